@@ -1,0 +1,1 @@
+"""Networks: one Linen module a file, no sampling and no loss inside."""

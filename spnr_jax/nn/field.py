@@ -1,0 +1,54 @@
+"""Radiance field: density and colour at a place from the volume's feature there.
+
+One hidden layer with softplus; density = softplus(raw - 1) (a ReLU can die before it has seen the object); features also
+see the view direction.  All features but RGB are linear in the hidden layer, and so is compositing: the hidden layer is
+composited, and `finish` applies the linear part once per ray instead of once per sample.
+"""
+
+import flax.linen as nn
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from spnr_jax.numerics import per_feature
+
+
+def encode_direction(directions: Float[Array, "*batch 3"], num_frequencies: int) -> Float[Array, "*batch encoding"]:
+    """[d, sin(d), cos(d), sin(2 d), cos(2 d), ...] of unit directions, 3 + 6 num_frequencies numbers."""
+    parts = [directions]
+    for k in range(num_frequencies):
+        parts += [jnp.sin(directions * 2**k), jnp.cos(directions * 2**k)]
+    return jnp.concatenate(parts, axis=-1)
+
+
+class RadianceField(nn.Module):
+    """Density, RGB and hidden layer of samples; `view` and `finish` are the parts that a ray needs once."""
+
+    width: int
+    num_features: int
+    direction_frequencies: int
+
+    def setup(self) -> None:
+        """Layers: hidden -> [density, rgb], direction -> features, hidden -> the features after rgb."""
+        self.hidden = nn.Dense(self.width)
+        self.head = nn.Dense(4)
+        self.direction = nn.Dense(self.num_features, use_bias=False)
+        self.features = nn.Dense(self.num_features - 3, use_bias=False)
+        self.feature_bias = self.param("feature_bias", nn.initializers.zeros, (self.num_features - 3,))
+
+    def view(self, directions: Float[Array, "*rays 3"]) -> Float[Array, "*rays features"]:
+        """What the view direction adds to each feature."""
+        return self.direction(encode_direction(directions, self.direction_frequencies))
+
+    def __call__(
+        self, x: Float[Array, "*rays samples channels"], view: Float[Array, "*rays features"]
+    ) -> tuple[Float[Array, "*rays samples"], Float[Array, "*rays samples 3"], Float[Array, "*rays samples hidden"]]:
+        """Density, RGB in (0, 1) and hidden layer at each sample."""
+        hidden = nn.softplus(self.hidden(x))
+        out = self.head(hidden)
+        return nn.softplus(out[..., 0] - 1), nn.sigmoid(out[..., 1:] + view[..., None, :3]), hidden
+
+    def finish(
+        self, hidden: Float[Array, "*rays hidden"], acc: Float[Array, "*rays"], view: Float[Array, "*rays features"]
+    ) -> Float[Array, "*rays rest"]:
+        """Features after RGB of a ray, on a zero background, from its composited hidden layer and opacity."""
+        return self.features(hidden) + acc[..., None] * (per_feature(self.feature_bias, view) + view[..., 3:])

@@ -1,0 +1,38 @@
+"""2D upsampler: feature image to an image of twice the size; it learns what to add to the bilinear RGB."""
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from spnr_jax.nn.convolution import conv, kernel_init, upsample_conv
+from spnr_jax.numerics import per_feature
+
+SLOPE = 0.2
+
+
+def bilinear(x: Float[Array, "batch height width features"], height: int, width: int) -> Float[Array, "batch h w features"]:
+    """Image resized with half-pixel centres (not aligned at the corners)."""
+    return jax.image.resize(x, (x.shape[0], height, width, x.shape[-1]), "bilinear", antialias=False)
+
+
+class Upsampler(nn.Module):
+    """Two convolutions at the low resolution, nearest x2, two at the high one; the last starts at zero."""
+
+    width: int
+
+    @nn.compact
+    def __call__(
+        self, x: Float[Array, "batch height width features"]
+    ) -> Float[Array, "batch {2*height} {2*width} 3"]:
+        """Image of twice the size; the first three features are RGB."""
+        y = x
+        for i, (features, layer) in enumerate(
+            [(self.width, conv), (self.width, conv), (self.width // 2, upsample_conv), (3, conv)]
+        ):
+            init = nn.initializers.zeros if i == 3 else kernel_init
+            kernel = self.param(f"kernel_{i}", init, (3, 3, y.shape[-1], features))
+            y = layer(y, kernel)
+            y = y + per_feature(self.param(f"bias_{i}", nn.initializers.zeros, (features,)), y)
+            y = y if i == 3 else nn.leaky_relu(y, SLOPE)
+        return y + bilinear(jnp.asarray(x[..., :3]), 2 * x.shape[1], 2 * x.shape[2])

@@ -1,0 +1,118 @@
+"""The method on one page: points -> features -> volume -> samples along rays -> image.
+
+    encode   PointNet on every point, mean per voxel, 3D U-Net                     once per object
+    render   rays, coarse samples, fine samples, compositing, 2D upsampler         once per view
+
+Objects lead, views follow: clouds are (objects, points, ...), cameras (objects, views, ...).
+"""
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from spnr_jax import cameras, compositing, sampling, voxels
+from spnr_jax.config import ModelConfig
+from spnr_jax.nn.field import RadianceField
+from spnr_jax.nn.pointnet import PointNet
+from spnr_jax.nn.unet3d import UNet3D
+from spnr_jax.nn.upsampler import Upsampler, bilinear
+from spnr_jax.types import Camera, Key, PointCloud, Rays, Rendering
+
+WHITE = 1.0
+
+
+class Renderer(nn.Module):
+    """The generator: a volume from a cloud, pictures from a volume."""
+
+    config: ModelConfig
+
+    def setup(self) -> None:
+        """Builds the parts that the config asks for."""
+        c = self.config
+        self.pointnet = PointNet(c.point_widths, c.point_features)
+        self.unet = UNet3D(c.volume_resolution, c.base_width, c.num_stages, c.num_groups)
+        self.field = RadianceField(c.field_width, c.num_features, c.direction_frequencies)
+        if c.upsamples:
+            self.upsampler = Upsampler(c.upsampler_width)
+
+    def encode(self, cloud: PointCloud, train: bool = False) -> Float[Array, "objects d d d features"]:
+        """Feature volume of each object from its points."""
+        resolution = self.config.volume_resolution
+        features = self.pointnet(self.point_inputs(cloud), cloud.mask, train)
+        rows, share = jax.vmap(lambda p, m: voxels.share_voxels(p, m, resolution))(cloud.positions, cloud.mask)
+        occupancy = jnp.ones_like(features[..., :1])
+        return self.unet(rows, jnp.concatenate([features, occupancy], axis=-1) * share[..., None])
+
+    def point_inputs(self, cloud: PointCloud) -> Float[Array, "objects points channels"]:
+        """Position, offset from the centre of the own voxel, and the materials that the network is built for."""
+        _, offset = voxels.locate(cloud.positions, self.config.volume_resolution)
+        materials = [getattr(cloud, name) for name in self.config.materials]
+        materials = [m[..., None] if m.ndim < cloud.positions.ndim else m for m in materials]
+        inputs = jnp.concatenate([cloud.positions, offset, *materials], axis=-1)
+        return jnp.where(cloud.mask[..., None], inputs, 0.0)
+
+    def render(
+        self, volume: Float[Array, "objects d d d features"], camera: Camera, key: Key | None = None
+    ) -> Rendering:
+        """Views of encoded objects; the camera's size is that of the image.  A key jitters the samples (training)."""
+        c = self.config
+        height, width = (round(n * c.render_resolution / c.image_resolution) for n in (camera.height, camera.width))
+        rays = cameras.camera_rays(cameras.resize(camera, height, width))
+        views = rays.directions.shape[:-3]
+        rays = jax.tree.map(lambda x: x.reshape(views[0], -1, 3), rays)
+        features, depth, acc = self.render_rays(volume, rays, key)
+        features = features.reshape(-1, height, width, c.num_features)
+        image = features[..., :3]
+        if c.upsamples:
+            image = self.upsampler(bilinear(features, camera.height // 2, camera.width // 2))
+        return Rendering(
+            image=image.reshape(*views, camera.height, camera.width, 3),
+            image_lr=features[..., :3].reshape(*views, height, width, 3),
+            depth=depth.reshape(*views, height, width),
+            acc=acc.reshape(*views, height, width),
+        )
+
+    def render_rays(
+        self, volume: Float[Array, "objects d d d features"], rays: Rays, key: Key | None = None
+    ) -> tuple[Float[Array, "objects rays k"], Float[Array, "objects rays"], Float[Array, "objects rays"]]:
+        """Feature vector (RGB on white first), expected distance and opacity of each ray."""
+        counts = self.config.sampling
+        coarse_key, fine_key = (None, None) if key is None else jax.random.split(key)
+        near, far, _ = cameras.intersect_box(rays.origins, rays.directions)
+        view = self.field.view(rays.directions)
+
+        distances, edges = sampling.stratified(coarse_key, near, far, counts.num_coarse)
+        density, rgb, hidden = self.shade(volume, rays, distances, view)
+        weights, _ = compositing.volume_weights(density, compositing.interval_lengths(distances, far))
+        if counts.num_fine:
+            fine = sampling.importance(fine_key, edges, weights, counts.num_fine, counts.padding)
+            both = zip((distances, density, rgb, hidden), (fine, *self.shade(volume, rays, fine, view)), strict=True)
+            distances, density, rgb, hidden = (jnp.concatenate(pair, axis=2) for pair in both)
+            weights = unsorted_weights(density, distances, far)
+
+        acc = jnp.sum(weights, axis=-1)
+        rest = self.field.finish(compositing.composite(weights, hidden), acc, view)
+        features = jnp.concatenate([compositing.composite(weights, rgb, WHITE), rest], axis=-1)
+        return features, compositing.expected_distance(weights, distances, far), acc
+
+    def shade(self, volume, rays: Rays, distances: Float[Array, "objects rays samples"], view):
+        """The radiance field at each sample."""
+        positions = rays.origins[..., None, :] + distances[..., None] * rays.directions[..., None, :]
+        # rays end on the faces of the box: rounding must not push their samples out of it
+        return self.field(voxels.trilinear(volume, jnp.clip(positions, -1, 1)), view)
+
+    def __call__(self, cloud: PointCloud, camera: Camera, key: Key | None = None, train: bool = False) -> Rendering:
+        """Views of each cloud from its cameras."""
+        return self.render(self.encode(cloud, train), camera, key)
+
+
+def unsorted_weights(
+    density: Float[Array, "*batch samples"], distances: Float[Array, "*batch samples"], far: Float[Array, "*batch"]
+) -> Float[Array, "*batch samples"]:
+    """Compositing weights of samples in any order: sorted by distance, weighted, and put back."""
+    order = jnp.argsort(distances, axis=-1)
+    sorted_distances, sorted_density = (jnp.take_along_axis(x, order, axis=-1) for x in (distances, density))
+    weights, _ = compositing.volume_weights(sorted_density, compositing.interval_lengths(sorted_distances, far))
+    return jnp.take_along_axis(weights, jnp.argsort(order, axis=-1), axis=-1)
+

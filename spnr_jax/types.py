@@ -1,0 +1,73 @@
+"""The records that travel between kernels: pytrees of arrays, data only.
+
+Every record may carry leading batch axes on all of its arrays (`*batch`); axis words are those of the README:
+batch objects views points rays samples height width features.  Colours of materials are linear RGB, images are sRGB
+in [0, 1].  Image sizes are static fields because they shape arrays.
+"""
+
+from typing import no_type_check
+
+import jax
+from flax import struct
+from jaxtyping import Array, Bool, Float
+
+
+@no_type_check  # pytree transformations rebuild records with leaves that are no arrays
+@struct.dataclass
+class PointCloud:
+    """Surface points of one object with their materials, padded to a fixed count; `mask` is True for real points."""
+
+    positions: Float[Array, "*batch points 3"]
+    base_color: Float[Array, "*batch points 3"]
+    roughness: Float[Array, "*batch points"]
+    metallic: Float[Array, "*batch points"]
+    mask: Bool[Array, "*batch points"]
+
+
+@no_type_check
+@struct.dataclass
+class Camera:
+    """A pinhole camera: pose with OpenGL axes (x right, y up, looking along -z) and intrinsics in pixels."""
+
+    cam_to_world: Float[Array, "*batch 3 4"]
+    intrinsics: Float[Array, "*batch 3 3"]
+    height: int = struct.field(pytree_node=False)
+    width: int = struct.field(pytree_node=False)
+
+
+@no_type_check
+@struct.dataclass
+class Rays:
+    """Half lines; `directions` have unit length, so distances along them are metric."""
+
+    origins: Float[Array, "*batch 3"]
+    directions: Float[Array, "*batch 3"]
+
+
+@no_type_check
+@struct.dataclass
+class Rendering:
+    """What a camera sees: `image` after the upsampler, the rest at the resolution of the volume rendering.
+
+    `depth` is the expected distance along the ray (the far side of the box where nothing is hit), `acc` the opacity.
+    """
+
+    image: Float[Array, "*batch height width 3"]
+    image_lr: Float[Array, "*batch height_lr width_lr 3"]
+    depth: Float[Array, "*batch height_lr width_lr"]
+    acc: Float[Array, "*batch height_lr width_lr"]
+
+
+@no_type_check
+@struct.dataclass
+class Batch:
+    """One training batch: clouds of `objects`, and `views` of each with reference and condition image."""
+
+    cloud: PointCloud
+    camera: Camera
+    image: Float[Array, "objects views height width 3"]
+    condition: Float[Array, "objects views height width 3"]
+    condition_mask: Bool[Array, "objects views height width"]
+
+
+Key = jax.Array
