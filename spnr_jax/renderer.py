@@ -87,9 +87,10 @@ class Renderer(nn.Module):
         weights, _ = compositing.volume_weights(density, compositing.interval_lengths(distances, far))
         if counts.num_fine:
             fine = sampling.importance(fine_key, edges, weights, counts.num_fine, counts.padding)
-            both = zip((distances, density, rgb, hidden), (fine, *self.shade(volume, rays, fine, view)), strict=True)
-            distances, density, rgb, hidden = (jnp.concatenate(pair, axis=2) for pair in both)
-            weights = unsorted_weights(density, distances, far)
+            both = zip((density, rgb, hidden), self.shade(volume, rays, fine, view), strict=True)
+            density, rgb, hidden = (jnp.concatenate(pair, axis=2) for pair in both)
+            weights = union_weights(distances, fine, density, far)
+            distances = jnp.concatenate([distances, fine], axis=-1)
 
         acc = jnp.sum(weights, axis=-1)
         rest = self.field.finish(compositing.composite(weights, hidden), acc, view)
@@ -107,12 +108,18 @@ class Renderer(nn.Module):
         return self.render(self.encode(cloud, train), camera, key)
 
 
-def unsorted_weights(
-    density: Float[Array, "*batch samples"], distances: Float[Array, "*batch samples"], far: Float[Array, "*batch"]
-) -> Float[Array, "*batch samples"]:
-    """Compositing weights of samples in any order: sorted by distance, weighted, and put back."""
-    order = jnp.argsort(distances, axis=-1)
-    sorted_distances, sorted_density = (jnp.take_along_axis(x, order, axis=-1) for x in (distances, density))
-    weights, _ = compositing.volume_weights(sorted_density, compositing.interval_lengths(sorted_distances, far))
-    return jnp.take_along_axis(weights, jnp.argsort(order, axis=-1), axis=-1)
+def union_weights(
+    coarse: Float[Array, "*batch n"],
+    fine: Float[Array, "*batch m"],
+    density: Float[Array, "*batch n+m"],
+    far: Float[Array, "*batch"],
+) -> Float[Array, "*batch n+m"]:
+    """Compositing weights of coarse and fine samples together, in the order [coarse, fine].
 
+    Only densities are sorted along the ray; what the weights multiply can stay where it is.
+    """
+    order, rank = sampling.merge(coarse, fine)
+    distances = jnp.concatenate([coarse, fine], axis=-1)
+    distances, density = (jnp.take_along_axis(x, order, axis=-1) for x in (distances, density))
+    weights, _ = compositing.volume_weights(density, compositing.interval_lengths(distances, far))
+    return jnp.take_along_axis(weights, rank, axis=-1)

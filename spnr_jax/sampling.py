@@ -7,7 +7,7 @@ of each stratum.  All of it is float32: one bf16 spacing is wider than a coarse 
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int, Shaped
 
 from spnr_jax.numerics import per_feature, safe_divide
 from spnr_jax.types import Key
@@ -48,21 +48,50 @@ def importance(
     mass = weights + padding
     cdf = jnp.cumsum(mass / jnp.sum(mass, axis=-1, keepdims=True), axis=-1)
     at = strata(key, weights.shape[:-1], num_samples)
-    upper = _count_at_most(cdf, at)
-    upper = jnp.minimum(upper, weights.shape[-1] - 1)
-
-    def pick(x, index):
-        return jnp.take_along_axis(x, index, axis=-1)
-
-    below = jnp.where(upper > 0, pick(cdf, jnp.maximum(upper - 1, 0)), 0.0)
-    fraction = jnp.clip(safe_divide(at - below, pick(cdf, upper) - below), 0.0, 1.0)
-    lo, hi = pick(edges, upper), pick(edges, upper + 1)
+    upper = jnp.minimum(count_at_most(cdf, at), weights.shape[-1] - 1)
+    below = jnp.where(upper > 0, _pick(cdf, jnp.maximum(upper - 1, 0)), 0.0)
+    fraction = jnp.clip(safe_divide(at - below, _pick(cdf, upper) - below), 0.0, 1.0)
+    lo, hi = _pick(edges, upper), _pick(edges, upper + 1)
     return jnp.clip(lo + fraction * (hi - lo), lo, hi)
 
 
-def _count_at_most(sorted_values, queries):
-    """For each query, how many of the sorted values are at most as large: all pairs for few, a search for many."""
-    if sorted_values.shape[-1] <= 256:
-        return jnp.sum(sorted_values[..., None, :] <= queries[..., :, None], axis=-1, dtype=jnp.int32)
-    search = jnp.vectorize(lambda a, v: jnp.searchsorted(a, v, side="right"), signature="(n),(m)->(m)")
-    return search(sorted_values, queries).astype(jnp.int32)
+def merge(
+    first: Float[Array, "*batch n"], second: Float[Array, "*batch m"]
+) -> tuple[Int[Array, "*batch n+m"], Int[Array, "*batch n+m"]]:
+    """(order, rank) of two sorted lists laid end to end: `both[order]` is sorted, and `sorted[rank]` is both again.
+
+    Equal numbers keep the first list's first.  Counting what is smaller takes an eighth of the time of sorting on a CPU.
+    """
+    n, m = first.shape[-1], second.shape[-1]
+    place_first, place_second, place = (per_feature(jnp.arange(k, dtype=jnp.int32), first) for k in (n, m, n + m))
+    # without barriers XLA computes the ranks anew inside each gather that reads them
+    barrier = jax.lax.optimization_barrier
+    rank_first = barrier(place_first + count_at_most(second, first, strictly=True))
+    rank_second = barrier(place_second + count_at_most(first, second))
+    place = jnp.broadcast_to(place, (*first.shape[:-1], n + m))
+    taken = barrier(count_at_most(rank_first, place, strictly=True))
+    from_first = _pick(rank_first, jnp.minimum(taken, n - 1)) == place
+    order = jnp.where(from_first, taken, n + place - taken)
+    return barrier((order, jnp.concatenate([rank_first, rank_second], axis=-1)))
+
+
+def count_at_most(
+    sorted_values: Shaped[Array, "*batch n"], queries: Shaped[Array, "*batch m"], strictly: bool = False
+) -> Int[Array, "*batch m"]:
+    """How many of the sorted values are <= (strictly: <) each query: one by one for few values, else by bisection."""
+    n = sorted_values.shape[-1]
+    count = jnp.zeros(queries.shape, jnp.int32)
+    if n <= 256:
+        for i in range(n):
+            value = sorted_values[..., i : i + 1]
+            count = count + (value < queries if strictly else value <= queries)
+        return count
+    for step in (2**k for k in reversed(range(n.bit_length()))):
+        value = _pick(sorted_values, jnp.minimum(count + step, n) - 1)
+        passes = value < queries if strictly else value <= queries
+        count = jnp.where((count + step <= n) & passes, count + step, count)
+    return count
+
+
+def _pick(values, index):
+    return jnp.take_along_axis(values, index, axis=-1)

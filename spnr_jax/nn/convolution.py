@@ -1,8 +1,14 @@
-"""3^n convolutions in the form that each platform computes fastest; the map never depends on the form.
+"""Convolutions in the form that each platform computes fastest; the map never depends on the form.
 
-Layout is channels last: inputs (batch, *space, in), kernels (3, ..., 3, in, out).  Strided convolutions pad one voxel on
-every side, like the stride-1 ones (a SAME rule would pad the far side only).
+Layout is channels last: inputs (batch, *space, in), kernels (*window, in, out) with equal sides.  Strided convolutions
+pad one voxel on every side, like the stride-1 ones (a SAME rule would pad the far side only).  On a GPU the native
+convolutions of XLA are right; on a CPU (measurements: docs/performance.md)
+  3D   a sum over depth taps of 2D convolutions, or one matrix product for tiny volumes
+  2D   native, but the kernel's gradient of 2-wide windows and of few output features as matrix products
 """
+
+import itertools
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -10,22 +16,20 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-# Row p holds, for each of the two coarse taps, which of the three fine taps fall on it when a row of pixels was
-# repeated twice and the output has parity p: output 2i + p reads fine 2i + p - 1 .. 2i + p + 1, coarse i - 1 + p, i + p.
+# Entry [p, t, k] is 1 where fine tap k falls on coarse tap t for outputs of parity p, after every pixel was repeated
+# twice: output 2i + p reads the fine pixels 2i + p - 1 .. 2i + p + 1, which are the coarse ones i - 1 + p and i + p.
 REPEAT_FOLD = np.array([[[1, 0, 0], [0, 1, 1]], [[1, 1, 0], [0, 0, 1]]], np.float32)
+
+kernel_init = jax.nn.initializers.he_normal(in_axis=-2, out_axis=-1)
 
 
 def conv(
     x: Float[Array, "batch *space in"], kernel: Float[Array, "*window in out"], stride: int = 1, padding: int = 1
 ) -> Float[Array, "batch *out_space out"]:
     """Convolution (correlation) in 2D or 3D with equal stride and padding on every axis."""
-    if x.ndim == 4:
-        return _native(x, kernel, stride, padding)
+    on_cpu = _conv2d_cpu if x.ndim == 4 else _conv3d_cpu
     return lax.platform_dependent(
-        x,
-        kernel,
-        cpu=lambda x, kernel: _conv3d_cpu(x, kernel, stride, padding),
-        default=lambda x, kernel: _native(x, kernel, stride, padding),
+        x, kernel, cpu=lambda x, k: on_cpu(x, k, stride, padding), default=lambda x, k: _native(x, k, stride, padding)
     )
 
 
@@ -37,69 +41,78 @@ def _native(x, kernel, stride, padding):
     )
 
 
-def _conv3d_cpu(x, kernel, stride, padding):
-    """As a sum over depth taps of a 2D convolution; tiny volumes as one matrix product.
+def _windows(x, window: int, stride: int):
+    """For each place in a window of the trailing spatial axes: what it sees in every window, (batch, *out, in)."""
+    stops = [(s - window) // stride * stride + 1 for s in x.shape[1:-1]]
+    for place in itertools.product(range(window), repeat=x.ndim - 2):
+        corner = (0, *place, 0)
+        end = (x.shape[0], *(p + s for p, s in zip(place, stops, strict=True)), x.shape[-1])
+        yield lax.slice(x, corner, end, (1, *[stride] * len(stops), 1))
 
-    XLA's native 3D convolution on CPU takes 2 to 7 times as long, its strided gradient 40 times (docs/performance.md).
-    """
+
+def _pad(x, padding: int):
+    return jnp.pad(x, ((0, 0), *[(padding, padding)] * (x.ndim - 2), (0, 0)))
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(2, 3))
+def _conv2d_products(x, kernel, stride, padding):
+    return _native(x, kernel, stride, padding)
+
+
+def _conv2d_backward(stride, padding, inputs, cotangent):
+    """XLA's gradient for the input; for the kernel one matrix product per place in the window."""
+    x, kernel = inputs
+    (dx,) = jax.linear_transpose(lambda x: _native(x, kernel, stride, padding), x)(cotangent)
+    flat = cotangent.reshape(-1, cotangent.shape[-1])
+    seen = _windows(_pad(x, padding), kernel.shape[0], stride)
+    dk = jnp.stack([s.reshape(flat.shape[0], -1).T @ flat for s in seen])
+    return dx, dk.reshape(kernel.shape)
+
+
+_conv2d_products.defvjp(lambda x, k, stride, padding: (_native(x, k, stride, padding), (x, k)), _conv2d_backward)
+
+
+def _conv2d_cpu(x, kernel, stride, padding):
+    form = _conv2d_products if kernel.shape[0] == 2 or kernel.shape[-1] <= 4 else _native
+    return form(x, kernel, stride, padding)
+
+
+def _conv3d_cpu(x, kernel, stride, padding):
     taps = kernel.shape[0]
+    if x.shape[1] <= 4:
+        columns = jnp.concatenate(list(_windows(_pad(x, padding), taps, stride)), axis=-1)
+        return columns @ kernel.reshape(-1, kernel.shape[-1])
     x = jnp.pad(x, ((0, 0), (padding, padding), *[(0, 0)] * 3))
     depth = (x.shape[1] - taps) // stride + 1
-    slices = [lax.slice_in_dim(x, k, k + (depth - 1) * stride + 1, stride, axis=1) for k in range(taps)]
-    if x.shape[2] <= 4:
-        return _conv3d_matmul(slices, kernel, stride, padding)
-    parts = (
-        _native(part.reshape(-1, *part.shape[2:]), tap, stride, padding) for part, tap in zip(slices, kernel, strict=True)
+    slices = (lax.slice_in_dim(x, k, k + (depth - 1) * stride + 1, stride, axis=1) for k in range(taps))
+    out = sum(
+        _conv2d_cpu(part.reshape(-1, *part.shape[2:]), tap, stride, padding)
+        for part, tap in zip(slices, kernel, strict=True)
     )
-    out = sum(parts)
     return out.reshape(x.shape[0], depth, *out.shape[1:])
-
-
-def _conv3d_matmul(slices, kernel, stride, padding):
-    taps = kernel.shape[0]
-    columns = []
-    for part in slices:
-        part = jnp.pad(part, ((0, 0), (0, 0), (padding, padding), (padding, padding), (0, 0)))
-        size = (part.shape[2] - taps) // stride + 1
-        stop = (size - 1) * stride + 1
-        columns += [
-            part[:, :, i : i + stop : stride, j : j + stop : stride] for i in range(taps) for j in range(taps)
-        ]
-    return jnp.concatenate(columns, axis=-1) @ kernel.reshape(-1, kernel.shape[-1])
 
 
 def upsample_conv(
     x: Float[Array, "batch *space in"], kernel: Float[Array, "*window in out"]
 ) -> Float[Array, "batch *double_space out"]:
-    """conv(nearest x2 of x, kernel), computed at the low resolution: 2^n instead of 3^n taps per output.
+    """conv(nearest x2 of x, kernel) for a 3-wide kernel, computed at the low resolution: 2^n instead of 3^n taps.
 
-    The repeated pixels under a 3-tap window are two distinct ones; their taps are added up once per output parity, all
+    The repeated pixels under a window are two distinct ones; their taps are added up once per output parity, all
     parities are channels of one convolution, and its results are interleaved.
     """
-    n = x.ndim - 2
+    n, space = x.ndim - 2, x.shape[1:-1]
     features_in, features_out = kernel.shape[-2:]
-    for axis in range(n):  # (..., 3, ...) -> (..., 2, ...), the parity appended
+    for axis in range(n):  # 3 fine taps -> 2 coarse taps in place, the parity appended
         kernel = jnp.moveaxis(jnp.tensordot(kernel, REPEAT_FOLD, axes=([axis], [2])), -1, axis)
-    kernel = jnp.moveaxis(kernel, range(n + 2, 2 * n + 2), range(n + 1, 2 * n + 1)).reshape(*[2] * n, features_in, -1)
-    out = conv(x, kernel, padding=1).reshape(x.shape[0], *[s + 1 for s in x.shape[1:-1]], *[2] * n, features_out)
-    return _interleave(out, x.shape[1:-1])
-
-
-def _interleave(out, space):
-    """Picks for each parity its own shift of the n + 1 window positions and weaves the parities together."""
-    n = len(space)
-    for axis in range(1, n + 1):
-        parity_axis = n + 1 + (axis - 1)
+    kernel = jnp.moveaxis(kernel, range(n + 2, 2 * n + 2), range(n + 1, 2 * n + 1))
+    out = conv(x, kernel.reshape(*[2] * n, features_in, -1))
+    parts = out.reshape(*out.shape[:-1], *[2] * n, features_out)  # parities stand in axes n + 1 .. 2n
+    for axis, size in enumerate(space):
+        # an output of parity p at i is the window that begins at i - 1 + p: position i + p of the padded input
         even, odd = (
-            lax.slice_in_dim(lax.index_in_dim(out, p, parity_axis, keepdims=True), p, p + space[axis - 1], axis=axis)
+            lax.slice_in_dim(lax.slice_in_dim(parts, p, p + 1, axis=n + 1 + axis), p, p + size, axis=1 + axis)
             for p in (0, 1)
         )
-        out = jnp.concatenate([even, odd], axis=parity_axis)
-    order = [0]
-    for axis in range(1, n + 1):
-        order += [axis, axis + n]
-    out = jnp.transpose(out, [*order, 2 * n + 1])
-    return out.reshape(out.shape[0], *[2 * s for s in space], out.shape[-1])
-
-
-kernel_init = jax.nn.initializers.he_normal(in_axis=-2, out_axis=-1)
+        parts = jnp.concatenate([even, odd], axis=n + 1 + axis)
+    woven = [axis for pair in zip(range(1, n + 1), range(n + 1, 2 * n + 1), strict=True) for axis in pair]
+    return jnp.transpose(parts, (0, *woven, 2 * n + 1)).reshape(x.shape[0], *(2 * s for s in space), features_out)

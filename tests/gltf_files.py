@@ -1,0 +1,94 @@
+"""Small glTF files for tests, written with nothing of data_gen."""
+
+import io
+import json
+import struct
+
+import numpy as np
+from PIL import Image
+
+COMPONENT = {"i1": 5120, "u1": 5121, "i2": 5122, "u2": 5123, "u4": 5125, "f4": 5126}
+KIND = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
+CORNERS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float32)  # a square that faces +z
+SQUARE = np.array([0, 1, 2, 0, 2, 3], np.uint16)
+
+
+def png(texels) -> bytes:
+    """An 8-bit PNG of texels (height, width, channels)."""
+    stream = io.BytesIO()
+    Image.fromarray(np.asarray(texels, np.uint8)).save(stream, "png")
+    return stream.getvalue()
+
+
+class GltfBuilder:
+    """A glTF document under construction: one node per mesh unless the test says otherwise."""
+
+    def __init__(self, **document):
+        self.document = {"asset": {"version": "2.0"}, "accessors": [], "bufferViews": [], "meshes": [], "nodes": []}
+        self.document |= {"scene": 0, "scenes": [{"nodes": []}], **document}
+        self.binary = b""
+
+    def view(self, data: bytes) -> int:
+        self.binary += b"\0" * (-len(self.binary) % 4)
+        self.document["bufferViews"].append({"buffer": 0, "byteOffset": len(self.binary), "byteLength": len(data)})
+        self.binary += data
+        return len(self.document["bufferViews"]) - 1
+
+    def accessor(self, array, **more) -> int:
+        array = np.asarray(array)
+        entry = {
+            "componentType": COMPONENT[array.dtype.str[1:]],
+            "count": len(array),
+            "type": KIND[1 if array.ndim == 1 else array.shape[1]],
+        }
+        self.document["accessors"].append({"bufferView": self.view(array.tobytes()), **entry, **more})
+        return len(self.document["accessors"]) - 1
+
+    def texture(self, texels=None, uri=None, **sampler) -> int:
+        """Number of a new texture, embedded from texels or named by a URI."""
+        images = self.document.setdefault("images", [])
+        images.append({"uri": uri} if uri else {"bufferView": self.view(png(texels)), "mimeType": "image/png"})
+        self.document.setdefault("samplers", []).append(sampler)
+        textures = self.document.setdefault("textures", [])
+        textures.append({"source": len(images) - 1, "sampler": len(images) - 1})
+        return len(textures) - 1
+
+    def material(self, **material) -> int:
+        self.document.setdefault("materials", []).append(material)
+        return len(self.document["materials"]) - 1
+
+    def primitive(self, positions=CORNERS, indices=SQUARE, *, material=None, mode=None, **attributes) -> dict:
+        primitive = {"attributes": {"POSITION": self.accessor(positions)}}
+        primitive["attributes"] |= {name: self.accessor(values) for name, values in attributes.items()}
+        more = {"indices": None if indices is None else self.accessor(indices), "material": material, "mode": mode}
+        return primitive | {name: value for name, value in more.items() if value is not None}
+
+    def mesh(self, *primitives, **node) -> int:
+        """Number of a new root node that draws the primitives."""
+        self.document["meshes"].append({"primitives": list(primitives)})
+        return self.node(mesh=len(self.document["meshes"]) - 1, **node)
+
+    def node(self, *, root=True, **node) -> int:
+        self.document["nodes"].append(node)
+        index = len(self.document["nodes"]) - 1
+        if root:
+            self.document["scenes"][0]["nodes"].append(index)
+        return index
+
+    def glb(self) -> bytes:
+        self.document["buffers"] = [{"byteLength": len(self.binary)}]
+        text = json.dumps(self.document).encode()
+        text += b" " * (-len(text) % 4)
+        binary = self.binary + b"\0" * (-len(self.binary) % 4)
+        chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
+        return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+    def write(self, path):
+        """Write a .glb, or a .gltf with its buffer beside it in data.bin; the path."""
+        if path.suffix == ".glb":
+            path.write_bytes(self.glb())
+        else:
+            self.document["buffers"] = [{"byteLength": len(self.binary), "uri": "data.bin"}]
+            (path.parent / "data.bin").write_bytes(self.binary)
+            path.write_text(json.dumps(self.document))
+        return path

@@ -1,0 +1,119 @@
+"""Laws of the procedural objects: sound geometry, one connected thing, a function of its category and seed only."""
+
+import hashlib
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from data_gen.procedural import CATEGORIES, category_of, make
+
+SEEDS = range(12)
+ASSETS = {(category, seed): make(category, seed) for category in CATEGORIES for seed in SEEDS}
+CASES = [pytest.param(asset, id=f"{category}-{seed}") for (category, seed), asset in ASSETS.items()]
+PIXELS = 48  # of the voxel grid along the longest side
+
+
+def digest(asset):
+    """Hash of every array of an object."""
+    state = hashlib.sha256()
+    for part in asset.parts:
+        material = part.material
+        arrays = (part.positions, part.faces, part.normals, part.texcoords)
+        for array in (*arrays, material.base_color, material.roughness, material.metallic):
+            state.update(np.ascontiguousarray(array).tobytes())
+    return state.hexdigest()
+
+
+def triangles(asset):
+    """(f, 3, 3) corners of all faces."""
+    return np.concatenate([part.positions[part.faces] for part in asset.parts])
+
+
+def corner_agreement(part):
+    """(f, 3) cosine between each face and its corners' normals."""
+    a, b, c = part.positions[part.faces.T]
+    facing = np.cross(b - a, c - a)
+    facing /= np.linalg.norm(facing, axis=1, keepdims=True)
+    return np.einsum("fk,fck->fc", facing, part.normals[part.faces])
+
+
+@pytest.mark.parametrize("asset", CASES)
+def test_geometry_is_finite_indexed_and_without_zero_area(asset):
+    for part in asset.parts:
+        for array in (part.positions, part.normals, part.texcoords):
+            assert np.isfinite(array).all()
+        assert np.array_equal(np.unique(part.faces), np.arange(len(part.positions)))
+        a, b, c = part.positions[part.faces.T]
+        assert np.linalg.norm(np.cross(b - a, c - a), axis=1).min() > 1e-10
+        np.testing.assert_allclose(np.linalg.norm(part.normals, axis=1), 1, atol=1e-5)
+        assert (corner_agreement(part) > 0).mean() > 0.985
+
+
+@pytest.mark.parametrize("asset", CASES)
+def test_objects_enclose_volume_stand_on_the_floor_and_have_few_parts(asset):
+    corners = triangles(asset)
+    assert np.einsum("fk,fk->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) > 0
+    assert corners[..., 1].min() == 0
+    assert 0.2 < np.ptp(corners.reshape(-1, 3), axis=0).max() < 4
+    assert 1 <= len(asset.parts) <= 6
+    assert 60 <= len(corners) <= 9000
+
+
+@pytest.mark.parametrize("asset", CASES)
+def test_every_part_touches_the_rest(asset):
+    ndimage = pytest.importorskip("scipy.ndimage")
+    rng = np.random.default_rng(0)
+    corners = triangles(asset)
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    chosen = np.concatenate([rng.choice(len(area), 60_000, p=area / area.sum()), np.repeat(np.arange(len(area)), 3)])
+    weights = rng.dirichlet((1, 1, 1), len(chosen))
+    samples = np.concatenate([np.einsum("nc,nck->nk", weights, corners[chosen]), corners.reshape(-1, 3)])
+    low = samples.min(axis=0)
+    voxels = ((samples - low) / np.ptp(samples, axis=0).max() * PIXELS).astype(int)
+    filled = np.zeros(voxels.max(axis=0) + 1, bool)
+    filled[tuple(voxels.T)] = True
+    _, components = ndimage.label(filled, np.ones((3, 3, 3)))
+    assert components == 1
+
+
+@pytest.mark.parametrize("asset", CASES)
+def test_materials_are_physical_and_textures_are_of_moderate_size(asset):
+    for part in asset.parts:
+        material = part.material
+        assert 0.015 < material.base_color.min() <= material.base_color.max() < 0.96
+        assert 0.045 < material.roughness.min() <= material.roughness.max() <= 1
+        assert max(material.base_color.size // 3, material.roughness.size) <= 256**2
+
+
+@pytest.mark.parametrize("category", CATEGORIES)
+def test_a_seed_gives_the_same_bytes_again_and_other_seeds_other_shapes_and_colours(category):
+    assert digest(make(category, 3)) == digest(ASSETS[category, 3])
+    assert len({digest(ASSETS[category, seed]) for seed in SEEDS}) == len(SEEDS)
+    shapes = {tuple(np.ptp(triangles(ASSETS[category, seed]).reshape(-1, 3), axis=0).round(4)) for seed in SEEDS}
+    assert len(shapes) == len(SEEDS)
+
+
+def test_another_process_makes_the_same_bytes():
+    code = (
+        "import hashlib; from data_gen.procedural import make; a = make('car', 5);"
+        "print(hashlib.sha256(b''.join(p.positions.tobytes() for p in a.parts)).hexdigest())"
+    )
+    printed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip()
+    here = hashlib.sha256(b"".join(part.positions.tobytes() for part in ASSETS["car", 5].parts)).hexdigest()
+    assert printed == here
+
+
+def test_any_run_of_objects_is_balanced_over_the_categories():
+    for count in (8, 80, 83):
+        names = [category_of(index) for index in range(5, 5 + count)]
+        counts = [names.count(category) for category in CATEGORIES]
+        assert max(counts) - min(counts) <= 1
+
+
+def test_unknown_categories_and_negative_seeds_are_refused_by_name():
+    with pytest.raises(ValueError, match="'boat' is not one of chair"):
+        make("boat", 0)
+    with pytest.raises(ValueError, match="seed must be 0 or more, got -1"):
+        make("chair", -1)
