@@ -82,3 +82,12 @@ def intersect_box(
     near, far = jnp.maximum(jnp.max(entry, axis=-1), 0.0), jnp.min(leave, axis=-1)
     hit = (far > near) & jnp.isfinite(far)
     return jnp.where(hit, near, 0.0), jnp.where(hit, far, 0.0), hit
+
+
+def orbit(azimuth: float, elevation: float, distance: float, centre: Float[Array, "3"]) -> Float[Array, "3 4"]:
+    """Pose that looks at `centre` from a distance; angles in radians, azimuth around y from +z, elevation above xz."""
+    horizontal = jnp.cos(elevation)
+    direction = jnp.stack([horizontal * jnp.sin(azimuth), jnp.sin(elevation), horizontal * jnp.cos(azimuth)])
+    # seen from straight above or below, the picture's up is where the back of the object is
+    up = jnp.where(horizontal > 1e-6, jnp.array([0.0, 1.0, 0.0]), jnp.array([0.0, 0.0, -1.0]) * jnp.sign(elevation))
+    return look_at(centre + distance * direction, centre, up)

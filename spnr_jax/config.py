@@ -7,7 +7,7 @@ naming the field, what came and what is possible.  Marks: [paper] stands in the 
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 MATERIAL_CHANNELS = {"base_color": 3, "roughness": 1, "metallic": 1}
 
@@ -264,7 +264,7 @@ def to_dict(config: TrainConfig) -> dict:
     return dataclasses.asdict(config)
 
 
-def from_dict(values: dict, kind: type = TrainConfig, path: str = "") -> TrainConfig:
+def from_dict(values: dict, kind: type = TrainConfig, path: str = "") -> Any:
     """Config from `to_dict`'s form; an unknown or missing field raises ValueError with its path."""
     fields = {f.name: f for f in dataclasses.fields(kind)}
     for name in values:

@@ -56,15 +56,31 @@ class Renderer(nn.Module):
         self, volume: Float[Array, "objects d d d features"], camera: Camera, key: Key | None = None
     ) -> Rendering:
         """Views of encoded objects; the camera's size is that of the image.  A key jitters the samples (training)."""
-        c = self.config
-        height, width = (round(n * c.render_resolution / c.image_resolution) for n in (camera.height, camera.width))
-        rays = cameras.camera_rays(cameras.resize(camera, height, width))
-        views = rays.directions.shape[:-3]
-        rays = jax.tree.map(lambda x: x.reshape(views[0], -1, 3), rays)
-        features, depth, acc = self.render_rays(volume, rays, key)
-        features = features.reshape(-1, height, width, c.num_features)
+        rays = self.rays(camera)
+        return self.develop(camera, *self.render_rays(volume, rays, key))
+
+    def rays(self, camera: Camera) -> Rays:
+        """Rays of the volume rendering for all views of an object in one axis, (objects, views * height * width, 3)."""
+        rays = cameras.camera_rays(cameras.resize(camera, *self.render_size(camera)))
+        return jax.tree.map(lambda x: x.reshape(x.shape[0], -1, 3), rays)
+
+    def render_size(self, camera: Camera) -> tuple[int, int]:
+        """Height and width of the volume rendering behind the camera's image."""
+        ratio = self.config.render_resolution / self.config.image_resolution
+        return round(camera.height * ratio), round(camera.width * ratio)
+
+    def develop(
+        self,
+        camera: Camera,
+        features: Float[Array, "objects rays k"],
+        depth: Float[Array, "objects rays"],
+        acc: Float[Array, "objects rays"],
+    ) -> Rendering:
+        """Images from the rays of `rays`: the upsampler, and everything in its place."""
+        views, (height, width) = camera.cam_to_world.shape[:-2], self.render_size(camera)
+        features = features.reshape(-1, height, width, self.config.num_features)
         image = features[..., :3]
-        if c.upsamples:
+        if self.config.upsamples:
             image = self.upsampler(bilinear(features, camera.height // 2, camera.width // 2))
         return Rendering(
             image=image.reshape(*views, camera.height, camera.width, 3),
@@ -85,16 +101,20 @@ class Renderer(nn.Module):
         distances, edges = sampling.stratified(coarse_key, near, far, counts.num_coarse)
         density, rgb, hidden = self.shade(volume, rays, distances, view)
         weights, _ = compositing.volume_weights(density, compositing.interval_lengths(distances, far))
+        passes = [(weights, rgb, hidden)]
         if counts.num_fine:
             fine = sampling.importance(fine_key, edges, weights, counts.num_fine, counts.padding)
-            both = zip((density, rgb, hidden), self.shade(volume, rays, fine, view), strict=True)
-            density, rgb, hidden = (jnp.concatenate(pair, axis=2) for pair in both)
-            weights = union_weights(distances, fine, density, far)
+            fine_density, fine_rgb, fine_hidden = self.shade(volume, rays, fine, view)
+            weights = union_weights(distances, fine, jnp.concatenate([density, fine_density], axis=-1), far)
             distances = jnp.concatenate([distances, fine], axis=-1)
+            parts = jnp.split(weights, [counts.num_coarse], axis=-1)
+            passes = [(parts[0], rgb, hidden), (parts[1], fine_rgb, fine_hidden)]
 
+        # each pass is composited where it lies: sums do not mind the order, and nothing wide is concatenated
         acc = jnp.sum(weights, axis=-1)
-        rest = self.field.finish(compositing.composite(weights, hidden), acc, view)
-        features = jnp.concatenate([compositing.composite(weights, rgb, WHITE), rest], axis=-1)
+        rgb = sum(compositing.composite(w, rgb) for w, rgb, _ in passes) + (1 - acc[..., None]) * WHITE
+        hidden = sum(compositing.composite(w, hidden) for w, _, hidden in passes)
+        features = jnp.concatenate([rgb, self.field.finish(hidden, acc, view)], axis=-1)
         return features, compositing.expected_distance(weights, distances, far), acc
 
     def shade(self, volume, rays: Rays, distances: Float[Array, "objects rays samples"], view):

@@ -33,8 +33,8 @@ def stratified(
 
 def importance(
     key: Key | None,
-    edges: Float[Array, "*batch bins+1"],
-    weights: Float[Array, "*batch bins"],
+    edges: Float[Array, "*batch edges"],
+    weights: Float[Array, "*batch edges-1"],
     num_samples: int,
     padding: float = 1e-5,
 ) -> Float[Array, "*batch {num_samples}"]:

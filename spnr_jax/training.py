@@ -18,7 +18,7 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from spnr_jax import losses
-from spnr_jax.config import TrainConfig
+from spnr_jax.config import ModelConfig, TrainConfig
 from spnr_jax.nn.discriminator import Discriminator
 from spnr_jax.renderer import Renderer
 from spnr_jax.types import Batch, Camera, Key, PointCloud, Rendering
@@ -201,14 +201,34 @@ def train_step(
     return state, metrics
 
 
-def encode(variables: dict, cloud: PointCloud, *, config) -> Array:
-    """Feature volumes (objects, d, d, d, features) of the clouds; `config` is the ModelConfig."""
+def encode(variables: dict, cloud: PointCloud, *, config: ModelConfig) -> Array:
+    """Feature volumes (objects, d, d, d, features) of the clouds."""
     return Renderer(config).apply(variables, cloud, method="encode")
 
 
-def render(variables: dict, volume: Array, camera: Camera, *, config) -> Rendering:
-    """Views of encoded volumes, samples at the middles of their strata."""
-    return Renderer(config).apply(variables, volume, camera, method="render")
+def render(variables: dict, volume: Array, camera: Camera, *, config: ModelConfig, ray_chunk: int = 0) -> Rendering:
+    """Views of encoded volumes, samples at the middles of their strata.
+
+    ray_chunk > 0 bounds the memory: so many rays of each object are rendered at a time.
+    """
+    renderer = Renderer(config)
+    rays = renderer.rays(camera)
+    num_rays = rays.origins.shape[1]
+
+    def render_rays(rays):
+        return renderer.apply(variables, volume, rays, method="render_rays")
+
+    if not 0 < ray_chunk < num_rays:
+        outputs = render_rays(rays)
+    else:
+        padding = -num_rays % ray_chunk
+        pad = ((0, 0), (0, padding), (0, 0))
+        chunks = jax.tree.map(lambda x: jnp.pad(x, pad, mode="edge").reshape(x.shape[0], -1, ray_chunk, 3), rays)
+        outputs = jax.lax.map(render_rays, jax.tree.map(lambda x: jnp.moveaxis(x, 1, 0), chunks))
+        outputs = jax.tree.map(
+            lambda x: jnp.moveaxis(x, 0, 1).reshape(x.shape[1], -1, *x.shape[3:])[:, :num_rays], outputs
+        )
+    return renderer.apply(variables, camera, *outputs, method="develop")
 
 
 def averaged_variables(state: TrainState) -> dict:
@@ -218,4 +238,4 @@ def averaged_variables(state: TrainState) -> dict:
 
 jitted_train_step = jax.jit(train_step, static_argnames=("config", "adversarial"), donate_argnames="state")
 jitted_encode = jax.jit(encode, static_argnames="config")
-jitted_render = jax.jit(render, static_argnames="config")
+jitted_render = jax.jit(render, static_argnames=("config", "ray_chunk"))

@@ -9,7 +9,7 @@ import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from spnr_jax.numerics import per_feature
+from spnr_jax.numerics import per_feature, softplus
 
 
 def encode_direction(directions: Float[Array, "*batch 3"], num_frequencies: int) -> Float[Array, "*batch encoding"]:
@@ -43,9 +43,11 @@ class RadianceField(nn.Module):
         self, x: Float[Array, "*rays samples channels"], view: Float[Array, "*rays features"]
     ) -> tuple[Float[Array, "*rays samples"], Float[Array, "*rays samples 3"], Float[Array, "*rays samples hidden"]]:
         """Density, RGB in (0, 1) and hidden layer at each sample."""
-        hidden = nn.softplus(self.hidden(x))
-        out = self.head(hidden)
-        return nn.softplus(out[..., 0] - 1), nn.sigmoid(out[..., 1:] + view[..., None, :3]), hidden
+        # one long axis of samples: XLA's CPU gradient of a product that sums over several axes takes four times as long
+        hidden = softplus(self.hidden(x.reshape(-1, x.shape[-1])))
+        out = self.head(hidden).reshape(*x.shape[:-1], 4)
+        rgb = nn.sigmoid(out[..., 1:] + view[..., None, :3])
+        return softplus(out[..., 0] - 1), rgb, hidden.reshape(*x.shape[:-1], self.width)
 
     def finish(
         self, hidden: Float[Array, "*rays hidden"], acc: Float[Array, "*rays"], view: Float[Array, "*rays features"]

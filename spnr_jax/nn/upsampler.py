@@ -24,7 +24,7 @@ class Upsampler(nn.Module):
     @nn.compact
     def __call__(
         self, x: Float[Array, "batch height width features"]
-    ) -> Float[Array, "batch {2*height} {2*width} 3"]:
+    ) -> Float[Array, "batch 2*height 2*width 3"]:
         """Image of twice the size; the first three features are RGB."""
         y = x
         for i, (features, layer) in enumerate(

@@ -1,0 +1,183 @@
+"""The command `spnr`: train a network, evaluate one, render a cloud.
+
+Errors of the user and of the disk are one line on stderr and exit code 2; Ctrl-C keeps the state and exits with 130.
+"""
+
+import dataclasses
+import json
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from spnr_jax import config as configs
+from spnr_jax.config import TrainConfig
+
+
+DESCRIPTION = "Sparse-point neural rendering: train a network, evaluate one, render a cloud of points."
+
+
+@dataclass(frozen=True, kw_only=True)
+class Train:
+    """Train a network on a data set.  A run folder that holds an unfinished run of the same config is continued."""
+
+    data: tyro.conf.Positional[Path]
+    """Folder of the data set."""
+    run: tyro.conf.Positional[Path]
+    """Folder of the run: config, checkpoints, metrics, previews."""
+    config: tyro.conf.OmitArgPrefixes[TrainConfig] = field(default_factory=configs.tiny)
+    """Every number of the run; --preset chooses the defaults."""
+    log_every: int = 20
+    """Steps between rows of metrics.jsonl and TensorBoard."""
+    preview_every: int = 500
+    """Steps between preview images with validation scores."""
+    checkpoint_every: int = 500
+    """Steps between checkpoints."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evaluate:
+    """Score a run's newest checkpoint beside the trivial renderers; write metrics.json and report.html."""
+
+    data: tyro.conf.Positional[Path]
+    """Folder of the data set."""
+    run: tyro.conf.Positional[Path]
+    """Folder of the run."""
+    out: Path | None = None
+    """Folder for metrics.json and report.html (default: the run)."""
+    split: Literal["train", "val", "test"] = "test"
+    """Objects to score."""
+    gallery: int = 16
+    """Objects shown in the report."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Render:
+    """Render a point cloud or mesh file: views as .png, and a turntable."""
+
+    cloud: tyro.conf.Positional[Path]
+    """.ply .xyz .txt .csv .npz .npy, or a mesh: .glb .gltf .obj .stl .off (its surface is sampled)."""
+    run: Path
+    """Run folder whose network renders."""
+    out: Path = Path("renders")
+    """Folder for the pictures."""
+    views: int = 4
+    """Still pictures, evenly around the object."""
+    elevation: float = 20.0
+    """Degrees above the horizon."""
+    resolution: int | None = None
+    """Pixels along each side (default: what the network was trained for)."""
+    num_points: int = 1024
+    """Points used of a bigger cloud or sampled from a mesh; fewer work too."""
+    up: Literal["x", "y", "z", "-x", "-y", "-z"] = "y"
+    """The file's upward axis."""
+    turntable: Literal["gif", "mp4", "none"] = "gif"
+    """Format of the turntable."""
+    frames: int = 48
+    """Frames of the turntable."""
+    seed: int = 0
+    """Seed of the surface samples of a mesh."""
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run the command line."""
+    arguments = sys.argv[1:] if arguments is None else arguments
+    sys.exit(guarded(lambda: run(parse(arguments)), "spnr"))
+
+
+def guarded(work: Callable[[], None], name: str) -> int:
+    """Exit code of the work; an error that a person can mend is one line on stderr and code 2, a stop is code 130."""
+    enable_compilation_cache()
+    try:
+        work()
+    except KeyboardInterrupt as stop:
+        print(f"{name}: {str(stop) or 'stopped'}", file=sys.stderr)
+        return 130
+    except (ValueError, OSError) as error:
+        print(f"{name}: {one_line(error)}", file=sys.stderr)
+        return 2
+    return 0
+
+
+def parse(arguments: list[str]) -> Train | Evaluate | Render:
+    """The command with all its options; the preset named by --preset gives the defaults of the others."""
+    train = Annotated[Train, tyro.conf.subcommand("train", default=_train_defaults(arguments))]
+    evaluate = Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
+    render = Annotated[Render, tyro.conf.subcommand("render")]
+    return tyro.cli(train | evaluate | render, prog="spnr", description=DESCRIPTION, args=arguments)
+
+
+def _train_defaults(arguments: list[str]) -> Train:
+    preset = "tiny"
+    for i, argument in enumerate(arguments):
+        name, _, value = argument.partition("=")
+        if name == "--preset":
+            preset = value or (arguments[i + 1] if i + 1 < len(arguments) else "")
+    if preset not in configs.PRESETS:
+        raise ValueError(f"--preset {preset}: there are {', '.join(configs.PRESETS)}")
+    return Train(data=tyro.MISSING, run=tyro.MISSING, config=configs.PRESETS[preset]())
+
+
+def run(command: Train | Evaluate | Render) -> None:
+    """Carries a command out."""
+    {Train: run_train, Evaluate: run_evaluate, Render: run_render}[type(command)](command)
+
+
+def enable_compilation_cache() -> None:
+    """Lets a second run skip XLA's compilation; JAX_COMPILATION_CACHE_DIR moves the cache."""
+    import jax
+
+    if jax.config.jax_compilation_cache_dir is None:
+        jax.config.update("jax_compilation_cache_dir", str(Path.home() / ".cache" / "spnr_jax"))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+
+
+def run_train(command: Train) -> None:
+    """`spnr train`."""
+    from spnr_jax import data, trainer
+
+    dataset = data.open_dataset(command.data)
+    schedule = trainer.Schedule(
+        log_every=command.log_every, preview_every=command.preview_every, checkpoint_every=command.checkpoint_every
+    )
+    trainer.train(command.config, dataset, command.run, schedule)
+    print(f"trained: {command.run} (score it with `spnr evaluate {command.data} {command.run}`)")
+
+
+def run_evaluate(command: Evaluate) -> None:
+    """`spnr evaluate`."""
+    from spnr_jax import data, evaluation, trainer
+    from spnr_jax.results import write_results
+
+    start = time.monotonic()
+    dataset = data.open_dataset(command.data)
+    outcome = evaluation.evaluate(command.run, dataset, command.split, command.gallery)
+    out = command.out or command.run
+    seconds = {"evaluate": round(time.monotonic() - start, 1)}
+    write_results(out, outcome, dataset.settings, trainer.read_rows(command.run), seconds)
+    print(json.dumps(outcome.summary["methods"], indent=2))
+    print(f"wrote {out / 'metrics.json'} and {out / 'report.html'}")
+
+
+def run_render(command: Render) -> None:
+    """`spnr render`."""
+    from spnr_jax.pictures import render_file
+
+    options = {f.name: getattr(command, f.name) for f in dataclasses.fields(command)}
+    for line in render_file(**options):
+        print(line, flush=True)
+
+
+def one_line(error: Exception) -> str:
+    """What an error says, on one line; an error of the disk with its place."""
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.filename or 'disk'}: {error.strerror}"
+    return " ".join(str(error).split())
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,117 @@
+"""Arrays as image files: 8-bit values, a depth map in colours, a turntable as a film.
+
+Images are (height, width, 3) or grey (height, width), uint8 or float in [0, 1], sRGB.  Files are written beside their
+place and renamed into it: a reader sees the old content or the new, never half of it.
+"""
+
+import importlib.util
+import io
+import os
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Array
+from PIL import Image
+
+OPAQUE = 0.5  # opacity from which a pixel's depth counts for the range of the colours
+PALETTE_FRAMES = 24  # frames, spread over the film, that choose the colours of a GIF
+CENTISECOND = 0.01  # the clock of a GIF
+
+
+def to_uint8(image: np.ndarray | Array) -> np.ndarray:
+    """The image in 8 bits; values outside [0, 1], which an upsampler can produce, are shown as black or white."""
+    image = np.asarray(image)
+    if image.dtype == np.uint8:
+        return image
+    if not np.isfinite(image).all():
+        raise ValueError(f"an image of shape {image.shape} holds NaN or infinity")
+    return np.round(255 * np.clip(image, 0, 1)).astype(np.uint8)
+
+
+def depth_image(depth: np.ndarray | Array, acc: np.ndarray | Array) -> np.ndarray:
+    """Colours (h, w, 3) uint8 of distances (h, w), near bright and far dark, fading to white with the opacity (h, w).
+
+    The colours span the distances of the opaque pixels of this one image (matplotlib's viridis, perceptually uniform).
+    """
+    from matplotlib import colormaps  # here, so that importing the package stays light
+
+    depth, acc = np.asarray(depth, np.float64), np.asarray(acc, np.float64)
+    opaque = depth[acc > OPAQUE]
+    near, far = (opaque.min(), opaque.max()) if opaque.size else (0.0, 1.0)
+    nearness = np.clip((far - depth) / max(far - near, np.finfo(np.float32).tiny), 0, 1)
+    opacity = np.clip(acc, 0, 1)[..., None]
+    return to_uint8(opacity * colormaps["viridis"](nearness)[..., :3] + 1 - opacity)
+
+
+def png(image: np.ndarray | Array) -> bytes:
+    """The image as a PNG file."""
+    stream = io.BytesIO()
+    Image.fromarray(to_uint8(image)).save(stream, "png", optimize=True)
+    return stream.getvalue()
+
+
+def write_whole(path: Path, data: bytes) -> None:
+    """Write a file in one piece; folders that are missing are made."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = path.with_name(f".unfinished-{path.name}")
+    try:
+        unfinished.write_bytes(data)
+        os.replace(unfinished, path)
+    finally:
+        unfinished.unlink(missing_ok=True)
+
+
+def write_turntable(path: str | Path, frames: list[np.ndarray], fps: float | int) -> tuple[Path, str]:
+    """(file written, reason): an endless .gif, or an .mp4 where imageio-ffmpeg is installed.
+
+    Without it a .mp4 becomes the .gif of the same name, and the reason says so in one line; else it is empty.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in (".gif", ".mp4"):
+        raise ValueError(f"{path}: a turntable is a .gif or .mp4 file, not {path.suffix!r}")
+    if not frames or not fps > 0:
+        raise ValueError(f"{path}: a turntable needs frames and a positive rate, got {len(frames)} frames at {fps} fps")
+    pictures = [to_uint8(frame) for frame in frames]
+    if path.suffix.lower() == ".gif":
+        write_whole(path, _gif(pictures, fps))
+        return path, ""
+    if importlib.util.find_spec("imageio_ffmpeg") is None:
+        path = path.with_suffix(".gif")
+        write_whole(path, _gif(pictures, fps))
+        return path, "written as .gif: .mp4 needs the package imageio-ffmpeg (pip install imageio-ffmpeg)"
+    _write_mp4(path, pictures, fps)
+    return path, ""
+
+
+def _gif(pictures: list[np.ndarray], fps: float | int) -> bytes:
+    """A GIF that loops; all frames share one palette, or still surfaces would flicker."""
+    chosen = np.unique(np.linspace(0, len(pictures) - 1, PALETTE_FRAMES).round().astype(int))
+    strip = Image.fromarray(np.concatenate([pictures[i] for i in chosen]))
+    palette = strip.quantize(256, method=Image.Quantize.MEDIANCUT, kmeans=2, dither=Image.Dither.NONE)
+    images = [Image.fromarray(picture).quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
+    milliseconds = round(1 / (fps * CENTISECOND)) * round(1000 * CENTISECOND)
+    stream = io.BytesIO()
+    images[0].save(
+        stream, "gif", save_all=True, append_images=images[1:], duration=milliseconds, loop=0, optimize=False
+    )
+    return stream.getvalue()
+
+
+def _write_mp4(path: Path, pictures: list[np.ndarray], fps: float | int) -> None:
+    """Write H.264 that every player opens, which wants even sides: an odd one loses its last pixel row."""
+    import imageio_ffmpeg
+
+    height, width = (size - size % 2 for size in pictures[0].shape[:2])
+    path.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = path.with_name(f".unfinished-{path.name}")
+    try:
+        writer = imageio_ffmpeg.write_frames(
+            str(unfinished), (width, height), fps=fps, quality=8, macro_block_size=2, ffmpeg_log_level="error"
+        )
+        writer.send(None)
+        for picture in pictures:
+            writer.send(np.ascontiguousarray(picture[:height, :width]))
+        writer.close()
+        os.replace(unfinished, path)
+    finally:
+        unfinished.unlink(missing_ok=True)

@@ -1,0 +1,89 @@
+"""The handle for people who only want pictures: load a network, encode a cloud once, render it from anywhere.
+
+    model = spnr_jax.load("runs/demo/train")
+    volume = model.encode(spnr_jax.read_cloud("chair.ply"))
+    rendering = model.render(volume, model.camera(volume, azimuth=30, elevation=20))
+
+Clouds, cameras and depths are in the cloud's own units; the transform into the network's box is kept with the volume.
+"""
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Float
+
+from spnr_jax import cameras, checkpoint, clouds, training
+from spnr_jax.config import ModelConfig
+from spnr_jax.types import Camera, PointCloud, Rendering
+
+RAY_CHUNK = 64 * 64  # rays rendered at once: about 300 MB at 128 samples
+FIELD_OF_VIEW, DISTANCE = np.deg2rad(40.0), 3.0  # of the training cameras; the object fits into the unit sphere
+
+
+@struct.dataclass
+class Volume:
+    """An encoded object: features in the box [-1, 1]^3, which is (position - centre) * scale of the cloud."""
+
+    features: Float[Array, "d d d features"]
+    centre: Float[Array, "3"]
+    scale: Float[Array, ""]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Model:
+    """A trained network; `encode` and `render` are jitted, one compilation per bucket of points and image size."""
+
+    config: ModelConfig
+    variables: dict
+
+    def encode(self, cloud: PointCloud) -> Volume:
+        """Volume of a cloud (unbatched, any units, y up).  ValueError if it holds no points or more than its file said."""
+        positions = np.asarray(cloud.positions, np.float32)
+        mask = np.asarray(cloud.mask)
+        if not mask.any():
+            raise ValueError("the cloud has no points; give at least one")
+        if not np.isfinite(positions[mask]).all():
+            raise ValueError("the cloud has NaN or infinite positions; remove those points")
+        centre, scale = clouds.normalization(positions[mask])
+        cloud = dataclasses.replace(cloud, positions=((positions - centre) * scale).astype(np.float32))
+        cloud = clouds.pad(cloud, clouds.bucket(len(positions)))
+        features = training.jitted_encode(
+            self.variables, jax.tree.map(lambda x: jnp.asarray(x)[None], cloud), config=self.config
+        )
+        return Volume(features=features[0], centre=jnp.asarray(centre), scale=jnp.asarray(scale))
+
+    def render(self, volume: Volume, camera: Camera) -> Rendering:
+        """The object as the camera (unbatched, or with one axis of views) sees it; depth in the cloud's units."""
+        single = camera.cam_to_world.ndim == 2
+        rotation, eye = camera.cam_to_world[..., :3], camera.cam_to_world[..., 3]
+        pose = jnp.concatenate([rotation, ((eye - volume.centre) * volume.scale)[..., None]], axis=-1)
+        inside = dataclasses.replace(camera, cam_to_world=pose)
+        inside = jax.tree.map(lambda x: jnp.asarray(x).reshape(1, -1, *x.shape[-2:]), inside)
+        rendering = training.jitted_render(
+            self.variables, volume.features[None], inside, config=self.config, ray_chunk=RAY_CHUNK
+        )
+        rendering = dataclasses.replace(rendering, depth=rendering.depth / volume.scale)
+        return jax.tree.map(lambda x: x[0, 0] if single else x[0], rendering)
+
+    def camera(
+        self, volume: Volume, azimuth: float = 30.0, elevation: float = 20.0, resolution: int | None = None
+    ) -> Camera:
+        """Camera that sees the whole object: degrees around the y axis from +z, and above the horizon."""
+        pose = cameras.orbit(np.deg2rad(azimuth), np.deg2rad(elevation), DISTANCE / float(volume.scale), volume.centre)
+        size = resolution or self.config.image_resolution
+        return cameras.pinhole(pose, FIELD_OF_VIEW, size, size)
+
+
+def load(run: Path | str) -> Model:
+    """The averaged network of a run folder's newest checkpoint."""
+    run = Path(run)
+    config = checkpoint.read_config(run)
+    state = checkpoint.restore(run, config)
+    if state is None:
+        raise ValueError(f"{run}: the run has no checkpoint yet; go on with `spnr train DATA {run}`")
+    return Model(config=config.model, variables=training.averaged_variables(state))

@@ -1,0 +1,173 @@
+"""The training loop: batches in, steps, and everything that a person or a later run wants to see of it.
+
+    RUN/config.json  metrics.jsonl  tensorboard/  previews/STEP.png  checkpoints/STEP/
+
+A run goes on by itself from its newest readable checkpoint; the rows of metrics.jsonl after it are dropped, because they
+will be written again.  A loss that is not finite stops the run and names the step; the last checkpoint stays.
+"""
+
+import json
+import math
+import os
+import signal
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax
+import numpy as np
+from PIL import Image
+from tqdm import tqdm
+
+from spnr_jax import checkpoint, data, evaluation, training
+from spnr_jax.config import TrainConfig
+
+
+@dataclass(frozen=True, kw_only=True)
+class Schedule:
+    """How often the loop does what is not training, in steps."""
+
+    log_every: int = 20
+    """Steps between rows of metrics.jsonl and TensorBoard."""
+    preview_every: int = 500
+    """Steps between preview images and validation scores."""
+    checkpoint_every: int = 500
+    """Steps between checkpoints."""
+
+
+class NotFinite(ValueError):
+    """A loss is NaN or infinite; the message names step and quantity."""
+
+
+def train(config: TrainConfig, dataset: data.Dataset, run: Path, schedule: Schedule) -> training.TrainState:
+    """The state after the config's last step; goes on where an earlier call left the run folder."""
+    checkpoint.write_config(run, config)
+    state = checkpoint.restore(run, config, say=tqdm.write) or training.create_state(config)
+    first = int(state.step)
+    if first:
+        tqdm.write(f"resuming {run} at step {first} of {config.num_steps}")
+    if first >= config.num_steps:
+        return state
+    log = MetricsLog(run, first)
+    adversarial_from = training.first_adversarial_step(config)
+    batches = data.batches(dataset, config, first)
+    pending: list[tuple[int, dict]] = []
+    with stop_requests() as requests, tqdm(total=config.num_steps, initial=first, unit="step", mininterval=1) as bar:
+        since = time.monotonic()
+        for step, batch in enumerate(batches, start=first):
+            state, metrics = training.jitted_train_step(
+                state, jax.device_put(batch), config=config, adversarial=step >= adversarial_from
+            )
+            pending.append((step + 1, metrics))
+            bar.update()
+            last = step + 1 == config.num_steps or bool(requests)
+            if last or (step + 1) % schedule.log_every == 0:
+                rows = check_finite(jax.device_get(pending))
+                pace = 1000 * (time.monotonic() - since) / len(rows)
+                log.write({"step": step + 1, **mean_row(rows), "ms_per_step": round(pace, 2)})
+                bar.set_postfix(loss=f"{rows[-1][1]['loss']:.2f}", psnr=f"{rows[-1][1]['psnr']:.1f}", refresh=False)
+                pending, since = [], time.monotonic()
+            if last or (step + 1) % schedule.checkpoint_every == 0:
+                checkpoint.save(run, state)
+                since = time.monotonic()
+            if last or (step + 1) % schedule.preview_every == 0:
+                log.write({"step": step + 1, **preview(state, config, dataset, run)})
+                since = time.monotonic()
+            if requests and step + 1 < config.num_steps:
+                raise KeyboardInterrupt(f"stopped at step {step + 1} of {config.num_steps}; the same command goes on from there")
+    log.close()
+    return state
+
+
+def check_finite(rows: list[tuple[int, dict]]) -> list[tuple[int, dict]]:
+    """The rows; NotFinite for the first that holds a number that is not finite."""
+    for step, metrics in rows:
+        for name, value in metrics.items():
+            if not math.isfinite(value):
+                raise NotFinite(
+                    f"{name} is {float(value)} at step {step}; the last checkpoint is kept. Try a lower learning rate "
+                    "or check the data with `spnr-data check`"
+                )
+    return rows
+
+
+def mean_row(rows: list[tuple[int, dict]]) -> dict[str, float]:
+    """Mean of each metric over steps."""
+    return {name: float(np.mean([metrics[name] for _, metrics in rows])) for name in rows[-1][1]}
+
+
+@contextmanager
+def stop_requests() -> Iterator[list[int]]:
+    """A list that fills when Ctrl-C or SIGTERM arrives: the loop ends its step, saves and stops."""
+    requests: list[int] = []
+    previous = {s: signal.signal(s, lambda number, _: requests.append(number)) for s in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield requests
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+
+class MetricsLog:
+    """metrics.jsonl and TensorBoard of a run; rows after `first_step` of an earlier run are dropped."""
+
+    def __init__(self, run: Path, first_step: int) -> None:
+        """Opens both for appending."""
+        from tensorboardX import SummaryWriter
+
+        path = run / "metrics.jsonl"
+        kept = [row for row in read_rows(run) if row["step"] <= first_step]
+        temporary = path.with_suffix(".partial")
+        temporary.write_text("".join(json.dumps(row) + "\n" for row in kept))
+        temporary.replace(path)
+        self._file = path.open("a")
+        self._board = SummaryWriter(str(run / "tensorboard"), purge_step=first_step)
+
+    def write(self, row: dict[str, float]) -> None:
+        """Appends one row; every entry but the step is a TensorBoard scalar."""
+        self._file.write(json.dumps(row) + "\n")
+        self._file.flush()
+        for name, value in row.items():
+            if name != "step":
+                self._board.add_scalar(name, value, row["step"])
+
+    def close(self) -> None:
+        """Flushes both to disk."""
+        os.fsync(self._file.fileno())
+        self._file.close()
+        self._board.close()
+
+
+def read_rows(run: Path) -> list[dict]:
+    """Rows of a run's metrics.jsonl; a last line that a crash cut off is left out."""
+    path = run / "metrics.jsonl"
+    rows = []
+    for line in path.read_text().splitlines() if path.exists() else []:
+        try:
+            rows.append(json.loads(line))
+        except ValueError:
+            break
+    return rows
+
+
+def preview(
+    state: training.TrainState, config: TrainConfig, dataset: data.Dataset, run: Path, num_objects: int = 6
+) -> dict[str, float]:
+    """Validation PSNR of the averaged network on a few objects; writes references over renderings to previews/."""
+    names = (dataset.splits["val"] or dataset.splits["train"])[:num_objects]
+    variables = training.averaged_variables(state)
+    columns, scores = [], []
+    for name in names:
+        item = data.read_object(dataset, name)
+        cloud = evaluation.test_cloud(item, config)
+        rendering = evaluation.render_views(variables, config, cloud, item.camera)
+        image, reference = np.clip(np.asarray(rendering.image), 0, 1), data.on_white(item.images)
+        scores.append(np.asarray(evaluation.metrics.psnr(image, reference)))
+        columns.append(np.concatenate([reference[0], image[0]]))
+    folder = run / "previews"
+    folder.mkdir(exist_ok=True)
+    picture = np.round(255 * np.concatenate(columns, axis=1)).astype(np.uint8)
+    Image.fromarray(picture).save(folder / f"{int(state.step):07d}.png")
+    return {"val_psnr": float(np.mean(np.concatenate(scores)))}

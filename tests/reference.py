@@ -1,0 +1,162 @@
+"""Plain-loop float64 twins of the kernels, for one ray or one volume: slow, and simple enough to be checked by eye."""
+
+import itertools
+import math
+
+import numpy as np
+
+
+def camera_ray(cam_to_world, focal, centre, row, column):
+    """Unit direction through a pixel centre; OpenGL axes, row 0 at the top."""
+    local = np.array([(column + 0.5 - centre[0]) / focal, -(row + 0.5 - centre[1]) / focal, -1.0])
+    direction = np.asarray(cam_to_world, np.float64)[:, :3] @ local
+    return direction / math.sqrt(direction @ direction)
+
+
+def box_interval(origin, direction, lo=-1.0, hi=1.0):
+    """(near, far) of the part of the ray at positive distance inside [lo, hi]^3, None where it misses."""
+    near, far = 0.0, math.inf
+    for o, d in zip(np.float64(origin), np.float64(direction), strict=True):
+        if d == 0:
+            if not lo <= o <= hi:
+                return None
+            continue
+        first, second = sorted(((lo - o) / d, (hi - o) / d))
+        near, far = max(near, first), min(far, second)
+    return (near, far) if far > near else None
+
+
+def importance(edges, weights, at, padding):
+    """For each number in `at`: where the cumulative mass of the step function reaches that share of the whole."""
+    edges, mass = np.float64(edges), np.float64(weights) + padding
+    mass = mass / mass.sum()
+    distances = []
+    for share in np.float64(at):
+        before = 0.0
+        for i, m in enumerate(mass):
+            if share < before + m or i == len(mass) - 1:
+                distances.append(edges[i] + min((share - before) / m, 1.0) * (edges[i + 1] - edges[i]))
+                break
+            before += m
+    return np.array(distances)
+
+
+def volume_weights(density, delta):
+    """(weights, residual transmittance): what is left of one unit of light after each interval in turn."""
+    light, weights = 1.0, []
+    for tau in np.float64(density) * np.float64(delta):
+        passed = light * math.exp(-tau)
+        weights.append(light * -math.expm1(-tau))
+        light = passed
+    return np.array(weights), light
+
+
+def composite(weights, values, background):
+    """Sum of what each interval sends, and the background through the rest."""
+    total = np.zeros(np.shape(values)[-1])
+    for weight, value in zip(np.float64(weights), np.float64(values), strict=True):
+        total += weight * value
+    return total + (1 - np.float64(weights).sum()) * np.float64(background)
+
+
+def voxel_of(position, resolution):
+    """(z, y, x) of the voxel that holds the position, None outside the box."""
+    if any(abs(p) > 1 for p in position):
+        return None
+    return tuple(min(int(math.floor((p + 1) * 0.5 * resolution)), resolution - 1) for p in np.float64(position)[::-1])
+
+
+def scatter_mean(positions, features, mask, resolution):
+    """(mean of the features in each voxel, occupancy), a list of points per voxel."""
+    inside = {}
+    for position, feature, valid in zip(positions, np.float64(features), mask, strict=True):
+        voxel = voxel_of(position, resolution)
+        if valid and voxel is not None:
+            inside.setdefault(voxel, []).append(feature)
+    volume = np.zeros((*[resolution] * 3, features.shape[-1]))
+    occupancy = np.zeros([resolution] * 3)
+    for voxel, members in inside.items():
+        volume[voxel] = np.mean(members, axis=0)
+        occupancy[voxel] = 1
+    return volume, occupancy
+
+
+def trilinear_taps(position, resolution):
+    """[(voxel, weight)] of the eight centres around a position; empty outside the box."""
+    if any(abs(p) > 1 for p in position):
+        return []
+    axes = []
+    for p in np.float64(position)[::-1]:
+        g = min(max((p + 1) * 0.5 * resolution - 0.5, 0.0), resolution - 1.0)
+        low = min(int(math.floor(g)), max(resolution - 2, 0))
+        axes.append([(low, 1 - (g - low)), (min(low + 1, resolution - 1), g - low)])
+    return [
+        (tuple(i for i, _ in corner), math.prod(w for _, w in corner)) for corner in itertools.product(*axes)
+    ]
+
+
+def trilinear(volume, position):
+    """Weighted mean of the eight nearest voxel centres."""
+    volume = np.float64(volume)
+    return sum((w * volume[voxel] for voxel, w in trilinear_taps(position, len(volume))), np.zeros(volume.shape[-1]))
+
+
+def convolution(x, kernel, stride=1, padding=1):
+    """Correlation of one channels-last array with a kernel (*window, in, out), output by output."""
+    x, kernel = np.float64(x), np.float64(kernel)
+    n, window = x.ndim - 1, kernel.shape[0]
+    x = np.pad(x, [*[(padding, padding)] * n, (0, 0)])
+    shape = [(size - window) // stride + 1 for size in x.shape[:-1]]
+    out = np.zeros((*shape, kernel.shape[-1]))
+    for place in np.ndindex(*shape):
+        patch = x[tuple(slice(stride * i, stride * i + window) for i in place)]
+        out[place] = np.tensordot(patch, kernel, axes=n + 1)
+    return out
+
+
+def repeat_twice(x):
+    """Nearest x2 on every axis but the last."""
+    for axis in range(x.ndim - 1):
+        x = np.repeat(x, 2, axis=axis)
+    return x
+
+
+def bilinear(x, height, width):
+    """One image resized with half-pixel centres, clamped at the border."""
+    out = np.zeros((height, width, x.shape[-1]))
+    for place in np.ndindex(height, width):
+        axes = []
+        for i, new, old in zip(place, (height, width), x.shape[:2], strict=True):
+            g = min(max((i + 0.5) * old / new - 0.5, 0.0), old - 1.0)
+            axes.append([(int(g), 1 - g % 1), (min(int(g) + 1, old - 1), g % 1)])
+        for (i, a), (j, b) in itertools.product(*axes):
+            out[place] += a * b * np.float64(x[i, j])
+    return out
+
+
+def area_downsample(image, size):
+    """Mean of one image over size x size equal cells, each pixel weighted by its overlap with the cell."""
+    image = np.float64(image)
+    height, width = image.shape[0] / size, image.shape[1] / size
+    out = np.zeros((size, size, image.shape[-1]))
+    for (i, j), (y, x) in itertools.product(np.ndindex(size, size), np.ndindex(*image.shape[:2])):
+        rows = min((i + 1) * height, y + 1) - max(i * height, y)
+        columns = min((j + 1) * width, x + 1) - max(j * width, x)
+        if rows > 0 and columns > 0:
+            out[i, j] += rows * columns / (height * width) * image[y, x]
+    return out
+
+
+def group_norm(x, groups, scale, bias, epsilon=1e-5):
+    """One array (*space, features), each group of consecutive channels to zero mean and unit variance."""
+    x, width = np.float64(x), x.shape[-1] // groups
+    out = np.empty_like(x)
+    for g in range(groups):
+        part = x[..., g * width : (g + 1) * width]
+        out[..., g * width : (g + 1) * width] = (part - part.mean()) / math.sqrt(part.var() + epsilon)
+    return out * scale + bias
+
+
+def softplus(x):
+    """log(1 + exp(x)) without overflow."""
+    return np.maximum(x, 0) + np.log1p(np.exp(-np.abs(np.float64(x))))

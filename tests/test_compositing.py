@@ -1,0 +1,132 @@
+"""Emission-absorption: weights, compositing, expected distance."""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import reference
+from laws import batch_law, close, gradient_law, numbers
+
+from spnr_jax.compositing import composite, expected_distance, interval_lengths, volume_weights
+
+DENSITY = 5 * jnp.abs(numbers(0, 2, 3, 8))
+DELTA = jnp.abs(numbers(1, 2, 3, 8))
+VALUES = numbers(2, 2, 3, 8, 4)
+
+
+class TestWeights:
+    def test_are_the_light_that_a_loop_loses(self):
+        weights, residual, density, delta = map(np.asarray, (*volume_weights(DENSITY, DELTA), DENSITY, DELTA))
+        for place in np.ndindex(2, 3):
+            close((weights[place], residual[place]), reference.volume_weights(density[place], delta[place]))
+
+    def test_obey_the_batch_and_gradient_laws(self):
+        batch_law(volume_weights, DENSITY, DELTA)
+        gradient_law(volume_weights, DENSITY, DELTA)
+
+    @pytest.mark.parametrize("scale", [0.0, 1e-8, 1.0, 1e3, 1e10])
+    def test_and_the_residual_sum_to_one(self, scale):
+        weights, residual = map(np.asarray, volume_weights(scale * DENSITY, DELTA))
+        assert (weights >= 0).all()
+        close(weights.sum(-1) + residual, np.ones((2, 3)), atol=1e-6)
+
+    @pytest.mark.parametrize(("k", "m"), list(itertools.product([-100, -10, 0, 10], repeat=2)))
+    def test_are_finite_in_value_and_gradient_for_every_scale_of_density_and_length(self, k, m):
+        rng = np.random.default_rng(3)
+        density = jnp.asarray(np.exp(k + rng.normal(size=64)), jnp.float32)
+        delta = jnp.asarray(np.exp(float(m)) * np.abs(rng.normal(size=64)) * (np.arange(64) % 8 > 0), jnp.float32)
+
+        def total(density, delta):
+            weights, residual = volume_weights(density, delta)
+            return jnp.sum(weights * jnp.arange(64.0)) + residual, (weights, residual)
+
+        (_, values), gradients = jax.jit(jax.value_and_grad(total, (0, 1), has_aux=True))(density, delta)
+        assert all(np.isfinite(x).all() for x in (*values, *gradients))
+        close(values, reference.volume_weights(density, delta), rtol=1e-4)
+
+    @pytest.mark.parametrize("place", [0, 4, 7])
+    def test_one_huge_density_stops_everything_where_it_is(self, place):
+        weights, residual = volume_weights(1e10 * jax.nn.one_hot(place, 8), jnp.full(8, 0.1))
+        close(weights, jax.nn.one_hot(place, 8))
+        assert residual == 0
+
+    def test_thin_intervals_are_not_lost(self):
+        weights, _ = volume_weights(jnp.full(64, 1e-6 / 64), jnp.ones(64))
+        assert weights.sum() == pytest.approx(1e-6, rel=1e-3)
+
+    def test_splitting_every_interval_changes_nothing(self):
+        weights, residual = volume_weights(DENSITY, DELTA)
+        halves, same = volume_weights(jnp.repeat(DENSITY, 2, axis=-1), jnp.repeat(DELTA / 2, 2, axis=-1))
+        close(halves.reshape(2, 3, 8, 2).sum(-1), weights)
+        close(same, residual)
+
+    def test_an_interval_without_length_changes_nothing(self):
+        with_empty = np.insert(DENSITY, 3, 1e10, axis=-1), np.insert(DELTA, 3, 0.0, axis=-1)
+        weights, residual = map(np.asarray, volume_weights(*map(jnp.asarray, with_empty)))
+        assert (weights[..., 3] == 0).all()
+        close((np.delete(weights, 3, axis=-1), residual), volume_weights(DENSITY, DELTA))
+
+    def test_optical_depth_keeps_its_precision_over_many_samples(self):
+        density = jnp.asarray(np.random.default_rng(4).gamma(0.1, size=128), jnp.float32)
+        close(volume_weights(density, jnp.ones(128)), reference.volume_weights(density, np.ones(128)), 3e-6, 1e-12)
+
+
+class TestIntervals:
+    def test_each_sample_owns_the_way_to_the_next_and_the_last_the_way_to_far(self):
+        close(interval_lengths(jnp.array([1.0, 1.5, 3.0]), jnp.array(3.25)), np.array([0.5, 1.5, 0.25]))
+
+    def test_obey_the_batch_and_gradient_laws(self):
+        distances, far = jnp.cumsum(DELTA, axis=-1), DELTA.sum(-1) + 1
+        batch_law(interval_lengths, distances, far)
+        gradient_law(interval_lengths, distances, far)
+
+
+class TestComposite:
+    weights, _ = volume_weights(DENSITY, DELTA)
+
+    def test_is_the_sum_over_samples_and_background(self):
+        colour, weights, values = map(np.asarray, (composite(self.weights, VALUES, 0.7), self.weights, VALUES))
+        for place in np.ndindex(2, 3):
+            close(colour[place], reference.composite(weights[place], values[place], 0.7))
+
+    def test_obeys_the_batch_and_gradient_laws(self):
+        background = numbers(5, 2, 3, 4)
+        batch_law(composite, self.weights, VALUES, background)
+        gradient_law(composite, self.weights, VALUES, background)
+
+    def test_an_empty_ray_is_exactly_the_background_and_values_get_no_gradient(self):
+        def white(values):
+            weights, _ = volume_weights(jnp.zeros((2, 3, 8)), DELTA)
+            return composite(weights, values, 1.0)
+
+        assert (white(VALUES) == 1).all()
+        close(jax.grad(lambda v: jnp.sum(white(v)))(VALUES), jnp.zeros_like(VALUES))
+
+
+class TestExpectedDistance:
+    distances = jnp.cumsum(DELTA, axis=-1)
+    far = DELTA.sum(-1) + 0.5
+    weights, _ = volume_weights(DENSITY, DELTA)
+
+    def test_obeys_the_batch_and_gradient_laws(self):
+        batch_law(expected_distance, self.weights, self.distances, self.far)
+        gradient_law(expected_distance, self.weights, self.distances, self.far)
+
+    @pytest.mark.parametrize("scale", [0.0, 1e-8, 1.0, 1e10])
+    def test_lies_between_the_first_sample_and_far(self, scale):
+        weights, _ = volume_weights(scale * DENSITY, DELTA)
+        distance = expected_distance(weights, self.distances, self.far)
+        assert (distance >= self.distances[..., 0] - 1e-5).all()
+        assert (distance <= self.far + 1e-5).all()
+
+    def test_light_that_nothing_stops_counts_as_far_with_a_finite_gradient(self):
+        def distance(density):
+            return expected_distance(volume_weights(density, DELTA)[0], self.distances, self.far)
+
+        assert (distance(jnp.zeros((2, 3, 8))) == self.far).all()
+        assert jnp.isfinite(jax.grad(lambda d: jnp.sum(distance(d)))(jnp.zeros((2, 3, 8)))).all()
+
+    def test_an_opaque_sample_is_where_it_is_seen(self):
+        close(expected_distance(jax.nn.one_hot(2, 4), jnp.array([1.0, 2.0, 3.0, 4.0]), jnp.array(9.0)), 3.0)

@@ -1,0 +1,140 @@
+"""Guarded division, unit vectors, and the gather and scatter that stay flat under vmap."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import reference
+from laws import batch_law, close, gradient_law, numbers
+
+from spnr_jax.numerics import gather_rows, normalize, per_feature, safe_divide, scatter_rows, softplus
+
+INDEX = jnp.asarray(np.random.default_rng(7).integers(0, 5, (2, 3, 4)), jnp.int32)
+
+
+class TestSafeDivide:
+    def test_is_division_at_every_batch_rank(self):
+        a, b = numbers(0, 2, 3, 4), numbers(1, 2, 3, 4)
+        batch_law(safe_divide, a, b)
+        close(safe_divide(a, b), np.float64(a) / np.float64(b))
+        gradient_law(safe_divide, a, b)
+
+    def test_a_zero_denominator_gives_zero_in_value_and_gradient(self):
+        value, gradient = jax.value_and_grad(lambda a, b: jnp.sum(safe_divide(a, b)), (0, 1))(
+            jnp.array([1.0, 0.0, -1e10]), jnp.zeros(3)
+        )
+        assert value == 0
+        close(gradient, (jnp.zeros(3), jnp.zeros(3)))
+
+    @pytest.mark.parametrize("denominator", [1e-8, -1e-8, 1e10, -1e10])
+    def test_the_sign_of_the_denominator_counts_however_small_it_is(self, denominator):
+        assert safe_divide(jnp.float32(3), jnp.float32(denominator)) == pytest.approx(3 / denominator, rel=1e-6)
+
+
+class TestNormalize:
+    def test_vectors_get_unit_length_and_keep_their_direction(self):
+        v = numbers(2, 2, 3, 3)
+        batch_law(normalize, v)
+        close(normalize(v), np.float64(v) / np.linalg.norm(v, axis=-1, keepdims=True))
+        gradient_law(normalize, v)
+
+    @pytest.mark.parametrize("scale", [1e-8, 1.0, 1e10])
+    def test_length_does_not_matter(self, scale):
+        close(normalize(scale * jnp.array([3.0, 0.0, -4.0])), jnp.array([0.6, 0.0, -0.8]))
+
+    def test_the_zero_vector_stays_zero_with_zero_gradient(self):
+        value, gradient = jax.value_and_grad(lambda v: jnp.sum(normalize(v)))(jnp.zeros(3))
+        assert value == 0
+        close(gradient, jnp.zeros(3))
+
+
+def test_per_feature_broadcasts_over_the_last_axis_alone():
+    close(jnp.zeros((4, 2, 3)) + per_feature(jnp.arange(3.0), jnp.zeros((4, 2, 3))), np.tile(np.arange(3.0), (4, 2, 1)))
+
+
+class TestRows:
+    """`gather_rows` and `scatter_rows` against plain indexing, in every way that vmap can map them."""
+
+    table, values = numbers(3, 2, 3, 5, 2), numbers(4, 2, 3, 4, 2)
+    maps = pytest.mark.parametrize("axes", [(0, 0), (0, None), (None, 0)], ids=["both", "table", "index"])
+
+    @staticmethod
+    def plain_gather(table, index):
+        return table[index]
+
+    @staticmethod
+    def plain_scatter(index, values):
+        return jnp.zeros((5, 2)).at[index].add(values)
+
+    @staticmethod
+    def scatter(index, values):
+        return scatter_rows(index, values, 5)
+
+    def nested(self, kernel, axes):
+        return jax.vmap(jax.vmap(kernel, in_axes=axes), in_axes=axes)
+
+    @maps
+    def test_gather_is_indexing_under_nested_vmap(self, axes):
+        arguments = [x if a == 0 else x[0, 0] for x, a in zip((self.table, INDEX), axes, strict=True)]
+        close(*(jax.jit(self.nested(f, axes))(*arguments) for f in (gather_rows, self.plain_gather)), rtol=0, atol=0)
+
+    @maps
+    def test_scatter_is_addition_under_nested_vmap(self, axes):
+        arguments = [x if a == 0 else x[0, 0] for x, a in zip((INDEX, self.values), axes, strict=True)]
+        close(*(jax.jit(self.nested(f, axes))(*arguments) for f in (self.scatter, self.plain_scatter)))
+
+    def test_different_axes_may_be_mapped_one_after_the_other(self):
+        def mapped(kernel):  # the table alone outside, the index alone inside
+            return jax.vmap(jax.vmap(kernel, (None, 0)), (0, None))(self.table[0], INDEX[0])
+
+        close(mapped(gather_rows), mapped(self.plain_gather))
+
+    @pytest.mark.parametrize("mapped", [False, True])
+    def test_first_and_second_order_gradients_are_those_of_indexing(self, mapped):
+        def derivatives(gather, scatter):
+            def energy(table, values, index):
+                return jnp.sum(gather(table**2, index) ** 3) + jnp.sum(scatter(index, values**2) ** 3 * table)
+
+            def slope(table, values, index):
+                gradient = jax.grad(energy, (0, 1))(table, values, index)
+                return jnp.sum(gradient[0] ** 2) + jnp.sum(jnp.sin(gradient[1]))
+
+            first, second = jax.grad(energy, (0, 1)), jax.grad(slope, (0, 1))
+            if mapped:
+                first, second = jax.vmap(jax.vmap(first)), jax.vmap(jax.vmap(second))
+                arguments = (self.table, self.values, INDEX)
+            else:
+                arguments = (self.table[0, 0], self.values[0, 0], INDEX[0, 0])
+            return jax.jit(lambda *a: (first(*a), second(*a)))(*arguments)
+
+        close(derivatives(gather_rows, self.scatter), derivatives(self.plain_gather, self.plain_scatter), rtol=1e-4)
+
+    def test_gather_and_scatter_are_adjoint(self):
+        table, values, index = self.table[1, 2], self.values[1, 2], INDEX[1, 2]
+        assert jnp.vdot(gather_rows(table, index), values) == pytest.approx(
+            float(jnp.vdot(table, self.scatter(index, values))), rel=1e-5
+        )
+
+    def test_no_index_gathers_nothing_and_scatters_zeros(self):
+        none = jnp.zeros((0,), jnp.int32)
+        assert gather_rows(self.table[0, 0], none).shape == (0, 2)
+        close(self.scatter(none, jnp.zeros((0, 2))), jnp.zeros((5, 2)))
+
+
+class TestSoftplus:
+    def test_is_log_one_plus_exp_with_the_sigmoid_as_gradient(self):
+        x = 5 * numbers(5, 2, 3, 4)
+        batch_law(softplus, x)
+        gradient_law(softplus, x)
+        close(softplus(x), reference.softplus(x))
+
+    @pytest.mark.parametrize("x", [-1e10, -1e4, -1e-8, 0.0, 1e-8, 1e4, 1e10])
+    def test_is_finite_at_the_extremes_and_its_gradient_lies_between_zero_and_one(self, x):
+        value, gradient = jax.value_and_grad(softplus)(jnp.float32(x))
+        assert value == pytest.approx(max(x, 0) + (np.log(2) if abs(x) < 1 else 0), rel=1e-6)
+        assert 0 <= gradient <= 1
+
+    def test_its_second_derivative_is_that_of_log_one_plus_exp(self):
+        x = np.linspace(-3, 3, 7, dtype=np.float32)
+        second = jax.jit(jax.vmap(jax.grad(jax.grad(softplus))))(jnp.asarray(x))
+        close(second, 1 / (1 + np.exp(-x)) / (1 + np.exp(x)))

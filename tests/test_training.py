@@ -1,0 +1,330 @@
+"""The training step: two networks, one forward, and a state that repeats itself bit for bit."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from laws import close, numbers, same_bits
+
+from spnr_jax import losses, training
+from spnr_jax.cameras import look_at, pinhole
+from spnr_jax.config import LossConfig, ModelConfig, OptimizerConfig, SamplingConfig, TrainConfig
+from spnr_jax.renderer import Renderer
+from spnr_jax.types import Batch, PointCloud
+
+SIZE = 24  # the smallest image that the discriminator can judge
+MODEL = ModelConfig(
+    point_widths=(8,),
+    point_features=4,
+    volume_resolution=8,
+    base_width=4,
+    num_stages=1,
+    num_groups=2,
+    field_width=8,
+    num_features=5,
+    direction_frequencies=1,
+    sampling=SamplingConfig(num_coarse=4, num_fine=4),
+    render_resolution=8,
+    resize_resolution=12,
+    image_resolution=SIZE,
+    upsampler_width=4,
+)
+CONFIG = TrainConfig(
+    model=MODEL,
+    loss=LossConfig(discriminator_width=4, r1_interval=2),
+    optimizer=OptimizerConfig(lr_generator=3e-3, warmup_steps=4, ema_decay=0.9),
+    num_steps=100,
+    batch_objects=2,
+    max_points=40,
+    min_points=40,
+)
+L1_ONLY = dataclasses.replace(CONFIG, loss=dataclasses.replace(CONFIG.loss, adversarial_weight=0.0))
+create = jax.jit(training.create_state, static_argnums=0)
+
+
+def batch(views=1):
+    """Two coloured balls on white, each seen from its own side."""
+    directions = np.random.default_rng(0).normal(size=(2, 40, 3)).astype(np.float32)
+    positions = 0.5 * directions / np.linalg.norm(directions, axis=-1, keepdims=True)
+    colors = np.float32([[0.8, 0.2, 0.1], [0.1, 0.3, 0.7]])
+    eyes = np.float32([[[0, 0.5, 2.5]], [[2.5, 0.5, 0]]]).repeat(views, axis=1)
+    pose = look_at(jnp.asarray(eyes), jnp.zeros(eyes.shape), jnp.broadcast_to(jnp.array([0.0, 1.0, 0.0]), eyes.shape))
+    rows, columns = np.mgrid[:SIZE, :SIZE] + 0.5 - SIZE / 2
+    disc = np.broadcast_to((np.hypot(rows, columns) < 0.3 * SIZE)[None, None], (2, views, SIZE, SIZE))
+    image = np.where(disc[..., None], colors[:, None, None, None], np.float32(1))
+    points = np.broadcast_to(colors[:, None], (2, 40, 3))
+    cloud = PointCloud(positions=positions, base_color=points, roughness=points[..., 0], metallic=points[..., 1] * 0,
+                       mask=np.ones((2, 40), bool))
+    mask = disc & (np.random.default_rng(1).uniform(size=disc.shape) < 0.2)
+    made = Batch(cloud=cloud, camera=pinhole(pose, 0.6, SIZE, SIZE), image=image, condition=image * mask[..., None],
+                 condition_mask=mask)
+    return jax.tree.map(jnp.asarray, made)
+
+
+def step(state, config=CONFIG, data=None):
+    """One jitted step on a copy: the state that is passed in gets donated."""
+    return training.jitted_train_step(
+        jax.tree.map(jnp.copy, state), batch() if data is None else data, config=config, adversarial=config is CONFIG
+    )
+
+
+def run(state, steps, config=CONFIG):
+    for _ in range(steps):
+        state, metrics = step(state, config)
+    return state, metrics
+
+
+@pytest.fixture(scope="module")
+def fresh():
+    return create(CONFIG)
+
+
+@pytest.fixture(scope="module")
+def fresh_l1():
+    return create(L1_ONLY)
+
+
+def through_host(state):
+    """The state as it would come back from a file: NumPy arrays, the key as its data."""
+    data = jax.tree.map(np.asarray, dataclasses.replace(state, key=jax.random.key_data(state.key)))
+    restored = jax.tree.map(jnp.asarray, data)
+    return dataclasses.replace(restored, key=jax.random.wrap_key_data(restored.key))
+
+
+class TestState:
+    def test_equal_seeds_give_equal_bits_and_other_seeds_other_weights(self, fresh):
+        same_bits(create(CONFIG), fresh)
+        other = create(dataclasses.replace(CONFIG, seed=1))
+        kernel = fresh.generator["unet"]["stem"]["kernel"]
+        assert (other.generator["unet"]["stem"]["kernel"] != kernel).mean() > 0.99
+
+    def test_the_average_starts_as_the_generator_in_its_own_memory(self, fresh):
+        state = training.create_state(CONFIG) if False else fresh
+        same_bits(state.averaged, state.generator)
+        same_bits(state.averaged_stats, state.batch_stats)
+
+    def test_there_is_no_discriminator_at_weight_zero_or_if_its_time_never_comes(self, fresh, fresh_l1):
+        assert fresh.discriminator is not None
+        assert fresh_l1.discriminator is None
+        assert fresh_l1.discriminator_optimizer is None
+        late = dataclasses.replace(CONFIG, loss=dataclasses.replace(CONFIG.loss, adversarial_start=1.0))
+        assert training.first_adversarial_step(late) == late.num_steps
+        assert jax.eval_shape(training.create_state, late).discriminator is None
+
+    @pytest.mark.parametrize(("share", "first"), [(0.0, 0), (0.25, 25), (1.0, 100)])
+    def test_the_discriminator_joins_after_its_share_of_the_steps(self, share, first):
+        loss = dataclasses.replace(CONFIG.loss, adversarial_start=share)
+        assert training.first_adversarial_step(dataclasses.replace(CONFIG, loss=loss)) == first
+
+
+class TestGraph:
+    @staticmethod
+    def traced(state, config, adversarial):
+        lowered = training.jitted_train_step.lower(state, batch(), config=config, adversarial=adversarial)
+        return lowered.as_text(debug_info=True)
+
+    def test_the_l1_graph_contains_no_discriminator(self, fresh, fresh_l1):
+        assert "Discriminator" in self.traced(fresh, CONFIG, True)
+        assert "Discriminator" not in self.traced(fresh_l1, L1_ONLY, False)
+
+    def test_before_its_time_the_discriminator_is_handed_through_untouched(self, fresh):
+        def after(state):
+            return training.train_step(state, batch(), config=CONFIG, adversarial=False)[0]
+
+        traced = jax.make_jaxpr(after, return_shape=True)(fresh)
+        jaxpr, shape = traced
+        names = [jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_leaves_with_path(shape)]
+        kept = [out for name, out in zip(names, jaxpr.jaxpr.outvars, strict=True) if name.startswith(".discriminator")]
+        assert kept
+        assert set(map(id, kept)) <= set(map(id, jaxpr.jaxpr.invars))
+
+    def test_the_step_compiles_once(self, fresh):
+        state, _ = step(fresh)
+        compiled = training.jitted_train_step._cache_size()
+        for seed in range(3):
+            state, _ = step(state, data=dataclasses.replace(batch(), image=numbers(seed, 2, 1, SIZE, SIZE, 3)))
+        assert training.jitted_train_step._cache_size() == compiled
+
+    def test_the_state_is_donated(self, fresh):
+        state = jax.tree.map(jnp.copy, fresh)
+        training.jitted_train_step(state, batch(), config=CONFIG, adversarial=True)
+        assert all(leaf.is_deleted() for leaf in jax.tree.leaves((state.generator, state.averaged, state.discriminator)))
+
+
+class TestStep:
+    def test_is_the_discriminators_update_and_then_the_generators_written_out(self, fresh):
+        """One forward and one pull-back give what two separate losses with their own forwards give."""
+        data = batch()
+        state, metrics = step(fresh)
+        generator_adam, discriminator_adam = training.optimizers(CONFIG)
+
+        @jax.jit
+        def written_out(start, data):
+            key = jax.random.fold_in(start.key, 0)
+            real, condition, mask = data.image[:, 0], data.condition[:, 0], data.condition_mask[:, 0]
+
+            def forward(params):
+                variables = {"params": params, "batch_stats": start.batch_stats}
+                return Renderer(MODEL).apply(
+                    variables, data.cloud, data.camera, jax.random.clone(key), train=True, mutable=["batch_stats"]
+                )
+
+            def judge(params, image):
+                return training.discriminator_of(CONFIG).apply({"params": params}, image, condition, mask)
+
+            def discriminator_loss(params):
+                fake = jax.lax.stop_gradient(forward(start.generator)[0].image[:, 0])
+                penalty = losses.r1(lambda image: judge(params, image), real)
+                loss = losses.discriminator_adversarial(judge(params, real), judge(params, fake))
+                return loss + CONFIG.loss.r1_interval * CONFIG.loss.r1_gamma * penalty
+
+            gradient = jax.grad(discriminator_loss)(start.discriminator)
+            update, _ = discriminator_adam.update(gradient, start.discriminator_optimizer)
+            discriminator = optax.apply_updates(start.discriminator, update)
+
+            def generator_loss(params):
+                rendering, _ = forward(params)
+                low = losses.area_downsample(data.image, 8)
+                l1 = losses.l1(rendering.image, data.image) + 0.5 * losses.l1(rendering.image_lr, low)
+                return 100 * l1 + losses.generator_adversarial(judge(discriminator, rendering.image[:, 0]))
+
+            loss, gradient = jax.value_and_grad(generator_loss)(start.generator)
+            return discriminator, loss, generator_adam.update(gradient, start.generator_optimizer)[1]
+
+        discriminator, loss, optimizer = written_out(fresh, data)
+        close(state.discriminator, discriminator, rtol=1e-3, atol=2e-6)
+        close(metrics["loss"], loss)
+        for ours, expected in zip(
+            jax.tree.leaves(state.generator_optimizer[0].mu), jax.tree.leaves(optimizer[0].mu), strict=True
+        ):
+            close(ours, expected, rtol=1e-3, atol=1e-3 * float(np.abs(expected).max()) + 1e-9)
+
+    def test_counts_itself_and_moves_both_networks(self, fresh):
+        state, metrics = step(fresh)
+        assert state.step == 1
+        for before, after in ((fresh.generator, state.generator), (fresh.discriminator, state.discriminator)):
+            moved = [(a != b).any() for a, b in zip(jax.tree.leaves(before), jax.tree.leaves(after), strict=True)]
+            assert np.mean(moved) > 0.5
+        assert all(np.isfinite(value) for value in metrics.values())
+
+    def test_metrics_are_those_of_the_rendering(self, fresh_l1):
+        _, metrics = step(fresh_l1, L1_ONLY)
+        assert set(metrics) == {"psnr", "l1", "loss", "gradient_norm"}
+        assert metrics["loss"] > 100 * metrics["l1"], "the low-resolution part comes on top"
+
+    def test_running_statistics_are_those_of_the_forward(self, fresh_l1):
+        state, _ = step(fresh_l1, L1_ONLY)
+        stats = state.batch_stats["pointnet"]["norm_0"]
+        assert (stats["mean"] != 0).all()
+        assert (stats["variance"] != 1).all()
+
+
+class TestLazyR1:
+    @pytest.mark.parametrize(("at", "due"), [(0, True), (1, False), (2, True), (3, False)])
+    def test_the_penalty_comes_every_interval_and_is_scaled_by_it(self, fresh, at, due):
+        data, fake = batch(), numbers(2, 2, SIZE, SIZE, 3)
+        real, condition, mask = data.image[:, 0], data.condition[:, 0], data.condition_mask[:, 0]
+
+        @jax.jit
+        def parts(params, step):
+            loss, metrics = training.discriminator_loss(CONFIG, params, fake, data, step)
+            module = training.discriminator_of(CONFIG)
+            penalty = losses.r1(lambda image: module.apply({"params": params}, image, condition, mask), real)
+            return loss - metrics["discriminator"], 2 * 10 * penalty
+
+        added, penalty = parts(fresh.discriminator, jnp.int32(at))
+        assert penalty > 0
+        close(added, penalty * due, rtol=1e-3, atol=1e-5)
+
+
+class TestAverage:
+    def test_moves_by_a_decay_that_grows_from_a_tenth_to_its_end(self, fresh_l1):
+        state = fresh_l1
+        for at in (0, 1, 200):
+            state = dataclasses.replace(state, step=jnp.int32(at))
+            after, _ = step(state, L1_ONLY)
+            decay = min(0.9, (1 + at) / (10 + at))
+            expected = jax.tree.map(
+                lambda old, new, decay=decay: decay * old + (1 - decay) * new,
+                (state.averaged, state.averaged_stats),
+                (after.generator, after.batch_stats),
+            )
+            close((after.averaged, after.averaged_stats), expected, atol=1e-7)
+            state = after
+
+    def test_evaluation_uses_it(self, fresh_l1):
+        state, _ = run(fresh_l1, 3, L1_ONLY)
+        variables = training.averaged_variables(state)
+        same_bits(variables, {"params": state.averaged, "batch_stats": state.averaged_stats})
+
+
+class TestLearningRate:
+    @pytest.mark.parametrize(("warmup", "steps"), [(10, 100), (0, 50), (500, 100), (1, 1)])
+    def test_rises_linearly_then_falls_by_a_cosine_to_its_last_share(self, warmup, steps):
+        o = OptimizerConfig(lr_generator=2e-3, warmup_steps=warmup, final_lr_scale=0.1)
+        rate = training.learning_rate(dataclasses.replace(CONFIG, optimizer=o, num_steps=steps))
+        warmup = min(warmup, steps)
+        start = 2e-3 / max(warmup, 1)
+        for at in sorted({0, warmup // 2, warmup, (warmup + steps) // 2, steps - 1}):
+            if at <= warmup and warmup:
+                expected = start + (2e-3 - start) * at / warmup
+            else:
+                share = min((at - warmup) / (max(steps, warmup + 1) - warmup), 1)
+                expected = 2e-3 * (0.1 + 0.9 * 0.5 * (1 + np.cos(np.pi * share)))
+            assert float(rate(at)) == pytest.approx(expected, rel=1e-5)
+        assert float(rate(0)) > 0, "no step is lost"
+
+
+class TestReproducibility:
+    def test_two_runs_from_one_seed_are_equal_bit_by_bit(self, fresh):
+        same_bits(run(fresh, 3), run(create(CONFIG), 3))
+
+    def test_a_run_that_stops_and_resumes_is_the_run_that_did_not(self, fresh):
+        whole, _ = run(fresh, 4)
+        half, _ = run(fresh, 2)
+        resumed, _ = run(through_host(half), 2)
+        same_bits(resumed, whole)
+
+    def test_every_step_draws_new_samples(self, fresh_l1):
+        """The same weights and batch, one step later: another jitter, another loss."""
+        (_, first), (_, later) = (
+            step(dataclasses.replace(fresh_l1, step=jnp.int32(s)), L1_ONLY) for s in (0, 1)
+        )
+        assert first["loss"] != later["loss"]
+
+
+def test_seeds_in_one_compiled_step_are_the_loop_over_seeds(fresh_l1):
+    def varied(seed):
+        generator = jax.tree.map(lambda x: x + 0.1 * numbers(seed, *x.shape), fresh_l1.generator)
+        return dataclasses.replace(fresh_l1, generator=generator, key=jax.random.key(seed))
+
+    states = [varied(seed) for seed in (3, 4)]
+    stacked = jax.tree.map(lambda *x: jnp.stack(x), *states)
+    mapped = jax.vmap(lambda s, b: training.train_step(s, b, config=L1_ONLY, adversarial=False), in_axes=(0, None))
+    after, metrics = jax.jit(mapped)(stacked, batch())
+    for i, state in enumerate(states):
+        alone, alone_metrics = step(state, L1_ONLY)
+        one = jax.tree.map(lambda x, i=i: x[i], (after, metrics))
+        close(one[1], alone_metrics, rtol=1e-4)
+        close(one[0].batch_stats, alone.batch_stats, rtol=1e-4)
+        for ours, expected in zip(
+            jax.tree.leaves(one[0].generator_optimizer[0].mu), jax.tree.leaves(alone.generator_optimizer[0].mu), strict=True
+        ):
+            close(ours, expected, rtol=1e-3, atol=1e-3 * float(np.abs(expected).max()) + 1e-9)
+
+
+def test_one_batch_is_learnt_by_heart(fresh_l1):
+    """Two balls on white: sixty steps take two thirds of the loss away."""
+    _, start = step(fresh_l1, L1_ONLY)
+    _, end = run(fresh_l1, 60, L1_ONLY)
+    assert end["loss"] < start["loss"] / 3
+
+
+def test_adversarial_training_stays_finite_and_still_learns(fresh):
+    _, start = step(fresh)
+    _, end = run(fresh, 40)
+    assert all(np.isfinite(value) for value in end.values())
+    assert end["l1"] < start["l1"]

@@ -1,0 +1,53 @@
+"""3D U-Net: the sparse stem, the widths of its stages, and the skips."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from laws import close, numbers
+
+from spnr_jax.nn.unet3d import UNet3D
+
+ROWS = jnp.asarray(np.random.default_rng(0).integers(0, 513, (2, 20)), jnp.int32)
+VALUES = numbers(1, 2, 20, 3)
+MODULE = UNet3D(resolution=8, base_width=4, num_stages=2, num_groups=2)
+VARIABLES = jax.jit(MODULE.init)(jax.random.key(0), ROWS, VALUES)
+apply = jax.jit(MODULE.apply)
+
+
+def test_each_stage_halves_the_resolution_doubles_the_channels_and_comes_back():
+    kernels = {name: block["kernel"].shape[-2:] for name, block in VARIABLES["params"].items()}
+    assert kernels == {
+        "stem": (3, 4),
+        "down_0": (4, 8),
+        "same_0": (8, 8),
+        "down_1": (8, 16),
+        "same_1": (16, 16),
+        "up_0": (16, 8),
+        "up_1": (8, 4),
+    }
+    assert apply(VARIABLES, ROWS, VALUES).shape == (2, 8, 8, 8, 4)
+
+
+def test_objects_do_not_see_each_other():
+    whole = apply(VARIABLES, ROWS, VALUES)
+    close(jax.jit(MODULE.apply)(VARIABLES, ROWS[1:], VALUES[1:]), whole[1:], atol=1e-5)
+
+
+def test_without_its_decoder_the_stem_alone_reaches_the_output():
+    """Skips are additions: blocks of zeros add relu(bias) = 0 to what the stem sends across."""
+    silent = {
+        name: block if name == "stem" else jax.tree.map(jnp.zeros_like, block)
+        for name, block in VARIABLES["params"].items()
+    }
+    stem, out = (apply({"params": p}, ROWS, VALUES) for p in (silent, VARIABLES["params"]))
+    assert (stem >= 0).all()
+    assert (stem > 0).any()
+    assert (out >= stem).all(), "a decoder block adds its ReLU"
+    assert (out > stem).any()
+
+
+def test_a_point_reaches_the_whole_volume_through_the_coarsest_stage():
+    def far_corner(values):
+        return jnp.sum(MODULE.apply(VARIABLES, jnp.zeros((1, 1), jnp.int32), values)[0, -1, -1, -1])
+
+    assert jnp.abs(jax.jit(jax.grad(far_corner))(jnp.ones((1, 1, 3)))).max() > 0
