@@ -8,6 +8,7 @@ merged    parts with equal materials (by value) are one part: a renderer compile
 
 import hashlib
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -77,8 +78,8 @@ def _cleaned(part: Part, notes: set[str]) -> list[Part]:
 def _used_vertices(part: Part) -> Part:
     """The part with only the vertices that its faces use, in their old order."""
     used, faces = np.unique(part.faces, return_inverse=True)
-    columns = {name: getattr(part, name) for name in WIDTHS}
-    kept = {name: None if values is None else values[used] for name, values in columns.items()}
+    kept: dict[str, Any] = {name: getattr(part, name) for name in WIDTHS}
+    kept = {name: None if values is None else values[used] for name, values in kept.items()}
     return replace(part, **kept, faces=faces.reshape(-1, 3).astype(np.int64))
 
 
@@ -88,14 +89,10 @@ def _settle_texture(part: Part, notes: set[str]) -> Part:
         return replace(part, texcoords=None)
     if part.texcoords is None:
         notes.add("texture on faces without texture coordinates (its mean is used)")
-        means = {
-            "base_color": part.material.base_color.reshape(-1, 3).mean(axis=0),
-            "roughness": part.material.roughness.mean(),
-            "metallic": part.material.metallic.mean(),
-        }
-        return replace(
-            part, material=replace(part.material, **{k: np.asarray(v, np.float32) for k, v in means.items()})
-        )
+        material = part.material
+        means = material.base_color.reshape(-1, 3).mean(axis=0), material.roughness.mean(), material.metallic.mean()
+        base_color, roughness, metallic = (np.asarray(mean, np.float32) for mean in means)
+        return replace(part, material=replace(material, base_color=base_color, roughness=roughness, metallic=metallic))
     if not (np.abs(part.texcoords) < MAX_TEXCOORD).all():
         raise RejectedAsset(f"has texture coordinates that are not finite, or beyond {MAX_TEXCOORD:g}: broken file")
     return part

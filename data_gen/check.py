@@ -122,7 +122,7 @@ def cam_to_world(transforms: dict) -> np.ndarray:
 
 def print_table(dataset: Path, object_ids, num_views: int, agreements, covered, faults) -> None:
     """Print the figures of a data set and its faults."""
-    rows = [("objects", len(object_ids)), ("views", num_views)]
+    rows: list[tuple[str, object]] = [("objects", len(object_ids)), ("views", num_views)]
     rows += [(split, len(records.read_split(dataset, split))) for split in records.SPLITS if has_split(dataset, split)]
     if (dataset / "rejected.jsonl").is_file():
         rows.append(("left out", len((dataset / "rejected.jsonl").read_text().splitlines())))

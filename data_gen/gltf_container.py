@@ -86,9 +86,10 @@ class GltfFile:
     def _buffer(self, index: int) -> bytes:
         if index not in self._buffers:
             uri = self.document["buffers"][index].get("uri")
-            if uri is None and self._binary is None:
+            data = self._binary if uri is None else read_companion(self.folder, uri)
+            if data is None:
                 raise RejectedAsset(f"buffer {index} has no data in the file")
-            self._buffers[index] = self._binary if uri is None else read_companion(self.folder, uri)
+            self._buffers[index] = data
         return self._buffers[index]
 
 

@@ -10,11 +10,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from data_gen.assets import Material, RejectedAsset
+from data_gen.assets import Material, RejectedAsset, Wrap
 from data_gen.gltf_container import GltfFile
 from data_gen.texels import color_texels, read_image, resize, value_texels
 
-WRAPS = {10497: "repeat", 33648: "mirror", 33071: "clamp"}
+WRAPS: dict[int, Wrap] = {10497: "repeat", 33648: "mirror", 33071: "clamp"}
 NEAREST = 9728
 SPECULAR_GLOSSINESS = "KHR_materials_pbrSpecularGlossiness"
 DIELECTRIC = 0.04  # reflectance of a non-metal at normal incidence
@@ -96,7 +96,7 @@ def _specular_glossiness(textures: "_Textures", spec: dict) -> dict[str, np.ndar
     surface = textures.read(spec.get("specularGlossinessTexture"))
     diffuse = np.asarray(spec.get("diffuseFactor", (1, 1, 1, 1)), np.float64)[:3]
     specular = np.asarray(spec.get("specularFactor", (1, 1, 1)), np.float64)
-    glossiness = np.float64(spec.get("glossinessFactor", 1.0))
+    glossiness = np.asarray(spec.get("glossinessFactor", 1.0), np.float64)
     if color is not None:
         diffuse = color_texels(color) * diffuse
     if surface is not None:
@@ -115,7 +115,7 @@ class _Textures:
     def __init__(self, file: GltfFile, name: str):
         self.file, self.name = file, name
         self.leading: dict | None = None
-        self.wrap = "repeat"
+        self.wrap: Wrap = "repeat"
         self.ignored: set[str] = set()
 
     def read(self, info: dict | None) -> np.ndarray | None:
@@ -141,7 +141,7 @@ class _Textures:
         label = self.file.document["images"][source].get("uri", f"image {source}")
         return read_image(self.file.image_bytes(source), label[:80])
 
-    def _wrap(self, texture: dict) -> str:
+    def _wrap(self, texture: dict) -> Wrap:
         sampler = self.file.document["samplers"][texture["sampler"]] if "sampler" in texture else {}
         wrap_s, wrap_t = WRAPS[sampler.get("wrapS", 10497)], WRAPS[sampler.get("wrapT", 10497)]
         if wrap_s != wrap_t:

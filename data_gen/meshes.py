@@ -30,6 +30,7 @@ TEXT_OR_BINARY = {".ply": load_ply, ".stl": load_stl, ".off": load_off}
 SUFFIXES = (".glb", ".gltf", ".obj", *TEXT_OR_BINARY)
 NAMED_BY_FOLDER = (".gltf", ".obj")  # files that come with companions, so that the folder is the object
 # What readers raise on files that break their rules; not MemoryError and not an interrupt.
+UNREADABLE: tuple[type[Exception], ...]
 UNREADABLE = (ValueError, LookupError, TypeError, AttributeError, NameError, ArithmeticError, OSError, RuntimeError)
 UNREADABLE += (AssertionError, struct.error, DeprecationWarning)
 UNREADABLE += (ImportError,)  # trimesh looks for a package that guesses the encoding of text that is not UTF-8

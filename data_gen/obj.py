@@ -39,7 +39,7 @@ def load_obj(path: Path) -> Asset:
     default = principled()
     parts = []
     for mesh in loaded["geometry"].values():
-        name = getattr(getattr(mesh["visual"], "material", None), "name", None)
+        name = getattr(getattr(mesh["visual"], "material", None), "name", "")
         parts.append(_part(mesh, materials.get(name, default)))
     if re.search(r"(?m)^vn ", text) and any(part.normals is None for part in parts):
         ignored.add("normals that only some faces have (flat shading is used)")
@@ -90,13 +90,14 @@ def _material(folder: Path, name: str, library: dict[str, dict[str, str]], ignor
     _reject_transparent(entry, name)
     ignored |= {f"MTL {key}" for key in entry if key not in READ | SILENT and entry[key].strip("0. ")}
     options = " ".join(entry.get(key, "") for key in ("map_kd", "map_pr", "map_pm"))
-    wrap = "clamp" if re.search(r"-clamp\s+on", options) else "repeat"
+    wrap: Wrap = "clamp" if re.search(r"-clamp\s+on", options) else "repeat"
     color = np.array([float(x) for x in entry.get("kd", "0.5 0.5 0.5").split()[:3]])
     if "map_kd" in entry:
         if "kd" in entry and not np.all(color == 1):
             ignored.add("MTL Kd beside map_Kd")
         color = color_texels(_image(folder, entry["map_kd"], ignored))
     roughness = np.sqrt(2 / (max(float(entry["ns"]), 0) + 2)) if "ns" in entry else 0.5
+    channels: dict[str, float | np.ndarray]
     channels = {"roughness": float(entry.get("pr", roughness)), "metallic": float(entry.get("pm", 0))}
     for channel, key in (("roughness", "map_pr"), ("metallic", "map_pm")):
         if key in entry:

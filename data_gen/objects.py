@@ -89,7 +89,7 @@ def object_details(task: Task, asset: Asset, transform: dict, seeds: dict[str, i
 
 def describe_material(material: Material) -> dict:
     """Return a material's channels as numbers, or as the size of their texture."""
-    described = {"wrap": material.wrap}
+    described: dict = {"wrap": material.wrap}
     for name, value_rank in (("base_color", 1), ("roughness", 0), ("metallic", 0)):
         channel = np.asarray(getattr(material, name))
         size = {"texture": list(channel.shape[:2])}

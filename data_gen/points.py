@@ -63,6 +63,7 @@ def sample_surface(asset: Asset, num_points: int, seed: int) -> SurfacePoints:
     face = np.minimum(face, np.searchsorted(cumulative, cumulative[-1]))  # the product can round up to the total
     barycentric = _uniform_barycentric(rng.random((num_points, 2)))
     first_face = np.cumsum([0, *(len(part.faces) for part in asset.parts)])
+    columns: dict[str, np.ndarray]
     columns = {name: np.zeros((num_points, 3), np.float32) for name in ("positions", "normals", "base_color")}
     columns |= {name: np.zeros(num_points, np.float32) for name in ("roughness", "metallic")}
     for part, first in zip(asset.parts, first_face, strict=False):
@@ -83,6 +84,7 @@ def evaluate_material(material: Material, texcoords: np.ndarray | None, count: i
     def channel(values: np.ndarray, value_ndim: int) -> np.ndarray:
         if values.ndim == value_ndim:
             return np.broadcast_to(values, (count, *values.shape))
+        assert texcoords is not None, "a texture needs texture coordinates"
         return lookup(values, texcoords, material.wrap)
 
     return {

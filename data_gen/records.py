@@ -34,7 +34,7 @@ POINT_FIELDS = (
     "metallic",
 )
 POINT_TYPE = np.dtype([(name, "<f4") for name in POINT_FIELDS] + [("face", "<i4")])
-PLY_TYPES = {"<f4": "float", "<i4": "int"}
+POINT_PROPERTIES = [*(f"property float {name}" for name in POINT_FIELDS), "property int face"]  # POINT_TYPE in a PLY
 UNFINISHED = ".unfinished-"  # prefix of folders that are still being written
 
 
@@ -127,8 +127,8 @@ def read_object(folder: Path) -> ObjectRecord:
 
 def write_points(path: Path, points: np.ndarray) -> None:
     """Write a POINT_TYPE array as a binary little-endian PLY of vertices."""
-    properties = [f"property {PLY_TYPES[POINT_TYPE[name].str]} {name}" for name in POINT_TYPE.names]
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}", *properties, "end_header"]
+    size = f"element vertex {len(points)}"
+    header = ["ply", "format binary_little_endian 1.0", size, *POINT_PROPERTIES, "end_header"]
     path.write_bytes(("\n".join(header) + "\n").encode("ascii") + points.tobytes())
 
 
@@ -136,8 +136,7 @@ def read_points(path: Path) -> np.ndarray:
     """Return the POINT_TYPE array (points,) of a file that `write_points` wrote; ValueError for any other file."""
     header, separator, body = path.read_bytes().partition(b"end_header\n")
     lines = header.decode("ascii", "replace").splitlines()
-    expected = [f"property {PLY_TYPES[POINT_TYPE[name].str]} {name}" for name in POINT_TYPE.names]
-    if not separator or lines[1:2] != ["format binary_little_endian 1.0"] or lines[3:] != expected:
+    if not separator or lines[1:2] != ["format binary_little_endian 1.0"] or lines[3:] != POINT_PROPERTIES:
         raise ValueError(f"{path}: not a points.ply of this data set (another header); generate the object again")
     count = int(lines[2].split()[-1])
     if len(body) != count * POINT_TYPE.itemsize:

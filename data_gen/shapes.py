@@ -168,10 +168,10 @@ def box(size, bevel=0.0, steps=1) -> Mesh:
     inset = bevel * (1 - np.sin(angle))
     height = -size[long] / 2 + bevel * (1 - np.cos(angle))
     inset, height = np.concatenate([inset, inset[::-1]]), np.concatenate([height, -height[::-1]])
-    outlines = [rounded_rectangle(size[cross], size[other])] * 2
+    wide, tall = size[[cross, other]]
+    outlines = [rounded_rectangle(wide, tall)] * 2
     if bevel > 0:
-        sides = size[[cross, other]]
-        outlines = [rounded_rectangle(*(sides - 2 * cut), max(bevel - cut, 1e-9), steps) for cut in inset]
+        outlines = [rounded_rectangle(wide - 2 * cut, tall - 2 * cut, max(bevel - cut, 1e-9), steps) for cut in inset]
     rings = np.empty((len(inset), len(outlines[0]), 3))
     rings[:, :, [cross, other]] = outlines
     rings[:, :, long] = height[:, None]

@@ -28,7 +28,8 @@ def read_image(data: bytes, name: str) -> np.ndarray:
     try:
         with Image.open(io.BytesIO(data)) as image:
             if image.mode.startswith("I"):  # PIL would clip 16-bit grey to 255 instead of scaling it
-                image = Image.fromarray((np.asarray(image, np.int64) // 257).astype(np.uint8))
+                eight_bit = (np.asarray(image, np.int64) // 257).astype(np.uint8)
+                return np.asarray(Image.fromarray(eight_bit).convert("RGBA"))
             return np.asarray(image.convert("RGBA"))
     except (UnidentifiedImageError, OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         raise RejectedAsset(f"names an image that cannot be read: {name} ({error})") from None

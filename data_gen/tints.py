@@ -17,6 +17,7 @@ LEVELS = (255, 31, 15, 7, 3, 1)  # steps per channel that tell tints apart; the 
 
 def split_by_tint(part: Part) -> tuple[list[Part], float]:
     """Parts without vertex colours that look like this one, and the largest error of a colour at a face's corner."""
+    assert part.colors is not None, "only parts with vertex colours are split"
     corners = part.colors[part.faces]
     face_colors = corners.mean(axis=1)
     for levels in LEVELS:

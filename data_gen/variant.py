@@ -56,7 +56,8 @@ def llvm_libraries() -> list[Path]:
         return [Path(named)]
     found = {path for root in LIBRARY_ROOTS for pattern in LIBRARY_PATTERNS for path in Path(root).glob(pattern)}
     versions = {path: int(match[1]) for path in sorted(found) if (match := LIBRARY_NAME.fullmatch(path.name))}
-    return sorted((path for path in versions if versions[path] >= OLDEST_LLVM), key=versions.get, reverse=True)
+    usable = (path for path, version in versions.items() if version >= OLDEST_LLVM)
+    return sorted(usable, key=versions.__getitem__, reverse=True)
 
 
 def probe(library: Path) -> bool:

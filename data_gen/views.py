@@ -129,12 +129,12 @@ def principled(part: Part) -> dict:
     if part.colors is not None and np.ndim(material.base_color) == 3:
         raise RejectedAsset("vertex colours on top of a base-colour texture cannot be rendered; bake them into one")
     if part.colors is not None:
-        base_color = {"type": "mesh_attribute", "name": "vertex_color"}
+        base_color: dict = {"type": "mesh_attribute", "name": "vertex_color"}
     elif np.ndim(material.base_color) == 3:
         base_color = bitmap_texture(material.base_color, material.wrap)
     else:
         base_color = {"type": "rgb", "value": [float(channel) for channel in material.base_color]}
-    inner = {"type": "principled", "base_color": base_color}
+    inner: dict = {"type": "principled", "base_color": base_color}
     for name in ("roughness", "metallic"):
         channel = getattr(material, name)
         inner[name] = bitmap_texture(channel[..., None], material.wrap) if np.ndim(channel) == 2 else float(channel)

@@ -9,7 +9,7 @@ import multiprocessing
 import signal
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
@@ -35,7 +35,9 @@ class Worker:
     idle: bool = True
 
 
-def run_tasks(function: Callable, tasks: Iterable, num_workers: int, setup: Callable, context: tuple) -> Iterator:
+def run_tasks(
+    function: Callable, tasks: Iterable, num_workers: int, setup: Callable, context: tuple
+) -> Generator[tuple, None, None]:
     """Yield (task, result) as they finish, where result = function(setup(*context), task) in a worker, or Died.
 
     An exception in a worker ends the run and is raised here. Leaving the iterator early kills the workers at once.

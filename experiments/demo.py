@@ -48,6 +48,7 @@ class Demo:
 
 def main(demo: Demo) -> None:
     """Runs the three parts and says where the results are."""
+    cli.enable_compilation_cache()
     seconds = Seconds(demo.out / "seconds.json")
     objects = demo.objects if demo.objects is not None else None if demo.meshes else 240
     generation = GenerateConfig(
@@ -65,7 +66,7 @@ def main(demo: Demo) -> None:
     seconds.measure("generate", lambda: generate(generation))
 
     tiny = config.tiny()
-    tiny = dataclasses.replace(tiny, seed=demo.seed, num_steps=demo.steps or tiny.num_steps)
+    tiny = dataclasses.replace(tiny, seed=demo.seed, num_steps=tiny.num_steps if demo.steps is None else demo.steps)
     dataset, run = data.open_dataset(generation.out), demo.out / "run"
     print(f"2/3 training preset {tiny.preset} for {tiny.num_steps} steps in {run}", flush=True)
     seconds.measure("train", lambda: trainer.train(tiny, dataset, run, trainer.Schedule()))

@@ -4,7 +4,7 @@ from importlib import import_module
 
 _PUBLIC = {"load": "spnr_jax.model", "Model": "spnr_jax.model", "Volume": "spnr_jax.model"}
 _PUBLIC |= {"read_cloud": "spnr_jax.clouds"}
-_PUBLIC |= {name: "spnr_jax.types" for name in ("PointCloud", "Camera", "Rays", "Rendering", "Batch")}
+_PUBLIC |= dict.fromkeys(("PointCloud", "Camera", "Rays", "Rendering", "Batch"), "spnr_jax.types")
 
 __all__ = sorted(_PUBLIC)
 

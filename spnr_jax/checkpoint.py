@@ -22,7 +22,7 @@ KEPT = 3  # newest checkpoints that stay
 def write_config(run: Path, config: TrainConfig) -> None:
     """Makes the run folder hold this config; ValueError if it holds the run of another one."""
     path = run / "config.json"
-    if path.exists():
+    if path.exists() and (run / "checkpoints").is_dir():  # without a checkpoint there is nothing to protect
         stored = to_dict(read_config(run))
         changed = _differences(stored, json.loads(json.dumps(to_dict(config))))
         if changed:
@@ -31,7 +31,7 @@ def write_config(run: Path, config: TrainConfig) -> None:
     run.mkdir(parents=True, exist_ok=True)
     temporary = path.with_suffix(".partial")
     temporary.write_text(json.dumps(to_dict(config), indent=2) + "\n")
-    temporary.rename(path)
+    temporary.replace(path)
 
 
 def _differences(stored: dict, wanted: dict, path: str = "") -> list[str]:
@@ -52,24 +52,24 @@ def read_config(run: Path | str) -> TrainConfig:
         raise ValueError(f"{run}: not a run folder (config.json is missing); train one with `spnr train DATA {run}`")
     try:
         return from_dict(json.loads(path.read_text()))
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
+    except (ValueError, TypeError, AttributeError) as error:
+        raise ValueError(f"{path}: not a config of this version ({error}); train a new run") from None
 
 
-def _checkpointer(run: Path):
+def _checkpointer(run: Path, *, writing: bool):
     logging.getLogger("absl").setLevel(logging.ERROR)  # one line a save is not for the user's terminal
     from orbax.checkpoint import v1 as ocp  # two seconds of import that rendering from Python need not pay
 
     return ocp.training.Checkpointer(
         (run / "checkpoints").absolute(),
         preservation_policy=ocp.training.preservation_policies.LatestN(KEPT),
-        cleanup_tmp_directories=True,
+        cleanup_tmp_directories=writing,  # a reader must not remove what a running training is writing
     )
 
 
 def save(run: Path, state: training.TrainState) -> None:
     """Writes the state as the run's newest checkpoint and removes those that are too old."""
-    with _checkpointer(run) as checkpointer:
+    with _checkpointer(run, writing=True) as checkpointer:
         checkpointer.save(int(state.step), state)
 
 
@@ -82,7 +82,7 @@ def restore(run: Path, config: TrainConfig, say: Callable[[str], None] = print) 
         lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding),
         jax.eval_shape(lambda: training.create_state(config)),
     )
-    with _checkpointer(run) as checkpointer:
+    with _checkpointer(run, writing=False) as checkpointer:
         steps = sorted((c.step for c in checkpointer.checkpoints), reverse=True)
         for step in steps:
             try:

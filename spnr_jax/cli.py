@@ -3,8 +3,11 @@
 Errors of the user and of the disk are one line on stderr and exit code 2; Ctrl-C keeps the state and exits with 130.
 """
 
+import contextlib
 import dataclasses
+import io
 import json
+import re
 import sys
 import time
 from collections.abc import Callable
@@ -17,7 +20,7 @@ import tyro
 from spnr_jax import config as configs
 from spnr_jax.config import TrainConfig
 
-
+BOX = r"[╭╮╰╯│─•]+|__tyro-dummy-inner__\."  # what tyro draws around an error, and its name for the whole command
 DESCRIPTION = "Sparse-point neural rendering: train a network, evaluate one, render a cloud of points."
 
 
@@ -91,7 +94,6 @@ def main(arguments: list[str] | None = None) -> None:
 
 def guarded(work: Callable[[], None], name: str) -> int:
     """Exit code of the work; an error that a person can mend is one line on stderr and code 2, a stop is code 130."""
-    enable_compilation_cache()
     try:
         work()
     except KeyboardInterrupt as stop:
@@ -108,7 +110,14 @@ def parse(arguments: list[str]) -> Train | Evaluate | Render:
     train = Annotated[Train, tyro.conf.subcommand("train", default=_train_defaults(arguments))]
     evaluate = Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     render = Annotated[Render, tyro.conf.subcommand("render")]
-    return tyro.cli(train | evaluate | render, prog="spnr", description=DESCRIPTION, args=arguments)
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said):
+            return tyro.cli(train | evaluate | render, prog="spnr", description=DESCRIPTION, args=arguments)
+    except SystemExit as stop:
+        if stop.code:
+            raise ValueError(re.sub(BOX, " ", said.getvalue().partition("\n")[2])) from None  # without the title
+        raise
 
 
 def _train_defaults(arguments: list[str]) -> Train:
@@ -124,6 +133,7 @@ def _train_defaults(arguments: list[str]) -> Train:
 
 def run(command: Train | Evaluate | Render) -> None:
     """Carries a command out."""
+    enable_compilation_cache()
     {Train: run_train, Evaluate: run_evaluate, Render: run_render}[type(command)](command)
 
 
@@ -157,7 +167,7 @@ def run_evaluate(command: Evaluate) -> None:
     dataset = data.open_dataset(command.data)
     outcome = evaluation.evaluate(command.run, dataset, command.split, command.gallery)
     out = command.out or command.run
-    seconds = {"evaluate": round(time.monotonic() - start, 1)}
+    seconds = dict.fromkeys(("evaluate", "total"), round(time.monotonic() - start, 1))
     write_results(out, outcome, dataset.settings, trainer.read_rows(command.run), seconds)
     print(json.dumps(outcome.summary["methods"], indent=2))
     print(f"wrote {out / 'metrics.json'} and {out / 'report.html'}")

@@ -7,7 +7,7 @@ naming the field, what came and what is possible.  Marks: [paper] stands in the 
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, get_type_hints
 
 MATERIAL_CHANNELS = {"base_color": 3, "roughness": 1, "metallic": 1}
 
@@ -26,7 +26,7 @@ class SamplingConfig:
     num_fine: int = 64
     """Samples drawn where the coarse weights are large [paper]; 0 renders the coarse samples alone."""
     padding: float = 1e-5
-    """Added to each coarse weight before sampling: empty rays are sampled evenly, thin parts keep nearly all samples."""
+    """Added to each coarse weight before sampling: empty rays are sampled evenly, thin parts keep nearly all."""
 
     def __post_init__(self) -> None:
         _require(self.num_coarse >= 1, f"num_coarse must be at least 1, got {self.num_coarse}")
@@ -123,7 +123,9 @@ class LossConfig:
     def __post_init__(self) -> None:
         for name in ("l1_weight", "low_resolution_weight", "adversarial_weight", "r1_gamma"):
             _require(getattr(self, name) >= 0, f"{name} must not be negative, got {getattr(self, name)}")
-        _require(0 <= self.adversarial_start <= 1, f"adversarial_start is a share of the steps, got {self.adversarial_start}")
+        _require(
+            0 <= self.adversarial_start <= 1, f"adversarial_start is a share of the steps, got {self.adversarial_start}"
+        )
         _require(self.r1_interval >= 1, f"r1_interval must be at least 1, got {self.r1_interval}")
 
 
@@ -220,9 +222,7 @@ def small() -> TrainConfig:
     """A quarter of the paper's compute, 128 px.  `spnr train --preset small DATA RUN`; hours on a CPU."""
     return TrainConfig(
         preset="small",
-        model=ModelConfig(
-            volume_resolution=32, num_stages=4, sampling=SamplingConfig(num_coarse=32, num_fine=32)
-        ),
+        model=ModelConfig(volume_resolution=32, num_stages=4, sampling=SamplingConfig(num_coarse=32, num_fine=32)),
         loss=LossConfig(adversarial_start=0.5, discriminator_width=32),
         optimizer=OptimizerConfig(lr_generator=1e-3, warmup_steps=200),
         num_steps=20_000,
@@ -240,17 +240,17 @@ def tiny() -> TrainConfig:
             volume_resolution=32,
             base_width=8,
             num_stages=3,
+            num_groups=1,
             sampling=SamplingConfig(num_coarse=16, num_fine=16),
             render_resolution=32,
             resize_resolution=32,
             image_resolution=64,
         ),
-        loss=LossConfig(adversarial_start=0.8, discriminator_width=16),
+        loss=LossConfig(adversarial_start=0.85, discriminator_width=16),
         optimizer=OptimizerConfig(lr_generator=2e-3, warmup_steps=100, ema_decay=0.995),
-        num_steps=3000,
-        batch_objects=2,
-        views_per_object=4,
-        max_points=2048,
+        num_steps=1200,
+        batch_objects=4,
+        max_points=1024,
     )
 
 
@@ -271,10 +271,10 @@ def from_dict(values: dict, kind: type = TrainConfig, path: str = "") -> Any:
         _require(name in fields, f"unknown config field {path}{name}; known: {', '.join(fields)}")
     for name in fields:
         _require(name in values, f"config field {path}{name} is missing")
+    kinds = get_type_hints(kind)
     arguments = {}
     for name, value in values.items():
-        nested = fields[name].type
         if isinstance(value, dict):
-            value = from_dict(value, nested, f"{path}{name}.")
+            value = from_dict(value, kinds[name], f"{path}{name}.")
         arguments[name] = tuple(value) if isinstance(value, list) else value
     return kind(**arguments)

@@ -20,6 +20,7 @@ from spnr_jax.config import TrainConfig
 from spnr_jax.types import Batch, Camera, PointCloud
 
 CACHE_BYTES = 2**31  # decoded objects kept in memory
+ORDER, POINTS_AND_VIEWS = 1, 2  # streams of random numbers under one seed: (0, 5) and (0, 5, 0) alone would be the same
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,14 +77,17 @@ def read_object(dataset: Dataset, name: str) -> ObjectData:
         intrinsics = np.array([[meta["fl_x"], 0, meta["cx"]], [0, meta["fl_y"], meta["cy"]], [0, 0, 1]], np.float32)
         files = [Path(frame["file_path"]).name for frame in meta["frames"]]
         height, width = int(meta["h"]), int(meta["w"])
+        if not np.isfinite(poses).all() or not np.isfinite(intrinsics).all():
+            raise ValueError("a camera holds NaN or infinity")
         images = np.stack([_read_rgba(path := folder / "images" / f, height, width) for f in files])
         conditions = np.stack([_read_rgba(path := folder / "conditions" / f, height, width) for f in files])
-    except (OSError, ValueError, KeyError) as error:
-        raise ValueError(f"{path}: cannot be read ({error}); run `spnr-data check {dataset.folder}`") from None
+        cloud = clouds.read_cloud(path := folder / "points.ply")
+    except (OSError, ValueError, LookupError, TypeError, SyntaxError) as error:  # Pillow raises SyntaxError too
+        reason = f"no entry {error}" if isinstance(error, KeyError) else str(error).replace(str(path), path.name)
+        raise ValueError(f"{path}: cannot be read ({reason}); run `spnr-data check {dataset.folder}`") from None
     camera = Camera(
         cam_to_world=poses, intrinsics=np.broadcast_to(intrinsics, (len(files), 3, 3)), height=height, width=width
     )
-    cloud = clouds.read_cloud(folder / "points.ply")
     return ObjectData(name=name, cloud=cloud, camera=camera, images=images, conditions=conditions)
 
 
@@ -113,7 +117,7 @@ def make_batch(objects: list[ObjectData], config: TrainConfig, step: int) -> Bat
     """The training batch of these objects at this step: random points and random views of each."""
     clouds_of, views_of = [], []
     for i, data in enumerate(objects):
-        generator = np.random.default_rng((config.seed, step, i))
+        generator = np.random.default_rng((config.seed, POINTS_AND_VIEWS, step, i))
         low, high = np.log2(config.min_points), np.log2(config.max_points)
         count = round(2 ** generator.uniform(low, high))
         clouds_of.append(choose_points(data.cloud, count, config.max_points, generator))
@@ -141,7 +145,7 @@ def object_names(names: tuple[str, ...], config: TrainConfig, step: int) -> list
     chosen = []
     for position in range(step * config.batch_objects, (step + 1) * config.batch_objects):
         epoch, place = divmod(position, len(names))
-        chosen.append(names[np.random.default_rng((config.seed, epoch)).permutation(len(names))[place]])
+        chosen.append(names[np.random.default_rng((config.seed, ORDER, epoch)).permutation(len(names))[place]])
     return chosen
 
 
@@ -156,7 +160,12 @@ def batches(dataset: Dataset, config: TrainConfig, first_step: int) -> Iterator[
         if name in cache:
             return cache[name]
         data = read_object(dataset, name)
-        check_views(data, config)
+        check_resolution(data, config)
+        if len(data.images) < config.views_per_object:
+            raise ValueError(
+                f"object {name} has {len(data.images)} views, views_per_object is {config.views_per_object}; lower it "
+                "or generate with more --views"
+            )
         if sum(d.num_bytes for d in cache.values()) + data.num_bytes < CACHE_BYTES:
             cache[name] = data
         return data
@@ -168,16 +177,14 @@ def batches(dataset: Dataset, config: TrainConfig, first_step: int) -> Iterator[
     return prefetch(assemble())
 
 
-def check_views(data: ObjectData, config: TrainConfig) -> None:
-    """ValueError if an object's images do not fit the config."""
+def check_resolution(data: ObjectData, config: TrainConfig) -> None:
+    """ValueError if an object's images do not have the size that the config's network renders."""
     size = config.model.image_resolution
     if (data.camera.height, data.camera.width) != (size, size):
         raise ValueError(
             f"object {data.name} has images of {data.camera.width} x {data.camera.height} pixels, preset "
             f"{config.preset} needs {size} x {size}; use another preset or generate with --resolution {size}"
         )
-    if len(data.images) < config.views_per_object:
-        raise ValueError(f"object {data.name} has {len(data.images)} views, views_per_object is {config.views_per_object}")
 
 
 def prefetch(items: Iterator, depth: int = 4) -> Iterator:

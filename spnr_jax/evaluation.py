@@ -80,6 +80,8 @@ def test_cloud(item: data.ObjectData, config: TrainConfig) -> PointCloud:
 def choose_radius(dataset: data.Dataset, config: TrainConfig, method: str, num_objects: int = 8) -> float:
     """The radius factor with the highest PSNR over a few training objects."""
     items = [data.read_object(dataset, name) for name in dataset.splits["train"][:num_objects]]
+    if not items:
+        raise ValueError(f"{dataset.folder}: no training objects to choose the radius of `{method}` on; generate some")
 
     def mean_psnr(factor: float) -> float:
         values = []
@@ -105,7 +107,7 @@ def evaluate_objects(
     """Pictures and scores of each object of a data set."""
     for name in names:
         item = data.read_object(dataset, name)
-        data.check_views(item, config)
+        data.check_resolution(item, config)
         cloud = test_cloud(item, config)
         rendering = render_views(variables, config, cloud, item.camera)
         size = item.images.shape[1:3]

@@ -13,7 +13,7 @@ SIZE = 10.4, 3.9  # inches; the page scales it
 SMOOTHING = 1 / 25  # of the rows, in one mean
 INK, GREY, ACCENT, VALIDATION = "#1d2330", "#8a92a3", "#2457d6", "#d9480f"
 FLOOR_DASHES = ("--", ":", "-.")
-STYLE = {
+STYLE: dict = {
     "svg.fonttype": "none",  # text stays text, in the font of the page
     "svg.hashsalt": "spnr",  # the same rows give the same bytes
     "font.size": 10,
@@ -66,8 +66,8 @@ def series(rows: Sequence[Mapping], name: str) -> tuple[np.ndarray, np.ndarray]:
 
 def smooth(values: np.ndarray) -> np.ndarray:
     """Centred running mean over SMOOTHING of the values; near the ends the window shrinks, so that it stays centred."""
-    reach = round(len(values) * SMOOTHING / 2)
+    widest = round(len(values) * SMOOTHING / 2)
     number = np.arange(len(values))
-    reach = np.minimum(reach, np.minimum(number, number[::-1]))
+    reach = np.minimum(widest, np.minimum(number, number[::-1]))
     total = np.concatenate([[0.0], np.cumsum(values)])
     return (total[number + reach + 1] - total[number - reach]) / (2 * reach + 1)

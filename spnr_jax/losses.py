@@ -38,7 +38,7 @@ def area_downsample(image: Float[Array, "*batch height width 3"], size: int) -> 
 
     def coverage(n: int) -> Float[Array, "size n"]:
         start = jnp.arange(size, dtype=jnp.float32)[:, None] * (n / size)
-        cell = jnp.arange(n, dtype=jnp.float32)
+        cell = jnp.arange(n, dtype=jnp.float32)[None]
         return jnp.clip(jnp.minimum(start + n / size, cell + 1) - jnp.maximum(start, cell), 0) * (size / n)
 
     rows, columns = coverage(image.shape[-3]), coverage(image.shape[-2])

@@ -42,13 +42,14 @@ class Model:
     variables: dict
 
     def encode(self, cloud: PointCloud) -> Volume:
-        """Volume of a cloud (unbatched, any units, y up).  ValueError if it holds no points or more than its file said."""
+        """Volume of a cloud (unbatched, any units, y up).  ValueError if it holds no points, NaN or infinity."""
         positions = np.asarray(cloud.positions, np.float32)
         mask = np.asarray(cloud.mask)
         if not mask.any():
             raise ValueError("the cloud has no points; give at least one")
-        if not np.isfinite(positions[mask]).all():
-            raise ValueError("the cloud has NaN or infinite positions; remove those points")
+        for field in dataclasses.fields(cloud):
+            if not np.isfinite(np.asarray(getattr(cloud, field.name))[mask]).all():
+                raise ValueError(f"the cloud has NaN or infinity in its {field.name}; remove those points")
         centre, scale = clouds.normalization(positions[mask])
         cloud = dataclasses.replace(cloud, positions=((positions - centre) * scale).astype(np.float32))
         cloud = clouds.pad(cloud, clouds.bucket(len(positions)))
@@ -59,9 +60,12 @@ class Model:
 
     def render(self, volume: Volume, camera: Camera) -> Rendering:
         """The object as the camera (unbatched, or with one axis of views) sees it; depth in the cloud's units."""
+        if self.config.upsamples and (camera.height % 2 or camera.width % 2):
+            raise ValueError(f"this network doubles its pictures: {camera.width} x {camera.height} pixels must be even")
         single = camera.cam_to_world.ndim == 2
         rotation, eye = camera.cam_to_world[..., :3], camera.cam_to_world[..., 3]
-        pose = jnp.concatenate([rotation, ((eye - volume.centre) * volume.scale)[..., None]], axis=-1)
+        eye = (eye - jnp.broadcast_to(volume.centre, eye.shape)) * volume.scale
+        pose = jnp.concatenate([rotation, eye[..., None]], axis=-1)
         inside = dataclasses.replace(camera, cam_to_world=pose)
         inside = jax.tree.map(lambda x: jnp.asarray(x).reshape(1, -1, *x.shape[-2:]), inside)
         rendering = training.jitted_render(

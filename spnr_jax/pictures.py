@@ -26,9 +26,11 @@ def render_file(
     seed: int,
 ) -> Iterator[str]:
     """Writes NAME_000.png ... (with _depth and _acc) and NAME_turntable.gif; yields a line about each step."""
-    for name, value in (("views", views), ("frames", frames), ("num-points", num_points)):
-        if value < (0 if name == "views" else 1):
-            raise ValueError(f"--{name} must be positive, got {value}")
+    if views < 0:
+        raise ValueError(f"--views must not be negative, got {views}")
+    for name, value in (("frames", frames), ("num-points", num_points)):
+        if value < 1:
+            raise ValueError(f"--{name} must be at least 1, got {value}")
     if resolution is not None and (resolution < 16 or resolution % 4):
         raise ValueError(f"--resolution must be a multiple of 4 of at least 16, got {resolution}")
     model = load(run)
@@ -38,15 +40,15 @@ def render_file(
     volume = model.encode(points)
     yield f"encoded {len(points.positions)} points of {cloud}"
     for i, azimuth in enumerate(np.arange(views) * 360 / max(views, 1)):
-        stem = out / f"{cloud.stem}_{i:03d}"
+        stem = f"{cloud.stem}_{i:03d}"
         rendering = model.render(volume, model.camera(volume, float(azimuth) + 30, elevation, resolution))
-        images.write_whole(stem.with_suffix(".png"), images.png(np.asarray(rendering.image)))
+        images.write_whole(out / f"{stem}.png", images.png(np.asarray(rendering.image)))
         for kind, picture in (
             ("depth", images.depth_image(rendering.depth, rendering.acc)),
             ("acc", np.repeat(np.asarray(rendering.acc)[..., None], 3, axis=-1)),
         ):
-            images.write_whole(stem.with_name(f"{stem.name}_{kind}.png"), images.png(picture))
-        yield f"wrote {stem}.png"
+            images.write_whole(out / f"{stem}_{kind}.png", images.png(picture))
+        yield f"wrote {out / stem}.png"
     if turntable != "none":
         film = turntable_frames(model, volume, frames, elevation, resolution)
         path, reason = images.write_turntable(out / f"{cloud.stem}_turntable.{turntable}", film, FRAMES_PER_SECOND)

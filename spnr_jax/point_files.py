@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 
 Columns = dict[str, np.ndarray]
+Element = tuple[str, int, list[tuple[str, str | None]]]  # name, count, [(property, type)]; the type of a list is None
 
 PLY_TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4"},
@@ -42,10 +43,10 @@ ARRAY_COLUMNS = {
 
 @dataclass(frozen=True, kw_only=True)
 class PlyHeader:
-    """What a PLY file announces: elements in order as (name, count, [(property, type)]), lists with type None."""
+    """What a PLY file announces; byte_order is None in a text file."""
 
     byte_order: str | None
-    elements: list[tuple[str, int, list[tuple[str, str | None]]]]
+    elements: list[Element]  # in the order of the file
     size: int  # bytes up to the data
 
     @property
@@ -66,7 +67,8 @@ def read_ply_header(path: Path) -> PlyHeader:
     end = re.search(rb"^end_header[ \t]*(\r\n|\n|\r)", data, re.MULTILINE)
     if not data.startswith(b"ply") or end is None:
         raise ValueError("is not a PLY file, or its header is cut off (expected 'ply' ... 'end_header')")
-    byte_order, elements = "unknown", []
+    byte_order: str | None = "unknown"
+    elements: list[Element] = []
     for line in data[: end.start()].decode("ascii", "replace").splitlines()[1:]:
         match line.split():
             case ["format", name, _]:
@@ -127,7 +129,8 @@ def _check_complete(found: int, announced: int) -> None:
 
 def _read_text(path: Path) -> Columns:
     """The columns of a text file; the last line before the numbers may name them, also behind # or //."""
-    header, is_comment, numbers = "", True, []
+    header, is_comment = "", True
+    numbers: list[str] = []
     for line in path.read_bytes().decode("utf-8-sig", "replace").splitlines():
         line = line.strip()
         text = re.sub(r"^(#|//)\s*", "", line)
@@ -181,7 +184,7 @@ def _named_arrays(archive: np.lib.npyio.NpzFile) -> Columns:
 
 
 def _by_name(rows: np.ndarray) -> Columns:
-    return {name.lower(): rows[name] for name in rows.dtype.names}
+    return {name.lower(): rows[name] for name in rows.dtype.names or ()}
 
 
 def _plain_columns(table: np.ndarray) -> Columns:

@@ -6,6 +6,9 @@
 Objects lead, views follow: clouds are (objects, points, ...), cameras (objects, views, ...).
 """
 
+import operator
+from functools import reduce
+
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
@@ -39,14 +42,14 @@ class Renderer(nn.Module):
     def encode(self, cloud: PointCloud, train: bool = False) -> Float[Array, "objects d d d features"]:
         """Feature volume of each object from its points."""
         resolution = self.config.volume_resolution
-        features = self.pointnet(self.point_inputs(cloud), cloud.mask, train)
+        features = self.pointnet(self.point_inputs(cloud), jnp.asarray(cloud.mask), train)
         rows, share = jax.vmap(lambda p, m: voxels.share_voxels(p, m, resolution))(cloud.positions, cloud.mask)
         occupancy = jnp.ones_like(features[..., :1])
         return self.unet(rows, jnp.concatenate([features, occupancy], axis=-1) * share[..., None])
 
     def point_inputs(self, cloud: PointCloud) -> Float[Array, "objects points channels"]:
         """Position, offset from the centre of the own voxel, and the materials that the network is built for."""
-        _, offset = voxels.locate(cloud.positions, self.config.volume_resolution)
+        _, offset = voxels.locate(jnp.asarray(cloud.positions), self.config.volume_resolution)
         materials = [getattr(cloud, name) for name in self.config.materials]
         materials = [m[..., None] if m.ndim < cloud.positions.ndim else m for m in materials]
         inputs = jnp.concatenate([cloud.positions, offset, *materials], axis=-1)
@@ -113,7 +116,7 @@ class Renderer(nn.Module):
         # each pass is composited where it lies: sums do not mind the order, and nothing wide is concatenated
         acc = jnp.sum(weights, axis=-1)
         rgb = sum(compositing.composite(w, rgb) for w, rgb, _ in passes) + (1 - acc[..., None]) * WHITE
-        hidden = sum(compositing.composite(w, hidden) for w, _, hidden in passes)
+        hidden = reduce(operator.add, (compositing.composite(w, hidden) for w, _, hidden in passes))
         features = jnp.concatenate([rgb, self.field.finish(hidden, acc, view)], axis=-1)
         return features, compositing.expected_distance(weights, distances, far), acc
 

@@ -92,7 +92,7 @@ def flatten(settings: Mapping, prefix: str = "") -> dict[str, object]:
 
 def psnr(image: np.ndarray, reference: np.ndarray) -> float:
     """PSNR in dB, at most 100, of two pictures as the page shows them (8 bit)."""
-    squared = np.mean((to_uint8(image) / 255 - to_uint8(reference) / 255) ** 2)
+    squared = float(np.mean((to_uint8(image) / 255 - to_uint8(reference) / 255) ** 2))
     return -10 * math.log10(max(squared, 1e-10))
 
 
@@ -173,7 +173,7 @@ def _bold_best(values: Sequence[float | None], decimals: int) -> list[str]:
     """The values as text, the highest in bold; what is missing or not a number is n/a."""
     finite = [value for value in values if value is not None and math.isfinite(value)]
     best = max(finite, default=None)
-    texts = {value: f"{value:.{decimals}f}" for value in finite}
+    texts: dict[float | None, str] = {value: f"{value:.{decimals}f}" for value in finite}
     return [f"<b>{texts[v]}</b>" if v == best else texts.get(v, "n/a") for v in values]
 
 

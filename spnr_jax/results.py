@@ -21,7 +21,7 @@ def write_results(
 ) -> None:
     """Writes metrics.json and report.html into a folder."""
     metrics = {**evaluation.summary, "seconds": seconds, "per_category": evaluation.per_category}
-    write_whole(out / "metrics.json", (json.dumps(metrics, indent=2) + "\n").encode())
+    write_whole(out / "metrics.json", (json.dumps(metrics, indent=2, allow_nan=False) + "\n").encode())
     ours, floors = metrics["methods"]["ours"], {k: v for k, v in metrics["methods"].items() if k != "ours"}
     best = max(floors, key=lambda name: floors[name]["psnr"])
     summary = (

@@ -1,8 +1,8 @@
 """Where along a ray the volume is evaluated: stratified samples, and samples drawn from a step function.
 
 Vocabulary: `edges` (*batch, n+1) are the sorted ends of n bins along a ray, `distances` (*batch, m) are samples,
-`weights` (*batch, n) is the mass of each bin.  A key draws one number per sample of every ray; key=None takes the middle
-of each stratum.  All of it is float32: one bf16 spacing is wider than a coarse bin.
+`weights` (*batch, n) is the mass of each bin.  A key draws one number per sample of every ray; key=None takes the
+middle of each stratum.  All of it is float32: one bf16 spacing is wider than a coarse bin.
 """
 
 import jax
@@ -60,7 +60,7 @@ def merge(
 ) -> tuple[Int[Array, "*batch n+m"], Int[Array, "*batch n+m"]]:
     """(order, rank) of two sorted lists laid end to end: `both[order]` is sorted, and `sorted[rank]` is both again.
 
-    Equal numbers keep the first list's first.  Counting what is smaller takes an eighth of the time of sorting on a CPU.
+    Equal numbers keep the first list's first.  Counting what is smaller takes an eighth of a sort's time on CPU.
     """
     n, m = first.shape[-1], second.shape[-1]
     place_first, place_second, place = (per_feature(jnp.arange(k, dtype=jnp.int32), first) for k in (n, m, n + m))

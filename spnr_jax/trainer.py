@@ -12,7 +12,7 @@ import os
 import signal
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -36,6 +36,11 @@ class Schedule:
     checkpoint_every: int = 500
     """Steps between checkpoints."""
 
+    def __post_init__(self) -> None:
+        for name, steps in vars(self).items():
+            if steps < 1:
+                raise ValueError(f"{name} must be at least 1 step, got {steps}")
+
 
 class NotFinite(ValueError):
     """A loss is NaN or infinite; the message names step and quantity."""
@@ -50,11 +55,14 @@ def train(config: TrainConfig, dataset: data.Dataset, run: Path, schedule: Sched
         tqdm.write(f"resuming {run} at step {first} of {config.num_steps}")
     if first >= config.num_steps:
         return state
-    log = MetricsLog(run, first)
     adversarial_from = training.first_adversarial_step(config)
-    batches = data.batches(dataset, config, first)
     pending: list[tuple[int, dict]] = []
-    with stop_requests() as requests, tqdm(total=config.num_steps, initial=first, unit="step", mininterval=1) as bar:
+    with (
+        stop_requests() as requests,
+        closing(MetricsLog(run, first)) as log,
+        closing(data.batches(dataset, config, first)) as batches,
+        tqdm(total=config.num_steps, initial=first, unit="step", mininterval=1) as bar,
+    ):
         since = time.monotonic()
         for step, batch in enumerate(batches, start=first):
             state, metrics = training.jitted_train_step(
@@ -62,22 +70,24 @@ def train(config: TrainConfig, dataset: data.Dataset, run: Path, schedule: Sched
             )
             pending.append((step + 1, metrics))
             bar.update()
-            last = step + 1 == config.num_steps or bool(requests)
-            if last or (step + 1) % schedule.log_every == 0:
+            last, stopping = step + 1 == config.num_steps, bool(requests)
+            save = last or stopping or (step + 1) % schedule.checkpoint_every == 0
+            if save or (step + 1) % schedule.log_every == 0:
                 rows = check_finite(jax.device_get(pending))
                 pace = 1000 * (time.monotonic() - since) / len(rows)
                 log.write({"step": step + 1, **mean_row(rows), "ms_per_step": round(pace, 2)})
                 bar.set_postfix(loss=f"{rows[-1][1]['loss']:.2f}", psnr=f"{rows[-1][1]['psnr']:.1f}", refresh=False)
                 pending, since = [], time.monotonic()
-            if last or (step + 1) % schedule.checkpoint_every == 0:
-                checkpoint.save(run, state)
-                since = time.monotonic()
             if last or (step + 1) % schedule.preview_every == 0:
                 log.write({"step": step + 1, **preview(state, config, dataset, run)})
                 since = time.monotonic()
-            if requests and step + 1 < config.num_steps:
-                raise KeyboardInterrupt(f"stopped at step {step + 1} of {config.num_steps}; the same command goes on from there")
-    log.close()
+            if save:  # after the rows up to this step, which a run that goes on from here will not write again
+                checkpoint.save(run, state)
+                since = time.monotonic()
+            if stopping and not last:
+                raise KeyboardInterrupt(
+                    f"stopped at step {step + 1} of {config.num_steps}; the same command goes on from there"
+                )
     return state
 
 
@@ -123,9 +133,9 @@ class MetricsLog:
         temporary.write_text("".join(json.dumps(row) + "\n" for row in kept))
         temporary.replace(path)
         self._file = path.open("a")
-        self._board = SummaryWriter(str(run / "tensorboard"), purge_step=first_step)
+        self._board = SummaryWriter(str(run / "tensorboard"), purge_step=first_step + 1)
 
-    def write(self, row: dict[str, float]) -> None:
+    def write(self, row: dict[str, int | float]) -> None:
         """Appends one row; every entry but the step is a TensorBoard scalar."""
         self._file.write(json.dumps(row) + "\n")
         self._file.flush()

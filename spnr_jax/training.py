@@ -64,7 +64,8 @@ def optimizers(config: TrainConfig) -> tuple[optax.GradientTransformation, optax
 
 def first_adversarial_step(config: TrainConfig) -> int:
     """Step from which the discriminator takes part; num_steps if it never does."""
-    return round(config.loss.adversarial_start * config.num_steps) if config.loss.adversarial_weight else config.num_steps
+    share = config.loss.adversarial_start if config.loss.adversarial_weight else 1.0
+    return round(share * config.num_steps)
 
 
 def discriminator_of(config: TrainConfig) -> Discriminator:
@@ -115,18 +116,22 @@ def reconstruction_loss(
     return config.loss.l1_weight * (losses.l1(image, reference) + weight * losses.l1(image_lr, low))
 
 
+def logits(config: TrainConfig, params: dict, image: Array, condition: Array, mask: Array) -> Array:
+    """What the discriminator says of the images under its parameters."""
+    return discriminator_of(config).bind({"params": params})(image, condition, mask)
+
+
 def discriminator_loss(config: TrainConfig, params: dict, fake: Array, batch: Batch, step: Array):
     """(loss, metrics) of the discriminator on references and renderings; R1 every r1_interval steps."""
-    module = discriminator_of(config)
     real, condition, mask = (_flatten_views(x) for x in (batch.image, batch.condition, batch.condition_mask))
-    both = module.apply({"params": params}, *(jnp.concatenate(x) for x in ((real, fake), (condition,) * 2, (mask,) * 2)))
+    both = logits(config, params, *(jnp.concatenate(x) for x in ((real, fake), (condition,) * 2, (mask,) * 2)))
     real_logits, fake_logits = jnp.split(both, 2)
     loss = losses.discriminator_adversarial(real_logits, fake_logits)
     metrics = {"discriminator": loss, "logit_real": jnp.mean(real_logits), "logit_fake": jnp.mean(fake_logits)}
     if config.loss.r1_gamma:
 
         def penalty():
-            return losses.r1(lambda image: module.apply({"params": params}, image, condition, mask), real)
+            return losses.r1(lambda image: logits(config, params, image, condition, mask), real)
 
         due = step % config.loss.r1_interval == 0
         loss = loss + config.loss.r1_interval * config.loss.r1_gamma * jax.lax.cond(due, penalty, lambda: 0.0)
@@ -142,7 +147,7 @@ def train_step(
 ) -> tuple[TrainState, dict[str, Array]]:
     """State after one step of both networks from one generator forward, and scalar metrics."""
     key = jax.random.fold_in(state.key, state.step)
-    renderer = Renderer(config.model)
+    renderer, reference = Renderer(config.model), jnp.asarray(batch.image)
     generator_adam, discriminator_adam = optimizers(config)
 
     def forward(params):
@@ -153,7 +158,7 @@ def train_step(
         return (rendering.image, rendering.image_lr), updated["batch_stats"]
 
     (image, image_lr), pull_back, batch_stats = jax.vjp(forward, state.generator, has_aux=True)
-    metrics = {"psnr": -10 * jnp.log10(jnp.mean((image - batch.image) ** 2)), "l1": losses.l1(image, batch.image)}
+    metrics = {"psnr": -10 * jnp.log10(jnp.mean((image - reference) ** 2)), "l1": losses.l1(image, reference)}
     discriminator, discriminator_optimizer = state.discriminator, state.discriminator_optimizer
     if adversarial:
         fake = _flatten_views(image)
@@ -165,20 +170,18 @@ def train_step(
         metrics |= more
 
     def image_loss(image, image_lr):
-        loss = reconstruction_loss(config, image, image_lr, batch.image)
+        loss = reconstruction_loss(config, image, image_lr, reference)
         if adversarial:
-            logits = discriminator_of(config).apply(
-                {"params": discriminator},
-                *(_flatten_views(x) for x in (image, batch.condition, batch.condition_mask)),
-            )
-            loss = loss + config.loss.adversarial_weight * losses.generator_adversarial(logits)
+            views = (_flatten_views(x) for x in (image, batch.condition, batch.condition_mask))
+            fake_logits = logits(config, discriminator, *views)
+            loss = loss + config.loss.adversarial_weight * losses.generator_adversarial(fake_logits)
         return loss
 
     loss, cotangents = jax.value_and_grad(image_loss, argnums=(0, 1))(image, image_lr)
     (gradient,) = pull_back(cotangents)
     update, generator_optimizer = generator_adam.update(gradient, state.generator_optimizer)
     generator = optax.apply_updates(state.generator, update)
-    metrics |= {"loss": loss, "gradient_norm": optax.global_norm(gradient)}
+    metrics |= {"loss": loss, "gradient_norm": optax.tree.norm(gradient)}
 
     # early weights are far from the last ones: average over a growing share of the past
     decay = jnp.minimum(config.optimizer.ema_decay, (1.0 + state.step) / (10.0 + state.step))
@@ -203,7 +206,7 @@ def train_step(
 
 def encode(variables: dict, cloud: PointCloud, *, config: ModelConfig) -> Array:
     """Feature volumes (objects, d, d, d, features) of the clouds."""
-    return Renderer(config).apply(variables, cloud, method="encode")
+    return Renderer(config).bind(variables).encode(cloud)
 
 
 def render(variables: dict, volume: Array, camera: Camera, *, config: ModelConfig, ray_chunk: int = 0) -> Rendering:
@@ -216,7 +219,7 @@ def render(variables: dict, volume: Array, camera: Camera, *, config: ModelConfi
     num_rays = rays.origins.shape[1]
 
     def render_rays(rays):
-        return renderer.apply(variables, volume, rays, method="render_rays")
+        return renderer.bind(variables).render_rays(volume, rays)
 
     if not 0 < ray_chunk < num_rays:
         outputs = render_rays(rays)
@@ -228,7 +231,7 @@ def render(variables: dict, volume: Array, camera: Camera, *, config: ModelConfi
         outputs = jax.tree.map(
             lambda x: jnp.moveaxis(x, 0, 1).reshape(x.shape[1], -1, *x.shape[3:])[:, :num_rays], outputs
         )
-    return renderer.apply(variables, camera, *outputs, method="develop")
+    return renderer.bind(variables).develop(camera, *outputs)
 
 
 def averaged_variables(state: TrainState) -> dict:

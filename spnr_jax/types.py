@@ -8,8 +8,11 @@ in [0, 1].  Image sizes are static fields because they shape arrays.
 from typing import no_type_check
 
 import jax
+import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float
+
+AnyArray = jax.Array | np.ndarray
 
 
 @no_type_check  # pytree transformations rebuild records with leaves that are no arrays
@@ -17,11 +20,11 @@ from jaxtyping import Array, Bool, Float
 class PointCloud:
     """Surface points of one object with their materials, padded to a fixed count; `mask` is True for real points."""
 
-    positions: Float[Array, "*batch points 3"]
-    base_color: Float[Array, "*batch points 3"]
-    roughness: Float[Array, "*batch points"]
-    metallic: Float[Array, "*batch points"]
-    mask: Bool[Array, "*batch points"]
+    positions: Float[AnyArray, "*batch points 3"]
+    base_color: Float[AnyArray, "*batch points 3"]
+    roughness: Float[AnyArray, "*batch points"]
+    metallic: Float[AnyArray, "*batch points"]
+    mask: Bool[AnyArray, "*batch points"]
 
 
 @no_type_check
@@ -29,8 +32,8 @@ class PointCloud:
 class Camera:
     """A pinhole camera: pose with OpenGL axes (x right, y up, looking along -z) and intrinsics in pixels."""
 
-    cam_to_world: Float[Array, "*batch 3 4"]
-    intrinsics: Float[Array, "*batch 3 3"]
+    cam_to_world: Float[AnyArray, "*batch 3 4"]
+    intrinsics: Float[AnyArray, "*batch 3 3"]
     height: int = struct.field(pytree_node=False)
     width: int = struct.field(pytree_node=False)
 
@@ -65,9 +68,9 @@ class Batch:
 
     cloud: PointCloud
     camera: Camera
-    image: Float[Array, "objects views height width 3"]
-    condition: Float[Array, "objects views height width 3"]
-    condition_mask: Bool[Array, "objects views height width"]
+    image: Float[AnyArray, "objects views height width 3"]
+    condition: Float[AnyArray, "objects views height width 3"]
+    condition_mask: Bool[AnyArray, "objects views height width"]
 
 
 Key = jax.Array

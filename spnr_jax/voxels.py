@@ -35,8 +35,8 @@ def row_of(cell: Int[Array, "*batch 3"], valid: Bool[Array, "*batch"], resolutio
 
 
 def share_voxels(
-    positions: Float[Array, "points 3"], mask: Bool[Array, "points"], resolution: int
-) -> tuple[Int[Array, "points"], Float[Array, "points"]]:
+    positions: Float[Array, "points 3"], mask: Bool[Array, " points"], resolution: int
+) -> tuple[Int[Array, " points"], Float[Array, " points"]]:
     """Row of each point in the flattened volume, and 1 / (points in its voxel); 0 if masked or outside the box."""
     valid = mask & jnp.all(jnp.abs(positions) <= 1, axis=-1)
     rows = row_of(locate(positions, resolution)[0], valid, resolution)
@@ -64,7 +64,7 @@ def scatter_mean(
 
 
 def scatter_conv(
-    rows: Int[Array, "points"],
+    rows: Int[Array, " points"],
     values: Float[Array, "points features"],
     kernel: Float[Array, "3 3 3 features out"],
     resolution: int,
@@ -100,17 +100,15 @@ def trilinear(
     grid = jnp.clip((positions + 1) * (0.5 * resolution) - 0.5, 0, resolution - 1)
     cell = jnp.clip(jnp.floor(grid), 0, max(resolution - 2, 0))
     upper = grid - jax.lax.stop_gradient(cell)
-    # the row of the lowest corner as a matrix product: XLA computes it once, where it would compute sums of products anew
+    # the lowest corner's row as a matrix product: XLA computes that once, where it would compute a sum of products anew
     # inside each of the eight gathers.  Exact in float32 up to 256^3 voxels.
     strides = jnp.array([[1.0], [resolution], [resolution**2]])
     lowest = jnp.matmul(cell.reshape(-1, 3), strides, precision="highest").astype(jnp.int32).reshape(cell.shape[:-1])
     table = volume.reshape(-1, volume.shape[-1])
     next_voxel = min(resolution - 1, 1)  # a volume of one voxel has no next one
-    out = 0.0
+    out: Array | float = 0.0
     for corner in itertools.product((0, 1), repeat=3):
         step = sum(high * next_voxel * resolution**axis for axis, high in enumerate(corner))
-        weight = 1.0
-        for axis, high in enumerate(corner):
-            weight = weight * (upper[..., axis] if high else 1 - upper[..., axis])
-        out = out + weight[..., None] * gather_rows(table, lowest + step)
+        x, y, z = (upper[..., axis] if high else 1 - upper[..., axis] for axis, high in enumerate(corner))
+        out = out + (x * y * z)[..., None] * gather_rows(table, lowest + step)
     return jnp.where(inside, out, 0.0)

@@ -90,9 +90,7 @@ def trilinear_taps(position, resolution):
         g = min(max((p + 1) * 0.5 * resolution - 0.5, 0.0), resolution - 1.0)
         low = min(int(math.floor(g)), max(resolution - 2, 0))
         axes.append([(low, 1 - (g - low)), (min(low + 1, resolution - 1), g - low)])
-    return [
-        (tuple(i for i, _ in corner), math.prod(w for _, w in corner)) for corner in itertools.product(*axes)
-    ]
+    return [(tuple(i for i, _ in corner), math.prod(w for _, w in corner)) for corner in itertools.product(*axes)]
 
 
 def trilinear(volume, position):

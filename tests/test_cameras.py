@@ -158,7 +158,9 @@ class TestBox:
 
     def test_points_on_hit_rays_between_near_and_far_lie_in_the_box(self):
         origins, directions = 2 * numbers(6, 50, 3), numbers(7, 50, 3)
-        near, far, hit, origins, directions = map(np.asarray, (*jax.jit(intersect_box)(origins, directions), origins, directions))
+        near, far, hit, origins, directions = map(
+            np.asarray, (*jax.jit(intersect_box)(origins, directions), origins, directions)
+        )
         for share in (0.0, 0.5, 1.0):
             points = origins + ((1 - share) * near + share * far)[:, None] * directions
             assert (np.abs(points[hit]) <= 1 + 1e-5).all()

@@ -1,7 +1,7 @@
 """Imports point down the layers, and importing the package stays light: both are read from the source.
 
-    0 types config | 1 numerics and its sibling kernels | 2 nn/ | 3 renderer baselines | 4 training
-    5 data checkpoint clouds evaluation model and what else reads or writes files | 6 cli report results trainer experiments
+0 types config | 1 numerics and its sibling kernels | 2 nn/ | 3 renderer baselines | 4 training
+5 data checkpoint clouds evaluation model and what else reads or writes files | 6 cli report results trainer experiments
 """
 
 import ast
@@ -69,7 +69,9 @@ def test_imports_point_down_the_layers(path):
             continue  # a name of the package itself, or the folder that the file stands in
         assert layer_of(there[0]) <= level, f"layer {level} imports {'.'.join(there)} of layer {layer_of(there[0])}"
         if layer_of(there[0]) == level < FILES:
-            sibling = there[1] if len(here) > 1 else there[0]  # nn/field.py and nn/unet3d.py, or cameras.py and voxels.py
+            sibling = (
+                there[1] if len(here) > 1 else there[0]
+            )  # nn/field.py and nn/unet3d.py, or cameras.py and voxels.py
             assert sibling in SHARED.get(level, set()), f"{here[-1]} imports its sibling {'.'.join(there)}"
 
 

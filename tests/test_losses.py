@@ -32,8 +32,9 @@ class TestAdversarial:
     @pytest.mark.parametrize("logit", [-1e4, 0.0, 1e4])
     def test_are_finite_for_a_sure_discriminator(self, logit):
         logits = jnp.full((1, 2, 2, 1), logit)
-        values = jax.value_and_grad(generator_adversarial)(logits), jax.value_and_grad(discriminator_adversarial)(
-            logits, logits
+        values = (
+            jax.value_and_grad(generator_adversarial)(logits),
+            jax.value_and_grad(discriminator_adversarial)(logits, logits),
         )
         assert all(np.isfinite(x).all() for x in jax.tree.leaves(values))
 

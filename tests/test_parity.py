@@ -204,13 +204,19 @@ def twin_named(tree):
     named = {"points.out.weight": points["out"]["kernel"].T, "points.out.bias": points["out"]["bias"]}
     for i in range(3):
         named[f"points.linears.{i}.weight"] = points[f"hidden_{i}"]["kernel"].T
-        named |= {f"points.norms.{i}.weight": points[f"norm_{i}"]["scale"], f"points.norms.{i}.bias": points[f"norm_{i}"]["bias"]}
+        named |= {
+            f"points.norms.{i}.weight": points[f"norm_{i}"]["scale"],
+            f"points.norms.{i}.bias": points[f"norm_{i}"]["bias"],
+        }
     for name, block in unet.items():
         prefix = "unet." + name.replace("_", ".")
         named |= {f"{prefix}.conv.weight": conv(block["kernel"])}
         named |= {f"{prefix}.norm.weight": block["norm"]["scale"], f"{prefix}.norm.bias": block["norm"]["bias"]}
     for i in range(4):
-        named |= {f"upsampler.conv{i}.weight": conv(upsampler[f"kernel_{i}"]), f"upsampler.conv{i}.bias": upsampler[f"bias_{i}"]}
+        named |= {
+            f"upsampler.conv{i}.weight": conv(upsampler[f"kernel_{i}"]),
+            f"upsampler.conv{i}.bias": upsampler[f"bias_{i}"],
+        }
     return named | twin_named_field(tree["field"])
 
 
@@ -263,4 +269,3 @@ def parameter_of(tree, name):
     if kind == "convs":
         return tree[f"{'kernel' if what == 'weight' else 'bias'}_{i}"]
     return tree[f"norm_{i}"]["scale" if what == "weight" else "bias"]
-

@@ -144,7 +144,9 @@ class TestCount:
     @pytest.mark.parametrize("n", [1, 7, 257, 511, 512])
     def test_is_bisection_of_the_sorted_list_with_ties_and_extremes(self, n, strictly):
         values = np.sort(np.random.default_rng(9).integers(0, n, n)).astype(np.float32)
-        queries = np.concatenate([values[:5], values[-3:], [-1e10, 1e10, n / 2 + 0.25, -np.inf, np.inf]]).astype(np.float32)
+        queries = np.concatenate([values[:5], values[-3:], [-1e10, 1e10, n / 2 + 0.25, -np.inf, np.inf]]).astype(
+            np.float32
+        )
         counted = jax.jit(count_at_most, static_argnums=2)(jnp.asarray(values), jnp.asarray(queries), strictly)
         np.testing.assert_array_equal(counted, np.searchsorted(values, queries, "left" if strictly else "right"))
 

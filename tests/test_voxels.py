@@ -129,9 +129,13 @@ class TestScatterConv:
 
         sparse, dense = both(self.sparse), both(self.dense)
         close(sparse, dense, rtol=1e-4, atol=1e-5)
-        volume = np.concatenate([x if x.ndim == 4 else x[..., None] for x in map(
-            np.asarray, scatter(POSITIONS[0, 0], FEATURES[0, 0], mask, D)
-        )], axis=-1)
+        volume = np.concatenate(
+            [
+                x if x.ndim == 4 else x[..., None]
+                for x in map(np.asarray, scatter(POSITIONS[0, 0], FEATURES[0, 0], mask, D))
+            ],
+            axis=-1,
+        )
         close(sparse[0][1], reference.convolution(volume, self.kernel), atol=1e-5)
 
     def test_no_valid_point_gives_zeros(self):

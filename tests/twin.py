@@ -1,4 +1,4 @@
-"""The parity fixture (weights, inputs and every stage's output of a PyTorch twin in float64) in this project's layout."""
+"""The parity fixture (weights, inputs, every stage's output of a PyTorch twin in float64) in this project's layout."""
 
 import json
 from pathlib import Path

@@ -153,7 +153,7 @@ def cabin(rng, paint, glass, half, belt, high, foot, style) -> list[Piece]:
         tube(np.array([line[i] for line in lines]), 0.007, segments=6)
         for i in (count // 8, 3 * count // 8, 5 * count // 8, 7 * count // 8)
     ]
-    places = {"bus": np.linspace(-0.35, 0.4, 6), "van": [0.2, 0.55]}.get(style, [0.42] if style != "truck" else [])
+    places = {"bus": np.linspace(-0.35, 0.4, 6).tolist(), "van": [0.2, 0.55], "truck": []}.get(style, [0.42])
     low, up = at(0.0), at(0.92)
     for share in places:
         a, b = (line[:, 2].min() * (1 - share) + line[:, 2].max() * share for line in (low, up))

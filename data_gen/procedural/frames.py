@@ -210,9 +210,9 @@ def collage(rng) -> list[Piece]:
         half = framed_sheet(rng, border, content(rng), paper(rng), width, height)
         reach, angle = max(mesh.positions[:, 0].max() for _, mesh in half), rng.uniform(15, 40)
         image = content(rng)
-        images = {id(half[-1][0])}
+        sheet_finish = half[-1][0]
         left = [(f, turn(move(mesh, x=-reach), "y", angle)) for f, mesh in half]
-        right = [(image if id(f) in images else f, turn(move(mesh, x=reach), "y", -angle)) for f, mesh in half]
+        right = [(image if f is sheet_finish else f, turn(move(mesh, x=reach), "y", -angle)) for f, mesh in half]
         return left + right
     columns, rows = int(rng.integers(2, 4)), int(rng.integers(1, 4))
     cell, gap, depth = rng.uniform(0.15, 0.3), rng.uniform(0.03, 0.06), 0.02

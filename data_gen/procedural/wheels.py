@@ -48,4 +48,4 @@ def wheel(rng, radius: float, width: float) -> tuple[Mesh, Mesh]:
     else:
         at = np.linspace(1, 0, 6)
         parts.append(lathe([(inner * 0.9, -half * 0.3), *zip(inner * 0.9 * at, dish * (1 - at**2), strict=True)], 20))
-    return tuple(turn(mesh, "z", -90) for mesh in (tyre, merge(parts)))
+    return turn(tyre, "z", -90), turn(merge(parts), "z", -90)

@@ -1,6 +1,6 @@
 """Radiance field: density and colour at a place from the volume's feature there.
 
-One hidden layer with softplus; density = softplus(raw - 1) (a ReLU can die before it has seen the object); features also
+One hidden layer with softplus; density = softplus(raw - 1) (a ReLU can die before it has seen the object); features
 see the view direction.  All features but RGB are linear in the hidden layer, and so is compositing: the hidden layer is
 composited, and `finish` applies the linear part once per ray instead of once per sample.
 """

@@ -59,6 +59,8 @@ class GroupNorm(nn.Module):
         variance = jnp.mean(jnp.square(grouped - mean), axis=(1, 3), keepdims=True)
         inverse = 1 / jnp.sqrt(variance + EPSILON)
         spread = (x.shape[0], *[1] * (x.ndim - 2), features)
-        per_channel = jnp.broadcast_to(inverse, (x.shape[0], 1, *grouped.shape[2:])).reshape(spread) * per_feature(scale, x)
+        per_channel = jnp.broadcast_to(inverse, (x.shape[0], 1, *grouped.shape[2:])).reshape(spread) * per_feature(
+            scale, x
+        )
         mean = jnp.broadcast_to(mean, (x.shape[0], 1, *grouped.shape[2:])).reshape(spread)
         return (x - mean) * per_channel + per_feature(bias, x)

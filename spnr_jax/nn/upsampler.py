@@ -11,7 +11,9 @@ from spnr_jax.numerics import per_feature
 SLOPE = 0.2
 
 
-def bilinear(x: Float[Array, "batch height width features"], height: int, width: int) -> Float[Array, "batch h w features"]:
+def bilinear(
+    x: Float[Array, "batch height width features"], height: int, width: int
+) -> Float[Array, "batch h w features"]:
     """Image resized with half-pixel centres (not aligned at the corners)."""
     return jax.image.resize(x, (x.shape[0], height, width, x.shape[-1]), "bilinear", antialias=False)
 
@@ -22,9 +24,7 @@ class Upsampler(nn.Module):
     width: int
 
     @nn.compact
-    def __call__(
-        self, x: Float[Array, "batch height width features"]
-    ) -> Float[Array, "batch 2*height 2*width 3"]:
+    def __call__(self, x: Float[Array, "batch height width features"]) -> Float[Array, "batch 2*height 2*width 3"]:
         """Image of twice the size; the first three features are RGB."""
         y = x
         for i, (features, layer) in enumerate(

@@ -1,0 +1,1 @@
+"""From meshes and procedural objects to data sets: materials, surface points, rendered views, records on disk."""

@@ -1,0 +1,219 @@
+"""`spnr`: what a person can mend is one line on stderr and exit code 2, never a traceback; help costs no JAX."""
+
+import dataclasses
+import json
+import shutil
+import signal
+import subprocess
+import sys
+
+import pytest
+import tiny_dataset
+
+from spnr_jax import cli, config
+
+
+@pytest.fixture(autouse=True)
+def shrunken(monkeypatch):
+    """The preset `tiny` is the tests' network, and nothing is written to the home folder."""
+    monkeypatch.setitem(config.PRESETS, "tiny", lambda: tiny_dataset.CONFIG)
+    monkeypatch.setattr(cli, "enable_compilation_cache", lambda: None)
+
+
+def exit_code(*arguments):
+    with pytest.raises(SystemExit) as stop:
+        cli.main([str(argument) for argument in arguments])
+    return stop.value.code
+
+
+def refused(capsys, *arguments):
+    """The one line of a refused command."""
+    assert exit_code(*arguments) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1, lines
+    assert lines[0].startswith("spnr: ")
+    assert "Traceback" not in lines[0]
+    return lines[0]
+
+
+@pytest.fixture
+def data():
+    return tiny_dataset.dataset().folder
+
+
+@pytest.fixture
+def run():
+    return tiny_dataset.run()
+
+
+def test_an_unknown_option_is_refused_with_the_nearest_name(capsys):
+    line = refused(capsys, "train", "data", "run", "--num-step", "3")
+    assert "--num-step, 3" in line
+    assert "Perhaps you meant: --num-steps" in line
+
+
+def test_a_missing_argument_an_unknown_command_and_a_word_for_a_number_are_refused(capsys):
+    assert "Folder of the data set" in refused(capsys, "train")
+    assert "train, evaluate, render" in refused(capsys, "fly")
+    assert "--views" in refused(capsys, "render", "a.ply", "--run", "r", "--views", "many")
+
+
+@pytest.mark.parametrize("form", [["--preset", "tny"], ["--preset=tny"], ["--preset"]])
+def test_an_unknown_preset_names_the_presets(form, capsys):
+    line = refused(capsys, "train", "data", "run", *form)
+    assert all(name in line for name in config.PRESETS)
+
+
+@pytest.mark.parametrize("form", [["--preset", "small"], ["--preset=small"]])
+def test_a_preset_gives_the_defaults_and_options_change_them(form):
+    command = cli.parse(["train", "data", "run", *form, "--num-steps", "7", "--field-width", "12"])
+    small = config.small()
+    expected = dataclasses.replace(small, num_steps=7, model=dataclasses.replace(small.model, field_width=12))
+    assert command.config == expected
+
+
+def test_a_resolution_that_the_unet_cannot_divide_is_refused(capsys):
+    line = refused(capsys, "train", "data", "run", "--volume-resolution", "9")
+    assert "volume_resolution 9 cannot be halved 1 times; use a multiple of 2" in line
+    assert "tyro" not in line
+
+
+@pytest.mark.parametrize(
+    ("command", "words"),
+    [
+        ("train", ["Optimiser steps", "Voxels along each axis", "L1 between image and reference", "Peak learning rate"]),
+        ("evaluate", ["Objects to score", "Folder of the run"]),
+        ("render", ["Degrees above the horizon", "Frames of the turntable", "upward axis"]),
+    ],
+)
+def test_the_help_of_each_command_explains_its_fields(command, words, capsys):
+    assert exit_code(command, "--help") == 0
+    text = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert all(word in text for word in words)
+
+
+def test_help_loads_nothing_heavy():
+    program = (
+        "import sys; from spnr_jax.cli import main\n"
+        "try: main(['train', '--help'])\n"
+        "except SystemExit: print(*(m for m in sys.modules if '.' not in m), file=sys.stderr)"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    loaded = set(done.stderr.split())
+    assert "tyro" in loaded
+    assert not loaded & {"jax", "flax", "orbax", "matplotlib", "mitsuba", "trimesh", "torch", "tensorboardX", "numpy"}
+
+
+def test_a_missing_data_folder_is_refused(capsys, tmp_path, run):
+    missing = tmp_path / "nothing"
+    for arguments in (("train", missing, tmp_path / "run"), ("evaluate", missing, run)):
+        line = refused(capsys, *arguments)
+        assert str(missing) in line
+        assert "spnr-data generate" in line
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_run_folder_of_another_preset_is_refused(capsys, data, run):
+    line = refused(capsys, "train", data, run, "--preset", "small")
+    assert "another config (preset tiny there, small asked" in line
+    assert "choose a new run folder" in line
+
+
+def test_a_schedule_of_no_steps_is_refused(capsys, data, tmp_path):
+    assert "log_every must be at least 1" in refused(capsys, "train", data, tmp_path / "run", "--log-every", 0)
+
+
+def test_a_run_folder_that_is_none_is_refused(capsys, data, tmp_path):
+    (tmp_path / "one.xyz").write_text("0 0 0\n")
+    for arguments in (("evaluate", data, tmp_path), ("render", tmp_path / "one.xyz", "--run", tmp_path)):
+        assert "not a run folder" in refused(capsys, *arguments)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "reason"),
+    [
+        ("empty.ply", b"", "empty"),
+        ("no_points.ply", b"ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nproperty float y\n"
+         b"property float z\nend_header\n", "0 points"),
+        ("nan.xyz", b"0 0 0\nnan 1 1\n", "NaN"),
+        ("noise.glb", b"\x00\x01\x02", "noise.glb"),
+        ("noise.npz", b"PK\x03\x04 no zip", "noise.npz"),
+        ("words.xyz", b"a cloud\nof words\n", "words.xyz"),
+        ("cloud.doc", b"0 0 0\n", "unknown kind"),
+    ],
+)  # fmt: skip
+def test_a_cloud_that_cannot_be_rendered_is_refused(name, content, reason, capsys, tmp_path, run):
+    (tmp_path / name).write_bytes(content)
+    line = refused(capsys, "render", tmp_path / name, "--run", run, "--out", tmp_path / "out")
+    assert reason in line
+    assert name in line
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_missing_cloud_is_refused(capsys, tmp_path, run):
+    assert "no such file" in refused(capsys, "render", tmp_path / "none.ply", "--run", run)
+
+
+def test_an_output_folder_that_is_a_file_is_refused(capsys, tmp_path, run):
+    (tmp_path / "one.xyz").write_text("0 0 0\n")
+    (tmp_path / "taken").write_text("")
+    line = refused(capsys, "render", tmp_path / "one.xyz", "--run", run, "--out", tmp_path / "taken")
+    assert str(tmp_path / "taken") in line
+
+
+def test_a_cloud_of_one_point_renders(capsys, tmp_path, run):
+    (tmp_path / "one.xyz").write_text("1 2 3\n")
+    out = tmp_path / "out"
+    arguments = ("--run", run, "--out", out, "--views", 1, "--frames", 2, "--resolution", 24)
+    assert exit_code("render", tmp_path / "one.xyz", *arguments) == 0
+    assert {path.name for path in out.iterdir()} == {
+        "one_000.png", "one_000_depth.png", "one_000_acc.png", "one_turntable.gif",
+    }  # fmt: skip
+    assert f"wrote {out / 'one_turntable.gif'}" in capsys.readouterr().out
+
+
+def test_a_damaged_newest_checkpoint_is_named_and_the_one_before_is_rendered(capsys, tmp_path, run):
+    copy = shutil.copytree(run, tmp_path / "run")
+    for path in (copy / "checkpoints" / "6").rglob("*"):
+        if path.is_file():
+            path.write_bytes(b"")
+    (tmp_path / "one.xyz").write_text("1 2 3\n")
+    arguments = ("--run", copy, "--out", tmp_path, "--views", 1, "--turntable", "none", "--resolution", 24)
+    assert exit_code("render", tmp_path / "one.xyz", *arguments) == 0
+    captured = capsys.readouterr()
+    assert "trying the one before" in captured.out + captured.err
+    assert (tmp_path / "one_000.png").is_file()
+
+
+def test_train_then_evaluate_write_a_run_and_its_scores(capsys, tmp_path, data):
+    run = tmp_path / "run"
+    assert exit_code("train", data, run, "--log-every", 2) == 0
+    assert f"spnr evaluate {data} {run}" in capsys.readouterr().out
+    assert exit_code("evaluate", data, run, "--gallery", 1, "--out", tmp_path / "scores") == 0
+    metrics = json.loads((tmp_path / "scores" / "metrics.json").read_text())
+    assert set(metrics["seconds"]) == {"evaluate", "total"}
+    assert metrics["methods"]["ours"]["objects"] == len(tiny_dataset.SPLITS["test"])
+    assert (tmp_path / "scores" / "report.html").is_file()
+
+
+def test_a_stop_is_exit_code_130_and_says_so(capsys):
+    def stopped():
+        raise KeyboardInterrupt
+
+    assert cli.guarded(stopped, "spnr") == 130
+    assert capsys.readouterr().err == "spnr: stopped\n"
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_an_error_of_the_program_keeps_its_traceback():
+    def broken():
+        raise AssertionError("a bug")
+
+    with pytest.raises(AssertionError, match="a bug"):
+        cli.guarded(broken, "spnr")
+
+
+def test_errors_of_many_lines_become_one():
+    assert cli.one_line(ValueError("this\n  and\nthat")) == "this and that"
+    assert cli.one_line(OSError(28, "No space left on device")) == "disk: No space left on device"
+    assert cli.one_line(OSError(13, "Permission denied", "a/b")) == "a/b: Permission denied"

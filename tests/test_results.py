@@ -1,0 +1,71 @@
+"""metrics.json has the form that other programs rely on, and the report shows the median view."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+import tiny_dataset
+
+from spnr_jax import evaluation, results, trainer
+
+NUMBERS = {"psnr", "ssim", "cpsnr", "iou", "objects", "views", "cpsnr_views"}
+
+
+@pytest.fixture(scope="module")
+def outcome():
+    return evaluation.evaluate(tiny_dataset.run(), tiny_dataset.dataset(), say=lambda line: None)
+
+
+def written(out, outcome):
+    results.write_results(out, outcome, {"seed": 0}, trainer.read_rows(tiny_dataset.run()), {"evaluate": 1.5, "total": 2.0})
+
+    def refuse(name):
+        raise AssertionError(f"{name} is no JSON")
+
+    return json.loads((out / "metrics.json").read_text(), parse_constant=refuse)
+
+
+def test_metrics_json_has_exactly_these_keys(outcome, tmp_path):
+    metrics = written(tmp_path, outcome)
+    assert set(metrics) == {
+        "methods", "seconds", "preset", "steps", "seed", "hardware", "settings", "per_category",
+    }  # fmt: skip
+    assert set(metrics["methods"]) == {"ours", "white", "splat", "nearest"}
+    assert all(set(values) == NUMBERS for values in metrics["methods"].values())
+    assert (metrics["preset"], metrics["steps"], metrics["seed"]) == ("tiny", 6, 0)
+    assert metrics["seconds"] == {"evaluate": 1.5, "total": 2.0}
+    assert isinstance(metrics["hardware"], str)
+
+
+def test_a_cpsnr_that_does_not_exist_is_null_and_the_report_is_written(outcome, tmp_path):
+    methods = {name: values | {"cpsnr": None, "cpsnr_views": 0} for name, values in outcome.summary["methods"].items()}
+    metrics = written(tmp_path, dataclasses.replace(outcome, summary=outcome.summary | {"methods": methods}))
+    assert metrics["methods"]["ours"]["cpsnr"] is None
+    assert "nan" not in (tmp_path / "report.html").read_text().lower().split("<svg")[0].replace("finance", "")[:2000]
+
+
+def test_a_number_that_is_not_finite_is_refused_instead_of_written(outcome, tmp_path):
+    broken = dataclasses.replace(outcome, summary=outcome.summary | {"steps": float("nan")})
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        written(tmp_path, broken)
+    assert not (tmp_path / "metrics.json").exists()
+
+
+def test_the_report_is_one_file_that_names_the_objects_and_the_best_floor(outcome, tmp_path):
+    metrics = written(tmp_path, outcome)
+    page = (tmp_path / "report.html").read_text()
+    for name in tiny_dataset.SPLITS["test"]:
+        assert name in page
+    best = max(("white", "splat", "nearest"), key=lambda name: metrics["methods"][name]["psnr"])
+    assert f"best trivial renderer ({best})" in page
+
+
+def test_a_gallery_row_is_the_view_of_the_median_psnr(outcome):
+    result = outcome.gallery[0]
+    psnr = np.array([30.0, 10.0, 20.0], np.float32)
+    scores = result.scores | {"ours": dataclasses.replace(result.scores["ours"], psnr=psnr)}
+    row = results.gallery_row(dataclasses.replace(result, scores=scores))
+    np.testing.assert_array_equal(row.reference, result.reference[2])
+    np.testing.assert_array_equal(row.ours, result.images["ours"][2])
+    np.testing.assert_array_equal(row.depth, result.depth[2])

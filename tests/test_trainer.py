@@ -1,0 +1,162 @@
+"""The loop: stopped anywhere, it goes on to the same numbers; what breaks stops it with a name and leaves a good state."""
+
+import errno
+import json
+import os
+import shutil
+import signal
+
+import jax
+import numpy as np
+import pytest
+import tiny_dataset
+from laws import same_bits
+from tiny_dataset import CONFIG, SCHEDULE
+
+from spnr_jax import checkpoint, cli, data, trainer
+
+KEPT_STEPS = {"2", "4", "6"}
+
+
+def interrupted(monkeypatch, step, number=signal.SIGTERM):
+    """Makes the signal arrive while the batch after `step` steps is fetched."""
+    real = data.batches
+
+    def batches(dataset, config, first):
+        for i, batch in enumerate(real(dataset, config, first), start=first):
+            if i + 1 == step:
+                signal.raise_signal(number)
+            yield batch
+
+    monkeypatch.setattr(data, "batches", batches)
+
+
+def stopped_run(monkeypatch, run, step):
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt, match=f"stopped at step {step} of 6"):
+        interrupted(patch, step)
+        trainer.train(CONFIG, tiny_dataset.dataset(), run, SCHEDULE)
+
+
+def rows_without_time(run):
+    return [{k: v for k, v in row.items() if k != "ms_per_step"} for row in trainer.read_rows(run)]
+
+
+def restored(run):
+    return checkpoint.restore(run, CONFIG)
+
+
+def test_a_stopped_run_goes_on_to_the_same_bits_and_rows(monkeypatch, tmp_path):
+    stopped_run(monkeypatch, tmp_path, 3)
+    assert int(restored(tmp_path).step) == 3
+    trainer.train(CONFIG, tiny_dataset.dataset(), tmp_path, SCHEDULE)
+    same_bits(restored(tmp_path), restored(tiny_dataset.run()))
+    assert rows_without_time(tmp_path) == rows_without_time(tiny_dataset.run())
+
+
+@pytest.mark.parametrize("end", ["", '{"step": 6, "lo'])
+def test_rows_after_the_checkpoint_and_half_rows_are_written_again(end, tmp_path):
+    run = shutil.copytree(tiny_dataset.run(), tmp_path / "run")
+    shutil.rmtree(run / "checkpoints" / "6")
+    with (run / "metrics.jsonl").open("a") as file:
+        file.write(end)
+    trainer.train(CONFIG, tiny_dataset.dataset(), run, SCHEDULE)
+    assert rows_without_time(run) == rows_without_time(tiny_dataset.run())
+    same_bits(restored(run), restored(tiny_dataset.run()))
+
+
+def test_a_damaged_newest_checkpoint_is_replaced_on_the_way(tmp_path, capsys):
+    run = shutil.copytree(tiny_dataset.run(), tmp_path / "run")
+    (run / "checkpoints" / "6" / "state" / "_METADATA").unlink(missing_ok=True)
+    for path in (run / "checkpoints" / "6").rglob("*"):
+        if path.is_file():
+            path.write_bytes(b"")
+    trainer.train(CONFIG, tiny_dataset.dataset(), run, SCHEDULE)
+    assert "checkpoints/6" in capsys.readouterr().out
+    same_bits(restored(run), restored(tiny_dataset.run()))
+    assert capsys.readouterr().out == "", "the checkpoint at step 6 is good again"
+
+
+def test_a_finished_run_is_left_alone():
+    before = {path: path.stat().st_mtime_ns for path in tiny_dataset.run().rglob("*") if path.is_file()}
+    state = trainer.train(CONFIG, tiny_dataset.dataset(), tiny_dataset.run(), SCHEDULE)
+    assert int(state.step) == 6
+    assert before == {path: path.stat().st_mtime_ns for path in tiny_dataset.run().rglob("*") if path.is_file()}
+
+
+def test_previews_and_rows_come_when_the_schedule_says():
+    run = tiny_dataset.run()
+    assert [row["step"] for row in trainer.read_rows(run) if "loss" in row] == [1, 2, 3, 4, 5, 6]
+    assert [row["step"] for row in trainer.read_rows(run) if "val_psnr" in row] == [3, 6]
+    assert {path.name for path in (run / "previews").iterdir()} == {"0000003.png", "0000006.png"}
+    assert {path.name for path in (run / "checkpoints").iterdir() if path.is_dir()} == KEPT_STEPS
+
+
+def test_handlers_of_signals_come_back_after_training():
+    before = signal.getsignal(signal.SIGINT)
+    with trainer.stop_requests() as requests:
+        signal.raise_signal(signal.SIGINT)
+        assert requests == [signal.SIGINT]
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def poisoned(monkeypatch, step):
+    real = data.make_batch
+
+    def make_batch(objects, config, at):
+        batch = real(objects, config, at)
+        return jax.tree.map(lambda x: x * np.nan if x.dtype == np.float32 else x, batch) if at + 1 == step else batch
+
+    monkeypatch.setattr(data, "make_batch", make_batch)
+
+
+def test_nan_stops_with_step_and_quantity_and_the_last_checkpoint_is_usable(monkeypatch, tmp_path, capsys):
+    poisoned(monkeypatch, 4)
+    sparse = trainer.Schedule(log_every=100, preview_every=100, checkpoint_every=2)  # step 4 is never due to be logged
+    code = cli.guarded(lambda: trainer.train(CONFIG, tiny_dataset.dataset(), tmp_path, sparse), "spnr")
+    line = capsys.readouterr().err.splitlines()[-1]
+    assert code == 2
+    assert "is nan at step 4" in line
+    assert line.startswith(("spnr: psnr ", "spnr: l1 "))
+    state = restored(tmp_path)
+    assert int(state.step) == 2
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(state.generator))
+
+
+def test_the_first_number_that_is_not_finite_is_named():
+    rows = [(1, {"loss": 1.0, "psnr": 2.0}), (2, {"loss": 1.0, "psnr": np.inf}), (3, {"loss": np.nan, "psnr": 1.0})]
+    with pytest.raises(trainer.NotFinite, match="psnr is inf at step 2"):
+        trainer.check_finite(rows)
+
+
+def test_a_full_disk_is_one_line_and_exit_code_2(monkeypatch, tmp_path, capsys):
+    def full(log, row):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(tmp_path / "metrics.jsonl"))
+
+    monkeypatch.setattr(trainer.MetricsLog, "write", full)
+    code = cli.guarded(lambda: trainer.train(CONFIG, tiny_dataset.dataset(), tmp_path, SCHEDULE), "spnr")
+    assert code == 2
+    line = capsys.readouterr().err.splitlines()[-1]
+    assert line == f"spnr: {tmp_path / 'metrics.jsonl'}: No space left on device"
+
+
+def test_ctrl_c_is_exit_code_130_and_says_how_to_go_on(monkeypatch, tmp_path, capsys):
+    interrupted(monkeypatch, 1, signal.SIGINT)
+    code = cli.guarded(lambda: trainer.train(CONFIG, tiny_dataset.dataset(), tmp_path, SCHEDULE), "spnr")
+    assert code == 130
+    expected = "spnr: stopped at step 1 of 6; the same command goes on from there"
+    assert capsys.readouterr().err.splitlines()[-1] == expected
+    assert int(restored(tmp_path).step) == 1
+
+
+@pytest.mark.parametrize("name", ["log_every", "preview_every", "checkpoint_every"])
+def test_a_schedule_of_no_steps_is_refused(name):
+    with pytest.raises(ValueError, match=f"{name} must be at least 1 step, got 0"):
+        trainer.Schedule(**{name: 0})
+
+
+def test_rows_are_json_without_nan():
+    def refuse(name):
+        raise AssertionError(f"{name} is no JSON")
+
+    for line in (tiny_dataset.run() / "metrics.jsonl").read_text().splitlines():
+        json.loads(line, parse_constant=refuse)
