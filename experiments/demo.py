@@ -79,7 +79,9 @@ def main(demo: Demo) -> None:
     parts = {name: round(value, 1) for name, value in parts.items()}
     write_results(demo.out, outcome, dataset.settings, trainer.read_rows(run), parts)
     for method, values in outcome.summary["methods"].items():
-        print(f"{method:8s} PSNR {values['psnr']:6.2f} dB   SSIM {values['ssim']:.3f}   opacity IoU {values['iou']:.3f}")
+        print(
+            f"{method:8s} PSNR {values['psnr']:6.2f} dB   SSIM {values['ssim']:.3f}   opacity IoU {values['iou']:.3f}"
+        )
     print(f"metrics: {demo.out / 'metrics.json'}\nreport:  {demo.out / 'report.html'}")
 
 

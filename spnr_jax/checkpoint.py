@@ -26,7 +26,9 @@ def write_config(run: Path, config: TrainConfig) -> None:
         stored = to_dict(read_config(run))
         changed = _differences(stored, json.loads(json.dumps(to_dict(config))))
         if changed:
-            raise ValueError(f"{run} holds a run with another config ({'; '.join(changed[:4])}); choose a new run folder")
+            raise ValueError(
+                f"{run} holds a run with another config ({'; '.join(changed[:4])}); choose a new run folder"
+            )
         return
     run.mkdir(parents=True, exist_ok=True)
     temporary = path.with_suffix(".partial")
@@ -70,7 +72,8 @@ def _checkpointer(run: Path, *, writing: bool):
 def save(run: Path, state: training.TrainState) -> None:
     """Writes the state as the run's newest checkpoint and removes those that are too old."""
     with _checkpointer(run, writing=True) as checkpointer:
-        checkpointer.save(int(state.step), state)
+        # a damaged checkpoint of this step, which an earlier run left, makes place
+        checkpointer.save(int(state.step), state, force=True, overwrite=True)
 
 
 def restore(run: Path, config: TrainConfig, say: Callable[[str], None] = print) -> training.TrainState | None:
@@ -89,13 +92,17 @@ def restore(run: Path, config: TrainConfig, say: Callable[[str], None] = print) 
                 state = checkpointer.load(step, like)
                 jax.block_until_ready(state)
             except Exception as error:  # noqa: BLE001 - Orbax and tensorstore raise many kinds for a damaged file
-                say(f"checkpoint {run / 'checkpoints' / str(step)} is damaged ({_first_line(error)}); trying the one before")
+                say(
+                    f"checkpoint {run / 'checkpoints' / str(step)} is damaged ({_first_line(error)}); trying the one before"
+                )
                 continue
             if int(state.step) == step:
                 return state
             say(f"checkpoint {run / 'checkpoints' / str(step)} holds step {int(state.step)}; trying the one before")
     if steps:
-        raise ValueError(f"{run / 'checkpoints'}: no checkpoint of this run can be read; remove the folder to start again")
+        raise ValueError(
+            f"{run / 'checkpoints'}: no checkpoint of this run can be read; remove the folder to start again"
+        )
     return None
 
 

@@ -87,7 +87,7 @@ def choose_radius(dataset: data.Dataset, config: TrainConfig, method: str, num_o
         values = []
         for item in items:
             image, _ = render_floor(method, test_cloud(item, config), item.camera, factor)
-            values.append(metrics.psnr(image, data.on_white(item.images)))
+            values.append(metrics.psnr(image, jnp.asarray(data.on_white(item.images))))
         return float(np.mean(values))
 
     return max(RADIUS_FACTORS, key=mean_psnr)
@@ -131,7 +131,9 @@ def summarise(results: list[dict[str, Scores]]) -> dict[str, dict[str, float]]:
     """Means over all images of each method, with the counts behind them."""
     table = {}
     for method in METHODS:
-        stacked = {k: np.concatenate([getattr(r[method], k) for r in results]) for k in ("psnr", "ssim", "cpsnr", "iou")}
+        stacked = {
+            k: np.concatenate([getattr(r[method], k) for r in results]) for k in ("psnr", "ssim", "cpsnr", "iou")
+        }
         visible = stacked["cpsnr"][~np.isnan(stacked["cpsnr"])]
         table[method] = {
             "psnr": float(stacked["psnr"].mean()),

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from PIL import Image
 from tqdm import tqdm
@@ -174,7 +175,7 @@ def preview(
         cloud = evaluation.test_cloud(item, config)
         rendering = evaluation.render_views(variables, config, cloud, item.camera)
         image, reference = np.clip(np.asarray(rendering.image), 0, 1), data.on_white(item.images)
-        scores.append(np.asarray(evaluation.metrics.psnr(image, reference)))
+        scores.append(np.asarray(evaluation.metrics.psnr(jnp.asarray(image), jnp.asarray(reference))))
         columns.append(np.concatenate([reference[0], image[0]]))
     folder = run / "previews"
     folder.mkdir(exist_ok=True)

@@ -52,6 +52,12 @@ class TestWeights:
         close(weights, jax.nn.one_hot(place, 8))
         assert residual == 0
 
+    def test_an_optical_depth_that_float32_cannot_hold_is_opaque_with_a_finite_gradient(self):
+        density, delta = jnp.full(4, 3e38), jnp.full(4, 10.0)
+        close(volume_weights(density, delta), (jax.nn.one_hot(0, 4), 0.0))
+        gradients = jax.grad(lambda d, l: jnp.sum(volume_weights(d, l)[0] * jnp.arange(4.0)), (0, 1))(density, delta)
+        assert all(jnp.isfinite(g).all() for g in gradients)
+
     def test_thin_intervals_are_not_lost(self):
         weights, _ = volume_weights(jnp.full(64, 1e-6 / 64), jnp.ones(64))
         assert weights.sum() == pytest.approx(1e-6, rel=1e-3)

@@ -105,7 +105,8 @@ def test_pictures_conditions_and_cameras_of_a_batch_are_those_of_the_files():
     folder = tiny_dataset.dataset().folder / "objects" / NAMES[0]
     for i, view in enumerate(views):
         picture, condition = (
-            np.asarray(Image.open(folder / kind / f"{view:03d}.png"), np.float64) / 255 for kind in ("images", "conditions")
+            np.asarray(Image.open(folder / kind / f"{view:03d}.png"), np.float64) / 255
+            for kind in ("images", "conditions")
         )
         seen = condition[..., 3] == 1
         assert 0 < seen.sum() < seen.size

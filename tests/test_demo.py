@@ -47,7 +47,9 @@ def test_the_demo_writes_its_report_and_a_second_call_reuses_everything(asked, t
 
 
 @pytest.mark.parametrize(("meshes", "objects", "expected"), [(None, None, 240), ("m", None, None), ("m", 7, 7)])
-def test_procedural_objects_are_made_unless_meshes_replace_them(meshes, objects, expected, asked, tmp_path, monkeypatch):
+def test_procedural_objects_are_made_unless_meshes_replace_them(
+    meshes, objects, expected, asked, tmp_path, monkeypatch
+):
     class Generated(Exception):  # noqa: N818 - no error: the demo has got as far as the test looks
         pass
 

@@ -3,6 +3,7 @@
 import dataclasses
 import shutil
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import tiny_dataset
@@ -30,9 +31,9 @@ def results():
 def test_scores_are_those_of_the_metrics_called_by_hand(results):
     for name, result in zip(NAMES, results, strict=True):
         item = data.read_object(tiny_dataset.dataset(), name)
-        reference, mask = data.on_white(item.images), item.conditions[..., 3] > 0
+        reference, mask = (jnp.asarray(x) for x in (data.on_white(item.images), item.conditions[..., 3] > 0))
         for method in evaluation.METHODS:
-            image = result.images[method]
+            image = jnp.asarray(result.images[method])
             assert 0 <= image.min() <= image.max() <= 1
             scores = result.scores[method]
             close(scores.psnr, -10 * np.log10(np.mean((image - reference) ** 2, axis=(1, 2, 3))), rtol=1e-4)
@@ -109,7 +110,7 @@ def test_the_radius_is_the_one_that_scores_best_on_training_objects(monkeypatch)
         values = []
         for item in items:
             image, _ = evaluation.render_floor("splat", evaluation.test_cloud(item, CONFIG), item.camera, factor)
-            values.append(np.mean(metrics.psnr(image, data.on_white(item.images))))
+            values.append(np.mean(metrics.psnr(image, jnp.asarray(data.on_white(item.images)))))
         return np.mean(values)
 
     assert score(chosen) == max(score(factor) for factor in evaluation.RADIUS_FACTORS)

@@ -32,7 +32,7 @@ def example_cloud(count=40, seed=0):
 def test_moving_and_scaling_cloud_and_camera_together_changes_only_the_unit_of_depth(handle):
     cloud, factor, shift = example_cloud(), 8.0, np.float32([16.0, -4.0, 2.0])
     volume = handle.encode(cloud)
-    camera = handle.camera(volume, 40, 25)
+    camera = handle.camera(volume, 40.0, 25.0)
     moved = handle.encode(dataclasses.replace(cloud, positions=cloud.positions * np.float32(factor) + shift))
     pose = np.array(camera.cam_to_world)
     pose[:, 3] = pose[:, 3] * factor + shift
@@ -59,7 +59,7 @@ def test_depth_is_the_distance_in_the_clouds_units(handle):
 def test_the_cameras_of_the_handle_look_at_the_middle_of_the_cloud(handle):
     cloud = example_cloud()
     volume = handle.encode(dataclasses.replace(cloud, positions=cloud.positions * 5 + 30))
-    for azimuth, elevation in ((0, 0), (130, 50), (10, 90), (10, -90)):
+    for azimuth, elevation in ((0.0, 0.0), (130.0, 50.0), (10.0, 90.0), (10.0, -90.0)):
         camera = handle.camera(volume, azimuth, elevation, resolution=32)
         pixels, _ = cameras.project(camera, volume.centre[None])
         close(pixels[0], np.float32([16, 16]), atol=1e-3)
@@ -67,7 +67,7 @@ def test_the_cameras_of_the_handle_look_at_the_middle_of_the_cloud(handle):
 
 def test_an_axis_of_views_holds_what_each_camera_sees_alone(handle):
     volume = handle.encode(example_cloud())
-    single = [handle.camera(volume, azimuth, 20) for azimuth in (0, 100)]
+    single = [handle.camera(volume, azimuth, 20.0) for azimuth in (0.0, 100.0)]
     stacked = Camera(
         cam_to_world=jax.numpy.stack([c.cam_to_world for c in single]),
         intrinsics=jax.numpy.stack([c.intrinsics for c in single]),

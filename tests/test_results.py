@@ -18,7 +18,9 @@ def outcome():
 
 
 def written(out, outcome):
-    results.write_results(out, outcome, {"seed": 0}, trainer.read_rows(tiny_dataset.run()), {"evaluate": 1.5, "total": 2.0})
+    results.write_results(
+        out, outcome, {"seed": 0}, trainer.read_rows(tiny_dataset.run()), {"evaluate": 1.5, "total": 2.0}
+    )
 
     def refuse(name):
         raise AssertionError(f"{name} is no JSON")

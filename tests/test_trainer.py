@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import re
 import shutil
 import signal
 
@@ -115,8 +116,7 @@ def test_nan_stops_with_step_and_quantity_and_the_last_checkpoint_is_usable(monk
     code = cli.guarded(lambda: trainer.train(CONFIG, tiny_dataset.dataset(), tmp_path, sparse), "spnr")
     line = capsys.readouterr().err.splitlines()[-1]
     assert code == 2
-    assert "is nan at step 4" in line
-    assert line.startswith(("spnr: psnr ", "spnr: l1 "))
+    assert re.match(r"spnr: \w+ is nan at step 4; the last checkpoint is kept", line)
     state = restored(tmp_path)
     assert int(state.step) == 2
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(state.generator))
