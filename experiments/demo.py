@@ -2,8 +2,8 @@
 
     python -m experiments.demo [--out runs/demo] [--meshes DIR]
 
-What is there already is reused: finished objects, trained steps.  The seconds of each part are those of the run that did
-the work.
+What is there already is reused: finished objects, trained steps.  The seconds of each part are those of the run that
+did the work.
 """
 
 import dataclasses
@@ -79,9 +79,7 @@ def main(demo: Demo) -> None:
     parts = {name: round(value, 1) for name, value in parts.items()}
     write_results(demo.out, outcome, dataset.settings, trainer.read_rows(run), parts)
     for method, values in outcome.summary["methods"].items():
-        print(
-            f"{method:8s} PSNR {values['psnr']:6.2f} dB   SSIM {values['ssim']:.3f}   opacity IoU {values['iou']:.3f}"
-        )
+        print(f"{method:8s} PSNR {values['psnr']:6.2f} dB   SSIM {values['ssim']:.3f}   IoU {values['iou']:.3f}")
     print(f"metrics: {demo.out / 'metrics.json'}\nreport:  {demo.out / 'report.html'}")
 
 

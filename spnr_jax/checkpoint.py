@@ -78,7 +78,8 @@ def save(run: Path, state: training.TrainState) -> None:
 
 def restore(run: Path, config: TrainConfig, say: Callable[[str], None] = print) -> training.TrainState | None:
     """The newest readable state of a run, None if it has none; `say` gets a line for each broken checkpoint."""
-    if not (run / "checkpoints").is_dir():
+    folder = run / "checkpoints"
+    if not folder.is_dir():
         return None
     sharding = jax.sharding.SingleDeviceSharding(jax.devices()[0])
     like = jax.tree.map(
@@ -92,13 +93,11 @@ def restore(run: Path, config: TrainConfig, say: Callable[[str], None] = print) 
                 state = checkpointer.load(step, like)
                 jax.block_until_ready(state)
             except Exception as error:  # noqa: BLE001 - Orbax and tensorstore raise many kinds for a damaged file
-                say(
-                    f"checkpoint {run / 'checkpoints' / str(step)} is damaged ({_first_line(error)}); trying the one before"
-                )
+                say(f"checkpoint {folder / str(step)} is damaged ({_first_line(error)}); trying the one before")
                 continue
             if int(state.step) == step:
                 return state
-            say(f"checkpoint {run / 'checkpoints' / str(step)} holds step {int(state.step)}; trying the one before")
+            say(f"checkpoint {folder / str(step)} holds step {int(state.step)}; trying the one before")
     if steps:
         raise ValueError(
             f"{run / 'checkpoints'}: no checkpoint of this run can be read; remove the folder to start again"

@@ -134,14 +134,20 @@ def _train_defaults(arguments: list[str]) -> Train:
 def run(command: Train | Evaluate | Render) -> None:
     """Carries a command out."""
     enable_compilation_cache()
-    {Train: run_train, Evaluate: run_evaluate, Render: run_render}[type(command)](command)
+    match command:
+        case Train():
+            run_train(command)
+        case Evaluate():
+            run_evaluate(command)
+        case Render():
+            run_render(command)
 
 
 def enable_compilation_cache() -> None:
     """Lets a second run skip XLA's compilation; JAX_COMPILATION_CACHE_DIR moves the cache."""
     import jax
 
-    if jax.config.jax_compilation_cache_dir is None:
+    if jax.config.values["jax_compilation_cache_dir"] is None:
         jax.config.update("jax_compilation_cache_dir", str(Path.home() / ".cache" / "spnr_jax"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
 

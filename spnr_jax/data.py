@@ -1,14 +1,14 @@
 """Training data from disk: objects as NumPy arrays, and batches that are a pure function of (seed, step).
 
-A data set is the folder that `spnr-data generate` writes (its form: README, "Data on disk").  Because a batch depends on
-nothing but the step, a resumed run needs no reader state to see the same data.
+A data set is the folder that `spnr-data generate` writes (its form: README, "Data on disk").  Because a batch depends
+on nothing but the step, a resumed run needs no reader state to see the same data.
 """
 
 import dataclasses
 import json
 import queue
 import threading
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -149,7 +149,7 @@ def object_names(names: tuple[str, ...], config: TrainConfig, step: int) -> list
     return chosen
 
 
-def batches(dataset: Dataset, config: TrainConfig, first_step: int) -> Iterator[Batch]:
+def batches(dataset: Dataset, config: TrainConfig, first_step: int) -> Generator[Batch, None, None]:
     """Training batches from `first_step` on, read and assembled ahead in a thread."""
     names = dataset.splits["train"]
     if not names:
@@ -187,7 +187,7 @@ def check_resolution(data: ObjectData, config: TrainConfig) -> None:
         )
 
 
-def prefetch(items: Iterator, depth: int = 4) -> Iterator:
+def prefetch(items: Iterator, depth: int = 4) -> Generator:
     """The same items, made ahead by a thread; its error is raised where the item would have come."""
     done = object()
     line: queue.Queue = queue.Queue(maxsize=depth)

@@ -1,7 +1,7 @@
 """How good a network is on a split of a data set, beside the trivial renderers that every table shows.
 
 Means are over images; a condition PSNR leaves out images in which no input point is visible and counts the others.
-The radius of the point renderers is chosen on training objects, as the multiple of the point spacing with the best PSNR.
+The radius of the point renderers is chosen on training objects: the multiple of the point spacing with the best PSNR.
 """
 
 import os
@@ -62,7 +62,7 @@ def score(
 
 
 @partial(jax.jit, static_argnames="method")
-def render_floor(method: str, cloud: PointCloud, camera: Camera, factor: float) -> tuple[Array, Array]:
+def render_floor(method: str, cloud: PointCloud, camera: Camera, factor: float | Array) -> tuple[Array, Array]:
     """Image and opacity of a trivial renderer for all views of one cloud."""
     if method == "white":
         image = floors.white(camera)
@@ -127,7 +127,7 @@ def evaluate_objects(
         )
 
 
-def summarise(results: list[dict[str, Scores]]) -> dict[str, dict[str, float]]:
+def summarise(results: list[dict[str, Scores]]) -> dict[str, dict[str, float | None]]:
     """Means over all images of each method, with the counts behind them."""
     table = {}
     for method in METHODS:
@@ -189,7 +189,7 @@ def evaluate(
             "split": split,
             "points": config.test_points,
             "radius factors": factors,
-            "metrics": "PSNR, SSIM (gaussian, sigma 1.5) on sRGB in [0, 1] over white, mean over images; PSNR capped at 100 dB",
+            "metrics": "PSNR (max. 100 dB), SSIM (gaussian, sigma 1.5) on sRGB in [0, 1] over white, mean over images",
         },
     }
     per_category = {c: summarise([s for n, s in scores.items() if category_of(n) == c]) for c in categories}

@@ -2,8 +2,8 @@
 
     RUN/config.json  metrics.jsonl  tensorboard/  previews/STEP.png  checkpoints/STEP/
 
-A run goes on by itself from its newest readable checkpoint; the rows of metrics.jsonl after it are dropped, because they
-will be written again.  A loss that is not finite stops the run and names the step; the last checkpoint stays.
+A run goes on by itself from its newest readable checkpoint; the rows of metrics.jsonl after it are dropped, because
+they will be written again.  A loss that is not finite stops the run and names the step; the last checkpoint stays.
 """
 
 import json
@@ -105,8 +105,8 @@ def check_finite(rows: list[tuple[int, dict]]) -> list[tuple[int, dict]]:
 
 
 def mean_row(rows: list[tuple[int, dict]]) -> dict[str, float]:
-    """Mean of each metric over steps."""
-    return {name: float(np.mean([metrics[name] for _, metrics in rows])) for name in rows[-1][1]}
+    """Mean of each metric over the steps that have it (the discriminator's begin somewhere between two rows)."""
+    return {name: float(np.mean([m[name] for _, m in rows if name in m])) for name in rows[-1][1]}
 
 
 @contextmanager

@@ -120,7 +120,7 @@ def test_a_config_comes_back_from_the_run_folder(tmp_path):
 
 def test_a_run_of_another_preset_is_refused_with_the_fields_that_differ(run):
     other = dataclasses.replace(CONFIG, preset="small", model=dataclasses.replace(CONFIG.model, field_width=16))
-    with pytest.raises(ValueError, match="another config") as error:
+    with pytest.raises(ValueError, match="with another config") as error:
         checkpoint.write_config(run, other)
     assert "preset tiny there, small asked" in str(error.value)
     assert "model.field_width 8 there, 16 asked" in str(error.value)

@@ -55,7 +55,7 @@ class TestWeights:
     def test_an_optical_depth_that_float32_cannot_hold_is_opaque_with_a_finite_gradient(self):
         density, delta = jnp.full(4, 3e38), jnp.full(4, 10.0)
         close(volume_weights(density, delta), (jax.nn.one_hot(0, 4), 0.0))
-        gradients = jax.grad(lambda d, l: jnp.sum(volume_weights(d, l)[0] * jnp.arange(4.0)), (0, 1))(density, delta)
+        gradients = jax.grad(lambda d, w: jnp.sum(volume_weights(d, w)[0] * jnp.arange(4.0)), (0, 1))(density, delta)
         assert all(jnp.isfinite(g).all() for g in gradients)
 
     def test_thin_intervals_are_not_lost(self):

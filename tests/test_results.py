@@ -44,7 +44,7 @@ def test_a_cpsnr_that_does_not_exist_is_null_and_the_report_is_written(outcome, 
     methods = {name: values | {"cpsnr": None, "cpsnr_views": 0} for name, values in outcome.summary["methods"].items()}
     metrics = written(tmp_path, dataclasses.replace(outcome, summary=outcome.summary | {"methods": methods}))
     assert metrics["methods"]["ours"]["cpsnr"] is None
-    assert "nan" not in (tmp_path / "report.html").read_text().lower().split("<svg")[0].replace("finance", "")[:2000]
+    assert ">nan" not in (tmp_path / "report.html").read_text().lower()
 
 
 def test_a_number_that_is_not_finite_is_refused_instead_of_written(outcome, tmp_path):

@@ -1,4 +1,4 @@
-"""The loop: stopped anywhere, it goes on to the same numbers; what breaks stops it with a name and leaves a good state."""
+"""The loop: stopped anywhere, it goes on to the same numbers; what breaks it is named and leaves a good state."""
 
 import errno
 import json
@@ -33,9 +33,10 @@ def interrupted(monkeypatch, step, number=signal.SIGTERM):
 
 
 def stopped_run(monkeypatch, run, step):
-    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt, match=f"stopped at step {step} of 6"):
+    with monkeypatch.context() as patch:
         interrupted(patch, step)
-        trainer.train(CONFIG, tiny_dataset.dataset(), run, SCHEDULE)
+        with pytest.raises(KeyboardInterrupt, match=f"stopped at step {step} of 6"):
+            trainer.train(CONFIG, tiny_dataset.dataset(), run, SCHEDULE)
 
 
 def rows_without_time(run):
@@ -126,6 +127,11 @@ def test_the_first_number_that_is_not_finite_is_named():
     rows = [(1, {"loss": 1.0, "psnr": 2.0}), (2, {"loss": 1.0, "psnr": np.inf}), (3, {"loss": np.nan, "psnr": 1.0})]
     with pytest.raises(trainer.NotFinite, match="psnr is inf at step 2"):
         trainer.check_finite(rows)
+
+
+def test_a_row_over_the_start_of_the_discriminator_is_the_mean_over_the_steps_that_have_it():
+    rows = [(1, {"loss": 1.0}), (2, {"loss": 3.0, "discriminator": 5.0})]
+    assert trainer.mean_row(rows) == {"loss": 2.0, "discriminator": 5.0}
 
 
 def test_a_full_disk_is_one_line_and_exit_code_2(monkeypatch, tmp_path, capsys):

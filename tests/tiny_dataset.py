@@ -1,4 +1,4 @@
-"""A data set and a run that take milliseconds and seconds: coloured balls painted with NumPy, a network of a few weights."""
+"""A data set and a run of milliseconds and seconds: coloured balls painted with NumPy, a network of few weights."""
 
 import atexit
 import functools
