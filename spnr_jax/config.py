@@ -185,6 +185,11 @@ class TrainConfig:
         for name in ("num_steps", "batch_objects", "views_per_object", "min_points", "test_points"):
             _require(getattr(self, name) >= 1, f"{name} must be at least 1, got {getattr(self, name)}")
         _require(
+            self.loss.adversarial_weight == 0 or self.model.image_resolution >= 24,
+            f"image_resolution {self.model.image_resolution} is too small for the discriminator's patches; use at least "
+            "24, or adversarial_weight 0",
+        )
+        _require(
             self.min_points <= self.max_points,
             f"min_points {self.min_points} must not exceed max_points {self.max_points}",
         )

@@ -83,7 +83,7 @@ def gather_rows(table: Float[Array, "rows features"], index: Int[Array, "*batch"
 
 
 def _gather_fwd(table, index):
-    return _gather(table, index), (index, table.shape[0])
+    return gather_rows(table, index), (index, table.shape[0])
 
 
 def _gather_bwd(residuals, cotangent):
@@ -107,6 +107,6 @@ def _scatter_zeros(rows, index, values):
 
 _scatter_rows = jax.custom_vjp(_scatter_zeros, nondiff_argnums=(0,))
 _scatter_rows.defvjp(
-    lambda rows, index, values: (_scatter_zeros(rows, index, values), index),
+    lambda rows, index, values: (_scatter_rows(rows, index, values), index),
     lambda rows, index, cotangent: (np.zeros(index.shape, jax.dtypes.float0), gather_rows(cotangent, index)),
 )

@@ -174,7 +174,7 @@ def _bold_best(values: Sequence[float | None], decimals: int) -> list[str]:
     finite = [value for value in values if value is not None and math.isfinite(value)]
     best = max(finite, default=None)
     texts: dict[float | None, str] = {value: f"{value:.{decimals}f}" for value in finite}
-    return [f"<b>{texts[v]}</b>" if v == best else texts.get(v, "n/a") for v in values]
+    return [f"<b>{texts[v]}</b>" if v is not None and v == best else texts.get(v, "n/a") for v in values]
 
 
 def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

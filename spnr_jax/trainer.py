@@ -50,7 +50,7 @@ class NotFinite(ValueError):
 def train(config: TrainConfig, dataset: data.Dataset, run: Path, schedule: Schedule) -> training.TrainState:
     """The state after the config's last step; goes on where an earlier call left the run folder."""
     checkpoint.write_config(run, config)
-    state = checkpoint.restore(run, config, say=tqdm.write) or training.create_state(config)
+    state = checkpoint.restore(run, config, say=tqdm.write) or training.jitted_create_state(config)
     first = int(state.step)
     if first:
         tqdm.write(f"resuming {run} at step {first} of {config.num_steps}")

@@ -239,6 +239,10 @@ def averaged_variables(state: TrainState) -> dict:
     return {"params": state.averaged, "batch_stats": state.averaged_stats}
 
 
+# runs once: a quick compilation is worth more than quick code
+jitted_create_state = jax.jit(
+    create_state, static_argnames="config", compiler_options={"xla_backend_optimization_level": 1}
+)
 jitted_train_step = jax.jit(train_step, static_argnames=("config", "adversarial"), donate_argnames="state")
 jitted_encode = jax.jit(encode, static_argnames="config")
 jitted_render = jax.jit(render, static_argnames=("config", "ray_chunk"))
