@@ -186,8 +186,8 @@ class TrainConfig:
             _require(getattr(self, name) >= 1, f"{name} must be at least 1, got {getattr(self, name)}")
         _require(
             self.loss.adversarial_weight == 0 or self.model.image_resolution >= 24,
-            f"image_resolution {self.model.image_resolution} is too small for the discriminator's patches; use at least "
-            "24, or adversarial_weight 0",
+            f"image_resolution {self.model.image_resolution} is too small for the discriminator; use at "
+            "least 24, or adversarial_weight 0",
         )
         _require(
             self.min_points <= self.max_points,

@@ -115,3 +115,10 @@ def test_material_channels_are_counted_from_the_names():
     assert ModelConfig().num_material_channels == 5
     assert ModelConfig(materials=("roughness",)).num_material_channels == 1
     assert ModelConfig(materials=()).num_material_channels == 0
+
+
+def test_an_image_too_small_for_the_discriminator_is_named():
+    small = ModelConfig(render_resolution=8, resize_resolution=8, image_resolution=16)
+    with pytest.raises(ValueError, match="image_resolution 16 is too small"):
+        TrainConfig(model=small)
+    assert TrainConfig(model=small, loss=LossConfig(adversarial_weight=0)).model is small
