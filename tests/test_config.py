@@ -121,4 +121,4 @@ def test_an_image_too_small_for_the_discriminator_is_named():
     small = ModelConfig(render_resolution=8, resize_resolution=8, image_resolution=16)
     with pytest.raises(ValueError, match="image_resolution 16 is too small"):
         TrainConfig(model=small)
-    assert TrainConfig(model=small, loss=LossConfig(adversarial_weight=0)).model is small
+    assert TrainConfig(model=small, loss=LossConfig(adversarial_weight=0.0)).model is small
