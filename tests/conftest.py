@@ -7,6 +7,7 @@ training step.  Nothing but rounding depends on it.
 """
 
 import os
+import signal
 
 import jax
 from jaxtyping import install_import_hook
@@ -15,6 +16,9 @@ QUICK_COMPILATION = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emi
 os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {QUICK_COMPILATION}".strip()  # read at the first use
 
 install_import_hook("spnr_jax", "beartype.beartype")
+
+# a shell that starts the suite in the background has it ignore Ctrl-C, and its children with it
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_debug_key_reuse", True)
