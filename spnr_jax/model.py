@@ -1,6 +1,6 @@
 """The handle for people who only want pictures: load a network, encode a cloud once, render it from anywhere.
 
-    model = spnr_jax.load("runs/demo/train")
+    model = spnr_jax.load("runs/demo/run")
     volume = model.encode(spnr_jax.read_cloud("chair.ply"))
     rendering = model.render(volume, model.camera(volume, azimuth=30, elevation=20))
 

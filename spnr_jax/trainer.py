@@ -24,6 +24,7 @@ from tqdm import tqdm
 
 from spnr_jax import checkpoint, data, evaluation, training
 from spnr_jax.config import TrainConfig
+from spnr_jax.images import to_uint8
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -179,6 +180,5 @@ def preview(
         columns.append(np.concatenate([reference[0], image[0]]))
     folder = run / "previews"
     folder.mkdir(exist_ok=True)
-    picture = np.round(255 * np.concatenate(columns, axis=1)).astype(np.uint8)
-    Image.fromarray(picture).save(folder / f"{int(state.step):07d}.png")
+    Image.fromarray(to_uint8(np.concatenate(columns, axis=1))).save(folder / f"{int(state.step):07d}.png")
     return {"val_psnr": float(np.mean(np.concatenate(scores)))}
