@@ -253,7 +253,7 @@ def tiny() -> TrainConfig:
         ),
         loss=LossConfig(adversarial_start=0.85, discriminator_width=16),
         optimizer=OptimizerConfig(lr_generator=2e-3, warmup_steps=100, ema_decay=0.995),
-        num_steps=800,
+        num_steps=1200,
         batch_objects=4,
         max_points=1024,
     )
