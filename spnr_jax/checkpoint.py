@@ -105,6 +105,18 @@ def restore(run: Path, config: TrainConfig, say: Callable[[str], None] = print) 
     return None
 
 
+def load_run(
+    run: Path | str, say: Callable[[str], None] = print, data: Path | str = "DATA"
+) -> tuple[TrainConfig, training.TrainState]:
+    """Config and newest readable state of a run; ValueError, with what to do, if it has no state (`data` is named)."""
+    run = Path(run)
+    config = read_config(run)
+    state = restore(run, config, say)
+    if state is None:
+        raise ValueError(f"{run}: the run has no checkpoint yet; go on with `spnr train {data} {run}`")
+    return config, state
+
+
 def _first_line(error: Exception) -> str:
     lines = str(error).strip().splitlines() or [type(error).__name__]
     return lines[0][:160]

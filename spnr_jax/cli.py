@@ -63,7 +63,7 @@ class Render:
     """Render a point cloud or mesh file: views as .png, and a turntable."""
 
     cloud: tyro.conf.Positional[Path]
-    """.ply .xyz .txt .csv .npz .npy, or a mesh: .glb .gltf .obj .stl .off (its surface is sampled)."""
+    """.ply .pcd .xyz .txt .csv .npz .npy, or a mesh: .glb .gltf .obj .stl .off (its surface is sampled)."""
     run: Path
     """Run folder whose network renders."""
     out: Path = Path("renders")

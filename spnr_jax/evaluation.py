@@ -161,10 +161,7 @@ def evaluate(
     run: Path, dataset: data.Dataset, split: str = "test", gallery_objects: int = 16, say: Callable[[str], None] = print
 ) -> Evaluation:
     """Scores of a run's newest checkpoint on a split."""
-    config = checkpoint.read_config(run)
-    state = checkpoint.restore(run, config, say)
-    if state is None:
-        raise ValueError(f"{run}: the run has no checkpoint yet; go on with `spnr train {dataset.folder} {run}`")
+    config, state = checkpoint.load_run(run, say, data=dataset.folder)
     names = dataset.splits[split]
     if not names:
         raise ValueError(f"{dataset.folder}: the {split} split is empty; choose another one or generate more objects")

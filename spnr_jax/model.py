@@ -85,9 +85,5 @@ class Model:
 
 def load(run: Path | str) -> Model:
     """The averaged network of a run folder's newest checkpoint."""
-    run = Path(run)
-    config = checkpoint.read_config(run)
-    state = checkpoint.restore(run, config)
-    if state is None:
-        raise ValueError(f"{run}: the run has no checkpoint yet; go on with `spnr train DATA {run}`")
+    config, state = checkpoint.load_run(run)
     return Model(config=config.model, variables=training.averaged_variables(state))

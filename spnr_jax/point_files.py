@@ -3,6 +3,7 @@
     .ply              the vertices' properties, ASCII or binary, in any order and of any scalar type
     .xyz .txt .csv    numbers separated by commas, semicolons or blanks; a header line names the columns, or their
                       count does (3: x y z, 6: + r g b, 8: + roughness metallic)
+    .pcd              the fields of a Point Cloud Library file (spnr_jax/pcd_files.py)
     .npz              arrays under the names of ARRAY_COLUMNS
     .npy              a structured array of named fields, or an array (points, 3 | 6 | 8) as in text
 
@@ -17,6 +18,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+
+from spnr_jax.pcd_files import read_pcd
 
 Columns = dict[str, np.ndarray]
 Element = tuple[str, int, list[tuple[str, str | None]]]  # name, count, [(property, type)]; the type of a list is None
@@ -209,6 +212,7 @@ def _is_number(text: str) -> bool:
 
 READERS = {
     ".ply": _read_ply,
+    ".pcd": read_pcd,
     **dict.fromkeys((".xyz", ".txt", ".csv"), _read_text),
     **dict.fromkeys((".npz", ".npy"), _read_numpy),
 }

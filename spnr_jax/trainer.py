@@ -19,12 +19,11 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-from PIL import Image
 from tqdm import tqdm
 
 from spnr_jax import checkpoint, data, evaluation, training
 from spnr_jax.config import TrainConfig
-from spnr_jax.images import to_uint8
+from spnr_jax.images import png, write_whole
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -178,7 +177,5 @@ def preview(
         image, reference = np.clip(np.asarray(rendering.image), 0, 1), data.on_white(item.images)
         scores.append(np.asarray(evaluation.metrics.psnr(jnp.asarray(image), jnp.asarray(reference))))
         columns.append(np.concatenate([reference[0], image[0]]))
-    folder = run / "previews"
-    folder.mkdir(exist_ok=True)
-    Image.fromarray(to_uint8(np.concatenate(columns, axis=1))).save(folder / f"{int(state.step):07d}.png")
+    write_whole(run / "previews" / f"{int(state.step):07d}.png", png(np.concatenate(columns, axis=1)))
     return {"val_psnr": float(np.mean(np.concatenate(scores)))}

@@ -211,7 +211,7 @@ def test_a_point_alone_is_moved_to_zero_and_not_scaled():
     [
         ("a.ply", None, "no such file"),
         ("a.xyz", "", "the file is empty"),
-        ("a.jpeg", "1 2 3", r"unknown kind of file '.jpeg'; expected one of .ply .xyz .txt .csv .npz .npy .glb"),
+        ("a.jpeg", "1 2 3", r"unknown kind of file '.jpeg'; expected one of .ply .pcd .xyz .txt .csv .npz .npy .glb"),
         ("a.xyz", "# nothing yet\n", "holds 0 points"),
         ("a.ply", ply_bytes("binary_little_endian", rows=[]), "holds 0 points"),
         ("a.xyz", "0 0 0\n1 nan 0\n2 2 2\ninf 0 0\n", "2 points with NaN, infinity .* first point 1"),
