@@ -3,6 +3,7 @@
 #   make demo MESHES=DIR     the same on a folder of .glb .gltf .obj .ply files: runs/demo-NAME/report.html
 #   make test                the everyday suite      make test-all   with the slow tests
 #   make check               format, lint, types, tests
+#   make mutants             break the kernels on purpose; every fault has to be caught by the tests
 
 PYTHON ?= python3.11
 PY := .venv/bin/python
@@ -11,7 +12,7 @@ TEST_LIST ?=
 OUT ?= runs/demo$(if $(MESHES),-$(notdir $(patsubst %/,%,$(MESHES))))
 DEMO ?=
 
-.PHONY: setup demo test test-all lint format types check clean
+.PHONY: setup demo test test-all lint format types check mutants clean
 
 setup: .venv/complete
 
@@ -43,6 +44,9 @@ types: setup
 	$(PY) -m mypy spnr_jax data_gen experiments
 
 check: lint types test
+
+mutants: setup
+	$(PY) tests/mutants.py
 
 clean:
 	rm -rf .venv build dist *.egg-info
