@@ -1,4 +1,4 @@
-"""The command `spnr-data`: generate a data set, check one, show one.
+"""The command `spnr-data`: generate a data set, check one, show one, pack one.
 
 Errors of the user and of the disk are one line on stderr and exit code 2; Ctrl-C is one line and exit code 130.
 """
@@ -6,12 +6,15 @@ Errors of the user and of the disk are one line on stderr and exit code 2; Ctrl-
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 
 from data_gen.check import check
 from data_gen.generate import generate
+from data_gen.pack import PackConfig, pack
 from data_gen.plan import GenerateConfig
+from data_gen.presets import PRESETS
 from data_gen.show import ShowConfig, show
 
 
@@ -23,14 +26,12 @@ class CheckConfig:
     """Folder of the data set."""
 
 
+Command = GenerateConfig | CheckConfig | ShowConfig | PackConfig
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line."""
-    config = tyro.extras.subcommand_cli_from_dict(
-        {"generate": GenerateConfig, "check": CheckConfig, "show": ShowConfig},
-        prog="spnr-data",
-        description="Data sets of rendered objects and their surface points.",
-        args=arguments,
-    )
+    config = parse(sys.argv[1:] if arguments is None else arguments)
     try:
         sys.exit(run(config))
     except KeyboardInterrupt:
@@ -40,13 +41,40 @@ def main(arguments: list[str] | None = None) -> None:
         sys.exit(2)
 
 
-def run(config: GenerateConfig | CheckConfig | ShowConfig) -> int:
+def parse(arguments: list[str]) -> Command:
+    """Return the command with all its options; the preset named by --preset gives the defaults of the others."""
+    generate_options = Annotated[GenerateConfig, tyro.conf.subcommand("generate", default=preset_defaults(arguments))]
+    check_options = Annotated[CheckConfig, tyro.conf.subcommand("check")]
+    show_options = Annotated[ShowConfig, tyro.conf.subcommand("show")]
+    pack_options = Annotated[PackConfig, tyro.conf.subcommand("pack")]
+    return tyro.cli(
+        generate_options | check_options | show_options | pack_options,  # type: ignore[arg-type]
+        prog="spnr-data",
+        description="Data sets of rendered objects and their surface points.",
+        args=arguments,
+    )
+
+
+def preset_defaults(arguments: list[str]) -> GenerateConfig:
+    """Return what --preset among the arguments stands for; tyro refuses a name that there is not."""
+    preset = None
+    for name, following in zip(arguments, [*arguments[1:], ""], strict=True):
+        option, _, value = name.partition("=")
+        if option == "--preset":
+            preset = PRESETS.get(value or following)
+    return preset(tyro.MISSING) if preset else GenerateConfig(out=tyro.MISSING)
+
+
+def run(config: Command) -> int:
     """Return the exit code of one command."""
     if isinstance(config, GenerateConfig):
         generate(config)
         return 0
     if isinstance(config, CheckConfig):
         return 0 if check(config.dataset) else 1
+    if isinstance(config, PackConfig):
+        pack(config)
+        return 0
     show(config)
     return 0
 
@@ -57,7 +85,7 @@ def interrupted() -> int:
     return 130
 
 
-def one_line(error: Exception, config: GenerateConfig | CheckConfig | ShowConfig) -> str:
+def one_line(error: Exception, config: Command) -> str:
     """Return what an error says, on one line; an error of the disk with its place and what to do."""
     if isinstance(error, OSError) and error.strerror:
         place = error.filename or (config.out if isinstance(config, GenerateConfig) else config.dataset)

@@ -17,6 +17,7 @@ def check(dataset: Path) -> bool:
     object_ids = sorted(records.completed_objects(dataset))
     faults = split_faults(dataset, set(object_ids))
     agreements, covered, num_views = [], [], 0
+    details = {}
     for object_id in object_ids:
         folder = dataset / "objects" / object_id
         try:
@@ -32,6 +33,8 @@ def check(dataset: Path) -> bool:
         agreements.append(agreement)
         covered.append((record.images[..., 3] > 0).mean())
         num_views += len(record.images)
+        details[object_id] = record.details
+    faults += variant_faults(dataset, details)
     print_table(dataset, object_ids, num_views, agreements, covered, faults)
     return not faults
 
@@ -45,6 +48,8 @@ def read_description(dataset: Path) -> dict:
         description = json.loads(path.read_text())
     except ValueError as error:
         raise ValueError(f"{path}: not readable ({error})") from None
+    if (dataset / "index.json").is_file():
+        raise ValueError(f"{dataset} is packed; look at the folder of objects that `spnr-data pack` read")
     if description.get("schema_version") != records.SCHEMA_VERSION:
         found = description.get("schema_version")
         raise ValueError(f"{path}: expected schema version {records.SCHEMA_VERSION}, got {found}; generate it again")
@@ -64,6 +69,29 @@ def split_faults(dataset: Path, object_ids: set[str]) -> list[str]:
         faults.append(f"splits: {absent[0]} is listed but has no folder ({len(absent)} such objects)")
     if unlisted := sorted(object_ids - set(listed)):
         faults.append(f"splits: {unlisted[0]} is in no split ({len(unlisted)} such objects)")
+    return faults
+
+
+def variant_faults(dataset: Path, details: dict[str, dict]) -> list[str]:
+    """Return what is wrong with colour variants: all of a product are in one split, and only train has any."""
+    split_of = {
+        object_id: split
+        for split in records.SPLITS
+        if has_split(dataset, split)
+        for object_id in records.read_split(dataset, split)
+    }
+    faults: list[str] = []
+    splits_of_product: dict[str, set[str]] = {}
+    for object_id, detail in details.items():
+        split = split_of.get(object_id)
+        if split is None:
+            continue
+        splits_of_product.setdefault(detail["product"], set()).add(split)
+        if detail["variant"] and split != "train":
+            faults.append(f"splits: {object_id} is a colour variant, but in {split}; only training objects have any")
+    for product, splits in sorted(splits_of_product.items()):
+        if len(splits) > 1:
+            faults.append(f"splits: variants of {product} are in {' and '.join(sorted(splits))}")
     return faults
 
 

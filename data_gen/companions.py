@@ -1,7 +1,9 @@
-"""The files that a mesh file names (buffers, images, material libraries), read only from beside it.
+"""The files that a mesh file names (buffers, images, material libraries), read only from its object's own folder.
 
-A name in a mesh file is somebody else's text: data URIs are decoded, a name that leaves the mesh's folder or points to
-the network is refused, and a file that is not there is a reason to reject the object, never a texture less.
+A name in a mesh file is somebody else's text: data URIs are decoded, a name that leaves the object's folder or points
+to the network is refused, and a file that is not there is a reason to reject the object, never a texture less. The
+object's folder is the mesh's, unless its source says otherwise: a ShapeNet object keeps its images beside the folder
+of its mesh (`../images`).
 """
 
 import base64
@@ -12,24 +14,41 @@ from urllib.parse import unquote, unquote_to_bytes
 from data_gen.assets import RejectedAsset
 
 
-def read_companion(folder: Path, uri: str) -> bytes:
-    """Bytes of the file that `uri` names, relative to `folder` (percent escapes as in glTF), or of a data URI."""
+def read_companion(folder: Path, uri: str, root: Path | None = None) -> bytes:
+    """Bytes of the file that `uri` names, relative to `folder` (percent escapes as in glTF), or of a data URI.
+
+    `root` is the object's folder, `folder` or one above it; RejectedAsset for a name that leads out of it.
+    """
     if uri.startswith("data:"):
         return _data_uri(uri)
-    plain = folder / uri
-    name = uri if _stays_inside(uri) and plain.is_file() else unquote(uri)
-    if not _stays_inside(name):
+    root = folder if root is None else root
+    plain = _inside(root, folder, uri)
+    path = plain if plain is not None and plain.is_file() else _inside(root, folder, unquote(uri))
+    if path is None:
         raise RejectedAsset(f"names a file outside its own folder: {uri!r}")
     try:
-        return (folder / name).read_bytes()
+        return path.read_bytes()
     except (FileNotFoundError, IsADirectoryError, NotADirectoryError):
-        raise RejectedAsset(f"names a file that is missing: {name!r}") from None
+        raise RejectedAsset(f"names a file that is missing: {unquote(uri)!r}") from None
 
 
-def _stays_inside(name: str) -> bool:
-    """Whether a relative name, written with either kind of slash, cannot leave its folder."""
+def _inside(root: Path, folder: Path, name: str) -> Path | None:
+    """The file that a name, written with either kind of slash, means from `folder`; None where it leaves `root`.
+
+    Parent steps are resolved in the text, so that a link among the folders cannot lead them elsewhere.
+    """
     parts = PurePosixPath(name.replace("\\", "/")).parts
-    return bool(parts) and ".." not in parts and "/" not in parts and ":" not in parts[0]
+    if not parts or "/" in parts or ":" in parts[0]:
+        return None
+    place = list(folder.relative_to(root).parts)
+    for part in parts:
+        if part != "..":
+            place.append(part)
+        elif place:
+            place.pop()
+        else:
+            return None
+    return root.joinpath(*place) if place else None
 
 
 def _data_uri(uri: str) -> bytes:

@@ -64,9 +64,10 @@ def find_meshes(folder: Path) -> list[tuple[str, Path]]:
     return sorted(ids.items())
 
 
-def load_mesh(path: Path) -> Asset:
+def load_mesh(path: Path, root: Path | None = None) -> Asset:
     """The object in a mesh file, parts merged by material; `source` names the file and its checksum.
 
+    `root` is the object's folder, which may hold an .obj file's companions above it (default: the file's folder).
     RejectedAsset, with one line, for a file that cannot be used: unreadable or truncated, compressed, transparent,
     without faces or extent, or with companions (buffers, images, libraries) missing or outside its folder.
     """
@@ -75,7 +76,7 @@ def load_mesh(path: Path) -> Asset:
         with warnings.catch_warnings(), np.errstate(all="ignore"):  # assemble looks for what is not finite
             # numpy only warns where the text of a file stops being numbers
             warnings.filterwarnings("error", "string or file could not be read", DeprecationWarning)
-            asset = assemble(_load(path))
+            asset = assemble(_load(path, root))
         checksum = hashlib.sha256(path.read_bytes()).hexdigest()
     except RejectedAsset:
         raise
@@ -87,13 +88,13 @@ def load_mesh(path: Path) -> Asset:
     return replace(asset, source={"file": path.name, "sha256": checksum})
 
 
-def _load(path: Path) -> Asset:
+def _load(path: Path, root: Path | None) -> Asset:
     """The raw asset of a file, by its suffix."""
     suffix = path.suffix.lower()
     if suffix in (".glb", ".gltf"):
         return load_gltf(path)
     if suffix == ".obj":
-        return load_obj(path)
+        return load_obj(path, root)
     if suffix not in TEXT_OR_BINARY:
         raise RejectedAsset(f"has suffix {suffix!r}; expected one of {' '.join(SUFFIXES)}")
     data = path.read_bytes()

@@ -5,36 +5,40 @@ nor an interruption changes a byte.
 """
 
 import hashlib
-from dataclasses import dataclass
-from pathlib import Path
+import os
+import socket
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from data_gen import meshes, points, procedural, records, views
+from data_gen import augmentation, meshes, points, procedural, records, views
 from data_gen.assets import Asset, Material, RejectedAsset
 from data_gen.plan import Task
-from data_gen.variant import mitsuba_module
+from data_gen.variant import LLVM, choose_variant, mitsuba_module
 
 
 @dataclass(frozen=True, kw_only=True)
 class Workbench:
-    """What a worker needs for any object of the data set."""
+    """What a worker needs for any object of the data set; `out` is a URL or an absolute path."""
 
-    out: Path
+    out: str
     envmap: np.ndarray
     view: views.ViewConfig
     num_points: int
     seed: int
-
-
-def set_up(bench: Workbench, variant: str) -> Workbench:
-    """Return the workbench in a worker process that is ready to render."""
-    mitsuba_module(variant)
-    return bench
+    variant: str
 
 
 def make_and_write(bench: Workbench, task: Task) -> str | None:
-    """Make one object's folder; return None, or the reason why it is left out. Errors of the disk are raised."""
+    """Make one object's folder; return None, or the reason why it is left out.
+
+    What is wrong with the worker and not with the object is raised: errors of the disk, a mesh file it does not see.
+    """
+    if records.has_object(bench.out, task.object_id):  # another run on the same data set was faster
+        return None
+    if task.path and not task.path.exists():
+        raise ValueError(f"{task.path}: worker {socket.gethostname()} does not see this file; mount it there")
+    prepare_renderer(bench.variant)
     try:
         record = make_record(bench, task)
     except RejectedAsset as error:
@@ -45,10 +49,20 @@ def make_and_write(bench: Workbench, task: Task) -> str | None:
     return None
 
 
+def prepare_renderer(variant: str) -> None:
+    """Load Mitsuba for this thread; ValueError if the variant that the run chose does not work on this machine."""
+    if variant == LLVM and "DRJIT_LIBLLVM_PATH" not in os.environ:  # a machine other than the one that chose
+        choose_variant(variant)
+    mitsuba_module(variant)
+
+
 def make_record(bench: Workbench, task: Task) -> records.ObjectRecord:
     """Return one object, rendered: asset, points, views, condition images."""
     seeds = object_seeds(bench.seed, task.object_id)
-    asset = meshes.load_mesh(task.path) if task.path else procedural.make(task.category, seeds["shape"])
+    asset = load_asset(task, bench.seed)
+    rotation = None
+    if task.colour_variant:
+        asset, rotation = augmentation.rotate_colours(asset, seeds["colours"])
     asset, transform = points.normalise(asset)
     surface = points.sample_surface(asset, bench.num_points, seeds["points"])
     cam_to_world = views.random_viewpoints(
@@ -62,14 +76,22 @@ def make_record(bench: Workbench, task: Task) -> records.ObjectRecord:
         ),
         images=images,
         conditions=conditions,
-        details=object_details(task, asset, transform, seeds),
+        details=object_details(task, asset, transform, seeds) | {"colour_rotation": rotation and rotation.describe()},
     )
+
+
+def load_asset(task: Task, seed: int) -> Asset:
+    """Return the object as its source has it; a colour variant has the shape of its product."""
+    if task.path is None:
+        return procedural.make(task.category, object_seeds(seed, task.product)["shape"])
+    asset = meshes.load_mesh(task.path, task.folder)
+    return replace(asset, category=task.category) if task.category else asset
 
 
 def object_seeds(seed: int, object_id: str) -> dict[str, int]:
     """Return an independent 32-bit seed for each purpose, a function of (seed, object id) alone."""
     digest = hashlib.sha256(f"{seed}/{object_id}".encode()).digest()
-    purposes = ("shape", "points", "viewpoints", "noise")
+    purposes = ("shape", "points", "viewpoints", "noise", "colours")
     return {name: int.from_bytes(digest[4 * i : 4 * i + 4], "little") for i, name in enumerate(purposes)}
 
 
@@ -77,13 +99,14 @@ def object_details(task: Task, asset: Asset, transform: dict, seeds: dict[str, i
     """Return the content of object.json (the checksums of the files are added when they are written)."""
     return {
         "id": task.object_id,
+        "product": task.product,
+        "variant": task.colour_variant,
         "category": asset.category,
         "source": {**asset.source, "file": task.shown_path} if task.path else asset.source,
         "normalisation": transform,
         "materials": [describe_material(part.material) | {"faces": len(part.faces)} for part in asset.parts],
         "ignored": list(asset.ignored),
         "seeds": seeds,
-        "colour_rotation": None,
     }
 
 

@@ -4,19 +4,21 @@
     DATASET/objects/ID/{points.ply, transforms.json, images/000.png, conditions/000.png, object.json}
 
 Everything written is a function of its content alone (no clock, no host, no absolute path), so equal objects are equal
-bytes. An object's folder is written beside its place and renamed into it: it is there complete, or not at all.
+bytes, and two runs in one place do no harm. An object is complete when its object.json is there, which is written
+last; on a local disk the folder also appears as a whole (data_gen/storage.py). DATASET is a path or a URL.
 """
 
 import hashlib
+import io
 import json
-import os
-import shutil
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
+
+from data_gen import storage
+from data_gen.storage import Location
 
 SCHEMA_VERSION = 1
 SPLITS = ("train", "val", "test")
@@ -35,7 +37,6 @@ POINT_FIELDS = (
 )
 POINT_TYPE = np.dtype([(name, "<f4") for name in POINT_FIELDS] + [("face", "<i4")])
 POINT_PROPERTIES = [*(f"property float {name}" for name in POINT_FIELDS), "property int face"]  # POINT_TYPE in a PLY
-UNFINISHED = ".unfinished-"  # prefix of folders that are still being written
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,30 +87,21 @@ def nerf_transforms(cam_to_world: np.ndarray, resolution: int, fov: float, focal
     }
 
 
-def write_object(dataset: Path, object_id: str, record: ObjectRecord) -> None:
+def write_object(dataset: Location, object_id: str, record: ObjectRecord) -> None:
     """Write an object's folder, complete or not at all; a complete one that is already there is left as it is."""
-    objects = dataset / "objects"
-    objects.mkdir(parents=True, exist_ok=True)
-    place = objects / object_id
-    unfinished = Path(tempfile.mkdtemp(prefix=UNFINISHED, dir=objects))
-    try:
-        write_object_files(unfinished, record)
-        unfinished.chmod(0o755)
-        if not place.exists():
-            unfinished.rename(place)
-    finally:
-        shutil.rmtree(unfinished, ignore_errors=True)
+    storage.write_object_folder(f"{dataset}/objects", object_id, object_files(record))
 
 
-def write_object_files(folder: Path, record: ObjectRecord) -> None:
-    """Write the files of one object into an empty folder, object.json with their checksums last."""
-    write_points(folder / "points.ply", record.points)
-    (folder / "transforms.json").write_text(json_text(record.transforms))
-    for name in ("images", "conditions"):
-        (folder / name).mkdir()
-        for view, pixels in enumerate(getattr(record, name)):
-            Image.fromarray(pixels, "RGBA").save(folder / name / f"{view:03d}.png")
-    (folder / "object.json").write_text(json_text({**record.details, "files": file_checksums(folder)}))
+def object_files(record: ObjectRecord) -> dict[str, bytes]:
+    """Return the files of one object by their paths in its folder, object.json with the others' checksums last."""
+    files = {
+        "points.ply": encode_points(record.points),
+        "transforms.json": json_text(record.transforms).encode(),
+        **{f"images/{view:03d}.png": encode_image(pixels) for view, pixels in enumerate(record.images)},
+        **{f"conditions/{view:03d}.png": encode_image(pixels) for view, pixels in enumerate(record.conditions)},
+    }
+    checksums = {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
+    return {**files, storage.LAST_FILE: json_text({**record.details, "files": checksums}).encode()}
 
 
 def read_object(folder: Path) -> ObjectRecord:
@@ -125,15 +117,15 @@ def read_object(folder: Path) -> ObjectRecord:
     )
 
 
-def write_points(path: Path, points: np.ndarray) -> None:
-    """Write a POINT_TYPE array as a binary little-endian PLY of vertices."""
+def encode_points(points: np.ndarray) -> bytes:
+    """Return a POINT_TYPE array as a binary little-endian PLY of vertices."""
     size = f"element vertex {len(points)}"
     header = ["ply", "format binary_little_endian 1.0", size, *POINT_PROPERTIES, "end_header"]
-    path.write_bytes(("\n".join(header) + "\n").encode("ascii") + points.tobytes())
+    return ("\n".join(header) + "\n").encode("ascii") + points.tobytes()
 
 
 def read_points(path: Path) -> np.ndarray:
-    """Return the POINT_TYPE array (points,) of a file that `write_points` wrote; ValueError for any other file."""
+    """Return the POINT_TYPE array (points,) of a file that `encode_points` made; ValueError for any other file."""
     header, separator, body = path.read_bytes().partition(b"end_header\n")
     lines = header.decode("ascii", "replace").splitlines()
     if not separator or lines[1:2] != ["format binary_little_endian 1.0"] or lines[3:] != POINT_PROPERTIES:
@@ -142,6 +134,13 @@ def read_points(path: Path) -> np.ndarray:
     if len(body) != count * POINT_TYPE.itemsize:
         raise ValueError(f"{path}: expected {count} points, found {len(body) / POINT_TYPE.itemsize:g}; file is cut off")
     return np.frombuffer(body, POINT_TYPE).copy()
+
+
+def encode_image(pixels: np.ndarray) -> bytes:
+    """Return (height, width, 4) uint8 as a PNG."""
+    buffer = io.BytesIO()
+    Image.fromarray(pixels, "RGBA").save(buffer, "PNG")
+    return buffer.getvalue()
 
 
 def read_image(path: Path) -> np.ndarray:
@@ -156,22 +155,19 @@ def read_image(path: Path) -> np.ndarray:
         raise ValueError(f"{path}: not a readable PNG ({error})") from None
 
 
-def file_checksums(folder: Path) -> dict[str, str]:
-    """Return the SHA-256 of every file in the folder but object.json, by its path in there."""
-    files = sorted(path for path in folder.rglob("*") if path.is_file() and path.name != "object.json")
-    return {path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+def has_object(dataset: Location, object_id: str) -> bool:
+    """Return whether an object of the data set is complete."""
+    return storage.has_object(f"{dataset}/objects", object_id)
 
 
-def completed_objects(dataset: Path) -> set[str]:
+def completed_objects(dataset: Location) -> set[str]:
     """Return the ids of the objects whose folders are complete."""
-    objects = dataset / "objects"
-    return {path.name for path in objects.iterdir() if not path.name.startswith(".")} if objects.is_dir() else set()
+    return storage.complete_objects(f"{dataset}/objects")
 
 
-def remove_unfinished(dataset: Path) -> None:
-    """Remove the folders that an earlier, interrupted run left half written."""
-    for path in (dataset / "objects").glob(UNFINISHED + "*"):
-        shutil.rmtree(path, ignore_errors=True)
+def remove_unfinished(dataset: Location) -> None:
+    """Remove the folders that an earlier, interrupted run left half written; those of a living one stay."""
+    storage.remove_unfinished(f"{dataset}/objects")
 
 
 def read_split(dataset: Path, split: str) -> list[str]:
@@ -179,12 +175,9 @@ def read_split(dataset: Path, split: str) -> list[str]:
     return (dataset / "splits" / f"{split}.txt").read_text().split()
 
 
-def write_text(path: Path, text: str) -> None:
+def write_text(location: Location, text: str) -> None:
     """Write a text file in one piece: a reader sees the old content or the new, never half of it."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(UNFINISHED + path.name)
-    unfinished.write_text(text)
-    os.replace(unfinished, path)
+    storage.write_file(location, text.encode())
 
 
 def json_text(content) -> str:

@@ -4,10 +4,17 @@ Conventions: cam_to_world is (4, 4), OpenGL axes (x right, y up, looking along -
 are square, row 0 on top; pixel (column i, row j) covers [i, i + 1) x [j, j + 1), so its centre is at + 0.5.
 Linear radiance comes out of Mitsuba premultiplied by the coverage (alpha): the light itself is hidden from the camera.
 An object's scene is loaded once and every view is rendered from it. Mitsuba reads the very arrays of the Material that
-the point sampler reads, so the picture and the points cannot disagree about a colour.
+the point sampler reads, so the picture and the points cannot disagree about a colour. Every face is seen from both
+sides, whatever its file says, and keeps its one normal.
+
+Which points a picture sees (`visibility`): "face" is the paper's rule, all points on a face that any primary ray of the
+camera hits; a point on such a face counts even where another part hides it. "point" tests each point by itself, with
+one ray to the camera.
 """
 
+import importlib
 from dataclasses import dataclass
+from typing import Any, Literal
 
 import numpy as np
 
@@ -15,6 +22,9 @@ from data_gen.assets import Asset, Material, Part, RejectedAsset
 from data_gen.variant import mitsuba_module
 
 POLE_COSINE = 0.999  # nearer to the y axis than this, z takes the part of "up"
+SURFACE_MARGIN = 1e-4  # a ray to the camera starts this far from its point: float32 places a point to about 1e-7
+
+Visibility = Literal["face", "point"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,6 +37,7 @@ class ViewConfig:
     distance: float = 3.0  # from the origin, in units of the normalised object
     spp: int = 64  # samples per pixel
     max_depth: int = 6  # path segments: light - object - object - camera is 3
+    visibility: Visibility = "face"
     visibility_grid: int = 4  # rays per pixel side that look for visible faces
 
     @property
@@ -37,10 +48,10 @@ class ViewConfig:
 
 @dataclass(frozen=True)
 class Scene:
-    """A loaded Mitsuba scene and, for each of its shapes, the global number of the shape's first face."""
+    """A loaded Mitsuba scene and the global number of each shape's first face, by the number that Mitsuba reports."""
 
-    handle: object
-    first_face: np.ndarray
+    handle: Any
+    first_face: dict[int, int]
 
 
 def look_at(eye: np.ndarray) -> np.ndarray:
@@ -87,7 +98,21 @@ def build_scene(asset: Asset, envmap: np.ndarray) -> Scene:
             content[name] = mitsuba_mesh(part, name)
             first_face.append(faces_before)
         faces_before += len(part.faces)
-    return Scene(mi.load_dict(content), np.array(first_face, dtype=np.int64))
+    handle = mi.load_dict(content)
+    return Scene(handle, dict(zip(shape_numbers(handle), first_face, strict=True)))
+
+
+def shape_numbers(handle) -> list[int]:
+    """Return what Mitsuba's `shape_index` is for each shape of a loaded scene, in the order of the scene.
+
+    Scalar code counts the scene's shapes from 1; compiled variants report a number of the whole process, which goes on
+    counting from one scene to the next and gives numbers of freed shapes out again.
+    """
+    mi = mitsuba_module()
+    if mi.variant().startswith("scalar"):
+        return list(range(1, len(handle.shapes()) + 1))
+    drjit = importlib.import_module("drjit")
+    return [int(number) for number in np.array(drjit.reinterpret_array(mi.UInt32, handle.shapes_dr()))]
 
 
 def mitsuba_mesh(part: Part, name: str):
@@ -175,15 +200,36 @@ def render_view(scene: Scene, cam_to_world: np.ndarray, config: ViewConfig, seed
     return np.array(image, dtype=np.float32)
 
 
+def visible_points(scene: Scene, surface, cam_to_world: np.ndarray, config: ViewConfig, seed: int) -> np.ndarray:
+    """Return which `points.SurfacePoints` the camera sees, (points,) bool, by the config's rule; see the header."""
+    if config.visibility == "point":
+        return unoccluded(scene, surface.positions, cam_to_world[:3, 3])
+    return np.isin(surface.face, visible_faces(scene, cam_to_world, config, seed))
+
+
 def visible_faces(scene: Scene, cam_to_world: np.ndarray, config: ViewConfig, seed: int) -> np.ndarray:
     """Return the sorted global numbers of the faces that the camera's primary rays hit, one ray per cell of a grid."""
     mi = mitsuba_module()
     integrator = mi.load_dict({"type": "aov", "aovs": "face:prim_index,shape:shape_index"})
     sensor = make_sensor(cam_to_world, config, config.resolution * config.visibility_grid)
     cells = np.array(mi.render(scene.handle, sensor=sensor, integrator=integrator, spp=1, seed=seed))
-    local_face, shape = cells.reshape(-1, cells.shape[-1]).astype(np.int64)[:, :2].T  # shape counts from 1; 0 is a miss
-    hit = shape > 0
-    return np.unique(scene.first_face[shape[hit] - 1] + local_face[hit])
+    face, shape = cells.reshape(-1, cells.shape[-1]).astype(np.int64)[:, :2].T  # shape 0 is a miss
+    return np.unique(np.concatenate([first + face[shape == number] for number, first in scene.first_face.items()]))
+
+
+def unoccluded(scene: Scene, positions: np.ndarray, eye: np.ndarray) -> np.ndarray:
+    """Return which surface points (points, 3) nothing hides from the eye (3,), (points,) bool; one ray for each."""
+    mi = mitsuba_module()
+    towards = np.asarray(eye, np.float64) - positions
+    distance = np.linalg.norm(towards, axis=-1)
+    directions = towards / distance[:, None]
+    rays = zip(positions + SURFACE_MARGIN * directions, directions, distance - SURFACE_MARGIN, strict=True)
+    if mi.variant().startswith("scalar"):
+        hidden = [scene.handle.ray_test(mi.Ray3f(o=o, d=d, maxt=t, time=0, wavelengths=[])) for o, d, t in rays]
+    else:
+        o, d, t = (np.array(column, np.float32).T for column in zip(*rays, strict=True))
+        hidden = scene.handle.ray_test(mi.Ray3f(o=o, d=d, maxt=t, time=0, wavelengths=[]))
+    return ~np.array(hidden, dtype=bool)
 
 
 def straight_srgb(radiance: np.ndarray) -> np.ndarray:
@@ -222,7 +268,7 @@ def render_views(asset: Asset, surface, cam_to_world: np.ndarray, envmap: np.nda
     for view, pose in enumerate(cam_to_world):
         view_seed = (seed + view) % 2**32
         image = straight_srgb(render_view(scene, pose, config, view_seed))
-        seen = np.isin(surface.face, visible_faces(scene, pose, config, view_seed))
+        seen = visible_points(scene, surface, pose, config, view_seed)
         images.append(image)
         conditions.append(condition_image(image, project(pose, surface.positions[seen].astype(np.float64), config)))
     return np.stack(images), np.stack(conditions)

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from spnr_jax.colors import srgb_to_linear
-from spnr_jax.point_files import READERS, Columns, read_columns, read_ply_header
+from spnr_jax.point_files import READERS, Columns, parse_ply, read_columns, read_ply_header
 from spnr_jax.types import PointCloud
 
 MESHES = (".glb", ".gltf", ".obj", ".stl", ".off")
@@ -74,8 +74,17 @@ def read_cloud(
         report(f"{num_points} of {len(positions)} points kept, evenly spread")
         kept = farthest_points(positions, num_points, seed)
         positions, materials = positions[kept], {name: values[kept] for name, values in materials.items()}
+    return _float32(positions @ np.array(UP[up], np.float64).T, materials)
+
+
+def cloud_of_ply(content: bytes) -> PointCloud:
+    """The cloud in the bytes of a PLY file of points, y up: (points, ...) float32; ValueError says what is wrong."""
+    return _float32(*_points_of_columns(parse_ply(content), report=lambda line: None))
+
+
+def _float32(positions: np.ndarray, materials: dict[str, np.ndarray]) -> PointCloud:
     return PointCloud(
-        positions=(positions @ np.array(UP[up], np.float64).T).astype(np.float32),
+        positions=positions.astype(np.float32),
         **{name: values.astype(np.float32) for name, values in materials.items()},
         mask=np.ones(len(positions), bool),
     )

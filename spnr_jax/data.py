@@ -1,25 +1,30 @@
 """Training data from disk: objects as NumPy arrays, and batches that are a pure function of (seed, step).
 
-A data set is the folder that `spnr-data generate` writes (its form: README, "Data on disk").  Because a batch depends
-on nothing but the step, a resumed run needs no reader state to see the same data.
+A data set is the folder that `spnr-data generate` writes (its form: README, "Data on disk"), or its packed form
+(spnr_jax/shards.py); both give the same batches.  Because a batch depends on nothing but the step, the state of the
+reader is the number of the step: a resumed run sees the same data, whatever was read ahead.  grain does the reading
+ahead, in threads.
 """
 
 import dataclasses
+import functools
+import io
 import json
-import queue
 import threading
-from collections.abc import Generator, Iterator
+from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 
 from spnr_jax import clouds
 from spnr_jax.config import TrainConfig
+from spnr_jax.shards import Shards, open_shards, read_files
 from spnr_jax.types import Batch, Camera, PointCloud
 
 CACHE_BYTES = 2**31  # decoded objects kept in memory
+READERS, READ_AHEAD = 2, 4  # threads that assemble batches, and batches ready or in work
 ORDER, POINTS_AND_VIEWS = 1, 2  # streams of random numbers under one seed: (0, 5) and (0, 5, 0) alone would be the same
 
 
@@ -35,21 +40,23 @@ class ObjectData:
 
     @property
     def num_bytes(self) -> int:
-        """Memory that the images take."""
-        return self.images.nbytes + self.conditions.nbytes
+        """Memory that the images and points take."""
+        points = sum(getattr(self.cloud, f.name).nbytes for f in dataclasses.fields(PointCloud))
+        return self.images.nbytes + self.conditions.nbytes + points
 
 
 @dataclass(frozen=True, kw_only=True)
 class Dataset:
-    """The folder, its settings and the object names of each split."""
+    """The folder, its settings and the object names of each split; with its shards if it is packed."""
 
     folder: Path
     settings: dict
     splits: dict[str, tuple[str, ...]]
+    shards: Shards | None = None
 
 
 def open_dataset(folder: Path | str) -> Dataset:
-    """The data set in a folder; ValueError if it is none or unfinished."""
+    """The data set in a folder, in either form; ValueError if it is none or unfinished."""
     folder = Path(folder)
     description = folder / "dataset.json"
     if not description.is_file():
@@ -64,36 +71,45 @@ def open_dataset(folder: Path | str) -> Dataset:
         if not path.is_file():
             raise ValueError(f"{path}: missing; run `spnr-data generate {folder}` again, it completes the data set")
         splits[split] = tuple(path.read_text().split())
-    return Dataset(folder=folder, settings=settings, splits=splits)
+    return Dataset(folder=folder, settings=settings, splits=splits, shards=open_shards(folder))
 
 
 def read_object(dataset: Dataset, name: str) -> ObjectData:
     """One object of the data set; ValueError names the file that is missing or broken."""
     folder = dataset.folder / "objects" / name
-    path = folder / "transforms.json"
+    read = _reader_of(folder) if dataset.shards is None else read_files(dataset.shards, name).__getitem__
+    file = "transforms.json"
     try:
-        meta = json.loads(path.read_text())
+        meta = json.loads(read(file))
         poses = np.array([frame["transform_matrix"] for frame in meta["frames"]], np.float32)[:, :3]
         intrinsics = np.array([[meta["fl_x"], 0, meta["cx"]], [0, meta["fl_y"], meta["cy"]], [0, 0, 1]], np.float32)
-        files = [Path(frame["file_path"]).name for frame in meta["frames"]]
+        names = [Path(frame["file_path"]).name for frame in meta["frames"]]
         height, width = int(meta["h"]), int(meta["w"])
         if not np.isfinite(poses).all() or not np.isfinite(intrinsics).all():
             raise ValueError("a camera holds NaN or infinity")
-        images = np.stack([_read_rgba(path := folder / "images" / f, height, width) for f in files])
-        conditions = np.stack([_read_rgba(path := folder / "conditions" / f, height, width) for f in files])
-        cloud = clouds.read_cloud(path := folder / "points.ply")
+        images = np.stack([_rgba(read(file := f"images/{name}"), height, width) for name in names])
+        conditions = np.stack([_rgba(read(file := f"conditions/{name}"), height, width) for name in names])
+        cloud = clouds.cloud_of_ply(read(file := "points.ply"))
     except (OSError, ValueError, LookupError, TypeError, SyntaxError) as error:  # Pillow raises SyntaxError too
+        path = folder / file
         reason = f"no entry {error}" if isinstance(error, KeyError) else str(error).replace(str(path), path.name)
         raise ValueError(f"{path}: cannot be read ({reason}); run `spnr-data check {dataset.folder}`") from None
     camera = Camera(
-        cam_to_world=poses, intrinsics=np.broadcast_to(intrinsics, (len(files), 3, 3)), height=height, width=width
+        cam_to_world=poses, intrinsics=np.broadcast_to(intrinsics, (len(names), 3, 3)), height=height, width=width
     )
     return ObjectData(name=name, cloud=cloud, camera=camera, images=images, conditions=conditions)
 
 
-def _read_rgba(path: Path, height: int, width: int) -> np.ndarray:
-    with Image.open(path) as image:
-        pixels = np.asarray(image.convert("RGBA"))
+def _reader_of(folder: Path) -> Callable[[str], bytes]:
+    return lambda file: (folder / file).read_bytes()
+
+
+def _rgba(content: bytes, height: int, width: int) -> np.ndarray:
+    try:
+        with Image.open(io.BytesIO(content)) as image:
+            pixels = np.asarray(image.convert("RGBA"))
+    except UnidentifiedImageError:
+        raise ValueError("is not an image") from None
     if pixels.shape[:2] != (height, width):
         raise ValueError(f"{pixels.shape[1]} x {pixels.shape[0]} pixels, transforms.json says {width} x {height}")
     return pixels
@@ -142,21 +158,46 @@ def make_batch(objects: list[ObjectData], config: TrainConfig, step: int) -> Bat
 
 def object_names(names: tuple[str, ...], config: TrainConfig, step: int) -> list[str]:
     """The objects of a step: consecutive pieces of one new permutation of all objects per epoch."""
-    chosen = []
-    for position in range(step * config.batch_objects, (step + 1) * config.batch_objects):
-        epoch, place = divmod(position, len(names))
-        chosen.append(names[np.random.default_rng((config.seed, ORDER, epoch)).permutation(len(names))[place]])
-    return chosen
+    positions = range(step * config.batch_objects, (step + 1) * config.batch_objects)
+    places = (divmod(position, len(names)) for position in positions)
+    return [names[epoch_order(config.seed, epoch, len(names))[place]] for epoch, place in places]
 
 
-def batches(dataset: Dataset, config: TrainConfig, first_step: int) -> Generator[Batch, None, None]:
-    """Training batches from `first_step` on, read and assembled ahead in a thread."""
+@functools.lru_cache(maxsize=4)  # one batch spans few epochs, and a million objects take 20 ms to permute
+def epoch_order(seed: int, epoch: int, count: int) -> np.ndarray:
+    """The permutation (count,) of all objects in an epoch."""
+    return np.random.default_rng((seed, ORDER, epoch)).permutation(count)
+
+
+def batches(
+    dataset: Dataset, config: TrainConfig, first_step: int, cache_bytes: int = CACHE_BYTES
+) -> Generator[Batch, None, None]:
+    """Training batches from `first_step` on, read and assembled ahead; an error is raised where its batch would be."""
+    import grain
+
     names = dataset.splits["train"]
     if not names:
         raise ValueError(f"{dataset.folder}: the train split is empty; generate more objects")
+    read = cached_reader(dataset, config, cache_bytes)
+
+    def assemble(step: int) -> Batch:
+        return make_batch([read(name) for name in object_names(names, config, step)], config, step)
+
+    steps = grain.MapDataset.range(first_step, config.num_steps).map(assemble)
+    options = grain.ReadOptions(num_threads=READERS, prefetch_buffer_size=READ_AHEAD)
+    yield from iter(steps.to_iter_dataset(options))  # its threads end with this generator
+
+
+def cached_reader(dataset: Dataset, config: TrainConfig, cache_bytes: int) -> Callable[[str], ObjectData]:
+    """A function of an object's name that reads it, checked against the config; the first `cache_bytes` stay in memory.
+
+    Several threads may call it.  Which objects stay does not matter: an epoch needs each of them once.
+    """
     cache: dict[str, ObjectData] = {}
+    lock, free = threading.Lock(), cache_bytes
 
     def read(name: str) -> ObjectData:
+        nonlocal free
         if name in cache:
             return cache[name]
         data = read_object(dataset, name)
@@ -166,15 +207,13 @@ def batches(dataset: Dataset, config: TrainConfig, first_step: int) -> Generator
                 f"object {name} has {len(data.images)} views, views_per_object is {config.views_per_object}; lower it "
                 "or generate with more --views"
             )
-        if sum(d.num_bytes for d in cache.values()) + data.num_bytes < CACHE_BYTES:
-            cache[name] = data
+        with lock:
+            if name not in cache and data.num_bytes < free:
+                cache[name] = data
+                free -= data.num_bytes
         return data
 
-    def assemble() -> Iterator[Batch]:
-        for step in range(first_step, config.num_steps):
-            yield make_batch([read(name) for name in object_names(names, config, step)], config, step)
-
-    return prefetch(assemble())
+    return read
 
 
 def check_resolution(data: ObjectData, config: TrainConfig) -> None:
@@ -185,42 +224,3 @@ def check_resolution(data: ObjectData, config: TrainConfig) -> None:
             f"object {data.name} has images of {data.camera.width} x {data.camera.height} pixels, preset "
             f"{config.preset} needs {size} x {size}; use another preset or generate with --resolution {size}"
         )
-
-
-def prefetch(items: Iterator, depth: int = 4) -> Generator:
-    """The same items, made ahead by a thread; its error is raised where the item would have come."""
-    done = object()
-    line: queue.Queue = queue.Queue(maxsize=depth)
-    stopped = threading.Event()
-
-    def put(item) -> bool:
-        while not stopped.is_set():
-            try:
-                line.put(item, timeout=0.1)
-                return True
-            except queue.Full:
-                continue
-        return False
-
-    def work() -> None:
-        try:
-            for item in items:
-                if not put((item, None)):
-                    return
-            put((done, None))
-        except Exception as error:  # noqa: BLE001 - handed to the consumer, which raises it
-            put((done, error))
-
-    thread = threading.Thread(target=work, daemon=True)
-    thread.start()
-    try:
-        while True:
-            item, error = line.get()
-            if error is not None:
-                raise error
-            if item is done:
-                return
-            yield item
-    finally:
-        stopped.set()
-        thread.join()

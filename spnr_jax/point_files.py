@@ -66,7 +66,10 @@ def read_columns(path: Path) -> Columns:
 def read_ply_header(path: Path) -> PlyHeader:
     """The header of a PLY file."""
     with path.open("rb") as file:
-        data = file.read(PLY_HEADER_LIMIT)
+        return _ply_header(file.read(PLY_HEADER_LIMIT))
+
+
+def _ply_header(data: bytes) -> PlyHeader:
     end = re.search(rb"^end_header[ \t]*(\r\n|\n|\r)", data, re.MULTILINE)
     if not data.startswith(b"ply") or end is None:
         raise ValueError("is not a PLY file, or its header is cut off (expected 'ply' ... 'end_header')")
@@ -91,9 +94,9 @@ def read_ply_header(path: Path) -> PlyHeader:
     return PlyHeader(byte_order=byte_order, elements=elements, size=end.end())
 
 
-def _read_ply(path: Path) -> Columns:
-    """The columns of the vertices; elements before them are skipped."""
-    header = read_ply_header(path)
+def parse_ply(content: bytes) -> Columns:
+    """The columns of the vertices in the bytes of a PLY file; elements before them are skipped."""
+    header = _ply_header(content[:PLY_HEADER_LIMIT])
     rows_before = bytes_before = 0
     for name, count, properties in header.elements:
         if count and any(kind is None for _, kind in properties):
@@ -103,7 +106,7 @@ def _read_ply(path: Path) -> Columns:
         order = header.byte_order or "="
         dtype = np.dtype([(field, order + kind) for field, kind in properties if kind is not None])
         if name == "vertex":
-            body = path.read_bytes()[header.size :]
+            body = content[header.size :]
             if header.byte_order is None:
                 return _by_name(_text_rows(body, rows_before, count, dtype))
             return _by_name(_binary_rows(body, bytes_before, count, dtype))
@@ -211,7 +214,7 @@ def _is_number(text: str) -> bool:
 
 
 READERS = {
-    ".ply": _read_ply,
+    ".ply": lambda path: parse_ply(path.read_bytes()),
     ".pcd": read_pcd,
     **dict.fromkeys((".xyz", ".txt", ".csv"), _read_text),
     **dict.fromkeys((".npz", ".npy"), _read_numpy),

@@ -122,32 +122,32 @@ def test_transparent_is_white_opaque_is_itself_and_half_is_between():
     np.testing.assert_allclose(data.on_white(rgba), [[1, 1, 1], [1, 0, 0.2], [0.8, 0.8, 0.8]], atol=1e-6)
 
 
-def test_the_readers_error_comes_at_its_place_after_the_items_before_it():
-    def items():
-        yield from (1, 2)
-        raise ValueError("third is broken")
-
-    line = data.prefetch(items(), depth=1)
-    assert list(islice(line, 2)) == [1, 2]
-    with pytest.raises(ValueError, match="third is broken"):
-        next(line)
-
-
-def test_the_reader_stops_when_its_consumer_stops_and_reads_only_a_little_ahead():
-    before = threading.active_count()
-    made = []
-
-    def items():
-        for i in range(1000):
-            made.append(i)
-            yield i
-
-    line = data.prefetch(items(), depth=2)
-    assert next(line) == 0
+def test_the_reader_stops_when_its_consumer_stops_and_reads_only_a_little_ahead(monkeypatch):
+    asked, before = [], threading.active_count()
+    object_names = data.object_names
+    monkeypatch.setattr(data, "object_names", lambda *a: asked.append(a[-1]) or object_names(*a))
+    line = data.batches(tiny_dataset.dataset(), dataclasses.replace(CONFIG, num_steps=1000), 0)
+    next(line)
     line.close()
+    deadline = time.monotonic() + 5
+    while threading.active_count() > before and time.monotonic() < deadline:
+        time.sleep(0.01)
     assert threading.active_count() == before
-    time.sleep(0.05)
-    assert len(made) <= 4
+    assert max(asked) <= data.READ_AHEAD
+
+
+def test_the_order_of_a_million_objects_costs_nothing_per_step():
+    names = tuple(map(str, range(10**6)))
+    start = time.monotonic()
+    for step in range(100):
+        data.object_names(names, CONFIG, step)
+    assert time.monotonic() - start < 5, "one permutation for all these steps takes 0.1 s, one each takes a minute"
+
+
+def test_the_cache_holds_as_many_objects_as_fit():
+    read = data.cached_reader(tiny_dataset.dataset(), CONFIG, int(2.5 * one_object().num_bytes))
+    first = [read(name) for name in NAMES]
+    assert [read(name) is kept for name, kept in zip(NAMES, first, strict=True)] == [True, True, False, False, False]
 
 
 def test_a_step_whose_object_is_broken_names_it_after_the_good_steps(copy):
@@ -236,8 +236,7 @@ def test_more_views_per_step_than_there_are_is_refused():
         next(data.batches(tiny_dataset.dataset(), config, 0))
 
 
-def test_objects_beyond_the_memory_of_the_cache_are_read_again_to_the_same_batches(monkeypatch):
+def test_objects_beyond_the_memory_of_the_cache_are_read_again_to_the_same_batches():
     expected = list(data.batches(tiny_dataset.dataset(), CONFIG, 0))
-    monkeypatch.setattr(data, "CACHE_BYTES", 0)
-    for a, b in zip(data.batches(tiny_dataset.dataset(), CONFIG, 0), expected, strict=True):
+    for a, b in zip(data.batches(tiny_dataset.dataset(), CONFIG, 0, cache_bytes=0), expected, strict=True):
         same_bits(a, b)

@@ -60,7 +60,7 @@ def test_every_way_to_write_a_square_gives_it(tmp_path, faces):
 def test_a_pentagon_beside_a_triangle_keeps_its_area(tmp_path):
     pentagon = "v 0 0 0\nv 2 0 0\nv 2 1 0\nv 1 2 0\nv 0 1 0\nf 1 2 3 4 5\n"
     assert areas_and_normals(load(tmp_path, pentagon).parts[0])[0] == pytest.approx(3)
-    assert areas_and_normals(load(tmp_path, pentagon + "f 1 2 3\n").parts[0])[0] == pytest.approx(4)
+    assert areas_and_normals(load(tmp_path, pentagon + "f 1 3 5\n").parts[0])[0] == pytest.approx(4)
 
 
 def test_relative_numbers_count_from_where_they_stand(tmp_path):
@@ -90,10 +90,26 @@ def test_roughness_comes_from_the_exponent_or_is_one_half(tmp_path):
 
 def test_a_texture_is_linearised_and_replaces_the_placeholder_beside_it(tmp_path):
     (tmp_path / "my wood.png").write_bytes(png(CHECKER))
-    asset = load_material(tmp_path, "Kd 0.8 0.8 0.8\nmap_Kd -s 2 2 1 -clamp on my wood.png", UV)
+    asset = load_material(tmp_path, "Kd 0.8 0.8 0.8\nmap_Kd -mm 0 1 -clamp on my wood.png", UV)
     np.testing.assert_allclose(asset.parts[0].material.base_color, srgb_to_linear(CHECKER / 255), atol=1e-6)
     assert asset.parts[0].material.wrap == "clamp"
-    assert asset.ignored == ("MTL Kd beside map_Kd", "MTL map option -s")
+    assert asset.ignored == ("MTL Kd beside map_Kd", "MTL map option -mm")
+
+
+def test_maps_are_scaled_and_shifted_and_a_name_may_begin_with_a_digit(tmp_path):
+    (tmp_path / "3d wood.png").write_bytes(png(CHECKER))
+    asset = load_material(tmp_path, "map_Kd -s 2 0.5 1 -o -.25 1e-1 3d wood.png", UV)
+    u, v, _ = asset.parts[0].positions.T  # as the file has them, v from below
+    expected = np.stack([2 * u - 0.25, 1 - (0.5 * v + 0.1)], axis=-1)
+    np.testing.assert_allclose(asset.parts[0].texcoords, expected, atol=1e-12)
+    assert asset.ignored == ()
+
+
+def test_maps_of_one_material_that_lie_differently_are_named(tmp_path):
+    (tmp_path / "wood.png").write_bytes(png(CHECKER))
+    asset = load_material(tmp_path, "map_Pr wood.png\nmap_Kd -s 2 wood.png", UV)
+    np.testing.assert_allclose(asset.parts[0].texcoords[:, 0], 2 * asset.parts[0].positions[:, 0])
+    assert asset.ignored == ("MTL maps of one material that lie differently (the first one's options are used)",)
 
 
 def test_two_materials_with_odd_names_make_two_parts(tmp_path):
@@ -141,3 +157,12 @@ def test_repeated_corners_are_removed_and_counted(tmp_path):
     asset = load(tmp_path, SQUARE + "f 1 1 3\nf 1 2 3\n")
     assert len(asset.parts[0].faces) == 1
     assert asset.ignored == ("1 degenerate faces",)
+
+
+def test_of_faces_on_the_same_corners_that_of_the_first_material_is_kept_whatever_their_order(tmp_path):
+    back = SQUARE.replace("v 1 0 0", "v 1 0 0\nv 1 0 0")  # vertex 3 is vertex 2 again
+    text = back + "usemtl red\nf 1 2 4\nusemtl blue\nf 4 3 1\nf 1 4 5\n"
+    asset = load(tmp_path, text, "newmtl blue\nKd 0 0 1\nnewmtl red\nKd 1 0 0\n")
+    faces = {tuple(part.material.base_color): len(part.faces) for part in asset.parts}
+    assert faces == {(1, 0, 0): 1, (0, 0, 1): 1}
+    assert asset.ignored == ("1 doubled faces (one of each is kept)",)

@@ -1,0 +1,134 @@
+"""Whether training waits for its data: both forms of a data set, read alone and under the train steps of the presets.
+
+    python -m experiments.loading DATASET [--presets tiny small abo] [--out runs/loading]
+
+The data set is packed into a temporary folder first. Nothing is kept in the cache of decoded objects, so every object
+is read and decoded anew, as it is where a data set is larger than memory. A preset is left out, with a line, if the
+images of the data set have another size than its network's.
+
+samples/s   objects a second that come out of the loader when nobody else works
+ms a step   median train step, data included, after the first, which compiles
+waiting     share of the steps' time before the batch was there
+"""
+
+import dataclasses
+import json
+import os
+import sys
+import tempfile
+import time
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax
+import numpy as np
+import tyro
+from tqdm import tqdm
+
+from data_gen.pack import PackConfig, pack
+from spnr_jax import cli, config, data, training
+from spnr_jax.config import TrainConfig
+from spnr_jax.images import write_whole
+
+TARGET = 0.02  # share of a step
+
+
+@dataclass(frozen=True, kw_only=True)
+class Loading:
+    """Measure the loader alone and the share of train steps spent waiting for it."""
+
+    dataset: tyro.conf.Positional[Path]
+    """Folder of the data set."""
+    out: Path = Path("runs/loading")
+    """Folder of results-SIZE.json and table-SIZE.md, where SIZE is the size of the images."""
+    presets: tuple[str, ...] = ("tiny", "small", "abo")
+    """Presets whose train step is measured."""
+    steps: int = 20
+    """Train steps that are timed; one more compiles."""
+    batches: int = 100
+    """Batches that the loader alone delivers."""
+
+
+def main(options: Loading) -> None:
+    """Measures, and writes the figures as JSON and as a Markdown table."""
+    cli.enable_compilation_cache()
+    size = image_size(data.open_dataset(options.dataset))
+    rows = []
+    with tempfile.TemporaryDirectory() as folder:
+        pack(PackConfig(dataset=options.dataset, out=Path(folder) / "packed"))
+        for preset in options.presets:
+            settings = config.PRESETS[preset]()
+            if settings.model.image_resolution != size:
+                print(f"{preset} left out: it needs images of {settings.model.image_resolution} px, these have {size}")
+                continue
+            for form, place in (("folder", options.dataset), ("packed", Path(folder) / "packed")):
+                figures = measure(data.open_dataset(place), settings, options)
+                rows.append({"preset": preset, "form": form, "batch_objects": settings.batch_objects, **figures})
+                print(json.dumps(rows[-1]), file=sys.stderr)
+    if not rows:
+        raise ValueError(f"{options.dataset}: no preset of {', '.join(options.presets)} has images of {size} px")
+    results = {"cores": os.cpu_count(), "device": jax.devices()[0].platform, "image_size": size, "rows": rows}
+    write_whole(options.out / f"results-{size}.json", (json.dumps(results, indent=1) + "\n").encode())
+    table = markdown(rows)
+    write_whole(options.out / f"table-{size}.md", table.encode())
+    print(table)
+
+
+def image_size(dataset: data.Dataset) -> int:
+    """Width of the data set's images in pixels."""
+    return data.read_object(dataset, dataset.splits["train"][0]).camera.width
+
+
+def measure(dataset: data.Dataset, settings: TrainConfig, options: Loading) -> dict[str, float]:
+    """The figures of one data set under one preset, with the discriminator at work."""
+    settings = dataclasses.replace(settings, num_steps=1 + max(options.steps, options.batches))
+    waits, steps = time_steps(dataset, settings, options.steps)
+    return {
+        "samples_per_second": round(samples_per_second(dataset, settings, options.batches), 1),
+        "ms_per_step": round(1000 * float(np.median(steps)), 1),
+        "waiting": round(sum(waits) / sum(steps), 5),
+    }
+
+
+def samples_per_second(dataset: data.Dataset, settings: TrainConfig, num_batches: int) -> float:
+    """Objects a second that the loader delivers, after the first batch."""
+    with closing(data.batches(dataset, settings, 0, cache_bytes=0)) as batches:
+        next(batches)
+        start = time.monotonic()
+        for _ in range(num_batches):
+            next(batches)
+        return num_batches * settings.batch_objects / (time.monotonic() - start)
+
+
+def time_steps(dataset: data.Dataset, settings: TrainConfig, num_steps: int) -> tuple[list[float], list[float]]:
+    """Seconds of each train step before its batch was there, and in all."""
+    state = training.jitted_create_state(settings)
+    waits, steps = [], []
+    with closing(data.batches(dataset, settings, 0, cache_bytes=0)) as batches:
+        for _ in tqdm(range(1 + num_steps), desc=f"{settings.preset} {dataset.folder.name}"):
+            start = time.monotonic()
+            batch = next(batches)
+            waits.append(time.monotonic() - start)
+            state, metrics = training.jitted_train_step(
+                state, jax.device_put(batch), config=settings, adversarial=settings.loss.adversarial_weight > 0
+            )
+            jax.block_until_ready((state, metrics))
+            steps.append(time.monotonic() - start)
+    return waits[1:], steps[1:]
+
+
+def markdown(rows: list[dict]) -> str:
+    """The rows as a Markdown table."""
+    lines = ["| preset | form | objects a step | samples/s | ms a step | waiting |", "|---|---|---:|---:|---:|---:|"]
+    for row in rows:
+        share = f"{row['waiting']:.2%}" + ("" if row["waiting"] < TARGET else f" (target {TARGET:.0%})")
+        lines.append(
+            f"| `{row['preset']}` | {row['form']} | {row['batch_objects']} | {row['samples_per_second']:.0f} | "
+            f"{row['ms_per_step']:.0f} | {share} |"
+        )
+    return "\n".join(lines) + "\n"
+
+
+if __name__ == "__main__":
+    sys.exit(cli.guarded(lambda: main(tyro.cli(Loading)), "loading"))

@@ -1,0 +1,69 @@
+"""Packed data sets: the files of many objects in a few big ones, with random access to each object.
+
+    PACKED/dataset.json  splits/...     as in a folder of objects
+    PACKED/shards/00000.array_record    ArrayRecord, one record an object: a msgpack map from the paths of the files
+                                        in its folder to their bytes, unchanged
+    PACKED/index.json                   {"shards": {file: number of records}, "ids": [id, ...] in the order of records}
+
+`spnr-data pack` writes them; here they are read, through grain's data source.
+"""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+INDEX = "index.json"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shards:
+    """An opened packed data set: where each object's record is, and the source of the records."""
+
+    folder: Path
+    places: dict[str, int]
+    records: Any  # grain.sources.ArrayRecordDataSource, which is imported on demand
+
+
+def open_shards(folder: Path) -> Shards | None:
+    """The packed objects of a data set, None if it is not packed; ValueError if something is missing."""
+    path = folder / INDEX
+    if not path.is_file():
+        return None
+    import grain
+
+    try:
+        index = json.loads(path.read_text())
+        files = {folder / "shards" / file: count for file, count in index["shards"].items()}
+        places = {name: place for place, name in enumerate(index["ids"])}
+    except (ValueError, LookupError, AttributeError, TypeError) as error:
+        raise ValueError(f"{path}: damaged ({error}); pack the data set again") from None
+    if absent := [file for file in files if not file.is_file()]:
+        raise ValueError(f"{absent[0]}: missing; pack the data set again")
+    try:
+        records = grain.sources.ArrayRecordDataSource([str(file) for file in files])
+        found = len(records)
+    except (RuntimeError, ValueError, OSError) as error:
+        raise ValueError(f"{folder}: its shards cannot be read ({first_line(error)}); pack them again") from None
+    if not found == len(places) == sum(files.values()):
+        raise ValueError(f"{folder}: {found} objects in the shards, {len(places)} in {INDEX}; pack the data set again")
+    return Shards(folder=folder, places=places, records=records)
+
+
+def read_files(shards: Shards, name: str) -> dict[str, bytes]:
+    """The files of one object by their paths in its folder; ValueError if its record is absent or broken."""
+    import msgpack
+
+    try:
+        return msgpack.unpackb(shards.records[shards.places[name]])
+    except KeyError:
+        raise ValueError(f"{shards.folder}: holds no object {name}; pack the data set again") from None
+    except (RuntimeError, ValueError, OSError, LookupError) as error:
+        raise ValueError(
+            f"{shards.folder}: object {name} cannot be read ({first_line(error)}); pack the data set again"
+        ) from None
+
+
+def first_line(error: Exception) -> str:
+    """What an error of the reader says, without its call stack."""
+    return (str(error).splitlines() or [type(error).__name__])[0][:200]
