@@ -10,10 +10,12 @@ import dataclasses
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from spnr_jax.numerics import normalize, safe_divide
+from spnr_jax.numerics import length, normalize, safe_divide
 from spnr_jax.types import Camera, Rays
 
-PARALLEL = 1e-20  # a direction component below this moves less than a float32 spacing through any scene
+# A direction component below this moves a ray by less than a float32 spacing across 10^4 boxes, so it counts as 0; the
+# square of its inverse, which the gradient contains, stays far from overflow.
+PARALLEL = 1e-12
 
 
 def look_at(
@@ -66,7 +68,7 @@ def project(
     plane = safe_divide(local[..., :2], jnp.broadcast_to(-local[..., 2:], local[..., :2].shape))
     focal = jnp.stack([camera.intrinsics[..., None, 0, 0], -camera.intrinsics[..., None, 1, 1]], axis=-1)
     pixels = plane * focal + camera.intrinsics[..., None, :2, 2]
-    return jnp.where(in_front[..., None], pixels, -jnp.inf), jnp.sqrt(jnp.sum(offset**2, axis=-1))
+    return jnp.where(in_front[..., None], pixels, -jnp.inf), length(offset)
 
 
 def intersect_box(

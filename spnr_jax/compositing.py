@@ -9,8 +9,6 @@ one meets the background.  All of it is float32.
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-OPAQUE = 1e4  # optical depth; exp(-OPAQUE) is 0 in float32, so more of it changes nothing but overflows
-
 
 def interval_lengths(
     distances: Float[Array, "*batch samples"], far: Float[Array, "*batch"]
@@ -25,9 +23,9 @@ def volume_weights(
     """Weights exp(-sum of tau before) * (1 - exp(-tau)), and the residual transmittance exp(-sum of all tau).
 
     1 - exp is expm1 (in float32 a thin interval would be lost), and optical depths are summed before one exp, not
-    transmittances multiplied.
+    transmittances multiplied.  An infinite optical depth is opaque, with zero gradient.
     """
-    tau = jnp.minimum(density * delta, OPAQUE)
+    tau = density * delta
     through = jnp.cumsum(tau, axis=-1)
     before = jnp.concatenate([jnp.zeros_like(tau[..., :1]), through[..., :-1]], axis=-1)
     return jnp.exp(-before) * -jnp.expm1(-tau), jnp.exp(-through[..., -1])

@@ -67,6 +67,8 @@ class ModelConfig:
     """Output: 2 x resize_resolution, or render_resolution, which builds no upsampler."""
     upsampler_width: int = 64
     """Channels of the upsampler before its x2; half of it after."""
+    precision: Literal["float32", "bfloat16"] = "float32"
+    """Format of the convolutions in U-Net, upsampler and discriminator; all else, parameters too, is float32."""
 
     def __post_init__(self) -> None:
         step = 2**self.num_stages
@@ -85,6 +87,10 @@ class ModelConfig:
             f"materials must be distinct names out of {tuple(MATERIAL_CHANNELS)}, got {self.materials}",
         )
         _require(
+            self.precision in ("float32", "bfloat16"),
+            f"precision must be float32 or bfloat16, got {self.precision}",
+        )
+        _require(
             self.image_resolution in (self.render_resolution, 2 * self.resize_resolution),
             f"image_resolution {self.image_resolution} must be render_resolution ({self.render_resolution}: no "
             f"upsampler) or twice resize_resolution ({2 * self.resize_resolution})",
@@ -94,6 +100,11 @@ class ModelConfig:
     def num_material_channels(self) -> int:
         """Numbers a point carries besides its position."""
         return sum(MATERIAL_CHANNELS[name] for name in self.materials)
+
+    @property
+    def bf16(self) -> bool:
+        """Whether the convolutions run in bfloat16."""
+        return self.precision == "bfloat16"
 
     @property
     def upsamples(self) -> bool:

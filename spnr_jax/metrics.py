@@ -41,7 +41,10 @@ def conditional_psnr(
 def ssim(
     image: Float[Array, "*batch height width 3"], reference: Float[Array, "*batch height width 3"]
 ) -> Float[Array, "*batch"]:
-    """Structural similarity, mean over channels; scikit-image's with gaussian weights, sigma 1.5, data range 1."""
+    """Structural similarity, mean over channels; scikit-image's with gaussian weights, sigma 1.5, data range 1.
+
+    Off by up to 1e-3 where both images are bright and flat: a small variance is the difference of large squares.
+    """
     if min(image.shape[-3:-1]) < 2 * SSIM_RADIUS + 1:
         raise ValueError(f"ssim needs images of at least {2 * SSIM_RADIUS + 1} pixels, got {image.shape[-3:-1]}")
     taps = np.exp(-0.5 * (np.arange(-SSIM_RADIUS, SSIM_RADIUS + 1) / SSIM_SIGMA) ** 2)

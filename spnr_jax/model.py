@@ -21,7 +21,6 @@ from spnr_jax import cameras, checkpoint, clouds, training
 from spnr_jax.config import ModelConfig
 from spnr_jax.types import Camera, PointCloud, Rendering
 
-RAY_CHUNK = 64 * 64  # rays rendered at once: about 300 MB at 128 samples
 FIELD_OF_VIEW, DISTANCE = np.deg2rad(40.0), 3.0  # of the training cameras; the object fits into the unit sphere
 
 
@@ -51,7 +50,9 @@ class Model:
             if not np.isfinite(np.asarray(getattr(cloud, field.name))[mask]).all():
                 raise ValueError(f"the cloud has NaN or infinity in its {field.name}; remove those points")
         centre, scale = clouds.normalization(positions[mask])
-        cloud = dataclasses.replace(cloud, positions=((positions - centre) * scale).astype(np.float32))
+        # the ends of a thin stick lie on the faces of the box: rounding must not push them out of it
+        inside = np.clip((positions - centre) * scale, -1, 1).astype(np.float32)
+        cloud = dataclasses.replace(cloud, positions=inside)
         cloud = clouds.pad(cloud, clouds.bucket(len(positions)))
         features = training.jitted_encode(
             self.variables, jax.tree.map(lambda x: jnp.asarray(x)[None], cloud), config=self.config
@@ -69,7 +70,7 @@ class Model:
         inside = dataclasses.replace(camera, cam_to_world=pose)
         inside = jax.tree.map(lambda x: jnp.asarray(x).reshape(1, -1, *x.shape[-2:]), inside)
         rendering = training.jitted_render(
-            self.variables, volume.features[None], inside, config=self.config, ray_chunk=RAY_CHUNK
+            self.variables, volume.features[None], inside, config=self.config
         )
         rendering = dataclasses.replace(rendering, depth=rendering.depth / volume.scale)
         return jax.tree.map(lambda x: x[0, 0] if single else x[0], rendering)

@@ -20,6 +20,7 @@ from spnr_jax.nn.field import RadianceField
 from spnr_jax.nn.pointnet import PointNet
 from spnr_jax.nn.unet3d import UNet3D
 from spnr_jax.nn.upsampler import Upsampler, bilinear
+from spnr_jax.numerics import clamp
 from spnr_jax.types import Camera, Key, PointCloud, Rays, Rendering
 
 WHITE = 1.0
@@ -34,10 +35,10 @@ class Renderer(nn.Module):
         """Builds the parts that the config asks for."""
         c = self.config
         self.pointnet = PointNet(c.point_widths, c.point_features)
-        self.unet = UNet3D(c.volume_resolution, c.base_width, c.num_stages, c.num_groups)
+        self.unet = UNet3D(c.volume_resolution, c.base_width, c.num_stages, c.num_groups, c.bf16)
         self.field = RadianceField(c.field_width, c.num_features, c.direction_frequencies)
         if c.upsamples:
-            self.upsampler = Upsampler(c.upsampler_width)
+            self.upsampler = Upsampler(c.upsampler_width, c.bf16)
 
     def encode(self, cloud: PointCloud, train: bool = False) -> Float[Array, "objects d d d features"]:
         """Feature volume of each object from its points."""
@@ -124,7 +125,7 @@ class Renderer(nn.Module):
         """The radiance field at each sample."""
         positions = rays.origins[..., None, :] + distances[..., None] * rays.directions[..., None, :]
         # rays end on the faces of the box: rounding must not push their samples out of it
-        return self.field(voxels.trilinear(volume, jnp.clip(positions, -1, 1)), view)
+        return self.field(voxels.trilinear(volume, clamp(positions, -1, 1)), view)
 
     def __call__(self, cloud: PointCloud, camera: Camera, key: Key | None = None, train: bool = False) -> Rendering:
         """Views of each cloud from its cameras."""

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Shaped
 
-from spnr_jax.numerics import per_feature, safe_divide
+from spnr_jax.numerics import clamp, per_feature, safe_divide
 from spnr_jax.types import Key
 
 
@@ -17,7 +17,7 @@ def strata(key: Key | None, shape: tuple[int, ...], num_samples: int) -> Float[A
     """One number in each of `num_samples` equal parts of [0, 1]: uniform in its part, or its middle without a key."""
     shape = (*shape, num_samples)
     jitter = jnp.full(shape, 0.5) if key is None else jax.random.uniform(key, shape)
-    return (per_feature(jnp.arange(num_samples, dtype=jnp.float32), jitter) + jitter) / num_samples
+    return (per_feature(jnp.arange(num_samples, dtype=float), jitter) + jitter) / num_samples
 
 
 def stratified(
@@ -25,10 +25,12 @@ def stratified(
 ) -> tuple[Float[Array, "*batch samples"], Float[Array, "*batch samples+1"]]:
     """Sorted distances, one in each equal part of [near, far], and the edges of the parts (NeRF, eq. 2)."""
     near, far = near[..., None], far[..., None]
-    fractions = per_feature(jnp.arange(num_samples + 1, dtype=jnp.float32) / num_samples, near)
-    edges = near * (1 - fractions) + far * fractions
+    steps = jnp.arange(num_samples + 1, dtype=jnp.promote_types(near.dtype, jnp.float32))
+    fractions = per_feature(steps / num_samples, near)
+    edges = near + (far - near) * fractions  # rises with the fractions, whatever is rounded
+    edges = jnp.where((fractions < 1) & (edges < far), edges, far)
     at = strata(key, near.shape[:-1], num_samples)
-    return jnp.clip(near + (far - near) * at, edges[..., :-1], edges[..., 1:]), edges
+    return clamp(near + (far - near) * at, edges[..., :-1], edges[..., 1:]), edges
 
 
 def importance(

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from spnr_jax.numerics import gather_rows, scatter_rows
+from spnr_jax.numerics import clamp, gather_rows, scatter_rows
 
 NEIGHBOURS = tuple((z, y, x) for z in (-1, 0, 1) for y in (-1, 0, 1) for x in (-1, 0, 1))
 
@@ -40,7 +40,7 @@ def share_voxels(
     """Row of each point in the flattened volume, and 1 / (points in its voxel); 0 if masked or outside the box."""
     valid = mask & jnp.all(jnp.abs(positions) <= 1, axis=-1)
     rows = row_of(locate(positions, resolution)[0], valid, resolution)
-    ones = valid.astype(jnp.float32)
+    ones = valid.astype(positions.dtype)
     count = gather_rows(scatter_rows(rows, ones[:, None], resolution**3 + 1), rows)[:, 0]
     return rows, ones / jnp.maximum(count, 1)
 
@@ -97,7 +97,7 @@ def trilinear(
         return jax.vmap(trilinear)(volume, positions)
     resolution = volume.shape[0]
     inside = jnp.all(jnp.abs(positions) <= 1, axis=-1, keepdims=True)
-    grid = jnp.clip((positions + 1) * (0.5 * resolution) - 0.5, 0, resolution - 1)
+    grid = clamp((positions + 1) * (0.5 * resolution) - 0.5, 0, resolution - 1)
     cell = jnp.clip(jnp.floor(grid), 0, max(resolution - 2, 0))
     upper = grid - jax.lax.stop_gradient(cell)
     # the lowest corner's row as a matrix product: XLA computes that once, where it would compute a sum of products anew

@@ -3,9 +3,13 @@
 A kernel takes float arrays and returns an array or a tuple of arrays; `arguments` lead with batch axes (2, 3).
 """
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
+from hypothesis import Phase, settings
+from hypothesis import strategies as st
 
 
 def numbers(seed: int, *shape: int, low: float = -1.0, high: float = 1.0) -> jax.Array:
@@ -77,3 +81,80 @@ def gradient_law(kernel, *arguments, rtol=1e-3):
     np.testing.assert_allclose((ahead - behind) / 2e-6, slope, rtol=1e-4, atol=1e-6 * scale)
     for s, d in zip(single, double, strict=True):
         close(s, d, rtol=rtol, atol=rtol * np.abs(d).max() + 1e-12)
+
+
+def adjoint_law(linear, x):
+    """<A x, y> = <x, A^T y> to 1e-6 for a random y, summed in float64: a linear kernel and its gradient are adjoint."""
+    out, transpose = jax.vjp(linear, x)
+    y = numbers(1, *out.shape)
+    (back,) = transpose(y)
+    out, x, y, back = map(np.float64, (out, x, y, back))
+    assert abs(np.vdot(out, y) - np.vdot(x, back)) <= 1e-6 * np.linalg.norm(out) * np.linalg.norm(y)
+
+
+KINDS = ("spread", "mixed", "equal", "ties", "one-hot", "zeros")
+TINY = 1e-37  # a float32 has all its digits above it
+hypotheses = settings(
+    max_examples=60,
+    deadline=None,
+    derandomize=True,
+    database=None,
+    phases=[Phase.explicit, Phase.generate, Phase.shrink],
+)
+
+
+@st.composite
+def extremes(draw, *shape, low=-30, high=30, signed=True):
+    """Float32 array: sizes between 10^low and 10^high, equal ones, ties, a single one, or zeros alone."""
+    kind, exponent = draw(st.sampled_from(KINDS)), draw(st.integers(low, high))
+    rng = np.random.default_rng(draw(st.integers(0, 999)))
+    x = rng.uniform(-1 if signed else 0, 1, shape)
+    if kind == "mixed":
+        return np.float32(x * 10.0 ** rng.integers(low, high + 1, shape))
+    if kind == "equal":
+        x = np.full(shape, x.flat[0])
+    elif kind == "ties":
+        x = np.round(2 * x) / 2
+    elif kind == "one-hot":
+        x = x * (np.arange(shape[-1]) == rng.integers(shape[-1]))
+    elif kind == "zeros":
+        x = 0 * x
+    return np.float32(x * 10.0**exponent)
+
+
+@functools.cache
+def _with_gradients(kernel):
+    """Jitted outputs of a kernel and the gradients of a fixed projection of them."""
+
+    def projected(*arguments):
+        out = kernel(*arguments)
+        leaves = jax.tree.leaves(out)
+        rng = np.random.default_rng(2)
+        return sum(jnp.vdot(jnp.asarray(rng.normal(size=x.shape), x.dtype), x) for x in leaves), out
+
+    def both(*arguments):
+        gradients, out = jax.grad(projected, tuple(range(len(arguments))), has_aux=True)(*arguments)
+        return out, gradients
+
+    return jax.jit(both)
+
+
+def float64_law(kernel, *arguments, rtol=1e-3, floors=(0.0,) * 4):
+    """Outputs of a kernel in float32, after a check of its gradients: finite, and float64's.
+
+    They may be off by rtol times the largest gradient by that argument, or times its floor where rounding makes more
+    noise than that.  Where float32 cannot hold a gradient nothing is asked.
+    Zeros may as well be subnormal numbers.  One kernel is one function object, or it is compiled anew.
+    """
+    both = _with_gradients(kernel)
+    out, gradients = jax.tree.map(np.asarray, both(*map(jnp.asarray, arguments)))
+    with jax.enable_x64(True):
+        _, doubles = jax.tree.map(np.asarray, both(*(jnp.asarray(np.float64(x)) for x in arguments)))
+    nearly = both(*(jnp.asarray(np.where(np.asarray(x) == 0, np.float32(1e-40), x)) for x in arguments))
+    close(nearly[0], out, atol=TINY)
+    for single, double, subnormal, floor in zip(gradients, doubles, nearly[1], floors, strict=False):
+        largest = np.abs(double).max()
+        if largest < 1e37:
+            assert np.isfinite(subnormal).all()
+            close(single, double, rtol=rtol, atol=rtol * max(largest, floor) + TINY)
+    return out

@@ -158,3 +158,10 @@ def group_norm(x, groups, scale, bias, epsilon=1e-5):
 def softplus(x):
     """log(1 + exp(x)) without overflow."""
     return np.maximum(x, 0) + np.log1p(np.exp(-np.abs(np.float64(x))))
+
+
+def batch_norm(x, epsilon=1e-5):
+    """(normalised rows, mean, variance) of real points (n, features); a mean of 0 and no variance without points."""
+    x = np.float64(x)
+    mean, variance = (x.mean(axis=0), x.var(axis=0)) if len(x) else (np.zeros(x.shape[1]), np.zeros(x.shape[1]))
+    return (x - mean) / np.sqrt(variance + epsilon), mean, variance

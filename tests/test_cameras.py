@@ -108,6 +108,12 @@ class TestProject:
         assert distance[0] == pytest.approx(np.linalg.norm(positions))
         assert (gradient == 0).all()
 
+    def test_a_point_in_the_eye_has_distance_zero_and_no_gradient(self):
+        view = pinhole(POSES[0, 0], 0.8, 4, 4)
+        distance, gradient = jax.value_and_grad(lambda p: jnp.sum(project(view, p)[1]))(EYES[0, 0][None])
+        assert distance == 0
+        assert (gradient == 0).all()
+
 
 class TestBox:
     def test_is_the_slab_loop_at_every_batch_rank(self):
@@ -155,6 +161,16 @@ class TestBox:
         gradients = jax.grad(lambda o, d: sum(map(jnp.sum, intersect_box(o, d)[:2])), (0, 1))(special, along)
         assert all(jnp.isfinite(g).all() for g in gradients)
         close([g[1] for g in gradients], [jnp.zeros(3)] * 2)
+
+    @pytest.mark.parametrize("slope", [0.0, 1e-30, 1e-20, 1e-19, 1e-12, 1e-11, 1e-7])
+    def test_rays_that_are_nearly_parallel_to_a_face_have_a_finite_gradient(self, slope):
+        origins = jnp.array([[0.1, 0.2, 3.0], [1e8, 0.2, 3.0]])
+        directions = jnp.broadcast_to(jnp.array([slope, 0.0, -1.0]), (2, 3))
+        near, far, hit = intersect_box(origins, directions)
+        close((near, far, hit), (np.array([2.0, 0.0]), np.array([4.0, 0.0]), np.array([True, False])))
+        gradients = jax.grad(lambda o, d: sum(map(jnp.sum, intersect_box(o, d)[:2])), (0, 1))(origins, directions)
+        close(gradients[0], jnp.array([[0.0, 0.0, 2.0], [0.0, 0.0, 0.0]]))
+        assert jnp.isfinite(gradients[1]).all()
 
     def test_points_on_hit_rays_between_near_and_far_lie_in_the_box(self):
         origins, directions = 2 * numbers(6, 50, 3), numbers(7, 50, 3)

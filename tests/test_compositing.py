@@ -10,6 +10,7 @@ import reference
 from laws import batch_law, close, gradient_law, numbers
 
 from spnr_jax.compositing import composite, expected_distance, interval_lengths, volume_weights
+from spnr_jax.numerics import softplus
 
 DENSITY = 5 * jnp.abs(numbers(0, 2, 3, 8))
 DELTA = jnp.abs(numbers(1, 2, 3, 8))
@@ -58,9 +59,45 @@ class TestWeights:
         gradients = jax.grad(lambda d, w: jnp.sum(volume_weights(d, w)[0] * jnp.arange(4.0)), (0, 1))(density, delta)
         assert all(jnp.isfinite(g).all() for g in gradients)
 
+    @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
+    def test_and_the_residual_of_thousands_of_samples_sum_to_one(self, scale):
+        density = scale * jnp.asarray(np.random.default_rng(5).gamma(0.1, size=(8, 4096)), jnp.float32)
+        weights, residual = map(np.float64, jax.jit(volume_weights)(density, jnp.full((8, 4096), 1 / 4096)))
+        close(weights.sum(-1) + residual, np.ones(8), rtol=0, atol=1e-6)
+
+    def test_opacity_rises_with_every_density(self):
+        grown = DENSITY[None] + np.eye(8, dtype=np.float32).reshape(8, 1, 1, 8)  # one more at each sample in turn
+        opacity = 1 - np.asarray(volume_weights(grown, jnp.broadcast_to(DELTA, grown.shape))[1])
+        before = 1 - np.asarray(volume_weights(DENSITY, DELTA)[1])
+        assert (opacity >= before).all()
+        assert (opacity > before).any()
+        slope = jax.grad(lambda density: jnp.sum(volume_weights(density, DELTA)[1]))(DENSITY)
+        assert (slope <= 0).all()
+
+    def test_a_wall_stops_the_gradient_behind_it_and_none_before_it(self):
+        """Where alpha is exactly 1 a product of transmittances would divide by zero."""
+        density, delta = jnp.array([0.5, 1.0, 1e10, 0.7, 0.2]), jnp.full(5, 0.3)
+        values = jnp.array([1.0, -2.0, 3.0, 5.0, 7.0])
+        gradient = np.asarray(jax.grad(lambda d: jnp.vdot(volume_weights(d, delta)[0], values))(density))
+        passed = np.exp(-0.3 * np.cumsum([0.5, 1.0]))  # behind the first and the second
+        after_second = 3.0 * passed[1]
+        after_first = (passed[0] - passed[1]) * -2.0 + after_second
+        close(gradient[:2], 0.3 * np.array([passed[0] * 1.0 - after_first, passed[1] * -2.0 - after_second]), atol=1e-5)
+        assert (gradient[2:] == 0).all()
+
     def test_thin_intervals_are_not_lost(self):
         weights, _ = volume_weights(jnp.full(64, 1e-6 / 64), jnp.ones(64))
         assert weights.sum() == pytest.approx(1e-6, rel=1e-3)
+
+    def test_a_thousand_thin_intervals_dim_what_lies_behind_them(self):
+        """The transmittance of each rounds to 1 in float32, so their product would be 1."""
+        weights, _ = volume_weights(jnp.full(4096, 2e-8), jnp.ones(4096))
+        close(weights[-1] / weights[0], np.exp(-4095 * 2e-8), rtol=1e-6)
+
+    def test_a_single_thin_interval_keeps_its_digits_and_its_gradient(self):
+        value, gradient = jax.value_and_grad(lambda d: volume_weights(d, jnp.ones(1))[0][0])(jnp.array([1e-8]))
+        assert value == pytest.approx(1e-8, rel=1e-6)
+        assert gradient[0] == pytest.approx(1, rel=1e-6)
 
     def test_splitting_every_interval_changes_nothing(self):
         weights, residual = volume_weights(DENSITY, DELTA)
@@ -108,7 +145,17 @@ class TestComposite:
             return composite(weights, values, 1.0)
 
         assert (white(VALUES) == 1).all()
+        assert (
+            jax.grad(lambda d: jnp.sum(composite(volume_weights(d, DELTA)[0], VALUES, 1.0)))(0 * DENSITY) != 0
+        ).any()
         close(jax.grad(lambda v: jnp.sum(white(v)))(VALUES), jnp.zeros_like(VALUES))
+
+    def test_a_ray_of_nearly_nothing_is_nearly_white(self):
+        """64 samples of a field that says -9: with an endless last interval the pixel would be opaque."""
+        density, delta = softplus(jnp.full(64, -9.0)), jnp.full(64, 2 / 64)
+        weights, _ = volume_weights(density, delta)
+        assert weights.sum() == pytest.approx(2.5e-4, rel=0.02)
+        assert (composite(weights, jnp.zeros((64, 3)), 1.0) >= 0.999).all()
 
 
 class TestExpectedDistance:

@@ -79,14 +79,6 @@ def test_an_axis_of_views_holds_what_each_camera_sees_alone(handle):
         close(jax.tree.map(lambda x, i=i: x[i], together), handle.render(volume, camera), atol=1e-5)
 
 
-def test_rendering_in_chunks_gives_the_same_picture(handle, monkeypatch):
-    volume = handle.encode(example_cloud())
-    camera = handle.camera(volume)
-    whole = handle.render(volume, camera)
-    monkeypatch.setattr(model, "RAY_CHUNK", 10)  # 64 rays: six chunks and a part of one
-    close(handle.render(volume, camera), whole, atol=1e-5)
-
-
 def test_the_handle_shows_what_the_evaluation_shows(handle):
     item = data.read_object(tiny_dataset.dataset(), "ball_000004")
     expected = evaluation.render_views(handle.variables, tiny_dataset.CONFIG, item.cloud, item.camera)

@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
-from laws import batch_law, close, gradient_law, numbers
+from laws import adjoint_law, batch_law, close, gradient_law, numbers
 
-from spnr_jax.numerics import gather_rows, normalize, per_feature, safe_divide, scatter_rows, softplus
+from spnr_jax.numerics import clamp, gather_rows, length, normalize, per_feature, safe_divide, scatter_rows, softplus
 
 INDEX = jnp.asarray(np.random.default_rng(7).integers(0, 5, (2, 3, 4)), jnp.int32)
 
@@ -38,7 +38,7 @@ class TestNormalize:
         close(normalize(v), np.float64(v) / np.linalg.norm(v, axis=-1, keepdims=True))
         gradient_law(normalize, v)
 
-    @pytest.mark.parametrize("scale", [1e-8, 1.0, 1e10])
+    @pytest.mark.parametrize("scale", [1e-30, 1e-8, 1.0, 1e10, 1e30])
     def test_length_does_not_matter(self, scale):
         close(normalize(scale * jnp.array([3.0, 0.0, -4.0])), jnp.array([0.6, 0.0, -0.8]))
 
@@ -46,6 +46,34 @@ class TestNormalize:
         value, gradient = jax.value_and_grad(lambda v: jnp.sum(normalize(v)))(jnp.zeros(3))
         assert value == 0
         close(gradient, jnp.zeros(3))
+
+
+class TestLength:
+    def test_is_the_euclidean_one_at_every_batch_rank(self):
+        v = numbers(6, 2, 3, 3)
+        batch_law(length, v)
+        gradient_law(length, v)
+        close(length(v), np.linalg.norm(np.float64(v), axis=-1))
+
+    @pytest.mark.parametrize("scale", [1e-30, 1.0, 1e30])
+    def test_neither_overflows_nor_vanishes_and_its_gradient_is_the_direction(self, scale):
+        value, gradient = jax.value_and_grad(length)(scale * jnp.array([3.0, 0.0, -4.0]))
+        assert value == pytest.approx(5 * scale, rel=1e-6)
+        close(gradient, jnp.array([0.6, 0.0, -0.8]))
+
+    def test_of_the_zero_vector_is_zero_with_zero_gradient(self):
+        value, gradient = jax.value_and_grad(length)(jnp.zeros(3))
+        assert value == 0
+        assert (gradient == 0).all()
+
+
+class TestClamp:
+    def test_is_clip_and_its_gradient_goes_to_what_it_returns(self):
+        x = jnp.array([-2.0, 0.3, 5.0, -1.0, 1.0])
+        (value, pull_back) = jax.vjp(clamp, x, jnp.full(5, -1.0), jnp.full(5, 1.0))
+        close(value, jnp.clip(x, -1, 1), rtol=0, atol=0)
+        expected = [[0, 1, 0, 1, 1], [1, 0, 0, 0, 0], [0, 0, 1, 0, 0]]
+        close(pull_back(jnp.ones(5)), tuple(jnp.array(row, jnp.float32) for row in expected))
 
 
 def test_per_feature_broadcasts_over_the_last_axis_alone():
@@ -111,9 +139,12 @@ class TestRows:
 
     def test_gather_and_scatter_are_adjoint(self):
         table, values, index = self.table[1, 2], self.values[1, 2], INDEX[1, 2]
-        assert jnp.vdot(gather_rows(table, index), values) == pytest.approx(
-            float(jnp.vdot(table, self.scatter(index, values))), rel=1e-5
+        gathered, scattered = gather_rows(table, index), self.scatter(index, values)
+        assert np.vdot(np.float64(gathered), np.float64(values)) == pytest.approx(
+            np.vdot(np.float64(table), np.float64(scattered)), rel=1e-6
         )
+        adjoint_law(lambda table: gather_rows(table, index), table)
+        adjoint_law(lambda values: self.scatter(index, values), values)
 
     def test_no_index_gathers_nothing_and_scatters_zeros(self):
         none = jnp.zeros((0,), jnp.int32)

@@ -1,58 +1,26 @@
 """The generator as a whole, shrunken: what must not change its pictures, and what must."""
 
 import dataclasses
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
+import tiny_model
 from laws import batch_law, close, gradient_law, numbers, same_bits
+from tiny_model import NUM_POINTS, camera, cloud, wobbled
 
-from spnr_jax import training
-from spnr_jax.cameras import look_at, pinhole
-from spnr_jax.config import ModelConfig, SamplingConfig
+from spnr_jax import sampling, training
+from spnr_jax.cameras import intersect_box
 from spnr_jax.renderer import Renderer, union_weights
-from spnr_jax.types import PointCloud
+from spnr_jax.types import Rays
 
-CONFIG = ModelConfig(
-    point_widths=(8,),
-    point_features=4,
-    volume_resolution=8,
-    base_width=4,
-    num_stages=1,
-    num_groups=2,
-    field_width=8,
-    num_features=5,
-    direction_frequencies=1,
-    sampling=SamplingConfig(num_coarse=4, num_fine=4),
-    render_resolution=8,
-    resize_resolution=8,
-    image_resolution=8,
-    upsampler_width=4,
-)
-NUM_POINTS = 40
-
-
-def cloud():
-    return PointCloud(
-        positions=0.7 * numbers(0, 2, NUM_POINTS, 3),
-        base_color=numbers(1, 2, NUM_POINTS, 3, low=0.0),
-        roughness=numbers(2, 2, NUM_POINTS, low=0.0),
-        metallic=numbers(3, 2, NUM_POINTS, low=0.0),
-        mask=jnp.ones((2, NUM_POINTS), bool),
-    )
-
-
-def camera(size=8, target=0.0):
-    eyes = jnp.asarray(np.float32([[[0, 1, 3], [3, 1, 0.5]], [[-2, 2, -2], [0.5, -1, 3]]]))
-    pose = look_at(eyes, jnp.full(eyes.shape, target), jnp.broadcast_to(jnp.array([0.0, 1.0, 0.0]), eyes.shape))
-    return pinhole(pose, 0.9, size, size)
-
-
-def wobbled(variables, seed):
-    """Weights away from the zeros and ones that they start at."""
-    return jax.tree.map(lambda x: x + 0.2 * numbers(seed, *x.shape), variables)
+CONFIG = tiny_model.WITHOUT_UPSAMPLER
 
 
 @pytest.fixture(scope="module")
@@ -78,6 +46,14 @@ class TestCloud:
         order = np.random.default_rng(5).permutation(NUM_POINTS)
         shuffled = jax.tree.map(lambda x: x[:, order], cloud())
         close(encode(variables, shuffled), encode(variables, cloud()), rtol=1e-4, atol=1e-5)
+
+    def test_padding_to_another_bucket_does_not_change_a_bit_of_the_volume(self, variables):
+        def padded(count):
+            return jax.tree.map(
+                lambda x: jnp.pad(x, [(0, 0), (0, count - NUM_POINTS)] + [(0, 0)] * (x.ndim - 2)), cloud()
+            )
+
+        same_bits(encode(variables, padded(1024)), encode(variables, padded(512)))
 
     @pytest.mark.parametrize("fill", [0.0, np.nan])
     def test_padding_does_not_change_image_or_statistics_whatever_it_holds(self, variables, fill):
@@ -128,10 +104,43 @@ class TestViews:
         second = jax.tree.map(lambda x: x[:, 1:], views)
         close(render(variables, volume, second), jax.tree.map(lambda x: x[:, 1:], both), rtol=1e-4, atol=1e-5)
 
-    @pytest.mark.parametrize("ray_chunk", [7, 64, 1000])
-    def test_rendering_in_chunks_is_rendering_at_once(self, variables, ray_chunk):
+    @pytest.mark.parametrize("ray_chunk", [1, 7, 64])
+    def test_rays_do_not_know_their_chunk(self, variables, ray_chunk):
+        """To a few roundings: a matrix product of another size adds in another order."""
         volume = encode(variables, cloud())
-        close(render(variables, volume, camera(), ray_chunk=ray_chunk), render(variables, volume, camera()))
+        whole, chunked = (render(variables, volume, camera(), ray_chunk=chunk) for chunk in (1000, ray_chunk))
+        close(chunked, whole, rtol=1e-6, atol=1e-6)
+        same_bits(render(variables, volume, camera(), ray_chunk=ray_chunk), chunked)
+
+    @pytest.mark.slow
+    def test_rays_of_one_object_have_the_same_bits_in_every_chunk_of_a_fair_size(self):
+        """As users compile: the flags of this suite let another program come out for every size."""
+        environment = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
+        command = [sys.executable, Path(__file__).with_name("chunk_bits.py"), "256", "500", "1024", "2048"]
+        checksums = subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout.split()
+        assert len(checksums) == 4
+        assert len(set(checksums)) == 1
+
+    def test_samples_of_rays_that_graze_an_edge_stay_in_the_box(self, variables):
+        """Their way through it is shorter than the rounding of a position, and outside there would be nothing."""
+        rng = np.random.default_rng(8)
+        edge = np.float32([1, 1, 0]) * (1 - 1e-6 * rng.random((1000, 1))) + np.float32([0, 0, 0.9]) * rng.random(
+            (1000, 1)
+        )
+        directions = np.float32([-1, 1, 0]) + 0.3 * rng.normal(size=(1000, 3))
+        directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+        rays = Rays(origins=jnp.float32(edge - 7 * directions)[None], directions=jnp.float32(directions)[None])
+        near, far, hit = map(np.asarray, intersect_box(rays.origins, rays.directions))
+        assert hit.sum() > 100
+        assert np.median((far - near)[hit]) < 1e-5
+
+        @jax.jit
+        def densities(rays, distances):
+            module = Renderer(CONFIG).bind(variables)
+            return module.shade(jnp.ones((1, 8, 8, 8, 4)), rays, distances, module.field.view(rays.directions))[0]
+
+        found = np.asarray(densities(rays, jnp.asarray((near + far) / 2)[..., None]))[..., 0][hit]
+        close(found, np.full(found.shape, found[0]))
 
     def test_rays_that_miss_the_box_are_exactly_white_and_carry_no_gradient(self, variables):
         away = camera(target=50.0)
@@ -183,6 +192,19 @@ class TestJitter:
         same_bits(first, again)
         assert (jnp.abs(first - other) > 1e-6).any()
 
+    def test_coarse_and_fine_samples_draw_numbers_of_their_own(self, variables, monkeypatch):
+        drawn, strata = [], sampling.strata
+        monkeypatch.setattr(sampling, "strata", lambda *a: (drawn.append(strata(*a)), drawn[-1])[1])
+
+        @jax.jit
+        def numbers_drawn(key):
+            Renderer(CONFIG).apply(variables, cloud(), camera(), key)
+            return tuple(drawn)
+
+        coarse, fine = numbers_drawn(jax.random.key(6))
+        assert coarse.shape == fine.shape
+        assert (coarse != fine).mean() > 0.99
+
     def test_equal_rays_of_two_views_get_their_own_samples(self, variables):
         twice = jax.tree.map(lambda x: jnp.concatenate([x[:, :1], x[:, :1]], axis=1), camera())
         image = jittered(variables, cloud(), twice, jax.random.key(5))[0].image
@@ -218,3 +240,12 @@ class TestUnionWeights:
         alone = union_weights(self.coarse, self.coarse[..., :0], self.density[..., :5], self.far)
         close(weights[..., :4] + weights[..., 5:], alone[..., :4])
         close(weights[..., 4], alone[..., 4])
+
+    def test_samples_that_coincide_have_finite_gradients(self):
+        same = jnp.ones((2, 3, 4))
+        density = jnp.concatenate([1e10 * self.density[..., :4], self.density[..., :4]], axis=-1)
+        arguments = same, same, density, jnp.ones((2, 3))
+        gradients = jax.grad(lambda *x: jnp.sum(union_weights(*x) * jnp.arange(8.0).reshape(1, 1, 8)), (0, 1, 2, 3))(
+            *arguments
+        )
+        assert all(jnp.isfinite(g).all() for g in gradients)

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
-from laws import batch_law, close, gradient_law, numbers
+from laws import batch_law, close, float64_law, gradient_law, numbers
 
 from spnr_jax import sampling
 from spnr_jax.sampling import count_at_most, importance, merge, strata, stratified
@@ -36,6 +36,11 @@ class TestStratified:
         batch_law(lambda near, far: stratified(None, near, far, 4), NEAR, FAR)
         gradient_law(lambda near, far: stratified(None, near, far, 4), NEAR, FAR)
 
+    def test_no_gradient_is_lost_where_the_compiler_computes_a_distance_twice(self):
+        """Once with a fused multiply-add and once without: jnp.clip compares the two in its gradient."""
+        near = np.float32([0.6369617, 0.26978672, 0.04097353])
+        float64_law(lambda near, far: stratified(None, near, far, 5), near, 2 * near, rtol=1e-5)
+
     @pytest.mark.parametrize(("near", "far"), [(0.0, 0.0), (1e10, 1.1e10), (1.0, 1 + 1e-7), (0.0, 1e-8)])
     @pytest.mark.parametrize("seed", KEYS)
     def test_one_sample_lies_in_each_part_however_long_the_ray_is(self, near, far, seed):
@@ -44,6 +49,15 @@ class TestStratified:
         assert (distances <= edges[:, 1:]).all()
         assert (edges[:, 0] == jnp.float32(near)).all()
         assert (edges[:, -1] == jnp.float32(far)).all()
+
+    @pytest.mark.parametrize("steps", [0, 1, 3])
+    def test_edges_rise_also_where_a_ray_is_as_short_as_the_rounding_of_its_distance(self, steps):
+        near = jnp.abs(numbers(4, 1000))
+        far = near * (1 + steps * 2**-23)
+        distances, edges = stratified(None, near, far, 16)
+        assert (jnp.diff(edges, axis=-1) >= 0).all()
+        assert ((edges[:, :-1] <= distances) & (distances <= edges[:, 1:])).all()
+        assert ((edges[:, 0] == near) & (edges[:, -1] == far)).all()
 
     def test_jitter_is_uniform_in_every_part(self):
         jitter = strata(fresh(1), (4000,), 4) * 4 - jnp.arange(4.0)[None]
@@ -114,6 +128,17 @@ class TestImportance:
         expected = np.interp(samples, np.float64(edges), mass / mass[-1])
         deviation = np.abs(expected - (np.arange(rays) + 0.5) / rays).max()
         assert deviation < 1.95 / np.sqrt(rays), "Kolmogorov-Smirnov, 0.1 %"
+
+    @pytest.mark.parametrize("seed", range(5))
+    def test_a_share_of_one_or_more_stays_at_the_end_of_the_last_bin(self, seed, monkeypatch):
+        """The cumulative mass of 127 bins ends a rounding above or below 1."""
+        monkeypatch.setattr(sampling, "strata", lambda *_: jnp.array([0.0, 1 - 2**-24, 1.0, 1 + 2**-22]))
+        weights = jnp.asarray(np.random.default_rng(seed).gamma(0.1, size=127), jnp.float32)
+        distances = np.asarray(importance(None, jnp.linspace(2.0, 3.0, 128), weights, 4))
+        assert distances[0] == 2
+        assert (distances[1:] <= 3).all()
+        assert (distances[1:] >= 3 - 1 / 127).all()
+        assert (np.diff(distances) >= 0).all()
 
     def test_no_gradient_passes_through_where_the_samples_lie(self):
         gradients = jax.grad(lambda e, w: jnp.sum(importance(None, e, w, 5)), (0, 1))(EDGES, WEIGHTS)

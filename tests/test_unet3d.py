@@ -51,3 +51,18 @@ def test_a_point_reaches_the_whole_volume_through_the_coarsest_stage():
         return jnp.sum(MODULE.apply(VARIABLES, jnp.zeros((1, 1), jnp.int32), values)[0, -1, -1, -1])
 
     assert jnp.abs(jax.jit(jax.grad(far_corner))(jnp.ones((1, 1, 3)))).max() > 0
+
+
+def test_moving_the_points_by_whole_coarse_voxels_moves_the_volume_with_them():
+    """Far from the border; the statistics of a group do not see where in the volume its voxels are."""
+    module = UNet3D(resolution=32, base_width=4, num_stages=1, num_groups=2)
+    cells, values = np.random.default_rng(3).integers(12, 16, (1, 20, 3)), numbers(4, 1, 20, 3)
+    variables = jax.jit(module.init)(jax.random.key(0), jnp.zeros((1, 20), jnp.int32), values)
+
+    def volume(shift):
+        rows = (cells + shift) @ np.array([32**2, 32, 1])
+        return np.asarray(jax.jit(module.apply)(variables, jnp.asarray(rows, jnp.int32), values))[0]
+
+    still, moved = volume(0), volume(np.array([4, 2, -2]))
+    close(moved[12:24, 10:22, 6:18], still[8:20, 8:20, 8:20], rtol=1e-3, atol=2e-4)
+    assert np.abs(still[8:20, 8:20, 8:20] - still[4:16, 6:18, 10:22]).max() > 0.1

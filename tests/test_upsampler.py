@@ -14,11 +14,17 @@ MODULE = Upsampler(width=4)
 VARIABLES = jax.jit(MODULE.init)(jax.random.key(0), X)
 
 
-@pytest.mark.parametrize(("height", "width"), [(8, 12), (6, 9), (4, 6), (5, 7)])
+@pytest.mark.parametrize(("height", "width"), [(8, 12), (6, 9), (4, 6), (5, 7), (1, 1)])
 def test_bilinear_has_half_pixel_centres_and_clamps_at_the_border(height, width):
     resized = np.asarray(bilinear(X, height, width))
     for i in range(2):
         close(resized[i], reference.bilinear(np.asarray(X)[i], height, width), atol=1e-5)
+
+
+@pytest.mark.parametrize("size", [100, 128], ids=["to 100", "twice"])
+def test_bilinear_at_the_sizes_of_the_paper(size):
+    x = numbers(2, 1, 64, 64, 3)
+    close(bilinear(x, size, size)[0], reference.bilinear(np.asarray(x)[0], size, size), rtol=0, atol=1e-5)
 
 
 def test_fresh_weights_give_the_bilinear_picture():

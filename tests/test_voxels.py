@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import reference
 from jax import lax
-from laws import batch_law, close, gradient_law, numbers
+from laws import adjoint_law, batch_law, close, gradient_law, numbers, same_bits
 
 from spnr_jax.voxels import locate, row_of, scatter_conv, scatter_mean, share_voxels, trilinear
 
@@ -55,6 +55,19 @@ class TestScatterMean:
         shuffled = scatter(POSITIONS[0, 0, order], FEATURES[0, 0, order], jnp.asarray(MASK[0, 0, order]), D)
         close(shuffled, scatter(POSITIONS[0, 0], FEATURES[0, 0], jnp.asarray(MASK[0, 0]), D))
 
+    def test_the_order_of_points_in_voxels_of_their_own_does_not_matter_by_a_bit(self):
+        cells = np.random.default_rng(9).permutation(D**3)[:12]
+        positions = np.stack(np.unravel_index(cells, (D, D, D)), axis=-1).astype(np.float32) * (2 / D) - 1 + 0.1
+        order = np.random.default_rng(4).permutation(12)
+        features, mask = np.asarray(FEATURES[0, 0]), MASK[0, 0]
+        one, other = (
+            scatter(*map(jnp.asarray, (positions[o], features[o], mask[o])), D) for o in (np.arange(12), order)
+        )
+        same_bits(one, other)
+
+    def test_is_the_adjoint_of_the_share_of_each_point(self):
+        adjoint_law(lambda f: scatter_mean(POSITIONS[0, 0], f, jnp.asarray(MASK[0, 0]), D)[0], FEATURES[0, 0])
+
     def test_padding_does_not_matter_whatever_it_holds(self):
         def padded(fill):
             extra = np.full((5, 3), fill, np.float32)
@@ -64,8 +77,9 @@ class TestScatterMean:
             return scatter(jnp.asarray(positions), jnp.asarray(features), jnp.asarray(mask), D)
 
         plain = scatter(POSITIONS[0, 0], FEATURES[0, 0], jnp.asarray(MASK[0, 0]), D)
-        close(padded(0.0), plain)
-        close(padded(1e10), plain)
+        same_bits(padded(0.0), plain)
+        same_bits(padded(1e30), plain)
+        same_bits(padded(np.nan), plain)
 
     @pytest.mark.parametrize(
         ("point", "kept"),
@@ -138,6 +152,12 @@ class TestScatterConv:
         )
         close(sparse[0][1], reference.convolution(volume, self.kernel), atol=1e-5)
 
+    def test_is_adjoint_to_its_gradient_in_points_and_kernel(self):
+        rows, share = share_voxels(POSITIONS[0, 0], jnp.asarray(MASK[0, 0]), D)
+        values = numbers(9, 12, 3) * share[:, None]
+        adjoint_law(lambda v: scatter_conv(rows, v, self.kernel, D), values)
+        adjoint_law(lambda k: scatter_conv(rows, values, k, D), self.kernel)
+
     def test_no_valid_point_gives_zeros(self):
         assert (self.sparse(POSITIONS[0, 0], FEATURES[0, 0], jnp.zeros(12, bool), self.kernel) == 0).all()
 
@@ -168,7 +188,7 @@ class TestTrilinear:
                 splat[voxel] += weight * value
         gradient = jax.jit(lambda c: jax.vjp(lambda v: trilinear(v, POSITIONS[0, 0]), VOLUME)[1](c)[0])(FEATURES[0, 0])
         close(gradient, splat)
-        assert np.vdot(lookup(VOLUME, POSITIONS[0, 0]), cotangent) == pytest.approx(np.vdot(VOLUME, splat), rel=1e-4)
+        adjoint_law(lambda volume: trilinear(volume, POSITIONS[0, 0]), VOLUME)
 
     def test_a_linear_field_is_reproduced_between_the_outermost_centres(self):
         centres = (np.arange(D, dtype=np.float32) + 0.5) * 2 / D - 1

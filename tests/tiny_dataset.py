@@ -7,12 +7,13 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
+import tiny_model
 
 from data_gen import records
 from spnr_jax import data, trainer
-from spnr_jax.config import LossConfig, ModelConfig, OptimizerConfig, SamplingConfig, TrainConfig
+from spnr_jax.config import LossConfig, OptimizerConfig, TrainConfig
 
-SIZE = 24  # the smallest image that the discriminator can judge
+SIZE = tiny_model.SIZE
 VIEWS, POINTS = 3, 40
 FIELD_OF_VIEW, DISTANCE, RADIUS = 40.0, 3.0, 0.9
 SPLITS = {
@@ -22,21 +23,7 @@ SPLITS = {
 }
 CONFIG = TrainConfig(
     preset="tiny",
-    model=ModelConfig(
-        point_widths=(8,),
-        point_features=4,
-        volume_resolution=8,
-        base_width=8,
-        num_stages=1,
-        field_width=8,
-        num_features=5,
-        direction_frequencies=1,
-        sampling=SamplingConfig(num_coarse=4, num_fine=4),
-        render_resolution=8,
-        resize_resolution=12,
-        image_resolution=SIZE,
-        upsampler_width=8,
-    ),
+    model=tiny_model.MODEL,
     loss=LossConfig(adversarial_start=0.5, discriminator_width=8, r1_interval=2),
     optimizer=OptimizerConfig(lr_generator=1e-2, warmup_steps=2, ema_decay=0.9),
     num_steps=6,

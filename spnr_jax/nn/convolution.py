@@ -24,13 +24,23 @@ kernel_init = jax.nn.initializers.he_normal(in_axis=-2, out_axis=-1)
 
 
 def conv(
-    x: Float[Array, "batch *space in"], kernel: Float[Array, "*window in out"], stride: int = 1, padding: int = 1
+    x: Float[Array, "batch *space in"],
+    kernel: Float[Array, "*window in out"],
+    stride: int = 1,
+    padding: int = 1,
+    bf16: bool = False,
 ) -> Float[Array, "batch *out_space out"]:
-    """Convolution (correlation) in 2D or 3D with equal stride and padding on every axis."""
-    on_cpu = _conv2d_cpu if x.ndim == 4 else _conv3d_cpu
-    return lax.platform_dependent(
+    """Convolution (correlation) in 2D or 3D with equal stride and padding on every axis.
+
+    With bf16 the convolution and its gradients run in bfloat16; what goes in and comes out keeps its own format.
+    """
+    on_cpu, result = _conv2d_cpu if x.ndim == 4 else _conv3d_cpu, x.dtype
+    if bf16:
+        x, kernel = x.astype(jnp.bfloat16), kernel.astype(jnp.bfloat16)
+    out = lax.platform_dependent(
         x, kernel, cpu=lambda x, k: on_cpu(x, k, stride, padding), default=lambda x, k: _native(x, k, stride, padding)
     )
+    return out.astype(result)
 
 
 def _native(x, kernel, stride, padding):
@@ -93,7 +103,7 @@ def _conv3d_cpu(x, kernel, stride, padding):
 
 
 def upsample_conv(
-    x: Float[Array, "batch *space in"], kernel: Float[Array, "*window in out"]
+    x: Float[Array, "batch *space in"], kernel: Float[Array, "*window in out"], bf16: bool = False
 ) -> Float[Array, "batch *double_space out"]:
     """conv(nearest x2 of x, kernel) for a 3-wide kernel, computed at the low resolution: 2^n instead of 3^n taps.
 
@@ -105,7 +115,7 @@ def upsample_conv(
     for axis in range(n):  # 3 fine taps -> 2 coarse taps in place, the parity appended
         kernel = jnp.moveaxis(jnp.tensordot(kernel, REPEAT_FOLD, axes=([axis], [2])), -1, axis)
     kernel = jnp.moveaxis(kernel, range(n + 2, 2 * n + 2), range(n + 1, 2 * n + 1))
-    out = conv(x, kernel.reshape(*[2] * n, features_in, -1))
+    out = conv(x, kernel.reshape(*[2] * n, features_in, -1), bf16=bf16)
     parts = out.reshape(*out.shape[:-1], *[2] * n, features_out)  # parities stand in axes n + 1 .. 2n
     for axis, size in enumerate(space):
         # an output of parity p at i is the window that begins at i - 1 + p: position i + p of the padded input

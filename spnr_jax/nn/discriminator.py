@@ -16,6 +16,7 @@ class Discriminator(nn.Module):
 
     width: int
     num_groups: int
+    bf16: bool = False
 
     @nn.compact
     def __call__(
@@ -29,7 +30,7 @@ class Discriminator(nn.Module):
         widths = [self.width * 2**i for i in range(4)]
         for i, features in enumerate([*widths, 1]):
             kernel = self.param(f"kernel_{i}", kernel_init, (4, 4, x.shape[-1], features))
-            x = conv(x, kernel, stride=2 if i < 3 else 1)
+            x = conv(x, kernel, stride=2 if i < 3 else 1, bf16=self.bf16)
             if i in (0, 4):
                 x = x + per_feature(self.param(f"bias_{i}", nn.initializers.zeros, (features,)), x)
             else:

@@ -12,7 +12,8 @@ EPSILON = 1e-5
 class BatchNorm(nn.Module):
     """Each feature to zero mean and unit variance over all points with mask True; running statistics in evaluation.
 
-    The running variance takes the unbiased estimate, as in the reference implementations.
+    The running variance takes the unbiased estimate, as in the reference implementations.  Features beyond 1e18 have a
+    variance that float32 cannot hold: the output is the bias.
     """
 
     momentum: float = 0.9
@@ -28,6 +29,7 @@ class BatchNorm(nn.Module):
         running_mean = self.variable("batch_stats", "mean", jnp.zeros, shape)
         running_variance = self.variable("batch_stats", "variance", jnp.ones, shape)
         if train:
+            x = jnp.where(mask[..., None], x, 0)  # what fills the padding may be anything
             axes = tuple(range(x.ndim - 1))
             weight = mask[..., None].astype(x.dtype)
             count = jnp.maximum(jnp.sum(weight), 1)

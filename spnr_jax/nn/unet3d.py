@@ -2,7 +2,8 @@
 
 Each encoder stage halves the resolution and doubles the channels; skip connections are additions [paper].  A stage is a
 stride-2 convolution and one at stride 1, a decoder stage nearest x2 and a convolution; each convolution is followed by
-GroupNorm and ReLU.  No transposed convolution.
+GroupNorm and ReLU.  No transposed convolution.  With bf16 the convolutions after the stem run in bfloat16; the stem's
+scattered sums, normalisation and parameters stay float32.
 """
 
 from typing import Literal
@@ -39,12 +40,16 @@ class Block(nn.Module):
     features: int
     kind: Literal["down", "same", "up"]
     num_groups: int
+    bf16: bool = False
 
     @nn.compact
     def __call__(self, x: Float[Array, "objects *space channels"]) -> Float[Array, "objects *out_space features"]:
         """The block's output."""
         kernel = self.param("kernel", kernel_init, (3, 3, 3, x.shape[-1], self.features))
-        x = upsample_conv(x, kernel) if self.kind == "up" else conv(x, kernel, stride=2 if self.kind == "down" else 1)
+        if self.kind == "up":
+            x = upsample_conv(x, kernel, self.bf16)
+        else:
+            x = conv(x, kernel, stride=2 if self.kind == "down" else 1, bf16=self.bf16)
         return nn.relu(GroupNorm(self.num_groups, name="norm")(x))
 
 
@@ -55,6 +60,7 @@ class UNet3D(nn.Module):
     base_width: int
     num_stages: int
     num_groups: int
+    bf16: bool = False
 
     @nn.compact
     def __call__(
@@ -66,9 +72,9 @@ class UNet3D(nn.Module):
         for i in range(self.num_stages):
             skips.append(x)
             width *= 2
-            x = Block(width, "down", self.num_groups, name=f"down_{i}")(x)
-            x = Block(width, "same", self.num_groups, name=f"same_{i}")(x)
+            x = Block(width, "down", self.num_groups, self.bf16, name=f"down_{i}")(x)
+            x = Block(width, "same", self.num_groups, self.bf16, name=f"same_{i}")(x)
         for i in range(self.num_stages):
             width //= 2
-            x = Block(width, "up", self.num_groups, name=f"up_{i}")(x) + skips.pop()
+            x = Block(width, "up", self.num_groups, self.bf16, name=f"up_{i}")(x) + skips.pop()
         return x

@@ -22,6 +22,7 @@ class Upsampler(nn.Module):
     """Two convolutions at the low resolution, nearest x2, two at the high one; the last starts at zero."""
 
     width: int
+    bf16: bool = False
 
     @nn.compact
     def __call__(self, x: Float[Array, "batch height width features"]) -> Float[Array, "batch 2*height 2*width 3"]:
@@ -32,7 +33,7 @@ class Upsampler(nn.Module):
         ):
             init = nn.initializers.zeros if i == 3 else kernel_init
             kernel = self.param(f"kernel_{i}", init, (3, 3, y.shape[-1], features))
-            y = layer(y, kernel)
+            y = layer(y, kernel, bf16=self.bf16)
             y = y + per_feature(self.param(f"bias_{i}", nn.initializers.zeros, (features,)), y)
             y = y if i == 3 else nn.leaky_relu(y, SLOPE)
         return y + bilinear(jnp.asarray(x[..., :3]), 2 * x.shape[1], 2 * x.shape[2])
