@@ -23,6 +23,7 @@ div { display: flex; align-items: center; gap: 4px } span { width: 86px; color: 
 img { image-rendering: pixelated }
 """
 POINT_IMAGE = 128  # pixels
+BACKDROP = np.array([186, 202, 222], np.uint8)  # neither black nor white, which roughness and metallic often are
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,7 +103,7 @@ def point_image(points: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
     colors = np.round(255 * (views.srgb_from_linear(values) if len(names) == 3 else values)).astype(np.uint8)
     far_first = np.argsort((positions - pose[:3, 3]) @ pose[:3, 2])
     columns, rows = np.floor(views.project(pose, positions, camera)).astype(int).clip(0, POINT_IMAGE - 2)[far_first].T
-    canvas = np.full((POINT_IMAGE, POINT_IMAGE, 3), 255, np.uint8)
+    canvas = np.tile(BACKDROP, (POINT_IMAGE, POINT_IMAGE, 1))
     for right, down in ((0, 0), (1, 0), (0, 1), (1, 1)):  # a dot is two pixels wide
         canvas[rows + down, columns + right] = colors[far_first]
     return canvas
