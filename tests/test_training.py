@@ -8,85 +8,12 @@ import numpy as np
 import optax
 import pytest
 from laws import close, numbers, same_bits
+from tiny_model import MODEL, SIZE
+from tiny_training import BATCH, CONFIG, L1_ONLY, copied, create, run, step
 
 from spnr_jax import losses, training
-from spnr_jax.cameras import look_at, pinhole
-from spnr_jax.config import LossConfig, ModelConfig, OptimizerConfig, SamplingConfig, TrainConfig
+from spnr_jax.config import OptimizerConfig
 from spnr_jax.renderer import Renderer
-from spnr_jax.types import Batch, PointCloud
-
-SIZE = 24  # the smallest image that the discriminator can judge
-MODEL = ModelConfig(
-    point_widths=(8,),
-    point_features=4,
-    volume_resolution=8,
-    base_width=4,
-    num_stages=1,
-    num_groups=2,
-    field_width=8,
-    num_features=5,
-    direction_frequencies=1,
-    sampling=SamplingConfig(num_coarse=4, num_fine=4),
-    render_resolution=8,
-    resize_resolution=12,
-    image_resolution=SIZE,
-    upsampler_width=4,
-)
-CONFIG = TrainConfig(
-    model=MODEL,
-    loss=LossConfig(discriminator_width=4, r1_interval=2),
-    optimizer=OptimizerConfig(lr_generator=2e-2, warmup_steps=4, ema_decay=0.9),
-    num_steps=100,
-    batch_objects=2,
-    max_points=40,
-    min_points=40,
-)
-L1_ONLY = dataclasses.replace(CONFIG, loss=dataclasses.replace(CONFIG.loss, adversarial_weight=0.0), seed=1)
-create = jax.jit(training.create_state, static_argnums=0)
-copied = jax.jit(lambda tree: jax.tree.map(jnp.copy, tree))
-
-
-def batch():
-    """Two coloured balls on white, each seen from its own side."""
-    directions = np.random.default_rng(0).normal(size=(2, 40, 3)).astype(np.float32)
-    positions = 0.5 * directions / np.linalg.norm(directions, axis=-1, keepdims=True)
-    colors = np.float32([[0.8, 0.2, 0.1], [0.1, 0.3, 0.7]])
-    eyes = np.float32([[[0, 0.5, 2.5]], [[2.5, 0.5, 0]]])
-    pose = look_at(jnp.asarray(eyes), jnp.zeros(eyes.shape), jnp.broadcast_to(jnp.array([0.0, 1.0, 0.0]), eyes.shape))
-    rows, columns = np.mgrid[:SIZE, :SIZE] + 0.5 - SIZE / 2
-    disc = np.broadcast_to((np.hypot(rows, columns) < 0.3 * SIZE)[None, None], (2, 1, SIZE, SIZE))
-    image = np.where(disc[..., None], colors[:, None, None, None], np.float32(1))
-    points = np.broadcast_to(colors[:, None], (2, 40, 3))
-    cloud = PointCloud(
-        positions=positions,
-        base_color=points,
-        roughness=points[..., 0],
-        metallic=points[..., 1] * 0,
-        mask=np.ones((2, 40), bool),
-    )
-    mask = disc & (np.random.default_rng(1).uniform(size=disc.shape) < 0.2)
-    made = Batch(
-        cloud=cloud,
-        camera=pinhole(pose, 0.6, SIZE, SIZE),
-        image=image,
-        condition=image * mask[..., None],
-        condition_mask=mask,
-    )
-    return jax.tree.map(jnp.asarray, made)
-
-
-BATCH = batch()
-
-
-def step(state, config=CONFIG, data=BATCH):
-    """One jitted step on a copy: the state that is passed in gets donated."""
-    return training.jitted_train_step(copied(state), data, config=config, adversarial=config is CONFIG)
-
-
-def run(state, steps, config=CONFIG):
-    for _ in range(steps):
-        state, metrics = step(state, config)
-    return state, metrics
 
 
 @pytest.fixture(scope="module")
