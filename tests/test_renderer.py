@@ -116,6 +116,7 @@ class TestViews:
     def test_rays_of_one_object_have_the_same_bits_in_every_chunk_of_a_fair_size(self):
         """As users compile: the flags of this suite let another program come out for every size."""
         environment = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
+        environment["PYTHONPATH"] = str(Path(__file__).parents[1])
         command = [sys.executable, Path(__file__).with_name("chunk_bits.py"), "256", "500", "1024", "2048"]
         checksums = subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout.split()
         assert len(checksums) == 4
