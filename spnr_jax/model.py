@@ -69,9 +69,7 @@ class Model:
         pose = jnp.concatenate([rotation, eye[..., None]], axis=-1)
         inside = dataclasses.replace(camera, cam_to_world=pose)
         inside = jax.tree.map(lambda x: jnp.asarray(x).reshape(1, -1, *x.shape[-2:]), inside)
-        rendering = training.jitted_render(
-            self.variables, volume.features[None], inside, config=self.config
-        )
+        rendering = training.jitted_render(self.variables, volume.features[None], inside, config=self.config)
         rendering = dataclasses.replace(rendering, depth=rendering.depth / volume.scale)
         return jax.tree.map(lambda x: x[0, 0] if single else x[0], rendering)
 

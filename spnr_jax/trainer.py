@@ -75,6 +75,8 @@ def train(config: TrainConfig, dataset: data.Dataset, run: Path, schedule: Sched
             save = last or stopping or (step + 1) % schedule.checkpoint_every == 0
             if save or (step + 1) % schedule.log_every == 0:
                 rows = check_finite(jax.device_get(pending))
+                if save:
+                    check_state(state)
                 pace = 1000 * (time.monotonic() - since) / len(rows)
                 log.write({"step": step + 1, **mean_row(rows), "ms_per_step": round(pace, 2)})
                 bar.set_postfix(loss=f"{rows[-1][1]['loss']:.2f}", psnr=f"{rows[-1][1]['psnr']:.1f}", refresh=False)
@@ -102,6 +104,17 @@ def check_finite(rows: list[tuple[int, dict]]) -> list[tuple[int, dict]]:
                     "or check the data with `spnr-data check`"
                 )
     return rows
+
+
+def check_state(state: training.TrainState) -> None:
+    """NotFinite for the first array with a number that is not finite: such a state is not saved.
+
+    A running variance can overflow while every loss is finite, because batches are normalised with their own.
+    """
+    for path, leaf in jax.tree_util.tree_leaves_with_path(state):
+        if jnp.issubdtype(leaf.dtype, jnp.floating) and not (finite := np.isfinite(leaf)).all():
+            name = jax.tree_util.keystr(path, simple=True, separator="_")
+            check_finite([(int(state.step), {name: np.asarray(leaf)[~finite][0]})])
 
 
 def mean_row(rows: list[tuple[int, dict]]) -> dict[str, float]:

@@ -231,9 +231,7 @@ def render(
         lambda rays: renderer.bind(variables).render_rays(volume, rays),
         jax.tree.map(lambda x: jnp.moveaxis(x, 1, 0), chunks),
     )
-    outputs = jax.tree.map(
-        lambda x: jnp.moveaxis(x, 0, 1).reshape(x.shape[1], -1, *x.shape[3:])[:, :num_rays], outputs
-    )
+    outputs = jax.tree.map(lambda x: jnp.moveaxis(x, 0, 1).reshape(x.shape[1], -1, *x.shape[3:])[:, :num_rays], outputs)
     return renderer.bind(variables).develop(camera, *outputs)
 
 

@@ -14,7 +14,7 @@ import tiny_dataset
 from laws import same_bits
 from tiny_dataset import CONFIG, SCHEDULE
 
-from spnr_jax import checkpoint, cli, data, trainer
+from spnr_jax import checkpoint, cli, data, trainer, training
 
 KEPT_STEPS = {"2", "4", "6"}
 
@@ -166,3 +166,13 @@ def test_rows_are_json_without_nan():
 
     for line in (tiny_dataset.run() / "metrics.jsonl").read_text().splitlines():
         json.loads(line, parse_constant=refuse)
+
+
+def test_a_state_that_is_not_finite_is_named_though_every_loss_is(monkeypatch, tmp_path):
+    """Training normalises batches with their own statistics: an overflown running variance shows in no loss."""
+    fresh = training.jitted_create_state(CONFIG)
+    fresh.batch_stats["pointnet"]["norm_0"]["variance"] *= np.inf
+    monkeypatch.setattr(training, "jitted_create_state", lambda config: fresh)
+    with pytest.raises(trainer.NotFinite, match="batch_stats_pointnet_norm_0_variance is inf at step 2"):
+        trainer.train(CONFIG, tiny_dataset.dataset(), tmp_path, SCHEDULE)
+    assert not (tmp_path / "checkpoints").exists()
