@@ -23,7 +23,7 @@ LAYERS = {
 FILES = 5  # every module that is not named above reads or writes files
 SHARED = {1: {"numerics"}, 2: {"convolution", "normalization"}}  # what siblings below the files may import
 IMPURE = {"os", "pathlib", "time", "io", "sys", "json", "shutil", "tempfile", "logging", "datetime", "random", "tqdm"}
-HEAVY = {"mitsuba", "trimesh", "viser", "torch", "matplotlib", "skimage"}
+HEAVY = {"mitsuba", "trimesh", "viser", "torch", "matplotlib", "skimage", "grain", "dask", "distributed"}
 
 
 def sources(folder: str) -> list[Path]:
