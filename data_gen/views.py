@@ -5,7 +5,8 @@ are square, row 0 on top; pixel (column i, row j) covers [i, i + 1) x [j, j + 1)
 Linear radiance comes out of Mitsuba premultiplied by the coverage (alpha): the light itself is hidden from the camera.
 An object's scene is loaded once and every view is rendered from it. Mitsuba reads the very arrays of the Material that
 the point sampler reads, so the picture and the points cannot disagree about a colour. Every face is seen from both
-sides, whatever its file says, and keeps its one normal.
+sides, whatever its file says, and keeps its one normal. Roughness and metallic may also be one value for each vertex of
+their part, (vertices,), as a reconstructed surface has them; base colours of vertices are the part's `colors`.
 
 Which points a picture sees (`visibility`): "face" is the paper's rule, all points on a face that any primary ray of the
 camera hits; a point on such a face counts even where another part hides it. "point" tests each point by itself, with
@@ -132,6 +133,9 @@ def mitsuba_mesh(part: Part, name: str):
     if part.colors is not None:
         tinted = np.asarray(part.colors) * part.material.base_color
         mesh.add_attribute("vertex_color", 3, np.ascontiguousarray(tinted, np.float32).ravel())
+    for name in ("roughness", "metallic"):
+        if np.ndim(channel := getattr(part.material, name)) == 1:
+            mesh.add_attribute(f"vertex_{name}", 1, np.ascontiguousarray(channel, np.float32))
     buffers = mi.traverse(mesh)
     buffers["vertex_positions"] = np.asarray(part.positions, np.float32).ravel()
     buffers["faces"] = np.asarray(part.faces, np.uint32).ravel()
@@ -162,7 +166,10 @@ def principled(part: Part) -> dict:
     inner: dict = {"type": "principled", "base_color": base_color}
     for name in ("roughness", "metallic"):
         channel = getattr(material, name)
-        inner[name] = bitmap_texture(channel[..., None], material.wrap) if np.ndim(channel) == 2 else float(channel)
+        if np.ndim(channel) == 1:
+            inner[name] = {"type": "mesh_attribute", "name": f"vertex_{name}"}
+        else:
+            inner[name] = bitmap_texture(channel[..., None], material.wrap) if np.ndim(channel) == 2 else float(channel)
     return inner
 
 

@@ -17,7 +17,7 @@ from spnr_jax.nn.normalization import BatchNorm, GroupNorm
 from spnr_jax.nn.unet3d import UNet3D
 from spnr_jax.nn.upsampler import Upsampler
 from spnr_jax.renderer import Renderer
-from spnr_jax.types import Rays
+from spnr_jax.types import Rays, Scene
 
 
 def batch_norm(x):
@@ -77,11 +77,12 @@ def render(volume, origins, directions, bias, samples=16):
     counts = SamplingConfig(num_coarse=samples, num_fine=samples)
     config = ModelConfig(field_width=8, num_features=4, direction_frequencies=1, sampling=counts)
     module, rays = Renderer(config), Rays(origins=origins, directions=directions)
-    variables = weights_of(module, volume.dtype, volume, rays, method="render_rays")
+    encoded = Scene(volume=volume, occupied=jnp.ones(volume.shape[:-1], bool))
+    variables = weights_of(module, volume.dtype, encoded, rays, method="render_rays")
     head = variables["params"]["field"]["head"]
     # no gradient by the bias: one number for all rays, whose gradients would cancel
     head["bias"] = head["bias"] + jnp.concatenate([jax.lax.stop_gradient(bias), jnp.zeros(3, bias.dtype)])
-    return module.apply(variables, volume, rays, method="render_rays")
+    return module.apply(variables, encoded, rays, method="render_rays")
 
 
 def scene(rng: Rng, density: float = 3.0, distance: float = 3.0):

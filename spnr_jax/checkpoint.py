@@ -38,8 +38,8 @@ def write_config(run: Path, config: TrainConfig) -> None:
 
 def _differences(stored: dict, wanted: dict, path: str = "") -> list[str]:
     changed = []
-    for name, value in wanted.items():
-        old = stored[name]
+    for name in (name for name in wanted if name in stored):  # of another method the name says it all
+        old, value = stored[name], wanted[name]
         if isinstance(value, dict):
             changed += _differences(old, value, f"{path}{name}.")
         elif json.loads(json.dumps(old)) != value:

@@ -6,7 +6,6 @@ Errors of the user and of the disk are one line on stderr and exit code 2; Ctrl-
 import contextlib
 import dataclasses
 import io
-import json
 import re
 import sys
 import time
@@ -32,7 +31,7 @@ class Train:
     """Folder of the data set."""
     run: tyro.conf.Positional[Path]
     """Folder of the run: config, checkpoints, metrics, previews."""
-    config: tyro.conf.OmitArgPrefixes[TrainConfig] = field(default_factory=configs.tiny)
+    config: tyro.conf.AvoidSubcommands[tyro.conf.OmitArgPrefixes[TrainConfig]] = field(default_factory=configs.tiny)
     """Every number of the run; --preset chooses the defaults."""
     log_every: int = 20
     """Steps between rows of metrics.jsonl and TensorBoard."""
@@ -56,6 +55,20 @@ class Evaluate:
     """Objects to score."""
     gallery: int = 16
     """Objects shown in the report."""
+    lpips: Path | None = None
+    """LPIPS weights, an .npz that `spnr convert-lpips` wrote; without them LPIPS is n/a."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ConvertLpips:
+    """Convert LPIPS weights for `spnr evaluate --lpips`; needs PyTorch to read the two files."""
+
+    alexnet: tyro.conf.Positional[Path]
+    """AlexNet weights of torchvision: alexnet-owt-....pth."""
+    heads: tyro.conf.Positional[Path]
+    """Linear heads of LPIPS, version 0.1: alex.pth, in weights/v0.1 of the package `lpips`."""
+    out: tyro.conf.Positional[Path]
+    """The .npz to write."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,6 +97,8 @@ class Render:
     """Frames of the turntable."""
     seed: int = 0
     """Seed of the surface samples of a mesh."""
+    quality: Literal["draft", "balanced", "best", "trained"] = "best"
+    """Samples along a ray near the points: a quarter, half or all of those trained with; or just as trained."""
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -105,15 +120,16 @@ def guarded(work: Callable[[], None], name: str) -> int:
     return 0
 
 
-def parse(arguments: list[str]) -> Train | Evaluate | Render:
+def parse(arguments: list[str]) -> Train | Evaluate | Render | ConvertLpips:
     """The command with all its options; the preset named by --preset gives the defaults of the others."""
     train = Annotated[Train, tyro.conf.subcommand("train", default=_train_defaults(arguments))]
     evaluate = Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     render = Annotated[Render, tyro.conf.subcommand("render")]
+    convert = Annotated[ConvertLpips, tyro.conf.subcommand("convert-lpips")]
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said):
-            return tyro.cli(train | evaluate | render, prog="spnr", description=DESCRIPTION, args=arguments)
+            return tyro.cli(train | evaluate | render | convert, prog="spnr", description=DESCRIPTION, args=arguments)
     except SystemExit as stop:
         if stop.code:
             raise ValueError(re.sub(BOX, " ", said.getvalue().partition("\n")[2])) from None  # without the title
@@ -131,7 +147,7 @@ def _train_defaults(arguments: list[str]) -> Train:
     return Train(data=tyro.MISSING, run=tyro.MISSING, config=configs.PRESETS[preset]())
 
 
-def run(command: Train | Evaluate | Render) -> None:
+def run(command: Train | Evaluate | Render | ConvertLpips) -> None:
     """Carries a command out."""
     enable_compilation_cache()
     match command:
@@ -141,6 +157,8 @@ def run(command: Train | Evaluate | Render) -> None:
             run_evaluate(command)
         case Render():
             run_render(command)
+        case ConvertLpips():
+            run_convert_lpips(command)
 
 
 def enable_compilation_cache() -> None:
@@ -166,16 +184,17 @@ def run_train(command: Train) -> None:
 
 def run_evaluate(command: Evaluate) -> None:
     """`spnr evaluate`."""
-    from spnr_jax import data, evaluation, trainer
-    from spnr_jax.results import write_results
+    from spnr_jax import data, evaluation, lpips_weights, trainer
+    from spnr_jax.results import text_table, write_results
 
     start = time.monotonic()
     dataset = data.open_dataset(command.data)
-    outcome = evaluation.evaluate(command.run, dataset, command.split, command.gallery)
+    weights = None if command.lpips is None else lpips_weights.read_weights(command.lpips)
+    outcome = evaluation.evaluate(command.run, dataset, command.split, command.gallery, weights=weights)
     out = command.out or command.run
     seconds = dict.fromkeys(("evaluate", "total"), round(time.monotonic() - start, 1))
     write_results(out, outcome, dataset.settings, trainer.read_rows(command.run), seconds)
-    print(json.dumps(outcome.summary["methods"], indent=2))
+    print("\n".join(text_table(outcome.summary["methods"])))
     print(f"wrote {out / 'metrics.json'} and {out / 'report.html'}")
 
 
@@ -186,6 +205,14 @@ def run_render(command: Render) -> None:
     options = {f.name: getattr(command, f.name) for f in dataclasses.fields(command)}
     for line in render_file(**options):
         print(line, flush=True)
+
+
+def run_convert_lpips(command: ConvertLpips) -> None:
+    """`spnr convert-lpips`."""
+    from spnr_jax import lpips_weights
+
+    lpips_weights.convert(command.alexnet, command.heads, command.out)
+    print(f"wrote {command.out} (score with `spnr evaluate DATA RUN --lpips {command.out}`)")
 
 
 def one_line(error: Exception) -> str:

@@ -1,7 +1,8 @@
-"""How good a network is on a split of a data set, beside the trivial renderers that every table shows.
+"""How good methods are on a split of a data set: a network beside the trivial renderers that every table shows.
 
-Means are over images; a condition PSNR leaves out images in which no input point is visible and counts the others.
-The radius of the point renderers is chosen on training objects: the multiple of the point spacing with the best PSNR.
+A method is a function that shows a cloud to cameras (`Method`); all of them see the same points and cameras, and are
+scored by the same metrics.  The radius of the point renderers is chosen on training objects: the multiple of the point
+spacing with the best PSNR.
 """
 
 import os
@@ -19,46 +20,59 @@ from jaxtyping import Array, Float
 from spnr_jax import checkpoint, data, metrics, training
 from spnr_jax.baselines import floors
 from spnr_jax.config import TrainConfig
+from spnr_jax.flip import flip
+from spnr_jax.lpips import LpipsWeights, lpips
+from spnr_jax.summary import Scores, differences, metric_settings, summarise
 from spnr_jax.types import Camera, PointCloud, Rendering
 
 RADIUS_FACTORS = (0.5, 0.75, 1.0, 1.5, 2.0)
-METHODS = ("ours", "white", "splat", "nearest")
+FLOORS = ("white", "splat", "nearest")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Scores:
-    """Scores of one method on the views of one object, each (views,); cpsnr is NaN where no point is visible."""
+class Pictures:
+    """What a method shows of one object: image (views, height, width, 3), opacity and depth (views, h, w).
 
-    psnr: np.ndarray
-    ssim: np.ndarray
-    cpsnr: np.ndarray
-    iou: np.ndarray
+    Opacity and depth may be smaller than the image; the trivial renderers have no depth.
+    """
+
+    image: np.ndarray | Array
+    acc: np.ndarray | Array
+    depth: np.ndarray | Array | None = None
+
+
+Method = Callable[[PointCloud, Camera], Pictures]
 
 
 @dataclass(frozen=True, kw_only=True)
 class ObjectResult:
-    """Pictures (views, height, width, ...) of every method and their scores on one object."""
+    """The references (views, height, width, 3) of one object, and every method's pictures and scores."""
 
     name: str
     reference: np.ndarray
-    images: dict[str, np.ndarray]
-    depth: np.ndarray
-    acc: np.ndarray
+    pictures: dict[str, Pictures]
     scores: dict[str, Scores]
 
 
 @jax.jit
 def score(
-    image: Float[Array, "views h w 3"], acc: Float[Array, "views h w"], reference: Array, alpha: Array, mask: Array
+    image: Float[Array, "views height width 3"],
+    acc: Float[Array, "views height width"],
+    reference: Array,
+    alpha: Array,
+    mask: Array,
+    weights: LpipsWeights | None = None,
 ) -> dict[str, Array]:
-    """All metrics of one object's views."""
+    """All metrics of one object's views; LPIPS if there are weights for it."""
     image = jnp.clip(image, 0, 1)
-    return {
+    scores = {
         "psnr": metrics.psnr(image, reference),
         "ssim": metrics.ssim(image, reference),
         "cpsnr": metrics.conditional_psnr(image, reference, mask),
+        "flip": flip(image, reference),
         "iou": metrics.opacity_iou(acc, alpha),
     }
+    return scores if weights is None else scores | {"lpips": lpips(image, reference, weights)}
 
 
 @partial(jax.jit, static_argnames="method")
@@ -101,50 +115,53 @@ def render_views(variables: dict, config: TrainConfig, cloud: PointCloud, camera
     return jax.tree.map(lambda x: x[0], rendering)
 
 
+def network(variables: dict, config: TrainConfig) -> Method:
+    """The method of a trained network."""
+
+    def show(cloud: PointCloud, camera: Camera) -> Pictures:
+        rendering = render_views(variables, config, cloud, camera)
+        return Pictures(image=rendering.image, acc=rendering.acc, depth=rendering.depth)
+
+    return show
+
+
+def floor(name: str, factor: float = 1.0) -> Method:
+    """The method of a trivial renderer."""
+
+    def show(cloud: PointCloud, camera: Camera) -> Pictures:
+        image, acc = render_floor(name, cloud, camera, factor)
+        return Pictures(image=image, acc=acc)
+
+    return show
+
+
 def evaluate_objects(
-    variables: dict, config: TrainConfig, dataset: data.Dataset, names: tuple[str, ...], factors: dict[str, float]
+    methods: dict[str, Method],
+    config: TrainConfig,
+    dataset: data.Dataset,
+    names: tuple[str, ...],
+    weights: LpipsWeights | None = None,
 ) -> Iterator[ObjectResult]:
-    """Pictures and scores of each object of a data set."""
+    """Pictures and scores of each object of a data set; points and image size are the config's."""
     for name in names:
         item = data.read_object(dataset, name)
         data.check_resolution(item, config)
         cloud = test_cloud(item, config)
-        rendering = render_views(variables, config, cloud, item.camera)
-        size = item.images.shape[1:3]
-        acc = jax.image.resize(rendering.acc, (len(item.images), *size), "bilinear")
-        pictures = {"ours": (rendering.image, acc)}
-        pictures |= {m: render_floor(m, cloud, item.camera, factors.get(m, 1.0)) for m in METHODS[1:]}
         alpha, mask = item.images[..., 3] / np.float32(255), item.conditions[..., 3] > 0
         reference = data.on_white(item.images)
-        scores = {m: Scores(**jax.device_get(score(*p, reference, alpha, mask))) for m, p in pictures.items()}
-        yield ObjectResult(
-            name=name,
-            reference=reference,
-            images={m: np.clip(np.asarray(p[0]), 0, 1) for m, p in pictures.items()},
-            depth=np.asarray(rendering.depth),
-            acc=np.asarray(rendering.acc),
-            scores=scores,
-        )
+        pictures, scores = {}, {}
+        for method, show in methods.items():
+            shown = show(cloud, item.camera)
+            acc = jax.image.resize(shown.acc, alpha.shape, "bilinear")
+            scores[method] = jax.device_get(score(shown.image, acc, reference, alpha, mask, weights))
+            pictures[method] = on_host(shown)
+        yield ObjectResult(name=name, reference=reference, pictures=pictures, scores=scores)
 
 
-def summarise(results: list[dict[str, Scores]]) -> dict[str, dict[str, float | None]]:
-    """Means over all images of each method, with the counts behind them."""
-    table = {}
-    for method in METHODS:
-        stacked = {
-            k: np.concatenate([getattr(r[method], k) for r in results]) for k in ("psnr", "ssim", "cpsnr", "iou")
-        }
-        visible = stacked["cpsnr"][~np.isnan(stacked["cpsnr"])]
-        table[method] = {
-            "psnr": float(stacked["psnr"].mean()),
-            "ssim": float(stacked["ssim"].mean()),
-            "cpsnr": float(visible.mean()) if len(visible) else None,
-            "iou": float(stacked["iou"].mean()),
-            "objects": len(results),
-            "views": len(stacked["psnr"]),
-            "cpsnr_views": len(visible),
-        }
-    return table
+def on_host(pictures: Pictures) -> Pictures:
+    """The pictures as NumPy arrays, the image in [0, 1]."""
+    depth = None if pictures.depth is None else np.asarray(pictures.depth)
+    return Pictures(image=np.clip(np.asarray(pictures.image), 0, 1), acc=np.asarray(pictures.acc), depth=depth)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -157,27 +174,49 @@ class Evaluation:
     gallery: list[ObjectResult]
 
 
-def evaluate(
-    run: Path, dataset: data.Dataset, split: str = "test", gallery_objects: int = 16, say: Callable[[str], None] = print
-) -> Evaluation:
-    """Scores of a run's newest checkpoint on a split."""
-    config, state = checkpoint.load_run(run, say, data=dataset.folder)
-    names = dataset.splits[split]
-    if not names:
-        raise ValueError(f"{dataset.folder}: the {split} split is empty; choose another one or generate more objects")
-    factors = {method: choose_radius(dataset, config, method) for method in ("splat", "nearest")}
-    variables = training.averaged_variables(state)
-    scores, gallery = {}, []
+def score_methods(
+    methods: dict[str, Method],
+    config: TrainConfig,
+    dataset: data.Dataset,
+    names: tuple[str, ...],
+    gallery_objects: int,
+    say: Callable[[str], None],
+    weights: LpipsWeights | None,
+) -> tuple[dict[str, dict[str, Scores]], list[ObjectResult]]:
+    """Scores of every object by name, and the results of a few objects, spread over the names, to be looked at."""
+    scores: dict[str, dict[str, Scores]] = {}
+    gallery = []
     shown = {names[round(i)] for i in np.linspace(0, len(names) - 1, min(gallery_objects, len(names)))}
-    for i, result in enumerate(evaluate_objects(variables, config, dataset, names, factors)):
+    for i, result in enumerate(evaluate_objects(methods, config, dataset, names, weights)):
         scores[result.name] = result.scores
         if result.name in shown:
             gallery.append(result)
         if (i + 1) % 8 == 0 or i + 1 == len(names):
             say(f"evaluated {i + 1} of {len(names)} objects")
+    return scores, gallery
+
+
+def evaluate(
+    run: Path,
+    dataset: data.Dataset,
+    split: str = "test",
+    gallery_objects: int = 16,
+    say: Callable[[str], None] = print,
+    weights: LpipsWeights | None = None,
+) -> Evaluation:
+    """Scores of a run's newest checkpoint on a split; LPIPS if there are weights for it."""
+    config, state = checkpoint.load_run(run, say, data=dataset.folder)
+    names = dataset.splits[split]
+    if not names:
+        raise ValueError(f"{dataset.folder}: the {split} split is empty; choose another one or generate more objects")
+    factors = {method: choose_radius(dataset, config, method) for method in ("splat", "nearest")}
+    methods = {"ours": network(training.averaged_variables(state), config)}
+    methods |= {name: floor(name, factors.get(name, 1.0)) for name in FLOORS}
+    scores, gallery = score_methods(methods, config, dataset, names, gallery_objects, say, weights)
     categories = sorted({category_of(name) for name in names})
     summary = {
         "methods": summarise(list(scores.values())),
+        "ours_minus": differences(list(scores.values())),
         "preset": config.preset,
         "steps": int(state.step),
         "seed": config.seed,
@@ -186,7 +225,7 @@ def evaluate(
             "split": split,
             "points": config.test_points,
             "radius factors": factors,
-            "metrics": "PSNR (max. 100 dB), SSIM (gaussian, sigma 1.5) on sRGB in [0, 1] over white, mean over images",
+            "metrics": metric_settings(with_lpips=weights is not None),
         },
     }
     per_category = {c: summarise([s for n, s in scores.items() if category_of(n) == c]) for c in categories}

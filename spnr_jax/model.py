@@ -10,34 +10,44 @@ Clouds, cameras and depths are in the cloud's own units; the transform into the 
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jaxtyping import Array, Float
+from scipy.spatial import cKDTree
 
 from spnr_jax import cameras, checkpoint, clouds, training
-from spnr_jax.config import ModelConfig
+from spnr_jax.model_config import ModelConfig, NetworkConfig, SamplingConfig
 from spnr_jax.types import Camera, PointCloud, Rendering
 
 FIELD_OF_VIEW, DISTANCE = np.deg2rad(40.0), 3.0  # of the training cameras; the object fits into the unit sphere
+Quality = Literal["draft", "balanced", "best", "trained"]
+SAMPLES = {"draft": 0.25, "balanced": 0.5, "best": 1.0}  # share of the samples a ray was trained with
+REACH_PER_SPACING, LARGEST_REACH = 1.6, 4  # what loses nothing from 128 to 4096 points, docs/performance.md
 
 
 @struct.dataclass
 class Volume:
-    """An encoded object: features in the box [-1, 1]^3, which is (position - centre) * scale of the cloud."""
+    """An encoded object in the box [-1, 1]^3, which is (position - centre) * scale of the cloud.
 
-    features: Float[Array, "d d d features"]
+    `scene` is what the network encodes a cloud as: for ours a `types.Scene`.
+    """
+
+    scene: Any
     centre: Float[Array, "3"]
     scale: Float[Array, ""]
+    reach: int = struct.field(pytree_node=False, default=LARGEST_REACH)
+    """Voxels around points that rendering looks at, from how far the points lie apart."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Model:
     """A trained network; `encode` and `render` are jitted, one compilation per bucket of points and image size."""
 
-    config: ModelConfig
+    config: NetworkConfig
     variables: dict
 
     def encode(self, cloud: PointCloud) -> Volume:
@@ -54,13 +64,20 @@ class Model:
         inside = np.clip((positions - centre) * scale, -1, 1).astype(np.float32)
         cloud = dataclasses.replace(cloud, positions=inside)
         cloud = clouds.pad(cloud, clouds.bucket(len(positions)))
-        features = training.jitted_encode(
+        scene = training.jitted_encode(
             self.variables, jax.tree.map(lambda x: jnp.asarray(x)[None], cloud), config=self.config
         )
-        return Volume(features=features[0], centre=jnp.asarray(centre), scale=jnp.asarray(scale))
+        scene = jax.tree.map(lambda x: x[0], scene)
+        voxels = getattr(self.config, "volume_resolution", 0)
+        reach = reach_of(inside[mask], voxels)
+        return Volume(scene=scene, centre=jnp.asarray(centre), scale=jnp.asarray(scale), reach=reach)
 
-    def render(self, volume: Volume, camera: Camera) -> Rendering:
-        """The object as the camera (unbatched, or with one axis of views) sees it; depth in the cloud's units."""
+    def render(self, volume: Volume, camera: Camera, quality: Quality = "best") -> Rendering:
+        """The object as the camera (unbatched, or with one axis of views) sees it; depth in the cloud's units.
+
+        `draft`, `balanced` and `best` look near the points alone, with a quarter, half and all of the samples of a ray;
+        `trained` renders as the network was trained.  Other networks than ours know one quality.
+        """
         if self.config.upsamples and (camera.height % 2 or camera.width % 2):
             raise ValueError(f"this network doubles its pictures: {camera.width} x {camera.height} pixels must be even")
         single = camera.cam_to_world.ndim == 2
@@ -69,7 +86,9 @@ class Model:
         pose = jnp.concatenate([rotation, eye[..., None]], axis=-1)
         inside = dataclasses.replace(camera, cam_to_world=pose)
         inside = jax.tree.map(lambda x: jnp.asarray(x).reshape(1, -1, *x.shape[-2:]), inside)
-        rendering = training.jitted_render(self.variables, volume.features[None], inside, config=self.config)
+        scene = jax.tree.map(lambda x: x[None], volume.scene)
+        config = at_quality(self.config, quality, volume.reach)
+        rendering = training.jitted_render(self.variables, scene, inside, config=config)
         rendering = dataclasses.replace(rendering, depth=rendering.depth / volume.scale)
         return jax.tree.map(lambda x: x[0, 0] if single else x[0], rendering)
 
@@ -80,6 +99,33 @@ class Model:
         pose = cameras.orbit(np.deg2rad(azimuth), np.deg2rad(elevation), DISTANCE / float(volume.scale), volume.centre)
         size = resolution or self.config.image_resolution
         return cameras.pinhole(pose, FIELD_OF_VIEW, size, size)
+
+
+def at_quality(config: NetworkConfig, quality: Quality, reach: int) -> NetworkConfig:
+    """The config that renders at a quality, with samples within `reach` voxels of points."""
+    if quality not in (*SAMPLES, "trained"):
+        raise ValueError(f"quality must be one of {', '.join(SAMPLES)}, trained, got {quality}")
+    if quality == "trained" or not isinstance(config, ModelConfig):
+        return config
+    counts = config.sampling
+    samples = max(round(SAMPLES[quality] * (counts.num_coarse + counts.num_fine)), 1)
+    return dataclasses.replace(config, sampling=SamplingConfig(num_coarse=samples, num_fine=0, reach=reach))
+
+
+def reach_of(positions: np.ndarray, resolution: int, num_queries: int = 4096) -> int:
+    """Voxels around points in which their surface lies, from the median distance to the nearest other point.
+
+    Copies of a point, closer than a 1024th of the box, count once.
+    """
+    x, y, z = np.floor((positions.T + 1) * 512).astype(np.int64)
+    _, distinct = np.unique((x * 2048 + y) * 2048 + z, return_index=True)
+    positions = positions[distinct]
+    if len(positions) < 2:
+        return LARGEST_REACH
+    queries = positions[:: -(-len(positions) // num_queries)]
+    distances, _ = cKDTree(positions).query(queries, 2)
+    spacing = np.median(distances[:, 1]) * resolution / 2
+    return int(np.clip(np.ceil(REACH_PER_SPACING * spacing), 1, LARGEST_REACH))
 
 
 def load(run: Path | str) -> Model:

@@ -5,10 +5,18 @@ XLA lowers a batched scatter on CPU to a loop about four times slower than a fla
 Subnormal numbers (below 1.2e-38) are zeros to XLA.
 """
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Shaped
+
+# log1p(e) / e on [0, 1], highest power first: Chebyshev interpolation of degree 8, relative error 3e-8
+LOG1P = (
+    *(5.2534577954e-03, -2.9588507387e-02, 7.8361668009e-02, -1.3674769705e-01, 1.9111431080e-01),
+    *(-2.4844369892e-01, 3.3319271342e-01, -4.9999501517e-01, 9.9999997054e-01),
+)
 
 
 def safe_divide(numerator: Float[Array, "*batch"], denominator: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
@@ -22,8 +30,15 @@ def safe_divide(numerator: Float[Array, "*batch"], denominator: Float[Array, "*b
 
 @jax.custom_jvp
 def softplus(x: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-    """log(1 + exp(x)), finite everywhere; half the time of jax.nn.softplus on a CPU, gradient a sigmoid."""
-    return jnp.maximum(x, 0) + jnp.log1p(jnp.exp(-jnp.abs(x)))
+    """log(1 + exp(x)), finite everywhere, relative error 2e-7; gradient a sigmoid.
+
+    log1p(e) of e = exp(-|x|) in (0, 1] is e times a polynomial: on a CPU 0.4 of the time of XLA's log1p.
+    """
+    e = jnp.exp(-jnp.abs(x))
+    ratio = jnp.full_like(e, LOG1P[0])
+    for coefficient in LOG1P[1:]:
+        ratio = ratio * e + coefficient
+    return jnp.maximum(x, 0) + e * ratio
 
 
 @softplus.defjvp
@@ -70,6 +85,14 @@ def _largest(vectors):
 def per_feature(vector: Shaped[Array, " features"], like: Array) -> Shaped[Array, "*ones features"]:
     """A vector over the last axis, with as many axes as `like` (ranks are never promoted silently)."""
     return vector.reshape(*[1] * (like.ndim - 1), -1)
+
+
+def computed_once(x: Float[Array, "*batch n"]) -> Float[Array, "*batch n"]:
+    """x, through a product with the identity matrix; for few and finite numbers that much else is computed from.
+
+    XLA's CPU compiler computes elementwise results anew in every loop that reads them, and drops optimization_barrier.
+    """
+    return jnp.matmul(x, jnp.eye(x.shape[-1], dtype=x.dtype), precision="highest")
 
 
 def _flatten_tables(axis_size, in_batched, table, index):
@@ -143,3 +166,36 @@ _scatter_rows.defvjp(
     lambda rows, index, values: (_scatter_rows(rows, index, values), index),
     lambda rows, index, cotangent: (np.zeros(index.shape, jax.dtypes.float0), gather_rows(cotangent, index)),
 )
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(3,))
+def blend_rows(
+    table: Float[Array, "rows features"],
+    lowest: Int[Array, " batch"],
+    weights: Float[Array, "batch k"],
+    steps: tuple[int, ...],
+) -> Float[Array, "batch features"]:
+    """Sum over k of weights[:, k] * table[lowest + steps[k]]; every row must be in the table.
+
+    The gradient adds all k shares to one table, where the gradient of k gathers would add up k tables.
+    """
+    out = jnp.zeros((lowest.shape[0], table.shape[1]), table.dtype)
+    for k, step in enumerate(steps):
+        out = out + weights[:, k, None] * _gather(table, lowest + step)
+    return out
+
+
+def _blend_fwd(table, lowest, weights, steps):
+    return blend_rows(table, lowest, weights, steps), (table, lowest, weights)
+
+
+def _blend_bwd(steps, residuals, cotangent):
+    table, lowest, weights = residuals
+    sums, shares = jnp.zeros_like(table), []
+    for k, step in enumerate(steps):
+        sums = _scatter(sums, lowest + step, weights[:, k, None] * cotangent)
+        shares.append(jnp.sum(cotangent * _gather(table, lowest + step), axis=-1))
+    return sums, np.zeros(lowest.shape, jax.dtypes.float0), jnp.stack(shares, axis=-1)
+
+
+blend_rows.defvjp(_blend_fwd, _blend_bwd)

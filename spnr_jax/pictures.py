@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from spnr_jax import clouds, images
-from spnr_jax.model import Model, Volume, load
+from spnr_jax.model import Model, Quality, Volume, load
 
 FRAMES_PER_SECOND = 16
 
@@ -24,6 +24,7 @@ def render_file(
     turntable: str,
     frames: int,
     seed: int,
+    quality: Quality,
 ) -> Iterator[str]:
     """Writes NAME_000.png ... (with _depth and _acc) and NAME_turntable.gif; yields a line about each step."""
     if views < 0:
@@ -41,7 +42,7 @@ def render_file(
     yield f"encoded {len(points.positions)} points of {cloud}"
     for i, azimuth in enumerate(np.arange(views) * 360 / max(views, 1)):
         stem = f"{cloud.stem}_{i:03d}"
-        rendering = model.render(volume, model.camera(volume, float(azimuth) + 30, elevation, resolution))
+        rendering = model.render(volume, model.camera(volume, float(azimuth) + 30, elevation, resolution), quality)
         images.write_whole(out / f"{stem}.png", images.png(np.asarray(rendering.image)))
         for kind, picture in (
             ("depth", images.depth_image(rendering.depth, rendering.acc)),
@@ -50,15 +51,15 @@ def render_file(
             images.write_whole(out / f"{stem}_{kind}.png", images.png(picture))
         yield f"wrote {out / stem}.png"
     if turntable != "none":
-        film = turntable_frames(model, volume, frames, elevation, resolution)
+        film = turntable_frames(model, volume, frames, elevation, resolution, quality)
         path, reason = images.write_turntable(out / f"{cloud.stem}_turntable.{turntable}", film, FRAMES_PER_SECOND)
         yield f"wrote {path}" + (f" ({reason})" if reason else "")
 
 
 def turntable_frames(
-    model: Model, volume: Volume, frames: int, elevation: float, resolution: int | None
+    model: Model, volume: Volume, frames: int, elevation: float, resolution: int | None, quality: Quality
 ) -> list[np.ndarray]:
     """Images of one turn around the object."""
     azimuths = np.arange(frames) * 360 / frames
     cameras = (model.camera(volume, float(azimuth), elevation, resolution) for azimuth in azimuths)
-    return [np.asarray(model.render(volume, camera).image) for camera in cameras]
+    return [np.asarray(model.render(volume, camera, quality).image) for camera in cameras]

@@ -7,23 +7,26 @@ Objects lead, views follow: clouds are (objects, points, ...), cameras (objects,
 """
 
 import operator
-from functools import reduce
+from functools import partial, reduce
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
-from spnr_jax import cameras, compositing, sampling, voxels
-from spnr_jax.config import ModelConfig
+from spnr_jax import cameras, compositing, empty_space, sampling, voxels
+from spnr_jax.empty_space import Path
+from spnr_jax.model_config import ModelConfig
 from spnr_jax.nn.field import RadianceField
 from spnr_jax.nn.pointnet import PointNet
 from spnr_jax.nn.unet3d import UNet3D
 from spnr_jax.nn.upsampler import Upsampler, bilinear
 from spnr_jax.numerics import clamp
-from spnr_jax.types import Camera, Key, PointCloud, Rays, Rendering
+from spnr_jax.types import Camera, Key, PointCloud, Rays, Rendering, Scene
 
 WHITE = 1.0
+CELLS_PER_VOXEL = 2  # of a path through the box, counted along an axis
+RAY_BLOCK = 256  # rays near points that are rendered at once
 
 
 class Renderer(nn.Module):
@@ -40,13 +43,14 @@ class Renderer(nn.Module):
         if c.upsamples:
             self.upsampler = Upsampler(c.upsampler_width, c.bf16)
 
-    def encode(self, cloud: PointCloud, train: bool = False) -> Float[Array, "objects d d d features"]:
-        """Feature volume of each object from its points."""
+    def encode(self, cloud: PointCloud, train: bool = False) -> Scene:
+        """Feature volume of each object from its points, and where these are."""
         resolution = self.config.volume_resolution
         features = self.pointnet(self.point_inputs(cloud), jnp.asarray(cloud.mask), train)
         rows, share = jax.vmap(lambda p, m: voxels.share_voxels(p, m, resolution))(cloud.positions, cloud.mask)
         occupancy = jnp.ones_like(features[..., :1])
-        return self.unet(rows, jnp.concatenate([features, occupancy], axis=-1) * share[..., None])
+        volume = self.unet(rows, jnp.concatenate([features, occupancy], axis=-1) * share[..., None])
+        return Scene(volume=volume, occupied=jax.vmap(lambda r: voxels.occupied(r, resolution))(rows))
 
     def point_inputs(self, cloud: PointCloud) -> Float[Array, "objects points channels"]:
         """Position, offset from the centre of the own voxel, and the materials that the network is built for."""
@@ -56,12 +60,10 @@ class Renderer(nn.Module):
         inputs = jnp.concatenate([cloud.positions, offset, *materials], axis=-1)
         return jnp.where(cloud.mask[..., None], inputs, 0.0)
 
-    def render(
-        self, volume: Float[Array, "objects d d d features"], camera: Camera, key: Key | None = None
-    ) -> Rendering:
+    def render(self, scene: Scene, camera: Camera, key: Key | None = None) -> Rendering:
         """Views of encoded objects; the camera's size is that of the image.  A key jitters the samples (training)."""
         rays = self.rays(camera)
-        return self.develop(camera, *self.render_rays(volume, rays, key))
+        return self.develop(camera, *self.render_rays(scene, rays, key))
 
     def rays(self, camera: Camera) -> Rays:
         """Rays of the volume rendering for all views of an object in one axis, (objects, views * height * width, 3)."""
@@ -94,21 +96,75 @@ class Renderer(nn.Module):
         )
 
     def render_rays(
-        self, volume: Float[Array, "objects d d d features"], rays: Rays, key: Key | None = None
+        self, scene: Scene, rays: Rays, key: Key | None = None
     ) -> tuple[Float[Array, "objects rays k"], Float[Array, "objects rays"], Float[Array, "objects rays"]]:
         """Feature vector (RGB on white first), expected distance and opacity of each ray."""
-        counts = self.config.sampling
-        coarse_key, fine_key = (None, None) if key is None else jax.random.split(key)
+        if self.config.sampling.reach and not self.is_initializing():
+            return self.render_near_points(scene, rays, key)
         near, far, _ = cameras.intersect_box(rays.origins, rays.directions)
         view = self.field.view(rays.directions)
+        shade = partial(self.shade, scene.volume, rays, view)
+        features, weights, distances = self.march(shade, near, far, view, key)
+        return features, compositing.expected_distance(weights, distances, far), jnp.sum(weights, axis=-1)
 
+    def render_near_points(self, scene: Scene, rays: Rays, key: Key | None):
+        """`render_rays` with samples near the points alone: rays that miss them are white and cost nothing."""
+        reach, resolution = self.config.sampling.reach, self.config.volume_resolution
+        near, far, _ = cameras.intersect_box(rays.origins, rays.directions)
+        near_points = empty_space.dilate(scene.occupied, reach)
+        path = empty_space.open_path(near_points, rays, near, far, CELLS_PER_VOXEL * resolution)
+        renderer, variables = self.unbind()
+        (num_objects, num_rays), one = near.shape, (1,) * (near.ndim - 1)
+        objects = jnp.broadcast_to(jnp.arange(num_objects).reshape(-1, *one), near.shape)
+
+        def block(row, objects, rays, far, path):
+            return renderer.bind(variables).march_open(
+                scene.volume, objects, rays, far, path, None if key is None else jax.random.fold_in(key, row[0])
+            )
+
+        flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), (objects, rays, far, path))
+        empty = jnp.zeros((num_objects * num_rays, self.config.num_features)).at[:, :3].set(WHITE)
+        outputs = empty_space.map_existing(
+            block,
+            flat[3].travelled[:, -1] > 0,
+            (jnp.arange(num_objects * num_rays), *flat),
+            (empty, flat[2], jnp.zeros_like(flat[2])),
+            RAY_BLOCK,
+        )
+        return jax.tree.map(lambda x: x.reshape(num_objects, num_rays, *x.shape[1:]), outputs)
+
+    def march_open(self, volume, objects: Int[Array, " rays"], rays: Rays, far, path: Path, key: Key | None):
+        """Outputs of `render_rays` for rays of given objects, sampled along the open part of each."""
+        view = self.field.view(rays.directions)
+
+        def shade(travelled):
+            return self.shade(volume, rays, view, empty_space.distance_at(path, travelled), objects)
+
+        length = path.travelled[..., -1]
+        features, weights, travelled = self.march(shade, jnp.zeros_like(length), length, view, key)
+        distances = empty_space.distance_at(path, travelled)
+        return features, compositing.expected_distance(weights, distances, far), jnp.sum(weights, axis=-1)
+
+    def shade(self, volume, rays: Rays, view, distances: Float[Array, "*rays samples"], objects=None):
+        """The radiance field at each sample; `objects` as `voxels.trilinear` has them, one for each ray."""
+        positions = rays.origins[..., None, :] + distances[..., None] * rays.directions[..., None, :]
+        # rays end on the faces of the box: rounding must not push their samples out of it
+        positions = clamp(positions, -1, 1)
+        if objects is not None:
+            objects = jnp.broadcast_to(objects[..., None], distances.shape)
+        return self.field(voxels.trilinear(volume, positions, objects), view)
+
+    def march(self, shade, near, far, view, key: Key | None):
+        """Features of rays that `shade` evaluates between near and far, and weights and places of their samples."""
+        counts = self.config.sampling
+        coarse_key, fine_key = (None, None) if key is None else jax.random.split(key)
         distances, edges = sampling.stratified(coarse_key, near, far, counts.num_coarse)
-        density, rgb, hidden = self.shade(volume, rays, distances, view)
+        density, rgb, hidden = shade(distances)
         weights, _ = compositing.volume_weights(density, compositing.interval_lengths(distances, far))
         passes = [(weights, rgb, hidden)]
         if counts.num_fine:
             fine = sampling.importance(fine_key, edges, weights, counts.num_fine, counts.padding)
-            fine_density, fine_rgb, fine_hidden = self.shade(volume, rays, fine, view)
+            fine_density, fine_rgb, fine_hidden = shade(fine)
             weights = union_weights(distances, fine, jnp.concatenate([density, fine_density], axis=-1), far)
             distances = jnp.concatenate([distances, fine], axis=-1)
             parts = jnp.split(weights, [counts.num_coarse], axis=-1)
@@ -118,14 +174,7 @@ class Renderer(nn.Module):
         acc = jnp.sum(weights, axis=-1)
         rgb = sum(compositing.composite(w, rgb) for w, rgb, _ in passes) + (1 - acc[..., None]) * WHITE
         hidden = reduce(operator.add, (compositing.composite(w, hidden) for w, _, hidden in passes))
-        features = jnp.concatenate([rgb, self.field.finish(hidden, acc, view)], axis=-1)
-        return features, compositing.expected_distance(weights, distances, far), acc
-
-    def shade(self, volume, rays: Rays, distances: Float[Array, "objects rays samples"], view):
-        """The radiance field at each sample."""
-        positions = rays.origins[..., None, :] + distances[..., None] * rays.directions[..., None, :]
-        # rays end on the faces of the box: rounding must not push their samples out of it
-        return self.field(voxels.trilinear(volume, clamp(positions, -1, 1)), view)
+        return jnp.concatenate([rgb, self.field.finish(hidden, acc, view)], axis=-1), weights, distances
 
     def __call__(self, cloud: PointCloud, camera: Camera, key: Key | None = None, train: bool = False) -> Rendering:
         """Views of each cloud from its cameras."""

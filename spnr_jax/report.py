@@ -6,7 +6,7 @@ PNGs inside the page, the curve is an SVG; nothing is loaded from elsewhere, and
 
 import base64
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
@@ -16,31 +16,46 @@ import numpy as np
 from spnr_jax.images import depth_image, png, to_uint8, write_whole
 from spnr_jax.learning_curve import learning_curve_svg
 from spnr_jax.report_style import STYLE
+from spnr_jax.summary import NO_WEIGHTS
 
 METHODS = {"ours": "Ours", "nearest": "Nearest-point shading", "splat": "Base-colour splat", "white": "White image"}
-QUALITY = {"psnr": ("PSNR, dB", 2), "ssim": ("SSIM", 3), "cpsnr": ("cPSNR, dB", 2), "iou": ("Opacity IoU", 3)}
+HIGHER, LOWER = 1, -1  # what is better
+QUALITY = {  # metric -> head of its column, decimals, what is better
+    "psnr": ("PSNR, dB", 2, HIGHER),
+    "ssim": ("SSIM", 3, HIGHER),
+    "cpsnr": ("cPSNR, dB", 2, HIGHER),
+    "flip": ("FLIP", 3, LOWER),
+    "lpips": ("LPIPS", 3, LOWER),
+    "iou": ("Opacity IoU", 3, HIGHER),
+}
+ARROWS = {HIGHER: "\N{UPWARDS ARROW}", LOWER: "\N{DOWNWARDS ARROW}"}
 COUNTS = {"objects": "Objects", "views": "Views", "cpsnr_views": "cPSNR views"}
-GALLERY_HEADS = ("Reference", "Ours", "Base-colour splat", "Nearest point", "Depth", "Opacity")
 GALLERY_NOTE = (
     "The network never saw these objects. The number below a picture is its PSNR in dB. Depth: bright is near, dark "
-    "is far, spanning each picture's own range. Opacity: white is solid."
+    "is far, spanning each picture's own range. Opacity: white is solid. Both are those of our network."
 )
 QUALITY_NOTE = (
-    "PSNR on sRGB in [0, 1] over white, mean over images, capped at 100 dB. SSIM with a Gaussian window of sigma 1.5. "
-    "cPSNR is the PSNR over the pixels of visible input points; views without any are left out. Higher is better, the "
-    "best value of a column is bold."
+    "Means over images, sRGB in [0, 1] over white. PSNR is capped at 100 dB. SSIM with a Gaussian window of sigma 1.5. "
+    "cPSNR is the PSNR over the pixels of visible input points; views without any are left out. FLIP: LDR, 67 pixels "
+    "per degree. LPIPS: AlexNet v0.1. Arrows show what is better, the best value of a column is bold. Small: 95 % "
+    "bootstrap interval over objects."
+)
+DIFFERENCES_NOTE = (
+    "Ours minus each other method, image by image, so what makes an object hard for both cancels. Small: 95 % "
+    "bootstrap interval over objects, and the p-value of a sign-flip test over objects."
 )
 
 
 @dataclass(frozen=True, kw_only=True)
 class GalleryRow:
-    """One view of one object: pictures (h, w, 3), uint8 or float sRGB in [0, 1]; depth and acc (h', w') float."""
+    """One view of one object, as the reference and as each method shows it, the network first.
+
+    Pictures are (h, w, 3), uint8 or float sRGB in [0, 1]; depth and acc (h', w') float are the network's.
+    """
 
     name: str
     reference: np.ndarray
-    ours: np.ndarray
-    splat: np.ndarray
-    nearest: np.ndarray
+    images: Mapping[str, np.ndarray]
     depth: np.ndarray
     acc: np.ndarray
 
@@ -58,9 +73,9 @@ def write_report(
 ) -> None:
     """Write the page in one piece.
 
-    `metrics` is the content of metrics.json ("methods" of METHODS, "seconds", "preset", "steps", "seed", "hardware"),
-    `per_category` has a "methods" table for every category, `curve` the rows of metrics.jsonl, `settings` any nested
-    mapping.  Blank lines in the summary part paragraphs.
+    `metrics` is the content of metrics.json ("methods", "ours_minus", "seconds", "preset", "steps", "seed",
+    "hardware"), `per_category` has a "methods" table for every category, `curve` the rows of metrics.jsonl, `settings`
+    any nested mapping.  Blank lines in the summary part paragraphs.
     """
     methods = metrics["methods"]
     floors = {METHODS[m]: methods[m]["psnr"] for m in ("nearest", "splat", "white") if m in methods}
@@ -68,6 +83,9 @@ def write_report(
         f"<header><h1>{escape(title)}</h1>{_paragraphs(summary)}{_key_numbers(metrics)}</header>",
         _section("Unseen objects", _gallery(gallery), GALLERY_NOTE),
         _section("Quality", _quality_table(methods), QUALITY_NOTE),
+        _section("Differences", _difference_table(metrics["ours_minus"]), DIFFERENCES_NOTE)
+        if metrics.get("ours_minus")
+        else "",
         _section("Quality by category", _category_table(per_category), "PSNR in dB.") if per_category else "",
         _section("Learning curve", f"<figure>{learning_curve_svg(curve, floors)}</figure>", "") if curve else "",
         _section("Run", _definitions(_run_facts(metrics)), ""),
@@ -130,19 +148,21 @@ def _key_numbers(metrics: Mapping) -> str:
 
 
 def _gallery(rows: Sequence[GalleryRow]) -> str:
-    heads = "".join(f"<th>{head}</th>" for head in GALLERY_HEADS)
-    body = "".join(_gallery_row(row) for row in rows)
-    return f'<table class="gallery"><thead><tr><th></th>{heads}</tr></thead><tbody>{body}</tbody></table>'
+    methods = rows[0].images if rows else {}
+    heads = ["Reference", *(METHODS.get(method, method) for method in methods), "Depth", "Opacity"]
+    head = "".join(f"<th>{escape(text)}</th>" for text in heads)
+    body = "".join(_gallery_row(row, heads) for row in rows)
+    return f'<table class="gallery"><thead><tr><th></th>{head}</tr></thead><tbody>{body}</tbody></table>'
 
 
-def _gallery_row(row: GalleryRow) -> str:
+def _gallery_row(row: GalleryRow, heads: Sequence[str]) -> str:
     pictures = [(row.reference, "")]
-    pictures += [(image, f"{psnr(image, row.reference):.1f}") for image in (row.ours, row.splat, row.nearest)]
+    pictures += [(image, f"{psnr(image, row.reference):.1f}") for image in row.images.values()]
     pictures += [(depth_image(row.depth, row.acc), ""), (row.acc, "")]
     cells = "".join(
         f'<td><img src="data:image/png;base64,{base64.b64encode(png(image)).decode()}" '
-        f'alt="{escape(row.name)}, {head.lower()}"><small>{caption}</small></td>'
-        for head, (image, caption) in zip(GALLERY_HEADS, pictures, strict=True)
+        f'alt="{escape(row.name)}, {escape(head.lower())}"><small>{caption}</small></td>'
+        for head, (image, caption) in zip(heads, pictures, strict=True)
     )
     return f"<tr><th>{escape(row.name)}</th>{cells}</tr>"
 
@@ -151,11 +171,56 @@ def _quality_table(methods: Mapping[str, Mapping]) -> str:
     """Methods against metrics and counts; columns that no method has are left out."""
     quality = [name for name in QUALITY if any(name in scores for scores in methods.values())]
     counts = [name for name in COUNTS if any(name in scores for scores in methods.values())]
-    heads = ["", *(QUALITY[name][0] for name in quality), *(COUNTS[name] for name in counts)]
-    columns = [_bold_best([s.get(name) for s in methods.values()], QUALITY[name][1]) for name in quality]
+    heads = ["", *map(_head, quality), *(COUNTS[name] for name in counts)]
+    columns = [_quality_column(name, methods.values()) for name in quality]
     columns += [[escape(str(s.get(name, ""))) for s in methods.values()] for name in counts]
     names = [escape(METHODS.get(method, method)) for method in methods]
     return _table(heads, list(zip(names, *columns, strict=True)))
+
+
+def _quality_column(name: str, methods: Iterable[Mapping]) -> list[str]:
+    """The cells of a metric: the mean and, below it, its interval."""
+    _, decimals, better = QUALITY[name]
+    means = _bold_best([scores.get(name) for scores in methods], decimals, better, _missing(name))
+    intervals = [_interval(scores.get(f"{name}_interval"), decimals) for scores in methods]
+    return [f"{mean}{interval}" for mean, interval in zip(means, intervals, strict=True)]
+
+
+def _difference_table(ours_minus: Mapping[str, Mapping]) -> str:
+    """Other methods against the difference in each metric."""
+    names = [name for name in QUALITY if any(name in row for row in ours_minus.values())]
+    rows = []
+    for method, row in ours_minus.items():
+        cells = [_difference(row.get(name), name) for name in names]
+        rows.append((f"Ours minus {escape(METHODS.get(method, method).lower())}", *cells))
+    return _table(["", *map(_head, names)], rows)
+
+
+def _difference(found: Mapping | None, name: str) -> str:
+    if found is None:
+        return _missing(name)
+    decimals = QUALITY[name][1]
+    p_value = found["p_value"]
+    test = (
+        "" if p_value is None else f"<small>p {'= ' if p_value >= 0.001 else '&lt; '}{max(p_value, 0.001):.3f}</small>"
+    )
+    return f"{found['mean']:+.{decimals}f}{_interval(found['interval'], decimals, sign='+')}{test}"
+
+
+def _head(name: str) -> str:
+    text, _, better = QUALITY[name]
+    return f"{text}\N{NO-BREAK SPACE}{ARROWS[better]}"
+
+
+def _missing(name: str) -> str:
+    return NO_WEIGHTS if name == "lpips" else "n/a"
+
+
+def _interval(ends: Sequence[float] | None, decimals: int, sign: str = "") -> str:
+    if ends is None:
+        return ""
+    low, high = (f"{end:{sign}.{decimals}f}" for end in ends)
+    return f"<small>[{low}, {high}]</small>"
 
 
 def _category_table(per_category: Mapping[str, Mapping]) -> str:
@@ -169,12 +234,12 @@ def _category_table(per_category: Mapping[str, Mapping]) -> str:
     return _table(["", *(METHODS.get(method, method) for method in methods), "Objects"], rows)
 
 
-def _bold_best(values: Sequence[float | None], decimals: int) -> list[str]:
-    """The values as text, the highest in bold; what is missing or not a number is n/a."""
+def _bold_best(values: Sequence[float | None], decimals: int, better: int = HIGHER, missing: str = "n/a") -> list[str]:
+    """The values as text, the best in bold; what is missing or not a number is said to be so."""
     finite = [value for value in values if value is not None and math.isfinite(value)]
-    best = max(finite, default=None)
+    best = max(finite, default=None, key=lambda value: better * value)
     texts: dict[float | None, str] = {value: f"{value:.{decimals}f}" for value in finite}
-    return [f"<b>{texts[v]}</b>" if v is not None and v == best else texts.get(v, "n/a") for v in values]
+    return [f"<b>{texts[v]}</b>" if v is not None and v == best else texts.get(v, missing) for v in values]
 
 
 def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -185,8 +250,9 @@ def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def _run_facts(metrics: Mapping) -> dict[str, object]:
-    """Everything of metrics.json but the table of methods: what made it, and how long that took."""
-    facts = {name: value for name, value in metrics.items() if name not in ("methods", "seconds")}
+    """What made the scores, and how long that took; the rest of metrics.json has tables of its own."""
+    shown = ("methods", "ours_minus", "per_category", "settings", "seconds")
+    facts = {name: value for name, value in metrics.items() if name not in shown}
     times = {f"time to {stage}": duration(seconds) for stage, seconds in metrics.get("seconds", {}).items()}
     if "time to total" in times:
         times["time in total"] = times.pop("time to total")

@@ -30,9 +30,11 @@ thead th { color: var(--soft); font-size: 13px; font-weight: 600; text-align: ri
 .gallery small { display: block; min-height: 1.5em; color: var(--soft); font-size: 12px;
   font-variant-numeric: tabular-nums }
 .numbers { min-width: 60%; font-variant-numeric: tabular-nums }
-.numbers th, .numbers td { padding: 7px 12px; text-align: right; border-bottom: 1px solid var(--line) }
+.numbers th, .numbers td { padding: 7px 10px; text-align: right; border-bottom: 1px solid var(--line) }
+.numbers tbody > tr > * { vertical-align: top }
 .numbers th:first-child { padding-left: 0; text-align: left }
-.numbers tbody th { font-weight: 500 }
+.numbers tbody th { font-weight: 500; white-space: nowrap }
+.numbers small { display: block; color: var(--soft); font-size: 12px; white-space: nowrap }
 .numbers tbody tr:last-child > * { border-bottom: 0 }
 figure { margin: 8px 0 0 }
 figure svg { width: 100%; height: auto }

@@ -6,9 +6,10 @@ from pathlib import Path
 import numpy as np
 
 from spnr_jax.config import to_dict
-from spnr_jax.evaluation import Evaluation, ObjectResult
+from spnr_jax.evaluation import FLOORS, Evaluation, ObjectResult
 from spnr_jax.images import write_whole
-from spnr_jax.report import GalleryRow, write_report
+from spnr_jax.report import QUALITY, GalleryRow, write_report
+from spnr_jax.summary import NO_WEIGHTS
 
 
 def write_results(
@@ -22,13 +23,13 @@ def write_results(
     """Writes metrics.json and report.html into a folder."""
     metrics = {**evaluation.summary, "seconds": seconds, "per_category": evaluation.per_category}
     write_whole(out / "metrics.json", (json.dumps(metrics, indent=2, allow_nan=False) + "\n").encode())
-    ours, floors = metrics["methods"]["ours"], {k: v for k, v in metrics["methods"].items() if k != "ours"}
-    best = max(floors, key=lambda name: floors[name]["psnr"])
+    methods = metrics["methods"]
+    best = max(FLOORS, key=lambda name: methods[name]["psnr"])
     summary = (
         f"Preset {metrics['preset']}, {metrics['steps']} steps, {evaluation.config.test_points} points per object. "
-        f"{ours['psnr']:.2f} dB PSNR on {ours['views']} views of {ours['objects']} unseen objects: "
-        f"{ours['psnr'] - floors['white']['psnr']:+.2f} dB against the white image, "
-        f"{ours['psnr'] - floors[best]['psnr']:+.2f} dB against the best trivial renderer ({best})."
+        f"{methods['ours']['psnr']:.2f} dB PSNR on {methods['ours']['views']} views of {methods['ours']['objects']} "
+        f"unseen objects: {_difference(metrics, 'white')} against the white image, "
+        f"{_difference(metrics, best)} against the best trivial renderer ({best})."
     )
     write_report(
         out / "report.html",
@@ -42,16 +43,35 @@ def write_results(
     )
 
 
+def _difference(metrics: dict, other: str) -> str:
+    """How many dB ours is above another method, with its interval."""
+    found = metrics["ours_minus"][other]["psnr"]
+    ends = found["interval"]
+    return f"{found['mean']:+.2f} dB" + (f" [{ends[0]:+.2f}, {ends[1]:+.2f}]" if ends else "")
+
+
+def text_table(methods: dict[str, dict]) -> list[str]:
+    """Lines of the table of methods for a terminal: means, and what could not be measured."""
+    lines = []
+    for method, row in methods.items():
+        texts = []
+        for name, (head, decimals, _) in QUALITY.items():
+            missing = NO_WEIGHTS if name == "lpips" else "n/a"
+            texts.append(f"{head.partition(',')[0]} " + (missing if row[name] is None else f"{row[name]:.{decimals}f}"))
+        lines.append(f"{method:8s} " + "   ".join(texts))
+    return lines
+
+
 def gallery_row(result: ObjectResult) -> GalleryRow:
     """The view of an object whose PSNR is the median: neither flattered nor slandered."""
-    psnr = result.scores["ours"].psnr
+    psnr = result.scores["ours"]["psnr"]
     view = int(np.argsort(psnr)[len(psnr) // 2])
+    ours = result.pictures["ours"]
+    assert ours.depth is not None
     return GalleryRow(
         name=result.name,
         reference=result.reference[view],
-        ours=result.images["ours"][view],
-        splat=result.images["splat"][view],
-        nearest=result.images["nearest"][view],
-        depth=result.depth[view],
-        acc=result.acc[view],
+        images={m: np.asarray(p.image[view]) for m, p in result.pictures.items() if m != "white"},
+        depth=np.asarray(ours.depth[view]),
+        acc=np.asarray(ours.acc[view]),
     )

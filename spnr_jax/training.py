@@ -2,6 +2,10 @@
 
     forward -> losses -> train_step -> jitted train_step
 
+A method is a network and a loss: the config of a network finds its module (`network`), and any module with `encode`,
+`render` and `__call__` is trained by this step.  What it sows into the collection "losses" is added to the loss; a
+network without `render_rays` renders whole images.
+
 One step renders every view of the batch once.  The discriminator is updated on that rendering, the generator on the
 gradient that the updated discriminator and the L1 loss send back through it.  `adversarial` is static: without it the
 graph contains no discriminator.  All randomness of step s comes from fold_in(state.key, s), so a resumed run repeats
@@ -9,8 +13,9 @@ the uninterrupted one bit for bit.
 """
 
 from functools import partial
-from typing import no_type_check
+from typing import Any, no_type_check
 
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import optax
@@ -18,13 +23,22 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from spnr_jax import losses
-from spnr_jax.config import ModelConfig, TrainConfig
+from spnr_jax.baselines.npbg import NPBG
+from spnr_jax.baselines.point_nerf import PointNeRF
+from spnr_jax.baselines.points2nerf import Points2NeRF
+from spnr_jax.config import TrainConfig
 from spnr_jax.metrics import psnr
+from spnr_jax.model_config import ModelConfig, NetworkConfig, NPBGConfig, PointNeRFConfig, Points2NeRFConfig
 from spnr_jax.nn.discriminator import Discriminator
 from spnr_jax.renderer import Renderer
 from spnr_jax.types import Batch, Camera, Key, PointCloud, Rendering
 
-RAY_CHUNK = 1024  # rays of an object rendered at once: about 80 MB at 128 samples
+NETWORKS: dict[type, type[nn.Module]] = {
+    ModelConfig: Renderer,
+    NPBGConfig: NPBG,
+    PointNeRFConfig: PointNeRF,
+    Points2NeRFConfig: Points2NeRF,
+}
 
 
 @no_type_check
@@ -43,10 +57,23 @@ class TrainState:
     discriminator_optimizer: tuple | None
 
 
+def network(config: NetworkConfig) -> nn.Module:
+    """The module that a network's config describes."""
+    return NETWORKS[type(config)](config)
+
+
 def learning_rate(config: TrainConfig) -> optax.Schedule:
-    """Generator's learning rate: linear warm-up, then a cosine down to final_lr_scale."""
+    """Generator's learning rate: linear warm-up, then a cosine or an exponential down to final_lr_scale."""
     o = config.optimizer
     warmup = min(o.warmup_steps, config.num_steps)
+    if o.decay == "exponential":
+        return optax.warmup_exponential_decay_schedule(
+            init_value=o.lr_generator / max(warmup, 1),
+            peak_value=o.lr_generator,
+            warmup_steps=warmup,
+            transition_steps=max(config.num_steps - warmup, 1),
+            decay_rate=o.final_lr_scale,
+        )
     return optax.warmup_cosine_decay_schedule(
         init_value=o.lr_generator / max(warmup, 1),
         peak_value=o.lr_generator,
@@ -57,10 +84,11 @@ def learning_rate(config: TrainConfig) -> optax.Schedule:
 
 
 def optimizers(config: TrainConfig) -> tuple[optax.GradientTransformation, optax.GradientTransformation]:
-    """Adam for the generator and for the discriminator."""
+    """The generator's algorithm, and Adam for the discriminator."""
     o = config.optimizer
+    algorithm = {"adam": optax.adam, "radam": optax.radam}[o.algorithm]
     return (
-        optax.adam(learning_rate(config), b1=o.beta1, b2=o.beta2),
+        algorithm(learning_rate(config), b1=o.beta1, b2=o.beta2),
         optax.adam(o.lr_discriminator, b1=o.beta1_discriminator, b2=o.beta2),
     )
 
@@ -73,6 +101,7 @@ def first_adversarial_step(config: TrainConfig) -> int:
 
 def discriminator_of(config: TrainConfig) -> Discriminator:
     """The discriminator's module."""
+    assert isinstance(config.model, ModelConfig), "the config refuses an adversarial loss of other networks"
     return Discriminator(config.loss.discriminator_width, config.model.num_groups, config.model.bf16)
 
 
@@ -90,9 +119,9 @@ def example_inputs(config: TrainConfig) -> tuple[PointCloud, Camera]:
 def create_state(config: TrainConfig) -> TrainState:
     """Fresh weights and optimisers from the config's seed."""
     key, generator_key, discriminator_key = jax.random.split(jax.random.key(config.seed), 3)
-    variables = Renderer(config.model).init(generator_key, *example_inputs(config))
+    variables = network(config.model).init(generator_key, *example_inputs(config))
     generator_adam, discriminator_adam = optimizers(config)
-    generator, batch_stats = variables["params"], variables["batch_stats"]
+    generator, batch_stats = variables["params"], variables.get("batch_stats", {})
     discriminator = None
     if first_adversarial_step(config) < config.num_steps:
         image = jnp.zeros((1, *[config.model.image_resolution] * 2, 3))
@@ -110,13 +139,50 @@ def create_state(config: TrainConfig) -> TrainState:
     )
 
 
+def lattice(key: Key, batch: Batch, stride: int) -> Batch:
+    """The batch with every `stride`-th row and column of its views, from a random first one on: images still."""
+    first = jax.random.randint(key, (2,), 0, stride)
+
+    def thinned(x):
+        for axis, start in zip((2, 3), first, strict=True):
+            x = x.reshape(*x.shape[:axis], x.shape[axis] // stride, stride, *x.shape[axis + 1 :])
+            x = jax.lax.dynamic_index_in_dim(x, start, axis + 1, keepdims=False)
+        return x
+
+    image, condition, mask = (thinned(jnp.asarray(x)) for x in (batch.image, batch.condition, batch.condition_mask))
+    # pixel i of the lattice has its centre at first + stride * i + 0.5 of the view
+    shift = 0.5 - (first[::-1] + 0.5) / stride
+    zoom = jnp.diag(jnp.array([1 / stride, 1 / stride, 1.0])).at[:2, 2].set(shift)
+    intrinsics = jnp.einsum("ij,...jk->...ik", zoom, batch.camera.intrinsics, precision="highest")
+    camera = Camera(
+        cam_to_world=batch.camera.cam_to_world, intrinsics=intrinsics, height=image.shape[2], width=image.shape[3]
+    )
+    return Batch(cloud=batch.cloud, camera=camera, image=image, condition=condition, condition_mask=mask)
+
+
+def pixel_error(config: TrainConfig, image: Array, reference: Array, seen: Array | None = None) -> Float[Array, ""]:
+    """Mean error of all pixels, or of those that are `seen` (0 if there are none)."""
+    if config.loss.pixel == "l1" and seen is None:
+        return losses.l1(image, reference)
+    error = {"l1": jnp.abs, "mse": jnp.square}[config.loss.pixel](image - reference)
+    if seen is None:
+        return jnp.mean(error)
+    return jnp.sum(jnp.where(seen[..., None], error, 0)) / jnp.maximum(3 * jnp.sum(seen), 1)
+
+
 def reconstruction_loss(
-    config: TrainConfig, image: Float[Array, "*batch"], image_lr: Float[Array, "*batch_lr"], reference: Array
+    config: TrainConfig,
+    image: Float[Array, "*batch"],
+    image_lr: Float[Array, "*batch_lr"],
+    reference: Array,
+    seen: Array | None = None,
 ) -> Float[Array, ""]:
-    """Weighted L1 of the image, and of the volume-rendered RGB against the reference averaged down to its size."""
+    """Weighted error of the image, and of a smaller volume rendering against the reference averaged to its size."""
+    if not config.model.upsamples:
+        return config.loss.l1_weight * pixel_error(config, image, reference, seen)
     low = losses.area_downsample(reference, image_lr.shape[-2])
-    weight = config.loss.low_resolution_weight if config.model.upsamples else 0.0
-    return config.loss.l1_weight * (losses.l1(image, reference) + weight * losses.l1(image_lr, low))
+    errors = pixel_error(config, image, reference), pixel_error(config, image_lr, low)
+    return config.loss.l1_weight * (errors[0] + config.loss.low_resolution_weight * errors[1])
 
 
 def logits(config: TrainConfig, params: dict, image: Array, condition: Array, mask: Array) -> Array:
@@ -150,17 +216,22 @@ def train_step(
 ) -> tuple[TrainState, dict[str, Array]]:
     """State after one step of both networks from one generator forward, and scalar metrics."""
     key = jax.random.fold_in(state.key, state.step)
-    renderer, reference = Renderer(config.model), jnp.asarray(batch.image)
+    if config.pixel_stride > 1:
+        key, lattice_key = jax.random.split(key)
+        batch = lattice(lattice_key, batch, config.pixel_stride)
+    module, reference = network(config.model), jnp.asarray(batch.image)
     generator_adam, discriminator_adam = optimizers(config)
 
     def forward(params):
         variables = {"params": params, "batch_stats": state.batch_stats}
-        rendering, updated = renderer.apply(
-            variables, batch.cloud, batch.camera, key, train=True, mutable=["batch_stats"]
+        rendering, updated = module.apply(
+            variables, batch.cloud, batch.camera, key, train=True, mutable=["batch_stats", "losses"]
         )
-        return (rendering.image, rendering.image_lr), updated["batch_stats"]
+        sown = {name: value for name, (value,) in updated.get("losses", {}).items()}
+        seen = rendering.acc > 0 if config.loss.masked else None
+        return (rendering.image, rendering.image_lr, sown), (updated.get("batch_stats", {}), seen)
 
-    (image, image_lr), pull_back, batch_stats = jax.vjp(forward, state.generator, has_aux=True)
+    (image, image_lr, sown), pull_back, (batch_stats, seen) = jax.vjp(forward, state.generator, has_aux=True)
     metrics = {"psnr": jnp.mean(psnr(image, reference)), "l1": losses.l1(image, reference)}
     discriminator, discriminator_optimizer = state.discriminator, state.discriminator_optimizer
     if adversarial:
@@ -172,19 +243,21 @@ def train_step(
         discriminator = optax.apply_updates(discriminator, update)
         metrics |= more
 
-    def image_loss(image, image_lr):
-        loss = reconstruction_loss(config, image, image_lr, reference)
+    def whole_loss(image, image_lr, sown):
+        loss = reconstruction_loss(config, image, image_lr, reference, seen)
+        for term in sown.values():
+            loss = loss + term
         if adversarial:
             views = (_flatten_views(x) for x in (image, batch.condition, batch.condition_mask))
             fake_logits = logits(config, discriminator, *views)
             loss = loss + config.loss.adversarial_weight * losses.generator_adversarial(fake_logits)
         return loss
 
-    loss, cotangents = jax.value_and_grad(image_loss, argnums=(0, 1))(image, image_lr)
+    loss, cotangents = jax.value_and_grad(whole_loss, argnums=(0, 1, 2))(image, image_lr, sown)
     (gradient,) = pull_back(cotangents)
     update, generator_optimizer = generator_adam.update(gradient, state.generator_optimizer)
     generator = optax.apply_updates(state.generator, update)
-    metrics |= {"loss": loss, "gradient_norm": optax.tree.norm(gradient)}
+    metrics |= {"loss": loss, "gradient_norm": optax.tree.norm(gradient)} | sown
 
     # early weights are far from the last ones: average over a growing share of the past
     decay = jnp.minimum(config.optimizer.ema_decay, (1.0 + state.step) / (10.0 + state.step))
@@ -207,32 +280,38 @@ def train_step(
     return state, metrics
 
 
-def encode(variables: dict, cloud: PointCloud, *, config: ModelConfig) -> Array:
-    """Feature volumes (objects, d, d, d, features) of the clouds."""
-    return Renderer(config).bind(variables).encode(cloud)
+def encode(variables: dict, cloud: PointCloud, *, config: NetworkConfig) -> Any:
+    """Scenes of the clouds, objects first on every array: feature volumes (objects, d, d, d, features) for ours."""
+    return network(config).bind(variables).encode(cloud)
 
 
 def render(
-    variables: dict, volume: Array, camera: Camera, *, config: ModelConfig, ray_chunk: int = RAY_CHUNK
+    variables: dict, scene: Any, camera: Camera, *, config: NetworkConfig, ray_chunk: int | None = None
 ) -> Rendering:
-    """Views of encoded volumes, samples at the middles of their strata.
+    """Views of encoded scenes, samples at the middles of their strata.
 
-    So many rays of each object are rendered at a time, which bounds the memory.  On a CPU a pixel of one object has the
-    same bits for every chunk from 256 to 2048 rays, whatever is rendered beside it: the matrix products then add up in
-    one order.
+    So many rays of each object (the network's own number by default) are rendered at a time, which bounds the memory.
+    On a CPU a pixel of one object of ours has the same bits for every chunk from 256 to 2048 rays, whatever is rendered
+    beside it: the matrix products then add up in one order.
     """
-    renderer = Renderer(config)
-    rays = renderer.rays(camera)
-    num_rays = rays.origins.shape[1]
+    module = network(config)
+    if (ray_chunk := ray_chunk or config.ray_chunk) is None:
+        return module.bind(variables).render(scene, camera)
+    rays = module.rays(camera)
+    num_rays = jax.tree.leaves(rays)[0].shape[1]
     chunk = min(ray_chunk, num_rays)
-    pad = ((0, 0), (0, -num_rays % chunk), (0, 0))
-    chunks = jax.tree.map(lambda x: jnp.pad(x, pad, mode="edge").reshape(x.shape[0], -1, chunk, 3), rays)
+
+    def chunked(x):
+        padded = jnp.pad(x, ((0, 0), (0, -num_rays % chunk), *[(0, 0)] * (x.ndim - 2)), mode="edge")
+        return padded.reshape(x.shape[0], -1, chunk, *x.shape[2:])
+
+    chunks = jax.tree.map(chunked, rays)
     outputs = jax.lax.map(
-        lambda rays: renderer.bind(variables).render_rays(volume, rays),
+        lambda rays: module.bind(variables).render_rays(scene, rays),
         jax.tree.map(lambda x: jnp.moveaxis(x, 1, 0), chunks),
     )
     outputs = jax.tree.map(lambda x: jnp.moveaxis(x, 0, 1).reshape(x.shape[1], -1, *x.shape[3:])[:, :num_rays], outputs)
-    return renderer.bind(variables).develop(camera, *outputs)
+    return module.bind(variables).develop(camera, *outputs)
 
 
 def averaged_variables(state: TrainState) -> dict:

@@ -63,6 +63,15 @@ class Rendering:
 
 @no_type_check
 @struct.dataclass
+class Scene:
+    """An encoded object: the feature volume, and the voxels that hold points."""
+
+    volume: Float[Array, "*batch d d d features"]
+    occupied: Bool[Array, "*batch d d d"]
+
+
+@no_type_check
+@struct.dataclass
 class Batch:
     """One training batch: clouds of `objects`, and `views` of each with reference and condition image."""
 

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from spnr_jax.numerics import clamp, gather_rows, scatter_rows
+from spnr_jax.numerics import blend_rows, clamp, computed_once, gather_rows, scatter_rows
 
 NEIGHBOURS = tuple((z, y, x) for z in (-1, 0, 1) for y in (-1, 0, 1) for x in (-1, 0, 1))
 
@@ -43,6 +43,11 @@ def share_voxels(
     ones = valid.astype(positions.dtype)
     count = gather_rows(scatter_rows(rows, ones[:, None], resolution**3 + 1), rows)[:, 0]
     return rows, ones / jnp.maximum(count, 1)
+
+
+def occupied(rows: Int[Array, " points"], resolution: int) -> Bool[Array, "d d d"]:
+    """Whether each voxel holds a point, from the points' rows in the flattened volume."""
+    return jnp.zeros(resolution**3 + 1, bool).at[rows].set(True)[:-1].reshape(*[resolution] * 3)
 
 
 def scatter_mean(
@@ -86,29 +91,31 @@ def scatter_conv(
 
 
 def trilinear(
-    volume: Float[Array, "*objects d d d features"], positions: Float[Array, "*batch 3"]
+    volume: Float[Array, "*objects d d d features"],
+    positions: Float[Array, "*batch 3"],
+    objects: Int[Array, "*batch"] | None = None,
 ) -> Float[Array, "*batch features"]:
     """Features between the eight nearest voxel centres; zero outside [-1, 1]^3.
 
-    The first axes of the positions are the objects of the volume.  Within half a voxel of the border the lookup takes
-    the outermost centres.
+    The first axes of the positions are the objects of the volume, unless `objects` gives each position's.  Within half
+    a voxel of the border the lookup takes the outermost centres.
     """
-    if volume.ndim > 4:
+    if volume.ndim > 4 and objects is None:
         return jax.vmap(trilinear)(volume, positions)
-    resolution = volume.shape[0]
-    inside = jnp.all(jnp.abs(positions) <= 1, axis=-1, keepdims=True)
+    resolution = volume.shape[-2]
+    inside = jnp.all(jnp.abs(positions) <= 1, axis=-1)
     grid = clamp((positions + 1) * (0.5 * resolution) - 0.5, 0, resolution - 1)
     cell = jnp.clip(jnp.floor(grid), 0, max(resolution - 2, 0))
     upper = grid - jax.lax.stop_gradient(cell)
-    # the lowest corner's row as a matrix product: XLA computes that once, where it would compute a sum of products anew
-    # inside each of the eight gathers.  Exact in float32 up to 256^3 voxels.
+    # rows as a matrix product, for the reason that `computed_once` gives; exact in float32 up to 256^3 voxels
     strides = jnp.array([[1.0], [resolution], [resolution**2]])
-    lowest = jnp.matmul(cell.reshape(-1, 3), strides, precision="highest").astype(jnp.int32).reshape(cell.shape[:-1])
-    table = volume.reshape(-1, volume.shape[-1])
+    lowest = jnp.matmul(cell.reshape(-1, 3), strides, precision="highest").astype(jnp.int32)[:, 0]
+    if objects is not None:
+        lowest = lowest + objects.reshape(-1) * resolution**3
+    corners = list(itertools.product((0, 1), repeat=3))
+    x, y, z = (jnp.stack([1 - upper[..., axis], upper[..., axis]]) for axis in range(3))
+    weights = jnp.stack([jnp.where(inside, x[i] * y[j] * z[k], 0) for i, j, k in corners], axis=-1)
     next_voxel = min(resolution - 1, 1)  # a volume of one voxel has no next one
-    out: Array | float = 0.0
-    for corner in itertools.product((0, 1), repeat=3):
-        step = sum(high * next_voxel * resolution**axis for axis, high in enumerate(corner))
-        x, y, z = (upper[..., axis] if high else 1 - upper[..., axis] for axis, high in enumerate(corner))
-        out = out + (x * y * z)[..., None] * gather_rows(table, lowest + step)
-    return jnp.where(inside, out, 0.0)
+    steps = tuple(next_voxel * (i + resolution * (j + resolution * k)) for i, j, k in corners)
+    out = blend_rows(volume.reshape(-1, volume.shape[-1]), lowest, computed_once(weights.reshape(-1, 8)), steps)
+    return out.reshape(*positions.shape[:-1], volume.shape[-1])

@@ -49,6 +49,22 @@ def test_a_state_comes_back_bit_by_bit(tmp_path):
     same_bits(checkpoint.restore(tmp_path, CONFIG), state)
 
 
+def test_a_state_without_statistics_comes_back_too(tmp_path):
+    tiny = config.PRESETS["npbg_tiny"]()
+    state = training.jitted_create_state(tiny)
+    checkpoint.write_config(tmp_path, tiny)
+    checkpoint.save(tmp_path, state)
+    assert state.batch_stats == {}
+    same_bits(checkpoint.load_run(tmp_path)[1], state)
+
+
+def test_a_run_of_another_method_is_refused_with_its_name(tmp_path):
+    checkpoint.write_config(tmp_path, config.tiny())
+    (tmp_path / "checkpoints").mkdir()
+    with pytest.raises(ValueError, match=r"model\.method ours there, npbg asked"):
+        checkpoint.write_config(tmp_path, config.PRESETS["npbg_tiny"]())
+
+
 def test_a_folder_without_checkpoints_holds_no_state(tmp_path):
     assert checkpoint.restore(tmp_path, CONFIG) is None
 

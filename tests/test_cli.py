@@ -85,6 +85,13 @@ def test_a_preset_gives_the_defaults_and_options_change_them(form):
     assert command.config == expected
 
 
+def test_the_preset_chooses_the_network_whose_options_there_are(capsys):
+    command = cli.parse(["train", "data", "run", "--preset", "point_nerf_tiny", "--radius", "0.2"])
+    tiny = config.PRESETS["point_nerf_tiny"]()
+    assert command.config == dataclasses.replace(tiny, model=dataclasses.replace(tiny.model, radius=0.2))
+    assert "--radius" in refused(capsys, "train", "data", "run", "--preset", "npbg_tiny", "--radius", "0.2")
+
+
 def test_a_resolution_that_the_unet_cannot_divide_is_refused(capsys):
     line = refused(capsys, "train", "data", "run", "--volume-resolution", "9")
     assert "volume_resolution 9 cannot be halved 1 times; use a multiple of 2" in line

@@ -5,16 +5,8 @@ import json
 
 import pytest
 
-from spnr_jax.config import (
-    PRESETS,
-    LossConfig,
-    ModelConfig,
-    OptimizerConfig,
-    SamplingConfig,
-    TrainConfig,
-    from_dict,
-    to_dict,
-)
+from spnr_jax.config import PRESETS, LossConfig, OptimizerConfig, TrainConfig, from_dict, to_dict
+from spnr_jax.model_config import METHODS, ModelConfig, NPBGConfig, PointNeRFConfig, SamplingConfig
 
 
 @pytest.mark.parametrize(
@@ -40,6 +32,8 @@ from spnr_jax.config import (
         (TrainConfig, "num_steps", 0, "at least 1"),
         (TrainConfig, "batch_objects", 0, "at least 1"),
         (TrainConfig, "min_points", 5000, "max_points 4096"),
+        (TrainConfig, "pixel_stride", 0, "at least 1"),
+        (TrainConfig, "pixel_stride", 2, "neighbours"),
     ],
 )
 def test_a_wrong_number_names_the_field_what_came_and_what_is_possible(kind, field, value, hint):
@@ -47,6 +41,17 @@ def test_a_wrong_number_names_the_field_what_came_and_what_is_possible(kind, fie
         kind(**{field: value})
     assert hint in str(error.value)
     assert str(value) in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("kind", "field", "known"),
+    [(LossConfig, "pixel", "l1 or mse"), (OptimizerConfig, "algorithm", "radam"), (OptimizerConfig, "decay", "cosine")],
+)
+def test_an_unknown_word_names_the_known_ones(kind, field, known):
+    config = kind()
+    object.__setattr__(config, field, "none")  # the tests' type checker would be quicker than the config
+    with pytest.raises(ValueError, match=rf"{field} must be .*{known}.*got none"):
+        config.__post_init__()
 
 
 def test_an_unknown_material_names_the_known_ones():
@@ -104,6 +109,42 @@ class TestFromDict:
         values["model"]["volume_resolution"] = 33
         with pytest.raises(ValueError, match="volume_resolution"):
             from_dict(values)
+
+
+class TestMethods:
+    def test_a_file_names_its_method_and_the_fields_are_those_of_that_method(self):
+        kinds = {name: PRESETS[name]().model for name in ("tiny", "npbg_tiny", "point_nerf_tiny", "points2nerf_tiny")}
+        methods = [to_dict(PRESETS[name]())["model"]["method"] for name in kinds]
+        assert methods == list(METHODS)
+        values = to_dict(PRESETS["npbg_tiny"]())
+        values["model"]["radius"] = 0.1
+        with pytest.raises(ValueError, match=r"unknown config field model\.radius.*encoder_widths"):
+            from_dict(values)
+
+    def test_an_unknown_method_names_the_known_ones(self):
+        values = to_dict(TrainConfig())
+        values["model"]["method"] = "nerf"
+        with pytest.raises(ValueError, match=r"model\.method nerf is not one of ours, npbg"):
+            from_dict(values)
+
+    def test_a_file_from_before_there_were_baselines_is_read_as_ours(self):
+        values = to_dict(PRESETS["abo"]())
+        del values["model"]["method"], values["pixel_stride"]
+        del values["loss"]["pixel"], values["loss"]["masked"]
+        del values["optimizer"]["algorithm"], values["optimizer"]["decay"]
+        assert from_dict(values) == PRESETS["abo"]()
+
+    @pytest.mark.parametrize("name", [name for name in PRESETS if isinstance(PRESETS[name]().model, NPBGConfig)])
+    def test_the_discriminator_judges_no_baseline(self, name):
+        with pytest.raises(ValueError, match="adversarial_weight 1.0.*use 0"):
+            dataclasses.replace(PRESETS[name](), loss=LossConfig())
+
+    def test_a_lattice_is_for_independent_pixels_that_it_divides(self):
+        quiet = LossConfig(adversarial_weight=0.0)
+        assert TrainConfig(model=PointNeRFConfig(image_resolution=200), loss=quiet, pixel_stride=5).pixel_stride == 5
+        for model in (NPBGConfig(), PointNeRFConfig(image_resolution=126)):
+            with pytest.raises(ValueError, match="pixel_stride 4 needs"):
+                TrainConfig(model=model, loss=quiet, pixel_stride=4)
 
 
 def test_unknown_options_are_errors():

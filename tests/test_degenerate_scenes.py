@@ -208,7 +208,7 @@ class TestUnits:
         stick, _ = self.picture(variables, positions)
         ends[:, seed % 3] = [-1, 1] if np.diff(ends[:, seed % 3]) > 0 else [1, -1]
         exact, _ = self.picture(variables, np.repeat(ends, NUM_POINTS // 2, axis=0))
-        close(stick.features, exact.features, atol=1e-4)
+        close(stick.scene, exact.scene, atol=1e-4)
 
     @pytest.mark.slow
     def test_a_million_points_that_are_copies_look_like_the_points(self, variables):

@@ -10,12 +10,22 @@ import pytest
 import tiny_dataset
 from laws import close
 from tiny_dataset import CONFIG
+from tiny_lpips import WEIGHTS
 
 from spnr_jax import checkpoint, data, evaluation, metrics, training
 from spnr_jax.baselines import floors
+from spnr_jax.flip import flip
+from spnr_jax.lpips import lpips
+from spnr_jax.summary import METRICS, NO_WEIGHTS
 
 NAMES = tiny_dataset.SPLITS["test"]
 FACTORS = {"splat": 1.5, "nearest": 0.75}
+
+
+def methods():
+    variables = training.averaged_variables(checkpoint.restore(tiny_dataset.run(), CONFIG))
+    trivial = {name: evaluation.floor(name, FACTORS.get(name, 1.0)) for name in evaluation.FLOORS}
+    return {"ours": evaluation.network(variables, CONFIG), **trivial}
 
 
 @pytest.fixture(scope="module")
@@ -25,22 +35,23 @@ def outcome():
 
 @pytest.fixture(scope="module")
 def results():
-    variables = training.averaged_variables(checkpoint.restore(tiny_dataset.run(), CONFIG))
-    return list(evaluation.evaluate_objects(variables, CONFIG, tiny_dataset.dataset(), NAMES, FACTORS))
+    return list(evaluation.evaluate_objects(methods(), CONFIG, tiny_dataset.dataset(), NAMES))
 
 
 def test_scores_are_those_of_the_metrics_called_by_hand(results):
     for name, result in zip(NAMES, results, strict=True):
         item = data.read_object(tiny_dataset.dataset(), name)
         reference, mask = (jnp.asarray(x) for x in (data.on_white(item.images), item.conditions[..., 3] > 0))
-        for method in evaluation.METHODS:
-            image = jnp.asarray(result.images[method])
+        assert list(result.scores) == ["ours", "white", "splat", "nearest"]
+        for method, scores in result.scores.items():
+            assert set(scores) == set(METRICS) - {"lpips"}
+            image = jnp.asarray(result.pictures[method].image)
             assert 0 <= image.min() <= image.max() <= 1
-            scores = result.scores[method]
-            close(scores.psnr, -10 * np.log10(np.mean((image - reference) ** 2, axis=(1, 2, 3))), rtol=1e-4)
-            close(scores.ssim, metrics.ssim(image, reference), atol=1e-4)
-            close(scores.cpsnr, metrics.conditional_psnr(image, reference, mask), rtol=1e-4)
-        assert np.all(result.images["white"] == 1)
+            close(scores["psnr"], -10 * np.log10(np.mean((image - reference) ** 2, axis=(1, 2, 3))), rtol=1e-4)
+            close(scores["ssim"], metrics.ssim(image, reference), atol=1e-4)
+            close(scores["cpsnr"], metrics.conditional_psnr(image, reference, mask), rtol=1e-4)
+            close(scores["flip"], flip(image, reference), atol=1e-5)
+        assert np.all(result.pictures["white"].image == 1)
 
 
 def test_the_floors_are_those_of_the_same_points_and_cameras(results):
@@ -49,44 +60,30 @@ def test_the_floors_are_those_of_the_same_points_and_cameras(results):
     for method, factor in FACTORS.items():
         view = jax.tree.map(lambda x: jnp.asarray(x[1]), item.camera)
         image, _ = getattr(floors, method)(cloud, view, factor * floors.spacing(cloud))
-        close(results[0].images[method][1], image, atol=1e-5)
+        close(results[0].pictures[method].image[1], image, atol=1e-5)
 
 
 def test_opacity_is_compared_at_the_size_of_the_reference(results):
     item = data.read_object(tiny_dataset.dataset(), NAMES[0])
-    assert results[0].acc.shape[1:] == (8, 8)
-    white = results[0].scores["white"].iou
+    assert results[0].pictures["ours"].acc.shape[1:] == (8, 8)
+    assert results[0].pictures["ours"].depth.shape[1:] == (8, 8)
+    assert results[0].pictures["splat"].depth is None
+    white = results[0].scores["white"]["iou"]
     assert np.all(white == 0), "an empty picture overlaps with nothing"
-    assert np.all(results[0].scores["nearest"].iou > 0.3)
+    assert np.all(results[0].scores["nearest"]["iou"] > 0.3)
     assert len(white) == len(item.images)
 
 
 def test_a_summary_is_the_mean_over_all_images_with_its_counts(outcome, results):
-    assert set(outcome.summary["methods"]) == set(evaluation.METHODS)
+    assert set(outcome.summary["methods"]) == {"ours", *evaluation.FLOORS}
+    assert set(outcome.summary["ours_minus"]) == set(evaluation.FLOORS)
     for table in outcome.summary["methods"].values():
         assert table["objects"] == len(NAMES)
         assert table["views"] == len(NAMES) * tiny_dataset.VIEWS
-    ours = np.concatenate([result.scores["ours"].psnr for result in results])
+    ours = np.concatenate([result.scores["ours"]["psnr"] for result in results])
     assert outcome.summary["methods"]["ours"]["psnr"] == pytest.approx(ours.mean(), abs=1e-4)
     assert outcome.summary["steps"] == CONFIG.num_steps
     assert set(outcome.summary["settings"]["radius factors"].values()) <= set(evaluation.RADIUS_FACTORS)
-
-
-def scores_of(*values, cpsnr):
-    row = np.array(values, np.float32)
-    return evaluation.Scores(psnr=row, ssim=row / 100, cpsnr=np.array(cpsnr, np.float32), iou=row / 50)
-
-
-def test_an_image_without_visible_points_is_left_out_of_its_mean_alone_and_counted():
-    one, two = scores_of(10, 20, cpsnr=[np.nan, 12]), scores_of(30, cpsnr=[14])
-    table = evaluation.summarise([dict.fromkeys(evaluation.METHODS, one), dict.fromkeys(evaluation.METHODS, two)])
-    assert table["ours"]["psnr"] == 20, "mean over images, not over objects"
-    assert (table["ours"]["cpsnr"], table["ours"]["cpsnr_views"], table["ours"]["views"]) == (13, 2, 3)
-
-
-def test_no_visible_point_at_all_is_no_number():
-    none = dict.fromkeys(evaluation.METHODS, scores_of(10, cpsnr=[np.nan]))
-    assert evaluation.summarise([none])["white"]["cpsnr"] is None
 
 
 def test_categories_come_from_the_names_and_add_up(outcome):
@@ -134,9 +131,8 @@ def test_objects_of_one_view_are_evaluated_although_training_draws_two(tmp_path)
     copy = shutil.copytree(tiny_dataset.dataset().folder, tmp_path / "data")
     item = data.read_object(data.open_dataset(copy), NAMES[0])
     config = dataclasses.replace(CONFIG, views_per_object=len(item.images) + 1)
-    variables = training.averaged_variables(checkpoint.restore(tiny_dataset.run(), CONFIG))
-    (result,) = evaluation.evaluate_objects(variables, config, data.open_dataset(copy), NAMES[:1], FACTORS)
-    assert len(result.scores["ours"].psnr) == tiny_dataset.VIEWS
+    (result,) = evaluation.evaluate_objects(methods(), config, data.open_dataset(copy), NAMES[:1])
+    assert len(result.scores["ours"]["psnr"]) == tiny_dataset.VIEWS
 
 
 @pytest.mark.parametrize(("split", "expected"), [("test", "the test split is empty"), ("train", "no training objects")])
@@ -151,3 +147,42 @@ def test_a_run_without_a_checkpoint_says_how_to_go_on(tmp_path):
     checkpoint.write_config(tmp_path, CONFIG)
     with pytest.raises(ValueError, match="no checkpoint yet; go on with `spnr train"):
         evaluation.evaluate(tmp_path, tiny_dataset.dataset())
+
+
+def test_any_number_of_methods_see_the_same_objects_and_are_scored_alike():
+    def half(cloud, camera):
+        size = (len(camera.cam_to_world), camera.height, camera.width)
+        return evaluation.Pictures(image=jnp.full((*size, 3), 0.5), acc=jnp.ones(size))
+
+    asked = {"grey": half, "also grey": half, "white": evaluation.floor("white")}
+    scores, gallery = evaluation.score_methods(asked, CONFIG, tiny_dataset.dataset(), NAMES, 1, print, None)
+    assert list(scores) == list(NAMES)
+    for by_method in scores.values():
+        assert list(by_method) == list(asked)
+        close(by_method["grey"], by_method["also grey"])
+    assert [result.name for result in gallery] == [NAMES[0]]
+
+
+def test_lpips_is_measured_with_weights_and_said_to_be_missing_without(outcome, tmp_path):
+    size = 32  # the smallest multiple of 8 that AlexNet takes
+    folder = tiny_dataset.write_dataset(tmp_path / "data", {"train": (), "val": (), "test": ("a", "b")}, size=size)
+    model = dataclasses.replace(CONFIG.model, image_resolution=size, resize_resolution=size // 2)
+    config = dataclasses.replace(CONFIG, model=model)
+    asked = {"white": evaluation.floor("white")}
+    dataset = data.open_dataset(folder)
+    (first, second) = evaluation.evaluate_objects(asked, config, dataset, ("a", "b"), WEIGHTS)
+    for result in (first, second):
+        image, reference = result.pictures["white"].image, jnp.asarray(result.reference)
+        close(result.scores["white"]["lpips"], lpips(jnp.asarray(image), reference, WEIGHTS), rtol=1e-4)
+    assert outcome.summary["methods"]["ours"]["lpips"] is None
+    assert outcome.summary["settings"]["metrics"]["LPIPS"] == NO_WEIGHTS
+
+
+def test_weights_change_what_the_settings_say(monkeypatch):
+    monkeypatch.setattr(evaluation, "score_methods", lambda *a: (dict.fromkeys(NAMES, RESULT), []))
+    found = evaluation.evaluate(tiny_dataset.run(), tiny_dataset.dataset(), say=lambda line: None, weights=WEIGHTS)
+    assert "AlexNet v0.1" in found.summary["settings"]["metrics"]["LPIPS"]
+    assert found.summary["methods"]["ours"]["lpips"] == 0.25
+
+
+RESULT = {method: {metric: np.full(2, 0.25) for metric in METRICS} for method in ("ours", *evaluation.FLOORS)}

@@ -1,6 +1,7 @@
 """The handle: any units, any number of points, one camera or many, and the same picture whatever the memory allows."""
 
 import dataclasses
+import inspect
 
 import jax
 import numpy as np
@@ -10,6 +11,7 @@ from laws import close
 
 import spnr_jax
 from spnr_jax import cameras, data, evaluation, model, training
+from spnr_jax.model_config import NPBGConfig, SamplingConfig
 from spnr_jax.types import Camera, PointCloud
 
 
@@ -82,14 +84,16 @@ def test_an_axis_of_views_holds_what_each_camera_sees_alone(handle):
 def test_the_handle_shows_what_the_evaluation_shows(handle):
     item = data.read_object(tiny_dataset.dataset(), "ball_000004")
     expected = evaluation.render_views(handle.variables, tiny_dataset.CONFIG, item.cloud, item.camera)
+    encoded = training.jitted_encode(
+        handle.variables, jax.tree.map(lambda x: jax.numpy.asarray(x)[None], item.cloud), config=handle.config
+    )
     volume = model.Volume(
-        features=training.jitted_encode(
-            handle.variables, jax.tree.map(lambda x: jax.numpy.asarray(x)[None], item.cloud), config=handle.config
-        )[0],
+        scene=jax.tree.map(lambda x: x[0], encoded),
         centre=jax.numpy.zeros(3),
         scale=jax.numpy.ones(()),
     )
-    close(handle.render(volume, jax.tree.map(jax.numpy.asarray, item.camera)), expected, atol=1e-5)
+    views = jax.tree.map(jax.numpy.asarray, item.camera)
+    close(handle.render(volume, views, "trained"), expected, atol=1e-5)
 
 
 def test_points_that_are_masked_do_not_count(handle):
@@ -131,3 +135,33 @@ def test_a_run_without_a_checkpoint_says_how_to_get_one(tmp_path):
     (tmp_path / "config.json").write_text((tiny_dataset.run() / "config.json").read_text())
     with pytest.raises(ValueError, match="no checkpoint yet.*spnr train"):
         spnr_jax.load(tmp_path)
+
+
+class TestQuality:
+    @pytest.mark.parametrize(("quality", "samples"), [("draft", 2), ("balanced", 4), ("best", 8)])
+    def test_a_quality_is_a_share_of_the_samples_near_the_points(self, quality, samples):
+        config = dataclasses.replace(tiny_dataset.CONFIG.model, sampling=SamplingConfig(num_coarse=4, num_fine=4))
+        expected = SamplingConfig(num_coarse=samples, num_fine=0, reach=3)
+        assert model.at_quality(config, quality, 3) == dataclasses.replace(config, sampling=expected)
+
+    def test_trained_is_the_config_of_the_network_and_so_is_every_quality_of_other_networks(self):
+        config = tiny_dataset.CONFIG.model
+        assert model.at_quality(config, "trained", 3) == config
+        assert model.at_quality(NPBGConfig(), "draft", 3) == NPBGConfig()
+
+    def test_another_word_is_refused(self):
+        unchecked = inspect.unwrap(model.at_quality)  # the tests' type check would refuse it first
+        with pytest.raises(ValueError, match="quality must be one of draft, balanced, best, trained, got fast"):
+            unchecked(tiny_dataset.CONFIG.model, "fast", 1)
+
+    @pytest.mark.parametrize("quality", ["draft", "balanced", "best", "trained"])
+    def test_every_quality_shows_the_object(self, handle, quality):
+        volume = handle.encode(example_cloud())
+        rendering = handle.render(volume, handle.camera(volume), quality)
+        assert np.isfinite(np.asarray(rendering.image)).all()
+        assert (np.asarray(rendering.acc) > 0).any()
+
+    def test_reach_follows_the_distance_between_the_points(self):
+        grid = np.stack(np.meshgrid(*[np.linspace(-1, 1, 9)] * 3), axis=-1).reshape(-1, 3)  # a quarter apart
+        assert [model.reach_of(grid, resolution) for resolution in (4, 8, 16, 64)] == [1, 2, 4, 4]
+        assert model.reach_of(grid[:1], 32) == model.LARGEST_REACH

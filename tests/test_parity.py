@@ -9,16 +9,17 @@ import numpy as np
 import pytest
 import twin
 
+from experiments import twin_layout
 from spnr_jax import cameras, compositing, losses, sampling, training, voxels
 from spnr_jax.nn.field import encode_direction
 from spnr_jax.renderer import Renderer
 
 TOLERANCE = 1e-4
 ARRAYS = twin.load()
-CONFIG = twin.train_config(ARRAYS)
-BATCH = jax.tree.map(jnp.asarray, twin.batch(ARRAYS))
-GENERATOR, STATISTICS = twin.generator(ARRAYS)
-DISCRIMINATOR = twin.discriminator(ARRAYS)
+CONFIG = twin_layout.train_config(ARRAYS)
+BATCH = jax.tree.map(jnp.asarray, twin_layout.batch(ARRAYS))
+GENERATOR, STATISTICS = twin_layout.generator(ARRAYS)
+DISCRIMINATOR = twin_layout.discriminator(ARRAYS)
 VARIABLES = {"params": GENERATOR, "batch_stats": STATISTICS}
 
 
@@ -44,15 +45,16 @@ def stages():
         module = renderer.bind(variables)
         resolution, counts = CONFIG.model.volume_resolution, CONFIG.model.sampling
         point_features = module.pointnet(module.point_inputs(cloud), cloud.mask, False)
-        volume = module.encode(cloud)
+        scene = module.encode(cloud)
+        volume = scene.volume
         rays = module.rays(camera)
         near, far, _ = cameras.intersect_box(rays.origins, rays.directions)
         view = module.field.view(rays.directions)
         coarse, edges = sampling.stratified(None, near, far, counts.num_coarse)
         positions = rays.origins[..., None, :] + coarse[..., None] * rays.directions[..., None, :]
-        density, rgb, _ = module.shade(volume, rays, coarse, view)
+        density, rgb, _ = module.shade(volume, rays, view, coarse)
         weights, _ = compositing.volume_weights(density, compositing.interval_lengths(coarse, far))
-        features, depth, acc = module.render_rays(volume, rays)
+        features, depth, acc = module.render_rays(scene, rays)
         return {
             "voxel": voxels.locate(cloud.positions, resolution),
             "point_features": point_features[0],
@@ -71,7 +73,7 @@ def stages():
             "features": features,
             "depth": depth,
             "acc": acc,
-            "rendering": module.render(volume, camera),
+            "rendering": module.render(scene, camera),
         }
 
     return run(VARIABLES, BATCH.cloud, BATCH.camera)

@@ -10,6 +10,7 @@ from spnr_jax import pictures
 OPTIONS = {
     "views": 2, "elevation": 20.0, "resolution": 24, "num_points": 30, "up": "y", "turntable": "gif", "frames": 5,
     "seed": 0,
+    "quality": "best",
 }  # fmt: skip
 STILLS = {f"chair_{i:03d}{kind}.png" for i in range(2) for kind in ("", "_depth", "_acc")}
 

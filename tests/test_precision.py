@@ -14,7 +14,7 @@ from tiny_training import BATCH, CONFIG, L1_ONLY, create, step
 
 from spnr_jax import training
 from spnr_jax.renderer import Renderer
-from spnr_jax.types import Rays
+from spnr_jax.types import Rays, Scene
 
 BF16_MODEL = dataclasses.replace(MODEL, precision="bfloat16")
 BF16 = dataclasses.replace(CONFIG, model=BF16_MODEL)
@@ -51,11 +51,11 @@ def test_statistics_of_the_normalisations_stay_float32():
 
 def test_points_field_sampling_and_compositing_stay_float32():
     rays = Rays(origins=numbers(0, 2, 6, 3), directions=numbers(1, 2, 6, 3))
-    volume = jnp.zeros((2, 8, 8, 8, 4))
+    scene = Scene(volume=jnp.zeros((2, 8, 8, 8, 4)), occupied=jnp.ones((2, 8, 8, 8), bool))
     variables = jax.eval_shape(lambda: Renderer(BF16_MODEL).init(jax.random.key(0), cloud(), camera(24)))
 
     def samples(variables, key):
-        return Renderer(BF16_MODEL).bind(variables).render_rays(volume, rays, key)
+        return Renderer(BF16_MODEL).bind(variables).render_rays(scene, rays, key)
 
     def points(variables):
         module = Renderer(BF16_MODEL).bind(variables)

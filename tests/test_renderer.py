@@ -18,7 +18,7 @@ from tiny_model import NUM_POINTS, camera, cloud, wobbled
 from spnr_jax import sampling, training
 from spnr_jax.cameras import intersect_box
 from spnr_jax.renderer import Renderer, union_weights
-from spnr_jax.types import Rays
+from spnr_jax.types import Rays, Scene
 
 CONFIG = tiny_model.WITHOUT_UPSAMPLER
 
@@ -30,6 +30,10 @@ def variables():
 
 def encode(variables, cloud, config=CONFIG):
     return training.jitted_encode(variables, cloud, config=config)
+
+
+def scene(volume):
+    return Scene(volume=volume, occupied=jnp.ones(volume.shape[:-1], bool))
 
 
 def render(variables, volume, camera, config=CONFIG, **options):
@@ -79,7 +83,7 @@ class TestCloud:
 
     def test_no_point_gives_a_finite_volume(self, variables):
         empty = dataclasses.replace(cloud(), mask=jnp.zeros((2, NUM_POINTS), bool))
-        assert jnp.isfinite(encode(variables, empty)).all()
+        assert jnp.isfinite(encode(variables, empty).volume).all()
 
     @pytest.mark.parametrize("materials", [(), ("roughness",), ("base_color", "metallic")], ids=str)
     def test_materials_that_the_config_leaves_out_are_not_read(self, materials):
@@ -147,10 +151,10 @@ class TestViews:
         away = camera(target=50.0)
 
         def total(variables, volume):
-            rendering = training.render(variables, volume, away, config=CONFIG)
+            rendering = training.render(variables, scene(volume), away, config=CONFIG)
             return jnp.sum(rendering.image) + jnp.sum(rendering.depth), rendering
 
-        volume = encode(variables, cloud())
+        volume = encode(variables, cloud()).volume
         (_, rendering), gradients = jax.jit(jax.value_and_grad(total, (0, 1), has_aux=True))(variables, volume)
         assert (rendering.image == 1).all()
         assert (rendering.image_lr == 1).all()
@@ -162,7 +166,7 @@ class TestViews:
         """Density is huge at every sample: opacity one, and the depth is that of the first sample."""
         solid = jax.tree.map(lambda x: x, variables)
         solid["params"]["field"]["head"]["bias"] = jnp.array([1e6, 0.0, 0.0, 0.0])
-        rendering = render(solid, jnp.zeros((2, 8, 8, 8, 4)), camera())
+        rendering = render(solid, scene(jnp.zeros((2, 8, 8, 8, 4))), camera())
         hit = np.asarray(rendering.depth) > 0
         assert hit.any()
         close(np.asarray(rendering.acc)[hit], np.ones(hit.sum()), atol=1e-5)

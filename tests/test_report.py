@@ -55,17 +55,22 @@ def row(seed: int) -> GalleryRow:
     reference = rng.integers(0, 256, (12, 16, 3)).astype(np.uint8)
     images = {name: rng.uniform(size=(12, 16, 3)) for name in ("ours", "splat", "nearest")}
     return GalleryRow(
-        name=f"object<{seed}>", reference=reference, depth=rng.uniform(2, 3, (6, 8)), acc=np.eye(6, 8), **images
+        name=f"object<{seed}>", reference=reference, depth=rng.uniform(2, 3, (6, 8)), acc=np.eye(6, 8), images=images
     )
 
 
 def table() -> dict:
     counts = {"objects": 3, "views": 30}
     return {
-        "ours": {"psnr": 21.125, "ssim": 0.91234, "cpsnr": 17.5, **counts},
-        "white": {"psnr": 13.0, "ssim": 0.95, "cpsnr": None, **counts},
-        "splat": {"psnr": 18.0, "ssim": 0.8, "cpsnr": float("nan"), **counts},
+        "ours": {"psnr": 21.125, "psnr_interval": [20.5, 21.75], "ssim": 0.91234, "cpsnr": 17.5, "flip": 0.1, **counts},
+        "white": {"psnr": 13.0, "psnr_interval": None, "ssim": 0.95, "cpsnr": None, "flip": 0.25, **counts},
+        "splat": {"psnr": 18.0, "ssim": 0.8, "cpsnr": float("nan"), "flip": 0.05, **counts},
     }
+
+
+def differences() -> dict:
+    found = {"mean": 3.125, "interval": [-0.5, 6.75], "p_value": 0.0123}
+    return {"splat": {"psnr": found, "lpips": None}, "white": {"psnr": found | {"interval": None, "p_value": None}}}
 
 
 def content(**changes) -> dict:
@@ -106,19 +111,17 @@ def test_the_gallery_shows_every_picture_of_every_row_in_the_order_of_its_heads(
     assert len(pictures) == 12
     for shown, wanted in ((pictures[:6], row(0)), (pictures[6:], row(1))):
         np.testing.assert_array_equal(shown[0], wanted.reference)
-        for image, expected in zip(shown[1:4], (wanted.ours, wanted.splat, wanted.nearest), strict=True):
+        for image, expected in zip(shown[1:4], wanted.images.values(), strict=True):
             np.testing.assert_allclose(image / 255, expected, atol=0.51 / 255)
         assert (shown[4][wanted.acc == 0] == 255).all()
         np.testing.assert_array_equal(shown[5], 255 * wanted.acc)
-    heads = [
-        text for text in page.all("th") if text in ("Reference", "Ours", "Base-colour splat", "Nearest point", "Depth")
-    ]
-    assert heads[:5] == ["Reference", "Ours", "Base-colour splat", "Nearest point", "Depth"]
+    heads = page.all("th")[:6]
+    assert heads == ["Reference", "Ours", "Base-colour splat", "Nearest-point shading", "Depth", "Opacity"]
 
 
 def test_numbers_below_pictures_are_their_psnr(tmp_path):
     wanted = row(0)
-    squared = np.mean((np.round(255 * wanted.ours) / 255 - wanted.reference / 255.0) ** 2)
+    squared = np.mean((np.round(255 * wanted.images["ours"]) / 255 - wanted.reference / 255.0) ** 2)
     assert write(tmp_path).all("small")[0] == f"{10 * np.log10(1 / squared):.1f}"
     assert psnr(wanted.reference, wanted.reference / 255) == pytest.approx(100)
 
@@ -126,10 +129,36 @@ def test_numbers_below_pictures_are_their_psnr(tmp_path):
 def test_the_best_value_of_each_metric_alone_is_bold_and_what_is_missing_is_not_a_number(tmp_path):
     page = write(tmp_path)
     bold = page.all("b")
-    assert [text for text in bold if not text.endswith(("dB", " s"))] == ["21.12", "17.50", "0.950"]
+    assert [text for text in bold if not text.endswith(("dB", " s"))] == ["21.12", "17.50", "0.950", "0.050"]
     assert page.all("td").count("n/a") == 2
     assert [text for text in page.all("td") if text in ("18.00", "0.800")] == ["18.00", "0.800"]
-    assert "Opacity IoU" not in page.all("th")
+    assert not any("Opacity IoU" in text or "LPIPS" in text for text in page.all("th"))
+
+
+def test_arrows_say_what_is_better_and_small_numbers_how_sure_it_is(tmp_path):
+    page = write(tmp_path)
+    assert {"PSNR, dB\u00a0\u2191", "FLIP\u00a0\u2193"} <= set(page.all("th"))
+    assert [text for text in page.all("small") if text.startswith("[")] == ["[20.50, 21.75]"]
+
+
+def test_an_lpips_that_was_not_measured_is_said_to_lack_weights(tmp_path):
+    methods = {name: row | {"lpips": None} for name, row in table().items()}
+    page = write(tmp_path, metrics={"methods": methods})
+    assert page.all("td").count("n/a (no weights)") == 3
+    page = write(tmp_path, metrics={"methods": methods | {"ours": table()["ours"] | {"lpips": 0.125}}})
+    assert "0.125" in page.all("b")
+    assert page.all("td").count("n/a (no weights)") == 2
+
+
+def test_differences_have_a_sign_an_interval_and_a_test(tmp_path):
+    page = write(tmp_path, metrics={"methods": table(), "ours_minus": differences()})
+    assert "Differences" in page.all("h2")
+    assert {"Ours minus base-colour splat", "Ours minus white image"} <= set(page.all("th"))
+    assert page.all("td").count("+3.12") == 2
+    assert {"[-0.50, +6.75]", "p = 0.012"} <= set(page.all("small"))
+    tiny = {"splat": {"psnr": {"mean": 3.0, "interval": [2.0, 4.0], "p_value": 0.0001}}}
+    page = write(tmp_path, metrics={"methods": table(), "ours_minus": tiny})
+    assert "p < 0.001" in page.all("small")
 
 
 def test_key_numbers_are_the_distances_to_the_floors_that_there_are(tmp_path):
@@ -179,7 +208,7 @@ def test_a_run_without_curve_pictures_or_categories_is_still_a_page(tmp_path):
 def test_a_picture_that_is_not_finite_leaves_the_old_report(tmp_path):
     write(tmp_path)
     before = (tmp_path / "report.html").read_bytes()
-    broken = dataclasses.replace(row(0), ours=np.full((12, 16, 3), np.nan))
+    broken = dataclasses.replace(row(0), images={"ours": np.full((12, 16, 3), np.nan)})
     with pytest.raises(ValueError, match="NaN"):
         write(tmp_path, gallery=[broken])
     assert (tmp_path / "report.html").read_bytes() == before

@@ -8,8 +8,9 @@ import pytest
 import tiny_dataset
 
 from spnr_jax import evaluation, results, trainer
+from spnr_jax.summary import METRICS
 
-NUMBERS = {"psnr", "ssim", "cpsnr", "iou", "objects", "views", "cpsnr_views"}
+NUMBERS = {"objects", "views", "cpsnr_views", *METRICS, *(f"{metric}_interval" for metric in METRICS)}
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +32,7 @@ def written(out, outcome):
 def test_metrics_json_has_exactly_these_keys(outcome, tmp_path):
     metrics = written(tmp_path, outcome)
     assert set(metrics) == {
-        "methods", "seconds", "preset", "steps", "seed", "hardware", "settings", "per_category",
+        "methods", "ours_minus", "seconds", "preset", "steps", "seed", "hardware", "settings", "per_category",
     }  # fmt: skip
     assert set(metrics["methods"]) == {"ours", "white", "splat", "nearest"}
     assert all(set(values) == NUMBERS for values in metrics["methods"].values())
@@ -61,13 +62,37 @@ def test_the_report_is_one_file_that_names_the_objects_and_the_best_floor(outcom
         assert name in page
     best = max(("white", "splat", "nearest"), key=lambda name: metrics["methods"][name]["psnr"])
     assert f"best trivial renderer ({best})" in page
+    found = metrics["ours_minus"][best]["psnr"]
+    assert (
+        f"{found['mean']:+.2f} dB [{found['interval'][0]:+.2f}, {found['interval'][1]:+.2f}] against the best" in page
+    )
+    assert page.count("n/a (no weights)") >= 4
+
+
+def test_intervals_are_pairs_around_plain_numbers(outcome, tmp_path):
+    ours = written(tmp_path, outcome)["methods"]["ours"]
+    for name in ("psnr", "ssim", "cpsnr", "flip", "iou"):
+        low, high = ours[f"{name}_interval"]
+        assert low <= ours[name] <= high
+
+
+def test_the_table_for_a_terminal_has_a_line_for_each_method_and_says_what_is_missing(outcome):
+    methods = outcome.summary["methods"]
+    lines = results.text_table(methods)
+    assert [line.split()[0] for line in lines] == list(methods)
+    for line, row in zip(lines, methods.values(), strict=True):
+        assert f"PSNR {row['psnr']:.2f} " in line
+        assert f"FLIP {row['flip']:.3f} " in line
+        assert "LPIPS n/a (no weights)" in line
 
 
 def test_a_gallery_row_is_the_view_of_the_median_psnr(outcome):
     result = outcome.gallery[0]
     psnr = np.array([30.0, 10.0, 20.0], np.float32)
-    scores = result.scores | {"ours": dataclasses.replace(result.scores["ours"], psnr=psnr)}
+    scores = result.scores | {"ours": result.scores["ours"] | {"psnr": psnr}}
     row = results.gallery_row(dataclasses.replace(result, scores=scores))
     np.testing.assert_array_equal(row.reference, result.reference[2])
-    np.testing.assert_array_equal(row.ours, result.images["ours"][2])
-    np.testing.assert_array_equal(row.depth, result.depth[2])
+    assert set(row.images) == {"ours", "splat", "nearest"}
+    for method, image in row.images.items():
+        np.testing.assert_array_equal(image, result.pictures[method].image[2])
+    np.testing.assert_array_equal(row.depth, result.pictures["ours"].depth[2])

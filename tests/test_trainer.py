@@ -1,5 +1,6 @@
 """The loop: stopped anywhere, it goes on to the same numbers; what breaks it is named and leaves a good state."""
 
+import dataclasses
 import errno
 import json
 import os
@@ -14,7 +15,10 @@ import tiny_dataset
 from laws import same_bits
 from tiny_dataset import CONFIG, SCHEDULE
 
-from spnr_jax import checkpoint, cli, data, trainer, training
+import spnr_jax
+from spnr_jax import checkpoint, cli, data, evaluation, trainer, training
+from spnr_jax.config import LossConfig
+from spnr_jax.model_config import NPBGConfig, PointNeRFConfig
 
 KEPT_STEPS = {"2", "4", "6"}
 
@@ -176,3 +180,33 @@ def test_a_state_that_is_not_finite_is_named_though_every_loss_is(monkeypatch, t
     with pytest.raises(trainer.NotFinite, match="batch_stats_pointnet_norm_0_variance is inf at step 2"):
         trainer.train(CONFIG, tiny_dataset.dataset(), tmp_path, SCHEDULE)
     assert not (tmp_path / "checkpoints").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["npbg", "point_nerf"])
+def test_a_baseline_is_trained_resumed_previewed_evaluated_and_loaded_like_ours(name, monkeypatch, tmp_path):
+    model = {
+        "npbg": NPBGConfig(encoder_widths=(8, 9), decoder_widths=(4,), image_resolution=tiny_dataset.SIZE),
+        "point_nerf": PointNeRFConfig(
+            num_candidates=8, num_samples=4, width=8, color_width=8, image_resolution=tiny_dataset.SIZE
+        ),
+    }[name]
+    loss = LossConfig(l1_weight=1.0, adversarial_weight=0.0, pixel="mse", masked=name == "point_nerf")
+    config = dataclasses.replace(CONFIG, model=model, loss=loss, pixel_stride=4 if name == "point_nerf" else 1)
+    dataset, whole, broken = tiny_dataset.dataset(), tmp_path / "whole", tmp_path / "broken"
+    trainer.train(config, dataset, whole, SCHEDULE)
+    with monkeypatch.context() as patch:
+        interrupted(patch, 3)
+        with pytest.raises(KeyboardInterrupt):
+            trainer.train(config, dataset, broken, SCHEDULE)
+    trainer.train(config, dataset, broken, SCHEDULE)
+    same_bits(checkpoint.restore(broken, config), checkpoint.restore(whole, config))
+    assert (whole / "previews" / "0000006.png").is_file()
+    outcome = evaluation.evaluate(whole, dataset, say=lambda line: None)
+    assert np.isfinite(next(iter(outcome.summary["methods"].values()))["psnr"])
+    handle = spnr_jax.load(whole)
+    item = data.read_object(dataset, "ball_000004")
+    volume = handle.encode(item.cloud)
+    rendering = handle.render(volume, handle.camera(volume))
+    assert rendering.image.shape == (tiny_dataset.SIZE, tiny_dataset.SIZE, 3)
+    assert np.isfinite(np.asarray(rendering.image)).all()

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,9 +12,11 @@ from laws import close, numbers, same_bits
 from tiny_model import MODEL, SIZE
 from tiny_training import BATCH, CONFIG, L1_ONLY, copied, create, run, step
 
-from spnr_jax import losses, training
-from spnr_jax.config import OptimizerConfig
+from spnr_jax import cameras, losses, training
+from spnr_jax.config import LossConfig, OptimizerConfig
+from spnr_jax.model_config import NPBGConfig, PointNeRFConfig
 from spnr_jax.renderer import Renderer
+from spnr_jax.types import Rendering
 
 
 @pytest.fixture(scope="module")
@@ -219,6 +222,94 @@ class TestLearningRate:
                 expected = 2e-3 * (0.1 + 0.9 * 0.5 * (1 + np.cos(np.pi * share)))
             assert float(rate(at)) == pytest.approx(expected, rel=1e-5)
         assert float(rate(0)) > 0, "no step is lost"
+
+    def test_or_by_an_exponential(self):
+        """Point-NeRF's: a tenth after half a million of a million steps."""
+        o = OptimizerConfig(lr_generator=5e-4, warmup_steps=0, final_lr_scale=0.01, decay="exponential")
+        rate = training.learning_rate(dataclasses.replace(CONFIG, optimizer=o, num_steps=1_000_000))
+        for at, expected in ((0, 5e-4), (500_000, 5e-5), (1_000_000, 5e-6)):
+            assert float(rate(at)) == pytest.approx(expected, rel=1e-4)
+
+    def test_the_algorithm_is_the_one_asked_for(self):
+        gradient, updates = jnp.array([0.5, -2.0]), {}
+        for name, algorithm in (("adam", optax.adam), ("radam", optax.radam)):
+            config = dataclasses.replace(CONFIG, optimizer=dataclasses.replace(CONFIG.optimizer, algorithm=name))
+            expected = algorithm(training.learning_rate(config))
+            ours, _ = training.optimizers(config)
+            updates[name], _ = ours.update(gradient, ours.init(gradient))
+            close(updates[name], expected.update(gradient, expected.init(gradient))[0])
+        assert (updates["adam"] != updates["radam"]).all()
+
+
+class TestLattice:
+    def test_is_every_so_many_th_pixel_of_picture_condition_and_rays(self):
+        made, firsts = jax.jit(training.lattice, static_argnums=2), set()
+        whole = cameras.camera_rays(BATCH.camera).directions
+        for seed in range(6):
+            thin = made(jax.random.key(seed), BATCH, 4)
+            assert thin.image.shape == (2, 1, SIZE // 4, SIZE // 4, 3)
+            rays = cameras.camera_rays(thin.camera).directions
+            distance = np.abs(np.asarray(whole[0, 0]) - np.asarray(rays[0, 0, 0, 0])).sum(-1)
+            row, column = np.unravel_index(distance.argmin(), distance.shape)
+            assert max(row, column) < 4
+            firsts.add((row, column))
+            close(rays, whole[:, :, row::4, column::4], atol=1e-6)
+            for name in ("image", "condition", "condition_mask"):
+                same_bits(getattr(thin, name), getattr(BATCH, name)[:, :, row::4, column::4])
+            same_bits(thin.cloud, BATCH.cloud)
+        assert len(firsts) > 3, "another first pixel for another key"
+
+
+class TestPixelError:
+    def test_is_the_mean_of_what_the_config_asks_for(self):
+        image, reference = numbers(0, 2, 1, 4, 4, 3), numbers(1, 2, 1, 4, 4, 3)
+        for pixel, expected in (("l1", np.abs(image - reference)), ("mse", (image - reference) ** 2)):
+            config = dataclasses.replace(L1_ONLY, loss=dataclasses.replace(L1_ONLY.loss, pixel=pixel))
+            close(training.pixel_error(config, image, reference), expected.mean())
+            seen = jnp.arange(32).reshape(2, 1, 4, 4) % 5 == 0
+            close(training.pixel_error(config, image, reference, seen), expected[np.asarray(seen)].mean())
+            assert training.pixel_error(config, image, reference, jnp.zeros_like(seen)) == 0
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class OneColorConfig(NPBGConfig):
+    """A network of one weight, to see what the step asks of a network."""
+
+
+class OneColor(nn.Module):
+    config: OneColorConfig
+
+    @nn.compact
+    def __call__(self, cloud, camera, key=None, train=False):
+        grey = self.param("grey", nn.initializers.constant(0.25), ())
+        self.sow("losses", "size", 3 * grey**2)
+        image = jnp.full((*camera.cam_to_world.shape[:-2], camera.height, camera.width, 3), grey)
+        return Rendering(image=image, image_lr=image, depth=image[..., 0], acc=image[..., 0])
+
+
+def test_a_method_is_a_network_and_a_loss(monkeypatch):
+    """One weight g, no statistics: the gradient of 2 mean (g - reference)^2 + 3 g^2, written out."""
+    monkeypatch.setitem(training.NETWORKS, OneColorConfig, OneColor)
+    config = dataclasses.replace(
+        L1_ONLY,
+        model=OneColorConfig(image_resolution=32),
+        loss=LossConfig(l1_weight=2.0, adversarial_weight=0.0, pixel="mse"),
+    )
+    state = create(config)
+    assert (state.generator, state.batch_stats) == ({"grey": 0.25}, {})
+    after, metrics = step(state, config)
+    reference = np.float64(BATCH.image)
+    expected = 2 * np.mean((0.25 - reference) ** 2) + 3 * 0.25**2
+    assert float(metrics["loss"]) == pytest.approx(expected, rel=1e-5)
+    assert float(metrics["size"]) == pytest.approx(3 * 0.25**2)
+    gradient = 4 * np.mean(0.25 - reference) + 6 * 0.25
+    close(after.generator_optimizer[0].mu["grey"], 0.1 * gradient, rtol=1e-4)
+    assert after.averaged["grey"] != after.generator["grey"]
+
+
+def test_a_network_of_rays_is_shown_in_chunks_and_one_of_pictures_whole():
+    assert {PointNeRFConfig().ray_chunk, NPBGConfig.ray_chunk, MODEL.ray_chunk} == {256, None, 1024}
+    assert isinstance(training.network(MODEL), Renderer)
 
 
 class TestReproducibility:

@@ -1,0 +1,231 @@
+"""What speed costs in quality: a trained network rendered in many ways, and which of them nothing beats.
+
+    python -m experiments.speed_accuracy DATA RUN [RUN ...] [--out runs/speed_accuracy] [--objects 24]
+
+Every run is rendered as it was trained, and with other sample counts, with samples near the points alone, with fewer
+rays, in bfloat16 and from other numbers of points.  Runs of other volume resolutions or widths add their own points.
+Writes results.json after every setting (an interrupted call goes on), table.md, and front.png: PSNR, SSIM and FLIP
+against milliseconds a view, and PSNR against memory.
+
+ms a view   median over objects of the fastest of several renderings of one view, the volume encoded before
+ms encode   the same for the volume
+MB          temporary memory of the compiled rendering
+front       settings that no other beats in both PSNR and ms a view; its knee lies farthest above the line from its
+            cheapest to its best, PSNR against the logarithm of the time
+"""
+
+import dataclasses
+import io
+import json
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+from matplotlib.figure import Figure
+
+from spnr_jax import checkpoint, cli, data, evaluation, training
+from spnr_jax.config import TrainConfig
+from spnr_jax.images import write_whole
+from spnr_jax.model_config import ModelConfig, SamplingConfig
+
+REPEATS = 5
+TIMED_OBJECTS = 8
+GROUPS = {  # of settings, as the plot colours them
+    "trained": "#1d2330",
+    "samples": "#2457d6",
+    "near points": "#2f9e44",
+    "rays": "#d9480f",
+    "bfloat16": "#9c36b5",
+    "points": "#868e96",
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class SpeedAccuracy:
+    """Render trained networks in many ways and draw quality against cost."""
+
+    data: tyro.conf.Positional[Path]
+    """Folder of the data set; its test objects are rendered."""
+    runs: tyro.conf.Positional[tuple[Path, ...]]
+    """Run folders."""
+    out: Path = Path("runs/speed_accuracy")
+    """Folder of results.json, table.md and front.png."""
+    objects: int = 24
+    """Test objects, evenly out of the split."""
+    quick: bool = False
+    """A few settings of the first run, for a test."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Setting:
+    """A way to render a run."""
+
+    group: str
+    name: str
+    config: TrainConfig
+
+
+def settings(config: TrainConfig) -> list[Setting]:
+    """Every way to render a network, the trained one first."""
+    model = config.model
+    assert isinstance(model, ModelConfig)
+
+    def variant(group: str, name: str, points: int = config.test_points, **fields) -> Setting:
+        changed = dataclasses.replace(config, test_points=points, model=dataclasses.replace(model, **fields))
+        return Setting(group=group, name=name, config=changed)
+
+    def samples(coarse: int, fine: int, reach: int = 0) -> SamplingConfig:
+        return dataclasses.replace(model.sampling, num_coarse=coarse, num_fine=fine, reach=reach)
+
+    total = model.sampling.num_coarse + model.sampling.num_fine
+    halves = [max(total // k, 2) for k in (1, 2, 4)]
+    near = [SamplingConfig(num_coarse=n, num_fine=0, reach=r) for r in (1, 2, 3) for n in (*halves, total // 8 + 1)]
+    size = model.render_resolution
+    return [
+        variant("trained", "as trained"),
+        *(
+            variant("samples", f"{n // 2} + {n // 2}", sampling=samples(n // 2, n // 2))
+            for n in (2 * total, *halves[1:])
+        ),
+        *(variant("samples", f"{n} + 0", sampling=samples(n, 0)) for n in halves[:2]),
+        *(variant("near points", f"{s.num_coarse} within {s.reach}", sampling=s) for s in near),
+        *(
+            variant("rays", f"{n} x {n} rays", render_resolution=n)
+            for n in (size // 2, size * 3 // 4)
+            if model.upsamples
+        ),
+        variant("bfloat16", "bfloat16", precision="bfloat16"),
+        *(variant("points", f"{n} points", points=n) for n in (256, 512, 2048, 4096)),
+    ]
+
+
+def main(options: SpeedAccuracy) -> None:
+    """Measures what results.json lacks, then writes the table and the plot."""
+    cli.enable_compilation_cache()
+    dataset = data.open_dataset(options.data)
+    split = dataset.splits["test"]
+    if not split:
+        raise ValueError(f"{options.data}: the test split is empty; generate more objects")
+    names = tuple(split[round(i)] for i in np.linspace(0, len(split) - 1, min(options.objects, len(split))))
+    place = options.out / "results.json"
+    rows: list[dict] = json.loads(place.read_text())["rows"] if place.exists() else []
+    todo = [(run, setting) for run in options.runs for setting in settings(checkpoint.read_config(run))]
+    todo = todo[:: len(todo) // 4] if options.quick else todo
+    loaded: dict[Path, dict] = {}
+    begin, measured = time.monotonic(), 0
+    for i, (run, setting) in enumerate(todo):
+        if any((row["run"], row["name"]) == (str(run), setting.name) for row in rows):
+            continue
+        if run not in loaded:
+            loaded[run] = training.averaged_variables(checkpoint.load_run(run)[1])
+        figures = measure(loaded[run], setting.config, dataset, names)
+        rows.append({"run": str(run), "group": setting.group, "name": setting.name, **figures})
+        write_whole(place, (json.dumps(header(names) | {"rows": rows}, indent=1) + "\n").encode())
+        measured += 1
+        left = (time.monotonic() - begin) / measured * (len(todo) - i - 1)
+        print(f"{run.name}: {setting.name}: {figures['psnr']:.2f} dB, {figures['ms_view']:.2f} ms; {left:.0f} s left")
+    chosen = front(rows)
+    write_whole(options.out / "table.md", table(rows, chosen).encode())
+    write_whole(options.out / "front.png", plot(rows, chosen))
+    print(f"wrote {options.out / 'table.md'} and {options.out / 'front.png'}; knee: {rows[knee(rows, chosen)]['name']}")
+
+
+def header(names: tuple[str, ...]) -> dict:
+    """What the figures stand on."""
+    return {"hardware": evaluation.hardware(), "date": time.strftime("%Y-%m-%d"), "objects": len(names)}
+
+
+def measure(variables: dict, config: TrainConfig, dataset: data.Dataset, names: tuple[str, ...]) -> dict[str, float]:
+    """Mean scores over the objects' images, times and memory of one setting."""
+    show = {"ours": evaluation.network(variables, config)}
+    scores = [result.scores["ours"] for result in evaluation.evaluate_objects(show, config, dataset, names)]
+    means = {m: float(np.mean(np.concatenate([s[m] for s in scores]))) for m in ("psnr", "ssim", "flip", "iou")}
+    model, encodes, views = config.model, [], []
+    for name in names[:TIMED_OBJECTS]:
+        item = data.read_object(dataset, name)
+        cloud = jax.tree.map(lambda x: jnp.asarray(x)[None], evaluation.test_cloud(item, config))
+        camera = jax.tree.map(lambda x: jnp.asarray(x)[None, :1], item.camera)
+        encodes.append(fastest(lambda c=cloud: training.jitted_encode(variables, c, config=model)))
+        scene = training.jitted_encode(variables, cloud, config=model)
+        views.append(fastest(lambda s=scene, c=camera: training.jitted_render(variables, s, c, config=model)))
+    analysis = training.jitted_render.lower(variables, scene, camera, config=model).compile().memory_analysis()
+    memory = analysis.temp_size_in_bytes / 2**20 if analysis else float("nan")
+    times = {"ms_view": float(np.median(views)), "ms_encode": float(np.median(encodes))}
+    return {name: round(value, 4) for name, value in (means | times | {"temporary_mb": memory}).items()}
+
+
+def fastest(work: Callable) -> float:
+    """Milliseconds of the fastest of several calls; the first one, which compiles, does not count."""
+    jax.block_until_ready(work())
+    times = []
+    for _ in range(REPEATS):
+        start = time.perf_counter()
+        jax.block_until_ready(work())
+        times.append(1000 * (time.perf_counter() - start))
+    return min(times)
+
+
+def front(rows: list[dict]) -> list[int]:
+    """Rows that no other beats in PSNR and time, cheapest first."""
+    order = sorted(range(len(rows)), key=lambda i: (rows[i]["ms_view"], -rows[i]["psnr"]))
+    chosen: list[int] = []
+    for i in order:
+        if not chosen or rows[i]["psnr"] > rows[chosen[-1]]["psnr"]:
+            chosen.append(i)
+    return chosen
+
+
+def knee(rows: list[dict], chosen: list[int]) -> int:
+    """The row of the front that lies farthest above the line from its cheapest to its best."""
+    x = np.log([rows[i]["ms_view"] for i in chosen])
+    y = np.array([rows[i]["psnr"] for i in chosen])
+    x, y = ((v - v[0]) / (v[-1] - v[0]) if v[-1] != v[0] else np.zeros_like(v) for v in (x, y))
+    return chosen[int(np.argmax(y - x))]
+
+
+def table(rows: list[dict], chosen: list[int]) -> str:
+    """Markdown; settings of the front are marked, and differences are to the run as trained."""
+    lines = ["| run | setting | PSNR, dB | SSIM | FLIP | IoU | ms a view | ms encode | MB |", "|---|---|" + "---:|" * 7]
+    for i, row in enumerate(rows):
+        base = next((r for r in rows if r["run"] == row["run"] and r["group"] == "trained"), row)
+        mark = " (front, knee)" if chosen and i == knee(rows, chosen) else " (front)" if i in chosen else ""
+        change = "" if row is base else f" ({row['psnr'] - base['psnr']:+.2f})"
+        lines.append(
+            f"| {Path(row['run']).name} | {row['name']}{mark} | {row['psnr']:.2f}{change} | {row['ssim']:.3f} "
+            f"| {row['flip']:.3f} | {row['iou']:.3f} | {row['ms_view']:.1f} | {row['ms_encode']:.1f} "
+            f"| {row['temporary_mb']:.0f} |"
+        )
+    return "\n".join(lines) + "\n"
+
+
+def plot(rows: list[dict], chosen: list[int]) -> bytes:
+    """PNG of quality against cost."""
+    figure = Figure(figsize=(14, 3.6), layout="constrained")
+    labels = {"psnr": "PSNR, dB", "ssim": "SSIM", "flip": "FLIP (lower is better)"}
+    panels = [("ms_view", "psnr"), ("ms_view", "ssim"), ("ms_view", "flip"), ("temporary_mb", "psnr")]
+    for axes, (x, y) in zip(figure.subplots(1, 4), panels, strict=True):
+        for group, color in GROUPS.items():
+            shown = [row for row in rows if row["group"] == group]
+            axes.scatter([r[x] for r in shown], [r[y] for r in shown], color=color, s=26, label=group, zorder=3)
+        if (x, y) == ("ms_view", "psnr"):
+            axes.plot([rows[i][x] for i in chosen], [rows[i][y] for i in chosen], color="#adb5bd", zorder=2)
+            best = rows[knee(rows, chosen)]
+            axes.annotate(f"knee: {best['name']}", (best[x], best[y]), xytext=(6, -14), textcoords="offset points")
+            axes.legend(fontsize=7, loc="lower right")
+        axes.set_xscale("log")
+        axes.set_xlabel("ms a view" if x == "ms_view" else "MB of temporary memory")
+        axes.set_ylabel(labels[y])
+        axes.grid(alpha=0.2)
+    out = io.BytesIO()
+    figure.savefig(out, format="png", dpi=110)
+    return out.getvalue()
+
+
+if __name__ == "__main__":
+    sys.exit(cli.guarded(lambda: main(tyro.cli(SpeedAccuracy)), "speed_accuracy"))
