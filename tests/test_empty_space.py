@@ -80,6 +80,12 @@ class TestPath:
         at = jnp.array([[0.0, 0.3, 1.0]] * 3) * (self.far - self.near)[:, None]
         close(distance_at(path, at), self.near[:, None] + at, atol=1e-6)
 
+    def test_paths_have_no_gradient(self):
+        def ends(far):
+            return jnp.sum(open_path(jnp.ones((4, 4, 4), bool), self.rays, self.near, far, 5).edges)
+
+        assert (jax.grad(ends)(self.far) == 0).all()
+
     def test_each_object_has_its_own_voxels(self):
         grids = jnp.array(RNG.random((2, 4, 4, 4)) < 0.5)
         rays, near, far = jax.tree.map(lambda x: jnp.stack([x, x]), (self.rays, self.near, self.far))

@@ -7,7 +7,8 @@ import pytest
 import reference
 from laws import close, gradient_law, numbers
 
-from spnr_jax.nn.normalization import BatchNorm, GroupNorm
+from spnr_jax.nn.normalization import BatchNorm, GroupNorm, group_norm
+from spnr_jax.numerics import per_feature
 
 X = 3 * numbers(0, 2, 6, 4) + 1
 ALL = jnp.ones((2, 6), bool)
@@ -92,6 +93,28 @@ class TestGroupNorm:
 
     def test_its_gradients_are_right(self):
         gradient_law(self.apply, numbers(8, 2, 3, 2, 8))
+
+    def test_its_gradients_and_theirs_are_those_of_the_plain_form(self):
+        def plain(x, scale, bias):
+            groups = x.reshape(2, 6, 4, 2)
+            centred = groups - groups.mean((1, 3), keepdims=True)
+            out = centred / jnp.sqrt(jnp.mean(centred**2, (1, 3), keepdims=True) + 1e-5)
+            return out.reshape(x.shape) * per_feature(scale, x) + per_feature(bias, x)
+
+        def ours(x, scale, bias):
+            return group_norm(x, scale, bias, 4)
+
+        x, weights = 2 * numbers(9, 2, 6, 8) + 1, numbers(10, 2, 6, 8)
+
+        def gradient(f, *arguments):
+            return jax.grad(lambda *a: jnp.sum(jnp.sin(f(*a) * weights)), (0, 1, 2))(*arguments)
+
+        def second(f, *arguments):
+            return jax.grad(lambda *a: sum(jnp.sum(g**2) for g in gradient(f, *a)), (0, 1, 2))(*arguments)
+
+        for derivative in (gradient, second):
+            expected = derivative(plain, x, self.params["scale"], self.params["bias"])
+            close(derivative(ours, x, self.params["scale"], self.params["bias"]), expected, rtol=1e-3, atol=1e-4)
 
     def test_a_constant_input_gives_the_bias_with_a_finite_gradient(self):
         x = jnp.full((1, 3, 3, 8), 7.0)
