@@ -12,13 +12,8 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
-
-# Entry [p, t, k] is 1 where fine tap k falls on coarse tap t for outputs of parity p, after every pixel was repeated
-# twice: output 2i + p reads the fine pixels 2i + p - 1 .. 2i + p + 1, which are the coarse ones i - 1 + p and i + p.
-REPEAT_FOLD = np.array([[[1, 0, 0], [0, 1, 1]], [[1, 1, 0], [0, 0, 1]]], np.float32)
 
 kernel_init = jax.nn.initializers.he_normal(in_axis=-2, out_axis=-1)
 
@@ -113,7 +108,10 @@ def upsample_conv(
     n, space = x.ndim - 2, x.shape[1:-1]
     features_in, features_out = kernel.shape[-2:]
     for axis in range(n):  # 3 fine taps -> 2 coarse taps in place, the parity appended
-        kernel = jnp.moveaxis(jnp.tensordot(kernel, REPEAT_FOLD, axes=([axis], [2])), -1, axis)
+        # output 2i + p reads the fine pixels 2i + p - 1 .. 2i + p + 1, which are the coarse ones i - 1 + p and i + p
+        first, middle, last = (lax.slice_in_dim(kernel, k, k + 1, axis=axis) for k in range(3))
+        even, odd = (first, middle + last), (first + middle, last)
+        kernel = jnp.stack([jnp.concatenate(taps, axis=axis) for taps in (even, odd)], axis=-1)
     kernel = jnp.moveaxis(kernel, range(n + 2, 2 * n + 2), range(n + 1, 2 * n + 1))
     out = conv(x, kernel.reshape(*[2] * n, features_in, -1), bf16=bf16)
     parts = out.reshape(*out.shape[:-1], *[2] * n, features_out)  # parities stand in axes n + 1 .. 2n

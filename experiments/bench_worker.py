@@ -1,0 +1,129 @@
+"""A side of the benchmark in a process of its own, asked for one turn at a time: the standard library alone.
+
+The child makes its function, runs it until it is warm, and then waits for lines on stdin; each names the seconds of a
+turn and is answered by one line of JSON.  Between turns it must not spin: every answer says how much processor time
+passed while it waited (a few ms at most with the defaults of OpenMP and XLA, so none is changed).  Peak memory is that
+of the turns; what making the function took (a compiler takes more than the function) is given back before.
+"""
+
+import ctypes
+import gc
+import json
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import IO, Any
+
+FEWEST = 3  # timed runs of a turn
+M_TRIM_THRESHOLD, M_MMAP_MAX = -1, -4  # of glibc's mallopt
+
+
+class Worker:
+    """The parent's end of a child: `facts` is what it said of itself, `turn` asks it to work."""
+
+    def __init__(self, name: str, process: subprocess.Popen, errors: IO[str]) -> None:
+        """Waits until the child is ready; ValueError with its last words if it stops."""
+        self._name, self._process, self._errors = name, process, errors
+        self.facts = self._answer()
+
+    def turn(self, seconds: float) -> dict[str, Any]:
+        """{"ms": each run's, "peak_mb", "idle_cpu_s": processor time since the last turn}."""
+        assert self._process.stdin is not None
+        with suppress(BrokenPipeError):  # the missing answer says why
+            self._process.stdin.write(f"{seconds}\n")
+            self._process.stdin.flush()
+        return self._answer()
+
+    def _answer(self) -> dict[str, Any]:
+        assert self._process.stdout is not None
+        line = self._process.stdout.readline()
+        if not line:
+            code = self._process.wait()
+            self._errors.seek(0)
+            words = self._errors.read().strip().splitlines() or ["it said nothing"]
+            raise ValueError(f"{self._name} stopped with code {code}: {words[-1]}")
+        return json.loads(line)
+
+
+@contextmanager
+def worker(module: str, spec: dict) -> Iterator[Worker]:
+    """The child `python -m module SPEC`, ready to be asked; it ends with the block."""
+    # no persistent compilation cache: its hits would be taken for the compiler's time
+    settings = {"JAX_PLATFORMS": "cpu", "JAX_ENABLE_COMPILATION_CACHE": "false"}
+    with (
+        tempfile.TemporaryFile("w+") as errors,
+        subprocess.Popen(
+            [sys.executable, "-m", module, json.dumps(spec)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=errors,
+            text=True,
+            env=os.environ | settings | {"OMP_NUM_THREADS": str(spec["threads"])},
+        ) as process,
+    ):
+        try:
+            yield Worker(f"{module} ({spec['preset']}, {spec['mode']})", process, errors)
+        finally:
+            process.kill()
+
+
+def serve(make: Callable[[dict], tuple[Callable[[], object], dict]]) -> None:
+    """The child's end: `make` turns the spec into (function to time, facts), the rest is said above."""
+    spec = json.loads(sys.argv[1])
+    answers = os.fdopen(os.dup(1), "w", buffering=1)
+    os.dup2(2, 1)  # what a library prints is no answer
+    keep_memory()
+    os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[: spec["threads"]])
+    start = time.perf_counter()
+    run, facts = make(spec)
+    forget_peak()
+    print(json.dumps(facts | {"start_s": round(time.perf_counter() - start, 1)}), file=answers)
+    rested = time.process_time()
+    for line in sys.stdin:
+        idle = time.process_time() - rested
+        answer = {"ms": turn(run, float(line)), "peak_mb": peak_mb(), "idle_cpu_s": round(idle, 4)}
+        rested = time.process_time()
+        print(json.dumps(answer), file=answers)
+
+
+def turn(run: Callable[[], object], seconds: float) -> list[float]:
+    """Milliseconds of each run until so many seconds are full; one run before them refills the caches."""
+    run()
+    taken: list[float] = []
+    while len(taken) < FEWEST or sum(taken) < 1e3 * seconds:
+        start = time.perf_counter()
+        run()
+        taken.append(round(1e3 * (time.perf_counter() - start), 3))
+    return taken
+
+
+def keep_memory() -> None:
+    """Has glibc keep freed memory in the process: no page faults in every step."""
+    libc = ctypes.CDLL(None)
+    if hasattr(libc, "mallopt"):
+        libc.mallopt(M_MMAP_MAX, 0)
+        libc.mallopt(M_TRIM_THRESHOLD, 2**31 - 1)
+
+
+def forget_peak() -> None:
+    """Gives unused memory back and has the kernel count the peak from here on, where it can (Linux)."""
+    gc.collect()
+    libc, counter = ctypes.CDLL(None), Path("/proc/self/clear_refs")
+    if hasattr(libc, "malloc_trim") and counter.exists():
+        libc.malloc_trim(0)
+        counter.write_text("5")
+
+
+def peak_mb() -> int:
+    """Largest resident memory since `forget_peak`, in MB of 2^20 bytes; since the start where that does nothing."""
+    status = Path("/proc/self/status")
+    if status.exists():
+        line = next(line for line in status.read_text().splitlines() if line.startswith("VmHWM"))
+        return int(line.split()[1]) // 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
