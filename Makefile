@@ -1,6 +1,9 @@
 # Everything a person does here.  Each target makes its own environment in .venv from constraints.txt.
 #   make demo                generate, train, evaluate, report: runs/demo/report.html
 #   make demo MESHES=DIR     the same on a folder of .glb .gltf .obj .ply files: runs/demo-NAME/report.html
+#   make table1              the paper's Table 1, every method trained and scored: runs/table1-tiny/table1.html
+#   make table1 DATA=DIR BUDGET=quick|tiny|paper TABLE1='--minutes 10'   on your data, with more options
+#   make bench               time the network beside a PyTorch twin: runs/bench.md (BENCH="--twin FILE --quick")
 #   make test                the everyday suite      make test-all   with the slow tests
 #   make check               format, lint, types, tests
 #   make mutants             break the kernels on purpose; every fault has to be caught by the tests
@@ -11,8 +14,12 @@ MESHES ?=
 TEST_LIST ?=
 OUT ?= runs/demo$(if $(MESHES),-$(notdir $(patsubst %/,%,$(MESHES))))
 DEMO ?=
+BENCH ?=
+DATA ?=
+BUDGET ?= tiny
+TABLE1 ?=
 
-.PHONY: setup demo test test-all lint format types check mutants clean
+.PHONY: setup demo table1 bench test test-all lint format types check mutants clean
 
 setup: .venv/complete
 
@@ -20,11 +27,20 @@ setup: .venv/complete
 	@begin=$$(date +%s); \
 	test -x $(PY) || $(PYTHON) -m venv .venv; \
 	echo "installing into .venv (about a minute)"; \
-	$(PY) -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[data,dev]' && \
+	$(PY) -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[data,baselines,dev]' && \
 	echo $$(( $$(date +%s) - begin )) > .venv/install_seconds && touch $@
 
 demo: setup
 	$(PY) -m experiments.demo --out $(OUT) $(if $(MESHES),--meshes $(MESHES)) $(if $(TEST_LIST),--test-list $(TEST_LIST)) $(DEMO)
+
+table1: OUT = runs/table1-$(BUDGET)$(if $(DATA),-$(notdir $(patsubst %/,%,$(DATA))))
+table1: setup
+	$(if $(DATA),,$(PY) -m data_gen generate $(OUT)/data --objects 240 --spp 24 --visibility-grid 2 \
+		--resolution $(if $(filter paper,$(BUDGET)),128,64))
+	$(PY) -m experiments.table1 --data $(or $(DATA),$(OUT)/data) --out $(OUT) --budget $(BUDGET) $(TABLE1)
+
+bench: setup
+	$(PY) -m experiments.bench $(BENCH)
 
 test: setup
 	$(PY) -m pytest -q -n 2 --dist loadfile -m "not slow"

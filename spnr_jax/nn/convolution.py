@@ -15,6 +15,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+FEW_FEATURES = 4  # of a convolution's output, for which XLA's gradient of the kernel is slow
+
 kernel_init = jax.nn.initializers.he_normal(in_axis=-2, out_axis=-1)
 
 
@@ -65,11 +67,20 @@ def _conv2d_products(x, kernel, stride, padding):
 
 
 def _conv2d_backward(stride, padding, inputs, cotangent):
-    """XLA's gradient for the input; for the kernel one matrix product per place in the window."""
+    """XLA's gradient for the input; for the kernel one matrix product per place in the window, or one for all places.
+
+    With few output features the cotangents that every input pixel meets in the window are put side by side.
+    """
     x, kernel = inputs
     (dx,) = jax.linear_transpose(lambda x: _native(x, kernel, stride, padding), x)(cotangent)
-    flat = cotangent.reshape(-1, cotangent.shape[-1])
-    seen = _windows(_pad(x, padding), kernel.shape[0], stride)
+    window, (features_in, features_out) = kernel.shape[0], kernel.shape[2:]
+    if stride == 1 and features_out <= FEW_FEATURES:
+        met = list(_windows(_pad(cotangent, window - 1 - padding), window, 1))
+        columns = jnp.concatenate(met[::-1], axis=-1)
+        dk = x.reshape(-1, features_in).T @ columns.reshape(-1, window**2 * features_out)
+        return dx, dk.reshape(features_in, window, window, features_out).transpose(1, 2, 0, 3)
+    flat = cotangent.reshape(-1, features_out)
+    seen = _windows(_pad(x, padding), window, stride)
     dk = jnp.stack([s.reshape(flat.shape[0], -1).T @ flat for s in seen])
     return dx, dk.reshape(kernel.shape)
 
@@ -78,7 +89,7 @@ _conv2d_products.defvjp(lambda x, k, stride, padding: (_native(x, k, stride, pad
 
 
 def _conv2d_cpu(x, kernel, stride, padding):
-    form = _conv2d_products if kernel.shape[0] == 2 or kernel.shape[-1] <= 4 else _native
+    form = _conv2d_products if kernel.shape[0] == 2 or kernel.shape[-1] <= FEW_FEATURES else _native
     return form(x, kernel, stride, padding)
 
 
@@ -110,8 +121,8 @@ def upsample_conv(
     for axis in range(n):  # 3 fine taps -> 2 coarse taps in place, the parity appended
         # output 2i + p reads the fine pixels 2i + p - 1 .. 2i + p + 1, which are the coarse ones i - 1 + p and i + p
         first, middle, last = (lax.slice_in_dim(kernel, k, k + 1, axis=axis) for k in range(3))
-        even, odd = (first, middle + last), (first + middle, last)
-        kernel = jnp.stack([jnp.concatenate(taps, axis=axis) for taps in (even, odd)], axis=-1)
+        parities = (first, middle + last), (first + middle, last)
+        kernel = jnp.stack([jnp.concatenate(taps, axis=axis) for taps in parities], axis=-1)
     kernel = jnp.moveaxis(kernel, range(n + 2, 2 * n + 2), range(n + 1, 2 * n + 1))
     out = conv(x, kernel.reshape(*[2] * n, features_in, -1), bf16=bf16)
     parts = out.reshape(*out.shape[:-1], *[2] * n, features_out)  # parities stand in axes n + 1 .. 2n

@@ -1,0 +1,108 @@
+"""Every method on the same unseen objects: scores, the seconds that its pictures took, and one view to look at.
+
+Here a method shows an object of the data set, because pictures of Poisson surfaces are kept under its name.
+"""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from spnr_jax import data, evaluation
+from spnr_jax.config import TrainConfig
+from spnr_jax.lpips import LpipsWeights
+from spnr_jax.report import duration
+from spnr_jax.summary import Scores, summarise
+
+ObjectMethod = Callable[[data.ObjectData], evaluation.Pictures]
+PROGRESS_LINES = 20
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shown:
+    """One view of one object: reference and the picture of each method (height, width, 3), with its PSNR."""
+
+    name: str
+    view: int
+    reference: np.ndarray
+    images: dict[str, np.ndarray]
+    psnr: dict[str, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scored:
+    """Scores by object and method, the objects to look at, and each method's seconds per view by object."""
+
+    scores: dict[str, dict[str, Scores]]
+    shown: list[Shown]
+    seconds: dict[str, list[float]]
+
+
+def spread(names: tuple[str, ...], count: int) -> tuple[str, ...]:
+    """So many of the names, evenly from the first to the last."""
+    return tuple(names[round(i)] for i in np.linspace(0, len(names) - 1, min(count, len(names))))
+
+
+def of_cloud(method: evaluation.Method, config: TrainConfig) -> ObjectMethod:
+    """The method of an object that shows its first points to its cameras."""
+    return lambda item: method(evaluation.test_cloud(item, config), item.camera)
+
+
+def score_objects(
+    methods: dict[str, ObjectMethod],
+    config: TrainConfig,
+    dataset: data.Dataset,
+    names: tuple[str, ...],
+    num_shown: int,
+    weights: LpipsWeights | None,
+) -> Scored:
+    """All methods on these objects, with a line now and then; points and image size are the config's."""
+    seconds: dict[str, list[float]] = {method: [] for method in methods}
+    scores, shown, to_show, start = {}, [], spread(names, num_shown), time.monotonic()
+    for number, name in enumerate(names, start=1):
+        item = data.read_object(dataset, name)
+        shows = {method: timed(show, item, seconds[method]) for method, show in methods.items()}
+        (result,) = evaluation.evaluate_objects(shows, config, dataset, (name,), weights)
+        if "npbg" in result.scores:
+            del result.scores["npbg"]["iou"]  # it predicts colours alone
+        scores[name] = result.scores
+        if name in to_show:
+            shown.append(median_view(result))
+        if number % max(1, len(names) // PROGRESS_LINES) == 0 or number == len(names):
+            left = duration((time.monotonic() - start) / number * (len(names) - number))
+            print(f"scored {number} of {len(names)} objects, about {left} left", flush=True)
+    return Scored(scores=scores, shown=shown, seconds=seconds)
+
+
+def timed(show: ObjectMethod, item: data.ObjectData, seconds: list[float]) -> evaluation.Method:
+    """The method bound to an object, noting the seconds per view until the pictures lie on the host."""
+
+    def measured(*_: object) -> evaluation.Pictures:
+        start = time.monotonic()
+        pictures = evaluation.on_host(show(item))
+        seconds.append((time.monotonic() - start) / len(pictures.image))
+        return pictures
+
+    return measured
+
+
+def median_view(result: evaluation.ObjectResult) -> Shown:
+    """The view whose PSNR is the median of the first method's: neither flattered nor slandered."""
+    first = next(iter(result.scores.values()))["psnr"]
+    view = int(np.argsort(first)[len(first) // 2])
+    return Shown(
+        name=result.name,
+        view=view,
+        reference=result.reference[view],
+        images={method: np.asarray(pictures.image[view]) for method, pictures in result.pictures.items()},
+        psnr={method: float(scores["psnr"][view]) for method, scores in result.scores.items()},
+    )
+
+
+def by_category(scores: dict[str, dict[str, Scores]]) -> dict[str, dict]:
+    """The summary of each class of objects, if there are several."""
+    classes: dict[str, list[dict[str, Scores]]] = {}
+    for name in sorted(scores):
+        classes.setdefault(evaluation.category_of(name), []).append(scores[name])
+    return {name: summarise(found) for name, found in classes.items()} if len(classes) > 1 else {}
