@@ -4,7 +4,8 @@ Layout is channels last: inputs (batch, *space, in), kernels (*window, in, out) 
 pad one voxel on every side, like the stride-1 ones (a SAME rule would pad the far side only).  On a GPU the native
 convolutions of XLA are right; on a CPU (measurements: docs/performance.md)
   3D   a sum over depth taps of 2D convolutions, or one matrix product for tiny volumes
-  2D   native, but the kernel's gradient of 2-wide windows and of few output features as matrix products
+  2D   native, but the kernel's gradient of 2- and 4-wide windows and of few output features as matrix products;
+       128 input features or more in one matrix product
 """
 
 import itertools
@@ -16,6 +17,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 FEW_FEATURES = 4  # of a convolution's output, for which XLA's gradient of the kernel is slow
+MANY_FEATURES = 128  # of its input, for which one matrix product is faster than a convolution
 
 kernel_init = jax.nn.initializers.he_normal(in_axis=-2, out_axis=-1)
 
@@ -89,15 +91,23 @@ _conv2d_products.defvjp(lambda x, k, stride, padding: (_native(x, k, stride, pad
 
 
 def _conv2d_cpu(x, kernel, stride, padding):
-    form = _conv2d_products if kernel.shape[0] == 2 or kernel.shape[-1] <= FEW_FEATURES else _native
+    window, (features_in, features_out) = kernel.shape[0], kernel.shape[2:]
+    if features_in >= MANY_FEATURES:
+        return _columns(x, kernel, stride, padding)
+    form = _conv2d_products if window != 3 or features_out <= FEW_FEATURES else _native
     return form(x, kernel, stride, padding)
+
+
+def _columns(x, kernel, stride, padding):
+    """One matrix product of everything that each window sees."""
+    columns = jnp.concatenate(list(_windows(_pad(x, padding), kernel.shape[0], stride)), axis=-1)
+    return columns @ kernel.reshape(-1, kernel.shape[-1])
 
 
 def _conv3d_cpu(x, kernel, stride, padding):
     taps = kernel.shape[0]
     if x.shape[1] <= 4:
-        columns = jnp.concatenate(list(_windows(_pad(x, padding), taps, stride)), axis=-1)
-        return columns @ kernel.reshape(-1, kernel.shape[-1])
+        return _columns(x, kernel, stride, padding)
     x = jnp.pad(x, ((0, 0), (padding, padding), *[(0, 0)] * 3))
     depth = (x.shape[1] - taps) // stride + 1
     slices = (lax.slice_in_dim(x, k, k + (depth - 1) * stride + 1, stride, axis=1) for k in range(taps))
