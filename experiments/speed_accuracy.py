@@ -28,6 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 
 from spnr_jax import checkpoint, cli, data, evaluation, training
 from spnr_jax.config import TrainConfig
@@ -216,9 +217,12 @@ def plot(rows: list[dict], chosen: list[int]) -> bytes:
         if (x, y) == ("ms_view", "psnr"):
             axes.plot([rows[i][x] for i in chosen], [rows[i][y] for i in chosen], color="#adb5bd", zorder=2)
             best = rows[knee(rows, chosen)]
-            axes.annotate(f"knee: {best['name']}", (best[x], best[y]), xytext=(6, -14), textcoords="offset points")
+            axes.annotate(f"knee: {best['name']}", (best[x], best[y]), xytext=(12, -24), textcoords="offset points")
             axes.legend(fontsize=7, loc="lower right")
         axes.set_xscale("log")
+        axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axes.xaxis.set_major_formatter(ScalarFormatter())
+        axes.xaxis.set_minor_formatter(NullFormatter())
         axes.set_xlabel("ms a view" if x == "ms_view" else "MB of temporary memory")
         axes.set_ylabel(labels[y])
         axes.grid(alpha=0.2)
