@@ -114,7 +114,7 @@ def main(options: SpeedAccuracy) -> None:
     split = dataset.splits["test"]
     if not split:
         raise ValueError(f"{options.data}: the test split is empty; generate more objects")
-    names = tuple(split[round(i)] for i in np.linspace(0, len(split) - 1, min(options.objects, len(split))))
+    names = evaluation.spread(split, options.objects)
     place = options.out / "results.json"
     rows: list[dict] = json.loads(place.read_text())["rows"] if place.exists() else []
     todo = [(run, setting) for run in options.runs for setting in settings(checkpoint.read_config(run))]

@@ -26,7 +26,7 @@ import tyro
 
 from data_gen.poisson import pymeshlab
 from experiments import poisson, table1_page, table1_poisson, table1_report, table1_training
-from experiments.table1_scores import ObjectMethod, Scored, Shown, by_category, of_cloud, score_objects, spread
+from experiments.table1_scores import ObjectMethod, Scored, Shown, by_category, of_cloud, score_objects
 from experiments.table1_training import NETWORKS, Budget, Trained
 from spnr_jax import cli, data, evaluation
 from spnr_jax.config import PRESETS, TrainConfig
@@ -146,7 +146,7 @@ def test_objects(dataset: data.Dataset, options: Table1) -> tuple[str, ...]:
     names = dataset.splits["test"]
     if not names:
         raise ValueError(f"{dataset.folder}: the test split is empty; generate more objects")
-    return spread(names, options.objects or (QUICK_OBJECTS if options.budget == "quick" else len(names)))
+    return evaluation.spread(names, options.objects or (QUICK_OBJECTS if options.budget == "quick" else len(names)))
 
 
 def claim(options: Table1, dataset: data.Dataset) -> None:

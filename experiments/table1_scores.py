@@ -39,11 +39,6 @@ class Scored:
     seconds: dict[str, list[float]]
 
 
-def spread(names: tuple[str, ...], count: int) -> tuple[str, ...]:
-    """So many of the names, evenly from the first to the last."""
-    return tuple(names[round(i)] for i in np.linspace(0, len(names) - 1, min(count, len(names))))
-
-
 def of_cloud(method: evaluation.Method, config: TrainConfig) -> ObjectMethod:
     """The method of an object that shows its first points to its cameras."""
     return lambda item: method(evaluation.test_cloud(item, config), item.camera)
@@ -59,7 +54,7 @@ def score_objects(
 ) -> Scored:
     """All methods on these objects, with a line now and then; points and image size are the config's."""
     seconds: dict[str, list[float]] = {method: [] for method in methods}
-    scores, shown, to_show, start = {}, [], spread(names, num_shown), time.monotonic()
+    scores, shown, to_show, start = {}, [], evaluation.spread(names, num_shown), time.monotonic()
     for number, name in enumerate(names, start=1):
         item = data.read_object(dataset, name)
         shows = {method: timed(show, item, seconds[method]) for method, show in methods.items()}
@@ -68,7 +63,7 @@ def score_objects(
             del result.scores["npbg"]["iou"]  # it predicts colours alone
         scores[name] = result.scores
         if name in to_show:
-            shown.append(median_view(result))
+            shown.append(shown_view(result))
         if number % max(1, len(names) // PROGRESS_LINES) == 0 or number == len(names):
             left = duration((time.monotonic() - start) / number * (len(names) - number))
             print(f"scored {number} of {len(names)} objects, about {left} left", flush=True)
@@ -87,10 +82,9 @@ def timed(show: ObjectMethod, item: data.ObjectData, seconds: list[float]) -> ev
     return measured
 
 
-def median_view(result: evaluation.ObjectResult) -> Shown:
-    """The view whose PSNR is the median of the first method's: neither flattered nor slandered."""
-    first = next(iter(result.scores.values()))["psnr"]
-    view = int(np.argsort(first)[len(first) // 2])
+def shown_view(result: evaluation.ObjectResult) -> Shown:
+    """The view whose PSNR is the median of the first method's."""
+    view = evaluation.median_view(next(iter(result.scores.values()))["psnr"])
     return Shown(
         name=result.name,
         view=view,

@@ -45,7 +45,10 @@ def open_path(
     far: Float[Array, "*batch"],
     num_cells: int,
 ) -> Path:
-    """Cells between near and far; the first axes of the rays are the objects of `near_points`.  No gradient."""
+    """Cells between near and far; the first axes of the rays are the objects of `near_points`.  No gradient.
+
+    A cell is as open as the voxel of its middle; on a face between two voxels, rounding decides which.
+    """
     if near_points.ndim > 3:
         return jax.vmap(partial(open_path, num_cells=num_cells))(near_points, rays, near, far)
     near, far = near[..., None], far[..., None]

@@ -174,6 +174,16 @@ class Evaluation:
     gallery: list[ObjectResult]
 
 
+def spread(names: tuple[str, ...], count: int) -> tuple[str, ...]:
+    """So many of the names, evenly from the first to the last."""
+    return tuple(names[round(i)] for i in np.linspace(0, len(names) - 1, min(count, len(names))))
+
+
+def median_view(psnr: np.ndarray) -> int:
+    """The view with the median PSNR, which neither flatters nor slanders."""
+    return int(np.argsort(psnr)[len(psnr) // 2])
+
+
 def score_methods(
     methods: dict[str, Method],
     config: TrainConfig,
@@ -186,7 +196,7 @@ def score_methods(
     """Scores of every object by name, and the results of a few objects, spread over the names, to be looked at."""
     scores: dict[str, dict[str, Scores]] = {}
     gallery = []
-    shown = {names[round(i)] for i in np.linspace(0, len(names) - 1, min(gallery_objects, len(names)))}
+    shown = spread(names, gallery_objects)
     for i, result in enumerate(evaluate_objects(methods, config, dataset, names, weights)):
         scores[result.name] = result.scores
         if result.name in shown:

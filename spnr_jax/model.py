@@ -68,9 +68,10 @@ class Model:
             self.variables, jax.tree.map(lambda x: jnp.asarray(x)[None], cloud), config=self.config
         )
         scene = jax.tree.map(lambda x: x[0], scene)
-        voxels = getattr(self.config, "volume_resolution", 0)
-        reach = reach_of(inside[mask], voxels)
-        return Volume(scene=scene, centre=jnp.asarray(centre), scale=jnp.asarray(scale), reach=reach)
+        volume = Volume(scene=scene, centre=jnp.asarray(centre), scale=jnp.asarray(scale))
+        if not isinstance(self.config, ModelConfig):
+            return volume
+        return dataclasses.replace(volume, reach=reach_of(inside[mask], self.config.volume_resolution))
 
     def render(self, volume: Volume, camera: Camera, quality: Quality = "best") -> Rendering:
         """The object as the camera (unbatched, or with one axis of views) sees it; depth in the cloud's units.

@@ -67,8 +67,7 @@ class Renderer(nn.Module):
 
     def rays(self, camera: Camera) -> Rays:
         """Rays of the volume rendering for all views of an object in one axis, (objects, views * height * width, 3)."""
-        rays = cameras.camera_rays(cameras.resize(camera, *self.render_size(camera)))
-        return jax.tree.map(lambda x: x.reshape(x.shape[0], -1, 3), rays)
+        return cameras.view_rays(cameras.resize(camera, *self.render_size(camera)))
 
     def render_size(self, camera: Camera) -> tuple[int, int]:
         """Height and width of the volume rendering behind the camera's image."""
@@ -114,24 +113,24 @@ class Renderer(nn.Module):
         near_points = empty_space.dilate(scene.occupied, reach)
         path = empty_space.open_path(near_points, rays, near, far, CELLS_PER_VOXEL * resolution)
         renderer, variables = self.unbind()
-        (num_objects, num_rays), one = near.shape, (1,) * (near.ndim - 1)
-        objects = jnp.broadcast_to(jnp.arange(num_objects).reshape(-1, *one), near.shape)
 
         def block(row, objects, rays, far, path):
             return renderer.bind(variables).march_open(
                 scene.volume, objects, rays, far, path, None if key is None else jax.random.fold_in(key, row[0])
             )
 
-        flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), (objects, rays, far, path))
-        empty = jnp.zeros((num_objects * num_rays, self.config.num_features)).at[:, :3].set(WHITE)
+        shape = near.shape
+        rays, far, path = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), (rays, far, path))
+        row = jnp.arange(far.size)
+        white = jnp.zeros((far.size, self.config.num_features)).at[:, :3].set(WHITE)
         outputs = empty_space.map_existing(
             block,
-            flat[3].travelled[:, -1] > 0,
-            (jnp.arange(num_objects * num_rays), *flat),
-            (empty, flat[2], jnp.zeros_like(flat[2])),
+            path.travelled[:, -1] > 0,
+            (row, row // shape[1], rays, far, path),
+            (white, far, jnp.zeros_like(far)),
             RAY_BLOCK,
         )
-        return jax.tree.map(lambda x: x.reshape(num_objects, num_rays, *x.shape[1:]), outputs)
+        return jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), outputs)
 
     def march_open(self, volume, objects: Int[Array, " rays"], rays: Rays, far, path: Path, key: Key | None):
         """Outputs of `render_rays` for rays of given objects, sampled along the open part of each."""

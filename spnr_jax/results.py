@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from spnr_jax.config import to_dict
-from spnr_jax.evaluation import FLOORS, Evaluation, ObjectResult
+from spnr_jax.evaluation import FLOORS, Evaluation, ObjectResult, median_view
 from spnr_jax.images import write_whole
 from spnr_jax.report import QUALITY, GalleryRow, write_report
 from spnr_jax.summary import NO_WEIGHTS
@@ -63,9 +63,8 @@ def text_table(methods: dict[str, dict]) -> list[str]:
 
 
 def gallery_row(result: ObjectResult) -> GalleryRow:
-    """The view of an object whose PSNR is the median: neither flattered nor slandered."""
-    psnr = result.scores["ours"]["psnr"]
-    view = int(np.argsort(psnr)[len(psnr) // 2])
+    """The view of an object whose PSNR is the median."""
+    view = median_view(result.scores["ours"]["psnr"])
     ours = result.pictures["ours"]
     assert ours.depth is not None
     return GalleryRow(

@@ -24,7 +24,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 TABLE = Path(__file__).with_suffix(".toml")
 COPIED = ("spnr_jax", "data_gen", "experiments", "tests", "pyproject.toml")
-LIMIT = 900  # seconds for the tests of one mutant
+LIMIT = 1800  # seconds for the tests of one mutant
 PASSED, FAILED = 0, 1  # exit codes of pytest; any other is a fault of the mutant or of the machine
 
 

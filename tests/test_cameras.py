@@ -5,9 +5,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
-from laws import batch_law, close, gradient_law, numbers
+from laws import batch_law, close, gradient_law, numbers, same_bits
 
-from spnr_jax.cameras import camera_rays, intersect_box, look_at, orbit, pinhole, project, resize
+from spnr_jax.cameras import (
+    as_images,
+    camera_rays,
+    intersect_box,
+    look_at,
+    orbit,
+    pinhole,
+    project,
+    resize,
+    view_rays,
+)
 
 UP = jnp.array([0.0, 1.0, 0.0])
 EYES = 3 * numbers(0, 2, 3, 3) + 0.1
@@ -194,3 +204,13 @@ class TestOrbit:
     def test_azimuth_turns_from_z_towards_x(self):
         close(orbit(0.0, 0.0, 1.0, jnp.zeros(3))[:, 3], np.array([0.0, 0.0, 1.0]))
         close(orbit(np.pi / 2, 0.0, 1.0, jnp.zeros(3))[:, 3], np.array([1.0, 0.0, 0.0]))
+
+
+def test_views_become_one_axis_of_rays_and_images_again():
+    poses = look_at(numbers(70, 2, 3, 3) * 4, jnp.zeros((2, 3, 3)), jnp.array([[[0.0, 1.0, 0.0]]]))
+    camera = pinhole(poses, 0.7, 4, 5)
+    rays, flat = camera_rays(camera), view_rays(camera)
+    assert flat.origins.shape == (2, 60, 3)
+    images = as_images(camera, flat.directions, flat.origins[..., 0], flat.origins[..., 1])
+    same_bits(images.image, rays.directions)
+    same_bits((images.depth, images.acc), (rays.origins[..., 0], rays.origins[..., 1]))

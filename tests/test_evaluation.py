@@ -186,3 +186,9 @@ def test_weights_change_what_the_settings_say(monkeypatch):
 
 
 RESULT = {method: {metric: np.full(2, 0.25) for metric in METRICS} for method in ("ours", *evaluation.FLOORS)}
+
+
+def test_objects_are_spread_from_the_first_to_the_last():
+    assert evaluation.spread(tuple("abcdefg"), 3) == ("a", "d", "g")
+    assert evaluation.spread(tuple("ab"), 5) == ("a", "b")
+    assert evaluation.spread(("a",), 0) == ()

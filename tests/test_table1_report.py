@@ -6,7 +6,7 @@ import re
 import numpy as np
 
 from experiments import table1_page, table1_report, table1_scores
-from experiments.table1_scores import Shown, spread
+from experiments.table1_scores import Shown
 from spnr_jax import evaluation
 
 
@@ -29,15 +29,9 @@ def test_the_view_that_is_shown_is_the_one_of_median_quality():
         pictures={"ours": pictures, "white": pictures},
         scores={"ours": {"psnr": np.array([3.0, 9.0, 4.0])}, "white": {"psnr": np.array([5.0, 6.0, 7.0])}},
     )
-    shown = table1_scores.median_view(result)
+    shown = table1_scores.shown_view(result)
     assert shown.view == shown.reference.item() == shown.images["white"].item() == 2
     assert shown.psnr == {"ours": 4.0, "white": 7.0}
-
-
-def test_objects_are_spread_from_the_first_to_the_last():
-    assert spread(tuple("abcdefg"), 3) == ("a", "d", "g")
-    assert spread(tuple("ab"), 5) == ("a", "b")
-    assert spread(("a",), 0) == ()
 
 
 def test_no_name_ends_the_script():

@@ -201,12 +201,8 @@ class PointNeRF(nn.Module):
 
     def rays(self, camera: Camera) -> ViewRays:
         """Rays of all views of an object in one axis, (objects, views * height * width, ...)."""
-        rays = cameras.camera_rays(camera)
-        axes = camera.cam_to_world[..., None, None, :, :3]
-        axes = jnp.broadcast_to(axes, (*rays.directions.shape[:-1], 3, 3))
-        return ViewRays(
-            rays=jax.tree.map(lambda x: x.reshape(x.shape[0], -1, 3), rays), axes=axes.reshape(len(axes), -1, 3, 3)
-        )
+        axes = jnp.repeat(camera.cam_to_world[..., :3], camera.height * camera.width, axis=1)
+        return ViewRays(rays=cameras.view_rays(camera), axes=axes)
 
     def render_rays(
         self, cloud: PointCloud, view: ViewRays, key: Key | None = None
@@ -220,9 +216,7 @@ class PointNeRF(nn.Module):
 
     def develop(self, camera: Camera, rgb: Array, depth: Array, acc: Array) -> Rendering:
         """Images from the rays of `rays`."""
-        shape = *camera.cam_to_world.shape[:-2], camera.height, camera.width
-        image = rgb.reshape(*shape, 3)
-        return Rendering(image=image, image_lr=image, depth=depth.reshape(shape), acc=acc.reshape(shape))
+        return cameras.as_images(camera, rgb, depth, acc)
 
     def render(self, cloud: PointCloud, camera: Camera, key: Key | None = None) -> Rendering:
         """Views of each cloud.  A key moves the candidates (training)."""

@@ -191,19 +191,11 @@ class Points2NeRF(nn.Module):
 
     def rays(self, camera: Camera) -> Rays:
         """Rays of all views of an object in one axis, (objects, views * height * width, 3)."""
-        return jax.tree.map(lambda x: x.reshape(x.shape[0], -1, 3), cameras.camera_rays(camera))
+        return cameras.view_rays(camera)
 
-    def develop(
-        self,
-        camera: Camera,
-        rgb: Float[Array, "objects rays 3"],
-        depth: Float[Array, "objects rays"],
-        acc: Float[Array, "objects rays"],
-    ) -> Rendering:
+    def develop(self, camera: Camera, rgb: Array, depth: Array, acc: Array) -> Rendering:
         """Images from the rays of `rays`."""
-        shape = (*camera.cam_to_world.shape[:-2], camera.height, camera.width)
-        image = rgb.reshape(*shape, 3)
-        return Rendering(image=image, image_lr=image, depth=depth.reshape(shape), acc=acc.reshape(shape))
+        return cameras.as_images(camera, rgb, depth, acc)
 
     def render_rays(
         self, weights: Weights, rays: Rays, key: Key | None = None
