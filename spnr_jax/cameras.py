@@ -104,7 +104,12 @@ def intersect_box(
     return jnp.where(hit, near, 0.0), jnp.where(hit, far, 0.0), hit
 
 
-def orbit(azimuth: float, elevation: float, distance: float, centre: Float[Array, "3"]) -> Float[Array, "3 4"]:
+def orbit(
+    azimuth: float | Float[Array, ""],
+    elevation: float | Float[Array, ""],
+    distance: float | Float[Array, ""],
+    centre: Float[Array, "3"],
+) -> Float[Array, "3 4"]:
     """Pose that looks at `centre` from a distance; angles in radians, azimuth around y from +z, elevation above xz."""
     horizontal = jnp.cos(elevation)
     direction = jnp.stack([horizontal * jnp.sin(azimuth), jnp.sin(elevation), horizontal * jnp.cos(azimuth)])

@@ -5,6 +5,7 @@ Errors of the user and of the disk are one line on stderr and exit code 2; Ctrl-
 
 import contextlib
 import dataclasses
+import importlib.util
 import io
 import re
 import sys
@@ -18,6 +19,7 @@ import tyro
 
 from spnr_jax import config as configs
 from spnr_jax.config import TrainConfig
+from spnr_jax.render_command import Render
 
 BOX = r"[╭╮╰╯│─•]+|__tyro-dummy-inner__\."  # what tyro draws around an error, and its name for the whole command
 DESCRIPTION = "Sparse-point neural rendering: train a network, evaluate one, render a cloud of points."
@@ -72,33 +74,21 @@ class ConvertLpips:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Render:
-    """Render a point cloud or mesh file: views as .png, and a turntable."""
+class View:
+    """Look at a point cloud or mesh file in the browser: its points and what a network makes of them, edited live."""
 
     cloud: tyro.conf.Positional[Path]
-    """.ply .pcd .xyz .txt .csv .npz .npy, or a mesh: .glb .gltf .obj .stl .off (its surface is sampled)."""
+    """What `spnr render` reads."""
     run: Path
     """Run folder whose network renders."""
-    out: Path = Path("renders")
-    """Folder for the pictures."""
-    views: int = 4
-    """Still pictures, evenly around the object."""
-    elevation: float = 20.0
-    """Degrees above the horizon."""
-    resolution: int | None = None
-    """Pixels along each side (default: what the network was trained for)."""
+    host: str = "127.0.0.1"
+    """Address to listen on; another than this machine's own opens the viewer to a network."""
+    port: int = 8080
+    """Port to listen on; 0 takes any free one."""
     num_points: int = 1024
     """Points used of a bigger cloud or sampled from a mesh; fewer work too."""
-    up: Literal["x", "y", "z", "-x", "-y", "-z"] = "y"
-    """The file's upward axis."""
-    turntable: Literal["gif", "mp4", "none"] = "gif"
-    """Format of the turntable."""
-    frames: int = 48
-    """Frames of the turntable."""
-    seed: int = 0
-    """Seed of the surface samples of a mesh."""
-    quality: Literal["draft", "balanced", "best", "trained"] = "best"
-    """Samples along a ray near the points: a quarter, half or all of those trained with; or just as trained."""
+    up: Literal["auto", "x", "y", "z", "-x", "-y", "-z"] = "auto"
+    """The file's upward axis; auto looks for it, and says what it found."""
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -120,16 +110,19 @@ def guarded(work: Callable[[], None], name: str) -> int:
     return 0
 
 
-def parse(arguments: list[str]) -> Train | Evaluate | Render | ConvertLpips:
+def parse(arguments: list[str]) -> Train | Evaluate | Render | View | ConvertLpips:
     """The command with all its options; the preset named by --preset gives the defaults of the others."""
     train = Annotated[Train, tyro.conf.subcommand("train", default=_train_defaults(arguments))]
     evaluate = Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     render = Annotated[Render, tyro.conf.subcommand("render")]
+    view = Annotated[View, tyro.conf.subcommand("view")]
     convert = Annotated[ConvertLpips, tyro.conf.subcommand("convert-lpips")]
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said):
-            return tyro.cli(train | evaluate | render | convert, prog="spnr", description=DESCRIPTION, args=arguments)
+            return tyro.cli(
+                train | evaluate | render | view | convert, prog="spnr", description=DESCRIPTION, args=arguments
+            )
     except SystemExit as stop:
         if stop.code:
             raise ValueError(re.sub(BOX, " ", said.getvalue().partition("\n")[2])) from None  # without the title
@@ -147,7 +140,7 @@ def _train_defaults(arguments: list[str]) -> Train:
     return Train(data=tyro.MISSING, run=tyro.MISSING, config=configs.PRESETS[preset]())
 
 
-def run(command: Train | Evaluate | Render | ConvertLpips) -> None:
+def run(command: Train | Evaluate | Render | View | ConvertLpips) -> None:
     """Carries a command out."""
     enable_compilation_cache()
     match command:
@@ -157,6 +150,8 @@ def run(command: Train | Evaluate | Render | ConvertLpips) -> None:
             run_evaluate(command)
         case Render():
             run_render(command)
+        case View():
+            run_view(command)
         case ConvertLpips():
             run_convert_lpips(command)
 
@@ -167,7 +162,7 @@ def enable_compilation_cache() -> None:
 
     if jax.config.values["jax_compilation_cache_dir"] is None:
         jax.config.update("jax_compilation_cache_dir", str(Path.home() / ".cache" / "spnr_jax"))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
 
 
 def run_train(command: Train) -> None:
@@ -202,9 +197,20 @@ def run_render(command: Render) -> None:
     """`spnr render`."""
     from spnr_jax.pictures import render_file
 
-    options = {f.name: getattr(command, f.name) for f in dataclasses.fields(command)}
-    for line in render_file(**options):
+    for line in render_file(command, note=lambda line: print(f"{command.cloud}: {line}", file=sys.stderr)):
         print(line, flush=True)
+
+
+def run_view(command: View) -> None:
+    """`spnr view`."""
+    if importlib.util.find_spec("viser") is None:
+        raise ValueError("spnr view needs the package viser; pip install 'spnr-jax[viewer]'")
+    from spnr_jax.viewer.server import open_viewer
+
+    viewer, notes = open_viewer(**{f.name: getattr(command, f.name) for f in dataclasses.fields(command)})
+    for line in (*notes, *viewer.lines):
+        print(line, flush=True)
+    viewer.wait()
 
 
 def run_convert_lpips(command: ConvertLpips) -> None:

@@ -4,9 +4,12 @@ Images are (height, width, 3) or grey (height, width), uint8 or float in [0, 1],
 place and renamed into it: a reader sees the old content or the new, never half of it.
 """
 
+import contextlib
 import importlib.util
 import io
 import os
+import warnings
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -28,16 +31,19 @@ def to_uint8(image: np.ndarray | Array) -> np.ndarray:
     return np.round(255 * np.clip(image, 0, 1)).astype(np.uint8)
 
 
-def depth_image(depth: np.ndarray | Array, acc: np.ndarray | Array) -> np.ndarray:
+def depth_image(
+    depth: np.ndarray | Array, acc: np.ndarray | Array, span: tuple[float, float] | None = None
+) -> np.ndarray:
     """Colours (h, w, 3) uint8 of distances (h, w), near bright and far dark, fading to white with the opacity (h, w).
 
-    The colours span the distances of the opaque pixels of this one image (matplotlib's viridis, perceptually uniform).
+    The colours (matplotlib's viridis, perceptually uniform) go from the nearest to the farthest distance of the span,
+    or of the opaque pixels of this one image.
     """
     from matplotlib import colormaps  # here, so that importing the package stays light
 
     depth, acc = np.asarray(depth, np.float64), np.asarray(acc, np.float64)
     opaque = depth[acc > OPAQUE]
-    near, far = (opaque.min(), opaque.max()) if opaque.size else (0.0, 1.0)
+    near, far = span or ((opaque.min(), opaque.max()) if opaque.size else (0.0, 1.0))
     nearness = np.clip((far - depth) / max(far - near, np.finfo(np.float32).tiny), 0, 1)
     opacity = np.clip(acc, 0, 1)[..., None]
     return to_uint8(opacity * colormaps["viridis"](nearness)[..., :3] + 1 - opacity)
@@ -47,6 +53,13 @@ def png(image: np.ndarray | Array) -> bytes:
     """The image as a PNG file."""
     stream = io.BytesIO()
     Image.fromarray(to_uint8(image)).save(stream, "png", optimize=True)
+    return stream.getvalue()
+
+
+def npz(*arrays: np.ndarray) -> bytes:
+    """The arrays as a compressed NPZ file, in their order."""
+    stream = io.BytesIO()
+    np.savez_compressed(stream, *arrays)
     return stream.getvalue()
 
 
@@ -75,12 +88,35 @@ def write_turntable(path: str | Path, frames: list[np.ndarray], fps: float | int
     if path.suffix.lower() == ".gif":
         write_whole(path, _gif(pictures, fps))
         return path, ""
-    if importlib.util.find_spec("imageio_ffmpeg") is None:
+    reason = _missing_codec()
+    if reason:
         path = path.with_suffix(".gif")
         write_whole(path, _gif(pictures, fps))
-        return path, "written as .gif: .mp4 needs the package imageio-ffmpeg (pip install imageio-ffmpeg)"
+        return path, f"written as .gif: {reason}"
     _write_mp4(path, pictures, fps)
     return path, ""
+
+
+def _missing_codec() -> str:
+    """Why no .mp4 can be written; empty if one can."""
+    if importlib.util.find_spec("imageio_ffmpeg") is None:
+        return ".mp4 needs the package imageio-ffmpeg (pip install imageio-ffmpeg)"
+    import imageio_ffmpeg
+
+    try:
+        with _quiet_forks():
+            imageio_ffmpeg.get_ffmpeg_exe()
+    except RuntimeError:  # a platform that the package brings no program for
+        return ".mp4 needs the program ffmpeg"
+    return ""
+
+
+@contextlib.contextmanager
+def _quiet_forks() -> Iterator[None]:
+    """Without JAX's warning of forks: the child starts ffmpeg at once and touches nothing of JAX."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "os.fork", RuntimeWarning)
+        yield
 
 
 def _gif(pictures: list[np.ndarray], fps: float | int) -> bytes:
@@ -108,7 +144,8 @@ def _write_mp4(path: Path, pictures: list[np.ndarray], fps: float | int) -> None
         writer = imageio_ffmpeg.write_frames(
             str(unfinished), (width, height), fps=fps, quality=8, macro_block_size=2, ffmpeg_log_level="error"
         )
-        writer.send(None)
+        with _quiet_forks():
+            writer.send(None)
         for picture in pictures:
             writer.send(np.ascontiguousarray(picture[:height, :width]))
         writer.close()

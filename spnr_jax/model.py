@@ -9,6 +9,7 @@ Clouds, cameras and depths are in the cloud's own units; the transform into the 
 
 import dataclasses
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -64,10 +65,7 @@ class Model:
         inside = np.clip((positions - centre) * scale, -1, 1).astype(np.float32)
         cloud = dataclasses.replace(cloud, positions=inside)
         cloud = clouds.pad(cloud, clouds.bucket(len(positions)))
-        scene = training.jitted_encode(
-            self.variables, jax.tree.map(lambda x: jnp.asarray(x)[None], cloud), config=self.config
-        )
-        scene = jax.tree.map(lambda x: x[0], scene)
+        scene = _encode(self.variables, cloud, config=self.config)
         volume = Volume(scene=scene, centre=jnp.asarray(centre), scale=jnp.asarray(scale))
         if not isinstance(self.config, ModelConfig):
             return volume
@@ -81,25 +79,47 @@ class Model:
         """
         if self.config.upsamples and (camera.height % 2 or camera.width % 2):
             raise ValueError(f"this network doubles its pictures: {camera.width} x {camera.height} pixels must be even")
-        single = camera.cam_to_world.ndim == 2
-        rotation, eye = camera.cam_to_world[..., :3], camera.cam_to_world[..., 3]
-        eye = (eye - jnp.broadcast_to(volume.centre, eye.shape)) * volume.scale
-        pose = jnp.concatenate([rotation, eye[..., None]], axis=-1)
-        inside = dataclasses.replace(camera, cam_to_world=pose)
-        inside = jax.tree.map(lambda x: jnp.asarray(x).reshape(1, -1, *x.shape[-2:]), inside)
-        scene = jax.tree.map(lambda x: x[None], volume.scene)
         config = at_quality(self.config, quality, volume.reach)
-        rendering = training.jitted_render(self.variables, scene, inside, config=config)
-        rendering = dataclasses.replace(rendering, depth=rendering.depth / volume.scale)
-        return jax.tree.map(lambda x: x[0, 0] if single else x[0], rendering)
+        return _render(self.variables, volume.scene, volume.centre, volume.scale, camera, config=config)
 
     def camera(
         self, volume: Volume, azimuth: float = 30.0, elevation: float = 20.0, resolution: int | None = None
     ) -> Camera:
         """Camera that sees the whole object: degrees around the y axis from +z, and above the horizon."""
-        pose = cameras.orbit(np.deg2rad(azimuth), np.deg2rad(elevation), DISTANCE / float(volume.scale), volume.centre)
+        angles = np.deg2rad(np.float32(azimuth)), np.deg2rad(np.float32(elevation))
         size = resolution or self.config.image_resolution
-        return cameras.pinhole(pose, FIELD_OF_VIEW, size, size)
+        return _orbiting(*angles, DISTANCE / volume.scale, volume.centre, size=size)
+
+
+# The three are compiled whole: each operation outside of a jit would be compiled alone, 30 ms apiece at the first call.
+
+
+# this option halves the compilation of the U-Net and costs it no time; rendering would take twice as long
+@partial(jax.jit, static_argnames="config", compiler_options={"xla_cpu_use_fusion_emitters": False})
+def _encode(variables: dict, cloud: PointCloud, *, config: NetworkConfig) -> Any:
+    """What the network makes of a cloud in the box (unbatched)."""
+    scene = training.encode(variables, jax.tree.map(lambda x: x[None], cloud), config=config)
+    return jax.tree.map(lambda x: x[0], scene)
+
+
+@partial(jax.jit, static_argnames="config")
+def _render(variables: dict, scene: Any, centre, scale, camera: Camera, *, config: NetworkConfig) -> Rendering:
+    """`Model.render` with the config of a quality."""
+    single = camera.cam_to_world.ndim == 2
+    rotation, eye = camera.cam_to_world[..., :3], camera.cam_to_world[..., 3]
+    eye = (eye - jnp.broadcast_to(centre, eye.shape)) * scale
+    pose = jnp.concatenate([rotation, eye[..., None]], axis=-1)
+    inside = dataclasses.replace(camera, cam_to_world=pose)
+    inside = jax.tree.map(lambda x: x.reshape(1, -1, *x.shape[-2:]), inside)
+    rendering = training.render(variables, jax.tree.map(lambda x: x[None], scene), inside, config=config)
+    rendering = dataclasses.replace(rendering, depth=rendering.depth / scale)
+    return jax.tree.map(lambda x: x[0, 0] if single else x[0], rendering)
+
+
+@partial(jax.jit, static_argnames="size")
+def _orbiting(azimuth, elevation, distance, centre, *, size: int) -> Camera:
+    """Square camera of `size` pixels that looks at the centre; angles in radians."""
+    return cameras.pinhole(cameras.orbit(azimuth, elevation, distance, centre), FIELD_OF_VIEW, size, size)
 
 
 def at_quality(config: NetworkConfig, quality: Quality, reach: int) -> NetworkConfig:

@@ -1,15 +1,19 @@
-"""Point files of the Point Cloud Library: .pcd 0.6 and 0.7, as ASCII, binary or LZF-compressed, as named columns.
+"""Point files of the Point Cloud Library as named columns: .pcd 0.6 and 0.7, ASCII, binary or LZF-compressed.
 
-A header of text lines names the fields with their sizes, types (F, I, U) and counts; then come the points, row by row,
-or, compressed, one column after the other.  A field `rgb` or `rgba` packs 0xRRGGBB into the bits of one 4-byte number.
-Every fault is a ValueError that says what is wrong; the file's name is added by the caller.
+They are read piece by piece, compressed ones whole.  A header of text lines names the fields with their sizes, types
+(F, I, U) and counts; then come the points, row by row, or, compressed, one column after the other.  A field `rgb` or
+`rgba` packs 0xRRGGBB into the bits of one 4-byte number.  Every fault is a ValueError that says what is wrong; the
+file's name is added by the caller.
 """
 
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+
+from spnr_jax.ply_files import binary_rows, text_rows
 
 HEADER_LIMIT = 2**16  # bytes
 ENTRIES = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA")
@@ -29,17 +33,23 @@ class PcdHeader:
     size: int  # bytes up to the data
 
 
-def read_pcd(path: Path) -> dict[str, np.ndarray]:
-    """The fields of a PCD file as columns (points,); a field of several numbers, such as a descriptor, is left out."""
-    data = path.read_bytes()
-    header = _header(data)
-    body = data[header.size :]
-    if header.encoding == "ascii":
-        points = _text_points(body, header)
-    elif header.encoding == "binary":
-        points = _rows(body, header)
-    else:
-        points = _columns(body, header)
+def pcd_pieces(path: Path) -> Iterator[dict[str, np.ndarray]]:
+    """The fields of a PCD file as columns, some points at a time; a field of several numbers is left out."""
+    with path.open("rb") as file:
+        header = _header(file.read(HEADER_LIMIT))
+        file.seek(header.size)
+        if header.encoding == "ascii":
+            lines = (text for line in file if (text := line.decode("ascii", "replace").strip()))
+            pieces = text_rows(lines, header.num_points, header.layout)
+        elif header.encoding == "binary":
+            pieces = binary_rows(file, header.num_points, header.layout)
+        else:
+            pieces = iter([_columns(file.read(), header)])
+        yield from map(_unpacked, pieces)
+
+
+def _unpacked(points: np.ndarray) -> dict[str, np.ndarray]:
+    """The fields of points as columns, packed colours as three."""
     columns = {name.lower(): points[name] for name in points.dtype.names or () if points[name].ndim == 1}
     packed = next((name for name in PACKED if name in columns), None)
     if packed is None:
@@ -83,21 +93,6 @@ def _header(data: bytes) -> PcdHeader:
     if num_points < 0:
         raise ValueError(f"has a PCD header that announces {num_points} points")
     return PcdHeader(layout=layout, num_points=num_points, encoding=encoding, size=end.end())
-
-
-def _text_points(body: bytes, header: PcdHeader) -> np.ndarray:
-    """The points of an ASCII file."""
-    lines = [line for line in body.decode("ascii", "replace").splitlines() if line.strip()]
-    _check_complete(len(lines), header.num_points)
-    if not header.num_points:
-        return np.empty(0, header.layout)
-    return np.loadtxt(lines[: header.num_points], dtype=header.layout, comments=None, ndmin=1)
-
-
-def _rows(body: bytes, header: PcdHeader) -> np.ndarray:
-    """The points of a binary file, one after the other."""
-    _check_complete(len(body) // max(1, header.layout.itemsize), header.num_points)
-    return np.frombuffer(body, header.layout, header.num_points)
 
 
 def _columns(body: bytes, header: PcdHeader) -> np.ndarray:
@@ -146,8 +141,3 @@ def decompress(data: bytes, size: int) -> bytes:
     if len(plain) != size:
         raise ValueError(f"has compressed data that is damaged: {len(plain)} bytes come out, {size} are announced")
     return bytes(plain)
-
-
-def _check_complete(found: int, announced: int) -> None:
-    if found < announced:
-        raise ValueError(f"is cut off: its header announces {announced} points, the data ends after {found}")

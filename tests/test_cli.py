@@ -190,9 +190,13 @@ def test_a_cloud_of_one_point_renders(capsys, tmp_path, run):
     arguments = ("--run", run, "--out", out, "--views", 1, "--frames", 2, "--resolution", 24)
     assert exit_code("render", tmp_path / "one.xyz", *arguments) == 0
     assert {path.name for path in out.iterdir()} == {
-        "one_000.png", "one_000_depth.png", "one_000_acc.png", "one_turntable.gif",
+        "one_000.png", "one_000_depth.png", "one_000_depth.npy", "one_000_depth_16bit.png", "one_000_opacity.png",
+        "one_turntable.gif", "one_cameras.json",
     }  # fmt: skip
-    assert f"wrote {out / 'one_turntable.gif'}" in capsys.readouterr().out
+    captured = capsys.readouterr()
+    assert f"wrote {out / 'one_turntable.gif'}" in captured.out
+    for name in ("base_color", "roughness", "metallic"):
+        assert f"one.xyz: no {name} in the file" in captured.err
 
 
 def test_a_damaged_newest_checkpoint_is_named_and_the_one_before_is_rendered(capsys, tmp_path, run):

@@ -1,4 +1,7 @@
 import re
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -6,8 +9,11 @@ from gltf_files import GltfBuilder
 from test_point_files import ply_bytes
 
 from data_gen.records import POINT_TYPE, encode_points
-from spnr_jax.clouds import UP, bucket, farthest_points, normalization, pad, read_cloud
+from spnr_jax import clouds
+from spnr_jax.clouds import bucket, normalization, pad, place_cloud, read_cloud
+from spnr_jax.up_axis import ROTATIONS
 
+ROOT = Path(__file__).parents[1]
 XYZRGB = [("x", "float"), ("y", "float"), ("z", "float"), ("red", "uchar"), ("green", "uchar"), ("blue", "uchar")]
 SRGB = np.where(np.arange(256) <= 10, np.arange(256) / 255 / 12.92, ((np.arange(256) / 255 + 0.055) / 1.055) ** 2.4)
 SQUARE_OBJ = "v 0 0 2\nv 1 0 2\nv 1 1 2\nv 0 1 2\nf 1 2 3 4\n"
@@ -62,9 +68,9 @@ def test_8_bit_unit_and_255_colours_are_the_same_linear_colour_and_the_report_sa
         write(
             tmp_path, "a.ply", ply_bytes("binary_big_endian", rows=rows, properties=XYZRGB)
         ): "red green blue .* 0..255",
-        write(tmp_path, "b.xyz", "\n".join(" ".join(map(str, row)) for row in rows)): "r g b .* 0..255",
-        write(tmp_path, "c.csv", "x y z diffuse_red diffuse_green diffuse_blue\n" + text): "diffuse_red .* 0..1$",
-        tmp_path / "d.npz": "r g b .* 0..65535",
+        write(tmp_path, "b.xyz", "\n".join(" ".join(map(str, row)) for row in rows)): "red green blue .* 0..255",
+        write(tmp_path, "c.csv", "x y z diffuse_red diffuse_green diffuse_blue\n" + text): "red green blue .* 0..1$",
+        tmp_path / "d.npz": "red green blue .* 0..65535",
     }
     np.savez(tmp_path / "d.npz", points=np.array(rows)[:, :3], colors=(levels * 257).astype(np.uint16))
     for path, how in files.items():
@@ -122,7 +128,7 @@ def test_the_surface_of_a_mesh_is_sampled_with_its_material(tmp_path, name):
     assert len(read_cloud(path).mask) == 4096
 
 
-@pytest.mark.parametrize("up", UP)
+@pytest.mark.parametrize("up", ROTATIONS)
 def test_up_is_a_rotation_that_takes_the_named_axis_to_y(tmp_path, up):
     np.save(tmp_path / "axes.npy", np.eye(3))
     images = read_cloud(tmp_path / "axes.npy", up=up).positions
@@ -145,30 +151,6 @@ def test_thinning_keeps_points_of_the_file_with_their_materials_and_depends_on_t
     np.testing.assert_array_equal(
         read_cloud(tmp_path / "a.npz", num_points=2000).positions, positions.astype(np.float32)
     )
-
-
-@pytest.mark.parametrize("num_points", [500, 6000])  # 6000 is thinned at random before
-def test_thinned_points_cover_the_shape_evenly_where_a_random_choice_leaves_gaps(num_points):
-    positions, count = sphere_points(2, num_points), 64
-    kept = farthest_points(positions, count, seed=0)
-    between = np.linalg.norm(positions[kept, None] - positions[kept], axis=-1) + 9 * np.eye(count)
-    gap = np.linalg.norm(positions[:, None] - positions[kept], axis=-1).min(axis=1)
-    random = np.random.default_rng(0).choice(num_points, count, replace=False)
-    random_gap = np.linalg.norm(positions[:, None] - positions[random], axis=-1).min(axis=1)
-    assert between.min() > 0.8 * np.quantile(gap, 0.99)  # a packing that covers: both radii agree
-    assert np.quantile(gap, 0.99) < 0.6 * np.quantile(random_gap, 0.99)
-
-
-def test_farthest_points_are_those_of_the_plain_loop():
-    positions = sphere_points(3, 60)
-    kept = [int(np.random.default_rng(7).integers(60))]
-    while len(kept) < 20:
-        kept.append(int(np.argmax([min(np.linalg.norm(p - positions[k]) for k in kept) for p in positions])))
-    np.testing.assert_array_equal(farthest_points(positions, 20, seed=7), sorted(kept))
-
-
-def test_points_that_coincide_are_never_kept_twice():
-    np.testing.assert_array_equal(farthest_points(np.zeros((9, 3)), 9, seed=0), np.arange(9))
 
 
 def test_padding_adds_masked_zeros_and_changes_no_real_point(tmp_path):
@@ -211,18 +193,26 @@ def test_a_point_alone_is_moved_to_zero_and_not_scaled():
     [
         ("a.ply", None, "no such file"),
         ("a.xyz", "", "the file is empty"),
-        ("a.jpeg", "1 2 3", r"unknown kind of file '.jpeg'; expected one of .ply .pcd .xyz .txt .csv .npz .npy .glb"),
+        (
+            "a.jpeg",
+            "1 2 3",
+            r"unknown kind of file '.jpeg'; expected one of .ply .pcd .xyz .txt .csv .npz .npy .las .laz .glb",
+        ),
         ("a.xyz", "# nothing yet\n", "holds 0 points"),
         ("a.ply", ply_bytes("binary_little_endian", rows=[]), "holds 0 points"),
         ("a.xyz", "0 0 0\n1 nan 0\n2 2 2\ninf 0 0\n", "2 points with NaN, infinity .* first point 1"),
         ("a.xyz", "0 0 1e39\n", "too large a number"),
-        ("a.csv", "px,py,pz\n0,0,0\n", "needs the properties x y z; found px py pz"),
-        ("a.xyz", "0 0 0 0.5 0.5 -0.2\n", "has r g b from -0.2 to 0.5; expected 0 to 1"),
+        ("a.csv", "px,py,pz\n0,0,0\n", r"needs the properties x y z \(and may have .*\); found px py pz"),
+        ("a.xyz", "0 0 0 0.5 0.5 -0.2\n", "has red green blue from -0.2 to 0.5; expected 0 to 1"),
         ("a.xyz", "0 0 0 0.5 1.3 0.2\n", "colours up to 1.3: neither 0 to 1 nor 0 to 255"),
         ("a.xyz", "0 0 0 3 4 256\n", "from 0.01.* to 1.00392"),
         ("a.csv", "x y z base_color_r base_color_g base_color_b\n0 0 0 0 0 9\n", "from 0 to 9"),
         ("a.csv", "x y z roughness\n0 0 0 nan\n", "roughness from nan"),
-        ("a.xyz", "0 0 5000000.1\n0 0 5000000.9\n", "0.5 apart at best .* extent of 0.8; move them to the origin"),
+        (
+            "a.ply",
+            ply_bytes("binary_little_endian", rows=[(0.0, 0.0, 5e6), (0.0, 0.0, 5e6 + 1)], properties=XYZRGB[:3]),
+            "0.5 apart at best .* extent of 1; move them to the origin",
+        ),
         ("a.ply", ply_bytes("binary_little_endian")[:-20], "announces 3 points, the data ends after 2"),
         ("a.obj", "v 0 0 0\n", "has no faces"),
         ("a.glb", b"glTF\2\0\0\0\xff\xff\0\0", "broken or truncated|cut off|truncated"),
@@ -238,8 +228,99 @@ def test_every_bad_file_is_one_line_that_names_it_and_the_reason(tmp_path, name,
     assert "\n" not in str(caught.value)
 
 
+def test_a_mesh_without_material_says_so(tmp_path):
+    _, lines = read(write(tmp_path, "a.obj", SQUARE_OBJ), num_points=10)
+    assert any(line.startswith("no material in the mesh: base_color 0.5, roughness 0.5, metallic 0") for line in lines)
+    _, lines = read(write(tmp_path, "a.ply", SQUARE_PLY), num_points=10)
+    assert not any("no material" in line for line in lines)
+
+
+def test_map_coordinates_keep_their_precision_and_the_way_back_is_kept(tmp_path):
+    points = np.random.default_rng(0).uniform(0, 1, (50, 3)) + [500_000, 4_000_000, 100]
+    np.save(tmp_path / "a.npy", points)
+    placed = place_cloud(tmp_path / "a.npy", up="z")
+    back = placed.cloud.positions @ placed.rotation + placed.origin
+    np.testing.assert_allclose(back, points, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(placed.cloud.positions[:, 1], points[:, 2] - placed.origin[2], atol=1e-6)
+
+
+def test_up_is_found_where_it_is_left_to_the_reader_and_said(tmp_path):
+    rng = np.random.default_rng(0)
+    cone = rng.uniform(-1, 1, (900, 3)) * [1, 1, 0.01]
+    cone[:300] *= np.linspace(1, 0, 300)[:, None]
+    cone[:300, 2] += np.linspace(0, 2, 300)
+    np.save(tmp_path / "a.npy", cone)
+    lines: list[str] = []
+    placed = place_cloud(tmp_path / "a.npy", report=lines.append)
+    assert placed.up == "z"
+    assert any(line.startswith("z taken as up") for line in lines)
+    assert place_cloud(tmp_path / "a.npy", up="-x").up == "-x"
+
+
+LITTLE_MEMORY = """
+import resource, sys
+from spnr_jax.clouds import read_cloud
+before = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
+resource.setrlimit(resource.RLIMIT_AS, (before + int(sys.argv[2]),) * 2)
+cloud = read_cloud(sys.argv[1], num_points=256)
+print(len(cloud.mask), *cloud.positions.min(axis=0), *cloud.positions.max(axis=0))
+"""
+
+
+def big_file(folder, suffix: str):
+    """A file of a cube's surface, several times larger than the memory that its reader gets."""
+    rng = np.random.default_rng(0)
+    if suffix == ".xyz":
+        points = rng.uniform(-1, 1, (20_000, 3))
+        points[np.arange(20_000), np.arange(20_000) % 3] = np.where(np.arange(20_000) % 2, 1, -1)
+        block = "".join(f"{x:.60f} {y:.60f} {z:.60f}\n" for x, y, z in points)
+        with (folder / "big.xyz").open("w") as file:
+            for _ in range(100):
+                file.write(block)
+        return folder / "big.xyz"
+    path, count = folder / "big.ply", 4_000_000
+    properties = [(f"p{i}", "double") for i in range(20)]
+    header = ply_bytes("binary_little_endian", rows=[], properties=XYZRGB[:3] + properties, before=0)
+    header = header[: header.index(b"element edge")] + b"end_header\n"
+    points = np.zeros(count // 100, [(name, "<f4") for name in "xyz"] + [(name, "<f8") for name, _ in properties])
+    for axis in "xyz":
+        points[axis] = rng.uniform(-1, 1, len(points))
+    for i, axis in enumerate("xyz"):
+        points[axis][i::3] = rng.choice([-1, 1], len(points[i::3]))
+    with path.open("wb") as file:
+        file.write(header.replace(b"element vertex 0", b"element vertex %d" % count))
+        for _ in range(100):
+            file.write(points.tobytes())
+    return path
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("suffix", "memory"), [(".ply", 400e6), (".xyz", 220e6)])
+def test_a_cloud_larger_than_the_memory_is_read(tmp_path, suffix, memory):
+    path = big_file(tmp_path, suffix)
+    assert path.stat().st_size > 1.7 * memory
+    done = subprocess.run(
+        [sys.executable, "-c", LITTLE_MEMORY, path, str(int(memory))], capture_output=True, text=True, cwd=ROOT
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    count, *bounds = done.stdout.split()
+    assert int(count) == 256
+    np.testing.assert_allclose(np.float64(bounds), [-1, -1, -1, 1, 1, 1], atol=0.01)
+
+
+def test_a_cloud_beyond_the_capacity_is_thinned_while_reading_and_says_so(tmp_path, monkeypatch):
+    monkeypatch.setattr(clouds, "CAPACITY", 500)
+    positions = sphere_points(1, 4000)
+    np.savez(tmp_path / "a.npz", xyz=positions, roughness=np.arange(4000) / 4000)
+    cloud, lines = read(tmp_path / "a.npz")
+    assert 60 <= len(cloud.mask) <= 500
+    assert lines[0] == f"{len(cloud.mask)} of 4000 points kept while reading, the first of each voxel"
+    source = np.round(cloud.roughness * 4000).astype(int)
+    np.testing.assert_array_equal(cloud.positions, positions[source].astype(np.float32))
+
+
 def test_wrong_options_are_refused_before_the_file_is_touched():
-    with pytest.raises(ValueError, match="up must be one of y, -y, z, -z, x, -x, got 'w'"):
+    with pytest.raises(ValueError, match="up must be one of y, -y, z, -z, x, -x, auto, got 'w'"):
         read_cloud("absent.ply", up="w")
     with pytest.raises(ValueError, match="num_points must be at least 1, got 0"):
         read_cloud("absent.ply", num_points=0)

@@ -104,13 +104,26 @@ def test_what_stands_still_in_a_turntable_does_not_flicker(tmp_path):
     np.testing.assert_array_equal(shown, np.broadcast_to(shown[:1], shown.shape))
 
 
-@pytest.mark.skipif(importlib.util.find_spec("imageio_ffmpeg") is not None, reason="imageio-ffmpeg is installed")
-def test_an_mp4_without_its_encoder_becomes_a_gif_and_one_line_says_why(tmp_path):
+def test_an_mp4_without_its_encoder_becomes_a_gif_and_one_line_says_why(tmp_path, monkeypatch):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     path, reason = write_turntable(tmp_path / "a.mp4", shaded_frames(3), fps=10)
     assert path == tmp_path / "a.gif"
     assert len(read_frames(path)) == 3
     assert "imageio-ffmpeg" in reason
     assert "\n" not in reason
+
+
+@pytest.mark.skipif(importlib.util.find_spec("imageio_ffmpeg") is None, reason="needs imageio-ffmpeg")
+def test_an_encoder_without_its_program_counts_as_none(tmp_path, monkeypatch):
+    import imageio_ffmpeg
+
+    def none_found():
+        raise RuntimeError("No ffmpeg exe could be found")
+
+    monkeypatch.setattr(imageio_ffmpeg, "get_ffmpeg_exe", none_found)
+    path, reason = write_turntable(tmp_path / "a.mp4", shaded_frames(3), fps=10)
+    assert path == tmp_path / "a.gif"
+    assert reason == "written as .gif: .mp4 needs the program ffmpeg"
 
 
 @pytest.mark.skipif(importlib.util.find_spec("imageio_ffmpeg") is None, reason="needs imageio-ffmpeg")

@@ -6,7 +6,8 @@ from hypothesis import strategies as st
 
 from spnr_jax.clouds import read_cloud
 from spnr_jax.colors import srgb_to_linear
-from spnr_jax.pcd_files import decompress, read_pcd
+from spnr_jax.pcd_files import decompress
+from spnr_jax.point_files import read_columns
 
 LAYOUT = np.dtype([("x", "<f4"), ("y", "<f4"), ("pad", "u1", (3,)), ("z", "<f4"), ("rgb", "<f4"), ("roughness", "<f8")])
 COLORS = np.array([[255, 0, 3], [1, 128, 250], [7, 7, 7], [0, 255, 0]], np.uint32)
@@ -75,7 +76,7 @@ def write(folder, content: bytes):
 @pytest.mark.parametrize("newline", ["\n", "\r\n"])
 def test_every_encoding_of_a_pcd_gives_the_same_columns_and_unpacked_colours(tmp_path, encoding, newline):
     rows = points()
-    columns = read_pcd(write(tmp_path, pcd_bytes(encoding, rows, newline)))
+    columns = read_columns(write(tmp_path, pcd_bytes(encoding, rows, newline)))
     assert set(columns) == {"x", "y", "z", "roughness", "r", "g", "b"}
     for name in ("x", "y", "z", "roughness"):
         np.testing.assert_array_equal(columns[name], rows[name])
@@ -95,7 +96,7 @@ def test_a_pcd_cut_anywhere_is_refused_in_one_line(tmp_path, encoding):
     last = whole.rstrip().rindex(b"\n") + 1 if encoding == "ascii" else len(whole) - 9
     for length in (1, 30, body - 2, body, body + 5 * (encoding != "ascii"), last):
         with pytest.raises(ValueError, match="cut off|not a PCD"):
-            read_pcd(write(tmp_path, whole[:length]))
+            read_columns(write(tmp_path, whole[:length]))
 
 
 @pytest.mark.parametrize(
@@ -111,7 +112,7 @@ def test_a_pcd_cut_anywhere_is_refused_in_one_line(tmp_path, encoding):
 )
 def test_a_pcd_header_that_lies_is_refused(tmp_path, old, new, message):
     with pytest.raises(ValueError, match=message):
-        read_pcd(write(tmp_path, pcd_bytes("binary", points()).replace(old, new)))
+        read_columns(write(tmp_path, pcd_bytes("binary", points()).replace(old, new)))
 
 
 @settings(max_examples=60, deadline=None)

@@ -4,7 +4,8 @@ import pickle
 import numpy as np
 import pytest
 
-from spnr_jax.point_files import read_columns
+from spnr_jax import numpy_files, ply_files, text_files
+from spnr_jax.point_files import column_pieces, read_columns
 
 VERTEX = [("y", "double"), ("red", "uchar"), ("x", "float"), ("label", "short"), ("z", "float")]
 NUMPY = {"double": "f8", "uchar": "u1", "float": "f4", "short": "i2"}
@@ -98,11 +99,55 @@ def test_text_is_read_whatever_its_separator_header_and_comments(tmp_path, text)
     np.testing.assert_array_equal(table, [[1, 2, 3, 0.1, 0.2, 0.3], [4, 5, 6, 0.4, 0.5, 0.6]])
 
 
+NORMALS = [(0.6, 0.8, 0.0), (0.0, -0.6, 0.8)]
+
+
+@pytest.mark.parametrize(
+    ("rows", "names"),
+    [
+        ([(1, 2, 3, 90), (4, 5, 6, 80)], "x y z intensity"),
+        ([(1, 2, 3, *NORMALS[0]), (4, 5, 6, *NORMALS[1])], "x y z nx ny nz"),
+        ([(1, 2, 3, 0.6, 0.8, 0.0), (4, 5, 6, 0.0, 0.6, 0.8)], "x y z r g b"),
+        ([(1, 2, 3, 9, 8, 7, *NORMALS[0]), (4, 5, 6, 6, 5, 4, *NORMALS[1])], "x y z r g b nx ny nz"),
+        ([(1, 2, 3, *NORMALS[0], 9, 8, 7), (4, 5, 6, *NORMALS[1], 6, 5, 4)], "x y z nx ny nz r g b"),
+    ],
+)
+def test_columns_without_names_are_told_by_their_number_and_normals_by_their_length(tmp_path, rows, names):
+    text = "\n".join(" ".join(map(str, row)) for row in rows)
+    columns = read_columns(write(tmp_path, "a.xyz", text))
+    assert list(columns) == names.split()
+    np.testing.assert_array_equal(np.stack(list(columns.values()), axis=-1), rows)
+
+
+@pytest.mark.parametrize("name", ["a.ply", "b.ply", "c.xyz", "d.npy", "e.pcd"])
+def test_pieces_are_small_and_together_the_whole_file(tmp_path, name, monkeypatch):
+    monkeypatch.setattr(ply_files, "PIECE_BYTES", 7 * 24)
+    monkeypatch.setattr(ply_files, "PIECE_LINES", 7)
+    monkeypatch.setattr(text_files, "PIECE_LINES", 7)
+    monkeypatch.setattr(numpy_files, "PIECE_BYTES", 7 * 24)
+    table = np.arange(60.0).reshape(20, 3)
+    lines = "".join("{:g} {:g} {:g}\n".format(*row) for row in table)
+    double = [(axis, "double") for axis in "xyz"]
+    content = {
+        "a.ply": ply_bytes("binary_big_endian", rows=[tuple(row) for row in table], properties=double),
+        "b.ply": ply_bytes("ascii", rows=[tuple(row) for row in table], properties=double),
+        "c.xyz": lines,
+        "d.npy": b"",
+        "e.pcd": f"FIELDS x y z\nSIZE 8 8 8\nTYPE F F F\nPOINTS 20\nDATA ascii\n{lines}",
+    }[name]
+    path = write(tmp_path, name, content)
+    if name == "d.npy":
+        np.save(path, table)
+    pieces = list(column_pieces(path))
+    assert [len(piece["x"]) for piece in pieces] == [7, 7, 6]
+    np.testing.assert_array_equal(np.stack(list(read_columns(path).values()), axis=-1), table)
+
+
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
         ("1 2 3\n4 5\n", "number of columns changed"),
-        ("1 2 3 4\n", r"shape \(1, 4\)"),
+        ("1 2 3 4 5\n", r"shape \(1, 5\)"),
         ("x y z\n1 2 3 4\n", "names 3 columns .* above 4"),
         ("1 2 3\n4 five 6\n", "five"),
         ("0,5 1,5 2,5 0,1 0,1 0,1\n", "5 1"),  # decimal commas are not six columns
@@ -144,7 +189,7 @@ def test_numpy_files_that_are_broken_pickled_or_of_another_layout_are_refused(tm
     damaged[300] ^= 0xFF
     cases = {
         "a.npz": (whole[".npz"][:400], "truncated"),
-        "b.npy": (whole[".npy"][:400], "Failed to read all data"),
+        "b.npy": (whole[".npy"][:400], "truncated"),
         "c.npz": (bytes(damaged), "truncated .*CRC"),
         "d.npy": (pickle.dumps([1, 2]), "not a NumPy file"),
     }
@@ -156,7 +201,7 @@ def test_numpy_files_that_are_broken_pickled_or_of_another_layout_are_refused(tm
         "wide": ({"points": np.zeros((5, 4))}, r"'points' of shape \(5, 4\)"),
         "text": ({"points": np.array([["1", "2", "3"]])}, "type <U1"),
         "ragged": ({"points": np.zeros((5, 3)), "rgb": np.zeros((4, 3))}, "different lengths.*'x': 5.*'r': 4"),
-        "nameless": ({"vertices": np.zeros((5, 3))}, "named positions, points or xyz; found vertices"),
+        "nameless": ({"corners": np.zeros((5, 3))}, "named positions, points or xyz; found corners"),
     }
     for name, (content, reason) in arrays.items():
         np.savez(tmp_path / f"{name}.npz", **content)

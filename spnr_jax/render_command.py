@@ -1,0 +1,66 @@
+"""The options of `spnr render`, and nothing that takes time to import: `--help` reads this file alone."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+Output = Literal["image", "depth", "opacity"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Render:
+    """Render a point cloud or mesh file: views as .png, a turntable, depth, opacity, a mesh, the density grid."""
+
+    cloud: tyro.conf.Positional[Path]
+    """.ply (also 3D Gaussian splats) .pcd .xyz .txt .csv .las .laz .npz .npy, or a mesh: .glb .gltf .obj .stl .off (its
+    surface is sampled)."""
+    run: Path
+    """Run folder whose network renders."""
+    out: Path = Path("renders")
+    """Folder for what is written."""
+    up: Literal["auto", "x", "y", "z", "-x", "-y", "-z"] = "auto"
+    """The file's upward axis; auto: by the format, else y or z, as the object would stand."""
+    num_points: int = 1024
+    """Points used of a bigger cloud, evenly spread, or sampled from a mesh; fewer work too."""
+    seed: int = 0
+    """Seed of the points that are chosen."""
+    views: int = 4
+    """Still pictures, evenly around the object."""
+    elevation: float = 20.0
+    """Degrees above the horizon."""
+    resolution: int | None = None
+    """Pixels along each side (default: what the network was trained for)."""
+    quality: Literal["draft", "balanced", "best", "trained"] = "best"
+    """Samples along a ray near the points: a quarter, half or all of those trained with; or just as trained."""
+    outputs: tuple[Output, ...] = ("image", "depth", "opacity")
+    """What is written of each view; depth comes coloured, as .npy and as 16-bit .png."""
+    transparent: bool = False
+    """Stills on a transparent background instead of white (straight alpha)."""
+    turntable: Literal["gif", "mp4", "none"] = "gif"
+    """Format of the turntable."""
+    frames: int = 48
+    """Frames of the turntable."""
+    fps: int = 16
+    """Frames a second of the turntable."""
+    mesh: bool = False
+    """Also write the surface as .glb, with the materials of the nearest points."""
+    density: bool = False
+    """Also write the density on a grid as .npz."""
+    grid_resolution: int = 96
+    """Places along each side of the grid of --mesh and --density."""
+
+    def __post_init__(self) -> None:
+        """ValueError names the option that makes no sense."""
+        if self.views < 0:
+            raise ValueError(f"--views must not be negative, got {self.views}")
+        for name in ("frames", "num_points", "fps"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"--{name.replace('_', '-')} must be at least 1, got {getattr(self, name)}")
+        if self.resolution is not None and (self.resolution < 16 or self.resolution % 4):
+            raise ValueError(f"--resolution must be a multiple of 4 of at least 16, got {self.resolution}")
+        if not -90 <= self.elevation <= 90:
+            raise ValueError(f"--elevation must be -90 to 90 degrees, got {self.elevation:g}")
+        if not 8 <= self.grid_resolution <= 512:
+            raise ValueError(f"--grid-resolution must be 8 to 512, got {self.grid_resolution}")

@@ -1,0 +1,97 @@
+"""Fewer points that still cover the shape evenly: voxels for any number of points, then farthest points.
+
+A voxel keeps the first of its points in the order of the file.  Voxels are halved or doubled around a fixed corner, so
+that the result depends on the points and their order alone.  Memory and time of the farthest points are bounded by
+thinning with voxels first.
+"""
+
+from collections.abc import Iterable
+
+import numpy as np
+
+Columns = dict[str, np.ndarray]
+
+THINNING = 16  # farthest-point sampling starts from at most this many times the points that it keeps
+INNER = (0.05, 0.95)  # quantiles along each axis between which the extent of a cloud is measured: outliers do not count
+FINEST = 2**10  # voxels along the extent that streaming starts with
+HALVINGS = 20  # of the extent, to the smallest voxel that is tried
+SMALLEST_EXTENT = 1e-30  # where all points coincide
+KEY_BITS = 21  # of a voxel's index along an axis
+
+
+def thin_stream(pieces: Iterable[Columns], capacity: int) -> tuple[Columns, int]:
+    """The columns of all pieces, thinned evenly to `capacity` points where there are more, and how many there were.
+
+    No more than the kept points and one piece are in memory.  Where they are too many the voxels are doubled.
+    """
+    kept: Columns = {}
+    seen, voxel, corner = 0, None, np.zeros(3)
+    for piece in pieces:
+        seen += len(piece["x"])
+        kept = {name: np.concatenate([kept[name], piece[name]]) if kept else piece[name] for name in piece}
+        if len(kept["x"]) <= capacity and voxel is None:
+            continue
+        positions = np.stack([np.asarray(kept[axis], np.float64) for axis in "xyz"], axis=-1)
+        if voxel is None:
+            corner, extent = _frame(positions)
+            voxel = extent / FINEST
+        first = first_in_voxels(positions - corner, voxel)
+        while len(first) > capacity:
+            voxel *= 2
+            first = first[first_in_voxels(positions[first] - corner, voxel)]
+        kept = {name: values[first] for name, values in kept.items()}
+    return kept, seen
+
+
+def first_in_voxels(positions: np.ndarray, voxel: float) -> np.ndarray:
+    """Sorted indices of the first point of positions (n, 3) in each cube of side `voxel`.
+
+    What lies more than 2^20 voxels from 0 falls into the outermost ones.
+    """
+    half = 2.0 ** (KEY_BITS - 1)
+    x, y, z = (np.clip(np.floor(positions.T / voxel), -half, half - 1) + half).astype(np.int64)
+    _, first = np.unique((x << 2 * KEY_BITS) | (y << KEY_BITS) | z, return_index=True)
+    return np.sort(first)
+
+
+def _frame(positions: np.ndarray) -> tuple[np.ndarray, float]:
+    """Corner (3,) and side of a cube that holds most of the positions (n, 3)."""
+    low, high = np.quantile(positions, INNER, axis=0)
+    return low, max(float((high - low).max()), SMALLEST_EXTENT)
+
+
+def candidates(positions: np.ndarray, count: int) -> np.ndarray:
+    """Sorted indices of at most THINNING * count points, at least `count`: those of the finest voxels that fit.
+
+    Points that coincide share every voxel; where voxels leave too few, the first others are added.
+    """
+    if len(positions) <= THINNING * count:
+        return np.arange(len(positions))
+    corner, extent = _frame(positions)
+    chosen = np.arange(1)
+    for halving in range(HALVINGS):
+        finer = first_in_voxels(positions - corner, extent / 2**halving)
+        if len(finer) > THINNING * count:
+            break
+        chosen = finer
+    missing = max(0, count - len(chosen))
+    others = np.setdiff1d(np.arange(len(positions)), chosen)[:missing] if missing else chosen[:0]
+    return np.sort(np.concatenate([chosen, others]))
+
+
+def farthest_points(positions: np.ndarray, count: int, seed: int) -> np.ndarray:
+    """Sorted indices (count,) of points (n, 3), each in turn the farthest from those before; n >= count.
+
+    The seed chooses the first.  Beyond THINNING * count points voxels thin them first: the time is count^2 at most.
+    """
+    among = candidates(positions, count)
+    x, y, z = np.ascontiguousarray((positions[among] - positions.mean(axis=0)).T, np.float32)
+    squared = np.full(len(among), np.inf, np.float32)
+    chosen = np.empty(count, np.int64)
+    chosen[0] = np.random.default_rng(seed).integers(len(among))
+    for step in range(1, count):
+        last = chosen[step - 1]
+        np.minimum(squared, (x - x[last]) ** 2 + (y - y[last]) ** 2 + (z - z[last]) ** 2, out=squared)
+        squared[last] = -1  # never again, not even where points coincide
+        chosen[step] = np.argmax(squared)
+    return np.sort(among[chosen])
