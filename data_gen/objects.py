@@ -59,11 +59,7 @@ def prepare_renderer(variant: str) -> None:
 def make_record(bench: Workbench, task: Task) -> records.ObjectRecord:
     """Return one object, rendered: asset, points, views, condition images."""
     seeds = object_seeds(bench.seed, task.object_id)
-    asset = load_asset(task, bench.seed)
-    rotation = None
-    if task.colour_variant:
-        asset, rotation = augmentation.rotate_colours(asset, seeds["colours"])
-    asset, transform = points.normalise(asset)
+    asset, transform, rotation = make_asset(task, bench.seed)
     surface = points.sample_surface(asset, bench.num_points, seeds["points"])
     cam_to_world = views.random_viewpoints(
         bench.view.views, bench.view.distance, np.random.default_rng(seeds["viewpoints"])
@@ -78,6 +74,14 @@ def make_record(bench: Workbench, task: Task) -> records.ObjectRecord:
         conditions=conditions,
         details=object_details(task, asset, transform, seeds) | {"colour_rotation": rotation and rotation.describe()},
     )
+
+
+def make_asset(task: Task, seed: int) -> tuple[Asset, dict, augmentation.ColourRotation | None]:
+    """Return the object as it is rendered and sampled, the transform that normalised it, and its colours' rotation."""
+    asset, rotation = load_asset(task, seed), None
+    if task.colour_variant:
+        asset, rotation = augmentation.rotate_colours(asset, object_seeds(seed, task.object_id)["colours"])
+    return *points.normalise(asset), rotation
 
 
 def load_asset(task: Task, seed: int) -> Asset:

@@ -12,7 +12,6 @@ The same command goes on where it was stopped and trains nothing twice.  The sam
 times, and with --minutes the number of steps, are those of the machine.
 """
 
-import hashlib
 import json
 import os
 import statistics
@@ -25,7 +24,7 @@ from typing import Literal
 import tyro
 
 from data_gen.poisson import pymeshlab
-from experiments import poisson, table1_page, table1_poisson, table1_report, table1_training
+from experiments import claims, poisson, table1_page, table1_poisson, table1_report, table1_training
 from experiments.table1_scores import ObjectMethod, Scored, Shown, by_category, of_cloud, score_objects
 from experiments.table1_training import NETWORKS, Budget, Trained
 from spnr_jax import cli, data, evaluation
@@ -150,20 +149,14 @@ def test_objects(dataset: data.Dataset, options: Table1) -> tuple[str, ...]:
 
 
 def claim(options: Table1, dataset: data.Dataset) -> None:
-    """Makes the folder that of this table; ValueError if it is another's, whose runs would be mixed in."""
-    content = json.dumps([dataset.settings, dataset.splits], sort_keys=True)
+    """Makes the folder that of this table; ValueError if it is another's."""
     asked = {
         "budget": options.budget,
         "minutes": options.minutes,
         "seed": options.seed,
-        "data": hashlib.sha256(content.encode()).hexdigest(),
+        "data": claims.checksum(dataset),
     }
-    path = options.out / "table1.json"
-    if path.is_file():
-        there = json.loads(path.read_text())
-        if different := [name for name in asked if there.get(name) != asked[name]]:
-            raise ValueError(f"{options.out} holds a table with another {', '.join(different)}; choose another --out")
-    write_whole(path, (json.dumps(asked, indent=1) + "\n").encode())
+    claims.claim(options.out / "table1.json", asked, "a table")
 
 
 def surface_folder(options: Table1, config: TrainConfig, row: str) -> Path:

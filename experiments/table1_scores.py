@@ -51,8 +51,12 @@ def score_objects(
     names: tuple[str, ...],
     num_shown: int,
     weights: LpipsWeights | None,
+    more: Callable[[data.ObjectData, evaluation.Pictures], Scores] | None = None,
 ) -> Scored:
-    """All methods on these objects, with a line now and then; points and image size are the config's."""
+    """All methods on these objects, with a line now and then; points and image size are the config's.
+
+    `more` scores a method's pictures of an object in other ways, too.
+    """
     seconds: dict[str, list[float]] = {method: [] for method in methods}
     scores, shown, to_show, start = {}, [], evaluation.spread(names, num_shown), time.monotonic()
     for number, name in enumerate(names, start=1):
@@ -61,6 +65,9 @@ def score_objects(
         (result,) = evaluation.evaluate_objects(shows, config, dataset, (name,), weights)
         if "npbg" in result.scores:
             del result.scores["npbg"]["iou"]  # it predicts colours alone
+        if more:
+            for method, pictures in result.pictures.items():
+                result.scores[method] |= more(item, pictures)
         scores[name] = result.scores
         if name in to_show:
             shown.append(shown_view(result))

@@ -44,6 +44,8 @@ class LossConfig:
     """Error of a pixel; the weights named l1 apply to either."""
     masked: bool = added(False)
     """Leave pixels of opacity 0 out of the pixel error: Point-NeRF's rays without a point in reach."""
+    condition: bool = added(True)
+    """Whether the discriminator sees the true colours at visible input points [paper]; else an empty image and mask."""
 
     def __post_init__(self) -> None:
         for name in ("l1_weight", "low_resolution_weight", "adversarial_weight", "r1_gamma"):
@@ -52,6 +54,7 @@ class LossConfig:
             0 <= self.adversarial_start <= 1, f"adversarial_start is a share of the steps, got {self.adversarial_start}"
         )
         require(self.pixel in ("l1", "mse"), f"pixel must be l1 or mse, got {self.pixel}")
+        require(self.condition in (True, False), f"condition must be true or false, got {self.condition}")
         require(self.r1_interval >= 1, f"r1_interval must be at least 1, got {self.r1_interval}")
 
 

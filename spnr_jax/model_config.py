@@ -91,6 +91,12 @@ class ModelConfig:
     """Channels of the upsampler before its x2; half of it after."""
     precision: Literal["float32", "bfloat16"] = added("float32")
     """Format of the convolutions in U-Net, upsampler and discriminator; all else, parameters too, is float32."""
+    scatter: Literal["mean", "max", "trilinear"] = added("mean")
+    """How the features of points meet in a voxel (`voxels.spread`)."""
+    skip: Literal["add", "concat"] = added("add")
+    """How the U-Net's encoder joins its decoder: added to a stage's output [paper], or as input of its convolution."""
+    sees_direction: bool = added(True)
+    """Whether colour and features depend on the view direction."""
 
     def __post_init__(self) -> None:
         step = 2**self.num_stages
@@ -108,6 +114,13 @@ class ModelConfig:
         require(
             self.precision in ("float32", "bfloat16"),
             f"precision must be float32 or bfloat16, got {self.precision}",
+        )
+        require(
+            self.scatter in ("mean", "max", "trilinear"), f"scatter must be mean, max or trilinear, got {self.scatter}"
+        )
+        require(self.skip in ("add", "concat"), f"skip must be add or concat, got {self.skip}")
+        require(
+            self.sees_direction in (True, False), f"sees_direction must be true or false, got {self.sees_direction}"
         )
         require(
             self.image_resolution in (self.render_resolution, 2 * self.resize_resolution),

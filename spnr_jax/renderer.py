@@ -38,19 +38,19 @@ class Renderer(nn.Module):
         """Builds the parts that the config asks for."""
         c = self.config
         self.pointnet = PointNet(c.point_widths, c.point_features)
-        self.unet = UNet3D(c.volume_resolution, c.base_width, c.num_stages, c.num_groups, c.bf16)
-        self.field = RadianceField(c.field_width, c.num_features, c.direction_frequencies)
+        self.unet = UNet3D(c.volume_resolution, c.base_width, c.num_stages, c.num_groups, c.bf16, c.skip)
+        self.field = RadianceField(c.field_width, c.num_features, c.direction_frequencies, c.sees_direction)
         if c.upsamples:
             self.upsampler = Upsampler(c.upsampler_width, c.bf16)
 
     def encode(self, cloud: PointCloud, train: bool = False) -> Scene:
         """Feature volume of each object from its points, and where these are."""
-        resolution = self.config.volume_resolution
-        features = self.pointnet(self.point_inputs(cloud), jnp.asarray(cloud.mask), train)
-        rows, share = jax.vmap(lambda p, m: voxels.share_voxels(p, m, resolution))(cloud.positions, cloud.mask)
-        occupancy = jnp.ones_like(features[..., :1])
-        volume = self.unet(rows, jnp.concatenate([features, occupancy], axis=-1) * share[..., None])
-        return Scene(volume=volume, occupied=jax.vmap(lambda r: voxels.occupied(r, resolution))(rows))
+        positions, mask = jnp.asarray(cloud.positions), jnp.asarray(cloud.mask)
+        features = self.pointnet(self.point_inputs(cloud), mask, train)
+        spread = partial(voxels.spread, self.config.scatter, resolution=self.config.volume_resolution)
+        occupied = partial(voxels.occupied, resolution=self.config.volume_resolution)
+        volume = self.unet(*jax.vmap(spread)(positions, features, mask))
+        return Scene(volume=volume, occupied=jax.vmap(occupied)(positions, mask))
 
     def point_inputs(self, cloud: PointCloud) -> Float[Array, "objects points channels"]:
         """Position, offset from the centre of the own voxel, and the materials that the network is built for."""

@@ -116,9 +116,10 @@ def example_inputs(config: TrainConfig) -> tuple[PointCloud, Camera]:
     return cloud, Camera(cam_to_world=pose[None, None], intrinsics=jnp.eye(3)[None, None], height=size, width=size)
 
 
-def create_state(config: TrainConfig) -> TrainState:
-    """Fresh weights and optimisers from the config's seed."""
-    key, generator_key, discriminator_key = jax.random.split(jax.random.key(config.seed), 3)
+def create_state(config: TrainConfig, seed: int | Array | None = None) -> TrainState:
+    """Fresh weights and optimisers from a seed, the config's by default."""
+    key = jax.random.key(config.seed if seed is None else seed)
+    key, generator_key, discriminator_key = jax.random.split(key, 3)
     variables = network(config.model).init(generator_key, *example_inputs(config))
     generator_adam, discriminator_adam = optimizers(config)
     generator, batch_stats = variables["params"], variables.get("batch_stats", {})
@@ -187,6 +188,8 @@ def reconstruction_loss(
 
 def logits(config: TrainConfig, params: dict, image: Array, condition: Array, mask: Array) -> Array:
     """What the discriminator says of the images under its parameters."""
+    if not config.loss.condition:
+        condition, mask = jnp.zeros_like(condition), jnp.zeros_like(mask)
     return discriminator_of(config).bind({"params": params})(image, condition, mask)
 
 

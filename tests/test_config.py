@@ -45,7 +45,15 @@ def test_a_wrong_number_names_the_field_what_came_and_what_is_possible(kind, fie
 
 @pytest.mark.parametrize(
     ("kind", "field", "known"),
-    [(LossConfig, "pixel", "l1 or mse"), (OptimizerConfig, "algorithm", "radam"), (OptimizerConfig, "decay", "cosine")],
+    [
+        (LossConfig, "pixel", "l1 or mse"),
+        (LossConfig, "condition", "true or false"),
+        (OptimizerConfig, "algorithm", "radam"),
+        (OptimizerConfig, "decay", "cosine"),
+        (ModelConfig, "scatter", "mean, max or trilinear"),
+        (ModelConfig, "skip", "add or concat"),
+        (ModelConfig, "sees_direction", "true or false"),
+    ],
 )
 def test_an_unknown_word_names_the_known_ones(kind, field, known):
     config = kind()
@@ -132,6 +140,8 @@ class TestMethods:
         del values["model"]["method"], values["pixel_stride"]
         del values["loss"]["pixel"], values["loss"]["masked"]
         del values["optimizer"]["algorithm"], values["optimizer"]["decay"]
+        del values["loss"]["condition"]
+        del values["model"]["scatter"], values["model"]["skip"], values["model"]["sees_direction"]
         assert from_dict(values) == PRESETS["abo"]()
 
     @pytest.mark.parametrize("name", [name for name in PRESETS if isinstance(PRESETS[name]().model, NPBGConfig)])

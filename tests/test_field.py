@@ -66,6 +66,16 @@ def test_density_does_not_see_the_direction_and_colour_and_features_do():
     assert (jnp.abs(other_rest - rest) > 1e-4).any()
 
 
+def test_a_field_that_does_not_see_the_direction_has_no_weights_for_it_and_one_colour_from_all_sides():
+    module = RadianceField(width=6, num_features=7, direction_frequencies=2, sees_direction=False)
+    params = {name: layer for name, layer in VARIABLES["params"].items() if name != "direction"}
+    made = jax.eval_shape(lambda key: module.init(key, X, DIRECTIONS, method=everything), jax.random.key(0))
+    assert set(made["params"]) == set(params)
+    one, other = (module.apply({"params": params}, X, d, method=everything) for d in (DIRECTIONS, -DIRECTIONS))
+    close(one, other, rtol=0, atol=0)
+    close(one[0], apply(X, DIRECTIONS)[0])
+
+
 @pytest.mark.parametrize("scale", [0.0, 1e-8, 1e4, -1e4])
 def test_is_finite_in_value_and_gradient_however_large_the_volume_is(scale):
     def total(x):

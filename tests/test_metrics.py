@@ -7,7 +7,7 @@ import pytest
 from laws import batch_law, close, numbers
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
-from spnr_jax.metrics import PSNR_CAP, conditional_psnr, opacity_iou, psnr, ssim
+from spnr_jax.metrics import PSNR_CAP, conditional_psnr, high_frequency_ratio, opacity_iou, psnr, ssim
 
 IMAGE = numbers(0, 2, 3, 16, 13, 3, low=0.0)
 REFERENCE = jnp.clip(IMAGE + 0.2 * numbers(1, 2, 3, 16, 13, 3), 0, 1)
@@ -93,3 +93,45 @@ class TestOpacityIou:
 
     def test_two_empty_pictures_agree(self):
         assert opacity_iou(jnp.zeros((2, 2)), jnp.zeros((2, 2))) == 1
+
+
+class TestHighFrequencyRatio:
+    def test_is_the_energy_of_the_windowed_spectrum_beyond_half_of_nyquist(self):
+        def energy(image):
+            height, width = image.shape[:2]
+            window = np.outer(*(np.sin(np.pi * np.arange(n) / n) ** 2 for n in (height, width)))
+            spectrum = np.fft.fft2(np.float64(image) * window[..., None], axes=(0, 1))
+            return sum(
+                np.sum(np.abs(spectrum[i, j]) ** 2)
+                for i, j in np.ndindex(height, width)
+                if np.hypot(min(i, height - i) / (height / 2), min(j, width - j) / (width / 2)) >= 0.5
+            )
+
+        measured = np.asarray(high_frequency_ratio(IMAGE, REFERENCE))
+        for place in np.ndindex(2, 3):
+            expected = energy(np.asarray(IMAGE[place])) / energy(np.asarray(REFERENCE[place]))
+            close(measured[place], expected, rtol=1e-4)
+
+    def test_obeys_the_batch_law(self):
+        batch_law(high_frequency_ratio, IMAGE, REFERENCE, rtol=1e-4)
+
+    def test_is_one_for_equal_images_less_for_a_blurred_one_and_more_with_noise(self):
+        close(high_frequency_ratio(IMAGE, IMAGE), np.ones((2, 3)))
+        blurred = sum(jnp.roll(IMAGE, shift, axis=-2) for shift in (-1, 0, 1)) / 3
+        assert (high_frequency_ratio(blurred, IMAGE) < 0.7).all()
+        smooth = jnp.broadcast_to(jnp.linspace(0.0, 1.0, 13).reshape(1, 1, 1, 13, 1), IMAGE.shape) ** 2
+        assert (high_frequency_ratio(smooth + 0.1 * numbers(3, *IMAGE.shape), smooth) > 1.5).all()
+
+    def test_brightness_does_not_count_and_contrast_does_by_its_square(self):
+        ratio = high_frequency_ratio(IMAGE, REFERENCE)
+        close(high_frequency_ratio(IMAGE + 0.3, REFERENCE - 0.2), ratio, rtol=1e-4)
+        close(high_frequency_ratio(0.5 * IMAGE, REFERENCE), 0.25 * ratio, rtol=1e-4)
+
+    def test_a_smaller_share_of_nyquist_lets_slower_waves_count(self):
+        wave = jnp.broadcast_to(jnp.cos(2 * jnp.pi * 5 * jnp.arange(32) / 32).reshape(32, 1, 1), (32, 32, 3))
+        sharp = numbers(4, 32, 32, 3)
+        low, high = (high_frequency_ratio(wave, sharp, share) for share in (0.25, 0.5))
+        assert low > 100 * high
+
+    def test_a_flat_reference_has_no_ratio(self):
+        assert np.isnan(high_frequency_ratio(IMAGE[0, 0], jnp.full((16, 13, 3), 0.3)))

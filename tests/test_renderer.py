@@ -81,6 +81,17 @@ class TestCloud:
             atol=1e-5,
         )
 
+    @pytest.mark.parametrize("scatter", ["max", "trilinear"])
+    def test_another_scatter_gives_another_volume_and_the_same_occupied_voxels(self, variables, scatter):
+        """Rendering near points looks around the voxels that hold points, however these are scattered."""
+        config = dataclasses.replace(CONFIG, scatter=scatter)
+        plain, other = encode(variables, cloud()), encode(variables, cloud(), config)
+        same_bits(other.occupied, plain.occupied)
+        assert (jnp.abs(other.volume - plain.volume) > 1e-3).any()
+        order = np.random.default_rng(5).permutation(NUM_POINTS)
+        shuffled = jax.tree.map(lambda x: x[:, order], cloud())
+        close(encode(variables, shuffled, config), other, rtol=1e-4, atol=1e-5)
+
     def test_no_point_gives_a_finite_volume(self, variables):
         empty = dataclasses.replace(cloud(), mask=jnp.zeros((2, NUM_POINTS), bool))
         assert jnp.isfinite(encode(variables, empty).volume).all()

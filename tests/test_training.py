@@ -168,6 +168,19 @@ class TestStep:
         assert (stats["variance"] != 1).all()
 
 
+class TestCondition:
+    def test_without_it_the_discriminator_sees_an_empty_image_and_mask(self, fresh):
+        blind = dataclasses.replace(CONFIG, loss=dataclasses.replace(CONFIG.loss, condition=False))
+        image, condition, mask = (x[:, 0] for x in (BATCH.image, BATCH.condition, BATCH.condition_mask))
+        empty = jnp.zeros_like(condition), jnp.zeros_like(mask)
+        seen, unseen, expected = (
+            jax.jit(training.logits, static_argnums=0)(config, fresh.discriminator, image, *inputs)
+            for config, inputs in ((CONFIG, (condition, mask)), (blind, (condition, mask)), (CONFIG, empty))
+        )
+        same_bits(unseen, expected)
+        assert (seen != unseen).any()
+
+
 class TestLazyR1:
     @pytest.mark.parametrize(("at", "due"), [(0, True), (1, False), (2, True), (3, False)])
     def test_the_penalty_comes_every_interval_and_is_scaled_by_it(self, fresh, at, due):

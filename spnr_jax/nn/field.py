@@ -26,6 +26,7 @@ class RadianceField(nn.Module):
     width: int
     num_features: int
     direction_frequencies: int
+    sees_direction: bool = True
 
     def setup(self) -> None:
         """Layers: hidden -> [density, rgb], direction -> features, hidden -> the features after rgb."""
@@ -36,7 +37,9 @@ class RadianceField(nn.Module):
         self.feature_bias = self.param("feature_bias", nn.initializers.zeros, (self.num_features - 3,))
 
     def view(self, directions: Float[Array, "*rays 3"]) -> Float[Array, "*rays features"]:
-        """What the view direction adds to each feature."""
+        """What the view direction adds to each feature: nothing if the field does not see it."""
+        if not self.sees_direction:
+            return jnp.zeros((*directions.shape[:-1], self.num_features), directions.dtype)
         return self.direction(encode_direction(directions, self.direction_frequencies))
 
     def __call__(

@@ -1,0 +1,117 @@
+"""Ablations: a reference training, and one that differs in one thing a row, on the same data and for as many steps.
+
+    python -m experiments.ablations --data DIR --out DIR [--steps N] [--seeds 0 1 2] [--rows no_condition ...]
+
+    OUT/runs/ROW_SEED/                            run folders; finished ones are only read
+    OUT/results.json  table.md                    scores, costs, and differences to the reference with intervals
+    OUT/differences.png  gallery.png              the differences, and pictures of unseen objects
+
+Rows that are the preset itself (its own depth) are left out, and that without colour variants where the training split
+has none: `spnr-data generate DIR --colour-variants 5` makes them.  More rows and seeds can be asked for later.
+Runs of one seed see the same batches and jitter, whatever the row.  The same command gives the same scores on a CPU.
+"""
+
+import dataclasses
+import os
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from experiments import training_report, training_runs
+from experiments.training_runs import Budget, Variant
+from spnr_jax import cli, data
+from spnr_jax.config import TrainConfig
+from spnr_jax.model_config import ModelConfig
+
+Row = Literal[
+    "no_condition",
+    "no_colour_variants",
+    "depth_3",
+    "depth_4",
+    "depth_5",
+    "skip_concat",
+    "no_fine_samples",
+    "no_view_direction",
+    "scatter_max",
+    "scatter_trilinear",
+]
+ROWS: tuple[Row, ...] = Row.__args__  # type: ignore[attr-defined]
+REFERENCE = "reference"
+LABELS = {
+    "no_condition": "No condition image",
+    "no_colour_variants": "No colour variants",
+    "depth_3": "U-Net of 3 stages",
+    "depth_4": "U-Net of 4 stages",
+    "depth_5": "U-Net of 5 stages",
+    "skip_concat": "Skips concatenated",
+    "no_fine_samples": "No fine samples",
+    "no_view_direction": "No view direction",
+    "scatter_max": "Scatter: maximum",
+    "scatter_trilinear": "Scatter: trilinear",
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ablations:
+    """Train a preset and variants that differ from it in one thing each, and compare them on unseen objects."""
+
+    data: Path
+    """Folder of the data set."""
+    out: Path
+    """Folder of runs and results; the same command goes on there."""
+    rows: tuple[Row, ...] = ROWS
+    """What is changed, one thing a row."""
+    budget: tyro.conf.OmitArgPrefixes[Budget] = field(default_factory=Budget)
+
+
+def main(options: Ablations) -> None:
+    """Trains what is not trained, scores all rows, writes tables and pictures."""
+    cli.enable_compilation_cache()
+    dataset = data.open_dataset(options.data)
+    names, config = options.budget.names(dataset), options.budget.config()
+    data.check_resolution(data.read_object(dataset, names[0]), config)
+    training_runs.claim(options.out, "ablations", options.budget, dataset)
+    variants = rows(options.rows, config, dataset)
+    trained = training_runs.train(variants, options.budget.seeds, options.out)
+    compared = training_runs.score(trained, REFERENCE, dataset, names, options.budget.shown)
+    training_report.write(options.out, variants, REFERENCE, compared, options.budget, dataset)
+
+
+def rows(wanted: tuple[Row, ...], config: TrainConfig, dataset: data.Dataset) -> list[Variant]:
+    """The reference, and the rows that differ from it; a line says which do not."""
+    variants = [Variant(name=REFERENCE, label=f"Unchanged ({config.preset})", config=config, dataset=dataset)]
+    for name in (name for name in ROWS if name in wanted):
+        plain = training_runs.without_colour_variants(dataset) if name == "no_colour_variants" else dataset
+        variant = Variant(name=name, label=LABELS[name], config=changed(name, config), dataset=plain)
+        if (variant.config, variant.dataset.splits) == (config, dataset.splits):
+            print(f"{LABELS[name]}: left out, the reference is the same")
+        else:
+            variants.append(variant)
+    return variants
+
+
+def changed(row: Row, config: TrainConfig) -> TrainConfig:
+    """The config with the one change of a row."""
+    assert isinstance(config.model, ModelConfig)
+    samples = config.model.sampling
+    model: dict[str, dict] = {
+        **{f"depth_{stages}": {"num_stages": stages} for stages in (3, 4, 5)},
+        "skip_concat": {"skip": "concat"},
+        "no_fine_samples": {
+            "sampling": dataclasses.replace(samples, num_coarse=samples.num_coarse + samples.num_fine, num_fine=0)
+        },
+        "no_view_direction": {"sees_direction": False},
+        "scatter_max": {"scatter": "max"},
+        "scatter_trilinear": {"scatter": "trilinear"},
+    }
+    if row == "no_condition":
+        return dataclasses.replace(config, loss=dataclasses.replace(config.loss, condition=False))
+    return dataclasses.replace(config, model=dataclasses.replace(config.model, **model.get(row, {})))
+
+
+if __name__ == "__main__":
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
+    sys.exit(cli.guarded(lambda: main(tyro.cli(Ablations, prog="python -m experiments.ablations")), "ablations"))

@@ -1,0 +1,28 @@
+"""The mesh that an object of a data set was made from, from the data set's own records."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from data_gen import originals
+from data_gen.assets import Asset
+from spnr_jax import data, shards
+
+
+def mesh_of(dataset: data.Dataset, item: data.ObjectData, meshes: Path | None) -> Asset:
+    """The normalised mesh of an object; ValueError if it cannot be made again, or is another one by now.
+
+    `meshes` is the folder of the mesh files, where the data set was made from such.
+    """
+    seed = dataset.settings.get("settings", {}).get("seed")
+    if seed is None:
+        raise ValueError(f"{dataset.folder / 'dataset.json'}: names no seed, so its meshes cannot be made again")
+    return originals.original(details(dataset, item.name), seed, np.asarray(item.cloud.positions), meshes)
+
+
+def details(dataset: data.Dataset, name: str) -> dict:
+    """What object.json says of an object, in either form of the data set."""
+    if dataset.shards is not None:
+        return json.loads(shards.read_files(dataset.shards, name)["object.json"])
+    return json.loads((dataset.folder / "objects" / name / "object.json").read_bytes())

@@ -1,0 +1,200 @@
+"""Ablations: each row changes one thing; a stopped experiment goes on to the same numbers; differences are paired."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+import tiny_dataset
+from tiny_runs import check_conditions, results_of, shrunken
+
+from experiments import training_report, training_runs
+from experiments.ablations import LABELS, ROWS, Ablations, changed, main, rows
+from experiments.training_runs import Budget, Compared
+from spnr_jax import checkpoint, cli, config, data, evaluation, trainer, training
+from spnr_jax.config import to_dict
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _shrunken():
+    with shrunken():
+        yield
+
+
+def asked(out, wanted=("skip_concat",), dataset=None, **budget):
+    folder = dataset or tiny_dataset.dataset().folder
+    return Ablations(data=folder, out=out, rows=wanted, budget=Budget(**{"quick": True} | budget))
+
+
+@pytest.fixture(scope="module")
+def out(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("ablations") / "out"
+    main(asked(folder))
+    return folder
+
+
+def leaves(values, path=""):
+    for name, value in values.items():
+        yield from leaves(value, f"{path}{name}.") if isinstance(value, dict) else [(f"{path}{name}", value)]
+
+
+class TestRows:
+    tiny = config.tiny()
+
+    def test_each_changes_what_it_says_and_nothing_else(self):
+        expected = {
+            "no_condition": {"loss.condition": False},
+            "no_colour_variants": {},
+            "depth_3": {},  # tiny's own
+            "depth_4": {"model.num_stages": 4},
+            "depth_5": {"model.num_stages": 5},
+            "skip_concat": {"model.skip": "concat"},
+            "no_fine_samples": {"model.sampling.num_coarse": 32, "model.sampling.num_fine": 0},
+            "no_view_direction": {"model.sees_direction": False},
+            "scatter_max": {"model.scatter": "max"},
+            "scatter_trilinear": {"model.scatter": "trilinear"},
+        }
+        before = dict(leaves(to_dict(self.tiny)))
+        found = {
+            row: {name: value for name, value in leaves(to_dict(changed(row, self.tiny))) if before[name] != value}
+            for row in ROWS
+        }
+        assert found == expected
+        assert set(LABELS) == set(ROWS)
+
+    def test_rows_that_are_the_reference_are_left_out_with_a_line(self, capsys):
+        made = rows(ROWS, self.tiny, tiny_dataset.dataset())
+        assert {variant.name for variant in made} == {"reference", *ROWS} - {"depth_3", "no_colour_variants"}
+        said = capsys.readouterr().out
+        assert "U-Net of 3 stages: left out" in said
+        assert "No colour variants: left out" in said
+
+    def test_without_colour_variants_the_training_split_alone_shrinks(self):
+        splits = tiny_dataset.SPLITS | {"train": ("a", "a--1", "a--2", "b")}
+        dataset = dataclasses.replace(tiny_dataset.dataset(), splits=splits)
+        (_, variant) = rows(("no_colour_variants",), self.tiny, dataset)
+        assert variant.dataset.splits == tiny_dataset.SPLITS | {"train": ("a", "b")}
+        assert variant.config == self.tiny
+
+
+def test_scores_and_differences_are_those_of_the_runs_on_the_same_views(out):
+    results, psnr = results_of(out), {}
+    for row in ("reference", "skip_concat"):
+        found, state = checkpoint.load_run(out / "runs" / f"{row}_0")
+        show = {row: evaluation.network(training.averaged_variables(state), found)}
+        scored = evaluation.evaluate_objects(show, found, tiny_dataset.dataset(), ("ball_000004", "chair"))
+        psnr[row] = np.concatenate([result.scores[row]["psnr"] for result in scored])
+        assert results["variants"][row]["psnr"] == pytest.approx(psnr[row].mean(), abs=1e-5)
+    difference = results["minus_reference"]["skip_concat"]["psnr"]
+    assert difference["mean"] == pytest.approx((psnr["skip_concat"] - psnr["reference"]).mean(), abs=1e-5)
+    assert difference["by_seed"] == [difference["mean"]]
+    assert results["test_objects"] == ["ball_000004", "chair"]
+    check_conditions(out)
+
+
+def test_a_finished_experiment_is_only_read(out, monkeypatch):
+    def forbidden(*_, **__):
+        raise AssertionError("something was trained again")
+
+    before = json.loads((out / "results.json").read_text())
+    monkeypatch.setattr(training, "jitted_train_step", forbidden)
+    main(asked(out))
+    after = json.loads((out / "results.json").read_text())
+    for row in ("reference", "skip_concat"):
+        assert after["variants"][row]["training_seconds"] == before["variants"][row]["training_seconds"]
+
+
+def test_a_stopped_experiment_goes_on_to_the_same_numbers(out, tmp_path, monkeypatch):
+    train, calls = trainer.train, []
+
+    def stopped(*arguments):
+        calls.append(arguments)
+        if len(calls) == 2:
+            raise KeyboardInterrupt("stopped at step 1 of 4; the same command goes on from there")
+        return train(*arguments)
+
+    monkeypatch.setattr(trainer, "train", stopped)
+    assert cli.guarded(lambda: main(asked(tmp_path)), "ablations") == 130
+    assert not (tmp_path / "results.json").exists()
+    assert cli.guarded(lambda: main(asked(tmp_path)), "ablations") == 0
+    assert results_of(tmp_path) == results_of(out)
+
+
+def test_another_data_set_or_number_of_steps_is_refused_with_one_line(out, tmp_path, capsys):
+    other = tiny_dataset.write_dataset(tmp_path / "data", tiny_dataset.SPLITS | {"val": ()})
+    for options, word in ((asked(out, quick=False, steps=5), "steps"), (asked(out, dataset=other), "data")):
+        assert cli.guarded(lambda options=options: main(options), "ablations") == 2
+        (line,) = capsys.readouterr().err.strip().splitlines()
+        assert f"holds results with another {word}; choose another --out" in line
+
+
+@pytest.mark.parametrize(
+    ("budget", "message"),
+    [
+        ({"seeds": ()}, "--seeds: expected one or more"),
+        ({"seeds": (1, 1)}, "none of them twice"),
+        ({"steps": 0}, "--steps: expected 1 or more"),
+        ({"steps": 5, "quick": True}, "not together with --quick"),
+        ({"shown": 0}, "--shown: expected 1 or more"),
+    ],
+)
+def test_a_wrong_option_says_what_is_possible(budget, message):
+    with pytest.raises(ValueError, match=message):
+        Budget(**budget)
+
+
+class TestReport:
+    """Two variants, two seeds, three objects of two views with made-up scores."""
+
+    rng = np.random.default_rng(0)
+    by_seed = {
+        name: [
+            [{metric: level + seed + rng.random(2) for metric in training_report.METRICS} for _ in range(3)]
+            for seed in range(2)
+        ]
+        for name, level, rng in (("a", 10.0, rng), ("b", 13.0, rng))
+    }
+    compared = Compared(
+        scores={n: [training_runs.joined(o) for o in zip(*seeds, strict=True)] for n, seeds in by_seed.items()},
+        by_seed=by_seed,
+        costs={},
+        shown=[],
+        shown_scores=[],
+    )
+
+    def test_a_difference_compares_equal_seeds_objects_and_views(self):
+        found = training_report.change(self.compared, "b", "a", "psnr")
+        pairs = zip(self.by_seed["b"], self.by_seed["a"], strict=True)
+        means = [
+            np.mean([b["psnr"] - a["psnr"] for b, a in zip(first, second, strict=True)]) for first, second in pairs
+        ]
+        assert found["by_seed"] == pytest.approx(means)
+        assert found["mean"] == pytest.approx(np.mean(means))
+        assert found["interval"][0] < found["mean"] < found["interval"][1]
+
+    def test_a_metric_that_no_view_has_is_none(self):
+        nothing = [{metric: np.full(2, np.nan) for metric in training_report.METRICS}] * 3
+        assert training_report.means(nothing)["detail"] is None
+        scores = {"a": nothing, "b": nothing}
+        compared = dataclasses.replace(self.compared, scores=scores)
+        assert training_report.change(compared, "b", "a", "detail") is None
+
+
+def test_the_pace_of_a_run_is_not_that_of_its_compilations(tmp_path):
+    paces = (900.0, 10.0, 30.0, 20.0, 20.0, 800.0, 10.0, 20.0, 30.0)
+    rows = [{"step": i, "ms_per_step": pace} for i, pace in enumerate(paces)] + [{"step": 9, "val_psnr": 1.0}]
+    (tmp_path / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    assert training_runs.step_milliseconds(tmp_path) == 20.0
+    (tmp_path / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows[:3]))
+    assert training_runs.step_milliseconds(tmp_path) is None
+
+
+def test_scores_inside_the_silhouette_do_not_see_the_rest():
+    item = data.read_object(tiny_dataset.dataset(), "chair")
+    reference = data.on_white(item.images)
+    outside = item.images[..., 3:] <= 127
+    spoilt = np.where(outside, np.float32(0.5), reference)
+    found = training_runs.more_scores(item, evaluation.Pictures(image=spoilt, acc=spoilt[..., 0]))
+    np.testing.assert_allclose(found["inside"], 100.0)
+    equal = training_runs.more_scores(item, evaluation.Pictures(image=reference, acc=reference[..., 0]))
+    np.testing.assert_allclose(equal["detail"], 1.0, rtol=1e-5)

@@ -1,0 +1,106 @@
+"""Figure 2: colour variants beside their objects, and two trainings that differ in the training split alone."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import tiny_dataset
+from tiny_runs import check_conditions, results_of, shrunken
+
+from data_gen.plan import check_options, plan_data_set
+from experiments import fig2_color_augmentation, training_runs
+from experiments.fig2_color_augmentation import Fig2, generation, main, nearest_views, trainings
+from experiments.training_runs import Budget
+from spnr_jax import cli, data, training
+
+TRAIN = ("ball_000000", "ball_000000--1", "ball_000000--2", "ball_000001", "ball_000001--1", "cube_000000")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _shrunken():
+    with shrunken():
+        yield
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A data set with colour variants."""
+    return tiny_dataset.write_dataset(tmp_path_factory.mktemp("fig2") / "data", tiny_dataset.SPLITS | {"train": TRAIN})
+
+
+@pytest.fixture(scope="module")
+def out(folder, tmp_path_factory):
+    place = tmp_path_factory.mktemp("fig2") / "out"
+    main(Fig2(data=folder, out=place, budget=Budget(quick=True)))
+    return place
+
+
+def test_both_trainings_are_scored_on_the_same_objects(out):
+    results = results_of(out)
+    assert {name: row["training_objects"] for name, row in results["variants"].items()} == {"without": 3, "with": 6}
+    assert results["reference"] == "without"
+    assert set(results["minus_reference"]["with"]) >= {"psnr", "flip"}
+    assert results["minus_reference"]["with"]["psnr"]["mean"] != 0
+    assert (out / "variants.png").read_bytes().startswith(b"\x89PNG")
+    check_conditions(out)
+
+
+def test_a_finished_figure_is_only_read(out, folder, monkeypatch):
+    def forbidden(*_, **__):
+        raise AssertionError("something was trained again")
+
+    before = results_of(out)
+    monkeypatch.setattr(training, "jitted_train_step", forbidden)
+    main(Fig2(data=folder, out=out, budget=Budget(quick=True)))
+    assert results_of(out) == before
+
+
+def test_the_trainings_differ_in_the_training_split_alone(folder):
+    dataset = data.open_dataset(folder)
+    plain, whole = trainings(Fig2(out=folder, data=folder), dataset)
+    assert plain.config == whole.config
+    assert whole.dataset == dataset
+    assert plain.dataset.splits == dataset.splits | {"train": ("ball_000000", "ball_000001", "cube_000000")}
+
+
+def test_a_data_set_without_variants_is_refused_with_the_command_that_makes_one(tmp_path, capsys):
+    options = Fig2(data=tiny_dataset.dataset().folder, out=tmp_path)
+    assert cli.guarded(lambda: main(options), "fig2") == 2
+    assert "spnr-data generate DIR --colour-variants 5" in capsys.readouterr().err
+
+
+def test_without_a_data_set_one_with_variants_is_generated(folder, tmp_path, monkeypatch):
+    made = []
+
+    def generate(config):
+        made.append(config)
+        tiny_dataset.write_dataset(config.out, tiny_dataset.SPLITS | {"train": TRAIN})
+
+    def train(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(fig2_color_augmentation, "generate", generate)
+    monkeypatch.setattr(training_runs, "train", train)
+    options = Fig2(out=tmp_path, generated=30, colour_variants=3)
+    with pytest.raises(KeyboardInterrupt):
+        main(options)
+    (config,) = made
+    check_options(config)
+    assert (config.out, config.objects, config.colour_variants) == (tmp_path / "data", 30, 3)
+    plan = plan_data_set(config)
+    split = plan.split([task.object_id for task in plan.tasks])
+    assert len(plan.variants(split["train"])) == 3 * len(split["train"])
+    quick = generation(dataclasses.replace(options, budget=Budget(quick=True)), tmp_path)
+    assert (quick.objects, quick.colour_variants, quick.resolution) == (12, 2, tiny_dataset.SIZE)
+
+
+def test_the_nearest_views_look_from_the_same_side():
+    angles = np.radians([[0, 90, 180], [95, 200, 300], [270, 10, 88]])
+    eyes = [3 * np.stack([np.sin(a), 0 * a, np.cos(a)], axis=-1) for a in angles]
+    assert nearest_views(eyes) == [1, 0, 2]
+
+
+@pytest.mark.parametrize("option", ["generated", "colour_variants"])
+def test_a_wrong_option_says_what_is_possible(tmp_path, option):
+    with pytest.raises(ValueError, match=f"--{option.replace('_', '-')}: expected 1 or more"):
+        Fig2(out=tmp_path, **{option: 0})

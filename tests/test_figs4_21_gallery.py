@@ -1,0 +1,151 @@
+"""The contact sheets show every object of every method in one layout, and are made once."""
+
+import base64
+import dataclasses
+import io
+import json
+import re
+
+import numpy as np
+import pytest
+import stand_ins
+import tiny_dataset
+from PIL import Image
+
+from data_gen import records
+from experiments import figs4_21_gallery, methods, sheets
+from experiments.figs4_21_gallery import Gallery, main
+from experiments.methods import Sources
+from spnr_jax import cli, data
+
+SIZE, GAP = tiny_dataset.SIZE, sheets.GAP
+NAMES = tiny_dataset.SPLITS["test"]
+
+
+@pytest.fixture(autouse=True)
+def _stand_ins(monkeypatch):
+    monkeypatch.setattr(cli, "enable_compilation_cache", lambda: None)
+    monkeypatch.setattr(methods, "networks", lambda *_: stand_ins.stand_ins("Ours", "Ours (a/run)"))
+
+
+def asked(out, **options):
+    return Gallery(data=tiny_dataset.dataset().folder, out=out, **({"rows": 1, "columns": 2} | options))
+
+
+def reference(name, view=0):
+    return np.round(255 * data.on_white(data.read_object(tiny_dataset.dataset(), name).images[view]))
+
+
+def place(sheet, column, row=0):
+    start = column * (SIZE + GAP), row * (SIZE + GAP)
+    return np.asarray(Image.open(sheet))[start[1] : start[1] + SIZE, start[0] : start[0] + SIZE]
+
+
+def test_every_sheet_has_the_objects_in_the_same_place_page_after_page(tmp_path, monkeypatch):
+    read = data.read_object
+
+    def with_a_darker_view(*arguments):
+        item = read(*arguments)
+        images = item.images.copy()
+        images[1, ..., :3] //= 2
+        return dataclasses.replace(item, images=images)
+
+    monkeypatch.setattr(data, "read_object", with_a_darker_view)
+    main(asked(tmp_path, view=1))
+    sheets_of = {path.name for path in tmp_path.glob("*.png")}
+    assert sheets_of == {f"{stem}_{page}.png" for stem in ("reference", "ours", "ours-a-run") for page in (1, 2)}
+    for i, name in enumerate(NAMES):
+        page, column = divmod(i, 2)
+        np.testing.assert_array_equal(place(tmp_path / f"reference_{page + 1}.png", column), reference(name, 1))
+        drawn = np.asarray(Image.open(tmp_path / "pictures" / "Ours" / f"{name}.png"))
+        np.testing.assert_array_equal(place(tmp_path / f"ours_{page + 1}.png", column), drawn)
+    assert (place(tmp_path / "ours_2.png", 1) == 255).all()
+
+
+def test_the_page_holds_each_object_with_all_methods_and_their_psnr(tmp_path):
+    main(asked(tmp_path))
+    text, results = (tmp_path / "gallery.html").read_text(), json.loads((tmp_path / "results.json").read_text())
+    assert "http" not in text
+    pictures = re.findall(r'src="data:image/png;base64,([^"]+)"', text)
+    assert len(pictures) == 3 * len(NAMES)
+    first = np.asarray(Image.open(io.BytesIO(base64.b64decode(pictures[0]))))
+    np.testing.assert_array_equal(first, reference(NAMES[0]))
+    drawn = np.asarray(Image.open(tmp_path / "pictures" / "Ours" / f"{NAMES[0]}.png")) / 255
+    error = np.mean((drawn - reference(NAMES[0]) / 255) ** 2)
+    assert results["psnr"]["Ours"][0] == pytest.approx(-10 * np.log10(error), abs=1e-3)
+    assert f"<br>{results['psnr']['Ours'][0]:.1f}<" in text
+
+
+def test_too_few_test_objects_are_counted_and_the_command_for_more_is_named(tmp_path, capsys):
+    main(asked(tmp_path, objects=120))
+    said = capsys.readouterr().out
+    assert "has 3 test objects, 120 were asked for" in said
+    assert "--objects 126 --test-objects 120" in said
+    assert "--test-objects 120" in (tmp_path / "gallery.html").read_text()
+    main(asked(tmp_path, objects=2))
+    assert "were asked for" not in capsys.readouterr().out
+
+
+def test_pictures_are_made_once_and_of_one_view_and_network(tmp_path, monkeypatch):
+    main(asked(tmp_path))
+
+    def forbidden(*_):
+        raise AssertionError("a picture was made again")
+
+    monkeypatch.setattr(stand_ins.StandIn, "show", forbidden)
+    before = (tmp_path / "ours_1.png").read_bytes()
+    main(asked(tmp_path))
+    assert (tmp_path / "ours_1.png").read_bytes() == before
+    with pytest.raises(ValueError, match="holds a gallery with another view; choose another --out"):
+        main(asked(tmp_path, view=1))
+    monkeypatch.setattr(methods, "networks", lambda *_: stand_ins.stand_ins("Ours", checksum="1"))
+    with pytest.raises(ValueError, match="holds pictures of Ours with another config"):
+        main(asked(tmp_path))
+
+
+def test_poisson_pictures_of_a_table_are_shown_where_there_is_one_of_every_object(tmp_path, capsys):
+    table, points = tmp_path / "table", tiny_dataset.CONFIG.test_points
+    grey = np.full((SIZE, SIZE, 4), 99, np.uint8)
+    grey[..., 3] = 255
+    for name in NAMES:
+        folder = table / f"poisson_{points}" / name
+        folder.mkdir(parents=True)
+        (folder / "000.png").write_bytes(records.encode_image(grey))
+        (folder / "made.json").write_text("{}")
+    main(asked(tmp_path / "out", sources=Sources(table1=table)))
+    assert (place(tmp_path / "out" / "poisson_1.png", 0) == 99).all()
+    assert "Poisson, trimmed 0.3 left out" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("wrong", [{"objects": 0}, {"view": -1}, {"rows": 0}, {"columns": 0}])
+def test_wrong_options_are_refused_by_name(wrong, tmp_path):
+    with pytest.raises(ValueError, match=f"--{next(iter(wrong))}: expected"):
+        asked(tmp_path, **wrong)
+
+
+def test_a_view_that_is_not_there_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="--view 3: object ball_000004 has views 0 to 2"):
+        main(asked(tmp_path, view=3))
+
+
+def test_names_of_files_are_lower_case_words():
+    assert figs4_21_gallery.file_stem("Poisson, trimmed 0.3") == "poisson-trimmed-0-3"
+
+
+class TestGrid:
+    red, blue = (np.tile(np.uint8(color), (4, 4, 1)) for color in ((200, 0, 0), (0, 0, 200)))
+
+    def test_cells_stand_in_rows_and_a_missing_one_is_white(self):
+        found = sheets.grid([[self.red, self.blue], [self.blue]], size=8)
+        assert found.shape == (2 * (8 + GAP), 2 * (8 + GAP), 3)
+        np.testing.assert_array_equal(found[0, 0], self.red[0, 0])
+        np.testing.assert_array_equal(found[7, 8 + GAP], self.blue[0, 0])
+        np.testing.assert_array_equal(found[8 + GAP, 0], self.blue[0, 0])
+        assert (found[8 + GAP :, 8 + GAP :] == 255).all()
+
+    def test_names_stand_above_and_beside_the_cells(self):
+        bare, named = (sheets.grid([[self.red]], *names, size=80) for names in ((), (["above"], ["beside_it"])))
+        top, left = (a - b for a, b in zip(named.shape[:2], bare.shape[:2], strict=True))
+        np.testing.assert_array_equal(named[top:, left:], bare)
+        assert named[:top].min() < 100
+        assert named[top:, :left].min() < 100

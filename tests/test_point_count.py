@@ -1,0 +1,170 @@
+"""Every method is scored on clouds of each size, once; points that a data set lacks come from the mesh."""
+
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import stand_ins
+import tiny_dataset
+from handmade import RED, ball, plain
+from PIL import Image
+
+from data_gen.assets import Asset
+from experiments import methods, point_count, sheets
+from experiments.point_count import PointCount, cloud_of, main
+from spnr_jax import cli, data, evaluation, statistics
+
+NAMES = tiny_dataset.SPLITS["test"]
+COUNTS = (8, 16, 64)
+STORED = tiny_dataset.POINTS
+FLOORS = ["Nearest-point shading", "Base-colour splat", "White image"]
+
+
+def mesh(*_):
+    """What the tiny data set's pictures show."""
+    return Asset(parts=(ball(radius=tiny_dataset.RADIUS, material=plain(RED, 0.3)),))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _stand_ins():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cli, "enable_compilation_cache", lambda: None)
+        patch.setattr(methods, "networks", lambda *_: stand_ins.stand_ins("Ours", "NPBG"))
+        patch.setattr(evaluation, "choose_radius", lambda *_: 1.5)
+        patch.setattr(point_count, "mesh_of", mesh)
+        patch.setattr(point_count, "details", lambda *_: {"seeds": {"points": 5}})
+        yield
+
+
+def read(path):
+    with Image.open(path) as image:
+        return np.asarray(image)
+
+
+def asked(out, **options):
+    return PointCount(data=tiny_dataset.dataset().folder, out=out, **({"counts": COUNTS} | options))
+
+
+@pytest.fixture(scope="module")
+def out(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("points")
+    main(asked(folder))
+    return folder
+
+
+def test_a_cloud_holds_the_first_points_and_beyond_those_new_ones_of_the_mesh():
+    dataset = tiny_dataset.dataset()
+    item = data.read_object(dataset, NAMES[0])
+    np.testing.assert_array_equal(cloud_of(dataset, item, 16, None).positions, item.cloud.positions[:16])
+    many = cloud_of(dataset, item, 300, None)
+    assert many.mask.shape == (300,)
+    assert many.mask.all()
+    np.testing.assert_allclose(np.linalg.norm(many.positions, axis=1), tiny_dataset.RADIUS, rtol=0.05)
+    np.testing.assert_allclose(many.base_color, np.tile(np.float32(RED), (300, 1)))
+    assert {x.dtype for x in jax.tree.leaves(many)} == {np.dtype("float32"), np.dtype("bool")}
+
+
+def test_the_curves_are_the_scores_of_the_evaluation_at_each_count(out):
+    results = json.loads((out / "results.json").read_text())
+    assert list(results["curves"]) == ["Ours", "NPBG", *FLOORS]
+    assert results["counts"] == list(COUNTS)
+    dataset, scores = tiny_dataset.dataset(), []
+    for name in NAMES:
+        item = data.read_object(dataset, name)
+        shown = evaluation.floor("splat", 1.5)(methods.first_points(item, 16), item.camera)
+        alpha = item.images[..., 3] / np.float32(255)
+        scores.append(evaluation.score(shown.image, shown.acc, data.on_white(item.images), alpha, alpha > 0))
+    for metric in point_count.METRICS:
+        values = [np.asarray(row[metric], np.float64) for row in scores]
+        (point,) = [p for p in results["curves"]["Base-colour splat"][metric] if p["points"] == 16]
+        assert point["mean"] == pytest.approx(np.mean(values), rel=1e-6)
+        assert point["interval"] == pytest.approx(statistics.interval(values), rel=1e-6)
+
+
+def test_a_method_without_opacity_has_no_curve_of_it(out):
+    results = json.loads((out / "results.json").read_text())
+    assert set(results["curves"]["NPBG"]) == {"psnr", "flip"}
+    assert "| NPBG | n/a | n/a | n/a |" in (out / "table.md").read_text()
+
+
+def test_every_count_is_a_column_of_the_table_and_of_the_pictures(out):
+    assert "| PSNR, dB | 8 | 16 | 64 |" in (out / "table.md").read_text()
+    height, width = read(out / "strip.png").shape[:2]
+    cell = 128 + sheets.GAP
+    assert (width // cell, height // cell) == (1 + len(COUNTS), 1 + len(FLOORS))  # all but the white image
+    assert (out / "point_count.png").read_bytes().startswith(b"\x89PNG")
+    pictures = [read(out / "Ours" / f"{count}.png") for count in COUNTS]
+    assert pictures[0].mean() > pictures[1].mean() > pictures[2].mean()  # the stand-in is darker with more points
+
+
+def test_what_was_measured_is_not_measured_again(out, tmp_path, monkeypatch):
+    def forbidden(*_):
+        raise AssertionError("something was measured again")
+
+    before = (out / "results.json").read_bytes()
+    measure = point_count.measure
+    monkeypatch.setattr(point_count, "measure", forbidden)
+    main(asked(out))
+    assert (out / "results.json").read_bytes() == before
+    calls = []
+
+    def stopped(*arguments):
+        calls.append(arguments)
+        if len(calls) == 5:
+            raise KeyboardInterrupt
+        return measure(*arguments)
+
+    monkeypatch.setattr(point_count, "measure", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        main(asked(tmp_path))
+    main(asked(tmp_path))
+    assert (tmp_path / "results.json").read_bytes() == before
+    assert len(calls) == len(NAMES) * len(COUNTS) * (2 + len(FLOORS)) + 2  # of the stopped count two were lost
+
+
+def test_a_folder_holds_the_scores_of_one_network_and_of_the_same_objects(out, monkeypatch):
+    with pytest.raises(ValueError, match="holds point counts with another objects; choose another --out"):
+        main(asked(out, objects=1))
+    monkeypatch.setattr(methods, "networks", lambda *_: stand_ins.stand_ins("Ours", checksum="1"))
+    with pytest.raises(ValueError, match="holds scores of Ours with another config"):
+        main(asked(out))
+
+
+def test_counts_that_cannot_be_had_are_left_out_with_the_reason(monkeypatch, capsys, tmp_path):
+    def absent(*_):
+        raise ValueError("object chair was made from chair.obj: give the folder of the meshes with --meshes")
+
+    monkeypatch.setattr(point_count, "mesh_of", absent)
+    dataset = tiny_dataset.dataset()
+    assert point_count.available_counts(asked(tmp_path), dataset, NAMES[0]) == [8, 16]
+    said = capsys.readouterr().out
+    assert f"left out 64 points: the data set holds {STORED} an object, and object chair was made from" in said
+    assert "--meshes" in said
+    assert point_count.available_counts(asked(tmp_path, counts=(64,)), dataset, NAMES[0]) == [STORED]
+
+
+@pytest.mark.parametrize("counts", [(), (0, 8), (16, 8), (8, 8)])
+def test_counts_have_to_rise(counts, tmp_path):
+    with pytest.raises(ValueError, match="--counts: expected rising numbers of points"):
+        asked(tmp_path, counts=counts)
+
+
+def test_a_method_compiles_once_for_all_objects_of_a_count():
+    traces = []
+
+    @jax.jit
+    def images(cloud, poses):
+        traces.append(cloud)
+        grey = jnp.mean(cloud.base_color) + 0 * poses[:, :1, :1]
+        acc = jnp.broadcast_to(grey, (len(poses), tiny_dataset.SIZE, tiny_dataset.SIZE))
+        return jnp.stack([acc] * 3, axis=-1), acc
+
+    def show(item):
+        image, acc = images(item.cloud, item.camera.cam_to_world)
+        return evaluation.Pictures(image=image, acc=acc)
+
+    for name in NAMES:
+        point_count.measure(tiny_dataset.dataset(), name, point_count.Method(show=show, identity={}), 64, None)
+    assert len(traces) == 1
