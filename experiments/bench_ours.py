@@ -14,8 +14,9 @@ import numpy as np
 
 from experiments import bench_scene, bench_worker, twin_layout
 from spnr_jax import training
-from spnr_jax.config import PRESETS, TrainConfig
+from spnr_jax.config import TrainConfig
 from spnr_jax.model_config import ModelConfig
+from spnr_jax.presets import PRESETS
 from spnr_jax.types import Batch
 
 NUM_GROUPS, DISCRIMINATOR_WIDTH = 8, 64  # the twin's, for every preset

@@ -19,7 +19,7 @@ import tyro
 
 from data_gen.generate import generate
 from data_gen.plan import GenerateConfig
-from spnr_jax import cli, config, data, evaluation, trainer
+from spnr_jax import cli, data, evaluation, presets, trainer
 from spnr_jax.images import write_whole
 from spnr_jax.results import write_results
 
@@ -65,7 +65,7 @@ def main(demo: Demo) -> None:
     print(f"1/3 generating the data set in {generation.out}", flush=True)
     seconds.measure("generate", lambda: generate(generation))
 
-    tiny = config.tiny()
+    tiny = presets.tiny()
     tiny = dataclasses.replace(tiny, seed=demo.seed, num_steps=tiny.num_steps if demo.steps is None else demo.steps)
     dataset, run = data.open_dataset(generation.out), demo.out / "run"
     print(f"2/3 training preset {tiny.preset} for {tiny.num_steps} steps in {run}", flush=True)

@@ -27,7 +27,7 @@ import tyro
 from tqdm import tqdm
 
 from data_gen.pack import PackConfig, pack
-from spnr_jax import cli, config, data, training
+from spnr_jax import cli, data, presets, training
 from spnr_jax.config import TrainConfig
 from spnr_jax.images import write_whole
 
@@ -58,7 +58,7 @@ def main(options: Loading) -> None:
     with tempfile.TemporaryDirectory() as folder:
         pack(PackConfig(dataset=options.dataset, out=Path(folder) / "packed"))
         for preset in options.presets:
-            settings = config.PRESETS[preset]()
+            settings = presets.PRESETS[preset]()
             if settings.model.image_resolution != size:
                 print(f"{preset} left out: it needs images of {settings.model.image_resolution} px, these have {size}")
                 continue

@@ -33,8 +33,9 @@ from experiments import claims, many_runs
 from experiments.many_objects_report import LABELS, plot, table
 from experiments.many_runs import FORMS, Form
 from spnr_jax import cli, data, evaluation, training
-from spnr_jax.config import PRESETS, TrainConfig
+from spnr_jax.config import TrainConfig
 from spnr_jax.images import write_whole
+from spnr_jax.presets import PRESETS
 from spnr_jax.types import Camera, PointCloud
 
 SAVE_EVERY = 20

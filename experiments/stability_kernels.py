@@ -12,7 +12,7 @@ import numpy as np
 from skimage.metrics import structural_similarity
 
 from spnr_jax import cameras, compositing, losses, metrics, sampling, voxels
-from spnr_jax.config import SamplingConfig
+from spnr_jax.model_config import SamplingConfig
 from spnr_jax.types import Camera
 
 Rng = np.random.Generator

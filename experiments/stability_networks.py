@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.stability_kernels import Rng, box_at_distance
-from spnr_jax.config import ModelConfig, SamplingConfig
+from spnr_jax.model_config import ModelConfig, SamplingConfig
 from spnr_jax.nn.discriminator import Discriminator
 from spnr_jax.nn.normalization import BatchNorm, GroupNorm
 from spnr_jax.nn.unet3d import UNet3D

@@ -28,9 +28,10 @@ from experiments import claims, poisson, table1_page, table1_poisson, table1_rep
 from experiments.table1_scores import ObjectMethod, Scored, Shown, by_category, of_cloud, score_objects
 from experiments.table1_training import NETWORKS, Budget, Trained
 from spnr_jax import cli, data, evaluation
-from spnr_jax.config import PRESETS, TrainConfig
+from spnr_jax.config import TrainConfig
 from spnr_jax.images import write_whole
 from spnr_jax.lpips_weights import read_weights
+from spnr_jax.presets import PRESETS
 from spnr_jax.summary import differences, metric_settings, summarise
 
 Row = Literal["ours", "npbg", "point_nerf", "points2nerf", "poisson", "poisson_trimmed", "nearest", "splat", "white"]

@@ -19,7 +19,8 @@ from typing import Literal
 import jax
 
 from spnr_jax import checkpoint, data, trainer, training
-from spnr_jax.config import PRESETS, TrainConfig
+from spnr_jax.config import TrainConfig
+from spnr_jax.presets import PRESETS
 
 Budget = Literal["quick", "tiny", "paper"]
 NETWORKS = ("ours", "npbg", "point_nerf", "points2nerf")

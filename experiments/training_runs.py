@@ -23,7 +23,8 @@ from experiments.methods import test_objects
 from experiments.table1_scores import Shown, of_cloud, score_objects
 from experiments.table1_training import Trained
 from spnr_jax import checkpoint, data, evaluation, metrics, trainer, training
-from spnr_jax.config import PRESETS, TrainConfig
+from spnr_jax.config import TrainConfig
+from spnr_jax.presets import PRESETS
 from spnr_jax.summary import Scores
 
 Preset = Literal["abo", "shapenet_car", "shapenet_plane", "shapenet_chair", "small", "tiny"]

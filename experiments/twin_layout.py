@@ -10,7 +10,8 @@ from collections.abc import Mapping
 import jax.numpy as jnp
 import numpy as np
 
-from spnr_jax.config import LossConfig, ModelConfig, OptimizerConfig, SamplingConfig, TrainConfig
+from spnr_jax.config import LossConfig, OptimizerConfig, TrainConfig
+from spnr_jax.model_config import ModelConfig, SamplingConfig
 from spnr_jax.types import Batch, Camera, PointCloud
 
 Arrays = Mapping[str, np.ndarray]

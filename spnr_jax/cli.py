@@ -17,7 +17,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from spnr_jax import config as configs
+from spnr_jax import presets
 from spnr_jax.config import TrainConfig
 from spnr_jax.render_command import Render
 
@@ -33,7 +33,7 @@ class Train:
     """Folder of the data set."""
     run: tyro.conf.Positional[Path]
     """Folder of the run: config, checkpoints, metrics, previews."""
-    config: tyro.conf.AvoidSubcommands[tyro.conf.OmitArgPrefixes[TrainConfig]] = field(default_factory=configs.tiny)
+    config: tyro.conf.AvoidSubcommands[tyro.conf.OmitArgPrefixes[TrainConfig]] = field(default_factory=presets.tiny)
     """Every number of the run; --preset chooses the defaults."""
     log_every: int = 20
     """Steps between rows of metrics.jsonl and TensorBoard."""
@@ -135,9 +135,9 @@ def _train_defaults(arguments: list[str]) -> Train:
         name, _, value = argument.partition("=")
         if name == "--preset":
             preset = value or (arguments[i + 1] if i + 1 < len(arguments) else "")
-    if preset not in configs.PRESETS:
-        raise ValueError(f"--preset {preset}: there are {', '.join(configs.PRESETS)}")
-    return Train(data=tyro.MISSING, run=tyro.MISSING, config=configs.PRESETS[preset]())
+    if preset not in presets.PRESETS:
+        raise ValueError(f"--preset {preset}: there are {', '.join(presets.PRESETS)}")
+    return Train(data=tyro.MISSING, run=tyro.MISSING, config=presets.PRESETS[preset]())
 
 
 def run(command: Train | Evaluate | Render | View | ConvertLpips) -> None:

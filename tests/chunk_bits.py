@@ -7,13 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from spnr_jax import cameras, config, training
+from spnr_jax import cameras, presets, training
 from spnr_jax.renderer import Renderer
 from spnr_jax.types import Scene
 
-MODEL = config.tiny().model
+MODEL = presets.tiny().model
 
-weights = Renderer(MODEL).init(jax.random.key(0), *training.example_inputs(config.tiny()))
+weights = Renderer(MODEL).init(jax.random.key(0), *training.example_inputs(presets.tiny()))
 leaves, form = jax.tree.flatten(weights)  # the fresh ones render a nearly uniform fog
 leaves = [x + 0.2 * jax.random.normal(jax.random.key(i), x.shape) for i, x in enumerate(leaves)]
 volume = jax.random.normal(jax.random.key(1), (1, *[MODEL.volume_resolution] * 3, MODEL.base_width))

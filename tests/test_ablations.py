@@ -11,7 +11,7 @@ from tiny_runs import check_conditions, results_of, shrunken
 from experiments import training_report, training_runs
 from experiments.ablations import LABELS, ROWS, Ablations, changed, main, rows
 from experiments.training_runs import Budget, Compared
-from spnr_jax import checkpoint, cli, config, data, evaluation, trainer, training
+from spnr_jax import checkpoint, cli, data, evaluation, presets, trainer, training
 from spnr_jax.config import to_dict
 
 
@@ -39,7 +39,7 @@ def leaves(values, path=""):
 
 
 class TestRows:
-    tiny = config.tiny()
+    tiny = presets.tiny()
 
     def test_each_changes_what_it_says_and_nothing_else(self):
         expected = {

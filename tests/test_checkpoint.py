@@ -11,7 +11,7 @@ import tiny_dataset
 from laws import same_bits
 from tiny_dataset import CONFIG
 
-from spnr_jax import checkpoint, config, training
+from spnr_jax import checkpoint, config, presets, training
 
 # Orbax's reader drops a coroutine of its Zarr store when a file is not what it expects
 pytestmark = pytest.mark.filterwarnings(
@@ -50,7 +50,7 @@ def test_a_state_comes_back_bit_by_bit(tmp_path):
 
 
 def test_a_state_without_statistics_comes_back_too(tmp_path):
-    tiny = config.PRESETS["npbg_tiny"]()
+    tiny = presets.PRESETS["npbg_tiny"]()
     state = training.jitted_create_state(tiny)
     checkpoint.write_config(tmp_path, tiny)
     checkpoint.save(tmp_path, state)
@@ -59,10 +59,10 @@ def test_a_state_without_statistics_comes_back_too(tmp_path):
 
 
 def test_a_run_of_another_method_is_refused_with_its_name(tmp_path):
-    checkpoint.write_config(tmp_path, config.tiny())
+    checkpoint.write_config(tmp_path, presets.tiny())
     (tmp_path / "checkpoints").mkdir()
     with pytest.raises(ValueError, match=r"model\.method ours there, npbg asked"):
-        checkpoint.write_config(tmp_path, config.PRESETS["npbg_tiny"]())
+        checkpoint.write_config(tmp_path, presets.PRESETS["npbg_tiny"]())
 
 
 def test_a_folder_without_checkpoints_holds_no_state(tmp_path):
@@ -130,8 +130,8 @@ def test_the_newest_three_checkpoints_stay(tmp_path):
 
 
 def test_a_config_comes_back_from_the_run_folder(tmp_path):
-    checkpoint.write_config(tmp_path / "run", config.small())
-    assert checkpoint.read_config(tmp_path / "run") == config.small()
+    checkpoint.write_config(tmp_path / "run", presets.small())
+    assert checkpoint.read_config(tmp_path / "run") == presets.small()
 
 
 def test_a_run_of_another_preset_is_refused_with_the_fields_that_differ(run):
@@ -145,7 +145,7 @@ def test_a_run_of_another_preset_is_refused_with_the_fields_that_differ(run):
 
 
 def test_a_run_that_never_got_to_a_checkpoint_may_begin_again_with_another_config(tmp_path):
-    checkpoint.write_config(tmp_path, config.small())
+    checkpoint.write_config(tmp_path, presets.small())
     checkpoint.write_config(tmp_path, CONFIG)
     assert checkpoint.read_config(tmp_path) == CONFIG
 

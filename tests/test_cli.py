@@ -11,7 +11,7 @@ import sys
 import pytest
 import tiny_dataset
 
-from spnr_jax import config
+from spnr_jax import presets
 
 
 def unchecked_cli():
@@ -28,7 +28,7 @@ cli = unchecked_cli()
 @pytest.fixture(autouse=True)
 def shrunken(monkeypatch):
     """The preset `tiny` is the tests' network, and nothing is written to the home folder."""
-    monkeypatch.setitem(config.PRESETS, "tiny", lambda: tiny_dataset.CONFIG)
+    monkeypatch.setitem(presets.PRESETS, "tiny", lambda: tiny_dataset.CONFIG)
     monkeypatch.setattr(cli, "enable_compilation_cache", lambda: None)
 
 
@@ -74,20 +74,20 @@ def test_a_missing_argument_an_unknown_command_and_a_word_for_a_number_are_refus
 @pytest.mark.parametrize("form", [["--preset", "tny"], ["--preset=tny"], ["--preset"]])
 def test_an_unknown_preset_names_the_presets(form, capsys):
     line = refused(capsys, "train", "data", "run", *form)
-    assert all(name in line for name in config.PRESETS)
+    assert all(name in line for name in presets.PRESETS)
 
 
 @pytest.mark.parametrize("form", [["--preset", "small"], ["--preset=small"]])
 def test_a_preset_gives_the_defaults_and_options_change_them(form):
     command = cli.parse(["train", "data", "run", *form, "--num-steps", "7", "--field-width", "12"])
-    small = config.small()
+    small = presets.small()
     expected = dataclasses.replace(small, num_steps=7, model=dataclasses.replace(small.model, field_width=12))
     assert command.config == expected
 
 
 def test_the_preset_chooses_the_network_whose_options_there_are(capsys):
     command = cli.parse(["train", "data", "run", "--preset", "point_nerf_tiny", "--radius", "0.2"])
-    tiny = config.PRESETS["point_nerf_tiny"]()
+    tiny = presets.PRESETS["point_nerf_tiny"]()
     assert command.config == dataclasses.replace(tiny, model=dataclasses.replace(tiny.model, radius=0.2))
     assert "--radius" in refused(capsys, "train", "data", "run", "--preset", "npbg_tiny", "--radius", "0.2")
 

@@ -5,8 +5,9 @@ import json
 
 import pytest
 
-from spnr_jax.config import PRESETS, LossConfig, OptimizerConfig, TrainConfig, from_dict, to_dict
+from spnr_jax.config import LossConfig, OptimizerConfig, TrainConfig, from_dict, to_dict
 from spnr_jax.model_config import METHODS, ModelConfig, NPBGConfig, PointNeRFConfig, SamplingConfig
+from spnr_jax.presets import PRESETS
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from tiny_runs import L1_ONLY, check_conditions, results_of, shrunken
 
 from experiments.fig1_loss_tradeoff import Fig1, main, pretrained, variant
 from experiments.training_runs import QUICK_STEPS, Budget
-from spnr_jax import checkpoint, cli, config, training
+from spnr_jax import checkpoint, cli, config, presets, training
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -33,13 +33,13 @@ def out(tmp_path_factory):
 
 def test_the_adversarial_loss_takes_part_from_the_first_step_and_the_weights_alone_differ():
     options = Fig1(data=tiny_dataset.dataset().folder, out=tiny_dataset.folder())
-    made = [variant(options, weight, config.tiny(), tiny_dataset.dataset()) for weight in options.l1_weights]
+    made = [variant(options, weight, presets.tiny(), tiny_dataset.dataset()) for weight in options.l1_weights]
     assert [v.config.loss.l1_weight for v in made] == [0, 100, 5000]
     for v in made:
         assert (v.config.loss.adversarial_weight, training.first_adversarial_step(v.config)) == (1, 0)
         assert v.start is None
         assert dataclasses.replace(v.config, loss=config.LossConfig()) == dataclasses.replace(
-            config.tiny(), loss=config.LossConfig()
+            presets.tiny(), loss=config.LossConfig()
         )
 
 

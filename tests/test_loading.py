@@ -9,7 +9,7 @@ import tiny_dataset
 
 from data_gen import records
 from experiments import loading
-from spnr_jax import config, data
+from spnr_jax import data, presets
 
 
 @pytest.fixture
@@ -26,7 +26,7 @@ def quick(monkeypatch):
     monkeypatch.setattr(loading.cli, "enable_compilation_cache", lambda: None)
     monkeypatch.setattr(loading.training, "jitted_create_state", lambda settings: 0)
     monkeypatch.setattr(loading.training, "jitted_train_step", lambda *_, **__: time.sleep(0.02) or (0, {}))
-    monkeypatch.setitem(config.PRESETS, "tiny", lambda: tiny_dataset.CONFIG)
+    monkeypatch.setitem(presets.PRESETS, "tiny", lambda: tiny_dataset.CONFIG)
 
 
 def test_both_forms_are_measured_and_a_preset_of_another_size_is_left_out(folder, quick, tmp_path, capsys):
@@ -42,7 +42,7 @@ def test_both_forms_are_measured_and_a_preset_of_another_size_is_left_out(folder
 def test_a_slow_reader_is_seen_as_waiting(folder, quick, monkeypatch):
     read = data.read_object
     monkeypatch.setattr(data, "read_object", lambda *a: time.sleep(0.1) or read(*a))
-    waits, steps = loading.time_steps(data.open_dataset(folder), config.PRESETS["tiny"](), 4)
+    waits, steps = loading.time_steps(data.open_dataset(folder), presets.PRESETS["tiny"](), 4)
     assert len(waits) == len(steps) == 4
     assert 0.5 < sum(waits) / sum(steps) < 1
 

@@ -14,7 +14,7 @@ from tiny_baselines import SHRUNKEN
 from experiments import many_objects, many_objects_report, many_runs
 from experiments.many_objects import ManyObjects, main
 from experiments.many_runs import AXES, FORMS, apart, create, entered_batch, entered_states, form_step, left
-from spnr_jax import cli, config, data, trainer, training
+from spnr_jax import cli, data, presets, trainer, training
 
 SEEDS = (3, 4, 5)
 STEPS = 3
@@ -111,7 +111,7 @@ def _shrunken():
     """The shrunken network under the name of the preset, and a state saved after every step."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(cli, "enable_compilation_cache", lambda: None)
-        patch.setitem(config.PRESETS, "tiny", lambda: QUICK)
+        patch.setitem(presets.PRESETS, "tiny", lambda: QUICK)
         patch.setattr(many_objects, "SAVE_EVERY", 1)
         yield
 

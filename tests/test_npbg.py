@@ -13,8 +13,8 @@ from tiny_training import BATCH, L1_ONLY, create, run, step
 
 from spnr_jax import cameras, training
 from spnr_jax.baselines.npbg import NPBG, GatedConv, half, raster, visible_points
-from spnr_jax.config import PRESETS
 from spnr_jax.model_config import NPBGConfig
+from spnr_jax.presets import PRESETS
 from spnr_jax.types import Camera
 
 CONFIG = NPBGConfig(encoder_widths=(8, 9, 10), decoder_widths=(5, 4), image_resolution=16)

@@ -14,8 +14,9 @@ from tiny_training import BATCH, L1_ONLY, create, run, step
 from spnr_jax import cameras, training
 from spnr_jax.baselines import point_nerf
 from spnr_jax.baselines.point_nerf import PointNeRF
-from spnr_jax.config import PRESETS, LossConfig
+from spnr_jax.config import LossConfig
 from spnr_jax.model_config import PointNeRFConfig
+from spnr_jax.presets import PRESETS
 from spnr_jax.types import Rays
 
 CONFIG = PointNeRFConfig(

@@ -14,8 +14,9 @@ from laws import close, numbers
 from spnr_jax import training
 from spnr_jax.baselines import points2nerf
 from spnr_jax.baselines.points2nerf import Hypernetwork, Points2NeRF
-from spnr_jax.config import OptimizerConfig, TrainConfig, from_dict, points2nerf_abo, points2nerf_tiny, to_dict
+from spnr_jax.config import OptimizerConfig, TrainConfig, from_dict, to_dict
 from spnr_jax.model_config import Points2NeRFConfig
+from spnr_jax.presets import points2nerf_abo, points2nerf_tiny
 
 FAITHFUL = Points2NeRFConfig(
     kl_weight=0.01,

@@ -22,7 +22,7 @@ from tiny_baselines import BASELINE, SHRUNKEN, SIZE
 from data_gen import poisson as surfaces
 from data_gen import records, views
 from experiments import poisson, table1, table1_poisson, table1_report, table1_scores, table1_training
-from spnr_jax import cli, config, data, evaluation, trainer, training
+from spnr_jax import cli, data, evaluation, presets, trainer, training
 
 SOLVER = importlib.util.find_spec("pymeshlab") is not None
 METHODS = tuple(name for name in table1.ROWS if SOLVER or not name.startswith("poisson"))
@@ -33,7 +33,7 @@ def _shrunken_presets():
     """The shrunken networks under the names of the tiny presets, and no cache of compilations on disk."""
     with pytest.MonkeyPatch.context() as patch:
         for name, shrunken in SHRUNKEN.items():
-            patch.setitem(config.PRESETS, name, lambda shrunken=shrunken: shrunken)
+            patch.setitem(presets.PRESETS, name, lambda shrunken=shrunken: shrunken)
         for name, surface in table1_poisson.SURFACES.items():  # depth 12 takes seconds for a ball of few points
             patch.setitem(table1_poisson.SURFACES, name, dataclasses.replace(surface, depth=5))
         patch.setattr(cli, "enable_compilation_cache", lambda: None)
@@ -287,7 +287,7 @@ def test_a_data_set_without_test_objects_is_refused(dataset, tmp_path):
 @pytest.mark.slow
 def test_the_quick_budget_runs_the_presets_themselves(tmp_path, monkeypatch):
     for name in SHRUNKEN:
-        monkeypatch.setitem(config.PRESETS, name, getattr(config, name))
+        monkeypatch.setitem(presets.PRESETS, name, getattr(presets, name))
     painted = tiny_dataset.write_dataset(tmp_path / "data", size=64)
     table1.main(asked(painted, tmp_path / "out", methods=(*table1_training.NETWORKS, "white")))
     costs = results_of(tmp_path / "out")["costs"]

@@ -9,7 +9,7 @@ import tiny_dataset
 from tiny_baselines import BASELINE, SHRUNKEN
 
 from experiments import table1_training
-from spnr_jax import checkpoint, config, data, training
+from spnr_jax import checkpoint, data, presets, training
 
 
 @pytest.mark.parametrize(
@@ -26,7 +26,7 @@ def test_a_budget_has_a_preset_of_every_network(budget, size, category, ours, np
     found = table1_training.presets(budget, size, category)
     assert (found["ours"], found["npbg"]) == (ours, npbg)
     assert tuple(found) == table1_training.NETWORKS
-    assert set(found.values()) <= set(config.PRESETS)
+    assert set(found.values()) <= set(presets.PRESETS)
 
 
 def test_the_paper_budget_names_the_sizes_that_it_needs():
@@ -56,7 +56,7 @@ def test_the_pace_leaves_out_the_step_that_compiles(monkeypatch):
 
 
 def test_a_run_that_was_begun_keeps_its_number_of_steps(tmp_path, monkeypatch):
-    monkeypatch.setitem(config.PRESETS, "npbg_tiny", lambda: SHRUNKEN["npbg_tiny"])
+    monkeypatch.setitem(presets.PRESETS, "npbg_tiny", lambda: SHRUNKEN["npbg_tiny"])
     monkeypatch.setattr(table1_training, "steps_within", lambda seconds, config, dataset: round(seconds))
     first = table1_training.config_of("npbg_tiny", "tiny", 3, 2.0, None, tmp_path)
     assert (first.num_steps, first.seed, first.preset) == (120, 3, "npbg_tiny")

@@ -13,7 +13,8 @@ import tiny_dataset
 import tiny_training
 
 from spnr_jax import data, losses, trainer, training
-from spnr_jax.config import PRESETS, LossConfig, OptimizerConfig, TrainConfig
+from spnr_jax.config import LossConfig, OptimizerConfig, TrainConfig
+from spnr_jax.presets import PRESETS
 from spnr_jax.renderer import Renderer
 
 EVERY_STEP = trainer.Schedule(log_every=1, preview_every=100, checkpoint_every=100)

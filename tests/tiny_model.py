@@ -8,7 +8,7 @@ import numpy as np
 from laws import numbers
 
 from spnr_jax.cameras import look_at, pinhole
-from spnr_jax.config import ModelConfig, SamplingConfig
+from spnr_jax.model_config import ModelConfig, SamplingConfig
 from spnr_jax.types import PointCloud
 
 SIZE = 24  # the smallest image that the discriminator can judge

@@ -7,7 +7,7 @@ import json
 import pytest
 import tiny_dataset
 
-from spnr_jax import cli, config
+from spnr_jax import cli, presets
 
 L1_ONLY = dataclasses.replace(
     tiny_dataset.CONFIG, loss=dataclasses.replace(tiny_dataset.CONFIG.loss, adversarial_weight=0.0)
@@ -19,7 +19,7 @@ CLOCKED = ("training_seconds", "ms_per_step", "ms_per_view")
 def shrunken():
     """The preset `tiny` is L1_ONLY, and compilations are not kept on disk."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(config.PRESETS, "tiny", lambda: L1_ONLY)
+        patch.setitem(presets.PRESETS, "tiny", lambda: L1_ONLY)
         patch.setattr(cli, "enable_compilation_cache", lambda: None)
         yield
 
