@@ -52,10 +52,11 @@ def train(config: TrainConfig, dataset: data.Dataset, run: Path, schedule: Sched
     checkpoint.write_config(run, config)
     state = checkpoint.restore(run, config, say=tqdm.write) or training.jitted_create_state(config)
     first = int(state.step)
+    if first >= config.num_steps:
+        tqdm.write(f"{run} is finished: {first} steps")
+        return state
     if first:
         tqdm.write(f"resuming {run} at step {first} of {config.num_steps}")
-    if first >= config.num_steps:
-        return state
     adversarial_from = training.first_adversarial_step(config)
     pending: list[tuple[int, dict]] = []
     with (

@@ -66,6 +66,10 @@ class TestPath:
         at = jnp.array([[0.1, 0.49, 0.51, 0.7, 1.4, 1.5]] * 3)
         close(distance_at(path, at)[0], np.array([0.1, 0.49, 1.01, 1.2, 1.9, 2.0]), atol=1e-6)
 
+    def test_a_place_on_the_edge_of_a_gap_lies_before_it(self):
+        path = self.path([True, False, True, False])  # open from 0 to 0.5 and from 1 to 1.5
+        close(distance_at(path, jnp.array([[0.5, 1.0]] * 3))[0], np.array([0.5, 1.5]), atol=1e-6)
+
     def test_distances_rise_with_the_length_and_stay_between_near_and_far(self):
         for row in RNG.random((16, 4)) < 0.5:
             path = self.path(list(row), 7)

@@ -16,7 +16,7 @@ from laws import batch_law, close, gradient_law, numbers, same_bits
 from tiny_model import NUM_POINTS, camera, cloud, wobbled
 
 from spnr_jax import sampling, training
-from spnr_jax.cameras import intersect_box
+from spnr_jax.cameras import intersect_box, view_rays
 from spnr_jax.renderer import Renderer, union_weights
 from spnr_jax.types import Rays, Scene
 
@@ -71,6 +71,25 @@ class TestCloud:
         expected = jittered(variables, plain, camera(), jax.random.clone(key))
         close(jittered(variables, padded, camera(), key), expected, rtol=1e-4, atol=1e-5)
 
+    def test_what_fills_the_padding_does_not_reach_the_gradient(self, variables):
+        def gradient(cloud):
+            def total(params):
+                module = Renderer(CONFIG).bind({**variables, "params": params})
+                features = module.pointnet(module.point_inputs(cloud), cloud.mask, train=False)
+                return jnp.sum(jnp.where(cloud.mask[..., None], features, 0) ** 2)
+
+            return jax.grad(total)(variables["params"])["pointnet"]
+
+        mask = cloud().mask.at[:, 5:].set(False)
+        zeros, spoilt = (
+            jax.tree.map(
+                lambda x, fill=fill: jnp.where(mask.reshape(*mask.shape, *[1] * (x.ndim - 2)), x, fill), cloud()
+            )
+            for fill in (0, jnp.nan)
+        )
+        zeros, spoilt = (dataclasses.replace(c, mask=mask) for c in (zeros, spoilt))
+        close(gradient(spoilt), gradient(zeros))
+
     def test_in_evaluation_an_object_does_not_see_the_others(self, variables):
         both = render(variables, encode(variables, cloud()), camera())
         alone = jax.tree.map(lambda x: x[1:], (cloud(), camera()))
@@ -118,6 +137,17 @@ class TestViews:
         both = render(variables, volume, views)
         second = jax.tree.map(lambda x: x[:, 1:], views)
         close(render(variables, volume, second), jax.tree.map(lambda x: x[:, 1:], both), rtol=1e-4, atol=1e-5)
+
+    def test_samples_at_entry_and_exit_see_the_volume(self, variables):
+        """Rounding puts many of them a little outside the box, where there is nothing."""
+        rays = view_rays(camera(32))
+        near, far, hit = intersect_box(rays.origins, rays.directions)
+        volume = jnp.ones((2, *[CONFIG.volume_resolution] * 3, CONFIG.base_width))
+        module = Renderer(CONFIG).bind(variables)
+        distances = jnp.stack([near, 0.5 * (near + far), far], axis=-1)
+        density, _, _ = module.shade(volume, rays, module.field.view(rays.directions), distances)
+        assert hit.sum() > 500
+        close(density[hit], jnp.broadcast_to(density[hit][:, 1:2], density[hit].shape))
 
     @pytest.mark.parametrize("ray_chunk", [1, 7, 64])
     def test_rays_do_not_know_their_chunk(self, variables, ray_chunk):
