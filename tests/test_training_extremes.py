@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 import tiny_dataset
 import tiny_training
+from tiny_baselines import NETWORKS
 
 from spnr_jax import data, losses, trainer, training
 from spnr_jax.config import LossConfig, OptimizerConfig, TrainConfig
-from spnr_jax.presets import PRESETS
+from spnr_jax.presets import BASELINES, OURS, tiny
 from spnr_jax.renderer import Renderer
 
 EVERY_STEP = trainer.Schedule(log_every=1, preview_every=100, checkpoint_every=100)
@@ -83,8 +84,8 @@ class TestWildSettings:
     @pytest.mark.slow
     @pytest.mark.parametrize("name", ["rates", "weights"])
     def test_two_hundred_steps_of_tiny_are_finite_to_their_end_or_stop_by_name(self, name, tmp_path):
-        tiny = dataclasses.replace(PRESETS["tiny"](), num_steps=200)
-        config = with_rates(tiny, 100) if name == "rates" else with_losses(tiny, **WILD_WEIGHTS)
+        config = dataclasses.replace(tiny(), num_steps=200)
+        config = with_rates(config, 100) if name == "rates" else with_losses(config, **WILD_WEIGHTS)
         train_to_the_end_or_a_name(config, images_of(config, tmp_path / "data"), tmp_path / "run")
 
 
@@ -146,9 +147,8 @@ class TestOddBatches:
         assert metrics["gradient_norm"] > 1
 
 
-def shrunken(name: str, precision: str, num_steps: int) -> TrainConfig:
+def shrunken(config: TrainConfig, precision: str, num_steps: int) -> TrainConfig:
     """A preset with its own stages, passes, losses and schedule, at 16 rays a side and the narrowest layers."""
-    config = PRESETS[name]()
     m, smaller = config.model, config.model.render_resolution // 16
     groups = min(m.num_groups, 2)
     sizes = {f"{n}_resolution": getattr(m, f"{n}_resolution") // smaller for n in ("render", "resize", "image")}
@@ -166,11 +166,24 @@ def shrunken(name: str, precision: str, num_steps: int) -> TrainConfig:
         precision=precision,
         **sizes,
     )
+    loss = dataclasses.replace(config.loss, discriminator_width=4, r1_interval=2)
+    return shortened(dataclasses.replace(config, model=model, loss=loss), num_steps)
+
+
+def shrunken_baseline(config: TrainConfig, num_steps: int) -> TrainConfig:
+    """A baseline's preset with its own units, mode, losses and schedule, at 8 pixels a side and the narrowest layers."""
+    small = next(model for model in NETWORKS.values() if isinstance(model, type(config.model)))
+    kept = ("near", "radius", "jitter", "density_scale", "mode", "initialization", "kl_weight", "materials")
+    kept = {name: getattr(config.model, name) for name in kept if hasattr(config.model, name)}
+    model = dataclasses.replace(small, **kept, image_resolution=8 * config.pixel_stride)
+    return shortened(dataclasses.replace(config, model=model), num_steps)
+
+
+def shortened(config: TrainConfig, num_steps: int) -> TrainConfig:
+    """The config with few steps on few points of two objects."""
     return dataclasses.replace(
         config,
-        model=model,
-        loss=dataclasses.replace(config.loss, discriminator_width=4, r1_interval=2),
-        optimizer=dataclasses.replace(config.optimizer, warmup_steps=2),
+        optimizer=dataclasses.replace(config.optimizer, warmup_steps=min(config.optimizer.warmup_steps, 2)),
         num_steps=num_steps,
         batch_objects=2,
         min_points=8,
@@ -199,15 +212,21 @@ def train_under_debug_nans(config: TrainConfig, dataset):
 
 class TestNoNaN:
     def test_a_few_steps_of_shrunken_tiny_make_none(self, tmp_path):
-        config = with_losses(shrunken("tiny", "float32", 4), adversarial_weight=0.0)
+        config = with_losses(shrunken(tiny(), "float32", 4), adversarial_weight=0.0)
         assert train_under_debug_nans(config, images_of(config, tmp_path)).step == 4
 
     @pytest.mark.slow
     @pytest.mark.parametrize("precision", ["float32", "bfloat16"])
-    @pytest.mark.parametrize("name", PRESETS)
-    def test_twenty_steps_of_each_shrunken_preset_make_none(self, name, precision, tmp_path):
-        config = shrunken(name, precision, 20)
+    @pytest.mark.parametrize("preset", OURS)
+    def test_twenty_steps_of_each_shrunken_preset_make_none(self, preset, precision, tmp_path):
+        config = shrunken(preset(), precision, 20)
         assert training.first_adversarial_step(config) in range(1, 20), "both phases are trained"
+        assert train_under_debug_nans(config, images_of(config, tmp_path)).step == 20
+
+    @pytest.mark.slow
+    @pytest.mark.parametrize("preset", BASELINES)
+    def test_twenty_steps_of_each_shrunken_baseline_make_none(self, preset, tmp_path):
+        config = shrunken_baseline(preset(), 20)
         assert train_under_debug_nans(config, images_of(config, tmp_path)).step == 20
 
 
