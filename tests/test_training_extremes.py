@@ -171,7 +171,7 @@ def shrunken(config: TrainConfig, precision: str, num_steps: int) -> TrainConfig
 
 
 def shrunken_baseline(config: TrainConfig, num_steps: int) -> TrainConfig:
-    """A baseline's preset with its own units, mode, losses and schedule, at 8 pixels a side and the narrowest layers."""
+    """A baseline's preset with its own units, mode, losses and schedule, 8 pixels a side and the narrowest layers."""
     small = next(model for model in NETWORKS.values() if isinstance(model, type(config.model)))
     kept = ("near", "radius", "jitter", "density_scale", "mode", "initialization", "kl_weight", "materials")
     kept = {name: getattr(config.model, name) for name in kept if hasattr(config.model, name)}
