@@ -8,7 +8,7 @@ import pytest
 import tiny_dataset
 
 from experiments import demo
-from spnr_jax import cli, config
+from spnr_jax import cli, presets
 
 
 @pytest.fixture
@@ -22,7 +22,7 @@ def asked(monkeypatch):
             shutil.copytree(tiny_dataset.dataset().folder, generation.out)
 
     monkeypatch.setattr(demo, "generate", generate)
-    monkeypatch.setattr(config, "tiny", lambda: tiny_dataset.CONFIG)
+    monkeypatch.setattr(presets, "tiny", lambda: tiny_dataset.CONFIG)
     monkeypatch.setattr(cli, "enable_compilation_cache", lambda: None)
     return configs
 
