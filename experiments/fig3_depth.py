@@ -159,7 +159,7 @@ def object_maps(
     options: Fig3, dataset: data.Dataset, item: data.ObjectData, found: dict[str, Method], points: int
 ) -> dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Depth, opacity and true depth (views, h, w) of an object by method; read where they are made."""
-    cloud = methods.first_points(item, points)
+    cloud = evaluation.first_points(item, points)
     maps = {}
     for name, method in found.items():
         seen, acc = kept(options.out / "depths" / name / f"{item.name}.npz", partial(method.show, item, cloud))

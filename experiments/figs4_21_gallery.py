@@ -138,7 +138,7 @@ def picture(network: methods.Network, item: data.ObjectData, view: int, points: 
     """A network's picture of one view, from the object's first points; read where it is made."""
     if not place.is_file():
         camera = jax.tree.map(lambda x: x[view : view + 1], item.camera)
-        shown = network.show()(methods.first_points(item, points), camera)
+        shown = network.show()(evaluation.first_points(item, points), camera)
         write_whole(place, png(np.asarray(shown.image[0])))
     with Image.open(place) as image:
         return np.asarray(image.convert("RGB"))

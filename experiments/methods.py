@@ -8,14 +8,10 @@ from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
-import jax
-import numpy as np
-
 from experiments.table1_report import LABELS
 from spnr_jax import checkpoint, data, evaluation, training
 from spnr_jax.config import TrainConfig
 from spnr_jax.model_config import METHODS
-from spnr_jax.types import PointCloud
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,8 +92,3 @@ def test_objects(dataset: data.Dataset, count: int | None) -> tuple[str, ...]:
     if count is not None and count < 1:
         raise ValueError(f"--objects: expected 1 or more, got {count}")
     return evaluation.spread(names, count or len(names))
-
-
-def first_points(item: data.ObjectData, count: int) -> PointCloud:
-    """So many points of an object, or all if it has fewer: always the same ones."""
-    return jax.tree.map(lambda x: np.asarray(x)[:count], item.cloud)

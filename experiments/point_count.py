@@ -19,8 +19,6 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Literal
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import tyro
 from PIL import Image
@@ -200,16 +198,14 @@ def measure(
     item = data.read_object(dataset, name)
     item = dataclasses.replace(item, cloud=cloud_of(dataset, item, count, meshes))
     pictures = evaluation.on_host(method.show(item))
-    alpha, mask = item.images[..., 3] / np.float32(255), item.conditions[..., 3] > 0
-    acc = jax.image.resize(jnp.asarray(pictures.acc), alpha.shape, "bilinear")
-    found = evaluation.score(jnp.asarray(pictures.image), acc, data.on_white(item.images), alpha, mask)
+    found = evaluation.score_pictures(item, pictures)
     return {metric: np.asarray(found[metric], np.float64).tolist() for metric in METRICS}, np.asarray(pictures.image[0])
 
 
 def cloud_of(dataset: data.Dataset, item: data.ObjectData, count: int, meshes: Path | None) -> PointCloud:
     """So many points of an object: stored ones, or if there are not enough new ones from its mesh."""
     if count <= len(item.cloud.positions):
-        return methods.first_points(item, count)
+        return evaluation.first_points(item, count)
     seed = details(dataset, item.name)["seeds"]["points"]
     drawn = points.sample_surface(mesh_of(dataset, item, meshes), count, seed)
     return PointCloud(

@@ -30,6 +30,7 @@ import tyro
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 
+from experiments.methods import test_objects
 from spnr_jax import checkpoint, cli, data, evaluation, training
 from spnr_jax.config import TrainConfig
 from spnr_jax.images import write_whole
@@ -111,10 +112,7 @@ def main(options: SpeedAccuracy) -> None:
     """Measures what results.json lacks, then writes the table and the plot."""
     cli.enable_compilation_cache()
     dataset = data.open_dataset(options.data)
-    split = dataset.splits["test"]
-    if not split:
-        raise ValueError(f"{options.data}: the test split is empty; generate more objects")
-    names = evaluation.spread(split, options.objects)
+    names = test_objects(dataset, options.objects)
     place = options.out / "results.json"
     rows: list[dict] = json.loads(place.read_text())["rows"] if place.exists() else []
     todo = [(run, setting) for run in options.runs for setting in settings(checkpoint.read_config(run))]

@@ -25,6 +25,7 @@ import tyro
 
 from data_gen.poisson import pymeshlab
 from experiments import claims, poisson, table1_page, table1_poisson, table1_report, table1_training
+from experiments.methods import test_objects
 from experiments.table1_scores import ObjectMethod, Scored, Shown, by_category, of_cloud, score_objects
 from experiments.table1_training import NETWORKS, Budget, Trained
 from spnr_jax import cli, data, evaluation
@@ -83,7 +84,7 @@ def main(options: Table1) -> None:
     """Trains what is not trained, scores all methods, writes the tables and the page."""
     cli.enable_compilation_cache()
     dataset = data.open_dataset(options.data)
-    names = test_objects(dataset, options)
+    names = test_objects(dataset, options.objects or (QUICK_OBJECTS if options.budget == "quick" else None))
     first = data.read_object(dataset, names[0])
     category = dataset.settings.get("settings", {}).get("category")
     presets = table1_training.presets(options.budget, first.camera.height, category)
@@ -139,14 +140,6 @@ def write(out: Path, results: dict, shown: list[Shown]) -> None:
         write_whole(out / name, text.encode())
     print(table1_report.markdown(tables[:1], []))
     print(f"wrote {', '.join(files)} in {out}")
-
-
-def test_objects(dataset: data.Dataset, options: Table1) -> tuple[str, ...]:
-    """The objects to be scored: all of the test split, or so many spread over it."""
-    names = dataset.splits["test"]
-    if not names:
-        raise ValueError(f"{dataset.folder}: the test split is empty; generate more objects")
-    return evaluation.spread(names, options.objects or (QUICK_OBJECTS if options.budget == "quick" else len(names)))
 
 
 def claim(options: Table1, dataset: data.Dataset) -> None:

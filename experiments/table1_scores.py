@@ -62,7 +62,7 @@ def score_objects(
     for number, name in enumerate(names, start=1):
         item = data.read_object(dataset, name)
         shows = {method: timed(show, item, seconds[method]) for method, show in methods.items()}
-        (result,) = evaluation.evaluate_objects(shows, config, dataset, (name,), weights)
+        result = evaluation.evaluate_object(shows, config, item, weights)
         if "npbg" in result.scores:
             del result.scores["npbg"]["iou"]  # it predicts colours alone
         if more:

@@ -8,13 +8,7 @@ import dataclasses
 from dataclasses import dataclass, field
 from typing import Any, Literal, get_type_hints
 
-from spnr_jax.model_config import (
-    METHODS,
-    ModelConfig,
-    NetworkConfig,
-    added,
-    require,
-)
+from spnr_jax.model_config import METHODS, ModelConfig, NetworkConfig, added, require
 
 
 @dataclass(frozen=True, kw_only=True)

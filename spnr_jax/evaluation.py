@@ -87,7 +87,11 @@ def render_floor(method: str, cloud: PointCloud, camera: Camera, factor: float |
 
 def test_cloud(item: data.ObjectData, config: TrainConfig) -> PointCloud:
     """The object's first `test_points` points: always the same ones."""
-    count = min(config.test_points, len(item.cloud.positions))
+    return first_points(item, config.test_points)
+
+
+def first_points(item: data.ObjectData, count: int) -> PointCloud:
+    """So many points of an object, or all if it has fewer: always the same ones."""
     return jax.tree.map(lambda x: x[:count], item.cloud)
 
 
@@ -144,18 +148,28 @@ def evaluate_objects(
 ) -> Iterator[ObjectResult]:
     """Pictures and scores of each object of a data set; points and image size are the config's."""
     for name in names:
-        item = data.read_object(dataset, name)
-        data.check_resolution(item, config)
-        cloud = test_cloud(item, config)
-        alpha, mask = item.images[..., 3] / np.float32(255), item.conditions[..., 3] > 0
-        reference = data.on_white(item.images)
-        pictures, scores = {}, {}
-        for method, show in methods.items():
-            shown = show(cloud, item.camera)
-            acc = jax.image.resize(shown.acc, alpha.shape, "bilinear")
-            scores[method] = jax.device_get(score(shown.image, acc, reference, alpha, mask, weights))
-            pictures[method] = on_host(shown)
-        yield ObjectResult(name=name, reference=reference, pictures=pictures, scores=scores)
+        yield evaluate_object(methods, config, data.read_object(dataset, name), weights)
+
+
+def evaluate_object(
+    methods: dict[str, Method], config: TrainConfig, item: data.ObjectData, weights: LpipsWeights | None = None
+) -> ObjectResult:
+    """Pictures and scores of one object."""
+    data.check_resolution(item, config)
+    cloud = test_cloud(item, config)
+    pictures, scores = {}, {}
+    for method, show in methods.items():
+        shown = show(cloud, item.camera)
+        scores[method] = score_pictures(item, shown, weights)
+        pictures[method] = on_host(shown)
+    return ObjectResult(name=item.name, reference=data.on_white(item.images), pictures=pictures, scores=scores)
+
+
+def score_pictures(item: data.ObjectData, pictures: Pictures, weights: LpipsWeights | None = None) -> Scores:
+    """All metrics of pictures of an object's views; the opacity is interpolated to their size."""
+    alpha, mask = item.images[..., 3] / np.float32(255), item.conditions[..., 3] > 0
+    acc = jax.image.resize(jnp.asarray(pictures.acc), alpha.shape, "bilinear")
+    return jax.device_get(score(jnp.asarray(pictures.image), acc, data.on_white(item.images), alpha, mask, weights))
 
 
 def on_host(pictures: Pictures) -> Pictures:

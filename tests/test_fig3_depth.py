@@ -13,7 +13,7 @@ from data_gen.assets import Asset
 from data_gen.poisson import PoissonConfig
 from experiments import depth_scores, fig3_depth, methods
 from experiments.fig3_depth import Fig3
-from spnr_jax import cli, data
+from spnr_jax import cli, data, evaluation
 from spnr_jax.types import PointCloud
 
 SIZE = 64
@@ -161,7 +161,7 @@ def test_a_poisson_surface_of_many_points_has_the_depth_of_the_ball():
     assert np.mean(acc == opaque) > 0.95
     both = (acc > 0) & (opaque > 0) & (expected < expected.min() + 0.3)
     np.testing.assert_allclose(seen[both] + stand_ins.OFFSET, np.tile(expected, (3, 1, 1))[both], atol=0.05)
-    line = methods.first_points(item, 1)
+    line = evaluation.first_points(item, 1)
     assert not fig3_depth.of_surface(PoissonConfig(depth=5)).show(item, line)[1].any()
 
 

@@ -9,7 +9,7 @@ import tiny_dataset
 
 from experiments import methods
 from experiments.methods import Sources, networks
-from spnr_jax import data
+from spnr_jax import data, evaluation
 
 
 @pytest.fixture(scope="module")
@@ -48,5 +48,5 @@ def test_what_cannot_be_compared_is_refused_by_name(table, tmp_path):
 
 def test_points_are_always_the_first_ones():
     item = data.read_object(tiny_dataset.dataset(), tiny_dataset.SPLITS["test"][0])
-    assert (methods.first_points(item, 7).positions == item.cloud.positions[:7]).all()
-    assert len(methods.first_points(item, 10_000).mask) == tiny_dataset.POINTS
+    assert (evaluation.first_points(item, 7).positions == item.cloud.positions[:7]).all()
+    assert len(evaluation.first_points(item, 10_000).mask) == tiny_dataset.POINTS

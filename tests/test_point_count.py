@@ -73,7 +73,7 @@ def test_the_curves_are_the_scores_of_the_evaluation_at_each_count(out):
     dataset, scores = tiny_dataset.dataset(), []
     for name in NAMES:
         item = data.read_object(dataset, name)
-        shown = evaluation.floor("splat", 1.5)(methods.first_points(item, 16), item.camera)
+        shown = evaluation.floor("splat", 1.5)(evaluation.first_points(item, 16), item.camera)
         alpha = item.images[..., 3] / np.float32(255)
         scores.append(evaluation.score(shown.image, shown.acc, data.on_white(item.images), alpha, alpha > 0))
     for metric in point_count.METRICS:
