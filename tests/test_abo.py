@@ -100,6 +100,7 @@ def test_another_folder_is_refused_with_what_was_expected_and_found(tmp_path, ca
         (gzip.compress(b"id,file\nA,B\n"), "line 2: expected columns 3dmodel_id and path"),
         (gzip.compress(rows(["B1", "B1"]).encode()), "line 3: product B1 is listed twice"),
     ],
+    ids=["not compressed", "cut off", "other columns", "listed twice"],
 )
 def test_a_damaged_table_is_one_line(tmp_path, content, expected):
     (tmp_path / "metadata").mkdir()
