@@ -73,6 +73,7 @@ def batch(arrays: Arrays) -> Batch:
         cloud=cloud,
         camera=camera,
         image=images["target"],
+        alpha=np.ones_like(images["mask"][..., 0]),  # the twin has no loss of opacity
         condition=images["cond"],
         condition_mask=images["mask"][..., 0] > 0.5,
     )

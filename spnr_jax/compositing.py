@@ -9,6 +9,8 @@ one meets the background.  All of it is float32.
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+WHITE = 1.0  # background of every picture
+
 
 def interval_lengths(
     distances: Float[Array, "*batch samples"], far: Float[Array, "*batch"]

@@ -5,10 +5,14 @@ naming the field, what came and what is possible.  Marks: [paper] stands in the 
 """
 
 import dataclasses
+import math
 from dataclasses import dataclass, field
-from typing import Any, Literal, get_type_hints
+from types import UnionType
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from spnr_jax.model_config import METHODS, ModelConfig, NetworkConfig, added, require
+
+LARGEST = 2**63  # of any number in a config
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,11 +37,13 @@ class LossConfig:
     """Error of a pixel; the weights named l1 apply to either."""
     masked: bool = added(False)
     """Leave pixels of opacity 0 out of the pixel error: Point-NeRF's rays without a point in reach."""
+    opacity_weight: float = added(0.0)
+    """L1 between opacity and that of the reference, beside the loss of the picture."""
     condition: bool = added(True)
     """Whether the discriminator sees the true colours at visible input points [paper]; else an empty image and mask."""
 
     def __post_init__(self) -> None:
-        for name in ("l1_weight", "low_resolution_weight", "adversarial_weight", "r1_gamma"):
+        for name in ("l1_weight", "low_resolution_weight", "adversarial_weight", "r1_gamma", "opacity_weight"):
             require(getattr(self, name) >= 0, f"{name} must not be negative, got {getattr(self, name)}")
         require(
             0 <= self.adversarial_start <= 1, f"adversarial_start is a share of the steps, got {self.adversarial_start}"
@@ -138,7 +144,7 @@ def to_dict(config: TrainConfig) -> dict:
 
 
 def from_dict(values: dict, kind: type = TrainConfig, path: str = "") -> Any:
-    """Config from `to_dict`'s form; an unknown or missing field raises ValueError with its path."""
+    """Config from `to_dict`'s form; a field unknown, missing or of another type raises ValueError with its path."""
     fields = {f.name: f for f in dataclasses.fields(kind)}
     for name in values:
         require(name in fields, f"unknown config field {path}{name}; known: {', '.join(fields)}")
@@ -150,8 +156,25 @@ def from_dict(values: dict, kind: type = TrainConfig, path: str = "") -> Any:
         if isinstance(value, dict):
             inner, value = _network_kind(value, path) if kinds[name] == NetworkConfig else (kinds[name], value)
             value = from_dict(value, inner, f"{path}{name}.")
-        arguments[name] = tuple(value) if isinstance(value, list) else value
+        value = tuple(value) if isinstance(value, list) else value
+        require(_fits(value, kinds[name]), f"config field {path}{name} holds {value!r}, which is of another type")
+        arguments[name] = value
     return kind(**arguments)
+
+
+def _fits(value: Any, kind: Any) -> bool:
+    """Whether a value is what an annotation says; numbers are finite, and a whole number will do for a float."""
+    origin, inside = get_origin(kind), get_args(kind)
+    if origin is UnionType:
+        return any(_fits(value, other) for other in inside)
+    if origin is Literal:
+        return isinstance(value, str) and value in inside
+    if origin is tuple:
+        return isinstance(value, tuple) and all(_fits(entry, inside[0]) for entry in value)
+    if kind in (int, float):
+        number = isinstance(value, int) or (kind is float and isinstance(value, float) and math.isfinite(value))
+        return number and not isinstance(value, bool) and abs(value) < LARGEST
+    return isinstance(value, kind)
 
 
 def _network_kind(values: dict, path: str) -> tuple[type, dict]:

@@ -11,6 +11,7 @@ import functools
 import io
 import json
 import threading
+import warnings
 from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,10 +21,12 @@ from PIL import Image, UnidentifiedImageError
 
 from spnr_jax import clouds
 from spnr_jax.config import TrainConfig
-from spnr_jax.shards import Shards, open_shards, read_files
+from spnr_jax.shards import Shards, is_plain_name, open_shards, read_files
 from spnr_jax.types import Batch, Camera, PointCloud
 
 CACHE_BYTES = 2**31  # decoded objects kept in memory
+# what a file that breaks its rules makes its reader raise; Pillow raises SyntaxError
+UNREADABLE = (OSError, ValueError, LookupError, TypeError, ArithmeticError, AttributeError, RecursionError, SyntaxError)
 READERS, READ_AHEAD = 2, 4  # threads that assemble batches, and batches ready or in work
 ORDER, POINTS_AND_VIEWS = 1, 2  # streams of random numbers under one seed: (0, 5) and (0, 5, 0) alone would be the same
 
@@ -63,14 +66,18 @@ def open_dataset(folder: Path | str) -> Dataset:
         raise ValueError(f"{folder}: no finished data set (dataset.json is missing); run `spnr-data generate {folder}`")
     try:
         settings = json.loads(description.read_text())
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{description}: not valid JSON ({error}); generate the data set again") from None
+    if not isinstance(settings, dict):
+        raise ValueError(f"{description}: holds no settings; generate the data set again")
     splits = {}
     for split in ("train", "val", "test"):
         path = folder / "splits" / f"{split}.txt"
         if not path.is_file():
             raise ValueError(f"{path}: missing; run `spnr-data generate {folder}` again, it completes the data set")
-        splits[split] = tuple(path.read_text().split())
+        splits[split] = tuple(path.read_text(errors="replace").split())
+        if strange := [name for name in splits[split] if not is_plain_name(name)]:
+            raise ValueError(f"{path}: {strange[0]!r} is no name of an object; generate the data set again")
     return Dataset(folder=folder, settings=settings, splits=splits, shards=open_shards(folder))
 
 
@@ -85,12 +92,14 @@ def read_object(dataset: Dataset, name: str) -> ObjectData:
         intrinsics = np.array([[meta["fl_x"], 0, meta["cx"]], [0, meta["fl_y"], meta["cy"]], [0, 0, 1]], np.float32)
         names = [Path(frame["file_path"]).name for frame in meta["frames"]]
         height, width = int(meta["h"]), int(meta["w"])
-        if not np.isfinite(poses).all() or not np.isfinite(intrinsics).all():
-            raise ValueError("a camera holds NaN or infinity")
+        if poses.shape[1:] != (3, 4) or not (np.isfinite(poses).all() and np.isfinite(intrinsics).all()):
+            raise ValueError("a camera is no 4 x 4 matrix of finite numbers")
+        if not min(meta["fl_x"], meta["fl_y"]) > 0:
+            raise ValueError(f"focal lengths {meta['fl_x']} and {meta['fl_y']}, expected positive ones")
         images = np.stack([_rgba(read(file := f"images/{name}"), height, width) for name in names])
         conditions = np.stack([_rgba(read(file := f"conditions/{name}"), height, width) for name in names])
         cloud = clouds.cloud_of_ply(read(file := "points.ply"))
-    except (OSError, ValueError, LookupError, TypeError, SyntaxError) as error:  # Pillow raises SyntaxError too
+    except UNREADABLE as error:
         path = folder / file
         reason = f"no entry {error}" if isinstance(error, KeyError) else str(error).replace(str(path), path.name)
         raise ValueError(f"{path}: cannot be read ({reason}); run `spnr-data check {dataset.folder}`") from None
@@ -106,13 +115,15 @@ def _reader_of(folder: Path) -> Callable[[str], bytes]:
 
 def _rgba(content: bytes, height: int, width: int) -> np.ndarray:
     try:
-        with Image.open(io.BytesIO(content)) as image:
-            pixels = np.asarray(image.convert("RGBA"))
+        with warnings.catch_warnings(action="error", category=Image.DecompressionBombWarning):
+            image = Image.open(io.BytesIO(content))
+        if image.size != (width, height):  # before memory is taken for them
+            raise ValueError(f"{image.width} x {image.height} pixels, transforms.json says {width} x {height}")
+        return np.asarray(image.convert("RGBA"))
     except UnidentifiedImageError:
         raise ValueError("is not an image") from None
-    if pixels.shape[:2] != (height, width):
-        raise ValueError(f"{pixels.shape[1]} x {pixels.shape[0]} pixels, transforms.json says {width} x {height}")
-    return pixels
+    except (Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
+        raise ValueError(str(error)) from None
 
 
 def on_white(rgba: np.ndarray) -> np.ndarray:
@@ -138,7 +149,7 @@ def make_batch(objects: list[ObjectData], config: TrainConfig, step: int) -> Bat
         count = round(2 ** generator.uniform(low, high))
         clouds_of.append(choose_points(data.cloud, count, config.max_points, generator))
         views_of.append(generator.permutation(len(data.images))[: config.views_per_object])
-    images = np.stack([on_white(data.images[v]) for data, v in zip(objects, views_of, strict=True)])
+    images = np.stack([data.images[v] for data, v in zip(objects, views_of, strict=True)])
     conditions = np.stack([data.conditions[v] for data, v in zip(objects, views_of, strict=True)])
     mask = conditions[..., 3] > 0
     poses = np.stack([data.camera.cam_to_world[v] for data, v in zip(objects, views_of, strict=True)])
@@ -150,7 +161,8 @@ def make_batch(objects: list[ObjectData], config: TrainConfig, step: int) -> Bat
     return Batch(
         cloud=PointCloud(**stacked),
         camera=Camera(cam_to_world=poses, intrinsics=intrinsics, height=first.height, width=first.width),
-        image=images,
+        image=on_white(images),
+        alpha=images[..., 3].astype(np.float32) / 255,
         condition=np.where(mask[..., None], conditions[..., :3].astype(np.float32) / 255, 0),
         condition_mask=mask,
     )

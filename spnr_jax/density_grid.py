@@ -17,7 +17,9 @@ from spnr_jax import empty_space, voxels
 from spnr_jax.clouds import PlacedCloud
 from spnr_jax.model import Model, Volume
 from spnr_jax.model_config import ModelConfig
+from spnr_jax.numerics import normalize
 from spnr_jax.renderer import Renderer
+from spnr_jax.types import Rays
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,13 +58,17 @@ def sample_density(model: Model, volume: Volume, placed: PlacedCloud, resolution
 
 @partial(jax.jit, static_argnames=("config", "reach"))
 def _density_at(variables: dict, scene: Any, places: Float[Array, "n 3"], *, config: ModelConfig, reach: int) -> Array:
-    """Density (n,) per unit of the box at places in the box."""
+    """Density (n,) per unit of the box at places in the box, as seen on the way to its centre.
+
+    That way matters to a network that turns normals to the viewer: an object is solid behind what is seen from outside.
+    """
 
     def look_up(renderer: Renderer):
-        view = jnp.zeros(config.num_features)  # density does not depend on it
-        density, _, _ = renderer.field(voxels.trilinear(scene.volume, places), view)
-        near_points = empty_space.dilate(scene.occupied, reach)
-        cell, _ = voxels.locate(places, config.volume_resolution)
-        return jnp.where(near_points[cell[:, 2], cell[:, 1], cell[:, 0]], density, 0.0)
+        rays = Rays(origins=places[None], directions=-normalize(places)[None])
+        density, _ = renderer.shade(scene, rays, renderer.field.view(rays.directions), jnp.zeros((1, len(places), 1)))
+        near_points = empty_space.dilate(scene.occupied[0], reach)
+        cell, _ = voxels.locate(places, len(near_points))
+        return jnp.where(near_points[cell[:, 2], cell[:, 1], cell[:, 0]], density[0, :, 0], 0.0)
 
+    scene = jax.tree.map(lambda x: x[None], scene)
     return look_up(Renderer(config).bind(variables))

@@ -33,7 +33,9 @@ def r1(
     return 0.5 * jnp.mean(jnp.sum(gradient**2, axis=(1, 2, 3)))
 
 
-def area_downsample(image: Float[Array, "*batch height width 3"], size: int) -> Float[Array, "*batch {size} {size} 3"]:
+def area_downsample(
+    image: Float[Array, "*batch height width features"], size: int
+) -> Float[Array, "*batch {size} {size} features"]:
     """Image averaged over equal squares; pixels that straddle a border count by their covered share."""
 
     def coverage(n: int) -> Float[Array, "size n"]:

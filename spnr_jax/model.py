@@ -123,12 +123,16 @@ def _orbiting(azimuth, elevation, distance, centre, *, size: int) -> Camera:
 
 
 def at_quality(config: NetworkConfig, quality: Quality, reach: int) -> NetworkConfig:
-    """The config that renders at a quality, with samples within `reach` voxels of points."""
+    """The config that renders at a quality, with samples within `reach` voxels of points.
+
+    A network that sees the surface keeps its own reach: the cells of the surface's grid grow with the spacing.
+    """
     if quality not in (*SAMPLES, "trained"):
         raise ValueError(f"quality must be one of {', '.join(SAMPLES)}, trained, got {quality}")
     if quality == "trained" or not isinstance(config, ModelConfig):
         return config
     counts = config.sampling
+    reach = counts.reach if config.num_neighbors else reach
     samples = max(round(SAMPLES[quality] * (counts.num_coarse + counts.num_fine)), 1)
     return dataclasses.replace(config, sampling=SamplingConfig(num_coarse=samples, num_fine=0, reach=reach))
 

@@ -58,7 +58,6 @@ class ModelConfig:
     """Sizes of the generator."""
 
     ray_chunk: ClassVar[int | None] = 1024  # about 80 MB at 128 samples
-    per_pixel: ClassVar[bool] = False
 
     materials: tuple[Material, ...] = ("base_color", "roughness", "metallic")
     """Material channels that the points carry into the network."""
@@ -97,8 +96,18 @@ class ModelConfig:
     """How the U-Net's encoder joins its decoder: added to a stage's output [paper], or as input of its convolution."""
     sees_direction: bool = added(True)
     """Whether colour and features depend on the view direction."""
+    num_neighbors: int = added(0)
+    """Nearest points whose planes and materials a sample sees (`surface.py`); 0: the volume's feature alone [paper]."""
+    color: Literal["free", "lit"] = added("free")
+    """Radiance: free RGB [paper], or predicted light on the materials of the nearest points (`nn/surface_field.py`)."""
+    point_norm: Literal["batch", "layer"] = added("batch")
+    """Normalisation in the PointNet: over points [paper] or over the features of one."""
 
     def __post_init__(self) -> None:
+        require(0 <= self.num_stages <= 16, f"num_stages must be 0 to 16, got {self.num_stages}")
+        sizes = ("point_features", "num_groups", "field_width", "render_resolution", "resize_resolution")
+        for name in (*sizes, "image_resolution", "upsampler_width"):
+            require(getattr(self, name) >= 1, f"{name} must be at least 1, got {getattr(self, name)}")
         step = 2**self.num_stages
         require(
             self.volume_resolution % step == 0 and self.volume_resolution > 0,
@@ -122,6 +131,17 @@ class ModelConfig:
         require(
             self.sees_direction in (True, False), f"sees_direction must be true or false, got {self.sees_direction}"
         )
+        require(self.color in ("free", "lit"), f"color must be free or lit, got {self.color}")
+        require(self.point_norm in ("batch", "layer"), f"point_norm must be batch or layer, got {self.point_norm}")
+        require(self.num_neighbors >= 0, f"num_neighbors must not be negative, got {self.num_neighbors}")
+        require(
+            self.num_neighbors > 0 or self.color == "free", "color lit needs the nearest points; use num_neighbors 6"
+        )
+        require(
+            self.num_neighbors == 0 or (not self.upsamples and self.sampling.reach == 1),
+            "a network that sees the nearest points renders every pixel, near the points alone; use reach 1 and "
+            f"render_resolution {self.image_resolution}, or num_neighbors 0",
+        )
         require(
             self.image_resolution in (self.render_resolution, 2 * self.resize_resolution),
             f"image_resolution {self.image_resolution} must be render_resolution ({self.render_resolution}: no "
@@ -142,6 +162,11 @@ class ModelConfig:
     def upsamples(self) -> bool:
         """Whether the graph contains the upsampler."""
         return self.image_resolution != self.render_resolution
+
+    @property
+    def per_pixel(self) -> bool:
+        """Whether a pixel does not depend on its neighbours: the upsampler alone mixes them."""
+        return not self.upsamples
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -75,6 +75,33 @@ def tiny() -> TrainConfig:
     )
 
 
+def plus_tiny() -> TrainConfig:
+    """Light on the materials of the nearest points, 64 px, a ray a pixel.  `spnr train --preset plus_tiny DATA RUN`."""
+    return TrainConfig(
+        preset="plus_tiny",
+        model=ModelConfig(
+            volume_resolution=32,
+            base_width=8,
+            num_stages=3,
+            num_groups=1,
+            num_features=3,
+            num_neighbors=6,
+            color="lit",
+            point_norm="layer",
+            sampling=SamplingConfig(num_coarse=16, num_fine=0, reach=1),
+            render_resolution=64,
+            resize_resolution=32,
+            image_resolution=64,
+        ),
+        loss=LossConfig(l1_weight=1.0, adversarial_weight=0.0, opacity_weight=0.3),
+        optimizer=OptimizerConfig(lr_generator=2e-3, warmup_steps=100, ema_decay=0.995),
+        num_steps=1200,
+        batch_objects=4,
+        max_points=1024,
+        pixel_stride=2,
+    )
+
+
 def _baseline_loss(pixel: Literal["l1", "mse"], masked: bool = False) -> LossConfig:
     return LossConfig(l1_weight=1.0, adversarial_weight=0.0, pixel=pixel, masked=masked)
 
@@ -206,7 +233,7 @@ def points2nerf_tiny() -> TrainConfig:
     )
 
 
-OURS = (abo, shapenet_car, shapenet_plane, shapenet_chair, small, tiny)
+OURS = (abo, shapenet_car, shapenet_plane, shapenet_chair, small, tiny, plus_tiny)
 BASELINES = (
     *(npbg_abo, npbg_shapenet, npbg_tiny),
     *(point_nerf_abo, point_nerf_shapenet, point_nerf_tiny),

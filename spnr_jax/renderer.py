@@ -14,17 +14,17 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from spnr_jax import cameras, compositing, empty_space, sampling, voxels
+from spnr_jax import cameras, compositing, empty_space, sampling, surface, voxels
 from spnr_jax.empty_space import Path
 from spnr_jax.model_config import ModelConfig
 from spnr_jax.nn.field import RadianceField
 from spnr_jax.nn.pointnet import PointNet
+from spnr_jax.nn.surface_field import SurfaceField
 from spnr_jax.nn.unet3d import UNet3D
 from spnr_jax.nn.upsampler import Upsampler, bilinear
 from spnr_jax.numerics import clamp
 from spnr_jax.types import Camera, Key, PointCloud, Rays, Rendering, Scene
 
-WHITE = 1.0
 CELLS_PER_VOXEL = 2  # of a path through the box, counted along an axis
 RAY_BLOCK = 256  # rays near points that are rendered at once
 
@@ -37,20 +37,27 @@ class Renderer(nn.Module):
     def setup(self) -> None:
         """Builds the parts that the config asks for."""
         c = self.config
-        self.pointnet = PointNet(c.point_widths, c.point_features)
+        self.pointnet = PointNet(c.point_widths, c.point_features, c.point_norm)
         self.unet = UNet3D(c.volume_resolution, c.base_width, c.num_stages, c.num_groups, c.bf16, c.skip)
-        self.field = RadianceField(c.field_width, c.num_features, c.direction_frequencies, c.sees_direction)
+        self.field: RadianceField | SurfaceField
+        if c.num_neighbors:
+            self.field = SurfaceField(c.field_width, c.direction_frequencies, c.sees_direction, c.color == "lit")
+        else:
+            self.field = RadianceField(c.field_width, c.num_features, c.direction_frequencies, c.sees_direction)
         if c.upsamples:
             self.upsampler = Upsampler(c.upsampler_width, c.bf16)
 
     def encode(self, cloud: PointCloud, train: bool = False) -> Scene:
-        """Feature volume of each object from its points, and where these are."""
+        """Feature volume of each object from its points, where these are, and the surface that they lie on."""
         positions, mask = jnp.asarray(cloud.positions), jnp.asarray(cloud.mask)
         features = self.pointnet(self.point_inputs(cloud), mask, train)
         spread = partial(voxels.spread, self.config.scatter, resolution=self.config.volume_resolution)
-        occupied = partial(voxels.occupied, resolution=self.config.volume_resolution)
         volume = self.unet(*jax.vmap(spread)(positions, features, mask))
-        return Scene(volume=volume, occupied=jax.vmap(occupied)(positions, mask))
+        near, cells = None, self.config.volume_resolution
+        if self.config.num_neighbors:
+            near, cells = surface.estimate(cloud, self.config.num_neighbors), surface.grid_resolution(mask.shape[-1])
+        occupied = jax.vmap(partial(voxels.occupied, resolution=cells))(positions, mask)
+        return Scene(volume=volume, occupied=occupied, surface=near)
 
     def point_inputs(self, cloud: PointCloud) -> Float[Array, "objects points channels"]:
         """Position, offset from the centre of the own voxel, and the materials that the network is built for."""
@@ -102,27 +109,26 @@ class Renderer(nn.Module):
             return self.render_near_points(scene, rays, key)
         near, far, _ = cameras.intersect_box(rays.origins, rays.directions)
         view = self.field.view(rays.directions)
-        shade = partial(self.shade, scene.volume, rays, view)
+        shade = partial(self.shade, scene, rays, view)
         features, weights, distances = self.march(shade, near, far, view, key)
         return features, compositing.expected_distance(weights, distances, far), jnp.sum(weights, axis=-1)
 
     def render_near_points(self, scene: Scene, rays: Rays, key: Key | None):
         """`render_rays` with samples near the points alone: rays that miss them are white and cost nothing."""
-        reach, resolution = self.config.sampling.reach, self.config.volume_resolution
         near, far, _ = cameras.intersect_box(rays.origins, rays.directions)
-        near_points = empty_space.dilate(scene.occupied, reach)
-        path = empty_space.open_path(near_points, rays, near, far, CELLS_PER_VOXEL * resolution)
+        near_points = empty_space.dilate(scene.occupied, self.config.sampling.reach)
+        path = empty_space.open_path(near_points, rays, near, far, CELLS_PER_VOXEL * scene.occupied.shape[-1])
         renderer, variables = self.unbind()
 
         def block(row, objects, rays, far, path):
             return renderer.bind(variables).march_open(
-                scene.volume, objects, rays, far, path, None if key is None else jax.random.fold_in(key, row[0])
+                scene, objects, rays, far, path, None if key is None else jax.random.fold_in(key, row[0])
             )
 
         shape = near.shape
         rays, far, path = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), (rays, far, path))
         row = jnp.arange(far.size)
-        white = jnp.zeros((far.size, self.config.num_features)).at[:, :3].set(WHITE)
+        white = jnp.zeros((far.size, self.config.num_features)).at[:, :3].set(compositing.WHITE)
         outputs = empty_space.map_existing(
             block,
             path.travelled[:, -1] > 0,
@@ -132,48 +138,57 @@ class Renderer(nn.Module):
         )
         return jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), outputs)
 
-    def march_open(self, volume, objects: Int[Array, " rays"], rays: Rays, far, path: Path, key: Key | None):
+    def march_open(self, scene: Scene, objects: Int[Array, " rays"], rays: Rays, far, path: Path, key: Key | None):
         """Outputs of `render_rays` for rays of given objects, sampled along the open part of each."""
         view = self.field.view(rays.directions)
 
         def shade(travelled):
-            return self.shade(volume, rays, view, empty_space.distance_at(path, travelled), objects)
+            return self.shade(scene, rays, view, empty_space.distance_at(path, travelled), objects)
 
         length = path.travelled[..., -1]
         features, weights, travelled = self.march(shade, jnp.zeros_like(length), length, view, key)
         distances = empty_space.distance_at(path, travelled)
         return features, compositing.expected_distance(weights, distances, far), jnp.sum(weights, axis=-1)
 
-    def shade(self, volume, rays: Rays, view, distances: Float[Array, "*rays samples"], objects=None):
+    def shade(self, scene: Scene, rays: Rays, view, distances: Float[Array, "*rays samples"], objects=None):
         """The radiance field at each sample; `objects` as `voxels.trilinear` has them, one for each ray."""
         positions = rays.origins[..., None, :] + distances[..., None] * rays.directions[..., None, :]
         # rays end on the faces of the box: rounding must not push their samples out of it
         positions = clamp(positions, -1, 1)
         if objects is not None:
             objects = jnp.broadcast_to(objects[..., None], distances.shape)
-        return self.field(voxels.trilinear(volume, positions, objects), view)
+        features = voxels.trilinear(scene.volume, positions, objects)
+        if isinstance(self.field, RadianceField):
+            return self.field(features, view)
+        assert scene.surface is not None, "encoded for this field"
+        if objects is None:
+            objects = jnp.broadcast_to(jnp.arange(len(positions))[:, None, None], distances.shape)
+        directions = jnp.broadcast_to(rays.directions[..., None, :], positions.shape).reshape(-1, 3)
+        view = jnp.broadcast_to(view[..., None, :], (*distances.shape, view.shape[-1])).reshape(len(directions), -1)
+        seen = surface.describe(scene.surface, positions.reshape(-1, 3), directions, objects.reshape(-1))
+        outputs = self.field(features.reshape(len(directions), -1), view, directions, seen)
+        return jax.tree.map(lambda x: x.reshape(*distances.shape, *x.shape[1:]), outputs)
 
     def march(self, shade, near, far, view, key: Key | None):
         """Features of rays that `shade` evaluates between near and far, and weights and places of their samples."""
         counts = self.config.sampling
         coarse_key, fine_key = (None, None) if key is None else jax.random.split(key)
         distances, edges = sampling.stratified(coarse_key, near, far, counts.num_coarse)
-        density, rgb, hidden = shade(distances)
+        density, emitted = shade(distances)
         weights, _ = compositing.volume_weights(density, compositing.interval_lengths(distances, far))
-        passes = [(weights, rgb, hidden)]
+        passes = [(weights, emitted)]
         if counts.num_fine:
             fine = sampling.importance(fine_key, edges, weights, counts.num_fine, counts.padding)
-            fine_density, fine_rgb, fine_hidden = shade(fine)
+            fine_density, fine_emitted = shade(fine)
             weights = union_weights(distances, fine, jnp.concatenate([density, fine_density], axis=-1), far)
             distances = jnp.concatenate([distances, fine], axis=-1)
             parts = jnp.split(weights, [counts.num_coarse], axis=-1)
-            passes = [(parts[0], rgb, hidden), (parts[1], fine_rgb, fine_hidden)]
+            passes = [(parts[0], emitted), (parts[1], fine_emitted)]
 
         # each pass is composited where it lies: sums do not mind the order, and nothing wide is concatenated
-        acc = jnp.sum(weights, axis=-1)
-        rgb = sum(compositing.composite(w, rgb) for w, rgb, _ in passes) + (1 - acc[..., None]) * WHITE
-        hidden = reduce(operator.add, (compositing.composite(w, hidden) for w, _, hidden in passes))
-        return jnp.concatenate([rgb, self.field.finish(hidden, acc, view)], axis=-1), weights, distances
+        sums = [jax.tree.map(partial(compositing.composite, w), emitted) for w, emitted in passes]
+        emitted = jax.tree.map(lambda *parts: reduce(operator.add, parts), *sums)
+        return self.field.finish(emitted, jnp.sum(weights, axis=-1), view), weights, distances
 
     def __call__(self, cloud: PointCloud, camera: Camera, key: Key | None = None, train: bool = False) -> Rendering:
         """Views of each cloud from its cameras."""

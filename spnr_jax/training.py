@@ -150,7 +150,8 @@ def lattice(key: Key, batch: Batch, stride: int) -> Batch:
             x = jax.lax.dynamic_index_in_dim(x, start, axis + 1, keepdims=False)
         return x
 
-    image, condition, mask = (thinned(jnp.asarray(x)) for x in (batch.image, batch.condition, batch.condition_mask))
+    images = (batch.image, batch.alpha, batch.condition, batch.condition_mask)
+    image, alpha, condition, mask = (thinned(jnp.asarray(x)) for x in images)
     # pixel i of the lattice has its centre at first + stride * i + 0.5 of the view
     shift = 0.5 - (first[::-1] + 0.5) / stride
     zoom = jnp.diag(jnp.array([1 / stride, 1 / stride, 1.0])).at[:2, 2].set(shift)
@@ -158,7 +159,7 @@ def lattice(key: Key, batch: Batch, stride: int) -> Batch:
     camera = Camera(
         cam_to_world=batch.camera.cam_to_world, intrinsics=intrinsics, height=image.shape[2], width=image.shape[3]
     )
-    return Batch(cloud=batch.cloud, camera=camera, image=image, condition=condition, condition_mask=mask)
+    return Batch(cloud=batch.cloud, camera=camera, image=image, alpha=alpha, condition=condition, condition_mask=mask)
 
 
 def pixel_error(config: TrainConfig, image: Array, reference: Array, seen: Array | None = None) -> Float[Array, ""]:
@@ -231,6 +232,9 @@ def train_step(
             variables, batch.cloud, batch.camera, key, train=True, mutable=["batch_stats", "losses"]
         )
         sown = {name: value for name, (value,) in updated.get("losses", {}).items()}
+        if config.loss.opacity_weight:
+            opacity = losses.area_downsample(jnp.asarray(batch.alpha)[..., None], rendering.acc.shape[-1])[..., 0]
+            sown["opacity"] = config.loss.opacity_weight * losses.l1(rendering.acc, opacity)
         seen = rendering.acc > 0 if config.loss.masked else None
         return (rendering.image, rendering.image_lr, sown), (updated.get("batch_stats", {}), seen)
 

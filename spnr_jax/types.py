@@ -10,7 +10,7 @@ from typing import no_type_check
 import jax
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 AnyArray = jax.Array | np.ndarray
 
@@ -63,21 +63,60 @@ class Rendering:
 
 @no_type_check
 @struct.dataclass
+class Surface:
+    """What is known of a surface from its points (`surface.py`).
+
+    A row of `points` is a point's position, normal, base colour, roughness, metallic and spacing; the last row, all 0,
+    stands for no point.  `nearest` are the rows of the points nearest to each cell of a grid.
+    """
+
+    points: Float[Array, "*batch points+1 12"]
+    nearest: Int[Array, "*batch g g g k"]
+
+
+@no_type_check
+@struct.dataclass
+class SurfaceSample:
+    """The surface as seen from a place: lengths in spacings of the points, `spacing` itself in units of the box.
+
+    `height` is the signed distance to the plane, positive before it, `beside` that to the blended position of the
+    points, `nearest` that to the nearest of them.  `normal` is turned to the viewer, and shorter than 1 where the
+    points disagree.  Where no point is near, `exists` is False, `nearest` large, and all else 0.
+    """
+
+    exists: Bool[Array, "*batch"]
+    height: Float[Array, "*batch"]
+    beside: Float[Array, "*batch"]
+    nearest: Float[Array, "*batch"]
+    spacing: Float[Array, "*batch"]
+    normal: Float[Array, "*batch 3"]
+    base_color: Float[Array, "*batch 3"]
+    roughness: Float[Array, "*batch"]
+    metallic: Float[Array, "*batch"]
+
+
+@no_type_check
+@struct.dataclass
 class Scene:
-    """An encoded object: the feature volume, and the voxels that hold points."""
+    """An encoded object: the feature volume, the cells that hold points, and the surface of networks that see one.
+
+    The cells are the volume's voxels, or those of the surface's grid.
+    """
 
     volume: Float[Array, "*batch d d d features"]
-    occupied: Bool[Array, "*batch d d d"]
+    occupied: Bool[Array, "*batch g g g"]
+    surface: Surface | None = None
 
 
 @no_type_check
 @struct.dataclass
 class Batch:
-    """One training batch: clouds of `objects`, and `views` of each with reference and condition image."""
+    """One training batch: clouds of `objects`, and `views` of each with reference, its opacity, and condition image."""
 
     cloud: PointCloud
     camera: Camera
     image: Float[AnyArray, "objects views height width 3"]
+    alpha: Float[AnyArray, "objects views height width"]
     condition: Float[AnyArray, "objects views height width 3"]
     condition_mask: Bool[AnyArray, "objects views height width"]
 

@@ -17,10 +17,10 @@ X, DIRECTIONS = numbers(0, 2, 3, 5, 4), normalize(numbers(1, 2, 3, 3))
 
 def everything(module, x, directions):
     view = module.view(directions)
-    density, rgb, hidden = module(x, view)
+    density, (rgb, hidden) = module(x, view)
     weights, _ = volume_weights(density, jnp.full(density.shape, 0.3))
-    acc = jnp.sum(weights, axis=-1)
-    return density, rgb, hidden, weights, view, module.finish(composite(weights, hidden), acc, view)
+    emitted = composite(weights, rgb), composite(weights, hidden)
+    return density, rgb, hidden, weights, view, module.finish(emitted, jnp.sum(weights, axis=-1), view)
 
 
 VARIABLES = jax.jit(lambda key: MODULE.init(key, X, DIRECTIONS, method=everything))(jax.random.key(0))
@@ -51,11 +51,13 @@ def test_density_and_colour_are_those_of_the_layers_written_out():
 
 
 def test_finishing_the_composited_hidden_layer_composites_the_features_of_every_sample():
-    _, _, hidden, weights, view, finished = apply(X, DIRECTIONS)
+    _, rgb, hidden, weights, view, finished = apply(X, DIRECTIONS)
     params = jax.tree.map(np.float64, VARIABLES["params"])
     per_sample = np.float64(hidden) @ params["features"]["kernel"] + params["feature_bias"]
     per_sample = per_sample + np.float64(view)[..., None, 3:]
-    close(finished, np.einsum("...s,...sf->...f", np.float64(weights), per_sample), atol=1e-5)
+    colors = np.concatenate([np.float64(rgb) - 1, per_sample], axis=-1)  # on white: colours above it are added to it
+    expected = np.einsum("...s,...sf->...f", np.float64(weights), colors) + np.eye(7)[:3].sum(axis=0)
+    close(finished, expected, atol=1e-5)
 
 
 def test_density_does_not_see_the_direction_and_colour_and_features_do():

@@ -52,7 +52,7 @@ def stages():
         view = module.field.view(rays.directions)
         coarse, edges = sampling.stratified(None, near, far, counts.num_coarse)
         positions = rays.origins[..., None, :] + coarse[..., None] * rays.directions[..., None, :]
-        density, rgb, _ = module.shade(volume, rays, view, coarse)
+        density, (rgb, _) = module.shade(scene, rays, view, coarse)
         weights, _ = compositing.volume_weights(density, compositing.interval_lengths(coarse, far))
         features, depth, acc = module.render_rays(scene, rays)
         return {

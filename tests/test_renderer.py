@@ -145,7 +145,7 @@ class TestViews:
         volume = jnp.ones((2, *[CONFIG.volume_resolution] * 3, CONFIG.base_width))
         module = Renderer(CONFIG).bind(variables)
         distances = jnp.stack([near, 0.5 * (near + far), far], axis=-1)
-        density, _, _ = module.shade(volume, rays, module.field.view(rays.directions), distances)
+        density, _ = module.shade(scene(volume), rays, module.field.view(rays.directions), distances)
         assert hit.sum() > 500
         close(density[hit], jnp.broadcast_to(density[hit][:, 1:2], density[hit].shape))
 
@@ -183,7 +183,8 @@ class TestViews:
         @jax.jit
         def densities(rays, distances):
             module = Renderer(CONFIG).bind(variables)
-            return module.shade(jnp.ones((1, 8, 8, 8, 4)), rays, distances, module.field.view(rays.directions))[0]
+            everywhere = scene(jnp.ones((1, 8, 8, 8, 4)))
+            return module.shade(everywhere, rays, module.field.view(rays.directions), distances)[0]
 
         found = np.asarray(densities(rays, jnp.asarray((near + far) / 2)[..., None]))[..., 0][hit]
         close(found, np.full(found.shape, found[0]))

@@ -49,6 +49,7 @@ def batch():
         cloud=cloud,
         camera=pinhole(pose, 0.6, SIZE, SIZE),
         image=image,
+        alpha=disc.astype(np.float32),
         condition=image * mask[..., None],
         condition_mask=mask,
     )

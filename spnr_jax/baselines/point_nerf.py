@@ -28,7 +28,6 @@ from spnr_jax.model_config import MATERIAL_CHANNELS, PointNeRFConfig
 from spnr_jax.numerics import length, per_feature, softplus
 from spnr_jax.types import Camera, Key, PointCloud, Rays, Rendering
 
-WHITE = 1.0
 BLOCK = 1024  # shading points at once: 8 MB for a layer of 256 with 8 neighbours
 SLOPE, GAIN = 0.01, math.sqrt(2 / (1 + 0.01**2))  # of the leaky ReLU, and what it asks of the weights before it
 WIDENED = 0.001  # colours reach past [0, 1] by this, so that 0 and 1 are not at infinity
@@ -256,5 +255,5 @@ def render_object(
     )
     density, rgb = density.reshape(points.exists.shape), rgb.reshape(*points.exists.shape, 3)
     shares, _ = compositing.volume_weights(density, points.delta)
-    image = compositing.composite(shares, rgb, jnp.full((1, 3), WHITE))
+    image = compositing.composite(shares, rgb, jnp.full((1, 3), compositing.WHITE))
     return image, compositing.expected_distance(shares, points.distances, far), jnp.sum(shares, axis=-1)

@@ -32,7 +32,6 @@ from spnr_jax.nn.field import encode_direction
 from spnr_jax.numerics import per_feature, softplus
 from spnr_jax.types import Camera, Key, PointCloud, Rays, Rendering
 
-WHITE = 1.0
 PAINTED = 1e10  # length of a ray's last interval in faithful mode
 QUIET = -6.0  # log variance that a scaled encoder begins with: codes are told apart from the first step on
 
@@ -210,7 +209,7 @@ class Points2NeRF(nn.Module):
             delta = delta.at[..., -1].set(jnp.where(hit, PAINTED, 0.0))
         shares, _ = compositing.volume_weights(density, delta)
         depth = compositing.expected_distance(shares, distances, far)
-        return compositing.composite(shares, rgb, WHITE), depth, jnp.sum(shares, axis=-1)
+        return compositing.composite(shares, rgb, compositing.WHITE), depth, jnp.sum(shares, axis=-1)
 
     def __call__(self, cloud: PointCloud, camera: Camera, key: Key | None = None, train: bool = False) -> Rendering:
         """Views of each cloud from its cameras; training draws the codes with the key and adds the KL term."""

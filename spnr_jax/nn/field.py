@@ -9,6 +9,7 @@ import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from spnr_jax.compositing import WHITE
 from spnr_jax.numerics import per_feature, softplus
 
 
@@ -21,7 +22,7 @@ def encode_direction(directions: Float[Array, "*batch 3"], num_frequencies: int)
 
 
 class RadianceField(nn.Module):
-    """Density, RGB and hidden layer of samples; `view` and `finish` are the parts that a ray needs once."""
+    """Density and colour of samples; `view` and `finish` are the parts that a ray needs once."""
 
     width: int
     num_features: int
@@ -44,16 +45,18 @@ class RadianceField(nn.Module):
 
     def __call__(
         self, x: Float[Array, "*rays samples channels"], view: Float[Array, "*rays features"]
-    ) -> tuple[Float[Array, "*rays samples"], Float[Array, "*rays samples 3"], Float[Array, "*rays samples hidden"]]:
-        """Density, RGB in (0, 1) and hidden layer at each sample."""
+    ) -> tuple[Float[Array, "*rays samples"], tuple[Array, Array]]:
+        """Density, and what is emitted at each sample: RGB in (0, 1) and hidden layer (*rays, samples, ...)."""
         # one long axis of samples: XLA's CPU gradient of a product that sums over several axes takes four times as long
         hidden = softplus(self.hidden(x.reshape(-1, x.shape[-1])))
         out = self.head(hidden).reshape(*x.shape[:-1], 4)
         rgb = nn.sigmoid(out[..., 1:] + view[..., None, :3])
-        return softplus(out[..., 0] - 1), rgb, hidden.reshape(*x.shape[:-1], self.width)
+        return softplus(out[..., 0] - 1), (rgb, hidden.reshape(*x.shape[:-1], self.width))
 
     def finish(
-        self, hidden: Float[Array, "*rays hidden"], acc: Float[Array, "*rays"], view: Float[Array, "*rays features"]
-    ) -> Float[Array, "*rays rest"]:
-        """Features after RGB of a ray, on a zero background, from its composited hidden layer and opacity."""
-        return self.features(hidden) + acc[..., None] * (per_feature(self.feature_bias, view) + view[..., 3:])
+        self, emitted: tuple[Array, Array], acc: Float[Array, "*rays"], view: Float[Array, "*rays features"]
+    ) -> Float[Array, "*rays features"]:
+        """Features of a ray, RGB on white and the rest on zero, from what is composited and its opacity."""
+        rgb, hidden = emitted
+        rest = self.features(hidden) + acc[..., None] * (per_feature(self.feature_bias, view) + view[..., 3:])
+        return jnp.concatenate([rgb + (1 - acc[..., None]) * WHITE, rest], axis=-1)

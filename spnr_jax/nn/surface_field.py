@@ -1,0 +1,80 @@
+"""Radiance field that sees the surface: density and colour at a place from the volume's feature and the nearest points.
+
+With `lit` the network does not invent colours, it predicts light.  Base colour b and metallic m of the points nearby
+give the specular colour at normal incidence, F0 = 0.04 (1 - m) + b m, and the radiance b (1 - m) E + F0 L in linear
+light, where E (diffuse light) and L (light from the mirrored direction) are positive outputs that see normal, roughness
+and view direction.  Radiance is composited in linear light, divided by the opacity, and encoded as sRGB last.
+Without it, RGB is free as in `field.py`, and composited as sRGB.
+"""
+
+import flax.linen as nn
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from spnr_jax.colors import linear_to_srgb
+from spnr_jax.compositing import WHITE
+from spnr_jax.nn.field import encode_direction
+from spnr_jax.numerics import clamp, softplus
+from spnr_jax.types import SurfaceSample
+
+DIELECTRIC = 0.04  # reflectance of plastic, wood, paint at normal incidence
+DENSITY_SCALE = 20.0  # fog of one unit of the network's output is opaque within a voxel or two
+SPACING_SCALE = 10.0  # brings the spacing of a thousand points to the order of 1
+LEAST_OPACITY = 1e-6  # below it a ray is white, whatever its colour
+
+
+class SurfaceField(nn.Module):
+    """Density and colour of samples; `view` and `finish` are the parts that a ray needs once."""
+
+    width: int
+    direction_frequencies: int
+    sees_direction: bool
+    lit: bool
+
+    def setup(self) -> None:
+        """Layers: near -> density, near + direction -> deep -> light."""
+        self.near = nn.Dense(self.width)
+        self.density = nn.Dense(1)
+        self.deep = nn.Dense(self.width)
+        self.light = nn.Dense(6 if self.lit else 3)
+        self.direction = nn.Dense(self.width, use_bias=False)
+
+    def view(self, directions: Float[Array, "*rays 3"]) -> Float[Array, "*rays hidden"]:
+        """What the view direction adds to the layer before the light: nothing if the field does not see it."""
+        if not self.sees_direction:
+            return jnp.zeros((*directions.shape[:-1], self.width), directions.dtype)
+        return self.direction(encode_direction(directions, self.direction_frequencies))
+
+    def __call__(
+        self,
+        x: Float[Array, "samples channels"],
+        view: Float[Array, "samples hidden"],
+        directions: Float[Array, "samples 3"],
+        surface: SurfaceSample,
+    ) -> tuple[Float[Array, " samples"], tuple[Float[Array, "samples 3"]]]:
+        """Density, 0 where no point is near, and linear radiance (sRGB colours unless `lit`) of each sample."""
+        base, metallic = surface.base_color, surface.metallic[:, None]
+        facing = -jnp.sum(surface.normal * directions, axis=-1)
+        lengths = (surface.height, surface.beside, surface.nearest, SPACING_SCALE * surface.spacing)
+        inputs = [x, jnp.stack([*lengths, facing, surface.roughness, surface.metallic], axis=-1), surface.normal, base]
+        if self.sees_direction:
+            inputs.append(directions + 2 * facing[:, None] * surface.normal)
+        near = softplus(self.near(jnp.concatenate(inputs, axis=-1)))
+        density = jnp.where(surface.exists, DENSITY_SCALE * softplus(self.density(near)[:, 0] - 1), 0)
+        light = self.light(softplus(self.deep(near) + view))
+        if not self.lit:
+            return density, (nn.sigmoid(light),)
+        diffuse, mirrored = jnp.split(softplus(light), 2, axis=-1)
+        specular = DIELECTRIC * (1 - metallic) + base * metallic
+        return density, (base * (1 - metallic) * diffuse + specular * mirrored,)
+
+    def finish(
+        self, emitted: tuple[Float[Array, "*rays 3"]], acc: Float[Array, "*rays"], view: Array
+    ) -> Float[Array, "*rays 3"]:
+        """sRGB of a ray on white, from its composited radiance and opacity."""
+        del view
+        (color,) = emitted
+        acc = acc[..., None]
+        if self.lit:
+            color = acc * linear_to_srgb(clamp(color / jnp.maximum(acc, LEAST_OPACITY), 0.0, 1.0))
+        return color + (1 - acc) * WHITE

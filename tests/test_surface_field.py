@@ -1,0 +1,128 @@
+"""The field that sees the surface: light on materials, and nothing where no point is near."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import reference
+from laws import close, numbers
+
+from spnr_jax.nn.surface_field import DENSITY_SCALE, DIELECTRIC, SurfaceField
+from spnr_jax.numerics import normalize
+from spnr_jax.types import SurfaceSample
+
+N = 12
+
+
+def sample(seed=0):
+    return SurfaceSample(
+        exists=jnp.arange(N) % 5 > 0,
+        height=numbers(seed, N),
+        beside=numbers(seed + 1, N, low=0.0),
+        nearest=numbers(seed + 2, N, low=0.0),
+        spacing=numbers(seed + 3, N, low=0.0, high=0.1),
+        normal=normalize(numbers(seed + 4, N, 3)),
+        base_color=numbers(seed + 5, N, 3, low=0.0),
+        roughness=numbers(seed + 6, N, low=0.0),
+        metallic=numbers(seed + 7, N, low=0.0),
+    )
+
+
+X, DIRECTIONS = numbers(20, N, 4), normalize(numbers(21, N, 3))
+
+
+def field(lit, sees_direction=True):
+    return SurfaceField(width=6, direction_frequencies=2, sees_direction=sees_direction, lit=lit)
+
+
+def evaluate(module, x, directions, surface):
+    return module(x, module.view(directions), directions, surface)
+
+
+def weights(module):
+    variables = jax.jit(lambda key: module.init(key, X, DIRECTIONS, sample(), method=evaluate))(jax.random.key(0))
+    return jax.tree.map(lambda x: x + 0.3 * numbers(2, *x.shape), variables)
+
+
+def apply(module, variables, surface, directions=DIRECTIONS):
+    return jax.jit(lambda *x: module.apply(variables, *x, method=evaluate))(X, directions, surface)
+
+
+@pytest.mark.parametrize("lit", [True, False])
+def test_density_and_radiance_are_those_of_the_layers_written_out(lit):
+    module, surface = field(lit), jax.tree.map(np.float64, sample())
+    variables = weights(module)
+    density, (color,) = apply(module, variables, sample())
+    params, d = jax.tree.map(np.float64, variables["params"]), np.float64(DIRECTIONS)
+
+    def dense(name, x):
+        return x @ params[name]["kernel"] + params[name].get("bias", 0)
+
+    facing = -np.sum(surface.normal * d, axis=1)
+    scalars = (surface.height, surface.beside, surface.nearest, 10 * surface.spacing, facing)
+    scalars = np.stack([*scalars, surface.roughness, surface.metallic], axis=1)
+    mirrored = d + 2 * facing[:, None] * surface.normal
+    inputs = np.concatenate([np.float64(X), scalars, surface.normal, surface.base_color, mirrored], axis=1)
+    near = reference.softplus(dense("near", inputs))
+    expected = DENSITY_SCALE * reference.softplus(dense("density", near)[:, 0] - 1)
+    close(density, np.where(sample().exists, expected, 0))
+    encoded = np.concatenate([d] + [f(d * 2**k) for k in range(2) for f in (np.sin, np.cos)], axis=1)
+    light = dense("light", reference.softplus(dense("deep", near) + dense("direction", encoded)))
+    if lit:
+        light, metal = reference.softplus(light), surface.metallic[:, None]
+        diffuse = surface.base_color * (1 - metal) * light[:, :3]
+        close(color, diffuse + (DIELECTRIC * (1 - metal) + surface.base_color * metal) * light[:, 3:])
+    else:
+        close(color, 1 / (1 + np.exp(-light)))
+
+
+def test_the_mirrored_direction_leaves_a_mirror_as_the_view_came():
+    d, n = np.float64(DIRECTIONS), np.float64(sample().normal)
+    mirrored = d + 2 * -np.sum(n * d, axis=1, keepdims=True) * n
+    close(np.linalg.norm(mirrored, axis=1), np.ones(N))
+    close(np.sum(mirrored * n, axis=1), -np.sum(d * n, axis=1))
+
+
+def test_a_black_dielectric_reflects_light_and_a_black_metal_none():
+    module = field(lit=True)
+    variables, surface = weights(module), sample().replace(base_color=jnp.zeros((N, 3)))
+    _, (plastic,) = apply(module, variables, surface.replace(metallic=jnp.zeros(N)))
+    _, (metal,) = apply(module, variables, surface.replace(metallic=jnp.ones(N)))
+    assert (plastic > 0).all()
+    assert (metal == 0).all()
+
+
+def test_where_no_point_is_near_nothing_is_dense():
+    module = field(lit=True)
+    density, _ = apply(module, weights(module), sample().replace(exists=jnp.zeros(N, bool)))
+    assert (density == 0).all()
+
+
+def test_a_field_that_does_not_see_the_direction_has_one_colour_from_all_sides_that_see_the_same_face():
+    module, surface = field(lit=True, sees_direction=False), sample()
+    variables = weights(module)
+    assert "direction" not in variables["params"]
+    turned = DIRECTIONS - 2 * jnp.sum(DIRECTIONS * surface.normal, axis=1, keepdims=True) * surface.normal
+    turned = -turned  # as steep, from the other side of the normal
+    (density, color), (other_density, other) = (apply(module, variables, surface, d) for d in (DIRECTIONS, turned))
+    close((other_density, other), (density, color), rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("lit", [True, False])
+def test_a_ray_mixes_in_linear_light_and_lies_on_white_in_srgb(lit):
+    """Half covered by linear grey 0.5 (sRGB 0.7354): half of that, and half of white."""
+    grey, half = jnp.full((1, 3), 0.25), jnp.array([0.5])
+    expected = 0.5 * (0.735357 if lit else 0.5) + 0.5
+    close(field(lit).finish((grey,), half, half), jnp.full((1, 3), expected))
+    empty = field(lit).finish((jnp.zeros((1, 3)),), jnp.zeros(1), half)
+    assert (empty == 1).all()
+
+
+def test_a_ray_of_no_or_of_blinding_light_is_finite_in_value_and_gradient():
+    for radiance in (0.0, 1e-30, 1e-8, 1e4):
+        for acc in (0.0, 1e-30, 1e-6, 1.0):
+            value, gradient = jax.value_and_grad(lambda x, a: jnp.sum(field(True).finish((x,), a, a)), argnums=(0, 1))(
+                jnp.full((1, 3), radiance * acc), jnp.array([acc])
+            )
+            assert 0 <= value <= 3.00001
+            assert all(jnp.isfinite(x).all() for x in gradient), (radiance, acc)
