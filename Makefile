@@ -6,6 +6,9 @@
 #   make bench               time the network beside a PyTorch twin: runs/bench.md (BENCH="--twin FILE --quick")
 #   make test                the everyday suite      make test-all   with the slow tests
 #   make check               format, lint, types, tests
+#   make docs                the documents as a site: site/index.html
+#   make wheel               the package: dist/*.whl     make test-wheel   it alone in an empty environment
+#   make chaos               kill a training 100 times, fill its disk, ...: runs/chaos/chaos.md (CHAOS="--kills 10")
 #   make mutants             break the kernels on purpose; every fault has to be caught by the tests
 
 PYTHON ?= python3.11
@@ -18,8 +21,9 @@ BENCH ?=
 DATA ?=
 BUDGET ?= tiny
 TABLE1 ?=
+CHAOS ?=
 
-.PHONY: setup demo table1 bench test test-all lint format types check mutants clean
+.PHONY: setup demo table1 bench test test-all test-wheel lint format types check docs wheel chaos mutants clean
 
 setup: .venv/complete
 
@@ -27,7 +31,7 @@ setup: .venv/complete
 	@begin=$$(date +%s); \
 	test -x $(PY) || $(PYTHON) -m venv .venv; \
 	echo "installing into .venv (about a minute)"; \
-	$(PY) -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[data,viewer,formats,baselines,dev]' && \
+	$(PY) -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[data,viewer,formats,export,baselines,dev]' && \
 	echo $$(( $$(date +%s) - begin )) > .venv/install_seconds && touch $@
 
 demo: setup
@@ -48,6 +52,9 @@ test: setup
 test-all: setup
 	$(PY) -m pytest -q -n 2 --dist loadfile
 
+test-wheel: setup
+	$(PY) -m pytest -q tests/test_wheel.py
+
 lint: setup
 	$(PY) -m ruff check .
 	$(PY) -m ruff format --check .
@@ -61,8 +68,22 @@ types: setup
 
 check: lint types test
 
+docs: .venv/docs
+	NO_MKDOCS_2_WARNING=1 $(PY) -m mkdocs build --quiet --strict
+
+.venv/docs: .venv/complete
+	$(PY) -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[docs]' && touch $@
+
+wheel: setup
+	rm -rf build
+	$(PY) -m pip wheel --quiet --disable-pip-version-check --no-deps -w dist .
+	rm -rf build
+
+chaos: setup
+	$(PY) -m experiments.chaos --out runs/chaos $(CHAOS)
+
 mutants: setup
 	$(PY) tests/mutants.py
 
 clean:
-	rm -rf .venv build dist *.egg-info
+	rm -rf .venv build dist site *.egg-info

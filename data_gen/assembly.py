@@ -26,6 +26,7 @@ def assemble(asset: Asset) -> Asset:
     """The asset with its parts checked, cleaned and merged; what was changed is added to `ignored`."""
     for part in asset.parts:
         _check_columns(part)
+        _check_material(part.material)
     low, high = bounding_box(asset)
     smallest = DEGENERATE_AREA * np.sum((high - low) ** 2)
     notes: set[str] = set(asset.ignored)
@@ -56,6 +57,17 @@ def _check_columns(part: Part) -> None:
         raise RejectedAsset(
             f"has faces that name vertices {part.faces.min()} to {part.faces.max()} of {count}: broken file"
         )
+
+
+def _check_material(material: Material) -> None:
+    """Refuse a material whose channels are not finite values, one or a texture of them."""
+    for name, inner in (("base_color", (3,)), ("roughness", ()), ("metallic", ())):
+        values = getattr(material, name)
+        rows = values.shape[: values.ndim - len(inner)]
+        if values.shape[len(rows) :] != inner or len(rows) not in (0, 2) or not values.size:
+            raise RejectedAsset(f"has a material with {name} of shape {values.shape}: broken file")
+        if not np.isfinite(values).all():
+            raise RejectedAsset(f"has a material whose {name} is not finite (NaN or infinity)")
 
 
 def textured(material: Material) -> bool:

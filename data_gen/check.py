@@ -1,13 +1,13 @@
 """Whether a data set is sound: every file readable and as it was written, its parts in agreement with each other."""
 
 import hashlib
-import json
 from pathlib import Path
 
 import numpy as np
 
 from data_gen import records
 
+COUNTS = ("views", "resolution", "points")  # settings that the files of every object are compared with
 LEAST_AGREEMENT = 0.9  # of the visible points, on opaque pixels; the rest sit on silhouettes, where pixels are cut
 
 
@@ -22,10 +22,10 @@ def check(dataset: Path) -> bool:
         folder = dataset / "objects" / object_id
         try:
             record = records.read_object(folder)
-        except (ValueError, OSError, KeyError) as error:
+            found = object_faults(folder, record, description["settings"])
+        except (ValueError, OSError) as error:
             faults.append(f"{object_id}: {type(error).__name__}: {error}")
             continue
-        found = object_faults(folder, record, description["settings"])
         agreement = points_on_object(record)
         if agreement < LEAST_AGREEMENT:
             found.append(f"only {agreement:.0%} of the visible points fall on opaque pixels")
@@ -44,15 +44,15 @@ def read_description(dataset: Path) -> dict:
     path = dataset / "dataset.json"
     if not path.is_file():
         raise ValueError(f"{dataset} holds no data set: {path.name} is missing; make one with spnr-data generate")
-    try:
-        description = json.loads(path.read_text())
-    except ValueError as error:
-        raise ValueError(f"{path}: not readable ({error})") from None
+    description = records.read_document(path)
     if (dataset / "index.json").is_file():
         raise ValueError(f"{dataset} is packed; look at the folder of objects that `spnr-data pack` read")
     if description.get("schema_version") != records.SCHEMA_VERSION:
         found = description.get("schema_version")
         raise ValueError(f"{path}: expected schema version {records.SCHEMA_VERSION}, got {found}; generate it again")
+    settings = description.get("settings")
+    if not isinstance(settings, dict) or not all(isinstance(settings.get(name), int) for name in COUNTS):
+        raise ValueError(f"{path}: expected settings with the numbers {', '.join(COUNTS)}; generate it again")
     return description
 
 
@@ -86,8 +86,8 @@ def variant_faults(dataset: Path, details: dict[str, dict]) -> list[str]:
         split = split_of.get(object_id)
         if split is None:
             continue
-        splits_of_product.setdefault(detail["product"], set()).add(split)
-        if detail["variant"] and split != "train":
+        splits_of_product.setdefault(str(detail.get("product")), set()).add(split)
+        if detail.get("variant") and split != "train":
             faults.append(f"splits: {object_id} is a colour variant, but in {split}; only training objects have any")
     for product, splits in sorted(splits_of_product.items()):
         if len(splits) > 1:
@@ -98,6 +98,8 @@ def variant_faults(dataset: Path, details: dict[str, dict]) -> list[str]:
 def object_faults(folder: Path, record: records.ObjectRecord, settings: dict) -> list[str]:
     """Return what is wrong with one object."""
     files = record.details.get("files", {})
+    if not isinstance(files, dict) or not {"product", "variant"} <= record.details.keys():
+        return ["object.json: expected files, product and variant"]
     damaged = [name for name, checksum in files.items() if checksum_of(folder / name) != checksum]
     faults = [f"{name} has another checksum than when it was written" for name in damaged]
     size = (settings["views"], settings["resolution"], settings["resolution"], 4)
@@ -145,7 +147,7 @@ def points_on_object(record: records.ObjectRecord) -> float:
 
 def cam_to_world(transforms: dict) -> np.ndarray:
     """Return the cameras (views, 4, 4) of a transforms.json."""
-    return np.array([frame["transform_matrix"] for frame in transforms["frames"]])
+    return np.array([frame["transform_matrix"] for frame in transforms["frames"]], np.float64)
 
 
 def print_table(dataset: Path, object_ids, num_views: int, agreements, covered, faults) -> None:

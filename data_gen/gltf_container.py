@@ -15,6 +15,7 @@ from data_gen.companions import read_companion
 
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
+MOST_ZEROS = 2**22  # rows that an accessor without a buffer may announce: nothing in the file stands for them
 GLB_MAGIC, CHUNK_JSON, CHUNK_BIN = b"glTF", 0x4E4F534A, 0x004E4942
 
 
@@ -46,7 +47,7 @@ class GltfFile:
         if "bufferView" in accessor:
             start = accessor.get("byteOffset", 0)
             values = self._rows(accessor["bufferView"], start, dtype, width, count)
-        elif sparse:
+        elif sparse and 0 <= count <= MOST_ZEROS:
             values = np.zeros((count, width), dtype)
         else:
             raise RejectedAsset(f"accessor {index} holds no data: the file is compressed by an extension")

@@ -95,8 +95,13 @@ def object_files(dataset: Path, object_id: str) -> dict[str, bytes]:
     """Return the files of an object by their paths in its folder; ValueError if one is not as it was written."""
     folder = dataset / "objects" / object_id
     details = (folder / storage.LAST_FILE).read_bytes()
-    files = {name: (folder / name).read_bytes() for name in json.loads(details)["files"]}
-    for name, checksum in json.loads(details)["files"].items():
+    checksums = records.read_document(folder / storage.LAST_FILE).get("files")
+    if not isinstance(checksums, dict) or any(records.file_of(folder, name) is None for name in checksums):
+        raise ValueError(
+            f"{folder / storage.LAST_FILE}: expected the files of the object's own folder; generate it again"
+        )
+    files = {name: (folder / name).read_bytes() for name in checksums}
+    for name, checksum in checksums.items():
         if hashlib.sha256(files[name]).hexdigest() != checksum:
             raise ValueError(f"{folder / name} is not as it was written: run spnr-data check {dataset}")
     return {**files, storage.LAST_FILE: details}

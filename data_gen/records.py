@@ -11,8 +11,9 @@ last; on a local disk the folder also appears as a whole (data_gen/storage.py). 
 import hashlib
 import io
 import json
+import re
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 from PIL import Image
@@ -21,6 +22,7 @@ from data_gen import storage
 from data_gen.storage import Location
 
 SCHEMA_VERSION = 1
+MOST_PIXELS = 2**26  # of a view
 SPLITS = ("train", "val", "test")
 POINT_FIELDS = (
     "x",
@@ -106,15 +108,34 @@ def object_files(record: ObjectRecord) -> dict[str, bytes]:
 
 def read_object(folder: Path) -> ObjectRecord:
     """Return the object in a folder; ValueError or OSError if a file is missing or damaged."""
-    transforms = json.loads((folder / "transforms.json").read_text())
-    names = [Path(frame["file_path"]).name for frame in transforms["frames"]]
+    transforms = read_document(folder / "transforms.json")
+    try:
+        names = [Path(frame["file_path"]).name for frame in transforms["frames"]]
+        poses = np.array([frame["transform_matrix"] for frame in transforms["frames"]], np.float64)
+    except (ValueError, LookupError, TypeError, ArithmeticError) as error:
+        raise ValueError(
+            f"{folder / 'transforms.json'}: holds no frames ({error!r}); generate the object again"
+        ) from None
+    if poses.shape[1:] != (4, 4) or not np.isfinite(poses).all():
+        raise ValueError(f"{folder / 'transforms.json'}: a camera is no 4 x 4 matrix of finite numbers")
     return ObjectRecord(
         points=read_points(folder / "points.ply"),
         transforms=transforms,
         images=np.stack([read_image(folder / "images" / name) for name in names]),
         conditions=np.stack([read_image(folder / "conditions" / name) for name in names]),
-        details=json.loads((folder / "object.json").read_text()),
+        details=read_document(folder / "object.json"),
     )
+
+
+def read_document(path: Path) -> dict:
+    """Return the dict of a JSON file; ValueError or OSError if there is none."""
+    try:
+        document = json.loads(path.read_text())
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path}: not readable ({error}); generate it again") from None
+    if not isinstance(document, dict):
+        raise ValueError(f"{path}: expected named entries, found {type(document).__name__}; generate it again")
+    return document
 
 
 def encode_points(points: np.ndarray) -> bytes:
@@ -130,7 +151,8 @@ def read_points(path: Path) -> np.ndarray:
     lines = header.decode("ascii", "replace").splitlines()
     if not separator or lines[1:2] != ["format binary_little_endian 1.0"] or lines[3:] != POINT_PROPERTIES:
         raise ValueError(f"{path}: not a points.ply of this data set (another header); generate the object again")
-    count = int(lines[2].split()[-1])
+    announced = re.fullmatch(r"element vertex (\d{1,15})", lines[2])
+    count = int(announced[1]) if announced else -1
     if len(body) != count * POINT_TYPE.itemsize:
         raise ValueError(f"{path}: expected {count} points, found {len(body) / POINT_TYPE.itemsize:g}; file is cut off")
     return np.frombuffer(body, POINT_TYPE).copy()
@@ -147,11 +169,11 @@ def read_image(path: Path) -> np.ndarray:
     """Return an RGBA PNG as (height, width, 4) uint8; ValueError if it is damaged or of another kind."""
     try:
         with Image.open(path) as image:
+            if image.mode != "RGBA" or image.width * image.height > MOST_PIXELS:
+                raise ValueError(f"{path}: expected an RGBA image of a view, got {image.mode} of {image.size} pixels")
             image.load()
-            if image.mode != "RGBA":
-                raise ValueError(f"{path}: expected an RGBA image, got {image.mode}")
             return np.array(image)
-    except (OSError, SyntaxError) as error:  # Pillow reports a damaged PNG as either
+    except (OSError, SyntaxError, Image.DecompressionBombError) as error:  # Pillow reports a damaged PNG as these
         raise ValueError(f"{path}: not a readable PNG ({error})") from None
 
 
@@ -183,3 +205,9 @@ def write_text(location: Location, text: str) -> None:
 def json_text(content) -> str:
     """Return the content as indented JSON with sorted keys; a number that is not finite is an error."""
     return json.dumps(content, indent=1, sort_keys=True, allow_nan=False) + "\n"
+
+
+def file_of(folder: Path, name: str) -> Path | None:
+    """Return the file that a name in an object.json means, None where it leads out of the object's folder."""
+    parts = PurePosixPath(name).parts
+    return folder / name if parts and not {"..", "/"} & set(parts) and "\\" not in name else None

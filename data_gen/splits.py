@@ -63,7 +63,7 @@ def read_split_file(path: Path, known: set[str], synset: str | None) -> Listed:
     try:
         text = path.read_text("utf-8")
         listed = splits_of_csv(text, synset) if path.suffix.lower() == ".csv" else json.loads(text)
-    except (OSError, ValueError, csv.Error) as error:
+    except (OSError, ValueError, RecursionError, csv.Error) as error:
         raise ValueError(f"--split-file {path}: cannot be read ({error}); give .json or .csv") from None
     lists = listed.values() if isinstance(listed, dict) and listed.keys() <= set(SPLITS) else [None]
     if not all(isinstance(ids, list) and all(isinstance(name, str) for name in ids) for ids in lists):

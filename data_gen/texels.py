@@ -13,6 +13,7 @@ from PIL import Image, UnidentifiedImageError
 from data_gen.assets import RejectedAsset, Wrap
 
 MAX_SIZE = 1024
+MOST_PIXELS = 2**26  # of an image file: 8192 x 8192
 
 
 def srgb_to_linear(encoded: np.ndarray) -> np.ndarray:
@@ -27,6 +28,8 @@ def read_image(data: bytes, name: str) -> np.ndarray:
     """Texels (height, width, 4) uint8 of an image file as they are encoded; alpha is 255 where it has none."""
     try:
         with Image.open(io.BytesIO(data)) as image:
+            if image.width * image.height > MOST_PIXELS:  # before memory is taken for them
+                raise ValueError(f"{image.width} x {image.height} pixels, more than {MOST_PIXELS}")
             if image.mode.startswith("I"):  # PIL would clip 16-bit grey to 255 instead of scaling it
                 eight_bit = (np.asarray(image, np.int64) // 257).astype(np.uint8)
                 return np.asarray(Image.fromarray(eight_bit).convert("RGBA"))

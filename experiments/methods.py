@@ -11,7 +11,7 @@ from pathlib import Path
 from experiments.table1_report import LABELS
 from spnr_jax import checkpoint, data, evaluation, training
 from spnr_jax.config import TrainConfig
-from spnr_jax.model_config import METHODS
+from spnr_jax.model_config import METHODS, ModelConfig
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,7 +57,7 @@ def networks(sources: Sources, dataset: data.Dataset) -> dict[str, Network]:
     if not runs:
         raise ValueError("--runs: name at least one run folder, or --table1 with the folder of a table that has some")
     found = [(run, load(run, dataset)) for run in runs]
-    found.sort(key=lambda pair: list(METHODS).index(pair[1].method))
+    found.sort(key=lambda pair: list(LABELS).index(pair[1].method))
     times = Counter(network.method for _, network in found)
     named = {name_of(network.method, run, times[network.method] > 1): network for run, network in found}
     if len(named) < len(runs):
@@ -75,6 +75,8 @@ def load(run: Path, dataset: data.Dataset) -> Network:
     config, state = checkpoint.load_run(run, data=dataset.folder)
     data.check_resolution(data.read_object(dataset, dataset.splits["test"][0]), config)
     method = next(name for name, kind in METHODS.items() if isinstance(config.model, kind))
+    if isinstance(config.model, ModelConfig) and config.model.num_neighbors:
+        method = "plus"
     return Network(
         method=method,
         config=config,

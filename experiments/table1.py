@@ -35,7 +35,9 @@ from spnr_jax.lpips_weights import read_weights
 from spnr_jax.presets import PRESETS
 from spnr_jax.summary import differences, metric_settings, summarise
 
-Row = Literal["ours", "npbg", "point_nerf", "points2nerf", "poisson", "poisson_trimmed", "nearest", "splat", "white"]
+Row = Literal[
+    "ours", "plus", "npbg", "point_nerf", "points2nerf", "poisson", "poisson_trimmed", "nearest", "splat", "white"
+]
 ROWS: tuple[Row, ...] = Row.__args__  # type: ignore[attr-defined]
 QUICK_OBJECTS = 3
 

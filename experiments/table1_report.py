@@ -15,6 +15,7 @@ from spnr_jax.summary import NO_WEIGHTS
 
 LABELS = {
     "ours": "Ours",
+    "plus": "Ours, plus",
     "npbg": "NPBG",
     "point_nerf": "Point-NeRF",
     "points2nerf": "Points2NeRF",

@@ -23,7 +23,7 @@ from spnr_jax.config import TrainConfig
 from spnr_jax.presets import PRESETS
 
 Budget = Literal["quick", "tiny", "paper"]
-NETWORKS = ("ours", "npbg", "point_nerf", "points2nerf")
+NETWORKS = ("ours", "plus", "npbg", "point_nerf", "points2nerf")
 QUICK_STEPS = 4
 PAPER_SIZES = {128: "abo", 200: "shapenet"}
 PACE_SECONDS, PACE_STEPS = 5.0, 3  # a pace is measured over at least so long and so many steps

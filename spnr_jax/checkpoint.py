@@ -2,14 +2,19 @@
 
     RUN/config.json          the TrainConfig
     RUN/checkpoints/STEP/    one state; appears complete or not at all
+    RUN/training.lock        empty; locked while a process trains there
 
 The newest readable checkpoint counts: a broken one is named and the one before it is taken.
 """
 
 import json
 import logging
-from collections.abc import Callable
+import os
+import re
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import jax
 
@@ -17,6 +22,23 @@ from spnr_jax import training
 from spnr_jax.config import TrainConfig, from_dict, to_dict
 
 KEPT = 3  # newest checkpoints that stay
+
+
+@contextmanager
+def alone(run: Path) -> Iterator[None]:
+    """While it lasts no other process trains in the run folder, which is made; ValueError if one does already.
+
+    The operating system opens the lock when its process ends, however it ends.
+    """
+    import fcntl  # Windows has none
+
+    run.mkdir(parents=True, exist_ok=True)
+    with (run / "training.lock").open("a") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise ValueError(f"{run}: another process trains in this folder; wait for it or choose a new one") from None
+        yield
 
 
 def write_config(run: Path, config: TrainConfig) -> None:
@@ -54,12 +76,12 @@ def read_config(run: Path | str) -> TrainConfig:
         raise ValueError(f"{run}: not a run folder (config.json is missing); train one with `spnr train DATA {run}`")
     try:
         return from_dict(json.loads(path.read_text()))
-    except (ValueError, TypeError, AttributeError) as error:
+    except (ValueError, TypeError, AttributeError, ArithmeticError, RecursionError) as error:
         raise ValueError(f"{path}: not a config of this version ({error}); train a new run") from None
 
 
 def _checkpointer(run: Path, *, writing: bool):
-    logging.getLogger("absl").setLevel(logging.ERROR)  # one line a save is not for the user's terminal
+    logging.getLogger("absl").setLevel(logging.CRITICAL)  # a line each save, call stacks of what is raised as well
     from orbax.checkpoint import v1 as ocp  # two seconds of import that rendering from Python need not pay
 
     return ocp.training.Checkpointer(
@@ -70,10 +92,19 @@ def _checkpointer(run: Path, *, writing: bool):
 
 
 def save(run: Path, state: training.TrainState) -> None:
-    """Writes the state as the run's newest checkpoint and removes those that are too old."""
-    with _checkpointer(run, writing=True) as checkpointer:
-        # a damaged checkpoint of this step, which an earlier run left, makes place
-        checkpointer.save(int(state.step), state, force=True, overwrite=True)
+    """Writes the state as the run's newest checkpoint and removes those that are too old; ValueError if it cannot."""
+    step = int(state.step)
+    try:
+        with _checkpointer(run, writing=True) as checkpointer:
+            # a damaged checkpoint of this step, which an earlier run left, makes place
+            checkpointer.save(step, state, force=True, overwrite=True)
+    except (OSError, ValueError) as error:  # tensorstore raises ValueError for the disk's errors, too
+        number = re.search(r"os_error_code='(\d+)'", str(error))
+        reason = os.strerror(int(number[1])) if number else _first_line(error)
+        raise ValueError(
+            f"checkpoint {run / 'checkpoints' / str(step)} cannot be written ({reason}); the one before is kept: mend "
+            "this, and the same command goes on from there"
+        ) from None
 
 
 def restore(run: Path, config: TrainConfig, say: Callable[[str], None] = print) -> training.TrainState | None:
@@ -93,6 +124,7 @@ def restore(run: Path, config: TrainConfig, say: Callable[[str], None] = print) 
                 state = checkpointer.load(step, like)
                 jax.block_until_ready(state)
             except Exception as error:  # noqa: BLE001 - Orbax and tensorstore raise many kinds for a damaged file
+                _refuse_other_version(checkpointer, folder / str(step), like)
                 say(f"checkpoint {folder / str(step)} is damaged ({_first_line(error)}); trying the one before")
                 continue
             if int(state.step) == step:
@@ -103,6 +135,32 @@ def restore(run: Path, config: TrainConfig, say: Callable[[str], None] = print) 
             f"{run / 'checkpoints'}: no checkpoint of this run can be read; remove the folder to start again"
         )
     return None
+
+
+def _refuse_other_version(checkpointer: Any, path: Path, like: training.TrainState) -> None:
+    """ValueError if a checkpoint that cannot be read is whole, but of other arrays: going on would overwrite it."""
+    try:
+        found, wanted = _shapes(checkpointer.metadata(int(path.name)).metadata), _shapes(like)
+    except Exception:  # noqa: BLE001 - as in `restore`: it is damaged
+        return
+    different = sorted(name for name in found.keys() | wanted.keys() if found.get(name) != wanted.get(name))
+    if found and different:  # of damaged files it finds nothing
+        raise ValueError(
+            f"checkpoint {path} is of another version of spnr_jax: {different[0]} has shape "
+            f"{found.get(different[0], 'none')}, here {wanted.get(different[0], 'none')}; go on with that version, or "
+            "choose a new run folder"
+        )
+
+
+def _shapes(tree: Any) -> dict[str, tuple[int, ...]]:
+    """Shape of each array of a tree by its path; of a random key, that of the numbers which it is stored as."""
+
+    def shape(leaf: Any) -> tuple[int, ...]:
+        is_key = jax.numpy.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+        return tuple(jax.eval_shape(jax.random.key_data, leaf).shape if is_key else leaf.shape)
+
+    leaves = jax.tree_util.tree_leaves_with_path(tree)
+    return {jax.tree_util.keystr(path, simple=True, separator="."): shape(leaf) for path, leaf in leaves}
 
 
 def load_run(

@@ -1,4 +1,4 @@
-"""The command `spnr`: train a network, evaluate one, render a cloud.
+"""The command `spnr`: train a network, evaluate one, render a cloud, export a network.
 
 Errors of the user and of the disk are one line on stderr and exit code 2; Ctrl-C keeps the state and exits with 130.
 """
@@ -7,6 +7,7 @@ import contextlib
 import dataclasses
 import importlib.util
 import io
+import json
 import re
 import sys
 import time
@@ -22,6 +23,7 @@ from spnr_jax.config import TrainConfig
 from spnr_jax.render_command import Render
 
 BOX = r"[╭╮╰╯│─•]+|__tyro-dummy-inner__\."  # what tyro draws around an error, and its name for the whole command
+LONGEST_LINE = 800  # characters of an error
 DESCRIPTION = "Sparse-point neural rendering: train a network, evaluate one, render a cloud of points."
 
 
@@ -74,6 +76,26 @@ class ConvertLpips:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Export:
+    """Write a network as functions for JAX without this package, and as StableHLO for other compilers."""
+
+    run: tyro.conf.Positional[Path]
+    """Run folder whose network is exported."""
+    out: Path = Path("exported")
+    """Folder for encode.jax, render.jax, both as .stablehlo, and export.json, which says what they take and give."""
+    num_points: int = 1024
+    """Points of a cloud, padding included; exactly so many."""
+    resolution: int | None = None
+    """Pixels along each side (default: what the network was trained for)."""
+    quality: Literal["draft", "balanced", "best", "trained"] = "best"
+    """As for `spnr render`."""
+    reach: int = 4
+    """Voxels around points that are looked at, 1 to 4: 1.6 times their median distance, rounded up, loses nothing."""
+    platforms: tuple[Literal["cpu", "cuda", "rocm", "tpu"], ...] = ("cpu",)
+    """Where the functions are to run."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class View:
     """Look at a point cloud or mesh file in the browser: its points and what a network makes of them, edited live."""
 
@@ -89,6 +111,9 @@ class View:
     """Points used of a bigger cloud or sampled from a mesh; fewer work too."""
     up: Literal["auto", "x", "y", "z", "-x", "-y", "-z"] = "auto"
     """The file's upward axis; auto looks for it, and says what it found."""
+
+
+Command = Train | Evaluate | Render | View | Export | ConvertLpips
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -110,18 +135,22 @@ def guarded(work: Callable[[], None], name: str) -> int:
     return 0
 
 
-def parse(arguments: list[str]) -> Train | Evaluate | Render | View | ConvertLpips:
+def parse(arguments: list[str]) -> Command:
     """The command with all its options; the preset named by --preset gives the defaults of the others."""
     train = Annotated[Train, tyro.conf.subcommand("train", default=_train_defaults(arguments))]
     evaluate = Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     render = Annotated[Render, tyro.conf.subcommand("render")]
     view = Annotated[View, tyro.conf.subcommand("view")]
+    export = Annotated[Export, tyro.conf.subcommand("export")]
     convert = Annotated[ConvertLpips, tyro.conf.subcommand("convert-lpips")]
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said):
             return tyro.cli(
-                train | evaluate | render | view | convert, prog="spnr", description=DESCRIPTION, args=arguments
+                train | evaluate | render | view | export | convert,
+                prog="spnr",
+                description=DESCRIPTION,
+                args=arguments,
             )
     except SystemExit as stop:
         if stop.code:
@@ -140,7 +169,7 @@ def _train_defaults(arguments: list[str]) -> Train:
     return Train(data=tyro.MISSING, run=tyro.MISSING, config=presets.PRESETS[preset]())
 
 
-def run(command: Train | Evaluate | Render | View | ConvertLpips) -> None:
+def run(command: Command) -> None:
     """Carries a command out."""
     enable_compilation_cache()
     match command:
@@ -152,6 +181,8 @@ def run(command: Train | Evaluate | Render | View | ConvertLpips) -> None:
             run_render(command)
         case View():
             run_view(command)
+        case Export():
+            run_export(command)
         case ConvertLpips():
             run_convert_lpips(command)
 
@@ -213,6 +244,26 @@ def run_view(command: View) -> None:
     viewer.wait()
 
 
+def run_export(command: Export) -> None:
+    """`spnr export`."""
+    from spnr_jax import export, model
+    from spnr_jax.images import write_whole
+
+    handle, where = model.load(command.run), command.platforms
+    functions = {
+        "encode": export.export_encode(handle, num_points=command.num_points, platforms=where),
+        "render": export.export_render(
+            handle, resolution=command.resolution, quality=command.quality, reach=command.reach, platforms=where
+        ),
+    }
+    for name, content in functions.items():
+        write_whole(command.out / f"{name}.jax", content)
+        write_whole(command.out / f"{name}.stablehlo", export.stablehlo(content))
+    signatures = {name: export.signature(content) for name, content in functions.items()}
+    write_whole(command.out / "export.json", (json.dumps(signatures, indent=1) + "\n").encode())
+    print(f"wrote encode and render to {command.out} (export.json says what they take and give)")
+
+
 def run_convert_lpips(command: ConvertLpips) -> None:
     """`spnr convert-lpips`."""
     from spnr_jax import lpips_weights
@@ -222,10 +273,13 @@ def run_convert_lpips(command: ConvertLpips) -> None:
 
 
 def one_line(error: Exception) -> str:
-    """What an error says, on one line; an error of the disk with its place."""
+    """What an error says, on one line that a person can read whole; an error of the disk with its place."""
+    said = str(error)
     if isinstance(error, OSError) and error.strerror:
-        return f"{error.filename or 'disk'}: {error.strerror}"
-    return " ".join(str(error).split())
+        said = f"{error.filename or 'disk'}: {error.strerror}"
+    line = " ".join(said.split())
+    # a name or number in a broken file may be of any length
+    return line if len(line) <= LONGEST_LINE else f"{line[: LONGEST_LINE // 2]} ... {line[-LONGEST_LINE // 2 :]}"
 
 
 if __name__ == "__main__":

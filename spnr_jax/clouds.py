@@ -158,6 +158,8 @@ def _sampled_mesh(path: Path, count: int, seed: int, report: Callable[[str], Non
     for feature in asset.ignored:
         report(f"ignored: {feature}")
     points = sample_surface(asset, count, seed)
+    if not np.isfinite(points.positions).all():
+        raise ValueError(f"holds vertices too large for float32, more than {np.finfo(np.float32).max:.2g}")
     report(f"{count} points drawn from the surface of the mesh")
     values = {name: getattr(points, name) for name in DEFAULTS}
     if all((values[name] == default).all() for name, default in DEFAULTS.items()):

@@ -88,13 +88,14 @@ def read_object(dataset: Dataset, name: str) -> ObjectData:
     file = "transforms.json"
     try:
         meta = json.loads(read(file))
-        poses = np.array([frame["transform_matrix"] for frame in meta["frames"]], np.float32)[:, :3]
-        intrinsics = np.array([[meta["fl_x"], 0, meta["cx"]], [0, meta["fl_y"], meta["cy"]], [0, 0, 1]], np.float32)
+        with np.errstate(over="ignore"):  # what leaves float32 is infinite, and refused
+            poses = np.array([frame["transform_matrix"] for frame in meta["frames"]], np.float32)[:, :3]
+            intrinsics = np.array([[meta["fl_x"], 0, meta["cx"]], [0, meta["fl_y"], meta["cy"]], [0, 0, 1]], np.float32)
         names = [Path(frame["file_path"]).name for frame in meta["frames"]]
         height, width = int(meta["h"]), int(meta["w"])
         if poses.shape[1:] != (3, 4) or not (np.isfinite(poses).all() and np.isfinite(intrinsics).all()):
             raise ValueError("a camera is no 4 x 4 matrix of finite numbers")
-        if not min(meta["fl_x"], meta["fl_y"]) > 0:
+        if not min(intrinsics[0, 0], intrinsics[1, 1]) > 0:
             raise ValueError(f"focal lengths {meta['fl_x']} and {meta['fl_y']}, expected positive ones")
         images = np.stack([_rgba(read(file := f"images/{name}"), height, width) for name in names])
         conditions = np.stack([_rgba(read(file := f"conditions/{name}"), height, width) for name in names])

@@ -7,13 +7,13 @@ They are made once from two files that others publish: AlexNet's weights as torc
 import importlib
 import io
 import pickle
-import zipfile
 from pathlib import Path
 
 import numpy as np
 
 from spnr_jax.images import write_whole
 from spnr_jax.lpips import CHANNELS, WINDOWS, LpipsWeights
+from spnr_jax.numpy_files import read_arrays
 
 CONVOLUTIONS = (0, 3, 6, 8, 10)  # places of the convolutions among AlexNet's features
 INPUTS = (3, *CHANNELS[:-1])
@@ -29,12 +29,10 @@ def read_weights(path: Path) -> LpipsWeights:
     advice = "make it with `spnr convert-lpips`"
     if not path.is_file():
         raise ValueError(f"{path}: no such file of LPIPS weights; {advice}")
-    if not zipfile.is_zipfile(path):  # np.load would leave its handle on such a file open
-        raise ValueError(f"{path}: not an .npz file of LPIPS weights; {advice}")
     try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-    except (ValueError, OSError, EOFError, zipfile.BadZipFile, AttributeError) as error:
+        with path.open("rb") as file:
+            arrays = read_arrays(file, SHAPES)
+    except ValueError as error:
         raise ValueError(f"{path}: not an .npz file of LPIPS weights ({error}); {advice}") from None
     return from_arrays(arrays, path)
 

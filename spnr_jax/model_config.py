@@ -118,7 +118,8 @@ class ModelConfig:
             self.base_width % self.num_groups == 0 and self.base_width > 0,
             f"base_width {self.base_width} must be a positive multiple of num_groups {self.num_groups}",
         )
-        require(self.num_features >= 3, f"num_features must be at least 3 (RGB), got {self.num_features}")
+        least = 3 if self.num_neighbors else 4
+        require(self.num_features >= least, f"num_features must be at least {least} (RGB first), got {self.num_features}")
         check_materials(self.materials)
         require(
             self.precision in ("float32", "bfloat16"),

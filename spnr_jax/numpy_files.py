@@ -6,9 +6,11 @@
 Pickled objects, which could run code, are refused.  Every fault is a ValueError; the caller adds the file's name.
 """
 
+import math
+import tokenize
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from io import BufferedIOBase
 from pathlib import Path
 
@@ -17,6 +19,11 @@ import numpy as np
 from spnr_jax.text_files import NUMBERS, Columns, plain_names
 
 PIECE_BYTES = 2**25  # of an array in memory at a time
+MOST_BYTES = 2**31  # of an archive's arrays when unpacked: a small file can announce any number
+# what NumPy and zipfile raise on files that break their rules
+UNREADABLE: tuple[type[Exception], ...]
+UNREADABLE = (ValueError, LookupError, TypeError, ArithmeticError, EOFError, OSError, RuntimeError, SyntaxError)
+UNREADABLE += (tokenize.TokenError, zipfile.BadZipFile, zlib.error)
 ARRAY_COLUMNS = {
     **dict.fromkeys(("positions", "points", "xyz", "vertices"), ("x", "y", "z")),
     **dict.fromkeys(("base_color", "albedo"), ("base_color_r", "base_color_g", "base_color_b")),
@@ -32,13 +39,13 @@ def numpy_pieces(path: Path) -> Iterator[Columns]:
         magic = file.read(6)
         file.seek(0)
         if magic.startswith(b"PK"):
-            yield _archive(file)
+            yield _named_arrays(read_arrays(file, ARRAY_COLUMNS))
             return
     if not magic.startswith(b"\x93NUMPY"):
         raise ValueError("is not a NumPy file")
     try:
         loaded = np.lib.format.open_memmap(path, mode="r")
-    except (EOFError, ValueError) as error:
+    except UNREADABLE as error:
         raise ValueError(f"is a broken, truncated or pickled NumPy file ({error})") from None
     rows = np.atleast_1d(loaded)
     names = rows.dtype.names or plain_names(rows)
@@ -49,20 +56,48 @@ def numpy_pieces(path: Path) -> Iterator[Columns]:
         yield {name.lower(): column for name, column in zip(names, values, strict=True)}
 
 
-def _archive(file: BufferedIOBase) -> Columns:
-    """The columns of an archive, which comes whole: its arrays are compressed as such."""
+def read_arrays(file: BufferedIOBase, wanted: Collection[str]) -> dict[str, np.ndarray]:
+    """The arrays of an .npz archive whose names are wanted; ValueError for one that is broken or unpacks to too much.
+
+    An array's size is checked before memory is taken for it: its header must not announce more than its bytes.
+    """
+    arrays = {}
     try:
-        with np.load(file, allow_pickle=False) as archive:
-            return _named_arrays(archive)
-    except (EOFError, zipfile.BadZipFile, zlib.error) as error:
+        with zipfile.ZipFile(file) as archive:
+            members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
+            unpacked = sum(info.file_size for name, info in members.items() if name in wanted)
+            if unpacked > MOST_BYTES:
+                raise ValueError(
+                    f"unpacks to {unpacked} bytes, more than {MOST_BYTES}; use .npy, which is read in pieces"
+                )
+            for name in [name for name in members if name in wanted]:
+                arrays[name] = _member(archive, members[name])
+    except UNREADABLE as error:
         raise ValueError(f"is a broken or truncated NumPy file ({error})") from None
+    if not arrays:
+        raise ValueError(f"has none of the arrays {', '.join(wanted)}; found {', '.join(members) or 'none'}")
+    return arrays
 
 
-def _named_arrays(archive: np.lib.npyio.NpzFile) -> Columns:
+def _member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
+    """One array of an archive."""
+    with archive.open(info) as stream:
+        version = np.lib.format.read_magic(stream)
+        read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, _, dtype = read_header(stream)
+        if dtype.hasobject or any(size < 0 for size in shape):
+            raise ValueError(f"{info.filename} holds objects or a negative size, shape {shape} and type {dtype}")
+        if math.prod(shape) * dtype.itemsize > info.file_size:
+            raise ValueError(f"{info.filename} is cut off: shape {shape} of {dtype} in {info.file_size} bytes")
+    with archive.open(info) as stream:
+        return np.lib.format.read_array(stream, allow_pickle=False)
+
+
+def _named_arrays(archive: dict[str, np.ndarray]) -> Columns:
     """The columns of arrays (points, c), or (points,) for scalars, under the names of ARRAY_COLUMNS."""
     columns: Columns = {}
-    for name in [name for name in archive if name in ARRAY_COLUMNS]:
-        array, targets = archive[name], ARRAY_COLUMNS[name]
+    for name, array in archive.items():
+        targets = ARRAY_COLUMNS[name]
         table = array[:, None] if array.ndim == 1 else array
         if table.ndim != 2 or table.shape[1] != len(targets) or table.dtype.kind not in NUMBERS:
             raise ValueError(

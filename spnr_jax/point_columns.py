@@ -109,8 +109,10 @@ def _base_color(columns: Columns, report: Report) -> np.ndarray | None:
     if "intensity" not in columns:
         return None
     intensity = np.asarray(columns["intensity"], np.float64)
+    if not np.isfinite(intensity).all():
+        return None
     dark, bright = intensity.min(), np.quantile(intensity, BRIGHTEST)
-    if not (np.isfinite(intensity).all() and bright > dark):
+    if not (bright > dark and np.isfinite(bright - dark)):
         return None
     report(f"no colour in the file: intensity {dark:g}..{bright:g} shown as grey")
     return _linear(np.repeat(np.clip((intensity - dark) / (bright - dark), 0, 1)[:, None], 3, axis=-1))

@@ -75,31 +75,40 @@ def tiny() -> TrainConfig:
     )
 
 
-def plus_tiny() -> TrainConfig:
-    """Light on the materials of the nearest points, 64 px, a ray a pixel.  `spnr train --preset plus_tiny DATA RUN`."""
-    return TrainConfig(
-        preset="plus_tiny",
-        model=ModelConfig(
-            volume_resolution=32,
-            base_width=8,
-            num_stages=3,
-            num_groups=1,
-            num_features=3,
-            num_neighbors=6,
-            color="lit",
-            point_norm="layer",
-            sampling=SamplingConfig(num_coarse=16, num_fine=0, reach=1),
-            render_resolution=64,
-            resize_resolution=32,
-            image_resolution=64,
-        ),
-        loss=LossConfig(l1_weight=1.0, adversarial_weight=0.0, opacity_weight=0.3),
-        optimizer=OptimizerConfig(lr_generator=2e-3, warmup_steps=100, ema_decay=0.995),
-        num_steps=1200,
-        batch_objects=4,
-        max_points=1024,
-        pixel_stride=2,
+def _plus(preset: TrainConfig, name: str, pixel_stride: int, num_coarse: int) -> TrainConfig:
+    """The preset's network and training with light on the materials of the nearest points: a ray a pixel, no GAN."""
+    assert isinstance(preset.model, ModelConfig)
+    model = dataclasses.replace(
+        preset.model,
+        num_features=3,
+        num_neighbors=6,
+        color="lit",
+        point_norm="layer",
+        sampling=SamplingConfig(num_coarse=num_coarse, num_fine=0, reach=1),
+        render_resolution=preset.model.image_resolution,
     )
+    loss = LossConfig(l1_weight=1.0, adversarial_weight=0.0, opacity_weight=0.3)
+    return dataclasses.replace(preset, preset=name, model=model, loss=loss, pixel_stride=pixel_stride)
+
+
+def plus_abo() -> TrainConfig:
+    """Light on materials, a volume of the paper's size, 128 px.  `spnr train --preset plus_abo DATA RUN`; one GPU."""
+    return _plus(abo(), "plus_abo", pixel_stride=2, num_coarse=32)
+
+
+def plus_shapenet() -> TrainConfig:
+    """The same at 200 px.  `spnr train --preset plus_shapenet DATA RUN`; meant for one GPU."""
+    return _plus(shapenet_car(), "plus_shapenet", pixel_stride=2, num_coarse=32)
+
+
+def plus_small() -> TrainConfig:
+    """Light on materials, 128 px.  `spnr train --preset plus_small DATA RUN`; hours on a CPU."""
+    return _plus(small(), "plus_small", pixel_stride=4, num_coarse=24)
+
+
+def plus_tiny() -> TrainConfig:
+    """Light on materials, 64 px, minutes on two CPU cores.  `spnr train --preset plus_tiny DATA RUN`."""
+    return _plus(tiny(), "plus_tiny", pixel_stride=2, num_coarse=16)
 
 
 def _baseline_loss(pixel: Literal["l1", "mse"], masked: bool = False) -> LossConfig:
@@ -233,10 +242,11 @@ def points2nerf_tiny() -> TrainConfig:
     )
 
 
-OURS = (abo, shapenet_car, shapenet_plane, shapenet_chair, small, tiny, plus_tiny)
+OURS = (abo, shapenet_car, shapenet_plane, shapenet_chair, small, tiny)
+PLUS = (plus_abo, plus_shapenet, plus_small, plus_tiny)
 BASELINES = (
     *(npbg_abo, npbg_shapenet, npbg_tiny),
     *(point_nerf_abo, point_nerf_shapenet, point_nerf_tiny),
     *(points2nerf_abo, points2nerf_shapenet, points2nerf_tiny),
 )
-PRESETS: dict[str, Callable[[], TrainConfig]] = {preset.__name__: preset for preset in (*OURS, *BASELINES)}
+PRESETS: dict[str, Callable[[], TrainConfig]] = {preset.__name__: preset for preset in (*OURS, *PLUS, *BASELINES)}

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 INDEX = "index.json"
+LONGEST_NAME = 200  # file systems allow 255 bytes
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,9 +35,11 @@ def open_shards(folder: Path) -> Shards | None:
 
     try:
         index = json.loads(path.read_text())
-        files = {folder / "shards" / file: count for file, count in index["shards"].items()}
+        if strange := [name for name in (*index["shards"], *index["ids"]) if not is_plain_name(name)]:
+            raise ValueError(f"{strange[0]!r} is no name of a file or object")
+        files = {folder / "shards" / file: int(count) for file, count in index["shards"].items()}
         places = {name: place for place, name in enumerate(index["ids"])}
-    except (ValueError, LookupError, AttributeError, TypeError) as error:
+    except (ValueError, LookupError, AttributeError, TypeError, OverflowError, RecursionError) as error:
         raise ValueError(f"{path}: damaged ({error}); pack the data set again") from None
     if absent := [file for file in files if not file.is_file()]:
         raise ValueError(f"{absent[0]}: missing; pack the data set again")
@@ -54,14 +57,27 @@ def read_files(shards: Shards, name: str) -> dict[str, bytes]:
     """The files of one object by their paths in its folder; ValueError if its record is absent or broken."""
     import msgpack
 
+    if name not in shards.places:
+        raise ValueError(f"{shards.folder}: holds no object {name}; pack the data set again")
     try:
-        return msgpack.unpackb(shards.records[shards.places[name]])
-    except KeyError:
-        raise ValueError(f"{shards.folder}: holds no object {name}; pack the data set again") from None
-    except (RuntimeError, ValueError, OSError, LookupError) as error:
+        files = msgpack.unpackb(shards.records[shards.places[name]])
+        if not isinstance(files, dict) or not all(isinstance(content, bytes) for content in files.values()):
+            raise ValueError("its record holds no files")
+        return files
+    except (RuntimeError, ValueError, OSError, LookupError, TypeError) as error:
         raise ValueError(
             f"{shards.folder}: object {name} cannot be read ({first_line(error)}); pack the data set again"
         ) from None
+
+
+def is_plain_name(name: object) -> bool:
+    """Whether a name in a data set's lists is that of a file or folder right there: no path, nothing hidden."""
+    return (
+        isinstance(name, str)
+        and 0 < len(name) <= LONGEST_NAME
+        and name.isprintable()
+        and not (name.startswith(".") or set(name) & set("/\\:"))
+    )
 
 
 def first_line(error: Exception) -> str:

@@ -16,6 +16,7 @@ INNER = (0.05, 0.95)  # quantiles along each axis between which the extent of a 
 FINEST = 2**10  # voxels along the extent that streaming starts with
 HALVINGS = 20  # of the extent, to the smallest voxel that is tried
 SMALLEST_EXTENT = 1e-30  # where all points coincide
+FARTHEST = 1e18  # from the middle, in the file's units, up to which distances are squared as they are
 KEY_BITS = 21  # of a voxel's index along an axis
 
 
@@ -85,7 +86,11 @@ def farthest_points(positions: np.ndarray, count: int, seed: int) -> np.ndarray:
     The seed chooses the first.  Beyond THINNING * count points voxels thin them first: the time is count^2 at most.
     """
     among = candidates(positions, count)
-    x, y, z = np.ascontiguousarray((positions[among] - positions.mean(axis=0)).T, np.float32)
+    centred = positions[among] - positions.mean(axis=0)
+    largest = np.abs(centred).max(initial=0)
+    if largest > FARTHEST:  # else the squares leave float32
+        centred = centred / largest
+    x, y, z = np.ascontiguousarray(centred.T, np.float32)
     squared = np.full(len(among), np.inf, np.float32)
     chosen = np.empty(count, np.int64)
     chosen[0] = np.random.default_rng(seed).integers(len(among))

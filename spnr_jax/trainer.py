@@ -49,6 +49,15 @@ class NotFinite(ValueError):
 
 def train(config: TrainConfig, dataset: data.Dataset, run: Path, schedule: Schedule) -> training.TrainState:
     """The state after the config's last step; goes on where an earlier call left the run folder."""
+    with checkpoint.alone(run):
+        try:
+            return _train(config, dataset, run, schedule)
+        except OSError as error:
+            error.filename = error.filename or str(run)  # writing to a full disk does not say where
+            raise
+
+
+def _train(config: TrainConfig, dataset: data.Dataset, run: Path, schedule: Schedule) -> training.TrainState:
     checkpoint.write_config(run, config)
     state = checkpoint.restore(run, config, say=tqdm.write) or training.jitted_create_state(config)
     first = int(state.step)
@@ -151,29 +160,32 @@ class MetricsLog:
         self._board = SummaryWriter(str(run / "tensorboard"), purge_step=first_step + 1)
 
     def write(self, row: dict[str, int | float]) -> None:
-        """Appends one row; every entry but the step is a TensorBoard scalar."""
+        """Appends one row, to the disk itself; every entry but the step is a TensorBoard scalar."""
         self._file.write(json.dumps(row) + "\n")
         self._file.flush()
+        os.fsync(self._file.fileno())  # a checkpoint that outlives a power cut needs the rows before it
         for name, value in row.items():
             if name != "step":
                 self._board.add_scalar(name, value, row["step"])
 
     def close(self) -> None:
-        """Flushes both to disk."""
-        os.fsync(self._file.fileno())
+        """Closes both."""
         self._file.close()
         self._board.close()
 
 
 def read_rows(run: Path) -> list[dict]:
-    """Rows of a run's metrics.jsonl; a last line that a crash cut off is left out."""
+    """Rows of a run's metrics.jsonl; a last line that a crash cut off is left out, and what follows a broken one."""
     path = run / "metrics.jsonl"
-    rows = []
-    for line in path.read_text().splitlines() if path.exists() else []:
+    rows: list[dict] = []
+    for line in path.read_text(errors="replace").splitlines() if path.exists() else []:
         try:
-            rows.append(json.loads(line))
-        except ValueError:
+            row = json.loads(line)
+        except (ValueError, RecursionError):
             break
+        if not isinstance(row, dict) or not all(isinstance(value, int | float) for value in row.values()):
+            break
+        rows.append(row)
     return rows
 
 

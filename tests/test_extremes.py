@@ -17,7 +17,7 @@ from laws import TINY, close, extremes, float64_law, hypotheses, numbers
 from skimage.metrics import structural_similarity
 
 from spnr_jax import cameras, colors, compositing, losses, metrics, numerics, sampling, voxels
-from spnr_jax.nn.field import encode_direction
+from spnr_jax.nn.encoding import encode_direction
 from spnr_jax.nn.normalization import BatchNorm
 
 BINS, SAMPLES, POINTS = 8, 5, 12

@@ -8,7 +8,8 @@ import reference
 from laws import batch_law, close, gradient_law, numbers
 
 from spnr_jax.compositing import composite, volume_weights
-from spnr_jax.nn.field import RadianceField, encode_direction
+from spnr_jax.nn.encoding import encode_direction
+from spnr_jax.nn.field import RadianceField
 from spnr_jax.numerics import normalize
 
 MODULE = RadianceField(width=6, num_features=7, direction_frequencies=2)

@@ -16,14 +16,14 @@ ROOT = Path(__file__).parents[1]
 LAYERS = {
     0: {"types", "config", "model_config"},
     1: {"numerics", "cameras", "colors", "sampling", "compositing", "voxels", "losses", "metrics", "statistics"},
-    2: {"nn", "empty_space", "flip", "lpips"},
+    2: {"nn", "empty_space", "surface", "flip", "lpips"},
     3: {"renderer", "baselines"},
     4: {"training"},
     6: {"cli", "report", "results", "trainer"},
 }
 FILES = 5  # every module that is not named above reads or writes files
 # what siblings below the files may import
-SHARED = {0: {"model_config"}, 1: {"numerics"}, 2: {"convolution", "normalization"}}
+SHARED = {0: {"model_config"}, 1: {"numerics"}, 2: {"convolution", "encoding", "normalization"}}
 IMPURE = {"os", "pathlib", "time", "io", "sys", "json", "shutil", "tempfile", "logging", "datetime", "random", "tqdm"}
 HEAVY = {"mitsuba", "pymeshlab", "trimesh", "viser", "torch", "matplotlib", "skimage", "grain", "dask", "distributed"}
 

@@ -11,7 +11,7 @@ import twin
 
 from experiments import twin_layout
 from spnr_jax import cameras, compositing, losses, sampling, training, voxels
-from spnr_jax.nn.field import encode_direction
+from spnr_jax.nn.encoding import encode_direction
 from spnr_jax.renderer import Renderer
 
 TOLERANCE = 1e-4

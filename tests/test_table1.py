@@ -134,7 +134,7 @@ def test_a_table_that_was_stopped_goes_on_to_the_same_numbers(out, dataset, tmp_
         assert row == uninterrupted["methods"][name]
         assert results["costs"][name] == uninterrupted["costs"][name]
     said = capsys.readouterr().out
-    assert "network 3 of 4, Point-NeRF: preset point_nerf_tiny, 4 steps" in said
+    assert "network 4 of 5, Point-NeRF: preset point_nerf_tiny, 4 steps" in said
     assert "scored 3 of 3 objects" in said
 
 
@@ -267,7 +267,7 @@ def test_the_time_of_a_view_leaves_out_the_object_that_compiled(tmp_path):
     [
         ({"minutes": 1.0}, "--minutes 1.0: .*quick takes 4 steps"),
         ({"budget": "tiny", "minutes": 0.0}, "--minutes 0.0: expected more than 0"),
-        ({"methods": ()}, "--methods: name at least one of ours, npbg"),
+        ({"methods": ()}, "--methods: name at least one of ours, plus, npbg"),
         ({"objects": 0}, "--objects: expected 1 or more, got 0"),
         ({"shown": -1}, "--shown: expected 0 or more, got -1"),
     ],
@@ -293,6 +293,7 @@ def test_the_quick_budget_runs_the_presets_themselves(tmp_path, monkeypatch):
     costs = results_of(tmp_path / "out")["costs"]
     assert {name: cost["preset"] for name, cost in costs.items() if "preset" in cost} == {
         "ours": "tiny",
+        "plus": "plus_tiny",
         "npbg": "npbg_tiny",
         "point_nerf": "point_nerf_tiny",
         "points2nerf": "points2nerf_tiny",

@@ -12,10 +12,11 @@ import pytest
 import tiny_dataset
 import tiny_training
 from tiny_baselines import NETWORKS
+from tiny_baselines import PLUS as PLUS_MODEL
 
 from spnr_jax import data, losses, trainer, training
 from spnr_jax.config import LossConfig, OptimizerConfig, TrainConfig
-from spnr_jax.presets import BASELINES, OURS, tiny
+from spnr_jax.presets import BASELINES, OURS, PLUS, tiny
 from spnr_jax.renderer import Renderer
 
 EVERY_STEP = trainer.Schedule(log_every=1, preview_every=100, checkpoint_every=100)
@@ -221,6 +222,12 @@ class TestNoNaN:
     def test_twenty_steps_of_each_shrunken_preset_make_none(self, preset, precision, tmp_path):
         config = shrunken(preset(), precision, 20)
         assert training.first_adversarial_step(config) in range(1, 20), "both phases are trained"
+        assert train_under_debug_nans(config, images_of(config, tmp_path)).step == 20
+
+    @pytest.mark.slow
+    @pytest.mark.parametrize("preset", PLUS)
+    def test_twenty_steps_of_each_shrunken_network_that_sees_the_surface_make_none(self, preset, tmp_path):
+        config = dataclasses.replace(preset(), model=PLUS_MODEL, num_steps=20, min_points=40, max_points=80)
         assert train_under_debug_nans(config, images_of(config, tmp_path)).step == 20
 
     @pytest.mark.slow

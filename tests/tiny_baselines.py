@@ -3,9 +3,10 @@
 import dataclasses
 
 import tiny_dataset
+import tiny_model
 
 from spnr_jax.config import LossConfig, OptimizerConfig
-from spnr_jax.model_config import NPBGConfig, PointNeRFConfig, Points2NeRFConfig
+from spnr_jax.model_config import NetworkConfig, NPBGConfig, PointNeRFConfig, Points2NeRFConfig
 
 SIZE = tiny_dataset.SIZE
 BASELINE = dataclasses.replace(
@@ -13,7 +14,9 @@ BASELINE = dataclasses.replace(
     loss=LossConfig(l1_weight=1.0, adversarial_weight=0.0, pixel="mse"),
     optimizer=OptimizerConfig(lr_generator=1e-2, warmup_steps=2, ema_decay=0.9),
 )
-NETWORKS = {
+PLUS = dataclasses.replace(tiny_model.PLUS, render_resolution=SIZE, image_resolution=SIZE)
+NETWORKS: dict[str, NetworkConfig] = {
+    "plus_tiny": PLUS,
     "npbg_tiny": NPBGConfig(encoder_widths=(8, 9), decoder_widths=(5,), image_resolution=SIZE),
     "point_nerf_tiny": PointNeRFConfig(
         num_candidates=12,

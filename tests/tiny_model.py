@@ -29,6 +29,14 @@ MODEL = ModelConfig(
     upsampler_width=4,
 )
 WITHOUT_UPSAMPLER = dataclasses.replace(MODEL, image_resolution=8)
+PLUS = dataclasses.replace(
+    WITHOUT_UPSAMPLER,
+    num_features=3,
+    num_neighbors=3,
+    color="lit",
+    point_norm="layer",
+    sampling=SamplingConfig(num_coarse=6, num_fine=0, reach=1),
+)
 NUM_POINTS = 40
 
 

@@ -9,11 +9,15 @@ left out, and so is a .glb without a row; both are reported. glTF is y up, metre
 
 import csv
 import gzip
+import re
+import zlib
 from pathlib import Path
 
 from data_gen.sources.listing import Listed, described
 
 FOLDER = "3dmodels"
+FILE = re.compile(r"([\w-]+/)*[\w-]+(\.[\w-]+)*")  # no way up, and none from the root
+LONGEST_TABLE = 2**28  # bytes, unpacked; ABO's has a million
 TABLES = ("metadata/3dmodels.csv.gz", "metadata/3dmodels.csv")
 
 
@@ -42,9 +46,10 @@ def find_products(root: Path) -> list[Listed]:
 def read_table(table: Path) -> dict[str, str]:
     """The .glb file of each product, relative to 3dmodels/original; ValueError if the table is not ABO's."""
     try:
-        text = gzip.decompress(table.read_bytes()) if table.suffix == ".gz" else table.read_bytes()
+        with gzip.open(table) if table.suffix == ".gz" else table.open("rb") as file:
+            text = file.read(LONGEST_TABLE)
         rows = list(csv.DictReader(text.decode("utf-8").splitlines()))
-    except (OSError, EOFError, UnicodeDecodeError, csv.Error) as error:
+    except (OSError, EOFError, UnicodeDecodeError, zlib.error, csv.Error) as error:
         raise ValueError(f"{table}: cannot be read ({error}); unpack the download again") from None
     names: dict[str, str] = {}
     for number, row in enumerate(rows, start=2):
@@ -53,5 +58,7 @@ def read_table(table: Path) -> dict[str, str]:
             raise ValueError(f"{table}, line {number}: expected columns 3dmodel_id and path; unpack the download again")
         if object_id in names:
             raise ValueError(f"{table}, line {number}: product {object_id} is listed twice; unpack the download again")
+        if not FILE.fullmatch(name):
+            raise ValueError(f"{table}, line {number}: {name!r} is no file below 3dmodels/original; unpack it again")
         names[object_id] = name
     return names

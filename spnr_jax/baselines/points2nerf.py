@@ -28,7 +28,7 @@ from jaxtyping import Array, Bool, Float
 
 from spnr_jax import cameras, compositing, sampling
 from spnr_jax.model_config import Points2NeRFConfig
-from spnr_jax.nn.field import encode_direction
+from spnr_jax.nn.encoding import encode_direction
 from spnr_jax.numerics import per_feature, softplus
 from spnr_jax.types import Camera, Key, PointCloud, Rays, Rendering
 

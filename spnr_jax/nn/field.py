@@ -10,15 +10,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from spnr_jax.compositing import WHITE
+from spnr_jax.nn.encoding import encode_direction
 from spnr_jax.numerics import per_feature, softplus
-
-
-def encode_direction(directions: Float[Array, "*batch 3"], num_frequencies: int) -> Float[Array, "*batch encoding"]:
-    """[d, sin(d), cos(d), sin(2 d), cos(2 d), ...] of unit directions, 3 + 6 num_frequencies numbers."""
-    parts = [directions]
-    for k in range(num_frequencies):
-        parts += [jnp.sin(directions * 2**k), jnp.cos(directions * 2**k)]
-    return jnp.concatenate(parts, axis=-1)
 
 
 class RadianceField(nn.Module):

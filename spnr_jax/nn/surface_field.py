@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from spnr_jax.colors import linear_to_srgb
 from spnr_jax.compositing import WHITE
-from spnr_jax.nn.field import encode_direction
+from spnr_jax.nn.encoding import encode_direction
 from spnr_jax.numerics import clamp, softplus
 from spnr_jax.types import SurfaceSample
 

@@ -13,14 +13,14 @@ from typing import Any, cast
 import numpy as np
 import viser
 
-from spnr_jax.model import SAMPLES, Model, Quality
+from spnr_jax.model import Model, Quality
 from spnr_jax.viewer import levels, scene, session, uploads, views
 from spnr_jax.viewer.loop import Loop
-from spnr_jax.viewer.picture import LAYERS, Layer
+from spnr_jax.viewer.picture import LAYERS
 from spnr_jax.viewer.scene import Material, Scene
 from spnr_jax.viewer.session import State
 
-QUALITIES: tuple[Quality, ...] = (*cast(tuple[Quality, ...], tuple(SAMPLES)), "trained")
+LONGEST_NOTE = 500  # characters
 MOVING_JPEG, RESTING_JPEG = 75, 92  # qualities of the pictures sent
 # A file dropped anywhere on the page goes into the file input of the upload button.
 DROP = """<img alt="" style="display:none" src="data:image/gif;base64,R0lGODlhAQABAAAAACwAAAAAAQABAAAC"
@@ -97,7 +97,7 @@ class Browser:
         try:
             work()
         except (ValueError, OSError) as error:
-            self._note("That did not work", " ".join(str(error).split()), color="red")
+            self._note("That did not work", " ".join(str(error).split())[:LONGEST_NOTE], color="red")
 
     def _note(self, title: str, body: str, **options: Any) -> None:
         self._client.add_notification(title, body, auto_close_seconds=10, **options)
@@ -114,9 +114,7 @@ class Browser:
         self._look(camera)
 
     def _look(self, camera: viser.CameraHandle) -> None:
-        view = views.from_browser(
-            camera.wxyz, camera.position, float(camera.fov), int(camera.image_width), int(camera.image_height)
-        )
+        view = views.from_browser(camera.wxyz, camera.position, camera.fov, camera.image_width, camera.image_height)
         if view is not None:
             self._replace(view=view)
 
@@ -130,14 +128,19 @@ class Browser:
     def _add_view(self, gui: viser.GuiApi, available: tuple[int, ...]) -> None:
         left = gui.add_dropdown("Left", LAYERS, initial_value="points")
         right = gui.add_dropdown("Right", (*LAYERS, "none"), initial_value="picture")
-        quality = gui.add_dropdown("At rest", QUALITIES, initial_value="best", hint="While the camera moves: draft")
+        quality = gui.add_dropdown(
+            "At rest", session.QUALITIES, initial_value="best", hint="While the camera moves: draft"
+        )
         size = gui.add_dropdown("Pixels", [str(n) for n in available], initial_value=str(available[1]))
         self._table = gui.add_markdown(levels.table({}))
         controls = (left, right, quality, size)
 
         async def changed(_: Any) -> None:
-            panes = tuple(cast(Layer, control.value) for control in (left, right) if control.value != "none")
-            self._replace(panes=panes, quality=cast(Quality, quality.value), size=int(size.value))
+            self._slowly(
+                lambda: self._replace(
+                    **session.chosen(self._model, (left.value, right.value), quality.value, size.value)
+                )
+            )
 
         for control in controls:
             control.on_update(changed)
@@ -161,10 +164,13 @@ class Browser:
     def _editor(self, material: Material, value: Callable[[], Any]) -> Callable[[viser.GuiEvent], Any]:
         async def edit(event: viser.GuiEvent) -> None:
             if event.client is not None:  # not when the program itself moves the slider
-                now = value()
-                self._change_scene(lambda old: scene.edited(old, material, now))
+                self._slowly(lambda: self._edit(material, value()))
 
         return edit
+
+    def _edit(self, material: Material, value: Any) -> None:
+        now = scene.material_value(material, value)  # here, where an error has a person to tell it to
+        self._change_scene(lambda old: scene.edited(old, material, now))
 
     def _show_materials(self, state: State) -> State:
         """Has the controls show the materials of the affected points; the state as it is."""
@@ -180,7 +186,7 @@ class Browser:
         count = gui.add_markdown("no keyframes")
         seconds = gui.add_slider("Seconds between", 0.25, 10.0, 0.25, 2.0)
         play, stop = gui.add_button("Play"), gui.add_button("Stop", visible=False)
-        kind = gui.add_dropdown("Film", ("mp4", "gif"), initial_value="mp4")
+        kind = gui.add_dropdown("Film", session.FILMS, initial_value="mp4")
         export = gui.add_button("Export film")
 
         def recorded(state: State) -> State:
@@ -189,7 +195,7 @@ class Browser:
 
         @keyframes.on_click
         async def _(_: Any) -> None:
-            target = np.array(self._client.camera.look_at)
+            target = self._client.camera.look_at
             self.loop.submit(session.record(target) if keyframes.value == "add" else session.without_keyframes)
             self.loop.submit(recorded)
 

@@ -6,7 +6,7 @@ anew, so that a stream of edits, as from a slider, is encoded once for each pict
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import jax.numpy as jnp
 import numpy as np
@@ -68,14 +68,25 @@ def affected(scene: Scene) -> np.ndarray:
     return scene.selected if scene.selected.any() else np.ones_like(scene.selected)
 
 
-def edited(scene: Scene, material: Material, value: float | tuple[float, float, float]) -> Scene:
+def edited(scene: Scene, material: Material, value: Any) -> Scene:
     """The scene with a material of the affected points set; base colour is sRGB in [0, 1], the rest in [0, 1]."""
-    new = np.clip(np.asarray(value, np.float32), 0, 1)
+    new = material_value(material, value)
     if material == "base_color":
         new = np.asarray(srgb_to_linear(jnp.asarray(new)))
     values = np.array(getattr(scene.cloud, material))
     values[affected(scene)] = new
     return _with_cloud(scene, dataclasses.replace(scene.cloud, **{material: values}))
+
+
+def material_value(material: Material, value: Any) -> np.ndarray:
+    """A control's value, () or of a colour (3,), in [0, 1]; ValueError for one that is no finite number."""
+    try:
+        new = np.asarray(value, np.float32)
+    except (TypeError, ValueError, OverflowError):
+        new = np.zeros(0, np.float32)
+    if new.shape != ((3,) if material == "base_color" else ()) or not np.isfinite(new).all():
+        raise ValueError(f"{material} has to be {'3 numbers' if material == 'base_color' else 'a number'} from 0 to 1")
+    return np.asarray(np.clip(new, 0, 1))
 
 
 def restored(scene: Scene) -> Scene:

@@ -6,26 +6,29 @@ network.
 
 import dataclasses
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, cast
 
 import numpy as np
 
 from spnr_jax import images
-from spnr_jax.model import Model, Quality
+from spnr_jax.model import SAMPLES, Model, Quality
 from spnr_jax.viewer import path as camera_path
 from spnr_jax.viewer import picture
 from spnr_jax.viewer.path import Keyframe
-from spnr_jax.viewer.picture import Drawn, Layer
+from spnr_jax.viewer.picture import LAYERS, Drawn, Layer
 from spnr_jax.viewer.scene import Scene, encoded, select_rectangle
-from spnr_jax.viewer.views import View, in_pane, pane_camera, pane_size
+from spnr_jax.viewer.views import FARTHEST, View, in_pane, pane_camera, pane_size
 
 MOVING: Quality = "draft"
 MOVING_LONGEST, LONGEST = 960, 1600  # pixels of the canvas's longer side, while it moves and at rest
 FRAMES_PER_SECOND = 16
 MOST_FRAMES = 960
+LONGEST_PAUSE = 10.0  # seconds between keyframes
+FILMS = ("mp4", "gif")
+QUALITIES: tuple[Quality, ...] = (*cast(tuple[Quality, ...], tuple(SAMPLES)), "trained")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -44,6 +47,16 @@ class State:
 def sizes(model: Model) -> tuple[int, ...]:
     """Sizes that can be chosen: what the network was trained for, twice and four times that."""
     return tuple(factor * model.config.image_resolution for factor in (1, 2, 4))
+
+
+def chosen(model: Model, layers: Sequence[Any], quality: Any, size: Any) -> dict[str, Any]:
+    """Fields of the state for what the controls say, "none" being no pane; ValueError for what they do not offer."""
+    panes, sides = tuple(layer for layer in layers if layer != "none"), {str(n): n for n in sizes(model)}
+    if not panes or any(pane not in LAYERS for pane in panes):
+        raise ValueError(f"a pane shows one of {', '.join(LAYERS)}")
+    if quality not in QUALITIES or str(size) not in sides:
+        raise ValueError(f"a picture at rest has one of {', '.join(QUALITIES)}, and {', '.join(sides)} pixels")
+    return {"panes": panes, "quality": quality, "size": sides[str(size)]}
 
 
 def draw(model: Model, state: State, moving: bool) -> tuple[State, Drawn | None]:
@@ -82,6 +95,8 @@ def keyframe(view: View, target: np.ndarray) -> Keyframe:
 
 def path_poses(state: State, seconds: float) -> list[tuple[np.ndarray, np.ndarray]]:
     """Poses of the recorded path, `seconds` between keyframes; ValueError for a path too short or too long."""
+    if not 0 < seconds <= LONGEST_PAUSE:
+        raise ValueError(f"between keyframes are 0 to {LONGEST_PAUSE:g} seconds, got {seconds:g}")
     frames = round(seconds * FRAMES_PER_SECOND * max(len(state.keyframes) - 1, 1)) + 1
     if frames > MOST_FRAMES:
         raise ValueError(f"the path has {frames} frames; at most {MOST_FRAMES}: use fewer keyframes or less time")
@@ -92,13 +107,18 @@ def film(
     model: Model,
     state: State,
     seconds: float,
-    kind: Literal["mp4", "gif"],
+    kind: Any,
     layer: Layer,
     progress: Callable[[float], None] = lambda share: None,
 ) -> tuple[str, bytes, str]:
-    """(file name, content, reason) of the recorded path, one square pane; the reason says why not as `kind`, or ''."""
+    """(file name, content, reason) of the recorded path, one square pane; the reason says why not as `kind`, or ''.
+
+    `kind` is one of FILMS, ValueError else.
+    """
     if state.view is None:
         raise ValueError("nothing was drawn yet")
+    if kind not in FILMS or layer not in LAYERS:  # the kind becomes part of a file's name
+        raise ValueError(f"a film is one of {', '.join(FILMS)}, of one of {', '.join(LAYERS)}")
     scene, route = encoded(model, state.scene), path_poses(state, seconds)
     frames = []
     for i, (position, rotation) in enumerate(route):
@@ -112,13 +132,19 @@ def film(
         return path.name, path.read_bytes(), reason
 
 
-def record(target: np.ndarray) -> Callable[[State], State]:
-    """The change that adds the view as a keyframe; `target` (3,) is the point of the box that it turns around."""
+def record(target: Any) -> Callable[[State], State]:
+    """The change that adds the view as a keyframe; `target` (3,) is the point of the box that it turns around.
+
+    A target that is no point near the box, and keyframes beyond MOST_FRAMES, change nothing.
+    """
+    point = numbers(target, 3)
 
     def change(state: State) -> State:
-        if state.view is None:
+        if state.view is None or point is None or not (np.abs(point) < FARTHEST).all():
             return state
-        return dataclasses.replace(state, keyframes=(*state.keyframes, keyframe(state.view, target)))
+        if len(state.keyframes) >= MOST_FRAMES:
+            return state
+        return dataclasses.replace(state, keyframes=(*state.keyframes, keyframe(state.view, point)))
 
     return change
 
@@ -128,10 +154,24 @@ def without_keyframes(state: State) -> State:
     return dataclasses.replace(state, keyframes=())
 
 
-def select(state: State, low: tuple[float, float], high: tuple[float, float], add: bool) -> State:
-    """The state with the points selected that lie between two corners of the canvas, (x, y) in shares of its size."""
-    if state.view is None:
+def numbers(values: Any, count: int) -> np.ndarray | None:
+    """What a browser sent as so many finite numbers, None if it is something else."""
+    try:
+        array = np.asarray(values, np.float64)
+    except (TypeError, ValueError, OverflowError):
+        return None
+    return array if array.shape == (count,) and np.isfinite(array).all() else None
+
+
+def select(state: State, low: Any, high: Any, add: bool) -> State:
+    """The state with the points selected that lie between two corners of the canvas, (x, y) in shares of its size.
+
+    Corners that are not two finite numbers select nothing.
+    """
+    low, high = numbers(low, 2), numbers(high, 2)
+    if state.view is None or low is None or high is None:
         return state
+    low, high = np.clip(low, -1, 2), np.clip(high, -1, 2)  # a little outside is as good as far outside
     count = len(state.panes)
     width, height = pane_size(state.view, count, LONGEST)
     camera = pane_camera(state.view, state.scene.volume, width, height)

@@ -8,6 +8,7 @@ draws squares, one program for each size: the square that covers a pane is rende
 
 import dataclasses
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -17,6 +18,8 @@ from spnr_jax.model import Volume
 from spnr_jax.types import Camera
 
 FARTHEST = 1e3  # boxes; beyond, float32 rays miss (README, "Numerical domain")
+MOST_PIXELS = 2**16  # along a side of a browser's canvas
+NARROWEST = 1e-3  # radians
 WIDEST = np.deg2rad(150)
 OPENCV = np.diag([1.0, -1.0, -1.0])  # the browser's cameras look along +z with y down, ours along -z with y up
 
@@ -32,18 +35,22 @@ class View:
     height: int
 
 
-def from_browser(wxyz: np.ndarray, position: np.ndarray, field_of_view: float, width: int, height: int) -> View | None:
-    """The view of a browser's message; None for one from which nothing can be drawn (NaN, no pixels, too far)."""
-    wxyz, position = np.asarray(wxyz, np.float64), np.asarray(position, np.float64)
+def from_browser(wxyz: Any, position: Any, field_of_view: Any, width: Any, height: Any) -> View | None:
+    """The view of a browser's message of any values; None if nothing can be drawn from it (NaN, no pixels, far)."""
+    try:
+        wxyz, position = np.asarray(wxyz, np.float64), np.asarray(position, np.float64)
+        field_of_view, width, height = float(field_of_view), int(width), int(height)
+    except (TypeError, ValueError, OverflowError):
+        return None
     if wxyz.shape != (4,) or position.shape != (3,):
         return None
     drawable = (
         np.isfinite(wxyz).all()
         and np.linalg.norm(wxyz) > 1e-6
         and bool((np.abs(position) < FARTHEST).all())
-        and 0 < field_of_view <= WIDEST
-        and width > 1
-        and height > 1
+        and NARROWEST <= field_of_view <= WIDEST
+        and 1 < width <= MOST_PIXELS
+        and 1 < height <= MOST_PIXELS
     )
     if not drawable:
         return None

@@ -1,0 +1,124 @@
+"""What the documents show runs, every page has its place in the site, and the functions they name exist."""
+
+import importlib
+import re
+import shutil
+import tomllib
+from pathlib import Path
+
+import pytest
+import tiny_dataset
+import tiny_untrained
+import yaml
+
+import spnr_jax
+from spnr_jax import export
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+CODE = re.compile(r"^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+IDENTIFIER = re.compile(r"^::: ([\w.]+)$", re.MULTILINE)
+PAGES = sorted(DOCS.glob("*.md"))
+
+
+@pytest.fixture
+def workplace(tmp_path, monkeypatch):
+    """A folder with what the examples use: what `make demo` leaves, a cloud, an exported network."""
+    (tmp_path / "runs" / "demo").mkdir(parents=True)
+    (tmp_path / "runs" / "demo" / "data").symlink_to(tiny_dataset.dataset().folder)
+    (tmp_path / "runs" / "demo" / "run").symlink_to(tiny_untrained.run())
+    shutil.copy(tiny_dataset.dataset().folder / "objects" / "chair" / "points.ply", tmp_path / "chair.ply")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def execute(path):
+    """The names that the python blocks of a page leave, run one after the other; errors name the page's lines."""
+    text, names = path.read_text(), {"__name__": "__main__"}
+    blocks = list(CODE.finditer(text))
+    assert blocks, f"{path.name} has no example"
+    for block in blocks:
+        lines_before = text.count("\n", 0, block.start(1))
+        exec(compile("\n" * lines_before + block.group(1), str(path), "exec"), names)
+    return names
+
+
+def test_the_readmes_example_draws_a_picture(workplace):
+    names = execute(ROOT / "README.md")
+    assert names["rendering"].image.shape[-1] == 3
+    assert (workplace / "ball.png").stat().st_size > 100
+
+
+def test_the_examples_of_the_twelve_functions_run_in_their_order(workplace):
+    names = execute(DOCS / "api.md")
+    assert int(names["state"].step) == 1
+    assert "ours" in names["outcome"].summary["methods"]
+    assert names["volume_of_means"][2, 2, :, 0].tolist() == [2, 0, 0, 7], "as its comment says"
+    assert names["seen"][1] == pytest.approx(0.63, abs=0.005), "as its comment says"
+    assert names["by_pose"].shape == (3, 4)
+
+
+def test_the_example_without_this_package_runs_on_what_the_command_writes(workplace):
+    model = spnr_jax.load("runs/demo/run")
+    (workplace / "exported").mkdir()
+    (workplace / "exported" / "encode.jax").write_bytes(export.export_encode(model, num_points=1024))
+    (workplace / "exported" / "render.jax").write_bytes(export.export_render(model, resolution=128))
+    names = execute(DOCS / "exporting.md")
+    assert "spnr_jax" not in names
+
+
+def test_there_are_twelve_functions_each_with_an_example_below_it():
+    parts = IDENTIFIER.split((DOCS / "api.md").read_text())
+    assert len(parts[1::2]) == 12
+    for name, text in zip(parts[1::2], parts[2::2], strict=True):
+        assert any(name.rpartition(".")[2] in block for block in CODE.findall(text)), f"no example of {name}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_what_a_page_takes_from_docstrings_exists_and_says_what_it_returns(page):
+    for name in IDENTIFIER.findall(page.read_text()):
+        found = resolve(name)
+        assert (found.__doc__ or "").strip(), f"{name} has no docstring"
+
+
+def resolve(name):
+    """The module, class or function of a dotted name."""
+    parts = name.split(".")
+    for length in range(len(parts), 0, -1):
+        try:
+            found = importlib.import_module(".".join(parts[:length]))
+        except ModuleNotFoundError:
+            continue
+        for part in parts[length:]:
+            found = getattr(found, part)
+        return found
+    raise AssertionError(f"there is no {name}")
+
+
+def test_every_page_is_in_the_sites_navigation_once():
+    navigation = yaml.safe_load((ROOT / "mkdocs.yml").read_text())["nav"]
+    assert sorted(leaves(navigation)) == [page.name for page in PAGES]
+
+
+def leaves(node):
+    if isinstance(node, str):
+        return [node]
+    return [leaf for child in (node.values() if isinstance(node, dict) else node) for leaf in leaves(child)]
+
+
+def test_every_passage_that_a_page_takes_from_the_readme_is_marked_there():
+    readme = (ROOT / "README.md").read_text()
+    wanted = {name for page in PAGES for name in re.findall(r'--8<-- "README.md:(\w+)"', page.read_text())}
+    assert wanted
+    for name in wanted:
+        start, end = (f"<!-- --8<-- [{which}:{name}] -->" for which in ("start", "end"))
+        assert readme.count(start) == readme.count(end) == 1
+        assert readme[readme.index(start) + len(start) : readme.index(end)].strip()
+
+
+def test_the_extras_that_the_documents_name_exist():
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    assert {"data", "viewer", "baselines", "cluster", "bench", "cuda"} <= extras.keys()
+    for page in (*PAGES, ROOT / "README.md", *(ROOT / "spnr_jax").rglob("*.py"), *(ROOT / "data_gen").rglob("*.py")):
+        for names in re.findall(r"spnr-jax\[([\w,]+)\]", page.read_text()):
+            assert set(names.split(",")) <= extras.keys(), page
