@@ -8,6 +8,7 @@
 #   make check               format, lint, types, tests
 #   make docs                the documents as a site: site/index.html
 #   make wheel               the package: dist/*.whl     make test-wheel   it alone in an empty environment
+#   make fuzz                10,000 damaged files for every reader: runs/fuzz/fuzz.md (FUZZ="--reader glb")
 #   make chaos               kill a training 100 times, fill its disk, ...: runs/chaos/chaos.md (CHAOS="--kills 10")
 #   make mutants             break the kernels on purpose; every fault has to be caught by the tests
 
@@ -22,8 +23,9 @@ DATA ?=
 BUDGET ?= tiny
 TABLE1 ?=
 CHAOS ?=
+FUZZ ?=
 
-.PHONY: setup demo table1 bench test test-all test-wheel lint format types check docs wheel chaos mutants clean
+.PHONY: setup demo table1 bench test test-all test-wheel lint format types check docs wheel chaos fuzz mutants clean
 
 setup: .venv/complete
 
@@ -78,6 +80,9 @@ wheel: setup
 	rm -rf build
 	$(PY) -m pip wheel --quiet --disable-pip-version-check --no-deps -w dist .
 	rm -rf build
+
+fuzz: setup
+	$(PY) -m experiments.fuzz --out runs/fuzz $(FUZZ)
 
 chaos: setup
 	$(PY) -m experiments.chaos --out runs/chaos $(CHAOS)

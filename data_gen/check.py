@@ -13,7 +13,9 @@ LEAST_AGREEMENT = 0.9  # of the visible points, on opaque pixels; the rest sit o
 
 def check(dataset: Path) -> bool:
     """Print a table of what was found and each fault on a line of its own; return whether the data set is sound."""
-    description = read_description(dataset)
+    settings = read_description(dataset).get("settings")
+    if not isinstance(settings, dict) or not all(isinstance(settings.get(name), int) for name in COUNTS):
+        raise ValueError(f"{dataset / 'dataset.json'}: expected settings {', '.join(COUNTS)}; generate it again")
     object_ids = sorted(records.completed_objects(dataset))
     faults = split_faults(dataset, set(object_ids))
     agreements, covered, num_views = [], [], 0
@@ -22,7 +24,7 @@ def check(dataset: Path) -> bool:
         folder = dataset / "objects" / object_id
         try:
             record = records.read_object(folder)
-            found = object_faults(folder, record, description["settings"])
+            found = object_faults(folder, record, settings)
         except (ValueError, OSError) as error:
             faults.append(f"{object_id}: {type(error).__name__}: {error}")
             continue
@@ -50,9 +52,6 @@ def read_description(dataset: Path) -> dict:
     if description.get("schema_version") != records.SCHEMA_VERSION:
         found = description.get("schema_version")
         raise ValueError(f"{path}: expected schema version {records.SCHEMA_VERSION}, got {found}; generate it again")
-    settings = description.get("settings")
-    if not isinstance(settings, dict) or not all(isinstance(settings.get(name), int) for name in COUNTS):
-        raise ValueError(f"{path}: expected settings with the numbers {', '.join(COUNTS)}; generate it again")
     return description
 
 

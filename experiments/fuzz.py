@@ -118,9 +118,8 @@ def finish(options: Fuzz, name: str, result: Result) -> None:
                 shown = time.monotonic()
                 rate = (result.done - first) / (shown - begin)
                 left = (options.inputs - result.done) / rate
-                print(
-                    f"{name}: {result.done} of {options.inputs}, {result.failed} failed, {rate:.0f}/s, {left:.0f} s left"
-                )
+                counts = f"{result.done} of {options.inputs}, {result.failed} failed"
+                print(f"{name}: {counts}, {rate:.0f}/s, {left:.0f} s left", flush=True)
                 save(options, result)
         save(options, result)
 

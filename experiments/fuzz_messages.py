@@ -97,7 +97,7 @@ def read_message(folder: Path, main: str) -> None:
         assert np.isfinite(values).all(), f"{name} not finite"
         assert 0 <= values.min() <= values.max() <= 1, f"{name} outside [0, 1]"
     try:
-        seconds = float(sent.get("seconds"))  # as viser does with what moves a slider
+        seconds = float(sent.get("seconds", ""))  # as viser does with what moves a slider
     except (TypeError, OverflowError):
         raise ValueError("viser passes on a number of seconds alone") from None
     for position, rotation in session.path_poses(state, seconds):

@@ -24,6 +24,7 @@ Parts = dict[str, bytes]
 Random = np.random.Generator
 
 DECOY = "secret.bin"  # lies beside the folder of an input; no reader may open it
+PATHS: tuple[str, ...]
 PATHS = (f"../{DECOY}", f"..\\{DECOY}", f"a/../../{DECOY}", f"%2e%2e/{DECOY}", "/etc/passwd", "file:///etc/passwd")
 PATHS += (
     "http://localhost/a.png",
@@ -37,6 +38,7 @@ PATHS += (
     "ü\ud7ff\U0001f600",
     "data:;base64,%%",
 )
+NUMBERS: tuple[str, ...]
 NUMBERS = ("0", "-1", "1", "255", "256", "65536", "2147483647", "-2147483648", "4294967295", "9223372036854775807")
 NUMBERS += (
     "1e308",
@@ -256,7 +258,8 @@ def open_glb(data: bytes) -> tuple[Parts, Callable[[Parts], bytes]] | None:
     """The chunks of a GLB file."""
     if data[:4] != b"glTF":
         return None
-    parts, place = {}, 12
+    parts: Parts = {}
+    place = 12
     while place + 8 <= len(data):
         size, kind = struct.unpack_from("<I4s", data, place)
         parts[f"{len(parts)} {kind.hex()}"] = data[place + 8 : place + 8 + size]
@@ -292,7 +295,8 @@ def open_png(data: bytes) -> tuple[Parts, Callable[[Parts], bytes]] | None:
     """The chunks of a PNG image."""
     if not data.startswith(b"\x89PNG\r\n\x1a\n"):
         return None
-    parts, place = {}, 8
+    parts: Parts = {}
+    place = 8
     while place + 12 <= len(data):
         size, kind = struct.unpack_from(">I4s", data, place)
         parts[f"{len(parts)} {kind.hex()}"] = data[place + 8 : place + 8 + size]

@@ -166,7 +166,7 @@ def read_lpips(folder: Path, main: str) -> None:
     read_weights(folder / main)
 
 
-CLOUDS = {
+CLOUDS: dict[str, Callable[[], list[Files]]] = {
     "ply": fuzz_seeds.plys, "ply-mesh": fuzz_seeds.ply_meshes, "pcd": fuzz_seeds.pcds, "text": fuzz_seeds.texts,
     "npz": fuzz_seeds.npzs, "npy": fuzz_seeds.npys, "las": functools.partial(fuzz_seeds.scans, "las"),
     "laz": functools.partial(fuzz_seeds.scans, "laz"), "stl": fuzz_seeds.stls, "off": fuzz_seeds.offs,

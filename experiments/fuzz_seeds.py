@@ -261,6 +261,7 @@ def datasets() -> list[Files]:
     files = {f"objects/a/{name}": content for name, content in object_files().items()}
     files |= {"dataset.json": records.json_text(described).encode()}
     files |= {"splits/train.txt": b"a\n", "splits/val.txt": b"", "splits/test.txt": b""}
+    first: tuple[str, ...]
     first = ("objects/a/transforms.json", "objects/a/points.ply", "objects/a/images/000.png", "objects/a/object.json")
     first += ("dataset.json", "splits/train.txt")
     return [{name: files[name]} | files for name in first]

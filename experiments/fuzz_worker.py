@@ -34,6 +34,7 @@ Outcome = Literal["read", "refused", "failed"]
 SECONDS = 10.0  # that an input may take
 MEMORY = 2**30  # bytes of address space beyond what the process has after reading all seeds
 LONGEST_REASON = 1000  # characters of a line that a person should read
+FORBIDDEN: tuple[str, ...]
 FORBIDDEN = ("os.system", "subprocess.Popen", "os.exec", "os.posix_spawn", "socket.connect", "pickle.find_class")
 FORBIDDEN += ("os.fork", "os.forkpty", "ctypes.dlopen", "urllib.Request", "webbrowser.open", "exec")
 CHANGES = {
@@ -183,7 +184,8 @@ def main(arguments: list[str]) -> None:
     (folder.parent / DECOY).write_bytes(b"nobody reads this")
     os.chdir(folder.parent)
     tempfile.tempdir = str(folder)
-    seeds, there = reader.seeds(), {}
+    there: Files = {}
+    seeds = reader.seeds()
     for files in seeds:  # loads what is loaded on demand, before memory and files are watched
         write_input(folder, files, there)
         there = files

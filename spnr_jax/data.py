@@ -94,7 +94,7 @@ def read_object(dataset: Dataset, name: str) -> ObjectData:
         names = [Path(frame["file_path"]).name for frame in meta["frames"]]
         height, width = int(meta["h"]), int(meta["w"])
         if poses.shape[1:] != (3, 4) or not (np.isfinite(poses).all() and np.isfinite(intrinsics).all()):
-            raise ValueError("a camera is no 4 x 4 matrix of finite numbers")
+            raise ValueError("a camera holds NaN or infinity, or is no 4 x 4 matrix")
         if not min(intrinsics[0, 0], intrinsics[1, 1]) > 0:
             raise ValueError(f"focal lengths {meta['fl_x']} and {meta['fl_y']}, expected positive ones")
         images = np.stack([_rgba(read(file := f"images/{name}"), height, width) for name in names])

@@ -29,7 +29,7 @@ def las_pieces(path: Path) -> Iterator[dict[str, np.ndarray]]:
         import laspy  # an extra: only here
     except ImportError:
         raise ValueError(MISSING.format(package="laspy")) from None
-    if path.suffix.lower() == ".laz" and not laspy.LazBackend.Lazrs.is_available():
+    if path.suffix.lower() == ".laz" and laspy.LazBackend.Lazrs not in laspy.LazBackend.detect_available():
         raise ValueError(MISSING.format(package="lazrs"))
     # the parallel reader of lazrs ends the whole process on a damaged file
     backends = (laspy.LazBackend.Lazrs,)

@@ -119,7 +119,7 @@ class ModelConfig:
             f"base_width {self.base_width} must be a positive multiple of num_groups {self.num_groups}",
         )
         least = 3 if self.num_neighbors else 4
-        require(self.num_features >= least, f"num_features must be at least {least} (RGB first), got {self.num_features}")
+        require(self.num_features >= least, f"num_features must be {least} or more, RGB first, got {self.num_features}")
         check_materials(self.materials)
         require(
             self.precision in ("float32", "bfloat16"),

@@ -153,3 +153,15 @@ def check_variant(out, details):
     means = [records.point_columns(r.points, *records.POINT_FIELDS[6:9]).mean(axis=0) for r in (original, variant)]
     np.testing.assert_allclose(means[1], matrix @ means[0], atol=0.03)
     assert np.abs(means[1] - means[0]).max() > 0.03
+
+
+@pytest.mark.parametrize("path", ["../../secret.glb", "/etc/a.glb", "A/../../a.glb", "A\\a.glb"])
+def test_a_table_whose_paths_lead_elsewhere_or_that_is_damaged_is_refused(path, tmp_path):
+    (tmp_path / "3dmodels.csv").write_text(f"3dmodel_id,path\na,{path}\n")
+    with pytest.raises(ValueError, match="no file below"):
+        abo.read_table(tmp_path / "3dmodels.csv")
+    damaged = bytearray(gzip.compress(b"3dmodel_id,path\na,A/a.glb\n" * 20, mtime=0))
+    damaged[12:20] = b"\xff" * 8
+    (tmp_path / "3dmodels.csv.gz").write_bytes(damaged)
+    with pytest.raises(ValueError, match="cannot be read"):
+        abo.read_table(tmp_path / "3dmodels.csv.gz")

@@ -7,7 +7,7 @@ import pytest
 
 from spnr_jax.config import LossConfig, OptimizerConfig, TrainConfig, from_dict, to_dict
 from spnr_jax.model_config import METHODS, ModelConfig, NPBGConfig, PointNeRFConfig, SamplingConfig
-from spnr_jax.presets import PRESETS
+from spnr_jax.presets import PRESETS, tiny
 
 
 @pytest.mark.parametrize(
@@ -174,3 +174,17 @@ def test_an_image_too_small_for_the_discriminator_is_named():
     with pytest.raises(ValueError, match="image_resolution 16 is too small"):
         TrainConfig(model=small)
     assert TrainConfig(model=small, loss=LossConfig(adversarial_weight=0.0)).model is small
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"num_stages": 2**62}, {"num_stages": 10**400}, {"num_groups": 0}, {"base_width": 16.0}, {"materials": [["a"]]},
+        {"sees_direction": 1}, {"precision": None}, {"point_widths": 8}, {"field_width": True},
+        {"sampling": 3}, {"image_resolution": -64},
+    ],
+)  # fmt: skip
+def test_a_stored_value_of_another_type_or_size_is_refused(change):
+    values = json.loads(json.dumps(to_dict(tiny())))
+    with pytest.raises(ValueError, match=next(iter(change))):
+        from_dict(values | {"model": values["model"] | change})

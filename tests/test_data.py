@@ -5,6 +5,7 @@ import json
 import shutil
 import threading
 import time
+import zlib
 from itertools import islice
 
 import numpy as np
@@ -240,3 +241,40 @@ def test_objects_beyond_the_memory_of_the_cache_are_read_again_to_the_same_batch
     expected = list(data.batches(tiny_dataset.dataset(), CONFIG, 0))
     for a, b in zip(data.batches(tiny_dataset.dataset(), CONFIG, 0, cache_bytes=0), expected, strict=True):
         same_bits(a, b)
+
+
+def deep() -> str:
+    return "[" * 100_000 + "]" * 100_000
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "reason"),
+    [
+        ("dataset.json", deep(), "not valid JSON"), ("dataset.json", "3", "no settings"),
+        ("splits/train.txt", "../../secret", "no name of an object"), ("splits/train.txt", ".", "no name of an object"),
+    ],
+)  # fmt: skip
+def test_a_data_set_whose_lists_lead_elsewhere_or_too_deep_is_refused(file, content, reason, copy):
+    (copy / file).write_text(content)
+    with pytest.raises(ValueError, match=reason):
+        data.open_dataset(copy)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [deep(), "3", '{"frames": []}', '{"fl_x": -1, "fl_y": 1, "cx": 1, "cy": 1, "w": 24, "h": 24, "frames": []}'],
+)
+def test_transforms_of_another_form_are_named(content, copy):
+    (copy / "objects" / NAMES[0] / "transforms.json").write_text(content)
+    with pytest.raises(ValueError, match=r"transforms\.json: cannot be read"):
+        data.read_object(data.open_dataset(copy), NAMES[0])
+
+
+def test_a_picture_that_announces_billions_of_pixels_is_refused_before_memory_is_taken(copy):
+    path = copy / "objects" / NAMES[0] / "images" / "000.png"
+    content = bytearray(path.read_bytes())
+    content[16:24] = (70_000).to_bytes(4, "big") * 2
+    content[29:33] = zlib.crc32(content[12:29]).to_bytes(4, "big")
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match="pixels"):
+        data.read_object(data.open_dataset(copy), NAMES[0])

@@ -1,6 +1,7 @@
 """Laser scans keep their coordinates and colours; without laspy one line says what to install."""
 
 import builtins
+import struct
 
 import numpy as np
 import pytest
@@ -72,3 +73,29 @@ def test_a_compressed_scan_without_its_codec_names_the_extra(tmp_path, monkeypat
     monkeypatch.setattr(laspy.LazBackend, "detect_available", classmethod(lambda cls: ()))
     with pytest.raises(ValueError, match=r"needs the package lazrs .*\[formats\]"):
         read_cloud(tmp_path / "a.laz")
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "reason"),
+    [(100, 2**32 - 1, "records in its header"), (96, 2**32 - 1, "points from byte"), (0, 0, "not a LAS file")],
+)
+def test_a_header_that_announces_more_than_the_file_holds_is_refused_at_once(place, value, reason, tmp_path):
+    scan(tmp_path / "a.las", 7)
+    content = bytearray((tmp_path / "a.las").read_bytes())
+    content[place : place + 4] = value.to_bytes(4, "little")
+    (tmp_path / "a.las").write_bytes(content)
+    with pytest.raises(ValueError, match=reason):
+        read_cloud(tmp_path / "a.las")
+
+
+def test_a_chunk_table_that_is_too_long_or_too_short_never_reaches_the_library_that_trusts_it(tmp_path):
+    scan(tmp_path / "a.laz", 7)
+    whole = (tmp_path / "a.laz").read_bytes()
+    (data,) = struct.unpack_from("<I", whole, 96)
+    (table,) = struct.unpack_from("<q", whole, data)
+    for chunks, reason in ((2**31, "chunks in"), (0, "points in 0 chunks")):
+        content = bytearray(whole)
+        content[table + 4 : table + 8] = chunks.to_bytes(4, "little")
+        (tmp_path / "a.laz").write_bytes(content)
+        with pytest.raises(ValueError, match=reason):
+            read_cloud(tmp_path / "a.laz")

@@ -166,3 +166,11 @@ def test_of_faces_on_the_same_corners_that_of_the_first_material_is_kept_whateve
     faces = {tuple(part.material.base_color): len(part.faces) for part in asset.parts}
     assert faces == {(1, 0, 0): 1, (0, 0, 1): 1}
     assert asset.ignored == ("1 doubled faces (one of each is kept)",)
+
+
+@pytest.mark.parametrize("line", ["Kd nan 0 0", "Pm nan", "Pr inf\nKd 1 nan 1"])
+def test_a_material_that_is_not_finite_is_refused(line, tmp_path):
+    (tmp_path / "a.mtl").write_text(f"newmtl a\n{line}\n")
+    (tmp_path / "a.obj").write_text("mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl a\nf 1 2 3\n")
+    with pytest.raises(RejectedAsset, match="not finite"):
+        load_mesh(tmp_path / "a.obj")

@@ -166,3 +166,12 @@ def test_commands_that_look_at_folders_of_objects_say_so_of_a_packed_one(command
         main([command, str(packed), *out])
     assert stopped.value.code == 2
     assert "is packed; look at the folder of objects" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("files", ['{"files": {"../../../secret": "a"}}', '{"files": 3}', "[]", "[" * 10**5])
+def test_an_object_that_names_files_of_others_is_not_packed(files, tmp_path):
+    (tmp_path / "objects" / "a").mkdir(parents=True)
+    (tmp_path / "objects" / "a" / "object.json").write_text(files)
+    (tmp_path / "secret").write_text("a")
+    with pytest.raises(ValueError, match=r"object\.json: "):
+        pack.object_files(tmp_path, "a")

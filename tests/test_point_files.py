@@ -1,5 +1,6 @@
 import itertools
 import pickle
+import zipfile
 
 import numpy as np
 import pytest
@@ -197,13 +198,32 @@ def test_numpy_files_that_are_broken_pickled_or_of_another_layout_are_refused(tm
         with pytest.raises(ValueError, match=reason):
             read_columns(write(tmp_path, name, content))
     arrays = {
-        "object": ({"points": np.array([{}, None], object)}, "allow_pickle"),
+        "object": ({"points": np.array([{}, None], object)}, "holds objects"),
         "wide": ({"points": np.zeros((5, 4))}, r"'points' of shape \(5, 4\)"),
         "text": ({"points": np.array([["1", "2", "3"]])}, "type <U1"),
         "ragged": ({"points": np.zeros((5, 3)), "rgb": np.zeros((4, 3))}, "different lengths.*'x': 5.*'r': 4"),
-        "nameless": ({"corners": np.zeros((5, 3))}, "named positions, points or xyz; found corners"),
+        "nameless": ({"corners": np.zeros((5, 3))}, "none of the arrays positions, points, xyz.*; found corners"),
     }
     for name, (content, reason) in arrays.items():
         np.savez(tmp_path / f"{name}.npz", **content)
         with pytest.raises(ValueError, match=reason):
             read_columns(tmp_path / f"{name}.npz")
+
+
+def test_an_array_that_announces_more_than_its_file_holds_is_refused_before_memory_is_taken(tmp_path):
+    np.savez(tmp_path / "a.npz", points=np.zeros((5, 3)))
+    with zipfile.ZipFile(tmp_path / "a.npz") as archive:
+        content = archive.read("points.npy")
+    cases = {
+        "huge": (content.replace(b"(5, 3), }" + b" " * 6, b"(5000000, 3), }"), "cut off"),
+        "header": (content.replace(b"'shape'", b"'shape("), "broken"),
+        "text": (b"no array at all", "broken"),
+    }
+    for name, (changed, reason) in cases.items():
+        with zipfile.ZipFile(tmp_path / f"{name}.npz", "w") as archive:
+            archive.writestr("points.npy", changed)
+        with pytest.raises(ValueError, match=reason):
+            read_columns(tmp_path / f"{name}.npz")
+    (tmp_path / "a.npy").write_bytes(content.replace(b"'shape'", b"'shape("))  # numpy's own error here is no ValueError
+    with pytest.raises(ValueError, match="broken"):
+        read_columns(tmp_path / "a.npy")

@@ -82,3 +82,8 @@ def test_candidates_are_enough_and_not_too_many_even_where_points_coincide():
         among = candidates(positions, 100)
         assert 100 <= len(among) <= THINNING * 100
         assert len(np.unique(among)) == len(among)
+
+
+def test_points_whose_squared_distances_leave_float32_are_thinned_as_smaller_ones_are():
+    positions = np.random.default_rng(3).normal(size=(200, 3))
+    np.testing.assert_array_equal(farthest_points(1e30 * positions, 20, 0), farthest_points(positions, 20, 0))

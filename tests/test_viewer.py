@@ -376,3 +376,40 @@ def test_the_expected_losses_are_those_of_the_readmes_table():
 def _readme():
     text = (ROOT / "README.md").read_text()
     return text[text.index("| quality | PSNR") :].partition("\n\n")[0]
+
+
+# what a browser may send
+
+
+@pytest.mark.parametrize("kind", ["x/../../../evil.gif", "exe", None, 3])
+def test_a_film_of_a_kind_that_is_not_offered_writes_nothing(kind, tmp_path, monkeypatch):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    with pytest.raises(ValueError, match="a film is one of mp4, gif"):
+        session.film(model(), state(), 1.0, kind, "points")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("sent", [(("points",), "best", "1000000"), (("secret",), "best", "24"), ((), "x", "a")])
+def test_controls_that_say_what_they_do_not_offer_are_refused(sent):
+    with pytest.raises(ValueError, match="one of"):
+        session.chosen(model(), *sent)
+
+
+@pytest.mark.parametrize("value", [float("nan"), "a", [1, 2], None, 10**400, {}])
+def test_an_edit_with_no_number_is_refused_and_one_outside_is_clipped(value):
+    with pytest.raises(ValueError, match="roughness has to be a number"):
+        scenes.edited(scene(), "roughness", value)
+    assert (scenes.edited(scene(), "roughness", 7).cloud.roughness == 1).all()
+
+
+@pytest.mark.parametrize("corner", [[float("nan"), 0], "ab", None, [0], [[0, 1], 2]])
+def test_a_selection_or_target_that_is_no_point_changes_nothing(corner):
+    before = state()
+    assert session.select(before, corner, [1, 1], add=False) is before
+    assert session.record(corner)(before) is before
+
+
+@pytest.mark.parametrize("seconds", [float("nan"), float("inf"), 0.0, -1.0, 1e9])
+def test_a_path_of_no_or_endless_time_is_refused(seconds):
+    with pytest.raises(ValueError, match="between keyframes"):
+        session.path_poses(state(), seconds)
