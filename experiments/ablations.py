@@ -6,8 +6,9 @@
     OUT/results.json  table.md                    scores, costs, and differences to the reference with intervals
     OUT/differences.png  gallery.png              the differences, and pictures of unseen objects
 
-Rows that are the preset itself (its own depth) are left out, and that without colour variants where the training split
-has none: `spnr-data generate DIR --colour-variants 5` makes them.  More rows and seeds can be asked for later.
+Rows that are the preset itself (its own depth; those of the nearest points for a preset without them) are left out, and
+that without colour variants where the training split has none: `spnr-data generate DIR --colour-variants 5` makes them.
+More rows and seeds can be asked for later.
 Runs of one seed see the same batches and jitter, whatever the row.  The same command gives the same scores on a CPU.
 """
 
@@ -37,6 +38,12 @@ Row = Literal[
     "no_view_direction",
     "scatter_max",
     "scatter_trilinear",
+    "free_colour",
+    "no_neighbours",
+    "three_neighbours",
+    "twelve_neighbours",
+    "batch_norm",
+    "no_opacity_loss",
 ]
 ROWS: tuple[Row, ...] = Row.__args__  # type: ignore[attr-defined]
 REFERENCE = "reference"
@@ -51,6 +58,12 @@ LABELS = {
     "no_view_direction": "No view direction",
     "scatter_max": "Scatter: maximum",
     "scatter_trilinear": "Scatter: trilinear",
+    "free_colour": "Free colours, not light on materials",
+    "no_neighbours": "No nearest points",
+    "three_neighbours": "3 nearest points",
+    "twelve_neighbours": "12 nearest points",
+    "batch_norm": "PointNet: batch normalisation",
+    "no_opacity_loss": "No loss of opacity",
 }
 
 
@@ -106,9 +119,18 @@ def changed(row: Row, config: TrainConfig) -> TrainConfig:
         "no_view_direction": {"sees_direction": False},
         "scatter_max": {"scatter": "max"},
         "scatter_trilinear": {"scatter": "trilinear"},
+        "batch_norm": {"point_norm": "batch"},
     }
-    if row == "no_condition":
-        return dataclasses.replace(config, loss=dataclasses.replace(config.loss, condition=False))
+    if config.model.num_neighbors:
+        model |= {
+            "free_colour": {"color": "free"},
+            "no_neighbours": {"color": "free", "num_neighbors": 0, "num_features": ModelConfig.num_features},
+            "three_neighbours": {"num_neighbors": 3},
+            "twelve_neighbours": {"num_neighbors": 12},
+        }
+    loss = {"no_condition": {"condition": False}, "no_opacity_loss": {"opacity_weight": 0.0}}
+    if row in loss:
+        return dataclasses.replace(config, loss=dataclasses.replace(config.loss, **loss[row]))
     return dataclasses.replace(config, model=dataclasses.replace(config.model, **model.get(row, {})))
 
 

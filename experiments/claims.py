@@ -1,10 +1,8 @@
 """Whose a folder of results is: what is asked for stands in a file there, and another request is refused."""
 
-import hashlib
 import json
 from pathlib import Path
 
-from spnr_jax import data
 from spnr_jax.images import write_whole
 
 
@@ -15,9 +13,3 @@ def claim(path: Path, asked: dict, what: str) -> None:
         if different := [name for name in asked if there.get(name) != asked[name]]:
             raise ValueError(f"{path.parent} holds {what} with another {', '.join(different)}; choose another --out")
     write_whole(path, (json.dumps(asked, indent=1) + "\n").encode())
-
-
-def checksum(dataset: data.Dataset) -> str:
-    """A number that tells data sets apart: of their settings and the names of their objects."""
-    content = json.dumps([dataset.settings, dataset.splits], sort_keys=True)
-    return hashlib.sha256(content.encode()).hexdigest()

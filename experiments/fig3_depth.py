@@ -33,7 +33,7 @@ from experiments.methods import Sources
 from experiments.source_meshes import mesh_of
 from experiments.table1_poisson import SURFACES
 from experiments.table1_report import LABELS
-from spnr_jax import cameras, cli, data, evaluation
+from spnr_jax import cameras, cli, data, evaluation, run_record
 from spnr_jax.images import depth_image, npz, png, write_whole
 from spnr_jax.types import Camera, PointCloud
 
@@ -85,7 +85,7 @@ def main(options: Fig3) -> None:
     cli.enable_compilation_cache()
     dataset = data.open_dataset(options.data)
     names = methods.test_objects(dataset, 2 if options.quick else options.objects)
-    claims.claim(options.out / "fig3.json", {"data": claims.checksum(dataset)}, "depths")
+    claims.claim(options.out / "fig3.json", {"data": run_record.checksum(dataset)}, "depths")
     networks = methods.networks(options.sources, dataset)
     if left_out := [name for name, network in networks.items() if not network.has_depth]:
         print(f"left out, since they predict no depth: {', '.join(left_out)}")

@@ -29,7 +29,7 @@ from experiments.methods import Sources
 from experiments.table1_page import data_address
 from experiments.table1_poisson import SURFACES
 from experiments.table1_report import LABELS
-from spnr_jax import cli, data, evaluation
+from spnr_jax import cli, data, evaluation, run_record
 from spnr_jax.images import png, write_whole
 from spnr_jax.report import psnr
 from spnr_jax.report_style import STYLE
@@ -80,7 +80,7 @@ def main(options: Gallery) -> None:
     names = methods.test_objects(dataset, 3 if options.quick else options.objects)
     if note := shortage(dataset, options):
         print(note)
-    whole = {"data": claims.checksum(dataset), "view": options.view}
+    whole = {"data": run_record.checksum(dataset), "view": options.view}
     claims.claim(options.out / "gallery.json", whole, "a gallery")
     networks = methods.networks(options.sources, dataset)
     points = next(iter(networks.values())).config.test_points

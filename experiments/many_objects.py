@@ -32,7 +32,7 @@ import tyro
 from experiments import claims, many_runs
 from experiments.many_objects_report import LABELS, plot, table
 from experiments.many_runs import FORMS, Form
-from spnr_jax import cli, data, evaluation, training
+from spnr_jax import cli, data, evaluation, run_record, training
 from spnr_jax.config import TrainConfig
 from spnr_jax.images import write_whole
 from spnr_jax.presets import PRESETS
@@ -89,7 +89,7 @@ def main(options: ManyObjects) -> None:
         "objects": options.objects,
         "rounds": options.rounds,
         "seed": options.seed,
-        "data": claims.checksum(dataset),
+        "data": run_record.checksum(dataset),
     }
     claims.claim(options.out / "many_objects.json", asked, "many objects")
     seeds = range(options.seed, options.seed + options.runs)

@@ -31,7 +31,7 @@ from experiments.source_meshes import details, mesh_of
 from experiments.table1_poisson import SURFACES
 from experiments.table1_report import LABELS
 from experiments.table1_scores import ObjectMethod
-from spnr_jax import cli, data, evaluation, statistics
+from spnr_jax import cli, data, evaluation, run_record, statistics
 from spnr_jax.images import png, write_whole
 from spnr_jax.types import PointCloud
 
@@ -85,7 +85,7 @@ def main(options: PointCount) -> None:
     names = methods.test_objects(dataset, 2 if options.quick else options.objects)
     networks = methods.networks(options.sources, dataset)
     counts = available_counts(options, dataset, names[0])
-    whole = {"data": claims.checksum(dataset), "objects": list(names)}
+    whole = {"data": run_record.checksum(dataset), "objects": list(names)}
     claims.claim(options.out / "point_count.json", whole, "point counts")
     found = all_methods(options, dataset, networks)
     scores: dict[str, dict[int, Scores]] = {label: {} for label in found}

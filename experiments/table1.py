@@ -28,7 +28,7 @@ from experiments import claims, poisson, table1_page, table1_poisson, table1_rep
 from experiments.methods import test_objects
 from experiments.table1_scores import ObjectMethod, Scored, Shown, by_category, of_cloud, score_objects
 from experiments.table1_training import NETWORKS, Budget, Trained
-from spnr_jax import cli, data, evaluation
+from spnr_jax import cli, data, evaluation, run_record
 from spnr_jax.config import TrainConfig
 from spnr_jax.images import write_whole
 from spnr_jax.lpips_weights import read_weights
@@ -150,7 +150,7 @@ def claim(options: Table1, dataset: data.Dataset) -> None:
         "budget": options.budget,
         "minutes": options.minutes,
         "seed": options.seed,
-        "data": claims.checksum(dataset),
+        "data": run_record.checksum(dataset),
     }
     claims.claim(options.out / "table1.json", asked, "a table")
 

@@ -112,7 +112,7 @@ def train(config: TrainConfig, dataset: data.Dataset, run: Path) -> Trained:
 
 
 def training_seconds(run: Path) -> float:
-    """Seconds that a run's steps took over all calls, from its log: compilation included, previews and saving not."""
+    """Seconds that a run's steps took over all calls, from its log: not compilation, previews and saving."""
     seconds, before = 0.0, 0
     for row in trainer.read_rows(run):
         if "ms_per_step" in row:

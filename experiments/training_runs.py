@@ -22,12 +22,14 @@ from experiments import claims, table1_training
 from experiments.methods import test_objects
 from experiments.table1_scores import Shown, of_cloud, score_objects
 from experiments.table1_training import Trained
-from spnr_jax import checkpoint, data, evaluation, metrics, trainer, training
+from spnr_jax import checkpoint, data, evaluation, metrics, run_record, trainer, training
 from spnr_jax.config import TrainConfig
 from spnr_jax.presets import PRESETS
 from spnr_jax.summary import Scores
 
-Preset = Literal["abo", "shapenet_car", "shapenet_plane", "shapenet_chair", "small", "tiny"]
+PaperPreset = Literal["abo", "shapenet_car", "shapenet_plane", "shapenet_chair", "small", "tiny"]
+PlusPreset = Literal["plus_abo", "plus_shapenet", "plus_small", "plus_tiny"]
+Preset = PaperPreset | PlusPreset
 QUICK_STEPS, QUICK_OBJECTS = 4, 2
 FEWEST_ROWS = 8  # of a log, two of which may hold a compilation
 OPAQUE = 0.5  # opacity of the reference from which a pixel lies inside the silhouette
@@ -104,7 +106,7 @@ class Compared:
 def claim(out: Path, what: str, budget: Budget, dataset: data.Dataset, **more: object) -> None:
     """Makes the folder that of this experiment; ValueError if it is another's."""
     asked = {"experiment": what, "preset": budget.preset, "steps": budget.config().num_steps, **more}
-    claims.claim(out / "asked.json", asked | {"data": claims.checksum(dataset)}, "results")
+    claims.claim(out / "asked.json", asked | {"data": run_record.checksum(dataset)}, "results")
 
 
 def train(variants: Sequence[Variant], seeds: Sequence[int], out: Path) -> dict[str, list[Run]]:

@@ -113,7 +113,15 @@ class View:
     """The file's upward axis; auto looks for it, and says what it found."""
 
 
-Command = Train | Evaluate | Render | View | Export | ConvertLpips
+@dataclass(frozen=True, kw_only=True)
+class Runs:
+    """List the runs below a folder: best validation PSNR, time, learning curve."""
+
+    folder: tyro.conf.Positional[Path] = Path()
+    """Folder that holds run folders, at any depth."""
+
+
+Command = Train | Evaluate | Render | View | Export | Runs | ConvertLpips
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -142,12 +150,13 @@ def parse(arguments: list[str]) -> Command:
     render = Annotated[Render, tyro.conf.subcommand("render")]
     view = Annotated[View, tyro.conf.subcommand("view")]
     export = Annotated[Export, tyro.conf.subcommand("export")]
+    runs = Annotated[Runs, tyro.conf.subcommand("runs")]
     convert = Annotated[ConvertLpips, tyro.conf.subcommand("convert-lpips")]
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said):
             return tyro.cli(
-                train | evaluate | render | view | export | convert,
+                train | evaluate | render | view | export | runs | convert,
                 prog="spnr",
                 description=DESCRIPTION,
                 args=arguments,
@@ -183,6 +192,8 @@ def run(command: Command) -> None:
             run_view(command)
         case Export():
             run_export(command)
+        case Runs():
+            run_runs(command)
         case ConvertLpips():
             run_convert_lpips(command)
 
@@ -262,6 +273,13 @@ def run_export(command: Export) -> None:
     signatures = {name: export.signature(content) for name, content in functions.items()}
     write_whole(command.out / "export.json", (json.dumps(signatures, indent=1) + "\n").encode())
     print(f"wrote encode and render to {command.out} (export.json says what they take and give)")
+
+
+def run_runs(command: Runs) -> None:
+    """`spnr runs`."""
+    from spnr_jax import runs_command
+
+    print("\n".join(runs_command.table(runs_command.read_runs(command.folder))))
 
 
 def run_convert_lpips(command: ConvertLpips) -> None:

@@ -1,6 +1,6 @@
 """The training loop: batches in, steps, and everything that a person or a later run wants to see of it.
 
-    RUN/config.json  metrics.jsonl  tensorboard/  previews/STEP.png  checkpoints/STEP/
+    RUN/config.json  run.json  metrics.jsonl  tensorboard/  previews/STEP.png  checkpoints/STEP/
 
 A run goes on by itself from its newest readable checkpoint; the rows of metrics.jsonl after it are dropped, because
 they will be written again.  A loss that is not finite stops the run and names the step; the last checkpoint stays.
@@ -10,7 +10,6 @@ import json
 import math
 import os
 import signal
-import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
@@ -24,6 +23,7 @@ from tqdm import tqdm
 from spnr_jax import checkpoint, data, evaluation, training
 from spnr_jax.config import TrainConfig
 from spnr_jax.images import png, write_whole
+from spnr_jax.run_record import Clock, RunRecord
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,6 +58,7 @@ def train(config: TrainConfig, dataset: data.Dataset, run: Path, schedule: Sched
 
 
 def _train(config: TrainConfig, dataset: data.Dataset, run: Path, schedule: Schedule) -> training.TrainState:
+    clock = Clock()
     checkpoint.write_config(run, config)
     state = checkpoint.restore(run, config, say=tqdm.write) or training.jitted_create_state(config)
     first = int(state.step)
@@ -66,7 +67,7 @@ def _train(config: TrainConfig, dataset: data.Dataset, run: Path, schedule: Sche
         return state
     if first:
         tqdm.write(f"resuming {run} at step {first} of {config.num_steps}")
-    adversarial_from = training.first_adversarial_step(config)
+    record, adversarial_from = RunRecord(run, dataset, first), training.first_adversarial_step(config)
     pending: list[tuple[int, dict]] = []
     with (
         stop_requests() as requests,
@@ -74,29 +75,34 @@ def _train(config: TrainConfig, dataset: data.Dataset, run: Path, schedule: Sche
         closing(data.batches(dataset, config, first)) as batches,
         tqdm(total=config.num_steps, initial=first, unit="step", mininterval=1) as bar,
     ):
-        since = time.monotonic()
+        clock.lap("restore")
         for step, batch in enumerate(batches, start=first):
             state, metrics = training.jitted_train_step(
                 state, jax.device_put(batch), config=config, adversarial=step >= adversarial_from
             )
             pending.append((step + 1, metrics))
             bar.update()
+            if step == first:
+                jax.block_until_ready(metrics)
+                clock.lap("compilation")
             last, stopping = step + 1 == config.num_steps, bool(requests)
             save = last or stopping or (step + 1) % schedule.checkpoint_every == 0
             if save or (step + 1) % schedule.log_every == 0:
                 rows = check_finite(jax.device_get(pending))
                 if save:
                     check_state(state)
-                pace = 1000 * (time.monotonic() - since) / len(rows)
+                seconds, timed = clock.lap("steps"), [at for at, _ in rows if at > first + 1]
+                pace = 1000 * (seconds / len(timed) if timed else clock.seconds["compilation"])
                 log.write({"step": step + 1, **mean_row(rows), "ms_per_step": round(pace, 2)})
                 bar.set_postfix(loss=f"{rows[-1][1]['loss']:.2f}", psnr=f"{rows[-1][1]['psnr']:.1f}", refresh=False)
-                pending, since = [], time.monotonic()
+                pending = []
             if last or (step + 1) % schedule.preview_every == 0:
                 log.write({"step": step + 1, **preview(state, config, dataset, run)})
-                since = time.monotonic()
+                clock.lap("previews")
             if save:  # after the rows up to this step, which a run that goes on from here will not write again
                 checkpoint.save(run, state)
-                since = time.monotonic()
+                clock.lap("checkpoints")
+                record.write(step + 1, clock)
             if stopping and not last:
                 raise KeyboardInterrupt(
                     f"stopped at step {step + 1} of {config.num_steps}; the same command goes on from there"

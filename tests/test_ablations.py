@@ -14,6 +14,8 @@ from experiments.training_runs import Budget, Compared
 from spnr_jax import checkpoint, cli, data, evaluation, presets, trainer, training
 from spnr_jax.config import to_dict
 
+PLUS_ROWS = ("free_colour", "no_neighbours", "three_neighbours", "twelve_neighbours", "batch_norm", "no_opacity_loss")
+
 
 @pytest.fixture(scope="module", autouse=True)
 def _shrunken():
@@ -53,18 +55,33 @@ class TestRows:
             "no_view_direction": {"model.sees_direction": False},
             "scatter_max": {"model.scatter": "max"},
             "scatter_trilinear": {"model.scatter": "trilinear"},
-        }
-        before = dict(leaves(to_dict(self.tiny)))
-        found = {
-            row: {name: value for name, value in leaves(to_dict(changed(row, self.tiny))) if before[name] != value}
-            for row in ROWS
-        }
-        assert found == expected
+        } | dict.fromkeys(PLUS_ROWS, {})
+        assert {row: self.changes(row, self.tiny) for row in ROWS} == expected
         assert set(LABELS) == set(ROWS)
+
+    def test_what_makes_a_plus_network_is_taken_away_piece_by_piece(self):
+        expected = {
+            "free_colour": {"model.color": "free"},
+            "no_neighbours": {"model.color": "free", "model.num_neighbors": 0, "model.num_features": 32},
+            "three_neighbours": {"model.num_neighbors": 3},
+            "twelve_neighbours": {"model.num_neighbors": 12},
+            "batch_norm": {"model.point_norm": "batch"},
+            "no_opacity_loss": {"loss.opacity_weight": 0.0},
+        }
+        assert {row: self.changes(row, presets.plus_tiny()) for row in PLUS_ROWS} == expected
+
+    @staticmethod
+    def changes(row, config):
+        before = dict(leaves(to_dict(config)))
+        return {name: value for name, value in leaves(to_dict(changed(row, config))) if before[name] != value}
 
     def test_rows_that_are_the_reference_are_left_out_with_a_line(self, capsys):
         made = rows(ROWS, self.tiny, tiny_dataset.dataset())
-        assert {variant.name for variant in made} == {"reference", *ROWS} - {"depth_3", "no_colour_variants"}
+        assert {variant.name for variant in made} == {"reference", *ROWS} - {
+            "depth_3",
+            "no_colour_variants",
+            *PLUS_ROWS,
+        }
         said = capsys.readouterr().out
         assert "U-Net of 3 stages: left out" in said
         assert "No colour variants: left out" in said
