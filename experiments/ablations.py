@@ -128,7 +128,7 @@ def changed(row: Row, config: TrainConfig) -> TrainConfig:
             "three_neighbours": {"num_neighbors": 3},
             "twelve_neighbours": {"num_neighbors": 12},
         }
-    loss = {"no_condition": {"condition": False}, "no_opacity_loss": {"opacity_weight": 0.0}}
+    loss: dict[Row, dict] = {"no_condition": {"condition": False}, "no_opacity_loss": {"opacity_weight": 0.0}}
     if row in loss:
         return dataclasses.replace(config, loss=dataclasses.replace(config.loss, **loss[row]))
     return dataclasses.replace(config, model=dataclasses.replace(config.model, **model.get(row, {})))

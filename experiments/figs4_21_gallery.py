@@ -6,6 +6,7 @@ One view of each object; the numbers of objects and views are options.  Poisson 
 experiments.table1 has rendered, where --table1 names its folder.
 
     OUT/reference_1.png ours_1.png ...   sheets of so many rows and columns, page by page
+    OUT/side_by_side.png                 a few objects spread over all, a row for each method
     OUT/gallery.html                     every object with all methods side by side, in one file
     OUT/pictures/METHOD/ID.png           each picture; what is there is kept, so a stopped call goes on
     OUT/results.json                     PSNR of every picture, and the conditions
@@ -63,7 +64,7 @@ class Gallery:
     rows: int = 12
     """Rows of a sheet."""
     columns: int = 10
-    """Columns of a sheet."""
+    """Columns of a sheet, and objects in side_by_side.png."""
     quick: bool = False
     """A check that everything works: three objects."""
 
@@ -105,6 +106,7 @@ def main(options: Gallery) -> None:
             print(f"{number} of {len(names)} objects", flush=True)
     scores = {label: [psnr(*pair) for pair in zip(row, shown[REFERENCE], strict=True)] for label, row in shown.items()}
     pages = write_sheets(options, shown)
+    write_whole(options.out / "side_by_side.png", png(side_by_side(shown, options.columns)))
     results = {
         "objects": list(names),
         "view": options.view,
@@ -118,7 +120,8 @@ def main(options: Gallery) -> None:
     }
     write_whole(options.out / "results.json", (json.dumps(results, indent=1, allow_nan=False) + "\n").encode())
     write_whole(options.out / "gallery.html", page(options, names, shown, scores, results).encode())
-    print(f"wrote {pages} sheets for each of {len(shown)} methods, gallery.html and results.json in {options.out}")
+    written = "side_by_side.png, gallery.html and results.json"
+    print(f"wrote {pages} sheets for each of {len(shown)} methods, {written} in {options.out}")
 
 
 def shortage(dataset: data.Dataset, options: Gallery) -> str:
@@ -167,6 +170,14 @@ def write_sheets(options: Gallery, shown: dict[str, list[np.ndarray]]) -> int:
             rows = [row[i : i + options.columns] for i in range(0, len(row), options.columns)]
             write_whole(options.out / f"{file_stem(label)}_{number + 1}.png", png(sheets.grid(rows, size=size)))
     return pages
+
+
+def side_by_side(shown: dict[str, list[np.ndarray]], count: int) -> np.ndarray:
+    """The pictures (h, w, 3) uint8 of `count` objects, from the first to the last, with a row for each method."""
+    total = len(shown[REFERENCE])
+    picked = sorted({round(i) for i in np.linspace(0, total - 1, min(count, total))})
+    rows = [[pictures[i] for i in picked] for pictures in shown.values()]
+    return sheets.grid(rows, rows=list(shown), size=max(64, shown[REFERENCE][0].shape[0]))
 
 
 def file_stem(label: str) -> str:

@@ -165,7 +165,7 @@ def notes(results: Mapping) -> list[str]:
         f"All methods: the same {objects['train objects']} training objects, {counts['objects']} test objects of "
         f"{objects['test objects']}, cameras, and first {results['points']} points; {results['resolution']} px.",
         f"Hardware: {results['hardware']}; Poisson surfaces are made and rendered on its CPU. Seed {results['seed']}.",
-        "Training is the time of the steps, compilation included. ms per view: median over the objects but the first; "
+        "Training is the time of the steps, without compilation. ms per view: median over the objects but the first; "
         "what is done once per object is shared by its views.",
         *(f"{name}: {text}." for name, text in results["metrics"].items()),
     ]

@@ -52,7 +52,7 @@ def test_every_sheet_has_the_objects_in_the_same_place_page_after_page(tmp_path,
 
     monkeypatch.setattr(data, "read_object", with_a_darker_view)
     main(asked(tmp_path, view=1))
-    sheets_of = {path.name for path in tmp_path.glob("*.png")}
+    sheets_of = {path.name for path in tmp_path.glob("*_[12].png")}
     assert sheets_of == {f"{stem}_{page}.png" for stem in ("reference", "ours", "ours-a-run") for page in (1, 2)}
     for i, name in enumerate(NAMES):
         page, column = divmod(i, 2)
@@ -60,6 +60,16 @@ def test_every_sheet_has_the_objects_in_the_same_place_page_after_page(tmp_path,
         drawn = np.asarray(Image.open(tmp_path / "pictures" / "Ours" / f"{name}.png"))
         np.testing.assert_array_equal(place(tmp_path / f"ours_{page + 1}.png", column), drawn)
     assert (place(tmp_path / "ours_2.png", 1) == 255).all()
+
+
+def test_side_by_side_are_the_first_and_the_last_object_and_some_between_a_row_for_each_method():
+    pictures = [np.full((64, 64, 3), i, np.uint8) for i in range(9)]
+    shown = {"Reference": pictures, "Ours": [200 - x for x in pictures]}
+    sheet = figs4_21_gallery.side_by_side(shown, 3)
+    left = sheet.shape[1] - 3 * (64 + GAP)
+    cells = [sheet[row * (64 + GAP) + 9, left + column * (64 + GAP) + 9, 0] for row in (0, 1) for column in (0, 1, 2)]
+    assert cells == [0, 4, 8, 200, 196, 192]
+    assert figs4_21_gallery.side_by_side(shown, 99).shape[1] == left + 9 * (64 + GAP)
 
 
 def test_the_page_holds_each_object_with_all_methods_and_their_psnr(tmp_path):
