@@ -9,6 +9,8 @@ one meets the background.  All of it is float32.
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from spnr_jax.numerics import one_minus_exp
+
 WHITE = 1.0  # background of every picture
 
 
@@ -24,13 +26,13 @@ def volume_weights(
 ) -> tuple[Float[Array, "*batch samples"], Float[Array, "*batch"]]:
     """Weights exp(-sum of tau before) * (1 - exp(-tau)), and the residual transmittance exp(-sum of all tau).
 
-    1 - exp is expm1 (in float32 a thin interval would be lost), and optical depths are summed before one exp, not
-    transmittances multiplied.  An infinite optical depth is opaque, with zero gradient.
+    1 - exp is `one_minus_exp` (a thin interval would be lost, and an opaque one's gradient), and optical depths are
+    summed before one exp, not transmittances multiplied.  An infinite optical depth is opaque, with zero gradient.
     """
     tau = density * delta
     through = jnp.cumsum(tau, axis=-1)
     before = jnp.concatenate([jnp.zeros_like(tau[..., :1]), through[..., :-1]], axis=-1)
-    return jnp.exp(-before) * -jnp.expm1(-tau), jnp.exp(-through[..., -1])
+    return jnp.exp(-before) * one_minus_exp(tau), jnp.exp(-through[..., -1])
 
 
 def composite(

@@ -46,6 +46,20 @@ def _softplus_jvp(primals, tangents):
     return softplus(*primals), jax.nn.sigmoid(*primals) * tangents[0]
 
 
+@jax.custom_jvp
+def one_minus_exp(x: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+    """1 - exp(-x), exact for small x too; gradient exp(-x).
+
+    JAX's derivative of expm1 adds 1 to its value, which leaves no digit of it from x = 17 on.
+    """
+    return -jnp.expm1(-x)
+
+
+@one_minus_exp.defjvp
+def _one_minus_exp_jvp(primals, tangents):
+    return one_minus_exp(*primals), jnp.exp(-primals[0]) * tangents[0]
+
+
 def clamp(
     x: Float[Array, "*shape"], low: Float[Array, "*shape"] | float | int, high: Float[Array, "*shape"] | float | int
 ) -> Float[Array, "*shape"]:

@@ -7,7 +7,17 @@ import pytest
 import reference
 from laws import adjoint_law, batch_law, close, gradient_law, numbers
 
-from spnr_jax.numerics import clamp, gather_rows, length, normalize, per_feature, safe_divide, scatter_rows, softplus
+from spnr_jax.numerics import (
+    clamp,
+    gather_rows,
+    length,
+    normalize,
+    one_minus_exp,
+    per_feature,
+    safe_divide,
+    scatter_rows,
+    softplus,
+)
 
 INDEX = jnp.asarray(np.random.default_rng(7).integers(0, 5, (2, 3, 4)), jnp.int32)
 
@@ -29,6 +39,20 @@ class TestSafeDivide:
     @pytest.mark.parametrize("denominator", [1e-8, -1e-8, 1e10, -1e10])
     def test_the_sign_of_the_denominator_counts_however_small_it_is(self, denominator):
         assert safe_divide(jnp.float32(3), jnp.float32(denominator)) == pytest.approx(3 / denominator, rel=1e-6)
+
+
+class TestOneMinusExp:
+    @pytest.mark.parametrize("size", [1e-30, 1e-8, 1e-3, 1.0, 16.5, 80.0, np.inf])
+    def test_value_and_gradient_keep_their_digits_at_every_size(self, size):
+        x = jnp.float32(size)
+        value, gradient = jax.value_and_grad(one_minus_exp)(x)
+        np.testing.assert_allclose(value, -np.expm1(-np.float64(x)), rtol=3e-7)
+        np.testing.assert_allclose(gradient, np.exp(-np.float64(x)), rtol=3e-6)
+
+    def test_obeys_the_batch_and_gradient_laws(self):
+        x = numbers(5, 2, 3, 4, low=0.0, high=3.0)
+        batch_law(one_minus_exp, x)
+        gradient_law(one_minus_exp, x)
 
 
 class TestNormalize:

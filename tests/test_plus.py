@@ -161,7 +161,8 @@ class TestConfig:
     @pytest.mark.parametrize(
         ("changes", "message"),
         [
-            ({"num_neighbors": 0}, "color lit needs the nearest points; use num_neighbors 6"),
+            ({"num_neighbors": 0, "num_features": 5}, "color lit needs the nearest points; use num_neighbors 6"),
+            ({"num_neighbors": 0, "color": "free"}, "num_features must be 4 or more, RGB first, got 3"),
             ({"num_neighbors": -1}, "num_neighbors must not be negative, got -1"),
             ({"sampling": SamplingConfig(num_coarse=4, reach=0)}, "use reach 1"),
             ({"image_resolution": 24}, "render_resolution 24"),
