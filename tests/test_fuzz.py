@@ -20,7 +20,7 @@ from spnr_jax.presets import tiny
 from spnr_jax.viewer import session, views
 
 ROOT = Path(__file__).parents[1]
-INPUTS = 30  # of each reader; number 0 is a valid file
+INPUTS = 16  # of each reader; number 0 is a valid file
 SOURCES = sorted(path for folder in ("spnr_jax", "data_gen", "experiments") for path in (ROOT / folder).rglob("*.py"))
 json_values = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
