@@ -78,7 +78,7 @@ def serve(make: Callable[[dict], tuple[Callable[[], object], dict]]) -> None:
     spec = json.loads(sys.argv[1])
     answers = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)  # what a library prints is no answer
-    sys.stdout.reconfigure(line_buffering=True)  # and stands before an error's last words
+    sys.stdout = sys.stderr  # unbuffered: it stands before an error's last words
     keep_memory()
     os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[: spec["threads"]])
     start = time.perf_counter()
