@@ -254,16 +254,22 @@ def damage_tree(tree: Any, rng: Random) -> Any:
 # Containers
 
 
+def chunks_of(data: bytes, place: int, head: str, behind: int) -> Parts:
+    """Chunks from a place on, by number and kind: each has a head of size and kind, and so many bytes behind it."""
+    parts: Parts = {}
+    while place + struct.calcsize(head) + behind <= len(data):
+        size, kind = struct.unpack_from(head, data, place)
+        start = place + struct.calcsize(head)
+        parts[f"{len(parts)} {kind.hex()}"] = data[start : start + size]
+        place = start + size + behind
+    return parts
+
+
 def open_glb(data: bytes) -> tuple[Parts, Callable[[Parts], bytes]] | None:
     """The chunks of a GLB file."""
     if data[:4] != b"glTF":
         return None
-    parts: Parts = {}
-    place = 12
-    while place + 8 <= len(data):
-        size, kind = struct.unpack_from("<I4s", data, place)
-        parts[f"{len(parts)} {kind.hex()}"] = data[place + 8 : place + 8 + size]
-        place += 8 + size
+    parts = chunks_of(data, 12, "<I4s", behind=0)
 
     def close(parts: Parts) -> bytes:
         chunks = b"".join(struct.pack("<I4s", len(v), bytes.fromhex(k.split()[1])) + v for k, v in parts.items())
@@ -295,12 +301,7 @@ def open_png(data: bytes) -> tuple[Parts, Callable[[Parts], bytes]] | None:
     """The chunks of a PNG image."""
     if not data.startswith(b"\x89PNG\r\n\x1a\n"):
         return None
-    parts: Parts = {}
-    place = 8
-    while place + 12 <= len(data):
-        size, kind = struct.unpack_from(">I4s", data, place)
-        parts[f"{len(parts)} {kind.hex()}"] = data[place + 8 : place + 8 + size]
-        place += 12 + size
+    parts = chunks_of(data, 8, ">I4s", behind=4)
 
     def chunk(kind: bytes, content: bytes) -> bytes:
         return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))

@@ -46,7 +46,7 @@ class RunRecord:
         self._entry: dict[str, Any] = {
             "began": datetime.now(UTC).isoformat(timespec="seconds"),
             "first_step": first_step,
-            "version": importlib.metadata.version("spnr-jax") if installed() else "not installed",
+            "version": version(),
             "commit": commit(),
             "jax": jax.__version__,
             "hardware": evaluation.hardware(),
@@ -76,13 +76,12 @@ def checksum(dataset: data.Dataset) -> str:
     return hashlib.sha256(content.encode()).hexdigest()
 
 
-def installed() -> bool:
-    """Whether the package is installed, and not only on the path."""
+def version() -> str:
+    """The installed version of the package."""
     try:
-        importlib.metadata.distribution("spnr-jax")
+        return importlib.metadata.version("spnr-jax")
     except importlib.metadata.PackageNotFoundError:
-        return False
-    return True
+        return "not installed"  # only on the path
 
 
 def commit() -> str | None:

@@ -9,15 +9,13 @@ in units of the points' own spacing, so that dense and sparse clouds look alike.
 has no gradient by the points.
 """
 
-import itertools
-
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from spnr_jax.numerics import length
 from spnr_jax.types import PointCloud, Surface, SurfaceSample
-from spnr_jax.voxels import locate, row_of
+from spnr_jax.voxels import NEIGHBOURS, locate, row_of
 
 PLANE_POINTS = 10  # of a plane, the point itself among them
 SPACING_POINTS = 4  # nearest others whose root mean square distance is a point's spacing
@@ -82,12 +80,12 @@ def nearest_by_cell(
     """
     num_points = len(positions)
     cell, offset = locate(positions, resolution)
-    steps = jnp.array(list(itertools.product((-1, 0, 1), repeat=3)), jnp.int32)
-    target = cell[:, None] + steps[None]
+    steps = jnp.array([NEIGHBOURS], jnp.int32)
+    target = cell[:, None] + steps
     counts = mask & jnp.all(jnp.abs(positions) <= 1, axis=-1)
     counts = counts[:, None] & jnp.all((target >= 0) & (target < resolution), axis=-1)
     rows = row_of(target, counts, resolution).reshape(-1)
-    away = jnp.sum((offset[:, None] - steps[None].astype(offset.dtype)) ** 2, axis=-1).reshape(-1)
+    away = jnp.sum((offset[:, None] - steps.astype(offset.dtype)) ** 2, axis=-1).reshape(-1)
     point = jnp.broadcast_to(jnp.arange(num_points, dtype=jnp.int32)[:, None], target.shape[:2]).reshape(-1)
     rows, _, point = jax.lax.sort((rows, away, point), num_keys=2)
     place = jnp.arange(len(rows), dtype=jnp.int32)
