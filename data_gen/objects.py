@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from data_gen import augmentation, meshes, points, procedural, records, views
+from data_gen import augmentation, meshes, points, procedural, records, reshaping, views
 from data_gen.assets import Asset, Material, RejectedAsset
 from data_gen.plan import Task
 from data_gen.variant import LLVM, choose_variant, mitsuba_module
@@ -59,7 +59,7 @@ def prepare_renderer(variant: str) -> None:
 def make_record(bench: Workbench, task: Task) -> records.ObjectRecord:
     """Return one object, rendered: asset, points, views, condition images."""
     seeds = object_seeds(bench.seed, task.object_id)
-    asset, transform, rotation = make_asset(task, bench.seed)
+    asset, details = make_asset(task, bench.seed)
     surface = points.sample_surface(asset, bench.num_points, seeds["points"])
     cam_to_world = views.random_viewpoints(
         bench.view.views, bench.view.distance, np.random.default_rng(seeds["viewpoints"])
@@ -72,16 +72,22 @@ def make_record(bench: Workbench, task: Task) -> records.ObjectRecord:
         ),
         images=images,
         conditions=conditions,
-        details=object_details(task, asset, transform, seeds) | {"colour_rotation": rotation and rotation.describe()},
+        details=object_details(task, asset, seeds) | details,
     )
 
 
-def make_asset(task: Task, seed: int) -> tuple[Asset, dict, augmentation.ColourRotation | None]:
-    """Return the object as it is rendered and sampled, the transform that normalised it, and its colours' rotation."""
-    asset, rotation = load_asset(task, seed), None
+def make_asset(task: Task, seed: int) -> tuple[Asset, dict]:
+    """Return the object as it is rendered and sampled, and what was done to it as it stands in object.json."""
+    asset, seeds, details = load_asset(task, seed), object_seeds(seed, task.object_id), {"colour_rotation": None}
     if task.colour_variant:
-        asset, rotation = augmentation.rotate_colours(asset, object_seeds(seed, task.object_id)["colours"])
-    return *points.normalise(asset), rotation
+        asset, rotation = augmentation.rotate_colours(asset, seeds["colours"])
+        details["colour_rotation"] = rotation.describe()
+    if task.reshaped:
+        shape = reshaping.draw_reshaping(seeds["pose"])
+        asset = reshaping.reshape(asset, shape)
+        details["reshaping"] = shape.describe()
+    asset, details["normalisation"] = points.normalise(asset)
+    return asset, details
 
 
 def load_asset(task: Task, seed: int) -> Asset:
@@ -95,11 +101,11 @@ def load_asset(task: Task, seed: int) -> Asset:
 def object_seeds(seed: int, object_id: str) -> dict[str, int]:
     """Return an independent 32-bit seed for each purpose, a function of (seed, object id) alone."""
     digest = hashlib.sha256(f"{seed}/{object_id}".encode()).digest()
-    purposes = ("shape", "points", "viewpoints", "noise", "colours")
+    purposes = ("shape", "points", "viewpoints", "noise", "colours", "pose")
     return {name: int.from_bytes(digest[4 * i : 4 * i + 4], "little") for i, name in enumerate(purposes)}
 
 
-def object_details(task: Task, asset: Asset, transform: dict, seeds: dict[str, int]) -> dict:
+def object_details(task: Task, asset: Asset, seeds: dict[str, int]) -> dict:
     """Return the content of object.json (the checksums of the files are added when they are written)."""
     return {
         "id": task.object_id,
@@ -107,7 +113,6 @@ def object_details(task: Task, asset: Asset, transform: dict, seeds: dict[str, i
         "variant": task.colour_variant,
         "category": asset.category,
         "source": {**asset.source, "file": task.shown_path} if task.path else asset.source,
-        "normalisation": transform,
         "materials": [describe_material(part.material) | {"faces": len(part.faces)} for part in asset.parts],
         "ignored": list(asset.ignored),
         "seeds": seeds,

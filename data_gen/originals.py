@@ -45,7 +45,12 @@ def task_of(details: dict, root: Path | None) -> Task:
     """Return what made the object: a category, or a mesh file under the root."""
     name, source = details["id"], details["source"]
     variant = details.get("variant", 0)  # data sets from before there were colour variants do not say
-    made = {"object_id": name, "variant_of": details["product"] if variant else "", "colour_variant": variant}
+    made = {
+        "object_id": name,
+        "variant_of": details["product"] if variant else "",
+        "colour_variant": variant,
+        "reshaped": "reshaping" in details,
+    }
     if "file" not in source:
         return Task(category=details["category"], **made)
     if root is None:

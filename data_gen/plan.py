@@ -49,6 +49,8 @@ class GenerateConfig:
     """Folder of .glb, .gltf, .obj and .ply files: short for --source meshes --root."""
     colour_variants: int = 0
     """Variants of each training object with its base colours rotated in RGB space; test objects have none."""
+    reshape_variants: bool = False
+    """Turn, mirror and stretch the variants too, and bend their roughness: a few meshes go further."""
     train_objects: int | None = None
     """Training objects, variants included: variants are drawn until there are as many (default: all variants)."""
     test_objects: int | None = None
@@ -97,7 +99,7 @@ class Task:
     """One object to make: a mesh file (with its path as it is reported), or a procedural category.
 
     `folder` is the widest that a mesh's companions may lie in (default: the mesh's own); `fault` is why it cannot be
-    made, known before it is tried. A colour variant names its product and its number, from 1.
+    made, known before it is tried. A colour variant names its product and its number, from 1, and may be reshaped too.
     """
 
     object_id: str
@@ -108,6 +110,7 @@ class Task:
     fault: str = ""
     variant_of: str = ""
     colour_variant: int = 0
+    reshaped: bool = False
 
     @property
     def product(self) -> str:
@@ -136,7 +139,13 @@ class Plan:
         most = None if total is None else max(total - len(train_ids), 0)
         chosen = splits.chosen_variants(train_ids, self.config.colour_variants, most, self.config.seed)
         return [
-            replace(products[name], object_id=f"{name}--{number}", variant_of=name, colour_variant=number)
+            replace(
+                products[name],
+                object_id=f"{name}--{number}",
+                variant_of=name,
+                colour_variant=number,
+                reshaped=self.config.reshape_variants,
+            )
             for name, number in chosen
         ]
 

@@ -51,25 +51,22 @@ def test_faces_are_met_from_inside_and_whichever_way_they_are_turned():
         np.testing.assert_allclose(depth.caster(Asset(parts=(part,)))(*ray), [0.5], rtol=1e-6)
 
 
-def record(task, asset, transform, count=50):
-    """object.json of an object and the points that lie beside it."""
+def made(task, count=50):
+    """An object, its object.json and the points that lie beside it."""
     seeds = objects.object_seeds(SEED, task.object_id)
-    details = json.loads(json.dumps(objects.object_details(task, asset, transform, seeds)))
-    return details, points.sample_surface(asset, count, seeds["points"]).positions
-
-
-def made(task):
-    asset, transform, _ = objects.make_asset(task, SEED)
-    return asset, *record(task, asset, transform)
+    asset, done = objects.make_asset(task, SEED)
+    details = json.loads(json.dumps(objects.object_details(task, asset, seeds) | done))
+    return asset, details, points.sample_surface(asset, count, seeds["points"]).positions
 
 
 PROCEDURAL = (
     Task(object_id="lamp_000004", category="lamp"),
     Task(object_id="lamp_000004--2", category="lamp", variant_of="lamp_000004", colour_variant=2),
+    Task(object_id="lamp_000004--2", category="lamp", variant_of="lamp_000004", colour_variant=2, reshaped=True),
 )
 
 
-@pytest.mark.parametrize("task", PROCEDURAL, ids=["product", "colour variant"])
+@pytest.mark.parametrize("task", PROCEDURAL, ids=["product", "colour variant", "reshaped"])
 def test_a_procedural_object_is_made_again_from_its_record(task):
     asset, details, stored = made(task)
     again = originals.original(details, SEED, stored)

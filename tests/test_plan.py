@@ -7,6 +7,7 @@ import pytest
 
 from data_gen import plan, presets, splits
 from data_gen.__main__ import parse
+from data_gen.description import describe
 
 OUT = ["generate", "out"]
 IDS = [f"object_{number}" for number in range(40)]
@@ -81,6 +82,14 @@ def test_without_a_number_every_training_product_has_all_its_variants():
     made = planned(test_objects=10, val_fraction=0, colour_variants=3)
     assert len(made.variants(made.split(ids(made.tasks))["train"])) == 90
     assert planned().variants(["chair_000000"]) == []
+
+
+def test_variants_are_reshaped_if_asked_for_and_older_data_sets_that_were_not_stay_the_same():
+    for asked in (False, True):
+        made = planned(test_objects=10, colour_variants=1, reshape_variants=asked)
+        assert {task.reshaped for task in made.variants(made.split(ids(made.tasks))["train"])} == {asked}
+        assert not any(task.reshaped for task in made.tasks)
+        assert ("reshape_variants" in describe(made, "scalar_rgb")["settings"]) == asked
 
 
 def test_a_variant_sorts_right_behind_its_product():
