@@ -38,12 +38,15 @@ class LossConfig:
     masked: bool = added(False)
     """Leave pixels of opacity 0 out of the pixel error: Point-NeRF's rays without a point in reach."""
     opacity_weight: float = added(0.0)
-    """L1 between opacity and that of the reference, beside the loss of the picture."""
+    """Mean squared error of the opacity against the reference's, beside the loss of the picture."""
+    mse_weight: float = added(0.0)
+    """Mean squared error of the picture beside the weighted one: what L1 leaves undecided at an outline is averaged."""
     condition: bool = added(True)
     """Whether the discriminator sees the true colours at visible input points [paper]; else an empty image and mask."""
 
     def __post_init__(self) -> None:
-        for name in ("l1_weight", "low_resolution_weight", "adversarial_weight", "r1_gamma", "opacity_weight"):
+        weights = ("l1_weight", "low_resolution_weight", "adversarial_weight", "opacity_weight", "mse_weight")
+        for name in (*weights, "r1_gamma"):
             require(getattr(self, name) >= 0, f"{name} must not be negative, got {getattr(self, name)}")
         require(
             0 <= self.adversarial_start <= 1, f"adversarial_start is a share of the steps, got {self.adversarial_start}"

@@ -17,13 +17,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from spnr_jax import checkpoint, data, metrics, training
+from spnr_jax import data, metrics, training
 from spnr_jax.baselines import floors
 from spnr_jax.config import TrainConfig
 from spnr_jax.flip import flip
 from spnr_jax.lpips import LpipsWeights, lpips
 from spnr_jax.summary import Scores, differences, metric_settings, summarise
+from spnr_jax.supersampling import rays_per_side
 from spnr_jax.types import Camera, PointCloud, Rendering
+from spnr_jax.weights import read_trained
 
 RADIUS_FACTORS = (0.5, 0.75, 1.0, 1.5, 2.0)
 FLOORS = ("white", "splat", "nearest")
@@ -115,7 +117,8 @@ def render_views(variables: dict, config: TrainConfig, cloud: PointCloud, camera
     """All views of one object (clouds of data sets are normalised already)."""
     cloud, camera = jax.tree.map(lambda x: jnp.asarray(x)[None], (cloud, camera))
     volume = training.jitted_encode(variables, cloud, config=config.model)
-    rendering = training.jitted_render(variables, volume, camera, config=config.model)
+    side = rays_per_side(config.model, camera.width)
+    rendering = training.jitted_render(variables, volume, camera, config=config.model, rays_per_side=side)
     return jax.tree.map(lambda x: x[0], rendering)
 
 
@@ -155,7 +158,8 @@ def evaluate_object(
     methods: dict[str, Method], config: TrainConfig, item: data.ObjectData, weights: LpipsWeights | None = None
 ) -> ObjectResult:
     """Pictures and scores of one object."""
-    data.check_resolution(item, config)
+    if not config.model.per_pixel:
+        data.check_resolution(item, config)
     cloud = test_cloud(item, config)
     pictures, scores = {}, {}
     for method, show in methods.items():
@@ -229,12 +233,13 @@ def evaluate(
     weights: LpipsWeights | None = None,
 ) -> Evaluation:
     """Scores of a run's newest checkpoint on a split; LPIPS if there are weights for it."""
-    config, state = checkpoint.load_run(run, say, data=dataset.folder)
+    trained = read_trained(run, say, data=dataset.folder)
+    config = trained.config
     names = dataset.splits[split]
     if not names:
         raise ValueError(f"{dataset.folder}: the {split} split is empty; choose another one or generate more objects")
     factors = {method: choose_radius(dataset, config, method) for method in ("splat", "nearest")}
-    methods = {"ours": network(training.averaged_variables(state), config)}
+    methods = {"ours": network(trained.variables, config)}
     methods |= {name: floor(name, factors.get(name, 1.0)) for name in FLOORS}
     scores, gallery = score_methods(methods, config, dataset, names, gallery_objects, say, weights)
     categories = sorted({category_of(name) for name in names})
@@ -242,7 +247,7 @@ def evaluate(
         "methods": summarise(list(scores.values())),
         "ours_minus": differences(list(scores.values())),
         "preset": config.preset,
-        "steps": int(state.step),
+        "steps": trained.steps,
         "seed": config.seed,
         "hardware": hardware(),
         "settings": {

@@ -1,6 +1,6 @@
 """The handle for people who only want pictures: load a network, encode a cloud once, render it from anywhere.
 
-    model = spnr_jax.load("runs/demo/run")
+    model = spnr_jax.load()  # the network in the package; or a run folder, or a file of weights
     volume = model.encode(spnr_jax.read_cloud("chair.ply"))
     rendering = model.render(volume, model.camera(volume, azimuth=30, elevation=20))
 
@@ -20,7 +20,7 @@ from flax import struct
 from jaxtyping import Array, Float
 from scipy.spatial import cKDTree
 
-from spnr_jax import cameras, checkpoint, clouds, training
+from spnr_jax import cameras, clouds, supersampling, training, weights
 from spnr_jax.model_config import ModelConfig, NetworkConfig, SamplingConfig
 from spnr_jax.types import Camera, PointCloud, Rendering
 
@@ -74,13 +74,15 @@ class Model:
     def render(self, volume: Volume, camera: Camera, quality: Quality = "best") -> Rendering:
         """The object as the camera (unbatched, or with one axis of views) sees it; depth in the cloud's units.
 
-        `draft`, `balanced` and `best` look near the points alone, with a quarter, half and all of the samples of a ray;
-        `trained` renders as the network was trained.  Other networks than ours know one quality.
+        `draft`, `balanced` and `best` look near the points alone, with a quarter, half and all of the samples of a ray,
+        and `best` has several rays a pixel where pictures are smaller than those of the training (`supersampling.py`);
+        `trained` renders as the network was trained.  Other networks than ours know one number of samples.
         """
         if self.config.upsamples and (camera.height % 2 or camera.width % 2):
             raise ValueError(f"this network doubles its pictures: {camera.width} x {camera.height} pixels must be even")
         config = at_quality(self.config, quality, volume.reach)
-        return _render(self.variables, volume.scene, volume.centre, volume.scale, camera, config=config)
+        side = supersampling.rays_per_side(config, camera.width) if quality == "best" else 1
+        return _render(self.variables, volume.scene, volume.centre, volume.scale, camera, config=config, side=side)
 
     def camera(
         self, volume: Volume, azimuth: float = 30.0, elevation: float = 20.0, resolution: int | None = None
@@ -102,16 +104,19 @@ def _encode(variables: dict, cloud: PointCloud, *, config: NetworkConfig) -> Any
     return jax.tree.map(lambda x: x[0], scene)
 
 
-@partial(jax.jit, static_argnames="config")
-def _render(variables: dict, scene: Any, centre, scale, camera: Camera, *, config: NetworkConfig) -> Rendering:
-    """`Model.render` with the config of a quality."""
+@partial(jax.jit, static_argnames=("config", "side"))
+def _render(
+    variables: dict, scene: Any, centre, scale, camera: Camera, *, config: NetworkConfig, side: int = 1
+) -> Rendering:
+    """`Model.render` with the config and the rays per side of a pixel of a quality."""
     single = camera.cam_to_world.ndim == 2
     rotation, eye = camera.cam_to_world[..., :3], camera.cam_to_world[..., 3]
     eye = (eye - jnp.broadcast_to(centre, eye.shape)) * scale
     pose = jnp.concatenate([rotation, eye[..., None]], axis=-1)
     inside = dataclasses.replace(camera, cam_to_world=pose)
     inside = jax.tree.map(lambda x: x.reshape(1, -1, *x.shape[-2:]), inside)
-    rendering = training.render(variables, jax.tree.map(lambda x: x[None], scene), inside, config=config)
+    scene = jax.tree.map(lambda x: x[None], scene)
+    rendering = training.render(variables, scene, inside, config=config, rays_per_side=side)
     rendering = dataclasses.replace(rendering, depth=rendering.depth / scale)
     return jax.tree.map(lambda x: x[0, 0] if single else x[0], rendering)
 
@@ -153,7 +158,7 @@ def reach_of(positions: np.ndarray, resolution: int, num_queries: int = 4096) ->
     return int(np.clip(np.ceil(REACH_PER_SPACING * spacing), 1, LARGEST_REACH))
 
 
-def load(run: Path | str) -> Model:
-    """The averaged network of a run folder's newest checkpoint."""
-    config, state = checkpoint.load_run(run)
-    return Model(config=config.model, variables=training.averaged_variables(state))
+def load(run: Path | str | None = None) -> Model:
+    """The averaged network of a run folder's newest checkpoint or of a file of weights; None: the package's own."""
+    trained = weights.read_trained(run)
+    return Model(config=trained.config.model, variables=trained.variables)

@@ -16,8 +16,8 @@ class Render:
     cloud: tyro.conf.Positional[Path]
     """.ply (also 3D Gaussian splats) .pcd .xyz .txt .csv .las .laz .npz .npy, or a mesh: .glb .gltf .obj .stl .off (its
     surface is sampled)."""
-    run: Path
-    """Run folder whose network renders."""
+    run: Path | None = None
+    """Run folder, or file of weights, whose network renders (default: the network in the package)."""
     out: Path = Path("renders")
     """Folder for what is written."""
     up: Literal["auto", "x", "y", "z", "-x", "-y", "-z"] = "auto"

@@ -1,13 +1,16 @@
 """The surface near a place, from the few points around it: where it lies, how it is turned, what it is made of.
 
-    estimate    once per object: a plane through the neighbours of each point, and the points nearest to every cell of a
-                grid whose cells grow with the distance between points
-    describe    at each sample: the planes and materials of its cell's points, blended by their distance
+    estimate    once per object: the shape of each point's neighbourhood, and the points nearest to every cell of a grid
+                whose cells grow with the distance between points
+    describe    at each sample: the planes and materials of its cell's points, blended by their distance, and where the
+                ray through the sample meets those planes
 
 A normal has no sign of its own: it is turned towards the viewer, which is where a visible surface faces.  Lengths are
 in units of the points' own spacing, so that dense and sparse clouds look alike.  All of it is geometry, not learnt, and
 has no gradient by the points.
 """
+
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +26,18 @@ BLOCK = 1024  # points whose neighbours are searched at once
 LEAST_SPACING = 1e-4  # in units of the box, for points that coincide
 CELLS = 1.0  # along an axis of the grid, per square root of the number of points; 0.75 lost 0.1 dB
 MOST_CELLS = 96
-NEAR, FAR = 1e-6, 10.0  # spacings, the smallest and the largest distance to a point that is told
+NEAR, FAR = 1e-6, 10.0  # spacings, the smallest and the largest distance that is told
+LEAST_FACING = 0.05  # cosine of the angle between ray and normal below which a plane counts as seen from its edge
+LEAST_RATIO = 1e-3  # of two extents
+
+
+class Neighbourhoods(NamedTuple):
+    """What the neighbours of each point say of the surface there; `Surface` says what the numbers mean."""
+
+    normals: Float[Array, "points 3"]
+    inward: Float[Array, "points 3"]
+    ratios: Float[Array, "points 2"]
+    spacing: Float[Array, " points"]
 
 
 def grid_resolution(num_points: int) -> int:
@@ -49,25 +63,32 @@ def neighbours(
     return index, squared
 
 
-def planes(
-    positions: Float[Array, "points 3"], mask: Bool[Array, " points"]
-) -> tuple[Float[Array, "points 3"], Float[Array, " points"]]:
-    """Unit normal, of either sign, of the plane through the neighbours of each point, and the point's spacing.
+def neighbourhoods(positions: Float[Array, "points 3"], mask: Bool[Array, " points"]) -> Neighbourhoods:
+    """The shape of each point's neighbourhood.
 
-    The normal is the direction in which the neighbours spread least (Hoppe et al. 1992).
+    Its normal, of either sign, is the direction in which the neighbours spread least (Hoppe et al. 1992); at a rim the
+    way to their middle leads inwards.
     """
     index, squared = neighbours(positions, mask, PLANE_POINTS)
     found = jnp.isfinite(squared)
     weight = (found / jnp.maximum(jnp.sum(found, axis=1, keepdims=True), 1))[..., None]
     around = positions[index]
-    spread = around - jnp.sum(weight * around, axis=1, keepdims=True)
+    middle = jnp.sum(weight * around, axis=1)
+    spread = around - middle[:, None]
     covariance = jnp.einsum("pki,pkj->pij", weight * spread, spread, precision="highest")
     scale = jnp.maximum(jnp.trace(covariance, axis1=1, axis2=2), LEAST_SPACING**2)
-    normals = jnp.linalg.eigh(covariance / scale[:, None, None])[1][..., 0]
+    variances, axes = jnp.linalg.eigh(covariance / scale[:, None, None])
+    extents = jnp.sqrt(jnp.maximum(variances, 0) + LEAST_RATIO**2)
     others = slice(1, 1 + SPACING_POINTS)
     few = jnp.maximum(jnp.sum(found[:, others], axis=1), 1)
     spacing = jnp.sqrt(jnp.sum(jnp.where(found, squared, 0)[:, others], axis=1) / few)
-    return normals, jnp.maximum(spacing, LEAST_SPACING)
+    spacing = jnp.maximum(spacing, LEAST_SPACING)
+    return Neighbourhoods(
+        normals=axes[..., 0],
+        inward=(middle - positions) / spacing[:, None],
+        ratios=extents[:, :2] / extents[:, 1:],
+        spacing=spacing,
+    )
 
 
 def nearest_by_cell(
@@ -100,11 +121,12 @@ def estimate(cloud: PointCloud, count: int) -> Surface:
 
     def one(cloud: PointCloud) -> Surface:
         positions, mask = jnp.asarray(cloud.positions), jnp.asarray(cloud.mask)
-        normals, spacing = planes(positions, mask)
-        numbers = (positions, normals, cloud.base_color, cloud.roughness, cloud.metallic, spacing)
-        rows = jnp.concatenate([x.reshape(len(spacing), -1) for x in numbers], axis=1)
+        around = neighbourhoods(positions, mask)
+        materials = (cloud.base_color, cloud.roughness, cloud.metallic)
+        numbers = (positions, around.normals, *materials, around.inward, around.ratios, around.spacing)
+        rows = jnp.concatenate([x.reshape(len(mask), -1) for x in numbers], axis=1)
         rows = jnp.where(mask[:, None], rows, 0)
-        nearest = nearest_by_cell(positions, mask, grid_resolution(len(spacing)), count)
+        nearest = nearest_by_cell(positions, mask, grid_resolution(len(mask)), count)
         return Surface(points=jnp.pad(rows, ((0, 1), (0, 0))), nearest=nearest)
 
     return jax.lax.stop_gradient(jax.vmap(one)(jax.tree.map(jnp.asarray, cloud)))
@@ -128,27 +150,49 @@ def describe(
     # numbers of one kind lie side by side, (count, samples): a CPU works on eight samples at a time
     columns = surface.points.reshape(-1, surface.points.shape[-1]).T
     *numbers, spacing = (column[index] for column in columns)
-    position, normal, (red, green, blue, roughness, metallic) = numbers[:3], numbers[3:6], numbers[6:]
+    position, normal, (red, green, blue, roughness, metallic) = numbers[:3], numbers[3:6], numbers[6:11]
+    inward, (flatness, narrowness) = numbers[11:14], numbers[14:]
     exists = spacing > 0
     scale = jnp.where(exists, 1 / jnp.where(exists, spacing, 1), 0)
     offset = [(positions[None, :, i] - position[i]) * scale for i in range(3)]
-    squared = jnp.where(exists, sum(o**2 for o in offset), jnp.inf)
+    squared = jnp.where(exists, _dot(offset, offset), jnp.inf)
     closest = jnp.min(squared, axis=0, keepdims=True)
     share = jnp.where(exists, jnp.exp(-0.5 * (squared - jnp.where(jnp.isfinite(closest), closest, 0))), 0)
     share = share / jnp.maximum(jnp.sum(share, axis=0, keepdims=True), 1)
-    turned = jnp.where(sum(n * directions[None, :, i] for i, n in enumerate(normal)) < 0, share, -share)
+    view = [directions[None, :, i] for i in range(3)]
+    along = _dot(normal, view)
+    sign = jnp.where(along < 0, 1, -1)  # turns the normal to the viewer
+    height = sign * _dot(normal, offset)
+    turned = sign * share
+    # where the ray meets each point's plane, and how far from the point
+    ahead = jnp.clip(height / jnp.maximum(jnp.abs(along), LEAST_FACING), -FAR, FAR)
+    passed = [o + ahead * d for o, d in zip(offset, view, strict=True)]
+    missed = jnp.where(exists, jnp.minimum(_dot(passed, passed), FAR**2), FAR**2)
+    least = jnp.min(missed, axis=0, keepdims=True)
+    met = jnp.where(exists, jnp.exp(-0.5 * (missed - least)), 0)
+    met = met / jnp.maximum(jnp.sum(met, axis=0, keepdims=True), 1)
 
     def blend(*parts):
         return jnp.stack([jnp.sum(share * x, axis=0) for x in parts], axis=-1)
 
     return SurfaceSample(
         exists=exists[0],
-        height=jnp.sum(turned * sum(n * o for n, o in zip(normal, offset, strict=True)), axis=0),
+        height=jnp.sum(share * height, axis=0),
         beside=length(blend(*offset)),
         nearest=jnp.sqrt(jnp.clip(closest[0], NEAR**2, FAR**2)),
+        ahead=jnp.sum(met * ahead, axis=0),
+        miss=jnp.sqrt(jnp.maximum(least[0], NEAR**2)),
+        outside=-jnp.sum(share * _dot(inward, offset), axis=0),
+        flatness=blend(flatness)[:, 0],
+        narrowness=blend(narrowness)[:, 0],
         spacing=blend(spacing)[:, 0],
         normal=jnp.stack([jnp.sum(turned * n, axis=0) for n in normal], axis=-1),
         base_color=blend(red, green, blue),
         roughness=blend(roughness)[:, 0],
         metallic=blend(metallic)[:, 0],
     )
+
+
+def _dot(a, b):
+    """Sum of the products of three numbers each."""
+    return sum(x * y for x, y in zip(a, b, strict=True))

@@ -22,7 +22,7 @@ import optax
 from flax import struct
 from jaxtyping import Array, Float
 
-from spnr_jax import losses
+from spnr_jax import cameras, losses, supersampling
 from spnr_jax.baselines.npbg import NPBG
 from spnr_jax.baselines.point_nerf import PointNeRF
 from spnr_jax.baselines.points2nerf import Points2NeRF
@@ -181,7 +181,8 @@ def reconstruction_loss(
 ) -> Float[Array, ""]:
     """Weighted error of the image, and of a smaller volume rendering against the reference averaged to its size."""
     if not config.model.upsamples:
-        return config.loss.l1_weight * pixel_error(config, image, reference, seen)
+        error = config.loss.l1_weight * pixel_error(config, image, reference, seen)
+        return error + config.loss.mse_weight * jnp.mean((image - reference) ** 2)
     low = losses.area_downsample(reference, image_lr.shape[-2])
     errors = pixel_error(config, image, reference), pixel_error(config, image_lr, low)
     return config.loss.l1_weight * (errors[0] + config.loss.low_resolution_weight * errors[1])
@@ -234,7 +235,7 @@ def train_step(
         sown = {name: value for name, (value,) in updated.get("losses", {}).items()}
         if config.loss.opacity_weight:
             opacity = losses.area_downsample(jnp.asarray(batch.alpha)[..., None], rendering.acc.shape[-1])[..., 0]
-            sown["opacity"] = config.loss.opacity_weight * losses.l1(rendering.acc, opacity)
+            sown["opacity"] = config.loss.opacity_weight * jnp.mean((rendering.acc - opacity) ** 2)
         seen = rendering.acc > 0 if config.loss.masked else None
         return (rendering.image, rendering.image_lr, sown), (updated.get("batch_stats", {}), seen)
 
@@ -293,14 +294,24 @@ def encode(variables: dict, cloud: PointCloud, *, config: NetworkConfig) -> Any:
 
 
 def render(
-    variables: dict, scene: Any, camera: Camera, *, config: NetworkConfig, ray_chunk: int | None = None
+    variables: dict,
+    scene: Any,
+    camera: Camera,
+    *,
+    config: NetworkConfig,
+    ray_chunk: int | None = None,
+    rays_per_side: int = 1,
 ) -> Rendering:
-    """Views of encoded scenes, samples at the middles of their strata.
+    """Views of encoded scenes, samples at the middles of their strata, rays_per_side^2 rays a pixel averaged.
 
     So many rays of each object (the network's own number by default) are rendered at a time, which bounds the memory.
     On a CPU a pixel of one object of ours has the same bits for every chunk from 256 to 2048 rays, whatever is rendered
     beside it: the matrix products then add up in one order.
     """
+    if rays_per_side > 1:
+        wide = cameras.resize(camera, rays_per_side * camera.height, rays_per_side * camera.width)
+        rendering = render(variables, scene, wide, config=config, ray_chunk=ray_chunk)
+        return supersampling.averaged(rendering, rays_per_side)
     module = network(config)
     if (ray_chunk := ray_chunk or config.ray_chunk) is None:
         return module.bind(variables).render(scene, camera)
@@ -332,4 +343,4 @@ jitted_create_state = jax.jit(
 )
 jitted_train_step = jax.jit(train_step, static_argnames=("config", "adversarial"), donate_argnames="state")
 jitted_encode = jax.jit(encode, static_argnames="config")
-jitted_render = jax.jit(render, static_argnames=("config", "ray_chunk"))
+jitted_render = jax.jit(render, static_argnames=("config", "ray_chunk", "rays_per_side"))

@@ -66,11 +66,12 @@ class Rendering:
 class Surface:
     """What is known of a surface from its points (`surface.py`).
 
-    A row of `points` is a point's position, normal, base colour, roughness, metallic and spacing; the last row, all 0,
-    stands for no point.  `nearest` are the rows of the points nearest to each cell of a grid.
+    A row of `points` is a point's position, normal, base colour, roughness, metallic, the way to the middle of its
+    neighbours, their flatness and narrowness, and its spacing; the last row, all 0, stands for no point.  `nearest` are
+    the rows of the points nearest to each cell of a grid.
     """
 
-    points: Float[Array, "*batch points+1 12"]
+    points: Float[Array, "*batch points+1 17"]
     nearest: Int[Array, "*batch g g g k"]
 
 
@@ -80,14 +81,23 @@ class SurfaceSample:
     """The surface as seen from a place: lengths in spacings of the points, `spacing` itself in units of the box.
 
     `height` is the signed distance to the plane, positive before it, `beside` that to the blended position of the
-    points, `nearest` that to the nearest of them.  `normal` is turned to the viewer, and shorter than 1 where the
-    points disagree.  Where no point is near, `exists` is False, `nearest` large, and all else 0.
+    points, `nearest` that to the nearest of them.  The ray meets the points' planes `ahead` of the place (behind it if
+    negative), and passes that one of them which it meets best at the distance `miss`.  `outside` grows beyond the rim
+    of the points: it is the offset from them against the way to the middle of their neighbours.  `flatness` and
+    `narrowness` are the ratios of the neighbours' least to middle and middle to largest extent: 0 in a plane, 0 on a
+    line.  `normal` is turned to the viewer, and shorter than 1 where the points disagree.  Where no point is near,
+    `exists` is False, `nearest` and `miss` are large, and all else 0.
     """
 
     exists: Bool[Array, "*batch"]
     height: Float[Array, "*batch"]
     beside: Float[Array, "*batch"]
     nearest: Float[Array, "*batch"]
+    ahead: Float[Array, "*batch"]
+    miss: Float[Array, "*batch"]
+    outside: Float[Array, "*batch"]
+    flatness: Float[Array, "*batch"]
+    narrowness: Float[Array, "*batch"]
     spacing: Float[Array, "*batch"]
     normal: Float[Array, "*batch 3"]
     base_color: Float[Array, "*batch 3"]

@@ -31,7 +31,7 @@ def ball(seed=0, points=300, objects=2):
 
 
 estimate = jax.jit(surface.estimate, static_argnums=1)
-planes = jax.jit(surface.planes)
+neighbourhoods = jax.jit(surface.neighbourhoods)
 describe = jax.jit(surface.describe)
 
 
@@ -51,20 +51,41 @@ class TestPlanes:
 
     def test_normals_of_a_ball_point_along_its_radius_and_the_spacing_is_the_distance_between_points(self):
         cloud = ball(points=2000, objects=1)
-        normals, spacing = planes(cloud.positions[0], cloud.mask[0])
+        around = neighbourhoods(cloud.positions[0], cloud.mask[0])
+        normals, spacing = around.normals, around.spacing
         real, outward = np.asarray(cloud.mask[0]), normalize(cloud.positions[0] - 0.1)
         assert np.quantile(np.abs(np.sum(normals * outward, axis=1))[real], 0.01) > 0.99
         close(jnp.linalg.norm(normals, axis=1), jnp.ones(2000), atol=1e-5)
         area_of_a_point = 4 * math.pi * 0.4**2 / 1500
         assert 0.6 < np.median(spacing[real]) / math.sqrt(area_of_a_point) < 1.0
 
+    @pytest.mark.parametrize(
+        ("extent", "flat", "narrow"),
+        [((1, 1, 1), False, False), ((1, 1, 0), True, False), ((1, 1e-3, 1e-3), False, True)],
+    )
+    def test_a_plane_is_flat_and_a_stick_narrow(self, extent, flat, narrow):
+        points = 0.9 * numbers(5, 512, 3) * jnp.array([extent])
+        flatness, narrowness = np.median(neighbourhoods(points, jnp.ones(512, bool)).ratios, axis=0)
+        assert (flatness < 0.1) == flat
+        assert (narrowness < 0.35) == narrow
+
+    def test_the_way_to_the_middle_of_the_neighbours_leads_inwards_at_a_rim_and_nowhere_inside(self):
+        rows = jnp.linspace(-0.5, 0.5, 21)
+        square = jnp.stack([*jnp.meshgrid(rows, rows, indexing="ij"), jnp.zeros((21, 21))], axis=-1)
+        square = square.reshape(-1, 3) + 0.001 * numbers(7, 441, 3)
+        inward = np.asarray(neighbourhoods(square, jnp.ones(441, bool)).inward)
+        rim, middle = np.asarray(square[:, 0] > 0.49), np.abs(np.asarray(square[:, :2])).max(axis=1) < 0.2
+        assert (inward[rim, 0] < -0.4).all()
+        assert np.linalg.norm(inward[middle], axis=1).max() < 0.3
+
     @pytest.mark.parametrize("points", [1, 2, 3, 12])
     def test_few_points_points_on_a_line_and_points_in_one_place_have_finite_planes(self, points):
         line = jnp.arange(points)[:, None] * jnp.array([[0.1, 0.05, 0.0]])
         for positions in (line, jnp.zeros((points, 3)), 1e-30 * line):
-            normals, spacing = planes(positions, jnp.arange(points) < max(points - 1, 1))
-            assert jnp.isfinite(normals).all()
-            assert (spacing >= surface.LEAST_SPACING).all()
+            around = neighbourhoods(positions, jnp.arange(points) < max(points - 1, 1))
+            assert all(jnp.isfinite(numbers).all() for numbers in around)
+            assert (around.spacing >= surface.LEAST_SPACING).all()
+            assert ((around.ratios >= 0) & (around.ratios <= 1)).all()
 
 
 class TestCells:
@@ -111,16 +132,25 @@ class TestSamples:
             assert bool(told.exists[s]) == (len(rows) > 0)
             if not len(rows):
                 continue
-            offset = (np.float64(positions[s]) - rows[:, :3]) / rows[:, 11:]
+            offset = (np.float64(positions[s]) - rows[:, :3]) / rows[:, 16:]
             away = np.linalg.norm(offset, axis=1)
             share = np.exp(-0.5 * (away**2 - away.min() ** 2))
             share /= share.sum()
             normal = rows[:, 3:6] * np.where(rows[:, 3:6] @ np.float64(directions[s]) > 0, -1, 1)[:, None]
+            height = np.sum(normal * offset, axis=1)
+            ahead = np.clip(height / np.maximum(-normal @ np.float64(directions[s]), surface.LEAST_FACING), -10, 10)
+            miss = np.minimum(np.linalg.norm(offset + ahead[:, None] * np.float64(directions[s]), axis=1), 10)
+            met = np.exp(-0.5 * (miss**2 - miss.min() ** 2))
             expected = {
-                "height": share @ np.sum(normal * offset, axis=1),
+                "ahead": met @ ahead / met.sum(),
+                "miss": miss.min(),
+                "outside": -share @ np.sum(rows[:, 11:14] * offset, axis=1),
+                "flatness": share @ rows[:, 14],
+                "narrowness": share @ rows[:, 15],
+                "height": share @ height,
                 "beside": np.linalg.norm(share @ offset),
                 "nearest": min(away.min(), surface.FAR),
-                "spacing": share @ rows[:, 11],
+                "spacing": share @ rows[:, 16],
                 "normal": share @ normal,
                 "base_color": share @ rows[:, 6:9],
                 "roughness": share @ rows[:, 9],
@@ -132,9 +162,36 @@ class TestSamples:
         positions = jnp.full((4, 3), 0.99)
         told = describe(estimate(ball(), COUNT), positions, *views(positions))
         assert not told.exists.any()
-        close(told.nearest, jnp.full(4, surface.FAR))
-        for name in ("height", "beside", "spacing", "normal", "base_color", "roughness", "metallic"):
+        close((told.nearest, told.miss), (jnp.full(4, surface.FAR),) * 2)
+        for name in (
+            "height",
+            "beside",
+            "ahead",
+            "outside",
+            "flatness",
+            "narrowness",
+            "spacing",
+            "normal",
+            "base_color",
+        ):
             assert (getattr(told, name) == 0).all(), name
+
+    def test_a_ray_is_told_where_it_meets_a_wall_and_how_far_from_the_walls_points(self):
+        rows = jnp.linspace(-0.5, 0.5, 21)
+        wall = jnp.stack([*jnp.meshgrid(rows, rows, indexing="ij"), jnp.zeros((21, 21))], axis=-1).reshape(1, -1, 3)
+        ones = jnp.ones((1, 441))
+        cloud = PointCloud(
+            positions=wall, base_color=0 * wall, roughness=ones, metallic=ones, mask=jnp.ones((1, 441), bool)
+        )
+        oblique = jnp.array([[0.6, 0.0, -0.8]])
+        for point in (wall[0, 220], wall[0, 220] + jnp.array([0.02, 0.02, 0.0])):
+            for distance in (0.04, -0.04):
+                told = describe(
+                    estimate(cloud, COUNT), (point - distance * oblique[0])[None], oblique, jnp.zeros(1, jnp.int32)
+                )
+                close(told.ahead * told.spacing, jnp.array([distance]), rtol=1e-3)
+                away = jnp.linalg.norm(point[None] - wall[0], axis=1).min()
+                close(told.miss * told.spacing, away[None], atol=2e-4)
 
     def test_height_is_positive_on_the_viewers_side_and_changes_sign_with_it(self):
         cloud = ball()
@@ -153,9 +210,10 @@ class TestSamples:
         """But for the spacing, and where a sample lies so near a border of cells that rounding moves it over."""
         cloud = ball()
         half = dataclasses.replace(cloud, positions=0.5 * cloud.positions)
-        whole, small = (planes(c.positions[0], c.mask[0]) for c in (cloud, half))
-        close(2 * small[1], whole[1])
-        close(jnp.abs(jnp.sum(small[0] * whole[0], axis=1)), jnp.ones(300), atol=1e-4)
+        whole, small = (neighbourhoods(c.positions[0], c.mask[0]) for c in (cloud, half))
+        close(2 * small.spacing, whole.spacing)
+        close(jnp.abs(jnp.sum(small.normals * whole.normals, axis=1)), jnp.ones(300), atol=1e-4)
+        close((small.inward, small.ratios), (whole.inward, whole.ratios), rtol=1e-3, atol=1e-4)
         order = np.random.default_rng(3).permutation(300)
         mixed = jax.tree.map(lambda x: x[:, order], cloud)
         positions = cloud.positions.reshape(-1, 3)[:50] + 0.02

@@ -7,7 +7,7 @@ import pytest
 import reference
 from laws import close, numbers
 
-from spnr_jax.nn.surface_field import DENSITY_SCALE, DIELECTRIC, SurfaceField
+from spnr_jax.nn.surface_field import DIELECTRIC, SHARPNESS, STRENGTH, SurfaceField
 from spnr_jax.numerics import normalize
 from spnr_jax.types import SurfaceSample
 
@@ -20,7 +20,12 @@ def sample(seed=0):
         height=numbers(seed, N),
         beside=numbers(seed + 1, N, low=0.0),
         nearest=numbers(seed + 2, N, low=0.0),
-        spacing=numbers(seed + 3, N, low=0.0, high=0.1),
+        ahead=numbers(seed + 8, N),
+        miss=numbers(seed + 9, N, low=0.0),
+        outside=numbers(seed + 10, N),
+        flatness=numbers(seed + 11, N, low=0.0),
+        narrowness=numbers(seed + 12, N, low=0.0),
+        spacing=numbers(seed + 3, N, low=0.01, high=0.1),
         normal=normalize(numbers(seed + 4, N, 3)),
         base_color=numbers(seed + 5, N, 3, low=0.0),
         roughness=numbers(seed + 6, N, low=0.0),
@@ -59,15 +64,17 @@ def test_density_and_radiance_are_those_of_the_layers_written_out(lit):
         return x @ params[name]["kernel"] + params[name].get("bias", 0)
 
     facing = -np.sum(surface.normal * d, axis=1)
-    scalars = (surface.height, surface.beside, surface.nearest, 10 * surface.spacing, facing)
-    scalars = np.stack([*scalars, surface.roughness, surface.metallic], axis=1)
+    lengths = (surface.height, surface.beside, surface.nearest, surface.ahead, surface.miss, surface.outside)
+    scalars = [*lengths, surface.flatness, surface.narrowness]
+    scalars = np.stack([*scalars, 10 * surface.spacing, facing, surface.roughness, surface.metallic], axis=1)
     mirrored = d + 2 * facing[:, None] * surface.normal
     inputs = np.concatenate([np.float64(X), scalars, surface.normal, surface.base_color, mirrored], axis=1)
-    near = reference.softplus(dense("near", inputs))
-    expected = DENSITY_SCALE * reference.softplus(dense("density", near)[:, 0] - 1)
-    close(density, np.where(sample().exists, expected, 0))
+    shape = reference.softplus(dense("shape", reference.softplus(dense("near", inputs))))
+    strength, shift = dense("density", shape).T
+    fog = STRENGTH * reference.softplus(strength) / (1 + np.exp(SHARPNESS * surface.height - shift))
+    close(density, np.where(sample().exists, fog * np.maximum(facing, 0) / surface.spacing, 0), rtol=1e-4)
     encoded = np.concatenate([d] + [f(d * 2**k) for k in range(2) for f in (np.sin, np.cos)], axis=1)
-    light = dense("light", reference.softplus(dense("deep", near) + dense("direction", encoded)))
+    light = dense("light", reference.softplus(dense("deep", shape) + dense("direction", encoded)))
     if lit:
         light, metal = reference.softplus(light), surface.metallic[:, None]
         diffuse = surface.base_color * (1 - metal) * light[:, :3]
@@ -90,6 +97,21 @@ def test_a_black_dielectric_reflects_light_and_a_black_metal_none():
     _, (metal,) = apply(module, variables, surface.replace(metallic=jnp.ones(N)))
     assert (plastic > 0).all()
     assert (metal == 0).all()
+
+
+def test_the_deeper_behind_the_surface_the_denser_and_a_ray_along_it_meets_nothing():
+    module, surface = field(lit=True), sample()
+    variables = weights(module)
+    told = jax.tree.map(lambda x: x, variables)
+    told["params"]["near"]["kernel"] = (
+        told["params"]["near"]["kernel"].at[len(X[0])].set(0)
+    )  # the network sees no height
+    facing = -jnp.ones(N) * 0.5
+    towards = surface.replace(exists=jnp.ones(N, bool), normal=facing[:, None] * DIRECTIONS)
+    densities = [apply(module, told, towards.replace(height=jnp.full(N, h)))[0] for h in (3.0, 0.5, 0.0, -0.5, -3.0)]
+    assert all((behind > before).all() for before, behind in zip(densities, densities[1:], strict=False))
+    across = jnp.cross(DIRECTIONS, jnp.array([0.0, 1.0, 0.0]))
+    close(apply(module, variables, towards.replace(normal=normalize(across)))[0], jnp.zeros(N), atol=1e-4)
 
 
 def test_where_no_point_is_near_nothing_is_dense():

@@ -1,5 +1,9 @@
 """Radiance field that sees the surface: density and colour at a place from the volume's feature and the nearest points.
 
+Density is fog behind the surface, nothing before it: strength * facing / spacing * sigmoid(shift - SHARPNESS * height),
+height and spacing of the points, strength and shift from the network.  A ray that meets the surface at a right angle
+and one that grazes it then pass as much fog per depth, so that outlines do not grow by the path along them.
+
 With `lit` the network does not invent colours, it predicts light.  Base colour b and metallic m of the points nearby
 give the specular colour at normal incidence, F0 = 0.04 (1 - m) + b m, and the radiance b (1 - m) E + F0 L in linear
 light, where E (diffuse light) and L (light from the mirrored direction) are positive outputs that see normal, roughness
@@ -18,7 +22,8 @@ from spnr_jax.numerics import clamp, softplus
 from spnr_jax.types import SurfaceSample
 
 DIELECTRIC = 0.04  # reflectance of plastic, wood, paint at normal incidence
-DENSITY_SCALE = 20.0  # fog of one unit of the network's output is opaque within a voxel or two
+STRENGTH = 4.0  # optical depth per spacing of depth, of one unit of the network's output
+SHARPNESS = 4.0  # the fog sets in within about half a spacing
 SPACING_SCALE = 10.0  # brings the spacing of a thousand points to the order of 1
 LEAST_OPACITY = 1e-6  # below it a ray is white, whatever its colour
 
@@ -32,9 +37,10 @@ class SurfaceField(nn.Module):
     lit: bool
 
     def setup(self) -> None:
-        """Layers: near -> density, near + direction -> deep -> light."""
+        """Layers: near -> shape -> density, shape + direction -> deep -> light."""
         self.near = nn.Dense(self.width)
-        self.density = nn.Dense(1)
+        self.shape = nn.Dense(self.width)
+        self.density = nn.Dense(2)
         self.deep = nn.Dense(self.width)
         self.light = nn.Dense(6 if self.lit else 3)
         self.direction = nn.Dense(self.width, use_bias=False)
@@ -55,13 +61,18 @@ class SurfaceField(nn.Module):
         """Density, 0 where no point is near, and linear radiance (sRGB colours unless `lit`) of each sample."""
         base, metallic = surface.base_color, surface.metallic[:, None]
         facing = -jnp.sum(surface.normal * directions, axis=-1)
-        lengths = (surface.height, surface.beside, surface.nearest, SPACING_SCALE * surface.spacing)
-        inputs = [x, jnp.stack([*lengths, facing, surface.roughness, surface.metallic], axis=-1), surface.normal, base]
+        lengths = (surface.height, surface.beside, surface.nearest, surface.ahead, surface.miss, surface.outside)
+        shape = (surface.flatness, surface.narrowness, SPACING_SCALE * surface.spacing, facing)
+        numbers = jnp.stack([*lengths, *shape, surface.roughness, surface.metallic], axis=-1)
+        inputs = [x, numbers, surface.normal, base]
         if self.sees_direction:
             inputs.append(directions + 2 * facing[:, None] * surface.normal)
-        near = softplus(self.near(jnp.concatenate(inputs, axis=-1)))
-        density = jnp.where(surface.exists, DENSITY_SCALE * softplus(self.density(near)[:, 0] - 1), 0)
-        light = self.light(softplus(self.deep(near) + view))
+        seen = softplus(self.shape(softplus(self.near(jnp.concatenate(inputs, axis=-1)))))
+        strength, shift = jnp.moveaxis(self.density(seen), -1, 0)
+        steep = jnp.maximum(facing, 0) / jnp.where(surface.exists, surface.spacing, 1)
+        behind = nn.sigmoid(shift - SHARPNESS * surface.height)
+        density = jnp.where(surface.exists, STRENGTH * softplus(strength) * steep * behind, 0)
+        light = self.light(softplus(self.deep(seen) + view))
         if not self.lit:
             return density, (nn.sigmoid(light),)
         diffuse, mirrored = jnp.split(softplus(light), 2, axis=-1)

@@ -96,7 +96,9 @@ class Viewer:
             browser.loop.stop()
 
 
-def open_viewer(cloud: Path, run: Path, *, host: str, port: int, num_points: int, up: str) -> tuple[Viewer, list[str]]:
+def open_viewer(
+    cloud: Path, run: Path | None, *, host: str, port: int, num_points: int, up: str
+) -> tuple[Viewer, list[str]]:
     """A running viewer of a file with a run's network, and what was assumed about the file, a line each.
 
     ValueError for a port that is in use, a host that is not of this machine, and whatever cannot be read.

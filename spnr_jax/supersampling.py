@@ -1,0 +1,41 @@
+"""Several rays a pixel, averaged as light is: what a picture smaller than those of the training needs.
+
+A network whose pixels do not depend on their neighbours has learnt what a ray of its training sees, a cone of one pixel
+there.  The pixels of a smaller picture are wider: each is the mean of the rays that it would have had in the training.
+"""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from spnr_jax.colors import linear_to_srgb, srgb_to_linear
+from spnr_jax.compositing import WHITE
+from spnr_jax.model_config import NetworkConfig
+from spnr_jax.numerics import clamp
+from spnr_jax.types import Rendering
+
+LEAST_OPACITY = 1e-6  # below it a pixel is white, whatever its colour
+
+
+def rays_per_side(config: NetworkConfig, size: int) -> int:
+    """Rays along each side of a pixel of a picture `size` pixels wide, so that they lie as close as in the training."""
+    return max(round(config.image_resolution / size), 1) if config.per_pixel else 1
+
+
+def averaged(rendering: Rendering, side: int) -> Rendering:
+    """The rendering with every square of side x side pixels averaged: the light of the object, its opacity, the depth.
+
+    Colours are averaged as linear light of the object alone and laid on white as sRGB, as the references are.
+    """
+    opacity, depth = rendering.acc[..., None], rendering.depth[..., None]
+    straight = clamp((rendering.image - (1 - opacity) * WHITE) / jnp.maximum(opacity, LEAST_OPACITY), 0.0, 1.0)
+    light, depth, acc = (mean_of_squares(x, side) for x in (opacity * srgb_to_linear(straight), depth, opacity))
+    straight = linear_to_srgb(clamp(light / jnp.maximum(acc, LEAST_OPACITY), 0.0, 1.0))
+    image = acc * straight + (1 - acc) * WHITE
+    return Rendering(image=image, image_lr=image, depth=depth[..., 0], acc=acc[..., 0])
+
+
+def mean_of_squares(x: Float[Array, "*batch height width features"], side: int) -> Float[Array, "*batch h w features"]:
+    """The mean of each square of side x side pixels."""
+    *batch, height, width, features = x.shape
+    squares = x.reshape(*batch, height // side, side, width // side, side, features)
+    return jnp.mean(squares, axis=(-4, -2))

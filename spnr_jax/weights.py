@@ -1,0 +1,97 @@
+"""Trained networks, and their file: one .npz of a config and the averaged weights as float16, a few megabytes at most.
+
+    config              the TrainConfig as JSON, in bytes
+    steps               of training
+    params/.../kernel   one array each, as they lie in the Linen variables
+
+The package holds the network that renders where no other is named (docs/model_card.md): `shipped` is its file.
+"""
+
+import io
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from importlib import resources
+from pathlib import Path
+
+import jax
+import numpy as np
+from flax.traverse_util import flatten_dict, unflatten_dict
+
+from spnr_jax import checkpoint, training
+from spnr_jax.config import TrainConfig, from_dict, to_dict
+from spnr_jax.images import write_whole
+from spnr_jax.numpy_files import read_arrays
+
+UNREADABLE = (ValueError, TypeError, AttributeError, ArithmeticError, RecursionError)  # a header of any content
+ADVICE = "write one with `spnr export RUN`"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trained:
+    """A network as evaluation and rendering use it: Linen variables with averaged weights, and where they come from."""
+
+    config: TrainConfig
+    variables: dict
+    steps: int
+
+
+def shipped() -> Path:
+    """The file of the network that the package holds."""
+    return Path(str(resources.files("spnr_jax") / "pretrained.npz"))
+
+
+def read_trained(source: Path | str | None, say: Callable[[str], None] = print, data: Path | str = "DATA") -> Trained:
+    """The network of a run folder's newest checkpoint or of a file of weights; None is the package's own.
+
+    ValueError, with what to do, if there is none; `say` gets a line for each broken checkpoint, `data` is named.
+    """
+    path = shipped() if source is None else Path(source)
+    if path.suffix == ".npz":
+        return read_weights(path)
+    config, state = checkpoint.load_run(path, say, data)
+    return Trained(config=config, variables=training.averaged_variables(state), steps=int(state.step))
+
+
+def write_weights(path: Path, trained: Trained) -> None:
+    """Writes the file; ValueError for weights that float16 cannot hold."""
+    arrays = {name: np.asarray(values) for name, values in flatten_dict(trained.variables, sep="/").items()}
+    halves = {name: values.astype(np.float16) for name, values in arrays.items()}
+    for name, values in halves.items():
+        if not np.isfinite(values).all():
+            raise ValueError(f"{path}: {name} reaches {np.abs(arrays[name]).max():.3g}, which float16 does not hold")
+    described = np.frombuffer(json.dumps(to_dict(trained.config)).encode(), np.uint8)
+    stream = io.BytesIO()
+    np.savez_compressed(stream, allow_pickle=False, config=described, steps=np.int64(trained.steps), **halves)
+    write_whole(path, stream.getvalue())
+
+
+def read_weights(path: Path) -> Trained:
+    """The network of a file, in float32; ValueError that says what is wrong with it."""
+    if not path.is_file():
+        raise ValueError(f"{path}: no such file of weights; {ADVICE}")
+    try:
+        with path.open("rb") as file:
+            header = read_arrays(file, ("config", "steps"))
+            config, steps = from_dict(json.loads(header["config"].tobytes())), int(header["steps"])
+            shapes = variable_shapes(config)
+            file.seek(0)
+            arrays = read_arrays(file, shapes)
+    except (*UNREADABLE, LookupError) as error:
+        raise ValueError(f"{path}: not a file of weights of this version ({error}); {ADVICE}") from None
+    for name, wanted in shapes.items():
+        found = arrays.get(name, np.zeros(0))
+        if found.shape != wanted.shape or found.dtype != np.float16 or not np.isfinite(found).all():
+            raise ValueError(
+                f"{path}: {name} should hold {wanted.shape} finite float16 numbers, not {found.shape} of {found.dtype};"
+                f" {ADVICE}"
+            )
+    variables = unflatten_dict({name: values.astype(np.float32) for name, values in arrays.items()}, sep="/")
+    return Trained(config=config, variables=variables, steps=steps)
+
+
+def variable_shapes(config: TrainConfig) -> dict[str, jax.ShapeDtypeStruct]:
+    """Shape of every weight of the config's network, by name."""
+    create = partial(training.network(config.model).init, jax.random.key(0))
+    return flatten_dict(jax.eval_shape(create, *training.example_inputs(config)), sep="/")
