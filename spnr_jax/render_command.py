@@ -22,7 +22,7 @@ class Render:
     """Folder for what is written."""
     up: Literal["auto", "x", "y", "z", "-x", "-y", "-z"] = "auto"
     """The file's upward axis; auto: by the format, else y or z, as the object would stand."""
-    num_points: int = 1024
+    num_points: int = 4096
     """Points used of a bigger cloud, evenly spread, or sampled from a mesh; fewer work too."""
     seed: int = 0
     """Seed of the points that are chosen."""

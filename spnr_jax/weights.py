@@ -16,6 +16,7 @@ from importlib import resources
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from flax.traverse_util import flatten_dict, unflatten_dict
 
@@ -57,10 +58,10 @@ def read_trained(source: Path | str | None, say: Callable[[str], None] = print, 
 def write_weights(path: Path, trained: Trained) -> None:
     """Writes the file; ValueError for weights that float16 cannot hold."""
     arrays = {name: np.asarray(values) for name, values in flatten_dict(trained.variables, sep="/").items()}
+    for name, values in arrays.items():
+        if not np.abs(values).max(initial=0) <= np.finfo(np.float16).max:
+            raise ValueError(f"{path}: {name} reaches {np.abs(values).max():.3g}, which float16 does not hold")
     halves = {name: values.astype(np.float16) for name, values in arrays.items()}
-    for name, values in halves.items():
-        if not np.isfinite(values).all():
-            raise ValueError(f"{path}: {name} reaches {np.abs(arrays[name]).max():.3g}, which float16 does not hold")
     described = np.frombuffer(json.dumps(to_dict(trained.config)).encode(), np.uint8)
     stream = io.BytesIO()
     np.savez_compressed(stream, allow_pickle=False, config=described, steps=np.int64(trained.steps), **halves)
@@ -74,7 +75,10 @@ def read_weights(path: Path) -> Trained:
     try:
         with path.open("rb") as file:
             header = read_arrays(file, ("config", "steps"))
-            config, steps = from_dict(json.loads(header["config"].tobytes())), int(header["steps"])
+            described, steps = json.loads(header["config"].tobytes()), int(header["steps"])
+            if not isinstance(described, dict):
+                raise ValueError("its config is no JSON object")
+            config = from_dict(described)
             shapes = variable_shapes(config)
             file.seek(0)
             arrays = read_arrays(file, shapes)
@@ -87,7 +91,7 @@ def read_weights(path: Path) -> Trained:
                 f"{path}: {name} should hold {wanted.shape} finite float16 numbers, not {found.shape} of {found.dtype};"
                 f" {ADVICE}"
             )
-    variables = unflatten_dict({name: values.astype(np.float32) for name, values in arrays.items()}, sep="/")
+    variables = unflatten_dict({name: jnp.asarray(values, jnp.float32) for name, values in arrays.items()}, sep="/")
     return Trained(config=config, variables=variables, steps=steps)
 
 

@@ -12,7 +12,7 @@ import tiny_untrained
 import yaml
 
 import spnr_jax
-from spnr_jax import export
+from spnr_jax import export, weights
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -49,7 +49,8 @@ def test_the_readmes_example_draws_a_picture(workplace):
     assert (workplace / "ball.png").stat().st_size > 100
 
 
-def test_the_examples_of_the_twelve_functions_run_in_their_order(workplace):
+def test_the_examples_of_the_twelve_functions_run_in_their_order(workplace, monkeypatch):
+    monkeypatch.setattr(weights, "shipped", tiny_untrained.run)  # the README's example draws with the package's network
     names = execute(DOCS / "api.md")
     assert int(names["state"].step) == 1
     assert "ours" in names["outcome"].summary["methods"]

@@ -1,0 +1,65 @@
+"""The package's network is made again from two data sets joined into one, and what is there is reused."""
+
+import dataclasses
+import json
+import shutil
+
+import pytest
+import tiny_dataset
+
+from experiments import pretrain
+from spnr_jax import cli, data, presets, weights
+
+CONFIG = dataclasses.replace(
+    tiny_dataset.CONFIG, loss=dataclasses.replace(tiny_dataset.CONFIG.loss, adversarial_weight=0.0)
+)
+
+
+@pytest.fixture
+def asked(monkeypatch):
+    """Instead of Mitsuba, the tests' data set, its objects under other names for the meshes; what was to be made."""
+    configs = []
+
+    def generate(generation):
+        configs.append(generation)
+        if generation.out.exists():
+            return
+        shutil.copytree(tiny_dataset.dataset().folder, generation.out)
+        if generation.meshes:
+            for path in sorted((generation.out / "objects").iterdir()):
+                path.rename(path.with_name(f"mesh-{path.name}"))
+            for path in (generation.out / "splits").iterdir():
+                path.write_text("".join(f"mesh-{name}\n" for name in path.read_text().split()))
+
+    monkeypatch.setattr(pretrain, "generate", generate)
+    monkeypatch.setattr(presets, "plus_small", lambda: CONFIG)
+    monkeypatch.setattr(cli, "enable_compilation_cache", lambda: None)
+    return configs
+
+
+def test_both_data_sets_train_one_network_and_its_file_is_what_was_scored(asked, tmp_path, capsys):
+    options = pretrain.Pretrain(out=tmp_path / "out", meshes=tmp_path, test_list=tmp_path / "test.txt")
+    pretrain.main(options)
+    procedural, meshes = asked
+    assert (procedural.objects, procedural.meshes, procedural.colour_variants) == (2400, None, 0)
+    assert (meshes.meshes, meshes.colour_variants, meshes.reshape_variants) == (tmp_path, 8, True)
+    assert meshes.test_list == tmp_path / "test.txt"
+    joined, single = data.open_dataset(options.out / "data"), tiny_dataset.dataset()
+    for split, names in single.splits.items():
+        assert set(joined.splits[split]) == {*names, *(f"mesh-{name}" for name in names)}
+    assert data.read_object(joined, f"mesh-{single.splits['test'][0]}").images.size
+    trained = weights.read_trained(options.out / "pretrained.npz")
+    assert (trained.config, trained.steps) == (CONFIG, CONFIG.num_steps)
+    scored = json.loads((options.out / "metrics.json").read_text())
+    assert scored["methods"]["ours"]["objects"] == len(joined.splits["test"])
+    assert "report.html" in capsys.readouterr().out
+
+    pretrain.main(options)
+    again = json.loads((options.out / "metrics.json").read_text())
+    assert again["methods"] == scored["methods"]
+    assert again["seconds"].get("train") == scored["seconds"].get("train")
+
+
+def test_without_meshes_the_procedural_objects_train_alone(asked, tmp_path):
+    parts = pretrain.data_sets(pretrain.Pretrain(out=tmp_path, objects=5), 128)
+    assert [(part.objects, part.resolution, part.meshes) for part in parts] == [(5, 128, None)]

@@ -1,0 +1,110 @@
+"""A network in one file: the same pictures as from its run, and one line for whatever is wrong with the file."""
+
+import dataclasses
+import io
+import zipfile
+
+import jax
+import numpy as np
+import pytest
+import tiny_untrained
+import tiny_viewer
+from laws import close
+
+from spnr_jax import checkpoint, model, training, weights
+from spnr_jax.config import TrainConfig
+
+
+@pytest.fixture(scope="module")
+def trained() -> weights.Trained:
+    return weights.read_trained(tiny_untrained.run())
+
+
+@pytest.fixture
+def file(trained, tmp_path):
+    weights.write_weights(tmp_path / "w.npz", trained)
+    return tmp_path / "w.npz"
+
+
+def rewritten(file, **changes):
+    """The file with other arrays; None leaves one out."""
+    arrays = dict(np.load(file, allow_pickle=False)) | changes
+    np.savez(file, allow_pickle=False, **{name: values for name, values in arrays.items() if values is not None})
+
+
+def test_what_is_read_is_the_run_rounded_to_half_precision(trained, file):
+    config, state = checkpoint.load_run(tiny_untrained.run())
+    read = weights.read_trained(file)
+    assert (read.config, read.steps) == (config, int(state.step))
+    close(read.variables, jax.tree.map(np.asarray, training.averaged_variables(state)), rtol=1e-3, atol=1e-4)
+    halved = jax.tree.map(lambda x: np.asarray(x, np.float16).astype(np.float32), trained.variables)
+    jax.tree.map(np.testing.assert_array_equal, read.variables, halved)
+
+
+def test_the_handle_draws_from_a_file_what_it_draws_from_the_run(file):
+    cloud, pictures = tiny_viewer.cloud(), []
+    for source in (tiny_untrained.run(), file):
+        handle = model.load(source)
+        volume = handle.encode(cloud)
+        pictures.append(np.asarray(handle.render(volume, handle.camera(volume)).image))
+    assert pictures[0].std() > 0.01
+    np.testing.assert_allclose(*pictures, atol=5e-3)
+
+
+def test_every_weight_of_a_network_has_its_shape_by_name(trained):
+    found = {name: x.shape for name, x in weights.flatten_dict(trained.variables, sep="/").items()}
+    assert {name: x.shape for name, x in weights.variable_shapes(trained.config).items()} == found
+
+
+def test_weights_that_half_precision_does_not_hold_are_refused_and_nothing_is_written(trained, tmp_path):
+    large = dataclasses.replace(trained, variables=jax.tree.map(lambda x: x * 0 + 7e4, trained.variables))
+    with pytest.raises(ValueError, match=r"reaches 7e\+04, which float16 does not hold"):
+        weights.write_weights(tmp_path / "w.npz", large)
+    assert not list(tmp_path.iterdir())
+
+
+class TestBrokenFiles:
+    def reason(self, file):
+        with pytest.raises(ValueError, match=rf"^{file}: ") as error:
+            weights.read_trained(file)
+        assert "\n" not in str(error.value)
+        assert "spnr export RUN" in str(error.value)
+        return str(error.value)
+
+    def test_no_such_file(self, tmp_path):
+        assert "no such file" in self.reason(tmp_path / "none.npz")
+
+    @pytest.mark.parametrize("content", [b"", b"weights", b"PK\x03\x04 and no more"])
+    def test_no_archive(self, tmp_path, content):
+        (tmp_path / "w.npz").write_bytes(content)
+        self.reason(tmp_path / "w.npz")
+
+    def test_half_a_file(self, file):
+        file.write_bytes(file.read_bytes()[:-200])
+        self.reason(file)
+
+    @pytest.mark.parametrize("config", [b"", b"{", b"[1]", b"{}", b'{"preset": 3}', b"[" * 10000])
+    def test_another_header(self, file, config):
+        rewritten(file, config=np.frombuffer(config, np.uint8))
+        self.reason(file)
+
+    def test_no_header(self, file):
+        rewritten(file, steps=None)
+        self.reason(file)
+
+    def test_a_weight_that_is_missing_or_of_another_shape_type_or_not_finite(self, file):
+        name = next(name for name in np.load(file).files if name.startswith("params/unet"))
+        values = np.load(file)[name]
+        for wrong in (None, values[..., :1], values.astype(np.float32), np.full_like(values, np.nan)):
+            rewritten(file, **{name: wrong})
+            assert name in self.reason(file)
+            rewritten(file, **{name: values})
+        assert isinstance(weights.read_trained(file).config, TrainConfig)
+
+    def test_a_pickle_is_not_opened(self, file):
+        stream = io.BytesIO()
+        np.save(stream, np.array([print], dtype=object), allow_pickle=True)
+        with zipfile.ZipFile(file, "w") as archive:
+            archive.writestr("config.npy", stream.getvalue())
+            archive.writestr("steps.npy", stream.getvalue())
+        assert "objects" in self.reason(file)
