@@ -44,6 +44,7 @@ Row = Literal[
     "twelve_neighbours",
     "batch_norm",
     "no_opacity_loss",
+    "no_squared_error",
 ]
 ROWS: tuple[Row, ...] = Row.__args__  # type: ignore[attr-defined]
 REFERENCE = "reference"
@@ -64,6 +65,7 @@ LABELS = {
     "twelve_neighbours": "12 nearest points",
     "batch_norm": "PointNet: batch normalisation",
     "no_opacity_loss": "No loss of opacity",
+    "no_squared_error": "L1 alone",
 }
 
 
@@ -128,7 +130,11 @@ def changed(row: Row, config: TrainConfig) -> TrainConfig:
             "three_neighbours": {"num_neighbors": 3},
             "twelve_neighbours": {"num_neighbors": 12},
         }
-    loss: dict[Row, dict] = {"no_condition": {"condition": False}, "no_opacity_loss": {"opacity_weight": 0.0}}
+    loss: dict[Row, dict] = {
+        "no_condition": {"condition": False},
+        "no_opacity_loss": {"opacity_weight": 0.0},
+        "no_squared_error": {"mse_weight": 0.0},
+    }
     if row in loss:
         return dataclasses.replace(config, loss=dataclasses.replace(config.loss, **loss[row]))
     return dataclasses.replace(config, model=dataclasses.replace(config.model, **model.get(row, {})))

@@ -14,7 +14,8 @@ from experiments.training_runs import Budget, Compared
 from spnr_jax import checkpoint, cli, data, evaluation, presets, trainer, training
 from spnr_jax.config import to_dict
 
-PLUS_ROWS = ("free_colour", "no_neighbours", "three_neighbours", "twelve_neighbours", "batch_norm", "no_opacity_loss")
+PLUS_ROWS = ("free_colour", "no_neighbours", "three_neighbours", "twelve_neighbours", "batch_norm")
+PLUS_ROWS += ("no_opacity_loss", "no_squared_error")
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -67,6 +68,7 @@ class TestRows:
             "twelve_neighbours": {"model.num_neighbors": 12},
             "batch_norm": {"model.point_norm": "batch"},
             "no_opacity_loss": {"loss.opacity_weight": 0.0},
+            "no_squared_error": {"loss.mse_weight": 0.0},
         }
         assert {row: self.changes(row, presets.plus_tiny()) for row in PLUS_ROWS} == expected
 
