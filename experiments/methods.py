@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from experiments.table1_report import LABELS
-from spnr_jax import checkpoint, data, evaluation, training
+from spnr_jax import data, evaluation, weights
 from spnr_jax.config import TrainConfig
 from spnr_jax.model_config import METHODS, ModelConfig
 
@@ -19,7 +19,7 @@ class Sources:
     """Where the networks are."""
 
     runs: tuple[Path, ...] = ()
-    """Run folders."""
+    """Run folders, or files of weights."""
     table1: Path | None = None
     """Folder of a table that experiments.table1 made; its runs are taken too."""
 
@@ -71,18 +71,20 @@ def name_of(method: str, run: Path, shared: bool) -> str:
 
 
 def load(run: Path, dataset: data.Dataset) -> Network:
-    """The averaged network of a run's newest checkpoint, whose pictures have the size of the data set's."""
-    config, state = checkpoint.load_run(run, data=dataset.folder)
-    data.check_resolution(data.read_object(dataset, dataset.splits["test"][0]), config)
+    """The averaged network of a run's newest checkpoint or a file of weights, fit for the size of the pictures."""
+    trained = weights.read_trained(run, data=dataset.folder)
+    config = trained.config
+    if not config.model.per_pixel:
+        data.check_resolution(data.read_object(dataset, dataset.splits["test"][0]), config)
     method = next(name for name, kind in METHODS.items() if isinstance(config.model, kind))
     if isinstance(config.model, ModelConfig) and config.model.num_neighbors:
         method = "plus"
     return Network(
         method=method,
         config=config,
-        variables=training.averaged_variables(state),
-        steps=int(state.step),
-        checksum=hashlib.sha256((run / "config.json").read_bytes()).hexdigest(),
+        variables=trained.variables,
+        steps=trained.steps,
+        checksum=hashlib.sha256((run if run.is_file() else run / "config.json").read_bytes()).hexdigest(),
     )
 
 

@@ -1,6 +1,7 @@
 """The wheel holds the two packages and nothing else, and draws a picture where nothing but its dependencies is."""
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -13,6 +14,8 @@ import pytest
 import tiny_dataset
 import tiny_untrained
 from PIL import Image
+
+from data_gen import command
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -65,6 +68,11 @@ def clean_environment(**variables):
     return kept | variables
 
 
+def test_the_data_command_knows_the_packages_of_its_extra():
+    wanted = PROJECT["optional-dependencies"]["data"]
+    assert sorted(command.PACKAGES) == sorted(re.match(r"[\w-]+", entry)[0] for entry in wanted)
+
+
 def test_importing_the_package_brings_no_slow_module_along():
     code = f"import sys, spnr_jax; print(*({SLOW!r} & set(sys.modules)))"
     assert not output_of(sys.executable, "-c", code, cwd=ROOT).split()
@@ -99,13 +107,13 @@ def test_in_an_empty_environment_the_wheel_renders_clouds_and_meshes(environment
         assert package not in listed.split(), "an extra's package came along"
     shutil.copy(tiny_dataset.dataset().folder / "objects" / "chair" / "points.ply", tmp_path / "cloud.ply")
     (tmp_path / "mesh.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n")
-    options = f"--run {tiny_untrained.run()} --views 1 --frames 2 --num-points 64 --out pictures".split()
+    options = "--views 1 --frames 2 --num-points 64 --resolution 32 --out pictures".split()
     variables = clean_environment(JAX_COMPILATION_CACHE_DIR=str(tmp_path / "cache"))
     for name in ("cloud.ply", "mesh.obj"):
         output_of(environment / "spnr", "render", name, *options, cwd=tmp_path, env=variables)
         with Image.open(tmp_path / "pictures" / f"{Path(name).stem}_000.png") as picture:
             pixels = np.asarray(picture)
-        assert pixels.shape == (tiny_dataset.SIZE, tiny_dataset.SIZE, 3)
+        assert pixels.shape == (32, 32, 3)
         assert pixels.min() < 250, "all white"
         assert (tmp_path / "pictures" / f"{Path(name).stem}_turntable.gif").is_file()
 
@@ -113,12 +121,16 @@ def test_in_an_empty_environment_the_wheel_renders_clouds_and_meshes(environment
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "extra"),
-    [(("view", "cloud.ply", "--run", "RUN"), "viewer"), (("export", "RUN", "--out", "out"), "export")],
+    [
+        (("spnr", "view", "cloud.ply"), "viewer"),
+        (("spnr", "export", "RUN", "--out", "out"), "export"),
+        (("spnr-data", "generate", "out"), "data"),
+    ],
 )
 def test_what_needs_an_extra_says_so_in_one_line(environment, tmp_path, arguments, extra):
-    words = [str(tiny_untrained.run()) if word == "RUN" else word for word in arguments]
+    program, *words = [str(tiny_untrained.run()) if word == "RUN" else word for word in arguments]
     done = subprocess.run(
-        [environment / "spnr", *words], capture_output=True, text=True, cwd=tmp_path,
+        [environment / program, *words], capture_output=True, text=True, cwd=tmp_path,
         env=clean_environment(JAX_COMPILATION_CACHE_DIR=str(tmp_path / "cache")),
     )  # fmt: skip
     assert done.returncode == 2
