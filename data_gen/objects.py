@@ -78,7 +78,8 @@ def make_record(bench: Workbench, task: Task) -> records.ObjectRecord:
 
 def make_asset(task: Task, seed: int) -> tuple[Asset, dict]:
     """Return the object as it is rendered and sampled, and what was done to it as it stands in object.json."""
-    asset, seeds, details = load_asset(task, seed), object_seeds(seed, task.object_id), {"colour_rotation": None}
+    asset, seeds = load_asset(task, seed), object_seeds(seed, task.object_id)
+    details: dict = {"colour_rotation": None}
     if task.colour_variant:
         asset, rotation = augmentation.rotate_colours(asset, seeds["colours"])
         details["colour_rotation"] = rotation.describe()

@@ -16,6 +16,7 @@ import json
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -83,7 +84,7 @@ def main(options: Flicker) -> None:
     for number, name in enumerate(names, start=1):
         item = data.read_object(dataset, name)
         place = options.out / "frames" / f"{name}.npz"
-        references, distances = kept(place, lambda item=item: true_frames(options, dataset, item, camera))
+        references, distances = kept(place, partial(true_frames, options, dataset, item, camera))
         shown = {REFERENCE: references.astype(np.float32) / 255}
         for label, network in networks.items():
             shown[label] = frames_of(network, item, camera)

@@ -59,6 +59,8 @@ class ManyObjects:
     """Objects that are encoded and rendered at once, one view each."""
     rounds: int = 6
     """Turns of every form when it is timed."""
+    map: bool = True
+    """Whether jax.lax.map is tried too; on a CPU it can take many times as long as the other forms together."""
     seed: int = 0
     """First seed."""
     quick: bool = False
@@ -70,6 +72,11 @@ class ManyObjects:
         for name in ("runs", "steps", "objects", "rounds"):
             if getattr(self, name) < 1:
                 raise ValueError(f"--{name}: expected 1 or more, got {getattr(self, name)}")
+
+    @property
+    def forms(self) -> tuple[Form, ...]:
+        """The forms that train."""
+        return FORMS if self.map else FORMS[:2]
 
 
 def main(options: ManyObjects) -> None:
@@ -88,13 +95,14 @@ def main(options: ManyObjects) -> None:
         "steps": options.steps,
         "objects": options.objects,
         "rounds": options.rounds,
+        "map": options.map,
         "seed": options.seed,
         "data": run_record.checksum(dataset),
     }
     claims.claim(options.out / "many_objects.json", asked, "many objects")
     seeds = range(options.seed, options.seed + options.runs)
     start = many_runs.create(config, seeds)
-    trained = {form: train(form, options.out, dataset, config, seeds, start) for form in FORMS}
+    trained = {form: train(form, options.out, dataset, config, seeds, start) for form in options.forms}
     pace = kept(options.out / "pace.json", partial(measure_pace, options, dataset, config, seeds, start))
     render = kept(options.out / "render.json", partial(measure_rendering, options, dataset, config, names, start))
     results = asked | {
@@ -102,7 +110,7 @@ def main(options: ManyObjects) -> None:
         "parameters": sum(x[0].size for x in jax.tree.leaves(start.generator)),
         "batch objects": config.batch_objects,
         "losses": {form: losses.tolist() for form, (_, losses) in trained.items()},
-        "apart from the loop": {form: equality(trained, form) for form in FORMS[1:]},
+        "apart from the loop": {form: equality(trained, form) for form in options.forms[1:]},
         "pace": pace,
         "render": render,
     }
@@ -171,7 +179,7 @@ def measure_pace(
     found = {}
     for phase, adversarial in phases.items():
         turns = {}
-        for form in FORMS:
+        for form in options.forms:
             step, piece = many_runs.form_step(form, config, adversarial), many_runs.entered_batch(form, batch)
             turns[form] = partial(turn, step, [many_runs.entered_states(form, start)], piece)
         found[phase] = in_turns(turns, options.rounds)

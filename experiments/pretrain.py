@@ -13,6 +13,7 @@ import json
 import os
 import sys
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import tyro
@@ -60,7 +61,7 @@ def main(options: Pretrain) -> None:
     parts = data_sets(options, config.model.image_resolution)
     for part in parts:
         print(f"generating {part.out}", flush=True)
-        seconds.measure("generate", lambda part=part: generate(part))
+        seconds.measure("generate", partial(generate, part))
     dataset = data.open_dataset(joined(options.out / "data", [Path(part.out) for part in parts]))
     run = options.out / "run"
     print(f"training preset {config.preset} for {config.num_steps} steps in {run}", flush=True)

@@ -107,12 +107,20 @@ def save(run: Path, state: training.TrainState) -> None:
         ) from None
 
 
-def restore(run: Path, config: TrainConfig, say: Callable[[str], None] = print) -> training.TrainState | None:
-    """The newest readable state of a run, None if it has none; `say` gets a line for each broken checkpoint."""
+def restore(
+    run: Path,
+    config: TrainConfig,
+    say: Callable[[str], object] = print,
+    sharding: jax.sharding.Sharding | None = None,
+) -> training.TrainState | None:
+    """The newest readable state of a run, None if it has none; `say` gets a line for each broken checkpoint.
+
+    The state lies where `sharding` says, by default on the first device, wherever it lay when it was saved.
+    """
     folder = run / "checkpoints"
     if not folder.is_dir():
         return None
-    sharding = jax.sharding.SingleDeviceSharding(jax.devices()[0])
+    sharding = sharding or jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
     like = jax.tree.map(
         lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding),
         jax.eval_shape(lambda: training.create_state(config)),

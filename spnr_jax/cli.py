@@ -8,6 +8,7 @@ import dataclasses
 import importlib.util
 import io
 import json
+import os
 import re
 import sys
 import time
@@ -43,6 +44,16 @@ class Train:
     """Steps between preview images with validation scores."""
     checkpoint_every: int = 500
     """Steps between checkpoints."""
+    distributed: bool = False
+    """One of several processes that a launcher started (SLURM, Open MPI, Kubernetes) and that train together."""
+    coordinator: str | None = None
+    """Without a launcher: HOST:PORT at which process 0 is found by all; with --num-processes and --process-id."""
+    num_processes: int | None = None
+    """Processes that train together."""
+    process_id: int | None = None
+    """Which of them this is, from 0."""
+    depth_devices: int = 1
+    """Devices that share each volume, cut along one axis, if it is too big for one."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,9 +63,9 @@ class Evaluate:
     data: tyro.conf.Positional[Path]
     """Folder of the data set."""
     run: tyro.conf.Positional[Path]
-    """Folder of the run."""
+    """Folder of the run, or a file of weights."""
     out: Path | None = None
-    """Folder for metrics.json and report.html (default: the run)."""
+    """Folder for metrics.json and report.html (default: the run, or the name of the file without its suffix)."""
     split: Literal["train", "val", "test"] = "test"
     """Objects to score."""
     gallery: int = 16
@@ -77,12 +88,12 @@ class ConvertLpips:
 
 @dataclass(frozen=True, kw_only=True)
 class Export:
-    """Write a network as functions for JAX without this package, and as StableHLO for other compilers."""
+    """Write a network as a file of weights, as functions for JAX without this package, and as StableHLO."""
 
     run: tyro.conf.Positional[Path]
     """Run folder whose network is exported."""
     out: Path = Path("exported")
-    """Folder for encode.jax, render.jax, both as .stablehlo, and export.json, which says what they take and give."""
+    """Folder for weights.npz, encode.jax, render.jax, both as .stablehlo, and export.json: what they take and give."""
     num_points: int = 1024
     """Points of a cloud, padding included; exactly so many."""
     resolution: int | None = None
@@ -101,13 +112,13 @@ class View:
 
     cloud: tyro.conf.Positional[Path]
     """What `spnr render` reads."""
-    run: Path
-    """Run folder whose network renders."""
+    run: Path | None = None
+    """Run folder, or file of weights, whose network renders (default: the network in the package)."""
     host: str = "127.0.0.1"
     """Address to listen on; another than this machine's own opens the viewer to a network."""
     port: int = 8080
     """Port to listen on; 0 takes any free one."""
-    num_points: int = 1024
+    num_points: int = 4096
     """Points used of a bigger cloud or sampled from a mesh; fewer work too."""
     up: Literal["auto", "x", "y", "z", "-x", "-y", "-z"] = "auto"
     """The file's upward axis; auto looks for it, and says what it found."""
@@ -127,7 +138,18 @@ Command = Train | Evaluate | Render | View | Export | Runs | ConvertLpips
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line."""
     arguments = sys.argv[1:] if arguments is None else arguments
-    sys.exit(guarded(lambda: run(parse(arguments)), "spnr"))
+    code = guarded(lambda: run(parse(arguments)), "spnr")
+    if code == 2 and _one_of_several():
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)  # JAX would wait for the other processes, which wait for this one
+    sys.exit(code)
+
+
+def _one_of_several() -> bool:
+    import jax
+
+    return jax.distributed.is_initialized() and jax.process_count() > 1
 
 
 def guarded(work: Callable[[], None], name: str) -> int:
@@ -209,14 +231,21 @@ def enable_compilation_cache() -> None:
 
 def run_train(command: Train) -> None:
     """`spnr train`."""
-    from spnr_jax import data, trainer
+    import jax
 
+    from spnr_jax import data, distributed, trainer
+
+    address = command.coordinator, command.num_processes, command.process_id
+    if command.distributed or address != (None, None, None):
+        distributed.initialize(*address)
+    mesh = distributed.device_mesh(command.depth_devices) if jax.device_count() > 1 else None
     dataset = data.open_dataset(command.data)
     schedule = trainer.Schedule(
         log_every=command.log_every, preview_every=command.preview_every, checkpoint_every=command.checkpoint_every
     )
-    trainer.train(command.config, dataset, command.run, schedule)
-    print(f"trained: {command.run} (score it with `spnr evaluate {command.data} {command.run}`)")
+    trainer.train(command.config, dataset, command.run, schedule, mesh)
+    if distributed.leads():
+        print(f"trained: {command.run} (score it with `spnr evaluate {command.data} {command.run}`)")
 
 
 def run_evaluate(command: Evaluate) -> None:
@@ -228,7 +257,7 @@ def run_evaluate(command: Evaluate) -> None:
     dataset = data.open_dataset(command.data)
     weights = None if command.lpips is None else lpips_weights.read_weights(command.lpips)
     outcome = evaluation.evaluate(command.run, dataset, command.split, command.gallery, weights=weights)
-    out = command.out or command.run
+    out = command.out or (command.run.with_suffix("") if command.run.suffix == ".npz" else command.run)
     seconds = dict.fromkeys(("evaluate", "total"), round(time.monotonic() - start, 1))
     write_results(out, outcome, dataset.settings, trainer.read_rows(command.run), seconds)
     print("\n".join(text_table(outcome.summary["methods"])))
@@ -257,10 +286,12 @@ def run_view(command: View) -> None:
 
 def run_export(command: Export) -> None:
     """`spnr export`."""
-    from spnr_jax import export, model
+    from spnr_jax import export, model, weights
     from spnr_jax.images import write_whole
 
-    handle, where = model.load(command.run), command.platforms
+    trained, where = weights.read_trained(command.run), command.platforms
+    handle = model.Model(config=trained.config.model, variables=trained.variables)
+    weights.write_weights(command.out / "weights.npz", trained)
     functions = {
         "encode": export.export_encode(handle, num_points=command.num_points, platforms=where),
         "render": export.export_render(
@@ -272,7 +303,7 @@ def run_export(command: Export) -> None:
         write_whole(command.out / f"{name}.stablehlo", export.stablehlo(content))
     signatures = {name: export.signature(content) for name, content in functions.items()}
     write_whole(command.out / "export.json", (json.dumps(signatures, indent=1) + "\n").encode())
-    print(f"wrote encode and render to {command.out} (export.json says what they take and give)")
+    print(f"wrote weights.npz, encode and render to {command.out} (export.json says what they take and give)")
 
 
 def run_runs(command: Runs) -> None:

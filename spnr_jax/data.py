@@ -7,14 +7,18 @@ ahead, in threads.
 """
 
 import dataclasses
+import errno
 import functools
 import io
 import json
+import os
 import threading
+import time
 import warnings
 from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image, UnidentifiedImageError
@@ -27,6 +31,9 @@ from spnr_jax.types import Batch, Camera, PointCloud
 CACHE_BYTES = 2**31  # decoded objects kept in memory
 # what a file that breaks its rules makes its reader raise; Pillow raises SyntaxError
 UNREADABLE = (OSError, ValueError, LookupError, TypeError, ArithmeticError, AttributeError, RecursionError, SyntaxError)
+# errors of a network drive that is away for a moment, and the seconds after which its file is read again
+PASSING = (errno.EIO, errno.ESTALE, errno.ETIMEDOUT, errno.EAGAIN, errno.ENOTCONN)
+PAUSES = (0.1, 0.5, 2.0)
 READERS, READ_AHEAD = 2, 4  # threads that assemble batches, and batches ready or in work
 ORDER, POINTS_AND_VIEWS = 1, 2  # streams of random numbers under one seed: (0, 5) and (0, 5, 0) alone would be the same
 
@@ -84,8 +91,8 @@ def open_dataset(folder: Path | str) -> Dataset:
 def read_object(dataset: Dataset, name: str) -> ObjectData:
     """One object of the data set; ValueError names the file that is missing or broken."""
     folder = dataset.folder / "objects" / name
-    read = _reader_of(folder) if dataset.shards is None else read_files(dataset.shards, name).__getitem__
-    file = "transforms.json"
+    shards, file = dataset.shards, "transforms.json"
+    read = _reader_of(folder) if shards is None else patiently(lambda: read_files(shards, name)).__getitem__
     try:
         meta = json.loads(read(file))
         with np.errstate(over="ignore"):  # what leaves float32 is infinite, and refused
@@ -111,7 +118,19 @@ def read_object(dataset: Dataset, name: str) -> ObjectData:
 
 
 def _reader_of(folder: Path) -> Callable[[str], bytes]:
-    return lambda file: (folder / file).read_bytes()
+    return lambda file: patiently((folder / file).read_bytes)
+
+
+def patiently(read: Callable[[], Any]) -> Any:
+    """What `read` returns; it is called again after each of PAUSES while it fails with one of the errors PASSING."""
+    for pause in PAUSES:
+        try:
+            return read()
+        except (OSError, ValueError) as error:  # of shards the error's number is in the text alone
+            if not any(os.strerror(number) in str(error) for number in PASSING):
+                raise
+        time.sleep(pause)
+    return read()
 
 
 def _rgba(content: bytes, height: int, width: int) -> np.ndarray:
@@ -141,10 +160,13 @@ def choose_points(cloud: PointCloud, count: int, size: int, generator: np.random
     return clouds.pad(subset, size)
 
 
-def make_batch(objects: list[ObjectData], config: TrainConfig, step: int) -> Batch:
-    """The training batch of these objects at this step: random points and random views of each."""
+def make_batch(objects: list[ObjectData], config: TrainConfig, step: int, place: int = 0) -> Batch:
+    """The training batch of these objects at this step: random points and random views of each.
+
+    They are those from `place` on in the global batch; what is drawn for an object depends on its place there.
+    """
     clouds_of, views_of = [], []
-    for i, data in enumerate(objects):
+    for i, data in enumerate(objects, start=place):
         generator = np.random.default_rng((config.seed, POINTS_AND_VIEWS, step, i))
         low, high = np.log2(config.min_points), np.log2(config.max_points)
         count = round(2 ** generator.uniform(low, high))
@@ -183,18 +205,22 @@ def epoch_order(seed: int, epoch: int, count: int) -> np.ndarray:
 
 
 def batches(
-    dataset: Dataset, config: TrainConfig, first_step: int, cache_bytes: int = CACHE_BYTES
+    dataset: Dataset, config: TrainConfig, first_step: int, cache_bytes: int = CACHE_BYTES, own: range | None = None
 ) -> Generator[Batch, None, None]:
-    """Training batches from `first_step` on, read and assembled ahead; an error is raised where its batch would be."""
+    """Training batches from `first_step` on, read and assembled ahead; an error is raised where its batch would be.
+
+    With `own` only these places of each batch: the same objects, points and views as in the whole one.
+    """
     import grain
 
     names = dataset.splits["train"]
     if not names:
         raise ValueError(f"{dataset.folder}: the train split is empty; generate more objects")
-    read = cached_reader(dataset, config, cache_bytes)
+    read, own = cached_reader(dataset, config, cache_bytes), own or range(config.batch_objects)
 
     def assemble(step: int) -> Batch:
-        return make_batch([read(name) for name in object_names(names, config, step)], config, step)
+        chosen = object_names(names, config, step)[own.start : own.stop]
+        return make_batch([read(name) for name in chosen], config, step, own.start)
 
     steps = grain.MapDataset.range(first_step, config.num_steps).map(assemble)
     options = grain.ReadOptions(num_threads=READERS, prefetch_buffer_size=READ_AHEAD)

@@ -1,7 +1,8 @@
 """The few delicate primitives that the other kernels share.
 
 `gather_rows` and `scatter_rows` are each other's transpose.  Both flatten mapped axes into one longer table under vmap:
-XLA lowers a batched scatter on CPU to a loop about four times slower than a flat one (32^3 voxels, 2 objects).
+XLA lowers a batched scatter on CPU to a loop about four times slower than a flat one (32^3 voxels, 2 objects).  On a
+mesh there is one table for each group of objects: in a common one XLA would not know that rows stay on their device.
 Subnormal numbers (below 1.2e-38) are zeros to XLA.
 """
 
@@ -11,6 +12,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Shaped
+
+from spnr_jax.distributed import object_groups
 
 # log1p(e) / e on [0, 1], highest power first: Chebyshev interpolation of degree 8, relative error 3e-8
 LOG1P = (
@@ -109,17 +112,30 @@ def computed_once(x: Float[Array, "*batch n"]) -> Float[Array, "*batch n"]:
     return jnp.matmul(x, jnp.eye(x.shape[-1], dtype=x.dtype), precision="highest")
 
 
-def _flatten_tables(axis_size, in_batched, table, index):
-    """Table rows and indices of all mapped tables as one table (b * rows, c) and indices into it (b, *shape)."""
-    del in_batched
-    rows = table.shape[1]
-    offsets = rows * jnp.arange(axis_size, dtype=index.dtype).reshape(-1, *[1] * (index.ndim - 1))
-    return table.reshape(axis_size * rows, *table.shape[2:]), index + offsets
+def _end_to_end(function, table, index, *values):
+    """`function` of mapped tables (b, rows, c) as one table (b * rows, c), and of indices (b, *shape) into that."""
+    offsets = table.shape[1] * jnp.arange(len(table), dtype=index.dtype).reshape(-1, *[1] * (index.ndim - 1))
+    return function(table.reshape(-1, *table.shape[2:]), index + offsets, *values)
 
 
-@jax.custom_batching.custom_vmap
-def _gather(table, index):
+def _by_group(function, plain, *arguments):
+    """`function` of the tables of all objects end to end; on a mesh `plain` of those of each group of objects."""
+    groups = object_groups(len(arguments[0]))
+    if groups == 1:
+        return _end_to_end(function, *arguments)
+    return jax.vmap(partial(_end_to_end, plain))(*(x.reshape(groups, -1, *x.shape[1:]) for x in arguments))
+
+
+def _plain_gather(table, index):
     return table.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
+
+
+def _plain_scatter(table, index, values):
+    return table.at[index].add(values, mode="promise_in_bounds", wrap_negative_indices=False)
+
+
+_gather = jax.custom_batching.custom_vmap(_plain_gather)
+_scatter = jax.custom_batching.custom_vmap(_plain_scatter)
 
 
 @_gather.def_vmap
@@ -128,22 +144,17 @@ def _gather_vmap(axis_size, in_batched, table, index):
         return _gather(table, index), True
     if not in_batched[1]:
         index = jnp.broadcast_to(index, (axis_size, *index.shape))
-    return _gather(*_flatten_tables(axis_size, in_batched, table, index)), True
-
-
-@jax.custom_batching.custom_vmap
-def _scatter(table, index, values):
-    return table.at[index].add(values, mode="promise_in_bounds", wrap_negative_indices=False)
+    rows = _by_group(_gather, _plain_gather, table, index)
+    return rows.reshape(*index.shape, *table.shape[2:]), True
 
 
 @_scatter.def_vmap
-def _scatter_vmap(axis_size, in_batched, table, index, values):
+def _scatter_vmap(axis_size, in_batched, *arguments):
     def spread(x, batched):
         return x if batched else jnp.broadcast_to(x, (axis_size, *x.shape))
 
-    table, index, values = (spread(x, b) for x, b in zip((table, index, values), in_batched, strict=True))
-    flat, flat_index = _flatten_tables(axis_size, in_batched, table, index)
-    return _scatter(flat, flat_index, values).reshape(table.shape), True
+    arguments = tuple(map(spread, arguments, in_batched))
+    return _by_group(_scatter, _plain_scatter, *arguments).reshape(arguments[0].shape), True
 
 
 @jax.custom_vjp

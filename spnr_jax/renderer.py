@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from spnr_jax import cameras, compositing, empty_space, sampling, surface, voxels
+from spnr_jax.distributed import divide_rays, undivided
 from spnr_jax.empty_space import Path
 from spnr_jax.model_config import ModelConfig
 from spnr_jax.nn.field import RadianceField
@@ -74,7 +75,7 @@ class Renderer(nn.Module):
 
     def rays(self, camera: Camera) -> Rays:
         """Rays of the volume rendering for all views of an object in one axis, (objects, views * height * width, 3)."""
-        return cameras.view_rays(cameras.resize(camera, *self.render_size(camera)))
+        return divide_rays(cameras.view_rays(cameras.resize(camera, *self.render_size(camera))))
 
     def render_size(self, camera: Camera) -> tuple[int, int]:
         """Height and width of the volume rendering behind the camera's image."""
@@ -90,7 +91,7 @@ class Renderer(nn.Module):
     ) -> Rendering:
         """Images from the rays of `rays`: the upsampler, and everything in its place."""
         views, (height, width) = camera.cam_to_world.shape[:-2], self.render_size(camera)
-        features = features.reshape(-1, height, width, self.config.num_features)
+        features = undivided(features).reshape(-1, height, width, self.config.num_features)
         image = features[..., :3]
         if self.config.upsamples:
             image = self.upsampler(bilinear(features, camera.height // 2, camera.width // 2))

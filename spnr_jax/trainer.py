@@ -4,25 +4,29 @@
 
 A run goes on by itself from its newest readable checkpoint; the rows of metrics.jsonl after it are dropped, because
 they will be written again.  A loss that is not finite stops the run and names the step; the last checkpoint stays.
+
+Of several processes that train together (distributed.py) the first writes all of this; the checkpoints they write
+together.
 """
 
 import json
 import math
 import os
 import signal
-from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 from tqdm import tqdm
 
-from spnr_jax import checkpoint, data, evaluation, training
+from spnr_jax import checkpoint, data, distributed, evaluation, training
 from spnr_jax.config import TrainConfig
-from spnr_jax.images import png, write_whole
+from spnr_jax.images import png, to_uint8, write_whole
 from spnr_jax.run_record import Clock, RunRecord
 
 
@@ -47,45 +51,65 @@ class NotFinite(ValueError):
     """A loss is NaN or infinite; the message names step and quantity."""
 
 
-def train(config: TrainConfig, dataset: data.Dataset, run: Path, schedule: Schedule) -> training.TrainState:
-    """The state after the config's last step; goes on where an earlier call left the run folder."""
-    with checkpoint.alone(run):
+def train(
+    config: TrainConfig, dataset: data.Dataset, run: Path, schedule: Schedule, mesh: Mesh | None = None
+) -> training.TrainState:
+    """The state after the config's last step; goes on where an earlier call left the run folder.
+
+    On a mesh of devices (`distributed.device_mesh`) each of its processes calls this.
+    """
+    own = None if mesh is None else distributed.own_objects(mesh, config.batch_objects)
+    with ExitStack() as stack:
         try:
-            return _train(config, dataset, run, schedule)
+            distributed.first_alone(lambda: stack.enter_context(checkpoint.alone(run)))
+            distributed.first_alone(lambda: checkpoint.write_config(run, config))
+            return _train(config, dataset, run, schedule, mesh, own)
         except OSError as error:
             error.filename = error.filename or str(run)  # writing to a full disk does not say where
             raise
+        except jax.errors.JaxRuntimeError as error:
+            raise distributed.lost(error, run) from None
 
 
-def _train(config: TrainConfig, dataset: data.Dataset, run: Path, schedule: Schedule) -> training.TrainState:
-    clock = Clock()
-    checkpoint.write_config(run, config)
-    state = checkpoint.restore(run, config, say=tqdm.write) or training.jitted_create_state(config)
+def _train(
+    config: TrainConfig, dataset: data.Dataset, run: Path, schedule: Schedule, mesh: Mesh | None, own: range | None
+) -> training.TrainState:
+    clock, leads = Clock(), distributed.leads()
+    say: Callable[[str], object] = tqdm.write if leads else lambda line: None
+    with distributed.using(mesh):
+        sharding = None if mesh is None else distributed.replicated(mesh)
+        state = checkpoint.restore(run, config, say, sharding) or training.jitted_create_state(config)
     first = int(state.step)
     if first >= config.num_steps:
-        tqdm.write(f"{run} is finished: {first} steps")
+        say(f"{run} is finished: {first} steps")
         return state
     if first:
-        tqdm.write(f"resuming {run} at step {first} of {config.num_steps}")
-    record, adversarial_from = RunRecord(run, dataset, first), training.first_adversarial_step(config)
+        say(f"resuming {run} at step {first} of {config.num_steps}")
+    adversarial_from = training.first_adversarial_step(config)
+    agreed = distributed.Agreement(mesh)
     pending: list[tuple[int, dict]] = []
     with (
         stop_requests() as requests,
-        closing(MetricsLog(run, first)) as log,
-        closing(data.batches(dataset, config, first)) as batches,
-        tqdm(total=config.num_steps, initial=first, unit="step", mininterval=1) as bar,
+        closing(MetricsLog(run, first) if leads else Unwritten()) as log,
+        closing(data.batches(dataset, config, first, own=own)) as batches,
+        tqdm(total=config.num_steps, initial=first, unit="step", mininterval=1, disable=not leads) as bar,
     ):
+        record = RunRecord(run, dataset, first) if leads else Unwritten()
         clock.lap("restore")
         for step, batch in enumerate(batches, start=first):
-            state, metrics = training.jitted_train_step(
-                state, jax.device_put(batch), config=config, adversarial=step >= adversarial_from
-            )
+            with distributed.using(mesh):
+                state, metrics = training.jitted_train_step(
+                    state,
+                    distributed.placed(batch, mesh, config.batch_objects),
+                    config=config,
+                    adversarial=step >= adversarial_from,
+                )
             pending.append((step + 1, metrics))
             bar.update()
             if step == first:
                 jax.block_until_ready(metrics)
                 clock.lap("compilation")
-            last, stopping = step + 1 == config.num_steps, bool(requests)
+            last, stopping = step + 1 == config.num_steps, agreed(bool(requests))
             save = last or stopping or (step + 1) % schedule.checkpoint_every == 0
             if save or (step + 1) % schedule.log_every == 0:
                 rows = check_finite(jax.device_get(pending))
@@ -96,8 +120,9 @@ def _train(config: TrainConfig, dataset: data.Dataset, run: Path, schedule: Sche
                 log.write({"step": step + 1, **mean_row(rows), "ms_per_step": round(pace, 2)})
                 bar.set_postfix(loss=f"{rows[-1][1]['loss']:.2f}", psnr=f"{rows[-1][1]['psnr']:.1f}", refresh=False)
                 pending = []
-            if last or (step + 1) % schedule.preview_every == 0:
-                log.write({"step": step + 1, **preview(state, config, dataset, run)})
+            if leads and (last or (step + 1) % schedule.preview_every == 0):
+                scores, picture = preview(state, config, dataset, run)
+                log.write({"step": step + 1, **scores}, picture)
                 clock.lap("previews")
             if save:  # after the rows up to this step, which a run that goes on from here will not write again
                 checkpoint.save(run, state)
@@ -165,19 +190,31 @@ class MetricsLog:
         self._file = path.open("a")
         self._board = SummaryWriter(str(run / "tensorboard"), purge_step=first_step + 1)
 
-    def write(self, row: dict[str, int | float]) -> None:
-        """Appends one row, to the disk itself; every entry but the step is a TensorBoard scalar."""
+    def write(self, row: dict[str, int | float], picture: np.ndarray | None = None) -> None:
+        """Appends one row, to the disk itself; in TensorBoard its entries are scalars, and the picture is an image."""
         self._file.write(json.dumps(row) + "\n")
         self._file.flush()
         os.fsync(self._file.fileno())  # a checkpoint that outlives a power cut needs the rows before it
         for name, value in row.items():
             if name != "step":
                 self._board.add_scalar(name, value, row["step"])
+        if picture is not None:
+            self._board.add_image("preview", to_uint8(picture), row["step"], dataformats="HWC")
 
     def close(self) -> None:
         """Closes both."""
         self._file.close()
         self._board.close()
+
+
+class Unwritten:
+    """The log and the record of a process that does not write them."""
+
+    def write(self, *what: object) -> None:
+        """Writes nothing."""
+
+    def close(self) -> None:
+        """Closes nothing."""
 
 
 def read_rows(run: Path) -> list[dict]:
@@ -197,10 +234,10 @@ def read_rows(run: Path) -> list[dict]:
 
 def preview(
     state: training.TrainState, config: TrainConfig, dataset: data.Dataset, run: Path, num_objects: int = 6
-) -> dict[str, float]:
-    """Validation PSNR of the averaged network on a few objects; writes references over renderings to previews/."""
+) -> tuple[dict[str, float], np.ndarray]:
+    """Validation PSNR of the averaged network on a few objects, and references over renderings, kept in previews/."""
     names = (dataset.splits["val"] or dataset.splits["train"])[:num_objects]
-    variables = training.averaged_variables(state)
+    variables = distributed.on_this_process(training.averaged_variables(state))
     columns, scores = [], []
     for name in names:
         item = data.read_object(dataset, name)
@@ -209,5 +246,6 @@ def preview(
         image, reference = np.clip(np.asarray(rendering.image), 0, 1), data.on_white(item.images)
         scores.append(np.asarray(evaluation.metrics.psnr(jnp.asarray(image), jnp.asarray(reference))))
         columns.append(np.concatenate([reference[0], image[0]]))
-    write_whole(run / "previews" / f"{int(state.step):07d}.png", png(np.concatenate(columns, axis=1)))
-    return {"val_psnr": float(np.mean(np.concatenate(scores)))}
+    picture = np.concatenate(columns, axis=1)
+    write_whole(run / "previews" / f"{int(state.step):07d}.png", png(picture))
+    return {"val_psnr": float(np.mean(np.concatenate(scores)))}, picture

@@ -1,6 +1,7 @@
 """Laws of the cost model: one device waits for nobody, more devices cost more, and the documents hold its tables."""
 
 import dataclasses
+import itertools
 import json
 import math
 from pathlib import Path
@@ -76,7 +77,7 @@ def test_one_device_that_does_not_wait_is_efficient_and_more_are_less():
 
 def test_more_threads_never_cost_time_and_too_few_set_the_pace():
     seconds = [step_seconds(8, threads=threads) for threads in (0.25, 1, 2, 8, math.inf)]
-    assert seconds == sorted(seconds, reverse=True)
+    assert all(more <= (1 + 1e-9) * fewer for fewer, more in itertools.pairwise(seconds))
     assert seconds[0] == pytest.approx(8 / (0.25 * cost_model.OBJECT.read_per_second), rel=1e-3)
 
 

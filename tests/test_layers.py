@@ -1,6 +1,6 @@
 """Imports point down the layers, and importing the package stays light: both are read from the source.
 
-0 types model_config config | 1 numerics and its sibling kernels | 2 nn/ and kernels made of kernels
+0 types model_config config distributed | 1 numerics and its sibling kernels | 2 nn/ and kernels made of kernels
 3 renderer baselines | 4 training
 5 data checkpoint clouds evaluation model and what else reads or writes files | 6 cli report results trainer experiments
 """
@@ -14,16 +14,16 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 LAYERS = {
-    0: {"types", "config", "model_config"},
+    0: {"types", "config", "model_config", "distributed"},
     1: {"numerics", "cameras", "colors", "sampling", "compositing", "voxels", "losses", "metrics", "statistics"},
-    2: {"nn", "empty_space", "surface", "flip", "lpips"},
+    2: {"nn", "empty_space", "surface", "supersampling", "flip", "lpips"},
     3: {"renderer", "baselines"},
     4: {"training"},
     6: {"cli", "report", "results", "runs_command", "trainer"},
 }
 FILES = 5  # every module that is not named above reads or writes files
 # what siblings below the files may import
-SHARED = {0: {"model_config"}, 1: {"numerics"}, 2: {"convolution", "encoding", "normalization"}}
+SHARED = {0: {"model_config", "types"}, 1: {"numerics"}, 2: {"convolution", "encoding", "normalization"}}
 IMPURE = {"os", "pathlib", "time", "io", "sys", "json", "shutil", "tempfile", "logging", "datetime", "random", "tqdm"}
 HEAVY = {"mitsuba", "pymeshlab", "trimesh", "viser", "torch", "matplotlib", "skimage", "grain", "dask", "distributed"}
 

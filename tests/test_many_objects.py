@@ -190,6 +190,11 @@ def test_wrong_options_are_refused_by_name(wrong, tmp_path):
         asked(tmp_path, **wrong)
 
 
+def test_the_slow_form_can_be_left_out(tmp_path):
+    assert asked(tmp_path).forms == FORMS
+    assert asked(tmp_path, map=False).forms == ("loop", "vmap")
+
+
 def test_a_gain_is_how_many_times_as_fast_as_the_loop_round_by_round():
     seconds = {"loop": [2.0, 4.0, 6.0], "vmap": [1.0, 4.0, 1.5]}
     assert many_objects_report.gain(seconds, "vmap") == (2.0, 1.0, 4.0)

@@ -27,8 +27,8 @@ def interrupted(monkeypatch, step, number=signal.SIGTERM):
     """Makes the signal arrive while the batch after `step` steps is fetched."""
     real = data.batches
 
-    def batches(dataset, config, first):
-        for i, batch in enumerate(real(dataset, config, first), start=first):
+    def batches(dataset, config, first, **options):
+        for i, batch in enumerate(real(dataset, config, first, **options), start=first):
             if i + 1 == step:
                 signal.raise_signal(number)
             yield batch
@@ -108,8 +108,8 @@ def test_handlers_of_signals_come_back_after_training():
 def poisoned(monkeypatch, step):
     real = data.make_batch
 
-    def make_batch(objects, config, at):
-        batch = real(objects, config, at)
+    def make_batch(objects, config, at, first):
+        batch = real(objects, config, at, first)
         return jax.tree.map(lambda x: x * np.nan if x.dtype == np.float32 else x, batch) if at + 1 == step else batch
 
     monkeypatch.setattr(data, "make_batch", make_batch)

@@ -107,7 +107,7 @@ def test_in_an_empty_environment_the_wheel_renders_clouds_and_meshes(environment
         assert package not in listed.split(), "an extra's package came along"
     shutil.copy(tiny_dataset.dataset().folder / "objects" / "chair" / "points.ply", tmp_path / "cloud.ply")
     (tmp_path / "mesh.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n")
-    options = "--views 1 --frames 2 --num-points 64 --resolution 32 --out pictures".split()
+    options = ["--views", "1", "--frames", "2", "--num-points", "64", "--resolution", "32", "--out", "pictures"]
     variables = clean_environment(JAX_COMPILATION_CACHE_DIR=str(tmp_path / "cache"))
     for name in ("cloud.ply", "mesh.obj"):
         output_of(environment / "spnr", "render", name, *options, cwd=tmp_path, env=variables)

@@ -13,6 +13,7 @@ import flax.linen as nn
 import jax
 from jaxtyping import Array, Float, Int
 
+from spnr_jax.distributed import divide_depth
 from spnr_jax.nn.convolution import conv, kernel_init, upsample_conv
 from spnr_jax.nn.normalization import GroupNorm
 from spnr_jax.voxels import scatter_conv
@@ -78,6 +79,7 @@ class UNet3D(nn.Module):
     ) -> Float[Array, "objects d d d features"]:
         """Feature volume of each object from its scattered points (`voxels.scatter_conv` says in which form)."""
         x = Stem(self.base_width, self.resolution, self.num_groups, name="stem")(rows, values)
+        x = divide_depth(x, self.resolution // 2**self.num_stages)
         skips, width = [], self.base_width
         for i in range(self.num_stages):
             skips.append(x)
