@@ -37,6 +37,7 @@ def start(folder, layout):
     return experiment.run(folder, tiny_dataset.dataset().folder, layout, FLAGS)
 
 
+@pytest.mark.slow
 def test_two_processes_of_four_devices_go_on_from_a_checkpoint_of_one_and_one_reads_theirs(folder, one):
     """Each volume lies on two devices; R1 is due in the first of the two steps, statistics are of all objects."""
     shutil.copytree(one, folder / "eight", ignore=shutil.ignore_patterns("4"))

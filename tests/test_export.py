@@ -5,15 +5,15 @@ import importlib.util
 import json
 import subprocess
 import sys
-from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
+import tiny_untrained
 import tiny_viewer
 from laws import close
 
-from spnr_jax import cli, clouds, export, model
+from spnr_jax import cli, clouds, export
 
 pytestmark = pytest.mark.skipif(
     importlib.util.find_spec("flatbuffers") is None, reason="flatbuffers is not installed: pip install flatbuffers"
@@ -134,10 +134,9 @@ def test_another_size_than_the_buckets_is_refused(encoded):
 
 def test_the_command_writes_both_functions_their_stablehlo_and_what_they_take(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(cli, "enable_compilation_cache", lambda: None)  # it would write to the home folder
-    monkeypatch.setattr(model, "load", lambda run: tiny_viewer.model())
-    cli.run(cli.Export(run=Path("any"), out=tmp_path, num_points=64, resolution=SIZE))
+    cli.run(cli.Export(run=tiny_untrained.run(), out=tmp_path, num_points=64, resolution=SIZE))
     assert str(tmp_path) in capsys.readouterr().out
-    names = {"encode.jax", "encode.stablehlo", "render.jax", "render.stablehlo", "export.json"}
+    names = {"weights.npz", "encode.jax", "encode.stablehlo", "render.jax", "render.stablehlo", "export.json"}
     assert {path.name for path in tmp_path.iterdir()} == names
     said = json.loads((tmp_path / "export.json").read_text())
     assert said["encode"]["outputs"] == said["render"]["inputs"][0], "the volume goes from one to the other"

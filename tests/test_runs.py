@@ -3,6 +3,7 @@
 import json
 import subprocess
 
+import numpy as np
 import pytest
 import tiny_dataset
 from tiny_runs import L1_ONLY
@@ -24,7 +25,7 @@ def folder(tmp_path_factory):
             patch.setattr(trainer, "preview", wanted)
             raise KeyboardInterrupt("stopped")
 
-        patch.setattr(trainer, "preview", lambda *_: {"val_psnr": 11.0})
+        patch.setattr(trainer, "preview", lambda *_: ({"val_psnr": 11.0}, np.ones((2, 2, 3))))
         steps = L1_ONLY.num_steps
         trainer.train(L1_ONLY, dataset, folder / "a", SCHEDULE)
         patch.setattr(trainer, "preview", stopping)
