@@ -147,9 +147,8 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def _one_of_several() -> bool:
-    import jax
-
-    return jax.distributed.is_initialized() and jax.process_count() > 1
+    jax = sys.modules.get("jax")  # a mistyped option need not wait until it is imported
+    return jax is not None and jax.distributed.is_initialized() and jax.process_count() > 1
 
 
 def guarded(work: Callable[[], None], name: str) -> int:

@@ -25,7 +25,8 @@ from spnr_jax.config import TrainConfig, from_dict, to_dict
 from spnr_jax.images import write_whole
 from spnr_jax.numpy_files import read_arrays
 
-UNREADABLE = (ValueError, TypeError, AttributeError, ArithmeticError, RecursionError)  # a header of any content
+# what a header of any content makes its readers raise
+UNREADABLE = (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError)
 ADVICE = "write one with `spnr export RUN`"
 
 
@@ -82,7 +83,7 @@ def read_weights(path: Path) -> Trained:
             shapes = variable_shapes(config)
             file.seek(0)
             arrays = read_arrays(file, shapes)
-    except (*UNREADABLE, LookupError) as error:
+    except UNREADABLE as error:
         raise ValueError(f"{path}: not a file of weights of this version ({error}); {ADVICE}") from None
     for name, wanted in shapes.items():
         found = arrays.get(name, np.zeros(0))
