@@ -38,6 +38,9 @@ class Train:
     """Folder of the run: config, checkpoints, metrics, previews."""
     config: tyro.conf.AvoidSubcommands[tyro.conf.OmitArgPrefixes[TrainConfig]] = field(default_factory=presets.tiny)
     """Every number of the run; --preset chooses the defaults."""
+    init: str | None = None
+    """Weights that a new run begins with: a run folder, a file of weights, or `package` for the network in the package,
+    which is of preset plus_small (default: random)."""
     log_every: int = 20
     """Steps between rows of metrics.jsonl and TensorBoard."""
     preview_every: int = 500
@@ -232,7 +235,7 @@ def run_train(command: Train) -> None:
     """`spnr train`."""
     import jax
 
-    from spnr_jax import data, distributed, trainer
+    from spnr_jax import data, distributed, trainer, weights
 
     address = command.coordinator, command.num_processes, command.process_id
     if command.distributed or address != (None, None, None):
@@ -242,7 +245,8 @@ def run_train(command: Train) -> None:
     schedule = trainer.Schedule(
         log_every=command.log_every, preview_every=command.preview_every, checkpoint_every=command.checkpoint_every
     )
-    trainer.train(command.config, dataset, command.run, schedule, mesh)
+    init = None if command.init is None else weights.read_trained(None if command.init == "package" else command.init)
+    trainer.train(command.config, dataset, command.run, schedule, mesh, init)
     if distributed.leads():
         print(f"trained: {command.run} (score it with `spnr evaluate {command.data} {command.run}`)")
 

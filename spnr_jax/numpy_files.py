@@ -56,8 +56,8 @@ def numpy_pieces(path: Path) -> Iterator[Columns]:
         yield {name.lower(): column for name, column in zip(names, values, strict=True)}
 
 
-def read_arrays(file: BufferedIOBase, wanted: Collection[str]) -> dict[str, np.ndarray]:
-    """The arrays of an .npz archive whose names are wanted; ValueError for one that is broken or unpacks to too much.
+def read_arrays(file: BufferedIOBase, wanted: Collection[str] | None = None) -> dict[str, np.ndarray]:
+    """The arrays of an .npz archive, those whose names are wanted; ValueError if it is broken or unpacks to too much.
 
     An array's size is checked before memory is taken for it: its header must not announce more than its bytes.
     """
@@ -65,17 +65,18 @@ def read_arrays(file: BufferedIOBase, wanted: Collection[str]) -> dict[str, np.n
     try:
         with zipfile.ZipFile(file) as archive:
             members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
-            unpacked = sum(info.file_size for name, info in members.items() if name in wanted)
+            names = [name for name in members if wanted is None or name in wanted]
+            unpacked = sum(members[name].file_size for name in names)
             if unpacked > MOST_BYTES:
                 raise ValueError(
                     f"unpacks to {unpacked} bytes, more than {MOST_BYTES}; use .npy, which is read in pieces"
                 )
-            for name in [name for name in members if name in wanted]:
+            for name in names:
                 arrays[name] = _member(archive, members[name])
     except UNREADABLE as error:
         raise ValueError(f"is a broken or truncated NumPy file ({error})") from None
     if not arrays:
-        raise ValueError(f"has none of the arrays {', '.join(wanted)}; found {', '.join(members) or 'none'}")
+        raise ValueError(f"has none of the arrays {', '.join(wanted or ())}; found {', '.join(members) or 'none'}")
     return arrays
 
 

@@ -4,6 +4,7 @@ began, first_step, last_step    when, and from where to where it trained
 seconds                         by phase: restore, compilation (the first step), steps, previews, checkpoints
 version, commit, jax, hardware  of the code ("+" behind a commit: the checkout was changed), of JAX, of the machine
 data, data_checksum             the folder, and a number that tells data sets apart
+init                            the training whose weights a new run began with, where it was not random ones
 """
 
 import hashlib
@@ -19,6 +20,7 @@ import jax
 
 from spnr_jax import data, evaluation
 from spnr_jax.images import write_whole
+from spnr_jax.weights import Trained
 
 
 class Clock:
@@ -40,7 +42,7 @@ class Clock:
 class RunRecord:
     """The entry of this start, written anew whenever the run saves."""
 
-    def __init__(self, run: Path, dataset: data.Dataset, first_step: int) -> None:
+    def __init__(self, run: Path, dataset: data.Dataset, first_step: int, init: Trained | None = None) -> None:
         """Keeps the entries of earlier starts."""
         self._path, self._earlier = run / "run.json", read_starts(run)
         self._entry: dict[str, Any] = {
@@ -53,6 +55,8 @@ class RunRecord:
             "data": str(dataset.folder),
             "data_checksum": checksum(dataset),
         }
+        if init is not None:
+            self._entry["init"] = f"{init.config.preset}, {init.steps} steps"
 
     def write(self, last_step: int, clock: Clock) -> None:
         """Writes what is known by now."""

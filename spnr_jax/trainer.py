@@ -28,6 +28,7 @@ from spnr_jax import checkpoint, data, distributed, evaluation, training
 from spnr_jax.config import TrainConfig
 from spnr_jax.images import png, to_uint8, write_whole
 from spnr_jax.run_record import Clock, RunRecord
+from spnr_jax.weights import Trained
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,18 +53,24 @@ class NotFinite(ValueError):
 
 
 def train(
-    config: TrainConfig, dataset: data.Dataset, run: Path, schedule: Schedule, mesh: Mesh | None = None
+    config: TrainConfig,
+    dataset: data.Dataset,
+    run: Path,
+    schedule: Schedule,
+    mesh: Mesh | None = None,
+    init: Trained | None = None,
 ) -> training.TrainState:
     """The state after the config's last step; goes on where an earlier call left the run folder.
 
-    On a mesh of devices (`distributed.device_mesh`) each of its processes calls this.
+    A new run begins with random weights, or with those of `init`.  On a mesh of devices (`distributed.device_mesh`)
+    each of its processes calls this.
     """
     own = None if mesh is None else distributed.own_objects(mesh, config.batch_objects)
     with ExitStack() as stack:
         try:
             distributed.first_alone(lambda: stack.enter_context(checkpoint.alone(run)))
             distributed.first_alone(lambda: checkpoint.write_config(run, config))
-            return _train(config, dataset, run, schedule, mesh, own)
+            return _train(config, dataset, run, schedule, mesh, own, init)
         except OSError as error:
             error.filename = error.filename or str(run)  # writing to a full disk does not say where
             raise
@@ -72,13 +79,19 @@ def train(
 
 
 def _train(
-    config: TrainConfig, dataset: data.Dataset, run: Path, schedule: Schedule, mesh: Mesh | None, own: range | None
+    config: TrainConfig,
+    dataset: data.Dataset,
+    run: Path,
+    schedule: Schedule,
+    mesh: Mesh | None,
+    own: range | None,
+    init: Trained | None,
 ) -> training.TrainState:
     clock, leads = Clock(), distributed.leads()
     say: Callable[[str], object] = tqdm.write if leads else lambda line: None
     with distributed.using(mesh):
         sharding = None if mesh is None else distributed.replicated(mesh)
-        state = checkpoint.restore(run, config, say, sharding) or training.jitted_create_state(config)
+        state = checkpoint.restore(run, config, say, sharding) or new_state(config, init)
     first = int(state.step)
     if first >= config.num_steps:
         say(f"{run} is finished: {first} steps")
@@ -94,7 +107,7 @@ def _train(
         closing(data.batches(dataset, config, first, own=own)) as batches,
         tqdm(total=config.num_steps, initial=first, unit="step", mininterval=1, disable=not leads) as bar,
     ):
-        record = RunRecord(run, dataset, first) if leads else Unwritten()
+        record = RunRecord(run, dataset, first, init) if leads else Unwritten()
         clock.lap("restore")
         for step, batch in enumerate(batches, start=first):
             with distributed.using(mesh):
@@ -133,6 +146,12 @@ def _train(
                     f"stopped at step {step + 1} of {config.num_steps}; the same command goes on from there"
                 )
     return state
+
+
+def new_state(config: TrainConfig, init: Trained | None) -> training.TrainState:
+    """The state before the first step."""
+    state = training.jitted_create_state(config)
+    return state if init is None else training.begun_with(state, init.variables)
 
 
 def check_finite(rows: list[tuple[int, dict]]) -> list[tuple[int, dict]]:

@@ -12,6 +12,7 @@ graph contains no discriminator.  All randomness of step s comes from fold_in(st
 the uninterrupted one bit for bit.
 """
 
+import dataclasses
 from functools import partial
 from typing import Any, no_type_check
 
@@ -20,6 +21,7 @@ import jax
 import jax.numpy as jnp
 import optax
 from flax import struct
+from flax.traverse_util import flatten_dict
 from jaxtyping import Array, Float
 
 from spnr_jax import cameras, losses, supersampling
@@ -137,6 +139,30 @@ def create_state(config: TrainConfig, seed: int | Array | None = None) -> TrainS
         averaged_stats=jax.tree.map(jnp.copy, batch_stats),
         discriminator=discriminator,
         discriminator_optimizer=None if discriminator is None else discriminator_adam.init(discriminator),
+    )
+
+
+def begun_with(state: TrainState, variables: dict) -> TrainState:
+    """A fresh state with the generator of another training; ValueError if its weights are of another network."""
+    params, stats = variables["params"], variables.get("batch_stats", {})
+    own, other = (flatten_dict(weights, sep="/") for weights in (state.generator, params))
+    for name in own | other:
+        shapes = [weights[name].shape if name in weights else "none" for weights in (own, other)]
+        if shapes[0] != shapes[1]:
+            raise ValueError(
+                f"the weights to begin with are of another network: shape of {name} {shapes[1]}, needed {shapes[0]}; "
+                "use the preset that they were trained with"
+            )
+
+    def placed(new, old):
+        return jax.tree.map(lambda x, like: jax.device_put(jnp.array(x), like.sharding), new, old)
+
+    return dataclasses.replace(
+        state,
+        generator=placed(params, state.generator),
+        batch_stats=placed(stats, state.batch_stats),
+        averaged=placed(params, state.averaged),
+        averaged_stats=placed(stats, state.averaged_stats),
     )
 
 

@@ -16,7 +16,6 @@ from importlib import resources
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from flax.traverse_util import flatten_dict, unflatten_dict
 
@@ -70,30 +69,38 @@ def write_weights(path: Path, trained: Trained) -> None:
 
 
 def read_weights(path: Path) -> Trained:
-    """The network of a file, in float32; ValueError that says what is wrong with it."""
+    """The network of a file, in float32; ValueError that says what is wrong with it.
+
+    That the weights are those of the config's network takes a second to find out, because the network is traced for
+    their shapes; the package's own file is not asked again.
+    """
     if not path.is_file():
         raise ValueError(f"{path}: no such file of weights; {ADVICE}")
     try:
         with path.open("rb") as file:
-            header = read_arrays(file, ("config", "steps"))
-            described, steps = json.loads(header["config"].tobytes()), int(header["steps"])
-            if not isinstance(described, dict):
-                raise ValueError("its config is no JSON object")
-            config = from_dict(described)
-            shapes = variable_shapes(config)
-            file.seek(0)
-            arrays = read_arrays(file, shapes)
+            arrays = read_arrays(file)
+        described, steps = json.loads(arrays.pop("config").tobytes()), int(arrays.pop("steps"))
+        if not isinstance(described, dict):
+            raise ValueError("its config is no JSON object")
+        config = from_dict(described)
+        if path != shipped():
+            _check_weights(arrays, variable_shapes(config))
     except UNREADABLE as error:
         raise ValueError(f"{path}: not a file of weights of this version ({error}); {ADVICE}") from None
+    variables = unflatten_dict({name: x.astype(np.float32) for name, x in arrays.items()}, sep="/")
+    return Trained(config=config, variables=jax.device_put(variables), steps=steps)  # jnp.asarray would compile
+
+
+def _check_weights(arrays: dict[str, np.ndarray], shapes: dict[str, jax.ShapeDtypeStruct]) -> None:
+    """ValueError for the first array that is not as a network of these shapes needs it."""
+    if unknown := sorted(arrays.keys() - shapes):
+        raise ValueError(f"the network has no {unknown[0]}")
     for name, wanted in shapes.items():
         found = arrays.get(name, np.zeros(0))
         if found.shape != wanted.shape or found.dtype != np.float16 or not np.isfinite(found).all():
             raise ValueError(
-                f"{path}: {name} should hold {wanted.shape} finite float16 numbers, not {found.shape} of {found.dtype};"
-                f" {ADVICE}"
+                f"{name} should hold {wanted.shape} finite float16 numbers, not {found.shape} of {found.dtype}"
             )
-    variables = unflatten_dict({name: jnp.asarray(values, jnp.float32) for name, values in arrays.items()}, sep="/")
-    return Trained(config=config, variables=variables, steps=steps)
 
 
 def variable_shapes(config: TrainConfig) -> dict[str, jax.ShapeDtypeStruct]:

@@ -7,16 +7,17 @@ import os
 import re
 import shutil
 import signal
+from functools import partial
 
 import jax
 import numpy as np
 import pytest
 import tiny_dataset
-from laws import same_bits
+from laws import close, same_bits
 from tiny_dataset import CONFIG, SCHEDULE
 
 import spnr_jax
-from spnr_jax import checkpoint, cli, data, evaluation, trainer, training
+from spnr_jax import checkpoint, cli, data, evaluation, run_record, trainer, training, weights
 from spnr_jax.config import LossConfig
 from spnr_jax.model_config import NPBGConfig, PointNeRFConfig
 
@@ -57,6 +58,32 @@ def test_a_stopped_run_goes_on_to_the_same_bits_and_rows(monkeypatch, tmp_path):
     trainer.train(CONFIG, tiny_dataset.dataset(), tmp_path, SCHEDULE)
     same_bits(restored(tmp_path), restored(tiny_dataset.run()))
     assert rows_without_time(tmp_path) == rows_without_time(tiny_dataset.run())
+
+
+class TestBeginningWithOtherWeights:
+    def test_the_first_step_starts_from_them_and_the_record_names_them(self, tmp_path):
+        slow = dataclasses.replace(CONFIG.optimizer, lr_generator=1e-12, warmup_steps=0)
+        config = dataclasses.replace(CONFIG, optimizer=slow, seed=CONFIG.seed + 1)
+        init = weights.read_trained(tiny_dataset.run())
+        state = trainer.train(config, tiny_dataset.dataset(), tmp_path, SCHEDULE, init=init)
+        close(state.generator, init.variables["params"], atol=1e-9)
+        close(state.averaged, init.variables["params"], atol=1e-9)
+        (start,) = run_record.read_starts(tmp_path)
+        assert start["init"] == f"{CONFIG.preset}, {CONFIG.num_steps} steps"
+
+    def test_a_run_that_goes_on_keeps_its_own(self, tmp_path):
+        run = shutil.copytree(tiny_dataset.run(), tmp_path / "run")
+        shutil.rmtree(run / "checkpoints" / "6")
+        init = weights.read_trained(tiny_dataset.run())
+        zero = dataclasses.replace(init, variables=jax.tree.map(np.zeros_like, init.variables))
+        same_bits(trainer.train(CONFIG, tiny_dataset.dataset(), run, SCHEDULE, init=zero), restored(tiny_dataset.run()))
+
+    def test_weights_of_another_network_are_refused_in_one_line(self, tmp_path, capsys):
+        small = dataclasses.replace(CONFIG.model, base_width=2 * CONFIG.model.base_width)
+        config, init = dataclasses.replace(CONFIG, model=small), weights.read_trained(tiny_dataset.run())
+        work = partial(trainer.train, config, tiny_dataset.dataset(), tmp_path, SCHEDULE, init=init)
+        assert cli.guarded(work, "spnr") == 2
+        assert "are of another network: shape of" in capsys.readouterr().err.splitlines()[-1]
 
 
 @pytest.mark.parametrize("end", ["", '{"step": 6, "lo'])

@@ -56,6 +56,14 @@ def test_every_weight_of_a_network_has_its_shape_by_name(trained):
     assert {name: x.shape for name, x in weights.variable_shapes(trained.config).items()} == found
 
 
+def test_the_network_in_the_package_has_the_weights_that_its_config_describes(tmp_path):
+    copy = tmp_path / "copy.npz"  # the package's own file is not checked when it is read
+    copy.write_bytes(weights.shipped().read_bytes())
+    checked, trusted = weights.read_weights(copy), weights.read_trained(None)
+    assert checked.config == trusted.config
+    jax.tree.map(np.testing.assert_array_equal, checked.variables, trusted.variables)
+
+
 def test_weights_that_half_precision_does_not_hold_are_refused_and_nothing_is_written(trained, tmp_path):
     large = dataclasses.replace(trained, variables=jax.tree.map(lambda x: x * 0 + 7e4, trained.variables))
     with pytest.raises(ValueError, match=r"reaches 7e\+04, which float16 does not hold"):
@@ -99,6 +107,9 @@ class TestBrokenFiles:
             rewritten(file, **{name: wrong})
             assert name in self.reason(file)
             rewritten(file, **{name: values})
+        rewritten(file, **{"params/more": values})
+        assert "no params/more" in self.reason(file)
+        rewritten(file, **{"params/more": None})
         assert isinstance(weights.read_trained(file).config, TrainConfig)
 
     def test_a_pickle_is_not_opened(self, file):
