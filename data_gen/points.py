@@ -104,8 +104,8 @@ def _sample_part(part: Part, face: np.ndarray, barycentric: np.ndarray) -> dict[
     channels = evaluate_material(part.material, texcoords, len(face))
     if part.colors is not None:
         channels["base_color"] = channels["base_color"] * interpolate(part.colors)
-    geometric = _unit(_face_cross(part)[face])
-    normals = geometric if part.normals is None else _unit(interpolate(part.normals), geometric)
+    geometric = unit(_face_cross(part)[face])
+    normals = geometric if part.normals is None else unit(interpolate(part.normals), geometric)
     return {"positions": interpolate(part.positions), "normals": normals, **channels}
 
 
@@ -121,7 +121,7 @@ def _face_cross(part: Part) -> np.ndarray:
     return np.cross(b - a, c - a)
 
 
-def _unit(vectors: np.ndarray, fallback: np.ndarray | None = None) -> np.ndarray:
+def unit(vectors: np.ndarray, fallback: np.ndarray | None = None) -> np.ndarray:
     """Vectors (n, 3) of length 1; where one has no length, the fallback."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     directed = vectors / np.where(length > 0, length, 1)

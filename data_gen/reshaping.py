@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from data_gen.assets import Asset, Part
+from data_gen.points import unit
 
 MOST_STRETCH, MOST_BEND = 1.25, 2.0
 
@@ -54,9 +55,7 @@ def reshaped_part(part: Part, reshaping: Reshaping) -> Part:
     matrix = reshaping.matrix()
     normals = part.normals
     if normals is not None:
-        normals = normals @ np.linalg.inv(matrix)  # rows: the inverse transpose of the map
-        length = np.linalg.norm(normals, axis=1, keepdims=True)
-        normals = normals / np.where(length > 0, length, 1)
+        normals = unit(normals @ np.linalg.inv(matrix))  # rows: the inverse transpose of the map
     roughness = np.power(part.material.roughness, np.float32(reshaping.roughness_exponent))
     return replace(
         part,

@@ -74,8 +74,7 @@ def load(run: Path, dataset: data.Dataset) -> Network:
     """The averaged network of a run's newest checkpoint or a file of weights, fit for the size of the pictures."""
     trained = weights.read_trained(run, data=dataset.folder)
     config = trained.config
-    if not config.model.per_pixel:
-        data.check_resolution(data.read_object(dataset, dataset.splits["test"][0]), config)
+    data.check_renders(data.read_object(dataset, dataset.splits["test"][0]), config)
     method = next(name for name, kind in METHODS.items() if isinstance(config.model, kind))
     if isinstance(config.model, ModelConfig) and config.model.num_neighbors:
         method = "plus"

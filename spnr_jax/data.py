@@ -255,8 +255,14 @@ def cached_reader(dataset: Dataset, config: TrainConfig, cache_bytes: int) -> Ca
     return read
 
 
+def check_renders(data: ObjectData, config: TrainConfig) -> None:
+    """ValueError if the config's network cannot render an object's views: one size alone, or any pixel by itself."""
+    if not config.model.per_pixel:
+        check_resolution(data, config)
+
+
 def check_resolution(data: ObjectData, config: TrainConfig) -> None:
-    """ValueError if an object's images do not have the size that the config's network renders."""
+    """ValueError if an object's images do not have the size that the config's network is trained on."""
     size = config.model.image_resolution
     if (data.camera.height, data.camera.width) != (size, size):
         raise ValueError(

@@ -12,6 +12,11 @@ def l1(image: Float[Array, "*shape"], reference: Float[Array, "*shape"]) -> Floa
     return jnp.mean(jnp.abs(image - reference))
 
 
+def mse(image: Float[Array, "*shape"], reference: Float[Array, "*shape"]) -> Float[Array, ""]:
+    """Mean squared difference."""
+    return jnp.mean((image - reference) ** 2)
+
+
 def generator_adversarial(fake_logits: Float[Array, "*shape"]) -> Float[Array, ""]:
     """Non-saturating logistic loss of the generator, mean softplus(-D(fake))."""
     return jnp.mean(jax.nn.softplus(-fake_logits))

@@ -7,13 +7,10 @@ there.  The pixels of a smaller picture are wider: each is the mean of the rays 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from spnr_jax.colors import linear_to_srgb, srgb_to_linear
+from spnr_jax.colors import over, srgb_to_linear, unweighted
 from spnr_jax.compositing import WHITE
 from spnr_jax.model_config import NetworkConfig
-from spnr_jax.numerics import clamp
 from spnr_jax.types import Rendering
-
-LEAST_OPACITY = 1e-6  # below it a pixel is white, whatever its colour
 
 
 def rays_per_side(config: NetworkConfig, size: int) -> int:
@@ -27,10 +24,9 @@ def averaged(rendering: Rendering, side: int) -> Rendering:
     Colours are averaged as linear light of the object alone and laid on white as sRGB, as the references are.
     """
     opacity, depth = rendering.acc[..., None], rendering.depth[..., None]
-    straight = clamp((rendering.image - (1 - opacity) * WHITE) / jnp.maximum(opacity, LEAST_OPACITY), 0.0, 1.0)
+    straight = unweighted(rendering.image - (1 - opacity) * WHITE, opacity)
     light, depth, acc = (mean_of_squares(x, side) for x in (opacity * srgb_to_linear(straight), depth, opacity))
-    straight = linear_to_srgb(clamp(light / jnp.maximum(acc, LEAST_OPACITY), 0.0, 1.0))
-    image = acc * straight + (1 - acc) * WHITE
+    image = over(light, acc, WHITE)
     return Rendering(image=image, image_lr=image, depth=depth[..., 0], acc=acc[..., 0])
 
 

@@ -7,7 +7,7 @@ import pytest
 import reference
 from laws import batch_law, close, gradient_law, numbers
 
-from spnr_jax.losses import area_downsample, discriminator_adversarial, generator_adversarial, l1, r1
+from spnr_jax.losses import area_downsample, discriminator_adversarial, generator_adversarial, l1, mse, r1
 
 LOGITS = 3 * numbers(0, 2, 5, 5, 1), 3 * numbers(1, 2, 5, 5, 1)
 
@@ -16,6 +16,8 @@ def test_l1_is_the_mean_absolute_difference():
     a, b = numbers(2, 2, 3, 3, 3), numbers(3, 2, 3, 3, 3)
     close(l1(a, b), np.abs(np.float64(a) - np.float64(b)).mean())
     gradient_law(l1, a, b)
+    close(mse(a, b), ((np.float64(a) - np.float64(b)) ** 2).mean())
+    gradient_law(mse, a, b)
 
 
 class TestAdversarial:

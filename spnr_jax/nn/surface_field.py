@@ -15,17 +15,16 @@ import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from spnr_jax.colors import linear_to_srgb
+from spnr_jax.colors import over
 from spnr_jax.compositing import WHITE
 from spnr_jax.nn.encoding import encode_direction
-from spnr_jax.numerics import clamp, softplus
+from spnr_jax.numerics import softplus
 from spnr_jax.types import SurfaceSample
 
 DIELECTRIC = 0.04  # reflectance of plastic, wood, paint at normal incidence
 STRENGTH = 4.0  # optical depth per spacing of depth, of one unit of the network's output
 SHARPNESS = 4.0  # the fog sets in within about half a spacing
 SPACING_SCALE = 10.0  # brings the spacing of a thousand points to the order of 1
-LEAST_OPACITY = 1e-6  # below it a ray is white, whatever its colour
 
 
 class SurfaceField(nn.Module):
@@ -86,6 +85,4 @@ class SurfaceField(nn.Module):
         del view
         (color,) = emitted
         acc = acc[..., None]
-        if self.lit:
-            color = acc * linear_to_srgb(clamp(color / jnp.maximum(acc, LEAST_OPACITY), 0.0, 1.0))
-        return color + (1 - acc) * WHITE
+        return over(color, acc, WHITE) if self.lit else color + (1 - acc) * WHITE
