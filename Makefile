@@ -4,7 +4,9 @@
 #   make table1              the paper's Table 1, every method trained and scored: runs/table1-tiny/table1.html
 #   make table1 DATA=DIR BUDGET=quick|tiny|paper TABLE1='--minutes 10'   on your data, with more options
 #   make bench               time the network beside a PyTorch twin: runs/bench.md (BENCH="--twin FILE --quick")
-#   make test                the everyday suite      make test-all   with the slow tests
+#   make test                the everyday suite
+#   make test-ci             what takes minutes more: experiments, wheel, notebooks, kills, many devices
+#   make test-all            these, and what trains for minutes
 #   make check               format, lint, types, tests
 #   make docs                the documents as a site: site/index.html
 #   make wheel               the package: dist/*.whl     make test-wheel   it alone in an empty environment
@@ -25,7 +27,7 @@ TABLE1 ?=
 CHAOS ?=
 FUZZ ?=
 
-.PHONY: setup demo table1 bench test test-all test-wheel lint format types check docs wheel chaos fuzz mutants clean
+.PHONY: setup demo table1 bench test test-ci test-all test-wheel lint format types check docs wheel chaos fuzz mutants clean
 
 setup: .venv/complete
 
@@ -49,10 +51,13 @@ bench: setup
 	$(PY) -m experiments.bench $(BENCH)
 
 test: setup
-	$(PY) -m pytest -q -n 2 --dist loadfile -m "not slow"
+	$(PY) -m pytest -q -rs -n 2 --dist loadfile -m "not slow and not ci"
+
+test-ci: setup
+	$(PY) -m pytest -q -rs -n 2 --dist loadfile -m "ci and not slow"
 
 test-all: setup
-	$(PY) -m pytest -q -n 2 --dist loadfile
+	$(PY) -m pytest -q -rs -n 2 --dist loadfile
 
 test-wheel: setup
 	$(PY) -m pytest -q tests/test_wheel.py

@@ -14,6 +14,7 @@ from experiments.training_runs import Budget, Compared
 from spnr_jax import checkpoint, cli, data, evaluation, presets, trainer, training
 from spnr_jax.config import to_dict
 
+pytestmark = pytest.mark.ci  # it trains several networks
 PLUS_ROWS = ("free_colour", "no_neighbours", "three_neighbours", "twelve_neighbours", "batch_norm")
 PLUS_ROWS += ("no_opacity_loss", "no_squared_error")
 

@@ -31,7 +31,7 @@ def ended(*batches, code=0):
     return Ended(events=events, code=code, output="", seconds=1.0, seconds_to_end=None)
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_a_training_that_was_killed_ends_with_the_same_bits_data_and_rows(out):
     results = json.loads((out / "results.json").read_text())
     assert results["ended"] == 0
@@ -44,7 +44,7 @@ def test_a_training_that_was_killed_ends_with_the_same_bits_data_and_rows(out):
     assert len((out / "kills.csv").read_text().splitlines()) == 4
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_kills_that_were_made_are_only_read(out, capsys):
     begin = (out / "kills.json").stat().st_mtime_ns
     chaos.main(chaos.Chaos(out=out, kills=3, data=tiny_dataset.dataset().folder, faults=False))
@@ -52,7 +52,7 @@ def test_kills_that_were_made_are_only_read(out, capsys):
     assert capsys.readouterr().out == "3 of 3 faults survived (3 kills, 0 others)\n"
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_a_doubled_row_a_missing_row_another_batch_and_another_state_are_seen(out, tmp_path):
     whole, run = out / "whole", shutil.copytree(out / "killed", tmp_path / "run")
     one = ended("a", "b")
@@ -92,7 +92,7 @@ def test_training_holds_the_folder(tmp_path, capsys):
     assert not (tmp_path / "config.json").exists()
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_a_checkpoint_of_another_version_is_refused_and_kept(out, tmp_path):
     from orbax.checkpoint import v1 as ocp
 
@@ -104,7 +104,7 @@ def test_a_checkpoint_of_another_version_is_refused_and_kept(out, tmp_path):
     assert (run / "checkpoints" / "1000").is_dir()
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_a_checkpoint_that_cannot_be_written_is_one_line_with_the_disks_reason(out, tmp_path):
     _, state = checkpoint.load_run(out / "whole")
     (tmp_path / "checkpoints").write_text("a file where the folder should be")
@@ -191,7 +191,7 @@ def test_no_kills_are_refused(tmp_path):
         chaos.Chaos(out=tmp_path, kills=0)
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_a_training_of_which_something_is_lost_ends_with_an_error(out, monkeypatch):
     monkeypatch.setattr(chaos_report, "verdict", lambda results: ("2 of 3 faults survived", False))
     with pytest.raises(ValueError, match=r"something was lost; .*chaos\.md says what"):

@@ -12,6 +12,8 @@ from experiments.fig1_loss_tradeoff import Fig1, main, pretrained, variant
 from experiments.training_runs import QUICK_STEPS, Budget
 from spnr_jax import checkpoint, cli, config, presets, training
 
+pytestmark = pytest.mark.ci  # it trains several networks
+
 
 @pytest.fixture(scope="module", autouse=True)
 def _shrunken():

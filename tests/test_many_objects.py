@@ -16,6 +16,7 @@ from experiments.many_objects import ManyObjects, main
 from experiments.many_runs import AXES, FORMS, apart, create, entered_batch, entered_states, form_step, left
 from spnr_jax import cli, data, presets, trainer, training
 
+pytestmark = pytest.mark.ci  # it trains several networks
 SEEDS = (3, 4, 5)
 STEPS = 3
 QUICK = dataclasses.replace(SHRUNKEN["points2nerf_tiny"], num_steps=STEPS)  # no convolutions: compiles in a second

@@ -42,7 +42,7 @@ def execute(name, old="", new=""):
     return names
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_vmap_over_objects_draws_every_object_from_every_side(workplace):
     names = execute("vmap_over_objects")
     drawn = np.asarray(names["draw"](names["objects"]))
@@ -52,7 +52,7 @@ def test_vmap_over_objects_draws_every_object_from_every_side(workplace):
     assert len(plt.get_fignums()) == 2
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_your_own_loss_trains_with_both_losses(workplace):
     names = execute("your_own_loss", "SIZE, STEPS = 32, 80", "SIZE, STEPS = 16, 3")
     reference, *rows = (np.asarray(row) for row in names["rows"].values())

@@ -24,6 +24,7 @@ from data_gen import records, views
 from experiments import poisson, table1, table1_poisson, table1_report, table1_scores, table1_training
 from spnr_jax import cli, data, evaluation, presets, trainer, training
 
+pytestmark = pytest.mark.ci  # it trains several networks
 SOLVER = importlib.util.find_spec("pymeshlab") is not None
 METHODS = tuple(name for name in table1.ROWS if SOLVER or not name.startswith("poisson"))
 

@@ -85,7 +85,7 @@ def test_no_dependency_of_an_extra_is_imported_before_it_is_needed():
     assert not loaded & (unneeded | {"trimesh", "skimage", "matplotlib", "grain", "orbax"})
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_the_wheel_holds_the_two_packages_of_the_commands_and_all_of_their_files(wheel):
     names = zipfile.ZipFile(wheel).namelist()
     assert {name.split("/")[0] for name in names if ".dist-info/" not in name} == {"spnr_jax", "data_gen"}
@@ -100,7 +100,7 @@ def test_the_wheel_holds_the_two_packages_of_the_commands_and_all_of_their_files
         assert target.partition(":")[0].replace(".", "/") + ".py" in names
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_in_an_empty_environment_the_wheel_renders_clouds_and_meshes(environment, tmp_path):
     listed = output_of(environment / "python", "-m", "pip", "list", "--disable-pip-version-check")
     for package in ("mitsuba", "viser", "pymeshlab", "torch", "dask"):
@@ -118,7 +118,7 @@ def test_in_an_empty_environment_the_wheel_renders_clouds_and_meshes(environment
         assert (tmp_path / "pictures" / f"{Path(name).stem}_turntable.gif").is_file()
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 @pytest.mark.parametrize(
     ("arguments", "extra"),
     [
