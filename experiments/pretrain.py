@@ -3,9 +3,10 @@
     python -m experiments.pretrain --meshes DIR --test-list FILE [--out runs/pretrain]
 
 Two data sets lie below OUT: `procedural`, objects of all classes, and `meshes`, those that the list does not hold out,
-each with variants of colour and shape.  `data` joins them by links.  The preset plus_small trains on it in OUT/run; the
-held-out meshes score it (OUT/report.html), and OUT/pretrained.npz is the file that the package holds.  What is there
-already is reused: finished objects, trained steps.
+each with variants of colour and shape.  `data` joins them by links.  The preset plus_small trains on it in OUT/first;
+OUT/run begins where that ended and goes on with from 128 to 2048 points an object.  The held-out meshes score it
+(OUT/report.html), and OUT/pretrained.npz is the file that the package holds.  What is there already is reused: finished
+objects, trained steps.
 """
 
 import dataclasses
@@ -23,6 +24,7 @@ from data_gen.plan import GenerateConfig
 from data_gen.records import SPLITS
 from experiments.demo import Seconds
 from spnr_jax import cli, data, evaluation, presets, trainer, weights
+from spnr_jax.config import TrainConfig
 from spnr_jax.images import write_whole
 from spnr_jax.results import text_table, write_results
 
@@ -39,14 +41,16 @@ class Pretrain:
     """Folder of data sets, run, report and weights."""
     objects: int = 2400
     """Procedural objects."""
-    variants: int = 8
+    variants: int = 24
     """Variants of each training mesh: base colours rotated, turned, mirrored, stretched, roughness bent."""
     views: int = 4
     """Views per object."""
     spp: int = 24
     """Samples per pixel of the references."""
     steps: int | None = None
-    """Training steps (default: the preset's)."""
+    """Training steps of the first run (default: the preset's)."""
+    more_steps: int = 9000
+    """Training steps of the second run."""
     seed: int = 7
     """Seed of the data."""
 
@@ -63,14 +67,29 @@ def main(options: Pretrain) -> None:
         print(f"generating {part.out}", flush=True)
         seconds.measure("generate", partial(generate, part))
     dataset = data.open_dataset(joined(options.out / "data", [Path(part.out) for part in parts]))
-    run = options.out / "run"
-    print(f"training preset {config.preset} for {config.num_steps} steps in {run}", flush=True)
-    seconds.measure("train", lambda: trainer.train(config, dataset, run, trainer.Schedule()))
+    first, run = options.out / "first", options.out / "run"
+    seconds.measure("train", partial(train, config, dataset, first, None))
+    seconds.measure("train", partial(train, of_any_density(config, options.more_steps), dataset, run, first))
     weights.write_weights(options.out / "pretrained.npz", weights.read_trained(run))
     outcome = evaluation.evaluate(options.out / "pretrained.npz", dataset, "test" if dataset.splits["test"] else "val")
     write_results(options.out, outcome, dataset.settings, trainer.read_rows(run), seconds.values)
     print("\n".join(text_table(outcome.summary["methods"])))
     print(f"weights: {options.out / 'pretrained.npz'}\nreport:  {options.out / 'report.html'}")
+
+
+def train(config: TrainConfig, dataset: data.Dataset, run: Path, before: Path | None) -> None:
+    """Trains a run, from the weights that the run before it ended with."""
+    print(f"training preset {config.preset} for {config.num_steps} steps in {run}", flush=True)
+    init = None if before is None else weights.read_trained(before)
+    trainer.train(config, dataset, run, trainer.Schedule(), init=init)
+
+
+def of_any_density(config: TrainConfig, steps: int) -> TrainConfig:
+    """The config of the second run: few and many points, other batches, a lower learning rate."""
+    optimizer = dataclasses.replace(config.optimizer, lr_generator=1.5e-3)
+    return dataclasses.replace(
+        config, optimizer=optimizer, num_steps=steps, min_points=128, max_points=2048, seed=config.seed + 1
+    )
 
 
 def data_sets(options: Pretrain, resolution: int) -> list[GenerateConfig]:

@@ -8,7 +8,7 @@ import pytest
 import tiny_dataset
 
 from experiments import pretrain
-from spnr_jax import cli, data, presets, weights
+from spnr_jax import cli, data, presets, run_record, weights
 
 CONFIG = dataclasses.replace(
     tiny_dataset.CONFIG, loss=dataclasses.replace(tiny_dataset.CONFIG.loss, adversarial_weight=0.0)
@@ -38,18 +38,20 @@ def asked(monkeypatch):
 
 
 def test_both_data_sets_train_one_network_and_its_file_is_what_was_scored(asked, tmp_path, capsys):
-    options = pretrain.Pretrain(out=tmp_path / "out", meshes=tmp_path, test_list=tmp_path / "test.txt")
+    options = pretrain.Pretrain(out=tmp_path / "out", meshes=tmp_path, test_list=tmp_path / "test.txt", more_steps=2)
     pretrain.main(options)
     procedural, meshes = asked
     assert (procedural.objects, procedural.meshes, procedural.colour_variants) == (2400, None, 0)
-    assert (meshes.meshes, meshes.colour_variants, meshes.reshape_variants) == (tmp_path, 8, True)
+    assert (meshes.meshes, meshes.colour_variants, meshes.reshape_variants) == (tmp_path, 24, True)
     assert meshes.test_list == tmp_path / "test.txt"
     joined, single = data.open_dataset(options.out / "data"), tiny_dataset.dataset()
     for split, names in single.splits.items():
         assert set(joined.splits[split]) == {*names, *(f"mesh-{name}" for name in names)}
     assert data.read_object(joined, f"mesh-{single.splits['test'][0]}").images.size
     trained = weights.read_trained(options.out / "pretrained.npz")
-    assert (trained.config, trained.steps) == (CONFIG, CONFIG.num_steps)
+    assert (trained.config, trained.steps) == (pretrain.of_any_density(CONFIG, 2), 2)
+    (start,) = run_record.read_starts(options.out / "run")
+    assert start["init"] == f"{CONFIG.preset}, {CONFIG.num_steps} steps"
     scored = json.loads((options.out / "metrics.json").read_text())
     assert scored["methods"]["ours"]["objects"] == len(joined.splits["test"])
     assert "report.html" in capsys.readouterr().out
