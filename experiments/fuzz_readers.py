@@ -166,6 +166,13 @@ def read_lpips(folder: Path, main: str) -> None:
     read_weights(folder / main)
 
 
+def read_network(folder: Path, main: str) -> None:
+    """A file of weights."""
+    from spnr_jax.weights import Trained, read_weights
+
+    assert isinstance(read_weights(folder / main), Trained)
+
+
 CLOUDS: dict[str, Callable[[], list[Files]]] = {
     "ply": fuzz_seeds.plys, "ply-mesh": fuzz_seeds.ply_meshes, "pcd": fuzz_seeds.pcds, "text": fuzz_seeds.texts,
     "npz": fuzz_seeds.npzs, "npy": fuzz_seeds.npys, "las": functools.partial(fuzz_seeds.scans, "las"),
@@ -184,4 +191,5 @@ READERS = {
     "viewer-message": Reader(seeds=fuzz_messages.messages, read=fuzz_messages.read_message),
     "viewer-upload": Reader(seeds=fuzz_messages.sent_files, read=fuzz_messages.read_upload),
     "lpips": Reader(seeds=fuzz_seeds.lpips, read=read_lpips),
+    "weights": Reader(seeds=fuzz_seeds.weights, read=read_network),
 }

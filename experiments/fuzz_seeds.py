@@ -4,6 +4,7 @@ A seed is a dict from names to bytes, the file that is opened first, its compani
 literal seeds; damage to a few hundred bytes hits what matters.
 """
 
+import dataclasses
 import functools
 import io
 import json
@@ -307,3 +308,25 @@ def lpips() -> list[Files]:
         stream, allow_pickle=False, **{name: np.zeros(shape, np.int8) for name, shape in SHAPES.items()}
     )
     return [{"weights.npz": stream.getvalue()}]
+
+
+def weights() -> list[Files]:
+    """Files of weights of very small networks, one of them NPBG's."""
+    from spnr_jax.model_config import ModelConfig, SamplingConfig
+    from spnr_jax.weights import variable_shapes
+
+    ours = presets.tiny()
+    assert isinstance(ours.model, ModelConfig)
+    small = dataclasses.replace(
+        ours.model, point_widths=(4,), point_features=4, volume_resolution=8, base_width=4, num_stages=2, field_width=4,
+        sampling=SamplingConfig(num_coarse=2, num_fine=0), render_resolution=16, resize_resolution=16,
+        image_resolution=32, upsampler_width=4,
+    )  # fmt: skip
+    files = []
+    for config in (dataclasses.replace(ours, model=small), presets.npbg_tiny()):
+        described = np.frombuffer(json.dumps(to_dict(config)).encode(), np.uint8)
+        halves = {name: np.zeros(x.shape, np.float16) for name, x in variable_shapes(config).items()}
+        stream = io.BytesIO()
+        np.savez_compressed(stream, allow_pickle=False, config=described, steps=np.int64(3), **halves)
+        files.append({"weights.npz": stream.getvalue()})
+    return files

@@ -12,6 +12,7 @@ from typing import Any, ClassVar, Literal
 
 Material = Literal["base_color", "roughness", "metallic"]
 MATERIAL_CHANNELS = {"base_color": 3, "roughness": 1, "metallic": 1}
+MOST_LAYERS = 32  # of a PointNet: a damaged file must not cost minutes of tracing
 
 
 def added(default: Any) -> Any:
@@ -108,6 +109,10 @@ class ModelConfig:
         sizes = ("point_features", "num_groups", "field_width", "render_resolution", "resize_resolution")
         for name in (*sizes, "image_resolution", "upsampler_width"):
             require(getattr(self, name) >= 1, f"{name} must be at least 1, got {getattr(self, name)}")
+        require(
+            len(self.point_widths) <= MOST_LAYERS,
+            f"point_widths must name at most {MOST_LAYERS} layers, got {len(self.point_widths)}",
+        )
         step = 2**self.num_stages
         require(
             self.volume_resolution % step == 0 and self.volume_resolution > 0,

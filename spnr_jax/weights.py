@@ -11,7 +11,7 @@ import io
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from importlib import resources
 from pathlib import Path
 
@@ -103,6 +103,7 @@ def _check_weights(arrays: dict[str, np.ndarray], shapes: dict[str, jax.ShapeDty
             )
 
 
+@cache
 def variable_shapes(config: TrainConfig) -> dict[str, jax.ShapeDtypeStruct]:
     """Shape of every weight of the config's network, by name."""
     create = partial(training.network(config.model).init, jax.random.key(0))

@@ -63,6 +63,11 @@ def test_an_unknown_word_names_the_known_ones(kind, field, known):
         config.__post_init__()
 
 
+def test_a_pointnet_of_very_many_layers_is_refused():
+    with pytest.raises(ValueError, match="point_widths must name at most 32 layers, got 33"):
+        ModelConfig(point_widths=(4,) * 33)
+
+
 def test_an_unknown_material_names_the_known_ones():
     config = ModelConfig()
     object.__setattr__(config, "materials", ("colour",))  # the tests' type checker would be quicker than the config
