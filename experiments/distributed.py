@@ -8,11 +8,14 @@ with R1 in every second step.
 
     layouts       devices and processes, against one device
     handed over   half way from four processes to one, and from one to four: each reads what the other saved
-    cut           one volume of 128^3 voxels on one device and along one axis on four
+    cut           one volume of 128^3 voxels on one device and along one axis on four; the gradients of its first step
+                  (experiments/distributed_gradients.py)
     memory        of each device, for 128^3 and 256^3 voxels on 1, 2, 4 and 8 (experiments/distributed_memory.py)
+    rendering     pictures on one device and on eight, and what each does (experiments/distributed_rendering.py)
 
     OUT/data                the data set, if --data names none
     OUT/NAME  compiled      the runs, a finished one is only read; compiled programs
+    OUT/gradients.json  memory.json  rendering.json  rendering_DEVICES.npz
     OUT/results.json  table.md  distributed.png
 """
 
@@ -31,7 +34,7 @@ import jax
 import numpy as np
 import tyro
 
-from experiments import chaos, claims, distributed_memory
+from experiments import chaos, claims, distributed_gradients, distributed_memory, distributed_rendering
 from experiments.chaos_child import QUICK_COMPILATION
 from experiments.distributed_report import plot, table
 from spnr_jax import checkpoint, cli, data, run_record, trainer, training
@@ -114,7 +117,11 @@ def main(options: Distributed) -> None:
     large = [*flags, *LARGE.split()]
     one = start(ONE, large, "128 1 device")
     results["cut"] = compared(start(Layout(name="4 devices", devices=4, depth=4), large, "128 4 devices"), one)
+    gradients = partial(distributed_gradients.measured, place, 4, large)
+    results["gradients"] = claims.kept(options.out / "gradients.json", gradients)
     results["memory"] = distributed_memory.measured(options.out / "memory.json")
+    rendering = partial(distributed_rendering.measured, options.out)
+    results["rendering"] = claims.kept(options.out / "rendering.json", rendering)
     write_whole(options.out / "results.json", (json.dumps(results, indent=1) + "\n").encode())
     write_whole(options.out / "table.md", table(results).encode())
     write_whole(options.out / "distributed.png", plot(results))

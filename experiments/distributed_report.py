@@ -6,7 +6,7 @@ import numpy as np
 
 
 def table(results: dict) -> str:
-    """Markdown: how far every layout lies from one device, and the memory of a device by how many share a volume."""
+    """Markdown: how far every layout lies from one device, gradients, memory of a device, and what each renders."""
     lines = [
         f"| {results['steps']} steps, {results['batch_objects']} objects each | loss | any metric | running statistics "
         "| averaged parameters | ms a step |",
@@ -22,12 +22,26 @@ def table(results: dict) -> str:
         first = row[devices[0]]
         cells = (f"{value:,.0f} ({first / value:.1f})" if value != first else f"{value:,.0f}" for value in row.values())
         lines.append(f"| {resolution}^3 voxels | {' | '.join(cells)} |")
+    lines += ["", "| gradients of the first step, the volume cut in 4 | loss | worst array | median array |"]
+    lines.append("|---|---:|---:|---:|")
+    lines += [
+        f"| {precision} | {row['loss']:.1e} | {row['gradients']:.1e} ({row['array']}) | {row['median']:.1e} |"
+        for precision, row in results["gradients"].items()
+    ]
+    lines += ["", "| 8 views rendered | devices | seconds of all | of each | blocks of each | pixel off by |"]
+    lines.append("|---|---:|---:|---:|---:|---:|")
+    for network, rows in results["rendering"].items():
+        for count, row in rows.items():
+            share, blocks = row["seconds"] / int(count) / rows["1"]["seconds"], row.get("blocks", ["-"])
+            numbers = (count, f"{row['seconds']:.2f}", f"{share:.0%}", str(max(blocks)), f"{row['apart']:.1e}")
+            lines.append(f"| {network} | {' | '.join(numbers)} |")
     note = (
         f"Seed {results['seed']}; {results['hardware']}. Differences are relative, the "
         "largest of all steps; statistics and parameters by norms, after the last step. All devices share the same "
         "cores: the pace says what the division costs, not what it gains. Memory: arguments, results and temporary "
         "arrays of a step of the preset abo with one object, as XLA lays them out; in brackets how many times less "
-        "than on one device."
+        "than on one device. Gradients: the largest difference in an array over its largest entry. Seconds are those "
+        "of the processor; of each: all divided by the devices, as a share of one alone."
     )
     return "\n".join([*lines, "", note, ""])
 

@@ -103,8 +103,10 @@ def main(options: ManyObjects) -> None:
     seeds = range(options.seed, options.seed + options.runs)
     start = many_runs.create(config, seeds)
     trained = {form: train(form, options.out, dataset, config, seeds, start) for form in options.forms}
-    pace = kept(options.out / "pace.json", partial(measure_pace, options, dataset, config, seeds, start))
-    render = kept(options.out / "render.json", partial(measure_rendering, options, dataset, config, names, start))
+    pace = claims.kept(options.out / "pace.json", partial(measure_pace, options, dataset, config, seeds, start))
+    render = claims.kept(
+        options.out / "render.json", partial(measure_rendering, options, dataset, config, names, start)
+    )
     results = asked | {
         "hardware": evaluation.hardware(),
         "parameters": sum(x[0].size for x in jax.tree.leaves(start.generator)),
@@ -119,13 +121,6 @@ def main(options: ManyObjects) -> None:
     write_whole(options.out / "many_objects.png", plot(results))
     print(table(results))
     print(f"wrote results.json, table.md and many_objects.png in {options.out}")
-
-
-def kept(place: Path, make: Callable[[], dict]) -> dict:
-    """The content of a JSON file, which is made if it is not there."""
-    if not place.is_file():
-        write_whole(place, (json.dumps(make(), indent=1) + "\n").encode())
-    return json.loads(place.read_text())
 
 
 def train(

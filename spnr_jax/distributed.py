@@ -1,11 +1,12 @@
 """Many devices, many hosts: processes that know each other, a mesh of their devices, and what lies where on it.
 
     objects   the axis of the mesh over which the objects of a batch are divided: each device renders its own
-    depth     the axis over which the first grid axis (z) of every volume is divided, and with it the rays through it,
-              for volumes too big for one device
+    depth     the axis over which the rays of an object are divided; in training also the first grid axis (z) of its
+              volume, for volumes too big for one device
 
 The program is the one of a single device: placed inputs and the mesh in use are all that differs, and XLA adds the
-communication.  Parameters and optimisers are on every device whole.
+communication.  Parameters and optimisers are on every device whole.  Where a program packs rays by what they meet
+(`empty_space.map_existing`), each device packs its own (`on_own_rays`): XLA would let all of them compute all.
 """
 
 from collections.abc import Callable
@@ -19,10 +20,11 @@ import numpy as np
 from jax.experimental import multihost_utils
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
-from spnr_jax.types import Batch, Rays
+from spnr_jax.types import Batch
 
 OBJECTS, DEPTH = "objects", "depth"
 END_TIMEOUT = 30  # seconds that a process which ended waits for the others
+HEARTBEAT_TIMEOUT = 20  # seconds of silence after which a process counts as gone, and the others end
 
 
 def initialize(coordinator: str | None = None, num_processes: int | None = None, process_id: int | None = None) -> None:
@@ -37,7 +39,9 @@ def initialize(coordinator: str | None = None, num_processes: int | None = None,
     if num_processes is not None and not 0 <= (process_id or 0) < num_processes:
         raise ValueError(f"--process-id {process_id}: expected 0 to {num_processes - 1} of --num-processes")
     try:
-        jax.distributed.initialize(*given, shutdown_timeout_seconds=END_TIMEOUT)
+        jax.distributed.initialize(
+            *given, heartbeat_timeout_seconds=HEARTBEAT_TIMEOUT, shutdown_timeout_seconds=END_TIMEOUT
+        )
     except (RuntimeError, ValueError) as error:
         raise ValueError(
             f"the processes do not find each other ({error}); start them by srun, mpirun or an indexed Kubernetes job, "
@@ -51,6 +55,29 @@ def device_mesh(depth: int = 1) -> Mesh:
     if depth < 1 or count % depth:
         raise ValueError(f"--depth-devices {depth}: expected a divisor of the {count} devices")
     return jax.make_mesh((count // depth, depth), (OBJECTS, DEPTH), axis_types=(AxisType.Auto,) * 2)
+
+
+def rendering_mesh() -> Mesh | None:
+    """The devices of this process, all of them to each object; None if there is one alone."""
+    devices = jax.local_devices()
+    if len(devices) == 1:
+        return None
+    return jax.make_mesh((1, len(devices)), (OBJECTS, DEPTH), axis_types=(AxisType.Auto,) * 2, devices=devices)
+
+
+def everywhere(tree: Any) -> Any:
+    """The arrays on every device of this process whole; as they are if there is one alone."""
+    mesh = rendering_mesh()
+    return tree if mesh is None else jax.device_put(tree, replicated(mesh))
+
+
+def by_all_devices(render: Callable[..., Any], *arguments: Any) -> Any:
+    """What a jitted `render` makes of the arguments, its rays divided among this process's devices; on the first."""
+    mesh = rendering_mesh()
+    if mesh is None:
+        return render(*arguments)
+    with using(mesh):
+        return jax.device_put(render(*everywhere(arguments)), mesh.devices.flat[0])
 
 
 def using(mesh: Mesh | None) -> AbstractContextManager:
@@ -148,8 +175,34 @@ def lost(error: jax.errors.JaxRuntimeError, run: object) -> Exception:
 
 def object_groups(count: int) -> int:
     """How many groups the mesh in use divides so many objects into; 1 without a mesh, or if it does not divide them."""
-    groups = jax.sharding.get_abstract_mesh().shape.get(OBJECTS, 1)
+    groups = _devices(OBJECTS)
     return 1 if count % groups else groups
+
+
+def on_own_rays(function: Callable[..., Any], whole: Any, scenes: Any, rays: Any) -> Any:
+    """`function(whole, scenes, rays)`, in which each device of the mesh in use has its own objects and rays alone.
+
+    Arrays of `scenes` have objects first, those of `rays` and of what is returned objects and rays; `whole` is what all
+    share.  Rays are dealt to the devices like cards: neighbours, which meet the same, go to different ones.
+    """
+    (objects, count), devices = jax.tree.leaves(rays)[0].shape[:2], _devices(DEPTH)
+    if _devices(OBJECTS) * devices == 1 or objects % _devices(OBJECTS):  # a network is initialised with one object
+        return function(whole, scenes, rays)
+
+    def dealt(x: jax.Array) -> jax.Array:
+        x = jnp.pad(x, ((0, 0), (0, -count % devices), *[(0, 0)] * (x.ndim - 2)), mode="edge")
+        return x.reshape(x.shape[0], -1, devices, *x.shape[2:])
+
+    def collected(x: jax.Array) -> jax.Array:
+        return x.reshape(x.shape[0], -1, *x.shape[3:])[:, :count]
+
+    def own(whole: Any, scenes: Any, hand: Any) -> Any:
+        return jax.tree.map(lambda x: x[:, :, None], function(whole, scenes, jax.tree.map(lambda x: x[:, :, 0], hand)))
+
+    of_objects, of_rays = PartitionSpec(OBJECTS), PartitionSpec(OBJECTS, None, DEPTH)
+    # unchecked: a scan that starts from a constant is refused, although all results differ by device
+    divided = jax.shard_map(own, in_specs=(PartitionSpec(), of_objects, of_rays), out_specs=of_rays, check_vma=False)
+    return jax.tree.map(collected, divided(whole, scenes, jax.tree.map(dealt, rays)))
 
 
 def divide_depth(volume: jax.Array, coarsest: int) -> jax.Array:
@@ -158,7 +211,7 @@ def divide_depth(volume: jax.Array, coarsest: int) -> jax.Array:
     What is computed from them follows.  ValueError if the devices do not divide the `coarsest` grid: XLA gets gradients
     of strided convolutions wrong that do not come out even.
     """
-    devices = jax.sharding.get_abstract_mesh().shape.get(DEPTH, 1)
+    devices = _devices(DEPTH)
     if coarsest % devices:
         raise ValueError(
             f"--depth-devices {devices}: expected a divisor of {coarsest}, the sides of the network's coarsest grid "
@@ -167,17 +220,26 @@ def divide_depth(volume: jax.Array, coarsest: int) -> jax.Array:
     return _divided(volume) if devices > 1 else volume
 
 
-def divide_rays(rays: Rays) -> Rays:
-    """Rays (objects, rays, 3) divided among the devices that share their volume, if that comes out even."""
-    devices = jax.sharding.get_abstract_mesh().shape.get(DEPTH, 1)
-    return jax.tree.map(_divided, rays) if devices > 1 and rays.origins.shape[1] % devices == 0 else rays
+def divide_pixels(x: Any) -> Any:
+    """Rays (objects, rays, ...) or images (objects, rows, ...) divided among the devices that share an object.
+
+    They stay whole if that does not come out even.
+    """
+    devices, (first, *_) = _devices(DEPTH), jax.tree.leaves(x)
+    return jax.tree.map(_divided, x) if devices > 1 and first.shape[1] % devices == 0 else x
 
 
 def undivided(x: jax.Array) -> jax.Array:
     """An array (objects, ...) on every device that shares a volume, such as what rays brought."""
-    if jax.sharding.get_abstract_mesh().shape.get(DEPTH, 1) == 1:
+    if _devices(DEPTH) == 1:
         return x
     return jax.lax.with_sharding_constraint(x, PartitionSpec(OBJECTS))
+
+
+def _devices(axis: str) -> int:
+    """Devices along an axis of the mesh in use; 1 without one, and where each has its own already."""
+    mesh = jax.sharding.get_abstract_mesh()
+    return mesh.shape[axis] if axis in mesh.auto_axes else 1
 
 
 def _divided(x: jax.Array) -> jax.Array:

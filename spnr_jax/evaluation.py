@@ -20,6 +20,7 @@ from jaxtyping import Array, Float
 from spnr_jax import data, metrics, training
 from spnr_jax.baselines import floors
 from spnr_jax.config import TrainConfig
+from spnr_jax.distributed import by_all_devices
 from spnr_jax.flip import flip
 from spnr_jax.lpips import LpipsWeights, lpips
 from spnr_jax.summary import Scores, differences, metric_settings, summarise
@@ -114,11 +115,12 @@ def choose_radius(dataset: data.Dataset, config: TrainConfig, method: str, num_o
 
 
 def render_views(variables: dict, config: TrainConfig, cloud: PointCloud, camera: Camera) -> Rendering:
-    """All views of one object (clouds of data sets are normalised already)."""
+    """All views of one object (clouds of data sets are normalised already), rays divided among the devices."""
     cloud, camera = jax.tree.map(lambda x: jnp.asarray(x)[None], (cloud, camera))
     volume = training.jitted_encode(variables, cloud, config=config.model)
     side = rays_per_side(config.model, camera.width)
-    rendering = training.jitted_render(variables, volume, camera, config=config.model, rays_per_side=side)
+    render = partial(training.jitted_render, config=config.model, rays_per_side=side)
+    rendering = by_all_devices(render, variables, volume, camera)
     return jax.tree.map(lambda x: x[0], rendering)
 
 
@@ -158,8 +160,7 @@ def evaluate_object(
     methods: dict[str, Method], config: TrainConfig, item: data.ObjectData, weights: LpipsWeights | None = None
 ) -> ObjectResult:
     """Pictures and scores of one object."""
-    if not config.model.per_pixel:
-        data.check_resolution(item, config)
+    data.check_renders(item, config)
     cloud = test_cloud(item, config)
     pictures, scores = {}, {}
     for method, show in methods.items():

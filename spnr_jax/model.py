@@ -9,7 +9,7 @@ Clouds, cameras and depths are in the cloud's own units; the transform into the 
 
 import dataclasses
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -21,6 +21,7 @@ from jaxtyping import Array, Float
 from scipy.spatial import cKDTree
 
 from spnr_jax import cameras, clouds, supersampling, training, weights
+from spnr_jax.distributed import by_all_devices, everywhere
 from spnr_jax.model_config import ModelConfig, NetworkConfig, SamplingConfig
 from spnr_jax.types import Camera, PointCloud, Rendering
 
@@ -82,7 +83,12 @@ class Model:
             raise ValueError(f"this network doubles its pictures: {camera.width} x {camera.height} pixels must be even")
         config = at_quality(self.config, quality, volume.reach)
         side = supersampling.rays_per_side(config, camera.width) if quality == "best" else 1
-        return _render(self.variables, volume.scene, volume.centre, volume.scale, camera, config=config, side=side)
+        render = partial(_render, config=config, side=side)
+        return by_all_devices(render, self._spread, volume.scene, volume.centre, volume.scale, camera)
+
+    @cached_property
+    def _spread(self) -> dict:
+        return everywhere(self.variables)
 
     def camera(
         self, volume: Volume, azimuth: float = 30.0, elevation: float = 20.0, resolution: int | None = None

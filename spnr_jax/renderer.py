@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from spnr_jax import cameras, compositing, empty_space, sampling, surface, voxels
-from spnr_jax.distributed import divide_rays, undivided
+from spnr_jax.distributed import divide_pixels, on_own_rays, undivided
 from spnr_jax.empty_space import Path
 from spnr_jax.model_config import ModelConfig
 from spnr_jax.nn.field import RadianceField
@@ -75,7 +75,7 @@ class Renderer(nn.Module):
 
     def rays(self, camera: Camera) -> Rays:
         """Rays of the volume rendering for all views of an object in one axis, (objects, views * height * width, 3)."""
-        return divide_rays(cameras.view_rays(cameras.resize(camera, *self.render_size(camera))))
+        return divide_pixels(cameras.view_rays(cameras.resize(camera, *self.render_size(camera))))
 
     def render_size(self, camera: Camera) -> tuple[int, int]:
         """Height and width of the volume rendering behind the camera's image."""
@@ -94,7 +94,8 @@ class Renderer(nn.Module):
         features = undivided(features).reshape(-1, height, width, self.config.num_features)
         image = features[..., :3]
         if self.config.upsamples:
-            image = self.upsampler(bilinear(features, camera.height // 2, camera.width // 2))
+            small = divide_pixels(bilinear(features, camera.height // 2, camera.width // 2))
+            image = undivided(self.upsampler(small))
         return Rendering(
             image=image.reshape(*views, camera.height, camera.width, 3),
             image_lr=features[..., :3].reshape(*views, height, width, 3),
@@ -116,26 +117,34 @@ class Renderer(nn.Module):
 
     def render_near_points(self, scene: Scene, rays: Rays, key: Key | None):
         """`render_rays` with samples near the points alone: rays that miss them are white and cost nothing."""
+        renderer, variables = self.unbind()
+        shape = rays.origins.shape[:-1]
+        number = jnp.arange(shape[0] * shape[1]).reshape(shape)
+
+        def own(whole, scene, own_rays):
+            variables, key = whole
+            return renderer.bind(variables).render_open(scene, *own_rays, key)
+
+        return on_own_rays(own, (variables, key), scene, (rays, number))
+
+    def render_open(self, scene: Scene, rays: Rays, number: Int[Array, "objects rays"], key: Key | None):
+        """`render_near_points` on one device; what a ray draws depends on its number, not on those beside it."""
         near, far, _ = cameras.intersect_box(rays.origins, rays.directions)
         near_points = empty_space.dilate(scene.occupied, self.config.sampling.reach)
         path = empty_space.open_path(near_points, rays, near, far, CELLS_PER_VOXEL * scene.occupied.shape[-1])
         renderer, variables = self.unbind()
 
-        def block(row, objects, rays, far, path):
-            return renderer.bind(variables).march_open(
-                scene, objects, rays, far, path, None if key is None else jax.random.fold_in(key, row[0])
-            )
+        def block(objects, number, rays, far, path):
+            keys = None if key is None else jax.vmap(jax.random.fold_in, (None, 0))(key, number)
+            return renderer.bind(variables).march_open(scene, objects, rays, far, path, keys)
 
         shape = near.shape
-        rays, far, path = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), (rays, far, path))
-        row = jnp.arange(far.size)
+        objects = jnp.broadcast_to(jnp.arange(shape[0])[:, None], shape)
+        inputs = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), (objects, number, rays, far, path))
+        far, path = inputs[-2:]
         white = jnp.zeros((far.size, self.config.num_features)).at[:, :3].set(compositing.WHITE)
         outputs = empty_space.map_existing(
-            block,
-            path.travelled[:, -1] > 0,
-            (row, row // shape[1], rays, far, path),
-            (white, far, jnp.zeros_like(far)),
-            RAY_BLOCK,
+            block, path.travelled[:, -1] > 0, inputs, (white, far, jnp.zeros_like(far)), RAY_BLOCK
         )
         return jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), outputs)
 
@@ -171,9 +180,12 @@ class Renderer(nn.Module):
         return jax.tree.map(lambda x: x.reshape(*distances.shape, *x.shape[1:]), outputs)
 
     def march(self, shade, near, far, view, key: Key | None):
-        """Features of rays that `shade` evaluates between near and far, and weights and places of their samples."""
+        """Features of rays that `shade` evaluates between near and far, and weights and places of their samples.
+
+        The key is one for all rays, or one for each.
+        """
         counts = self.config.sampling
-        coarse_key, fine_key = (None, None) if key is None else jax.random.split(key)
+        coarse_key, fine_key = (None, None) if key is None else sampling.split(key)
         distances, edges = sampling.stratified(coarse_key, near, far, counts.num_coarse)
         density, emitted = shade(distances)
         weights, _ = compositing.volume_weights(density, compositing.interval_lengths(distances, far))

@@ -1,8 +1,9 @@
 """Where along a ray the volume is evaluated: stratified samples, and samples drawn from a step function.
 
 Vocabulary: `edges` (*batch, n+1) are the sorted ends of n bins along a ray, `distances` (*batch, m) are samples,
-`weights` (*batch, n) is the mass of each bin.  A key draws one number per sample of every ray; key=None takes the
-middle of each stratum.  All of it is float32: one bf16 spacing is wider than a coarse bin.
+`weights` (*batch, n) is the mass of each bin.  A key draws one number per sample of every ray, keys of the rays
+(*batch) each those of its own; key=None takes the middle of each stratum.  All of it is float32: one bf16 spacing is
+wider than a coarse bin.
 """
 
 import jax
@@ -16,8 +17,20 @@ from spnr_jax.types import Key
 def strata(key: Key | None, shape: tuple[int, ...], num_samples: int) -> Float[Array, "*batch samples"]:
     """One number in each of `num_samples` equal parts of [0, 1]: uniform in its part, or its middle without a key."""
     shape = (*shape, num_samples)
-    jitter = jnp.full(shape, 0.5) if key is None else jax.random.uniform(key, shape)
+    jitter = jnp.full(shape, 0.5) if key is None else _uniform(key, shape)
     return (per_feature(jnp.arange(num_samples, dtype=float), jitter) + jitter) / num_samples
+
+
+def split(key: Key) -> tuple[Key, Key]:
+    """Two new keys of each key."""
+    if key.ndim:
+        return jax.vmap(split)(key)
+    first, second = jax.random.split(key)
+    return first, second
+
+
+def _uniform(key, shape):
+    return jax.random.uniform(key, shape) if key.ndim == 0 else jax.vmap(_uniform, (0, None))(key, shape[1:])
 
 
 def stratified(

@@ -29,6 +29,7 @@ from spnr_jax.baselines.npbg import NPBG
 from spnr_jax.baselines.point_nerf import PointNeRF
 from spnr_jax.baselines.points2nerf import Points2NeRF
 from spnr_jax.config import TrainConfig
+from spnr_jax.distributed import on_own_rays
 from spnr_jax.metrics import psnr
 from spnr_jax.model_config import ModelConfig, NetworkConfig, NPBGConfig, PointNeRFConfig, Points2NeRFConfig
 from spnr_jax.nn.discriminator import Discriminator
@@ -190,11 +191,9 @@ def lattice(key: Key, batch: Batch, stride: int) -> Batch:
 
 def pixel_error(config: TrainConfig, image: Array, reference: Array, seen: Array | None = None) -> Float[Array, ""]:
     """Mean error of all pixels, or of those that are `seen` (0 if there are none)."""
-    if config.loss.pixel == "l1" and seen is None:
-        return losses.l1(image, reference)
-    error = {"l1": jnp.abs, "mse": jnp.square}[config.loss.pixel](image - reference)
     if seen is None:
-        return jnp.mean(error)
+        return {"l1": losses.l1, "mse": losses.mse}[config.loss.pixel](image, reference)
+    error = {"l1": jnp.abs, "mse": jnp.square}[config.loss.pixel](image - reference)
     return jnp.sum(jnp.where(seen[..., None], error, 0)) / jnp.maximum(3 * jnp.sum(seen), 1)
 
 
@@ -205,13 +204,13 @@ def reconstruction_loss(
     reference: Array,
     seen: Array | None = None,
 ) -> Float[Array, ""]:
-    """Weighted error of the image, and of a smaller volume rendering against the reference averaged to its size."""
-    if not config.model.upsamples:
-        error = config.loss.l1_weight * pixel_error(config, image, reference, seen)
-        return error + config.loss.mse_weight * jnp.mean((image - reference) ** 2)
-    low = losses.area_downsample(reference, image_lr.shape[-2])
-    errors = pixel_error(config, image, reference), pixel_error(config, image_lr, low)
-    return config.loss.l1_weight * (errors[0] + config.loss.low_resolution_weight * errors[1])
+    """Weighted errors of the image, and of a smaller volume rendering against the reference averaged to its size."""
+    error = pixel_error(config, image, reference, seen)
+    if config.model.upsamples:
+        low = losses.area_downsample(reference, image_lr.shape[-2])
+        error = error + config.loss.low_resolution_weight * pixel_error(config, image_lr, low)
+    error = config.loss.l1_weight * error
+    return error + config.loss.mse_weight * losses.mse(image, reference) if config.loss.mse_weight else error
 
 
 def logits(config: TrainConfig, params: dict, image: Array, condition: Array, mask: Array) -> Array:
@@ -261,7 +260,7 @@ def train_step(
         sown = {name: value for name, (value,) in updated.get("losses", {}).items()}
         if config.loss.opacity_weight:
             opacity = losses.area_downsample(jnp.asarray(batch.alpha)[..., None], rendering.acc.shape[-1])[..., 0]
-            sown["opacity"] = config.loss.opacity_weight * jnp.mean((rendering.acc - opacity) ** 2)
+            sown["opacity"] = config.loss.opacity_weight * losses.mse(rendering.acc, opacity)
         seen = rendering.acc > 0 if config.loss.masked else None
         return (rendering.image, rendering.image_lr, sown), (updated.get("batch_stats", {}), seen)
 
@@ -341,7 +340,13 @@ def render(
     module = network(config)
     if (ray_chunk := ray_chunk or config.ray_chunk) is None:
         return module.bind(variables).render(scene, camera)
-    rays = module.rays(camera)
+    in_chunks = partial(_in_chunks, module, ray_chunk)
+    outputs = on_own_rays(in_chunks, variables, scene, module.rays(camera))
+    return module.bind(variables).develop(camera, *outputs)
+
+
+def _in_chunks(module: nn.Module, ray_chunk: int, variables: dict, scene: Any, rays: Any) -> Any:
+    """What the module's `render_rays` gives for rays (objects, rays, ...), so many of each object at a time."""
     num_rays = jax.tree.leaves(rays)[0].shape[1]
     chunk = min(ray_chunk, num_rays)
 
@@ -354,8 +359,7 @@ def render(
         lambda rays: module.bind(variables).render_rays(scene, rays),
         jax.tree.map(lambda x: jnp.moveaxis(x, 1, 0), chunks),
     )
-    outputs = jax.tree.map(lambda x: jnp.moveaxis(x, 0, 1).reshape(x.shape[1], -1, *x.shape[3:])[:, :num_rays], outputs)
-    return module.bind(variables).develop(camera, *outputs)
+    return jax.tree.map(lambda x: jnp.moveaxis(x, 0, 1).reshape(x.shape[1], -1, *x.shape[3:])[:, :num_rays], outputs)
 
 
 def averaged_variables(state: TrainState) -> dict:

@@ -1,6 +1,7 @@
 """Empty space: open voxels, paths through them, and work that follows what exists."""
 
 import dataclasses
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +11,7 @@ import tiny_model
 from laws import close, same_bits
 from tiny_model import camera, cloud, wobbled
 
-from spnr_jax import cameras, empty_space, training, voxels
+from spnr_jax import cameras, empty_space, renderer, training, voxels
 from spnr_jax.empty_space import distance_at, map_existing, open_path
 from spnr_jax.model_config import SamplingConfig
 from spnr_jax.renderer import Renderer
@@ -187,6 +188,20 @@ class TestRendering:
             training.jitted_render(variables, scene, generic, config=config, ray_chunk=n) for n in (4096, ray_chunk)
         )
         close(chunked, whole, atol=1e-5)
+
+    def test_what_a_ray_draws_does_not_depend_on_the_rays_beside_it(self, variables, scene, monkeypatch):
+        """Devices of a mesh pack their own rays into blocks: a step must draw there what it draws on one device."""
+        config, generic = near_points(CONFIG, 1), camera(target=0.013)
+
+        @partial(jax.jit, static_argnames="block")
+        def jittered(key, block):
+            monkeypatch.setattr(renderer, "RAY_BLOCK", block)
+            return Renderer(config).bind(variables).render(scene, generic, key)
+
+        few, many = (jittered(jax.random.key(0), block) for block in (7, 256))
+        close(few, many, atol=1e-5)
+        still = training.jitted_render(variables, scene, generic, config=config)
+        assert np.abs(np.asarray(many.image) - np.asarray(still.image)).max() > 1e-3, "a key moves the samples"
 
     def test_no_point_gives_a_white_picture(self, variables):
         empty = dataclasses.replace(cloud(), mask=jnp.zeros_like(cloud().mask))

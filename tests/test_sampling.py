@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
-from laws import batch_law, close, float64_law, gradient_law, numbers
+from laws import batch_law, close, float64_law, gradient_law, numbers, same_bits
 
 from spnr_jax import sampling
 from spnr_jax.sampling import count_at_most, importance, merge, strata, stratified
@@ -75,6 +75,11 @@ class TestStratified:
         assert len(np.unique(jitter)) > 3990
         assert abs(np.corrcoef(jitter.T)[0, 1]) < 0.07
         assert abs(np.corrcoef(jitter[:-1, 0], jitter[1:, 0])[0, 1]) < 0.07
+
+    def test_keys_of_rays_draw_for_each_what_they_draw_for_it_alone(self):
+        together = [strata(keys, (3,), 5) for keys in sampling.split(jax.random.split(fresh(4), 3))]
+        alone = [[strata(key, (), 5) for key in jax.random.split(of_ray)] for of_ray in jax.random.split(fresh(4), 3)]
+        same_bits(together, [jnp.stack(x) for x in zip(*alone, strict=True)])
 
     def test_equal_keys_give_equal_bits_and_other_keys_others(self):
         first, again, other = (strata(fresh(seed), (3,), 4) for seed in (5, 5, 6))

@@ -23,6 +23,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from spnr_jax import cameras, compositing, sampling
+from spnr_jax.distributed import on_own_rays
 from spnr_jax.empty_space import map_existing
 from spnr_jax.model_config import MATERIAL_CHANNELS, PointNeRFConfig
 from spnr_jax.numerics import length, per_feature, softplus
@@ -209,9 +210,13 @@ class PointNeRF(nn.Module):
         """RGB on white, expected distance and opacity of each ray, one object after the other."""
         near, far, hit = cameras.intersect_box(view.rays.origins, view.rays.directions)
         distances = candidates(key, near, far, self.config.num_candidates, self.config.jitter)
-        one = partial(render_object, self.weights, self.config)
+
+        def own(weights, cloud, of_rays):
+            one = partial(render_object, weights, self.config)
+            return jax.lax.map(lambda x: one(*x), (cloud, *of_rays))
+
         cloud = jax.tree.map(jnp.asarray, cloud)
-        return jax.lax.map(lambda x: one(*x), jax.lax.stop_gradient((cloud, view, distances, far, hit)))
+        return on_own_rays(own, self.weights, *jax.lax.stop_gradient((cloud, (view, distances, far, hit))))
 
     def develop(self, camera: Camera, rgb: Array, depth: Array, acc: Array) -> Rendering:
         """Images from the rays of `rays`."""

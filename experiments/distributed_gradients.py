@@ -1,0 +1,90 @@
+"""Gradients of a first training step on one device and on several that share each volume: how far they lie apart.
+
+    python -m experiments.distributed_gradients DATA DEVICES PRECISION OPTIONS...    one line of JSON
+
+Options are those of `spnr train`.  Adam turns gradients near zero into whole steps, so parameters after it say little.
+In float64 what is left of a right division is rounding at 1e-12, and what is left of a wrong one is what is wrong; in
+float32 sums over millions of voxels that nearly cancel keep few digits, on any number of devices.
+"""
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from spnr_jax import cli, data, distributed, training
+
+PRECISIONS = ("float32", "float64")
+
+
+def measured(dataset: Path, devices: int, options: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """`apart` by precision, each of a process that sees so many devices."""
+    return {precision: in_child(dataset, devices, precision, options) for precision in PRECISIONS}
+
+
+def in_child(dataset: Path, devices: int, precision: str, options: Sequence[str]) -> dict[str, Any]:
+    """`apart` of a process that sees so many devices."""
+    done = subprocess.run(
+        [sys.executable, "-m", "experiments.distributed_gradients", str(dataset), str(devices), precision, *options],
+        env=os.environ
+        | {
+            "XLA_FLAGS": f"--xla_force_host_platform_device_count={devices}",
+            "JAX_ENABLE_X64": str(int(precision == "float64")),
+        },
+        capture_output=True,
+        text=True,
+    )
+    if done.returncode:
+        raise ValueError(f"gradients on {devices} devices: {done.stderr.strip()[-300:]}")
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def apart(dataset: Path, devices: int, precision: str, options: Sequence[str]) -> dict[str, Any]:
+    """Relative difference of the loss, and of the array of gradients that differs most, by its largest entry."""
+    command = cli.parse(["train", str(dataset), "run", *options])
+    assert isinstance(command, cli.Train)
+    config = command.config
+    batch = next(data.batches(data.open_dataset(dataset), config, 0))
+    losses, gradients = [], []
+    for mesh in (None, distributed.device_mesh(devices)):
+        with distributed.using(mesh):
+            state, metrics = training.jitted_train_step(
+                in_precision(training.jitted_create_state(config), precision),
+                distributed.placed(in_precision(batch, precision), mesh, config.batch_objects),
+                config=config,
+                adversarial=False,
+            )
+        losses.append(float(metrics["loss"]))
+        gradients.append(jax.device_get(state.generator_optimizer[0].mu))  # of one step their mean is a multiple
+    pairs = zip(jax.tree_util.tree_leaves_with_path(gradients[0]), jax.tree.leaves(gradients[1]), strict=True)
+    by_array = {
+        jax.tree_util.keystr(path, simple=True, separator="."): distance(other, one) for (path, one), other in pairs
+    }
+    worst = max(by_array, key=lambda name: by_array[name])
+    return {
+        "loss": abs(losses[1] / losses[0] - 1),
+        "gradients": by_array[worst],
+        "array": worst,
+        "median": float(np.median(list(by_array.values()))),
+    }
+
+
+def in_precision(tree: Any, precision: str) -> Any:
+    """The tree with its float32 arrays in a precision."""
+    return jax.tree.map(lambda x: x.astype(precision) if x.dtype == np.float32 else x, tree)
+
+
+def distance(a: np.ndarray, b: np.ndarray) -> float:
+    """Largest difference, as a share of the largest entry of the second; 0 of zeros."""
+    return float(np.abs(a - b).max() / max(np.abs(b).max(), 1e-30))
+
+
+if __name__ == "__main__":
+    cli.enable_compilation_cache()
+    print(json.dumps(apart(Path(sys.argv[1]), int(sys.argv[2]), sys.argv[3], sys.argv[4:])))
