@@ -26,6 +26,7 @@ from experiments.demo import Seconds
 from spnr_jax import cli, data, evaluation, presets, trainer, weights
 from spnr_jax.config import TrainConfig
 from spnr_jax.images import write_whole
+from spnr_jax.model_config import ModelConfig
 from spnr_jax.results import text_table, write_results
 
 
@@ -86,9 +87,15 @@ def train(config: TrainConfig, dataset: data.Dataset, run: Path, before: Path | 
 
 def of_any_density(config: TrainConfig, steps: int) -> TrainConfig:
     """The config of the second run: few and many points, other batches, a lower learning rate."""
-    optimizer = dataclasses.replace(config.optimizer, lr_generator=1.5e-3)
+    assert isinstance(config.model, ModelConfig)
     return dataclasses.replace(
-        config, optimizer=optimizer, num_steps=steps, min_points=128, max_points=2048, seed=config.seed + 1
+        config,
+        model=dataclasses.replace(config.model, surface_cells=45),  # of 2048 points
+        optimizer=dataclasses.replace(config.optimizer, lr_generator=1.5e-3),
+        num_steps=steps,
+        min_points=128,
+        max_points=2048,
+        seed=config.seed + 1,
     )
 
 

@@ -99,6 +99,8 @@ class ModelConfig:
     """Whether colour and features depend on the view direction."""
     num_neighbors: int = added(0)
     """Nearest points whose planes and materials a sample sees (`surface.py`); 0: the volume's feature alone [paper]."""
+    surface_cells: int = added(0)
+    """Cells along each axis of the grid of nearest points, at least; the presets' is that of the training's clouds."""
     color: Literal["free", "lit"] = added("free")
     """Radiance: free RGB [paper], or predicted light on the materials of the nearest points (`nn/surface_field.py`)."""
     point_norm: Literal["batch", "layer"] = added("batch")
@@ -139,7 +141,8 @@ class ModelConfig:
         )
         require(self.color in ("free", "lit"), f"color must be free or lit, got {self.color}")
         require(self.point_norm in ("batch", "layer"), f"point_norm must be batch or layer, got {self.point_norm}")
-        require(self.num_neighbors >= 0, f"num_neighbors must not be negative, got {self.num_neighbors}")
+        for name in ("num_neighbors", "surface_cells"):
+            require(getattr(self, name) >= 0, f"{name} must not be negative, got {getattr(self, name)}")
         require(
             self.num_neighbors > 0 or self.color == "free", "color lit needs the nearest points; use num_neighbors 6"
         )

@@ -82,6 +82,7 @@ def _plus(preset: TrainConfig, name: str, pixel_stride: int, num_coarse: int) ->
         preset.model,
         num_features=3,
         num_neighbors=6,
+        surface_cells=round(preset.max_points**0.5),
         color="lit",
         point_norm="layer",
         sampling=SamplingConfig(num_coarse=num_coarse, num_fine=0, reach=1),

@@ -56,7 +56,8 @@ class Renderer(nn.Module):
         volume = self.unet(*jax.vmap(spread)(positions, features, mask))
         near, cells = None, self.config.volume_resolution
         if self.config.num_neighbors:
-            near, cells = surface.estimate(cloud, self.config.num_neighbors), surface.grid_resolution(mask.shape[-1])
+            cells = surface.grid_resolution(mask.shape[-1], self.config.surface_cells)
+            near = surface.estimate(cloud, self.config.num_neighbors, cells)
         occupied = jax.vmap(partial(voxels.occupied, resolution=cells))(positions, mask)
         return Scene(volume=volume, occupied=occupied, surface=near)
 

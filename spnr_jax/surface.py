@@ -40,9 +40,12 @@ class Neighbourhoods(NamedTuple):
     spacing: Float[Array, " points"]
 
 
-def grid_resolution(num_points: int) -> int:
-    """Cells along each axis of the grid for so many points; a surface's points lie in the order of its square."""
-    return min(max(round(CELLS * num_points**0.5), 1), MOST_CELLS)
+def grid_resolution(num_points: int, least: int = 1) -> int:
+    """Cells along each axis of the grid for so many points; a surface's points lie in the order of its square.
+
+    Padding counts as points: with the `least` of a training, smaller clouds see the grid that they saw there.
+    """
+    return min(max(round(CELLS * num_points**0.5), least, 1), MOST_CELLS)
 
 
 def neighbours(
@@ -116,8 +119,8 @@ def nearest_by_cell(
     return table[:-1].reshape(*[resolution] * 3, count)
 
 
-def estimate(cloud: PointCloud, count: int) -> Surface:
-    """The surface around the points of each cloud (objects, points, ...), `count` points at each cell."""
+def estimate(cloud: PointCloud, count: int, resolution: int) -> Surface:
+    """The surface around the points of each cloud (objects, points, ...), `count` points at each cell of the grid."""
 
     def one(cloud: PointCloud) -> Surface:
         positions, mask = jnp.asarray(cloud.positions), jnp.asarray(cloud.mask)
@@ -126,7 +129,7 @@ def estimate(cloud: PointCloud, count: int) -> Surface:
         numbers = (positions, around.normals, *materials, around.inward, around.ratios, around.spacing)
         rows = jnp.concatenate([x.reshape(len(mask), -1) for x in numbers], axis=1)
         rows = jnp.where(mask[:, None], rows, 0)
-        nearest = nearest_by_cell(positions, mask, grid_resolution(len(mask)), count)
+        nearest = nearest_by_cell(positions, mask, resolution, count)
         return Surface(points=jnp.pad(rows, ((0, 1), (0, 0))), nearest=nearest)
 
     return jax.lax.stop_gradient(jax.vmap(one)(jax.tree.map(jnp.asarray, cloud)))

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -30,7 +31,11 @@ def ball(seed=0, points=300, objects=2):
     )
 
 
-estimate = jax.jit(surface.estimate, static_argnums=1)
+@partial(jax.jit, static_argnames=("count", "least"))
+def estimate(cloud, count, least=1):
+    return surface.estimate(cloud, count, surface.grid_resolution(cloud.mask.shape[-1], least))
+
+
 neighbourhoods = jax.jit(surface.neighbourhoods)
 describe = jax.jit(surface.describe)
 
@@ -114,6 +119,7 @@ class TestCells:
             side = 2 * 3 / surface.grid_resolution(points)
             assert 4 < points * side**2 / 8 < 5  # 8: the area of a cube with half diagonal 1
         assert surface.grid_resolution(10**7) == surface.MOST_CELLS
+        assert [surface.grid_resolution(n, 45) for n in (1, 128, 2048, 4096)] == [45, 45, 45, 64]
 
 
 class TestSamples:
@@ -232,6 +238,18 @@ class TestSamples:
         nothing = dataclasses.replace(cloud, mask=jnp.zeros_like(cloud.mask))
         assert not describe(estimate(nothing, COUNT), positions, *views(positions)).exists.any()
 
+    def test_how_much_padding_there_is_does_not_matter_where_the_least_grid_is_that_of_all(self):
+        cloud, positions = ball(), numbers(5, 64, 3)
+        padded = jax.tree.map(
+            lambda x: jnp.pad(x, ((0, 0), (0, 3 * x.shape[1]), *[(0, 0)] * (x.ndim - 2)), constant_values=0), cloud
+        )
+        least = surface.grid_resolution(padded.mask.shape[1])
+        known, more = (estimate(c, COUNT, least) for c in (cloud, padded))
+        told, same = (describe(s, positions, *views(positions)) for s in (known, more))
+        close(told, same, atol=1e-5)
+        assert told.exists.any()
+        assert estimate(cloud, COUNT).nearest.shape[1] < known.nearest.shape[1] == least
+
     def test_an_object_does_not_know_what_is_encoded_beside_it(self):
         cloud, positions = ball(), numbers(5, 64, 3, low=0.0, high=0.6)
         directions, _ = views(positions)
@@ -249,7 +267,7 @@ class TestSamples:
         def gradients(places, positions):
             def total(places, positions):
                 moved = dataclasses.replace(cloud, positions=places)
-                told = surface.describe(surface.estimate(moved, COUNT), positions, directions, objects)
+                told = surface.describe(estimate(moved, COUNT), positions, directions, objects)
                 return sum(jnp.sum(x) for x in jax.tree.leaves(dataclasses.replace(told, exists=jnp.zeros(7))))
 
             return jax.grad(total, (0, 1))(places, positions)
