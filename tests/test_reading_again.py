@@ -109,7 +109,7 @@ def test_packed_objects_are_read_again_too():
 @pytest.fixture
 def stepless(monkeypatch):
     """A network without numbers, whose step does nothing: the reader alone is tested."""
-    monkeypatch.setattr(training, "jitted_create_state", lambda config: SimpleNamespace(step=0))
+    monkeypatch.setattr(trainer, "new_state", lambda config, init: SimpleNamespace(step=0))
     monkeypatch.setattr(training, "jitted_train_step", lambda state, batch, **_: (state, {"loss": batch.image.mean()}))
 
 
