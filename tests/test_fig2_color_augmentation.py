@@ -13,6 +13,8 @@ from experiments.fig2_color_augmentation import Fig2, generation, main, nearest_
 from experiments.training_runs import Budget
 from spnr_jax import cli, data, training
 
+pytestmark = pytest.mark.ci  # it trains several networks
+
 TRAIN = ("ball_000000", "ball_000000--1", "ball_000000--2", "ball_000001", "ball_000001--1", "cube_000000")
 
 

@@ -16,6 +16,8 @@ from experiments import methods, point_count, sheets
 from experiments.point_count import PointCount, cloud_of, main
 from spnr_jax import cli, data, evaluation, statistics
 
+pytestmark = pytest.mark.ci  # it trains several networks
+
 NAMES = tiny_dataset.SPLITS["test"]
 COUNTS = (8, 16, 64)
 STORED = tiny_dataset.POINTS

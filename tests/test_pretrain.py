@@ -10,6 +10,8 @@ import tiny_dataset
 from experiments import pretrain
 from spnr_jax import cli, data, presets, run_record, weights
 
+pytestmark = pytest.mark.ci  # it trains several networks
+
 CONFIG = dataclasses.replace(
     tiny_dataset.CONFIG, loss=dataclasses.replace(tiny_dataset.CONFIG.loss, adversarial_weight=0.0)
 )
