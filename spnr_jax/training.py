@@ -146,7 +146,8 @@ def create_state(config: TrainConfig, seed: int | Array | None = None) -> TrainS
 def begun_with(state: TrainState, variables: dict) -> TrainState:
     """A fresh state with the generator of another training; ValueError if its weights are of another network."""
     params, stats = variables["params"], variables.get("batch_stats", {})
-    own, other = (flatten_dict(weights, sep="/") for weights in (state.generator, params))
+    needed = {"params": state.generator, "batch_stats": state.batch_stats}
+    own, other = (flatten_dict(weights, sep="/") for weights in (needed, {"params": params, "batch_stats": stats}))
     for name in own | other:
         shapes = [weights[name].shape if name in weights else "none" for weights in (own, other)]
         if shapes[0] != shapes[1]:
