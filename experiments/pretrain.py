@@ -26,8 +26,10 @@ from experiments.demo import Seconds
 from spnr_jax import cli, data, evaluation, presets, trainer, weights
 from spnr_jax.config import TrainConfig
 from spnr_jax.images import write_whole
-from spnr_jax.model_config import ModelConfig
+from spnr_jax.model_config import ModelConfig, surface_grid
 from spnr_jax.results import text_table, write_results
+
+MOST_POINTS = 2048  # of an object in the second run
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,11 +92,11 @@ def of_any_density(config: TrainConfig, steps: int) -> TrainConfig:
     assert isinstance(config.model, ModelConfig)
     return dataclasses.replace(
         config,
-        model=dataclasses.replace(config.model, surface_cells=45),  # of 2048 points
+        model=dataclasses.replace(config.model, surface_cells=surface_grid(MOST_POINTS)),
         optimizer=dataclasses.replace(config.optimizer, lr_generator=1.5e-3),
         num_steps=steps,
         min_points=128,
-        max_points=2048,
+        max_points=MOST_POINTS,
         seed=config.seed + 1,
     )
 

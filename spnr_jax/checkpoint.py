@@ -7,7 +7,6 @@
 The newest readable checkpoint counts: a broken one is named and the one before it is taken.
 """
 
-import ctypes
 import json
 import logging
 import os
@@ -19,7 +18,7 @@ from typing import Any
 
 import jax
 
-from spnr_jax import training
+from spnr_jax import memory, training
 from spnr_jax.config import TrainConfig, from_dict, to_dict
 
 KEPT = 3  # newest checkpoints that stay
@@ -106,15 +105,7 @@ def save(run: Path, state: training.TrainState) -> None:
             f"checkpoint {run / 'checkpoints' / str(step)} cannot be written ({reason}); the one before is kept: mend "
             "this, and the same command goes on from there"
         ) from None
-    _return_memory()
-
-
-def _return_memory() -> None:
-    """Has glibc give freed memory back to the system: it keeps 130 MB of Orbax's, and 1 MB more after each save."""
-    try:
-        ctypes.CDLL("libc.so.6").malloc_trim(0)
-    except (OSError, AttributeError):
-        return  # another C library
+    memory.give_back()
 
 
 def restore(

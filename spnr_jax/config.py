@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from types import UnionType
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
-from spnr_jax.model_config import METHODS, ModelConfig, NetworkConfig, added, require
+from spnr_jax.model_config import METHODS, ModelConfig, NetworkConfig, added, require, surface_grid
 
 LARGEST = 2**63  # of any number in a config
 
@@ -137,6 +137,13 @@ class TrainConfig:
             self.min_points <= self.max_points,
             f"min_points {self.min_points} must not exceed max_points {self.max_points}",
         )
+        if isinstance(self.model, ModelConfig) and self.model.num_neighbors:
+            cells = surface_grid(self.max_points)
+            require(
+                self.model.surface_cells >= cells,
+                f"model.surface_cells {self.model.surface_cells}: with max_points {self.max_points} the network would "
+                f"train on a finer grid than it renders smaller clouds with; use at least {cells}",
+            )
 
 
 def to_dict(config: TrainConfig) -> dict:

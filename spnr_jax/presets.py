@@ -8,7 +8,14 @@ from collections.abc import Callable
 from typing import Literal
 
 from spnr_jax.config import LossConfig, OptimizerConfig, TrainConfig
-from spnr_jax.model_config import ModelConfig, NPBGConfig, PointNeRFConfig, Points2NeRFConfig, SamplingConfig
+from spnr_jax.model_config import (
+    ModelConfig,
+    NPBGConfig,
+    PointNeRFConfig,
+    Points2NeRFConfig,
+    SamplingConfig,
+    surface_grid,
+)
 
 
 def abo() -> TrainConfig:
@@ -82,7 +89,7 @@ def _plus(preset: TrainConfig, name: str, pixel_stride: int, num_coarse: int) ->
         preset.model,
         num_features=3,
         num_neighbors=6,
-        surface_cells=round(preset.max_points**0.5),
+        surface_cells=surface_grid(preset.max_points),
         color="lit",
         point_norm="layer",
         sampling=SamplingConfig(num_coarse=num_coarse, num_fine=0, reach=1),

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Int
 from spnr_jax import cameras, compositing, empty_space, sampling, surface, voxels
 from spnr_jax.distributed import divide_pixels, on_own_rays, undivided
 from spnr_jax.empty_space import Path
-from spnr_jax.model_config import ModelConfig
+from spnr_jax.model_config import ModelConfig, surface_grid
 from spnr_jax.nn.field import RadianceField
 from spnr_jax.nn.pointnet import PointNet
 from spnr_jax.nn.surface_field import SurfaceField
@@ -26,7 +26,7 @@ from spnr_jax.nn.upsampler import Upsampler, bilinear
 from spnr_jax.numerics import clamp
 from spnr_jax.types import Camera, Key, PointCloud, Rays, Rendering, Scene
 
-CELLS_PER_VOXEL = 2  # of a path through the box, counted along an axis
+CELLS_PER_VOXEL = 1  # of a path through the box, counted along an axis
 RAY_BLOCK = 256  # rays near points that are rendered at once
 
 
@@ -56,7 +56,7 @@ class Renderer(nn.Module):
         volume = self.unet(*jax.vmap(spread)(positions, features, mask))
         near, cells = None, self.config.volume_resolution
         if self.config.num_neighbors:
-            cells = surface.grid_resolution(mask.shape[-1], self.config.surface_cells)
+            cells = surface_grid(mask.shape[-1], self.config.surface_cells)
             near = surface.estimate(cloud, self.config.num_neighbors, cells)
         occupied = jax.vmap(partial(voxels.occupied, resolution=cells))(positions, mask)
         return Scene(volume=volume, occupied=occupied, surface=near)
@@ -175,9 +175,8 @@ class Renderer(nn.Module):
         if objects is None:
             objects = jnp.broadcast_to(jnp.arange(len(positions))[:, None, None], distances.shape)
         directions = jnp.broadcast_to(rays.directions[..., None, :], positions.shape).reshape(-1, 3)
-        view = jnp.broadcast_to(view[..., None, :], (*distances.shape, view.shape[-1])).reshape(len(directions), -1)
         seen = surface.describe(scene.surface, positions.reshape(-1, 3), directions, objects.reshape(-1))
-        outputs = self.field(features.reshape(len(directions), -1), view, directions, seen)
+        outputs = self.field(features.reshape(len(directions), -1), directions, seen)
         return jax.tree.map(lambda x: x.reshape(*distances.shape, *x.shape[1:]), outputs)
 
     def march(self, shade, near, far, view, key: Key | None):

@@ -24,8 +24,6 @@ PLANE_POINTS = 10  # of a plane, the point itself among them
 SPACING_POINTS = 4  # nearest others whose root mean square distance is a point's spacing
 BLOCK = 1024  # points whose neighbours are searched at once
 LEAST_SPACING = 1e-4  # in units of the box, for points that coincide
-CELLS = 1.0  # along an axis of the grid, per square root of the number of points; 0.75 lost 0.1 dB
-MOST_CELLS = 96
 NEAR, FAR = 1e-6, 10.0  # spacings, the smallest and the largest distance that is told
 LEAST_FACING = 0.05  # cosine of the angle between ray and normal below which a plane counts as seen from its edge
 LEAST_RATIO = 1e-3  # of two extents
@@ -38,14 +36,6 @@ class Neighbourhoods(NamedTuple):
     inward: Float[Array, "points 3"]
     ratios: Float[Array, "points 2"]
     spacing: Float[Array, " points"]
-
-
-def grid_resolution(num_points: int, least: int = 1) -> int:
-    """Cells along each axis of the grid for so many points; a surface's points lie in the order of its square.
-
-    Padding counts as points: with the `least` of a training, smaller clouds see the grid that they saw there.
-    """
-    return min(max(round(CELLS * num_points**0.5), least, 1), MOST_CELLS)
 
 
 def neighbours(

@@ -24,7 +24,7 @@ import numpy as np
 from jax.sharding import Mesh
 from tqdm import tqdm
 
-from spnr_jax import checkpoint, data, distributed, evaluation, training
+from spnr_jax import checkpoint, data, distributed, evaluation, memory, training
 from spnr_jax.config import TrainConfig
 from spnr_jax.images import png, to_uint8, write_whole
 from spnr_jax.run_record import Clock, RunRecord
@@ -65,6 +65,7 @@ def train(
     A new run begins with random weights, or with those of `init`.  On a mesh of devices (`distributed.device_mesh`)
     each of its processes calls this.
     """
+    memory.one_arena()
     own = None if mesh is None else distributed.own_objects(mesh, config.batch_objects)
     with ExitStack() as stack:
         try:

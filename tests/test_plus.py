@@ -11,12 +11,12 @@ import tiny_training
 from laws import close, same_bits
 from tiny_model import PLUS, camera, cloud, wobbled
 
-from spnr_jax import empty_space, surface, training
+from spnr_jax import empty_space, presets, training
 from spnr_jax.clouds import PlacedCloud
 from spnr_jax.config import LossConfig, OptimizerConfig
 from spnr_jax.density_grid import sample_density
 from spnr_jax.model import Model
-from spnr_jax.model_config import ModelConfig, SamplingConfig
+from spnr_jax.model_config import ModelConfig, SamplingConfig, surface_grid
 from spnr_jax.renderer import Renderer
 
 GENERIC = camera(target=0.0171)  # no cell has its middle on a face between cells, where rounding would decide
@@ -46,7 +46,7 @@ class TestRendering:
         known = scene.surface.nearest[..., 0] < tiny_model.NUM_POINTS
         same_bits(empty_space.dilate(scene.occupied, 1), known)
         assert 0 < np.mean(known) < 1
-        assert known.shape[1] == surface.grid_resolution(tiny_model.NUM_POINTS)
+        assert known.shape[1] == surface_grid(tiny_model.NUM_POINTS)
 
     def test_a_box_that_is_open_everywhere_is_rendered_as_without_skipping(self, config, variables, scene):
         everywhere = dataclasses.replace(scene, occupied=jnp.ones_like(scene.occupied))
@@ -172,6 +172,12 @@ class TestConfig:
     def test_what_does_not_go_together_is_refused(self, changes, message):
         with pytest.raises(ValueError, match=message):
             dataclasses.replace(PLUS, **changes)
+
+    def test_the_grid_of_a_training_is_at_least_that_of_its_clouds(self):
+        config = presets.plus_tiny()
+        with pytest.raises(ValueError, match="surface_cells 32: with max_points 2048 .* use at least 45"):
+            dataclasses.replace(config, max_points=2048)
+        dataclasses.replace(config, max_points=2048, model=dataclasses.replace(config.model, surface_cells=45))
 
     def test_the_papers_network_sees_no_surface(self):
         assert (ModelConfig().num_neighbors, ModelConfig().color, ModelConfig().point_norm) == (0, "free", "batch")

@@ -12,6 +12,7 @@ import reference
 from laws import close, numbers, same_bits
 
 from spnr_jax import surface
+from spnr_jax.model_config import MOST_CELLS, surface_grid
 from spnr_jax.numerics import normalize
 from spnr_jax.types import PointCloud
 
@@ -33,7 +34,7 @@ def ball(seed=0, points=300, objects=2):
 
 @partial(jax.jit, static_argnames=("count", "least"))
 def estimate(cloud, count, least=1):
-    return surface.estimate(cloud, count, surface.grid_resolution(cloud.mask.shape[-1], least))
+    return surface.estimate(cloud, count, surface_grid(cloud.mask.shape[-1], least))
 
 
 neighbourhoods = jax.jit(surface.neighbourhoods)
@@ -116,10 +117,10 @@ class TestCells:
 
     def test_three_by_three_cells_of_a_large_surface_hold_four_or_five_points_however_many_there_are(self):
         for points in (512, 1024, 4096):
-            side = 2 * 3 / surface.grid_resolution(points)
+            side = 2 * 3 / surface_grid(points)
             assert 4 < points * side**2 / 8 < 5  # 8: the area of a cube with half diagonal 1
-        assert surface.grid_resolution(10**7) == surface.MOST_CELLS
-        assert [surface.grid_resolution(n, 45) for n in (1, 128, 2048, 4096)] == [45, 45, 45, 64]
+        assert surface_grid(10**7) == MOST_CELLS
+        assert [surface_grid(n, 45) for n in (1, 128, 2048, 4096)] == [45, 45, 45, 64]
 
 
 class TestSamples:
@@ -243,7 +244,7 @@ class TestSamples:
         padded = jax.tree.map(
             lambda x: jnp.pad(x, ((0, 0), (0, 3 * x.shape[1]), *[(0, 0)] * (x.ndim - 2)), constant_values=0), cloud
         )
-        least = surface.grid_resolution(padded.mask.shape[1])
+        least = surface_grid(padded.mask.shape[1])
         known, more = (estimate(c, COUNT, least) for c in (cloud, padded))
         told, same = (describe(s, positions, *views(positions)) for s in (known, more))
         close(told, same, atol=1e-5)

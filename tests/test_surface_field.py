@@ -7,6 +7,7 @@ import pytest
 import reference
 from laws import close, numbers
 
+from spnr_jax import colors
 from spnr_jax.nn.surface_field import DIELECTRIC, SHARPNESS, STRENGTH, SurfaceField
 from spnr_jax.numerics import normalize
 from spnr_jax.types import SurfaceSample
@@ -41,7 +42,10 @@ def field(lit, sees_direction=True):
 
 
 def evaluate(module, x, directions, surface):
-    return module(x, module.view(directions), directions, surface)
+    """Density of samples, and the picture of rays of which each meets one sample: that of full opacity."""
+    view = module.view(directions)
+    density, emitted = module(x, directions, surface)
+    return density, module.finish(emitted, jnp.ones(len(x)), view)
 
 
 def weights(module):
@@ -54,10 +58,10 @@ def apply(module, variables, surface, directions=DIRECTIONS):
 
 
 @pytest.mark.parametrize("lit", [True, False])
-def test_density_and_radiance_are_those_of_the_layers_written_out(lit):
+def test_density_and_colour_are_those_of_the_layers_written_out(lit):
     module, surface = field(lit), jax.tree.map(np.float64, sample())
     variables = weights(module)
-    density, (color,) = apply(module, variables, sample())
+    density, color = apply(module, variables, sample())
     params, d = jax.tree.map(np.float64, variables["params"]), np.float64(DIRECTIONS)
 
     def dense(name, x):
@@ -78,7 +82,8 @@ def test_density_and_radiance_are_those_of_the_layers_written_out(lit):
     if lit:
         light, metal = reference.softplus(light), surface.metallic[:, None]
         diffuse = surface.base_color * (1 - metal) * light[:, :3]
-        close(color, diffuse + (DIELECTRIC * (1 - metal) + surface.base_color * metal) * light[:, 3:])
+        radiance = diffuse + (DIELECTRIC * (1 - metal) + surface.base_color * metal) * light[:, 3:]
+        close(color, colors.linear_to_srgb(jnp.clip(radiance, 0, 1)))
     else:
         close(color, 1 / (1 + np.exp(-light)))
 
@@ -93,8 +98,8 @@ def test_the_mirrored_direction_leaves_a_mirror_as_the_view_came():
 def test_a_black_dielectric_reflects_light_and_a_black_metal_none():
     module = field(lit=True)
     variables, surface = weights(module), sample().replace(base_color=jnp.zeros((N, 3)))
-    _, (plastic,) = apply(module, variables, surface.replace(metallic=jnp.zeros(N)))
-    _, (metal,) = apply(module, variables, surface.replace(metallic=jnp.ones(N)))
+    _, plastic = apply(module, variables, surface.replace(metallic=jnp.zeros(N)))
+    _, metal = apply(module, variables, surface.replace(metallic=jnp.ones(N)))
     assert (plastic > 0).all()
     assert (metal == 0).all()
 
@@ -130,21 +135,49 @@ def test_a_field_that_does_not_see_the_direction_has_one_colour_from_all_sides_t
     close((other_density, other), (density, color), rtol=1e-4, atol=1e-5)
 
 
+def finish(module, variables, emitted, acc, view=None):
+    view = jnp.zeros((len(acc), module.width)) if view is None else view
+    return module.apply(variables, emitted, acc, view, method="finish")
+
+
 @pytest.mark.parametrize("lit", [True, False])
-def test_a_ray_mixes_in_linear_light_and_lies_on_white_in_srgb(lit):
-    """Half covered by linear grey 0.5 (sRGB 0.7354): half of that, and half of white."""
-    grey, half = jnp.full((1, 3), 0.25), jnp.array([0.5])
-    expected = 0.5 * (0.735357 if lit else 0.5) + 0.5
-    close(field(lit).finish((grey,), half, half), jnp.full((1, 3), expected))
-    empty = field(lit).finish((jnp.zeros((1, 3)),), jnp.zeros(1), half)
-    assert (empty == 1).all()
+def test_a_ray_lies_on_white_in_srgb_by_its_opacity(lit):
+    """What is composited weighs as much as the opacity: half of it is the same colour, half of the picture."""
+    module = field(lit)
+    variables, emitted = weights(module), module.apply(weights(module), X, DIRECTIONS, sample())
+    _, whole = emitted
+    full = finish(module, variables, whole, jnp.ones(N))
+    half = finish(module, variables, tuple(0.5 * x for x in whole), jnp.full(N, 0.5))
+    close(half, 0.5 * full + 0.5, rtol=1e-5, atol=1e-6)
+    assert (finish(module, variables, tuple(0 * x for x in whole), jnp.zeros(N)) == 1).all()
 
 
-def test_a_ray_of_no_or_of_blinding_light_is_finite_in_value_and_gradient():
-    for radiance in (0.0, 1e-30, 1e-8, 1e4):
+def test_light_is_told_once_for_what_a_ray_sees_in_the_mean():
+    """Two samples of a ray: layers up to `shape` each, then the mean; materials mix in linear light."""
+    module = field(lit=True)
+    variables = weights(module)
+    _, whole = module.apply(variables, X, DIRECTIONS, sample())
+    share = 0.25
+    mixed = tuple(share * x[:1] + (1 - share) * x[1:2] for x in whole)
+    params = variables["params"]
+    deep = share * whole[0][0] + (1 - share) * whole[0][1]
+    deep = jax.nn.softplus(deep @ params["deep"]["kernel"] + params["deep"]["bias"])
+    light = jax.nn.softplus(deep @ params["light"]["kernel"] + params["light"]["bias"])
+    radiance = mixed[1][0] * light[:3] + mixed[2][0] * light[3:]
+    close(finish(module, variables, mixed, jnp.ones(1))[0], colors.linear_to_srgb(jnp.clip(radiance, 0, 1)), rtol=1e-4)
+
+
+@pytest.mark.parametrize("lit", [True, False])
+def test_a_ray_of_no_or_of_blinding_light_is_finite_in_value_and_gradient(lit):
+    module = field(lit)
+    variables = weights(module)
+    for size in (0.0, 1e-30, 1e-8, 1e4):
         for acc in (0.0, 1e-30, 1e-6, 1.0):
-            value, gradient = jax.value_and_grad(lambda x, a: jnp.sum(field(True).finish((x,), a, a)), argnums=(0, 1))(
-                jnp.full((1, 3), radiance * acc), jnp.array([acc])
-            )
+
+            def picture(size, acc):
+                emitted = (jnp.full((1, 6), size * acc), *[jnp.full((1, 3), size * acc)] * (2 if lit else 0))
+                return jnp.sum(finish(module, variables, emitted, acc))
+
+            value, gradient = jax.value_and_grad(picture, argnums=(0, 1))(jnp.float32(size), jnp.array([acc]))
             assert 0 <= value <= 3.00001
-            assert all(jnp.isfinite(x).all() for x in gradient), (radiance, acc)
+            assert all(jnp.isfinite(x).all() for x in gradient), (size, acc)

@@ -14,7 +14,7 @@ BASELINE = dataclasses.replace(
     loss=LossConfig(l1_weight=1.0, adversarial_weight=0.0, pixel="mse"),
     optimizer=OptimizerConfig(lr_generator=1e-2, warmup_steps=2, ema_decay=0.9),
 )
-PLUS = dataclasses.replace(tiny_model.PLUS, render_resolution=SIZE, image_resolution=SIZE)
+PLUS = dataclasses.replace(tiny_model.PLUS, surface_cells=32, render_resolution=SIZE, image_resolution=SIZE)
 NETWORKS: dict[str, NetworkConfig] = {
     "plus_tiny": PLUS,
     "npbg_tiny": NPBGConfig(encoder_widths=(8, 9), decoder_widths=(5,), image_resolution=SIZE),

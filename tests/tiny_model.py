@@ -33,6 +33,7 @@ PLUS = dataclasses.replace(
     WITHOUT_UPSAMPLER,
     num_features=3,
     num_neighbors=3,
+    surface_cells=6,  # of 40 points
     color="lit",
     point_norm="layer",
     sampling=SamplingConfig(num_coarse=6, num_fine=0, reach=1),

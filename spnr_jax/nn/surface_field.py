@@ -7,15 +7,17 @@ and one that grazes it then pass as much fog per depth, so that outlines do not 
 With `lit` the network does not invent colours, it predicts light.  Base colour b and metallic m of the points nearby
 give the specular colour at normal incidence, F0 = 0.04 (1 - m) + b m, and the radiance b (1 - m) E + F0 L in linear
 light, where E (diffuse light) and L (light from the mirrored direction) are positive outputs that see normal, roughness
-and view direction.  Radiance is composited in linear light, divided by the opacity, and encoded as sRGB last.
-Without it, RGB is free as in `field.py`, and composited as sRGB.
+and view direction.  Without it, RGB is free, and sRGB.
+
+The shading is deferred: what the light depends on is composited, and `finish` asks for the light once per ray, of the
+mean of what the ray sees.  Colours are mixed in linear light, divided by the opacity, and encoded as sRGB last.
 """
 
 import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from spnr_jax.colors import over
+from spnr_jax.colors import LEAST_OPACITY, over
 from spnr_jax.compositing import WHITE
 from spnr_jax.nn.encoding import encode_direction
 from spnr_jax.numerics import softplus
@@ -53,11 +55,13 @@ class SurfaceField(nn.Module):
     def __call__(
         self,
         x: Float[Array, "samples channels"],
-        view: Float[Array, "samples hidden"],
         directions: Float[Array, "samples 3"],
         surface: SurfaceSample,
-    ) -> tuple[Float[Array, " samples"], tuple[Float[Array, "samples 3"]]]:
-        """Density, 0 where no point is near, and linear radiance (sRGB colours unless `lit`) of each sample."""
+    ) -> tuple[Float[Array, " samples"], tuple[Float[Array, "samples _"], ...]]:
+        """Density, 0 where no point is near, and what the light depends on: the layer `shape`, the material's colours.
+
+        With `lit` these are the diffuse colour and the specular colour at normal incidence, else there are none.
+        """
         base, metallic = surface.base_color, surface.metallic[:, None]
         facing = -jnp.sum(surface.normal * directions, axis=-1)
         lengths = (surface.height, surface.beside, surface.nearest, surface.ahead, surface.miss, surface.outside)
@@ -71,18 +75,18 @@ class SurfaceField(nn.Module):
         steep = jnp.maximum(facing, 0) / jnp.where(surface.exists, surface.spacing, 1)
         behind = nn.sigmoid(shift - SHARPNESS * surface.height)
         density = jnp.where(surface.exists, STRENGTH * softplus(strength) * steep * behind, 0)
-        light = self.light(softplus(self.deep(seen) + view))
         if not self.lit:
-            return density, (nn.sigmoid(light),)
-        diffuse, mirrored = jnp.split(softplus(light), 2, axis=-1)
-        specular = DIELECTRIC * (1 - metallic) + base * metallic
-        return density, (base * (1 - metallic) * diffuse + specular * mirrored,)
+            return density, (seen,)
+        return density, (seen, base * (1 - metallic), DIELECTRIC * (1 - metallic) + base * metallic)
 
     def finish(
-        self, emitted: tuple[Float[Array, "*rays 3"]], acc: Float[Array, "*rays"], view: Array
+        self, emitted: tuple[Array, ...], acc: Float[Array, "*rays"], view: Float[Array, "*rays hidden"]
     ) -> Float[Array, "*rays 3"]:
-        """sRGB of a ray on white, from its composited radiance and opacity."""
-        del view
-        (color,) = emitted
+        """sRGB of a ray on white, from what is composited, its opacity and direction."""
+        seen, *colors = emitted
         acc = acc[..., None]
-        return over(color, acc, WHITE) if self.lit else color + (1 - acc) * WHITE
+        light = self.light(softplus(self.deep(seen / jnp.maximum(acc, LEAST_OPACITY)) + view))
+        if not self.lit:
+            return acc * nn.sigmoid(light) + (1 - acc) * WHITE
+        diffuse, mirrored = jnp.split(softplus(light), 2, axis=-1)
+        return over(colors[0] * diffuse + colors[1] * mirrored, acc, WHITE)
