@@ -8,55 +8,46 @@ float32 sums over millions of voxels that nearly cancel keep few digits, on any 
 """
 
 import json
-import os
-import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import numpy as np
+from jax.sharding import Mesh
 
+from experiments.virtual_devices import in_child
 from spnr_jax import cli, data, distributed, training
+from spnr_jax.config import TrainConfig
 
 PRECISIONS = ("float32", "float64")
 
 
 def measured(dataset: Path, devices: int, options: Sequence[str]) -> dict[str, dict[str, Any]]:
     """`apart` by precision, each of a process that sees so many devices."""
-    return {precision: in_child(dataset, devices, precision, options) for precision in PRECISIONS}
+    return {
+        precision: in_child(
+            __name__,
+            devices,
+            [str(dataset), str(devices), precision, *options],
+            environment={"JAX_ENABLE_X64": str(int(precision == "float64"))},
+        )
+        for precision in PRECISIONS
+    }
 
 
-def in_child(dataset: Path, devices: int, precision: str, options: Sequence[str]) -> dict[str, Any]:
-    """`apart` of a process that sees so many devices."""
-    done = subprocess.run(
-        [sys.executable, "-m", "experiments.distributed_gradients", str(dataset), str(devices), precision, *options],
-        env=os.environ
-        | {
-            "XLA_FLAGS": f"--xla_force_host_platform_device_count={devices}",
-            "JAX_ENABLE_X64": str(int(precision == "float64")),
-        },
-        capture_output=True,
-        text=True,
-    )
-    if done.returncode:
-        raise ValueError(f"gradients on {devices} devices: {done.stderr.strip()[-300:]}")
-    return json.loads(done.stdout.splitlines()[-1])
-
-
-def apart(dataset: Path, devices: int, precision: str, options: Sequence[str]) -> dict[str, Any]:
+def apart(
+    config: TrainConfig, dataset: data.Dataset, mesh: Mesh, precision: Literal["float32", "float64"] = "float32"
+) -> dict[str, Any]:
     """Relative difference of the loss, and of the array of gradients that differs most, by its largest entry."""
-    command = cli.parse(["train", str(dataset), "run", *options])
-    assert isinstance(command, cli.Train)
-    config = command.config
-    batch = next(data.batches(data.open_dataset(dataset), config, 0))
+    batch = next(data.batches(dataset, config, 0))
     losses, gradients = [], []
-    for mesh in (None, distributed.device_mesh(devices)):
-        with distributed.using(mesh):
+    for devices in (None, mesh):
+        with distributed.using(devices):
             state, metrics = training.jitted_train_step(
                 in_precision(training.jitted_create_state(config), precision),
-                distributed.placed(in_precision(batch, precision), mesh, config.batch_objects),
+                distributed.placed(in_precision(batch, precision), devices, config.batch_objects),
                 config=config,
                 adversarial=False,
             )
@@ -85,6 +76,14 @@ def distance(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.abs(a - b).max() / max(np.abs(b).max(), 1e-30))
 
 
+def main(dataset: Path, devices: int, precision: Literal["float32", "float64"], options: Sequence[str]) -> None:
+    """Prints `apart` for the config that options of `spnr train` make."""
+    command = cli.parse(["train", str(dataset), "run", *options])
+    assert isinstance(command, cli.Train)
+    mesh = distributed.device_mesh(devices)
+    print(json.dumps(apart(command.config, data.open_dataset(dataset), mesh, precision)))
+
+
 if __name__ == "__main__":
     cli.enable_compilation_cache()
-    print(json.dumps(apart(Path(sys.argv[1]), int(sys.argv[2]), sys.argv[3], sys.argv[4:])))
+    main(Path(sys.argv[1]), int(sys.argv[2]), "float64" if sys.argv[3] == "float64" else "float32", sys.argv[4:])

@@ -8,14 +8,13 @@ Convolutions are XLA's own, the form of a GPU: the sums of 2D convolutions that 
 
 import dataclasses
 import json
-import os
-import subprocess
 import sys
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 
+from experiments.virtual_devices import in_child
 from spnr_jax import distributed, presets, training
 from spnr_jax.config import TrainConfig
 from spnr_jax.images import write_whole
@@ -25,6 +24,8 @@ from spnr_jax.types import Batch, Camera, PointCloud
 
 RESOLUTIONS, DEVICES = (128, 256), (1, 2, 4, 8)
 MIB = 2**20
+# the optimisation of the machine code takes no part in what lies in memory
+UNOPTIMISED = "--xla_backend_optimization_level=0"
 
 
 def measured(place: Path) -> dict[str, dict[str, float]]:
@@ -34,25 +35,10 @@ def measured(place: Path) -> dict[str, dict[str, float]]:
         for devices in map(str, DEVICES):
             row = found.setdefault(resolution, {})
             if devices not in row:
-                row[devices] = in_child(resolution, devices)
+                row[devices] = in_child(__name__, int(devices), [resolution, devices], UNOPTIMISED) / MIB
                 write_whole(place, (json.dumps(found, indent=1) + "\n").encode())
                 print(f"{resolution}^3 voxels on {devices}: {row[devices]:.0f} MiB each", flush=True)
     return found
-
-
-def in_child(resolution: str, devices: str) -> float:
-    """`bytes_a_device` in MiB, of a process that sees so many devices."""
-    # least optimisation of the machine code, which takes no part in what lies in memory
-    flags = f"--xla_force_host_platform_device_count={devices} --xla_backend_optimization_level=0"
-    done = subprocess.run(
-        [sys.executable, "-m", "experiments.distributed_memory", resolution, devices],
-        env=os.environ | {"XLA_FLAGS": flags},
-        capture_output=True,
-        text=True,
-    )
-    if done.returncode:
-        raise ValueError(f"memory of {resolution}^3 voxels on {devices} devices: {done.stderr.strip()[-300:]}")
-    return json.loads(done.stdout.splitlines()[-1]) / MIB
 
 
 def config(resolution: int) -> TrainConfig:

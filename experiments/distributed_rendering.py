@@ -11,8 +11,6 @@ points, and by the preset `tiny` with fresh weights, which renders all rays.
 """
 
 import json
-import os
-import subprocess
 import sys
 import time
 from collections import Counter
@@ -26,6 +24,7 @@ import jax
 import numpy as np
 
 import spnr_jax
+from experiments.virtual_devices import in_child
 from spnr_jax import cli, evaluation, presets, training
 from spnr_jax.distributed import DEPTH, OBJECTS
 from spnr_jax.renderer import Renderer
@@ -42,26 +41,13 @@ def measured(folder: Path) -> dict[str, dict[str, Any]]:
     pictures = {}
     for devices in DEVICES:
         kept = folder / f"rendering_{devices}.npz"
-        for network, row in in_child(devices, kept).items():
+        for network, row in in_child(__name__, devices, [str(devices), str(kept)]).items():
             found[network][str(devices)] = row
         with np.load(kept, allow_pickle=False) as file:
             pictures[devices] = dict(file)
         for network, rows in found.items():
             rows[str(devices)]["apart"] = float(np.abs(pictures[devices][network] - pictures[1][network]).max())
     return found
-
-
-def in_child(devices: int, kept: Path) -> dict[str, dict[str, Any]]:
-    """`rendered`, of a process that sees so many devices."""
-    done = subprocess.run(
-        [sys.executable, "-m", "experiments.distributed_rendering", str(devices), str(kept)],
-        env=os.environ | {"XLA_FLAGS": f"--xla_force_host_platform_device_count={devices}"},
-        capture_output=True,
-        text=True,
-    )
-    if done.returncode:
-        raise ValueError(f"rendering on {devices} devices: {done.stderr.strip()[-300:]}")
-    return json.loads(done.stdout.splitlines()[-1])
 
 
 def rendered(kept: Path) -> dict[str, dict[str, Any]]:

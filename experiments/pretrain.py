@@ -1,12 +1,12 @@
-"""The network in the package, made again: data, training, scores, file of weights.
+"""A network of the package, made again: data, training, scores, file of weights.
 
-    python -m experiments.pretrain --meshes DIR --test-list FILE [--out runs/pretrain]
+    python -m experiments.pretrain --meshes DIR --test-list FILE [--network tiny] [--out runs/pretrain]
 
 Two data sets lie below OUT: `procedural`, objects of all classes, and `meshes`, those that the list does not hold out,
-each with variants of colour and shape.  `data` joins them by links.  The preset plus_small trains on it in OUT/first;
-OUT/run begins where that ended and goes on with from 128 to 2048 points an object.  The held-out meshes score it
-(OUT/report.html), and OUT/pretrained.npz is the file that the package holds.  What is there already is reused: finished
-objects, trained steps.
+each with variants of colour and shape.  `data` joins them by links.  `small` is trained on it in three runs of which
+each begins where the one before ended: OUT/small/run1 with the points of the preset, the others with 128 to 2048 an
+object.  `tiny` is trained in one.  The held-out meshes score it (OUT/small/report.html), and OUT/small.npz is the file
+that the package holds.  What is there already is reused: finished objects, trained steps.
 """
 
 import dataclasses
@@ -16,6 +16,7 @@ import sys
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Literal
 
 import tyro
 
@@ -29,13 +30,15 @@ from spnr_jax.images import write_whole
 from spnr_jax.model_config import ModelConfig, surface_grid
 from spnr_jax.results import text_table, write_results
 
-MOST_POINTS = 2048  # of an object in the second run
+MOST_POINTS = 2048  # of an object after the first run
 
 
 @dataclass(frozen=True, kw_only=True)
 class Pretrain:
-    """Make the network in the package again."""
+    """Make a network of the package again."""
 
+    network: Literal["small", "tiny"] = "small"
+    """Which one."""
     meshes: Path | None = None
     """Folder of .glb, .gltf, .obj and .ply files that train beside the procedural objects (default: none)."""
     test_list: Path | None = None
@@ -51,9 +54,7 @@ class Pretrain:
     spp: int = 24
     """Samples per pixel of the references."""
     steps: int | None = None
-    """Training steps of the first run (default: the preset's)."""
-    more_steps: int = 9000
-    """Training steps of the second run."""
+    """Training steps of each run (default: those that the package's network had)."""
     seed: int = 7
     """Seed of the data."""
 
@@ -61,43 +62,54 @@ class Pretrain:
 def main(options: Pretrain) -> None:
     """Runs the parts and says where the results are."""
     cli.enable_compilation_cache()
-    seconds = Seconds(options.out / "seconds.json")
-    config = presets.plus_small()
-    if options.steps is not None:
-        config = dataclasses.replace(config, num_steps=options.steps)
-    parts = data_sets(options, config.model.image_resolution)
+    out = options.out / options.network
+    seconds = Seconds(out / "seconds.json")
+    runs = recipe(options)
+    parts = data_sets(options, runs[0].model.image_resolution)
     for part in parts:
         print(f"generating {part.out}", flush=True)
         seconds.measure("generate", partial(generate, part))
     dataset = data.open_dataset(joined(options.out / "data", [Path(part.out) for part in parts]))
-    first, run = options.out / "first", options.out / "run"
-    seconds.measure("train", partial(train, config, dataset, first, None))
-    seconds.measure("train", partial(train, of_any_density(config, options.more_steps), dataset, run, first))
-    weights.write_weights(options.out / "pretrained.npz", weights.read_trained(run))
-    outcome = evaluation.evaluate(options.out / "pretrained.npz", dataset, "test" if dataset.splits["test"] else "val")
-    write_results(options.out, outcome, dataset.settings, trainer.read_rows(run), seconds.values)
+    trained = None
+    for number, config in enumerate(runs, start=1):
+        run = out / f"run{number}"
+        print(f"training preset {config.preset} for {config.num_steps} steps in {run}", flush=True)
+        seconds.measure("train", partial(trainer.train, config, dataset, run, trainer.Schedule(), init=trained))
+        trained = weights.read_trained(run)
+    file = options.out / f"{options.network}.npz"
+    assert trained is not None, "there is at least one run"
+    weights.write_weights(file, trained)
+    outcome = evaluation.evaluate(file, dataset, "test" if dataset.splits["test"] else "val")
+    write_results(out, outcome, dataset.settings, trainer.read_rows(run), seconds.values)
     print("\n".join(text_table(outcome.summary["methods"])))
-    print(f"weights: {options.out / 'pretrained.npz'}\nreport:  {options.out / 'report.html'}")
+    print(f"weights: {file}\nreport:  {out / 'report.html'}")
 
 
-def train(config: TrainConfig, dataset: data.Dataset, run: Path, before: Path | None) -> None:
-    """Trains a run, from the weights that the run before it ended with."""
-    print(f"training preset {config.preset} for {config.num_steps} steps in {run}", flush=True)
-    init = None if before is None else weights.read_trained(before)
-    trainer.train(config, dataset, run, trainer.Schedule(), init=init)
+def recipe(options: Pretrain) -> list[TrainConfig]:
+    """The configs of the runs of a network."""
+    if options.network == "tiny":
+        runs = [presets.plus_lite()]
+    else:
+        first = presets.plus_small()
+        runs = [
+            first,
+            of_any_density(first, steps=9000, seed=first.seed + 1, lr=1.5e-3),
+            of_any_density(first, steps=6000, seed=first.seed + 2, lr=1e-3),
+        ]
+    return runs if options.steps is None else [dataclasses.replace(run, num_steps=options.steps) for run in runs]
 
 
-def of_any_density(config: TrainConfig, steps: int) -> TrainConfig:
-    """The config of the second run: few and many points, other batches, a lower learning rate."""
+def of_any_density(config: TrainConfig, steps: int, seed: int, lr: float) -> TrainConfig:
+    """The config of a run after the first: few and many points, other batches, a lower learning rate."""
     assert isinstance(config.model, ModelConfig)
     return dataclasses.replace(
         config,
         model=dataclasses.replace(config.model, surface_cells=surface_grid(MOST_POINTS)),
-        optimizer=dataclasses.replace(config.optimizer, lr_generator=1.5e-3),
+        optimizer=dataclasses.replace(config.optimizer, lr_generator=lr),
         num_steps=steps,
         min_points=128,
         max_points=MOST_POINTS,
-        seed=config.seed + 1,
+        seed=seed,
     )
 
 

@@ -39,8 +39,8 @@ class Train:
     config: tyro.conf.AvoidSubcommands[tyro.conf.OmitArgPrefixes[TrainConfig]] = field(default_factory=presets.tiny)
     """Every number of the run; --preset chooses the defaults."""
     init: str | None = None
-    """Weights that a new run begins with: a run folder, a file of weights, or `package` for the network in the package,
-    which is of preset plus_small (default: random)."""
+    """Weights that a new run begins with: a run folder, a file of weights, or `small` or `tiny`, the networks in the
+    package, which are of the presets plus_small and plus_lite (default: random)."""
     log_every: int = 20
     """Steps between rows of metrics.jsonl and TensorBoard."""
     preview_every: int = 500
@@ -66,7 +66,7 @@ class Evaluate:
     data: tyro.conf.Positional[Path]
     """Folder of the data set."""
     run: tyro.conf.Positional[Path]
-    """Folder of the run, or a file of weights."""
+    """Folder of the run, a file of weights, or `small` or `tiny`, the networks in the package."""
     out: Path | None = None
     """Folder for metrics.json and report.html (default: the run, or the name of the file without its suffix)."""
     split: Literal["train", "val", "test"] = "test"
@@ -116,7 +116,7 @@ class View:
     cloud: tyro.conf.Positional[Path]
     """What `spnr render` reads."""
     run: Path | None = None
-    """Run folder, or file of weights, whose network renders (default: the network in the package)."""
+    """Network that renders: `small` or `tiny` of the package, a run folder, a file of weights (default: small)."""
     host: str = "127.0.0.1"
     """Address to listen on; another than this machine's own opens the viewer to a network."""
     port: int = 8080
@@ -245,7 +245,7 @@ def run_train(command: Train) -> None:
     schedule = trainer.Schedule(
         log_every=command.log_every, preview_every=command.preview_every, checkpoint_every=command.checkpoint_every
     )
-    init = None if command.init is None else weights.read_trained(None if command.init == "package" else command.init)
+    init = None if command.init is None else weights.read_trained(command.init)
     trainer.train(command.config, dataset, command.run, schedule, mesh, init)
     if distributed.leads():
         print(f"trained: {command.run} (score it with `spnr evaluate {command.data} {command.run}`)")

@@ -134,6 +134,8 @@ def normalization(positions: np.ndarray) -> tuple[np.ndarray, np.float32]:
 def _check_file(path: Path) -> None:
     """ValueError unless there is a file of a known kind with something in it."""
     known = tuple(dict.fromkeys((*READERS, *MESHES)))
+    if path.is_dir():
+        raise ValueError(f"{path}: a folder; expected a file of one of {' '.join(known)}")
     if path.suffix.lower() not in known:
         raise ValueError(f"{path}: unknown kind of file {path.suffix!r}; expected one of {' '.join(known)}")
     if not path.is_file():

@@ -1,6 +1,6 @@
 """The handle for people who only want pictures: load a network, encode a cloud once, render it from anywhere.
 
-    model = spnr_jax.load()  # the network in the package; or a run folder, or a file of weights
+    model = spnr_jax.load()  # "small" of the package; or "tiny", a run folder, a file of weights
     volume = model.encode(spnr_jax.read_cloud("chair.ply"))
     rendering = model.render(volume, model.camera(volume, azimuth=30, elevation=20))
 
@@ -165,6 +165,6 @@ def reach_of(positions: np.ndarray, resolution: int, num_queries: int = 4096) ->
 
 
 def load(run: Path | str | None = None) -> Model:
-    """The averaged network of a run folder's newest checkpoint or of a file of weights; None: the package's own."""
+    """A network of the package (`small`, `tiny`; None is small), of a run folder's newest checkpoint, or of a file."""
     trained = weights.read_trained(run)
     return Model(config=trained.config.model, variables=trained.variables)

@@ -109,8 +109,30 @@ def plus_shapenet() -> TrainConfig:
     return _plus(shapenet_car(), "plus_shapenet", pixel_stride=2, num_coarse=32)
 
 
+def plus_lite() -> TrainConfig:
+    """The package's network `tiny`: half the sizes of plus_small's.  `spnr train --preset plus_lite DATA RUN`."""
+    small = plus_small()
+    assert isinstance(small.model, ModelConfig)
+    return dataclasses.replace(
+        small,
+        preset="plus_lite",
+        model=dataclasses.replace(
+            small.model,
+            point_widths=(32, 64, 128),
+            point_features=16,
+            volume_resolution=16,
+            field_width=32,
+            sampling=dataclasses.replace(small.model.sampling, num_coarse=8),
+            surface_cells=surface_grid(2048),
+        ),
+        num_steps=9000,
+        min_points=128,
+        max_points=2048,
+    )
+
+
 def plus_small() -> TrainConfig:
-    """The network in the package: plus_tiny's at 128 px, for longer.  `spnr train --preset plus_small DATA RUN`."""
+    """The package's network `small`: plus_tiny's at 128 px, for longer.  `spnr train --preset plus_small DATA RUN`."""
     tiny = plus_tiny()
     assert isinstance(tiny.model, ModelConfig)
     return dataclasses.replace(
@@ -261,7 +283,7 @@ def points2nerf_tiny() -> TrainConfig:
 
 
 OURS = (abo, shapenet_car, shapenet_plane, shapenet_chair, small, tiny)
-PLUS = (plus_abo, plus_shapenet, plus_small, plus_tiny)
+PLUS = (plus_abo, plus_lite, plus_shapenet, plus_small, plus_tiny)
 BASELINES = (
     *(npbg_abo, npbg_shapenet, npbg_tiny),
     *(point_nerf_abo, point_nerf_shapenet, point_nerf_tiny),

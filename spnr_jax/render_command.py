@@ -17,7 +17,7 @@ class Render:
     """.ply (also 3D Gaussian splats) .pcd .xyz .txt .csv .las .laz .npz .npy, or a mesh: .glb .gltf .obj .stl .off (its
     surface is sampled)."""
     run: Path | None = None
-    """Run folder, or file of weights, whose network renders (default: the network in the package)."""
+    """Network that renders: `small` or `tiny` of the package, a run folder, a file of weights (default: small)."""
     out: Path = Path("renders")
     """Folder for what is written."""
     up: Literal["auto", "x", "y", "z", "-x", "-y", "-z"] = "auto"

@@ -4,7 +4,8 @@
     steps               of training
     params/.../kernel   one array each, as they lie in the Linen variables
 
-The package holds the network that renders where no other is named (docs/model_card.md): `shipped` is its file.
+The package holds two networks (docs/model_card.md), of which `small` renders where no other is named: `shipped` is the
+file of one.
 """
 
 import io
@@ -27,6 +28,7 @@ from spnr_jax.numpy_files import read_arrays
 # what a header of any content makes its readers raise
 UNREADABLE = (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError)
 ADVICE = "write one with `spnr export RUN`"
+SHIPPED = ("small", "tiny")  # what the package holds
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,17 +40,18 @@ class Trained:
     steps: int
 
 
-def shipped() -> Path:
-    """The file of the network that the package holds."""
-    return Path(str(resources.files("spnr_jax") / "pretrained.npz"))
+def shipped(name: str = "small") -> Path:
+    """The file of a network that the package holds."""
+    return Path(str(resources.files("spnr_jax") / "pretrained" / f"{name}.npz"))
 
 
 def read_trained(source: Path | str | None, say: Callable[[str], None] = print, data: Path | str = "DATA") -> Trained:
-    """The network of a run folder's newest checkpoint or of a file of weights; None is the package's own.
+    """The network of a run folder's newest checkpoint, of a file of weights, or of the package: None, `small`, `tiny`.
 
     ValueError, with what to do, if there is none; `say` gets a line for each broken checkpoint, `data` is named.
     """
-    path = shipped() if source is None else Path(source)
+    name = "small" if source is None else str(source)
+    path = shipped(name) if name in SHIPPED else Path(name)
     if path.suffix == ".npz":
         return read_weights(path)
     config, state = checkpoint.load_run(path, say, data)
@@ -72,7 +75,7 @@ def read_weights(path: Path) -> Trained:
     """The network of a file, in float32; ValueError that says what is wrong with it.
 
     That the weights are those of the config's network takes a second to find out, because the network is traced for
-    their shapes; the package's own file is not asked again.
+    their shapes; the package's own files are not asked again.
     """
     if not path.is_file():
         raise ValueError(f"{path}: no such file of weights; {ADVICE}")
@@ -83,7 +86,7 @@ def read_weights(path: Path) -> Trained:
         if not isinstance(described, dict):
             raise ValueError("its config is no JSON object")
         config = from_dict(described)
-        if path != shipped():
+        if path not in [shipped(name) for name in SHIPPED]:
             _check_weights(arrays, variable_shapes(config))
     except UNREADABLE as error:
         raise ValueError(f"{path}: not a file of weights of this version ({error}); {ADVICE}") from None

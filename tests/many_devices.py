@@ -14,13 +14,13 @@ from unittest import mock
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import test_point_nerf
 import tiny_dataset
 import tiny_model
 
+from experiments import distributed_gradients
 from experiments.distributed_rendering import counting
-from spnr_jax import data, distributed, renderer, training
+from spnr_jax import distributed, renderer, training
 from spnr_jax.config import LossConfig
 from spnr_jax.model_config import SamplingConfig
 
@@ -68,19 +68,8 @@ def trained(model) -> float:
     """Largest relative difference between the gradients of one device and of four pairs, in the first step."""
     loss = LossConfig(l1_weight=1.0, adversarial_weight=0.0)
     config = dataclasses.replace(tiny_dataset.CONFIG, model=model, loss=loss, batch_objects=8)
-    batch = next(data.batches(tiny_dataset.dataset(), config, 0))
-    gradients = []
-    for mesh in (None, distributed.device_mesh(depth=2)):
-        with distributed.using(mesh):
-            state, _ = training.jitted_train_step(
-                training.jitted_create_state(config),
-                distributed.placed(batch, mesh, config.batch_objects),
-                config=config,
-                adversarial=False,
-            )
-        gradients.append(jax.device_get(state.generator_optimizer[0].mu))  # their first mean
-    pairs = zip(*map(jax.tree.leaves, gradients), strict=True)
-    return max(float(np.abs(a - b).max() / max(np.abs(b).max(), 1e-12)) for a, b in pairs)
+    found = distributed_gradients.apart(config, tiny_dataset.dataset(), distributed.device_mesh(depth=2))
+    return found["gradients"]
 
 
 def blocks() -> list[list[int]]:

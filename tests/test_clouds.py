@@ -228,6 +228,11 @@ def test_every_bad_file_is_one_line_that_names_it_and_the_reason(tmp_path, name,
     assert "\n" not in str(caught.value)
 
 
+def test_a_folder_is_no_cloud(tmp_path):
+    with pytest.raises(ValueError, match=r"a folder; expected a file of one of .ply .pcd"):
+        read(tmp_path)
+
+
 def test_a_mesh_without_material_says_so(tmp_path):
     _, lines = read(write(tmp_path, "a.obj", SQUARE_OBJ), num_points=10)
     assert any(line.startswith("no material in the mesh: base_color 0.5, roughness 0.5, metallic 0") for line in lines)

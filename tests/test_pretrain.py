@@ -40,7 +40,7 @@ def asked(monkeypatch):
 
 
 def test_both_data_sets_train_one_network_and_its_file_is_what_was_scored(asked, tmp_path, capsys):
-    options = pretrain.Pretrain(out=tmp_path / "out", meshes=tmp_path, test_list=tmp_path / "test.txt", more_steps=2)
+    options = pretrain.Pretrain(out=tmp_path / "out", meshes=tmp_path, test_list=tmp_path / "test.txt", steps=2)
     pretrain.main(options)
     procedural, meshes = asked
     assert (procedural.objects, procedural.meshes, procedural.colour_variants) == (2400, None, 0)
@@ -50,16 +50,16 @@ def test_both_data_sets_train_one_network_and_its_file_is_what_was_scored(asked,
     for split, names in single.splits.items():
         assert set(joined.splits[split]) == {*names, *(f"mesh-{name}" for name in names)}
     assert data.read_object(joined, f"mesh-{single.splits['test'][0]}").images.size
-    trained = weights.read_trained(options.out / "pretrained.npz")
-    assert (trained.config, trained.steps) == (pretrain.of_any_density(CONFIG, 2), 2)
-    (start,) = run_record.read_starts(options.out / "run")
-    assert start["init"] == f"{CONFIG.preset}, {CONFIG.num_steps} steps"
-    scored = json.loads((options.out / "metrics.json").read_text())
+    trained, out = weights.read_trained(options.out / "small.npz"), options.out / "small"
+    assert (trained.config, trained.steps) == (pretrain.recipe(options)[-1], 2)
+    starts = [run_record.read_starts(out / f"run{number}") for number in (1, 2, 3)]
+    assert [start["init"] for (start,) in starts] == [None, *[f"{CONFIG.preset}, 2 steps"] * 2]
+    scored = json.loads((out / "metrics.json").read_text())
     assert scored["methods"]["ours"]["objects"] == len(joined.splits["test"])
     assert "report.html" in capsys.readouterr().out
 
     pretrain.main(options)
-    again = json.loads((options.out / "metrics.json").read_text())
+    again = json.loads((out / "metrics.json").read_text())
     assert again["methods"] == scored["methods"]
     assert again["seconds"].get("train") == scored["seconds"].get("train")
 
@@ -67,3 +67,12 @@ def test_both_data_sets_train_one_network_and_its_file_is_what_was_scored(asked,
 def test_without_meshes_the_procedural_objects_train_alone(asked, tmp_path):
     parts = pretrain.data_sets(pretrain.Pretrain(out=tmp_path, objects=5), 128)
     assert [(part.objects, part.resolution, part.meshes) for part in parts] == [(5, 128, None)]
+
+
+def test_tiny_has_one_run_and_each_run_of_small_begins_where_the_one_before_ended():
+    assert pretrain.recipe(pretrain.Pretrain(network="tiny")) == [presets.plus_lite()]
+    first, *later = pretrain.recipe(pretrain.Pretrain())
+    assert first == presets.plus_small()
+    assert [run.num_steps for run in later] == [9000, 6000]
+    assert len({run.seed for run in (first, *later)}) == 3
+    assert all(run.model.surface_cells == presets.plus_lite().model.surface_cells for run in later)

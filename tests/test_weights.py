@@ -56,12 +56,21 @@ def test_every_weight_of_a_network_has_its_shape_by_name(trained):
     assert {name: x.shape for name, x in weights.variable_shapes(trained.config).items()} == found
 
 
-def test_the_network_in_the_package_has_the_weights_that_its_config_describes(tmp_path):
-    copy = tmp_path / "copy.npz"  # the package's own file is not checked when it is read
-    copy.write_bytes(weights.shipped().read_bytes())
-    checked, trusted = weights.read_weights(copy), weights.read_trained(None)
+@pytest.mark.parametrize(("name", "preset"), [("small", "plus_small"), ("tiny", "plus_lite")])
+def test_the_networks_in_the_package_have_the_weights_that_their_configs_describe(tmp_path, name, preset):
+    copy = tmp_path / "copy.npz"  # the package's own files are not checked when they are read
+    copy.write_bytes(weights.shipped(name).read_bytes())
+    checked, trusted = weights.read_weights(copy), weights.read_trained(name)
     assert checked.config == trusted.config
+    assert checked.config.preset == preset
     jax.tree.map(np.testing.assert_array_equal, checked.variables, trusted.variables)
+
+
+def test_a_name_is_the_packages_network_and_a_path_is_not(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    assert weights.read_trained(None).config.preset == weights.read_trained("small").config.preset == "plus_small"
+    with pytest.raises(ValueError, match="none.npz: no such file"):
+        weights.read_trained("none.npz")
 
 
 def test_weights_that_half_precision_does_not_hold_are_refused_and_nothing_is_written(trained, tmp_path):

@@ -1,0 +1,67 @@
+"""What glibc's allocator is asked: threads share an arena, freed memory goes back, another C library is left alone."""
+
+import ctypes
+import platform
+import subprocess
+import sys
+
+import pytest
+
+from spnr_jax import memory
+
+THREADS = 6
+CHILD = f"""
+import ctypes, sys, threading
+from spnr_jax import memory
+
+def arenas():
+    libc = ctypes.CDLL("libc.so.6")
+    libc.fopen.restype = ctypes.c_void_p
+    file = ctypes.c_void_p(libc.fopen(sys.argv[2].encode(), b"w"))
+    libc.malloc_info(0, file)
+    libc.fclose(file)
+    return open(sys.argv[2]).read().count("<heap nr=")
+
+def allocate():
+    kept = [bytes(2000) for _ in range(50)]  # too large for Python's own pools
+    meeting.wait()
+
+if sys.argv[1] == "one":
+    memory.one_arena()
+before = arenas()
+meeting = threading.Barrier({THREADS})
+threads = [threading.Thread(target=allocate) for _ in range({THREADS})]
+for thread in threads:
+    thread.start()
+for thread in threads:
+    thread.join()
+print(arenas() - before)
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="the C library is not glibc")
+@pytest.mark.parametrize(("asked", "more"), [("one", 0), ("none", THREADS)])
+def test_threads_share_an_arena_when_they_are_asked_to(tmp_path, asked, more):
+    done = subprocess.run(
+        [sys.executable, "-c", CHILD, asked, str(tmp_path / "info")], capture_output=True, text=True, check=True
+    )
+    assert int(done.stdout) == more
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="the C library is not glibc")
+def test_freed_memory_goes_back(monkeypatch):
+    asked = []
+    library = ctypes.CDLL("libc.so.6")
+    monkeypatch.setattr(ctypes, "CDLL", lambda name: asked.append(name) or library)
+    memory.give_back()
+    assert asked == ["libc.so.6"]
+
+
+def test_another_c_library_is_left_alone(monkeypatch):
+    def missing(name):
+        raise OSError(name)
+
+    for library in (missing, lambda name: object()):
+        monkeypatch.setattr(ctypes, "CDLL", library)
+        memory.one_arena()
+        memory.give_back()
