@@ -122,10 +122,10 @@ def plus_lite() -> TrainConfig:
             point_features=16,
             volume_resolution=16,
             field_width=32,
-            sampling=dataclasses.replace(small.model.sampling, num_coarse=8),
+            sampling=SamplingConfig(num_coarse=8, num_fine=0, reach=1),
             surface_cells=surface_grid(2048),
         ),
-        num_steps=9000,
+        num_steps=5000,
         min_points=128,
         max_points=2048,
     )
@@ -138,7 +138,12 @@ def plus_small() -> TrainConfig:
     return dataclasses.replace(
         tiny,
         preset="plus_small",
-        model=dataclasses.replace(tiny.model, render_resolution=128, image_resolution=128),
+        model=dataclasses.replace(
+            tiny.model,
+            render_resolution=128,
+            image_resolution=128,
+            sampling=SamplingConfig(num_coarse=16, num_fine=0, reach=1),
+        ),
         optimizer=dataclasses.replace(tiny.optimizer, ema_decay=0.999),
         num_steps=11_000,
         min_points=384,
@@ -148,7 +153,7 @@ def plus_small() -> TrainConfig:
 
 def plus_tiny() -> TrainConfig:
     """Light on materials, 64 px, minutes on two CPU cores.  `spnr train --preset plus_tiny DATA RUN`."""
-    return _plus(tiny(), "plus_tiny", pixel_stride=2, num_coarse=16)
+    return _plus(tiny(), "plus_tiny", pixel_stride=2, num_coarse=8)
 
 
 def _baseline_loss(pixel: Literal["l1", "mse"], masked: bool = False) -> LossConfig:
