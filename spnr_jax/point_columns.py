@@ -14,6 +14,7 @@ other numbers by their size.
 
 from collections.abc import Callable
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -119,7 +120,8 @@ def _base_color(columns: Columns, report: Report) -> np.ndarray | None:
 
 
 def _linear(colors: np.ndarray) -> np.ndarray:
-    return np.asarray(srgb_to_linear(jnp.asarray(colors, jnp.float32)))
+    whole = jax.jit(srgb_to_linear)  # its operations alone would be compiled one by one
+    return np.asarray(whole(jnp.asarray(colors, jnp.float32)))
 
 
 def _full(values: np.ndarray, linear: bool = True) -> float:
