@@ -22,6 +22,7 @@ from spnr_jax.voxels import NEIGHBOURS, locate, row_of
 
 PLANE_POINTS = 10  # of a plane, the point itself among them
 SPACING_POINTS = 4  # nearest others whose root mean square distance is a point's spacing
+ROW_BITS, DISTANCE_BITS = 20, 31  # of a cell's number, MOST_CELLS^3 at most, and of a float32 that is not negative
 BLOCK = 1024  # points whose neighbours are searched at once
 LEAST_SPACING = 1e-4  # in units of the box, for points that coincide
 NEAR, FAR = 1e-6, 10.0  # spacings, the smallest and the largest distance that is told
@@ -101,12 +102,30 @@ def nearest_by_cell(
     rows = row_of(target, counts, resolution).reshape(-1)
     away = jnp.sum((offset[:, None] - steps.astype(offset.dtype)) ** 2, axis=-1).reshape(-1)
     point = jnp.broadcast_to(jnp.arange(num_points, dtype=jnp.int32)[:, None], target.shape[:2]).reshape(-1)
-    rows, _, point = jax.lax.sort((rows, away, point), num_keys=2)
+    rows, point = in_order(rows, away, point, num_points)
     place = jnp.arange(len(rows), dtype=jnp.int32)
     first = jnp.full(resolution**3 + 1, len(rows), jnp.int32).at[rows].min(place, indices_are_sorted=True)
     table = jnp.full((resolution**3 + 1, count), num_points, jnp.int32)
     table = table.at[rows, place - first[rows]].set(point, mode="drop", unique_indices=True)
     return table[:-1].reshape(*[resolution] * 3, count)
+
+
+def in_order(
+    rows: Int[Array, " entries"], away: Float[Array, " entries"], point: Int[Array, " entries"], num_points: int
+) -> tuple[Int[Array, " entries"], Int[Array, " entries"]]:
+    """Rows of cells and points, sorted by row, in it by distance, and at equal distance by point.
+
+    All three make one number of 64 bits, which takes a CPU a ninth of the time of sorting three arrays.  Of more than
+    8192 points the last bits of the distance are left out.
+    """
+    point_bits = max(num_points - 1, 1).bit_length()
+    too_many = max(DISTANCE_BITS + point_bits - (64 - ROW_BITS), 0)
+    with jax.enable_x64(True):
+        distance = jax.lax.bitcast_convert_type(away.astype(jnp.float32), jnp.uint32)  # rises with what is not negative
+        row, distance, number = (x.astype(jnp.uint64) for x in (rows, distance, point))
+        key = row << (64 - ROW_BITS) | (distance >> too_many) << point_bits | number
+        key = jax.lax.sort(key)
+        return (key >> (64 - ROW_BITS)).astype(jnp.int32), (key & (2**point_bits - 1)).astype(jnp.int32)
 
 
 def estimate(cloud: PointCloud, count: int, resolution: int) -> Surface:

@@ -115,6 +115,19 @@ class TestCells:
             expected = [i for _, i in sorted(near)[:COUNT]] + [len(positions)] * max(COUNT - len(near), 0)
             assert found[cell].tolist() == expected
 
+    @pytest.mark.parametrize("num_points", [1, 2, 1000, 8192, 8193, 10**6])
+    def test_entries_are_sorted_by_cell_then_distance_then_point(self, num_points):
+        generator = np.random.default_rng(0)
+        rows = generator.integers(0, 40, 500).astype(np.int32) * (MOST_CELLS**3 // 39)
+        away = np.float32(
+            generator.choice([0.0, 1e-30, 0.25, 0.5, 6.75], 500)
+        )  # ties, and far enough apart for any bits
+        point = generator.integers(0, num_points, 500).astype(np.int32)
+        found = surface.in_order(*map(jnp.asarray, (rows, away, point)), num_points)
+        order = np.lexsort((point, away, rows))
+        same_bits(found, (rows[order], point[order]))
+        assert found[0].dtype == found[1].dtype == jnp.int32
+
     def test_three_by_three_cells_of_a_large_surface_hold_four_or_five_points_however_many_there_are(self):
         for points in (512, 1024, 4096):
             side = 2 * 3 / surface_grid(points)
