@@ -111,6 +111,7 @@ def test_a_damaged_table_is_one_line(tmp_path, content, expected):
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.ci
 def test_the_preset_makes_the_data_set_with_variants_of_training_products_only(download, tmp_path, capsys):
     out = tmp_path / "set"
     command = ["generate", out, "--preset", "abo", "--root", download, *TINY, "--variant", "scalar_rgb"]

@@ -27,6 +27,7 @@ def asked(monkeypatch):
     return configs
 
 
+@pytest.mark.ci
 def test_the_demo_writes_its_report_and_a_second_call_reuses_everything(asked, tmp_path, capsys):
     demo.main(demo.Demo(out=tmp_path))
     first = json.loads((tmp_path / "metrics.json").read_text())

@@ -49,6 +49,7 @@ def test_the_readmes_example_draws_a_picture(workplace):
     assert (workplace / "ball.png").stat().st_size > 100
 
 
+@pytest.mark.ci
 def test_the_examples_of_the_twelve_functions_run_in_their_order(workplace, monkeypatch):
     monkeypatch.setattr(
         weights, "shipped", lambda name="small": tiny_untrained.run()

@@ -79,6 +79,7 @@ def test_the_ratio_is_by_object_and_the_references_are_their_own():
     assert "| ours | 51.00 | 1.50" in text
 
 
+@pytest.mark.ci
 def test_the_whole_way(tmp_path, monkeypatch, capsys):
     pytest.importorskip("mitsuba")
     options = flicker.Flicker(

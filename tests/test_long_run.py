@@ -94,6 +94,7 @@ def test_hundreds_are_medians_of_the_rows_of_a_hundred_steps():
     assert hundreds(samples) == [(1, 100, 50.0), (101, 200, 70.0)]
 
 
+@pytest.mark.ci
 def test_a_run_compiles_once_for_each_kind_of_work(tmp_path, capsys):
     jax.clear_caches()  # another test may have drawn a preview
     assert "compilations" not in main(asked(tmp_path, steps=40))

