@@ -11,7 +11,7 @@ import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import jax
 import numpy as np
@@ -37,9 +37,7 @@ def measured(dataset: Path, devices: int, options: Sequence[str]) -> dict[str, d
     }
 
 
-def apart(
-    config: TrainConfig, dataset: data.Dataset, mesh: Mesh, precision: Literal["float32", "float64"] = "float32"
-) -> dict[str, Any]:
+def apart(config: TrainConfig, dataset: data.Dataset, mesh: Mesh, precision: str = "float32") -> dict[str, Any]:
     """Relative difference of the loss, and of the array of gradients that differs most, by its largest entry."""
     batch = next(data.batches(dataset, config, 0))
     losses, gradients = [], []
@@ -76,7 +74,7 @@ def distance(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.abs(a - b).max() / max(np.abs(b).max(), 1e-30))
 
 
-def main(dataset: Path, devices: int, precision: Literal["float32", "float64"], options: Sequence[str]) -> None:
+def main(dataset: Path, devices: int, precision: str, options: Sequence[str]) -> None:
     """Prints `apart` for the config that options of `spnr train` make."""
     command = cli.parse(["train", str(dataset), "run", *options])
     assert isinstance(command, cli.Train)
@@ -86,4 +84,4 @@ def main(dataset: Path, devices: int, precision: Literal["float32", "float64"], 
 
 if __name__ == "__main__":
     cli.enable_compilation_cache()
-    main(Path(sys.argv[1]), int(sys.argv[2]), "float64" if sys.argv[3] == "float64" else "float32", sys.argv[4:])
+    main(Path(sys.argv[1]), int(sys.argv[2]), sys.argv[3], sys.argv[4:])

@@ -27,10 +27,7 @@ from experiments.demo import Seconds
 from spnr_jax import cli, data, evaluation, presets, trainer, weights
 from spnr_jax.config import TrainConfig
 from spnr_jax.images import write_whole
-from spnr_jax.model_config import ModelConfig, surface_grid
 from spnr_jax.results import text_table, write_results
-
-MOST_POINTS = 2048  # of an object after the first run
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,14 +98,10 @@ def recipe(options: Pretrain) -> list[TrainConfig]:
 
 def of_any_density(config: TrainConfig, steps: int, seed: int, lr: float) -> TrainConfig:
     """The config of a run after the first: few and many points, other batches, a lower learning rate."""
-    assert isinstance(config.model, ModelConfig)
     return dataclasses.replace(
-        config,
-        model=dataclasses.replace(config.model, surface_cells=surface_grid(MOST_POINTS)),
+        presets.of_any_density(config),
         optimizer=dataclasses.replace(config.optimizer, lr_generator=lr),
         num_steps=steps,
-        min_points=128,
-        max_points=MOST_POINTS,
         seed=seed,
     )
 

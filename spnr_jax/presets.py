@@ -109,45 +109,39 @@ def plus_shapenet() -> TrainConfig:
     return _plus(shapenet_car(), "plus_shapenet", pixel_stride=2, num_coarse=32)
 
 
+def of_any_density(config: TrainConfig) -> TrainConfig:
+    """The config of a network near points with 128 to 2048 points an object, on their grid."""
+    assert isinstance(config.model, ModelConfig)
+    most = 2048
+    model = dataclasses.replace(config.model, surface_cells=surface_grid(most))
+    return dataclasses.replace(config, model=model, min_points=128, max_points=most)
+
+
 def plus_lite() -> TrainConfig:
     """The package's network `tiny`: half the sizes of plus_small's.  `spnr train --preset plus_lite DATA RUN`."""
-    small = plus_small()
+    small = of_any_density(plus_small())
     assert isinstance(small.model, ModelConfig)
-    return dataclasses.replace(
-        small,
-        preset="plus_lite",
-        model=dataclasses.replace(
-            small.model,
-            point_widths=(32, 64, 128),
-            point_features=16,
-            volume_resolution=16,
-            field_width=32,
-            sampling=SamplingConfig(num_coarse=8, num_fine=0, reach=1),
-            surface_cells=surface_grid(2048),
-        ),
-        num_steps=5000,
-        min_points=128,
-        max_points=2048,
+    model = dataclasses.replace(
+        small.model,
+        point_widths=(32, 64, 128),
+        point_features=16,
+        volume_resolution=16,
+        field_width=32,
+        sampling=dataclasses.replace(small.model.sampling, num_coarse=8),
     )
+    return dataclasses.replace(small, preset="plus_lite", model=model, num_steps=5000)
 
 
 def plus_small() -> TrainConfig:
     """The package's network `small`: plus_tiny's at 128 px, for longer.  `spnr train --preset plus_small DATA RUN`."""
-    tiny = plus_tiny()
-    assert isinstance(tiny.model, ModelConfig)
+    small = _plus(tiny(), "plus_small", pixel_stride=4, num_coarse=16)
+    assert isinstance(small.model, ModelConfig)
     return dataclasses.replace(
-        tiny,
-        preset="plus_small",
-        model=dataclasses.replace(
-            tiny.model,
-            render_resolution=128,
-            image_resolution=128,
-            sampling=SamplingConfig(num_coarse=16, num_fine=0, reach=1),
-        ),
-        optimizer=dataclasses.replace(tiny.optimizer, ema_decay=0.999),
+        small,
+        model=dataclasses.replace(small.model, render_resolution=128, image_resolution=128),
+        optimizer=dataclasses.replace(small.optimizer, ema_decay=0.999),
         num_steps=11_000,
         min_points=384,
-        pixel_stride=4,
     )
 
 

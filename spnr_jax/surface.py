@@ -16,13 +16,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from spnr_jax.model_config import MOST_CELLS
 from spnr_jax.numerics import length
 from spnr_jax.types import PointCloud, Surface, SurfaceSample
 from spnr_jax.voxels import NEIGHBOURS, locate, row_of
 
 PLANE_POINTS = 10  # of a plane, the point itself among them
 SPACING_POINTS = 4  # nearest others whose root mean square distance is a point's spacing
-ROW_BITS, DISTANCE_BITS = 20, 31  # of a cell's number, MOST_CELLS^3 at most, and of a float32 that is not negative
+ROW_BITS, DISTANCE_BITS = (MOST_CELLS**3).bit_length(), 31  # of a cell's number, of a float32 that is not negative
 BLOCK = 1024  # points whose neighbours are searched at once
 LEAST_SPACING = 1e-4  # in units of the box, for points that coincide
 NEAR, FAR = 1e-6, 10.0  # spacings, the smallest and the largest distance that is told

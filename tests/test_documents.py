@@ -51,9 +51,8 @@ def test_the_readmes_example_draws_a_picture(workplace):
 
 @pytest.mark.ci
 def test_the_examples_of_the_twelve_functions_run_in_their_order(workplace, monkeypatch):
-    monkeypatch.setattr(
-        weights, "shipped", lambda name="small": tiny_untrained.run()
-    )  # the README's example draws with the package's network
+    # the README's example draws with the package's network
+    monkeypatch.setattr(weights, "shipped", lambda name="small": tiny_untrained.run())
     names = execute(DOCS / "api.md")
     assert int(names["state"].step) == 1
     assert "ours" in names["outcome"].summary["methods"]

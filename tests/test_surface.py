@@ -119,9 +119,7 @@ class TestCells:
     def test_entries_are_sorted_by_cell_then_distance_then_point(self, num_points):
         generator = np.random.default_rng(0)
         rows = generator.integers(0, 40, 500).astype(np.int32) * (MOST_CELLS**3 // 39)
-        away = np.float32(
-            generator.choice([0.0, 1e-30, 0.25, 0.5, 6.75], 500)
-        )  # ties, and far enough apart for any bits
+        away = np.float32(generator.choice([0.0, 1e-30, 0.25, 0.5, 6.75], 500))  # ties, and unlike in their first bits
         point = generator.integers(0, num_points, 500).astype(np.int32)
         found = surface.in_order(*map(jnp.asarray, (rows, away, point)), num_points)
         order = np.lexsort((point, away, rows))

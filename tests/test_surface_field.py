@@ -141,11 +141,24 @@ def finish(module, variables, emitted, acc, view=None):
 
 
 @pytest.mark.parametrize("lit", [True, False])
+def test_a_ray_mixes_in_linear_light_and_lies_on_white_in_srgb(lit):
+    """Half covered by linear grey 0.5 (sRGB 0.7354) in light of 1: half of that, and half of white."""
+    module = field(lit)
+    variables = jax.tree.map(jnp.zeros_like, weights(module))
+    if lit:
+        variables["params"]["light"]["bias"] += np.log(np.e - 1)  # softplus makes it 1
+    grey, half, black = jnp.full((1, 3), 0.25), jnp.array([0.5]), jnp.zeros((1, 3))
+    expected = 0.5 * (0.735357 if lit else 0.5) + 0.5
+    emitted = (jnp.zeros((1, 6)), *((grey, black) if lit else ()))
+    close(finish(module, variables, emitted, half), jnp.full((1, 3), expected))
+
+
+@pytest.mark.parametrize("lit", [True, False])
 def test_a_ray_lies_on_white_in_srgb_by_its_opacity(lit):
     """What is composited weighs as much as the opacity: half of it is the same colour, half of the picture."""
     module = field(lit)
-    variables, emitted = weights(module), module.apply(weights(module), X, DIRECTIONS, sample())
-    _, whole = emitted
+    variables = weights(module)
+    _, whole = module.apply(variables, X, DIRECTIONS, sample())
     full = finish(module, variables, whole, jnp.ones(N))
     half = finish(module, variables, tuple(0.5 * x for x in whole), jnp.full(N, 0.5))
     close(half, 0.5 * full + 0.5, rtol=1e-5, atol=1e-6)

@@ -92,7 +92,7 @@ _conv2d_products.defvjp(lambda x, k, stride, padding: (_native(x, k, stride, pad
 
 def _conv2d_cpu(x, kernel, stride, padding):
     window, (features_in, features_out) = kernel.shape[0], kernel.shape[2:]
-    if features_in >= MANY_FEATURES:
+    if features_in >= MANY_FEATURES and features_out > FEW_FEATURES:
         return _columns(x, kernel, stride, padding)
     form = _conv2d_products if window != 3 or features_out <= FEW_FEATURES else _native
     return form(x, kernel, stride, padding)
