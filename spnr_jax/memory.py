@@ -1,18 +1,19 @@
 """What a long training asks of glibc's allocator, so that memory does not grow; other C libraries are left alone."""
 
 import ctypes
+import os
 from collections.abc import Callable
 
 ARENA_MAX = -8  # M_ARENA_MAX of malloc.h
 
 
-def one_arena() -> None:
-    """Has the threads that begin from now on share one arena.
+def few_arenas() -> None:
+    """Has the threads that begin from now on share arenas, as many as there are cores.
 
     Each batch, row and checkpoint is made by other threads than the one before; with an arena for each, what they free
-    stays scattered over all of them.
+    stays scattered over all of them.  With fewer arenas than cores the threads of one step would wait for each other.
     """
-    _ask(lambda libc: libc.mallopt(ARENA_MAX, 1))
+    _ask(lambda libc: libc.mallopt(ARENA_MAX, os.cpu_count() or 1))
 
 
 def give_back() -> None:

@@ -65,7 +65,7 @@ def train(
     A new run begins with random weights, or with those of `init`.  On a mesh of devices (`distributed.device_mesh`)
     each of its processes calls this.
     """
-    memory.one_arena()
+    memory.few_arenas()
     own = None if mesh is None else distributed.own_objects(mesh, config.batch_objects)
     with ExitStack() as stack:
         try:

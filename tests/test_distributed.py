@@ -52,6 +52,16 @@ def test_two_processes_of_four_devices_go_on_from_a_checkpoint_of_one_and_one_re
 
 
 @pytest.mark.ci
+@pytest.mark.parametrize("layout", [x for x in experiment.LAYOUTS if x.launcher != "addresses"], ids=lambda x: x.name)
+def test_processes_of_a_launcher_find_each_other(folder, one, layout):
+    if layout.launcher == "mpirun" and sys.platform != "linux":
+        pytest.skip("Open MPI is installed on Linux alone")
+    found = compared(start(folder, layout), one)
+    del found["ms"]
+    assert max(found.values()) < TOLERANCE, found
+
+
+@pytest.mark.ci
 def test_eight_devices_render_and_train_what_one_does_and_each_only_its_own_rays():
     """Pictures of all networks that know rays, on rays and rows that 8 does and does not divide; steps of 4 x 2."""
     tests = Path(__file__).parent
