@@ -17,7 +17,7 @@ def few_arenas() -> None:
 
 
 def give_back() -> None:
-    """Has freed memory go back to the system: glibc keeps 130 MB of Orbax's, and 1 MB more after each save."""
+    """Has freed memory go back to the system: of Orbax's glibc keeps 130 MB, and 1 MB more after each save."""
     _ask(lambda libc: libc.malloc_trim(0))
 
 

@@ -94,9 +94,10 @@ class TestGroupNorm:
     def test_its_gradients_are_right(self):
         gradient_law(self.apply, numbers(8, 2, 3, 2, 8))
 
-    def test_its_gradients_and_theirs_are_those_of_the_plain_form(self):
+    @pytest.mark.parametrize(("batch", "places"), [(2, 6), (1, 6), (1, 5)])
+    def test_its_gradients_and_theirs_are_those_of_the_plain_form(self, batch, places):
         def plain(x, scale, bias):
-            groups = x.reshape(2, 6, 4, 2)
+            groups = x.reshape(batch, places, 4, 2)
             centred = groups - groups.mean((1, 3), keepdims=True)
             out = centred / jnp.sqrt(jnp.mean(centred**2, (1, 3), keepdims=True) + 1e-5)
             return out.reshape(x.shape) * per_feature(scale, x) + per_feature(bias, x)
@@ -104,7 +105,7 @@ class TestGroupNorm:
         def ours(x, scale, bias):
             return group_norm(x, scale, bias, 4)
 
-        x, weights = 2 * numbers(9, 2, 6, 8) + 1, numbers(10, 2, 6, 8)
+        x, weights = 2 * numbers(9, batch, places, 8) + 1, numbers(10, batch, places, 8)
 
         def gradient(f, *arguments):
             return jax.grad(lambda *a: jnp.sum(jnp.sin(f(*a) * weights)), (0, 1, 2))(*arguments)

@@ -17,6 +17,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 FEW_FEATURES = 4  # of a convolution's output, for which XLA's gradient of the kernel is slow
+FEW_PIXELS = 2  # an axis, for which a kernel is larger than what it is folded for
 MANY_FEATURES = 128  # of its input, for which one matrix product is faster than a convolution
 
 kernel_init = jax.nn.initializers.he_normal(in_axis=-2, out_axis=-1)
@@ -69,12 +70,15 @@ def _conv2d_products(x, kernel, stride, padding):
 
 
 def _conv2d_backward(stride, padding, inputs, cotangent):
-    """XLA's gradient for the input; for the kernel one matrix product per place in the window, or one for all places.
+    """For the kernel one matrix product per place in the window, or one for all places; the input's is XLA's or one, too.
 
     With few output features the cotangents that every input pixel meets in the window are put side by side.
     """
     x, kernel = inputs
-    (dx,) = jax.linear_transpose(lambda x: _native(x, kernel, stride, padding), x)(cotangent)
+    if kernel.shape[0] == 2 and (stride, padding) == (1, 1):
+        dx = _input_gradient_of_pairs(x, kernel, cotangent)
+    else:
+        (dx,) = jax.linear_transpose(lambda x: _native(x, kernel, stride, padding), x)(cotangent)
     window, (features_in, features_out) = kernel.shape[0], kernel.shape[2:]
     if stride == 1 and features_out <= FEW_FEATURES:
         met = list(_windows(_pad(cotangent, window - 1 - padding), window, 1))
@@ -85,6 +89,14 @@ def _conv2d_backward(stride, padding, inputs, cotangent):
     seen = _windows(_pad(x, padding), window, stride)
     dk = jnp.stack([s.reshape(flat.shape[0], -1).T @ flat for s in seen])
     return dx, dk.reshape(kernel.shape)
+
+
+def _input_gradient_of_pairs(x, kernel, cotangent):
+    """What each place of a window of 2 gives to its input, by one matrix product, and the sum of the four."""
+    height, width, features_in = x.shape[1:]
+    given = cotangent @ jnp.moveaxis(kernel, -1, 0).reshape(kernel.shape[-1], -1)
+    given = given.reshape(*cotangent.shape[:3], 2, 2, features_in)
+    return sum(given[:, 1 - i : 1 - i + height, 1 - j : 1 - j + width, i, j] for i in (0, 1) for j in (0, 1))
 
 
 _conv2d_products.defvjp(lambda x, k, stride, padding: (_native(x, k, stride, padding), (x, k)), _conv2d_backward)
@@ -124,9 +136,14 @@ def upsample_conv(
     """conv(nearest x2 of x, kernel) for a 3-wide kernel, computed at the low resolution: 2^n instead of 3^n taps.
 
     The repeated pixels under a window are two distinct ones; their taps are added up once per output parity, all
-    parities are channels of one convolution, and its results are interleaved.
+    parities are channels of one convolution, and its results are interleaved.  Of the coarsest grids every pixel is
+    repeated: adding up the kernel would take longer than its products.
     """
     n, space = x.ndim - 2, x.shape[1:-1]
+    if max(space) <= FEW_PIXELS:
+        for axis in range(1, n + 1):
+            x = jnp.repeat(x, 2, axis=axis)
+        return conv(x, kernel, bf16=bf16)
     features_in, features_out = kernel.shape[-2:]
     for axis in range(n):  # 3 fine taps -> 2 coarse taps in place, the parity appended
         # output 2i + p reads the fine pixels 2i + p - 1 .. 2i + p + 1, which are the coarse ones i - 1 + p and i + p

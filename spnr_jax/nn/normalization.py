@@ -91,11 +91,18 @@ def _group_norm_backward(num_groups, residuals, cotangent):
     x, mean, inverse, scale = residuals
     scale, centred = per_feature(scale, inverse), x - mean[:, None]
     shift_gradient = jnp.sum(cotangent, axis=1)
-    scale_gradient = jnp.sum(cotangent * centred, axis=1) * inverse
+    scale_gradient = _sum_of_places(cotangent * centred) * inverse
     along_one, along_x = (_group_mean(g * scale, num_groups) / x.shape[1] for g in (shift_gradient, scale_gradient))
     slope, constant, linear = (computed_once(v * inverse) for v in (scale, -along_one, -along_x * inverse))
     gradient = cotangent * slope[:, None] + centred * linear[:, None] + constant[:, None]
     return gradient, jnp.sum(scale_gradient, axis=0), jnp.sum(shift_gradient, axis=0)
+
+
+def _sum_of_places(x):
+    """Sum over axis 1; a single batch entry in two halves, because XLA's CPU loop over one is up to 70 times slower."""
+    if len(x) > 1 or x.shape[1] % 2:
+        return jnp.sum(x, axis=1)
+    return jnp.sum(jnp.sum(x.reshape(2, -1, x.shape[2]), axis=1), axis=0, keepdims=True)
 
 
 def _group_mean(per_channel, num_groups):
