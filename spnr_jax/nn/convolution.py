@@ -4,8 +4,8 @@ Layout is channels last: inputs (batch, *space, in), kernels (*window, in, out) 
 pad one voxel on every side, like the stride-1 ones (a SAME rule would pad the far side only).  On a GPU the native
 convolutions of XLA are right; on a CPU (measurements: docs/performance.md)
   3D   a sum over depth taps of 2D convolutions, or one matrix product for tiny volumes
-  2D   native, but the kernel's gradient of 2- and 4-wide windows and of few output features as matrix products;
-       128 input features or more in one matrix product
+  2D   native, but as matrix products the gradients of 2-wide windows, the kernel's of 4-wide windows and of few output
+       features; 128 input features or more in one matrix product
 """
 
 import itertools
@@ -70,7 +70,7 @@ def _conv2d_products(x, kernel, stride, padding):
 
 
 def _conv2d_backward(stride, padding, inputs, cotangent):
-    """For the kernel one matrix product per place in the window, or one for all places; the input's is XLA's or one, too.
+    """XLA's gradient for the input, or one matrix product; for the kernel one per place in the window, or one for all.
 
     With few output features the cotangents that every input pixel meets in the window are put side by side.
     """
