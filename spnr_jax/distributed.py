@@ -9,6 +9,7 @@ communication.  Parameters and optimisers are on every device whole.  Where a pr
 (`empty_space.map_existing`), each device packs its own (`on_own_rays`): XLA would let all of them compute all.
 """
 
+import os
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
@@ -24,6 +25,8 @@ from spnr_jax.types import Batch
 
 OBJECTS, DEPTH = "objects", "depth"
 END_TIMEOUT = 30  # seconds that a process which ended waits for the others
+# XLA's CPU runtime begins sums that do not need each other in any order: gloo of two processes then mixes them up
+IN_ORDER = "--xla_cpu_enable_concurrency_optimized_scheduler=false"
 HEARTBEAT_TIMEOUT = 20  # seconds of silence after which a process counts as gone, and the others end
 
 
@@ -38,6 +41,7 @@ def initialize(coordinator: str | None = None, num_processes: int | None = None,
         raise ValueError("--coordinator, --num-processes and --process-id: expected all three, or none in a launcher")
     if num_processes is not None and not 0 <= (process_id or 0) < num_processes:
         raise ValueError(f"--process-id {process_id}: expected 0 to {num_processes - 1} of --num-processes")
+    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {IN_ORDER}".strip()
     try:
         jax.distributed.initialize(
             *given, heartbeat_timeout_seconds=HEARTBEAT_TIMEOUT, shutdown_timeout_seconds=END_TIMEOUT
