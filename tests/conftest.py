@@ -10,16 +10,12 @@ import os
 import signal
 
 import jax
-from hypothesis import settings
 from jaxtyping import install_import_hook
 
 QUICK_COMPILATION = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
 os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {QUICK_COMPILATION}".strip()  # read at the first use
 
 install_import_hook("spnr_jax", "beartype.beartype")
-
-settings.register_profile("untimed", deadline=None)  # an example that waits for another process is no failure
-settings.load_profile("untimed")
 
 # a shell that starts the suite in the background has it ignore Ctrl-C, and its children with it
 signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -13,7 +13,7 @@ from data_gen.points import sample_surface
 
 UNIT = st.floats(0, 1, width=32)
 SEEDS = st.integers(0, 2**32 - 1)
-SLOW = settings(max_examples=60)
+SLOW = settings(deadline=None, max_examples=60)
 
 
 def distances(colours):

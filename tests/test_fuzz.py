@@ -152,7 +152,7 @@ def test_no_source_runs_code_that_a_file_may_hold(path):
 # Values of any kind
 
 
-@settings(max_examples=150, derandomize=True)
+@settings(max_examples=150, deadline=None, derandomize=True)
 @given(st.sampled_from(sorted(to_dict(tiny())["model"])), json_values)
 def test_any_value_of_a_config_makes_a_config_of_right_types_or_a_valueerror(name, value):
     values = json.loads(json.dumps(to_dict(tiny())))
@@ -167,7 +167,7 @@ def test_any_value_of_a_config_makes_a_config_of_right_types_or_a_valueerror(nam
         assert isinstance(value, int)
 
 
-@settings(max_examples=150, derandomize=True)
+@settings(max_examples=150, deadline=None, derandomize=True)
 @given(json_values, json_values, json_values)
 def test_a_camera_message_of_any_values_is_a_view_or_none(wxyz, position, number):
     assert views.from_browser(wxyz, position, number, number, number) is None or np.isfinite(position).all()

@@ -115,14 +115,14 @@ def test_a_pcd_header_that_lies_is_refused(tmp_path, old, new, message):
         read_columns(write(tmp_path, pcd_bytes("binary", points()).replace(old, new)))
 
 
-@settings(max_examples=60)
+@settings(max_examples=60, deadline=None)
 @given(st.lists(st.sampled_from([b"a", b"b", b"abc", b"abcabcabc", b"\0" * 300, b"xyz" * 20]), max_size=12))
 def test_decompress_inverts_lzf(pieces):
     data = b"".join(pieces)
     assert decompress(compress(data), len(data)) == data
 
 
-@settings(max_examples=200)
+@settings(max_examples=200, deadline=None)
 @given(st.binary(min_size=1, max_size=60))
 def test_lzf_that_gives_another_size_or_reaches_before_its_start_is_refused(data):
     try:
