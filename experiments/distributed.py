@@ -149,10 +149,11 @@ def run(out: Path, dataset: Path, layout: Layout, flags: Sequence[str], name: st
     }
     out.mkdir(parents=True, exist_ok=True)
     children, files = [], []
-    for number, (whole, more) in enumerate(launched(command, layout, free_port())):
+    for number, (arguments, found) in enumerate(launched(command, layout, free_port())):
         files.append((out / f"{folder.name} {number}.txt").open("w+"))
-        told = environment | more
-        children.append(subprocess.Popen(whole, env=told, stdout=files[-1], stderr=subprocess.STDOUT))
+        children.append(
+            subprocess.Popen(arguments, env=environment | found, stdout=files[-1], stderr=subprocess.STDOUT)
+        )
     try:
         codes = [child.wait(LIMIT) for child in children]
     finally:

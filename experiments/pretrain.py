@@ -90,13 +90,13 @@ def recipe(options: Pretrain) -> list[TrainConfig]:
         first = presets.plus_small()
         runs = [
             first,
-            of_any_density(first, steps=9000, seed=first.seed + 1, lr=1.5e-3),
-            of_any_density(first, steps=6000, seed=first.seed + 2, lr=1e-3),
+            later(first, steps=9000, seed=first.seed + 1, lr=1.5e-3),
+            later(first, steps=6000, seed=first.seed + 2, lr=1e-3),
         ]
     return runs if options.steps is None else [dataclasses.replace(run, num_steps=options.steps) for run in runs]
 
 
-def of_any_density(config: TrainConfig, steps: int, seed: int, lr: float) -> TrainConfig:
+def later(config: TrainConfig, steps: int, seed: int, lr: float) -> TrainConfig:
     """The config of a run after the first: few and many points, other batches, a lower learning rate."""
     return dataclasses.replace(
         presets.of_any_density(config),

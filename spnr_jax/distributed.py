@@ -25,9 +25,9 @@ from spnr_jax.types import Batch
 
 OBJECTS, DEPTH = "objects", "depth"
 END_TIMEOUT = 30  # seconds that a process which ended waits for the others
+HEARTBEAT_TIMEOUT = 20  # seconds of silence after which a process counts as gone, and the others end
 # XLA's CPU runtime begins sums that do not need each other in any order: gloo of two processes then mixes them up
 IN_ORDER = "--xla_cpu_enable_concurrency_optimized_scheduler=false"
-HEARTBEAT_TIMEOUT = 20  # seconds of silence after which a process counts as gone, and the others end
 
 
 def initialize(coordinator: str | None = None, num_processes: int | None = None, process_id: int | None = None) -> None:

@@ -122,9 +122,18 @@ def test_devices_that_cannot_share_volumes_are_refused(depth):
         ((None, None, None), "the processes do not find each other .*; start them by srun, mpirun"),
     ],
 )
-def test_processes_that_cannot_find_each_other_are_told_what_to_give(address, line):
+def test_processes_that_cannot_find_each_other_are_told_what_to_give(address, line, monkeypatch):
+    monkeypatch.setenv("XLA_FLAGS", os.environ["XLA_FLAGS"])  # which joining adds to
     with pytest.raises(ValueError, match=line):
         distributed.initialize(*address)
+
+
+def test_processes_begin_their_sums_in_order_beside_what_else_was_asked_of_xla(monkeypatch):
+    seen = []
+    monkeypatch.setenv("XLA_FLAGS", "--asked=1")
+    monkeypatch.setattr(jax.distributed, "initialize", lambda *_, **__: seen.append(os.environ["XLA_FLAGS"]))
+    distributed.initialize("localhost:1234", 2, 0)
+    assert seen == ["--asked=1 --xla_cpu_enable_concurrency_optimized_scheduler=false"]
 
 
 def test_a_process_alone_waits_for_nobody():

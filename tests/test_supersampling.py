@@ -103,11 +103,11 @@ def test_the_handle_takes_several_rays_for_the_best_picture_alone():
     variables = wobbled(jax.jit(Renderer(config).init)(jax.random.key(0), cloud(), camera()), 4)
     handle, single = Model(config=config, variables=variables), jax.tree.map(lambda x: np.asarray(x[0]), cloud())
     volume = handle.encode(single)
-    view, wide = (handle.camera(volume, azimuth=41.3, elevation=17.9, resolution=n) for n in (8, 16))
+    view, wide = (handle.camera(volume, azimuth=17.3, elevation=36.1, resolution=n) for n in (8, 16))
     large = handle.render(volume, wide, "trained")
     expected = averaged(jax.tree.map(lambda x: x[None], large), 2)
     apart = np.abs(np.asarray(handle.render(volume, view, "best").image - expected.image[0]))
-    assert np.mean(apart > 1e-4) < 0.035  # two pixels: rays that rounding moves over a face of a cell
+    assert np.mean(apart > 1e-4) < 0.02  # one pixel: a ray that rounding moves over a face of a cell
     assert np.abs(np.asarray(handle.render(volume, view, "trained").image - expected.image[0])).max() > 0.01
 
 
