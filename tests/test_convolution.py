@@ -62,7 +62,7 @@ def test_is_the_loop_over_outputs(shape):
             close(out[i], reference.convolution(np.asarray(x)[i], kernel, stride), atol=1e-5)
 
 
-@pytest.mark.parametrize("shape", [(5, 3), (1, 1), (5, 2, 6), (1, 1, 1)], ids=str)
+@pytest.mark.parametrize("shape", [(5, 3), (1, 1), (1, 2), (5, 2, 6), (1, 1, 1), (2, 1, 2)], ids=str)
 def test_upsample_conv_is_the_convolution_of_every_pixel_repeated(shape):
     x, kernel = numbers(4, 2, *shape, 3), numbers(5, *[3] * len(shape), 3, 4)
     close(value_and_gradients(upsample_conv, x, kernel), value_and_gradients(repeated, x, kernel), 1e-4, 2e-5)
