@@ -40,9 +40,9 @@ from experiments import chaos, claims, distributed_gradients, distributed_memory
 from experiments.chaos_child import QUICK_COMPILATION
 from experiments.distributed_report import plot, table
 from spnr_jax import checkpoint, cli, data, run_record, trainer, training
-from spnr_jax.distributed import IN_ORDER
 from spnr_jax.evaluation import hardware
 from spnr_jax.images import write_whole
+from spnr_jax.launch import IN_ORDER
 
 ROOT = Path(__file__).parents[1]
 LIMIT = 3600.0  # seconds that a run may take

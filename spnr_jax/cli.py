@@ -235,11 +235,11 @@ def run_train(command: Train) -> None:
     """`spnr train`."""
     import jax
 
-    from spnr_jax import data, distributed, trainer, weights
+    from spnr_jax import data, distributed, launch, trainer, weights
 
     address = command.coordinator, command.num_processes, command.process_id
     if command.distributed or address != (None, None, None):
-        distributed.initialize(*address)
+        launch.join(*address)
     mesh = distributed.device_mesh(command.depth_devices) if jax.device_count() > 1 else None
     dataset = data.open_dataset(command.data)
     schedule = trainer.Schedule(

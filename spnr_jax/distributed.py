@@ -1,4 +1,4 @@
-"""Many devices, many hosts: processes that know each other, a mesh of their devices, and what lies where on it.
+"""Many devices, many hosts: a mesh of their devices, and what lies where on it.
 
     objects   the axis of the mesh over which the objects of a batch are divided: each device renders its own
     depth     the axis over which the rays of an object are divided; in training also the first grid axis (z) of its
@@ -9,7 +9,6 @@ communication.  Parameters and optimisers are on every device whole.  Where a pr
 (`empty_space.map_existing`), each device packs its own (`on_own_rays`): XLA would let all of them compute all.
 """
 
-import os
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
@@ -24,33 +23,6 @@ from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 from spnr_jax.types import Batch
 
 OBJECTS, DEPTH = "objects", "depth"
-END_TIMEOUT = 30  # seconds that a process which ended waits for the others
-HEARTBEAT_TIMEOUT = 20  # seconds of silence after which a process counts as gone, and the others end
-# XLA's CPU runtime begins sums that do not need each other in any order: gloo of two processes then mixes them up
-IN_ORDER = "--xla_cpu_enable_concurrency_optimized_scheduler=false"
-
-
-def initialize(coordinator: str | None = None, num_processes: int | None = None, process_id: int | None = None) -> None:
-    """Joins this process to the others of its training, before anything else of JAX runs.
-
-    Without arguments JAX asks the launcher's environment (SLURM, Open MPI, Kubernetes).  ValueError if that says
-    nothing, or the others cannot be reached.
-    """
-    given = coordinator, num_processes, process_id
-    if None in given and given != (None, None, None):
-        raise ValueError("--coordinator, --num-processes and --process-id: expected all three, or none in a launcher")
-    if num_processes is not None and not 0 <= (process_id or 0) < num_processes:
-        raise ValueError(f"--process-id {process_id}: expected 0 to {num_processes - 1} of --num-processes")
-    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {IN_ORDER}".strip()
-    try:
-        jax.distributed.initialize(
-            *given, heartbeat_timeout_seconds=HEARTBEAT_TIMEOUT, shutdown_timeout_seconds=END_TIMEOUT
-        )
-    except (RuntimeError, ValueError) as error:
-        raise ValueError(
-            f"the processes do not find each other ({error}); start them by srun, mpirun or an indexed Kubernetes job, "
-            "or give --coordinator HOST:PORT --num-processes N --process-id I"
-        ) from None
 
 
 def device_mesh(depth: int = 1) -> Mesh:

@@ -20,7 +20,7 @@ from experiments import distributed as experiment
 from experiments import distributed_memory
 from experiments.chaos_child import QUICK_COMPILATION
 from experiments.distributed import Distributed, Layout, compared
-from spnr_jax import data, distributed
+from spnr_jax import data, distributed, launch
 
 # the discriminator and R1 take part from the first step
 FLAGS = f"{experiment.NETWORK} --adversarial-start 0 --batch-objects 4 --num-steps 4 --checkpoint-every 2".split()
@@ -125,14 +125,14 @@ def test_devices_that_cannot_share_volumes_are_refused(depth):
 def test_processes_that_cannot_find_each_other_are_told_what_to_give(address, line, monkeypatch):
     monkeypatch.setenv("XLA_FLAGS", os.environ["XLA_FLAGS"])  # which joining adds to
     with pytest.raises(ValueError, match=line):
-        distributed.initialize(*address)
+        launch.join(*address)
 
 
 def test_processes_begin_their_sums_in_order_beside_what_else_was_asked_of_xla(monkeypatch):
     seen = []
     monkeypatch.setenv("XLA_FLAGS", "--asked=1")
     monkeypatch.setattr(jax.distributed, "initialize", lambda *_, **__: seen.append(os.environ["XLA_FLAGS"]))
-    distributed.initialize("localhost:1234", 2, 0)
+    launch.join("localhost:1234", 2, 0)
     assert seen == ["--asked=1 --xla_cpu_enable_concurrency_optimized_scheduler=false"]
 
 
