@@ -19,7 +19,7 @@ class Sources:
     """Where the networks are."""
 
     runs: tuple[Path, ...] = ()
-    """Run folders, or files of weights."""
+    """Run folders, files of weights, or `small` or `tiny`, the networks in the package."""
     table1: Path | None = None
     """Folder of a table that experiments.table1 made; its runs are taken too."""
 
@@ -67,7 +67,7 @@ def networks(sources: Sources, dataset: data.Dataset) -> dict[str, Network]:
 
 def name_of(method: str, run: Path, shared: bool) -> str:
     """What tables and pictures call a network."""
-    return f"{LABELS[method]} ({run.parent.name}/{run.name})" if shared else LABELS[method]
+    return f"{LABELS[method]} ({Path(run.parent.name) / run.name})" if shared else LABELS[method]
 
 
 def load(run: Path, dataset: data.Dataset) -> Network:
@@ -78,12 +78,13 @@ def load(run: Path, dataset: data.Dataset) -> Network:
     method = next(name for name, kind in METHODS.items() if isinstance(config.model, kind))
     if isinstance(config.model, ModelConfig) and config.model.num_neighbors:
         method = "plus"
+    described = place if (place := weights.place(run)).is_file() else place / "config.json"
     return Network(
         method=method,
         config=config,
         variables=trained.variables,
         steps=trained.steps,
-        checksum=hashlib.sha256((run if run.is_file() else run / "config.json").read_bytes()).hexdigest(),
+        checksum=hashlib.sha256(described.read_bytes()).hexdigest(),
     )
 
 

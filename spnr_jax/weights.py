@@ -45,13 +45,18 @@ def shipped(name: str = "small") -> Path:
     return Path(str(resources.files("spnr_jax") / "pretrained" / f"{name}.npz"))
 
 
+def place(source: Path | str | None) -> Path:
+    """The run folder or file that `read_trained` reads."""
+    name = "small" if source is None else str(source)
+    return shipped(name) if name in SHIPPED else Path(name)
+
+
 def read_trained(source: Path | str | None, say: Callable[[str], None] = print, data: Path | str = "DATA") -> Trained:
     """The network of a run folder's newest checkpoint, of a file of weights, or of the package: None, `small`, `tiny`.
 
     ValueError, with what to do, if there is none; `say` gets a line for each broken checkpoint, `data` is named.
     """
-    name = "small" if source is None else str(source)
-    path = shipped(name) if name in SHIPPED else Path(name)
+    path = place(source)
     if path.suffix == ".npz":
         return read_weights(path)
     config, state = checkpoint.load_run(path, say, data)

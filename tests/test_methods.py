@@ -1,7 +1,9 @@
 """The networks of a comparison are found in run folders and tables, named once each, and fit the data."""
 
 import dataclasses
+import hashlib
 import shutil
+from pathlib import Path
 
 import pytest
 import stand_ins
@@ -9,7 +11,7 @@ import tiny_dataset
 
 from experiments import methods
 from experiments.methods import Sources, networks
-from spnr_jax import data, evaluation
+from spnr_jax import data, evaluation, weights
 
 
 @pytest.fixture(scope="module")
@@ -28,6 +30,14 @@ def test_networks_of_a_table_and_of_runs_are_named_after_their_methods_in_the_or
     assert list(found) == ["Ours (fresh/tiny)", "Ours (runs/ours)", "NPBG"]
     assert [network.has_depth for network in found.values()] == [True, True, False]
     assert found["Ours (runs/ours)"].identity == found["Ours (fresh/tiny)"].identity
+
+
+def test_the_networks_of_the_package_go_by_their_names():
+    found = networks(Sources(runs=(Path("small"), Path("tiny"))), tiny_dataset.dataset())
+    assert [name.rsplit(" ", 1)[1] for name in found] == ["(small)", "(tiny)"]
+    assert [network.identity["config"] for network in found.values()] == [
+        hashlib.sha256(weights.shipped(name).read_bytes()).hexdigest() for name in ("small", "tiny")
+    ]
 
 
 def test_what_cannot_be_compared_is_refused_by_name(table, tmp_path):
