@@ -50,7 +50,7 @@ NETWORK = (
     "--point-widths 8 --point-features 4 --volume-resolution 8 --base-width 4 --num-stages 1 --num-groups 2"
     " --field-width 8 --num-features 5 --direction-frequencies 1 --num-coarse 4 --num-fine 4 --render-resolution 12"
     " --resize-resolution 12 --image-resolution 24 --upsampler-width 4 --discriminator-width 4 --r1-interval 2"
-    " --lr-generator 1e-2 --warmup-steps 2 --min-points 8 --max-points 32 --test-points 24 --log-every 1"
+    " --lr-generator 1e-3 --warmup-steps 2 --min-points 8 --max-points 32 --test-points 24 --log-every 1"
 )
 LARGE = "--volume-resolution 128 --num-stages 4 --batch-objects 1 --adversarial-weight 0 --num-steps 2"
 
@@ -91,7 +91,7 @@ class Distributed:
     """Steps of each run."""
     batch_objects: int = 8
     """Objects of a step, on all devices together."""
-    seed: int = 1
+    seed: int = 0
     """Seed of weights, batches and jitter."""
 
     def __post_init__(self) -> None:

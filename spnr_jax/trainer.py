@@ -136,8 +136,8 @@ def _train(
                 pending = []
             if leads and (last or (step + 1) % schedule.preview_every == 0):
                 scores, picture = preview(state, config, dataset, run)
-                memory.give_back()
                 log.write({"step": step + 1, **scores}, picture)
+                memory.give_back()
                 clock.lap("previews")
             if save:  # after the rows up to this step, which a run that goes on from here will not write again
                 checkpoint.save(run, state)

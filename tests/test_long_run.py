@@ -13,7 +13,7 @@ from tiny_baselines import SHRUNKEN
 from experiments import long_run
 from experiments.long_run import LongRun, Witness, compiled_once, drift, laws, main, median_rise, stretches
 from experiments.long_run_report import hundreds
-from spnr_jax import checkpoint, cli, presets, trainer, training
+from spnr_jax import checkpoint, cli, memory, presets, trainer, training
 
 QUICK = dataclasses.replace(SHRUNKEN["points2nerf_tiny"], batch_objects=2)  # no convolutions: compiles in a second
 
@@ -122,7 +122,13 @@ def test_a_program_that_is_compiled_at_every_preview_breaks_the_law(tmp_path, mo
 
 
 def test_the_trainer_is_as_before_when_the_witness_has_gone():
-    parts = (training, "jitted_train_step"), (trainer, "preview"), (checkpoint, "save"), (trainer.MetricsLog, "write")
+    parts = (
+        (training, "jitted_train_step"),
+        (trainer, "preview"),
+        (checkpoint, "save"),
+        (trainer.MetricsLog, "write"),
+        (memory, "give_back"),
+    )
     before = [getattr(*part) for part in parts]
     seen = Witness()
     with seen.watching():
