@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments import bench_scene, bench_worker, twin_layout
-from spnr_jax import training
+from spnr_jax import memory, training
 from spnr_jax.config import TrainConfig
 from spnr_jax.model_config import ModelConfig
 from spnr_jax.presets import PRESETS
@@ -25,6 +25,7 @@ NEAR_POINTS = {"tiny": (16, 0), "small": (16, 16), "abo": (32, 32)}  # coarse an
 
 def main() -> None:
     """Serves the mode of the spec."""
+    memory.keep_arrays()
     bench_worker.serve(make)
 
 

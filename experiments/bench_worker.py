@@ -1,4 +1,4 @@
-"""A side of the benchmark in a process of its own, asked for one turn at a time: the standard library alone.
+"""A side of the benchmark in a process of its own, asked for one turn at a time: without JAX, which the twin lacks.
 
 The child makes its function, runs it until it is warm, and then waits for lines on stdin; each names the seconds of a
 turn and is answered by one line of JSON.  Between turns it must not spin: every answer says how much processor time
@@ -6,7 +6,6 @@ passed while it waited (a few ms at most with the defaults of OpenMP and XLA, so
 of the turns; what making the function took (a compiler takes more than the function) is given back before.
 """
 
-import ctypes
 import gc
 import json
 import os
@@ -20,8 +19,9 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
 
+from spnr_jax import memory
+
 FEWEST = 3  # timed runs of a turn
-M_TRIM_THRESHOLD, M_MMAP_MAX = -1, -4  # of glibc's mallopt
 
 
 class Worker:
@@ -79,7 +79,7 @@ def serve(make: Callable[[dict], tuple[Callable[[], object], dict]]) -> None:
     answers = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)  # what a library prints is no answer
     sys.stdout = sys.stderr  # unbuffered: it stands before an error's last words
-    keep_memory()
+    memory.keep()
     os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[: spec["threads"]])
     start = time.perf_counter()
     run, facts = make(spec)
@@ -104,20 +104,12 @@ def turn(run: Callable[[], object], seconds: float) -> list[float]:
     return taken
 
 
-def keep_memory() -> None:
-    """Has glibc keep freed memory in the process: no page faults in every step."""
-    libc = ctypes.CDLL(None)
-    if hasattr(libc, "mallopt"):
-        libc.mallopt(M_MMAP_MAX, 0)
-        libc.mallopt(M_TRIM_THRESHOLD, 2**31 - 1)
-
-
 def forget_peak() -> None:
     """Gives unused memory back and has the kernel count the peak from here on, where it can (Linux)."""
     gc.collect()
-    libc, counter = ctypes.CDLL(None), Path("/proc/self/clear_refs")
-    if hasattr(libc, "malloc_trim") and counter.exists():
-        libc.malloc_trim(0)
+    memory.give_back()
+    counter = Path("/proc/self/clear_refs")
+    if counter.exists():
         counter.write_text("5")
 
 

@@ -48,7 +48,7 @@ class Demo:
 
 def main(demo: Demo) -> None:
     """Runs the three parts and says where the results are."""
-    cli.enable_compilation_cache()
+    cli.set_up_jax()
     seconds = Seconds(demo.out / "seconds.json")
     objects = demo.objects if demo.objects is not None else None if demo.meshes else 240
     generation = GenerateConfig(

@@ -83,5 +83,5 @@ def main(dataset: Path, devices: int, precision: str, options: Sequence[str]) ->
 
 
 if __name__ == "__main__":
-    cli.enable_compilation_cache()
+    cli.set_up_jax()
     main(Path(sys.argv[1]), int(sys.argv[2]), sys.argv[3], sys.argv[4:])

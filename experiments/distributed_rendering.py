@@ -115,5 +115,5 @@ def counting() -> Iterator[Counter[int]]:
 
 
 if __name__ == "__main__":
-    cli.enable_compilation_cache()
+    cli.set_up_jax()
     print(json.dumps(rendered(Path(sys.argv[2]))))

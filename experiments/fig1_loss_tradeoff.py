@@ -54,7 +54,7 @@ class Fig1:
 
 def main(options: Fig1) -> None:
     """Trains what is not trained, scores all weights, writes tables and pictures."""
-    cli.enable_compilation_cache()
+    cli.set_up_jax()
     dataset = data.open_dataset(options.data)
     names, config = options.budget.names(dataset), options.budget.config()
     data.check_resolution(data.read_object(dataset, names[0]), config)

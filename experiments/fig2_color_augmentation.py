@@ -55,7 +55,7 @@ class Fig2:
 
 def main(options: Fig2) -> None:
     """Generates and trains what is missing, scores both trainings, writes tables and pictures."""
-    cli.enable_compilation_cache()
+    cli.set_up_jax()
     folder = options.data or options.out / "data"
     if options.data is None:
         print(f"generating the data set in {folder}", flush=True)

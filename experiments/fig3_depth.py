@@ -82,7 +82,7 @@ class Method:
 
 def main(options: Fig3) -> None:
     """Makes what is missing of depths and truth, then scores, table and picture."""
-    cli.enable_compilation_cache()
+    cli.set_up_jax()
     dataset = data.open_dataset(options.data)
     names = methods.test_objects(dataset, 2 if options.quick else options.objects)
     claims.claim(options.out / "fig3.json", {"data": run_record.checksum(dataset)}, "depths")

@@ -76,7 +76,7 @@ class Gallery:
 
 def main(options: Gallery) -> None:
     """Makes the pictures that are missing, then sheets and page."""
-    cli.enable_compilation_cache()
+    cli.set_up_jax()
     dataset = data.open_dataset(options.data)
     names = methods.test_objects(dataset, 3 if options.quick else options.objects)
     if note := shortage(dataset, options):

@@ -72,7 +72,7 @@ def main(options: Flicker) -> None:
     """Makes what is missing of the references, then frames, scores and pictures."""
     if options.frames < 3:
         raise ValueError(f"--frames: expected 3 or more, got {options.frames}")
-    cli.enable_compilation_cache()
+    cli.set_up_jax()
     dataset = data.open_dataset(options.data)
     names = methods.test_objects(dataset, options.objects)
     networks = methods.networks(options.sources, dataset)

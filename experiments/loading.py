@@ -52,7 +52,7 @@ class Loading:
 
 def main(options: Loading) -> None:
     """Measures, and writes the figures as JSON and as a Markdown table."""
-    cli.enable_compilation_cache()
+    cli.set_up_jax()
     size = image_size(data.open_dataset(options.dataset))
     rows = []
     with tempfile.TemporaryDirectory() as folder:

@@ -152,7 +152,7 @@ def holdings() -> dict[str, float]:
 
 def main(options: LongRun) -> list[str]:
     """Trains; the laws that were broken."""
-    cli.enable_compilation_cache()
+    cli.set_up_jax()
     run = options.out / "run"
     if run.exists():
         raise ValueError(f"{run}: holds a run, and one is measured from its first step on; choose another --out")

@@ -81,7 +81,7 @@ class ManyObjects:
 
 def main(options: ManyObjects) -> None:
     """Answers what is not answered yet, then writes results, table and curves."""
-    cli.enable_compilation_cache()
+    cli.set_up_jax()
     if options.quick:
         options = dataclasses.replace(options, runs=2, steps=3, objects=2, rounds=1)
     dataset = data.open_dataset(options.data)

@@ -80,7 +80,7 @@ class Method:
 
 def main(options: PointCount) -> None:
     """Measures what is missing, then writes results, table, curves and pictures."""
-    cli.enable_compilation_cache()
+    cli.set_up_jax()
     dataset = data.open_dataset(options.data)
     names = methods.test_objects(dataset, 2 if options.quick else options.objects)
     networks = methods.networks(options.sources, dataset)

@@ -58,7 +58,7 @@ class Pretrain:
 
 def main(options: Pretrain) -> None:
     """Runs the parts and says where the results are."""
-    cli.enable_compilation_cache()
+    cli.set_up_jax()
     out = options.out / options.network
     seconds = Seconds(out / "seconds.json")
     runs = recipe(options)

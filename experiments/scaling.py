@@ -84,26 +84,24 @@ def with_samples(config: TrainConfig, count: int) -> tuple[TrainConfig, Batch]:
     return dataclasses.replace(config, model=model), bench_ours.batch(config)
 
 
-POWERS = tuple(2**i for i in range(17))
+POWERS = tuple(2**i for i in range(21))
 SWEEPS = {
     "points": Sweep(mode="encode", values=POWERS[9:], unit="points of an object", work=lambda n: n, case=with_points),
     "volume": Sweep(
         mode="encode",
-        values=(32, 64, 128),
+        values=POWERS[5:8],
         unit="voxels along a side (work: cubed)",
         work=lambda n: n**3,
         case=with_volume,
     ),
     "image": Sweep(
         mode="render",
-        values=(64, 128, 256, 512),
+        values=POWERS[6:11],
         unit="pixels along a side (work: squared)",
         work=lambda n: n**2,
         case=with_pixels,
     ),
-    "samples": Sweep(
-        mode="render", values=(16, 32, 64, 128), unit="samples of a ray", work=lambda n: n, case=with_samples
-    ),
+    "samples": Sweep(mode="render", values=POWERS[4:8], unit="samples of a ray", work=lambda n: n, case=with_samples),
     "views": Sweep(mode="render", values=POWERS[:5], unit="views of an object", work=lambda n: n, case=with_views),
     "objects": Sweep(
         mode="train_l1", values=POWERS[:5], unit="objects of a batch", work=lambda n: n, case=with_objects
@@ -129,8 +127,7 @@ class Options:
 
 def main(options: Options) -> None:
     """Measures every axis, a line for each value; writes after each axis."""
-    cli.enable_compilation_cache()
-    bench_worker.keep_memory()
+    cli.set_up_jax()
     out = options.out.with_name(f"{options.out.name}-quick") if options.quick else options.out
     names: tuple[str, ...] = options.only or tuple(SWEEPS)
     found: list[dict] = []

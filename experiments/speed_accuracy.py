@@ -110,7 +110,7 @@ def settings(config: TrainConfig) -> list[Setting]:
 
 def main(options: SpeedAccuracy) -> None:
     """Measures what results.json lacks, then writes the table and the plot."""
-    cli.enable_compilation_cache()
+    cli.set_up_jax()
     dataset = data.open_dataset(options.data)
     names = test_objects(dataset, options.objects)
     place = options.out / "results.json"

@@ -84,7 +84,7 @@ class Table1:
 
 def main(options: Table1) -> None:
     """Trains what is not trained, scores all methods, writes the tables and the page."""
-    cli.enable_compilation_cache()
+    cli.set_up_jax()
     dataset = data.open_dataset(options.data)
     names = test_objects(dataset, options.objects or (QUICK_OBJECTS if options.budget == "quick" else None))
     first = data.read_object(dataset, names[0])

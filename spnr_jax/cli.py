@@ -204,7 +204,7 @@ def _train_defaults(arguments: list[str]) -> Train:
 
 def run(command: Command) -> None:
     """Carries a command out."""
-    enable_compilation_cache()
+    set_up_jax()
     match command:
         case Train():
             run_train(command)
@@ -222,10 +222,16 @@ def run(command: Command) -> None:
             run_convert_lpips(command)
 
 
-def enable_compilation_cache() -> None:
-    """Lets a second run skip XLA's compilation; JAX_COMPILATION_CACHE_DIR moves the cache."""
+def set_up_jax() -> None:
+    """Lets a second run skip XLA's compilation, and steps on a CPU use the memory of those before.
+
+    JAX_COMPILATION_CACHE_DIR moves the cache.
+    """
     import jax
 
+    from spnr_jax import memory
+
+    memory.keep_arrays()
     if jax.config.values["jax_compilation_cache_dir"] is None:
         jax.config.update("jax_compilation_cache_dir", str(Path.home() / ".cache" / "spnr_jax"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)

@@ -50,6 +50,38 @@ def test_threads_share_as_many_arenas_as_there_are_cores_when_they_are_asked_to(
     assert int(done.stdout) == more
 
 
+FAULTS = """
+import resource, sys
+from spnr_jax import memory
+
+if sys.argv[1] == "keep":
+    memory.keep_arrays()
+import jax
+
+@jax.jit
+def step(x, w):
+    y = x @ w  # 128 MB
+    return y.T @ y
+
+x, w = jax.numpy.ones((128 << 10, 256)), jax.numpy.ones((256, 256))
+for _ in range(3):
+    step(x, w).block_until_ready()
+before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+step(x, w).block_until_ready()
+print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="the C library is not glibc")
+def test_a_step_uses_the_memory_of_the_one_before_when_it_is_kept():
+    def faults(asked):
+        done = subprocess.run([sys.executable, "-c", FAULTS, asked], capture_output=True, text=True, check=True)
+        return int(done.stdout)
+
+    assert faults("let go") > 10_000
+    assert faults("keep") < 1000
+
+
 def test_freed_memory_goes_back(monkeypatch):
     kept = []
     monkeypatch.setattr(
@@ -66,4 +98,5 @@ def test_another_c_library_is_left_alone(monkeypatch):
     for library in (missing, lambda name: object()):
         monkeypatch.setattr(ctypes, "CDLL", library)
         memory.few_arenas()
+        memory.keep()
         memory.give_back()
