@@ -77,11 +77,11 @@ class Witness:
 
     def __init__(self) -> None:
         """Nothing seen yet."""
-        self.samples: list[dict[str, float]] = []
+        self.samples: list[dict[str, Any]] = []
         self.compilations: list[dict[str, Any]] = []
         self._calls: Counter[str] = Counter()
         self._causes = ["loop"]
-        self._previewed: int | None = None  # the step, until its memory is given back
+        self._previewed: int | None = None  # the step of a preview whose memory is not given back yet
 
     @contextmanager
     def watching(self) -> Iterator[None]:
