@@ -204,7 +204,7 @@ def _train_defaults(arguments: list[str]) -> Train:
 
 def run(command: Command) -> None:
     """Carries a command out."""
-    set_up_jax()
+    set_up_jax(repeats=not isinstance(command, Render | View))
     match command:
         case Train():
             run_train(command)
@@ -222,16 +222,17 @@ def run(command: Command) -> None:
             run_convert_lpips(command)
 
 
-def set_up_jax() -> None:
-    """Lets a second run skip XLA's compilation, and steps on a CPU use the memory of those before.
+def set_up_jax(*, repeats: bool = True) -> None:
+    """Lets a second run skip XLA's compilation; JAX_COMPILATION_CACHE_DIR moves the cache.
 
-    JAX_COMPILATION_CACHE_DIR moves the cache.
+    Work that repeats itself on a CPU uses the memory of the time before; a first picture comes 0.1 s sooner without.
     """
     import jax
 
     from spnr_jax import memory
 
-    memory.keep_arrays()
+    if repeats:
+        memory.keep_arrays()
     if jax.config.values["jax_compilation_cache_dir"] is None:
         jax.config.update("jax_compilation_cache_dir", str(Path.home() / ".cache" / "spnr_jax"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)

@@ -29,7 +29,7 @@ cli = unchecked_cli()
 def shrunken(monkeypatch):
     """The preset `tiny` is the tests' network, and nothing is written to the home folder."""
     monkeypatch.setitem(presets.PRESETS, "tiny", lambda: tiny_dataset.CONFIG)
-    monkeypatch.setattr(cli, "set_up_jax", lambda: None)
+    monkeypatch.setattr(cli, "set_up_jax", lambda **_: None)
 
 
 def exit_code(*arguments):

@@ -23,7 +23,7 @@ def asked(monkeypatch):
 
     monkeypatch.setattr(demo, "generate", generate)
     monkeypatch.setattr(presets, "tiny", lambda: tiny_dataset.CONFIG)
-    monkeypatch.setattr(cli, "set_up_jax", lambda: None)
+    monkeypatch.setattr(cli, "set_up_jax", lambda **_: None)
     return configs
 
 

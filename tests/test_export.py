@@ -133,7 +133,7 @@ def test_another_size_than_the_buckets_is_refused(encoded):
 
 
 def test_the_command_writes_both_functions_their_stablehlo_and_what_they_take(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(cli, "set_up_jax", lambda: None)  # it would write to the home folder
+    monkeypatch.setattr(cli, "set_up_jax", lambda **_: None)  # it would write to the home folder
     cli.run(cli.Export(run=tiny_untrained.run(), out=tmp_path, num_points=64, resolution=SIZE))
     assert str(tmp_path) in capsys.readouterr().out
     names = {"weights.npz", "encode.jax", "encode.stablehlo", "render.jax", "render.stablehlo", "export.json"}

@@ -83,7 +83,7 @@ class TestScores:
 
 @pytest.fixture(autouse=True)
 def _no_cache(monkeypatch):
-    monkeypatch.setattr(cli, "set_up_jax", lambda: None)
+    monkeypatch.setattr(cli, "set_up_jax", lambda **_: None)
 
 
 def painted_ball(*_):
@@ -104,7 +104,7 @@ def out(tmp_path_factory):
     folder = tmp_path_factory.mktemp("fig3")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(fig3_depth, "mesh_of", painted_ball)
-        patch.setattr(cli, "set_up_jax", lambda: None)
+        patch.setattr(cli, "set_up_jax", lambda **_: None)
         show(patch, "Ours", "NPBG")
         fig3_depth.main(asked(folder))
     return folder

@@ -24,7 +24,7 @@ NAMES = tiny_dataset.SPLITS["test"]
 
 @pytest.fixture(autouse=True)
 def _stand_ins(monkeypatch):
-    monkeypatch.setattr(cli, "set_up_jax", lambda: None)
+    monkeypatch.setattr(cli, "set_up_jax", lambda **_: None)
     monkeypatch.setattr(methods, "networks", lambda *_: stand_ins.stand_ins("Ours", "Ours (a/run)"))
 
 

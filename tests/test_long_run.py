@@ -24,7 +24,7 @@ def asked(out, **options):
 
 @pytest.fixture(autouse=True)
 def _shrunken(monkeypatch):
-    monkeypatch.setattr(cli, "set_up_jax", lambda: None)
+    monkeypatch.setattr(cli, "set_up_jax", lambda **_: None)
     monkeypatch.setattr(presets, "tiny", lambda: QUICK)
 
 

@@ -111,7 +111,7 @@ def test_a_saved_state_is_restored_bit_by_bit(tmp_path):
 def _shrunken():
     """The shrunken network under the name of the preset, and a state saved after every step."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(cli, "set_up_jax", lambda: None)
+        patch.setattr(cli, "set_up_jax", lambda **_: None)
         patch.setitem(presets.PRESETS, "tiny", lambda: QUICK)
         patch.setattr(many_objects, "SAVE_EVERY", 1)
         yield

@@ -32,7 +32,7 @@ def mesh(*_):
 @pytest.fixture(scope="module", autouse=True)
 def _stand_ins():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(cli, "set_up_jax", lambda: None)
+        patch.setattr(cli, "set_up_jax", lambda **_: None)
         patch.setattr(methods, "networks", lambda *_: stand_ins.stand_ins("Ours", "NPBG"))
         patch.setattr(evaluation, "choose_radius", lambda *_: 1.5)
         patch.setattr(point_count, "mesh_of", mesh)

@@ -35,7 +35,7 @@ def asked(monkeypatch):
 
     monkeypatch.setattr(pretrain, "generate", generate)
     monkeypatch.setattr(presets, "plus_small", lambda: CONFIG)
-    monkeypatch.setattr(cli, "set_up_jax", lambda: None)
+    monkeypatch.setattr(cli, "set_up_jax", lambda **_: None)
     return configs
 
 

@@ -40,7 +40,7 @@ def test_work_is_what_the_axis_multiplies(name):
 
 @pytest.mark.slow
 def test_a_quick_run_ends_with_table_and_plot(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(scaling.cli, "set_up_jax", lambda: None)
+    monkeypatch.setattr(scaling.cli, "set_up_jax", lambda **_: None)
     scaling.main(scaling.Options(out=tmp_path / "scaling", only=("points",), quick=True))
     found = json.loads((tmp_path / "scaling-quick.json").read_text())
     assert [point["work"] for point in found["axes"][0]["points"]] == [512, 1024]

@@ -37,7 +37,7 @@ def _shrunken_presets():
             patch.setitem(presets.PRESETS, name, lambda shrunken=shrunken: shrunken)
         for name, surface in table1_poisson.SURFACES.items():  # depth 12 takes seconds for a ball of few points
             patch.setitem(table1_poisson.SURFACES, name, dataclasses.replace(surface, depth=5))
-        patch.setattr(cli, "set_up_jax", lambda: None)
+        patch.setattr(cli, "set_up_jax", lambda **_: None)
         yield
 
 

@@ -20,7 +20,7 @@ def shrunken():
     """The preset `tiny` is L1_ONLY, and compilations are not kept on disk."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(presets.PRESETS, "tiny", lambda: L1_ONLY)
-        patch.setattr(cli, "set_up_jax", lambda: None)
+        patch.setattr(cli, "set_up_jax", lambda **_: None)
         yield
 
 
