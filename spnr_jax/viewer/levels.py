@@ -1,7 +1,7 @@
 """What a quality costs and loses: the figures of the README's table, which a test compares with it.
 
-They are of the preset `tiny` on 12 unseen procedural objects at 64 x 64, 1024 points, 2 cores of an AMD EPYC,
-2026-11-21 (`python -m experiments.speed_accuracy`): how the levels compare, not what this machine needs, which the
+They are of the preset `tiny` on 12 unseen procedural objects at 64 x 64, 1024 points, two cores of an Intel Xeon,
+2026-11-22 (`python -m experiments.speed_accuracy`): how the levels compare, not what this machine needs, which the
 viewer measures.
 """
 
@@ -22,10 +22,10 @@ class Level:
 
 
 LEVELS: dict[Quality, Level] = {
-    "draft": Level(psnr=21.61, flip=0.136, milliseconds=4.6),
-    "balanced": Level(psnr=21.66, flip=0.136, milliseconds=4.9),
-    "best": Level(psnr=21.67, flip=0.136, milliseconds=6.1),
-    "trained": Level(psnr=21.52, flip=0.139, milliseconds=7.8),
+    "draft": Level(psnr=21.59, flip=0.137, milliseconds=3.1),
+    "balanced": Level(psnr=21.64, flip=0.137, milliseconds=3.9),
+    "best": Level(psnr=21.65, flip=0.137, milliseconds=4.7),
+    "trained": Level(psnr=21.51, flip=0.140, milliseconds=6.5),
 }
 
 
