@@ -3,6 +3,7 @@
 import dataclasses
 import importlib.util
 import json
+import os
 import shutil
 import signal
 import subprocess
@@ -30,6 +31,29 @@ def shrunken(monkeypatch):
     """The preset `tiny` is the tests' network, and nothing is written to the home folder."""
     monkeypatch.setitem(presets.PRESETS, "tiny", lambda: tiny_dataset.CONFIG)
     monkeypatch.setattr(cli, "set_up_jax", lambda **_: None)
+
+
+SETTING_UP = """
+import sys
+import jax
+from spnr_jax import cli, memory
+memory.keep = lambda: print("kept")
+cli.run_render = cli.run_runs = lambda command: None
+cli.run(cli.parse(sys.argv[1:]))
+print(jax.config.values["jax_cpu_enable_async_dispatch"], jax.config.values["jax_compilation_cache_dir"])
+"""
+
+
+@pytest.mark.parametrize(("arguments", "said"), [(["render", "x.ply"], ["True"]), (["runs", "."], ["kept", "False"])])
+def test_memory_is_kept_where_work_repeats_itself_and_compilations_always(arguments, said, tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-c", SETTING_UP, *arguments],
+        env=os.environ | {"HOME": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stdout.split() == [*said, str(tmp_path / ".cache" / "spnr_jax")]
 
 
 def exit_code(*arguments):
