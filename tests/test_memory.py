@@ -64,11 +64,12 @@ def step(x, w):
     return y.T @ y
 
 x, w = jax.numpy.ones((128 << 10, 256)), jax.numpy.ones((256, 256))
-for _ in range(3):
+faults = []
+for _ in range(10):  # the first ones find no memory, or one piece where two are in use
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
     step(x, w).block_until_ready()
-before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-step(x, w).block_until_ready()
-print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+    faults.append(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+print(min(faults))
 """
 
 
