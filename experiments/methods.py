@@ -78,7 +78,8 @@ def load(run: Path, dataset: data.Dataset) -> Network:
     method = next(name for name, kind in METHODS.items() if isinstance(config.model, kind))
     if isinstance(config.model, ModelConfig) and config.model.num_neighbors:
         method = "plus"
-    described = place if (place := weights.place(run)).is_file() else place / "config.json"
+    place = weights.place(run)
+    described = place if place.is_file() else place / "config.json"
     return Network(
         method=method,
         config=config,

@@ -19,7 +19,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from spnr_jax import presets
+from spnr_jax import memory, presets
 from spnr_jax.config import TrainConfig
 from spnr_jax.render_command import Render
 
@@ -228,8 +228,6 @@ def set_up_jax(*, repeats: bool = True) -> None:
     Work that repeats itself on a CPU uses the memory of the time before; a first picture comes 0.1 s sooner without.
     """
     import jax
-
-    from spnr_jax import memory
 
     if repeats:
         memory.keep_arrays()

@@ -121,6 +121,17 @@ def test_a_program_that_is_compiled_at_every_preview_breaks_the_law(tmp_path, mo
     assert "compilations" in main(asked(tmp_path, steps=20))
 
 
+def test_memory_of_a_preview_is_read_once_when_it_was_given_back():
+    seen = Witness()
+    write, give_back = seen.watched("row", lambda log, row: None), seen.watched("memory", lambda: None)
+    give_back()
+    write(None, {"step": 5, "psnr": 20.0})
+    assert seen.samples == []
+    give_back()
+    give_back()
+    assert [(sample["step"], sample["ms_per_step"]) for sample in seen.samples] == [(5, None)]
+
+
 def test_the_trainer_is_as_before_when_the_witness_has_gone():
     parts = (
         (training, "jitted_train_step"),
