@@ -3,10 +3,11 @@
     python -m experiments.pretrain --meshes DIR --test-list FILE [--network tiny] [--out runs/pretrain]
 
 Two data sets lie below OUT: `procedural`, objects of all classes, and `meshes`, those that the list does not hold out,
-each with variants of colour and shape.  `data` joins them by links.  `small` is trained on it in three runs of which
+each with variants of colour and shape.  `data` joins them by links.  `small` is trained on it in four runs of which
 each begins where the one before ended: OUT/small/run1 with the points of the preset, the others with 128 to 2048 an
-object.  `tiny` is trained in one.  The held-out meshes score it (OUT/small/report.html), and OUT/small.npz is the file
-that the package holds.  What is there already is reused: finished objects, trained steps.
+object; the last trains its refiner alone.  `tiny` is trained in one.  The held-out meshes score it
+(OUT/small/report.html), and OUT/small.npz is the file that the package holds.  What is there already is reused:
+finished objects, trained steps.
 """
 
 import dataclasses
@@ -92,6 +93,7 @@ def recipe(options: Pretrain) -> list[TrainConfig]:
             first,
             later(first, steps=9000, seed=first.seed + 1, lr=1.5e-3),
             later(first, steps=6000, seed=first.seed + 2, lr=1e-3),
+            refining(presets.plus_refined()),
         ]
     return runs if options.steps is None else [dataclasses.replace(run, num_steps=options.steps) for run in runs]
 
@@ -104,6 +106,12 @@ def later(config: TrainConfig, steps: int, seed: int, lr: float) -> TrainConfig:
         num_steps=steps,
         seed=seed,
     )
+
+
+def refining(config: TrainConfig) -> TrainConfig:
+    """The config of a run that trains the refiner alone."""
+    optimizer = dataclasses.replace(config.optimizer, lr_generator=2e-3, only=("refiner",))
+    return dataclasses.replace(config, optimizer=optimizer)
 
 
 def data_sets(options: Pretrain, resolution: int) -> list[GenerateConfig]:

@@ -28,7 +28,7 @@ from spnr_jax.presets import PRESETS
 from spnr_jax.summary import Scores
 
 PaperPreset = Literal["abo", "shapenet_car", "shapenet_plane", "shapenet_chair", "small", "tiny"]
-PlusPreset = Literal["plus_abo", "plus_lite", "plus_shapenet", "plus_small", "plus_tiny"]
+PlusPreset = Literal["plus_abo", "plus_lite", "plus_refined", "plus_shapenet", "plus_small", "plus_tiny"]
 Preset = PaperPreset | PlusPreset
 QUICK_STEPS, QUICK_OBJECTS = 4, 2
 FEWEST_ROWS = 8  # of a log, two of which may hold a compilation

@@ -80,6 +80,8 @@ class OptimizerConfig:
     """Adam, or rectified Adam for the generator."""
     decay: Literal["cosine", "exponential"] = added("cosine")
     """How the generator's learning rate falls after the warm-up."""
+    only: tuple[str, ...] = added(())
+    """Parts of the generator that are trained, as `refiner`; the others stay as they began.  None named: all."""
 
     def __post_init__(self) -> None:
         for name in ("lr_generator", "lr_discriminator"):
@@ -115,6 +117,8 @@ class TrainConfig:
     """Seed of weights, batches and jitter."""
     pixel_stride: int = added(1)
     """Every so many-th row and column of a view is rendered in training, from a random first one on."""
+    crop: int = added(0)
+    """Pixels along each side of the square of a view that is rendered in training, at a random place; 0: all of it."""
 
     def __post_init__(self) -> None:
         for name in ("num_steps", "batch_objects", "views_per_object", "min_points", "test_points", "pixel_stride"):
@@ -132,6 +136,14 @@ class TrainConfig:
             self.pixel_stride == 1 or (self.model.per_pixel and self.model.image_resolution % self.pixel_stride == 0),
             f"pixel_stride {self.pixel_stride} needs a network whose pixels do not depend on their neighbours and an "
             f"image_resolution that it divides ({self.model.image_resolution}); use 1",
+        )
+        require(
+            self.crop == 0 or (self.model.any_size and 1 <= self.crop <= self.model.image_resolution),
+            f"crop {self.crop} needs a network that renders pictures of any size, and at most its image_resolution "
+            f"({self.model.image_resolution}) pixels; use 0",
+        )
+        require(
+            self.crop == 0 or self.pixel_stride == 1, f"pixel_stride {self.pixel_stride} and crop {self.crop}: use one"
         )
         require(
             self.min_points <= self.max_points,

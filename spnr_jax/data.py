@@ -256,8 +256,8 @@ def cached_reader(dataset: Dataset, config: TrainConfig, cache_bytes: int) -> Ca
 
 
 def check_renders(data: ObjectData, config: TrainConfig) -> None:
-    """ValueError if the config's network cannot render an object's views: one size alone, or any pixel by itself."""
-    if not config.model.per_pixel:
+    """ValueError if the config's network cannot render an object's views: one size alone, or any."""
+    if not config.model.any_size:
         check_resolution(data, config)
 
 

@@ -77,6 +77,7 @@ class Model:
 
         `draft`, `balanced` and `best` look near the points alone, with a quarter, half and all of the samples of a ray,
         and `best` has several rays a pixel where pictures are smaller than those of the training (`supersampling.py`);
+        the network's refiner, if it has one, is left out of `draft`;
         `trained` renders as the network was trained.  Other networks than ours know one number of samples.
         """
         if self.config.upsamples and (camera.height % 2 or camera.width % 2):
@@ -145,7 +146,10 @@ def at_quality(config: NetworkConfig, quality: Quality, reach: int) -> NetworkCo
     counts = config.sampling
     reach = counts.reach if config.num_neighbors else reach
     samples = max(round(SAMPLES[quality] * (counts.num_coarse + counts.num_fine)), 1)
-    return dataclasses.replace(config, sampling=SamplingConfig(num_coarse=samples, num_fine=0, reach=reach))
+    sampling = SamplingConfig(num_coarse=samples, num_fine=0, reach=reach)
+    if quality == "draft" and config.refiner_width:
+        return dataclasses.replace(config, sampling=sampling, refiner_width=0, num_features=3)
+    return dataclasses.replace(config, sampling=sampling)
 
 
 def reach_of(positions: np.ndarray, resolution: int, num_queries: int = 4096) -> int:

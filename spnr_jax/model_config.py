@@ -4,6 +4,7 @@ Besides its fields, a network's config says how it is trained and rendered, as c
     upsamples   whether the volume rendering is smaller than the image
     ray_chunk   rays of an object rendered at once, which bounds the memory; None renders whole images
     per_pixel   whether a pixel does not depend on its neighbours, so that a lattice of them can be trained on
+    any_size    whether pictures of any size can be rendered
 A network is found by its config (`training.network`); METHODS are the names that tell the configs apart in JSON.
 """
 
@@ -115,6 +116,8 @@ class ModelConfig:
     """Radiance: free RGB [paper], or predicted light on the materials of the nearest points (`nn/surface_field.py`)."""
     point_norm: Literal["batch", "layer"] = added("batch")
     """Normalisation in the PointNet: over points [paper] or over the features of one."""
+    refiner_width: int = added(0)
+    """Channels of the CNN that looks over the rendered picture (`nn/refiner.py`); 0: none."""
 
     def __post_init__(self) -> None:
         require(0 <= self.num_stages <= 16, f"num_stages must be 0 to 16, got {self.num_stages}")
@@ -135,8 +138,15 @@ class ModelConfig:
             self.base_width % self.num_groups == 0 and self.base_width > 0,
             f"base_width {self.base_width} must be a positive multiple of num_groups {self.num_groups}",
         )
-        least = 3 if self.num_neighbors else 4
-        require(self.num_features >= least, f"num_features must be {least} or more, RGB first, got {self.num_features}")
+        if self.num_neighbors:
+            features, names = (3 + self.field_width, "RGB and the hidden layer") if self.refiner_width else (3, "RGB")
+            require(
+                self.num_features == features,
+                f"num_features must be {features}, {names}, for a network that sees the nearest points, got "
+                f"{self.num_features}",
+            )
+        else:
+            require(self.num_features >= 4, f"num_features must be 4 or more, RGB first, got {self.num_features}")
         check_materials(self.materials)
         require(
             self.precision in ("float32", "bfloat16"),
@@ -151,10 +161,14 @@ class ModelConfig:
         )
         require(self.color in ("free", "lit"), f"color must be free or lit, got {self.color}")
         require(self.point_norm in ("batch", "layer"), f"point_norm must be batch or layer, got {self.point_norm}")
-        for name in ("num_neighbors", "surface_cells"):
+        for name in ("num_neighbors", "surface_cells", "refiner_width"):
             require(getattr(self, name) >= 0, f"{name} must not be negative, got {getattr(self, name)}")
         require(
             self.num_neighbors > 0 or self.color == "free", "color lit needs the nearest points; use num_neighbors 6"
+        )
+        require(
+            self.refiner_width == 0 or self.num_neighbors > 0,
+            "a refiner looks over pictures rendered near the points; use num_neighbors 6, or refiner_width 0",
         )
         require(
             self.num_neighbors == 0 or (not self.upsamples and self.sampling.reach == 1),
@@ -184,7 +198,12 @@ class ModelConfig:
 
     @property
     def per_pixel(self) -> bool:
-        """Whether a pixel does not depend on its neighbours: the upsampler alone mixes them."""
+        """Whether a pixel does not depend on its neighbours: upsampler and refiner mix them."""
+        return not self.upsamples and not self.refiner_width
+
+    @property
+    def any_size(self) -> bool:
+        """Whether pictures of any size can be rendered: the upsampler has learnt one."""
         return not self.upsamples
 
 
@@ -195,6 +214,7 @@ class NPBGConfig:
     upsamples: ClassVar[bool] = False
     ray_chunk: ClassVar[int | None] = None
     per_pixel: ClassVar[bool] = False
+    any_size: ClassVar[bool] = False
 
     encoder_widths: tuple[int, ...] = (16, 32, 48, 64, 80)
     """Channels at each scale, the finest first; each scale has half the pixels of the one before."""
@@ -229,6 +249,7 @@ class PointNeRFConfig:
 
     upsamples: ClassVar[bool] = False
     per_pixel: ClassVar[bool] = True
+    any_size: ClassVar[bool] = True
 
     radius: float = 0.1
     """Reach of a point [paper], in units of the box [-1, 1]^3 whose object has a half-diagonal of 1."""
@@ -276,6 +297,7 @@ class Points2NeRFConfig:
 
     upsamples: ClassVar[bool] = False
     per_pixel: ClassVar[bool] = True
+    any_size: ClassVar[bool] = True
 
     mode: Literal["faithful", "fixed"] = "faithful"
     """The published code's arithmetic, or that of a variational autoencoder over finite intervals."""

@@ -132,8 +132,26 @@ def plus_lite() -> TrainConfig:
     return dataclasses.replace(small, preset="plus_lite", model=model, num_steps=5000)
 
 
+def plus_refined() -> TrainConfig:
+    """The package's network `small`: plus_small's with a refiner.  `spnr train --preset plus_refined --init small ...`.
+
+    Without --init, train `plus_small` first and begin with its run: a lattice of rays is quicker to learn from.
+    """
+    small = of_any_density(plus_small())
+    assert isinstance(small.model, ModelConfig)
+    return dataclasses.replace(
+        small,
+        preset="plus_refined",
+        model=dataclasses.replace(small.model, refiner_width=32, num_features=3 + small.model.field_width),
+        loss=dataclasses.replace(small.loss, mse_weight=4.0, opacity_weight=2.0),
+        num_steps=9000,
+        pixel_stride=1,
+        crop=small.model.image_resolution // 2,
+    )
+
+
 def plus_small() -> TrainConfig:
-    """The package's network `small`: plus_tiny's at 128 px, for longer.  `spnr train --preset plus_small DATA RUN`."""
+    """plus_tiny's network at 128 px, for longer.  `spnr train --preset plus_small DATA RUN`."""
     small = _plus(tiny(), "plus_small", pixel_stride=4, num_coarse=16)
     assert isinstance(small.model, ModelConfig)
     return dataclasses.replace(
@@ -282,7 +300,7 @@ def points2nerf_tiny() -> TrainConfig:
 
 
 OURS = (abo, shapenet_car, shapenet_plane, shapenet_chair, small, tiny)
-PLUS = (plus_abo, plus_lite, plus_shapenet, plus_small, plus_tiny)
+PLUS = (plus_abo, plus_lite, plus_refined, plus_shapenet, plus_small, plus_tiny)
 BASELINES = (
     *(npbg_abo, npbg_shapenet, npbg_tiny),
     *(point_nerf_abo, point_nerf_shapenet, point_nerf_tiny),

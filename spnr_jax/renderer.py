@@ -3,6 +3,8 @@
     encode   PointNet on every point, mean per voxel, 3D U-Net                     once per object
     render   rays, coarse samples, fine samples, compositing, 2D upsampler         once per view
 
+Networks that see the nearest points have a refiner in the upsampler's place, or neither.
+
 Objects lead, views follow: clouds are (objects, points, ...), cameras (objects, views, ...).
 """
 
@@ -15,15 +17,18 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from spnr_jax import cameras, compositing, empty_space, sampling, surface, voxels
+from spnr_jax.colors import LEAST_OPACITY
 from spnr_jax.distributed import divide_pixels, on_own_rays, undivided
 from spnr_jax.empty_space import Path
 from spnr_jax.model_config import ModelConfig, surface_grid
 from spnr_jax.nn.field import RadianceField
 from spnr_jax.nn.pointnet import PointNet
+from spnr_jax.nn.refiner import Refiner
 from spnr_jax.nn.surface_field import SurfaceField
 from spnr_jax.nn.unet3d import UNet3D
-from spnr_jax.nn.upsampler import Upsampler, bilinear
-from spnr_jax.numerics import clamp
+from spnr_jax.nn.upsampler import Upsampler
+from spnr_jax.numerics import clamp, length
+from spnr_jax.resizing import bilinear
 from spnr_jax.types import Camera, Key, PointCloud, Rays, Rendering, Scene
 
 CELLS_PER_VOXEL = 1  # of a path through the box, counted along an axis
@@ -47,6 +52,8 @@ class Renderer(nn.Module):
             self.field = RadianceField(c.field_width, c.num_features, c.direction_frequencies, c.sees_direction)
         if c.upsamples:
             self.upsampler = Upsampler(c.upsampler_width, c.bf16)
+        if c.refiner_width:
+            self.refiner = Refiner(c.refiner_width, bf16=c.bf16)
 
     def encode(self, cloud: PointCloud, train: bool = False) -> Scene:
         """Feature volume of each object from its points, where these are, and the surface that they lie on."""
@@ -90,10 +97,13 @@ class Renderer(nn.Module):
         depth: Float[Array, "objects rays"],
         acc: Float[Array, "objects rays"],
     ) -> Rendering:
-        """Images from the rays of `rays`: the upsampler, and everything in its place."""
+        """Images from the rays of `rays`: upsampler or refiner, and everything in its place."""
         views, (height, width) = camera.cam_to_world.shape[:-2], self.render_size(camera)
         features = undivided(features).reshape(-1, height, width, self.config.num_features)
         image = features[..., :3]
+        depth, acc = (x.reshape(-1, height, width) for x in (depth, acc))
+        if self.config.refiner_width:
+            image, depth, acc = self.refine(camera, features, undivided(depth), undivided(acc))
         if self.config.upsamples:
             small = divide_pixels(bilinear(features, camera.height // 2, camera.width // 2))
             image = undivided(self.upsampler(small))
@@ -103,6 +113,14 @@ class Renderer(nn.Module):
             depth=depth.reshape(*views, height, width),
             acc=acc.reshape(*views, height, width),
         )
+
+    def refine(self, camera: Camera, features, depth, acc):
+        """Image, depth and opacity after the refiner, from what was rendered (objects * views, height, width, ...)."""
+        rays = cameras.view_rays(camera)
+        _, far, _ = cameras.intersect_box(rays.origins, rays.directions)
+        eye = length(jnp.asarray(camera.cam_to_world)[..., 3]).reshape(-1)
+        shrink = max(round(max(camera.height, camera.width) / self.config.image_resolution), 1)
+        return self.refiner(features[..., :3], features[..., 3:], depth, acc, far.reshape(depth.shape), eye, shrink)
 
     def render_rays(
         self, scene: Scene, rays: Rays, key: Key | None = None
@@ -201,7 +219,12 @@ class Renderer(nn.Module):
         # each pass is composited where it lies: sums do not mind the order, and nothing wide is concatenated
         sums = [jax.tree.map(partial(compositing.composite, w), emitted) for w, emitted in passes]
         emitted = jax.tree.map(lambda *parts: reduce(operator.add, parts), *sums)
-        return self.field.finish(emitted, jnp.sum(weights, axis=-1), view), weights, distances
+        acc = jnp.sum(weights, axis=-1)
+        features = self.field.finish(emitted, acc, view)
+        if self.config.refiner_width:
+            hidden = emitted[0] / jnp.maximum(acc, LEAST_OPACITY)[..., None]
+            features = jnp.concatenate([features, hidden], axis=-1)
+        return features, weights, distances
 
     def __call__(self, cloud: PointCloud, camera: Camera, key: Key | None = None, train: bool = False) -> Rendering:
         """Views of each cloud from its cameras."""

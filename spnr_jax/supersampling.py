@@ -1,21 +1,19 @@
 """Several rays a pixel, averaged as light is: what a picture smaller than those of the training needs.
 
-A network whose pixels do not depend on their neighbours has learnt what a ray of its training sees, a cone of one pixel
-there.  The pixels of a smaller picture are wider: each is the mean of the rays that it would have had in the training.
+A network that renders pictures of any size has learnt what a ray of its training sees, a cone of one pixel there.  The
+pixels of a smaller picture are wider: each is the mean of the rays that it would have had in the training.
 """
-
-import jax.numpy as jnp
-from jaxtyping import Array, Float
 
 from spnr_jax.colors import over, srgb_to_linear, unweighted
 from spnr_jax.compositing import WHITE
 from spnr_jax.model_config import NetworkConfig
+from spnr_jax.resizing import mean_of_squares
 from spnr_jax.types import Rendering
 
 
 def rays_per_side(config: NetworkConfig, size: int) -> int:
     """Rays along each side of a pixel of a picture `size` pixels wide, so that they lie as close as in the training."""
-    return max(round(config.image_resolution / size), 1) if config.per_pixel else 1
+    return max(round(config.image_resolution / size), 1) if config.any_size else 1
 
 
 def averaged(rendering: Rendering, side: int) -> Rendering:
@@ -28,10 +26,3 @@ def averaged(rendering: Rendering, side: int) -> Rendering:
     light, depth, acc = (mean_of_squares(x, side) for x in (opacity * srgb_to_linear(straight), depth, opacity))
     image = over(light, acc, WHITE)
     return Rendering(image=image, image_lr=image, depth=depth[..., 0], acc=acc[..., 0])
-
-
-def mean_of_squares(x: Float[Array, "*batch height width features"], side: int) -> Float[Array, "*batch h w features"]:
-    """The mean of each square of side x side pixels."""
-    *batch, height, width, features = x.shape
-    squares = x.reshape(*batch, height // side, side, width // side, side, features)
-    return jnp.mean(squares, axis=(-4, -2))

@@ -135,7 +135,7 @@ def create_state(config: TrainConfig, seed: int | Array | None = None) -> TrainS
         key=key,
         generator=generator,
         batch_stats=batch_stats,
-        generator_optimizer=generator_adam.init(generator),
+        generator_optimizer=generator_adam.init(parted(config, generator)[0]),
         averaged=jax.tree.map(jnp.copy, generator),  # a donated state must not hold one buffer twice
         averaged_stats=jax.tree.map(jnp.copy, batch_stats),
         discriminator=discriminator,
@@ -143,9 +143,22 @@ def create_state(config: TrainConfig, seed: int | Array | None = None) -> TrainS
     )
 
 
+def parted(config: TrainConfig, generator: dict) -> tuple[dict, dict]:
+    """The parts of the generator that are trained, and those that stay as they are."""
+    only = config.optimizer.only or tuple(generator)
+    if unknown := sorted(set(only) - set(generator)):
+        raise ValueError(f"optimizer.only names {unknown[0]}; the parts of this network: {', '.join(generator)}")
+    trained = {name: part for name, part in generator.items() if name in only}
+    return trained, {name: part for name, part in generator.items() if name not in only}
+
+
 def begun_with(state: TrainState, variables: dict) -> TrainState:
-    """A fresh state with the generator of another training; ValueError if its weights are of another network."""
+    """A fresh state with the generator of another training; ValueError if its weights are of another network.
+
+    A refiner that the other one lacks stays fresh.
+    """
     params, stats = variables["params"], variables.get("batch_stats", {})
+    params = {name: part for name, part in state.generator.items() if name == "refiner"} | params
     needed = {"params": state.generator, "batch_stats": state.batch_stats}
     own, other = (flatten_dict(weights, sep="/") for weights in (needed, {"params": params, "batch_stats": stats}))
     for name in own | other:
@@ -187,6 +200,23 @@ def lattice(key: Key, batch: Batch, stride: int) -> Batch:
     camera = Camera(
         cam_to_world=batch.camera.cam_to_world, intrinsics=intrinsics, height=image.shape[2], width=image.shape[3]
     )
+    return Batch(cloud=batch.cloud, camera=camera, image=image, alpha=alpha, condition=condition, condition_mask=mask)
+
+
+def cropped(key: Key, batch: Batch, size: int) -> Batch:
+    """The batch with a square of `size` pixels of each view, at one random place for all: images still."""
+    height, width = batch.image.shape[2:4]
+    first = jax.random.randint(key, (2,), 0, jnp.array([height, width]) - size + 1)
+
+    def cut(x):
+        for axis, start in zip((2, 3), first, strict=True):
+            x = jax.lax.dynamic_slice_in_dim(x, start, size, axis)
+        return x
+
+    images = (batch.image, batch.alpha, batch.condition, batch.condition_mask)
+    image, alpha, condition, mask = (cut(jnp.asarray(x)) for x in images)
+    intrinsics = jnp.asarray(batch.camera.intrinsics).at[..., :2, 2].add(-first[::-1])
+    camera = Camera(cam_to_world=batch.camera.cam_to_world, intrinsics=intrinsics, height=size, width=size)
     return Batch(cloud=batch.cloud, camera=camera, image=image, alpha=alpha, condition=condition, condition_mask=mask)
 
 
@@ -250,14 +280,17 @@ def train_step(
     if config.pixel_stride > 1:
         key, lattice_key = jax.random.split(key)
         batch = lattice(lattice_key, batch, config.pixel_stride)
+    if config.crop:
+        key, crop_key = jax.random.split(key)
+        batch = cropped(crop_key, batch, config.crop)
     module, reference = network(config.model), jnp.asarray(batch.image)
     generator_adam, discriminator_adam = optimizers(config)
+    trained, still = parted(config, state.generator)
+    how = (None, False) if still else (key, True)  # what is trained behind other parts learns from what they will show
 
-    def forward(params):
-        variables = {"params": params, "batch_stats": state.batch_stats}
-        rendering, updated = module.apply(
-            variables, batch.cloud, batch.camera, key, train=True, mutable=["batch_stats", "losses"]
-        )
+    def forward(trained):
+        variables = {"params": trained | still, "batch_stats": state.batch_stats}
+        rendering, updated = module.apply(variables, batch.cloud, batch.camera, *how, mutable=["batch_stats", "losses"])
         sown = {name: value for name, (value,) in updated.get("losses", {}).items()}
         if config.loss.opacity_weight:
             opacity = losses.area_downsample(jnp.asarray(batch.alpha)[..., None], rendering.acc.shape[-1])[..., 0]
@@ -265,7 +298,7 @@ def train_step(
         seen = rendering.acc > 0 if config.loss.masked else None
         return (rendering.image, rendering.image_lr, sown), (updated.get("batch_stats", {}), seen)
 
-    (image, image_lr, sown), pull_back, (batch_stats, seen) = jax.vjp(forward, state.generator, has_aux=True)
+    (image, image_lr, sown), pull_back, (batch_stats, seen) = jax.vjp(forward, trained, has_aux=True)
     metrics = {"psnr": jnp.mean(psnr(image, reference)), "l1": losses.l1(image, reference)}
     discriminator, discriminator_optimizer = state.discriminator, state.discriminator_optimizer
     if adversarial:
@@ -290,23 +323,23 @@ def train_step(
     loss, cotangents = jax.value_and_grad(whole_loss, argnums=(0, 1, 2))(image, image_lr, sown)
     (gradient,) = pull_back(cotangents)
     update, generator_optimizer = generator_adam.update(gradient, state.generator_optimizer)
-    generator = optax.apply_updates(state.generator, update)
+    trained = optax.apply_updates(trained, update)
     metrics |= {"loss": loss, "gradient_norm": optax.tree.norm(gradient)} | sown
 
     # early weights are far from the last ones: average over a growing share of the past
     decay = jnp.minimum(config.optimizer.ema_decay, (1.0 + state.step) / (10.0 + state.step))
     averaged, averaged_stats = jax.tree.map(
         lambda old, new: decay * old + (1 - decay) * new,
-        (state.averaged, state.averaged_stats),
-        (generator, batch_stats),
+        ({name: state.averaged[name] for name in trained}, state.averaged_stats),
+        (trained, batch_stats),
     )
     state = TrainState(
         step=state.step + 1,
         key=state.key,
-        generator=generator,
+        generator=trained | still,
         batch_stats=batch_stats,
         generator_optimizer=generator_optimizer,
-        averaged=averaged,
+        averaged=state.averaged | averaged,
         averaged_stats=averaged_stats,
         discriminator=discriminator,
         discriminator_optimizer=discriminator_optimizer,

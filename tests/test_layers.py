@@ -15,7 +15,10 @@ import pytest
 ROOT = Path(__file__).parents[1]
 LAYERS = {
     0: {"types", "config", "model_config", "distributed"},
-    1: {"numerics", "cameras", "colors", "sampling", "compositing", "voxels", "losses", "metrics", "statistics"},
+    1: {
+        *("numerics", "cameras", "colors", "compositing", "losses", "metrics", "resizing", "sampling", "statistics"),
+        "voxels",
+    },
     2: {"nn", "empty_space", "surface", "supersampling", "flip", "lpips"},
     3: {"renderer", "baselines"},
     4: {"training"},

@@ -6,14 +6,18 @@ import shutil
 
 import pytest
 import tiny_dataset
+import tiny_model
 
 from experiments import pretrain
 from spnr_jax import cli, data, presets, run_record, weights
 
 pytestmark = pytest.mark.ci  # it trains several networks
 
+SIZE = tiny_dataset.CONFIG.model.image_resolution
 CONFIG = dataclasses.replace(
-    tiny_dataset.CONFIG, loss=dataclasses.replace(tiny_dataset.CONFIG.loss, adversarial_weight=0.0)
+    tiny_dataset.CONFIG,
+    model=dataclasses.replace(tiny_model.PLUS, render_resolution=SIZE, image_resolution=SIZE, surface_cells=45),
+    loss=dataclasses.replace(tiny_dataset.CONFIG.loss, adversarial_weight=0.0),
 )
 
 
@@ -52,8 +56,8 @@ def test_both_data_sets_train_one_network_and_its_file_is_what_was_scored(asked,
     assert data.read_object(joined, f"mesh-{single.splits['test'][0]}").images.size
     trained, out = weights.read_trained(options.out / "small.npz"), options.out / "small"
     assert (trained.config, trained.steps) == (pretrain.recipe(options)[-1], 2)
-    starts = [run_record.read_starts(out / f"run{number}") for number in (1, 2, 3)]
-    assert [start.get("init") for (start,) in starts] == [None, *[f"{CONFIG.preset}, 2 steps"] * 2]
+    starts = [run_record.read_starts(out / f"run{number}") for number in (1, 2, 3, 4)]
+    assert [start.get("init") for (start,) in starts] == [None, *[f"{CONFIG.preset}, 2 steps"] * 3]
     scored = json.loads((out / "metrics.json").read_text())
     assert scored["methods"]["ours"]["objects"] == len(joined.splits["test"])
     assert "report.html" in capsys.readouterr().out
@@ -73,6 +77,7 @@ def test_tiny_has_one_run_and_each_run_of_small_begins_where_the_one_before_ende
     assert pretrain.recipe(pretrain.Pretrain(network="tiny")) == [presets.plus_lite()]
     first, *later = pretrain.recipe(pretrain.Pretrain())
     assert first == presets.plus_small()
-    assert [run.num_steps for run in later] == [9000, 6000]
-    assert len({run.seed for run in (first, *later)}) == 3
+    assert [run.num_steps for run in later] == [9000, 6000, presets.plus_refined().num_steps]
+    assert len({run.seed for run in (first, *later[:-1])}) == 3
+    assert later[-1].optimizer.only == ("refiner",)
     assert all(run.model.surface_cells == presets.plus_lite().model.surface_cells for run in later)

@@ -13,7 +13,8 @@ from spnr_jax import cameras, training
 from spnr_jax.model import Model
 from spnr_jax.model_config import NPBGConfig
 from spnr_jax.renderer import Renderer
-from spnr_jax.supersampling import averaged, mean_of_squares, rays_per_side
+from spnr_jax.resizing import mean_of_squares
+from spnr_jax.supersampling import averaged, rays_per_side
 from spnr_jax.types import Rendering
 
 SIDE = 2

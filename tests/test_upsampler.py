@@ -7,7 +7,8 @@ import pytest
 import reference
 from laws import close, gradient_law, numbers
 
-from spnr_jax.nn.upsampler import Upsampler, bilinear
+from spnr_jax.nn.upsampler import Upsampler
+from spnr_jax.resizing import bilinear
 
 X = numbers(0, 2, 4, 6, 5)
 MODULE = Upsampler(width=4)

@@ -19,8 +19,8 @@ from jaxtyping import Array, Bool, Float, Int
 from spnr_jax import cameras
 from spnr_jax.model_config import NPBGConfig
 from spnr_jax.nn.convolution import conv
-from spnr_jax.nn.upsampler import bilinear
 from spnr_jax.numerics import per_feature
+from spnr_jax.resizing import bilinear
 from spnr_jax.types import Camera, Key, PointCloud, Rendering
 
 

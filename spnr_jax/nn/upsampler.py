@@ -1,21 +1,14 @@
 """2D upsampler: feature image to an image of twice the size; it learns what to add to the bilinear RGB."""
 
 import flax.linen as nn
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from spnr_jax.nn.convolution import conv, kernel_init, upsample_conv
 from spnr_jax.numerics import per_feature
+from spnr_jax.resizing import bilinear
 
 SLOPE = 0.2
-
-
-def bilinear(
-    x: Float[Array, "batch height width features"], height: int, width: int
-) -> Float[Array, "batch h w features"]:
-    """Image resized with half-pixel centres (not aligned at the corners)."""
-    return jax.image.resize(x, (x.shape[0], height, width, x.shape[-1]), "bilinear", antialias=False)
 
 
 class Upsampler(nn.Module):

@@ -1,0 +1,293 @@
+"""The refiner: what it may change of a picture, at which sizes, and how it is trained behind a network that stays."""
+
+import dataclasses
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import tiny_training
+from laws import close, numbers, same_bits
+from tiny_model import PLUS, camera, cloud, wobbled
+
+from spnr_jax import cameras, presets, training
+from spnr_jax.config import LossConfig, OptimizerConfig, TrainConfig
+from spnr_jax.model import Model, at_quality
+from spnr_jax.nn.refiner import FOLD, LEVELS, ODDS, Refiner
+from spnr_jax.renderer import Renderer
+from spnr_jax.resizing import bilinear, folded, mean_of_squares, unfolded
+from spnr_jax.supersampling import averaged, rays_per_side
+
+SQUARE = FOLD * 2 ** (LEVELS - 1)  # pixels that the coarsest level takes as one
+REFINED = dataclasses.replace(PLUS, refiner_width=4, num_features=3 + PLUS.field_width)
+REFINER = Refiner(width=4)
+SEEN = 6 + REFINER.num_told
+FAR = 5.0
+
+
+def picture(height=24, width=16, seed=0):
+    """What rays gave: an object with rims of every opacity in the middle, nothing around it."""
+    acc = jnp.clip(2 * numbers(seed, 2, height, width), 0, 1)
+    acc = acc.at[..., :4].set(0).at[..., -2:].set(0)
+    image = 1 - acc[..., None] * numbers(seed + 1, 2, height, width, 3, low=0.0)
+    hidden = numbers(seed + 2, 2, height, width, 3)
+    depth = acc * numbers(seed + 3, 2, height, width, low=2.0, high=4.0) + (1 - acc) * FAR
+    return image, hidden, depth, acc, jnp.full(acc.shape, FAR), jnp.full(2, 3.0)
+
+
+@pytest.fixture(scope="module")
+def fresh():
+    return REFINER.init(jax.random.key(0), *picture())
+
+
+@pytest.fixture(scope="module")
+def variables(fresh):
+    return wobbled(fresh, 5)
+
+
+def refined(variables, *inputs):
+    return REFINER.apply(variables, *inputs)
+
+
+class Changes(Refiner):
+    @nn.compact
+    def __call__(self, seen, shrink):
+        return self.change(seen, shrink)
+
+
+def changes(variables, seen, shrink=1):
+    return Changes(width=4).apply(variables, seen, shrink)
+
+
+class TestPicture:
+    def test_a_fresh_one_changes_nothing_to_speak_of(self, fresh):
+        image, _, depth, acc, *_ = inputs = picture()
+        solid = np.asarray((acc == 0) | (acc > 0.05))  # the colour of what is hardly there is not told
+        new_image, new_depth, new_acc = refined(fresh, *inputs)
+        close(new_acc, acc, atol=ODDS)
+        close(new_image[solid], image[solid], atol=2 * ODDS)
+        close(new_depth[solid], depth[solid], atol=3 * ODDS)
+
+    def test_nothing_is_drawn_where_no_point_is_near(self, variables):
+        *_, acc, _, _ = inputs = picture()
+        image, depth, opacity = refined(variables, *inputs)
+        nothing = np.asarray(acc == 0)
+        assert 0 < nothing.mean() < 1
+        for values, empty in ((image, 1), (opacity, 0), (depth, FAR)):
+            assert (np.asarray(values)[nothing] == empty).all()
+        assert np.abs(np.asarray(opacity - acc)[~nothing]).max() > 0.05, "these weights change what is there"
+
+    def test_the_object_stays_where_it_was(self, variables):
+        """Depth is a mixture of the object's own and the far side, by the new opacity."""
+        image, hidden, depth, acc, far, eye = picture()
+        acc = jnp.where(acc > 0, jnp.maximum(acc, 0.01), 0)
+        depth = jnp.where(acc > 0, acc * 2.5 + (1 - acc) * FAR, FAR)
+        _, new_depth, new_acc = refined(variables, image, hidden, depth, acc, far, eye)
+        close(new_depth, new_acc * 2.5 + (1 - new_acc) * FAR, atol=1e-4)
+
+    def test_pixels_around_are_seen(self, variables):
+        image, hidden, depth, acc, far, eye = picture()
+        elsewhere = acc.at[:, 8:10, 8:10].set(1.0)
+        _, _, before = refined(variables, image, hidden, depth, acc, far, eye)
+        _, _, after = refined(variables, image, hidden, depth, elsewhere, far, eye)
+        changed = np.asarray(before != after)
+        assert changed[:, 8:10, 8:10].any()
+        assert changed[:, 12:, 8:].any()
+
+    @pytest.mark.parametrize("value", [0.0, 1e-30, 1e-8, 1.0])
+    def test_extremes_of_opacity_have_finite_pictures_and_gradients(self, variables, value):
+        acc = jnp.full((1, 8, 8), value)
+        image, hidden = jnp.full((1, 8, 8, 3), 1 - value), jnp.full((1, 8, 8, 3), 1e4)
+        depth = acc * 2 + (1 - acc) * FAR
+
+        def total(variables, *inputs):
+            return sum(jnp.sum(x) for x in refined(variables, *inputs, jnp.full((1, 8, 8), FAR), jnp.full(1, 3.0)))
+
+        inputs = (image, hidden, depth, acc)
+        for part in jax.tree.leaves(jax.grad(total, argnums=(0, 1, 2, 3, 4))(variables, *inputs)):
+            assert jnp.isfinite(part).all()
+        assert jnp.isfinite(total(variables, *inputs))
+
+
+class TestSize:
+    def test_a_shift_by_a_square_shifts_the_changes(self, variables):
+        seen = numbers(0, 1, 24 * SQUARE, 24 * SQUARE, SEEN)  # the middle sees no border
+        moved = changes(variables, jnp.roll(seen, (SQUARE, -SQUARE), (1, 2)))[:, 96:104, 96:104]
+        close(moved, changes(variables, seen)[:, 96 - SQUARE : 104 - SQUARE, 96 + SQUARE : 104 + SQUARE], atol=1e-4)
+        assert np.abs(np.asarray(moved)).max() > 0.05
+
+    def test_what_lies_beyond_the_picture_is_empty(self, variables):
+        seen = numbers(0, 1, 11, 13, SEEN)
+        small = changes(variables, seen, 1)
+        assert small.shape == (1, 11, 13, 4)
+        wide = jnp.pad(seen, ((0, 0), (0, 16 - 11), (0, 16 - 13), (0, 0)))
+        close(small, changes(variables, wide, 1)[:, :11, :13], atol=1e-5)
+
+    @pytest.mark.parametrize("shrink", [2, 3])
+    def test_a_larger_picture_is_changed_as_the_smaller_one(self, variables, shrink):
+        seen = numbers(0, 1, 16, 16, SEEN)
+        large = jnp.repeat(jnp.repeat(seen, shrink, 1), shrink, 2)
+        expected = bilinear(changes(variables, seen, 1), 16 * shrink, 16 * shrink)
+        close(changes(variables, large, shrink), expected, atol=1e-5)
+
+    def test_folding_puts_the_pixels_of_a_square_side_by_side(self):
+        x = numbers(0, 2, 4, 6, 3)
+        y = folded(x, 2)
+        assert y.shape == (2, 2, 3, 12)
+        same_bits(y[:, 1, 2], jnp.concatenate([x[:, 2, 4], x[:, 2, 5], x[:, 3, 4], x[:, 3, 5]], axis=-1))
+        same_bits(unfolded(y, 2), x)
+        close(mean_of_squares(x, 2), jnp.mean(y.reshape(2, 2, 3, 4, 3), axis=3))
+
+
+@pytest.fixture(scope="module")
+def network():
+    return wobbled(jax.jit(Renderer(REFINED).init)(jax.random.key(0), cloud(), camera()), 4)
+
+
+@pytest.fixture(scope="module")
+def scene(network):
+    return training.jitted_encode(network, cloud(), config=REFINED)
+
+
+def without(network):
+    return {"params": {name: part for name, part in network["params"].items() if name != "refiner"}}
+
+
+class TestRendering:
+    def test_is_the_rendering_of_the_nearest_points_looked_over(self, network, scene):
+        plain = training.jitted_render(without(network), scene, camera(), config=PLUS)
+        whole = training.jitted_render(network, scene, camera(), config=REFINED)
+        close(whole.image_lr, plain.image, atol=1e-6)
+        assert ((np.asarray(whole.acc) > 0) == (np.asarray(plain.acc) > 0)).all()
+        assert np.abs(np.asarray(whole.acc - plain.acc)).max() > 0.05
+        assert np.abs(np.asarray(whole.image - plain.image)).max() > 0.05
+
+    @pytest.mark.parametrize("ray_chunk", [7, 300])
+    def test_the_chunk_does_not_matter(self, network, scene, ray_chunk):
+        whole = training.jitted_render(network, scene, camera(), config=REFINED)
+        chunked = training.jitted_render(network, scene, camera(), config=REFINED, ray_chunk=ray_chunk)
+        close(chunked, whole, atol=1e-5)
+
+    def test_a_view_does_not_know_what_is_beside_it(self, network, scene):
+        whole = training.jitted_render(network, scene, camera(), config=REFINED)
+        second = jax.tree.map(lambda x: x[1:], scene), jax.tree.map(lambda x: x[1:, :1], camera())
+        alone = training.jitted_render(network, *second, config=REFINED)
+        close(alone, jax.tree.map(lambda x: x[1:, :1], whole), atol=1e-5)
+
+    def test_a_smaller_picture_is_looked_over_at_the_size_of_the_training(self, network, scene):
+        assert rays_per_side(REFINED, 4) == 2
+        several = training.jitted_render(network, scene, camera(4), config=REFINED, rays_per_side=2)
+        close(several, averaged(training.jitted_render(network, scene, camera(8), config=REFINED), 2), atol=1e-5)
+
+    def test_draft_does_without(self):
+        assert at_quality(REFINED, "draft", 1).refiner_width == 0
+        assert at_quality(REFINED, "balanced", 1).refiner_width == at_quality(REFINED, "best", 1).refiner_width == 4
+
+    @pytest.mark.parametrize("quality", ["draft", "balanced", "best", "trained"])
+    def test_every_quality_renders(self, network, quality):
+        model = Model(config=REFINED, variables=network)
+        one = jax.tree.map(lambda x: x[0], cloud())
+        volume = model.encode(one)
+        rendering = model.render(volume, model.camera(volume, resolution=17), quality)
+        assert rendering.image.shape == (17, 17, 3)
+        assert np.isfinite(rendering.image).all()
+        assert (np.asarray(rendering.acc) > 0).any()
+
+
+ONLY = TrainConfig(
+    model=dataclasses.replace(REFINED, render_resolution=24, image_resolution=24, surface_cells=6),
+    loss=LossConfig(l1_weight=1.0, mse_weight=4.0, adversarial_weight=0.0, opacity_weight=2.0),
+    optimizer=OptimizerConfig(lr_generator=1e-2, warmup_steps=0, only=("refiner",)),
+    num_steps=30,
+    batch_objects=2,
+    min_points=8,
+    max_points=32,
+    crop=16,
+)
+
+
+class TestTraining:
+    def test_the_other_parts_stay_as_they_began(self):
+        batch, state = tiny_training.batch(), training.jitted_create_state(ONLY)
+        begun = jax.device_get(state)
+        known = [x.shape for x in jax.tree.leaves(state.generator_optimizer[0].mu)]
+        assert known == [x.shape for x in jax.tree.leaves(begun.generator["refiner"])], "Adam knows what is trained"
+        rows = []
+        for _ in range(30):
+            state, metrics = training.jitted_train_step(state, batch, config=ONLY, adversarial=False)
+            rows.append(float(metrics["loss"]))
+        for trained in (state.generator, state.averaged):
+            still = {name: part for name, part in trained.items() if name != "refiner"}
+            same_bits(still, {name: begun.generator[name] for name in still})
+        assert np.abs(state.generator["refiner"]["out"]["kernel"]).max() > 0, "it began at zero"
+        assert np.mean(rows[-5:]) < np.mean(rows[:5])
+
+    def test_begins_behind_a_network_without_it(self):
+        plain = dataclasses.replace(
+            ONLY, model=dataclasses.replace(ONLY.model, refiner_width=0, num_features=3), optimizer=OptimizerConfig()
+        )
+        other = training.averaged_variables(training.jitted_create_state(plain, seed=7))
+        state = training.begun_with(training.jitted_create_state(ONLY), other)
+        same_bits({name: state.generator[name] for name in other["params"]}, other["params"])
+        same_bits(state.averaged, state.generator)
+        with pytest.raises(ValueError, match="of another network: shape of params/refiner/.*, needed none"):
+            training.begun_with(training.jitted_create_state(plain), training.averaged_variables(state))
+
+    def test_a_part_that_is_not_there_is_named(self):
+        config = dataclasses.replace(ONLY, optimizer=OptimizerConfig(only=("refiner", "head")))
+        with pytest.raises(ValueError, match="optimizer.only names head; the parts of this network: .*unet"):
+            training.create_state(config)
+
+    def test_a_crop_is_a_square_of_picture_condition_and_rays(self):
+        batch, firsts = tiny_training.batch(), set()
+        made, whole = jax.jit(training.cropped, static_argnums=2), cameras.camera_rays(batch.camera).directions
+        for seed in range(6):
+            crop = made(jax.random.key(seed), batch, 10)
+            rays = cameras.camera_rays(crop.camera).directions
+            assert crop.image.shape == (*batch.image.shape[:2], 10, 10, 3)
+            distance = np.abs(np.asarray(whole[0, 0]) - np.asarray(rays[0, 0, 0, 0])).sum(-1)
+            row, column = np.unravel_index(distance.argmin(), distance.shape)
+            firsts.add((row, column))
+            inside = np.s_[:, :, row : row + 10, column : column + 10]
+            close(rays, whole[inside], atol=1e-6)
+            for name in ("image", "alpha", "condition", "condition_mask"):
+                same_bits(getattr(crop, name), getattr(batch, name)[inside])
+            same_bits(crop.cloud, batch.cloud)
+        assert len(firsts) > 3, "another place for another key"
+
+    def test_a_crop_as_large_as_the_view_is_the_view(self):
+        batch = tiny_training.batch()
+        same_bits(training.cropped(jax.random.key(0), batch, batch.image.shape[2]), batch)
+
+
+class TestConfig:
+    def test_the_preset_is_that_of_the_weights_with_a_refiner(self):
+        refined, small = presets.plus_refined(), presets.of_any_density(presets.plus_small())
+        assert refined.model.refiner_width > 0
+        assert dataclasses.replace(refined.model, refiner_width=0, num_features=3) == small.model
+
+    @pytest.mark.parametrize(
+        ("changes", "message"),
+        [
+            ({"crop": 25}, "crop 25 needs .* at most its image_resolution \\(24\\)"),
+            ({"crop": -1}, "crop -1 needs"),
+            ({"pixel_stride": 2, "crop": 0}, "pixel_stride 2 needs a network whose pixels do not depend"),
+        ],
+    )
+    def test_what_does_not_go_together_is_said(self, changes, message):
+        with pytest.raises(ValueError, match=message):
+            dataclasses.replace(ONLY, **changes)
+
+    def test_a_lattice_and_a_crop_exclude_each_other(self):
+        plain = dataclasses.replace(ONLY.model, refiner_width=0, num_features=3)
+        with pytest.raises(ValueError, match="pixel_stride 2 and crop 16: use one"):
+            dataclasses.replace(ONLY, model=plain, pixel_stride=2)
+
+    def test_it_needs_the_nearest_points(self):
+        with pytest.raises(ValueError, match="a refiner looks over pictures rendered near the points"):
+            dataclasses.replace(REFINED, num_neighbors=0, color="free", num_features=5, refiner_width=4)
+        with pytest.raises(ValueError, match="num_features must be 11, RGB and the hidden layer, .* got 3"):
+            dataclasses.replace(REFINED, num_features=3)
+        with pytest.raises(ValueError, match="num_features must be 3, RGB, .* got 4"):
+            dataclasses.replace(PLUS, num_features=4)
