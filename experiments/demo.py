@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import tyro
 
@@ -91,11 +92,11 @@ class Seconds:
         self._path = path
         self.values: dict[str, float] = json.loads(path.read_text()) if path.is_file() else {}
 
-    def measure(self, part: str, work: Callable[[], object]) -> None:
-        """Does the work and adds its time; a part that had nothing left to do (under 10 s) adds nothing."""
+    def measure(self, part: str, work: Callable[[], Any]) -> Any:
+        """Does the work, adds its time and returns its result; one that had nothing left to do (10 s) adds nothing."""
         start = time.monotonic()
         try:
-            work()
+            return work()
         finally:
             spent = time.monotonic() - start
             if part not in self.values or spent > 10:

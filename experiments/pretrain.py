@@ -3,11 +3,11 @@
     python -m experiments.pretrain --meshes DIR --test-list FILE [--network tiny] [--out runs/pretrain]
 
 Two data sets lie below OUT: `procedural`, objects of all classes, and `meshes`, those that the list does not hold out,
-each with variants of colour and shape.  `data` joins them by links.  `small` is trained on it in four runs of which
+each with variants of colour and shape.  `data` joins them by links.  `small` is trained on it in three runs of which
 each begins where the one before ended: OUT/small/run1 with the points of the preset, the others with 128 to 2048 an
-object; the last trains its refiner alone.  `tiny` is trained in one.  The held-out meshes score it
-(OUT/small/report.html), and OUT/small.npz is the file that the package holds.  What is there already is reused:
-finished objects, trained steps.
+object; then its refiner is, on what the network shows (OUT/small/pictures).  `tiny` is trained in one run.  The
+held-out meshes score it (OUT/small/report.html), and OUT/small.npz is the file that the package holds.  What is there
+already is reused: finished objects, trained steps, pictures.
 """
 
 import dataclasses
@@ -24,6 +24,7 @@ import tyro
 from data_gen.generate import generate
 from data_gen.plan import GenerateConfig
 from data_gen.records import SPLITS
+from experiments import refinement
 from experiments.demo import Seconds
 from spnr_jax import cli, data, evaluation, presets, trainer, weights
 from spnr_jax.config import TrainConfig
@@ -76,6 +77,9 @@ def main(options: Pretrain) -> None:
         trained = weights.read_trained(run)
     file = options.out / f"{options.network}.npz"
     assert trained is not None, "there is at least one run"
+    if options.network == "small":
+        refine = partial(refinement.refined, trained, dataset, out / "pictures", options.steps)
+        trained = seconds.measure("refine", refine)
     weights.write_weights(file, trained)
     outcome = evaluation.evaluate(file, dataset, "test" if dataset.splits["test"] else "val")
     write_results(out, outcome, dataset.settings, trainer.read_rows(run), seconds.values)
@@ -93,7 +97,6 @@ def recipe(options: Pretrain) -> list[TrainConfig]:
             first,
             later(first, steps=9000, seed=first.seed + 1, lr=1.5e-3),
             later(first, steps=6000, seed=first.seed + 2, lr=1e-3),
-            refining(presets.plus_refined()),
         ]
     return runs if options.steps is None else [dataclasses.replace(run, num_steps=options.steps) for run in runs]
 
@@ -106,12 +109,6 @@ def later(config: TrainConfig, steps: int, seed: int, lr: float) -> TrainConfig:
         num_steps=steps,
         seed=seed,
     )
-
-
-def refining(config: TrainConfig) -> TrainConfig:
-    """The config of a run that trains the refiner alone."""
-    optimizer = dataclasses.replace(config.optimizer, lr_generator=2e-3, only=("refiner",))
-    return dataclasses.replace(config, optimizer=optimizer)
 
 
 def data_sets(options: Pretrain, resolution: int) -> list[GenerateConfig]:

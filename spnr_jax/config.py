@@ -80,8 +80,6 @@ class OptimizerConfig:
     """Adam, or rectified Adam for the generator."""
     decay: Literal["cosine", "exponential"] = added("cosine")
     """How the generator's learning rate falls after the warm-up."""
-    only: tuple[str, ...] = added(())
-    """Parts of the generator that are trained, as `refiner`; the others stay as they began.  None named: all."""
 
     def __post_init__(self) -> None:
         for name in ("lr_generator", "lr_discriminator"):

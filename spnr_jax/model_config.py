@@ -139,7 +139,7 @@ class ModelConfig:
             f"base_width {self.base_width} must be a positive multiple of num_groups {self.num_groups}",
         )
         if self.num_neighbors:
-            features, names = (3 + self.field_width, "RGB and the hidden layer") if self.refiner_width else (3, "RGB")
+            features, names = (16, "RGB and what rays tell the refiner") if self.refiner_width else (3, "RGB")
             require(
                 self.num_features == features,
                 f"num_features must be {features}, {names}, for a network that sees the nearest points, got "
@@ -169,6 +169,10 @@ class ModelConfig:
         require(
             self.refiner_width == 0 or self.num_neighbors > 0,
             "a refiner looks over pictures rendered near the points; use num_neighbors 6, or refiner_width 0",
+        )
+        require(
+            self.refiner_width == 0 or self.sampling.num_fine == 0,
+            "a refiner looks over coarse samples; use num_fine 0",
         )
         require(
             self.num_neighbors == 0 or (not self.upsamples and self.sampling.reach == 1),

@@ -137,16 +137,20 @@ def plus_refined() -> TrainConfig:
 
     Without --init, train `plus_small` first and begin with its run: a lattice of rays is quicker to learn from.
     """
-    small = of_any_density(plus_small())
-    assert isinstance(small.model, ModelConfig)
+    return with_refiner(of_any_density(plus_small()))
+
+
+def with_refiner(config: TrainConfig) -> TrainConfig:
+    """The config of a network near points with a refiner, which sees crops."""
+    assert isinstance(config.model, ModelConfig)
     return dataclasses.replace(
-        small,
+        config,
         preset="plus_refined",
-        model=dataclasses.replace(small.model, refiner_width=32, num_features=3 + small.model.field_width),
-        loss=dataclasses.replace(small.loss, mse_weight=4.0, opacity_weight=2.0),
-        num_steps=9000,
+        model=dataclasses.replace(config.model, refiner_width=32, num_features=16),
+        loss=dataclasses.replace(config.loss, mse_weight=4.0, opacity_weight=2.0),
+        num_steps=7000,
         pixel_stride=1,
-        crop=small.model.image_resolution // 2,
+        crop=config.model.image_resolution // 2,
     )
 
 

@@ -17,13 +17,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from spnr_jax import cameras, compositing, empty_space, sampling, surface, voxels
-from spnr_jax.colors import LEAST_OPACITY
 from spnr_jax.distributed import divide_pixels, on_own_rays, undivided
 from spnr_jax.empty_space import Path
 from spnr_jax.model_config import ModelConfig, surface_grid
 from spnr_jax.nn.field import RadianceField
 from spnr_jax.nn.pointnet import PointNet
-from spnr_jax.nn.refiner import Refiner
+from spnr_jax.nn.refiner import ODDS, Refiner
 from spnr_jax.nn.surface_field import SurfaceField
 from spnr_jax.nn.unet3d import UNet3D
 from spnr_jax.nn.upsampler import Upsampler
@@ -47,7 +46,9 @@ class Renderer(nn.Module):
         self.unet = UNet3D(c.volume_resolution, c.base_width, c.num_stages, c.num_groups, c.bf16, c.skip)
         self.field: RadianceField | SurfaceField
         if c.num_neighbors:
-            self.field = SurfaceField(c.field_width, c.direction_frequencies, c.sees_direction, c.color == "lit")
+            self.field = SurfaceField(
+                c.field_width, c.direction_frequencies, c.sees_direction, c.color == "lit", tells=c.refiner_width > 0
+            )
         else:
             self.field = RadianceField(c.field_width, c.num_features, c.direction_frequencies, c.sees_direction)
         if c.upsamples:
@@ -118,9 +119,16 @@ class Renderer(nn.Module):
         """Image, depth and opacity after the refiner, from what was rendered (objects * views, height, width, ...)."""
         rays = cameras.view_rays(camera)
         _, far, _ = cameras.intersect_box(rays.origins, rays.directions)
-        eye = length(jnp.asarray(camera.cam_to_world)[..., 3]).reshape(-1)
+        far = far.reshape(depth.shape)
         shrink = max(round(max(camera.height, camera.width) / self.config.image_resolution), 1)
-        return self.refiner(features[..., :3], features[..., 3:], depth, acc, far.reshape(depth.shape), eye, shrink)
+        image, refined = self.refiner(self.seen(camera, features, depth, acc), shrink)
+        distance = (depth - far) / jnp.maximum(acc, ODDS)  # of the object alone, from the far side
+        return image, far + refined * distance, refined
+
+    def seen(self, camera: Camera, features, depth, acc):
+        """What the refiner sees of pictures (objects * views, height, width, ...)."""
+        eye = length(jnp.asarray(camera.cam_to_world)[..., 3]).reshape(-1, 1, 1)
+        return jnp.concatenate([features, (acc * (depth - eye))[..., None], acc[..., None]], axis=-1)
 
     def render_rays(
         self, scene: Scene, rays: Rays, key: Key | None = None
@@ -206,6 +214,9 @@ class Renderer(nn.Module):
         coarse_key, fine_key = (None, None) if key is None else sampling.split(key)
         distances, edges = sampling.stratified(coarse_key, near, far, counts.num_coarse)
         density, emitted = shade(distances)
+        if self.config.refiner_width:
+            *emitted, least = emitted
+            least = jnp.min(least, axis=-2)
         weights, _ = compositing.volume_weights(density, compositing.interval_lengths(distances, far))
         passes = [(weights, emitted)]
         if counts.num_fine:
@@ -220,10 +231,11 @@ class Renderer(nn.Module):
         sums = [jax.tree.map(partial(compositing.composite, w), emitted) for w, emitted in passes]
         emitted = jax.tree.map(lambda *parts: reduce(operator.add, parts), *sums)
         acc = jnp.sum(weights, axis=-1)
-        features = self.field.finish(emitted, acc, view)
         if self.config.refiner_width:
-            hidden = emitted[0] / jnp.maximum(acc, LEAST_OPACITY)[..., None]
-            features = jnp.concatenate([features, hidden], axis=-1)
+            *emitted, means = emitted
+        features = self.field.finish(tuple(emitted), acc, view)
+        if self.config.refiner_width:
+            features = jnp.concatenate([features, means, least], axis=-1)
         return features, weights, distances
 
     def __call__(self, cloud: PointCloud, camera: Camera, key: Key | None = None, train: bool = False) -> Rendering:

@@ -135,21 +135,12 @@ def create_state(config: TrainConfig, seed: int | Array | None = None) -> TrainS
         key=key,
         generator=generator,
         batch_stats=batch_stats,
-        generator_optimizer=generator_adam.init(parted(config, generator)[0]),
+        generator_optimizer=generator_adam.init(generator),
         averaged=jax.tree.map(jnp.copy, generator),  # a donated state must not hold one buffer twice
         averaged_stats=jax.tree.map(jnp.copy, batch_stats),
         discriminator=discriminator,
         discriminator_optimizer=None if discriminator is None else discriminator_adam.init(discriminator),
     )
-
-
-def parted(config: TrainConfig, generator: dict) -> tuple[dict, dict]:
-    """The parts of the generator that are trained, and those that stay as they are."""
-    only = config.optimizer.only or tuple(generator)
-    if unknown := sorted(set(only) - set(generator)):
-        raise ValueError(f"optimizer.only names {unknown[0]}; the parts of this network: {', '.join(generator)}")
-    trained = {name: part for name, part in generator.items() if name in only}
-    return trained, {name: part for name, part in generator.items() if name not in only}
 
 
 def begun_with(state: TrainState, variables: dict) -> TrainState:
@@ -285,12 +276,12 @@ def train_step(
         batch = cropped(crop_key, batch, config.crop)
     module, reference = network(config.model), jnp.asarray(batch.image)
     generator_adam, discriminator_adam = optimizers(config)
-    trained, still = parted(config, state.generator)
-    how = (None, False) if still else (key, True)  # what is trained behind other parts learns from what they will show
 
-    def forward(trained):
-        variables = {"params": trained | still, "batch_stats": state.batch_stats}
-        rendering, updated = module.apply(variables, batch.cloud, batch.camera, *how, mutable=["batch_stats", "losses"])
+    def forward(params):
+        variables = {"params": params, "batch_stats": state.batch_stats}
+        rendering, updated = module.apply(
+            variables, batch.cloud, batch.camera, key, train=True, mutable=["batch_stats", "losses"]
+        )
         sown = {name: value for name, (value,) in updated.get("losses", {}).items()}
         if config.loss.opacity_weight:
             opacity = losses.area_downsample(jnp.asarray(batch.alpha)[..., None], rendering.acc.shape[-1])[..., 0]
@@ -298,7 +289,7 @@ def train_step(
         seen = rendering.acc > 0 if config.loss.masked else None
         return (rendering.image, rendering.image_lr, sown), (updated.get("batch_stats", {}), seen)
 
-    (image, image_lr, sown), pull_back, (batch_stats, seen) = jax.vjp(forward, trained, has_aux=True)
+    (image, image_lr, sown), pull_back, (batch_stats, seen) = jax.vjp(forward, state.generator, has_aux=True)
     metrics = {"psnr": jnp.mean(psnr(image, reference)), "l1": losses.l1(image, reference)}
     discriminator, discriminator_optimizer = state.discriminator, state.discriminator_optimizer
     if adversarial:
@@ -323,23 +314,23 @@ def train_step(
     loss, cotangents = jax.value_and_grad(whole_loss, argnums=(0, 1, 2))(image, image_lr, sown)
     (gradient,) = pull_back(cotangents)
     update, generator_optimizer = generator_adam.update(gradient, state.generator_optimizer)
-    trained = optax.apply_updates(trained, update)
+    generator = optax.apply_updates(state.generator, update)
     metrics |= {"loss": loss, "gradient_norm": optax.tree.norm(gradient)} | sown
 
     # early weights are far from the last ones: average over a growing share of the past
     decay = jnp.minimum(config.optimizer.ema_decay, (1.0 + state.step) / (10.0 + state.step))
     averaged, averaged_stats = jax.tree.map(
         lambda old, new: decay * old + (1 - decay) * new,
-        ({name: state.averaged[name] for name in trained}, state.averaged_stats),
-        (trained, batch_stats),
+        (state.averaged, state.averaged_stats),
+        (generator, batch_stats),
     )
     state = TrainState(
         step=state.step + 1,
         key=state.key,
-        generator=trained | still,
+        generator=generator,
         batch_stats=batch_stats,
         generator_optimizer=generator_optimizer,
-        averaged=state.averaged | averaged,
+        averaged=averaged,
         averaged_stats=averaged_stats,
         discriminator=discriminator,
         discriminator_optimizer=discriminator_optimizer,

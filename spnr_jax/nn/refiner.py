@@ -1,13 +1,14 @@
 """CNN that looks over a rendered picture: what no ray can know alone, such as that an outline goes on straight.
 
-A small U-Net over what the rays of a picture gave: colour, opacity, depth, and what the hidden layer of the field told
-of each.  It says by how much the log odds of the opacity and the colour of the object change at each pixel.  It works
-at half the picture's size, and of pictures larger than those of its training on their mean over squares of pixels:
-there it sees points as far apart as it has learnt, and its changes, which are smooth, are laid on the large picture.
-Where no point is near, nothing is drawn.
+A small U-Net over what the rays of a picture gave: colour, opacity, depth, and what they tell of the surface that they
+met or passed (`surface_field.told`).  It says by how much the log odds of the opacity and the colour of the object
+change at each pixel.  It works at half the picture's size, and of pictures larger than those of its training on their
+mean over squares of pixels: there it sees points as far apart as it has learnt, and its changes, which are smooth, are
+laid on the large picture.  Where no point is near, nothing is drawn.
 """
 
 import flax.linen as nn
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -23,49 +24,47 @@ ODDS = 1e-3  # keeps the odds of what is clear or solid finite
 
 
 class Refiner(nn.Module):
-    """A picture of an object on white, its depth and opacity, with changes that see the pixels around."""
+    """Colour and opacity of a picture of an object on white, with changes that see the pixels around."""
 
     width: int
-    num_told: int = 8
     bf16: bool = False
 
     @nn.compact
     def __call__(
-        self,
-        image: Float[Array, "batch height width 3"],
-        hidden: Float[Array, "batch height width hidden"],
-        depth: Float[Array, "batch height width"],
-        acc: Float[Array, "batch height width"],
-        far: Float[Array, "batch height width"],
-        eye: Float[Array, " batch"],
-        shrink: int = 1,
-    ) -> tuple[
-        Float[Array, "batch height width 3"], Float[Array, "batch height width"], Float[Array, "batch height width"]
-    ]:
-        """Image, depth and opacity; `far` is where rays end, `eye` the distance of the camera from the box's centre.
+        self, seen: Float[Array, "batch height width features"], shrink: int = 1
+    ) -> tuple[Float[Array, "batch height width 3"], Float[Array, "batch height width"]]:
+        """Image and opacity; the changes are those of a picture that is smaller by `shrink`.
 
-        The changes are those of a picture that is smaller by `shrink`.
+        Seen of each pixel: RGB on white, what its ray told (only zeros near no point), how far behind the middle of the
+        box things are, times their opacity, and that opacity.
         """
-        told = nn.Dense(self.num_told, name="told")(hidden)
-        opacity, drawn = acc[..., None], (acc > 0).astype(acc.dtype)[..., None]
-        weighted = image - (1 - opacity) * WHITE
-        distance = far + (depth - far) / jnp.maximum(acc, ODDS)  # of the object alone
-        depth = opacity * (distance - eye[:, None, None])[..., None]
-        seen = jnp.concatenate([weighted, opacity, depth, drawn, drawn * told], axis=-1)
-        change = self.change(seen, shrink)
+        image, told, opacity = seen[..., :3], seen[..., 3:-2], seen[..., -1:]
+        drawn = jnp.any(told != 0, axis=-1, keepdims=True).astype(seen.dtype)
+        change = self.change(drawn * self.standardised(seen), drawn, shrink)
         odds = jnp.log(opacity + ODDS) - jnp.log1p(ODDS - opacity)
-        opacity = drawn * nn.sigmoid(odds + change[..., 3:])
-        color = weighted / jnp.maximum(acc, LEAST)[..., None] + change[..., :3]
-        image, acc = opacity * color + (1 - opacity) * WHITE, opacity[..., 0]
-        return image, far + acc * (distance - far), acc
+        refined = drawn * nn.sigmoid(odds + change[..., 3:])
+        color = (image - (1 - opacity) * WHITE) / jnp.maximum(opacity, LEAST) + change[..., :3]
+        return refined * color + (1 - refined) * WHITE, refined[..., 0]
+
+    def standardised(self, seen: Float[Array, "*batch features"]) -> Float[Array, "*batch features"]:
+        """Features less their mean, over their deviation, which training measures before it begins."""
+        mean = self.param("mean", nn.initializers.zeros, seen.shape[-1:])
+        deviation = self.param("deviation", nn.initializers.ones, seen.shape[-1:])
+        mean, deviation = jax.lax.stop_gradient((mean, deviation))
+        return (seen - per_feature(mean, seen)) / per_feature(deviation, seen)
 
     def change(
-        self, seen: Float[Array, "batch height width features"], shrink: int
+        self,
+        seen: Float[Array, "batch height width features"],
+        drawn: Float[Array, "batch height width 1"],
+        shrink: int,
     ) -> Float[Array, "batch height width 4"]:
         """Changes of colour and log odds of opacity; pixels beyond the picture are empty."""
         height, width = seen.shape[1:3]
         square = shrink * FOLD * 2 ** (LEVELS - 1)
-        padded = jnp.pad(seen, ((0, 0), (0, -height % square), (0, -width % square), (0, 0)))
+        padded = jnp.pad(
+            jnp.concatenate([seen, drawn], axis=-1), ((0, 0), (0, -height % square), (0, -width % square), (0, 0))
+        )
         x = folded(mean_of_squares(padded, shrink), FOLD)
         skips = []
         for level in range(LEVELS):

@@ -29,6 +29,20 @@ SHARPNESS = 4.0  # the fog sets in within about half a spacing
 SPACING_SCALE = 10.0  # brings the spacing of a thousand points to the order of 1
 
 
+NOWHERE = 10.0  # spacings, of what is not there
+
+
+def told(surface: SurfaceSample, facing: Float[Array, " samples"]) -> tuple[Array, Array]:
+    """What samples tell the refiner: (samples, 9), of which a ray's mean counts, and (samples, 4), of which the least.
+
+    The least are how near the ray passes points, their planes, their rim and the surface, large where there is none.
+    """
+    s = surface
+    means = (s.height, s.beside, s.nearest, s.miss, s.outside, s.flatness, s.narrowness, SPACING_SCALE * s.spacing)
+    least = [jnp.where(s.exists, length, NOWHERE) for length in (s.nearest, s.miss, s.outside, s.height)]
+    return jnp.stack([*means, facing], axis=-1), jnp.stack(least, axis=-1)
+
+
 class SurfaceField(nn.Module):
     """Density and colour of samples; `view` and `finish` are the parts that a ray needs once."""
 
@@ -36,6 +50,7 @@ class SurfaceField(nn.Module):
     direction_frequencies: int
     sees_direction: bool
     lit: bool
+    tells: bool = False
 
     def setup(self) -> None:
         """Layers: near -> shape -> density, shape + direction -> deep -> light."""
@@ -61,6 +76,7 @@ class SurfaceField(nn.Module):
         """Density, 0 where no point is near, and what the light depends on: the layer `shape`, the material's colours.
 
         With `lit` these are the diffuse colour and the specular colour at normal incidence, else there are none.
+        What is `told` comes last, if the field tells.
         """
         base, metallic = surface.base_color, surface.metallic[:, None]
         facing = -jnp.sum(surface.normal * directions, axis=-1)
@@ -75,9 +91,8 @@ class SurfaceField(nn.Module):
         steep = jnp.maximum(facing, 0) / jnp.where(surface.exists, surface.spacing, 1)
         behind = nn.sigmoid(shift - SHARPNESS * surface.height)
         density = jnp.where(surface.exists, STRENGTH * softplus(strength) * steep * behind, 0)
-        if not self.lit:
-            return density, (seen,)
-        return density, (seen, base * (1 - metallic), DIELECTRIC * (1 - metallic) + base * metallic)
+        colors = (base * (1 - metallic), DIELECTRIC * (1 - metallic) + base * metallic) if self.lit else ()
+        return density, (seen, *colors, *(told(surface, facing) if self.tells else ()))
 
     def finish(
         self, emitted: tuple[Array, ...], acc: Float[Array, "*rays"], view: Float[Array, "*rays hidden"]
