@@ -6,6 +6,7 @@ In the plot a bar is an interval, the large dot the mean, and small dots are the
 
 import io
 import json
+import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -29,6 +30,7 @@ METRICS = {  # head, decimals, what is better
 }
 COSTS = {"parameters": "Parameters", "ms_per_step": "ms per step", "ms_per_view": "ms per view"}
 BETTER, WORSE, OPEN, INK = "#2f9e44", "#d9480f", "#868e96", "#1d2330"
+LINE = 19  # letters of a title above a picture
 CAPTION = "Below a picture: PSNR in dB, and its\nhigh-frequency energy over the reference's."
 
 
@@ -243,7 +245,7 @@ def picture_rows(
             axes.set_xlabel(text, fontsize=7, labelpad=2)
         line[0].set_ylabel(name.replace("_", "_\n", 1), fontsize=7, rotation=0, ha="right", va="center")
     for axes, title in zip(panels[0], titles, strict=False):
-        axes.set_title(title, fontsize=8)
+        axes.set_title(textwrap.fill(title, LINE), fontsize=8)
     if caption:
         figure.supxlabel(caption, fontsize=8)
     return png(figure)

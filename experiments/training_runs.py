@@ -122,6 +122,7 @@ def train(variants: Sequence[Variant], seeds: Sequence[int], out: Path) -> dict[
             checkpoint.save(run, variant.start(config))
         trained = table1_training.train(config, variant.dataset, run)
         runs[variant.name].append(Run(trained=trained, ms_per_step=step_milliseconds(run)))
+        jax.clear_caches()  # two dozen trainings' programs are more pieces of memory than Linux maps for a process
     return runs
 
 

@@ -56,7 +56,7 @@ def test_every_weight_of_a_network_has_its_shape_by_name(trained):
     assert {name: x.shape for name, x in weights.variable_shapes(trained.config).items()} == found
 
 
-@pytest.mark.parametrize(("name", "preset"), [("small", "plus_small"), ("tiny", "plus_lite")])
+@pytest.mark.parametrize(("name", "preset"), [("small", "plus_refined"), ("tiny", "plus_lite")])
 def test_the_networks_in_the_package_have_the_weights_that_their_configs_describe(tmp_path, name, preset):
     copy = tmp_path / "copy.npz"  # the package's own files are not checked when they are read
     copy.write_bytes(weights.shipped(name).read_bytes())
@@ -68,7 +68,7 @@ def test_the_networks_in_the_package_have_the_weights_that_their_configs_describ
 
 def test_a_name_is_the_packages_network_and_a_path_is_not(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    assert weights.read_trained(None).config.preset == weights.read_trained("small").config.preset == "plus_small"
+    assert weights.read_trained(None).config.preset == weights.read_trained("small").config.preset == "plus_refined"
     with pytest.raises(ValueError, match="none.npz: no such file"):
         weights.read_trained("none.npz")
 
