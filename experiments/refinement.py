@@ -145,7 +145,7 @@ def crop(
 
 def error(refiner: Refiner, config: TrainConfig, weights: dict, seen: Array, reference: Array) -> Float[Array, ""]:
     """What training minimises on crops: errors of the picture, and of the opacity at two scales."""
-    image, opacity = refiner.apply({"params": weights}, seen.astype(jnp.float32))
+    image, opacity = refiner.bind({"params": weights})(seen.astype(jnp.float32))
     color, alpha = jnp.split(reference.astype(jnp.float32) / 255, [3], axis=-1)
     acc, true_image = opacity[..., None], color * alpha + (1 - alpha)
     squared = losses.mse(acc, alpha) + losses.mse(mean_of_squares(acc, 2), mean_of_squares(alpha, 2))
