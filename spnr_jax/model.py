@@ -77,13 +77,16 @@ class Model:
 
         `draft`, `balanced` and `best` look near the points alone, with a quarter, half and all of the samples of a ray,
         and `best` has several rays a pixel where pictures are smaller than those of the training (`supersampling.py`);
-        the network's refiner, if it has one, is left out of `draft`;
+        the network's refiner, if it has one, is left out of `draft`, and of smaller pictures by any other than `best`;
         `trained` renders as the network was trained.  Other networks than ours know one number of samples.
         """
         if self.config.upsamples and (camera.height % 2 or camera.width % 2):
             raise ValueError(f"this network doubles its pictures: {camera.width} x {camera.height} pixels must be even")
         config = at_quality(self.config, quality, volume.reach)
-        side = supersampling.rays_per_side(config, camera.width) if quality == "best" else 1
+        needed = supersampling.rays_per_side(config, camera.width)
+        side = needed if quality == "best" else 1
+        if side < needed:  # it has learnt to see pictures of the training's size
+            config = without_refiner(config)
         render = partial(_render, config=config, side=side)
         return by_all_devices(render, self._spread, volume.scene, volume.centre, volume.scale, camera)
 
@@ -146,10 +149,15 @@ def at_quality(config: NetworkConfig, quality: Quality, reach: int) -> NetworkCo
     counts = config.sampling
     reach = counts.reach if config.num_neighbors else reach
     samples = max(round(SAMPLES[quality] * (counts.num_coarse + counts.num_fine)), 1)
-    sampling = SamplingConfig(num_coarse=samples, num_fine=0, reach=reach)
-    if quality == "draft" and config.refiner_width:
-        return dataclasses.replace(config, sampling=sampling, refiner_width=0, num_features=3)
-    return dataclasses.replace(config, sampling=sampling)
+    config = dataclasses.replace(config, sampling=SamplingConfig(num_coarse=samples, num_fine=0, reach=reach))
+    return without_refiner(config) if quality == "draft" else config
+
+
+def without_refiner(config: NetworkConfig) -> NetworkConfig:
+    """The config that shows what the refiner would see."""
+    if not isinstance(config, ModelConfig) or not config.refiner_width:
+        return config
+    return dataclasses.replace(config, refiner_width=0, num_features=3)
 
 
 def reach_of(positions: np.ndarray, resolution: int, num_queries: int = 4096) -> int:

@@ -192,6 +192,17 @@ class TestRendering:
         assert at_quality(REFINED, "draft", 1).refiner_width == 0
         assert at_quality(REFINED, "balanced", 1).refiner_width == at_quality(REFINED, "best", 1).refiner_width == 4
 
+    @pytest.mark.parametrize("quality", ["balanced", "trained"])
+    def test_a_smaller_picture_of_one_ray_a_pixel_is_not_looked_over(self, network, quality):
+        """There points lie closer together, in pixels, than it has learnt to see them."""
+        one, refined = jax.tree.map(lambda x: x[0], cloud()), Model(config=REFINED, variables=network)
+        plain = Model(config=PLUS, variables=without(network))
+        for size, same in ((4, True), (8, False)):
+            volumes = refined.encode(one), plain.encode(one)
+            view = refined.camera(volumes[0], resolution=size)
+            pictures = refined.render(volumes[0], view, quality).image, plain.render(volumes[1], view, quality).image
+            assert np.allclose(*pictures, atol=1e-4) is same
+
     @pytest.mark.parametrize("quality", ["draft", "balanced", "best", "trained"])
     def test_every_quality_renders(self, network, quality):
         model = Model(config=REFINED, variables=network)
