@@ -14,7 +14,7 @@ from tiny_model import PLUS, camera, cloud, wobbled
 from spnr_jax import cameras, presets, training
 from spnr_jax.config import LossConfig, OptimizerConfig, TrainConfig
 from spnr_jax.model import Model, at_quality
-from spnr_jax.nn.refiner import FOLD, LEVELS, ODDS, Refiner
+from spnr_jax.nn.refiner import FOLD, LEAST, LEVELS, ODDS, Refiner
 from spnr_jax.renderer import Renderer
 from spnr_jax.resizing import bilinear, folded, mean_of_squares, unfolded
 from spnr_jax.supersampling import averaged, rays_per_side
@@ -76,7 +76,7 @@ class TestPicture:
         _, acc = REFINER.apply(variables, seen)
         assert np.asarray(acc)[np.asarray(seen[..., -1]) == 0].min() > 0
 
-    def test_features_are_taken_at_their_mean_and_deviation(self, variables):
+    def test_what_is_seen_is_standardised_and_changed_as_odds_and_colour(self, variables):
         seen, mean, deviation = picture(), jnp.arange(8.0) / 8, 1 + jnp.arange(8.0)
         near = jnp.any(seen[..., 3:6] != 0, axis=-1, keepdims=True)
         known = {"params": variables["params"] | {"mean": mean, "deviation": deviation}}
@@ -84,8 +84,10 @@ class TestPicture:
         scaled = near * (seen - mean[None, None, None]) / deviation[None, None, None]
         expected = changes(plain, jnp.concatenate([scaled, near], axis=-1))
         odds = jnp.log(seen[..., -1] + ODDS) - jnp.log1p(ODDS - seen[..., -1])
-        _, acc = REFINER.apply(known, seen)
+        image, acc = REFINER.apply(known, seen)
         close(acc, near[..., 0] * jax.nn.sigmoid(odds + expected[..., 3]), atol=1e-5)
+        color = (seen[..., :3] - 1 + seen[..., -1:]) / jnp.maximum(seen[..., -1:], LEAST) + expected[..., :3]
+        close(image, acc[..., None] * color + 1 - acc[..., None], atol=1e-4)
 
     def test_pixels_around_are_seen(self, variables):
         seen = picture()
