@@ -15,6 +15,7 @@ Material = Literal["base_color", "roughness", "metallic"]
 MATERIAL_CHANNELS = {"base_color": 3, "roughness": 1, "metallic": 1}
 CELLS = 1.0  # of the grid of nearest points along an axis, per square root of the number of points; 0.75 lost 0.1 dB
 MOST_CELLS = 96
+NUM_TOLD = 13  # numbers of a ray for the refiner (`nn/surface_field.told`)
 MOST_LAYERS = 32  # of a PointNet: a damaged file must not cost minutes of tracing
 
 
@@ -139,7 +140,7 @@ class ModelConfig:
             f"base_width {self.base_width} must be a positive multiple of num_groups {self.num_groups}",
         )
         if self.num_neighbors:
-            features, names = (16, "RGB and what rays tell the refiner") if self.refiner_width else (3, "RGB")
+            features, names = (3 + NUM_TOLD, "RGB and what rays tell the refiner") if self.refiner_width else (3, "RGB")
             require(
                 self.num_features == features,
                 f"num_features must be {features}, {names}, for a network that sees the nearest points, got "

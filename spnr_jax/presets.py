@@ -9,6 +9,7 @@ from typing import Literal
 
 from spnr_jax.config import LossConfig, OptimizerConfig, TrainConfig
 from spnr_jax.model_config import (
+    NUM_TOLD,
     ModelConfig,
     NPBGConfig,
     PointNeRFConfig,
@@ -146,7 +147,7 @@ def with_refiner(config: TrainConfig) -> TrainConfig:
     return dataclasses.replace(
         config,
         preset="plus_refined",
-        model=dataclasses.replace(config.model, refiner_width=32, num_features=16),
+        model=dataclasses.replace(config.model, refiner_width=32, num_features=3 + NUM_TOLD),
         loss=dataclasses.replace(config.loss, mse_weight=4.0, opacity_weight=2.0),
         num_steps=10_000,
         pixel_stride=1,

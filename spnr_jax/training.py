@@ -13,6 +13,7 @@ the uninterrupted one bit for bit.
 """
 
 import dataclasses
+from collections.abc import Callable
 from functools import partial
 from typing import Any, no_type_check
 
@@ -182,16 +183,11 @@ def lattice(key: Key, batch: Batch, stride: int) -> Batch:
             x = jax.lax.dynamic_index_in_dim(x, start, axis + 1, keepdims=False)
         return x
 
-    images = (batch.image, batch.alpha, batch.condition, batch.condition_mask)
-    image, alpha, condition, mask = (thinned(jnp.asarray(x)) for x in images)
     # pixel i of the lattice has its centre at first + stride * i + 0.5 of the view
     shift = 0.5 - (first[::-1] + 0.5) / stride
     zoom = jnp.diag(jnp.array([1 / stride, 1 / stride, 1.0])).at[:2, 2].set(shift)
     intrinsics = jnp.einsum("ij,...jk->...ik", zoom, batch.camera.intrinsics, precision="highest")
-    camera = Camera(
-        cam_to_world=batch.camera.cam_to_world, intrinsics=intrinsics, height=image.shape[2], width=image.shape[3]
-    )
-    return Batch(cloud=batch.cloud, camera=camera, image=image, alpha=alpha, condition=condition, condition_mask=mask)
+    return _some_pixels(batch, thinned, intrinsics)
 
 
 def cropped(key: Key, batch: Batch, size: int) -> Batch:
@@ -204,10 +200,16 @@ def cropped(key: Key, batch: Batch, size: int) -> Batch:
             x = jax.lax.dynamic_slice_in_dim(x, start, size, axis)
         return x
 
+    return _some_pixels(batch, cut, jnp.asarray(batch.camera.intrinsics).at[..., :2, 2].add(-first[::-1]))
+
+
+def _some_pixels(batch: Batch, some: Callable[[Array], Array], intrinsics: Array) -> Batch:
+    """The batch with some of the pixels of its images, which cameras of these intrinsics see."""
     images = (batch.image, batch.alpha, batch.condition, batch.condition_mask)
-    image, alpha, condition, mask = (cut(jnp.asarray(x)) for x in images)
-    intrinsics = jnp.asarray(batch.camera.intrinsics).at[..., :2, 2].add(-first[::-1])
-    camera = Camera(cam_to_world=batch.camera.cam_to_world, intrinsics=intrinsics, height=size, width=size)
+    image, alpha, condition, mask = (some(jnp.asarray(x)) for x in images)
+    camera = Camera(
+        cam_to_world=batch.camera.cam_to_world, intrinsics=intrinsics, height=image.shape[2], width=image.shape[3]
+    )
     return Batch(cloud=batch.cloud, camera=camera, image=image, alpha=alpha, condition=condition, condition_mask=mask)
 
 
