@@ -15,8 +15,9 @@ def describe(plan: Plan, variant: str) -> dict:
     """Return the content of dataset.json: all that decides the bytes, nothing of where or how fast."""
     config = plan.config
     settings = {name: value for name, value in asdict(config).items() if name not in PLACES}
-    if not config.reshape_variants:  # as data sets have it that were described before there was the choice
-        del settings["reshape_variants"]
+    for name, first in (("reshape_variants", False), ("spread", "random")):
+        if settings[name] == first:  # as data sets have it that were described before there was the choice
+            del settings[name]
     mesh_ids = [task.object_id for task in plan.tasks if task.path]
     listed = {split: {"count": len(ids), "ids_sha256": text_checksum(ids)} for split, ids in plan.listed.items()}
     envmap_sum = hashlib.sha256(config.envmap.read_bytes()).hexdigest() if config.envmap else None

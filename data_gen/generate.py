@@ -89,6 +89,7 @@ def make_objects(config: GenerateConfig, tasks: Sequence[Task], envmap: np.ndarr
         num_points=config.points,
         seed=config.seed,
         variant=variant,
+        spread=config.spread,
     )
     anywhere = (
         replace(task, path=task.path and task.path.absolute(), folder=task.folder and task.folder.absolute())

@@ -27,6 +27,7 @@ class Workbench:
     num_points: int
     seed: int
     variant: str
+    spread: points.Spread = "random"
 
 
 def make_and_write(bench: Workbench, task: Task) -> str | None:
@@ -60,7 +61,7 @@ def make_record(bench: Workbench, task: Task) -> records.ObjectRecord:
     """Return one object, rendered: asset, points, views, condition images."""
     seeds = object_seeds(bench.seed, task.object_id)
     asset, details = make_asset(task, bench.seed)
-    surface = points.sample_surface(asset, bench.num_points, seeds["points"])
+    surface = points.sample_surface(asset, bench.num_points, seeds["points"], bench.spread)
     cam_to_world = views.random_viewpoints(
         bench.view.views, bench.view.distance, np.random.default_rng(seeds["viewpoints"])
     )

@@ -12,12 +12,14 @@ import numpy as np
 from data_gen.assets import Asset, RejectedAsset
 from data_gen.objects import make_asset
 from data_gen.plan import Task
-from data_gen.points import sample_surface
+from data_gen.points import Spread, sample_surface
 
 MOVED = 1e-4  # of the object's half diagonal; the same mesh gives the same points but for a last bit
 
 
-def original(details: dict, seed: int, stored: np.ndarray, root: Path | None = None) -> Asset:
+def original(
+    details: dict, seed: int, stored: np.ndarray, root: Path | None = None, spread: Spread = "random"
+) -> Asset:
     """Return the normalised object of an object.json and the seed of its data set, checked against its points (n, 3).
 
     ValueError, with what to do, where it cannot be had.
@@ -29,7 +31,7 @@ def original(details: dict, seed: int, stored: np.ndarray, root: Path | None = N
         )
     try:
         asset = make_asset(task, seed)[0]
-        again = sample_surface(asset, len(stored), details["seeds"]["points"]).positions
+        again = sample_surface(asset, len(stored), details["seeds"]["points"], spread).positions
     except RejectedAsset as error:
         raise ValueError(f"{task.shown_path or task.object_id}: cannot be made again ({error})") from None
     moved = float(np.abs(again - stored).max(initial=0))

@@ -16,6 +16,7 @@ from typing import Annotated, Literal
 import tyro
 
 from data_gen import meshes, procedural, splits
+from data_gen.points import Spread
 from data_gen.sources import abo, shapenet
 from data_gen.sources.shapenet import Category
 from data_gen.views import Visibility
@@ -66,6 +67,8 @@ class GenerateConfig:
     """Views per object, from random directions."""
     points: int = 4096
     """Surface points per object."""
+    spread: Spread = "random"
+    """How they lie: drawn by area, or each the farthest from those before it, as spnr render thins bigger clouds."""
     spp: int = 64
     """Samples per pixel; Mitsuba rounds it up to a product of two near-equal numbers."""
     max_depth: int = 6

@@ -1,16 +1,21 @@
-"""Surface points with materials: normalisation of an object, and uniform samples of its surface.
+"""Surface points with materials: normalisation of an object, and samples of its surface.
 
-Points are drawn uniformly by area over all parts; the material of each is looked up with the interpolation of the
-renderer (data_gen/texels.py) and multiplied by the interpolated vertex colour. `face` counts through all parts, as the
-renderer reports its hits.
+Points are drawn uniformly by area over all parts, or spread evenly: each the farthest of several times as many from
+those before.  The material of each is looked up with the interpolation of the renderer (data_gen/texels.py) and
+multiplied by the interpolated vertex colour.  `face` counts through all parts, as the renderer reports its hits.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from typing import Literal
 
 import numpy as np
 
 from data_gen.assets import Asset, Material, Part, RejectedAsset
 from data_gen.texels import lookup
+from spnr_jax.subsample import farthest_points
+
+Spread = Literal["random", "even"]
+CANDIDATES = 4  # points drawn for each that is kept of an even spread
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,10 +55,22 @@ def normalise(asset: Asset) -> tuple[Asset, dict]:
     return replace(asset, parts=parts), {"centre": centre.tolist(), "scale": float(scale)}
 
 
-def sample_surface(asset: Asset, num_points: int, seed: int) -> SurfacePoints:
-    """Points drawn uniformly by area from all faces; the same seed gives the same points."""
+def sample_surface(asset: Asset, num_points: int, seed: int, spread: Spread = "random") -> SurfacePoints:
+    """Points on all faces; the same seed gives the same points.
+
+    Random ones are drawn uniformly by area.  Of an even spread each is the farthest of CANDIDATES times as many from
+    those before it, so that any first ones of them are spread evenly too, and thin parts have their share.
+    """
     if num_points < 1:
         raise ValueError(f"num_points must be at least 1, got {num_points}")
+    if spread == "random":
+        return _random_points(asset, num_points, seed)
+    drawn = _random_points(asset, CANDIDATES * num_points, seed)
+    chosen = farthest_points(drawn.positions, num_points, seed)
+    return SurfacePoints(**{column.name: getattr(drawn, column.name)[chosen] for column in fields(SurfacePoints)})
+
+
+def _random_points(asset: Asset, num_points: int, seed: int) -> SurfacePoints:
     bounding_box(asset)
     rng = np.random.default_rng(seed)
     cumulative = np.cumsum(np.concatenate([face_areas(part) for part in asset.parts]))

@@ -97,6 +97,7 @@ def recipe(options: Pretrain) -> list[TrainConfig]:
             first,
             later(first, steps=9000, seed=first.seed + 1, lr=1.5e-3),
             later(first, steps=6000, seed=first.seed + 2, lr=1e-3),
+            dataclasses.replace(later(first, steps=4000, seed=first.seed + 3, lr=1e-3), even_share=0.5),
         ]
     return runs if options.steps is None else [dataclasses.replace(run, num_steps=options.steps) for run in runs]
 
@@ -119,6 +120,7 @@ def data_sets(options: Pretrain, resolution: int) -> list[GenerateConfig]:
         views=options.views,
         spp=options.spp,
         visibility_grid=1,  # no discriminator looks at the conditions
+        spread="even",
         seed=options.seed,
     )
     procedural = dataclasses.replace(

@@ -60,7 +60,8 @@ def keep(place: Path, variables: dict, config: TrainConfig, item: data.ObjectDat
     """Renders an object's views and writes the file of what the refiner will see."""
     number = zlib.crc32(item.name.encode())
     count = min(COUNTS[number % len(COUNTS)], len(item.cloud.mask))
-    cloud = data.choose_points(item.cloud, count, clouds.bucket(count), np.random.default_rng(number))
+    generator = np.random.default_rng(number)
+    cloud = data.choose_points(item.cloud, count, clouds.bucket(count), generator, config.even_share)
     seen = np.asarray(rendered(variables, cloud, item.camera, config=config.model), np.float16)
     stream = io.BytesIO()
     np.savez(stream, seen=seen, reference=item.images)

@@ -18,7 +18,8 @@ def mesh_of(dataset: data.Dataset, item: data.ObjectData, meshes: Path | None) -
     seed = dataset.settings.get("settings", {}).get("seed")
     if seed is None:
         raise ValueError(f"{dataset.folder / 'dataset.json'}: names no seed, so its meshes cannot be made again")
-    return originals.original(details(dataset, item.name), seed, np.asarray(item.cloud.positions), meshes)
+    positions = np.asarray(item.cloud.positions)
+    return originals.original(details(dataset, item.name), seed, positions, meshes, dataset.spread)
 
 
 def details(dataset: data.Dataset, name: str) -> dict:

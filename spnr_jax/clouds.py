@@ -79,7 +79,7 @@ def place_cloud(
         raise ValueError(f"{path}: {str(error).splitlines()[0]}") from error
     if num_points is not None and len(positions) > num_points:
         report(f"{num_points} of {len(positions)} points kept, evenly spread")
-        kept = farthest_points(positions, num_points, seed)
+        kept = np.sort(farthest_points(positions, num_points, seed))
         positions, values = positions[kept], {name: column[kept] for name, column in values.items()}
     if up == "auto":
         up, reason = find_up(positions, path)
@@ -159,10 +159,10 @@ def _sampled_mesh(path: Path, count: int, seed: int, report: Callable[[str], Non
     asset = load_mesh(path)
     for feature in asset.ignored:
         report(f"ignored: {feature}")
-    points = sample_surface(asset, count, seed)
+    points = sample_surface(asset, count, seed, "even")
     if not np.isfinite(points.positions).all():
         raise ValueError(f"holds vertices too large for float32, more than {np.finfo(np.float32).max:.2g}")
-    report(f"{count} points drawn from the surface of the mesh")
+    report(f"{count} points spread over the surface of the mesh")
     values = {name: getattr(points, name) for name in DEFAULTS}
     if all((values[name] == default).all() for name, default in DEFAULTS.items()):
         report("no material in the mesh: base_color 0.5, roughness 0.5, metallic 0 taken everywhere")

@@ -117,6 +117,8 @@ class TrainConfig:
     """Every so many-th row and column of a view is rendered in training, from a random first one on."""
     crop: int = added(0)
     """Pixels along each side of the square of a view that is rendered in training, at a random place; 0: all of it."""
+    even_share: float = added(0.0)
+    """Share of the clouds that are first points of an object in a data set of `--spread even`, not random ones."""
 
     def __post_init__(self) -> None:
         for name in ("num_steps", "batch_objects", "views_per_object", "min_points", "test_points", "pixel_stride"):
@@ -143,6 +145,7 @@ class TrainConfig:
         require(
             self.crop == 0 or self.pixel_stride == 1, f"pixel_stride {self.pixel_stride} and crop {self.crop}: use one"
         )
+        require(0 <= self.even_share <= 1, f"even_share is a share of the clouds, got {self.even_share}")
         require(
             self.min_points <= self.max_points,
             f"min_points {self.min_points} must not exceed max_points {self.max_points}",

@@ -18,7 +18,7 @@ import warnings
 from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from PIL import Image, UnidentifiedImageError
@@ -63,6 +63,11 @@ class Dataset:
     settings: dict
     splits: dict[str, tuple[str, ...]]
     shards: Shards | None = None
+
+    @property
+    def spread(self) -> Literal["random", "even"]:
+        """How the objects' points lie; of even ones the first are evenly spread, too."""
+        return "even" if self.settings.get("settings", {}).get("spread") == "even" else "random"
 
 
 def open_dataset(folder: Path | str) -> Dataset:
@@ -152,10 +157,16 @@ def on_white(rgba: np.ndarray) -> np.ndarray:
     return color * alpha + (1 - alpha)
 
 
-def choose_points(cloud: PointCloud, count: int, size: int, generator: np.random.Generator) -> PointCloud:
-    """`count` of the points without repetition (or all, if there are fewer), padded to `size`."""
+def choose_points(
+    cloud: PointCloud, count: int, size: int, generator: np.random.Generator, even_share: float = 0.0
+) -> PointCloud:
+    """`count` of the points without repetition (or all, if there are fewer), padded to `size`.
+
+    They are random ones, or the first with the probability `even_share`.
+    """
     total = len(cloud.positions)
-    chosen = generator.permutation(total)[: min(count, total)]
+    first = even_share > 0 and generator.random() < even_share
+    chosen = (np.arange(total) if first else generator.permutation(total))[:count]
     subset = PointCloud(**{f.name: getattr(cloud, f.name)[chosen] for f in dataclasses.fields(PointCloud)})
     return clouds.pad(subset, size)
 
@@ -170,7 +181,7 @@ def make_batch(objects: list[ObjectData], config: TrainConfig, step: int, place:
         generator = np.random.default_rng((config.seed, POINTS_AND_VIEWS, step, i))
         low, high = np.log2(config.min_points), np.log2(config.max_points)
         count = round(2 ** generator.uniform(low, high))
-        clouds_of.append(choose_points(data.cloud, count, config.max_points, generator))
+        clouds_of.append(choose_points(data.cloud, count, config.max_points, generator, config.even_share))
         views_of.append(generator.permutation(len(data.images))[: config.views_per_object])
     images = np.stack([data.images[v] for data, v in zip(objects, views_of, strict=True)])
     conditions = np.stack([data.conditions[v] for data, v in zip(objects, views_of, strict=True)])
@@ -216,6 +227,11 @@ def batches(
     names = dataset.splits["train"]
     if not names:
         raise ValueError(f"{dataset.folder}: the train split is empty; generate more objects")
+    if config.even_share and dataset.spread != "even":
+        raise ValueError(
+            f"{dataset.folder}: its points are drawn at random, even_share is {config.even_share}; generate with "
+            "--spread even, or use even_share 0"
+        )
     read, own = cached_reader(dataset, config, cache_bytes), own or range(config.batch_objects)
 
     def assemble(step: int) -> Batch:

@@ -81,9 +81,10 @@ def candidates(positions: np.ndarray, count: int) -> np.ndarray:
 
 
 def farthest_points(positions: np.ndarray, count: int, seed: int) -> np.ndarray:
-    """Sorted indices (count,) of points (n, 3), each in turn the farthest from those before; n >= count.
+    """Indices (count,) of points (n, 3), each the farthest from those before it; n >= count.
 
-    The seed chooses the first.  Beyond THINNING * count points voxels thin them first: the time is count^2 at most.
+    So any first ones of them are evenly spread.  The seed chooses the very first.  Beyond THINNING * count points
+    voxels thin them before: the time is count^2 at most.
     """
     among = candidates(positions, count)
     centred = positions[among] - positions.mean(axis=0)
@@ -99,4 +100,4 @@ def farthest_points(positions: np.ndarray, count: int, seed: int) -> np.ndarray:
         np.minimum(squared, (x - x[last]) ** 2 + (y - y[last]) ** 2 + (z - z[last]) ** 2, out=squared)
         squared[last] = -1  # never again, not even where points coincide
         chosen[step] = np.argmax(squared)
-    return np.sort(among[chosen])
+    return among[chosen]

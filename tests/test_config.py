@@ -34,6 +34,7 @@ from spnr_jax.presets import PRESETS, tiny
         (TrainConfig, "batch_objects", 0, "at least 1"),
         (TrainConfig, "min_points", 5000, "max_points 4096"),
         (TrainConfig, "pixel_stride", 0, "at least 1"),
+        (TrainConfig, "even_share", 1.1, "a share"),
         (TrainConfig, "pixel_stride", 2, "neighbours"),
     ],
 )

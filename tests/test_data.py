@@ -6,6 +6,7 @@ import shutil
 import threading
 import time
 import zlib
+from contextlib import closing
 from itertools import islice
 
 import numpy as np
@@ -81,6 +82,26 @@ def test_materials_stay_with_their_points():
     chosen = data.choose_points(cloud, 12, 12, np.random.default_rng(3))
     roughness = {tuple(p): r for p, r in zip(cloud.positions, cloud.roughness, strict=True)}
     assert [roughness[tuple(p)] for p in chosen.positions] == chosen.roughness.tolist()
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
+def test_that_share_of_the_clouds_are_the_first_points(share):
+    cloud = one_object().cloud
+    chosen = [data.choose_points(cloud, 9, 16, np.random.default_rng(seed), share) for seed in range(60)]
+    first = np.mean([np.array_equal(c.positions[:9], cloud.positions[:9]) for c in chosen])
+    assert first == pytest.approx(share, abs=0.2)
+    assert share == 0.5 or first == share
+
+
+def test_first_points_of_a_data_set_of_random_ones_are_refused_as_even():
+    dataset = tiny_dataset.dataset()
+    config = dataclasses.replace(CONFIG, even_share=0.5)
+    with pytest.raises(ValueError, match=f"{dataset.folder}: its points are drawn at random.*--spread even"):
+        next(data.batches(dataset, config, 0))
+    even = dataclasses.replace(dataset, settings={"settings": {"spread": "even"}})
+    assert (dataset.spread, even.spread) == ("random", "even")
+    with closing(data.batches(even, config, 0)) as batches:
+        next(batches)
 
 
 def test_a_cloud_with_fewer_points_than_asked_is_taken_whole():

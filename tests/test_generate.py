@@ -71,6 +71,23 @@ def test_two_workers_an_interruption_and_killed_workers_end_with_the_same_bytes(
     assert tree(out) == tree(finished)
 
 
+def test_points_can_be_spread_evenly_and_the_data_set_says_so(meshes, finished, tmp_path):
+    assert (
+        run("generate", tmp_path / "set", "--meshes", meshes, *SMALL, "--test-fraction", 0.25, "--spread", "even") == 0
+    )
+    assert run("check", tmp_path / "set") == 0
+    random, even = (json.loads((folder / "dataset.json").read_text()) for folder in (finished, tmp_path / "set"))
+    assert even["settings"].pop("spread") == "even"
+    assert even == random
+
+    def nearest(folder):
+        positions = records.read_object(folder / "objects" / "thing_0").points
+        positions = records.point_columns(positions[:32], "x", "y", "z")
+        return np.linalg.norm(positions[:, None] - positions + 9 * np.eye(32)[..., None], axis=-1).min()
+
+    assert nearest(tmp_path / "set") > 2 * nearest(finished)
+
+
 def test_a_bad_mesh_is_left_out_with_its_reason_and_the_others_are_made(finished):
     rows = [json.loads(line) for line in (finished / "rejected.jsonl").read_text().splitlines()]
     assert [(row["id"], row["path"]) for row in rows] == [("empty", "empty.ply")]

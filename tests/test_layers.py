@@ -17,7 +17,7 @@ LAYERS = {
     0: {"types", "config", "model_config", "distributed"},
     1: {
         *("numerics", "cameras", "colors", "compositing", "losses", "metrics", "resizing", "sampling", "statistics"),
-        "voxels",
+        *("subsample", "voxels"),
     },
     2: {"nn", "empty_space", "surface", "supersampling", "flip", "lpips"},
     3: {"renderer", "baselines"},

@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 import trimesh
 from gltf_files import CORNERS, SQUARE, GltfBuilder
+from handmade import ball, box
 
-from data_gen.assets import RejectedAsset
+from data_gen.assets import Asset, RejectedAsset
 from data_gen.meshes import find_meshes, load_mesh
-from data_gen.points import normalise, sample_surface
+from data_gen.points import CANDIDATES, normalise, sample_surface
 from data_gen.texels import srgb_to_linear
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
@@ -189,6 +190,28 @@ class TestRealFiles:
         assert len(found) == 78
         for _, path in found:
             check(load_mesh(path))
+
+
+class TestEvenSpread:
+    shape = Asset(parts=(ball(radius=1.0), box(half=(0.5, 0.01, 0.01))))
+
+    def test_points_are_those_of_more_random_ones_with_their_materials(self):
+        even, drawn = sample_surface(self.shape, 40, 3, "even"), sample_surface(self.shape, CANDIDATES * 40, 3)
+        place = {tuple(position): i for i, position in enumerate(drawn.positions)}
+        chosen = [place[tuple(position)] for position in even.positions]
+        assert len(set(chosen)) == 40
+        for name, values in vars(even).items():
+            np.testing.assert_array_equal(values, getattr(drawn, name)[chosen])
+
+    @pytest.mark.parametrize("count", [16, 60, 240])
+    def test_any_first_ones_leave_smaller_gaps_than_random_ones(self, count):
+        def gap(points):
+            away = np.linalg.norm(surface.positions[:, None] - points.positions[:count], axis=-1)
+            return np.quantile(away.min(axis=1), 0.99)
+
+        surface = sample_surface(self.shape, 2000, 0)
+        spread = {kind: sample_surface(self.shape, 240, 1, kind) for kind in ("random", "even")}
+        assert gap(spread["even"]) < 0.75 * gap(spread["random"])
 
 
 def check(asset):

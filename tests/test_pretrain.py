@@ -33,6 +33,8 @@ def asked(monkeypatch):
         if generation.out.exists():
             return
         shutil.copytree(tiny_dataset.dataset().folder, generation.out)
+        described = {"settings": {"spread": generation.spread}}
+        (generation.out / "dataset.json").write_text(json.dumps(described))
         if generation.meshes:
             for path in sorted((generation.out / "objects").iterdir()):
                 path.rename(path.with_name(f"mesh-{path.name}"))
@@ -52,6 +54,7 @@ def test_both_data_sets_train_one_network_and_its_file_is_what_was_scored(asked,
     assert (procedural.objects, procedural.meshes, procedural.colour_variants) == (2400, None, 0)
     assert (meshes.meshes, meshes.colour_variants, meshes.reshape_variants) == (tmp_path, 24, True)
     assert meshes.test_list == tmp_path / "test.txt"
+    assert {procedural.spread, meshes.spread} == {"even"}
     joined, single = data.open_dataset(options.out / "data"), tiny_dataset.dataset()
     for split, names in single.splits.items():
         assert set(joined.splits[split]) == {*names, *(f"mesh-{name}" for name in names)}
@@ -59,11 +62,11 @@ def test_both_data_sets_train_one_network_and_its_file_is_what_was_scored(asked,
     trained, out = weights.read_trained(options.out / "small.npz"), options.out / "small"
     last = presets.with_refiner(pretrain.recipe(options)[-1])
     assert (trained.config, trained.steps) == (dataclasses.replace(last, num_steps=2), 2)
-    before = weights.read_trained(out / "run3").variables["params"]
+    before = weights.read_trained(out / "run4").variables["params"]
     for part, kept in before.items():
         jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, atol=1e-3), trained.variables["params"][part], kept)
-    starts = [run_record.read_starts(out / f"run{number}") for number in (1, 2, 3)]
-    assert [start.get("init") for (start,) in starts] == [None, *[f"{CONFIG.preset}, 2 steps"] * 2]
+    starts = [run_record.read_starts(out / f"run{number}") for number in (1, 2, 3, 4)]
+    assert [start.get("init") for (start,) in starts] == [None, *[f"{CONFIG.preset}, 2 steps"] * 3]
     scored = json.loads((out / "metrics.json").read_text())
     assert scored["methods"]["ours"]["objects"] == len(joined.splits["test"])
     assert "report.html" in capsys.readouterr().out
@@ -83,6 +86,7 @@ def test_tiny_has_one_run_and_each_run_of_small_begins_where_the_one_before_ende
     assert pretrain.recipe(pretrain.Pretrain(network="tiny")) == [presets.plus_lite()]
     first, *later = pretrain.recipe(pretrain.Pretrain())
     assert first == presets.plus_small()
-    assert [run.num_steps for run in later] == [9000, 6000]
-    assert len({run.seed for run in (first, *later)}) == 3
+    assert [run.num_steps for run in later] == [9000, 6000, 4000]
+    assert [run.even_share for run in (first, *later)] == [0, 0, 0, 0.5]
+    assert len({run.seed for run in (first, *later)}) == 4
     assert all(run.model.surface_cells == presets.plus_lite().model.surface_cells for run in later)
