@@ -32,6 +32,7 @@ from experiments.table1_poisson import SURFACES
 from experiments.table1_report import LABELS
 from experiments.table1_scores import ObjectMethod
 from spnr_jax import cli, data, evaluation, run_record, statistics
+from spnr_jax.config import TrainConfig
 from spnr_jax.images import png, write_whole
 from spnr_jax.types import PointCloud
 
@@ -98,8 +99,10 @@ def main(options: PointCount) -> None:
         "curves": {label: curve(found[label], scores[label]) for label in found},
         "counts": counts,
         "objects": list(names),
+        "classes": by_class({label: found[shown_count(counts, config)] for label, found in scores.items()}),
         "made of": {label: method.identity for label, method in found.items()},
         "trained on": [config.min_points, config.max_points],
+        "class points": shown_count(counts, config),
         "hardware": evaluation.hardware(),
         "data": dataset.settings.get("settings", {}),
         "seed": "that of the data set's points; nothing else is drawn",
@@ -207,7 +210,7 @@ def cloud_of(dataset: data.Dataset, item: data.ObjectData, count: int, meshes: P
     if count <= len(item.cloud.positions):
         return evaluation.first_points(item, count)
     seed = details(dataset, item.name)["seeds"]["points"]
-    drawn = points.sample_surface(mesh_of(dataset, item, meshes), count, seed)
+    drawn = points.sample_surface(mesh_of(dataset, item, meshes), count, seed, dataset.spread)
     return PointCloud(
         positions=drawn.positions,
         base_color=drawn.base_color,
@@ -240,6 +243,29 @@ def curve(method: Method, scores: dict[int, Scores]) -> dict[str, list[dict]]:
         ]
         for metric in METRICS
         if metric != "iou" or method.has_opacity
+    }
+
+
+def shown_count(counts: Sequence[int], config: TrainConfig) -> int:
+    """The count of the table of classes: the nearest to that of the network's evaluation."""
+    return min(counts, key=lambda count: abs(np.log(count / config.test_points)))
+
+
+def by_class(scores: dict[str, Scores]) -> dict[str, dict]:
+    """For each class its number of objects, each method's mean PSNR over views, and on how many objects it is best."""
+    first = next(iter(scores.values()))
+    psnr = {label: {name: np.mean(found[name]["psnr"]) for name in first} for label, found in scores.items()}
+    best = {name: max(psnr, key=lambda label: psnr[label][name]) for name in first}
+    classes: dict[str, list[str]] = {}
+    for name in sorted(first):
+        classes.setdefault(evaluation.category_of(name), []).append(name)
+    return {
+        category: {
+            "objects": len(names),
+            "psnr": {label: float(np.mean([found[name] for name in names])) for label, found in psnr.items()},
+            "best on": {label: sum(best[name] == label for name in names) for label in psnr},
+        }
+        for category, names in classes.items()
     }
 
 

@@ -19,12 +19,26 @@ def table(results: dict) -> str:
             cells = [cell(point, decimals) for point in curves.get(metric, ())]
             lines.append(f"| {label} | {' | '.join(cells or ['n/a'] * len(results['counts']))} |")
         parts.append("\n".join([*lines, ""]))
+    parts.append(class_table(results))
     low, high = results["trained on"]
     note = (
         f"{len(results['objects'])} unseen objects; means over images with 95 % bootstrap intervals over objects. "
         f"The first network trained on {low} to {high} points. {results['hardware']}."
     )
     return "\n".join([*parts, note, ""])
+
+
+def class_table(results: dict) -> str:
+    """Markdown: PSNR of the methods on each class of objects at one count, and how often each is the best."""
+    classes = results["classes"]
+    heads = [f"{name} ({found['objects']})" for name, found in classes.items()]
+    lines = [f"| PSNR, dB, {results['class points']:,} points | {' | '.join(heads)} | best on objects |"]
+    lines.append("|---|" + "---:|" * (len(heads) + 1))
+    for label in results["curves"]:
+        cells = [f"{found['psnr'][label]:.2f}" for found in classes.values()]
+        best = sum(found["best on"][label] for found in classes.values())
+        lines.append(f"| {label} | {' | '.join(cells)} | {best} |")
+    return "\n".join([*lines, ""])
 
 
 def cell(point: dict, decimals: int) -> str:

@@ -91,6 +91,25 @@ def test_a_method_without_opacity_has_no_curve_of_it(out):
     assert "| NPBG | n/a | n/a | n/a |" in (out / "table.md").read_text()
 
 
+def test_classes_have_the_means_of_their_objects_and_the_best_method_is_counted(out):
+    objects = {"chair_000001": (20.0, 10.0), "chair_000002": (24.0, 30.0), "sofa_000003": (15.0, 25.0)}
+    scores = {
+        label: {name: {"psnr": [values[i] - 1, values[i] + 1]} for name, values in objects.items()}
+        for i, label in enumerate("ab")
+    }
+    assert point_count.by_class(scores) == {
+        "chair": {"objects": 2, "psnr": {"a": 22.0, "b": 20.0}, "best on": {"a": 1, "b": 1}},
+        "sofa": {"objects": 1, "psnr": {"a": 15.0, "b": 25.0}, "best on": {"a": 0, "b": 1}},
+    }
+    results = json.loads((out / "results.json").read_text())
+    assert results["class points"] == 16  # nearest to 24
+    for label, curves in results["curves"].items():
+        found = results["classes"]
+        total = sum(found[name]["psnr"][label] * found[name]["objects"] for name in found) / len(NAMES)
+        assert total == pytest.approx(curves["psnr"][1]["mean"], rel=1e-6)
+    assert "| PSNR, dB, 16 points | ball (1) |" in (out / "table.md").read_text()
+
+
 def test_every_count_is_a_column_of_the_table_and_of_the_pictures(out):
     assert "| PSNR, dB | 8 | 16 | 64 |" in (out / "table.md").read_text()
     height, width = read(out / "strip.png").shape[:2]
