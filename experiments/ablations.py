@@ -1,10 +1,14 @@
-"""Ablations: a reference training, and one that differs in one thing a row, on the same data and for as many steps.
+"""Ablations: a reference training, and one that differs in one thing a row, on the same data and budget.
 
-    python -m experiments.ablations --data DIR --out DIR [--steps N] [--seeds 0 1 2] [--rows no_condition ...]
+    python -m experiments.ablations --data DIR --out DIR [--steps N | --minutes M] [--seeds 0 1 2] [--rows paper ...]
 
     OUT/runs/ROW_SEED/                            run folders; finished ones are only read
+    OUT/fold_K/runs/ROW_SEED/                     those of a part of the objects, with --folds
     OUT/results.json  table.md                    scores, costs, and differences to the reference with intervals
     OUT/differences.png  gallery.png              the differences, and pictures of unseen objects
+
+Every variant trains for as many steps, or with --minutes for as long.  With --folds each part of all objects is held
+out in turn, so that every one of them is scored by networks that never saw it.
 
 Rows that are the preset itself (its own depth; those of the nearest points for a preset without them) are left out, and
 that without colour variants where the training split has none: `spnr-data generate DIR --colour-variants 5` makes them.
@@ -23,11 +27,12 @@ import tyro
 
 from experiments import training_report, training_runs
 from experiments.training_runs import Budget, Variant
-from spnr_jax import cli, data
+from spnr_jax import cli, data, presets
 from spnr_jax.config import TrainConfig
 from spnr_jax.model_config import ModelConfig
 
 Row = Literal[
+    "paper",
     "no_condition",
     "no_colour_variants",
     "depth_3",
@@ -48,7 +53,9 @@ Row = Literal[
 ]
 ROWS: tuple[Row, ...] = Row.__args__  # type: ignore[attr-defined]
 REFERENCE = "reference"
+PAPER = {"plus_tiny": presets.tiny, "plus_abo": presets.abo, "plus_shapenet": presets.shapenet_car}  # same sizes
 LABELS = {
+    "paper": "The paper's network and training",
     "no_condition": "No condition image",
     "no_colour_variants": "No colour variants",
     "depth_3": "U-Net of 3 stages",
@@ -79,20 +86,49 @@ class Ablations:
     """Folder of runs and results; the same command goes on there."""
     rows: tuple[Row, ...] = ROWS
     """What is changed, one thing a row."""
+    folds: int = 1
+    """Parts of all objects, each held out in turn (1: the data set's own test split alone)."""
     budget: tyro.conf.OmitArgPrefixes[Budget] = field(default_factory=Budget)
+
+    def __post_init__(self) -> None:
+        if self.folds < 1:
+            raise ValueError(f"--folds: expected 1 or more, got {self.folds}")
 
 
 def main(options: Ablations) -> None:
     """Trains what is not trained, scores all rows, writes tables and pictures."""
     cli.set_up_jax()
     dataset = data.open_dataset(options.data)
-    names, config = options.budget.names(dataset), options.budget.config()
-    data.check_resolution(data.read_object(dataset, names[0]), config)
-    training_runs.claim(options.out, "ablations", options.budget, dataset)
-    variants = rows(options.rows, config, dataset)
-    trained = training_runs.train(variants, options.budget.seeds, options.out)
-    compared = training_runs.score(trained, REFERENCE, dataset, names, options.budget.shown)
-    training_report.write(options.out, variants, REFERENCE, compared, options.budget, dataset)
+    budget, config = options.budget, options.budget.config()
+    parts, compared = folds(dataset, options.folds), []
+    data.check_resolution(data.read_object(dataset, budget.names(parts[0])[0]), config)
+    held_out = {"folds": options.folds} if options.folds > 1 else {}
+    training_runs.claim(options.out, "ablations", budget, dataset, **held_out)
+    for number, part in enumerate(parts):
+        out = options.out if len(parts) == 1 else options.out / f"fold_{number}"
+        if len(parts) > 1:
+            print(f"fold {number + 1} of {len(parts)}", flush=True)
+        variants = rows(options.rows, config, part)
+        trained = training_runs.train(variants, budget, out)
+        shown = -(-budget.shown // len(parts))
+        compared.append(training_runs.score(trained, REFERENCE, part, budget.names(part), shown))
+    training_report.write(options.out, variants, REFERENCE, training_runs.merged(compared), budget, dataset)
+
+
+def folds(dataset: data.Dataset, count: int) -> list[data.Dataset]:
+    """The data set with each part of its objects as the test split, or as it is; variants train beside their object."""
+    if count == 1:
+        return [dataset]
+    everything = sorted(name for names in dataset.splits.values() for name in names)
+    objects = [name for name in everything if "--" not in name]
+    if len(objects) < 2 * count:
+        raise ValueError(f"--folds {count}: {dataset.folder} holds {len(objects)} objects, too few")
+    found = []
+    for first in range(count):
+        test = tuple(objects[first::count])
+        train = tuple(name for name in everything if name.split("--")[0] not in test)
+        found.append(dataclasses.replace(dataset, splits={"train": train, "val": (), "test": test}))
+    return found
 
 
 def rows(wanted: tuple[Row, ...], config: TrainConfig, dataset: data.Dataset) -> list[Variant]:
@@ -102,7 +138,7 @@ def rows(wanted: tuple[Row, ...], config: TrainConfig, dataset: data.Dataset) ->
         plain = training_runs.without_colour_variants(dataset) if name == "no_colour_variants" else dataset
         variant = Variant(name=name, label=LABELS[name], config=changed(name, config), dataset=plain)
         if (variant.config, variant.dataset.splits) == (config, dataset.splits):
-            print(f"{LABELS[name]}: left out, the reference is the same")
+            print(f"{LABELS[name]}: left out, {config.preset} is the same or has no such form")
         else:
             variants.append(variant)
     return variants
@@ -110,6 +146,8 @@ def rows(wanted: tuple[Row, ...], config: TrainConfig, dataset: data.Dataset) ->
 
 def changed(row: Row, config: TrainConfig) -> TrainConfig:
     """The config with the one change of a row."""
+    if row == "paper":
+        return dataclasses.replace(PAPER.get(config.preset, lambda: config)(), num_steps=config.num_steps)
     assert isinstance(config.model, ModelConfig)
     samples = config.model.sampling
     model: dict[str, dict] = {

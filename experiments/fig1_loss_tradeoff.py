@@ -61,7 +61,7 @@ def main(options: Fig1) -> None:
     training_runs.claim(options.out, "fig1", options.budget, dataset, pretrain=options.pretrain)
     variants = [variant(options, weight, config, dataset) for weight in options.l1_weights]
     reference = variants[options.l1_weights.index(100.0) if 100.0 in options.l1_weights else 0].name
-    trained = training_runs.train(variants, options.budget.seeds, options.out)
+    trained = training_runs.train(variants, options.budget, options.out)
     compared = training_runs.score(trained, reference, dataset, names, options.budget.shown)
     start = f"{options.pretrain} steps of L1 alone" if options.pretrain else "scratch"
     training_report.write(options.out, variants, reference, compared, options.budget, dataset, {"start": start})

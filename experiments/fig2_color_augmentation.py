@@ -66,7 +66,7 @@ def main(options: Fig2) -> None:
     data.check_resolution(data.read_object(dataset, names[0]), config)
     training_runs.claim(options.out, "fig2", options.budget, dataset)
     write_whole(options.out / "variants.png", variants_picture(dataset, options.budget.shown))
-    trained = training_runs.train(variants, options.budget.seeds, options.out)
+    trained = training_runs.train(variants, options.budget, options.out)
     compared = training_runs.score(trained, "without", dataset, names, options.budget.shown)
     training_report.write(options.out, variants, "without", compared, options.budget, dataset)
 

@@ -60,8 +60,11 @@ def config_of(
     config = dataclasses.replace(PRESETS[preset](), seed=seed)
     if budget == "quick":
         return dataclasses.replace(config, num_steps=QUICK_STEPS)
-    if minutes is None:
-        return config
+    return config if minutes is None else within(minutes, config, dataset, run)
+
+
+def within(minutes: float, config: TrainConfig, dataset: data.Dataset, run: Path) -> TrainConfig:
+    """The config with as many steps as fit into so many minutes here; a run that was begun keeps its steps."""
     begun = (run / "config.json").is_file()
     steps = checkpoint.read_config(run).num_steps if begun else steps_within(60 * minutes, config, dataset)
     return dataclasses.replace(config, num_steps=steps)

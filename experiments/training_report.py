@@ -75,11 +75,11 @@ def numbers(
             if variant.name != reference
         },
         "preset": budget.preset,
-        "steps": config.num_steps,
+        "minutes": budget.minutes,
         "seeds": list(budget.seeds),
         "hardware": evaluation.hardware(),
         "data": dataset.settings.get("settings", {}),
-        "test_objects": list(budget.names(dataset)),
+        "test_objects": list(compared.names),
         "views": len(next(iter(compared.scores.values()))[0]["psnr"]) // len(budget.seeds),
         "points": config.test_points,
         "resolution": config.model.image_resolution,
@@ -170,9 +170,13 @@ def ends(interval: Sequence[float] | None, decimals: int, sign: str = "") -> tup
 def notes(results: Mapping) -> list[str]:
     """What a reader has to know of the numbers."""
     counts = sorted({row["training_objects"] for row in results["variants"].values()})
+    steps = [count for row in results["variants"].values() for count in row["steps"]]
+    budget = f"{steps[0]:,} steps each"
+    if results["minutes"] is not None:
+        budget = f"{results['minutes']:g} minutes of training steps each, {min(steps):,} to {max(steps):,}"
     return [
-        f"Budget: preset {results['preset']}, {results['steps']} steps each, {' or '.join(map(str, counts))} training "
-        f"objects. Seeds: {', '.join(map(str, results['seeds']))}.",
+        f"Budget: preset {results['preset']}, {budget}, {' or '.join(map(str, counts))} training objects. "
+        f"Seeds: {', '.join(map(str, results['seeds']))}.",
         f"Hardware: {results['hardware']}.",
         f"Every variant: the same {len(results['test_objects'])} test objects, cameras and first {results['points']} "
         f"points; {results['resolution']} px.",

@@ -43,6 +43,8 @@ class Budget:
     """What every variant changes one thing of."""
     steps: int | None = None
     """Training steps of every variant (default: the preset's)."""
+    minutes: float | None = None
+    """Minutes of training steps that each gets on this machine instead, as many steps as fit."""
     seeds: tuple[int, ...] = (0,)
     """Seeds of weights, batches and jitter; every variant trains with each of them."""
     objects: int | None = None
@@ -57,6 +59,10 @@ class Budget:
             raise ValueError(f"--seeds: expected one or more numbers, none of them twice, got {list(self.seeds)}")
         if self.steps is not None and (self.quick or self.steps < 1):
             raise ValueError(f"--steps: expected 1 or more, and not together with --quick, got {self.steps}")
+        if self.minutes is not None and (self.quick or self.steps is not None or not self.minutes > 0):
+            raise ValueError(
+                f"--minutes: expected more than 0, and neither with --steps nor --quick, got {self.minutes:g}"
+            )
         if self.shown < 1:
             raise ValueError(f"--shown: expected 1 or more, got {self.shown}")
 
@@ -96,6 +102,7 @@ class Compared:
     `shown_scores` are those of the pictures.
     """
 
+    names: tuple[str, ...]
     scores: dict[str, list[Scores]]
     by_seed: dict[str, list[list[Scores]]]
     costs: dict[str, dict]
@@ -106,16 +113,20 @@ class Compared:
 def claim(out: Path, what: str, budget: Budget, dataset: data.Dataset, **more: object) -> None:
     """Makes the folder that of this experiment; ValueError if it is another's."""
     asked = {"experiment": what, "preset": budget.preset, "steps": budget.config().num_steps, **more}
+    if budget.minutes is not None:
+        asked |= {"steps": None, "minutes": budget.minutes}
     claims.claim(out / "asked.json", asked | {"data": run_record.checksum(dataset)}, "results")
 
 
-def train(variants: Sequence[Variant], seeds: Sequence[int], out: Path) -> dict[str, list[Run]]:
+def train(variants: Sequence[Variant], budget: Budget, out: Path) -> dict[str, list[Run]]:
     """The network of every variant and seed, trained one after another."""
     runs: dict[str, list[Run]] = {variant.name: [] for variant in variants}
-    todo = list(itertools.product(seeds, variants))
+    todo = list(itertools.product(budget.seeds, variants))
     for number, (seed, variant) in enumerate(todo, start=1):
         run, config = out / "runs" / f"{variant.name}_{seed}", dataclasses.replace(variant.config, seed=seed)
         place = f"run {number} of {len(todo)}: {variant.label}, seed {seed}"
+        if budget.minutes is not None:
+            config = table1_training.within(budget.minutes, config, variant.dataset, run)
         print(f"{place}: {config.num_steps} steps in {run}", flush=True)
         if variant.start and not (run / "checkpoints").is_dir():
             checkpoint.write_config(run, config)
@@ -163,11 +174,13 @@ def score(
         steps = [run.ms_per_step for run in found if run.ms_per_step is not None]
         costs[name] = {
             "parameters": found[0].trained.cost["parameters"],
+            "steps": [run.trained.cost["steps"] for run in found],
             "training_seconds": [run.trained.cost["training_seconds"] for run in found],
             "ms_per_step": round(statistics.mean(steps), 2) if steps else None,
             "ms_per_view": round(1000 * statistics.median(warm), 2) if warm else None,
         }
     return Compared(
+        names=names,
         scores={name: [joined(seeds) for seeds in zip(*lists, strict=True)] for name, lists in by_seed.items()},
         by_seed=by_seed,
         costs=costs,
@@ -179,6 +192,34 @@ def score(
             }
             for one in scored.shown
         ],
+    )
+
+
+def merged(parts: Sequence[Compared]) -> Compared:
+    """Comparisons of the same variants on different objects as one; costs are means of theirs."""
+
+    def mean(found: Sequence) -> float | None:
+        return None if None in found else round(statistics.fmean(found), 2)
+
+    variants = parts[0].scores
+    return Compared(
+        names=tuple(name for part in parts for name in part.names),
+        scores={name: [scores for part in parts for scores in part.scores[name]] for name in variants},
+        by_seed={
+            name: [list(itertools.chain(*seeds)) for seeds in zip(*(part.by_seed[name] for part in parts), strict=True)]
+            for name in variants
+        },
+        costs={
+            name: {
+                "parameters": parts[0].costs[name]["parameters"],
+                "steps": [steps for part in parts for steps in part.costs[name]["steps"]],
+                "training_seconds": [seconds for part in parts for seconds in part.costs[name]["training_seconds"]],
+                **{c: mean([part.costs[name][c] for part in parts]) for c in ("ms_per_step", "ms_per_view")},
+            }
+            for name in variants
+        },
+        shown=[one for part in parts for one in part.shown],
+        shown_scores=[one for part in parts for one in part.shown_scores],
     )
 
 

@@ -8,8 +8,8 @@ import pytest
 import tiny_dataset
 from tiny_runs import check_conditions, results_of, shrunken
 
-from experiments import training_report, training_runs
-from experiments.ablations import LABELS, ROWS, Ablations, changed, main, rows
+from experiments import table1_training, training_report, training_runs
+from experiments.ablations import LABELS, ROWS, Ablations, changed, folds, main, rows
 from experiments.training_runs import Budget, Compared
 from spnr_jax import checkpoint, cli, data, evaluation, presets, trainer, training
 from spnr_jax.config import to_dict
@@ -25,9 +25,9 @@ def _shrunken():
         yield
 
 
-def asked(out, wanted=("skip_concat",), dataset=None, **budget):
+def asked(out, wanted=("skip_concat",), dataset=None, folds=1, **budget):
     folder = dataset or tiny_dataset.dataset().folder
-    return Ablations(data=folder, out=out, rows=wanted, budget=Budget(**{"quick": True} | budget))
+    return Ablations(data=folder, out=out, rows=wanted, folds=folds, budget=Budget(**{"quick": True} | budget))
 
 
 @pytest.fixture(scope="module")
@@ -47,6 +47,7 @@ class TestRows:
 
     def test_each_changes_what_it_says_and_nothing_else(self):
         expected = {
+            "paper": {},  # the preset itself
             "no_condition": {"loss.condition": False},
             "no_colour_variants": {},
             "depth_3": {},  # tiny's own
@@ -73,6 +74,10 @@ class TestRows:
         }
         assert {row: self.changes(row, presets.plus_tiny()) for row in PLUS_ROWS} == expected
 
+    def test_the_paper_s_network_is_the_preset_that_a_plus_one_was_made_of(self):
+        plus = dataclasses.replace(presets.plus_tiny(), num_steps=77)
+        assert changed("paper", plus) == dataclasses.replace(presets.tiny(), num_steps=77)
+
     @staticmethod
     def changes(row, config):
         before = dict(leaves(to_dict(config)))
@@ -81,6 +86,7 @@ class TestRows:
     def test_rows_that_are_the_reference_are_left_out_with_a_line(self, capsys):
         made = rows(ROWS, self.tiny, tiny_dataset.dataset())
         assert {variant.name for variant in made} == {"reference", *ROWS} - {
+            "paper",
             "depth_3",
             "no_colour_variants",
             *PLUS_ROWS,
@@ -110,6 +116,44 @@ def test_scores_and_differences_are_those_of_the_runs_on_the_same_views(out):
     assert difference["by_seed"] == [difference["mean"]]
     assert results["test_objects"] == ["ball_000004", "chair"]
     check_conditions(out)
+
+
+def test_every_object_is_scored_once_by_networks_that_never_saw_it(tmp_path):
+    main(asked(tmp_path, folds=3, quick=False, steps=2))
+    names = {name for split in tiny_dataset.SPLITS.values() for name in split}
+    results = results_of(tmp_path)
+    assert sorted(results["test_objects"]) == sorted(names)
+    for number, part in enumerate(folds(tiny_dataset.dataset(), 3)):
+        assert set(part.splits["test"]) | set(part.splits["train"]) == names
+        assert not set(part.splits["test"]) & set(part.splits["train"])
+        assert (tmp_path / f"fold_{number}" / "runs" / "reference_0" / "config.json").is_file()
+    psnr = []
+    for number, part in enumerate(folds(tiny_dataset.dataset(), 3)):
+        found, state = checkpoint.load_run(tmp_path / f"fold_{number}" / "runs" / "reference_0")
+        show = {"shown": evaluation.network(training.averaged_variables(state), found)}
+        scored = evaluation.evaluate_objects(show, found, part, part.splits["test"])
+        psnr += [result.scores["shown"]["psnr"] for result in scored]
+    assert results["variants"]["reference"]["psnr"] == pytest.approx(np.mean(np.concatenate(psnr)), abs=1e-5)
+
+
+def test_variants_are_held_out_with_their_object():
+    splits = {"train": ("a", "a--1", "b", "c"), "val": (), "test": ("d",)}
+    dataset = dataclasses.replace(tiny_dataset.dataset(), splits=splits)
+    first, second = folds(dataset, 2)
+    assert first.splits == {"train": ("b", "d"), "val": (), "test": ("a", "c")}
+    assert second.splits == {"train": ("a", "a--1", "c"), "val": (), "test": ("b", "d")}
+    with pytest.raises(ValueError, match="--folds 3.*holds 4 objects, too few"):
+        folds(dataset, 3)
+
+
+def test_minutes_give_every_variant_the_steps_that_fit(tmp_path, monkeypatch):
+    paces = {"add": 2.0, "concat": 6.0}
+    monkeypatch.setattr(table1_training, "step_seconds", lambda config, *_: paces[config.model.skip])
+    main(asked(tmp_path, quick=False, minutes=0.2))
+    results = results_of(tmp_path)
+    assert {name: row["steps"] for name, row in results["variants"].items()} == {"reference": [6], "skip_concat": [2]}
+    assert "0.2 minutes of training steps each, 2 to 6" in (tmp_path / "table.md").read_text()
+    assert cli.guarded(lambda: main(asked(tmp_path, quick=False, minutes=0.4)), "ablations") == 2
 
 
 def test_a_finished_experiment_is_only_read(out, monkeypatch):
@@ -175,6 +219,7 @@ class TestReport:
         for name, level, rng in (("a", 10.0, rng), ("b", 13.0, rng))
     }
     compared = Compared(
+        names=("one", "two", "three"),
         scores={n: [training_runs.joined(o) for o in zip(*seeds, strict=True)] for n, seeds in by_seed.items()},
         by_seed=by_seed,
         costs={},

@@ -50,7 +50,7 @@ def test_every_weight_has_its_pictures_and_its_high_frequency_energy(out):
     assert set(results["variants"]) == {"l1_0", "l1_100"}
     assert results["reference"] == "l1_100"
     assert results["start"] == "2 steps of L1 alone"
-    assert results["steps"] == QUICK_STEPS
+    assert {row["steps"][0] for row in results["variants"].values()} == {QUICK_STEPS}
     for row in results["variants"].values():
         assert row["detail"] > 0
     check_conditions(out)
