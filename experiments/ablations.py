@@ -53,7 +53,6 @@ Row = Literal[
 ]
 ROWS: tuple[Row, ...] = Row.__args__  # type: ignore[attr-defined]
 REFERENCE = "reference"
-PAPER = {"plus_tiny": presets.tiny, "plus_abo": presets.abo, "plus_shapenet": presets.shapenet_car}  # same sizes
 LABELS = {
     "paper": "The paper's network and training",
     "no_condition": "No condition image",
@@ -144,10 +143,21 @@ def rows(wanted: tuple[Row, ...], config: TrainConfig, dataset: data.Dataset) ->
     return variants
 
 
+def paper_network(config: TrainConfig) -> TrainConfig:
+    """The paper's network and training of the sizes that a plus preset has; any other config as it is."""
+    made = {"plus_tiny": presets.tiny, "plus_abo": presets.abo, "plus_shapenet": presets.shapenet_car}
+    if config.preset == "plus_small":  # tiny's sizes, pictures twice as large
+        tiny = presets.tiny()
+        assert isinstance(tiny.model, ModelConfig)
+        model = dataclasses.replace(tiny.model, render_resolution=64, resize_resolution=64, image_resolution=128)
+        return dataclasses.replace(tiny, model=model, num_steps=config.num_steps)
+    return dataclasses.replace(made.get(config.preset, lambda: config)(), num_steps=config.num_steps)
+
+
 def changed(row: Row, config: TrainConfig) -> TrainConfig:
     """The config with the one change of a row."""
     if row == "paper":
-        return dataclasses.replace(PAPER.get(config.preset, lambda: config)(), num_steps=config.num_steps)
+        return paper_network(config)
     assert isinstance(config.model, ModelConfig)
     samples = config.model.sampling
     model: dict[str, dict] = {

@@ -149,7 +149,7 @@ def with_refiner(config: TrainConfig) -> TrainConfig:
         preset="plus_refined",
         model=dataclasses.replace(config.model, refiner_width=32, num_features=3 + NUM_TOLD),
         loss=dataclasses.replace(config.loss, mse_weight=4.0, opacity_weight=2.0),
-        num_steps=10_000,
+        num_steps=20_000,
         pixel_stride=1,
         crop=config.model.image_resolution // 2,
     )

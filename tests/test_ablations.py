@@ -77,6 +77,11 @@ class TestRows:
     def test_the_paper_s_network_is_the_preset_that_a_plus_one_was_made_of(self):
         plus = dataclasses.replace(presets.plus_tiny(), num_steps=77)
         assert changed("paper", plus) == dataclasses.replace(presets.tiny(), num_steps=77)
+        model, larger = changed("paper", presets.plus_small()).model, presets.plus_small().model
+        assert (model.image_resolution, model.num_neighbors) == (128, 0)
+        for size in ("point_widths", "volume_resolution", "base_width", "num_stages", "field_width"):
+            assert getattr(model, size) == getattr(larger, size)
+        assert changed("paper", presets.tiny()) == presets.tiny()
 
     @staticmethod
     def changes(row, config):
