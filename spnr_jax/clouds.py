@@ -2,9 +2,9 @@
 
 `read_cloud` makes a PointCloud of NumPy float32 arrays, not padded, in the file's own units, turned so that y is up;
 `place_cloud` also says how to get back into the file's frame.  Files of points are read as named columns
-(spnr_jax/point_files.py, what they mean: point_columns.py), of any size in bounded memory; meshes are sampled
-uniformly by area, with their materials.  What a file does not say is grey 0.5, roughness 0.5, metallic 0; `report` is
-told so, and of every other assumption, one line each.
+(spnr_jax/point_files.py, what they mean: point_columns.py), of any size in bounded memory; points are
+spread evenly over meshes, with their materials.  What a file does not say is grey 0.5, roughness 0.5, metallic 0;
+`report` is told so, and of every other assumption, one line each.
 """
 
 from collections.abc import Callable, Iterator
@@ -23,6 +23,7 @@ from spnr_jax.up_axis import ROTATIONS, find_up
 
 MESHES = (".glb", ".gltf", ".obj", ".stl", ".off")
 MESH_POINTS = 4096  # points drawn from a mesh if no number is asked for; the most that training draws
+MOST_EVEN = 2**14  # points that are spread evenly over a mesh, in seconds; more lie close enough as they are drawn
 CAPACITY = 2**19  # points of a file that are in memory at most; more are thinned while reading
 COARSEST_STEP = 1e-3  # of the extent, that rounding to float32 may cost
 SMALLEST_BUCKET = 512
@@ -152,14 +153,14 @@ def _is_mesh(path: Path) -> bool:
 
 
 def _sampled_mesh(path: Path, count: int, seed: int, report: Callable[[str], None]):
-    """Positions (count, 3) float64, their origin (3,) and materials on a mesh's surface."""
+    """Positions (count, 3) float64, their origin (3,) and materials of points spread evenly over a mesh."""
     from data_gen.meshes import load_mesh  # only here: everything else of the package does without data_gen
     from data_gen.points import sample_surface
 
     asset = load_mesh(path)
     for feature in asset.ignored:
         report(f"ignored: {feature}")
-    points = sample_surface(asset, count, seed, "even")
+    points = sample_surface(asset, count, seed, "even" if count <= MOST_EVEN else "random")
     if not np.isfinite(points.positions).all():
         raise ValueError(f"holds vertices too large for float32, more than {np.finfo(np.float32).max:.2g}")
     report(f"{count} points spread over the surface of the mesh")

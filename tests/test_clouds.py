@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from gltf_files import GltfBuilder
+from scipy.spatial import cKDTree
 from test_point_files import ply_bytes
 
 from data_gen.records import POINT_TYPE, encode_points
@@ -93,6 +94,16 @@ def test_what_a_file_does_not_say_is_grey_half_rough_no_metal_and_reported(tmp_p
     cloud, lines = read(write(tmp_path, "b.csv", "x,y,z,metalness\n0,0,0,0.25\n"))
     assert cloud.metallic == [0.25]
     assert not any("metallic" in line for line in lines)
+
+
+def test_points_are_spread_evenly_over_a_mesh_unless_there_are_very_many(tmp_path, monkeypatch):
+    def nearest(count):
+        positions = read_cloud(write(tmp_path, "a.obj", SQUARE_OBJ), num_points=count, seed=1).positions
+        return cKDTree(positions).query(positions, k=2)[0][:, 1].min() * np.sqrt(count)
+
+    monkeypatch.setattr(clouds, "MOST_EVEN", 300)
+    assert nearest(300) > 0.5  # of the distance on a square lattice
+    assert nearest(301) < 0.2
 
 
 @pytest.mark.parametrize("name", ["a.obj", "a.off", "a.ply", "a.stl", "a.glb", "a.gltf"])
