@@ -200,13 +200,14 @@ def table(results: dict) -> str:
 
 def plot(curves: dict[str, list[np.ndarray]], names: Sequence[str]) -> bytes:
     """Flicker over the turn, a panel for each object, as PNG."""
+    top = 1.05 * 255 * max(np.nanmax(curve) for found in curves.values() for curve in found)
     with matplotlib.rc_context({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}):
         figure = Figure(figsize=(3.2 * len(names), 2.6), layout="constrained")
         for i, axes in enumerate(np.atleast_1d(figure.subplots(1, len(names), sharey=True))):
             for label, found in curves.items():
                 turn = np.linspace(0, 360, len(found[i]), endpoint=False)
                 axes.plot(turn, 255 * found[i], label=label, linewidth=1.2)
-            axes.set(title=names[i], xlabel="azimuth, degrees", ylim=(0, None))
+            axes.set(title=names[i], xlabel="azimuth, degrees", ylim=(0, top))
         axes.legend(frameon=False)
         figure.supylabel("flicker, of 255", fontsize=9)
         stream = io.BytesIO()
