@@ -30,7 +30,7 @@ from experiments.point_count_report import METRICS, plot, table
 from experiments.source_meshes import details, mesh_of
 from experiments.table1_poisson import SURFACES
 from experiments.table1_report import LABELS
-from experiments.table1_scores import ObjectMethod
+from experiments.table1_scores import ObjectMethod, classes_of
 from spnr_jax import cli, data, evaluation, run_record, statistics
 from spnr_jax.config import TrainConfig
 from spnr_jax.images import png, write_whole
@@ -256,16 +256,13 @@ def by_class(scores: dict[str, Scores]) -> dict[str, dict]:
     first = next(iter(scores.values()))
     psnr = {label: {name: np.mean(found[name]["psnr"]) for name in first} for label, found in scores.items()}
     best = {name: max(psnr, key=lambda label: psnr[label][name]) for name in first}
-    classes: dict[str, list[str]] = {}
-    for name in sorted(first):
-        classes.setdefault(evaluation.category_of(name), []).append(name)
     return {
         category: {
             "objects": len(names),
             "psnr": {label: float(np.mean([found[name] for name in names])) for label, found in psnr.items()},
             "best on": {label: sum(best[name] == label for name in names) for label in psnr},
         }
-        for category, names in classes.items()
+        for category, names in classes_of(first).items()
     }
 
 
