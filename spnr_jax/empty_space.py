@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 from spnr_jax import sampling
 from spnr_jax.numerics import gather_rows
 from spnr_jax.types import Rays
-from spnr_jax.voxels import locate, row_of
+from spnr_jax.voxels import row_at, voxel_of
 
 
 @no_type_check  # pytree transformations rebuild records with leaves that are no arrays
@@ -55,13 +55,15 @@ def open_path(
     fractions = jnp.arange(num_cells + 1, dtype=near.dtype).reshape(*[1] * (near.ndim - 1), -1) / num_cells
     edges = near + (far - near) * fractions
     middles = 0.5 * (edges[..., 1:] + edges[..., :-1])
-    places = rays.origins[..., None, :] + middles[..., None] * rays.directions[..., None, :]
-    cell, _ = locate(places, near_points.shape[0])
-    rows = row_of(cell, jnp.ones(cell.shape[:-1], bool), near_points.shape[0])
-    is_open = gather_rows(near_points.reshape(-1, 1).astype(near.dtype), rows)[..., 0]
-    travelled = jnp.cumsum(is_open * jnp.diff(edges, axis=-1), axis=-1)
-    travelled = jnp.concatenate([jnp.zeros_like(near), travelled], axis=-1)
-    return jax.lax.stop_gradient(Path(edges=edges, travelled=travelled))
+    resolution = near_points.shape[0]
+    # an axis at a time: the voxels of all cells are then found in one loop
+    x, y, z = (
+        voxel_of(rays.origins[..., i, None] + middles * rays.directions[..., i, None], resolution) for i in range(3)
+    )
+    is_open = gather_rows(near_points.reshape(-1, 1).astype(near.dtype), row_at(x, y, z, resolution))[..., 0]
+    # equal cells are counted, in a product: a running sum takes a CPU four times as long
+    count = is_open @ jnp.triu(jnp.ones((num_cells, num_cells + 1), near.dtype), 1)
+    return jax.lax.stop_gradient(Path(edges=edges, travelled=count * ((far - near) / num_cells)))
 
 
 def distance_at(path: Path, travelled: Float[Array, "*batch samples"]) -> Float[Array, "*batch samples"]:

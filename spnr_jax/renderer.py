@@ -32,6 +32,7 @@ from spnr_jax.types import Camera, Key, PointCloud, Rays, Rendering, Scene
 
 CELLS_PER_VOXEL = 1  # of a path through the box, counted along an axis
 RAY_BLOCK = 256  # rays near points that are rendered at once
+CPU_BLOCK = 64  # the same without gradients on a CPU: what their samples read stays in its first cache
 
 
 class Renderer(nn.Module):
@@ -169,9 +170,10 @@ class Renderer(nn.Module):
         objects = jnp.broadcast_to(jnp.arange(shape[0])[:, None], shape)
         inputs = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), (objects, number, rays, far, path))
         far, path = inputs[-2:]
+        size = CPU_BLOCK if key is None and jax.default_backend() == "cpu" else RAY_BLOCK
         white = jnp.zeros((far.size, self.config.num_features)).at[:, :3].set(compositing.WHITE)
         outputs = empty_space.map_existing(
-            block, path.travelled[:, -1] > 0, inputs, (white, far, jnp.zeros_like(far)), RAY_BLOCK
+            block, path.travelled[:, -1] > 0, inputs, (white, far, jnp.zeros_like(far)), size
         )
         return jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), outputs)
 

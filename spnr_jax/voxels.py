@@ -29,15 +29,24 @@ def locate(
 
     A position on the far face of the box belongs to the last voxel.
     """
-    grid = (positions + 1) * (0.5 * resolution)
-    cell = jnp.clip(jnp.floor(grid), 0, resolution - 1)
-    return cell.astype(jnp.int32), grid - jax.lax.stop_gradient(cell) - 0.5
+    cell = voxel_of(positions, resolution)
+    return cell, (positions + 1) * (0.5 * resolution) - cell - 0.5
+
+
+def voxel_of(positions: Float[Array, "*batch"], resolution: int) -> Int[Array, "*batch"]:
+    """Number of the voxel along an axis, clamped to the grid, of each position along it in [-1, 1]."""
+    cell = jnp.floor((positions + 1) * (0.5 * resolution))
+    return jnp.clip(cell, 0, resolution - 1).astype(jnp.int32)
 
 
 def row_of(cell: Int[Array, "*batch 3"], valid: Bool[Array, "*batch"], resolution: int) -> Int[Array, "*batch"]:
     """Row of each voxel in the flattened volume; what is not valid goes to the spare row resolution ** 3."""
-    x, y, z = cell[..., 0], cell[..., 1], cell[..., 2]
-    return jnp.where(valid, (z * resolution + y) * resolution + x, resolution**3)
+    return jnp.where(valid, row_at(cell[..., 0], cell[..., 1], cell[..., 2], resolution), resolution**3)
+
+
+def row_at(x: Int[Array, "*batch"], y: Int[Array, "*batch"], z: Int[Array, "*batch"], resolution: int):
+    """Row of the voxel at x, y, z in the flattened volume, of their shape."""
+    return (z * resolution + y) * resolution + x
 
 
 def voxel_rows(

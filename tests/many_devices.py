@@ -75,7 +75,7 @@ def trained(model) -> float:
 def blocks() -> list[list[int]]:
     """How many blocks of four rays one device renders, and each of eight."""
     counts = []
-    with counting() as ran, mock.patch.object(renderer, "RAY_BLOCK", 4):
+    with counting() as ran, mock.patch.object(renderer, "CPU_BLOCK", 4):
         arguments = inputs(PLUS, SIZES["near points"])
         render = jax.jit(partial(training.render, config=PLUS))
         for run in (render, partial(distributed.by_all_devices, render)):

@@ -203,6 +203,15 @@ class TestRendering:
         still = training.jitted_render(variables, scene, generic, config=config)
         assert np.abs(np.asarray(many.image) - np.asarray(still.image)).max() > 1e-3, "a key moves the samples"
 
+    @pytest.mark.skipif(jax.default_backend() != "cpu", reason="other devices have one size of blocks")
+    def test_pictures_do_not_depend_on_the_size_of_blocks(self, variables, scene, monkeypatch):
+        @partial(jax.jit, static_argnames="block")
+        def still(block):
+            monkeypatch.setattr(renderer, "CPU_BLOCK", block)
+            return Renderer(near_points(CONFIG, 1)).bind(variables).render(scene, camera(target=0.013))
+
+        close(still(7), still(4096), atol=1e-5)
+
     def test_no_point_gives_a_white_picture(self, variables):
         empty = dataclasses.replace(cloud(), mask=jnp.zeros_like(cloud().mask))
         scene = training.jitted_encode(variables, empty, config=CONFIG)
