@@ -83,6 +83,10 @@ def tiny() -> TrainConfig:
     )
 
 
+FEW_SAMPLES = 8  # of a ray near points: a picture then takes no longer than the paper's network, docs/ablations.md
+PACKAGE_SAMPLES = 16  # of the package's network `small`
+
+
 def _plus(preset: TrainConfig, name: str, pixel_stride: int, num_coarse: int) -> TrainConfig:
     """The preset's network and training with light on the materials of the nearest points: a ray a pixel, no GAN."""
     assert isinstance(preset.model, ModelConfig)
@@ -110,6 +114,13 @@ def plus_shapenet() -> TrainConfig:
     return _plus(shapenet_car(), "plus_shapenet", pixel_stride=2, num_coarse=32)
 
 
+def with_samples(config: TrainConfig, count: int) -> TrainConfig:
+    """The config of a network near points with so many samples a ray."""
+    assert isinstance(config.model, ModelConfig)
+    sampling = dataclasses.replace(config.model.sampling, num_coarse=count)
+    return dataclasses.replace(config, model=dataclasses.replace(config.model, sampling=sampling))
+
+
 def of_any_density(config: TrainConfig) -> TrainConfig:
     """The config of a network near points with 128 to 2048 points an object, on their grid."""
     assert isinstance(config.model, ModelConfig)
@@ -120,15 +131,10 @@ def of_any_density(config: TrainConfig) -> TrainConfig:
 
 def plus_lite() -> TrainConfig:
     """The package's network `tiny`: half the sizes of plus_small's.  `spnr train --preset plus_lite DATA RUN`."""
-    small = of_any_density(plus_small())
+    small = with_samples(of_any_density(plus_small()), 8)
     assert isinstance(small.model, ModelConfig)
     model = dataclasses.replace(
-        small.model,
-        point_widths=(32, 64, 128),
-        point_features=16,
-        volume_resolution=16,
-        field_width=32,
-        sampling=dataclasses.replace(small.model.sampling, num_coarse=8),
+        small.model, point_widths=(32, 64, 128), point_features=16, volume_resolution=16, field_width=32
     )
     return dataclasses.replace(small, preset="plus_lite", model=model, num_steps=5000)
 
@@ -138,7 +144,7 @@ def plus_refined() -> TrainConfig:
 
     Without --init, train `plus_small` first and begin with its run: a lattice of rays is quicker to learn from.
     """
-    return with_refiner(of_any_density(plus_small()))
+    return with_refiner(of_any_density(with_samples(plus_small(), PACKAGE_SAMPLES)))
 
 
 def with_refiner(config: TrainConfig) -> TrainConfig:
@@ -157,7 +163,7 @@ def with_refiner(config: TrainConfig) -> TrainConfig:
 
 def plus_small() -> TrainConfig:
     """plus_tiny's network at 128 px, for longer.  `spnr train --preset plus_small DATA RUN`."""
-    small = _plus(tiny(), "plus_small", pixel_stride=4, num_coarse=16)
+    small = _plus(tiny(), "plus_small", pixel_stride=4, num_coarse=FEW_SAMPLES)
     assert isinstance(small.model, ModelConfig)
     return dataclasses.replace(
         small,
@@ -170,7 +176,7 @@ def plus_small() -> TrainConfig:
 
 def plus_tiny() -> TrainConfig:
     """Light on materials, 64 px, minutes on two CPU cores.  `spnr train --preset plus_tiny DATA RUN`."""
-    return _plus(tiny(), "plus_tiny", pixel_stride=2, num_coarse=8)
+    return _plus(tiny(), "plus_tiny", pixel_stride=2, num_coarse=FEW_SAMPLES)
 
 
 def _baseline_loss(pixel: Literal["l1", "mse"], masked: bool = False) -> LossConfig:

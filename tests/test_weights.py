@@ -13,6 +13,7 @@ from laws import close
 
 from spnr_jax import checkpoint, model, training, weights
 from spnr_jax.config import TrainConfig
+from spnr_jax.presets import PRESETS
 
 
 @pytest.fixture(scope="module")
@@ -63,6 +64,7 @@ def test_the_networks_in_the_package_have_the_weights_that_their_configs_describ
     checked, trusted = weights.read_weights(copy), weights.read_trained(name)
     assert checked.config == trusted.config
     assert checked.config.preset == preset
+    assert checked.config.model == PRESETS[preset]().model
     jax.tree.map(np.testing.assert_array_equal, checked.variables, trusted.variables)
 
 
