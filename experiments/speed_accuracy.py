@@ -3,7 +3,8 @@
     python -m experiments.speed_accuracy DATA RUN [RUN ...] [--out runs/speed_accuracy] [--objects 24]
 
 Every run is rendered as it was trained, and with other sample counts, with samples near the points alone, with fewer
-rays, in bfloat16 and from other numbers of points.  Runs of other volume resolutions or widths add their own points.
+rays, in bfloat16 and from other numbers of points.  Networks that see the nearest points have samples nowhere else, and
+as many rays as pixels.  Runs of other volume resolutions or widths add their own points.
 Writes results.json after every setting (an interrupted call goes on), table.md, and front.png: PSNR, SSIM and FLIP
 against milliseconds a view, and PSNR against memory.
 
@@ -21,6 +22,7 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -35,9 +37,11 @@ from spnr_jax import checkpoint, cli, data, evaluation, training
 from spnr_jax.config import TrainConfig
 from spnr_jax.images import write_whole
 from spnr_jax.model_config import ModelConfig, SamplingConfig
+from spnr_jax.supersampling import rays_per_side
 
 REPEATS = 5
 TIMED_OBJECTS = 8
+MARKERS = "osD^v<>P"  # of runs
 GROUPS = {  # of settings, as the plot colours them
     "trained": "#1d2330",
     "samples": "#2457d6",
@@ -82,21 +86,21 @@ def settings(config: TrainConfig) -> list[Setting]:
         changed = dataclasses.replace(config, test_points=points, model=dataclasses.replace(model, **fields))
         return Setting(group=group, name=name, config=changed)
 
-    def samples(coarse: int, fine: int, reach: int = 0) -> SamplingConfig:
+    def samples(coarse: int, fine: int = 0, reach: int = 0) -> SamplingConfig:
         return dataclasses.replace(model.sampling, num_coarse=coarse, num_fine=fine, reach=reach)
 
     total = model.sampling.num_coarse + model.sampling.num_fine
     halves = [max(total // k, 2) for k in (1, 2, 4)]
-    near = [SamplingConfig(num_coarse=n, num_fine=0, reach=r) for r in (1, 2, 3) for n in (*halves, total // 8 + 1)]
+    if model.num_neighbors:
+        anywhere, near = [], [(n, model.sampling.reach) for n in (2 * total, 3 * total // 4, *halves[1:])]
+    else:
+        anywhere = [(n // 2, n // 2) for n in (2 * total, *halves[1:])] + [(n, 0) for n in halves[:2]]
+        near = [(n, reach) for reach in (1, 2, 3) for n in (*halves, total // 8 + 1)]
     size = model.render_resolution
     ways = [
         variant("trained", "as trained"),
-        *(
-            variant("samples", f"{n // 2} + {n // 2}", sampling=samples(n // 2, n // 2))
-            for n in (2 * total, *halves[1:])
-        ),
-        *(variant("samples", f"{n} + 0", sampling=samples(n, 0)) for n in halves[:2]),
-        *(variant("near points", f"{s.num_coarse} within {s.reach}", sampling=s) for s in near),
+        *(variant("samples", f"{coarse} + {fine}", sampling=samples(coarse, fine)) for coarse, fine in anywhere),
+        *(variant("near points", f"{n} within {reach}", sampling=samples(n, reach=reach)) for n, reach in near),
         *(
             variant("rays", f"{n} x {n} rays", render_resolution=n)
             for n in (size // 2, size * 3 // 4)
@@ -153,8 +157,9 @@ def measure(variables: dict, config: TrainConfig, dataset: data.Dataset, names: 
         camera = jax.tree.map(lambda x: jnp.asarray(x)[None, :1], item.camera)
         encodes.append(fastest(lambda c=cloud: training.jitted_encode(variables, c, config=model)))
         scene = training.jitted_encode(variables, cloud, config=model)
-        views.append(fastest(lambda s=scene, c=camera: training.jitted_render(variables, s, c, config=model)))
-    analysis = training.jitted_render.lower(variables, scene, camera, config=model).compile().memory_analysis()
+        render = partial(training.jitted_render, config=model, rays_per_side=rays_per_side(model, item.camera.width))
+        views.append(fastest(partial(render, variables, scene, camera)))
+    analysis = training.jitted_render.lower(variables, scene, camera, **render.keywords).compile().memory_analysis()
     memory = analysis.temp_size_in_bytes / 2**20 if analysis else float("nan")
     times = {"ms_view": float(np.median(views)), "ms_encode": float(np.median(encodes))}
     return {name: round(value, 4) for name, value in (means | times | {"temporary_mb": memory}).items()}
@@ -208,15 +213,25 @@ def plot(rows: list[dict], chosen: list[int]) -> bytes:
     """PNG of quality against cost."""
     figure = Figure(figsize=(14, 3.6), layout="constrained")
     labels = {"psnr": "PSNR, dB", "ssim": "SSIM", "flip": "FLIP (lower is better)"}
+    runs = list(dict.fromkeys(row["run"] for row in rows))
     panels = [("ms_view", "psnr"), ("ms_view", "ssim"), ("ms_view", "flip"), ("temporary_mb", "psnr")]
     for axes, (x, y) in zip(figure.subplots(1, 4), panels, strict=True):
         for group, color in GROUPS.items():
-            shown = [row for row in rows if row["group"] == group]
-            axes.scatter([r[x] for r in shown], [r[y] for r in shown], color=color, s=26, label=group, zorder=3)
+            for number, run in enumerate(runs):
+                shown = [row for row in rows if (row["group"], row["run"]) == (group, run)]
+                marker, label = MARKERS[number % len(MARKERS)], group if number == 0 else None
+                axes.scatter([r[x] for r in shown], [r[y] for r in shown], 26, color, marker, label=label, zorder=3)
+        if len(runs) > 1 and (x, y) == ("ms_view", "ssim"):
+            for number, run in enumerate(runs):
+                axes.scatter([], [], 26, "#1d2330", MARKERS[number % len(MARKERS)], label=Path(run).name)
+            axes.legend(fontsize=7, loc="lower right")
         if (x, y) == ("ms_view", "psnr"):
             axes.plot([rows[i][x] for i in chosen], [rows[i][y] for i in chosen], color="#adb5bd", zorder=2)
             best = rows[knee(rows, chosen)]
-            axes.annotate(f"knee: {best['name']}", (best[x], best[y]), xytext=(12, -24), textcoords="offset points")
+            whose = f"{Path(best['run']).name}, " if len(runs) > 1 else ""
+            axes.annotate(
+                f"knee: {whose}{best['name']}", (best[x], best[y]), xytext=(12, -24), textcoords="offset points"
+            )
             axes.legend(fontsize=7, loc="lower right")
         axes.set_xscale("log")
         axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))

@@ -1,13 +1,16 @@
 """The trade of speed for quality: which settings are measured, which of them nothing beats, and what is written."""
 
+import dataclasses
 import json
 
 import pytest
 import tiny_dataset
+import tiny_model
 
 from experiments import speed_accuracy
 from experiments.speed_accuracy import SpeedAccuracy, front, knee, main, settings
 from spnr_jax import checkpoint, training
+from spnr_jax.config import LossConfig
 
 
 def row(ms, psnr):
@@ -32,6 +35,17 @@ def test_the_trained_way_comes_first_and_every_name_once():
     assert ways[0].config == tiny_dataset.CONFIG
     assert len({way.name for way in ways}) == len(ways)
     assert {way.group for way in ways} == set(speed_accuracy.GROUPS)
+
+
+def test_a_network_near_the_points_is_rendered_with_other_samples_there_and_as_many_rays():
+    alone = LossConfig(adversarial_weight=0.0)
+    config = dataclasses.replace(tiny_dataset.CONFIG, model=tiny_model.PLUS, loss=alone)
+    ways = settings(config)
+    assert ways[0].config == config
+    assert {way.group for way in ways} == {"trained", "near points", "bfloat16", "points"}
+    total = config.model.sampling.num_coarse
+    found = {way.config.model.sampling.num_coarse for way in ways if way.group == "near points"}
+    assert found == {2 * total, 3 * total // 4, total // 2, max(total // 4, 2)}
 
 
 def test_a_second_call_goes_on_where_the_first_one_stopped(tmp_path, monkeypatch):
