@@ -67,7 +67,8 @@ def networks(sources: Sources, dataset: data.Dataset) -> dict[str, Network]:
 
 def name_of(method: str, run: Path, shared: bool) -> str:
     """What tables and pictures call a network."""
-    return f"{LABELS[method]} ({Path(run.parent.name) / run.name})" if shared else LABELS[method]
+    whose = ", ".join(part for part in (run.parent.name, run.name) if part)  # results lie in folders of this name
+    return f"{LABELS[method]} ({whose})" if shared else LABELS[method]
 
 
 def load(run: Path, dataset: data.Dataset) -> Network:

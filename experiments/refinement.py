@@ -46,6 +46,7 @@ def refined(trained: Trained, dataset: data.Dataset, folder: Path, steps: int | 
     """The network with a refiner, trained on pictures of the training objects, for the preset's steps by default."""
     config = presets.with_refiner(trained.config)
     config = dataclasses.replace(config, num_steps=steps or config.num_steps)
+    data.check_spread(dataset, config)
     places = [folder / f"{name}.npz" for name in dataset.splits["train"]]
     for place in tqdm(places, desc="rendering", unit="object"):
         if not place.exists():

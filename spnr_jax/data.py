@@ -227,11 +227,7 @@ def batches(
     names = dataset.splits["train"]
     if not names:
         raise ValueError(f"{dataset.folder}: the train split is empty; generate more objects")
-    if config.even_share and dataset.spread != "even":
-        raise ValueError(
-            f"{dataset.folder}: its points are drawn at random, even_share is {config.even_share}; generate with "
-            "--spread even, or use even_share 0"
-        )
+    check_spread(dataset, config)
     read, own = cached_reader(dataset, config, cache_bytes), own or range(config.batch_objects)
 
     def assemble(step: int) -> Batch:
@@ -269,6 +265,15 @@ def cached_reader(dataset: Dataset, config: TrainConfig, cache_bytes: int) -> Ca
         return data
 
     return read
+
+
+def check_spread(dataset: Dataset, config: TrainConfig) -> None:
+    """ValueError if the config asks for evenly spread clouds where an object's points are random ones."""
+    if config.even_share and dataset.spread != "even":
+        raise ValueError(
+            f"{dataset.folder}: its points are drawn at random, even_share is {config.even_share}; generate with "
+            "--spread even, or use even_share 0"
+        )
 
 
 def check_renders(data: ObjectData, config: TrainConfig) -> None:

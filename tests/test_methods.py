@@ -27,9 +27,9 @@ def test_networks_of_a_table_and_of_runs_are_named_after_their_methods_in_the_or
     dataset = tiny_dataset.dataset()
     assert list(networks(Sources(table1=table), dataset)) == ["Ours", "NPBG"]
     found = networks(Sources(runs=(stand_ins.fresh("tiny"),), table1=table), dataset)
-    assert list(found) == ["Ours (fresh/tiny)", "Ours (runs/ours)", "NPBG"]
+    assert list(found) == ["Ours (fresh, tiny)", "Ours (runs, ours)", "NPBG"]
     assert [network.has_depth for network in found.values()] == [True, True, False]
-    assert found["Ours (runs/ours)"].identity == found["Ours (fresh/tiny)"].identity
+    assert found["Ours (runs, ours)"].identity == found["Ours (fresh, tiny)"].identity
 
 
 def test_the_networks_of_the_package_go_by_their_names():

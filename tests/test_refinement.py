@@ -54,6 +54,13 @@ def test_a_refined_network_is_the_one_before_with_a_refiner(trained, tmp_path):
     assert jax.tree.map(np.shape, refined.variables["params"]) == shapes
 
 
+def test_a_network_that_saw_even_clouds_is_not_refined_on_random_ones(trained, tmp_path):
+    even = dataclasses.replace(trained, config=dataclasses.replace(PLAIN, even_share=0.5))
+    with pytest.raises(ValueError, match="points are drawn at random.*--spread even"):
+        refinement.refined(even, tiny_dataset.dataset(), tmp_path, steps=2)
+    assert not list(tmp_path.iterdir())
+
+
 def test_pictures_that_are_there_are_only_read_and_steps_repeat(trained, tmp_path):
     dataset = tiny_dataset.dataset()
     first = refinement.refined(trained, dataset, tmp_path, steps=2)
