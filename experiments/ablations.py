@@ -4,7 +4,8 @@
 
     OUT/runs/ROW_SEED/                            run folders; finished ones are only read
     OUT/fold_K/runs/ROW_SEED/                     those of a part of the objects, with --folds
-    OUT/results.json  table.md                    scores, costs, and differences to the reference with intervals
+    OUT/results.json  table.md                    scores, costs, and differences to the reference with intervals: on all
+                                                  objects, on mesh files, and on procedural ones
     OUT/differences.png  gallery.png              the differences, and pictures of unseen objects
 
 Every variant trains for as many steps, or with --minutes for as long.  With --folds each part of all objects is held
@@ -28,8 +29,8 @@ import tyro
 from experiments import training_report, training_runs
 from experiments.training_runs import Budget, Variant
 from spnr_jax import cli, data, presets
-from spnr_jax.config import TrainConfig
-from spnr_jax.model_config import ModelConfig
+from spnr_jax.config import LossConfig, TrainConfig
+from spnr_jax.model_config import ModelConfig, SamplingConfig
 
 Row = Literal[
     "paper",
@@ -50,6 +51,12 @@ Row = Literal[
     "batch_norm",
     "no_opacity_loss",
     "no_squared_error",
+    "adversarial",
+    "no_average",
+    "one_count",
+    "more_views",
+    "half_samples",
+    "twice_samples",
 ]
 ROWS: tuple[Row, ...] = Row.__args__  # type: ignore[attr-defined]
 REFERENCE = "reference"
@@ -72,6 +79,12 @@ LABELS = {
     "batch_norm": "PointNet: batch normalisation",
     "no_opacity_loss": "No loss of opacity",
     "no_squared_error": "L1 alone",
+    "adversarial": "With the discriminator at the end",
+    "no_average": "Last weights, not their average",
+    "one_count": "Clouds of one size",
+    "more_views": "4 views of an object a step, as many rays",
+    "half_samples": "Half the samples",
+    "twice_samples": "Twice the samples",
 }
 
 
@@ -119,13 +132,13 @@ def folds(dataset: data.Dataset, count: int) -> list[data.Dataset]:
     if count == 1:
         return [dataset]
     everything = sorted(name for names in dataset.splits.values() for name in names)
-    objects = [name for name in everything if "--" not in name]
+    objects = [name for name in everything if name == training_runs.original(name)]
     if len(objects) < 2 * count:
         raise ValueError(f"--folds {count}: {dataset.folder} holds {len(objects)} objects, too few")
     found = []
     for first in range(count):
         test = tuple(objects[first::count])
-        train = tuple(name for name in everything if name.split("--")[0] not in test)
+        train = tuple(name for name in everything if training_runs.original(name) not in test)
         found.append(dataclasses.replace(dataset, splits={"train": train, "val": (), "test": test}))
     return found
 
@@ -150,8 +163,10 @@ def paper_network(config: TrainConfig) -> TrainConfig:
         tiny = presets.tiny()
         assert isinstance(tiny.model, ModelConfig)
         model = dataclasses.replace(tiny.model, render_resolution=64, resize_resolution=64, image_resolution=128)
-        return dataclasses.replace(tiny, model=model, num_steps=config.num_steps)
-    return dataclasses.replace(made.get(config.preset, lambda: config)(), num_steps=config.num_steps)
+        paper = dataclasses.replace(tiny, model=model)
+    else:
+        paper = made.get(config.preset, lambda: config)()
+    return dataclasses.replace(paper, num_steps=config.num_steps, even_share=config.even_share)
 
 
 def changed(row: Row, config: TrainConfig) -> TrainConfig:
@@ -159,8 +174,18 @@ def changed(row: Row, config: TrainConfig) -> TrainConfig:
     if row == "paper":
         return paper_network(config)
     assert isinstance(config.model, ModelConfig)
-    samples = config.model.sampling
-    model: dict[str, dict] = {
+    return dataclasses.replace(
+        config,
+        model=dataclasses.replace(config.model, **model_changes(config.model).get(row, {})),
+        loss=dataclasses.replace(config.loss, **loss_changes(config.loss).get(row, {})),
+        **recipe_changes(config).get(row, {}),
+    )
+
+
+def model_changes(model: ModelConfig) -> dict[str, dict]:
+    """The fields of a network that rows change."""
+    samples = model.sampling
+    changes: dict[str, dict] = {
         **{f"depth_{stages}": {"num_stages": stages} for stages in (3, 4, 5)},
         "skip_concat": {"skip": "concat"},
         "no_fine_samples": {
@@ -170,22 +195,49 @@ def changed(row: Row, config: TrainConfig) -> TrainConfig:
         "scatter_max": {"scatter": "max"},
         "scatter_trilinear": {"scatter": "trilinear"},
         "batch_norm": {"point_norm": "batch"},
+        "half_samples": {"sampling": scaled(samples, 0.5)},
+        "twice_samples": {"sampling": scaled(samples, 2)},
     }
-    if config.model.num_neighbors:
-        model |= {
+    if model.num_neighbors:
+        changes |= {
             "free_colour": {"color": "free"},
             "no_neighbours": {"color": "free", "num_neighbors": 0, "num_features": ModelConfig.num_features},
             "three_neighbours": {"num_neighbors": 3},
             "twelve_neighbours": {"num_neighbors": 12},
         }
-    loss: dict[Row, dict] = {
+    return changes
+
+
+def loss_changes(loss: LossConfig) -> dict[str, dict]:
+    """The fields of the losses that rows change."""
+    changes: dict[str, dict] = {
         "no_condition": {"condition": False},
         "no_opacity_loss": {"opacity_weight": 0.0},
         "no_squared_error": {"mse_weight": 0.0},
     }
-    if row in loss:
-        return dataclasses.replace(config, loss=dataclasses.replace(config.loss, **loss[row]))
-    return dataclasses.replace(config, model=dataclasses.replace(config.model, **model.get(row, {})))
+    if loss.adversarial_weight == 0:  # as tiny has it, beside an L1 of weight 1
+        changes["adversarial"] = {"adversarial_weight": 0.01, "adversarial_start": 0.85, "discriminator_width": 16}
+    return changes
+
+
+def recipe_changes(config: TrainConfig) -> dict[str, dict]:
+    """The other fields of a training that rows change."""
+    changes: dict[str, dict] = {
+        "no_average": {"optimizer": dataclasses.replace(config.optimizer, ema_decay=0.0)},
+        "one_count": {"min_points": config.max_points},
+        "more_views": {"views_per_object": 4 * config.views_per_object},
+    }
+    if config.model.per_pixel:
+        changes["more_views"] |= {"pixel_stride": 2 * config.pixel_stride}
+    if config.loss.adversarial_weight == 0:
+        changes["adversarial"] = {"pixel_stride": 1, "crop": 0}  # the discriminator sees whole pictures
+    return changes
+
+
+def scaled(sampling: SamplingConfig, factor: float) -> SamplingConfig:
+    """So many times as many samples, coarse and fine ones."""
+    coarse, fine = (round(factor * count) for count in (sampling.num_coarse, sampling.num_fine))
+    return dataclasses.replace(sampling, num_coarse=coarse, num_fine=fine)
 
 
 if __name__ == "__main__":

@@ -106,8 +106,8 @@ def variants_picture(dataset: data.Dataset, num_objects: int) -> bytes:
     """
     found: dict[str, list[str]] = {}
     for name in sorted(dataset.splits["train"]):
-        if "--" in name:
-            found.setdefault(name.partition("--")[0], []).append(name)
+        if name != training_runs.original(name):
+            found.setdefault(training_runs.original(name), []).append(name)
     rows, most = [], min(MOST_SHOWN, max(map(len, found.values())))
     for product in evaluation.spread(tuple(p for p in found if len(found[p]) >= most), num_objects):
         items = [data.read_object(dataset, name) for name in (product, *found[product][:most])]

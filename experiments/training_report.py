@@ -15,7 +15,9 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import MaxNLocator
 
+from experiments import training_runs
 from experiments.table1_report import Cell, Table, markdown
+from experiments.table1_scores import classes_of
 from experiments.training_runs import OPAQUE, Budget, Compared, Variant
 from spnr_jax import data, evaluation, statistics
 from spnr_jax.images import write_whole
@@ -45,9 +47,9 @@ def write(
 ) -> None:
     """Writes the files and prints the tables; what is in `more` is written with the results."""
     results = numbers(variants, reference, compared, budget, dataset) | dict(more or {})
-    tables, labels = [quality_table(results)], {variant.name: variant.label for variant in variants}
+    labels = {variant.name: variant.label for variant in variants}
+    tables = tables_of(results)
     if len(variants) > 1:
-        tables.append(differences_table(results))
         write_whole(out / "differences.png", differences_plot(results))
     write_whole(out / "results.json", (json.dumps(results, indent=1, allow_nan=False) + "\n").encode())
     write_whole(out / "table.md", markdown(tables, notes(results)).encode())
@@ -60,30 +62,46 @@ def numbers(
     variants: Sequence[Variant], reference: str, compared: Compared, budget: Budget, dataset: data.Dataset
 ) -> dict:
     """Everything that is written, and the conditions that it stands on."""
-    config = variants[0].config
-    return {
+    config, names = variants[0].config, compared.names
+    meshes = classes_of(names).get(evaluation.MESHES, [])
+    origins = {"mesh files": meshes, "procedural": [name for name in names if name not in meshes]}
+    whole = comparison(compared, reference)
+    return whole | {
         "variants": {
             variant.name: {"label": variant.label, "training_objects": len(variant.dataset.splits["train"])}
             | compared.costs[variant.name]
-            | means(compared.scores[variant.name])
+            | whole["variants"][variant.name]
             for variant in variants
         },
         "reference": reference,
-        "minus_reference": {
-            variant.name: {metric: change(compared, variant.name, reference, metric) for metric in METRICS}
-            for variant in variants
-            if variant.name != reference
+        "by_origin": {
+            origin: comparison(training_runs.part(compared, found), reference)
+            for origin, found in origins.items()
+            if 0 < len(found) < len(names)
         },
         "preset": budget.preset,
         "minutes": budget.minutes,
+        "even_share": budget.even_share,
         "seeds": list(budget.seeds),
         "hardware": evaluation.hardware(),
         "data": dataset.settings.get("settings", {}),
-        "test_objects": list(compared.names),
         "views": len(next(iter(compared.scores.values()))[0]["psnr"]) // len(budget.seeds),
         "points": config.test_points,
         "resolution": config.model.image_resolution,
         "metrics": metric_settings(with_lpips=False),
+    }
+
+
+def comparison(compared: Compared, reference: str) -> dict:
+    """Quality of every variant on the objects that were compared, and all differences to the reference."""
+    return {
+        "variants": {name: means(scores) for name, scores in compared.scores.items()},
+        "minus_reference": {
+            name: {metric: change(compared, name, reference, metric) for metric in METRICS}
+            for name in compared.scores
+            if name != reference
+        },
+        "test_objects": list(compared.names),
     }
 
 
@@ -122,7 +140,19 @@ def heads() -> tuple[str, ...]:
     return tuple(f"{head} {ARROWS[better]}" if better else head for head, _, better in METRICS.values())
 
 
-def quality_table(results: Mapping) -> Table:
+def tables_of(results: Mapping) -> list[Table]:
+    """Qualities and differences on all objects, and on those of each origin where there are several."""
+    found = []
+    for origin, own in {"": results, **results["by_origin"]}.items():
+        variants = {name: row | own["variants"][name] for name, row in results["variants"].items()}
+        shown = results | own | {"variants": variants}
+        found.append(quality_table(shown, origin))
+        if shown["minus_reference"]:
+            found.append(differences_table(shown, origin))
+    return found
+
+
+def quality_table(results: Mapping, origin: str = "") -> Table:
     """Quality and cost of every variant."""
     rows = []
     for row in results["variants"].values():
@@ -136,11 +166,11 @@ def quality_table(results: Mapping) -> Table:
             Cell(text="-" if row[c] is None else f"{row[c]:,}" if c == "parameters" else f"{row[c]:.1f}") for c in COSTS
         ]
         rows.append((row["label"], tuple(cells)))
-    title = f"{len(results['test_objects'])} unseen objects, {results['views']} views each"
+    title = f"{len(results['test_objects'])} unseen objects{from_(origin)}, {results['views']} views each"
     return Table(title=title, heads=(*heads(), *COSTS.values()), rows=tuple(rows))
 
 
-def differences_table(results: Mapping) -> Table:
+def differences_table(results: Mapping, origin: str = "") -> Table:
     """Every variant minus the reference."""
     rows = []
     for name, changes in results["minus_reference"].items():
@@ -159,7 +189,12 @@ def differences_table(results: Mapping) -> Table:
         rows.append((results["variants"][name]["label"], tuple(cells)))
     label = results["variants"][results["reference"]]["label"]
     note = "View by view on equal seeds; 95 % bootstrap intervals over objects. Bold: the interval leaves out 0."
-    return Table(title=f"Minus {label}", heads=heads(), rows=tuple(rows), note=note)
+    return Table(title=f"Minus {label}{from_(origin)}", heads=heads(), rows=tuple(rows), note=note)
+
+
+def from_(origin: str) -> str:
+    """Which objects a table is of, for its title."""
+    return f" ({origin})" if origin else ""
 
 
 def ends(interval: Sequence[float] | None, decimals: int, sign: str = "") -> tuple[str, ...]:
@@ -174,9 +209,11 @@ def notes(results: Mapping) -> list[str]:
     budget = f"{steps[0]:,} steps each"
     if results["minutes"] is not None:
         budget = f"{results['minutes']:g} minutes of training steps each, {min(steps):,} to {max(steps):,}"
+    share = results["even_share"]
+    clouds = f" Share of the training clouds that are evenly spread: {share:g}." if share else ""
     return [
         f"Budget: preset {results['preset']}, {budget}, {' or '.join(map(str, counts))} training objects. "
-        f"Seeds: {', '.join(map(str, results['seeds']))}.",
+        f"Seeds: {', '.join(map(str, results['seeds']))}.{clouds}",
         f"Hardware: {results['hardware']}.",
         f"Every variant: the same {len(results['test_objects'])} test objects, cameras and first {results['points']} "
         f"points; {results['resolution']} px.",

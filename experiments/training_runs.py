@@ -45,6 +45,8 @@ class Budget:
     """Training steps of every variant (default: the preset's)."""
     minutes: float | None = None
     """Minutes of training steps that each gets on this machine instead, as many steps as fit."""
+    even_share: float = 0.0
+    """Share of the training clouds that are first points of an object, in a data set of `--spread even`."""
     seeds: tuple[int, ...] = (0,)
     """Seeds of weights, batches and jitter; every variant trains with each of them."""
     objects: int | None = None
@@ -67,9 +69,10 @@ class Budget:
             raise ValueError(f"--shown: expected 1 or more, got {self.shown}")
 
     def config(self) -> TrainConfig:
-        """The preset with the steps of this budget."""
+        """The preset with the steps and the clouds of this budget."""
         config = PRESETS[self.preset]()
-        return dataclasses.replace(config, num_steps=QUICK_STEPS if self.quick else self.steps or config.num_steps)
+        steps = QUICK_STEPS if self.quick else self.steps or config.num_steps
+        return dataclasses.replace(config, num_steps=steps, even_share=self.even_share)
 
     def names(self, dataset: data.Dataset) -> tuple[str, ...]:
         """The objects to be scored."""
@@ -115,6 +118,8 @@ def claim(out: Path, what: str, budget: Budget, dataset: data.Dataset, **more: o
     asked = {"experiment": what, "preset": budget.preset, "steps": budget.config().num_steps, **more}
     if budget.minutes is not None:
         asked |= {"steps": None, "minutes": budget.minutes}
+    if budget.even_share:
+        asked |= {"even_share": budget.even_share}
     claims.claim(out / "asked.json", asked | {"data": run_record.checksum(dataset)}, "results")
 
 
@@ -122,11 +127,13 @@ def train(variants: Sequence[Variant], budget: Budget, out: Path) -> dict[str, l
     """The network of every variant and seed, trained one after another."""
     runs: dict[str, list[Run]] = {variant.name: [] for variant in variants}
     todo = list(itertools.product(budget.seeds, variants))
+    steps: dict[str, int] = {}
     for number, (seed, variant) in enumerate(todo, start=1):
         run, config = out / "runs" / f"{variant.name}_{seed}", dataclasses.replace(variant.config, seed=seed)
         place = f"run {number} of {len(todo)}: {variant.label}, seed {seed}"
         if budget.minutes is not None:
-            config = table1_training.within(budget.minutes, config, variant.dataset, run)
+            config = table1_training.within(budget.minutes, config, variant.dataset, run, steps.get(variant.name))
+            steps[variant.name] = config.num_steps  # its other seeds train for as many
         print(f"{place}: {config.num_steps} steps in {run}", flush=True)
         if variant.start and not (run / "checkpoints").is_dir():
             checkpoint.write_config(run, config)
@@ -144,9 +151,14 @@ def step_milliseconds(run: Path) -> float | None:
 
 
 def without_colour_variants(dataset: data.Dataset) -> data.Dataset:
-    """The data set whose training objects have no colour variants (they are called ID--1, ID--2, ...)."""
-    train = tuple(name for name in dataset.splits["train"] if "--" not in name)
+    """The data set whose training objects have no colour variants."""
+    train = tuple(name for name in dataset.splits["train"] if name == original(name))
     return dataclasses.replace(dataset, splits=dataset.splits | {"train": train})
+
+
+def original(name: str) -> str:
+    """The object that a variant was made of (these are called ID--1, ID--2, ...), or the object itself."""
+    return name.partition("--")[0]
 
 
 def score(
@@ -220,6 +232,17 @@ def merged(parts: Sequence[Compared]) -> Compared:
         },
         shown=[one for part in parts for one in part.shown],
         shown_scores=[one for part in parts for one in part.shown_scores],
+    )
+
+
+def part(compared: Compared, names: Sequence[str]) -> Compared:
+    """The comparison on some of its objects; costs and pictures are those of all."""
+    own = [compared.names.index(name) for name in names]
+    return dataclasses.replace(
+        compared,
+        names=tuple(names),
+        scores={name: [scores[i] for i in own] for name, scores in compared.scores.items()},
+        by_seed={name: [[scores[i] for i in own] for scores in seeds] for name, seeds in compared.by_seed.items()},
     )
 
 

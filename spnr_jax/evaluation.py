@@ -30,6 +30,7 @@ from spnr_jax.weights import read_trained
 
 RADIUS_FACTORS = (0.5, 0.75, 1.0, 1.5, 2.0)
 FLOORS = ("white", "splat", "nearest")
+MESHES = "meshes"  # the class of all objects that come from mesh files
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -265,7 +266,7 @@ def evaluate(
 def category_of(name: str) -> str:
     """Class of an object from its name (chair_000012); mesh files are one class."""
     stem, _, number = name.rpartition("_")
-    return stem if number.isdigit() and len(number) == 6 else "meshes"
+    return stem if number.isdigit() and len(number) == 6 else MESHES
 
 
 def hardware() -> str:

@@ -58,6 +58,12 @@ class TestRows:
             "no_view_direction": {"model.sees_direction": False},
             "scatter_max": {"model.scatter": "max"},
             "scatter_trilinear": {"model.scatter": "trilinear"},
+            "adversarial": {},  # tiny has it
+            "no_average": {"optimizer.ema_decay": 0.0},
+            "one_count": {"min_points": 1024},
+            "more_views": {"views_per_object": 4},
+            "half_samples": {"model.sampling.num_coarse": 8, "model.sampling.num_fine": 8},
+            "twice_samples": {"model.sampling.num_coarse": 32, "model.sampling.num_fine": 32},
         } | dict.fromkeys(PLUS_ROWS, {})
         assert {row: self.changes(row, self.tiny) for row in ROWS} == expected
         assert set(LABELS) == set(ROWS)
@@ -74,6 +80,20 @@ class TestRows:
         }
         assert {row: self.changes(row, presets.plus_tiny()) for row in PLUS_ROWS} == expected
 
+    def test_a_plus_network_is_trained_in_other_ways(self):
+        expected = {
+            "adversarial": {
+                "loss.adversarial_weight": 0.01,
+                "loss.adversarial_start": 0.85,
+                "loss.discriminator_width": 16,
+                "pixel_stride": 1,
+            },
+            "more_views": {"views_per_object": 4, "pixel_stride": 4},
+            "half_samples": {"model.sampling.num_coarse": 4},
+            "twice_samples": {"model.sampling.num_coarse": 16},
+        }
+        assert {row: self.changes(row, presets.plus_tiny()) for row in expected} == expected
+
     def test_the_paper_s_network_is_the_preset_that_a_plus_one_was_made_of(self):
         plus = dataclasses.replace(presets.plus_tiny(), num_steps=77)
         assert changed("paper", plus) == dataclasses.replace(presets.tiny(), num_steps=77)
@@ -82,6 +102,10 @@ class TestRows:
         for size in ("point_widths", "volume_resolution", "base_width", "num_stages", "field_width"):
             assert getattr(model, size) == getattr(larger, size)
         assert changed("paper", presets.tiny()) == presets.tiny()
+
+    def test_all_rows_train_on_the_clouds_of_the_budget(self):
+        config = Budget(preset="plus_tiny", even_share=0.5).config()
+        assert {changed(row, config).even_share for row in ROWS} == {0.5}
 
     @staticmethod
     def changes(row, config):
@@ -94,6 +118,7 @@ class TestRows:
             "paper",
             "depth_3",
             "no_colour_variants",
+            "adversarial",
             *PLUS_ROWS,
         }
         said = capsys.readouterr().out
@@ -114,8 +139,13 @@ def test_scores_and_differences_are_those_of_the_runs_on_the_same_views(out):
         found, state = checkpoint.load_run(out / "runs" / f"{row}_0")
         show = {row: evaluation.network(training.averaged_variables(state), found)}
         scored = evaluation.evaluate_objects(show, found, tiny_dataset.dataset(), ("ball_000004", "chair"))
-        psnr[row] = np.concatenate([result.scores[row]["psnr"] for result in scored])
+        own = {result.name: result.scores[row]["psnr"] for result in scored}
+        psnr[row] = np.concatenate(list(own.values()))
         assert results["variants"][row]["psnr"] == pytest.approx(psnr[row].mean(), abs=1e-5)
+        for origin, name in (("procedural", "ball_000004"), ("mesh files", "chair")):
+            part = results["by_origin"][origin]
+            assert part["test_objects"] == [name]
+            assert part["variants"][row]["psnr"] == pytest.approx(own[name].mean(), abs=1e-5)
     difference = results["minus_reference"]["skip_concat"]["psnr"]
     assert difference["mean"] == pytest.approx((psnr["skip_concat"] - psnr["reference"]).mean(), abs=1e-5)
     assert difference["by_seed"] == [difference["mean"]]
@@ -152,11 +182,17 @@ def test_variants_are_held_out_with_their_object():
 
 
 def test_minutes_give_every_variant_the_steps_that_fit(tmp_path, monkeypatch):
-    paces = {"add": 2.0, "concat": 6.0}
-    monkeypatch.setattr(table1_training, "step_seconds", lambda config, *_: paces[config.model.skip])
-    main(asked(tmp_path, quick=False, minutes=0.2))
-    results = results_of(tmp_path)
-    assert {name: row["steps"] for name, row in results["variants"].items()} == {"reference": [6], "skip_concat": [2]}
+    paces, measured = {"add": 2.0, "concat": 6.0}, []
+
+    def step_seconds(config, *_):
+        measured.append((config.model.skip, config.seed))
+        return paces[config.model.skip]
+
+    monkeypatch.setattr(table1_training, "step_seconds", step_seconds)
+    main(asked(tmp_path, quick=False, minutes=0.2, seeds=(0, 1)))
+    steps = {name: row["steps"] for name, row in results_of(tmp_path)["variants"].items()}
+    assert steps == {"reference": [6, 6], "skip_concat": [2, 2]}
+    assert set(measured) == {("add", 0), ("concat", 0)}, "once for all seeds"
     assert "0.2 minutes of training steps each, 2 to 6" in (tmp_path / "table.md").read_text()
     assert cli.guarded(lambda: main(asked(tmp_path, quick=False, minutes=0.4)), "ablations") == 2
 
