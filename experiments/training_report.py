@@ -79,6 +79,13 @@ def numbers(
             for origin, found in origins.items()
             if 0 < len(found) < len(names)
         },
+        "by_object": {
+            name: {
+                variant: {metric: round(float(scores[i][metric].mean()), 4) for metric in ("psnr", "flip")}
+                for variant, scores in compared.scores.items()
+            }
+            for i, name in enumerate(names)
+        },
         "preset": budget.preset,
         "minutes": budget.minutes,
         "even_share": budget.even_share,

@@ -146,6 +146,7 @@ def test_scores_and_differences_are_those_of_the_runs_on_the_same_views(out):
             part = results["by_origin"][origin]
             assert part["test_objects"] == [name]
             assert part["variants"][row]["psnr"] == pytest.approx(own[name].mean(), abs=1e-5)
+            assert results["by_object"][name][row]["psnr"] == pytest.approx(own[name].mean(), abs=1e-4)
     difference = results["minus_reference"]["skip_concat"]["psnr"]
     assert difference["mean"] == pytest.approx((psnr["skip_concat"] - psnr["reference"]).mean(), abs=1e-5)
     assert difference["by_seed"] == [difference["mean"]]
