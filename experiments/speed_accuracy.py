@@ -32,8 +32,9 @@ import tyro
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 
+from experiments import claims
 from experiments.methods import test_objects
-from spnr_jax import checkpoint, cli, data, evaluation, training
+from spnr_jax import checkpoint, cli, data, evaluation, run_record, training
 from spnr_jax.config import TrainConfig
 from spnr_jax.images import write_whole
 from spnr_jax.model_config import ModelConfig, SamplingConfig
@@ -117,6 +118,8 @@ def main(options: SpeedAccuracy) -> None:
     cli.set_up_jax()
     dataset = data.open_dataset(options.data)
     names = test_objects(dataset, options.objects)
+    asked = {"objects": list(names), "data": run_record.checksum(dataset)}
+    claims.claim(options.out / "asked.json", asked, "results")
     place = options.out / "results.json"
     rows: list[dict] = json.loads(place.read_text())["rows"] if place.exists() else []
     todo = [(run, setting) for run in options.runs for setting in settings(checkpoint.read_config(run))]
@@ -211,7 +214,7 @@ def table(rows: list[dict], chosen: list[int]) -> str:
 
 def plot(rows: list[dict], chosen: list[int]) -> bytes:
     """PNG of quality against cost."""
-    figure = Figure(figsize=(14, 3.6), layout="constrained")
+    figure = Figure(figsize=(14, 3.9), layout="constrained")
     labels = {"psnr": "PSNR, dB", "ssim": "SSIM", "flip": "FLIP (lower is better)"}
     runs = list(dict.fromkeys(row["run"] for row in rows))
     panels = [("ms_view", "psnr"), ("ms_view", "ssim"), ("ms_view", "flip"), ("temporary_mb", "psnr")]
@@ -220,11 +223,8 @@ def plot(rows: list[dict], chosen: list[int]) -> bytes:
             for number, run in enumerate(runs):
                 shown = [row for row in rows if (row["group"], row["run"]) == (group, run)]
                 marker, label = MARKERS[number % len(MARKERS)], group if number == 0 else None
-                axes.scatter([r[x] for r in shown], [r[y] for r in shown], 26, color, marker, label=label, zorder=3)
-        if len(runs) > 1 and (x, y) == ("ms_view", "ssim"):
-            for number, run in enumerate(runs):
-                axes.scatter([], [], 26, "#1d2330", MARKERS[number % len(MARKERS)], label=Path(run).name)
-            axes.legend(fontsize=7, loc="lower right")
+                look = {"color": color, "marker": marker, "s": 26, "zorder": 3}
+                axes.scatter([r[x] for r in shown], [r[y] for r in shown], **look, label=label)
         if (x, y) == ("ms_view", "psnr"):
             axes.plot([rows[i][x] for i in chosen], [rows[i][y] for i in chosen], color="#adb5bd", zorder=2)
             best = rows[knee(rows, chosen)]
@@ -232,7 +232,10 @@ def plot(rows: list[dict], chosen: list[int]) -> bytes:
             axes.annotate(
                 f"knee: {whose}{best['name']}", (best[x], best[y]), xytext=(12, -24), textcoords="offset points"
             )
-            axes.legend(fontsize=7, loc="lower right")
+            for number, run in enumerate(runs if len(runs) > 1 else ()):
+                marker = MARKERS[number % len(MARKERS)]
+                axes.scatter([], [], s=26, color="#1d2330", marker=marker, label=Path(run).name)
+            figure.legend(loc="outside lower center", ncols=len(GROUPS) + len(runs), fontsize=8)
         axes.set_xscale("log")
         axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         axes.xaxis.set_major_formatter(ScalarFormatter())

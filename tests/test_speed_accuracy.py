@@ -72,6 +72,8 @@ def test_a_second_call_goes_on_where_the_first_one_stopped(tmp_path, monkeypatch
     assert len({row["name"] for row in rows}) == len(rows) == len(measured) - 1
     assert (tmp_path / "front.png").stat().st_size > 1000
     assert "as trained" in (tmp_path / "table.md").read_text()
+    with pytest.raises(ValueError, match="results with another objects; choose another --out"):
+        main(dataclasses.replace(options, objects=2))
 
 
 def test_a_setting_is_scored_and_timed():
