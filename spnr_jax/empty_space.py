@@ -61,7 +61,7 @@ def open_path(
         voxel_of(rays.origins[..., i, None] + middles * rays.directions[..., i, None], resolution) for i in range(3)
     )
     is_open = gather_rows(near_points.reshape(-1, 1).astype(near.dtype), row_at(x, y, z, resolution))[..., 0]
-    # equal cells are counted, in a product: a running sum takes a CPU four times as long
+    # equal cells are counted, in a product: a running sum takes a CPU longer, docs/performance.md
     count = is_open @ jnp.triu(jnp.ones((num_cells, num_cells + 1), near.dtype), 1)
     return jax.lax.stop_gradient(Path(edges=edges, travelled=count * ((far - near) / num_cells)))
 

@@ -32,7 +32,7 @@ from spnr_jax.types import Camera, Key, PointCloud, Rays, Rendering, Scene
 
 CELLS_PER_VOXEL = 1  # of a path through the box, counted along an axis
 RAY_BLOCK = 256  # rays near points that are rendered at once
-CPU_BLOCK = 64  # the same without gradients on a CPU: what their samples read stays in its first cache
+CPU_BLOCK = 64  # the same on a CPU without a training's key: what they read stays in its first cache
 
 
 class Renderer(nn.Module):
