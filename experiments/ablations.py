@@ -42,6 +42,7 @@ Row = Literal[
     "skip_concat",
     "no_fine_samples",
     "no_view_direction",
+    "view_direction",
     "scatter_max",
     "scatter_trilinear",
     "free_colour",
@@ -70,6 +71,7 @@ LABELS = {
     "skip_concat": "Skips concatenated",
     "no_fine_samples": "No fine samples",
     "no_view_direction": "No view direction",
+    "view_direction": "Sees the view direction",
     "scatter_max": "Scatter: maximum",
     "scatter_trilinear": "Scatter: trilinear",
     "free_colour": "Free colours, not light on materials",
@@ -192,6 +194,7 @@ def model_changes(model: ModelConfig) -> dict[str, dict]:
             "sampling": dataclasses.replace(samples, num_coarse=samples.num_coarse + samples.num_fine, num_fine=0)
         },
         "no_view_direction": {"sees_direction": False},
+        "view_direction": {"sees_direction": True},
         "scatter_max": {"scatter": "max"},
         "scatter_trilinear": {"scatter": "trilinear"},
         "batch_norm": {"point_norm": "batch"},

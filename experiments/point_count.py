@@ -30,7 +30,7 @@ from experiments.point_count_report import METRICS, plot, table
 from experiments.source_meshes import details, mesh_of
 from experiments.table1_poisson import SURFACES
 from experiments.table1_report import LABELS
-from experiments.table1_scores import ObjectMethod, classes_of
+from experiments.table1_scores import ObjectMethod
 from spnr_jax import cli, data, evaluation, run_record, statistics
 from spnr_jax.config import TrainConfig
 from spnr_jax.images import png, write_whole
@@ -262,7 +262,7 @@ def by_class(scores: dict[str, Scores]) -> dict[str, dict]:
             "psnr": {label: float(np.mean([found[name] for name in names])) for label, found in psnr.items()},
             "best on": {label: sum(best[name] == label for name in names) for label in psnr},
         }
-        for category, names in classes_of(first).items()
+        for category, names in evaluation.classes_of(first).items()
     }
 
 

@@ -92,7 +92,7 @@ def recipe(options: Pretrain) -> list[TrainConfig]:
     if options.network == "tiny":
         runs = [presets.plus_lite()]
     else:
-        first = presets.with_samples(presets.plus_small(), presets.PACKAGE_SAMPLES)
+        first = presets.packaged(presets.plus_small(), presets.PACKAGE_SAMPLES)
         runs = [
             first,
             later(first, steps=9000, seed=first.seed + 1, lr=1.5e-3),

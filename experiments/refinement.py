@@ -2,12 +2,14 @@
 
     FOLDER/OBJECT.npz   what the rays of an object's views gave, (views, height, width, features) as float16, and the
                         references (views, height, width, 4) in 8 bits; finished ones are only read
+    FOLDER/asked.json   whose pictures they are: another network or data set is refused
 
 Rendering would cost a step several times what the refiner's own work does, and would give the same again and again.
 Steps see crops of the pictures, mirrored and upside down too.
 """
 
 import dataclasses
+import hashlib
 import io
 import zlib
 from collections.abc import Iterator
@@ -21,7 +23,8 @@ import optax
 from jaxtyping import Array, Float
 from tqdm import tqdm
 
-from spnr_jax import cameras, clouds, data, losses, presets
+from experiments import claims
+from spnr_jax import cameras, clouds, data, losses, presets, run_record, training
 from spnr_jax.colors import LEAST_OPACITY
 from spnr_jax.config import TrainConfig
 from spnr_jax.images import write_whole
@@ -47,6 +50,9 @@ def refined(trained: Trained, dataset: data.Dataset, folder: Path, steps: int | 
     config = presets.with_refiner(trained.config)
     config = dataclasses.replace(config, num_steps=steps or config.num_steps)
     data.check_spread(dataset, config)
+    numbers = b"".join(np.asarray(x).tobytes() for x in jax.tree.leaves(trained.variables))
+    asked = {"network": hashlib.sha256(numbers).hexdigest(), "data": run_record.checksum(dataset)}
+    claims.claim(folder / "asked.json", asked | {"even_share": config.even_share}, "pictures")
     places = [folder / f"{name}.npz" for name in dataset.splits["train"]]
     for place in tqdm(places, desc="rendering", unit="object"):
         if not place.exists():
@@ -109,9 +115,7 @@ def train(config: TrainConfig, pictures: list[tuple[np.ndarray, np.ndarray]]) ->
         loss, gradient = jax.value_and_grad(partial(error, refiner, config))(weights, seen, reference)
         update, optimizer = algorithm.update(gradient, optimizer, weights)
         weights = optax.apply_updates(weights, update)
-        decay = jnp.minimum(DECAY, (1 + number) / (10 + number))
-        averaged = jax.tree.map(lambda old, new: decay * old + (1 - decay) * new, averaged, weights)
-        return weights, optimizer, averaged, loss
+        return weights, optimizer, training.moving_average(averaged, weights, number, DECAY), loss
 
     optimizer, averaged = algorithm.init(weights), jax.tree.map(jnp.copy, weights)
     shown: list[Array] = []

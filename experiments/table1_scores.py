@@ -4,7 +4,7 @@ Here a method shows an object of the data set, because pictures of Poisson surfa
 """
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -103,13 +103,5 @@ def shown_view(result: evaluation.ObjectResult) -> Shown:
 
 def by_category(scores: dict[str, dict[str, Scores]]) -> dict[str, dict]:
     """The summary of each class of objects, if there are several."""
-    classes = classes_of(scores)
+    classes = evaluation.classes_of(scores)
     return {c: summarise([scores[name] for name in names]) for c, names in classes.items()} if len(classes) > 1 else {}
-
-
-def classes_of(names: Iterable[str]) -> dict[str, list[str]]:
-    """The objects of each class, sorted."""
-    classes: dict[str, list[str]] = {}
-    for name in sorted(names):
-        classes.setdefault(evaluation.category_of(name), []).append(name)
-    return classes

@@ -17,7 +17,6 @@ from matplotlib.ticker import MaxNLocator
 
 from experiments import training_runs
 from experiments.table1_report import Cell, Table, markdown
-from experiments.table1_scores import classes_of
 from experiments.training_runs import OPAQUE, Budget, Compared, Variant
 from spnr_jax import data, evaluation, statistics
 from spnr_jax.images import write_whole
@@ -63,7 +62,7 @@ def numbers(
 ) -> dict:
     """Everything that is written, and the conditions that it stands on."""
     config, names = variants[0].config, compared.names
-    meshes = classes_of(names).get(evaluation.MESHES, [])
+    meshes = evaluation.classes_of(names).get(evaluation.MESHES, [])
     origins = {"mesh files": meshes, "procedural": [name for name in names if name not in meshes]}
     whole = comparison(compared, reference)
     return whole | {

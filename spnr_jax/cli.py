@@ -40,7 +40,7 @@ class Train:
     """Every number of the run; --preset chooses the defaults."""
     init: str | None = None
     """Weights that a new run begins with: a run folder, a file of weights, or `small` or `tiny`, the networks in the
-    package, which are of the presets plus_small and plus_lite (default: random)."""
+    package, which are of the presets plus_refined and plus_lite (default: random)."""
     log_every: int = 20
     """Steps between rows of metrics.jsonl and TensorBoard."""
     preview_every: int = 500

@@ -7,7 +7,7 @@ spacing with the best PSNR.
 
 import os
 import platform
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -244,7 +244,6 @@ def evaluate(
     methods = {"ours": network(trained.variables, config)}
     methods |= {name: floor(name, factors.get(name, 1.0)) for name in FLOORS}
     scores, gallery = score_methods(methods, config, dataset, names, gallery_objects, say, weights)
-    categories = sorted({category_of(name) for name in names})
     summary = {
         "methods": summarise(list(scores.values())),
         "ours_minus": differences(list(scores.values())),
@@ -259,8 +258,17 @@ def evaluate(
             "metrics": metric_settings(with_lpips=weights is not None),
         },
     }
-    per_category = {c: summarise([s for n, s in scores.items() if category_of(n) == c]) for c in categories}
+    classes = classes_of(scores)
+    per_category = {category: summarise([scores[name] for name in classes[category]]) for category in sorted(classes)}
     return Evaluation(config=config, summary=summary, per_category=per_category, gallery=gallery)
+
+
+def classes_of(names: Iterable[str]) -> dict[str, list[str]]:
+    """The objects of each class, sorted."""
+    classes: dict[str, list[str]] = {}
+    for name in sorted(names):
+        classes.setdefault(category_of(name), []).append(name)
+    return classes
 
 
 def category_of(name: str) -> str:

@@ -97,6 +97,7 @@ def _plus(preset: TrainConfig, name: str, pixel_stride: int, num_coarse: int) ->
         surface_cells=surface_grid(preset.max_points),
         color="lit",
         point_norm="layer",
+        sees_direction=False,
         sampling=SamplingConfig(num_coarse=num_coarse, num_fine=0, reach=1),
         render_resolution=preset.model.image_resolution,
     )
@@ -114,11 +115,11 @@ def plus_shapenet() -> TrainConfig:
     return _plus(shapenet_car(), "plus_shapenet", pixel_stride=2, num_coarse=32)
 
 
-def with_samples(config: TrainConfig, count: int) -> TrainConfig:
-    """The config of a network near points with so many samples a ray."""
+def packaged(config: TrainConfig, num_samples: int) -> TrainConfig:
+    """The config of a network near points as the package has them: seeing the view direction, with so many samples."""
     assert isinstance(config.model, ModelConfig)
-    sampling = dataclasses.replace(config.model.sampling, num_coarse=count)
-    return dataclasses.replace(config, model=dataclasses.replace(config.model, sampling=sampling))
+    sampling = dataclasses.replace(config.model.sampling, num_coarse=num_samples)
+    return dataclasses.replace(config, model=dataclasses.replace(config.model, sampling=sampling, sees_direction=True))
 
 
 def of_any_density(config: TrainConfig) -> TrainConfig:
@@ -131,7 +132,7 @@ def of_any_density(config: TrainConfig) -> TrainConfig:
 
 def plus_lite() -> TrainConfig:
     """The package's network `tiny`: half the sizes of plus_small's.  `spnr train --preset plus_lite DATA RUN`."""
-    small = with_samples(of_any_density(plus_small()), 8)
+    small = of_any_density(packaged(plus_small(), FEW_SAMPLES))
     assert isinstance(small.model, ModelConfig)
     model = dataclasses.replace(
         small.model, point_widths=(32, 64, 128), point_features=16, volume_resolution=16, field_width=32
@@ -142,9 +143,9 @@ def plus_lite() -> TrainConfig:
 def plus_refined() -> TrainConfig:
     """The package's network `small`: plus_small's with a refiner.  `spnr train --preset plus_refined --init small ...`.
 
-    Without --init, train `plus_small` first and begin with its run: a lattice of rays is quicker to learn from.
+    Without --init, begin with a run of `plus_small --sees-direction`: a lattice of rays is quicker to learn from.
     """
-    return with_refiner(of_any_density(with_samples(plus_small(), PACKAGE_SAMPLES)))
+    return with_refiner(of_any_density(packaged(plus_small(), PACKAGE_SAMPLES)))
 
 
 def with_refiner(config: TrainConfig) -> TrainConfig:

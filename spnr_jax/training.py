@@ -319,12 +319,8 @@ def train_step(
     generator = optax.apply_updates(state.generator, update)
     metrics |= {"loss": loss, "gradient_norm": optax.tree.norm(gradient)} | sown
 
-    # early weights are far from the last ones: average over a growing share of the past
-    decay = jnp.minimum(config.optimizer.ema_decay, (1.0 + state.step) / (10.0 + state.step))
-    averaged, averaged_stats = jax.tree.map(
-        lambda old, new: decay * old + (1 - decay) * new,
-        (state.averaged, state.averaged_stats),
-        (generator, batch_stats),
+    averaged, averaged_stats = moving_average(
+        (state.averaged, state.averaged_stats), (generator, batch_stats), state.step, config.optimizer.ema_decay
     )
     state = TrainState(
         step=state.step + 1,
@@ -338,6 +334,12 @@ def train_step(
         discriminator_optimizer=discriminator_optimizer,
     )
     return state, metrics
+
+
+def moving_average(averaged: Any, newest: Any, step: Array, decay: float) -> Any:
+    """The average with the newest weights in it, over a growing share of the past: early ones are far from the last."""
+    share = jnp.minimum(decay, (1.0 + step) / (10.0 + step))
+    return jax.tree.map(lambda old, new: share * old + (1 - share) * new, averaged, newest)
 
 
 def encode(variables: dict, cloud: PointCloud, *, config: NetworkConfig) -> Any:

@@ -16,7 +16,7 @@ from spnr_jax.config import to_dict
 
 pytestmark = pytest.mark.ci  # it trains several networks
 PLUS_ROWS = ("free_colour", "no_neighbours", "three_neighbours", "twelve_neighbours", "batch_norm")
-PLUS_ROWS += ("no_opacity_loss", "no_squared_error")
+PLUS_ROWS += ("no_opacity_loss", "no_squared_error", "view_direction")
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -77,6 +77,7 @@ class TestRows:
             "batch_norm": {"model.point_norm": "batch"},
             "no_opacity_loss": {"loss.opacity_weight": 0.0},
             "no_squared_error": {"loss.mse_weight": 0.0},
+            "view_direction": {"model.sees_direction": True},
         }
         assert {row: self.changes(row, presets.plus_tiny()) for row in PLUS_ROWS} == expected
 

@@ -85,7 +85,7 @@ def test_without_meshes_the_procedural_objects_train_alone(asked, tmp_path):
 def test_tiny_has_one_run_and_each_run_of_small_begins_where_the_one_before_ended():
     assert pretrain.recipe(pretrain.Pretrain(network="tiny")) == [presets.plus_lite()]
     first, *later = pretrain.recipe(pretrain.Pretrain())
-    assert first == presets.with_samples(presets.plus_small(), 16)
+    assert first == presets.packaged(presets.plus_small(), 16)
     assert [run.num_steps for run in later] == [9000, 6000, 4000]
     assert [run.even_share for run in (first, *later)] == [0, 0, 0, 0.5]
     assert len({run.seed for run in (first, *later)}) == 4

@@ -70,6 +70,13 @@ def test_pictures_that_are_there_are_only_read_and_steps_repeat(trained, tmp_pat
     same_bits(again.variables, first.variables)
 
 
+def test_pictures_of_another_network_are_refused(trained, tmp_path):
+    refinement.refined(trained, tiny_dataset.dataset(), tmp_path, steps=1)
+    other = dataclasses.replace(trained, variables=jax.tree.map(lambda x: 2 * x, trained.variables))
+    with pytest.raises(ValueError, match=r"holds pictures with another network; choose another --out"):
+        refinement.refined(other, tiny_dataset.dataset(), tmp_path, steps=1)
+
+
 def test_kept_is_what_the_network_shows_and_its_references(trained, tmp_path):
     item = data.read_object(tiny_dataset.dataset(), tiny_dataset.dataset().splits["train"][0])
     place = tmp_path / "kept.npz"

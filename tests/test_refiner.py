@@ -275,7 +275,7 @@ class TestTraining:
 
 class TestConfig:
     def test_the_preset_is_that_of_the_weights_with_a_refiner(self):
-        refined, small = presets.plus_refined(), presets.of_any_density(presets.with_samples(presets.plus_small(), 16))
+        refined, small = presets.plus_refined(), presets.of_any_density(presets.packaged(presets.plus_small(), 16))
         assert refined.model.refiner_width > 0
         assert dataclasses.replace(refined.model, refiner_width=0, num_features=3) == small.model
 
