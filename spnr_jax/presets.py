@@ -83,7 +83,7 @@ def tiny() -> TrainConfig:
     )
 
 
-FEW_SAMPLES = 8  # of a ray near points: a picture takes as long as with the paper's network, docs/ablations.md
+FEW_SAMPLES = 8  # of a ray near points: a picture takes less time than the paper's network, docs/ablations.md
 PACKAGE_SAMPLES = 16  # of the package's network `small`
 
 
