@@ -1,4 +1,4 @@
-"""Point clouds from files, and the few operations that a cloud needs before a network sees it.
+"""Point clouds from files.
 
 `read_cloud` makes a PointCloud of NumPy float32 arrays, not padded, in the file's own units, turned so that y is up;
 `place_cloud` also says how to get back into the file's frame.  Files of points are read as named columns
@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-import jax
 import numpy as np
 
 from spnr_jax.ply_files import read_ply_header
@@ -26,7 +25,6 @@ MESH_POINTS = 4096  # points drawn from a mesh if no number is asked for; the mo
 MOST_EVEN = 2**14  # points that are spread evenly over a mesh, in seconds; more lie close enough as they are drawn
 CAPACITY = 2**19  # points of a file that are in memory at most; more are thinned while reading
 COARSEST_STEP = 1e-3  # of the extent, that rounding to float32 may cost
-SMALLEST_BUCKET = 512
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,35 +99,6 @@ def _float32(positions: np.ndarray, values: dict[str, np.ndarray]) -> PointCloud
         **{name: column.astype(np.float32) for name, column in values.items()},
         mask=np.ones(len(positions), bool),
     )
-
-
-def pad(cloud: PointCloud, size: int) -> PointCloud:
-    """The cloud (points, ...) with zeros behind it up to `size` points, for which `mask` is False."""
-    missing = size - len(cloud.mask)
-    if missing < 0:
-        raise ValueError(f"a cloud of {len(cloud.mask)} points does not fit into {size}; thin it out first")
-
-    def extend(values):
-        return np.concatenate([values, np.zeros((missing, *values.shape[1:]), values.dtype)])
-
-    return jax.tree.map(extend, cloud)
-
-
-def bucket(count: int) -> int:
-    """The smallest of 512, 1024, 2048, ... that holds `count` points: few sizes, so few compilations."""
-    if count < 1:
-        raise ValueError(f"a cloud needs at least 1 point, got {count}")
-    return max(SMALLEST_BUCKET, 1 << (count - 1).bit_length())
-
-
-def normalization(positions: np.ndarray) -> tuple[np.ndarray, np.float32]:
-    """(centre (3,), scale ()): (positions - centre) * scale has its bounding box around 0, with half diagonal 1.
-
-    The scale of points without extent is 1.
-    """
-    low, high = (np.asarray(bound, np.float64) for bound in (positions.min(axis=0), positions.max(axis=0)))
-    diagonal = np.linalg.norm(high - low)
-    return ((low + high) / 2).astype(np.float32), np.float32(2 / diagonal if diagonal > 0 else 1)
 
 
 def _check_file(path: Path) -> None:

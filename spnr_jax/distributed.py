@@ -20,8 +20,6 @@ import numpy as np
 from jax.experimental import multihost_utils
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
-from spnr_jax.types import Batch
-
 OBJECTS, DEPTH = "objects", "depth"
 
 
@@ -89,7 +87,7 @@ def own_objects(mesh: Mesh, batch_objects: int) -> range:
     return range(min(starts), max(stops))
 
 
-def placed(own: Batch, mesh: Mesh | None, batch_objects: int) -> Batch:
+def placed(own: Any, mesh: Mesh | None, batch_objects: int) -> Any:
     """The global batch on the mesh, of which this process holds `own_objects`; without a mesh on the first device."""
     if mesh is None:
         return jax.device_put(own)

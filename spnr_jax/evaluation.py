@@ -5,8 +5,6 @@ scored by the same metrics.  The radius of the point renderers is chosen on trai
 spacing with the best PSNR.
 """
 
-import os
-import platform
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
@@ -17,15 +15,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from spnr_jax import data, metrics, training
+from spnr_jax import data, inference, machine, metrics
 from spnr_jax.baselines import floors
 from spnr_jax.config import TrainConfig
-from spnr_jax.distributed import by_all_devices
 from spnr_jax.flip import flip
 from spnr_jax.lpips import LpipsWeights, lpips
 from spnr_jax.summary import Scores, differences, metric_settings, summarise
-from spnr_jax.supersampling import rays_per_side
-from spnr_jax.types import Camera, PointCloud, Rendering
+from spnr_jax.types import Camera, PointCloud
 from spnr_jax.weights import read_trained
 
 RADIUS_FACTORS = (0.5, 0.75, 1.0, 1.5, 2.0)
@@ -89,16 +85,6 @@ def render_floor(method: str, cloud: PointCloud, camera: Camera, factor: float |
     return jax.vmap(lambda view: getattr(floors, method)(cloud, view, radius))(camera)
 
 
-def test_cloud(item: data.ObjectData, config: TrainConfig) -> PointCloud:
-    """The object's first `test_points` points: always the same ones."""
-    return first_points(item, config.test_points)
-
-
-def first_points(item: data.ObjectData, count: int) -> PointCloud:
-    """So many points of an object, or all if it has fewer: always the same ones."""
-    return jax.tree.map(lambda x: x[:count], item.cloud)
-
-
 def choose_radius(dataset: data.Dataset, config: TrainConfig, method: str, num_objects: int = 8) -> float:
     """The radius factor with the highest PSNR over a few training objects."""
     items = [data.read_object(dataset, name) for name in dataset.splits["train"][:num_objects]]
@@ -108,28 +94,18 @@ def choose_radius(dataset: data.Dataset, config: TrainConfig, method: str, num_o
     def mean_psnr(factor: float) -> float:
         values = []
         for item in items:
-            image, _ = render_floor(method, test_cloud(item, config), item.camera, factor)
+            image, _ = render_floor(method, data.test_cloud(item, config), item.camera, factor)
             values.append(metrics.psnr(image, jnp.asarray(data.on_white(item.images))))
         return float(np.mean(values))
 
     return max(RADIUS_FACTORS, key=mean_psnr)
 
 
-def render_views(variables: dict, config: TrainConfig, cloud: PointCloud, camera: Camera) -> Rendering:
-    """All views of one object (clouds of data sets are normalised already), rays divided among the devices."""
-    cloud, camera = jax.tree.map(lambda x: jnp.asarray(x)[None], (cloud, camera))
-    volume = training.jitted_encode(variables, cloud, config=config.model)
-    side = rays_per_side(config.model, camera.width)
-    render = partial(training.jitted_render, config=config.model, rays_per_side=side)
-    rendering = by_all_devices(render, variables, volume, camera)
-    return jax.tree.map(lambda x: x[0], rendering)
-
-
 def network(variables: dict, config: TrainConfig) -> Method:
     """The method of a trained network."""
 
     def show(cloud: PointCloud, camera: Camera) -> Pictures:
-        rendering = render_views(variables, config, cloud, camera)
+        rendering = inference.render_views(variables, config.model, cloud, camera)
         return Pictures(image=rendering.image, acc=rendering.acc, depth=rendering.depth)
 
     return show
@@ -162,7 +138,7 @@ def evaluate_object(
 ) -> ObjectResult:
     """Pictures and scores of one object."""
     data.check_renders(item, config)
-    cloud = test_cloud(item, config)
+    cloud = data.test_cloud(item, config)
     pictures, scores = {}, {}
     for method, show in methods.items():
         shown = show(cloud, item.camera)
@@ -250,7 +226,7 @@ def evaluate(
         "preset": config.preset,
         "steps": trained.steps,
         "seed": config.seed,
-        "hardware": hardware(),
+        "hardware": machine.hardware(),
         "settings": {
             "split": split,
             "points": config.test_points,
@@ -275,14 +251,3 @@ def category_of(name: str) -> str:
     """Class of an object from its name (chair_000012); mesh files are one class."""
     stem, _, number = name.rpartition("_")
     return stem if number.isdigit() and len(number) == 6 else MESHES
-
-
-def hardware() -> str:
-    """The device that JAX uses, in words."""
-    device = jax.devices()[0]
-    if device.platform != "cpu":
-        return f"{jax.device_count()} x {device.device_kind}"
-    cpuinfo = Path("/proc/cpuinfo")
-    lines = cpuinfo.read_text().splitlines() if cpuinfo.is_file() else []
-    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
-    return f"{len(os.sched_getaffinity(0))} cores of {names[0] if names else platform.machine()}"

@@ -24,7 +24,7 @@ from flax.serialization import from_state_dict, to_state_dict
 from jax import export
 from jaxtyping import Array, Bool, Float
 
-from spnr_jax import training
+from spnr_jax import inference
 from spnr_jax.model import LARGEST_REACH, Model, Quality, Volume
 from spnr_jax.types import Camera, PointCloud
 
@@ -114,7 +114,7 @@ def _encode(model: Model, cloud: Arrays) -> tuple[Any, Array, Array]:
     centre, scale = box_around(cloud["positions"], cloud["mask"])
     inside = jnp.clip((cloud["positions"] - centre[None]) * scale, -1, 1)
     one_object = jax.tree.map(lambda x: x[None], PointCloud(**cloud | {"positions": inside}))
-    scene = training.encode(model.variables, one_object, config=model.config)
+    scene = inference.encode(model.variables, one_object, config=model.config)
     return jax.tree.map(lambda x: x[0], scene), centre, scale
 
 

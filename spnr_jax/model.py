@@ -10,7 +10,6 @@ Clouds, cameras and depths are in the cloud's own units; the transform into the 
 import dataclasses
 from dataclasses import dataclass
 from functools import cached_property, partial
-from pathlib import Path
 from typing import Any, Literal
 
 import jax
@@ -20,7 +19,7 @@ from flax import struct
 from jaxtyping import Array, Float
 from scipy.spatial import cKDTree
 
-from spnr_jax import cameras, clouds, supersampling, training, weights
+from spnr_jax import cameras, cloud_arrays, inference, supersampling
 from spnr_jax.distributed import by_all_devices, everywhere
 from spnr_jax.model_config import ModelConfig, NetworkConfig, SamplingConfig
 from spnr_jax.types import Camera, PointCloud, Rendering
@@ -61,11 +60,11 @@ class Model:
         for field in dataclasses.fields(cloud):
             if not np.isfinite(np.asarray(getattr(cloud, field.name))[mask]).all():
                 raise ValueError(f"the cloud has NaN or infinity in its {field.name}; remove those points")
-        centre, scale = clouds.normalization(positions[mask])
+        centre, scale = cloud_arrays.normalization(positions[mask])
         # the ends of a thin stick lie on the faces of the box: rounding must not push them out of it
         inside = np.clip((positions - centre) * scale, -1, 1).astype(np.float32)
         cloud = dataclasses.replace(cloud, positions=inside)
-        cloud = clouds.pad(cloud, clouds.bucket(len(positions)))
+        cloud = cloud_arrays.pad(cloud, cloud_arrays.bucket(len(positions)))
         scene = _encode(self.variables, cloud, config=self.config)
         volume = Volume(scene=scene, centre=jnp.asarray(centre), scale=jnp.asarray(scale))
         if not isinstance(self.config, ModelConfig):
@@ -110,7 +109,7 @@ class Model:
 @partial(jax.jit, static_argnames="config", compiler_options={"xla_cpu_use_fusion_emitters": False})
 def _encode(variables: dict, cloud: PointCloud, *, config: NetworkConfig) -> Any:
     """What the network makes of a cloud in the box (unbatched)."""
-    scene = training.encode(variables, jax.tree.map(lambda x: x[None], cloud), config=config)
+    scene = inference.encode(variables, jax.tree.map(lambda x: x[None], cloud), config=config)
     return jax.tree.map(lambda x: x[0], scene)
 
 
@@ -126,7 +125,7 @@ def _render(
     inside = dataclasses.replace(camera, cam_to_world=pose)
     inside = jax.tree.map(lambda x: x.reshape(1, -1, *x.shape[-2:]), inside)
     scene = jax.tree.map(lambda x: x[None], scene)
-    rendering = training.render(variables, scene, inside, config=config, rays_per_side=side)
+    rendering = inference.render(variables, scene, inside, config=config, rays_per_side=side)
     rendering = dataclasses.replace(rendering, depth=rendering.depth / scale)
     return jax.tree.map(lambda x: x[0, 0] if single else x[0], rendering)
 
@@ -174,9 +173,3 @@ def reach_of(positions: np.ndarray, resolution: int, num_queries: int = 4096) ->
     distances, _ = cKDTree(positions).query(queries, 2)
     spacing = np.median(distances[:, 1]) * resolution / 2
     return int(np.clip(np.ceil(REACH_PER_SPACING * spacing), 1, LARGEST_REACH))
-
-
-def load(run: Path | str | None = None) -> Model:
-    """A network of the package (`small`, `tiny`; None is small), of a run folder's newest checkpoint, or of a file."""
-    trained = weights.read_trained(run)
-    return Model(config=trained.config.model, variables=trained.variables)

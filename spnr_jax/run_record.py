@@ -18,7 +18,7 @@ from typing import Any
 
 import jax
 
-from spnr_jax import data, evaluation
+from spnr_jax import data, machine
 from spnr_jax.images import write_whole
 from spnr_jax.weights import Trained
 
@@ -51,7 +51,7 @@ class RunRecord:
             "version": version(),
             "commit": commit(),
             "jax": jax.__version__,
-            "hardware": evaluation.hardware(),
+            "hardware": machine.hardware(),
             "data": str(dataset.folder),
             "data_checksum": checksum(dataset),
         }

@@ -24,9 +24,10 @@ import numpy as np
 from jax.sharding import Mesh
 from tqdm import tqdm
 
-from spnr_jax import checkpoint, data, distributed, evaluation, memory, training
+from spnr_jax import batching, checkpoint, data, distributed, inference, memory, training
 from spnr_jax.config import TrainConfig
 from spnr_jax.images import png, to_uint8, write_whole
+from spnr_jax.metrics import psnr
 from spnr_jax.run_record import Clock, RunRecord
 from spnr_jax.weights import Trained
 
@@ -105,7 +106,7 @@ def _train(
     with (
         stop_requests() as requests,
         closing(MetricsLog(run, first) if leads else Unwritten()) as log,
-        closing(data.batches(dataset, config, first, own=own)) as batches,
+        closing(batching.batches(dataset, config, first, own=own)) as batches,
         tqdm(total=config.num_steps, initial=first, unit="step", mininterval=1, disable=not leads) as bar,
     ):
         record = RunRecord(run, dataset, first, init) if leads else Unwritten()
@@ -262,10 +263,10 @@ def preview(
     columns, scores = [], []
     for name in names:
         item = data.read_object(dataset, name)
-        cloud = evaluation.test_cloud(item, config)
-        rendering = evaluation.render_views(variables, config, cloud, item.camera)
+        cloud = data.test_cloud(item, config)
+        rendering = inference.render_views(variables, config.model, cloud, item.camera)
         image, reference = np.clip(np.asarray(rendering.image), 0, 1), data.on_white(item.images)
-        scores.append(np.asarray(evaluation.metrics.psnr(jnp.asarray(image), jnp.asarray(reference))))
+        scores.append(np.asarray(psnr(jnp.asarray(image), jnp.asarray(reference))))
         columns.append(np.concatenate([reference[0], image[0]]))
     picture = np.concatenate(columns, axis=1)
     write_whole(run / "previews" / f"{int(state.step):07d}.png", png(picture))

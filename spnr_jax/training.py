@@ -2,9 +2,9 @@
 
     forward -> losses -> train_step -> jitted train_step
 
-A method is a network and a loss: the config of a network finds its module (`network`), and any module with `encode`,
-`render` and `__call__` is trained by this step.  What it sows into the collection "losses" is added to the loss; a
-network without `render_rays` renders whole images.
+A method is a network and a loss: the config of a network finds its module (`inference.network`), and any module with
+`encode`, `render` and `__call__` is trained by this step.  What it sows into the collection "losses" is added to the
+loss; a network without `render_rays` renders whole images.
 
 One step renders every view of the batch once.  The discriminator is updated on that rendering, the generator on the
 gradient that the updated discriminator and the L1 loss send back through it.  `adversarial` is static: without it the
@@ -17,7 +17,6 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, no_type_check
 
-import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import optax
@@ -25,24 +24,13 @@ from flax import struct
 from flax.traverse_util import flatten_dict
 from jaxtyping import Array, Float
 
-from spnr_jax import cameras, losses, supersampling
-from spnr_jax.baselines.npbg import NPBG
-from spnr_jax.baselines.point_nerf import PointNeRF
-from spnr_jax.baselines.points2nerf import Points2NeRF
+from spnr_jax import losses
 from spnr_jax.config import TrainConfig
-from spnr_jax.distributed import on_own_rays
+from spnr_jax.inference import example_inputs, network
 from spnr_jax.metrics import psnr
-from spnr_jax.model_config import ModelConfig, NetworkConfig, NPBGConfig, PointNeRFConfig, Points2NeRFConfig
+from spnr_jax.model_config import ModelConfig
 from spnr_jax.nn.discriminator import Discriminator
-from spnr_jax.renderer import Renderer
-from spnr_jax.types import Batch, Camera, Key, PointCloud, Rendering
-
-NETWORKS: dict[type, type[nn.Module]] = {
-    ModelConfig: Renderer,
-    NPBGConfig: NPBG,
-    PointNeRFConfig: PointNeRF,
-    Points2NeRFConfig: Points2NeRF,
-}
+from spnr_jax.types import Batch, Camera, Key
 
 
 @no_type_check
@@ -59,11 +47,6 @@ class TrainState:
     averaged_stats: dict
     discriminator: dict | None
     discriminator_optimizer: tuple | None
-
-
-def network(config: NetworkConfig) -> nn.Module:
-    """The module that a network's config describes."""
-    return NETWORKS[type(config)](config)
 
 
 def learning_rate(config: TrainConfig) -> optax.Schedule:
@@ -107,17 +90,6 @@ def discriminator_of(config: TrainConfig) -> Discriminator:
     """The discriminator's module."""
     assert isinstance(config.model, ModelConfig), "the config refuses an adversarial loss of other networks"
     return Discriminator(config.loss.discriminator_width, config.model.num_groups, config.model.bf16)
-
-
-def example_inputs(config: TrainConfig) -> tuple[PointCloud, Camera]:
-    """The smallest valid inputs of the generator, for the shapes of its parameters."""
-    points, size = jnp.zeros((1, 2, 3)), config.model.image_resolution
-    scalars = jnp.zeros((1, 2))
-    cloud = PointCloud(
-        positions=points, base_color=points, roughness=scalars, metallic=scalars, mask=jnp.ones((1, 2), bool)
-    )
-    pose = jnp.concatenate([jnp.eye(3), jnp.array([[0.0], [0.0], [3.0]])], axis=1)
-    return cloud, Camera(cam_to_world=pose[None, None], intrinsics=jnp.eye(3)[None, None], height=size, width=size)
 
 
 def create_state(config: TrainConfig, seed: int | Array | None = None) -> TrainState:
@@ -342,55 +314,6 @@ def moving_average(averaged: Any, newest: Any, step: Array, decay: float) -> Any
     return jax.tree.map(lambda old, new: share * old + (1 - share) * new, averaged, newest)
 
 
-def encode(variables: dict, cloud: PointCloud, *, config: NetworkConfig) -> Any:
-    """Scenes of the clouds, objects first on every array: feature volumes (objects, d, d, d, features) for ours."""
-    return network(config).bind(variables).encode(cloud)
-
-
-def render(
-    variables: dict,
-    scene: Any,
-    camera: Camera,
-    *,
-    config: NetworkConfig,
-    ray_chunk: int | None = None,
-    rays_per_side: int = 1,
-) -> Rendering:
-    """Views of encoded scenes, samples at the middles of their strata, rays_per_side^2 rays a pixel averaged.
-
-    So many rays of each object (the network's own number by default) are rendered at a time, which bounds the memory.
-    On a CPU a pixel of one object of ours has the same bits for every chunk from 256 to 2048 rays, whatever is rendered
-    beside it: the matrix products then add up in one order.
-    """
-    if rays_per_side > 1:
-        wide = cameras.resize(camera, rays_per_side * camera.height, rays_per_side * camera.width)
-        rendering = render(variables, scene, wide, config=config, ray_chunk=ray_chunk)
-        return supersampling.averaged(rendering, rays_per_side)
-    module = network(config)
-    if (ray_chunk := ray_chunk or config.ray_chunk) is None:
-        return module.bind(variables).render(scene, camera)
-    in_chunks = partial(_in_chunks, module, ray_chunk)
-    outputs = on_own_rays(in_chunks, variables, scene, module.rays(camera))
-    return module.bind(variables).develop(camera, *outputs)
-
-
-def _in_chunks(module: nn.Module, ray_chunk: int, variables: dict, scene: Any, rays: Any) -> Any:
-    """What the module's `render_rays` gives for rays (objects, rays, ...), so many of each object at a time."""
-    num_rays = jax.tree.leaves(rays)[0].shape[1]
-    chunk = min(ray_chunk, num_rays)
-
-    def chunked(x):
-        padded = jnp.pad(x, ((0, 0), (0, -num_rays % chunk), *[(0, 0)] * (x.ndim - 2)), mode="edge")
-        return padded.reshape(x.shape[0], -1, chunk, *x.shape[2:])
-
-    chunks = jax.tree.map(chunked, rays)
-    outputs = jax.lax.map(
-        lambda rays: module.bind(variables).render_rays(scene, rays),
-        jax.tree.map(lambda x: jnp.moveaxis(x, 1, 0), chunks),
-    )
-    return jax.tree.map(lambda x: jnp.moveaxis(x, 0, 1).reshape(x.shape[1], -1, *x.shape[3:])[:, :num_rays], outputs)
-
-
 def averaged_variables(state: TrainState) -> dict:
     """The generator that evaluation uses, as Linen variables."""
     return {"params": state.averaged, "batch_stats": state.averaged_stats}
@@ -401,5 +324,3 @@ jitted_create_state = jax.jit(
     create_state, static_argnames="config", compiler_options={"xla_backend_optimization_level": 1}
 )
 jitted_train_step = jax.jit(train_step, static_argnames=("config", "adversarial"), donate_argnames="state")
-jitted_encode = jax.jit(encode, static_argnames="config")
-jitted_render = jax.jit(render, static_argnames=("config", "ray_chunk", "rays_per_side"))

@@ -20,9 +20,10 @@ import jax
 import numpy as np
 from flax.traverse_util import flatten_dict, unflatten_dict
 
-from spnr_jax import checkpoint, training
 from spnr_jax.config import TrainConfig, from_dict, to_dict
 from spnr_jax.images import write_whole
+from spnr_jax.inference import example_inputs, network
+from spnr_jax.model import Model
 from spnr_jax.numpy_files import read_arrays
 
 # what a header of any content makes its readers raise
@@ -59,8 +60,16 @@ def read_trained(source: Path | str | None, say: Callable[[str], None] = print, 
     path = place(source)
     if path.suffix == ".npz":
         return read_weights(path)
+    from spnr_jax import checkpoint, training  # here: a file of weights is read without optimisers
+
     config, state = checkpoint.load_run(path, say, data)
     return Trained(config=config, variables=training.averaged_variables(state), steps=int(state.step))
+
+
+def load(run: Path | str | None = None) -> Model:
+    """A network of the package (`small`, `tiny`; None is small), of a run folder's newest checkpoint, or of a file."""
+    trained = read_trained(run)
+    return Model(config=trained.config.model, variables=trained.variables)
 
 
 def write_weights(path: Path, trained: Trained) -> None:
@@ -114,5 +123,5 @@ def _check_weights(arrays: dict[str, np.ndarray], shapes: dict[str, jax.ShapeDty
 @cache
 def variable_shapes(config: TrainConfig) -> dict[str, jax.ShapeDtypeStruct]:
     """Shape of every weight of the config's network, by name."""
-    create = partial(training.network(config.model).init, jax.random.key(0))
-    return flatten_dict(jax.eval_shape(create, *training.example_inputs(config)), sep="/")
+    create = partial(network(config.model).init, jax.random.key(0))
+    return flatten_dict(jax.eval_shape(create, *example_inputs(config.model)), sep="/")
