@@ -32,7 +32,7 @@ from experiments import bench_report as report
 from experiments.bench_scene import BATCHES
 from experiments.bench_worker import Worker, worker
 from spnr_jax import cli
-from spnr_jax.images import write_whole
+from spnr_jax.formats.images import write_whole
 
 Preset = Literal["tiny", "small", "abo"]
 Mode = Literal["train", "train_l1", "encode", "render"]

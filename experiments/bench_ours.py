@@ -13,11 +13,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments import bench_scene, bench_worker, twin_layout
-from spnr_jax import memory, training
 from spnr_jax.config import TrainConfig
+from spnr_jax.devices import allocator
+from spnr_jax.kernels.records import Batch
+from spnr_jax.method import inference
 from spnr_jax.model_config import ModelConfig
 from spnr_jax.presets import PRESETS
-from spnr_jax.types import Batch
+from spnr_jax.training import optimisation
 
 NUM_GROUPS, DISCRIMINATOR_WIDTH = 8, 64  # the twin's, for every preset
 NEAR_POINTS = {"tiny": (16, 0), "small": (16, 16), "abo": (32, 32)}  # coarse and fine samples
@@ -25,7 +27,7 @@ NEAR_POINTS = {"tiny": (16, 0), "small": (16, 16), "abo": (32, 32)}  # coarse an
 
 def main() -> None:
     """Serves the mode of the spec."""
-    memory.keep_arrays()
+    allocator.keep_arrays()
     bench_worker.serve(make)
 
 
@@ -84,20 +86,20 @@ def batch(config: TrainConfig) -> Batch:
 
 def function(config: TrainConfig, batch: Batch, mode: str) -> Callable[[], object]:
     """One step, one encoding of the batch, or one view of each of its volumes; returns when it is done."""
-    state = training.jitted_create_state(config)
+    state = optimisation.jitted_create_state(config)
     if mode.startswith("train"):
 
         def step() -> None:
             nonlocal state
-            state, metrics = training.jitted_train_step(state, batch, config=config, adversarial=mode == "train")
+            state, metrics = optimisation.jitted_train_step(state, batch, config=config, adversarial=mode == "train")
             jax.block_until_ready((state, metrics))
 
         return step
-    variables, cloud = training.averaged_variables(state), batch.cloud
+    variables, cloud = optimisation.averaged_variables(state), batch.cloud
     if mode == "encode":
-        return lambda: jax.block_until_ready(training.jitted_encode(variables, cloud, config=config.model))
-    scene = training.jitted_encode(variables, cloud, config=config.model)
-    return lambda: jax.block_until_ready(training.jitted_render(variables, scene, batch.camera, config=config.model))
+        return lambda: jax.block_until_ready(inference.jitted_encode(variables, cloud, config=config.model))
+    scene = inference.jitted_encode(variables, cloud, config=config.model)
+    return lambda: jax.block_until_ready(inference.jitted_render(variables, scene, batch.camera, config=config.model))
 
 
 def differences(config: TrainConfig, arrays: twin_layout.Arrays) -> dict[str, float]:
@@ -112,9 +114,9 @@ def differences(config: TrainConfig, arrays: twin_layout.Arrays) -> dict[str, fl
     inputs = jax.device_put(twin_layout.batch(arrays))
     params, statistics = twin_layout.generator(arrays)
     variables = {"params": params, "batch_stats": statistics}
-    scene = training.jitted_encode(variables, inputs.cloud, config=config.model)
-    image = training.jitted_render(variables, scene, inputs.camera, config=config.model).image[:, 0]
-    judge = jax.jit(training.discriminator_of(config).apply)
+    scene = inference.jitted_encode(variables, inputs.cloud, config=config.model)
+    image = inference.jitted_render(variables, scene, inputs.camera, config=config.model).image[:, 0]
+    judge = jax.jit(optimisation.discriminator_of(config).apply)
     params = {"params": twin_layout.discriminator(arrays)}
     logits = judge(params, image, inputs.condition[:, 0], inputs.condition_mask[:, 0])
     stages = {"volume": scene.volume, "image": image, "logits": logits}

@@ -28,8 +28,8 @@ import tyro
 from experiments import chaos_faults, chaos_kills, chaos_report
 from experiments.chaos_kills import Kill, Training
 from spnr_jax import cli
-from spnr_jax.evaluation import hardware
-from spnr_jax.images import write_whole
+from spnr_jax.devices.machine import hardware
+from spnr_jax.formats.images import write_whole
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -25,7 +25,7 @@ LIMIT = 300.0  # seconds without an event after which a process hangs
 
 SERVER = multiprocessing.get_context("forkserver")
 SERVER.set_forkserver_preload(
-    ["spnr_jax.trainer", "spnr_jax.cli", "orbax.checkpoint.v1", "grain", "tensorboardX", __name__]
+    ["spnr_jax.training.trainer", "spnr_jax.cli", "orbax.checkpoint.v1", "grain", "tensorboardX", __name__]
 )
 # least optimisation: nothing but rounding depends on it, and a start waits for the compiler and the tracer alone
 QUICK_COMPILATION = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
@@ -114,7 +114,7 @@ def _child(arguments: list[str], cache: Path, output: Path, events: Connection) 
 
 def _watch(events: Connection) -> None:
     """Lets the functions that train say when they begin and end."""
-    from spnr_jax import checkpoint, trainer, training
+    from spnr_jax.training import checkpoint, optimisation, trainer
 
     now = 0  # steps done
 
@@ -143,7 +143,7 @@ def _watch(events: Connection) -> None:
 
     tell("start")
     for owner, name, watch in (
-        (training, "jitted_train_step", watched_step),
+        (optimisation, "jitted_train_step", watched_step),
         (checkpoint, "save", partial(watched, "checkpoint")),
         (trainer, "preview", partial(watched, "preview")),
         (trainer.MetricsLog, "write", partial(watched, "log")),

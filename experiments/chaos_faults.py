@@ -25,7 +25,8 @@ import numpy as np
 from experiments import chaos_kills
 from experiments.chaos_child import QUICK_COMPILATION, Ended
 from experiments.chaos_kills import Training
-from spnr_jax import checkpoint, data
+from spnr_jax.formats import data_sets
+from spnr_jax.training import checkpoint
 
 GRACE = 30.0  # seconds that schedulers give after SIGTERM: Slurm's KillWait, Kubernetes' grace period
 UNSHARED = ["unshare", "--user", "--map-root-user", "--mount"]
@@ -177,7 +178,7 @@ def lost_object(training: Training, run: Path) -> Seen:
     """A picture that was deleted from the data set."""
     folder = run.with_name(f"{run.name}-data")
     shutil.copytree(training.data, folder)
-    for name in data.open_dataset(folder).splits["train"]:
+    for name in data_sets.open_dataset(folder).splits["train"]:
         (folder / "objects" / name / "images" / "001.png").unlink()
     return called(replace(training, data=folder), run)
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from experiments import chaos_child
 from experiments.chaos_child import Aim, Ended, Event, Phase
-from spnr_jax import checkpoint, trainer
+from spnr_jax.training import checkpoint, trainer
 
 STEPS_A_KILL, FEWEST_STEPS = 4, 40
 CHECKPOINT_EVERY, LOG_EVERY = 8, 2

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from experiments.chaos_child import PHASES
-from spnr_jax.images import write_whole
+from spnr_jax.formats.images import write_whole
 
 COLORS = {
     "start": "#868e96", "step": "#2457d6", "log": "#2f9e44", "checkpoint": "#d9480f", "preview": "#9c36b5",

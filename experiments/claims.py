@@ -7,7 +7,7 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
-from spnr_jax.images import write_whole
+from spnr_jax.formats.images import write_whole
 
 
 def claim(path: Path, asked: dict, what: str) -> None:

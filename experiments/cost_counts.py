@@ -17,9 +17,10 @@ import jax
 import tyro
 
 from experiments import distributed_memory
-from spnr_jax import presets, training
+from spnr_jax import presets
 from spnr_jax.config import TrainConfig
 from spnr_jax.nn import convolution
+from spnr_jax.training import optimisation
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,14 +53,16 @@ def main(options: CostCounts) -> None:
 def lowered(config: TrainConfig) -> Any:
     """The step of one object with the discriminator, before it is compiled."""
     config = dataclasses.replace(config, batch_objects=1)
-    state = jax.eval_shape(lambda: training.create_state(config))
+    state = jax.eval_shape(lambda: optimisation.create_state(config))
     batch = distributed_memory.batch_shapes(config)
-    return training.jitted_train_step.lower(state, batch, config=config, adversarial=state.discriminator is not None)
+    return optimisation.jitted_train_step.lower(
+        state, batch, config=config, adversarial=state.discriminator is not None
+    )
 
 
 def parameters(config: TrainConfig) -> dict[str, int]:
     """Numbers of trained parameters, of those in a saved state, and of layers that average over all devices."""
-    state = jax.eval_shape(lambda: training.create_state(config))
+    state = jax.eval_shape(lambda: optimisation.create_state(config))
 
     def count(*trees: Any) -> int:
         return sum(x.size for x in jax.tree.leaves(trees))

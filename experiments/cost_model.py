@@ -25,8 +25,8 @@ import numpy as np
 import tyro
 
 from spnr_jax import cli
-from spnr_jax.data import READ_AHEAD, READERS
-from spnr_jax.images import write_whole
+from spnr_jax.formats.images import write_whole
+from spnr_jax.training.batching import READ_AHEAD, READERS
 
 SIZES = (16_161, 1_000_000)  # ABO with its colour variants, as the paper; and a million
 DEVICES = (1, 8, 256)

@@ -22,16 +22,18 @@ import numpy as np
 import tyro
 from tqdm import tqdm
 
-from data_gen import points, records, views
-from data_gen.assets import Asset, RejectedAsset
-from data_gen.generate import make_light
-from data_gen.objects import load_asset, object_seeds
-from data_gen.plan import GenerateConfig, Task, plan_objects
-from data_gen.variant import SCALAR, choose_variant, mitsuba_module, threads
+from data_gen.make.generate import make_light
+from data_gen.make.objects import load_asset, object_seeds
+from data_gen.plan.tasks import GenerateConfig, Task, plan_objects
+from data_gen.render import views
+from data_gen.render.variant import SCALAR, choose_variant, mitsuba_module, threads
+from data_gen.store import layout
 from experiments.data_timing import PHASES, time_objects, worker_pool
 from spnr_jax import cli
-from spnr_jax.images import write_whole
-from spnr_jax.report import psnr
+from spnr_jax.formats.images import write_whole
+from spnr_jax.formats.mesh import surface_points
+from spnr_jax.formats.mesh.assets import Asset, RejectedAsset
+from spnr_jax.scoring.report import psnr
 
 SAMPLES = (16, 32, 64, 128, 256, 512, 1024)
 REFERENCE_SAMPLES = 4096
@@ -74,7 +76,7 @@ def main(options: DataGeneration) -> None:
     measure: dict[str, Callable] = {"timing": measure_timing, "noise": measure_noise, "visibility": measure_visibility}
     for part in options.parts:
         results[part] = measure[part](options)
-        write_whole(place, records.json_text(results).encode())
+        write_whole(place, layout.json_text(results).encode())
     if "noise" in results:
         plot_noise(options.out / "noise.png", results["noise"])
     tables = "\n".join(line for part in measure if part in results for line in TABLES[part](results[part]))
@@ -99,7 +101,7 @@ def light_for(options: DataGeneration, variant: str) -> np.ndarray:
 def load(task: Task, seed: int) -> Asset | None:
     """Return the normalised object of a task, or None if it cannot be used."""
     try:
-        return points.normalise(load_asset(task, seed))[0]
+        return surface_points.normalise(load_asset(task, seed))[0]
     except RejectedAsset as reason:
         tqdm.write(f"left out {task.object_id}: {reason}", file=sys.stderr)
         return None
@@ -208,7 +210,7 @@ def measure_visibility(options: DataGeneration) -> list[dict]:
 def compare_rules(asset: Asset, object_id: str, options: DataGeneration) -> tuple[float, float]:
     """Return the shares of an object's condition pixels by face that the rule by point drops and adds, of all views."""
     seeds = object_seeds(options.seed, object_id)
-    surface = points.sample_surface(asset, 4096, seeds["points"])
+    surface = surface_points.sample_surface(asset, 4096, seeds["points"])
     scene = views.build_scene(asset, np.ones((2, 4, 3), np.float32))
     rng = np.random.default_rng(seeds["viewpoints"])
     config = views.ViewConfig(resolution=options.resolutions[0])

@@ -16,23 +16,26 @@ from unittest import mock
 import numpy as np
 from tqdm import tqdm
 
-from data_gen import meshes, points, procedural, records, views
-from data_gen.objects import Workbench, make_and_write
-from data_gen.plan import Task
-from data_gen.variant import mitsuba_module
+from data_gen import procedural
+from data_gen.make.objects import Workbench, make_and_write
+from data_gen.plan.tasks import Task
+from data_gen.render import views
+from data_gen.render.variant import mitsuba_module
+from data_gen.store import layout
+from spnr_jax.formats.mesh import meshes, surface_points
 
 # the functions of each phase; the rest of an object's time is "other"
 CALLS = (
     ("load", meshes, "load_mesh"),
     ("load", procedural, "make"),
-    ("points", points, "normalise"),
-    ("points", points, "sample_surface"),
+    ("points", surface_points, "normalise"),
+    ("points", surface_points, "sample_surface"),
     ("scene", views, "build_scene"),
     ("render", views, "render_view"),
     ("visibility", views, "visible_points"),
     ("encode", views, "straight_srgb"),
     ("encode", views, "condition_image"),
-    ("write", records, "write_object"),
+    ("write", layout, "write_object"),
 )
 PHASES = (*dict.fromkeys(phase for phase, _, _ in CALLS), "other")
 

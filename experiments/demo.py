@@ -18,11 +18,14 @@ from typing import Any
 
 import tyro
 
-from data_gen.generate import generate
-from data_gen.plan import GenerateConfig
-from spnr_jax import cli, data, evaluation, presets, trainer
-from spnr_jax.images import write_whole
-from spnr_jax.results import write_results
+from data_gen.make.generate import generate
+from data_gen.plan.tasks import GenerateConfig
+from spnr_jax import cli, presets
+from spnr_jax.formats import data_sets
+from spnr_jax.formats.images import write_whole
+from spnr_jax.scoring import evaluation
+from spnr_jax.scoring.results import write_results
+from spnr_jax.training import trainer
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,7 +71,7 @@ def main(demo: Demo) -> None:
 
     tiny = presets.tiny()
     tiny = dataclasses.replace(tiny, seed=demo.seed, num_steps=tiny.num_steps if demo.steps is None else demo.steps)
-    dataset, run = data.open_dataset(generation.out), demo.out / "run"
+    dataset, run = data_sets.open_dataset(generation.out), demo.out / "run"
     print(f"2/3 training preset {tiny.preset} for {tiny.num_steps} steps in {run}", flush=True)
     seconds.measure("train", lambda: trainer.train(tiny, dataset, run, trainer.Schedule()))
 

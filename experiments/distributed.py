@@ -39,10 +39,12 @@ import tyro
 from experiments import chaos, claims, distributed_gradients, distributed_memory, distributed_rendering
 from experiments.chaos_child import QUICK_COMPILATION
 from experiments.distributed_report import plot, table
-from spnr_jax import checkpoint, cli, data, run_record, trainer, training
-from spnr_jax.evaluation import hardware
-from spnr_jax.images import write_whole
-from spnr_jax.launch import IN_ORDER
+from spnr_jax import cli
+from spnr_jax.devices.launch import IN_ORDER
+from spnr_jax.devices.machine import hardware
+from spnr_jax.formats import data_sets
+from spnr_jax.formats.images import write_whole
+from spnr_jax.training import checkpoint, optimisation, run_record, trainer
 
 ROOT = Path(__file__).parents[1]
 LIMIT = 3600.0  # seconds that a run may take
@@ -104,7 +106,7 @@ class Distributed:
 def main(options: Distributed) -> None:
     """Does what is not done yet, then writes results, table and curves."""
     place = options.data or chaos.generated(options.out / "data")
-    dataset = data.open_dataset(place)
+    dataset = data_sets.open_dataset(place)
     asked = {name: value for name, value in vars(options).items() if name not in ("data", "out")}
     claims.claim(options.out / "distributed.json", asked | {"data": run_record.checksum(dataset)}, "runs")
     flags = (
@@ -233,7 +235,7 @@ def compared(run: Path, one: Path) -> dict[str, float]:
         "loss": max(abs(a["loss"] / b["loss"] - 1) for a, b in zip(rows, expected, strict=True)),
         "metrics": max(apart.values()),
         "statistics": distance(state.batch_stats, reference.batch_stats),
-        "parameters": distance(training.averaged_variables(state), training.averaged_variables(reference)),
+        "parameters": distance(optimisation.averaged_variables(state), optimisation.averaged_variables(reference)),
         "ms": float(np.median([row["ms_per_step"] for row in rows[1:]])),
     }
 

@@ -18,8 +18,11 @@ import numpy as np
 from jax.sharding import Mesh
 
 from experiments.virtual_devices import in_child
-from spnr_jax import cli, data, distributed, training
+from spnr_jax import cli
 from spnr_jax.config import TrainConfig
+from spnr_jax.devices import placement
+from spnr_jax.formats import data_sets
+from spnr_jax.training import batching, optimisation
 
 PRECISIONS = ("float32", "float64")
 
@@ -37,15 +40,15 @@ def measured(dataset: Path, devices: int, options: Sequence[str]) -> dict[str, d
     }
 
 
-def apart(config: TrainConfig, dataset: data.Dataset, mesh: Mesh, precision: str = "float32") -> dict[str, Any]:
+def apart(config: TrainConfig, dataset: data_sets.Dataset, mesh: Mesh, precision: str = "float32") -> dict[str, Any]:
     """Relative difference of the loss, and of the array of gradients that differs most, by its largest entry."""
-    batch = next(data.batches(dataset, config, 0))
+    batch = next(batching.batches(dataset, config, 0))
     losses, gradients = [], []
     for devices in (None, mesh):
-        with distributed.using(devices):
-            state, metrics = training.jitted_train_step(
-                in_precision(training.jitted_create_state(config), precision),
-                distributed.placed(in_precision(batch, precision), devices, config.batch_objects),
+        with placement.using(devices):
+            state, metrics = optimisation.jitted_train_step(
+                in_precision(optimisation.jitted_create_state(config), precision),
+                placement.placed(in_precision(batch, precision), devices, config.batch_objects),
                 config=config,
                 adversarial=False,
             )
@@ -78,8 +81,8 @@ def main(dataset: Path, devices: int, precision: str, options: Sequence[str]) ->
     """Prints `apart` for the config that options of `spnr train` make."""
     command = cli.parse(["train", str(dataset), "run", *options])
     assert isinstance(command, cli.Train)
-    mesh = distributed.device_mesh(devices)
-    print(json.dumps(apart(command.config, data.open_dataset(dataset), mesh, precision)))
+    mesh = placement.device_mesh(devices)
+    print(json.dumps(apart(command.config, data_sets.open_dataset(dataset), mesh, precision)))
 
 
 if __name__ == "__main__":

@@ -15,12 +15,14 @@ import jax
 import jax.numpy as jnp
 
 from experiments.virtual_devices import in_child
-from spnr_jax import distributed, presets, training
+from spnr_jax import presets
 from spnr_jax.config import TrainConfig
-from spnr_jax.images import write_whole
+from spnr_jax.devices import placement
+from spnr_jax.formats.images import write_whole
+from spnr_jax.kernels.records import Batch, Camera, PointCloud
 from spnr_jax.model_config import ModelConfig
 from spnr_jax.nn import convolution
-from spnr_jax.types import Batch, Camera, PointCloud
+from spnr_jax.training import optimisation
 
 RESOLUTIONS, DEVICES = (128, 256), (1, 2, 4, 8)
 MIB = 2**20
@@ -84,16 +86,16 @@ def batch_shapes(config: TrainConfig) -> Batch:
 def bytes_a_device(resolution: int) -> int:
     """Arguments, results and temporary arrays of one device in a step, the volume cut among all of them."""
     convolution._conv3d_cpu = convolution._native  # the form of a GPU
-    asked, mesh = config(resolution), distributed.device_mesh(jax.device_count())
+    asked, mesh = config(resolution), placement.device_mesh(jax.device_count())
 
     def lying(tree, sharding):
         return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding), tree)
 
-    state = jax.eval_shape(lambda: training.create_state(asked))
-    with distributed.using(mesh):
-        lowered = training.jitted_train_step.lower(
-            lying(state, distributed.replicated(mesh)),
-            lying(batch_shapes(asked), distributed.by_object(mesh)),
+    state = jax.eval_shape(lambda: optimisation.create_state(asked))
+    with placement.using(mesh):
+        lowered = optimisation.jitted_train_step.lower(
+            lying(state, placement.replicated(mesh)),
+            lying(batch_shapes(asked), placement.by_object(mesh)),
             config=asked,
             adversarial=False,
         )

@@ -25,10 +25,12 @@ import numpy as np
 
 import spnr_jax
 from experiments.virtual_devices import in_child
-from spnr_jax import cli, evaluation, presets, training
-from spnr_jax.distributed import DEPTH, OBJECTS
-from spnr_jax.renderer import Renderer
-from spnr_jax.types import Camera, PointCloud
+from spnr_jax import cli, presets
+from spnr_jax.devices.placement import DEPTH, OBJECTS
+from spnr_jax.kernels.records import Camera, PointCloud
+from spnr_jax.method import inference
+from spnr_jax.method.renderer import Renderer
+from spnr_jax.training import optimisation
 
 DEVICES = (1, 8)
 VIEWS, SIZE, POINTS = 8, 128, 1500
@@ -56,13 +58,13 @@ def rendered(kept: Path) -> dict[str, dict[str, Any]]:
     handle, config = spnr_jax.load(), presets.tiny()
     volume = handle.encode(cloud)
     views = jax.tree.map(lambda *x: np.stack(x), *(handle.camera(volume, azimuth=45.0 * i) for i in range(VIEWS)))
-    variables = training.averaged_variables(training.create_state(config))
+    variables = optimisation.averaged_variables(optimisation.create_state(config))
     camera = Camera(
         cam_to_world=np.asarray(views.cam_to_world), intrinsics=np.asarray(views.intrinsics), height=SIZE, width=SIZE
     )
     work = {
         "package": lambda: handle.render(volume, views).image,
-        "tiny": lambda: evaluation.render_views(variables, config, cloud, camera).image,
+        "tiny": lambda: inference.render_views(variables, config.model, cloud, camera).image,
     }
     found: dict[str, dict[str, Any]] = {name: {"seconds": seconds(one)} for name, one in work.items()}
     with counting() as blocks:

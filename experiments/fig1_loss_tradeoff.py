@@ -27,8 +27,10 @@ import tyro
 
 from experiments import table1_training, training_report, training_runs
 from experiments.training_runs import Budget, Variant
-from spnr_jax import cli, data, training
+from spnr_jax import cli
 from spnr_jax.config import TrainConfig
+from spnr_jax.formats import data_sets
+from spnr_jax.training import optimisation
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,9 +57,9 @@ class Fig1:
 def main(options: Fig1) -> None:
     """Trains what is not trained, scores all weights, writes tables and pictures."""
     cli.set_up_jax()
-    dataset = data.open_dataset(options.data)
+    dataset = data_sets.open_dataset(options.data)
     names, config = options.budget.names(dataset), options.budget.config()
-    data.check_resolution(data.read_object(dataset, names[0]), config)
+    data_sets.check_resolution(data_sets.read_object(dataset, names[0]), config)
     training_runs.claim(options.out, "fig1", options.budget, dataset, pretrain=options.pretrain)
     variants = [variant(options, weight, config, dataset) for weight in options.l1_weights]
     reference = variants[options.l1_weights.index(100.0) if 100.0 in options.l1_weights else 0].name
@@ -67,7 +69,7 @@ def main(options: Fig1) -> None:
     training_report.write(options.out, variants, reference, compared, options.budget, dataset, {"start": start})
 
 
-def variant(options: Fig1, weight: float, config: TrainConfig, dataset: data.Dataset) -> Variant:
+def variant(options: Fig1, weight: float, config: TrainConfig, dataset: data_sets.Dataset) -> Variant:
     """The training with one weight of the L1 loss."""
     loss = dataclasses.replace(config.loss, l1_weight=weight, adversarial_weight=1.0, adversarial_start=0.0)
     return Variant(
@@ -79,14 +81,14 @@ def variant(options: Fig1, weight: float, config: TrainConfig, dataset: data.Dat
     )
 
 
-def pretrained(options: Fig1, dataset: data.Dataset, config: TrainConfig) -> training.TrainState:
+def pretrained(options: Fig1, dataset: data_sets.Dataset, config: TrainConfig) -> optimisation.TrainState:
     """A fresh state whose generator was trained with the L1 loss alone."""
     loss = dataclasses.replace(config.loss, l1_weight=100.0, adversarial_weight=0.0)
     before = dataclasses.replace(config, loss=loss, num_steps=options.pretrain)
     run = options.out / "runs" / f"pretrained_{config.seed}"
     print(f"before it, {options.pretrain} steps of the L1 loss alone in {run}", flush=True)
     found = table1_training.train(before, dataset, run).variables
-    state = training.jitted_create_state(config)
+    state = optimisation.jitted_create_state(config)
     return dataclasses.replace(
         state,
         generator=found["params"],

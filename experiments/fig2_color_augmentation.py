@@ -21,12 +21,14 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-from data_gen.generate import generate
-from data_gen.plan import GenerateConfig
+from data_gen.make.generate import generate
+from data_gen.plan.tasks import GenerateConfig
 from experiments import training_report, training_runs
 from experiments.training_runs import Budget, Variant
-from spnr_jax import cli, data, evaluation
-from spnr_jax.images import write_whole
+from spnr_jax import cli
+from spnr_jax.formats import data_sets
+from spnr_jax.formats.images import write_whole
+from spnr_jax.scoring import evaluation
 
 QUICK_OBJECTS, QUICK_VARIANTS = 12, 2
 MOST_SHOWN = 5  # variants of an object in the picture
@@ -60,10 +62,10 @@ def main(options: Fig2) -> None:
     if options.data is None:
         print(f"generating the data set in {folder}", flush=True)
         generate(generation(options, folder))
-    dataset = data.open_dataset(folder)
+    dataset = data_sets.open_dataset(folder)
     variants = trainings(options, dataset)
     names, config = options.budget.names(dataset), variants[0].config
-    data.check_resolution(data.read_object(dataset, names[0]), config)
+    data_sets.check_resolution(data_sets.read_object(dataset, names[0]), config)
     training_runs.claim(options.out, "fig2", options.budget, dataset)
     write_whole(options.out / "variants.png", variants_picture(dataset, options.budget.shown))
     trained = training_runs.train(variants, options.budget, options.out)
@@ -85,7 +87,7 @@ def generation(options: Fig2, folder: Path) -> GenerateConfig:
     )
 
 
-def trainings(options: Fig2, dataset: data.Dataset) -> list[Variant]:
+def trainings(options: Fig2, dataset: data_sets.Dataset) -> list[Variant]:
     """The training without variants, and that with them; ValueError if the data set has none."""
     plain, config = training_runs.without_colour_variants(dataset), options.budget.config()
     if plain.splits == dataset.splits:
@@ -99,7 +101,7 @@ def trainings(options: Fig2, dataset: data.Dataset) -> list[Variant]:
     ]
 
 
-def variants_picture(dataset: data.Dataset, num_objects: int) -> bytes:
+def variants_picture(dataset: data_sets.Dataset, num_objects: int) -> bytes:
     """PNG: a row a training object, itself and its variants; each seen by its camera that is nearest to the object's.
 
     The view of an object is the one that its variants come nearest to: cameras are random, and each has its own.
@@ -110,9 +112,9 @@ def variants_picture(dataset: data.Dataset, num_objects: int) -> bytes:
             found.setdefault(training_runs.original(name), []).append(name)
     rows, most = [], min(MOST_SHOWN, max(map(len, found.values())))
     for product in evaluation.spread(tuple(p for p in found if len(found[p]) >= most), num_objects):
-        items = [data.read_object(dataset, name) for name in (product, *found[product][:most])]
+        items = [data_sets.read_object(dataset, name) for name in (product, *found[product][:most])]
         views = nearest_views([np.asarray(item.camera.cam_to_world)[..., 3] for item in items])
-        images = [data.on_white(item.images[view]) for item, view in zip(items, views, strict=True)]
+        images = [data_sets.on_white(item.images[view]) for item, view in zip(items, views, strict=True)]
         rows.append((product, [(image, "") for image in images]))
     caption = "The same shapes; viewpoints are random,\nthe nearest ones are shown."
     return training_report.picture_rows(["Object", *(f"Variant {i + 1}" for i in range(most))], rows, caption)

@@ -25,17 +25,22 @@ import jax
 import numpy as np
 import tyro
 
-from data_gen import depth, poisson
-from data_gen.variant import choose_variant, mitsuba_module
+from data_gen.render import depth, poisson_surface
+from data_gen.render.variant import choose_variant, mitsuba_module
 from experiments import claims, depth_scores, methods, sheets
 from experiments.depth_scores import METRICS, OPAQUE
 from experiments.methods import Sources
 from experiments.source_meshes import mesh_of
 from experiments.table1_poisson import SURFACES
 from experiments.table1_report import LABELS
-from spnr_jax import cameras, cli, data, evaluation, run_record
-from spnr_jax.images import depth_image, npz, png, write_whole
-from spnr_jax.types import Camera, PointCloud
+from spnr_jax import cli
+from spnr_jax.devices import machine
+from spnr_jax.formats import data_sets
+from spnr_jax.formats.images import depth_image, npz, png, write_whole
+from spnr_jax.kernels import cameras
+from spnr_jax.kernels.records import Camera, PointCloud
+from spnr_jax.scoring import evaluation
+from spnr_jax.training import run_record
 
 FLOATER, MISSED = np.array([0.85, 0.1, 0.1]), np.array([0.15, 0.35, 0.85])
 WORST = 0.2  # error, in half diagonals, that the picture shows black
@@ -46,7 +51,7 @@ NOTE = (
     "opaque pixels outside the silhouette, far ones farther from it than 1/32 of the picture."
 )
 
-Shown = Callable[[data.ObjectData, PointCloud], tuple[np.ndarray, np.ndarray]]
+Shown = Callable[[data_sets.ObjectData, PointCloud], tuple[np.ndarray, np.ndarray]]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,7 +88,7 @@ class Method:
 def main(options: Fig3) -> None:
     """Makes what is missing of depths and truth, then scores, table and picture."""
     cli.set_up_jax()
-    dataset = data.open_dataset(options.data)
+    dataset = data_sets.open_dataset(options.data)
     names = methods.test_objects(dataset, 2 if options.quick else options.objects)
     claims.claim(options.out / "fig3.json", {"data": run_record.checksum(dataset)}, "depths")
     networks = methods.networks(options.sources, dataset)
@@ -101,7 +106,7 @@ def main(options: Fig3) -> None:
     scores: dict[str, list] = {name: [] for name in found}
     rows, shown = [], evaluation.spread(names, options.shown)
     for number, name in enumerate(names, start=1):
-        item = data.read_object(dataset, name)
+        item = data_sets.read_object(dataset, name)
         maps = object_maps(options, dataset, item, found, points)
         for label, (seen, acc, truth) in maps.items():
             scores[label].append(depth_scores.scores(seen, acc, far_side(item.camera, truth.shape[1:]), truth))
@@ -115,7 +120,7 @@ def main(options: Fig3) -> None:
         "objects": list(names),
         "views": len(next(iter(maps.values()))[2]),
         "pixels": {method: truth.shape[-1] for method, (_, _, truth) in maps.items()},
-        "hardware": evaluation.hardware(),
+        "hardware": machine.hardware(),
         "data": dataset.settings.get("settings", {}),
         "seed": "nothing is drawn: samples lie at the middles of their strata",
     }
@@ -132,7 +137,7 @@ def main(options: Fig3) -> None:
 def of_network(network: methods.Network) -> Method:
     """The depth that a network renders."""
 
-    def show(item: data.ObjectData, cloud: PointCloud) -> tuple[np.ndarray, np.ndarray]:
+    def show(item: data_sets.ObjectData, cloud: PointCloud) -> tuple[np.ndarray, np.ndarray]:
         pictures = evaluation.on_host(network.show()(cloud, item.camera))
         assert pictures.depth is not None
         return np.asarray(pictures.depth), np.asarray(pictures.acc)
@@ -140,13 +145,13 @@ def of_network(network: methods.Network) -> Method:
     return Method(show=show, identity=network.identity)
 
 
-def of_surface(config: poisson.PoissonConfig) -> Method:
+def of_surface(config: poisson_surface.PoissonConfig) -> Method:
     """The depth of a surface that is made of the points; nothing where they span none."""
 
-    def show(item: data.ObjectData, cloud: PointCloud) -> tuple[np.ndarray, np.ndarray]:
+    def show(item: data_sets.ObjectData, cloud: PointCloud) -> tuple[np.ndarray, np.ndarray]:
         try:
-            asset = poisson.reconstruct(jax.tree.map(np.asarray, cloud), config)
-        except poisson.NoSurface:
+            asset = poisson_surface.reconstruct(jax.tree.map(np.asarray, cloud), config)
+        except poisson_surface.NoSurface:
             return (np.zeros(item.images.shape[:3], np.float32),) * 2
         found = cast_views(depth.caster(asset), item.camera)
         hit = np.isfinite(found)
@@ -156,10 +161,10 @@ def of_surface(config: poisson.PoissonConfig) -> Method:
 
 
 def object_maps(
-    options: Fig3, dataset: data.Dataset, item: data.ObjectData, found: dict[str, Method], points: int
+    options: Fig3, dataset: data_sets.Dataset, item: data_sets.ObjectData, found: dict[str, Method], points: int
 ) -> dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Depth, opacity and true depth (views, h, w) of an object by method; read where they are made."""
-    cloud = evaluation.first_points(item, points)
+    cloud = data_sets.first_points(item, points)
     maps = {}
     for name, method in found.items():
         seen, acc = kept(options.out / "depths" / name / f"{item.name}.npz", partial(method.show, item, cloud))
@@ -170,7 +175,7 @@ def object_maps(
 
 
 def true_depth(
-    dataset: data.Dataset, item: data.ObjectData, meshes: Path | None, size: tuple[int, ...]
+    dataset: data_sets.Dataset, item: data_sets.ObjectData, meshes: Path | None, size: tuple[int, ...]
 ) -> tuple[np.ndarray]:
     """Distances (views, *size) to the mesh that the object was made from."""
     cast = depth.caster(mesh_of(dataset, item, meshes))
@@ -197,14 +202,14 @@ def far_side(camera: Camera, size: tuple[int, ...]) -> np.ndarray:
     return np.asarray(cameras.intersect_box(rays.origins, rays.directions)[1])
 
 
-def picture_row(item: data.ObjectData, maps: dict, scores: dict[str, list]) -> tuple[str, list[np.ndarray]]:
+def picture_row(item: data_sets.ObjectData, maps: dict, scores: dict[str, list]) -> tuple[str, list[np.ndarray]]:
     """Reference, truth, and depth and error of each method, in the view whose error is the first method's median."""
     first = np.nan_to_num(next(iter(scores.values()))[-1]["error"], nan=np.inf)
     view = evaluation.median_view(first)
     finest = max((truth[view] for _, _, truth in maps.values()), key=len)
     inside = np.isfinite(finest)
     span = (float(finest[inside].min()), float(finest[inside].max())) if inside.any() else (0.0, 1.0)
-    cells = [data.on_white(item.images[view])]
+    cells = [data_sets.on_white(item.images[view])]
     cells.append(depth_image(np.where(inside, finest, 0), inside, span))
     for seen, acc, truth in maps.values():
         cells += [depth_image(seen[view], acc[view], span), error_image(seen[view], acc[view], truth[view])]

@@ -24,16 +24,19 @@ import numpy as np
 import tyro
 from PIL import Image
 
-from data_gen import records
+from data_gen.store import layout
 from experiments import claims, methods, sheets
 from experiments.methods import Sources
 from experiments.table1_page import data_address
 from experiments.table1_poisson import SURFACES
 from experiments.table1_report import LABELS
-from spnr_jax import cli, data, evaluation, run_record
-from spnr_jax.images import png, write_whole
-from spnr_jax.report import psnr
-from spnr_jax.report_style import STYLE
+from spnr_jax import cli
+from spnr_jax.devices import machine
+from spnr_jax.formats import data_sets
+from spnr_jax.formats.images import png, write_whole
+from spnr_jax.scoring.report import psnr
+from spnr_jax.scoring.report_style import STYLE
+from spnr_jax.training import run_record
 
 REFERENCE = "Reference"
 PAGE_STYLE = """
@@ -77,7 +80,7 @@ class Gallery:
 def main(options: Gallery) -> None:
     """Makes the pictures that are missing, then sheets and page."""
     cli.set_up_jax()
-    dataset = data.open_dataset(options.data)
+    dataset = data_sets.open_dataset(options.data)
     names = methods.test_objects(dataset, 3 if options.quick else options.objects)
     if note := shortage(dataset, options):
         print(note)
@@ -92,16 +95,16 @@ def main(options: Gallery) -> None:
     surfaces = surface_folders(options.sources.table1, points, names)
     shown |= {label: [] for label in surfaces}
     for number, name in enumerate(names, start=1):
-        item = data.read_object(dataset, name)
+        item = data_sets.read_object(dataset, name)
         if options.view >= len(item.images):
             raise ValueError(f"--view {options.view}: object {name} has views 0 to {len(item.images) - 1}")
-        shown[REFERENCE].append(data.on_white(item.images[options.view]))
+        shown[REFERENCE].append(data_sets.on_white(item.images[options.view]))
         for label, network in networks.items():
             place = options.out / "pictures" / label / f"{name}.png"
             shown[label].append(picture(network, item, options.view, points, place))
         for label, folder in surfaces.items():
-            rgba = records.read_image(folder / name / f"{options.view:03d}.png")
-            shown[label].append(data.on_white(rgba))
+            rgba = layout.read_image(folder / name / f"{options.view:03d}.png")
+            shown[label].append(data_sets.on_white(rgba))
         if number % 10 == 0 or number == len(names):
             print(f"{number} of {len(names)} objects", flush=True)
     scores = {label: [psnr(*pair) for pair in zip(row, shown[REFERENCE], strict=True)] for label, row in shown.items()}
@@ -113,7 +116,7 @@ def main(options: Gallery) -> None:
         "psnr": {label: [round(value, 3) for value in row] for label, row in scores.items() if label != REFERENCE},
         "made of": {label: network.identity for label, network in networks.items()},
         "points": points,
-        "hardware": evaluation.hardware(),
+        "hardware": machine.hardware(),
         "data": dataset.settings.get("settings", {}),
         "seed": "nothing is drawn: samples lie at the middles of their strata",
         "note": note,
@@ -124,7 +127,7 @@ def main(options: Gallery) -> None:
     print(f"wrote {pages} sheets for each of {len(shown)} methods, {written} in {options.out}")
 
 
-def shortage(dataset: data.Dataset, options: Gallery) -> str:
+def shortage(dataset: data_sets.Dataset, options: Gallery) -> str:
     """A line where the data set has fewer test objects than asked, with how to make more; else nothing."""
     count, wanted = len(dataset.splits["test"]), options.objects
     if count >= wanted or options.quick:
@@ -137,11 +140,11 @@ def shortage(dataset: data.Dataset, options: Gallery) -> str:
     )
 
 
-def picture(network: methods.Network, item: data.ObjectData, view: int, points: int, place: Path) -> np.ndarray:
+def picture(network: methods.Network, item: data_sets.ObjectData, view: int, points: int, place: Path) -> np.ndarray:
     """A network's picture of one view, from the object's first points; read where it is made."""
     if not place.is_file():
         camera = jax.tree.map(lambda x: x[view : view + 1], item.camera)
-        shown = network.show()(evaluation.first_points(item, points), camera)
+        shown = network.show()(data_sets.first_points(item, points), camera)
         write_whole(place, png(np.asarray(shown.image[0])))
     with Image.open(place) as image:
         return np.asarray(image.convert("RGB"))

@@ -27,16 +27,21 @@ import tyro
 from matplotlib.figure import Figure
 from scipy.ndimage import map_coordinates
 
-from data_gen import depth, light, views
-from data_gen.variant import choose_variant, mitsuba_module
+from data_gen.render import depth, light, views
+from data_gen.render.variant import choose_variant, mitsuba_module
 from experiments import claims, methods
 from experiments.fig3_depth import cast_views, kept
 from experiments.methods import Sources
 from experiments.poisson import unscaled_light, view_config
 from experiments.source_meshes import mesh_of
-from spnr_jax import cameras, cli, data, evaluation, run_record, statistics
-from spnr_jax.images import to_uint8, write_turntable, write_whole
-from spnr_jax.types import Camera
+from spnr_jax import cli
+from spnr_jax.devices import machine
+from spnr_jax.formats import data_sets
+from spnr_jax.formats.images import to_uint8, write_turntable, write_whole
+from spnr_jax.kernels import cameras
+from spnr_jax.kernels.records import Camera
+from spnr_jax.scoring import evaluation, intervals
+from spnr_jax.training import run_record
 
 SAME_PLACE = 0.01  # half diagonals that what frame t sees there may be nearer or farther than the place
 REFERENCE = "references"
@@ -73,16 +78,16 @@ def main(options: Flicker) -> None:
     if options.frames < 3:
         raise ValueError(f"--frames: expected 3 or more, got {options.frames}")
     cli.set_up_jax()
-    dataset = data.open_dataset(options.data)
+    dataset = data_sets.open_dataset(options.data)
     names = methods.test_objects(dataset, options.objects)
     networks = methods.networks(options.sources, dataset)
     asked = {name: getattr(options, name) for name in ("frames", "elevation", "spp")}
     claims.claim(options.out / "flicker.json", {"data": run_record.checksum(dataset)} | asked, "turntables")
     mitsuba_module(choose_variant(options.variant)[0])
-    camera = turntable(data.read_object(dataset, names[0]).camera, options.frames, options.elevation)
+    camera = turntable(data_sets.read_object(dataset, names[0]).camera, options.frames, options.elevation)
     curves: dict[str, list[np.ndarray]] = {name: [] for name in (REFERENCE, *networks)}
     for number, name in enumerate(names, start=1):
-        item = data.read_object(dataset, name)
+        item = data_sets.read_object(dataset, name)
         place = options.out / "frames" / f"{name}.npz"
         references, distances = kept(place, partial(true_frames, options, dataset, item, camera))
         shown = {REFERENCE: references.astype(np.float32) / 255}
@@ -97,7 +102,7 @@ def main(options: Flicker) -> None:
         strip = [np.concatenate([frames[i] for frames in shown.values()], axis=1) for i in range(options.frames)]
         write_turntable(options.out / f"{name}.gif", strip, fps=24)
         print(f"{number} of {len(names)}: {name}", flush=True)
-    results = summarise(curves, names) | asked | {"hardware": evaluation.hardware(), "pixels": camera.width}
+    results = summarise(curves, names) | asked | {"hardware": machine.hardware(), "pixels": camera.width}
     write_whole(options.out / "results.json", (json.dumps(results, indent=1, allow_nan=False) + "\n").encode())
     write_whole(options.out / "table.md", table(results).encode())
     write_whole(options.out / "flicker.png", plot(curves, names))
@@ -115,7 +120,7 @@ def turntable(like: Camera, frames: int, elevation: float) -> Camera:
 
 
 def true_frames(
-    options: Flicker, dataset: data.Dataset, item: data.ObjectData, camera: Camera
+    options: Flicker, dataset: data_sets.Dataset, item: data_sets.ObjectData, camera: Camera
 ) -> tuple[np.ndarray, np.ndarray]:
     """References on white (frames, h, w, 3) uint8 and distances to the mesh (frames, h, w), inf beside it."""
     asset = mesh_of(dataset, item, options.meshes)
@@ -124,18 +129,18 @@ def true_frames(
     poses = np.tile(np.eye(4), (len(camera.cam_to_world), 1, 1))
     poses[:, :3] = camera.cam_to_world
     pictures = [views.straight_srgb(views.render_view(scene, pose, config, i)) for i, pose in enumerate(poses)]
-    references = to_uint8(np.stack([data.on_white(picture) for picture in pictures]))
+    references = to_uint8(np.stack([data_sets.on_white(picture) for picture in pictures]))
     return references, cast_views(depth.caster(asset), camera)
 
 
-def light_of(dataset: data.Dataset, envmap: Path | None) -> np.ndarray:
+def light_of(dataset: data_sets.Dataset, envmap: Path | None) -> np.ndarray:
     """The scaled environment map (height, width, 3) of the data set."""
     return light.scaled_to_white(unscaled_light(dataset.settings["environment_map"], envmap))
 
 
-def frames_of(network: methods.Network, item: data.ObjectData, camera: Camera) -> np.ndarray:
+def frames_of(network: methods.Network, item: data_sets.ObjectData, camera: Camera) -> np.ndarray:
     """The network's pictures (frames, h, w, 3) of the object's first points, ten frames at a time."""
-    cloud, show = evaluation.first_points(item, network.config.test_points), network.show()
+    cloud, show = data_sets.first_points(item, network.config.test_points), network.show()
     parts = []
     for start in range(0, len(camera.cam_to_world), 10):
         few = jax.tree.map(lambda x, start=start: x[start : start + 10], camera)
@@ -172,7 +177,7 @@ def summarise(curves: dict[str, list[np.ndarray]], names: Sequence[str]) -> dict
     rows = {}
     for label, found in means.items():
         ratios = found / means[REFERENCE]
-        ends = statistics.interval([np.array([ratio]) for ratio in ratios])
+        ends = intervals.interval([np.array([ratio]) for ratio in ratios])
         rows[label] = {
             "flicker": float(found.mean()),
             "ratio": float(ratios.mean()),

@@ -27,7 +27,7 @@ import tyro
 
 from experiments.fuzz_worker import SECONDS, make_input
 from spnr_jax import cli
-from spnr_jax.images import write_whole
+from spnr_jax.formats.images import write_whole
 
 GRACE = 5.0  # seconds that a child may need beyond those of an input
 START = 120.0  # seconds that a child may need to begin

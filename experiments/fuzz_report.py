@@ -7,7 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from spnr_jax.images import write_whole
+from spnr_jax.formats.images import write_whole
 
 COLORS = {"read": "#2457d6", "refused": "#a8b3c7", "failed": "#c0392b"}
 

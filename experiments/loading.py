@@ -26,10 +26,12 @@ import numpy as np
 import tyro
 from tqdm import tqdm
 
-from data_gen.pack import PackConfig, pack
-from spnr_jax import cli, data, presets, training
+from data_gen.store.pack import PackConfig, pack
+from spnr_jax import cli, presets
 from spnr_jax.config import TrainConfig
-from spnr_jax.images import write_whole
+from spnr_jax.formats import data_sets
+from spnr_jax.formats.images import write_whole
+from spnr_jax.training import batching, optimisation
 
 TARGET = 0.02  # share of a step
 
@@ -53,7 +55,7 @@ class Loading:
 def main(options: Loading) -> None:
     """Measures, and writes the figures as JSON and as a Markdown table."""
     cli.set_up_jax()
-    size = image_size(data.open_dataset(options.dataset))
+    size = image_size(data_sets.open_dataset(options.dataset))
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         pack(PackConfig(dataset=options.dataset, out=Path(folder) / "packed"))
@@ -63,7 +65,7 @@ def main(options: Loading) -> None:
                 print(f"{preset} left out: it needs images of {settings.model.image_resolution} px, these have {size}")
                 continue
             for form, place in (("folder", options.dataset), ("packed", Path(folder) / "packed")):
-                figures = measure(data.open_dataset(place), settings, options)
+                figures = measure(data_sets.open_dataset(place), settings, options)
                 rows.append({"preset": preset, "form": form, "batch_objects": settings.batch_objects, **figures})
                 print(json.dumps(rows[-1]), file=sys.stderr)
     if not rows:
@@ -75,12 +77,12 @@ def main(options: Loading) -> None:
     print(table)
 
 
-def image_size(dataset: data.Dataset) -> int:
+def image_size(dataset: data_sets.Dataset) -> int:
     """Width of the data set's images in pixels."""
-    return data.read_object(dataset, dataset.splits["train"][0]).camera.width
+    return data_sets.read_object(dataset, dataset.splits["train"][0]).camera.width
 
 
-def measure(dataset: data.Dataset, settings: TrainConfig, options: Loading) -> dict[str, float]:
+def measure(dataset: data_sets.Dataset, settings: TrainConfig, options: Loading) -> dict[str, float]:
     """The figures of one data set under one preset, with the discriminator at work."""
     settings = dataclasses.replace(settings, num_steps=1 + max(options.steps, options.batches))
     waits, steps = time_steps(dataset, settings, options.steps)
@@ -91,9 +93,9 @@ def measure(dataset: data.Dataset, settings: TrainConfig, options: Loading) -> d
     }
 
 
-def samples_per_second(dataset: data.Dataset, settings: TrainConfig, num_batches: int) -> float:
+def samples_per_second(dataset: data_sets.Dataset, settings: TrainConfig, num_batches: int) -> float:
     """Objects a second that the loader delivers, after the first batch."""
-    with closing(data.batches(dataset, settings, 0, cache_bytes=0)) as batches:
+    with closing(batching.batches(dataset, settings, 0, cache_bytes=0)) as batches:
         next(batches)
         start = time.monotonic()
         for _ in range(num_batches):
@@ -101,16 +103,16 @@ def samples_per_second(dataset: data.Dataset, settings: TrainConfig, num_batches
         return num_batches * settings.batch_objects / (time.monotonic() - start)
 
 
-def time_steps(dataset: data.Dataset, settings: TrainConfig, num_steps: int) -> tuple[list[float], list[float]]:
+def time_steps(dataset: data_sets.Dataset, settings: TrainConfig, num_steps: int) -> tuple[list[float], list[float]]:
     """Seconds of each train step before its batch was there, and in all."""
-    state = training.jitted_create_state(settings)
+    state = optimisation.jitted_create_state(settings)
     waits, steps = [], []
-    with closing(data.batches(dataset, settings, 0, cache_bytes=0)) as batches:
+    with closing(batching.batches(dataset, settings, 0, cache_bytes=0)) as batches:
         for _ in tqdm(range(1 + num_steps), desc=f"{settings.preset} {dataset.folder.name}"):
             start = time.monotonic()
             batch = next(batches)
             waits.append(time.monotonic() - start)
-            state, metrics = training.jitted_train_step(
+            state, metrics = optimisation.jitted_train_step(
                 state, jax.device_put(batch), config=settings, adversarial=settings.loss.adversarial_weight > 0
             )
             jax.block_until_ready((state, metrics))

@@ -38,12 +38,15 @@ import jax
 import numpy as np
 import tyro
 
-from data_gen.generate import generate
-from data_gen.plan import GenerateConfig
+from data_gen.make.generate import generate
+from data_gen.plan.tasks import GenerateConfig
 from experiments.long_run_report import plot, table
-from spnr_jax import checkpoint, cli, data, evaluation, memory, presets, trainer, training
+from spnr_jax import cli, presets
 from spnr_jax.config import TrainConfig
-from spnr_jax.images import write_whole
+from spnr_jax.devices import allocator, machine
+from spnr_jax.formats import data_sets
+from spnr_jax.formats.images import write_whole
+from spnr_jax.training import checkpoint, optimisation, trainer
 
 COMPILED = "/jax/core/compile/backend_compile_duration"  # JAX's name of the event
 MOST_MEMORY, MOST_TIME, MOST_HANDLES = 0.01, 0.05, 10  # growth over a stretch: shares, and a number
@@ -93,11 +96,11 @@ class Witness:
 
         with ExitStack() as stack:
             for cause, owner, name in (
-                ("step", training, "jitted_train_step"),
+                ("step", optimisation, "jitted_train_step"),
                 ("preview", trainer, "preview"),
                 ("checkpoint", checkpoint, "save"),
                 ("row", trainer.MetricsLog, "write"),
-                ("memory", memory, "give_back"),
+                ("memory", allocator, "give_back"),
             ):
                 stack.enter_context(mock.patch.object(owner, name, self.watched(cause, getattr(owner, name))))
             jax.monitoring.register_event_duration_secs_listener(compiled)
@@ -158,7 +161,7 @@ def main(options: LongRun) -> list[str]:
         raise ValueError(f"{run}: holds a run, and one is measured from its first step on; choose another --out")
     if not Path("/proc/self/status").is_file():
         raise ValueError("memory is read from /proc/self/status, which only Linux has")
-    dataset = data.open_dataset(options.data or generated(options))
+    dataset = data_sets.open_dataset(options.data or generated(options))
     config = configured(options)
     witness, begin = Witness(), time.monotonic()
     try:
@@ -177,7 +180,7 @@ def written(options: LongRun, parts: list[tuple[int, int]], witness: Witness, se
     results = {
         "steps": options.steps,
         "last step": witness.samples[-1]["step"],
-        "hardware": evaluation.hardware(),
+        "hardware": machine.hardware(),
         "date": time.strftime("%Y-%m-%d"),
         "seconds": round(seconds, 1),
         "stretches": parts,
@@ -220,7 +223,7 @@ def schedule(steps: int) -> trainer.Schedule:
 
 def stretches(config: TrainConfig, settled: int) -> list[tuple[int, int]]:
     """First and last step of each part of the run that one program makes, without the steps until it has settled."""
-    bounds = sorted({0, training.first_adversarial_step(config), config.num_steps})
+    bounds = sorted({0, optimisation.first_adversarial_step(config), config.num_steps})
     return [(first + settled, last) for first, last in itertools.pairwise(bounds)]
 
 

@@ -32,11 +32,15 @@ import tyro
 from experiments import claims, many_runs
 from experiments.many_objects_report import LABELS, plot, table
 from experiments.many_runs import FORMS, Form
-from spnr_jax import cli, data, evaluation, run_record, training
+from spnr_jax import cli
 from spnr_jax.config import TrainConfig
-from spnr_jax.images import write_whole
+from spnr_jax.devices import machine
+from spnr_jax.formats import data_sets
+from spnr_jax.formats.images import write_whole
+from spnr_jax.kernels.records import Camera, PointCloud
+from spnr_jax.method import inference
 from spnr_jax.presets import PRESETS
-from spnr_jax.types import Camera, PointCloud
+from spnr_jax.training import optimisation, run_record
 
 SAVE_EVERY = 20
 
@@ -84,7 +88,7 @@ def main(options: ManyObjects) -> None:
     cli.set_up_jax()
     if options.quick:
         options = dataclasses.replace(options, runs=2, steps=3, objects=2, rounds=1)
-    dataset = data.open_dataset(options.data)
+    dataset = data_sets.open_dataset(options.data)
     config = dataclasses.replace(PRESETS[options.preset](), num_steps=options.steps, seed=options.seed)
     names = (*dataset.splits["test"], *dataset.splits["train"])[: options.objects]
     if len(names) < options.objects:
@@ -108,7 +112,7 @@ def main(options: ManyObjects) -> None:
         options.out / "render.json", partial(measure_rendering, options, dataset, config, names, start)
     )
     results = asked | {
-        "hardware": evaluation.hardware(),
+        "hardware": machine.hardware(),
         "parameters": sum(x[0].size for x in jax.tree.leaves(start.generator)),
         "batch objects": config.batch_objects,
         "losses": {form: losses.tolist() for form, (_, losses) in trained.items()},
@@ -126,11 +130,11 @@ def main(options: ManyObjects) -> None:
 def train(
     form: Form,
     out: Path,
-    dataset: data.Dataset,
+    dataset: data_sets.Dataset,
     config: TrainConfig,
     seeds: Sequence[int],
-    start: training.TrainState,
-) -> tuple[training.TrainState, np.ndarray]:
+    start: optimisation.TrainState,
+) -> tuple[optimisation.TrainState, np.ndarray]:
     """States after the last step and the losses (steps, runs), by one form; goes on where it was stopped."""
     place = out / f"train_{form}.npz"
     states, losses = many_runs.restore(place, start) or (start, np.zeros((0, len(seeds))))
@@ -138,7 +142,7 @@ def train(
     if first == config.num_steps:
         return states, losses
     found, rows = many_runs.entered_states(form, states), list(losses)
-    adversarial_from = training.first_adversarial_step(config)
+    adversarial_from = optimisation.first_adversarial_step(config)
     steps = {late: many_runs.form_step(form, config, late) for late in (False, True)}
     for step, batch in enumerate(many_runs.batches(dataset, config, seeds, first), start=first):
         found, metrics = steps[step >= adversarial_from](found, many_runs.entered_batch(form, batch))
@@ -151,7 +155,7 @@ def train(
     return many_runs.left(form, found), np.array(rows)
 
 
-def equality(trained: dict[Form, tuple[training.TrainState, np.ndarray]], form: Form) -> dict[str, float]:
+def equality(trained: dict[Form, tuple[optimisation.TrainState, np.ndarray]], form: Form) -> dict[str, float]:
     """How far a form's parameters and losses lie from those of the loop, relative to these."""
     (states, losses), (expected, curve) = trained[form], trained["loop"]
     apart = many_runs.apart(states, expected)
@@ -161,15 +165,15 @@ def equality(trained: dict[Form, tuple[training.TrainState, np.ndarray]], form: 
 
 def measure_pace(
     options: ManyObjects,
-    dataset: data.Dataset,
+    dataset: data_sets.Dataset,
     config: TrainConfig,
     seeds: Sequence[int],
-    start: training.TrainState,
+    start: optimisation.TrainState,
 ) -> dict[str, dict[str, list[float]]]:
     """Seconds of a step of all runs by each form, turn by turn, without and with the discriminator."""
     batch = next(many_runs.batches(dataset, config, seeds, 0))
     phases = {"without discriminator": False}
-    if training.first_adversarial_step(config) < config.num_steps:
+    if optimisation.first_adversarial_step(config) < config.num_steps:
         phases["with discriminator"] = True
     found = {}
     for phase, adversarial in phases.items():
@@ -203,17 +207,17 @@ def in_turns(work: Mapping[Any, Callable[[], object]], rounds: int) -> dict[str,
 
 def measure_rendering(
     options: ManyObjects,
-    dataset: data.Dataset,
+    dataset: data_sets.Dataset,
     config: TrainConfig,
     names: Sequence[str],
-    start: training.TrainState,
+    start: optimisation.TrainState,
 ) -> dict[str, Any]:
     """Seconds to encode and render one view of every object by each form, and how far the images lie apart."""
-    variables = training.averaged_variables(many_runs.unstack(start)[0])
-    items = [data.read_object(dataset, name) for name in names]
-    data.check_resolution(items[0], config)
+    variables = optimisation.averaged_variables(many_runs.unstack(start)[0])
+    items = [data_sets.read_object(dataset, name) for name in names]
+    data_sets.check_resolution(items[0], config)
     inputs = [
-        (evaluation.test_cloud(item, config), jax.tree.map(lambda x: np.asarray(x)[:1], item.camera)) for item in items
+        (data_sets.test_cloud(item, config), jax.tree.map(lambda x: np.asarray(x)[:1], item.camera)) for item in items
     ]
     cloud, camera = jax.device_put(jax.tree.map(lambda *x: np.stack(x), *inputs))
 
@@ -222,8 +226,8 @@ def measure_rendering(
         return whole(cloud, camera)[0]
 
     def whole(cloud: PointCloud, camera: Camera) -> jax.Array:
-        scene = training.encode(variables, cloud, config=config.model)
-        return training.render(variables, scene, camera, config=config.model).image
+        scene = inference.encode(variables, cloud, config=config.model)
+        return inference.render(variables, scene, camera, config=config.model).image
 
     single, many, batched = jax.jit(one), jax.jit(jax.vmap(one)), jax.jit(whole)
     mapped = jax.jit(lambda cloud, camera: jax.lax.map(lambda x: one(*x), (cloud, camera)))

@@ -1,4 +1,4 @@
-"""M training runs at once: the same `training.train_step` in three forms, and how far their results lie apart.
+"""M training runs at once: the same `optimisation.train_step` in three forms, and how far their results lie apart.
 
     loop   M calls of the jitted step, one run after the other: what everybody does
     vmap   one program, `jax.vmap` over states and batches
@@ -23,11 +23,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from spnr_jax import data, training
 from spnr_jax.config import TrainConfig
-from spnr_jax.images import write_whole
-from spnr_jax.training import TrainState
-from spnr_jax.types import Batch
+from spnr_jax.formats import data_sets
+from spnr_jax.formats.images import write_whole
+from spnr_jax.kernels.records import Batch
+from spnr_jax.training import batching, optimisation
+from spnr_jax.training.optimisation import TrainState
 
 Form = Literal["loop", "vmap", "map"]
 FORMS: tuple[Form, ...] = ("loop", "vmap", "map")
@@ -37,8 +38,8 @@ Step = Callable[[Any, Any], tuple[Any, dict[str, jax.Array]]]
 
 
 def create(config: TrainConfig, seeds: Sequence[int]) -> TrainState:
-    """Fresh states of a run for each seed, as `training.create_state` makes them; compiled once."""
-    states = [training.jitted_create_state(config, jnp.uint32(seed)) for seed in seeds]
+    """Fresh states of a run for each seed, as `optimisation.create_state` makes them; compiled once."""
+    states = [optimisation.jitted_create_state(config, jnp.uint32(seed)) for seed in seeds]
     return stack(states)
 
 
@@ -68,28 +69,28 @@ def with_key(state: TrainState) -> TrainState:
     return dataclasses.replace(state, key=jax.random.wrap_key_data(jnp.asarray(state.key)))
 
 
-def batches(dataset: data.Dataset, config: TrainConfig, seeds: Sequence[int], first: int) -> Iterator[Batch]:
+def batches(dataset: data_sets.Dataset, config: TrainConfig, seeds: Sequence[int], first: int) -> Iterator[Batch]:
     """Of each step from `first` on the batches of all runs, each the one that the run alone would see."""
-    read = data.cached_reader(dataset, config, data.CACHE_BYTES)
+    read = batching.cached_reader(dataset, config, batching.CACHE_BYTES)
     configs = [dataclasses.replace(config, seed=seed) for seed in seeds]
     for step in range(first, config.num_steps):
         made = []
         for one in configs:
-            names = data.object_names(dataset.splits["train"], one, step)
-            made.append(data.make_batch([read(name) for name in names], one, step))
+            names = batching.object_names(dataset.splits["train"], one, step)
+            made.append(batching.make_batch([read(name) for name in names], one, step))
         yield jax.device_put(jax.tree.map(lambda *x: np.stack(x), *made))
 
 
 def form_step(form: Form, config: TrainConfig, adversarial: bool) -> Step:
     """One step of all runs in a form: from its states and batches (`entered`) to its states and stacked metrics."""
-    one = partial(training.train_step, config=config, adversarial=adversarial)
+    one = partial(optimisation.train_step, config=config, adversarial=adversarial)
     if form == "vmap":
         return jax.jit(jax.vmap(one, in_axes=(AXES, 0), out_axes=(AXES, 0)), donate_argnums=0)
     if form == "map":
         return jax.jit(partial(mapped, one), donate_argnums=0)
 
     def loop(states: list[TrainState], batch: list[Batch]) -> tuple[list[TrainState], dict[str, jax.Array]]:
-        step = partial(training.jitted_train_step, config=config, adversarial=adversarial)
+        step = partial(optimisation.jitted_train_step, config=config, adversarial=adversarial)
         found = [step(state, piece) for state, piece in zip(states, batch, strict=True)]
         return [state for state, _ in found], jax.tree.map(lambda *x: jnp.stack(x), *(m for _, m in found))
 

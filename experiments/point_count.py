@@ -23,7 +23,6 @@ import numpy as np
 import tyro
 from PIL import Image
 
-from data_gen import points
 from experiments import claims, methods, poisson, sheets
 from experiments.methods import Network, Sources
 from experiments.point_count_report import METRICS, plot, table
@@ -31,10 +30,15 @@ from experiments.source_meshes import details, mesh_of
 from experiments.table1_poisson import SURFACES
 from experiments.table1_report import LABELS
 from experiments.table1_scores import ObjectMethod
-from spnr_jax import cli, data, evaluation, run_record, statistics
+from spnr_jax import cli
 from spnr_jax.config import TrainConfig
-from spnr_jax.images import png, write_whole
-from spnr_jax.types import PointCloud
+from spnr_jax.devices import machine
+from spnr_jax.formats import data_sets
+from spnr_jax.formats.images import png, write_whole
+from spnr_jax.formats.mesh import surface_points
+from spnr_jax.kernels.records import PointCloud
+from spnr_jax.scoring import evaluation, intervals
+from spnr_jax.training import run_record
 
 COUNTS = (128, 256, 512, 1024, 2048, 4096, 10_000)
 
@@ -82,7 +86,7 @@ class Method:
 def main(options: PointCount) -> None:
     """Measures what is missing, then writes results, table, curves and pictures."""
     cli.set_up_jax()
-    dataset = data.open_dataset(options.data)
+    dataset = data_sets.open_dataset(options.data)
     names = methods.test_objects(dataset, 2 if options.quick else options.objects)
     networks = methods.networks(options.sources, dataset)
     counts = available_counts(options, dataset, names[0])
@@ -103,7 +107,7 @@ def main(options: PointCount) -> None:
         "made of": {label: method.identity for label, method in found.items()},
         "trained on": [config.min_points, config.max_points],
         "class points": shown_count(counts, config),
-        "hardware": evaluation.hardware(),
+        "hardware": machine.hardware(),
         "data": dataset.settings.get("settings", {}),
         "seed": "that of the data set's points; nothing else is drawn",
     }
@@ -120,10 +124,10 @@ def main(options: PointCount) -> None:
     print(f"wrote {', '.join(files)} in {options.out}")
 
 
-def available_counts(options: PointCount, dataset: data.Dataset, name: str) -> list[int]:
+def available_counts(options: PointCount, dataset: data_sets.Dataset, name: str) -> list[int]:
     """The counts that can be had; a line names those that cannot, and why."""
     counts = [options.counts[0], options.counts[-1]] if options.quick else list(options.counts)
-    item = data.read_object(dataset, name)
+    item = data_sets.read_object(dataset, name)
     stored = len(item.cloud.positions)
     try:
         if counts[-1] > stored:
@@ -135,7 +139,7 @@ def available_counts(options: PointCount, dataset: data.Dataset, name: str) -> l
     return counts
 
 
-def all_methods(options: PointCount, dataset: data.Dataset, networks: dict[str, Network]) -> dict[str, Method]:
+def all_methods(options: PointCount, dataset: data_sets.Dataset, networks: dict[str, Network]) -> dict[str, Method]:
     """Networks, Poisson surfaces, and the trivial renderers."""
     config = next(iter(networks.values())).config
     found = {label: of_network(network) for label, network in networks.items()}
@@ -171,15 +175,15 @@ def of_floor(name: str, factor: float) -> Method:
 def of_surface(renderer: poisson.Renderer, name: str) -> Method:
     """A Poisson surface of the points."""
 
-    def show(item: data.ObjectData) -> evaluation.Pictures:
+    def show(item: data_sets.ObjectData) -> evaluation.Pictures:
         rgba, _ = renderer.pictures(item, len(item.cloud.mask), SURFACES[name])
-        return evaluation.Pictures(image=data.on_white(rgba), acc=rgba[..., 3].astype(np.float32) / 255)
+        return evaluation.Pictures(image=data_sets.on_white(rgba), acc=rgba[..., 3].astype(np.float32) / 255)
 
     return Method(show=show, identity=asdict(SURFACES[name]))
 
 
 def kept_scores(
-    options: PointCount, dataset: data.Dataset, names: tuple[str, ...], label: str, method: Method, count: int
+    options: PointCount, dataset: data_sets.Dataset, names: tuple[str, ...], label: str, method: Method, count: int
 ) -> Scores:
     """The scores of a method at a count, with a picture of one object; read where they are made."""
     place = options.out / label / f"{count}.json"
@@ -195,22 +199,22 @@ def kept_scores(
 
 
 def measure(
-    dataset: data.Dataset, name: str, method: Method, count: int, meshes: Path | None
+    dataset: data_sets.Dataset, name: str, method: Method, count: int, meshes: Path | None
 ) -> tuple[dict[str, list[float]], np.ndarray]:
     """Scores of every view of an object from so many points, and the picture of the first one."""
-    item = data.read_object(dataset, name)
+    item = data_sets.read_object(dataset, name)
     item = dataclasses.replace(item, cloud=cloud_of(dataset, item, count, meshes))
     pictures = evaluation.on_host(method.show(item))
     found = evaluation.score_pictures(item, pictures)
     return {metric: np.asarray(found[metric], np.float64).tolist() for metric in METRICS}, np.asarray(pictures.image[0])
 
 
-def cloud_of(dataset: data.Dataset, item: data.ObjectData, count: int, meshes: Path | None) -> PointCloud:
+def cloud_of(dataset: data_sets.Dataset, item: data_sets.ObjectData, count: int, meshes: Path | None) -> PointCloud:
     """So many points of an object: stored ones, or if there are not enough new ones from its mesh."""
     if count <= len(item.cloud.positions):
-        return evaluation.first_points(item, count)
+        return data_sets.first_points(item, count)
     seed = details(dataset, item.name)["seeds"]["points"]
-    drawn = points.sample_surface(mesh_of(dataset, item, meshes), count, seed, dataset.spread)
+    drawn = surface_points.sample_surface(mesh_of(dataset, item, meshes), count, seed, dataset.spread)
     return PointCloud(
         positions=drawn.positions,
         base_color=drawn.base_color,
@@ -237,7 +241,7 @@ def curve(method: Method, scores: dict[int, Scores]) -> dict[str, list[dict]]:
             {
                 "points": count,
                 "mean": mean(found, metric),
-                "interval": statistics.interval([np.array(row[metric]) for row in found.values()]),
+                "interval": intervals.interval([np.array(row[metric]) for row in found.values()]),
             }
             for count, found in scores.items()
         ]
@@ -267,10 +271,10 @@ def by_class(scores: dict[str, Scores]) -> dict[str, dict]:
 
 
 def strip(
-    options: PointCount, dataset: data.Dataset, name: str, labels: Sequence[str], counts: Sequence[int]
+    options: PointCount, dataset: data_sets.Dataset, name: str, labels: Sequence[str], counts: Sequence[int]
 ) -> np.ndarray:
     """One object: a row for each method, a column for each count, and the reference before them."""
-    reference = data.on_white(data.read_object(dataset, name).images[0])
+    reference = data_sets.on_white(data_sets.read_object(dataset, name).images[0])
     rows = []
     for label in labels:
         row = [reference]

@@ -2,7 +2,7 @@
 
 import io
 
-from spnr_jax.report import QUALITY
+from spnr_jax.scoring.report import QUALITY
 
 METRICS = ("psnr", "flip", "iou")
 COLORS = ("#2457d6", "#d9480f", "#2f9e44", "#9c36b5", "#0b7285", "#e8a700", "#868e96", "#495057", "#adb5bd")

@@ -24,11 +24,14 @@ import numpy as np
 import tyro
 from tqdm import tqdm
 
-from data_gen import light, poisson, records, views
-from data_gen.poisson import PoissonConfig
-from data_gen.variant import choose_variant, mitsuba_module
-from spnr_jax import cli, data, metrics
-from spnr_jax.images import write_whole
+from data_gen.render import light, poisson_surface, views
+from data_gen.render.poisson_surface import PoissonConfig
+from data_gen.render.variant import choose_variant, mitsuba_module
+from data_gen.store import layout
+from spnr_jax import cli
+from spnr_jax.formats import data_sets
+from spnr_jax.formats.images import write_whole
+from spnr_jax.kernels import metrics
 
 RENDERING = ("resolution", "fov", "spp", "max_depth")  # settings that decide a picture, given the pose of its camera
 
@@ -58,7 +61,7 @@ class Options:
 def main(options: Options) -> None:
     """Writes pictures and scores of every object of the split."""
     check_packages()
-    dataset = data.open_dataset(options.data)
+    dataset = data_sets.open_dataset(options.data)
     if not dataset.splits.get(options.split):
         raise ValueError(f"--split {options.split}: {options.data} has no objects there; try train, val or test")
     if options.points < 1:
@@ -66,7 +69,7 @@ def main(options: Options) -> None:
     outcome = Outcome(options)
     renderer = Renderer(dataset.settings, options.envmap, options.variant, options.seed)
     for name in tqdm(dataset.splits[options.split], unit="object", file=sys.stderr):
-        item = data.read_object(dataset, name)
+        item = data_sets.read_object(dataset, name)
         paths = [options.out / "images" / name / f"{view:03d}.png" for view in range(len(item.images))]
         if outcome.has(name) and all(path.is_file() for path in paths):
             continue
@@ -74,8 +77,8 @@ def main(options: Options) -> None:
         if empty:
             tqdm.write(f"{name}: {empty}; its pictures are empty", file=sys.stderr)
         for path, picture in zip(paths, pictures, strict=True):
-            write_whole(path, records.encode_image(picture))
-        scores = metrics.psnr(*(jnp.asarray(data.on_white(x)) for x in (pictures, item.images)))
+            write_whole(path, layout.encode_image(picture))
+        scores = metrics.psnr(*(jnp.asarray(data_sets.on_white(x)) for x in (pictures, item.images)))
         outcome.add(name, float(np.mean(scores)), empty)
     mean = np.mean([row["psnr"] for row in outcome.objects.values()])
     print(f"{options.out}: {len(outcome.objects)} objects, PSNR {mean:.2f} dB on white")
@@ -93,14 +96,14 @@ class Renderer:
         self._seed, self._view = seed, view_config(settings)
         self._light = light.scaled_to_white(unscaled_light(settings["environment_map"], envmap))
 
-    def pictures(self, item: data.ObjectData, num_points: int, surface: PoissonConfig) -> tuple[np.ndarray, str]:
+    def pictures(self, item: data_sets.ObjectData, num_points: int, surface: PoissonConfig) -> tuple[np.ndarray, str]:
         """Straight-alpha sRGB (views, height, width, 4) uint8 from the object's first points, and "".
 
         Where they span no surface: empty pictures, and the reason.
         """
         try:
-            asset = poisson.reconstruct(jax.tree.map(lambda x: np.asarray(x)[:num_points], item.cloud), surface)
-        except poisson.NoSurface as error:
+            asset = poisson_surface.reconstruct(jax.tree.map(lambda x: np.asarray(x)[:num_points], item.cloud), surface)
+        except poisson_surface.NoSurface as error:
             return np.zeros(item.images.shape, np.uint8), str(error)
         scene = views.build_scene(asset, self._light)
         poses = np.tile(np.eye(4), (len(item.images), 1, 1))
@@ -156,7 +159,7 @@ class Outcome:
     def add(self, name: str, psnr: float, empty: str) -> None:
         """Notes an object's score."""
         self.objects[name] = {"psnr": round(psnr, 3), "empty": empty}
-        write_whole(self._path, records.json_text({"options": self._options, "objects": self.objects}).encode())
+        write_whole(self._path, layout.json_text({"options": self._options, "objects": self.objects}).encode())
 
 
 def check_packages() -> None:

@@ -21,15 +21,18 @@ from typing import Literal
 
 import tyro
 
-from data_gen.generate import generate
-from data_gen.plan import GenerateConfig
-from data_gen.records import SPLITS
+from data_gen.make.generate import generate
+from data_gen.plan.tasks import GenerateConfig
+from data_gen.store.layout import SPLITS
 from experiments import refinement
 from experiments.demo import Seconds
-from spnr_jax import cli, data, evaluation, presets, trainer, weights
+from spnr_jax import cli, presets
 from spnr_jax.config import TrainConfig
-from spnr_jax.images import write_whole
-from spnr_jax.results import text_table, write_results
+from spnr_jax.formats import data_sets as data
+from spnr_jax.formats.images import write_whole
+from spnr_jax.scoring import evaluation
+from spnr_jax.scoring.results import text_table, write_results
+from spnr_jax.training import trainer, weights
 
 
 @dataclass(frozen=True, kw_only=True)

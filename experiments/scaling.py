@@ -27,11 +27,12 @@ import numpy as np
 import tyro
 
 from experiments import bench_ours, bench_worker
-from spnr_jax import cameras, cli
+from spnr_jax import cli
 from spnr_jax.config import TrainConfig
-from spnr_jax.images import write_whole
+from spnr_jax.formats.images import write_whole
+from spnr_jax.kernels import cameras
+from spnr_jax.kernels.records import Batch
 from spnr_jax.model_config import ModelConfig
-from spnr_jax.types import Batch
 
 INK, GREY = "#2457d6", "#a8b3c7"
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from spnr_jax.images import to_uint8
+from spnr_jax.formats.images import to_uint8
 
 INK, PAPER, GAP = (29, 35, 48), (255, 255, 255), 4
 FONT_SIZE, LETTER = 12, 6.2  # pixels, the second the mean width of a letter

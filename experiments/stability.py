@@ -31,7 +31,7 @@ from experiments import stability_report as report
 from experiments.stability_report import Curve, Point
 from experiments.stability_sweeps import FIGURES, Axis, Kernel
 from spnr_jax import cli
-from spnr_jax.images import write_whole
+from spnr_jax.formats.images import write_whole
 
 AGREEMENT = 1e-9  # between the float64 run and the NumPy twin
 

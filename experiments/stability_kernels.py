@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from skimage.metrics import structural_similarity
 
-from spnr_jax import cameras, compositing, losses, metrics, sampling, voxels
+from spnr_jax.kernels import cameras, compositing, losses, metrics, sampling, voxels
+from spnr_jax.kernels.records import Camera
 from spnr_jax.model_config import SamplingConfig
-from spnr_jax.types import Camera
 
 Rng = np.random.Generator
 RAYS = 64

@@ -11,13 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.stability_kernels import Rng, box_at_distance
+from spnr_jax.kernels.records import Rays, Scene
+from spnr_jax.method.renderer import Renderer
 from spnr_jax.model_config import ModelConfig, SamplingConfig
 from spnr_jax.nn.discriminator import Discriminator
 from spnr_jax.nn.normalization import BatchNorm, GroupNorm
 from spnr_jax.nn.unet3d import UNet3D
 from spnr_jax.nn.upsampler import Upsampler
-from spnr_jax.renderer import Renderer
-from spnr_jax.types import Rays, Scene
 
 
 def batch_norm(x):

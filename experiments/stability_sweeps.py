@@ -13,7 +13,7 @@ import numpy as np
 
 from experiments import stability_kernels as k
 from experiments import stability_networks as networks
-from spnr_jax import compositing, losses, metrics, voxels
+from spnr_jax.kernels import compositing, losses, metrics, voxels
 
 
 @dataclass(frozen=True)

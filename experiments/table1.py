@@ -23,17 +23,21 @@ from typing import Literal
 
 import tyro
 
-from data_gen.poisson import pymeshlab
+from data_gen.render.poisson_surface import pymeshlab
 from experiments import claims, poisson, table1_page, table1_poisson, table1_report, table1_training
 from experiments.methods import test_objects
 from experiments.table1_scores import ObjectMethod, Scored, Shown, by_category, of_cloud, score_objects
 from experiments.table1_training import NETWORKS, Budget, Trained
-from spnr_jax import cli, data, evaluation, run_record
+from spnr_jax import cli
 from spnr_jax.config import TrainConfig
-from spnr_jax.images import write_whole
-from spnr_jax.lpips_weights import read_weights
+from spnr_jax.devices import machine
+from spnr_jax.formats import data_sets
+from spnr_jax.formats.images import write_whole
 from spnr_jax.presets import PRESETS
-from spnr_jax.summary import differences, metric_settings, summarise
+from spnr_jax.scoring import evaluation
+from spnr_jax.scoring.lpips_weights import read_weights
+from spnr_jax.scoring.summary import differences, metric_settings, summarise
+from spnr_jax.training import run_record
 
 Row = Literal[
     "ours", "plus", "npbg", "point_nerf", "points2nerf", "poisson", "poisson_trimmed", "nearest", "splat", "white"
@@ -85,13 +89,13 @@ class Table1:
 def main(options: Table1) -> None:
     """Trains what is not trained, scores all methods, writes the tables and the page."""
     cli.set_up_jax()
-    dataset = data.open_dataset(options.data)
+    dataset = data_sets.open_dataset(options.data)
     names = test_objects(dataset, options.objects or (QUICK_OBJECTS if options.budget == "quick" else None))
-    first = data.read_object(dataset, names[0])
+    first = data_sets.read_object(dataset, names[0])
     category = dataset.settings.get("settings", {}).get("category")
     presets = table1_training.presets(options.budget, first.camera.height, category)
     config = PRESETS[presets["ours"]]()  # its points and pixels are given to every method
-    data.check_resolution(first, config)
+    data_sets.check_resolution(first, config)
     claim(options, dataset)
     weights = None if options.lpips is None else read_weights(options.lpips)
     surfaces, missing = surface_methods(options, dataset, config)  # before hours of training: something may be amiss
@@ -106,7 +110,7 @@ def main(options: Table1) -> None:
         "budget": options.budget,
         "minutes": options.minutes,
         "seed": options.seed,
-        "hardware": evaluation.hardware(),
+        "hardware": machine.hardware(),
         "data": dataset.settings.get("settings", {}) | {f"{s} objects": len(o) for s, o in dataset.splits.items()},
         "test_objects": list(names),
         "points": config.test_points,
@@ -144,7 +148,7 @@ def write(out: Path, results: dict, shown: list[Shown]) -> None:
     print(f"wrote {', '.join(files)} in {out}")
 
 
-def claim(options: Table1, dataset: data.Dataset) -> None:
+def claim(options: Table1, dataset: data_sets.Dataset) -> None:
     """Makes the folder that of this table; ValueError if it is another's."""
     asked = {
         "budget": options.budget,
@@ -161,7 +165,7 @@ def surface_folder(options: Table1, config: TrainConfig, row: str) -> Path:
 
 
 def surface_methods(
-    options: Table1, dataset: data.Dataset, config: TrainConfig
+    options: Table1, dataset: data_sets.Dataset, config: TrainConfig
 ) -> tuple[dict[str, ObjectMethod], dict[str, str]]:
     """The Poisson rows in the data set's light, and those that have to be left out, with the reason."""
     wanted = {name: surface for name, surface in table1_poisson.SURFACES.items() if name in options.methods}
@@ -179,7 +183,7 @@ def surface_methods(
 
 
 def floor_methods(
-    options: Table1, dataset: data.Dataset, config: TrainConfig
+    options: Table1, dataset: data_sets.Dataset, config: TrainConfig
 ) -> tuple[dict[str, ObjectMethod], dict[str, float]]:
     """The trivial renderers, and the radius factors that are best for them on training objects."""
     wanted: list[str] = [name for name in reversed(evaluation.FLOORS) if name in options.methods]
@@ -187,7 +191,7 @@ def floor_methods(
     return {name: of_cloud(evaluation.floor(name, factors.get(name, 1.0)), config) for name in wanted}, factors
 
 
-def train_networks(options: Table1, dataset: data.Dataset, presets: dict[str, str]) -> dict[str, Trained]:
+def train_networks(options: Table1, dataset: data_sets.Dataset, presets: dict[str, str]) -> dict[str, Trained]:
     """The networks of the table, one after another; finished ones are only read."""
     wanted: list[str] = [name for name in NETWORKS if name in options.methods]
     trained = {}

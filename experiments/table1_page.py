@@ -14,8 +14,8 @@ import numpy as np
 
 from experiments.table1_report import LABELS, Cell, Table
 from experiments.table1_scores import Shown
-from spnr_jax.images import png
-from spnr_jax.report_style import STYLE
+from spnr_jax.formats.images import png
+from spnr_jax.scoring.report_style import STYLE
 
 TITLE = "Table 1: every method on the same unseen objects"
 HELP = (

@@ -10,17 +10,17 @@ from pathlib import Path
 
 import numpy as np
 
-from data_gen import records
-from data_gen.poisson import PoissonConfig
+from data_gen.render.poisson_surface import PoissonConfig
+from data_gen.store import layout
 from experiments.poisson import Renderer
-from spnr_jax import data
-from spnr_jax.evaluation import Pictures
-from spnr_jax.images import write_whole
+from spnr_jax.formats import data_sets
+from spnr_jax.formats.images import write_whole
+from spnr_jax.scoring.evaluation import Pictures
 
 SURFACES = {"poisson": PoissonConfig(), "poisson_trimmed": PoissonConfig(trim=0.3)}
 
 
-def show(renderer: Renderer, points: int, surface: PoissonConfig, folder: Path, item: data.ObjectData) -> Pictures:
+def show(renderer: Renderer, points: int, surface: PoissonConfig, folder: Path, item: data_sets.ObjectData) -> Pictures:
     """Image and opacity of the surface of an object's first points, in all its views; read where they are made."""
     note = folder / item.name / "made.json"
     paths = [folder / item.name / f"{view:03d}.png" for view in range(len(item.images))]
@@ -29,11 +29,11 @@ def show(renderer: Renderer, points: int, surface: PoissonConfig, folder: Path, 
         pictures, empty = renderer.pictures(item, points, surface)
         seconds = time.monotonic() - start
         for path, picture in zip(paths, pictures, strict=True):
-            write_whole(path, records.encode_image(picture))
+            write_whole(path, layout.encode_image(picture))
         made = {"seconds": round(seconds, 4), "views": len(paths), "empty": empty}
-        write_whole(note, records.json_text(made).encode())
-    rgba = np.stack([records.read_image(path) for path in paths])
-    return Pictures(image=data.on_white(rgba), acc=rgba[..., 3].astype(np.float32) / 255)
+        write_whole(note, layout.json_text(made).encode())
+    rgba = np.stack([layout.read_image(path) for path in paths])
+    return Pictures(image=data_sets.on_white(rgba), acc=rgba[..., 3].astype(np.float32) / 255)
 
 
 def seconds_per_view(folder: Path, names: tuple[str, ...]) -> list[float]:

@@ -10,8 +10,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from experiments.table1_training import QUICK_STEPS
-from spnr_jax.report import ARROWS, QUALITY, duration
-from spnr_jax.summary import NO_WEIGHTS
+from spnr_jax.scoring.report import ARROWS, QUALITY, duration
+from spnr_jax.scoring.summary import NO_WEIGHTS
 
 LABELS = {
     "ours": "Ours",

@@ -18,10 +18,12 @@ from matplotlib.ticker import MaxNLocator
 from experiments import training_runs
 from experiments.table1_report import Cell, Table, markdown
 from experiments.training_runs import OPAQUE, Budget, Compared, Variant
-from spnr_jax import data, evaluation, statistics
-from spnr_jax.images import write_whole
-from spnr_jax.report import ARROWS, HIGHER, QUALITY
-from spnr_jax.summary import Scores, metric_settings
+from spnr_jax.devices import machine
+from spnr_jax.formats import data_sets
+from spnr_jax.formats.images import write_whole
+from spnr_jax.scoring import evaluation, intervals
+from spnr_jax.scoring.report import ARROWS, HIGHER, QUALITY
+from spnr_jax.scoring.summary import Scores, metric_settings
 
 METRICS = {  # head, decimals, what is better
     "psnr": QUALITY["psnr"],
@@ -41,7 +43,7 @@ def write(
     reference: str,
     compared: Compared,
     budget: Budget,
-    dataset: data.Dataset,
+    dataset: data_sets.Dataset,
     more: Mapping[str, object] | None = None,
 ) -> None:
     """Writes the files and prints the tables; what is in `more` is written with the results."""
@@ -58,7 +60,7 @@ def write(
 
 
 def numbers(
-    variants: Sequence[Variant], reference: str, compared: Compared, budget: Budget, dataset: data.Dataset
+    variants: Sequence[Variant], reference: str, compared: Compared, budget: Budget, dataset: data_sets.Dataset
 ) -> dict:
     """Everything that is written, and the conditions that it stands on."""
     config, names = variants[0].config, compared.names
@@ -89,7 +91,7 @@ def numbers(
         "minutes": budget.minutes,
         "even_share": budget.even_share,
         "seeds": list(budget.seeds),
-        "hardware": evaluation.hardware(),
+        "hardware": machine.hardware(),
         "data": dataset.settings.get("settings", {}),
         "views": len(next(iter(compared.scores.values()))[0]["psnr"]) // len(budget.seeds),
         "points": config.test_points,
@@ -117,7 +119,7 @@ def means(objects: Sequence[Scores]) -> dict[str, float | list[float] | None]:
     for metric in METRICS:
         values = [scores[metric] for scores in objects]
         every = np.concatenate(values)
-        ends = None if np.isnan(every).all() else statistics.interval(values)
+        ends = None if np.isnan(every).all() else intervals.interval(values)
         row[metric] = None if np.isnan(every).all() else float(np.nanmean(every))
         row[f"{metric}_interval"] = None if ends is None else list(ends)
     return row
@@ -126,8 +128,8 @@ def means(objects: Sequence[Scores]) -> dict[str, float | list[float] | None]:
 def change(compared: Compared, variant: str, reference: str, metric: str) -> dict | None:
     """The variant minus the reference: mean, interval, p-value, and the mean of each seed alone."""
 
-    def minus(first: Sequence[Scores], second: Sequence[Scores]) -> statistics.Difference | None:
-        return statistics.difference([s[metric] for s in first], [s[metric] for s in second])
+    def minus(first: Sequence[Scores], second: Sequence[Scores]) -> intervals.Difference | None:
+        return intervals.difference([s[metric] for s in first], [s[metric] for s in second])
 
     found = minus(compared.scores[variant], compared.scores[reference])
     if found is None:

@@ -5,14 +5,17 @@ import json
 
 import numpy as np
 import pytest
-import tiny_dataset
-from tiny_runs import check_conditions, results_of, shrunken
+from support import tiny_dataset
+from support.tiny_runs import check_conditions, results_of, shrunken
 
 from experiments import table1_training, training_report, training_runs
 from experiments.ablations import LABELS, ROWS, Ablations, changed, folds, main, rows
 from experiments.training_runs import Budget, Compared
-from spnr_jax import checkpoint, cli, data, evaluation, presets, trainer, training
+from spnr_jax import cli, presets
 from spnr_jax.config import to_dict
+from spnr_jax.formats import data_sets
+from spnr_jax.scoring import evaluation
+from spnr_jax.training import checkpoint, optimisation, trainer
 
 pytestmark = pytest.mark.ci  # it trains several networks
 PLUS_ROWS = ("free_colour", "no_neighbours", "three_neighbours", "twelve_neighbours", "batch_norm")
@@ -138,7 +141,7 @@ def test_scores_and_differences_are_those_of_the_runs_on_the_same_views(out):
     results, psnr = results_of(out), {}
     for row in ("reference", "skip_concat"):
         found, state = checkpoint.load_run(out / "runs" / f"{row}_0")
-        show = {row: evaluation.network(training.averaged_variables(state), found)}
+        show = {row: evaluation.network(optimisation.averaged_variables(state), found)}
         scored = evaluation.evaluate_objects(show, found, tiny_dataset.dataset(), ("ball_000004", "chair"))
         own = {result.name: result.scores[row]["psnr"] for result in scored}
         psnr[row] = np.concatenate(list(own.values()))
@@ -167,7 +170,7 @@ def test_every_object_is_scored_once_by_networks_that_never_saw_it(tmp_path):
     psnr = []
     for number, part in enumerate(folds(tiny_dataset.dataset(), 3)):
         found, state = checkpoint.load_run(tmp_path / f"fold_{number}" / "runs" / "reference_0")
-        show = {"shown": evaluation.network(training.averaged_variables(state), found)}
+        show = {"shown": evaluation.network(optimisation.averaged_variables(state), found)}
         scored = evaluation.evaluate_objects(show, found, part, part.splits["test"])
         psnr += [result.scores["shown"]["psnr"] for result in scored]
     assert results["variants"]["reference"]["psnr"] == pytest.approx(np.mean(np.concatenate(psnr)), abs=1e-5)
@@ -204,7 +207,7 @@ def test_a_finished_experiment_is_only_read(out, monkeypatch):
         raise AssertionError("something was trained again")
 
     before = json.loads((out / "results.json").read_text())
-    monkeypatch.setattr(training, "jitted_train_step", forbidden)
+    monkeypatch.setattr(optimisation, "jitted_train_step", forbidden)
     main(asked(out))
     after = json.loads((out / "results.json").read_text())
     for row in ("reference", "skip_concat"):
@@ -298,8 +301,8 @@ def test_the_pace_of_a_run_is_not_that_of_its_compilations(tmp_path):
 
 
 def test_scores_inside_the_silhouette_do_not_see_the_rest():
-    item = data.read_object(tiny_dataset.dataset(), "chair")
-    reference = data.on_white(item.images)
+    item = data_sets.read_object(tiny_dataset.dataset(), "chair")
+    reference = data_sets.on_white(item.images)
     outside = item.images[..., 3:] <= 127
     spoilt = np.where(outside, np.float32(0.5), reference)
     found = training_runs.more_scores(item, evaluation.Pictures(image=spoilt, acc=spoilt[..., 0]))

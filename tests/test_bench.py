@@ -10,10 +10,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import twin
+from support import twin
 
 from experiments import bench, bench_ours, bench_report, bench_scene, bench_worker, twin_layout
-from spnr_jax import cameras
+from spnr_jax.kernels import cameras
 
 OPTIONS = {"presets": ("tiny",), "modes": ("render",), "variants": ("plain", "fast"), "rounds": 3, "seconds": 0.02}
 

@@ -10,12 +10,13 @@ import shutil
 
 import jax.numpy as jnp
 import pytest
-import tiny_dataset
-from tiny_dataset import CONFIG
+from support import tiny_dataset
+from support.tiny_dataset import CONFIG
 
 from experiments import chaos, chaos_child, chaos_faults, chaos_kills, chaos_report
 from experiments.chaos_child import Ended, Event
-from spnr_jax import checkpoint, cli, trainer
+from spnr_jax import cli
+from spnr_jax.training import checkpoint, trainer
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ import math
 from pathlib import Path
 
 import pytest
-import tiny_dataset
+from support import tiny_dataset
 
 from experiments import cost_counts, cost_model
 from experiments.cost_model import (

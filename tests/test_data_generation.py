@@ -5,9 +5,11 @@ import json
 import numpy as np
 import pytest
 
-from data_gen import procedural, records, views
-from data_gen.objects import Workbench
-from data_gen.plan import Task
+from data_gen import procedural
+from data_gen.make.objects import Workbench
+from data_gen.plan.tasks import Task
+from data_gen.render import views
+from data_gen.store import layout
 from experiments import data_generation
 from experiments.data_timing import PHASES, time_object
 
@@ -20,9 +22,9 @@ def bench(folder):
 
 
 def test_nearly_all_of_an_objects_time_has_a_phase_and_the_clocks_are_taken_off_again(tmp_path):
-    before = procedural.make, views.render_view, records.write_object
+    before = procedural.make, views.render_view, layout.write_object
     seconds = time_object(bench(tmp_path), Task(object_id="chair_000000", category="chair"))
-    assert (procedural.make, views.render_view, records.write_object) == before
+    assert (procedural.make, views.render_view, layout.write_object) == before
     assert tuple(seconds) == PHASES
     assert min(seconds.values()) > 0
     # the first picture sets Mitsuba up, outside of every phase

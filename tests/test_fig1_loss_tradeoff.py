@@ -4,13 +4,14 @@ import dataclasses
 
 import numpy as np
 import pytest
-import tiny_dataset
-from laws import same_bits
-from tiny_runs import L1_ONLY, check_conditions, results_of, shrunken
+from support import tiny_dataset
+from support.laws import same_bits
+from support.tiny_runs import L1_ONLY, check_conditions, results_of, shrunken
 
 from experiments.fig1_loss_tradeoff import Fig1, main, pretrained, variant
 from experiments.training_runs import QUICK_STEPS, Budget
-from spnr_jax import checkpoint, cli, config, presets, training
+from spnr_jax import cli, config, presets
+from spnr_jax.training import checkpoint, optimisation
 
 pytestmark = pytest.mark.ci  # it trains several networks
 
@@ -38,7 +39,7 @@ def test_the_adversarial_loss_takes_part_from_the_first_step_and_the_weights_alo
     made = [variant(options, weight, presets.tiny(), tiny_dataset.dataset()) for weight in options.l1_weights]
     assert [v.config.loss.l1_weight for v in made] == [0, 100, 5000]
     for v in made:
-        assert (v.config.loss.adversarial_weight, training.first_adversarial_step(v.config)) == (1, 0)
+        assert (v.config.loss.adversarial_weight, optimisation.first_adversarial_step(v.config)) == (1, 0)
         assert v.start is None
         assert dataclasses.replace(v.config, loss=config.LossConfig()) == dataclasses.replace(
             presets.tiny(), loss=config.LossConfig()
@@ -74,7 +75,7 @@ def test_a_finished_figure_is_only_read_and_another_start_is_refused(out, monkey
         raise AssertionError("something was trained again")
 
     before = results_of(out)
-    monkeypatch.setattr(training, "jitted_train_step", forbidden)
+    monkeypatch.setattr(optimisation, "jitted_train_step", forbidden)
     main(asked(out, pretrain=2))
     assert results_of(out) == before
     capsys.readouterr()

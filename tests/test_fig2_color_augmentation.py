@@ -4,14 +4,16 @@ import dataclasses
 
 import numpy as np
 import pytest
-import tiny_dataset
-from tiny_runs import check_conditions, results_of, shrunken
+from support import tiny_dataset
+from support.tiny_runs import check_conditions, results_of, shrunken
 
-from data_gen.plan import check_options, plan_data_set
+from data_gen.plan.tasks import check_options, plan_data_set
 from experiments import fig2_color_augmentation, training_runs
 from experiments.fig2_color_augmentation import Fig2, generation, main, nearest_views, trainings
 from experiments.training_runs import Budget
-from spnr_jax import cli, data, training
+from spnr_jax import cli
+from spnr_jax.formats import data_sets
+from spnr_jax.training import optimisation
 
 pytestmark = pytest.mark.ci  # it trains several networks
 
@@ -52,13 +54,13 @@ def test_a_finished_figure_is_only_read(out, folder, monkeypatch):
         raise AssertionError("something was trained again")
 
     before = results_of(out)
-    monkeypatch.setattr(training, "jitted_train_step", forbidden)
+    monkeypatch.setattr(optimisation, "jitted_train_step", forbidden)
     main(Fig2(data=folder, out=out, budget=Budget(quick=True)))
     assert results_of(out) == before
 
 
 def test_the_trainings_differ_in_the_training_split_alone(folder):
-    dataset = data.open_dataset(folder)
+    dataset = data_sets.open_dataset(folder)
     plain, whole = trainings(Fig2(out=folder, data=folder), dataset)
     assert plain.config == whole.config
     assert whole.dataset == dataset

@@ -5,16 +5,16 @@ import json
 
 import numpy as np
 import pytest
-import stand_ins
-import tiny_dataset
-from handmade import ball
+from support import stand_ins, tiny_dataset
+from support.handmade import ball
 
-from data_gen.assets import Asset
-from data_gen.poisson import PoissonConfig
+from data_gen.render.poisson_surface import PoissonConfig
 from experiments import depth_scores, fig3_depth, methods
 from experiments.fig3_depth import Fig3
-from spnr_jax import cli, data, evaluation
-from spnr_jax.types import PointCloud
+from spnr_jax import cli
+from spnr_jax.formats import data_sets
+from spnr_jax.formats.mesh.assets import Asset
+from spnr_jax.kernels.records import PointCloud
 
 SIZE = 64
 TRUTH = np.full((SIZE, SIZE), np.inf)
@@ -151,7 +151,7 @@ def test_a_folder_holds_the_depths_of_one_network_of_a_name(out, tmp_path, monke
 @pytest.mark.skipif(importlib.util.find_spec("pymeshlab") is None, reason="pymeshlab is not installed")
 def test_a_poisson_surface_of_many_points_has_the_depth_of_the_ball():
     dataset = tiny_dataset.dataset()
-    item = data.read_object(dataset, dataset.splits["test"][0])
+    item = data_sets.read_object(dataset, dataset.splits["test"][0])
     normals = np.random.default_rng(0).normal(size=(800, 3)).astype(np.float32)
     positions = tiny_dataset.RADIUS * normals / np.linalg.norm(normals, axis=1, keepdims=True)
     color, one = np.zeros_like(positions), np.zeros(800, np.float32)
@@ -161,7 +161,7 @@ def test_a_poisson_surface_of_many_points_has_the_depth_of_the_ball():
     assert np.mean(acc == opaque) > 0.95
     both = (acc > 0) & (opaque > 0) & (expected < expected.min() + 0.3)
     np.testing.assert_allclose(seen[both] + stand_ins.OFFSET, np.tile(expected, (3, 1, 1))[both], atol=0.05)
-    line = evaluation.first_points(item, 1)
+    line = data_sets.first_points(item, 1)
     assert not fig3_depth.of_surface(PoissonConfig(depth=5)).show(item, line)[1].any()
 
 

@@ -7,13 +7,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import tiny_dataset
-from tiny_baselines import SHRUNKEN
+from support import tiny_dataset
+from support.tiny_baselines import SHRUNKEN
 
 from experiments import long_run
 from experiments.long_run import LongRun, Witness, compiled_once, drift, laws, main, median_rise, stretches
 from experiments.long_run_report import hundreds
-from spnr_jax import checkpoint, cli, memory, presets, trainer, training
+from spnr_jax import cli, presets
+from spnr_jax.devices import allocator
+from spnr_jax.training import checkpoint, optimisation, trainer
 
 QUICK = dataclasses.replace(SHRUNKEN["points2nerf_tiny"], batch_objects=2)  # no convolutions: compiles in a second
 
@@ -134,11 +136,11 @@ def test_memory_of_a_preview_is_read_once_when_it_was_given_back():
 
 def test_the_trainer_is_as_before_when_the_witness_has_gone():
     parts = (
-        (training, "jitted_train_step"),
+        (optimisation, "jitted_train_step"),
         (trainer, "preview"),
         (checkpoint, "save"),
         (trainer.MetricsLog, "write"),
-        (memory, "give_back"),
+        (allocator, "give_back"),
     )
     before = [getattr(*part) for part in parts]
     seen = Witness()

@@ -7,14 +7,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import tiny_dataset
-from laws import same_bits
-from tiny_baselines import SHRUNKEN
+from support import tiny_dataset
+from support.laws import same_bits
+from support.tiny_baselines import SHRUNKEN
 
 from experiments import many_objects, many_objects_report, many_runs
 from experiments.many_objects import ManyObjects, main
 from experiments.many_runs import AXES, FORMS, apart, create, entered_batch, entered_states, form_step, left
-from spnr_jax import cli, data, presets, trainer, training
+from spnr_jax import cli, presets
+from spnr_jax.training import batching, optimisation, trainer
 
 pytestmark = pytest.mark.ci  # it trains several networks
 SEEDS = (3, 4, 5)
@@ -34,7 +35,7 @@ def trained(form, of, adversarial=False):
 
 def test_a_state_of_a_seed_is_that_of_the_config_with_this_seed():
     states = many_runs.unstack(create(QUICK, SEEDS))
-    same_bits(states[1], training.jitted_create_state(dataclasses.replace(QUICK, seed=SEEDS[1])))
+    same_bits(states[1], optimisation.jitted_create_state(dataclasses.replace(QUICK, seed=SEEDS[1])))
 
 
 @pytest.fixture(scope="module")
@@ -94,7 +95,7 @@ def test_the_batches_of_a_run_are_those_that_it_would_see_alone():
     dataset = tiny_dataset.dataset()
     together = next(many_runs.batches(dataset, QUICK, SEEDS, 2))
     for i, seed in enumerate(SEEDS):
-        alone = next(data.batches(dataset, dataclasses.replace(QUICK, seed=seed), 2))
+        alone = next(batching.batches(dataset, dataclasses.replace(QUICK, seed=seed), 2))
         same_bits(jax.tree.map(lambda x, i=i: x[i], together), jax.tree.map(jnp.asarray, alone))
 
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from experiments import table1_page, table1_report, table1_scores
 from experiments.table1_scores import Shown
-from spnr_jax import evaluation
+from spnr_jax.scoring import evaluation
 
 
 def test_the_best_of_a_column_is_the_highest_or_for_errors_the_lowest():
