@@ -4,7 +4,6 @@
 """
 
 import sys
-from collections.abc import Sequence
 from importlib import import_module
 from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
@@ -20,8 +19,6 @@ __all__ = sorted(_PUBLIC)
 
 def __getattr__(name: str):
     """Loads a public name on first use, so that importing the package stays quick."""
-    if name in _KERNELS:
-        return import_module(f"spnr_jax.kernels.{name}")
     if name not in _PUBLIC:
         raise AttributeError(f"module 'spnr_jax' has no attribute {name!r}")
     return getattr(import_module(f"spnr_jax.{_PUBLIC[name]}"), name)
@@ -30,9 +27,7 @@ def __getattr__(name: str):
 class _Kernels(MetaPathFinder, Loader):
     """Imports `spnr_jax.sampling` and the like as the module that lies in the folder kernels: the same object."""
 
-    def find_spec(
-        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
-    ) -> ModuleSpec | None:
+    def find_spec(self, fullname: str, path: object, target: object = None) -> ModuleSpec | None:
         """A specification for the six names, none for any other."""
         package, _, name = fullname.rpartition(".")
         return ModuleSpec(fullname, self) if package == "spnr_jax" and name in _KERNELS else None
