@@ -208,7 +208,7 @@ def render_view(scene: Scene, cam_to_world: np.ndarray, config: ViewConfig, seed
 
 
 def visible_points(scene: Scene, surface, cam_to_world: np.ndarray, config: ViewConfig, seed: int) -> np.ndarray:
-    """Return which `points.SurfacePoints` the camera sees, (points,) bool, by the config's rule; see the header."""
+    """Return which `SurfacePoints` the camera sees, (points,) bool, by the config's rule; see the header."""
     if config.visibility == "point":
         return unoccluded(scene, surface.positions, cam_to_world[:3, 3])
     return np.isin(surface.face, visible_faces(scene, cam_to_world, config, seed))
@@ -269,7 +269,7 @@ def condition_image(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
 
 
 def render_views(asset: Asset, surface, cam_to_world: np.ndarray, envmap: np.ndarray, config: ViewConfig, seed: int):
-    """Return (images, conditions), each (views, height, width, 4) uint8, of an asset and its `points.SurfacePoints`."""
+    """Return (images, conditions), each (views, height, width, 4) uint8, of an asset and its `SurfacePoints`."""
     scene = build_scene(asset, envmap)
     images, conditions = [], []
     for view, pose in enumerate(cam_to_world):

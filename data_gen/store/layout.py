@@ -57,7 +57,7 @@ class ObjectRecord:
 
 
 def pack_points(surface) -> np.ndarray:
-    """Return sampled surface points (`points.SurfacePoints`) as one array of POINT_TYPE (points,)."""
+    """Return sampled surface points (`SurfacePoints`) as one array of POINT_TYPE (points,)."""
     columns = [surface.positions, surface.normals, surface.base_color, surface.roughness, surface.metallic]
     packed = np.empty(len(surface.positions), POINT_TYPE)
     for name, column in zip(POINT_FIELDS, np.column_stack(columns).T, strict=True):

@@ -99,7 +99,7 @@ def signature(content: bytes) -> dict[str, Any]:
 def box_around(
     positions: Float[Array, "points 3"], mask: Bool[Array, " points"]
 ) -> tuple[Float[Array, "3"], Float[Array, ""]]:
-    """Centre and scale of `clouds.normalization` for the points that are not masked.
+    """Centre and scale of `cloud_arrays.normalization` for the points that are not masked.
 
     In float32, so the scale may differ in its last bits from that of `Model.encode`, which is computed in float64.
     """
