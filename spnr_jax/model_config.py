@@ -354,6 +354,28 @@ class Points2NeRFConfig:
             require(getattr(self, name) >= 1, f"{name} must be at least 1, got {getattr(self, name)}")
 
 
+@dataclass(frozen=True, kw_only=True)
+class SurfelConfig:
+    """Our network over the G-buffer of surfels (`method/surfel_renderer.py`)."""
+
+    image_resolution: int = 512
+    """Pixels along each side of a picture where no other size is asked for."""
+    widths: tuple[int, ...] = (24, 48, 64, 64)
+    """Features of the U-Net's levels, at the resolution of the points first."""
+    top: int = 24
+    """Features of the blocks that double the resolution."""
+
+    upsamples = False
+    ray_chunk = None
+    per_pixel = False
+    any_size = True
+
+    def __post_init__(self) -> None:
+        require(self.image_resolution >= 1, f"image_resolution must be at least 1, got {self.image_resolution}")
+        require(len(self.widths) > 0 and min(self.widths) >= 1, f"widths must be positive, got {self.widths}")
+        require(self.top >= 1, f"top must be at least 1, got {self.top}")
+
+
 NetworkConfig = ModelConfig | NPBGConfig | PointNeRFConfig | Points2NeRFConfig
 METHODS: dict[str, type[NetworkConfig]] = {
     "ours": ModelConfig,

@@ -16,7 +16,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 SPNR_JAX = (
     *("model_config", "config"),
-    *("devices", "kernels", "nn", "baselines", "method"),
+    *("devices", "kernels", "surfels", "nn", "baselines", "method"),
     *("formats/mesh", "formats", "training", "scoring", "tools", "viewer"),
     *("presets", "cli", "__init__"),
 )
@@ -25,7 +25,7 @@ DATA_GEN = (
     *("__main__", "command", "__init__"),
 )
 ORDER = [f"spnr_jax/{entry}" for entry in SPNR_JAX] + [f"data_gen/{entry}" for entry in DATA_GEN] + ["experiments"]
-PURE = ("kernels", "nn", "baselines", "method")
+PURE = ("kernels", "surfels", "nn", "baselines", "method")
 WITHOUT_JIT = ("devices", "kernels", "nn", "baselines")
 OF_SPNR_JAX = {"spnr_jax/kernels", "spnr_jax/formats", "spnr_jax/formats/mesh"}  # that data_gen stands on
 IMPURE = {"os", "pathlib", "time", "io", "sys", "json", "shutil", "tempfile", "logging", "datetime", "random", "tqdm"}

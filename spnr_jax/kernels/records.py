@@ -25,6 +25,8 @@ class PointCloud:
     roughness: Float[AnyArray, "*batch points"]
     metallic: Float[AnyArray, "*batch points"]
     mask: Bool[AnyArray, "*batch points"]
+    normals: Float[AnyArray, "*batch points 3"] | None = None
+    """Of unit length, of either sign; None where the file has none: then they are estimated."""
 
 
 @no_type_check
@@ -116,6 +118,61 @@ class Scene:
     volume: Float[Array, "*batch d d d features"]
     occupied: Bool[Array, "*batch g g g"]
     surface: Surface | None = None
+
+
+@no_type_check
+@struct.dataclass
+class Surfels:
+    """Surface elements of one object (`surfels/estimate.py`): discs with materials, padded; zeros where mask is False.
+
+    `spacing` is the side of the square that a point stands for, in units of the box; `gradient` the change of each
+    colour along x, y, z; `sided` 1 where one side is outside, 0 where both are; `visible` how much each of 64
+    directions sees; `shape` the planarity and linearity of the neighbourhood.
+    """
+
+    position: Float[AnyArray, "points 3"]
+    normal: Float[AnyArray, "points 3"]
+    spacing: Float[AnyArray, " points"]
+    base_color: Float[AnyArray, "points 3"]
+    gradient: Float[AnyArray, "points 3 3"]
+    roughness: Float[AnyArray, " points"]
+    metallic: Float[AnyArray, " points"]
+    sided: Float[AnyArray, " points"]
+    visible: Float[AnyArray, "points 64"]
+    shape: Float[AnyArray, "points 2"]
+    mask: Bool[AnyArray, " points"]
+
+
+@no_type_check
+@struct.dataclass
+class Light:
+    """Light from all around, as tables by direction, every one linear in the environment map (`surfels/lighting.py`).
+
+    `tables[0]` is the irradiance over pi of a surface by its normal, `tables[1:]` what a surface of each of the
+    roughnesses LEVELS mirrors by the mirrored direction; `tables[1]` is the map itself.
+    """
+
+    tables: Float[AnyArray, "7 32 64 3"]
+
+
+@no_type_check
+@struct.dataclass
+class GBuffer:
+    """What the front-most surfels say at each pixel of a picture: blends of their attributes, camera axes for vectors.
+
+    `opacity` is that of all surfels along the ray, `coverage` the summed weights of those in front, `depth` along the
+    camera's axis, `spread` its standard deviation, `color` to first order, the rest blended with the wider kernel.
+    Where nothing is drawn all is 0.
+    """
+
+    opacity: Float[Array, "height width"]
+    coverage: Float[Array, "height width"]
+    depth: Float[Array, "height width"]
+    spread: Float[Array, "height width"]
+    log_spacing: Float[Array, "height width"]
+    normal: Float[Array, "height width 3"]
+    color: Float[Array, "height width 3"]
+    attributes: Float[Array, "height width features"]
 
 
 @no_type_check

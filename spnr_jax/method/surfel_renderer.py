@@ -1,0 +1,177 @@
+"""Our method on one page: points -> surfels -> G-buffer -> shader network -> light on materials -> picture.
+
+    encode   neighbours, normals, sides, visibility by direction              once per object, NumPy and SciPy
+    render   discs splatted to a G-buffer, a CNN over it, light               once per view
+
+A picture is drawn at the resolution at which the points lie FINEST to COARSEST pixels apart and doubled from there by
+the network, so its work follows the points and the pixels that they cover.  Only a window around the object is drawn.
+Sizes that shape arrays are counted first and rounded up to few values: each new one is compiled once.
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Float
+
+from spnr_jax.kernels import cameras
+from spnr_jax.kernels.compositing import WHITE
+from spnr_jax.kernels.records import Camera, Light, PointCloud, Rendering, Surfels
+from spnr_jax.kernels.resizing import mean_of_squares
+from spnr_jax.model_config import SurfelConfig
+from spnr_jax.nn.shader import Shader, doubled, picture
+from spnr_jax.surfels import features, lighting, splatting
+from spnr_jax.surfels.estimate import estimate
+
+COARSEST = 3.5  # pixels between points from which on a picture is drawn at half the size
+FINEST = 0.8  # below which it is drawn at twice the size and averaged
+MOST_DOUBLINGS = 4
+STEP, MARGIN = 32, 8  # pixels of which a window is a multiple, and around the object in it
+GRID = 8  # of which a window's corner is a multiple: the network's levels see the same squares from every camera
+
+
+@struct.dataclass
+class SurfelScene:
+    """An encoded object: its surfels, and their median spacing, which decides at what size a picture is drawn."""
+
+    surfels: Surfels
+    spacing: float = struct.field(pytree_node=False)
+
+
+class Plan(NamedTuple):
+    """Doublings by the network, pixels averaged along a side, and the window of the G-buffer."""
+
+    doublings: int
+    side: int
+    left: int
+    top: int
+    width: int
+    height: int
+
+
+def encode(cloud: PointCloud) -> SurfelScene:
+    """Surfels of a cloud (unbatched, in the box)."""
+    mask = np.asarray(cloud.mask)
+    names = ("positions", "base_color", "roughness", "metallic", "normals")
+    columns = {name: None if (x := getattr(cloud, name)) is None else np.asarray(x)[mask] for name in names}
+    surfels = estimate(**columns)
+    return SurfelScene(surfels=jax.device_put(surfels), spacing=float(np.median(surfels.spacing[surfels.mask])))
+
+
+def render(variables: dict, scene: SurfelScene, camera: Camera, light: Light, *, config: SurfelConfig) -> Rendering:
+    """One view (camera unbatched, in the box) of an encoded object."""
+    doublings, side = resolution_of(scene.spacing, camera)
+    small = cameras.resize(camera, *(-(-n * side // 2**doublings) for n in (camera.height, camera.width)))
+    box, total = jax.device_get(_extent(scene.surfels, small))
+    plan = _window(box, doublings, side)
+    if total == 0:
+        return _nothing(camera)
+    inside = _seen_through(small, plan)
+    found, slots = splatting.entries(scene.surfels, inside, total=_rounded(int(total), 2**15, splatting.MOST_ENTRIES))
+    most = inside.height * inside.width
+    slots = min(_rounded(int(slots), 2**11, most), most)
+    drawn = _shade(variables, found, scene.surfels, light, inside, config=config, doublings=doublings, slots=slots)
+    return _placed(drawn, camera, plan)
+
+
+def resolution_of(spacing: float, camera: Camera) -> tuple[int, int]:
+    """Doublings by the network, and pixels averaged along each side, for points this far apart around the origin."""
+    focal, eye = (np.asarray(x, np.float64) for x in (camera.intrinsics[0, 0], camera.cam_to_world[:, 3]))
+    pixels = spacing * float(focal) / max(float(np.linalg.norm(eye)), 1e-3)
+    doublings = int(np.clip(np.floor(np.log2(max(pixels / COARSEST, 1e-9))) + 1, 0, MOST_DOUBLINGS))
+    return doublings, 2 if pixels < FINEST else 1
+
+
+@jax.jit
+def _extent(surfels: Surfels, camera: Camera) -> tuple[Array, Array]:
+    """Lowest and highest column and row that discs cover, and the number of entries at most."""
+    foot = splatting.footprints(surfels, camera)
+    drawn = foot.count > 0
+    rows = foot.count // foot.width
+    low = [jnp.min(jnp.where(drawn, x, 2**20)) for x in (foot.left, foot.top)]
+    high = [jnp.max(jnp.where(drawn, x + n, 0)) for x, n in ((foot.left, foot.width), (foot.top, rows))]
+    return jnp.stack([*low, *high]), jnp.sum(foot.count)
+
+
+def _window(box: np.ndarray, doublings: int, side: int) -> Plan:
+    left, top = (max(int(x) - MARGIN, 0) // GRID * GRID for x in box[:2])
+    width, height = (
+        max(-(-(int(end) + MARGIN - first) // STEP) * STEP, STEP)
+        for first, end in zip((left, top), box[2:], strict=True)
+    )
+    return Plan(doublings, side, left, top, width, height)
+
+
+def _rounded(count: int, least: int, most: int) -> int:
+    """A power of the root of two that holds the count: few sizes, few compilations."""
+    count = max(count, least)
+    if count > most:
+        raise ValueError(f"the picture needs {count} entries of discs, at most {most} are drawn; ask for a smaller one")
+    return min(int(2 ** (np.ceil(2 * np.log2(count)) / 2)), most)
+
+
+def _seen_through(camera: Camera, plan: Plan) -> Camera:
+    """The camera whose picture is the window."""
+    shift = jnp.zeros((3, 3)).at[:2, 2].set(jnp.array([plan.left, plan.top], jnp.float32))
+    return Camera(
+        cam_to_world=jnp.asarray(camera.cam_to_world, jnp.float32),
+        intrinsics=jnp.asarray(camera.intrinsics, jnp.float32) - shift,
+        height=plan.height,
+        width=plan.width,
+    )
+
+
+@partial(jax.jit, static_argnames=("config", "doublings", "slots"))
+def _shade(
+    variables: dict,
+    found: splatting.Entries,
+    surfels: Surfels,
+    light: Light,
+    camera: Camera,
+    *,
+    config: SurfelConfig,
+    doublings: int,
+    slots: int,
+) -> Float[Array, "height width 5"]:
+    """Colour, opacity and depth along the camera's axis, of the window at the network's resolution."""
+    buffer = splatting.blend(found, surfels, features.attributes(surfels, light, camera), camera, slots=slots)
+    seen, maps = features.features(buffer, light, camera)
+    seen, maps = jax.lax.optimization_barrier((seen, maps))
+    outputs = Shader(config.widths, config.top).apply(variables, seen[None], doublings)
+    ambient = lighting.projected(light, camera.cam_to_world[:, :3])
+    color, alpha = picture(outputs, maps[None], ambient[None], doublings)
+    depth = buffer.depth[None, ..., None]
+    for _ in range(doublings):
+        depth = doubled(depth)
+    return jnp.concatenate([color, alpha[..., None], depth], axis=-1)[0]
+
+
+def _placed(drawn: Float[Array, "h w 5"], camera: Camera, plan: Plan) -> Rendering:
+    """The window in its place in the picture."""
+    scale = 2**plan.doublings
+    height, width = (n * plan.side for n in (camera.height, camera.width))
+    values = np.asarray(drawn)
+    top, left = plan.top * scale, plan.left * scale
+    values = values[: max(height - top, 0), : max(width - left, 0)]
+    alpha = values[..., 3:4]
+    sums = np.zeros((height, width, 5), np.float32)
+    sums[top : top + values.shape[0], left : left + values.shape[1]] = np.concatenate(
+        [values[..., :3] * alpha, alpha, values[..., 4:] * alpha], axis=-1
+    )
+    if plan.side > 1:
+        sums = np.asarray(mean_of_squares(jnp.asarray(sums), plan.side))
+    acc = sums[..., 3]
+    rays = cameras.camera_rays(jax.tree.map(jnp.asarray, camera))
+    _, far, _ = cameras.intersect_box(rays.origins, rays.directions)
+    along = np.maximum(-np.asarray(rays.directions) @ np.asarray(camera.cam_to_world)[:, 2], 1e-6)
+    image = sums[..., :3] + (1 - acc[..., None]) * WHITE
+    depth = sums[..., 4] / along + (1 - acc) * np.asarray(far)
+    return Rendering(image=image, image_lr=image, depth=depth.astype(np.float32), acc=acc)
+
+
+def _nothing(camera: Camera) -> Rendering:
+    """A view in which nothing of the object is seen."""
+    return _placed(np.zeros((1, 1, 5), np.float32), camera, Plan(0, 1, 0, 0, 1, 1))

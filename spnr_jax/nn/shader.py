@@ -1,0 +1,113 @@
+"""CNN that shades a G-buffer: opacity, a change of the base colour, and how light is passed on, for each pixel.
+
+A U-Net over what the front-most surfels say, at the resolution at which points lie two to four pixels apart, so that it
+sees points as it has learnt to whatever their number; then one block that doubles the resolution, as often as the
+picture needs.  Its outputs are factors of light maps that are linear in the light (`picture`): the network sees no
+light, and a picture is linear in it up to the sRGB curve.
+"""
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from spnr_jax.kernels.colors import linear_to_srgb
+from spnr_jax.kernels.resizing import mean_of_squares, unfolded
+from spnr_jax.surfels.lighting import SPECULAR
+
+NUM_OUTPUTS = 19
+COLOR_STEP, ODDS_STEP = 0.3, 2.0  # what an output of 1 changes the base colour, and the log odds of the opacity by
+LEAST_ODDS = 1e-2  # keeps the odds of what is clear or solid finite
+
+
+def doubled(x: Float[Array, "batch height width features"]) -> Float[Array, "batch h w features"]:
+    """Twice the size, bilinear; the border repeats."""
+    for axis in (1, 2):
+        size = x.shape[axis]
+        before = jnp.concatenate([_part(x, axis, 0, 1), _part(x, axis, 0, size - 1)], axis)
+        after = jnp.concatenate([_part(x, axis, 1, size), _part(x, axis, size - 1, size)], axis)
+        pair = jnp.stack([0.75 * x + 0.25 * before, 0.75 * x + 0.25 * after], axis + 1)
+        x = pair.reshape(*x.shape[:axis], 2 * size, *x.shape[axis + 1 :])
+    return x
+
+
+def _part(x: Array, axis: int, first: int, end: int) -> Array:
+    return jax.lax.slice_in_dim(x, first, end, axis=axis)
+
+
+class Block(nn.Module):
+    """Two convolutions beside the identity."""
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "batch height width features"]) -> Float[Array, "batch height width features"]:
+        """The features, changed."""
+        y = nn.LayerNorm(name="norm")(x)
+        y = nn.relu(nn.Conv(x.shape[-1], (3, 3), name="a")(y))
+        return x + nn.Conv(x.shape[-1], (3, 3), name="b")(y)
+
+
+class Double(nn.Module):
+    """Features at twice the resolution."""
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "batch height width features"]) -> Float[Array, "batch h w features"]:
+        """Bilinear, plus four new pixels from each, plus two convolutions."""
+        features = x.shape[-1]
+        x = doubled(x) + unfolded(nn.Dense(4 * features, name="expand")(x), 2)
+        y = nn.relu(nn.Conv(features, (3, 3), name="a")(x))
+        return x + nn.Conv(features, (3, 3), name="b")(y)
+
+
+class Shader(nn.Module):
+    """Factors of a picture's light maps (`picture`) from a G-buffer (`surfels.features`)."""
+
+    widths: tuple[int, ...]
+    top: int
+
+    @nn.compact
+    def __call__(
+        self, seen: Float[Array, "batch height width features"], doublings: int
+    ) -> Float[Array, "batch h w 19"]:
+        """Outputs at 2^doublings times the resolution."""
+        height, width = seen.shape[1:3]
+        square = 2 ** (len(self.widths) - 1)
+        x = jnp.pad(seen, ((0, 0), (0, -height % square), (0, -width % square), (0, 0)))
+        skips = []
+        for level, features in enumerate(self.widths):
+            x = nn.Conv(features, (3, 3), name=f"in{level}")(mean_of_squares(x, 2) if level else x)
+            x = Block(name=f"down{level}")(x)
+            skips.append(x)
+        for level in reversed(range(len(self.widths) - 1)):
+            x = skips[level] + doubled(nn.Dense(self.widths[level], name=f"up{level}")(x))
+            x = Block(name=f"dec{level}")(x)
+        x = nn.Dense(self.top, name="top")(x[:, :height, :width])
+        double = Double(name="double")
+        for _ in range(doublings):
+            x = double(x)
+        return nn.Dense(NUM_OUTPUTS, kernel_init=nn.initializers.zeros, name="out")(nn.LayerNorm(name="norm")(x))
+
+
+def picture(
+    outputs: Float[Array, "batch h w 19"],
+    maps: Float[Array, "batch height width 17"],
+    ambient: Float[Array, "batch 9 3"],
+    doublings: int,
+) -> tuple[Float[Array, "batch h w 3"], Float[Array, "batch h w"]]:
+    """sRGB colour and opacity: light that the network lets through falls on the surfels' materials.
+
+    `maps` are those of `surfels.features`, `ambient` the light's spherical harmonics in camera axes.
+    """
+    for _ in range(doublings):
+        maps = doubled(maps)
+    color, metallic, opacity, factor, summand = (maps[..., i:j] for i, j in ((0, 3), (3, 4), (4, 5), (5, 6), (6, 7)))
+    arriving, unshadowed, mirrored, reflected = (maps[..., i:j] for i, j in ((7, 10), (10, 13), (13, 16), (16, 17)))
+    base = jnp.clip(color + COLOR_STEP * outputs[..., 0:3], 0, 1)
+    odds = jnp.log(opacity + LEAST_ODDS) - jnp.log(1 + LEAST_ODDS - opacity)
+    alpha = nn.sigmoid(odds + ODDS_STEP * outputs[..., 3:4])
+    bounced = outputs[..., 8:11] * ambient[:, None, None, 0]
+    bounced += jnp.einsum("bhwk,bkc->bhwc", outputs[..., 11:19], ambient[:, 1:], precision="highest")
+    diffuse = (1 + outputs[..., 4:5]) * arriving + outputs[..., 5:6] * unshadowed + bounced
+    specular = (1 + outputs[..., 6:7]) * reflected + outputs[..., 7:8]
+    normal_incidence = SPECULAR * (1 - metallic) + base * metallic
+    linear = base * (1 - metallic) * diffuse + (normal_incidence * factor + summand) * mirrored * specular
+    return jnp.minimum(linear_to_srgb(jnp.maximum(linear, 0)), 1), alpha[..., 0]

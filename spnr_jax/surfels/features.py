@@ -1,0 +1,94 @@
+"""What the shader network sees of a G-buffer, and the light that its outputs are factors of.
+
+Everything is relative: vectors in the camera's axes, lengths in spacings or pixels.  So a picture does not depend on
+how the object, the camera and the light are turned together, nor on the unit of the cloud.
+"""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from spnr_jax.kernels.colors import linear_to_srgb
+from spnr_jax.kernels.records import Camera, GBuffer, Light, Surfels
+from spnr_jax.surfels import lighting
+from spnr_jax.surfels.visibility import DIRECTIONS
+
+NUM_FEATURES, NUM_MAPS = 27, 17
+FAINT = 0.02  # opacity from which on a pixel's numbers begin to count
+WINDOWS = 2, 6  # pixels to each side over which the depth is compared
+TRUST = 0.25  # most that a colour to first order leaves the blended one
+
+
+def attributes(surfels: Surfels, light: Light, camera: Camera) -> Float[Array, "points 16"]:
+    """Numbers of each surfel that are blended over pixels; those of the light are linear in it."""
+    rotation, eye = camera.cam_to_world[:, :3], camera.cam_to_world[:, 3]
+    cosines = jnp.maximum(jnp.einsum("pi,di->pd", surfels.normal, DIRECTIONS, precision="highest"), 0)
+    openness = jnp.sum(surfels.visible * cosines, axis=1) / jnp.maximum(jnp.sum(cosines, axis=1), 1e-6)
+    bent = 4 / len(DIRECTIONS) * jnp.einsum("pd,di->pi", surfels.visible, DIRECTIONS, precision="highest")
+    view = eye[None] - surfels.position
+    view = view / jnp.maximum(jnp.linalg.norm(view, axis=1, keepdims=True), 1e-6)
+    along = jnp.sum(view * surfels.normal, axis=1, keepdims=True)
+    mirror = 2 * jnp.abs(along) * jnp.where(along < 0, -1.0, 1.0) * surfels.normal - view
+    lobe = jnp.exp(lighting.LOBE * (jnp.einsum("pi,di->pd", mirror, DIRECTIONS, precision="highest") - 1))
+    reflected = jnp.sum(surfels.visible * lobe, axis=1) / jnp.sum(lobe, axis=1)
+    columns = [surfels.roughness, surfels.metallic, lighting.arriving(surfels, light), reflected, openness]
+    columns += [jnp.einsum("pi,ij->pj", bent, rotation, precision="highest"), surfels.base_color, surfels.shape]
+    columns += [surfels.sided]
+    return jnp.concatenate([x[:, None] if x.ndim == 1 else x for x in map(jnp.asarray, columns)], axis=1)
+
+
+def features(
+    buffer: GBuffer, light: Light, camera: Camera
+) -> tuple[Float[Array, "height width 27"], Float[Array, "height width 17"]]:
+    """The network's input, which knows no light, and the maps of materials and light for `nn.shader.picture`."""
+    roughness, metallic, *arriving, reflected, openness = jnp.moveaxis(buffer.attributes, -1, 0)[:7]
+    bent, blended = buffer.attributes[..., 7:10], buffer.attributes[..., 10:13]
+    planarity, linearity, sided = jnp.moveaxis(buffer.attributes, -1, 0)[13:16]
+    color = jnp.clip(jnp.clip(buffer.color, blended - TRUST, blended + TRUST), 0, 1)
+    normal, view = _directions(buffer, camera)
+    cosine = -sum(n * v for n, v in zip(normal, view, strict=True))
+    mirror = [v + 2 * cosine * n for n, v in zip(normal, view, strict=True)]
+    turned = [_to_world(camera, direction) for direction in (normal, mirror)]
+    factor, summand = lighting.reflectance(roughness, jnp.clip(cosine, 0.05, 1))
+    spacing = jnp.exp(buffer.log_spacing)
+    in_pixels = jnp.maximum(spacing, 1e-6) * camera.intrinsics[0, 0] / jnp.maximum(buffer.depth, 0.1)
+    told = [buffer.opacity, jnp.log1p(buffer.coverage), roughness, metallic, openness, reflected]
+    told += [jnp.minimum(buffer.spread / spacing, 4), *(_relief(buffer, spacing, reach) for reach in WINDOWS)]
+    told += [0.5 * jnp.log(in_pixels), planarity, linearity, sided, cosine]
+    vectors = [buffer.normal, bent, linear_to_srgb(color), linear_to_srgb(blended)]
+    drawn = (buffer.opacity / (buffer.opacity + FAINT))[..., None]
+    seen = jnp.concatenate([drawn * jnp.concatenate([jnp.stack(told, axis=-1), *vectors], axis=-1), drawn], axis=-1)
+    unshadowed = lighting.irradiance(light, turned[0]), lighting.mirrored(light, turned[1], roughness)
+    maps = [*jnp.moveaxis(color, -1, 0), metallic, buffer.opacity, factor, summand, *arriving]
+    return seen, jnp.stack([*maps, *unshadowed[0], *unshadowed[1], reflected], axis=-1)
+
+
+def _directions(buffer: GBuffer, camera: Camera) -> tuple[list[Array], list[Array]]:
+    """Unit normals and rays' directions, camera axes, as columns; the camera's axis where there is no normal."""
+    size = jnp.sqrt(jnp.sum(buffer.normal**2, axis=-1))
+    known = size > 1e-3
+    normal = [buffer.normal[..., i] / jnp.maximum(size, 1e-4) for i in range(3)]
+    normal = [jnp.where(known, n, c) for n, c in zip(normal, (0.0, 0.0, 1.0), strict=True)]
+    columns, rows = jnp.arange(camera.width) + 0.5, jnp.arange(camera.height) + 0.5
+    right = jnp.broadcast_to(((columns - camera.intrinsics[0, 2]) / camera.intrinsics[0, 0])[None], size.shape)
+    up = jnp.broadcast_to(-((rows - camera.intrinsics[1, 2]) / camera.intrinsics[1, 1])[:, None], size.shape)
+    length = jnp.sqrt(right**2 + up**2 + 1)
+    return normal, [right / length, up / length, -1 / length]
+
+
+def _to_world(camera: Camera, direction: list[Array]) -> list[Array]:
+    pose = camera.cam_to_world
+    return [sum(pose[i, j] * direction[j] for j in range(3)) for i in range(3)]
+
+
+def _relief(buffer: GBuffer, spacing: Float[Array, "height width"], reach: int) -> Float[Array, "height width"]:
+    """How far each pixel lies behind the mean around it, in spacings, squeezed into (-1, 1)."""
+    mean = _box(buffer.opacity * buffer.depth, reach) / jnp.maximum(_box(buffer.opacity, reach), 1e-3)
+    return jnp.where(buffer.opacity > 0.01, jnp.tanh((buffer.depth - mean) / (4 * spacing)), 0)
+
+
+def _box(values: Float[Array, "height width"], reach: int) -> Float[Array, "height width"]:
+    """Sums over squares of pixels; there is nothing beyond the picture."""
+    height, width = values.shape
+    padded = jnp.pad(values, reach)
+    down = sum(padded[i : i + height] for i in range(2 * reach + 1))
+    return sum(down[:, i : i + width] for i in range(2 * reach + 1))

@@ -1,0 +1,88 @@
+"""Which directions see a point: orthographic depth buffers of the points themselves.
+
+From each of 64 directions the points are drawn into a grid whose cells are CELL spacings wide, every point into the
+four cells around it.  A point is seen where, lifted off the surface by a spacing, it lies at most a spacing behind what
+the grid holds.  So one pass over the points gives the side that a surface shows, ambient occlusion, and the share of
+any light that arrives.
+"""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+NUM_DIRECTIONS = 64
+CELL = 1.5  # spacings
+FINEST = 1024  # cells along the box at most
+BOX = 2.2  # side of the square that every direction draws: the box's diagonal is 2
+
+
+def spiral(count: int) -> Float[np.ndarray, "count 3"]:
+    """Unit directions spread evenly over the sphere (a Fibonacci spiral)."""
+    height = 1 - (2 * np.arange(count) + 1) / count
+    turn = np.arange(count) * np.pi * (3 - np.sqrt(5))
+    radius = np.sqrt(1 - height**2)
+    return np.stack([radius * np.cos(turn), height, radius * np.sin(turn)], axis=1).astype(np.float32)
+
+
+def tangents(normals: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+    """Two unit vectors at right angles to each unit normal and to each other (Duff et al. 2017)."""
+    x, y, z = normals.T
+    sign = np.where(z >= 0, 1.0, -1.0)
+    a = -1 / (sign + z)
+    b = x * y * a
+    first = np.stack([1 + sign * x**2 * a, sign * b, -sign * x], axis=-1)
+    second = np.stack([b, sign + y**2 * a, -y], axis=-1)
+    return first.astype(np.float32), second.astype(np.float32)
+
+
+DIRECTIONS = spiral(NUM_DIRECTIONS)
+
+
+def grid_of(spacing: float) -> tuple[np.float32, int]:
+    """Width of a cell and number of cells along the grid, a power of the root of two: few sizes, few compilations."""
+    cell = max(CELL * spacing, BOX / FINEST)
+    needed = 16 * np.ceil(max(np.ceil(BOX / cell), 16) / 16)
+    return np.float32(cell), int(2 ** (np.ceil(2 * np.log2(needed)) / 2))
+
+
+@partial(jax.jit, static_argnames="grid")
+def seen_from(
+    positions: Float[Array, "points 3"],
+    normals: Float[Array, "points 3"],
+    spacing: Float[Array, " points"],
+    mask: Bool[Array, " points"],
+    cell: Float[Array, ""],
+    *,
+    grid: int,
+) -> Float[Array, "points 64"]:
+    """How much each of DIRECTIONS sees of each point: 1 in front, 0 from two spacings behind the depth buffer on."""
+    x, y, z = positions.T
+
+    def along(axis, vectors):
+        return vectors[0] * axis[0] + vectors[1] * axis[1] + vectors[2] * axis[2]
+
+    def cell_of(column, row):
+        return jnp.clip(row, 0, grid - 1) * grid + jnp.clip(column, 0, grid - 1)
+
+    def one(axes):
+        towards, right, up = axes
+        column = jnp.floor(along(right, (x, y, z)) / cell + grid / 2 - 0.5).astype(jnp.int32)
+        row = jnp.floor(along(up, (x, y, z)) / cell + grid / 2 - 0.5).astype(jnp.int32)
+        depth = along(towards, (x, y, z))
+        nearest = jnp.full(grid * grid, -2 * BOX)
+        for step in ((0, 0), (0, 1), (1, 0), (1, 1)):
+            index = jnp.where(mask, cell_of(column + step[0], row + step[1]), grid * grid)
+            nearest = nearest.at[index].max(depth, mode="drop")
+        lift = jnp.sign(along(towards, normals.T)) * spacing
+        lifted = [p + lift * n for p, n in zip((x, y, z), normals.T, strict=True)]
+        index = cell_of(
+            jnp.floor(along(right, lifted) / cell + grid / 2).astype(jnp.int32),
+            jnp.floor(along(up, lifted) / cell + grid / 2).astype(jnp.int32),
+        )
+        behind = (nearest[index] - along(towards, lifted)) / jnp.maximum(spacing, cell / CELL)
+        return jnp.clip(2.0 - behind, 0, 1)
+
+    return jax.lax.map(one, (jnp.asarray(DIRECTIONS), *map(jnp.asarray, tangents(DIRECTIONS)))).T
