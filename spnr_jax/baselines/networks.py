@@ -7,7 +7,7 @@ from spnr_jax.baselines.point_nerf import PointNeRF
 from spnr_jax.baselines.points2nerf import Points2NeRF
 from spnr_jax.model_config import NPBGConfig, PointNeRFConfig, Points2NeRFConfig
 
-BASELINES: dict[type, type[nn.Module]] = {
+NETWORKS: dict[type, type[nn.Module]] = {
     NPBGConfig: NPBG,
     PointNeRFConfig: PointNeRF,
     Points2NeRFConfig: Points2NeRF,

@@ -22,9 +22,9 @@ def network(config: NetworkConfig) -> nn.Module:
     """The module that a network's config describes."""
     if isinstance(config, ModelConfig):
         return Renderer(config)
-    from spnr_jax.baselines.networks import BASELINES  # here: our own network is drawn without them
+    from spnr_jax.baselines.networks import NETWORKS  # here: our own network is drawn without them
 
-    return BASELINES[type(config)](config)
+    return NETWORKS[type(config)](config)
 
 
 def example_inputs(config: NetworkConfig) -> tuple[PointCloud, Camera]:

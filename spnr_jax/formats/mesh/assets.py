@@ -1,4 +1,4 @@
-"""What every source of objects hands to the rest of data_gen: parts of triangles with principled materials.
+"""What every source of objects hands on: parts of triangles with principled materials.
 
 Conventions, fixed here and nowhere else:
   axes        right-handed, y up (as in glTF), any unit; `normalise` brings an object into the unit sphere
@@ -16,6 +16,7 @@ from typing import Literal
 import numpy as np
 
 Wrap = Literal["repeat", "mirror", "clamp"]
+Values = np.ndarray | np.floating  # NumPy makes numbers of arrays without axes
 
 
 class RejectedAsset(ValueError):
@@ -30,8 +31,8 @@ class Material:
     """
 
     base_color: np.ndarray
-    roughness: np.ndarray
-    metallic: np.ndarray
+    roughness: Values
+    metallic: Values
     wrap: Wrap = "repeat"
 
 

@@ -7,10 +7,11 @@ KHR_texture_transform and wrap mode); a second texture that disagrees is replace
 """
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
-from spnr_jax.formats.mesh.assets import Material, RejectedAsset, Wrap
+from spnr_jax.formats.mesh.assets import Material, RejectedAsset, Values, Wrap
 from spnr_jax.formats.mesh.gltf_container import GltfFile
 from spnr_jax.formats.mesh.texels import color_texels, read_image, resize, value_texels
 
@@ -79,7 +80,7 @@ def metallic_roughness(diffuse: np.ndarray, specular: np.ndarray) -> tuple[np.nd
     return np.clip(base_color, 0, 1), metallic[..., 0]
 
 
-def _metallic_roughness(textures: "_Textures", spec: dict) -> dict[str, np.ndarray]:
+def _metallic_roughness(textures: "_Textures", spec: dict) -> dict[str, Any]:
     color = textures.read(spec.get("baseColorTexture"))
     surface = textures.read(spec.get("metallicRoughnessTexture"))
     base_color = np.asarray(spec.get("baseColorFactor", (1, 1, 1, 1)), np.float64)[:3]
@@ -91,7 +92,7 @@ def _metallic_roughness(textures: "_Textures", spec: dict) -> dict[str, np.ndarr
     )
 
 
-def _specular_glossiness(textures: "_Textures", spec: dict) -> dict[str, np.ndarray]:
+def _specular_glossiness(textures: "_Textures", spec: dict) -> dict[str, Any]:
     color = textures.read(spec.get("diffuseTexture"))
     surface = textures.read(spec.get("specularGlossinessTexture"))
     diffuse = np.asarray(spec.get("diffuseFactor", (1, 1, 1, 1)), np.float64)[:3]
@@ -169,12 +170,12 @@ def _texture_transform(moved: dict) -> tuple[np.ndarray, np.ndarray]:
     return np.array([[cos, sin], [-sin, cos]]) * scale, np.asarray(moved.get("offset", (0, 0)), np.float64)
 
 
-def _channels(**channels: np.ndarray | float) -> dict[str, np.ndarray]:
+def _channels(**channels: Values | float) -> dict[str, Any]:
     """The channels as float32 in [0, 1]."""
     return {name: np.clip(np.asarray(values, np.float32), 0, 1) for name, values in channels.items()}
 
 
-def _perceived_brightness(color: np.ndarray) -> np.ndarray:
+def _perceived_brightness(color: np.ndarray) -> Values:
     return np.sqrt((color * color) @ np.array([0.299, 0.587, 0.114]))
 
 

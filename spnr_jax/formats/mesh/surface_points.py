@@ -10,7 +10,7 @@ from typing import Literal
 
 import numpy as np
 
-from spnr_jax.formats.mesh.assets import Asset, Material, Part, RejectedAsset
+from spnr_jax.formats.mesh.assets import Asset, Material, Part, RejectedAsset, Values
 from spnr_jax.formats.mesh.texels import lookup
 from spnr_jax.kernels.thinning import farthest_points
 
@@ -98,11 +98,11 @@ def face_areas(part: Part) -> np.ndarray:
 def evaluate_material(material: Material, texcoords: np.ndarray | None, count: int) -> dict[str, np.ndarray]:
     """base_color (count, 3), roughness (count,) and metallic (count,) of a material at texture coordinates."""
 
-    def channel(values: np.ndarray, value_ndim: int) -> np.ndarray:
+    def channel(values: Values, value_ndim: int) -> np.ndarray:
         if values.ndim == value_ndim:
             return np.broadcast_to(values, (count, *values.shape))
         assert texcoords is not None, "a texture needs texture coordinates"
-        return lookup(values, texcoords, material.wrap)
+        return lookup(np.asarray(values), texcoords, material.wrap)
 
     return {
         "base_color": channel(material.base_color, 1),

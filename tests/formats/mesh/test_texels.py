@@ -7,6 +7,7 @@ import pytest
 from PIL import Image
 from support.gltf_files import png
 
+from data_gen.render.variant import mitsuba_module
 from spnr_jax.formats.mesh.texels import lookup, read_image, shrink, srgb_to_linear, value_texels
 
 MODES = ("repeat", "mirror", "clamp")
@@ -17,10 +18,9 @@ def mi():
     """Mitsuba in its scalar variant, which other tests do not depend on."""
     mitsuba = pytest.importorskip("mitsuba")
     before = mitsuba.variant()
-    mitsuba.set_variant("scalar_rgb")
-    yield mitsuba
+    yield mitsuba_module("scalar_rgb")  # on one thread, which whoever renders next relies on
     if before:
-        mitsuba.set_variant(before)
+        mitsuba_module(before)
 
 
 @pytest.mark.parametrize("wrap", MODES)
