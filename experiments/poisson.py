@@ -32,6 +32,7 @@ from spnr_jax import cli
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.images import write_whole
 from spnr_jax.kernels import metrics
+from spnr_jax.surfels.room import indoor_envmap
 
 RENDERING = ("resolution", "fov", "spp", "max_depth")  # settings that decide a picture, given the pose of its camera
 
@@ -124,7 +125,7 @@ def unscaled_light(described: dict, envmap: Path | None) -> np.ndarray:
     if described["sha256"] is None:
         if envmap:
             raise ValueError(f"--envmap {envmap}: the {described['name']} lit the data set; leave the option out")
-        return light.indoor_envmap()
+        return indoor_envmap()
     if envmap is None:
         raise ValueError(f"--envmap: give {described['name']}, which lit the data set")
     radiance = light.load_envmap(envmap)

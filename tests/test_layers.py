@@ -27,7 +27,12 @@ DATA_GEN = (
 ORDER = [f"spnr_jax/{entry}" for entry in SPNR_JAX] + [f"data_gen/{entry}" for entry in DATA_GEN] + ["experiments"]
 PURE = ("kernels", "surfels", "nn", "baselines", "method")
 WITHOUT_JIT = ("devices", "kernels", "nn", "baselines")
-OF_SPNR_JAX = {"spnr_jax/kernels", "spnr_jax/formats", "spnr_jax/formats/mesh"}  # that data_gen stands on
+OF_SPNR_JAX = {
+    "spnr_jax/kernels",
+    "spnr_jax/surfels",
+    "spnr_jax/formats",
+    "spnr_jax/formats/mesh",
+}  # that data_gen stands on
 IMPURE = {"os", "pathlib", "time", "io", "sys", "json", "shutil", "tempfile", "logging", "datetime", "random", "tqdm"}
 HEAVY = {"mitsuba", "pymeshlab", "trimesh", "viser", "torch", "matplotlib", "skimage", "grain", "dask", "distributed"}
 

@@ -24,6 +24,7 @@ from data_gen.render import light, views
 from data_gen.render.variant import choose_variant, mitsuba_module
 from data_gen.store import layout, storage
 from data_gen.store.storage import Location
+from spnr_jax.surfels.room import indoor_envmap
 
 
 def generate(config: GenerateConfig) -> None:
@@ -63,7 +64,7 @@ def make_missing(config: GenerateConfig, tasks: Sequence[Task], settings: dict) 
 def make_light(config: GenerateConfig, variant: str) -> np.ndarray:
     """Return the scaled environment map (height, width, 3) of the data set."""
     mitsuba_module(variant)
-    return light.scaled_to_white(light.load_envmap(config.envmap) if config.envmap else light.indoor_envmap())
+    return light.scaled_to_white(light.load_envmap(config.envmap) if config.envmap else indoor_envmap())
 
 
 def refuse_other_content(out: Location, settings: dict) -> None:

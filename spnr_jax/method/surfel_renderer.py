@@ -137,6 +137,7 @@ def _shade(
     slots: int,
 ) -> Float[Array, "height width 5"]:
     """Colour, opacity and depth along the camera's axis, of the window at the network's resolution."""
+    surfels = features.turned(surfels, camera)
     buffer = splatting.blend(found, surfels, features.attributes(surfels, light, camera), camera, slots=slots)
     seen, maps = features.features(buffer, light, camera)
     seen, maps = jax.lax.optimization_barrier((seen, maps))

@@ -32,6 +32,7 @@ SMOOTHED = 9  # neighbours over which the spacing is averaged
 LEAST_SPACING = 1e-5  # in units of the box, for points that coincide
 RIDGE = 0.15  # of the colour's regression, in spacings
 TURN = 0.5  # votes against a given normal from which it is turned
+EVIDENCE = 1.0  # votes that a lean is measured against: few of them are none
 UNSURE, SURE = 0.15, 0.45  # lean of the votes from which a side begins to count, and counts whole
 BLOCK = 2**16  # points that are worked on at once
 
@@ -73,6 +74,7 @@ def estimate(
     spacing = np.concatenate([_smoothed(n, w, spacing) for n, w in zip(blocks, layers, strict=True)])
     pairs = zip(blocks, rows, layers, strict=True)
     gradient = np.concatenate([_gradient(n, w, spacing[s], normal[s], base_color, s) for n, s, w in pairs])
+    seen = _visible(positions, normal, spacing, middle)
     surfels = Surfels(
         position=positions,
         normal=normal,
@@ -82,7 +84,7 @@ def estimate(
         roughness=roughness,
         metallic=metallic,
         sided=sided,
-        visible=_visible(positions, normal, spacing, middle),
+        visible=np.concatenate([_averaged(n, w, seen) for n, w in zip(blocks, layers, strict=True)]),
         shape=shape,
         mask=np.ones(len(positions), bool),
     )
@@ -170,7 +172,7 @@ def _lean(normal: np.ndarray, seen: np.ndarray) -> np.ndarray:
     """From -1 to 1: how much more is seen of the side that the normal points to than of the other."""
     cosines = normal @ DIRECTIONS.T
     front, back = (np.einsum("nd,nd->n", seen, np.maximum(side, 0)) for side in (cosines, -cosines))
-    return (front - back) / np.maximum(front + back, 1e-3)
+    return (front - back) / (front + back + EVIDENCE)
 
 
 def _voted(near: Near, rows: slice, normal: np.ndarray, spacing: np.ndarray, lean: np.ndarray) -> np.ndarray:
@@ -209,6 +211,12 @@ def _smoothed(near: Near, layer: np.ndarray, spacing: np.ndarray) -> np.ndarray:
     weight = layer[:, :SMOOTHED]
     logarithm = np.log(np.maximum(spacing, LEAST_SPACING))[near.index[:, :SMOOTHED]]
     return np.exp((weight * logarithm).sum(axis=1) / weight.sum(axis=1)).astype(np.float32)
+
+
+def _averaged(near: Near, layer: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """Mean over the nearest of the layer: a depth buffer of points is noisy."""
+    weight = layer[:, :SMOOTHED] / layer[:, :SMOOTHED].sum(axis=1, keepdims=True)
+    return sum(weight[:, k, None] * seen[near.index[:, k]] for k in range(weight.shape[1])).astype(np.float32)
 
 
 def _gradient(

@@ -4,6 +4,8 @@ Everything is relative: vectors in the camera's axes, lengths in spacings or pix
 how the object, the camera and the light are turned together, nor on the unit of the cloud.
 """
 
+import dataclasses
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -16,6 +18,13 @@ NUM_FEATURES, NUM_MAPS = 27, 17
 FAINT = 0.02  # opacity from which on a pixel's numbers begin to count
 WINDOWS = 2, 6  # pixels to each side over which the depth is compared
 TRUST = 0.25  # most that a colour to first order leaves the blended one
+
+
+def turned(surfels: Surfels, camera: Camera) -> Surfels:
+    """The surfels as seen from a camera: the normals of those without a side point to it."""
+    view = camera.cam_to_world[:, 3][None] - surfels.position
+    behind = (jnp.sum(view * surfels.normal, axis=1, keepdims=True) < 0) & (surfels.sided[:, None] < 0.5)
+    return dataclasses.replace(surfels, normal=jnp.where(behind, -surfels.normal, surfels.normal))
 
 
 def attributes(surfels: Surfels, light: Light, camera: Camera) -> Float[Array, "points 16"]:

@@ -1,11 +1,8 @@
 """Light from all around, and what of it meets a surface: every function here is linear in the environment map.
 
-A map is (height, 2 * height, 3), linear radiance, latitude-longitude: row 0 is straight up (+y), column c of w looks
-along the azimuth phi = 2 pi (c + 0.5) / w, where the direction is (sin phi, 0, -cos phi) on the horizon.
-
-    tables    irradiance by normal, and the map blurred by the GGX lobes of LEVELS by mirrored direction (split-sum
-              approximation, Karis 2013), 32 x 64 texels each
-    arriving  what each surfel receives of it: irradiance through the directions that see the surfel
+tables    irradiance by normal, and the map blurred by the GGX lobes of LEVELS by mirrored direction (split-sum
+          approximation, Karis 2013), 32 x 64 texels each
+arriving  what each surfel receives of it: irradiance through the directions that see the surfel
 """
 
 from functools import cache
@@ -15,6 +12,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from spnr_jax.kernels.records import Light, Surfels
+from spnr_jax.surfels.envmaps import directions, resampled, solid_angles
+from spnr_jax.surfels.room import SCALE, indoor_envmap
 from spnr_jax.surfels.visibility import DIRECTIONS
 
 HEIGHT, WIDTH = 32, 64  # of a table
@@ -23,22 +22,6 @@ TOLD = 2  # the level whose values at the directions of the visibility stand for
 SPECULAR = 0.04  # reflectance of what is not metal, seen from straight above
 LOBE = 8.0  # of the directions around the mirrored one whose visibility counts
 SH_BANDS = 9  # spherical harmonics up to degree 2
-
-
-def directions(height: int) -> Float[np.ndarray, "height width 3"]:
-    """Unit directions through the middles of a map's texels."""
-    theta = np.pi * (np.arange(height) + 0.5) / height
-    phi = np.pi * (np.arange(2 * height) + 0.5) / height
-    across = np.sin(theta)[:, None]
-    up = np.broadcast_to(np.cos(theta)[:, None], (height, 2 * height))
-    return np.stack([across * np.sin(phi), up, -across * np.cos(phi)], axis=-1).astype(np.float32)
-
-
-def solid_angles(height: int) -> Float[np.ndarray, "height width"]:
-    """Of the texels of a map, in steradian."""
-    edges = np.cos(np.pi * np.arange(height + 1) / height)
-    rows = (edges[:-1] - edges[1:]) * np.pi / height
-    return np.repeat(rows[:, None], 2 * height, axis=1).astype(np.float32)
 
 
 @cache
@@ -62,26 +45,10 @@ def light_of(envmap: Float[np.ndarray, "height width 3"]) -> Light:
     return Light(tables=np.concatenate([tables[:1], small[None], tables[1:]]))
 
 
-def resampled(envmap: Float[np.ndarray, "h w 3"], height: int) -> Float[np.ndarray, "height width 3"]:
-    """A map of another size: means over its texels' solid angles, of a map refined first where it is too coarse."""
-    fine = envmap
-    for axis, size in ((0, height), (1, 2 * height)):
-        repeats = int(np.lcm(fine.shape[axis], size) // fine.shape[axis])
-        fine = np.repeat(fine, repeats, axis=axis) if repeats < 16 else _stretched(fine, axis, 16 * size)
-    area = np.repeat(_row_areas(fine.shape[0])[:, None], fine.shape[1], axis=1)[..., None]
-    shape = (height, fine.shape[0] // height, 2 * height, fine.shape[1] // (2 * height))
-    total, weight = ((x.reshape(*shape, -1)).sum(axis=(1, 3)) for x in (fine * area, area))
-    return (total / weight).astype(np.float32)
-
-
-def _stretched(values: np.ndarray, axis: int, size: int) -> np.ndarray:
-    """Nearest texels at `size` places."""
-    return np.take(values, (np.arange(size) + 0.5) * values.shape[axis] // size, axis=axis, mode="clip")
-
-
-def _row_areas(height: int) -> np.ndarray:
-    edges = np.cos(np.pi * np.arange(height + 1) / height)
-    return (edges[:-1] - edges[1:]).astype(np.float32)
+@cache
+def room_light() -> Light:
+    """The light of the package's room, which pictures have where no other is asked for."""
+    return light_of(SCALE * indoor_envmap())
 
 
 def look_up(tables: Float[Array, "rows 3"], towards: list[Array], first: Array | int = 0) -> list[Array]:
@@ -145,6 +112,6 @@ def harmonics(x: Array, y: Array, z: Array) -> list[Array]:
 
 def projected(light: Light, rotation: Float[Array, "3 3"]) -> Float[Array, "9 3"]:
     """Spherical harmonics of the map over pi in the axes of a camera, columns of cam_to_world."""
-    towards = jnp.asarray(directions(HEIGHT).reshape(-1, 3)) @ rotation
+    towards = jnp.asarray(directions(HEIGHT).reshape(-1, 3), jnp.float32) @ rotation
     basis = jnp.stack(harmonics(*towards.T)) * jnp.asarray(solid_angles(HEIGHT).reshape(1, -1))
     return jnp.einsum("bt,tc->bc", basis, jnp.asarray(light.tables)[1].reshape(-1, 3), precision="highest") / jnp.pi

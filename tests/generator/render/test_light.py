@@ -7,6 +7,8 @@ from support.handmade import ball, plain
 from data_gen.render import light, views
 from data_gen.render.variant import mitsuba_module, threads
 from spnr_jax.formats.mesh.assets import Asset
+from spnr_jax.surfels.envmaps import directions
+from spnr_jax.surfels.room import indoor_envmap
 
 
 def solid_angle_mean(envmap):
@@ -24,7 +26,7 @@ def write_exr(path, envmap):
 
 @pytest.fixture(scope="module")
 def room():
-    return light.indoor_envmap(64)
+    return indoor_envmap(64)
 
 
 def test_a_white_diffuse_sphere_averages_0_6_under_the_scaled_map(room):
@@ -42,7 +44,7 @@ def test_scaling_leaves_the_colours_and_contrasts_of_the_map_alone(room):
 @pytest.mark.parametrize("sign", [-1, 1])
 def test_light_from_a_direction_of_the_map_falls_on_that_side_of_an_object(axis, sign):
     towards = sign * np.eye(3)[axis]
-    envmap = (light.map_directions(32) @ towards > 0.8)[..., None] * np.ones(3, np.float32) * 5
+    envmap = (directions(32) @ towards > 0.8)[..., None] * np.ones(3, np.float32) * 5
     scene = views.build_scene(Asset(parts=(ball(radius=0.6, material=plain()),)), envmap)
     config = views.ViewConfig(resolution=8, spp=16)
     lit = views.render_view(scene, views.look_at(3 * towards + 0.01), config, 0)

@@ -15,6 +15,7 @@ from experiments import poisson as command
 from spnr_jax.formats.mesh import surface_points
 from spnr_jax.formats.mesh.assets import Asset
 from spnr_jax.kernels.records import PointCloud
+from spnr_jax.surfels.room import indoor_envmap
 
 needs_solver = pytest.mark.skipif(importlib.util.find_spec("pymeshlab") is None, reason="pymeshlab is not installed")
 RADIUS, COUNT = 0.7, 600
@@ -162,7 +163,7 @@ def dataset(tmp_path_factory):
     asset = Asset(parts=(ball(radius=RADIUS, material=plain(RED)),))
     surface = surface_points.sample_surface(asset, COUNT, 0)
     poses = views.random_viewpoints(VIEW.views, VIEW.distance, np.random.default_rng(5))
-    lamp = light.scaled_to_white(light.indoor_envmap())
+    lamp = light.scaled_to_white(indoor_envmap())
     images, conditions = views.render_views(asset, surface, poses, lamp, VIEW, 6)
     packed = layout.pack_points(surface)
     line = packed.copy()
