@@ -22,7 +22,7 @@ from spnr_jax.kernels.compositing import WHITE
 from spnr_jax.kernels.records import Camera, Light, PointCloud, Rendering, Surfels
 from spnr_jax.kernels.resizing import mean_of_squares
 from spnr_jax.model_config import SurfelConfig
-from spnr_jax.nn.shader import Shader, doubled, picture
+from spnr_jax.nn.shader import NUM_OUTPUTS, Shader, doubled, picture
 from spnr_jax.surfels import features, lighting, splatting
 from spnr_jax.surfels.estimate import estimate
 
@@ -61,8 +61,10 @@ def encode(cloud: PointCloud) -> SurfelScene:
     return SurfelScene(surfels=jax.device_put(surfels), spacing=float(np.median(surfels.spacing[surfels.mask])))
 
 
-def render(variables: dict, scene: SurfelScene, camera: Camera, light: Light, *, config: SurfelConfig) -> Rendering:
-    """One view (camera unbatched, in the box) of an encoded object."""
+def render(
+    variables: dict | None, scene: SurfelScene, camera: Camera, light: Light, *, config: SurfelConfig
+) -> Rendering:
+    """One view (camera unbatched, in the box) of an encoded object; without variables discs and light alone."""
     doublings, side = resolution_of(scene.spacing, camera)
     small = cameras.resize(camera, *(-(-n * side // 2**doublings) for n in (camera.height, camera.width)))
     box, total = jax.device_get(_extent(scene.surfels, small))
@@ -126,7 +128,7 @@ def _seen_through(camera: Camera, plan: Plan) -> Camera:
 
 @partial(jax.jit, static_argnames=("config", "doublings", "slots"))
 def _shade(
-    variables: dict,
+    variables: dict | None,
     found: splatting.Entries,
     surfels: Surfels,
     light: Light,
@@ -141,7 +143,10 @@ def _shade(
     buffer = splatting.blend(found, surfels, features.attributes(surfels, light, camera), camera, slots=slots)
     seen, maps = features.features(buffer, light, camera)
     seen, maps = jax.lax.optimization_barrier((seen, maps))
-    outputs = Shader(config.widths, config.top).apply(variables, seen[None], doublings)
+    if variables is None:
+        outputs = jnp.zeros((1, *(n << doublings for n in seen.shape[:2]), NUM_OUTPUTS))
+    else:
+        outputs = Shader(config.widths, config.top).apply(variables, seen[None], doublings)
     ambient = lighting.projected(light, camera.cam_to_world[:, :3])
     color, alpha = picture(outputs, maps[None], ambient[None], doublings)
     depth = buffer.depth[None, ..., None]
