@@ -13,8 +13,8 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from experiments import fuzz_seeds
-from experiments.fuzz_mutations import Files
+import valid_files
+from damage import Files
 from spnr_jax.model import Model, Volume
 from spnr_jax.presets import tiny
 from spnr_jax.types import PointCloud
@@ -39,7 +39,7 @@ def messages() -> list[Files]:
 def sent_files() -> list[Files]:
     """Files that a browser sends, with the name that it gives them."""
     found = []
-    for files in (*fuzz_seeds.plys()[:2], *fuzz_seeds.glbs(), *fuzz_seeds.npys()[:1]):
+    for files in (*valid_files.plys()[:2], *valid_files.glbs(), *valid_files.npys()[:1]):
         name, content = next(iter(files.items()))
         found.append({"name.json": json.dumps([name]).encode(), "content": content})
     return found
@@ -48,7 +48,7 @@ def sent_files() -> list[Files]:
 @functools.cache
 def _state() -> State:
     """What a browser that has just come sees; nothing of it needs a network."""
-    positions = fuzz_seeds.numbers(30, 3)
+    positions = valid_files.numbers(30, 3)
     cloud = PointCloud(
         positions=positions, base_color=positions, roughness=positions[:, 0], metallic=positions[:, 1],
         mask=np.ones(30, bool),
@@ -111,7 +111,7 @@ def read_message(folder: Path, main: str) -> None:
 
 def read_upload(folder: Path, main: str) -> None:
     """What a browser's file becomes; nothing of it stays on the disk."""
-    from experiments.fuzz_readers import MOST_POINTS, check_cloud
+    from file_readers import MOST_POINTS, check_cloud
 
     names = _document(folder / "name.json")
     if not isinstance(names, list) or len(names) != 1 or not isinstance(names[0], str):

@@ -14,8 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments import fuzz_messages, fuzz_seeds
-from experiments.fuzz_mutations import Files
+import browser_messages
+import valid_files
+from damage import Files
 
 MOST_POINTS = 32
 
@@ -125,7 +126,7 @@ def shards() -> list[Files]:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "shard"
         writer = ArrayRecordWriter(str(path), "group_size:1")
-        (seed,) = (files for files in fuzz_seeds.packed() if next(iter(files)) == "record")
+        (seed,) = (files for files in valid_files.packed() if next(iter(files)) == "record")
         writer.write(seed["record"])
         writer.close()
         shard = path.read_bytes()
@@ -174,22 +175,22 @@ def read_network(folder: Path, main: str) -> None:
 
 
 CLOUDS: dict[str, Callable[[], list[Files]]] = {
-    "ply": fuzz_seeds.plys, "ply-mesh": fuzz_seeds.ply_meshes, "pcd": fuzz_seeds.pcds, "text": fuzz_seeds.texts,
-    "npz": fuzz_seeds.npzs, "npy": fuzz_seeds.npys, "las": functools.partial(fuzz_seeds.scans, "las"),
-    "laz": functools.partial(fuzz_seeds.scans, "laz"), "stl": fuzz_seeds.stls, "off": fuzz_seeds.offs,
-    "obj": fuzz_seeds.objs, "gltf": fuzz_seeds.gltfs, "glb": fuzz_seeds.glbs,
+    "ply": valid_files.plys, "ply-mesh": valid_files.ply_meshes, "pcd": valid_files.pcds, "text": valid_files.texts,
+    "npz": valid_files.npzs, "npy": valid_files.npys, "las": functools.partial(valid_files.scans, "las"),
+    "laz": functools.partial(valid_files.scans, "laz"), "stl": valid_files.stls, "off": valid_files.offs,
+    "obj": valid_files.objs, "gltf": valid_files.gltfs, "glb": valid_files.glbs,
 }  # fmt: skip
 READERS = {
     **{name: Reader(seeds=seeds, read=read_cloud) for name, seeds in CLOUDS.items()},
-    "config": Reader(seeds=fuzz_seeds.configs, read=read_config),
-    "metrics": Reader(seeds=fuzz_seeds.metric_rows, read=read_metrics),
-    "dataset": Reader(seeds=fuzz_seeds.datasets, read=read_dataset),
-    "dataset-check": Reader(seeds=fuzz_seeds.datasets, read=check_dataset),
-    "packed": Reader(seeds=fuzz_seeds.packed, read=read_packed),
+    "config": Reader(seeds=valid_files.configs, read=read_config),
+    "metrics": Reader(seeds=valid_files.metric_rows, read=read_metrics),
+    "dataset": Reader(seeds=valid_files.datasets, read=read_dataset),
+    "dataset-check": Reader(seeds=valid_files.datasets, read=check_dataset),
+    "packed": Reader(seeds=valid_files.packed, read=read_packed),
     "shard": Reader(seeds=shards, read=read_shard),
-    "lists": Reader(seeds=fuzz_seeds.lists, read=read_list),
-    "viewer-message": Reader(seeds=fuzz_messages.messages, read=fuzz_messages.read_message),
-    "viewer-upload": Reader(seeds=fuzz_messages.sent_files, read=fuzz_messages.read_upload),
-    "lpips": Reader(seeds=fuzz_seeds.lpips, read=read_lpips),
-    "weights": Reader(seeds=fuzz_seeds.weights, read=read_network),
+    "lists": Reader(seeds=valid_files.lists, read=read_list),
+    "viewer-message": Reader(seeds=browser_messages.messages, read=browser_messages.read_message),
+    "viewer-upload": Reader(seeds=browser_messages.sent_files, read=browser_messages.read_upload),
+    "lpips": Reader(seeds=valid_files.lpips, read=read_lpips),
+    "weights": Reader(seeds=valid_files.weights, read=read_network),
 }

@@ -1,4 +1,4 @@
-"""Valid files of every kind that is read, as small as can be: what experiments/fuzz.py damages.
+"""Valid files of every kind that is read, as small as can be: what tests/robustness/test_fuzz.py damages.
 
 A seed is a dict from names to bytes, the file that is opened first, its companions behind it.  All seeds follow from
 literal seeds; damage to a few hundred bytes hits what matters.
@@ -15,7 +15,7 @@ import numpy as np
 from PIL import Image
 
 from data_gen import records
-from experiments.fuzz_mutations import Files
+from damage import Files
 from spnr_jax import presets
 from spnr_jax.config import to_dict
 
