@@ -10,8 +10,10 @@
 #   make check               format, lint, types, tests
 #   make docs                the documents as a site: site/index.html
 #   make wheel               the package: dist/*.whl     make test-wheel   it alone in an empty environment
-#   make fuzz                10,000 damaged files for every reader: runs/fuzz/fuzz.md (FUZZ="--reader glb")
-#   make chaos               kill a training 100 times, fill its disk, ...: runs/chaos/chaos.md (CHAOS="--kills 10")
+#   make fuzz                10,000 damaged files for every reader, and a table (FUZZ_INPUTS=500 FUZZ="-k glb")
+#   make chaos               kill a training 100 times, fill its disk, ..., and a table (CHAOS_KILLS=2 for 4 x 2 kills)
+#   make stability           float32 beside float64 for every kernel over its whole domain, and a table
+#   make long-run            memory, pace and compilations of 2,000 training steps (LONG_RUN_STEPS=500)
 #   make mutants             break the kernels on purpose; every fault has to be caught by the tests
 
 PYTHON ?= python3.11
@@ -24,10 +26,9 @@ BENCH ?=
 DATA ?=
 BUDGET ?= tiny
 TABLE1 ?=
-CHAOS ?=
 FUZZ ?=
 
-.PHONY: setup demo table1 bench test test-ci test-all test-wheel lint format types check docs wheel chaos fuzz mutants clean
+.PHONY: setup demo table1 bench test test-ci test-all test-wheel lint format types check docs wheel chaos fuzz stability long-run mutants clean
 
 setup: .venv/complete
 
@@ -87,10 +88,16 @@ wheel: setup
 	rm -rf build
 
 fuzz: setup
-	$(PY) -m experiments.fuzz --out runs/fuzz $(FUZZ)
+	FUZZ_INPUTS=$(or $(FUZZ_INPUTS),10000) $(PY) -m pytest -q -s tests/robustness/test_fuzz.py -k "damaged and files" $(FUZZ)
 
 chaos: setup
-	$(PY) -m experiments.chaos --out runs/chaos $(CHAOS)
+	CHAOS_KILLS=$(or $(CHAOS_KILLS),25) $(PY) -m pytest -q -s tests/robustness/test_chaos.py
+
+stability: setup
+	STABILITY=1 $(PY) -m pytest -q -s tests/robustness/test_stability.py
+
+long-run: setup
+	LONG_RUN_STEPS=$(or $(LONG_RUN_STEPS),2000) $(PY) -m pytest -q -s tests/robustness/test_long_run.py
 
 mutants: setup
 	$(PY) tests/mutants.py

@@ -189,8 +189,7 @@ def _checked_pieces(path: Path) -> Iterator[Columns]:
 def _checked(columns: Columns, before: int) -> Columns:
     """The columns; ValueError if a position is NaN, infinite or too large for float32."""
     largest = np.finfo(np.float32).max
-    with np.errstate(invalid="ignore"):  # converting a signalling NaN warns; it is refused below
-        sound = np.logical_and.reduce([np.abs(np.asarray(columns[axis], np.float64)) < largest for axis in "xyz"])
+    sound = np.logical_and.reduce([np.abs(np.asarray(columns[axis], np.float64)) < largest for axis in "xyz"])
     broken = np.flatnonzero(~sound)
     if broken.size:
         raise ValueError(

@@ -12,9 +12,9 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-
 import valid_files
 from damage import Files
+
 from spnr_jax.model import Model, Volume
 from spnr_jax.presets import tiny
 from spnr_jax.types import PointCloud

@@ -1,8 +1,8 @@
 """Damage to valid files that knows their structure, drawn from a `random.Random`.
 
-Hypothesis hands in one whose every draw it can shrink (`st.randoms`).  Files are a dict from names to bytes.  A container
-is opened, one of its parts is damaged, and it is closed again with right lengths and checksums, so that the damage
-reaches what reads the part; now and then the whole is damaged instead.
+Hypothesis hands in one whose every draw it can shrink (`st.randoms`).  Files are a dict from names to bytes.  A
+container is opened, one of its parts is damaged, and it is closed again with right lengths and checksums, so that the
+damage reaches what reads the part; now and then the whole is damaged instead.
 """
 
 import copy
@@ -24,7 +24,18 @@ Opened = tuple[Files, Callable[[Files], bytes]]  # parts of a container, and wha
 DECOY = "secret.bin"  # lies beside the folder of an input; no reader may open it
 PATHS = [
     *(f"../{DECOY}", f"..\\{DECOY}", f"a/../../{DECOY}", f"%2e%2e/{DECOY}", "/etc/passwd", "file:///etc/passwd"),
-    *("http://localhost/a.png", "C:\\a", "\0", ".", "..", "", "a\0b", "x" * 5000, "ü\ud7ff\U0001f600", "data:;base64,%%"),
+    *(
+        "http://localhost/a.png",
+        "C:\\a",
+        "\0",
+        ".",
+        "..",
+        "",
+        "a\0b",
+        "x" * 5000,
+        "ü\ud7ff\U0001f600",
+        "data:;base64,%%",
+    ),
 ]
 NUMBERS = [
     *("0", "-1", "1", "255", "256", "65536", "2147483647", "-2147483648", "4294967295", "9223372036854775807", "1e308"),

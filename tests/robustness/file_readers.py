@@ -12,9 +12,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 import browser_messages
+import numpy as np
 import valid_files
 from damage import Files
 

@@ -40,7 +40,9 @@ def alone(tmp_path_factory):
 
 def seconds_of(events, phase):
     """Median duration of a phase."""
-    return float(np.median([after.seconds - event.seconds for event, after in pairwise(events) if event.phase == phase]))
+    return float(
+        np.median([after.seconds - event.seconds for event, after in pairwise(events) if event.phase == phase])
+    )
 
 
 @pytest.mark.ci

@@ -12,10 +12,10 @@ import struct
 from collections.abc import Sequence
 
 import numpy as np
+from damage import Files
 from PIL import Image
 
 from data_gen import records
-from damage import Files
 from spnr_jax import presets
 from spnr_jax.config import to_dict
 

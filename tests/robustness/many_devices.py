@@ -1,5 +1,7 @@
 """Render, and take a training step, on one of eight virtual devices and on all; print how far they lie apart, as JSON.
 
+    python many_devices.py [float64]      with float64 only the gradients of the plain network, in that precision
+
     renderings  largest difference of a picture, a depth or an opacity
     gradients   largest difference of a first step's gradients, relative to the largest entry of the array
     blocks      of rays near points that were rendered: on one device, and on each of the eight
@@ -9,20 +11,28 @@ A process of its own, which XLA_FLAGS shows eight devices.
 
 import dataclasses
 import json
+import sys
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import partial
+from pathlib import Path
 from unittest import mock
+
+sys.path.insert(0, str(Path(__file__).parents[1]))  # the helpers of all tests
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import test_point_nerf
 import tiny_dataset
 import tiny_model
 
-from experiments import distributed_gradients
-from experiments.distributed_rendering import counting
-from spnr_jax import distributed, renderer, training
+from spnr_jax import data, distributed, renderer, training
 from spnr_jax.config import LossConfig
+from spnr_jax.distributed import DEPTH, OBJECTS
 from spnr_jax.model_config import SamplingConfig
+from spnr_jax.renderer import Renderer
 
 PLUS = dataclasses.replace(
     tiny_model.PLUS,
@@ -40,11 +50,15 @@ SIZES = {"plain": 16, "near points": 9, "Point-NeRF": 9}  # of pictures: their r
 
 def main() -> None:
     """Compares, and prints."""
-    found = {"renderings": {}, "gradients": {}, "blocks": {}}
-    for name, model in MODELS.items():
-        found["renderings"][name] = rendered(model, SIZES[name])
-        found["gradients"][name] = trained(model)
-    found["blocks"] = blocks()
+    if "float64" in sys.argv:
+        jax.config.update("jax_enable_x64", True)
+        print(json.dumps(gradients_apart(MODELS["plain"], "float64")))
+        return
+    found = {
+        "renderings": {name: rendered(model, SIZES[name]) for name, model in MODELS.items()},
+        "gradients": {name: gradients_apart(model, "float32") for name, model in MODELS.items()},
+        "blocks": blocks(),
+    }
     print(json.dumps(found))
 
 
@@ -64,12 +78,42 @@ def rendered(model, size: int) -> float:
     return max(float(jnp.abs(a - b).max()) for a, b in zip(*map(jax.tree.leaves, (one, all_of_them)), strict=True))
 
 
-def trained(model) -> float:
-    """Largest relative difference between the gradients of one device and of four pairs, in the first step."""
+def gradients_apart(model, precision: str) -> float:
+    """Largest difference of the gradients of one device and of four pairs, over the largest entry of their array.
+
+    In float64 what is left of a right division is rounding at 1e-12, and what is left of a wrong one is what is wrong.
+    """
     loss = LossConfig(l1_weight=1.0, adversarial_weight=0.0)
     config = dataclasses.replace(tiny_dataset.CONFIG, model=model, loss=loss, batch_objects=8)
-    found = distributed_gradients.apart(config, tiny_dataset.dataset(), distributed.device_mesh(depth=2))
-    return found["gradients"]
+    batch, gradients = next(data.batches(tiny_dataset.dataset(), config, 0)), []
+
+    def precise(tree):
+        return jax.tree.map(lambda x: x.astype(precision) if x.dtype == np.float32 else x, tree)
+
+    for mesh in (None, distributed.device_mesh(depth=2)):
+        with distributed.using(mesh):
+            state = precise(training.jitted_create_state(config))
+            placed = distributed.placed(precise(batch), mesh, config.batch_objects)
+            state, _ = training.jitted_train_step(state, placed, config=config, adversarial=False)
+        gradients.append(jax.device_get(state.generator_optimizer[0].mu))  # of one step their mean is a multiple
+    pairs = zip(*map(jax.tree.leaves, gradients), strict=True)
+    return max(float(np.abs(a - b).max() / max(np.abs(a).max(), 1e-30)) for a, b in pairs)
+
+
+@contextmanager
+def counting() -> Iterator[Counter[int]]:
+    """While it lasts programs are compiled that count the blocks of rays near points which each device renders."""
+    found: Counter[int] = Counter()
+    march = Renderer.march_open
+
+    def counted(self, *arguments):
+        divided = jax.sharding.get_abstract_mesh().manual_axes
+        device = jax.lax.axis_index((OBJECTS, DEPTH)) if divided else 0
+        jax.debug.callback(lambda i: found.update([int(i)]), device)
+        return march(self, *arguments)
+
+    with mock.patch.object(Renderer, "march_open", counted):
+        yield found
 
 
 def blocks() -> list[list[int]]:

@@ -14,16 +14,14 @@ import numpy as np
 import pytest
 import tiny_dataset
 from laws import same_bits
+from layouts import NETWORK, QUICK_COMPILATION, Layout, compared
+from layouts import run as run_layout
 from tiny_dataset import CONFIG
 
-from experiments import distributed as experiment
-from experiments import distributed_memory
-from experiments.chaos_child import QUICK_COMPILATION
-from experiments.distributed import Distributed, Layout, compared
 from spnr_jax import data, distributed, launch
 
 # the discriminator and R1 take part from the first step
-FLAGS = f"{experiment.NETWORK} --adversarial-start 0 --batch-objects 4 --num-steps 4 --checkpoint-every 2".split()
+FLAGS = f"{NETWORK} --adversarial-start 0 --batch-objects 4 --num-steps 4 --checkpoint-every 2".split()
 TOLERANCE = 1e-5
 
 
@@ -38,40 +36,64 @@ def one(folder):
     return start(folder, Layout(name="one"))
 
 
+def agrees(run, one):
+    found = compared(run, one)
+    assert max(found.values()) < TOLERANCE, found
+
+
 def start(folder, layout):
-    return experiment.run(folder, tiny_dataset.dataset().folder, layout, FLAGS)
+    return run_layout(folder, tiny_dataset.dataset().folder, layout, FLAGS)
 
 
 @pytest.mark.ci
 def test_two_processes_of_four_devices_go_on_from_a_checkpoint_of_one_and_one_reads_theirs(folder, one):
     """Each volume lies on two devices; R1 is due in the first of the two steps, statistics are of all objects."""
     shutil.copytree(one, folder / "eight", ignore=shutil.ignore_patterns("4"))
-    found = compared(start(folder, Layout(name="eight", processes=2, devices=4, depth=2)), one)
-    del found["ms"]
-    assert max(found.values()) < TOLERANCE, found
+    agrees(start(folder, Layout(name="eight", processes=2, devices=4, depth=2)), one)
 
 
 @pytest.mark.ci
-@pytest.mark.parametrize("layout", [x for x in experiment.LAYOUTS if x.launcher != "addresses"], ids=lambda x: x.name)
-def test_processes_of_a_launcher_find_each_other(folder, one, layout):
-    if layout.launcher == "mpirun" and sys.platform != "linux":
+@pytest.mark.parametrize("launcher", ["SLURM's environment", "mpirun"])
+def test_processes_of_a_launcher_find_each_other(folder, one, launcher):
+    if launcher == "mpirun" and sys.platform != "linux":
         pytest.skip("Open MPI is installed on Linux alone")
-    found = compared(start(folder, layout), one)
-    del found["ms"]
-    assert max(found.values()) < TOLERANCE, found
+    agrees(start(folder, Layout(name=launcher, processes=2, launcher=launcher)), one)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "layout",
+    [
+        Layout(name="4 devices", devices=4),
+        Layout(name="4 processes", processes=4),
+        Layout(name="volumes cut in 2", devices=8, depth=2),
+    ],
+    ids=lambda layout: layout.name,
+)
+def test_every_layout_trains_as_one_device(folder, one, layout):
+    agrees(start(folder, layout), one)
+
+
+def many_devices(*arguments):
+    """What tests/robustness/many_devices.py finds on eight virtual devices."""
+    here = Path(__file__).parent
+    environment = os.environ | {
+        "XLA_FLAGS": f"{QUICK_COMPILATION} --xla_force_host_platform_device_count=8",
+        "PYTHONPATH": str(here.parents[1]),
+    }
+    command = [sys.executable, here / "many_devices.py", *arguments]
+    return json.loads(subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout)
+
+
+@pytest.mark.ci
+def test_gradients_of_divided_volumes_are_those_of_one_device_in_float64():
+    assert many_devices("float64") < 1e-9
 
 
 @pytest.mark.ci
 def test_eight_devices_render_and_train_what_one_does_and_each_only_its_own_rays():
     """Pictures of all networks that know rays, on rays and rows that 8 does and does not divide; steps of 4 x 2."""
-    tests = Path(__file__).parent
-    environment = os.environ | {
-        "XLA_FLAGS": f"{QUICK_COMPILATION} --xla_force_host_platform_device_count=8",
-        "PYTHONPATH": os.pathsep.join([str(tests), str(tests.parent)]),
-    }
-    command = [sys.executable, tests / "many_devices.py"]
-    said = subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout
-    found = json.loads(said)
+    found = many_devices()
     assert max(found["renderings"].values()) < 2e-6, found
     assert max(found["gradients"].values()) < TOLERANCE, found
     (one,), eight = found["blocks"]
@@ -141,19 +163,3 @@ def test_a_process_alone_waits_for_nobody():
     distributed.first_alone(lambda: done.append(distributed.leads()))
     assert done == [True]
     assert [distributed.Agreement(None)(asked) for asked in (False, True, False)] == [False, True, False]
-
-
-@pytest.mark.slow
-def test_every_layout_trains_as_one_device(monkeypatch, tmp_path):
-    """20 steps on 8 devices, in 2 and 4 processes, handed over half way, and 128^3 voxels cut in 4."""
-    monkeypatch.setattr(distributed_memory, "measured", lambda place: {"128": {"1": 2.0, "2": 1.0}})
-    experiment.main(Distributed(out=tmp_path, data=tiny_dataset.dataset().folder))
-    results = json.loads((tmp_path / "results.json").read_text())
-    assert len(results["losses"]) == 20
-    for row in results["layouts"].values():
-        assert max(row[name] for name in ("loss", "metrics", "statistics", "parameters")) < TOLERANCE, row
-    # its parameters differ by 5e-4 after two steps of Adam, from rounding: in float64 gradients are the same
-    assert max(results["cut"][name] for name in ("loss", "metrics")) < TOLERANCE
-    assert results["gradients"]["float64"]["gradients"] < 1e-9, results["gradients"]
-    assert max(row["8"]["apart"] for row in results["rendering"].values()) < TOLERANCE
-    assert (tmp_path / "distributed.png").read_bytes().startswith(b"\x89PNG")
