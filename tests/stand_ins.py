@@ -7,7 +7,7 @@ import numpy as np
 import tiny_dataset
 from tiny_baselines import SHRUNKEN
 
-from experiments import methods
+from experiments.comparison import networks as methods
 from spnr_jax import checkpoint, evaluation, training
 
 OFFSET = 0.125  # of the depth that a stand-in shows

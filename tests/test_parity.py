@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import twin
 
-from experiments import twin_layout
+from experiments.speed import twin_layout
 from spnr_jax import cameras, compositing, losses, sampling, training, voxels
 from spnr_jax.nn.encoding import encode_direction
 from spnr_jax.renderer import Renderer

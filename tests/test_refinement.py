@@ -10,7 +10,7 @@ import tiny_dataset
 from laws import close, same_bits
 from tiny_model import PLUS
 
-from experiments import refinement
+from experiments.packaged import refinement
 from spnr_jax import clouds, data, presets, training
 from spnr_jax.config import LossConfig
 from spnr_jax.nn.refiner import Refiner

@@ -70,7 +70,7 @@ def main(options: Loading) -> None:
     if not rows:
         raise ValueError(f"{options.dataset}: no preset of {', '.join(options.presets)} has images of {size} px")
     found = {"hardware": evaluation.hardware(), "image_size": size, "rows": rows}
-    results.write(options.out / str(size), found, [table(rows)], [found["hardware"]])
+    results.write(options.out / str(size), found, [table(rows)], [evaluation.hardware()])
 
 
 def image_size(dataset: data.Dataset) -> int:

@@ -233,7 +233,7 @@ def scatter(axes: Axes, rows: list[dict], x: str, y: str) -> None:
             shown = [row for row in rows if (row["group"], row["run"]) == (group, run)]
             label = group if len(runs) == 1 else f"{Path(run).name}, {group}"
             x_values, y_values = ([row[name] for row in shown] for name in (x, y))
-            axes.scatter(x_values, y_values, 26, color, marker, zorder=3, label=label)
+            axes.scatter(x_values, y_values, s=26, c=color, marker=marker, zorder=3, label=label)
 
 
 if __name__ == "__main__":

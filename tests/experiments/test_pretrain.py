@@ -10,7 +10,7 @@ import pytest
 import tiny_dataset
 import tiny_model
 
-from experiments import pretrain
+from experiments.packaged import pretrain
 from spnr_jax import cli, data, presets, run_record, weights
 
 pytestmark = pytest.mark.ci  # it trains several networks

@@ -9,11 +9,11 @@ import pytest
 import stand_ins
 import tiny_dataset
 from handmade import RED, ball, plain
-from PIL import Image
 
 from data_gen.assets import Asset
-from experiments import methods, point_count, sheets
-from experiments.point_count import PointCount, cloud_of, main
+from experiments.comparison import networks
+from experiments.studies import point_count
+from experiments.studies.point_count import PointCount, cloud_of, main
 from spnr_jax import cli, data, evaluation, statistics
 
 pytestmark = pytest.mark.ci  # it trains several networks
@@ -33,16 +33,11 @@ def mesh(*_):
 def _stand_ins():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(cli, "set_up_jax", lambda **_: None)
-        patch.setattr(methods, "networks", lambda *_: stand_ins.stand_ins("Ours", "NPBG"))
+        patch.setattr(networks, "networks", lambda *_: stand_ins.stand_ins("Ours", "NPBG"))
         patch.setattr(evaluation, "choose_radius", lambda *_: 1.5)
         patch.setattr(point_count, "mesh_of", mesh)
         patch.setattr(point_count, "details", lambda *_: {"seeds": {"points": 5}})
         yield
-
-
-def read(path):
-    with Image.open(path) as image:
-        return np.asarray(image)
 
 
 def asked(out, **options):
@@ -88,7 +83,6 @@ def test_the_curves_are_the_scores_of_the_evaluation_at_each_count(out):
 def test_a_method_without_opacity_has_no_curve_of_it(out):
     results = json.loads((out / "results.json").read_text())
     assert set(results["curves"]["NPBG"]) == {"psnr", "flip"}
-    assert "| NPBG | n/a | n/a | n/a |" in (out / "table.md").read_text()
 
 
 def test_classes_have_the_means_of_their_objects_and_the_best_method_is_counted(out):
@@ -107,17 +101,6 @@ def test_classes_have_the_means_of_their_objects_and_the_best_method_is_counted(
         found = results["classes"]
         total = sum(found[name]["psnr"][label] * found[name]["objects"] for name in found) / len(NAMES)
         assert total == pytest.approx(curves["psnr"][1]["mean"], rel=1e-6)
-    assert "| PSNR, dB, 16 points | ball (1) |" in (out / "table.md").read_text()
-
-
-def test_every_count_is_a_column_of_the_table_and_of_the_pictures(out):
-    assert "| PSNR, dB | 8 | 16 | 64 |" in (out / "table.md").read_text()
-    height, width = read(out / "strip.png").shape[:2]
-    cell = 128 + sheets.GAP
-    assert (width // cell, height // cell) == (1 + len(COUNTS), 1 + len(FLOORS))  # all but the white image
-    assert (out / "point_count.png").read_bytes().startswith(b"\x89PNG")
-    pictures = [read(out / "Ours" / f"{count}.png") for count in COUNTS]
-    assert pictures[0].mean() > pictures[1].mean() > pictures[2].mean()  # the stand-in is darker with more points
 
 
 def test_what_was_measured_is_not_measured_again(out, tmp_path, monkeypatch):
@@ -148,7 +131,7 @@ def test_what_was_measured_is_not_measured_again(out, tmp_path, monkeypatch):
 def test_a_folder_holds_the_scores_of_one_network_and_of_the_same_objects(out, monkeypatch):
     with pytest.raises(ValueError, match="holds point counts with another objects; choose another --out"):
         main(asked(out, objects=1))
-    monkeypatch.setattr(methods, "networks", lambda *_: stand_ins.stand_ins("Ours", checksum="1"))
+    monkeypatch.setattr(networks, "networks", lambda *_: stand_ins.stand_ins("Ours", checksum="1"))
     with pytest.raises(ValueError, match="holds scores of Ours with another config"):
         main(asked(out))
 
@@ -164,12 +147,6 @@ def test_counts_that_cannot_be_had_are_left_out_with_the_reason(monkeypatch, cap
     assert f"left out 64 points: the data set holds {STORED} an object, and object chair was made from" in said
     assert "--meshes" in said
     assert point_count.available_counts(asked(tmp_path, counts=(64,)), dataset, NAMES[0]) == [STORED]
-
-
-@pytest.mark.parametrize("counts", [(), (0, 8), (16, 8), (8, 8)])
-def test_counts_have_to_rise(counts, tmp_path):
-    with pytest.raises(ValueError, match="--counts: expected rising numbers of points"):
-        asked(tmp_path, counts=counts)
 
 
 def test_a_method_compiles_once_for_all_objects_of_a_count():

@@ -8,9 +8,9 @@ import tiny_dataset
 from laws import same_bits
 from tiny_runs import L1_ONLY, check_conditions, results_of, shrunken
 
-from experiments.fig1_loss_tradeoff import Fig1, main, pretrained, variant
-from experiments.training_runs import QUICK_STEPS, Budget
-from spnr_jax import checkpoint, cli, config, presets, training
+from experiments.comparison.variants import QUICK_STEPS, Budget
+from experiments.paper.fig1 import Fig1, main, pretrained, variant
+from spnr_jax import checkpoint, config, presets, training
 
 pytestmark = pytest.mark.ci  # it trains several networks
 
@@ -67,30 +67,3 @@ def test_all_weights_start_from_the_network_that_the_l1_loss_trained(out):
         same_bits((start.generator, start.averaged), (before.averaged,) * 2)
         same_bits((start.batch_stats, start.averaged_stats), (before.averaged_stats,) * 2)
         assert np.isfinite(start.discriminator["kernel_0"]).all()
-
-
-def test_a_finished_figure_is_only_read_and_another_start_is_refused(out, monkeypatch, capsys):
-    def forbidden(*_, **__):
-        raise AssertionError("something was trained again")
-
-    before = results_of(out)
-    monkeypatch.setattr(training, "jitted_train_step", forbidden)
-    main(asked(out, pretrain=2))
-    assert results_of(out) == before
-    capsys.readouterr()
-    assert cli.guarded(lambda: main(asked(out)), "fig1") == 2
-    assert "another pretrain" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"l1_weights": ()}, "--l1-weights: expected distinct"),
-        ({"l1_weights": (-1.0,)}, "from 0 on"),
-        ({"l1_weights": (1.0, 1.0)}, "distinct"),
-        ({"pretrain": -1}, "--pretrain: expected 0 or more"),
-    ],
-)
-def test_a_wrong_option_says_what_is_possible(tmp_path, options, message):
-    with pytest.raises(ValueError, match=message):
-        asked(tmp_path, **options)

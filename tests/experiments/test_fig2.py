@@ -8,10 +8,11 @@ import tiny_dataset
 from tiny_runs import check_conditions, results_of, shrunken
 
 from data_gen.plan import check_options, plan_data_set
-from experiments import fig2_color_augmentation, training_runs
-from experiments.fig2_color_augmentation import Fig2, generation, main, nearest_views, trainings
-from experiments.training_runs import Budget
-from spnr_jax import cli, data, training
+from experiments.comparison import variants
+from experiments.comparison.variants import Budget
+from experiments.paper import fig2
+from experiments.paper.fig2 import Fig2, generation, main, nearest_views, trainings
+from spnr_jax import cli, data
 
 pytestmark = pytest.mark.ci  # it trains several networks
 
@@ -47,16 +48,6 @@ def test_both_trainings_are_scored_on_the_same_objects(out):
     check_conditions(out)
 
 
-def test_a_finished_figure_is_only_read(out, folder, monkeypatch):
-    def forbidden(*_, **__):
-        raise AssertionError("something was trained again")
-
-    before = results_of(out)
-    monkeypatch.setattr(training, "jitted_train_step", forbidden)
-    main(Fig2(data=folder, out=out, budget=Budget(quick=True)))
-    assert results_of(out) == before
-
-
 def test_the_trainings_differ_in_the_training_split_alone(folder):
     dataset = data.open_dataset(folder)
     plain, whole = trainings(Fig2(out=folder, data=folder), dataset)
@@ -81,8 +72,8 @@ def test_without_a_data_set_one_with_variants_is_generated(folder, tmp_path, mon
     def train(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(fig2_color_augmentation, "generate", generate)
-    monkeypatch.setattr(training_runs, "train", train)
+    monkeypatch.setattr(fig2, "generate", generate)
+    monkeypatch.setattr(variants, "train", train)
     options = Fig2(out=tmp_path, generated=30, colour_variants=3)
     with pytest.raises(KeyboardInterrupt):
         main(options)
@@ -100,9 +91,3 @@ def test_the_nearest_views_look_from_the_same_side():
     angles = np.radians([[0, 90, 180], [95, 200, 300], [270, 10, 88]])
     eyes = [3 * np.stack([np.sin(a), 0 * a, np.cos(a)], axis=-1) for a in angles]
     assert nearest_views(eyes) == [1, 0, 2]
-
-
-@pytest.mark.parametrize("option", ["generated", "colour_variants"])
-def test_a_wrong_option_says_what_is_possible(tmp_path, option):
-    with pytest.raises(ValueError, match=f"--{option.replace('_', '-')}: expected 1 or more"):
-        Fig2(out=tmp_path, **{option: 0})

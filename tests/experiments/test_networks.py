@@ -9,8 +9,8 @@ import pytest
 import stand_ins
 import tiny_dataset
 
-from experiments import methods
-from experiments.methods import Sources, networks
+from experiments.comparison import networks as methods
+from experiments.comparison.networks import Sources, networks
 from spnr_jax import data, evaluation, weights
 
 

@@ -1,7 +1,6 @@
 """Laws of the reconstruction: a sphere of points is a sphere again, facing outwards, in the colours of its points."""
 
 import importlib.util
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +10,7 @@ from handmade import RED, ball, plain
 from data_gen import light, normals, points, poisson, records, views
 from data_gen.assets import Asset
 from data_gen.poisson import NoSurface, PoissonConfig
-from experiments import poisson as command
+from experiments.comparison import poisson as rendering
 from spnr_jax.types import PointCloud
 
 needs_solver = pytest.mark.skipif(importlib.util.find_spec("pymeshlab") is None, reason="pymeshlab is not installed")
@@ -188,27 +187,6 @@ def dataset(tmp_path_factory):
     return folder
 
 
-@needs_solver
-def test_a_ball_is_rendered_as_its_reference_and_a_line_is_an_empty_picture_with_the_reason(dataset, tmp_path, capsys):
-    options = command.Options(data=dataset, out=tmp_path, surface=QUICK, points=500, variant="scalar_rgb")
-    command.main(options)
-    outcome = json.loads((tmp_path / "poisson.json").read_text())["objects"]
-    assert outcome["ball"]["psnr"] > 30
-    assert outcome["ball"]["empty"] == ""
-    assert "500 points on one line" in outcome["line"]["empty"]
-    assert "line: 500 points on one line" in capsys.readouterr().err
-    pictures = sorted((tmp_path / "images").rglob("*.png"))
-    assert [path.relative_to(tmp_path / "images").as_posix() for path in pictures] == [
-        *("ball/000.png", "ball/001.png", "line/000.png", "line/001.png")
-    ]
-    assert (records.read_image(pictures[-1]) == 0).all()
-    written = [path.stat().st_mtime_ns for path in pictures]
-    command.main(options)  # nothing is left to do
-    assert [path.stat().st_mtime_ns for path in pictures] == written
-    with pytest.raises(ValueError, match="other options"):
-        command.main(command.Options(data=dataset, out=tmp_path, surface=QUICK, points=400, variant="scalar_rgb"))
-
-
 def test_roughness_and_metal_of_vertices_are_rendered_where_they_are():
     # one half of a ball is a mirror, the other matt: it looks as the two balls of one material do
     lamp = np.random.default_rng(7).random((8, 16, 3)).astype(np.float32)
@@ -231,21 +209,21 @@ def test_the_light_has_to_be_that_of_the_data_set(tmp_path):
     other = tmp_path / "room.hdr"
     described = {"name": "studio.hdr", "sha256": "0" * 64}
     with pytest.raises(ValueError, match=r"--envmap: give studio.hdr"):
-        command.unscaled_light(described, None)
+        rendering.unscaled_light(described, None)
     with pytest.raises(ValueError, match="leave the option out"):
-        command.unscaled_light({"name": "procedural room", "sha256": None}, other)
+        rendering.unscaled_light({"name": "procedural room", "sha256": None}, other)
     views.mitsuba_module().Bitmap(np.ones((4, 8, 3), np.float32)).write(str(other))
     with pytest.raises(ValueError, match=r"not the studio.hdr"):
-        command.unscaled_light(described, other)
+        rendering.unscaled_light(described, other)
 
 
 def test_a_data_set_without_a_renderer_setting_is_refused_by_name():
     with pytest.raises(ValueError, match="fov"):
-        command.view_config({"settings": {k: v for k, v in vars(VIEW).items() if k != "fov"}})
-    assert command.view_config({"settings": {**vars(VIEW), "seed": 3}}) == replace(VIEW, views=views.ViewConfig.views)
+        rendering.view_config({"settings": {k: v for k, v in vars(VIEW).items() if k != "fov"}})
+    assert rendering.view_config({"settings": {**vars(VIEW), "seed": 3}}) == replace(VIEW, views=views.ViewConfig.views)
 
 
 def test_absent_packages_are_named(monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(ValueError, match="pymeshlab"):
-        command.check_packages()
+        rendering.check_packages()

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 import tiny_dataset
 
-from experiments import demo
+from experiments.packaged import demo
 from spnr_jax import cli, presets
 
 

@@ -4,12 +4,10 @@ The networks are shrunken, the data set is painted: the way from an empty folder
 """
 
 import base64
-import csv
 import dataclasses
 import importlib.util
 import io
 import json
-import re
 import shutil
 from html.parser import HTMLParser
 
@@ -21,7 +19,9 @@ from tiny_baselines import BASELINE, SHRUNKEN, SIZE
 
 from data_gen import poisson as surfaces
 from data_gen import records, views
-from experiments import poisson, table1, table1_poisson, table1_report, table1_scores, table1_training
+from experiments.comparison import budget, poisson, scoring
+from experiments.comparison.networks import LABELS
+from experiments.paper import table1
 from spnr_jax import cli, data, evaluation, presets, trainer, training
 
 pytestmark = pytest.mark.ci  # it trains several networks
@@ -35,8 +35,8 @@ def _shrunken_presets():
     with pytest.MonkeyPatch.context() as patch:
         for name, shrunken in SHRUNKEN.items():
             patch.setitem(presets.PRESETS, name, lambda shrunken=shrunken: shrunken)
-        for name, surface in table1_poisson.SURFACES.items():  # depth 12 takes seconds for a ball of few points
-            patch.setitem(table1_poisson.SURFACES, name, dataclasses.replace(surface, depth=5))
+        for name, surface in poisson.SURFACES.items():  # depth 12 takes seconds for a ball of few points
+            patch.setitem(poisson.SURFACES, name, dataclasses.replace(surface, depth=5))
         patch.setattr(cli, "set_up_jax", lambda **_: None)
         yield
 
@@ -76,23 +76,6 @@ def out(dataset, tmp_path_factory):
     return folder
 
 
-def test_every_method_is_in_every_file(out):
-    files = {path.name for path in out.iterdir() if path.is_file()}
-    assert files == {"results.json", "table.md", "table.csv", "table.tex", "table1.html", "table1.json"}
-    results = results_of(out)
-    assert tuple(results["methods"]) == METHODS
-    assert results["test_objects"] == list(tiny_dataset.SPLITS["test"])
-    assert set(results["ours_minus"]) == set(METHODS) - {"ours"}
-    for name in ("table.md", "table.tex", "table1.html"):
-        text = (out / name).read_text()
-        assert all(table1_report.LABELS[method] in text for method in METHODS), name
-        assert "n/a (no weights)" in text
-        assert "n/a (no opacity)" in text
-        assert "4 steps" in text
-        assert results["hardware"] in text
-    assert {cost["steps"] for cost in results["costs"].values() if "steps" in cost} == {table1_training.QUICK_STEPS}
-
-
 def test_scores_of_ours_and_the_floors_are_those_of_the_evaluation_of_its_run(out, dataset):
     found = evaluation.evaluate(out / "runs" / "ours", data.open_dataset(dataset)).summary
     results = results_of(out)
@@ -125,12 +108,12 @@ def test_a_table_that_was_stopped_goes_on_to_the_same_numbers(out, dataset, tmp_
         return train(*arguments)
 
     monkeypatch.setattr(trainer, "train", stopped)
-    options = asked(dataset, tmp_path, methods=table1_training.NETWORKS)
+    options = asked(dataset, tmp_path, methods=budget.NETWORKS)
     assert cli.guarded(lambda: table1.main(options), "table1") == 130
     assert not (tmp_path / "results.json").exists()
     assert cli.guarded(lambda: table1.main(options), "table1") == 0
     results, uninterrupted = results_of(tmp_path), results_of(out)
-    assert tuple(results["methods"]) == table1_training.NETWORKS
+    assert tuple(results["methods"]) == budget.NETWORKS
     for name, row in results["methods"].items():
         assert row == uninterrupted["methods"][name]
         assert results["costs"][name] == uninterrupted["costs"][name]
@@ -148,20 +131,11 @@ def test_a_folder_holds_one_table(out, dataset, change, named):
         table1.main(asked(dataset, out, **change))
 
 
-def test_a_folder_holds_a_table_of_one_data_set(out, dataset, tmp_path):
-    other = shutil.copytree(dataset, tmp_path / "data")
-    (other / "splits" / "train.txt").write_text("ball_000000\n")
-    with pytest.raises(ValueError, match="another data"):
-        table1.main(asked(other, out))
-
-
 def test_without_the_solver_the_rows_say_what_to_install(dataset, tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "pymeshlab", None)
     table1.main(asked(dataset, tmp_path, methods=("poisson", "poisson_trimmed", "white")))
     assert list(results_of(tmp_path)["methods"]) == ["white"]
-    for row in ("Poisson", "Poisson, trimmed 0.3"):
-        assert re.search(rf"^\| {row} \| not run: [^|]*pip install", (tmp_path / "table.md").read_text(), re.MULTILINE)
-    assert all(len(found) == 1 for found in widths(tmp_path / "table.md"))
+    assert all("pip install" in reason for reason in results_of(tmp_path)["missing"].values())
     with pytest.raises(ValueError, match=r"^--methods poisson: none can be made here, not run: .*pip install"):
         table1.main(asked(dataset, tmp_path / "alone", methods=("poisson",)))
 
@@ -176,35 +150,6 @@ def test_a_poisson_row_shows_the_surface_of_the_points_that_the_networks_see(out
     for view, picture in enumerate(expected):
         np.testing.assert_array_equal(records.read_image(folder / f"{view:03d}.png"), picture)
     assert json.loads((folder / "made.json").read_text())["empty"] == empty
-
-
-def widths(markdown):
-    """For each table of the file the different widths of its lines."""
-    lines = markdown.read_text().splitlines()
-    bars = [[line.count("|") for line in lines[i - 1 :]] for i, line in enumerate(lines) if line.startswith("|---")]
-    return [set(found[: found.index(0)]) for found in bars]
-
-
-def test_rows_of_the_tables_are_as_wide_as_their_heads(out):
-    assert len(widths(out / "table.md")) == 5  # methods, differences, three classes of objects
-    assert all(len(found) == 1 for found in widths(out / "table.md"))
-    tex = (out / "table.tex").read_text()
-    for body in re.findall(r"\\begin\{tabular\}\{l(r+)\}(.*?)\\end\{tabular\}", tex, re.DOTALL):
-        assert {row.count("&") for row in body[1].splitlines() if "&" in row} == {len(body[0])}
-    assert not re.search(r"(?<!\\)[_#]", "".join(line for line in tex.splitlines(True) if not line.startswith("%")))
-
-
-def test_the_csv_holds_the_numbers_of_the_results_unrounded(out):
-    results = results_of(out)
-    rows = {
-        (row["objects_of"], row["method"]): row for row in csv.DictReader(io.StringIO((out / "table.csv").read_text()))
-    }
-    assert len(rows) == len(METHODS) * (1 + len(results["per_category"]))
-    assert float(rows["all", "npbg"]["psnr"]) == results["methods"]["npbg"]["psnr"]
-    assert float(rows["all", "npbg"]["psnr_low"]) == results["methods"]["npbg"]["psnr_interval"][0]
-    assert float(rows["all", "white"]["ours_minus_flip"]) == results["ours_minus"]["white"]["flip"]["mean"]
-    assert float(rows["cube", "ours"]["ssim"]) == results["per_category"]["cube"]["ours"]["ssim"]
-    assert rows["all", "npbg"]["iou"] == rows["all", "npbg"]["lpips"] == ""
 
 
 class Page(HTMLParser):
@@ -239,7 +184,7 @@ def test_the_page_loads_nothing_and_holds_every_picture(out, dataset):
     assert page.addresses == []
     assert "http" not in text
     content = json.loads(page.scripts[0])
-    assert tuple(content["methods"]) == METHODS
+    assert tuple(content["methods"]) == tuple(LABELS[name] for name in METHODS)
     assert [shown["name"] for shown in content["objects"]] == list(tiny_dataset.SPLITS["test"])
     for shown in content["objects"]:
         item = data.read_object(data.open_dataset(dataset), shown["name"])
@@ -250,53 +195,7 @@ def test_the_page_loads_nothing_and_holds_every_picture(out, dataset):
             assert shown["psnr"][method] == pytest.approx(-10 * np.log10(error), abs=0.1)
 
 
-def test_the_number_of_objects_in_the_page_is_an_option(dataset, tmp_path):
-    table1.main(asked(dataset, tmp_path, methods=("nearest", "white"), shown=1))
-    assert len(json.loads(Page((tmp_path / "table1.html").read_text()).scripts[0])["objects"]) == 1
-    table1.main(asked(dataset, tmp_path, methods=("nearest", "white"), shown=0))
-    assert Page((tmp_path / "table1.html").read_text()).scripts == []
-
-
 def test_the_time_of_a_view_leaves_out_the_object_that_compiled(tmp_path):
-    scored = table1_scores.Scored(scores={}, shown=[], seconds={"white": [9.0, 0.001, 0.003], "splat": [9.0]})
+    scored = scoring.Scored(scores={}, shown=[], seconds={"white": [9.0, 0.001, 0.003], "splat": [9.0]})
     found = table1.costs(asked(tmp_path, tmp_path), {}, scored, BASELINE)
     assert found == {"white": {"ms_per_view": 2.0}, "splat": {"ms_per_view": None}}
-
-
-@pytest.mark.parametrize(
-    ("wrong", "named"),
-    [
-        ({"minutes": 1.0}, "--minutes 1.0: .*quick takes 4 steps"),
-        ({"budget": "tiny", "minutes": 0.0}, "--minutes 0.0: expected more than 0"),
-        ({"methods": ()}, "--methods: name at least one of ours, plus, npbg"),
-        ({"objects": 0}, "--objects: expected 1 or more, got 0"),
-        ({"shown": -1}, "--shown: expected 0 or more, got -1"),
-    ],
-)
-def test_wrong_options_are_refused_by_name(wrong, named, tmp_path):
-    with pytest.raises(ValueError, match=named):
-        asked(tmp_path, tmp_path, **wrong)
-
-
-def test_a_data_set_without_test_objects_is_refused(dataset, tmp_path):
-    other = shutil.copytree(dataset, tmp_path / "data")
-    (other / "splits" / "test.txt").write_text("")
-    with pytest.raises(ValueError, match="test split is empty"):
-        table1.main(asked(other, tmp_path / "out"))
-
-
-@pytest.mark.slow
-def test_the_quick_budget_runs_the_presets_themselves(tmp_path, monkeypatch):
-    for name in SHRUNKEN:
-        monkeypatch.setitem(presets.PRESETS, name, getattr(presets, name))
-    painted = tiny_dataset.write_dataset(tmp_path / "data", size=64)
-    table1.main(asked(painted, tmp_path / "out", methods=(*table1_training.NETWORKS, "white")))
-    costs = results_of(tmp_path / "out")["costs"]
-    assert {name: cost["preset"] for name, cost in costs.items() if "preset" in cost} == {
-        "ours": "tiny",
-        "plus": "plus_tiny",
-        "npbg": "npbg_tiny",
-        "point_nerf": "point_nerf_tiny",
-        "points2nerf": "points2nerf_tiny",
-    }
-    assert costs["npbg"]["parameters"] == 465_774

@@ -8,10 +8,11 @@ import pytest
 import tiny_dataset
 from tiny_runs import check_conditions, results_of, shrunken
 
-from experiments import table1_training, training_report, training_runs
-from experiments.ablations import LABELS, ROWS, Ablations, changed, folds, main, rows
-from experiments.training_runs import Budget, Compared
-from spnr_jax import checkpoint, cli, data, evaluation, presets, trainer, training
+from experiments.comparison import budget as budgets
+from experiments.comparison import variants, variants_report
+from experiments.comparison.variants import Budget, Compared
+from experiments.studies.ablations import LABELS, ROWS, Ablations, changed, folds, main, rows
+from spnr_jax import checkpoint, cli, data, evaluation, presets, training
 from spnr_jax.config import to_dict
 
 pytestmark = pytest.mark.ci  # it trains several networks
@@ -104,10 +105,6 @@ class TestRows:
             assert getattr(model, size) == getattr(larger, size)
         assert changed("paper", presets.tiny()) == presets.tiny()
 
-    def test_all_rows_train_on_the_clouds_of_the_budget(self):
-        config = Budget(preset="plus_tiny", even_share=0.5).config()
-        assert {changed(row, config).even_share for row in ROWS} == {0.5}
-
     @staticmethod
     def changes(row, config):
         before = dict(leaves(to_dict(config)))
@@ -190,41 +187,12 @@ def test_minutes_give_every_variant_the_steps_that_fit(tmp_path, monkeypatch):
         measured.append((config.model.skip, config.seed))
         return paces[config.model.skip]
 
-    monkeypatch.setattr(table1_training, "step_seconds", step_seconds)
+    monkeypatch.setattr(budgets, "step_seconds", step_seconds)
     main(asked(tmp_path, quick=False, minutes=0.2, seeds=(0, 1)))
     steps = {name: row["steps"] for name, row in results_of(tmp_path)["variants"].items()}
     assert steps == {"reference": [6, 6], "skip_concat": [2, 2]}
     assert set(measured) == {("add", 0), ("concat", 0)}, "once for all seeds"
-    assert "0.2 minutes of training steps each, 2 to 6" in (tmp_path / "table.md").read_text()
     assert cli.guarded(lambda: main(asked(tmp_path, quick=False, minutes=0.4)), "ablations") == 2
-
-
-def test_a_finished_experiment_is_only_read(out, monkeypatch):
-    def forbidden(*_, **__):
-        raise AssertionError("something was trained again")
-
-    before = json.loads((out / "results.json").read_text())
-    monkeypatch.setattr(training, "jitted_train_step", forbidden)
-    main(asked(out))
-    after = json.loads((out / "results.json").read_text())
-    for row in ("reference", "skip_concat"):
-        assert after["variants"][row]["training_seconds"] == before["variants"][row]["training_seconds"]
-
-
-def test_a_stopped_experiment_goes_on_to_the_same_numbers(out, tmp_path, monkeypatch):
-    train, calls = trainer.train, []
-
-    def stopped(*arguments):
-        calls.append(arguments)
-        if len(calls) == 2:
-            raise KeyboardInterrupt("stopped at step 1 of 4; the same command goes on from there")
-        return train(*arguments)
-
-    monkeypatch.setattr(trainer, "train", stopped)
-    assert cli.guarded(lambda: main(asked(tmp_path)), "ablations") == 130
-    assert not (tmp_path / "results.json").exists()
-    assert cli.guarded(lambda: main(asked(tmp_path)), "ablations") == 0
-    assert results_of(tmp_path) == results_of(out)
 
 
 def test_another_data_set_or_number_of_steps_is_refused_with_one_line(out, tmp_path, capsys):
@@ -235,35 +203,20 @@ def test_another_data_set_or_number_of_steps_is_refused_with_one_line(out, tmp_p
         assert f"holds results with another {word}; choose another --out" in line
 
 
-@pytest.mark.parametrize(
-    ("budget", "message"),
-    [
-        ({"seeds": ()}, "--seeds: expected one or more"),
-        ({"seeds": (1, 1)}, "none of them twice"),
-        ({"steps": 0}, "--steps: expected 1 or more"),
-        ({"steps": 5, "quick": True}, "not together with --quick"),
-        ({"shown": 0}, "--shown: expected 1 or more"),
-    ],
-)
-def test_a_wrong_option_says_what_is_possible(budget, message):
-    with pytest.raises(ValueError, match=message):
-        Budget(**budget)
-
-
 class TestReport:
     """Two variants, two seeds, three objects of two views with made-up scores."""
 
     rng = np.random.default_rng(0)
     by_seed = {
         name: [
-            [{metric: level + seed + rng.random(2) for metric in training_report.METRICS} for _ in range(3)]
+            [{metric: level + seed + rng.random(2) for metric in variants_report.METRICS} for _ in range(3)]
             for seed in range(2)
         ]
         for name, level, rng in (("a", 10.0, rng), ("b", 13.0, rng))
     }
     compared = Compared(
         names=("one", "two", "three"),
-        scores={n: [training_runs.joined(o) for o in zip(*seeds, strict=True)] for n, seeds in by_seed.items()},
+        scores={n: [variants.joined(o) for o in zip(*seeds, strict=True)] for n, seeds in by_seed.items()},
         by_seed=by_seed,
         costs={},
         shown=[],
@@ -271,7 +224,7 @@ class TestReport:
     )
 
     def test_a_difference_compares_equal_seeds_objects_and_views(self):
-        found = training_report.change(self.compared, "b", "a", "psnr")
+        found = variants_report.change(self.compared, "b", "a", "psnr")
         pairs = zip(self.by_seed["b"], self.by_seed["a"], strict=True)
         means = [
             np.mean([b["psnr"] - a["psnr"] for b, a in zip(first, second, strict=True)]) for first, second in pairs
@@ -281,20 +234,20 @@ class TestReport:
         assert found["interval"][0] < found["mean"] < found["interval"][1]
 
     def test_a_metric_that_no_view_has_is_none(self):
-        nothing = [{metric: np.full(2, np.nan) for metric in training_report.METRICS}] * 3
-        assert training_report.means(nothing)["detail"] is None
+        nothing = [{metric: np.full(2, np.nan) for metric in variants_report.METRICS}] * 3
+        assert variants_report.means(nothing)["detail"] is None
         scores = {"a": nothing, "b": nothing}
         compared = dataclasses.replace(self.compared, scores=scores)
-        assert training_report.change(compared, "b", "a", "detail") is None
+        assert variants_report.change(compared, "b", "a", "detail") is None
 
 
 def test_the_pace_of_a_run_is_not_that_of_its_compilations(tmp_path):
     paces = (900.0, 10.0, 30.0, 20.0, 20.0, 800.0, 10.0, 20.0, 30.0)
     rows = [{"step": i, "ms_per_step": pace} for i, pace in enumerate(paces)] + [{"step": 9, "val_psnr": 1.0}]
     (tmp_path / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
-    assert training_runs.step_milliseconds(tmp_path) == 20.0
+    assert variants.step_milliseconds(tmp_path) == 20.0
     (tmp_path / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows[:3]))
-    assert training_runs.step_milliseconds(tmp_path) is None
+    assert variants.step_milliseconds(tmp_path) is None
 
 
 def test_scores_inside_the_silhouette_do_not_see_the_rest():
@@ -302,7 +255,7 @@ def test_scores_inside_the_silhouette_do_not_see_the_rest():
     reference = data.on_white(item.images)
     outside = item.images[..., 3:] <= 127
     spoilt = np.where(outside, np.float32(0.5), reference)
-    found = training_runs.more_scores(item, evaluation.Pictures(image=spoilt, acc=spoilt[..., 0]))
+    found = variants.more_scores(item, evaluation.Pictures(image=spoilt, acc=spoilt[..., 0]))
     np.testing.assert_allclose(found["inside"], 100.0)
-    equal = training_runs.more_scores(item, evaluation.Pictures(image=reference, acc=reference[..., 0]))
+    equal = variants.more_scores(item, evaluation.Pictures(image=reference, acc=reference[..., 0]))
     np.testing.assert_allclose(equal["detail"], 1.0, rtol=1e-5)

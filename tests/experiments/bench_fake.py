@@ -2,7 +2,7 @@
 
 import time
 
-from experiments import bench_worker
+from experiments.speed import worker
 
 MS = {"network": 2.0, "near points": 1.0, "plain": 8.0, "fast": 4.0}
 
@@ -21,4 +21,4 @@ def make(spec):
 
 
 if __name__ == "__main__":
-    bench_worker.serve(make)
+    worker.serve(make)

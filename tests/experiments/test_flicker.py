@@ -9,8 +9,8 @@ import tiny_dataset
 import tiny_untrained
 
 from data_gen.variant import choose_variant, mitsuba_module
-from experiments import flicker
-from experiments.methods import Sources
+from experiments.comparison.networks import Sources
+from experiments.studies import flicker
 from spnr_jax import cameras, data
 from spnr_jax.types import Camera
 
@@ -75,12 +75,10 @@ def test_the_ratio_is_by_object_and_the_references_are_their_own():
     rows = flicker.summarise(curves, ("a", "b"))["methods"]
     assert rows["references"]["ratio"] == 1
     assert rows["ours"]["ratio"] == pytest.approx((2 + 1) / 2)
-    text = flicker.table({"methods": rows, "frames": 3, "pixels": 8, "spp": 4, "hardware": "a machine"})
-    assert "| ours | 51.00 | 1.50" in text
 
 
 @pytest.mark.ci
-def test_the_whole_way(tmp_path, monkeypatch, capsys):
+def test_the_whole_way(tmp_path, monkeypatch):
     pytest.importorskip("mitsuba")
     options = flicker.Flicker(
         data=tiny_dataset.dataset().folder, out=tmp_path, sources=Sources(runs=(tiny_untrained.run(),)), objects=1,
@@ -95,7 +93,6 @@ def test_the_whole_way(tmp_path, monkeypatch, capsys):
     assert len(results["methods"]) == 2
     assert all(row["flicker"] >= 0 for row in results["methods"].values())
     assert {path.suffix for path in tmp_path.iterdir()} >= {".png", ".gif", ".md"}
-    assert "against the references" in capsys.readouterr().out
     with pytest.raises(ValueError, match="another frames"):
         flicker.main(dataclasses.replace(options, frames=4))
     with pytest.raises(
