@@ -3,7 +3,7 @@
 #   make demo MESHES=DIR     the same on a folder of .glb .gltf .obj .ply files: runs/demo-NAME/report.html
 #   make table1              the paper's Table 1, every method trained and scored: runs/table1-tiny/table1.html
 #   make table1 DATA=DIR BUDGET=quick|tiny|paper TABLE1='--minutes 10'   on your data, with more options
-#   make bench               time the network beside a PyTorch twin: runs/bench.md (BENCH="--twin FILE --quick")
+#   make bench               time the network beside a PyTorch twin: runs/bench/table.md (BENCH="--quick")
 #   make test                the everyday suite
 #   make test-ci             what takes minutes more: experiments, wheel, notebooks, kills, many devices
 #   make test-all            these, and what trains for minutes
@@ -36,20 +36,20 @@ setup: .venv/complete
 	@begin=$$(date +%s); \
 	test -x $(PY) || $(PYTHON) -m venv .venv; \
 	echo "installing into .venv (about a minute)"; \
-	$(PY) -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[data,viewer,formats,export,baselines,dev]' && \
+	$(PY) -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[data,viewer,formats,export,baselines,experiments,dev]' && \
 	echo $$(( $$(date +%s) - begin )) > .venv/install_seconds && touch $@
 
 demo: setup
-	$(PY) -m experiments.demo --out $(OUT) $(if $(MESHES),--meshes $(MESHES)) $(if $(TEST_LIST),--test-list $(TEST_LIST)) $(DEMO)
+	$(PY) -m experiments.packaged.demo --out $(OUT) $(if $(MESHES),--meshes $(MESHES)) $(if $(TEST_LIST),--test-list $(TEST_LIST)) $(DEMO)
 
 table1: OUT = runs/table1-$(BUDGET)$(if $(DATA),-$(notdir $(patsubst %/,%,$(DATA))))
 table1: setup
 	$(if $(DATA),,$(PY) -m data_gen generate $(OUT)/data --objects 240 --spp 24 --visibility-grid 2 \
 		--resolution $(if $(filter paper,$(BUDGET)),128,64))
-	$(PY) -m experiments.table1 --data $(or $(DATA),$(OUT)/data) --out $(OUT) --budget $(BUDGET) $(TABLE1)
+	$(PY) -m experiments.paper.table1 --data $(or $(DATA),$(OUT)/data) --out $(OUT) --budget $(BUDGET) $(TABLE1)
 
 bench: setup
-	$(PY) -m experiments.bench $(BENCH)
+	$(PY) -m experiments.speed.bench $(BENCH)
 
 test: setup
 	$(PY) -m pytest -q -rs -n 2 --dist loadfile -m "not slow and not ci"
