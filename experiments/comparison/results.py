@@ -54,7 +54,7 @@ def _picture(place: Path) -> np.ndarray:
 
 
 WRITERS: dict[str, Callable[[Any], bytes]] = {
-    ".json": as_json,
+    ".json": lambda content: (json.dumps(content, indent=1) + "\n").encode(),  # scores may be NaN
     ".npz": lambda arrays: images.npz(*arrays),
     ".png": images.png,
 }

@@ -110,19 +110,6 @@ class TestRows:
         before = dict(leaves(to_dict(config)))
         return {name: value for name, value in leaves(to_dict(changed(row, config))) if before[name] != value}
 
-    def test_rows_that_are_the_reference_are_left_out_with_a_line(self, capsys):
-        made = rows(ROWS, self.tiny, tiny_dataset.dataset())
-        assert {variant.name for variant in made} == {"reference", *ROWS} - {
-            "paper",
-            "depth_3",
-            "no_colour_variants",
-            "adversarial",
-            *PLUS_ROWS,
-        }
-        said = capsys.readouterr().out
-        assert "U-Net of 3 stages: left out" in said
-        assert "No colour variants: left out" in said
-
     def test_without_colour_variants_the_training_split_alone_shrinks(self):
         splits = tiny_dataset.SPLITS | {"train": ("a", "a--1", "a--2", "b")}
         dataset = dataclasses.replace(tiny_dataset.dataset(), splits=splits)
@@ -193,14 +180,6 @@ def test_minutes_give_every_variant_the_steps_that_fit(tmp_path, monkeypatch):
     assert steps == {"reference": [6, 6], "skip_concat": [2, 2]}
     assert set(measured) == {("add", 0), ("concat", 0)}, "once for all seeds"
     assert cli.guarded(lambda: main(asked(tmp_path, quick=False, minutes=0.4)), "ablations") == 2
-
-
-def test_another_data_set_or_number_of_steps_is_refused_with_one_line(out, tmp_path, capsys):
-    other = tiny_dataset.write_dataset(tmp_path / "data", tiny_dataset.SPLITS | {"val": ()})
-    for options, word in ((asked(out, quick=False, steps=5), "steps"), (asked(out, dataset=other), "data")):
-        assert cli.guarded(lambda options=options: main(options), "ablations") == 2
-        (line,) = capsys.readouterr().err.strip().splitlines()
-        assert f"holds results with another {word}; choose another --out" in line
 
 
 class TestReport:

@@ -1,17 +1,12 @@
 """Figure 2: colour variants beside their objects, and two trainings that differ in the training split alone."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 import tiny_dataset
 from tiny_runs import check_conditions, results_of, shrunken
 
-from data_gen.plan import check_options, plan_data_set
-from experiments.comparison import variants
 from experiments.comparison.variants import Budget
-from experiments.paper import fig2
-from experiments.paper.fig2 import Fig2, generation, main, nearest_views, trainings
+from experiments.paper.fig2 import Fig2, main, nearest_views, trainings
 from spnr_jax import cli, data
 
 pytestmark = pytest.mark.ci  # it trains several networks
@@ -60,31 +55,6 @@ def test_a_data_set_without_variants_is_refused_with_the_command_that_makes_one(
     options = Fig2(data=tiny_dataset.dataset().folder, out=tmp_path)
     assert cli.guarded(lambda: main(options), "fig2") == 2
     assert "spnr-data generate DIR --colour-variants 5" in capsys.readouterr().err
-
-
-def test_without_a_data_set_one_with_variants_is_generated(folder, tmp_path, monkeypatch):
-    made = []
-
-    def generate(config):
-        made.append(config)
-        tiny_dataset.write_dataset(config.out, tiny_dataset.SPLITS | {"train": TRAIN})
-
-    def train(*_):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(fig2, "generate", generate)
-    monkeypatch.setattr(variants, "train", train)
-    options = Fig2(out=tmp_path, generated=30, colour_variants=3)
-    with pytest.raises(KeyboardInterrupt):
-        main(options)
-    (config,) = made
-    check_options(config)
-    assert (config.out, config.objects, config.colour_variants) == (tmp_path / "data", 30, 3)
-    plan = plan_data_set(config)
-    split = plan.split([task.object_id for task in plan.tasks])
-    assert len(plan.variants(split["train"])) == 3 * len(split["train"])
-    quick = generation(dataclasses.replace(options, budget=Budget(quick=True)), tmp_path)
-    assert (quick.objects, quick.colour_variants, quick.resolution) == (12, 2, tiny_dataset.SIZE)
 
 
 def test_the_nearest_views_look_from_the_same_side():

@@ -134,15 +134,6 @@ def test_a_second_call_makes_nothing_again_and_gives_the_same(out, monkeypatch):
     assert (out / "results.json").read_bytes() == before
 
 
-def test_a_folder_holds_the_depths_of_one_network_of_a_name(out, tmp_path, monkeypatch):
-    show(monkeypatch, "Ours", checksum="1")
-    with pytest.raises(ValueError, match=r"holds depths of Ours with another config; choose another --out"):
-        fig3.main(asked(out))
-    show(monkeypatch, "NPBG")
-    with pytest.raises(ValueError, match="--runs: none of these predicts depth"):
-        fig3.main(asked(tmp_path))
-
-
 @pytest.mark.skipif(importlib.util.find_spec("pymeshlab") is None, reason="pymeshlab is not installed")
 def test_a_poisson_surface_of_many_points_has_the_depth_of_the_ball():
     dataset = tiny_dataset.dataset()

@@ -69,15 +69,6 @@ def test_side_by_side_are_the_first_and_the_last_object_and_some_between_a_row_f
     assert figs4_21.side_by_side(shown, 99).shape[1] == left + 9 * (64 + GAP)
 
 
-def test_too_few_test_objects_are_counted_and_the_command_for_more_is_named(tmp_path, capsys):
-    main(asked(tmp_path, objects=120))
-    said = capsys.readouterr().out
-    assert "has 3 test objects, 120 were asked for" in said
-    assert "--objects 126 --test-objects 120" in said
-    main(asked(tmp_path, objects=2))
-    assert "were asked for" not in capsys.readouterr().out
-
-
 def test_pictures_are_made_once_and_of_one_view_and_network(tmp_path, monkeypatch):
     main(asked(tmp_path))
 

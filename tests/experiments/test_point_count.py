@@ -128,14 +128,6 @@ def test_what_was_measured_is_not_measured_again(out, tmp_path, monkeypatch):
     assert len(calls) == len(NAMES) * len(COUNTS) * (2 + len(FLOORS)) + 2  # of the stopped count two were lost
 
 
-def test_a_folder_holds_the_scores_of_one_network_and_of_the_same_objects(out, monkeypatch):
-    with pytest.raises(ValueError, match="holds point counts with another objects; choose another --out"):
-        main(asked(out, objects=1))
-    monkeypatch.setattr(networks, "networks", lambda *_: stand_ins.stand_ins("Ours", checksum="1"))
-    with pytest.raises(ValueError, match="holds scores of Ours with another config"):
-        main(asked(out))
-
-
 def test_counts_that_cannot_be_had_are_left_out_with_the_reason(monkeypatch, capsys, tmp_path):
     def absent(*_):
         raise ValueError("object chair was made from chair.obj: give the folder of the meshes with --meshes")

@@ -122,15 +122,6 @@ def test_a_table_that_was_stopped_goes_on_to_the_same_numbers(out, dataset, tmp_
     assert "scored 3 of 3 objects" in said
 
 
-@pytest.mark.parametrize(
-    ("change", "named"),
-    [({"seed": 1}, "seed"), ({"budget": "tiny"}, "budget"), ({"budget": "tiny", "minutes": 1.0}, "minutes")],
-)
-def test_a_folder_holds_one_table(out, dataset, change, named):
-    with pytest.raises(ValueError, match=f"holds a table with another [^\n]*{named}[^\n]*; choose another --out$"):
-        table1.main(asked(dataset, out, **change))
-
-
 def test_without_the_solver_the_rows_say_what_to_install(dataset, tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "pymeshlab", None)
     table1.main(asked(dataset, tmp_path, methods=("poisson", "poisson_trimmed", "white")))

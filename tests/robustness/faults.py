@@ -56,7 +56,7 @@ def stopped_by(number: signal.Signals, phase: str) -> Inject:
         if phase == "checkpoint":
             shutil.rmtree(run / "checkpoints" / str(newest))
         step, before = newest if phase == "checkpoint" else newest + CHECKPOINT_EVERY // 2, checkpoint_steps(run)
-        aim = lambda event: 0.01 if event.phase == phase and event.step >= step else None  # noqa: E731
+        aim = lambda event: 0.0 if event.phase == phase and event.step >= step else None  # noqa: E731
         ended = training.run(run, aim=aim, number=number)
         good = ended.seconds_to_end < GRACE and checkpoint_steps(run) > before
         return Seen(code=ended.code if good else -1, output=ended.output, more_rows=True)

@@ -15,6 +15,7 @@ from pathlib import Path
 import browser_messages
 import numpy as np
 import valid_files
+import valid_runs
 from damage import Files
 
 MOST_POINTS = 32
@@ -125,7 +126,7 @@ def shards() -> list[Files]:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "shard"
         writer = ArrayRecordWriter(str(path), "group_size:1")
-        (seed,) = (files for files in valid_files.packed() if next(iter(files)) == "record")
+        (seed,) = (files for files in valid_runs.packed() if next(iter(files)) == "record")
         writer.write(seed["record"])
         writer.close()
         shard = path.read_bytes()
@@ -181,15 +182,15 @@ CLOUDS: dict[str, Callable[[], list[Files]]] = {
 }  # fmt: skip
 READERS = {
     **{name: Reader(seeds=seeds, read=read_cloud) for name, seeds in CLOUDS.items()},
-    "config": Reader(seeds=valid_files.configs, read=read_config),
-    "metrics": Reader(seeds=valid_files.metric_rows, read=read_metrics),
-    "dataset": Reader(seeds=valid_files.datasets, read=read_dataset),
-    "dataset-check": Reader(seeds=valid_files.datasets, read=check_dataset),
-    "packed": Reader(seeds=valid_files.packed, read=read_packed),
+    "config": Reader(seeds=valid_runs.configs, read=read_config),
+    "metrics": Reader(seeds=valid_runs.metric_rows, read=read_metrics),
+    "dataset": Reader(seeds=valid_runs.datasets, read=read_dataset),
+    "dataset-check": Reader(seeds=valid_runs.datasets, read=check_dataset),
+    "packed": Reader(seeds=valid_runs.packed, read=read_packed),
     "shard": Reader(seeds=shards, read=read_shard),
-    "lists": Reader(seeds=valid_files.lists, read=read_list),
+    "lists": Reader(seeds=valid_runs.lists, read=read_list),
     "viewer-message": Reader(seeds=browser_messages.messages, read=browser_messages.read_message),
     "viewer-upload": Reader(seeds=browser_messages.sent_files, read=browser_messages.read_upload),
-    "lpips": Reader(seeds=valid_files.lpips, read=read_lpips),
-    "weights": Reader(seeds=valid_files.weights, read=read_network),
+    "lpips": Reader(seeds=valid_runs.lpips, read=read_lpips),
+    "weights": Reader(seeds=valid_runs.weights, read=read_network),
 }

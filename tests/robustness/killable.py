@@ -68,20 +68,25 @@ class Training:
         return ["train", str(self.data), str(run), *OPTIONS.split(), "--num-steps", str(self.num_steps)]
 
     def run(self, run: Path, aim: Callable[[Event], float | None] = lambda event: None, number=signal.SIGKILL) -> Ended:
-        """The training in a process that gets a signal so many seconds after the event for which `aim` names them."""
+        """The training in a process that gets a signal so many seconds after the event for which `aim` names them.
+
+        It begins nothing else before: the signal falls into the phase that was aimed at, or at its end.
+        """
         os.environ.setdefault("XLA_FLAGS", QUICK_COMPILATION)  # the server hands it on
-        receiver, sender = SERVER.Pipe(duplex=False)
+        ours, theirs = SERVER.Pipe()
         output = run.with_name(f"{run.name}.txt")
-        process = SERVER.Process(target=_child, args=(self.arguments(run), self.cache, output, sender))
+        process = SERVER.Process(target=_child, args=(self.arguments(run), self.cache, output, theirs))
         process.start()
-        sender.close()  # so that the pipe ends with the process
+        theirs.close()  # so that the pipe ends with the process
         sent, events = None, []
-        while receiver.poll(LIMIT):
+        while ours.poll(LIMIT):
             try:
-                events.append(receiver.recv())
+                events.append(ours.recv())
+                delay = aim(events[-1]) if sent is None else None
+                ours.send("go on")  # it waits for that: with the next event until the signal was sent
             except (EOFError, OSError):
                 break
-            if sent is None and (delay := aim(events[-1])) is not None:
+            if delay is not None:
                 time.sleep(delay)
                 os.kill(process.pid, number)
                 sent = time.monotonic()
@@ -109,6 +114,7 @@ def _child(arguments: list[str], cache: Path, output: Path, events: Connection) 
 
     def tell(phase: str, step: int, what: object) -> None:
         events.send(Event(time.monotonic(), phase, step, checksum(what) if phase == "step" else None))
+        events.recv()
 
     def train() -> None:
         command = cli.parse(arguments)
