@@ -10,12 +10,12 @@ from typing import Annotated
 
 import tyro
 
-from data_gen.check import check
-from data_gen.generate import generate
-from data_gen.pack import PackConfig, pack
-from data_gen.plan import GenerateConfig
-from data_gen.presets import PRESETS
-from data_gen.show import ShowConfig, show
+from data_gen.make.generate import generate
+from data_gen.plan.data_presets import PRESETS
+from data_gen.plan.tasks import GenerateConfig
+from data_gen.store.check import check
+from data_gen.store.pack import PackConfig, pack
+from data_gen.store.show import ShowConfig, show
 
 
 @dataclass(frozen=True, kw_only=True)

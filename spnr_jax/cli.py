@@ -19,9 +19,10 @@ from typing import Annotated, Literal
 
 import tyro
 
-from spnr_jax import memory, presets
+from spnr_jax import presets
 from spnr_jax.config import TrainConfig
-from spnr_jax.render_command import Render
+from spnr_jax.devices import allocator
+from spnr_jax.tools.render_command import Render
 
 BOX = r"[╭╮╰╯│─•]+|__tyro-dummy-inner__\."  # what tyro draws around an error, and its name for the whole command
 LONGEST_LINE = 800  # characters of an error
@@ -230,7 +231,7 @@ def set_up_jax(*, repeats: bool = True) -> None:
     import jax
 
     if repeats:
-        memory.keep_arrays()
+        allocator.keep_arrays()
     if jax.config.values["jax_compilation_cache_dir"] is None:
         jax.config.update("jax_compilation_cache_dir", str(Path.home() / ".cache" / "spnr_jax"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
@@ -240,29 +241,33 @@ def run_train(command: Train) -> None:
     """`spnr train`."""
     import jax
 
-    from spnr_jax import data, distributed, launch, trainer, weights
+    from spnr_jax.devices import launch, placement
+    from spnr_jax.formats import data_sets
+    from spnr_jax.training import trainer, weights
 
     address = command.coordinator, command.num_processes, command.process_id
     if command.distributed or address != (None, None, None):
         launch.join(*address)
-    mesh = distributed.device_mesh(command.depth_devices) if jax.device_count() > 1 else None
-    dataset = data.open_dataset(command.data)
+    mesh = placement.device_mesh(command.depth_devices) if jax.device_count() > 1 else None
+    dataset = data_sets.open_dataset(command.data)
     schedule = trainer.Schedule(
         log_every=command.log_every, preview_every=command.preview_every, checkpoint_every=command.checkpoint_every
     )
     init = None if command.init is None else weights.read_trained(command.init)
     trainer.train(command.config, dataset, command.run, schedule, mesh, init)
-    if distributed.leads():
+    if placement.leads():
         print(f"trained: {command.run} (score it with `spnr evaluate {command.data} {command.run}`)")
 
 
 def run_evaluate(command: Evaluate) -> None:
     """`spnr evaluate`."""
-    from spnr_jax import data, evaluation, lpips_weights, trainer
-    from spnr_jax.results import text_table, write_results
+    from spnr_jax.formats import data_sets
+    from spnr_jax.scoring import evaluation, lpips_weights
+    from spnr_jax.scoring.results import text_table, write_results
+    from spnr_jax.training import trainer
 
     start = time.monotonic()
-    dataset = data.open_dataset(command.data)
+    dataset = data_sets.open_dataset(command.data)
     weights = None if command.lpips is None else lpips_weights.read_weights(command.lpips)
     outcome = evaluation.evaluate(command.run, dataset, command.split, command.gallery, weights=weights)
     out = command.out or (command.run.with_suffix("") if command.run.suffix == ".npz" else command.run)
@@ -274,7 +279,7 @@ def run_evaluate(command: Evaluate) -> None:
 
 def run_render(command: Render) -> None:
     """`spnr render`."""
-    from spnr_jax.pictures import render_file
+    from spnr_jax.tools.pictures import render_file
 
     for line in render_file(command, note=lambda line: print(f"{command.cloud}: {line}", file=sys.stderr)):
         print(line, flush=True)
@@ -294,8 +299,10 @@ def run_view(command: View) -> None:
 
 def run_export(command: Export) -> None:
     """`spnr export`."""
-    from spnr_jax import export, model, weights
-    from spnr_jax.images import write_whole
+    from spnr_jax.formats.images import write_whole
+    from spnr_jax.method import model
+    from spnr_jax.tools import export
+    from spnr_jax.training import weights
 
     trained, where = weights.read_trained(command.run), command.platforms
     handle = model.Model(config=trained.config.model, variables=trained.variables)
@@ -316,14 +323,14 @@ def run_export(command: Export) -> None:
 
 def run_runs(command: Runs) -> None:
     """`spnr runs`."""
-    from spnr_jax import runs_command
+    from spnr_jax.tools import runs_command
 
     print("\n".join(runs_command.table(runs_command.read_runs(command.folder))))
 
 
 def run_convert_lpips(command: ConvertLpips) -> None:
     """`spnr convert-lpips`."""
-    from spnr_jax import lpips_weights
+    from spnr_jax.scoring import lpips_weights
 
     lpips_weights.convert(command.alexnet, command.heads, command.out)
     print(f"wrote {command.out} (score with `spnr evaluate DATA RUN --lpips {command.out}`)")

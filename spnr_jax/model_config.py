@@ -5,7 +5,7 @@ Besides its fields, a network's config says how it is trained and rendered, as c
     ray_chunk   rays of an object rendered at once, which bounds the memory; None renders whole images
     per_pixel   whether a pixel does not depend on its neighbours, so that a lattice of them can be trained on
     any_size    whether pictures of any size can be rendered
-A network is found by its config (`training.network`); METHODS are the names that tell the configs apart in JSON.
+A network is found by its config (`inference.network`); METHODS are the names that tell the configs apart in JSON.
 """
 
 from dataclasses import dataclass, field

@@ -39,10 +39,16 @@ class Mutant:
     tests: tuple[str, ...]
 
 
+def test_file(name: str) -> str:
+    """Path of tests/**/test_NAME.py from the project's root; ValueError unless there is one."""
+    (found,) = (ROOT / "tests").rglob(f"test_{name}.py")
+    return found.relative_to(ROOT).as_posix()
+
+
 def read_table(path: Path = TABLE) -> tuple[Mutant, ...]:
     """The mutants of tests/mutants.toml."""
     return tuple(
-        Mutant(tests=tuple(f"tests/test_{name}.py" for name in module["tests"]), file=module["file"], **fault)
+        Mutant(tests=tuple(map(test_file, module["tests"])), file=module["file"], **fault)
         for module in tomllib.loads(path.read_text())["module"]
         for fault in module["fault"]
     )

@@ -10,7 +10,7 @@ import subprocess
 import sys
 
 import pytest
-import tiny_dataset
+from support import tiny_dataset
 
 from spnr_jax import presets
 
@@ -36,7 +36,7 @@ def shrunken(monkeypatch):
 SETTING_UP = """
 import sys
 import jax
-from spnr_jax import cli, memory
+from spnr_jax import cli; from spnr_jax.devices import allocator as memory
 memory.keep = lambda: print("kept")
 cli.run_render = cli.run_runs = lambda command: None
 cli.run(cli.parse(sys.argv[1:]))

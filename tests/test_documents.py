@@ -7,12 +7,12 @@ import tomllib
 from pathlib import Path
 
 import pytest
-import tiny_dataset
-import tiny_untrained
 import yaml
+from support import tiny_dataset, tiny_untrained
 
 import spnr_jax
-from spnr_jax import export, weights
+from spnr_jax.tools import export
+from spnr_jax.training import weights
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"

@@ -1,32 +1,33 @@
-"""Imports point down the layers, and importing the package stays light: both are read from the source.
+"""Imports point down the folders, and importing the package stays light: both are read from the source.
 
-0 types model_config config distributed | 1 numerics and its sibling kernels | 2 nn/ and kernels made of kernels
-3 renderer baselines | 4 training
-5 data checkpoint clouds evaluation model and what else reads or writes files | 6 cli report results trainer experiments
+A file imports from its own folder and from the entries above its own in the list below, and no files of one folder
+import each other in a circle.  Files at the top of a package are entries of their own.
 """
 
 import ast
 import subprocess
 import sys
+from collections import Counter
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).parents[1]
-LAYERS = {
-    0: {"types", "config", "model_config", "distributed"},
-    1: {
-        *("numerics", "cameras", "colors", "compositing", "losses", "metrics", "resizing", "sampling", "statistics"),
-        *("subsample", "voxels"),
-    },
-    2: {"nn", "empty_space", "surface", "supersampling", "flip", "lpips"},
-    3: {"renderer", "baselines"},
-    4: {"training"},
-    6: {"cli", "report", "results", "runs_command", "trainer"},
-}
-FILES = 5  # every module that is not named above reads or writes files
-# what siblings below the files may import
-SHARED = {0: {"model_config", "types"}, 1: {"numerics"}, 2: {"convolution", "encoding", "normalization"}}
+SPNR_JAX = (
+    *("model_config", "config"),
+    *("devices", "kernels", "nn", "baselines", "method"),
+    *("formats/mesh", "formats", "training", "scoring", "tools", "viewer"),
+    *("presets", "cli", "__init__"),
+)
+DATA_GEN = (
+    *("shapes", "procedural", "render", "store", "plan/sources", "plan", "make"),
+    *("__main__", "command", "__init__"),
+)
+ORDER = [f"spnr_jax/{entry}" for entry in SPNR_JAX] + [f"data_gen/{entry}" for entry in DATA_GEN] + ["experiments"]
+PURE = ("kernels", "nn", "baselines", "method")
+WITHOUT_JIT = ("devices", "kernels", "nn", "baselines")
+OF_SPNR_JAX = {"spnr_jax/kernels", "spnr_jax/formats", "spnr_jax/formats/mesh"}  # that data_gen stands on
 IMPURE = {"os", "pathlib", "time", "io", "sys", "json", "shutil", "tempfile", "logging", "datetime", "random", "tqdm"}
 HEAVY = {"mitsuba", "pymeshlab", "trimesh", "viser", "torch", "matplotlib", "skimage", "grain", "dask", "distributed"}
 
@@ -51,37 +52,66 @@ def parsed(path: Path) -> ast.Module:
     return ast.parse(path.read_text())
 
 
-def parts(path: Path) -> list[str]:
-    """Names below the package: spnr_jax/nn/field.py is [nn, field]."""
-    return list(path.relative_to(ROOT / "spnr_jax").with_suffix("").parts)
+def entry_of(path: Path) -> str:
+    """The folder of a file from the root, or the file itself at the top of a package; experiments are one entry."""
+    place = path.relative_to(ROOT)
+    if place.parts[0] == "experiments":
+        return "experiments"
+    if place.parts[0] == "data_gen" and place.parts[1] == "procedural":
+        return "data_gen/procedural"
+    return place.parent.as_posix() if len(place.parts) > 2 else place.with_suffix("").as_posix()
 
 
-def layer_of(name: str) -> int:
-    return next((level for level, names in LAYERS.items() if name in names), FILES)
-
-
-PACKAGE = [path for path in sources("spnr_jax") if path.name != "__init__.py"]
-MODULES = {parts(path)[0] for path in PACKAGE}
+PACKAGE = [path for folder in ("spnr_jax", "data_gen", "experiments") for path in sources(folder)]
+MODULES = {".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path for path in PACKAGE}
 named = {"ids": lambda path: "/".join(path.relative_to(ROOT).parts)}
 
 
+def own_imports(path: Path) -> set[Path]:
+    """The files of the project that a file imports; of a folder, what its __init__.py holds."""
+    names = {name for name in imports(parsed(path)) if name in MODULES}
+    # `from a import b` of a module b reads nothing from a
+    inner = {name for name in names if any(other.startswith(f"{name}.") for other in names)}
+    return {MODULES[name] for name in names - inner}
+
+
+def test_the_order_names_every_folder_once_and_nothing_else():
+    assert max(Counter(ORDER).values()) == 1
+    assert {entry_of(path) for path in PACKAGE} == set(ORDER)
+
+
 @pytest.mark.parametrize("path", PACKAGE, **named)
-def test_imports_point_down_the_layers(path):
-    here = parts(path)
-    level = layer_of(here[0])
-    for there in (name.split(".")[1:] for name in imports(parsed(path)) if name.startswith("spnr_jax.")):
-        if there[0] not in MODULES or len(there) < len(here):
-            continue  # a name of the package itself, or the folder that the file stands in
-        assert layer_of(there[0]) <= level, f"layer {level} imports {'.'.join(there)} of layer {layer_of(there[0])}"
-        if layer_of(there[0]) == level < FILES:
-            sibling = (
-                there[1] if len(here) > 1 else there[0]
-            )  # nn/field.py and nn/unet3d.py, or cameras.py and voxels.py
-            assert sibling in SHARED.get(level, set()), f"{here[-1]} imports its sibling {'.'.join(there)}"
+def test_imports_point_down_the_folders(path):
+    here = entry_of(path)
+    for there in own_imports(path):
+        above = ORDER.index(entry_of(there)) <= ORDER.index(here)
+        assert above, f"{here} imports {there.relative_to(ROOT)}, which stands below it in the list"
 
 
-@pytest.mark.parametrize("path", [path for path in PACKAGE if layer_of(parts(path)[0]) <= 4], **named)
-class TestPureLayers:
+@pytest.mark.parametrize("entry", [entry for entry in ORDER if entry != "experiments"])
+def test_the_files_of_a_folder_do_not_import_each_other_in_a_circle(entry):
+    files = [path for path in PACKAGE if entry_of(path) == entry]
+    graph = {path: own_imports(path) & set(files) - {path} for path in files}
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        pytest.fail(" -> ".join(path.name for path in error.args[1]))
+
+
+@pytest.mark.parametrize("path", sources("spnr_jax"), **named)
+def test_spnr_jax_knows_neither_data_gen_nor_experiments(path):
+    assert not {name.split(".")[0] for name in imports(parsed(path))} & {"data_gen", "experiments"}
+
+
+@pytest.mark.parametrize("path", sources("data_gen"), **named)
+def test_data_gen_stands_on_kernels_and_formats_alone(path):
+    assert not {name.split(".")[0] for name in imports(parsed(path))} & {"experiments"}
+    entries = {entry_of(there) for there in own_imports(path)}
+    assert {entry for entry in entries if entry.startswith("spnr_jax/")} <= OF_SPNR_JAX
+
+
+@pytest.mark.parametrize("path", [path for folder in PURE for path in sources(f"spnr_jax/{folder}")], **named)
+class TestPureFolders:
     def test_touch_no_files_clocks_or_global_randomness(self, path):
         modules = {name.split(".")[0] for name in imports(parsed(path))}
         assert not modules & (IMPURE | HEAVY)
@@ -95,42 +125,56 @@ class TestPureLayers:
         assert not calls & {"print", "open", "input", "exec", "eval"}
 
 
-def test_only_training_and_what_stands_above_it_compiles():
-    for path in PACKAGE:
-        if layer_of(parts(path)[0]) < 4:
-            assert "jax.jit" not in path.read_text(), path
+def test_what_programs_are_made_of_is_not_compiled_by_itself():
+    for path in (path for folder in WITHOUT_JIT for path in sources(f"spnr_jax/{folder}")):
+        assert "jax.jit" not in path.read_text(), path
 
 
-def test_the_layers_name_no_module_that_does_not_exist():
-    assert set().union(*LAYERS.values()) <= MODULES
+def test_the_tops_of_the_packages_hold_at_most_six_files():
+    for package in ("spnr_jax", "data_gen"):
+        assert len(list((ROOT / package).glob("*.py"))) <= 6
 
 
-def test_importing_the_package_loads_no_heavy_module():
-    code = f"import sys, spnr_jax; print(*({HEAVY!r} & set(sys.modules)))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
-    assert not done.stdout.split()
-
-
-@pytest.mark.parametrize("path", sources("data_gen"), **named)
-def test_data_gen_stands_on_layers_0_and_1_alone(path):
-    for name in imports(parsed(path)):
-        package, *there = name.split(".")
-        if package == "spnr_jax" and there:
-            assert layer_of(there[0]) <= 1, f"{path.name} imports {name}"
-        assert package != "experiments"
-
-
-@pytest.mark.parametrize("path", sources("spnr_jax"), **named)
-def test_data_gen_is_loaded_by_the_reader_of_clouds_alone_and_only_on_demand(path):
-    tree = parsed(path)
-    inside = set().union(*(imports(n) for n in ast.walk(tree) if isinstance(n, ast.FunctionDef)), set())
-    everywhere = {name for name in imports(tree) if name.split(".")[0] in ("data_gen", "experiments")}
-    if path.name == "clouds.py":
-        assert everywhere <= inside, "at import, or in a class body"
-    else:
-        assert not everywhere
+def test_no_two_modules_share_a_name_and_none_has_one_of_the_standard_library():
+    names = Counter(path.stem for path in PACKAGE if not path.stem.startswith("__"))
+    names.update({path.parent.name for path in PACKAGE if path.name == "__init__.py"})
+    assert not [name for name, count in names.items() if count > 1]
+    assert not set(names) & sys.stdlib_module_names
 
 
 def test_no_file_is_a_drawer_for_everything():
-    names = {path.stem for folder in ("spnr_jax", "data_gen", "experiments") for path in sources(folder)}
-    assert not names & {"utils", "helpers", "misc", "common"}
+    assert not {path.stem for path in PACKAGE} & {"utils", "helpers", "misc", "common"}
+
+
+def modules_after(code: str) -> set[str]:
+    """Names of all modules that are loaded when the code has run in a process of its own."""
+    done = subprocess.run(
+        [sys.executable, "-c", f"import sys; {code}; print(*sys.modules)"],
+        capture_output=True,
+        text=True,
+        check=True,
+        cwd=ROOT,
+    )
+    return set(done.stdout.split())
+
+
+def test_importing_the_package_loads_no_heavy_module():
+    assert not modules_after("import spnr_jax") & (HEAVY | {"jax"})
+
+
+def test_a_picture_needs_nothing_that_trains_or_compares():
+    loaded = modules_after("import spnr_jax, spnr_jax.method.model; spnr_jax.load, spnr_jax.read_cloud")
+    assert not {name.split(".")[0] for name in loaded} & (HEAVY | {"optax", "orbax", "data_gen", "experiments"})
+    assert not {name for name in loaded if name.startswith("spnr_jax.baselines.")}
+    assert not loaded & {"spnr_jax.nn.discriminator", "spnr_jax.training.trainer", "spnr_jax.training.optimisation"}
+
+
+@pytest.mark.parametrize("name", ["cameras", "sampling", "compositing", "voxels", "losses", "metrics"])
+def test_the_kernels_of_the_specification_are_one_module_under_both_names(name):
+    code = (
+        f"import importlib; import spnr_jax.{name}; short = sys.modules['spnr_jax.{name}']; "
+        f"from spnr_jax import {name}; from spnr_jax.kernels import {name} as whole; "
+        f"assert short is {name} is whole is importlib.import_module('spnr_jax.kernels.{name}'); "
+        f"assert whole.__name__ == whole.__spec__.name == 'spnr_jax.kernels.{name}'"
+    )
+    assert f"spnr_jax.{name}" in modules_after(code)

@@ -8,7 +8,7 @@ import matplotlib
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
-import tiny_untrained
+from support import tiny_untrained
 
 FOLDER = Path(__file__).parents[1] / "notebooks"
 NAMES = ("vmap_over_objects", "your_own_loss")

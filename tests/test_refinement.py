@@ -6,15 +6,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import tiny_dataset
-from laws import close, same_bits
-from tiny_model import PLUS
+from support import tiny_dataset
+from support.laws import close, same_bits
+from support.tiny_model import PLUS
 
 from experiments.packaged import refinement
 from spnr_jax import clouds, data, presets, training
 from spnr_jax.config import LossConfig
+from spnr_jax.formats import data_sets
+from spnr_jax.kernels import cloud_arrays
+from spnr_jax.method import inference
 from spnr_jax.nn.refiner import Refiner
-from spnr_jax.weights import Trained
+from spnr_jax.training import optimisation
+from spnr_jax.training.weights import Trained
 
 SIZE = tiny_dataset.CONFIG.model.image_resolution
 PLAIN = dataclasses.replace(
@@ -27,7 +31,7 @@ CONFIG = dataclasses.replace(presets.with_refiner(PLAIN), num_steps=40)
 
 @pytest.fixture(scope="module")
 def trained():
-    return Trained(config=PLAIN, variables=training.averaged_variables(training.create_state(PLAIN)), steps=0)
+    return Trained(config=PLAIN, variables=optimisation.averaged_variables(optimisation.create_state(PLAIN)), steps=0)
 
 
 def majorities(count=6, size=24):
@@ -50,7 +54,7 @@ def test_a_refined_network_is_the_one_before_with_a_refiner(trained, tmp_path):
     before = trained.variables["params"]
     same_bits({name: refined.variables["params"][name] for name in before}, before)
     assert {path.stem for path in tmp_path.glob("*.npz")} == set(dataset.splits["train"])
-    shapes = jax.tree.map(np.shape, training.create_state(refined.config).generator)
+    shapes = jax.tree.map(np.shape, optimisation.create_state(refined.config).generator)
     assert jax.tree.map(np.shape, refined.variables["params"]) == shapes
 
 
@@ -78,14 +82,14 @@ def test_pictures_of_another_network_are_refused(trained, tmp_path):
 
 
 def test_kept_is_what_the_network_shows_and_its_references(trained, tmp_path):
-    item = data.read_object(tiny_dataset.dataset(), tiny_dataset.dataset().splits["train"][0])
+    item = data_sets.read_object(tiny_dataset.dataset(), tiny_dataset.dataset().splits["train"][0])
     place = tmp_path / "kept.npz"
     refinement.keep(place, trained.variables, CONFIG, item)
     views = list(refinement.read(place))
     assert len(views) == len(item.images)
-    plain = training.network(PLAIN.model)
+    plain = inference.network(PLAIN.model)
     assert len(item.cloud.mask) < min(refinement.COUNTS), "all points of this object are kept"
-    cloud = clouds.pad(item.cloud, clouds.bucket(len(item.cloud.mask)))
+    cloud = cloud_arrays.pad(item.cloud, cloud_arrays.bucket(len(item.cloud.mask)))
     cloud, camera = jax.tree.map(lambda x: jnp.asarray(x)[None], (cloud, item.camera))
     shown = plain.bind(trained.variables)(cloud, camera)
     for (seen, reference), image, acc, truth in zip(views, shown.image[0], shown.acc[0], item.images, strict=True):

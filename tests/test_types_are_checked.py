@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import pytest
 from jaxtyping import TypeCheckError
 
-from spnr_jax import compositing, sampling
+from spnr_jax.kernels import compositing, sampling
 from spnr_jax.nn.normalization import GroupNorm
 
 

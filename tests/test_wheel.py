@@ -11,9 +11,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import tiny_dataset
-import tiny_untrained
 from PIL import Image
+from support import tiny_dataset, tiny_untrained
 
 from data_gen import command
 
@@ -79,7 +78,7 @@ def test_importing_the_package_brings_no_slow_module_along():
 
 
 def test_no_dependency_of_an_extra_is_imported_before_it_is_needed():
-    code = "import sys, spnr_jax.model, spnr_jax.clouds, spnr_jax.pictures; print(*sys.modules)"
+    code = "import sys, spnr_jax.method.model, spnr_jax.formats.clouds, spnr_jax.tools.pictures; print(*sys.modules)"
     loaded = set(output_of(sys.executable, "-c", code, cwd=ROOT).split())
     unneeded = {"mitsuba", "dask", "fsspec", "viser", "laspy", "imageio_ffmpeg", "pymeshlab", "torch"}
     assert not loaded & (unneeded | {"trimesh", "skimage", "matplotlib", "grain", "orbax"})

@@ -6,16 +6,16 @@ given. Objects stand on y = 0 with y up and face +z; lengths are of the order of
 
 import numpy as np
 
-from data_gen.assets import Asset
-from data_gen.procedural.assembly import assemble
 from data_gen.procedural.cars import car
 from data_gen.procedural.chairs import chair
 from data_gen.procedural.frames import frame
+from data_gen.procedural.joining import assemble
 from data_gen.procedural.lamps import lamp
 from data_gen.procedural.planes import plane
 from data_gen.procedural.shelves import shelf
 from data_gen.procedural.sofas import sofa
 from data_gen.procedural.tables import table
+from spnr_jax.formats.mesh.assets import Asset
 
 FAMILIES = {
     "chair": chair,

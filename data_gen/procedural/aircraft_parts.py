@@ -5,11 +5,24 @@ The fuselage is about 1 long, its nose at z = 0.5.
 
 import numpy as np
 
-from data_gen import finishes, patterns
-from data_gen.outlines import airfoil, circle
-from data_gen.procedural.assembly import Piece
+from data_gen.procedural.joining import Piece
 from data_gen.procedural.wheels import wheel
-from data_gen.shapes import Mesh, both_sides, box, cross, lathe, loft, merge, move, patch, superellipsoid, tube, turn
+from data_gen.shapes import finishes, patterns
+from data_gen.shapes.outlines import airfoil, circle
+from data_gen.shapes.primitives import (
+    Mesh,
+    both_sides,
+    box,
+    cross,
+    lathe,
+    loft,
+    merge,
+    move,
+    patch,
+    superellipsoid,
+    tube,
+    turn,
+)
 
 
 def fuselage(z, width, height, middle, segments=28) -> Mesh:

@@ -6,11 +6,23 @@ height is the bonnet, belt and boot line. The cabin is a second, narrower loft o
 
 import numpy as np
 
-from data_gen import finishes
-from data_gen.outlines import rounded_rectangle, superellipse
-from data_gen.procedural.assembly import Piece
+from data_gen.procedural.joining import Piece
 from data_gen.procedural.wheels import wheel
-from data_gen.shapes import Mesh, both_sides, box, cylinder, lathe, loft, merge, move, superellipsoid, tube, turn
+from data_gen.shapes import finishes
+from data_gen.shapes.outlines import rounded_rectangle, superellipse
+from data_gen.shapes.primitives import (
+    Mesh,
+    both_sides,
+    box,
+    cylinder,
+    lathe,
+    loft,
+    merge,
+    move,
+    superellipsoid,
+    tube,
+    turn,
+)
 
 # Fractions of the length, from the tail (0) to the nose (1): rear glass foot, roof start, roof end, windscreen foot.
 CABINS = {

@@ -2,10 +2,8 @@
 
 import numpy as np
 
-from data_gen import finishes
-from data_gen.outlines import bent_line, curve, rounded_rectangle
-from data_gen.procedural.assembly import Piece
 from data_gen.procedural.easy_chairs import armchair, tub_chair
+from data_gen.procedural.joining import Piece
 from data_gen.procedural.legs import (
     four_legs,
     leg_style,
@@ -13,18 +11,9 @@ from data_gen.procedural.legs import (
     star_base,
 )
 from data_gen.procedural.wooden_chairs import side_chair, stool
-from data_gen.shapes import (
-    Mesh,
-    both_sides,
-    box,
-    cylinder,
-    merge,
-    move,
-    shell,
-    superellipsoid,
-    tube,
-    turn,
-)
+from data_gen.shapes import finishes
+from data_gen.shapes.outlines import bent_line, curve, rounded_rectangle
+from data_gen.shapes.primitives import Mesh, both_sides, box, cylinder, merge, move, shell, superellipsoid, tube, turn
 
 
 def chair(rng) -> list[Piece]:

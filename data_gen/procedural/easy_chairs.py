@@ -2,25 +2,16 @@
 
 import numpy as np
 
-from data_gen import finishes
-from data_gen.outlines import superellipse
-from data_gen.procedural.assembly import Piece
+from data_gen.procedural.joining import Piece
 from data_gen.procedural.legs import (
     four_legs,
     leg_style,
     post,
     round_legs,
 )
-from data_gen.shapes import (
-    both_sides,
-    box,
-    cylinder,
-    merge,
-    move,
-    shell,
-    superellipsoid,
-    turn,
-)
+from data_gen.shapes import finishes
+from data_gen.shapes.outlines import superellipse
+from data_gen.shapes.primitives import both_sides, box, cylinder, merge, move, shell, superellipsoid, turn
 
 
 def armchair(rng) -> list[Piece]:

@@ -2,10 +2,23 @@
 
 import numpy as np
 
-from data_gen import finishes
-from data_gen.procedural.assembly import Piece
+from data_gen.procedural.joining import Piece
 from data_gen.procedural.legs import four_legs, leg_style
-from data_gen.shapes import Mesh, box, cylinder, lathe, loft, merge, moulding, move, patch, superellipsoid, tube, turn
+from data_gen.shapes import finishes
+from data_gen.shapes.primitives import (
+    Mesh,
+    box,
+    cylinder,
+    lathe,
+    loft,
+    merge,
+    moulding,
+    move,
+    patch,
+    superellipsoid,
+    tube,
+    turn,
+)
 
 
 def frame(rng) -> list[Piece]:

@@ -7,8 +7,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from data_gen.outlines import circle, curve, rounded_rectangle, superellipse
-from data_gen.shapes import Mesh, box, cylinder, lathe, loft, merge, move, superellipsoid, tube, turn
+from data_gen.shapes.outlines import circle, curve, rounded_rectangle, superellipse
+from data_gen.shapes.primitives import Mesh, box, cylinder, lathe, loft, merge, move, superellipsoid, tube, turn
 
 Leg = Callable[[np.ndarray, np.ndarray], Mesh]
 

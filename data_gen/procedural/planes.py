@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from data_gen import finishes
 from data_gen.procedural.aircraft_parts import (
     body_profile,
     cockpit,
@@ -16,8 +15,9 @@ from data_gen.procedural.aircraft_parts import (
     tail,
     windows,
 )
-from data_gen.procedural.assembly import Piece
-from data_gen.shapes import both_sides, box, cylinder, lathe, merge, move, superellipsoid, tube, turn
+from data_gen.procedural.joining import Piece
+from data_gen.shapes import finishes
+from data_gen.shapes.primitives import both_sides, box, cylinder, lathe, merge, move, superellipsoid, tube, turn
 
 
 def plane(rng) -> list[Piece]:

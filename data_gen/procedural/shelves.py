@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from data_gen import finishes
-from data_gen.procedural.assembly import Piece
+from data_gen.procedural.joining import Piece
 from data_gen.procedural.legs import four_legs, leg_style, turned_profile
-from data_gen.shapes import Mesh, box, cylinder, lathe, merge, move, superellipsoid, tube, turn
+from data_gen.shapes import finishes
+from data_gen.shapes.primitives import Mesh, box, cylinder, lathe, merge, move, superellipsoid, tube, turn
 
 BOARD = (0.012, 0.035)
 

@@ -2,12 +2,12 @@
 
 import numpy as np
 
-from data_gen import finishes
-from data_gen.outlines import superellipse
-from data_gen.procedural.assembly import Piece
+from data_gen.procedural.joining import Piece
 from data_gen.procedural.legs import four_legs, leg_style, pedestal, round_legs, stretchers
 from data_gen.procedural.shelves import drawer_stack
-from data_gen.shapes import Mesh, box, merge, move, prism, tube, turn
+from data_gen.shapes import finishes
+from data_gen.shapes.outlines import superellipse
+from data_gen.shapes.primitives import Mesh, box, merge, move, prism, tube, turn
 
 
 def table(rng) -> list[Piece]:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from data_gen.shapes import Mesh, box, cylinder, lathe, merge, move, turn
+from data_gen.shapes.primitives import Mesh, box, cylinder, lathe, merge, move, turn
 
 
 def wheel(rng, radius: float, width: float) -> tuple[Mesh, Mesh]:

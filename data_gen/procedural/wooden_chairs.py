@@ -2,9 +2,7 @@
 
 import numpy as np
 
-from data_gen import finishes
-from data_gen.outlines import curve, rounded_rectangle, superellipse
-from data_gen.procedural.assembly import Piece
+from data_gen.procedural.joining import Piece
 from data_gen.procedural.legs import (
     four_legs,
     leg_style,
@@ -13,7 +11,9 @@ from data_gen.procedural.legs import (
     stretchers,
     turned_profile,
 )
-from data_gen.shapes import (
+from data_gen.shapes import finishes
+from data_gen.shapes.outlines import curve, rounded_rectangle, superellipse
+from data_gen.shapes.primitives import (
     Mesh,
     both_sides,
     box,

@@ -18,9 +18,10 @@ from typing import Literal
 
 import jax
 
-from spnr_jax import checkpoint, data, trainer, training
 from spnr_jax.config import TrainConfig
+from spnr_jax.formats import data_sets
 from spnr_jax.presets import PRESETS
+from spnr_jax.training import batching, checkpoint, optimisation, trainer
 
 Budget = Literal["quick", "tiny", "paper"]
 NETWORKS = ("ours", "plus", "npbg", "point_nerf", "points2nerf")
@@ -54,7 +55,7 @@ def presets(budget: Budget, size: int, category: str | None) -> dict[str, str]:
 
 
 def config_of(
-    preset: str, budget: Budget, seed: int, minutes: float | None, dataset: data.Dataset, run: Path
+    preset: str, budget: Budget, seed: int, minutes: float | None, dataset: data_sets.Dataset, run: Path
 ) -> TrainConfig:
     """The preset with the seed and the steps of the budget; a run that was begun keeps its steps."""
     config = dataclasses.replace(PRESETS[preset](), seed=seed)
@@ -64,7 +65,7 @@ def config_of(
 
 
 def within(
-    minutes: float, config: TrainConfig, dataset: data.Dataset, run: Path, measured: int | None = None
+    minutes: float, config: TrainConfig, dataset: data_sets.Dataset, run: Path, measured: int | None = None
 ) -> TrainConfig:
     """The config with as many steps as fit into so many minutes here; a run that was begun keeps its steps.
 
@@ -75,9 +76,9 @@ def within(
     return dataclasses.replace(config, num_steps=steps)
 
 
-def steps_within(seconds: float, config: TrainConfig, dataset: data.Dataset) -> int:
+def steps_within(seconds: float, config: TrainConfig, dataset: data_sets.Dataset) -> int:
     """How many steps fit into so many seconds here, those with the discriminator at their share and pace."""
-    alone = training.first_adversarial_step(config) / config.num_steps
+    alone = optimisation.first_adversarial_step(config) / config.num_steps
     pace = sum(
         share * step_seconds(config, dataset, adversarial)
         for share, adversarial in ((alone, False), (1 - alone, True))
@@ -86,13 +87,13 @@ def steps_within(seconds: float, config: TrainConfig, dataset: data.Dataset) -> 
     return max(1, int(seconds / pace))
 
 
-def step_seconds(config: TrainConfig, dataset: data.Dataset, adversarial: bool) -> float:
+def step_seconds(config: TrainConfig, dataset: data_sets.Dataset, adversarial: bool) -> float:
     """Seconds of a training step, reading the data included, compilation not."""
-    state = training.jitted_create_state(config)
+    state = optimisation.jitted_create_state(config)
     steps, start = -1, 0.0
-    with closing(data.batches(dataset, config, 0)) as batches:
+    with closing(batching.batches(dataset, config, 0)) as batches:
         for batch in batches:
-            state, metrics = training.jitted_train_step(
+            state, metrics = optimisation.jitted_train_step(
                 state, jax.device_put(batch), config=config, adversarial=adversarial
             )
             jax.block_until_ready(metrics)
@@ -104,12 +105,12 @@ def step_seconds(config: TrainConfig, dataset: data.Dataset, adversarial: bool) 
     return (time.monotonic() - start) / max(steps, 1)
 
 
-def train(config: TrainConfig, dataset: data.Dataset, run: Path) -> Trained:
+def train(config: TrainConfig, dataset: data_sets.Dataset, run: Path) -> Trained:
     """The network after its last step; a finished run is only read."""
     every = max(500, config.num_steps // SAVES)
     schedule = trainer.Schedule(preview_every=every, checkpoint_every=every)
     state = trainer.train(config, dataset, run, schedule)
-    variables = training.averaged_variables(state)
+    variables = optimisation.averaged_variables(state)
     cost = {
         "preset": config.preset,
         "parameters": sum(x.size for x in jax.tree.leaves(variables["params"])),

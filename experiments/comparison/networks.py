@@ -10,7 +10,10 @@ from pathlib import Path
 
 from spnr_jax import data, evaluation, weights
 from spnr_jax.config import TrainConfig
+from spnr_jax.formats import data_sets
 from spnr_jax.model_config import METHODS, ModelConfig
+from spnr_jax.scoring import evaluation
+from spnr_jax.training import weights
 
 LABELS = {  # method -> its name in tables and pictures, in their order
     "ours": "Ours",
@@ -61,7 +64,7 @@ class Network:
         return evaluation.network(self.variables, self.config)
 
 
-def networks(sources: Sources, dataset: data.Dataset) -> dict[str, Network]:
+def networks(sources: Sources, dataset: data_sets.Dataset) -> dict[str, Network]:
     """The networks by their names, in the order of Table 1; ValueError if there is none, or of another image size."""
     runs = list(sources.runs)
     if sources.table1 is not None:
@@ -83,11 +86,11 @@ def name_of(method: str, run: Path, shared: bool) -> str:
     return f"{LABELS[method]} ({whose})" if shared else LABELS[method]
 
 
-def load(run: Path, dataset: data.Dataset) -> Network:
+def load(run: Path, dataset: data_sets.Dataset) -> Network:
     """The averaged network of a run's newest checkpoint or a file of weights, fit for the size of the pictures."""
     trained = weights.read_trained(run, data=dataset.folder)
     config = trained.config
-    data.check_renders(data.read_object(dataset, dataset.splits["test"][0]), config)
+    data_sets.check_renders(data_sets.read_object(dataset, dataset.splits["test"][0]), config)
     method = next(name for name, kind in METHODS.items() if isinstance(config.model, kind))
     if isinstance(config.model, ModelConfig) and config.model.num_neighbors:
         method = "plus"
@@ -102,7 +105,7 @@ def load(run: Path, dataset: data.Dataset) -> Network:
     )
 
 
-def test_objects(dataset: data.Dataset, count: int | None) -> tuple[str, ...]:
+def test_objects(dataset: data_sets.Dataset, count: int | None) -> tuple[str, ...]:
     """Test objects, evenly out of the split, or all of them; ValueError if there is none."""
     names = dataset.splits["test"]
     if not names:

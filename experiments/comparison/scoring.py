@@ -9,13 +9,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spnr_jax import data, evaluation
 from spnr_jax.config import TrainConfig
-from spnr_jax.lpips import LpipsWeights
-from spnr_jax.report import duration
-from spnr_jax.summary import Scores, summarise
+from spnr_jax.formats import data_sets
+from spnr_jax.scoring import evaluation
+from spnr_jax.scoring.lpips import LpipsWeights
+from spnr_jax.scoring.report import duration
+from spnr_jax.scoring.summary import Scores, summarise
 
-ObjectMethod = Callable[[data.ObjectData], evaluation.Pictures]
+ObjectMethod = Callable[[data_sets.ObjectData], evaluation.Pictures]
 PROGRESS_LINES = 20
 
 
@@ -41,17 +42,17 @@ class Scored:
 
 def of_cloud(method: evaluation.Method, config: TrainConfig) -> ObjectMethod:
     """The method of an object that shows its first points to its cameras."""
-    return lambda item: method(evaluation.test_cloud(item, config), item.camera)
+    return lambda item: method(data_sets.test_cloud(item, config), item.camera)
 
 
 def score_objects(
     methods: dict[str, ObjectMethod],
     config: TrainConfig,
-    dataset: data.Dataset,
+    dataset: data_sets.Dataset,
     names: tuple[str, ...],
     num_shown: int,
     weights: LpipsWeights | None,
-    more: Callable[[data.ObjectData, evaluation.Pictures], Scores] | None = None,
+    more: Callable[[data_sets.ObjectData, evaluation.Pictures], Scores] | None = None,
 ) -> Scored:
     """All methods on these objects, with a line now and then; points and image size are the config's.
 
@@ -60,7 +61,7 @@ def score_objects(
     seconds: dict[str, list[float]] = {method: [] for method in methods}
     scores, shown, to_show, start = {}, [], evaluation.spread(names, num_shown), time.monotonic()
     for number, name in enumerate(names, start=1):
-        item = data.read_object(dataset, name)
+        item = data_sets.read_object(dataset, name)
         shows = {method: timed(show, item, seconds[method]) for method, show in methods.items()}
         result = evaluation.evaluate_object(shows, config, item, weights)
         if "npbg" in result.scores:
@@ -77,7 +78,7 @@ def score_objects(
     return Scored(scores=scores, shown=shown, seconds=seconds)
 
 
-def timed(show: ObjectMethod, item: data.ObjectData, seconds: list[float]) -> evaluation.Method:
+def timed(show: ObjectMethod, item: data_sets.ObjectData, seconds: list[float]) -> evaluation.Method:
     """The method bound to an object, noting the seconds per view until the pictures lie on the host."""
 
     def measured(*_: object) -> evaluation.Pictures:

@@ -12,7 +12,7 @@ from spnr_jax import cameras, data, shards
 from spnr_jax.types import Camera
 
 
-def mesh_of(dataset: data.Dataset, item: data.ObjectData, meshes: Path | None) -> Asset:
+def mesh_of(dataset: data_sets.Dataset, item: data_sets.ObjectData, meshes: Path | None) -> Asset:
     """The normalised mesh of an object; ValueError if it cannot be made again, or is another one by now.
 
     `meshes` is the folder of the mesh files, where the data set was made from such.
@@ -24,7 +24,7 @@ def mesh_of(dataset: data.Dataset, item: data.ObjectData, meshes: Path | None) -
     return originals.original(details(dataset, item.name), seed, positions, meshes, dataset.spread)
 
 
-def details(dataset: data.Dataset, name: str) -> dict:
+def details(dataset: data_sets.Dataset, name: str) -> dict:
     """What object.json says of an object, in either form of the data set."""
     if dataset.shards is not None:
         return json.loads(shards.read_files(dataset.shards, name)["object.json"])

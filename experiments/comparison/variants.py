@@ -25,8 +25,12 @@ from experiments.comparison.networks import test_objects
 from experiments.comparison.scoring import Shown, of_cloud, score_objects
 from spnr_jax import checkpoint, data, evaluation, metrics, trainer, training
 from spnr_jax.config import TrainConfig
+from spnr_jax.formats import data_sets
+from spnr_jax.kernels import metrics
 from spnr_jax.presets import PRESETS
-from spnr_jax.summary import Scores
+from spnr_jax.scoring import evaluation
+from spnr_jax.scoring.summary import Scores
+from spnr_jax.training import checkpoint, optimisation, run_record, trainer
 
 PaperPreset = Literal["abo", "shapenet_car", "shapenet_plane", "shapenet_chair", "small", "tiny"]
 PlusPreset = Literal["plus_abo", "plus_lite", "plus_refined", "plus_shapenet", "plus_small", "plus_tiny"]
@@ -75,7 +79,7 @@ class Budget:
         steps = QUICK_STEPS if self.quick else self.steps or config.num_steps
         return dataclasses.replace(config, num_steps=steps, even_share=self.even_share)
 
-    def names(self, dataset: data.Dataset) -> tuple[str, ...]:
+    def names(self, dataset: data_sets.Dataset) -> tuple[str, ...]:
         """The objects to be scored."""
         return test_objects(dataset, QUICK_OBJECTS if self.quick else self.objects)
 
@@ -87,8 +91,8 @@ class Variant:
     name: str
     label: str
     config: TrainConfig
-    dataset: data.Dataset
-    start: Callable[[TrainConfig], training.TrainState] | None = None
+    dataset: data_sets.Dataset
+    start: Callable[[TrainConfig], optimisation.TrainState] | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,7 +118,7 @@ class Compared:
     shown_scores: list[dict[str, dict[str, float]]]
 
 
-def claim(out: Path, what: str, budget: Budget, dataset: data.Dataset, **more: object) -> None:
+def claim(out: Path, what: str, budget: Budget, dataset: data_sets.Dataset, **more: object) -> None:
     """Makes the folder that of this experiment; ValueError if it is another's."""
     asked = {"preset": budget.preset, "steps": budget.config().num_steps, **more}
     if budget.minutes is not None:
@@ -151,7 +155,7 @@ def step_milliseconds(run: Path) -> float | None:
     return round(statistics.median(found), 2) if len(found) >= FEWEST_ROWS else None
 
 
-def without_colour_variants(dataset: data.Dataset) -> data.Dataset:
+def without_colour_variants(dataset: data_sets.Dataset) -> data_sets.Dataset:
     """The data set whose training objects have no colour variants."""
     train = tuple(name for name in dataset.splits["train"] if name == original(name))
     return dataclasses.replace(dataset, splits=dataset.splits | {"train": train})
@@ -165,7 +169,7 @@ def original(name: str) -> str:
 def score(
     runs: Mapping[str, Sequence[Run]],
     reference: str,
-    dataset: data.Dataset,
+    dataset: data_sets.Dataset,
     names: tuple[str, ...],
     num_shown: int,
 ) -> Compared:
@@ -252,10 +256,10 @@ def joined(seeds: Sequence[Scores]) -> Scores:
     return {metric: np.concatenate([scores[metric] for scores in seeds]) for metric in seeds[0]}
 
 
-def more_scores(item: data.ObjectData, pictures: evaluation.Pictures) -> Scores:
+def more_scores(item: data_sets.ObjectData, pictures: evaluation.Pictures) -> Scores:
     """PSNR inside the silhouette, and high-frequency energy over the reference's, of each view."""
     inside = item.images[..., 3] > 255 * OPAQUE
-    return jax.device_get(_more_scores(np.asarray(pictures.image), data.on_white(item.images), inside))
+    return jax.device_get(_more_scores(np.asarray(pictures.image), data_sets.on_white(item.images), inside))
 
 
 @jax.jit

@@ -35,7 +35,7 @@ def write(
     reference: str,
     compared: Compared,
     budget: Budget,
-    dataset: data.Dataset,
+    dataset: data_sets.Dataset,
     more: Mapping[str, object] | None = None,
 ) -> None:
     """Writes the files and prints the tables; what is in `more` is written with the results."""
@@ -78,7 +78,7 @@ def numbers(
         "minutes": budget.minutes,
         "even_share": budget.even_share,
         "seeds": list(budget.seeds),
-        "hardware": evaluation.hardware(),
+        "hardware": machine.hardware(),
         "data": dataset.settings.get("settings", {}),
         "views": len(next(iter(compared.scores.values()))[0]["psnr"]) // len(budget.seeds),
         "points": config.test_points,
@@ -106,7 +106,7 @@ def means(objects: Sequence[Scores]) -> dict[str, float | list[float] | None]:
     for metric in METRICS:
         values = [scores[metric] for scores in objects]
         every = np.concatenate(values)
-        ends = None if np.isnan(every).all() else statistics.interval(values)
+        ends = None if np.isnan(every).all() else intervals.interval(values)
         row[metric] = None if np.isnan(every).all() else float(np.nanmean(every))
         row[f"{metric}_interval"] = None if ends is None else list(ends)
     return row
@@ -115,8 +115,8 @@ def means(objects: Sequence[Scores]) -> dict[str, float | list[float] | None]:
 def change(compared: Compared, variant: str, reference: str, metric: str) -> dict | None:
     """The variant minus the reference: mean, interval, p-value, and the mean of each seed alone."""
 
-    def minus(first: Sequence[Scores], second: Sequence[Scores]) -> statistics.Difference | None:
-        return statistics.difference([s[metric] for s in first], [s[metric] for s in second])
+    def minus(first: Sequence[Scores], second: Sequence[Scores]) -> intervals.Difference | None:
+        return intervals.difference([s[metric] for s in first], [s[metric] for s in second])
 
     found = minus(compared.scores[variant], compared.scores[reference])
     if found is None:

@@ -66,7 +66,7 @@ def main(demo: Demo) -> None:
 
     tiny = presets.tiny()
     tiny = dataclasses.replace(tiny, seed=demo.seed, num_steps=tiny.num_steps if demo.steps is None else demo.steps)
-    dataset, run = data.open_dataset(generation.out), demo.out / "run"
+    dataset, run = data_sets.open_dataset(generation.out), demo.out / "run"
     print(f"2/3 training preset {tiny.preset} for {tiny.num_steps} steps in {run}", flush=True)
     seconds.measure("train", lambda: trainer.train(tiny, dataset, run, trainer.Schedule()))
 

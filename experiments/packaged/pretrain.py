@@ -26,8 +26,11 @@ from experiments.packaged import refinement
 from experiments.packaged.demo import Seconds
 from spnr_jax import cli, data, evaluation, presets, trainer, weights
 from spnr_jax.config import TrainConfig
-from spnr_jax.images import write_whole
-from spnr_jax.results import text_table, write_results
+from spnr_jax.formats import data_sets as data
+from spnr_jax.formats.images import write_whole
+from spnr_jax.scoring import evaluation
+from spnr_jax.scoring.results import text_table, write_results
+from spnr_jax.training import trainer, weights
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -27,14 +27,18 @@ from experiments.comparison import results
 from spnr_jax import cameras, clouds, data, losses, presets, training
 from spnr_jax.colors import LEAST_OPACITY
 from spnr_jax.config import TrainConfig
-from spnr_jax.images import write_whole
+from spnr_jax.formats import data_sets
+from spnr_jax.formats.images import write_whole
+from spnr_jax.formats.npz import read_arrays
+from spnr_jax.kernels import cameras, cloud_arrays, losses
+from spnr_jax.kernels.colors import LEAST_OPACITY
+from spnr_jax.kernels.records import Camera, PointCloud
+from spnr_jax.kernels.resizing import mean_of_squares
+from spnr_jax.method.renderer import Renderer
 from spnr_jax.model_config import ModelConfig
 from spnr_jax.nn.refiner import Refiner
-from spnr_jax.numpy_files import read_arrays
-from spnr_jax.renderer import Renderer
-from spnr_jax.resizing import mean_of_squares
-from spnr_jax.types import Camera, PointCloud
-from spnr_jax.weights import Trained
+from spnr_jax.training import batching, optimisation, run_record
+from spnr_jax.training.weights import Trained
 
 COUNTS = (512, 1024, 1024, 2048)  # points of an object, one of these by its name
 BATCH = 8  # crops a step
@@ -45,30 +49,30 @@ EVERY = 7  # view, of which the features' mean and deviation are measured
 LEAST_DEVIATION = 1e-3
 
 
-def refined(trained: Trained, dataset: data.Dataset, folder: Path, steps: int | None = None) -> Trained:
+def refined(trained: Trained, dataset: data_sets.Dataset, folder: Path, steps: int | None = None) -> Trained:
     """The network with a refiner, trained on pictures of the training objects, for the preset's steps by default."""
     config = presets.with_refiner(trained.config)
     config = dataclasses.replace(config, num_steps=steps or config.num_steps)
-    data.check_spread(dataset, config)
+    batching.check_spread(dataset, config)
     numbers = b"".join(np.asarray(x).tobytes() for x in jax.tree.leaves(trained.variables))
     asked = {"network": hashlib.sha256(numbers).hexdigest(), "even_share": config.even_share}
     results.claim(folder, "pictures", asked, dataset)
     places = [folder / f"{name}.npz" for name in dataset.splits["train"]]
     for place in tqdm(places, desc="rendering", unit="object"):
         if not place.exists():
-            keep(place, trained.variables, config, data.read_object(dataset, place.stem))
+            keep(place, trained.variables, config, data_sets.read_object(dataset, place.stem))
     pictures = [picture for place in tqdm(places, desc="reading", unit="object") for picture in read(place)]
     weights = train(config, pictures)
     params = trained.variables["params"] | {"refiner": jax.device_get(weights)}
     return Trained(config=config, variables=trained.variables | {"params": params}, steps=config.num_steps)
 
 
-def keep(place: Path, variables: dict, config: TrainConfig, item: data.ObjectData) -> None:
+def keep(place: Path, variables: dict, config: TrainConfig, item: data_sets.ObjectData) -> None:
     """Renders an object's views and writes the file of what the refiner will see."""
     number = zlib.crc32(item.name.encode())
     count = min(COUNTS[number % len(COUNTS)], len(item.cloud.mask))
     generator = np.random.default_rng(number)
-    cloud = data.choose_points(item.cloud, count, clouds.bucket(count), generator, config.even_share)
+    cloud = batching.choose_points(item.cloud, count, cloud_arrays.bucket(count), generator, config.even_share)
     seen = np.asarray(rendered(variables, cloud, item.camera, config=config.model), np.float16)
     stream = io.BytesIO()
     np.savez(stream, seen=seen, reference=item.images)
@@ -115,7 +119,7 @@ def train(config: TrainConfig, pictures: list[tuple[np.ndarray, np.ndarray]]) ->
         loss, gradient = jax.value_and_grad(partial(error, refiner, config))(weights, seen, reference)
         update, optimizer = algorithm.update(gradient, optimizer, weights)
         weights = optax.apply_updates(weights, update)
-        return weights, optimizer, training.moving_average(averaged, weights, number, DECAY), loss
+        return weights, optimizer, optimisation.moving_average(averaged, weights, number, DECAY), loss
 
     optimizer, averaged = algorithm.init(weights), jax.tree.map(jnp.copy, weights)
     shown: list[Array] = []

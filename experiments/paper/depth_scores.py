@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import distance_transform_edt
 
-from spnr_jax import statistics
+from spnr_jax.scoring import intervals
 
 OPAQUE = 0.5
 EDGE = 1 / 32  # of the picture's width
@@ -76,7 +76,7 @@ def summarise(objects: Sequence[dict[str, np.ndarray]]) -> dict[str, dict]:
     for name in METRICS:
         values = [found[name] for found in objects]
         known = not np.isnan(np.concatenate(values)).all()
-        ends = statistics.interval(values) if known else None
+        ends = intervals.interval(values) if known else None
         table[name] = {
             "mean": float(np.nanmean(np.concatenate(values))) if known else None,
             "interval": None if ends is None else list(ends),

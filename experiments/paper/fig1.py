@@ -28,6 +28,8 @@ from experiments.comparison import budget, variants, variants_report
 from experiments.comparison.variants import Budget, Variant
 from spnr_jax import cli, data, training
 from spnr_jax.config import TrainConfig
+from spnr_jax.formats import data_sets
+from spnr_jax.training import optimisation
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,7 +56,7 @@ class Fig1:
 def main(options: Fig1) -> None:
     """Trains what is not trained, scores all weights, writes tables and pictures."""
     cli.set_up_jax()
-    dataset = data.open_dataset(options.data)
+    dataset = data_sets.open_dataset(options.data)
     names, config = options.budget.names(dataset), options.budget.config()
     data.check_resolution(data.read_object(dataset, names[0]), config)
     variants.claim(options.out, "fig1", options.budget, dataset, pretrain=options.pretrain)
@@ -66,7 +68,7 @@ def main(options: Fig1) -> None:
     variants_report.write(options.out, runs, reference, compared, options.budget, dataset, {"start": start})
 
 
-def variant(options: Fig1, weight: float, config: TrainConfig, dataset: data.Dataset) -> Variant:
+def variant(options: Fig1, weight: float, config: TrainConfig, dataset: data_sets.Dataset) -> Variant:
     """The training with one weight of the L1 loss."""
     loss = dataclasses.replace(config.loss, l1_weight=weight, adversarial_weight=1.0, adversarial_start=0.0)
     return Variant(
@@ -78,7 +80,7 @@ def variant(options: Fig1, weight: float, config: TrainConfig, dataset: data.Dat
     )
 
 
-def pretrained(options: Fig1, dataset: data.Dataset, config: TrainConfig) -> training.TrainState:
+def pretrained(options: Fig1, dataset: data_sets.Dataset, config: TrainConfig) -> optimisation.TrainState:
     """A fresh state whose generator was trained with the L1 loss alone."""
     loss = dataclasses.replace(config.loss, l1_weight=100.0, adversarial_weight=0.0)
     before = dataclasses.replace(config, loss=loss, num_steps=options.pretrain)

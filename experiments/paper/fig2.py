@@ -84,7 +84,7 @@ def generation(options: Fig2, folder: Path) -> GenerateConfig:
     )
 
 
-def trainings(options: Fig2, dataset: data.Dataset) -> list[Variant]:
+def trainings(options: Fig2, dataset: data_sets.Dataset) -> list[Variant]:
     """The training without variants, and that with them; ValueError if the data set has none."""
     plain, config = variants.without_colour_variants(dataset), options.budget.config()
     if plain.splits == dataset.splits:
@@ -98,7 +98,7 @@ def trainings(options: Fig2, dataset: data.Dataset) -> list[Variant]:
     ]
 
 
-def variants_picture(dataset: data.Dataset, num_objects: int) -> bytes:
+def variants_picture(dataset: data_sets.Dataset, num_objects: int) -> bytes:
     """PNG: a row a training object, itself and its variants; each seen by its camera that is nearest to the object's.
 
     The view of an object is the one that its variants come nearest to: cameras are random, and each has its own.
@@ -109,7 +109,7 @@ def variants_picture(dataset: data.Dataset, num_objects: int) -> bytes:
             found.setdefault(variants.original(name), []).append(name)
     rows, most = [], min(MOST_SHOWN, max(map(len, found.values())))
     for product in evaluation.spread(tuple(p for p in found if len(found[p]) >= most), num_objects):
-        items = [data.read_object(dataset, name) for name in (product, *found[product][:most])]
+        items = [data_sets.read_object(dataset, name) for name in (product, *found[product][:most])]
         views = nearest_views([np.asarray(item.camera.cam_to_world)[..., 3] for item in items])
         images = [data.on_white(item.images[view]) for item, view in zip(items, views, strict=True)]
         rows.append((product, images))

@@ -48,7 +48,7 @@ NOTE = (
 )
 PICTURE = f"In the picture: errors in grey, black from {WORST:g} on; floaters red, missed pixels blue."
 
-Shown = Callable[[data.ObjectData, PointCloud], tuple[np.ndarray, np.ndarray]]
+Shown = Callable[[data_sets.ObjectData, PointCloud], tuple[np.ndarray, np.ndarray]]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,7 +109,7 @@ def main(options: Fig3) -> None:
         "objects": list(names),
         "views": len(next(iter(maps.values()))[2]),
         "pixels": {method: truth.shape[-1] for method, (_, _, truth) in maps.items()},
-        "hardware": evaluation.hardware(),
+        "hardware": machine.hardware(),
         "data": dataset.settings.get("settings", {}),
         "seed": "nothing is drawn: samples lie at the middles of their strata",
     }
@@ -133,7 +133,7 @@ def all_methods(options: Fig3, dataset: data.Dataset) -> tuple[dict[str, Method]
 def of_network(network: networks.Network) -> Method:
     """The depth that a network renders."""
 
-    def show(item: data.ObjectData, cloud: PointCloud) -> tuple[np.ndarray, np.ndarray]:
+    def show(item: data_sets.ObjectData, cloud: PointCloud) -> tuple[np.ndarray, np.ndarray]:
         pictures = evaluation.on_host(network.show()(cloud, item.camera))
         assert pictures.depth is not None
         return np.asarray(pictures.depth), np.asarray(pictures.acc)
@@ -141,13 +141,13 @@ def of_network(network: networks.Network) -> Method:
     return Method(show=show, identity=network.identity)
 
 
-def of_surface(config: poisson.PoissonConfig) -> Method:
+def of_surface(config: poisson_surface.PoissonConfig) -> Method:
     """The depth of a surface that is made of the points; nothing where they span none."""
 
-    def show(item: data.ObjectData, cloud: PointCloud) -> tuple[np.ndarray, np.ndarray]:
+    def show(item: data_sets.ObjectData, cloud: PointCloud) -> tuple[np.ndarray, np.ndarray]:
         try:
-            asset = poisson.reconstruct(jax.tree.map(np.asarray, cloud), config)
-        except poisson.NoSurface:
+            asset = poisson_surface.reconstruct(jax.tree.map(np.asarray, cloud), config)
+        except poisson_surface.NoSurface:
             return (np.zeros(item.images.shape[:3], np.float32),) * 2
         found = cast_views(depth.caster(asset), item.camera)
         hit = np.isfinite(found)
@@ -157,10 +157,10 @@ def of_surface(config: poisson.PoissonConfig) -> Method:
 
 
 def object_maps(
-    options: Fig3, dataset: data.Dataset, item: data.ObjectData, found: dict[str, Method], points: int
+    options: Fig3, dataset: data_sets.Dataset, item: data_sets.ObjectData, found: dict[str, Method], points: int
 ) -> dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Depth, opacity and true depth (views, h, w) of an object by method; read where they are made."""
-    cloud = evaluation.first_points(item, points)
+    cloud = data_sets.first_points(item, points)
     maps = {}
     for name, method in found.items():
         seen, acc = kept(options.out / "depths" / name / f"{item.name}.npz", partial(method.show, item, cloud))
@@ -171,7 +171,7 @@ def object_maps(
 
 
 def true_depth(
-    dataset: data.Dataset, item: data.ObjectData, meshes: Path | None, size: tuple[int, ...]
+    dataset: data_sets.Dataset, item: data_sets.ObjectData, meshes: Path | None, size: tuple[int, ...]
 ) -> tuple[np.ndarray]:
     """Distances (views, *size) to the mesh that the object was made from."""
     cast = depth.caster(mesh_of(dataset, item, meshes))
@@ -184,14 +184,14 @@ def far_side(camera: Camera, size: tuple[int, ...]) -> np.ndarray:
     return np.asarray(cameras.intersect_box(rays.origins, rays.directions)[1])
 
 
-def picture_row(item: data.ObjectData, maps: dict, scores: dict[str, list]) -> tuple[str, list[np.ndarray]]:
+def picture_row(item: data_sets.ObjectData, maps: dict, scores: dict[str, list]) -> tuple[str, list[np.ndarray]]:
     """Reference, truth, and depth and error of each method, in the view whose error is the first method's median."""
     first = np.nan_to_num(next(iter(scores.values()))[-1]["error"], nan=np.inf)
     view = evaluation.median_view(first)
     finest = max((truth[view] for _, _, truth in maps.values()), key=len)
     inside = np.isfinite(finest)
     span = (float(finest[inside].min()), float(finest[inside].max())) if inside.any() else (0.0, 1.0)
-    cells = [data.on_white(item.images[view])]
+    cells = [data_sets.on_white(item.images[view])]
     cells.append(depth_image(np.where(inside, finest, 0), inside, span))
     for seen, acc, truth in maps.values():
         cells += [depth_image(seen[view], acc[view], span), error_image(seen[view], acc[view], truth[view])]

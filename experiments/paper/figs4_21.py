@@ -79,7 +79,7 @@ def main(options: Gallery) -> None:
         "psnr": {label: [round(value, 3) for value in row] for label, row in scores.items() if label != REFERENCE},
         "made of": {label: network.identity for label, network in trained.items()},
         "points": points,
-        "hardware": evaluation.hardware(),
+        "hardware": machine.hardware(),
         "data": dataset.settings.get("settings", {}),
         "seed": "nothing is drawn: samples lie at the middles of their strata",
         "note": note,
@@ -118,7 +118,7 @@ def all_pictures(
     return shown
 
 
-def shortage(dataset: data.Dataset, options: Gallery) -> str:
+def shortage(dataset: data_sets.Dataset, options: Gallery) -> str:
     """A line where the data set has fewer test objects than asked, with how to make more; else nothing."""
     count, wanted = len(dataset.splits["test"]), options.objects
     if count >= wanted or options.quick:

@@ -30,7 +30,10 @@ from spnr_jax import cli, data, evaluation
 from spnr_jax.config import TrainConfig
 from spnr_jax.lpips_weights import read_weights
 from spnr_jax.presets import PRESETS
-from spnr_jax.summary import differences, metric_settings, summarise
+from spnr_jax.scoring import evaluation
+from spnr_jax.scoring.lpips_weights import read_weights
+from spnr_jax.scoring.summary import differences, metric_settings, summarise
+from spnr_jax.training import run_record
 
 Row = Literal[
     "ours", "plus", "npbg", "point_nerf", "points2nerf", "poisson", "poisson_trimmed", "nearest", "splat", "white"
@@ -82,9 +85,9 @@ class Table1:
 def main(options: Table1) -> None:
     """Trains what is not trained, scores all methods, writes the tables and the page."""
     cli.set_up_jax()
-    dataset = data.open_dataset(options.data)
+    dataset = data_sets.open_dataset(options.data)
     names = test_objects(dataset, options.objects or (QUICK_OBJECTS if options.budget == "quick" else None))
-    first = data.read_object(dataset, names[0])
+    first = data_sets.read_object(dataset, names[0])
     category = dataset.settings.get("settings", {}).get("category")
     presets = budget.presets(options.budget, first.camera.height, category)
     config = PRESETS[presets["ours"]]()  # its points and pixels are given to every method
@@ -155,7 +158,7 @@ def surface_folder(options: Table1, config: TrainConfig, row: str) -> Path:
 
 
 def surface_methods(
-    options: Table1, dataset: data.Dataset, config: TrainConfig
+    options: Table1, dataset: data_sets.Dataset, config: TrainConfig
 ) -> tuple[dict[str, ObjectMethod], dict[str, str]]:
     """The Poisson rows in the data set's light, and those that have to be left out, with the reason."""
     wanted = {name: surface for name, surface in poisson.SURFACES.items() if name in options.methods}
@@ -173,7 +176,7 @@ def surface_methods(
 
 
 def floor_methods(
-    options: Table1, dataset: data.Dataset, config: TrainConfig
+    options: Table1, dataset: data_sets.Dataset, config: TrainConfig
 ) -> tuple[dict[str, ObjectMethod], dict[str, float]]:
     """The trivial renderers, and the radius factors that are best for them on training objects."""
     wanted: list[str] = [name for name in reversed(evaluation.FLOORS) if name in options.methods]
@@ -181,7 +184,7 @@ def floor_methods(
     return {name: of_cloud(evaluation.floor(name, factors.get(name, 1.0)), config) for name in wanted}, factors
 
 
-def train_networks(options: Table1, dataset: data.Dataset, presets: dict[str, str]) -> dict[str, Trained]:
+def train_networks(options: Table1, dataset: data_sets.Dataset, presets: dict[str, str]) -> dict[str, Trained]:
     """The networks of the table, one after another; finished ones are only read."""
     wanted: list[str] = [name for name in NETWORKS if name in options.methods]
     trained = {}

@@ -64,7 +64,7 @@ def main(options: Loading) -> None:
                 print(f"{preset} left out: it needs images of {settings.model.image_resolution} px, these have {size}")
                 continue
             for form, place in (("folder", options.dataset), ("packed", Path(folder) / "packed")):
-                figures = measure(data.open_dataset(place), settings, options)
+                figures = measure(data_sets.open_dataset(place), settings, options)
                 rows.append({"preset": preset, "form": form, "batch_objects": settings.batch_objects, **figures})
                 print(json.dumps(rows[-1]), file=sys.stderr)
     if not rows:
@@ -73,12 +73,12 @@ def main(options: Loading) -> None:
     results.write(options.out / str(size), found, [table(rows)], [evaluation.hardware()])
 
 
-def image_size(dataset: data.Dataset) -> int:
+def image_size(dataset: data_sets.Dataset) -> int:
     """Width of the data set's images in pixels."""
-    return data.read_object(dataset, dataset.splits["train"][0]).camera.width
+    return data_sets.read_object(dataset, dataset.splits["train"][0]).camera.width
 
 
-def measure(dataset: data.Dataset, settings: TrainConfig, options: Loading) -> dict[str, float]:
+def measure(dataset: data_sets.Dataset, settings: TrainConfig, options: Loading) -> dict[str, float]:
     """The figures of one data set under one preset, with the discriminator at work."""
     settings = dataclasses.replace(settings, num_steps=1 + max(options.steps, options.batches))
     waits, steps = time_steps(dataset, settings, options.steps)
@@ -89,9 +89,9 @@ def measure(dataset: data.Dataset, settings: TrainConfig, options: Loading) -> d
     }
 
 
-def samples_per_second(dataset: data.Dataset, settings: TrainConfig, num_batches: int) -> float:
+def samples_per_second(dataset: data_sets.Dataset, settings: TrainConfig, num_batches: int) -> float:
     """Objects a second that the loader delivers, after the first batch."""
-    with closing(data.batches(dataset, settings, 0, cache_bytes=0)) as batches:
+    with closing(batching.batches(dataset, settings, 0, cache_bytes=0)) as batches:
         next(batches)
         start = time.monotonic()
         for _ in range(num_batches):
@@ -99,16 +99,16 @@ def samples_per_second(dataset: data.Dataset, settings: TrainConfig, num_batches
         return num_batches * settings.batch_objects / (time.monotonic() - start)
 
 
-def time_steps(dataset: data.Dataset, settings: TrainConfig, num_steps: int) -> tuple[list[float], list[float]]:
+def time_steps(dataset: data_sets.Dataset, settings: TrainConfig, num_steps: int) -> tuple[list[float], list[float]]:
     """Seconds of each train step before its batch was there, and in all."""
-    state = training.jitted_create_state(settings)
+    state = optimisation.jitted_create_state(settings)
     waits, steps = [], []
-    with closing(data.batches(dataset, settings, 0, cache_bytes=0)) as batches:
+    with closing(batching.batches(dataset, settings, 0, cache_bytes=0)) as batches:
         for _ in tqdm(range(1 + num_steps), desc=f"{settings.preset} {dataset.folder.name}"):
             start = time.monotonic()
             batch = next(batches)
             waits.append(time.monotonic() - start)
-            state, metrics = training.jitted_train_step(
+            state, metrics = optimisation.jitted_train_step(
                 state, jax.device_put(batch), config=settings, adversarial=settings.loss.adversarial_weight > 0
             )
             jax.block_until_ready((state, metrics))

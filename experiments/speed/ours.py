@@ -15,9 +15,12 @@ import numpy as np
 from experiments.speed import scene, twin_layout, worker
 from spnr_jax import memory, training
 from spnr_jax.config import TrainConfig
+from spnr_jax.devices import allocator
+from spnr_jax.kernels.records import Batch
+from spnr_jax.method import inference
 from spnr_jax.model_config import ModelConfig
 from spnr_jax.presets import PRESETS
-from spnr_jax.types import Batch
+from spnr_jax.training import optimisation
 
 NUM_GROUPS, DISCRIMINATOR_WIDTH = 8, 64  # the twin's, for every preset
 NEAR_POINTS = {"tiny": (16, 0), "small": (16, 16), "abo": (32, 32)}  # coarse and fine samples
@@ -84,16 +87,16 @@ def batch(config: TrainConfig) -> Batch:
 
 def function(config: TrainConfig, batch: Batch, mode: str) -> Callable[[], object]:
     """One step, one encoding of the batch, or one view of each of its volumes; returns when it is done."""
-    state = training.jitted_create_state(config)
+    state = optimisation.jitted_create_state(config)
     if mode.startswith("train"):
 
         def step() -> None:
             nonlocal state
-            state, metrics = training.jitted_train_step(state, batch, config=config, adversarial=mode == "train")
+            state, metrics = optimisation.jitted_train_step(state, batch, config=config, adversarial=mode == "train")
             jax.block_until_ready((state, metrics))
 
         return step
-    variables, cloud = training.averaged_variables(state), batch.cloud
+    variables, cloud = optimisation.averaged_variables(state), batch.cloud
     if mode == "encode":
         return lambda: jax.block_until_ready(training.jitted_encode(variables, cloud, config=config.model))
     volume = training.jitted_encode(variables, cloud, config=config.model)

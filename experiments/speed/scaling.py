@@ -29,7 +29,6 @@ from experiments.speed import ours, worker
 from spnr_jax import cameras, cli, evaluation
 from spnr_jax.config import TrainConfig
 from spnr_jax.model_config import ModelConfig
-from spnr_jax.types import Batch
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from spnr_jax.config import LossConfig, OptimizerConfig, TrainConfig
+from spnr_jax.kernels.records import Batch, Camera, PointCloud
 from spnr_jax.model_config import ModelConfig, SamplingConfig
-from spnr_jax.types import Batch, Camera, PointCloud
 
 Arrays = Mapping[str, np.ndarray]
 

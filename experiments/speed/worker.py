@@ -19,7 +19,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
 
-from spnr_jax import memory
+from spnr_jax.devices import allocator
 
 FEWEST = 3  # timed runs of a turn
 
@@ -79,7 +79,7 @@ def serve(make: Callable[[dict], tuple[Callable[[], object], dict]]) -> None:
     answers = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)  # what a library prints is no answer
     sys.stdout = sys.stderr  # unbuffered: it stands before an error's last words
-    memory.keep()
+    allocator.keep()
     os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[: spec["threads"]])
     start = time.perf_counter()
     run, facts = make(spec)
@@ -107,7 +107,7 @@ def turn(run: Callable[[], object], seconds: float) -> list[float]:
 def forget_peak() -> None:
     """Gives unused memory back and has the kernel count the peak from here on, where it can (Linux)."""
     gc.collect()
-    memory.give_back()
+    allocator.give_back()
     counter = Path("/proc/self/clear_refs")
     if counter.exists():
         counter.write_text("5")

@@ -29,6 +29,7 @@ from experiments.comparison import variants, variants_report
 from experiments.comparison.variants import Budget, Variant
 from spnr_jax import cli, data, presets
 from spnr_jax.config import LossConfig, TrainConfig
+from spnr_jax.formats import data_sets
 from spnr_jax.model_config import ModelConfig, SamplingConfig
 
 REFERENCE = "reference"
@@ -88,10 +89,10 @@ class Ablations:
 def main(options: Ablations) -> None:
     """Trains what is not trained, scores all rows, writes tables and pictures."""
     cli.set_up_jax()
-    dataset = data.open_dataset(options.data)
+    dataset = data_sets.open_dataset(options.data)
     budget, config = options.budget, options.budget.config()
     parts, compared = folds(dataset, options.folds), []
-    data.check_resolution(data.read_object(dataset, budget.names(parts[0])[0]), config)
+    data_sets.check_resolution(data_sets.read_object(dataset, budget.names(parts[0])[0]), config)
     held_out = {"folds": options.folds} if options.folds > 1 else {}
     variants.claim(options.out, "ablations", budget, dataset, **held_out)
     for number, part in enumerate(parts):
@@ -105,7 +106,7 @@ def main(options: Ablations) -> None:
     variants_report.write(options.out, runs, REFERENCE, variants.merged(compared), budget, dataset)
 
 
-def folds(dataset: data.Dataset, count: int) -> list[data.Dataset]:
+def folds(dataset: data_sets.Dataset, count: int) -> list[data_sets.Dataset]:
     """The data set with each part of its objects as the test split, or as it is; variants train beside their object."""
     if count == 1:
         return [dataset]
@@ -121,7 +122,7 @@ def folds(dataset: data.Dataset, count: int) -> list[data.Dataset]:
     return found
 
 
-def rows(wanted: tuple[Row, ...], config: TrainConfig, dataset: data.Dataset) -> list[Variant]:
+def rows(wanted: tuple[Row, ...], config: TrainConfig, dataset: data_sets.Dataset) -> list[Variant]:
     """The reference, and the rows that differ from it; a line says which do not."""
     found = [Variant(name=REFERENCE, label=f"Unchanged ({config.preset})", config=config, dataset=dataset)]
     for name in (name for name in ROWS if name in wanted):

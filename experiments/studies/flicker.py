@@ -113,7 +113,7 @@ def turntable(like: Camera, frames: int, elevation: float) -> Camera:
 
 
 def true_frames(
-    options: Flicker, dataset: data.Dataset, item: data.ObjectData, camera: Camera
+    options: Flicker, dataset: data_sets.Dataset, item: data_sets.ObjectData, camera: Camera
 ) -> tuple[np.ndarray, np.ndarray]:
     """References on white (frames, h, w, 3) uint8 and distances to the mesh (frames, h, w), inf beside it."""
     asset = mesh_of(dataset, item, options.meshes)
@@ -122,18 +122,18 @@ def true_frames(
     poses = np.tile(np.eye(4), (len(camera.cam_to_world), 1, 1))
     poses[:, :3] = camera.cam_to_world
     pictures = [views.straight_srgb(views.render_view(scene, pose, config, i)) for i, pose in enumerate(poses)]
-    references = to_uint8(np.stack([data.on_white(picture) for picture in pictures]))
+    references = to_uint8(np.stack([data_sets.on_white(picture) for picture in pictures]))
     return references, cast_views(depth.caster(asset), camera)
 
 
-def light_of(dataset: data.Dataset, envmap: Path | None) -> np.ndarray:
+def light_of(dataset: data_sets.Dataset, envmap: Path | None) -> np.ndarray:
     """The scaled environment map (height, width, 3) of the data set."""
     return light.scaled_to_white(unscaled_light(dataset.settings["environment_map"], envmap))
 
 
 def frames_of(network: Network, item: data.ObjectData, camera: Camera) -> np.ndarray:
     """The network's pictures (frames, h, w, 3) of the object's first points, ten frames at a time."""
-    cloud, show = evaluation.first_points(item, network.config.test_points), network.show()
+    cloud, show = data_sets.first_points(item, network.config.test_points), network.show()
     parts = []
     for start in range(0, len(camera.cam_to_world), 10):
         few = jax.tree.map(lambda x, start=start: x[start : start + 10], camera)
@@ -170,7 +170,7 @@ def summarise(curves: dict[str, list[np.ndarray]], names: Sequence[str]) -> dict
     rows = {}
     for label, found in means.items():
         ratios = found / means[REFERENCE]
-        ends = statistics.interval([np.array([ratio]) for ratio in ratios])
+        ends = intervals.interval([np.array([ratio]) for ratio in ratios])
         rows[label] = {
             "flicker": float(found.mean()),
             "ratio": float(ratios.mean()),

@@ -114,10 +114,10 @@ def main(options: PointCount) -> None:
     results.write(options.out, whole, report.tables_of(whole), report.notes(whole), files)
 
 
-def available_counts(options: PointCount, dataset: data.Dataset, name: str) -> list[int]:
+def available_counts(options: PointCount, dataset: data_sets.Dataset, name: str) -> list[int]:
     """The counts that can be had; a line names those that cannot, and why."""
     counts = [options.counts[0], options.counts[-1]] if options.quick else list(options.counts)
-    item = data.read_object(dataset, name)
+    item = data_sets.read_object(dataset, name)
     stored = len(item.cloud.positions)
     try:
         if counts[-1] > stored:
@@ -165,15 +165,15 @@ def of_floor(name: str, factor: float) -> Method:
 def of_surface(renderer: poisson.Renderer, name: str) -> Method:
     """A Poisson surface of the points."""
 
-    def show(item: data.ObjectData) -> evaluation.Pictures:
+    def show(item: data_sets.ObjectData) -> evaluation.Pictures:
         rgba, _ = renderer.pictures(item, len(item.cloud.mask), SURFACES[name])
-        return evaluation.Pictures(image=data.on_white(rgba), acc=rgba[..., 3].astype(np.float32) / 255)
+        return evaluation.Pictures(image=data_sets.on_white(rgba), acc=rgba[..., 3].astype(np.float32) / 255)
 
     return Method(show=show, identity=asdict(SURFACES[name]))
 
 
 def kept_scores(
-    options: PointCount, dataset: data.Dataset, names: tuple[str, ...], label: str, method: Method, count: int
+    options: PointCount, dataset: data_sets.Dataset, names: tuple[str, ...], label: str, method: Method, count: int
 ) -> Scores:
     """The scores of a method at a count, with a picture of one object; read where they are made."""
     place = options.out / label / f"{count}.json"
@@ -191,22 +191,22 @@ def kept_scores(
 
 
 def measure(
-    dataset: data.Dataset, name: str, method: Method, count: int, meshes: Path | None
+    dataset: data_sets.Dataset, name: str, method: Method, count: int, meshes: Path | None
 ) -> tuple[dict[str, list[float]], np.ndarray]:
     """Scores of every view of an object from so many points, and the picture of the first one."""
-    item = data.read_object(dataset, name)
+    item = data_sets.read_object(dataset, name)
     item = dataclasses.replace(item, cloud=cloud_of(dataset, item, count, meshes))
     pictures = evaluation.on_host(method.show(item))
     found = evaluation.score_pictures(item, pictures)
     return {metric: np.asarray(found[metric], np.float64).tolist() for metric in METRICS}, np.asarray(pictures.image[0])
 
 
-def cloud_of(dataset: data.Dataset, item: data.ObjectData, count: int, meshes: Path | None) -> PointCloud:
+def cloud_of(dataset: data_sets.Dataset, item: data_sets.ObjectData, count: int, meshes: Path | None) -> PointCloud:
     """So many points of an object: stored ones, or if there are not enough new ones from its mesh."""
     if count <= len(item.cloud.positions):
-        return evaluation.first_points(item, count)
+        return data_sets.first_points(item, count)
     seed = details(dataset, item.name)["seeds"]["points"]
-    drawn = points.sample_surface(mesh_of(dataset, item, meshes), count, seed, dataset.spread)
+    drawn = surface_points.sample_surface(mesh_of(dataset, item, meshes), count, seed, dataset.spread)
     return PointCloud(
         positions=drawn.positions,
         base_color=drawn.base_color,
@@ -233,7 +233,7 @@ def curve(method: Method, scores: dict[int, Scores]) -> dict[str, list[dict]]:
             {
                 "points": count,
                 "mean": mean(found, metric),
-                "interval": statistics.interval([np.array(row[metric]) for row in found.values()]),
+                "interval": intervals.interval([np.array(row[metric]) for row in found.values()]),
             }
             for count, found in scores.items()
         ]
@@ -263,7 +263,7 @@ def by_class(scores: dict[str, Scores]) -> dict[str, dict]:
 
 
 def strip(
-    options: PointCount, dataset: data.Dataset, name: str, labels: Sequence[str], counts: Sequence[int]
+    options: PointCount, dataset: data_sets.Dataset, name: str, labels: Sequence[str], counts: Sequence[int]
 ) -> np.ndarray:
     """One object: a row for each method, a column for each count, and the reference before them."""
     reference = data.on_white(data.read_object(dataset, name).images[0])

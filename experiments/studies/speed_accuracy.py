@@ -37,7 +37,8 @@ from experiments.comparison.tables import Table, number, text
 from spnr_jax import checkpoint, cli, data, evaluation, training
 from spnr_jax.config import TrainConfig
 from spnr_jax.model_config import ModelConfig, SamplingConfig
-from spnr_jax.supersampling import rays_per_side
+from spnr_jax.scoring import evaluation
+from spnr_jax.training import checkpoint, optimisation, run_record
 
 REPEATS = 5
 TIMED_OBJECTS = 8
@@ -115,7 +116,7 @@ def settings(config: TrainConfig) -> list[Setting]:
 def main(options: SpeedAccuracy) -> None:
     """Measures the settings that are not measured, then writes the table and the plot."""
     cli.set_up_jax()
-    dataset = data.open_dataset(options.data)
+    dataset = data_sets.open_dataset(options.data)
     names = test_objects(dataset, options.objects)
     results.claim(options.out, "results", {"objects": list(names)}, dataset)
     todo = [(run, setting) for run in options.runs for setting in settings(checkpoint.read_config(run))]
@@ -139,21 +140,23 @@ def main(options: SpeedAccuracy) -> None:
     results.write(options.out, found, [table(rows, chosen)], [best], {"front.png": plot(rows, chosen)})
 
 
-def measure(variables: dict, config: TrainConfig, dataset: data.Dataset, names: tuple[str, ...]) -> dict[str, float]:
+def measure(
+    variables: dict, config: TrainConfig, dataset: data_sets.Dataset, names: tuple[str, ...]
+) -> dict[str, float]:
     """Mean scores over the objects' images, times and memory of one setting."""
     show = {"ours": evaluation.network(variables, config)}
     scores = [result.scores["ours"] for result in evaluation.evaluate_objects(show, config, dataset, names)]
     means = {m: float(np.mean(np.concatenate([s[m] for s in scores]))) for m in ("psnr", "ssim", "flip", "iou")}
     model, encodes, views = config.model, [], []
     for name in names[:TIMED_OBJECTS]:
-        item = data.read_object(dataset, name)
-        cloud = jax.tree.map(lambda x: jnp.asarray(x)[None], evaluation.test_cloud(item, config))
+        item = data_sets.read_object(dataset, name)
+        cloud = jax.tree.map(lambda x: jnp.asarray(x)[None], data_sets.test_cloud(item, config))
         camera = jax.tree.map(lambda x: jnp.asarray(x)[None, :1], item.camera)
-        encodes.append(fastest(lambda c=cloud: training.jitted_encode(variables, c, config=model)))
-        scene = training.jitted_encode(variables, cloud, config=model)
-        render = partial(training.jitted_render, config=model, rays_per_side=rays_per_side(model, item.camera.width))
+        encodes.append(fastest(lambda c=cloud: inference.jitted_encode(variables, c, config=model)))
+        scene = inference.jitted_encode(variables, cloud, config=model)
+        render = partial(inference.jitted_render, config=model, rays_per_side=rays_per_side(model, item.camera.width))
         views.append(fastest(partial(render, variables, scene, camera)))
-    analysis = training.jitted_render.lower(variables, scene, camera, **render.keywords).compile().memory_analysis()
+    analysis = inference.jitted_render.lower(variables, scene, camera, **render.keywords).compile().memory_analysis()
     memory = analysis.temp_size_in_bytes / 2**20 if analysis else float("nan")
     times = {"ms_view": float(np.median(views)), "ms_encode": float(np.median(encodes))}
     return {name: round(value, 4) for name, value in (means | times | {"temporary_mb": memory}).items()}

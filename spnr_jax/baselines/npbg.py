@@ -16,12 +16,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from spnr_jax import cameras
+from spnr_jax.kernels import cameras
+from spnr_jax.kernels.numerics import per_feature
+from spnr_jax.kernels.records import Camera, Key, PointCloud, Rendering
+from spnr_jax.kernels.resizing import bilinear
 from spnr_jax.model_config import NPBGConfig
 from spnr_jax.nn.convolution import conv
-from spnr_jax.numerics import per_feature
-from spnr_jax.resizing import bilinear
-from spnr_jax.types import Camera, Key, PointCloud, Rendering
 
 
 def visible_points(

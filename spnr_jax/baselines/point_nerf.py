@@ -22,12 +22,12 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from spnr_jax import cameras, compositing, sampling
-from spnr_jax.distributed import on_own_rays
-from spnr_jax.empty_space import map_existing
+from spnr_jax.devices.placement import on_own_rays
+from spnr_jax.kernels import cameras, compositing, sampling
+from spnr_jax.kernels.numerics import length, per_feature, softplus
+from spnr_jax.kernels.occupancy import map_existing
+from spnr_jax.kernels.records import Camera, Key, PointCloud, Rays, Rendering
 from spnr_jax.model_config import MATERIAL_CHANNELS, PointNeRFConfig
-from spnr_jax.numerics import length, per_feature, softplus
-from spnr_jax.types import Camera, Key, PointCloud, Rays, Rendering
 
 BLOCK = 1024  # shading points at once: 8 MB for a layer of 256 with 8 neighbours
 SLOPE, GAIN = 0.01, math.sqrt(2 / (1 + 0.01**2))  # of the leaky ReLU, and what it asks of the weights before it

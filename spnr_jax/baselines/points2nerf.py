@@ -26,11 +26,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from spnr_jax import cameras, compositing, sampling
+from spnr_jax.kernels import cameras, compositing, sampling
+from spnr_jax.kernels.numerics import per_feature, softplus
+from spnr_jax.kernels.records import Camera, Key, PointCloud, Rays, Rendering
 from spnr_jax.model_config import Points2NeRFConfig
 from spnr_jax.nn.encoding import encode_direction
-from spnr_jax.numerics import per_feature, softplus
-from spnr_jax.types import Camera, Key, PointCloud, Rays, Rendering
 
 PAINTED = 1e10  # length of a ray's last interval in faithful mode
 QUIET = -6.0  # log variance that a scaled encoder begins with: codes are told apart from the first step on

@@ -4,9 +4,9 @@ import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from spnr_jax.kernels.numerics import per_feature
 from spnr_jax.nn.convolution import conv, kernel_init
 from spnr_jax.nn.normalization import GroupNorm
-from spnr_jax.numerics import per_feature
 
 SLOPE = 0.2
 

@@ -9,9 +9,9 @@ import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from spnr_jax.compositing import WHITE
+from spnr_jax.kernels.compositing import WHITE
+from spnr_jax.kernels.numerics import per_feature, softplus
 from spnr_jax.nn.encoding import encode_direction
-from spnr_jax.numerics import per_feature, softplus
 
 
 class RadianceField(nn.Module):

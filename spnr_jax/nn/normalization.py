@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from spnr_jax.numerics import computed_once, per_feature
+from spnr_jax.kernels.numerics import computed_once, per_feature
 
 EPSILON = 1e-5
 

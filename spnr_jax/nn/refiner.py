@@ -12,10 +12,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from spnr_jax.compositing import WHITE
+from spnr_jax.kernels.compositing import WHITE
+from spnr_jax.kernels.numerics import per_feature
+from spnr_jax.kernels.resizing import bilinear, folded, mean_of_squares, unfolded
 from spnr_jax.nn.convolution import conv, kernel_init
-from spnr_jax.numerics import per_feature
-from spnr_jax.resizing import bilinear, folded, mean_of_squares, unfolded
 
 LEVELS = 3  # of the U-Net
 FOLD = 2  # pixels along each side of what the first level takes as one

@@ -17,11 +17,11 @@ import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from spnr_jax.colors import LEAST_OPACITY, over
-from spnr_jax.compositing import WHITE
+from spnr_jax.kernels.colors import LEAST_OPACITY, over
+from spnr_jax.kernels.compositing import WHITE
+from spnr_jax.kernels.numerics import softplus
+from spnr_jax.kernels.records import SurfaceSample
 from spnr_jax.nn.encoding import encode_direction
-from spnr_jax.numerics import softplus
-from spnr_jax.types import SurfaceSample
 
 DIELECTRIC = 0.04  # reflectance of plastic, wood, paint at normal incidence
 STRENGTH = 4.0  # optical depth per spacing of depth, of one unit of the network's output

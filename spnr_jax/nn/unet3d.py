@@ -13,10 +13,10 @@ import flax.linen as nn
 import jax
 from jaxtyping import Array, Float, Int
 
-from spnr_jax.distributed import divide_depth
+from spnr_jax.devices.placement import divide_depth
+from spnr_jax.kernels.voxels import scatter_conv
 from spnr_jax.nn.convolution import conv, kernel_init, upsample_conv
 from spnr_jax.nn.normalization import GroupNorm
-from spnr_jax.voxels import scatter_conv
 
 
 class Stem(nn.Module):

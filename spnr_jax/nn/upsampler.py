@@ -4,9 +4,9 @@ import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from spnr_jax.kernels.numerics import per_feature
+from spnr_jax.kernels.resizing import bilinear
 from spnr_jax.nn.convolution import conv, kernel_init, upsample_conv
-from spnr_jax.numerics import per_feature
-from spnr_jax.resizing import bilinear
 
 SLOPE = 0.2
 

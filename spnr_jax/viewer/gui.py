@@ -13,8 +13,8 @@ from typing import Any, cast
 import numpy as np
 import viser
 
-from spnr_jax.model import Model, Quality
-from spnr_jax.viewer import levels, scene, session, uploads, views
+from spnr_jax.method.model import Model, Quality
+from spnr_jax.viewer import levels, scene, session, uploads, viewpoint
 from spnr_jax.viewer.loop import Loop
 from spnr_jax.viewer.picture import LAYERS
 from spnr_jax.viewer.scene import Material, Scene
@@ -114,7 +114,7 @@ class Browser:
         self._look(camera)
 
     def _look(self, camera: viser.CameraHandle) -> None:
-        view = views.from_browser(camera.wxyz, camera.position, camera.fov, camera.image_width, camera.image_height)
+        view = viewpoint.from_browser(camera.wxyz, camera.position, camera.fov, camera.image_width, camera.image_height)
         if view is not None:
             self._replace(view=view)
 
@@ -219,7 +219,7 @@ class Browser:
         camera, start = self._client.camera, time.monotonic()
         for i, (position, rotation) in enumerate(poses):
             with self._client.atomic():
-                camera.position, camera.wxyz = position, views.to_browser(rotation)
+                camera.position, camera.wxyz = position, viewpoint.to_browser(rotation)
             time.sleep(max(start + (i + 1) / session.FRAMES_PER_SECOND - time.monotonic(), 0))
             if self.loop.stopped or not self._playing.is_set():
                 break

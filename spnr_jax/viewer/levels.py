@@ -7,7 +7,7 @@ viewer measures.
 
 from dataclasses import dataclass
 
-from spnr_jax.model import Quality
+from spnr_jax.method.model import Quality
 
 SOURCE = "README, Speed and quality: `tiny`, 12 unseen objects, 64 x 64"
 

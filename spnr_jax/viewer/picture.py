@@ -13,12 +13,12 @@ from typing import Literal
 import numpy as np
 from PIL import Image, ImageDraw
 
-from spnr_jax import images
-from spnr_jax.model import Model, Quality
-from spnr_jax.types import Camera, Rendering
-from spnr_jax.viewer import views
+from spnr_jax.formats import images
+from spnr_jax.kernels.records import Camera, Rendering
+from spnr_jax.method.model import Model, Quality
+from spnr_jax.viewer import viewpoint
 from spnr_jax.viewer.scene import Scene
-from spnr_jax.viewer.views import View
+from spnr_jax.viewer.viewpoint import View
 
 Layer = Literal["points", "picture", "depth", "opacity"]
 LAYERS: tuple[Layer, ...] = ("points", "picture", "depth", "opacity")
@@ -53,22 +53,22 @@ def draw(
 
     `longest` bounds the pixels of the canvas's longer side; labels name the panes' layers.
     """
-    width, height = views.pane_size(view, len(panes), longest)
+    width, height = viewpoint.pane_size(view, len(panes), longest)
     rendering, milliseconds = None, None
     if quality is not None and any(layer != "points" for layer in panes):
         begin = time.perf_counter()
-        camera = views.square_camera(view, scene.volume, width, height, size)
+        camera = viewpoint.square_camera(view, scene.volume, width, height, size)
         rendering = model.render(scene.volume, camera, quality)
         squares = {layer: _square(rendering, layer) for layer in panes if layer != "points"}
         milliseconds = 1000 * (time.perf_counter() - begin)
     drawn = []
     for layer in panes:
         if layer == "points":
-            picture = draw_points(scene, views.pane_camera(view, scene.volume, width, height))
+            picture = draw_points(scene, viewpoint.pane_camera(view, scene.volume, width, height))
         elif rendering is None:
             picture = np.full((height, width, 3), 255, np.uint8)
         else:
-            picture = views.cut(squares[layer], width, height)
+            picture = viewpoint.cut(squares[layer], width, height)
         waiting = layer != "points" and rendering is None
         label = f"{layer}: the network is being prepared" if waiting else layer
         drawn.append(_labelled(picture, label) if labels else picture)
@@ -86,7 +86,7 @@ def _square(rendering: Rendering, layer: Layer) -> np.ndarray:
 
 def draw_points(scene: Scene, camera: Camera) -> np.ndarray:
     """The points as discs on white, near ones over far ones, selected ones ringed: (height, width, 3) uint8."""
-    pixels, depth = views.project(camera, np.asarray(scene.cloud.positions))
+    pixels, depth = viewpoint.project(camera, np.asarray(scene.cloud.positions))
     order = np.argsort(-depth)
     order = order[depth[order] > 0]
     rings = scene.selected.any()

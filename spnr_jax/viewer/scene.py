@@ -12,11 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial import cKDTree
 
-from spnr_jax.colors import linear_to_srgb, srgb_to_linear
-from spnr_jax.images import to_uint8
-from spnr_jax.model import Model, Volume
-from spnr_jax.types import Camera, PointCloud
-from spnr_jax.viewer.views import project
+from spnr_jax.formats.images import to_uint8
+from spnr_jax.kernels.colors import linear_to_srgb, srgb_to_linear
+from spnr_jax.kernels.records import Camera, PointCloud
+from spnr_jax.method.model import Model, Volume
+from spnr_jax.viewer.viewpoint import project
 
 Material = Literal["base_color", "roughness", "metallic"]
 RADIUS_PER_SPACING = 0.7

@@ -14,13 +14,14 @@ from pathlib import Path
 import numpy as np
 import viser
 
-from spnr_jax import clouds
-from spnr_jax.model import FIELD_OF_VIEW, Model, load
+from spnr_jax.formats import clouds
+from spnr_jax.method.model import FIELD_OF_VIEW, Model
+from spnr_jax.training.weights import load
 from spnr_jax.viewer import session, uploads
 from spnr_jax.viewer.gui import Browser, Reading
 from spnr_jax.viewer.scene import Scene, open_scene
 from spnr_jax.viewer.session import State
-from spnr_jax.viewer.views import View
+from spnr_jax.viewer.viewpoint import View
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 EYE = (1.7, 1.2, 2.9)  # in the box: where a browser looks from at first, at its middle

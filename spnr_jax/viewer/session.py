@@ -13,14 +13,13 @@ from typing import Any, cast
 
 import numpy as np
 
-from spnr_jax import images
-from spnr_jax.model import SAMPLES, Model, Quality
-from spnr_jax.viewer import path as camera_path
-from spnr_jax.viewer import picture
-from spnr_jax.viewer.path import Keyframe
+from spnr_jax.formats import images
+from spnr_jax.method.model import SAMPLES, Model, Quality
+from spnr_jax.viewer import camera_path, picture
+from spnr_jax.viewer.camera_path import Keyframe
 from spnr_jax.viewer.picture import LAYERS, Drawn, Layer
 from spnr_jax.viewer.scene import Scene, encoded, select_rectangle
-from spnr_jax.viewer.views import FARTHEST, View, in_pane, pane_camera, pane_size
+from spnr_jax.viewer.viewpoint import FARTHEST, View, in_pane, pane_camera, pane_size
 
 MOVING: Quality = "draft"
 MOVING_LONGEST, LONGEST = 960, 1600  # pixels of the canvas's longer side, while it moves and at rest

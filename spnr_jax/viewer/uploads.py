@@ -9,8 +9,8 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path, PurePath
 
-from spnr_jax import clouds
-from spnr_jax.types import PointCloud
+from spnr_jax.formats import clouds
+from spnr_jax.kernels.records import PointCloud
 
 LONGEST_NAME = 60
 

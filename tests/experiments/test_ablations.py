@@ -5,8 +5,8 @@ import json
 
 import numpy as np
 import pytest
-import tiny_dataset
-from tiny_runs import check_conditions, results_of, shrunken
+from support import tiny_dataset
+from support.tiny_runs import check_conditions, results_of, shrunken
 
 from experiments.comparison import budget as budgets
 from experiments.comparison import variants, variants_report
@@ -14,6 +14,9 @@ from experiments.comparison.variants import Budget, Compared
 from experiments.studies.ablations import LABELS, ROWS, Ablations, changed, folds, main, rows
 from spnr_jax import checkpoint, cli, data, evaluation, presets, training
 from spnr_jax.config import to_dict
+from spnr_jax.formats import data_sets
+from spnr_jax.scoring import evaluation
+from spnr_jax.training import checkpoint, optimisation, trainer
 
 pytestmark = pytest.mark.ci  # it trains several networks
 PLUS_ROWS = ("free_colour", "no_neighbours", "three_neighbours", "twelve_neighbours", "batch_norm")
@@ -122,7 +125,7 @@ def test_scores_and_differences_are_those_of_the_runs_on_the_same_views(out):
     results, psnr = results_of(out), {}
     for row in ("reference", "skip_concat"):
         found, state = checkpoint.load_run(out / "runs" / f"{row}_0")
-        show = {row: evaluation.network(training.averaged_variables(state), found)}
+        show = {row: evaluation.network(optimisation.averaged_variables(state), found)}
         scored = evaluation.evaluate_objects(show, found, tiny_dataset.dataset(), ("ball_000004", "chair"))
         own = {result.name: result.scores[row]["psnr"] for result in scored}
         psnr[row] = np.concatenate(list(own.values()))
@@ -151,7 +154,7 @@ def test_every_object_is_scored_once_by_networks_that_never_saw_it(tmp_path):
     psnr = []
     for number, part in enumerate(folds(tiny_dataset.dataset(), 3)):
         found, state = checkpoint.load_run(tmp_path / f"fold_{number}" / "runs" / "reference_0")
-        show = {"shown": evaluation.network(training.averaged_variables(state), found)}
+        show = {"shown": evaluation.network(optimisation.averaged_variables(state), found)}
         scored = evaluation.evaluate_objects(show, found, part, part.splits["test"])
         psnr += [result.scores["shown"]["psnr"] for result in scored]
     assert results["variants"]["reference"]["psnr"] == pytest.approx(np.mean(np.concatenate(psnr)), abs=1e-5)
@@ -230,8 +233,8 @@ def test_the_pace_of_a_run_is_not_that_of_its_compilations(tmp_path):
 
 
 def test_scores_inside_the_silhouette_do_not_see_the_rest():
-    item = data.read_object(tiny_dataset.dataset(), "chair")
-    reference = data.on_white(item.images)
+    item = data_sets.read_object(tiny_dataset.dataset(), "chair")
+    reference = data_sets.on_white(item.images)
     outside = item.images[..., 3:] <= 127
     spoilt = np.where(outside, np.float32(0.5), reference)
     found = variants.more_scores(item, evaluation.Pictures(image=spoilt, acc=spoilt[..., 0]))

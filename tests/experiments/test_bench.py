@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import twin
+from support import twin
 
 from experiments.speed import bench, ours, scene, twin_layout
 from experiments.speed import worker as workers

@@ -5,8 +5,8 @@ import json
 from itertools import chain
 
 import pytest
-import tiny_dataset
-from tiny_baselines import BASELINE, SHRUNKEN
+from support import tiny_dataset
+from support.tiny_baselines import BASELINE, SHRUNKEN
 
 from experiments.comparison import budget as budgets
 from spnr_jax import checkpoint, data, presets, training

@@ -5,7 +5,7 @@ import shutil
 from types import SimpleNamespace
 
 import pytest
-import tiny_dataset
+from support import tiny_dataset
 
 from experiments.packaged import demo
 from spnr_jax import cli, presets

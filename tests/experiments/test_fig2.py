@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-import tiny_dataset
-from tiny_runs import check_conditions, results_of, shrunken
+from support import tiny_dataset
+from support.tiny_runs import check_conditions, results_of, shrunken
 
 from experiments.comparison.variants import Budget
 from experiments.paper.fig2 import Fig2, main, nearest_views, trainings
@@ -44,7 +44,7 @@ def test_both_trainings_are_scored_on_the_same_objects(out):
 
 
 def test_the_trainings_differ_in_the_training_split_alone(folder):
-    dataset = data.open_dataset(folder)
+    dataset = data_sets.open_dataset(folder)
     plain, whole = trainings(Fig2(out=folder, data=folder), dataset)
     assert plain.config == whole.config
     assert whole.dataset == dataset

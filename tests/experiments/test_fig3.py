@@ -5,9 +5,8 @@ import json
 
 import numpy as np
 import pytest
-import stand_ins
-import tiny_dataset
-from handmade import ball
+from support import stand_ins, tiny_dataset
+from support.handmade import ball
 
 from data_gen.assets import Asset
 from data_gen.poisson import PoissonConfig
@@ -137,7 +136,7 @@ def test_a_second_call_makes_nothing_again_and_gives_the_same(out, monkeypatch):
 @pytest.mark.skipif(importlib.util.find_spec("pymeshlab") is None, reason="pymeshlab is not installed")
 def test_a_poisson_surface_of_many_points_has_the_depth_of_the_ball():
     dataset = tiny_dataset.dataset()
-    item = data.read_object(dataset, dataset.splits["test"][0])
+    item = data_sets.read_object(dataset, dataset.splits["test"][0])
     normals = np.random.default_rng(0).normal(size=(800, 3)).astype(np.float32)
     positions = tiny_dataset.RADIUS * normals / np.linalg.norm(normals, axis=1, keepdims=True)
     color, one = np.zeros_like(positions), np.zeros(800, np.float32)

@@ -4,9 +4,8 @@ import dataclasses
 
 import numpy as np
 import pytest
-import stand_ins
-import tiny_dataset
 from PIL import Image
+from support import stand_ins, tiny_dataset
 
 from data_gen import records
 from experiments.comparison import figures, networks
@@ -30,7 +29,7 @@ def asked(out, **options):
 
 
 def reference(name, view=0):
-    return np.round(255 * data.on_white(data.read_object(tiny_dataset.dataset(), name).images[view]))
+    return np.round(255 * data_sets.on_white(data_sets.read_object(tiny_dataset.dataset(), name).images[view]))
 
 
 def place(sheet, column, row=0):
@@ -39,7 +38,7 @@ def place(sheet, column, row=0):
 
 
 def test_every_sheet_has_the_objects_in_the_same_place_page_after_page(tmp_path, monkeypatch):
-    read = data.read_object
+    read = data_sets.read_object
 
     def with_a_darker_view(*arguments):
         item = read(*arguments)
@@ -47,7 +46,7 @@ def test_every_sheet_has_the_objects_in_the_same_place_page_after_page(tmp_path,
         images[1, ..., :3] //= 2
         return dataclasses.replace(item, images=images)
 
-    monkeypatch.setattr(data, "read_object", with_a_darker_view)
+    monkeypatch.setattr(data_sets, "read_object", with_a_darker_view)
     main(asked(tmp_path, view=1))
     sheets_of = {path.name for path in tmp_path.glob("*_[12].png")}
     assert sheets_of == {f"{stem}_{page}.png" for stem in ("reference", "ours", "ours-a-run") for page in (1, 2)}
@@ -93,7 +92,7 @@ def test_poisson_pictures_of_a_table_are_shown_where_there_is_one_of_every_objec
     for name in NAMES:
         folder = table / f"poisson_{points}" / name
         folder.mkdir(parents=True)
-        (folder / "000.png").write_bytes(records.encode_image(grey))
+        (folder / "000.png").write_bytes(layout.encode_image(grey))
         (folder / "made.json").write_text("{}")
     main(asked(tmp_path / "out", sources=Sources(table1=table)))
     assert (place(tmp_path / "out" / "poisson_1.png", 0) == 99).all()

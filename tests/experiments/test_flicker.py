@@ -5,8 +5,7 @@ import json
 
 import numpy as np
 import pytest
-import tiny_dataset
-import tiny_untrained
+from support import tiny_dataset, tiny_untrained
 
 from data_gen.variant import choose_variant, mitsuba_module
 from experiments.comparison.networks import Sources
@@ -99,12 +98,12 @@ def test_the_whole_way(tmp_path, monkeypatch):
         ValueError, match="--frames 3: neighbouring ones see no place of ball_000004 in common; take more"
     ):
         flicker.main(dataclasses.replace(options, frames=3, out=tmp_path / "few"))
-    assert isinstance(data.open_dataset(options.data), data.Dataset)
+    assert isinstance(data_sets.open_dataset(options.data), data_sets.Dataset)
 
 
 def box():
-    from handmade import box as part
+    from support.handmade import box as part
 
-    from data_gen.assets import Asset
+    from spnr_jax.formats.mesh.assets import Asset
 
     return Asset(parts=(part(),))

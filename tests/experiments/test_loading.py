@@ -5,7 +5,7 @@ import shutil
 import time
 
 import pytest
-import tiny_dataset
+from support import tiny_dataset
 
 from data_gen import records
 from experiments.speed import loading
@@ -15,8 +15,8 @@ from spnr_jax import data, presets
 @pytest.fixture
 def folder(tmp_path):
     target = shutil.copytree(tiny_dataset.dataset().folder, tmp_path / "data")
-    records.write_text(target / "dataset.json", records.json_text({"schema_version": records.SCHEMA_VERSION}))
-    records.write_text(target / "rejected.jsonl", "")
+    layout.write_text(target / "dataset.json", layout.json_text({"schema_version": layout.SCHEMA_VERSION}))
+    layout.write_text(target / "rejected.jsonl", "")
     return target
 
 
@@ -39,9 +39,9 @@ def test_both_forms_are_measured_and_a_preset_of_another_size_is_left_out(folder
 
 
 def test_a_slow_reader_is_seen_as_waiting(folder, quick, monkeypatch):
-    read = data.read_object
-    monkeypatch.setattr(data, "read_object", lambda *a: time.sleep(0.1) or read(*a))
-    waits, steps = loading.time_steps(data.open_dataset(folder), presets.PRESETS["tiny"](), 4)
+    read = data_sets.read_object
+    monkeypatch.setattr(data_sets, "read_object", lambda *a: time.sleep(0.1) or read(*a))
+    waits, steps = loading.time_steps(data_sets.open_dataset(folder), presets.PRESETS["tiny"](), 4)
     assert len(waits) == len(steps) == 4
     assert 0.5 < sum(waits) / sum(steps) < 1
 

@@ -6,8 +6,7 @@ import shutil
 from pathlib import Path
 
 import pytest
-import stand_ins
-import tiny_dataset
+from support import stand_ins, tiny_dataset
 
 from experiments.comparison import networks as methods
 from experiments.comparison.networks import Sources, networks
@@ -46,7 +45,7 @@ def test_what_cannot_be_compared_is_refused_by_name(table, tmp_path):
         networks(Sources(table1=tmp_path), dataset)
     with pytest.raises(ValueError, match="--runs: a run folder is named twice"):
         networks(Sources(runs=(stand_ins.fresh("tiny"),) * 2), dataset)
-    larger = data.open_dataset(tiny_dataset.write_dataset(tmp_path / "data", size=2 * tiny_dataset.SIZE))
+    larger = data_sets.open_dataset(tiny_dataset.write_dataset(tmp_path / "data", size=2 * tiny_dataset.SIZE))
     with pytest.raises(ValueError, match=r"images of 48 x 48 pixels, [^\n]*needs 24 x 24"):
         networks(Sources(table1=table), larger)
     with pytest.raises(ValueError, match="--objects: expected 1 or more, got 0"):
@@ -57,6 +56,6 @@ def test_what_cannot_be_compared_is_refused_by_name(table, tmp_path):
 
 
 def test_points_are_always_the_first_ones():
-    item = data.read_object(tiny_dataset.dataset(), tiny_dataset.SPLITS["test"][0])
-    assert (evaluation.first_points(item, 7).positions == item.cloud.positions[:7]).all()
-    assert len(evaluation.first_points(item, 10_000).mask) == tiny_dataset.POINTS
+    item = data_sets.read_object(tiny_dataset.dataset(), tiny_dataset.SPLITS["test"][0])
+    assert (data_sets.first_points(item, 7).positions == item.cloud.positions[:7]).all()
+    assert len(data_sets.first_points(item, 10_000).mask) == tiny_dataset.POINTS

@@ -53,7 +53,7 @@ def out(tmp_path_factory):
 
 def test_a_cloud_holds_the_first_points_and_beyond_those_new_ones_of_the_mesh():
     dataset = tiny_dataset.dataset()
-    item = data.read_object(dataset, NAMES[0])
+    item = data_sets.read_object(dataset, NAMES[0])
     np.testing.assert_array_equal(cloud_of(dataset, item, 16, None).positions, item.cloud.positions[:16])
     many = cloud_of(dataset, item, 300, None)
     assert many.mask.shape == (300,)
@@ -69,15 +69,15 @@ def test_the_curves_are_the_scores_of_the_evaluation_at_each_count(out):
     assert results["counts"] == list(COUNTS)
     dataset, scores = tiny_dataset.dataset(), []
     for name in NAMES:
-        item = data.read_object(dataset, name)
-        shown = evaluation.floor("splat", 1.5)(evaluation.first_points(item, 16), item.camera)
+        item = data_sets.read_object(dataset, name)
+        shown = evaluation.floor("splat", 1.5)(data_sets.first_points(item, 16), item.camera)
         alpha = item.images[..., 3] / np.float32(255)
-        scores.append(evaluation.score(shown.image, shown.acc, data.on_white(item.images), alpha, alpha > 0))
+        scores.append(evaluation.score(shown.image, shown.acc, data_sets.on_white(item.images), alpha, alpha > 0))
     for metric in point_count.METRICS:
         values = [np.asarray(row[metric], np.float64) for row in scores]
         (point,) = [p for p in results["curves"]["Base-colour splat"][metric] if p["points"] == 16]
         assert point["mean"] == pytest.approx(np.mean(values), rel=1e-6)
-        assert point["interval"] == pytest.approx(statistics.interval(values), rel=1e-6)
+        assert point["interval"] == pytest.approx(intervals.interval(values), rel=1e-6)
 
 
 def test_a_method_without_opacity_has_no_curve_of_it(out):

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from handmade import RED, ball, plain
+from support.handmade import RED, ball, plain
 
 from data_gen import light, normals, points, poisson, records, views
 from data_gen.assets import Asset
@@ -79,26 +79,26 @@ def test_the_order_of_the_points_does_not_matter_to_their_normals():
 )
 def test_points_that_span_no_surface_are_refused_in_one_line(positions):
     with pytest.raises(NoSurface, match=f"^{len(positions)} points[^\n]*a surface needs[^\n]*$"):
-        poisson.reconstruct(cloud_of(positions), QUICK)
+        poisson_surface.reconstruct(cloud_of(positions), QUICK)
 
 
 def test_masked_points_are_no_points():
     with pytest.raises(NoSurface, match="^1 points"):
-        poisson.reconstruct(SPHERE.replace(mask=np.arange(COUNT) < 1), QUICK)
+        poisson_surface.reconstruct(SPHERE.replace(mask=np.arange(COUNT) < 1), QUICK)
 
 
 def test_trimming_cuts_off_the_least_supported_vertices_and_the_faces_on_them():
     square = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [9, 9, 0]], float)
     faces = np.array([[0, 1, 2], [0, 2, 3], [2, 4, 3]])
-    vertices, kept = poisson.trimmed(square, faces, np.array([4.0, 5, 6, 7, 1]), 0.2)
+    vertices, kept = poisson_surface.trimmed(square, faces, np.array([4.0, 5, 6, 7, 1]), 0.2)
     np.testing.assert_array_equal(vertices, square[:4])
     np.testing.assert_array_equal(kept, faces[:2])
-    np.testing.assert_array_equal(poisson.trimmed(square, faces, np.zeros(5), 0.0)[1], faces)
+    np.testing.assert_array_equal(poisson_surface.trimmed(square, faces, np.zeros(5), 0.0)[1], faces)
 
 
 def test_the_normal_of_a_vertex_is_the_mean_of_its_faces_by_area_and_no_face_gives_the_y_axis():
     corners = np.array([[0, 0, 0], [2, 0, 0], [0, 2, 0], [0, 0, 1], [5, 5, 5]], float)
-    found = poisson.vertex_normals(corners, np.array([[0, 1, 2], [0, 2, 3]]))
+    found = poisson_surface.vertex_normals(corners, np.array([[0, 1, 2], [0, 2, 3]]))
     np.testing.assert_allclose(found[0], np.array([1, 0, 2]) / np.sqrt(5))
     np.testing.assert_allclose(found[1], [0, 0, 1])
     np.testing.assert_allclose(found[4], [0, 1, 0])
@@ -106,7 +106,7 @@ def test_the_normal_of_a_vertex_is_the_mean_of_its_faces_by_area_and_no_face_giv
 
 @needs_solver
 def test_a_sphere_of_points_is_a_closed_sphere_that_faces_outwards_in_the_colours_of_the_nearest_points():
-    asset = poisson.reconstruct(SPHERE, QUICK)
+    asset = poisson_surface.reconstruct(SPHERE, QUICK)
     (part,) = asset.parts
     edges = np.sort(part.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     assert (np.unique(edges, axis=0, return_counts=True)[1] == 2).all()  # watertight
@@ -124,7 +124,7 @@ def test_a_sphere_of_points_is_a_closed_sphere_that_faces_outwards_in_the_colour
 
 @needs_solver
 def test_the_same_points_give_the_same_surface():
-    first, again = (poisson.reconstruct(SPHERE, QUICK).parts[0] for _ in range(2))
+    first, again = (poisson_surface.reconstruct(SPHERE, QUICK).parts[0] for _ in range(2))
     np.testing.assert_array_equal(first.positions, again.positions)
     np.testing.assert_array_equal(first.faces, again.faces)
 
@@ -132,7 +132,7 @@ def test_the_same_points_give_the_same_surface():
 @needs_solver
 def test_points_in_a_plane_give_a_flat_sheet():
     positions = np.random.default_rng(4).uniform(-0.6, 0.6, (300, 3)) * [1, 1, 0]
-    (part,) = poisson.reconstruct(cloud_of(positions), QUICK).parts
+    (part,) = poisson_surface.reconstruct(cloud_of(positions), QUICK).parts
     assert len(part.faces)
     assert np.abs(part.positions[:, 2]).max() < 0.01
 
@@ -140,7 +140,7 @@ def test_points_in_a_plane_give_a_flat_sheet():
 def test_a_missing_solver_is_one_line_that_says_what_to_install(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "pymeshlab", None)
     with pytest.raises(ValueError, match=r"^Poisson[^\n]*pip install[^\n]*baselines[^\n]*$"):
-        poisson.reconstruct(SPHERE, QUICK)
+        poisson_surface.reconstruct(SPHERE, QUICK)
 
 
 @pytest.mark.parametrize(("wrong", "name"), [({"depth": 0}, "depth"), ({"trim": 1.0}, "trim")])
@@ -157,33 +157,33 @@ def dataset(tmp_path_factory):
     """A data set of one red ball and one line of points, lit by the procedural room."""
     folder = tmp_path_factory.mktemp("poisson") / "data"
     asset = Asset(parts=(ball(radius=RADIUS, material=plain(RED)),))
-    surface = points.sample_surface(asset, COUNT, 0)
+    surface = surface_points.sample_surface(asset, COUNT, 0)
     poses = views.random_viewpoints(VIEW.views, VIEW.distance, np.random.default_rng(5))
     lamp = light.scaled_to_white(light.indoor_envmap())
     images, conditions = views.render_views(asset, surface, poses, lamp, VIEW, 6)
-    packed = records.pack_points(surface)
+    packed = layout.pack_points(surface)
     line = packed.copy()
     line["x"], line["y"], line["z"] = 0, np.linspace(-0.9, 0.9, COUNT), 0
     for name, content in (("ball", packed), ("line", line)):
-        records.write_object(
+        layout.write_object(
             folder,
             name,
-            records.ObjectRecord(
+            layout.ObjectRecord(
                 points=content,
-                transforms=records.nerf_transforms(poses, VIEW.resolution, VIEW.fov, VIEW.focal_length),
+                transforms=layout.nerf_transforms(poses, VIEW.resolution, VIEW.fov, VIEW.focal_length),
                 images=images,
                 conditions=conditions,
                 details={},
             ),
         )
     for split, names in (("train", ""), ("val", ""), ("test", "ball\nline\n")):
-        records.write_text(folder / "splits" / f"{split}.txt", names)
+        layout.write_text(folder / "splits" / f"{split}.txt", names)
     description = {
-        "schema_version": records.SCHEMA_VERSION,
+        "schema_version": layout.SCHEMA_VERSION,
         "settings": vars(VIEW),
         "environment_map": {"name": "procedural room", "sha256": None},
     }
-    records.write_text(folder / "dataset.json", records.json_text(description))
+    layout.write_text(folder / "dataset.json", layout.json_text(description))
     return folder
 
 

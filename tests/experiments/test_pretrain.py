@@ -7,8 +7,7 @@ import shutil
 import jax
 import numpy as np
 import pytest
-import tiny_dataset
-import tiny_model
+from support import tiny_dataset, tiny_model
 
 from experiments.packaged import pretrain
 from spnr_jax import cli, data, presets, run_record, weights
@@ -55,10 +54,10 @@ def test_both_data_sets_train_one_network_and_its_file_is_what_was_scored(asked,
     assert (meshes.meshes, meshes.colour_variants, meshes.reshape_variants) == (tmp_path, 24, True)
     assert meshes.test_list == tmp_path / "test.txt"
     assert {procedural.spread, meshes.spread} == {"even"}
-    joined, single = data.open_dataset(options.out / "data"), tiny_dataset.dataset()
+    joined, single = data_sets.open_dataset(options.out / "data"), tiny_dataset.dataset()
     for split, names in single.splits.items():
         assert set(joined.splits[split]) == {*names, *(f"mesh-{name}" for name in names)}
-    assert data.read_object(joined, f"mesh-{single.splits['test'][0]}").images.size
+    assert data_sets.read_object(joined, f"mesh-{single.splits['test'][0]}").images.size
     trained, out = weights.read_trained(options.out / "small.npz"), options.out / "small"
     last = presets.with_refiner(pretrain.recipe(options)[-1])
     assert (trained.config, trained.steps) == (dataclasses.replace(last, num_steps=2), 2)

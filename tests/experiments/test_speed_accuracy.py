@@ -4,13 +4,13 @@ import dataclasses
 import json
 
 import pytest
-import tiny_dataset
-import tiny_model
+from support import tiny_dataset, tiny_model
 
 from experiments.studies import speed_accuracy
 from experiments.studies.speed_accuracy import SpeedAccuracy, front, knee, main, settings
 from spnr_jax import checkpoint, training
 from spnr_jax.config import LossConfig
+from spnr_jax.training import checkpoint, optimisation
 
 
 def row(ms, psnr):
@@ -76,7 +76,9 @@ def test_a_second_call_goes_on_where_the_first_one_stopped(tmp_path, monkeypatch
 def test_a_setting_is_scored_and_timed():
     config, state = checkpoint.load_run(tiny_dataset.run())
     dataset = tiny_dataset.dataset()
-    figures = speed_accuracy.measure(training.averaged_variables(state), config, dataset, dataset.splits["test"][:1])
+    figures = speed_accuracy.measure(
+        optimisation.averaged_variables(state), config, dataset, dataset.splits["test"][:1]
+    )
     assert figures["psnr"] > 5
     assert figures["ms_view"] > 0
     assert figures["temporary_mb"] > 0

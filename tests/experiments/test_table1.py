@@ -13,9 +13,9 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
-import tiny_dataset
 from PIL import Image
-from tiny_baselines import BASELINE, SHRUNKEN, SIZE
+from support import tiny_dataset
+from support.tiny_baselines import BASELINE, SHRUNKEN, SIZE
 
 from data_gen import poisson as surfaces
 from data_gen import records, views
@@ -47,11 +47,11 @@ def dataset(tmp_path_factory):
     folder = tmp_path_factory.mktemp("table1") / "data"
     shutil.copytree(tiny_dataset.dataset().folder, folder)
     described = {
-        "schema_version": records.SCHEMA_VERSION,
+        "schema_version": layout.SCHEMA_VERSION,
         "settings": vars(views.ViewConfig(resolution=SIZE, spp=4, views=tiny_dataset.VIEWS, max_depth=2)),
         "environment_map": {"name": "procedural room", "sha256": None},
     }
-    records.write_text(folder / "dataset.json", records.json_text(described))
+    layout.write_text(folder / "dataset.json", layout.json_text(described))
     return folder
 
 
@@ -77,7 +77,7 @@ def out(dataset, tmp_path_factory):
 
 
 def test_scores_of_ours_and_the_floors_are_those_of_the_evaluation_of_its_run(out, dataset):
-    found = evaluation.evaluate(out / "runs" / "ours", data.open_dataset(dataset)).summary
+    found = evaluation.evaluate(out / "runs" / "ours", data_sets.open_dataset(dataset)).summary
     results = results_of(out)
     for method in ("ours", *evaluation.FLOORS):
         assert results["methods"][method] == found["methods"][method]
@@ -88,7 +88,7 @@ def test_a_finished_table_is_not_trained_again(out, dataset, monkeypatch):
     def forbidden(*_, **__):
         raise AssertionError("something was made again")
 
-    monkeypatch.setattr(training, "jitted_train_step", forbidden)
+    monkeypatch.setattr(optimisation, "jitted_train_step", forbidden)
     monkeypatch.setattr(poisson.Renderer, "pictures", forbidden)
     before, costs = results_of(out), json.loads((out / "results.json").read_text())["costs"]
     table1.main(asked(dataset, out))
@@ -133,13 +133,13 @@ def test_without_the_solver_the_rows_say_what_to_install(dataset, tmp_path, monk
 
 @pytest.mark.skipif(not SOLVER, reason="pymeshlab is not installed")
 def test_a_poisson_row_shows_the_surface_of_the_points_that_the_networks_see(out, dataset):
-    found, name = data.open_dataset(dataset), tiny_dataset.SPLITS["test"][0]
-    item, points = data.read_object(found, name), tiny_dataset.CONFIG.test_points
+    found, name = data_sets.open_dataset(dataset), tiny_dataset.SPLITS["test"][0]
+    item, points = data_sets.read_object(found, name), tiny_dataset.CONFIG.test_points
     renderer = poisson.Renderer(found.settings, variant="scalar_rgb")
     expected, empty = renderer.pictures(item, points, surfaces.PoissonConfig(depth=5))
     folder = out / f"poisson_{points}" / name
     for view, picture in enumerate(expected):
-        np.testing.assert_array_equal(records.read_image(folder / f"{view:03d}.png"), picture)
+        np.testing.assert_array_equal(layout.read_image(folder / f"{view:03d}.png"), picture)
     assert json.loads((folder / "made.json").read_text())["empty"] == empty
 
 
@@ -178,8 +178,8 @@ def test_the_page_loads_nothing_and_holds_every_picture(out, dataset):
     assert tuple(content["methods"]) == tuple(LABELS[name] for name in METHODS)
     assert [shown["name"] for shown in content["objects"]] == list(tiny_dataset.SPLITS["test"])
     for shown in content["objects"]:
-        item = data.read_object(data.open_dataset(dataset), shown["name"])
-        reference = np.round(255 * data.on_white(item.images[shown["view"]]))
+        item = data_sets.read_object(data_sets.open_dataset(dataset), shown["name"])
+        reference = np.round(255 * data_sets.on_white(item.images[shown["view"]]))
         np.testing.assert_array_equal(decoded(shown["reference"]), reference)
         for method, address in shown["images"].items():
             error = np.mean((decoded(address) / 255 - reference / 255) ** 2)

@@ -17,8 +17,7 @@ from damage import Files
 
 from spnr_jax.model import Model, Volume
 from spnr_jax.presets import tiny
-from spnr_jax.types import PointCloud
-from spnr_jax.viewer import picture, scene, session, uploads, views
+from spnr_jax.viewer import picture, scene, session, uploads, viewpoint
 from spnr_jax.viewer.scene import Scene
 from spnr_jax.viewer.session import State
 
@@ -75,7 +74,7 @@ def read_message(folder: Path, main: str) -> None:
     if not isinstance(sent, dict) or not all(isinstance(sent.get(key), dict) for key in ("camera", "controls")):
         raise ValueError("viser passes on named values alone")
     look, controls, state = sent["camera"], sent["controls"], _state()
-    view = views.from_browser(*(look.get(name) for name in CAMERA))
+    view = viewpoint.from_browser(*(look.get(name) for name in CAMERA))
     state = dataclasses.replace(state, view=view)
     state = session.select(state, sent.get("low"), sent.get("high"), add=True)
     for target in sent["look_at"] if isinstance(sent.get("look_at"), list) else []:

@@ -31,7 +31,7 @@ class Reader:
 
 def read_cloud(folder: Path, main: str) -> None:
     """What `spnr render` and `spnr view` do with a file of points or a mesh."""
-    from spnr_jax import clouds
+    from spnr_jax.formats import clouds
 
     placed = clouds.place_cloud(folder / main, num_points=MOST_POINTS, report=lambda line: None)
     check_cloud(placed.cloud, MOST_POINTS)
@@ -59,8 +59,8 @@ def check_cloud(cloud, most: int | None = None) -> None:
 
 def read_config(folder: Path, main: str) -> None:
     """A run folder's config."""
-    from spnr_jax.checkpoint import read_config
     from spnr_jax.config import from_dict, to_dict
+    from spnr_jax.training.checkpoint import read_config
 
     config = read_config(folder)
     hash(config)  # it is a static argument of jit
@@ -69,7 +69,7 @@ def read_config(folder: Path, main: str) -> None:
 
 def read_metrics(folder: Path, main: str) -> None:
     """The rows that a report draws."""
-    from spnr_jax.trainer import read_rows
+    from spnr_jax.training.trainer import read_rows
 
     for row in read_rows(folder):
         assert isinstance(row, dict), f"a row that is a {type(row).__name__}"
@@ -78,11 +78,11 @@ def read_metrics(folder: Path, main: str) -> None:
 
 def read_dataset(folder: Path, main: str) -> None:
     """Every object of a data set, as training reads it."""
-    from spnr_jax import data
+    from spnr_jax.formats import data_sets
 
-    dataset = data.open_dataset(folder)
+    dataset = data_sets.open_dataset(folder)
     for name in dataset.splits["train"][:3]:
-        item = data.read_object(dataset, name)
+        item = data_sets.read_object(dataset, name)
         check_cloud(item.cloud)
         views, height, width = len(item.camera.cam_to_world), item.camera.height, item.camera.width
         for images in (item.images, item.conditions):
@@ -135,7 +135,7 @@ def shards() -> list[Files]:
 
 def check_dataset(folder: Path, main: str) -> None:
     """What `spnr-data check` says, and what `spnr-data pack` would put into a record."""
-    from data_gen import check, pack
+    from data_gen.store import check, pack
 
     with contextlib.redirect_stdout(io.StringIO()):
         sound = check.check(folder)
@@ -146,8 +146,8 @@ def check_dataset(folder: Path, main: str) -> None:
 
 def read_list(folder: Path, main: str) -> None:
     """Splits that a user names, and the tables of other data sets."""
-    from data_gen import splits
-    from data_gen.sources import abo
+    from data_gen.plan import splits
+    from data_gen.plan.sources import abo
 
     path, known = folder / main, {"a", "b"}
     if main.startswith("3dmodels"):
@@ -162,14 +162,14 @@ def read_list(folder: Path, main: str) -> None:
 
 def read_lpips(folder: Path, main: str) -> None:
     """LPIPS weights."""
-    from spnr_jax.lpips_weights import read_weights
+    from spnr_jax.scoring.lpips_weights import read_weights
 
     read_weights(folder / main)
 
 
 def read_network(folder: Path, main: str) -> None:
     """A file of weights."""
-    from spnr_jax.weights import Trained, read_weights
+    from spnr_jax.training.weights import Trained, read_weights
 
     assert isinstance(read_weights(folder / main), Trained)
 

@@ -43,7 +43,7 @@ PLUS = dataclasses.replace(
 MODELS = {
     "plain": tiny_model.MODEL,
     "near points": PLUS,
-    "Point-NeRF": dataclasses.replace(test_point_nerf.CONFIG, image_resolution=24),
+    "Point-NeRF": dataclasses.replace(tiny_model.POINT_NERF, image_resolution=24),
 }
 SIZES = {"plain": 16, "near points": 9, "Point-NeRF": 9}  # of pictures: their rays are no multiple of 8, 16 rows are
 
@@ -65,15 +65,15 @@ def main() -> None:
 def inputs(model, size: int):
     """Variables of a network, an object as it encodes it, cameras."""
     cloud, camera = jax.tree.map(lambda x: x[:1], (tiny_model.cloud(), tiny_model.camera(size, target=0.013)))
-    variables = tiny_model.wobbled(jax.jit(training.network(model).init)(jax.random.key(0), cloud, camera), 4)
-    return variables, training.jitted_encode(variables, cloud, config=model), camera
+    variables = tiny_model.wobbled(jax.jit(inference.network(model).init)(jax.random.key(0), cloud, camera), 4)
+    return variables, inference.jitted_encode(variables, cloud, config=model), camera
 
 
 def rendered(model, size: int) -> float:
     """Largest difference between the renderings of one device and of all."""
     arguments = inputs(model, size)
-    render = partial(training.jitted_render, config=model, ray_chunk=16)
-    one, all_of_them = render(*arguments), distributed.by_all_devices(render, *arguments)
+    render = partial(inference.jitted_render, config=model, ray_chunk=16)
+    one, all_of_them = render(*arguments), placement.by_all_devices(render, *arguments)
     assert all_of_them.image.sharding.device_set == one.image.sharding.device_set
     return max(float(jnp.abs(a - b).max()) for a, b in zip(*map(jax.tree.leaves, (one, all_of_them)), strict=True))
 
@@ -121,8 +121,8 @@ def blocks() -> list[list[int]]:
     counts = []
     with counting() as ran, mock.patch.object(renderer, "CPU_BLOCK", 4):
         arguments = inputs(PLUS, SIZES["near points"])
-        render = jax.jit(partial(training.render, config=PLUS))
-        for run in (render, partial(distributed.by_all_devices, render)):
+        render = jax.jit(partial(inference.render, config=PLUS))
+        for run in (render, partial(placement.by_all_devices, render)):
             ran.clear()
             jax.block_until_ready(run(*arguments))
             jax.effects_barrier()

@@ -105,35 +105,35 @@ def test_eight_devices_render_and_train_what_one_does_and_each_only_its_own_rays
 def test_processes_assemble_the_pieces_of_one_batch(count):
     config = dataclasses.replace(CONFIG, batch_objects=4, num_steps=2)
     pieces = [range(i, i + 4 // count) for i in range(0, 4, 4 // count)]
-    parts = [list(data.batches(tiny_dataset.dataset(), config, 0, own=own)) for own in pieces]
-    for whole, *of_step in zip(data.batches(tiny_dataset.dataset(), config, 0), *parts, strict=True):
+    parts = [list(batching.batches(tiny_dataset.dataset(), config, 0, own=own)) for own in pieces]
+    for whole, *of_step in zip(batching.batches(tiny_dataset.dataset(), config, 0), *parts, strict=True):
         same_bits(jax.tree.map(lambda *x: np.concatenate(x), *of_step), whole)
 
 
 def test_a_batch_that_the_devices_do_not_divide_is_refused_in_one_line():
-    mesh = distributed.device_mesh()
-    assert distributed.own_objects(mesh, 3) == range(3)
+    mesh = placement.device_mesh()
+    assert placement.own_objects(mesh, 3) == range(3)
     mesh = jax.sharding.Mesh(np.full((4, 1), jax.devices()[0]), mesh.axis_names)
     with pytest.raises(ValueError, match="batch_objects 6 cannot be divided among 4 devices; use a multiple"):
-        distributed.own_objects(mesh, 6)
+        placement.own_objects(mesh, 6)
 
 
 def test_devices_that_do_not_divide_the_coarsest_grid_are_refused_in_one_line(monkeypatch):
     volume = jax.numpy.zeros((1, 8, 8, 8, 1))
-    assert distributed.divide_depth(volume, 3) is volume, "without a mesh nothing is divided"
-    axes = {distributed.OBJECTS: 1, distributed.DEPTH: 8}
+    assert placement.divide_depth(volume, 3) is volume, "without a mesh nothing is divided"
+    axes = {placement.OBJECTS: 1, placement.DEPTH: 8}
     mesh = SimpleNamespace(shape=axes, auto_axes=tuple(axes))
     monkeypatch.setattr(jax.sharding, "get_abstract_mesh", lambda: mesh)
     with pytest.raises(
         ValueError, match="--depth-devices 8: expected a divisor of 4, the sides of the network's coarse"
     ):
-        distributed.divide_depth(volume, 4)
+        placement.divide_depth(volume, 4)
 
 
 @pytest.mark.parametrize("depth", [0, 2])
 def test_devices_that_cannot_share_volumes_are_refused(depth):
     with pytest.raises(ValueError, match=f"--depth-devices {depth}: expected a divisor of the 1 devices"):
-        distributed.device_mesh(depth)
+        placement.device_mesh(depth)
 
 
 @pytest.mark.parametrize(
@@ -160,6 +160,6 @@ def test_processes_begin_their_sums_in_order_beside_what_else_was_asked_of_xla(m
 
 def test_a_process_alone_waits_for_nobody():
     done = []
-    distributed.first_alone(lambda: done.append(distributed.leads()))
+    placement.first_alone(lambda: done.append(placement.leads()))
     assert done == [True]
     assert [distributed.Agreement(None)(asked) for asked in (False, True, False)] == [False, True, False]

@@ -1,0 +1,1 @@
+"""Objects made by workers, until the data set is whole."""

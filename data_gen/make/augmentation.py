@@ -1,0 +1,100 @@
+"""Colour variants of an object: one rotation in linear RGB space, applied to all its base colours.
+
+The rotation turns about the grey axis, the line from black through mid-grey to white. It is linear, keeps the distances
+between colours, every grey as it is and the mean of the three channels, so of all rotations about mid-grey it leaves
+the gamut [0, 1]^3 least. An angle is drawn uniformly from the whole turn but for LEAST_DEGREES about no turn at all;
+one that takes any colour of the object out of the gamut is drawn again, MAX_DRAWS times at most. Then a third of a
+turn, one way or the other, is taken: it permutes red, green and blue, so nothing can leave the gamut; object.json
+names such an object (`fallback`).
+
+A flat colour, vertex colours (times the flat colour that they multiply) and every texel are rotated. Interpolation and
+texture lookup are averages, with which a linear map commutes: the variant's colour at a point is the rotation of the
+original's. Roughness, metallic and shape stay.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from spnr_jax.formats.mesh.assets import Asset, Part
+
+MAX_DRAWS = 64
+LEAST_DEGREES = 30  # a smaller turn is hardly a variant, and the only kind that saturated colours have room for
+ROUNDING = 1e-6  # of a rotated float32 colour; what it exceeds the gamut by is clipped
+
+
+@dataclass(frozen=True, kw_only=True)
+class ColourRotation:
+    """A rotation (3, 3) about the grey axis, its angle, and how it was found."""
+
+    matrix: np.ndarray
+    degrees: float
+    draws: int
+    fallback: bool
+
+    def describe(self) -> dict:
+        """Return the rotation as it stands in object.json."""
+        return {**vars(self), "matrix": self.matrix.tolist()}
+
+
+def rotate_colours(asset: Asset, seed: int) -> tuple[Asset, ColourRotation]:
+    """Return the asset with its base colours rotated, and the rotation, a function of the colours and the seed."""
+    rotation = draw_rotation(base_colours(asset), seed)
+    return replace(asset, parts=tuple(rotated_part(part, rotation.matrix) for part in asset.parts)), rotation
+
+
+def base_colours(asset: Asset) -> np.ndarray:
+    """Return every base colour (n, 3) of the asset: flat ones, at vertices, and all texels."""
+    return np.concatenate([part_colours(part).reshape(-1, 3) for part in asset.parts])
+
+
+def part_colours(part: Part) -> np.ndarray:
+    """Return the base colours (3,), (v, 3) or (height, width, 3) of a part, vertex colours times the material's."""
+    if part.colors is None:
+        return part.material.base_color
+    assert part.material.base_color.ndim == 1, "a textured part has no vertex colours: its texture is tinted instead"
+    return part.colors * part.material.base_color
+
+
+def draw_rotation(colours: np.ndarray, seed: int) -> ColourRotation:
+    """Return a random rotation about the grey axis that keeps the colours (n, 3) in the gamut."""
+    rng = np.random.default_rng(seed)
+    extreme = extreme_colours(colours)  # nearly every draw that fails, fails for one of these few
+    for draw in range(1, MAX_DRAWS + 1):
+        degrees = rng.uniform(LEAST_DEGREES, 360 - LEAST_DEGREES)
+        matrix = grey_rotation(degrees)
+        if in_gamut(extreme, matrix) and in_gamut(colours, matrix):
+            return ColourRotation(matrix=matrix, degrees=degrees, draws=draw, fallback=False)
+    degrees = float(rng.choice([120, 240]))
+    return ColourRotation(matrix=grey_rotation(degrees), degrees=degrees, draws=MAX_DRAWS, fallback=True)
+
+
+def grey_rotation(degrees: float) -> np.ndarray:
+    """Return the rotation (3, 3) by an angle about the grey axis; 120 degrees take red to green (Rodrigues)."""
+    angle = np.radians(degrees)
+    along = np.full((3, 3), 1 / 3)
+    across = np.array([[0, -1, 1], [1, 0, -1], [-1, 1, 0]]) / np.sqrt(3)
+    return np.cos(angle) * (np.eye(3) - along) + np.sin(angle) * across + along
+
+
+def extreme_colours(colours: np.ndarray, turns: int = 24) -> np.ndarray:
+    """Return the colours (m, 3) that some rotation of a coarse grid takes furthest up or down in a channel."""
+    rows = np.stack([grey_rotation(degrees)[0] for degrees in np.linspace(0, 360, turns, endpoint=False)])
+    first = [
+        np.array([values.argmin(), values.argmax()]) for values in (colours @ row.astype(colours.dtype) for row in rows)
+    ]
+    return colours[np.unique(np.concatenate(first))]
+
+
+def in_gamut(colours: np.ndarray, matrix: np.ndarray) -> bool:
+    """Return whether the rotated colours all lie in [0, 1]^3, but for rounding."""
+    rotated = colours @ matrix.T.astype(colours.dtype)
+    return bool(rotated.min() >= -ROUNDING and rotated.max() <= 1 + ROUNDING)
+
+
+def rotated_part(part: Part, matrix: np.ndarray) -> Part:
+    """Return the part with its base colours rotated; vertex colours take up the colour that they multiplied."""
+    rotated = np.clip(part_colours(part) @ matrix.T, 0, 1)
+    if part.colors is None:
+        return replace(part, material=replace(part.material, base_color=rotated.astype(np.float32)))
+    return replace(part, colors=rotated, material=replace(part.material, base_color=np.ones(3, np.float32)))

@@ -1,0 +1,136 @@
+"""A data set from its plan: what is missing is made by workers (cluster.py), then the lists are written.
+
+Products are made first, split, and then the colour variants of those that train (plan/splits.py). A run may stop
+anywhere: finished objects stay, and the same command makes the others, to the same bytes. dataset.json
+comes first and holds the folder for these settings; rejected.jsonl and the splits come last. Runs on several machines
+may share a data set: each skips what another has finished meanwhile, and equal settings write equal bytes.
+"""
+
+import json
+import os
+import sys
+from collections.abc import Sequence
+from dataclasses import fields, replace
+
+import numpy as np
+from tqdm import tqdm
+
+from data_gen.make.cluster import Died, connect, run_tasks
+from data_gen.make.description import describe, differences
+from data_gen.make.objects import Workbench, make_and_write
+from data_gen.plan.data_presets import PAPER_COUNTS
+from data_gen.plan.tasks import GenerateConfig, Task, check_options, plan_data_set
+from data_gen.render import light, views
+from data_gen.render.variant import choose_variant, mitsuba_module
+from data_gen.store import layout, storage
+from data_gen.store.storage import Location
+
+
+def generate(config: GenerateConfig) -> None:
+    """Write the data set that the config describes, or what is missing of it; ValueError or OSError if it cannot be."""
+    check_options(config)
+    plan = plan_data_set(config)
+    variant, notice = choose_variant(config.variant)
+    settings = describe(plan, variant)
+    refuse_other_content(config.out, settings)
+    if notice:
+        print(notice, file=sys.stderr)
+    rejected = {task.object_id: task.fault for task in plan.tasks if task.fault}
+    rejected |= make_missing(config, [task for task in plan.tasks if not task.fault], settings)
+    split_ids = plan.split([task.object_id for task in plan.tasks if task.object_id not in rejected])
+    variants = plan.variants(split_ids["train"])
+    rejected |= make_missing(config, variants, settings)
+    split_ids["train"] = sorted(split_ids["train"] + [v.object_id for v in variants if v.object_id not in rejected])
+    finish(config, [*plan.tasks, *variants], split_ids, rejected)
+
+
+def make_missing(config: GenerateConfig, tasks: Sequence[Task], settings: dict) -> dict[str, str]:
+    """Make the objects that are not there yet; return the reason for each that was left out, by id."""
+    done = layout.completed_objects(config.out)
+    missing = [task for task in tasks if task.object_id not in done]
+    if not missing:
+        return {}
+    variant = settings["settings"]["variant"]
+    envmap = make_light(config, variant)
+    refuse_other_content(config.out, settings)  # another run may have begun there meanwhile
+    layout.write_text(f"{config.out}/dataset.json", layout.json_text(settings))
+    layout.remove_unfinished(config.out)
+    rejected = make_objects(config, missing, envmap, variant)
+    # the process of one that is there died here, but another run has made it
+    return {name: reason for name, reason in rejected.items() if not layout.has_object(config.out, name)}
+
+
+def make_light(config: GenerateConfig, variant: str) -> np.ndarray:
+    """Return the scaled environment map (height, width, 3) of the data set."""
+    mitsuba_module(variant)
+    return light.scaled_to_white(light.load_envmap(config.envmap) if config.envmap else light.indoor_envmap())
+
+
+def refuse_other_content(out: Location, settings: dict) -> None:
+    """Raise ValueError if the place holds another data set, or anything else."""
+    described = storage.read_file(f"{out}/dataset.json")
+    if described is not None:
+        try:
+            before = json.loads(described)
+        except ValueError:
+            raise ValueError(f"{out}/dataset.json is damaged: remove {out}, or choose another folder") from None
+        if before != settings:
+            changed = ", ".join(differences(before, settings))
+            raise ValueError(f"{out} holds a data set with other settings ({changed}): choose another folder")
+    elif not storage.is_empty(out):
+        raise ValueError(f"{out} is not empty and holds no data set: choose another folder")
+
+
+def make_objects(config: GenerateConfig, tasks: Sequence[Task], envmap: np.ndarray, variant: str) -> dict[str, str]:
+    """Make the objects on the workers; return the reason for each that was left out, by id."""
+    bench = Workbench(
+        out=storage.absolute(config.out),
+        envmap=envmap,
+        view=views.ViewConfig(**{field.name: getattr(config, field.name) for field in fields(views.ViewConfig)}),
+        num_points=config.points,
+        seed=config.seed,
+        variant=variant,
+        spread=config.spread,
+    )
+    anywhere = (
+        replace(task, path=task.path and task.path.absolute(), folder=task.folder and task.folder.absolute())
+        for task in tasks
+    )
+    rejected = {}
+    try:
+        with (
+            connect(config.cluster, min(config.workers or os.cpu_count() or 1, len(tasks))) as client,
+            tqdm(total=len(tasks), unit="object", dynamic_ncols=True) as bar,
+        ):
+            for task, reason in run_tasks(client, make_and_write, bench, anywhere):
+                if isinstance(reason, Died):
+                    reason = f"the process that made it died {reason.times} times; out of memory?"
+                if reason is not None:
+                    rejected[task.object_id] = reason
+                    tqdm.write(f"left out {task.shown_path or task.object_id}: {reason}", file=sys.stderr)
+                bar.update()
+    finally:
+        layout.remove_unfinished(config.out)
+    return rejected
+
+
+def finish(
+    config: GenerateConfig, tasks: Sequence[Task], split_ids: dict[str, list[str]], rejected: dict[str, str]
+) -> None:
+    """Write rejected.jsonl and the splits, and say what became of the objects."""
+    rows = [
+        json.dumps({"id": task.object_id, "path": task.shown_path or None, "reason": rejected[task.object_id]})
+        for task in tasks
+        if task.object_id in rejected
+    ]
+    layout.write_text(f"{config.out}/rejected.jsonl", "".join(row + "\n" for row in rows))
+    for split in layout.SPLITS:
+        layout.write_text(
+            f"{config.out}/splits/{split}.txt", "".join(f"{object_id}\n" for object_id in split_ids[split])
+        )
+    counts = ", ".join(f"{len(split_ids[split])} {split}" for split in layout.SPLITS)
+    made = len(tasks) - len(rows)
+    paper = "; the paper has {} train, {} test".format(*PAPER_COUNTS[config.preset]) if config.preset else ""
+    print(f"{config.out}: {made} objects ({counts}), {len(rows)} left out{paper}", file=sys.stderr)
+    if not made:
+        raise ValueError(f"{config.out}: every object was left out; {config.out}/rejected.jsonl says why")

@@ -1,0 +1,133 @@
+"""One object from its source to its folder, as a worker process makes it.
+
+Everything random about an object follows from (seed, object id) alone, so neither the order, nor the number of workers,
+nor an interruption changes a byte.
+"""
+
+import hashlib
+import os
+import socket
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from data_gen import procedural
+from data_gen.make import augmentation, reshaping
+from data_gen.plan.tasks import Task
+from data_gen.render import views
+from data_gen.render.variant import LLVM, choose_variant, mitsuba_module
+from data_gen.store import layout
+from spnr_jax.formats.mesh import meshes, surface_points
+from spnr_jax.formats.mesh.assets import Asset, Material, RejectedAsset
+
+
+@dataclass(frozen=True, kw_only=True)
+class Workbench:
+    """What a worker needs for any object of the data set; `out` is a URL or an absolute path."""
+
+    out: str
+    envmap: np.ndarray
+    view: views.ViewConfig
+    num_points: int
+    seed: int
+    variant: str
+    spread: surface_points.Spread = "random"
+
+
+def make_and_write(bench: Workbench, task: Task) -> str | None:
+    """Make one object's folder; return None, or the reason why it is left out.
+
+    What is wrong with the worker and not with the object is raised: errors of the disk, a mesh file it does not see.
+    """
+    if layout.has_object(bench.out, task.object_id):  # another run on the same data set was faster
+        return None
+    if task.path and not task.path.exists():
+        raise ValueError(f"{task.path}: worker {socket.gethostname()} does not see this file; mount it there")
+    prepare_renderer(bench.variant)
+    try:
+        record = make_record(bench, task)
+    except RejectedAsset as error:
+        return str(error)
+    except Exception as error:  # whatever is wrong with one object must not stop the others; its row says what it was
+        return f"unexpected {type(error).__name__}: {error}".splitlines()[0]
+    layout.write_object(bench.out, task.object_id, record)
+    return None
+
+
+def prepare_renderer(variant: str) -> None:
+    """Load Mitsuba for this thread; ValueError if the variant that the run chose does not work on this machine."""
+    if variant == LLVM and "DRJIT_LIBLLVM_PATH" not in os.environ:  # a machine other than the one that chose
+        choose_variant(variant)
+    mitsuba_module(variant)
+
+
+def make_record(bench: Workbench, task: Task) -> layout.ObjectRecord:
+    """Return one object, rendered: asset, points, views, condition images."""
+    seeds = object_seeds(bench.seed, task.object_id)
+    asset, details = make_asset(task, bench.seed)
+    surface = surface_points.sample_surface(asset, bench.num_points, seeds["points"], bench.spread)
+    cam_to_world = views.random_viewpoints(
+        bench.view.views, bench.view.distance, np.random.default_rng(seeds["viewpoints"])
+    )
+    images, conditions = views.render_views(asset, surface, cam_to_world, bench.envmap, bench.view, seeds["noise"])
+    return layout.ObjectRecord(
+        points=layout.pack_points(surface),
+        transforms=layout.nerf_transforms(cam_to_world, bench.view.resolution, bench.view.fov, bench.view.focal_length),
+        images=images,
+        conditions=conditions,
+        details=object_details(task, asset, seeds) | details,
+    )
+
+
+def make_asset(task: Task, seed: int) -> tuple[Asset, dict]:
+    """Return the object as it is rendered and sampled, and what was done to it as it stands in object.json."""
+    asset, seeds = load_asset(task, seed), object_seeds(seed, task.object_id)
+    details: dict = {"colour_rotation": None}
+    if task.colour_variant:
+        asset, rotation = augmentation.rotate_colours(asset, seeds["colours"])
+        details["colour_rotation"] = rotation.describe()
+    if task.reshaped:
+        shape = reshaping.draw_reshaping(seeds["pose"])
+        asset = reshaping.reshape(asset, shape)
+        details["reshaping"] = shape.describe()
+    asset, details["normalisation"] = surface_points.normalise(asset)
+    return asset, details
+
+
+def load_asset(task: Task, seed: int) -> Asset:
+    """Return the object as its source has it; a colour variant has the shape of its product."""
+    if task.path is None:
+        return procedural.make(task.category, object_seeds(seed, task.product)["shape"])
+    asset = meshes.load_mesh(task.path, task.folder)
+    return replace(asset, category=task.category) if task.category else asset
+
+
+def object_seeds(seed: int, object_id: str) -> dict[str, int]:
+    """Return an independent 32-bit seed for each purpose, a function of (seed, object id) alone."""
+    digest = hashlib.sha256(f"{seed}/{object_id}".encode()).digest()
+    purposes = ("shape", "points", "viewpoints", "noise", "colours", "pose")
+    return {name: int.from_bytes(digest[4 * i : 4 * i + 4], "little") for i, name in enumerate(purposes)}
+
+
+def object_details(task: Task, asset: Asset, seeds: dict[str, int]) -> dict:
+    """Return the content of object.json (the checksums of the files are added when they are written)."""
+    return {
+        "id": task.object_id,
+        "product": task.product,
+        "variant": task.colour_variant,
+        "category": asset.category,
+        "source": {**asset.source, "file": task.shown_path} if task.path else asset.source,
+        "materials": [describe_material(part.material) | {"faces": len(part.faces)} for part in asset.parts],
+        "ignored": list(asset.ignored),
+        "seeds": seeds,
+    }
+
+
+def describe_material(material: Material) -> dict:
+    """Return a material's channels as numbers, or as the size of their texture."""
+    described: dict = {"wrap": material.wrap}
+    for name, value_rank in (("base_color", 1), ("roughness", 0), ("metallic", 0)):
+        channel = np.asarray(getattr(material, name))
+        size = {"texture": list(channel.shape[:2])}
+        described[name] = channel.astype(float).tolist() if channel.ndim == value_rank else size
+    return described

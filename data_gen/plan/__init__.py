@@ -1,0 +1,1 @@
+"""Which objects a data set is to hold, and in which split they are."""

@@ -1,0 +1,286 @@
+"""What a data set is to hold, decided before anything is rendered: the options and the objects.
+
+A procedural object is `category_000012`, its number counted through all categories; a mesh's id comes from its file, or
+from the data set that it is part of (`sources`). A colour variant of a product is `ID--1`, `ID--2`, ...: it lies
+beside its product in every sorted list. Which products train, and so have variants, is decided in splits.py,
+when it is known which can be rendered at all.
+"""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import count, islice
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from data_gen import procedural
+from data_gen.plan import splits
+from data_gen.plan.sources import abo, shapenet
+from data_gen.plan.sources.shapenet import Category
+from data_gen.render.views import Visibility
+from spnr_jax.formats.mesh import meshes
+from spnr_jax.formats.mesh.surface_points import Spread
+
+DEFAULT_OBJECTS = 200
+SAFE_ID = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]*")
+
+Source = Literal["procedural", "meshes", "abo", "shapenet"]
+Preset = Literal["abo", "shapenet_car", "shapenet_plane", "shapenet_chair"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class GenerateConfig:
+    """Generate a data set of rendered objects: procedural ones, mesh files, or a data set of others."""
+
+    out: Annotated[str | Path, tyro.conf.Positional, tyro.conf.arg(metavar="PATH|URL")]
+    """Folder of the data set, or its URL (s3://..., as fsspec opens it). An unfinished run there is completed."""
+    preset: Preset | None = None
+    """Settings of the paper for one of its data sets: defaults of the other options, which --help then shows."""
+    source: Source | None = None
+    """Where the objects come from (default: meshes if --meshes is given, else procedural)."""
+    root: Path | None = None
+    """Folder of the source: of mesh files, of the ABO 3D download (holds 3dmodels), of ShapeNetCore v2 or v1."""
+    category: Category | None = None
+    """Class of ShapeNet objects."""
+    objects: int | None = None
+    """Number of procedural objects (default: 200, or 0 if there are others)."""
+    categories: tuple[str, ...] = ()
+    """Categories of procedural objects (default: all)."""
+    meshes: Path | None = None
+    """Folder of .glb, .gltf, .obj and .ply files: short for --source meshes --root."""
+    colour_variants: int = 0
+    """Variants of each training object with its base colours rotated in RGB space; test objects have none."""
+    reshape_variants: bool = False
+    """Turn, mirror and stretch the variants too, and bend their roughness: a few meshes go further."""
+    train_objects: int | None = None
+    """Training objects, variants included: variants are drawn until there are as many (default: all variants)."""
+    test_objects: int | None = None
+    """Objects of the test split, drawn by the seed (default: the share --test-fraction)."""
+    test_list: Path | None = None
+    """Text file with the ids, one per line, of the objects that go to the test split."""
+    split_file: Path | None = None
+    """Splits: .json {"train": [ids], "val": [ids], "test": [ids]}, or .csv with columns id,split or as in ShapeNet's
+    all.csv. Objects that it does not list are left aside; they train if it lists no training objects."""
+    resolution: int = 64
+    """Width and height of the images in pixels."""
+    views: int = 10
+    """Views per object, from random directions."""
+    points: int = 4096
+    """Surface points per object."""
+    spread: Spread = "random"
+    """How they lie: drawn by area, or each the farthest from those before it, as spnr render thins bigger clouds."""
+    spp: int = 64
+    """Samples per pixel; Mitsuba rounds it up to a product of two near-equal numbers."""
+    max_depth: int = 6
+    """Longest light path in segments; 2 is direct light only."""
+    fov: float = 40.0
+    """Field of view in degrees."""
+    distance: float = 3.0
+    """Distance of the cameras from the object's centre; the object fits into the unit sphere."""
+    visibility: Visibility = "face"
+    """Points that a view sees: all on a face that a camera ray hits, or each point that nothing hides by itself."""
+    visibility_grid: int = 4
+    """Rays per pixel side that look for visible faces."""
+    envmap: Path | None = None
+    """Environment map, .hdr or .exr (default: a procedural room). Scaled: a white sphere averages 0.6."""
+    seed: int = 0
+    """Seed of shapes, points, viewpoints, noise and splits."""
+    workers: int | None = None
+    """Local processes that render (default: one per CPU core)."""
+    cluster: str | None = None
+    """Address of a Dask scheduler whose workers render instead. They see the mesh files and OUT under these names."""
+    val_fraction: float = 0.05
+    """Share of the objects that goes to the validation split."""
+    test_fraction: float = 0.1
+    """Share of the objects that goes to the test split; not used with a number or a list of test objects."""
+    variant: str = "auto"
+    """Mitsuba variant: scalar_rgb, llvm_ad_rgb, or auto for the faster one that works here."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Task:
+    """One object to make: a mesh file (with its path as it is reported), or a procedural category.
+
+    `folder` is the widest that a mesh's companions may lie in (default: the mesh's own); `fault` is why it cannot be
+    made, known before it is tried. A colour variant names its product and its number, from 1, and may be reshaped too.
+    """
+
+    object_id: str
+    category: str = ""
+    path: Path | None = None
+    shown_path: str = ""
+    folder: Path | None = None
+    fault: str = ""
+    variant_of: str = ""
+    colour_variant: int = 0
+    reshaped: bool = False
+
+    @property
+    def product(self) -> str:
+        """Return the id of the object whose shape this one has: its own, or that of the variant's original."""
+        return self.variant_of or self.object_id
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """The products of a data set, the splits that a file names, and how many products the others are to hold."""
+
+    config: GenerateConfig
+    tasks: tuple[Task, ...]
+    listed: splits.Listed
+    num_test: int
+    num_val: int
+
+    def split(self, usable: Sequence[str]) -> dict[str, list[str]]:
+        """Return the sorted ids of each split of the products that can be rendered."""
+        return splits.split_products(usable, self.listed, self.config.seed, self.num_test, self.num_val)
+
+    def variants(self, train_ids: Sequence[str]) -> list[Task]:
+        """Return the colour variants of the training products, sorted by id."""
+        products = {task.object_id: task for task in self.tasks}
+        total = self.config.train_objects
+        most = None if total is None else max(total - len(train_ids), 0)
+        chosen = splits.chosen_variants(train_ids, self.config.colour_variants, most, self.config.seed)
+        return [
+            replace(
+                products[name],
+                object_id=f"{name}--{number}",
+                variant_of=name,
+                colour_variant=number,
+                reshaped=self.config.reshape_variants,
+            )
+            for name, number in chosen
+        ]
+
+
+def check_options(config: GenerateConfig) -> None:
+    """Raise ValueError, naming the option, for a value that no data set can be made with."""
+    for name in ("resolution", "views", "points", "spp", "visibility_grid", "max_depth"):
+        least = 2 if name == "max_depth" else 1
+        if getattr(config, name) < least:
+            raise ValueError(f"--{name.replace('_', '-')}: expected {least} or more, got {getattr(config, name)}")
+    for name in ("objects", "colour_variants", "train_objects", "test_objects", "workers"):
+        least = 1 if name in ("train_objects", "workers") else 0
+        if getattr(config, name) is not None and getattr(config, name) < least:
+            raise ValueError(f"--{name.replace('_', '-')}: expected {least} or more, got {getattr(config, name)}")
+    if config.seed < 0:
+        raise ValueError(f"--seed: expected 0 or more, got {config.seed}")
+    if not 0 < config.fov < 180:
+        raise ValueError(f"--fov: expected degrees between 0 and 180, got {config.fov:g}")
+    if not config.distance > 1:
+        raise ValueError(f"--distance: expected more than 1, outside the object's unit sphere, got {config.distance:g}")
+    if min(config.val_fraction, config.test_fraction) < 0 or config.val_fraction + config.test_fraction >= 1:
+        raise ValueError("--val-fraction, --test-fraction: expected shares that leave some objects to train on")
+    if config.envmap and not config.envmap.is_file():
+        raise ValueError(f"--envmap {config.envmap}: no such file; give a latitude-longitude .hdr or .exr")
+    if unknown := set(config.categories) - set(procedural.CATEGORIES):
+        known = ", ".join(procedural.CATEGORIES)
+        raise ValueError(f"--categories: no category {', '.join(sorted(unknown))}; there are {known}")
+    check_source(config)
+
+
+def check_source(config: GenerateConfig) -> None:
+    """Raise ValueError, naming the option, for options that do not say which objects are meant."""
+    source = source_of(config)
+    if config.meshes and (config.root or source != "meshes"):
+        raise ValueError(f"--meshes {config.meshes}: not together with --root or --source {source}; give one of them")
+    if source == "procedural" and config.root:
+        raise ValueError(f"--root {config.root}: give --source meshes, abo or shapenet with it")
+    if source != "procedural" and not mesh_root(config):
+        raise ValueError(f"--source {source}: give --root, the folder that holds it")
+    if source == "shapenet" and not config.category:
+        raise ValueError(f"--source shapenet: give --category, one of {', '.join(shapenet.SYNSETS)}")
+    if source != "shapenet" and config.category:
+        raise ValueError(f"--category {config.category}: only with --source shapenet; --categories chooses procedural")
+    if config.split_file and config.test_list:
+        raise ValueError(f"--test-list {config.test_list}: not together with --split-file; give one of them")
+
+
+def source_of(config: GenerateConfig) -> Source:
+    """Return where the objects come from."""
+    return config.source or ("meshes" if config.meshes else "procedural")
+
+
+def mesh_root(config: GenerateConfig) -> Path | None:
+    """Return the folder of the objects that are not procedural."""
+    return config.meshes or config.root
+
+
+def plan_objects(config: GenerateConfig) -> list[Task]:
+    """Return every product of the data set, sorted by id. A procedural object's id does not depend on --categories."""
+    num_objects = config.objects if config.objects is not None else 0 if mesh_root(config) else DEFAULT_OBJECTS
+    wanted = set(config.categories or procedural.CATEGORIES)
+    numbered = ((index, procedural.category_of(index)) for index in count())
+    chosen = islice(((index, category) for index, category in numbered if category in wanted), num_objects)
+    tasks = [Task(object_id=f"{category}_{index:06d}", category=category) for index, category in chosen]
+    if root := mesh_root(config):
+        tasks += mesh_tasks(config, root)
+    if not tasks:
+        raise ValueError("nothing to do: give --objects above 0, or --meshes with mesh files")
+    tasks.sort(key=lambda task: task.object_id)
+    for task, after in zip(tasks, tasks[1:], strict=False):
+        if task.object_id == after.object_id:
+            raise ValueError(f"{task.object_id} is the id of two objects; rename the mesh file")
+    if unsafe := [task.object_id for task in tasks if not SAFE_ID.fullmatch(task.object_id)]:
+        raise ValueError(f"{unsafe[0]!r} cannot be an object's id; expected letters, digits, dot, dash and underscore")
+    return tasks
+
+
+def mesh_tasks(config: GenerateConfig, root: Path) -> list[Task]:
+    """Return the objects of the source that are files, in any order."""
+    if source_of(config) == "meshes":
+        found = meshes.find_meshes(root)
+        return [Task(object_id=name, path=path, shown_path=shown(path, root)) for name, path in found]
+    listed = shapenet.find_objects(root, config.category) if config.category else abo.find_products(root)
+    return [
+        Task(
+            object_id=item.object_id,
+            category=config.category or "",
+            path=item.path,
+            shown_path=shown(item.path, root),
+            folder=item.folder,
+            fault=item.fault,
+        )
+        for item in listed
+    ]
+
+
+def shown(path: Path, root: Path) -> str:
+    """Return a file's path as it is reported: from the source's root, for where that lies is nobody's business."""
+    return path.relative_to(root).as_posix()
+
+
+def plan_data_set(config: GenerateConfig) -> Plan:
+    """Return the products to render and the sizes of the splits; ValueError if the options do not fit the objects."""
+    tasks = plan_objects(config)
+    listed = read_listed(config, {task.object_id for task in tasks})
+    named = {name for ids in listed.values() for name in ids}
+    tasks = [task for task in tasks if task.object_id in named or "train" not in listed]
+    num_free = len(tasks) - len(listed.get("test", ()))
+    num_test = round(config.test_fraction * len(tasks)) if config.test_objects is None else config.test_objects
+    if not listed and num_test >= len(tasks):
+        raise ValueError(f"--test-objects {num_test}: leaves none of the {len(tasks)} objects to train on")
+    plan = Plan(
+        tasks=tuple(tasks),
+        listed=listed,
+        num_test=num_test,
+        num_val=round(config.val_fraction * num_free),
+        config=config,
+    )
+    if config.train_objects is None:
+        return plan
+    split_ids = plan.split([task.object_id for task in tasks])
+    surplus = set(splits.ranked(split_ids["train"], config.seed, "split")[config.train_objects :])
+    return replace(plan, tasks=tuple(task for task in tasks if task.object_id not in surplus))
+
+
+def read_listed(config: GenerateConfig, known: set[str]) -> splits.Listed:
+    """Return the ids of the splits that the user's file names, none without a file."""
+    if config.test_list:
+        return splits.read_test_list(config.test_list, known)
+    if not config.split_file:
+        return {}
+    synset = shapenet.SYNSETS[config.category] if config.category else None
+    return splits.read_split_file(config.split_file, known, synset)

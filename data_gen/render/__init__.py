@@ -1,0 +1,1 @@
+"""Pictures of an asset: light, cameras, depth, what each view sees."""

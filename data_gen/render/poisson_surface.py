@@ -1,0 +1,124 @@
+"""A surface from points alone, as a renderer of references needs it: screened Poisson reconstruction (Kazhdan 2013).
+
+    points -> oriented normals (normals.py) -> pymeshlab's solver -> mesh; materials of the nearest point
+
+The asset that comes out has base colour, roughness and metallic at its vertices and is rendered like any other
+(views.py): the same light, cameras and integrator as the pictures that it is compared with.
+`depth` is that of the solver's octree: 12, far finer than a thousand points are spaced, is what the paper names. The
+solver closes what is open, bridges what is near, and extrapolates; `trim` removes its least supported vertices.
+Deterministic: the solver runs in one thread.
+"""
+
+import importlib
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from data_gen.render.normals import NEIGHBOURS, oriented_normals
+from spnr_jax.formats.mesh.assets import Asset, Material, Part
+from spnr_jax.kernels.records import PointCloud
+
+STRAIGHT = 1e-5  # points spread less than this share of their extent beside a line have no surface
+
+
+class NoSurface(ValueError):
+    """Points that span no surface; the message is one line."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PoissonConfig:
+    """How a surface is made of points."""
+
+    depth: int = 12
+    """Depth of the octree: the finest cell is the extent / 2^depth."""
+    neighbours: int = NEIGHBOURS
+    """Nearest points that a normal is estimated from."""
+    trim: float = 0.0
+    """Share of the vertices, those with the fewest points around them, that is cut off; 0 keeps all."""
+
+    def __post_init__(self) -> None:
+        if self.depth < 1:
+            raise ValueError(f"depth: expected 1 or more, got {self.depth}")
+        if self.neighbours < 3:
+            raise ValueError(f"neighbours: expected 3 or more, which span a plane, got {self.neighbours}")
+        if not 0 <= self.trim < 1:
+            raise ValueError(f"trim: expected a share of the vertices, at least 0 and below 1, got {self.trim}")
+
+
+def reconstruct(cloud: PointCloud, config: PoissonConfig) -> Asset:
+    """Return the surface of one cloud (points, ...), smooth, with the materials of the nearest point at each vertex.
+
+    NoSurface where there is none: too few points, or points on one line.
+    """
+    present = np.asarray(cloud.mask)
+    positions = np.asarray(cloud.positions, np.float64)[present]
+    check_extent(positions)
+    vertices, faces, density = screened_poisson(positions, oriented_normals(positions, config.neighbours), config.depth)
+    vertices, faces = trimmed(vertices, faces, density, config.trim)
+    if not len(faces):
+        raise NoSurface(f"{len(positions)} points: the Poisson solver found no surface; give more points")
+    nearest = cKDTree(positions).query(vertices)[1]
+    base_color, roughness, metallic = (
+        np.asarray(channel, np.float32)[present][nearest]
+        for channel in (cloud.base_color, cloud.roughness, cloud.metallic)
+    )
+    part = Part(
+        positions=vertices,
+        faces=faces,
+        material=Material(base_color=np.ones(3, np.float32), roughness=roughness, metallic=metallic),
+        normals=vertex_normals(vertices, faces),
+        colors=base_color,
+    )
+    return Asset(parts=(part,))
+
+
+def check_extent(positions: np.ndarray) -> None:
+    """Raise NoSurface unless the positions (points, 3) spread over a plane at least."""
+    if len(positions) < 3:
+        raise NoSurface(f"{len(positions)} points: a surface needs at least 3 that are not on one line")
+    spread = np.linalg.svd(positions - positions.mean(axis=0), compute_uv=False)
+    if not spread[1] > STRAIGHT * spread[0]:
+        raise NoSurface(f"{len(positions)} points on one line or in one place: a surface needs them beside each other")
+
+
+def screened_poisson(
+    positions: np.ndarray, normals: np.ndarray, depth: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return vertices (v, 3), faces (f, 3) and the density of points around each vertex (v,)."""
+    solver = pymeshlab().MeshSet()
+    solver.add_mesh(pymeshlab().Mesh(vertex_matrix=positions, v_normals_matrix=normals))
+    solver.generate_surface_reconstruction_screened_poisson(depth=depth, threads=1)
+    mesh = solver.current_mesh()
+    if not mesh.face_number():
+        return np.zeros((0, 3)), np.zeros((0, 3), np.int64), np.zeros(0)
+    return mesh.vertex_matrix(), mesh.face_matrix().astype(np.int64), mesh.vertex_scalar_array()
+
+
+def trimmed(
+    vertices: np.ndarray, faces: np.ndarray, density: np.ndarray, share: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return vertices and faces without the share of the vertices that has the lowest density, and their faces."""
+    if not share or not len(faces):
+        return vertices, faces
+    kept = density >= np.quantile(density, share)
+    number = np.cumsum(kept) - 1
+    return vertices[kept], number[faces[kept[faces].all(axis=1)]]
+
+
+def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Return the unit mean normals (v, 3) of the faces around each vertex, weighted by area; y where there is none."""
+    a, b, c = np.moveaxis(vertices[faces], 1, 0)
+    sums = np.zeros_like(vertices)
+    np.add.at(sums, faces, np.cross(b - a, c - a)[:, None])
+    length = np.linalg.norm(sums, axis=1, keepdims=True)
+    return np.where(length > 0, sums / np.where(length > 0, length, 1), [0.0, 1.0, 0.0])
+
+
+def pymeshlab():
+    """Return the solver's module; ValueError, with what to install, if it is absent."""
+    try:
+        return importlib.import_module("pymeshlab")
+    except ImportError as error:
+        needed = "Poisson reconstruction needs pymeshlab: pip install 'spnr-jax[baselines]'"
+        raise ValueError(f"{needed} ({error})") from None

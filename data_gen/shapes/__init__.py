@@ -1,0 +1,1 @@
+"""Shapes, outlines, patterns and finishes that procedural objects are made of."""

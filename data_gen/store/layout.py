@@ -1,0 +1,213 @@
+"""The files of a data set: how each is written, and how it is read back.
+
+    DATASET/dataset.json, splits/{train,val,test}.txt, rejected.jsonl
+    DATASET/objects/ID/{points.ply, transforms.json, images/000.png, conditions/000.png, object.json}
+
+Everything written is a function of its content alone (no clock, no host, no absolute path), so equal objects are equal
+bytes, and two runs in one place do no harm. An object is complete when its object.json is there, which is written
+last; on a local disk the folder also appears as a whole (data_gen/store/storage.py). DATASET is a path or a URL.
+"""
+
+import hashlib
+import io
+import json
+import re
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+from PIL import Image
+
+from data_gen.store import storage
+from data_gen.store.storage import Location
+
+SCHEMA_VERSION = 1
+MOST_PIXELS = 2**26  # of a view
+SPLITS = ("train", "val", "test")
+POINT_FIELDS = (
+    "x",
+    "y",
+    "z",
+    "nx",
+    "ny",
+    "nz",
+    "base_color_r",
+    "base_color_g",
+    "base_color_b",
+    "roughness",
+    "metallic",
+)
+POINT_TYPE = np.dtype([(name, "<f4") for name in POINT_FIELDS] + [("face", "<i4")])
+POINT_PROPERTIES = [*(f"property float {name}" for name in POINT_FIELDS), "property int face"]  # POINT_TYPE in a PLY
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObjectRecord:
+    """One object as it lies on disk.
+
+    points: POINT_TYPE (points,); transforms: the dict of transforms.json; images, conditions: (views, height, width, 4)
+    uint8; details: the dict of object.json.
+    """
+
+    points: np.ndarray
+    transforms: dict
+    images: np.ndarray
+    conditions: np.ndarray
+    details: dict
+
+
+def pack_points(surface) -> np.ndarray:
+    """Return sampled surface points (`SurfacePoints`) as one array of POINT_TYPE (points,)."""
+    columns = [surface.positions, surface.normals, surface.base_color, surface.roughness, surface.metallic]
+    packed = np.empty(len(surface.positions), POINT_TYPE)
+    for name, column in zip(POINT_FIELDS, np.column_stack(columns).T, strict=True):
+        packed[name] = column
+    packed["face"] = surface.face
+    return packed
+
+
+def point_columns(points: np.ndarray, *names: str) -> np.ndarray:
+    """Return the named fields of a POINT_TYPE array as (points, len(names)) float64."""
+    return np.stack([points[name] for name in names], axis=-1).astype(np.float64)
+
+
+def nerf_transforms(cam_to_world: np.ndarray, resolution: int, fov: float, focal_length: float) -> dict:
+    """Return transforms.json for cameras (views, 4, 4): NeRF's convention, with nerfstudio's intrinsics."""
+    return {
+        "camera_model": "OPENCV",
+        "camera_angle_x": float(np.radians(fov)),
+        "fl_x": float(focal_length),
+        "fl_y": float(focal_length),
+        "cx": resolution / 2,
+        "cy": resolution / 2,
+        "w": resolution,
+        "h": resolution,
+        "frames": [
+            {"file_path": f"images/{view:03d}.png", "transform_matrix": matrix.tolist()}
+            for view, matrix in enumerate(cam_to_world)
+        ],
+    }
+
+
+def write_object(dataset: Location, object_id: str, record: ObjectRecord) -> None:
+    """Write an object's folder, complete or not at all; a complete one that is already there is left as it is."""
+    storage.write_object_folder(f"{dataset}/objects", object_id, object_files(record))
+
+
+def object_files(record: ObjectRecord) -> dict[str, bytes]:
+    """Return the files of one object by their paths in its folder, object.json with the others' checksums last."""
+    files = {
+        "points.ply": encode_points(record.points),
+        "transforms.json": json_text(record.transforms).encode(),
+        **{f"images/{view:03d}.png": encode_image(pixels) for view, pixels in enumerate(record.images)},
+        **{f"conditions/{view:03d}.png": encode_image(pixels) for view, pixels in enumerate(record.conditions)},
+    }
+    checksums = {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
+    return {**files, storage.LAST_FILE: json_text({**record.details, "files": checksums}).encode()}
+
+
+def read_object(folder: Path) -> ObjectRecord:
+    """Return the object in a folder; ValueError or OSError if a file is missing or damaged."""
+    transforms = read_document(folder / "transforms.json")
+    try:
+        names = [Path(frame["file_path"]).name for frame in transforms["frames"]]
+        poses = np.array([frame["transform_matrix"] for frame in transforms["frames"]], np.float64)
+    except (ValueError, LookupError, TypeError, ArithmeticError) as error:
+        raise ValueError(
+            f"{folder / 'transforms.json'}: holds no frames ({error!r}); generate the object again"
+        ) from None
+    if poses.shape[1:] != (4, 4) or not np.isfinite(poses).all():
+        raise ValueError(f"{folder / 'transforms.json'}: a camera is no 4 x 4 matrix of finite numbers")
+    return ObjectRecord(
+        points=read_points(folder / "points.ply"),
+        transforms=transforms,
+        images=np.stack([read_image(folder / "images" / name) for name in names]),
+        conditions=np.stack([read_image(folder / "conditions" / name) for name in names]),
+        details=read_document(folder / "object.json"),
+    )
+
+
+def read_document(path: Path) -> dict:
+    """Return the dict of a JSON file; ValueError or OSError if there is none."""
+    try:
+        document = json.loads(path.read_text())
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path}: not readable ({error}); generate it again") from None
+    if not isinstance(document, dict):
+        raise ValueError(f"{path}: expected named entries, found {type(document).__name__}; generate it again")
+    return document
+
+
+def encode_points(points: np.ndarray) -> bytes:
+    """Return a POINT_TYPE array as a binary little-endian PLY of vertices."""
+    size = f"element vertex {len(points)}"
+    header = ["ply", "format binary_little_endian 1.0", size, *POINT_PROPERTIES, "end_header"]
+    return ("\n".join(header) + "\n").encode("ascii") + points.tobytes()
+
+
+def read_points(path: Path) -> np.ndarray:
+    """Return the POINT_TYPE array (points,) of a file that `encode_points` made; ValueError for any other file."""
+    header, separator, body = path.read_bytes().partition(b"end_header\n")
+    lines = header.decode("ascii", "replace").splitlines()
+    if not separator or lines[1:2] != ["format binary_little_endian 1.0"] or lines[3:] != POINT_PROPERTIES:
+        raise ValueError(f"{path}: not a points.ply of this data set (another header); generate the object again")
+    announced = re.fullmatch(r"element vertex (\d{1,15})", lines[2])
+    count = int(announced[1]) if announced else -1
+    if len(body) != count * POINT_TYPE.itemsize:
+        raise ValueError(f"{path}: expected {count} points, found {len(body) / POINT_TYPE.itemsize:g}; file is cut off")
+    return np.frombuffer(body, POINT_TYPE).copy()
+
+
+def encode_image(pixels: np.ndarray) -> bytes:
+    """Return (height, width, 4) uint8 as a PNG."""
+    buffer = io.BytesIO()
+    Image.fromarray(pixels, "RGBA").save(buffer, "PNG")
+    return buffer.getvalue()
+
+
+def read_image(path: Path) -> np.ndarray:
+    """Return an RGBA PNG as (height, width, 4) uint8; ValueError if it is damaged or of another kind."""
+    try:
+        with Image.open(path) as image:
+            if image.mode != "RGBA" or image.width * image.height > MOST_PIXELS:
+                raise ValueError(f"{path}: expected an RGBA image of a view, got {image.mode} of {image.size} pixels")
+            image.load()
+            return np.array(image)
+    except (OSError, SyntaxError, Image.DecompressionBombError) as error:  # Pillow reports a damaged PNG as these
+        raise ValueError(f"{path}: not a readable PNG ({error})") from None
+
+
+def has_object(dataset: Location, object_id: str) -> bool:
+    """Return whether an object of the data set is complete."""
+    return storage.has_object(f"{dataset}/objects", object_id)
+
+
+def completed_objects(dataset: Location) -> set[str]:
+    """Return the ids of the objects whose folders are complete."""
+    return storage.complete_objects(f"{dataset}/objects")
+
+
+def remove_unfinished(dataset: Location) -> None:
+    """Remove the folders that an earlier, interrupted run left half written; those of a living one stay."""
+    storage.remove_unfinished(f"{dataset}/objects")
+
+
+def read_split(dataset: Path, split: str) -> list[str]:
+    """Return the object ids of one split."""
+    return (dataset / "splits" / f"{split}.txt").read_text().split()
+
+
+def write_text(location: Location, text: str) -> None:
+    """Write a text file in one piece: a reader sees the old content or the new, never half of it."""
+    storage.write_file(location, text.encode())
+
+
+def json_text(content) -> str:
+    """Return the content as indented JSON with sorted keys; a number that is not finite is an error."""
+    return json.dumps(content, indent=1, sort_keys=True, allow_nan=False) + "\n"
+
+
+def file_of(folder: Path, name: str) -> Path | None:
+    """Return the file that a name in an object.json means, None where it leads out of the object's folder."""
+    parts = PurePosixPath(name).parts
+    return folder / name if parts and not {"..", "/"} & set(parts) and "\\" not in name else None

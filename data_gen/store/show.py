@@ -1,0 +1,110 @@
+"""A contact sheet of a data set: one self-contained HTML page, for looking.
+
+Per object: its pictures, its condition images, and its points as a front view in base colour, roughness and metallic.
+"""
+
+import base64
+import html
+import io
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import tyro
+from PIL import Image
+
+from data_gen.render import views
+from data_gen.store import check, layout
+
+STYLE = """
+body { font: 14px/1.4 system-ui, sans-serif; margin: 24px; background: #f4f4f2; color: #222 }
+section { background: #fff; padding: 12px 16px; margin: 0 0 14px; border-radius: 6px }
+h2 { font-size: 15px; margin: 0 0 6px } h2 small { color: #777; font-weight: normal; margin-left: 8px }
+div { display: flex; align-items: center; gap: 4px } span { width: 86px; color: #777; font-size: 12px }
+img { image-rendering: pixelated }
+"""
+POINT_IMAGE = 128  # pixels
+BACKDROP = np.array([186, 202, 222], np.uint8)  # neither black nor white, which roughness and metallic often are
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShowConfig:
+    """Write a contact sheet of a data set as one HTML file."""
+
+    dataset: tyro.conf.Positional[Path]
+    """Folder of the data set."""
+    to: Path | None = None
+    """The HTML file (default: contact_sheet.html in the data set's folder)."""
+    objects: int = 48
+    """Show at most this many objects, spread evenly over the data set."""
+
+
+def show(config: ShowConfig) -> Path:
+    """Write the contact sheet; return its path."""
+    check.read_description(config.dataset)
+    if config.objects < 1:
+        raise ValueError(f"--objects: expected 1 or more, got {config.objects}")
+    object_ids = sorted(layout.completed_objects(config.dataset))
+    if not object_ids:
+        raise ValueError(f"{config.dataset} holds no finished object yet; run spnr-data generate again")
+    chosen = np.unique(np.linspace(0, len(object_ids) - 1, min(config.objects, len(object_ids))).round().astype(int))
+    sections = [object_section(config.dataset, object_ids[index]) for index in chosen]
+    title = f"{config.dataset.resolve().name}: {len(chosen)} of {len(object_ids)} objects"
+    page = f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{html.escape(title)}</title>'
+    page += f"<style>{STYLE}</style><h1>{html.escape(title)}</h1>{''.join(sections)}</html>\n"
+    path = config.to or config.dataset / "contact_sheet.html"
+    layout.write_text(path, page)
+    print(path)
+    return path
+
+
+def object_section(dataset: Path, object_id: str) -> str:
+    """Return the HTML of one object."""
+    record = layout.read_object(dataset / "objects" / object_id)
+    ignored = "; ".join(record.details["ignored"])
+    note = f"{record.details['category']}{', ignored: ' + ignored if ignored else ''}"
+    heading = f"<h2>{html.escape(object_id)}<small>{html.escape(note)}</small></h2>"
+    rows = [
+        image_row("pictures", [white_bytes(image) for image in record.images]),
+        image_row("visible", [white_bytes(condition) for condition in record.conditions]),
+        image_row("points", [point_image(record.points, names) for names in channel_names()]),
+    ]
+    return f"<section>{heading}{''.join(rows)}</section>"
+
+
+def channel_names() -> list[tuple[str, ...]]:
+    """Return the point fields that are shown: three for a colour, one for grey."""
+    return [("base_color_r", "base_color_g", "base_color_b"), ("roughness",), ("metallic",)]
+
+
+def image_row(label: str, images: list[np.ndarray]) -> str:
+    """Return a labelled row of pictures (height, width, 3) uint8, shown at 96 pixels or their own size."""
+    tags = "".join(f'<img width="{max(96, image.shape[1])}" src="{data_url(image)}" alt="">' for image in images)
+    return f"<div><span>{label}</span>{tags}</div>"
+
+
+def white_bytes(image: np.ndarray) -> np.ndarray:
+    """Return an RGBA picture on white as (height, width, 3) uint8."""
+    return np.round(255 * views.on_white(image)).astype(np.uint8)
+
+
+def data_url(image: np.ndarray) -> str:
+    """Return the picture as a PNG inside a URL."""
+    buffer = io.BytesIO()
+    Image.fromarray(image).save(buffer, "PNG")
+    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
+
+
+def point_image(points: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
+    """Return the points seen obliquely from the front as (128, 128, 3) uint8, near ones over far ones."""
+    camera = views.ViewConfig(resolution=POINT_IMAGE)
+    pose = views.look_at(camera.distance * np.array([0.5, 0.4, 0.77]))
+    positions = layout.point_columns(points, "x", "y", "z")
+    values = np.broadcast_to(layout.point_columns(points, *names), (len(points), 3))
+    colors = np.round(255 * (views.srgb_from_linear(values) if len(names) == 3 else values)).astype(np.uint8)
+    far_first = np.argsort((positions - pose[:3, 3]) @ pose[:3, 2])
+    columns, rows = np.floor(views.project(pose, positions, camera)).astype(int).clip(0, POINT_IMAGE - 2)[far_first].T
+    canvas = np.tile(BACKDROP, (POINT_IMAGE, POINT_IMAGE, 1))
+    for right, down in ((0, 0), (1, 0), (0, 1), (1, 1)):  # a dot is two pixels wide
+        canvas[rows + down, columns + right] = colors[far_first]
+    return canvas

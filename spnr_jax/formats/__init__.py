@@ -1,0 +1,1 @@
+"""Files of clouds, pictures and data sets, read and written."""

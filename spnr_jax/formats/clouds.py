@@ -1,0 +1,184 @@
+"""Point clouds from files.
+
+`read_cloud` makes a PointCloud of NumPy float32 arrays, not padded, in the file's own units, turned so that y is up;
+`place_cloud` also says how to get back into the file's frame.  Files of points are read as named columns
+(point_files.py, what they mean: point_columns.py), of any size in bounded memory; points are
+spread evenly over meshes, with their materials.  What a file does not say is grey 0.5, roughness 0.5, metallic 0;
+`report` is told so, and of every other assumption, one line each.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from spnr_jax.formats.ply import read_ply_header
+from spnr_jax.formats.point_columns import DEFAULTS, Columns, materials, useful
+from spnr_jax.formats.point_files import READERS, column_pieces, parse_ply
+from spnr_jax.formats.up_axis import ROTATIONS, find_up
+from spnr_jax.kernels.records import PointCloud
+from spnr_jax.kernels.thinning import THINNING, farthest_points, thin_stream
+
+MESHES = (".glb", ".gltf", ".obj", ".stl", ".off")
+MESH_POINTS = 4096  # points drawn from a mesh if no number is asked for; the most that training draws
+MOST_EVEN = 2**14  # points that are spread evenly over a mesh, in seconds; more lie close enough as they are drawn
+CAPACITY = 2**19  # points of a file that are in memory at most; more are thinned while reading
+COARSEST_STEP = 1e-3  # of the extent, that rounding to float32 may cost
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlacedCloud:
+    """A cloud, y up, and its place in the file's frame: position in the file = rotation.T @ position + origin."""
+
+    cloud: PointCloud
+    up: str
+    rotation: np.ndarray  # (3, 3): file -> y up
+    origin: np.ndarray  # (3,) float64, 0 unless float32 is too coarse there
+
+
+def read_cloud(
+    path: str | Path,
+    *,
+    num_points: int | None = None,
+    up: str = "y",
+    seed: int = 0,
+    report: Callable[[str], None] = lambda line: None,
+) -> PointCloud:
+    """The cloud in a file of points or on a mesh file's surface: (points, ...) float32, `mask` all True.
+
+    More than `num_points` are thinned out evenly, fewer are kept; a mesh gives exactly `num_points` (4096 if None).
+    `up` is the file's upward axis, or "auto".  ValueError, one line that names the file, for whatever cannot be read.
+    """
+    return place_cloud(path, num_points=num_points, up=up, seed=seed, report=report).cloud
+
+
+def place_cloud(
+    path: str | Path,
+    *,
+    num_points: int | None = None,
+    up: str = "auto",
+    seed: int = 0,
+    report: Callable[[str], None] = lambda line: None,
+) -> PlacedCloud:
+    """The cloud of `read_cloud` with the way back into the file's frame."""
+    path = Path(path)
+    if up not in (*ROTATIONS, "auto"):
+        raise ValueError(f"up must be one of {', '.join(ROTATIONS)}, auto, got {up!r}")
+    if num_points is not None and num_points < 1:
+        raise ValueError(f"num_points must be at least 1, got {num_points}")
+    _check_file(path)
+    try:
+        if _is_mesh(path):
+            positions, origin, values = _sampled_mesh(path, num_points or MESH_POINTS, seed, report)
+        else:
+            columns = _bounded_columns(path, num_points, report)
+            positions, origin, values = _points_of_columns(columns, report)
+    except (ValueError, OSError) as error:
+        raise ValueError(f"{path}: {str(error).splitlines()[0]}") from error
+    if num_points is not None and len(positions) > num_points:
+        report(f"{num_points} of {len(positions)} points kept, evenly spread")
+        kept = np.sort(farthest_points(positions, num_points, seed))
+        positions, values = positions[kept], {name: column[kept] for name, column in values.items()}
+    if up == "auto":
+        up, reason = find_up(positions, path)
+        report(f"{up} taken as up ({reason}); --up says otherwise")
+    rotation = np.array(ROTATIONS[up], np.float64)
+    return PlacedCloud(cloud=_float32(positions @ rotation.T, values), up=up, rotation=rotation, origin=origin)
+
+
+def cloud_of_ply(content: bytes) -> PointCloud:
+    """The cloud in the bytes of a PLY file of points, y up: (points, ...) float32; ValueError says what is wrong."""
+    positions, _, values = _points_of_columns(_checked(useful(parse_ply(content)), 0), report=lambda line: None)
+    return _float32(positions, values)
+
+
+def _float32(positions: np.ndarray, values: dict[str, np.ndarray]) -> PointCloud:
+    return PointCloud(
+        positions=positions.astype(np.float32),
+        **{name: column.astype(np.float32) for name, column in values.items()},
+        mask=np.ones(len(positions), bool),
+    )
+
+
+def _check_file(path: Path) -> None:
+    """ValueError unless there is a file of a known kind with something in it."""
+    known = tuple(dict.fromkeys((*READERS, *MESHES)))
+    if path.is_dir():
+        raise ValueError(f"{path}: a folder; expected a file of one of {' '.join(known)}")
+    if path.suffix.lower() not in known:
+        raise ValueError(f"{path}: unknown kind of file {path.suffix!r}; expected one of {' '.join(known)}")
+    if not path.is_file():
+        raise ValueError(f"{path}: there is no such file")
+    if path.stat().st_size == 0:
+        raise ValueError(f"{path}: the file is empty")
+
+
+def _is_mesh(path: Path) -> bool:
+    if path.suffix.lower() != ".ply":
+        return path.suffix.lower() in MESHES
+    with path.open("rb") as file:
+        return read_ply_header(file).is_mesh
+
+
+def _sampled_mesh(path: Path, count: int, seed: int, report: Callable[[str], None]):
+    """Positions (count, 3) float64, their origin (3,) and materials of points spread evenly over a mesh."""
+    from spnr_jax.formats.mesh.meshes import load_mesh  # here: points are read without trimesh
+    from spnr_jax.formats.mesh.surface_points import sample_surface
+
+    asset = load_mesh(path)
+    for feature in asset.ignored:
+        report(f"ignored: {feature}")
+    points = sample_surface(asset, count, seed, "even" if count <= MOST_EVEN else "random")
+    if not np.isfinite(points.positions).all():
+        raise ValueError(f"holds vertices too large for float32, more than {np.finfo(np.float32).max:.2g}")
+    report(f"{count} points spread over the surface of the mesh")
+    values = {name: getattr(points, name) for name in DEFAULTS}
+    if all((values[name] == default).all() for name, default in DEFAULTS.items()):
+        report("no material in the mesh: base_color 0.5, roughness 0.5, metallic 0 taken everywhere")
+    return points.positions.astype(np.float64), np.zeros(3), values
+
+
+def _bounded_columns(path: Path, num_points: int | None, report: Callable[[str], None]) -> Columns:
+    """The useful columns of a point file, thinned while reading to CAPACITY points or what `num_points` needs."""
+    capacity = max(CAPACITY, THINNING * (num_points or 0))
+    columns, seen = thin_stream(_checked_pieces(path), capacity)
+    if seen > capacity:
+        report(f"{len(columns['x'])} of {seen} points kept while reading, the first of each voxel")
+    return columns
+
+
+def _checked_pieces(path: Path) -> Iterator[Columns]:
+    seen = 0
+    for piece in column_pieces(path):
+        yield _checked(useful(piece), seen)
+        seen += len(next(iter(piece.values()), ()))
+
+
+def _checked(columns: Columns, before: int) -> Columns:
+    """The columns; ValueError if a position is NaN, infinite or too large for float32."""
+    largest = np.finfo(np.float32).max
+    sound = np.logical_and.reduce([np.abs(np.asarray(columns[axis], np.float64)) < largest for axis in "xyz"])
+    broken = np.flatnonzero(~sound)
+    if broken.size:
+        raise ValueError(
+            f"holds {broken.size} points with NaN, infinity or too large a number, first point {before + broken[0]}"
+        )
+    return columns
+
+
+def _points_of_columns(columns: Columns, report: Callable[[str], None]):
+    """Positions (points, 3) float64, their origin (3,) and materials of useful columns."""
+    if not columns or len(columns["x"]) == 0:
+        raise ValueError("holds 0 points")
+    positions = np.stack([np.asarray(columns[axis], np.float64) for axis in "xyz"], axis=-1)
+    origin = np.zeros(3)
+    extent, step = np.ptp(positions, axis=0).max(), np.spacing(np.float32(np.abs(positions).max()))
+    if step > COARSEST_STEP * extent > 0:
+        if columns["x"].dtype == np.float32:
+            raise ValueError(
+                f"holds points {step:g} apart at best in float32, for an extent of {extent:g}; move them to the origin"
+            )
+        origin = np.floor(positions.min(axis=0))
+        report(f"moved by {' '.join(f'{0 - value:.0f}' for value in origin)} to keep precision")
+    return positions - origin, origin, materials(columns, report)

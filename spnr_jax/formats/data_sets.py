@@ -1,0 +1,176 @@
+"""Data sets on disk, read: what they hold, and their objects as NumPy arrays.
+
+A data set is the folder that `spnr-data generate` writes (its form: README, "Data on disk"), or its packed form
+(spnr_jax/formats/shards.py); both give the same objects.
+"""
+
+import dataclasses
+import errno
+import io
+import json
+import os
+import time
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from PIL import Image, UnidentifiedImageError
+
+from spnr_jax.config import TrainConfig
+from spnr_jax.formats import clouds
+from spnr_jax.formats.shards import Shards, is_plain_name, open_shards, read_files
+from spnr_jax.kernels.records import Camera, PointCloud
+
+# what a file that breaks its rules makes its reader raise; Pillow raises SyntaxError
+UNREADABLE = (OSError, ValueError, LookupError, TypeError, ArithmeticError, AttributeError, RecursionError, SyntaxError)
+# errors of a network drive that is away for a moment, and the seconds after which its file is read again
+PASSING = (errno.EIO, errno.ESTALE, errno.ETIMEDOUT, errno.EAGAIN, errno.ENOTCONN)
+PAUSES = (0.1, 0.5, 2.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObjectData:
+    """One object: all its points, and every view as 8-bit RGBA (straight alpha) with its condition image."""
+
+    name: str
+    cloud: PointCloud
+    camera: Camera
+    images: np.ndarray  # (views, height, width, 4) uint8
+    conditions: np.ndarray  # (views, height, width, 4) uint8, alpha 255 at visible points
+
+    @property
+    def num_bytes(self) -> int:
+        """Memory that the images and points take."""
+        points = sum(getattr(self.cloud, f.name).nbytes for f in dataclasses.fields(PointCloud))
+        return self.images.nbytes + self.conditions.nbytes + points
+
+
+@dataclass(frozen=True, kw_only=True)
+class Dataset:
+    """The folder, its settings and the object names of each split; with its shards if it is packed."""
+
+    folder: Path
+    settings: dict
+    splits: dict[str, tuple[str, ...]]
+    shards: Shards | None = None
+
+    @property
+    def spread(self) -> Literal["random", "even"]:
+        """How the objects' points lie; of even ones the first are evenly spread, too."""
+        return "even" if self.settings.get("settings", {}).get("spread") == "even" else "random"
+
+
+def open_dataset(folder: Path | str) -> Dataset:
+    """The data set in a folder, in either form; ValueError if it is none or unfinished."""
+    folder = Path(folder)
+    description = folder / "dataset.json"
+    if not description.is_file():
+        raise ValueError(f"{folder}: no finished data set (dataset.json is missing); run `spnr-data generate {folder}`")
+    try:
+        settings = json.loads(description.read_text())
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{description}: not valid JSON ({error}); generate the data set again") from None
+    if not isinstance(settings, dict):
+        raise ValueError(f"{description}: holds no settings; generate the data set again")
+    splits = {}
+    for split in ("train", "val", "test"):
+        path = folder / "splits" / f"{split}.txt"
+        if not path.is_file():
+            raise ValueError(f"{path}: missing; run `spnr-data generate {folder}` again, it completes the data set")
+        splits[split] = tuple(path.read_text(errors="replace").split())
+        if strange := [name for name in splits[split] if not is_plain_name(name)]:
+            raise ValueError(f"{path}: {strange[0]!r} is no name of an object; generate the data set again")
+    return Dataset(folder=folder, settings=settings, splits=splits, shards=open_shards(folder))
+
+
+def read_object(dataset: Dataset, name: str) -> ObjectData:
+    """One object of the data set; ValueError names the file that is missing or broken."""
+    folder = dataset.folder / "objects" / name
+    shards, file = dataset.shards, "transforms.json"
+    read = _reader_of(folder) if shards is None else patiently(lambda: read_files(shards, name)).__getitem__
+    try:
+        meta = json.loads(read(file))
+        with np.errstate(over="ignore"):  # what leaves float32 is infinite, and refused
+            poses = np.array([frame["transform_matrix"] for frame in meta["frames"]], np.float32)[:, :3]
+            intrinsics = np.array([[meta["fl_x"], 0, meta["cx"]], [0, meta["fl_y"], meta["cy"]], [0, 0, 1]], np.float32)
+        names = [Path(frame["file_path"]).name for frame in meta["frames"]]
+        height, width = int(meta["h"]), int(meta["w"])
+        if poses.shape[1:] != (3, 4) or not (np.isfinite(poses).all() and np.isfinite(intrinsics).all()):
+            raise ValueError("a camera holds NaN or infinity, or is no 4 x 4 matrix")
+        if not min(intrinsics[0, 0], intrinsics[1, 1]) > 0:
+            raise ValueError(f"focal lengths {meta['fl_x']} and {meta['fl_y']}, expected positive ones")
+        images = np.stack([_rgba(read(file := f"images/{name}"), height, width) for name in names])
+        conditions = np.stack([_rgba(read(file := f"conditions/{name}"), height, width) for name in names])
+        cloud = clouds.cloud_of_ply(read(file := "points.ply"))
+    except UNREADABLE as error:
+        path = folder / file
+        reason = f"no entry {error}" if isinstance(error, KeyError) else str(error).replace(str(path), path.name)
+        raise ValueError(f"{path}: cannot be read ({reason}); run `spnr-data check {dataset.folder}`") from None
+    camera = Camera(
+        cam_to_world=poses, intrinsics=np.broadcast_to(intrinsics, (len(names), 3, 3)), height=height, width=width
+    )
+    return ObjectData(name=name, cloud=cloud, camera=camera, images=images, conditions=conditions)
+
+
+def _reader_of(folder: Path) -> Callable[[str], bytes]:
+    return lambda file: patiently((folder / file).read_bytes)
+
+
+def patiently(read: Callable[[], Any]) -> Any:
+    """What `read` returns; it is called again after each of PAUSES while it fails with one of the errors PASSING."""
+    for pause in PAUSES:
+        try:
+            return read()
+        except (OSError, ValueError) as error:  # of shards the error's number is in the text alone
+            if not any(os.strerror(number) in str(error) for number in PASSING):
+                raise
+        time.sleep(pause)
+    return read()
+
+
+def _rgba(content: bytes, height: int, width: int) -> np.ndarray:
+    try:
+        with warnings.catch_warnings(action="error", category=Image.DecompressionBombWarning):
+            image = Image.open(io.BytesIO(content))
+        if image.size != (width, height):  # before memory is taken for them
+            raise ValueError(f"{image.width} x {image.height} pixels, transforms.json says {width} x {height}")
+        return np.asarray(image.convert("RGBA"))
+    except UnidentifiedImageError:
+        raise ValueError("is not an image") from None
+    except (Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
+        raise ValueError(str(error)) from None
+
+
+def on_white(rgba: np.ndarray) -> np.ndarray:
+    """Float RGB in [0, 1] of 8-bit straight-alpha pixels over white."""
+    color, alpha = rgba[..., :3].astype(np.float32) / 255, rgba[..., 3:].astype(np.float32) / 255
+    return color * alpha + (1 - alpha)
+
+
+def test_cloud(item: ObjectData, config: TrainConfig) -> PointCloud:
+    """The object's first `test_points` points: always the same ones."""
+    return first_points(item, config.test_points)
+
+
+def first_points(item: ObjectData, count: int) -> PointCloud:
+    """So many points of an object, or all if it has fewer: always the same ones."""
+    return PointCloud(**{f.name: getattr(item.cloud, f.name)[:count] for f in dataclasses.fields(PointCloud)})
+
+
+def check_renders(data: ObjectData, config: TrainConfig) -> None:
+    """ValueError if the config's network cannot render an object's views: one size alone, or any."""
+    if not config.model.any_size:
+        check_resolution(data, config)
+
+
+def check_resolution(data: ObjectData, config: TrainConfig) -> None:
+    """ValueError if an object's images do not have the size that the config's network is trained on."""
+    size = config.model.image_resolution
+    if (data.camera.height, data.camera.width) != (size, size):
+        raise ValueError(
+            f"object {data.name} has images of {data.camera.width} x {data.camera.height} pixels, preset "
+            f"{config.preset} needs {size} x {size}; use another preset or generate with --resolution {size}"
+        )

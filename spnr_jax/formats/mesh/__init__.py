@@ -1,0 +1,1 @@
+"""Mesh files read with their materials, and points on their surfaces."""

@@ -1,0 +1,240 @@
+"""Wavefront OBJ + MTL as raw assets: geometry through trimesh, materials from the MTL text.
+
+Kd is linear (as Blender writes it) and counts only without map_Kd (sRGB), for most exporters leave a placeholder beside
+a map; roughness is Pr, else sqrt(2 / (Ns + 2)), else 0.5; metallic is Pm, else 0. Transparent: d below 1, map_d, or Tr
+strictly between 0 and 1 (writers disagree which end of Tr is the opaque one). Of faces with the same three corners,
+in either order, one is kept, that of the material used first: ShapeNet has many, one for each side, and a ray could
+not tell which it hits.
+"""
+
+import io
+import re
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from trimesh.exchange.obj import load_obj as read_obj_text
+from trimesh.geometry import triangulate_quads
+
+from spnr_jax.formats.mesh.assets import Asset, Material, Part, RejectedAsset, Wrap
+from spnr_jax.formats.mesh.companions import read_companion
+from spnr_jax.formats.mesh.texels import color_texels, read_image, value_texels
+
+PLACE = "material-{}"  # name that trimesh sees for the n-th material, so that any name in the file is safe
+READ = {"newmtl", "kd", "map_kd", "pr", "map_pr", "pm", "map_pm", "ns", "d", "tr", "map_d"}
+SILENT = {"ka", "ks", "ni", "illum", "tf", "sharpness"}  # the older lighting model: has no principled counterpart
+Read = Callable[[str], bytes]  # the bytes of a companion file, by its name in the text
+MAPS = ("map_kd", "map_pr", "map_pm")
+OPTION = re.compile(r"-(\w+)((?:\s+(?:on|off|[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)(?=\s))*)\s+")
+
+
+class Placement(NamedTuple):
+    """How a material's maps lie on the surface: texture coordinates (u, v from the lower edge) * scale + offset."""
+
+    wrap: Wrap = "repeat"
+    scale: tuple[float, float] = (1.0, 1.0)
+    offset: tuple[float, float] = (0.0, 0.0)
+
+
+def load_obj(path: Path, root: Path | None = None) -> Asset:
+    """The file's faces grouped by material, as they lie in the file; RejectedAsset if it cannot be used.
+
+    `root` is the folder that libraries and images must not lead out of (default: the file's own).
+    """
+    read = partial(read_companion, path.parent, root=root)
+    text = path.read_text("utf-8", errors="replace")
+    text = re.sub(r"(?m)^ +", "", text.replace("\t", " "))  # trimesh looks for keywords at the line's start
+    if not re.search(r"(?m)^f ", text):
+        raise RejectedAsset("has no faces")
+    library: dict[str, dict[str, str]] = {}
+    for names in re.findall(r"(?m)^mtllib +(.+?) *$", text):
+        library |= parse_mtl(_read_library(read, path.parent, names))
+    names = list(dict.fromkeys(re.findall(r"(?m)^usemtl +(.+?) *$", text)))
+    ignored: set[str] = set()
+    materials = {PLACE.format(i): _material(read, name, library, ignored) for i, name in enumerate(names)}
+    loaded = read_obj_text(io.StringIO(_renamed(text, names)), resolver={"names": _name_list(materials)})
+    order = {name: number for number, name in enumerate(materials)}
+    meshes = sorted(loaded["geometry"].values(), key=lambda mesh: order.get(_material_name(mesh), -1))
+    default = principled(), Placement()
+    parts = [_part(mesh, *materials.get(_material_name(mesh), default)) for mesh in meshes]
+    if re.search(r"(?m)^vn ", text) and any(part.normals is None for part in parts):
+        ignored.add("normals that only some faces have (flat shading is used)")
+    parts = _without_doubles(parts, ignored)
+    return Asset(parts=tuple(parts), ignored=tuple(sorted(ignored)))
+
+
+def _without_doubles(parts: list[Part], ignored: set[str]) -> list[Part]:
+    """The parts without the faces whose three corners an earlier face, of any part, has in some order."""
+    corners = np.concatenate([part.positions[part.faces] for part in parts])
+    if corners.shape[1:] != (3, 3):
+        return parts  # broken: assemble says what is wrong
+    order = np.lexsort(np.moveaxis(corners, -1, 0)[::-1], axis=-1)
+    sorted_corners = np.take_along_axis(corners, order[..., None], axis=1)
+    first = np.unique(sorted_corners.reshape(-1, 9), axis=0, return_index=True)[1]
+    kept = np.zeros(len(corners), bool)
+    kept[first] = True
+    if kept.all():
+        return parts
+    ignored.add(f"{int((~kept).sum())} doubled faces (one of each is kept)")
+    ends = np.cumsum([len(part.faces) for part in parts])[:-1]
+    return [replace(part, faces=part.faces[here]) for part, here in zip(parts, np.split(kept, ends), strict=True)]
+
+
+def principled(
+    base_color: float | np.ndarray = 0.5,
+    roughness: float | np.ndarray = 0.5,
+    metallic: float | np.ndarray = 0.0,
+    wrap: Wrap = "repeat",
+) -> Material:
+    """A material of float32 channels; grey of roughness 0.5 where nothing is given."""
+    color = np.asarray(base_color, np.float32)
+    return Material(
+        base_color=np.clip(np.full(3, color, np.float32) if color.ndim == 0 else color, 0, 1),
+        roughness=np.clip(np.asarray(roughness, np.float32), 0, 1),
+        metallic=np.clip(np.asarray(metallic, np.float32), 0, 1),
+        wrap=wrap,
+    )
+
+
+def parse_mtl(text: str) -> dict[str, dict[str, str]]:
+    """Statements of an MTL file: {material name: {keyword in lower case: rest of the line}}."""
+    library: dict[str, dict[str, str]] = {}
+    current: dict[str, str] = {}
+    for line in text.splitlines():
+        keyword, _, rest = line.strip().partition(" ")
+        if keyword.lower() == "newmtl":
+            current = library.setdefault(rest.strip(), {})
+        elif keyword and not keyword.startswith("#"):
+            current[keyword.lower()] = rest.strip()
+    return library
+
+
+def _read_library(read: Read, folder: Path, names: str) -> str:
+    """Text of the material libraries of one `mtllib` line: one name with spaces, or several without."""
+    single = (folder / names).is_file() or len(names.split()) == 1
+    found = [read(name.replace("\\", "/")) for name in ([names] if single else names.split())]
+    return "\n".join(data.decode("utf-8", errors="replace") for data in found)
+
+
+def _material(
+    read: Read, name: str, library: dict[str, dict[str, str]], ignored: set[str]
+) -> tuple[Material, Placement]:
+    """The principled material of an MTL entry, and how its maps lie."""
+    if name not in library:
+        raise RejectedAsset(f"uses material {name!r}, which no material library defines")
+    entry = library[name]
+    _reject_transparent(entry, name)
+    ignored |= {f"MTL {key}" for key in entry if key not in READ | SILENT and entry[key].strip("0. ")}
+    placement = _placement([entry[key] for key in MAPS if key in entry], ignored)
+    color = np.array([float(x) for x in entry.get("kd", "0.5 0.5 0.5").split()[:3]])
+    if "map_kd" in entry:
+        if "kd" in entry and not np.all(color == 1):
+            ignored.add("MTL Kd beside map_Kd")
+        color = color_texels(_image(read, entry["map_kd"]))
+    roughness = np.sqrt(2 / (max(float(entry["ns"]), 0) + 2)) if "ns" in entry else 0.5
+    channels: dict[str, float | np.ndarray]
+    channels = {"roughness": float(entry.get("pr", roughness)), "metallic": float(entry.get("pm", 0))}
+    for channel, key in (("roughness", "map_pr"), ("metallic", "map_pm")):
+        if key in entry:
+            channels[channel] = value_texels(_image(read, entry[key])[..., 0])
+    return principled(color, **channels, wrap=placement.wrap), placement
+
+
+def _placement(statements: list[str], ignored: set[str]) -> Placement:
+    """How the maps of a material's statements lie: as the first says; others that disagree are named as ignored."""
+    places = []
+    for options, _ in map(_options, statements):
+        ignored |= {f"MTL map option -{name}" for name in options if name not in ("clamp", "s", "o")}
+        wrap: Wrap = "clamp" if options.get("clamp") == ["on"] else "repeat"
+        scale, offset = (_pair(options.get(name, []), missing) for name, missing in (("s", 1.0), ("o", 0.0)))
+        places.append(Placement(wrap, scale, offset))
+    if len(set(places)) > 1:
+        ignored.add("MTL maps of one material that lie differently (the first one's options are used)")
+    return places[0] if places else Placement()
+
+
+def _options(statement: str) -> tuple[dict[str, list[str]], str]:
+    """The options of a map statement with their arguments, and the name of its image."""
+    options = {}
+    while option := OPTION.match(statement):
+        options[option[1]] = option[2].split()
+        statement = statement[option.end() :]
+    return options, statement.strip().replace("\\", "/")
+
+
+def _pair(arguments: list[str], missing: float) -> tuple[float, float]:
+    """The numbers for u and v, of up to three arguments."""
+    u, v, *_ = [*map(float, arguments), missing, missing]
+    return u, v
+
+
+def _image(read: Read, statement: str) -> np.ndarray:
+    """Texels of the image that a map statement names."""
+    _, name = _options(statement)
+    return read_image(read(name), name)
+
+
+def _reject_transparent(entry: dict[str, str], name: str) -> None:
+    if "map_d" in entry:
+        raise RejectedAsset(f"is transparent: material {name!r} has map_d")
+    if "d" in entry and (opacity := float(entry["d"].split()[-1])) < 1:
+        raise RejectedAsset(f"is transparent: material {name!r} has d {opacity:g}")
+    if "tr" in entry and 0 < (share := float(entry["tr"].split()[-1])) < 1:
+        raise RejectedAsset(f"is transparent: material {name!r} has Tr {share:g}")
+
+
+def _renamed(text: str, names: list[str]) -> str:
+    """The OBJ text with numbered material names and absolute vertex numbers, its library replaced by ours."""
+    numbers = {name: PLACE.format(number) for number, name in enumerate(names)}
+    text = re.sub(r"(?m)^mtllib.*$", "", text)
+    text = re.sub(r"(?m)^usemtl +(.+?) *$", lambda match: f"usemtl {numbers[match[1]]}", text)
+    if re.search(r"(?m)^f .*-", text):
+        text = _absolute(text)
+    return f"mtllib names\n{text}"
+
+
+def _absolute(text: str) -> str:
+    """The OBJ text with relative (negative) vertex numbers made absolute; trimesh counts them from the file's end."""
+    counts = {"v": 0, "vt": 0, "vn": 0}
+    lines = []
+    for line in text.splitlines():
+        keyword, *words = line.split() or [""]
+        if keyword in counts:
+            counts[keyword] += 1
+        elif keyword == "f":
+            corners = [zip(word.split("/"), counts.values(), strict=False) for word in words]
+            absolute = [
+                "/".join(str(int(n) + c + 1) if n.startswith("-") else n for n, c in corner) for corner in corners
+            ]
+            line = " ".join(["f", *absolute])
+        lines.append(line)
+    return "\n".join(lines)
+
+
+def _name_list(materials: Iterable[str]) -> str:
+    """An MTL text of names only, which makes trimesh keep the material of each face."""
+    return "\n".join(f"newmtl {name}" for name in materials)
+
+
+def _material_name(mesh: dict) -> str:
+    """The material name of one group of faces that trimesh read, or an empty one."""
+    return getattr(getattr(mesh["visual"], "material", None), "name", "")
+
+
+def _part(mesh: dict, material: Material, placement: Placement) -> Part:
+    """One group of faces that trimesh read."""
+    texcoords = getattr(mesh["visual"], "uv", None)
+    if texcoords is not None:
+        u, v = (texcoords[:, :2] * placement.scale + placement.offset).T
+        texcoords = np.stack([u, 1 - v], axis=-1)  # OBJ counts v from the lower edge
+    return Part(
+        positions=np.asarray(mesh["vertices"], np.float64),
+        faces=triangulate_quads(mesh["faces"]),
+        material=material,
+        normals=mesh.get("vertex_normals"),
+        texcoords=texcoords,
+        colors=mesh.get("vertex_colors"),
+    )

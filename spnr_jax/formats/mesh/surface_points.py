@@ -1,0 +1,145 @@
+"""Surface points with materials: normalisation of an object, and samples of its surface.
+
+Points are drawn uniformly by area over all parts, or spread evenly: each the farthest of several times as many from
+those before.  The material of each is looked up with the interpolation of the renderer (texels.py) and
+multiplied by the interpolated vertex colour.  `face` counts through all parts, as the renderer reports its hits.
+"""
+
+from dataclasses import dataclass, fields, replace
+from typing import Literal
+
+import numpy as np
+
+from spnr_jax.formats.mesh.assets import Asset, Material, Part, RejectedAsset, Values
+from spnr_jax.formats.mesh.texels import lookup
+from spnr_jax.kernels.thinning import farthest_points
+
+Spread = Literal["random", "even"]
+CANDIDATES = 4  # points drawn for each that is kept of an even spread
+
+
+@dataclass(frozen=True, kw_only=True)
+class SurfacePoints:
+    """Points (n,) on a surface, float32: linear colours and materials in [0, 1], unit normals, global face (int32)."""
+
+    positions: np.ndarray
+    normals: np.ndarray
+    base_color: np.ndarray
+    roughness: np.ndarray
+    metallic: np.ndarray
+    face: np.ndarray
+
+
+def bounding_box(asset: Asset) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest corner (3,) of the vertices that faces use; RejectedAsset where there is no such box."""
+    corners = [part.positions[part.faces.ravel()] for part in asset.parts if len(part.faces)]
+    if not corners:
+        raise RejectedAsset("has no faces")
+    used = np.concatenate(corners)
+    if not np.isfinite(used).all():
+        raise RejectedAsset("has vertices that are not finite (NaN or infinity)")
+    low, high = used.min(axis=0), used.max(axis=0)
+    if not np.linalg.norm(high - low) > 0:
+        raise RejectedAsset("has zero extent: all its vertices lie in one point")
+    return low, high
+
+
+def normalise(asset: Asset) -> tuple[Asset, dict]:
+    """The asset with its bounding-box centre at 0 and half of the box's diagonal 1, and the transform that did it.
+
+    The transform is {"centre": [x, y, z], "scale": s}: normalised = (position - centre) * scale.
+    """
+    low, high = bounding_box(asset)
+    centre, scale = (low + high) / 2, 2 / np.linalg.norm(high - low)
+    parts = tuple(replace(part, positions=(part.positions - centre) * scale) for part in asset.parts)
+    return replace(asset, parts=parts), {"centre": centre.tolist(), "scale": float(scale)}
+
+
+def sample_surface(asset: Asset, num_points: int, seed: int, spread: Spread = "random") -> SurfacePoints:
+    """Points on all faces; the same seed gives the same points.
+
+    Random ones are drawn uniformly by area.  Of an even spread each is the farthest of CANDIDATES times as many from
+    those before it, so that any first ones of them are spread evenly too, and thin parts have their share.
+    """
+    if num_points < 1:
+        raise ValueError(f"num_points must be at least 1, got {num_points}")
+    if spread == "random":
+        return _random_points(asset, num_points, seed)
+    drawn = _random_points(asset, CANDIDATES * num_points, seed)
+    chosen = farthest_points(drawn.positions, num_points, seed)
+    return SurfacePoints(**{column.name: getattr(drawn, column.name)[chosen] for column in fields(SurfacePoints)})
+
+
+def _random_points(asset: Asset, num_points: int, seed: int) -> SurfacePoints:
+    bounding_box(asset)
+    rng = np.random.default_rng(seed)
+    cumulative = np.cumsum(np.concatenate([face_areas(part) for part in asset.parts]))
+    if not cumulative[-1] > 0:
+        raise RejectedAsset("has no face with an area")
+    face = np.searchsorted(cumulative, rng.random(num_points) * cumulative[-1], side="right")
+    face = np.minimum(face, np.searchsorted(cumulative, cumulative[-1]))  # the product can round up to the total
+    barycentric = _uniform_barycentric(rng.random((num_points, 2)))
+    first_face = np.cumsum([0, *(len(part.faces) for part in asset.parts)])
+    columns: dict[str, np.ndarray]
+    columns = {name: np.zeros((num_points, 3), np.float32) for name in ("positions", "normals", "base_color")}
+    columns |= {name: np.zeros(num_points, np.float32) for name in ("roughness", "metallic")}
+    for part, first in zip(asset.parts, first_face, strict=False):
+        here = (face >= first) & (face < first + len(part.faces))
+        for name, values in _sample_part(part, face[here] - first, barycentric[here]).items():
+            columns[name][here] = values
+    return SurfacePoints(**columns, face=face.astype(np.int32))
+
+
+def face_areas(part: Part) -> np.ndarray:
+    """Areas (f,) of a part's triangles."""
+    return np.linalg.norm(_face_cross(part), axis=-1) / 2
+
+
+def evaluate_material(material: Material, texcoords: np.ndarray | None, count: int) -> dict[str, np.ndarray]:
+    """base_color (count, 3), roughness (count,) and metallic (count,) of a material at texture coordinates."""
+
+    def channel(values: Values, value_ndim: int) -> np.ndarray:
+        if values.ndim == value_ndim:
+            return np.broadcast_to(values, (count, *values.shape))
+        assert texcoords is not None, "a texture needs texture coordinates"
+        return lookup(np.asarray(values), texcoords, material.wrap)
+
+    return {
+        "base_color": channel(material.base_color, 1),
+        "roughness": channel(material.roughness, 0),
+        "metallic": channel(material.metallic, 0),
+    }
+
+
+def _sample_part(part: Part, face: np.ndarray, barycentric: np.ndarray) -> dict[str, np.ndarray]:
+    """Every column of SurfacePoints but `face`, at barycentric coordinates (n, 3) of local faces (n,)."""
+
+    def interpolate(values: np.ndarray) -> np.ndarray:
+        return np.einsum("nk,nkc->nc", barycentric, values[part.faces[face]])
+
+    texcoords = None if part.texcoords is None else interpolate(part.texcoords)
+    channels = evaluate_material(part.material, texcoords, len(face))
+    if part.colors is not None:
+        channels["base_color"] = channels["base_color"] * interpolate(part.colors)
+    geometric = unit(_face_cross(part)[face])
+    normals = geometric if part.normals is None else unit(interpolate(part.normals), geometric)
+    return {"positions": interpolate(part.positions), "normals": normals, **channels}
+
+
+def _uniform_barycentric(uniform: np.ndarray) -> np.ndarray:
+    """Barycentric coordinates (n, 3), uniform over the triangle, of uniform numbers (n, 2)."""
+    root = np.sqrt(uniform[:, :1])
+    return np.concatenate([1 - root, root * (1 - uniform[:, 1:]), root * uniform[:, 1:]], axis=-1)
+
+
+def _face_cross(part: Part) -> np.ndarray:
+    """Normals (f, 3) of twice the triangles' area."""
+    a, b, c = np.moveaxis(part.positions[part.faces], 1, 0)
+    return np.cross(b - a, c - a)
+
+
+def unit(vectors: np.ndarray, fallback: np.ndarray | None = None) -> np.ndarray:
+    """Vectors (n, 3) of length 1; where one has no length, the fallback."""
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    directed = vectors / np.where(length > 0, length, 1)
+    return directed if fallback is None else np.where(length > 0, directed, fallback)

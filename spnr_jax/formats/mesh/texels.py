@@ -1,0 +1,90 @@
+"""Texels: encoded images to linear values, and the lookup that the point sampler and the renderer share.
+
+Conventions (assets.py): row 0 is v = 0, v runs down the rows, texel centres lie at half-integers / size.
+The lookup is mitsuba's `bitmap` with `filter_type: bilinear` and the same `wrap_mode`; a test compares the two.
+Images larger than MAX_SIZE texels in width or height are box-filtered (in linear values) to at most MAX_SIZE.
+"""
+
+import io
+
+import numpy as np
+from PIL import Image, UnidentifiedImageError
+
+from spnr_jax.formats.mesh.assets import RejectedAsset, Wrap
+
+MAX_SIZE = 1024
+MOST_PIXELS = 2**26  # of an image file: 8192 x 8192
+
+
+def srgb_to_linear(encoded: np.ndarray) -> np.ndarray:
+    """Linear values of sRGB-encoded ones in [0, 1] (IEC 61966-2-1)."""
+    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+
+
+SRGB_TABLE = srgb_to_linear(np.arange(256) / 255).astype(np.float32)
+
+
+def read_image(data: bytes, name: str) -> np.ndarray:
+    """Texels (height, width, 4) uint8 of an image file as they are encoded; alpha is 255 where it has none."""
+    try:
+        with Image.open(io.BytesIO(data)) as image:
+            if image.width * image.height > MOST_PIXELS:  # before memory is taken for them
+                raise ValueError(f"{image.width} x {image.height} pixels, more than {MOST_PIXELS}")
+            if image.mode.startswith("I"):  # PIL would clip 16-bit grey to 255 instead of scaling it
+                eight_bit = (np.asarray(image, np.int64) // 257).astype(np.uint8)
+                return np.asarray(Image.fromarray(eight_bit).convert("RGBA"))
+            return np.asarray(image.convert("RGBA"))
+    except (UnidentifiedImageError, OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        raise RejectedAsset(f"names an image that cannot be read: {name} ({error})") from None
+
+
+def color_texels(encoded: np.ndarray) -> np.ndarray:
+    """Linear colours (h, w, 3) float32 of sRGB-encoded texels (h, w, 4) uint8, at most MAX_SIZE a side."""
+    return shrink(SRGB_TABLE[encoded[..., :3]])
+
+
+def value_texels(encoded: np.ndarray) -> np.ndarray:
+    """Values (h, w) float32 in [0, 1] of linearly encoded texels (h, w) uint8, at most MAX_SIZE a side."""
+    return shrink(encoded.astype(np.float32) / 255)
+
+
+def shrink(texels: np.ndarray) -> np.ndarray:
+    """The texture (height, width) or (height, width, c), float32, box-filtered to at most MAX_SIZE texels a side."""
+    height, width = texels.shape[:2]
+    ratio = MAX_SIZE / max(height, width)
+    if ratio >= 1:
+        return texels.astype(np.float32)
+    return resize(texels, max(1, round(height * ratio)), max(1, round(width * ratio)))
+
+
+def resize(texels: np.ndarray, height: int, width: int) -> np.ndarray:
+    """The texture resampled with a box filter, float32."""
+    channels = texels.reshape(*texels.shape[:2], -1)
+    resized = [
+        np.asarray(Image.fromarray(np.ascontiguousarray(channel)).resize((width, height), Image.Resampling.BOX))
+        for channel in np.moveaxis(channels.astype(np.float32), -1, 0)
+    ]
+    return np.stack(resized, axis=-1).reshape(height, width, *texels.shape[2:])
+
+
+def lookup(texels: np.ndarray, texcoords: np.ndarray, wrap: Wrap) -> np.ndarray:
+    """Bilinear values (n,) or (n, c) of a texture (height, width) or (height, width, c) at texcoords (n, 2)."""
+    size = np.array([texels.shape[1], texels.shape[0]])
+    position = np.asarray(texcoords, np.float64) * size - 0.5
+    corner = np.floor(position).astype(np.int64)
+    weight = position - corner
+    (left, top), (right, bottom) = _wrap(corner, size, wrap).T, _wrap(corner + 1, size, wrap).T
+    x, y = (weight[:, axis].reshape(-1, *[1] * (texels.ndim - 2)) for axis in (0, 1))
+    upper = (1 - x) * texels[top, left] + x * texels[top, right]
+    lower = (1 - x) * texels[bottom, left] + x * texels[bottom, right]
+    return (1 - y) * upper + y * lower
+
+
+def _wrap(index: np.ndarray, size: np.ndarray, wrap: Wrap) -> np.ndarray:
+    """Texel indices inside [0, size) for any integer indices."""
+    if wrap == "clamp":
+        return np.clip(index, 0, size - 1)
+    if wrap == "repeat":
+        return index % size
+    folded = index % (2 * size)
+    return np.minimum(folded, 2 * size - 1 - folded)

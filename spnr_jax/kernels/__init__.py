@@ -1,0 +1,1 @@
+"""Pure functions of arrays, and the records that travel between them."""

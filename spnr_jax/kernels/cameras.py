@@ -1,0 +1,118 @@
+"""Cameras: poses, pixel grids, rays and the box that the object lies in.
+
+Conventions: OpenGL axes (x right, y up, the camera looks along -z), `cam_to_world` maps camera to world coordinates,
+intrinsics are in pixels, row 0 is the top of the image and pixel (row, column) has its centre at (column + 0.5,
+row + 0.5).  Ray directions have unit length.  Everything broadcasts over leading batch axes.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from spnr_jax.kernels.numerics import length, normalize, safe_divide
+from spnr_jax.kernels.records import Camera, Rays, Rendering
+
+# A direction component below this moves a ray by less than a float32 spacing across 10^4 boxes, so it counts as 0; the
+# square of its inverse, which the gradient contains, stays far from overflow.
+PARALLEL = 1e-12
+
+
+def look_at(
+    eye: Float[Array, "*batch 3"], target: Float[Array, "*#batch 3"], up: Float[Array, "*#batch 3"]
+) -> Float[Array, "*batch 3 4"]:
+    """Camera-to-world pose at `eye` that looks at `target`; `up` must not be parallel to the line of sight."""
+    backward = normalize(eye - target)
+    right = normalize(jnp.cross(jnp.broadcast_to(up, backward.shape), backward))
+    return jnp.stack([right, jnp.cross(backward, right), backward, jnp.broadcast_to(eye, backward.shape)], axis=-1)
+
+
+def pinhole(cam_to_world: Float[Array, "*batch 3 4"], field_of_view: float, height: int, width: int) -> Camera:
+    """Camera with a horizontal field of view in radians, square pixels and the principal point in the middle."""
+    focal = 0.5 * width / jnp.tan(0.5 * field_of_view)
+    intrinsics = jnp.array([[focal, 0, 0.5 * width], [0, focal, 0.5 * height], [0, 0, 1]], jnp.float32)
+    intrinsics = jnp.broadcast_to(intrinsics, (*cam_to_world.shape[:-2], 3, 3))
+    return Camera(cam_to_world=cam_to_world, intrinsics=intrinsics, height=height, width=width)
+
+
+def resize(camera: Camera, height: int, width: int) -> Camera:
+    """The same view with another number of pixels."""
+    scale = jnp.array([[width / camera.width], [height / camera.height], [1.0]], jnp.float32)
+    scale = jnp.broadcast_to(scale, (*camera.intrinsics.shape[:-1], 1))
+    return dataclasses.replace(camera, intrinsics=camera.intrinsics * scale, height=height, width=width)
+
+
+def camera_rays(camera: Camera) -> Rays:
+    """Rays through all pixel centres, (*batch, height, width, 3)."""
+    columns, rows = (jnp.arange(n, dtype=jnp.float32) + 0.5 for n in (camera.width, camera.height))
+    fx, fy, cx, cy = (camera.intrinsics[..., i, j, None, None] for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    ones = [1] * (fx.ndim - 2)
+    x, y = (columns.reshape(*ones, 1, -1) - cx) / fx, -(rows.reshape(*ones, -1, 1) - cy) / fy
+    x, y = jnp.broadcast_arrays(x, y)
+    local = jnp.stack([x, y, -jnp.ones_like(x)], axis=-1)
+    rotation, eye = camera.cam_to_world[..., :3], camera.cam_to_world[..., None, None, :, 3]
+    directions = normalize(jnp.einsum("...ij,...hwj->...hwi", rotation, local, precision="highest"))
+    return Rays(origins=jnp.broadcast_to(eye, directions.shape), directions=directions)
+
+
+def view_rays(camera: Camera) -> Rays:
+    """Rays of all views of an object in one axis, (objects, views * height * width, 3)."""
+    return jax.tree.map(lambda x: x.reshape(x.shape[0], -1, 3), camera_rays(camera))
+
+
+def as_images(
+    camera: Camera,
+    rgb: Float[Array, "objects rays 3"],
+    depth: Float[Array, "objects rays"],
+    acc: Float[Array, "objects rays"],
+) -> Rendering:
+    """Views from the rays of `view_rays`, by a method that renders every pixel of the image."""
+    shape = (*camera.cam_to_world.shape[:-2], camera.height, camera.width)
+    image = rgb.reshape(*shape, 3)
+    return Rendering(image=image, image_lr=image, depth=depth.reshape(shape), acc=acc.reshape(shape))
+
+
+def project(
+    camera: Camera, positions: Float[Array, "*batch points 3"]
+) -> tuple[Float[Array, "*batch points 2"], Float[Array, "*batch points"]]:
+    """Pixel coordinates (column, row) and distance from the eye, the inverse of `camera_rays`.
+
+    A point at or behind the plane of the eye has no pixel: its coordinates are NaN-free but outside every image (-inf).
+    """
+    offset = positions - camera.cam_to_world[..., None, :, 3]
+    local = jnp.einsum("...ji,...nj->...ni", camera.cam_to_world[..., :3], offset, precision="highest")
+    in_front = -local[..., 2] > 0
+    plane = safe_divide(local[..., :2], jnp.broadcast_to(-local[..., 2:], local[..., :2].shape))
+    focal = jnp.stack([camera.intrinsics[..., None, 0, 0], -camera.intrinsics[..., None, 1, 1]], axis=-1)
+    pixels = plane * focal + camera.intrinsics[..., None, :2, 2]
+    return jnp.where(in_front[..., None], pixels, -jnp.inf), length(offset)
+
+
+def intersect_box(
+    origins: Float[Array, "*batch 3"], directions: Float[Array, "*batch 3"], lo: float = -1.0, hi: float = 1.0
+) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"], Bool[Array, "*batch"]]:
+    """Distances of entry (0 from inside) and exit of the cube [lo, hi]^3, and whether it is hit; a miss has 0, 0."""
+    parallel = jnp.abs(directions) < PARALLEL
+    inverse = 1 / jnp.where(parallel, 1.0, directions)
+    a, b = (lo - origins) * inverse, (hi - origins) * inverse
+    inside = (origins >= lo) & (origins <= hi)
+    entry = jnp.where(parallel, jnp.where(inside, -jnp.inf, jnp.inf), jnp.minimum(a, b))
+    leave = jnp.where(parallel, jnp.where(inside, jnp.inf, -jnp.inf), jnp.maximum(a, b))
+    near, far = jnp.maximum(jnp.max(entry, axis=-1), 0.0), jnp.min(leave, axis=-1)
+    hit = (far > near) & jnp.isfinite(far)
+    return jnp.where(hit, near, 0.0), jnp.where(hit, far, 0.0), hit
+
+
+def orbit(
+    azimuth: float | Float[Array, ""],
+    elevation: float | Float[Array, ""],
+    distance: float | Float[Array, ""],
+    centre: Float[Array, "3"],
+) -> Float[Array, "3 4"]:
+    """Pose that looks at `centre` from a distance; angles in radians, azimuth around y from +z, elevation above xz."""
+    horizontal = jnp.cos(elevation)
+    direction = jnp.stack([horizontal * jnp.sin(azimuth), jnp.sin(elevation), horizontal * jnp.cos(azimuth)])
+    # seen from straight above or below, the picture's up is where the back of the object is
+    up = jnp.where(horizontal > 1e-6, jnp.array([0.0, 1.0, 0.0]), jnp.array([0.0, 0.0, -1.0]) * jnp.sign(elevation))
+    return look_at(centre + distance * direction, centre, up)

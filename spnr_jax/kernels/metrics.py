@@ -1,0 +1,96 @@
+"""Image quality: one number per image, never an average that hides its denominator.
+
+Images are float RGB in [0, 1] on white, (*batch, height, width, 3).
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from spnr_jax.kernels.numerics import safe_divide
+
+PSNR_CAP = 100.0  # dB, of identical images
+SSIM_SIGMA, SSIM_RADIUS = 1.5, 5  # gaussian window of Wang et al. 2004, cut at 3.5 sigma as scikit-image does
+SILENT = 1e-10  # spectral energy a pixel below which there is only rounding; 8-bit steps have 5e-7
+SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2
+
+
+def _decibel(mean_squared_error):
+    floor = 10 ** (-PSNR_CAP / 10)
+    return -10 * jnp.log10(jnp.maximum(mean_squared_error, floor))
+
+
+def psnr(
+    image: Float[Array, "*batch height width 3"], reference: Float[Array, "*batch height width 3"]
+) -> Float[Array, "*batch"]:
+    """Peak signal-to-noise ratio in dB, at most 100."""
+    return _decibel(jnp.mean((image - reference) ** 2, axis=(-3, -2, -1)))
+
+
+def conditional_psnr(
+    image: Float[Array, "*batch height width 3"],
+    reference: Float[Array, "*batch height width 3"],
+    mask: Bool[Array, "*batch height width"],
+) -> Float[Array, "*batch"]:
+    """PSNR over the condition pixels alone, where a visible input point lies; NaN if there is none (skip and count)."""
+    squared = jnp.sum(jnp.where(mask[..., None], (image - reference) ** 2, 0), axis=(-3, -2, -1))
+    count = 3 * jnp.sum(mask, axis=(-2, -1))
+    return jnp.where(count > 0, _decibel(safe_divide(squared, count.astype(squared.dtype))), jnp.nan)
+
+
+def ssim(
+    image: Float[Array, "*batch height width 3"], reference: Float[Array, "*batch height width 3"]
+) -> Float[Array, "*batch"]:
+    """Structural similarity, mean over channels; scikit-image's with gaussian weights, sigma 1.5, data range 1.
+
+    Off by up to 1e-3 where both images are bright and flat: a small variance is the difference of large squares.
+    """
+    if min(image.shape[-3:-1]) < 2 * SSIM_RADIUS + 1:
+        raise ValueError(f"ssim needs images of at least {2 * SSIM_RADIUS + 1} pixels, got {image.shape[-3:-1]}")
+    taps = np.exp(-0.5 * (np.arange(-SSIM_RADIUS, SSIM_RADIUS + 1) / SSIM_SIGMA) ** 2)
+    taps = (taps / taps.sum()).tolist()
+
+    def blur(x):  # the border, where the window leaves the image, is cut off
+        for axis in (x.ndim - 3, x.ndim - 2):
+            shifted = (jax.lax.slice_in_dim(x, i, x.shape[axis] - 2 * SSIM_RADIUS + i, axis=axis) for i in range(11))
+            x = sum(tap * part for tap, part in zip(taps, shifted, strict=True))
+        return x
+
+    mean_x, mean_y = blur(image), blur(reference)
+    variance_x, variance_y = blur(image**2) - mean_x**2, blur(reference**2) - mean_y**2
+    covariance = blur(image * reference) - mean_x * mean_y
+    score = (2 * mean_x * mean_y + SSIM_C1) * (2 * covariance + SSIM_C2)
+    score = score / ((mean_x**2 + mean_y**2 + SSIM_C1) * (variance_x + variance_y + SSIM_C2))
+    return jnp.mean(score, axis=(-3, -2, -1))
+
+
+def opacity_iou(
+    acc: Float[Array, "*batch height width"], alpha: Float[Array, "*batch height width"]
+) -> Float[Array, "*batch"]:
+    """Intersection over union of the pixels that are more than half opaque; 1 where both have none."""
+    ours, theirs = acc > 0.5, alpha > 0.5
+    union = jnp.sum(ours | theirs, axis=(-2, -1))
+    return jnp.where(union > 0, safe_divide(1.0 * jnp.sum(ours & theirs, axis=(-2, -1)), 1.0 * union), 1.0)
+
+
+def high_frequency_ratio(
+    image: Float[Array, "*batch height width 3"], reference: Float[Array, "*batch height width 3"], share: float = 0.5
+) -> Float[Array, "*batch"]:
+    """Energy of the image over that of the reference above `share` of the Nyquist frequency; 1 is equally sharp.
+
+    Spectra of all channels in a Hann window; a constant does not count.  NaN where the reference has no such energy.
+    """
+    height, width = image.shape[-3:-1]
+    rows, columns = (0.5 - 0.5 * np.cos(2 * np.pi * np.arange(n) / n) for n in (height, width))
+    frequency = np.hypot(2 * np.fft.fftfreq(height)[:, None], 2 * np.fft.fftfreq(width))
+    window, high = rows[:, None] * columns, frequency >= share
+
+    def energy(x):
+        centred = x - jnp.mean(x, axis=(-3, -2), keepdims=True)
+        shape = (*[1] * (x.ndim - 3), height, width, 1)
+        spectrum = jnp.fft.fft2(centred * jnp.asarray(window.reshape(shape), x.dtype), axes=(-3, -2), norm="ortho")
+        return jnp.sum(jnp.where(high.reshape(shape), jnp.abs(spectrum) ** 2, 0), axis=(-3, -2, -1))
+
+    ours, theirs = energy(image), energy(reference)
+    return jnp.where(theirs > SILENT * height * width, safe_divide(ours, theirs), jnp.nan)

@@ -1,0 +1,112 @@
+"""Where along a ray the volume is evaluated: stratified samples, and samples drawn from a step function.
+
+Vocabulary: `edges` (*batch, n+1) are the sorted ends of n bins along a ray, `distances` (*batch, m) are samples,
+`weights` (*batch, n) is the mass of each bin.  A key draws one number per sample of every ray, keys of the rays
+(*batch) each those of its own; key=None takes the middle of each stratum.  All of it is float32: one bf16 spacing is
+wider than a coarse bin.
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, Shaped
+
+from spnr_jax.kernels.numerics import clamp, per_feature, safe_divide
+from spnr_jax.kernels.records import Key
+
+
+def strata(key: Key | None, shape: tuple[int, ...], num_samples: int) -> Float[Array, "*batch samples"]:
+    """One number in each of `num_samples` equal parts of [0, 1]: uniform in its part, or its middle without a key."""
+    shape = (*shape, num_samples)
+    jitter = jnp.full(shape, 0.5) if key is None else _uniform(key, shape)
+    return (per_feature(jnp.arange(num_samples, dtype=float), jitter) + jitter) / num_samples
+
+
+def split(key: Key) -> tuple[Key, Key]:
+    """Two new keys of each key."""
+    if key.ndim:
+        return jax.vmap(split)(key)
+    first, second = jax.random.split(key)
+    return first, second
+
+
+def _uniform(key, shape):
+    return jax.random.uniform(key, shape) if key.ndim == 0 else jax.vmap(_uniform, (0, None))(key, shape[1:])
+
+
+def stratified(
+    key: Key | None, near: Float[Array, "*batch"], far: Float[Array, "*batch"], num_samples: int
+) -> tuple[Float[Array, "*batch samples"], Float[Array, "*batch samples+1"]]:
+    """Sorted distances, one in each equal part of [near, far], and the edges of the parts (NeRF, eq. 2)."""
+    near, far = near[..., None], far[..., None]
+    steps = jnp.arange(num_samples + 1, dtype=jnp.promote_types(near.dtype, jnp.float32))
+    fractions = per_feature(steps / num_samples, near)
+    edges = near + (far - near) * fractions  # rises with the fractions, whatever is rounded
+    edges = jnp.where((fractions < 1) & (edges < far), edges, far)
+    at = strata(key, near.shape[:-1], num_samples)
+    return clamp(near + (far - near) * at, edges[..., :-1], edges[..., 1:]), edges
+
+
+def importance(
+    key: Key | None,
+    edges: Float[Array, "*batch edges"],
+    weights: Float[Array, "*batch edges-1"],
+    num_samples: int,
+    padding: float = 1e-5,
+) -> Float[Array, "*batch {num_samples}"]:
+    """Sorted distances inside the edges, distributed as the step function `weights + padding` (NeRF, section 5.2).
+
+    Inverts the cumulative distribution at one number of each of num_samples strata.  All-zero weights give an even
+    spread.  No gradient: the samples are where to look, not what is seen; through them the coarse weights would be
+    pulled towards whatever the fine samples happen to find.
+    """
+    edges, weights = jax.lax.stop_gradient((edges, weights))
+    mass = weights + padding
+    cdf = jnp.cumsum(mass / jnp.sum(mass, axis=-1, keepdims=True), axis=-1)
+    at = strata(key, weights.shape[:-1], num_samples)
+    upper = jnp.minimum(count_at_most(cdf, at), weights.shape[-1] - 1)
+    below = jnp.where(upper > 0, _pick(cdf, jnp.maximum(upper - 1, 0)), 0.0)
+    fraction = jnp.clip(safe_divide(at - below, _pick(cdf, upper) - below), 0.0, 1.0)
+    lo, hi = _pick(edges, upper), _pick(edges, upper + 1)
+    return jnp.clip(lo + fraction * (hi - lo), lo, hi)
+
+
+def merge(
+    first: Float[Array, "*batch n"], second: Float[Array, "*batch m"]
+) -> tuple[Int[Array, "*batch n+m"], Int[Array, "*batch n+m"]]:
+    """(order, rank) of two sorted lists laid end to end: `both[order]` is sorted, and `sorted[rank]` is both again.
+
+    Equal numbers keep the first list's first.  Counting what is smaller takes an eighth of a sort's time on CPU.
+    """
+    n, m = first.shape[-1], second.shape[-1]
+    place_first, place_second, place = (per_feature(jnp.arange(k, dtype=jnp.int32), first) for k in (n, m, n + m))
+    # without barriers XLA computes the ranks anew inside each gather that reads them
+    barrier = jax.lax.optimization_barrier
+    rank_first = barrier(place_first + count_at_most(second, first, strictly=True))
+    rank_second = barrier(place_second + count_at_most(first, second))
+    place = jnp.broadcast_to(place, (*first.shape[:-1], n + m))
+    taken = barrier(count_at_most(rank_first, place, strictly=True))
+    from_first = _pick(rank_first, jnp.minimum(taken, n - 1)) == place
+    order = jnp.where(from_first, taken, n + place - taken)
+    return barrier((order, jnp.concatenate([rank_first, rank_second], axis=-1)))
+
+
+def count_at_most(
+    sorted_values: Shaped[Array, "*batch n"], queries: Shaped[Array, "*batch m"], strictly: bool = False
+) -> Int[Array, "*batch m"]:
+    """How many of the sorted values are <= (strictly: <) each query: one by one for few values, else by bisection."""
+    n = sorted_values.shape[-1]
+    count = jnp.zeros(queries.shape, jnp.int32)
+    if n <= 256:
+        for i in range(n):
+            value = sorted_values[..., i : i + 1]
+            count = count + (value < queries if strictly else value <= queries)
+        return count
+    for step in (2**k for k in reversed(range(n.bit_length()))):
+        value = _pick(sorted_values, jnp.minimum(count + step, n) - 1)
+        passes = value < queries if strictly else value <= queries
+        count = jnp.where((count + step <= n) & passes, count + step, count)
+    return count
+
+
+def _pick(values, index):
+    return jnp.take_along_axis(values, index, axis=-1)

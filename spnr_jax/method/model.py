@@ -1,0 +1,176 @@
+"""The handle for people who only want pictures: load a network, encode a cloud once, render it from anywhere.
+
+    model = spnr_jax.load()  # "small" of the package; or "tiny", a run folder, a file of weights
+    volume = model.encode(spnr_jax.read_cloud("chair.ply"))
+    rendering = model.render(volume, model.camera(volume, azimuth=30, elevation=20))
+
+Clouds, cameras and depths are in the cloud's own units; the transform into the network's box is kept with the volume.
+"""
+
+import dataclasses
+from dataclasses import dataclass
+from functools import cached_property, partial
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Float
+from scipy.spatial import cKDTree
+
+from spnr_jax.devices.placement import by_all_devices, everywhere
+from spnr_jax.kernels import cameras, cloud_arrays, supersampling
+from spnr_jax.kernels.records import Camera, PointCloud, Rendering
+from spnr_jax.method import inference
+from spnr_jax.model_config import ModelConfig, NetworkConfig, SamplingConfig
+
+FIELD_OF_VIEW, DISTANCE = np.deg2rad(40.0), 3.0  # of the training cameras; the object fits into the unit sphere
+Quality = Literal["draft", "balanced", "best", "trained"]
+SAMPLES = {"draft": 0.25, "balanced": 0.5, "best": 1.0}  # share of the samples a ray was trained with
+REACH_PER_SPACING, LARGEST_REACH = 1.6, 4  # what loses nothing from 128 to 4096 points, docs/performance.md
+
+
+@struct.dataclass
+class Volume:
+    """An encoded object in the box [-1, 1]^3, which is (position - centre) * scale of the cloud.
+
+    `scene` is what the network encodes a cloud as: for ours a `records.Scene`.
+    """
+
+    scene: Any
+    centre: Float[Array, "3"]
+    scale: Float[Array, ""]
+    reach: int = struct.field(pytree_node=False, default=LARGEST_REACH)
+    """Voxels around points that rendering looks at, from how far the points lie apart."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Model:
+    """A trained network; `encode` and `render` are jitted, one compilation per bucket of points and image size."""
+
+    config: NetworkConfig
+    variables: dict
+
+    def encode(self, cloud: PointCloud) -> Volume:
+        """Volume of a cloud (unbatched, any units, y up).  ValueError if it holds no points, NaN or infinity."""
+        positions = np.asarray(cloud.positions, np.float32)
+        mask = np.asarray(cloud.mask)
+        if not mask.any():
+            raise ValueError("the cloud has no points; give at least one")
+        for field in dataclasses.fields(cloud):
+            if not np.isfinite(np.asarray(getattr(cloud, field.name))[mask]).all():
+                raise ValueError(f"the cloud has NaN or infinity in its {field.name}; remove those points")
+        centre, scale = cloud_arrays.normalization(positions[mask])
+        # the ends of a thin stick lie on the faces of the box: rounding must not push them out of it
+        inside = np.clip((positions - centre) * scale, -1, 1).astype(np.float32)
+        cloud = dataclasses.replace(cloud, positions=inside)
+        cloud = cloud_arrays.pad(cloud, cloud_arrays.bucket(len(positions)))
+        scene = _encode(self.variables, cloud, config=self.config)
+        volume = Volume(scene=scene, centre=jnp.asarray(centre), scale=jnp.asarray(scale))
+        if not isinstance(self.config, ModelConfig):
+            return volume
+        return dataclasses.replace(volume, reach=reach_of(inside[mask], self.config.volume_resolution))
+
+    def render(self, volume: Volume, camera: Camera, quality: Quality = "best") -> Rendering:
+        """The object as the camera (unbatched, or with one axis of views) sees it; depth in the cloud's units.
+
+        `draft`, `balanced` and `best` look near the points alone, with a quarter, half and all of the samples of a ray,
+        and `best` has several rays a pixel where pictures are smaller than those of the training (`supersampling.py`);
+        the network's refiner, if it has one, is left out of `draft`, and of smaller pictures by any other than `best`;
+        `trained` renders as the network was trained.  Other networks than ours know one number of samples.
+        """
+        if self.config.upsamples and (camera.height % 2 or camera.width % 2):
+            raise ValueError(f"this network doubles its pictures: {camera.width} x {camera.height} pixels must be even")
+        config = at_quality(self.config, quality, volume.reach)
+        needed = supersampling.rays_per_side(config, camera.width)
+        side = needed if quality == "best" else 1
+        if side < needed:  # it has learnt to see pictures of the training's size
+            config = without_refiner(config)
+        render = partial(_render, config=config, side=side)
+        return by_all_devices(render, self._spread, volume.scene, volume.centre, volume.scale, camera)
+
+    @cached_property
+    def _spread(self) -> dict:
+        return everywhere(self.variables)
+
+    def camera(
+        self, volume: Volume, azimuth: float = 30.0, elevation: float = 20.0, resolution: int | None = None
+    ) -> Camera:
+        """Camera that sees the whole object: degrees around the y axis from +z, and above the horizon."""
+        angles = np.deg2rad(np.float32(azimuth)), np.deg2rad(np.float32(elevation))
+        size = resolution or self.config.image_resolution
+        return _orbiting(*angles, DISTANCE / volume.scale, volume.centre, size=size)
+
+
+# The three are compiled whole: each operation outside of a jit would be compiled alone, 30 ms apiece at the first call.
+
+
+# this option halves the compilation of the U-Net and costs it no time; rendering would take twice as long
+@partial(jax.jit, static_argnames="config", compiler_options={"xla_cpu_use_fusion_emitters": False})
+def _encode(variables: dict, cloud: PointCloud, *, config: NetworkConfig) -> Any:
+    """What the network makes of a cloud in the box (unbatched)."""
+    scene = inference.encode(variables, jax.tree.map(lambda x: x[None], cloud), config=config)
+    return jax.tree.map(lambda x: x[0], scene)
+
+
+@partial(jax.jit, static_argnames=("config", "side"))
+def _render(
+    variables: dict, scene: Any, centre, scale, camera: Camera, *, config: NetworkConfig, side: int = 1
+) -> Rendering:
+    """`Model.render` with the config and the rays per side of a pixel of a quality."""
+    single = camera.cam_to_world.ndim == 2
+    rotation, eye = camera.cam_to_world[..., :3], camera.cam_to_world[..., 3]
+    eye = (eye - jnp.broadcast_to(centre, eye.shape)) * scale
+    pose = jnp.concatenate([rotation, eye[..., None]], axis=-1)
+    inside = dataclasses.replace(camera, cam_to_world=pose)
+    inside = jax.tree.map(lambda x: x.reshape(1, -1, *x.shape[-2:]), inside)
+    scene = jax.tree.map(lambda x: x[None], scene)
+    rendering = inference.render(variables, scene, inside, config=config, rays_per_side=side)
+    rendering = dataclasses.replace(rendering, depth=rendering.depth / scale)
+    return jax.tree.map(lambda x: x[0, 0] if single else x[0], rendering)
+
+
+@partial(jax.jit, static_argnames="size")
+def _orbiting(azimuth, elevation, distance, centre, *, size: int) -> Camera:
+    """Square camera of `size` pixels that looks at the centre; angles in radians."""
+    return cameras.pinhole(cameras.orbit(azimuth, elevation, distance, centre), FIELD_OF_VIEW, size, size)
+
+
+def at_quality(config: NetworkConfig, quality: Quality, reach: int) -> NetworkConfig:
+    """The config that renders at a quality, with samples within `reach` voxels of points.
+
+    A network that sees the surface keeps its own reach: the cells of the surface's grid grow with the spacing.
+    """
+    if quality not in (*SAMPLES, "trained"):
+        raise ValueError(f"quality must be one of {', '.join(SAMPLES)}, trained, got {quality}")
+    if quality == "trained" or not isinstance(config, ModelConfig):
+        return config
+    counts = config.sampling
+    reach = counts.reach if config.num_neighbors else reach
+    samples = max(round(SAMPLES[quality] * (counts.num_coarse + counts.num_fine)), 1)
+    config = dataclasses.replace(config, sampling=SamplingConfig(num_coarse=samples, num_fine=0, reach=reach))
+    return without_refiner(config) if quality == "draft" else config
+
+
+def without_refiner(config: NetworkConfig) -> NetworkConfig:
+    """The config that shows what the refiner would see."""
+    if not isinstance(config, ModelConfig) or not config.refiner_width:
+        return config
+    return dataclasses.replace(config, refiner_width=0, num_features=3)
+
+
+def reach_of(positions: np.ndarray, resolution: int, num_queries: int = 4096) -> int:
+    """Voxels around points in which their surface lies, from the median distance to the nearest other point.
+
+    Copies of a point, closer than a 1024th of the box, count once.
+    """
+    x, y, z = np.floor((positions.T + 1) * 512).astype(np.int64)
+    _, distinct = np.unique((x * 2048 + y) * 2048 + z, return_index=True)
+    positions = positions[distinct]
+    if len(positions) < 2:
+        return LARGEST_REACH
+    queries = positions[:: -(-len(positions) // num_queries)]
+    distances, _ = cKDTree(positions).query(queries, 2)
+    spacing = np.median(distances[:, 1]) * resolution / 2
+    return int(np.clip(np.ceil(REACH_PER_SPACING * spacing), 1, LARGEST_REACH))

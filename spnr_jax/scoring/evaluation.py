@@ -1,0 +1,258 @@
+"""How good methods are on a split of a data set: a network beside the trivial renderers that every table shows.
+
+A method is a function that shows a cloud to cameras (`Method`); all of them see the same points and cameras, and are
+scored by the same metrics.  The radius of the point renderers is chosen on training objects: the multiple of the point
+spacing with the best PSNR.
+"""
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from spnr_jax.config import TrainConfig
+from spnr_jax.devices import machine
+from spnr_jax.formats import data_sets
+from spnr_jax.kernels import metrics
+from spnr_jax.kernels.records import Camera, PointCloud
+from spnr_jax.method import inference
+from spnr_jax.scoring import floors
+from spnr_jax.scoring.flip import flip
+from spnr_jax.scoring.lpips import LpipsWeights, lpips
+from spnr_jax.scoring.summary import Scores, differences, metric_settings, summarise
+from spnr_jax.training.weights import read_trained
+
+RADIUS_FACTORS = (0.5, 0.75, 1.0, 1.5, 2.0)
+FLOORS = ("white", "splat", "nearest")
+MESHES = "meshes"  # the class of all objects that come from mesh files
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pictures:
+    """What a method shows of one object: image (views, height, width, 3), opacity and depth (views, h, w).
+
+    Opacity and depth may be smaller than the image; the trivial renderers have no depth.
+    """
+
+    image: np.ndarray | Array
+    acc: np.ndarray | Array
+    depth: np.ndarray | Array | None = None
+
+
+Method = Callable[[PointCloud, Camera], Pictures]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObjectResult:
+    """The references (views, height, width, 3) of one object, and every method's pictures and scores."""
+
+    name: str
+    reference: np.ndarray
+    pictures: dict[str, Pictures]
+    scores: dict[str, Scores]
+
+
+@jax.jit
+def score(
+    image: Float[Array, "views height width 3"],
+    acc: Float[Array, "views height width"],
+    reference: Array,
+    alpha: Array,
+    mask: Array,
+    weights: LpipsWeights | None = None,
+) -> dict[str, Array]:
+    """All metrics of one object's views; LPIPS if there are weights for it."""
+    image = jnp.clip(image, 0, 1)
+    scores = {
+        "psnr": metrics.psnr(image, reference),
+        "ssim": metrics.ssim(image, reference),
+        "cpsnr": metrics.conditional_psnr(image, reference, mask),
+        "flip": flip(image, reference),
+        "iou": metrics.opacity_iou(acc, alpha),
+    }
+    return scores if weights is None else scores | {"lpips": lpips(image, reference, weights)}
+
+
+@partial(jax.jit, static_argnames="method")
+def render_floor(method: str, cloud: PointCloud, camera: Camera, factor: float | Array) -> tuple[Array, Array]:
+    """Image and opacity of a trivial renderer for all views of one cloud."""
+    if method == "white":
+        image = floors.white(camera)
+        return image, jnp.zeros(image.shape[:-1])
+    radius = factor * floors.spacing(cloud)
+    return jax.vmap(lambda view: getattr(floors, method)(cloud, view, radius))(camera)
+
+
+def choose_radius(dataset: data_sets.Dataset, config: TrainConfig, method: str, num_objects: int = 8) -> float:
+    """The radius factor with the highest PSNR over a few training objects."""
+    items = [data_sets.read_object(dataset, name) for name in dataset.splits["train"][:num_objects]]
+    if not items:
+        raise ValueError(f"{dataset.folder}: no training objects to choose the radius of `{method}` on; generate some")
+
+    def mean_psnr(factor: float) -> float:
+        values = []
+        for item in items:
+            image, _ = render_floor(method, data_sets.test_cloud(item, config), item.camera, factor)
+            values.append(metrics.psnr(image, jnp.asarray(data_sets.on_white(item.images))))
+        return float(np.mean(values))
+
+    return max(RADIUS_FACTORS, key=mean_psnr)
+
+
+def network(variables: dict, config: TrainConfig) -> Method:
+    """The method of a trained network."""
+
+    def show(cloud: PointCloud, camera: Camera) -> Pictures:
+        rendering = inference.render_views(variables, config.model, cloud, camera)
+        return Pictures(image=rendering.image, acc=rendering.acc, depth=rendering.depth)
+
+    return show
+
+
+def floor(name: str, factor: float = 1.0) -> Method:
+    """The method of a trivial renderer."""
+
+    def show(cloud: PointCloud, camera: Camera) -> Pictures:
+        image, acc = render_floor(name, cloud, camera, factor)
+        return Pictures(image=image, acc=acc)
+
+    return show
+
+
+def evaluate_objects(
+    methods: dict[str, Method],
+    config: TrainConfig,
+    dataset: data_sets.Dataset,
+    names: tuple[str, ...],
+    weights: LpipsWeights | None = None,
+) -> Iterator[ObjectResult]:
+    """Pictures and scores of each object of a data set; points and image size are the config's."""
+    for name in names:
+        yield evaluate_object(methods, config, data_sets.read_object(dataset, name), weights)
+
+
+def evaluate_object(
+    methods: dict[str, Method], config: TrainConfig, item: data_sets.ObjectData, weights: LpipsWeights | None = None
+) -> ObjectResult:
+    """Pictures and scores of one object."""
+    data_sets.check_renders(item, config)
+    cloud = data_sets.test_cloud(item, config)
+    pictures, scores = {}, {}
+    for method, show in methods.items():
+        shown = show(cloud, item.camera)
+        scores[method] = score_pictures(item, shown, weights)
+        pictures[method] = on_host(shown)
+    return ObjectResult(name=item.name, reference=data_sets.on_white(item.images), pictures=pictures, scores=scores)
+
+
+def score_pictures(item: data_sets.ObjectData, pictures: Pictures, weights: LpipsWeights | None = None) -> Scores:
+    """All metrics of pictures of an object's views; the opacity is interpolated to their size."""
+    alpha, mask = item.images[..., 3] / np.float32(255), item.conditions[..., 3] > 0
+    acc = jax.image.resize(jnp.asarray(pictures.acc), alpha.shape, "bilinear")
+    return jax.device_get(
+        score(jnp.asarray(pictures.image), acc, data_sets.on_white(item.images), alpha, mask, weights)
+    )
+
+
+def on_host(pictures: Pictures) -> Pictures:
+    """The pictures as NumPy arrays, the image in [0, 1]."""
+    depth = None if pictures.depth is None else np.asarray(pictures.depth)
+    return Pictures(image=np.clip(np.asarray(pictures.image), 0, 1), acc=np.asarray(pictures.acc), depth=depth)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evaluation:
+    """What `spnr evaluate` writes: the metrics.json content, and results of the objects for the gallery."""
+
+    config: TrainConfig
+    summary: dict
+    per_category: dict[str, dict]
+    gallery: list[ObjectResult]
+
+
+def spread(names: tuple[str, ...], count: int) -> tuple[str, ...]:
+    """So many of the names, evenly from the first to the last."""
+    return tuple(names[round(i)] for i in np.linspace(0, len(names) - 1, min(count, len(names))))
+
+
+def median_view(psnr: np.ndarray) -> int:
+    """The view with the median PSNR, which neither flatters nor slanders."""
+    return int(np.argsort(psnr)[len(psnr) // 2])
+
+
+def score_methods(
+    methods: dict[str, Method],
+    config: TrainConfig,
+    dataset: data_sets.Dataset,
+    names: tuple[str, ...],
+    gallery_objects: int,
+    say: Callable[[str], None],
+    weights: LpipsWeights | None,
+) -> tuple[dict[str, dict[str, Scores]], list[ObjectResult]]:
+    """Scores of every object by name, and the results of a few objects, spread over the names, to be looked at."""
+    scores: dict[str, dict[str, Scores]] = {}
+    gallery = []
+    shown = spread(names, gallery_objects)
+    for i, result in enumerate(evaluate_objects(methods, config, dataset, names, weights)):
+        scores[result.name] = result.scores
+        if result.name in shown:
+            gallery.append(result)
+        if (i + 1) % 8 == 0 or i + 1 == len(names):
+            say(f"evaluated {i + 1} of {len(names)} objects")
+    return scores, gallery
+
+
+def evaluate(
+    run: Path,
+    dataset: data_sets.Dataset,
+    split: str = "test",
+    gallery_objects: int = 16,
+    say: Callable[[str], None] = print,
+    weights: LpipsWeights | None = None,
+) -> Evaluation:
+    """Scores of a run's newest checkpoint on a split; LPIPS if there are weights for it."""
+    trained = read_trained(run, say, data=dataset.folder)
+    config = trained.config
+    names = dataset.splits[split]
+    if not names:
+        raise ValueError(f"{dataset.folder}: the {split} split is empty; choose another one or generate more objects")
+    factors = {method: choose_radius(dataset, config, method) for method in ("splat", "nearest")}
+    methods = {"ours": network(trained.variables, config)}
+    methods |= {name: floor(name, factors.get(name, 1.0)) for name in FLOORS}
+    scores, gallery = score_methods(methods, config, dataset, names, gallery_objects, say, weights)
+    summary = {
+        "methods": summarise(list(scores.values())),
+        "ours_minus": differences(list(scores.values())),
+        "preset": config.preset,
+        "steps": trained.steps,
+        "seed": config.seed,
+        "hardware": machine.hardware(),
+        "settings": {
+            "split": split,
+            "points": config.test_points,
+            "radius factors": factors,
+            "metrics": metric_settings(with_lpips=weights is not None),
+        },
+    }
+    classes = classes_of(scores)
+    per_category = {category: summarise([scores[name] for name in classes[category]]) for category in sorted(classes)}
+    return Evaluation(config=config, summary=summary, per_category=per_category, gallery=gallery)
+
+
+def classes_of(names: Iterable[str]) -> dict[str, list[str]]:
+    """The objects of each class, sorted."""
+    classes: dict[str, list[str]] = {}
+    for name in sorted(names):
+        classes.setdefault(category_of(name), []).append(name)
+    return classes
+
+
+def category_of(name: str) -> str:
+    """Class of an object from its name (chair_000012); mesh files are one class."""
+    stem, _, number = name.rpartition("_")
+    return stem if number.isdigit() and len(number) == 6 else MESHES

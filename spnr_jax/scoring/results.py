@@ -1,0 +1,76 @@
+"""An evaluation as files: metrics.json for programs, report.html for people."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from spnr_jax.config import to_dict
+from spnr_jax.formats.images import write_whole
+from spnr_jax.scoring.evaluation import FLOORS, Evaluation, ObjectResult, median_view
+from spnr_jax.scoring.report import QUALITY, GalleryRow, write_report
+from spnr_jax.scoring.summary import NO_WEIGHTS
+
+
+def write_results(
+    out: Path,
+    evaluation: Evaluation,
+    dataset_settings: dict,
+    curve: list[dict],
+    seconds: dict[str, float],
+    title: str = "Sparse-point neural rendering: objects that the network never saw",
+) -> None:
+    """Writes metrics.json and report.html into a folder."""
+    metrics = {**evaluation.summary, "seconds": seconds, "per_category": evaluation.per_category}
+    write_whole(out / "metrics.json", (json.dumps(metrics, indent=2, allow_nan=False) + "\n").encode())
+    methods = metrics["methods"]
+    best = max(FLOORS, key=lambda name: methods[name]["psnr"])
+    summary = (
+        f"Preset {metrics['preset']}, {metrics['steps']} steps, {evaluation.config.test_points} points per object. "
+        f"{methods['ours']['psnr']:.2f} dB PSNR on {methods['ours']['views']} views of {methods['ours']['objects']} "
+        f"unseen objects: {_difference(metrics, 'white')} against the white image, "
+        f"{_difference(metrics, best)} against the best trivial renderer ({best})."
+    )
+    write_report(
+        out / "report.html",
+        title=title,
+        summary=summary,
+        settings={"training": to_dict(evaluation.config), "data": dataset_settings, **metrics["settings"]},
+        metrics=metrics,
+        gallery=[gallery_row(result) for result in evaluation.gallery],
+        curve=curve,
+        per_category=evaluation.per_category,
+    )
+
+
+def _difference(metrics: dict, other: str) -> str:
+    """How many dB ours is above another method, with its interval."""
+    found = metrics["ours_minus"][other]["psnr"]
+    ends = found["interval"]
+    return f"{found['mean']:+.2f} dB" + (f" [{ends[0]:+.2f}, {ends[1]:+.2f}]" if ends else "")
+
+
+def text_table(methods: dict[str, dict]) -> list[str]:
+    """Lines of the table of methods for a terminal: means, and what could not be measured."""
+    lines = []
+    for method, row in methods.items():
+        texts = []
+        for name, (head, decimals, _) in QUALITY.items():
+            missing = NO_WEIGHTS if name == "lpips" else "n/a"
+            texts.append(f"{head.partition(',')[0]} " + (missing if row[name] is None else f"{row[name]:.{decimals}f}"))
+        lines.append(f"{method:8s} " + "   ".join(texts))
+    return lines
+
+
+def gallery_row(result: ObjectResult) -> GalleryRow:
+    """The view of an object whose PSNR is the median."""
+    view = median_view(result.scores["ours"]["psnr"])
+    ours = result.pictures["ours"]
+    assert ours.depth is not None
+    return GalleryRow(
+        name=result.name,
+        reference=result.reference[view],
+        images={m: np.asarray(p.image[view]) for m, p in result.pictures.items() if m != "white"},
+        depth=np.asarray(ours.depth[view]),
+        acc=np.asarray(ours.acc[view]),
+    )

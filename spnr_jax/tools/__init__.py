@@ -1,0 +1,1 @@
+"""What the commands do with a trained network: pictures, depth maps, meshes, exports."""

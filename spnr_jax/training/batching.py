@@ -1,0 +1,141 @@
+"""Training batches that are a pure function of (seed, step), read ahead.
+
+Because a batch depends on nothing but the step, the state of the reader is the number of the step: a resumed run sees
+the same data, whatever was read ahead.  grain does the reading ahead, in threads.
+"""
+
+import dataclasses
+import functools
+import threading
+from collections.abc import Callable, Generator
+
+import numpy as np
+
+from spnr_jax.config import TrainConfig
+from spnr_jax.formats import data_sets
+from spnr_jax.formats.data_sets import Dataset, ObjectData, on_white
+from spnr_jax.kernels.cloud_arrays import pad
+from spnr_jax.kernels.records import Batch, Camera, PointCloud
+
+CACHE_BYTES = 2**31  # decoded objects kept in memory
+READERS, READ_AHEAD = 2, 4  # threads that assemble batches, and batches ready or in work
+ORDER, POINTS_AND_VIEWS = 1, 2  # streams of random numbers under one seed: (0, 5) and (0, 5, 0) alone would be the same
+
+
+def choose_points(
+    cloud: PointCloud, count: int, size: int, generator: np.random.Generator, even_share: float = 0.0
+) -> PointCloud:
+    """`count` of the points without repetition (or all, if there are fewer), padded to `size`.
+
+    They are random ones, or the first with the probability `even_share`.
+    """
+    total = len(cloud.positions)
+    first = even_share > 0 and generator.random() < even_share
+    chosen = (np.arange(total) if first else generator.permutation(total))[:count]
+    subset = PointCloud(**{f.name: getattr(cloud, f.name)[chosen] for f in dataclasses.fields(PointCloud)})
+    return pad(subset, size)
+
+
+def make_batch(objects: list[ObjectData], config: TrainConfig, step: int, place: int = 0) -> Batch:
+    """The training batch of these objects at this step: random points and random views of each.
+
+    They are those from `place` on in the global batch; what is drawn for an object depends on its place there.
+    """
+    clouds_of, views_of = [], []
+    for i, item in enumerate(objects, start=place):
+        generator = np.random.default_rng((config.seed, POINTS_AND_VIEWS, step, i))
+        low, high = np.log2(config.min_points), np.log2(config.max_points)
+        count = round(2 ** generator.uniform(low, high))
+        clouds_of.append(choose_points(item.cloud, count, config.max_points, generator, config.even_share))
+        views_of.append(generator.permutation(len(item.images))[: config.views_per_object])
+    images = np.stack([item.images[v] for item, v in zip(objects, views_of, strict=True)])
+    conditions = np.stack([item.conditions[v] for item, v in zip(objects, views_of, strict=True)])
+    mask = conditions[..., 3] > 0
+    poses = np.stack([item.camera.cam_to_world[v] for item, v in zip(objects, views_of, strict=True)])
+    intrinsics = np.stack([item.camera.intrinsics[v] for item, v in zip(objects, views_of, strict=True)])
+    stacked = {
+        f.name: np.stack([getattr(cloud, f.name) for cloud in clouds_of]) for f in dataclasses.fields(PointCloud)
+    }
+    first = objects[0].camera
+    return Batch(
+        cloud=PointCloud(**stacked),
+        camera=Camera(cam_to_world=poses, intrinsics=intrinsics, height=first.height, width=first.width),
+        image=on_white(images),
+        alpha=images[..., 3].astype(np.float32) / 255,
+        condition=np.where(mask[..., None], conditions[..., :3].astype(np.float32) / 255, 0),
+        condition_mask=mask,
+    )
+
+
+def object_names(names: tuple[str, ...], config: TrainConfig, step: int) -> list[str]:
+    """The objects of a step: consecutive pieces of one new permutation of all objects per epoch."""
+    positions = range(step * config.batch_objects, (step + 1) * config.batch_objects)
+    places = (divmod(position, len(names)) for position in positions)
+    return [names[epoch_order(config.seed, epoch, len(names))[place]] for epoch, place in places]
+
+
+@functools.lru_cache(maxsize=4)  # one batch spans few epochs, and a million objects take 20 ms to permute
+def epoch_order(seed: int, epoch: int, count: int) -> np.ndarray:
+    """The permutation (count,) of all objects in an epoch."""
+    return np.random.default_rng((seed, ORDER, epoch)).permutation(count)
+
+
+def batches(
+    dataset: Dataset, config: TrainConfig, first_step: int, cache_bytes: int = CACHE_BYTES, own: range | None = None
+) -> Generator[Batch, None, None]:
+    """Training batches from `first_step` on, read and assembled ahead; an error is raised where its batch would be.
+
+    With `own` only these places of each batch: the same objects, points and views as in the whole one.
+    """
+    import grain
+
+    names = dataset.splits["train"]
+    if not names:
+        raise ValueError(f"{dataset.folder}: the train split is empty; generate more objects")
+    check_spread(dataset, config)
+    read, own = cached_reader(dataset, config, cache_bytes), own or range(config.batch_objects)
+
+    def assemble(step: int) -> Batch:
+        chosen = object_names(names, config, step)[own.start : own.stop]
+        return make_batch([read(name) for name in chosen], config, step, own.start)
+
+    steps = grain.MapDataset.range(first_step, config.num_steps).map(assemble)
+    options = grain.ReadOptions(num_threads=READERS, prefetch_buffer_size=READ_AHEAD)
+    yield from iter(steps.to_iter_dataset(options))  # its threads end with this generator
+
+
+def cached_reader(dataset: Dataset, config: TrainConfig, cache_bytes: int) -> Callable[[str], ObjectData]:
+    """A function of an object's name that reads it, checked against the config; the first `cache_bytes` stay in memory.
+
+    Several threads may call it.  Which objects stay does not matter: an epoch needs each of them once.
+    """
+    cache: dict[str, ObjectData] = {}
+    lock, free = threading.Lock(), cache_bytes
+
+    def read(name: str) -> ObjectData:
+        nonlocal free
+        if name in cache:
+            return cache[name]
+        item = data_sets.read_object(dataset, name)
+        data_sets.check_resolution(item, config)
+        if len(item.images) < config.views_per_object:
+            raise ValueError(
+                f"object {name} has {len(item.images)} views, views_per_object is {config.views_per_object}; lower it "
+                "or generate with more --views"
+            )
+        with lock:
+            if name not in cache and item.num_bytes < free:
+                cache[name] = item
+                free -= item.num_bytes
+        return item
+
+    return read
+
+
+def check_spread(dataset: Dataset, config: TrainConfig) -> None:
+    """ValueError if the config asks for evenly spread clouds where an object's points are random ones."""
+    if config.even_share and dataset.spread != "even":
+        raise ValueError(
+            f"{dataset.folder}: its points are drawn at random, even_share is {config.even_share}; generate with "
+            "--spread even, or use even_share 0"
+        )

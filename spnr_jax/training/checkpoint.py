@@ -1,0 +1,190 @@
+"""Run folders on disk: the config, and checkpoints of the training state through Orbax.
+
+    RUN/config.json          the TrainConfig
+    RUN/checkpoints/STEP/    one state; appears complete or not at all
+    RUN/training.lock        empty; locked while a process trains there
+
+The newest readable checkpoint counts: a broken one is named and the one before it is taken.
+"""
+
+import json
+import logging
+import os
+import re
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from spnr_jax.config import TrainConfig, from_dict, to_dict
+from spnr_jax.devices import allocator
+from spnr_jax.training import optimisation
+
+KEPT = 3  # newest checkpoints that stay
+
+
+@contextmanager
+def alone(run: Path) -> Iterator[None]:
+    """While it lasts no other process trains in the run folder, which is made; ValueError if one does already.
+
+    The operating system opens the lock when its process ends, however it ends.
+    """
+    import fcntl  # Windows has none
+
+    run.mkdir(parents=True, exist_ok=True)
+    with (run / "training.lock").open("a") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise ValueError(f"{run}: another process trains in this folder; wait for it or choose a new one") from None
+        yield
+
+
+def write_config(run: Path, config: TrainConfig) -> None:
+    """Makes the run folder hold this config; ValueError if it holds the run of another one."""
+    path = run / "config.json"
+    if path.exists() and (run / "checkpoints").is_dir():  # without a checkpoint there is nothing to protect
+        stored = to_dict(read_config(run))
+        changed = _differences(stored, json.loads(json.dumps(to_dict(config))))
+        if changed:
+            raise ValueError(
+                f"{run} holds a run with another config ({'; '.join(changed[:4])}); choose a new run folder"
+            )
+        return
+    run.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_suffix(".partial")
+    temporary.write_text(json.dumps(to_dict(config), indent=2) + "\n")
+    temporary.replace(path)
+
+
+def _differences(stored: dict, wanted: dict, path: str = "") -> list[str]:
+    changed = []
+    for name in (name for name in wanted if name in stored):  # of another method the name says it all
+        old, value = stored[name], wanted[name]
+        if isinstance(value, dict):
+            changed += _differences(old, value, f"{path}{name}.")
+        elif json.loads(json.dumps(old)) != value:
+            changed.append(f"{path}{name} {old} there, {value} asked")
+    return changed
+
+
+def read_config(run: Path | str) -> TrainConfig:
+    """The config of a run folder; ValueError if there is none or it is not of this version."""
+    path = Path(run) / "config.json"
+    if not path.is_file():
+        raise ValueError(f"{run}: not a run folder (config.json is missing); train one with `spnr train DATA {run}`")
+    try:
+        return from_dict(json.loads(path.read_text()))
+    except (ValueError, TypeError, AttributeError, ArithmeticError, RecursionError) as error:
+        raise ValueError(f"{path}: not a config of this version ({error}); train a new run") from None
+
+
+def _checkpointer(run: Path, *, writing: bool):
+    logging.getLogger("absl").setLevel(logging.CRITICAL)  # a line each save, call stacks of what is raised as well
+    from orbax.checkpoint import v1 as ocp  # two seconds of import that rendering from Python need not pay
+
+    return ocp.training.Checkpointer(
+        (run / "checkpoints").absolute(),
+        preservation_policy=ocp.training.preservation_policies.LatestN(KEPT),
+        cleanup_tmp_directories=writing,  # a reader must not remove what a running training is writing
+    )
+
+
+def save(run: Path, state: optimisation.TrainState) -> None:
+    """Writes the state as the run's newest checkpoint and removes those that are too old; ValueError if it cannot."""
+    step = int(state.step)
+    try:
+        with _checkpointer(run, writing=True) as checkpointer:
+            # a damaged checkpoint of this step, which an earlier run left, makes place
+            checkpointer.save(step, state, force=True, overwrite=True)
+    except (OSError, ValueError) as error:  # tensorstore raises ValueError for the disk's errors, too
+        number = re.search(r"os_error_code='(\d+)'", str(error))
+        reason = os.strerror(int(number[1])) if number else _first_line(error)
+        raise ValueError(
+            f"checkpoint {run / 'checkpoints' / str(step)} cannot be written ({reason}); the one before is kept: mend "
+            "this, and the same command goes on from there"
+        ) from None
+    allocator.give_back()
+
+
+def restore(
+    run: Path,
+    config: TrainConfig,
+    say: Callable[[str], object] = print,
+    sharding: jax.sharding.Sharding | None = None,
+) -> optimisation.TrainState | None:
+    """The newest readable state of a run, None if it has none; `say` gets a line for each broken checkpoint.
+
+    The state lies where `sharding` says, by default on the first device, wherever it lay when it was saved.
+    """
+    folder = run / "checkpoints"
+    if not folder.is_dir():
+        return None
+    sharding = sharding or jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
+    like = jax.tree.map(
+        lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding),
+        jax.eval_shape(lambda: optimisation.create_state(config)),
+    )
+    with _checkpointer(run, writing=False) as checkpointer:
+        steps = sorted((c.step for c in checkpointer.checkpoints), reverse=True)
+        for step in steps:
+            try:
+                state = checkpointer.load(step, like)
+                jax.block_until_ready(state)
+            except Exception as error:  # noqa: BLE001 - Orbax and tensorstore raise many kinds for a damaged file
+                _refuse_other_version(checkpointer, folder / str(step), like)
+                say(f"checkpoint {folder / str(step)} is damaged ({_first_line(error)}); trying the one before")
+                continue
+            if int(state.step) == step:
+                return state
+            say(f"checkpoint {folder / str(step)} holds step {int(state.step)}; trying the one before")
+    if steps:
+        raise ValueError(
+            f"{run / 'checkpoints'}: no checkpoint of this run can be read; remove the folder to start again"
+        )
+    return None
+
+
+def _refuse_other_version(checkpointer: Any, path: Path, like: optimisation.TrainState) -> None:
+    """ValueError if a checkpoint that cannot be read is whole, but of other arrays: going on would overwrite it."""
+    try:
+        found, wanted = _shapes(checkpointer.metadata(int(path.name)).metadata), _shapes(like)
+    except Exception:  # noqa: BLE001 - as in `restore`: it is damaged
+        return
+    different = sorted(name for name in found.keys() | wanted.keys() if found.get(name) != wanted.get(name))
+    if found and different:  # of damaged files it finds nothing
+        raise ValueError(
+            f"checkpoint {path} is of another version of spnr_jax: {different[0]} has shape "
+            f"{found.get(different[0], 'none')}, here {wanted.get(different[0], 'none')}; go on with that version, or "
+            "choose a new run folder"
+        )
+
+
+def _shapes(tree: Any) -> dict[str, tuple[int, ...]]:
+    """Shape of each array of a tree by its path; of a random key, that of the numbers which it is stored as."""
+
+    def shape(leaf: Any) -> tuple[int, ...]:
+        is_key = jax.numpy.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+        return tuple(jax.eval_shape(jax.random.key_data, leaf).shape if is_key else leaf.shape)
+
+    leaves = jax.tree_util.tree_leaves_with_path(tree)
+    return {jax.tree_util.keystr(path, simple=True, separator="."): shape(leaf) for path, leaf in leaves}
+
+
+def load_run(
+    run: Path | str, say: Callable[[str], None] = print, data: Path | str = "DATA"
+) -> tuple[TrainConfig, optimisation.TrainState]:
+    """Config and newest readable state of a run; ValueError, with what to do, if it has no state (`data` is named)."""
+    run = Path(run)
+    config = read_config(run)
+    state = restore(run, config, say)
+    if state is None:
+        raise ValueError(f"{run}: the run has no checkpoint yet; go on with `spnr train {data} {run}`")
+    return config, state
+
+
+def _first_line(error: Exception) -> str:
+    lines = str(error).strip().splitlines() or [type(error).__name__]
+    return lines[0][:160]

@@ -1,0 +1,326 @@
+"""Training as pure functions: state in, state out.  The only jax.jit lines of the package's training stand here.
+
+    forward -> losses -> train_step -> jitted train_step
+
+A method is a network and a loss: the config of a network finds its module (`inference.network`), and any module with
+`encode`, `render` and `__call__` is trained by this step.  What it sows into the collection "losses" is added to the
+loss; a network without `render_rays` renders whole images.
+
+One step renders every view of the batch once.  The discriminator is updated on that rendering, the generator on the
+gradient that the updated discriminator and the L1 loss send back through it.  `adversarial` is static: without it the
+graph contains no discriminator.  All randomness of step s comes from fold_in(state.key, s), so a resumed run repeats
+the uninterrupted one bit for bit.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from functools import partial
+from typing import Any, no_type_check
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+from flax.traverse_util import flatten_dict
+from jaxtyping import Array, Float
+
+from spnr_jax.config import TrainConfig
+from spnr_jax.kernels import losses
+from spnr_jax.kernels.metrics import psnr
+from spnr_jax.kernels.records import Batch, Camera, Key
+from spnr_jax.method.inference import example_inputs, network
+from spnr_jax.model_config import ModelConfig
+from spnr_jax.nn.discriminator import Discriminator
+
+
+@no_type_check
+@struct.dataclass
+class TrainState:
+    """Everything that a step changes; data only.  `averaged` is the generator that evaluation uses."""
+
+    step: Array
+    key: Key
+    generator: dict
+    batch_stats: dict
+    generator_optimizer: tuple
+    averaged: dict
+    averaged_stats: dict
+    discriminator: dict | None
+    discriminator_optimizer: tuple | None
+
+
+def learning_rate(config: TrainConfig) -> optax.Schedule:
+    """Generator's learning rate: linear warm-up, then a cosine or an exponential down to final_lr_scale."""
+    o = config.optimizer
+    warmup = min(o.warmup_steps, config.num_steps)
+    if o.decay == "exponential":
+        return optax.warmup_exponential_decay_schedule(
+            init_value=o.lr_generator / max(warmup, 1),
+            peak_value=o.lr_generator,
+            warmup_steps=warmup,
+            transition_steps=max(config.num_steps - warmup, 1),
+            decay_rate=o.final_lr_scale,
+        )
+    return optax.warmup_cosine_decay_schedule(
+        init_value=o.lr_generator / max(warmup, 1),
+        peak_value=o.lr_generator,
+        warmup_steps=warmup,
+        decay_steps=max(config.num_steps, warmup + 1),
+        end_value=o.lr_generator * o.final_lr_scale,
+    )
+
+
+def optimizers(config: TrainConfig) -> tuple[optax.GradientTransformation, optax.GradientTransformation]:
+    """The generator's algorithm, and Adam for the discriminator."""
+    o = config.optimizer
+    algorithm = {"adam": optax.adam, "radam": optax.radam}[o.algorithm]
+    return (
+        algorithm(learning_rate(config), b1=o.beta1, b2=o.beta2),
+        optax.adam(o.lr_discriminator, b1=o.beta1_discriminator, b2=o.beta2),
+    )
+
+
+def first_adversarial_step(config: TrainConfig) -> int:
+    """Step from which the discriminator takes part; num_steps if it never does."""
+    share = config.loss.adversarial_start if config.loss.adversarial_weight else 1.0
+    return round(share * config.num_steps)
+
+
+def discriminator_of(config: TrainConfig) -> Discriminator:
+    """The discriminator's module."""
+    assert isinstance(config.model, ModelConfig), "the config refuses an adversarial loss of other networks"
+    return Discriminator(config.loss.discriminator_width, config.model.num_groups, config.model.bf16)
+
+
+def create_state(config: TrainConfig, seed: int | Array | None = None) -> TrainState:
+    """Fresh weights and optimisers from a seed, the config's by default."""
+    key = jax.random.key(config.seed if seed is None else seed)
+    key, generator_key, discriminator_key = jax.random.split(key, 3)
+    variables = network(config.model).init(generator_key, *example_inputs(config.model))
+    generator_adam, discriminator_adam = optimizers(config)
+    generator, batch_stats = variables["params"], variables.get("batch_stats", {})
+    discriminator = None
+    if first_adversarial_step(config) < config.num_steps:
+        image = jnp.zeros((1, *[config.model.image_resolution] * 2, 3))
+        discriminator = discriminator_of(config).init(discriminator_key, image, image, image[..., 0] > 0)["params"]
+    return TrainState(
+        step=jnp.zeros((), jnp.int32),
+        key=key,
+        generator=generator,
+        batch_stats=batch_stats,
+        generator_optimizer=generator_adam.init(generator),
+        averaged=jax.tree.map(jnp.copy, generator),  # a donated state must not hold one buffer twice
+        averaged_stats=jax.tree.map(jnp.copy, batch_stats),
+        discriminator=discriminator,
+        discriminator_optimizer=None if discriminator is None else discriminator_adam.init(discriminator),
+    )
+
+
+def begun_with(state: TrainState, variables: dict) -> TrainState:
+    """A fresh state with the generator of another training; ValueError if its weights are of another network.
+
+    A refiner that the other one lacks stays fresh.
+    """
+    params, stats = variables["params"], variables.get("batch_stats", {})
+    params = {name: part for name, part in state.generator.items() if name == "refiner"} | params
+    needed = {"params": state.generator, "batch_stats": state.batch_stats}
+    own, other = (flatten_dict(weights, sep="/") for weights in (needed, {"params": params, "batch_stats": stats}))
+    for name in own | other:
+        shapes = [weights[name].shape if name in weights else "none" for weights in (own, other)]
+        if shapes[0] != shapes[1]:
+            raise ValueError(
+                f"the weights to begin with are of another network: shape of {name} {shapes[1]}, needed {shapes[0]}; "
+                "use the preset that they were trained with"
+            )
+
+    def placed(new, old):
+        return jax.tree.map(lambda x, like: jax.device_put(jnp.array(x), like.sharding), new, old)
+
+    return dataclasses.replace(
+        state,
+        generator=placed(params, state.generator),
+        batch_stats=placed(stats, state.batch_stats),
+        averaged=placed(params, state.averaged),
+        averaged_stats=placed(stats, state.averaged_stats),
+    )
+
+
+def lattice(key: Key, batch: Batch, stride: int) -> Batch:
+    """The batch with every `stride`-th row and column of its views, from a random first one on: images still."""
+    first = jax.random.randint(key, (2,), 0, stride)
+
+    def thinned(x):
+        for axis, start in zip((2, 3), first, strict=True):
+            x = x.reshape(*x.shape[:axis], x.shape[axis] // stride, stride, *x.shape[axis + 1 :])
+            x = jax.lax.dynamic_index_in_dim(x, start, axis + 1, keepdims=False)
+        return x
+
+    # pixel i of the lattice has its centre at first + stride * i + 0.5 of the view
+    shift = 0.5 - (first[::-1] + 0.5) / stride
+    zoom = jnp.diag(jnp.array([1 / stride, 1 / stride, 1.0])).at[:2, 2].set(shift)
+    intrinsics = jnp.einsum("ij,...jk->...ik", zoom, batch.camera.intrinsics, precision="highest")
+    return _some_pixels(batch, thinned, intrinsics)
+
+
+def cropped(key: Key, batch: Batch, size: int) -> Batch:
+    """The batch with a square of `size` pixels of each view, at one random place for all: images still."""
+    height, width = batch.image.shape[2:4]
+    first = jax.random.randint(key, (2,), 0, jnp.array([height, width]) - size + 1)
+
+    def cut(x):
+        for axis, start in zip((2, 3), first, strict=True):
+            x = jax.lax.dynamic_slice_in_dim(x, start, size, axis)
+        return x
+
+    return _some_pixels(batch, cut, jnp.asarray(batch.camera.intrinsics).at[..., :2, 2].add(-first[::-1]))
+
+
+def _some_pixels(batch: Batch, some: Callable[[Array], Array], intrinsics: Array) -> Batch:
+    """The batch with some of the pixels of its images, which cameras of these intrinsics see."""
+    images = (batch.image, batch.alpha, batch.condition, batch.condition_mask)
+    image, alpha, condition, mask = (some(jnp.asarray(x)) for x in images)
+    camera = Camera(
+        cam_to_world=batch.camera.cam_to_world, intrinsics=intrinsics, height=image.shape[2], width=image.shape[3]
+    )
+    return Batch(cloud=batch.cloud, camera=camera, image=image, alpha=alpha, condition=condition, condition_mask=mask)
+
+
+def pixel_error(config: TrainConfig, image: Array, reference: Array, seen: Array | None = None) -> Float[Array, ""]:
+    """Mean error of all pixels, or of those that are `seen` (0 if there are none)."""
+    if seen is None:
+        return {"l1": losses.l1, "mse": losses.mse}[config.loss.pixel](image, reference)
+    error = {"l1": jnp.abs, "mse": jnp.square}[config.loss.pixel](image - reference)
+    return jnp.sum(jnp.where(seen[..., None], error, 0)) / jnp.maximum(3 * jnp.sum(seen), 1)
+
+
+def reconstruction_loss(
+    config: TrainConfig,
+    image: Float[Array, "*batch"],
+    image_lr: Float[Array, "*batch_lr"],
+    reference: Array,
+    seen: Array | None = None,
+) -> Float[Array, ""]:
+    """Weighted errors of the image, and of a smaller volume rendering against the reference averaged to its size."""
+    error = pixel_error(config, image, reference, seen)
+    if config.model.upsamples:
+        low = losses.area_downsample(reference, image_lr.shape[-2])
+        error = error + config.loss.low_resolution_weight * pixel_error(config, image_lr, low)
+    error = config.loss.l1_weight * error
+    return error + config.loss.mse_weight * losses.mse(image, reference) if config.loss.mse_weight else error
+
+
+def logits(config: TrainConfig, params: dict, image: Array, condition: Array, mask: Array) -> Array:
+    """What the discriminator says of the images under its parameters."""
+    if not config.loss.condition:
+        condition, mask = jnp.zeros_like(condition), jnp.zeros_like(mask)
+    return discriminator_of(config).bind({"params": params})(image, condition, mask)
+
+
+def discriminator_loss(config: TrainConfig, params: dict, fake: Array, batch: Batch, step: Array):
+    """(loss, metrics) of the discriminator on references and renderings; R1 every r1_interval steps."""
+    real, condition, mask = (_flatten_views(x) for x in (batch.image, batch.condition, batch.condition_mask))
+    both = logits(config, params, *(jnp.concatenate(x) for x in ((real, fake), (condition,) * 2, (mask,) * 2)))
+    real_logits, fake_logits = jnp.split(both, 2)
+    loss = losses.discriminator_adversarial(real_logits, fake_logits)
+    metrics = {"discriminator": loss, "logit_real": jnp.mean(real_logits), "logit_fake": jnp.mean(fake_logits)}
+    if config.loss.r1_gamma:
+
+        def penalty():
+            return losses.r1(lambda image: logits(config, params, image, condition, mask), real)
+
+        due = step % config.loss.r1_interval == 0
+        loss = loss + config.loss.r1_interval * config.loss.r1_gamma * jax.lax.cond(due, penalty, lambda: 0.0)
+    return loss, metrics
+
+
+def _flatten_views(x):
+    return x.reshape(-1, *x.shape[2:])
+
+
+def train_step(
+    state: TrainState, batch: Batch, *, config: TrainConfig, adversarial: bool
+) -> tuple[TrainState, dict[str, Array]]:
+    """State after one step of both networks from one generator forward, and scalar metrics."""
+    key = jax.random.fold_in(state.key, state.step)
+    if config.pixel_stride > 1:
+        key, lattice_key = jax.random.split(key)
+        batch = lattice(lattice_key, batch, config.pixel_stride)
+    if config.crop:
+        key, crop_key = jax.random.split(key)
+        batch = cropped(crop_key, batch, config.crop)
+    module, reference = network(config.model), jnp.asarray(batch.image)
+    generator_adam, discriminator_adam = optimizers(config)
+
+    def forward(params):
+        variables = {"params": params, "batch_stats": state.batch_stats}
+        rendering, updated = module.apply(
+            variables, batch.cloud, batch.camera, key, train=True, mutable=["batch_stats", "losses"]
+        )
+        sown = {name: value for name, (value,) in updated.get("losses", {}).items()}
+        if config.loss.opacity_weight:
+            opacity = losses.area_downsample(jnp.asarray(batch.alpha)[..., None], rendering.acc.shape[-1])[..., 0]
+            sown["opacity"] = config.loss.opacity_weight * losses.mse(rendering.acc, opacity)
+        seen = rendering.acc > 0 if config.loss.masked else None
+        return (rendering.image, rendering.image_lr, sown), (updated.get("batch_stats", {}), seen)
+
+    (image, image_lr, sown), pull_back, (batch_stats, seen) = jax.vjp(forward, state.generator, has_aux=True)
+    metrics = {"psnr": jnp.mean(psnr(image, reference)), "l1": losses.l1(image, reference)}
+    discriminator, discriminator_optimizer = state.discriminator, state.discriminator_optimizer
+    if adversarial:
+        fake = _flatten_views(image)
+        gradient, more = jax.grad(partial(discriminator_loss, config), has_aux=True)(
+            discriminator, fake, batch, state.step
+        )
+        update, discriminator_optimizer = discriminator_adam.update(gradient, discriminator_optimizer)
+        discriminator = optax.apply_updates(discriminator, update)
+        metrics |= more
+
+    def whole_loss(image, image_lr, sown):
+        loss = reconstruction_loss(config, image, image_lr, reference, seen)
+        for term in sown.values():
+            loss = loss + term
+        if adversarial:
+            views = (_flatten_views(x) for x in (image, batch.condition, batch.condition_mask))
+            fake_logits = logits(config, discriminator, *views)
+            loss = loss + config.loss.adversarial_weight * losses.generator_adversarial(fake_logits)
+        return loss
+
+    loss, cotangents = jax.value_and_grad(whole_loss, argnums=(0, 1, 2))(image, image_lr, sown)
+    (gradient,) = pull_back(cotangents)
+    update, generator_optimizer = generator_adam.update(gradient, state.generator_optimizer)
+    generator = optax.apply_updates(state.generator, update)
+    metrics |= {"loss": loss, "gradient_norm": optax.tree.norm(gradient)} | sown
+
+    averaged, averaged_stats = moving_average(
+        (state.averaged, state.averaged_stats), (generator, batch_stats), state.step, config.optimizer.ema_decay
+    )
+    state = TrainState(
+        step=state.step + 1,
+        key=state.key,
+        generator=generator,
+        batch_stats=batch_stats,
+        generator_optimizer=generator_optimizer,
+        averaged=averaged,
+        averaged_stats=averaged_stats,
+        discriminator=discriminator,
+        discriminator_optimizer=discriminator_optimizer,
+    )
+    return state, metrics
+
+
+def moving_average(averaged: Any, newest: Any, step: Array, decay: float) -> Any:
+    """The average with the newest weights in it, over a growing share of the past: early ones are far from the last."""
+    share = jnp.minimum(decay, (1.0 + step) / (10.0 + step))
+    return jax.tree.map(lambda old, new: share * old + (1 - share) * new, averaged, newest)
+
+
+def averaged_variables(state: TrainState) -> dict:
+    """The generator that evaluation uses, as Linen variables."""
+    return {"params": state.averaged, "batch_stats": state.averaged_stats}
+
+
+# runs once: a quick compilation is worth more than quick code
+jitted_create_state = jax.jit(
+    create_state, static_argnames="config", compiler_options={"xla_backend_optimization_level": 1}
+)
+jitted_train_step = jax.jit(train_step, static_argnames=("config", "adversarial"), donate_argnames="state")

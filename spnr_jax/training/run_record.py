@@ -1,0 +1,100 @@
+"""What a run folder says of its making: RUN/run.json, an entry for every start of the trainer.
+
+began, first_step, last_step    when, and from where to where it trained
+seconds                         by phase: restore, compilation (the first step), steps, previews, checkpoints
+version, commit, jax, hardware  of the code ("+" behind a commit: the checkout was changed), of JAX, of the machine
+data, data_checksum             the folder, and a number that tells data sets apart
+init                            the training whose weights a new run began with, where it was not random ones
+"""
+
+import hashlib
+import importlib.metadata
+import json
+import subprocess
+import time
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from spnr_jax.devices import machine
+from spnr_jax.formats import data_sets
+from spnr_jax.formats.images import write_whole
+from spnr_jax.training.weights import Trained
+
+
+class Clock:
+    """Seconds since it was made, by phase: each lap belongs to one."""
+
+    def __init__(self) -> None:
+        """Starts it."""
+        self.seconds: dict[str, float] = {}
+        self._since = time.monotonic()
+
+    def lap(self, phase: str) -> float:
+        """Seconds since the lap before, counted towards the phase."""
+        now = time.monotonic()
+        elapsed, self._since = now - self._since, now
+        self.seconds[phase] = self.seconds.get(phase, 0.0) + elapsed
+        return elapsed
+
+
+class RunRecord:
+    """The entry of this start, written anew whenever the run saves."""
+
+    def __init__(self, run: Path, dataset: data_sets.Dataset, first_step: int, init: Trained | None = None) -> None:
+        """Keeps the entries of earlier starts."""
+        self._path, self._earlier = run / "run.json", read_starts(run)
+        self._entry: dict[str, Any] = {
+            "began": datetime.now(UTC).isoformat(timespec="seconds"),
+            "first_step": first_step,
+            "version": version(),
+            "commit": commit(),
+            "jax": jax.__version__,
+            "hardware": machine.hardware(),
+            "data": str(dataset.folder),
+            "data_checksum": checksum(dataset),
+        }
+        if init is not None:
+            self._entry["init"] = f"{init.config.preset}, {init.steps} steps"
+
+    def write(self, last_step: int, clock: Clock) -> None:
+        """Writes what is known by now."""
+        seconds = {phase: round(value, 2) for phase, value in clock.seconds.items()}
+        starts = [*self._earlier, self._entry | {"last_step": last_step, "seconds": seconds}]
+        write_whole(self._path, (json.dumps({"starts": starts}, indent=1) + "\n").encode())
+
+
+def read_starts(run: Path) -> list[dict]:
+    """Entries of a run's run.json; none if there is no such file or it cannot be read."""
+    try:
+        starts = json.loads((run / "run.json").read_text(errors="replace"))["starts"]
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return []
+    return [entry for entry in starts if isinstance(entry, dict)] if isinstance(starts, list) else []
+
+
+def checksum(dataset: data_sets.Dataset) -> str:
+    """A number that tells data sets apart: of their settings and the names of their objects."""
+    content = json.dumps([dataset.settings, dataset.splits], sort_keys=True)
+    return hashlib.sha256(content.encode()).hexdigest()
+
+
+def version() -> str:
+    """The installed version of the package."""
+    try:
+        return importlib.metadata.version("spnr-jax")
+    except importlib.metadata.PackageNotFoundError:
+        return "not installed"  # only on the path
+
+
+def commit() -> str | None:
+    """The commit that the code was checked out at, with a "+" if files differ from it; None outside of a checkout."""
+    git = ("git", "-C", str(Path(__file__).parent))
+    try:
+        head = subprocess.run([*git, "rev-parse", "HEAD"], capture_output=True, text=True, check=True, timeout=10)
+        changed = subprocess.run([*git, "status", "--porcelain", "."], capture_output=True, text=True, timeout=10)
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return head.stdout.strip() + ("+" if changed.stdout.strip() else "")

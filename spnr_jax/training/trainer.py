@@ -1,0 +1,290 @@
+"""The training loop: batches in, steps, and everything that a person or a later run wants to see of it.
+
+    RUN/config.json  run.json  metrics.jsonl  tensorboard/  previews/STEP.png  checkpoints/STEP/
+
+A run goes on by itself from its newest readable checkpoint; the rows of metrics.jsonl after it are dropped, because
+they will be written again.  A loss that is not finite stops the run and names the step; the last checkpoint stays.
+
+Of several processes that train together (placement.py) the first writes all of this; the checkpoints they write
+together.
+"""
+
+import json
+import math
+import os
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh
+from tqdm import tqdm
+
+from spnr_jax.config import TrainConfig
+from spnr_jax.devices import allocator, placement
+from spnr_jax.formats import data_sets
+from spnr_jax.formats.images import png, to_uint8, write_whole
+from spnr_jax.kernels.metrics import psnr
+from spnr_jax.method import inference
+from spnr_jax.training import batching, checkpoint, optimisation
+from spnr_jax.training.run_record import Clock, RunRecord
+from spnr_jax.training.weights import Trained
+
+
+@dataclass(frozen=True, kw_only=True)
+class Schedule:
+    """How often the loop does what is not training, in steps."""
+
+    log_every: int = 20
+    """Steps between rows of metrics.jsonl and TensorBoard."""
+    preview_every: int = 500
+    """Steps between preview images and validation scores."""
+    checkpoint_every: int = 500
+    """Steps between checkpoints."""
+
+    def __post_init__(self) -> None:
+        for name, steps in vars(self).items():
+            if steps < 1:
+                raise ValueError(f"{name} must be at least 1 step, got {steps}")
+
+
+Phase = Literal["step", "row", "preview", "checkpoint", "end"]
+OnEvent = Callable[[Phase, int, object], object]  # phase that begins, steps done so far, its batch or row, else None
+
+
+class NotFinite(ValueError):
+    """A loss is NaN or infinite; the message names step and quantity."""
+
+
+def train(
+    config: TrainConfig,
+    dataset: data_sets.Dataset,
+    run: Path,
+    schedule: Schedule,
+    mesh: Mesh | None = None,
+    init: Trained | None = None,
+    on_event: OnEvent | None = None,
+) -> training.TrainState:
+    """The state after the config's last step; goes on where an earlier call left the run folder.
+
+    A new run begins with random weights, or with those of `init`.  On a mesh of devices (`distributed.device_mesh`)
+    each of its processes calls this.  `on_event` is told what the loop is about to do; what was told before is done.
+    """
+    allocator.few_arenas()
+    own = None if mesh is None else placement.own_objects(mesh, config.batch_objects)
+    with ExitStack() as stack:
+        try:
+            distributed.first_alone(lambda: stack.enter_context(checkpoint.alone(run)))
+            distributed.first_alone(lambda: checkpoint.write_config(run, config))
+            return _train(config, dataset, run, schedule, mesh, own, init, on_event or (lambda *event: None))
+        except OSError as error:
+            error.filename = error.filename or str(run)  # writing to a full disk does not say where
+            raise
+        except jax.errors.JaxRuntimeError as error:
+            raise placement.lost(error, run) from None
+
+
+def _train(
+    config: TrainConfig,
+    dataset: data_sets.Dataset,
+    run: Path,
+    schedule: Schedule,
+    mesh: Mesh | None,
+    own: range | None,
+    init: Trained | None,
+    tell: OnEvent,
+) -> training.TrainState:
+    clock, leads = Clock(), distributed.leads()
+    say: Callable[[str], object] = tqdm.write if leads else lambda line: None
+    with placement.using(mesh):
+        sharding = None if mesh is None else placement.replicated(mesh)
+        state = checkpoint.restore(run, config, say, sharding) or new_state(config, init)
+    first = int(state.step)
+    if first >= config.num_steps:
+        say(f"{run} is finished: {first} steps")
+        return state
+    if first:
+        say(f"resuming {run} at step {first} of {config.num_steps}")
+    adversarial_from = optimisation.first_adversarial_step(config)
+    agreed = placement.Agreement(mesh)
+    pending: list[tuple[int, dict]] = []
+    with (
+        stop_requests() as requests,
+        closing(MetricsLog(run, first) if leads else Unwritten()) as log,
+        closing(batching.batches(dataset, config, first, own=own)) as batches,
+        tqdm(total=config.num_steps, initial=first, unit="step", mininterval=1, disable=not leads) as bar,
+    ):
+        record = RunRecord(run, dataset, first, init) if leads else Unwritten()
+        clock.lap("restore")
+        for step, batch in enumerate(batches, start=first):
+            tell("step", step, batch)
+            with distributed.using(mesh):
+                state, metrics = training.jitted_train_step(
+                    state,
+                    placement.placed(batch, mesh, config.batch_objects),
+                    config=config,
+                    adversarial=step >= adversarial_from,
+                )
+            pending.append((step + 1, metrics))
+            bar.update()
+            if step == first:
+                jax.block_until_ready(metrics)
+                clock.lap("compilation")
+            last, stopping = step + 1 == config.num_steps, agreed(bool(requests))
+            save = last or stopping or (step + 1) % schedule.checkpoint_every == 0
+            if save or (step + 1) % schedule.log_every == 0:
+                rows = check_finite(jax.device_get(pending))
+                if save:
+                    check_state(state)
+                seconds, timed = clock.lap("steps"), [at for at, _ in rows if at > first + 1]
+                pace = 1000 * (seconds / len(timed) if timed else clock.seconds["compilation"])
+                row = {"step": step + 1, **mean_row(rows), "ms_per_step": round(pace, 2)}
+                tell("row", step + 1, row)
+                log.write(row)
+                bar.set_postfix(loss=f"{rows[-1][1]['loss']:.2f}", psnr=f"{rows[-1][1]['psnr']:.1f}", refresh=False)
+                pending = []
+            if leads and (last or (step + 1) % schedule.preview_every == 0):
+                tell("preview", step + 1, None)
+                scores, picture = preview(state, config, dataset, run)
+                log.write({"step": step + 1, **scores}, picture)
+                allocator.give_back()
+                clock.lap("previews")
+            if save:  # after the rows up to this step, which a run that goes on from here will not write again
+                tell("checkpoint", step + 1, None)
+                checkpoint.save(run, state)
+                clock.lap("checkpoints")
+                record.write(step + 1, clock)
+            if last or stopping:
+                tell("end", step + 1, None)
+            if stopping and not last:
+                raise KeyboardInterrupt(
+                    f"stopped at step {step + 1} of {config.num_steps}; the same command goes on from there"
+                )
+    return state
+
+
+def new_state(config: TrainConfig, init: Trained | None) -> optimisation.TrainState:
+    """The state before the first step."""
+    state = optimisation.jitted_create_state(config)
+    return state if init is None else optimisation.begun_with(state, init.variables)
+
+
+def check_finite(rows: list[tuple[int, dict]]) -> list[tuple[int, dict]]:
+    """The rows; NotFinite for the first that holds a number that is not finite."""
+    for step, metrics in rows:
+        for name, value in metrics.items():
+            if not math.isfinite(value):
+                raise NotFinite(
+                    f"{name} is {float(value)} at step {step}; the last checkpoint is kept. Try a lower learning rate "
+                    "or check the data with `spnr-data check`"
+                )
+    return rows
+
+
+def check_state(state: optimisation.TrainState) -> None:
+    """NotFinite for the first array with a number that is not finite: such a state is not saved.
+
+    A running variance can overflow while every loss is finite, because batches are normalised with their own.
+    """
+    for path, leaf in jax.tree_util.tree_leaves_with_path(state):
+        if jnp.issubdtype(leaf.dtype, jnp.floating) and not (finite := np.isfinite(leaf)).all():
+            name = jax.tree_util.keystr(path, simple=True, separator="_")
+            check_finite([(int(state.step), {name: np.asarray(leaf)[~finite][0]})])
+
+
+def mean_row(rows: list[tuple[int, dict]]) -> dict[str, float]:
+    """Mean of each metric over the steps that have it (the discriminator's begin somewhere between two rows)."""
+    return {name: float(np.mean([m[name] for _, m in rows if name in m])) for name in rows[-1][1]}
+
+
+@contextmanager
+def stop_requests() -> Iterator[list[int]]:
+    """A list that fills when Ctrl-C or SIGTERM arrives: the loop ends its step, saves and stops."""
+    requests: list[int] = []
+    previous = {s: signal.signal(s, lambda number, _: requests.append(number)) for s in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield requests
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+
+class MetricsLog:
+    """metrics.jsonl and TensorBoard of a run; rows after `first_step` of an earlier run are dropped."""
+
+    def __init__(self, run: Path, first_step: int) -> None:
+        """Opens both for appending."""
+        from tensorboardX import SummaryWriter
+
+        path = run / "metrics.jsonl"
+        kept = [row for row in read_rows(run) if row["step"] <= first_step]
+        temporary = path.with_suffix(".partial")
+        temporary.write_text("".join(json.dumps(row) + "\n" for row in kept))
+        temporary.replace(path)
+        self._file = path.open("a")
+        self._board = SummaryWriter(str(run / "tensorboard"), purge_step=first_step + 1)
+
+    def write(self, row: dict[str, int | float], picture: np.ndarray | None = None) -> None:
+        """Appends one row, to the disk itself; in TensorBoard its entries are scalars, and the picture is an image."""
+        self._file.write(json.dumps(row) + "\n")
+        self._file.flush()
+        os.fsync(self._file.fileno())  # a checkpoint that outlives a power cut needs the rows before it
+        for name, value in row.items():
+            if name != "step":
+                self._board.add_scalar(name, value, row["step"])
+        if picture is not None:
+            self._board.add_image("preview", to_uint8(picture), row["step"], dataformats="HWC")
+
+    def close(self) -> None:
+        """Closes both."""
+        self._file.close()
+        self._board.close()
+
+
+class Unwritten:
+    """The log and the record of a process that does not write them."""
+
+    def write(self, *what: object) -> None:
+        """Writes nothing."""
+
+    def close(self) -> None:
+        """Closes nothing."""
+
+
+def read_rows(run: Path) -> list[dict]:
+    """Rows of a run's metrics.jsonl; a last line that a crash cut off is left out, and what follows a broken one."""
+    path = run / "metrics.jsonl"
+    rows: list[dict] = []
+    for line in path.read_text(errors="replace").splitlines() if path.exists() else []:
+        try:
+            row = json.loads(line)
+        except (ValueError, RecursionError):
+            break
+        if not isinstance(row, dict) or not all(isinstance(value, int | float) for value in row.values()):
+            break
+        rows.append(row)
+    return rows
+
+
+def preview(
+    state: optimisation.TrainState, config: TrainConfig, dataset: data_sets.Dataset, run: Path, num_objects: int = 6
+) -> tuple[dict[str, float], np.ndarray]:
+    """Validation PSNR of the averaged network on a few objects, and references over renderings, kept in previews/."""
+    names = (dataset.splits["val"] or dataset.splits["train"])[:num_objects]
+    variables = placement.on_this_process(optimisation.averaged_variables(state))
+    columns, scores = [], []
+    for name in names:
+        item = data_sets.read_object(dataset, name)
+        cloud = data_sets.test_cloud(item, config)
+        rendering = inference.render_views(variables, config.model, cloud, item.camera)
+        image, reference = np.clip(np.asarray(rendering.image), 0, 1), data_sets.on_white(item.images)
+        scores.append(np.asarray(psnr(jnp.asarray(image), jnp.asarray(reference))))
+        columns.append(np.concatenate([reference[0], image[0]]))
+    picture = np.concatenate(columns, axis=1)
+    write_whole(run / "previews" / f"{int(state.step):07d}.png", png(picture))
+    return {"val_psnr": float(np.mean(np.concatenate(scores)))}, picture

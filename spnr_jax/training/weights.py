@@ -1,0 +1,127 @@
+"""Trained networks, and their file: one .npz of a config and the averaged weights as float16, a few megabytes at most.
+
+    config              the TrainConfig as JSON, in bytes
+    steps               of training
+    params/.../kernel   one array each, as they lie in the Linen variables
+
+The package holds two networks (docs/model_card.md), of which `small` renders where no other is named: `shipped` is the
+file of one.
+"""
+
+import io
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache, partial
+from importlib import resources
+from pathlib import Path
+
+import jax
+import numpy as np
+from flax.traverse_util import flatten_dict, unflatten_dict
+
+from spnr_jax.config import TrainConfig, from_dict, to_dict
+from spnr_jax.formats.images import write_whole
+from spnr_jax.formats.npz import read_arrays
+from spnr_jax.method.inference import example_inputs, network
+from spnr_jax.method.model import Model
+
+# what a header of any content makes its readers raise
+UNREADABLE = (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError)
+ADVICE = "write one with `spnr export RUN`"
+SHIPPED = ("small", "tiny")  # what the package holds
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trained:
+    """A network as evaluation and rendering use it: Linen variables with averaged weights, and where they come from."""
+
+    config: TrainConfig
+    variables: dict
+    steps: int
+
+
+def shipped(name: str = "small") -> Path:
+    """The file of a network that the package holds."""
+    return Path(str(resources.files("spnr_jax") / "pretrained" / f"{name}.npz"))
+
+
+def place(source: Path | str | None) -> Path:
+    """The run folder or file that `read_trained` reads."""
+    name = "small" if source is None else str(source)
+    return shipped(name) if name in SHIPPED else Path(name)
+
+
+def read_trained(source: Path | str | None, say: Callable[[str], None] = print, data: Path | str = "DATA") -> Trained:
+    """The network of a run folder's newest checkpoint, of a file of weights, or of the package: None, `small`, `tiny`.
+
+    ValueError, with what to do, if there is none; `say` gets a line for each broken checkpoint, `data` is named.
+    """
+    path = place(source)
+    if path.suffix == ".npz":
+        return read_weights(path)
+    from spnr_jax.training import checkpoint, optimisation  # here: a file of weights is read without optimisers
+
+    config, state = checkpoint.load_run(path, say, data)
+    return Trained(config=config, variables=optimisation.averaged_variables(state), steps=int(state.step))
+
+
+def load(run: Path | str | None = None) -> Model:
+    """A network of the package (`small`, `tiny`; None is small), of a run folder's newest checkpoint, or of a file."""
+    trained = read_trained(run)
+    return Model(config=trained.config.model, variables=trained.variables)
+
+
+def write_weights(path: Path, trained: Trained) -> None:
+    """Writes the file; ValueError for weights that float16 cannot hold."""
+    arrays = {name: np.asarray(values) for name, values in flatten_dict(trained.variables, sep="/").items()}
+    for name, values in arrays.items():
+        if not np.abs(values).max(initial=0) <= np.finfo(np.float16).max:
+            raise ValueError(f"{path}: {name} reaches {np.abs(values).max():.3g}, which float16 does not hold")
+    halves = {name: values.astype(np.float16) for name, values in arrays.items()}
+    described = np.frombuffer(json.dumps(to_dict(trained.config)).encode(), np.uint8)
+    stream = io.BytesIO()
+    np.savez_compressed(stream, allow_pickle=False, config=described, steps=np.int64(trained.steps), **halves)
+    write_whole(path, stream.getvalue())
+
+
+def read_weights(path: Path) -> Trained:
+    """The network of a file, in float32; ValueError that says what is wrong with it.
+
+    That the weights are those of the config's network takes a second to find out, because the network is traced for
+    their shapes; the package's own files are not asked again.
+    """
+    if not path.is_file():
+        raise ValueError(f"{path}: no such file of weights; {ADVICE}")
+    try:
+        with path.open("rb") as file:
+            arrays = read_arrays(file)
+        described, steps = json.loads(arrays.pop("config").tobytes()), int(arrays.pop("steps"))
+        if not isinstance(described, dict):
+            raise ValueError("its config is no JSON object")
+        config = from_dict(described)
+        if path not in [shipped(name) for name in SHIPPED]:
+            _check_weights(arrays, variable_shapes(config))
+    except UNREADABLE as error:
+        raise ValueError(f"{path}: not a file of weights of this version ({error}); {ADVICE}") from None
+    variables = unflatten_dict({name: x.astype(np.float32) for name, x in arrays.items()}, sep="/")
+    return Trained(config=config, variables=jax.device_put(variables), steps=steps)  # jnp.asarray would compile
+
+
+def _check_weights(arrays: dict[str, np.ndarray], shapes: dict[str, jax.ShapeDtypeStruct]) -> None:
+    """ValueError for the first array that is not as a network of these shapes needs it."""
+    if unknown := sorted(arrays.keys() - shapes):
+        raise ValueError(f"the network has no {unknown[0]}")
+    for name, wanted in shapes.items():
+        found = arrays.get(name, np.zeros(0))
+        if found.shape != wanted.shape or found.dtype != np.float16 or not np.isfinite(found).all():
+            raise ValueError(
+                f"{name} should hold {wanted.shape} finite float16 numbers, not {found.shape} of {found.dtype}"
+            )
+
+
+@cache
+def variable_shapes(config: TrainConfig) -> dict[str, jax.ShapeDtypeStruct]:
+    """Shape of every weight of the config's network, by name."""
+    create = partial(network(config.model).init, jax.random.key(0))
+    return flatten_dict(jax.eval_shape(create, *example_inputs(config.model)), sep="/")

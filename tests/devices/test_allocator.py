@@ -1,0 +1,104 @@
+"""What glibc's allocator is asked: threads share arenas, freed memory goes back, another C library is left alone."""
+
+import ctypes
+import platform
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import pytest
+
+from spnr_jax.devices import allocator
+
+THREADS = 6
+CHILD = f"""
+import ctypes, os, sys, threading
+from spnr_jax.devices import allocator as memory
+
+def arenas():
+    libc = ctypes.CDLL("libc.so.6")
+    libc.fopen.restype = ctypes.c_void_p
+    file = ctypes.c_void_p(libc.fopen(sys.argv[2].encode(), b"w"))
+    libc.malloc_info(0, file)
+    libc.fclose(file)
+    return open(sys.argv[2]).read().count("<heap nr=")
+
+def allocate():
+    kept = [bytes(2000) for _ in range(50)]  # too large for Python's own pools
+    meeting.wait()
+
+os.cpu_count = lambda: 2
+if sys.argv[1] == "few":
+    memory.few_arenas()
+before = arenas()
+meeting = threading.Barrier({THREADS})
+threads = [threading.Thread(target=allocate) for _ in range({THREADS})]
+for thread in threads:
+    thread.start()
+for thread in threads:
+    thread.join()
+print(arenas() - before)
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="the C library is not glibc")
+@pytest.mark.parametrize(("asked", "more"), [("few", 1), ("none", THREADS)])
+def test_threads_share_as_many_arenas_as_there_are_cores_when_they_are_asked_to(tmp_path, asked, more):
+    done = subprocess.run(
+        [sys.executable, "-c", CHILD, asked, str(tmp_path / "info")], capture_output=True, text=True, check=True
+    )
+    assert int(done.stdout) == more
+
+
+FAULTS = """
+import resource, sys
+from spnr_jax.devices import allocator as memory
+
+if sys.argv[1] == "keep":
+    memory.keep_arrays()
+import jax
+
+@jax.jit
+def step(x, w):
+    y = x @ w  # 128 MB
+    return y.T @ y
+
+x, w = jax.numpy.ones((128 << 10, 256)), jax.numpy.ones((256, 256))
+faults = []
+for _ in range(10):  # the first ones find no memory, or one piece where two are in use
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    step(x, w).block_until_ready()
+    faults.append(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+print(min(faults))
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="the C library is not glibc")
+def test_a_step_uses_the_memory_of_the_one_before_when_it_is_kept():
+    def faults(asked):
+        done = subprocess.run([sys.executable, "-c", FAULTS, asked], capture_output=True, text=True, check=True)
+        return int(done.stdout)
+
+    fresh = faults("let go")
+    assert fresh >= 64, "128 MB in pages of 2 MB at most"
+    assert faults("keep") < fresh / 4
+
+
+def test_freed_memory_goes_back(monkeypatch):
+    kept = []
+    monkeypatch.setattr(
+        ctypes, "CDLL", lambda name: SimpleNamespace(malloc_trim=lambda keep: kept.append((name, keep)))
+    )
+    allocator.give_back()
+    assert kept == [("libc.so.6", 0)]
+
+
+def test_another_c_library_is_left_alone(monkeypatch):
+    def missing(name):
+        raise OSError(name)
+
+    for library in (missing, lambda name: object()):
+        monkeypatch.setattr(ctypes, "CDLL", library)
+        allocator.few_arenas()
+        allocator.keep()
+        allocator.give_back()

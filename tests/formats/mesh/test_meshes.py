@@ -1,0 +1,233 @@
+"""Mesh folders and files: ids, the formats without materials, and real files where they are at hand."""
+
+import hashlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from support.gltf_files import CORNERS, SQUARE, GltfBuilder
+from support.handmade import ball, box
+
+from spnr_jax.formats.mesh.assets import Asset, RejectedAsset
+from spnr_jax.formats.mesh.meshes import find_meshes, load_mesh
+from spnr_jax.formats.mesh.surface_points import CANDIDATES, normalise, sample_surface
+from spnr_jax.formats.mesh.texels import srgb_to_linear
+
+DATA = Path(__file__).parents[4] / "shared" / "data"
+FACES = SQUARE.reshape(2, 3)
+
+
+def write(path, text=""):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
+    return path
+
+
+class TestFindMeshes:
+    def ids(self, folder, *names):
+        for name in names:
+            write(folder / name)
+        return {identifier: str(path.relative_to(folder)) for identifier, path in find_meshes(folder)}
+
+    def test_ids_are_stems_or_the_folder_of_a_lone_obj_or_gltf(self, tmp_path):
+        found = self.ids(tmp_path, "b.glb", "a.PLY", "pan/model.obj", "pan/model.mtl", "lamp/scene.gltf", "x/cup.glb")
+        assert found == {
+            "a": "a.PLY",
+            "b": "b.glb",
+            "cup": "x/cup.glb",
+            "lamp": "lamp/scene.gltf",
+            "pan": "pan/model.obj",
+        }
+        assert list(found) == sorted(found)
+
+    def test_names_that_collide_become_paths(self, tmp_path):
+        found = self.ids(
+            tmp_path, "chair.glb", "Chair.obj", "1/m/scene.gltf", "2/m/scene.gltf", "two/a.stl", "two/b.stl"
+        )
+        assert found == {
+            "chair.glb": "chair.glb",
+            "Chair.obj": "Chair.obj",
+            "1_m_scene.gltf": "1/m/scene.gltf",
+            "2_m_scene.gltf": "2/m/scene.gltf",
+            "a": "two/a.stl",
+            "b": "two/b.stl",
+        }
+
+    def test_ids_are_unique_even_where_letter_case_and_cleaning_collide(self, tmp_path):
+        found = self.ids(tmp_path, "a b.glb", "a_b.glb", "a?b.glb", "A_B.GLB", "ä.off", "ö.off", "a_b.glb.ply")
+        assert len(found) == 7
+        assert len({name.casefold() for name in found}) == 7
+        assert all(set(name) <= set("abcdefghijklmnopqrstuvwxyzABGLP._-0123456789") for name in found)
+        assert all(name[0] not in "._-" for name in found)
+
+    def test_hidden_files_and_folders_are_skipped(self, tmp_path):
+        assert self.ids(tmp_path, "a.glb", ".b.glb", ".cache/c.glb") == {"a": "a.glb"}
+
+    def test_no_folder_and_no_mesh_are_said_in_one_line(self, tmp_path):
+        with pytest.raises(ValueError, match="absent is not a folder"):
+            find_meshes(tmp_path / "absent")
+        write(tmp_path / "readme.txt")
+        with pytest.raises(ValueError, match="holds no mesh file: expected .glb .gltf .obj"):
+            find_meshes(tmp_path)
+
+
+class TestPlainFormats:
+    @pytest.mark.parametrize("suffix", ["ply", "stl", "off", "obj"])
+    def test_geometry_without_materials_is_grey_half_rough_and_no_metal(self, tmp_path, suffix):
+        trimesh.Trimesh(CORNERS, FACES, process=False).export(tmp_path / f"a.{suffix}")
+        (part,) = load_mesh(tmp_path / f"a.{suffix}").parts
+        found = {tuple(map(tuple, triangle)) for triangle in part.positions[part.faces]}
+        assert found == {tuple(map(tuple, triangle)) for triangle in CORNERS[FACES].astype(float)}
+        np.testing.assert_array_equal(part.material.base_color, [0.5, 0.5, 0.5])
+        assert (part.material.roughness, part.material.metallic) == (0.5, 0)
+
+    def ply(self, tmp_path, properties, rows, faces):
+        header = f"ply\nformat ascii 1.0\nelement vertex {len(rows)}\n{properties}\n{faces[0]}\nend_header\n"
+        return write(tmp_path / "a.ply", header + "\n".join([*rows, *faces[1:], ""]))
+
+    def test_eight_bit_vertex_colours_are_srgb_and_float_ones_linear(self, tmp_path):
+        faces = ["element face 1\nproperty list uchar int vertex_indices", "3 0 1 2"]
+        corners = ["0 0 0", "1 0 0", "0 1 0"]
+        for kind, color, expected in (
+            ("uchar", "255 128 0", [1, srgb_to_linear(np.array(128 / 255)), 0]),
+            ("float", "1 0.5 0", [1, 0.5, 0]),
+        ):
+            channels = "\n".join(f"property {kind} {name}" for name in ("red", "green", "blue"))
+            properties = "property float x\nproperty float y\nproperty float z\n" + channels
+            path = self.ply(tmp_path, properties, [f"{corner} {color}" for corner in corners], faces)
+            (part,) = load_mesh(path).parts
+            np.testing.assert_allclose(part.colors, [expected] * 3, atol=1e-6)
+            np.testing.assert_array_equal(part.material.base_color, [1, 1, 1])
+
+    def test_face_colours_stay_on_their_faces(self, tmp_path):
+        mesh = trimesh.Trimesh(CORNERS, FACES, process=False, face_colors=[[255, 0, 0, 255], [0, 0, 255, 255]])
+        mesh.export(tmp_path / "a.ply")
+        (part,) = load_mesh(tmp_path / "a.ply").parts
+        np.testing.assert_array_equal(part.colors[part.faces], [[[1, 0, 0]] * 3, [[0, 0, 1]] * 3])
+
+    def test_normals_in_a_ply_are_kept(self, tmp_path):
+        mesh = trimesh.Trimesh(CORNERS, FACES, process=False, vertex_normals=[[0, 0.6, 0.8]] * 4)
+        mesh.export(tmp_path / "a.ply", vertex_normal=True)
+        np.testing.assert_allclose(load_mesh(tmp_path / "a.ply").parts[0].normals, [[0, 0.6, 0.8]] * 4, atol=1e-6)
+
+    def test_a_cloud_of_points_has_no_faces(self, tmp_path):
+        trimesh.PointCloud(CORNERS).export(tmp_path / "a.ply")
+        with pytest.raises(RejectedAsset, match="no faces"):
+            load_mesh(tmp_path / "a.ply")
+
+    @pytest.mark.parametrize("suffix", ["ply", "stl", "off", "obj", "gltf", "glb"])
+    def test_noise_and_absent_files_are_refused_in_one_line(self, tmp_path, suffix):
+        path = tmp_path / f"a.{suffix}"
+        for content in (None, b"", bytes(range(256)) * 4, b"OFF\n3 1 0\n0 0 0\n", b"ply\nformat ascii 1.0\n"):
+            if content is not None:
+                path.write_bytes(content)
+            with pytest.raises(RejectedAsset) as caught:
+                load_mesh(path)
+            assert "\n" not in str(caught.value)
+
+    def test_a_suffix_that_is_not_read_is_refused(self, tmp_path):
+        with pytest.raises(RejectedAsset, match="expected one of .glb"):
+            load_mesh(write(tmp_path / "a.fbx"))
+
+
+class TestAssembly:
+    def test_unused_vertices_go_and_normals_become_unit(self, tmp_path):
+        builder = GltfBuilder()
+        positions = np.concatenate([np.full((3, 3), 50, np.float32), CORNERS])
+        normals = np.tile(np.float32([0, 0, 3]), (7, 1))
+        normals[4] = 0
+        builder.mesh(builder.primitive(positions, SQUARE + np.uint16(3), NORMAL=normals))
+        asset = load_mesh(builder.write(tmp_path / "a.glb"))
+        np.testing.assert_array_equal(asset.parts[0].positions, CORNERS)
+        np.testing.assert_array_equal(asset.parts[0].normals, [[0, 0, 1]] * 4)
+        assert asset.ignored == ("some normals without a direction (the faces' are used)",)
+
+    def test_the_source_names_the_file_and_its_checksum(self, tmp_path):
+        path = write(tmp_path / "a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+        assert load_mesh(path).source == {"file": "a.obj", "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason="the folder of real mesh files is not beside this checkout")
+class TestRealFiles:
+    EXPECTED = {
+        "blend_muscle_car": "is transparent: material 'Lamp_glass.003' has alphaMode BLEND",
+        "draco_sedan": "needs KHR_draco_mesh_compression",
+        "lines_and_triangles_window": "is transparent: material 'Glass_Crystal' has alphaMode BLEND",
+        "meshopt_webp_suv": "needs EXT_meshopt_compression",
+        "missing_texture_wicker_chair": "names a file that is missing: 'textures/Wicker_chair_baseColor.png'",
+        "degenerate_faces": None,
+        "negative_scale_test": None,
+        "specgloss_chaise": None,
+        "strips_cad_part": None,
+        "vertex_colour_printer": None,
+    }
+
+    def test_each_hard_file_is_read_or_refused_with_the_right_reason(self):
+        found = dict(find_meshes(DATA / "hard"))
+        assert set(found) == set(self.EXPECTED)
+        for name, reason in self.EXPECTED.items():
+            if reason is None:
+                check(load_mesh(found[name]))
+            else:
+                with pytest.raises(RejectedAsset, match=reason):
+                    load_mesh(found[name])
+
+    @pytest.mark.parametrize(
+        "name", ["sk_777_219", "khr_milk_truck", "kenney_racer", "sk_seat_ba", "negative_scale_test"]
+    )
+    def test_geometry_agrees_with_trimesh(self, name):
+        path = next(DATA.glob(f"*/**/{name}.glb"))
+        theirs, asset = trimesh.load_scene(path).to_geometry(), load_mesh(path)
+        ours = np.concatenate([part.positions[part.faces] for part in asset.parts])
+        np.testing.assert_allclose([ours.min(axis=(0, 1)), ours.max(axis=(0, 1))], theirs.bounds, rtol=1e-5, atol=1e-5)
+        area = np.linalg.norm(np.cross(ours[:, 1] - ours[:, 0], ours[:, 2] - ours[:, 0]), axis=-1).sum() / 2
+        assert area == pytest.approx(theirs.area, rel=1e-5)
+
+    @pytest.mark.slow
+    def test_every_training_object_is_read(self):
+        found = find_meshes(DATA / "real" / "train")
+        assert len(found) == 78
+        for _, path in found:
+            check(load_mesh(path))
+
+
+class TestEvenSpread:
+    shape = Asset(parts=(ball(radius=1.0), box(half=(0.5, 0.01, 0.01))))
+
+    def test_points_are_those_of_more_random_ones_with_their_materials(self):
+        even, drawn = sample_surface(self.shape, 40, 3, "even"), sample_surface(self.shape, CANDIDATES * 40, 3)
+        place = {tuple(position): i for i, position in enumerate(drawn.positions)}
+        chosen = [place[tuple(position)] for position in even.positions]
+        assert len(set(chosen)) == 40
+        for name, values in vars(even).items():
+            np.testing.assert_array_equal(values, getattr(drawn, name)[chosen])
+
+    @pytest.mark.parametrize("count", [16, 60, 240])
+    def test_any_first_ones_leave_smaller_gaps_than_random_ones(self, count):
+        def gap(points):
+            away = np.linalg.norm(surface.positions[:, None] - points.positions[:count], axis=-1)
+            return np.quantile(away.min(axis=1), 0.99)
+
+        surface = sample_surface(self.shape, 2000, 0)
+        spread = {kind: sample_surface(self.shape, 240, 1, kind) for kind in ("random", "even")}
+        assert gap(spread["even"]) < 0.75 * gap(spread["random"])
+
+
+def check(asset):
+    """What the rest of data_gen relies on, for one object."""
+    moved, _ = normalise(asset)
+    points = sample_surface(moved, 256, 0)
+    for values in vars(points).values():
+        assert np.isfinite(values).all()
+    for values in (points.base_color, points.roughness, points.metallic):
+        assert values.min() >= 0
+        assert values.max() <= 1
+    np.testing.assert_allclose(np.linalg.norm(points.normals, axis=-1), 1, atol=1e-5)
+    assert np.linalg.norm(points.positions, axis=-1).max() <= 1 + 1e-5
+    keys = {
+        (part.normals is None, *(channel.tobytes() for channel in (look.base_color, look.roughness, look.metallic)))
+        for part in moved.parts
+        for look in [part.material]
+    }
+    assert len(keys) == len(moved.parts)

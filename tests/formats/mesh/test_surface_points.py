@@ -1,0 +1,137 @@
+"""Surface points: uniform by area, materials as the renderer sees them, normalisation that can be undone."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from spnr_jax.formats.mesh.assets import Asset, Material, Part, RejectedAsset
+from spnr_jax.formats.mesh.surface_points import normalise, sample_surface
+
+CORNERS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float64)
+FACES = np.array([[0, 1, 2], [0, 2, 3]])
+
+
+def material(color=(0.5, 0.5, 0.5), roughness=0.5, metallic=0.0, wrap="repeat"):
+    channels = {"base_color": color, "roughness": roughness, "metallic": metallic}
+    return Material(**{name: np.asarray(values, np.float32) for name, values in channels.items()}, wrap=wrap)
+
+
+def square(size=1.0, offset=(0, 0, 0), look=None, **columns):
+    return Part(positions=CORNERS * size + offset, faces=FACES, material=look or material(), **columns)
+
+
+class TestNormalise:
+    def test_centre_goes_to_zero_and_half_the_diagonal_to_one(self):
+        asset = Asset(parts=(square(3.0, (10, 20, 30)), square(1.0, (11, 21, 34))))
+        moved, transform = normalise(asset)
+        corners = np.concatenate([part.positions for part in moved.parts])
+        np.testing.assert_allclose(corners.min(axis=0), -corners.max(axis=0), atol=1e-12)
+        assert np.linalg.norm(np.ptp(corners, axis=0)) == pytest.approx(2)
+        assert transform == {"centre": [11.5, 21.5, 32.0], "scale": pytest.approx(2 / np.sqrt(9 + 9 + 16))}
+
+    def test_the_transform_inverts(self):
+        asset = Asset(parts=(square(0.01, (365, -2, 7)),))
+        moved, transform = normalise(asset)
+        back = moved.parts[0].positions / transform["scale"] + transform["centre"]
+        np.testing.assert_allclose(back, asset.parts[0].positions, atol=1e-9)
+
+    def test_vertices_without_faces_do_not_count(self):
+        stray = replace(square(), positions=np.concatenate([CORNERS, [[99, np.nan, 99]]]))
+        assert normalise(Asset(parts=(stray,)))[1] == normalise(Asset(parts=(square(),)))[1]
+
+    @pytest.mark.parametrize(
+        ("part", "reason"),
+        [
+            (replace(square(), faces=np.zeros((0, 3), np.int64)), "no faces"),
+            (square(0.0, (1, 2, 3)), "zero extent"),
+            (square(1.0, (0, np.inf, 0)), "not finite"),
+            (square(1.0, (np.nan, 0, 0)), "not finite"),
+        ],
+    )
+    def test_objects_without_a_box_are_refused(self, part, reason):
+        with pytest.raises(RejectedAsset, match=reason):
+            normalise(Asset(parts=(part,)))
+        with pytest.raises(RejectedAsset, match="no faces"):
+            normalise(Asset(parts=()))
+
+
+class TestSampleSurface:
+    def test_points_spread_by_area_over_parts_and_faces(self):
+        asset = Asset(parts=(square(1.0), square(3.0, (5, 0, 0)), square(0.0)))
+        count = np.bincount(sample_surface(asset, 20_000, 0).face, minlength=6) / 20_000
+        # four standard deviations of a share of 20000 draws
+        np.testing.assert_allclose(count, [0.05, 0.05, 0.45, 0.45, 0, 0], atol=4 * 0.5 / np.sqrt(20_000))
+
+    def test_points_are_uniform_inside_a_triangle(self):
+        triangle = replace(square(), faces=FACES[:1])
+        points = sample_surface(Asset(parts=(triangle,)), 20_000, 1).positions
+        # moments of the uniform distribution on the triangle (0,0) (1,0) (1,1)
+        np.testing.assert_allclose(points.mean(axis=0), [2 / 3, 1 / 3, 0], atol=0.01)
+        np.testing.assert_allclose(np.cov(points.T)[:2, :2], [[1 / 18, 1 / 36], [1 / 36, 1 / 18]], atol=2e-3)
+
+    def test_every_point_lies_on_the_face_that_it_names(self):
+        parts = (square(2.0), square(1.0, (0, 0, 3)), square(1.5, (4, 1, -1)))
+        points = sample_surface(Asset(parts=parts), 500, 2)
+        corners = np.concatenate([part.positions[part.faces] for part in parts])[points.face]
+        edges = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
+        inside = np.linalg.pinv(edges) @ (points.positions - corners[:, 0])[..., None]
+        rebuilt = (edges @ inside)[..., 0] + corners[:, 0]
+        np.testing.assert_allclose(rebuilt, points.positions, atol=1e-5)
+        assert inside.min() > -1e-5
+        assert inside.sum(axis=1).max() < 1 + 1e-5
+
+    def test_the_material_is_looked_up_where_the_point_lies(self):
+        ramp = np.linspace(0, 1, 64, dtype=np.float32)  # value of texel centre i is i / 63
+        look = material(
+            color=np.stack([np.tile(ramp, (64, 1)), np.tile(ramp[:, None], (1, 64)), np.ones((64, 64))], axis=-1),
+            roughness=np.tile(1 - ramp[:, None], (1, 2)),
+            metallic=0.25,
+            wrap="clamp",
+        )
+        tint = np.tile([0.5, 1.0, 0.5], (4, 1))
+        part = square(look=look, texcoords=np.stack([CORNERS[:, 0], 1 - CORNERS[:, 1]], axis=-1), colors=tint)
+        points = sample_surface(Asset(parts=(part,)), 1000, 3)
+        u, v = points.positions[:, 0], 1 - points.positions[:, 1]
+
+        def texel(coordinate):
+            return np.clip((coordinate * 64 - 0.5) / 63, 0, 1)
+
+        np.testing.assert_allclose(points.base_color[:, 0], 0.5 * texel(u), atol=1e-5)
+        np.testing.assert_allclose(points.base_color[:, 1], texel(v), atol=1e-5)
+        np.testing.assert_allclose(points.base_color[:, 2], 0.5, atol=1e-6)
+        np.testing.assert_allclose(points.roughness, 1 - texel(v), atol=1e-5)
+        np.testing.assert_array_equal(points.metallic, np.float32(0.25))
+
+    def test_vertex_colours_are_interpolated_linearly(self):
+        part = square(look=material((1, 1, 1)), colors=np.stack([CORNERS[:, 0]] * 3, axis=-1))
+        points = sample_surface(Asset(parts=(part,)), 200, 4)
+        np.testing.assert_allclose(points.base_color[:, 1], points.positions[:, 0], atol=1e-6)
+
+    def test_normals_are_the_faces_or_the_interpolated_ones_and_always_unit(self):
+        tilted = np.array([[-1, 0, 1], [1, 0, 1], [1, 0, 1], [-1, 0, 1]]) / np.sqrt(2)
+        flat = sample_surface(Asset(parts=(square(),)), 200, 5)
+        smooth = sample_surface(Asset(parts=(square(normals=tilted),)), 200, 5)
+        np.testing.assert_array_equal(flat.normals, np.tile(np.float32([0, 0, 1]), (200, 1)))
+        expected = np.stack([2 * smooth.positions[:, 0] - 1, np.zeros(200), np.ones(200)], axis=-1)
+        expected /= np.linalg.norm(expected, axis=-1, keepdims=True)
+        np.testing.assert_allclose(smooth.normals, expected, atol=1e-5)
+
+    def test_the_seed_decides_everything(self):
+        asset = Asset(parts=(square(),))
+        first, again, other = (sample_surface(asset, 50, seed) for seed in (7, 7, 8))
+        np.testing.assert_array_equal(first.positions, again.positions)
+        assert not np.array_equal(first.positions, other.positions)
+
+    def test_columns_are_float32_and_faces_int32(self):
+        points = sample_surface(Asset(parts=(square(),)), 10, 0)
+        dtypes = {name: str(values.dtype) for name, values in vars(points).items()}
+        columns = ("positions", "normals", "base_color", "roughness", "metallic")
+        assert dtypes == {**dict.fromkeys(columns, "float32"), "face": "int32"}
+
+    def test_impossible_requests_say_so(self):
+        with pytest.raises(ValueError, match="num_points must be at least 1, got 0"):
+            sample_surface(Asset(parts=(square(),)), 0, 0)
+        line = replace(square(), positions=CORNERS * [1, 0, 0])
+        with pytest.raises(RejectedAsset, match="area"):
+            sample_surface(Asset(parts=(line,)), 5, 0)

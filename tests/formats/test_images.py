@@ -1,0 +1,144 @@
+import importlib.util
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from spnr_jax.formats.images import depth_image, png, to_uint8, write_turntable, write_whole
+
+
+def shaded_frames(count: int) -> list[np.ndarray]:
+    """A smoothly shaded, tinted disc that moves over white, float in [0, 1]."""
+    y, x = np.mgrid[:64, :64] / 64
+    frames = []
+    for center in np.linspace(0.3, 0.7, count):
+        shade = 1 - 1.5 * np.hypot(x - center + 0.1, y - 0.4)
+        disc = np.hypot(x - center, y - 0.5) < 0.3
+        frames.append(np.where(disc[..., None], shade[..., None] * [1.0, 0.7, 0.3], 1.0))
+    return frames
+
+
+def read_frames(path) -> np.ndarray:
+    with Image.open(path) as film:
+        return np.stack([np.asarray(film.convert("RGB")) for i in range(film.n_frames) if not film.seek(i)])
+
+
+def test_eight_bit_values_round_to_the_nearest_level_and_keep_eight_bit_images():
+    np.testing.assert_array_equal(
+        to_uint8(np.array([-0.1, 0.0, 0.4999 / 255, 0.5, 1.0, 1.2])), [0, 0, 0, 128, 255, 255]
+    )
+    levels = np.arange(256, dtype=np.uint8)
+    np.testing.assert_array_equal(to_uint8(levels / 255), levels)
+    assert to_uint8(levels) is levels
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_an_image_that_is_not_finite_is_refused(value):
+    with pytest.raises(ValueError, match="NaN or infinity"):
+        to_uint8(np.full((2, 2, 3), value))
+
+
+@pytest.mark.parametrize("shape", [(5, 7, 3), (5, 7)])
+def test_a_png_holds_the_exact_pixels(tmp_path, shape):
+    image = np.random.default_rng(0).integers(0, 256, shape).astype(np.uint8)
+    (tmp_path / "a.png").write_bytes(png(image))
+    with Image.open(tmp_path / "a.png") as opened:
+        np.testing.assert_array_equal(np.asarray(opened), image)
+
+
+def test_depth_is_brighter_where_it_is_nearer_and_white_where_nothing_is():
+    depth = np.array([[2.0, 2.5, 3.0, 9.0]])
+    shown = depth_image(depth, np.array([[1.0, 1, 1, 0]])).astype(int)
+    brightness = shown.sum(axis=-1)[0]
+    assert brightness[0] > brightness[1] > brightness[2]
+    np.testing.assert_array_equal(shown[0, 3], 255)
+
+
+def test_depth_colours_span_the_opaque_pixels_alone_so_unit_and_background_do_not_matter():
+    rng = np.random.default_rng(1)
+    depth, acc = rng.uniform(2, 3, (6, 6)), (rng.uniform(size=(6, 6)) < 0.7).astype(float)
+    shown = depth_image(depth, acc)
+    np.testing.assert_array_equal(depth_image(np.where(acc > 0, depth, 1e6), acc), shown)
+    assert np.abs(depth_image(100 * depth, acc).astype(int) - shown).max() <= 1
+
+
+@pytest.mark.parametrize("acc", [0.0, 1.0])
+def test_depth_without_any_range_is_still_a_picture(acc):
+    shown = depth_image(np.full((3, 3), 2.0), np.full((3, 3), acc))
+    assert (shown == (255 if acc == 0 else shown[0, 0])).all()
+
+
+def test_a_file_that_cannot_be_finished_leaves_the_old_one_and_nothing_else(tmp_path, monkeypatch):
+    path = tmp_path / "new" / "a.bin"
+    write_whole(path, b"old")
+
+    def full(source, target):
+        raise OSError("disk full")
+
+    monkeypatch.setattr("os.replace", full)
+    with pytest.raises(OSError, match="disk full"):
+        write_whole(path, b"newer")
+    assert path.read_bytes() == b"old"
+    assert [p.name for p in path.parent.iterdir()] == ["a.bin"]
+
+
+def test_a_turntable_gif_loops_at_its_rate_and_shows_every_frame_with_a_pure_white_background(tmp_path):
+    frames = shaded_frames(12)
+    path, reason = write_turntable(tmp_path / "a.gif", frames, fps=20)
+    assert (path, reason) == (tmp_path / "a.gif", "")
+    with Image.open(path) as film:
+        assert film.info["loop"] == 0
+        assert film.info["duration"] == 50
+    shown, wanted = read_frames(path).astype(int), np.stack([to_uint8(frame) for frame in frames])
+    np.testing.assert_array_equal((shown == 255).all(axis=-1), (wanted == 255).all(axis=-1))
+    error = np.abs(shown - wanted)[(wanted < 255).any(axis=-1)]
+    assert error.mean() < 2
+    assert error.max() <= 12
+
+
+def test_what_stands_still_in_a_turntable_does_not_flicker(tmp_path):
+    still = shaded_frames(1)[0]
+    moving = [np.concatenate([still, still * color], axis=1) for color in np.random.default_rng(2).uniform(size=(5, 3))]
+    path, _ = write_turntable(tmp_path / "a.gif", moving, fps=10)
+    shown = read_frames(path)[:, :, :64]
+    np.testing.assert_array_equal(shown, np.broadcast_to(shown[:1], shown.shape))
+
+
+def test_an_mp4_without_its_encoder_becomes_a_gif_and_one_line_says_why(tmp_path, monkeypatch):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    path, reason = write_turntable(tmp_path / "a.mp4", shaded_frames(3), fps=10)
+    assert path == tmp_path / "a.gif"
+    assert len(read_frames(path)) == 3
+    assert "imageio-ffmpeg" in reason
+    assert "\n" not in reason
+
+
+@pytest.mark.skipif(importlib.util.find_spec("imageio_ffmpeg") is None, reason="needs imageio-ffmpeg")
+def test_an_encoder_without_its_program_counts_as_none(tmp_path, monkeypatch):
+    import imageio_ffmpeg
+
+    def none_found():
+        raise RuntimeError("No ffmpeg exe could be found")
+
+    monkeypatch.setattr(imageio_ffmpeg, "get_ffmpeg_exe", none_found)
+    path, reason = write_turntable(tmp_path / "a.mp4", shaded_frames(3), fps=10)
+    assert path == tmp_path / "a.gif"
+    assert reason == "written as .gif: .mp4 needs the program ffmpeg"
+
+
+@pytest.mark.skipif(importlib.util.find_spec("imageio_ffmpeg") is None, reason="needs imageio-ffmpeg")
+def test_an_mp4_has_every_frame(tmp_path):
+    import imageio_ffmpeg
+
+    path, reason = write_turntable(tmp_path / "a.mp4", [frame[:63, :61] for frame in shaded_frames(10)], fps=10)
+    assert (path, reason) == (tmp_path / "a.mp4", "")
+    assert imageio_ffmpeg.count_frames_and_secs(str(path))[0] == 10
+
+
+@pytest.mark.parametrize(
+    ("name", "count", "fps", "reason"),
+    [("a.avi", 2, 10, ".gif or .mp4 file, not '.avi'"), ("a.gif", 0, 10, "0 frames"), ("a.gif", 2, 0, "at 0 fps")],
+)
+def test_a_turntable_that_cannot_be_is_refused(tmp_path, name, count, fps, reason):
+    with pytest.raises(ValueError, match=reason):
+        write_turntable(tmp_path / name, shaded_frames(count), fps)

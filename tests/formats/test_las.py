@@ -1,0 +1,101 @@
+"""Laser scans keep their coordinates and colours; without laspy one line says what to install."""
+
+import builtins
+import struct
+
+import numpy as np
+import pytest
+
+from spnr_jax.formats.clouds import place_cloud, read_cloud
+
+laspy = pytest.importorskip("laspy")
+ORIGIN = np.array([500_000.0, 4_000_000.0, 120.0])
+
+
+def scan(path, point_format: int, count=300):
+    """A scan of random points in a cube of ten metres; its positions, as a LAS file rounds them to millimetres."""
+    rng = np.random.default_rng(0)
+    header = laspy.LasHeader(point_format=point_format, version="1.4")
+    header.offsets, header.scales = ORIGIN, [0.001] * 3
+    las = laspy.LasData(header)
+    positions = np.round(rng.uniform(0, 10, (count, 3)), 3) + ORIGIN
+    las.x, las.y, las.z = positions.T
+    las.intensity = rng.integers(0, 2000, count)
+    if point_format == 7:
+        las.red, las.green, las.blue = (np.full(count, level, np.uint16) for level in (65535, 32768, 0))
+    las.write(path)
+    return positions
+
+
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+def test_a_scan_keeps_its_coordinates_colours_and_is_z_up(tmp_path, suffix):
+    positions = scan(tmp_path / f"a{suffix}", 7)
+    placed = place_cloud(tmp_path / f"a{suffix}")
+    assert placed.up == "z"
+    back = placed.cloud.positions @ placed.rotation + placed.origin
+    np.testing.assert_allclose(back, positions, rtol=0, atol=1e-4)
+    np.testing.assert_allclose(placed.cloud.base_color[0], [1, 0.2140, 0], atol=1e-4)
+
+
+def test_a_scan_without_colours_shows_its_intensity(tmp_path):
+    scan(tmp_path / "a.las", 6)
+    lines: list[str] = []
+    cloud = read_cloud(tmp_path / "a.las", report=lines.append)
+    assert np.ptp(cloud.base_color) > 0.9
+    assert any("intensity" in line for line in lines)
+
+
+def test_a_broken_scan_is_one_line(tmp_path):
+    scan(tmp_path / "a.las", 7)
+    whole = (tmp_path / "a.las").read_bytes()
+    for content in (b"LASF", b"no scan at all" * 100, whole[:200]):
+        (tmp_path / "b.las").write_bytes(content)
+        with pytest.raises(ValueError, match="b.las: .*(broken|cut|truncated)"):
+            read_cloud(tmp_path / "b.las")
+
+
+def test_without_laspy_one_line_names_the_extra(tmp_path, monkeypatch):
+    scan(tmp_path / "a.las", 7)
+    real = builtins.__import__
+
+    def missing(name, *arguments, **options):
+        if name == "laspy":
+            raise ImportError(name)
+        return real(name, *arguments, **options)
+
+    monkeypatch.setattr(builtins, "__import__", missing)
+    with pytest.raises(ValueError, match=r"a.las: needs the package laspy .* pip install 'spnr-jax\[formats\]'"):
+        read_cloud(tmp_path / "a.las")
+
+
+def test_a_compressed_scan_without_its_codec_names_the_extra(tmp_path, monkeypatch):
+    scan(tmp_path / "a.laz", 7)
+    monkeypatch.setattr(laspy.LazBackend, "detect_available", classmethod(lambda cls: ()))
+    with pytest.raises(ValueError, match=r"needs the package lazrs .*\[formats\]"):
+        read_cloud(tmp_path / "a.laz")
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "reason"),
+    [(100, 2**32 - 1, "records in its header"), (96, 2**32 - 1, "points from byte"), (0, 0, "not a LAS file")],
+)
+def test_a_header_that_announces_more_than_the_file_holds_is_refused_at_once(place, value, reason, tmp_path):
+    scan(tmp_path / "a.las", 7)
+    content = bytearray((tmp_path / "a.las").read_bytes())
+    content[place : place + 4] = value.to_bytes(4, "little")
+    (tmp_path / "a.las").write_bytes(content)
+    with pytest.raises(ValueError, match=reason):
+        read_cloud(tmp_path / "a.las")
+
+
+def test_a_chunk_table_that_is_too_long_or_too_short_never_reaches_the_library_that_trusts_it(tmp_path):
+    scan(tmp_path / "a.laz", 7)
+    whole = (tmp_path / "a.laz").read_bytes()
+    (data,) = struct.unpack_from("<I", whole, 96)
+    (table,) = struct.unpack_from("<q", whole, data)
+    for chunks, reason in ((2**31, "chunks in"), (0, "points in 0 chunks")):
+        content = bytearray(whole)
+        content[table + 4 : table + 8] = chunks.to_bytes(4, "little")
+        (tmp_path / "a.laz").write_bytes(content)
+        with pytest.raises(ValueError, match=reason):
+            read_cloud(tmp_path / "a.laz")

@@ -1,0 +1,82 @@
+"""Columns under any name in common use mean the same, in any range, and what is assumed is said."""
+
+import numpy as np
+import pytest
+
+from spnr_jax.formats.point_columns import materials, useful
+
+POSITION = {axis: np.zeros(2) for axis in "xyz"}
+LEVEL = 0.2140411  # linear value of sRGB 0.5
+
+
+def read(**columns):
+    """Materials of two points with the columns, and what was reported."""
+    lines: list[str] = []
+    return materials(useful(POSITION | {name: np.asarray(v) for name, v in columns.items()}), lines.append), lines
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        "red green blue",
+        "r g b",
+        "diffuse_red diffuse_green diffuse_blue",
+        "rf gf bf",
+        "color_red color_green color_blue",
+    ],
+)
+def test_srgb_colours_have_many_names(names):
+    values, lines = read(**{name: [0.5, 1.0] for name in names.split()})
+    np.testing.assert_allclose(values["base_color"], [[LEVEL] * 3, [1.0] * 3], rtol=1e-5)
+    assert lines[0] == "red green blue taken as sRGB in 0..1"
+
+
+@pytest.mark.parametrize("names", ["base_color_r base_color_g base_color_b", "albedo_r albedo_g albedo_b"])
+def test_base_colours_are_linear(names):
+    values, _ = read(**{name: [0.5, 1.0] for name in names.split()}, red=[0, 0], green=[0, 0], blue=[0, 0])
+    np.testing.assert_array_equal(values["base_color"], [[0.5] * 3, [1.0] * 3])
+
+
+@pytest.mark.parametrize("rough", ["roughness", "scalar_roughness", "pbr_roughness"])
+@pytest.mark.parametrize("metal", ["metallic", "metalness", "scalar_metallic"])
+def test_roughness_and_metallic_have_many_names_and_whole_bytes(rough, metal):
+    values, _ = read(**{rough: np.array([0, 255], np.uint8), metal: [0.25, 0.75]})
+    np.testing.assert_array_equal(values["roughness"], [0, 1])
+    np.testing.assert_array_equal(values["metallic"], [0.25, 0.75])
+
+
+def test_8_bit_colours_in_16_bit_fields_are_not_black():
+    values, lines = read(**dict.fromkeys(("red", "green", "blue"), np.array([0, 255], np.uint16)))
+    np.testing.assert_array_equal(values["base_color"], [[0] * 3, [1] * 3])
+    assert lines[0].endswith("0..255")
+
+
+def test_intensity_is_grey_where_there_is_no_colour_and_unused_where_there_is():
+    values, lines = read(scalar_intensity=[100, 300])
+    np.testing.assert_allclose(values["base_color"][:, 0], [0, 1])
+    assert lines[0] == "no colour in the file: intensity 100..298 shown as grey"
+    values, lines = read(intensity=[100, 300], red=[1, 1], green=[0, 0], blue=[0, 0])
+    np.testing.assert_array_equal(values["base_color"], [[1, 0, 0]] * 2)
+    values, lines = read(intensity=[5, 5])
+    assert lines[0].startswith("no base_color in the file")
+
+
+def test_only_what_is_used_is_kept():
+    columns = useful(POSITION | {"nx": np.zeros(2), "label": np.ones(2), "r": np.ones(2)})
+    assert list(columns) == ["x", "y", "z"]
+
+
+def test_an_unknown_layout_says_what_it_needs_and_what_was_found():
+    with pytest.raises(ValueError, match=r"needs the properties x y z .* found east north height$"):
+        useful({name: np.zeros(1) for name in ("east", "north", "height")})
+    with pytest.raises(ValueError, match="found none"):
+        useful({})
+
+
+def test_splats_become_points_of_their_constant_colour_and_fog_is_dropped():
+    splats = {f"f_dc_{i}": np.array([0.0, 9.0]) for i in range(3)} | {"opacity": np.array([2.0, -3.0])}
+    extra = {f"f_rest_{i}": np.ones(2) for i in range(45)} | {f"rot_{i}": np.ones(2) for i in range(4)}
+    columns = useful(POSITION | {"x": np.array([5.0, 6.0])} | splats | extra)
+    assert list(columns) == ["x", "y", "z", "red", "green", "blue"]
+    np.testing.assert_array_equal(columns["x"], [5.0])
+    np.testing.assert_allclose(materials(columns, lambda line: None)["base_color"], [[LEVEL] * 3], rtol=1e-5)

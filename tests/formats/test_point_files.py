@@ -1,0 +1,210 @@
+import itertools
+import pickle
+import zipfile
+
+import numpy as np
+import pytest
+from support.point_clouds import NUMPY, ROWS, VERTEX, ply_bytes
+
+from spnr_jax.formats import npz, ply, text
+from spnr_jax.formats.point_files import column_pieces, read_columns
+
+
+def write(folder, name: str, content: bytes | str):
+    path = folder / name
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    return path
+
+
+@pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
+@pytest.mark.parametrize("newline", ["\n", "\r\n"])
+def test_every_form_of_a_ply_gives_the_same_columns_with_their_types(tmp_path, form, newline):
+    columns = read_columns(write(tmp_path, "a.ply", ply_bytes(form, newline)))
+    assert list(columns) == [name for name, _ in VERTEX]
+    for (name, kind), expected in zip(VERTEX, zip(*ROWS, strict=True), strict=True):
+        np.testing.assert_array_equal(columns[name], np.array(expected, NUMPY[kind]))
+        assert columns[name].dtype == np.dtype(NUMPY[kind]).newbyteorder(columns[name].dtype.byteorder)
+
+
+@pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
+def test_the_order_of_properties_in_a_ply_does_not_matter(tmp_path, form):
+    for order in itertools.permutations(range(3)):
+        properties = [(("x", "float"), ("y", "double"), ("red", "uchar"))[i] for i in order]
+        rows = [tuple((1.5, 2.5, 200)[i] for i in order)]
+        columns = read_columns(write(tmp_path, "a.ply", ply_bytes(form, rows=rows, properties=properties)))
+        assert (columns["x"][0], columns["y"][0], columns["red"][0]) == (1.5, 2.5, 200)
+
+
+@pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])
+def test_a_ply_cut_anywhere_in_its_points_or_header_is_refused(tmp_path, form):
+    whole = ply_bytes(form)
+    body = whole.index(b"end_header") + len("end_header\n")
+    ends = whole.rindex(b"9.0") if form == "ascii" else len(whole) - 10
+    for length in (3, 60, body - 12, body, body + 13, ends):
+        with pytest.raises(ValueError, match=r"cut off|not understood|columns|no PLY element|lists"):
+            read_columns(write(tmp_path, "a.ply", whole[:length]))
+
+
+@pytest.mark.parametrize(
+    ("broken", "reason"),
+    [
+        (b"solid of something", "not a PLY"),
+        (b"ply\nformat ascii 1.0\nelement vertex 1\nproperty quad x\nend_header\n1\n", "property quad x"),
+        (b"ply\nformat binary_middle_endian 1.0\nelement vertex 0\nend_header\n", "known format"),
+        (b"ply\nformat ascii 1.0\nelement vertex -1\nproperty float x\nend_header\n", "element vertex -1"),
+        (b"ply\nformat ascii 1.0\nelement edge 0\nend_header\n", "no PLY element 'vertex', only edge"),
+        (b"ply\nformat ascii 1.0\nelement vertex 1\nproperty uchar x\nend_header\n300\n", "300"),
+        (b"ply\nformat ascii 1.0\nelement vertex 1\nproperty list uchar int x\nend_header\n1 1\n", "lists"),
+    ],
+)
+def test_a_ply_that_breaks_the_format_is_refused_with_the_place(tmp_path, broken, reason):
+    with pytest.raises(ValueError, match=reason):
+        read_columns(write(tmp_path, "a.ply", broken))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "1 2 3 0.1 0.2 0.3\n4 5 6 0.4 0.5 0.6\n",
+        "1,2,3,0.1,0.2,0.3\r\n4,5,6,0.4,0.5,0.6",
+        "1\t2\t3\t0.1\t0.2\t0.3\n\n4\t5\t6\t0.4\t0.5\t0.6\n",
+        "\ufeffX;Y;Z;R;G;B\n1;2;3;0.1;0.2;0.3\n4;5;6;0.4;0.5;0.6\n",
+        '"x", "y", "z", "r", "g", "b"\n1, 2, 3, 0.1, 0.2, 0.3\n4, 5, 6, 0.4, 0.5, 0.6\n',
+        "# scanned on Monday\n# x y z r g b\n1 2 3 .1 .2 .3\n# a remark\n4 5 6 .4 .5 .6\n",
+        "// the x axis points to the right\n1 2 3 1e-1 2e-1 3e-1\n4 5 6 4e-1 5e-1 6e-1\n",
+        "//2 points\nb g r z y x\n0.3 0.2 0.1 3 2 1\n0.6 0.5 0.4 6 5 4\n",
+    ],
+)
+def test_text_is_read_whatever_its_separator_header_and_comments(tmp_path, text):
+    columns = read_columns(write(tmp_path, "a.csv", text))
+    table = np.stack([columns[name] for name in "xyzrgb"], axis=-1)
+    np.testing.assert_array_equal(table, [[1, 2, 3, 0.1, 0.2, 0.3], [4, 5, 6, 0.4, 0.5, 0.6]])
+
+
+NORMALS = [(0.6, 0.8, 0.0), (0.0, -0.6, 0.8)]
+
+
+@pytest.mark.parametrize(
+    ("rows", "names"),
+    [
+        ([(1, 2, 3, 90), (4, 5, 6, 80)], "x y z intensity"),
+        ([(1, 2, 3, *NORMALS[0]), (4, 5, 6, *NORMALS[1])], "x y z nx ny nz"),
+        ([(1, 2, 3, 0.6, 0.8, 0.0), (4, 5, 6, 0.0, 0.6, 0.8)], "x y z r g b"),
+        ([(1, 2, 3, 9, 8, 7, *NORMALS[0]), (4, 5, 6, 6, 5, 4, *NORMALS[1])], "x y z r g b nx ny nz"),
+        ([(1, 2, 3, *NORMALS[0], 9, 8, 7), (4, 5, 6, *NORMALS[1], 6, 5, 4)], "x y z nx ny nz r g b"),
+    ],
+)
+def test_columns_without_names_are_told_by_their_number_and_normals_by_their_length(tmp_path, rows, names):
+    text = "\n".join(" ".join(map(str, row)) for row in rows)
+    columns = read_columns(write(tmp_path, "a.xyz", text))
+    assert list(columns) == names.split()
+    np.testing.assert_array_equal(np.stack(list(columns.values()), axis=-1), rows)
+
+
+@pytest.mark.parametrize("name", ["a.ply", "b.ply", "c.xyz", "d.npy", "e.pcd"])
+def test_pieces_are_small_and_together_the_whole_file(tmp_path, name, monkeypatch):
+    monkeypatch.setattr(ply, "PIECE_BYTES", 7 * 24)
+    monkeypatch.setattr(ply, "PIECE_LINES", 7)
+    monkeypatch.setattr(text, "PIECE_LINES", 7)
+    monkeypatch.setattr(npz, "PIECE_BYTES", 7 * 24)
+    table = np.arange(60.0).reshape(20, 3)
+    lines = "".join("{:g} {:g} {:g}\n".format(*row) for row in table)
+    double = [(axis, "double") for axis in "xyz"]
+    content = {
+        "a.ply": ply_bytes("binary_big_endian", rows=[tuple(row) for row in table], properties=double),
+        "b.ply": ply_bytes("ascii", rows=[tuple(row) for row in table], properties=double),
+        "c.xyz": lines,
+        "d.npy": b"",
+        "e.pcd": f"FIELDS x y z\nSIZE 8 8 8\nTYPE F F F\nPOINTS 20\nDATA ascii\n{lines}",
+    }[name]
+    path = write(tmp_path, name, content)
+    if name == "d.npy":
+        np.save(path, table)
+    pieces = list(column_pieces(path))
+    assert [len(piece["x"]) for piece in pieces] == [7, 7, 6]
+    np.testing.assert_array_equal(np.stack(list(read_columns(path).values()), axis=-1), table)
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("1 2 3\n4 5\n", "number of columns changed"),
+        ("1 2 3 4 5\n", r"shape \(1, 5\)"),
+        ("x y z\n1 2 3 4\n", "names 3 columns .* above 4"),
+        ("1 2 3\n4 five 6\n", "five"),
+        ("0,5 1,5 2,5 0,1 0,1 0,1\n", "5 1"),  # decimal commas are not six columns
+    ],
+)
+def test_text_whose_columns_are_not_certain_is_refused(tmp_path, text, reason):
+    with pytest.raises(ValueError, match=reason):
+        read_columns(write(tmp_path, "a.xyz", text))
+
+
+def test_arrays_and_records_of_numpy_give_the_same_columns(tmp_path):
+    rng = np.random.default_rng(0)
+    positions, color, roughness = rng.normal(size=(5, 3)), rng.uniform(size=(5, 3)), rng.uniform(size=5)
+    np.savez_compressed(
+        tmp_path / "a.npz",
+        xyz=positions,
+        rgb=color,
+        roughness=roughness[:, None],
+        metallic=roughness,
+        notes=np.array([{}]),
+    )
+    np.save(tmp_path / "b.npy", np.column_stack([positions, color, roughness, roughness]))
+    fields = [(name, "f8") for name in ("x", "y", "z", "r", "g", "b", "roughness", "metallic")]
+    record = np.array([tuple(row) for row in np.load(tmp_path / "b.npy")], fields)
+    np.save(tmp_path / "c.npy", record)
+    expected = {name: record[name] for name, _ in fields}
+    for name in ("a.npz", "b.npy", "c.npy"):
+        columns = read_columns(tmp_path / name)
+        assert columns.keys() == expected.keys()
+        for column in expected:
+            np.testing.assert_array_equal(columns[column], expected[column])
+
+
+def test_numpy_files_that_are_broken_pickled_or_of_another_layout_are_refused(tmp_path):
+    np.savez(tmp_path / "whole.npz", points=np.zeros((50, 3)))
+    np.save(tmp_path / "whole.npy", np.zeros((50, 3)))
+    whole = {suffix: (tmp_path / f"whole{suffix}").read_bytes() for suffix in (".npz", ".npy")}
+    damaged = bytearray(whole[".npz"])
+    damaged[300] ^= 0xFF
+    cases = {
+        "a.npz": (whole[".npz"][:400], "truncated"),
+        "b.npy": (whole[".npy"][:400], "truncated"),
+        "c.npz": (bytes(damaged), "truncated .*CRC"),
+        "d.npy": (pickle.dumps([1, 2]), "not a NumPy file"),
+    }
+    for name, (content, reason) in cases.items():
+        with pytest.raises(ValueError, match=reason):
+            read_columns(write(tmp_path, name, content))
+    arrays = {
+        "object": ({"points": np.array([{}, None], object)}, "holds objects"),
+        "wide": ({"points": np.zeros((5, 4))}, r"'points' of shape \(5, 4\)"),
+        "text": ({"points": np.array([["1", "2", "3"]])}, "type <U1"),
+        "ragged": ({"points": np.zeros((5, 3)), "rgb": np.zeros((4, 3))}, "different lengths.*'x': 5.*'r': 4"),
+        "nameless": ({"corners": np.zeros((5, 3))}, "none of the arrays positions, points, xyz.*; found corners"),
+    }
+    for name, (content, reason) in arrays.items():
+        np.savez(tmp_path / f"{name}.npz", **content)
+        with pytest.raises(ValueError, match=reason):
+            read_columns(tmp_path / f"{name}.npz")
+
+
+def test_an_array_that_announces_more_than_its_file_holds_is_refused_before_memory_is_taken(tmp_path):
+    np.savez(tmp_path / "a.npz", points=np.zeros((5, 3)))
+    with zipfile.ZipFile(tmp_path / "a.npz") as archive:
+        content = archive.read("points.npy")
+    cases = {
+        "huge": (content.replace(b"(5, 3), }" + b" " * 6, b"(5000000, 3), }"), "cut off"),
+        "header": (content.replace(b"'shape'", b"'shape("), "broken"),
+        "text": (b"no array at all", "broken"),
+    }
+    for name, (changed, reason) in cases.items():
+        with zipfile.ZipFile(tmp_path / f"{name}.npz", "w") as archive:
+            archive.writestr("points.npy", changed)
+        with pytest.raises(ValueError, match=reason):
+            read_columns(tmp_path / f"{name}.npz")
+    (tmp_path / "a.npy").write_bytes(content.replace(b"'shape'", b"'shape("))  # numpy's own error here is no ValueError
+    with pytest.raises(ValueError, match="broken"):
+        read_columns(tmp_path / "a.npy")

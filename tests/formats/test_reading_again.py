@@ -1,0 +1,157 @@
+"""A drive that is away for a moment costs a pause; what stays broken ends the training with one line, and no thread."""
+
+import dataclasses
+import errno
+import os
+import re
+import shutil
+import threading
+from contextlib import closing
+from pathlib import Path
+from types import SimpleNamespace
+
+import msgpack
+import pytest
+from support import tiny_dataset
+from support.laws import same_bits
+
+from spnr_jax import cli
+from spnr_jax.formats import data_sets
+from spnr_jax.formats.shards import Shards
+from spnr_jax.training import batching, optimisation, trainer
+
+CONFIG = tiny_dataset.CONFIG
+RETRIES = len(data_sets.PAUSES)
+RARELY = trainer.Schedule(log_every=99, preview_every=99, checkpoint_every=99)
+
+
+@pytest.fixture(autouse=True)
+def pauses(monkeypatch):
+    """Pauses of no length, but as many."""
+    monkeypatch.setattr(data_sets, "PAUSES", (0.0,) * RETRIES)
+
+
+def failing(monkeypatch, times, number, name="001.png"):
+    """Makes reading files of this name fail so many times with an error of the system; the thread of each try.
+
+    Readers that an earlier test has left behind may still try: a test counts the tries of its own thread.
+    """
+    real, tries = Path.read_bytes, []
+
+    def read_bytes(path):
+        if path.name == name:
+            tries.append(threading.current_thread())
+            if len(tries) <= times:
+                raise OSError(number, os.strerror(number), str(path))
+        return real(path)
+
+    monkeypatch.setattr(Path, "read_bytes", read_bytes)
+    return tries
+
+
+def last_line(capsys):
+    return capsys.readouterr().err.splitlines()[-1]
+
+
+@pytest.mark.parametrize("number", data_sets.PASSING)
+def test_a_drive_that_is_away_for_a_moment_changes_no_bit(number, monkeypatch):
+    with closing(batching.batches(tiny_dataset.dataset(), CONFIG, 0)) as batches:
+        expected = next(batches)
+    tries = failing(monkeypatch, RETRIES, number)
+    with closing(batching.batches(tiny_dataset.dataset(), CONFIG, 0)) as batches:
+        same_bits(next(batches), expected)
+    assert len(tries) > RETRIES
+
+
+def test_a_drive_that_stays_away_is_one_line_after_a_few_tries(monkeypatch):
+    tries = failing(monkeypatch, 99, errno.EIO)
+    with pytest.raises(ValueError, match=r"001\.png: cannot be read \(.*Input/output error.*spnr-data check") as error:
+        data_sets.read_object(tiny_dataset.dataset(), "chair")
+    assert tries.count(threading.current_thread()) == 1 + RETRIES
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("number", [errno.ENOENT, errno.EACCES])
+def test_an_error_that_does_not_pass_is_not_tried_again(number, monkeypatch):
+    tries = failing(monkeypatch, 99, number)
+    with pytest.raises(ValueError, match="cannot be read"):
+        data_sets.read_object(tiny_dataset.dataset(), "chair")
+    assert tries.count(threading.current_thread()) == 1
+
+
+def test_each_pause_is_waited(monkeypatch):
+    waited = []
+    monkeypatch.setattr(data_sets, "PAUSES", (0.1, 0.5, 2.0))
+    monkeypatch.setattr(data_sets.time, "sleep", waited.append)
+    failing(monkeypatch, 2, errno.ESTALE)
+    data_sets.read_object(tiny_dataset.dataset(), "chair")
+    assert waited == [0.1, 0.5]
+
+
+def test_packed_objects_are_read_again_too():
+    whole, tries = tiny_dataset.dataset(), []
+    folder = whole.folder / "objects" / "chair"
+    record = msgpack.packb(
+        {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    )
+
+    class Away:
+        def __getitem__(self, place):
+            tries.append(place)
+            if len(tries) <= RETRIES:
+                raise RuntimeError(f"UNKNOWN: pread() failed: {os.strerror(errno.EIO)}; reading 00000.array_record")
+            return record
+
+    packed = Shards(folder=whole.folder, places={"chair": 0}, records=Away())
+    item = data_sets.read_object(dataclasses.replace(whole, shards=packed), "chair")
+    same_bits(item.images, data_sets.read_object(whole, "chair").images)
+    assert len(tries) == 1 + RETRIES
+
+
+@pytest.fixture
+def stepless(monkeypatch):
+    """A network without numbers, whose step does nothing: the reader alone is tested."""
+    monkeypatch.setattr(trainer, "new_state", lambda config, init: SimpleNamespace(step=0))
+    monkeypatch.setattr(
+        optimisation, "jitted_train_step", lambda state, batch, **_: (state, {"loss": batch.image.mean()})
+    )
+
+
+def test_an_error_in_a_reading_thread_ends_the_training_with_one_line(stepless, monkeypatch, tmp_path, capsys):
+    tries = failing(monkeypatch, 99, errno.EIO)
+    code = cli.guarded(lambda: trainer.train(CONFIG, tiny_dataset.dataset(), tmp_path, RARELY), "spnr")
+    assert code == 2
+    assert re.match(r"spnr: .*001\.png: cannot be read \(.*Input/output error", last_line(capsys))
+    assert tries
+    assert threading.main_thread() not in tries, "the files were read in threads"
+
+
+def test_a_file_that_vanishes_while_training_is_one_line(stepless, monkeypatch, tmp_path, capsys):
+    dataset = data_sets.open_dataset(shutil.copytree(tiny_dataset.dataset().folder, tmp_path / "data"))
+    monkeypatch.setattr(batching, "READ_AHEAD", 1)
+    monkeypatch.setattr(batching, "CACHE_BYTES", 0)
+    real, uncached = batching.batches, []
+
+    def batches(dataset, config, first, **options):
+        for batch in real(dataset, config, first, cache_bytes=0, **options):
+            if not uncached:
+                uncached.append(shutil.rmtree(dataset.folder / "objects" / "ball_000000" / "images"))
+            yield batch
+
+    monkeypatch.setattr(batching, "batches", batches)
+    config = dataclasses.replace(CONFIG, num_steps=20)
+    code = cli.guarded(lambda: trainer.train(config, dataset, tmp_path / "run", RARELY), "spnr")
+    assert code == 2
+    assert re.match(r"spnr: .*ball_000000.images.00\d\.png: cannot be read \(.*No such file", last_line(capsys))
+
+
+@pytest.mark.parametrize("error", [MemoryError, SystemExit, RuntimeError])
+def test_whatever_ends_a_reading_thread_ends_the_training(error, stepless, monkeypatch, tmp_path):
+    """Threads are part of the training's process: none can die and leave it waiting."""
+
+    def make_batch(*_):
+        raise error("the thread is over")
+
+    monkeypatch.setattr(batching, "make_batch", make_batch)
+    with pytest.raises(error, match="the thread is over"):
+        trainer.train(CONFIG, tiny_dataset.dataset(), tmp_path, RARELY)

@@ -1,0 +1,108 @@
+"""Laws of colour variants: a rotation of all base colours, inside the gamut, that nothing else depends on."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from support.handmade import ball, box, checked_box_and_ball, plain
+
+from data_gen.make import augmentation
+from spnr_jax.formats.mesh.assets import Asset, Material
+from spnr_jax.formats.mesh.surface_points import sample_surface
+
+UNIT = st.floats(0, 1, width=32)
+SEEDS = st.integers(0, 2**32 - 1)
+SLOW = settings(deadline=None, max_examples=60)
+
+
+def distances(colours):
+    return np.linalg.norm(colours[:, None] - colours[None], axis=-1)
+
+
+def painted(texels, flat, corners) -> Asset:
+    """A box with a texture, a ball of one colour and a box with colours at its vertices."""
+    texture = Material(base_color=texels, roughness=np.float32(0.5), metallic=np.float32(0))
+    tinted = box((0, 1, 0), material=plain(flat))
+    tinted = type(tinted)(**{**vars(tinted), "colors": np.resize(corners, tinted.positions.shape)})
+    return Asset(parts=(box(material=texture, texcoords=True), ball((1, 0, 0), material=plain(flat)), tinted))
+
+
+ASSETS = st.builds(
+    painted,
+    arrays(np.float32, (3, 2, 3), elements=UNIT),
+    arrays(np.float32, (3,), elements=UNIT),
+    arrays(np.float64, (5, 3), elements=UNIT),
+)
+
+
+@SLOW
+@given(ASSETS, SEEDS)
+def test_distances_between_base_colours_stay_and_all_stay_in_gamut(asset, seed):
+    rotated, _ = augmentation.rotate_colours(asset, seed)
+    before, after = augmentation.base_colours(asset), augmentation.base_colours(rotated)
+    assert after.min() >= 0
+    assert after.max() <= 1
+    np.testing.assert_allclose(distances(after), distances(before), atol=1e-5)
+
+
+@SLOW
+@given(ASSETS, SEEDS)
+def test_the_colour_at_a_point_is_the_rotation_of_the_originals(asset, seed):
+    rotated, rotation = augmentation.rotate_colours(asset, seed)
+    before, after = (sample_surface(shape, 200, 3) for shape in (asset, rotated))
+    np.testing.assert_allclose(after.base_color, before.base_color @ rotation.matrix.T, atol=1e-5)
+    for name in ("positions", "normals", "roughness", "metallic", "face"):
+        np.testing.assert_array_equal(getattr(after, name), getattr(before, name))
+
+
+@given(st.floats(0, 360))
+def test_it_is_a_rotation_that_keeps_greys(degrees):
+    matrix = augmentation.grey_rotation(degrees)
+    np.testing.assert_allclose(matrix @ matrix.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(matrix) == pytest.approx(1)
+    np.testing.assert_allclose(matrix @ np.full(3, 0.3), np.full(3, 0.3))
+    assert np.trace(matrix) == pytest.approx(1 + 2 * np.cos(np.radians(degrees)))
+
+
+def test_a_third_of_a_turn_takes_red_to_green():
+    np.testing.assert_allclose(augmentation.grey_rotation(120) @ [1, 0, 0], [0, 1, 0], atol=1e-12)
+
+
+def test_colours_that_leave_no_room_are_permuted_and_the_object_says_so():
+    asset = Asset(parts=(ball(material=plain((1, 0, 0))), box(material=plain((0, 1, 1)))))
+    rotated, rotation = augmentation.rotate_colours(asset, 0)
+    assert rotation.describe()["fallback"]
+    assert rotation.degrees in (120, 240)
+    assert {tuple(part.material.base_color.round(6)) for part in rotated.parts} in (
+        {(0, 1, 0), (1, 0, 1)},
+        {(0, 0, 1), (1, 1, 0)},
+    )
+
+
+def test_muted_colours_turn_any_way_and_the_seed_decides_which():
+    asset = Asset(parts=(ball(material=plain((0.5, 0.4, 0.45))),))
+    turns = [augmentation.rotate_colours(asset, seed)[1] for seed in range(200)]
+    assert not any(turn.fallback for turn in turns)
+    assert np.histogram([turn.degrees for turn in turns], 6, (30, 330))[0].min() > 15
+    assert turns[7].describe() == augmentation.rotate_colours(asset, 7)[1].describe()
+
+
+def test_a_texture_and_a_flat_colour_turn_by_the_same_angle():
+    asset = checked_box_and_ball()
+    rotated, rotation = augmentation.rotate_colours(asset, 4)
+    for before, after in zip(asset.parts, rotated.parts, strict=True):
+        assert np.abs(after.material.base_color - before.material.base_color).max() > 0.05
+        expected = before.material.base_color @ rotation.matrix.T
+        np.testing.assert_allclose(after.material.base_color, expected, atol=1e-6)
+        np.testing.assert_array_equal(after.material.roughness, before.material.roughness)
+
+
+def test_a_rare_saturated_texel_is_not_overlooked():
+    texels = np.full((64, 64, 3), 0.5, np.float32)
+    texels[40, 13] = (1, 0, 0.2)
+    for seed in range(20):
+        matrix = augmentation.draw_rotation(texels.reshape(-1, 3), seed).matrix
+        rotated = texels.reshape(-1, 3) @ matrix.T
+        assert rotated.min() > -1e-5
+        assert rotated.max() < 1 + 1e-5

@@ -1,0 +1,218 @@
+"""Laws of the plan: splits are by product, of the size that was asked for, and variants belong to training products."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from data_gen.__main__ import parse
+from data_gen.make.description import describe
+from data_gen.plan import data_presets, splits, tasks
+
+OUT = ["generate", "out"]
+IDS = [f"object_{number}" for number in range(40)]
+
+
+def config(**options):
+    return tasks.GenerateConfig(out=Path("x"), **options)
+
+
+def planned(**options):
+    """The plan of 40 procedural objects."""
+    return tasks.plan_data_set(config(objects=40, **options))
+
+
+def ids(tasks):
+    return [task.object_id for task in tasks]
+
+
+def error(**options):
+    def make():
+        tasks.check_options(config(**options))
+        tasks.plan_data_set(config(**options))
+
+    with pytest.raises(ValueError, match=".") as caught:
+        make()
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def test_splits_are_disjoint_complete_and_of_the_size_asked_for():
+    for options, num_test in (({"test_fraction": 0.2}, 8), ({"test_objects": 11}, 11)):
+        made = planned(val_fraction=0.1, **options)
+        split = made.split(ids(made.tasks))
+        assert sorted(split["train"] + split["val"] + split["test"]) == ids(made.tasks)
+        assert (len(split["val"]), len(split["test"])) == (4, num_test)
+    assert planned(seed=1, test_objects=11).split(ids(made.tasks)) != split
+
+
+def test_an_object_that_cannot_be_used_takes_no_place_in_the_test_split():
+    made = planned(test_objects=11, val_fraction=0)
+    first = made.split(ids(made.tasks))
+    usable = [name for name in ids(made.tasks) if name != first["test"][0]]
+    second = made.split(usable)
+    assert len(second["test"]) == 11
+    assert set(first["test"]) - set(second["test"]) == {first["test"][0]}
+    assert len(second["train"]) == len(first["train"]) - 1
+
+
+def test_a_test_list_is_the_test_split(tmp_path):
+    made = planned()
+    (tmp_path / "test.txt").write_text("\n".join(ids(made.tasks)[3:7]))
+    split = planned(test_list=tmp_path / "test.txt", val_fraction=0.25).split(ids(made.tasks))
+    assert split["test"] == ids(made.tasks)[3:7]
+    assert len(split["val"]) == 9
+
+
+def test_originals_come_first_and_variants_fill_up_to_the_number_asked_for():
+    made = planned(test_objects=10, val_fraction=0.1, colour_variants=5, train_objects=67)
+    train = made.split(ids(made.tasks))["train"]
+    variants = made.variants(train)
+    assert len(train) + len(variants) == 67
+    assert {variant.product for variant in variants} <= set(train)
+    assert all(variant.object_id == f"{variant.product}--{variant.colour_variant}" for variant in variants)
+    assert len({variant.object_id for variant in variants}) == len(variants)
+    assert variants == made.variants(train)
+    assert variants != planned(test_objects=10, val_fraction=0.1, colour_variants=5, train_objects=67, seed=1).variants(
+        train
+    )
+
+
+def test_without_a_number_every_training_product_has_all_its_variants():
+    made = planned(test_objects=10, val_fraction=0, colour_variants=3)
+    assert len(made.variants(made.split(ids(made.tasks))["train"])) == 90
+    assert planned().variants(["chair_000000"]) == []
+
+
+def test_variants_are_reshaped_if_asked_for_and_older_data_sets_that_were_not_stay_the_same():
+    for asked in (False, True):
+        made = planned(test_objects=10, colour_variants=1, reshape_variants=asked)
+        assert {task.reshaped for task in made.variants(made.split(ids(made.tasks))["train"])} == {asked}
+        assert not any(task.reshaped for task in made.tasks)
+        assert ("reshape_variants" in describe(made, "scalar_rgb")["settings"]) == asked
+
+
+def test_a_variant_sorts_right_behind_its_product():
+    names = ["a", "a--1", "a--2", "a-2", "a.b", "a1", "aB", "a_1", "ab"]
+    assert sorted(names) == names
+
+
+def test_fewer_training_objects_than_there_are_leave_some_aside():
+    made = planned(test_objects=10, val_fraction=0.1, train_objects=7)
+    split = made.split(ids(made.tasks))
+    assert [len(split[name]) for name in ("train", "val", "test")] == [7, 4, 10]
+    assert split["test"] == planned(test_objects=10, val_fraction=0.1).split(ids(planned().tasks))["test"]
+
+
+def test_a_split_file_decides_and_what_it_does_not_list_is_left_aside(tmp_path):
+    names = ids(planned().tasks)
+    listed = {"train": names[:20], "val": names[20:22], "test": names[30:]}
+    (tmp_path / "split.json").write_text(json.dumps(listed))
+    made = planned(split_file=tmp_path / "split.json")
+    assert ids(made.tasks) == sorted(names[:22] + names[30:])
+    assert made.split(ids(made.tasks)) == listed
+    (tmp_path / "test.json").write_text(json.dumps({"test": names[5:9]}))
+    split = planned(split_file=tmp_path / "test.json", val_fraction=0).split(names)
+    assert split["test"] == names[5:9]
+    assert len(split["train"]) == 36
+
+
+def test_of_a_split_file_of_shapenet_the_rows_of_the_class_count(tmp_path):
+    rows = ["000001,02691156,02691156,aaa,train", "000002,02958343,03100240,bbb,train"]
+    rows += ["000003,02958343,03100240,ccc,test", "000004,02958343,03100240,ddd,val"]
+    (tmp_path / "all.csv").write_text("\n".join(["id,synsetId,subSynsetId,modelId,split", *rows]))
+    listed = splits.read_split_file(tmp_path / "all.csv", {"bbb", "ccc", "ddd"}, "02958343")
+    assert listed == {"train": ["bbb"], "val": ["ddd"], "test": ["ccc"]}
+    (tmp_path / "plain.csv").write_text("id,split\r\nb,test\r\na,train\r\n")
+    assert splits.read_split_file(tmp_path / "plain.csv", {"a", "b"}, None) == {"train": ["a"], "test": ["b"]}
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "expected"),
+    [
+        ("s.json", '{"train": ["chair_000000"], "test": ["chair_000000"]}', "more than once (train, test)"),
+        ("s.json", '{"train": ["chair_000000"], "test": ["moon", "sun"]}', "no object moon (2 of 3 ids unknown)"),
+        ("s.json", '{"training": []}', "expected lists of ids named train, val, test"),
+        ("s.json", '{"test": "chair_000000"}', "expected lists of ids"),
+        ("s.json", "[1]", "expected lists of ids"),
+        ("s.json", '{"test": []}', "lists no objects"),
+        ("s.json", "{", "cannot be read"),
+        ("s.csv", "name,split\na,train\n", "line 2: expected columns id"),
+        ("s.csv", "id,split\na,valid\n", "one of train, val, test"),
+    ],
+)
+def test_a_split_file_that_cannot_be_meant_is_one_line(tmp_path, name, text, expected):
+    (tmp_path / name).write_text(text)
+    message = error(objects=8, split_file=tmp_path / name)
+    assert expected in message
+    assert f"--split-file {tmp_path / name}" in message
+
+
+def test_options_that_do_not_go_together_are_one_line(tmp_path):
+    assert "give --source meshes, abo or shapenet" in error(root=tmp_path)
+    assert "give --source meshes, abo or shapenet" in error(root=tmp_path, source="procedural")
+    assert "--source abo: give --root" in error(source="abo")
+    assert "give --category, one of car, plane, chair" in error(source="shapenet", root=tmp_path)
+    assert "only with --source shapenet" in error(category="car")
+    assert "only with --source shapenet" in error(source="abo", root=tmp_path, category="car")
+    assert "not together" in error(source="abo", meshes=tmp_path)
+    assert "not together" in error(meshes=tmp_path, root=tmp_path)
+    assert "not together" in error(objects=1, test_list=Path("a"), split_file=Path("b"))
+    assert "--test-objects 8: leaves none of the 8" in error(objects=8, test_objects=8)
+    assert "--colour-variants: expected 0 or more" in error(colour_variants=-1)
+    assert "--train-objects: expected 1 or more" in error(train_objects=0)
+
+
+def test_a_preset_is_the_default_of_the_options_and_they_override_it():
+    for name, preset in data_presets.PRESETS.items():
+        made = parse([*OUT, "--preset", name, "--root", "data", "--spp", "16"])
+        assert vars(made) == {**vars(preset("out")), "root": Path("data"), "spp": 16, "out": made.out}
+        assert made.preset == name
+        tasks.check_options(made)
+    assert parse([*OUT, f"--preset={name}", "--colour-variants", "2"]).colour_variants == 2
+    assert parse(OUT) == tasks.GenerateConfig(out=parse(OUT).out)
+
+
+def test_the_presets_hold_the_papers_numbers():
+    abo, car = data_presets.abo(Path("x")), data_presets.shapenet_car(Path("x"))
+    assert (abo.resolution, abo.views, abo.colour_variants, abo.train_objects, abo.test_objects) == (
+        128,
+        10,
+        5,
+        16161,
+        200,
+    )
+    assert (car.resolution, car.views, car.colour_variants, car.category, car.test_objects) == (200, 10, 0, "car", 128)
+    assert data_presets.shapenet_plane(Path("x")).test_objects == 406
+    assert data_presets.shapenet_chair(Path("x")).test_objects == 105
+
+
+def test_help_shows_the_presets_values(capsys):
+    with pytest.raises(SystemExit):
+        parse(["generate", "--preset", "shapenet_plane", "--help"])
+    said = " ".join(capsys.readouterr().out.split())
+    assert "default: 406" in said
+    assert "default: 200" in said
+
+
+def test_an_unknown_preset_or_class_is_refused_and_the_known_are_named(capsys):
+    for arguments, known in ((["--preset", "abc"], "shapenet_chair"), (["--category", "boat"], "plane")):
+        with pytest.raises(SystemExit) as stopped:
+            parse([*OUT, *arguments])
+        assert stopped.value.code == 2
+        assert known in capsys.readouterr().err
+
+
+def test_meshes_are_the_same_source_by_either_name_and_go_with_procedural_objects(tmp_path):
+    for name in ("b.ply", "a.glb"):
+        (tmp_path / name).write_bytes(b"")
+    short, long = config(meshes=tmp_path), config(source="meshes", root=tmp_path)
+    assert tasks.plan_objects(short) == tasks.plan_objects(long)
+    assert ids(tasks.plan_objects(short)) == ["a", "b"]
+    mixed = tasks.plan_objects(config(meshes=tmp_path, objects=1))
+    assert [(task.object_id, task.shown_path) for task in mixed] == [
+        ("a", "a.glb"),
+        ("b", "b.ply"),
+        ("chair_000000", ""),
+    ]
+    assert len(tasks.plan_objects(config())) == 200

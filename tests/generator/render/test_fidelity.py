@@ -1,0 +1,273 @@
+"""What the network is told equals what it is shown: sampled points against the materials that the renderer draws with.
+
+Each object is loaded from a file, its points are sampled, and through every point that the camera sees one ray is
+traced in the scene that the pictures are rendered from. Where the ray lands, Mitsuba is asked for the base colour,
+roughness and metallic of the surface: an unlit render of exactly those spots, without the pixel grid in between, on
+which a point would be compared with its neighbours. Two tests then tie that answer to pictures: an albedo picture at
+the points' sub-pixel places, and radiance, which for a smooth metal under white light is its base colour.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.gltf_files import CORNERS, GltfBuilder, png
+from support.handmade import ball, box, plain
+
+from data_gen.render import views
+from data_gen.render.variant import mitsuba_module
+from spnr_jax.formats.mesh import meshes, surface_points
+from spnr_jax.formats.mesh.assets import Asset
+
+WHITE_LIGHT = np.ones((8, 16, 3), np.float32)
+REAL = Path(__file__).parents[4] / "shared" / "data" / "real" / "train"
+EYE = np.array([0.5, 0.4, 2.9])
+STEP = 1 / 255
+GRAZING = 0.1  # cosine of a view so flat that float32 moves the spot where the ray lands
+UV = np.array([[0, 1], [1, 1], [1, 0], [0, 0]], np.float32)
+NOISE = np.random.default_rng(0).integers(0, 256, (5, 7, 3))
+CHANNELS = ("base_color", "roughness", "metallic")
+
+
+def told_and_shown(asset, eye=EYE, count=400, seed=0):
+    """The points' own channels and normals, and the renderer's at the same spots, of all points that the eye sees."""
+    mi = mitsuba_module()
+    asset, _ = surface_points.normalise(asset)
+    surface = surface_points.sample_surface(asset, count, seed)
+    scene = views.build_scene(asset, WHITE_LIGHT)
+    first_face = dict(zip([shape.id() for shape in scene.handle.shapes()], scene.first_face.values(), strict=True))
+    rows, shown = [], {name: [] for name in (*CHANNELS, "normals")}
+    for row in np.flatnonzero(views.unoccluded(scene, surface.positions, eye)):
+        towards = surface.positions[row] - eye
+        hit = scene.handle.ray_intersect(mi.Ray3f(eye, towards / np.linalg.norm(towards)))
+        on_its_face = hit.is_valid() and first_face[hit.shape.id()] + hit.prim_index == surface.face[row]
+        if not on_its_face or abs(np.dot(hit.n, hit.to_world(hit.wi))) < GRAZING:
+            continue
+        np.testing.assert_allclose(np.array(hit.p), surface.positions[row], atol=2e-5)
+        rows.append(row)
+        shown["normals"].append(np.array(hit.sh_frame.n))
+        shown["base_color"].append(np.array(hit.bsdf().eval_attribute_3("base_color", hit)))
+        for name in ("roughness", "metallic"):
+            shown[name].append(hit.bsdf().eval_attribute_1(name, hit))
+    assert len(rows) > 0.05 * count
+    return {name: getattr(surface, name)[rows] for name in shown}, {name: np.array(shown[name]) for name in shown}
+
+
+def assert_agreement(asset, varying=(), **options):
+    """Told equals shown to one step of 8 bits; the channels named as varying do vary over the object."""
+    told, shown = told_and_shown(asset, **options)
+    for name in CHANNELS:
+        np.testing.assert_allclose(told[name], shown[name], atol=STEP, err_msg=name)
+        assert (np.ptp(told[name], axis=0).max() > 0.1) == (name in varying), name
+    np.testing.assert_allclose(told["normals"], shown["normals"], atol=1e-3)
+    return told
+
+
+def square(tmp_path, material=None, node=None, builder=None, positions=CORNERS, **attributes):
+    """The asset of a glTF file with one square of a material."""
+    builder = builder or GltfBuilder()
+    index = None if material is None else builder.material(**material)
+    builder.mesh(builder.primitive(positions, material=index, **attributes), **(node or {}))
+    return meshes.load_mesh(builder.write(tmp_path / "square.glb"))
+
+
+def textured(builder, texels=NOISE, info=None, sampler=None, **factors):
+    """A glTF material with a base-colour texture."""
+    texture = {"index": builder.texture(texels, **(sampler or {})), **(info or {})}
+    return {"pbrMetallicRoughness": {"baseColorTexture": texture, **factors}}
+
+
+def factors(color, roughness, metallic):
+    return {
+        "pbrMetallicRoughness": {
+            "baseColorFactor": [*color, 1],
+            "roughnessFactor": roughness,
+            "metallicFactor": metallic,
+        }
+    }
+
+
+class TestGltf:
+    def test_each_primitive_keeps_its_own_flat_material(self, tmp_path):
+        builder = GltfBuilder()
+        looks = [((0.9, 0.1, 0.2), 0.1, 0.0), ((0.02, 0.5, 1.0), 1.0, 1.0), ((0, 0, 0), 0.0, 0.3), ((1, 1, 1), 0.6, 0)]
+        shifts = np.float32([[0, 0, 0], [2, 0, 0], [0, 2, 0], [2, 2, 0]])
+        squares = [
+            builder.primitive(CORNERS + shift, material=builder.material(**factors(*look)))
+            for shift, look in zip(shifts, looks, strict=True)
+        ]
+        builder.mesh(*squares[:3])
+        builder.mesh(squares[3], translation=[0, 0, 0.5])
+        asset = meshes.load_mesh(builder.write(tmp_path / "squares.glb"))
+        told = assert_agreement(asset, varying=CHANNELS)
+        for color, roughness, metallic in looks:
+            near = np.abs(told["base_color"] - color).max(axis=1) < 1e-6
+            assert near.sum() > 40
+            np.testing.assert_allclose(told["roughness"][near], roughness, atol=1e-6)
+            np.testing.assert_allclose(told["metallic"][near], metallic, atol=1e-6)
+
+    @pytest.mark.parametrize("mirrored", [False, True])
+    @pytest.mark.parametrize("smooth", [False, True])
+    def test_flat_smooth_and_mirrored_faces_show_their_texture_and_normals(self, tmp_path, smooth, mirrored):
+        builder = GltfBuilder()
+        tilted = np.float32([[-1, 0, 2], [1, 0, 2], [1, 1, 2], [-1, 1, 2]])
+        tilted /= np.linalg.norm(tilted, axis=1, keepdims=True)
+        attributes = {"TEXCOORD_0": UV} | ({"NORMAL": tilted} if smooth else {})
+        node = {"scale": [-1, 2, 1]} if mirrored else {"rotation": [0, 0.2, 0, 0.96**0.5]}
+        asset = square(tmp_path, textured(builder), node, builder, **attributes)
+        told = assert_agreement(asset, varying=["base_color"])
+        assert told["normals"][:, 2].min() > 0.5  # towards the camera, mirrored or not
+        assert (np.ptp(told["normals"], axis=0).max() > 0.2) == smooth
+
+    @pytest.mark.parametrize("double_sided", [False, True])
+    def test_faces_seen_from_behind_show_the_same_material(self, tmp_path, double_sided):
+        builder = GltfBuilder()
+        material = textured(builder) | {"doubleSided": double_sided}
+        asset = square(tmp_path, material, builder=builder, TEXCOORD_0=UV)
+        assert assert_agreement(asset, varying=["base_color"], eye=EYE * [1, 1, -1])["normals"][:, 2].min() > 0.99
+
+    @pytest.mark.parametrize("code", [10497, 33648, 33071])
+    def test_texture_coordinates_beyond_the_texture_wrap_alike(self, tmp_path, code):
+        builder = GltfBuilder()
+        material = textured(builder, sampler={"wrapS": code, "wrapT": code})
+        asset = square(tmp_path, material, builder=builder, TEXCOORD_0=UV * np.float32(4.3) - np.float32(1.7))
+        assert asset.ignored == ()
+        assert_agreement(asset, varying=["base_color"], count=1500)
+
+    def test_moved_textures_agree(self, tmp_path):
+        builder = GltfBuilder()
+        moved = {"KHR_texture_transform": {"offset": [0.3, -0.2], "rotation": 0.7, "scale": [2.0, 0.5]}}
+        assert_agreement(
+            square(tmp_path, textured(builder, info={"extensions": moved}), builder=builder, TEXCOORD_0=UV),
+            varying=["base_color"],
+        )
+
+    @pytest.mark.parametrize("size", [(1, 1), (1, 6), (6, 1), (2, 2), (33, 17)])
+    def test_textures_of_any_size_agree(self, tmp_path, size):
+        builder = GltfBuilder()
+        texels = np.random.default_rng(1).integers(0, 256, (*size, 3))
+        asset = square(tmp_path, textured(builder, texels), builder=builder, TEXCOORD_0=UV)
+        assert_agreement(asset, varying=["base_color"] if texels.size > 3 else [])
+
+    def test_channels_with_textures_of_their_own_size_agree(self, tmp_path):
+        builder = GltfBuilder()
+        material = textured(builder, baseColorFactor=[0.9, 0.5, 1, 1], roughnessFactor=0.8)
+        surface = builder.texture(np.random.default_rng(2).integers(0, 256, (9, 3, 3)))
+        material["pbrMetallicRoughness"]["metallicRoughnessTexture"] = {"index": surface}
+        assert_agreement(square(tmp_path, material, builder=builder, TEXCOORD_0=UV), varying=CHANNELS)
+
+    def test_specular_glossiness_agrees(self, tmp_path):
+        builder = GltfBuilder()
+        rgba = np.random.default_rng(3).integers(0, 256, (4, 4, 4))
+        glossy = {"diffuseTexture": {"index": builder.texture(NOISE)}}
+        glossy |= {"specularGlossinessTexture": {"index": builder.texture(rgba)}}
+        material = {"extensions": {"KHR_materials_pbrSpecularGlossiness": glossy}}
+        assert_agreement(square(tmp_path, material, builder=builder, TEXCOORD_0=UV), varying=CHANNELS)
+
+    def test_vertex_colours_times_a_factor_agree(self, tmp_path):
+        colors = np.float32([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0]])
+        asset = square(tmp_path, factors((0.5, 1, 0.8), 0.4, 0.2), COLOR_0=colors)
+        assert_agreement(asset, varying=["base_color"])
+
+    def test_vertex_colours_over_surface_textures_agree(self, tmp_path):
+        builder = GltfBuilder()
+        material = {"pbrMetallicRoughness": {"metallicRoughnessTexture": {"index": builder.texture(NOISE)}}}
+        colors = np.float32([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0]])
+        asset = square(tmp_path, material, builder=builder, TEXCOORD_0=UV, COLOR_0=colors)
+        assert asset.ignored == ()
+        assert_agreement(asset, varying=CHANNELS)
+
+    def test_colours_of_whole_faces_times_a_texture_agree_and_are_exact(self, tmp_path):
+        builder = GltfBuilder()
+        corners = CORNERS[[0, 1, 2, 0, 2, 3]]
+        colors = np.repeat(np.float32([[1, 0.2, 0.2], [0.2, 0.2, 1]]), 3, axis=0)
+        material = builder.material(**textured(builder))
+        uv = UV[[0, 1, 2, 0, 2, 3]]
+        builder.mesh(builder.primitive(corners, None, material=material, TEXCOORD_0=uv, COLOR_0=colors))
+        asset = meshes.load_mesh(builder.write(tmp_path / "faces.glb"))
+        assert asset.ignored == ()
+        assert_agreement(asset, varying=["base_color"])
+
+    def test_colours_that_vary_within_a_textured_face_are_named_and_still_agree(self, tmp_path):
+        builder = GltfBuilder()
+        colors = np.float32([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0]])
+        asset = square(tmp_path, textured(builder), builder=builder, TEXCOORD_0=UV, COLOR_0=colors)
+        assert asset.ignored == ("vertex colours that vary within textured faces (one tint per face is used)",)
+        assert_agreement(asset, varying=["base_color"])
+
+
+class TestOtherFormats:
+    SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nvt 0 0\nvt 3 0\nvt 3 3\nvt 0 3\n"
+
+    def obj(self, tmp_path, mtl, faces="usemtl paint\nf 1/1 2/2 3/3 4/4\n"):
+        (tmp_path / "look.mtl").write_text(mtl)
+        (tmp_path / "object.obj").write_text(f"mtllib look.mtl\n{self.SQUARE}{faces}")
+        return meshes.load_mesh(tmp_path / "object.obj")
+
+    def test_obj_factors_agree(self, tmp_path):
+        two = "usemtl paint\nf 1 2 3\nusemtl steel\nf 1 3 4\n"
+        mtl = "newmtl paint\nKd 0.8 0.1 0.1\nPr 0.2\nnewmtl steel\nKd 0.5 0.5 0.6\nPr 0.4\nPm 1\n"
+        told = assert_agreement(self.obj(tmp_path, mtl, two), varying=CHANNELS)
+        assert {*np.round(told["roughness"], 3)} == {np.float32(0.2), np.float32(0.4)}
+
+    @pytest.mark.parametrize("option", ["", "-clamp on ", "-s 2 0.5 1 -o 0.25 0.1 0 "])
+    def test_obj_textures_agree(self, tmp_path, option):
+        (tmp_path / "wood.png").write_bytes(png(NOISE))
+        (tmp_path / "grey.png").write_bytes(png(np.random.default_rng(4).integers(0, 256, (3, 8, 1))[..., [0, 0, 0]]))
+        maps = {"map_Kd": "wood.png", "map_Pr": "grey.png", "map_Pm": "wood.png"}
+        mtl = "newmtl paint\n" + "".join(f"{key} {option}{name}\n" for key, name in maps.items())
+        assert_agreement(self.obj(tmp_path, mtl), varying=CHANNELS, count=1500)
+
+    def test_ply_colours_of_vertices_agree(self, tmp_path):
+        header = "ply\nformat ascii 1.0\nelement vertex 4\n" + "".join(f"property float {c}\n" for c in "xyz")
+        header += "".join(f"property uchar {c}\n" for c in ("red", "green", "blue"))
+        header += "element face 2\nproperty list uchar int vertex_indices\nend_header\n"
+        body = "0 0 0 255 0 0\n1 0 0 0 255 0\n1 1 0 0 0 255\n0 1 0 90 90 90\n3 0 1 2\n3 0 2 3\n"
+        (tmp_path / "square.ply").write_text(header + body)
+        assert_agreement(meshes.load_mesh(tmp_path / "square.ply"), varying=["base_color"])
+
+
+def test_an_albedo_picture_agrees_at_the_points_sub_pixel_places():
+    asset = Asset(parts=(box(half=(0.8, 0.8, 0.02), material=plain((0.9, 0.7, 1.0))),))
+    colors = 0.5 + 0.5 * asset.parts[0].positions / [0.8, 0.8, 0.02]
+    asset = Asset(parts=(type(asset.parts[0])(**{**vars(asset.parts[0]), "colors": colors}),))
+    config = views.ViewConfig(resolution=128)
+    pose = views.look_at(EYE)
+    mi = mitsuba_module()
+    scene = views.build_scene(asset, WHITE_LIGHT)
+    unlit = mi.load_dict({"type": "aov", "aovs": "albedo:albedo"})
+    sensor = views.make_sensor(pose, config, config.resolution)
+    picture = np.array(mi.render(scene.handle, sensor=sensor, integrator=unlit, spp=64, seed=0))[..., :3]
+    surface = surface_points.sample_surface(asset, 1000, 5)
+    front = (surface.face >= 10) & (np.abs(surface.positions) < 0.75).all(axis=1)
+    x, y = (views.project(pose, surface.positions[front].astype(float), config) - 0.5).T
+    column, row = np.floor(x).astype(int), np.floor(y).astype(int)
+    right, down = (x - column)[:, None], (y - row)[:, None]
+    upper = (1 - right) * picture[row, column] + right * picture[row, column + 1]
+    lower = (1 - right) * picture[row + 1, column] + right * picture[row + 1, column + 1]
+    np.testing.assert_allclose((1 - down) * upper + down * lower, surface.base_color[front], atol=STEP)
+
+
+@pytest.mark.parametrize("color", [(0.9, 0.6, 0.2), (0.04, 0.5, 1.0), (1.0, 1.0, 1.0)])
+def test_a_smooth_metal_under_white_light_radiates_the_base_colour_that_its_points_carry(color):
+    # at normal incidence a metal's reflectance is its base colour, and the mirrored light is 1 from everywhere
+    asset = Asset(parts=(box(half=(0.6, 0.6, 0.02), material=plain(color, roughness=0.05, metallic=1.0)),))
+    config = views.ViewConfig(resolution=16, spp=256)
+    radiance = views.render_view(views.build_scene(asset, WHITE_LIGHT), views.look_at(np.array([0, 0, 3.0])), config, 0)
+    told = surface_points.sample_surface(asset, 100, 6).base_color.mean(axis=0)
+    np.testing.assert_allclose(radiance[6:10, 6:10, :3].mean(axis=(0, 1)), told, atol=STEP)
+
+
+def test_smooth_objects_carry_the_normals_that_the_renderer_shades_with():
+    told, shown = told_and_shown(Asset(parts=(ball(rows=6),)), count=1000)
+    np.testing.assert_allclose(told["normals"], shown["normals"], atol=1e-3)
+
+
+@pytest.mark.skipif(not REAL.is_dir(), reason="needs the real meshes beside the checkout")
+@pytest.mark.parametrize(
+    "name", ["khr_sheen_chair.glb", "kenney_racer.glb", "sk_taxi.glb", "gso_chefmate_8_frypan/chefmate_8_frypan.obj"]
+)
+def test_real_objects_agree(name):
+    told, shown = told_and_shown(meshes.load_mesh(REAL / name), count=1000)
+    for channel in CHANNELS:
+        np.testing.assert_allclose(told[channel], shown[channel], atol=STEP, err_msg=channel)

@@ -1,0 +1,73 @@
+"""Laws of the environment light: where a map's directions point, and how bright it is made."""
+
+import numpy as np
+import pytest
+from support.handmade import ball, plain
+
+from data_gen.render import light, views
+from data_gen.render.variant import mitsuba_module, threads
+from spnr_jax.formats.mesh.assets import Asset
+
+
+def solid_angle_mean(envmap):
+    """The mean radiance over all directions: what a white diffuse sphere shows on average, in closed form."""
+    theta = np.pi * (np.arange(len(envmap)) + 0.5) / len(envmap)
+    weights = np.broadcast_to(np.sin(theta)[:, None], envmap.shape[:2])
+    return float((envmap.mean(-1) * weights).sum() / weights.sum())
+
+
+def write_exr(path, envmap):
+    mi = mitsuba_module()
+    with threads(2):
+        mi.Bitmap(envmap).write(str(path))
+
+
+@pytest.fixture(scope="module")
+def room():
+    return light.indoor_envmap(64)
+
+
+def test_a_white_diffuse_sphere_averages_0_6_under_the_scaled_map(room):
+    scaled = light.scaled_to_white(room)
+    assert light.white_sphere_radiance(scaled, num_views=24, seed=5) == pytest.approx(0.6, rel=0.01)
+    assert solid_angle_mean(scaled) == pytest.approx(0.6, rel=0.01)
+
+
+def test_scaling_leaves_the_colours_and_contrasts_of_the_map_alone(room):
+    scaled = light.scaled_to_white(3.7 * room)
+    np.testing.assert_allclose(scaled / scaled.mean(), room / room.mean(), rtol=1e-4)
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_light_from_a_direction_of_the_map_falls_on_that_side_of_an_object(axis, sign):
+    towards = sign * np.eye(3)[axis]
+    envmap = (light.map_directions(32) @ towards > 0.8)[..., None] * np.ones(3, np.float32) * 5
+    scene = views.build_scene(Asset(parts=(ball(radius=0.6, material=plain()),)), envmap)
+    config = views.ViewConfig(resolution=8, spp=16)
+    lit = views.render_view(scene, views.look_at(3 * towards + 0.01), config, 0)
+    dark = views.render_view(scene, views.look_at(-3 * towards + 0.01), config, 0)
+    assert lit[..., :3].mean() > 10 * dark[..., :3].mean()
+
+
+def test_the_room_has_light_from_above_and_a_dynamic_range_that_a_camera_can_hold(room):
+    assert room.dtype == np.float32
+    assert room.min() > 0
+    assert 5 < room.max() / room.mean() < 50
+    assert room[:16].mean() > 1.5 * room[-16:].mean()
+
+
+def test_an_environment_map_file_reads_back_as_it_was_written(tmp_path, room):
+    write_exr(tmp_path / "room.exr", room)
+    np.testing.assert_array_equal(light.load_envmap(tmp_path / "room.exr"), room)
+
+
+def test_an_unusable_environment_map_is_refused_with_its_name(tmp_path):
+    (tmp_path / "broken.hdr").write_bytes(b"#?RADIANCE\n")
+    with pytest.raises(ValueError, match=r"broken\.hdr: not a readable"):
+        light.load_envmap(tmp_path / "broken.hdr")
+    with pytest.raises(ValueError, match="no such file"):
+        light.load_envmap(tmp_path / "absent.exr")
+    write_exr(tmp_path / "black.exr", np.zeros((4, 8, 3), np.float32))
+    with pytest.raises(ValueError, match="some light"):
+        light.load_envmap(tmp_path / "black.exr")

@@ -1,0 +1,122 @@
+"""Which points a picture sees, against rays that the tests cast themselves, one triangle after the other."""
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.handmade import ball, box
+
+from data_gen.render import views
+from data_gen.render.variant import LLVM, choose_variant
+from spnr_jax.formats.mesh import surface_points
+from spnr_jax.formats.mesh.assets import Asset
+
+LIGHT = np.ones((8, 16, 3), np.float32)
+CONFIG = views.ViewConfig(resolution=64, views=1)
+WALL_AND_BOX = Asset(parts=(box((0, 0, -0.3), (0.8, 0.5, 0.05)), box((0.2, 0, 0.3), (0.25, 0.2, 0.1))))
+CROWD = Asset(parts=(*WALL_AND_BOX.parts, ball((-0.4, 0.1, 0.2), 0.3, rows=5)))
+# none lies in the plane of a box's side: a side seen edge-on is neither hidden nor seen
+EYES = np.array([[0.33, 0.27, 2.9], [1.9, 1.3, 1.8], [-2.2, -1.1, 1.4], [0.9, 2.1, -2.0]])
+
+
+def hidden(asset, positions, eye):
+    """(points,) bool: whether a triangle crosses the segment from a point to the eye (Möller and Trumbore 1997)."""
+    result = np.zeros(len(positions), bool)
+    towards = eye - positions
+    for part in asset.parts:
+        for a, b, c in part.positions[part.faces]:
+            across = np.cross(towards, c - a)
+            determinant = across @ (b - a)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                u = ((positions - a) * across).sum(1) / determinant
+                along = np.cross(positions - a, b - a)
+                v = (towards * along).sum(1) / determinant
+                t = along @ (c - a) / determinant
+            result |= (u >= 0) & (v >= 0) & (u + v <= 1) & (t > 1e-5) & (t < 1)
+    return result
+
+
+@pytest.mark.parametrize("eye", EYES)
+def test_a_point_is_seen_where_no_triangle_crosses_its_way_to_the_camera(eye):
+    surface = surface_points.sample_surface(CROWD, 2000, 0)
+    seen = views.unoccluded(views.build_scene(CROWD, LIGHT), surface.positions, eye)
+    expected = ~hidden(CROWD, surface.positions.astype(np.float64), eye)
+    assert 0.2 < expected.mean() < 0.8
+    assert (seen != expected).sum() <= 2  # at an edge, float32 may decide otherwise
+
+
+@pytest.mark.parametrize("eye", EYES)
+def test_the_faces_that_primary_rays_hit_are_those_with_a_point_that_sees_the_camera(eye):
+    surface = surface_points.sample_surface(CROWD, 20_000, 1)
+    hit = views.visible_faces(views.build_scene(CROWD, LIGHT), views.look_at(eye), CONFIG, 0)
+    sees = ~hidden(CROWD, surface.positions.astype(np.float64), eye)
+    seeing, count = np.unique(surface.face[sees], return_counts=True)
+    assert set(seeing[count > 2]) <= set(hit)
+    sampled, samples = np.unique(surface.face, return_counts=True)
+    assert set(hit) & set(sampled[samples > 200]) <= set(seeing)  # no face is reported that nowhere sees the camera
+    assert 10 < len(hit) < sum(len(part.faces) for part in CROWD.parts)
+
+
+def test_a_point_behind_another_part_is_seen_by_its_face_but_not_by_itself():
+    surface = surface_points.sample_surface(WALL_AND_BOX, 2000, 2)
+    scene, eye = views.build_scene(WALL_AND_BOX, LIGHT), np.array([0.0, 0.0, 3.0])
+    by_face, by_point = (
+        views.visible_points(scene, surface, views.look_at(eye), replace(CONFIG, visibility=rule), 0)
+        for rule in ("face", "point")
+    )
+    wall = np.isin(surface.face, (10, 11))  # its front
+    x, y, _ = surface.positions.T * 2.6 / 3.25  # onto the plane of the box's front, as the camera sees it
+    behind = wall & (np.abs(x - 0.2) < 0.24) & (np.abs(y) < 0.19)
+    assert behind.sum() > 50
+    assert by_face[wall].all()
+    assert not by_point[behind].any()
+    assert not (by_point & ~by_face).any()
+
+
+def test_the_rule_decides_which_condition_pixels_there_are():
+    surface = surface_points.sample_surface(WALL_AND_BOX, 2000, 3)
+    pose = views.look_at(np.array([0.0, 0.0, 3.0]))[None]
+    by_face, by_point = (
+        views.render_views(WALL_AND_BOX, surface, pose, LIGHT, replace(CONFIG, spp=4, visibility=rule), 0)[1]
+        for rule in ("face", "point")
+    )
+    face_pixels, point_pixels = by_face[..., 3] > 0, by_point[..., 3] > 0
+    assert not (point_pixels & ~face_pixels).any()
+    assert 20 < (face_pixels & ~point_pixels).sum() < 0.2 * face_pixels.sum()
+
+
+# Run in a process of its own: one process has one variant, and its numbers of shapes go on from scene to scene.
+COMPILED = f"""
+import sys
+sys.path[:0] = {[str(Path(__file__).parent), str(Path(__file__).parents[2])]!r}
+import numpy as np
+from data_gen.render import views
+from data_gen.render.variant import mitsuba_module
+from spnr_jax.formats.mesh import surface_points
+mitsuba_module(sys.argv[1])
+from test_visibility import CONFIG, CROWD, EYES, LIGHT, WALL_AND_BOX
+kept = [views.build_scene(WALL_AND_BOX, LIGHT), views.build_scene(CROWD, LIGHT)]
+scene, surface = views.build_scene(CROWD, LIGHT), surface_points.sample_surface(CROWD, 500, 0)
+for eye in EYES:
+    print(*views.visible_faces(scene, views.look_at(eye), CONFIG, 0))
+    print(*np.flatnonzero(views.unoccluded(scene, surface.positions, eye)))
+image = views.render_view(scene, views.look_at(EYES[0]), CONFIG, 0)
+print(*image.mean(axis=(0, 1)))
+"""
+
+
+def test_the_compiled_variant_sees_and_draws_what_the_scalar_one_does_with_other_scenes_alive():
+    if choose_variant()[0] != LLVM:
+        pytest.skip("needs an LLVM library that Mitsuba's compiled variant works with")
+    outputs = []
+    for variant in ("scalar_rgb", LLVM):
+        command = [sys.executable, "-c", COMPILED, variant]
+        outputs.append(subprocess.run(command, check=True, capture_output=True, text=True).stdout.splitlines())
+    scalar, compiled = ([np.array(line.split(), float) for line in lines] for lines in outputs)
+    for expected, got in zip(scalar[:-1], compiled[:-1], strict=True):
+        assert len(expected) > 10
+        assert len(np.setxor1d(expected, got)) <= 2
+    np.testing.assert_allclose(compiled[-1], scalar[-1], rtol=0.01)

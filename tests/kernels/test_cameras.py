@@ -1,0 +1,216 @@
+"""Poses, pixel grids, projection and the ray/box interval."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support import reference
+from support.laws import batch_law, close, gradient_law, numbers, same_bits
+
+from spnr_jax.kernels.cameras import (
+    as_images,
+    camera_rays,
+    intersect_box,
+    look_at,
+    orbit,
+    pinhole,
+    project,
+    resize,
+    view_rays,
+)
+
+UP = jnp.array([0.0, 1.0, 0.0])
+EYES = 3 * numbers(0, 2, 3, 3) + 0.1
+UPS = jnp.broadcast_to(UP, (2, 3, 3))
+POSES = jax.jit(look_at)(EYES, jnp.zeros((2, 3, 3)), UPS)
+
+
+@jax.jit
+def camera():
+    return pinhole(POSES, 0.8, 4, 6)
+
+
+class TestLookAt:
+    def test_obeys_the_batch_and_gradient_laws(self):
+        arguments = EYES, numbers(1, 2, 3, 3), UPS
+        batch_law(look_at, *arguments)
+        gradient_law(look_at, *arguments)
+
+    def test_axes_are_orthonormal_right_handed_and_look_along_minus_z(self):
+        pose = np.float64(look_at(EYES, numbers(1, 2, 3, 3), UPS))
+        rotation = pose[..., :3]
+        close(np.swapaxes(rotation, -1, -2) @ rotation, np.broadcast_to(np.eye(3), rotation.shape), atol=2e-6)
+        close(np.linalg.det(rotation), np.ones((2, 3)))
+        towards = np.float64(numbers(1, 2, 3, 3) - EYES)
+        close(-rotation[..., 2], towards / np.linalg.norm(towards, axis=-1, keepdims=True))
+        assert (rotation[..., 1, 1] > 0).all(), "the camera stands upright"
+        close(pose[..., 3], EYES)
+
+
+class TestRays:
+    def test_are_those_of_a_pixel_by_pixel_loop(self):
+        rays = jax.tree.map(np.asarray, jax.jit(camera_rays)(camera()))
+        focal = 3 / np.tan(0.4)
+        for i, j, row, column in np.ndindex(2, 3, 4, 6):
+            expected = reference.camera_ray(np.asarray(POSES)[i, j], focal, (3.0, 2.0), row, column)
+            close(rays.directions[i, j, row, column], expected)
+            close(rays.origins[i, j, row, column], np.asarray(EYES)[i, j])
+
+    def test_obey_the_batch_and_gradient_laws(self):
+        def kernel(pose):
+            rays = camera_rays(pinhole(pose, 0.8, 2, 3))
+            return rays.origins, rays.directions
+
+        batch_law(kernel, POSES)
+        gradient_law(kernel, POSES)
+
+    def test_the_field_of_view_is_the_angle_between_the_left_and_right_border(self):
+        rays = np.asarray(jax.jit(lambda pose: camera_rays(pinhole(pose, 0.8, 1, 1000)).directions[0])(POSES[0, 0]))
+        assert np.arccos(rays[0] @ rays[-1]) == pytest.approx(0.8, rel=2e-3)
+
+    def test_project_is_the_inverse(self):
+        distance = 0.3 + 5 * jnp.abs(numbers(2, 2, 3, 24, 1))
+
+        @jax.jit
+        def there_and_back(view, distance):
+            rays = camera_rays(view)
+            origins, directions = (x.reshape(2, 3, 24, 3) for x in (rays.origins, rays.directions))
+            return project(view, origins + distance * directions)
+
+        pixels, measured = there_and_back(camera(), distance)
+        columns, rows = np.meshgrid(np.arange(6) + 0.5, np.arange(4) + 0.5)
+        close(pixels, np.broadcast_to(np.stack([columns, rows], -1).reshape(24, 2), (2, 3, 24, 2)), atol=2e-4)
+        close(measured, distance[..., 0])
+
+    def test_resizing_keeps_the_view(self):
+        @jax.jit
+        def corners(view):  # rays through the corners of the image: half a pixel outside the first and last centres
+            local = jnp.array([[0.0, 0.0, 1.0], [view.width, 0.0, 1.0], [view.width, view.height, 1.0]])
+            return jnp.linalg.solve(view.intrinsics, jnp.broadcast_to(local.T, view.intrinsics.shape))
+
+        small = resize(camera(), 2, 12)
+        assert (small.height, small.width) == (2, 12)
+        close(corners(small), corners(camera()))
+        close(resize(small, 4, 6).intrinsics, camera().intrinsics)
+
+
+class TestProject:
+    def test_obeys_the_batch_and_gradient_laws(self):
+        def kernel(pose, positions):
+            return project(pinhole(pose, 0.8, 4, 6), positions)
+
+        positions = 0.1 * numbers(3, 2, 3, 5, 3)
+        batch_law(kernel, POSES, positions, rtol=1e-4)
+        gradient_law(kernel, POSES, positions)
+
+    @pytest.mark.parametrize("depth", [0.0, 2.0], ids=["at the eye's plane", "behind it"])
+    def test_a_point_not_in_front_has_no_pixel_and_no_gradient(self, depth):
+        view = pinhole(jnp.concatenate([jnp.eye(3), jnp.zeros((3, 1))], axis=1), 0.8, 4, 4)
+
+        @jax.jit
+        def pixels_distance_gradient(positions):
+            (pixels, distance), pull_back = jax.vjp(lambda p: project(view, p), positions)
+            return pixels, distance, pull_back((jnp.ones_like(pixels), jnp.zeros_like(distance)))[0]
+
+        positions = jnp.array([[0.5, 0.2, depth]])
+        pixels, distance, gradient = pixels_distance_gradient(positions)
+        assert (pixels == -jnp.inf).all()
+        assert distance[0] == pytest.approx(np.linalg.norm(positions))
+        assert (gradient == 0).all()
+
+    def test_a_point_in_the_eye_has_distance_zero_and_no_gradient(self):
+        view = pinhole(POSES[0, 0], 0.8, 4, 4)
+        distance, gradient = jax.value_and_grad(lambda p: jnp.sum(project(view, p)[1]))(EYES[0, 0][None])
+        assert distance == 0
+        assert (gradient == 0).all()
+
+
+class TestBox:
+    def test_is_the_slab_loop_at_every_batch_rank(self):
+        origins, directions = 2 * numbers(4, 2, 3, 8, 3), numbers(5, 2, 3, 8, 3)
+        batch_law(lambda o, d: intersect_box(o, d)[:2], origins, directions)
+        near, far, hit = map(np.asarray, jax.jit(intersect_box)(origins, directions))
+        origins, directions = np.asarray(origins), np.asarray(directions)
+        assert 0 < hit.sum() < hit.size
+        for place in np.ndindex(2, 3, 8):
+            interval = reference.box_interval(origins[place], directions[place])
+            assert bool(hit[place]) == (interval is not None)
+            close((near[place], far[place]), interval or (0.0, 0.0))
+
+    @pytest.mark.parametrize(
+        ("origin", "direction", "expected"),
+        [
+            ((0, 0, 3), (0, 0, -1), (2, 4)),  # parallel to two pairs of faces
+            ((2, 0, 3), (0, 0, -1), None),  # parallel and beside the box
+            ((0, 0, 0), (0, 1, 0), (0, 1)),  # from inside
+            ((0, 0, 1), (0, 0, -1), (0, 2)),  # from a face inwards
+            ((0, 0, 1), (0, 0, 1), None),  # from a face outwards
+            ((1, 0, 3), (0, 0, -1), (2, 4)),  # along a face, in it
+            ((-1, -1, 3), (0, 0, -1), (2, 4)),  # along an edge, in it
+            ((0, 0, 3), (0, 0, 1), None),  # the box lies behind
+            ((2, 2, 2), (-1, -1, -1), (1, 3)),  # through two corners
+            ((2, 0, 0), (-1, 1, 0), None),  # touches an edge
+            ((0, 0, 3e8), (0, 0, -1), (3e8, 3e8)),  # so far away that the box has no depth in float32
+        ],
+    )
+    def test_special_rays_are_finite_and_right(self, origin, direction, expected):
+        near, far, hit = jax.jit(intersect_box)(jnp.array(origin, jnp.float32), jnp.array(direction, jnp.float32))
+        if expected and expected[0] < expected[1]:
+            assert bool(hit)
+            close((near, far), (jnp.float32(expected[0]), jnp.float32(expected[1])))
+        else:
+            assert not hit
+            assert near == far == 0
+
+    def test_gradients_are_those_of_the_slabs_and_zero_for_a_miss(self):
+        origins = jnp.array([[0.1, -0.2, 3.0], [0.3, 0.2, 2.5]])
+        directions = jnp.array([[0.05, 0.1, -1.0], [-0.1, 0.2, -0.9]])
+        gradient_law(lambda o, d: intersect_box(o, d)[:2], origins, directions)
+        special = jnp.array([[0.0, 0.0, 3.0], [2.0, 0.0, 3.0], [1.0, 0.0, 3.0]])
+        along = jnp.broadcast_to(jnp.array([0.0, 0.0, -1.0]), (3, 3))
+        gradients = jax.grad(lambda o, d: sum(map(jnp.sum, intersect_box(o, d)[:2])), (0, 1))(special, along)
+        assert all(jnp.isfinite(g).all() for g in gradients)
+        close([g[1] for g in gradients], [jnp.zeros(3)] * 2)
+
+    @pytest.mark.parametrize("slope", [0.0, 1e-30, 1e-20, 1e-19, 1e-12, 1e-11, 1e-7])
+    def test_rays_that_are_nearly_parallel_to_a_face_have_a_finite_gradient(self, slope):
+        origins = jnp.array([[0.1, 0.2, 3.0], [1e8, 0.2, 3.0]])
+        directions = jnp.broadcast_to(jnp.array([slope, 0.0, -1.0]), (2, 3))
+        near, far, hit = intersect_box(origins, directions)
+        close((near, far, hit), (np.array([2.0, 0.0]), np.array([4.0, 0.0]), np.array([True, False])))
+        gradients = jax.grad(lambda o, d: sum(map(jnp.sum, intersect_box(o, d)[:2])), (0, 1))(origins, directions)
+        close(gradients[0], jnp.array([[0.0, 0.0, 2.0], [0.0, 0.0, 0.0]]))
+        assert jnp.isfinite(gradients[1]).all()
+
+    def test_points_on_hit_rays_between_near_and_far_lie_in_the_box(self):
+        origins, directions = 2 * numbers(6, 50, 3), numbers(7, 50, 3)
+        near, far, hit, origins, directions = map(
+            np.asarray, (*jax.jit(intersect_box)(origins, directions), origins, directions)
+        )
+        for share in (0.0, 0.5, 1.0):
+            points = origins + ((1 - share) * near + share * far)[:, None] * directions
+            assert (np.abs(points[hit]) <= 1 + 1e-5).all()
+
+
+class TestOrbit:
+    @pytest.mark.parametrize("elevation", [-np.pi / 2, -0.4, 0.0, 1.2, np.pi / 2])
+    def test_looks_at_the_centre_from_the_distance_even_from_straight_above_and_below(self, elevation):
+        centre = jnp.array([0.3, -0.2, 0.1])
+        pose = np.float64(orbit(2.5, elevation, 3.0, centre))
+        close(pose[:, 3], centre + 3.0 * pose[:, 2], atol=1e-5)
+        close(pose[:, :3].T @ pose[:, :3], np.eye(3), atol=1e-5)
+        assert pose[1, 3] - centre[1] == pytest.approx(3 * np.sin(elevation), abs=1e-5)
+
+    def test_azimuth_turns_from_z_towards_x(self):
+        close(orbit(0.0, 0.0, 1.0, jnp.zeros(3))[:, 3], np.array([0.0, 0.0, 1.0]))
+        close(orbit(np.pi / 2, 0.0, 1.0, jnp.zeros(3))[:, 3], np.array([1.0, 0.0, 0.0]))
+
+
+def test_views_become_one_axis_of_rays_and_images_again():
+    poses = look_at(numbers(70, 2, 3, 3) * 4, jnp.zeros((2, 3, 3)), jnp.array([[[0.0, 1.0, 0.0]]]))
+    camera = pinhole(poses, 0.7, 4, 5)
+    rays, flat = camera_rays(camera), view_rays(camera)
+    assert flat.origins.shape == (2, 60, 3)
+    images = as_images(camera, flat.directions, flat.origins[..., 0], flat.origins[..., 1])
+    same_bits(images.image, rays.directions)
+    same_bits((images.depth, images.acc), (rays.origins[..., 0], rays.origins[..., 1]))

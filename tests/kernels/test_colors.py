@@ -1,0 +1,67 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from spnr_jax.kernels.colors import linear_to_srgb, over, srgb_to_linear, unweighted
+
+LEVELS = np.arange(256) / 255
+
+
+def loop_srgb_to_linear(value: float) -> float:
+    """IEC 61966-2-1, one value, float64."""
+    return value / 12.92 if value <= 0.04045 else ((value + 0.055) / 1.055) ** 2.4
+
+
+def test_decoding_agrees_with_the_standard_at_every_8_bit_level():
+    expected = [loop_srgb_to_linear(level) for level in LEVELS]
+    np.testing.assert_allclose(srgb_to_linear(jnp.asarray(LEVELS, jnp.float32)), expected, rtol=2e-6)
+
+
+def test_encoding_inverts_decoding_to_far_below_an_8_bit_level():
+    levels = jnp.asarray(LEVELS, jnp.float32)
+    np.testing.assert_allclose(linear_to_srgb(srgb_to_linear(levels)), levels, atol=1e-6)
+
+
+def test_black_white_and_middle_grey_are_where_the_standard_puts_them():
+    np.testing.assert_allclose(
+        linear_to_srgb(jnp.array([0.0, 0.0031308, 0.5, 1.0])), [0, 0.04045, 0.735357, 1], atol=1e-6
+    )
+
+
+@pytest.mark.parametrize("transfer", [linear_to_srgb, srgb_to_linear])
+def test_values_and_gradients_are_finite_at_and_below_zero(transfer):
+    inputs = jnp.array([-1.0, -1e-8, 0.0, 1e-8, 1e10])
+    assert np.isfinite(transfer(inputs)).all()
+    assert np.isfinite(jax.vmap(jax.grad(transfer))(inputs)).all()
+
+
+@pytest.mark.parametrize("transfer", [linear_to_srgb, srgb_to_linear])
+def test_the_transfer_functions_rise_strictly_and_continuously(transfer):
+    steps = np.diff(transfer(jnp.linspace(0.0, 0.1, 2001)))
+    assert (steps > 0).all()
+    assert steps.max() < 1e-3
+
+
+BACKGROUND = 0.75
+
+
+def test_an_object_is_encoded_and_then_laid_over_the_background_by_its_opacity():
+    opacity, light = np.array([[1.0], [0.5], [0.25]]), np.array([[0.2, 0.0, 1.0]] * 3)
+    encoded = linear_to_srgb(jnp.asarray(light))
+    expected = opacity * encoded + (1 - opacity) * BACKGROUND
+    np.testing.assert_allclose(
+        over(jnp.asarray(opacity * light), jnp.asarray(opacity), BACKGROUND), expected, atol=1e-6
+    )
+    np.testing.assert_allclose(unweighted(jnp.asarray(opacity * light), jnp.asarray(opacity)), light, atol=1e-6)
+
+
+@pytest.mark.parametrize("light", [0.0, 1e-30, 1e-7, 1e10])
+@pytest.mark.parametrize("opacity", [0.0, 1e-30, 1e-7, 1.0])
+def test_the_picture_and_its_gradients_are_finite_at_any_opacity_and_light(light, opacity):
+    def picture(light, opacity):
+        return over(light, opacity, BACKGROUND)[0]
+
+    at = jnp.array([light]), jnp.array([opacity])
+    assert 0 <= picture(*at) <= 1
+    assert np.isfinite(jax.grad(picture, (0, 1))(*at)).all()

@@ -1,0 +1,234 @@
+"""Empty space: open voxels, paths through them, and work that follows what exists."""
+
+import dataclasses
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support import tiny_model
+from support.laws import close, same_bits
+from support.tiny_model import camera, cloud, wobbled
+
+from spnr_jax.kernels import cameras, occupancy, voxels
+from spnr_jax.kernels.occupancy import distance_at, map_existing, open_path
+from spnr_jax.kernels.records import Rays, Scene
+from spnr_jax.method import inference, renderer
+from spnr_jax.method.renderer import Renderer
+from spnr_jax.model_config import SamplingConfig
+
+CONFIG = tiny_model.WITHOUT_UPSAMPLER
+RNG = np.random.default_rng(0)
+
+
+def near_points(config, reach):
+    return dataclasses.replace(config, sampling=dataclasses.replace(config.sampling, reach=reach))
+
+
+@pytest.fixture(scope="module")
+def variables():
+    return wobbled(jax.jit(Renderer(CONFIG).init)(jax.random.key(0), cloud(), camera()), 4)
+
+
+@pytest.fixture(scope="module")
+def scene(variables):
+    return inference.jitted_encode(variables, cloud(), config=CONFIG)
+
+
+class TestDilate:
+    @pytest.mark.parametrize("reach", [0, 1, 2, 9])
+    def test_voxels_within_reach_of_an_occupied_one_are_near_points(self, reach):
+        occupied = RNG.random((2, 6, 6, 6)) < 0.01
+        expected = np.zeros_like(occupied)
+        for where, z, y, x in np.argwhere(occupied):
+            lowest = np.maximum([z - reach, y - reach, x - reach], 0)
+            expected[where, *(slice(lo, at + reach + 1) for lo, at in zip(lowest, (z, y, x), strict=True))] = True
+        same_bits(occupancy.dilate(jnp.array(occupied), reach), jnp.array(expected))
+
+
+class TestPath:
+    """Rays through a grid of 4^3 voxels of which some are open."""
+
+    near, far = jnp.array([0.0, 0.5, 1.0]), jnp.array([2.0, 1.5, 1.0])
+    rays = Rays(origins=jnp.array([[-1.0, 0.1, 0.1]] * 3), directions=jnp.array([[1.0, 0.0, 0.0]] * 3))
+
+    def path(self, row, cells=8):
+        """Open voxels of the row that the rays run along."""
+        grid = jnp.zeros((4, 4, 4), bool).at[2, 2].set(jnp.array(row))
+        return open_path(grid, self.rays, self.near, self.far, cells)
+
+    def test_open_length_is_that_of_the_open_voxels_between_near_and_far(self):
+        path = self.path([True, False, True, True])  # open from 0 to 0.5 and from 1 to 2
+        close(path.travelled[:, -1], np.array([1.5, 0.5, 0.0]))
+        close(path.travelled[0], np.array([0, 0.25, 0.5, 0.5, 0.5, 0.75, 1, 1.25, 1.5]))
+
+    def test_places_lie_in_open_voxels_and_jump_over_gaps(self):
+        path = self.path([True, False, True, True])
+        at = jnp.array([[0.1, 0.49, 0.51, 0.7, 1.4, 1.5]] * 3)
+        close(distance_at(path, at)[0], np.array([0.1, 0.49, 1.01, 1.2, 1.9, 2.0]), atol=1e-6)
+
+    def test_a_place_on_the_edge_of_a_gap_lies_before_it(self):
+        path = self.path([True, False, True, False])  # open from 0 to 0.5 and from 1 to 1.5
+        close(distance_at(path, jnp.array([[0.5, 1.0]] * 3))[0], np.array([0.5, 1.5]), atol=1e-6)
+
+    def test_distances_rise_with_the_length_and_stay_between_near_and_far(self):
+        for row in RNG.random((16, 4)) < 0.5:
+            path = self.path(list(row), 7)
+            at = jnp.linspace(0, 1.2, 50)[None] * path.travelled[:, -1:]
+            distances = np.asarray(distance_at(path, at))
+            assert (np.diff(distances, axis=-1) >= 0).all()
+            assert (distances >= np.asarray(self.near)[:, None]).all()
+            assert (distances <= np.asarray(self.far)[:, None]).all()
+
+    def test_where_all_is_open_the_length_is_the_distance_from_near(self):
+        path = self.path([True] * 4, 5)
+        at = jnp.array([[0.0, 0.3, 1.0]] * 3) * (self.far - self.near)[:, None]
+        close(distance_at(path, at), self.near[:, None] + at, atol=1e-6)
+
+    def test_paths_have_no_gradient(self):
+        def ends(far):
+            return jnp.sum(open_path(jnp.ones((4, 4, 4), bool), self.rays, self.near, far, 5).edges)
+
+        assert (jax.grad(ends)(self.far) == 0).all()
+
+    def test_each_object_has_its_own_voxels(self):
+        grids = jnp.array(RNG.random((2, 4, 4, 4)) < 0.5)
+        rays, near, far = jax.tree.map(lambda x: jnp.stack([x, x]), (self.rays, self.near, self.far))
+        both = open_path(grids, rays, near, far, 8)
+        for i in range(2):
+            close(jax.tree.map(lambda x, i=i: x[i], both), open_path(grids[i], self.rays, self.near, self.far, 8))
+
+
+class TestMapExisting:
+    exists = jnp.array(RNG.random(23) < 0.4)
+    x, w = jnp.array(RNG.normal(size=(23, 3))), jnp.array(RNG.normal(size=3))
+
+    def mapped(self, w, x, exists, block):
+        return map_existing(lambda x: jnp.sin(x) @ w, exists, (x,), jnp.full(x.shape[0], 7.0), block)
+
+    @pytest.mark.parametrize("block", [1, 4, 23, 100])
+    @pytest.mark.parametrize("share", [0.0, 0.4, 1.0])
+    def test_rows_that_exist_get_the_function_and_the_others_what_is_empty(self, block, share):
+        exists = jnp.array(RNG.random(23) < share)
+        expected = jnp.where(exists, jnp.sin(self.x) @ self.w, 7.0)
+        close(jax.jit(self.mapped, static_argnums=3)(self.w, self.x, exists, block), expected)
+
+    def test_the_gradient_is_that_of_the_rows_that_exist(self):
+        def plain(w, x):
+            return jnp.sum(jnp.where(self.exists, jnp.sin(x) @ w, 7.0) ** 2)
+
+        def ours(w, x):
+            return jnp.sum(self.mapped(w, x, self.exists, 4) ** 2)
+
+        close(jax.grad(ours, (0, 1))(self.w, self.x), jax.grad(plain, (0, 1))(self.w, self.x), rtol=1e-4)
+
+    @pytest.mark.parametrize(("existing", "blocks"), [(0, 0), (1, 1), (4, 1), (5, 2), (23, 6)])
+    def test_only_blocks_that_hold_an_existing_row_are_computed(self, existing, blocks):
+        ran = []
+
+        def function(x):
+            jax.debug.callback(lambda: ran.append(1))
+            return x[:, 0]
+
+        exists = jnp.arange(23) % 23 >= 23 - existing
+        jax.block_until_ready(jax.jit(lambda x: map_existing(function, exists, (x,), jnp.zeros(23), 4))(self.x))
+        jax.effects_barrier()
+        assert len(ran) == blocks
+
+
+class TestLookup:
+    def test_positions_may_name_their_object(self):
+        volume = jnp.array(RNG.normal(size=(3, 4, 4, 4, 2)))
+        positions, objects = jnp.array(RNG.uniform(-1.1, 1.1, (5, 7, 3))), jnp.array(RNG.integers(0, 3, (5, 7)))
+        expected = [
+            [voxels.trilinear(volume[o], p) for p, o in zip(*row, strict=True)]
+            for row in zip(positions, objects.tolist(), strict=True)
+        ]
+        close(voxels.trilinear(volume, positions, objects), jnp.array(expected), atol=1e-6)
+
+
+class TestRendering:
+    def test_a_box_that_is_open_everywhere_is_rendered_as_without_skipping(self, variables, scene):
+        everywhere = Scene(volume=scene.volume, occupied=jnp.ones_like(scene.occupied))
+        expected = inference.jitted_render(variables, everywhere, camera(), config=CONFIG)
+        ours = inference.jitted_render(variables, everywhere, camera(), config=near_points(CONFIG, 1))
+        hit = np.asarray(expected.depth) > 0  # a ray that misses the box has depth 0 in both
+        close(ours, expected, atol=2e-4)
+        assert hit.any()
+
+    def test_so_is_its_gradient(self, variables, scene):
+        def total(volume, config):
+            everywhere = Scene(volume=volume, occupied=jnp.ones_like(scene.occupied))
+            rendering = inference.render(variables, everywhere, camera(), config=config)
+            return jnp.sum(jnp.sin(rendering.image)) + jnp.sum(rendering.acc)
+
+        gradient = jax.jit(jax.grad(total), static_argnums=1)
+        expected = np.asarray(gradient(scene.volume, CONFIG))
+        ours = np.asarray(gradient(scene.volume, near_points(CONFIG, 1)))
+        assert np.linalg.norm(ours - expected) < 1e-3 * np.linalg.norm(expected)
+
+    def test_rays_that_miss_the_points_are_white_and_transparent(self, variables, scene):
+        rendering = inference.jitted_render(variables, scene, camera(), config=near_points(CONFIG, 1))
+        rays = Renderer(CONFIG).bind(variables).rays(camera())
+        near, far, _ = cameras.intersect_box(rays.origins, rays.directions)
+        cells = 2 * CONFIG.volume_resolution
+        path = open_path(occupancy.dilate(scene.occupied, 1), rays, near, far, cells)
+        missed = np.asarray(path.travelled[..., -1] == 0).reshape(rendering.acc.shape)
+        assert missed.any()
+        assert not missed.all()
+        assert (np.asarray(rendering.image)[missed] == 1).all()
+        assert (np.asarray(rendering.acc)[missed] == 0).all()
+        close(np.asarray(rendering.depth)[missed], np.asarray(far).reshape(missed.shape)[missed])
+
+    @pytest.mark.parametrize("ray_chunk", [7, 300])
+    def test_the_chunk_does_not_matter(self, variables, scene, ray_chunk):
+        config = near_points(CONFIG, 1)
+        generic = camera(target=0.013)  # no cell has its middle on a face between voxels, where rounding would decide
+        whole, chunked = (
+            inference.jitted_render(variables, scene, generic, config=config, ray_chunk=n) for n in (4096, ray_chunk)
+        )
+        close(chunked, whole, atol=1e-5)
+
+    def test_what_a_ray_draws_does_not_depend_on_the_rays_beside_it(self, variables, scene, monkeypatch):
+        """Devices of a mesh pack their own rays into blocks: a step must draw there what it draws on one device."""
+        config, generic = near_points(CONFIG, 1), camera(target=0.013)
+
+        @partial(jax.jit, static_argnames="block")
+        def jittered(key, block):
+            monkeypatch.setattr(renderer, "RAY_BLOCK", block)
+            return Renderer(config).bind(variables).render(scene, generic, key)
+
+        few, many = (jittered(jax.random.key(0), block) for block in (7, 256))
+        close(few, many, atol=1e-5)
+        still = inference.jitted_render(variables, scene, generic, config=config)
+        assert np.abs(np.asarray(many.image) - np.asarray(still.image)).max() > 1e-3, "a key moves the samples"
+
+    @pytest.mark.skipif(jax.default_backend() != "cpu", reason="other devices have one size of blocks")
+    def test_pictures_do_not_depend_on_the_size_of_blocks(self, variables, scene, monkeypatch):
+        @partial(jax.jit, static_argnames="block")
+        def still(block):
+            monkeypatch.setattr(renderer, "CPU_BLOCK", block)
+            return Renderer(near_points(CONFIG, 1)).bind(variables).render(scene, camera(target=0.013))
+
+        close(still(7), still(4096), atol=1e-5)
+
+    def test_no_point_gives_a_white_picture(self, variables):
+        empty = dataclasses.replace(cloud(), mask=jnp.zeros_like(cloud().mask))
+        scene = inference.jitted_encode(variables, empty, config=CONFIG)
+        assert not scene.occupied.any()
+        rendering = inference.jitted_render(variables, scene, camera(), config=near_points(CONFIG, 3))
+        assert (rendering.image == 1).all()
+
+    def test_occupied_voxels_are_those_of_the_points(self, scene):
+        cell, _ = voxels.locate(cloud().positions, CONFIG.volume_resolution)
+        for i in range(2):
+            inside = np.asarray(cloud().mask[i]) & (np.abs(cloud().positions[i]) <= 1).all(-1)
+            x, y, z = np.asarray(cell[i])[inside].T
+            expected = np.zeros(scene.occupied.shape[1:], bool)
+            expected[z, y, x] = True
+            same_bits(scene.occupied[i], jnp.array(expected))
+
+    def test_a_negative_reach_is_refused(self):
+        with pytest.raises(ValueError, match="reach must not be negative, got -1"):
+            SamplingConfig(reach=-1)

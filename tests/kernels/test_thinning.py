@@ -1,0 +1,89 @@
+"""Fewer points cover the shape as evenly, whatever their number and however the file is cut into pieces."""
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+from support.point_clouds import sphere_points
+
+from spnr_jax.kernels.thinning import THINNING, candidates, farthest_points, first_in_voxels, thin_stream
+
+
+@pytest.mark.parametrize("num_points", [500, 6000])  # 6000 is thinned at random before
+def test_thinned_points_cover_the_shape_evenly_where_a_random_choice_leaves_gaps(num_points):
+    positions, count = sphere_points(2, num_points), 64
+    kept = farthest_points(positions, count, seed=0)
+    between = np.linalg.norm(positions[kept, None] - positions[kept], axis=-1) + 9 * np.eye(count)
+    gap = np.linalg.norm(positions[:, None] - positions[kept], axis=-1).min(axis=1)
+    random = np.random.default_rng(0).choice(num_points, count, replace=False)
+    random_gap = np.linalg.norm(positions[:, None] - positions[random], axis=-1).min(axis=1)
+    assert between.min() > 0.8 * np.quantile(gap, 0.99)  # a packing that covers: both radii agree
+    assert np.quantile(gap, 0.99) < 0.6 * np.quantile(random_gap, 0.99)
+
+
+def test_farthest_points_are_those_of_the_plain_loop():
+    positions = sphere_points(3, 60)
+    kept = [int(np.random.default_rng(7).integers(60))]
+    while len(kept) < 20:
+        kept.append(int(np.argmax([min(np.linalg.norm(p - positions[k]) for k in kept) for p in positions])))
+    np.testing.assert_array_equal(farthest_points(positions, 20, seed=7), kept)
+
+
+def test_points_that_coincide_are_never_kept_twice():
+    assert sorted(farthest_points(np.zeros((9, 3)), 9, seed=0)) == list(range(9))
+
+
+def pieces_of(positions: np.ndarray, size: int):
+    """Columns with the row number as `tag`, `size` points at a time."""
+    table = np.column_stack([positions, np.arange(len(positions))])
+    for start in range(0, len(table), size):
+        yield dict(zip(("x", "y", "z", "tag"), table[start : start + size].T, strict=True))
+
+
+def test_a_voxel_keeps_the_first_of_its_points():
+    positions = np.array([[0.1, 0.1, 0.1], [-0.1, 0.1, 0.1], [0.9, 0.9, 0.9], [1.1, 0.9, 0.9], [0.5, 0.5, 0.5]])
+    np.testing.assert_array_equal(first_in_voxels(positions, 1.0), [0, 1, 3])
+    np.testing.assert_array_equal(first_in_voxels(positions, 1e-3), np.arange(5))
+    np.testing.assert_array_equal(first_in_voxels(positions * 1e30, 1e-3), [0, 1])  # beyond the last voxel
+
+
+def test_a_stream_that_fits_is_kept_as_it_is_whatever_its_pieces():
+    positions = sphere_points(0, 100)
+    for size in (7, 50, 100):
+        kept, seen = thin_stream(pieces_of(positions, size), capacity=100)
+        assert seen == 100
+        np.testing.assert_array_equal(kept["tag"], np.arange(100))
+        np.testing.assert_array_equal(kept["y"], positions[:, 1])
+    assert thin_stream([], capacity=3) == ({}, 0)
+
+
+@pytest.mark.parametrize("size", [500, 20_000])
+def test_a_stream_that_is_too_long_is_thinned_evenly_and_rows_stay_together(size):
+    positions, capacity = sphere_points(1, 20_000), 800
+    kept, seen = thin_stream(pieces_of(positions, size), capacity)
+    rows = kept["tag"].astype(int)
+    assert seen == 20_000
+    assert capacity / 8 <= len(rows) <= capacity
+    np.testing.assert_array_equal(np.stack([kept[axis] for axis in "xyz"], axis=-1), positions[rows])
+    gap, _ = cKDTree(positions[rows]).query(positions)
+    random = np.random.default_rng(0).choice(20_000, len(rows), replace=False)
+    random_gap, _ = cKDTree(positions[random]).query(positions)
+    assert gap.max() < 0.7 * random_gap.max()
+
+
+def test_points_far_outside_do_not_make_the_voxels_of_the_others_larger():
+    positions = np.concatenate([sphere_points(2, 5000), [[1e7, 0, 0]]])
+    kept, _ = thin_stream(pieces_of(positions, 6000), capacity=1000)
+    assert len(kept["x"]) > 120
+    assert len(candidates(positions, 60)) > 200
+
+
+def test_candidates_are_enough_and_not_too_many_even_where_points_coincide():
+    for positions in (sphere_points(3, 4000), np.zeros((4000, 3)), np.eye(3)[np.arange(4000) % 3]):
+        among = candidates(positions, 100)
+        assert 100 <= len(among) <= THINNING * 100
+        assert len(np.unique(among)) == len(among)
+
+
+def test_points_whose_squared_distances_leave_float32_are_thinned_as_smaller_ones_are():
+    positions = np.random.default_rng(3).normal(size=(200, 3))
+    np.testing.assert_array_equal(farthest_points(1e30 * positions, 20, 0), farthest_points(positions, 20, 0))

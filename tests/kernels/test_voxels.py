@@ -1,0 +1,317 @@
+"""Points to volume and back: scatter by voxel, the sparse convolution, trilinear lookup."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+from support import reference
+from support.laws import adjoint_law, batch_law, close, gradient_law, numbers, same_bits
+
+from spnr_jax.kernels.voxels import (
+    locate,
+    row_of,
+    scatter_conv,
+    scatter_max,
+    scatter_mean,
+    scatter_trilinear,
+    share_voxels,
+    spread,
+    trilinear,
+)
+
+D = 4
+POSITIONS = 1.2 * numbers(0, 2, 3, 12, 3)  # some lie outside the box, and several share a voxel
+FEATURES = numbers(1, 2, 3, 12, 2)
+MASK = np.random.default_rng(2).uniform(size=(2, 3, 12)) > 0.3
+VOLUME = numbers(3, D, D, D, 2)
+scatter = jax.jit(scatter_mean, static_argnums=3)
+lookup = jax.jit(trilinear)
+
+
+class TestLocate:
+    @pytest.mark.parametrize(
+        ("coordinate", "voxel"), [(-1.0, 0), (-0.5, 1), (-1e-8, 2), (0.0, 2), (0.49999, 2), (1.0, 3)]
+    )
+    def test_a_face_belongs_to_the_voxel_above_it_and_the_far_face_to_the_last(self, coordinate, voxel):
+        cell, offset = locate(jnp.array([coordinate, 0.0, -0.75]), D)
+        np.testing.assert_array_equal(cell, [voxel, 2, 0])
+        close(offset, np.array([(np.float32(coordinate) + 1) * 2 - voxel - 0.5, -0.5, 0.0]))
+
+    def test_obeys_the_batch_law(self):
+        batch_law(lambda p: locate(p, D), POSITIONS)
+
+    def test_rows_run_through_x_first_and_what_is_not_valid_goes_to_the_spare_row(self):
+        cell = jnp.array([[1, 2, 3], [1, 2, 3]], jnp.int32)
+        np.testing.assert_array_equal(row_of(cell, jnp.array([True, False]), D), [1 + 4 * 2 + 16 * 3, 64])
+
+
+class TestScatterMean:
+    def test_is_the_mean_of_a_list_per_voxel(self):
+        volume, occupancy = map(np.asarray, scatter(POSITIONS, FEATURES, jnp.asarray(MASK), D))
+        positions, features = np.asarray(POSITIONS), np.asarray(FEATURES)
+        for place in np.ndindex(2, 3):
+            expected = reference.scatter_mean(positions[place], features[place], MASK[place], D)
+            close((volume[place], occupancy[place]), expected)
+
+    def test_obeys_the_batch_law(self):
+        batch_law(lambda p, f, m: scatter_mean(p, f, m > 0.5, D), POSITIONS, FEATURES, jnp.asarray(MASK, jnp.float32))
+
+    def test_its_gradient_is_right_also_for_shared_voxels(self):
+        gradient_law(lambda f: scatter_mean(POSITIONS[0, 0], f, jnp.asarray(MASK[0, 0]), D), FEATURES[0, 0])
+
+    def test_the_order_of_the_points_does_not_matter(self):
+        order = np.random.default_rng(4).permutation(12)
+        shuffled = scatter(POSITIONS[0, 0, order], FEATURES[0, 0, order], jnp.asarray(MASK[0, 0, order]), D)
+        close(shuffled, scatter(POSITIONS[0, 0], FEATURES[0, 0], jnp.asarray(MASK[0, 0]), D))
+
+    def test_the_order_of_points_in_voxels_of_their_own_does_not_matter_by_a_bit(self):
+        cells = np.random.default_rng(9).permutation(D**3)[:12]
+        positions = np.stack(np.unravel_index(cells, (D, D, D)), axis=-1).astype(np.float32) * (2 / D) - 1 + 0.1
+        order = np.random.default_rng(4).permutation(12)
+        features, mask = np.asarray(FEATURES[0, 0]), MASK[0, 0]
+        one, other = (
+            scatter(*map(jnp.asarray, (positions[o], features[o], mask[o])), D) for o in (np.arange(12), order)
+        )
+        same_bits(one, other)
+
+    def test_is_the_adjoint_of_the_share_of_each_point(self):
+        adjoint_law(lambda f: scatter_mean(POSITIONS[0, 0], f, jnp.asarray(MASK[0, 0]), D)[0], FEATURES[0, 0])
+
+    def test_padding_does_not_matter_whatever_it_holds(self):
+        def padded(fill):
+            extra = np.full((5, 3), fill, np.float32)
+            positions = np.concatenate([np.asarray(POSITIONS)[0, 0], extra])
+            features = np.concatenate([np.asarray(FEATURES)[0, 0], extra[:, :2]])
+            mask = np.concatenate([MASK[0, 0], np.zeros(5, bool)])
+            return scatter(jnp.asarray(positions), jnp.asarray(features), jnp.asarray(mask), D)
+
+        plain = scatter(POSITIONS[0, 0], FEATURES[0, 0], jnp.asarray(MASK[0, 0]), D)
+        same_bits(padded(0.0), plain)
+        same_bits(padded(1e30), plain)
+        same_bits(padded(np.nan), plain)
+
+    @pytest.mark.parametrize(
+        ("point", "kept"),
+        [
+            ((1, 1, 1), True),
+            ((-1, -1, -1), True),
+            ((-1, 1, 0), True),
+            ((np.nextafter(np.float32(1), np.float32(2)), 0, 0), False),
+            ((0, -1.5, 0), False),
+            ((0, 0, 1e10), False),
+        ],
+    )
+    def test_points_on_the_faces_stay_and_points_outside_are_dropped(self, point, kept):
+        volume, occupancy = scatter(jnp.array([point], jnp.float32), jnp.ones((1, 2)), jnp.ones(1, bool), D)
+        assert volume.sum() == 2 * kept
+        assert occupancy.sum() == kept
+
+    def test_all_masked_gives_zeros_and_zero_gradients(self):
+        def total(features):
+            volume, occupancy = scatter_mean(POSITIONS[0, 0], features, jnp.zeros(12, bool), D)
+            return jnp.sum(volume) + jnp.sum(occupancy)
+
+        value, gradient = jax.jit(jax.value_and_grad(total))(FEATURES[0, 0])
+        assert value == 0
+        assert (gradient == 0).all()
+
+    @pytest.mark.parametrize("count", [1, 1000])
+    def test_identical_points_are_one_point(self, count):
+        positions = jnp.broadcast_to(jnp.array([0.3, -0.2, 0.9]), (count, 3))
+        volume, occupancy = scatter(positions, jnp.full((count, 2), 0.7), jnp.ones(count, bool), D)
+        assert (occupancy > 0).sum() == 1
+        close((volume[3, 1, 2], occupancy[3, 1, 2]), (jnp.full(2, 0.7), 1.0), rtol=3e-5)
+
+
+@pytest.mark.parametrize(
+    ("kernel", "twin"),
+    [(scatter_max, reference.scatter_max), (scatter_trilinear, reference.scatter_trilinear)],
+    ids=["max", "trilinear"],
+)
+class TestOtherScatters:
+    cloud = POSITIONS[0, 0], FEATURES[0, 0], jnp.asarray(MASK[0, 0])
+
+    def test_is_the_loop_over_points(self, kernel, twin):
+        volume, occupancy = map(np.asarray, jax.jit(kernel, static_argnums=3)(POSITIONS, FEATURES, MASK, D))
+        positions, features = np.asarray(POSITIONS), np.asarray(FEATURES)
+        for place in np.ndindex(2, 3):
+            close((volume[place], occupancy[place]), twin(positions[place], features[place], MASK[place], D))
+
+    def test_obeys_the_batch_law(self, kernel, twin):
+        batch_law(lambda p, f, m: kernel(p, f, m > 0.5, D), POSITIONS, FEATURES, jnp.asarray(MASK, jnp.float32))
+
+    def test_its_gradient_is_right_also_where_points_share_voxels(self, kernel, twin):
+        positions, _, mask = self.cloud
+        gradient_law(lambda f: kernel(positions, f, mask, D), self.cloud[1])
+
+    def test_the_order_of_the_points_does_not_matter(self, kernel, twin):
+        order = np.random.default_rng(4).permutation(12)
+        close(kernel(*(x[order] for x in self.cloud), D), kernel(*self.cloud, D))
+
+    @pytest.mark.parametrize("fill", [0.0, 1e30, np.nan])
+    def test_padding_does_not_matter_whatever_it_holds(self, kernel, twin, fill):
+        extra = jnp.full((5, 3), fill, jnp.float32)
+        fills = extra, extra[:, :2], jnp.zeros(5, bool)
+        padded = (jnp.concatenate(pair) for pair in zip(self.cloud, fills, strict=True))
+        same_bits(kernel(*padded, D), kernel(*self.cloud, D))
+
+    def test_no_point_gives_zeros_and_zero_gradients(self, kernel, twin):
+        positions, features, mask = self.cloud
+
+        def total(features, mask):
+            volume, occupancy = kernel(positions, features, mask, D)
+            return jnp.sum(volume) + jnp.sum(occupancy)
+
+        value, gradient = jax.jit(jax.value_and_grad(total))(features, jnp.zeros_like(mask))
+        assert value == 0
+        assert (gradient == 0).all()
+        empty = kernel(jnp.zeros((0, 3)), jnp.zeros((0, 2)), jnp.zeros(0, bool), D)
+        assert all((x == 0).all() for x in empty)
+
+    def test_is_the_sum_of_what_it_spreads_as_the_stem_reads_it(self, kernel, twin):
+        name = kernel.__name__.removeprefix("scatter_")
+        rows, values = spread(name, *self.cloud, D)
+        volume, occupancy = kernel(*self.cloud, D)
+        dense = jnp.concatenate([volume, occupancy[..., None]], axis=-1)
+        weights = numbers(5, 3, 3, 3, 3, 4)
+        close(scatter_conv(rows, values, weights, D), reference.convolution(dense, weights), atol=1e-5)
+
+
+class TestScatterMax:
+    def test_points_that_tie_share_the_gradient(self):
+        positions = jnp.broadcast_to(jnp.array([0.3, -0.2, 0.9]), (3, 3))
+        features = jnp.array([[0.5], [0.5], [-1.0]])
+        gradient = jax.grad(lambda f: jnp.sum(scatter_max(positions, f, jnp.ones(3, bool), D)[0]))(features)
+        close(gradient, np.array([[0.5], [0.5], [0.0]]))
+
+
+class TestScatterTrilinear:
+    def test_a_point_at_a_voxel_centre_is_in_that_voxel_alone_however_often_it_is_there(self):
+        centre = jnp.broadcast_to(jnp.array([-0.25, 0.75, 0.25]), (3, 3))  # x, y, z
+        for count in (1, 3):
+            volume, full = scatter_trilinear(centre[:count], jnp.full((count, 2), 0.7), jnp.ones(count, bool), D)
+            assert (full > 0).sum() == 1
+            close((volume[2, 3, 1], full[2, 3, 1]), (jnp.full(2, 0.7), 1.0))
+
+    def test_a_lone_point_is_the_adjoint_of_the_lookup_and_loses_nothing(self):
+        position, feature = jnp.array([[0.1, -0.33, 0.6]]), jnp.array([[2.0, -1.0]])
+        volume, full = scatter_trilinear(position, feature, jnp.ones(1, bool), D)
+        (splat,) = jax.vjp(lambda v: trilinear(v, position), VOLUME)[1](feature)
+        close(volume, splat)
+        close((volume.sum((0, 1, 2)), full.sum()), (feature[0], 1.0))
+
+    def test_a_point_that_moves_a_little_changes_the_volume_a_little(self):
+        along = jnp.stack([jnp.linspace(-1, 1, 401), jnp.full(401, 0.1), jnp.full(401, -0.3)], axis=-1)[:, None]
+        ones = jnp.ones((401, 1, 1))
+        volumes, _ = jax.jit(scatter_trilinear, static_argnums=3)(along, ones, ones[..., 0] > 0, D)
+        assert jnp.abs(jnp.diff(volumes, axis=0)).max() < 2 * 2 / 400 * D / 2
+        hard, _ = scatter(along, ones, ones[..., 0] > 0, D)
+        assert jnp.abs(jnp.diff(hard, axis=0)).max() == 1
+
+
+class TestScatterConv:
+    kernel = numbers(5, 3, 3, 3, 3, 4)
+
+    @staticmethod
+    def dense(positions, features, mask, kernel):
+        volume, occupancy = scatter_mean(positions, features, mask, D)
+        volume = jnp.concatenate([volume, occupancy[..., None]], axis=-1)
+        numbering = ("NDHWC", "DHWIO", "NDHWC")
+        return lax.conv_general_dilated(volume[None], kernel, (1, 1, 1), "SAME", dimension_numbers=numbering)[0]
+
+    @staticmethod
+    def sparse(positions, features, mask, kernel):
+        rows, share = share_voxels(positions, mask, D)
+        values = jnp.concatenate([features, jnp.ones_like(features[:, :1])], axis=-1) * share[:, None]
+        return scatter_conv(rows, values, kernel, D)
+
+    def test_is_the_convolution_of_the_scattered_volume_in_value_and_gradient(self):
+        weights = numbers(6, D, D, D, 4)
+        mask = jnp.asarray(MASK[0, 0])
+
+        def both(form):
+            def projected(features, kernel):
+                out = form(POSITIONS[0, 0], features, mask, kernel)
+                return jnp.vdot(weights, out), out
+
+            return jax.jit(jax.value_and_grad(projected, (0, 1), has_aux=True))(FEATURES[0, 0], self.kernel)
+
+        sparse, dense = both(self.sparse), both(self.dense)
+        close(sparse, dense, rtol=1e-4, atol=1e-5)
+        volume = np.concatenate(
+            [
+                x if x.ndim == 4 else x[..., None]
+                for x in map(np.asarray, scatter(POSITIONS[0, 0], FEATURES[0, 0], mask, D))
+            ],
+            axis=-1,
+        )
+        close(sparse[0][1], reference.convolution(volume, self.kernel), atol=1e-5)
+
+    def test_is_adjoint_to_its_gradient_in_points_and_kernel(self):
+        rows, share = share_voxels(POSITIONS[0, 0], jnp.asarray(MASK[0, 0]), D)
+        values = numbers(9, 12, 3) * share[:, None]
+        adjoint_law(lambda v: scatter_conv(rows, v, self.kernel, D), values)
+        adjoint_law(lambda k: scatter_conv(rows, values, k, D), self.kernel)
+
+    def test_no_valid_point_gives_zeros(self):
+        assert (self.sparse(POSITIONS[0, 0], FEATURES[0, 0], jnp.zeros(12, bool), self.kernel) == 0).all()
+
+
+class TestTrilinear:
+    def test_is_the_loop_over_the_eight_corners(self):
+        looked, positions = np.asarray(lookup(VOLUME, POSITIONS)), np.asarray(POSITIONS)
+        for place in np.ndindex(2, 3, 12):
+            close(looked[place], reference.trilinear(VOLUME, positions[place]))
+
+    def test_obeys_the_batch_law(self):
+        batch_law(lambda p: trilinear(VOLUME, p), POSITIONS)
+
+    def test_objects_are_looked_up_in_their_own_volumes(self):
+        volumes = numbers(7, 2, D, D, D, 2)
+        both = lookup(volumes, POSITIONS)
+        for i in range(2):
+            close(both[i], lookup(volumes[i], POSITIONS[i]))
+
+    def test_its_gradients_are_right(self):
+        gradient_law(trilinear, VOLUME, POSITIONS[0, 0])
+
+    def test_the_gradient_by_the_volume_is_the_adjoint_splat(self):
+        positions, cotangent = np.asarray(POSITIONS[0, 0]), np.asarray(FEATURES[0, 0])
+        splat = np.zeros((D, D, D, 2))
+        for position, value in zip(positions, cotangent, strict=True):
+            for voxel, weight in reference.trilinear_taps(position, D):
+                splat[voxel] += weight * value
+        gradient = jax.jit(lambda c: jax.vjp(lambda v: trilinear(v, POSITIONS[0, 0]), VOLUME)[1](c)[0])(FEATURES[0, 0])
+        close(gradient, splat)
+        adjoint_law(lambda volume: trilinear(volume, POSITIONS[0, 0]), VOLUME)
+
+    def test_a_linear_field_is_reproduced_between_the_outermost_centres(self):
+        centres = (np.arange(D, dtype=np.float32) + 0.5) * 2 / D - 1
+        z, y, x = np.meshgrid(centres, centres, centres, indexing="ij")
+        field = jnp.asarray(np.stack([2 * x - y + 3 * z + 1, z], axis=-1))
+        p = 0.75 * numbers(8, 50, 3)
+        close(lookup(field, p), jnp.stack([2 * p[:, 0] - p[:, 1] + 3 * p[:, 2] + 1, p[:, 2]], axis=-1), atol=2e-6)
+
+    def test_a_voxel_centre_returns_its_voxel(self):
+        centre = jnp.array([-0.25, 0.75, 0.25])  # x, y, z
+        close(lookup(VOLUME, centre), VOLUME[2, 3, 1])
+
+    def test_is_continuous_across_cells_and_constant_within_half_a_voxel_of_the_border(self):
+        along = jnp.stack([jnp.linspace(-1, 1, 2001), jnp.full(2001, 0.1), jnp.full(2001, -0.3)], axis=-1)
+        values = np.asarray(lookup(VOLUME, along))
+        assert np.abs(np.diff(values, axis=0)).max() < 0.001 * 2 * D
+        assert (values[:250] == values[0]).all()
+
+    def test_outside_the_box_there_is_nothing_in_value_and_gradient(self):
+        outside = jnp.array([[1.001, 0.0, 0.0], [0.0, -1.5, 0.0], [0.0, 0.0, 1e10], [-1e10, 0.0, 0.0]])
+        assert (lookup(VOLUME, outside) == 0).all()
+        gradients = jax.jit(jax.grad(lambda v, p: jnp.sum(trilinear(v, p)), (0, 1)))(VOLUME, outside)
+        assert all((g == 0).all() for g in gradients)
+
+    def test_a_single_voxel_fills_the_box(self):
+        volume = jnp.full((1, 1, 1, 2), 0.3)
+        close(lookup(volume, jnp.array([[-1.0, 0.2, 1.0], [0.0, 0.0, 0.0]])), jnp.full((2, 2), 0.3))
+
+    def test_no_position_looks_nothing_up(self):
+        assert lookup(VOLUME, jnp.zeros((0, 3))).shape == (0, 2)

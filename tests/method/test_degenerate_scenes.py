@@ -1,0 +1,217 @@
+"""Scenes that nobody meant to render, through the whole generator: what they look like, and gradients that stay finite.
+
+Every scene has the shapes of the others, so one compilation renders all of them, in training mode: there the statistics
+of the points are those of the scene.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support import tiny_model
+from support.laws import close, numbers
+
+from spnr_jax.kernels import losses
+from spnr_jax.kernels.cameras import camera_rays, intersect_box, look_at, pinhole, resize
+from spnr_jax.kernels.records import PointCloud
+from spnr_jax.method.model import Model
+from spnr_jax.method.renderer import Renderer
+
+MODEL, SIZE, NUM_POINTS = tiny_model.MODEL, tiny_model.SIZE, 32
+RANDOM = 0.6 * np.asarray(numbers(0, NUM_POINTS, 3))
+FIRST = np.arange(NUM_POINTS) == 0
+
+
+def cloud(positions=RANDOM, mask=None, **materials):
+    """One object (1, points, ...); materials are grey unless they are given."""
+    values = {"base_color": np.full((NUM_POINTS, 3), 0.5), "roughness": np.full(NUM_POINTS, 0.5)}
+    values |= {"metallic": np.zeros(NUM_POINTS)} | materials
+    arrays = {name: jnp.asarray(x, jnp.float32)[None] for name, x in {"positions": positions, **values}.items()}
+    return PointCloud(**arrays, mask=jnp.ones((1, NUM_POINTS), bool) if mask is None else jnp.asarray(mask)[None])
+
+
+def camera(eye=(0.5, 0.8, 3.0), target=(0.0, 0.0, 0.0), field_of_view=0.9):
+    """One view (1, 1, ...) of one object."""
+    eye, target, up = (jnp.array(x, jnp.float32).reshape(1, 1, 3) for x in (eye, target, (0.0, 1.0, 0.0)))
+    return pinhole(look_at(eye, target, up), field_of_view, SIZE, SIZE)
+
+
+@pytest.fixture(scope="module")
+def variables():
+    fresh = jax.jit(Renderer(MODEL).init)(jax.random.key(0), cloud(), camera())
+    return tiny_model.wobbled(fresh, 4)
+
+
+@jax.jit
+def rendered(variables, cloud, camera):
+    """The rendering of a training step, and the gradients of an L1 loss by weights and by every number of the scene."""
+    inputs = {f.name: getattr(cloud, f.name) for f in dataclasses.fields(cloud) if f.name != "mask"}
+    inputs |= {"cam_to_world": camera.cam_to_world, "intrinsics": camera.intrinsics}
+
+    def loss(params, inputs):
+        places = {name: inputs[name] for name in ("cam_to_world", "intrinsics")}
+        points = {name: x for name, x in inputs.items() if name not in places}
+        rendering, _ = Renderer(MODEL).apply(
+            variables | {"params": params},
+            dataclasses.replace(cloud, **points),
+            dataclasses.replace(camera, **places),
+            train=True,
+            mutable=["batch_stats"],
+        )
+        return losses.l1(rendering.image, jnp.full(rendering.image.shape, 0.3)), rendering
+
+    gradients, rendering = jax.grad(loss, (0, 1), has_aux=True)(variables["params"], inputs)
+    return rendering, gradients
+
+
+def see(variables, cloud, camera):
+    """(rendering, gradients by weights, gradients by inputs), after the laws that every scene obeys."""
+    rendering, (by_weights, by_inputs) = jax.tree.map(np.asarray, rendered(variables, cloud, camera))
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves((rendering, by_weights, by_inputs)))
+    assert ((rendering.image_lr >= -1e-6) & (rendering.image_lr <= 1 + 1e-6)).all()
+    assert ((rendering.acc >= 0) & (rendering.acc <= 1 + 1e-6)).all()
+    rays = camera_rays(resize(camera, *rendering.acc.shape[-2:]))
+    near, far, hit = map(np.asarray, intersect_box(rays.origins, rays.directions))
+    slack = 1e-5 * (1 + far)
+    assert ((rendering.depth >= near - slack) & (rendering.depth <= far + slack)).all()
+    assert (rendering.image_lr[~hit] == 1).all()
+    return rendering, by_weights, by_inputs
+
+
+def line(t):
+    return np.stack([t, 0.3 * t, -0.5 * t], axis=-1)
+
+
+POINTS = {
+    "one point": cloud(mask=FIRST),
+    "equal points": cloud(np.tile(RANDOM[:1], (NUM_POINTS, 1))),
+    "two places": cloud(np.repeat(RANDOM[:2], NUM_POINTS // 2, axis=0)),
+    "a line": cloud(line(np.linspace(-0.9, 0.9, NUM_POINTS))),
+    "a plane": cloud(RANDOM * [1, 0, 1]),
+    "the faces of the box": cloud(np.sign(RANDOM)),
+    "borders of voxels": cloud(np.round(4 * RANDOM) / 4),
+    "outside the box": cloud(RANDOM + 3),
+    "far outside the box": cloud(1e30 * RANDOM),
+    "no point": cloud(mask=np.zeros(NUM_POINTS, bool)),
+}
+
+
+@pytest.mark.parametrize("name", POINTS)
+def test_any_arrangement_of_points_has_a_finite_picture_and_finite_gradients(variables, name):
+    see(variables, POINTS[name], camera())
+
+
+def test_equal_points_look_like_one_of_them(variables):
+    many, one = (see(variables, POINTS[name], camera())[0] for name in ("equal points", "one point"))
+    close(many, one, atol=1e-3)
+
+
+@pytest.mark.parametrize("name", ["outside the box", "far outside the box"])
+def test_points_outside_the_box_are_no_points(variables, name):
+    rendering, _, by_inputs = see(variables, POINTS[name], camera())
+    close(rendering, see(variables, POINTS["no point"], camera())[0], rtol=0, atol=0)
+    assert all((by_inputs[field] == 0).all() for field in ("positions", "base_color", "roughness", "metallic"))
+
+
+MATERIALS = {
+    "black": {"base_color": np.zeros((NUM_POINTS, 3))},
+    "white": {"base_color": np.ones((NUM_POINTS, 3))},
+    "a mirror": {"roughness": np.zeros(NUM_POINTS), "metallic": np.ones(NUM_POINTS)},
+    "chalk": {"roughness": np.ones(NUM_POINTS), "metallic": np.zeros(NUM_POINTS)},
+}
+
+
+def test_extreme_materials_are_finite_and_seen_by_evaluation(variables):
+    """In training the statistics of one object hide what is equal in all of its points; in evaluation nothing does."""
+    for materials in MATERIALS.values():
+        see(variables, cloud(**materials), camera())
+    handle = Model(config=MODEL, variables=variables)
+    images = []
+    for materials in MATERIALS.values():
+        one = jax.tree.map(lambda x: np.asarray(x)[0], cloud(**materials))
+        volume = handle.encode(one)
+        images.append(np.asarray(handle.render(volume, handle.camera(volume)).image_lr))
+    assert np.isfinite(images).all()
+    assert min(np.abs(images[i] - images[j]).max() for i in range(4) for j in range(i)) > 1e-4
+
+
+CAMERAS = {
+    "inside the object": camera(eye=(0.0, 0.1, 0.2)),
+    "on a point": camera(eye=RANDOM[0]),
+    "on a face": camera(eye=(0.0, 0.0, 1.0)),
+    "on a face, looking along it": camera(eye=(0.0, 0.0, 1.0), target=(1.0, 0.0, 1.0)),
+    "on a corner": camera(eye=(1.0, 1.0, 1.0)),
+    "along an axis": camera(eye=(0.0, 0.0, 3.0), field_of_view=0.0),
+    "in a face": camera(eye=(1.0, 0.0, 3.0), target=(1.0, 0.0, 0.0), field_of_view=0.0),
+    "along an edge": camera(eye=(1.0, 1.0, 3.0), target=(1.0, 1.0, 0.0), field_of_view=0.0),
+    "through an edge": camera(eye=(3.0, 0.0, 3.0), field_of_view=0.0),
+    "through two corners": camera(eye=(2.0, 2.0, 2.0), field_of_view=0.0),
+    "past an edge": camera(eye=(2.0, 0.0, 0.0), target=(1.0, 1.0, 0.0), field_of_view=0.0),
+    "half a sphere": camera(field_of_view=3.1),
+    "without a direction": camera(eye=(0.0, 0.0, 3.0), target=(0.0, 0.0, 3.0)),
+    "upright": camera(eye=(0.0, 3.0, 0.0)),
+    "far away": camera(eye=(0.0, 0.0, 1e6), field_of_view=1e-6),
+    "out of sight": camera(eye=(0.0, 0.0, 1e30)),
+}
+
+
+@pytest.mark.parametrize("name", CAMERAS)
+def test_any_camera_has_a_finite_picture_and_finite_gradients(variables, name):
+    rendering = see(variables, cloud(), CAMERAS[name])[0]
+    if "inside" in name or "on a point" in name:
+        assert (rendering.acc > 0).all(), "every ray passes the volume"
+    if "axis" in name or "through" in name:
+        assert (rendering.acc > 0).all()
+        close(rendering.image_lr, np.broadcast_to(rendering.image_lr[..., :1, :1, :], rendering.image_lr.shape))
+    if name in ("without a direction", "out of sight", "past an edge"):
+        assert (rendering.image_lr == 1).all()
+
+
+def test_looking_away_is_exactly_white_and_pulls_at_nothing_in_the_scene(variables):
+    rendering, by_weights, by_inputs = see(variables, cloud(), camera(target=(1.0, 1.6, 6.0)))
+    assert (rendering.image_lr == 1).all()
+    assert (rendering.acc == 0).all()
+    assert all((x == 0).all() for x in jax.tree.leaves(by_inputs))
+    assert all((x == 0).all() for part in ("pointnet", "unet", "field") for x in jax.tree.leaves(by_weights[part]))
+
+
+class TestUnits:
+    """Through the model handle, which normalises: in evaluation mode, each cloud in its own units."""
+
+    @staticmethod
+    def picture(variables, positions, count=NUM_POINTS):
+        handle = Model(config=MODEL, variables=variables)
+        one = jax.tree.map(lambda x: np.asarray(x)[0], cloud(base_color=np.asarray(numbers(5, NUM_POINTS, 3, low=0.0))))
+        one = jax.tree.map(lambda x: np.resize(x, (count, *x.shape[1:])), one)
+        volume = handle.encode(dataclasses.replace(one, positions=np.float32(positions)))
+        rendering = handle.render(volume, handle.camera(volume, 30.0, 20.0))
+        assert all(np.isfinite(x).all() for x in jax.tree.leaves(rendering))
+        return volume, rendering
+
+    @pytest.mark.parametrize("size", [1e-30, 1e-6, 1e6, 1e30])
+    def test_size_changes_nothing_but_the_unit_of_depth(self, variables, size):
+        _, expected = self.picture(variables, RANDOM)
+        _, rendering = self.picture(variables, size * np.float64(RANDOM))
+        close(rendering.image, expected.image, atol=1e-4)
+        close(rendering.acc, expected.acc, atol=1e-4)
+        close(rendering.depth / np.float32(size), expected.depth, rtol=1e-4)
+
+    @pytest.mark.parametrize("seed", range(5))
+    def test_the_ends_of_a_stick_along_an_axis_stay_in_the_box(self, variables, seed):
+        """They lie on two faces, and rounding must not drop them: a stick of two points has no others."""
+        rng = np.random.default_rng(seed)
+        ends = np.zeros((2, 3))
+        ends[:, seed % 3] = rng.normal(size=2) * 10.0 ** rng.uniform(-3, 3)
+        positions = np.repeat(ends, NUM_POINTS // 2, axis=0)
+        stick, _ = self.picture(variables, positions)
+        ends[:, seed % 3] = [-1, 1] if np.diff(ends[:, seed % 3]) > 0 else [1, -1]
+        exact, _ = self.picture(variables, np.repeat(ends, NUM_POINTS // 2, axis=0))
+        close(stick.scene, exact.scene, atol=1e-4)
+
+    @pytest.mark.slow
+    def test_a_million_points_that_are_copies_look_like_the_points(self, variables):
+        _, expected = self.picture(variables, RANDOM)
+        _, rendering = self.picture(variables, np.resize(RANDOM, (1_000_000, 3)), 1_000_000)
+        close(rendering, expected, atol=5e-3)

@@ -1,0 +1,97 @@
+"""How far a GPU may be from the CPU, and from itself: it sums in another order, scatters in any order, and rounds
+matrix products and convolutions to TF32 (10 bits) unless it is told not to.
+
+Without a GPU every test here is skipped.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support.laws import numbers
+from support.tiny_model import MODEL, camera, cloud, wobbled
+from support.tiny_training import BATCH, CONFIG
+
+from spnr_jax.kernels import voxels
+from spnr_jax.method import inference
+from spnr_jax.method.renderer import Renderer
+from spnr_jax.training import optimisation
+
+
+def devices(platform: str) -> list:
+    try:
+        return jax.devices(platform)
+    except RuntimeError:
+        return []
+
+
+pytestmark = pytest.mark.skipif(not devices("gpu"), reason="compares a GPU with the CPU, and JAX finds no GPU")
+TOLERANCE = {"highest": 1e-4, "default": 2e-2}  # of the largest entry
+
+
+def on(platform: str, function, *arguments):
+    """NumPy outputs of a function compiled for and run on that platform."""
+    device = devices(platform)[0]
+    with jax.default_device(device):
+        return jax.tree.map(np.asarray, jax.jit(function)(*jax.device_put(arguments, device)))
+
+
+def agree(actual, expected, tolerance):
+    """Each leaf differs by at most the tolerance times its largest entry."""
+    for ours, theirs in zip(jax.tree.leaves(actual), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=0, atol=tolerance * np.abs(theirs).max() + 1e-9)
+
+
+def picture_and_gradient(variables):
+    """Pictures of two objects, and the gradient of their sum of squares by the weights."""
+
+    def rendering(params):
+        return Renderer(MODEL).apply({**variables, "params": params}, cloud(), camera(24))
+
+    gradient = jax.grad(lambda params: jnp.mean(rendering(params).image ** 2))(variables["params"])
+    picture = rendering(variables["params"])
+    return (picture.image, picture.depth, picture.acc), gradient
+
+
+@pytest.mark.parametrize("precision", TOLERANCE)
+def test_pictures_and_gradients_are_those_of_the_cpu(precision):
+    variables = wobbled(Renderer(MODEL).init(jax.random.key(0), *inference.example_inputs(CONFIG.model)), 1)
+    with jax.default_matmul_precision(precision):
+        gpu = on("gpu", picture_and_gradient, variables)
+    agree(gpu, on("cpu", picture_and_gradient, variables), TOLERANCE[precision])
+
+
+def test_scatter_and_lookup_are_those_of_the_cpu_to_1e_5():
+    positions, features = numbers(0, 1000, 3), numbers(1, 1000, 4)
+
+    def there_and_back(positions, features):
+        volume, _ = voxels.scatter_mean(positions, features, jnp.ones(1000, bool), 8)
+        return volume, voxels.trilinear(volume, positions)
+
+    agree(*(on(platform, there_and_back, positions, features) for platform in ("gpu", "cpu")), 1e-5)
+
+
+def test_two_runs_of_a_step_on_a_gpu_differ_by_no_more_than_the_order_of_its_sums():
+    """One part in a hundred thousand of each gradient; Adam hides sizes in its step, its mean shows them."""
+
+    def first_step():
+        state, metrics = optimisation.train_step(
+            optimisation.create_state(CONFIG), BATCH, config=CONFIG, adversarial=True
+        )
+        return metrics["loss"], state.generator_optimizer[0].mu, state.discriminator_optimizer[0].mu
+
+    agree(on("gpu", first_step), on("gpu", first_step), 1e-5)
+
+
+def test_training_on_a_gpu_loses_as_much_as_on_the_cpu():
+    """Twenty steps; a run is not the other run bit by bit, but a curve like it to a fiftieth."""
+
+    def curve():
+        def step(state, _):
+            state, metrics = optimisation.train_step(state, BATCH, config=CONFIG, adversarial=True)
+            return state, metrics["loss"]
+
+        return jax.lax.scan(step, optimisation.create_state(CONFIG), None, length=20)[1]
+
+    gpu, cpu = on("gpu", curve), on("cpu", curve)
+    assert np.abs(gpu - cpu).mean() < 0.02 * cpu[0]

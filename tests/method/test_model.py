@@ -1,0 +1,169 @@
+"""The handle: any units, any number of points, one camera or many, and the same picture whatever the memory allows."""
+
+import dataclasses
+import inspect
+
+import jax
+import numpy as np
+import pytest
+from support import tiny_dataset
+from support.laws import close
+
+import spnr_jax
+from spnr_jax.formats import data_sets
+from spnr_jax.kernels import cameras
+from spnr_jax.kernels.records import Camera, PointCloud
+from spnr_jax.method import inference, model
+from spnr_jax.model_config import NPBGConfig, SamplingConfig
+
+
+@pytest.fixture(scope="module")
+def handle():
+    return spnr_jax.load(tiny_dataset.run())
+
+
+def example_cloud(count=40, seed=0):
+    rng = np.random.default_rng(seed)
+    return PointCloud(
+        positions=rng.uniform(-0.5, 0.5, (count, 3)).astype(np.float32),
+        base_color=rng.random((count, 3)).astype(np.float32),
+        roughness=rng.random(count).astype(np.float32),
+        metallic=rng.random(count).astype(np.float32),
+        mask=np.ones(count, bool),
+    )
+
+
+def test_moving_and_scaling_cloud_and_camera_together_changes_only_the_unit_of_depth(handle):
+    cloud, factor, shift = example_cloud(), 8.0, np.float32([16.0, -4.0, 2.0])
+    volume = handle.encode(cloud)
+    camera = handle.camera(volume, 40.0, 25.0)
+    moved = handle.encode(dataclasses.replace(cloud, positions=cloud.positions * np.float32(factor) + shift))
+    pose = np.array(camera.cam_to_world)
+    pose[:, 3] = pose[:, 3] * factor + shift
+    far_away = handle.render(moved, dataclasses.replace(camera, cam_to_world=jax.numpy.asarray(pose)))
+    rendering = handle.render(volume, camera)
+    close(far_away.image, rendering.image, rtol=0, atol=2e-4)
+    close(far_away.acc, rendering.acc, rtol=0, atol=2e-4)
+    close(far_away.depth, factor * rendering.depth, rtol=2e-4)
+
+
+def test_depth_is_the_distance_in_the_clouds_units(handle):
+    cloud = example_cloud()
+    cloud = dataclasses.replace(cloud, positions=100 * cloud.positions)
+    volume = handle.encode(cloud)
+    camera = handle.camera(volume)
+    distance = float(np.linalg.norm(np.asarray(camera.cam_to_world)[:, 3] - np.asarray(volume.centre)))
+    depth = np.asarray(handle.render(volume, camera).depth)
+    half = np.sqrt(3) / float(volume.scale)  # of the box's diagonal
+    hit = depth > 0
+    assert hit.sum() > 10
+    assert np.all(np.abs(depth[hit] - distance) <= half)
+
+
+def test_the_cameras_of_the_handle_look_at_the_middle_of_the_cloud(handle):
+    cloud = example_cloud()
+    volume = handle.encode(dataclasses.replace(cloud, positions=cloud.positions * 5 + 30))
+    for azimuth, elevation in ((0.0, 0.0), (130.0, 50.0), (10.0, 90.0), (10.0, -90.0)):
+        camera = handle.camera(volume, azimuth, elevation, resolution=32)
+        pixels, _ = cameras.project(camera, volume.centre[None])
+        close(pixels[0], np.float32([16, 16]), atol=1e-3)
+
+
+def test_an_axis_of_views_holds_what_each_camera_sees_alone(handle):
+    volume = handle.encode(example_cloud())
+    single = [handle.camera(volume, azimuth, 20.0) for azimuth in (0.0, 100.0)]
+    stacked = Camera(
+        cam_to_world=jax.numpy.stack([c.cam_to_world for c in single]),
+        intrinsics=jax.numpy.stack([c.intrinsics for c in single]),
+        height=single[0].height,
+        width=single[0].width,
+    )
+    together = handle.render(volume, stacked)
+    for i, camera in enumerate(single):
+        close(jax.tree.map(lambda x, i=i: x[i], together), handle.render(volume, camera), atol=1e-5)
+
+
+def test_the_handle_shows_what_the_evaluation_shows(handle):
+    item = data_sets.read_object(tiny_dataset.dataset(), "ball_000004")
+    expected = inference.render_views(handle.variables, tiny_dataset.CONFIG.model, item.cloud, item.camera)
+    encoded = inference.jitted_encode(
+        handle.variables, jax.tree.map(lambda x: jax.numpy.asarray(x)[None], item.cloud), config=handle.config
+    )
+    volume = model.Volume(
+        scene=jax.tree.map(lambda x: x[0], encoded),
+        centre=jax.numpy.zeros(3),
+        scale=jax.numpy.ones(()),
+    )
+    views = jax.tree.map(jax.numpy.asarray, item.camera)
+    close(handle.render(volume, views, "trained"), expected, atol=1e-5)
+
+
+def test_points_that_are_masked_do_not_count(handle):
+    cloud = example_cloud(40)
+    longer = jax.tree.map(lambda x: np.concatenate([x, x[:5]]), cloud)
+    longer.mask[40:] = False
+    longer.positions[40:] = 1e6
+    close(handle.encode(longer), handle.encode(cloud))
+
+
+def test_a_cloud_of_one_point_renders(handle):
+    volume = handle.encode(example_cloud(1))
+    assert np.isfinite(np.asarray(handle.render(volume, handle.camera(volume)).image)).all()
+
+
+def test_a_cloud_without_points_is_refused(handle):
+    cloud = example_cloud(3)
+    for empty in (jax.tree.map(lambda x: x[:0], cloud), dataclasses.replace(cloud, mask=np.zeros(3, bool))):
+        with pytest.raises(ValueError, match="no points"):
+            handle.encode(empty)
+
+
+@pytest.mark.parametrize("name", ["positions", "base_color", "roughness", "metallic"])
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_number_that_is_not_finite_is_refused_by_its_name(name, value, handle):
+    cloud = example_cloud(3)
+    getattr(cloud, name)[1] = value
+    with pytest.raises(ValueError, match=f"NaN or infinity in its {name}"):
+        handle.encode(cloud)
+
+
+def test_an_odd_picture_is_refused_where_the_network_doubles(handle):
+    volume = handle.encode(example_cloud())
+    with pytest.raises(ValueError, match="25 x 25 pixels must be even"):
+        handle.render(volume, handle.camera(volume, resolution=25))
+
+
+def test_a_run_without_a_checkpoint_says_how_to_get_one(tmp_path):
+    (tmp_path / "config.json").write_text((tiny_dataset.run() / "config.json").read_text())
+    with pytest.raises(ValueError, match="no checkpoint yet.*spnr train"):
+        spnr_jax.load(tmp_path)
+
+
+class TestQuality:
+    @pytest.mark.parametrize(("quality", "samples"), [("draft", 2), ("balanced", 4), ("best", 8)])
+    def test_a_quality_is_a_share_of_the_samples_near_the_points(self, quality, samples):
+        config = dataclasses.replace(tiny_dataset.CONFIG.model, sampling=SamplingConfig(num_coarse=4, num_fine=4))
+        expected = SamplingConfig(num_coarse=samples, num_fine=0, reach=3)
+        assert model.at_quality(config, quality, 3) == dataclasses.replace(config, sampling=expected)
+
+    def test_trained_is_the_config_of_the_network_and_so_is_every_quality_of_other_networks(self):
+        config = tiny_dataset.CONFIG.model
+        assert model.at_quality(config, "trained", 3) == config
+        assert model.at_quality(NPBGConfig(), "draft", 3) == NPBGConfig()
+
+    def test_another_word_is_refused(self):
+        unchecked = inspect.unwrap(model.at_quality)  # the tests' type check would refuse it first
+        with pytest.raises(ValueError, match="quality must be one of draft, balanced, best, trained, got fast"):
+            unchecked(tiny_dataset.CONFIG.model, "fast", 1)
+
+    @pytest.mark.parametrize("quality", ["draft", "balanced", "best", "trained"])
+    def test_every_quality_shows_the_object(self, handle, quality):
+        volume = handle.encode(example_cloud())
+        rendering = handle.render(volume, handle.camera(volume), quality)
+        assert np.isfinite(np.asarray(rendering.image)).all()
+        assert (np.asarray(rendering.acc) > 0).any()
+
+    def test_reach_follows_the_distance_between_the_points(self):
+        grid = np.stack(np.meshgrid(*[np.linspace(-1, 1, 9)] * 3), axis=-1).reshape(-1, 3)  # a quarter apart
+        assert [model.reach_of(grid, resolution) for resolution in (4, 8, 16, 64)] == [1, 2, 4, 4]
+        assert model.reach_of(grid[:1], 32) == model.LARGEST_REACH

@@ -1,0 +1,273 @@
+"""Every stage against a PyTorch twin with the same weights: outputs, losses, statistics, gradients.
+
+The twin's numbers were computed in float64; this code runs in float32 and must agree to 1e-4 of the norm.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support import twin
+
+from experiments.speed import twin_layout
+from spnr_jax import cameras, compositing, losses, sampling, training, voxels
+from spnr_jax.nn.encoding import encode_direction
+from spnr_jax.training import optimisation
+
+TOLERANCE = 1e-4
+ARRAYS = twin.load()
+CONFIG = twin_layout.train_config(ARRAYS)
+BATCH = jax.tree.map(jnp.asarray, twin_layout.batch(ARRAYS))
+GENERATOR, STATISTICS = twin_layout.generator(ARRAYS)
+DISCRIMINATOR = twin_layout.discriminator(ARRAYS)
+VARIABLES = {"params": GENERATOR, "batch_stats": STATISTICS}
+
+
+def agree(ours, theirs, tolerance=TOLERANCE):
+    """The norm of the difference is a 10 000th of the norm."""
+    ours, theirs = np.asarray(ours, np.float64), np.asarray(theirs, np.float64)
+    assert ours.shape == theirs.shape
+    assert np.linalg.norm(ours - theirs) <= tolerance * np.linalg.norm(theirs)
+
+
+def pictures(key):
+    """An image stack of the fixture (1, c, h, w) as (1 view, h, w, c)."""
+    return np.moveaxis(ARRAYS[key], 1, -1)
+
+
+@pytest.fixture(scope="module")
+def stages():
+    """Every intermediate result of the generator in evaluation, from one compiled call."""
+
+    @jax.jit
+    def run(variables, cloud, camera):
+        renderer = Renderer(CONFIG.model)
+        module = renderer.bind(variables)
+        resolution, counts = CONFIG.model.volume_resolution, CONFIG.model.sampling
+        point_features = module.pointnet(module.point_inputs(cloud), cloud.mask, False)
+        scene = module.encode(cloud)
+        volume = scene.volume
+        rays = module.rays(camera)
+        near, far, _ = cameras.intersect_box(rays.origins, rays.directions)
+        view = module.field.view(rays.directions)
+        coarse, edges = sampling.stratified(None, near, far, counts.num_coarse)
+        positions = rays.origins[..., None, :] + coarse[..., None] * rays.directions[..., None, :]
+        density, (rgb, _) = module.shade(scene, rays, view, coarse)
+        weights, _ = compositing.volume_weights(density, compositing.interval_lengths(coarse, far))
+        features, depth, acc = module.render_rays(scene, rays)
+        return {
+            "voxel": voxels.locate(cloud.positions, resolution),
+            "point_features": point_features[0],
+            "grid": voxels.scatter_mean(cloud.positions, point_features, cloud.mask, resolution),
+            "volume": volume,
+            "ray_direction": rays.directions,
+            "near": near[..., None],
+            "far": far[..., None],
+            "direction_encoding": encode_direction(rays.directions, CONFIG.model.direction_frequencies),
+            "coarse_t": coarse,
+            "coarse_lookup": voxels.trilinear(volume, jnp.clip(positions, -1, 1)),  # rays that miss: the twin clamps
+            "coarse_density": density,
+            "coarse_rgb": rgb,
+            "coarse_weights": weights,
+            "fine_t": sampling.importance(None, edges, weights, counts.num_fine, counts.padding),
+            "features": features,
+            "depth": depth,
+            "acc": acc,
+            "rendering": module.render(scene, camera),
+        }
+
+    return run(VARIABLES, BATCH.cloud, BATCH.camera)
+
+
+class TestGeneratorStages:
+    def test_points_lie_in_the_same_voxels_at_the_same_offsets(self, stages):
+        cell, offset = (np.asarray(x[0]) for x in stages["voxel"])
+        d = CONFIG.model.volume_resolution
+        np.testing.assert_array_equal((cell[:, 2] * d + cell[:, 1]) * d + cell[:, 0], ARRAYS["eval/voxel_index"])
+        agree(offset, ARRAYS["eval/voxel_offset"][0])
+
+    def test_point_features(self, stages):
+        agree(stages["point_features"], ARRAYS["eval/point_features"])
+
+    def test_scattered_grid(self, stages):
+        volume, occupancy = stages["grid"]
+        agree(np.concatenate([volume, occupancy[..., None]], axis=-1), np.moveaxis(ARRAYS["eval/grid"], 1, -1))
+
+    def test_feature_volume(self, stages):
+        agree(stages["volume"], np.moveaxis(ARRAYS["eval/volume"], 1, -1))
+
+    @pytest.mark.parametrize(
+        "name", ["ray_direction", "near", "far", "coarse_t", "coarse_density", "coarse_weights", "fine_t"]
+    )
+    def test_along_the_rays(self, stages, name):
+        agree(stages[name], ARRAYS[f"eval/{name}"])
+
+    def test_direction_encoding_of_the_first_pixel_of_every_row(self, stages):
+        encoding = np.asarray(stages["direction_encoding"]).reshape(1, 32, 32, -1)
+        agree(encoding[:, :, 0], ARRAYS["eval/direction_encoding"])
+
+    def test_lookups_and_colours_of_the_first_row(self, stages):
+        agree(stages["coarse_lookup"][:, :32], ARRAYS["eval/coarse_lookup_row0"])
+        agree(stages["coarse_rgb"][:, :32], ARRAYS["eval/coarse_rgb_row0"])
+
+    def test_rendered_features(self, stages):
+        features = np.asarray(stages["features"]).reshape(1, 32, 32, -1)
+        agree(features, pictures("eval/features"))
+        agree(features[..., :3], pictures("eval/rgb"))
+        agree(stages["rendering"].image_lr[:, 0], pictures("eval/rgb"))
+
+    def test_opacity_and_depth(self, stages):
+        acc, depth, far = (np.asarray(stages[name]).reshape(1, 32, 32, 1) for name in ("acc", "depth", "far"))
+        agree(acc, pictures("eval/acc"))
+        agree(depth - (1 - acc) * far, pictures("eval/depth"))  # ours adds the light that nothing stops, at `far`
+
+    def test_image(self, stages):
+        agree(stages["rendering"].image[:, 0], pictures("eval/image"))
+
+    @pytest.mark.parametrize(("name", "source"), [("fake", "eval/image"), ("real", "in/target")])
+    def test_logits(self, name, source):
+        image = jnp.asarray(pictures(source))
+        logits = optimisation.discriminator_of(CONFIG).apply(
+            {"params": DISCRIMINATOR}, image, BATCH.condition[0], BATCH.condition_mask[0]
+        )
+        agree(logits, pictures(f"eval/logits_{name}"))
+
+
+def judge(params, image):
+    logits = optimisation.discriminator_of(CONFIG).apply(
+        {"params": params}, image[:, 0], BATCH.condition[0], BATCH.condition_mask[0]
+    )
+    return losses.generator_adversarial(logits)
+
+
+@pytest.fixture(scope="module")
+def trained():
+    """Rendering, losses, statistics and gradients of the generator in training, without jitter."""
+
+    @jax.jit
+    def run(params):
+        def loss(params):
+            variables = {"params": params, "batch_stats": STATISTICS}
+            rendering, updated = Renderer(CONFIG.model).apply(
+                variables, BATCH.cloud, BATCH.camera, train=True, mutable=["batch_stats"]
+            )
+            l1 = optimisation.reconstruction_loss(CONFIG, rendering.image, rendering.image_lr, BATCH.image)
+            adversarial = CONFIG.loss.adversarial_weight * judge(DISCRIMINATOR, rendering.image)
+            parts = {"l1": l1, "adv": adversarial, "loss_g": l1 + adversarial}
+            return l1 + adversarial, (rendering, updated["batch_stats"], parts)
+
+        return jax.value_and_grad(loss, has_aux=True)(params)
+
+    (_, (rendering, statistics, parts)), gradients = run(GENERATOR)
+    return rendering, statistics, parts, gradients
+
+
+class TestGeneratorTraining:
+    def test_images_with_batch_statistics(self, trained):
+        rendering = trained[0]
+        agree(rendering.image[:, 0], pictures("train/image"))
+        agree(rendering.image_lr[:, 0], pictures("train/rgb"))
+        agree(rendering.acc[:, 0, ..., None], pictures("train/acc"))
+        far = ARRAYS["eval/far"].reshape(1, 32, 32, 1)
+        acc, depth = (np.asarray(x)[:, 0, ..., None] for x in (rendering.acc, rendering.depth))
+        agree(depth - (1 - acc) * far, pictures("train/depth"))
+
+    @pytest.mark.parametrize("name", ["l1", "adv", "loss_g"])
+    def test_losses(self, trained, name):
+        agree(trained[2][name], ARRAYS[f"train/{name}"])
+
+    @pytest.mark.parametrize("layer", range(3))
+    def test_running_statistics_after_one_forward(self, trained, layer):
+        ours = trained[1]["pointnet"][f"norm_{layer}"]
+        agree(ours["mean"], ARRAYS[f"train/after/points.norms.{layer}.running_mean"])
+        agree(ours["variance"], ARRAYS[f"train/after/points.norms.{layer}.running_var"])
+
+    def test_gradient_norm_of_every_parameter(self, trained):
+        norms = {k.removeprefix("train/grad_norm/gen."): v for k, v in ARRAYS.items() if "grad_norm/gen." in k}
+        ours = twin_named(trained[3])
+        assert set(ours) == set(norms)
+        for name, norm in norms.items():
+            agree(np.linalg.norm(ours[name]), norm)
+
+    def test_gradients_where_they_are_stored_in_full(self, trained):
+        stored = {k.removeprefix("train/grad/gen."): v for k, v in ARRAYS.items() if k.startswith("train/grad/gen.")}
+        ours = twin_named(trained[3])
+        for name, gradient in stored.items():
+            agree(ours[name], gradient)
+
+
+def twin_named(tree):
+    """Gradients under the twin's names and in its layout."""
+
+    def conv(x):
+        return np.moveaxis(np.asarray(x), (-1, -2), (0, 1))
+
+    points, unet, upsampler = tree["pointnet"], tree["unet"], tree["upsampler"]
+    named = {"points.out.weight": points["out"]["kernel"].T, "points.out.bias": points["out"]["bias"]}
+    for i in range(3):
+        named[f"points.linears.{i}.weight"] = points[f"hidden_{i}"]["kernel"].T
+        named |= {
+            f"points.norms.{i}.weight": points[f"norm_{i}"]["scale"],
+            f"points.norms.{i}.bias": points[f"norm_{i}"]["bias"],
+        }
+    for name, block in unet.items():
+        prefix = "unet." + name.replace("_", ".")
+        named |= {f"{prefix}.conv.weight": conv(block["kernel"])}
+        named |= {f"{prefix}.norm.weight": block["norm"]["scale"], f"{prefix}.norm.bias": block["norm"]["bias"]}
+    for i in range(4):
+        named |= {
+            f"upsampler.conv{i}.weight": conv(upsampler[f"kernel_{i}"]),
+            f"upsampler.conv{i}.bias": upsampler[f"bias_{i}"],
+        }
+    return named | twin_named_field(tree["field"])
+
+
+def twin_named_field(field):
+    """Ours keeps density and RGB in one matrix, and the rows of hidden layer and direction in two."""
+    head, bias = field["head"]["kernel"], field["head"]["bias"]
+    hidden = np.concatenate([head[:, 1:], field["features"]["kernel"]], axis=1)
+    return {
+        "renderer.field.hidden.weight": field["hidden"]["kernel"].T,
+        "renderer.field.hidden.bias": field["hidden"]["bias"],
+        "renderer.field.density.weight": head[:, :1].T,
+        "renderer.field.density.bias": bias[:1],
+        "renderer.field.feature.weight": np.concatenate([hidden, field["direction"]["kernel"]]).T,
+        "renderer.field.feature.bias": np.concatenate([bias[1:], field["feature_bias"]]),
+    }
+
+
+@pytest.fixture(scope="module")
+def discriminated():
+    """Loss and R1 penalty of the discriminator on the twin's training image, each with its gradients."""
+    fake = jnp.asarray(pictures("train/image"))
+    real, condition, mask = BATCH.image[0], BATCH.condition[0], BATCH.condition_mask[0]
+    module = optimisation.discriminator_of(CONFIG)
+
+    def loss(params):  # step 1, where no R1 is due
+        return optimisation.discriminator_loss(CONFIG, params, fake, BATCH, jnp.int32(1))[0]
+
+    def penalty(params):
+        r1 = losses.r1(lambda image: module.apply({"params": params}, image, condition, mask), real)
+        return CONFIG.loss.r1_gamma * r1
+
+    return {name: jax.jit(jax.value_and_grad(f))(DISCRIMINATOR) for name, f in (("loss_d", loss), ("r1", penalty))}
+
+
+class TestDiscriminatorTraining:
+    @pytest.mark.parametrize("name", ["loss_d", "r1"])
+    def test_losses(self, discriminated, name):
+        agree(discriminated[name][0], ARRAYS[f"train/{name}"])
+
+    @pytest.mark.parametrize(("name", "key"), [("loss_d", "grad_norm"), ("r1", "grad_norm_r1")])
+    def test_gradient_norm_of_every_parameter(self, discriminated, name, key):
+        stored = {k.split("disc.")[1]: v for k, v in ARRAYS.items() if k.startswith(f"train/{key}/disc.")}
+        assert len(stored) == 13
+        for parameter, norm in stored.items():
+            agree(np.linalg.norm(parameter_of(discriminated[name][1], parameter)), norm)
+
+
+def parameter_of(tree, name):
+    kind, i, what = name.split(".")
+    if kind == "convs":
+        return tree[f"{'kernel' if what == 'weight' else 'bias'}_{i}"]
+    return tree[f"norm_{i}"]["scale" if what == "weight" else "bias"]

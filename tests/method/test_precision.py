@@ -1,0 +1,93 @@
+"""Convolutions in bfloat16: an option that changes nothing else, and nothing at all while it is off."""
+
+import dataclasses
+import functools
+import re
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support.laws import numbers, same_bits
+from support.tiny_model import MODEL, camera, cloud
+from support.tiny_training import BATCH, CONFIG, L1_ONLY, create, step
+
+from spnr_jax.kernels.records import Rays, Scene
+from spnr_jax.method.renderer import Renderer
+from spnr_jax.training import optimisation
+
+BF16_MODEL = dataclasses.replace(MODEL, precision="bfloat16")
+BF16 = dataclasses.replace(CONFIG, model=BF16_MODEL)
+CONVOLUTION = re.compile(r":(\w+)\[[\d,]*\] = conv_general_dilated")
+STATISTIC = re.compile(r":(\w+)\[[\d,]*\] = (?:reduce_sum|sqrt|div)")
+
+
+@functools.cache
+def traced(config) -> tuple[str, dict]:
+    """A step of both networks and a picture from fresh weights, written out, and the formats of all results."""
+
+    def everything():
+        state = optimisation.create_state(config)
+        picture = Renderer(config.model).apply(optimisation.averaged_variables(state), cloud(), camera(24))
+        state, metrics = optimisation.train_step(state, BATCH, config=config, adversarial=True)
+        return {"state": state, "metrics": metrics, "picture": picture}
+
+    jaxpr, shapes = jax.make_jaxpr(everything, return_shape=True)()
+    return str(jaxpr), jax.tree.map(lambda x: (x.shape, x.dtype), shapes)
+
+
+def test_while_it_is_off_no_number_is_a_bfloat16():
+    assert "bf16" not in traced(CONFIG)[0]
+
+
+def test_every_convolution_and_its_gradients_run_in_bfloat16():
+    assert set(CONVOLUTION.findall(traced(CONFIG)[0])) == {"f32"}
+    assert set(CONVOLUTION.findall(traced(BF16)[0])) == {"bf16"}
+
+
+def test_statistics_of_the_normalisations_stay_float32():
+    assert "bf16" not in STATISTIC.findall(traced(BF16)[0])
+
+
+def test_points_field_sampling_and_compositing_stay_float32():
+    rays = Rays(origins=numbers(0, 2, 6, 3), directions=numbers(1, 2, 6, 3))
+    scene = Scene(volume=jnp.zeros((2, 8, 8, 8, 4)), occupied=jnp.ones((2, 8, 8, 8), bool))
+    variables = jax.eval_shape(lambda: Renderer(BF16_MODEL).init(jax.random.key(0), cloud(), camera(24)))
+
+    def samples(variables, key):
+        return Renderer(BF16_MODEL).bind(variables).render_rays(scene, rays, key)
+
+    def points(variables):
+        module = Renderer(BF16_MODEL).bind(variables)
+        return module.pointnet(module.point_inputs(cloud()), cloud().mask, False)
+
+    assert "bf16" not in str(jax.make_jaxpr(samples)(variables, jax.random.key(0)))
+    assert "bf16" not in str(jax.make_jaxpr(points)(variables))
+
+
+def test_state_metrics_and_pictures_have_the_formats_of_float32():
+    assert traced(BF16)[1] == traced(CONFIG)[1]
+
+
+def test_both_begin_with_the_same_weights():
+    same_bits(create(dataclasses.replace(L1_ONLY, model=BF16_MODEL)), create(L1_ONLY))
+
+
+@pytest.mark.parametrize("start", [L1_ONLY, pytest.param(CONFIG, marks=pytest.mark.slow)], ids=["L1", "both networks"])
+def test_thirty_steps_lose_as_much_as_in_float32(start):
+    """The curves differ by at most a twentieth of the first loss, and on average by a fiftieth."""
+    single, half = (loss_curve(dataclasses.replace(start, model=model)) for model in (MODEL, BF16_MODEL))
+    apart = np.abs(half - single) / single[0]
+    assert apart.max() > 0
+    assert apart.max() < 0.05
+    assert apart.mean() < 0.02
+    assert half[-1] < 0.5 * half[0]
+
+
+def loss_curve(config):
+    """Loss of each of thirty steps on one batch."""
+    state, losses = create(config), []
+    for _ in range(30):
+        state, metrics = step(state, config)
+        losses.append(float(metrics["loss"]))
+    return np.array(losses)

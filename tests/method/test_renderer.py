@@ -1,0 +1,306 @@
+"""The generator as a whole, shrunken: what must not change its pictures, and what must."""
+
+import dataclasses
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support import reference, tiny_model
+from support.laws import batch_law, close, gradient_law, numbers, same_bits
+from support.tiny_model import NUM_POINTS, camera, cloud, wobbled
+
+from spnr_jax.kernels import sampling
+from spnr_jax.kernels.cameras import intersect_box, view_rays
+from spnr_jax.kernels.records import Rays, Scene
+from spnr_jax.method import inference
+from spnr_jax.method.renderer import Renderer, union_weights
+
+SUPPORT = Path(__file__).parents[1] / "support"
+CONFIG = tiny_model.WITHOUT_UPSAMPLER
+
+
+@pytest.fixture(scope="module")
+def variables():
+    return wobbled(jax.jit(Renderer(CONFIG).init)(jax.random.key(0), cloud(), camera()), 4)
+
+
+def encode(variables, cloud, config=CONFIG):
+    return inference.jitted_encode(variables, cloud, config=config)
+
+
+def scene(volume):
+    return Scene(volume=volume, occupied=jnp.ones(volume.shape[:-1], bool))
+
+
+def render(variables, volume, camera, config=CONFIG, **options):
+    return inference.jitted_render(variables, volume, camera, config=config, **options)
+
+
+@jax.jit
+def jittered(variables, cloud, camera, key):
+    return Renderer(CONFIG).apply(variables, cloud, camera, key, train=True, mutable=["batch_stats"])
+
+
+class TestCloud:
+    def test_the_order_of_the_points_does_not_change_the_volume(self, variables):
+        order = np.random.default_rng(5).permutation(NUM_POINTS)
+        shuffled = jax.tree.map(lambda x: x[:, order], cloud())
+        close(encode(variables, shuffled), encode(variables, cloud()), rtol=1e-4, atol=1e-5)
+
+    def test_padding_to_another_bucket_does_not_change_a_bit_of_the_volume(self, variables):
+        def padded(count):
+            return jax.tree.map(
+                lambda x: jnp.pad(x, [(0, 0), (0, count - NUM_POINTS)] + [(0, 0)] * (x.ndim - 2)), cloud()
+            )
+
+        same_bits(encode(variables, padded(1024)), encode(variables, padded(512)))
+
+    @pytest.mark.parametrize("fill", [0.0, np.nan])
+    def test_padding_does_not_change_image_or_statistics_whatever_it_holds(self, variables, fill):
+        plain, key = cloud(), jax.random.key(1)
+
+        def pad(x):
+            return jnp.concatenate([x, jnp.full((2, 5, *x.shape[2:]), fill, x.dtype)], axis=1)
+
+        padded = jax.tree.map(pad, dataclasses.replace(plain, mask=jnp.zeros((2, NUM_POINTS))))
+        padded = dataclasses.replace(padded, mask=jnp.concatenate([plain.mask, jnp.zeros((2, 5), bool)], axis=1))
+        expected = jittered(variables, plain, camera(), jax.random.clone(key))
+        close(jittered(variables, padded, camera(), key), expected, rtol=1e-4, atol=1e-5)
+
+    def test_what_fills_the_padding_does_not_reach_the_gradient(self, variables):
+        def gradient(cloud):
+            def total(params):
+                module = Renderer(CONFIG).bind({**variables, "params": params})
+                features = module.pointnet(module.point_inputs(cloud), cloud.mask, train=False)
+                return jnp.sum(jnp.where(cloud.mask[..., None], features, 0) ** 2)
+
+            return jax.grad(total)(variables["params"])["pointnet"]
+
+        mask = cloud().mask.at[:, 5:].set(False)
+        zeros, spoilt = (
+            jax.tree.map(
+                lambda x, fill=fill: jnp.where(mask.reshape(*mask.shape, *[1] * (x.ndim - 2)), x, fill), cloud()
+            )
+            for fill in (0, jnp.nan)
+        )
+        zeros, spoilt = (dataclasses.replace(c, mask=mask) for c in (zeros, spoilt))
+        close(gradient(spoilt), gradient(zeros))
+
+    def test_in_evaluation_an_object_does_not_see_the_others(self, variables):
+        both = render(variables, encode(variables, cloud()), camera())
+        alone = jax.tree.map(lambda x: x[1:], (cloud(), camera()))
+        close(
+            render(variables, encode(variables, alone[0]), alone[1]),
+            jax.tree.map(lambda x: x[1:], both),
+            rtol=1e-4,
+            atol=1e-5,
+        )
+
+    @pytest.mark.parametrize("scatter", ["max", "trilinear"])
+    def test_another_scatter_gives_another_volume_and_the_same_occupied_voxels(self, variables, scatter):
+        """Rendering near points looks around the voxels that hold points, however these are scattered."""
+        config = dataclasses.replace(CONFIG, scatter=scatter)
+        plain, other = encode(variables, cloud()), encode(variables, cloud(), config)
+        same_bits(other.occupied, plain.occupied)
+        assert (jnp.abs(other.volume - plain.volume) > 1e-3).any()
+        order = np.random.default_rng(5).permutation(NUM_POINTS)
+        shuffled = jax.tree.map(lambda x: x[:, order], cloud())
+        close(encode(variables, shuffled, config), other, rtol=1e-4, atol=1e-5)
+
+    def test_no_point_gives_a_finite_volume(self, variables):
+        empty = dataclasses.replace(cloud(), mask=jnp.zeros((2, NUM_POINTS), bool))
+        assert jnp.isfinite(encode(variables, empty).volume).all()
+
+    @pytest.mark.parametrize("materials", [(), ("roughness",), ("base_color", "metallic")], ids=str)
+    def test_materials_that_the_config_leaves_out_are_not_read(self, materials):
+        config = dataclasses.replace(CONFIG, materials=materials)
+        module, unread = Renderer(config), {"base_color", "roughness", "metallic"} - set(materials)
+        spoilt = dataclasses.replace(
+            cloud(), **{name: jnp.full_like(getattr(cloud(), name), jnp.nan) for name in unread}
+        )
+        inputs = module.apply({}, spoilt, method="point_inputs")
+        assert inputs.shape[-1] == 6 + config.num_material_channels
+        assert jnp.isfinite(inputs).all()
+        names = iter(range(6, inputs.shape[-1]))
+        for name in materials:
+            given = np.asarray(getattr(cloud(), name)).reshape(2, NUM_POINTS, -1)
+            close(np.asarray(inputs)[..., [next(names) for _ in range(given.shape[-1])]], given, rtol=0)
+
+
+class TestViews:
+    def test_a_view_does_not_depend_on_the_other_views(self, variables):
+        volume, views = encode(variables, cloud()), camera()
+        both = render(variables, volume, views)
+        second = jax.tree.map(lambda x: x[:, 1:], views)
+        close(render(variables, volume, second), jax.tree.map(lambda x: x[:, 1:], both), rtol=1e-4, atol=1e-5)
+
+    def test_samples_at_entry_and_exit_see_the_volume(self, variables):
+        """Rounding puts many of them a little outside the box, where there is nothing."""
+        rays = view_rays(camera(32))
+        near, far, hit = intersect_box(rays.origins, rays.directions)
+        volume = jnp.ones((2, *[CONFIG.volume_resolution] * 3, CONFIG.base_width))
+        module = Renderer(CONFIG).bind(variables)
+        distances = jnp.stack([near, 0.5 * (near + far), far], axis=-1)
+        density, _ = module.shade(scene(volume), rays, module.field.view(rays.directions), distances)
+        assert hit.sum() > 500
+        close(density[hit], jnp.broadcast_to(density[hit][:, 1:2], density[hit].shape))
+
+    @pytest.mark.parametrize("ray_chunk", [1, 7, 64])
+    def test_rays_do_not_know_their_chunk(self, variables, ray_chunk):
+        """To a few roundings: a matrix product of another size adds in another order."""
+        volume = encode(variables, cloud())
+        whole, chunked = (render(variables, volume, camera(), ray_chunk=chunk) for chunk in (1000, ray_chunk))
+        close(chunked, whole, rtol=1e-6, atol=1e-6)
+        same_bits(render(variables, volume, camera(), ray_chunk=ray_chunk), chunked)
+
+    @pytest.mark.slow
+    def test_rays_of_one_object_have_the_same_bits_in_every_chunk_of_a_fair_size(self):
+        """As users compile: the flags of this suite let another program come out for every size."""
+        environment = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
+        environment["PYTHONPATH"] = os.pathsep.join(map(str, SUPPORT.parents[:2]))
+        command = [
+            sys.executable,
+            SUPPORT / "chunk_bits.py",
+            "256",
+            "500",
+            "1024",
+            "2048",
+        ]
+        checksums = subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout.split()
+        assert len(checksums) == 4
+        assert len(set(checksums)) == 1
+
+    def test_samples_of_rays_that_graze_an_edge_stay_in_the_box(self, variables):
+        """Their way through it is shorter than the rounding of a position, and outside there would be nothing."""
+        rng = np.random.default_rng(8)
+        edge = np.float32([1, 1, 0]) * (1 - 1e-6 * rng.random((1000, 1))) + np.float32([0, 0, 0.9]) * rng.random(
+            (1000, 1)
+        )
+        directions = np.float32([-1, 1, 0]) + 0.3 * rng.normal(size=(1000, 3))
+        directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+        rays = Rays(origins=jnp.float32(edge - 7 * directions)[None], directions=jnp.float32(directions)[None])
+        near, far, hit = map(np.asarray, intersect_box(rays.origins, rays.directions))
+        assert hit.sum() > 100
+        assert np.median((far - near)[hit]) < 1e-5
+
+        @jax.jit
+        def densities(rays, distances):
+            module = Renderer(CONFIG).bind(variables)
+            everywhere = scene(jnp.ones((1, 8, 8, 8, 4)))
+            return module.shade(everywhere, rays, module.field.view(rays.directions), distances)[0]
+
+        found = np.asarray(densities(rays, jnp.asarray((near + far) / 2)[..., None]))[..., 0][hit]
+        close(found, np.full(found.shape, found[0]))
+
+    def test_rays_that_miss_the_box_are_exactly_white_and_carry_no_gradient(self, variables):
+        away = camera(target=50.0)
+
+        def total(variables, volume):
+            rendering = inference.render(variables, scene(volume), away, config=CONFIG)
+            return jnp.sum(rendering.image) + jnp.sum(rendering.depth), rendering
+
+        volume = encode(variables, cloud()).volume
+        (_, rendering), gradients = jax.jit(jax.value_and_grad(total, (0, 1), has_aux=True))(variables, volume)
+        assert (rendering.image == 1).all()
+        assert (rendering.image_lr == 1).all()
+        assert (rendering.acc == 0).all()
+        assert (rendering.depth == 0).all()
+        assert all((g == 0).all() for g in jax.tree.leaves(gradients))
+
+    def test_an_opaque_volume_is_seen_at_its_face(self, variables):
+        """Density is huge at every sample: opacity one, and the depth is that of the first sample."""
+        solid = jax.tree.map(lambda x: x, variables)
+        solid["params"]["field"]["head"]["bias"] = jnp.array([1e6, 0.0, 0.0, 0.0])
+        rendering = render(solid, scene(jnp.zeros((2, 8, 8, 8, 4))), camera())
+        hit = np.asarray(rendering.depth) > 0
+        assert hit.any()
+        close(np.asarray(rendering.acc)[hit], np.ones(hit.sum()), atol=1e-5)
+
+    def test_without_an_upsampler_the_image_is_the_rendering_and_no_upsampler_is_built(self, variables):
+        assert set(variables["params"]) == {"pointnet", "unet", "field"}
+        rendering = render(variables, encode(variables, cloud()), camera())
+        same_bits(rendering.image, rendering.image_lr)
+
+    @pytest.mark.parametrize(("resize", "size"), [(8, 16), (12, 24)])
+    def test_with_fresh_weights_the_upsampler_shows_the_rendering_resized(self, variables, resize, size):
+        config = dataclasses.replace(CONFIG, resize_resolution=resize, image_resolution=size)
+        fresh = jax.jit(Renderer(config).init)(jax.random.key(2), cloud(), camera(size))
+        assert "upsampler" in fresh["params"]
+        merged = {"params": fresh["params"] | variables["params"], "batch_stats": variables["batch_stats"]}
+        rendering = render(merged, encode(variables, cloud()), camera(size), config)
+        low = render(variables, encode(variables, cloud()), camera())
+        close(rendering.image_lr, low.image_lr, rtol=1e-4, atol=1e-5)
+        expected = reference.bilinear(np.asarray(low.image_lr)[1, 0], resize, resize)
+        close(rendering.image[1, 0], reference.bilinear(expected, size, size), atol=1e-4)
+
+
+class TestJitter:
+    def test_equal_keys_give_equal_bits_and_other_keys_other_samples(self, variables):
+        first, again, other = (
+            jittered(variables, cloud(), camera(), jax.random.key(seed))[0].image for seed in (3, 3, 4)
+        )
+        same_bits(first, again)
+        assert (jnp.abs(first - other) > 1e-6).any()
+
+    def test_coarse_and_fine_samples_draw_numbers_of_their_own(self, variables, monkeypatch):
+        drawn, strata = [], sampling.strata
+        monkeypatch.setattr(sampling, "strata", lambda *a: (drawn.append(strata(*a)), drawn[-1])[1])
+
+        @jax.jit
+        def numbers_drawn(key):
+            Renderer(CONFIG).apply(variables, cloud(), camera(), key)
+            return tuple(drawn)
+
+        coarse, fine = numbers_drawn(jax.random.key(6))
+        assert coarse.shape == fine.shape
+        assert (coarse != fine).mean() > 0.99
+
+    def test_equal_rays_of_two_views_get_their_own_samples(self, variables):
+        twice = jax.tree.map(lambda x: jnp.concatenate([x[:, :1], x[:, :1]], axis=1), camera())
+        image = jittered(variables, cloud(), twice, jax.random.key(5))[0].image
+        assert (jnp.abs(image[:, 0] - image[:, 1]) > 1e-6).any()
+
+
+class TestUnionWeights:
+    coarse = jnp.sort(numbers(6, 2, 3, 5), axis=-1)
+    fine = jnp.sort(numbers(7, 2, 3, 4), axis=-1)
+    density = 3 * numbers(8, 2, 3, 9, low=0.0)
+    far = jnp.full((2, 3), 1.5)
+
+    def test_are_those_of_the_sorted_samples_put_back_in_their_places(self):
+        weights = np.asarray(union_weights(self.coarse, self.fine, self.density, self.far))
+        distances = np.concatenate([self.coarse, self.fine], axis=-1)
+        for place in np.ndindex(2, 3):
+            order = np.argsort(distances[place], kind="stable")
+            delta = np.diff(np.append(distances[place][order], 1.5))
+            expected = np.empty(9)
+            expected[order], _ = reference.volume_weights(np.asarray(self.density)[place][order], delta)
+            close(weights[place], expected)
+
+    def test_obey_the_batch_law(self):
+        batch_law(union_weights, self.coarse, self.fine, self.density, self.far)
+
+    def test_gradients_by_the_density_are_right(self):
+        gradient_law(lambda density: union_weights(self.coarse, self.fine, density, self.far), self.density)
+
+    def test_a_fine_sample_on_top_of_a_coarse_one_changes_nothing(self):
+        same = self.coarse[..., :4]
+        density = jnp.concatenate([self.density[..., :5], self.density[..., :4]], axis=-1)
+        weights = union_weights(self.coarse, same, density, self.far)
+        alone = union_weights(self.coarse, self.coarse[..., :0], self.density[..., :5], self.far)
+        close(weights[..., :4] + weights[..., 5:], alone[..., :4])
+        close(weights[..., 4], alone[..., 4])
+
+    def test_samples_that_coincide_have_finite_gradients(self):
+        same = jnp.ones((2, 3, 4))
+        density = jnp.concatenate([1e10 * self.density[..., :4], self.density[..., :4]], axis=-1)
+        arguments = same, same, density, jnp.ones((2, 3))
+        gradients = jax.grad(lambda *x: jnp.sum(union_weights(*x) * jnp.arange(8.0).reshape(1, 1, 8)), (0, 1, 2, 3))(
+            *arguments
+        )
+        assert all(jnp.isfinite(g).all() for g in gradients)

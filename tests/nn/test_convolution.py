@@ -1,0 +1,93 @@
+"""The convolution forms of the CPU against XLA's native one and against a loop."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+from support import reference
+from support.laws import close, gradient_law, numbers
+
+from spnr_jax.nn.convolution import conv, upsample_conv
+
+
+def native(x, kernel, stride=1, padding=1):
+    n = x.ndim - 2
+    axes = "DHW"[-n:]
+    numbering = (f"N{axes}C", f"{axes}IO", f"N{axes}C")
+    return lax.conv_general_dilated(x, kernel, (stride,) * n, [(padding, padding)] * n, dimension_numbers=numbering)
+
+
+def repeated(x, kernel):
+    for axis in range(1, x.ndim - 1):
+        x = jnp.repeat(x, 2, axis=axis)
+    return native(x, kernel)
+
+
+def value_and_gradients(form, x, kernel):
+    """Output, and gradients of a random projection of it by input and kernel."""
+
+    def projected(x, kernel):
+        out = form(x, kernel)
+        weights = np.random.default_rng(9).normal(size=out.shape)
+        return jnp.vdot(jnp.asarray(weights, jnp.float32), out), out
+
+    return jax.jit(jax.value_and_grad(projected, (0, 1), has_aux=True))(x, kernel)
+
+
+# 2D: (5 x 6) and 3D above and at the size where the CPU turns to one matrix product
+SHAPES = [(5, 6), (4, 4, 4), (6, 5, 7), (2, 2, 3)]
+
+
+@pytest.mark.parametrize("shape", SHAPES, ids=str)
+@pytest.mark.parametrize(
+    ("window", "stride", "padding", "features"),
+    [(3, 1, 1, 8), (3, 2, 1, 3), (2, 1, 1, 8), (4, 2, 1, 5), (4, 1, 1, 1), (1, 1, 0, 3)],
+)
+def test_is_the_native_convolution_in_value_and_gradients(shape, window, stride, padding, features):
+    x, kernel = numbers(0, 2, *shape, 3), numbers(1, *[window] * len(shape), 3, features)
+
+    def both(form):
+        return value_and_gradients(lambda x, k: form(x, k, stride, padding), x, kernel)
+
+    close(both(conv), both(native), rtol=1e-4, atol=2e-5)
+
+
+@pytest.mark.parametrize("shape", [(5, 6), (3, 2, 4)], ids=["2D", "3D"])
+def test_is_the_loop_over_outputs(shape):
+    x, kernel = numbers(2, 2, *shape, 3), numbers(3, *[3] * len(shape), 3, 4)
+    for stride in (1, 2):
+        out = np.asarray(conv(x, kernel, stride))
+        for i in range(2):
+            close(out[i], reference.convolution(np.asarray(x)[i], kernel, stride), atol=1e-5)
+
+
+@pytest.mark.parametrize("shape", [(5, 3), (1, 1), (1, 2), (5, 2, 6), (1, 1, 1), (2, 1, 2)], ids=str)
+def test_upsample_conv_is_the_convolution_of_every_pixel_repeated(shape):
+    x, kernel = numbers(4, 2, *shape, 3), numbers(5, *[3] * len(shape), 3, 4)
+    close(value_and_gradients(upsample_conv, x, kernel), value_and_gradients(repeated, x, kernel), 1e-4, 2e-5)
+    out = reference.convolution(reference.repeat_twice(np.asarray(x)[1]), kernel)
+    close(upsample_conv(x, kernel)[1], out, atol=1e-5)
+
+
+@pytest.mark.parametrize("window", [2, 3])
+def test_vmap_is_the_loop_and_gradients_are_right_also_where_a_custom_rule_stands(window):
+    x, kernel = numbers(6, 3, 2, 5, 5, 2), numbers(7, 3, window, window, 2, 4)
+    mapped = jax.jit(jax.vmap(conv))(x, kernel)
+    for i in range(3):
+        close(mapped[i], native(x[i], kernel[i]), atol=1e-5)
+    gradient_law(conv, x[0], kernel[0])
+
+
+@pytest.mark.parametrize("window", [2, 3])
+def test_second_order_gradients_are_those_of_the_native_form(window):
+    """R1 differentiates the discriminator's gradient."""
+    x, kernel = numbers(8, 1, 5, 5, 2), numbers(9, window, window, 2, 1)
+
+    def penalty(form):
+        def squared(x, kernel):
+            return jnp.sum(jax.grad(lambda x: jnp.sum(jnp.tanh(form(x, kernel))))(x) ** 2)
+
+        return jax.jit(jax.value_and_grad(squared, (0, 1)))(x, kernel)
+
+    close(penalty(conv), penalty(native), rtol=1e-4, atol=1e-5)

@@ -1,0 +1,123 @@
+"""Batch statistics over real points alone, and groups of channels."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support import reference
+from support.laws import close, gradient_law, numbers
+
+from spnr_jax.kernels.numerics import per_feature
+from spnr_jax.nn.normalization import BatchNorm, GroupNorm, group_norm
+
+X = 3 * numbers(0, 2, 6, 4) + 1
+ALL = jnp.ones((2, 6), bool)
+
+
+def batch_variables():
+    params = {"scale": numbers(1, 4) + 2, "bias": numbers(2, 4)}
+    return {"params": params, "batch_stats": {"mean": numbers(3, 4), "variance": numbers(4, 4) + 1.5}}
+
+
+def train(x, mask, variables=None):
+    return BatchNorm().apply(variables or batch_variables(), x, mask, True, mutable=["batch_stats"])
+
+
+class TestBatchNorm:
+    def test_normalises_by_the_statistics_of_the_batch(self):
+        out, _ = train(X, ALL)
+        x, params = np.float64(X).reshape(-1, 4), batch_variables()["params"]
+        expected = (x - x.mean(0)) / np.sqrt(x.var(0) + 1e-5) * np.float64(params["scale"]) + np.float64(params["bias"])
+        close(out.reshape(-1, 4), expected, atol=1e-5)
+
+    def test_running_statistics_move_a_tenth_of_the_way_with_the_unbiased_variance(self):
+        _, updated = train(X, ALL)
+        before, x = batch_variables()["batch_stats"], np.float64(X).reshape(-1, 4)
+        close(updated["batch_stats"]["mean"], 0.9 * np.float64(before["mean"]) + 0.1 * x.mean(0))
+        close(updated["batch_stats"]["variance"], 0.9 * np.float64(before["variance"]) + 0.1 * x.var(0, ddof=1))
+
+    @pytest.mark.parametrize("fill", [0.0, 1e30, np.nan])
+    def test_with_padding_is_that_of_the_unpadded_set_whatever_the_padding_holds(self, fill):
+        padded = jnp.concatenate([X, jnp.full((2, 3, 4), fill)], axis=1)
+        mask = jnp.concatenate([ALL, jnp.zeros((2, 3), bool)], axis=1)
+        (out, stats), (plain, plain_stats) = train(padded, mask), train(X, ALL)
+        close(out[:, :6], plain)
+        close(stats, plain_stats)
+        gradient = jax.grad(lambda x: jnp.sum(train(x, mask)[0][:, :6] ** 2))(padded)
+        close(gradient[:, :6], jax.grad(lambda x: jnp.sum(train(x, ALL)[0] ** 2))(X), atol=1e-5)
+        assert (gradient[:, 6:] == 0).all()
+
+    def test_gradients_flow_through_the_statistics(self):
+        mask = ALL.at[0, 4:].set(False)
+        variables = batch_variables()
+        gradient_law(lambda x: jnp.where(mask[..., None], train(x, mask, variables)[0], 0), X)
+
+    def test_in_evaluation_no_point_sees_the_others(self):
+        module = BatchNorm()
+        whole = module.apply(batch_variables(), X, ALL, False)
+        close(module.apply(batch_variables(), X[1:, :1], ALL[1:, :1], False), whole[1:, :1], rtol=0)
+        stats = batch_variables()["batch_stats"]
+        expected = (np.float64(X) - np.float64(stats["mean"])) / np.sqrt(np.float64(stats["variance"]) + 1e-5)
+        params = batch_variables()["params"]
+        close(whole, expected * np.float64(params["scale"]) + np.float64(params["bias"]), atol=1e-5)
+
+    @pytest.mark.parametrize("count", [0, 1], ids=["no point", "one point"])
+    def test_is_finite_in_value_statistics_and_gradient_without_spread(self, count):
+        mask = jnp.zeros((2, 6), bool).at[0, :count].set(True)
+        (_, (out, updated)), gradient = jax.value_and_grad(
+            lambda x: (jnp.sum(train(x, mask)[0]), train(x, mask)), has_aux=True
+        )(X)
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((out, updated, gradient)))
+
+    def test_initialising_leaves_the_running_statistics_at_their_start(self):
+        stats = BatchNorm().init(jax.random.key(0), X, ALL, True)["batch_stats"]
+        close(stats, {"mean": jnp.zeros(4), "variance": jnp.ones(4)})
+
+
+class TestGroupNorm:
+    params = {"scale": numbers(5, 8) + 2, "bias": numbers(6, 8)}
+
+    def apply(self, x, groups=4):
+        return GroupNorm(groups).apply({"params": self.params}, x)
+
+    @pytest.mark.parametrize("shape", [(5,), (3, 4), (2, 3, 2)], ids=["1D", "2D", "3D"])
+    @pytest.mark.parametrize("groups", [1, 4, 8])
+    def test_is_the_loop_over_groups_for_each_entry_alone(self, shape, groups):
+        x = 3 * numbers(7, 2, *shape, 8) + 1
+        out = np.asarray(self.apply(x, groups))
+        for i in range(2):
+            expected = reference.group_norm(
+                np.asarray(x)[i], groups, np.float64(self.params["scale"]), np.float64(self.params["bias"])
+            )
+            close(out[i], expected, atol=1e-5)
+
+    def test_its_gradients_are_right(self):
+        gradient_law(self.apply, numbers(8, 2, 3, 2, 8))
+
+    @pytest.mark.parametrize(("batch", "places"), [(2, 6), (1, 6), (1, 5)])
+    def test_its_gradients_and_theirs_are_those_of_the_plain_form(self, batch, places):
+        def plain(x, scale, bias):
+            groups = x.reshape(batch, places, 4, 2)
+            centred = groups - groups.mean((1, 3), keepdims=True)
+            out = centred / jnp.sqrt(jnp.mean(centred**2, (1, 3), keepdims=True) + 1e-5)
+            return out.reshape(x.shape) * per_feature(scale, x) + per_feature(bias, x)
+
+        def ours(x, scale, bias):
+            return group_norm(x, scale, bias, 4)
+
+        x, weights = 2 * numbers(9, batch, places, 8) + 1, numbers(10, batch, places, 8)
+
+        def gradient(f, *arguments):
+            return jax.grad(lambda *a: jnp.sum(jnp.sin(f(*a) * weights)), (0, 1, 2))(*arguments)
+
+        def second(f, *arguments):
+            return jax.grad(lambda *a: sum(jnp.sum(g**2) for g in gradient(f, *a)), (0, 1, 2))(*arguments)
+
+        for derivative in (gradient, second):
+            expected = derivative(plain, x, self.params["scale"], self.params["bias"])
+            close(derivative(ours, x, self.params["scale"], self.params["bias"]), expected, rtol=1e-3, atol=1e-4)
+
+    def test_a_constant_input_gives_the_bias_with_a_finite_gradient(self):
+        x = jnp.full((1, 3, 3, 8), 7.0)
+        close(self.apply(x), jnp.broadcast_to(self.params["bias"].reshape(1, 1, 1, 8), x.shape))
+        assert jnp.isfinite(jax.grad(lambda x: jnp.sum(self.apply(x) ** 2))(x)).all()

@@ -1,0 +1,89 @@
+"""3D U-Net: the sparse stem, the widths of its stages, and the skips."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from support import reference
+from support.laws import close, numbers
+
+from spnr_jax.nn.unet3d import Block, UNet3D
+
+ROWS = jnp.asarray(np.random.default_rng(0).integers(0, 513, (2, 20)), jnp.int32)
+VALUES = numbers(1, 2, 20, 3)
+MODULE = UNet3D(resolution=8, base_width=4, num_stages=2, num_groups=2)
+VARIABLES = jax.jit(MODULE.init)(jax.random.key(0), ROWS, VALUES)
+apply = jax.jit(MODULE.apply)
+
+
+def test_each_stage_halves_the_resolution_doubles_the_channels_and_comes_back():
+    kernels = {name: block["kernel"].shape[-2:] for name, block in VARIABLES["params"].items()}
+    assert kernels == {
+        "stem": (3, 4),
+        "down_0": (4, 8),
+        "same_0": (8, 8),
+        "down_1": (8, 16),
+        "same_1": (16, 16),
+        "up_0": (16, 8),
+        "up_1": (8, 4),
+    }
+    assert apply(VARIABLES, ROWS, VALUES).shape == (2, 8, 8, 8, 4)
+
+
+def test_objects_do_not_see_each_other():
+    whole = apply(VARIABLES, ROWS, VALUES)
+    close(jax.jit(MODULE.apply)(VARIABLES, ROWS[1:], VALUES[1:]), whole[1:], atol=1e-5)
+
+
+def test_without_its_decoder_the_stem_alone_reaches_the_output():
+    """Skips are additions: blocks of zeros add relu(bias) = 0 to what the stem sends across."""
+    silent = {
+        name: block if name == "stem" else jax.tree.map(jnp.zeros_like, block)
+        for name, block in VARIABLES["params"].items()
+    }
+    stem, out = (apply({"params": p}, ROWS, VALUES) for p in (silent, VARIABLES["params"]))
+    assert (stem >= 0).all()
+    assert (stem > 0).any()
+    assert (out >= stem).all(), "a decoder block adds its ReLU"
+    assert (out > stem).any()
+
+
+def test_concatenated_skips_are_seen_by_the_decoders_convolution_beside_its_own_input():
+    x, beside = numbers(5, 1, 4, 4, 4, 3), numbers(6, 1, 8, 8, 8, 2)
+    block = Block(features=4, kind="up", num_groups=2)
+    variables = jax.jit(block.init)(jax.random.key(1), x, beside)
+    params = jax.tree.map(np.float64, variables["params"])
+    both = np.concatenate([reference.repeat_twice(np.asarray(x[0])), np.asarray(beside[0])], axis=-1)
+    y = reference.convolution(both, params["kernel"])
+    y = reference.group_norm(y, 2, params["norm"]["scale"], params["norm"]["bias"])
+    close(jax.jit(block.apply)(variables, x, beside)[0], np.maximum(y, 0), rtol=1e-4, atol=1e-5)
+
+
+def test_concatenated_skips_widen_the_kernels_of_the_decoder_alone():
+    module = UNet3D(resolution=8, base_width=4, num_stages=2, num_groups=2, skip="concat")
+    shapes = jax.eval_shape(module.init, jax.random.key(0), ROWS, VALUES)["params"]
+    widths = {name: block["kernel"].shape[-2:] for name, block in shapes.items()}
+    plain = {name: block["kernel"].shape[-2:] for name, block in VARIABLES["params"].items()}
+    assert widths == plain | {"up_0": (16 + 8, 8), "up_1": (8 + 4, 4)}
+    assert jax.eval_shape(module.apply, {"params": shapes}, ROWS, VALUES).shape == (2, 8, 8, 8, 4)
+
+
+def test_a_point_reaches_the_whole_volume_through_the_coarsest_stage():
+    def far_corner(values):
+        return jnp.sum(MODULE.apply(VARIABLES, jnp.zeros((1, 1), jnp.int32), values)[0, -1, -1, -1])
+
+    assert jnp.abs(jax.jit(jax.grad(far_corner))(jnp.ones((1, 1, 3)))).max() > 0
+
+
+def test_moving_the_points_by_whole_coarse_voxels_moves_the_volume_with_them():
+    """Far from the border; the statistics of a group do not see where in the volume its voxels are."""
+    module = UNet3D(resolution=32, base_width=4, num_stages=1, num_groups=2)
+    cells, values = np.random.default_rng(3).integers(12, 16, (1, 20, 3)), numbers(4, 1, 20, 3)
+    variables = jax.jit(module.init)(jax.random.key(0), jnp.zeros((1, 20), jnp.int32), values)
+
+    def volume(shift):
+        rows = (cells + shift) @ np.array([32**2, 32, 1])
+        return np.asarray(jax.jit(module.apply)(variables, jnp.asarray(rows, jnp.int32), values))[0]
+
+    still, moved = volume(0), volume(np.array([4, 2, -2]))
+    close(moved[12:24, 10:22, 6:18], still[8:20, 8:20, 8:20], rtol=1e-3, atol=2e-4)
+    assert np.abs(still[8:20, 8:20, 8:20] - still[4:16, 6:18, 10:22]).max() > 0.1

@@ -1,0 +1,196 @@
+"""Scores are those of the metrics called by hand on the files' pictures; nothing is left out unsaid."""
+
+import dataclasses
+import shutil
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support import tiny_dataset
+from support.laws import close
+from support.tiny_dataset import CONFIG
+from support.tiny_lpips import WEIGHTS
+
+from spnr_jax.formats import data_sets
+from spnr_jax.kernels import metrics
+from spnr_jax.scoring import evaluation, floors
+from spnr_jax.scoring.flip import flip
+from spnr_jax.scoring.lpips import lpips
+from spnr_jax.scoring.summary import METRICS, NO_WEIGHTS
+from spnr_jax.training import checkpoint, optimisation
+
+NAMES = tiny_dataset.SPLITS["test"]
+FACTORS = {"splat": 1.5, "nearest": 0.75}
+
+
+def methods():
+    variables = optimisation.averaged_variables(checkpoint.restore(tiny_dataset.run(), CONFIG))
+    trivial = {name: evaluation.floor(name, FACTORS.get(name, 1.0)) for name in evaluation.FLOORS}
+    return {"ours": evaluation.network(variables, CONFIG), **trivial}
+
+
+@pytest.fixture(scope="module")
+def outcome():
+    return evaluation.evaluate(tiny_dataset.run(), tiny_dataset.dataset(), say=lambda line: None)
+
+
+@pytest.fixture(scope="module")
+def results():
+    return list(evaluation.evaluate_objects(methods(), CONFIG, tiny_dataset.dataset(), NAMES))
+
+
+def test_scores_are_those_of_the_metrics_called_by_hand(results):
+    for name, result in zip(NAMES, results, strict=True):
+        item = data_sets.read_object(tiny_dataset.dataset(), name)
+        reference, mask = (jnp.asarray(x) for x in (data_sets.on_white(item.images), item.conditions[..., 3] > 0))
+        assert list(result.scores) == ["ours", "white", "splat", "nearest"]
+        for method, scores in result.scores.items():
+            assert set(scores) == set(METRICS) - {"lpips"}
+            image = jnp.asarray(result.pictures[method].image)
+            assert 0 <= image.min() <= image.max() <= 1
+            close(scores["psnr"], -10 * np.log10(np.mean((image - reference) ** 2, axis=(1, 2, 3))), rtol=1e-4)
+            close(scores["ssim"], metrics.ssim(image, reference), atol=1e-4)
+            close(scores["cpsnr"], metrics.conditional_psnr(image, reference, mask), rtol=1e-4)
+            close(scores["flip"], flip(image, reference), atol=1e-5)
+        assert np.all(result.pictures["white"].image == 1)
+
+
+def test_the_floors_are_those_of_the_same_points_and_cameras(results):
+    item = data_sets.read_object(tiny_dataset.dataset(), NAMES[0])
+    cloud = jax.tree.map(jnp.asarray, data_sets.test_cloud(item, CONFIG))
+    for method, factor in FACTORS.items():
+        view = jax.tree.map(lambda x: jnp.asarray(x[1]), item.camera)
+        image, _ = getattr(floors, method)(cloud, view, factor * floors.spacing(cloud))
+        close(results[0].pictures[method].image[1], image, atol=1e-5)
+
+
+def test_opacity_is_compared_at_the_size_of_the_reference(results):
+    item = data_sets.read_object(tiny_dataset.dataset(), NAMES[0])
+    assert results[0].pictures["ours"].acc.shape[1:] == (8, 8)
+    assert results[0].pictures["ours"].depth.shape[1:] == (8, 8)
+    assert results[0].pictures["splat"].depth is None
+    white = results[0].scores["white"]["iou"]
+    assert np.all(white == 0), "an empty picture overlaps with nothing"
+    assert np.all(results[0].scores["nearest"]["iou"] > 0.3)
+    assert len(white) == len(item.images)
+
+
+def test_a_summary_is_the_mean_over_all_images_with_its_counts(outcome, results):
+    assert set(outcome.summary["methods"]) == {"ours", *evaluation.FLOORS}
+    assert set(outcome.summary["ours_minus"]) == set(evaluation.FLOORS)
+    for table in outcome.summary["methods"].values():
+        assert table["objects"] == len(NAMES)
+        assert table["views"] == len(NAMES) * tiny_dataset.VIEWS
+    ours = np.concatenate([result.scores["ours"]["psnr"] for result in results])
+    assert outcome.summary["methods"]["ours"]["psnr"] == pytest.approx(ours.mean(), abs=1e-4)
+    assert outcome.summary["steps"] == CONFIG.num_steps
+    assert set(outcome.summary["settings"]["radius factors"].values()) <= set(evaluation.RADIUS_FACTORS)
+
+
+def test_categories_come_from_the_names_and_add_up(outcome):
+    assert set(outcome.per_category) == {"ball", "cube", "meshes"}
+    counts = [table["ours"]["objects"] for table in outcome.per_category.values()]
+    assert sum(counts) == outcome.summary["methods"]["ours"]["objects"]
+    names = ("chair_000012", "office_chair_000012", "chair", "chair_12", "b_0000123")
+    assert [evaluation.category_of(n) for n in names] == ["chair", "office_chair", "meshes", "meshes", "meshes"]
+
+
+def test_the_radius_is_the_one_that_scores_best_on_training_objects(monkeypatch):
+    asked = []
+    real = data_sets.read_object
+    monkeypatch.setattr(data_sets, "read_object", lambda dataset, name: asked.append(name) or real(dataset, name))
+    chosen = evaluation.choose_radius(tiny_dataset.dataset(), CONFIG, "splat", num_objects=2)
+    assert set(asked) == set(tiny_dataset.SPLITS["train"][:2])
+    items = [real(tiny_dataset.dataset(), name) for name in tiny_dataset.SPLITS["train"][:2]]
+
+    def score(factor):
+        values = []
+        for item in items:
+            image, _ = evaluation.render_floor("splat", data_sets.test_cloud(item, CONFIG), item.camera, factor)
+            values.append(np.mean(metrics.psnr(image, jnp.asarray(data_sets.on_white(item.images)))))
+        return np.mean(values)
+
+    assert score(chosen) == max(score(factor) for factor in evaluation.RADIUS_FACTORS)
+
+
+def test_the_test_points_are_always_the_first_ones():
+    item = data_sets.read_object(tiny_dataset.dataset(), NAMES[0])
+    cloud = data_sets.test_cloud(item, CONFIG)
+    np.testing.assert_array_equal(cloud.positions, item.cloud.positions[: CONFIG.test_points])
+    assert len(data_sets.test_cloud(item, dataclasses.replace(CONFIG, test_points=10**6)).positions) == len(
+        item.cloud.positions
+    )
+
+
+def test_the_gallery_holds_as_many_objects_as_asked_first_and_last_among_them():
+    few = evaluation.evaluate(tiny_dataset.run(), tiny_dataset.dataset(), gallery_objects=2, say=lambda line: None)
+    assert [result.name for result in few.gallery] == [NAMES[0], NAMES[-1]]
+    assert few.summary["methods"]["ours"]["objects"] == len(NAMES)
+
+
+def test_objects_of_one_view_are_evaluated_although_training_draws_two(tmp_path):
+    copy = shutil.copytree(tiny_dataset.dataset().folder, tmp_path / "data")
+    item = data_sets.read_object(data_sets.open_dataset(copy), NAMES[0])
+    config = dataclasses.replace(CONFIG, views_per_object=len(item.images) + 1)
+    (result,) = evaluation.evaluate_objects(methods(), config, data_sets.open_dataset(copy), NAMES[:1])
+    assert len(result.scores["ours"]["psnr"]) == tiny_dataset.VIEWS
+
+
+@pytest.mark.parametrize(("split", "expected"), [("test", "the test split is empty"), ("train", "no training objects")])
+def test_an_empty_split_is_an_error_that_names_it(split, expected, tmp_path):
+    copy = shutil.copytree(tiny_dataset.dataset().folder, tmp_path / "data")
+    (copy / "splits" / f"{split}.txt").write_text("")
+    with pytest.raises(ValueError, match=expected):
+        evaluation.evaluate(tiny_dataset.run(), data_sets.open_dataset(copy), say=lambda line: None)
+
+
+def test_a_run_without_a_checkpoint_says_how_to_go_on(tmp_path):
+    checkpoint.write_config(tmp_path, CONFIG)
+    with pytest.raises(ValueError, match="no checkpoint yet; go on with `spnr train"):
+        evaluation.evaluate(tmp_path, tiny_dataset.dataset())
+
+
+def test_any_number_of_methods_see_the_same_objects_and_are_scored_alike():
+    def half(cloud, camera):
+        size = (len(camera.cam_to_world), camera.height, camera.width)
+        return evaluation.Pictures(image=jnp.full((*size, 3), 0.5), acc=jnp.ones(size))
+
+    asked = {"grey": half, "also grey": half, "white": evaluation.floor("white")}
+    scores, gallery = evaluation.score_methods(asked, CONFIG, tiny_dataset.dataset(), NAMES, 1, print, None)
+    assert list(scores) == list(NAMES)
+    for by_method in scores.values():
+        assert list(by_method) == list(asked)
+        close(by_method["grey"], by_method["also grey"])
+    assert [result.name for result in gallery] == [NAMES[0]]
+
+
+def test_lpips_is_measured_with_weights_and_said_to_be_missing_without(outcome, tmp_path):
+    size = 32  # the smallest multiple of 8 that AlexNet takes
+    folder = tiny_dataset.write_dataset(tmp_path / "data", {"train": (), "val": (), "test": ("a", "b")}, size=size)
+    model = dataclasses.replace(CONFIG.model, image_resolution=size, resize_resolution=size // 2)
+    config = dataclasses.replace(CONFIG, model=model)
+    asked = {"white": evaluation.floor("white")}
+    dataset = data_sets.open_dataset(folder)
+    (first, second) = evaluation.evaluate_objects(asked, config, dataset, ("a", "b"), WEIGHTS)
+    for result in (first, second):
+        image, reference = result.pictures["white"].image, jnp.asarray(result.reference)
+        close(result.scores["white"]["lpips"], lpips(jnp.asarray(image), reference, WEIGHTS), rtol=1e-4)
+    assert outcome.summary["methods"]["ours"]["lpips"] is None
+    assert outcome.summary["settings"]["metrics"]["LPIPS"] == NO_WEIGHTS
+
+
+def test_weights_change_what_the_settings_say(monkeypatch):
+    monkeypatch.setattr(evaluation, "score_methods", lambda *a: (dict.fromkeys(NAMES, RESULT), []))
+    found = evaluation.evaluate(tiny_dataset.run(), tiny_dataset.dataset(), say=lambda line: None, weights=WEIGHTS)
+    assert "AlexNet v0.1" in found.summary["settings"]["metrics"]["LPIPS"]
+    assert found.summary["methods"]["ours"]["lpips"] == 0.25
+
+
+RESULT = {method: {metric: np.full(2, 0.25) for metric in METRICS} for method in ("ours", *evaluation.FLOORS)}
+
+
+def test_objects_are_spread_from_the_first_to_the_last():
+    assert evaluation.spread(tuple("abcdefg"), 3) == ("a", "d", "g")
+    assert evaluation.spread(tuple("ab"), 5) == ("a", "b")
+    assert evaluation.spread(("a",), 0) == ()

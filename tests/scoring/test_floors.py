@@ -1,0 +1,182 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from spnr_jax.kernels.cameras import look_at, pinhole
+from spnr_jax.kernels.records import Camera, PointCloud
+from spnr_jax.scoring.floors import nearest, spacing, splat, white
+
+RADIUS = 0.12
+
+
+def make_cloud(positions, base_color=None, mask=None) -> PointCloud:
+    positions = jnp.asarray(positions, jnp.float32)
+    num_points = len(positions)
+    return PointCloud(
+        positions=positions,
+        base_color=jnp.full((num_points, 3), 0.5) if base_color is None else jnp.asarray(base_color, jnp.float32),
+        roughness=jnp.zeros(num_points),
+        metallic=jnp.zeros(num_points),
+        mask=jnp.ones(num_points, bool) if mask is None else jnp.asarray(mask),
+    )
+
+
+def random_cloud(seed: int, num_points: int = 60) -> PointCloud:
+    """Points in a ball around the origin that reaches behind the camera of `skewed_camera`; a third is masked."""
+    rng = np.random.default_rng(seed)
+    positions = rng.uniform(-1, 1, (num_points, 3)) * [1, 1, 2.5]
+    return make_cloud(positions, rng.uniform(size=(num_points, 3)), rng.uniform(size=num_points) < 0.67)
+
+
+def front_camera(distance: float = 4.0, size: int = 32) -> Camera:
+    return pinhole(look_at(jnp.array([0, 0, distance]), jnp.zeros(3), jnp.array([0.0, 1, 0])), 0.6, size, size)
+
+
+def skewed_camera() -> Camera:
+    """Not square, focal lengths that differ, the principal point off the middle."""
+    pose = look_at(jnp.array([0.4, 0.5, 2.0]), jnp.array([0.1, 0, 0]), jnp.array([0.0, 1, 0]))
+    intrinsics = jnp.array([[26.0, 0, 13], [0, 31, 8], [0, 0, 1]])
+    return Camera(cam_to_world=pose, intrinsics=intrinsics, height=18, width=23)
+
+
+def encode(linear: np.ndarray) -> np.ndarray:
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+
+
+def loop_rays(camera: Camera):
+    """(row, column, eye, unit direction, plane coordinates) of every pixel, float64."""
+    pose, k = np.asarray(camera.cam_to_world, np.float64), np.asarray(camera.intrinsics, np.float64)
+    for row in range(camera.height):
+        for column in range(camera.width):
+            plane = np.array([(column + 0.5 - k[0, 2]) / k[0, 0], -(row + 0.5 - k[1, 2]) / k[1, 1]])
+            direction = pose[:, :3] @ [*plane, -1]
+            yield row, column, pose[:, 3], direction / np.linalg.norm(direction), plane
+
+
+def loop_splat(cloud: PointCloud, camera: Camera, radius: float):
+    """The disc's definition in camera coordinates: it lies in the plane z = depth of its point."""
+    pose = np.asarray(camera.cam_to_world, np.float64)
+    image, acc = np.ones((camera.height, camera.width, 3)), np.zeros((camera.height, camera.width))
+    for row, column, eye, _, plane in loop_rays(camera):
+        best = np.inf
+        for position, color in zip(
+            *(np.asarray(a)[cloud.mask] for a in (cloud.positions, cloud.base_color)), strict=True
+        ):
+            x, y, z = pose[:, :3].T @ (position - eye)
+            if -z > 0 and np.hypot(*(plane * -z - [x, y])) <= radius and -z < best:
+                best, acc[row, column], image[row, column] = -z, 1, encode(color)
+    return image, acc
+
+
+def loop_nearest(cloud: PointCloud, camera: Camera, radius: float):
+    """Nearest-point shading to the letter: first find the intersection, then search the point nearest to it."""
+    positions, colors = (np.asarray(a, np.float64)[cloud.mask] for a in (cloud.positions, cloud.base_color))
+    image, acc = np.ones((camera.height, camera.width, 3)), np.zeros((camera.height, camera.width))
+    for row, column, eye, direction, _ in loop_rays(camera):
+        first = np.inf
+        for offset in positions - eye:
+            b = direction @ offset
+            discriminant = b**2 - offset @ offset + radius**2
+            if discriminant >= 0 and b + np.sqrt(discriminant) >= 0:
+                first = min(first, max(b - np.sqrt(discriminant), 0))
+        if np.isfinite(first):
+            index = np.argmin(np.linalg.norm(positions - (eye + first * direction), axis=-1))
+            acc[row, column], image[row, column] = 1, encode(colors[index])
+    return image, acc
+
+
+@pytest.mark.parametrize(("renderer", "twin"), [(splat, loop_splat), (nearest, loop_nearest)])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_every_pixel_is_that_of_the_plain_loop(renderer, twin, seed):
+    cloud, camera = random_cloud(seed), skewed_camera()
+    image, acc = renderer(cloud, camera, RADIUS)
+    expected_image, expected_acc = twin(cloud, camera, RADIUS)
+    assert 0.1 < expected_acc.mean() < 0.95
+    np.testing.assert_array_equal(acc, expected_acc)
+    np.testing.assert_allclose(image, expected_image, atol=1e-5)
+
+
+def test_an_eye_inside_balls_sees_only_the_nearest_of_their_points():
+    cloud, camera = random_cloud(2), skewed_camera()
+    eye = np.asarray(camera.cam_to_world[:, 3])
+    inside = np.concatenate([[eye + [0.3, 0, 0], eye + [0, 0.1, 0.1], eye + [0, 0, -0.4]], cloud.positions[3:]])
+    cloud = make_cloud(inside, cloud.base_color)
+    image, acc = nearest(cloud, camera, 0.5)
+    np.testing.assert_array_equal(acc, 1)
+    np.testing.assert_allclose(image, loop_nearest(cloud, camera, 0.5)[0], atol=1e-5)
+
+
+def test_a_disc_covers_the_area_that_its_projection_has():
+    camera = front_camera(distance=4.0, size=256)
+    _, acc = splat(make_cloud([[0.1, -0.2, 0.5]]), camera, 0.4)
+    pixel_radius = float(camera.intrinsics[0, 0]) * 0.4 / 3.5
+    np.testing.assert_allclose(acc.sum(), np.pi * pixel_radius**2, rtol=0.01)
+
+
+def test_colours_are_the_srgb_of_the_linear_base_colour():
+    cloud = make_cloud([[0, 0, 0]], [[0.5, 0.0, 1.0]])
+    for renderer in (splat, nearest):
+        np.testing.assert_allclose(renderer(cloud, front_camera(), 0.5)[0][16, 16], [0.735357, 0, 1], atol=1e-5)
+
+
+@pytest.mark.parametrize("renderer", [splat, nearest])
+def test_the_order_of_points_and_padding_do_not_matter(renderer):
+    cloud, camera = random_cloud(3), skewed_camera()
+    order = np.random.default_rng(4).permutation(60)
+    shuffled = jax.tree.map(lambda a: a[order], cloud)
+    padded = jax.tree.map(lambda a: jnp.concatenate([a, jnp.zeros((7, *a.shape[1:]), a.dtype)]), cloud)
+    for same in (shuffled, padded):
+        np.testing.assert_array_equal(renderer(same, camera, RADIUS)[0], renderer(cloud, camera, RADIUS)[0])
+
+
+@pytest.mark.parametrize("renderer", [splat, nearest])
+def test_a_cloud_without_real_points_is_the_white_image(renderer):
+    camera = front_camera()
+    image, acc = renderer(make_cloud(np.zeros((5, 3)), mask=np.zeros(5, bool)), camera, 1.0)
+    np.testing.assert_array_equal(image, white(camera))
+    np.testing.assert_array_equal(acc, 0)
+
+
+@pytest.mark.parametrize("renderer", [splat, nearest])
+def test_what_lies_behind_the_eye_is_not_seen(renderer):
+    behind = make_cloud([[0, 0, 6.0], [0.1, 0, 5.0]])
+    assert renderer(behind, front_camera(distance=4.0), 0.3)[1].sum() == 0
+
+
+@pytest.mark.parametrize("renderer", [splat, nearest])
+def test_jit_and_vmap_change_nothing(renderer):
+    clouds = [random_cloud(seed) for seed in (5, 6)]
+    stacked, camera = jax.tree.map(lambda *a: jnp.stack(a), *clouds), skewed_camera()
+    loop = np.stack([renderer(cloud, camera, RADIUS)[0] for cloud in clouds])
+    mapped = jax.jit(jax.vmap(lambda cloud: renderer(cloud, camera, RADIUS)[0]))(stacked)
+    np.testing.assert_allclose(mapped, loop, atol=1e-6)
+
+
+def test_blocks_of_rays_give_the_image_of_all_rays_at_once(monkeypatch):
+    cloud, camera = random_cloud(7), skewed_camera()
+    whole = splat(cloud, camera, RADIUS)[0]
+    monkeypatch.setattr("spnr_jax.scoring.floors.BLOCK", 60 * 5)  # 414 rays: 82 blocks of 5 and a remainder
+    np.testing.assert_array_equal(splat(cloud, camera, RADIUS)[0], whole)
+
+
+def test_spacing_is_the_median_distance_to_the_nearest_other_real_point():
+    cloud = random_cloud(8)
+    real = np.asarray(cloud.positions, np.float64)[cloud.mask]
+    distances = [min(np.linalg.norm(p - q) for j, q in enumerate(real) if j != i) for i, p in enumerate(real)]
+    np.testing.assert_allclose(spacing(cloud), np.median(distances), rtol=1e-5)
+
+
+def test_spacing_of_a_grid_is_its_pitch_and_scales_with_it():
+    grid = np.stack(np.meshgrid(*[np.arange(5.0)] * 3), axis=-1).reshape(-1, 3)
+    np.testing.assert_allclose(spacing(make_cloud(0.25 * grid)), 0.25, rtol=1e-6)
+
+
+@pytest.mark.parametrize("real", [0, 1])
+def test_spacing_without_a_second_point_is_zero(real):
+    assert spacing(make_cloud(np.zeros((4, 3)), mask=np.arange(4) < real)) == 0
+
+
+def test_white_is_white_in_every_pixel_of_every_camera():
+    cameras = jax.tree.map(lambda a: jnp.stack([a, a]), skewed_camera())
+    np.testing.assert_array_equal(white(cameras), np.ones((2, 18, 23, 3)))

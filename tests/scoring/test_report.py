@@ -1,0 +1,246 @@
+import base64
+import dataclasses
+import io
+import json
+import subprocess
+import sys
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from spnr_jax.scoring.report import GalleryRow, duration, flatten, psnr, write_report
+
+VOID = {"meta", "img", "br"}
+SETTINGS = {"model": {"widths": (64, 128), "sampling": {"num_coarse": 16}}, "light": "<studio & sky>", "augment": {}}
+
+
+class Page(HTMLParser):
+    """Texts of the page by element, its images and every address; fails on an element that is not closed."""
+
+    def __init__(self, text: str):
+        super().__init__()
+        self.open, self.texts, self.sources, self.links, self.tags = [], [], [], [], set()
+        self.feed(text)
+        assert self.open == []
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.add(tag)
+        attributes = dict(attrs)
+        if tag == "img":
+            self.sources.append(attributes["src"])
+        self.links += [value for name, value in attrs if name in ("href", "xlink:href", "src", "action") and value]
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attrs):
+        self.handle_starttag(tag, attrs)
+        if tag not in VOID:
+            self.open.pop()
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if data.strip():
+            self.texts.append((self.open[-1], data.strip()))
+
+    def all(self, tag: str) -> list[str]:
+        return [text for name, text in self.texts if name == tag]
+
+
+def row(seed: int) -> GalleryRow:
+    rng = np.random.default_rng(seed)
+    reference = rng.integers(0, 256, (12, 16, 3)).astype(np.uint8)
+    images = {name: rng.uniform(size=(12, 16, 3)) for name in ("ours", "splat", "nearest")}
+    return GalleryRow(
+        name=f"object<{seed}>", reference=reference, depth=rng.uniform(2, 3, (6, 8)), acc=np.eye(6, 8), images=images
+    )
+
+
+def table() -> dict:
+    counts = {"objects": 3, "views": 30}
+    return {
+        "ours": {"psnr": 21.125, "psnr_interval": [20.5, 21.75], "ssim": 0.91234, "cpsnr": 17.5, "flip": 0.1, **counts},
+        "white": {"psnr": 13.0, "psnr_interval": None, "ssim": 0.95, "cpsnr": None, "flip": 0.25, **counts},
+        "splat": {"psnr": 18.0, "ssim": 0.8, "cpsnr": float("nan"), "flip": 0.05, **counts},
+    }
+
+
+def differences() -> dict:
+    found = {"mean": 3.125, "interval": [-0.5, 6.75], "p_value": 0.0123}
+    return {"splat": {"psnr": found, "lpips": None}, "white": {"psnr": found | {"interval": None, "p_value": None}}}
+
+
+def content(**changes) -> dict:
+    metrics = {
+        "methods": table(),
+        "seconds": {"train": 372.0, "total": 8000.0},
+        "preset": "tiny",
+        "steps": 99,
+        "seed": 7,
+    }
+    whole = {
+        "title": "A <run>",
+        "summary": "First & <foremost>.\n\nSecond.",
+        "settings": SETTINGS,
+        "metrics": metrics | {"hardware": "2 cores"},
+        "gallery": [row(0), row(1)],
+        "curve": [{"step": 1, "psnr": 12.0}, {"step": 2, "psnr": 14.0}, {"step": 2, "val_psnr": 13.0}],
+    }
+    return whole | changes
+
+
+def write(tmp_path, **changes) -> Page:
+    write_report(tmp_path / "report.html", **content(**changes))
+    return Page((tmp_path / "report.html").read_text(encoding="utf-8"))
+
+
+def test_the_page_is_one_file_without_addresses_or_scripts(tmp_path):
+    page = write(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["report.html"]
+    assert all(link.startswith(("data:image/png;base64,", "#")) for link in page.links)
+    assert not page.tags & {"script", "link", "iframe", "object", "a"}
+    assert "@import" not in (tmp_path / "report.html").read_text()
+
+
+def test_the_gallery_shows_every_picture_of_every_row_in_the_order_of_its_heads(tmp_path):
+    page = write(tmp_path)
+    pictures = [np.asarray(Image.open(io.BytesIO(base64.b64decode(s.split(",")[1])))) for s in page.sources]
+    assert len(pictures) == 12
+    for shown, wanted in ((pictures[:6], row(0)), (pictures[6:], row(1))):
+        np.testing.assert_array_equal(shown[0], wanted.reference)
+        for image, expected in zip(shown[1:4], wanted.images.values(), strict=True):
+            np.testing.assert_allclose(image / 255, expected, atol=0.51 / 255)
+        assert (shown[4][wanted.acc == 0] == 255).all()
+        np.testing.assert_array_equal(shown[5], 255 * wanted.acc)
+    heads = page.all("th")[:6]
+    assert heads == ["Reference", "Ours", "Base-colour splat", "Nearest-point shading", "Depth", "Opacity"]
+
+
+def test_numbers_below_pictures_are_their_psnr(tmp_path):
+    wanted = row(0)
+    squared = np.mean((np.round(255 * wanted.images["ours"]) / 255 - wanted.reference / 255.0) ** 2)
+    assert write(tmp_path).all("small")[0] == f"{10 * np.log10(1 / squared):.1f}"
+    assert psnr(wanted.reference, wanted.reference / 255) == pytest.approx(100)
+
+
+def test_the_best_value_of_each_metric_alone_is_bold_and_what_is_missing_is_not_a_number(tmp_path):
+    page = write(tmp_path)
+    bold = page.all("b")
+    assert [text for text in bold if not text.endswith(("dB", " s"))] == ["21.12", "17.50", "0.950", "0.050"]
+    assert page.all("td").count("n/a") == 2
+    assert [text for text in page.all("td") if text in ("18.00", "0.800")] == ["18.00", "0.800"]
+    assert not any("Opacity IoU" in text or "LPIPS" in text for text in page.all("th"))
+
+
+def test_arrows_say_what_is_better_and_small_numbers_how_sure_it_is(tmp_path):
+    page = write(tmp_path)
+    assert {"PSNR, dB\u00a0\u2191", "FLIP\u00a0\u2193"} <= set(page.all("th"))
+    assert [text for text in page.all("small") if text.startswith("[")] == ["[20.50, 21.75]"]
+
+
+def test_an_lpips_that_was_not_measured_is_said_to_lack_weights(tmp_path):
+    methods = {name: row | {"lpips": None} for name, row in table().items()}
+    page = write(tmp_path, metrics={"methods": methods})
+    assert page.all("td").count("n/a (no weights)") == 3
+    page = write(tmp_path, metrics={"methods": methods | {"ours": table()["ours"] | {"lpips": 0.125}}})
+    assert "0.125" in page.all("b")
+    assert page.all("td").count("n/a (no weights)") == 2
+
+
+def test_differences_have_a_sign_an_interval_and_a_test(tmp_path):
+    page = write(tmp_path, metrics={"methods": table(), "ours_minus": differences()})
+    assert "Differences" in page.all("h2")
+    assert {"Ours minus base-colour splat", "Ours minus white image"} <= set(page.all("th"))
+    assert page.all("td").count("+3.12") == 2
+    assert {"[-0.50, +6.75]", "p = 0.012"} <= set(page.all("small"))
+    tiny = {"splat": {"psnr": {"mean": 3.0, "interval": [2.0, 4.0], "p_value": 0.0001}}}
+    page = write(tmp_path, metrics={"methods": table(), "ours_minus": tiny})
+    assert "p < 0.001" in page.all("small")
+
+
+def test_key_numbers_are_the_distances_to_the_floors_that_there_are(tmp_path):
+    page = write(tmp_path)
+    assert page.all("b")[:4] == ["21.1 dB", "+8.1 dB", "+3.1 dB", "6 min 12 s"]
+    assert not any("over nearest" in text for text in page.all("div"))
+
+
+def test_every_setting_and_fact_of_the_run_is_named(tmp_path):
+    page = write(tmp_path)
+    entries = dict(zip(page.all("dt"), page.all("dd"), strict=True))
+    assert entries == {
+        "preset": "tiny",
+        "steps": "99",
+        "seed": "7",
+        "hardware": "2 cores",
+        "time to train": "6 min 12 s",
+        "time in total": "2 h 13 min",
+        "model.widths": "(64, 128)",
+        "model.sampling.num_coarse": "16",
+        "light": "<studio & sky>",
+        "augment": "{}",
+    }
+
+
+def test_texts_are_shown_as_they_are_written(tmp_path):
+    page = write(tmp_path)
+    assert page.all("h1") == page.all("title") == ["A <run>"]
+    assert page.all("p")[:2] == ["First & <foremost>.", "Second."]
+    assert "object<1>" in page.all("th")
+
+
+def test_categories_have_their_own_table_with_the_best_method_bold(tmp_path):
+    lower = {name: scores | {"psnr": 30 - scores["psnr"], "objects": 5} for name, scores in table().items()}
+    page = write(tmp_path, per_category={"chair": table(), "<car>": lower})
+    assert "<car>" in page.all("th")
+    assert [text for text in page.all("b") if text in ("21.12", "17.00", "8.88")] == ["21.12", "21.12", "17.00"]
+    assert "5" in page.all("td")
+
+
+def test_a_run_without_curve_pictures_or_categories_is_still_a_page(tmp_path):
+    page = write(tmp_path, curve=[], gallery=[])
+    assert "svg" not in page.tags
+    assert page.all("h2") == ["Unseen objects", "Quality", "Run", "Settings"]
+
+
+def test_a_picture_that_is_not_finite_leaves_the_old_report(tmp_path):
+    write(tmp_path)
+    before = (tmp_path / "report.html").read_bytes()
+    broken = dataclasses.replace(row(0), images={"ours": np.full((12, 16, 3), np.nan)})
+    with pytest.raises(ValueError, match="NaN"):
+        write(tmp_path, gallery=[broken])
+    assert (tmp_path / "report.html").read_bytes() == before
+
+
+def test_the_same_run_gives_the_same_bytes(tmp_path):
+    write(tmp_path)
+    before = (tmp_path / "report.html").read_bytes()
+    write(tmp_path)
+    assert (tmp_path / "report.html").read_bytes() == before
+
+
+def test_flattening_keeps_every_leaf_under_its_dotted_name():
+    assert flatten({"a": {"b": {"c": 1}, "d": []}, "e": {}}) == {"a.b.c": 1, "a.d": [], "e": {}}
+
+
+def test_durations_are_said_in_the_units_that_people_use():
+    spoken = [duration(s) for s in (0.04, 8.44, 59.96, 60, 119.7, 372, 3599.9, 3600, 7503)]
+    assert spoken == [
+        "0.0 s",
+        "8.4 s",
+        "1 min 0 s",
+        "1 min 0 s",
+        "2 min 0 s",
+        "6 min 12 s",
+        "1 h 0 min",
+        "1 h 0 min",
+        "2 h 5 min",
+    ]
+
+
+def test_the_report_and_clouds_do_not_import_what_only_some_files_need():
+    code = "import sys, json, spnr_jax.scoring.report, spnr_jax.formats.clouds; print(json.dumps(sorted(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert not {"matplotlib", "trimesh", "mitsuba"} & set(json.loads(done.stdout))

@@ -1,0 +1,29 @@
+"""Points on a ball, and PLY files made by hand."""
+
+import numpy as np
+
+VERTEX = [("y", "double"), ("red", "uchar"), ("x", "float"), ("label", "short"), ("z", "float")]
+NUMPY = {"double": "f8", "uchar": "u1", "float": "f4", "short": "i2"}
+ROWS = [(0.125, 255, -1.5, -7, 3.0), (2.5, 0, 1e-3, 300, -4.25), (0.0, 7, 9.0, 0, 1.0)]
+
+
+def ply_bytes(form: str, newline: str = "\n", rows=ROWS, properties=VERTEX, before: int = 2) -> bytes:
+    """A PLY file of `rows`, behind an element of `before` cameras and in front of an element of edges."""
+    header = ["ply", f"format {form} 1.0", "comment made by hand", "obj_info none"]
+    header += [f"element camera {before}", "property float f", "property int id", f"element vertex {len(rows)}"]
+    header += [f"property {kind} {name}" for name, kind in properties]
+    header += ["element edge 1", "property list uchar int ends", "end_header", ""]
+    head = newline.join(header).encode()
+    if form == "ascii":
+        lines = ["1.5 3"] * before + [" ".join(map(str, row)) for row in rows] + ["2 0 1", ""]
+        return head + newline.join(lines).encode()
+    order = "<" if "little" in form else ">"
+    camera = np.array([(1.5, 3)] * before, [("f", order + "f4"), ("id", order + "i4")])
+    vertex = np.array(rows, [(name, order + NUMPY[kind]) for name, kind in properties])
+    return head + camera.tobytes() + vertex.tobytes() + b"\x02\0\0\0\0\1\0\0\0"
+
+
+def sphere_points(seed: int, num_points: int) -> np.ndarray:
+    """Points on a sphere, much denser at one pole."""
+    points = np.random.default_rng(seed).normal(size=(num_points, 3)) + [0, 1.5, 0]
+    return points / np.linalg.norm(points, axis=-1, keepdims=True)

@@ -1,0 +1,47 @@
+"""Every network of the comparison with few weights, for the pixels and points of `tiny_dataset`."""
+
+import dataclasses
+
+from support import tiny_dataset, tiny_model
+
+from spnr_jax.config import LossConfig, OptimizerConfig
+from spnr_jax.model_config import NetworkConfig, NPBGConfig, PointNeRFConfig, Points2NeRFConfig
+
+SIZE = tiny_dataset.SIZE
+BASELINE = dataclasses.replace(
+    tiny_dataset.CONFIG,
+    loss=LossConfig(l1_weight=1.0, adversarial_weight=0.0, pixel="mse"),
+    optimizer=OptimizerConfig(lr_generator=1e-2, warmup_steps=2, ema_decay=0.9),
+)
+PLUS = dataclasses.replace(tiny_model.PLUS, surface_cells=32, render_resolution=SIZE, image_resolution=SIZE)
+NETWORKS: dict[str, NetworkConfig] = {
+    "plus_tiny": PLUS,
+    "npbg_tiny": NPBGConfig(encoder_widths=(8, 9), decoder_widths=(5,), image_resolution=SIZE),
+    "point_nerf_tiny": PointNeRFConfig(
+        num_candidates=12,
+        num_samples=4,
+        num_neighbors=2,
+        width=4,
+        color_width=4,
+        feature_frequencies=1,
+        offset_frequencies=1,
+        direction_frequencies=1,
+        image_resolution=SIZE,
+    ),
+    "points2nerf_tiny": Points2NeRFConfig(
+        point_widths=(8,),
+        hidden_width=4,
+        code_size=4,
+        hypernetwork_widths=(4,),
+        chunk_size=64,
+        chunk_embedding=2,
+        frequencies=1,
+        nerf_width=4,
+        nerf_depth=2,
+        num_samples=4,
+        image_resolution=SIZE,
+    ),
+}
+SHRUNKEN = {"tiny": dataclasses.replace(BASELINE, model=tiny_dataset.CONFIG.model)} | {
+    name: dataclasses.replace(BASELINE, preset=name, model=model) for name, model in NETWORKS.items()
+}

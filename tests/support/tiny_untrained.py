@@ -1,0 +1,21 @@
+"""A run folder of an untrained network, made in a second: for what asks whether it runs, not how good it is."""
+
+import dataclasses
+import functools
+
+from support import tiny_dataset
+
+from spnr_jax.training import checkpoint, optimisation
+
+CONFIG = dataclasses.replace(
+    tiny_dataset.CONFIG, loss=dataclasses.replace(tiny_dataset.CONFIG.loss, adversarial_weight=0.0)
+)
+
+
+@functools.cache
+def run():
+    """The folder, removed at the end of the session."""
+    folder = tiny_dataset.folder() / "untrained"
+    checkpoint.write_config(folder, CONFIG)
+    checkpoint.save(folder, optimisation.jitted_create_state(CONFIG))
+    return folder

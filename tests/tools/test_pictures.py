@@ -1,0 +1,155 @@
+"""Every picture that was asked for lies where it was said, and a cloud in any file comes out as pictures."""
+
+import json
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+from support import tiny_dataset
+
+from spnr_jax.formats.up_axis import ROTATIONS
+from spnr_jax.tools import pictures
+from spnr_jax.tools.render_command import Render
+
+OPTIONS = {"views": 2, "resolution": 24, "num_points": 30, "up": "y", "frames": 5}
+KINDS = (".png", "_depth.png", "_depth.npy", "_depth_16bit.png", "_opacity.png")
+STILLS = {f"chair_{i:03d}{kind}" for i in range(2) for kind in KINDS} | {"chair_cameras.json"}
+
+
+def cloud_file(folder, name="chair.xyz", count=40):
+    points = np.random.default_rng(0).uniform(-1, 1, (count, 3))
+    np.savetxt(folder / name, points)
+    return folder / name
+
+
+def rendered(cloud, out, **options):
+    notes: list[str] = []
+    command = Render(cloud=cloud, run=tiny_dataset.run(), out=out, **OPTIONS | options)
+    return [*pictures.render_file(command, notes.append), *notes]
+
+
+def shown(path):
+    with Image.open(path) as picture:
+        return np.asarray(picture)
+
+
+def names(out):
+    return {path.name for path in out.iterdir()}
+
+
+def test_stills_depth_opacity_and_a_turntable_of_the_asked_frames_are_written(tmp_path):
+    out = tmp_path / "new" / "out"
+    lines = rendered(cloud_file(tmp_path), out)
+    assert names(out) == STILLS | {"chair_turntable.gif"}
+    assert {shown(out / name).shape[:2] for name in STILLS if name.endswith(("000.png", "001.png"))} == {(24, 24)}
+    assert {shown(out / name).shape[:2] for name in STILLS if "depth.png" in name or "opacity" in name} == {(8, 8)}
+    with Image.open(out / "chair_turntable.gif") as film:
+        assert film.n_frames == 5
+    assert any("30 of 40 points" in line for line in lines)
+    assert [line for line in lines if line.startswith("wrote")] == [
+        f"wrote {out / name}" for name in ("chair_000.png", "chair_001.png", "chair_turntable.gif")
+    ]
+
+
+def test_a_name_with_dots_keeps_every_view(tmp_path):
+    rendered(cloud_file(tmp_path, "chair.v2.xyz"), tmp_path / "out", turntable="none")
+    assert names(tmp_path / "out") == {name.replace("chair", "chair.v2") for name in STILLS}
+
+
+def test_the_views_are_different_and_the_same_again_at_the_second_time(tmp_path):
+    cloud = cloud_file(tmp_path)
+    for out in ("a", "b"):
+        rendered(cloud, tmp_path / out)
+    files = {name: (tmp_path / "a" / name).read_bytes() for name in names(tmp_path / "a")}
+    assert files == {name: (tmp_path / "b" / name).read_bytes() for name in names(tmp_path / "b")}
+    assert files["chair_000_depth.png"] != files["chair_001_depth.png"]
+
+
+def test_a_file_turned_and_moved_gives_the_same_pictures_and_cameras_that_moved_with_it(tmp_path):
+    turn, shift = np.array(ROTATIONS["z"], float), np.array([16.0, -4.0, 2.0])
+    points = np.round(np.random.default_rng(0).uniform(-1, 1, (30, 3)) * 64) / 64  # exact in float32, also moved
+    for name, positions in (("a", points), ("b", points @ turn + shift)):
+        np.save(tmp_path / f"{name}.npy", positions)
+    for name, up in (("a", "y"), ("b", "z")):
+        rendered(tmp_path / f"{name}.npy", tmp_path, up=up, views=1, turntable="none")
+    for kind in KINDS[:2]:
+        assert np.abs(shown(tmp_path / f"a_000{kind}").astype(int) - shown(tmp_path / f"b_000{kind}")).max() <= 1
+    documents = [json.loads((tmp_path / f"{name}_cameras.json").read_text()) for name in "ab"]
+    here, there = (np.array(d["frames"][0]["transform_matrix"]) for d in documents)
+    np.testing.assert_allclose(there[:3, :3], turn.T @ here[:3, :3], atol=1e-6)
+    np.testing.assert_allclose(there[:3, 3], turn.T @ here[:3, 3] + shift, atol=1e-5)
+    for document, positions in zip(documents, (points, points @ turn + shift), strict=True):
+        to_box = document["normalization"]
+        inside = to_box["scale"] * (positions @ np.array(to_box["rotation"]).T - to_box["centre"])
+        np.testing.assert_allclose(inside.min(axis=0), -inside.max(axis=0), atol=1e-5)
+        np.testing.assert_allclose(np.linalg.norm(inside.max(axis=0)), 1, atol=1e-5)
+
+
+def test_the_depth_files_say_the_same_in_the_units_of_the_file(tmp_path):
+    rendered(cloud_file(tmp_path), tmp_path, turntable="none")
+    scale = json.loads((tmp_path / "chair_cameras.json").read_text())["depth"]["scale_16bit"]
+    for i in range(2):
+        depth, steps = np.load(tmp_path / f"chair_00{i}_depth.npy"), shown(tmp_path / f"chair_00{i}_depth_16bit.png")
+        assert (depth.dtype, steps.dtype) == (np.float32, np.uint16)
+        np.testing.assert_array_equal(steps == 0, np.isnan(depth))
+        np.testing.assert_allclose(scale * steps[steps > 0], depth[steps > 0], atol=scale)
+
+
+def test_straight_alpha_laid_on_white_is_the_image_again():
+    rng = np.random.default_rng(0)
+    acc = rng.uniform(0.1, 1, size=(8, 8)).astype(np.float32)
+    image = acc[..., None] * rng.uniform(size=(8, 8, 3)) + 1 - acc[..., None]
+    rgba = pictures.straight_alpha(image, acc)
+    np.testing.assert_allclose(rgba[..., :3] * rgba[..., 3:] + 1 - rgba[..., 3:], image, atol=1e-5)
+    nothing = pictures.straight_alpha(np.ones((4, 4, 3)), np.zeros((2, 2)))
+    np.testing.assert_array_equal(nothing, np.broadcast_to([1.0, 1, 1, 0], (4, 4, 4)))
+
+
+def test_a_transparent_still_has_an_alpha_channel_and_chosen_outputs_alone_are_written(tmp_path):
+    out = tmp_path / "out"
+    rendered(cloud_file(tmp_path), out, turntable="none", outputs=("image",), transparent=True)
+    assert names(out) == {"chair_000.png", "chair_001.png", "chair_cameras.json"}
+    assert shown(out / "chair_000.png").shape == (24, 24, 4)
+
+
+def test_the_density_grid_is_written_with_its_place_and_the_mesh_in_the_frame_of_the_file(tmp_path, monkeypatch):
+    monkeypatch.setattr(pictures, "MESH_OPACITY", 1e-3)  # the tests' network is hardly trained: all fog
+    np.save(tmp_path / "chair.npy", np.random.default_rng(0).uniform(-1, 1, (40, 3)) * [1, 2, 3] + [100, 200, 300])
+    out = tmp_path / "out"
+    rendered(tmp_path / "chair.npy", out, views=0, turntable="none", up="z", mesh=True, density=True, grid_resolution=9)
+    assert names(out) == {"chair_mesh.glb", "chair_density.npz"}
+    with np.load(out / "chair_density.npz") as grid:
+        assert grid["density"].shape == (9, 9, 9)
+        middle = grid["lowest"] + 4 * grid["spacing"]
+    np.testing.assert_allclose(middle, [100, 200, 300], atol=0.5)
+    bounds = trimesh.load(out / "chair_mesh.glb").bounds
+    np.testing.assert_allclose(bounds.mean(axis=0), [100, 200, 300], atol=1.5)
+
+
+def test_no_views_and_no_turntable_write_nothing(tmp_path):
+    rendered(cloud_file(tmp_path), tmp_path / "out", views=0, turntable="none")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_cloud_of_one_point_gives_pictures(tmp_path):
+    (tmp_path / "chair.xyz").write_text("3 4 5\n")
+    rendered(tmp_path / "chair.xyz", tmp_path / "out", turntable="none")
+    assert names(tmp_path / "out") == STILLS
+
+
+@pytest.mark.parametrize(
+    ("option", "expected"),
+    [
+        ({"elevation": 91.0}, "--elevation must be -90 to 90 degrees, got 91"),
+        ({"grid_resolution": 4}, "--grid-resolution must be 8 to 512, got 4"),
+        ({"views": -1}, "--views must not be negative, got -1"),
+        ({"frames": 0}, "--frames must be at least 1, got 0"),
+        ({"num_points": 0}, "--num-points must be at least 1, got 0"),
+        ({"resolution": 18}, "--resolution must be a multiple of 4 of at least 16, got 18"),
+        ({"resolution": 8}, "--resolution must be a multiple of 4 of at least 16, got 8"),
+    ],
+)
+def test_options_without_sense_are_refused_by_their_name_before_anything_is_read(option, expected, tmp_path):
+    with pytest.raises(ValueError, match=expected):
+        rendered(tmp_path / "missing.xyz", tmp_path / "out", **option)

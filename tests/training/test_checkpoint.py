@@ -1,0 +1,165 @@
+"""Run folders: a config guards its run, and a broken checkpoint costs the steps since the one before, not the run."""
+
+import dataclasses
+import itertools
+import json
+import shutil
+
+import jax
+import pytest
+from support import tiny_dataset
+from support.laws import same_bits
+from support.tiny_dataset import CONFIG
+
+from spnr_jax import config, presets
+from spnr_jax.training import checkpoint, optimisation
+
+# Orbax's reader drops a coroutine of its Zarr store when a file is not what it expects
+pytestmark = pytest.mark.filterwarnings(
+    "ignore:coroutine 'Store:RuntimeWarning", "ignore::pytest.PytestUnraisableExceptionWarning"
+)
+
+
+def newest_files(run, step):
+    return sorted(path for path in (run / "checkpoints" / str(step)).rglob("*") if path.is_file())
+
+
+def emptied(path):
+    path.write_bytes(b"")
+
+
+def overwritten(path):
+    path.write_bytes(b"\xff" * path.stat().st_size)
+
+
+def halved(path):
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+DAMAGES = {"emptied": emptied, "overwritten": overwritten, "halved": halved, "deleted": lambda path: path.unlink()}
+
+
+@pytest.fixture
+def run(tmp_path):
+    return shutil.copytree(tiny_dataset.run(), tmp_path / "run")
+
+
+def test_a_state_comes_back_bit_by_bit(tmp_path):
+    state = optimisation.create_state(CONFIG)
+    checkpoint.save(tmp_path, state)
+    same_bits(checkpoint.restore(tmp_path, CONFIG), state)
+
+
+def test_a_state_without_statistics_comes_back_too(tmp_path):
+    tiny = presets.PRESETS["npbg_tiny"]()
+    state = optimisation.jitted_create_state(tiny)
+    checkpoint.write_config(tmp_path, tiny)
+    checkpoint.save(tmp_path, state)
+    assert state.batch_stats == {}
+    same_bits(checkpoint.load_run(tmp_path)[1], state)
+
+
+def test_a_run_of_another_method_is_refused_with_its_name(tmp_path):
+    checkpoint.write_config(tmp_path, presets.tiny())
+    (tmp_path / "checkpoints").mkdir()
+    with pytest.raises(ValueError, match=r"model\.method ours there, npbg asked"):
+        checkpoint.write_config(tmp_path, presets.PRESETS["npbg_tiny"]())
+
+
+def test_a_folder_without_checkpoints_holds_no_state(tmp_path):
+    assert checkpoint.restore(tmp_path, CONFIG) is None
+
+
+@pytest.mark.parametrize("damage", DAMAGES.values(), ids=DAMAGES)
+def test_a_damaged_newest_checkpoint_is_named_and_the_one_before_is_taken(damage, run):
+    for path in newest_files(run, 6):
+        damage(path)
+    said = []
+    state = checkpoint.restore(run, CONFIG, said.append)
+    assert int(state.step) == 4
+    assert len(said) == 1
+    assert str(run / "checkpoints" / "6") in said[0]
+    assert "\n" not in said[0]
+
+
+def test_damage_to_a_single_file_costs_the_checkpoint_or_nothing(run):
+    whole = checkpoint.restore(run, CONFIG)
+    taken = []
+    for path, damage in zip(newest_files(run, 6), itertools.cycle(DAMAGES.values()), strict=False):
+        content = path.read_bytes()
+        damage(path)
+        state = checkpoint.restore(run, CONFIG, lambda line: None)
+        taken.append(int(state.step))
+        assert taken[-1] in (4, 6)
+        if taken[-1] == 6:
+            same_bits(state, whole)
+        path.write_bytes(content)
+    assert 4 in taken
+
+
+def test_a_checkpoint_of_another_step_under_this_name_is_not_taken(run):
+    shutil.rmtree(run / "checkpoints" / "6")
+    shutil.copytree(run / "checkpoints" / "2", run / "checkpoints" / "6")
+    said = []
+    assert int(checkpoint.restore(run, CONFIG, said.append).step) == 4
+    assert len(said) == 1
+
+
+def test_a_run_whose_checkpoints_are_all_damaged_is_one_clear_error(run):
+    for step in (2, 4, 6):
+        for path in newest_files(run, step):
+            emptied(path)
+    with pytest.raises(
+        ValueError, match="no checkpoint of this run can be read; remove the folder to start again"
+    ) as error:
+        checkpoint.restore(run, CONFIG, lambda line: None)
+    assert "\n" not in str(error.value)
+
+
+def test_reading_leaves_what_a_running_training_is_writing(run):
+    writing = run / "checkpoints" / "8.orbax-checkpoint-tmp"
+    writing.mkdir()
+    checkpoint.restore(run, CONFIG)
+    assert writing.is_dir()
+
+
+def test_the_newest_three_checkpoints_stay(tmp_path):
+    state = optimisation.create_state(CONFIG)
+    for step in range(1, 6):
+        checkpoint.save(tmp_path, dataclasses.replace(state, step=jax.numpy.full_like(state.step, step)))
+    assert {path.name for path in (tmp_path / "checkpoints").iterdir() if path.is_dir()} == {"3", "4", "5"}
+
+
+def test_a_config_comes_back_from_the_run_folder(tmp_path):
+    checkpoint.write_config(tmp_path / "run", presets.small())
+    assert checkpoint.read_config(tmp_path / "run") == presets.small()
+
+
+def test_a_run_of_another_preset_is_refused_with_the_fields_that_differ(run):
+    other = dataclasses.replace(CONFIG, preset="small", model=dataclasses.replace(CONFIG.model, field_width=16))
+    with pytest.raises(ValueError, match="with another config") as error:
+        checkpoint.write_config(run, other)
+    assert "preset tiny there, small asked" in str(error.value)
+    assert "model.field_width 8 there, 16 asked" in str(error.value)
+    assert checkpoint.read_config(run) == CONFIG
+    checkpoint.write_config(run, CONFIG)
+
+
+def test_a_run_that_never_got_to_a_checkpoint_may_begin_again_with_another_config(tmp_path):
+    checkpoint.write_config(tmp_path, presets.small())
+    checkpoint.write_config(tmp_path, CONFIG)
+    assert checkpoint.read_config(tmp_path) == CONFIG
+
+
+@pytest.mark.parametrize(
+    "text", ["", "{", "[]", "3", '{"preset": "tiny"}', json.dumps(config.to_dict(CONFIG) | {"num_steps": "many"})]
+)
+def test_a_config_that_is_none_is_an_error_with_its_path(text, tmp_path):
+    (tmp_path / "config.json").write_text(text)
+    with pytest.raises(ValueError, match="config.json: not a config of this version"):
+        checkpoint.read_config(tmp_path)
+
+
+def test_a_folder_that_is_no_run_says_how_to_train_one(tmp_path):
+    with pytest.raises(ValueError, match="not a run folder .*spnr train DATA"):
+        checkpoint.read_config(tmp_path / "nowhere")

@@ -1,0 +1,378 @@
+"""The training step: two networks, one forward, and a state that repeats itself bit for bit."""
+
+import dataclasses
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from support.laws import close, numbers, same_bits
+from support.tiny_model import MODEL, SIZE
+from support.tiny_training import BATCH, CONFIG, L1_ONLY, copied, create, run, step
+
+from spnr_jax.baselines import networks
+from spnr_jax.config import LossConfig, OptimizerConfig
+from spnr_jax.kernels import cameras, losses
+from spnr_jax.kernels.records import Rendering
+from spnr_jax.method import inference
+from spnr_jax.method.renderer import Renderer
+from spnr_jax.model_config import NPBGConfig, PointNeRFConfig
+from spnr_jax.training import optimisation
+
+
+@pytest.fixture(scope="module")
+def fresh():
+    return create(CONFIG)
+
+
+@pytest.fixture(scope="module")
+def fresh_l1():
+    return create(L1_ONLY)
+
+
+def near(actual, expected):
+    """Gradients agree to a thousandth of the largest entry of each leaf."""
+    for ours, theirs in zip(jax.tree.leaves(actual), jax.tree.leaves(expected), strict=True):
+        close(ours, theirs, rtol=1e-3, atol=1e-3 * float(np.abs(theirs).max()) + 1e-9)
+
+
+def through_host(state):
+    """The state as it would come back from a file: NumPy arrays, the key as its data."""
+    data = jax.tree.map(np.asarray, dataclasses.replace(state, key=jax.random.key_data(state.key)))
+    restored = jax.tree.map(jnp.asarray, data)
+    return dataclasses.replace(restored, key=jax.random.wrap_key_data(restored.key))
+
+
+class TestState:
+    def test_equal_seeds_give_equal_bits_and_other_seeds_other_weights(self, fresh, fresh_l1):
+        same_bits(create(CONFIG), fresh)
+        kernels = [state.generator["unet"]["stem"]["kernel"] for state in (fresh, fresh_l1)]
+        assert (kernels[0] != kernels[1]).mean() > 0.99
+
+    def test_the_average_starts_as_the_generator(self, fresh):
+        same_bits(fresh.averaged, fresh.generator)
+        same_bits(fresh.averaged_stats, fresh.batch_stats)
+
+    def test_there_is_no_discriminator_at_weight_zero_or_if_its_time_never_comes(self, fresh, fresh_l1):
+        assert fresh.discriminator is not None
+        assert fresh_l1.discriminator is None
+        assert fresh_l1.discriminator_optimizer is None
+        late = dataclasses.replace(CONFIG, loss=dataclasses.replace(CONFIG.loss, adversarial_start=1.0))
+        assert optimisation.first_adversarial_step(late) == late.num_steps
+        assert jax.eval_shape(lambda: optimisation.create_state(late)).discriminator is None
+
+    @pytest.mark.parametrize(("share", "first"), [(0.0, 0), (0.25, 25), (1.0, 100)])
+    def test_the_discriminator_joins_after_its_share_of_the_steps(self, share, first):
+        loss = dataclasses.replace(CONFIG.loss, adversarial_start=share)
+        assert optimisation.first_adversarial_step(dataclasses.replace(CONFIG, loss=loss)) == first
+
+
+class TestGraph:
+    @staticmethod
+    def traced(state, config, adversarial):
+        return str(
+            jax.make_jaxpr(lambda s: optimisation.train_step(s, BATCH, config=config, adversarial=adversarial))(state)
+        )
+
+    def test_the_l1_graph_contains_no_discriminator(self, fresh, fresh_l1):
+        # its first kernel is the only array with a window of 4 x 4 on 7 channels: image, condition, mask
+        assert "f32[4,4,7," in self.traced(fresh, CONFIG, True)
+        assert "f32[4,4,7," not in self.traced(fresh_l1, L1_ONLY, False)
+
+    def test_before_its_time_the_discriminator_is_handed_through_untouched(self, fresh):
+        def after(state):
+            return optimisation.train_step(state, BATCH, config=CONFIG, adversarial=False)[0]
+
+        traced = jax.make_jaxpr(after, return_shape=True)(fresh)
+        jaxpr, shape = traced
+        names = [jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_leaves_with_path(shape)]
+        kept = [out for name, out in zip(names, jaxpr.jaxpr.outvars, strict=True) if name.startswith(".discriminator")]
+        assert kept
+        assert set(map(id, kept)) <= set(map(id, jaxpr.jaxpr.invars))
+
+    def test_the_step_compiles_once(self, fresh):
+        state, _ = step(fresh)
+        compiled = optimisation.jitted_train_step._cache_size()
+        for seed in range(3):
+            state, _ = step(state, data=dataclasses.replace(BATCH, image=numbers(seed, 2, 1, SIZE, SIZE, 3)))
+        assert optimisation.jitted_train_step._cache_size() == compiled
+
+    def test_the_state_is_donated(self, fresh):
+        state = copied(fresh)
+        optimisation.jitted_train_step(state, BATCH, config=CONFIG, adversarial=True)
+        assert all(
+            leaf.is_deleted() for leaf in jax.tree.leaves((state.generator, state.averaged, state.discriminator))
+        )
+
+
+class TestStep:
+    def test_is_the_discriminators_update_and_then_the_generators_written_out(self, fresh):
+        """One forward and one pull-back give what two separate losses with their own forwards give."""
+        state, metrics = step(fresh)
+        generator_adam, discriminator_adam = optimisation.optimizers(CONFIG)
+
+        @jax.jit
+        def written_out(start, data):
+            key = jax.random.fold_in(start.key, 0)
+            real, condition, mask = data.image[:, 0], data.condition[:, 0], data.condition_mask[:, 0]
+
+            def forward(params):
+                variables = {"params": params, "batch_stats": start.batch_stats}
+                return Renderer(MODEL).apply(
+                    variables, data.cloud, data.camera, jax.random.clone(key), train=True, mutable=["batch_stats"]
+                )
+
+            def judge(params, image):
+                return optimisation.discriminator_of(CONFIG).apply({"params": params}, image, condition, mask)
+
+            def discriminator_loss(params):
+                fake = jax.lax.stop_gradient(forward(start.generator)[0].image[:, 0])
+                penalty = losses.r1(lambda image: judge(params, image), real)
+                loss = losses.discriminator_adversarial(judge(params, real), judge(params, fake))
+                return loss + CONFIG.loss.r1_interval * CONFIG.loss.r1_gamma * penalty
+
+            gradient = jax.grad(discriminator_loss)(start.discriminator)
+            update, after = discriminator_adam.update(gradient, start.discriminator_optimizer)
+            discriminator = optax.apply_updates(start.discriminator, update)
+
+            def generator_loss(params):
+                rendering, _ = forward(params)
+                low = losses.area_downsample(data.image, 8)
+                l1 = losses.l1(rendering.image, data.image) + 0.5 * losses.l1(rendering.image_lr, low)
+                return 100 * l1 + losses.generator_adversarial(judge(discriminator, rendering.image[:, 0]))
+
+            loss, gradient = jax.value_and_grad(generator_loss)(start.generator)
+            return loss, (after[0].mu, generator_adam.update(gradient, start.generator_optimizer)[1][0].mu)
+
+        loss, moments = written_out(fresh, BATCH)
+        close(metrics["loss"], loss)
+        near(state.discriminator_optimizer[0].mu, moments[0])  # Adam's first step hides sizes, mu shows them
+        near(state.generator_optimizer[0].mu, moments[1])
+
+    def test_counts_itself_and_moves_both_networks(self, fresh):
+        state, metrics = step(fresh)
+        assert state.step == 1
+        for before, after in ((fresh.generator, state.generator), (fresh.discriminator, state.discriminator)):
+            moved = [(a != b).any() for a, b in zip(jax.tree.leaves(before), jax.tree.leaves(after), strict=True)]
+            assert np.mean(moved) > 0.5
+        assert all(np.isfinite(value) for value in metrics.values())
+
+    def test_metrics_are_those_of_the_rendering(self, fresh_l1):
+        _, metrics = step(fresh_l1, L1_ONLY)
+        assert set(metrics) == {"psnr", "l1", "loss", "gradient_norm"}
+        assert metrics["loss"] > 100 * metrics["l1"], "the low-resolution part comes on top"
+
+    def test_running_statistics_are_those_of_the_forward(self, fresh_l1):
+        state, _ = step(fresh_l1, L1_ONLY)
+        stats = state.batch_stats["pointnet"]["norm_0"]
+        assert (stats["mean"] != 0).all()
+        assert (stats["variance"] != 1).all()
+
+
+class TestCondition:
+    def test_without_it_the_discriminator_sees_an_empty_image_and_mask(self, fresh):
+        blind = dataclasses.replace(CONFIG, loss=dataclasses.replace(CONFIG.loss, condition=False))
+        image, condition, mask = (x[:, 0] for x in (BATCH.image, BATCH.condition, BATCH.condition_mask))
+        empty = jnp.zeros_like(condition), jnp.zeros_like(mask)
+        seen, unseen, expected = (
+            jax.jit(optimisation.logits, static_argnums=0)(config, fresh.discriminator, image, *inputs)
+            for config, inputs in ((CONFIG, (condition, mask)), (blind, (condition, mask)), (CONFIG, empty))
+        )
+        same_bits(unseen, expected)
+        assert (seen != unseen).any()
+
+
+class TestLazyR1:
+    @pytest.mark.parametrize(("at", "due"), [(0, True), (1, False), (2, True), (3, False)])
+    def test_the_penalty_comes_every_interval_and_is_scaled_by_it(self, fresh, at, due):
+        data, fake = BATCH, numbers(2, 2, SIZE, SIZE, 3)
+        real, condition, mask = data.image[:, 0], data.condition[:, 0], data.condition_mask[:, 0]
+
+        @jax.jit
+        def parts(params, step):
+            loss, metrics = optimisation.discriminator_loss(CONFIG, params, fake, data, step)
+            module = optimisation.discriminator_of(CONFIG)
+            penalty = losses.r1(lambda image: module.apply({"params": params}, image, condition, mask), real)
+            return loss - metrics["discriminator"], 2 * 10 * penalty
+
+        added, penalty = parts(fresh.discriminator, jnp.int32(at))
+        assert penalty > 0
+        close(added, penalty * due, rtol=1e-3, atol=1e-5)
+
+
+class TestAverage:
+    def test_moves_by_a_decay_that_grows_from_a_tenth_to_its_end(self, fresh_l1):
+        state = fresh_l1
+        for at in (0, 1, 200):
+            state = dataclasses.replace(state, step=jnp.int32(at))
+            after, _ = step(state, L1_ONLY)
+            decay = min(0.9, (1 + at) / (10 + at))
+            expected = jax.tree.map(
+                lambda old, new, decay=decay: decay * old + (1 - decay) * new,
+                (state.averaged, state.averaged_stats),
+                (after.generator, after.batch_stats),
+            )
+            close((after.averaged, after.averaged_stats), expected, atol=1e-7)
+            state = after
+
+    def test_evaluation_uses_it(self, fresh_l1):
+        state, _ = run(fresh_l1, 3, L1_ONLY)
+        variables = optimisation.averaged_variables(state)
+        same_bits(variables, {"params": state.averaged, "batch_stats": state.averaged_stats})
+
+
+class TestLearningRate:
+    @pytest.mark.parametrize(("warmup", "steps"), [(10, 100), (0, 50), (500, 100), (1, 1)])
+    def test_rises_linearly_then_falls_by_a_cosine_to_its_last_share(self, warmup, steps):
+        o = OptimizerConfig(lr_generator=2e-3, warmup_steps=warmup, final_lr_scale=0.1)
+        rate = optimisation.learning_rate(dataclasses.replace(CONFIG, optimizer=o, num_steps=steps))
+        warmup = min(warmup, steps)
+        start = 2e-3 / max(warmup, 1)
+        for at in sorted({0, warmup // 2, warmup, (warmup + steps) // 2, steps - 1}):
+            if at <= warmup and warmup:
+                expected = start + (2e-3 - start) * at / warmup
+            else:
+                share = min((at - warmup) / (max(steps, warmup + 1) - warmup), 1)
+                expected = 2e-3 * (0.1 + 0.9 * 0.5 * (1 + np.cos(np.pi * share)))
+            assert float(rate(at)) == pytest.approx(expected, rel=1e-5)
+        assert float(rate(0)) > 0, "no step is lost"
+
+    def test_or_by_an_exponential(self):
+        """Point-NeRF's: a tenth after half a million of a million steps."""
+        o = OptimizerConfig(lr_generator=5e-4, warmup_steps=0, final_lr_scale=0.01, decay="exponential")
+        rate = optimisation.learning_rate(dataclasses.replace(CONFIG, optimizer=o, num_steps=1_000_000))
+        for at, expected in ((0, 5e-4), (500_000, 5e-5), (1_000_000, 5e-6)):
+            assert float(rate(at)) == pytest.approx(expected, rel=1e-4)
+
+    def test_the_algorithm_is_the_one_asked_for(self):
+        gradient, updates = jnp.array([0.5, -2.0]), {}
+        for name, algorithm in (("adam", optax.adam), ("radam", optax.radam)):
+            config = dataclasses.replace(CONFIG, optimizer=dataclasses.replace(CONFIG.optimizer, algorithm=name))
+            expected = algorithm(optimisation.learning_rate(config))
+            ours, _ = optimisation.optimizers(config)
+            updates[name], _ = ours.update(gradient, ours.init(gradient))
+            close(updates[name], expected.update(gradient, expected.init(gradient))[0])
+        assert (updates["adam"] != updates["radam"]).all()
+
+
+class TestLattice:
+    def test_is_every_so_many_th_pixel_of_picture_condition_and_rays(self):
+        made, firsts = jax.jit(optimisation.lattice, static_argnums=2), set()
+        whole = cameras.camera_rays(BATCH.camera).directions
+        for seed in range(6):
+            thin = made(jax.random.key(seed), BATCH, 4)
+            assert thin.image.shape == (2, 1, SIZE // 4, SIZE // 4, 3)
+            rays = cameras.camera_rays(thin.camera).directions
+            distance = np.abs(np.asarray(whole[0, 0]) - np.asarray(rays[0, 0, 0, 0])).sum(-1)
+            row, column = np.unravel_index(distance.argmin(), distance.shape)
+            assert max(row, column) < 4
+            firsts.add((row, column))
+            close(rays, whole[:, :, row::4, column::4], atol=1e-6)
+            for name in ("image", "condition", "condition_mask"):
+                same_bits(getattr(thin, name), getattr(BATCH, name)[:, :, row::4, column::4])
+            same_bits(thin.cloud, BATCH.cloud)
+        assert len(firsts) > 3, "another first pixel for another key"
+
+
+class TestPixelError:
+    def test_is_the_mean_of_what_the_config_asks_for(self):
+        image, reference = numbers(0, 2, 1, 4, 4, 3), numbers(1, 2, 1, 4, 4, 3)
+        for pixel, expected in (("l1", np.abs(image - reference)), ("mse", (image - reference) ** 2)):
+            config = dataclasses.replace(L1_ONLY, loss=dataclasses.replace(L1_ONLY.loss, pixel=pixel))
+            close(optimisation.pixel_error(config, image, reference), expected.mean())
+            seen = jnp.arange(32).reshape(2, 1, 4, 4) % 5 == 0
+            close(optimisation.pixel_error(config, image, reference, seen), expected[np.asarray(seen)].mean())
+            assert optimisation.pixel_error(config, image, reference, jnp.zeros_like(seen)) == 0
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class OneColorConfig(NPBGConfig):
+    """A network of one weight, to see what the step asks of a network."""
+
+
+class OneColor(nn.Module):
+    config: OneColorConfig
+
+    @nn.compact
+    def __call__(self, cloud, camera, key=None, train=False):
+        grey = self.param("grey", nn.initializers.constant(0.25), ())
+        self.sow("losses", "size", 3 * grey**2)
+        image = jnp.full((*camera.cam_to_world.shape[:-2], camera.height, camera.width, 3), grey)
+        return Rendering(image=image, image_lr=image, depth=image[..., 0], acc=image[..., 0])
+
+
+def test_a_method_is_a_network_and_a_loss(monkeypatch):
+    """One weight g, no statistics: the gradient of 2 mean (g - reference)^2 + 3 g^2, written out."""
+    monkeypatch.setitem(networks.NETWORKS, OneColorConfig, OneColor)
+    config = dataclasses.replace(
+        L1_ONLY,
+        model=OneColorConfig(image_resolution=32),
+        loss=LossConfig(l1_weight=2.0, adversarial_weight=0.0, pixel="mse"),
+    )
+    state = create(config)
+    assert (state.generator, state.batch_stats) == ({"grey": 0.25}, {})
+    after, metrics = step(state, config)
+    reference = np.float64(BATCH.image)
+    expected = 2 * np.mean((0.25 - reference) ** 2) + 3 * 0.25**2
+    assert float(metrics["loss"]) == pytest.approx(expected, rel=1e-5)
+    assert float(metrics["size"]) == pytest.approx(3 * 0.25**2)
+    gradient = 4 * np.mean(0.25 - reference) + 6 * 0.25
+    close(after.generator_optimizer[0].mu["grey"], 0.1 * gradient, rtol=1e-4)
+    assert after.averaged["grey"] != after.generator["grey"]
+
+
+def test_a_network_of_rays_is_shown_in_chunks_and_one_of_pictures_whole():
+    assert {PointNeRFConfig().ray_chunk, NPBGConfig.ray_chunk, MODEL.ray_chunk} == {256, None, 1024}
+    assert isinstance(inference.network(MODEL), Renderer)
+
+
+class TestReproducibility:
+    def test_two_runs_from_one_seed_are_equal_bit_by_bit(self, fresh):
+        same_bits(run(fresh, 3), run(create(CONFIG), 3))
+
+    def test_a_run_that_stops_and_resumes_is_the_run_that_did_not(self, fresh):
+        whole, _ = run(fresh, 4)
+        half, _ = run(fresh, 2)
+        resumed, _ = run(through_host(half), 2)
+        same_bits(resumed, whole)
+
+    def test_every_step_draws_new_samples(self, fresh_l1):
+        """The same weights and batch, one step later: another jitter, another loss."""
+        (_, first), (_, later) = (step(dataclasses.replace(fresh_l1, step=jnp.int32(s)), L1_ONLY) for s in (0, 1))
+        assert first["loss"] != later["loss"]
+
+
+def test_seeds_in_one_compiled_step_are_the_loop_over_seeds(fresh_l1):
+    def varied(seed):
+        generator = jax.tree.map(lambda x: x + 0.1 * numbers(seed, *x.shape), fresh_l1.generator)
+        return dataclasses.replace(fresh_l1, generator=generator, key=jax.random.key(seed))
+
+    states = [varied(seed) for seed in (3, 4)]
+    stacked = jax.tree.map(lambda *x: jnp.stack(x), *states)
+    mapped = jax.vmap(lambda s, b: optimisation.train_step(s, b, config=L1_ONLY, adversarial=False), in_axes=(0, None))
+    after, metrics = jax.jit(mapped)(stacked, BATCH)
+    together = (
+        metrics,
+        after.batch_stats,
+        after.generator_optimizer[0].mu,
+    )  # Adam's first step hides sizes, mu shows them
+    for i, state in enumerate(states):
+        alone, alone_metrics = step(state, L1_ONLY)
+        expected = alone_metrics, alone.batch_stats, alone.generator_optimizer[0].mu
+        near(jax.tree.map(lambda x, i=i: x[i], together), expected)
+
+
+def test_one_batch_is_learnt_by_heart(fresh_l1):
+    """Two balls on white: sixty steps leave less than a third of the loss."""
+    _, start = step(fresh_l1, L1_ONLY)
+    _, end = run(fresh_l1, 60, L1_ONLY)
+    assert end["loss"] < start["loss"] / 3
+
+
+def test_adversarial_training_stays_finite_and_still_learns(fresh):
+    _, start = step(fresh)
+    _, end = run(fresh, 40)
+    assert all(np.isfinite(value) for value in end.values())
+    assert end["l1"] < start["l1"]

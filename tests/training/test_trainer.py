@@ -1,0 +1,242 @@
+"""The loop: stopped anywhere, it goes on to the same numbers; what breaks it is named and leaves a good state."""
+
+import dataclasses
+import errno
+import json
+import os
+import re
+import shutil
+import signal
+from functools import partial
+
+import jax
+import numpy as np
+import pytest
+from support import tiny_dataset
+from support.laws import close, same_bits
+from support.tiny_dataset import CONFIG, SCHEDULE
+
+import spnr_jax
+from spnr_jax import cli
+from spnr_jax.config import LossConfig
+from spnr_jax.formats import data_sets
+from spnr_jax.model_config import NPBGConfig, PointNeRFConfig
+from spnr_jax.scoring import evaluation
+from spnr_jax.training import batching, checkpoint, optimisation, run_record, trainer, weights
+
+KEPT_STEPS = {"2", "4", "6"}
+
+
+def interrupted(monkeypatch, step, number=signal.SIGTERM):
+    """Makes the signal arrive while the batch after `step` steps is fetched."""
+    real = batching.batches
+
+    def batches(dataset, config, first, **options):
+        for i, batch in enumerate(real(dataset, config, first, **options), start=first):
+            if i + 1 == step:
+                signal.raise_signal(number)
+            yield batch
+
+    monkeypatch.setattr(batching, "batches", batches)
+
+
+def stopped_run(monkeypatch, run, step):
+    with monkeypatch.context() as patch:
+        interrupted(patch, step)
+        with pytest.raises(KeyboardInterrupt, match=f"stopped at step {step} of 6"):
+            trainer.train(CONFIG, tiny_dataset.dataset(), run, SCHEDULE)
+
+
+def rows_without_time(run):
+    return [{k: v for k, v in row.items() if k != "ms_per_step"} for row in trainer.read_rows(run)]
+
+
+def restored(run):
+    return checkpoint.restore(run, CONFIG)
+
+
+def test_a_stopped_run_goes_on_to_the_same_bits_and_rows(monkeypatch, tmp_path):
+    stopped_run(monkeypatch, tmp_path, 3)
+    assert int(restored(tmp_path).step) == 3
+    trainer.train(CONFIG, tiny_dataset.dataset(), tmp_path, SCHEDULE)
+    same_bits(restored(tmp_path), restored(tiny_dataset.run()))
+    assert rows_without_time(tmp_path) == rows_without_time(tiny_dataset.run())
+
+
+class TestBeginningWithOtherWeights:
+    def test_the_first_step_starts_from_them_and_the_record_names_them(self, tmp_path):
+        slow = dataclasses.replace(CONFIG.optimizer, lr_generator=1e-12, warmup_steps=0)
+        config = dataclasses.replace(CONFIG, optimizer=slow, seed=CONFIG.seed + 1)
+        init = weights.read_trained(tiny_dataset.run())
+        state = trainer.train(config, tiny_dataset.dataset(), tmp_path, SCHEDULE, init=init)
+        close(state.generator, init.variables["params"], atol=1e-9)
+        close(state.averaged, init.variables["params"], atol=1e-9)
+        (start,) = run_record.read_starts(tmp_path)
+        assert start["init"] == f"{CONFIG.preset}, {CONFIG.num_steps} steps"
+
+    def test_a_run_that_goes_on_keeps_its_own(self, tmp_path):
+        run = shutil.copytree(tiny_dataset.run(), tmp_path / "run")
+        shutil.rmtree(run / "checkpoints" / "6")
+        init = weights.read_trained(tiny_dataset.run())
+        zero = dataclasses.replace(init, variables=jax.tree.map(np.zeros_like, init.variables))
+        same_bits(trainer.train(CONFIG, tiny_dataset.dataset(), run, SCHEDULE, init=zero), restored(tiny_dataset.run()))
+
+    def test_weights_of_another_network_are_refused_in_one_line(self, tmp_path, capsys):
+        small = dataclasses.replace(CONFIG.model, base_width=2 * CONFIG.model.base_width)
+        config, init = dataclasses.replace(CONFIG, model=small), weights.read_trained(tiny_dataset.run())
+        work = partial(trainer.train, config, tiny_dataset.dataset(), tmp_path, SCHEDULE, init=init)
+        assert cli.guarded(work, "spnr") == 2
+        assert "are of another network: shape of" in capsys.readouterr().err.splitlines()[-1]
+
+
+@pytest.mark.parametrize("end", ["", '{"step": 6, "lo'])
+def test_rows_after_the_checkpoint_and_half_rows_are_written_again(end, tmp_path):
+    run = shutil.copytree(tiny_dataset.run(), tmp_path / "run")
+    shutil.rmtree(run / "checkpoints" / "6")
+    with (run / "metrics.jsonl").open("a") as file:
+        file.write(end)
+    trainer.train(CONFIG, tiny_dataset.dataset(), run, SCHEDULE)
+    assert rows_without_time(run) == rows_without_time(tiny_dataset.run())
+    same_bits(restored(run), restored(tiny_dataset.run()))
+
+
+def test_a_damaged_newest_checkpoint_is_replaced_on_the_way(tmp_path, capsys):
+    run = shutil.copytree(tiny_dataset.run(), tmp_path / "run")
+    (run / "checkpoints" / "6" / "state" / "_METADATA").unlink(missing_ok=True)
+    for path in (run / "checkpoints" / "6").rglob("*"):
+        if path.is_file():
+            path.write_bytes(b"")
+    trainer.train(CONFIG, tiny_dataset.dataset(), run, SCHEDULE)
+    assert "checkpoints/6" in capsys.readouterr().out
+    same_bits(restored(run), restored(tiny_dataset.run()))
+    assert capsys.readouterr().out == "", "the checkpoint at step 6 is good again"
+
+
+def test_a_finished_run_is_left_alone():
+    before = {path: path.stat().st_mtime_ns for path in tiny_dataset.run().rglob("*") if path.is_file()}
+    state = trainer.train(CONFIG, tiny_dataset.dataset(), tiny_dataset.run(), SCHEDULE)
+    assert int(state.step) == 6
+    assert before == {path: path.stat().st_mtime_ns for path in tiny_dataset.run().rglob("*") if path.is_file()}
+
+
+def test_previews_and_rows_come_when_the_schedule_says():
+    run = tiny_dataset.run()
+    assert [row["step"] for row in trainer.read_rows(run) if "loss" in row] == [1, 2, 3, 4, 5, 6]
+    assert [row["step"] for row in trainer.read_rows(run) if "val_psnr" in row] == [3, 6]
+    assert {path.name for path in (run / "previews").iterdir()} == {"0000003.png", "0000006.png"}
+    assert {path.name for path in (run / "checkpoints").iterdir() if path.is_dir()} == KEPT_STEPS
+
+
+def test_handlers_of_signals_come_back_after_training():
+    before = signal.getsignal(signal.SIGINT)
+    with trainer.stop_requests() as requests:
+        signal.raise_signal(signal.SIGINT)
+        assert requests == [signal.SIGINT]
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def poisoned(monkeypatch, step):
+    real = batching.make_batch
+
+    def make_batch(objects, config, at, first):
+        batch = real(objects, config, at, first)
+        return jax.tree.map(lambda x: x * np.nan if x.dtype == np.float32 else x, batch) if at + 1 == step else batch
+
+    monkeypatch.setattr(batching, "make_batch", make_batch)
+
+
+def test_nan_stops_with_step_and_quantity_and_the_last_checkpoint_is_usable(monkeypatch, tmp_path, capsys):
+    poisoned(monkeypatch, 4)
+    sparse = trainer.Schedule(log_every=100, preview_every=100, checkpoint_every=2)  # step 4 is never due to be logged
+    code = cli.guarded(lambda: trainer.train(CONFIG, tiny_dataset.dataset(), tmp_path, sparse), "spnr")
+    line = capsys.readouterr().err.splitlines()[-1]
+    assert code == 2
+    assert re.match(r"spnr: \w+ is nan at step 4; the last checkpoint is kept", line)
+    state = restored(tmp_path)
+    assert int(state.step) == 2
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(state.generator))
+
+
+def test_the_first_number_that_is_not_finite_is_named():
+    rows = [(1, {"loss": 1.0, "psnr": 2.0}), (2, {"loss": 1.0, "psnr": np.inf}), (3, {"loss": np.nan, "psnr": 1.0})]
+    with pytest.raises(trainer.NotFinite, match="psnr is inf at step 2"):
+        trainer.check_finite(rows)
+
+
+def test_a_row_over_the_start_of_the_discriminator_is_the_mean_over_the_steps_that_have_it():
+    rows = [(1, {"loss": 1.0}), (2, {"loss": 3.0, "discriminator": 5.0})]
+    assert trainer.mean_row(rows) == {"loss": 2.0, "discriminator": 5.0}
+
+
+def test_a_full_disk_is_one_line_and_exit_code_2(monkeypatch, tmp_path, capsys):
+    def full(log, row):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(tmp_path / "metrics.jsonl"))
+
+    monkeypatch.setattr(trainer.MetricsLog, "write", full)
+    code = cli.guarded(lambda: trainer.train(CONFIG, tiny_dataset.dataset(), tmp_path, SCHEDULE), "spnr")
+    assert code == 2
+    line = capsys.readouterr().err.splitlines()[-1]
+    assert line == f"spnr: {tmp_path / 'metrics.jsonl'}: No space left on device"
+
+
+def test_ctrl_c_is_exit_code_130_and_says_how_to_go_on(monkeypatch, tmp_path, capsys):
+    interrupted(monkeypatch, 1, signal.SIGINT)
+    code = cli.guarded(lambda: trainer.train(CONFIG, tiny_dataset.dataset(), tmp_path, SCHEDULE), "spnr")
+    assert code == 130
+    expected = "spnr: stopped at step 1 of 6; the same command goes on from there"
+    assert capsys.readouterr().err.splitlines()[-1] == expected
+    assert int(restored(tmp_path).step) == 1
+
+
+@pytest.mark.parametrize("name", ["log_every", "preview_every", "checkpoint_every"])
+def test_a_schedule_of_no_steps_is_refused(name):
+    with pytest.raises(ValueError, match=f"{name} must be at least 1 step, got 0"):
+        trainer.Schedule(**{name: 0})
+
+
+def test_rows_are_json_without_nan():
+    def refuse(name):
+        raise AssertionError(f"{name} is no JSON")
+
+    for line in (tiny_dataset.run() / "metrics.jsonl").read_text().splitlines():
+        json.loads(line, parse_constant=refuse)
+
+
+def test_a_state_that_is_not_finite_is_named_though_every_loss_is(monkeypatch, tmp_path):
+    """Training normalises batches with their own statistics: an overflown running variance shows in no loss."""
+    fresh = optimisation.jitted_create_state(CONFIG)
+    fresh.batch_stats["pointnet"]["norm_0"]["variance"] *= np.inf
+    monkeypatch.setattr(optimisation, "jitted_create_state", lambda config: fresh)
+    with pytest.raises(trainer.NotFinite, match="batch_stats_pointnet_norm_0_variance is inf at step 2"):
+        trainer.train(CONFIG, tiny_dataset.dataset(), tmp_path, SCHEDULE)
+    assert not (tmp_path / "checkpoints").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["npbg", "point_nerf"])
+def test_a_baseline_is_trained_resumed_previewed_evaluated_and_loaded_like_ours(name, monkeypatch, tmp_path):
+    model = {
+        "npbg": NPBGConfig(encoder_widths=(8, 9), decoder_widths=(4,), image_resolution=tiny_dataset.SIZE),
+        "point_nerf": PointNeRFConfig(
+            num_candidates=8, num_samples=4, width=8, color_width=8, image_resolution=tiny_dataset.SIZE
+        ),
+    }[name]
+    loss = LossConfig(l1_weight=1.0, adversarial_weight=0.0, pixel="mse", masked=name == "point_nerf")
+    config = dataclasses.replace(CONFIG, model=model, loss=loss, pixel_stride=4 if name == "point_nerf" else 1)
+    dataset, whole, broken = tiny_dataset.dataset(), tmp_path / "whole", tmp_path / "broken"
+    trainer.train(config, dataset, whole, SCHEDULE)
+    with monkeypatch.context() as patch:
+        interrupted(patch, 3)
+        with pytest.raises(KeyboardInterrupt):
+            trainer.train(config, dataset, broken, SCHEDULE)
+    trainer.train(config, dataset, broken, SCHEDULE)
+    same_bits(checkpoint.restore(broken, config), checkpoint.restore(whole, config))
+    assert (whole / "previews" / "0000006.png").is_file()
+    outcome = evaluation.evaluate(whole, dataset, say=lambda line: None)
+    assert np.isfinite(next(iter(outcome.summary["methods"].values()))["psnr"])
+    handle = spnr_jax.load(whole)
+    item = data_sets.read_object(dataset, "ball_000004")
+    volume = handle.encode(item.cloud)
+    rendering = handle.render(volume, handle.camera(volume))
+    assert rendering.image.shape == (tiny_dataset.SIZE, tiny_dataset.SIZE, 3)
+    assert np.isfinite(np.asarray(rendering.image)).all()

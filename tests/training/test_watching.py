@@ -1,0 +1,82 @@
+"""TensorBoard shows the previews: the pixels of previews/STEP.png, at their step."""
+
+import io
+import struct
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from PIL import Image
+from support import tiny_dataset
+from tensorboardX.proto.event_pb2 import Event
+
+from spnr_jax.formats.images import png
+from spnr_jax.training import checkpoint, optimisation, trainer
+
+PICTURE = np.random.default_rng(0).random((8, 6, 3)).astype(np.float32)
+
+
+def events(run):
+    """(step, value) of everything in the event files of a run; a record is length, checksum, content, checksum."""
+    found = []
+    for path in sorted((run / "tensorboard").iterdir()):
+        content, place = path.read_bytes(), 0
+        while place < len(content):
+            (length,) = struct.unpack_from("<Q", content, place)
+            event = Event.FromString(content[place + 12 : place + 12 + length])
+            found += [(event.step, value) for value in event.summary.value]
+            place += 16 + length
+    return found
+
+
+def pixels(content):
+    return np.asarray(Image.open(io.BytesIO(content)))
+
+
+def test_a_row_with_a_picture_is_scalars_and_an_image_of_the_same_pixels_as_the_file(tmp_path):
+    log = trainer.MetricsLog(tmp_path, 0)
+    log.write({"step": 2, "loss": 3.0})
+    log.write({"step": 3, "val_psnr": 20.5}, PICTURE)
+    log.close()
+    (_, loss), (at, score), (shown, picture) = events(tmp_path)
+    assert (loss.tag, loss.simple_value) == ("loss", 3.0)
+    assert (at, score.tag, score.simple_value) == (3, "val_psnr", 20.5)
+    assert (shown, picture.tag) == (3, "preview")
+    np.testing.assert_array_equal(pixels(picture.image.encoded_image_string), pixels(png(PICTURE)))
+    assert trainer.read_rows(tmp_path) == [{"step": 2, "loss": 3.0}, {"step": 3, "val_psnr": 20.5}]
+
+
+@pytest.fixture
+def stepless(monkeypatch):
+    """A training without a network: its previews are PICTURE."""
+    state = optimisation.TrainState(
+        step=jnp.zeros((), jnp.int32),
+        key=jax.random.key(0),
+        generator={},
+        batch_stats={},
+        generator_optimizer=(),
+        averaged={},
+        averaged_stats={},
+        discriminator=None,
+        discriminator_optimizer=None,
+    )
+    metrics = {"loss": np.float32(1), "psnr": np.float32(20)}
+    monkeypatch.setattr(optimisation, "jitted_create_state", lambda config: state)
+    monkeypatch.setattr(optimisation, "jitted_train_step", lambda state, batch, **_: (state, metrics))
+    monkeypatch.setattr(trainer, "preview", lambda *_: ({"val_psnr": 20.0}, PICTURE))
+    monkeypatch.setattr(checkpoint, "save", lambda run, state: None)
+
+
+def test_every_preview_of_a_training_is_an_image_at_its_step(stepless, tmp_path):
+    trainer.train(tiny_dataset.CONFIG, tiny_dataset.dataset(), tmp_path, tiny_dataset.SCHEDULE)
+    assert [step for step, value in events(tmp_path) if value.HasField("image")] == [3, 6]
+
+
+@pytest.mark.slow
+def test_the_image_is_that_of_the_previews_folder():
+    run = tiny_dataset.run()
+    images = {step: value.image.encoded_image_string for step, value in events(run) if value.HasField("image")}
+    for step, content in images.items():
+        np.testing.assert_array_equal(pixels(content), pixels((run / "previews" / f"{step:07d}.png").read_bytes()))
+    assert sorted(images) == [3, 6]

@@ -1,0 +1,131 @@
+"""A network in one file: the same pictures as from its run, and one line for whatever is wrong with the file."""
+
+import dataclasses
+import io
+import zipfile
+
+import jax
+import numpy as np
+import pytest
+from support import tiny_untrained, tiny_viewer
+from support.laws import close
+
+from spnr_jax.config import TrainConfig
+from spnr_jax.presets import PRESETS
+from spnr_jax.training import checkpoint, optimisation, weights
+
+
+@pytest.fixture(scope="module")
+def trained() -> weights.Trained:
+    return weights.read_trained(tiny_untrained.run())
+
+
+@pytest.fixture
+def file(trained, tmp_path):
+    weights.write_weights(tmp_path / "w.npz", trained)
+    return tmp_path / "w.npz"
+
+
+def rewritten(file, **changes):
+    """The file with other arrays; None leaves one out."""
+    arrays = dict(np.load(file, allow_pickle=False)) | changes
+    np.savez(file, allow_pickle=False, **{name: values for name, values in arrays.items() if values is not None})
+
+
+def test_what_is_read_is_the_run_rounded_to_half_precision(trained, file):
+    config, state = checkpoint.load_run(tiny_untrained.run())
+    read = weights.read_trained(file)
+    assert (read.config, read.steps) == (config, int(state.step))
+    close(read.variables, jax.tree.map(np.asarray, optimisation.averaged_variables(state)), rtol=1e-3, atol=1e-4)
+    halved = jax.tree.map(lambda x: np.asarray(x, np.float16).astype(np.float32), trained.variables)
+    jax.tree.map(np.testing.assert_array_equal, read.variables, halved)
+
+
+def test_the_handle_draws_from_a_file_what_it_draws_from_the_run(file):
+    cloud, pictures = tiny_viewer.cloud(), []
+    for source in (tiny_untrained.run(), file):
+        handle = weights.load(source)
+        volume = handle.encode(cloud)
+        pictures.append(np.asarray(handle.render(volume, handle.camera(volume)).image))
+    assert pictures[0].std() > 0.01
+    np.testing.assert_allclose(*pictures, atol=5e-3)
+
+
+def test_every_weight_of_a_network_has_its_shape_by_name(trained):
+    found = {name: x.shape for name, x in weights.flatten_dict(trained.variables, sep="/").items()}
+    assert {name: x.shape for name, x in weights.variable_shapes(trained.config).items()} == found
+
+
+@pytest.mark.parametrize(("name", "preset"), [("small", "plus_refined"), ("tiny", "plus_lite")])
+def test_the_networks_in_the_package_have_the_weights_that_their_configs_describe(tmp_path, name, preset):
+    copy = tmp_path / "copy.npz"  # the package's own files are not checked when they are read
+    copy.write_bytes(weights.shipped(name).read_bytes())
+    checked, trusted = weights.read_weights(copy), weights.read_trained(name)
+    assert checked.config == trusted.config
+    assert checked.config.preset == preset
+    assert checked.config.model == PRESETS[preset]().model
+    jax.tree.map(np.testing.assert_array_equal, checked.variables, trusted.variables)
+
+
+def test_a_name_is_the_packages_network_and_a_path_is_not(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    assert weights.read_trained(None).config.preset == weights.read_trained("small").config.preset == "plus_refined"
+    with pytest.raises(ValueError, match="none.npz: no such file"):
+        weights.read_trained("none.npz")
+
+
+def test_weights_that_half_precision_does_not_hold_are_refused_and_nothing_is_written(trained, tmp_path):
+    large = dataclasses.replace(trained, variables=jax.tree.map(lambda x: x * 0 + 7e4, trained.variables))
+    with pytest.raises(ValueError, match=r"reaches 7e\+04, which float16 does not hold"):
+        weights.write_weights(tmp_path / "w.npz", large)
+    assert not list(tmp_path.iterdir())
+
+
+class TestBrokenFiles:
+    def reason(self, file):
+        with pytest.raises(ValueError, match=rf"^{file}: ") as error:
+            weights.read_trained(file)
+        assert "\n" not in str(error.value)
+        assert "spnr export RUN" in str(error.value)
+        return str(error.value)
+
+    def test_no_such_file(self, tmp_path):
+        assert "no such file" in self.reason(tmp_path / "none.npz")
+
+    @pytest.mark.parametrize("content", [b"", b"weights", b"PK\x03\x04 and no more"])
+    def test_no_archive(self, tmp_path, content):
+        (tmp_path / "w.npz").write_bytes(content)
+        self.reason(tmp_path / "w.npz")
+
+    def test_half_a_file(self, file):
+        file.write_bytes(file.read_bytes()[:-200])
+        self.reason(file)
+
+    @pytest.mark.parametrize("config", [b"", b"{", b"[1]", b"{}", b'{"preset": 3}', b"[" * 10000])
+    def test_another_header(self, file, config):
+        rewritten(file, config=np.frombuffer(config, np.uint8))
+        self.reason(file)
+
+    def test_no_header(self, file):
+        rewritten(file, steps=None)
+        self.reason(file)
+
+    def test_a_weight_that_is_missing_or_of_another_shape_type_or_not_finite(self, file):
+        name = next(name for name in np.load(file).files if name.startswith("params/unet"))
+        values = np.load(file)[name]
+        for wrong in (None, values[..., :1], values.astype(np.float32), np.full_like(values, np.nan)):
+            rewritten(file, **{name: wrong})
+            assert name in self.reason(file)
+            rewritten(file, **{name: values})
+        rewritten(file, **{"params/more": values})
+        assert "no params/more" in self.reason(file)
+        rewritten(file, **{"params/more": None})
+        assert isinstance(weights.read_trained(file).config, TrainConfig)
+
+    def test_a_pickle_is_not_opened(self, file):
+        stream = io.BytesIO()
+        np.save(stream, np.array([print], dtype=object), allow_pickle=True)
+        with zipfile.ZipFile(file, "w") as archive:
+            archive.writestr("config.npy", stream.getvalue())
+            archive.writestr("steps.npy", stream.getvalue())
+        assert "objects" in self.reason(file)

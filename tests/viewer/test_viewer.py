@@ -1,0 +1,415 @@
+"""The viewer without a browser: one camera for all panes, edits that the network sees, and pictures in time."""
+
+import dataclasses
+import io
+import re
+import threading
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from PIL import Image
+from support import tiny_viewer
+from support.tiny_viewer import model, scene, state, view
+
+from spnr_jax import cli
+from spnr_jax.kernels import cameras
+from spnr_jax.method.model import SAMPLES
+from spnr_jax.viewer import camera_path, levels, picture, session, uploads, viewpoint
+from spnr_jax.viewer import scene as scenes
+from spnr_jax.viewer.loop import Loop
+
+ROOT = Path(__file__).parents[2]
+
+
+def drawn(moving=False, **changes):
+    return session.draw(model(), state(**changes), moving)[1]
+
+
+def canvas(**changes):
+    return drawn(**changes).image
+
+
+def pane(image, number, count=2):
+    width = image.shape[1] // count
+    return image[:, number * width + 2 : (number + 1) * width - 2]
+
+
+def reddish(image):
+    return (image[..., 0] > 150) & (image[..., 1:].max(axis=-1) < 120)
+
+
+def bluish(image):
+    return (image[..., 2] > 150) & (image[..., :2].max(axis=-1) < 120)
+
+
+# views
+
+
+def test_the_browsers_convention_and_ours_are_each_others_inverse():
+    rotation = view(0.7).rotation
+    again = viewpoint.from_browser(viewpoint.to_browser(rotation), np.ones(3), 0.5, 10, 10)
+    np.testing.assert_allclose(again.rotation, rotation, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"position": [np.nan, 0, 0]}, {"position": [1e9, 0, 0]}, {"position": [0, 0]}, {"wxyz": [0, 0, 0, 0]},
+        {"wxyz": [np.inf, 0, 0, 1]}, {"field_of_view": 0.0}, {"field_of_view": 3.2}, {"field_of_view": np.nan},
+        {"width": 0}, {"height": -5},
+    ],
+)  # fmt: skip
+def test_a_camera_from_which_nothing_can_be_drawn_is_no_view(changed):
+    changed = {name: np.array(value) if isinstance(value, list) else value for name, value in changed.items()}
+    good = {"wxyz": np.eye(4)[0], "position": 3 * np.eye(3)[2], "field_of_view": 0.7, "width": 100, "height": 50}
+    assert viewpoint.from_browser(**good) is not None
+    assert viewpoint.from_browser(**good | changed) is None
+
+
+@pytest.mark.parametrize(("width", "height"), [(60, 60), (90, 30), (30, 90)])
+def test_a_place_of_the_square_that_the_network_draws_is_cut_to_its_place_in_the_pane(width, height):
+    volume, size = scene().volume, 96
+    square = viewpoint.square_camera(view(), volume, width, height, size)
+    small = viewpoint.pane_camera(view(), volume, width, height)
+    positions = np.asarray(scene().cloud.positions, np.float64)
+    in_square, _ = viewpoint.project(square, positions)
+    in_pane, _ = viewpoint.project(small, positions)
+    shift = size / 2 - np.array([width, height]) * size / max(width, height) / 2
+    np.testing.assert_allclose((in_square - shift) * max(width, height) / size, in_pane, atol=1e-3)
+    marked = np.zeros((size, size, 3), np.uint8)
+    middle, _ = viewpoint.project(square, np.asarray(scene().volume.centre, np.float64)[None])
+    column, row = middle[0].astype(int)
+    marked[row - 2 : row + 2, column - 2 : column + 2] = 255
+    rows, columns = np.nonzero(viewpoint.cut(marked, width, height)[..., 0] > 100)
+    assert abs(rows.mean() + 0.5 - height / 2) < 1
+    assert abs(columns.mean() + 0.5 - width / 2) < 1
+
+
+def test_points_are_projected_where_cameras_project_puts_them():
+    camera = viewpoint.pane_camera(view(0.4), scene().volume, 80, 60)
+    expected, _ = cameras.project(jax.tree.map(jnp.asarray, camera), jnp.asarray(scene().cloud.positions))
+    pixels, depth = viewpoint.project(camera, scene().cloud.positions)
+    np.testing.assert_allclose(pixels, expected, atol=1e-3)
+    assert (depth > 0).all()
+    pixels, depth = viewpoint.project(camera, (camera.cam_to_world[:, 3] + camera.cam_to_world[:, 2])[None])
+    assert np.isnan(pixels).all()
+    assert depth < 0
+
+
+# pictures
+
+
+def test_both_panes_show_the_same_camera_and_the_right_layers():
+    image = canvas(panes=("points", "opacity"))
+    assert image.shape == (60, 120, 3)
+    points = pane(image, 0)
+    left, right = points[:, : points.shape[1] // 2], points[:, points.shape[1] // 2 :]
+    assert reddish(left).mean() > 0.1 > 0.02 > reddish(right).mean()
+    assert bluish(right).mean() > 0.1 > 0.02 > bluish(left).mean()
+
+
+def test_every_layer_is_another_picture_and_one_pane_takes_the_whole_canvas():
+    images = {layer: canvas(panes=(layer,)) for layer in picture.LAYERS}
+    assert all(image.shape == (60, 120, 3) for image in images.values())
+    for first in images:
+        for second in images:
+            if first < second:
+                assert np.abs(images[first].astype(int) - images[second]).mean() > 2, (first, second)
+
+
+def test_points_need_no_network_and_say_so_by_no_time():
+    assert drawn(panes=("points",)).milliseconds is None
+    outline = session.outline(model(), state())
+    assert reddish(pane(outline, 0)).any()
+    assert (pane(outline, 1)[:30] == 255).all()
+
+
+def test_nearer_points_hide_farther_ones():
+    two = dataclasses.replace(
+        tiny_viewer.cloud(),
+        **{name: np.asarray(getattr(tiny_viewer.cloud(), name))[:2] for name in ("roughness", "metallic", "mask")},
+        positions=np.float32([[0, 0, -1], [0, 0, 1]]),
+        base_color=np.float32([tiny_viewer.RED, tiny_viewer.BLUE]),
+    )
+    opened = scenes.open_scene(model(), two, "two")
+    assert bluish(picture.draw_points(opened, viewpoint.pane_camera(view(), opened.volume, 60, 60))).any()
+    assert not reddish(picture.draw_points(opened, viewpoint.pane_camera(view(), opened.volume, 60, 60)))[
+        28:32, 28:32
+    ].any()
+
+
+def test_while_things_move_the_draft_is_drawn_and_at_rest_what_was_chosen():
+    for moving, expected in ((True, ("draft", 24)), (False, ("balanced", 48))):
+        picture_of_it = drawn(moving=moving, quality="balanced")
+        assert (picture_of_it.quality, picture_of_it.size) == expected
+        assert picture_of_it.milliseconds > 0
+
+
+def test_nothing_is_drawn_before_the_browser_said_where_it_looks_from():
+    assert drawn(view=None) is None
+    assert session.outline(model(), state(view=None)) is None
+
+
+# materials
+
+
+def test_an_edit_changes_the_selected_points_alone_and_what_the_network_draws():
+    before = canvas(panes=("picture",))
+    chosen = session.select(state(), (0.0, 0.0), (0.25, 1.0), add=False)
+    red = np.asarray(scene().cloud.positions)[:, 0] < 4
+    assert chosen.scene.selected[red].mean() > 0.9
+    assert not chosen.scene.selected[np.asarray(scene().cloud.positions)[:, 0] > 6].any()
+    green = scenes.edited(chosen.scene, "base_color", (0.0, 1.0, 0.0))
+    np.testing.assert_allclose(green.cloud.base_color[green.selected], [[0, 1, 0]] * green.selected.sum(), atol=1e-6)
+    kept = ~green.selected
+    np.testing.assert_array_equal(green.cloud.base_color[kept], scene().cloud.base_color[kept])
+    assert green.stale
+    after, now = session.draw(model(), state(panes=("picture",), scene=green), moving=False)
+    assert not after.scene.stale
+    assert np.abs(now.image.astype(int) - before).max() > 3
+    assert scene().cloud.base_color[:, 1].max() < 0.1, "the file's cloud is as it was"
+
+
+@pytest.mark.parametrize("material", ["roughness", "metallic"])
+def test_without_a_selection_an_edit_changes_all_points_and_restoring_gives_the_files_materials(material):
+    changed = scenes.edited(scene(), material, 1.5)
+    assert (getattr(changed.cloud, material) == 1).all()
+    assert scenes.mean_materials(changed)[1 if material == "roughness" else 2] == 1
+    assert scenes.restored(changed).cloud is scene().cloud
+    before, after = (canvas(panes=("picture",), scene=s) for s in (scene(), changed))
+    assert np.abs(before.astype(int) - after).max() > 0
+
+
+def test_a_rectangle_in_either_pane_selects_the_same_points_and_can_be_added_to():
+    in_left = session.select(state(), (0.05, 0.2), (0.2, 0.7), add=False)
+    in_right = session.select(state(), (0.7, 0.7), (0.55, 0.2), add=False)
+    assert 0 < in_left.scene.selected.sum() < 200
+    np.testing.assert_array_equal(in_left.scene.selected, in_right.scene.selected)
+    both = session.select(in_left, (0.3, 0.2), (0.45, 0.7), add=True)
+    assert both.scene.selected.sum() > in_left.scene.selected.sum()
+    assert both.scene.selected[in_left.scene.selected].all()
+    assert not scenes.select_all(both.scene).selected.any()
+
+
+def test_the_controls_show_the_means_of_what_an_edit_would_change():
+    half = session.select(state(), (0.0, 0.0), (0.2, 1.0), add=False).scene
+    (red, green, blue), roughness, metallic = scenes.mean_materials(half)
+    assert red > 200 > 100 > max(green, blue)
+    assert (roughness, metallic) == (0.5, 0)
+
+
+def test_selected_points_are_ringed():
+    chosen = session.select(state(), (0.0, 0.0), (0.25, 1.0), add=False)
+    image = canvas(panes=("points",), scene=chosen.scene)
+    rings = (image == picture.SELECTED).all(axis=-1)
+    assert rings[:, :60].any()
+    assert not (canvas(panes=("points",)) == picture.SELECTED).all(axis=-1).any()
+
+
+# camera path
+
+
+def keyframes(*azimuths):
+    frames = (session.keyframe(view(azimuth), np.zeros(3)) for azimuth in azimuths)
+    return tuple(frames)
+
+
+def test_a_path_passes_its_keyframes_and_goes_around_what_it_looks_at():
+    poses = camera_path.poses(keyframes(0.0, 1.5, 3.0), 41)
+    for at, azimuth in ((0, 0.0), (20, 1.5), (40, 3.0)):
+        np.testing.assert_allclose(poses[at][0], view(azimuth).position, atol=1e-9)
+        np.testing.assert_allclose(poses[at][1], view(azimuth).rotation, atol=1e-9)
+    for position, rotation in poses:
+        assert np.linalg.norm(position) == pytest.approx(4)
+        np.testing.assert_allclose(position - 4 * rotation[:, 2], 0, atol=1e-9)
+    steps = [np.linalg.norm(b[0] - a[0]) for a, b in zip(poses, poses[1:], strict=False)]
+    assert max(steps) < 2 * np.mean(steps)
+
+
+def test_a_camera_that_only_moves_keeps_its_rotation():
+    near, far = keyframes(0.3, 0.3)
+    far = dataclasses.replace(far, position=2 * far.position, distance=2 * far.distance)
+    poses = camera_path.poses((near, far), 5)
+    assert [np.linalg.norm(position) for position, _ in poses] == pytest.approx([4, 5, 6, 7, 8])
+    for _, rotation in poses:
+        np.testing.assert_allclose(rotation, near.rotation)
+
+
+def test_one_keyframe_is_no_path_and_a_path_of_an_hour_is_refused():
+    with pytest.raises(ValueError, match="at least 2 keyframes"):
+        session.path_poses(state(keyframes=keyframes(0.0)), 1.0)
+    with pytest.raises(ValueError, match="at most"):
+        session.path_poses(state(keyframes=keyframes(*np.linspace(0, 6, 100))), 10.0)
+
+
+def test_keyframes_are_recorded_where_the_browser_looks_and_cleared():
+    after = session.record(np.zeros(3))(session.record(np.zeros(3))(state()))
+    assert [frame.distance for frame in after.keyframes] == pytest.approx([4, 4])
+    assert session.without_keyframes(after).keyframes == ()
+    assert session.record(np.zeros(3))(state(view=None)).keyframes == ()
+
+
+def test_a_film_shows_the_path_and_a_snapshot_the_canvas():
+    moving = state(keyframes=keyframes(0.0, 1.0))
+    shares = []
+    name, content, reason = session.film(model(), moving, 0.25, "gif", "points", shares.append)
+    assert (name, reason) == ("path.gif", "")
+    assert shares[-1] == 1
+    with Image.open(io.BytesIO(content)) as film:
+        assert (film.n_frames, film.size) == (5, (48, 48))
+        first = np.asarray(film.convert("RGB")).astype(int)
+        film.seek(4)
+        assert np.abs(np.asarray(film.convert("RGB")) - first).mean() > 2
+    still = np.asarray(Image.open(io.BytesIO(session.snapshot(model(), state()))))
+    np.testing.assert_array_equal(still, canvas())
+
+
+# the loop
+
+
+def test_changes_are_applied_in_order_drawn_at_once_and_once_more_at_rest():
+    drawn, rested = [], threading.Event()
+
+    def show(numbers, moving):
+        drawn.append((tuple(numbers), moving))
+        if numbers and not moving:
+            rested.set()
+        return numbers
+
+    loop = Loop([], show, rest=0.05)
+    for number in range(5):
+        loop.submit(lambda numbers, number=number: [*numbers, number])
+    loop.start()
+    assert rested.wait(10)
+    loop.stop()
+    loop.join(10.0)
+    assert drawn[0] == ((), True)
+    assert drawn[1:] == [((0, 1, 2, 3, 4), True), ((0, 1, 2, 3, 4), False)]
+    assert loop.stopped
+
+
+def test_changes_that_come_while_a_picture_is_drawn_wait_together_and_supersede_it():
+    drawn, begun, go, seen = [], threading.Event(), threading.Event(), []
+
+    def show(number, moving):
+        if number == 0:
+            begun.set()
+            go.wait(10)
+            seen.append(loop.superseded)
+        drawn.append(number)
+        if number == 3:
+            loop.stop()
+        return number
+
+    loop = Loop(0, show, rest=10.0)
+    loop.start()
+    assert begun.wait(10)
+    for _ in range(3):
+        loop.submit(lambda number: number + 1)
+    go.set()
+    loop.join(10.0)
+    assert drawn == [0, 3]
+    assert seen == [True]
+
+
+# files and figures
+
+
+def test_without_viser_the_command_says_what_to_install(monkeypatch):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(ValueError, match=r"pip install 'spnr-jax\[viewer\]'"):
+        cli.run_view(cli.View(cloud=Path("a.ply"), run=Path("run")))
+
+
+@pytest.mark.parametrize(
+    ("name", "shown"),
+    [
+        ("chair.ply", "chair.ply"), ("../../etc/passwd", "passwd"), ("C:\\x\\..\\a b.xyz", "a b.xyz"), ("", "file"),
+        ("..", ".."), ("a\x00[b](http://c).ply", "c_.ply"), ("x" * 500 + ".ply", "x" * 56 + ".ply"),
+    ],
+)  # fmt: skip
+def test_of_a_browsers_file_name_only_its_last_part_is_shown(name, shown):
+    assert uploads.display_name(name) == shown
+
+
+def test_an_uploaded_cloud_is_read_in_a_temporary_folder_that_is_gone_afterwards(tmp_path, monkeypatch):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    content = "\n".join(f"{x} {x * x} 0" for x in range(30)).encode()
+    lines = []
+    cloud = uploads.read_upload("../../up.xyz", content, num_points=10, up="y", report=lines.append)
+    assert len(cloud.positions) == 10
+    assert lines
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("a.ply", b"", "a.ply: the file is empty"),
+        ("a.exe", b"MZ", "a.exe: unknown kind"), ("ply", b"", "ply: unknown"),
+        ("../evil/.ply", b"x", "unknown kind"), ("n.xyz", b"0 0 nan\n", "n.xyz"), ("p.npz", b"\x80\x04N.", "p.npz"),
+    ],
+)  # fmt: skip
+def test_a_file_that_cannot_be_read_is_refused_under_the_browsers_name(name, content, words, tmp_path, monkeypatch):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    with pytest.raises(ValueError, match=re.escape(words)) as refused:
+        uploads.read_upload(name, content, num_points=10, up="y")
+    assert str(tmp_path) not in str(refused.value)
+    assert "\n" not in str(refused.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_expected_losses_are_those_of_the_readmes_table():
+    rows = re.findall(r"^\| `(\w+)`: [^|]* \| ([\d.]+) \| ([\d.]+) \| [\d.]+ \| ([\d.]+) \|", _readme(), re.MULTILINE)
+    table = {name: levels.Level(psnr=float(p), flip=float(f), milliseconds=float(ms)) for name, p, f, ms in rows}
+    assert table == levels.LEVELS
+    assert set(levels.LEVELS) == {*SAMPLES, "trained"}
+    assert levels.expected_loss("best") == (0, 0)
+    text = levels.table({("draft", 64): 12.4})
+    assert "| draft | 12 (64²) | -0.06 dB | +0.000 |" in text
+    assert "| best | - | +0.00 dB | +0.000 |" in text
+
+
+def _readme():
+    text = (ROOT / "README.md").read_text()
+    return text[text.index("| quality | PSNR") :].partition("\n\n")[0]
+
+
+# what a browser may send
+
+
+@pytest.mark.parametrize("kind", ["x/../../../evil.gif", "exe", None, 3])
+def test_a_film_of_a_kind_that_is_not_offered_writes_nothing(kind, tmp_path, monkeypatch):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    with pytest.raises(ValueError, match="a film is one of mp4, gif"):
+        session.film(model(), state(), 1.0, kind, "points")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("sent", [(("points",), "best", "1000000"), (("secret",), "best", "24"), ((), "x", "a")])
+def test_controls_that_say_what_they_do_not_offer_are_refused(sent):
+    with pytest.raises(ValueError, match="one of"):
+        session.chosen(model(), *sent)
+
+
+@pytest.mark.parametrize("value", [float("nan"), "a", [1, 2], None, 10**400, {}])
+def test_an_edit_with_no_number_is_refused_and_one_outside_is_clipped(value):
+    with pytest.raises(ValueError, match="roughness has to be a number"):
+        scenes.edited(scene(), "roughness", value)
+    assert (scenes.edited(scene(), "roughness", 7).cloud.roughness == 1).all()
+
+
+@pytest.mark.parametrize("corner", [[float("nan"), 0], "ab", None, [0], [[0, 1], 2]])
+def test_a_selection_or_target_that_is_no_point_changes_nothing(corner):
+    before = state()
+    assert session.select(before, corner, [1, 1], add=False) is before
+    assert session.record(corner)(before) is before
+
+
+@pytest.mark.parametrize("seconds", [float("nan"), float("inf"), 0.0, -1.0, 1e9])
+def test_a_path_of_no_or_endless_time_is_refused(seconds):
+    with pytest.raises(ValueError, match="between keyframes"):
+        session.path_poses(state(), seconds)
