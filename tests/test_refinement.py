@@ -11,7 +11,7 @@ from support.laws import close, same_bits
 from support.tiny_model import PLUS
 
 from experiments.packaged import refinement
-from spnr_jax import clouds, data, presets, training
+from spnr_jax import presets
 from spnr_jax.config import LossConfig
 from spnr_jax.formats import data_sets
 from spnr_jax.kernels import cloud_arrays

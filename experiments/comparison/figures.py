@@ -11,7 +11,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 from PIL import Image, ImageDraw, ImageFont
 
-from spnr_jax.images import to_uint8
+from spnr_jax.formats.images import to_uint8
 
 COLORS = ("#2457d6", "#d9480f", "#2f9e44", "#9c36b5", "#0b7285", "#e8a700", "#868e96", "#495057", "#adb5bd")
 BLUE, RED, GREEN, *_ = COLORS

@@ -8,7 +8,6 @@ from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
-from spnr_jax import data, evaluation, weights
 from spnr_jax.config import TrainConfig
 from spnr_jax.formats import data_sets
 from spnr_jax.model_config import METHODS, ModelConfig

@@ -14,8 +14,8 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from experiments.comparison.scoring import Shown
 from experiments.comparison.tables import Table
-from spnr_jax.images import png
-from spnr_jax.report_style import STYLE
+from spnr_jax.formats.images import png
+from spnr_jax.scoring.report_style import STYLE
 
 ENVIRONMENT = Environment(
     loader=FileSystemLoader(Path(__file__).parent),

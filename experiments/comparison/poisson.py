@@ -17,12 +17,13 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from data_gen import light, poisson, records, views
-from data_gen.poisson import PoissonConfig
-from data_gen.variant import choose_variant, mitsuba_module
-from spnr_jax import data
-from spnr_jax.evaluation import Pictures
-from spnr_jax.images import write_whole
+from data_gen.render import light, poisson_surface, views
+from data_gen.render.poisson_surface import PoissonConfig
+from data_gen.render.variant import choose_variant, mitsuba_module
+from data_gen.store import layout
+from spnr_jax.formats import data_sets
+from spnr_jax.formats.images import write_whole
+from spnr_jax.scoring.evaluation import Pictures
 
 RENDERING = ("resolution", "fov", "spp", "max_depth")  # settings that decide a picture, given the pose of its camera
 SURFACES = {"poisson": PoissonConfig(), "poisson_trimmed": PoissonConfig(trim=0.3)}
@@ -40,14 +41,14 @@ class Renderer:
         self._seed, self._view = seed, view_config(settings)
         self._light = light.scaled_to_white(unscaled_light(settings["environment_map"], envmap))
 
-    def pictures(self, item: data.ObjectData, num_points: int, surface: PoissonConfig) -> tuple[np.ndarray, str]:
+    def pictures(self, item: data_sets.ObjectData, num_points: int, surface: PoissonConfig) -> tuple[np.ndarray, str]:
         """Straight-alpha sRGB (views, height, width, 4) uint8 from the object's first points, and "".
 
         Where they span no surface: empty pictures, and the reason.
         """
         try:
-            asset = poisson.reconstruct(jax.tree.map(lambda x: np.asarray(x)[:num_points], item.cloud), surface)
-        except poisson.NoSurface as error:
+            asset = poisson_surface.reconstruct(jax.tree.map(lambda x: np.asarray(x)[:num_points], item.cloud), surface)
+        except poisson_surface.NoSurface as error:
             return np.zeros(item.images.shape, np.uint8), str(error)
         scene = views.build_scene(asset, self._light)
         poses = np.tile(np.eye(4), (len(item.images), 1, 1))
@@ -77,7 +78,7 @@ def unscaled_light(described: dict, envmap: Path | None) -> np.ndarray:
     return radiance
 
 
-def show(renderer: Renderer, points: int, surface: PoissonConfig, folder: Path, item: data.ObjectData) -> Pictures:
+def show(renderer: Renderer, points: int, surface: PoissonConfig, folder: Path, item: data_sets.ObjectData) -> Pictures:
     """Image and opacity of the surface of an object's first points, in all its views; read where they are made."""
     note = folder / item.name / "made.json"
     paths = [folder / item.name / f"{view:03d}.png" for view in range(len(item.images))]
@@ -86,11 +87,11 @@ def show(renderer: Renderer, points: int, surface: PoissonConfig, folder: Path, 
         pictures, empty = renderer.pictures(item, points, surface)
         seconds = time.monotonic() - start
         for path, picture in zip(paths, pictures, strict=True):
-            write_whole(path, records.encode_image(picture))
+            write_whole(path, layout.encode_image(picture))
         made = {"seconds": round(seconds, 4), "views": len(paths), "empty": empty}
-        write_whole(note, records.json_text(made).encode())
-    rgba = np.stack([records.read_image(path) for path in paths])
-    return Pictures(image=data.on_white(rgba), acc=rgba[..., 3].astype(np.float32) / 255)
+        write_whole(note, layout.json_text(made).encode())
+    rgba = np.stack([layout.read_image(path) for path in paths])
+    return Pictures(image=data_sets.on_white(rgba), acc=rgba[..., 3].astype(np.float32) / 255)
 
 
 def seconds_per_view(folder: Path, names: tuple[str, ...]) -> list[float]:

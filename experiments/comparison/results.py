@@ -17,10 +17,11 @@ from PIL import Image
 
 from experiments.comparison import tables
 from experiments.comparison.tables import Table
-from spnr_jax import data, images, run_record
+from spnr_jax.formats import data_sets, images
+from spnr_jax.training import run_record
 
 
-def claim(folder: Path, what: str, asked: Mapping, dataset: data.Dataset | None = None) -> None:
+def claim(folder: Path, what: str, asked: Mapping, dataset: data_sets.Dataset | None = None) -> None:
     """Makes a folder that of a request (on a data set); ValueError if it is another's."""
     asked = {"of": what, **asked} | ({} if dataset is None else {"data": run_record.checksum(dataset)})
     path = folder / "asked.json"

@@ -6,10 +6,12 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from data_gen import depth, originals
-from data_gen.assets import Asset
-from spnr_jax import cameras, data, shards
-from spnr_jax.types import Camera
+from data_gen.make import originals
+from data_gen.render import depth
+from spnr_jax.formats import data_sets, shards
+from spnr_jax.formats.mesh.assets import Asset
+from spnr_jax.kernels import cameras
+from spnr_jax.kernels.records import Camera
 
 
 def mesh_of(dataset: data_sets.Dataset, item: data_sets.ObjectData, meshes: Path | None) -> Asset:

@@ -23,14 +23,13 @@ from experiments.comparison import results
 from experiments.comparison.budget import Trained
 from experiments.comparison.networks import test_objects
 from experiments.comparison.scoring import Shown, of_cloud, score_objects
-from spnr_jax import checkpoint, data, evaluation, metrics, trainer, training
 from spnr_jax.config import TrainConfig
 from spnr_jax.formats import data_sets
 from spnr_jax.kernels import metrics
 from spnr_jax.presets import PRESETS
 from spnr_jax.scoring import evaluation
 from spnr_jax.scoring.summary import Scores
-from spnr_jax.training import checkpoint, optimisation, run_record, trainer
+from spnr_jax.training import checkpoint, optimisation, trainer
 
 PaperPreset = Literal["abo", "shapenet_car", "shapenet_plane", "shapenet_chair", "small", "tiny"]
 PlusPreset = Literal["plus_abo", "plus_lite", "plus_refined", "plus_shapenet", "plus_small", "plus_tiny"]

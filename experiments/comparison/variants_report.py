@@ -15,9 +15,10 @@ from matplotlib.ticker import MaxNLocator
 from experiments.comparison import figures, results, variants
 from experiments.comparison.tables import Cell, Table, number, text
 from experiments.comparison.variants import OPAQUE, Budget, Compared, Variant
-from spnr_jax import data, evaluation, images, statistics
-from spnr_jax.report import ARROWS, HIGHER, QUALITY
-from spnr_jax.summary import Scores, metric_settings
+from spnr_jax.formats import data_sets, images
+from spnr_jax.scoring import evaluation, intervals
+from spnr_jax.scoring.report import ARROWS, HIGHER, QUALITY
+from spnr_jax.scoring.summary import Scores, metric_settings
 
 METRICS = {  # head, decimals, what is better
     "psnr": QUALITY["psnr"],
@@ -47,7 +48,7 @@ def write(
 
 
 def numbers(
-    trained: Sequence[Variant], reference: str, compared: Compared, budget: Budget, dataset: data.Dataset
+    trained: Sequence[Variant], reference: str, compared: Compared, budget: Budget, dataset: data_sets.Dataset
 ) -> dict:
     """Everything that is written, and the conditions that it stands on."""
     config, names = trained[0].config, compared.names

@@ -15,12 +15,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from data_gen.generate import generate
-from data_gen.plan import GenerateConfig
+from data_gen.make.generate import generate
+from data_gen.plan.tasks import GenerateConfig
 from experiments import command
-from spnr_jax import cli, data, evaluation, presets, trainer
-from spnr_jax.images import write_whole
-from spnr_jax.results import write_results
+from spnr_jax import cli, presets
+from spnr_jax.formats import data_sets
+from spnr_jax.formats.images import write_whole
+from spnr_jax.scoring import evaluation
+from spnr_jax.scoring.results import write_results
+from spnr_jax.training import trainer
 
 
 @dataclass(frozen=True, kw_only=True)

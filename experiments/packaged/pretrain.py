@@ -18,13 +18,13 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
-from data_gen.generate import generate
-from data_gen.plan import GenerateConfig
-from data_gen.records import SPLITS
+from data_gen.make.generate import generate
+from data_gen.plan.tasks import GenerateConfig
+from data_gen.store.layout import SPLITS
 from experiments import command
 from experiments.packaged import refinement
 from experiments.packaged.demo import Seconds
-from spnr_jax import cli, data, evaluation, presets, trainer, weights
+from spnr_jax import cli, presets
 from spnr_jax.config import TrainConfig
 from spnr_jax.formats import data_sets as data
 from spnr_jax.formats.images import write_whole

@@ -24,8 +24,7 @@ from jaxtyping import Array, Float
 from tqdm import tqdm
 
 from experiments.comparison import results
-from spnr_jax import cameras, clouds, data, losses, presets, training
-from spnr_jax.colors import LEAST_OPACITY
+from spnr_jax import presets
 from spnr_jax.config import TrainConfig
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.images import write_whole
@@ -37,7 +36,7 @@ from spnr_jax.kernels.resizing import mean_of_squares
 from spnr_jax.method.renderer import Renderer
 from spnr_jax.model_config import ModelConfig
 from spnr_jax.nn.refiner import Refiner
-from spnr_jax.training import batching, optimisation, run_record
+from spnr_jax.training import batching, optimisation
 from spnr_jax.training.weights import Trained
 
 COUNTS = (512, 1024, 1024, 2048)  # points of an object, one of these by its name

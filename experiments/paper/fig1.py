@@ -26,7 +26,7 @@ import tyro
 from experiments import command
 from experiments.comparison import budget, variants, variants_report
 from experiments.comparison.variants import Budget, Variant
-from spnr_jax import cli, data, training
+from spnr_jax import cli
 from spnr_jax.config import TrainConfig
 from spnr_jax.formats import data_sets
 from spnr_jax.training import optimisation
@@ -58,7 +58,7 @@ def main(options: Fig1) -> None:
     cli.set_up_jax()
     dataset = data_sets.open_dataset(options.data)
     names, config = options.budget.names(dataset), options.budget.config()
-    data.check_resolution(data.read_object(dataset, names[0]), config)
+    data_sets.check_resolution(data_sets.read_object(dataset, names[0]), config)
     variants.claim(options.out, "fig1", options.budget, dataset, pretrain=options.pretrain)
     runs = [variant(options, weight, config, dataset) for weight in options.l1_weights]
     reference = runs[options.l1_weights.index(100.0) if 100.0 in options.l1_weights else 0].name
@@ -87,7 +87,7 @@ def pretrained(options: Fig1, dataset: data_sets.Dataset, config: TrainConfig) -
     run = options.out / "runs" / f"pretrained_{config.seed}"
     print(f"before it, {options.pretrain} steps of the L1 loss alone in {run}", flush=True)
     found = budget.train(before, dataset, run).variables
-    state = training.jitted_create_state(config)
+    state = optimisation.jitted_create_state(config)
     return dataclasses.replace(
         state,
         generator=found["params"],

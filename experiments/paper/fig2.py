@@ -19,13 +19,15 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-from data_gen.generate import generate
-from data_gen.plan import GenerateConfig
+from data_gen.make.generate import generate
+from data_gen.plan.tasks import GenerateConfig
 from experiments import command
 from experiments.comparison import figures, variants, variants_report
 from experiments.comparison.variants import Budget, Variant
-from spnr_jax import cli, data, evaluation
-from spnr_jax.images import png, write_whole
+from spnr_jax import cli
+from spnr_jax.formats import data_sets
+from spnr_jax.formats.images import png, write_whole
+from spnr_jax.scoring import evaluation
 
 QUICK_OBJECTS, QUICK_VARIANTS = 12, 2
 MOST_SHOWN = 5  # variants of an object in the picture
@@ -59,10 +61,10 @@ def main(options: Fig2) -> None:
     if options.data is None:
         print(f"generating the data set in {folder}", flush=True)
         generate(generation(options, folder))
-    dataset = data.open_dataset(folder)
+    dataset = data_sets.open_dataset(folder)
     runs = trainings(options, dataset)
     names, config = options.budget.names(dataset), runs[0].config
-    data.check_resolution(data.read_object(dataset, names[0]), config)
+    data_sets.check_resolution(data_sets.read_object(dataset, names[0]), config)
     variants.claim(options.out, "fig2", options.budget, dataset)
     write_whole(options.out / "variants.png", variants_picture(dataset, options.budget.shown))
     trained = variants.train(runs, options.budget, options.out)
@@ -111,7 +113,7 @@ def variants_picture(dataset: data_sets.Dataset, num_objects: int) -> bytes:
     for product in evaluation.spread(tuple(p for p in found if len(found[p]) >= most), num_objects):
         items = [data_sets.read_object(dataset, name) for name in (product, *found[product][:most])]
         views = nearest_views([np.asarray(item.camera.cam_to_world)[..., 3] for item in items])
-        images = [data.on_white(item.images[view]) for item, view in zip(items, views, strict=True)]
+        images = [data_sets.on_white(item.images[view]) for item, view in zip(items, views, strict=True)]
         rows.append((product, images))
     heads = ["Object", *(f"Variant {i + 1}" for i in range(most))]
     return png(figures.grid([images for _, images in rows], heads, [product for product, _ in rows], 128))

@@ -23,8 +23,8 @@ import jax
 import numpy as np
 import tyro
 
-from data_gen import depth, poisson
-from data_gen.variant import choose_variant, mitsuba_module
+from data_gen.render import depth, poisson_surface
+from data_gen.render.variant import choose_variant, mitsuba_module
 from experiments import command
 from experiments.comparison import figures, networks, results
 from experiments.comparison.networks import LABELS, Sources
@@ -34,9 +34,12 @@ from experiments.comparison.source_meshes import cast_views, mesh_of
 from experiments.comparison.tables import Table, number, text
 from experiments.paper import depth_scores
 from experiments.paper.depth_scores import METRICS, OPAQUE
-from spnr_jax import cameras, cli, data, evaluation
-from spnr_jax.images import depth_image, png
-from spnr_jax.types import Camera, PointCloud
+from spnr_jax import cli
+from spnr_jax.formats import data_sets
+from spnr_jax.formats.images import depth_image, png
+from spnr_jax.kernels import cameras
+from spnr_jax.kernels.records import Camera, PointCloud
+from spnr_jax.scoring import evaluation
 
 FLOATER, MISSED = np.array([0.85, 0.1, 0.1]), np.array([0.15, 0.35, 0.85])
 WORST = 0.2  # error, in half diagonals, that the picture shows black
@@ -85,7 +88,7 @@ class Method:
 def main(options: Fig3) -> None:
     """Makes what is missing of depths and truth, then scores, table and picture."""
     cli.set_up_jax()
-    dataset = data.open_dataset(options.data)
+    dataset = data_sets.open_dataset(options.data)
     names = networks.test_objects(dataset, 2 if options.quick else options.objects)
     results.claim(options.out, "depths", {}, dataset)
     found, points = all_methods(options, dataset)
@@ -95,7 +98,7 @@ def main(options: Fig3) -> None:
     scores: dict[str, list] = {name: [] for name in found}
     rows, shown = [], evaluation.spread(names, options.shown)
     for count, name in enumerate(names, start=1):
-        item = data.read_object(dataset, name)
+        item = data_sets.read_object(dataset, name)
         maps = object_maps(options, dataset, item, found, points)
         for label, (seen, acc, truth) in maps.items():
             scores[label].append(depth_scores.scores(seen, acc, far_side(item.camera, truth.shape[1:]), truth))
@@ -118,7 +121,7 @@ def main(options: Fig3) -> None:
     results.write(options.out, all_results, [table(all_results)], [NOTE, PICTURE], {"fig3_depth.png": png(picture)})
 
 
-def all_methods(options: Fig3, dataset: data.Dataset) -> tuple[dict[str, Method], int]:
+def all_methods(options: Fig3, dataset: data_sets.Dataset) -> tuple[dict[str, Method], int]:
     """What shows depth: networks and surfaces, and the points that all are given."""
     trained = networks.networks(options.sources, dataset)
     if left_out := [name for name, network in trained.items() if not network.has_depth]:

@@ -21,15 +21,16 @@ import jax
 import numpy as np
 import tyro
 
-from data_gen import records
+from data_gen.store import layout
 from experiments import command
 from experiments.comparison import figures, networks, page, results
 from experiments.comparison.networks import LABELS, Network, Sources
 from experiments.comparison.poisson import SURFACES
 from experiments.comparison.scoring import Shown
-from spnr_jax import cli, data, evaluation
-from spnr_jax.images import png, write_whole
-from spnr_jax.report import psnr
+from spnr_jax import cli
+from spnr_jax.formats import data_sets
+from spnr_jax.formats.images import png, write_whole
+from spnr_jax.scoring.report import psnr
 
 REFERENCE = "Reference"
 
@@ -63,7 +64,7 @@ class Gallery:
 def main(options: Gallery) -> None:
     """Makes the pictures that are missing, then sheets and page."""
     cli.set_up_jax()
-    dataset = data.open_dataset(options.data)
+    dataset = data_sets.open_dataset(options.data)
     names = networks.test_objects(dataset, 3 if options.quick else options.objects)
     if note := shortage(dataset, options):
         print(note)
@@ -95,7 +96,7 @@ def main(options: Gallery) -> None:
 
 
 def all_pictures(
-    options: Gallery, dataset: data.Dataset, names: tuple[str, ...], trained: dict[str, Network], points: int
+    options: Gallery, dataset: data_sets.Dataset, names: tuple[str, ...], trained: dict[str, Network], points: int
 ) -> dict[str, list[np.ndarray]]:
     """The picture of every object by the reference and by each method, in one view."""
     for label, network in trained.items():
@@ -104,15 +105,15 @@ def all_pictures(
     surfaces = surface_folders(options.sources.table1, points, names)
     shown: dict[str, list[np.ndarray]] = {label: [] for label in (REFERENCE, *trained, *surfaces)}
     for number, name in enumerate(names, start=1):
-        item = data.read_object(dataset, name)
+        item = data_sets.read_object(dataset, name)
         if options.view >= len(item.images):
             raise ValueError(f"--view {options.view}: object {name} has views 0 to {len(item.images) - 1}")
-        shown[REFERENCE].append(data.on_white(item.images[options.view]))
+        shown[REFERENCE].append(data_sets.on_white(item.images[options.view]))
         for label, network in trained.items():
             place = options.out / "pictures" / label / f"{name}.png"
             shown[label].append(results.kept(place, partial(picture, network, item, options.view, points)))
         for label, folder in surfaces.items():
-            shown[label].append(data.on_white(records.read_image(folder / name / f"{options.view:03d}.png")))
+            shown[label].append(data_sets.on_white(layout.read_image(folder / name / f"{options.view:03d}.png")))
         if number % 10 == 0 or number == len(names):
             print(f"{number} of {len(names)} objects", flush=True)
     return shown
@@ -131,10 +132,10 @@ def shortage(dataset: data_sets.Dataset, options: Gallery) -> str:
     )
 
 
-def picture(network: Network, item: data.ObjectData, view: int, points: int) -> np.ndarray:
+def picture(network: Network, item: data_sets.ObjectData, view: int, points: int) -> np.ndarray:
     """A network's picture of one view, from the object's first points."""
     camera = jax.tree.map(lambda x: x[view : view + 1], item.camera)
-    return np.asarray(network.show()(evaluation.first_points(item, points), camera).image[0])
+    return np.asarray(network.show()(data_sets.first_points(item, points), camera).image[0])
 
 
 def surface_folders(table1: Path | None, points: int, names: tuple[str, ...]) -> dict[str, Path]:

@@ -19,21 +19,21 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
-from data_gen.poisson import pymeshlab
+from data_gen.render.poisson_surface import pymeshlab
 from experiments import command
 from experiments.comparison import budget, page, poisson, results
 from experiments.comparison.budget import NETWORKS, Budget, Trained
 from experiments.comparison.networks import LABELS, test_objects
 from experiments.comparison.scoring import ObjectMethod, Scored, Shown, by_category, of_cloud, score_objects
 from experiments.paper import table1_tables
-from spnr_jax import cli, data, evaluation
+from spnr_jax import cli
 from spnr_jax.config import TrainConfig
-from spnr_jax.lpips_weights import read_weights
+from spnr_jax.devices import machine
+from spnr_jax.formats import data_sets
 from spnr_jax.presets import PRESETS
 from spnr_jax.scoring import evaluation
 from spnr_jax.scoring.lpips_weights import read_weights
 from spnr_jax.scoring.summary import differences, metric_settings, summarise
-from spnr_jax.training import run_record
 
 Row = Literal[
     "ours", "plus", "npbg", "point_nerf", "points2nerf", "poisson", "poisson_trimmed", "nearest", "splat", "white"
@@ -91,7 +91,7 @@ def main(options: Table1) -> None:
     category = dataset.settings.get("settings", {}).get("category")
     presets = budget.presets(options.budget, first.camera.height, category)
     config = PRESETS[presets["ours"]]()  # its points and pixels are given to every method
-    data.check_resolution(first, config)
+    data_sets.check_resolution(first, config)
     asked = {name: getattr(options, name) for name in ("budget", "minutes", "seed")}
     results.claim(options.out, "a table", asked, dataset)
     weights = None if options.lpips is None else read_weights(options.lpips)
@@ -115,11 +115,11 @@ def main(options: Table1) -> None:
     write(options.out, found, scored.shown)
 
 
-def conditions(dataset: data.Dataset, names: tuple[str, ...], config: TrainConfig) -> dict[str, object]:
+def conditions(dataset: data_sets.Dataset, names: tuple[str, ...], config: TrainConfig) -> dict[str, object]:
     """What the numbers stand on."""
     counts = {f"{split} objects": len(objects) for split, objects in dataset.splits.items()}
     return {
-        "hardware": evaluation.hardware(),
+        "hardware": machine.hardware(),
         "data": dataset.settings.get("settings", {}) | counts,
         "test_objects": list(names),
         "points": config.test_points,

@@ -5,8 +5,8 @@ from collections.abc import Mapping
 from experiments.comparison.budget import QUICK_STEPS
 from experiments.comparison.networks import LABELS
 from experiments.comparison.tables import Cell, Table, number, text
-from spnr_jax.report import ARROWS, QUALITY, duration
-from spnr_jax.summary import NO_WEIGHTS
+from spnr_jax.scoring.report import ARROWS, QUALITY, duration
+from spnr_jax.scoring.summary import NO_WEIGHTS
 
 METRICS = ("psnr", "ssim", "lpips", "flip", "cpsnr", "iou")
 COSTS = {"parameters": "Parameters", "steps": "Steps", "training_seconds": "Training", "ms_per_view": "ms per view"}

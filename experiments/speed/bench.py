@@ -30,7 +30,7 @@ from experiments.comparison import results
 from experiments.speed import bench_report as report
 from experiments.speed.scene import BATCHES
 from experiments.speed.worker import Worker, worker
-from spnr_jax.images import write_whole
+from spnr_jax.formats.images import write_whole
 
 Preset = Literal["tiny", "small", "abo"]
 Mode = Literal["train", "train_l1", "encode", "render"]

@@ -16,16 +16,17 @@ from pathlib import Path
 
 import numpy as np
 
-from data_gen import points, views
-from data_gen.generate import make_light
-from data_gen.objects import Workbench, load_asset, make_and_write, object_seeds
-from data_gen.plan import GenerateConfig, Task, plan_objects
-from data_gen.variant import choose_variant, mitsuba_module
+from data_gen.make.generate import make_light
+from data_gen.make.objects import Workbench, load_asset, make_and_write, object_seeds
+from data_gen.plan.tasks import GenerateConfig, Task, plan_objects
+from data_gen.render import views
+from data_gen.render.variant import choose_variant, mitsuba_module
 from experiments import command
 from experiments.comparison import results
 from experiments.comparison.tables import Table, number
-from spnr_jax import evaluation
-from spnr_jax.report import psnr
+from spnr_jax.devices import machine
+from spnr_jax.formats.mesh import surface_points
+from spnr_jax.scoring.report import psnr
 
 PHASES = {  # functions whose cumulative time is a phase; the rest is "other"
     "load": ("load_asset",),
@@ -80,7 +81,7 @@ def main(options: DataGeneration) -> None:
     tables = [Table(title=f"Speed, 10 views of {options.resolution} px, {options.spp} samples", heads=heads, rows=rows)]
     rows = tuple((f"{samples} samples", (number(a, 1), number(b, 1))) for samples, (a, b) in noise.items())
     tables.append(Table(title="Noise", heads=("median, dB", "10th percentile, dB"), rows=rows))
-    facts = {"hardware": evaluation.hardware(), "variant": variant, "seconds": seconds, "noise": noise}
+    facts = {"hardware": machine.hardware(), "variant": variant, "seconds": seconds, "noise": noise}
     results.write(options.out, facts, tables, [f"{variant}, {facts['hardware']}"])
 
 
@@ -105,7 +106,7 @@ def measured_noise(tasks: list[Task], light: np.ndarray, resolution: int) -> dic
     """Median and 10th percentile of the PSNR by samples per pixel, two views an object."""
     config, scores = views.ViewConfig(resolution=resolution), []
     for task in tasks:
-        scene = views.build_scene(points.normalise(load_asset(task, 0))[0], light)
+        scene = views.build_scene(surface_points.normalise(load_asset(task, 0))[0], light)
         rng = np.random.default_rng(object_seeds(0, task.object_id)["viewpoints"])
         for pose in views.random_viewpoints(2, config.distance, rng):
             reference = picture(scene, pose, config, REFERENCE_SAMPLES, first_seed=1000)

@@ -25,12 +25,15 @@ import numpy as np
 import tyro
 from tqdm import tqdm
 
-from data_gen.pack import PackConfig, pack
+from data_gen.store.pack import PackConfig, pack
 from experiments import command
 from experiments.comparison import results
 from experiments.comparison.tables import Table, number, text
-from spnr_jax import cli, data, evaluation, presets, training
+from spnr_jax import cli, presets
 from spnr_jax.config import TrainConfig
+from spnr_jax.devices import machine
+from spnr_jax.formats import data_sets
+from spnr_jax.training import optimisation
 
 TARGET = 0.02  # share of a step
 
@@ -54,7 +57,7 @@ class Loading:
 def main(options: Loading) -> None:
     """Measures, and writes the figures as JSON and as a Markdown table."""
     cli.set_up_jax()
-    size = image_size(data.open_dataset(options.dataset))
+    size = image_size(data_sets.open_dataset(options.dataset))
     rows: list[dict] = []
     with tempfile.TemporaryDirectory() as folder:
         pack(PackConfig(dataset=options.dataset, out=Path(folder) / "packed"))
@@ -69,8 +72,8 @@ def main(options: Loading) -> None:
                 print(json.dumps(rows[-1]), file=sys.stderr)
     if not rows:
         raise ValueError(f"{options.dataset}: no preset of {', '.join(options.presets)} has images of {size} px")
-    found = {"hardware": evaluation.hardware(), "image_size": size, "rows": rows}
-    results.write(options.out / str(size), found, [table(rows)], [evaluation.hardware()])
+    found = {"hardware": machine.hardware(), "image_size": size, "rows": rows}
+    results.write(options.out / str(size), found, [table(rows)], [machine.hardware()])
 
 
 def image_size(dataset: data_sets.Dataset) -> int:

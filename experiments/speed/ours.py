@@ -13,7 +13,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.speed import scene, twin_layout, worker
-from spnr_jax import memory, training
 from spnr_jax.config import TrainConfig
 from spnr_jax.devices import allocator
 from spnr_jax.kernels.records import Batch
@@ -28,7 +27,7 @@ NEAR_POINTS = {"tiny": (16, 0), "small": (16, 16), "abo": (32, 32)}  # coarse an
 
 def main() -> None:
     """Serves the mode of the spec."""
-    memory.keep_arrays()
+    allocator.keep_arrays()
     worker.serve(make)
 
 
@@ -98,9 +97,9 @@ def function(config: TrainConfig, batch: Batch, mode: str) -> Callable[[], objec
         return step
     variables, cloud = optimisation.averaged_variables(state), batch.cloud
     if mode == "encode":
-        return lambda: jax.block_until_ready(training.jitted_encode(variables, cloud, config=config.model))
-    volume = training.jitted_encode(variables, cloud, config=config.model)
-    return lambda: jax.block_until_ready(training.jitted_render(variables, volume, batch.camera, config=config.model))
+        return lambda: jax.block_until_ready(inference.jitted_encode(variables, cloud, config=config.model))
+    volume = inference.jitted_encode(variables, cloud, config=config.model)
+    return lambda: jax.block_until_ready(inference.jitted_render(variables, volume, batch.camera, config=config.model))
 
 
 def differences(config: TrainConfig, arrays: twin_layout.Arrays) -> dict[str, float]:
@@ -115,9 +114,9 @@ def differences(config: TrainConfig, arrays: twin_layout.Arrays) -> dict[str, fl
     inputs = jax.device_put(twin_layout.batch(arrays))
     params, statistics = twin_layout.generator(arrays)
     variables = {"params": params, "batch_stats": statistics}
-    volume = training.jitted_encode(variables, inputs.cloud, config=config.model)
-    image = training.jitted_render(variables, volume, inputs.camera, config=config.model).image[:, 0]
-    judge = jax.jit(training.discriminator_of(config).apply)
+    volume = inference.jitted_encode(variables, inputs.cloud, config=config.model)
+    image = inference.jitted_render(variables, volume, inputs.camera, config=config.model).image[:, 0]
+    judge = jax.jit(optimisation.discriminator_of(config).apply)
     params = {"params": twin_layout.discriminator(arrays)}
     logits = judge(params, image, inputs.condition[:, 0], inputs.condition_mask[:, 0])
     stages = {"volume": volume.volume, "image": image, "logits": logits}

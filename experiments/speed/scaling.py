@@ -26,8 +26,10 @@ from experiments import command
 from experiments.comparison import figures, results
 from experiments.comparison.tables import Table, number, text
 from experiments.speed import ours, worker
-from spnr_jax import cameras, cli, evaluation
+from spnr_jax import cli
 from spnr_jax.config import TrainConfig
+from spnr_jax.devices import machine
+from spnr_jax.kernels import cameras
 from spnr_jax.model_config import ModelConfig
 
 
@@ -129,7 +131,7 @@ def main(options: Options) -> None:
     for name in names:
         found.append(results.kept(out / f"{name}.json", partial(measure, name, options)))
         print(f"{name}: slope {found[-1]['slope']:.2f}, last step {found[-1]['last_slope']:.2f}", flush=True)
-    setting = {"hardware": evaluation.hardware(), "date": time.strftime("%Y-%m-%d"), "preset": options.preset}
+    setting = {"hardware": machine.hardware(), "date": time.strftime("%Y-%m-%d"), "preset": options.preset}
     note = f"preset {options.preset}, {setting['hardware']}, {setting['date']}"
     results.write(out, setting | {"axes": found}, [table(found)], [note], {"scaling.png": plot(found)})
 

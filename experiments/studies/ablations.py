@@ -27,7 +27,7 @@ import tyro
 from experiments import command
 from experiments.comparison import variants, variants_report
 from experiments.comparison.variants import Budget, Variant
-from spnr_jax import cli, data, presets
+from spnr_jax import cli, presets
 from spnr_jax.config import LossConfig, TrainConfig
 from spnr_jax.formats import data_sets
 from spnr_jax.model_config import ModelConfig, SamplingConfig

@@ -23,17 +23,21 @@ import tyro
 from matplotlib.figure import Figure
 from scipy.ndimage import map_coordinates
 
-from data_gen import depth, light, views
-from data_gen.variant import choose_variant, mitsuba_module
+from data_gen.render import depth, light, views
+from data_gen.render.variant import choose_variant, mitsuba_module
 from experiments import command
 from experiments.comparison import figures, networks, results
 from experiments.comparison.networks import Network, Sources
 from experiments.comparison.poisson import unscaled_light, view_config
 from experiments.comparison.source_meshes import cast_views, mesh_of
 from experiments.comparison.tables import Table, number, text
-from spnr_jax import cameras, cli, data, evaluation, statistics
-from spnr_jax.images import to_uint8, write_turntable
-from spnr_jax.types import Camera
+from spnr_jax import cli
+from spnr_jax.devices import machine
+from spnr_jax.formats import data_sets
+from spnr_jax.formats.images import to_uint8, write_turntable
+from spnr_jax.kernels import cameras
+from spnr_jax.kernels.records import Camera
+from spnr_jax.scoring import evaluation, intervals
 
 SAME_PLACE = 0.01  # half diagonals that what frame t sees there may be nearer or farther than the place
 REFERENCE = "references"
@@ -70,27 +74,27 @@ def main(options: Flicker) -> None:
     if options.frames < 3:
         raise ValueError(f"--frames: expected 3 or more, got {options.frames}")
     cli.set_up_jax()
-    dataset = data.open_dataset(options.data)
+    dataset = data_sets.open_dataset(options.data)
     names = networks.test_objects(dataset, options.objects)
     trained = networks.networks(options.sources, dataset)
     asked = {name: getattr(options, name) for name in ("frames", "elevation", "spp")}
     results.claim(options.out, "turntables", asked, dataset)
     mitsuba_module(choose_variant(options.variant)[0])
-    camera = turntable(data.read_object(dataset, names[0]).camera, options.frames, options.elevation)
+    camera = turntable(data_sets.read_object(dataset, names[0]).camera, options.frames, options.elevation)
     curves: dict[str, list[np.ndarray]] = {name: [] for name in (REFERENCE, *trained)}
     for count, name in enumerate(names, start=1):
         for label, curve in object_curves(options, dataset, name, trained, camera).items():
             curves[label].append(curve)
         print(f"{count} of {len(names)}: {name}", flush=True)
-    found = summarise(curves, names) | asked | {"hardware": evaluation.hardware(), "pixels": camera.width}
+    found = summarise(curves, names) | asked | {"hardware": machine.hardware(), "pixels": camera.width}
     results.write(options.out, found, [table(found)], [], {"flicker.png": plot(curves, names)})
 
 
 def object_curves(
-    options: Flicker, dataset: data.Dataset, name: str, trained: dict[str, Network], camera: Camera
+    options: Flicker, dataset: data_sets.Dataset, name: str, trained: dict[str, Network], camera: Camera
 ) -> dict[str, np.ndarray]:
     """Flicker from frame to frame of one object by method; its turntables are written side by side."""
-    item = data.read_object(dataset, name)
+    item = data_sets.read_object(dataset, name)
     place = options.out / "frames" / f"{name}.npz"
     references, distances = results.kept(place, partial(true_frames, options, dataset, item, camera))
     shown = {REFERENCE: references.astype(np.float32) / 255}
@@ -131,7 +135,7 @@ def light_of(dataset: data_sets.Dataset, envmap: Path | None) -> np.ndarray:
     return light.scaled_to_white(unscaled_light(dataset.settings["environment_map"], envmap))
 
 
-def frames_of(network: Network, item: data.ObjectData, camera: Camera) -> np.ndarray:
+def frames_of(network: Network, item: data_sets.ObjectData, camera: Camera) -> np.ndarray:
     """The network's pictures (frames, h, w, 3) of the object's first points, ten frames at a time."""
     cloud, show = data_sets.first_points(item, network.config.test_points), network.show()
     parts = []

@@ -2,7 +2,7 @@
 
     python -m experiments.studies.many_objects --data DIR --out DIR [--runs 8] [--steps 20] [--preset tiny]
 
-M runs (seeds) of `training.train_step`, and N objects that are encoded and rendered, are each done by a Python loop
+M runs (seeds) of `optimisation.train_step`, and N objects that are encoded and rendered, are each done by a Python loop
 over the jitted function and by one program under vmap, in turns.  States and batches of all runs are one tree with an
 axis of runs first; `step` alone is shared, so that what depends on it (R1 every so many steps) stays a branch.  The
 learning rate is no axis of runs: the config, which holds it, is static, so that each value is a program of its own.
@@ -23,11 +23,15 @@ import numpy as np
 from experiments import command
 from experiments.comparison import results
 from experiments.comparison.tables import Table, number
-from spnr_jax import cli, data, evaluation, training
+from spnr_jax import cli
 from spnr_jax.config import TrainConfig
+from spnr_jax.devices import machine
+from spnr_jax.formats import data_sets
+from spnr_jax.kernels.records import Batch
+from spnr_jax.method import inference
 from spnr_jax.presets import PRESETS
-from spnr_jax.training import TrainState
-from spnr_jax.types import Batch
+from spnr_jax.training import batching, optimisation
+from spnr_jax.training.optimisation import TrainState
 
 OF_A_RUN = tuple(f.name for f in dataclasses.fields(TrainState) if f.name != "step")
 AXES: Any = TrainState(step=None, **dict.fromkeys(OF_A_RUN, 0))  # type: ignore[arg-type]
@@ -54,12 +58,12 @@ class ManyObjects:
 def main(options: ManyObjects) -> None:
     """Trains and renders in both forms, and writes how fast they were and how far they lie apart."""
     cli.set_up_jax()
-    dataset = data.open_dataset(options.data)
+    dataset = data_sets.open_dataset(options.data)
     config = dataclasses.replace(PRESETS[options.preset](), num_steps=options.steps)
     names = (*dataset.splits["test"], *dataset.splits["train"])[: options.objects]
     trained = train(dataset, config, range(options.runs))
     rendered = render(dataset, config, names)
-    found = {"hardware": evaluation.hardware(), "preset": options.preset, "train": trained, "render": rendered}
+    found = {"hardware": machine.hardware(), "preset": options.preset, "train": trained, "render": rendered}
     rows = (
         (f"{options.runs} runs, steps of a run a second", row(trained, options.runs)),
         (f"{len(names)} objects, views a second", row(rendered, len(names))),
@@ -80,16 +84,16 @@ def row(found: Mapping[str, Any], count: int) -> tuple:
     return (*rates, ratio, *(number(value, 8) for value in found["apart"]))
 
 
-def train(dataset: data.Dataset, config: TrainConfig, seeds: Sequence[int]) -> dict[str, Any]:
+def train(dataset: data_sets.Dataset, config: TrainConfig, seeds: Sequence[int]) -> dict[str, Any]:
     """Seconds of a step of all runs in both forms, and the largest relative difference of a loss, first and in all."""
-    singles = [training.jitted_create_state(config, jnp.uint32(seed)) for seed in seeds]
+    singles = [optimisation.jitted_create_state(config, jnp.uint32(seed)) for seed in seeds]
     stacked = stack(singles)
-    adversarial_from = training.first_adversarial_step(config)
+    adversarial_from = optimisation.first_adversarial_step(config)
     seconds: dict[str, list[float]] = {"loop": [], "vmap": []}
     apart = []
     for step, batch in enumerate(batches(dataset, config, seeds)):
         late = step >= adversarial_from
-        one = partial(training.jitted_train_step, config=config, adversarial=late)
+        one = partial(optimisation.jitted_train_step, config=config, adversarial=late)
         pieces = [jax.tree.map(lambda x, i=i: x[i], batch) for i in range(len(seeds))]
         start = time.perf_counter()
         stepped = jax.block_until_ready([one(state, piece) for state, piece in zip(singles, pieces, strict=True)])
@@ -107,7 +111,7 @@ def train(dataset: data.Dataset, config: TrainConfig, seeds: Sequence[int]) -> d
 @partial(jax.jit, static_argnames=("config", "adversarial"), donate_argnums=0)
 def vmapped(states: TrainState, batch: Batch, config: TrainConfig, adversarial: bool):
     """One step of all runs in one program."""
-    one = partial(training.train_step, config=config, adversarial=adversarial)
+    one = partial(optimisation.train_step, config=config, adversarial=adversarial)
     return jax.vmap(one, in_axes=(AXES, 0), out_axes=(AXES, 0))(states, batch)
 
 
@@ -118,30 +122,30 @@ def stack(states: Sequence[TrainState]) -> TrainState:
     return dataclasses.replace(stacked, step=jnp.copy(states[0].step), key=jax.random.wrap_key_data(stacked.key))
 
 
-def batches(dataset: data.Dataset, config: TrainConfig, seeds: Sequence[int]) -> Iterator[Batch]:
+def batches(dataset: data_sets.Dataset, config: TrainConfig, seeds: Sequence[int]) -> Iterator[Batch]:
     """Of each step the batches of all runs, each the one that the run alone would see."""
-    read = data.cached_reader(dataset, config, data.CACHE_BYTES)
+    read = batching.cached_reader(dataset, config, batching.CACHE_BYTES)
     for step in range(config.num_steps):
         made = []
         for one in (dataclasses.replace(config, seed=seed) for seed in seeds):
-            names = data.object_names(dataset.splits["train"], one, step)
-            made.append(data.make_batch([read(name) for name in names], one, step))
+            names = batching.object_names(dataset.splits["train"], one, step)
+            made.append(batching.make_batch([read(name) for name in names], one, step))
         yield jax.device_put(jax.tree.map(lambda *x: np.stack(x), *made))
 
 
-def render(dataset: data.Dataset, config: TrainConfig, names: Sequence[str], rounds: int = 6) -> dict[str, Any]:
+def render(dataset: data_sets.Dataset, config: TrainConfig, names: Sequence[str], rounds: int = 6) -> dict[str, Any]:
     """Seconds to encode and render one view of every object in both forms, and the largest difference of a pixel."""
-    variables = training.averaged_variables(training.jitted_create_state(config))
-    items = [data.read_object(dataset, name) for name in names]
+    variables = optimisation.averaged_variables(optimisation.jitted_create_state(config))
+    items = [data_sets.read_object(dataset, name) for name in names]
     inputs = [
-        (evaluation.test_cloud(item, config), jax.tree.map(lambda x: np.asarray(x)[:1], item.camera)) for item in items
+        (data_sets.test_cloud(item, config), jax.tree.map(lambda x: np.asarray(x)[:1], item.camera)) for item in items
     ]
     stacked = jax.device_put(jax.tree.map(lambda *x: np.stack(x), *inputs))
 
     def one(cloud, camera) -> jax.Array:
         cloud, camera = jax.tree.map(lambda x: x[None], (cloud, camera))
-        scene = training.encode(variables, cloud, config=config.model)
-        return training.render(variables, scene, camera, config=config.model).image[0]
+        scene = inference.encode(variables, cloud, config=config.model)
+        return inference.render(variables, scene, camera, config=config.model).image[0]
 
     single, many = jax.jit(one), jax.jit(jax.vmap(one))
     pieces = [jax.tree.map(lambda x, i=i: x[i], stacked) for i in range(len(names))]

@@ -21,7 +21,6 @@ from typing import Literal
 import numpy as np
 import tyro
 
-from data_gen import points
 from experiments import command
 from experiments.comparison import figures, networks, poisson, results
 from experiments.comparison.networks import LABELS, Network, Sources
@@ -30,10 +29,14 @@ from experiments.comparison.scoring import ObjectMethod
 from experiments.comparison.source_meshes import details, mesh_of
 from experiments.studies import point_count_report as report
 from experiments.studies.point_count_report import METRICS
-from spnr_jax import cli, data, evaluation, statistics
+from spnr_jax import cli
 from spnr_jax.config import TrainConfig
-from spnr_jax.images import png
-from spnr_jax.types import PointCloud
+from spnr_jax.devices import machine
+from spnr_jax.formats import data_sets
+from spnr_jax.formats.images import png
+from spnr_jax.formats.mesh import surface_points
+from spnr_jax.kernels.records import PointCloud
+from spnr_jax.scoring import evaluation, intervals
 
 COUNTS = (128, 256, 512, 1024, 2048, 4096, 10_000)
 
@@ -81,7 +84,7 @@ class Method:
 def main(options: PointCount) -> None:
     """Measures what is missing, then writes results, tables, curves and pictures."""
     cli.set_up_jax()
-    dataset = data.open_dataset(options.data)
+    dataset = data_sets.open_dataset(options.data)
     names = networks.test_objects(dataset, 2 if options.quick else options.objects)
     trained = networks.networks(options.sources, dataset)
     counts = available_counts(options, dataset, names[0])
@@ -102,7 +105,7 @@ def main(options: PointCount) -> None:
         "made of": {label: method.identity for label, method in found.items()},
         "trained on": [config.min_points, config.max_points],
         "class points": shown,
-        "hardware": evaluation.hardware(),
+        "hardware": machine.hardware(),
         "data": dataset.settings.get("settings", {}),
         "seed": "that of the data set's points; nothing else is drawn",
     }
@@ -129,7 +132,7 @@ def available_counts(options: PointCount, dataset: data_sets.Dataset, name: str)
     return counts
 
 
-def all_methods(options: PointCount, dataset: data.Dataset, trained: dict[str, Network]) -> dict[str, Method]:
+def all_methods(options: PointCount, dataset: data_sets.Dataset, trained: dict[str, Network]) -> dict[str, Method]:
     """Networks, Poisson surfaces, and the trivial renderers."""
     config = next(iter(trained.values())).config
     found = {label: of_network(network) for label, network in trained.items()}
@@ -266,7 +269,7 @@ def strip(
     options: PointCount, dataset: data_sets.Dataset, name: str, labels: Sequence[str], counts: Sequence[int]
 ) -> np.ndarray:
     """One object: a row for each method, a column for each count, and the reference before them."""
-    reference = data.on_white(data.read_object(dataset, name).images[0])
+    reference = data_sets.on_white(data_sets.read_object(dataset, name).images[0])
     rows = [
         [reference, *(results.READERS[".png"](options.out / label / f"{count}.png") for count in counts)]
         for label in labels

@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 
 from experiments.comparison import figures
 from experiments.comparison.tables import Table, number, text
-from spnr_jax.report import QUALITY
+from spnr_jax.scoring.report import QUALITY
 
 METRICS = ("psnr", "flip", "iou")
 

@@ -34,11 +34,13 @@ from experiments import command
 from experiments.comparison import figures, results
 from experiments.comparison.networks import test_objects
 from experiments.comparison.tables import Table, number, text
-from spnr_jax import checkpoint, cli, data, evaluation, training
+from spnr_jax import cli
 from spnr_jax.config import TrainConfig
+from spnr_jax.devices import machine
+from spnr_jax.formats import data_sets
 from spnr_jax.model_config import ModelConfig, SamplingConfig
 from spnr_jax.scoring import evaluation
-from spnr_jax.training import checkpoint, optimisation, run_record
+from spnr_jax.training import checkpoint, optimisation
 
 REPEATS = 5
 TIMED_OBJECTS = 8
@@ -125,7 +127,7 @@ def main(options: SpeedAccuracy) -> None:
 
     def measured(run: Path, setting: Setting) -> dict:
         if run not in loaded:
-            loaded[run] = training.averaged_variables(checkpoint.load_run(run)[1])
+            loaded[run] = optimisation.averaged_variables(checkpoint.load_run(run)[1])
         found = measure(loaded[run], setting.config, dataset, names)
         print(f"{run.name}: {setting.name}: {found['psnr']:.2f} dB, {found['ms_view']:.2f} ms", flush=True)
         return {"run": str(run), "group": setting.group, "name": setting.name, **found}
@@ -135,7 +137,7 @@ def main(options: SpeedAccuracy) -> None:
         rows.append(results.kept(place, partial(measured, run, setting)))
         print(f"{count + 1} of {len(todo)}", flush=True)
     chosen = front(rows)
-    found = {"hardware": evaluation.hardware(), "date": time.strftime("%Y-%m-%d"), "objects": len(names), "rows": rows}
+    found = {"hardware": machine.hardware(), "date": time.strftime("%Y-%m-%d"), "objects": len(names), "rows": rows}
     best = f"The knee of the front is {rows[knee(rows, chosen)]['name']}."
     results.write(options.out, found, [table(rows, chosen)], [best], {"front.png": plot(rows, chosen)})
 

@@ -72,7 +72,7 @@ def train(
 ) -> training.TrainState:
     """The state after the config's last step; goes on where an earlier call left the run folder.
 
-    A new run begins with random weights, or with those of `init`.  On a mesh of devices (`distributed.device_mesh`)
+    A new run begins with random weights, or with those of `init`.  On a mesh of devices (`placement.device_mesh`)
     each of its processes calls this.  `on_event` is told what the loop is about to do; what was told before is done.
     """
     allocator.few_arenas()

@@ -12,11 +12,11 @@ from experiments.comparison import budget as budgets
 from experiments.comparison import variants, variants_report
 from experiments.comparison.variants import Budget, Compared
 from experiments.studies.ablations import LABELS, ROWS, Ablations, changed, folds, main, rows
-from spnr_jax import checkpoint, cli, data, evaluation, presets, training
+from spnr_jax import cli, presets
 from spnr_jax.config import to_dict
 from spnr_jax.formats import data_sets
 from spnr_jax.scoring import evaluation
-from spnr_jax.training import checkpoint, optimisation, trainer
+from spnr_jax.training import checkpoint, optimisation
 
 pytestmark = pytest.mark.ci  # it trains several networks
 PLUS_ROWS = ("free_colour", "no_neighbours", "three_neighbours", "twelve_neighbours", "batch_norm")

@@ -16,7 +16,7 @@ from support import twin
 
 from experiments.speed import bench, ours, scene, twin_layout
 from experiments.speed import worker as workers
-from spnr_jax import cameras
+from spnr_jax.kernels import cameras
 
 OPTIONS = {"presets": ("tiny",), "modes": ("render",), "variants": ("plain", "fast"), "rounds": 3, "seconds": 0.02}
 

@@ -9,7 +9,8 @@ from support import tiny_dataset
 from support.tiny_baselines import BASELINE, SHRUNKEN
 
 from experiments.comparison import budget as budgets
-from spnr_jax import checkpoint, data, presets, training
+from spnr_jax import presets
+from spnr_jax.training import batching, checkpoint, optimisation
 
 
 @pytest.mark.parametrize(
@@ -46,9 +47,9 @@ def test_the_pace_leaves_out_the_step_that_compiles(monkeypatch):
     ticks = chain([100.0, 101.0, 103.0, 106.0], iter(lambda: 106.0, None))
     monkeypatch.setattr(budgets, "PACE_SECONDS", 5.0)
     monkeypatch.setattr(budgets.time, "monotonic", lambda: next(ticks))
-    monkeypatch.setattr(training, "jitted_create_state", lambda config: "state")
-    monkeypatch.setattr(training, "jitted_train_step", lambda state, batch, **_: (state, 1.0))
-    monkeypatch.setattr(data, "batches", lambda *_: (i for i in range(9)))
+    monkeypatch.setattr(optimisation, "jitted_create_state", lambda config: "state")
+    monkeypatch.setattr(optimisation, "jitted_train_step", lambda state, batch, **_: (state, 1.0))
+    monkeypatch.setattr(batching, "batches", lambda *_: (i for i in range(9)))
     # asked at the third, fourth... step after the first: 101 and 103 are too early
     assert budgets.step_seconds(BASELINE, None, adversarial=False) == pytest.approx(6.0 / 5)
 

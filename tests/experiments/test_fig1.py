@@ -10,7 +10,8 @@ from support.tiny_runs import L1_ONLY, check_conditions, results_of, shrunken
 
 from experiments.comparison.variants import QUICK_STEPS, Budget
 from experiments.paper.fig1 import Fig1, main, pretrained, variant
-from spnr_jax import checkpoint, config, presets, training
+from spnr_jax import config, presets
+from spnr_jax.training import checkpoint, optimisation
 
 pytestmark = pytest.mark.ci  # it trains several networks
 

@@ -7,7 +7,8 @@ from support.tiny_runs import check_conditions, results_of, shrunken
 
 from experiments.comparison.variants import Budget
 from experiments.paper.fig2 import Fig2, main, nearest_views, trainings
-from spnr_jax import cli, data
+from spnr_jax import cli
+from spnr_jax.formats import data_sets
 
 pytestmark = pytest.mark.ci  # it trains several networks
 

@@ -8,13 +8,14 @@ import pytest
 from support import stand_ins, tiny_dataset
 from support.handmade import ball
 
-from data_gen.assets import Asset
-from data_gen.poisson import PoissonConfig
+from data_gen.render.poisson_surface import PoissonConfig
 from experiments.comparison import networks
 from experiments.paper import depth_scores, fig3
 from experiments.paper.fig3 import Fig3
-from spnr_jax import cli, data, evaluation
-from spnr_jax.types import PointCloud
+from spnr_jax import cli
+from spnr_jax.formats import data_sets
+from spnr_jax.formats.mesh.assets import Asset
+from spnr_jax.kernels.records import PointCloud
 
 SIZE = 64
 TRUTH = np.full((SIZE, SIZE), np.inf)
@@ -146,7 +147,7 @@ def test_a_poisson_surface_of_many_points_has_the_depth_of_the_ball():
     assert np.mean(acc == opaque) > 0.95
     both = (acc > 0) & (opaque > 0) & (expected < expected.min() + 0.3)
     np.testing.assert_allclose(seen[both] + stand_ins.OFFSET, np.tile(expected, (3, 1, 1))[both], atol=0.05)
-    line = evaluation.first_points(item, 1)
+    line = data_sets.first_points(item, 1)
     assert not fig3.of_surface(PoissonConfig(depth=5)).show(item, line)[1].any()
 
 

@@ -7,12 +7,13 @@ import pytest
 from PIL import Image
 from support import stand_ins, tiny_dataset
 
-from data_gen import records
+from data_gen.store import layout
 from experiments.comparison import figures, networks
 from experiments.comparison.networks import Sources
 from experiments.paper import figs4_21
 from experiments.paper.figs4_21 import Gallery, main
-from spnr_jax import cli, data
+from spnr_jax import cli
+from spnr_jax.formats import data_sets
 
 SIZE, GAP = tiny_dataset.SIZE, figures.GAP
 NAMES = tiny_dataset.SPLITS["test"]

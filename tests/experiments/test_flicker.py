@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 from support import tiny_dataset, tiny_untrained
 
-from data_gen.variant import choose_variant, mitsuba_module
+from data_gen.render.variant import choose_variant, mitsuba_module
 from experiments.comparison.networks import Sources
 from experiments.studies import flicker
-from spnr_jax import cameras, data
-from spnr_jax.types import Camera
+from spnr_jax.formats import data_sets
+from spnr_jax.kernels import cameras
+from spnr_jax.kernels.records import Camera
 
 FRAMES, SIZE = 12, 48
 

@@ -7,9 +7,10 @@ import time
 import pytest
 from support import tiny_dataset
 
-from data_gen import records
+from data_gen.store import layout
 from experiments.speed import loading
-from spnr_jax import data, presets
+from spnr_jax import presets
+from spnr_jax.formats import data_sets
 
 
 @pytest.fixture

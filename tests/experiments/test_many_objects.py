@@ -7,12 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import tiny_dataset
-from laws import same_bits
-from tiny_baselines import SHRUNKEN
+from support import tiny_dataset
+from support.laws import same_bits
+from support.tiny_baselines import SHRUNKEN
 
 from experiments.studies import many_objects
-from spnr_jax import cli, data, presets, training
+from spnr_jax import cli, presets
+from spnr_jax.training import batching, optimisation
 
 SEEDS = (3, 4, 5)
 QUICK = dataclasses.replace(SHRUNKEN["points2nerf_tiny"], num_steps=3)  # no convolutions: compiles in a second
@@ -22,13 +23,13 @@ def test_the_batches_of_a_run_are_those_that_it_would_see_alone():
     dataset = tiny_dataset.dataset()
     together = list(many_objects.batches(dataset, QUICK, SEEDS))[2]
     for i, seed in enumerate(SEEDS):
-        alone = next(data.batches(dataset, dataclasses.replace(QUICK, seed=seed), 2))
+        alone = next(batching.batches(dataset, dataclasses.replace(QUICK, seed=seed), 2))
         same_bits(jax.tree.map(lambda x, i=i: x[i], together), jax.tree.map(jnp.asarray, alone))
 
 
 @pytest.mark.ci
 def test_stacked_states_share_their_step_and_keep_their_keys():
-    states = [training.jitted_create_state(QUICK, jnp.uint32(seed)) for seed in SEEDS]
+    states = [optimisation.jitted_create_state(QUICK, jnp.uint32(seed)) for seed in SEEDS]
     stacked = many_objects.stack(states)
     assert stacked.step.shape == ()
     np.testing.assert_array_equal(jax.random.key_data(stacked.key)[1], jax.random.key_data(states[1].key))

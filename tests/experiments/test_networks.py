@@ -10,7 +10,8 @@ from support import stand_ins, tiny_dataset
 
 from experiments.comparison import networks as methods
 from experiments.comparison.networks import Sources, networks
-from spnr_jax import data, evaluation, weights
+from spnr_jax.formats import data_sets
+from spnr_jax.training import weights
 
 
 @pytest.fixture(scope="module")

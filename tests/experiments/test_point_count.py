@@ -6,15 +6,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import stand_ins
-import tiny_dataset
-from handmade import RED, ball, plain
+from support import stand_ins, tiny_dataset
+from support.handmade import RED, ball, plain
 
-from data_gen.assets import Asset
 from experiments.comparison import networks
 from experiments.studies import point_count
 from experiments.studies.point_count import PointCount, cloud_of, main
-from spnr_jax import cli, data, evaluation, statistics
+from spnr_jax import cli
+from spnr_jax.formats import data_sets
+from spnr_jax.formats.mesh.assets import Asset
+from spnr_jax.scoring import evaluation, intervals
 
 pytestmark = pytest.mark.ci  # it trains several networks
 

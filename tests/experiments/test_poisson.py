@@ -7,11 +7,13 @@ import numpy as np
 import pytest
 from support.handmade import RED, ball, plain
 
-from data_gen import light, normals, points, poisson, records, views
-from data_gen.assets import Asset
-from data_gen.poisson import NoSurface, PoissonConfig
+from data_gen.render import light, normals, poisson_surface, views
+from data_gen.render.poisson_surface import NoSurface, PoissonConfig
+from data_gen.store import layout
 from experiments.comparison import poisson as rendering
-from spnr_jax.types import PointCloud
+from spnr_jax.formats.mesh import surface_points
+from spnr_jax.formats.mesh.assets import Asset
+from spnr_jax.kernels.records import PointCloud
 
 needs_solver = pytest.mark.skipif(importlib.util.find_spec("pymeshlab") is None, reason="pymeshlab is not installed")
 RADIUS, COUNT = 0.7, 600

@@ -10,7 +10,9 @@ import pytest
 from support import tiny_dataset, tiny_model
 
 from experiments.packaged import pretrain
-from spnr_jax import cli, data, presets, run_record, weights
+from spnr_jax import cli, presets
+from spnr_jax.formats import data_sets
+from spnr_jax.training import run_record, weights
 
 pytestmark = pytest.mark.ci  # it trains several networks
 

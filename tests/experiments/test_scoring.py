@@ -8,7 +8,7 @@ import numpy as np
 from experiments.comparison import page, scoring
 from experiments.comparison.scoring import Shown
 from experiments.paper import table1_tables
-from spnr_jax import evaluation
+from spnr_jax.scoring import evaluation
 
 
 def test_the_best_of_a_column_is_the_highest_or_for_errors_the_lowest():

@@ -8,7 +8,6 @@ from support import tiny_dataset, tiny_model
 
 from experiments.studies import speed_accuracy
 from experiments.studies.speed_accuracy import SpeedAccuracy, front, knee, main, settings
-from spnr_jax import checkpoint, training
 from spnr_jax.config import LossConfig
 from spnr_jax.training import checkpoint, optimisation
 

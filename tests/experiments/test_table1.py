@@ -17,12 +17,16 @@ from PIL import Image
 from support import tiny_dataset
 from support.tiny_baselines import BASELINE, SHRUNKEN, SIZE
 
-from data_gen import poisson as surfaces
-from data_gen import records, views
+from data_gen.render import poisson_surface as surfaces
+from data_gen.render import views
+from data_gen.store import layout
 from experiments.comparison import budget, poisson, scoring
 from experiments.comparison.networks import LABELS
 from experiments.paper import table1
-from spnr_jax import cli, data, evaluation, presets, trainer, training
+from spnr_jax import cli, presets
+from spnr_jax.formats import data_sets
+from spnr_jax.scoring import evaluation
+from spnr_jax.training import optimisation, trainer
 
 pytestmark = pytest.mark.ci  # it trains several networks
 SOLVER = importlib.util.find_spec("pymeshlab") is not None

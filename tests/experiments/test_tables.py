@@ -6,7 +6,7 @@ import re
 
 import numpy as np
 import pytest
-import tiny_dataset
+from support import tiny_dataset
 
 from experiments.comparison import figures, results
 from experiments.comparison.tables import Table, csv_text, latex, markdown, number, text

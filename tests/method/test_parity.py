@@ -10,7 +10,7 @@ import pytest
 from support import twin
 
 from experiments.speed import twin_layout
-from spnr_jax import cameras, compositing, losses, sampling, training, voxels
+from spnr_jax.kernels import cameras, compositing, losses, sampling, voxels
 from spnr_jax.nn.encoding import encode_direction
 from spnr_jax.training import optimisation
 

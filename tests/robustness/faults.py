@@ -17,7 +17,7 @@ import numpy as np
 from killable import CHECKPOINT_EVERY, QUICK_COMPILATION, Ended, Training, checkpoint_steps
 from orbax.checkpoint import v1 as ocp
 
-from spnr_jax import data
+from spnr_jax.formats import data_sets
 
 GRACE = 30.0  # seconds that schedulers give after SIGTERM: Slurm's KillWait, Kubernetes' grace period
 SKIPPED = 99
@@ -109,7 +109,7 @@ def lost_picture(training: Training, run: Path) -> Seen:
     """A picture of each object that was deleted from the data set."""
     folder = run.with_name(f"{run.name}-data")
     shutil.copytree(training.data, folder)
-    for name in data.open_dataset(folder).splits["train"]:
+    for name in data_sets.open_dataset(folder).splits["train"]:
         (folder / "objects" / name / "images" / "001.png").unlink()
     return called(replace(training, data=folder), run)
 

@@ -20,11 +20,13 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from spnr_jax import checkpoint, trainer
+from spnr_jax.training import checkpoint, trainer
 
 LIMIT = 300.0  # seconds without an event after which a process hangs
 SERVER = multiprocessing.get_context("forkserver")
-SERVER.set_forkserver_preload(["spnr_jax.trainer", "spnr_jax.cli", "orbax.checkpoint.v1", "grain", "tensorboardX"])
+SERVER.set_forkserver_preload(
+    ["spnr_jax.training.trainer", "spnr_jax.cli", "orbax.checkpoint.v1", "grain", "tensorboardX"]
+)
 QUICK_COMPILATION = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
 CHECKPOINT_EVERY = 8
 OPTIONS = (  # few weights; the discriminator takes part from the first step, so that its state counts too
@@ -107,7 +109,8 @@ def _child(arguments: list[str], cache: Path, output: Path, events: Connection) 
             os.dup2(file.fileno(), stream)
     from tqdm import tqdm
 
-    from spnr_jax import cli, data
+    from spnr_jax import cli
+    from spnr_jax.formats import data_sets
 
     tqdm.set_lock(threading.RLock())  # its own is a semaphore between processes, which a killed one would leave behind
     jax.config.update("jax_compilation_cache_dir", str(cache))
@@ -119,7 +122,7 @@ def _child(arguments: list[str], cache: Path, output: Path, events: Connection) 
     def train() -> None:
         command = cli.parse(arguments)
         every = {name: getattr(command, name) for name in ("log_every", "preview_every", "checkpoint_every")}
-        dataset, schedule = data.open_dataset(command.data), trainer.Schedule(**every)
+        dataset, schedule = data_sets.open_dataset(command.data), trainer.Schedule(**every)
         trainer.train(command.config, dataset, command.run, schedule, on_event=tell)
         print("trained")
 

@@ -17,8 +17,8 @@ from typing import Literal
 import jax
 import numpy as np
 
-from spnr_jax import checkpoint, trainer, training
-from spnr_jax.launch import IN_ORDER
+from spnr_jax.devices.launch import IN_ORDER
+from spnr_jax.training import checkpoint, optimisation, trainer
 
 ROOT = Path(__file__).parents[2]
 LIMIT = 3600.0  # seconds that a run may take
@@ -111,7 +111,7 @@ def compared(run: Path, one: Path) -> dict[str, float]:
         "losses": max(abs(a["loss"] / b["loss"] - 1) for a, b in zip(rows, expected, strict=True)),
         "metrics": max(apart),
         "statistics": distance(state.batch_stats, reference.batch_stats),
-        "parameters": distance(training.averaged_variables(state), training.averaged_variables(reference)),
+        "parameters": distance(optimisation.averaged_variables(state), optimisation.averaged_variables(reference)),
     }
 
 

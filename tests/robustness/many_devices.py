@@ -24,15 +24,15 @@ sys.path.insert(0, str(Path(__file__).parents[1]))  # the helpers of all tests
 import jax
 import jax.numpy as jnp
 import numpy as np
-import test_point_nerf
-import tiny_dataset
-import tiny_model
+from support import tiny_dataset, tiny_model
 
-from spnr_jax import data, distributed, renderer, training
 from spnr_jax.config import LossConfig
-from spnr_jax.distributed import DEPTH, OBJECTS
+from spnr_jax.devices import placement
+from spnr_jax.devices.placement import DEPTH, OBJECTS
+from spnr_jax.method import renderer
+from spnr_jax.method.renderer import Renderer
 from spnr_jax.model_config import SamplingConfig
-from spnr_jax.renderer import Renderer
+from spnr_jax.training import batching, optimisation
 
 PLUS = dataclasses.replace(
     tiny_model.PLUS,
@@ -85,16 +85,16 @@ def gradients_apart(model, precision: str) -> float:
     """
     loss = LossConfig(l1_weight=1.0, adversarial_weight=0.0)
     config = dataclasses.replace(tiny_dataset.CONFIG, model=model, loss=loss, batch_objects=8)
-    batch, gradients = next(data.batches(tiny_dataset.dataset(), config, 0)), []
+    batch, gradients = next(batching.batches(tiny_dataset.dataset(), config, 0)), []
 
     def precise(tree):
         return jax.tree.map(lambda x: x.astype(precision) if x.dtype == np.float32 else x, tree)
 
-    for mesh in (None, distributed.device_mesh(depth=2)):
-        with distributed.using(mesh):
-            state = precise(training.jitted_create_state(config))
-            placed = distributed.placed(precise(batch), mesh, config.batch_objects)
-            state, _ = training.jitted_train_step(state, placed, config=config, adversarial=False)
+    for mesh in (None, placement.device_mesh(depth=2)):
+        with placement.using(mesh):
+            state = precise(optimisation.jitted_create_state(config))
+            placed = placement.placed(precise(batch), mesh, config.batch_objects)
+            state, _ = optimisation.jitted_train_step(state, placed, config=config, adversarial=False)
         gradients.append(jax.device_get(state.generator_optimizer[0].mu))  # of one step their mean is a multiple
     pairs = zip(*map(jax.tree.leaves, gradients), strict=True)
     return max(float(np.abs(a - b).max() / max(np.abs(a).max(), 1e-30)) for a, b in pairs)

@@ -1,7 +1,7 @@
 """Which kernel is swept along which axis, and the domain in which float32 keeps its budget (docs/stability.md).
 
 Inputs stay away from kinks (cell walls, equal pixels): there a gradient jumps, and no precision helps.  A twin is the
-kernel's value in float64 NumPy, mostly the plain loops of tests/reference.py.
+kernel's value in float64 NumPy, mostly the plain loops of tests/support/reference.py.
 """
 
 from collections.abc import Callable
@@ -10,14 +10,14 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 import numpy as np
-import reference
 from skimage.metrics import structural_similarity
+from support import reference
 
-from spnr_jax import cameras, compositing, losses, metrics, sampling, voxels
+from spnr_jax.kernels import cameras, compositing, losses, metrics, sampling, voxels
+from spnr_jax.kernels.records import Camera, Rays, Scene
+from spnr_jax.method.renderer import Renderer
 from spnr_jax.model_config import ModelConfig, SamplingConfig
 from spnr_jax.nn.normalization import BatchNorm, GroupNorm
-from spnr_jax.renderer import Renderer
-from spnr_jax.types import Camera, Rays, Scene
 
 RAYS = 16
 

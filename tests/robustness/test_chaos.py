@@ -15,12 +15,13 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-import tiny_dataset
 from faults import FAULTS, SKIPPED
 from killable import CHECKPOINT_EVERY, Training, batches, checkpoint_steps, different, rows
-from tiny_dataset import CONFIG
+from support import tiny_dataset
+from support.tiny_dataset import CONFIG
 
-from spnr_jax import checkpoint, cli, trainer
+from spnr_jax import cli
+from spnr_jax.training import checkpoint, trainer
 
 KILLS = int(os.environ.get("CHAOS_KILLS", "1"))  # of each phase
 STEPS = max(40, 4 * KILLS)

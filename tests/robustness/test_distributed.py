@@ -12,13 +12,13 @@ from types import SimpleNamespace
 import jax
 import numpy as np
 import pytest
-import tiny_dataset
-from laws import same_bits
 from layouts import NETWORK, QUICK_COMPILATION, Layout, compared
 from layouts import run as run_layout
-from tiny_dataset import CONFIG
+from support import tiny_dataset
+from support.laws import same_bits
+from support.tiny_dataset import CONFIG
 
-from spnr_jax import data, distributed, launch
+from spnr_jax.devices import launch, placement
 
 # the discriminator and R1 take part from the first step
 FLAGS = f"{NETWORK} --adversarial-start 0 --batch-objects 4 --num-steps 4 --checkpoint-every 2".split()
@@ -162,4 +162,4 @@ def test_a_process_alone_waits_for_nobody():
     done = []
     placement.first_alone(lambda: done.append(placement.leads()))
     assert done == [True]
-    assert [distributed.Agreement(None)(asked) for asked in (False, True, False)] == [False, True, False]
+    assert [placement.Agreement(None)(asked) for asked in (False, True, False)] == [False, True, False]

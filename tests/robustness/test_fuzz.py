@@ -33,7 +33,7 @@ from watched import limited_memory, watched
 from spnr_jax.cli import one_line
 from spnr_jax.config import from_dict, to_dict
 from spnr_jax.presets import tiny
-from spnr_jax.viewer import session, views
+from spnr_jax.viewer import session, viewpoint
 
 ROOT = Path(__file__).parents[2]
 INPUTS = int(os.environ.get("FUZZ_INPUTS", "16"))  # of each reader
@@ -210,6 +210,6 @@ def test_any_value_of_a_config_makes_a_config_of_right_types_or_a_valueerror(nam
 @settings(max_examples=150, deadline=None, derandomize=True)
 @given(json_values, json_values, json_values)
 def test_a_camera_message_of_any_values_is_a_view_or_none(wxyz, position, number):
-    assert views.from_browser(wxyz, position, number, number, number) is None or np.isfinite(position).all()
-    assert views.from_browser([1, 0, 0, 0], position, 0.5, 10, 10) is None or np.isfinite(position).all()
+    assert viewpoint.from_browser(wxyz, position, number, number, number) is None or np.isfinite(position).all()
+    assert viewpoint.from_browser([1, 0, 0, 0], position, 0.5, 10, 10) is None or np.isfinite(position).all()
     assert session.numbers(wxyz, 2) is None or np.isfinite(wxyz).all()

@@ -14,10 +14,11 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-import tiny_dataset
-from tiny_baselines import SHRUNKEN
+from support import tiny_dataset
+from support.tiny_baselines import SHRUNKEN
 
-from spnr_jax import presets, trainer
+from spnr_jax import presets
+from spnr_jax.training import trainer
 
 STEPS = int(os.environ.get("LONG_RUN_STEPS", "0"))
 COMPILED = "/jax/core/compile/backend_compile_duration"  # JAX's name of the event
@@ -100,15 +101,15 @@ def test_what_compiles_at_every_preview_is_seen():
 @pytest.mark.skipif(not STEPS, reason="`make long-run`: minutes on an idle machine")
 def test_memory_handles_and_pace_of_a_long_run(tmp_path):
     """Memory grows by less than 1 %, a step's time by less than 5 %, threads and files by fewer than ten."""
-    from data_gen.generate import generate
-    from data_gen.plan import GenerateConfig
-    from spnr_jax import data
+    from data_gen.make.generate import generate
+    from data_gen.plan.tasks import GenerateConfig
+    from spnr_jax.formats import data_sets
 
     generate(GenerateConfig(out=tmp_path / "data", objects=48, spp=16, visibility_grid=2))
     tiny = presets.tiny()
     config = dataclasses.replace(tiny, num_steps=STEPS, loss=dataclasses.replace(tiny.loss, adversarial_weight=0.0))
     every = {"log_every": max(STEPS // 200, 1), "preview_every": max(STEPS // 80, 1)}
-    dataset = data.open_dataset(tmp_path / "data")
+    dataset = data_sets.open_dataset(tmp_path / "data")
     seen = watch(config, tmp_path / "run", dataset, checkpoint_every=max(STEPS // 25, 1), **every)
     steps, memory, threads, files = np.array([row for row in seen.samples if row[0] >= STEPS / 20], float).T
     pace = np.array([row for row in seen.pace if row[0] >= STEPS / 20]).T

@@ -9,7 +9,7 @@ import numpy as np
 from damage import Files
 from valid_files import POINTS, SIZE, VIEWS, numbers
 
-from data_gen import records
+from data_gen.store import layout
 from spnr_jax import presets
 from spnr_jax.config import to_dict
 
@@ -28,30 +28,30 @@ def metric_rows() -> list[Files]:
 @functools.cache
 def object_files() -> Files:
     """The files of an object of a data set."""
-    points = np.zeros(POINTS, records.POINT_TYPE)
-    for i, name in enumerate(records.POINT_FIELDS):
+    points = np.zeros(POINTS, layout.POINT_TYPE)
+    for i, name in enumerate(layout.POINT_FIELDS):
         points[name] = numbers(POINTS, 11)[:, i] * 0.5
     points["nx"], points["ny"], points["nz"] = 0, 0, 1
     images = (255 * numbers(VIEWS, SIZE, SIZE, 4)).astype(np.uint8)
     poses = np.tile(np.eye(4), (VIEWS, 1, 1))
-    record = records.ObjectRecord(
+    record = layout.ObjectRecord(
         points=points,
-        transforms=records.nerf_transforms(poses, SIZE, 40.0, 11.0),
+        transforms=layout.nerf_transforms(poses, SIZE, 40.0, 11.0),
         images=images,
         conditions=images,
         details={"id": "a", "product": "a", "variant": 0, "seeds": {"points": 0}, "source": {"file": "m.obj"}},
     )
-    return records.object_files(record)
+    return layout.object_files(record)
 
 
 def datasets() -> list[Files]:
     """A data set of one object, a seed for each of its files as the one that is hit most."""
     described = {
-        "schema_version": records.SCHEMA_VERSION,
+        "schema_version": layout.SCHEMA_VERSION,
         "settings": {"views": VIEWS, "resolution": SIZE, "points": POINTS},
     }
     files = {f"objects/a/{name}": content for name, content in object_files().items()}
-    files |= {"dataset.json": records.json_text(described).encode()}
+    files |= {"dataset.json": layout.json_text(described).encode()}
     files |= {"splits/train.txt": b"a\n", "splits/val.txt": b"", "splits/test.txt": b""}
     first: tuple[str, ...]
     first = ("objects/a/transforms.json", "objects/a/points.ply", "objects/a/images/000.png", "objects/a/object.json")
@@ -63,11 +63,11 @@ def packed() -> list[Files]:
     """What a packed data set is made of: its index, and one record (a msgpack map) that goes into a shard."""
     import msgpack
 
-    described = {"schema_version": records.SCHEMA_VERSION, "settings": {}}
+    described = {"schema_version": layout.SCHEMA_VERSION, "settings": {}}
     files = {
         "index.json": json.dumps({"shards": {"00000.array_record": 1}, "ids": ["a"]}).encode(),
         "record": msgpack.packb(object_files()),
-        "dataset.json": records.json_text(described).encode(),
+        "dataset.json": layout.json_text(described).encode(),
         "splits/train.txt": b"a\n",
         "splits/val.txt": b"",
         "splits/test.txt": b"",
@@ -92,7 +92,7 @@ def lists() -> list[Files]:
 
 def lpips() -> list[Files]:
     """An archive of LPIPS weights, of zeros: they pack well."""
-    from spnr_jax.lpips_weights import SHAPES
+    from spnr_jax.scoring.lpips_weights import SHAPES
 
     stream = io.BytesIO()
     np.savez_compressed(
@@ -104,7 +104,7 @@ def lpips() -> list[Files]:
 def weights() -> list[Files]:
     """Files of weights of very small networks, one of them NPBG's."""
     from spnr_jax.model_config import ModelConfig, SamplingConfig
-    from spnr_jax.weights import variable_shapes
+    from spnr_jax.training.weights import variable_shapes
 
     ours = presets.tiny()
     assert isinstance(ours.model, ModelConfig)

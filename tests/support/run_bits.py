@@ -12,12 +12,12 @@ from contextlib import closing
 
 import jax
 import numpy as np
-from support import tiny_dataset
 
 from spnr_jax.config import LossConfig
 from spnr_jax.formats import data_sets
 from spnr_jax.method import inference
 from spnr_jax.training import batching, optimisation
+from support import tiny_dataset
 
 CONFIG = dataclasses.replace(
     tiny_dataset.CONFIG, loss=LossConfig(discriminator_width=4, r1_interval=2), num_steps=3, batch_objects=4

@@ -4,11 +4,12 @@ import functools
 from pathlib import Path
 
 import numpy as np
-from support import tiny_dataset
-from support.tiny_baselines import SHRUNKEN
 
 from experiments.comparison import networks as methods
-from spnr_jax import checkpoint, evaluation, training
+from spnr_jax.scoring import evaluation
+from spnr_jax.training import checkpoint, optimisation
+from support import tiny_dataset
+from support.tiny_baselines import SHRUNKEN
 
 OFFSET = 0.125  # of the depth that a stand-in shows
 

@@ -2,10 +2,9 @@
 
 import dataclasses
 
-from support import tiny_dataset, tiny_model
-
 from spnr_jax.config import LossConfig, OptimizerConfig
 from spnr_jax.model_config import NetworkConfig, NPBGConfig, PointNeRFConfig, Points2NeRFConfig
+from support import tiny_dataset, tiny_model
 
 SIZE = tiny_dataset.SIZE
 BASELINE = dataclasses.replace(

@@ -7,12 +7,12 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-from support import tiny_model
 
 from data_gen.store import layout
 from spnr_jax.config import LossConfig, OptimizerConfig, TrainConfig
 from spnr_jax.formats import data_sets
 from spnr_jax.training import trainer
+from support import tiny_model
 
 SIZE = tiny_model.SIZE
 VIEWS, POINTS = 3, 40

@@ -5,9 +5,9 @@ import dataclasses
 import json
 
 import pytest
-from support import tiny_dataset
 
 from spnr_jax import cli, presets
+from support import tiny_dataset
 
 L1_ONLY = dataclasses.replace(
     tiny_dataset.CONFIG, loss=dataclasses.replace(tiny_dataset.CONFIG.loss, adversarial_weight=0.0)

@@ -5,12 +5,12 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
-from support.tiny_model import MODEL, NUM_POINTS, SIZE
 
 from spnr_jax.config import LossConfig, OptimizerConfig, TrainConfig
 from spnr_jax.kernels.cameras import look_at, pinhole
 from spnr_jax.kernels.records import Batch, PointCloud
 from spnr_jax.training import optimisation
+from support.tiny_model import MODEL, NUM_POINTS, SIZE
 
 CONFIG = TrainConfig(
     model=MODEL,

@@ -3,9 +3,8 @@
 import dataclasses
 import functools
 
-from support import tiny_dataset
-
 from spnr_jax.training import checkpoint, optimisation
+from support import tiny_dataset
 
 CONFIG = dataclasses.replace(
     tiny_dataset.CONFIG, loss=dataclasses.replace(tiny_dataset.CONFIG.loss, adversarial_weight=0.0)

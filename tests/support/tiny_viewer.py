@@ -5,7 +5,6 @@ import functools
 
 import jax
 import numpy as np
-from support import tiny_model
 
 from spnr_jax.kernels.records import PointCloud
 from spnr_jax.method.model import Model
@@ -13,6 +12,7 @@ from spnr_jax.method.renderer import Renderer
 from spnr_jax.viewer.scene import Scene, open_scene
 from spnr_jax.viewer.session import State
 from spnr_jax.viewer.viewpoint import OPENCV, View, from_browser, to_browser
+from support import tiny_model
 
 RED, BLUE = (0.8, 0.05, 0.05), (0.05, 0.05, 0.8)
 
