@@ -22,6 +22,7 @@ import tyro
 from spnr_jax import presets
 from spnr_jax.config import TrainConfig
 from spnr_jax.devices import allocator
+from spnr_jax.model_config import SurfelConfig
 from spnr_jax.tools.render_command import Render
 
 BOX = r"[╭╮╰╯│─•]+|__tyro-dummy-inner__\."  # what tyro draws around an error, and its name for the whole command
@@ -122,7 +123,7 @@ class View:
     """Address to listen on; another than this machine's own opens the viewer to a network."""
     port: int = 8080
     """Port to listen on; 0 takes any free one."""
-    num_points: int = 4096
+    num_points: int = 16384
     """Points used of a bigger cloud or sampled from a mesh; fewer work too."""
     up: Literal["auto", "x", "y", "z", "-x", "-y", "-z"] = "auto"
     """The file's upward axis; auto looks for it, and says what it found."""
@@ -305,6 +306,11 @@ def run_export(command: Export) -> None:
     from spnr_jax.training import weights
 
     trained, where = weights.read_trained(command.run), command.platforms
+    if isinstance(trained.config.model, SurfelConfig):
+        raise ValueError(
+            f"{command.run}: sizes of a picture of surfels are counted first, so it is no single function "
+            "to export; use a network of rays, such as small"
+        )
     handle = model.Model(config=trained.config.model, variables=trained.variables)
     weights.write_weights(command.out / "weights.npz", trained)
     functions = {

@@ -17,6 +17,7 @@ from spnr_jax.training import weights
 LABELS = {  # method -> its name in tables and pictures, in their order
     "ours": "Ours",
     "plus": "Ours, plus",
+    "surfels": "Surfels",
     "npbg": "NPBG",
     "point_nerf": "Point-NeRF",
     "points2nerf": "Points2NeRF",
