@@ -47,7 +47,7 @@ class Render:
     fps: int = 16
     """Frames a second of the turntable."""
     mesh: bool = False
-    """Also write the surface as .glb, with the materials of the nearest points; of the network `small` where the one that
+    """Also write the surface as .glb, with the materials of the nearest points; by the network `small` if the one that
     renders has no density."""
     density: bool = False
     """Also write the density on a grid as .npz."""

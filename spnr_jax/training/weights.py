@@ -53,7 +53,7 @@ def place(source: Path | str | None) -> Path:
 
 
 def read_trained(source: Path | str | None, say: Callable[[str], None] = print, data: Path | str = "DATA") -> Trained:
-    """The network of a run folder's newest checkpoint, of a file of weights, or of the package: None, `surfels`, `small`, `tiny`.
+    """The network of a run folder's newest checkpoint, of a file of weights, or of the package: one of SHIPPED.
 
     ValueError, with what to do, if there is none; `say` gets a line for each broken checkpoint, `data` is named.
     """
@@ -67,7 +67,7 @@ def read_trained(source: Path | str | None, say: Callable[[str], None] = print, 
 
 
 def load(run: Path | str | None = None) -> Model:
-    """A network of the package (`surfels`, `small`, `tiny`; None is the first), of a run folder's newest checkpoint, or of a file."""
+    """A network of the package (SHIPPED; None is the first), of a run folder's newest checkpoint, or of a file."""
     trained = read_trained(run)
     return Model(config=trained.config.model, variables=trained.variables)
 
