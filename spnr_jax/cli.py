@@ -22,12 +22,14 @@ import tyro
 from spnr_jax import presets
 from spnr_jax.config import TrainConfig
 from spnr_jax.devices import allocator
+from spnr_jax.formats.debugging import show_stack, without_debug
 from spnr_jax.model_config import SurfelConfig
 from spnr_jax.tools.render_command import Render
 
 BOX = r"[╭╮╰╯│─•]+|__tyro-dummy-inner__\."  # what tyro draws around an error, and its name for the whole command
 LONGEST_LINE = 800  # characters of an error
-DESCRIPTION = "Sparse-point neural rendering: train a network, evaluate one, render a cloud of points."
+DESCRIPTION = """Sparse-point neural rendering: train a network, evaluate one, render a cloud of points.
+--debug, or SPNR_DEBUG=1, shows the call stack of an error."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -142,7 +144,7 @@ Command = Train | Evaluate | Render | View | Export | Runs | ConvertLpips
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line."""
-    arguments = sys.argv[1:] if arguments is None else arguments
+    arguments = without_debug(sys.argv[1:] if arguments is None else arguments)
     code = guarded(lambda: run(parse(arguments)), "spnr")
     if code == 2 and _one_of_several():
         sys.stdout.flush()
@@ -164,6 +166,7 @@ def guarded(work: Callable[[], None], name: str) -> int:
         print(f"{name}: {str(stop) or 'stopped'}", file=sys.stderr)
         return 130
     except (ValueError, OSError) as error:
+        show_stack()
         print(f"{name}: {one_line(error)}", file=sys.stderr)
         return 2
     return 0
