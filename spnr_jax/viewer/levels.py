@@ -1,8 +1,8 @@
 """What a quality costs and loses: the figures of the README's table, which a test compares with it.
 
 They are of the preset `tiny` on 12 unseen procedural objects at 64 x 64, 1024 points, two cores of an Intel Xeon,
-2026-11-22 (`python -m experiments.studies.speed_accuracy`): how the levels compare, not what this machine needs, which the
-viewer measures.
+2026-11-22 (`python -m experiments.studies.speed_accuracy`): how the levels compare, not what this machine needs, which
+the viewer measures.
 """
 
 from dataclasses import dataclass
