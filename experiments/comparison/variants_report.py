@@ -15,6 +15,7 @@ from matplotlib.ticker import MaxNLocator
 from experiments.comparison import figures, results, variants
 from experiments.comparison.tables import Cell, Table, number, text
 from experiments.comparison.variants import OPAQUE, Budget, Compared, Variant
+from spnr_jax.devices import machine
 from spnr_jax.formats import data_sets, images
 from spnr_jax.scoring import evaluation, intervals
 from spnr_jax.scoring.report import ARROWS, HIGHER, QUALITY

@@ -35,6 +35,7 @@ from experiments.comparison.tables import Table, number, text
 from experiments.paper import depth_scores
 from experiments.paper.depth_scores import METRICS, OPAQUE
 from spnr_jax import cli
+from spnr_jax.devices import machine
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.images import depth_image, png
 from spnr_jax.kernels import cameras

@@ -28,6 +28,7 @@ from experiments.comparison.networks import LABELS, Network, Sources
 from experiments.comparison.poisson import SURFACES
 from experiments.comparison.scoring import Shown
 from spnr_jax import cli
+from spnr_jax.devices import machine
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.images import png, write_whole
 from spnr_jax.scoring.report import psnr

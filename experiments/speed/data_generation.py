@@ -2,9 +2,8 @@
 
     python -m experiments.speed.data_generation [--out runs/data_generation] [--meshes DIR]
 
-Objects are made one after another in this process, by the functions that workers of `spnr-data generate` call, under
-Python's profiler; workers share nothing, so N idle cores make N times as many.  Noise is the PSNR of pictures of few
-samples against one of 4096 (a mean of pictures of 256), both as they are written: 8-bit sRGB on white.
+Objects are made one after another here, as workers of `spnr-data generate` make them, under Python's profiler; N idle
+cores make N times as many.  Noise: PSNR against 4096 samples a pixel (a mean of pictures of 256), 8-bit sRGB on white.
 """
 
 import cProfile
@@ -68,21 +67,18 @@ def main(options: DataGeneration) -> None:
     seconds = {kind: timed(tasks, light, variant, options) for kind, tasks in kinds.items()}
     noise = measured_noise([t for tasks in kinds.values() for t in tasks[::2]], light, options.resolution)
     heads = ("objects an hour and core", *(f"{phase}, %" for phase in (*PHASES, "other")))
-    rows = tuple(
-        (
-            kind,
-            (
-                number(3600 / sum(row.values()), 0),
-                *(number(s / sum(row.values()), 1, factor=100) for s in row.values()),
-            ),
-        )
-        for kind, row in seconds.items()
-    )
+    rows = tuple((kind, speeds(row)) for kind, row in seconds.items())
     tables = [Table(title=f"Speed, 10 views of {options.resolution} px, {options.spp} samples", heads=heads, rows=rows)]
     rows = tuple((f"{samples} samples", (number(a, 1), number(b, 1))) for samples, (a, b) in noise.items())
     tables.append(Table(title="Noise", heads=("median, dB", "10th percentile, dB"), rows=rows))
     facts = {"hardware": machine.hardware(), "variant": variant, "seconds": seconds, "noise": noise}
     results.write(options.out, facts, tables, [f"{variant}, {facts['hardware']}"])
+
+
+def speeds(seconds: dict[str, float]) -> tuple:
+    """Objects an hour, and the share of each phase."""
+    whole = sum(seconds.values())
+    return (number(3600 / whole, 0), *(number(s / whole, 1, factor=100) for s in seconds.values()))
 
 
 def timed(tasks: list[Task], light: np.ndarray, variant: str, options: DataGeneration) -> dict[str, float]:
@@ -93,13 +89,11 @@ def timed(tasks: list[Task], light: np.ndarray, variant: str, options: DataGener
         start = time.perf_counter()
         made = sum(profiler.runcall(make_and_write, bench, task) is None for task in tasks)
         whole = time.perf_counter() - start
-    if not made:
-        raise ValueError("every object was left out; give other --meshes")
     calls: dict[str, float] = {}
     for (_, _, name), (*_, cumulative, _) in pstats.Stats(profiler).stats.items():  # type: ignore[attr-defined]
         calls[name] = calls.get(name, 0.0) + cumulative
-    found = {phase: sum(calls.get(name, 0.0) for name in names) / made for phase, names in PHASES.items()}
-    return found | {"other": max(whole / made - sum(found.values()), 0.0)}
+    found = {phase: sum(calls.get(name, 0.0) for name in names) / max(made, 1) for phase, names in PHASES.items()}
+    return found | {"other": max(whole / max(made, 1) - sum(found.values()), 0.0)}
 
 
 def measured_noise(tasks: list[Task], light: np.ndarray, resolution: int) -> dict[int, tuple[float, float]]:
@@ -118,8 +112,8 @@ def measured_noise(tasks: list[Task], light: np.ndarray, resolution: int) -> dic
 def picture(scene, pose: np.ndarray, config: views.ViewConfig, samples: int, first_seed: int) -> np.ndarray:
     """A picture (height, width, 3) of so many samples per pixel, as a data set would hold it."""
     rounds = max(1, samples // AT_ONCE)
-    config = replace(config, spp=samples // rounds)
-    found = [views.render_view(scene, pose, config, first_seed + number) for number in range(rounds)]
+    few = replace(config, spp=samples // rounds)
+    found = [views.render_view(scene, pose, few, first_seed + i) for i in range(rounds)]
     return views.on_white(views.straight_srgb(np.mean(found, axis=0)))
 
 

@@ -30,6 +30,7 @@ from spnr_jax import cli
 from spnr_jax.config import TrainConfig
 from spnr_jax.devices import machine
 from spnr_jax.kernels import cameras
+from spnr_jax.kernels.records import Batch
 from spnr_jax.model_config import ModelConfig
 
 

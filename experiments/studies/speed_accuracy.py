@@ -38,6 +38,8 @@ from spnr_jax import cli
 from spnr_jax.config import TrainConfig
 from spnr_jax.devices import machine
 from spnr_jax.formats import data_sets
+from spnr_jax.kernels.supersampling import rays_per_side
+from spnr_jax.method import inference
 from spnr_jax.model_config import ModelConfig, SamplingConfig
 from spnr_jax.scoring import evaluation
 from spnr_jax.training import checkpoint, optimisation

@@ -69,7 +69,7 @@ def train(
     mesh: Mesh | None = None,
     init: Trained | None = None,
     on_event: OnEvent | None = None,
-) -> training.TrainState:
+) -> optimisation.TrainState:
     """The state after the config's last step; goes on where an earlier call left the run folder.
 
     A new run begins with random weights, or with those of `init`.  On a mesh of devices (`placement.device_mesh`)
@@ -79,8 +79,8 @@ def train(
     own = None if mesh is None else placement.own_objects(mesh, config.batch_objects)
     with ExitStack() as stack:
         try:
-            distributed.first_alone(lambda: stack.enter_context(checkpoint.alone(run)))
-            distributed.first_alone(lambda: checkpoint.write_config(run, config))
+            placement.first_alone(lambda: stack.enter_context(checkpoint.alone(run)))
+            placement.first_alone(lambda: checkpoint.write_config(run, config))
             return _train(config, dataset, run, schedule, mesh, own, init, on_event or (lambda *event: None))
         except OSError as error:
             error.filename = error.filename or str(run)  # writing to a full disk does not say where
@@ -98,8 +98,8 @@ def _train(
     own: range | None,
     init: Trained | None,
     tell: OnEvent,
-) -> training.TrainState:
-    clock, leads = Clock(), distributed.leads()
+) -> optimisation.TrainState:
+    clock, leads = Clock(), placement.leads()
     say: Callable[[str], object] = tqdm.write if leads else lambda line: None
     with placement.using(mesh):
         sharding = None if mesh is None else placement.replicated(mesh)
@@ -123,8 +123,8 @@ def _train(
         clock.lap("restore")
         for step, batch in enumerate(batches, start=first):
             tell("step", step, batch)
-            with distributed.using(mesh):
-                state, metrics = training.jitted_train_step(
+            with placement.using(mesh):
+                state, metrics = optimisation.jitted_train_step(
                     state,
                     placement.placed(batch, mesh, config.batch_objects),
                     config=config,

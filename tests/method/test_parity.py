@@ -11,6 +11,7 @@ from support import twin
 
 from experiments.speed import twin_layout
 from spnr_jax.kernels import cameras, compositing, losses, sampling, voxels
+from spnr_jax.method.renderer import Renderer
 from spnr_jax.nn.encoding import encode_direction
 from spnr_jax.training import optimisation
 

@@ -29,7 +29,7 @@ from support import tiny_dataset, tiny_model
 from spnr_jax.config import LossConfig
 from spnr_jax.devices import placement
 from spnr_jax.devices.placement import DEPTH, OBJECTS
-from spnr_jax.method import renderer
+from spnr_jax.method import inference, renderer
 from spnr_jax.method.renderer import Renderer
 from spnr_jax.model_config import SamplingConfig
 from spnr_jax.training import batching, optimisation

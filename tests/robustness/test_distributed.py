@@ -19,6 +19,7 @@ from support.laws import same_bits
 from support.tiny_dataset import CONFIG
 
 from spnr_jax.devices import launch, placement
+from spnr_jax.training import batching
 
 # the discriminator and R1 take part from the first step
 FLAGS = f"{NETWORK} --adversarial-start 0 --batch-objects 4 --num-steps 4 --checkpoint-every 2".split()
