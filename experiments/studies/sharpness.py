@@ -17,6 +17,7 @@ from time import perf_counter
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
@@ -150,7 +151,7 @@ def _draw(
 def _smaller(reference: np.ndarray, side: int) -> np.ndarray:
     """The mean of squares of pixels, colours weighted by their opacity."""
     weighted = np.concatenate([reference[..., :3] * reference[..., 3:], reference[..., 3:]], axis=-1)
-    weighted = np.asarray(mean_of_squares(weighted, side))
+    weighted = np.asarray(mean_of_squares(jnp.asarray(weighted), side))
     return np.concatenate([weighted[..., :3] / np.maximum(weighted[..., 3:], 1e-4), weighted[..., 3:]], axis=-1)
 
 

@@ -108,6 +108,7 @@ class Model:
         """Views by the network over surfels."""
         if quality not in (*SAMPLES, "trained"):
             raise ValueError(f"quality must be one of {', '.join(SAMPLES)}, trained, got {quality}")
+        assert isinstance(self.config, SurfelConfig)
         variables = None if quality == "draft" else self.variables
         inside = _in_box(camera, volume.centre, volume.scale)
         draw = surfel_renderer.render if inside.cam_to_world.ndim == 2 else surfel_renderer.render_views
