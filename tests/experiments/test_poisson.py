@@ -1,4 +1,4 @@
-"""Poisson surfaces beside the networks: in the light of the data set, or empty, with the reason, where there is none."""
+"""Poisson surfaces beside the networks: in the light of the data set, or empty with the reason where there is none."""
 
 import importlib.util
 import json
