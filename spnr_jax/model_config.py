@@ -376,10 +376,11 @@ class SurfelConfig:
         require(self.top >= 1, f"top must be at least 1, got {self.top}")
 
 
-NetworkConfig = ModelConfig | NPBGConfig | PointNeRFConfig | Points2NeRFConfig
+NetworkConfig = ModelConfig | NPBGConfig | PointNeRFConfig | Points2NeRFConfig | SurfelConfig
 METHODS: dict[str, type[NetworkConfig]] = {
     "ours": ModelConfig,
     "npbg": NPBGConfig,
     "point_nerf": PointNeRFConfig,
     "points2nerf": Points2NeRFConfig,
+    "surfels": SurfelConfig,
 }

@@ -13,9 +13,10 @@ import jax.numpy as jnp
 
 from spnr_jax.devices.placement import by_all_devices, on_own_rays
 from spnr_jax.kernels import cameras, supersampling
-from spnr_jax.kernels.records import Camera, PointCloud, Rendering
+from spnr_jax.kernels.records import Camera, Key, PointCloud, Rendering
+from spnr_jax.method import surfel_renderer
 from spnr_jax.method.renderer import Renderer
-from spnr_jax.model_config import ModelConfig, NetworkConfig
+from spnr_jax.model_config import ModelConfig, NetworkConfig, SurfelConfig
 
 
 def network(config: NetworkConfig) -> nn.Module:
@@ -25,6 +26,13 @@ def network(config: NetworkConfig) -> nn.Module:
     from spnr_jax.baselines.networks import NETWORKS  # here: our own network is drawn without them
 
     return NETWORKS[type(config)](config)
+
+
+def init(key: Key, config: NetworkConfig) -> dict:
+    """Fresh variables of a config's network."""
+    if isinstance(config, SurfelConfig):
+        return surfel_renderer.init(key, config)
+    return network(config).init(key, *example_inputs(config))
 
 
 def example_inputs(config: NetworkConfig) -> tuple[PointCloud, Camera]:

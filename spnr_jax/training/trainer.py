@@ -29,8 +29,9 @@ from spnr_jax.devices import allocator, placement
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.images import png, to_uint8, write_whole
 from spnr_jax.kernels.metrics import psnr
-from spnr_jax.method import inference
-from spnr_jax.training import batching, checkpoint, optimisation
+from spnr_jax.kernels.records import Camera, Light, PointCloud, Rendering
+from spnr_jax.model_config import SurfelConfig
+from spnr_jax.training import checkpoint, optimisation, work
 from spnr_jax.training.run_record import Clock, RunRecord
 from spnr_jax.training.weights import Trained
 
@@ -63,11 +64,13 @@ def train(
     schedule: Schedule,
     mesh: Mesh | None = None,
     init: Trained | None = None,
+    light: Light | None = None,
 ) -> optimisation.TrainState:
     """The state after the config's last step; goes on where an earlier call left the run folder.
 
-    A new run begins with random weights, or with those of `init`.  On a mesh of devices (`placement.device_mesh`)
-    each of its processes calls this.
+    A new run begins with random weights, or with those of `init`.  `light` is that of the data set's pictures, which
+    networks over G-buffers see; it need not be given for the room of `spnr-data generate`.  On a mesh of devices
+    (`placement.device_mesh`) each of its processes calls this.
     """
     allocator.few_arenas()
     own = None if mesh is None else placement.own_objects(mesh, config.batch_objects)
@@ -75,7 +78,7 @@ def train(
         try:
             placement.first_alone(lambda: stack.enter_context(checkpoint.alone(run)))
             placement.first_alone(lambda: checkpoint.write_config(run, config))
-            return _train(config, dataset, run, schedule, mesh, own, init)
+            return _train(config, dataset, run, schedule, mesh, own, init, light)
         except OSError as error:
             error.filename = error.filename or str(run)  # writing to a full disk does not say where
             raise
@@ -91,6 +94,7 @@ def _train(
     mesh: Mesh | None,
     own: range | None,
     init: Trained | None,
+    light: Light | None,
 ) -> optimisation.TrainState:
     clock, leads = Clock(), placement.leads()
     say: Callable[[str], object] = tqdm.write if leads else lambda line: None
@@ -103,25 +107,23 @@ def _train(
         return state
     if first:
         say(f"resuming {run} at step {first} of {config.num_steps}")
-    adversarial_from = optimisation.first_adversarial_step(config)
+    task = (
+        work.of_gbuffers(config, dataset, run, light)
+        if isinstance(config.model, SurfelConfig)
+        else work.of_views(config, dataset, mesh, own)
+    )
     agreed = placement.Agreement(mesh)
     pending: list[tuple[int, dict]] = []
     with (
         stop_requests() as requests,
         closing(MetricsLog(run, first) if leads else Unwritten()) as log,
-        closing(batching.batches(dataset, config, first, own=own)) as batches,
+        closing(task.batches(first)) as batches,
         tqdm(total=config.num_steps, initial=first, unit="step", mininterval=1, disable=not leads) as bar,
     ):
         record = RunRecord(run, dataset, first, init) if leads else Unwritten()
         clock.lap("restore")
         for step, batch in enumerate(batches, start=first):
-            with placement.using(mesh):
-                state, metrics = optimisation.jitted_train_step(
-                    state,
-                    placement.placed(batch, mesh, config.batch_objects),
-                    config=config,
-                    adversarial=step >= adversarial_from,
-                )
+            state, metrics = task.step(state, batch, step)
             pending.append((step + 1, metrics))
             bar.update()
             if step == first:
@@ -139,10 +141,12 @@ def _train(
                 bar.set_postfix(loss=f"{rows[-1][1]['loss']:.2f}", psnr=f"{rows[-1][1]['psnr']:.1f}", refresh=False)
                 pending = []
             if leads and (last or (step + 1) % schedule.preview_every == 0):
-                scores, picture = preview(state, config, dataset, run)
+                scores, picture = preview(state, config, dataset, run, task.render_views)
                 log.write({"step": step + 1, **scores}, picture)
                 allocator.give_back()
                 clock.lap("previews")
+            if last:
+                task.finish(state)
             if save:  # after the rows up to this step, which a run that goes on from here will not write again
                 checkpoint.save(run, state)
                 clock.lap("checkpoints")
@@ -258,7 +262,12 @@ def read_rows(run: Path) -> list[dict]:
 
 
 def preview(
-    state: optimisation.TrainState, config: TrainConfig, dataset: data_sets.Dataset, run: Path, num_objects: int = 6
+    state: optimisation.TrainState,
+    config: TrainConfig,
+    dataset: data_sets.Dataset,
+    run: Path,
+    render_views: Callable[[dict, PointCloud, Camera], Rendering],
+    num_objects: int = 6,
 ) -> tuple[dict[str, float], np.ndarray]:
     """Validation PSNR of the averaged network on a few objects, and references over renderings, kept in previews/."""
     names = (dataset.splits["val"] or dataset.splits["train"])[:num_objects]
@@ -267,7 +276,7 @@ def preview(
     for name in names:
         item = data_sets.read_object(dataset, name)
         cloud = data_sets.test_cloud(item, config)
-        rendering = inference.render_views(variables, config.model, cloud, item.camera)
+        rendering = render_views(variables, cloud, item.camera)
         image, reference = np.clip(np.asarray(rendering.image), 0, 1), data_sets.on_white(item.images)
         scores.append(np.asarray(psnr(jnp.asarray(image), jnp.asarray(reference))))
         columns.append(np.concatenate([reference[0], image[0]]))
