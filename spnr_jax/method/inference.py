@@ -13,10 +13,11 @@ import jax.numpy as jnp
 
 from spnr_jax.devices.placement import by_all_devices, on_own_rays
 from spnr_jax.kernels import cameras, supersampling
-from spnr_jax.kernels.records import Camera, Key, PointCloud, Rendering
+from spnr_jax.kernels.records import Camera, Key, Light, PointCloud, Rendering
 from spnr_jax.method import surfel_renderer
 from spnr_jax.method.renderer import Renderer
 from spnr_jax.model_config import ModelConfig, NetworkConfig, SurfelConfig
+from spnr_jax.surfels.lighting import room_light
 
 
 def network(config: NetworkConfig) -> nn.Module:
@@ -99,8 +100,16 @@ jitted_encode = jax.jit(encode, static_argnames="config")
 jitted_render = jax.jit(render, static_argnames=("config", "ray_chunk", "rays_per_side"))
 
 
-def render_views(variables: dict, config: NetworkConfig, cloud: PointCloud, camera: Camera) -> Rendering:
-    """All views of one object (clouds of data sets are normalised already), rays divided among the devices."""
+def render_views(
+    variables: dict, config: NetworkConfig, cloud: PointCloud, camera: Camera, light: Light | None = None
+) -> Rendering:
+    """All views of one object (clouds of data sets are normalised already), rays divided among the devices.
+
+    The light is for a network that sees it; None is the package's room.
+    """
+    if isinstance(config, SurfelConfig):
+        scene = surfel_renderer.encode(cloud)
+        return surfel_renderer.render_views(variables, scene, camera, light or room_light(), config=config)
     cloud, camera = jax.tree.map(lambda x: jnp.asarray(x)[None], (cloud, camera))
     volume = jitted_encode(variables, cloud, config=config)
     side = supersampling.rays_per_side(config, camera.width)

@@ -21,9 +21,10 @@ from scipy.spatial import cKDTree
 
 from spnr_jax.devices.placement import by_all_devices, everywhere
 from spnr_jax.kernels import cameras, cloud_arrays, supersampling
-from spnr_jax.kernels.records import Camera, PointCloud, Rendering
-from spnr_jax.method import inference
-from spnr_jax.model_config import ModelConfig, NetworkConfig, SamplingConfig
+from spnr_jax.kernels.records import Camera, Light, PointCloud, Rendering
+from spnr_jax.method import inference, surfel_renderer
+from spnr_jax.model_config import ModelConfig, NetworkConfig, SamplingConfig, SurfelConfig
+from spnr_jax.surfels import lighting
 
 FIELD_OF_VIEW, DISTANCE = np.deg2rad(40.0), 3.0  # of the training cameras; the object fits into the unit sphere
 Quality = Literal["draft", "balanced", "best", "trained"]
@@ -58,13 +59,17 @@ class Model:
         mask = np.asarray(cloud.mask)
         if not mask.any():
             raise ValueError("the cloud has no points; give at least one")
-        for field in dataclasses.fields(cloud):
-            if not np.isfinite(np.asarray(getattr(cloud, field.name))[mask]).all():
-                raise ValueError(f"the cloud has NaN or infinity in its {field.name}; remove those points")
+        for name, values in vars(cloud).items():
+            if values is not None and not np.isfinite(np.asarray(values)[mask]).all():
+                raise ValueError(f"the cloud has NaN or infinity in its {name}; remove those points")
         centre, scale = cloud_arrays.normalization(positions[mask])
         # the ends of a thin stick lie on the faces of the box: rounding must not push them out of it
         inside = np.clip((positions - centre) * scale, -1, 1).astype(np.float32)
         cloud = dataclasses.replace(cloud, positions=inside)
+        if isinstance(self.config, SurfelConfig):
+            scene = surfel_renderer.encode(cloud)
+            return Volume(scene=scene, centre=jnp.asarray(centre), scale=jnp.asarray(scale))
+        cloud = dataclasses.replace(cloud, normals=None)
         cloud = cloud_arrays.pad(cloud, cloud_arrays.bucket(len(positions)))
         scene = _encode(self.variables, cloud, config=self.config)
         volume = Volume(scene=scene, centre=jnp.asarray(centre), scale=jnp.asarray(scale))
@@ -72,14 +77,23 @@ class Model:
             return volume
         return dataclasses.replace(volume, reach=reach_of(inside[mask], self.config.volume_resolution))
 
-    def render(self, volume: Volume, camera: Camera, quality: Quality = "best") -> Rendering:
+    def render(
+        self, volume: Volume, camera: Camera, quality: Quality = "best", light: Light | None = None
+    ) -> Rendering:
         """The object as the camera (unbatched, or with one axis of views) sees it; depth in the cloud's units.
+
+        The network over surfels takes a light (default: the package's room), and leaves its CNN out of `draft`; the
+        networks of rays know the light that they were trained in alone, and have these levels:
 
         `draft`, `balanced` and `best` look near the points alone, with a quarter, half and all of the samples of a ray,
         and `best` has several rays a pixel where pictures are smaller than those of the training (`supersampling.py`);
         the network's refiner, if it has one, is left out of `draft`, and of smaller pictures by any other than `best`;
         `trained` renders as the network was trained.  Other networks than ours know one number of samples.
         """
+        if isinstance(self.config, SurfelConfig):
+            return self._shaded(volume, camera, quality, lighting.room_light() if light is None else light)
+        if light is not None:
+            raise ValueError("this network knows the light of its training alone; give no light")
         if self.config.upsamples and (camera.height % 2 or camera.width % 2):
             raise ValueError(f"this network doubles its pictures: {camera.width} x {camera.height} pixels must be even")
         config = at_quality(self.config, quality, volume.reach)
@@ -89,6 +103,17 @@ class Model:
             config = without_refiner(config)
         render = partial(_render, config=config, side=side)
         return by_all_devices(render, self._spread, volume.scene, volume.centre, volume.scale, camera)
+
+    def _shaded(self, volume: Volume, camera: Camera, quality: Quality, light: Light) -> Rendering:
+        """Views by the network over surfels."""
+        if quality not in (*SAMPLES, "trained"):
+            raise ValueError(f"quality must be one of {', '.join(SAMPLES)}, trained, got {quality}")
+        assert isinstance(self.config, SurfelConfig)
+        variables = None if quality == "draft" else self.variables
+        inside = _in_box(camera, volume.centre, volume.scale)
+        draw = surfel_renderer.render if inside.cam_to_world.ndim == 2 else surfel_renderer.render_views
+        drawn = draw(variables, volume.scene, inside, light, config=self.config)
+        return dataclasses.replace(drawn, depth=drawn.depth / np.asarray(volume.scale))
 
     @cached_property
     def _spread(self) -> dict:
@@ -120,15 +145,19 @@ def _render(
 ) -> Rendering:
     """`Model.render` with the config and the rays per side of a pixel of a quality."""
     single = camera.cam_to_world.ndim == 2
-    rotation, eye = camera.cam_to_world[..., :3], camera.cam_to_world[..., 3]
-    eye = (eye - jnp.broadcast_to(centre, eye.shape)) * scale
-    pose = jnp.concatenate([rotation, eye[..., None]], axis=-1)
-    inside = dataclasses.replace(camera, cam_to_world=pose)
-    inside = jax.tree.map(lambda x: x.reshape(1, -1, *x.shape[-2:]), inside)
+    inside = jax.tree.map(lambda x: x.reshape(1, -1, *x.shape[-2:]), _in_box(camera, centre, scale))
     scene = jax.tree.map(lambda x: x[None], scene)
     rendering = inference.render(variables, scene, inside, config=config, rays_per_side=side)
     rendering = dataclasses.replace(rendering, depth=rendering.depth / scale)
     return jax.tree.map(lambda x: x[0, 0] if single else x[0], rendering)
+
+
+@jax.jit
+def _in_box(camera: Camera, centre, scale) -> Camera:
+    """The camera in the coordinates of the box."""
+    rotation, eye = camera.cam_to_world[..., :3], camera.cam_to_world[..., 3]
+    eye = (eye - jnp.broadcast_to(centre, eye.shape)) * scale
+    return dataclasses.replace(camera, cam_to_world=jnp.concatenate([rotation, eye[..., None]], axis=-1))
 
 
 @partial(jax.jit, static_argnames="size")

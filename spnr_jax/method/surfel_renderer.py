@@ -22,7 +22,7 @@ from spnr_jax.kernels.compositing import WHITE
 from spnr_jax.kernels.records import Camera, Key, Light, PointCloud, Rendering, Surfels
 from spnr_jax.kernels.resizing import mean_of_squares
 from spnr_jax.model_config import SurfelConfig
-from spnr_jax.nn.shader import Shader, doubled, picture
+from spnr_jax.nn.shader import NUM_OUTPUTS, Shader, doubled, picture
 from spnr_jax.surfels import features, lighting, splatting
 from spnr_jax.surfels.estimate import estimate
 
@@ -67,8 +67,10 @@ def encode(cloud: PointCloud) -> SurfelScene:
     return SurfelScene(surfels=jax.device_put(surfels), spacing=float(np.median(surfels.spacing[surfels.mask])))
 
 
-def render(variables: dict, scene: SurfelScene, camera: Camera, light: Light, *, config: SurfelConfig) -> Rendering:
-    """One view (camera unbatched, in the box) of an encoded object."""
+def render(
+    variables: dict | None, scene: SurfelScene, camera: Camera, light: Light, *, config: SurfelConfig
+) -> Rendering:
+    """One view (camera unbatched, in the box) of an encoded object; without variables discs and light alone."""
     doublings, side = resolution_of(scene.spacing, camera)
     small = cameras.resize(camera, *(-(-n * side // 2**doublings) for n in (camera.height, camera.width)))
     box, total = jax.device_get(_extent(scene.surfels, small))
@@ -81,6 +83,15 @@ def render(variables: dict, scene: SurfelScene, camera: Camera, light: Light, *,
     slots = min(_rounded(int(slots), 2**11, most), most)
     drawn = _shade(variables, found, scene.surfels, light, inside, config=config, doublings=doublings, slots=slots)
     return _placed(drawn, camera, plan)
+
+
+def render_views(
+    variables: dict | None, scene: SurfelScene, cameras: Camera, light: Light, *, config: SurfelConfig
+) -> Rendering:
+    """Views one after the other (one axis of cameras): the sizes of each are counted before it is drawn."""
+    views = [jax.tree.map(lambda x, i=i: x[i], cameras) for i in range(len(cameras.cam_to_world))]
+    drawn = [render(variables, scene, view, light, config=config) for view in views]
+    return jax.tree.map(lambda *x: np.stack(x), *drawn)
 
 
 def resolution_of(spacing: float, camera: Camera) -> tuple[int, int]:
@@ -144,7 +155,7 @@ def look(
 
 @partial(jax.jit, static_argnames=("config", "doublings", "slots"))
 def _shade(
-    variables: dict,
+    variables: dict | None,
     found: splatting.Entries,
     surfels: Surfels,
     light: Light,
@@ -157,7 +168,10 @@ def _shade(
     """Colour, opacity and depth along the camera's axis, of the window at the network's resolution."""
     seen, maps, ambient, depth = look(found, surfels, light, camera, slots=slots)
     seen, maps = jax.lax.optimization_barrier((seen, maps))
-    outputs = Shader(config.widths, config.top).apply(variables, seen[None], doublings)
+    if variables is None:
+        outputs = jnp.zeros((1, *(n << doublings for n in seen.shape[:2]), NUM_OUTPUTS))
+    else:
+        outputs = Shader(config.widths, config.top).apply(variables, seen[None], doublings)
     color, alpha = picture(outputs, maps[None], ambient[None], doublings)
     depth = depth[None, ..., None]
     for _ in range(doublings):

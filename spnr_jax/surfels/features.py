@@ -18,6 +18,7 @@ NUM_FEATURES, NUM_MAPS = 27, 17
 ODD = (14, 17), (15, 18)  # features that change their sign when the picture is mirrored along x, or along y
 FAINT = 0.02  # opacity from which on a pixel's numbers begin to count
 WINDOWS = 2, 6  # pixels to each side over which the depth is compared
+EDGE = 1.2  # coverage at the outline: discs reach beyond the surface, half of their weight
 TRUST = 0.25  # most that a colour to first order leaves the blended one
 
 
@@ -68,7 +69,8 @@ def features(
     drawn = (buffer.opacity / (buffer.opacity + FAINT))[..., None]
     seen = jnp.concatenate([drawn * jnp.concatenate([jnp.stack(told, axis=-1), *vectors], axis=-1), drawn], axis=-1)
     unshadowed = lighting.irradiance(light, turned[0]), lighting.mirrored(light, turned[1], roughness)
-    maps = [*jnp.moveaxis(color, -1, 0), metallic, buffer.opacity, factor, summand, *arriving]
+    solid = buffer.opacity * -jnp.expm1(-((buffer.coverage / EDGE) ** 2))
+    maps = [*jnp.moveaxis(color, -1, 0), metallic, solid, factor, summand, *arriving]
     return seen, jnp.stack([*maps, *unshadowed[0], *unshadowed[1], reflected], axis=-1)
 
 

@@ -28,7 +28,7 @@ ODD = (3, 4, 7), (1, 4, 5)  # of them, those that change their sign when the lig
 @cache
 def _lobes() -> Float[np.ndarray, "tables texels texels"]:
     """Weights of the texels in each entry of the tables, those of a lobe adding up to 1."""
-    towards, area = directions(HEIGHT).reshape(-1, 3), solid_angles(HEIGHT).reshape(-1)
+    towards, area = directions(HEIGHT).reshape(-1, 3).astype(np.float32), solid_angles(HEIGHT).reshape(-1)
     cosine = np.maximum(towards @ towards.T, -1)
     lobes = [np.maximum(cosine, 0)]
     half = np.clip((1 + cosine) / 2, 0, 1)
@@ -36,7 +36,7 @@ def _lobes() -> Float[np.ndarray, "tables texels texels"]:
         squared = roughness**4
         lobes.append(squared / (half * (squared - 1) + 1) ** 2 * np.maximum(cosine, 0))
     weights = np.stack(lobes) * area
-    return (weights / weights.sum(axis=-1, keepdims=True)).astype(np.float32)
+    return weights / weights.sum(axis=-1, keepdims=True)
 
 
 def light_of(envmap: Float[np.ndarray, "height width 3"]) -> Light:

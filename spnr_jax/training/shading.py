@@ -1,4 +1,4 @@
-"""Training of the shader network on crops of G-buffers: loss, step, and pictures of what it has learnt.
+"""Training of the shader network on crops of G-buffers: loss and step.
 
 The state, its checkpoints, and the loop are those of the other networks (`optimisation.TrainState`, `trainer.py`).
 """
@@ -14,8 +14,7 @@ from jaxtyping import Array, Float
 from spnr_jax.config import TrainConfig
 from spnr_jax.kernels import losses
 from spnr_jax.kernels.metrics import psnr
-from spnr_jax.kernels.records import Camera, Crops, Light, PointCloud, Rendering
-from spnr_jax.method import surfel_renderer
+from spnr_jax.kernels.records import Crops
 from spnr_jax.model_config import SurfelConfig
 from spnr_jax.nn.shader import Shader, picture
 from spnr_jax.training import optimisation
@@ -64,13 +63,3 @@ def train_step(state: TrainState, crops: Crops, *, config: TrainConfig) -> tuple
 
 
 jitted_train_step = jax.jit(train_step, static_argnames="config", donate_argnames="state")
-
-
-def render_views(
-    variables: dict, cloud: PointCloud, camera: Camera, *, config: SurfelConfig, light: Light
-) -> Rendering:
-    """All views of one object (clouds of data sets are normalised already)."""
-    scene = surfel_renderer.encode(cloud)
-    views = [jax.tree.map(lambda x, i=i: x[i], camera) for i in range(len(camera.cam_to_world))]
-    drawn = [surfel_renderer.render(variables, scene, view, light, config=config) for view in views]
-    return jax.tree.map(lambda *images: jnp.stack(images), *drawn)

@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -29,7 +30,8 @@ from spnr_jax.devices import allocator, placement
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.images import png, to_uint8, write_whole
 from spnr_jax.kernels.metrics import psnr
-from spnr_jax.kernels.records import Camera, Light, PointCloud, Rendering
+from spnr_jax.kernels.records import Light
+from spnr_jax.method import inference
 from spnr_jax.model_config import SurfelConfig
 from spnr_jax.training import checkpoint, optimisation, work
 from spnr_jax.training.run_record import Clock, RunRecord
@@ -53,6 +55,10 @@ class Schedule:
                 raise ValueError(f"{name} must be at least 1 step, got {steps}")
 
 
+Phase = Literal["step", "row", "preview", "checkpoint", "end"]
+OnEvent = Callable[[Phase, int, object], object]  # phase that begins, steps done so far, its batch or row, else None
+
+
 class NotFinite(ValueError):
     """A loss is NaN or infinite; the message names step and quantity."""
 
@@ -64,13 +70,14 @@ def train(
     schedule: Schedule,
     mesh: Mesh | None = None,
     init: Trained | None = None,
+    on_event: OnEvent | None = None,
     light: Light | None = None,
 ) -> optimisation.TrainState:
     """The state after the config's last step; goes on where an earlier call left the run folder.
 
-    A new run begins with random weights, or with those of `init`.  `light` is that of the data set's pictures, which
-    networks over G-buffers see; it need not be given for the room of `spnr-data generate`.  On a mesh of devices
-    (`placement.device_mesh`) each of its processes calls this.
+    A new run begins with random weights, or with those of `init`.  On a mesh of devices (`placement.device_mesh`)
+    each of its processes calls this.  `on_event` is told what the loop is about to do; what was told before is done.
+    `light` is that of the data set's pictures, if the network sees the light and it is another than the room.
     """
     allocator.few_arenas()
     own = None if mesh is None else placement.own_objects(mesh, config.batch_objects)
@@ -78,7 +85,8 @@ def train(
         try:
             placement.first_alone(lambda: stack.enter_context(checkpoint.alone(run)))
             placement.first_alone(lambda: checkpoint.write_config(run, config))
-            return _train(config, dataset, run, schedule, mesh, own, init, light)
+            tell = on_event or (lambda *event: None)
+            return _train(config, dataset, run, schedule, mesh, own, init, tell, light)
         except OSError as error:
             error.filename = error.filename or str(run)  # writing to a full disk does not say where
             raise
@@ -94,6 +102,7 @@ def _train(
     mesh: Mesh | None,
     own: range | None,
     init: Trained | None,
+    tell: OnEvent,
     light: Light | None,
 ) -> optimisation.TrainState:
     clock, leads = Clock(), placement.leads()
@@ -107,11 +116,11 @@ def _train(
         return state
     if first:
         say(f"resuming {run} at step {first} of {config.num_steps}")
-    task = (
-        work.of_gbuffers(config, dataset, run, light)
-        if isinstance(config.model, SurfelConfig)
-        else work.of_views(config, dataset, mesh, own)
-    )
+    if isinstance(config.model, SurfelConfig):
+        light = light or work.light_of(dataset)
+        task = work.of_gbuffers(config, dataset, run, light)
+    else:
+        task = work.of_views(config, dataset, mesh, own)
     agreed = placement.Agreement(mesh)
     pending: list[tuple[int, dict]] = []
     with (
@@ -123,6 +132,7 @@ def _train(
         record = RunRecord(run, dataset, first, init) if leads else Unwritten()
         clock.lap("restore")
         for step, batch in enumerate(batches, start=first):
+            tell("step", step, batch)
             state, metrics = task.step(state, batch, step)
             pending.append((step + 1, metrics))
             bar.update()
@@ -137,20 +147,26 @@ def _train(
                     check_state(state)
                 seconds, timed = clock.lap("steps"), [at for at, _ in rows if at > first + 1]
                 pace = 1000 * (seconds / len(timed) if timed else clock.seconds["compilation"])
-                log.write({"step": step + 1, **mean_row(rows), "ms_per_step": round(pace, 2)})
+                row = {"step": step + 1, **mean_row(rows), "ms_per_step": round(pace, 2)}
+                tell("row", step + 1, row)
+                log.write(row)
                 bar.set_postfix(loss=f"{rows[-1][1]['loss']:.2f}", psnr=f"{rows[-1][1]['psnr']:.1f}", refresh=False)
                 pending = []
             if leads and (last or (step + 1) % schedule.preview_every == 0):
-                scores, picture = preview(state, config, dataset, run, task.render_views)
+                tell("preview", step + 1, None)
+                scores, picture = preview(state, config, dataset, run, light)
                 log.write({"step": step + 1, **scores}, picture)
                 allocator.give_back()
                 clock.lap("previews")
             if last:
                 task.finish(state)
             if save:  # after the rows up to this step, which a run that goes on from here will not write again
+                tell("checkpoint", step + 1, None)
                 checkpoint.save(run, state)
                 clock.lap("checkpoints")
                 record.write(step + 1, clock)
+            if last or stopping:
+                tell("end", step + 1, None)
             if stopping and not last:
                 raise KeyboardInterrupt(
                     f"stopped at step {step + 1} of {config.num_steps}; the same command goes on from there"
@@ -266,7 +282,7 @@ def preview(
     config: TrainConfig,
     dataset: data_sets.Dataset,
     run: Path,
-    render_views: Callable[[dict, PointCloud, Camera], Rendering],
+    light: Light | None = None,
     num_objects: int = 6,
 ) -> tuple[dict[str, float], np.ndarray]:
     """Validation PSNR of the averaged network on a few objects, and references over renderings, kept in previews/."""
@@ -276,7 +292,7 @@ def preview(
     for name in names:
         item = data_sets.read_object(dataset, name)
         cloud = data_sets.test_cloud(item, config)
-        rendering = render_views(variables, cloud, item.camera)
+        rendering = inference.render_views(variables, config.model, cloud, item.camera, light)
         image, reference = np.clip(np.asarray(rendering.image), 0, 1), data_sets.on_white(item.images)
         scores.append(np.asarray(psnr(jnp.asarray(image), jnp.asarray(reference))))
         columns.append(np.concatenate([reference[0], image[0]]))

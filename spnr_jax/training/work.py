@@ -1,4 +1,4 @@
-"""What the training loop need not know of a network: its batches, its step, how its pictures are drawn.
+"""What the training loop need not know of a network: its batches and its step.
 
 There are two kinds: networks that learn from whole views of clouds (`of_views`: the paper's, ours near points, the
 baselines), and the shader network, which learns from crops of G-buffers (`of_gbuffers`).
@@ -15,9 +15,7 @@ from jax.sharding import Mesh
 from spnr_jax.config import TrainConfig
 from spnr_jax.devices import placement
 from spnr_jax.formats.data_sets import Dataset
-from spnr_jax.kernels.records import Camera, Crops, Light, PointCloud, Rendering
-from spnr_jax.method import inference
-from spnr_jax.model_config import SurfelConfig
+from spnr_jax.kernels.records import Crops, Light
 from spnr_jax.surfels import lighting
 from spnr_jax.training import batching, gbuffers, optimisation, shading
 from spnr_jax.training.optimisation import TrainState
@@ -31,7 +29,6 @@ class Work(NamedTuple):
 
     batches: Callable[[int], Generator[Any, None, None]]  # from a step on
     step: Callable[[TrainState, Any, int], tuple[TrainState, dict]]  # with the step's number
-    render_views: Callable[[dict, PointCloud, Camera], Rendering]
     finish: Callable[[TrainState], object] = lambda state: None  # called with the last state
 
 
@@ -45,21 +42,16 @@ def of_views(config: TrainConfig, dataset: Dataset, mesh: Mesh | None, own: rang
             adversarial = number >= adversarial_from
             return optimisation.jitted_train_step(state, batch, config=config, adversarial=adversarial)
 
-    def render_views(variables: dict, cloud: PointCloud, camera: Camera) -> Rendering:
-        return inference.render_views(variables, config.model, cloud, camera)
-
-    return Work(partial(batching.batches, dataset, config, own=own), step, render_views)
+    return Work(partial(batching.batches, dataset, config, own=own), step)
 
 
-def of_gbuffers(config: TrainConfig, dataset: Dataset, run: Path, light: Light | None) -> Work:
+def of_gbuffers(config: TrainConfig, dataset: Dataset, run: Path, light: Light) -> Work:
     """Of the shader network: G-buffers that are missing in the run folder are made first, which takes a while.
 
     The averaged weights are written to the run folder at the end.  All devices of a process do the same work.
     """
-    assert isinstance(config.model, SurfelConfig)
     if jax.process_count() > 1:
         raise ValueError(f"preset {config.preset} trains in one process; start it without --distributed")
-    light = light or light_of(dataset)
     views = gbuffers.complete(dataset, light, config, run / "gbuffers")
 
     def step(state: TrainState, crops: Crops, number: int) -> tuple[TrainState, dict]:
@@ -69,8 +61,7 @@ def of_gbuffers(config: TrainConfig, dataset: Dataset, run: Path, light: Light |
         variables = placement.on_this_process(optimisation.averaged_variables(state))
         write_weights(run / "weights.npz", Trained(config=config, variables=variables, steps=int(state.step)))
 
-    render_views = partial(shading.render_views, config=config.model, light=light)
-    return Work(partial(gbuffers.batches, views, config), step, render_views, finish)
+    return Work(partial(gbuffers.batches, views, config), step, finish)
 
 
 def light_of(dataset: Dataset) -> Light:

@@ -1,0 +1,119 @@
+"""Scores of a picture at the size that people look at: outline, holes, detail, and two objects with a known answer.
+
+Pictures are sRGB on white, references RGBA with straight alpha, all float in [0, 1]; lengths are pixels.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from scipy.ndimage import binary_dilation, binary_erosion, gaussian_filter
+
+from spnr_jax.kernels.records import PointCloud
+
+OUTLINE = 3  # pixels to both sides of the true outline
+WELL_INSIDE = 4  # pixels from the outline
+SOLID = 0.9  # opacity below which a pixel well inside is a hole
+DETAIL = 3.0  # standard deviation of the Gaussian whose residue is detail
+WAVES = 8.0  # the same for the ball
+GREY = 0.5  # base colour of the ball
+PLATE = (2.0, 1.4, 0.03)  # sides
+
+
+class Sharpness(NamedTuple):
+    """Of one picture: decibels, a root mean square, per cent, a correlation."""
+
+    psnr: float
+    psnr_inside: float
+    outline_rmse: float
+    holes: float
+    detail: float
+
+
+def sharpness(
+    image: Float[np.ndarray, "height width 3"],
+    opacity: Float[np.ndarray, "height width"],
+    reference: Float[np.ndarray, "height width 4"],
+) -> Sharpness:
+    """The scores of a picture; NaN where the reference has no pixel that a score is of."""
+    alpha = reference[..., 3]
+    white = reference[..., :3] * alpha[..., None] + 1 - alpha[..., None]
+    squared, body = (image - white) ** 2, alpha > 0.5
+    outline = binary_dilation(body, iterations=OUTLINE) & ~binary_erosion(body, iterations=OUTLINE)
+    deep = binary_erosion(body, iterations=WELL_INSIDE)
+    return Sharpness(
+        psnr=_decibels(squared),
+        psnr_inside=_decibels(squared[alpha > 0.999]),
+        outline_rmse=_mean((opacity - alpha)[outline] ** 2) ** 0.5,
+        holes=100 * _mean(opacity[deep] < SOLID),
+        detail=_correlation(_residue(image, DETAIL)[deep], _residue(white, DETAIL)[deep]),
+    )
+
+
+def _mean(values: np.ndarray) -> float:
+    return float(np.mean(values)) if values.size else float("nan")
+
+
+def _decibels(squared: np.ndarray) -> float:
+    mean = _mean(squared)
+    return float(min(-10 * np.log10(mean), 100.0)) if mean > 0 else (100.0 if mean == 0 else mean)
+
+
+def _residue(image: np.ndarray, sigma: float) -> np.ndarray:
+    """What a Gaussian takes away of the mean of the colours."""
+    grey = image.mean(axis=-1)
+    return grey - gaussian_filter(grey, sigma)
+
+
+def _correlation(one: np.ndarray, other: np.ndarray) -> float:
+    if one.size < 2 or one.std() == 0 or other.std() == 0:
+        return float("nan")
+    return float(np.corrcoef(one, other)[0, 1])
+
+
+def ball(count: int, seed: int = 0) -> PointCloud:
+    """Random points of a grey ball: its picture should be smooth."""
+    towards = np.random.default_rng(seed).standard_normal((count, 3))
+    towards = (towards / np.linalg.norm(towards, axis=1, keepdims=True)).astype(np.float32)
+    return _cloud(towards, np.full((count, 3), GREY, np.float32), towards)
+
+
+def ball_waves(image: Float[np.ndarray, "height width 3"], opacity: Float[np.ndarray, "height width"]) -> float:
+    """Root mean square of what a wide Gaussian takes away of the ball, away from its outline."""
+    inside = binary_erosion(opacity > 0.5, iterations=int(3 * WAVES))
+    return _mean(_residue(image, WAVES)[inside] ** 2) ** 0.5
+
+
+def plate(count: int, seed: int = 0) -> PointCloud:
+    """Random points of a thin plate, red in front (+z) and blue behind and at the rims."""
+    generator = np.random.default_rng(seed)
+    width, height, depth = PLATE
+    areas = np.array([width * height] * 2 + [width * depth] * 2 + [height * depth] * 2)
+    side = generator.choice(6, count, p=areas / areas.sum())
+    places = generator.uniform(-0.5, 0.5, (count, 3))
+    axis, sign = np.array([2, 2, 1, 1, 0, 0])[side], np.where(side % 2 == 0, 0.5, -0.5)
+    places[np.arange(count), axis] = sign
+    normals = np.zeros((count, 3), np.float32)
+    normals[np.arange(count), axis] = 2 * sign
+    color = np.where((side == 0)[:, None], [0.8, 0.05, 0.05], [0.05, 0.05, 0.8])
+    return _cloud((places * PLATE).astype(np.float32), color.astype(np.float32), normals)
+
+
+def blue_share(image: Float[np.ndarray, "height width 3"], opacity: Float[np.ndarray, "height width"]) -> float:
+    """Share of blue in the colour of the plate's front, in linear light; .077 is true (its rims are not seen)."""
+    inside = binary_erosion(opacity > 0.5, iterations=WELL_INSIDE)
+    linear = np.where(image > 0.04045, ((image + 0.055) / 1.055) ** 2.4, image / 12.92)
+    red, _, blue = linear[inside].mean(axis=0)
+    return float(blue / (red + blue))
+
+
+def _cloud(positions: np.ndarray, base_color: np.ndarray, normals: np.ndarray) -> PointCloud:
+    count = len(positions)
+    return PointCloud(
+        positions=positions,
+        base_color=base_color,
+        roughness=np.full(count, 0.5, np.float32),
+        metallic=np.zeros(count, np.float32),
+        mask=np.ones(count, bool),
+        normals=normals,
+    )
