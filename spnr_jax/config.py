@@ -37,6 +37,8 @@ class LossConfig:
     """Error of a pixel; the weights named l1 apply to either."""
     masked: bool = added(False)
     """Leave pixels of opacity 0 out of the pixel error: Point-NeRF's rays without a point in reach."""
+    opacity_l1_weight: float = added(0.0)
+    """L1 of the opacity against the reference's."""
     opacity_weight: float = added(0.0)
     """Mean squared error of the opacity against the reference's, beside the loss of the picture."""
     mse_weight: float = added(0.0)
@@ -45,8 +47,8 @@ class LossConfig:
     """Whether the discriminator sees the true colours at visible input points [paper]; else an empty image and mask."""
 
     def __post_init__(self) -> None:
-        weights = ("l1_weight", "low_resolution_weight", "adversarial_weight", "opacity_weight", "mse_weight")
-        for name in (*weights, "r1_gamma"):
+        weights = ("l1_weight", "low_resolution_weight", "adversarial_weight", "mse_weight", "r1_gamma")
+        for name in (*weights, "opacity_weight", "opacity_l1_weight"):
             require(getattr(self, name) >= 0, f"{name} must not be negative, got {getattr(self, name)}")
         require(
             0 <= self.adversarial_start <= 1, f"adversarial_start is a share of the steps, got {self.adversarial_start}"
@@ -80,11 +82,14 @@ class OptimizerConfig:
     """Adam, or rectified Adam for the generator."""
     decay: Literal["cosine", "exponential"] = added("cosine")
     """How the generator's learning rate falls after the warm-up."""
+    clip_norm: float = added(0.0)
+    """Norm to which the generator's gradient is shortened where it is longer; 0: never."""
 
     def __post_init__(self) -> None:
         for name in ("lr_generator", "lr_discriminator"):
             require(getattr(self, name) > 0, f"{name} must be positive, got {getattr(self, name)}")
         require(0 <= self.ema_decay < 1, f"ema_decay must be in [0, 1), got {self.ema_decay}")
+        require(self.clip_norm >= 0, f"clip_norm must not be negative, got {self.clip_norm}")
         require(self.warmup_steps >= 0, f"warmup_steps must not be negative, got {self.warmup_steps}")
         require(self.algorithm in ("adam", "radam"), f"algorithm must be adam or radam, got {self.algorithm}")
         require(self.decay in ("cosine", "exponential"), f"decay must be cosine or exponential, got {self.decay}")
@@ -118,7 +123,8 @@ class TrainConfig:
     crop: int = added(0)
     """Pixels along each side of the square of a view that is rendered in training, at a random place; 0: all of it."""
     even_share: float = added(0.0)
-    """Share of the clouds that are first points of an object in a data set of `--spread even`, not random ones."""
+    """Share of the clouds that are evenly spread, not random points: an object's first ones in a data set of `--spread
+    even`, or farthest points where the network sees G-buffers."""
 
     def __post_init__(self) -> None:
         for name in ("num_steps", "batch_objects", "views_per_object", "min_points", "test_points", "pixel_stride"):

@@ -15,6 +15,7 @@ from spnr_jax.model_config import (
     PointNeRFConfig,
     Points2NeRFConfig,
     SamplingConfig,
+    SurfelConfig,
     surface_grid,
 )
 
@@ -180,6 +181,31 @@ def plus_tiny() -> TrainConfig:
     return _plus(tiny(), "plus_tiny", pixel_stride=2, num_coarse=FEW_SAMPLES)
 
 
+def surfels() -> TrainConfig:
+    """Our network over G-buffers of surfels, pictures of any size.  `spnr train --preset surfels DATA RUN`.
+
+    DATA of `spnr-data generate` with --resolution 512 --points 65536.  Some hours on two CPU cores, the first of them
+    for the G-buffers, which take some 10 MB of disk a cloud.  Expected figures: see docs/model_card.md.
+    """
+    return TrainConfig(
+        preset="surfels",
+        model=SurfelConfig(),
+        loss=LossConfig(
+            l1_weight=1.0, mse_weight=5.0, adversarial_weight=0.0, opacity_weight=1.0, opacity_l1_weight=0.3
+        ),
+        optimizer=OptimizerConfig(
+            lr_generator=1.5e-3, beta2=0.99, warmup_steps=200, final_lr_scale=0.02, clip_norm=1.0
+        ),
+        num_steps=10_000,
+        views_per_object=4,
+        min_points=256,
+        max_points=65_536,
+        test_points=4096,
+        crop=96,
+        even_share=0.6,
+    )
+
+
 def _baseline_loss(pixel: Literal["l1", "mse"], masked: bool = False) -> LossConfig:
     return LossConfig(l1_weight=1.0, adversarial_weight=0.0, pixel=pixel, masked=masked)
 
@@ -318,4 +344,6 @@ BASELINES = (
     *(point_nerf_abo, point_nerf_shapenet, point_nerf_tiny),
     *(points2nerf_abo, points2nerf_shapenet, points2nerf_tiny),
 )
-PRESETS: dict[str, Callable[[], TrainConfig]] = {preset.__name__: preset for preset in (*OURS, *PLUS, *BASELINES)}
+PRESETS: dict[str, Callable[[], TrainConfig]] = {
+    preset.__name__: preset for preset in (*OURS, *PLUS, surfels, *BASELINES)
+}

@@ -128,8 +128,8 @@ class TestFromDict:
 
 class TestMethods:
     def test_a_file_names_its_method_and_the_fields_are_those_of_that_method(self):
-        kinds = {name: PRESETS[name]().model for name in ("tiny", "npbg_tiny", "point_nerf_tiny", "points2nerf_tiny")}
-        methods = [to_dict(PRESETS[name]())["model"]["method"] for name in kinds]
+        names = "tiny", "surfels", "npbg_tiny", "point_nerf_tiny", "points2nerf_tiny"
+        methods = [to_dict(PRESETS[name]())["model"]["method"] for name in names]
         assert methods == list(METHODS)
         values = to_dict(PRESETS["npbg_tiny"]())
         values["model"]["radius"] = 0.1

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from spnr_jax.formats.ply import read_ply_header
-from spnr_jax.formats.point_columns import DEFAULTS, Columns, materials, useful
+from spnr_jax.formats.point_columns import DEFAULTS, Columns, materials, normals, useful
 from spnr_jax.formats.point_files import READERS, column_pieces, parse_ply
 from spnr_jax.formats.up_axis import ROTATIONS, find_up
 from spnr_jax.kernels.records import PointCloud
@@ -84,6 +84,8 @@ def place_cloud(
         up, reason = find_up(positions, path)
         report(f"{up} taken as up ({reason}); --up says otherwise")
     rotation = np.array(ROTATIONS[up], np.float64)
+    if "normals" in values:
+        values["normals"] = values["normals"] @ rotation.T
     return PlacedCloud(cloud=_float32(positions @ rotation.T, values), up=up, rotation=rotation, origin=origin)
 
 
@@ -122,7 +124,7 @@ def _is_mesh(path: Path) -> bool:
 
 
 def _sampled_mesh(path: Path, count: int, seed: int, report: Callable[[str], None]):
-    """Positions (count, 3) float64, their origin (3,) and materials of points spread evenly over a mesh."""
+    """Positions (count, 3) float64, their origin (3,), materials and normals of points spread evenly over a mesh."""
     from spnr_jax.formats.mesh.meshes import load_mesh  # here: points are read without trimesh
     from spnr_jax.formats.mesh.surface_points import sample_surface
 
@@ -136,7 +138,7 @@ def _sampled_mesh(path: Path, count: int, seed: int, report: Callable[[str], Non
     values = {name: getattr(points, name) for name in DEFAULTS}
     if all((values[name] == default).all() for name, default in DEFAULTS.items()):
         report("no material in the mesh: base_color 0.5, roughness 0.5, metallic 0 taken everywhere")
-    return points.positions.astype(np.float64), np.zeros(3), values
+    return points.positions.astype(np.float64), np.zeros(3), values | {"normals": points.normals}
 
 
 def _bounded_columns(path: Path, num_points: int | None, report: Callable[[str], None]) -> Columns:
@@ -168,7 +170,7 @@ def _checked(columns: Columns, before: int) -> Columns:
 
 
 def _points_of_columns(columns: Columns, report: Callable[[str], None]):
-    """Positions (points, 3) float64, their origin (3,) and materials of useful columns."""
+    """Positions (points, 3) float64, their origin (3,), materials and normals, if any, of useful columns."""
     if not columns or len(columns["x"]) == 0:
         raise ValueError("holds 0 points")
     positions = np.stack([np.asarray(columns[axis], np.float64) for axis in "xyz"], axis=-1)
@@ -181,4 +183,5 @@ def _points_of_columns(columns: Columns, report: Callable[[str], None]):
             )
         origin = np.floor(positions.min(axis=0))
         report(f"moved by {' '.join(f'{0 - value:.0f}' for value in origin)} to keep precision")
-    return positions - origin, origin, materials(columns, report)
+    values, directions = materials(columns, report), normals(columns)
+    return positions - origin, origin, values if directions is None else values | {"normals": directions}

@@ -4,7 +4,6 @@ A data set is the folder that `spnr-data generate` writes (its form: README, "Da
 (spnr_jax/formats/shards.py); both give the same objects.
 """
 
-import dataclasses
 import errno
 import io
 import json
@@ -16,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import jax
 import numpy as np
 from PIL import Image, UnidentifiedImageError
 
@@ -44,8 +44,7 @@ class ObjectData:
     @property
     def num_bytes(self) -> int:
         """Memory that the images and points take."""
-        points = sum(getattr(self.cloud, f.name).nbytes for f in dataclasses.fields(PointCloud))
-        return self.images.nbytes + self.conditions.nbytes + points
+        return self.images.nbytes + self.conditions.nbytes + sum(x.nbytes for x in jax.tree.leaves(self.cloud))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -157,7 +156,7 @@ def test_cloud(item: ObjectData, config: TrainConfig) -> PointCloud:
 
 def first_points(item: ObjectData, count: int) -> PointCloud:
     """So many points of an object, or all if it has fewer: always the same ones."""
-    return PointCloud(**{f.name: getattr(item.cloud, f.name)[:count] for f in dataclasses.fields(PointCloud)})
+    return jax.tree.map(lambda values: values[:count], item.cloud)
 
 
 def check_renders(data: ObjectData, config: TrainConfig) -> None:

@@ -30,6 +30,7 @@ ARRAY_COLUMNS = {
     **dict.fromkeys(("colors", "rgb", "color"), ("r", "g", "b")),
     "roughness": ("roughness",),
     **dict.fromkeys(("metallic", "metalness"), ("metallic",)),
+    "normals": ("nx", "ny", "nz"),
 }
 
 

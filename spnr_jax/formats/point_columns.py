@@ -6,6 +6,7 @@
     base_color_r base_color_g base_color_b            base colour, linear
     red green blue                                    colour, sRGB
     roughness metallic                                in [0, 1]
+    nx ny nz                                          normal, of any length
     intensity                                         of a laser's echo, shown as grey where there is no colour
 
 and drops the others.  Colours, roughness and metallic are 0..1, or 0..255 (0..65535): unsigned integers by their type,
@@ -28,6 +29,7 @@ Report = Callable[[str], None]
 POSITION = ("x", "y", "z")
 LINEAR = ("base_color_r", "base_color_g", "base_color_b")
 SRGB = ("red", "green", "blue")
+NORMAL = ("nx", "ny", "nz")
 PREFIX = "scalar_"  # CloudCompare's, for everything but positions and colours
 ALIASES = (  # groups that stand for each other: the first that is there counts
     (POSITION, (POSITION, ("points:0", "points:1", "points:2"), ("points_0", "points_1", "points_2"))),
@@ -52,6 +54,7 @@ ALIASES = (  # groups that stand for each other: the first that is there counts
             ("color_red", "color_green", "color_blue"),
         ),
     ),
+    (NORMAL, (NORMAL, ("normal_x", "normal_y", "normal_z"))),
     (("roughness",), (("roughness",), ("rough",), ("roughness_factor",), ("pbr_roughness",))),
     (("metallic",), (("metallic",), ("metalness",), ("metallic_factor",), ("metal",), ("pbr_metallic",))),
     (("intensity",), (("intensity",), ("reflectance",))),
@@ -59,6 +62,7 @@ ALIASES = (  # groups that stand for each other: the first that is there counts
 DEFAULTS = {"base_color": 0.5, "roughness": 0.5, "metallic": 0.0}
 ROUNDING = 1e-4  # values this far outside [0, 1] are taken for rounded ones
 BRIGHTEST = 0.99  # quantile of the intensities that is shown white
+SHORTEST = 1e-30  # normal that still has a direction
 
 
 def useful(columns: Columns) -> Columns:
@@ -88,6 +92,17 @@ def materials(columns: Columns, report: Report) -> dict[str, np.ndarray]:
             values = np.full((count, 3) if name == "base_color" else count, default)
         complete[name] = values
     return complete
+
+
+def normals(columns: Columns) -> np.ndarray | None:
+    """Normals (points, 3) of unit length, 0 where a row has none that can be used; None if no row has one."""
+    if not set(NORMAL) <= columns.keys() or any(columns[name].dtype.kind == "u" for name in NORMAL):
+        return None  # numbers without a sign encode a normal in some way of their own
+    vectors = np.stack([np.asarray(columns[name], np.float64) for name in NORMAL], axis=-1)
+    with np.errstate(over="ignore"):
+        length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    usable = np.isfinite(length) & (length > SHORTEST)
+    return np.where(usable, vectors / np.where(usable, length, 1), 0) if usable.any() else None
 
 
 def _scalar(columns: Columns, name: str) -> np.ndarray | None:

@@ -10,7 +10,7 @@ from typing import no_type_check
 import jax
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, UInt8
 
 AnyArray = jax.Array | np.ndarray
 
@@ -186,6 +186,21 @@ class Batch:
     alpha: Float[AnyArray, "objects views height width"]
     condition: Float[AnyArray, "objects views height width 3"]
     condition_mask: Bool[AnyArray, "objects views height width"]
+
+
+@no_type_check
+@struct.dataclass
+class Crops:
+    """One training batch of the shader network: squares of G-buffers as it sees them (`surfels/features.py`).
+
+    `target` is the reference, 8-bit RGBA with straight alpha, at 2^doublings times the resolution.
+    """
+
+    seen: Float[AnyArray, "crops height width 27"]
+    maps: Float[AnyArray, "crops height width 17"]
+    ambient: Float[AnyArray, "crops 9 3"]
+    target: UInt8[AnyArray, "crops h w 4"]
+    doublings: int = struct.field(pytree_node=False)
 
 
 Key = jax.Array

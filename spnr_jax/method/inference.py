@@ -13,7 +13,7 @@ import jax.numpy as jnp
 
 from spnr_jax.devices.placement import by_all_devices, on_own_rays
 from spnr_jax.kernels import cameras, supersampling
-from spnr_jax.kernels.records import Camera, PointCloud, Rendering
+from spnr_jax.kernels.records import Camera, Key, Light, PointCloud, Rendering
 from spnr_jax.method import surfel_renderer
 from spnr_jax.method.renderer import Renderer
 from spnr_jax.model_config import ModelConfig, NetworkConfig, SurfelConfig
@@ -27,6 +27,13 @@ def network(config: NetworkConfig) -> nn.Module:
     from spnr_jax.baselines.networks import NETWORKS  # here: our own network is drawn without them
 
     return NETWORKS[type(config)](config)
+
+
+def init(key: Key, config: NetworkConfig) -> dict:
+    """Fresh variables of a config's network."""
+    if isinstance(config, SurfelConfig):
+        return surfel_renderer.init(key, config)
+    return network(config).init(key, *example_inputs(config))
 
 
 def example_inputs(config: NetworkConfig) -> tuple[PointCloud, Camera]:
@@ -93,12 +100,16 @@ jitted_encode = jax.jit(encode, static_argnames="config")
 jitted_render = jax.jit(render, static_argnames=("config", "ray_chunk", "rays_per_side"))
 
 
-def render_views(variables: dict, config: NetworkConfig, cloud: PointCloud, camera: Camera) -> Rendering:
-    """All views of one object (clouds of data sets are normalised already), rays divided among the devices."""
+def render_views(
+    variables: dict, config: NetworkConfig, cloud: PointCloud, camera: Camera, light: Light | None = None
+) -> Rendering:
+    """All views of one object (clouds of data sets are normalised already), rays divided among the devices.
+
+    The light is for a network that sees it; None is the package's room.
+    """
     if isinstance(config, SurfelConfig):
-        return surfel_renderer.render_views(
-            variables, surfel_renderer.encode(cloud), camera, room_light(), config=config
-        )
+        scene = surfel_renderer.encode(cloud)
+        return surfel_renderer.render_views(variables, scene, camera, light or room_light(), config=config)
     cloud, camera = jax.tree.map(lambda x: jnp.asarray(x)[None], (cloud, camera))
     volume = jitted_encode(variables, cloud, config=config)
     side = supersampling.rays_per_side(config, camera.width)

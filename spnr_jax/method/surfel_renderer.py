@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.compositing import WHITE
-from spnr_jax.kernels.records import Camera, Light, PointCloud, Rendering, Surfels
+from spnr_jax.kernels.records import Camera, Key, Light, PointCloud, Rendering, Surfels
 from spnr_jax.kernels.resizing import mean_of_squares
 from spnr_jax.model_config import SurfelConfig
 from spnr_jax.nn.shader import NUM_OUTPUTS, Shader, doubled, picture
@@ -50,6 +50,12 @@ class Plan(NamedTuple):
     top: int
     width: int
     height: int
+
+
+def init(key: Key, config: SurfelConfig) -> dict:
+    """Fresh variables of the shader network."""
+    side = 2 ** len(config.widths)
+    return Shader(config.widths, config.top).init(key, jnp.zeros((1, side, side, features.NUM_FEATURES)), 1)
 
 
 def encode(cloud: PointCloud) -> SurfelScene:
@@ -135,6 +141,18 @@ def _seen_through(camera: Camera, plan: Plan) -> Camera:
     )
 
 
+def look(
+    found: splatting.Entries, surfels: Surfels, light: Light, camera: Camera, *, slots: int
+) -> tuple[
+    Float[Array, "height width 27"], Float[Array, "height width 17"], Float[Array, "9 3"], Float[Array, "height width"]
+]:
+    """What the network sees of a picture's entries, the light maps, the light's harmonics in camera axes, the depth."""
+    surfels = features.turned(surfels, camera)
+    buffer = splatting.blend(found, surfels, features.attributes(surfels, light, camera), camera, slots=slots)
+    seen, maps = features.features(buffer, light, camera)
+    return seen, maps, lighting.projected(light, camera.cam_to_world[:, :3]), buffer.depth
+
+
 @partial(jax.jit, static_argnames=("config", "doublings", "slots"))
 def _shade(
     variables: dict | None,
@@ -148,17 +166,14 @@ def _shade(
     slots: int,
 ) -> Float[Array, "height width 5"]:
     """Colour, opacity and depth along the camera's axis, of the window at the network's resolution."""
-    surfels = features.turned(surfels, camera)
-    buffer = splatting.blend(found, surfels, features.attributes(surfels, light, camera), camera, slots=slots)
-    seen, maps = features.features(buffer, light, camera)
+    seen, maps, ambient, depth = look(found, surfels, light, camera, slots=slots)
     seen, maps = jax.lax.optimization_barrier((seen, maps))
     if variables is None:
         outputs = jnp.zeros((1, *(n << doublings for n in seen.shape[:2]), NUM_OUTPUTS))
     else:
         outputs = Shader(config.widths, config.top).apply(variables, seen[None], doublings)
-    ambient = lighting.projected(light, camera.cam_to_world[:, :3])
     color, alpha = picture(outputs, maps[None], ambient[None], doublings)
-    depth = buffer.depth[None, ..., None]
+    depth = depth[None, ..., None]
     for _ in range(doublings):
         depth = doubled(depth)
     return jnp.concatenate([color, alpha[..., None], depth], axis=-1)[0]

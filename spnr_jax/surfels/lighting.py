@@ -22,6 +22,7 @@ TOLD = 2  # the level whose values at the directions of the visibility stand for
 SPECULAR = 0.04  # reflectance of what is not metal, seen from straight above
 LOBE = 8.0  # of the directions around the mirrored one whose visibility counts
 SH_BANDS = 9  # spherical harmonics up to degree 2
+ODD = (3, 4, 7), (1, 4, 5)  # of them, those that change their sign when the light is mirrored along x, or along y
 
 
 @cache

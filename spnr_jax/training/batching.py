@@ -4,11 +4,12 @@ Because a batch depends on nothing but the step, the state of the reader is the 
 the same data, whatever was read ahead.  grain does the reading ahead, in threads.
 """
 
-import dataclasses
 import functools
 import threading
 from collections.abc import Callable, Generator
+from typing import Any
 
+import jax
 import numpy as np
 
 from spnr_jax.config import TrainConfig
@@ -32,8 +33,7 @@ def choose_points(
     total = len(cloud.positions)
     first = even_share > 0 and generator.random() < even_share
     chosen = (np.arange(total) if first else generator.permutation(total))[:count]
-    subset = PointCloud(**{f.name: getattr(cloud, f.name)[chosen] for f in dataclasses.fields(PointCloud)})
-    return pad(subset, size)
+    return pad(jax.tree.map(lambda values: values[chosen], cloud), size)
 
 
 def make_batch(objects: list[ObjectData], config: TrainConfig, step: int, place: int = 0) -> Batch:
@@ -46,19 +46,17 @@ def make_batch(objects: list[ObjectData], config: TrainConfig, step: int, place:
         generator = np.random.default_rng((config.seed, POINTS_AND_VIEWS, step, i))
         low, high = np.log2(config.min_points), np.log2(config.max_points)
         count = round(2 ** generator.uniform(low, high))
-        clouds_of.append(choose_points(item.cloud, count, config.max_points, generator, config.even_share))
+        cloud = item.cloud.replace(normals=None)  # networks of whole views estimate them, if they need any
+        clouds_of.append(choose_points(cloud, count, config.max_points, generator, config.even_share))
         views_of.append(generator.permutation(len(item.images))[: config.views_per_object])
     images = np.stack([item.images[v] for item, v in zip(objects, views_of, strict=True)])
     conditions = np.stack([item.conditions[v] for item, v in zip(objects, views_of, strict=True)])
     mask = conditions[..., 3] > 0
     poses = np.stack([item.camera.cam_to_world[v] for item, v in zip(objects, views_of, strict=True)])
     intrinsics = np.stack([item.camera.intrinsics[v] for item, v in zip(objects, views_of, strict=True)])
-    stacked = {
-        f.name: np.stack([getattr(cloud, f.name) for cloud in clouds_of]) for f in dataclasses.fields(PointCloud)
-    }
     first = objects[0].camera
     return Batch(
-        cloud=PointCloud(**stacked),
+        cloud=jax.tree.map(lambda *columns: np.stack(columns), *clouds_of),
         camera=Camera(cam_to_world=poses, intrinsics=intrinsics, height=first.height, width=first.width),
         image=on_white(images),
         alpha=images[..., 3].astype(np.float32) / 255,
@@ -87,8 +85,6 @@ def batches(
 
     With `own` only these places of each batch: the same objects, points and views as in the whole one.
     """
-    import grain
-
     names = dataset.splits["train"]
     if not names:
         raise ValueError(f"{dataset.folder}: the train split is empty; generate more objects")
@@ -99,9 +95,15 @@ def batches(
         chosen = object_names(names, config, step)[own.start : own.stop]
         return make_batch([read(name) for name in chosen], config, step, own.start)
 
-    steps = grain.MapDataset.range(first_step, config.num_steps).map(assemble)
-    options = grain.ReadOptions(num_threads=READERS, prefetch_buffer_size=READ_AHEAD)
-    yield from iter(steps.to_iter_dataset(options))  # its threads end with this generator
+    yield from read_ahead(assemble, first_step, config.num_steps)
+
+
+def read_ahead(assemble: Callable[[int], Any], first_step: int, num_steps: int) -> Generator[Any, None, None]:
+    """What `assemble` makes of each step, some steps ahead in threads, which end with this generator."""
+    import grain
+
+    steps = grain.MapDataset.range(first_step, num_steps).map(assemble)
+    yield from iter(steps.to_iter_dataset(grain.ReadOptions(num_threads=READERS, prefetch_buffer_size=READ_AHEAD)))
 
 
 def cached_reader(dataset: Dataset, config: TrainConfig, cache_bytes: int) -> Callable[[str], ObjectData]:

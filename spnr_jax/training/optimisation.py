@@ -1,4 +1,4 @@
-"""Training as pure functions: state in, state out.  The only jax.jit lines of the package's training stand here.
+"""Training as pure functions: state in, state out.  The networks that render whole views are trained by it.
 
     forward -> losses -> train_step -> jitted train_step
 
@@ -28,7 +28,7 @@ from spnr_jax.config import TrainConfig
 from spnr_jax.kernels import losses
 from spnr_jax.kernels.metrics import psnr
 from spnr_jax.kernels.records import Batch, Camera, Key
-from spnr_jax.method.inference import example_inputs, network
+from spnr_jax.method.inference import init, network
 from spnr_jax.model_config import ModelConfig
 from spnr_jax.nn.discriminator import Discriminator
 
@@ -74,8 +74,9 @@ def optimizers(config: TrainConfig) -> tuple[optax.GradientTransformation, optax
     """The generator's algorithm, and Adam for the discriminator."""
     o = config.optimizer
     algorithm = {"adam": optax.adam, "radam": optax.radam}[o.algorithm]
+    generator = algorithm(learning_rate(config), b1=o.beta1, b2=o.beta2)
     return (
-        algorithm(learning_rate(config), b1=o.beta1, b2=o.beta2),
+        optax.chain(optax.clip_by_global_norm(o.clip_norm), generator) if o.clip_norm else generator,
         optax.adam(o.lr_discriminator, b1=o.beta1_discriminator, b2=o.beta2),
     )
 
@@ -96,7 +97,7 @@ def create_state(config: TrainConfig, seed: int | Array | None = None) -> TrainS
     """Fresh weights and optimisers from a seed, the config's by default."""
     key = jax.random.key(config.seed if seed is None else seed)
     key, generator_key, discriminator_key = jax.random.split(key, 3)
-    variables = network(config.model).init(generator_key, *example_inputs(config.model))
+    variables = init(generator_key, config.model)
     generator_adam, discriminator_adam = optimizers(config)
     generator, batch_stats = variables["params"], variables.get("batch_stats", {})
     discriminator = None

@@ -30,8 +30,10 @@ from spnr_jax.devices import allocator, placement
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.images import png, to_uint8, write_whole
 from spnr_jax.kernels.metrics import psnr
+from spnr_jax.kernels.records import Light
 from spnr_jax.method import inference
-from spnr_jax.training import batching, checkpoint, optimisation
+from spnr_jax.model_config import SurfelConfig
+from spnr_jax.training import checkpoint, optimisation, work
 from spnr_jax.training.run_record import Clock, RunRecord
 from spnr_jax.training.weights import Trained
 
@@ -69,11 +71,13 @@ def train(
     mesh: Mesh | None = None,
     init: Trained | None = None,
     on_event: OnEvent | None = None,
+    light: Light | None = None,
 ) -> optimisation.TrainState:
     """The state after the config's last step; goes on where an earlier call left the run folder.
 
     A new run begins with random weights, or with those of `init`.  On a mesh of devices (`placement.device_mesh`)
     each of its processes calls this.  `on_event` is told what the loop is about to do; what was told before is done.
+    `light` is that of the data set's pictures, if the network sees the light and it is another than the room.
     """
     allocator.few_arenas()
     own = None if mesh is None else placement.own_objects(mesh, config.batch_objects)
@@ -81,7 +85,8 @@ def train(
         try:
             placement.first_alone(lambda: stack.enter_context(checkpoint.alone(run)))
             placement.first_alone(lambda: checkpoint.write_config(run, config))
-            return _train(config, dataset, run, schedule, mesh, own, init, on_event or (lambda *event: None))
+            tell = on_event or (lambda *event: None)
+            return _train(config, dataset, run, schedule, mesh, own, init, tell, light)
         except OSError as error:
             error.filename = error.filename or str(run)  # writing to a full disk does not say where
             raise
@@ -98,6 +103,7 @@ def _train(
     own: range | None,
     init: Trained | None,
     tell: OnEvent,
+    light: Light | None,
 ) -> optimisation.TrainState:
     clock, leads = Clock(), placement.leads()
     say: Callable[[str], object] = tqdm.write if leads else lambda line: None
@@ -110,26 +116,24 @@ def _train(
         return state
     if first:
         say(f"resuming {run} at step {first} of {config.num_steps}")
-    adversarial_from = optimisation.first_adversarial_step(config)
+    if isinstance(config.model, SurfelConfig):
+        light = light or work.light_of(dataset)
+        task = work.of_gbuffers(config, dataset, run, light)
+    else:
+        task = work.of_views(config, dataset, mesh, own)
     agreed = placement.Agreement(mesh)
     pending: list[tuple[int, dict]] = []
     with (
         stop_requests() as requests,
         closing(MetricsLog(run, first) if leads else Unwritten()) as log,
-        closing(batching.batches(dataset, config, first, own=own)) as batches,
+        closing(task.batches(first)) as batches,
         tqdm(total=config.num_steps, initial=first, unit="step", mininterval=1, disable=not leads) as bar,
     ):
         record = RunRecord(run, dataset, first, init) if leads else Unwritten()
         clock.lap("restore")
         for step, batch in enumerate(batches, start=first):
             tell("step", step, batch)
-            with placement.using(mesh):
-                state, metrics = optimisation.jitted_train_step(
-                    state,
-                    placement.placed(batch, mesh, config.batch_objects),
-                    config=config,
-                    adversarial=step >= adversarial_from,
-                )
+            state, metrics = task.step(state, batch, step)
             pending.append((step + 1, metrics))
             bar.update()
             if step == first:
@@ -150,10 +154,12 @@ def _train(
                 pending = []
             if leads and (last or (step + 1) % schedule.preview_every == 0):
                 tell("preview", step + 1, None)
-                scores, picture = preview(state, config, dataset, run)
+                scores, picture = preview(state, config, dataset, run, light)
                 log.write({"step": step + 1, **scores}, picture)
                 allocator.give_back()
                 clock.lap("previews")
+            if last:
+                task.finish(state)
             if save:  # after the rows up to this step, which a run that goes on from here will not write again
                 tell("checkpoint", step + 1, None)
                 checkpoint.save(run, state)
@@ -272,7 +278,12 @@ def read_rows(run: Path) -> list[dict]:
 
 
 def preview(
-    state: optimisation.TrainState, config: TrainConfig, dataset: data_sets.Dataset, run: Path, num_objects: int = 6
+    state: optimisation.TrainState,
+    config: TrainConfig,
+    dataset: data_sets.Dataset,
+    run: Path,
+    light: Light | None = None,
+    num_objects: int = 6,
 ) -> tuple[dict[str, float], np.ndarray]:
     """Validation PSNR of the averaged network on a few objects, and references over renderings, kept in previews/."""
     names = (dataset.splits["val"] or dataset.splits["train"])[:num_objects]
@@ -281,7 +292,7 @@ def preview(
     for name in names:
         item = data_sets.read_object(dataset, name)
         cloud = data_sets.test_cloud(item, config)
-        rendering = inference.render_views(variables, config.model, cloud, item.camera)
+        rendering = inference.render_views(variables, config.model, cloud, item.camera, light)
         image, reference = np.clip(np.asarray(rendering.image), 0, 1), data_sets.on_white(item.images)
         scores.append(np.asarray(psnr(jnp.asarray(image), jnp.asarray(reference))))
         columns.append(np.concatenate([reference[0], image[0]]))

@@ -23,7 +23,7 @@ from flax.traverse_util import flatten_dict, unflatten_dict
 from spnr_jax.config import TrainConfig, from_dict, to_dict
 from spnr_jax.formats.images import write_whole
 from spnr_jax.formats.npz import read_arrays
-from spnr_jax.method.inference import example_inputs, network
+from spnr_jax.method.inference import init
 from spnr_jax.method.model import Model
 
 # what a header of any content makes its readers raise
@@ -123,5 +123,4 @@ def _check_weights(arrays: dict[str, np.ndarray], shapes: dict[str, jax.ShapeDty
 @cache
 def variable_shapes(config: TrainConfig) -> dict[str, jax.ShapeDtypeStruct]:
     """Shape of every weight of the config's network, by name."""
-    create = partial(network(config.model).init, jax.random.key(0))
-    return flatten_dict(jax.eval_shape(create, *example_inputs(config.model)), sep="/")
+    return flatten_dict(jax.eval_shape(partial(init, config=config.model), jax.random.key(0)), sep="/")

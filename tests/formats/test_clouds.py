@@ -130,6 +130,7 @@ def test_the_surface_of_a_mesh_is_sampled_with_its_material(tmp_path, name):
     np.testing.assert_allclose(cloud.base_color, np.broadcast_to(color, (400, 3)), atol=2e-3)
     np.testing.assert_allclose(cloud.roughness, roughness, atol=1e-6)
     np.testing.assert_allclose(cloud.metallic, metallic, atol=1e-6)
+    np.testing.assert_allclose(cloud.normals, np.broadcast_to([0, 0, 1], (400, 3)), atol=1e-6)
     np.testing.assert_array_equal(read_cloud(path, num_points=400, seed=3).positions, cloud.positions)
     assert len(read_cloud(path).mask) == 4096
 
@@ -142,6 +143,38 @@ def test_up_is_a_rotation_that_takes_the_named_axis_to_y(tmp_path, up):
     np.testing.assert_array_equal(sign * images["xyz".index(up[-1])], [0, 1, 0])
     np.testing.assert_allclose(np.linalg.det(images), 1)
     np.testing.assert_array_equal(images @ images.T, np.eye(3))
+
+
+@pytest.mark.parametrize("names", ["nx ny nz", "normal_x normal_y normal_z", "scalar_nx scalar_ny scalar_nz"])
+def test_normals_have_unit_length_and_turn_with_the_cloud_and_a_row_without_one_gets_zero(tmp_path, names):
+    rows = ["0 0 1 0 0 2", "0 1 0 0 -3e-9 0", "1 0 0 0 0 0", "2 0 0 nan 0 1", "3 0 0 inf 0 0", "4 0 0 3 4 0"]
+    path = write(tmp_path, "a.csv", "\n".join([f"x y z {names}", *rows]))
+    normals = [[0, 0, 1], [0, -1, 0], [0] * 3, [0] * 3, [0] * 3, [0.6, 0.8, 0]]
+    cloud = read_cloud(path)
+    np.testing.assert_allclose(cloud.normals, normals, atol=1e-7)
+    assert cloud.normals.dtype == np.float32
+    np.testing.assert_allclose(read_cloud(path, up="z").normals, normals @ np.array(ROTATIONS["z"]).T, atol=1e-7)
+    np.testing.assert_allclose(pad(cloud, 8).normals, [*normals, [0] * 3, [0] * 3], atol=1e-7)
+
+
+def test_a_cloud_without_a_usable_normal_has_none(tmp_path):
+    zeros = write(tmp_path, "zeros.csv", "x y z nx ny nz\n0 0 1 0 0 0\n0 1 0 nan 0 0")
+    part = write(tmp_path, "part.csv", "x y z nx ny\n0 0 1 0 1\n0 1 0 0 1")
+    packed = np.zeros(2, [(name, "f4") for name in "xyz"] + [(name, "u1") for name in ("nx", "ny", "nz")])
+    packed["nx"] = 255
+    np.save(tmp_path / "packed.npy", packed)
+    for path in (zeros, part, tmp_path / "packed.npy"):
+        assert read_cloud(path).normals is None
+    assert pad(read_cloud(zeros), 4).normals is None
+
+
+def test_a_point_that_is_kept_keeps_its_normal(tmp_path, monkeypatch):
+    positions = sphere_points(2, 900)
+    np.savez(tmp_path / "a.npz", xyz=positions, normals=2 * positions)
+    monkeypatch.setattr(clouds, "CAPACITY", 400)
+    cloud = read_cloud(tmp_path / "a.npz", num_points=20)
+    assert len(cloud.mask) == 20
+    np.testing.assert_allclose(cloud.normals, cloud.positions, atol=1e-6)
 
 
 def test_thinning_keeps_points_of_the_file_with_their_materials_and_depends_on_the_seed_alone(tmp_path):

@@ -9,6 +9,7 @@ import zlib
 from contextlib import closing
 from itertools import islice
 
+import jax
 import numpy as np
 import pytest
 from PIL import Image
@@ -74,8 +75,19 @@ def test_points_are_a_subset_without_repetition_and_padding_is_masked():
     found = {tuple(row) for row in chosen.positions[:9]}
     assert len(found) == 9
     assert found <= rows
-    for field in dataclasses.fields(chosen):
-        assert not np.any(getattr(chosen, field.name)[9:])
+    assert not any(np.any(column[9:]) for column in jax.tree.leaves(chosen))
+
+
+def test_normals_are_read_and_stay_with_their_points_and_a_cloud_may_lack_them():
+    item = one_object()
+    np.testing.assert_allclose(item.cloud.normals, item.cloud.positions / tiny_dataset.RADIUS, atol=1e-6)
+    chosen = batching.choose_points(item.cloud, 9, 16, np.random.default_rng(1))
+    np.testing.assert_allclose(chosen.normals, chosen.positions / tiny_dataset.RADIUS, atol=1e-6)
+    np.testing.assert_array_equal(data_sets.first_points(item, 5).normals, item.cloud.normals[:5])
+    without = dataclasses.replace(item, cloud=item.cloud.replace(normals=None))
+    assert batching.choose_points(without.cloud, 9, 16, np.random.default_rng(1)).normals is None
+    assert data_sets.first_points(without, 5).normals is None
+    assert item.num_bytes - without.num_bytes == item.cloud.normals.nbytes
 
 
 def test_materials_stay_with_their_points():

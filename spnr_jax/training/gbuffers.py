@@ -1,0 +1,240 @@
+"""G-buffers of a data set's clouds: what the shader network learns from, made once and kept on disk.
+
+    FOLDER/OBJECT.CLOUD.npz    views of one random cloud of an object
+        doublings              (views,): how often the network doubles each view's resolution
+        seen0, seen1, ...      what it sees of the view, in the window around the object, float16
+        maps, ambient, target  likewise: light maps in float16, the light's harmonics, the reference in 8 bits
+
+A file is a pure function of (seed, object, cloud); it appears whole or not at all, and one that cannot be read is made
+again.  A batch is a pure function of (seed, step) and the list of files: squares of views of equal doublings.
+"""
+
+import io
+import zlib
+from collections.abc import Callable, Generator
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float, UInt8
+from tqdm import tqdm
+
+from spnr_jax.config import TrainConfig
+from spnr_jax.formats.clouds import MOST_EVEN
+from spnr_jax.formats.data_sets import Dataset, ObjectData, read_object
+from spnr_jax.formats.images import to_uint8, write_whole
+from spnr_jax.formats.npz import read_arrays
+from spnr_jax.kernels import cameras
+from spnr_jax.kernels.cloud_arrays import bucket
+from spnr_jax.kernels.records import Camera, Crops, Light, PointCloud
+from spnr_jax.kernels.thinning import farthest_points
+from spnr_jax.method import surfel_renderer
+from spnr_jax.surfels import features, lighting, splatting
+from spnr_jax.training.batching import read_ahead
+
+CLOUDS = 3  # of each object
+WITHOUT_NORMALS = 0.5  # share of them whose normals are estimated
+SIDES = (1, 1, 1, 2, 4, 8)  # pixels of a reference averaged along a side, drawn from these
+SMALL, FEWER = 4, 8  # side from which on a cloud has at most so many times fewer points
+MOST_ENTRIES = 2**22  # of a view: one with more is left out
+LEAST = 8  # pixels along the shorter side of a view
+MARGIN, FAINT = 6, 0.01  # pixels around the window, and opacity from which on a pixel is in it
+SIZES = (96, 64, 32, 20, 12)  # pixels along a crop by doublings; of another config.crop than the first in proportion
+SHARES = (0.36, 0.26, 0.18, 0.14, 0.06)  # of the steps, by doublings
+HALVED = 3  # doublings from which on a batch has half the crops
+TRIES, COVERED, DRAWN = 4, 0.15, 0.02  # places that are tried for a crop, until this share of it has this opacity
+LARGEST = 6e4  # in float16; no light makes a picture brighter than white
+CLOUD, CROP = 3, 4  # streams of random numbers under one seed, beside those of `batching`
+
+Arrays = dict[str, np.ndarray]
+NAMES = ("seen", "maps", "ambient", "target")
+look = jax.jit(surfel_renderer.look, static_argnames="slots")
+
+
+class View(NamedTuple):
+    """Where a view is kept, and how often its resolution is doubled."""
+
+    path: Path
+    number: int
+    doublings: int
+
+
+def complete(dataset: Dataset, light: Light, config: TrainConfig, folder: Path) -> list[View]:
+    """The views of the data set's objects; files that are missing or broken are made."""
+    views = []
+    for name in tqdm(dataset.splits["train"], "G-buffers", unit="object"):
+        paths = [folder / f"{name}.{number}.npz" for number in range(CLOUDS)]
+        found = [_doublings(path) for path in paths]
+        item = read_object(dataset, name) if None in found else None
+        for number, path in enumerate(paths):
+            if item is not None and found[number] is None:
+                arrays = make(item, number, light, config)
+                write_whole(path, _packed(arrays))
+                found[number] = arrays["doublings"].tolist()
+        views += [View(path, i, d) for path, of in zip(paths, found, strict=True) for i, d in enumerate(of or ())]
+    if not views:
+        raise ValueError(f"{dataset.folder}: no object of its train split can be learnt from; generate more objects")
+    return views
+
+
+def _doublings(path: Path) -> list[int] | None:
+    """Of each view in a file; None if there is no file that can be read."""
+    try:
+        with path.open("rb") as file:
+            return read_arrays(file, ("doublings",))["doublings"].tolist()
+    except (OSError, ValueError):
+        return None
+
+
+def _packed(arrays: Arrays) -> bytes:
+    stream = io.BytesIO()
+    np.savez(stream, allow_pickle=False, **arrays)  # not compressed: a view is read for each crop
+    return stream.getvalue()
+
+
+def make(item: ObjectData, number: int, light: Light, config: TrainConfig) -> Arrays:
+    """The content of a file: views of the object's cloud of this number."""
+    generator = np.random.default_rng((config.seed, CLOUD, zlib.crc32(item.name.encode()), number))
+    side = int(generator.choice(SIDES))
+    scene = surfel_renderer.encode(random_cloud(item.cloud, side, config, generator))
+    arrays: Arrays = {}
+    doublings: list[int] = []
+    for index in generator.permutation(len(item.images))[: config.views_per_object]:
+        camera = jax.tree.map(lambda x, i=index: np.asarray(x[i]), item.camera)
+        if view := make_view(scene, camera, item.images[index], side, light):
+            arrays |= {f"{name}{len(doublings)}": view[1][name] for name in NAMES}
+            doublings.append(view[0])
+    return arrays | {"doublings": np.array(doublings, np.int64)}
+
+
+def random_cloud(cloud: PointCloud, side: int, config: TrainConfig, generator: np.random.Generator) -> PointCloud:
+    """Random points of a cloud or evenly spread ones, with or without their normals."""
+    most = max(config.max_points // (FEWER if side >= SMALL else 1), config.min_points)
+    count = min(int(np.exp(generator.uniform(np.log(config.min_points), np.log(most)))), len(cloud.mask))
+    even = generator.random() < config.even_share and count <= MOST_EVEN
+    chosen = generator.permutation(len(cloud.mask))[:count]
+    if even:
+        chosen = farthest_points(cloud.positions, count, int(chosen[0]))
+    if generator.random() < WITHOUT_NORMALS:
+        cloud = cloud.replace(normals=None)
+    return jax.tree.map(lambda values: values[chosen], cloud)
+
+
+def make_view(
+    scene: surfel_renderer.SurfelScene,
+    camera: Camera,
+    image: UInt8[np.ndarray, "height width 4"],
+    side: int,
+    light: Light,
+) -> tuple[int, Arrays] | None:
+    """Doublings and arrays of a view, `side` times smaller than its reference is kept; None if it teaches nothing."""
+    small = cameras.resize(camera, camera.height // side, camera.width // side)
+    doublings, finer = surfel_renderer.resolution_of(scene.spacing, small)
+    side, scale = side // finer, 2**doublings  # what is drawn at twice the size is compared at that size
+    if side == 0 or any(n % (side * scale) or n // (side * scale) < LEAST for n in image.shape[:2]):
+        return None
+    drawn = cameras.resize(camera, *(n // (side * scale) for n in image.shape[:2]))
+    total = int(splatting.count(scene.surfels, drawn))
+    if not 0 < total <= MOST_ENTRIES:
+        return None
+    found, slots = splatting.entries(scene.surfels, drawn, total=bucket(max(total, 2**15)))
+    slots = min(bucket(max(int(slots), 2**11)), drawn.height * drawn.width)
+    seen, maps, ambient, _ = map(np.asarray, look(found, scene.surfels, light, drawn, slots=slots))
+    target = averaged(image, side)
+    shown = target[..., 3].reshape(drawn.height, scale, drawn.width, scale).max(axis=(1, 3))
+    inside = (seen[..., 0] > FAINT) | (shown > 0)
+    if not inside.any():
+        return None
+    rows, columns = _around(inside.any(axis=1)), _around(inside.any(axis=0))
+    return doublings, {
+        "seen": seen[rows, columns].astype(np.float16),
+        "maps": np.clip(maps[rows, columns], -LARGEST, LARGEST).astype(np.float16),
+        "ambient": ambient,
+        "target": target[scale * rows.start : scale * rows.stop, scale * columns.start : scale * columns.stop],
+    }
+
+
+def averaged(image: UInt8[np.ndarray, "height width 4"], side: int) -> UInt8[np.ndarray, "h w 4"]:
+    """The picture `side` times smaller: each square's opacity, and its colour weighted by it."""
+    alpha = image[..., 3:].astype(np.float32) / 255
+    layers = np.concatenate([image[..., :3] / np.float32(255) * alpha, alpha], axis=-1)
+    height, width = (n // side for n in image.shape[:2])
+    means = layers.reshape(height, side, width, side, 4).mean(axis=(1, 3))
+    return to_uint8(np.concatenate([means[..., :3] / np.maximum(means[..., 3:], 1e-4), means[..., 3:]], axis=-1))
+
+
+def _around(inside: np.ndarray) -> slice:
+    """From the first to the last place that is inside, and a margin."""
+    first, last = np.flatnonzero(inside)[[0, -1]].tolist()
+    return slice(max(first - MARGIN, 0), min(last + 1 + MARGIN, len(inside)))
+
+
+def batches(views: list[View], config: TrainConfig, first_step: int) -> Generator[Crops, None, None]:
+    """Training batches from `first_step` on, assembled ahead."""
+    by_doublings: dict[int, list[View]] = {}
+    for view in views:
+        by_doublings.setdefault(view.doublings, []).append(view)
+    assemble: Callable[[int], Crops] = partial(make_batch, by_doublings, config)
+    yield from read_ahead(assemble, first_step, config.num_steps)
+
+
+def make_batch(views: dict[int, list[View]], config: TrainConfig, step: int) -> Crops:
+    """The batch of a step: crops of random views, by doublings, mirrored or not."""
+    generator = np.random.default_rng((config.seed, CROP, step))
+    shares = np.array([SHARES[doublings] for doublings in sorted(views)])
+    doublings = int(generator.choice(sorted(views), p=shares / shares.sum()))
+    size = -(-config.crop * SIZES[doublings] // SIZES[0])
+    crops = []
+    for _ in range(max(config.batch_objects // (2 if doublings >= HALVED else 1), 1)):
+        view = views[doublings][generator.integers(len(views[doublings]))]
+        crop = cropped(read_view(view), size, 2**doublings, generator)
+        for axis in (0, 1):
+            crop = mirrored(crop, axis) if generator.random() < 0.5 else crop
+        crops.append(crop)
+    return Crops(**{name: np.stack([crop[name] for crop in crops]) for name in NAMES}, doublings=doublings)
+
+
+def read_view(view: View) -> Arrays:
+    """The arrays of a view; ValueError if its file cannot be read."""
+    try:
+        with view.path.open("rb") as file:
+            arrays = read_arrays(file, [f"{name}{view.number}" for name in NAMES])
+    except ValueError as error:
+        raise ValueError(f"{view.path}: {error}; remove it, and the same command makes it again") from None
+    return {name: arrays[f"{name}{view.number}"] for name in NAMES}
+
+
+def cropped(view: Arrays, size: int, scale: int, generator: np.random.Generator) -> Arrays:
+    """A square of a view that shows something of the object; empty beyond the view's ends."""
+    seen = view["seen"]
+    for _ in range(TRIES):
+        top, left = (int(generator.integers(0, max(n - size, 0) + 1)) for n in seen.shape[:2])
+        if np.mean(seen[top : top + size, left : left + size, 0] > DRAWN) > COVERED:
+            break
+
+    def cut(values: np.ndarray, scale: int) -> np.ndarray:
+        part = values[scale * top : scale * (top + size), scale * left : scale * (left + size)]
+        return np.pad(part, [(0, scale * size - n) for n in part.shape[:2]] + [(0, 0)])
+
+    return {
+        "seen": cut(seen, 1).astype(np.float32),
+        "maps": cut(view["maps"], 1).astype(np.float32),
+        "ambient": view["ambient"],
+        "target": cut(view["target"], scale),
+    }
+
+
+def mirrored(view: Arrays, axis: int) -> Arrays:
+    """The view of object, camera and light mirrored along x (axis 0) or y (axis 1) of the camera."""
+    flipped = {name: np.flip(view[name], 1 - axis) for name in ("seen", "maps", "target")}
+    return {
+        **flipped,
+        "seen": flipped["seen"] * _signs(features.NUM_FEATURES, features.ODD[axis]),
+        "ambient": view["ambient"] * _signs(lighting.SH_BANDS, lighting.ODD[axis])[:, None],
+    }
+
+
+def _signs(count: int, odd: tuple[int, ...]) -> Float[np.ndarray, " count"]:
+    return np.where(np.isin(np.arange(count), odd), -1, 1).astype(np.float32)

@@ -1,0 +1,76 @@
+"""What the training loop need not know of a network: its batches and its step.
+
+There are two kinds: networks that learn from whole views of clouds (`of_views`: the paper's, ours near points, the
+baselines), and the shader network, which learns from crops of G-buffers (`of_gbuffers`).
+"""
+
+from collections.abc import Callable, Generator
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+from jax.sharding import Mesh
+
+from spnr_jax.config import TrainConfig
+from spnr_jax.devices import placement
+from spnr_jax.formats.data_sets import Dataset
+from spnr_jax.kernels.records import Crops, Light
+from spnr_jax.surfels import lighting
+from spnr_jax.training import batching, gbuffers, optimisation, shading
+from spnr_jax.training.optimisation import TrainState
+from spnr_jax.training.weights import Trained, write_weights
+
+ROOM = "procedural room"  # as the generator of data sets calls it
+
+
+class Work(NamedTuple):
+    """What a kind of network gives the loop."""
+
+    batches: Callable[[int], Generator[Any, None, None]]  # from a step on
+    step: Callable[[TrainState, Any, int], tuple[TrainState, dict]]  # with the step's number
+    finish: Callable[[TrainState], object] = lambda state: None  # called with the last state
+
+
+def of_views(config: TrainConfig, dataset: Dataset, mesh: Mesh | None, own: range | None) -> Work:
+    """Of a network that renders whole views; a mesh's devices share the objects of a batch."""
+    adversarial_from = optimisation.first_adversarial_step(config)
+
+    def step(state: TrainState, batch: Any, number: int) -> tuple[TrainState, dict]:
+        with placement.using(mesh):
+            batch = placement.placed(batch, mesh, config.batch_objects)
+            adversarial = number >= adversarial_from
+            return optimisation.jitted_train_step(state, batch, config=config, adversarial=adversarial)
+
+    return Work(partial(batching.batches, dataset, config, own=own), step)
+
+
+def of_gbuffers(config: TrainConfig, dataset: Dataset, run: Path, light: Light) -> Work:
+    """Of the shader network: G-buffers that are missing in the run folder are made first, which takes a while.
+
+    The averaged weights are written to the run folder at the end.  All devices of a process do the same work.
+    """
+    if jax.process_count() > 1:
+        raise ValueError(f"preset {config.preset} trains in one process; start it without --distributed")
+    views = gbuffers.complete(dataset, light, config, run / "gbuffers")
+
+    def step(state: TrainState, crops: Crops, number: int) -> tuple[TrainState, dict]:
+        return shading.jitted_train_step(state, crops, config=config)
+
+    def finish(state: TrainState) -> None:
+        variables = placement.on_this_process(optimisation.averaged_variables(state))
+        write_weights(run / "weights.npz", Trained(config=config, variables=variables, steps=int(state.step)))
+
+    return Work(partial(gbuffers.batches, views, config), step, finish)
+
+
+def light_of(dataset: Dataset) -> Light:
+    """The light of a data set's pictures; ValueError if it is another than the room, whose map alone is at hand."""
+    described = dataset.settings.get("environment_map")
+    name = described.get("name", ROOM) if isinstance(described, dict) else ROOM
+    if name != ROOM:
+        raise ValueError(
+            f"{dataset.folder}: lit by {name}, and the command trains in the {ROOM} alone; give the light of that map "
+            "to spnr_jax.training.trainer.train"
+        )
+    return lighting.room_light()

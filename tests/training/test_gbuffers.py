@@ -1,0 +1,167 @@
+"""G-buffers on disk are a function of (seed, object, cloud), batches one of (seed, step); mirrored pairs stay pairs."""
+
+import dataclasses
+import shutil
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support import tiny_surfels
+from support.laws import close, same_bits
+from support.tiny_surfels import CONFIG, LIGHT, NAME
+
+from spnr_jax.formats import data_sets
+from spnr_jax.kernels.cameras import pinhole
+from spnr_jax.kernels.records import Crops, Surfels
+from spnr_jax.method import surfel_renderer
+from spnr_jax.surfels import features, lighting, splatting
+from spnr_jax.surfels.visibility import DIRECTIONS
+from spnr_jax.training import gbuffers, optimisation, shading
+
+AXES = pytest.mark.parametrize("axis", [0, 1])
+
+
+def grouped(views):
+    return {d: [view for view in views if view.doublings == d] for d in {view.doublings for view in views}}
+
+
+def made(seed, number):
+    item = data_sets.read_object(tiny_surfels.dataset(), NAME)
+    return gbuffers.make(item, number, LIGHT, dataclasses.replace(CONFIG, seed=seed))
+
+
+def test_a_file_is_what_its_seed_object_and_cloud_make_of_it():
+    path = next(view.path for view in tiny_surfels.views())
+    number = int(path.name.split(".")[1])
+    with np.load(path) as file:
+        again = made(CONFIG.seed, number)
+        assert set(again) == set(file)
+        assert all(np.array_equal(again[name], file[name]) for name in file)
+        others = made(CONFIG.seed, number + 1), made(CONFIG.seed + 1, number)
+        assert all(not np.array_equal(other.get("seen0"), file["seen0"]) for other in others)
+
+
+def test_a_file_cut_off_by_a_crash_is_made_again_and_no_other_one(tmp_path):
+    views = tiny_surfels.views()
+    folder = shutil.copytree(views[0].path.parent, tmp_path / "gbuffers")
+    broken = folder / views[0].path.name
+    whole = broken.read_bytes()
+    broken.write_bytes(whole[: len(whole) // 2])
+    written = {path: path.stat().st_mtime_ns for path in folder.iterdir()}
+    again = gbuffers.complete(tiny_surfels.dataset(), LIGHT, CONFIG, folder)
+    assert [view._replace(path=view.path.name) for view in again] == [v._replace(path=v.path.name) for v in views]
+    assert broken.read_bytes() == whole
+    assert {path for path in folder.iterdir() if path.stat().st_mtime_ns != written[path]} == {broken}
+
+
+def test_a_file_that_breaks_later_is_named_with_the_remedy(tmp_path):
+    path = shutil.copy(tiny_surfels.views()[0].path, tmp_path / "a.npz")
+    path.write_bytes(path.read_bytes()[:-30])
+    with pytest.raises(ValueError, match=r"a\.npz: is a broken.*remove it"):
+        gbuffers.read_view(gbuffers.View(path, 0, 0))
+
+
+def test_batches_are_a_function_of_seed_and_step():
+    views = tiny_surfels.views()
+    whole = list(gbuffers.batches(views, CONFIG, 0))
+    assert len(whole) == CONFIG.num_steps
+    for a, b in zip(gbuffers.batches(views, CONFIG, 2), whole[2:], strict=True):
+        assert a.doublings == b.doublings
+        same_bits(a, b)
+    other = gbuffers.make_batch(grouped(views), dataclasses.replace(CONFIG, seed=1), 0)
+    assert other.doublings != whole[0].doublings or not np.array_equal(other.seen, whole[0].seen)
+
+
+def test_steps_meet_every_resolution_in_its_share_with_crops_of_its_size(monkeypatch):
+    view = gbuffers.read_view(tiny_surfels.views()[0])
+    monkeypatch.setattr(gbuffers, "read_view", lambda view: view)
+    monkeypatch.setattr(gbuffers, "cropped", lambda view, size, scale, generator: view | {"seen": view["seen"][:1]})
+    steps = [gbuffers.make_batch({d: [view] for d in range(5)}, CONFIG, step).doublings for step in range(400)]
+    np.testing.assert_allclose(np.bincount(steps) / 400, gbuffers.SHARES, atol=0.06)
+
+
+def test_a_crop_shows_the_same_place_in_what_is_seen_and_in_the_reference():
+    rows, columns = np.mgrid[:7, :9]
+    place = (10 * rows + columns + 1)[..., None]
+    fine = np.repeat(np.repeat(place, 4, axis=0), 4, axis=1)
+    view = {"seen": place / 100, "maps": place, "ambient": np.zeros((9, 3)), "target": fine.astype(np.uint8)}
+    for seed in range(8):
+        crop = gbuffers.cropped(view, 8, 4, np.random.default_rng(seed))
+        assert crop["seen"].shape == (8, 8, 1)
+        np.testing.assert_allclose(100 * crop["seen"], crop["target"][::4, ::4], atol=1e-4)
+        np.testing.assert_array_equal(crop["maps"], crop["target"][2::4, 2::4])
+        assert (crop["maps"][7] == 0).all(), "the view has seven rows"
+
+
+def test_a_smaller_reference_is_the_mean_of_what_is_seen_on_white():
+    image = np.random.default_rng(3).integers(0, 256, (8, 12, 4), np.uint8)
+    means = data_sets.on_white(image).reshape(2, 4, 3, 4, 3).mean(axis=(1, 3))
+    np.testing.assert_allclose(data_sets.on_white(gbuffers.averaged(image, 4)), means, atol=1.1 / 255)
+    np.testing.assert_array_equal(gbuffers.averaged(image, 1)[image[..., 3] > 0], image[image[..., 3] > 0])
+
+
+@AXES
+def test_mirroring_leaves_the_loss_of_the_untrained_network_as_it_is(axis):
+    params, kept = optimisation.create_state(CONFIG).generator, tiny_surfels.views()[0]
+    view = gbuffers.read_view(kept)
+    whole = gbuffers.cropped(view, max(view["seen"].shape[:2]), 2**kept.doublings, np.random.default_rng(0))
+    turned = gbuffers.mirrored(whole, axis)
+    losses = [
+        shading.loss(params, Crops(**{k: x[None] for k, x in one.items()}, doublings=kept.doublings), config=CONFIG)[0]
+        for one in (whole, turned)
+    ]
+    np.testing.assert_allclose(*losses, rtol=1e-5)
+    assert not np.array_equal(whole["target"], turned["target"])
+    assert not np.array_equal(whole["seen"], turned["seen"])
+    same_bits(gbuffers.mirrored(turned, axis), whole)
+
+
+@AXES
+def test_a_mirrored_object_is_seen_as_the_mirrored_view(axis):
+    """Every number of it: the signs of vectors, which the untrained network does not look at, too."""
+    rng, mirror = np.random.default_rng(5), np.where(np.arange(3) == axis, -1, 1).astype(np.float32)
+    normal = rng.normal(size=(60, 3)).astype(np.float32)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    color = rng.random((60, 3), np.float32)
+    pose = jnp.concatenate([jnp.eye(3), jnp.array([[0.0], [0.0], [3.0]])], axis=1)
+    camera, seen = pinhole(pose, 0.7, 24, 24), []
+    for sign in (np.ones(3, np.float32), mirror):
+        surfels = Surfels(
+            position=0.8 * normal * sign,
+            normal=normal * sign,
+            spacing=np.full(60, 0.4, np.float32),
+            base_color=color,
+            gradient=np.zeros((60, 3, 3), np.float32),
+            roughness=color[:, 0],
+            metallic=color[:, 1],
+            sided=np.ones(60, np.float32),
+            visible=np.maximum((normal * sign) @ DIRECTIONS.T, 0),
+            shape=color[:, :2],
+            mask=np.ones(60, bool),
+        )
+        found, slots = splatting.entries(surfels, camera, total=2**14)
+        seen.append(np.asarray(gbuffers.look(found, surfels, LIGHT, camera, slots=24 * 24)[0]))
+    view = {"seen": seen[0], "maps": seen[0], "target": seen[0], "ambient": np.zeros((9, 3))}
+    np.testing.assert_allclose(gbuffers.mirrored(view, axis)["seen"], seen[1], atol=0.05)
+    assert np.abs(seen[1][..., features.ODD[axis]]).mean() > 0.1
+
+
+@AXES
+def test_harmonics_of_the_mirrored_light_are_the_mirrored_ones(axis):
+    towards = np.random.default_rng(2).normal(size=(3, 50)).astype(np.float32)
+    towards /= np.linalg.norm(towards, axis=0)
+    turned = towards * np.where(np.arange(3) == axis, -1, 1)[:, None].astype(np.float32)
+    view = {name: np.zeros((2, 2, features.NUM_FEATURES)) for name in ("seen", "maps", "target")}
+    basis = np.stack(lighting.harmonics(*jnp.asarray(towards)))
+    expected = gbuffers.mirrored(view | {"ambient": basis}, axis)["ambient"]
+    close(np.stack(lighting.harmonics(*jnp.asarray(turned))), expected, atol=1e-6)
+
+
+def test_points_too_far_apart_or_too_near_for_the_reference_teach_nothing():
+    item = data_sets.read_object(tiny_surfels.dataset(), NAME)
+    camera = jax.tree.map(lambda x: x[0], item.camera)
+    scene = surfel_renderer.encode(item.cloud)
+    for spacing in (3.0, 0.01):  # G-buffers of three pixels, and pictures of twice the reference's size
+        other = dataclasses.replace(scene, spacing=spacing)
+        assert gbuffers.make_view(other, camera, item.images[0], 1, LIGHT) is None

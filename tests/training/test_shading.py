@@ -1,0 +1,109 @@
+"""Training of the shader network: a step learns, a stopped run goes on to the same bits, its file is a network."""
+
+import dataclasses
+import signal
+
+import jax
+import numpy as np
+import pytest
+from support import tiny_surfels
+from support.laws import close, same_bits
+from support.tiny_surfels import CONFIG, LIGHT, SCHEDULE
+
+import spnr_jax
+from spnr_jax.model_config import SurfelConfig
+from spnr_jax.surfels import lighting
+from spnr_jax.training import checkpoint, gbuffers, optimisation, shading, trainer, work
+
+
+def rows_without_time(run):
+    return [{k: v for k, v in row.items() if k != "ms_per_step"} for row in trainer.read_rows(run)]
+
+
+def interrupted(monkeypatch, step):
+    real = gbuffers.batches
+
+    def batches(views, config, first):
+        for i, batch in enumerate(real(views, config, first), start=first):
+            if i + 1 == step:
+                signal.raise_signal(signal.SIGTERM)
+            yield batch
+
+    monkeypatch.setattr(gbuffers, "batches", batches)
+
+
+def test_steps_lower_the_loss_on_one_object():
+    config = dataclasses.replace(CONFIG, num_steps=40)
+    state, losses = optimisation.create_state(config), []
+    crops = next(iter(gbuffers.batches(tiny_surfels.views(), config, 0)))
+    for _ in range(30):
+        state, metrics = shading.jitted_train_step(state, crops, config=config)
+        losses.append(float(metrics["loss"]))
+    assert losses[-1] < 0.6 * losses[0]
+    assert float(shading.loss(state.averaged, crops, config=config)[0]) < losses[0]
+
+
+def test_the_loss_is_the_sum_of_its_weighted_errors():
+    crops = next(iter(gbuffers.batches(tiny_surfels.views(), CONFIG, 0)))
+    params, terms = optimisation.create_state(CONFIG).generator, {}
+    value, metrics = shading.loss(params, crops, config=CONFIG)
+    names = "l1_weight", "mse_weight", "opacity_weight", "opacity_l1_weight"
+    for name in names:
+        weights = dataclasses.replace(CONFIG.loss, **(dict.fromkeys(names, 0.0) | {name: 1.0}))
+        terms[name] = float(shading.loss(params, crops, config=dataclasses.replace(CONFIG, loss=weights))[0])
+    assert min(terms.values()) > 0
+    assert float(value) == pytest.approx(sum(getattr(CONFIG.loss, name) * terms[name] for name in names), rel=1e-5)
+    assert terms["l1_weight"] == pytest.approx(float(metrics["l1"]))
+    assert terms["opacity_weight"] == pytest.approx(float(metrics["mse_opacity"]))
+
+
+def test_a_stopped_run_goes_on_to_the_same_bits_and_rows(monkeypatch, tmp_path):
+    with monkeypatch.context() as patch:
+        interrupted(patch, 3)
+        with pytest.raises(KeyboardInterrupt, match="stopped at step 3 of 4"):
+            trainer.train(CONFIG, tiny_surfels.dataset(), tmp_path, SCHEDULE, light=LIGHT)
+    assert not (tmp_path / "weights.npz").exists()
+    trainer.train(CONFIG, tiny_surfels.dataset(), tmp_path, SCHEDULE, light=LIGHT)
+    same_bits(checkpoint.restore(tmp_path, CONFIG), checkpoint.restore(tiny_surfels.run(), CONFIG))
+    assert rows_without_time(tmp_path) == rows_without_time(tiny_surfels.run())
+    assert (tmp_path / "weights.npz").read_bytes() == (tiny_surfels.run() / "weights.npz").read_bytes()
+
+
+def test_the_run_and_the_file_that_it_ends_with_are_one_network():
+    of_run, of_file = spnr_jax.load(tiny_surfels.run()), spnr_jax.load(tiny_surfels.run() / "weights.npz")
+    assert isinstance(of_file.config, SurfelConfig)
+    assert of_run.config == of_file.config == CONFIG.model
+    close(of_file.variables, jax.tree.map(np.asarray, of_run.variables), rtol=1e-3, atol=1e-4)
+    assert "val_psnr" in trainer.read_rows(tiny_surfels.run())[-1]
+
+
+def test_a_loss_that_is_not_finite_stops_the_run_and_names_the_step(monkeypatch, tmp_path):
+    real = gbuffers.make_batch
+
+    def poisoned(views, config, step):
+        crops = real(views, config, step)
+        return dataclasses.replace(crops, maps=crops.maps * np.float32(np.nan)) if step == 1 else crops
+
+    monkeypatch.setattr(gbuffers, "make_batch", poisoned)
+    with pytest.raises(trainer.NotFinite, match=r"is nan at step 2; the last checkpoint is kept"):
+        trainer.train(CONFIG, tiny_surfels.dataset(), tmp_path, SCHEDULE, light=LIGHT)
+
+
+def test_a_gradient_longer_than_the_configs_norm_counts_as_one_of_that_norm():
+    optimizer = dataclasses.replace(CONFIG.optimizer, clip_norm=0.0)
+    clipping, _ = optimisation.optimizers(CONFIG)
+    plain, _ = optimisation.optimizers(dataclasses.replace(CONFIG, optimizer=optimizer))
+    for length, counted in ((40.0, 1.0), (0.5, 0.5)):
+        (_, moments), (_, expected) = (
+            adam.update({"a": np.float32([0, size])}, adam.init({"a": np.zeros(2, np.float32)}))
+            for adam, size in ((clipping, length), (plain, counted))
+        )
+        close(moments, jax.tree.map(np.asarray, expected))
+
+
+def test_the_room_is_the_light_where_a_data_set_names_no_other_one():
+    dataset = tiny_surfels.dataset()
+    assert work.light_of(dataset) is lighting.room_light()
+    other = dataclasses.replace(dataset, settings={"environment_map": {"name": "forest.hdr"}})
+    with pytest.raises(ValueError, match=r"lit by forest\.hdr"):
+        work.light_of(other)
