@@ -6,7 +6,7 @@ The networks draw the test objects of a data set (`spnr-data generate --spread e
 from so many of each object's first points, beside the same discs and light without a network (`draft`).  A ball of one
 grey should be smooth, a plate red in front should show no blue.
 
-    OUT/results.json  OUT/table.md .csv .tex     scores (`scoring/sharpness.py`) of each network and number of points
+    OUT/results.json  OUT/table.md .csv .tex     scores (`scoring/picture_scores.py`) of each network and number of points
     OUT/gallery.png   OUT/ID.png                 references and pictures beside each other, at full size
 """
 
@@ -32,7 +32,7 @@ from spnr_jax.kernels.resizing import mean_of_squares
 from spnr_jax.method.model import Model, Quality
 from spnr_jax.model_config import SurfelConfig
 from spnr_jax.scoring import intervals
-from spnr_jax.scoring.sharpness import Sharpness, ball, ball_waves, blue_share, plate, sharpness
+from spnr_jax.scoring.picture_scores import Sharpness, ball, ball_waves, blue_share, plate, sharpness
 from spnr_jax.training.weights import load
 
 DECIMALS = Sharpness(psnr=2, psnr_inside=2, outline_rmse=3, holes=2, detail=3)
