@@ -80,7 +80,7 @@ def render(
     inside = _seen_through(small, plan)
     found, slots = splatting.entries(scene.surfels, inside, total=_rounded(int(total), 2**15, splatting.MOST_ENTRIES))
     most = inside.height * inside.width
-    slots = min(_rounded(int(slots), 2**11, most), most)
+    slots = min(_rounded(int(slots), 2**11, splatting.MOST_ENTRIES), most)
     drawn = _shade(variables, found, scene.surfels, light, inside, config=config, doublings=doublings, slots=slots)
     return _placed(drawn, camera, plan)
 
