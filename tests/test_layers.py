@@ -24,7 +24,13 @@ DATA_GEN = (
     *("shapes", "procedural", "render", "store", "plan/sources", "plan", "make"),
     *("__main__", "command", "__init__"),
 )
-ORDER = [f"spnr_jax/{entry}" for entry in SPNR_JAX] + [f"data_gen/{entry}" for entry in DATA_GEN] + ["experiments"]
+QUESTIONS = ("paper", "studies", "speed", "packaged")  # folders of experiments, of which none knows another
+EXPERIMENTS = ("__init__", "entry_point", "comparison", *QUESTIONS)
+ORDER = [
+    f"{package}/{entry}"
+    for package, entries in {"spnr_jax": SPNR_JAX, "data_gen": DATA_GEN, "experiments": EXPERIMENTS}.items()
+    for entry in entries
+]
 PURE = ("kernels", "surfels", "nn", "baselines", "method")
 WITHOUT_JIT = ("devices", "kernels", "nn", "baselines")
 OF_SPNR_JAX = {
@@ -58,10 +64,8 @@ def parsed(path: Path) -> ast.Module:
 
 
 def entry_of(path: Path) -> str:
-    """The folder of a file from the root, or the file itself at the top of a package; experiments are one entry."""
+    """The folder of a file from the root, or the file itself at the top of a package."""
     place = path.relative_to(ROOT)
-    if place.parts[0] == "experiments":
-        return "experiments"
     if place.parts[0] == "data_gen" and place.parts[1] == "procedural":
         return "data_gen/procedural"
     return place.parent.as_posix() if len(place.parts) > 2 else place.with_suffix("").as_posix()
@@ -93,7 +97,7 @@ def test_imports_point_down_the_folders(path):
         assert above, f"{here} imports {there.relative_to(ROOT)}, which stands below it in the list"
 
 
-@pytest.mark.parametrize("entry", [entry for entry in ORDER if entry != "experiments"])
+@pytest.mark.parametrize("entry", ORDER)
 def test_the_files_of_a_folder_do_not_import_each_other_in_a_circle(entry):
     files = [path for path in PACKAGE if entry_of(path) == entry]
     graph = {path: own_imports(path) & set(files) - {path} for path in files}
@@ -113,6 +117,12 @@ def test_data_gen_stands_on_kernels_and_formats_alone(path):
     assert not {name.split(".")[0] for name in imports(parsed(path))} & {"experiments"}
     entries = {entry_of(there) for there in own_imports(path)}
     assert {entry for entry in entries if entry.startswith("spnr_jax/")} <= OF_SPNR_JAX
+
+
+@pytest.mark.parametrize("folder", QUESTIONS)
+def test_an_experiment_knows_no_other_question(folder):
+    entries = {entry_of(there) for path in sources(f"experiments/{folder}") for there in own_imports(path)}
+    assert not entries & {f"experiments/{other}" for other in QUESTIONS if other != folder}
 
 
 @pytest.mark.parametrize("path", [path for folder in PURE for path in sources(f"spnr_jax/{folder}")], **named)
@@ -136,7 +146,7 @@ def test_what_programs_are_made_of_is_not_compiled_by_itself():
 
 
 def test_the_tops_of_the_packages_hold_at_most_six_files():
-    for package in ("spnr_jax", "data_gen"):
+    for package in ("spnr_jax", "data_gen", "experiments"):
         assert len(list((ROOT / package).glob("*.py"))) <= 6
 
 

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from experiments.comparison.scoring import Shown
-from experiments.comparison.tables import Table
+from experiments.comparison.object_scores import Shown
+from experiments.comparison.result_tables import Table
 from spnr_jax.formats.images import png
 from spnr_jax.scoring.report_style import STYLE
 

@@ -19,10 +19,10 @@ import jax
 import numpy as np
 
 from experiments.comparison import budget as budgets
-from experiments.comparison import results
+from experiments.comparison import results_folder
 from experiments.comparison.budget import Trained
-from experiments.comparison.networks import test_objects
-from experiments.comparison.scoring import Shown, of_cloud, score_objects
+from experiments.comparison.object_scores import Shown, of_cloud, score_objects
+from experiments.comparison.trained_networks import test_objects
 from spnr_jax.config import TrainConfig
 from spnr_jax.formats import data_sets
 from spnr_jax.kernels import metrics
@@ -124,7 +124,7 @@ def claim(out: Path, what: str, budget: Budget, dataset: data_sets.Dataset, **mo
         asked |= {"steps": None, "minutes": budget.minutes}
     if budget.even_share:
         asked |= {"even_share": budget.even_share}
-    results.claim(out, what, asked, dataset)
+    results_folder.claim(out, what, asked, dataset)
 
 
 def train(variants: Sequence[Variant], budget: Budget, out: Path) -> dict[str, list[Run]]:

@@ -12,8 +12,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from experiments.comparison import figures, results, variants
-from experiments.comparison.tables import Cell, Table, number, text
+from experiments.comparison import figures, results_folder, variants
+from experiments.comparison.result_tables import Cell, Table, number, text
 from experiments.comparison.variants import OPAQUE, Budget, Compared, Variant
 from spnr_jax.devices import machine
 from spnr_jax.formats import data_sets, images
@@ -45,7 +45,7 @@ def write(
     files = {"gallery.png": gallery({variant.name: variant.label for variant in trained}, compared)}
     if len(trained) > 1:
         files["differences.png"] = differences_plot(found)
-    results.write(out, found, tables_of(found), notes(found), files)
+    results_folder.write(out, found, tables_of(found), notes(found), files)
 
 
 def numbers(

@@ -17,7 +17,7 @@ from typing import Any
 
 from data_gen.make.generate import generate
 from data_gen.plan.tasks import GenerateConfig
-from experiments import command
+from experiments import entry_point
 from spnr_jax import cli, presets
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.images import write_whole
@@ -112,4 +112,4 @@ def install_seconds() -> dict[str, float]:
 
 
 if __name__ == "__main__":
-    command.run(main, Demo, "packaged.demo")
+    entry_point.run(main, Demo, "packaged.demo")

@@ -21,7 +21,7 @@ from typing import Literal
 from data_gen.make.generate import generate
 from data_gen.plan.tasks import GenerateConfig
 from data_gen.store.layout import SPLITS
-from experiments import command
+from experiments import entry_point
 from experiments.packaged import refinement
 from experiments.packaged.demo import Seconds
 from spnr_jax import cli, presets
@@ -159,4 +159,4 @@ def joined(folder: Path, parts: list[Path]) -> Path:
 
 
 if __name__ == "__main__":
-    command.run(main, Pretrain, "packaged.pretrain")
+    entry_point.run(main, Pretrain, "packaged.pretrain")

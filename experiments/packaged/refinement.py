@@ -23,7 +23,7 @@ import optax
 from jaxtyping import Array, Float
 from tqdm import tqdm
 
-from experiments.comparison import results
+from experiments.comparison import results_folder
 from spnr_jax import presets
 from spnr_jax.config import TrainConfig
 from spnr_jax.formats import data_sets
@@ -55,7 +55,7 @@ def refined(trained: Trained, dataset: data_sets.Dataset, folder: Path, steps: i
     batching.check_spread(dataset, config)
     numbers = b"".join(np.asarray(x).tobytes() for x in jax.tree.leaves(trained.variables))
     asked = {"network": hashlib.sha256(numbers).hexdigest(), "even_share": config.even_share}
-    results.claim(folder, "pictures", asked, dataset)
+    results_folder.claim(folder, "pictures", asked, dataset)
     places = [folder / f"{name}.npz" for name in dataset.splits["train"]]
     for place in tqdm(places, desc="rendering", unit="object"):
         if not place.exists():

@@ -23,7 +23,7 @@ import jax
 import jax.numpy as jnp
 import tyro
 
-from experiments import command
+from experiments import entry_point
 from experiments.comparison import budget, variants, variants_report
 from experiments.comparison.variants import Budget, Variant
 from spnr_jax import cli
@@ -98,4 +98,4 @@ def pretrained(options: Fig1, dataset: data_sets.Dataset, config: TrainConfig) -
 
 
 if __name__ == "__main__":
-    command.run(main, Fig1, "paper.fig1")
+    entry_point.run(main, Fig1, "paper.fig1")

@@ -21,7 +21,7 @@ import tyro
 
 from data_gen.make.generate import generate
 from data_gen.plan.tasks import GenerateConfig
-from experiments import command
+from experiments import entry_point
 from experiments.comparison import figures, variants, variants_report
 from experiments.comparison.variants import Budget, Variant
 from spnr_jax import cli
@@ -128,4 +128,4 @@ def nearest_views(eyes: list[np.ndarray]) -> list[int]:
 
 
 if __name__ == "__main__":
-    command.run(main, Fig2, "paper.fig2")
+    entry_point.run(main, Fig2, "paper.fig2")

@@ -25,13 +25,13 @@ import tyro
 
 from data_gen.render import depth, poisson_surface
 from data_gen.render.variant import choose_variant, mitsuba_module
-from experiments import command
-from experiments.comparison import figures, networks, results
-from experiments.comparison.networks import LABELS, Sources
+from experiments import entry_point
+from experiments.comparison import figures, results_folder, trained_networks
 from experiments.comparison.poisson import SURFACES
-from experiments.comparison.results import kept
+from experiments.comparison.result_tables import Table, number, text
+from experiments.comparison.results_folder import kept
 from experiments.comparison.source_meshes import cast_views, mesh_of
-from experiments.comparison.tables import Table, number, text
+from experiments.comparison.trained_networks import LABELS, Sources
 from experiments.paper import depth_scores
 from experiments.paper.depth_scores import METRICS, OPAQUE
 from spnr_jax import cli
@@ -90,12 +90,12 @@ def main(options: Fig3) -> None:
     """Makes what is missing of depths and truth, then scores, table and picture."""
     cli.set_up_jax()
     dataset = data_sets.open_dataset(options.data)
-    names = networks.test_objects(dataset, 2 if options.quick else options.objects)
-    results.claim(options.out, "depths", {}, dataset)
+    names = trained_networks.test_objects(dataset, 2 if options.quick else options.objects)
+    results_folder.claim(options.out, "depths", {}, dataset)
     found, points = all_methods(options, dataset)
     mitsuba_module(choose_variant(options.variant)[0])
     for label, method in found.items():
-        results.claim(options.out / "depths" / label, f"depths of {label}", method.identity | {"points": points})
+        results_folder.claim(options.out / "depths" / label, f"depths of {label}", method.identity | {"points": points})
     scores: dict[str, list] = {name: [] for name in found}
     rows, shown = [], evaluation.spread(names, options.shown)
     for count, name in enumerate(names, start=1):
@@ -119,12 +119,14 @@ def main(options: Fig3) -> None:
     }
     heads = ["Reference", "True depth", *(f"{name}{end}" for name in found for end in (", depth", ", error"))]
     picture = figures.grid([cells for _, cells in rows], heads, [label for label, _ in rows], 128)
-    results.write(options.out, all_results, [table(all_results)], [NOTE, PICTURE], {"fig3_depth.png": png(picture)})
+    results_folder.write(
+        options.out, all_results, [table(all_results)], [NOTE, PICTURE], {"fig3_depth.png": png(picture)}
+    )
 
 
 def all_methods(options: Fig3, dataset: data_sets.Dataset) -> tuple[dict[str, Method], int]:
     """What shows depth: networks and surfaces, and the points that all are given."""
-    trained = networks.networks(options.sources, dataset)
+    trained = trained_networks.networks(options.sources, dataset)
     if left_out := [name for name, network in trained.items() if not network.has_depth]:
         print(f"left out, since they predict no depth: {', '.join(left_out)}")
     found = {name: of_network(network) for name, network in trained.items() if network.has_depth}
@@ -134,7 +136,7 @@ def all_methods(options: Fig3, dataset: data_sets.Dataset) -> tuple[dict[str, Me
     return found, next(iter(trained.values())).config.test_points
 
 
-def of_network(network: networks.Network) -> Method:
+def of_network(network: trained_networks.Network) -> Method:
     """The depth that a network renders."""
 
     def show(item: data_sets.ObjectData, cloud: PointCloud) -> tuple[np.ndarray, np.ndarray]:
@@ -227,4 +229,4 @@ def table(found: dict) -> Table:
 
 
 if __name__ == "__main__":
-    command.run(main, Fig3, "paper.fig3")
+    entry_point.run(main, Fig3, "paper.fig3")

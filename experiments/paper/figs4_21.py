@@ -22,11 +22,11 @@ import numpy as np
 import tyro
 
 from data_gen.store import layout
-from experiments import command
-from experiments.comparison import figures, networks, page, results
-from experiments.comparison.networks import LABELS, Network, Sources
+from experiments import entry_point
+from experiments.comparison import figures, page, results_folder, trained_networks
+from experiments.comparison.object_scores import Shown
 from experiments.comparison.poisson import SURFACES
-from experiments.comparison.scoring import Shown
+from experiments.comparison.trained_networks import LABELS, Network, Sources
 from spnr_jax import cli
 from spnr_jax.devices import machine
 from spnr_jax.formats import data_sets
@@ -66,11 +66,11 @@ def main(options: Gallery) -> None:
     """Makes the pictures that are missing, then sheets and page."""
     cli.set_up_jax()
     dataset = data_sets.open_dataset(options.data)
-    names = networks.test_objects(dataset, 3 if options.quick else options.objects)
+    names = trained_networks.test_objects(dataset, 3 if options.quick else options.objects)
     if note := shortage(dataset, options):
         print(note)
-    results.claim(options.out, "a gallery", {"view": options.view}, dataset)
-    trained = networks.networks(options.sources, dataset)
+    results_folder.claim(options.out, "a gallery", {"view": options.view}, dataset)
+    trained = trained_networks.networks(options.sources, dataset)
     points = next(iter(trained.values())).config.test_points
     shown = all_pictures(options, dataset, names, trained, points)
     scores = {label: [psnr(*pair) for pair in zip(row, shown[REFERENCE], strict=True)] for label, row in shown.items()}
@@ -87,7 +87,7 @@ def main(options: Gallery) -> None:
         "note": note,
     }
     files = {
-        "results.json": results.as_json(found),
+        "results.json": results_folder.as_json(found),
         "side_by_side.png": png(side_by_side(shown, options.columns)),
         "gallery.html": gallery_page(names, shown, scores, found).encode(),
     }
@@ -102,7 +102,7 @@ def all_pictures(
     """The picture of every object by the reference and by each method, in one view."""
     for label, network in trained.items():
         asked = network.identity | {"points": points}
-        results.claim(options.out / "pictures" / label, f"pictures of {label}", asked)
+        results_folder.claim(options.out / "pictures" / label, f"pictures of {label}", asked)
     surfaces = surface_folders(options.sources.table1, points, names)
     shown: dict[str, list[np.ndarray]] = {label: [] for label in (REFERENCE, *trained, *surfaces)}
     for number, name in enumerate(names, start=1):
@@ -112,7 +112,7 @@ def all_pictures(
         shown[REFERENCE].append(data_sets.on_white(item.images[options.view]))
         for label, network in trained.items():
             place = options.out / "pictures" / label / f"{name}.png"
-            shown[label].append(results.kept(place, partial(picture, network, item, options.view, points)))
+            shown[label].append(results_folder.kept(place, partial(picture, network, item, options.view, points)))
         for label, folder in surfaces.items():
             shown[label].append(data_sets.on_white(layout.read_image(folder / name / f"{options.view:03d}.png")))
         if number % 10 == 0 or number == len(names):
@@ -197,4 +197,4 @@ def gallery_page(names: tuple[str, ...], shown: dict[str, list[np.ndarray]], sco
 
 
 if __name__ == "__main__":
-    command.run(main, Gallery, "paper.figs4_21")
+    entry_point.run(main, Gallery, "paper.figs4_21")

@@ -20,11 +20,11 @@ from pathlib import Path
 from typing import Literal
 
 from data_gen.render.poisson_surface import pymeshlab
-from experiments import command
-from experiments.comparison import budget, page, poisson, results
+from experiments import entry_point
+from experiments.comparison import budget, page, poisson, results_folder
 from experiments.comparison.budget import NETWORKS, Budget, Trained
-from experiments.comparison.networks import LABELS, test_objects
-from experiments.comparison.scoring import ObjectMethod, Scored, Shown, by_category, of_cloud, score_objects
+from experiments.comparison.object_scores import ObjectMethod, Scored, Shown, by_category, of_cloud, score_objects
+from experiments.comparison.trained_networks import LABELS, test_objects
 from experiments.paper import table1_tables
 from spnr_jax import cli
 from spnr_jax.config import TrainConfig
@@ -93,7 +93,7 @@ def main(options: Table1) -> None:
     config = PRESETS[presets["ours"]]()  # its points and pixels are given to every method
     data_sets.check_resolution(first, config)
     asked = {name: getattr(options, name) for name in ("budget", "minutes", "seed")}
-    results.claim(options.out, "a table", asked, dataset)
+    results_folder.claim(options.out, "a table", asked, dataset)
     weights = None if options.lpips is None else read_weights(options.lpips)
     surfaces, missing = surface_methods(options, dataset, config)  # before hours of training: something may be amiss
     trained = train_networks(options, dataset, presets)
@@ -149,7 +149,7 @@ def write(out: Path, found: dict, shown: list[Shown]) -> None:
         for one in shown
     ]
     whole = page.page("Table 1: every method on the same unseen objects", tables, notes, named)
-    results.write(out, found, tables, notes, {"table1.html": whole.encode()})
+    results_folder.write(out, found, tables, notes, {"table1.html": whole.encode()})
 
 
 def surface_folder(options: Table1, config: TrainConfig, row: str) -> Path:
@@ -217,4 +217,4 @@ def costs(options: Table1, trained: dict[str, Trained], scored: Scored, config: 
 
 
 if __name__ == "__main__":
-    command.run(main, Table1, "paper.table1")
+    entry_point.run(main, Table1, "paper.table1")

@@ -3,8 +3,8 @@
 from collections.abc import Mapping
 
 from experiments.comparison.budget import QUICK_STEPS
-from experiments.comparison.networks import LABELS
-from experiments.comparison.tables import Cell, Table, number, text
+from experiments.comparison.result_tables import Cell, Table, number, text
+from experiments.comparison.trained_networks import LABELS
 from spnr_jax.scoring.report import ARROWS, QUALITY, duration
 from spnr_jax.scoring.summary import NO_WEIGHTS
 

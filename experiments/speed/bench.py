@@ -25,10 +25,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from experiments import command
-from experiments.comparison import results
+from experiments import entry_point
+from experiments.comparison import results_folder
 from experiments.speed import bench_report as report
-from experiments.speed.scene import BATCHES
+from experiments.speed.bench_scene import BATCHES
 from experiments.speed.worker import Worker, worker
 from spnr_jax.formats.images import write_whole
 
@@ -101,12 +101,12 @@ def main(options: Options) -> None:
     for done, row in enumerate(measured(options, todo, bool(variants)), start=1):
         row = setting | row | {"date": time.strftime("%Y-%m-%d")}
         kept[cell_of(row)] = row
-        write_whole(path, results.as_json(list(kept.values())))
+        write_whole(path, results_folder.as_json(list(kept.values())))
         left = (time.monotonic() - start) / done * (len(todo) - done)
         print(f"[{done}/{len(todo)}, about {left / 60:.0f} min left] {report.line(row)}", flush=True)
     rows = [kept[cell] for cell in cells_of(Options(), (*VARIANTS, ALONE)) if cell in kept]
     files = {"bench.png": report.plot(rows)}
-    results.write(options.out, {"rows": rows}, [report.table(rows)], report.settings(rows), files)
+    results_folder.write(options.out, {"rows": rows}, [report.table(rows)], report.settings(rows), files)
 
 
 def twin_variants(options: Options) -> tuple[str, ...]:
@@ -237,4 +237,4 @@ def read_rows(path: Path) -> list[Row]:
 
 
 if __name__ == "__main__":
-    command.run(main, Options, "speed.bench")
+    entry_point.run(main, Options, "speed.bench")

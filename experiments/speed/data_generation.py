@@ -20,9 +20,9 @@ from data_gen.make.objects import Workbench, load_asset, make_and_write, object_
 from data_gen.plan.tasks import GenerateConfig, Task, plan_objects
 from data_gen.render import views
 from data_gen.render.variant import choose_variant, mitsuba_module
-from experiments import command
-from experiments.comparison import results
-from experiments.comparison.tables import Table, number
+from experiments import entry_point
+from experiments.comparison import results_folder
+from experiments.comparison.result_tables import Table, number
 from spnr_jax.devices import machine
 from spnr_jax.formats.mesh import surface_points
 from spnr_jax.scoring.report import psnr
@@ -72,7 +72,7 @@ def main(options: DataGeneration) -> None:
     rows = tuple((f"{samples} samples", (number(a, 1), number(b, 1))) for samples, (a, b) in noise.items())
     tables.append(Table(title="Noise", heads=("median, dB", "10th percentile, dB"), rows=rows))
     facts = {"hardware": machine.hardware(), "variant": variant, "seconds": seconds, "noise": noise}
-    results.write(options.out, facts, tables, [f"{variant}, {facts['hardware']}"])
+    results_folder.write(options.out, facts, tables, [f"{variant}, {facts['hardware']}"])
 
 
 def speeds(seconds: dict[str, float]) -> tuple:
@@ -118,4 +118,4 @@ def picture(scene, pose: np.ndarray, config: views.ViewConfig, samples: int, fir
 
 
 if __name__ == "__main__":
-    command.run(main, DataGeneration, "speed.data_generation")
+    entry_point.run(main, DataGeneration, "speed.data_generation")

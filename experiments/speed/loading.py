@@ -26,9 +26,9 @@ import tyro
 from tqdm import tqdm
 
 from data_gen.store.pack import PackConfig, pack
-from experiments import command
-from experiments.comparison import results
-from experiments.comparison.tables import Table, number, text
+from experiments import entry_point
+from experiments.comparison import results_folder
+from experiments.comparison.result_tables import Table, number, text
 from spnr_jax import cli, presets
 from spnr_jax.config import TrainConfig
 from spnr_jax.devices import machine
@@ -73,7 +73,7 @@ def main(options: Loading) -> None:
     if not rows:
         raise ValueError(f"{options.dataset}: no preset of {', '.join(options.presets)} has images of {size} px")
     found = {"hardware": machine.hardware(), "image_size": size, "rows": rows}
-    results.write(options.out / str(size), found, [table(rows)], [machine.hardware()])
+    results_folder.write(options.out / str(size), found, [table(rows)], [machine.hardware()])
 
 
 def image_size(dataset: data_sets.Dataset) -> int:
@@ -139,4 +139,4 @@ def table(rows: list[dict]) -> Table:
 
 
 if __name__ == "__main__":
-    command.run(main, Loading, "speed.loading")
+    entry_point.run(main, Loading, "speed.loading")

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.speed import scene, twin_layout, worker
+from experiments.speed import bench_scene, twin_layout, worker
 from spnr_jax.config import TrainConfig
 from spnr_jax.devices import allocator
 from spnr_jax.kernels.records import Batch
@@ -65,8 +65,8 @@ def twin_sized(preset: str, mode: str = "train", objects: int = 1) -> TrainConfi
         loss=loss,
         batch_objects=objects,
         views_per_object=1,
-        min_points=scene.NUM_POINTS,
-        max_points=scene.NUM_POINTS,
+        min_points=bench_scene.NUM_POINTS,
+        max_points=bench_scene.NUM_POINTS,
     )
 
 
@@ -80,7 +80,7 @@ def near_points(config: TrainConfig) -> TrainConfig:
 
 def batch(config: TrainConfig) -> Batch:
     """The benchmark's scene on the device."""
-    found = scene.arrays(config.batch_objects, config.model.image_resolution, config.max_points)
+    found = bench_scene.arrays(config.batch_objects, config.model.image_resolution, config.max_points)
     return jax.device_put(twin_layout.batch(found))
 
 

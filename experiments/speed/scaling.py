@@ -22,9 +22,9 @@ import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
 
-from experiments import command
-from experiments.comparison import figures, results
-from experiments.comparison.tables import Table, number, text
+from experiments import entry_point
+from experiments.comparison import figures, results_folder
+from experiments.comparison.result_tables import Table, number, text
 from experiments.speed import ours, worker
 from spnr_jax import cli
 from spnr_jax.config import TrainConfig
@@ -127,14 +127,14 @@ def main(options: Options) -> None:
     """Measures every axis that is not measured yet, a line for each value."""
     cli.set_up_jax()
     out = options.out.with_name(f"{options.out.name}-quick") if options.quick else options.out
-    results.claim(out, "costs", {"preset": options.preset})
+    results_folder.claim(out, "costs", {"preset": options.preset})
     found, names = [], list[str](options.only or SWEEPS)
     for name in names:
-        found.append(results.kept(out / f"{name}.json", partial(measure, name, options)))
+        found.append(results_folder.kept(out / f"{name}.json", partial(measure, name, options)))
         print(f"{name}: slope {found[-1]['slope']:.2f}, last step {found[-1]['last_slope']:.2f}", flush=True)
     setting = {"hardware": machine.hardware(), "date": time.strftime("%Y-%m-%d"), "preset": options.preset}
     note = f"preset {options.preset}, {setting['hardware']}, {setting['date']}"
-    results.write(out, setting | {"axes": found}, [table(found)], [note], {"scaling.png": plot(found)})
+    results_folder.write(out, setting | {"axes": found}, [table(found)], [note], {"scaling.png": plot(found)})
 
 
 def measure(name: str, options: Options) -> dict[str, Any]:
@@ -193,4 +193,4 @@ def plot(found: Sequence[dict]) -> Figure:
 
 
 if __name__ == "__main__":
-    command.run(main, Options, "speed.scaling")
+    entry_point.run(main, Options, "speed.scaling")

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from experiments.speed import scene, twin, worker
+from experiments.speed import bench_scene, twin, worker
 
 VARIANTS = {"plain": ("plain", False), "fast": ("fast", False), "compiled": ("fast", True)}  # implementation, compile
 WARM_UP = 8  # torch.compile and oneDNN settle later
@@ -27,7 +27,7 @@ def make(spec: dict) -> tuple[Callable[[], object], dict]:
     torch.set_num_threads(spec["threads"])
     torch.manual_seed(0)
     config = twin.PRESETS[spec["preset"]]
-    inputs = scene.arrays(spec["batch"], config.image, config.points)
+    inputs = bench_scene.arrays(spec["batch"], config.image, config.points)
     batch = twin.Batch(**{name.removeprefix("in/"): torch.from_numpy(array) for name, array in inputs.items()})
     facts = {"software": f"torch {torch.__version__}"}
     if spec["mode"] == "parity":

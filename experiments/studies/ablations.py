@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Literal
 
 import tyro
 
-from experiments import command
+from experiments import entry_point
 from experiments.comparison import variants, variants_report
 from experiments.comparison.variants import Budget, Variant
 from spnr_jax import cli, presets
@@ -221,4 +221,4 @@ def scaled(sampling: SamplingConfig, factor: float) -> SamplingConfig:
 
 
 if __name__ == "__main__":
-    command.run(main, Ablations, "studies.ablations")
+    entry_point.run(main, Ablations, "studies.ablations")

@@ -25,12 +25,12 @@ from scipy.ndimage import map_coordinates
 
 from data_gen.render import depth, light, views
 from data_gen.render.variant import choose_variant, mitsuba_module
-from experiments import command
-from experiments.comparison import figures, networks, results
-from experiments.comparison.networks import Network, Sources
+from experiments import entry_point
+from experiments.comparison import figures, results_folder, trained_networks
 from experiments.comparison.poisson import unscaled_light, view_config
+from experiments.comparison.result_tables import Table, number, text
 from experiments.comparison.source_meshes import cast_views, mesh_of
-from experiments.comparison.tables import Table, number, text
+from experiments.comparison.trained_networks import Network, Sources
 from spnr_jax import cli
 from spnr_jax.devices import machine
 from spnr_jax.formats import data_sets
@@ -75,10 +75,10 @@ def main(options: Flicker) -> None:
         raise ValueError(f"--frames: expected 3 or more, got {options.frames}")
     cli.set_up_jax()
     dataset = data_sets.open_dataset(options.data)
-    names = networks.test_objects(dataset, options.objects)
-    trained = networks.networks(options.sources, dataset)
+    names = trained_networks.test_objects(dataset, options.objects)
+    trained = trained_networks.networks(options.sources, dataset)
     asked = {name: getattr(options, name) for name in ("frames", "elevation", "spp")}
-    results.claim(options.out, "turntables", asked, dataset)
+    results_folder.claim(options.out, "turntables", asked, dataset)
     mitsuba_module(choose_variant(options.variant)[0])
     camera = turntable(data_sets.read_object(dataset, names[0]).camera, options.frames, options.elevation)
     curves: dict[str, list[np.ndarray]] = {name: [] for name in (REFERENCE, *trained)}
@@ -87,7 +87,7 @@ def main(options: Flicker) -> None:
             curves[label].append(curve)
         print(f"{count} of {len(names)}: {name}", flush=True)
     found = summarise(curves, names) | asked | {"hardware": machine.hardware(), "pixels": camera.width}
-    results.write(options.out, found, [table(found)], [], {"flicker.png": plot(curves, names)})
+    results_folder.write(options.out, found, [table(found)], [], {"flicker.png": plot(curves, names)})
 
 
 def object_curves(
@@ -96,7 +96,7 @@ def object_curves(
     """Flicker from frame to frame of one object by method; its turntables are written side by side."""
     item = data_sets.read_object(dataset, name)
     place = options.out / "frames" / f"{name}.npz"
-    references, distances = results.kept(place, partial(true_frames, options, dataset, item, camera))
+    references, distances = results_folder.kept(place, partial(true_frames, options, dataset, item, camera))
     shown = {REFERENCE: references.astype(np.float32) / 255}
     shown |= {label: frames_of(network, item, camera) for label, network in trained.items()}
     found = {label: flicker(frames, distances, camera) for label, frames in shown.items()}
@@ -217,4 +217,4 @@ def plot(curves: dict[str, list[np.ndarray]], names: Sequence[str]) -> Figure:
 
 
 if __name__ == "__main__":
-    command.run(main, Flicker, "studies.flicker")
+    entry_point.run(main, Flicker, "studies.flicker")

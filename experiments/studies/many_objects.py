@@ -20,9 +20,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments import command
-from experiments.comparison import results
-from experiments.comparison.tables import Table, number
+from experiments import entry_point
+from experiments.comparison import results_folder
+from experiments.comparison.result_tables import Table, number
 from spnr_jax import cli
 from spnr_jax.config import TrainConfig
 from spnr_jax.devices import machine
@@ -70,7 +70,7 @@ def main(options: ManyObjects) -> None:
     )
     heads = ("Python loop", "jax.vmap", "vmap over loop", "apart at first, relative", "at last")
     table = Table(title="One compiled program beside a loop", heads=heads, rows=rows)
-    results.write(
+    results_folder.write(
         options.out, found, [table], [f"Preset {options.preset}, {options.steps} steps; {found['hardware']}."]
     )
 
@@ -161,4 +161,4 @@ def render(dataset: data_sets.Dataset, config: TrainConfig, names: Sequence[str]
 
 
 if __name__ == "__main__":
-    command.run(main, ManyObjects, "studies.many_objects")
+    entry_point.run(main, ManyObjects, "studies.many_objects")

@@ -21,12 +21,12 @@ from typing import Literal
 import numpy as np
 import tyro
 
-from experiments import command
-from experiments.comparison import figures, networks, poisson, results
-from experiments.comparison.networks import LABELS, Network, Sources
+from experiments import entry_point
+from experiments.comparison import figures, poisson, results_folder, trained_networks
+from experiments.comparison.object_scores import ObjectMethod
 from experiments.comparison.poisson import SURFACES
-from experiments.comparison.scoring import ObjectMethod
 from experiments.comparison.source_meshes import details, mesh_of
+from experiments.comparison.trained_networks import LABELS, Network, Sources
 from experiments.studies import point_count_report as report
 from experiments.studies.point_count_report import METRICS
 from spnr_jax import cli
@@ -85,14 +85,14 @@ def main(options: PointCount) -> None:
     """Measures what is missing, then writes results, tables, curves and pictures."""
     cli.set_up_jax()
     dataset = data_sets.open_dataset(options.data)
-    names = networks.test_objects(dataset, 2 if options.quick else options.objects)
-    trained = networks.networks(options.sources, dataset)
+    names = trained_networks.test_objects(dataset, 2 if options.quick else options.objects)
+    trained = trained_networks.networks(options.sources, dataset)
     counts = available_counts(options, dataset, names[0])
-    results.claim(options.out, "point counts", {"objects": list(names)}, dataset)
+    results_folder.claim(options.out, "point counts", {"objects": list(names)}, dataset)
     found = all_methods(options, dataset, trained)
     scores: dict[str, dict[int, Scores]] = {label: {} for label in found}
     for label, method in found.items():
-        results.claim(options.out / label, f"scores of {label}", method.identity)
+        results_folder.claim(options.out / label, f"scores of {label}", method.identity)
         for count in counts:
             scores[label][count] = kept_scores(options, dataset, names, label, method, count)
     config = next(iter(trained.values())).config
@@ -114,7 +114,7 @@ def main(options: PointCount) -> None:
         "point_count.png": report.plot(whole),
         "strip.png": png(strip(options, dataset, shown_object(names), drawn, counts)),
     }
-    results.write(options.out, whole, report.tables_of(whole), report.notes(whole), files)
+    results_folder.write(options.out, whole, report.tables_of(whole), report.notes(whole), files)
 
 
 def available_counts(options: PointCount, dataset: data_sets.Dataset, name: str) -> list[int]:
@@ -186,11 +186,11 @@ def kept_scores(
         for name in names:
             scores[name], image = measure(dataset, name, method, count, options.meshes)
             if name == shown_object(names):
-                results.kept(place.with_suffix(".png"), partial(np.asarray, image))
+                results_folder.kept(place.with_suffix(".png"), partial(np.asarray, image))
         print(f"{label}, {count} points: {mean(scores, 'psnr'):.2f} dB", flush=True)
         return scores
 
-    return results.kept(place, score)
+    return results_folder.kept(place, score)
 
 
 def measure(
@@ -271,11 +271,11 @@ def strip(
     """One object: a row for each method, a column for each count, and the reference before them."""
     reference = data_sets.on_white(data_sets.read_object(dataset, name).images[0])
     rows = [
-        [reference, *(results.READERS[".png"](options.out / label / f"{count}.png") for count in counts)]
+        [reference, *(results_folder.READERS[".png"](options.out / label / f"{count}.png") for count in counts)]
         for label in labels
     ]
     return figures.grid(rows, [name, *(f"{count:,} points" for count in counts)], labels, 128)
 
 
 if __name__ == "__main__":
-    command.run(main, PointCount, "studies.point_count")
+    entry_point.run(main, PointCount, "studies.point_count")

@@ -6,7 +6,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from experiments.comparison import figures
-from experiments.comparison.tables import Table, number, text
+from experiments.comparison.result_tables import Table, number, text
 from spnr_jax.scoring.report import QUALITY
 
 METRICS = ("psnr", "flip", "iou")

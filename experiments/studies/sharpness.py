@@ -21,9 +21,9 @@ import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
-from experiments import command
-from experiments.comparison import figures, results
-from experiments.comparison.tables import Cell, Table, number
+from experiments import entry_point
+from experiments.comparison import figures, results_folder
+from experiments.comparison.result_tables import Cell, Table, number
 from spnr_jax.devices import machine
 from spnr_jax.formats import data_sets, images
 from spnr_jax.kernels import cameras
@@ -67,7 +67,7 @@ def main(options: SharpnessStudy) -> None:
     dataset = data_sets.open_dataset(options.data)
     names = dataset.splits["test"][: options.objects]
     asked = {"runs": list(options.runs), "counts": list(options.counts), "views": options.views, "objects": list(names)}
-    results.claim(options.out, "sharpness", asked | {"resolution": options.resolution}, dataset)
+    results_folder.claim(options.out, "sharpness", asked | {"resolution": options.resolution}, dataset)
     rows, known = {}, {}
     for label, model, quality in _methods(options.runs):
         for count in options.counts:
@@ -83,7 +83,7 @@ def main(options: SharpnessStudy) -> None:
         rows=tuple((name, _cells(found, known[name])) for name, found in rows.items()),
         note="Means over objects with 95 % intervals; a true plate shows a blue share of .077.",
     )
-    results.write(options.out, {"objects": rows, "known": known, "hardware": machine.hardware()}, [table])
+    results_folder.write(options.out, {"objects": rows, "known": known, "hardware": machine.hardware()}, [table])
 
 
 def _levels(model: Model) -> tuple[Quality, ...]:
@@ -110,7 +110,9 @@ def _kept_scores(
     count: int,
 ) -> dict[str, float]:
     place = options.out / "scores" / label.replace("/", "_") / f"{name}_{count}.json"
-    return results.kept(place, lambda: _scores(options, data_sets.read_object(dataset, name), model, quality, count))
+    return results_folder.kept(
+        place, lambda: _scores(options, data_sets.read_object(dataset, name), model, quality, count)
+    )
 
 
 def _scores(
@@ -167,7 +169,7 @@ def _known(out: Path, label: str, model: Model, quality: Quality, count: int) ->
         front = {"azimuth": 0.0, "elevation": 0.0}
         return {"ball": of(ball(count), ball_waves), "plate": of(plate(count), blue_share, **front)}
 
-    return results.kept(out / "known" / label.replace("/", "_") / f"{count}.json", make)
+    return results_folder.kept(out / "known" / label.replace("/", "_") / f"{count}.json", make)
 
 
 def _cells(found: Sequence[Mapping[str, float]], known: Mapping[str, float]) -> tuple[Cell, ...]:
@@ -200,4 +202,4 @@ def _pictures(options: SharpnessStudy, dataset: data_sets.Dataset, names: Sequen
 
 
 if __name__ == "__main__":
-    command.run(main, SharpnessStudy, "studies.sharpness")
+    entry_point.run(main, SharpnessStudy, "studies.sharpness")

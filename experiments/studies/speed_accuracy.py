@@ -30,10 +30,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 
-from experiments import command
-from experiments.comparison import figures, results
-from experiments.comparison.networks import test_objects
-from experiments.comparison.tables import Table, number, text
+from experiments import entry_point
+from experiments.comparison import figures, results_folder
+from experiments.comparison.result_tables import Table, number, text
+from experiments.comparison.trained_networks import test_objects
 from spnr_jax import cli
 from spnr_jax.config import TrainConfig
 from spnr_jax.devices import machine
@@ -122,7 +122,7 @@ def main(options: SpeedAccuracy) -> None:
     cli.set_up_jax()
     dataset = data_sets.open_dataset(options.data)
     names = test_objects(dataset, options.objects)
-    results.claim(options.out, "results", {"objects": list(names)}, dataset)
+    results_folder.claim(options.out, "results", {"objects": list(names)}, dataset)
     todo = [(run, setting) for run in options.runs for setting in settings(checkpoint.read_config(run))]
     todo = todo[:: len(todo) // 4] if options.quick else todo
     rows, loaded = [], dict[Path, dict]()
@@ -136,12 +136,12 @@ def main(options: SpeedAccuracy) -> None:
 
     for count, (run, setting) in enumerate(todo):
         place = options.out / "settings" / f"{options.runs.index(run)} {setting.name}.json"
-        rows.append(results.kept(place, partial(measured, run, setting)))
+        rows.append(results_folder.kept(place, partial(measured, run, setting)))
         print(f"{count + 1} of {len(todo)}", flush=True)
     chosen = front(rows)
     found = {"hardware": machine.hardware(), "date": time.strftime("%Y-%m-%d"), "objects": len(names), "rows": rows}
     best = f"The knee of the front is {rows[knee(rows, chosen)]['name']}."
-    results.write(options.out, found, [table(rows, chosen)], [best], {"front.png": plot(rows, chosen)})
+    results_folder.write(options.out, found, [table(rows, chosen)], [best], {"front.png": plot(rows, chosen)})
 
 
 def measure(
@@ -244,4 +244,4 @@ def scatter(axes: Axes, rows: list[dict], x: str, y: str) -> None:
 
 
 if __name__ == "__main__":
-    command.run(main, SpeedAccuracy, "studies.speed_accuracy")
+    entry_point.run(main, SpeedAccuracy, "studies.speed_accuracy")

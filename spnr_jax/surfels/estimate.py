@@ -32,6 +32,8 @@ SMOOTHED = 9  # neighbours over which the spacing is averaged
 LEAST_SPACING = 1e-5  # in units of the box, for points that coincide
 RIDGE = 0.15  # of the colour's regression, in spacings
 TURN = 0.5  # votes against a given normal from which it is turned
+HIDDEN = 0.4  # directions, counted by their cosines, that see a point at most that lies inside and is not drawn
+LEAST_SHOWN = 0.3  # share of the points that has to be left
 EVIDENCE = 1.0  # votes that a lean is measured against: few of them are none
 UNSURE, SURE = 0.15, 0.45  # lean of the votes from which a side begins to count, and counts whole
 BLOCK = 2**16  # points that are worked on at once
@@ -75,6 +77,7 @@ def estimate(
     pairs = zip(blocks, rows, layers, strict=True)
     gradient = np.concatenate([_gradient(n, w, spacing[s], normal[s], base_color, s) for n, s, w in pairs])
     seen = _visible(positions, normal, spacing, middle)
+    shown = _shown(normal, seen)
     surfels = Surfels(
         position=positions,
         normal=normal,
@@ -88,7 +91,7 @@ def estimate(
         shape=shape,
         mask=np.ones(len(positions), bool),
     )
-    return padded(surfels)
+    return padded(Surfels(**{name: np.asarray(values)[shown] for name, values in vars(surfels).items()}))
 
 
 def padded(surfels: Surfels) -> Surfels:
@@ -166,6 +169,12 @@ def _visible(positions: np.ndarray, normal: np.ndarray, spacing: np.ndarray, mid
     mask = jnp.arange(size) < count
     seen = seen_from(pad(positions), pad(normal), pad(bounded), mask, jnp.float32(cell), grid=grid)
     return np.asarray(seen)[:count]
+
+
+def _shown(normal: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """Which points something outside sees; all, where that would leave too few."""
+    shown = np.einsum("nd,nd->n", seen, np.abs(normal @ DIRECTIONS.T)) > HIDDEN
+    return shown if shown.mean() > LEAST_SHOWN else np.ones_like(shown)
 
 
 def _lean(normal: np.ndarray, seen: np.ndarray) -> np.ndarray:

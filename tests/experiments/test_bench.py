@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from support import twin
 
-from experiments.speed import bench, ours, scene, twin_layout
+from experiments.speed import bench, bench_scene, ours, twin_layout
 from experiments.speed import worker as workers
 from spnr_jax.kernels import cameras
 
@@ -175,14 +175,14 @@ def test_our_pytorch_twin_is_the_network_of_the_fixture(implementation):
 
 class TestScene:
     def test_points_lie_on_a_sphere_and_on_a_box(self):
-        sphere, box = scene.arrays(2, 4)["in/pos"]
-        np.testing.assert_allclose(np.linalg.norm(sphere, axis=-1), scene.SPHERE, rtol=1e-5)
-        np.testing.assert_allclose(np.abs(box).max(axis=-1), scene.BOX, rtol=1e-5)
+        sphere, box = bench_scene.arrays(2, 4)["in/pos"]
+        np.testing.assert_allclose(np.linalg.norm(sphere, axis=-1), bench_scene.SPHERE, rtol=1e-5)
+        np.testing.assert_allclose(np.abs(box).max(axis=-1), bench_scene.BOX, rtol=1e-5)
 
     def test_cameras_look_at_the_middle(self):
-        camera = twin_layout.batch(scene.arrays(3, 8)).camera
+        camera = twin_layout.batch(bench_scene.arrays(3, 8)).camera
         pixels, distance = cameras.project(jax.tree.map(jnp.asarray, camera), jnp.zeros((3, 1, 1, 3)))
         np.testing.assert_allclose(pixels, np.full((3, 1, 1, 2), 4.0), atol=1e-4)
-        np.testing.assert_allclose(distance, scene.DISTANCE, rtol=1e-5)
+        np.testing.assert_allclose(distance, bench_scene.DISTANCE, rtol=1e-5)
         rotation = camera.cam_to_world[..., :3]
         np.testing.assert_allclose(np.linalg.det(rotation), np.ones((3, 1)), rtol=1e-5)

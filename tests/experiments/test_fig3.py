@@ -9,7 +9,7 @@ from support import stand_ins, tiny_dataset
 from support.handmade import ball
 
 from data_gen.render.poisson_surface import PoissonConfig
-from experiments.comparison import networks
+from experiments.comparison import trained_networks
 from experiments.paper import depth_scores, fig3
 from experiments.paper.fig3 import Fig3
 from spnr_jax import cli
@@ -97,7 +97,7 @@ def asked(out, **options):
 
 
 def show(patch, *labels, **identity):
-    patch.setattr(networks, "networks", lambda *_: stand_ins.stand_ins(*labels, **identity))
+    patch.setattr(trained_networks, "networks", lambda *_: stand_ins.stand_ins(*labels, **identity))
 
 
 @pytest.fixture(scope="module")

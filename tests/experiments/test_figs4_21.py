@@ -8,8 +8,8 @@ from PIL import Image
 from support import stand_ins, tiny_dataset
 
 from data_gen.store import layout
-from experiments.comparison import figures, networks
-from experiments.comparison.networks import Sources
+from experiments.comparison import figures, trained_networks
+from experiments.comparison.trained_networks import Sources
 from experiments.paper import figs4_21
 from experiments.paper.figs4_21 import Gallery, main
 from spnr_jax import cli
@@ -22,7 +22,7 @@ NAMES = tiny_dataset.SPLITS["test"]
 @pytest.fixture(autouse=True)
 def _stand_ins(monkeypatch):
     monkeypatch.setattr(cli, "set_up_jax", lambda **_: None)
-    monkeypatch.setattr(networks, "networks", lambda *_: stand_ins.stand_ins("Ours", "Ours (a/run)"))
+    monkeypatch.setattr(trained_networks, "networks", lambda *_: stand_ins.stand_ins("Ours", "Ours (a/run)"))
 
 
 def asked(out, **options):
@@ -81,7 +81,7 @@ def test_pictures_are_made_once_and_of_one_view_and_network(tmp_path, monkeypatc
     assert (tmp_path / "ours_1.png").read_bytes() == before
     with pytest.raises(ValueError, match="holds a gallery with another view; choose another --out"):
         main(asked(tmp_path, view=1))
-    monkeypatch.setattr(networks, "networks", lambda *_: stand_ins.stand_ins("Ours", checksum="1"))
+    monkeypatch.setattr(trained_networks, "networks", lambda *_: stand_ins.stand_ins("Ours", checksum="1"))
     with pytest.raises(ValueError, match="holds pictures of Ours with another config"):
         main(asked(tmp_path))
 

@@ -8,7 +8,7 @@ import pytest
 from support import tiny_dataset, tiny_untrained
 
 from data_gen.render.variant import choose_variant, mitsuba_module
-from experiments.comparison.networks import Sources
+from experiments.comparison.trained_networks import Sources
 from experiments.studies import flicker
 from spnr_jax.formats import data_sets
 from spnr_jax.kernels import cameras

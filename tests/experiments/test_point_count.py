@@ -9,7 +9,7 @@ import pytest
 from support import stand_ins, tiny_dataset
 from support.handmade import RED, ball, plain
 
-from experiments.comparison import networks
+from experiments.comparison import trained_networks
 from experiments.studies import point_count
 from experiments.studies.point_count import PointCount, cloud_of, main
 from spnr_jax import cli
@@ -34,7 +34,7 @@ def mesh(*_):
 def _stand_ins():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(cli, "set_up_jax", lambda **_: None)
-        patch.setattr(networks, "networks", lambda *_: stand_ins.stand_ins("Ours", "NPBG"))
+        patch.setattr(trained_networks, "networks", lambda *_: stand_ins.stand_ins("Ours", "NPBG"))
         patch.setattr(evaluation, "choose_radius", lambda *_: 1.5)
         patch.setattr(point_count, "mesh_of", mesh)
         patch.setattr(point_count, "details", lambda *_: {"seeds": {"points": 5}})

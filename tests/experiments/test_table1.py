@@ -20,8 +20,8 @@ from support.tiny_baselines import BASELINE, SHRUNKEN, SIZE
 from data_gen.render import poisson_surface as surfaces
 from data_gen.render import views
 from data_gen.store import layout
-from experiments.comparison import budget, poisson, scoring
-from experiments.comparison.networks import LABELS
+from experiments.comparison import budget, object_scores, poisson
+from experiments.comparison.trained_networks import LABELS
 from experiments.paper import table1
 from spnr_jax import cli, presets
 from spnr_jax.formats import data_sets
@@ -191,6 +191,6 @@ def test_the_page_loads_nothing_and_holds_every_picture(out, dataset):
 
 
 def test_the_time_of_a_view_leaves_out_the_object_that_compiled(tmp_path):
-    scored = scoring.Scored(scores={}, shown=[], seconds={"white": [9.0, 0.001, 0.003], "splat": [9.0]})
+    scored = object_scores.Scored(scores={}, shown=[], seconds={"white": [9.0, 0.001, 0.003], "splat": [9.0]})
     found = table1.costs(asked(tmp_path, tmp_path), {}, scored, BASELINE)
     assert found == {"white": {"ms_per_view": 2.0}, "splat": {"ms_per_view": None}}

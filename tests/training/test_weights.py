@@ -69,7 +69,7 @@ def test_the_networks_in_the_package_have_the_weights_that_their_configs_describ
 
 def test_a_name_is_the_packages_network_and_a_path_is_not(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    assert weights.read_trained(None).config.preset == weights.read_trained("small").config.preset == "plus_refined"
+    assert weights.read_trained(None).config.preset == weights.read_trained("surfels").config.preset == "surfels"
     with pytest.raises(ValueError, match="none.npz: no such file"):
         weights.read_trained("none.npz")
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from support import stand_ins, tiny_dataset
 
-from experiments.comparison import networks as methods
-from experiments.comparison.networks import Sources, networks
+from experiments.comparison import trained_networks as methods
+from experiments.comparison.trained_networks import Sources, networks
 from spnr_jax.formats import data_sets
 from spnr_jax.training import weights
 

@@ -5,8 +5,8 @@ import re
 
 import numpy as np
 
-from experiments.comparison import page, scoring
-from experiments.comparison.scoring import Shown
+from experiments.comparison import object_scores, page
+from experiments.comparison.object_scores import Shown
 from experiments.paper import table1_tables
 from spnr_jax.scoring import evaluation
 
@@ -30,7 +30,7 @@ def test_the_view_that_is_shown_is_the_one_of_median_quality():
         pictures={"ours": pictures, "white": pictures},
         scores={"ours": {"psnr": np.array([3.0, 9.0, 4.0])}, "white": {"psnr": np.array([5.0, 6.0, 7.0])}},
     )
-    shown = scoring.shown_view(result)
+    shown = object_scores.shown_view(result)
     assert shown.view == shown.reference.item() == shown.images["white"].item() == 2
     assert shown.psnr == {"ours": 4.0, "white": 7.0}
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from support import tiny_dataset
 
-from experiments.comparison import figures, results
-from experiments.comparison.tables import Table, csv_text, latex, markdown, number, text
+from experiments.comparison import figures, results_folder
+from experiments.comparison.result_tables import Table, csv_text, latex, markdown, number, text
 
 ROWS = (
     ("ours_1", (number(21.456, 2, (20.0, 22.5), best=True), number(0.25, 1, factor=100))),
@@ -58,7 +58,7 @@ def test_the_csv_holds_every_number_unrounded_with_its_interval():
 def test_what_was_made_is_read_and_not_made_again(name, content, tmp_path):
     calls = []
     for _ in range(2):
-        found = results.kept(tmp_path / "in" / name, lambda: calls.append(1) or content)
+        found = results_folder.kept(tmp_path / "in" / name, lambda: calls.append(1) or content)
         for a, b in zip(found, content, strict=True):
             np.testing.assert_array_equal(a, b)
     assert calls == [1]
@@ -67,11 +67,11 @@ def test_what_was_made_is_read_and_not_made_again(name, content, tmp_path):
 def test_a_folder_is_one_requests_of_one_data_set(tmp_path):
     dataset = tiny_dataset.dataset()
     for _ in range(2):
-        results.claim(tmp_path, "scores", {"seed": 0, "objects": ("a", "b")}, dataset)
+        results_folder.claim(tmp_path, "scores", {"seed": 0, "objects": ("a", "b")}, dataset)
     with pytest.raises(ValueError, match="holds scores with another seed; choose another --out"):
-        results.claim(tmp_path, "scores", {"seed": 1, "objects": ["a", "b"]}, dataset)
+        results_folder.claim(tmp_path, "scores", {"seed": 1, "objects": ["a", "b"]}, dataset)
     with pytest.raises(ValueError, match="another of, data"):
-        results.claim(tmp_path, "pictures", {"seed": 0, "data": "another"})
+        results_folder.claim(tmp_path, "pictures", {"seed": 0, "data": "another"})
 
 
 def test_a_line_stands_below_each_picture():

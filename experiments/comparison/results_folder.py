@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from experiments.comparison import tables
-from experiments.comparison.tables import Table
+from experiments.comparison import result_tables
+from experiments.comparison.result_tables import Table
 from spnr_jax.formats import data_sets, images
 from spnr_jax.training import run_record
 
@@ -76,12 +76,12 @@ def write(
     """Writes results.json, the tables and what else there is, and prints the tables."""
     everything = {
         "results.json": as_json(results),
-        "table.md": tables.markdown(made, notes).encode(),
-        "table.csv": tables.csv_text(made).encode(),
-        "table.tex": tables.latex(made, notes).encode(),
+        "table.md": result_tables.markdown(made, notes).encode(),
+        "table.csv": result_tables.csv_text(made).encode(),
+        "table.tex": result_tables.latex(made, notes).encode(),
         **(files or {}),
     }
     for name, content in everything.items():
         images.write_whole(out / name, content)
-    print(tables.markdown(made))
+    print(result_tables.markdown(made))
     print(f"wrote {', '.join(everything)} in {out}", flush=True)
