@@ -72,7 +72,7 @@ def render(
 ) -> Rendering:
     """One view (camera unbatched, in the box) of an encoded object; without variables discs and light alone."""
     doublings, side = resolution_of(scene.spacing, camera)
-    small = cameras.resize(camera, *(-(-n * side // 2**doublings) for n in (camera.height, camera.width)))
+    small = _scaled(camera, side, 2**doublings)
     box, total = jax.device_get(_extent(scene.surfels, small))
     plan = _window(box, doublings, side)
     if total == 0:
@@ -80,7 +80,7 @@ def render(
     inside = _seen_through(small, plan)
     found, slots = splatting.entries(scene.surfels, inside, total=_rounded(int(total), 2**15, splatting.MOST_ENTRIES))
     most = inside.height * inside.width
-    slots = _rounded(int(slots), min(2**11, most), most)
+    slots = min(_rounded(int(slots), 2**11, splatting.MOST_ENTRIES), most)
     drawn = _shade(variables, found, scene.surfels, light, inside, config=config, doublings=doublings, slots=slots)
     return _placed(drawn, camera, plan)
 
@@ -100,6 +100,14 @@ def resolution_of(spacing: float, camera: Camera) -> tuple[int, int]:
     pixels = spacing * float(focal) / max(float(np.linalg.norm(eye)), 1e-3)
     doublings = int(np.clip(np.floor(np.log2(max(pixels / COARSEST, 1e-9))) + 1, 0, MOST_DOUBLINGS))
     return doublings, 2 if pixels < FINEST else 1
+
+
+def _scaled(camera: Camera, side: int, shrink: int) -> Camera:
+    """The camera of a picture `side` times as large, divided by `shrink`; its last row and column may reach beyond."""
+    scale = jnp.array([[side / shrink], [side / shrink], [1.0]], jnp.float32)
+    height, width = (-(-n * side // shrink) for n in (camera.height, camera.width))
+    intrinsics = jnp.asarray(camera.intrinsics, jnp.float32) * jnp.broadcast_to(scale, (3, 3))
+    return Camera(cam_to_world=camera.cam_to_world, intrinsics=intrinsics, height=height, width=width)
 
 
 @jax.jit

@@ -32,7 +32,6 @@ from spnr_jax.formats.images import png, to_uint8, write_whole
 from spnr_jax.kernels.metrics import psnr
 from spnr_jax.kernels.records import Light
 from spnr_jax.method import inference
-from spnr_jax.model_config import SurfelConfig
 from spnr_jax.training import checkpoint, optimisation, work
 from spnr_jax.training.run_record import Clock, RunRecord
 from spnr_jax.training.weights import Trained
@@ -116,11 +115,7 @@ def _train(
         return state
     if first:
         say(f"resuming {run} at step {first} of {config.num_steps}")
-    if isinstance(config.model, SurfelConfig):
-        light = light or work.light_of(dataset)
-        task = work.of_gbuffers(config, dataset, run, light)
-    else:
-        task = work.of_views(config, dataset, mesh, own)
+    task = work.work_of(config, dataset, run, mesh, own, light)
     agreed = placement.Agreement(mesh)
     pending: list[tuple[int, dict]] = []
     with (

@@ -16,6 +16,7 @@ from spnr_jax.config import TrainConfig
 from spnr_jax.devices import placement
 from spnr_jax.formats.data_sets import Dataset
 from spnr_jax.kernels.records import Crops, Light
+from spnr_jax.model_config import SurfelConfig
 from spnr_jax.surfels import lighting
 from spnr_jax.training import batching, gbuffers, optimisation, shading
 from spnr_jax.training.optimisation import TrainState
@@ -30,6 +31,15 @@ class Work(NamedTuple):
     batches: Callable[[int], Generator[Any, None, None]]  # from a step on
     step: Callable[[TrainState, Any, int], tuple[TrainState, dict]]  # with the step's number
     finish: Callable[[TrainState], object] = lambda state: None  # called with the last state
+
+
+def work_of(
+    config: TrainConfig, dataset: Dataset, run: Path, mesh: Mesh | None, own: range | None, light: Light | None
+) -> Work:
+    """That of the config's network; the mesh and its share of a batch, or the light, are for one of the two kinds."""
+    if isinstance(config.model, SurfelConfig):
+        return of_gbuffers(config, dataset, run, light or light_of(dataset))
+    return of_views(config, dataset, mesh, own)
 
 
 def of_views(config: TrainConfig, dataset: Dataset, mesh: Mesh | None, own: range | None) -> Work:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import shutil
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -74,11 +75,17 @@ def test_batches_are_a_function_of_seed_and_step():
 
 
 def test_steps_meet_every_resolution_in_its_share_with_crops_of_its_size(monkeypatch):
-    view = gbuffers.read_view(tiny_surfels.views()[0])
-    monkeypatch.setattr(gbuffers, "read_view", lambda view: view)
-    monkeypatch.setattr(gbuffers, "cropped", lambda view, size, scale, generator: view | {"seen": view["seen"][:1]})
-    steps = [gbuffers.make_batch({d: [view] for d in range(5)}, CONFIG, step).doublings for step in range(400)]
-    np.testing.assert_allclose(np.bincount(steps) / 400, gbuffers.SHARES, atol=0.06)
+    kept, config, steps = tiny_surfels.views()[0], dataclasses.replace(CONFIG, crop=48), []
+    view = gbuffers.read_view(kept)
+    monkeypatch.setattr(gbuffers, "read_view", lambda _: view)
+    monkeypatch.setattr(gbuffers, "cropped", lambda view, size, scale, _: steps[-1].append((size, scale)) or view)
+    for step in range(400):
+        steps.append([])
+        gbuffers.make_batch({doublings: [kept] for doublings in range(5)}, config, step)
+    doublings = [int(np.log2(crops[0][1])) for crops in steps]
+    np.testing.assert_allclose(np.bincount(doublings) / 400, gbuffers.SHARES, atol=0.06)
+    expected = {((48, 1),) * 2, ((32, 2),) * 2, ((16, 4),) * 2, ((10, 8),), ((6, 16),)}
+    assert {tuple(crops) for crops in steps} == expected
 
 
 def test_a_crop_shows_the_same_place_in_what_is_seen_and_in_the_reference():
@@ -107,8 +114,9 @@ def test_mirroring_leaves_the_loss_of_the_untrained_network_as_it_is(axis):
     view = gbuffers.read_view(kept)
     whole = gbuffers.cropped(view, max(view["seen"].shape[:2]), 2**kept.doublings, np.random.default_rng(0))
     turned = gbuffers.mirrored(whole, axis)
+    loss = jax.jit(partial(shading.loss, config=CONFIG))
     losses = [
-        shading.loss(params, Crops(**{k: x[None] for k, x in one.items()}, doublings=kept.doublings), config=CONFIG)[0]
+        loss(params, Crops(**{name: x[None] for name, x in one.items()}, doublings=kept.doublings))[0]
         for one in (whole, turned)
     ]
     np.testing.assert_allclose(*losses, rtol=1e-5)
