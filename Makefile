@@ -3,15 +3,17 @@
 #   make demo MESHES=DIR     the same on a folder of .glb .gltf .obj .ply files: runs/demo-NAME/report.html
 #   make table1              the paper's Table 1, every method trained and scored: runs/table1-tiny/table1.html
 #   make table1 DATA=DIR BUDGET=quick|tiny|paper TABLE1='--minutes 10'   on your data, with more options
-#   make bench               time the network beside a PyTorch twin: runs/bench.md (BENCH="--twin FILE --quick")
+#   make bench               time the network beside a PyTorch twin: runs/bench/table.md (BENCH="--quick")
 #   make test                the everyday suite
 #   make test-ci             what takes minutes more: experiments, wheel, notebooks, kills, many devices
 #   make test-all            these, and what trains for minutes
 #   make check               format, lint, types, tests
 #   make docs                the documents as a site: site/index.html
 #   make wheel               the package: dist/*.whl     make test-wheel   it alone in an empty environment
-#   make fuzz                10,000 damaged files for every reader: runs/fuzz/fuzz.md (FUZZ="--reader glb")
-#   make chaos               kill a training 100 times, fill its disk, ...: runs/chaos/chaos.md (CHAOS="--kills 10")
+#   make fuzz                10,000 damaged files for every reader, and a table (FUZZ_INPUTS=500 FUZZ="-k glb")
+#   make chaos               kill a training 100 times, fill its disk, ..., and a table (CHAOS_KILLS=2 for 4 x 2 kills)
+#   make stability           float32 beside float64 for every kernel over its whole domain, and a table
+#   make long-run            memory, pace and compilations of 2,000 training steps (LONG_RUN_STEPS=500)
 #   make mutants             break the kernels on purpose; every fault has to be caught by the tests
 
 PYTHON ?= python3.11
@@ -24,10 +26,9 @@ BENCH ?=
 DATA ?=
 BUDGET ?= tiny
 TABLE1 ?=
-CHAOS ?=
 FUZZ ?=
 
-.PHONY: setup demo table1 bench test test-ci test-all test-wheel lint format types check docs wheel chaos fuzz mutants clean
+.PHONY: setup demo table1 bench test test-ci test-all test-wheel lint format types check docs wheel chaos fuzz stability long-run mutants clean
 
 setup: .venv/complete
 
@@ -35,20 +36,20 @@ setup: .venv/complete
 	@begin=$$(date +%s); \
 	test -x $(PY) || $(PYTHON) -m venv .venv; \
 	echo "installing into .venv (about a minute)"; \
-	$(PY) -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[data,viewer,formats,export,baselines,dev]' && \
+	$(PY) -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[data,viewer,formats,export,baselines,experiments,dev]' && \
 	echo $$(( $$(date +%s) - begin )) > .venv/install_seconds && touch $@
 
 demo: setup
-	$(PY) -m experiments.demo --out $(OUT) $(if $(MESHES),--meshes $(MESHES)) $(if $(TEST_LIST),--test-list $(TEST_LIST)) $(DEMO)
+	$(PY) -m experiments.packaged.demo --out $(OUT) $(if $(MESHES),--meshes $(MESHES)) $(if $(TEST_LIST),--test-list $(TEST_LIST)) $(DEMO)
 
 table1: OUT = runs/table1-$(BUDGET)$(if $(DATA),-$(notdir $(patsubst %/,%,$(DATA))))
 table1: setup
 	$(if $(DATA),,$(PY) -m data_gen generate $(OUT)/data --objects 240 --spp 24 --visibility-grid 2 \
 		--resolution $(if $(filter paper,$(BUDGET)),128,64))
-	$(PY) -m experiments.table1 --data $(or $(DATA),$(OUT)/data) --out $(OUT) --budget $(BUDGET) $(TABLE1)
+	$(PY) -m experiments.paper.table1 --data $(or $(DATA),$(OUT)/data) --out $(OUT) --budget $(BUDGET) $(TABLE1)
 
 bench: setup
-	$(PY) -m experiments.bench $(BENCH)
+	$(PY) -m experiments.speed.bench $(BENCH)
 
 test: setup
 	$(PY) -m pytest -q -rs -n 2 --dist loadfile -m "not slow and not ci"
@@ -87,10 +88,16 @@ wheel: setup
 	rm -rf build
 
 fuzz: setup
-	$(PY) -m experiments.fuzz --out runs/fuzz $(FUZZ)
+	FUZZ_INPUTS=$(or $(FUZZ_INPUTS),10000) $(PY) -m pytest -q -s tests/robustness/test_fuzz.py -k "damaged and files" $(FUZZ)
 
 chaos: setup
-	$(PY) -m experiments.chaos --out runs/chaos $(CHAOS)
+	CHAOS_KILLS=$(or $(CHAOS_KILLS),25) $(PY) -m pytest -q -s tests/robustness/test_chaos.py
+
+stability: setup
+	STABILITY=1 $(PY) -m pytest -q -s tests/robustness/test_stability.py
+
+long-run: setup
+	LONG_RUN_STEPS=$(or $(LONG_RUN_STEPS),2000) $(PY) -m pytest -q -s tests/robustness/test_long_run.py
 
 mutants: setup
 	$(PY) tests/mutants.py

@@ -16,6 +16,7 @@ from data_gen.plan.tasks import GenerateConfig
 from data_gen.store.check import check
 from data_gen.store.pack import PackConfig, pack
 from data_gen.store.show import ShowConfig, show
+from spnr_jax.formats.debugging import show_stack, without_debug
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,12 +32,13 @@ Command = GenerateConfig | CheckConfig | ShowConfig | PackConfig
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line."""
-    config = parse(sys.argv[1:] if arguments is None else arguments)
+    config = parse(without_debug(sys.argv[1:] if arguments is None else arguments))
     try:
         sys.exit(run(config))
     except KeyboardInterrupt:
         sys.exit(interrupted())
     except (ValueError, OSError) as error:
+        show_stack()
         print(f"spnr-data: {one_line(error, config)}", file=sys.stderr)
         sys.exit(2)
 

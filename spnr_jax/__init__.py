@@ -11,7 +11,8 @@ from types import ModuleType
 
 _PUBLIC = {"load": "training.weights", "Model": "method.model", "Volume": "method.model"}
 _PUBLIC |= {"read_cloud": "formats.clouds"}
-_PUBLIC |= dict.fromkeys(("PointCloud", "Camera", "Rays", "Rendering", "Batch"), "kernels.records")
+_PUBLIC |= {"light_of": "surfels.lighting"}
+_PUBLIC |= dict.fromkeys(("PointCloud", "Camera", "Light", "Rays", "Rendering", "Batch"), "kernels.records")
 _KERNELS = ("cameras", "sampling", "compositing", "voxels", "losses", "metrics")
 
 __all__ = sorted(_PUBLIC)

@@ -22,11 +22,14 @@ import tyro
 from spnr_jax import presets
 from spnr_jax.config import TrainConfig
 from spnr_jax.devices import allocator
+from spnr_jax.formats.debugging import show_stack, without_debug
+from spnr_jax.model_config import SurfelConfig
 from spnr_jax.tools.render_command import Render
 
 BOX = r"[╭╮╰╯│─•]+|__tyro-dummy-inner__\."  # what tyro draws around an error, and its name for the whole command
 LONGEST_LINE = 800  # characters of an error
-DESCRIPTION = "Sparse-point neural rendering: train a network, evaluate one, render a cloud of points."
+DESCRIPTION = """Sparse-point neural rendering: train a network, evaluate one, render a cloud of points.
+--debug, or SPNR_DEBUG=1, shows the call stack of an error."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,7 +125,7 @@ class View:
     """Address to listen on; another than this machine's own opens the viewer to a network."""
     port: int = 8080
     """Port to listen on; 0 takes any free one."""
-    num_points: int = 4096
+    num_points: int = 16384
     """Points used of a bigger cloud or sampled from a mesh; fewer work too."""
     up: Literal["auto", "x", "y", "z", "-x", "-y", "-z"] = "auto"
     """The file's upward axis; auto looks for it, and says what it found."""
@@ -141,7 +144,7 @@ Command = Train | Evaluate | Render | View | Export | Runs | ConvertLpips
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line."""
-    arguments = sys.argv[1:] if arguments is None else arguments
+    arguments = without_debug(sys.argv[1:] if arguments is None else arguments)
     code = guarded(lambda: run(parse(arguments)), "spnr")
     if code == 2 and _one_of_several():
         sys.stdout.flush()
@@ -163,6 +166,7 @@ def guarded(work: Callable[[], None], name: str) -> int:
         print(f"{name}: {str(stop) or 'stopped'}", file=sys.stderr)
         return 130
     except (ValueError, OSError) as error:
+        show_stack()
         print(f"{name}: {one_line(error)}", file=sys.stderr)
         return 2
     return 0
@@ -305,6 +309,11 @@ def run_export(command: Export) -> None:
     from spnr_jax.training import weights
 
     trained, where = weights.read_trained(command.run), command.platforms
+    if isinstance(trained.config.model, SurfelConfig):
+        raise ValueError(
+            f"{command.run}: sizes of a picture of surfels are counted first, so it is no single function "
+            "to export; use a network of rays, such as small"
+        )
     handle = model.Model(config=trained.config.model, variables=trained.variables)
     weights.write_weights(command.out / "weights.npz", trained)
     functions = {

@@ -365,10 +365,10 @@ class SurfelConfig:
     top: int = 24
     """Features of the blocks that double the resolution."""
 
-    upsamples = False
-    ray_chunk = None
-    per_pixel = False
-    any_size = True
+    ray_chunk: ClassVar[int | None] = None
+    upsamples: ClassVar[bool] = False
+    per_pixel: ClassVar[bool] = False
+    any_size: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         require(self.image_resolution >= 1, f"image_resolution must be at least 1, got {self.image_resolution}")
@@ -376,9 +376,10 @@ class SurfelConfig:
         require(self.top >= 1, f"top must be at least 1, got {self.top}")
 
 
-NetworkConfig = ModelConfig | NPBGConfig | PointNeRFConfig | Points2NeRFConfig
+NetworkConfig = ModelConfig | SurfelConfig | NPBGConfig | PointNeRFConfig | Points2NeRFConfig
 METHODS: dict[str, type[NetworkConfig]] = {
     "ours": ModelConfig,
+    "surfels": SurfelConfig,
     "npbg": NPBGConfig,
     "point_nerf": PointNeRFConfig,
     "points2nerf": Points2NeRFConfig,

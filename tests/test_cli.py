@@ -268,3 +268,12 @@ def test_errors_of_many_lines_become_one():
     assert cli.one_line(ValueError("this\n  and\nthat")) == "this and that"
     assert cli.one_line(OSError(28, "No space left on device")) == "disk: No space left on device"
     assert cli.one_line(OSError(13, "Permission denied", "a/b")) == "a/b: Permission denied"
+
+
+def test_an_error_shows_its_call_stack_where_that_is_asked_for(capsys, monkeypatch, tmp_path):
+    monkeypatch.delenv("SPNR_DEBUG", raising=False)
+    assert exit_code("runs", tmp_path / "none") == 2
+    assert "Traceback" not in capsys.readouterr().err
+    monkeypatch.setenv("SPNR_DEBUG", "")  # so that it is put back
+    assert exit_code("runs", tmp_path / "none", "--debug") == 2
+    assert "Traceback" in capsys.readouterr().err

@@ -10,7 +10,7 @@ from support import tiny_dataset
 from support.laws import close, same_bits
 from support.tiny_model import PLUS
 
-from experiments import refinement
+from experiments.packaged import refinement
 from spnr_jax import presets
 from spnr_jax.config import LossConfig
 from spnr_jax.formats import data_sets

@@ -14,8 +14,10 @@ import jax.numpy as jnp
 from spnr_jax.devices.placement import by_all_devices, on_own_rays
 from spnr_jax.kernels import cameras, supersampling
 from spnr_jax.kernels.records import Camera, PointCloud, Rendering
+from spnr_jax.method import surfel_renderer
 from spnr_jax.method.renderer import Renderer
-from spnr_jax.model_config import ModelConfig, NetworkConfig
+from spnr_jax.model_config import ModelConfig, NetworkConfig, SurfelConfig
+from spnr_jax.surfels.lighting import room_light
 
 
 def network(config: NetworkConfig) -> nn.Module:
@@ -93,6 +95,10 @@ jitted_render = jax.jit(render, static_argnames=("config", "ray_chunk", "rays_pe
 
 def render_views(variables: dict, config: NetworkConfig, cloud: PointCloud, camera: Camera) -> Rendering:
     """All views of one object (clouds of data sets are normalised already), rays divided among the devices."""
+    if isinstance(config, SurfelConfig):
+        return surfel_renderer.render_views(
+            variables, surfel_renderer.encode(cloud), camera, room_light(), config=config
+        )
     cloud, camera = jax.tree.map(lambda x: jnp.asarray(x)[None], (cloud, camera))
     volume = jitted_encode(variables, cloud, config=config)
     side = supersampling.rays_per_side(config, camera.width)

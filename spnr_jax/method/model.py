@@ -105,19 +105,15 @@ class Model:
         return by_all_devices(render, self._spread, volume.scene, volume.centre, volume.scale, camera)
 
     def _shaded(self, volume: Volume, camera: Camera, quality: Quality, light: Light) -> Rendering:
-        """Views by the network over surfels, one after the other: the sizes of each are counted before it is drawn."""
+        """Views by the network over surfels."""
         if quality not in (*SAMPLES, "trained"):
             raise ValueError(f"quality must be one of {', '.join(SAMPLES)}, trained, got {quality}")
+        assert isinstance(self.config, SurfelConfig)
         variables = None if quality == "draft" else self.variables
         inside = _in_box(camera, volume.centre, volume.scale)
-        views = (
-            [inside]
-            if inside.cam_to_world.ndim == 2
-            else [jax.tree.map(lambda x, view=view: x[view], inside) for view in range(len(inside.cam_to_world))]
-        )
-        drawn = [surfel_renderer.render(variables, volume.scene, view, light, config=self.config) for view in views]
-        drawn = [dataclasses.replace(view, depth=view.depth / np.asarray(volume.scale)) for view in drawn]
-        return drawn[0] if inside.cam_to_world.ndim == 2 else jax.tree.map(lambda *x: np.stack(x), *drawn)
+        draw = surfel_renderer.render if inside.cam_to_world.ndim == 2 else surfel_renderer.render_views
+        drawn = draw(variables, volume.scene, inside, light, config=self.config)
+        return dataclasses.replace(drawn, depth=drawn.depth / np.asarray(volume.scale))
 
     @cached_property
     def _spread(self) -> dict:

@@ -79,6 +79,15 @@ def render(
     return _placed(drawn, camera, plan)
 
 
+def render_views(
+    variables: dict | None, scene: SurfelScene, cameras: Camera, light: Light, *, config: SurfelConfig
+) -> Rendering:
+    """Views one after the other (one axis of cameras): the sizes of each are counted before it is drawn."""
+    views = [jax.tree.map(lambda x, i=i: x[i], cameras) for i in range(len(cameras.cam_to_world))]
+    drawn = [render(variables, scene, view, light, config=config) for view in views]
+    return jax.tree.map(lambda *x: np.stack(x), *drawn)
+
+
 def resolution_of(spacing: float, camera: Camera) -> tuple[int, int]:
     """Doublings by the network, and pixels averaged along each side, for points this far apart around the origin."""
     focal, eye = (np.asarray(x, np.float64) for x in (camera.intrinsics[0, 0], camera.cam_to_world[:, 3]))

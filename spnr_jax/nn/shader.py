@@ -18,6 +18,7 @@ from spnr_jax.surfels.lighting import SPECULAR
 NUM_OUTPUTS = 19
 COLOR_STEP, ODDS_STEP = 0.3, 2.0  # what an output of 1 changes the base colour, and the log odds of the opacity by
 LEAST_ODDS = 1e-2  # keeps the odds of what is clear or solid finite
+NOTHING = 3e-3  # opacity below which a pixel stays clear, whatever the network says
 
 
 def doubled(x: Float[Array, "batch height width features"]) -> Float[Array, "batch h w features"]:
@@ -103,7 +104,7 @@ def picture(
     arriving, unshadowed, mirrored, reflected = (maps[..., i:j] for i, j in ((7, 10), (10, 13), (13, 16), (16, 17)))
     base = jnp.clip(color + COLOR_STEP * outputs[..., 0:3], 0, 1)
     odds = jnp.log(opacity + LEAST_ODDS) - jnp.log(1 + LEAST_ODDS - opacity)
-    alpha = nn.sigmoid(odds + ODDS_STEP * outputs[..., 3:4])
+    alpha = nn.sigmoid(odds + ODDS_STEP * outputs[..., 3:4]) * -jnp.expm1(-opacity / NOTHING)
     bounced = outputs[..., 8:11] * ambient[:, None, None, 0]
     bounced += jnp.einsum("bhwk,bkc->bhwc", outputs[..., 11:19], ambient[:, 1:], precision="highest")
     diffuse = (1 + outputs[..., 4:5]) * arriving + outputs[..., 5:6] * unshadowed + bounced

@@ -17,6 +17,7 @@ from spnr_jax.surfels.visibility import DIRECTIONS
 NUM_FEATURES, NUM_MAPS = 27, 17
 FAINT = 0.02  # opacity from which on a pixel's numbers begin to count
 WINDOWS = 2, 6  # pixels to each side over which the depth is compared
+EDGE = 1.2  # coverage at the outline: discs reach beyond the surface, half of their weight
 TRUST = 0.25  # most that a colour to first order leaves the blended one
 
 
@@ -67,7 +68,8 @@ def features(
     drawn = (buffer.opacity / (buffer.opacity + FAINT))[..., None]
     seen = jnp.concatenate([drawn * jnp.concatenate([jnp.stack(told, axis=-1), *vectors], axis=-1), drawn], axis=-1)
     unshadowed = lighting.irradiance(light, turned[0]), lighting.mirrored(light, turned[1], roughness)
-    maps = [*jnp.moveaxis(color, -1, 0), metallic, buffer.opacity, factor, summand, *arriving]
+    solid = buffer.opacity * -jnp.expm1(-((buffer.coverage / EDGE) ** 2))
+    maps = [*jnp.moveaxis(color, -1, 0), metallic, solid, factor, summand, *arriving]
     return seen, jnp.stack([*maps, *unshadowed[0], *unshadowed[1], reflected], axis=-1)
 
 

@@ -26,6 +26,7 @@ from spnr_jax.formats import clouds, images
 from spnr_jax.formats.clouds import PlacedCloud
 from spnr_jax.kernels.records import Camera, Rendering
 from spnr_jax.method.model import Model, Volume
+from spnr_jax.model_config import ModelConfig
 from spnr_jax.tools import depth_maps
 from spnr_jax.tools.render_command import Render
 from spnr_jax.training.weights import load
@@ -35,6 +36,7 @@ INVISIBLE = 1 / 255  # opacity below which a pixel has no colour of its own
 # The surface lies where a voxel of the network stops this share of the light.  Silhouettes of the mesh and of the
 # opacity then agree to an IoU of 0.92 (10 real objects); with 0.2 and 0.5 to 0.88 and 0.78.
 MESH_OPACITY = 0.3
+SOLID = "small"  # network of the package that has a density
 
 
 def render_file(options: Render, note: Callable[[str], None]) -> Iterator[str]:
@@ -136,6 +138,10 @@ def _write_solids(model: Model, volume: Volume, placed: PlacedCloud, options: Re
     """Writes the density grid, and its surface as a mesh."""
     from spnr_jax.tools import density_grid, mesh_export  # here: pictures alone do without
 
+    if not isinstance(model.config, ModelConfig):
+        yield f"the network that renders has no density: that of the package's {SOLID} is taken"
+        model = load(SOLID)
+        volume = model.encode(placed.cloud)
     grid = density_grid.sample_density(model, volume, placed, options.grid_resolution)
     if options.density:
         arrays = {"density": grid.density, "lowest": grid.lowest + grid.origin, "spacing": grid.spacing}

@@ -17,12 +17,13 @@ class Render:
     """.ply (also 3D Gaussian splats) .pcd .xyz .txt .csv .las .laz .npz .npy, or a mesh: .glb .gltf .obj .stl .off (its
     surface is sampled)."""
     run: Path | None = None
-    """Network that renders: `small` or `tiny` of the package, a run folder, a file of weights (default: small)."""
+    """Network that renders: `surfels`, `small` or `tiny` of the package, a run folder, a file of weights (default:
+    surfels)."""
     out: Path = Path("renders")
     """Folder for what is written."""
     up: Literal["auto", "x", "y", "z", "-x", "-y", "-z"] = "auto"
     """The file's upward axis; auto: by the format, else y or z, as the object would stand."""
-    num_points: int = 4096
+    num_points: int = 16384
     """Points used of a bigger cloud, evenly spread, or sampled from a mesh; fewer work too."""
     seed: int = 0
     """Seed of the points that are chosen."""
@@ -31,9 +32,10 @@ class Render:
     elevation: float = 20.0
     """Degrees above the horizon."""
     resolution: int | None = None
-    """Pixels along each side (default: what the network was trained for)."""
+    """Pixels along each side (default: 512 of surfels, else what the network was trained for)."""
     quality: Literal["draft", "balanced", "best", "trained"] = "best"
-    """Samples along a ray near the points: a quarter, half or all of those trained with; or just as trained."""
+    """draft: discs and light alone, without the CNN.  Of networks of rays: a quarter, half or all of the samples that a
+    ray was trained with, near the points; or just as trained."""
     outputs: tuple[Output, ...] = ("image", "depth", "opacity")
     """What is written of each view; depth comes coloured, as .npy and as 16-bit .png."""
     transparent: bool = False
@@ -45,7 +47,8 @@ class Render:
     fps: int = 16
     """Frames a second of the turntable."""
     mesh: bool = False
-    """Also write the surface as .glb, with the materials of the nearest points."""
+    """Also write the surface as .glb, with the materials of the nearest points; by the network `small` if the one that
+    renders has no density."""
     density: bool = False
     """Also write the density on a grid as .npz."""
     grid_resolution: int = 96

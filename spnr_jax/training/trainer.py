@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -52,6 +53,10 @@ class Schedule:
                 raise ValueError(f"{name} must be at least 1 step, got {steps}")
 
 
+Phase = Literal["step", "row", "preview", "checkpoint", "end"]
+OnEvent = Callable[[Phase, int, object], object]  # phase that begins, steps done so far, its batch or row, else None
+
+
 class NotFinite(ValueError):
     """A loss is NaN or infinite; the message names step and quantity."""
 
@@ -63,11 +68,12 @@ def train(
     schedule: Schedule,
     mesh: Mesh | None = None,
     init: Trained | None = None,
+    on_event: OnEvent | None = None,
 ) -> optimisation.TrainState:
     """The state after the config's last step; goes on where an earlier call left the run folder.
 
     A new run begins with random weights, or with those of `init`.  On a mesh of devices (`placement.device_mesh`)
-    each of its processes calls this.
+    each of its processes calls this.  `on_event` is told what the loop is about to do; what was told before is done.
     """
     allocator.few_arenas()
     own = None if mesh is None else placement.own_objects(mesh, config.batch_objects)
@@ -75,7 +81,7 @@ def train(
         try:
             placement.first_alone(lambda: stack.enter_context(checkpoint.alone(run)))
             placement.first_alone(lambda: checkpoint.write_config(run, config))
-            return _train(config, dataset, run, schedule, mesh, own, init)
+            return _train(config, dataset, run, schedule, mesh, own, init, on_event or (lambda *event: None))
         except OSError as error:
             error.filename = error.filename or str(run)  # writing to a full disk does not say where
             raise
@@ -91,6 +97,7 @@ def _train(
     mesh: Mesh | None,
     own: range | None,
     init: Trained | None,
+    tell: OnEvent,
 ) -> optimisation.TrainState:
     clock, leads = Clock(), placement.leads()
     say: Callable[[str], object] = tqdm.write if leads else lambda line: None
@@ -115,6 +122,7 @@ def _train(
         record = RunRecord(run, dataset, first, init) if leads else Unwritten()
         clock.lap("restore")
         for step, batch in enumerate(batches, start=first):
+            tell("step", step, batch)
             with placement.using(mesh):
                 state, metrics = optimisation.jitted_train_step(
                     state,
@@ -135,18 +143,24 @@ def _train(
                     check_state(state)
                 seconds, timed = clock.lap("steps"), [at for at, _ in rows if at > first + 1]
                 pace = 1000 * (seconds / len(timed) if timed else clock.seconds["compilation"])
-                log.write({"step": step + 1, **mean_row(rows), "ms_per_step": round(pace, 2)})
+                row = {"step": step + 1, **mean_row(rows), "ms_per_step": round(pace, 2)}
+                tell("row", step + 1, row)
+                log.write(row)
                 bar.set_postfix(loss=f"{rows[-1][1]['loss']:.2f}", psnr=f"{rows[-1][1]['psnr']:.1f}", refresh=False)
                 pending = []
             if leads and (last or (step + 1) % schedule.preview_every == 0):
+                tell("preview", step + 1, None)
                 scores, picture = preview(state, config, dataset, run)
                 log.write({"step": step + 1, **scores}, picture)
                 allocator.give_back()
                 clock.lap("previews")
             if save:  # after the rows up to this step, which a run that goes on from here will not write again
+                tell("checkpoint", step + 1, None)
                 checkpoint.save(run, state)
                 clock.lap("checkpoints")
                 record.write(step + 1, clock)
+            if last or stopping:
+                tell("end", step + 1, None)
             if stopping and not last:
                 raise KeyboardInterrupt(
                     f"stopped at step {step + 1} of {config.num_steps}; the same command goes on from there"

@@ -4,8 +4,8 @@
     steps               of training
     params/.../kernel   one array each, as they lie in the Linen variables
 
-The package holds two networks (docs/model_card.md), of which `small` renders where no other is named: `shipped` is the
-file of one.
+The package holds three networks (docs/model_card.md), of which `surfels` renders where no other is named: `shipped` is
+the file of one.
 """
 
 import io
@@ -29,7 +29,7 @@ from spnr_jax.method.model import Model
 # what a header of any content makes its readers raise
 UNREADABLE = (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError)
 ADVICE = "write one with `spnr export RUN`"
-SHIPPED = ("small", "tiny")  # what the package holds
+SHIPPED = ("surfels", "small", "tiny")  # what the package holds; the first renders where no other is named
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,19 +41,19 @@ class Trained:
     steps: int
 
 
-def shipped(name: str = "small") -> Path:
+def shipped(name: str = SHIPPED[0]) -> Path:
     """The file of a network that the package holds."""
     return Path(str(resources.files("spnr_jax") / "pretrained" / f"{name}.npz"))
 
 
 def place(source: Path | str | None) -> Path:
     """The run folder or file that `read_trained` reads."""
-    name = "small" if source is None else str(source)
+    name = SHIPPED[0] if source is None else str(source)
     return shipped(name) if name in SHIPPED else Path(name)
 
 
 def read_trained(source: Path | str | None, say: Callable[[str], None] = print, data: Path | str = "DATA") -> Trained:
-    """The network of a run folder's newest checkpoint, of a file of weights, or of the package: None, `small`, `tiny`.
+    """The network of a run folder's newest checkpoint, of a file of weights, or of the package: one of SHIPPED.
 
     ValueError, with what to do, if there is none; `say` gets a line for each broken checkpoint, `data` is named.
     """
@@ -67,7 +67,7 @@ def read_trained(source: Path | str | None, say: Callable[[str], None] = print, 
 
 
 def load(run: Path | str | None = None) -> Model:
-    """A network of the package (`small`, `tiny`; None is small), of a run folder's newest checkpoint, or of a file."""
+    """A network of the package (SHIPPED; None is the first), of a run folder's newest checkpoint, or of a file."""
     trained = read_trained(run)
     return Model(config=trained.config.model, variables=trained.variables)
 

@@ -7,14 +7,14 @@ value of a slider wins.  Slow ones (reading a file, a film) are plain functions,
 import dataclasses
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, cast
 
 import numpy as np
 import viser
 
 from spnr_jax.method.model import Model, Quality
-from spnr_jax.viewer import levels, scene, session, uploads, viewpoint
+from spnr_jax.viewer import scene, session, uploads, viewpoint
 from spnr_jax.viewer.loop import Loop
 from spnr_jax.viewer.picture import LAYERS
 from spnr_jax.viewer.scene import Material, Scene
@@ -80,7 +80,7 @@ class Browser:
             if drawn.quality is not None and drawn.milliseconds is not None:
                 self._measured = {key: ms for key, ms in self._measured.items() if key[0] != drawn.quality}
                 self._measured[drawn.quality, drawn.size] = drawn.milliseconds
-                self._table.content = levels.table(self._measured)
+                self._table.content = _pace(self._measured)
         return state
 
     def _send(self, canvas: np.ndarray, jpeg_quality: int) -> None:
@@ -132,7 +132,7 @@ class Browser:
             "At rest", session.QUALITIES, initial_value="best", hint="While the camera moves: draft"
         )
         size = gui.add_dropdown("Pixels", [str(n) for n in available], initial_value=str(available[1]))
-        self._table = gui.add_markdown(levels.table({}))
+        self._table = gui.add_markdown(_pace({}))
         controls = (left, right, quality, size)
 
         async def changed(_: Any) -> None:
@@ -267,3 +267,9 @@ class Browser:
         self._change_scene(lambda old: opened)
         self.loop.submit(self._show_materials)
         self._note(opened.name, "; ".join(notes) or f"{len(opened.selected)} points")
+
+
+def _pace(measured: Mapping[tuple[Quality, int], float]) -> str:
+    """Markdown: the newest milliseconds of each quality measured here, with the pixels drawn."""
+    rows = [f"| {quality} | {ms:.0f} ({size}²) |" for (quality, size), ms in sorted(measured.items())]
+    return "\n".join(["| quality | ms here |", "|---|---:|", *rows])

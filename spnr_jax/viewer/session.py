@@ -22,6 +22,7 @@ from spnr_jax.viewer.scene import Scene, encoded, select_rectangle
 from spnr_jax.viewer.viewpoint import FARTHEST, View, in_pane, pane_camera, pane_size
 
 MOVING: Quality = "draft"
+MOVING_SIZE = 256  # pixels of the network's square while it moves, at most
 MOVING_LONGEST, LONGEST = 960, 1600  # pixels of the canvas's longer side, while it moves and at rest
 FRAMES_PER_SECOND = 16
 MOST_FRAMES = 960
@@ -44,8 +45,8 @@ class State:
 
 
 def sizes(model: Model) -> tuple[int, ...]:
-    """Sizes that can be chosen: what the network was trained for, twice and four times that."""
-    return tuple(factor * model.config.image_resolution for factor in (1, 2, 4))
+    """Sizes that can be chosen: 256 or the smaller size that the network was trained for, twice and four times that."""
+    return tuple(factor * min(model.config.image_resolution, MOVING_SIZE) for factor in (1, 2, 4))
 
 
 def chosen(model: Model, layers: Sequence[Any], quality: Any, size: Any) -> dict[str, Any]:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from support import twin
 
-from experiments import twin_layout
+from experiments.speed import twin_layout
 from spnr_jax.kernels import cameras, compositing, losses, sampling, voxels
 from spnr_jax.method.renderer import Renderer
 from spnr_jax.nn.encoding import encode_direction

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments import methods
+from experiments.comparison import networks as methods
 from spnr_jax.scoring import evaluation
 from spnr_jax.training import checkpoint, optimisation
 from support import tiny_dataset

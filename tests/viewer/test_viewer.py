@@ -16,8 +16,7 @@ from support.tiny_viewer import model, scene, state, view
 
 from spnr_jax import cli
 from spnr_jax.kernels import cameras
-from spnr_jax.method.model import SAMPLES
-from spnr_jax.viewer import camera_path, levels, picture, session, uploads, viewpoint
+from spnr_jax.viewer import camera_path, picture, session, uploads, viewpoint
 from spnr_jax.viewer import scene as scenes
 from spnr_jax.viewer.loop import Loop
 
@@ -360,22 +359,6 @@ def test_a_file_that_cannot_be_read_is_refused_under_the_browsers_name(name, con
     assert str(tmp_path) not in str(refused.value)
     assert "\n" not in str(refused.value)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_the_expected_losses_are_those_of_the_readmes_table():
-    rows = re.findall(r"^\| `(\w+)`: [^|]* \| ([\d.]+) \| ([\d.]+) \| [\d.]+ \| ([\d.]+) \|", _readme(), re.MULTILINE)
-    table = {name: levels.Level(psnr=float(p), flip=float(f), milliseconds=float(ms)) for name, p, f, ms in rows}
-    assert table == levels.LEVELS
-    assert set(levels.LEVELS) == {*SAMPLES, "trained"}
-    assert levels.expected_loss("best") == (0, 0)
-    text = levels.table({("draft", 64): 12.4})
-    assert "| draft | 12 (64²) | -0.06 dB | +0.000 |" in text
-    assert "| best | - | +0.00 dB | +0.000 |" in text
-
-
-def _readme():
-    text = (ROOT / "README.md").read_text()
-    return text[text.index("| quality | PSNR") :].partition("\n\n")[0]
 
 
 # what a browser may send

@@ -9,6 +9,7 @@ import hashlib
 import io
 import re
 import struct
+import traceback
 import warnings
 from collections import Counter
 from dataclasses import replace
@@ -81,11 +82,19 @@ def load_mesh(path: Path, root: Path | None = None) -> Asset:
     except RejectedAsset:
         raise
     except UNREADABLE as error:
+        if isinstance(error, NameError) and _raised_by_us(error):
+            raise  # no file makes our own code name what is not there
         text = str(error).strip().split("\n")[0]
         raise RejectedAsset(
             f"cannot be read, the file is broken or truncated ({type(error).__name__}: {text})"
         ) from error
     return replace(asset, source={"file": path.name, "sha256": checksum})
+
+
+def _raised_by_us(error: Exception) -> bool:
+    """Whether the innermost call is one of this package."""
+    innermost = traceback.extract_tb(error.__traceback__)[-1]
+    return Path(innermost.filename).is_relative_to(Path(__file__).parents[2])
 
 
 def _load(path: Path, root: Path | None) -> Asset:

@@ -1,0 +1,20 @@
+"""How an experiment becomes a command: options of a dataclass, errors as one line, the exit codes of `spnr`."""
+
+import os
+import sys
+from collections.abc import Callable
+from typing import Any, NoReturn
+
+import tyro
+
+from spnr_jax import cli
+
+
+def run(main: Callable[[Any], object], options: type, name: str) -> NoReturn:
+    """Calls `main` with the options of the command line `python -m experiments.NAME`, and ends the process."""
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
+
+    def work() -> None:
+        main(tyro.cli(options, prog=f"python -m experiments.{name}"))
+
+    sys.exit(cli.guarded(work, name.rpartition(".")[2]))

@@ -1,0 +1,1 @@
+"""What every comparison of networks needs: trained networks, scores, tables, pictures, and a folder that resumes."""

@@ -1,0 +1,86 @@
+"""Figures of one style, and pictures side by side as one picture, with names above the columns and beside the rows."""
+
+import functools
+import io
+import textwrap
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib import rc_context
+from matplotlib.figure import Figure
+from PIL import Image, ImageDraw, ImageFont
+
+from spnr_jax.formats.images import to_uint8
+
+COLORS = ("#2457d6", "#d9480f", "#2f9e44", "#9c36b5", "#0b7285", "#e8a700", "#868e96", "#495057", "#adb5bd")
+BLUE, RED, GREEN, *_ = COLORS
+INK_COLOR, GREY = "#1d2330", "#a8b3c7"
+STYLE: dict[Any, Any] = {
+    "font.size": 9,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.alpha": 0.25,
+    "legend.frameon": False,
+    "legend.fontsize": 8,
+    "figure.constrained_layout.use": True,
+}
+INK, PAPER, GAP = (29, 35, 48), (255, 255, 255), 4
+FONT_SIZE, LETTER = 12, 6.2  # pixels, the second the mean width of a letter
+
+
+def drawing(draw: Callable[..., Figure]) -> Callable[..., bytes]:
+    """The PNG of the figure that a function draws, in the style of all figures."""
+
+    @functools.wraps(draw)
+    def call(*arguments: Any, **options: Any) -> bytes:
+        stream = io.BytesIO()
+        with rc_context(STYLE):
+            draw(*arguments, **options).savefig(stream, format="png", dpi=110, metadata={"Software": None})
+        return stream.getvalue()
+
+    return call
+
+
+def grid(
+    cells: Sequence[Sequence[np.ndarray]],
+    columns: Sequence[str] = (),
+    rows: Sequence[str] = (),
+    size: int = 96,
+    below: Sequence[Sequence[str]] = (),
+) -> np.ndarray:
+    """The rows of pictures (h, w, 3) as one (H, W, 3) uint8; every cell has `size` pixels along each side.
+
+    `below` has a line for each picture.
+
+    A picture of fewer pixels is shown with square ones, where they fit without rest; cells that a row lacks are white.
+    """
+    wide = max(map(len, cells))
+    left = 110 if rows else 0
+    heads = [textwrap.wrap(text, int(size / LETTER)) for text in columns]
+    top = (FONT_SIZE + 3) * max(map(len, heads), default=0) + (6 if columns else 0)
+    high = size + GAP + (FONT_SIZE + 2 if below else 0)
+    canvas = Image.new("RGB", (left + wide * (size + GAP), top + len(cells) * high), PAPER)
+    draw, font = ImageDraw.Draw(canvas), ImageFont.load_default(FONT_SIZE)
+    for i, lines in enumerate(heads):
+        draw.text((left + i * (size + GAP), 2), "\n".join(lines), INK, font, spacing=3)
+    for j, row in enumerate(cells):
+        if rows:
+            lines = textwrap.wrap(rows[j].replace("_", "_ "), int(left / LETTER) - 1)
+            text = "\n".join(line.replace("_ ", "_") for line in lines)
+            draw.text((2, top + j * high + size // 3), text, INK, font, spacing=3)
+        for i, picture in enumerate(row):
+            place = (left + i * (size + GAP), top + j * high)
+            canvas.paste(scaled(picture, size), place)
+            if below:
+                draw.text((place[0], place[1] + size), below[j][i], INK, font)
+    return np.asarray(canvas)
+
+
+def scaled(picture: np.ndarray, size: int) -> Image.Image:
+    """The picture with so many pixels along each side."""
+    image = Image.fromarray(to_uint8(picture))
+    exact = size % image.width == 0
+    return image.resize((size, size), Image.Resampling.NEAREST if exact else Image.Resampling.LANCZOS)

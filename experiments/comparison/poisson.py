@@ -1,0 +1,108 @@
+"""Poisson reconstruction beside the references: a surface from each object's points, rendered as they were.
+
+Light, cameras, samples per pixel and integrator are those that dataset.json names.  An object whose points span no
+surface is an empty picture.  Pictures are kept by object:
+
+    FOLDER/NAME/000.png     RGBA, sRGB, straight alpha, one for each view
+    FOLDER/NAME/made.json   seconds, number of views, and why the pictures are empty (""); there once they all are
+"""
+
+import hashlib
+import importlib.util
+import json
+import sys
+import time
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from data_gen.render import light, poisson_surface, views
+from data_gen.render.poisson_surface import PoissonConfig
+from data_gen.render.variant import choose_variant, mitsuba_module
+from data_gen.store import layout
+from spnr_jax.formats import data_sets
+from spnr_jax.formats.images import write_whole
+from spnr_jax.scoring.evaluation import Pictures
+from spnr_jax.surfels.room import indoor_envmap
+
+RENDERING = ("resolution", "fov", "spp", "max_depth")  # settings that decide a picture, given the pose of its camera
+SURFACES = {"poisson": PoissonConfig(), "poisson_trimmed": PoissonConfig(trim=0.3)}
+
+
+class Renderer:
+    """The references' light, cameras and integrator, on surfaces that are made of points."""
+
+    def __init__(self, settings: dict, envmap: Path | None = None, variant: str = "auto", seed: int = 0) -> None:
+        """Takes the settings of a data set (`Dataset.settings`); the envmap where that is a file."""
+        chosen, notice = choose_variant(variant)
+        if notice:
+            print(notice, file=sys.stderr)
+        mitsuba_module(chosen)
+        self._seed, self._view = seed, view_config(settings)
+        self._light = light.scaled_to_white(unscaled_light(settings["environment_map"], envmap))
+
+    def pictures(self, item: data_sets.ObjectData, num_points: int, surface: PoissonConfig) -> tuple[np.ndarray, str]:
+        """Straight-alpha sRGB (views, height, width, 4) uint8 from the object's first points, and "".
+
+        Where they span no surface: empty pictures, and the reason.
+        """
+        try:
+            asset = poisson_surface.reconstruct(jax.tree.map(lambda x: np.asarray(x)[:num_points], item.cloud), surface)
+        except poisson_surface.NoSurface as error:
+            return np.zeros(item.images.shape, np.uint8), str(error)
+        scene = views.build_scene(asset, self._light)
+        poses = np.tile(np.eye(4), (len(item.images), 1, 1))
+        poses[:, :3] = item.camera.cam_to_world
+        radiance = [views.render_view(scene, p, self._view, self._seed + view) for view, p in enumerate(poses)]
+        return np.stack([views.straight_srgb(r) for r in radiance]), ""
+
+
+def view_config(settings: dict) -> views.ViewConfig:
+    """What decides a data set's pictures, given the poses of their cameras."""
+    if missing := [name for name in RENDERING if name not in settings["settings"]]:
+        raise ValueError(f"dataset.json: the setting {missing[0]} is missing; generate the data set again")
+    return views.ViewConfig(**{name: settings["settings"][name] for name in RENDERING})
+
+
+def unscaled_light(described: dict, envmap: Path | None) -> np.ndarray:
+    """The environment map that a data set describes; ValueError if the file given is not it."""
+    if described["sha256"] is None:
+        if envmap:
+            raise ValueError(f"--envmap {envmap}: the {described['name']} lit the data set; leave the option out")
+        return indoor_envmap()
+    if envmap is None:
+        raise ValueError(f"--envmap: give {described['name']}, which lit the data set")
+    radiance = light.load_envmap(envmap)
+    if hashlib.sha256(envmap.read_bytes()).hexdigest() != described["sha256"]:
+        raise ValueError(f"--envmap {envmap}: not the {described['name']} that lit the data set (another checksum)")
+    return radiance
+
+
+def show(renderer: Renderer, points: int, surface: PoissonConfig, folder: Path, item: data_sets.ObjectData) -> Pictures:
+    """Image and opacity of the surface of an object's first points, in all its views; read where they are made."""
+    note = folder / item.name / "made.json"
+    paths = [folder / item.name / f"{view:03d}.png" for view in range(len(item.images))]
+    if not note.is_file():
+        start = time.monotonic()
+        pictures, empty = renderer.pictures(item, points, surface)
+        seconds = time.monotonic() - start
+        for path, picture in zip(paths, pictures, strict=True):
+            write_whole(path, layout.encode_image(picture))
+        made = {"seconds": round(seconds, 4), "views": len(paths), "empty": empty}
+        write_whole(note, layout.json_text(made).encode())
+    rgba = np.stack([layout.read_image(path) for path in paths])
+    return Pictures(image=data_sets.on_white(rgba), acc=rgba[..., 3].astype(np.float32) / 255)
+
+
+def seconds_per_view(folder: Path, names: tuple[str, ...]) -> list[float]:
+    """Seconds of solver and renderer by object, shared by its views."""
+    notes = [json.loads((folder / name / "made.json").read_text()) for name in names]
+    return [note["seconds"] / note["views"] for note in notes]
+
+
+def check_packages() -> None:
+    """Raise ValueError, with what to install, where one of the two optional packages is absent."""
+    for package in ("pymeshlab", "mitsuba"):
+        if importlib.util.find_spec(package) is None:
+            raise ValueError(f"this needs {package}: pip install 'spnr-jax[data,baselines]'")

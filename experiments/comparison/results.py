@@ -1,0 +1,87 @@
+"""A folder of results: whose it is, what was made for it, and the files that a person reads.
+
+    OUT/asked.json     what was asked for; another request is refused, because its results would be mixed in
+    OUT/results.json   every number and its conditions
+    OUT/table.md .csv .tex  and the pictures
+
+What was made stands in files of its own, so that the same command goes on where it was stopped.
+"""
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from experiments.comparison import tables
+from experiments.comparison.tables import Table
+from spnr_jax.formats import data_sets, images
+from spnr_jax.training import run_record
+
+
+def claim(folder: Path, what: str, asked: Mapping, dataset: data_sets.Dataset | None = None) -> None:
+    """Makes a folder that of a request (on a data set); ValueError if it is another's."""
+    asked = {"of": what, **asked} | ({} if dataset is None else {"data": run_record.checksum(dataset)})
+    path = folder / "asked.json"
+    if path.is_file():
+        there = json.loads(path.read_text())
+        if different := [name for name in asked if there.get(name) != json.loads(json.dumps(asked[name]))]:
+            raise ValueError(f"{folder} holds {what} with another {', '.join(different)}; choose another --out")
+    images.write_whole(path, as_json(asked))
+
+
+def as_json(content: object) -> bytes:
+    """The bytes of a JSON file."""
+    return (json.dumps(content, indent=1, allow_nan=False) + "\n").encode()
+
+
+def kept(place: Path, make: Callable[[], Any]) -> Any:
+    """What a file holds: JSON, arrays (.npz) or a picture (.png); it is made if it is not there."""
+    if not place.is_file():
+        images.write_whole(place, WRITERS[place.suffix](make()))
+    return READERS[place.suffix](place)
+
+
+def _arrays(place: Path) -> tuple[np.ndarray, ...]:
+    with np.load(place, allow_pickle=False) as arrays:
+        return tuple(arrays[name] for name in arrays.files)
+
+
+def _picture(place: Path) -> np.ndarray:
+    with Image.open(place) as image:
+        return np.asarray(image.convert("RGB"))
+
+
+WRITERS: dict[str, Callable[[Any], bytes]] = {
+    ".json": lambda content: (json.dumps(content, indent=1) + "\n").encode(),  # scores may be NaN
+    ".npz": lambda arrays: images.npz(*arrays),
+    ".png": images.png,
+}
+READERS: dict[str, Callable[[Path], Any]] = {
+    ".json": lambda place: json.loads(place.read_text()),
+    ".npz": _arrays,
+    ".png": _picture,
+}
+
+
+def write(
+    out: Path,
+    results: Mapping,
+    made: Sequence[Table],
+    notes: Sequence[str] = (),
+    files: Mapping[str, bytes] | None = None,
+) -> None:
+    """Writes results.json, the tables and what else there is, and prints the tables."""
+    everything = {
+        "results.json": as_json(results),
+        "table.md": tables.markdown(made, notes).encode(),
+        "table.csv": tables.csv_text(made).encode(),
+        "table.tex": tables.latex(made, notes).encode(),
+        **(files or {}),
+    }
+    for name, content in everything.items():
+        images.write_whole(out / name, content)
+    print(tables.markdown(made))
+    print(f"wrote {', '.join(everything)} in {out}", flush=True)

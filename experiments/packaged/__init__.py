@@ -1,0 +1,1 @@
+"""The demo, and how the networks of the package are made."""

@@ -1,0 +1,230 @@
+"""Figure 3, and beyond: depth maps of unseen objects beside the true depth, their errors, and floaters.
+
+    python -m experiments.paper.fig3 --data DIR --out DIR --runs RUN ... [--table1 DIR] [--surfaces poisson ...]
+
+The truth is ray casting of the very meshes that the references were rendered from, made again from the data set's
+records, along the rays of each method: its own pixels, through its own pixel centres.
+
+    OUT/truth/SIZE/ID.npz      true distances of all views, inf beside the object
+    OUT/depths/METHOD/ID.npz   a method's depth and opacity
+    OUT/results.json           every metric (experiments/paper/depth_scores.py), with intervals, and the conditions
+    OUT/table.md  OUT/fig3_depth.png
+
+What is there is kept, so the same command goes on where it was stopped.  It draws no random numbers.
+"""
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Literal
+
+import jax
+import numpy as np
+import tyro
+
+from data_gen.render import depth, poisson_surface
+from data_gen.render.variant import choose_variant, mitsuba_module
+from experiments import command
+from experiments.comparison import figures, networks, results
+from experiments.comparison.networks import LABELS, Sources
+from experiments.comparison.poisson import SURFACES
+from experiments.comparison.results import kept
+from experiments.comparison.source_meshes import cast_views, mesh_of
+from experiments.comparison.tables import Table, number, text
+from experiments.paper import depth_scores
+from experiments.paper.depth_scores import METRICS, OPAQUE
+from spnr_jax import cli
+from spnr_jax.devices import machine
+from spnr_jax.formats import data_sets
+from spnr_jax.formats.images import depth_image, png
+from spnr_jax.kernels import cameras
+from spnr_jax.kernels.records import Camera, PointCloud
+from spnr_jax.scoring import evaluation
+
+FLOATER, MISSED = np.array([0.85, 0.1, 0.1]), np.array([0.15, 0.35, 0.85])
+WORST = 0.2  # error, in half diagonals, that the picture shows black
+NOTE = (
+    "Distances are along the rays, in half diagonals of the object's box. Means over views with 95 % bootstrap "
+    "intervals over objects. Errors where a method is opaque inside the true silhouette: of the depth as it is "
+    "rendered, which counts what nothing stops at the far side of the box, and of what is opaque alone. Floaters are "
+    "opaque pixels outside the silhouette, far ones farther from it than 1/32 of the picture."
+)
+PICTURE = f"In the picture: errors in grey, black from {WORST:g} on; floaters red, missed pixels blue."
+
+Shown = Callable[[data_sets.ObjectData, PointCloud], tuple[np.ndarray, np.ndarray]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fig3:
+    """Depth maps of unseen objects, and how far they are from the truth."""
+
+    data: Path
+    """Folder of the data set."""
+    out: Path
+    """Folder of the results; the same command goes on there."""
+    sources: tyro.conf.OmitArgPrefixes[Sources] = field(default_factory=Sources)
+    surfaces: tuple[Literal["poisson", "poisson_trimmed"], ...] = ()
+    """Poisson surfaces to compare with: made of the same points."""
+    meshes: Path | None = None
+    """Folder of the mesh files that the data set was made from, if it was."""
+    objects: int | None = None
+    """Test objects, spread over the split (default: all)."""
+    shown: int = 8
+    """Objects in the picture."""
+    variant: str = "auto"
+    """Mitsuba variant: scalar_rgb, llvm_ad_rgb, or auto for the faster one that works here."""
+    quick: bool = False
+    """A check that everything works: two objects."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Method:
+    """How a method shows depth and opacity of an object, and what tells it from another one."""
+
+    show: Shown
+    identity: dict
+
+
+def main(options: Fig3) -> None:
+    """Makes what is missing of depths and truth, then scores, table and picture."""
+    cli.set_up_jax()
+    dataset = data_sets.open_dataset(options.data)
+    names = networks.test_objects(dataset, 2 if options.quick else options.objects)
+    results.claim(options.out, "depths", {}, dataset)
+    found, points = all_methods(options, dataset)
+    mitsuba_module(choose_variant(options.variant)[0])
+    for label, method in found.items():
+        results.claim(options.out / "depths" / label, f"depths of {label}", method.identity | {"points": points})
+    scores: dict[str, list] = {name: [] for name in found}
+    rows, shown = [], evaluation.spread(names, options.shown)
+    for count, name in enumerate(names, start=1):
+        item = data_sets.read_object(dataset, name)
+        maps = object_maps(options, dataset, item, found, points)
+        for label, (seen, acc, truth) in maps.items():
+            scores[label].append(depth_scores.scores(seen, acc, far_side(item.camera, truth.shape[1:]), truth))
+        if name in shown:
+            rows.append(picture_row(item, maps, scores))
+        print(f"{count} of {len(names)}: {name}", flush=True)
+    all_results = {
+        "methods": {name: depth_scores.summarise(rows) for name, rows in scores.items()},
+        "made of": {name: method.identity for name, method in found.items()},
+        "points": points,
+        "objects": list(names),
+        "views": len(next(iter(maps.values()))[2]),
+        "pixels": {method: truth.shape[-1] for method, (_, _, truth) in maps.items()},
+        "hardware": machine.hardware(),
+        "data": dataset.settings.get("settings", {}),
+        "seed": "nothing is drawn: samples lie at the middles of their strata",
+    }
+    heads = ["Reference", "True depth", *(f"{name}{end}" for name in found for end in (", depth", ", error"))]
+    picture = figures.grid([cells for _, cells in rows], heads, [label for label, _ in rows], 128)
+    results.write(options.out, all_results, [table(all_results)], [NOTE, PICTURE], {"fig3_depth.png": png(picture)})
+
+
+def all_methods(options: Fig3, dataset: data_sets.Dataset) -> tuple[dict[str, Method], int]:
+    """What shows depth: networks and surfaces, and the points that all are given."""
+    trained = networks.networks(options.sources, dataset)
+    if left_out := [name for name, network in trained.items() if not network.has_depth]:
+        print(f"left out, since they predict no depth: {', '.join(left_out)}")
+    found = {name: of_network(network) for name, network in trained.items() if network.has_depth}
+    found |= {LABELS[name]: of_surface(SURFACES[name]) for name in options.surfaces}
+    if not found:
+        raise ValueError("--runs: none of these predicts depth; name a run of another method, or --surfaces")
+    return found, next(iter(trained.values())).config.test_points
+
+
+def of_network(network: networks.Network) -> Method:
+    """The depth that a network renders."""
+
+    def show(item: data_sets.ObjectData, cloud: PointCloud) -> tuple[np.ndarray, np.ndarray]:
+        pictures = evaluation.on_host(network.show()(cloud, item.camera))
+        assert pictures.depth is not None
+        return np.asarray(pictures.depth), np.asarray(pictures.acc)
+
+    return Method(show=show, identity=network.identity)
+
+
+def of_surface(config: poisson_surface.PoissonConfig) -> Method:
+    """The depth of a surface that is made of the points; nothing where they span none."""
+
+    def show(item: data_sets.ObjectData, cloud: PointCloud) -> tuple[np.ndarray, np.ndarray]:
+        try:
+            asset = poisson_surface.reconstruct(jax.tree.map(np.asarray, cloud), config)
+        except poisson_surface.NoSurface:
+            return (np.zeros(item.images.shape[:3], np.float32),) * 2
+        found = cast_views(depth.caster(asset), item.camera)
+        hit = np.isfinite(found)
+        return np.where(hit, found, 0), hit.astype(np.float32)
+
+    return Method(show=show, identity=asdict(config))
+
+
+def object_maps(
+    options: Fig3, dataset: data_sets.Dataset, item: data_sets.ObjectData, found: dict[str, Method], points: int
+) -> dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Depth, opacity and true depth (views, h, w) of an object by method; read where they are made."""
+    cloud = data_sets.first_points(item, points)
+    maps = {}
+    for name, method in found.items():
+        seen, acc = kept(options.out / "depths" / name / f"{item.name}.npz", partial(method.show, item, cloud))
+        size, place = seen.shape[1:], options.out / "truth" / f"{seen.shape[-1]}" / f"{item.name}.npz"
+        (truth,) = kept(place, partial(true_depth, dataset, item, options.meshes, size))
+        maps[name] = (seen, acc, truth)
+    return maps
+
+
+def true_depth(
+    dataset: data_sets.Dataset, item: data_sets.ObjectData, meshes: Path | None, size: tuple[int, ...]
+) -> tuple[np.ndarray]:
+    """Distances (views, *size) to the mesh that the object was made from."""
+    cast = depth.caster(mesh_of(dataset, item, meshes))
+    return (cast_views(cast, cameras.resize(item.camera, *size)),)
+
+
+def far_side(camera: Camera, size: tuple[int, ...]) -> np.ndarray:
+    """Distances (views, *size) to the far side of the box, where rendered depths count what nothing stops."""
+    rays = cameras.camera_rays(cameras.resize(camera, *size))
+    return np.asarray(cameras.intersect_box(rays.origins, rays.directions)[1])
+
+
+def picture_row(item: data_sets.ObjectData, maps: dict, scores: dict[str, list]) -> tuple[str, list[np.ndarray]]:
+    """Reference, truth, and depth and error of each method, in the view whose error is the first method's median."""
+    first = np.nan_to_num(next(iter(scores.values()))[-1]["error"], nan=np.inf)
+    view = evaluation.median_view(first)
+    finest = max((truth[view] for _, _, truth in maps.values()), key=len)
+    inside = np.isfinite(finest)
+    span = (float(finest[inside].min()), float(finest[inside].max())) if inside.any() else (0.0, 1.0)
+    cells = [data_sets.on_white(item.images[view])]
+    cells.append(depth_image(np.where(inside, finest, 0), inside, span))
+    for seen, acc, truth in maps.values():
+        cells += [depth_image(seen[view], acc[view], span), error_image(seen[view], acc[view], truth[view])]
+    return f"{item.name}, view {view}", cells
+
+
+def error_image(seen: np.ndarray, acc: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """The error in grey (h, w, 3), black from WORST on; floaters red, what is missed blue."""
+    inside, opaque = np.isfinite(truth), acc > OPAQUE
+    grey = 1 - np.clip(np.abs(seen - np.where(inside, truth, 0)) / WORST, 0, 1)
+    picture = np.where((inside & opaque)[..., None], grey[..., None], np.ones(3))
+    picture[inside & ~opaque] = MISSED
+    picture[~inside & opaque] = FLOATER
+    return picture
+
+
+def table(found: dict) -> Table:
+    """The metrics of every method."""
+    rows = []
+    for name, row in found["methods"].items():
+        cells = [
+            number(row[metric]["mean"], decimals, row[metric]["interval"], factor=factor)
+            for metric, (_, decimals, factor) in METRICS.items()
+        ]
+        rows.append((name, (text(found["pixels"][name]), *cells)))
+    counts = f"{len(found['objects'])} unseen objects x {found['views']} views, {found['points']} points"
+    title = f"{counts}; {found['hardware']}"
+    return Table(title=title, heads=("Pixels", *(head for head, _, _ in METRICS.values())), rows=tuple(rows))
+
+
+if __name__ == "__main__":
+    command.run(main, Fig3, "paper.fig3")

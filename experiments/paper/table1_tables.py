@@ -1,0 +1,127 @@
+"""The results of Table 1 as tables: quality and cost, paired differences, and a table of each class of objects."""
+
+from collections.abc import Mapping
+
+from experiments.comparison.budget import QUICK_STEPS
+from experiments.comparison.networks import LABELS
+from experiments.comparison.tables import Cell, Table, number, text
+from spnr_jax.scoring.report import ARROWS, QUALITY, duration
+from spnr_jax.scoring.summary import NO_WEIGHTS
+
+METRICS = ("psnr", "ssim", "lpips", "flip", "cpsnr", "iou")
+COSTS = {"parameters": "Parameters", "steps": "Steps", "training_seconds": "Training", "ms_per_view": "ms per view"}
+MISSING = {"lpips": NO_WEIGHTS, "iou": "n/a (no opacity)"}
+BUDGETS = {
+    "quick": f"the tiny presets for {QUICK_STEPS} steps each, which shows that everything runs and nothing else",
+    "tiny": "the tiny presets, 64 px",
+    "paper": "the paper presets",
+}
+
+
+def tables(results: Mapping) -> list[Table]:
+    """The table of methods, the differences, and a table of each class of objects."""
+    made = [methods_table(results)]
+    if results["ours_minus"]:
+        made.append(differences_table(results["ours_minus"]))
+    for name, methods in results["per_category"].items():
+        count = next(iter(methods.values()))["objects"]
+        title = f"{name}, {count} object{'s' * (count != 1)}"
+        made.append(Table(title=title, heads=_metric_heads(), rows=_rows(methods, _quality(methods))))
+    return made
+
+
+def methods_table(results: Mapping) -> Table:
+    """Quality and cost of every method; rows that could not be made say why."""
+    methods, missing = results["methods"], results["missing"]
+    cost = {name: tuple(_cost(results["costs"][name], column) for column in COSTS) for name in methods}
+    quality = _quality(methods)
+    rows = dict(_rows(methods, {name: quality[name] + cost[name] for name in methods}))
+    rows |= {LABELS[name]: (Cell(text=reason),) for name, reason in missing.items()}
+    counts = next(iter(methods.values()))
+    return Table(
+        title=f"Methods, {counts['objects']} unseen objects, {counts['views']} views",
+        heads=(*_metric_heads(), *COSTS.values()),
+        rows=tuple((label, rows[label]) for label in LABELS.values() if label in rows),
+        note="Means over images with 95 % bootstrap intervals over objects; the best of a column stands out.",
+    )
+
+
+def differences_table(ours_minus: Mapping) -> Table:
+    """Ours minus each other method, image by image."""
+    rows = tuple(
+        (f"Ours minus {LABELS[name]}", tuple(_difference(row.get(metric), metric) for metric in METRICS))
+        for name, row in ours_minus.items()
+    )
+    note = "Image by image, with 95 % bootstrap intervals and the p-value of a sign-flip test, both over objects."
+    return Table(title="Paired differences", heads=_metric_heads(), rows=rows, note=note)
+
+
+def _metric_heads() -> tuple[str, ...]:
+    return tuple(f"{QUALITY[m][0]}\N{NO-BREAK SPACE}{ARROWS[QUALITY[m][2]]}" for m in METRICS)
+
+
+def _rows(methods: Mapping, cells: Mapping[str, tuple[Cell, ...]]) -> tuple[tuple[str, tuple[Cell, ...]], ...]:
+    return tuple((LABELS[name], cells[name]) for name in methods)
+
+
+def _quality(methods: Mapping[str, Mapping]) -> dict[str, tuple[Cell, ...]]:
+    """The cells of all metrics by method."""
+    columns = []
+    for metric in METRICS:
+        _, decimals, better = QUALITY[metric]
+        values = [row[metric] for row in methods.values() if row[metric] is not None]
+        best = max(values, key=lambda value: better * value) if values else None
+        columns.append(
+            [
+                number(
+                    row[metric],
+                    decimals,
+                    row[f"{metric}_interval"],
+                    missing=MISSING.get(metric, "n/a"),
+                    best=row[metric] == best,
+                )
+                for row in methods.values()
+            ]
+        )
+    return dict(zip(methods, zip(*columns, strict=True), strict=True))
+
+
+def _difference(found: Mapping | None, metric: str) -> Cell:
+    if found is None:
+        return text(MISSING.get(metric, "n/a"))
+    p_value = found["p_value"]
+    test = () if p_value is None else ("p < 0.001",) if p_value < 0.001 else (f"p = {p_value:.3f}",)
+    return number(found["mean"], QUALITY[metric][1], found["interval"], sign="+", more=test)
+
+
+def _cost(cost: Mapping, column: str) -> Cell:
+    value = cost.get(column)
+    if column == "training_seconds" and value is not None:
+        return Cell(text=duration(value), value=value)
+    return number(value, 1 if column == "ms_per_view" else 0, missing="-")
+
+
+def notes(results: Mapping) -> list[str]:
+    """What a reader has to know of the numbers: budget, data, machine, seed, how they were measured."""
+    counts, costs = next(iter(results["methods"].values())), results["costs"]
+    presets = ", ".join(f"{LABELS[name]} {cost['preset']}" for name, cost in costs.items() if "preset" in cost)
+    minutes = results["minutes"]
+    rule = (
+        "every network trains the steps of its preset"
+        if minutes is None
+        else f"every network trains as many steps as fit into {minutes:g} minutes on this machine, its warm-up and "
+        "decay over exactly these; measured beforehand, compilation, checkpoints and previews not counted"
+    )
+    budget = f"Budget {results['budget']}: {BUDGETS[results['budget']]}"
+    factors = ", ".join(f"{LABELS[name]} {value:g}" for name, value in results["radius_factors"].items())
+    objects = results["data"]
+    lines = [
+        budget + ("." if results["budget"] == "quick" else f"; {rule}.") + (f" Presets: {presets}." if presets else ""),
+        f"All methods: the same {objects['train objects']} training objects, {counts['objects']} test objects of "
+        f"{objects['test objects']}, cameras, and first {results['points']} points; {results['resolution']} px.",
+        f"Hardware: {results['hardware']}; Poisson surfaces are made and rendered on its CPU. Seed {results['seed']}.",
+        "Training is the time of the steps, without compilation. ms per view: median over the objects but the first; "
+        "what is done once per object is shared by its views.",
+        *(f"{name}: {text}." for name, text in results["metrics"].items()),
+    ]
+    return lines + ([f"Radius of a point, in point spacings, best on training objects: {factors}."] if factors else [])

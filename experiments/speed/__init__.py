@@ -1,0 +1,1 @@
+"""How fast: beside a PyTorch twin, with growing work, and where data is made and read."""

@@ -1,0 +1,242 @@
+"""The paper's network once more, in PyTorch: what the benchmark times ours against.
+
+    plain   as a PyTorch user writes it: dense convolutions, `grid_sample`, nearest upsampling before a convolution
+    fast    the same map with what helps on a CPU: the stem as a product of occupied voxels with all taps, the lookup as
+            an embedding bag, upsampling folded into transposed convolutions, the linear head after compositing
+
+Volumes are (batch, features, z, y, x), images (batch, features, row, column); focal = 1 / tan(half the field of view).
+Names of parameters are those of `twin_layout`.  float32, no R1; needs torch alone.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from experiments.speed.twin_rays import Config, Renderer
+
+PRESETS = {
+    "abo": Config(),
+    "small": Config(grid=32, stages=4, coarse=32, fine=32),
+    "tiny": Config(grid=32, base=8, stages=3, coarse=16, fine=16, render=32),
+}
+IMPLS = ("plain", "fast")
+SLOPE = 0.2  # of the leaky ReLUs
+
+
+def folded(weight: Tensor) -> Tensor:
+    """The weight of the transposed convolution, 4 taps, stride 2, that is nearest x2 and a convolution of 3 taps."""
+    one = torch.tensor([[0.0, 0, 1, 1], [0, 1, 1, 0], [1, 1, 0, 0]])
+    for _ in range(2, weight.ndim):
+        weight = torch.tensordot(weight, one, dims=([2], [0]))  # the new taps go last: after all axes in their order
+    return weight.transpose(0, 1)
+
+
+class PointNet(nn.Module):
+    """Points (p, 11) to features."""
+
+    def __init__(self, c: Config):
+        super().__init__()
+        widths = (11, *c.point_widths)
+        self.linears = nn.ModuleList(nn.Linear(a, b, bias=False) for a, b in zip(widths, widths[1:], strict=False))
+        self.norms = nn.ModuleList(nn.BatchNorm1d(w) for w in c.point_widths)
+        self.out = nn.Linear(widths[-1], c.point_features)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Linear, batch norm, ReLU, three times; linear."""
+        for linear, norm in zip(self.linears, self.norms, strict=True):
+            x = F.relu(norm(linear(x)))
+        return self.out(x)
+
+
+class Block(nn.Module):
+    """Convolution of 3^3 taps, group norm, ReLU."""
+
+    def __init__(self, inputs: int, outputs: int, c: Config, kind: str, fast: bool):
+        super().__init__()
+        self.conv = nn.Conv3d(inputs, outputs, 3, 2 if kind == "down" else 1, 1, bias=False)
+        self.norm = nn.GroupNorm(c.groups, outputs)
+        self.up, self.fast = kind == "up", fast
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Channels are last where the grid is large enough for it to help."""
+        if self.fast:
+            large = x.shape[2] > 4
+            x = x.contiguous(memory_format=torch.channels_last_3d if large else torch.contiguous_format)
+        if self.up and self.fast and x.shape[2] >= 4:
+            return F.relu(self.norm(F.conv_transpose3d(x, folded(self.conv.weight), stride=2, padding=1)))
+        return F.relu(self.norm(self.conv(F.interpolate(x, scale_factor=2) if self.up else x)))
+
+    def of_rows(self, rows: Tensor, cell: Tensor, index: Tensor, shape: tuple[int, ...]) -> Tensor:
+        """The block of a volume that holds `rows` in some voxels and zeros elsewhere."""
+        weight, n = self.conv.weight, shape[1]
+        taps = (rows @ weight.permute(1, 2, 3, 4, 0).flatten(1)).view(len(rows), 27, -1)
+        step = 1 - torch.cartesian_prod(*[torch.arange(3)] * 3)  # z, y, x
+        there = cell[:, None].flip(-1) + step
+        flat = index[:, None] + (step * torch.tensor([n * n, n, 1])).sum(-1)
+        flat = torch.where(((there >= 0) & (there < n)).all(-1), flat, shape[0] * n**3)  # a spare row
+        out = taps.new_zeros(shape[0] * n**3 + 1, weight.shape[0]).index_add(0, flat.view(-1), taps.flatten(0, 1))
+        return F.relu(self.norm(out[:-1].view(*shape, -1).permute(0, 4, 1, 2, 3)))
+
+
+class UNet(nn.Module):
+    """The 3D U-Net on the rows of occupied voxels; skip connections are sums."""
+
+    def __init__(self, c: Config, fast: bool):
+        super().__init__()
+        widths = [c.base * 2**i for i in range(c.stages + 1)]
+        pairs = list(zip(widths, widths[1:], strict=False))
+        self.fast, self.grid = fast, c.grid
+        self.stem = Block(c.point_features + 1, c.base, c, "same", fast)
+        self.down = nn.ModuleList(Block(a, b, c, "down", fast) for a, b in pairs)
+        self.same = nn.ModuleList(Block(b, b, c, "same", fast) for _, b in pairs)
+        self.up = nn.ModuleList(Block(b, a, c, "up", fast) for a, b in reversed(pairs))
+
+    def forward(self, rows: Tensor, cell: Tensor, index: Tensor, batch: int) -> Tensor:
+        """(batch, features, z, y, x)."""
+        shape = (batch, *[self.grid] * 3)
+        if self.fast:
+            x = self.stem.of_rows(rows, cell, index, shape)
+        else:
+            volume = rows.new_zeros(batch * self.grid**3, rows.shape[1]).index_add(0, index, rows)
+            x = self.stem(volume.view(*shape, -1).permute(0, 4, 1, 2, 3))
+        skips = []
+        for down, same in zip(self.down, self.same, strict=True):
+            skips.append(x)
+            x = same(down(x))
+        for up in self.up:
+            x = up(x) + skips.pop()
+        return x
+
+
+class Upsampler(nn.Module):
+    """The feature image to a picture of twice the size."""
+
+    def __init__(self, c: Config, fast: bool):
+        super().__init__()
+        self.fast, width = fast, c.up_width
+        self.conv0 = nn.Conv2d(c.features, width, 3, 1, 1)
+        self.conv1 = nn.Conv2d(width, width, 3, 1, 1)
+        self.conv2 = nn.Conv2d(width, 32, 3, 1, 1)  # after nearest x2
+        self.conv3 = nn.Conv2d(32, 3, 3, 1, 1)
+        if fast:
+            self.to(memory_format=torch.channels_last)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """What the convolutions add to the enlarged rgb."""
+        y = F.leaky_relu(self.conv1(F.leaky_relu(self.conv0(x), SLOPE)), SLOPE)
+        if self.fast:
+            y = F.conv_transpose2d(y, folded(self.conv2.weight), self.conv2.bias, stride=2, padding=1)
+        else:
+            y = self.conv2(F.interpolate(y, scale_factor=2))
+        rgb = F.interpolate(x[:, :3], scale_factor=2, mode="bilinear", align_corners=False)
+        return self.conv3(F.leaky_relu(y, SLOPE)) + rgb
+
+
+class Generator(nn.Module):
+    """Points and materials to a volume, a volume and a camera to a picture."""
+
+    def __init__(self, c: Config, implementation: str = "fast"):
+        super().__init__()
+        fast = implementation == "fast"
+        self.c, self.points, self.unet = c, PointNet(c), UNet(c, fast)
+        self.renderer, self.upsampler = Renderer(c, fast), Upsampler(c, fast)
+
+    def encode_volume(self, pos: Tensor, mat: Tensor) -> Tensor:
+        """The volume of points (batch, n, 3) with materials (batch, n, 5)."""
+        batch, n = len(pos), self.c.grid
+        grid = (pos + 1) * (0.5 * n)
+        cell = grid.floor().clamp(0, n - 1)
+        features = self.points(torch.cat([pos, grid - cell - 0.5, mat], -1).flatten(0, 1))
+        cell = cell.long()
+        x, y, z = cell.unbind(-1)
+        index = (((torch.arange(batch)[:, None] * n + z) * n + y) * n + x).view(-1)
+        inside = (pos.abs() <= 1).all(-1).to(pos.dtype).view(-1)
+        count = pos.new_zeros(batch * n**3).index_add_(0, index, inside)
+        share = (inside / count[index].clamp_min(1))[:, None]
+        rows = torch.cat([features, torch.ones_like(share)], 1) * share  # add up to [mean, occupancy] in a voxel
+        return self.unet(rows, cell.flatten(0, 1), index, batch)
+
+    def render_volume(self, volume: Tensor, c2w: Tensor, focal: Tensor) -> tuple[Tensor, Tensor]:
+        """(picture, rgb at the resolution of the rays) of one view of each volume."""
+        features = self.renderer(volume, c2w, focal)
+        return self.upsampler(features), features[:, :3]
+
+    def forward(self, pos: Tensor, mat: Tensor, c2w: Tensor, focal: Tensor) -> tuple[Tensor, Tensor]:
+        """Both."""
+        return self.render_volume(self.encode_volume(pos, mat), c2w, focal)
+
+
+class Discriminator(nn.Module):
+    """PatchGAN on picture, condition and mask."""
+
+    def __init__(self, c: Config):
+        super().__init__()
+        w = c.disc_width
+        widths = (7, w, 2 * w, 4 * w, 8 * w, 1)
+        normed = (False, True, True, True, False)
+        self.convs = nn.ModuleList(
+            nn.Conv2d(widths[i], widths[i + 1], 4, 2 if i < 3 else 1, 1, bias=not normed[i]) for i in range(5)
+        )
+        self.norms = nn.ModuleList(
+            nn.GroupNorm(c.groups, widths[i + 1]) if normed[i] else nn.Identity() for i in range(4)
+        )
+        self.to(memory_format=torch.channels_last)
+
+    def forward(self, image: Tensor, cond: Tensor, mask: Tensor) -> Tensor:
+        """Logits of patches."""
+        x = torch.cat([image, cond, mask], 1).contiguous(memory_format=torch.channels_last)
+        for conv, norm in zip(self.convs, self.norms, strict=False):
+            x = F.leaky_relu(norm(conv(x)), SLOPE)
+        return self.convs[-1](x)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Batch:
+    """One view of each object: pos mat c2w focal, and target cond mask (batch, features, size, size)."""
+
+    pos: Tensor
+    mat: Tensor
+    c2w: Tensor
+    focal: Tensor
+    target: Tensor
+    cond: Tensor
+    mask: Tensor
+
+
+def compiled(generator: Generator) -> Generator:
+    """The generator with torch.compile on all but the U-Net: on a CPU oneDNN's convolutions beat generated code."""
+    for module in (generator.points, generator.renderer, generator.upsampler):
+        module.compile(dynamic=False)
+    return generator
+
+
+def trainer(c: Config, implementation: str, compile: bool, adversarial: bool) -> Callable[[Batch], None]:
+    """A training step: one forward of the generator, an update of the discriminator, an update of the generator."""
+    generator, judge = Generator(c, implementation).train(), Discriminator(c).train()
+    generator = compiled(generator) if compile else generator
+    draw = torch.compile(judge, dynamic=False) if compile else judge
+    betas = (0.5, 0.999)
+    adam_g = torch.optim.Adam(generator.parameters(), c.lr_g, betas, fused=True)
+    adam_d = torch.optim.Adam(judge.parameters(), c.lr_d, betas, fused=True)
+
+    def step(batch: Batch) -> None:
+        image, rgb = generator(batch.pos, batch.mat, batch.c2w, batch.focal)
+        low = F.avg_pool2d(batch.target, batch.target.shape[-1] // c.render)
+        loss = c.l1_weight * (F.l1_loss(image, batch.target) + c.lowres_weight * F.l1_loss(rgb, low))
+        if adversarial:
+            adam_d.zero_grad()
+            both = torch.cat([batch.target, image.detach()])
+            real, fake = draw(both, torch.cat([batch.cond] * 2), torch.cat([batch.mask] * 2)).chunk(2)
+            (F.softplus(-real).mean() + F.softplus(fake).mean()).backward()
+            adam_d.step()
+            judge.requires_grad_(False)
+            loss = loss + c.adv_weight * F.softplus(-draw(image, batch.cond, batch.mask)).mean()
+        adam_g.zero_grad()
+        loss.backward()
+        adam_g.step()
+        judge.requires_grad_(True)
+
+    return step

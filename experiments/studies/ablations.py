@@ -1,0 +1,224 @@
+"""Ablations: a reference training, and one that differs in one thing a row, on the same data and budget.
+
+    python -m experiments.studies.ablations --data DIR --out DIR [--steps N | --minutes M] [--seeds 0 1 2] [--rows ...]
+
+    OUT/runs/ROW_SEED/                            run folders; finished ones are only read
+    OUT/fold_K/runs/ROW_SEED/                     those of a part of the objects, with --folds
+    OUT/results.json  table.md                    scores, costs, and differences to the reference with intervals: on all
+                                                  objects, on mesh files, and on procedural ones
+    OUT/differences.png  gallery.png              the differences, and pictures of unseen objects
+
+Every variant trains for as many steps, or with --minutes for as long.  With --folds each part of all objects is held
+out in turn, so that every one of them is scored by networks that never saw it.
+
+Rows that are the preset itself (its own depth; those of the nearest points for a preset without them) are left out, and
+that without colour variants where the training split has none: `spnr-data generate DIR --colour-variants 5` makes them.
+More rows and seeds can be asked for later.
+Runs of one seed see the same batches and jitter, whatever the row.  The same command gives the same scores on a CPU.
+"""
+
+import dataclasses
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import tyro
+
+from experiments import command
+from experiments.comparison import variants, variants_report
+from experiments.comparison.variants import Budget, Variant
+from spnr_jax import cli, presets
+from spnr_jax.config import LossConfig, TrainConfig
+from spnr_jax.formats import data_sets
+from spnr_jax.model_config import ModelConfig, SamplingConfig
+
+REFERENCE = "reference"
+LABELS = {
+    "paper": "The paper's network and training",
+    "no_condition": "No condition image",
+    "no_colour_variants": "No colour variants",
+    "depth_3": "U-Net of 3 stages",
+    "depth_4": "U-Net of 4 stages",
+    "depth_5": "U-Net of 5 stages",
+    "skip_concat": "Skips concatenated",
+    "no_fine_samples": "No fine samples",
+    "no_view_direction": "No view direction",
+    "view_direction": "Sees the view direction",
+    "scatter_max": "Scatter: maximum",
+    "scatter_trilinear": "Scatter: trilinear",
+    "free_colour": "Free colours, not light on materials",
+    "no_neighbours": "No nearest points",
+    "three_neighbours": "3 nearest points",
+    "twelve_neighbours": "12 nearest points",
+    "batch_norm": "PointNet: batch normalisation",
+    "no_opacity_loss": "No loss of opacity",
+    "no_squared_error": "L1 alone",
+    "adversarial": "With the discriminator at the end",
+    "no_average": "Last weights, not their average",
+    "one_count": "Clouds of one size",
+    "more_views": "4 views of an object a step, as many rays",
+    "half_samples": "Half the samples",
+    "twice_samples": "Twice the samples",
+}
+ROWS = tuple(LABELS)
+if TYPE_CHECKING:
+    Row = str
+else:
+    Row = Literal[ROWS]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ablations:
+    """Train a preset and variants that differ from it in one thing each, and compare them on unseen objects."""
+
+    data: Path
+    """Folder of the data set."""
+    out: Path
+    """Folder of runs and results; the same command goes on there."""
+    rows: tuple[Row, ...] = ROWS
+    """What is changed, one thing a row."""
+    folds: int = 1
+    """Parts of all objects, each held out in turn (1: the data set's own test split alone)."""
+    budget: tyro.conf.OmitArgPrefixes[Budget] = field(default_factory=Budget)
+
+    def __post_init__(self) -> None:
+        if self.folds < 1:
+            raise ValueError(f"--folds: expected 1 or more, got {self.folds}")
+
+
+def main(options: Ablations) -> None:
+    """Trains what is not trained, scores all rows, writes tables and pictures."""
+    cli.set_up_jax()
+    dataset = data_sets.open_dataset(options.data)
+    budget, config = options.budget, options.budget.config()
+    parts, compared = folds(dataset, options.folds), []
+    data_sets.check_resolution(data_sets.read_object(dataset, budget.names(parts[0])[0]), config)
+    held_out = {"folds": options.folds} if options.folds > 1 else {}
+    variants.claim(options.out, "ablations", budget, dataset, **held_out)
+    for number, part in enumerate(parts):
+        out = options.out if len(parts) == 1 else options.out / f"fold_{number}"
+        if len(parts) > 1:
+            print(f"fold {number + 1} of {len(parts)}", flush=True)
+        runs = rows(options.rows, config, part)
+        trained = variants.train(runs, budget, out)
+        shown = -(-budget.shown // len(parts))
+        compared.append(variants.score(trained, REFERENCE, part, budget.names(part), shown))
+    variants_report.write(options.out, runs, REFERENCE, variants.merged(compared), budget, dataset)
+
+
+def folds(dataset: data_sets.Dataset, count: int) -> list[data_sets.Dataset]:
+    """The data set with each part of its objects as the test split, or as it is; variants train beside their object."""
+    if count == 1:
+        return [dataset]
+    everything = sorted(name for names in dataset.splits.values() for name in names)
+    objects = [name for name in everything if name == variants.original(name)]
+    if len(objects) < 2 * count:
+        raise ValueError(f"--folds {count}: {dataset.folder} holds {len(objects)} objects, too few")
+    found = []
+    for first in range(count):
+        test = tuple(objects[first::count])
+        train = tuple(name for name in everything if variants.original(name) not in test)
+        found.append(dataclasses.replace(dataset, splits={"train": train, "val": (), "test": test}))
+    return found
+
+
+def rows(wanted: tuple[Row, ...], config: TrainConfig, dataset: data_sets.Dataset) -> list[Variant]:
+    """The reference, and the rows that differ from it; a line says which do not."""
+    found = [Variant(name=REFERENCE, label=f"Unchanged ({config.preset})", config=config, dataset=dataset)]
+    for name in (name for name in ROWS if name in wanted):
+        plain = variants.without_colour_variants(dataset) if name == "no_colour_variants" else dataset
+        variant = Variant(name=name, label=LABELS[name], config=changed(name, config), dataset=plain)
+        if (variant.config, variant.dataset.splits) == (config, dataset.splits):
+            print(f"{LABELS[name]}: left out, {config.preset} is the same or has no such form")
+        else:
+            found.append(variant)
+    return found
+
+
+def paper_network(config: TrainConfig) -> TrainConfig:
+    """The paper's network and training of the sizes that a plus preset has; any other config as it is."""
+    made = {"plus_tiny": presets.tiny, "plus_abo": presets.abo, "plus_shapenet": presets.shapenet_car}
+    if config.preset == "plus_small":  # tiny's sizes, pictures twice as large
+        tiny = presets.tiny()
+        assert isinstance(tiny.model, ModelConfig)
+        model = dataclasses.replace(tiny.model, render_resolution=64, resize_resolution=64, image_resolution=128)
+        paper = dataclasses.replace(tiny, model=model)
+    else:
+        paper = made.get(config.preset, lambda: config)()
+    return dataclasses.replace(paper, num_steps=config.num_steps, even_share=config.even_share)
+
+
+def changed(row: Row, config: TrainConfig) -> TrainConfig:
+    """The config with the one change of a row."""
+    if row == "paper":
+        return paper_network(config)
+    assert isinstance(config.model, ModelConfig)
+    return dataclasses.replace(
+        config,
+        model=dataclasses.replace(config.model, **model_changes(config.model).get(row, {})),
+        loss=dataclasses.replace(config.loss, **loss_changes(config.loss).get(row, {})),
+        **recipe_changes(config).get(row, {}),
+    )
+
+
+def model_changes(model: ModelConfig) -> dict[str, dict]:
+    """The fields of a network that rows change."""
+    samples = model.sampling
+    changes: dict[str, dict] = {
+        **{f"depth_{stages}": {"num_stages": stages} for stages in (3, 4, 5)},
+        "skip_concat": {"skip": "concat"},
+        "no_fine_samples": {
+            "sampling": dataclasses.replace(samples, num_coarse=samples.num_coarse + samples.num_fine, num_fine=0)
+        },
+        "no_view_direction": {"sees_direction": False},
+        "view_direction": {"sees_direction": True},
+        "scatter_max": {"scatter": "max"},
+        "scatter_trilinear": {"scatter": "trilinear"},
+        "batch_norm": {"point_norm": "batch"},
+        "half_samples": {"sampling": scaled(samples, 0.5)},
+        "twice_samples": {"sampling": scaled(samples, 2)},
+    }
+    if model.num_neighbors:
+        changes |= {
+            "free_colour": {"color": "free"},
+            "no_neighbours": {"color": "free", "num_neighbors": 0, "num_features": ModelConfig.num_features},
+            "three_neighbours": {"num_neighbors": 3},
+            "twelve_neighbours": {"num_neighbors": 12},
+        }
+    return changes
+
+
+def loss_changes(loss: LossConfig) -> dict[str, dict]:
+    """The fields of the losses that rows change."""
+    changes: dict[str, dict] = {
+        "no_condition": {"condition": False},
+        "no_opacity_loss": {"opacity_weight": 0.0},
+        "no_squared_error": {"mse_weight": 0.0},
+    }
+    if loss.adversarial_weight == 0:  # as tiny has it, beside an L1 of weight 1
+        changes["adversarial"] = {"adversarial_weight": 0.01, "adversarial_start": 0.85, "discriminator_width": 16}
+    return changes
+
+
+def recipe_changes(config: TrainConfig) -> dict[str, dict]:
+    """The other fields of a training that rows change."""
+    changes: dict[str, dict] = {
+        "no_average": {"optimizer": dataclasses.replace(config.optimizer, ema_decay=0.0)},
+        "one_count": {"min_points": config.max_points},
+        "more_views": {"views_per_object": 4 * config.views_per_object},
+    }
+    if config.model.per_pixel:
+        changes["more_views"] |= {"pixel_stride": 2 * config.pixel_stride}
+    if config.loss.adversarial_weight == 0:
+        changes["adversarial"] = {"pixel_stride": 1, "crop": 0}  # the discriminator sees whole pictures
+    return changes
+
+
+def scaled(sampling: SamplingConfig, factor: float) -> SamplingConfig:
+    """So many times as many samples, coarse and fine ones."""
+    coarse, fine = (round(factor * count) for count in (sampling.num_coarse, sampling.num_fine))
+    return dataclasses.replace(sampling, num_coarse=coarse, num_fine=fine)
+
+
+if __name__ == "__main__":
+    command.run(main, Ablations, "studies.ablations")

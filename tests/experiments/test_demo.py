@@ -1,0 +1,83 @@
+"""The demo reuses what is there, and its report counts the seconds of the run that did the work."""
+
+import json
+import shutil
+from types import SimpleNamespace
+
+import pytest
+from support import tiny_dataset
+
+from experiments.packaged import demo
+from spnr_jax import cli, presets
+
+
+@pytest.fixture
+def asked(monkeypatch):
+    """Instead of Mitsuba, the tests' data set; the configs that the generator was given."""
+    configs = []
+
+    def generate(generation):
+        configs.append(generation)
+        if not generation.out.exists():
+            shutil.copytree(tiny_dataset.dataset().folder, generation.out)
+
+    monkeypatch.setattr(demo, "generate", generate)
+    monkeypatch.setattr(presets, "tiny", lambda: tiny_dataset.CONFIG)
+    monkeypatch.setattr(cli, "set_up_jax", lambda **_: None)
+    return configs
+
+
+@pytest.mark.ci
+def test_the_demo_writes_its_report_and_a_second_call_reuses_everything(asked, tmp_path, capsys):
+    demo.main(demo.Demo(out=tmp_path))
+    first = json.loads((tmp_path / "metrics.json").read_text())
+    assert set(first["seconds"]) >= {"generate", "train", "evaluate", "total"}
+    parts = sum(seconds for name, seconds in first["seconds"].items() if name != "total")
+    assert first["seconds"]["total"] == pytest.approx(parts, abs=0.3)
+    assert first["steps"] == tiny_dataset.CONFIG.num_steps
+    page = (tmp_path / "report.html").read_text()
+    assert all(name in page for name in tiny_dataset.SPLITS["test"])
+    assert str(tmp_path / "report.html") in capsys.readouterr().out
+
+    checkpoints = {path: path.stat().st_mtime_ns for path in (tmp_path / "run" / "checkpoints").rglob("*")}
+    demo.main(demo.Demo(out=tmp_path))
+    second = json.loads((tmp_path / "metrics.json").read_text())
+    assert checkpoints == {path: path.stat().st_mtime_ns for path in (tmp_path / "run" / "checkpoints").rglob("*")}
+    assert second["methods"] == first["methods"]
+    assert second["seconds"]["train"] == first["seconds"]["train"]
+
+
+@pytest.mark.parametrize(("meshes", "objects", "expected"), [(None, None, 240), ("m", None, None), ("m", 7, 7)])
+def test_procedural_objects_are_made_unless_meshes_replace_them(
+    meshes, objects, expected, asked, tmp_path, monkeypatch
+):
+    class Generated(Exception):  # noqa: N818 - no error: the demo has got as far as the test looks
+        pass
+
+    def stop(*_):
+        raise Generated
+
+    monkeypatch.setattr(demo.data, "open_dataset", stop)
+    with pytest.raises(Generated):
+        demo.main(demo.Demo(out=tmp_path, meshes=meshes and tmp_path / meshes, objects=objects))
+    assert asked[0].objects == expected
+
+
+def test_zero_steps_are_refused(asked, tmp_path):
+    with pytest.raises(ValueError, match="num_steps must be at least 1, got 0"):
+        demo.main(demo.Demo(out=tmp_path, steps=0))
+
+
+def test_seconds_add_up_over_calls_and_idle_ones_add_nothing(tmp_path, monkeypatch):
+    clock = iter([0.0, 30.0, 100.0, 112.0, 200.0, 203.0])
+    monkeypatch.setattr(demo, "time", SimpleNamespace(monotonic=lambda: next(clock)))
+    for expected in (30.0, 42.0, 42.0):
+        seconds = demo.Seconds(tmp_path / "seconds.json")
+        seconds.measure("train", lambda: None)
+        assert json.loads((tmp_path / "seconds.json").read_text()) == {"train": expected}
+
+
+def test_seconds_of_work_that_was_stopped_are_kept(tmp_path):
+    with pytest.raises(KeyboardInterrupt):
+        demo.Seconds(tmp_path / "seconds.json").measure("train", lambda: (_ for _ in ()).throw(KeyboardInterrupt))
+    assert "train" in json.loads((tmp_path / "seconds.json").read_text())

@@ -1,0 +1,70 @@
+"""Figure 1: the runs differ in the L1 weight alone, from scratch or from one network that the L1 loss trained."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from support import tiny_dataset
+from support.laws import same_bits
+from support.tiny_runs import L1_ONLY, check_conditions, results_of, shrunken
+
+from experiments.comparison.variants import QUICK_STEPS, Budget
+from experiments.paper.fig1 import Fig1, main, pretrained, variant
+from spnr_jax import config, presets
+from spnr_jax.training import checkpoint, optimisation
+
+pytestmark = pytest.mark.ci  # it trains several networks
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _shrunken():
+    with shrunken():
+        yield
+
+
+def asked(out, **options):
+    budget = Budget(quick=True, shown=1)
+    return Fig1(data=tiny_dataset.dataset().folder, out=out, budget=budget, **{"l1_weights": (0.0, 100.0)} | options)
+
+
+@pytest.fixture(scope="module")
+def out(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("fig1") / "out"
+    main(asked(folder, pretrain=2))
+    return folder
+
+
+def test_the_adversarial_loss_takes_part_from_the_first_step_and_the_weights_alone_differ():
+    options = Fig1(data=tiny_dataset.dataset().folder, out=tiny_dataset.folder())
+    made = [variant(options, weight, presets.tiny(), tiny_dataset.dataset()) for weight in options.l1_weights]
+    assert [v.config.loss.l1_weight for v in made] == [0, 100, 5000]
+    for v in made:
+        assert (v.config.loss.adversarial_weight, optimisation.first_adversarial_step(v.config)) == (1, 0)
+        assert v.start is None
+        assert dataclasses.replace(v.config, loss=config.LossConfig()) == dataclasses.replace(
+            presets.tiny(), loss=config.LossConfig()
+        )
+
+
+def test_every_weight_has_its_pictures_and_its_high_frequency_energy(out):
+    results = results_of(out)
+    assert set(results["variants"]) == {"l1_0", "l1_100"}
+    assert results["reference"] == "l1_100"
+    assert results["start"] == "2 steps of L1 alone"
+    assert {row["steps"][0] for row in results["variants"].values()} == {QUICK_STEPS}
+    for row in results["variants"].values():
+        assert row["detail"] > 0
+    check_conditions(out)
+
+
+def test_all_weights_start_from_the_network_that_the_l1_loss_trained(out):
+    _, before = checkpoint.load_run(out / "runs" / "pretrained_0")
+    options = asked(out, pretrain=2)
+    for weight in options.l1_weights:
+        wanted = variant(options, weight, dataclasses.replace(L1_ONLY, num_steps=QUICK_STEPS), tiny_dataset.dataset())
+        assert checkpoint.read_config(out / "runs" / f"{wanted.name}_0") == wanted.config
+        start = pretrained(options, tiny_dataset.dataset(), wanted.config)
+        assert start.step == 0
+        same_bits((start.generator, start.averaged), (before.averaged,) * 2)
+        same_bits((start.batch_stats, start.averaged_stats), (before.averaged_stats,) * 2)
+        assert np.isfinite(start.discriminator["kernel_0"]).all()

@@ -1,0 +1,48 @@
+"""Many runs in one program are the single runs: states, batches, losses."""
+
+import dataclasses
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support import tiny_dataset
+from support.laws import same_bits
+from support.tiny_baselines import SHRUNKEN
+
+from experiments.studies import many_objects
+from spnr_jax import cli, presets
+from spnr_jax.training import batching, optimisation
+
+SEEDS = (3, 4, 5)
+QUICK = dataclasses.replace(SHRUNKEN["points2nerf_tiny"], num_steps=3)  # no convolutions: compiles in a second
+
+
+def test_the_batches_of_a_run_are_those_that_it_would_see_alone():
+    dataset = tiny_dataset.dataset()
+    together = list(many_objects.batches(dataset, QUICK, SEEDS))[2]
+    for i, seed in enumerate(SEEDS):
+        alone = next(batching.batches(dataset, dataclasses.replace(QUICK, seed=seed), 2))
+        same_bits(jax.tree.map(lambda x, i=i: x[i], together), jax.tree.map(jnp.asarray, alone))
+
+
+@pytest.mark.ci
+def test_stacked_states_share_their_step_and_keep_their_keys():
+    states = [optimisation.jitted_create_state(QUICK, jnp.uint32(seed)) for seed in SEEDS]
+    stacked = many_objects.stack(states)
+    assert stacked.step.shape == ()
+    np.testing.assert_array_equal(jax.random.key_data(stacked.key)[1], jax.random.key_data(states[1].key))
+    same_bits(jax.tree.map(lambda x: x[1], stacked.generator), states[1].generator)
+
+
+@pytest.mark.ci
+def test_runs_and_objects_in_one_program_are_the_single_ones(tmp_path, monkeypatch):
+    monkeypatch.setattr(cli, "set_up_jax", lambda **_: None)
+    monkeypatch.setitem(presets.PRESETS, "tiny", lambda: QUICK)
+    options = many_objects.ManyObjects(data=tiny_dataset.dataset().folder, out=tmp_path, runs=2, steps=3, objects=2)
+    many_objects.main(options)
+    found = json.loads((tmp_path / "results.json").read_text())
+    assert max(found["train"]["apart"]) < 1e-4
+    assert max(found["render"]["apart"]) < 1e-4
+    assert {len(seconds) for seconds in found["train"]["seconds"].values()} == {2}, "without the step that compiles"

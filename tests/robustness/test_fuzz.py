@@ -1,0 +1,215 @@
+"""Damaged files are read or refused with one line, whatever the damage; nothing else is touched.
+
+    make fuzz              10,000 inputs for every reader, and a table    (FUZZ="-k glb")
+
+An input is read (finite values of the right shapes and types) or refused as the commands print it with exit code 2.
+Anything else fails: another exception, a warning, more than 10 seconds, more than a GiB of memory, a file outside its
+folder, a program, a connection, a pickle.  Hypothesis draws the damage and shrinks what fails.
+"""
+
+import ast
+import contextlib
+import json
+import os
+import pickle
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+import traceback
+import warnings
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+from damage import DECOY, OPENERS, Files, mutated
+from file_readers import READERS
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from watched import limited_memory, watched
+
+from spnr_jax.cli import one_line
+from spnr_jax.config import from_dict, to_dict
+from spnr_jax.presets import tiny
+from spnr_jax.viewer import session, viewpoint
+
+ROOT = Path(__file__).parents[2]
+INPUTS = int(os.environ.get("FUZZ_INPUTS", "16"))  # of each reader
+SECONDS = 10.0  # that an input may take
+LONGEST_REASON = 1000  # characters of a line that a person should read
+IN_CHILD = "FUZZ_CHILD" in os.environ
+EVERYDAY = [name for name in READERS if INPUTS > 16 or name != "lpips"]  # whose files are as large as the network
+SOURCES = sorted(path for folder in ("spnr_jax", "data_gen", "experiments") for path in (ROOT / folder).rglob("*.py"))
+json_values = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
+    max_leaves=6,
+)
+
+
+@pytest.fixture(scope="module")
+def table():
+    """Outcomes by reader, printed at the end."""
+    rows: dict[str, Counter] = {}
+    yield rows
+    for name, row in rows.items():
+        print(f"\n{name}: {row['read']} read, {row['refused']} refused, slowest {row['slowest']:.2f} s", end="")
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """Where an input lies; a file that nobody may read lies beside it."""
+    (tmp_path / DECOY).write_bytes(b"nobody reads this")
+    (tmp_path / "input").mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "input"))
+    return tmp_path / "input"
+
+
+def write_input(folder: Path, files: Files) -> None:
+    """The folder with these files alone."""
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    for name, content in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(content)
+
+
+def attempt(read, folder: Path, main: str) -> str:
+    """Whether the files in a folder were read or refused; AssertionError for anything else."""
+    start = time.perf_counter()
+    with (
+        watched(folder) as broken,
+        warnings.catch_warnings(record=True) as said,
+        contextlib.redirect_stdout(sys.stderr),
+    ):
+        warnings.simplefilter("always")
+        try:
+            read(folder, main)
+            outcome, line = "read", "read"
+            assert not said, f"warns: {said[0].category.__name__} {said[0].message}"
+        except (ValueError, OSError) as error:  # what the commands turn into one line and exit code 2
+            outcome, line = "refused", one_line(error)
+        except BaseException as error:
+            raise AssertionError(traceback.format_exc()[-6000:]) from error
+    assert not broken, f"touches what is not its own: {broken}"
+    assert 3 < len(line) <= LONGEST_REASON, line
+    assert time.perf_counter() - start < SECONDS
+    return outcome
+
+
+def fuzzed(name: str, folder: Path) -> Counter:
+    """Outcomes of all inputs of a reader."""
+    reader, counts = READERS[name], Counter()
+    seeds = reader.seeds()
+    for files in seeds:  # a valid file is read; and loads what is loaded on demand
+        write_input(folder, files)
+        reader.read(folder, next(iter(files)))
+
+    @settings(max_examples=INPUTS, deadline=None, derandomize=INPUTS == 16, suppress_health_check=list(HealthCheck))
+    @given(st.sampled_from(range(len(seeds))), st.randoms(use_true_random=False))
+    def law(number, rng):
+        write_input(folder, mutated(seeds[number], rng))
+        begin = time.perf_counter()
+        counts[attempt(reader.read, folder, next(iter(seeds[number])))] += 1
+        counts["slowest"] = max(counts["slowest"], time.perf_counter() - begin)
+
+    with limited_memory():
+        law()
+    return counts
+
+
+@pytest.mark.parametrize("name", [name for name in EVERYDAY if (name == "laz") == IN_CHILD])
+def test_damaged_files_are_read_or_refused_with_one_line_and_nothing_else_is_touched(name, folder, table):
+    table[name] = fuzzed(name, folder)
+    assert name == "metrics" or table[name]["refused"]
+
+
+@pytest.mark.skipif(IN_CHILD, reason="this is the child")
+def test_damaged_laz_files_end_no_process():
+    """The library that unpacks .laz can abort its process: they are read in a child."""
+    command = [sys.executable, "-m", "pytest", "-q", "-s", "-p", "no:cacheprovider", __file__, "-k", "touched and laz"]
+    done = subprocess.run(command, cwd=ROOT, env=os.environ | {"FUZZ_CHILD": "1"}, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    print("\n" + next(line for line in done.stdout.splitlines() if "laz: " in line), end="")
+
+
+@pytest.mark.parametrize("name", ["glb", "npz", "npy", "obj", "packed"])
+def test_containers_are_closed_as_they_were_opened(name):
+    contents = [content for files in READERS[name].seeds() for content in files.values()]
+    found = [(opener, *opened) for content in contents for opener in OPENERS if (opened := opener(content))]
+    assert found
+    for opener, parts, close in found:
+        assert opener(close(parts))[0] == parts
+
+
+MISDEEDS = {
+    "memory": (lambda folder: np.empty(2**32), "MemoryError"),
+    "call stack": (lambda folder: {}["a"], "KeyError: 'a'"),
+    "warning": (lambda folder: warnings.warn("a", stacklevel=1), "UserWarning"),
+    "write": (lambda folder: (folder.parent / "outside").write_text("a"), "writes .*outside"),
+    "peek": (lambda folder: (folder.parent / DECOY).read_bytes(), f"reads .*{DECOY}"),
+    "program": (lambda folder: subprocess.run([sys.executable, "-c", ""], check=True), "subprocess.Popen"),
+    "pickle": (lambda folder: pickle.loads(pickle.dumps(Path)), "pickle.find_class"),
+}
+
+
+@pytest.mark.parametrize("name", MISDEEDS)
+def test_whatever_a_reader_does_that_it_must_not_is_seen(name, folder):
+    misdeed, words = MISDEEDS[name]
+    with limited_memory(), pytest.raises(AssertionError, match=words):
+        attempt(lambda place, main: misdeed(place), folder, "a")
+
+
+def test_a_reader_that_keeps_to_its_folder_is_not_accused(folder):
+    (folder / "a.txt").write_text("1")
+    assert (
+        attempt(lambda place, main: (place / "b.txt").write_text((place / main).read_text()), folder, "a.txt") == "read"
+    )
+
+
+# Code in files
+
+
+def keyword(call: ast.Call, name: str):
+    return next((ast.literal_eval(k.value) for k in call.keywords if k.arg == name), None)
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda path: "/".join(path.relative_to(ROOT).parts))
+def test_no_source_runs_code_that_a_file_may_hold(path):
+    for call in (node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call)):
+        name = ast.unparse(call.func)
+        last, where = name.rsplit(".", 1)[-1], f"{path.name}:{call.lineno} {name}"
+        assert name not in ("eval", "exec", "__import__"), where
+        assert last not in ("Unpickler", "loads") or name == "json.loads", where
+        assert not name.startswith(("pickle.", "cloudpickle.", "dill.", "shelve.", "marshal.")), where
+        assert not (last == "load" and name.startswith("yaml")), where
+        assert keyword(call, "allow_pickle") in (None, False), where
+        if name in ("np.load", "numpy.load", "np.lib.format.read_array"):
+            assert keyword(call, "allow_pickle") is False, where
+        if name == "torch.load":
+            assert keyword(call, "weights_only") is True, where
+
+
+# Values of any kind
+
+
+@settings(max_examples=150, deadline=None, derandomize=True)
+@given(st.sampled_from(sorted(to_dict(tiny())["model"])), json_values)
+def test_any_value_of_a_config_makes_a_config_of_right_types_or_a_valueerror(name, value):
+    values = json.loads(json.dumps(to_dict(tiny())))
+    before, values["model"][name] = values["model"][name], value
+    try:
+        hash(from_dict(values))
+    except (ValueError, TypeError, AttributeError):  # what read_config turns into one line
+        return
+    assert not isinstance(before, int) or isinstance(before, bool) or isinstance(value, int)
+
+
+@settings(max_examples=150, deadline=None, derandomize=True)
+@given(json_values, json_values, json_values)
+def test_a_camera_message_of_any_values_is_a_view_or_none(wxyz, position, number):
+    assert viewpoint.from_browser(wxyz, position, number, number, number) is None or np.isfinite(position).all()
+    assert viewpoint.from_browser([1, 0, 0, 0], position, 0.5, 10, 10) is None or np.isfinite(position).all()
+    assert session.numbers(wxyz, 2) is None or np.isfinite(wxyz).all()

@@ -1,0 +1,217 @@
+"""Valid files of every kind that is read, as small as can be: what tests/robustness/test_fuzz.py damages.
+
+A seed is a dict from names to bytes, the file that is opened first, its companions behind it.  All seeds follow from
+literal seeds; damage to a few hundred bytes hits what matters.
+"""
+
+import io
+import json
+import struct
+from collections.abc import Sequence
+
+import numpy as np
+from damage import Files
+from PIL import Image
+
+SIZE, VIEWS, POINTS = 8, 2, 12
+CORNERS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0.5, 0.5, 1]], np.float32)
+FACES = np.array([[0, 1, 2], [0, 2, 3], [0, 1, 4], [1, 2, 4]], np.uint16)
+
+
+def numbers(*shape: int) -> np.ndarray:
+    """Numbers in [0, 1), always the same."""
+    return np.random.default_rng(7).random(shape).astype(np.float32)
+
+
+def png(channels: int = 4) -> bytes:
+    """A picture of 4 x 4 pixels."""
+    return _png((255 * numbers(4, 4, channels)).astype(np.uint8))
+
+
+def _png(pixels: np.ndarray) -> bytes:
+    stream = io.BytesIO()
+    Image.fromarray(pixels).save(stream, "png")
+    return stream.getvalue()
+
+
+def ply(form: str, columns: Sequence[tuple[str, str]], faces: bool = False) -> bytes:
+    """A PLY file of points with these (type, name), or of a small mesh."""
+    codes = {"float": "f4", "uchar": "u1", "double": "f8", "int": "i4"}
+    order = ">" if "big" in form else "<"
+    count = len(CORNERS) if faces else POINTS
+    head = ["ply", f"format {form} 1.0", "comment made", f"element vertex {count}"]
+    head += [f"property {kind} {name}" for kind, name in columns]
+    head += [f"element face {len(FACES)}", "property list uchar int vertex_indices"] if faces else []
+    table = np.zeros(count, [(name, order + codes[kind]) for kind, name in columns])
+    for i, (kind, name) in enumerate(columns):
+        table[name] = (
+            CORNERS[:, i % 3] if faces and i < 3 else numbers(count, 16)[:, i] * (255 if kind == "uchar" else 1)
+        )
+    header = ("\n".join([*head, "end_header"]) + "\n").encode()
+    if form == "ascii":
+        rows = [" ".join(f"{value:g}" for value in row) for row in table.tolist()]
+        rows += [f"3 {a} {b} {c}" for a, b, c in FACES] if faces else []
+        return header + ("\n".join(rows) + "\n").encode()
+    triples = b"".join(struct.pack(f"{order}Biii", 3, *face) for face in FACES.tolist()) if faces else b""
+    return header + table.tobytes() + triples
+
+
+XYZ = [("float", "x"), ("float", "y"), ("float", "z")]
+RGB = [("uchar", "red"), ("uchar", "green"), ("uchar", "blue")]
+PBR = [("float", f"base_color_{c}") for c in "rgb"] + [("float", "roughness"), ("float", "metallic")]
+SPLAT = [*XYZ, *(("float", f"f_dc_{i}") for i in range(3)), ("float", "opacity"), ("float", "scale_0")]
+
+
+def plys() -> list[Files]:
+    """PLY files of points: text, both byte orders, splats."""
+    forms = ("ascii", "binary_little_endian", "binary_big_endian")
+    found = [{"cloud.ply": ply(form, XYZ + more)} for form in forms for more in (RGB, PBR)]
+    return [*found, {"cloud.ply": ply("binary_little_endian", SPLAT)}, {"cloud.ply": ply("ascii", SPLAT)}]
+
+
+def ply_meshes() -> list[Files]:
+    """PLY files with faces."""
+    return [{"cloud.ply": ply(form, XYZ + RGB, faces=True)} for form in ("ascii", "binary_little_endian")]
+
+
+def pcds() -> list[Files]:
+    """PCD files: text, binary, compressed."""
+    layout = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "<u4")])
+    points = np.zeros(POINTS, layout)
+    for i, name in enumerate("xyz"):
+        points[name] = numbers(POINTS, 3)[:, i]
+    points["rgb"] = np.arange(POINTS) * 65793
+    head = "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z rgb\nSIZE 4 4 4 4\nTYPE F F F U\nCOUNT 1 1 1 1\n"
+    head += f"WIDTH {POINTS}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {POINTS}\nDATA "
+    text = "\n".join(" ".join(f"{v:g}" for v in row) for row in points.tolist()) + "\n"
+    plain = b"".join(points[name].tobytes() for name in layout.names or ())
+    packed = b"".join(bytes([len(plain[i : i + 32]) - 1]) + plain[i : i + 32] for i in range(0, len(plain), 32))
+    bodies = {"ascii": text.encode(), "binary": points.tobytes()}
+    bodies["binary_compressed"] = struct.pack("<II", len(packed), len(plain)) + packed
+    return [{"cloud.pcd": f"{head}{kind}\n".encode() + body} for kind, body in bodies.items()]
+
+
+def texts() -> list[Files]:
+    """Text files of points: with and without names, commas and blanks."""
+    rows = numbers(POINTS, 9)
+    found = {"cloud.xyz": ("", " ", 3), "b/cloud.xyz": ("", " ", 6), "cloud.txt": ("", " ", 9)}
+    found |= {"cloud.csv": ("x,y,z,r,g,b\n", ",", 6), "b/cloud.csv": ("# x;y;z;intensity\n", ";", 4)}
+    files = []
+    for name, (header, mark, width) in found.items():
+        lines = "\n".join(mark.join(f"{v:g}" for v in row[:width]) for row in rows)
+        files.append({name.removeprefix("b/"): f"{header}{lines}\n".encode()})
+    return files
+
+
+def npzs() -> list[Files]:
+    """NPZ archives, packed and not."""
+    arrays = {"positions": numbers(POINTS, 3), "colors": (255 * numbers(POINTS, 3)).astype(np.uint8)}
+    arrays["roughness"] = numbers(POINTS)
+    files = []
+    for save in (np.savez, np.savez_compressed):
+        stream = io.BytesIO()
+        save(stream, allow_pickle=False, **arrays)
+        files.append({"cloud.npz": stream.getvalue()})
+    return files
+
+
+def npys() -> list[Files]:
+    """NPY arrays: plain and of named fields."""
+    named = np.zeros(POINTS, [("x", "f4"), ("y", "f4"), ("z", "f8"), ("red", "u1"), ("green", "u1"), ("blue", "u1")])
+    named["x"], named["z"] = numbers(2, POINTS)
+    files = []
+    for array in (numbers(POINTS, 6), named, np.asfortranarray(numbers(POINTS, 3))):
+        stream = io.BytesIO()
+        np.save(stream, array, allow_pickle=False)
+        files.append({"cloud.npy": stream.getvalue()})
+    return files
+
+
+def scans(suffix: str) -> list[Files]:
+    """Laser scans through laspy, of two point formats."""
+    import laspy
+
+    files = []
+    for point_format in (2, 6):
+        scan = laspy.LasData(laspy.LasHeader(point_format=point_format, version="1.4"))
+        scan.x, scan.y, scan.z = numbers(3, POINTS).astype(np.float64)
+        scan.intensity = np.arange(POINTS)
+        stream = io.BytesIO()
+        scan.write(stream, do_compress=suffix == "laz")
+        files.append({f"cloud.{suffix}": stream.getvalue()})
+    return files
+
+
+def stls() -> list[Files]:
+    """STL meshes, text and binary."""
+    facet = "facet normal 0 0 1\nouter loop\n{}endloop\nendfacet\n"
+    loops = ["".join("vertex {:g} {:g} {:g}\n".format(*CORNERS[i]) for i in face) for face in FACES]
+    text = "solid a\n" + "".join(map(facet.format, loops)) + "endsolid a\n"
+    binary = bytes(80) + struct.pack("<I", len(FACES))
+    binary += b"".join(np.concatenate([[[0, 0, 1]], CORNERS[face]]).astype("<f4").tobytes() + b"\0\0" for face in FACES)
+    return [{"cloud.stl": text.encode()}, {"cloud.stl": binary}]
+
+
+def offs() -> list[Files]:
+    """OFF meshes, plain and with colours."""
+    rows = ["{:g} {:g} {:g}".format(*corner) for corner in CORNERS]
+    faces = ["3 {} {} {}".format(*face) for face in FACES]
+    size = f"{len(CORNERS)} {len(FACES)} 0"
+    colored = [f"{row} 255 0 0 255" for row in rows]
+    return [{"cloud.off": "\n".join(["OFF", size, *rows, *faces, ""]).encode()},
+            {"cloud.off": "\n".join(["COFF", size, *colored, *faces, ""]).encode()}]  # fmt: skip
+
+
+def objs() -> list[Files]:
+    """OBJ meshes: bare, and with a library and a texture."""
+    rows = ["v {:g} {:g} {:g}".format(*corner) for corner in CORNERS]
+    bare = [*rows, *("f {} {} {}".format(*(face + 1)) for face in FACES), "f -1 -2 -3 -4", ""]
+    texcoords = [f"vt {u} {v}" for u, v in ((0, 0), (1, 0), (1, 1))]
+    faces = ["f {}/1/1 {}/2/1 {}/3/1".format(*(face + 1)) for face in FACES]
+    rich = ["mtllib a.mtl", *rows, *texcoords, "vn 0 0 1", "usemtl red", *faces[:2], "usemtl plain", *faces[2:], ""]
+    library = "newmtl red\nKd 1 1 1\nmap_Kd -s 1 1 1 -clamp on a.png\nd 1.0\n"
+    library += "newmtl plain\nKd 0.1 0.2 0.3\nNs 90\nPm 0.5\nTr 0\n"
+    return [{"cloud.obj": "\n".join(bare).encode()},
+            {"cloud.obj": "\n".join(rich).encode(), "a.mtl": library.encode(), "a.png": png(3)}]  # fmt: skip
+
+
+def _gltf(uri: str | None, images: bool) -> tuple[dict, bytes]:
+    """Document and buffer of a textured mesh under a node; the image is in the buffer or a file."""
+    blocks = [CORNERS.tobytes(), FACES.tobytes(), numbers(len(CORNERS), 2).tobytes(), png()]
+    blocks += [np.array([0, 3], np.uint16).tobytes(), CORNERS[:2].tobytes()]
+    offsets = np.cumsum([0, *(len(block) + -len(block) % 4 for block in blocks)]).tolist()
+    views = [{"buffer": 0, "byteOffset": o, "byteLength": len(b)} for o, b in zip(offsets, blocks, strict=False)]
+    sparse = {"count": 2, "indices": {"bufferView": 4, "componentType": 5123}, "values": {"bufferView": 5}}
+    buffer: dict = {"byteLength": offsets[-1]}
+    document = {
+        "asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}],
+        "nodes": [
+            {"children": [1], "rotation": [0, 0, 0, 1], "scale": [1, 2, 1]}, {"mesh": 0, "translation": [1, 0, 0]},
+        ],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0, "TEXCOORD_0": 2}, "indices": 1, "material": 0}]}],
+        "accessors": [
+            {"bufferView": 0, "componentType": 5126, "count": len(CORNERS), "type": "VEC3", "sparse": sparse},
+            {"bufferView": 1, "componentType": 5123, "count": FACES.size, "type": "SCALAR"},
+            {"bufferView": 2, "componentType": 5126, "count": len(CORNERS), "type": "VEC2"},
+        ],
+        "bufferViews": views, "buffers": [buffer if uri is None else {**buffer, "uri": uri}],
+        "materials": [{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}, "roughnessFactor": 0.5}}],
+        "textures": [{"source": 0, "sampler": 0}], "samplers": [{"wrapS": 10497}],
+        "images": [{"uri": "a.png"} if images else {"bufferView": 3, "mimeType": "image/png"}],
+    }  # fmt: skip
+    return document, b"".join(block + b"\0" * (-len(block) % 4) for block in blocks)
+
+
+def gltfs() -> list[Files]:
+    """A glTF document with a buffer and a texture beside it."""
+    document, binary = _gltf("data.bin", True)
+    return [{"cloud.gltf": json.dumps(document).encode(), "data.bin": binary, "a.png": png()}]
+
+
+def glbs() -> list[Files]:
+    """A GLB file with all inside."""
+    document, binary = _gltf(None, False)
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
+    return [{"cloud.glb": struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks}]
