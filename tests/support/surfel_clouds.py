@@ -1,0 +1,66 @@
+"""Clouds whose normals and spacing are known, surfels and cameras made by hand, for tests of `spnr_jax.surfels`."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from spnr_jax.kernels import cameras
+from spnr_jax.kernels.records import Camera, PointCloud, Surfels
+from spnr_jax.surfels.visibility import NUM_DIRECTIONS, spiral
+
+
+def even_square(count: int) -> np.ndarray:
+    """Points (count, 2) in [-1, 1)^2: Roberts' R2 sequence."""
+    ratio = 1.32471795724474602596  # x^3 = x + 1
+    return 2 * ((np.arange(1, count + 1)[:, None] / ratio ** np.arange(1, 3)) % 1) - 1
+
+
+def shape(name: str, count: int, spread: str = "even") -> tuple[np.ndarray, np.ndarray, float]:
+    """Positions, outward normals (either for `plane`) and the square root of the area per point."""
+    rng = np.random.default_rng(count)
+    u, v = (even_square(count) if spread == "even" else rng.uniform(-1, 1, (count, 2))).T
+    if name == "sphere":
+        normals = spiral(count) if spread == "even" else rng.normal(size=(count, 3))
+        normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+        positions, area = 0.6 * normals, 4 * np.pi * 0.6**2
+    elif name == "rod":
+        normals = np.stack([np.cos(np.pi * u), np.sin(np.pi * u), 0 * u], axis=1)
+        positions, area = 0.15 * normals + v[:, None] * [0, 0, 0.9], 2 * np.pi * 0.15 * 1.8
+    elif name == "plane":
+        normals = np.broadcast_to(np.array([0.48, 0.6, 0.64]), (count, 3))
+        positions, area = 0.6 * (u[:, None] * [0.8, 0, -0.6] + v[:, None] * [-0.36, 0.8, -0.48]), 1.2**2
+    else:  # two plates, outward on either side
+        above = np.arange(count) % 2 == 0
+        normals = np.where(above[:, None], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0])
+        positions, area = np.stack([0.6 * u, np.where(above, 0.1, -0.1), 0.6 * v], axis=1), 2 * 1.2**2
+    return positions.astype(np.float32), normals.astype(np.float32), float(np.sqrt(area / count))
+
+
+def cloud(positions, **columns) -> PointCloud:
+    """A grey cloud, other columns as given."""
+    count = len(positions)
+    columns = {"base_color": np.full((count, 3), 0.5), "roughness": np.full(count, 0.5)} | columns
+    columns = {name: np.asarray(x, np.float32) for name, x in ({"metallic": np.zeros(count)} | columns).items()}
+    return PointCloud(positions=np.asarray(positions, np.float32), mask=np.ones(count, bool), **columns)
+
+
+def surfels(position, normal, spacing, **columns) -> Surfels:
+    """Grey discs that every direction sees and that have one side."""
+    count = len(position)
+    columns = {
+        "base_color": np.full((count, 3), 0.5),
+        "gradient": np.zeros((count, 3, 3)),
+        "roughness": np.full(count, 0.5),
+        "metallic": np.zeros(count),
+        "sided": np.ones(count),
+        "visible": np.ones((count, NUM_DIRECTIONS)),
+        "shape": np.zeros((count, 2)),
+    } | columns
+    columns |= {"position": position, "normal": np.broadcast_to(normal, (count, 3))}
+    columns |= {"spacing": np.broadcast_to(spacing, count)}
+    return Surfels(**{name: jnp.asarray(x, jnp.float32) for name, x in columns.items()}, mask=jnp.ones(count, bool))
+
+
+def camera(size: int = 24, eye=(0.0, 0.0, 2.5), field_of_view: float = 0.7, target=(0.0, 0.0, 0.0)) -> Camera:
+    """A camera that looks at the target, y up."""
+    pose = cameras.look_at(jnp.asarray(eye, jnp.float32), jnp.asarray(target), jnp.array([0.0, 1.0, 0.0]))
+    return cameras.pinhole(pose, field_of_view, size, size)

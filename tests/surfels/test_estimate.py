@@ -1,0 +1,139 @@
+"""Surfels of bodies whose normals, spacing and colours are known."""
+
+import numpy as np
+import pytest
+from support.laws import close
+from support.surfel_clouds import even_square, shape
+
+from spnr_jax.surfels import estimate as module
+from spnr_jax.surfels.visibility import tangents
+
+FIELDS = ("normal", "spacing", "gradient", "sided", "visible", "shape")
+
+
+def estimate(positions, color=None, normals=None):
+    """Fields of the surfels of the real points."""
+    count = len(positions)
+    color = np.full((count, 3), 0.5, np.float32) if color is None else np.float32(color)
+    found = module.estimate(np.float32(positions), color, np.full(count, 0.5), np.zeros(count), normals)
+    assert found.mask.sum() == count
+    assert len(found.mask) & (len(found.mask) - 1) == 0
+    assert all(np.isfinite(values).all() for values in vars(found).values())
+    return {name: getattr(found, name)[:count] for name in FIELDS}
+
+
+CASES = [
+    ("plane", 1024, "random", 1), ("sphere", 256, "even", 2), ("sphere", 256, "random", 10),
+    ("sphere", 20_000, "even", 1), ("sphere", 4096, "random", 3), ("rod", 1024, "random", 10), ("plates", 1024, "even", 1),
+    ("plates", 1024, "random", 1),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "count", "spread", "degrees"), CASES)
+def test_normals_point_outward_within_degrees_and_the_spacing_is_the_root_of_the_area_per_point(
+    name, count, spread, degrees
+):
+    positions, normals, spacing = shape(name, count, spread)
+    found = estimate(positions)
+    cosine = np.sum(found["normal"] * normals, axis=1)
+    if name == "plane":
+        assert found["sided"].max() < 0.05  # both of its sides are seen alike
+        cosine = np.abs(cosine)
+    else:
+        assert np.mean(found["sided"] > 0.95) > 0.99
+        assert np.mean(cosine > 0) > 0.995
+    assert np.rad2deg(np.arccos(np.clip(np.quantile(cosine, 0.1), -1, 1))) < degrees
+    ratio = found["spacing"] / spacing
+    assert 0.75 < np.median(ratio) < 1.25
+    assert np.mean((ratio > 0.75) & (ratio < 1.25)) > (0.98 if spread == "even" else 0.8)
+
+
+def test_the_shape_is_0_in_a_plane_and_on_a_line():
+    planarity, linearity = estimate(shape("plane", 600)[0])["shape"].T
+    assert planarity.max() < 0.01
+    assert np.quantile(linearity, 0.1) > 0.5
+    line = np.linspace(-0.9, 0.9, 300)[:, None] * [0.6, 0, 0.8]
+    assert estimate(line)["shape"][:, 1].max() < 0.01
+
+
+@pytest.mark.parametrize(("ridge", "off"), [(0.0, 2e-3), (module.RIDGE, 0.05)])
+def test_the_gradient_of_a_colour_that_is_linear_is_exact_but_for_the_ridge(monkeypatch, ridge, off):
+    monkeypatch.setattr(module, "RIDGE", ridge)
+    positions, normals, _ = shape("plane", 700)
+    slopes = np.array([[0.3, -0.2, 0.1], [0.0, 0.5, 0.2], [-0.1, 0.1, -0.4]])
+    along = np.stack(tangents(normals[:1]), axis=1)[0]
+    expected = slopes @ along.T @ along  # a plane shows nothing of how the colour changes off it
+    gradient = estimate(positions, 0.5 + positions @ slopes.T)["gradient"]
+    inner = np.abs(positions).max(axis=1) < 0.4
+    assert np.abs(gradient[inner] - expected).max() < off * np.abs(expected).max()
+    assert np.abs(estimate(positions)["gradient"]).max() == 0
+
+
+@pytest.mark.parametrize(
+    "positions",
+    [
+        np.array([[0.1, 0.2, 0.3]]),
+        np.array([[0.1, 0.2, 0.3], [-0.4, 0.0, 0.9]]),
+        np.zeros((40, 3)),
+        np.repeat(even_square(30), 2, axis=0) @ np.array([[1.0, 0, 0], [0, 0, 1]]),
+        np.linspace(-1, 1, 50)[:, None] * np.array([0.0, 1.0, 0.0]),
+        np.concatenate([np.zeros((500, 3)), np.ones((1, 3))]),
+    ],
+    ids=["one", "two", "coincident", "twice", "collinear", "outlier"],
+)
+def test_points_that_span_no_surface_give_finite_surfels_with_unit_normals(positions):
+    found = estimate(positions)
+    close(np.linalg.norm(found["normal"], axis=1), np.ones(len(positions)), atol=1e-4)
+    assert found["spacing"].min() > 0
+    given = estimate(positions, normals=np.zeros((len(positions), 3), np.float32))
+    close(np.linalg.norm(given["normal"], axis=1), np.ones(len(positions)), atol=1e-4)
+
+
+def test_blocks_of_points_and_their_order_change_nothing(monkeypatch):
+    positions, _, _ = shape("sphere", 700, "random")
+    color = 0.5 + 0.5 * positions
+    whole = estimate(positions, color)
+    monkeypatch.setattr(module, "BLOCK", 97)
+    order = np.random.default_rng(3).permutation(len(positions))
+    shuffled = estimate(positions[order], color[order])
+    for name in FIELDS:
+        off = np.abs(shuffled[name] - whole[name][order]).reshape(len(positions), -1).max(axis=1)
+        # a visible cell's border is a border: rounding of a normal may move a lifted point over it
+        assert np.mean(off > 1e-3 * max(np.abs(whole[name]).max(), 1)) < 0.01, name
+
+
+def test_the_work_is_bounded_for_each_point(monkeypatch):
+    sizes, cells = [], []
+    neighbours, seen_from = module._neighbours, module.seen_from
+
+    def counted(*arguments):
+        near = neighbours(*arguments)
+        sizes.append(near.index.shape)
+        return near
+
+    def drawn(*arguments, grid):
+        cells.append(grid**2)
+        return seen_from(*arguments, grid=grid)
+
+    monkeypatch.setattr(module, "_neighbours", counted)
+    monkeypatch.setattr(module, "seen_from", drawn)
+    monkeypatch.setattr(module, "BLOCK", 1000)
+    estimate(shape("sphere", 3000, "random")[0])
+    assert sizes == [(1000, module.NEIGHBOURS)] * 3
+    assert max(cells) < 4 * 3000
+
+
+def test_normals_that_are_given_are_kept_and_those_of_the_wrong_sign_turned():
+    positions, normals, _ = shape("sphere", 800)
+    tilted = normals + 0.1 * tangents(normals)[0]
+    tilted /= np.linalg.norm(tilted, axis=1, keepdims=True)
+    wrong = np.random.default_rng(1).uniform(size=(800, 1)) < 0.3
+    found = estimate(positions, normals=np.where(wrong, -3 * tilted, 3 * tilted))
+    close(found["normal"], tilted, atol=1e-5)
+    close(found["sided"], np.ones(800))
+
+
+def test_a_normal_given_on_a_sheet_keeps_its_sign():
+    positions, normals, _ = shape("plane", 500)
+    close(estimate(positions, normals=normals)["normal"], normals, atol=1e-5)
+    close(estimate(positions, normals=-normals)["normal"], -normals, atol=1e-5)

@@ -1,0 +1,142 @@
+"""What the network sees: the same when object, camera and light turn together, but for the 64 directions."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support.laws import close, numbers
+from support.surfel_clouds import camera, even_square, shape, surfels
+
+from spnr_jax.kernels.records import Camera
+from spnr_jax.surfels import features, splatting
+from spnr_jax.surfels.estimate import estimate
+from spnr_jax.surfels.lighting import WIDTH, light_of
+
+QUARTER = np.float32([[0, 0, -1], [0, 1, 0], [1, 0, 0]])  # x to z: from azimuth phi of a map to phi + a quarter turn
+VIEW = (1.4, 0.9, 1.7)
+
+
+def ball_on_plate():
+    """Positions, and colours that change over them."""
+    ball, _, _ = shape("sphere", 300)
+    plate = np.insert(0.8 * even_square(200), 1, -0.62, axis=1)
+    positions = np.concatenate([0.8 * ball, plate]).astype(np.float32)
+    return positions, (0.5 + 0.5 * np.sin(3 * positions + [0, 1, 2])).astype(np.float32)
+
+
+def sky():
+    return np.random.default_rng(0).uniform(0, 2, (32, WIDTH, 3)).astype(np.float32)
+
+
+def told(turn, visible=None):
+    """G-buffer, network's input and maps of the ball on the plate, all turned by `turn` quarters about y."""
+    matrix = np.linalg.matrix_power(QUARTER, turn)
+    positions, color = ball_on_plate()
+    material = np.linspace(0.1, 0.9, len(positions)).astype(np.float32)
+    found = jax.tree.map(jnp.asarray, estimate(positions @ matrix.T, color, material, material[::-1].copy()))
+    if visible is not None:
+        found = dataclasses.replace(found, visible=jnp.full(found.visible.shape, visible))
+    view = camera(24, VIEW)
+    view = dataclasses.replace(view, cam_to_world=jnp.asarray(matrix) @ view.cam_to_world)
+    return drawn(found, light_of(np.roll(sky(), turn * WIDTH // 4, axis=1)), view)
+
+
+@jax.jit
+def drawn(found, light, view):
+    found = features.turned(found, view)
+    entries, _ = splatting.entries(found, view, total=2**15)
+    buffer = splatting.blend(entries, found, features.attributes(found, light, view), view, slots=24**2)
+    return buffer, *features.features(buffer, light, view)
+
+
+@pytest.fixture(scope="module")
+def turns():
+    return [jax.tree.map(np.asarray, told(turn)) for turn in (0, 1)]
+
+
+def test_the_geometry_and_the_materials_are_the_same_from_every_side(turns):
+    (one, *_), (other, *_) = turns
+    assert one.opacity.mean() > 0.2
+    for name in ("opacity", "coverage", "depth", "spread", "normal", "color", "log_spacing"):
+        off = np.abs(
+            one.opacity.reshape(24, 24, *[1] * (getattr(one, name).ndim - 2))
+            * (getattr(one, name) - getattr(other, name))
+        )
+        assert np.quantile(off, 0.995) < 1e-3, name
+    unseen = [0, 1, 10, 11, 12, 13, 14, 15]  # of no direction: materials, colour, shape, sides
+    assert np.quantile(np.abs(one.attributes - other.attributes)[..., unseen], 0.995) < 1e-3
+
+
+def test_light_from_its_tables_is_the_same_from_every_side(turns):
+    (buffer, _, one), (_, _, other) = turns
+    tables = [0, 1, 2, 3, 4, 5, 6, 10, 11, 12, 13, 14, 15]  # all but what arrives and what is reflected
+    off = buffer.opacity[..., None] * np.abs(one - other)[..., tables]
+    assert np.quantile(off, 0.99) < 5e-3
+
+
+def test_what_passes_through_the_64_directions_is_the_same_within_their_number(turns):
+    (buffer, seen, one), (_, turned, other) = turns
+    inside = buffer.opacity > 0.9
+    for name, a, b, mean in (
+        ("arriving", one[..., 7:10], other[..., 7:10], 0.1),
+        ("reflected", one[..., 16], other[..., 16], 0.1),
+        ("openness", seen[..., 4], turned[..., 4], 0.05),
+        ("bent", seen[..., 17:20], turned[..., 17:20], 0.08),
+    ):
+        assert np.abs(a - b)[inside].mean() < mean, name
+        assert np.abs(a[inside].mean() - b[inside].mean()) < mean / 3, name
+
+
+def test_the_network_sees_no_light():
+    positions, normal, spacing = shape("sphere", 500)
+    found, view = surfels(positions, normal, spacing), camera(24)
+    (_, one, _), (_, other, _) = (drawn(found, light_of(scale * sky()), view) for scale in (0.0, 3.0))
+    assert one.shape == (24, 24, features.NUM_FEATURES)
+    close(one, other)
+
+
+def test_maps_are_linear_in_the_light():
+    positions, normal, spacing = shape("sphere", 500)
+    found, view = surfels(positions, normal, spacing), camera(24)
+    lights = sky(), sky()[::-1].copy()
+    one, other, both = (drawn(found, light_of(x), view)[2] for x in (*lights, 2 * lights[0] + 3 * lights[1]))
+    assert one.shape == (24, 24, features.NUM_MAPS)
+    close(both[..., 7:16], 2 * one[..., 7:16] + 3 * other[..., 7:16], rtol=1e-3, atol=1e-4)
+    close(both[..., :7], one[..., :7])
+
+
+def test_without_points_everything_is_finite_and_what_the_network_sees_is_0():
+    found = surfels(np.float32([[0, 0, 9.0]] * 500), (0, 0, 1.0), 0.1)
+    buffer, seen, maps = drawn(found, light_of(sky()), camera(24))
+    assert np.all(np.asarray(seen) == 0)
+    assert np.isfinite(np.asarray(maps)).all()
+    assert np.all(np.asarray(maps)[..., 4] == 0)
+
+
+def test_normals_of_sheets_point_to_the_camera_and_those_of_sides_stay():
+    normal = np.asarray(numbers(0, 40, 3))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    sided = np.arange(40) % 2
+    found = surfels(numbers(1, 40, 3, low=-0.5, high=0.5), normal, 0.1, sided=sided)
+    turned = np.asarray(features.turned(found, camera(8, VIEW)).normal)
+    close(turned[sided == 1], normal[sided == 1])
+    assert np.all(np.sum(turned * (np.array(VIEW) - np.asarray(found.position)), axis=1)[sided == 0] > 0)
+    close(np.abs(np.sum(turned * normal, axis=1)), np.ones(40))
+
+
+def test_a_pixel_in_a_dent_lies_behind_the_mean_around_it_and_one_on_a_bump_before():
+    depth = jnp.full((32, 32), 2.0).at[8, 8].set(2.2).at[24, 24].set(1.8)
+    zeros, ones = jnp.zeros((32, 32)), jnp.ones((32, 32))
+    normal = jnp.broadcast_to(jnp.array([0.0, 0.0, 1.0]), (32, 32, 3))
+    buffer = features.GBuffer(
+        opacity=ones, coverage=ones, depth=depth, spread=zeros, log_spacing=jnp.log(0.1 * ones),
+        normal=normal, color=normal, attributes=jnp.full((32, 32, 16), 0.5),
+    )  # fmt: skip
+    view = Camera(cam_to_world=jnp.eye(3, 4), intrinsics=camera(32).intrinsics, height=32, width=32)
+    seen, _ = features.features(buffer, light_of(sky()), view)
+    for column in (7, 8):
+        assert seen[8, 8, column] > 0.3
+        assert seen[24, 24, column] < -0.3
+        close(seen[16, 16, column], 0.0, atol=1e-4)

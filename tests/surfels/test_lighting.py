@@ -1,0 +1,195 @@
+"""Light from all around: integrals, linearity in the map, energy, the borders of a map."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support.laws import close, numbers
+from support.surfel_clouds import surfels
+
+from spnr_jax.kernels.records import Light
+from spnr_jax.surfels import lighting
+from spnr_jax.surfels.envmaps import directions, resampled, solid_angles
+from spnr_jax.surfels.lighting import HEIGHT, LEVELS, WIDTH, light_of
+from spnr_jax.surfels.visibility import DIRECTIONS
+
+COLOR = np.array([0.3, 1.0, 2.0])
+
+
+def envmap(seed=0, height=HEIGHT):
+    return np.random.default_rng(seed).uniform(0, 2, (height, 2 * height, 3)).astype(np.float32)
+
+
+def smooth(towards):
+    """A radiance without edges."""
+    x, y, z = np.moveaxis(towards, -1, 0)
+    return np.stack([1 + x, np.exp(y), 1.5 + y * z - 0.5 * z], axis=-1)
+
+
+def columns(towards):
+    return list(jnp.asarray(towards, jnp.float32).reshape(-1, 3).T)
+
+
+def test_texels_lie_where_the_conventions_say_and_their_solid_angles_cover_the_sphere():
+    towards = directions(4)
+    close(towards[0, :, 1], np.full(8, np.cos(np.pi / 8)))
+    middle = directions(3)[1]  # the horizon: azimuth 0 looks along -z, a quarter turn along +x
+    close(middle[1], [1, 0, 0], atol=1e-6)
+    assert middle[0, 2] < 0 < middle[0, 0]
+    for height in (1, 7, 32):
+        close(solid_angles(height).sum(), 4 * np.pi, rtol=1e-5)
+        close(np.einsum("hwi,hw->i", directions(height), solid_angles(height)), np.zeros(3), atol=1e-5)
+
+
+def test_all_tables_of_constant_light_are_that_light():
+    light = light_of(np.broadcast_to(COLOR, (20, 40, 3)))
+    close(light.tables, np.broadcast_to(COLOR, light.tables.shape), rtol=1e-4)
+    towards = columns(numbers(0, 50, 3))
+    for found in (lighting.irradiance(light, towards), lighting.mirrored(light, towards, numbers(1, 50, low=0.0))):
+        close(jnp.stack(found, axis=-1), np.broadcast_to(COLOR, (50, 3)), rtol=1e-4)
+
+
+def test_irradiance_and_blurred_maps_are_integrals_over_the_sphere():
+    fine, area = directions(128).reshape(-1, 3), solid_angles(128).reshape(-1, 1).astype(float)
+    light = jax.tree.map(jnp.asarray, light_of(smooth(directions(64)).astype(np.float32)))
+    for towards in np.float64([[0, 1, 0], [0, -1, 0], [0.6, 0, 0.8], [0.48, 0.6, -0.64]]):
+        cosine = np.maximum(fine @ towards, 0)[:, None]
+        expected = (smooth(fine) * cosine * area).sum(axis=0) / np.pi
+        close(jnp.stack(lighting.irradiance(light, columns(towards)), axis=-1)[0], expected, rtol=0.01)
+        half = (1 + fine @ towards)[:, None] / 2  # squared cosine between the normal, which is the view, and half way
+        lobe = 0.6**4 / (half * (0.6**4 - 1) + 1) ** 2 * cosine * area
+        found = lighting.mirrored(light, columns(towards), jnp.full(1, 0.6))
+        close(jnp.stack(found, axis=-1)[0], (smooth(fine) * lobe).sum(axis=0) / lobe.sum(), rtol=0.02)
+
+
+def test_roughness_passes_through_the_levels_without_jumps():
+    light = jax.tree.map(jnp.asarray, light_of(envmap()))
+    towards = directions(HEIGHT)[5, 7]
+    for level, roughness in enumerate(LEVELS):
+        expected = light.tables[1 + level, 5, 7]
+        for off in (-1e-6, 0, 1e-6):
+            found = lighting.mirrored(light, columns(towards), jnp.full(1, roughness + off))
+            close(jnp.stack(found, axis=-1)[0], expected, rtol=1e-4)
+
+
+def test_everything_is_linear_in_the_map():
+    one, other = envmap(1), envmap(2)
+    found = surfels(numbers(0, 30, 3), jnp.asarray(DIRECTIONS[:30]), 0.1, visible=numbers(1, 30, 64, low=0.0))
+    towards, roughness = columns(DIRECTIONS), numbers(2, 64, low=0.0)
+    turn = np.float32([[0, 0.6, 0.8], [1, 0, 0], [0, 0.8, -0.6]])
+
+    def told(radiance):
+        light = light_of(radiance)
+        seen = lighting.irradiance(light, towards) + lighting.mirrored(light, towards, roughness)
+        return light.tables, seen, lighting.arriving(found, light), lighting.projected(light, turn)
+
+    sums = jax.tree.map(lambda a, b: 2 * a + 3 * b, told(one), told(other))
+    close(told(2 * one + 3 * other), sums, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("size", [(1, 2), (7, 14), (16, 33), (33, 66), (50, 100), (1023, 128)])
+@pytest.mark.parametrize("height", [32, 5])
+def test_another_size_keeps_the_energy_and_loses_no_lamp(size, height):
+    radiance = np.zeros((*size, 3), np.float32)
+    radiance[size[0] // 2, size[1] // 3] = 1e4  # one texel is all the light there is
+    radiance[0, 0] = 7
+
+    def energy(values):
+        edges = np.cos(np.pi * np.arange(len(values) + 1) / len(values))
+        return np.einsum("hwc,h->c", np.float64(values), edges[:-1] - edges[1:]) * 2 * np.pi / values.shape[1]
+
+    small = resampled(radiance, height)
+    assert small.shape == (height, 2 * height, 3)
+    close(energy(small), energy(radiance), rtol=1e-4)
+    assert small.min() >= 0
+
+
+def test_another_size_is_the_mean_over_whole_texels_and_the_same_size_the_map_itself():
+    radiance = envmap(3, 8)
+    close(resampled(radiance, 8), radiance, rtol=1e-5)
+    close(
+        resampled(np.repeat(np.repeat(radiance, 3, axis=0), 3, axis=1), 24), np.repeat(np.repeat(radiance, 3, 0), 3, 1)
+    )
+    area = solid_angles(8)[..., None].reshape(4, 2, 8, 2, 1)
+    means = (radiance.reshape(4, 2, 8, 2, 3) * area).sum(axis=(1, 3)) / area.sum(axis=(1, 3))
+    close(resampled(radiance, 4), means, rtol=1e-5)
+
+
+class TestLookUp:
+    def table(self):
+        return jnp.asarray(envmap(4).reshape(-1, 3))
+
+    def test_the_middle_of_a_texel_has_its_value_and_half_way_the_mean_of_its_neighbours(self):
+        found = lighting.look_up(self.table(), columns(directions(HEIGHT)))
+        close(jnp.stack(found, axis=-1), self.table(), rtol=1e-3, atol=1e-3)
+        corners = directions(2 * HEIGHT)[2::2, 2::2][: HEIGHT - 1, : WIDTH - 1]
+        turned = np.stack(lighting.look_up(self.table(), columns(corners)), axis=-1).reshape(*corners.shape)
+        texels = np.asarray(self.table()).reshape(HEIGHT, WIDTH, 3)
+        mixed = sum(
+            (0.75, 0.25)[i] * (0.75, 0.25)[j] * texels[1 + -i :, 1 - j :][: HEIGHT - 1, : WIDTH - 1]
+            for i in (0, 1)
+            for j in (0, 1)
+        )
+        close(turned, mixed, rtol=1e-3, atol=1e-3)
+
+    def test_it_is_periodic_in_the_azimuth_and_finite_at_the_poles(self):
+        azimuth = jnp.asarray([0.0, 1e-7, -1e-7, 2 * np.pi, np.pi, -np.pi], jnp.float32)
+        towards = [jnp.sin(azimuth), 0 * azimuth, -jnp.cos(azimuth)]
+        found = np.stack(lighting.look_up(self.table(), towards), axis=-1)
+        close(found[:4], np.broadcast_to(found[0], (4, 3)), rtol=1e-4)
+        close(found[4], found[5], rtol=1e-4)
+        texels = np.asarray(self.table()).reshape(HEIGHT, WIDTH, 3)
+        close(found[0], texels[15:17, [0, -1]].mean(axis=(0, 1)), rtol=1e-4)
+        poles = [jnp.zeros(4), jnp.asarray([1.0, -1.0, 1.0000001, -1.0000001]), jnp.asarray([0.0, 0.0, -0.0, 1e-30])]
+        assert np.isfinite(np.stack(lighting.look_up(self.table(), poles))).all()
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1e6])
+def test_faint_and_glaring_light_is_a_multiple_of_light(scale):
+    radiance = envmap(5) ** 8
+    light = light_of(np.float32(scale) * radiance)
+    assert np.isfinite(light.tables).all()
+    assert light.tables.min() >= 0
+    close(light.tables / scale, light_of(radiance).tables, rtol=1e-4)
+
+
+def test_what_arrives_at_a_surfel_that_all_directions_see_is_nearly_its_irradiance():
+    light = light_of(smooth(directions(HEIGHT)).astype(np.float32))
+    found = surfels(np.zeros((64, 3)), DIRECTIONS, 0.1)
+    open_light = np.stack(lighting.irradiance(light, columns(DIRECTIONS)), axis=-1)
+    close(lighting.arriving(found, light), open_light, rtol=0.08, atol=0.05)
+    blind = surfels(np.zeros((64, 3)), DIRECTIONS, 0.1, visible=np.zeros((64, 64)))
+    assert np.all(np.asarray(lighting.arriving(blind, light)) == 0)
+
+
+def test_the_harmonics_are_orthonormal_and_project_light_in_the_axes_of_the_camera():
+    basis = np.stack(lighting.harmonics(*columns(directions(HEIGHT))))
+    close(basis * solid_angles(HEIGHT).reshape(-1) @ basis.T, np.eye(9), atol=5e-3)
+    constant = lighting.projected(light_of(np.ones((32, 64, 3), np.float32)), np.eye(3, dtype=np.float32))
+    close(constant, np.eye(9)[:, :1] * 4 * 0.282095 * np.ones(3), atol=5e-3)
+    ahead = np.float32([[0, 0, 1], [0, 1, 0], [-1, 0, 0]])  # a camera that looks along -x, where z is x
+    tilted = lighting.projected(Light(tables=light_of(smooth(directions(HEIGHT)).astype(np.float32)).tables), ahead)
+    close(tilted[2, 0], 4 / 3 * 0.488603, rtol=1e-2)  # red is 1 + x, and behind the camera is +x
+    close(tilted[np.array([1, 3]), 0], np.zeros(2), atol=1e-2)
+
+
+def test_reflectance_is_that_of_an_integral_over_the_lobe_and_at_most_1():
+    rng = np.random.default_rng(0)
+    for roughness, cosine in ((0.3, 0.9), (0.5, 0.5), (0.8, 0.7), (1.0, 0.3), (0.2, 0.2)):
+        u, v = rng.uniform(size=(2, 40_000))
+        alpha = roughness**2
+        height = np.sqrt((1 - u) / (1 + (alpha**2 - 1) * u))
+        across = np.sqrt(1 - height**2)
+        view = np.array([np.sqrt(1 - cosine**2), cosine])
+        along = across * np.cos(2 * np.pi * v) * view[0] + height * view[1]
+        leaving = 2 * along * height - cosine
+        k = alpha / 2
+
+        def masked(c, k=k):
+            return c / (c * (1 - k) + k)
+
+        weight = np.where((leaving > 0) & (along > 0), masked(cosine) * masked(np.maximum(leaving, 0)), 0) * along
+        weight /= height * cosine
+        fresnel = (1 - np.clip(along, 0, 1)) ** 5
+        expected = np.mean((1 - fresnel) * weight), np.mean(fresnel * weight)
+        close(lighting.reflectance(jnp.float32(roughness), jnp.float32(cosine)), expected, atol=0.06)

@@ -1,0 +1,99 @@
+"""Which directions see a point: laws on simple bodies, and a plain loop."""
+
+import jax.numpy as jnp
+import numpy as np
+from support.laws import close
+from support.surfel_clouds import even_square, shape
+
+from spnr_jax.surfels import visibility
+from spnr_jax.surfels.visibility import DIRECTIONS, grid_of, seen_from, tangents
+
+
+def seen(positions, normals, spacing, mask=None):
+    """`seen_from` of NumPy arrays with points equally far apart."""
+    count = len(positions)
+    arrays = (np.asarray(x, np.float32) for x in (positions, np.broadcast_to(normals, (count, 3))))
+    cell, grid = grid_of(spacing)
+    spacing = jnp.full(count, spacing, jnp.float32)
+    mask = jnp.asarray(np.ones(count, bool) if mask is None else mask)
+    return np.asarray(seen_from(*map(jnp.asarray, arrays), spacing, mask, jnp.float32(cell), grid=grid))
+
+
+def loop(positions, normals, spacing):
+    """The same in float64, cell by cell."""
+    cell, grid = grid_of(spacing)
+    out = np.zeros((len(positions), len(DIRECTIONS)))
+    for d, axes in enumerate(zip(DIRECTIONS, *tangents(DIRECTIONS), strict=True)):
+        towards, right, up = np.float64(axes)
+        buffer = {}
+        for p in positions:
+            column, row = (int(np.floor(p @ axis / cell + grid / 2 - 0.5)) for axis in (right, up))
+            for place in ((row + i, column + j) for i in (0, 1) for j in (0, 1)):
+                buffer[place] = max(buffer.get(place, -np.inf), p @ towards)
+        for i, (p, n) in enumerate(zip(positions, normals, strict=True)):
+            lifted = p + np.sign(n @ towards) * spacing * n
+            place = tuple(int(np.floor(lifted @ axis / cell + grid / 2)) for axis in (up, right))
+            out[i, d] = np.clip(2 - (buffer.get(place, -np.inf) - lifted @ towards) / spacing, 0, 1)
+    return out
+
+
+def test_it_is_the_plain_loop_over_cells_but_for_rounding_at_their_borders():
+    rng = np.random.default_rng(0)
+    positions = rng.uniform(-0.6, 0.6, (60, 3))
+    normals = rng.normal(size=(60, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    difference = np.abs(seen(positions, normals, 0.15) - loop(positions, normals, 0.15))
+    assert np.mean(difference > 1e-4) < 1e-3
+    assert 0.2 < np.mean(loop(positions, normals, 0.15)) < 0.8
+
+
+def test_directions_outside_a_ball_see_the_side_turned_to_them_and_nothing_within():
+    positions, normals, spacing = shape("sphere", 900)
+    within = 0.3 * positions[::9]
+    found = seen(np.concatenate([positions, within]), np.concatenate([normals, normals[::9]]), spacing)
+    cosine = normals @ DIRECTIONS.T
+    assert found[: len(positions)][cosine > 0.65].min() > 0.95
+    assert found[: len(positions)][cosine > 0].mean() > 0.8  # the cells are too wide for what is seen from the side
+    assert found[: len(positions)][cosine < -0.1].max() == 0
+    assert found[len(positions) :].max() == 0
+
+
+def test_a_plate_hides_what_is_behind_it_from_its_side_alone():
+    plate = np.insert(0.8 * even_square(700), 1, 0, axis=1)
+    below = np.insert(0.1 * even_square(20), 1, -0.25, axis=1)
+    found = seen(np.concatenate([plate, below]), [0.0, 1.0, 0.0], 0.06)[len(plate) :]
+    assert found[:, DIRECTIONS[:, 1] > 0.5].max() == 0
+    assert found[:, DIRECTIONS[:, 1] < -0.5].min() == 1
+
+
+def test_points_that_the_mask_leaves_out_hide_nothing():
+    positions, normals, spacing = shape("sphere", 300)
+    around = np.concatenate([positions, 1.5 * positions])
+    mask = np.arange(600) < 300
+    both = seen(around, np.concatenate([normals, normals]), spacing, mask)
+    close(both[:300], seen(positions, normals, spacing))
+    assert seen(around, np.concatenate([normals, normals]), spacing)[:300].max() == 0
+
+
+def test_tangents_and_normal_are_three_unit_vectors_at_right_angles_also_at_the_poles():
+    normals = np.concatenate([DIRECTIONS, np.eye(3), -np.eye(3), [[0, 0.6, -0.8], [1e-4, 0, -1]]]).astype(np.float32)
+    frames = np.stack([*tangents(normals), normals], axis=1)
+    close(frames @ frames.swapaxes(1, 2), np.broadcast_to(np.eye(3), (len(normals), 3, 3)), atol=1e-6)
+    close(np.linalg.det(frames), np.ones(len(normals)), atol=1e-6)
+
+
+def test_directions_are_spread_evenly_over_the_sphere():
+    close(np.linalg.norm(DIRECTIONS, axis=1), np.ones(64))
+    close(DIRECTIONS.T @ DIRECTIONS / 64, np.eye(3) / 3, atol=5e-3)
+    close(DIRECTIONS.mean(axis=0), np.zeros(3), atol=5e-3)
+
+
+def test_the_grid_covers_the_box_with_few_sizes_and_never_more_than_1024_cells():
+    grids = {}
+    for spacing in np.geomspace(1e-7, 3.0, 200):
+        cell, grid = grid_of(float(spacing))
+        assert cell * grid >= visibility.BOX * (1 - 1e-6)
+        grids[grid] = cell
+    assert max(grids) == visibility.FINEST
+    assert min(grids) == 16
+    assert len(grids) <= 13

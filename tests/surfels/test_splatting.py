@@ -1,0 +1,217 @@
+"""The G-buffer of discs: float64 loops, what a plane shows, what hides what, and continuity."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support.laws import close, numbers
+from support.surfel_clouds import camera, even_square, shape, surfels
+
+from spnr_jax.kernels import cameras
+from spnr_jax.surfels import splatting
+from spnr_jax.surfels.splatting import shares
+
+TOTAL = 2**15  # entries, and 500 points in most scenes: few programs are compiled
+blend = jax.jit(splatting.blend, static_argnames="slots")
+
+
+def draw(found, view, attributes=None):
+    """G-buffer (as NumPy arrays) of surfels, and the entries that it was blended from."""
+    attributes = found.base_color if attributes is None else attributes
+    entries, slots = splatting.entries(found, view, total=TOTAL)
+    assert (
+        int(np.sum(np.asarray(entries.pixel) < view.height * view.width)) <= int(splatting.count(found, view)) <= TOTAL
+    )
+    assert int(slots) <= view.height * view.width
+    buffer = blend(entries, found, jnp.asarray(attributes), view, slots=view.height * view.width)
+    return jax.tree.map(np.asarray, buffer), entries
+
+
+def layer(count=500, height=0.0, normal=(0.0, 0.0, 1.0), **columns):
+    """A square layer of discs around the z axis, turned about the x axis to a normal."""
+    normal = np.asarray(normal) / np.linalg.norm(normal)
+    u, v = 1.1 * even_square(count).T
+    position = u[:, None] * [1, 0, 0] + v[:, None] * [0, normal[2], -normal[1]] + [0, 0, height]
+    return surfels(position, normal, 2.2 / np.sqrt(count), **columns)
+
+
+def both(*layers):
+    return jax.tree.map(lambda *x: jnp.concatenate(x), *layers)
+
+
+class TestShares:
+    def lists(self, seed, high=3.0):
+        rng = np.random.default_rng(seed)
+        depth = np.sort(rng.uniform(2, 2 + high, (24, 60)), axis=0)
+        tau = rng.uniform(0, 3, (24, 60)) * (rng.uniform(size=(24, 60)) < 0.8)
+        return tuple(np.float32(x) for x in (tau, depth, rng.uniform(0.1, 0.6, (24, 60))))
+
+    def twin(self, tau, depth, spacing):
+        tau, depth, spacing = map(np.float64, (tau, depth, spacing))
+        share, left = np.zeros_like(tau), np.zeros_like(tau)
+        for i, s in np.ndindex(tau.shape):
+            band, hidden = tau[i, s], 0.0
+            for j in range(len(tau)):
+                x = np.clip(abs(depth[i, s] - depth[j, s]) / (0.5 * (spacing[i, s] + spacing[j, s])) - 1, 0, 1)
+                apart = x * x * (3 - 2 * x) if abs(i - j) <= splatting.NEAR else 1.0
+                band += tau[j, s] * (1 - apart) if i != j else 0
+                hidden += tau[j, s] * apart if j < i else 0
+            left[i, s] = np.exp(-hidden)
+            share[i, s] = tau[i, s] * left[i, s] * (-np.expm1(-band) / band if band > 1e-6 else 1)
+        return share, left
+
+    def test_they_are_those_of_a_float64_loop(self):
+        for seed in (0, 1):
+            lists = self.lists(seed, high=(1.0, 6.0)[seed])
+            close(shares(*map(jnp.asarray, lists)), self.twin(*lists), rtol=2e-5, atol=2e-6)
+
+    def test_they_lie_in_0_to_1_and_so_does_their_sum(self):
+        for seed in range(4):
+            tau, depth, spacing = self.lists(seed, high=10.0 ** (seed - 2))
+            share, left = map(np.asarray, shares(*map(jnp.asarray, (10.0 ** (seed - 1) * tau, depth, spacing))))
+            assert share.min() >= 0
+            assert left.max() <= 1
+            assert share.sum(axis=0).max() <= 1 + 1e-5
+
+    def test_layers_that_are_well_apart_add_up_to_the_opacity_of_their_optical_depth(self):
+        depth = np.repeat([1.0, 2.0, 3.0, 5.0], 6)[:, None] + 0.04 * np.sort(numbers(0, 4, 6), axis=1).reshape(-1, 1)
+        tau = numbers(1, 24, 1, low=0.0, high=0.4)
+        share, left = shares(tau, jnp.asarray(depth, jnp.float32), jnp.full((24, 1), 0.1))
+        close(np.sum(share), -np.expm1(-np.sum(tau)), rtol=1e-5)
+        close(left[6:12], np.full((6, 1), np.exp(-np.sum(tau[:6]))), rtol=1e-5)
+
+    def test_the_order_within_a_layer_does_not_matter(self):
+        depth = np.sort(3 + 0.04 * numbers(2, 9, 1), axis=0)
+        tau, order = np.asarray(numbers(3, 9, 1, low=0.0)), np.array([4, 7, 0, 1, 8, 3, 2, 6, 5])
+        spacing = jnp.full((9, 1), 0.1)
+        share, _ = shares(jnp.asarray(tau), jnp.asarray(depth), spacing)
+        other, _ = shares(jnp.asarray(tau[order]), jnp.asarray(depth), spacing)
+        close(other, np.asarray(share)[order], rtol=1e-5)
+
+
+class TestEntries:
+    def test_they_are_all_pairs_of_a_float64_loop_over_discs_and_pixels_also_for_a_wide_view(self):
+        position, normal, _ = shape("sphere", 40, "random")
+        found, view = surfels(position, normal, 0.25), camera(20, (0.9, 0.8, 0.9), field_of_view=1.9)
+        _, entries = draw(found, view)
+        table = np.zeros((40, 400))
+        order = np.asarray(entries.order)[np.asarray(entries.pixel) < 400]
+        kernel, point = np.asarray(entries.kernel), np.asarray(entries.point)
+        table[point[order], np.asarray(entries.pixel)[: len(order)]] = kernel[order]
+        rays = cameras.camera_rays(view)
+        directions, eye = np.float64(rays.directions).reshape(-1, 3), np.float64(view.cam_to_world[:, 3])
+        pixels, _ = cameras.project(view, found.position)
+        places = np.stack(np.meshgrid(*[np.arange(20) + 0.5] * 2), axis=-1).reshape(-1, 2)
+        facing = np.asarray(splatting.footprints(found, view).facing) > 0
+        for i, (p, n) in enumerate(zip(np.float64(position), np.float64(normal), strict=True)):
+            slope = directions @ n
+            hit = eye + directions * ((n @ (p - eye)) / np.where(abs(slope) < 0.05, np.nan, slope))[:, None]
+            away = np.minimum(
+                ((hit - p) ** 2).sum(axis=1) / (splatting.RADIUS * 0.25) ** 2,
+                ((places - np.asarray(pixels)[i]) ** 2).sum(axis=1) / splatting.FLOOR**2,
+            )
+            clear = np.isfinite(away) & (directions @ (hit - eye).T[:, 0] > -9)
+            expected = facing[i] * np.clip(1 - away, 0, 1)
+            close(table[i][clear], expected[clear], atol=2e-3)
+
+    def test_they_are_sorted_by_pixel_and_depth_whatever_the_size_of_the_picture(self):
+        found = layer(20, normal=(0, 1, 1))
+        for size in (24, 2100):  # the second has more pixels than 21 bits count
+            view = camera(size, field_of_view=2.9 if size > 24 else 0.7)
+            total = int(splatting.count(found, view))
+            entries, slots = splatting.entries(found, view, total=total)
+            order, pixel = np.asarray(entries.order), np.asarray(entries.pixel)
+            live = pixel < size**2
+            assert np.all(np.diff(pixel) >= 0)
+            depth = np.asarray(entries.depth)[order]
+            assert np.all((np.diff(depth) > -1e-4) | (np.diff(pixel) > 0) | ~live[1:])
+            assert len(np.unique(pixel[live])) == int(slots) > 0
+            rows, columns = pixel[live] // size, pixel[live] % size
+            assert abs(rows.mean() + 0.5 - size / 2) < 0.1 * size
+            assert abs(columns.mean() + 0.5 - size / 2) < 0.1 * size
+
+    def test_discs_behind_the_camera_or_turned_away_or_beside_the_picture_are_not_drawn(self):
+        view = camera()
+        assert int(splatting.count(layer(), view)) > 0
+        assert int(splatting.count(layer(height=2.6), view)) == 0
+        assert int(splatting.count(layer(normal=(0, 0, -1)), view)) == 0
+        assert int(splatting.count(layer(normal=(0, 0, -1), sided=np.zeros(500)), view)) > 0
+        assert int(splatting.count(layer(), camera(target=(9.0, 0.0, 0.0)))) == 0
+        hidden = dataclasses.replace(layer(), mask=jnp.zeros(500, bool))
+        assert int(splatting.count(hidden, view)) == 0
+
+
+class TestBlend:
+    def test_a_plane_of_one_colour_has_that_colour_and_its_own_depth_and_normal(self):
+        found, view = layer(normal=(0, 0.6, 0.8), base_color=np.full((500, 3), [0.2, 0.5, 0.9])), camera()
+        buffer, _ = draw(found, view)
+        rays = cameras.camera_rays(view).directions
+        distance = -2.5 * 0.8 / np.asarray(rays @ jnp.array([0, 0.6, 0.8]))
+        inner = np.zeros((24, 24), bool)
+        inner[6:18, 4:20] = True
+        assert buffer.opacity[inner].min() > 0.95
+        for color in (buffer.color, buffer.attributes):
+            close(color[inner], np.broadcast_to([0.2, 0.5, 0.9], (12 * 16, 3)), rtol=1e-4)
+        close(buffer.normal[inner], np.broadcast_to([0, 0.6, 0.8], (12 * 16, 3)), atol=1e-4)
+        close(buffer.depth[inner], (-distance * rays[..., 2])[inner], rtol=1e-4)
+        close(np.exp(buffer.log_spacing[inner]), np.full(12 * 16, 2.2 / np.sqrt(500)), rtol=1e-4)
+        assert buffer.spread[inner].max() < 0.15 * 2.2 / np.sqrt(500)
+
+    def test_a_colour_that_is_linear_over_a_plane_is_drawn_at_each_pixel(self):
+        slopes = np.array([[0.3, 0.1, 0], [0, -0.4, 0], [0.2, 0.2, 0]])
+        found, view = layer(), camera()
+        color = 0.5 + np.asarray(found.position) @ slopes.T
+        found = surfels(
+            found.position, (0, 0, 1.0), found.spacing, base_color=color, gradient=np.tile(slopes, (500, 1, 1))
+        )
+        buffer, _ = draw(found, view)
+        rays = np.asarray(cameras.camera_rays(view).directions)
+        hit = [0, 0, 2.5] - 2.5 * rays / rays[..., 2:]
+        inner = buffer.opacity > 0.9
+        assert inner.mean() > 0.9
+        close(buffer.color[inner], (0.5 + hit @ slopes.T)[inner], atol=1e-4)
+        assert np.abs(buffer.attributes[inner] - (0.5 + hit @ slopes.T)[inner]).max() > 1e-3  # to order zero only
+
+    def test_an_opaque_layer_hides_what_is_two_spacings_behind_and_blends_with_what_is_half_of_one_behind(self):
+        spacing = 2.2 / np.sqrt(500)
+        for gap, leak in ((2.05, 0.06), (4.0, 0.06)):
+            buffer, _ = draw(
+                both(layer(base_color=np.ones((500, 3))), layer(height=-gap * spacing, base_color=np.zeros((500, 3)))),
+                camera(),
+            )
+            inner = buffer.attributes[4:20, 4:20]
+            assert inner.min() > 1 - leak
+        near = layer(height=-0.5 * spacing, base_color=np.zeros((500, 3)))
+        buffer, _ = draw(both(layer(base_color=np.ones((500, 3))), near), camera())
+        close(np.mean(buffer.attributes[4:20, 4:20]), 0.5, atol=0.05)
+
+    def test_nothing_seen_is_a_buffer_of_zeros(self):
+        buffer, _ = draw(layer(height=3.0), camera())
+        for values in jax.tree.leaves(buffer):
+            assert np.all(values == 0)
+
+    @pytest.mark.parametrize("seed", [0, 1])
+    def test_it_is_continuous_in_the_camera(self, seed):
+        rng = np.random.default_rng(seed)
+        position, normal, spacing = shape("sphere", 400, "random")
+        clutter = rng.uniform(-0.9, 0.9, (100, 3))
+        normal = np.concatenate([normal, clutter / np.linalg.norm(clutter, axis=1, keepdims=True)])
+        color = rng.uniform(size=(500, 3))
+        found = surfels(
+            np.concatenate([position, clutter]), normal, spacing, base_color=color, sided=rng.uniform(size=500) < 0.7
+        )
+        one, other = (draw(found, camera(24, (0.3 + step, 0.2, 2.4)))[0] for step in (0.0, 1e-6))
+        assert np.abs(one.opacity - other.opacity).max() < 1e-4
+        for name in ("attributes", "normal", "color"):
+            change = one.opacity[..., None] * getattr(one, name) - other.opacity[..., None] * getattr(other, name)
+            assert np.abs(change).max() < 1e-4, name
+
+    def test_the_order_of_the_points_does_not_matter(self):
+        position, normal, spacing = shape("sphere", 300, "random")
+        order = np.random.default_rng(5).permutation(300)
+        color = np.random.default_rng(6).uniform(size=(300, 3))
+        one, _ = draw(surfels(position, normal, spacing, base_color=color), camera())
+        other, _ = draw(surfels(position[order], normal[order], spacing, base_color=color[order]), camera())
+        close(jax.tree.leaves(other), jax.tree.leaves(one), rtol=1e-3, atol=1e-4)
