@@ -6,7 +6,7 @@ The networks draw the test objects of a data set (`spnr-data generate --spread e
 from so many of each object's first points, beside the same discs and light without a network (`draft`).  A ball of one
 grey should be smooth, a plate red in front should show no blue.
 
-    OUT/results.json  OUT/table.md .csv .tex     scores (`scoring/picture_scores.py`) of each network and number of points
+    OUT/results.json  OUT/table.md .csv .tex     `scoring/picture_scores.py`, of each network and number of points
     OUT/gallery.png   OUT/ID.png                 references and pictures beside each other, at full size
 """
 

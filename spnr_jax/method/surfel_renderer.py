@@ -9,7 +9,7 @@ Sizes that shape arrays are counted first and rounded up to few values: each new
 """
 
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.compositing import WHITE
-from spnr_jax.kernels.records import Camera, Key, Light, PointCloud, Rendering, Surfels
+from spnr_jax.kernels.records import AnyArray, Camera, Key, Light, PointCloud, Rendering, Surfels
 from spnr_jax.kernels.resizing import mean_of_squares
 from spnr_jax.model_config import SurfelConfig
 from spnr_jax.nn.shader import NUM_OUTPUTS, Shader, doubled, picture
@@ -55,14 +55,16 @@ class Plan(NamedTuple):
 def init(key: Key, config: SurfelConfig) -> dict:
     """Fresh variables of the shader network."""
     side = 2 ** len(config.widths)
-    return Shader(config.widths, config.top).init(key, jnp.zeros((1, side, side, features.NUM_FEATURES)), 1)
+    return dict(Shader(config.widths, config.top).init(key, jnp.zeros((1, side, side, features.NUM_FEATURES)), 1))
 
 
 def encode(cloud: PointCloud) -> SurfelScene:
     """Surfels of a cloud (unbatched, in the box)."""
     mask = np.asarray(cloud.mask)
     names = ("positions", "base_color", "roughness", "metallic", "normals")
-    columns = {name: None if (x := getattr(cloud, name)) is None else np.asarray(x)[mask] for name in names}
+    columns: dict[str, Any] = {
+        name: None if (x := getattr(cloud, name)) is None else np.asarray(x)[mask] for name in names
+    }
     surfels = estimate(**columns)
     return SurfelScene(surfels=jax.device_put(surfels), spacing=float(np.median(surfels.spacing[surfels.mask])))
 
@@ -72,15 +74,14 @@ def render(
 ) -> Rendering:
     """One view (camera unbatched, in the box) of an encoded object; without variables discs and light alone."""
     doublings, side = resolution_of(scene.spacing, camera)
-    small = _scaled(camera, side, 2**doublings)
+    small = _scaled(camera, doublings, side)
     box, total = jax.device_get(_extent(scene.surfels, small))
     plan = _window(box, doublings, side)
     if total == 0:
         return _nothing(camera)
     inside = _seen_through(small, plan)
     found, slots = splatting.entries(scene.surfels, inside, total=_rounded(int(total), 2**15, splatting.MOST_ENTRIES))
-    most = inside.height * inside.width
-    slots = min(_rounded(int(slots), 2**11, splatting.MOST_ENTRIES), most)
+    slots = _rounded(int(slots), 2**11, inside.height * inside.width)
     drawn = _shade(variables, found, scene.surfels, light, inside, config=config, doublings=doublings, slots=slots)
     return _placed(drawn, camera, plan)
 
@@ -102,23 +103,15 @@ def resolution_of(spacing: float, camera: Camera) -> tuple[int, int]:
     return doublings, 2 if pixels < FINEST else 1
 
 
-def _scaled(camera: Camera, side: int, shrink: int) -> Camera:
-    """The camera of a picture `side` times as large, divided by `shrink`; its last row and column may reach beyond."""
-    scale = jnp.array([[side / shrink], [side / shrink], [1.0]], jnp.float32)
-    height, width = (-(-n * side // shrink) for n in (camera.height, camera.width))
-    intrinsics = jnp.asarray(camera.intrinsics, jnp.float32) * jnp.broadcast_to(scale, (3, 3))
-    return Camera(cam_to_world=camera.cam_to_world, intrinsics=intrinsics, height=height, width=width)
-
-
 @jax.jit
 def _extent(surfels: Surfels, camera: Camera) -> tuple[Array, Array]:
     """Lowest and highest column and row that discs cover, and the number of entries at most."""
     foot = splatting.footprints(surfels, camera)
-    drawn = foot.count > 0
-    rows = foot.count // foot.width
+    drawn = foot.covered > 0
+    rows = foot.covered // foot.width
     low = [jnp.min(jnp.where(drawn, x, 2**20)) for x in (foot.left, foot.top)]
     high = [jnp.max(jnp.where(drawn, x + n, 0)) for x, n in ((foot.left, foot.width), (foot.top, rows))]
-    return jnp.stack([*low, *high]), jnp.sum(foot.count)
+    return jnp.stack([*low, *high]), jnp.sum(foot.covered)
 
 
 def _window(box: np.ndarray, doublings: int, side: int) -> Plan:
@@ -132,10 +125,17 @@ def _window(box: np.ndarray, doublings: int, side: int) -> Plan:
 
 def _rounded(count: int, least: int, most: int) -> int:
     """A power of the root of two that holds the count: few sizes, few compilations."""
-    count = max(count, least)
     if count > most:
         raise ValueError(f"the picture needs {count} entries of discs, at most {most} are drawn; ask for a smaller one")
-    return min(int(2 ** (np.ceil(2 * np.log2(count)) / 2)), most)
+    return min(int(2 ** (np.ceil(2 * np.log2(max(count, least))) / 2)), most)
+
+
+def _scaled(camera: Camera, doublings: int, side: int) -> Camera:
+    """The camera at the network's resolution; doubled, its picture may be larger than asked for, and is cut."""
+    height, width = (-(-n * side // 2**doublings) for n in (camera.height, camera.width))
+    scale = jnp.array([[side / 2**doublings], [side / 2**doublings], [1.0]], jnp.float32)
+    intrinsics = jnp.asarray(camera.intrinsics, jnp.float32) * scale
+    return Camera(cam_to_world=camera.cam_to_world, intrinsics=intrinsics, height=height, width=width)
 
 
 def _seen_through(camera: Camera, plan: Plan) -> Camera:
@@ -179,7 +179,7 @@ def _shade(
     if variables is None:
         outputs = jnp.zeros((1, *(n << doublings for n in seen.shape[:2]), NUM_OUTPUTS))
     else:
-        outputs = Shader(config.widths, config.top).apply(variables, seen[None], doublings)
+        outputs = jnp.asarray(Shader(config.widths, config.top).apply(variables, seen[None], doublings))
     color, alpha = picture(outputs, maps[None], ambient[None], doublings)
     depth = depth[None, ..., None]
     for _ in range(doublings):
@@ -187,7 +187,7 @@ def _shade(
     return jnp.concatenate([color, alpha[..., None], depth], axis=-1)[0]
 
 
-def _placed(drawn: Float[Array, "h w 5"], camera: Camera, plan: Plan) -> Rendering:
+def _placed(drawn: Float[AnyArray, "h w 5"], camera: Camera, plan: Plan) -> Rendering:
     """The window in its place in the picture."""
     scale = 2**plan.doublings
     height, width = (n * plan.side for n in (camera.height, camera.width))
@@ -207,7 +207,8 @@ def _placed(drawn: Float[Array, "h w 5"], camera: Camera, plan: Plan) -> Renderi
     along = np.maximum(-np.asarray(rays.directions) @ np.asarray(camera.cam_to_world)[:, 2], 1e-6)
     image = sums[..., :3] + (1 - acc[..., None]) * WHITE
     depth = sums[..., 4] / along + (1 - acc) * np.asarray(far)
-    return Rendering(image=image, image_lr=image, depth=depth.astype(np.float32), acc=acc)
+    whole, opacity = jnp.asarray(image, jnp.float32), jnp.asarray(acc)
+    return Rendering(image=whole, image_lr=whole, depth=jnp.asarray(depth, jnp.float32), acc=opacity)
 
 
 def _nothing(camera: Camera) -> Rendering:

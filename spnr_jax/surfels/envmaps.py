@@ -25,22 +25,17 @@ def solid_angles(height: int) -> Float[np.ndarray, "height width"]:
 
 
 def resampled(envmap: Float[np.ndarray, "h w 3"], height: int) -> Float[np.ndarray, "height width 3"]:
-    """A map of another size: means over its texels' solid angles, of a map refined first where it is too coarse."""
-    fine = envmap
-    for axis, size in ((0, height), (1, 2 * height)):
-        repeats = int(np.lcm(fine.shape[axis], size) // fine.shape[axis])
-        fine = np.repeat(fine, repeats, axis=axis) if repeats < 16 else _stretched(fine, axis, 16 * size)
-    area = np.repeat(_row_areas(fine.shape[0])[:, None], fine.shape[1], axis=1)[..., None]
-    shape = (height, fine.shape[0] // height, 2 * height, fine.shape[1] // (2 * height))
-    total, weight = ((x.reshape(*shape, -1)).sum(axis=(1, 3)) for x in (fine * area, area))
-    return (total / weight).astype(np.float32)
+    """A map of another size: each texel is the mean over its solid angle of those that it overlaps; energy is kept."""
+    rows = _shares(
+        -np.cos(np.pi * np.arange(envmap.shape[0] + 1) / envmap.shape[0]),
+        -np.cos(np.pi * np.arange(height + 1) / height),
+    )
+    columns = _shares(np.linspace(0, 1, envmap.shape[1] + 1), np.linspace(0, 1, 2 * height + 1))
+    narrow = np.tensordot(rows, envmap, axes=(1, 0))
+    return np.ascontiguousarray(np.tensordot(narrow, columns, axes=(1, 1)).swapaxes(1, 2))
 
 
-def _stretched(values: np.ndarray, axis: int, size: int) -> np.ndarray:
-    """Nearest texels at `size` places."""
-    return np.take(values, (np.arange(size) + 0.5) * values.shape[axis] // size, axis=axis, mode="clip")
-
-
-def _row_areas(height: int) -> np.ndarray:
-    edges = np.cos(np.pi * np.arange(height + 1) / height)
-    return (edges[:-1] - edges[1:]).astype(np.float32)
+def _shares(old: np.ndarray, new: np.ndarray) -> np.ndarray:
+    """Share of each old interval in each new one (new, old), from rising edges."""
+    overlap = np.minimum(old[1:], new[1:, None]) - np.maximum(old[:-1], new[:-1, None])
+    return (np.maximum(overlap, 0) / (new[1:] - new[:-1])[:, None]).astype(np.float32)

@@ -42,7 +42,7 @@ BLOCK = 2**16  # points that are worked on at once
 class Near(NamedTuple):
     """Neighbours of a block of points: their numbers, distances, and the way to them."""
 
-    index: Int[np.ndarray, "block k"]
+    number: Int[np.ndarray, "block k"]
     distance: Float[np.ndarray, "block k"]
     offset: Float[np.ndarray, "block k 3"]
 
@@ -118,9 +118,9 @@ def _neighbours(tree: cKDTree, positions: np.ndarray, first: int) -> Near:
 
 def _first_spacing(near: Near) -> np.ndarray:
     """From the area of the disc that holds some neighbours, whatever layer they are on."""
-    count = min(FIRST_DISC, near.index.shape[1] - 1)
+    count = min(FIRST_DISC, near.number.shape[1] - 1)
     if count == 0:  # a single point stands for a tenth of the box
-        return np.full(len(near.index), 0.1, np.float32)
+        return np.full(len(near.number), 0.1, np.float32)
     return np.maximum(np.sqrt(np.pi / count) * near.distance[:, count], LEAST_SPACING)
 
 
@@ -186,16 +186,16 @@ def _lean(normal: np.ndarray, seen: np.ndarray) -> np.ndarray:
 
 def _voted(near: Near, rows: slice, normal: np.ndarray, spacing: np.ndarray, lean: np.ndarray) -> np.ndarray:
     """The lean of each point and of its neighbours on the same layer, whichever way their normals point."""
-    along = np.einsum("nki,ni->nk", normal[near.index], normal[rows])
+    along = np.einsum("nki,ni->nk", normal[near.number], normal[rows])
     flat = np.exp(-0.5 * (_height(near, normal[rows], spacing[rows]) / LAYER) ** 2)
     weight = _close(near, spacing[rows]) * along**2 * flat
-    votes = np.einsum("nk,nk->n", weight * np.sign(along), lean[near.index])
+    votes = np.einsum("nk,nk->n", weight * np.sign(along), lean[near.number])
     return votes / np.maximum(weight.sum(axis=1), 1e-6)
 
 
 def _layer(near: Near, rows: slice, normal: np.ndarray, spacing: np.ndarray, sided: np.ndarray) -> np.ndarray:
     """Weight of each neighbour as one of the same layer: near the plane, and turned to the same side."""
-    along = np.einsum("nki,ni->nk", normal[near.index], normal[rows])
+    along = np.einsum("nki,ni->nk", normal[near.number], normal[rows])
     weight = np.exp(-0.5 * (_height(near, normal[rows], spacing[rows]) / LAYER) ** 2)
     weight = weight * np.where(sided[rows, None] > 0.5, np.clip(0.5 + along, 0, 1), 1)
     weight[:, 0] = 1
@@ -205,11 +205,11 @@ def _layer(near: Near, rows: slice, normal: np.ndarray, spacing: np.ndarray, sid
 def _own_spacing(near: Near, rows: slice, layer: np.ndarray, raw: np.ndarray) -> np.ndarray:
     """From the area of the disc that holds OWN_DISC neighbours of the layer."""
     raw = raw[rows]
-    if near.index.shape[1] == 1:
+    if near.number.shape[1] == 1:
         return raw
     held = np.cumsum(layer[:, 1:], axis=1)
     wanted = np.minimum(OWN_DISC, np.maximum(held[:, -1] * 0.6, 0.5))
-    last = np.minimum((held < wanted[:, None]).sum(axis=1) + 1, near.index.shape[1] - 1)
+    last = np.minimum((held < wanted[:, None]).sum(axis=1) + 1, near.number.shape[1] - 1)
     row = np.arange(len(raw))
     spacing = np.sqrt(np.pi / np.maximum(held[row, last - 1], 1)) * near.distance[row, last]
     return np.clip(spacing, 0.5 * raw, 1.6 * raw)
@@ -218,14 +218,14 @@ def _own_spacing(near: Near, rows: slice, layer: np.ndarray, raw: np.ndarray) ->
 def _smoothed(near: Near, layer: np.ndarray, spacing: np.ndarray) -> np.ndarray:
     """Geometric mean over the nearest of the layer."""
     weight = layer[:, :SMOOTHED]
-    logarithm = np.log(np.maximum(spacing, LEAST_SPACING))[near.index[:, :SMOOTHED]]
+    logarithm = np.log(np.maximum(spacing, LEAST_SPACING))[near.number[:, :SMOOTHED]]
     return np.exp((weight * logarithm).sum(axis=1) / weight.sum(axis=1)).astype(np.float32)
 
 
 def _averaged(near: Near, layer: np.ndarray, seen: np.ndarray) -> np.ndarray:
     """Mean over the nearest of the layer: a depth buffer of points is noisy."""
     weight = layer[:, :SMOOTHED] / layer[:, :SMOOTHED].sum(axis=1, keepdims=True)
-    return sum(weight[:, k, None] * seen[near.index[:, k]] for k in range(weight.shape[1])).astype(np.float32)
+    return sum(weight[:, k, None] * seen[near.number[:, k]] for k in range(weight.shape[1])).astype(np.float32)
 
 
 def _gradient(
@@ -234,11 +234,11 @@ def _gradient(
     """Change of each colour along x, y, z (block, colour, axis): weighted least squares in the tangent plane."""
     first, second = tangents(normal)
     plane = np.stack([np.einsum("nki,ni->nk", near.offset, t) for t in (first, second)], axis=-1)
-    inputs = np.concatenate([np.ones((*near.index.shape, 1), np.float32), plane / spacing[:, None, None]], axis=-1)
+    inputs = np.concatenate([np.ones((*near.number.shape, 1), np.float32), plane / spacing[:, None, None]], axis=-1)
     weight = layer * np.exp(-0.5 * (near.distance / spacing[:, None]) ** 2)
     weight[:, 0] = 1
     weighted = (weight[..., None] * inputs).swapaxes(1, 2)
     normal_equations = weighted @ inputs + np.diag([1e-6, RIDGE, RIDGE])
-    slopes = np.linalg.solve(normal_equations, weighted @ (color[near.index] - color[rows, None]))[:, 1:]
+    slopes = np.linalg.solve(normal_equations, weighted @ (color[near.number] - color[rows, None]))[:, 1:]
     along = slopes[:, 0, :, None] * first[:, None] + slopes[:, 1, :, None] * second[:, None]
     return along / spacing[:, None, None]

@@ -5,6 +5,8 @@ how the object, the camera and the light are turned together, nor on the unit of
 """
 
 import dataclasses
+from functools import reduce
+from operator import add
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -89,7 +91,8 @@ def _directions(buffer: GBuffer, camera: Camera) -> tuple[list[Array], list[Arra
 
 def _to_world(camera: Camera, direction: list[Array]) -> list[Array]:
     pose = camera.cam_to_world
-    return [sum(pose[i, j] * direction[j] for j in range(3)) for i in range(3)]
+    x, y, z = direction
+    return [pose[i, 0] * x + pose[i, 1] * y + pose[i, 2] * z for i in range(3)]
 
 
 def _relief(buffer: GBuffer, spacing: Float[Array, "height width"], reach: int) -> Float[Array, "height width"]:
@@ -102,5 +105,5 @@ def _box(values: Float[Array, "height width"], reach: int) -> Float[Array, "heig
     """Sums over squares of pixels; there is nothing beyond the picture."""
     height, width = values.shape
     padded = jnp.pad(values, reach)
-    down = sum(padded[i : i + height] for i in range(2 * reach + 1))
-    return sum(down[:, i : i + width] for i in range(2 * reach + 1))
+    down = reduce(add, [padded[i : i + height] for i in range(2 * reach + 1)])
+    return reduce(add, [down[:, i : i + width] for i in range(2 * reach + 1)])

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from spnr_jax.kernels.records import Light, Surfels
+from spnr_jax.kernels.records import AnyArray, Light, Surfels
 from spnr_jax.surfels.envmaps import directions, resampled, solid_angles
 from spnr_jax.surfels.room import SCALE, indoor_envmap
 from spnr_jax.surfels.visibility import DIRECTIONS
@@ -73,7 +73,7 @@ def look_up(tables: Float[Array, "rows 3"], towards: list[Array], first: Array |
 
 def irradiance(light: Light, normal: list[Array]) -> list[Array]:
     """Irradiance over pi of unshadowed surfaces, colours as columns."""
-    return look_up(light.tables[0].reshape(-1, 3), normal)
+    return look_up(jnp.asarray(light.tables[0]).reshape(-1, 3), normal)
 
 
 def mirrored(light: Light, towards: list[Array], roughness: Array) -> list[Array]:
@@ -81,7 +81,7 @@ def mirrored(light: Light, towards: list[Array], roughness: Array) -> list[Array
     level = jnp.clip(roughness, 0, 1) * (len(LEVELS) - 1)
     below = jnp.clip(jnp.floor(level), 0, len(LEVELS) - 2)
     share, first = level - below, (1 + below.astype(jnp.int32)) * (HEIGHT * WIDTH)
-    tables = light.tables.reshape(-1, 3)
+    tables = jnp.asarray(light.tables).reshape(-1, 3)
     smooth, rough = (look_up(tables, towards, first + step * HEIGHT * WIDTH) for step in (0, 1))
     return [(1 - share) * a + share * b for a, b in zip(smooth, rough, strict=True)]
 
@@ -111,7 +111,7 @@ def harmonics(x: Array, y: Array, z: Array) -> list[Array]:
     ]
 
 
-def projected(light: Light, rotation: Float[Array, "3 3"]) -> Float[Array, "9 3"]:
+def projected(light: Light, rotation: Float[AnyArray, "3 3"]) -> Float[Array, "9 3"]:
     """Spherical harmonics of the map over pi in the axes of a camera, columns of cam_to_world."""
     towards = jnp.asarray(directions(HEIGHT).reshape(-1, 3), jnp.float32) @ rotation
     basis = jnp.stack(harmonics(*towards.T)) * jnp.asarray(solid_angles(HEIGHT).reshape(1, -1))

@@ -22,7 +22,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from spnr_jax.kernels.records import Camera, GBuffer, Surfels
+from spnr_jax.kernels.records import AnyArray, Camera, GBuffer, Surfels
 
 RADIUS = 1.6  # of a disc, in spacings
 FLOOR = 1.0  # smallest radius on the picture, in pixels
@@ -32,7 +32,7 @@ NEAR = 8  # places in the list before and after an entry that are compared in de
 EDGE = 0.02  # cosine between ray and plane below which the plane counts as seen at this angle
 SHARP = 4  # power of the kernel by which colours are blended more narrowly than everything else
 NEAREST = 0.05  # distance before the camera from which discs are drawn
-DEPTH_BITS, ENTRY_BITS = 19, 24  # of the sorted number, pixels have the 21 above
+DEPTH_BITS, ENTRY_BITS = 19, 24  # of the sorted number of 64, at most; pixels have those above
 MOST_ENTRIES = 2**ENTRY_BITS
 
 
@@ -48,7 +48,7 @@ class Footprints(NamedTuple):
     left: Int[Array, " points"]
     top: Int[Array, " points"]
     width: Int[Array, " points"]
-    count: Int[Array, " points"]
+    covered: Int[Array, " points"]
 
 
 class Entries(NamedTuple):
@@ -73,9 +73,9 @@ def smoothstep(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
     return x * x * (3 - 2 * x)
 
 
-def _turned(matrix: Float[Array, "3 3"], vectors: Float[Array, "points 3"]) -> tuple[Array, Array, Array]:
+def _turned(matrix: Float[AnyArray, "3 3"], vectors: Float[AnyArray, "points 3"]) -> tuple[Array, Array, Array]:
     """Columns of vectors @ matrix."""
-    x, y, z = vectors.T
+    x, y, z = jnp.asarray(vectors).T
     one, two, three = (x * matrix[0, i] + y * matrix[1, i] + z * matrix[2, i] for i in range(3))
     return one, two, three
 
@@ -87,17 +87,20 @@ def footprints(surfels: Surfels, camera: Camera) -> Footprints:
     normal = _turned(rotation, surfels.normal)
     distance = jnp.sqrt(x * x + y * y + z * z)
     cosine = -(normal[0] * x + normal[1] * y + normal[2] * z) / jnp.maximum(distance, NEAREST)
-    facing = 1 - surfels.sided * (1 - smoothstep((cosine + 0.1) / 0.3))
+    facing = 1 - jnp.asarray(surfels.sided) * (1 - smoothstep((cosine + 0.1) / 0.3))
     ahead = jnp.maximum(-z, NEAREST)
     column = camera.intrinsics[0, 0] * x / ahead + camera.intrinsics[0, 2]
     row = -camera.intrinsics[1, 1] * y / ahead + camera.intrinsics[1, 2]
-    radius = RADIUS * surfels.spacing
+    radius = RADIUS * jnp.asarray(surfels.spacing)
+    nearest = jnp.maximum(ahead - radius * jnp.sqrt(jnp.clip(1 - normal[2] ** 2, 0, 1)), NEAREST)  # of the disc
     sides = []
-    for middle, focal, along, size in (
-        (column, camera.intrinsics[0, 0], normal[0], camera.width),
-        (row, camera.intrinsics[1, 1], normal[1], camera.height),
+    for middle, focal, aside, along, size in (
+        (column, camera.intrinsics[0, 0], x / ahead, normal[0], camera.width),
+        (row, camera.intrinsics[1, 1], y / ahead, normal[1], camera.height),
     ):
-        half = jnp.maximum(1.05 * focal * radius / ahead * jnp.sqrt(jnp.clip(1 - along**2, 0, 1)), FLOOR)
+        # a place of the disc at (dx, dz) from its centre lies focal * (dx + aside * dz) / (ahead - dz) beside it
+        extent = jnp.sqrt(jnp.maximum(1 + aside**2 - (along + aside * normal[2]) ** 2, 0))
+        half = jnp.maximum(focal * radius * extent / nearest, FLOOR)
         first = jnp.clip(jnp.ceil(middle - half - 0.5), 0, size)
         sides.append((first, jnp.maximum(jnp.clip(jnp.floor(middle + half - 0.5) + 1, 0, size) - first, 0)))
     (left, width), (top, height) = sides
@@ -112,24 +115,24 @@ def footprints(surfels: Surfels, camera: Camera) -> Footprints:
         left=left.astype(jnp.int32),
         top=top.astype(jnp.int32),
         width=jnp.maximum(width, 1).astype(jnp.int32),
-        count=jnp.where(drawn, width * height, 0).astype(jnp.int32),
+        covered=jnp.where(drawn, width * height, 0).astype(jnp.int32),
     )
 
 
 @jax.jit
 def count(surfels: Surfels, camera: Camera) -> Int[Array, ""]:
     """Number of entries that a picture makes at most."""
-    return jnp.sum(footprints(surfels, camera).count)
+    return jnp.sum(footprints(surfels, camera).covered)
 
 
 @partial(jax.jit, static_argnames="total")
 def entries(surfels: Surfels, camera: Camera, *, total: int) -> tuple[Entries, Int[Array, ""]]:
     """The sorted entries, `total` of them with the empty ones, and the number of covered pixels."""
     foot = footprints(surfels, camera)
-    end = jnp.cumsum(foot.count)
-    point = jnp.repeat(jnp.arange(len(foot.count), dtype=jnp.int32), foot.count, total_repeat_length=total)
+    end = jnp.cumsum(foot.covered)
+    point = jnp.repeat(jnp.arange(len(foot.covered), dtype=jnp.int32), foot.covered, total_repeat_length=total)
     # whole columns are gathered one by one, and not computed anew at every use: twenty times faster on a CPU
-    foot, begin, point = jax.lax.optimization_barrier((foot, end - foot.count, point))
+    foot, begin, point = jax.lax.optimization_barrier((foot, end - foot.covered, point))
     x, y, z, nx, ny, nz = (column[point] for column in (*foot.centre, *foot.normal))
     radius = foot.radius[point]
     place = jnp.arange(total, dtype=jnp.int32)
@@ -147,7 +150,7 @@ def entries(surfels: Surfels, camera: Camera, *, total: int) -> tuple[Entries, I
     kernel = jnp.clip(1 - jnp.minimum(in_plane, on_picture), 0, 1)
     depth = jnp.clip(met, -z - radius, -z + radius)
     pixel = jnp.where((place < end[-1]) & (kernel > 0), row * camera.width + column, camera.height * camera.width)
-    order, pixel = _sorted(pixel, depth, place)
+    order, pixel = _sorted(pixel, depth, place, camera.height * camera.width)
     first = jnp.concatenate([jnp.ones(1, bool), pixel[1:] != pixel[:-1]]) & (pixel < camera.height * camera.width)
     slot = jnp.cumsum(first.astype(jnp.int32)) - 1
     rank = place - jax.lax.cummax(jnp.where(first, place, 0))
@@ -155,16 +158,17 @@ def entries(surfels: Surfels, camera: Camera, *, total: int) -> tuple[Entries, I
 
 
 def _sorted(
-    pixel: Int[Array, " entries"], depth: Float[Array, " entries"], place: Int[Array, " entries"]
+    pixel: Int[Array, " entries"], depth: Float[Array, " entries"], place: Int[Array, " entries"], pixels: int
 ) -> tuple[Int[Array, " entries"], Int[Array, " entries"]]:
     """Places and pixels in the order of pixel and depth: one number of 64 bits sorts nine times faster than three."""
     low, high = jnp.min(depth), jnp.max(depth)
-    steps = 2**DEPTH_BITS - 1
+    depth_bits = min(DEPTH_BITS, 64 - ENTRY_BITS - pixels.bit_length())
+    steps = 2**depth_bits - 1
     with jax.enable_x64(True):
         level = (steps * (depth - low) / jnp.maximum(high - low, 1e-6)).astype(jnp.uint64)
-        key = pixel.astype(jnp.uint64) << (DEPTH_BITS + ENTRY_BITS) | level << ENTRY_BITS | place.astype(jnp.uint64)
+        key = pixel.astype(jnp.uint64) << (depth_bits + ENTRY_BITS) | level << ENTRY_BITS | place.astype(jnp.uint64)
         key = jax.lax.sort(key)
-        return (key & (2**ENTRY_BITS - 1)).astype(jnp.int32), (key >> (DEPTH_BITS + ENTRY_BITS)).astype(jnp.int32)
+        return (key & (2**ENTRY_BITS - 1)).astype(jnp.int32), (key >> (depth_bits + ENTRY_BITS)).astype(jnp.int32)
 
 
 def blend(
