@@ -33,7 +33,7 @@ def init(key: Key, config: NetworkConfig) -> dict:
     """Fresh variables of a config's network."""
     if isinstance(config, SurfelConfig):
         return surfel_renderer.init(key, config)
-    return network(config).init(key, *example_inputs(config))
+    return dict(network(config).init(key, *example_inputs(config)))
 
 
 def example_inputs(config: NetworkConfig) -> tuple[PointCloud, Camera]:

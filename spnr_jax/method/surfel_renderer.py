@@ -55,7 +55,7 @@ class Plan(NamedTuple):
 def init(key: Key, config: SurfelConfig) -> dict:
     """Fresh variables of the shader network."""
     side = 2 ** len(config.widths)
-    return Shader(config.widths, config.top).init(key, jnp.zeros((1, side, side, features.NUM_FEATURES)), 1)
+    return dict(Shader(config.widths, config.top).init(key, jnp.zeros((1, side, side, features.NUM_FEATURES)), 1))
 
 
 def encode(cloud: PointCloud) -> SurfelScene:
@@ -150,7 +150,7 @@ def look(
     surfels = features.turned(surfels, camera)
     buffer = splatting.blend(found, surfels, features.attributes(surfels, light, camera), camera, slots=slots)
     seen, maps = features.features(buffer, light, camera)
-    return seen, maps, lighting.projected(light, camera.cam_to_world[:, :3]), buffer.depth
+    return seen, maps, lighting.projected(light, jnp.asarray(camera.cam_to_world)[:, :3]), buffer.depth
 
 
 @partial(jax.jit, static_argnames=("config", "doublings", "slots"))

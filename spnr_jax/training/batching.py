@@ -4,6 +4,7 @@ Because a batch depends on nothing but the step, the state of the reader is the 
 the same data, whatever was read ahead.  grain does the reading ahead, in threads.
 """
 
+import dataclasses
 import functools
 import threading
 from collections.abc import Callable, Generator
@@ -46,7 +47,7 @@ def make_batch(objects: list[ObjectData], config: TrainConfig, step: int, place:
         generator = np.random.default_rng((config.seed, POINTS_AND_VIEWS, step, i))
         low, high = np.log2(config.min_points), np.log2(config.max_points)
         count = round(2 ** generator.uniform(low, high))
-        cloud = item.cloud.replace(normals=None)  # networks of whole views estimate them, if they need any
+        cloud = dataclasses.replace(item.cloud, normals=None)  # networks of whole views estimate them, if they need any
         clouds_of.append(choose_points(cloud, count, config.max_points, generator, config.even_share))
         views_of.append(generator.permutation(len(item.images))[: config.views_per_object])
     images = np.stack([item.images[v] for item, v in zip(objects, views_of, strict=True)])

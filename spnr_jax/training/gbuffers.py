@@ -9,6 +9,7 @@ A file is a pure function of (seed, object, cloud); it appears whole or not at a
 again.  A batch is a pure function of (seed, step) and the list of files: squares of views of equal doublings.
 """
 
+import dataclasses
 import io
 import zlib
 from collections.abc import Callable, Generator
@@ -116,9 +117,9 @@ def random_cloud(cloud: PointCloud, side: int, config: TrainConfig, generator: n
     even = generator.random() < config.even_share and count <= MOST_EVEN
     chosen = generator.permutation(len(cloud.mask))[:count]
     if even:
-        chosen = farthest_points(cloud.positions, count, int(chosen[0]))
+        chosen = farthest_points(np.asarray(cloud.positions), count, int(chosen[0]))
     if generator.random() < WITHOUT_NORMALS:
-        cloud = cloud.replace(normals=None)
+        cloud = dataclasses.replace(cloud, normals=None)
     return jax.tree.map(lambda values: values[chosen], cloud)
 
 
