@@ -158,7 +158,7 @@ def look(
     surfels = features.turned(surfels, camera)
     buffer = splatting.blend(found, surfels, features.attributes(surfels, light, camera), camera, slots=slots)
     seen, maps = features.features(buffer, light, camera)
-    return seen, maps, lighting.projected(light, camera.cam_to_world[:, :3]), buffer.depth
+    return seen, maps, lighting.projected(light, jnp.asarray(camera.cam_to_world)[:, :3]), buffer.depth
 
 
 @partial(jax.jit, static_argnames=("config", "doublings", "slots"))

@@ -5,6 +5,7 @@ The state, its checkpoints, and the loop are those of the other networks (`optim
 
 import dataclasses
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -27,7 +28,7 @@ def loss(params: dict, crops: Crops, *, config: TrainConfig) -> tuple[Float[Arra
     """(loss, metrics): errors of the picture on white and of the opacity, weighted as the config says."""
     assert isinstance(config.model, SurfelConfig)
     shader = Shader(config.model.widths, config.model.top)
-    outputs = jnp.asarray(shader.apply({"params": params}, jnp.asarray(crops.seen), crops.doublings))
+    outputs: Any = shader.apply({"params": params}, jnp.asarray(crops.seen), crops.doublings)
     image, alpha = picture(outputs, jnp.asarray(crops.maps), jnp.asarray(crops.ambient), crops.doublings)
     target = jnp.asarray(crops.target, jnp.float32) / 255
     opacity = target[..., 3]
