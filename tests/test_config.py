@@ -139,7 +139,7 @@ class TestMethods:
     def test_an_unknown_method_names_the_known_ones(self):
         values = to_dict(TrainConfig())
         values["model"]["method"] = "nerf"
-        with pytest.raises(ValueError, match=r"model\.method nerf is not one of ours, npbg"):
+        with pytest.raises(ValueError, match=r"model\.method nerf is not one of ours, surfels, npbg"):
             from_dict(values)
 
     def test_a_file_from_before_there_were_baselines_is_read_as_ours(self):

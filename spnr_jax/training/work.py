@@ -46,7 +46,7 @@ def of_views(config: TrainConfig, dataset: Dataset, mesh: Mesh | None, own: rang
     """Of a network that renders whole views; a mesh's devices share the objects of a batch."""
     adversarial_from = optimisation.first_adversarial_step(config)
 
-    def step(state: TrainState, batch: Any, number: int) -> tuple[TrainState, dict]:
+    def step(state: Any, batch: Any, number: int) -> tuple[Any, dict]:
         with placement.using(mesh):
             batch = placement.placed(batch, mesh, config.batch_objects)
             adversarial = number >= adversarial_from

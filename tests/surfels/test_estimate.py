@@ -25,8 +25,6 @@ def estimate(positions, color=None, normals=None):
 CASES = [
     ("plane", 1024, "random", 1), ("sphere", 256, "even", 2), ("sphere", 256, "random", 10),
     ("sphere", 20_000, "even", 1), ("sphere", 4096, "random", 3), ("rod", 1024, "random", 10),
-    ("plates", 1024, "even", 1),
-    ("plates", 1024, "random", 1),
 ]  # fmt: skip
 
 
@@ -101,27 +99,6 @@ def test_blocks_of_points_and_their_order_change_nothing(monkeypatch):
         off = np.abs(shuffled[name] - whole[name][order]).reshape(len(positions), -1).max(axis=1)
         # a visible cell's border is a border: rounding of a normal may move a lifted point over it
         assert np.mean(off > 1e-3 * max(np.abs(whole[name]).max(), 1)) < 0.01, name
-
-
-def test_the_work_is_bounded_for_each_point(monkeypatch):
-    sizes, cells = [], []
-    neighbours, seen_from = module._neighbours, module.seen_from
-
-    def counted(*arguments):
-        near = neighbours(*arguments)
-        sizes.append(near.index.shape)
-        return near
-
-    def drawn(*arguments, grid):
-        cells.append(grid**2)
-        return seen_from(*arguments, grid=grid)
-
-    monkeypatch.setattr(module, "_neighbours", counted)
-    monkeypatch.setattr(module, "seen_from", drawn)
-    monkeypatch.setattr(module, "BLOCK", 1000)
-    estimate(shape("sphere", 3000, "random")[0])
-    assert sizes == [(1000, module.NEIGHBOURS)] * 3
-    assert max(cells) < 4 * 3000
 
 
 def test_normals_that_are_given_are_kept_and_those_of_the_wrong_sign_turned():

@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 from support.laws import close
-from support.surfel_clouds import even_square, shape
+from support.surfel_clouds import shape
 
 from spnr_jax.surfels import visibility
 from spnr_jax.surfels.visibility import DIRECTIONS, grid_of, seen_from, tangents
@@ -56,23 +56,6 @@ def test_directions_outside_a_ball_see_the_side_turned_to_them_and_nothing_withi
     assert found[: len(positions)][cosine > 0].mean() > 0.8  # the cells are too wide for what is seen from the side
     assert found[: len(positions)][cosine < -0.1].max() == 0
     assert found[len(positions) :].max() == 0
-
-
-def test_a_plate_hides_what_is_behind_it_from_its_side_alone():
-    plate = np.insert(0.8 * even_square(700), 1, 0, axis=1)
-    below = np.insert(0.1 * even_square(20), 1, -0.25, axis=1)
-    found = seen(np.concatenate([plate, below]), [0.0, 1.0, 0.0], 0.06)[len(plate) :]
-    assert found[:, DIRECTIONS[:, 1] > 0.5].max() == 0
-    assert found[:, DIRECTIONS[:, 1] < -0.5].min() == 1
-
-
-def test_points_that_the_mask_leaves_out_hide_nothing():
-    positions, normals, spacing = shape("sphere", 300)
-    around = np.concatenate([positions, 1.5 * positions])
-    mask = np.arange(600) < 300
-    both = seen(around, np.concatenate([normals, normals]), spacing, mask)
-    close(both[:300], seen(positions, normals, spacing))
-    assert seen(around, np.concatenate([normals, normals]), spacing)[:300].max() == 0
 
 
 def test_tangents_and_normal_are_three_unit_vectors_at_right_angles_also_at_the_poles():

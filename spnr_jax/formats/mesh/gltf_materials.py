@@ -170,7 +170,7 @@ def _texture_transform(moved: dict) -> tuple[np.ndarray, np.ndarray]:
     return np.array([[cos, sin], [-sin, cos]]) * scale, np.asarray(moved.get("offset", (0, 0)), np.float64)
 
 
-def _channels(**channels: Values | float) -> dict[str, Any]:
+def _channels(**channels: Values | float | int) -> dict[str, Any]:
     """The channels as float32 in [0, 1]."""
     return {name: np.clip(np.asarray(values, np.float32), 0, 1) for name, values in channels.items()}
 

@@ -57,7 +57,7 @@ def shrink(texels: np.ndarray) -> np.ndarray:
     return resize(texels, max(1, round(height * ratio)), max(1, round(width * ratio)))
 
 
-def resize(texels: np.ndarray, height: int, width: int) -> np.ndarray:
+def resize(texels: np.ndarray, height: int | np.integer, width: int | np.integer) -> np.ndarray:
     """The texture resampled with a box filter, float32."""
     channels = texels.reshape(*texels.shape[:2], -1)
     resized = [

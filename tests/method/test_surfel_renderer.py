@@ -1,0 +1,125 @@
+"""Pictures of a ball by an untrained network: places, sizes, white around it, and any number of points."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support.laws import close, numbers
+from support.surfel_clouds import camera, cloud, shape
+
+from spnr_jax.kernels import cameras
+from spnr_jax.method import surfel_renderer
+from spnr_jax.method.surfel_renderer import GRID, encode, render, render_views, resolution_of
+from spnr_jax.model_config import SurfelConfig
+from spnr_jax.nn.shader import Shader
+from spnr_jax.surfels.features import NUM_FEATURES
+from spnr_jax.surfels.lighting import light_of
+
+CONFIG = SurfelConfig(widths=(8, 8), top=8)
+LIGHT = jax.tree.map(jnp.asarray, light_of(np.full((32, 64, 3), 0.8, np.float32)))
+RADIUS = 0.6
+
+
+def ball(count=600):
+    return encode(cloud(shape("sphere", count)[0], base_color=np.full((count, 3), [0.7, 0.3, 0.1])))
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return ball()
+
+
+@pytest.fixture(scope="module")
+def fresh():
+    return Shader(CONFIG.widths, CONFIG.top).init(jax.random.key(0), jnp.zeros((1, 8, 8, NUM_FEATURES)), 1)
+
+
+@pytest.fixture(scope="module")
+def wobbled(fresh):
+    leaves, form = jax.tree.flatten(fresh)
+    return jax.tree.unflatten(form, [x + 0.1 * numbers(i, *x.shape) for i, x in enumerate(leaves)])
+
+
+def truth(view):
+    """Distance along each ray to the ball, 0 beside it, and how near the ray passes its middle."""
+    rays = jax.tree.map(np.float64, cameras.camera_rays(view))
+    along = -np.sum(rays.origins * rays.directions, axis=-1)
+    miss = np.sqrt(np.sum(rays.origins**2, axis=-1) - along**2)
+    return along - np.sqrt(np.maximum(RADIUS**2 - miss**2, 0)), miss
+
+
+def check_ball(found, view, spacing):
+    distance, miss = truth(view)
+    inside, outside = miss < RADIUS - spacing, miss > RADIUS + 2.5 * spacing
+    assert found.image.shape == (view.height, view.width, 3)
+    for leaf in jax.tree.leaves(found):
+        assert np.isfinite(np.asarray(leaf)).all()
+    assert np.asarray(found.acc)[inside].min() > 0.9
+    assert np.all(np.asarray(found.acc)[outside] == 0)
+    assert np.all(np.asarray(found.image)[outside] == 1)
+    assert np.abs(np.asarray(found.depth) - distance)[inside].max() < spacing + 0.02 * distance.max()
+
+
+def test_a_ball_is_drawn_where_it_is_on_white(scene, fresh):
+    view = camera(64)
+    found = render(fresh, scene, view, LIGHT, config=CONFIG)
+    check_ball(found, view, scene.spacing)
+    middle = np.asarray(found.image)[28:36, 28:36].reshape(-1, 3)
+    assert np.all(np.diff(middle, axis=1) < -0.1)  # a brown ball: red above green above blue
+    close(render(None, scene, view, LIGHT, config=CONFIG).image, found.image, atol=1e-5)  # fresh weights change nothing
+
+
+@pytest.mark.parametrize("size", [(50, 70), (33, 47), (16, 16)])
+def test_pictures_of_any_size_show_the_ball_at_its_place(scene, size):
+    height, width = size
+    view = dataclasses.replace(cameras.pinhole(camera(8).cam_to_world, 0.9, height, width))
+    check_ball(render(None, scene, view, LIGHT, config=CONFIG), view, scene.spacing + 2.0 * 2.5 / view.intrinsics[0, 0])
+
+
+def test_a_small_ball_in_the_corner_of_a_picture_is_drawn_there(scene):
+    view = camera(96, eye=(0.0, 0.0, 9.0), target=(2.2, 2.2, 0.0))
+    check_ball(render(None, scene, view, LIGHT, config=CONFIG), view, 2 * scene.spacing)
+
+
+@pytest.mark.parametrize("target", [(0.0, 0.0, 9.0), (9.0, 0.0, 2.5)])
+def test_a_camera_that_looks_away_sees_white(scene, fresh, target):
+    found = render(fresh, scene, camera(64, target=target), LIGHT, config=CONFIG)
+    assert found.image.shape == (64, 64, 3)
+    assert np.all(np.asarray(found.image) == 1)
+    assert np.all(np.asarray(found.acc) == 0)
+
+
+def test_the_picture_moves_with_the_principal_point(wobbled):
+    scene, view = ball(3000), camera(96, eye=(0.6, 0.4, 3.6))
+    doublings, side = resolution_of(scene.spacing, view)
+    assert side == 1
+    step = GRID * 2**doublings
+    moved = dataclasses.replace(view, intrinsics=view.intrinsics.at[0, 2].add(step).at[1, 2].add(-step))
+    one, other = (np.asarray(render(wobbled, scene, v, LIGHT, config=CONFIG).image) for v in (view, moved))
+    close(other[: 96 - step, step:], one[step:, : 96 - step], atol=1e-4)
+    assert np.abs(one - np.asarray(render(None, scene, view, LIGHT, config=CONFIG).image)).max() > 0.01
+
+
+def test_views_are_those_drawn_one_by_one(scene):
+    views = [camera(64, eye) for eye in ((0.0, 0.0, 2.5), (1.5, 1.0, 1.5))]
+    together = render_views(None, scene, jax.tree.map(lambda *x: jnp.stack(x), *views), LIGHT, config=CONFIG)
+    for i, view in enumerate(views):
+        one = render(None, scene, view, LIGHT, config=CONFIG)
+        close(jax.tree.map(lambda x, i=i: x[i], together), one)
+
+
+def test_more_entries_than_can_be_sorted_are_refused_in_one_line(scene, monkeypatch):
+    monkeypatch.setattr(surfel_renderer.splatting, "MOST_ENTRIES", 100)
+    with pytest.raises(ValueError, match="ask for a smaller one"):
+        render(None, scene, camera(64), LIGHT, config=CONFIG)
+
+
+def test_padding_of_the_cloud_and_points_outside_the_picture_change_nothing(scene):
+    positions = shape("sphere", 600)[0]
+    color = np.full((600, 3), [0.7, 0.3, 0.1])
+    padded = cloud(np.concatenate([positions, 0 * positions]), base_color=np.concatenate([color, color]))
+    padded = dataclasses.replace(padded, mask=np.arange(1200) < 600)
+    found, expected = (render(None, s, camera(64), LIGHT, config=CONFIG) for s in (encode(padded), scene))
+    close(found, expected)

@@ -1,0 +1,113 @@
+"""The shader: what its outputs do to light and materials, linear in the light, at every number of doublings."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support.laws import close, numbers
+
+from spnr_jax.kernels.colors import srgb_to_linear
+from spnr_jax.kernels.resizing import bilinear
+from spnr_jax.nn.shader import COLOR_STEP, LEAST_ODDS, NOTHING, NUM_OUTPUTS, ODDS_STEP, Shader, doubled, picture
+from spnr_jax.surfels.features import NUM_MAPS
+from spnr_jax.surfels.lighting import SPECULAR
+
+SMALL = Shader(widths=(8, 8), top=8)
+LIT = slice(7, 16)  # maps that are linear in the light
+
+
+def maps(seed=0, size=6):
+    """Materials within [0, 1] and faint light, so that no picture is clipped."""
+    values = numbers(seed, 1, size, size, NUM_MAPS, low=0.1, high=0.9)
+    return values.at[..., LIT].multiply(0.5).at[..., 6].multiply(0.1)
+
+
+def drawn(outputs, values, ambient, doublings=0):
+    """Linear light and opacity."""
+    image, alpha = picture(outputs, values, ambient, doublings)
+    return srgb_to_linear(image), alpha
+
+
+def test_doubling_is_bilinear_with_half_pixel_centres():
+    x = numbers(0, 2, 5, 7, 3)
+    close(doubled(x), bilinear(x, 10, 14), atol=1e-6)
+
+
+class TestPicture:
+    def test_without_outputs_it_is_the_light_that_materials_reflect(self):
+        values, ambient = maps(), numbers(1, 1, 9, 3)
+        linear, alpha = drawn(jnp.zeros((1, 6, 6, NUM_OUTPUTS)), values, ambient)
+        color, metallic, opacity, factor, summand = np.split(np.float64(values[..., :7]), [3, 4, 5, 6], axis=-1)
+        arriving, _, mirrored, reflected = np.split(np.float64(values[..., 7:]), [3, 6, 9], axis=-1)
+        specular = ((SPECULAR * (1 - metallic) + color * metallic) * factor + summand) * mirrored * reflected
+        close(linear, color * (1 - metallic) * arriving + specular, rtol=1e-4)
+        close(alpha, (opacity[..., 0] + LEAST_ODDS) / (1 + 2 * LEAST_ODDS), rtol=1e-4)
+
+    def test_it_is_linear_in_the_light_whatever_the_outputs(self):
+        outputs, values = 0.3 * numbers(2, 1, 12, 12, NUM_OUTPUTS), maps()
+        outputs = outputs.at[..., 8:].multiply(0.1)
+        lights = [
+            (values.at[..., LIT].set(0.4 * numbers(s, 1, 6, 6, 9, low=0.2)), 0.1 * numbers(s, 1, 9, 3)) for s in (3, 4)
+        ]
+        both = values.at[..., LIT].set(lights[0][0][..., LIT] + 0.5 * lights[1][0][..., LIT])
+        (one, a), (other, _) = (drawn(outputs, *light, doublings=1) for light in lights)
+        total, alpha = drawn(outputs, both, lights[0][1] + 0.5 * lights[1][1], doublings=1)
+        unclipped = (np.asarray(total) < 0.99) & (np.asarray(one) > 1e-4) & (np.asarray(other) > 1e-4)
+        assert unclipped.mean() > 0.8
+        close(total[unclipped], (one + 0.5 * other)[unclipped], rtol=1e-3, atol=1e-5)
+        close(alpha, a)
+
+    def test_without_light_it_is_black_and_by_far_too_much_white(self):
+        outputs, values = numbers(5, 1, 6, 6, NUM_OUTPUTS, low=0.0), maps()
+        image, _ = picture(outputs, values.at[..., LIT].set(0), jnp.zeros((1, 9, 3)), 0)
+        assert np.all(np.asarray(image) == 0)
+        image, alpha = picture(outputs, values.at[..., LIT].set(1e6), jnp.zeros((1, 9, 3)).at[:, 0].set(1e6), 0)
+        assert np.all(np.asarray(image) == 1)
+        assert np.isfinite(np.asarray(alpha)).all()
+
+    def test_each_output_does_what_its_name_says(self):
+        values, ambient = maps(), numbers(6, 1, 9, 3, low=0.1, high=0.3)
+        values = values.at[..., :3].set(0.5).at[..., 3].set(0)
+
+        def change(index, size=1.0):
+            outputs = jnp.zeros((1, 6, 6, NUM_OUTPUTS))
+            linear, alpha = drawn(outputs.at[..., index].set(size), values, ambient)
+            plain, before = drawn(outputs, values, ambient)
+            return np.asarray(linear - plain), np.asarray(alpha), np.asarray(before)
+
+        close(change(0)[0][..., 0], COLOR_STEP * values[..., 7], rtol=1e-3)
+        close(change(0)[0][..., 1:], np.zeros((1, 6, 6, 2)))
+        _, alpha, before = change(3)
+        close(np.log(alpha / (1 - alpha)), np.log(before / (1 - before)) + ODDS_STEP, rtol=1e-3, atol=1e-3)
+        close(change(4, 0.1)[0], 0.05 * values[..., 7:10], rtol=1e-3, atol=1e-6)
+        close(change(5, 0.1)[0], 0.05 * values[..., 10:13], rtol=1e-3, atol=1e-6)
+        specular = (SPECULAR * values[..., 5:6] + values[..., 6:7]) * values[..., 13:16]
+        close(change(6)[0], specular * values[..., 16:17], rtol=1e-3, atol=1e-6)
+        close(change(7)[0], specular, rtol=1e-3, atol=1e-6)
+        close(change(9, 0.1)[0][..., 1], np.full((1, 6, 6), 0.05 * ambient[0, 0, 1]), rtol=1e-3)
+        for k in range(1, 9):
+            close(change(10 + k, 0.1)[0], np.broadcast_to(0.05 * ambient[0, k], (1, 6, 6, 3)), rtol=1e-3, atol=1e-6)
+
+    @pytest.mark.parametrize("opacity", [0.0, 1e-8, 1.0])
+    @pytest.mark.parametrize("light", [0.0, 1e-6, 1e6])
+    def test_values_and_gradients_are_finite_at_the_ends_of_opacity_and_light(self, opacity, light):
+        values = maps().at[..., 4].set(opacity).at[..., LIT].set(light)
+        outputs = 10 * numbers(7, 1, 6, 6, NUM_OUTPUTS)
+
+        @jax.jit
+        def both(*arguments):
+            image, alpha = picture(*arguments, 0)
+            gradients = jax.grad(lambda *x: sum(map(jnp.sum, picture(*x, 0))), (0, 1, 2))(*arguments)
+            return image, alpha, gradients
+
+        found = both(outputs, values, jnp.full((1, 9, 3), light))
+        for leaf in jax.tree.leaves(found):
+            assert np.isfinite(np.asarray(leaf)).all()
+        assert np.all((np.asarray(found[1]) >= 0) & (np.asarray(found[1]) <= 1))
+
+    def test_a_clear_pixel_stays_clear_whatever_the_outputs(self):
+        outputs = jnp.zeros((1, 6, 6, NUM_OUTPUTS)).at[..., 3].set(1e3)
+        _, alpha = picture(outputs, maps().at[..., 4].set(0), jnp.zeros((1, 9, 3)), 0)
+        assert np.all(np.asarray(alpha) == 0)
+        _, alpha = picture(outputs, maps().at[..., 4].set(5 * NOTHING), jnp.zeros((1, 9, 3)), 0)
+        assert np.all(np.asarray(alpha) > 0.99)
