@@ -29,7 +29,7 @@ from spnr_jax.method.model import Model, Volume
 from spnr_jax.model_config import ModelConfig
 from spnr_jax.tools import depth_maps
 from spnr_jax.tools.render_command import Render
-from spnr_jax.training.weights import load
+from spnr_jax.training.weights import load, suited_to
 
 FIRST_AZIMUTH = 30.0  # degrees of the first still: a view that shows front and side
 INVISIBLE = 1 / 255  # opacity below which a pixel has no colour of its own
@@ -42,10 +42,11 @@ SOLID = "small"  # network of the package that has a density
 def render_file(options: Render, note: Callable[[str], None]) -> Iterator[str]:
     """Writes what the options ask for; yields a line about each file, `note` gets the assumptions about the cloud."""
     _check_writable(options.out)
-    model = load(options.run)
+    named = load(options.run) if options.run else None  # a run that is none is said before the cloud is read
     placed = clouds.place_cloud(
         options.cloud, num_points=options.num_points, up=options.up, seed=options.seed, report=note
     )
+    model = named or load(suited_to(len(placed.cloud.positions)))
     volume = model.encode(placed.cloud)
     yield f"encoded {len(placed.cloud.positions)} points of {options.cloud}"
     name = options.out / options.cloud.stem

@@ -17,8 +17,8 @@ class Render:
     """.ply (also 3D Gaussian splats) .pcd .xyz .txt .csv .las .laz .npz .npy, or a mesh: .glb .gltf .obj .stl .off (its
     surface is sampled)."""
     run: Path | None = None
-    """Network that renders: `surfels`, `small` or `tiny` of the package, a run folder, a file of weights (default:
-    surfels)."""
+    """Network that renders: `surfels`, `small` or `tiny` of the package, a run folder, a file of weights
+    (default: surfels, of fewer than 6,000 points small)."""
     out: Path = Path("renders")
     """Folder for what is written."""
     up: Literal["auto", "x", "y", "z", "-x", "-y", "-z"] = "auto"

@@ -28,6 +28,7 @@ from spnr_jax.method.model import Model
 
 # what a header of any content makes its readers raise
 UNREADABLE = (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError)
+MANY_POINTS = 6000  # from which on surfels score better than samples on rays at 512 pixels
 ADVICE = "write one with `spnr export RUN`"
 SHIPPED = ("surfels", "small", "tiny")  # what the package holds; the first renders where no other is named
 
@@ -44,6 +45,11 @@ class Trained:
 def shipped(name: str = SHIPPED[0]) -> Path:
     """The file of a network that the package holds."""
     return Path(str(resources.files("spnr_jax") / "pretrained" / f"{name}.npz"))
+
+
+def suited_to(num_points: int) -> str:
+    """The package's network that draws so many points best (docs/surfels.md)."""
+    return "surfels" if num_points >= MANY_POINTS else "small"
 
 
 def place(source: Path | str | None) -> Path:

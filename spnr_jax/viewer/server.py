@@ -16,7 +16,7 @@ import viser
 
 from spnr_jax.formats import clouds
 from spnr_jax.method.model import FIELD_OF_VIEW, Model
-from spnr_jax.training.weights import load
+from spnr_jax.training.weights import load, suited_to
 from spnr_jax.viewer import session, uploads
 from spnr_jax.viewer.gui import Browser, Reading
 from spnr_jax.viewer.scene import Scene, open_scene
@@ -107,7 +107,7 @@ def open_viewer(
     _check_free(host, port)  # before the seconds that reading takes
     notes: list[str] = []
     points = clouds.read_cloud(cloud, num_points=num_points, up=up, report=notes.append)
-    model = load(run)
+    model = load(run or suited_to(len(points.positions)))
     first = open_scene(model, points, uploads.display_name(cloud.name))
     return Viewer(model, first, Reading(num_points=num_points, up=up), host, port), notes
 

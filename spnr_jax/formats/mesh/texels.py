@@ -61,7 +61,7 @@ def resize(texels: np.ndarray, height: int | np.integer, width: int | np.integer
     """The texture resampled with a box filter, float32."""
     channels = texels.reshape(*texels.shape[:2], -1)
     resized = [
-        np.asarray(Image.fromarray(np.ascontiguousarray(channel)).resize((width, height), Image.Resampling.BOX))
+        np.asarray(Image.fromarray(np.ascontiguousarray(channel)).resize((int(width), int(height)), Image.Resampling.BOX))
         for channel in np.moveaxis(channels.astype(np.float32), -1, 0)
     ]
     return np.stack(resized, axis=-1).reshape(height, width, *texels.shape[2:])
