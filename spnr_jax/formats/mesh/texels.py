@@ -59,9 +59,9 @@ def shrink(texels: np.ndarray) -> np.ndarray:
 
 def resize(texels: np.ndarray, height: int | np.integer, width: int | np.integer) -> np.ndarray:
     """The texture resampled with a box filter, float32."""
-    channels = texels.reshape(*texels.shape[:2], -1)
+    channels, size = texels.reshape(*texels.shape[:2], -1), (int(width), int(height))
     resized = [
-        np.asarray(Image.fromarray(np.ascontiguousarray(channel)).resize((int(width), int(height)), Image.Resampling.BOX))
+        np.asarray(Image.fromarray(np.ascontiguousarray(channel)).resize(size, Image.Resampling.BOX))
         for channel in np.moveaxis(channels.astype(np.float32), -1, 0)
     ]
     return np.stack(resized, axis=-1).reshape(height, width, *texels.shape[2:])
