@@ -39,7 +39,7 @@ def test_steps_lower_the_loss_on_one_object():
     for _ in range(30):
         state, metrics = shading.jitted_train_step(state, crops, config=config)
         losses.append(float(metrics["loss"]))
-    assert losses[-1] < 0.85 * losses[0]
+    assert losses[-1] < 0.6 * losses[0]
     assert float(shading.loss(state.averaged, crops, config=config)[0]) < losses[0]
 
 
