@@ -29,7 +29,8 @@ def loss(params: dict, crops: Crops, *, config: TrainConfig) -> tuple[Float[Arra
     assert isinstance(config.model, SurfelConfig)
     shader = Shader(config.model.widths, config.model.top)
     outputs: Any = shader.apply({"params": params}, jnp.asarray(crops.seen), crops.doublings)
-    image, alpha = picture(outputs, jnp.asarray(crops.maps), jnp.asarray(crops.ambient), crops.doublings)
+    color, alpha = picture(outputs, jnp.asarray(crops.maps), jnp.asarray(crops.ambient), crops.doublings)
+    image = color * alpha[..., None] + 1 - alpha[..., None]  # on white, as the reference is
     target = jnp.asarray(crops.target, jnp.float32) / 255
     opacity = target[..., 3]
     reference = target[..., :3] * opacity[..., None] + 1 - opacity[..., None]

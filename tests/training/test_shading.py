@@ -32,11 +32,20 @@ def interrupted(monkeypatch, step):
     monkeypatch.setattr(gbuffers, "batches", batches)
 
 
+def test_a_clear_pixel_costs_nothing_whatever_colour_lies_under_it():
+    state = optimisation.create_state(CONFIG)
+    crops = next(iter(gbuffers.batches(tiny_surfels.views(), CONFIG, 0)))
+    maps = np.array(crops.maps)
+    maps[..., 4] = 0  # opacity
+    clear = dataclasses.replace(crops, maps=maps, target=np.zeros_like(crops.target))
+    assert float(shading.loss(state.averaged, clear, config=CONFIG)[0]) < 1e-6
+
+
 def test_steps_lower_the_loss_on_one_object():
-    config = dataclasses.replace(CONFIG, num_steps=40)
+    config = dataclasses.replace(CONFIG, num_steps=100)
     state, losses = optimisation.create_state(config), []
     crops = next(iter(gbuffers.batches(tiny_surfels.views(), config, 0)))
-    for _ in range(30):
+    for _ in range(90):
         state, metrics = shading.jitted_train_step(state, crops, config=config)
         losses.append(float(metrics["loss"]))
     assert losses[-1] < 0.6 * losses[0]
