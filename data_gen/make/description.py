@@ -3,14 +3,15 @@
 import hashlib
 from collections.abc import Sequence
 from dataclasses import asdict
+from pathlib import Path
 
 from data_gen import procedural
-from data_gen.plan.tasks import Plan, source_of
+from data_gen.plan.tasks import GenerateConfig, Plan, source_of
 from data_gen.render import light
 from data_gen.store import layout
 
 # options that say where or how fast, or whose content is described instead
-PLACES = ("out", "workers", "cluster", "root", "meshes", "objects", "envmap", "test_list", "split_file")
+PLACES = ("out", "workers", "cluster", "root", "meshes", "objects", "envmap", "lights", "test_list", "split_file")
 
 
 def describe(plan: Plan, variant: str) -> dict:
@@ -22,7 +23,6 @@ def describe(plan: Plan, variant: str) -> dict:
             del settings[name]
     mesh_ids = [task.object_id for task in plan.tasks if task.path]
     listed = {split: {"count": len(ids), "ids_sha256": text_checksum(ids)} for split, ids in plan.listed.items()}
-    envmap_sum = hashlib.sha256(config.envmap.read_bytes()).hexdigest() if config.envmap else None
     return {
         "schema_version": layout.SCHEMA_VERSION,
         "settings": {
@@ -34,13 +34,31 @@ def describe(plan: Plan, variant: str) -> dict:
             "listed_splits": listed,
             "variant": variant,
         },
-        "environment_map": {
-            "name": config.envmap.name if config.envmap else "procedural room",
-            "sha256": envmap_sum,
-            "white_sphere_radiance": light.WHITE_SPHERE_RADIANCE,
-        },
+        "environment_map": describe_light(config),
         "colour_spaces": {"images": "sRGB, 8 bit, straight alpha", "points": "linear RGB", "background": "white"},
     }
+
+
+def describe_light(config: GenerateConfig) -> dict:
+    """Return what lights the pictures: names and checksums of maps, never where they lie."""
+    white = {"white_sphere_radiance": light.WHITE_SPHERE_RADIANCE}
+    if config.lights:
+        return {"kinds": [describe_kind(name) for name in config.lights], **white}
+    if config.envmap:
+        return {"name": config.envmap.name, "sha256": checksum_of(config.envmap), **white}
+    return {"name": "procedural room", "sha256": None, **white}
+
+
+def describe_kind(name: str) -> dict:
+    """Return one kind of `--lights`."""
+    if name in ("room", "random"):
+        return {"name": name}
+    return {"name": "maps", "sha256": {file.name: checksum_of(file) for file in light.map_files(name)}}
+
+
+def checksum_of(path: Path) -> str:
+    """Return the SHA-256 of a file."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def text_checksum(lines: Sequence[str]) -> str:

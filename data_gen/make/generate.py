@@ -12,7 +12,6 @@ import sys
 from collections.abc import Sequence
 from dataclasses import fields, replace
 
-import numpy as np
 from tqdm import tqdm
 
 from data_gen.make.cluster import Died, connect, run_tasks
@@ -52,19 +51,21 @@ def make_missing(config: GenerateConfig, tasks: Sequence[Task], settings: dict) 
     if not missing:
         return {}
     variant = settings["settings"]["variant"]
-    envmap = make_light(config, variant)
+    lights = make_lights(config, variant)
     refuse_other_content(config.out, settings)  # another run may have begun there meanwhile
     layout.write_text(f"{config.out}/dataset.json", layout.json_text(settings))
     layout.remove_unfinished(config.out)
-    rejected = make_objects(config, missing, envmap, variant)
+    rejected = make_objects(config, missing, lights, variant)
     # the process of one that is there died here, but another run has made it
     return {name: reason for name, reason in rejected.items() if not layout.has_object(config.out, name)}
 
 
-def make_light(config: GenerateConfig, variant: str) -> np.ndarray:
-    """Return the scaled environment map (height, width, 3) of the data set."""
+def make_lights(config: GenerateConfig, variant: str) -> light.Lights:
+    """Return the light of the data set: one scaled map for all views, or kinds that each view draws from."""
     mitsuba_module(variant)
-    return light.scaled_to_white(light.load_envmap(config.envmap) if config.envmap else indoor_envmap())
+    if config.lights:
+        return light.Lights(kinds=light.read_kinds(config.lights))
+    return light.Lights(light.scaled_to_white(light.load_envmap(config.envmap) if config.envmap else indoor_envmap()))
 
 
 def refuse_other_content(out: Location, settings: dict) -> None:
@@ -82,11 +83,11 @@ def refuse_other_content(out: Location, settings: dict) -> None:
         raise ValueError(f"{out} is not empty and holds no data set: choose another folder")
 
 
-def make_objects(config: GenerateConfig, tasks: Sequence[Task], envmap: np.ndarray, variant: str) -> dict[str, str]:
+def make_objects(config: GenerateConfig, tasks: Sequence[Task], lights: light.Lights, variant: str) -> dict[str, str]:
     """Make the objects on the workers; return the reason for each that was left out, by id."""
     bench = Workbench(
         out=storage.absolute(config.out),
-        envmap=envmap,
+        lights=lights,
         view=views.ViewConfig(**{field.name: getattr(config, field.name) for field in fields(views.ViewConfig)}),
         num_points=config.points,
         seed=config.seed,

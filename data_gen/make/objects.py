@@ -15,10 +15,12 @@ from data_gen import procedural
 from data_gen.make import augmentation, reshaping
 from data_gen.plan.tasks import Task
 from data_gen.render import views
+from data_gen.render.light import KEPT_HEIGHT, Lights
 from data_gen.render.variant import LLVM, choose_variant, mitsuba_module
 from data_gen.store import layout
 from spnr_jax.formats.mesh import meshes, surface_points
 from spnr_jax.formats.mesh.assets import Asset, Material, RejectedAsset
+from spnr_jax.surfels.envmaps import resampled
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,7 +28,7 @@ class Workbench:
     """What a worker needs for any object of the data set; `out` is a URL or an absolute path."""
 
     out: str
-    envmap: np.ndarray
+    lights: Lights
     view: views.ViewConfig
     num_points: int
     seed: int
@@ -69,12 +71,14 @@ def make_record(bench: Workbench, task: Task) -> layout.ObjectRecord:
     cam_to_world = views.random_viewpoints(
         bench.view.views, bench.view.distance, np.random.default_rng(seeds["viewpoints"])
     )
-    images, conditions = views.render_views(asset, surface, cam_to_world, bench.envmap, bench.view, seeds["noise"])
+    maps = list(bench.lights.of_views(bench.view.views, seeds["noise"]))
+    images, conditions = views.render_views(asset, surface, cam_to_world, maps, bench.view, seeds["noise"])
     return layout.ObjectRecord(
         points=layout.pack_points(surface),
         transforms=layout.nerf_transforms(cam_to_world, bench.view.resolution, bench.view.fov, bench.view.focal_length),
         images=images,
         conditions=conditions,
+        lights=None if bench.lights.shared is not None else np.stack([resampled(x, KEPT_HEIGHT) for x in maps]),
         details=object_details(task, asset, seeds) | details,
     )
 

@@ -85,6 +85,8 @@ class GenerateConfig:
     """Rays per pixel side that look for visible faces."""
     envmap: Path | None = None
     """Environment map, .hdr or .exr (default: a procedural room). Scaled: a white sphere averages 0.6."""
+    lights: tuple[str, ...] = ()
+    """A light for each view, turned at random, from these kinds: room, random (skies and lamps), or folders of maps."""
     seed: int = 0
     """Seed of shapes, points, viewpoints, noise and splits."""
     workers: int | None = None
@@ -175,6 +177,8 @@ def check_options(config: GenerateConfig) -> None:
         raise ValueError("--val-fraction, --test-fraction: expected shares that leave some objects to train on")
     if config.envmap and not config.envmap.is_file():
         raise ValueError(f"--envmap {config.envmap}: no such file; give a latitude-longitude .hdr or .exr")
+    if config.envmap and config.lights:
+        raise ValueError(f"--lights {config.lights[0]}: not together with --envmap, one light for all; give one of them")
     if unknown := set(config.categories) - set(procedural.CATEGORIES):
         known = ", ".join(procedural.CATEGORIES)
         raise ValueError(f"--categories: no category {', '.join(sorted(unknown))}; there are {known}")

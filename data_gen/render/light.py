@@ -1,4 +1,6 @@
-"""The light of every picture: one environment map, scaled so that a white diffuse sphere averages 0.6 linear.
+"""The light of every picture: an environment map, scaled so that a white diffuse sphere averages 0.6 linear.
+
+One map lights a whole data set, or each view draws a map of its own and turns it about the up axis.
 
 Conventions: a map is (height, 2 * height, 3) float32, linear radiance, latitude-longitude as Mitsuba reads it.
 Row 0 is straight up (+y); column c of w looks along azimuth phi = 2 pi (c + 0.5) / w, where the direction is
@@ -6,14 +8,62 @@ Row 0 is straight up (+y); column c of w looks along azimuth phi = 2 pi (c + 0.5
 The default map is the package's room (`spnr_jax.surfels.room`).
 """
 
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from data_gen.render.variant import mitsuba_module, threads
 from data_gen.render.views import ViewConfig, make_sensor, spread_viewpoints
+from spnr_jax.surfels import envmaps, room, skies
 
 WHITE_SPHERE_RADIANCE = 0.6  # far enough below 1 that white objects keep their shading against the white background
+
+DRAWN_HEIGHT = 256  # rows of a map that a view draws
+KEPT_HEIGHT = 32  # rows of the same as the data set keeps it: what `spnr_jax.light_of` looks at
+MAP_ENDINGS = (".hdr", ".exr")
+
+
+@dataclass(frozen=True)
+class Lights:
+    """One map for every view, or kinds of light of which each view draws one; a kind without maps is a random one."""
+
+    shared: np.ndarray | None = None
+    kinds: tuple[tuple[np.ndarray, ...], ...] = ()
+
+    def of_views(self, count: int, seed: int) -> Iterator[np.ndarray]:
+        """Return the map of each of so many views, or the shared one once."""
+        if self.shared is not None:
+            yield self.shared
+            return
+        for view in range(count):
+            generator = np.random.default_rng((seed, view, DRAWN_HEIGHT))
+            maps = self.kinds[generator.integers(len(self.kinds))]
+            drawn = maps[generator.integers(len(maps))] if maps else skies.random_map(generator, DRAWN_HEIGHT)
+            yield skies.normalised(skies.rotated(drawn, generator.uniform(0, 360)), WHITE_SPHERE_RADIANCE)
+
+
+def read_kinds(names: Sequence[str]) -> tuple[tuple[np.ndarray, ...], ...]:
+    """Return the kinds of light of --lights: `room`, `random`, or the maps of a folder; ValueError if there are none."""
+    kinds: list[tuple[np.ndarray, ...]] = []
+    for name in names:
+        if name == "random":
+            kinds.append(())
+        elif name == "room":
+            kinds.append((room.indoor_envmap(DRAWN_HEIGHT),))
+        else:
+            files = map_files(name)
+            kinds.append(tuple(envmaps.resampled(load_envmap(file), DRAWN_HEIGHT) for file in files))
+    return tuple(kinds)
+
+
+def map_files(folder: str) -> list[Path]:
+    """Return the environment maps in a folder, by name; ValueError if there are none."""
+    files = sorted(path for path in Path(folder).glob("*") if path.suffix.lower() in MAP_ENDINGS)
+    if not files:
+        raise ValueError(f"--lights {folder}: expected room, random, or a folder with .hdr or .exr maps; found no map")
+    return files
 
 
 def load_envmap(path: Path) -> np.ndarray:

@@ -14,6 +14,7 @@ one ray to the camera.
 """
 
 import importlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -90,17 +91,27 @@ def project(cam_to_world: np.ndarray, positions: np.ndarray, config: ViewConfig)
 
 def build_scene(asset: Asset, envmap: np.ndarray) -> Scene:
     """Return the asset under the light of the map (height, width, 3), one Mitsuba shape for each part with faces."""
-    mi = mitsuba_module()
-    content = {"type": "scene", "light": {"type": "envmap", "bitmap": mi.Bitmap(np.asarray(envmap, np.float32))}}
-    first_face, faces_before = [], 0
+    return lit_scene(mitsuba_shapes(asset), envmap)
+
+
+def mitsuba_shapes(asset: Asset) -> dict[str, tuple]:
+    """Return a Mitsuba mesh for each part with faces, and the number of the asset's faces before it, by name."""
+    shapes, faces_before = {}, 0
     for number, part in enumerate(asset.parts):
         if len(part.faces):
             name = f"part_{number:05d}"
-            content[name] = mitsuba_mesh(part, name)
-            first_face.append(faces_before)
+            shapes[name] = mitsuba_mesh(part, name), faces_before
         faces_before += len(part.faces)
-    handle = mi.load_dict(content)
-    return Scene(handle, dict(zip(shape_numbers(handle), first_face, strict=True)))
+    return shapes
+
+
+def lit_scene(shapes: dict[str, tuple], envmap: np.ndarray) -> Scene:
+    """Return the shapes under the light of the map (height, width, 3)."""
+    mi = mitsuba_module()
+    light = {"type": "envmap", "bitmap": mi.Bitmap(np.asarray(envmap, np.float32))}
+    handle = mi.load_dict({"type": "scene", "light": light} | {name: mesh for name, (mesh, _) in shapes.items()})
+    first_faces = [first for _, first in shapes.values()]
+    return Scene(handle, dict(zip(shape_numbers(handle), first_faces, strict=True)))
 
 
 def shape_numbers(handle) -> list[int]:
@@ -268,9 +279,16 @@ def condition_image(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
     return condition
 
 
-def render_views(asset: Asset, surface, cam_to_world: np.ndarray, envmap: np.ndarray, config: ViewConfig, seed: int):
-    """Return (images, conditions), each (views, height, width, 4) uint8, of an asset and its `SurfacePoints`."""
-    scene = build_scene(asset, envmap)
+def render_views(
+    asset: Asset, surface, cam_to_world: np.ndarray, envmaps: Sequence[np.ndarray], config: ViewConfig, seed: int
+):
+    """Return (images, conditions), each (views, height, width, 4) uint8, of an asset and its `SurfacePoints`.
+
+    There is one environment map for each view, or one for all.
+    """
+    shapes = mitsuba_shapes(asset)
+    scenes = (lit_scene(shapes, envmap) for envmap in envmaps)
+    scene = next(scenes)
     images, conditions = [], []
     for view, pose in enumerate(cam_to_world):
         view_seed = (seed + view) % 2**32
@@ -278,4 +296,5 @@ def render_views(asset: Asset, surface, cam_to_world: np.ndarray, envmap: np.nda
         seen = visible_points(scene, surface, pose, config, view_seed)
         images.append(image)
         conditions.append(condition_image(image, project(pose, surface.positions[seen].astype(np.float64), config)))
+        scene = next(scenes, scene)
     return np.stack(images), np.stack(conditions)

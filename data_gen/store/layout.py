@@ -2,6 +2,7 @@
 
     DATASET/dataset.json, splits/{train,val,test}.txt, rejected.jsonl
     DATASET/objects/ID/{points.ply, transforms.json, images/000.png, conditions/000.png, object.json}
+    DATASET/objects/ID/lights.npz where each view has its own light: `lights` (views, 32, 64, 3) linear radiance
 
 Everything written is a function of its content alone (no clock, no host, no absolute path), so equal objects are equal
 bytes, and two runs in one place do no harm. An object is complete when its object.json is there, which is written
@@ -46,7 +47,7 @@ class ObjectRecord:
     """One object as it lies on disk.
 
     points: POINT_TYPE (points,); transforms: the dict of transforms.json; images, conditions: (views, height, width, 4)
-    uint8; details: the dict of object.json.
+    uint8; details: the dict of object.json; lights: (views, 32, 64, 3) where each view has its own.
     """
 
     points: np.ndarray
@@ -54,6 +55,7 @@ class ObjectRecord:
     images: np.ndarray
     conditions: np.ndarray
     details: dict
+    lights: np.ndarray | None = None
 
 
 def pack_points(surface) -> np.ndarray:
@@ -102,6 +104,8 @@ def object_files(record: ObjectRecord) -> dict[str, bytes]:
         **{f"images/{view:03d}.png": encode_image(pixels) for view, pixels in enumerate(record.images)},
         **{f"conditions/{view:03d}.png": encode_image(pixels) for view, pixels in enumerate(record.conditions)},
     }
+    if record.lights is not None:
+        files["lights.npz"] = encode_lights(record.lights)
     checksums = {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
     return {**files, storage.LAST_FILE: json_text({**record.details, "files": checksums}).encode()}
 
@@ -162,6 +166,14 @@ def encode_image(pixels: np.ndarray) -> bytes:
     """Return (height, width, 4) uint8 as a PNG."""
     buffer = io.BytesIO()
     Image.fromarray(pixels, "RGBA").save(buffer, "PNG")
+    return buffer.getvalue()
+
+
+def encode_lights(lights: np.ndarray) -> bytes:
+    """Return environment maps (views, height, width, 3) as an .npz of halves; what is brighter than they hold is cut."""
+    buffer = io.BytesIO()
+    halves = np.minimum(lights, np.finfo(np.float16).max).astype(np.float16)
+    np.savez_compressed(buffer, allow_pickle=False, lights=halves)
     return buffer.getvalue()
 
 

@@ -1,0 +1,111 @@
+"""Environment maps that are computed: skies, studios, lamps, and random ones to learn from.
+
+Conventions of maps: `envmaps.py`.  Maps add up and scale; none is normalised.
+"""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from spnr_jax.surfels.envmaps import directions, solid_angles
+from spnr_jax.surfels.room import indoor_envmap
+
+HEIGHT = 128
+HORIZON = 0.08  # sine of the elevation over which ground and sky pass into each other
+MOST_LAMPS = 4  # of a random map
+
+Map = Float[np.ndarray, "height width 3"]
+
+
+def towards(azimuth: float, elevation: float) -> Float[np.ndarray, "3"]:
+    """Unit direction to a place of the sky, in degrees: azimuth 0 is +z, 90 is +x, elevation 90 straight up (+y)."""
+    turn, rise = np.radians([azimuth, elevation])
+    return np.array([np.cos(rise) * np.sin(turn), np.sin(rise), np.cos(rise) * np.cos(turn)])
+
+
+def gradient(zenith: Sequence[float], horizon: Sequence[float], ground: Sequence[float], height: int = HEIGHT) -> Map:
+    """Sky from the horizon to straight above, and a floor of one colour."""
+    sine = directions(height)[..., 1:2]
+    sky = np.asarray(horizon) + (np.asarray(zenith) - np.asarray(horizon)) * np.clip(sine, 0, 1) ** 0.7
+    up = np.clip(0.5 + 0.5 * sine / HORIZON, 0, 1)
+    return (np.asarray(ground) * (1 - up) + sky * up).astype(np.float32)
+
+
+def lamp(
+    azimuth: float, elevation: float, size: float, irradiance: Sequence[float], height: int = HEIGHT
+) -> Map:
+    """A round lamp `size` degrees across, by what it throws on a surface that faces it; at least two texels wide.
+
+    Its edge is a quarter of its radius wide.
+    """
+    radius = np.radians(max(size / 2, 180 / height))
+    angle = np.arccos(np.clip(directions(height) @ towards(azimuth, elevation), -1, 1))
+    ramp = np.clip((1.125 - angle / radius) * 4, 0, 1)
+    disc = ramp * ramp * (3 - 2 * ramp)
+    held = np.sum(disc * np.maximum(np.cos(angle), 0) * solid_angles(height))
+    return (disc[..., None] * np.asarray(irradiance) / held).astype(np.float32)
+
+
+def studio(height: int = HEIGHT) -> Map:
+    """Three softboxes before a grey backdrop."""
+    grey = gradient((0.25,) * 3, (0.2,) * 3, (0.12,) * 3, height)
+    key = lamp(-40, 40, 45, (1.9, 1.85, 1.8), height)
+    fill = lamp(70, 15, 60, (0.5, 0.55, 0.6), height)
+    return grey + key + fill + lamp(180, 50, 30, (0.9, 0.9, 0.95), height)
+
+
+def sunset(height: int = HEIGHT) -> Map:
+    """A low orange sun in a sky that is blue above and pink at the horizon."""
+    sky = gradient((0.16, 0.25, 0.5), (0.8, 0.45, 0.3), (0.12, 0.09, 0.08), height)
+    return sky + lamp(60, 8, 40, (0.5, 0.25, 0.1), height) + lamp(60, 8, 3, (2.2, 1.1, 0.4), height)
+
+
+def overcast(height: int = HEIGHT) -> Map:
+    """A white sky, brighter above, over a grey street."""
+    return gradient((0.95, 0.98, 1.05), (0.5, 0.52, 0.55), (0.15, 0.14, 0.13), height)
+
+
+def night(height: int = HEIGHT) -> Map:
+    """A dark blue sky, a warm street lamp and a cold one."""
+    sky = gradient((0.01, 0.015, 0.04), (0.03, 0.03, 0.06), (0.015, 0.012, 0.01), height)
+    return sky + lamp(-35, 50, 10, (0.9, 0.6, 0.25), height) + lamp(130, 25, 14, (0.15, 0.25, 0.45), height)
+
+
+NAMED: dict[str, Callable[[int], Map]] = {
+    "room": indoor_envmap,
+    "studio": studio,
+    "sunset": sunset,
+    "overcast": overcast,
+    "night": night,
+}
+
+
+def random_map(generator: np.random.Generator, height: int = HEIGHT) -> Map:
+    """A sky of random colours with up to MOST_LAMPS lamps, from broad glows to suns of three degrees."""
+
+    def colour(brightness: float, tint: float) -> np.ndarray:
+        return brightness * np.exp(tint * generator.standard_normal(3))
+
+    above, around, below = np.exp(generator.normal(-1, 0.7, 3))
+    whole = gradient(colour(above, 0.3), colour(around, 0.3), colour(below, 0.3), height)
+    for _ in range(generator.integers(0, MOST_LAMPS + 1)):
+        rise = np.degrees(np.arcsin(generator.uniform(-0.4, 1)))
+        size = np.exp(generator.uniform(np.log(3), np.log(90)))
+        power = np.exp(generator.normal(-0.3, 0.7))
+        whole = whole + lamp(generator.uniform(0, 360), rise, size, colour(power, 0.2), height)
+    return whole
+
+
+def rotated(envmap: Map, degrees: float) -> Map:
+    """The map turned about the up axis: what stood at azimuth a stands at a + degrees, as `towards` counts it."""
+    width = envmap.shape[1]
+    shift = -degrees / 360 * width  # columns run against the azimuth
+    whole, part = int(np.floor(shift)), shift - np.floor(shift)
+    return ((1 - part) * np.roll(envmap, whole, axis=1) + part * np.roll(envmap, whole + 1, axis=1)).astype(np.float32)
+
+
+def normalised(envmap: Map, white: float = 0.6) -> Map:
+    """The map scaled so that a white diffuse sphere, seen from all around, averages `white`: its mean radiance."""
+    mean = np.sum(envmap.mean(axis=-1) * solid_angles(len(envmap))) / (4 * np.pi)
+    return (envmap * (white / max(mean, 1e-12))).astype(np.float32)
