@@ -127,7 +127,8 @@ class Surfels:
 
     `spacing` is the side of the square that a point stands for, in units of the box; `gradient` the change of each
     colour along x, y, z; `sided` 1 where one side is outside, 0 where both are; `visible` how much each of 64
-    directions sees; `shape` the planarity and linearity of the neighbourhood.
+    directions sees; `shape` the planarity and linearity of the neighbourhood.  A disc ends `reach` spacings from its
+    point along `rim`, a unit vector in its plane, against it, and along and against their cross product normal x rim.
     """
 
     position: Float[AnyArray, "points 3"]
@@ -140,6 +141,8 @@ class Surfels:
     sided: Float[AnyArray, " points"]
     visible: Float[AnyArray, "points 64"]
     shape: Float[AnyArray, "points 2"]
+    rim: Float[AnyArray, "points 3"]
+    reach: Float[AnyArray, "points 4"]
     mask: Bool[AnyArray, " points"]
 
 

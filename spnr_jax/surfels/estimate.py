@@ -8,6 +8,7 @@ NumPy in, NumPy out; neighbours come from SciPy's k-d tree, blocks of points bou
     sided       1 where the votes say which side is outside, 0 where both are seen alike (a sheet)
     gradient    of the colour along the surface, a ridge regression over the layer: colours are interpolated to first
                 order
+    rim, reach  where the layer ends: a disc goes little further than the points of its layer
     shape       planarity and linearity: ratios of the neighbours' extents, 0 in a plane, 0 on a line
 """
 
@@ -26,8 +27,20 @@ NEIGHBOURS = 20  # of a point, itself among them
 FIRST_DISC = 6  # neighbours within the disc whose area gives a first spacing
 OWN_DISC = 5.0  # the same on the own layer, counted by their weights
 REACH = 1.2  # spacings, standard deviation of the weight of a neighbour's distance
-LAYER = 0.5  # spacings, standard deviation of the weight of a neighbour's height over the tangent plane
-THIN = 0.35  # the same while the normal is being found
+PAIRED = 6  # nearest points whose pairs span the planes that are tried
+SLIVER = 0.2  # sine between two of them from which on they span one
+FLAT = 0.1  # spacings from a plane at which a point supports it half
+TRUSTED = 1.15  # the plane of least spread counts so much more: it is the better one where points are noisy
+ROUNDS = 4  # of the quadric's fit
+STIFF = (1e-3, 1e-3, 0.1, 0.1, 0.1)  # ridge of its slopes and curvatures
+THICK, THINNEST = 0.3, 0.04  # spacings, most and least standard deviation of a neighbour's weight as one of the layer
+START = 0.12  # the same in the first round
+SPREADS = 2.0  # this deviation over the mean height of those that count
+LOOSE = 2.0  # the same of the layer that colours and spacings come from, over that of the fit
+APART, WALL = 3.0, 1.5  # deviations, and spacings, between which another layer is the other side of a wall
+PARALLEL = 0.8  # cosine between their normals
+STICKER, COVERING = 0.8, 2.0  # spacings, and neighbours above, from which on a layer covers a point
+SOLID = 3.0  # weight of the wall's vote
 SMOOTHED = 9  # neighbours over which the spacing is averaged
 LEAST_SPACING = 1e-5  # in units of the box, for points that coincide
 RIDGE = 0.15  # of the colour's regression, in spacings
@@ -36,6 +49,13 @@ HIDDEN = 0.4  # directions, counted by their cosines, that see a point at most t
 LEAST_SHOWN = 0.3  # share of the points that has to be left
 EVIDENCE = 1.0  # votes that a lean is measured against: few of them are none
 UNSURE, SURE = 0.15, 0.45  # lean of the votes from which a side begins to count, and counts whole
+RIM_DIRECTIONS = 16  # in which the end of a layer is looked for
+RIM_WITHIN = 2.2  # spacings around a point
+SHARP = 0.75  # cosine between normals below which two faces meet at an edge
+EDGE = 0.1  # spacings that a disc goes beyond the line where another face cuts it
+ALIGNED = 0.8  # cosine between a line's direction and one of the four
+FAR = 4.0  # where a disc without an end ends
+BEYOND = 0.35  # spacings that a surface goes beyond the last point of its layer
 BLOCK = 2**16  # points that are worked on at once
 
 
@@ -60,24 +80,33 @@ def estimate(
     blocks = [_neighbours(tree, positions, s) for s in range(0, len(positions), BLOCK)]
     raw = np.concatenate([_first_spacing(near) for near in blocks])
     rows = _split(len(positions))
-    found = [
-        _normals(near, raw[s], None if normals is None else normals[s]) for near, s in zip(blocks, rows, strict=True)
-    ]
-    normal, shape = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    if normals is None:
+        first = np.concatenate([_first_normals(near, raw[s]) for near, s in zip(blocks, rows, strict=True)])
+    else:
+        first = _unit(normals)
+    fits = [_fitted(near, raw[s], first[s], normals is not None) for near, s in zip(blocks, rows, strict=True)]
+    shape = np.concatenate([_shape(near, raw[s], f[1], f[2]) for near, s, f in zip(blocks, rows, fits, strict=True)])
+    normal = np.concatenate([fit[0] for fit in fits])
     middle = float(np.median(raw))
-    seen = _visible(positions, normal, raw, middle)
-    lean = _lean(normal, seen)
-    lean = np.concatenate([_voted(near, s, normal, raw, lean) for near, s in zip(blocks, rows, strict=True)])
+    lean = _lean(normal, _visible(positions, normal, raw, middle))
+    pairs = [(near, s, *fit[1:]) for near, s, fit in zip(blocks, rows, fits, strict=True)]
+    lean = np.concatenate([_voted(*of, normal, raw, lean) + _of_walls(*of, normal, raw) for of in pairs])
+    lean = np.concatenate([_voted(*of, normal, raw, np.clip(lean, -1, 1)) for of in pairs])
     turned = lean < (-TURN if normals is not None else 0.0)
     sided = np.ones_like(lean) if normals is not None else np.clip((np.abs(lean) - UNSURE) / (SURE - UNSURE), 0, 1)
     normal = np.where(turned[:, None], -normal, normal)
-    layers = [_layer(near, s, normal, raw, sided) for near, s in zip(blocks, rows, strict=True)]
+    layers = [_layer(*of, normal, sided) for of in pairs]
+    upwards = np.where(turned, -1, 1)[:, None]
+    covered = np.concatenate([_covered(n, s, scale, upwards[s] * height, normal) for n, s, scale, height in pairs])
     spacing = np.concatenate([_own_spacing(n, s, w, raw) for n, s, w in zip(blocks, rows, layers, strict=True)])
     spacing = np.concatenate([_smoothed(n, w, spacing) for n, w in zip(blocks, layers, strict=True)])
     pairs = zip(blocks, rows, layers, strict=True)
     gradient = np.concatenate([_gradient(n, w, spacing[s], normal[s], base_color, s) for n, s, w in pairs])
+    pairs = zip(blocks, rows, layers, strict=True)
+    edges = [_rims(n, w, spacing[s], s, normal, sided) for n, s, w in pairs]
+    rim, reach = (np.concatenate(parts) for parts in zip(*edges, strict=True))
     seen = _visible(positions, normal, spacing, middle)
-    shown = _shown(normal, seen)
+    shown = _shown(normal, seen, covered)
     surfels = Surfels(
         position=positions,
         normal=normal,
@@ -89,6 +118,8 @@ def estimate(
         sided=sided,
         visible=np.concatenate([_averaged(n, w, seen) for n, w in zip(blocks, layers, strict=True)]),
         shape=shape,
+        rim=rim,
+        reach=reach,
         mask=np.ones(len(positions), bool),
     )
     return padded(Surfels(**{name: np.asarray(values)[shown] for name, values in vars(surfels).items()}))
@@ -124,6 +155,17 @@ def _first_spacing(near: Near) -> np.ndarray:
     return np.maximum(np.sqrt(np.pi / count) * near.distance[:, count], LEAST_SPACING)
 
 
+def _close(near: Near, spacing: np.ndarray) -> np.ndarray:
+    return np.exp(-0.5 * (near.distance / (REACH * spacing[:, None])) ** 2)
+
+
+def _in_plane(near: Near, normal: np.ndarray, spacing: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Coordinates of the neighbours along two tangents and the normal, in spacings."""
+    scaled = near.offset / spacing[:, None, None]
+    one, two, three = (np.einsum("nki,ni->nk", scaled, axis) for axis in (*tangents(normal), normal))
+    return one, two, three
+
+
 def _spread(near: Near, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Variances, rising, and axes of the weighted neighbours."""
     weight = weight / np.maximum(weight.sum(axis=1, keepdims=True), 1e-9)
@@ -131,31 +173,71 @@ def _spread(near: Near, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.linalg.eigh(np.einsum("nk,nki,nkj->nij", weight, centred, centred, optimize=True))
 
 
-def _close(near: Near, spacing: np.ndarray) -> np.ndarray:
-    return np.exp(-0.5 * (near.distance / (REACH * spacing[:, None])) ** 2)
+def _first_normals(near: Near, spacing: np.ndarray) -> np.ndarray:
+    """Of the planes through a point that two of its nearest span, and the one of least spread, that with most points.
 
-
-def _height(near: Near, normal: np.ndarray, spacing: np.ndarray) -> np.ndarray:
-    """Of the neighbours over the tangent plane, in spacings."""
-    return np.einsum("nki,ni->nk", near.offset, normal) / spacing[:, None]
-
-
-def _normals(near: Near, spacing: np.ndarray, given: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-    """Unit normals of either sign, and the shape of the neighbourhood."""
+    So a point at an edge gets the plane of one of the faces, not one between them.
+    """
     weight = _close(near, spacing)
-    variance, axes = _spread(near, weight)
-    normal = axes[..., 0]
-    if given is not None:
-        size = np.linalg.norm(given, axis=1, keepdims=True)
-        normal = np.where(size > 0.5, given / np.where(size > 0.5, size, 1), normal)
-    else:
-        for _ in range(2):
-            flat = np.exp(-0.5 * (_height(near, normal, spacing) / THIN) ** 2)
-            variance, axes = _spread(near, weight * flat + 1e-6)
-            normal = axes[..., 0]
-    extent = np.sqrt(np.maximum(variance, 0))
-    shape = extent[:, :2] / np.maximum(extent[:, 1:], 1e-6)
-    return normal.astype(np.float32), shape.astype(np.float32)
+    best = _spread(near, weight)[1][..., 0].astype(np.float32)
+    most = TRUSTED * _supported(near, weight, best, spacing)
+    last = min(PAIRED, near.number.shape[1] - 1)
+    for one in range(1, last):
+        for two in range(one + 1, last + 1):
+            across = np.cross(near.offset[:, one], near.offset[:, two])
+            size = np.linalg.norm(across, axis=1)
+            wide = size > SLIVER * near.distance[:, one] * near.distance[:, two]
+            normal = across / np.maximum(size, 1e-12)[:, None]
+            support = np.where(wide, _supported(near, weight, normal, spacing), 0)
+            best = np.where((support > most)[:, None], normal, best)
+            most = np.maximum(most, support)
+    return best
+
+
+def _supported(near: Near, weight: np.ndarray, normal: np.ndarray, spacing: np.ndarray) -> np.ndarray:
+    height = np.einsum("nki,ni->nk", near.offset, normal) / spacing[:, None]
+    return np.sum(weight / (1 + (height / FLAT) ** 2), axis=1)
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    """The vectors at length 1; straight up where there is none."""
+    size = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return np.where(size > 0.5, vectors / np.where(size > 0.5, size, 1), [0, 1, 0]).astype(np.float32)
+
+
+def _fitted(
+    near: Near, spacing: np.ndarray, normal: np.ndarray, given: bool
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Unit normals of either sign, the layers' scale, and the height of each neighbour over a point's layer.
+
+    The layer is a quadric through the point (Cazals and Pouget 2003), fitted in rounds to the neighbours that lie close
+    to it; lengths are spacings.  Given normals are kept.
+    """
+    weight = _close(near, spacing)
+    scale = np.full(len(normal), START, np.float32)
+    height = _in_plane(near, normal, spacing)[2]
+    for _ in range(ROUNDS):
+        one, two, up = _in_plane(near, normal, spacing)
+        own = weight * np.exp(-0.5 * (height / scale[:, None]) ** 2)
+        terms = np.stack([one, two, one * one, one * two, two * two], axis=-1)
+        weighted = (own[..., None] * terms).swapaxes(1, 2)
+        solution = np.linalg.solve(weighted @ terms + np.diag(STIFF), weighted @ up[..., None])
+        if given:
+            solution[:, :2] = 0
+        height = up - (terms @ solution)[..., 0]
+        first, second = tangents(normal)
+        normal = normal - solution[:, 0] * first - solution[:, 1] * second
+        normal = (normal / np.linalg.norm(normal, axis=1, keepdims=True)).astype(np.float32)
+        away = np.sum(own * np.abs(height), axis=1) / np.maximum(own.sum(axis=1) - 1, 0.5)  # the point itself is at 0
+        scale = np.clip(SPREADS * away, THINNEST, THICK).astype(np.float32)
+    return normal, scale, height.astype(np.float32)
+
+
+def _shape(near: Near, spacing: np.ndarray, scale: np.ndarray, height: np.ndarray) -> np.ndarray:
+    """Ratios of the extents of the layer's neighbours."""
+    own = _close(near, spacing) * np.exp(-0.5 * (height / scale[:, None]) ** 2)
+    extent = np.sqrt(np.maximum(_spread(near, own + 1e-6)[0], 0))
+    return (extent[:, :2] / np.maximum(extent[:, 1:], 1e-6)).astype(np.float32)
 
 
 def _visible(positions: np.ndarray, normal: np.ndarray, spacing: np.ndarray, middle: float) -> np.ndarray:
@@ -171,9 +253,9 @@ def _visible(positions: np.ndarray, normal: np.ndarray, spacing: np.ndarray, mid
     return np.asarray(seen)[:count]
 
 
-def _shown(normal: np.ndarray, seen: np.ndarray) -> np.ndarray:
+def _shown(normal: np.ndarray, seen: np.ndarray, covered: np.ndarray) -> np.ndarray:
     """Which points something outside sees; all, where that would leave too few."""
-    shown = np.einsum("nd,nd->n", seen, np.abs(normal @ DIRECTIONS.T)) > HIDDEN
+    shown = ~covered & (np.einsum("nd,nd->n", seen, np.abs(normal @ DIRECTIONS.T)) > HIDDEN)
     return shown if shown.mean() > LEAST_SHOWN else np.ones_like(shown)
 
 
@@ -184,19 +266,45 @@ def _lean(normal: np.ndarray, seen: np.ndarray) -> np.ndarray:
     return (front - back) / (front + back + EVIDENCE)
 
 
-def _voted(near: Near, rows: slice, normal: np.ndarray, spacing: np.ndarray, lean: np.ndarray) -> np.ndarray:
+def _voted(
+    near: Near,
+    rows: slice,
+    scale: np.ndarray,
+    height: np.ndarray,
+    normal: np.ndarray,
+    spacing: np.ndarray,
+    lean: np.ndarray,
+) -> np.ndarray:
     """The lean of each point and of its neighbours on the same layer, whichever way their normals point."""
     along = np.einsum("nki,ni->nk", normal[near.number], normal[rows])
-    flat = np.exp(-0.5 * (_height(near, normal[rows], spacing[rows]) / LAYER) ** 2)
-    weight = _close(near, spacing[rows]) * along**2 * flat
-    votes = np.einsum("nk,nk->n", weight * np.sign(along), lean[near.number])
-    return votes / np.maximum(weight.sum(axis=1), 1e-6)
+    weight = _close(near, spacing[rows]) * along**2 * np.exp(-0.5 * (height / scale[:, None]) ** 2)
+    return np.einsum("nk,nk->n", weight * np.sign(along), lean[near.number]) / np.maximum(weight.sum(axis=1), 1e-6)
 
 
-def _layer(near: Near, rows: slice, normal: np.ndarray, spacing: np.ndarray, sided: np.ndarray) -> np.ndarray:
-    """Weight of each neighbour as one of the same layer: near the plane, and turned to the same side."""
+def _of_walls(
+    near: Near, rows: slice, scale: np.ndarray, height: np.ndarray, normal: np.ndarray, spacing: np.ndarray
+) -> np.ndarray:
+    """A lean from another layer, nearer than anything can be seen between: a wall's sides face away from each other."""
     along = np.einsum("nki,ni->nk", normal[near.number], normal[rows])
-    weight = np.exp(-0.5 * (_height(near, normal[rows], spacing[rows]) / LAYER) ** 2)
+    wall = _close(near, spacing[rows]) * (np.abs(along) > PARALLEL) * (np.abs(height) < WALL)
+    above, below = (np.sum(wall * (sign * height > APART * scale[:, None]), axis=1) for sign in (1, -1))
+    return SOLID * (below - above) / (above + below + EVIDENCE)
+
+
+def _covered(near: Near, rows: slice, scale: np.ndarray, height: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """Whether another layer that faces the same way lies right above a point, as a sticker does; see `_voted`."""
+    alike = np.einsum("nki,ni->nk", normal[near.number], normal[rows]) > PARALLEL
+    other = alike * np.exp(-0.5 * (near.distance / near.distance[:, -1:]) ** 2) * (np.abs(height) < STICKER)
+    above, below = (np.sum(other * (sign * height > APART * scale[:, None]), axis=1) for sign in (1, -1))
+    return above > np.maximum(COVERING, 2 * below)
+
+
+def _layer(
+    near: Near, rows: slice, scale: np.ndarray, height: np.ndarray, normal: np.ndarray, sided: np.ndarray
+) -> np.ndarray:
+    """Weight of each neighbour as one of the same layer: near the quadric, and turned to the same side."""
+    along = np.einsum("nki,ni->nk", normal[near.number], normal[rows])
+    weight = np.exp(-0.5 * (height / (LOOSE * scale[:, None])) ** 2)
     weight = weight * np.where(sided[rows, None] > 0.5, np.clip(0.5 + along, 0, 1), 1)
     weight[:, 0] = 1
     return weight
@@ -226,6 +334,41 @@ def _averaged(near: Near, layer: np.ndarray, seen: np.ndarray) -> np.ndarray:
     """Mean over the nearest of the layer: a depth buffer of points is noisy."""
     weight = layer[:, :SMOOTHED] / layer[:, :SMOOTHED].sum(axis=1, keepdims=True)
     return sum(weight[:, k, None] * seen[near.number[:, k]] for k in range(weight.shape[1])).astype(np.float32)
+
+
+def _rims(
+    near: Near, layer: np.ndarray, spacing: np.ndarray, rows: slice, normal: np.ndarray, sided: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The direction in which the layer ends soonest, and where it ends, in spacings, along `Surfels.reach`.
+
+    It ends a little beyond its last point; at a sharp edge where the plane of the other face cuts it (clip lines,
+    Zwicker et al. 2004).
+    """
+    own, others = normal[rows], normal[near.number]
+    one, two, _ = _in_plane(near, own, spacing)
+    there = (layer > 0.5) & (near.distance < RIM_WITHIN * spacing[:, None])
+    turn = (2 * np.pi / RIM_DIRECTIONS * np.arange(RIM_DIRECTIONS)).astype(np.float32)
+    ends = np.stack([(there * (one * np.cos(t) + two * np.sin(t))).max(axis=1) for t in turn], axis=1) + BEYOND
+    first, second = tangents(own)
+    across, up = (np.einsum("nki,ni->nk", others, t) for t in (first, second))
+    flat = np.hypot(across, up)
+    line = np.einsum("nki,nki->nk", others, near.offset) / spacing[:, None] / np.maximum(flat, 1e-6)
+    edge = (np.einsum("nki,ni->nk", others, own) < SHARP) & (line > 0) & (near.distance < RIM_WITHIN * spacing[:, None])
+    edge &= (sided[near.number] > 0.5) & (sided[rows, None] > 0.5) & (flat > 0.3)
+    line = np.where(edge, line + EDGE, np.inf)
+    nearest, row = line.argmin(axis=1), np.arange(len(own))
+    soonest = ends.argmin(axis=1)
+    cut = line[row, nearest] < ends[row, soonest] + BEYOND
+    angle = np.where(cut, np.arctan2(up[row, nearest], across[row, nearest]), turn[soonest])
+    reach = []
+    for quarter in (0, 2, 1, 3):
+        way = angle + quarter * np.pi / 2
+        step = np.round(way / (2 * np.pi) * RIM_DIRECTIONS).astype(np.int64) % RIM_DIRECTIONS
+        cosine = (across * np.cos(way)[:, None] + up * np.sin(way)[:, None]) / np.maximum(flat, 1e-6)
+        lines = np.where(cosine > ALIGNED, line, np.inf).min(axis=1)
+        reach.append(np.where(np.isfinite(lines), lines, ends[row, step]))
+    rim = np.cos(angle)[:, None] * first + np.sin(angle)[:, None] * second
+    return rim.astype(np.float32), np.minimum(np.stack(reach, axis=1), FAR).astype(np.float32)
 
 
 def _gradient(

@@ -26,6 +26,7 @@ from spnr_jax.kernels.records import AnyArray, Camera, GBuffer, Surfels
 
 RADIUS = 1.6  # of a disc, in spacings
 FLOOR = 1.0  # smallest radius on the picture, in pixels
+RIM_WIDTH = 0.4  # spacings over which a disc passes to 0 at the end of its layer
 OPACITY = 3.0  # optical depth at the middle of a disc
 LIST = 24  # entries of a pixel at most
 NEAR = 8  # places in the list before and after an entry that are compared in depth; those farther in front hide it
@@ -80,6 +81,10 @@ def _turned(matrix: Float[AnyArray, "3 3"], vectors: Float[AnyArray, "points 3"]
     return one, two, three
 
 
+def _cross(a: tuple[Array, Array, Array], b: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
 def footprints(surfels: Surfels, camera: Camera) -> Footprints:
     """Discs before a camera; those turned away, behind it or beside the picture cover no pixel."""
     rotation, eye = camera.cam_to_world[:, :3], camera.cam_to_world[:, 3]
@@ -132,7 +137,14 @@ def entries(surfels: Surfels, camera: Camera, *, total: int) -> tuple[Entries, I
     end = jnp.cumsum(foot.covered)
     point = jnp.repeat(jnp.arange(len(foot.covered), dtype=jnp.int32), foot.covered, total_repeat_length=total)
     # whole columns are gathered one by one, and not computed anew at every use: twenty times faster on a CPU
-    foot, begin, point = jax.lax.optimization_barrier((foot, end - foot.covered, point))
+    rotation = camera.cam_to_world[:, :3]
+    rim = _turned(rotation, surfels.rim)
+    side = _cross(foot.normal, rim)
+    reach = tuple(jnp.asarray(surfels.reach).T)
+    foot, begin, point, rim, side, reach = jax.lax.optimization_barrier(
+        (foot, end - foot.covered, point, rim, side, reach)
+    )
+    rx, ry, rz, tx, ty, tz = (column[point] for column in (*rim, *side))
     x, y, z, nx, ny, nz = (column[point] for column in (*foot.centre, *foot.normal))
     radius = foot.radius[point]
     place = jnp.arange(total, dtype=jnp.int32)
@@ -145,9 +157,17 @@ def entries(surfels: Surfels, camera: Camera, *, total: int) -> tuple[Entries, I
     slope = nx * right + ny * up - nz
     slope = jnp.where(slope < 0, jnp.minimum(slope, -EDGE), jnp.maximum(slope, EDGE))
     met = jnp.clip((nx * x + ny * y + nz * z) / slope, -z - 2 * radius, -z + 2 * radius)
-    in_plane = ((met * right - x) ** 2 + (met * up - y) ** 2 + (-met - z) ** 2) / radius**2
+    place_x, place_y, place_z = met * right - x, met * up - y, -met - z
+    in_plane = (place_x**2 + place_y**2 + place_z**2) / radius**2
+    spacing = radius / RADIUS
+    first = (place_x * rx + place_y * ry + place_z * rz) / spacing
+    second = (place_x * tx + place_y * ty + place_z * tz) / spacing
+    ends = [(r[point] + s * a) for r, s, a in zip(reach, (-1, 1, -1, 1), (first, first, second, second), strict=True)]
+    cut = 1.0
+    for e in ends:
+        cut = cut * jnp.clip(0.5 + e / RIM_WIDTH, 0, 1)
     on_picture = ((column + 0.5 - foot.column[point]) ** 2 + (row + 0.5 - foot.row[point]) ** 2) / FLOOR**2
-    kernel = jnp.clip(1 - jnp.minimum(in_plane, on_picture), 0, 1)
+    kernel = jnp.clip(1 - jnp.minimum(in_plane + (1 - cut), on_picture), 0, 1)
     depth = jnp.clip(met, -z - radius, -z + radius)
     pixel = jnp.where((place < end[-1]) & (kernel > 0), row * camera.width + column, camera.height * camera.width)
     order, pixel = _sorted(pixel, depth, place, camera.height * camera.width)
