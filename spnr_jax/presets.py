@@ -197,7 +197,7 @@ def surfels() -> TrainConfig:
             lr_generator=1.5e-3, beta2=0.99, warmup_steps=200, final_lr_scale=0.02, clip_norm=1.0
         ),
         num_steps=10_000,
-        views_per_object=4,
+        views_per_object=2,
         min_points=256,
         max_points=65_536,
         test_points=4096,

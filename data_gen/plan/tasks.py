@@ -178,7 +178,9 @@ def check_options(config: GenerateConfig) -> None:
     if config.envmap and not config.envmap.is_file():
         raise ValueError(f"--envmap {config.envmap}: no such file; give a latitude-longitude .hdr or .exr")
     if config.envmap and config.lights:
-        raise ValueError(f"--lights {config.lights[0]}: not together with --envmap, one light for all; give one of them")
+        raise ValueError(
+            f"--lights {config.lights[0]}: not together with --envmap, one light for all; give one of them"
+        )
     if unknown := set(config.categories) - set(procedural.CATEGORIES):
         known = ", ".join(procedural.CATEGORIES)
         raise ValueError(f"--categories: no category {', '.join(sorted(unknown))}; there are {known}")

@@ -21,6 +21,7 @@ from PIL import Image, UnidentifiedImageError
 
 from spnr_jax.config import TrainConfig
 from spnr_jax.formats import clouds
+from spnr_jax.formats.npz import read_arrays
 from spnr_jax.formats.shards import Shards, is_plain_name, open_shards, read_files
 from spnr_jax.kernels.records import Camera, PointCloud
 
@@ -28,6 +29,7 @@ from spnr_jax.kernels.records import Camera, PointCloud
 UNREADABLE = (OSError, ValueError, LookupError, TypeError, ArithmeticError, AttributeError, RecursionError, SyntaxError)
 # errors of a network drive that is away for a moment, and the seconds after which its file is read again
 PASSING = (errno.EIO, errno.ESTALE, errno.ETIMEDOUT, errno.EAGAIN, errno.ENOTCONN)
+LIGHT_SIZE = (32, 64)  # texels of a view's map
 PAUSES = (0.1, 0.5, 2.0)
 
 
@@ -40,6 +42,7 @@ class ObjectData:
     camera: Camera
     images: np.ndarray  # (views, height, width, 4) uint8
     conditions: np.ndarray  # (views, height, width, 4) uint8, alpha 255 at visible points
+    lights: np.ndarray | None = None  # (views, 32, 64, 3): environment maps, where each view has its own
 
     @property
     def num_bytes(self) -> int:
@@ -104,6 +107,7 @@ def read_object(dataset: Dataset, name: str) -> ObjectData:
         images = np.stack([_rgba(read(file := f"images/{name}"), height, width) for name in names])
         conditions = np.stack([_rgba(read(file := f"conditions/{name}"), height, width) for name in names])
         cloud = clouds.cloud_of_ply(read(file := "points.ply"))
+        lights = _lights(read(file := "lights.npz"), len(names)) if has_lights(dataset) else None
     except UNREADABLE as error:
         path = folder / file
         reason = f"no entry {error}" if isinstance(error, KeyError) else str(error).replace(str(path), path.name)
@@ -111,7 +115,20 @@ def read_object(dataset: Dataset, name: str) -> ObjectData:
     camera = Camera(
         cam_to_world=poses, intrinsics=np.broadcast_to(intrinsics, (len(names), 3, 3)), height=height, width=width
     )
-    return ObjectData(name=name, cloud=cloud, camera=camera, images=images, conditions=conditions)
+    return ObjectData(name=name, cloud=cloud, camera=camera, images=images, conditions=conditions, lights=lights)
+
+
+def has_lights(dataset: Dataset) -> bool:
+    """Whether each view of the data set has a light of its own."""
+    described = dataset.settings.get("environment_map")
+    return isinstance(described, dict) and "kinds" in described
+
+
+def _lights(content: bytes, views: int) -> np.ndarray:
+    lights = read_arrays(io.BytesIO(content), ("lights",))["lights"].astype(np.float32)
+    if lights.shape != (views, *LIGHT_SIZE, 3) or not np.isfinite(lights).all() or lights.min() < 0:
+        raise ValueError(f"expected {views} maps of {LIGHT_SIZE} texels of radiance, got {lights.shape}")
+    return lights
 
 
 def _reader_of(folder: Path) -> Callable[[str], bytes]:

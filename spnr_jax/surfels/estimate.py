@@ -55,7 +55,7 @@ SHARP = 0.75  # cosine between normals below which two faces meet at an edge
 EDGE = 0.1  # spacings that a disc goes beyond the line where another face cuts it
 ALIGNED = 0.8  # cosine between a line's direction and one of the four
 FAR = 4.0  # where a disc without an end ends
-BEYOND = 0.35  # spacings that a surface goes beyond the last point of its layer
+BEYOND = 0.25  # spacings that a surface goes beyond the last point of its layer
 BLOCK = 2**16  # points that are worked on at once
 
 

@@ -20,7 +20,7 @@ NUM_FEATURES, NUM_MAPS = 27, 17
 ODD = (14, 17), (15, 18)  # features that change their sign when the picture is mirrored along x, or along y
 FAINT = 0.02  # opacity from which on a pixel's numbers begin to count
 WINDOWS = 2, 6  # pixels to each side over which the depth is compared
-EDGE = 1.2  # coverage at the outline: discs reach beyond the surface, half of their weight
+EDGE = 0.6  # coverage at the outline: discs reach beyond the surface, half of their weight
 TRUST = 0.25  # most that a colour to first order leaves the blended one
 
 

@@ -32,9 +32,7 @@ def gradient(zenith: Sequence[float], horizon: Sequence[float], ground: Sequence
     return (np.asarray(ground) * (1 - up) + sky * up).astype(np.float32)
 
 
-def lamp(
-    azimuth: float, elevation: float, size: float, irradiance: Sequence[float], height: int = HEIGHT
-) -> Map:
+def lamp(azimuth: float, elevation: float, size: float, irradiance: Sequence[float], height: int = HEIGHT) -> Map:
     """A round lamp `size` degrees across, by what it throws on a surface that faces it; at least two texels wide.
 
     Its edge is a quarter of its radius wide.

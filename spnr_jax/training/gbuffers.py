@@ -20,6 +20,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 from jaxtyping import Float, UInt8
+from scipy.spatial import cKDTree
 from tqdm import tqdm
 
 from spnr_jax.config import TrainConfig
@@ -35,15 +36,19 @@ from spnr_jax.method import surfel_renderer
 from spnr_jax.surfels import features, lighting, splatting
 from spnr_jax.training.batching import read_ahead
 
-CLOUDS = 3  # of each object
-WITHOUT_NORMALS = 0.5  # share of them whose normals are estimated
-SIDES = (1, 1, 1, 2, 4, 8)  # pixels of a reference averaged along a side, drawn from these
+CLOUDS = 2  # of each object
+SCANNED = 0.2  # share of them that are made noisy
+NOISE = 0.05, 0.6  # least and most standard deviation of their points, in distances between nearest ones
+STRAY = 0.0, 0.0, 0.003, 0.01  # shares of points that lie anywhere, drawn from these
+COLOR_NOISE = 0.05  # most standard deviation of their colours
+WITHOUT_NORMALS = 0.5  # share of the others whose normals are estimated
+SIDES = (1, 1, 1, 1, 2, 4, 8)  # pixels of a reference averaged along a side, drawn from these
 SMALL, FEWER = 4, 8  # side from which on a cloud has at most so many times fewer points
 MOST_ENTRIES = 2**22  # of a view: one with more is left out
 LEAST = 8  # pixels along the shorter side of a view
 MARGIN, FAINT = 6, 0.01  # pixels around the window, and opacity from which on a pixel is in it
 SIZES = (96, 64, 32, 20, 12)  # pixels along a crop by doublings; of another config.crop than the first in proportion
-SHARES = (0.36, 0.26, 0.18, 0.14, 0.06)  # of the steps, by doublings
+SHARES = (0.36, 0.26, 0.24, 0.12, 0.02)  # of the steps, by doublings
 HALVED = 3  # doublings from which on a batch has half the crops
 TRIES, COVERED, DRAWN = 4, 0.15, 0.02  # places that are tried for a crop, until this share of it has this opacity
 LARGEST = 6e4  # in float16; no light makes a picture brighter than white
@@ -104,7 +109,8 @@ def make(item: ObjectData, number: int, light: Light, config: TrainConfig) -> Ar
     doublings: list[int] = []
     for index in generator.permutation(len(item.images))[: config.views_per_object]:
         camera = jax.tree.map(lambda x, i=index: np.asarray(x[i]), item.camera)
-        if view := make_view(scene, camera, item.images[index], side, light):
+        own = light if item.lights is None else lighting.light_of(item.lights[index])
+        if view := make_view(scene, camera, item.images[index], side, own):
             arrays |= {f"{name}{len(doublings)}": view[1][name] for name in NAMES}
             doublings.append(view[0])
     return arrays | {"doublings": np.array(doublings, np.int64)}
@@ -118,9 +124,26 @@ def random_cloud(cloud: PointCloud, side: int, config: TrainConfig, generator: n
     chosen = generator.permutation(len(cloud.mask))[:count]
     if even:
         chosen = farthest_points(np.asarray(cloud.positions), count, int(chosen[0]))
-    if generator.random() < WITHOUT_NORMALS:
-        cloud = dataclasses.replace(cloud, normals=None)
-    return jax.tree.map(lambda values: values[chosen], cloud)
+    cloud = jax.tree.map(lambda values: values[chosen], cloud)
+    if generator.random() < SCANNED:
+        return scanned(cloud, generator)
+    return dataclasses.replace(cloud, normals=None) if generator.random() < WITHOUT_NORMALS else cloud
+
+
+def scanned(cloud: PointCloud, generator: np.random.Generator) -> PointCloud:
+    """The cloud as a scanner might have it: without normals, noisy, with points that belong to nothing."""
+    positions = np.asarray(cloud.positions)
+    near = cKDTree(positions).query(positions, min(2, len(positions)))[0].reshape(len(positions), -1)[:, -1]
+    noise = generator.uniform(*NOISE) * np.median(near) * generator.standard_normal(positions.shape)
+    stray = generator.random(len(positions)) < generator.choice(STRAY)
+    anywhere = generator.uniform(-1, 1, positions.shape)
+    color = cloud.base_color + generator.uniform(0, COLOR_NOISE) * generator.standard_normal(positions.shape)
+    return dataclasses.replace(
+        cloud,
+        positions=np.clip(np.where(stray[:, None], anywhere, positions + noise), -1, 1).astype(np.float32),
+        base_color=np.clip(color, 0, 1).astype(np.float32),
+        normals=None,
+    )
 
 
 def make_view(
@@ -140,8 +163,8 @@ def make_view(
     total = int(splatting.count(scene.surfels, drawn))
     if not 0 < total <= MOST_ENTRIES:
         return None
-    found, slots = splatting.entries(scene.surfels, drawn, total=bucket(max(total, 2**15)))
-    slots = min(bucket(max(int(slots), 2**11)), drawn.height * drawn.width)
+    found, slots = splatting.entries(scene.surfels, drawn, total=_size(total, 2**16))
+    slots = min(_size(int(slots), drawn.height * drawn.width // 16), drawn.height * drawn.width)
     seen, maps, ambient, _ = map(np.asarray, look(found, scene.surfels, light, drawn, slots=slots))
     target = averaged(image, side)
     shown = target[..., 3].reshape(drawn.height, scale, drawn.width, scale).max(axis=(1, 3))
@@ -155,6 +178,11 @@ def make_view(
         "ambient": ambient,
         "target": target[scale * rows.start : scale * rows.stop, scale * columns.start : scale * columns.stop],
     }
+
+
+def _size(count: int, least: int) -> int:
+    """`least` times a power of four that holds the count: few sizes, few compilations."""
+    return least * 4 ** max(-(-((count - 1) // least).bit_length() // 2), 0)
 
 
 def averaged(image: UInt8[np.ndarray, "height width 4"], side: int) -> UInt8[np.ndarray, "h w 4"]:
