@@ -23,6 +23,7 @@ from data_gen.render import light, views
 from data_gen.render.variant import choose_variant, mitsuba_module
 from data_gen.store import layout, storage
 from data_gen.store.storage import Location
+from spnr_jax.formats.light_files import read_envmap
 from spnr_jax.surfels.room import indoor_envmap
 
 
@@ -65,7 +66,7 @@ def make_lights(config: GenerateConfig, variant: str) -> light.Lights:
     mitsuba_module(variant)
     if config.lights:
         return light.Lights(kinds=light.read_kinds(config.lights))
-    return light.Lights(light.scaled_to_white(light.load_envmap(config.envmap) if config.envmap else indoor_envmap()))
+    return light.Lights(light.scaled_to_white(read_envmap(config.envmap) if config.envmap else indoor_envmap()))
 
 
 def refuse_other_content(out: Location, settings: dict) -> None:

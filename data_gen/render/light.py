@@ -14,15 +14,15 @@ from pathlib import Path
 
 import numpy as np
 
-from data_gen.render.variant import mitsuba_module, threads
+from data_gen.render.variant import mitsuba_module
 from data_gen.render.views import ViewConfig, make_sensor, spread_viewpoints
+from spnr_jax.formats.light_files import ENDINGS, read_envmap
 from spnr_jax.surfels import envmaps, room, skies
 
 WHITE_SPHERE_RADIANCE = 0.6  # far enough below 1 that white objects keep their shading against the white background
 
 DRAWN_HEIGHT = 256  # rows of a map that a view draws
 KEPT_HEIGHT = 32  # rows of the same as the data set keeps it: what `spnr_jax.light_of` looks at
-MAP_ENDINGS = (".hdr", ".exr")
 
 
 @dataclass(frozen=True)
@@ -41,11 +41,11 @@ class Lights:
             generator = np.random.default_rng((seed, view, DRAWN_HEIGHT))
             maps = self.kinds[generator.integers(len(self.kinds))]
             drawn = maps[generator.integers(len(maps))] if maps else skies.random_map(generator, DRAWN_HEIGHT)
-            yield skies.normalised(skies.rotated(drawn, generator.uniform(0, 360)), WHITE_SPHERE_RADIANCE)
+            yield skies.normalised(np.roll(drawn, generator.integers(drawn.shape[1]), axis=1), WHITE_SPHERE_RADIANCE)
 
 
 def read_kinds(names: Sequence[str]) -> tuple[tuple[np.ndarray, ...], ...]:
-    """Return the kinds of light of --lights: `room`, `random`, or the maps of a folder; ValueError if there are none."""
+    """Return the kinds of light of --lights: `room`, `random`, or a folder's maps; ValueError if it has none."""
     kinds: list[tuple[np.ndarray, ...]] = []
     for name in names:
         if name == "random":
@@ -54,34 +54,16 @@ def read_kinds(names: Sequence[str]) -> tuple[tuple[np.ndarray, ...], ...]:
             kinds.append((room.indoor_envmap(DRAWN_HEIGHT),))
         else:
             files = map_files(name)
-            kinds.append(tuple(envmaps.resampled(load_envmap(file), DRAWN_HEIGHT) for file in files))
+            kinds.append(tuple(envmaps.resampled(read_envmap(file), DRAWN_HEIGHT) for file in files))
     return tuple(kinds)
 
 
 def map_files(folder: str) -> list[Path]:
     """Return the environment maps in a folder, by name; ValueError if there are none."""
-    files = sorted(path for path in Path(folder).glob("*") if path.suffix.lower() in MAP_ENDINGS)
+    files = sorted(path for path in Path(folder).glob("*") if path.suffix.lower() in ENDINGS)
     if not files:
         raise ValueError(f"--lights {folder}: expected room, random, or a folder with .hdr or .exr maps; found no map")
     return files
-
-
-def load_envmap(path: Path) -> np.ndarray:
-    """Return an environment map file (.hdr, .exr) as (height, width, 3) float32, unscaled; ValueError if unusable."""
-    mi = mitsuba_module()
-    if not Path(path).is_file():
-        raise ValueError(f"environment map {path}: no such file; give a latitude-longitude .hdr or .exr")
-    try:
-        with threads(2):  # with a single thread the OpenEXR reader waits for itself for ever (Mitsuba 3.9)
-            bitmap = mi.Bitmap(str(path)).convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, srgb_gamma=False)
-    except RuntimeError as error:
-        raise ValueError(
-            f"environment map {path}: not a readable .hdr or .exr ({str(error).splitlines()[0]})"
-        ) from None
-    radiance = np.array(bitmap, dtype=np.float32)
-    if not np.isfinite(radiance).all() or radiance.min() < 0 or radiance.max() <= 0:
-        raise ValueError(f"environment map {path}: expected finite radiance >= 0 with some light in it")
-    return radiance
 
 
 def scaled_to_white(envmap: np.ndarray, target: float = WHITE_SPHERE_RADIANCE) -> np.ndarray:

@@ -9,8 +9,6 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 LLVM, SCALAR = "llvm_ad_rgb", "scalar_rgb"
@@ -82,14 +80,3 @@ def mitsuba_module(variant: str | None = None):
         mi.set_log_level(mi.LogLevel.Error)  # else it warns about every rounded sample count
         importlib.import_module("drjit").set_thread_count(1)
     return mi
-
-
-@contextmanager
-def threads(count: int) -> Iterator[None]:
-    """Let Mitsuba use more threads than one, for a while."""
-    drjit = importlib.import_module("drjit")
-    drjit.set_thread_count(count)
-    try:
-        yield
-    finally:
-        drjit.set_thread_count(1)

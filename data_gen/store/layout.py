@@ -170,7 +170,7 @@ def encode_image(pixels: np.ndarray) -> bytes:
 
 
 def encode_lights(lights: np.ndarray) -> bytes:
-    """Return environment maps (views, height, width, 3) as an .npz of halves; what is brighter than they hold is cut."""
+    """Return environment maps (views, height, width, 3) as an .npz of halves, cut where they are too bright."""
     buffer = io.BytesIO()
     halves = np.minimum(lights, np.finfo(np.float16).max).astype(np.float16)
     np.savez_compressed(buffer, allow_pickle=False, lights=halves)

@@ -23,6 +23,7 @@ from data_gen.render.variant import choose_variant, mitsuba_module
 from data_gen.store import layout
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.images import write_whole
+from spnr_jax.formats.light_files import read_envmap
 from spnr_jax.scoring.evaluation import Pictures
 from spnr_jax.surfels.room import indoor_envmap
 
@@ -73,7 +74,7 @@ def unscaled_light(described: dict, envmap: Path | None) -> np.ndarray:
         return indoor_envmap()
     if envmap is None:
         raise ValueError(f"--envmap: give {described['name']}, which lit the data set")
-    radiance = light.load_envmap(envmap)
+    radiance = read_envmap(envmap)
     if hashlib.sha256(envmap.read_bytes()).hexdigest() != described["sha256"]:
         raise ValueError(f"--envmap {envmap}: not the {described['name']} that lit the data set (another checksum)")
     return radiance

@@ -7,6 +7,7 @@ Pickled objects, which could run code, are refused.  Every fault is a ValueError
 """
 
 import math
+import threading
 import tokenize
 import zipfile
 import zlib
@@ -18,6 +19,7 @@ import numpy as np
 
 from spnr_jax.formats.text import NUMBERS, Columns, plain_names
 
+HEADERS = threading.Lock()  # Python's parser, which NumPy reads headers with, fails in two threads at once (gh-106905)
 PIECE_BYTES = 2**25  # of an array in memory at a time
 MOST_BYTES = 2**31  # of an archive's arrays when unpacked: a small file can announce any number
 # what NumPy and zipfile raise on files that break their rules
@@ -83,7 +85,7 @@ def read_arrays(file: BufferedIOBase, wanted: Collection[str] | None = None) -> 
 
 def _member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
     """One array of an archive."""
-    with archive.open(info) as stream:
+    with HEADERS, archive.open(info) as stream:
         version = np.lib.format.read_magic(stream)
         read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
         shape, _, dtype = read_header(stream)
@@ -91,7 +93,7 @@ def _member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
             raise ValueError(f"{info.filename} holds objects or a negative size, shape {shape} and type {dtype}")
         if math.prod(shape) * dtype.itemsize > info.file_size:
             raise ValueError(f"{info.filename} is cut off: shape {shape} of {dtype} in {info.file_size} bytes")
-    with archive.open(info) as stream:
+    with HEADERS, archive.open(info) as stream:
         return np.lib.format.read_array(stream, allow_pickle=False)
 
 

@@ -294,7 +294,8 @@ def _of_walls(
 def _covered(near: Near, rows: slice, scale: np.ndarray, height: np.ndarray, normal: np.ndarray) -> np.ndarray:
     """Whether another layer that faces the same way lies right above a point, as a sticker does; see `_voted`."""
     alike = np.einsum("nki,ni->nk", normal[near.number], normal[rows]) > PARALLEL
-    other = alike * np.exp(-0.5 * (near.distance / near.distance[:, -1:]) ** 2) * (np.abs(height) < STICKER)
+    farthest = np.maximum(near.distance[:, -1:], LEAST_SPACING)
+    other = alike * np.exp(-0.5 * (near.distance / farthest) ** 2) * (np.abs(height) < STICKER)
     above, below = (np.sum(other * (sign * height > APART * scale[:, None]), axis=1) for sign in (1, -1))
     return above > np.maximum(COVERING, 2 * below)
 

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from spnr_jax.kernels.records import AnyArray, Light, Surfels
+from spnr_jax.surfels import skies
 from spnr_jax.surfels.envmaps import directions, resampled, solid_angles
 from spnr_jax.surfels.room import SCALE, indoor_envmap
 from spnr_jax.surfels.visibility import DIRECTIONS
@@ -50,6 +51,26 @@ def light_of(envmap: Float[np.ndarray, "height width 3"]) -> Light:
 def room_light() -> Light:
     """The light of the package's room, which pictures have where no other is asked for."""
     return light_of(SCALE * indoor_envmap())
+
+
+def sun(
+    azimuth: float, elevation: float, size: float = 3.0, color: tuple[float, float, float] = (1.0, 1.0, 1.0)
+) -> Light:
+    """A round lamp far away: degrees as `Model.camera` counts them, `size` across, irradiance of what faces it.
+
+    Shadows come from 64 directions, so they are never sharper than some ten degrees.
+    """
+    return light_of(skies.lamp(azimuth, elevation, size, color))
+
+
+def ambient(color: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Light:
+    """The same radiance from everywhere."""
+    return light_of(np.broadcast_to(np.float32(color), (HEIGHT, WIDTH, 3)))
+
+
+def background(light: Light, towards: list[Array]) -> list[Array]:
+    """Radiance of the map itself at unit directions, colours as columns."""
+    return look_up(jnp.asarray(light.tables[1]).reshape(-1, 3), towards)
 
 
 def look_up(tables: Float[Array, "rows 3"], towards: list[Array], first: Array | int = 0) -> list[Array]:

@@ -95,14 +95,6 @@ def random_map(generator: np.random.Generator, height: int = HEIGHT) -> Map:
     return whole
 
 
-def rotated(envmap: Map, degrees: float) -> Map:
-    """The map turned about the up axis: what stood at azimuth a stands at a + degrees, as `towards` counts it."""
-    width = envmap.shape[1]
-    shift = -degrees / 360 * width  # columns run against the azimuth
-    whole, part = int(np.floor(shift)), shift - np.floor(shift)
-    return ((1 - part) * np.roll(envmap, whole, axis=1) + part * np.roll(envmap, whole + 1, axis=1)).astype(np.float32)
-
-
 def normalised(envmap: Map, white: float = 0.6) -> Map:
     """The map scaled so that a white diffuse sphere, seen from all around, averages `white`: its mean radiance."""
     mean = np.sum(envmap.mean(axis=-1) * solid_angles(len(envmap))) / (4 * np.pi)

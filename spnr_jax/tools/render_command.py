@@ -6,6 +6,7 @@ from typing import Literal
 
 import tyro
 
+MOST_STOPS = 20
 Output = Literal["image", "depth", "opacity"]
 
 
@@ -40,8 +41,21 @@ class Render:
     """What is written of each view; depth comes coloured, as .npy and as 16-bit .png."""
     transparent: bool = False
     """Stills on a transparent background instead of white (straight alpha)."""
+    light: str | None = None
+    """Light: an environment map (.hdr .exr), or room, studio, sunset, overcast, night of the package (default: room, or
+    none where there is a sun)."""
+    light_yaw: float = 0.0
+    """Degrees that the map is turned about the up axis."""
+    sun: tuple[float, float] | None = None
+    """Azimuth and elevation, in degrees, of a sun: added to the light."""
+    exposure: float = 0.0
+    """Stops by which the light is brighter (negative: darker)."""
+    background: Literal["white", "light"] = "white"
+    """What is behind the object: white, or the light's map, blurred."""
     turntable: Literal["gif", "mp4", "none"] = "gif"
     """Format of the turntable."""
+    turn: Literal["object", "light"] = "object"
+    """What turns in it."""
     frames: int = 48
     """Frames of the turntable."""
     fps: int = 16
@@ -54,6 +68,12 @@ class Render:
     grid_resolution: int = 96
     """Places along each side of the grid of --mesh and --density."""
 
+    @property
+    def lit(self) -> bool:
+        """Whether anything is asked of the light, which networks of rays know by heart."""
+        asked = self.light, self.sun, self.light_yaw or None, self.exposure or None
+        return any(x is not None for x in asked) or self.background == "light" or self.turn == "light"
+
     def __post_init__(self) -> None:
         """ValueError names the option that makes no sense."""
         if self.views < 0:
@@ -65,5 +85,11 @@ class Render:
             raise ValueError(f"--resolution must be a multiple of 4 of at least 16, got {self.resolution}")
         if not -90 <= self.elevation <= 90:
             raise ValueError(f"--elevation must be -90 to 90 degrees, got {self.elevation:g}")
+        if self.sun and not -90 <= self.sun[1] <= 90:
+            raise ValueError(f"--sun: expected an azimuth and an elevation of -90 to 90 degrees, got {self.sun}")
+        if not abs(self.exposure) <= MOST_STOPS:
+            raise ValueError(f"--exposure must be -{MOST_STOPS} to {MOST_STOPS} stops, got {self.exposure:g}")
+        if self.transparent and self.background != "white":
+            raise ValueError("--background light: not together with --transparent; give one of them")
         if not 8 <= self.grid_resolution <= 512:
             raise ValueError(f"--grid-resolution must be 8 to 512, got {self.grid_resolution}")

@@ -29,7 +29,6 @@ from spnr_jax.formats.data_sets import Dataset, ObjectData, read_object
 from spnr_jax.formats.images import to_uint8, write_whole
 from spnr_jax.formats.npz import read_arrays
 from spnr_jax.kernels import cameras
-from spnr_jax.kernels.cloud_arrays import bucket
 from spnr_jax.kernels.records import Camera, Crops, Light, PointCloud
 from spnr_jax.kernels.thinning import farthest_points
 from spnr_jax.method import surfel_renderer

@@ -75,7 +75,7 @@ def of_gbuffers(config: TrainConfig, dataset: Dataset, run: Path, light: Light) 
 
 
 def light_of(dataset: Dataset) -> Light:
-    """The light of pictures that have none of their own; ValueError if it is another than the room, which is at hand."""
+    """The light of pictures that have none of their own; ValueError if it is another than the room."""
     described = dataset.settings.get("environment_map")
     name = described.get("name", ROOM) if isinstance(described, dict) else ROOM
     if name != ROOM:

@@ -5,7 +5,8 @@ import numpy as np
 
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.records import Camera, PointCloud, Surfels
-from spnr_jax.surfels.visibility import NUM_DIRECTIONS, spiral
+from spnr_jax.surfels.estimate import FAR
+from spnr_jax.surfels.visibility import NUM_DIRECTIONS, spiral, tangents
 
 
 def even_square(count: int) -> np.ndarray:
@@ -44,8 +45,9 @@ def cloud(positions, **columns) -> PointCloud:
 
 
 def surfels(position, normal, spacing, **columns) -> Surfels:
-    """Grey discs that every direction sees and that have one side."""
+    """Grey whole discs that every direction sees and that have one side."""
     count = len(position)
+    normal = np.broadcast_to(normal, (count, 3))
     columns = {
         "base_color": np.full((count, 3), 0.5),
         "gradient": np.zeros((count, 3, 3)),
@@ -54,8 +56,10 @@ def surfels(position, normal, spacing, **columns) -> Surfels:
         "sided": np.ones(count),
         "visible": np.ones((count, NUM_DIRECTIONS)),
         "shape": np.zeros((count, 2)),
+        "rim": tangents(np.asarray(normal))[0],
+        "reach": np.full((count, 4), FAR),
     } | columns
-    columns |= {"position": position, "normal": np.broadcast_to(normal, (count, 3))}
+    columns |= {"position": position, "normal": normal}
     columns |= {"spacing": np.broadcast_to(spacing, count)}
     return Surfels(**{name: jnp.asarray(x, jnp.float32) for name, x in columns.items()}, mask=jnp.ones(count, bool))
 

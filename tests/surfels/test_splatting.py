@@ -92,7 +92,9 @@ class TestShares:
 class TestEntries:
     def test_they_are_all_pairs_of_a_float64_loop_over_discs_and_pixels_also_for_a_wide_view(self):
         position, normal, _ = shape("sphere", 40, "random")
-        found, view = surfels(position, normal, 0.25), camera(20, (0.9, 0.8, 0.9), field_of_view=1.9)
+        reach = np.random.default_rng(6).uniform(0.2, 2, (40, 4))
+        found = surfels(position, normal, 0.25, reach=reach)
+        view = camera(20, (0.9, 0.8, 0.9), field_of_view=1.9)
         _, entries = draw(found, view)
         table = np.zeros((40, 400))
         order = np.asarray(entries.order)[np.asarray(entries.pixel) < 400]
@@ -106,8 +108,12 @@ class TestEntries:
         for i, (p, n) in enumerate(zip(np.float64(position), np.float64(normal), strict=True)):
             slope = directions @ n
             hit = eye + directions * ((n @ (p - eye)) / np.where(abs(slope) < 0.05, np.nan, slope))[:, None]
+            rim = np.float64(found.rim[i])
+            side = np.cross(n, rim)
+            ends = [e + (p - hit) @ way / 0.25 for e, way in zip(reach[i], (rim, -rim, side, -side), strict=True)]
+            kept = np.prod([np.clip(0.5 + e / splatting.RIM_WIDTH, 0, 1) for e in ends], axis=0)
             away = np.minimum(
-                ((hit - p) ** 2).sum(axis=1) / (splatting.RADIUS * 0.25) ** 2,
+                ((hit - p) ** 2).sum(axis=1) / (splatting.RADIUS * 0.25) ** 2 + 1 - kept,
                 ((places - np.asarray(pixels)[i]) ** 2).sum(axis=1) / splatting.FLOOR**2,
             )
             clear = np.isfinite(away) & (directions @ (hit - eye).T[:, 0] > -9)

@@ -17,7 +17,7 @@ from spnr_jax.kernels.cameras import pinhole
 from spnr_jax.kernels.records import Crops, Surfels
 from spnr_jax.method import surfel_renderer
 from spnr_jax.surfels import features, lighting, splatting
-from spnr_jax.surfels.visibility import DIRECTIONS
+from spnr_jax.surfels.visibility import DIRECTIONS, tangents
 from spnr_jax.training import gbuffers, optimisation, shading
 
 AXES = pytest.mark.parametrize("axis", [0, 1])
@@ -131,6 +131,7 @@ def test_a_mirrored_object_is_seen_as_the_mirrored_view(axis):
     rng, mirror = np.random.default_rng(5), np.where(np.arange(3) == axis, -1, 1).astype(np.float32)
     normal = rng.normal(size=(60, 3)).astype(np.float32)
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    rim, reach = tangents(normal)[0], rng.uniform(0.3, 2, (60, 4)).astype(np.float32)
     color = rng.random((60, 3), np.float32)
     pose = jnp.concatenate([jnp.eye(3), jnp.array([[0.0], [0.0], [3.0]])], axis=1)
     camera, seen = pinhole(pose, 0.7, 24, 24), []
@@ -146,6 +147,8 @@ def test_a_mirrored_object_is_seen_as_the_mirrored_view(axis):
             sided=np.ones(60, np.float32),
             visible=np.maximum((normal * sign) @ DIRECTIONS.T, 0),
             shape=color[:, :2],
+            rim=rim * sign,
+            reach=reach if sign.min() > 0 else reach[:, [0, 1, 3, 2]],  # normal x rim is not mirrored
             mask=np.ones(60, bool),
         )
         found, slots = splatting.entries(surfels, camera, total=2**14)

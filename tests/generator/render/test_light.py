@@ -5,7 +5,8 @@ import pytest
 from support.handmade import ball, plain
 
 from data_gen.render import light, views
-from data_gen.render.variant import mitsuba_module, threads
+from data_gen.render.variant import mitsuba_module
+from spnr_jax.formats.light_files import read_envmap, threads
 from spnr_jax.formats.mesh.assets import Asset
 from spnr_jax.surfels.envmaps import directions
 from spnr_jax.surfels.room import indoor_envmap
@@ -61,15 +62,15 @@ def test_the_room_has_light_from_above_and_a_dynamic_range_that_a_camera_can_hol
 
 def test_an_environment_map_file_reads_back_as_it_was_written(tmp_path, room):
     write_exr(tmp_path / "room.exr", room)
-    np.testing.assert_array_equal(light.load_envmap(tmp_path / "room.exr"), room)
+    np.testing.assert_array_equal(read_envmap(tmp_path / "room.exr"), room)
 
 
 def test_an_unusable_environment_map_is_refused_with_its_name(tmp_path):
     (tmp_path / "broken.hdr").write_bytes(b"#?RADIANCE\n")
     with pytest.raises(ValueError, match=r"broken\.hdr: not a readable"):
-        light.load_envmap(tmp_path / "broken.hdr")
+        read_envmap(tmp_path / "broken.hdr")
     with pytest.raises(ValueError, match="no such file"):
-        light.load_envmap(tmp_path / "absent.exr")
+        read_envmap(tmp_path / "absent.exr")
     write_exr(tmp_path / "black.exr", np.zeros((4, 8, 3), np.float32))
     with pytest.raises(ValueError, match="some light"):
-        light.load_envmap(tmp_path / "black.exr")
+        read_envmap(tmp_path / "black.exr")
