@@ -90,8 +90,10 @@ def estimate(
     middle = float(np.median(raw))
     lean = _lean(normal, _visible(positions, normal, raw, middle))
     pairs = [(near, s, *fit[1:]) for near, s, fit in zip(blocks, rows, fits, strict=True)]
-    lean = np.concatenate([_voted(*of, normal, raw, lean) + _of_walls(*of, normal, raw) for of in pairs])
-    lean = np.concatenate([_voted(*of, normal, raw, np.clip(lean, -1, 1)) for of in pairs])
+    lean = np.concatenate([_voted(*of, normal, raw, lean) for of in pairs])
+    if normals is None:
+        lean = np.clip(lean + np.concatenate([_of_walls(*of, normal, raw) for of in pairs]), -1, 1)
+        lean = np.concatenate([_voted(*of, normal, raw, lean) for of in pairs])
     turned = lean < (-TURN if normals is not None else 0.0)
     sided = np.ones_like(lean) if normals is not None else np.clip((np.abs(lean) - UNSURE) / (SURE - UNSURE), 0, 1)
     normal = np.where(turned[:, None], -normal, normal)
@@ -284,7 +286,10 @@ def _voted(
 def _of_walls(
     near: Near, rows: slice, scale: np.ndarray, height: np.ndarray, normal: np.ndarray, spacing: np.ndarray
 ) -> np.ndarray:
-    """A lean from another layer, nearer than anything can be seen between: a wall's sides face away from each other."""
+    """A lean from another layer, nearer than anything can be seen between: a wall's sides face away from each other.
+
+    A layer right under another, as under a sticker, is taken for a wall's inner side, and not seen from outside either.
+    """
     along = np.einsum("nki,ni->nk", normal[near.number], normal[rows])
     wall = _close(near, spacing[rows]) * (np.abs(along) > PARALLEL) * (np.abs(height) < WALL)
     above, below = (np.sum(wall * (sign * height > APART * scale[:, None]), axis=1) for sign in (1, -1))

@@ -6,6 +6,7 @@ from support.laws import close
 from support.surfel_clouds import even_square, shape
 
 from spnr_jax.surfels import estimate as module
+from spnr_jax.surfels.splatting import RADIUS
 from spnr_jax.surfels.visibility import tangents
 
 FIELDS = ("normal", "spacing", "gradient", "sided", "visible", "shape")
@@ -115,3 +116,76 @@ def test_a_normal_given_on_a_sheet_keeps_its_sign():
     positions, normals, _ = shape("plane", 500)
     close(estimate(positions, normals=normals)["normal"], normals, atol=1e-5)
     close(estimate(positions, normals=-normals)["normal"], -normals, atol=1e-5)
+
+
+def cube(count):
+    """Points, normals and spacing of a cube of side 1."""
+    u, v = 0.5 * even_square(count).T
+    faces = [(axis, sign) for axis in range(3) for sign in (-1, 1)]
+    positions, normals = [], []
+    for axis, sign in faces:
+        place = np.insert(np.stack([u, v], axis=1), axis, 0.5 * sign, axis=1)
+        positions.append(place)
+        normals.append(np.broadcast_to(sign * np.eye(3)[axis], (count, 3)))
+    return np.float32(np.concatenate(positions)), np.float32(np.concatenate(normals)), count**-0.5
+
+
+def ends(found, count):
+    """Where each disc ends in its four directions (points, 4, 3), and how far from the point, in spacings."""
+    rim = found.rim[:count]
+    side = np.cross(found.normal[:count], rim)
+    ways = np.stack([rim, -rim, side, -side], axis=1)
+    reach = np.minimum(found.reach[:count], RADIUS)[..., None]
+    return found.position[:count, None] + ways * reach * found.spacing[:count, None, None], reach[..., 0]
+
+
+@pytest.mark.parametrize(("known", "share"), [(True, 0.99), (False, 0.95)])
+def test_discs_end_where_the_faces_of_a_cube_meet(known, share):
+    positions, normals, spacing = cube(500)
+    grey = np.full(len(positions), 0.5, np.float32)
+    found = module.estimate(positions, np.stack([grey] * 3, axis=1), grey, grey, normals if known else None)
+    assert found.mask.sum() == len(positions)
+    places, reach = ends(found, len(positions))
+    beyond = (np.abs(places).max(axis=(1, 2)) - 0.5) / spacing
+    assert np.mean(beyond < module.EDGE + 0.15) > share
+    edge = np.sort(np.abs(positions), axis=1)[:, 1] > 0.5 - 0.5 * spacing  # near an edge: cut there, and not sooner
+    assert np.mean(beyond[edge] > -0.2) > share
+    assert np.median(reach[np.sort(np.abs(positions), axis=1)[:, 1] < 0.3]) == pytest.approx(RADIUS, abs=0.2)
+
+
+def test_discs_of_a_sheet_end_a_little_beyond_its_last_points():
+    positions, normals, spacing = shape("plane", 900)
+    grey = np.full(900, 0.5, np.float32)
+    found = module.estimate(positions, np.stack([grey] * 3, axis=1), grey, grey, normals)
+    first, second = np.array([0.8, 0, -0.6]), np.array([-0.36, 0.8, -0.48])
+    places, _ = ends(found, 900)
+    beyond = (np.abs(np.stack([places @ first, places @ second])).max(axis=(0, 2)) - 0.6) / spacing
+    assert np.quantile(beyond, 0.99) < 0.6
+    assert beyond.max() > 0
+
+
+@pytest.mark.parametrize("thickness", [0.2, 0.5, 1.0])
+def test_the_sides_of_a_thin_wall_face_away_from_each_other_and_keep_their_colours(thickness):
+    """Thinner than what the directions that see a point can tell apart; thickness in spacings of a side."""
+    u, v = 0.6 * even_square(1500).T
+    spacing = 1.2 / np.sqrt(1500)
+    sign = np.where(np.arange(3000) < 1500, 1.0, -1.0)
+    u, v = np.concatenate([u, v]), np.concatenate([v, u])
+    positions = np.stack([u, 0.5 * thickness * spacing * sign, v], axis=1)
+    color = np.where(sign[:, None] > 0, [0.9, 0.1, 0.1], [0.1, 0.1, 0.9])
+    found = estimate(positions, color)
+    inner = np.hypot(u, v) < 0.5
+    assert np.mean(found["normal"][inner, 1] * sign[inner] > 0.9) > 0.97
+    assert np.mean(np.abs(found["gradient"][inner]).max(axis=(1, 2)) < 0.1 / spacing) > 0.97
+
+
+def test_what_lies_right_under_a_layer_that_faces_the_same_way_is_not_drawn():
+    outer, normals, spacing = shape("sphere", 1500)
+    inner = outer[::-1] * [1, 1, -1] * (1 - 0.4 * spacing / 0.6)  # not point below point
+    positions = np.float32(np.concatenate([outer, inner]))
+    grey = np.full(3000, 0.5, np.float32)
+    normals = np.concatenate([normals, normals[::-1] * [1, 1, -1]]).astype(np.float32)
+    found = module.estimate(positions, np.stack([grey] * 3, axis=1), grey, grey, normals)
+    radius = np.linalg.norm(found.position[found.mask], axis=1)
+    assert np.mean(radius > 0.6 - 0.2 * spacing) > 0.97
+    assert np.sum(radius > 0.6 - 0.2 * spacing) > 0.98 * 1500
