@@ -163,13 +163,13 @@ class Light:
         """Both lights together."""
         return Light(tables=self.tables + other.tables)
 
-    def __mul__(self, factor: float) -> "Light":
+    def __mul__(self, factor: float | int) -> "Light":
         """The light so many times as bright."""
         return Light(tables=factor * self.tables)
 
     __rmul__ = __mul__
 
-    def turned(self, degrees: float) -> "Light":
+    def turned(self, degrees: float | int) -> "Light":
         """The light turned about the up axis: what stood at an azimuth (0 at +z, 90 at +x) stands so much further.
 
         Exact for multiples of a texel, 5.625 degrees; between them neighbours are mixed.

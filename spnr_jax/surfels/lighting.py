@@ -54,7 +54,10 @@ def room_light() -> Light:
 
 
 def sun(
-    azimuth: float, elevation: float, size: float = 3.0, color: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    azimuth: float | int,
+    elevation: float | int,
+    size: float | int = 3.0,
+    color: tuple[float, float, float] = (1.0, 1.0, 1.0),
 ) -> Light:
     """A round lamp far away: degrees as `Model.camera` counts them, `size` across, irradiance of what faces it.
 

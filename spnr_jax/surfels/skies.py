@@ -15,16 +15,17 @@ HEIGHT = 128
 HORIZON = 0.08  # sine of the elevation over which ground and sky pass into each other
 MOST_LAMPS = 4  # of a random map
 
+Color = Sequence[float] | np.ndarray
 Map = Float[np.ndarray, "height width 3"]
 
 
-def towards(azimuth: float, elevation: float) -> Float[np.ndarray, "3"]:
+def towards(azimuth: float | int, elevation: float | int) -> Float[np.ndarray, "3"]:
     """Unit direction to a place of the sky, in degrees: azimuth 0 is +z, 90 is +x, elevation 90 straight up (+y)."""
     turn, rise = np.radians([azimuth, elevation])
     return np.array([np.cos(rise) * np.sin(turn), np.sin(rise), np.cos(rise) * np.cos(turn)])
 
 
-def gradient(zenith: Sequence[float], horizon: Sequence[float], ground: Sequence[float], height: int = HEIGHT) -> Map:
+def gradient(zenith: Color, horizon: Color, ground: Color, height: int = HEIGHT) -> Map:
     """Sky from the horizon to straight above, and a floor of one colour."""
     sine = directions(height)[..., 1:2]
     sky = np.asarray(horizon) + (np.asarray(zenith) - np.asarray(horizon)) * np.clip(sine, 0, 1) ** 0.7
@@ -32,7 +33,9 @@ def gradient(zenith: Sequence[float], horizon: Sequence[float], ground: Sequence
     return (np.asarray(ground) * (1 - up) + sky * up).astype(np.float32)
 
 
-def lamp(azimuth: float, elevation: float, size: float, irradiance: Sequence[float], height: int = HEIGHT) -> Map:
+def lamp(
+    azimuth: float | int, elevation: float | int, size: float | int, irradiance: Color, height: int = HEIGHT
+) -> Map:
     """A round lamp `size` degrees across, by what it throws on a surface that faces it; at least two texels wide.
 
     Its edge is a quarter of its radius wide.
@@ -95,7 +98,7 @@ def random_map(generator: np.random.Generator, height: int = HEIGHT) -> Map:
     return whole
 
 
-def normalised(envmap: Map, white: float = 0.6) -> Map:
+def normalised(envmap: Map, white: float | int = 0.6) -> Map:
     """The map scaled so that a white diffuse sphere, seen from all around, averages `white`: its mean radiance."""
     mean = np.sum(envmap.mean(axis=-1) * solid_angles(len(envmap))) / (4 * np.pi)
     return (envmap * (white / max(mean, 1e-12))).astype(np.float32)
