@@ -23,7 +23,8 @@ from spnr_jax.config import TrainConfig
 from spnr_jax.formats import clouds
 from spnr_jax.formats.npz import read_arrays
 from spnr_jax.formats.shards import Shards, is_plain_name, open_shards, read_files
-from spnr_jax.kernels.records import Camera, PointCloud
+from spnr_jax.kernels.records import Camera, Light, PointCloud
+from spnr_jax.surfels.lighting import light_of
 
 # what a file that breaks its rules makes its reader raise; Pillow raises SyntaxError
 UNREADABLE = (OSError, ValueError, LookupError, TypeError, ArithmeticError, AttributeError, RecursionError, SyntaxError)
@@ -43,6 +44,11 @@ class ObjectData:
     images: np.ndarray  # (views, height, width, 4) uint8
     conditions: np.ndarray  # (views, height, width, 4) uint8, alpha 255 at visible points
     lights: np.ndarray | None = None  # (views, 32, 64, 3): environment maps, where each view has its own
+
+    @property
+    def own_lights(self) -> list[Light] | None:
+        """The light of each view, where it has its own."""
+        return None if self.lights is None else [light_of(envmap) for envmap in self.lights]
 
     @property
     def num_bytes(self) -> int:

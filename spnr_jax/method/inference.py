@@ -4,6 +4,7 @@ The config of a network finds its module (`network`): any with `encode`, `render
 each by itself has `rays` and `render_rays`; the others, whose `ray_chunk` is None, render whole images.
 """
 
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -101,11 +102,15 @@ jitted_render = jax.jit(render, static_argnames=("config", "ray_chunk", "rays_pe
 
 
 def render_views(
-    variables: dict, config: NetworkConfig, cloud: PointCloud, camera: Camera, light: Light | None = None
+    variables: dict,
+    config: NetworkConfig,
+    cloud: PointCloud,
+    camera: Camera,
+    light: Light | Sequence[Light] | None = None,
 ) -> Rendering:
     """All views of one object (clouds of data sets are normalised already), rays divided among the devices.
 
-    The light is for a network that sees it; None is the package's room.
+    The light, or one for each view, is for a network that sees it; None is the package's room.
     """
     if isinstance(config, SurfelConfig):
         scene = surfel_renderer.encode(cloud)

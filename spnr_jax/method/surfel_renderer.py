@@ -8,6 +8,7 @@ the network, so its work follows the points and the pixels that they cover.  Onl
 Sizes that shape arrays are counted first and rounded up to few values: each new one is compiled once.
 """
 
+from collections.abc import Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -87,11 +88,15 @@ def render(
 
 
 def render_views(
-    variables: dict | None, scene: SurfelScene, cameras: Camera, light: Light, *, config: SurfelConfig
+    variables: dict | None, scene: SurfelScene, cameras: Camera, light: Light | Sequence[Light], *, config: SurfelConfig
 ) -> Rendering:
-    """Views one after the other (one axis of cameras): the sizes of each are counted before it is drawn."""
+    """Views one after the other (one axis of cameras), in one light or each in its own.
+
+    The sizes of each are counted before it is drawn.
+    """
     views = [jax.tree.map(lambda x, i=i: x[i], cameras) for i in range(len(cameras.cam_to_world))]
-    drawn = [render(variables, scene, view, light, config=config) for view in views]
+    lights = [light] * len(views) if isinstance(light, Light) else light
+    drawn = [render(variables, scene, view, own, config=config) for view, own in zip(views, lights, strict=True)]
     return jax.tree.map(lambda *x: np.stack(x), *drawn)
 
 

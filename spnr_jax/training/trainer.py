@@ -287,7 +287,7 @@ def preview(
     for name in names:
         item = data_sets.read_object(dataset, name)
         cloud = data_sets.test_cloud(item, config)
-        rendering = inference.render_views(variables, config.model, cloud, item.camera, light)
+        rendering = inference.render_views(variables, config.model, cloud, item.camera, item.own_lights or light)
         image, reference = np.clip(np.asarray(rendering.image), 0, 1), data_sets.on_white(item.images)
         scores.append(np.asarray(psnr(jnp.asarray(image), jnp.asarray(reference))))
         columns.append(np.concatenate([reference[0], image[0]]))
