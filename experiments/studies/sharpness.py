@@ -139,7 +139,7 @@ def _draw(
         reference = item.images[view].astype(np.float32) / 255
         camera = jax.tree.map(lambda x, view=view: x[view], item.camera)
         if options.resolution and options.resolution != camera.height:
-            reference = _smaller(reference, camera.height // options.resolution)
+            reference = smaller(reference, camera.height // options.resolution)
             camera = cameras.resize(camera, options.resolution, options.resolution)
         for _ in range(2):
             begin = perf_counter()
@@ -150,7 +150,7 @@ def _draw(
     return drawn, (encode, fastest)
 
 
-def _smaller(reference: np.ndarray, side: int) -> np.ndarray:
+def smaller(reference: np.ndarray, side: int) -> np.ndarray:
     """The mean of squares of pixels, colours weighted by their opacity."""
     weighted = np.concatenate([reference[..., :3] * reference[..., 3:], reference[..., 3:]], axis=-1)
     weighted = np.asarray(mean_of_squares(jnp.asarray(weighted), side))

@@ -1,0 +1,98 @@
+"""Laws of light in pictures of the package's network: black, sums, multiples, turns, a white body, extremes."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support.surfel_clouds import cloud, shape
+
+import spnr_jax
+from spnr_jax.formats.light_files import read_light
+from spnr_jax.kernels.colors import srgb_to_linear
+from spnr_jax.surfels.envmaps import directions
+
+SIZE = 96
+
+
+@pytest.fixture(scope="module")
+def model():
+    return spnr_jax.load("surfels")
+
+
+@pytest.fixture(scope="module")
+def body():
+    """A ball with a rod through it, of several materials."""
+    ball, rod = shape("sphere", 900)[0], shape("rod", 500)[0]
+    positions = np.concatenate([ball, rod + [0, 0.35, 0]])
+    rng = np.random.default_rng(3)
+    color = np.where(positions[:, :1] > 0, [0.7, 0.3, 0.2], [0.2, 0.4, 0.6])
+    return cloud(positions, base_color=color, roughness=rng.uniform(0.2, 0.9, 1400), metallic=positions[:, 1] > 0.3)
+
+
+def linear(model, volume, light, azimuth=30.0):
+    """Linear light of the solid pixels, and which they are."""
+    found = model.render(volume, model.camera(volume, azimuth, resolution=SIZE), light=light)
+    solid = np.asarray(found.acc) > 0.999
+    straight = (np.asarray(found.image) - 1 + np.asarray(found.acc)[..., None]) / np.maximum(found.acc, 1e-3)[..., None]
+    assert solid.sum() > 500
+    return np.asarray(srgb_to_linear(jnp.clip(jnp.asarray(straight), 0, 1))), solid
+
+
+def test_black_light_gives_black(model, body):
+    image, solid = linear(model, model.encode(body), spnr_jax.ambient((0.0, 0.0, 0.0)))
+    assert image[solid].max() < 2e-3  # what an opacity of .999 leaves of the white behind
+
+
+def test_light_a_plus_light_b_is_their_sum_and_a_multiple_a_multiple(model, body):
+    volume = model.encode(body)
+    one, other = 0.3 * read_light("studio"), 0.3 * read_light("sunset")
+    pictures = [linear(model, volume, light) for light in (one, other, one + other, 2 * one)]
+    a, b, both, twice = (image for image, _ in pictures)
+    clear = pictures[0][1] & (np.minimum(a, b).min(axis=-1) > 1e-3) & (np.maximum(both, twice).max(axis=-1) < 0.99)
+    assert clear.sum() > 300  # where nothing is clipped
+    np.testing.assert_allclose(both[clear], (a + b)[clear], atol=2e-3)
+    np.testing.assert_allclose(twice[clear], 2 * a[clear], atol=2e-3)
+
+
+def test_object_camera_and_light_turned_together_give_nearly_the_same_picture(model, body):
+    """Not exactly: the 64 directions that see the points stand still, and so do the texels of the maps."""
+    light, turn = read_light("studio"), 16 * 5.625
+    angle = np.deg2rad(turn)
+    rotation = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+    turned = dataclasses.replace(body, positions=np.float32(body.positions @ rotation.T))
+    before, solid = linear(model, model.encode(body), light)
+    after, also = linear(model, model.encode(turned), light.turned(turn), azimuth=30.0 + turn)
+    off = np.abs(after - before)[solid & also]
+    assert np.mean(off) < 0.015
+    assert np.mean(solid != also) < 0.01
+
+
+@pytest.mark.parametrize("albedo", [0.2, 0.8])
+def test_a_matt_convex_body_in_uniform_light_shows_its_albedo(model, albedo):
+    ball = cloud(shape("sphere", 3000)[0], base_color=np.full((3000, 3), albedo), roughness=np.ones(3000))
+    image, solid = linear(model, model.encode(ball), spnr_jax.ambient())
+    assert np.mean(image[solid]) == pytest.approx(albedo, abs=0.03)  # what is not metal mirrors some of it, too
+
+
+@pytest.mark.parametrize("radiance", [1e-6, 1.0, 1e6])
+def test_no_light_gives_nan(model, body, radiance):
+    lamp = np.zeros((32, 64, 3), np.float32)
+    lamp[8, 20] = 1e5
+    for light in (spnr_jax.ambient(), spnr_jax.light_of(lamp)):
+        found = model.render(
+            model.encode(body), model.camera(model.encode(body), resolution=SIZE), light=radiance * light
+        )
+        assert np.isfinite(np.asarray(found.image)).all()
+        assert np.asarray(found.image).min() >= 0
+        assert np.asarray(found.image).max() <= 1 + 1e-6
+
+
+def test_light_comes_from_where_it_stands(model):
+    """A ball lit from the right is brighter there, and so is its picture from behind, on the other side."""
+    volume = model.encode(cloud(shape("sphere", 1500)[0], roughness=np.ones(1500)))
+    right = spnr_jax.light_of(np.maximum(directions(32) @ [1, 0, 0], 0)[..., None] ** 4 * np.ones(3, np.float32))
+    for azimuth, side in ((0.0, 1), (180.0, -1)):
+        image, solid = linear(model, volume, right, azimuth)
+        columns = np.arange(SIZE)[None] - SIZE / 2
+        assert side * np.sum(image.mean(axis=-1) * columns * solid) > 0
