@@ -5,7 +5,7 @@ import numpy as np
 
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.records import Camera, PointCloud, Surfels
-from spnr_jax.surfels.estimate import FAR
+from spnr_jax.surfels.rims import FAR
 from spnr_jax.surfels.visibility import NUM_DIRECTIONS, spiral, tangents
 
 

@@ -6,6 +6,7 @@ from support.laws import close
 from support.surfel_clouds import even_square, shape
 
 from spnr_jax.surfels import estimate as module
+from spnr_jax.surfels import neighbours, rims
 from spnr_jax.surfels.splatting import RADIUS
 from spnr_jax.surfels.visibility import tangents
 
@@ -93,7 +94,7 @@ def test_blocks_of_points_and_their_order_change_nothing(monkeypatch):
     positions, _, _ = shape("sphere", 700, "random")
     color = 0.5 + 0.5 * positions
     whole = estimate(positions, color)
-    monkeypatch.setattr(module, "BLOCK", 97)
+    monkeypatch.setattr(neighbours, "BLOCK", 97)
     order = np.random.default_rng(3).permutation(len(positions))
     shuffled = estimate(positions[order], color[order])
     for name in FIELDS:
@@ -147,7 +148,7 @@ def test_discs_end_where_the_faces_of_a_cube_meet(known, share):
     assert found.mask.sum() == len(positions)
     places, reach = ends(found, len(positions))
     beyond = (np.abs(places).max(axis=(1, 2)) - 0.5) / spacing
-    assert np.mean(beyond < module.EDGE + 0.15) > share
+    assert np.mean(beyond < rims.EDGE + 0.15) > share
     edge = np.sort(np.abs(positions), axis=1)[:, 1] > 0.5 - 0.5 * spacing  # near an edge: cut there, and not sooner
     assert np.mean(beyond[edge] > -0.2) > share
     assert np.median(reach[np.sort(np.abs(positions), axis=1)[:, 1] < 0.3]) == pytest.approx(RADIUS, abs=0.2)

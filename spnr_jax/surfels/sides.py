@@ -1,0 +1,84 @@
+"""Which side of each layer is outside: votes of the directions that see it, and of walls."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from spnr_jax.kernels.cloud_arrays import bucket
+from spnr_jax.surfels.layers import APART, PARALLEL, Layer
+from spnr_jax.surfels.neighbours import Near, close, joined
+from spnr_jax.surfels.visibility import DIRECTIONS, grid_of, seen_from
+
+WALL = 1.5  # spacings within which another layer is the other side of a wall
+SOLID = 3.0  # weight of the wall's vote
+TURN = 0.5  # votes against a given normal from which it is turned
+HIDDEN = 0.4  # directions, counted by their cosines, that see a point at most that lies inside and is not drawn
+LEAST_SHOWN = 0.3  # share of the points that has to be left
+EVIDENCE = 1.0  # votes that a lean is measured against: few of them are none
+UNSURE, SURE = 0.15, 0.45  # lean of the votes from which a side begins to count, and counts whole
+
+
+def visible_from(positions: np.ndarray, normal: np.ndarray, spacing: np.ndarray, middle: float) -> np.ndarray:
+    """How much each of DIRECTIONS sees of each point (points, directions); `middle` is the median spacing."""
+    size, count = bucket(len(positions)), len(positions)
+
+    def pad(values):
+        return jnp.asarray(np.concatenate([values, np.zeros((size - count, *values.shape[1:]), values.dtype)]))
+
+    cell, grid = grid_of(middle)
+    bounded = np.clip(spacing, middle / 2, 2 * middle).astype(np.float32)
+    mask = jnp.arange(size) < count
+    seen = seen_from(pad(positions), pad(normal), pad(bounded), mask, jnp.float32(cell), grid=grid)
+    return np.asarray(seen)[:count]
+
+
+def shown(normal: np.ndarray, seen: np.ndarray, covered: np.ndarray) -> np.ndarray:
+    """Which points something outside sees; all, where that would leave too few."""
+    shown = ~covered & (np.einsum("nd,nd->n", seen, np.abs(normal @ DIRECTIONS.T)) > HIDDEN)
+    return shown if shown.mean() > LEAST_SHOWN else np.ones_like(shown)
+
+
+def lean(normal: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """From -1 to 1: how much more is seen of the side that the normal points to than of the other."""
+    cosines = normal @ DIRECTIONS.T
+    front, back = (np.einsum("nd,nd->n", seen, np.maximum(side, 0)) for side in (cosines, -cosines))
+    return (front - back) / (front + back + EVIDENCE)
+
+
+def voted(near: Near, layer: Layer, normal: np.ndarray, spacing: np.ndarray, lean: np.ndarray) -> np.ndarray:
+    """The lean of each point and of its neighbours on the same layer, whichever way their normals point (block,)."""
+    along = np.einsum("nki,ni->nk", normal[near.number], normal[near.rows])
+    weight = close(near, spacing[near.rows]) * along**2 * np.exp(-0.5 * (layer.height / layer.scale[:, None]) ** 2)
+    return np.einsum("nk,nk->n", weight * np.sign(along), lean[near.number]) / np.maximum(weight.sum(axis=1), 1e-6)
+
+
+def of_walls(near: Near, layer: Layer, normal: np.ndarray, spacing: np.ndarray) -> np.ndarray:
+    """A lean from another layer, nearer than anything can be seen between: a wall's sides face away from each other.
+
+    A layer right under another, as under a sticker, is taken for a wall's inner side, and not seen from outside either.
+    """
+    along = np.einsum("nki,ni->nk", normal[near.number], normal[near.rows])
+    wall = close(near, spacing[near.rows]) * (np.abs(along) > PARALLEL) * (np.abs(layer.height) < WALL)
+    above, below = (np.sum(wall * (sign * layer.height > APART * layer.scale[:, None]), axis=1) for sign in (1, -1))
+    return SOLID * (below - above) / (above + below + EVIDENCE)
+
+
+def outward(
+    near: list[Near], layer: list[Layer], spacing: np.ndarray, given: bool, positions: np.ndarray, middle: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Normals that point outward (points, 3), and 1 where the votes say which side that is, 0 where they do not.
+
+    Given normals have a side; they are turned only where the votes are clear.
+    """
+    normal = np.concatenate([of.normal for of in layer])
+    normals, spacings = ([x] * len(near) for x in (normal, spacing))
+    towards = lean(normal, visible_from(positions, normal, spacing, middle))
+
+    def vote(votes: np.ndarray) -> np.ndarray:
+        return joined(voted, near, layer, normals, spacings, [votes] * len(near))
+
+    towards = vote(towards)
+    if given:
+        return np.where(towards[:, None] < -TURN, -normal, normal), np.ones_like(towards)
+    towards = vote(np.clip(towards + joined(of_walls, near, layer, normals, spacings), -1, 1))
+    sided = np.clip((np.abs(towards) - UNSURE) / (SURE - UNSURE), 0, 1)
+    return np.where(towards[:, None] < 0, -normal, normal), sided
