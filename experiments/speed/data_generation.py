@@ -15,10 +15,11 @@ from pathlib import Path
 
 import numpy as np
 
-from data_gen.make.generate import make_light
+from data_gen.make.generate import make_lights
 from data_gen.make.objects import Workbench, load_asset, make_and_write, object_seeds
 from data_gen.plan.tasks import GenerateConfig, Task, plan_objects
 from data_gen.render import views
+from data_gen.render.light import Lights
 from data_gen.render.variant import choose_variant, mitsuba_module
 from experiments import entry_point
 from experiments.comparison import results_folder
@@ -63,7 +64,7 @@ def main(options: DataGeneration) -> None:
         kinds["meshes"] = [found[i] for i in np.unique(np.linspace(0, len(found) - 1, options.objects).astype(int))]
     variant, _ = choose_variant()
     mitsuba_module(variant)
-    light = make_light(GenerateConfig(out=options.out), variant)
+    light = make_lights(GenerateConfig(out=options.out), variant)
     seconds = {kind: timed(tasks, light, variant, options) for kind, tasks in kinds.items()}
     noise = measured_noise([t for tasks in kinds.values() for t in tasks[::2]], light, options.resolution)
     heads = ("objects an hour and core", *(f"{phase}, %" for phase in (*PHASES, "other")))
@@ -81,11 +82,11 @@ def speeds(seconds: dict[str, float]) -> tuple:
     return (number(3600 / whole, 0), *(number(s / whole, 1, factor=100) for s in seconds.values()))
 
 
-def timed(tasks: list[Task], light: np.ndarray, variant: str, options: DataGeneration) -> dict[str, float]:
+def timed(tasks: list[Task], light: Lights, variant: str, options: DataGeneration) -> dict[str, float]:
     """Mean seconds of an object by phase."""
     view, profiler = views.ViewConfig(resolution=options.resolution, spp=options.spp), cProfile.Profile()
     with tempfile.TemporaryDirectory() as folder:
-        bench = Workbench(out=folder, envmap=light, view=view, num_points=4096, seed=0, variant=variant)
+        bench = Workbench(out=folder, lights=light, view=view, num_points=4096, seed=0, variant=variant)
         start = time.perf_counter()
         made = sum(profiler.runcall(make_and_write, bench, task) is None for task in tasks)
         whole = time.perf_counter() - start
@@ -96,11 +97,11 @@ def timed(tasks: list[Task], light: np.ndarray, variant: str, options: DataGener
     return found | {"other": max(whole / max(made, 1) - sum(found.values()), 0.0)}
 
 
-def measured_noise(tasks: list[Task], light: np.ndarray, resolution: int) -> dict[int, tuple[float, float]]:
+def measured_noise(tasks: list[Task], light: Lights, resolution: int) -> dict[int, tuple[float, float]]:
     """Median and 10th percentile of the PSNR by samples per pixel, two views an object."""
     config, scores = views.ViewConfig(resolution=resolution), []
     for task in tasks:
-        scene = views.build_scene(surface_points.normalise(load_asset(task, 0))[0], light)
+        scene = views.build_scene(surface_points.normalise(load_asset(task, 0))[0], light.shared)
         rng = np.random.default_rng(object_seeds(0, task.object_id)["viewpoints"])
         for pose in views.random_viewpoints(2, config.distance, rng):
             reference = picture(scene, pose, config, REFERENCE_SAMPLES, first_seed=1000)

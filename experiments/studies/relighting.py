@@ -3,7 +3,7 @@
     python -m experiments.studies.relighting --data ROOM VENICE STUDIO --out OUT [--run surfels] [--counts 1024 16384]
 
 Each data set holds the same objects under one kind of light (`spnr-data generate --lights FOLDER_OF_ONE_MAP`, or
-`--lights room`), turned for every view and kept beside it.  Beside the network: the same discs and light without it, with
+`--lights room`), turned for every view and kept beside it.  Beside the network: the same discs and light alone, with
 and without the visibility of the points (split-sum shading, Karis 2013).  Nothing is rescaled to the reference.
 
     OUT/results.json  OUT/table.md .csv .tex     dB, dB inside, FLIP, log error of linear light, of each light

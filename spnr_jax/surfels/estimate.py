@@ -19,7 +19,7 @@ from spnr_jax.surfels.neighbours import LEAST_SPACING, Near, each, first_spacing
 from spnr_jax.surfels.rims import rims
 from spnr_jax.surfels.visibility import tangents
 
-OWN_DISC = 5.5  # neighbours within the disc whose area gives the spacing, by their weights; no whole number: sums of ones jump there
+OWN_DISC = 5.5  # neighbours, by their weights, in the disc that gives the spacing; sums of ones jump at whole numbers
 SMOOTHED = 9  # neighbours over which the spacing is averaged
 RIDGE = 0.15  # of the colour's regression, in spacings
 

@@ -3,7 +3,6 @@
 NumPy in, NumPy out; neighbours come from SciPy's k-d tree.  Lengths are in units of the box, or in spacings.
 """
 
-import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
@@ -20,7 +19,7 @@ REACH = 1.2  # spacings, standard deviation of the weight of a neighbour's dista
 LEAST_SPACING = 1e-5  # in units of the box, for points that coincide
 ALONE = 0.1  # of the box, the spacing of a single point
 BLOCK = 2**12  # points that are worked on at once: they stay in a core's cache
-MOST_THREADS = 8
+THREADS = 4
 
 
 class Near(NamedTuple):
@@ -48,7 +47,7 @@ def neighbourhoods(positions: Float[np.ndarray, "points 3"]) -> list[Near]:
 
 def each(work: Callable[..., Any], *blocks: Iterable) -> list:
     """What the work gives for each block, in order; blocks are shared by the cores."""
-    with ThreadPoolExecutor(min(os.cpu_count() or 1, MOST_THREADS)) as pool:
+    with ThreadPoolExecutor(THREADS) as pool:
         return list(pool.map(work, *blocks))
 
 

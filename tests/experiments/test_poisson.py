@@ -33,7 +33,7 @@ def dataset(tmp_path_factory):
     surface = surface_points.sample_surface(asset, COUNT, 0)
     poses = views.random_viewpoints(VIEW.views, VIEW.distance, np.random.default_rng(5))
     lamp = light.scaled_to_white(indoor_envmap())
-    images, conditions = views.render_views(asset, surface, poses, lamp, VIEW, 6)
+    images, conditions = views.render_views(asset, surface, poses, [lamp], VIEW, 6)
     packed = layout.pack_points(surface)
     line = packed.copy()
     line["x"], line["y"], line["z"] = 0, np.linspace(-0.9, 0.9, COUNT), 0

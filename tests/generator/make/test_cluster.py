@@ -191,7 +191,7 @@ def test_a_cluster_and_an_object_store_give_the_bytes_of_local_processes_and_a_f
 def test_a_worker_that_does_not_see_a_mesh_file_ends_the_run_with_its_name(threaded, tmp_path):
     unseen = tasks.Task(object_id="thing", path=tmp_path / "other.ply")
     bench = objects.Workbench(
-        out=str(tmp_path / "set"), envmap=None, view=views.ViewConfig(), num_points=4, seed=0, variant="scalar_rgb"
+        out=str(tmp_path / "set"), lights=None, view=views.ViewConfig(), num_points=4, seed=0, variant="scalar_rgb"
     )
     with (
         cluster.connect(threaded, 1) as client,

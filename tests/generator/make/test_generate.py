@@ -17,7 +17,10 @@ from data_gen.__main__ import main
 from data_gen.make import generate, objects
 from data_gen.plan import tasks
 from data_gen.render import views
+from data_gen.render.light import Lights
 from data_gen.store import check, layout, show, storage
+from spnr_jax.formats import data_sets
+from spnr_jax.surfels.envmaps import directions
 
 SMALL = ["--resolution", "32", "--views", "2", "--points", "64", "--spp", "16", "--visibility-grid", "2"]
 ROOT = Path(__file__).parents[3]
@@ -136,7 +139,7 @@ def test_an_unexpected_error_leaves_out_that_object_only_but_a_full_disk_stops_t
     task = tasks.Task(object_id="a", category="chair")
     bench = objects.Workbench(
         out=str(tmp_path),
-        envmap=np.ones((4, 8, 3)),
+        lights=Lights(np.ones((4, 8, 3))),
         view=views.ViewConfig(),
         num_points=4,
         seed=0,
@@ -168,6 +171,8 @@ def test_an_unexpected_error_leaves_out_that_object_only_but_a_full_disk_stops_t
         (["--test-fraction", "1"], "leave some objects"),
         (["--objects", "0"], "nothing to do"),
         (["--envmap", "absent.hdr"], "no such file"),
+        (["--lights", "absent"], "--lights absent: expected room, random, or a folder"),
+        (["--lights", "room", "--envmap", __file__], "not together with --envmap"),
         (["--test-list", "absent.txt"], "not a readable text file"),
         (["--variant", "fast"], "variant: expected auto"),
     ],
@@ -267,3 +272,43 @@ def test_generating_a_finished_set_again_does_nothing(meshes, finished):
     )
     generate.generate(config)
     assert {path: path.stat().st_mtime_ns for path in (finished / "objects").rglob("*")} == before
+
+
+def test_each_view_may_have_its_own_light_which_is_kept_and_lights_its_picture(meshes, tmp_path):
+    out, again = tmp_path / "set", tmp_path / "again"
+    options = ["--meshes", meshes, *SMALL, "--workers", 1, "--test-fraction", 0.25, "--lights", "room", "random"]
+    for folder in (out, again):
+        assert run("generate", folder, *options) == 0
+    assert tree(out) == tree(again)
+    assert run("check", out) == 0
+    dataset = data_sets.open_dataset(out)
+    assert dataset.settings["environment_map"]["kinds"] == [{"name": "room"}, {"name": "random"}]
+    items = [data_sets.read_object(dataset, name) for name in dataset.splits["train"]]
+    lights = np.concatenate([item.lights for item in items])
+    assert lights.shape[1:] == (32, 64, 3)
+    assert len({light.tobytes() for light in lights}) == len(lights)
+    area = np.sin(np.pi * (np.arange(32) + 0.5) / 32)[:, None, None]
+    np.testing.assert_allclose((lights * area).mean(axis=(1, 2, 3)) / area.mean(), 0.6, rtol=0.02)
+    assert run("pack", out, "--out", tmp_path / "packed") == 0
+    packed = data_sets.read_object(data_sets.open_dataset(tmp_path / "packed"), items[0].name)
+    np.testing.assert_array_equal(packed.lights, items[0].lights)
+    assert items[0].own_lights[0].tables.shape == (7, 32, 64, 3)
+
+
+def test_a_view_is_brighter_where_its_light_is(tmp_path):
+    """A ball in a light of its own is brightest in the picture where the kept map says that it comes from."""
+    (tmp_path / "meshes").mkdir()
+    part = ball(radius=0.5)
+    trimesh.Trimesh(part.positions, part.faces, process=False).export(tmp_path / "meshes" / "ball.ply")
+    options = [*SMALL, "--views", 6, "--workers", 1, "--lights", "random", "--test-fraction", 0, "--val-fraction", 0]
+    assert run("generate", tmp_path / "set", "--meshes", tmp_path / "meshes", *options) == 0
+    item = data_sets.read_object(data_sets.open_dataset(tmp_path / "set"), "ball")
+    agreeing = []
+    for view, light in enumerate(item.lights):
+        weight = np.sin(np.pi * (np.arange(32) + 0.5) / 32)[:, None] * light.mean(axis=-1)
+        across = (weight[..., None] * directions(32)).sum(axis=(0, 1)) @ item.camera.cam_to_world[view][:, :3]
+        image, inside = item.images[view, ..., :3].mean(axis=-1), item.images[view, ..., 3] > 250
+        grid = np.stack(np.meshgrid(np.arange(32) - 15.5, 15.5 - np.arange(32)), axis=-1)
+        gradient = np.linalg.lstsq(grid[inside], image[inside] - image[inside].mean(), rcond=None)[0]
+        agreeing.append(gradient @ across[:2] > 0)
+    assert np.mean(agreeing) > 0.8

@@ -79,7 +79,7 @@ def test_condition_pixels_carry_the_reference_colour_and_hidden_points_leave_non
     asset = checked_box_and_ball()
     surface = surface_points.sample_surface(asset, 500, 0)
     poses = views.random_viewpoints(2, 3.0, np.random.default_rng(3))
-    images, conditions = views.render_views(asset, surface, poses, WHITE_LIGHT, CONFIG, 0)
+    images, conditions = views.render_views(asset, surface, poses, [WHITE_LIGHT], CONFIG, 0)
     scene = views.build_scene(asset, WHITE_LIGHT)
     for view, pose in enumerate(poses):
         seen = np.isin(surface.face, views.visible_faces(scene, pose, CONFIG, view))

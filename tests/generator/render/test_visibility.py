@@ -80,7 +80,7 @@ def test_the_rule_decides_which_condition_pixels_there_are():
     surface = surface_points.sample_surface(WALL_AND_BOX, 2000, 3)
     pose = views.look_at(np.array([0.0, 0.0, 3.0]))[None]
     by_face, by_point = (
-        views.render_views(WALL_AND_BOX, surface, pose, LIGHT, replace(CONFIG, spp=4, visibility=rule), 0)[1]
+        views.render_views(WALL_AND_BOX, surface, pose, [LIGHT], replace(CONFIG, spp=4, visibility=rule), 0)[1]
         for rule in ("face", "point")
     )
     face_pixels, point_pixels = by_face[..., 3] > 0, by_point[..., 3] > 0
