@@ -31,6 +31,7 @@ COARSEST = 3.5  # pixels between points from which on a picture is drawn at half
 FINEST = 0.8  # below which it is drawn at twice the size and averaged
 MOST_DOUBLINGS = 4
 STEP, MARGIN = 32, 8  # pixels of which a window is a multiple, and around the object in it
+LEAST_SLOTS = 2**11  # covered pixels that a table is made for
 GRID = 8  # of which a window's corner is a multiple: the network's levels see the same squares from every camera
 
 
@@ -74,17 +75,8 @@ def render(
     variables: dict | None, scene: SurfelScene, camera: Camera, light: Light, *, config: SurfelConfig
 ) -> Rendering:
     """One view (camera unbatched, in the box) of an encoded object; without variables discs and light alone."""
-    doublings, side = resolution_of(scene.spacing, camera)
-    small = _scaled(camera, doublings, side)
-    box, total = jax.device_get(_extent(scene.surfels, small))
-    plan = _window(box, doublings, side)
-    if total == 0:
-        return _nothing(camera)
-    inside = _seen_through(small, plan)
-    found, slots = splatting.entries(scene.surfels, inside, total=_rounded(int(total), 2**15, splatting.MOST_ENTRIES))
-    slots = _rounded(int(slots), 2**11, inside.height * inside.width)
-    drawn = _shade(variables, found, scene.surfels, light, inside, config=config, doublings=doublings, slots=slots)
-    return _placed(drawn, camera, plan)
+    plan, total = _planned(scene, camera)
+    return _drawn(variables, scene, camera, light, plan, total, LEAST_SLOTS, config)[0]
 
 
 def render_views(
@@ -92,12 +84,51 @@ def render_views(
 ) -> Rendering:
     """Views one after the other (one axis of cameras), in one light or each in its own.
 
-    The sizes of each are counted before it is drawn.
+    They share the sizes of the largest of them, so that few programs are compiled.
     """
     views = [jax.tree.map(lambda x, i=i: x[i], cameras) for i in range(len(cameras.cam_to_world))]
     lights = [light] * len(views) if isinstance(light, Light) else light
-    drawn = [render(variables, scene, view, own, config=config) for view, own in zip(views, lights, strict=True)]
+    plans = [_planned(scene, view) for view in views]
+    kinds = {plan[:2] for plan, _ in plans}  # doublings and side: those of one kind share their sizes
+    largest = {
+        kind: [max(values) for values in zip(*((*p[4:], n) for p, n in plans if p[:2] == kind), strict=True)]
+        for kind in kinds
+    }
+    slots, drawn = dict.fromkeys(kinds, LEAST_SLOTS), []
+    for view, own, (plan, total) in zip(views, lights, plans, strict=True):
+        kind = plan[:2]
+        width, height, most = largest[kind]
+        shared = plan._replace(width=width, height=height)
+        picture_of, slots[kind] = _drawn(variables, scene, view, own, shared, most if total else 0, slots[kind], config)
+        drawn.append(picture_of)
     return jax.tree.map(lambda *x: np.stack(x), *drawn)
+
+
+def _planned(scene: SurfelScene, camera: Camera) -> tuple[Plan, int]:
+    """Where and at what size a view is drawn, and its entries at most."""
+    doublings, side = resolution_of(scene.spacing, camera)
+    box, total = jax.device_get(_extent(scene.surfels, _scaled(camera, doublings, side)))
+    return _window(box, doublings, side), int(total)
+
+
+def _drawn(
+    variables: dict | None,
+    scene: SurfelScene,
+    camera: Camera,
+    light: Light,
+    plan: Plan,
+    total: int,
+    least_slots: int,
+    config: SurfelConfig,
+) -> tuple[Rendering, int]:
+    """A planned view, and the size of its table of pixels."""
+    if total == 0:
+        return _nothing(camera), least_slots
+    inside = _seen_through(_scaled(camera, plan.doublings, plan.side), plan)
+    found, covered = splatting.entries(scene.surfels, inside, total=_rounded(total, 2**15, splatting.MOST_ENTRIES))
+    slots = _rounded(max(int(covered), least_slots), LEAST_SLOTS, inside.height * inside.width)
+    looked = _look(found, scene.surfels, light, inside, slots=slots)
+    return _placed(_shade(variables, *looked, config=config, doublings=plan.doublings), camera, plan), slots
 
 
 def resolution_of(spacing: float, camera: Camera) -> tuple[int, int]:
@@ -166,21 +197,24 @@ def look(
     return seen, maps, lighting.projected(light, jnp.asarray(camera.cam_to_world)[:, :3]), buffer.depth
 
 
-@partial(jax.jit, static_argnames=("config", "doublings", "slots"))
+_look = jax.jit(look, static_argnames="slots")
+
+
+@partial(jax.jit, static_argnames=("config", "doublings"))
 def _shade(
     variables: dict | None,
-    found: splatting.Entries,
-    surfels: Surfels,
-    light: Light,
-    camera: Camera,
+    seen: Float[Array, "height width 27"],
+    maps: Float[Array, "height width 17"],
+    ambient: Float[Array, "9 3"],
+    depth: Float[Array, "height width"],
     *,
     config: SurfelConfig,
     doublings: int,
-    slots: int,
-) -> Float[Array, "height width 5"]:
-    """Colour, opacity and depth along the camera's axis, of the window at the network's resolution."""
-    seen, maps, ambient, depth = look(found, surfels, light, camera, slots=slots)
-    seen, maps = jax.lax.optimization_barrier((seen, maps))
+) -> Float[Array, "h w 5"]:
+    """Colour, opacity and depth along the camera's axis, of the window, doubled.
+
+    A program of its own: the sizes that `look` is compiled for change from picture to picture, the network's seldom.
+    """
     if variables is None:
         outputs = jnp.zeros((1, *(n << doublings for n in seen.shape[:2]), NUM_OUTPUTS))
     else:
