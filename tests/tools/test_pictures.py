@@ -212,7 +212,10 @@ def test_a_turntable_of_the_light_differs_from_frame_to_frame_and_keeps_the_outl
         (["--exposure", "21"], "--exposure must be -20 to 20 stops"),
         (["--light", "absent.hdr"], "absent.hdr: no such file"),
         (["--transparent", "--background", "light"], "--background light: not together with --transparent"),
-        (["--run", "small", "--light", "studio"], "--light: the network of --run small knows the light of its training"),
+        (
+            ["--run", "small", "--light", "studio"],
+            "--light: the network of --run small knows the light of its training",
+        ),
         (["--run", "small", "--turn", "light"], "--turn light: the network of --run small knows the light"),
         (["--run", "small", "--exposure", "1", "--sun", "0", "9"], "--sun, --exposure: the network of --run small"),
     ],

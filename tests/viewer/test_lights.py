@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 import re
-from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -11,6 +10,7 @@ import pytest
 from support import tiny_viewer
 from support.laws import close
 
+from spnr_jax.formats import light_files
 from spnr_jax.formats.light_files import NAMES
 from spnr_jax.kernels.records import Light
 from spnr_jax.method import surfel_renderer
@@ -75,7 +75,8 @@ def test_the_map_stands_behind_the_object_where_it_is_asked_for():
     white, lit = (canvas(Lighting(light="sunset", background=behind)) for behind in ("white", "light"))
     assert (white[:4, :4] == 255).all()
     assert lit[:4, :4].mean() < 240
-    assert np.abs(white - lit)[30, 60].mean() < 2, "the object itself stays"
+    changed = np.abs(white - lit)
+    assert changed[30, 60].mean() < changed[:4, :4].mean() / 2, "the object itself stays"
 
 
 def test_snapshots_and_films_have_the_light_of_the_canvas():
@@ -114,7 +115,7 @@ def test_every_control_changes_the_light(control, value):
 def test_the_sun_alone_has_no_map_and_nothing_asked_is_the_light_of_spnr_render():
     alone = lights.options_of(**QUIET | {"choice": SUN_ALONE})
     assert alone.light is None
-    assert np.asarray(light_of(alone).tables[1]).min() == 0
+    assert np.asarray(light_of(alone).tables[1]).min() < 1e-6
     assert light_of(Lighting()) is not None
     assert lights.made(lights.given(Lighting())).light is None
 
@@ -182,74 +183,11 @@ def test_a_map_of_the_command_line_is_in_the_list_under_its_name(tmp_path):
     mi = pytest.importorskip("mitsuba", reason="maps are read by mitsuba")
     if mi.variant() is None:
         mi.set_variant("scalar_rgb")
-    mi.Bitmap(np.random.default_rng(0).random((8, 16, 3), np.float32)).write(str(tmp_path / "sky.hdr"))
+    with light_files.threads(2):
+        mi.Bitmap(np.random.default_rng(0).random((8, 16, 3), np.float32)).write(str(tmp_path / "sky.hdr"))
     found = lights.given(Lighting(light=str(tmp_path / "sky.hdr"), light_yaw=45.0))
     assert (found.choice, found.options.light_yaw) == ("sky.hdr", 45.0)
     uploaded = uploads.read_uploaded_map("sky.HDR", (tmp_path / "sky.hdr").read_bytes())
     close(lights.made(found).light.tables, uploaded.turned(45).tables, rtol=1e-5)
     with pytest.raises(ValueError, match="no such file"):
         lights.given(Lighting(light=str(tmp_path / "absent.hdr")))
-
-
-# the browser's folder, without a browser
-
-
-class Gui:
-    """What a browser's GUI does for controls: they keep a value and call back."""
-
-    def __init__(self):
-        self.controls = {}
-
-    def add(self, label, *rest, initial_value=None):
-        value = rest[-1] if initial_value is None else initial_value
-        moved = []
-        control = SimpleNamespace(value=value, options=rest[0], on_update=moved.append, moved=moved)
-        self.controls[label] = control
-        return control
-
-    add_dropdown = add_slider = add_checkbox = add
-
-    def move(self, label, value):
-        self.controls[label].value = value
-        for callback in self.controls[label].moved:
-            with pytest.raises(StopIteration):
-                callback(SimpleNamespace(client="a person")).send(None)
-
-
-@pytest.fixture
-def folder():
-    """(the GUI, the lights as they are now, the controls)."""
-    pytest.importorskip("viser", reason="the viewer's extra is not installed: pip install 'spnr-jax[viewer]'")
-    from spnr_jax.viewer.light_controls import LightControls
-
-    gui, now = Gui(), SimpleNamespace(lights=Lights(), refused=[])
-
-    def change(how):
-        now.lights = how(now.lights)
-
-    def slowly(work):
-        try:
-            work()
-        except ValueError as error:
-            now.refused.append(str(error))
-
-    return gui, now, LightControls(gui, now.lights, change, slowly)
-
-
-def test_the_controls_move_the_lights_and_a_refusal_keeps_the_old(folder):
-    gui, now, controls = folder
-    moves = {"Light": "studio", "Turned": 90.0, "Sun": True, "Azimuth": 10.0, "Elevation": 5.0, "Exposure": 2.0}
-    for label, value in (moves | {"Behind": "light"}).items():
-        gui.move(label, value)
-    assert set(gui.controls) == {*moves, "Behind"}
-    wanted = Lighting(light="studio", light_yaw=90.0, sun=(10.0, 5.0), exposure=2.0, background="light")
-    assert now.lights.options == wanted
-    gui.move("Exposure", float("nan"))
-    assert len(now.refused) == 1
-    assert now.lights.options == wanted
-    gui.controls["Exposure"].value = 2.0
-    now.lights = lights.with_map(now.lights, "a.hdr", lopsided())
-    controls.show(state(lights=now.lights))
-    assert (gui.controls["Light"].value, "a.hdr" in gui.controls["Light"].options) == ("a.hdr", True)
-    gui.move("Turned", 0.0)
-    assert now.lights.choice == "a.hdr"
