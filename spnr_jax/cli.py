@@ -24,6 +24,7 @@ from spnr_jax.config import TrainConfig
 from spnr_jax.devices import allocator
 from spnr_jax.formats.debugging import show_stack, without_debug
 from spnr_jax.model_config import SurfelConfig
+from spnr_jax.tools.light_options import Lighting
 from spnr_jax.tools.render_command import Render
 
 BOX = r"[╭╮╰╯│─•]+|__tyro-dummy-inner__\."  # what tyro draws around an error, and its name for the whole command
@@ -120,7 +121,9 @@ class View:
     cloud: tyro.conf.Positional[Path]
     """What `spnr render` reads."""
     run: Path | None = None
-    """Network that renders: `small` or `tiny` of the package, a run folder, a file of weights (default: small)."""
+    """As for `spnr render`."""
+    lighting: tyro.conf.OmitArgPrefixes[Lighting] = Lighting()
+    """The light at first; of the networks of the package `surfels` alone takes another than that of its training."""
     host: str = "127.0.0.1"
     """Address to listen on; another than this machine's own opens the viewer to a network."""
     port: int = 8080

@@ -70,6 +70,12 @@ def test_the_example_without_this_package_runs_on_what_the_command_writes(workpl
     assert "spnr_jax" not in names
 
 
+def test_the_lights_of_the_page_about_them_are_made_as_it_says():
+    names = execute(DOCS / "light.md")
+    assert names["light"].tables.shape == names["studio"].tables.shape
+    assert float(names["light"].tables.min()) > 0.1, "the ambient light is everywhere"
+
+
 def test_there_are_twelve_functions_each_with_an_example_below_it():
     parts = IDENTIFIER.split((DOCS / "api.md").read_text())
     assert len(parts[1::2]) == 12

@@ -9,7 +9,6 @@ import math
 from typing import no_type_check
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int, UInt8
@@ -176,7 +175,8 @@ class Light:
         """
         columns = -degrees / 360 * self.tables.shape[-2]  # azimuths run against them
         whole, part = math.floor(columns), columns - math.floor(columns)
-        near, far = (jnp.roll(jnp.asarray(self.tables), whole + i, axis=-2) for i in (0, 1))
+        places = np.arange(self.tables.shape[-2]) - whole  # indices: jnp.roll is compiled anew for every whole number
+        near, far = (self.tables[..., (places - i) % len(places), :] for i in (0, 1))
         return Light(tables=(1 - part) * near + part * far)
 
 

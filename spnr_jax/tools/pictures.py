@@ -13,29 +13,22 @@
 Depth and opacity have the resolution of the volume rendering, which an upsampler doubles for the image.
 """
 
-import dataclasses
 import io
 import json
 import os
 from collections.abc import Callable, Iterator
-from functools import reduce
-from operator import add
 from pathlib import Path
 
-import jax.numpy as jnp
 import numpy as np
 from PIL import Image
 
 from spnr_jax.formats import clouds, images
 from spnr_jax.formats.clouds import PlacedCloud
-from spnr_jax.formats.light_files import read_light
-from spnr_jax.kernels.cameras import camera_rays
-from spnr_jax.kernels.colors import linear_to_srgb
 from spnr_jax.kernels.records import Camera, Light, Rendering
 from spnr_jax.method.model import Model, Volume
 from spnr_jax.model_config import ModelConfig
-from spnr_jax.surfels.lighting import background, sun
 from spnr_jax.tools import depth_maps
+from spnr_jax.tools.chosen_light import before, check_takes_light, light_of_options
 from spnr_jax.tools.render_command import Render
 from spnr_jax.training.weights import load, suited_to
 
@@ -44,7 +37,6 @@ INVISIBLE = 1 / 255  # opacity below which a pixel has no colour of its own
 # The surface lies where a voxel of the network stops this share of the light.  Silhouettes of the mesh and of the
 # opacity then agree to an IoU of 0.92 (10 real objects); with 0.2 and 0.5 to 0.88 and 0.78.
 MESH_OPACITY = 0.3
-SUN = (1.6, 1.5, 1.35)  # irradiance over pi of what faces the sun of --sun, slightly warm
 SOLID = "small"  # network of the package that has a density
 
 
@@ -52,7 +44,9 @@ def render_file(options: Render, note: Callable[[str], None]) -> Iterator[str]:
     """Writes what the options ask for; yields a line about each file, `note` gets the assumptions about the cloud."""
     _check_writable(options.out)
     named = load(options.run) if options.run else None  # a run that is none is said before the cloud is read
-    light = light_of_options(options)
+    if named:
+        check_takes_light(named, options.asked_of_light, options.run)
+    light = light_of_options(options.lighting) if options.asked_of_light else None
     placed = clouds.place_cloud(
         options.cloud, num_points=options.num_points, up=options.up, seed=options.seed, report=note
     )
@@ -63,7 +57,8 @@ def render_file(options: Render, note: Callable[[str], None]) -> Iterator[str]:
     frames = []
     for i, azimuth in enumerate(FIRST_AZIMUTH + np.arange(options.views) * 360 / max(options.views, 1)):
         camera = model.camera(volume, float(azimuth), options.elevation, options.resolution)
-        rendering = before(options, model.render(volume, camera, options.quality, light), camera, light)
+        rendering = model.render(volume, camera, options.quality, light)
+        rendering = before(options.lighting.background, rendering, camera, light)
         stem = f"{name}_{i:03d}"
         for suffix, data in still_files(rendering, camera, volume, options):
             images.write_whole(Path(stem + suffix), data)
@@ -111,27 +106,8 @@ def turntable_frames(model: Model, volume: Volume, options: Render, light: Light
         azimuth, shone = (FIRST_AZIMUTH, light and light.turned(turn)) if options.turn == "light" else (turn, light)
         camera = model.camera(volume, float(azimuth), options.elevation, options.resolution)
         rendering = model.render(volume, camera, options.quality, shone)
-        frames.append(np.asarray(before(options, rendering, camera, shone).image))
+        frames.append(np.asarray(before(options.lighting.background, rendering, camera, shone).image))
     return frames
-
-
-def light_of_options(options: Render) -> Light | None:
-    """The light that the options ask for; None where they say nothing of it."""
-    if not options.lit:
-        return None
-    parts = [read_light(options.light or "room").turned(options.light_yaw)] if options.light or not options.sun else []
-    parts += [sun(*options.sun, color=SUN)] if options.sun else []
-    return 2.0**options.exposure * reduce(add, parts)
-
-
-def before(options: Render, rendering: Rendering, camera: Camera, light: Light | None) -> Rendering:
-    """The picture before what the options want behind it, in place of white."""
-    if options.background == "white" or light is None:
-        return rendering
-    towards = [jnp.asarray(x) for x in np.moveaxis(np.asarray(camera_rays(camera).directions), -1, 0)]
-    behind = np.asarray(linear_to_srgb(jnp.minimum(jnp.stack(background(light, towards), axis=-1), 1)))
-    image = np.asarray(rendering.image) + (1 - np.asarray(rendering.acc))[..., None] * (behind - 1)
-    return dataclasses.replace(rendering, image=image)
 
 
 def cameras_document(frames: list[dict], placed: PlacedCloud, volume: Volume) -> dict:

@@ -6,7 +6,8 @@ from typing import Literal
 
 import tyro
 
-MOST_STOPS = 20
+from spnr_jax.tools.light_options import Lighting
+
 Output = Literal["image", "depth", "opacity"]
 
 
@@ -41,17 +42,8 @@ class Render:
     """What is written of each view; depth comes coloured, as .npy and as 16-bit .png."""
     transparent: bool = False
     """Stills on a transparent background instead of white (straight alpha)."""
-    light: str | None = None
-    """Light: an environment map (.hdr .exr), or room, studio, sunset, overcast, night of the package (default: room, or
-    none where there is a sun)."""
-    light_yaw: float = 0.0
-    """Degrees that the map is turned about the up axis."""
-    sun: tuple[float, float] | None = None
-    """Azimuth and elevation, in degrees, of a sun: added to the light."""
-    exposure: float = 0.0
-    """Stops by which the light is brighter (negative: darker)."""
-    background: Literal["white", "light"] = "white"
-    """What is behind the object: white, or the light's map, blurred."""
+    lighting: tyro.conf.OmitArgPrefixes[Lighting] = Lighting()
+    """The light; of the networks of the package `surfels` alone takes another than that of its training."""
     turntable: Literal["gif", "mp4", "none"] = "gif"
     """Format of the turntable."""
     turn: Literal["object", "light"] = "object"
@@ -69,10 +61,9 @@ class Render:
     """Places along each side of the grid of --mesh and --density."""
 
     @property
-    def lit(self) -> bool:
-        """Whether anything is asked of the light, which networks of rays know by heart."""
-        asked = self.light, self.sun, self.light_yaw or None, self.exposure or None
-        return any(x is not None for x in asked) or self.background == "light" or self.turn == "light"
+    def asked_of_light(self) -> tuple[str, ...]:
+        """Names of the options that need a network that takes a light."""
+        return (*self.lighting.asked, *(("--turn light",) if self.turn == "light" else ()))
 
     def __post_init__(self) -> None:
         """ValueError names the option that makes no sense."""
@@ -85,11 +76,7 @@ class Render:
             raise ValueError(f"--resolution must be a multiple of 4 of at least 16, got {self.resolution}")
         if not -90 <= self.elevation <= 90:
             raise ValueError(f"--elevation must be -90 to 90 degrees, got {self.elevation:g}")
-        if self.sun and not -90 <= self.sun[1] <= 90:
-            raise ValueError(f"--sun: expected an azimuth and an elevation of -90 to 90 degrees, got {self.sun}")
-        if not abs(self.exposure) <= MOST_STOPS:
-            raise ValueError(f"--exposure must be -{MOST_STOPS} to {MOST_STOPS} stops, got {self.exposure:g}")
-        if self.transparent and self.background != "white":
+        if self.transparent and self.lighting.background != "white":
             raise ValueError("--background light: not together with --transparent; give one of them")
         if not 8 <= self.grid_resolution <= 512:
             raise ValueError(f"--grid-resolution must be 8 to 512, got {self.grid_resolution}")

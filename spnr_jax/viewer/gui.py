@@ -14,7 +14,9 @@ import numpy as np
 import viser
 
 from spnr_jax.method.model import Model, Quality
-from spnr_jax.viewer import scene, session, uploads, viewpoint
+from spnr_jax.tools.chosen_light import takes_light
+from spnr_jax.viewer import lights, scene, session, uploads, viewpoint
+from spnr_jax.viewer.light_controls import ONE_LIGHT, LightControls
 from spnr_jax.viewer.loop import Loop
 from spnr_jax.viewer.picture import LAYERS
 from spnr_jax.viewer.scene import Material, Scene
@@ -22,16 +24,6 @@ from spnr_jax.viewer.session import State
 
 LONGEST_NOTE = 500  # characters
 MOVING_JPEG, RESTING_JPEG = 75, 92  # qualities of the pictures sent
-# A file dropped anywhere on the page goes into the file input of the upload button.
-DROP = """<img alt="" style="display:none" src="data:image/gif;base64,R0lGODlhAQABAAAAACwAAAAAAQABAAAC"
-onload="document.body.ondragover = event => event.preventDefault();
-document.body.ondrop = event => {
-  if (!event.dataTransfer.files.length) return;
-  event.preventDefault();
-  const input = document.querySelector('input[type=file]');
-  input.files = event.dataTransfer.files;
-  input.dispatchEvent(new Event('change', {bubbles: true}));
-};">"""
 HELP = "Drop a file anywhere on the page. Drag to orbit; Shift+drag selects points, Ctrl+Shift+drag adds to them."
 
 
@@ -47,19 +39,22 @@ class Browser:
     """One browser: its controls, and the loop that draws for it.  `network` keeps two from drawing at once."""
 
     def __init__(
-        self, client: viser.ClientHandle, model: Model, first: Scene, reading: Reading, network: threading.Lock
+        self, client: viser.ClientHandle, model: Model, first: State, reading: Reading, network: threading.Lock
     ) -> None:
         self._client, self._model, self._reading, self._network = client, model, reading, network
         self._measured: dict[tuple[Quality, int], float] = {}
         self._outlined = False
         self._playing = threading.Event()
         available = session.sizes(model)
-        self.loop = Loop(State(scene=first, size=available[1]), self._draw)
+        self.loop = Loop(first, self._draw)
         gui = client.gui
         with gui.add_folder("View"):
             self._add_view(gui, available)
         with gui.add_folder("Materials"):
             self._add_materials(gui)
+        self._light: LightControls | None = None
+        with gui.add_folder("Light"):
+            self._add_light(gui)
         with gui.add_folder("Camera path"):
             self._add_path(gui)
         with gui.add_folder("File"):
@@ -181,6 +176,16 @@ class Browser:
         )
         return state
 
+    def _add_light(self, gui: viser.GuiApi) -> None:
+        if not takes_light(self._model):
+            gui.add_markdown(ONE_LIGHT)
+            return
+        self._light = LightControls(gui, self.loop.state.lights, self._change_lights, self._slowly)
+        self._add_upload(gui, "Open a map (.hdr .exr)")
+
+    def _change_lights(self, change: Callable[[lights.Lights], lights.Lights]) -> None:
+        self.loop.submit(lambda state: dataclasses.replace(state, lights=change(state.lights)))
+
     def _add_path(self, gui: viser.GuiApi) -> None:
         keyframes = gui.add_button_group("Keyframes", ("add", "clear"))
         count = gui.add_markdown("no keyframes")
@@ -243,17 +248,21 @@ class Browser:
 
     def _add_files(self, gui: viser.GuiApi) -> None:
         gui.add_markdown(HELP)
-        gui.add_html(DROP)
-        upload = gui.add_upload_button("Open a file")
+        gui.add_html(uploads.DROP)
+        self._add_upload(gui, "Open a file")
         snapshot = gui.add_button("Snapshot")
-
-        @upload.on_upload
-        def _(event: viser.GuiEvent) -> None:
-            self._slowly(lambda: self._open(upload.value))
 
         @snapshot.on_click
         def _(_: Any) -> None:
             self._slowly(self._snapshot)
+
+    def _add_upload(self, gui: viser.GuiApi, label: str) -> None:
+        """A button that opens files, clouds and maps alike: which one gets a dropped file is the page's choice."""
+        upload = gui.add_upload_button(label)
+
+        @upload.on_upload
+        def _(event: viser.GuiEvent) -> None:
+            self._slowly(lambda: self._open(upload.value))
 
     def _snapshot(self) -> None:
         state = self.loop.state
@@ -261,12 +270,23 @@ class Browser:
         self._client.send_file_download(name, session.snapshot(self._model, state), save_immediately=True)
 
     def _open(self, file: viser.UploadedFile) -> None:
+        if uploads.is_map(file.name):
+            self._open_map(file)
+            return
         notes: list[str] = []
         cloud = uploads.read_upload(file.name, file.content, **dataclasses.asdict(self._reading), report=notes.append)
         opened = scene.open_scene(self._model, cloud, uploads.display_name(file.name))
         self._change_scene(lambda old: opened)
         self.loop.submit(self._show_materials)
         self._note(opened.name, "; ".join(notes) or f"{len(opened.selected)} points")
+
+    def _open_map(self, file: viser.UploadedFile) -> None:
+        if self._light is None:
+            raise ValueError(ONE_LIGHT)
+        name, light = uploads.display_name(file.name), uploads.read_uploaded_map(file.name, file.content)
+        self._change_lights(lambda old: lights.with_map(old, name, light))
+        self.loop.submit(self._light.show)
+        self._note(name, "is the light now")
 
 
 def _pace(measured: Mapping[tuple[Quality, int], float]) -> str:

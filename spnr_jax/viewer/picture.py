@@ -14,8 +14,9 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from spnr_jax.formats import images
-from spnr_jax.kernels.records import Camera, Rendering
+from spnr_jax.kernels.records import Camera, Light, Rendering
 from spnr_jax.method.model import Model, Quality
+from spnr_jax.tools.chosen_light import before
 from spnr_jax.viewer import viewpoint
 from spnr_jax.viewer.scene import Scene
 from spnr_jax.viewer.viewpoint import View
@@ -48,17 +49,21 @@ def draw(
     size: int,
     longest: int,
     labels: bool = True,
+    *,
+    light: Light | None = None,
+    background: str = "white",
 ) -> Drawn:
     """The canvas with its panes; the network draws squares of `size`, None as quality leaves its panes empty.
 
-    `longest` bounds the pixels of the canvas's longer side; labels name the panes' layers.
+    `longest` bounds the pixels of the canvas's longer side; labels name the panes' layers; `background` is what stands
+    behind the picture, white or the light's map.
     """
     width, height = viewpoint.pane_size(view, len(panes), longest)
     rendering, milliseconds = None, None
     if quality is not None and any(layer != "points" for layer in panes):
         begin = time.perf_counter()
         camera = viewpoint.square_camera(view, scene.volume, width, height, size)
-        rendering = model.render(scene.volume, camera, quality)
+        rendering = before(background, model.render(scene.volume, camera, quality, light), camera, light)
         squares = {layer: _square(rendering, layer) for layer in panes if layer != "points"}
         milliseconds = 1000 * (time.perf_counter() - begin)
     drawn = []

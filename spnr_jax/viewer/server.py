@@ -5,6 +5,7 @@ address, which any browser could ask for, is closed.
 """
 
 import contextlib
+import dataclasses
 import errno
 import io
 import socket
@@ -16,10 +17,12 @@ import viser
 
 from spnr_jax.formats import clouds
 from spnr_jax.method.model import FIELD_OF_VIEW, Model
+from spnr_jax.tools.chosen_light import check_takes_light
+from spnr_jax.tools.light_options import Lighting
 from spnr_jax.training.weights import load, suited_to
-from spnr_jax.viewer import session, uploads
+from spnr_jax.viewer import lights, session, uploads
 from spnr_jax.viewer.gui import Browser, Reading
-from spnr_jax.viewer.scene import Scene, open_scene
+from spnr_jax.viewer.scene import open_scene
 from spnr_jax.viewer.session import State
 from spnr_jax.viewer.viewpoint import View
 
@@ -41,7 +44,7 @@ class Server(viser.ViserServer):
 class Viewer:
     """A running server; `url` is where it listens, `lines` what a person should know about it."""
 
-    def __init__(self, model: Model, first: Scene, reading: Reading, host: str, port: int) -> None:
+    def __init__(self, model: Model, first: State, reading: Reading, host: str, port: int) -> None:
         _check_free(host, port)
         self._model, self._first, self._reading = model, first, reading
         self._network = threading.Lock()
@@ -52,9 +55,9 @@ class Viewer:
             self.stop()
             raise ValueError(_in_use(host, port))  # taken in the moment since it was found free
         self.url = f"http://{f'[{host}]' if ':' in host else host}:{self._server.get_port()}"
-        self.lines = [f"{self.url} shows {first.name} (Ctrl-C stops)"]
+        self.lines = [f"{self.url} shows {first.scene.name} (Ctrl-C stops)"]
         if host not in LOOPBACK:
-            self.lines.append(EXPOSED.format(host=host, port=self._server.get_port(), name=first.name))
+            self.lines.append(EXPOSED.format(host=host, port=self._server.get_port(), name=first.scene.name))
         self._server.gui.configure_theme(show_share_button=False, show_logo=False)
         self._server.gui.main_panel.dock_right()
         self._server.scene.set_up_direction("+y")
@@ -84,7 +87,7 @@ class Viewer:
     def _warm_up(self) -> None:
         """Compile what the first browser will ask for while it still loads the page."""
         view = View(position=np.array([0.0, 0.0, 3.0]), rotation=np.eye(3), field_of_view=1.0, width=64, height=64)
-        state = State(scene=self._first, view=view, size=session.sizes(self._model)[1], panes=("picture",))
+        state = dataclasses.replace(self._first, view=view, panes=("picture",))
         for moving in (True, False):
             with self._network:
                 session.draw(self._model, state, moving)
@@ -98,17 +101,22 @@ class Viewer:
 
 
 def open_viewer(
-    cloud: Path, run: Path | None, *, host: str, port: int, num_points: int, up: str
+    cloud: Path, run: Path | None, *, host: str, port: int, num_points: int, up: str, lighting: Lighting
 ) -> tuple[Viewer, list[str]]:
     """A running viewer of a file with a run's network, and what was assumed about the file, a line each.
 
     ValueError for a port that is in use, a host that is not of this machine, and whatever cannot be read.
     """
     _check_free(host, port)  # before the seconds that reading takes
+    named = load(run) if run else None
+    if named:
+        check_takes_light(named, lighting.asked, run)
+    shining = lights.given(lighting)
     notes: list[str] = []
     points = clouds.read_cloud(cloud, num_points=num_points, up=up, report=notes.append)
-    model = load(run or suited_to(len(points.positions)))
-    first = open_scene(model, points, uploads.display_name(cloud.name))
+    model = named or load("surfels" if lighting.asked else suited_to(len(points.positions)))
+    scene = open_scene(model, points, uploads.display_name(cloud.name))
+    first = State(scene=scene, size=session.sizes(model)[1], lights=shining)
     return Viewer(model, first, Reading(num_points=num_points, up=up), host, port), notes
 
 

@@ -17,6 +17,7 @@ from spnr_jax.formats import images
 from spnr_jax.method.model import SAMPLES, Model, Quality
 from spnr_jax.viewer import camera_path, picture
 from spnr_jax.viewer.camera_path import Keyframe
+from spnr_jax.viewer.lights import Lights, made
 from spnr_jax.viewer.picture import LAYERS, Drawn, Layer
 from spnr_jax.viewer.scene import Scene, encoded, select_rectangle
 from spnr_jax.viewer.viewpoint import FARTHEST, View, in_pane, pane_camera, pane_size
@@ -41,6 +42,7 @@ class State:
     quality: Quality = "best"
     size: int
     """Pixels along a side of the network's square at rest; while the camera moves it is what the network learnt."""
+    lights: Lights = Lights()
     keyframes: tuple[Keyframe, ...] = ()
 
 
@@ -60,16 +62,26 @@ def chosen(model: Model, layers: Sequence[Any], quality: Any, size: Any) -> dict
 
 
 def draw(model: Model, state: State, moving: bool) -> tuple[State, Drawn | None]:
-    """(the state with its cloud encoded, the canvas): nothing before the browser said where it looks from.
+    """(the state with its cloud encoded and its light made, the canvas): nothing before the browser said its view.
 
     Moving: `draft`, at the network's own size.  At rest: the chosen quality and size.
     """
     if state.view is None:
         return state, None
-    view, state = state.view, dataclasses.replace(state, scene=encoded(model, state.scene))
+    view, state = state.view, prepared(model, state)
     quality, size = (MOVING, sizes(model)[0]) if moving else (state.quality, state.size)
     longest = MOVING_LONGEST if moving else LONGEST
-    return state, picture.draw(model, state.scene, view, state.panes, quality, size, longest)
+    return state, picture.draw(model, state.scene, view, state.panes, quality, size, longest, **shone(state))
+
+
+def prepared(model: Model, state: State) -> State:
+    """The state with a volume of the cloud and the light of the controls as they are now."""
+    return dataclasses.replace(state, scene=encoded(model, state.scene), lights=made(state.lights))
+
+
+def shone(state: State) -> dict[str, Any]:
+    """What `picture.draw` takes of the light of a prepared state."""
+    return {"light": state.lights.light, "background": state.lights.options.background}
 
 
 def outline(model: Model, state: State) -> np.ndarray | None:
@@ -83,8 +95,9 @@ def snapshot(model: Model, state: State) -> bytes:
     """The canvas at rest as a PNG file."""
     if state.view is None:
         raise ValueError("nothing was drawn yet")
-    scene = encoded(model, state.scene)
-    return images.png(picture.draw(model, scene, state.view, state.panes, state.quality, state.size, LONGEST).image)
+    view, state = state.view, prepared(model, state)
+    drawn = picture.draw(model, state.scene, view, state.panes, state.quality, state.size, LONGEST, **shone(state))
+    return images.png(drawn.image)
 
 
 def keyframe(view: View, target: np.ndarray) -> Keyframe:
@@ -119,13 +132,12 @@ def film(
         raise ValueError("nothing was drawn yet")
     if kind not in FILMS or layer not in LAYERS:  # the kind becomes part of a file's name
         raise ValueError(f"a film is one of {', '.join(FILMS)}, of one of {', '.join(LAYERS)}")
-    scene, route = encoded(model, state.scene), path_poses(state, seconds)
+    begin, route, state = state.view, path_poses(state, seconds), prepared(model, state)
     frames = []
     for i, (position, rotation) in enumerate(route):
-        view = dataclasses.replace(
-            state.view, position=position, rotation=rotation, width=state.size, height=state.size
-        )
-        frames.append(picture.draw(model, scene, view, (layer,), state.quality, state.size, state.size, False).image)
+        view = dataclasses.replace(begin, position=position, rotation=rotation, width=state.size, height=state.size)
+        square = (state.quality, state.size, state.size, False)
+        frames.append(picture.draw(model, state.scene, view, (layer,), *square, **shone(state)).image)
         progress((i + 1) / len(route))
     with tempfile.TemporaryDirectory(prefix="spnr-view-") as folder:
         path, reason = images.write_turntable(Path(folder) / f"path.{kind}", frames, FRAMES_PER_SECOND)

@@ -8,8 +8,10 @@ import trimesh
 from PIL import Image
 from support import tiny_dataset
 
+from spnr_jax import cli
 from spnr_jax.formats.up_axis import ROTATIONS
 from spnr_jax.tools import pictures
+from spnr_jax.tools.light_options import Lighting
 from spnr_jax.tools.render_command import Render
 
 OPTIONS = {"views": 2, "resolution": 24, "num_points": 30, "up": "y", "frames": 5}
@@ -153,3 +155,76 @@ def test_a_cloud_of_one_point_gives_pictures(tmp_path):
 def test_options_without_sense_are_refused_by_their_name_before_anything_is_read(option, expected, tmp_path):
     with pytest.raises(ValueError, match=expected):
         rendered(tmp_path / "missing.xyz", tmp_path / "out", **option)
+
+
+# the light
+
+
+@pytest.fixture(scope="module")
+def in_light(tmp_path_factory):
+    """Renders one cloud by the package's network of surfels, without its CNN: one still, in what light is asked for."""
+    folder = tmp_path_factory.mktemp("lit")
+    cloud = cloud_file(folder)
+
+    def render(out, **options):
+        lighting = Lighting(**{name: options.pop(name) for name in tuple(options) if hasattr(Lighting, name)})
+        common = {"run": "surfels", "quality": "draft", "views": 1, "turntable": "none", "lighting": lighting}
+        rendered(cloud, folder / out, **common | options)
+        return folder / out
+
+    return render
+
+
+def test_light_sun_exposure_and_background_change_the_still_and_not_its_opacity(in_light):
+    asked = {
+        "as_it_is": {}, "studio": {"light": "studio"}, "bright": {"exposure": 1.0}, "sun": {"sun": (30.0, 40.0)},
+        "turned": {"light_yaw": 120.0}, "behind": {"background": "light"},
+    }  # fmt: skip
+    folders = {name: in_light(name, **options) for name, options in asked.items()}
+    stills = {name: shown(out / "chair_000.png").astype(int) for name, out in folders.items()}
+    for name, still in stills.items():
+        assert name == "as_it_is" or np.abs(still - stills["as_it_is"]).max() > 8, name
+    assert stills["bright"].mean() > stills["as_it_is"].mean()
+    assert stills["behind"][0, 0].min() < 250 < stills["as_it_is"][0, 0].min()
+    opacities = {(out / "chair_000_opacity.png").read_bytes() for out in folders.values()}
+    assert len(opacities) == 1
+
+
+def test_a_turntable_of_the_light_differs_from_frame_to_frame_and_keeps_the_outline(in_light):
+    out = in_light("turning", turn="light", views=0, turntable="gif", frames=3, exposure=-1.0)
+    with Image.open(out / "chair_turntable.gif") as film:
+        frames = []
+        for i in range(film.n_frames):
+            film.seek(i)
+            frames.append(np.asarray(film.convert("RGB")).astype(int))
+    assert len(frames) == 3
+    assert all(np.abs(frames[0] - other).max() > 8 for other in frames[1:])
+    outlines = [(frame > 250).all(axis=-1) for frame in frames]
+    assert all((outline == outlines[0]).mean() > 0.95 for outline in outlines)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["--sun", "30", "95"], "--sun: expected an azimuth and an elevation of -90 to 90 degrees"),
+        (["--sun", "nan", "5"], "--sun: expected an azimuth"),
+        (["--light-yaw", "inf"], "--light-yaw must be a number of degrees"),
+        (["--exposure", "21"], "--exposure must be -20 to 20 stops"),
+        (["--light", "absent.hdr"], "absent.hdr: no such file"),
+        (["--transparent", "--background", "light"], "--background light: not together with --transparent"),
+        (
+            ["--run", "small", "--light", "studio"],
+            "--light: the network of --run small knows the light of its training",
+        ),
+        (["--run", "small", "--turn", "light"], "--turn light: the network of --run small knows the light"),
+        (["--run", "small", "--exposure", "1", "--sun", "0", "9"], "--sun, --exposure: the network of --run small"),
+    ],
+)
+def test_light_that_cannot_be_is_one_line_and_code_2_before_the_cloud_is_read(arguments, expected, tmp_path, capsys):
+    with pytest.raises(SystemExit) as left:
+        cli.main(["render", str(tmp_path / "missing.ply"), "--out", str(tmp_path / "out"), *arguments])
+    said = capsys.readouterr().err
+    assert left.value.code == 2
+    assert expected in said
+    assert said.count("\n") == 1
+    assert "missing.ply" not in said

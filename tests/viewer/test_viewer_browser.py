@@ -18,6 +18,7 @@ pytest.importorskip("viser", reason="the viewer's extra is not installed: pip in
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install playwright")
 
 from spnr_jax import cli  # noqa: E402
+from spnr_jax.tools.light_options import Lighting  # noqa: E402
 from spnr_jax.viewer import server  # noqa: E402
 from spnr_jax.viewer.gui import Reading  # noqa: E402
 
@@ -34,7 +35,7 @@ needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on PAT
 
 def viewer(host="127.0.0.1", port=0):
     reading = Reading(num_points=100, up="y")
-    return server.Viewer(tiny_viewer.model(), tiny_viewer.scene(), reading, host, port)
+    return server.Viewer(tiny_viewer.model(), tiny_viewer.state(view=None), reading, host, port)
 
 
 @pytest.fixture(scope="module")
@@ -239,7 +240,7 @@ def test_two_browsers_have_their_own_camera_materials_and_file(chromium, running
 def test_a_port_in_use_is_refused_in_one_line_before_anything_is_read(capsys, tmp_path):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        missing = {"cloud": tmp_path / "no.ply", "run": tmp_path, "num_points": 10, "up": "y"}
+        missing = {"cloud": tmp_path / "no.ply", "run": tmp_path, "num_points": 10, "up": "y", "lighting": Lighting()}
         assert cli.guarded(lambda: server.open_viewer(host="127.0.0.1", port=port, **missing), "spnr") == 2
     assert capsys.readouterr().err == (
         f"spnr: --port {port} is in use on 127.0.0.1; choose another, or 0 for any free one\n"
