@@ -8,6 +8,7 @@ Clouds, cameras and depths are in the cloud's own units; the transform into the 
 """
 
 import dataclasses
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Any, Literal
@@ -103,6 +104,27 @@ class Model:
             config = without_refiner(config)
         render = partial(_render, config=config, side=side)
         return by_all_devices(render, self._spread, volume.scene, volume.centre, volume.scale, camera)
+
+    def render_each(
+        self,
+        volume: Volume,
+        views: Sequence[Camera],
+        quality: Quality = "best",
+        lights: Sequence[Light | None] | None = None,
+    ) -> Iterator[Rendering]:
+        """The object from several cameras, one after the other, each in its light: for films, whose frames are alike.
+
+        The network over surfels gives its pictures common sizes, so that it is compiled once and not for most of them.
+        """
+        lights = lights or [None] * len(views)
+        if not isinstance(self.config, SurfelConfig):
+            yield from (self.render(volume, view, quality, light) for view, light in zip(views, lights, strict=True))
+            return
+        inside = [_in_box(view, volume.centre, volume.scale) for view in views]
+        shone = [lighting.room_light() if light is None else light for light in lights]
+        variables = None if quality == "draft" else self.variables
+        for drawn in surfel_renderer.render_each(variables, volume.scene, inside, shone, config=self.config):
+            yield dataclasses.replace(drawn, depth=drawn.depth / np.asarray(volume.scale))
 
     def _shaded(self, volume: Volume, camera: Camera, quality: Quality, light: Light) -> Rendering:
         """Views by the network over surfels."""

@@ -8,7 +8,7 @@ the network, so its work follows the points and the pixels that they cover.  Onl
 Sizes that shape arrays are counted first and rounded up to few values: each new one is compiled once.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -82,26 +82,31 @@ def render(
 def render_views(
     variables: dict | None, scene: SurfelScene, cameras: Camera, light: Light | Sequence[Light], *, config: SurfelConfig
 ) -> Rendering:
-    """Views one after the other (one axis of cameras), in one light or each in its own.
-
-    They share the sizes of the largest of them, so that few programs are compiled.
-    """
+    """Views (one axis of cameras) in one light or each in its own."""
     views = [jax.tree.map(lambda x, i=i: x[i], cameras) for i in range(len(cameras.cam_to_world))]
     lights = [light] * len(views) if isinstance(light, Light) else light
+    return jax.tree.map(lambda *x: np.stack(x), *render_each(variables, scene, views, lights, config=config))
+
+
+def render_each(
+    variables: dict | None,
+    scene: SurfelScene,
+    views: Sequence[Camera],
+    lights: Sequence[Light],
+    *,
+    config: SurfelConfig,
+) -> Iterator[Rendering]:
+    """Views one after the other; they share the sizes of the largest of them, so that few programs are compiled."""
     plans = [_planned(scene, view) for view in views]
-    kinds = {plan[:2] for plan, _ in plans}  # doublings and side: those of one kind share their sizes
-    largest = {
-        kind: [max(values) for values in zip(*((*p[4:], n) for p, n in plans if p[:2] == kind), strict=True)]
-        for kind in kinds
-    }
-    slots, drawn = dict.fromkeys(kinds, LEAST_SLOTS), []
-    for view, own, (plan, total) in zip(views, lights, plans, strict=True):
-        kind = plan[:2]
-        width, height, most = largest[kind]
+    largest: dict[tuple, np.ndarray] = {}
+    for plan, total in plans:  # those of one resolution share their sizes
+        sizes = np.array([plan.width, plan.height, total, LEAST_SLOTS])
+        largest[plan[:2]] = np.maximum(largest.get(plan[:2], sizes), sizes)
+    for view, light, (plan, total) in zip(views, lights, plans, strict=True):
+        width, height, most, slots = map(int, largest[plan[:2]])
         shared = plan._replace(width=width, height=height)
-        picture_of, slots[kind] = _drawn(variables, scene, view, own, shared, most if total else 0, slots[kind], config)
-        drawn.append(picture_of)
-    return jax.tree.map(lambda *x: np.stack(x), *drawn)
+        found, largest[plan[:2]][3] = _drawn(variables, scene, view, light, shared, most if total else 0, slots, config)
+        yield found
 
 
 def _planned(scene: SurfelScene, camera: Camera) -> tuple[Plan, int]:

@@ -101,13 +101,12 @@ def straight_alpha(image: np.ndarray, acc: np.ndarray) -> np.ndarray:
 
 def turntable_frames(model: Model, volume: Volume, options: Render, light: Light | None) -> list[np.ndarray]:
     """Images of one turn around the object, or of its light."""
-    frames = []
-    for turn in np.arange(options.frames) * 360.0 / options.frames:
-        azimuth, shone = (FIRST_AZIMUTH, light and light.turned(turn)) if options.turn == "light" else (turn, light)
-        camera = model.camera(volume, float(azimuth), options.elevation, options.resolution)
-        rendering = model.render(volume, camera, options.quality, shone)
-        frames.append(np.asarray(before(options.lighting.background, rendering, camera, shone).image))
-    return frames
+    turns = np.arange(options.frames) * 360.0 / options.frames
+    azimuths = np.full(options.frames, FIRST_AZIMUTH) if options.turn == "light" else turns
+    lights = [light.turned(turn) if light and options.turn == "light" else light for turn in turns]
+    views = [model.camera(volume, float(a), options.elevation, options.resolution) for a in azimuths]
+    pictures = zip(model.render_each(volume, views, options.quality, lights), views, lights, strict=True)
+    return [np.asarray(before(options.lighting.background, *of).image) for of in pictures]
 
 
 def cameras_document(frames: list[dict], placed: PlacedCloud, volume: Volume) -> dict:
