@@ -182,7 +182,7 @@ def test_a_run_folder_that_is_none_is_refused(capsys, data, tmp_path):
         ("empty.ply", b"", "empty"),
         ("no_points.ply", b"ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nproperty float y\n"
          b"property float z\nend_header\n", "0 points"),
-        ("nan.xyz", b"0 0 0\nnan 1 1\n", "NaN"),
+        ("nan.xyz", b"nan 0 0\nnan 1 1\n", "NaN"),
         ("noise.glb", b"\x00\x01\x02", "noise.glb"),
         ("noise.npz", b"PK\x03\x04 no zip", "noise.npz"),
         ("words.xyz", b"a cloud\nof words\n", "words.xyz"),

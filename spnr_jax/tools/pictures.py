@@ -54,7 +54,12 @@ def render_file(options: Render, note: Callable[[str], None]) -> Iterator[str]:
     named = load(options.run) if options.run else None  # a run that is none is said before the cloud is read
     light = light_of_options(options)
     placed = clouds.place_cloud(
-        options.cloud, num_points=options.num_points, up=options.up, seed=options.seed, report=note
+        options.cloud,
+        num_points=options.num_points,
+        up=options.up,
+        seed=options.seed,
+        clean=options.clean,
+        report=note,
     )
     model = named or load("surfels" if light else suited_to(len(placed.cloud.positions)))
     volume = model.encode(placed.cloud)

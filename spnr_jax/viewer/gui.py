@@ -13,6 +13,7 @@ from typing import Any, cast
 import numpy as np
 import viser
 
+from spnr_jax.kernels.cleaning import Clean
 from spnr_jax.method.model import Model, Quality
 from spnr_jax.viewer import scene, session, uploads, viewpoint
 from spnr_jax.viewer.loop import Loop
@@ -37,10 +38,11 @@ HELP = "Drop a file anywhere on the page. Drag to orbit; Shift+drag selects poin
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Reading:
-    """How files are read: points kept of bigger clouds, and the upward axis."""
+    """How files are read: points kept of bigger clouds, the upward axis, and how scans are cleaned."""
 
     num_points: int
     up: str
+    clean: Clean
 
 
 class Browser:

@@ -15,6 +15,7 @@ import numpy as np
 import viser
 
 from spnr_jax.formats import clouds
+from spnr_jax.kernels.cleaning import Clean
 from spnr_jax.method.model import FIELD_OF_VIEW, Model
 from spnr_jax.training.weights import load, suited_to
 from spnr_jax.viewer import session, uploads
@@ -98,7 +99,7 @@ class Viewer:
 
 
 def open_viewer(
-    cloud: Path, run: Path | None, *, host: str, port: int, num_points: int, up: str
+    cloud: Path, run: Path | None, *, host: str, port: int, num_points: int, up: str, clean: Clean
 ) -> tuple[Viewer, list[str]]:
     """A running viewer of a file with a run's network, and what was assumed about the file, a line each.
 
@@ -106,10 +107,10 @@ def open_viewer(
     """
     _check_free(host, port)  # before the seconds that reading takes
     notes: list[str] = []
-    points = clouds.read_cloud(cloud, num_points=num_points, up=up, report=notes.append)
+    points = clouds.read_cloud(cloud, num_points=num_points, up=up, clean=clean, report=notes.append)
     model = load(run or suited_to(len(points.positions)))
     first = open_scene(model, points, uploads.display_name(cloud.name))
-    return Viewer(model, first, Reading(num_points=num_points, up=up), host, port), notes
+    return Viewer(model, first, Reading(num_points=num_points, up=up, clean=clean), host, port), notes
 
 
 def _check_free(host: str, port: int) -> None:

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path, PurePath
 
 from spnr_jax.formats import clouds
+from spnr_jax.kernels.cleaning import Clean
 from spnr_jax.kernels.records import PointCloud
 
 LONGEST_NAME = 60
@@ -22,7 +23,13 @@ def display_name(name: str) -> str:
 
 
 def read_upload(
-    name: str, content: bytes, *, num_points: int, up: str, report: Callable[[str], None] = lambda line: None
+    name: str,
+    content: bytes,
+    *,
+    num_points: int,
+    up: str,
+    clean: Clean = "off",
+    report: Callable[[str], None] = lambda line: None,
 ) -> PointCloud:
     """The cloud in a file's bytes; ValueError, with the name as the browser gave it, for what cannot be read."""
     shown = display_name(name)
@@ -30,6 +37,6 @@ def read_upload(
         path = Path(folder) / f"cloud{PurePath(shown).suffix.lower()}"
         path.write_bytes(content)
         try:
-            return clouds.read_cloud(path, num_points=num_points, up=up, report=report)
+            return clouds.read_cloud(path, num_points=num_points, up=up, clean=clean, report=report)
         except ValueError as error:
             raise ValueError(str(error).replace(str(path), shown)) from None
