@@ -277,3 +277,11 @@ def test_an_error_shows_its_call_stack_where_that_is_asked_for(capsys, monkeypat
     monkeypatch.setenv("SPNR_DEBUG", "")  # so that it is put back
     assert exit_code("runs", tmp_path / "none", "--debug") == 2
     assert "Traceback" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", ["render", "view"])
+def test_scans_are_cleaned_unless_it_is_said_otherwise(command, capsys):
+    assert cli.parse([command, "a.ply"]).clean == "auto"
+    for value in ("off", "strong"):
+        assert cli.parse([command, "a.ply", "--clean", value]).clean == value
+    assert "--clean" in refused(capsys, command, "a.ply", "--clean", "very")

@@ -458,7 +458,3 @@ class TestCleaning:
         plain, lines = read(path, num_points=200, clean="strong")
         np.testing.assert_array_equal(plain.positions, read_cloud(path, num_points=200).positions)
         assert not any("outliers" in line or "averaged" in line for line in lines)
-
-    def test_of_an_unknown_strength_is_refused(self, tmp_path):
-        with pytest.raises(ValueError, match="clean must be one of auto, off, strong, got 'very'"):
-            read_cloud(self.scan(tmp_path), clean="very")
