@@ -139,7 +139,8 @@ def _apart(positions: np.ndarray, strength: Strength) -> np.ndarray:
 def noise(positions: Float[np.ndarray, "points 3"]) -> tuple[float, float]:
     """Standard deviation of the points' heights above their surface, and their spacing; (0, 0) of too few points.
 
-    From LEAST_DENSE points on they can be told from curvature.  Both are medians over a sample, in the units of the positions.
+    From LEAST_DENSE points on they can be told from curvature.  Both are medians over a sample, in the units of the
+    positions.
     """
     distinct, _ = _distinct(positions)
     if len(distinct) < LEAST_DENSE:

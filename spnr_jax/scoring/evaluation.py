@@ -142,9 +142,7 @@ def evaluate_object(
     """Pictures and scores of one object."""
     data_sets.check_renders(item, config)
     if item.lights is not None:
-        raise ValueError(
-            f"object {item.name}: each view has its own light; `experiments.studies.relighting` scores those"
-        )
+        raise ValueError(f"object {item.name}: each view has its own light; `experiments.studies.relighting` scores those")
     cloud = data_sets.test_cloud(item, config)
     pictures, scores = {}, {}
     for method, show in methods.items():
