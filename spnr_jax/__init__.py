@@ -10,7 +10,7 @@ from importlib.machinery import ModuleSpec
 from types import ModuleType
 
 _PUBLIC = {"load": "training.weights", "Model": "method.model", "Volume": "method.model"}
-_PUBLIC |= {"read_cloud": "formats.clouds"}
+_PUBLIC |= {"read_cloud": "formats.clouds", "clean": "kernels.cleaning"}
 _PUBLIC |= {"read_light": "formats.light_files"} | dict.fromkeys(("light_of", "sun", "ambient"), "surfels.lighting")
 _PUBLIC |= dict.fromkeys(("PointCloud", "Camera", "Light", "Rays", "Rendering", "Batch"), "kernels.records")
 _KERNELS = ("cameras", "sampling", "compositing", "voxels", "losses", "metrics")

@@ -130,6 +130,9 @@ class View:
     """Port to listen on; 0 takes any free one."""
     num_points: int = 16384
     """Points used of a bigger cloud or sampled from a mesh; fewer work too."""
+    clean: Literal["auto", "off", "strong"] = "auto"
+    """Outliers of points are removed, and noisy ones averaged, before they are thinned; a clean cloud, and a mesh, stay
+    as they are.  strong: at smaller deviations."""
     up: Literal["auto", "x", "y", "z", "-x", "-y", "-z"] = "auto"
     """The file's upward axis; auto looks for it, and says what it found."""
 

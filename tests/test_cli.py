@@ -182,7 +182,7 @@ def test_a_run_folder_that_is_none_is_refused(capsys, data, tmp_path):
         ("empty.ply", b"", "empty"),
         ("no_points.ply", b"ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nproperty float y\n"
          b"property float z\nend_header\n", "0 points"),
-        ("nan.xyz", b"0 0 0\nnan 1 1\n", "NaN"),
+        ("nan.xyz", b"nan 0 0\nnan 1 1\n", "NaN"),
         ("noise.glb", b"\x00\x01\x02", "noise.glb"),
         ("noise.npz", b"PK\x03\x04 no zip", "noise.npz"),
         ("words.xyz", b"a cloud\nof words\n", "words.xyz"),
@@ -277,3 +277,11 @@ def test_an_error_shows_its_call_stack_where_that_is_asked_for(capsys, monkeypat
     monkeypatch.setenv("SPNR_DEBUG", "")  # so that it is put back
     assert exit_code("runs", tmp_path / "none", "--debug") == 2
     assert "Traceback" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", ["render", "view"])
+def test_scans_are_cleaned_unless_it_is_said_otherwise(command, capsys):
+    assert cli.parse([command, "a.ply"]).clean == "auto"
+    for value in ("off", "strong"):
+        assert cli.parse([command, "a.ply", "--clean", value]).clean == value
+    assert "--clean" in refused(capsys, command, "a.ply", "--clean", "very")

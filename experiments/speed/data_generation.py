@@ -101,7 +101,7 @@ def measured_noise(tasks: list[Task], light: Lights, resolution: int) -> dict[in
     """Median and 10th percentile of the PSNR by samples per pixel, two views an object."""
     config, scores = views.ViewConfig(resolution=resolution), []
     for task in tasks:
-        scene = views.build_scene(surface_points.normalise(load_asset(task, 0))[0], light.shared)
+        scene = views.build_scene(surface_points.normalise(load_asset(task, 0))[0], next(light.of_views(1, 0)))
         rng = np.random.default_rng(object_seeds(0, task.object_id)["viewpoints"])
         for pose in views.random_viewpoints(2, config.distance, rng):
             reference = picture(scene, pose, config, REFERENCE_SAMPLES, first_seed=1000)

@@ -10,13 +10,15 @@ spread evenly over meshes, with their materials.  What a file does not say is gr
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 
 from spnr_jax.formats.ply import read_ply_header
-from spnr_jax.formats.point_columns import DEFAULTS, Columns, materials, normals, useful
+from spnr_jax.formats.point_columns import DEFAULTS, LINEAR, POSITION, SRGB, Columns, materials, normals, useful
 from spnr_jax.formats.point_files import READERS, column_pieces, parse_ply
 from spnr_jax.formats.up_axis import ROTATIONS, find_up
+from spnr_jax.kernels.cleaning import Clean, cleaned
 from spnr_jax.kernels.records import PointCloud
 from spnr_jax.kernels.thinning import THINNING, farthest_points, thin_stream
 
@@ -24,6 +26,7 @@ MESHES = (".glb", ".gltf", ".obj", ".stl", ".off")
 MESH_POINTS = 4096  # points drawn from a mesh if no number is asked for; the most that training draws
 MOST_EVEN = 2**14  # points that are spread evenly over a mesh, in seconds; more lie close enough as they are drawn
 CAPACITY = 2**19  # points of a file that are in memory at most; more are thinned while reading
+BROKEN = "NaN, infinity or too large a number"
 COARSEST_STEP = 1e-3  # of the extent, that rounding to float32 may cost
 
 
@@ -43,14 +46,17 @@ def read_cloud(
     num_points: int | None = None,
     up: str = "y",
     seed: int = 0,
+    clean: Clean = "off",
     report: Callable[[str], None] = lambda line: None,
 ) -> PointCloud:
     """The cloud in a file of points or on a mesh file's surface: (points, ...) float32, `mask` all True.
 
     More than `num_points` are thinned out evenly, fewer are kept; a mesh gives exactly `num_points` (4096 if None).
-    `up` is the file's upward axis, or "auto".  ValueError, one line that names the file, for whatever cannot be read.
+    `up` is the file's upward axis, or "auto".  Unless `clean` is "off" points are cleaned before they are thinned
+    (spnr_jax/kernels/cleaning.py), those of meshes never; of a file that is thinned while reading, what that keeps.
+    Rows without finite numbers are left out.  ValueError, one line that names the file, for whatever cannot be read.
     """
-    return place_cloud(path, num_points=num_points, up=up, seed=seed, report=report).cloud
+    return place_cloud(path, num_points=num_points, up=up, seed=seed, clean=clean, report=report).cloud
 
 
 def place_cloud(
@@ -59,6 +65,7 @@ def place_cloud(
     num_points: int | None = None,
     up: str = "auto",
     seed: int = 0,
+    clean: Clean = "off",
     report: Callable[[str], None] = lambda line: None,
 ) -> PlacedCloud:
     """The cloud of `read_cloud` with the way back into the file's frame."""
@@ -67,6 +74,8 @@ def place_cloud(
         raise ValueError(f"up must be one of {', '.join(ROTATIONS)}, auto, got {up!r}")
     if num_points is not None and num_points < 1:
         raise ValueError(f"num_points must be at least 1, got {num_points}")
+    if clean not in get_args(Clean):
+        raise ValueError(f"clean must be one of {', '.join(get_args(Clean))}, got {clean!r}")
     _check_file(path)
     try:
         if _is_mesh(path):
@@ -74,6 +83,10 @@ def place_cloud(
         else:
             columns = _bounded_columns(path, num_points, report)
             positions, origin, values = _points_of_columns(columns, report)
+            if clean != "off":
+                positions, values, lines = cleaned(positions, values, clean)
+                for line in lines:
+                    report(line)
     except (ValueError, OSError) as error:
         raise ValueError(f"{path}: {str(error).splitlines()[0]}") from error
     if num_points is not None and len(positions) > num_points:
@@ -90,8 +103,11 @@ def place_cloud(
 
 
 def cloud_of_ply(content: bytes) -> PointCloud:
-    """The cloud in the bytes of a PLY file of points, y up: (points, ...) float32; ValueError says what is wrong."""
-    positions, _, values = _points_of_columns(_checked(useful(parse_ply(content)), 0), report=lambda line: None)
+    """The cloud in the bytes of a PLY file of points, y up: (points, ...) float32; ValueError says what is wrong.
+
+    It is for data sets, which were written whole: a row without finite numbers is a fault there.
+    """
+    positions, _, values = _points_of_columns(_all_sound(useful(parse_ply(content))), report=lambda line: None)
     return _float32(positions, values)
 
 
@@ -143,29 +159,38 @@ def _sampled_mesh(path: Path, count: int, seed: int, report: Callable[[str], Non
 
 def _bounded_columns(path: Path, num_points: int | None, report: Callable[[str], None]) -> Columns:
     """The useful columns of a point file, thinned while reading to CAPACITY points or what `num_points` needs."""
-    capacity = max(CAPACITY, THINNING * (num_points or 0))
-    columns, seen = thin_stream(_checked_pieces(path), capacity)
+    capacity, broken = max(CAPACITY, THINNING * (num_points or 0)), 0
+
+    def sound_pieces() -> Iterator[Columns]:
+        nonlocal broken
+        for piece in column_pieces(path):
+            columns = useful(piece)
+            sound = _sound(columns)
+            broken += int(np.count_nonzero(~sound))
+            yield columns if sound.all() else {name: column[sound] for name, column in columns.items()}
+
+    columns, seen = thin_stream(sound_pieces(), capacity)
+    if broken and not seen:
+        raise ValueError(f"holds no point that can be used: {BROKEN} in all of its {broken} rows")
+    if broken:
+        report(f"{broken:,} of {seen + broken:,} points left out: {BROKEN}")
     if seen > capacity:
         report(f"{len(columns['x'])} of {seen} points kept while reading, the first of each voxel")
     return columns
 
 
-def _checked_pieces(path: Path) -> Iterator[Columns]:
-    seen = 0
-    for piece in column_pieces(path):
-        yield _checked(useful(piece), seen)
-        seen += len(next(iter(piece.values()), ()))
-
-
-def _checked(columns: Columns, before: int) -> Columns:
-    """The columns; ValueError if a position is NaN, infinite or too large for float32."""
+def _sound(columns: Columns) -> np.ndarray:
+    """Mask (points,) of rows whose position and materials are numbers that float32 holds."""
+    names = [name for name in (*POSITION, *LINEAR, *SRGB, *DEFAULTS) if name in columns]
     largest = np.finfo(np.float32).max
-    sound = np.logical_and.reduce([np.abs(np.asarray(columns[axis], np.float64)) < largest for axis in "xyz"])
-    broken = np.flatnonzero(~sound)
+    return np.logical_and.reduce([np.abs(np.asarray(columns[name], np.float64)) < largest for name in names])
+
+
+def _all_sound(columns: Columns) -> Columns:
+    """The columns; ValueError if there is a row that is not sound."""
+    broken = np.flatnonzero(~_sound(columns))
     if broken.size:
-        raise ValueError(
-            f"holds {broken.size} points with NaN, infinity or too large a number, first point {before + broken[0]}"
-        )
+        raise ValueError(f"holds {broken.size} points with {BROKEN}, first point {broken[0]}")
     return columns
 
 

@@ -68,7 +68,7 @@ def sun(
 
 def ambient(color: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Light:
     """The same radiance from everywhere."""
-    return light_of(np.broadcast_to(np.float32(color), (HEIGHT, WIDTH, 3)))
+    return light_of(np.broadcast_to(np.array(color, np.float32), (HEIGHT, WIDTH, 3)))
 
 
 def background(light: Light, towards: list[Array]) -> list[Array]:

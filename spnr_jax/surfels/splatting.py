@@ -15,7 +15,9 @@ Everything passes to 0 at the border of a disc, so a picture is continuous in th
 sizes come from counts that the caller reads back: a picture is three programs, `count`, `entries`, `blend`.
 """
 
-from functools import partial
+from collections.abc import Sequence
+from functools import partial, reduce
+from operator import add, mul
 from typing import NamedTuple
 
 import jax
@@ -85,6 +87,10 @@ def _cross(a: tuple[Array, Array, Array], b: tuple[Array, Array, Array]) -> tupl
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
+def _dot(a: Sequence[Array], b: Sequence[Array]) -> Array:
+    return reduce(add, (x * y for x, y in zip(a, b, strict=True)))
+
+
 def footprints(surfels: Surfels, camera: Camera) -> Footprints:
     """Discs before a camera; those turned away, behind it or beside the picture cover no pixel."""
     rotation, eye = camera.cam_to_world[:, :3], camera.cam_to_world[:, 3]
@@ -144,7 +150,6 @@ def entries(surfels: Surfels, camera: Camera, *, total: int) -> tuple[Entries, I
     foot, begin, point, rim, side, reach = jax.lax.optimization_barrier(
         (foot, end - foot.covered, point, rim, side, reach)
     )
-    rx, ry, rz, tx, ty, tz = (column[point] for column in (*rim, *side))
     x, y, z, nx, ny, nz = (column[point] for column in (*foot.centre, *foot.normal))
     radius = foot.radius[point]
     place = jnp.arange(total, dtype=jnp.int32)
@@ -157,15 +162,11 @@ def entries(surfels: Surfels, camera: Camera, *, total: int) -> tuple[Entries, I
     slope = nx * right + ny * up - nz
     slope = jnp.where(slope < 0, jnp.minimum(slope, -EDGE), jnp.maximum(slope, EDGE))
     met = jnp.clip((nx * x + ny * y + nz * z) / slope, -z - 2 * radius, -z + 2 * radius)
-    place_x, place_y, place_z = met * right - x, met * up - y, -met - z
-    in_plane = (place_x**2 + place_y**2 + place_z**2) / radius**2
-    spacing = radius / RADIUS
-    first = (place_x * rx + place_y * ry + place_z * rz) / spacing
-    second = (place_x * tx + place_y * ty + place_z * tz) / spacing
-    ends = [(r[point] + s * a) for r, s, a in zip(reach, (-1, 1, -1, 1), (first, first, second, second), strict=True)]
-    cut = 1.0
-    for e in ends:
-        cut = cut * jnp.clip(0.5 + e / RIM_WIDTH, 0, 1)
+    there = [RADIUS / radius * x for x in (met * right - x, met * up - y, -met - z)]  # in spacings
+    in_plane = _dot(there, there) / RADIUS**2
+    along, across = _dot(there, [c[point] for c in rim]), _dot(there, [c[point] for c in side])
+    ends = [r[point] - x for r, x in zip(reach, (along, -along, across, -across), strict=True)]
+    cut = reduce(mul, (jnp.clip(0.5 + end / RIM_WIDTH, 0, 1) for end in ends))
     on_picture = ((column + 0.5 - foot.column[point]) ** 2 + (row + 0.5 - foot.row[point]) ** 2) / FLOOR**2
     kernel = jnp.clip(1 - jnp.minimum(in_plane + (1 - cut), on_picture), 0, 1)
     depth = jnp.clip(met, -z - radius, -z + radius)

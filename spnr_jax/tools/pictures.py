@@ -48,7 +48,12 @@ def render_file(options: Render, note: Callable[[str], None]) -> Iterator[str]:
         check_takes_light(named, options.asked_of_light, options.run)
     light = light_of_options(options.lighting) if options.asked_of_light else None
     placed = clouds.place_cloud(
-        options.cloud, num_points=options.num_points, up=options.up, seed=options.seed, report=note
+        options.cloud,
+        num_points=options.num_points,
+        up=options.up,
+        seed=options.seed,
+        clean=options.clean,
+        report=note,
     )
     model = named or load("surfels" if light else suited_to(len(placed.cloud.positions)))
     volume = model.encode(placed.cloud)

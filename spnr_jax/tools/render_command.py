@@ -27,6 +27,9 @@ class Render:
     """The file's upward axis; auto: by the format, else y or z, as the object would stand."""
     num_points: int = 16384
     """Points used of a bigger cloud, evenly spread, or sampled from a mesh; fewer work too."""
+    clean: Literal["auto", "off", "strong"] = "auto"
+    """Outliers of points are removed, and noisy ones averaged, before they are thinned; a clean cloud, and a mesh, stay
+    as they are.  strong: at smaller deviations."""
     seed: int = 0
     """Seed of the points that are chosen."""
     views: int = 4

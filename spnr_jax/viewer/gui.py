@@ -13,6 +13,7 @@ from typing import Any, cast
 import numpy as np
 import viser
 
+from spnr_jax.kernels.cleaning import Clean
 from spnr_jax.method.model import Model, Quality
 from spnr_jax.tools.chosen_light import takes_light
 from spnr_jax.viewer import lights, scene, session, uploads, viewpoint
@@ -29,10 +30,11 @@ HELP = "Drop a file anywhere on the page. Drag to orbit; Shift+drag selects poin
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Reading:
-    """How files are read: points kept of bigger clouds, and the upward axis."""
+    """How files are read: points kept of bigger clouds, the upward axis, and how scans are cleaned."""
 
     num_points: int
     up: str
+    clean: Clean
 
 
 class Browser:

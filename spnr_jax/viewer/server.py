@@ -16,6 +16,7 @@ import numpy as np
 import viser
 
 from spnr_jax.formats import clouds
+from spnr_jax.kernels.cleaning import Clean
 from spnr_jax.method.model import FIELD_OF_VIEW, Model
 from spnr_jax.tools.chosen_light import check_takes_light
 from spnr_jax.tools.light_options import Lighting
@@ -101,7 +102,15 @@ class Viewer:
 
 
 def open_viewer(
-    cloud: Path, run: Path | None, *, host: str, port: int, num_points: int, up: str, lighting: Lighting
+    cloud: Path,
+    run: Path | None,
+    *,
+    host: str,
+    port: int,
+    num_points: int,
+    up: str,
+    clean: Clean,
+    lighting: Lighting,
 ) -> tuple[Viewer, list[str]]:
     """A running viewer of a file with a run's network, and what was assumed about the file, a line each.
 
@@ -113,11 +122,11 @@ def open_viewer(
         check_takes_light(named, lighting.asked, run)
     shining = lights.given(lighting)
     notes: list[str] = []
-    points = clouds.read_cloud(cloud, num_points=num_points, up=up, report=notes.append)
+    points = clouds.read_cloud(cloud, num_points=num_points, up=up, clean=clean, report=notes.append)
     model = named or load("surfels" if lighting.asked else suited_to(len(points.positions)))
     scene = open_scene(model, points, uploads.display_name(cloud.name))
     first = State(scene=scene, size=session.sizes(model)[1], lights=shining)
-    return Viewer(model, first, Reading(num_points=num_points, up=up), host, port), notes
+    return Viewer(model, first, Reading(num_points=num_points, up=up, clean=clean), host, port), notes
 
 
 def _check_free(host: str, port: int) -> None:

@@ -7,10 +7,12 @@ libraries) have to be inside the file, since the readers look for them in that f
 
 import tempfile
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path, PurePath
 from typing import TypeVar
 
 from spnr_jax.formats import clouds, light_files
+from spnr_jax.kernels.cleaning import Clean
 from spnr_jax.kernels.records import Light, PointCloud
 
 # A file dropped anywhere on the page goes into the file input of the upload button.
@@ -34,10 +36,17 @@ def display_name(name: str) -> str:
 
 
 def read_upload(
-    name: str, content: bytes, *, num_points: int, up: str, report: Callable[[str], None] = lambda line: None
+    name: str,
+    content: bytes,
+    *,
+    num_points: int,
+    up: str,
+    clean: Clean = "off",
+    report: Callable[[str], None] = lambda line: None,
 ) -> PointCloud:
     """The cloud in a file's bytes; ValueError, with the name as the browser gave it, for what cannot be read."""
-    return _read(name, content, lambda path: clouds.read_cloud(path, num_points=num_points, up=up, report=report))
+    read = partial(clouds.read_cloud, num_points=num_points, up=up, clean=clean, report=report)
+    return _read(name, content, read)
 
 
 def is_map(name: str) -> bool:

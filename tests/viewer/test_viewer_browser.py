@@ -34,7 +34,7 @@ needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on PAT
 
 
 def viewer(host="127.0.0.1", port=0):
-    reading = Reading(num_points=100, up="y")
+    reading = Reading(num_points=100, up="y", clean="auto")
     return server.Viewer(tiny_viewer.model(), tiny_viewer.state(view=None), reading, host, port)
 
 
@@ -240,7 +240,8 @@ def test_two_browsers_have_their_own_camera_materials_and_file(chromium, running
 def test_a_port_in_use_is_refused_in_one_line_before_anything_is_read(capsys, tmp_path):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        missing = {"cloud": tmp_path / "no.ply", "run": tmp_path, "num_points": 10, "up": "y", "lighting": Lighting()}
+        missing = {"cloud": tmp_path / "no.ply", "run": tmp_path, "num_points": 10, "up": "y"}
+        missing |= {"clean": "auto", "lighting": Lighting()}
         assert cli.guarded(lambda: server.open_viewer(host="127.0.0.1", port=port, **missing), "spnr") == 2
     assert capsys.readouterr().err == (
         f"spnr: --port {port} is in use on 127.0.0.1; choose another, or 0 for any free one\n"

@@ -1,0 +1,213 @@
+"""Cleaning of scans: points that lie apart are removed, noisy ones are averaged; clean clouds stay as they are.
+
+    outliers    the mean distance of a point to its neighbours, against the median of theirs: the idea of the local
+                outlier factor (Breunig et al. 2000), so that a density that varies smoothly removes nothing.  The limit
+                is robust: a multiple of the median absolute deviation (MAD), and never below a fixed ratio
+    noise       distance of the neighbours from the plane that most of them lie close to (least quantile of squares,
+                Rousseeuw 1984): at an edge or a thin wall that is one of the faces, so that neither counts as noise.
+                Around thick noise the neighbourhood grows until it is flat
+    averaging   means of positions and materials over voxels as wide as the noise, then each mean is moved along the
+                normal onto the plane of those around it
+
+NumPy in, NumPy out, near linear in the points; the order of the points does not matter.
+"""
+
+import dataclasses
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.spatial import cKDTree
+
+from spnr_jax.kernels.records import PointCloud
+
+Strength = Literal["auto", "strong"]
+Clean = Literal["auto", "off", "strong"]
+Values = dict[str, np.ndarray]
+
+LEAST_POINTS = 100  # fewer say nothing of what lies apart
+NEIGHBOURS = 8  # of a point whose mean distance counts
+SPARSE = 3.0  # times the median distance, from which on the neighbours may be outliers themselves
+WIDE = 64  # neighbours that are asked then
+UNLISTED = 0.6  # of what else is borne, for a point that is among the neighbours of none
+FEW, CHANCE = 4, 3e-4  # points, and share of all, that chance sets apart in a cloud sampled at random
+SURE = 2.0  # of what is borne, from which on even these are outliers
+ROUNDS = 3  # outliers hide others behind them
+DEVIATIONS = {"auto": 7.0, "strong": 5.0}  # standard deviations of the logarithm, from the MAD, that are borne
+LEAST_RATIO = {"auto": 2.0, "strong": 1.6}  # to the neighbours' distance that is always borne: corners have it
+LEAST_DENSE = 1500  # points; of fewer, curvature would count as noise
+NOISY = {"auto": 0.45, "strong": 0.25}  # spacings of noise from which on points are averaged
+SAMPLE = 2048  # points at which the noise is measured
+PLANES = 48  # through three neighbours each, of which the best is taken
+HEIGHTS = 32  # neighbours whose distances from a plane are measured
+SHARE = 0.35  # of them that have to lie close to it
+GAUSSIAN = 0.3  # their largest distance from the best plane, over the standard deviation of the noise
+FLAT = 0.07  # of the neighbourhood's radius: thinner noise is measured there, thicker in a wider one
+WIDER = 4  # times as many neighbours
+VOXEL = 3.0  # standard deviations of the noise
+LEAST_VOXEL = 2.0  # spacings: four points of a surface in a voxel
+SMOOTHED = 16  # voxels whose plane a mean is moved onto
+CANCELLED = 0.5  # length of a mean of unit normals below which they contradict each other
+
+
+def clean(cloud: PointCloud, strength: Strength = "auto") -> tuple[PointCloud, list[str]]:
+    """The cloud without outliers and, where it is noisy, averaged; and a line about each thing that was done.
+
+    A cloud in which nothing is found comes back itself.  Else masked points are gone, too.  "strong" removes and
+    averages at smaller deviations.  ValueError for a batch of clouds or an unknown strength.
+    """
+    if strength not in NOISY:
+        raise ValueError(f"strength must be one of {', '.join(NOISY)}, got {strength!r}")
+    if np.ndim(cloud.positions) != 2:
+        raise ValueError(f"clean takes one cloud, positions (points, 3); got shape {np.shape(cloud.positions)}")
+    real = np.asarray(cloud.mask)
+    columns = {name: np.asarray(x)[real] for name, x in vars(cloud).items() if x is not None and name != "mask"}
+    positions, values, lines = cleaned(columns.pop("positions"), columns, strength)
+    if not lines:
+        return cloud, []
+    values = {name: np.asarray(x, np.float32) for name, x in (values | {"positions": positions}).items()}
+    return dataclasses.replace(cloud, mask=np.ones(len(positions), bool), **values), lines
+
+
+def cleaned(
+    positions: Float[np.ndarray, "points 3"], values: Values, strength: Strength = "auto"
+) -> tuple[Float[np.ndarray, "left 3"], Values, list[str]]:
+    """Positions and other columns (points, ...) of what is left, and a line about each thing that was done.
+
+    The same arrays come back where nothing was done.
+    """
+    lines = []
+    apart = outliers(positions, strength)
+    if apart.any():
+        lines.append(f"removed {apart.sum():,} outliers of {len(positions):,} points")
+        positions, values = positions[~apart], {name: x[~apart] for name, x in values.items()}
+    sigma, spacing = noise(positions)
+    if sigma > NOISY[strength] * spacing > 0:
+        before = len(positions)
+        positions, values = averaged(positions, values, max(VOXEL * sigma, LEAST_VOXEL * spacing))
+        lines.append(f"averaged {before:,} points to {len(positions):,}: noise of {sigma / spacing:.1f} spacings")
+    return positions, values, lines
+
+
+def outliers(positions: Float[np.ndarray, "points 3"], strength: Strength = "auto") -> Bool[np.ndarray, " points"]:
+    """True for points that are much farther from their neighbours than these from theirs."""
+    distinct, copies = _distinct(positions)
+    left = np.arange(len(distinct))
+    for _ in range(ROUNDS):
+        if len(left) < LEAST_POINTS:
+            break
+        apart = _apart(distinct[left], strength)
+        if not apart.any():
+            break
+        left = left[~apart]
+    removed = np.ones(len(distinct), bool)
+    removed[left] = False
+    return removed[copies]
+
+
+def _distinct(positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Positions (n, 3) without repetitions, sorted, which also keeps neighbours close in memory; the row of each."""
+    order = np.lexsort(positions.T)
+    ranked = positions[order]
+    new = np.ones(len(ranked), bool)
+    new[1:] = (ranked[1:] != ranked[:-1]).any(axis=1)
+    rows = np.empty(len(ranked), np.int64)
+    rows[order] = np.cumsum(new) - 1
+    return ranked[new], rows
+
+
+def _apart(positions: np.ndarray, strength: Strength) -> np.ndarray:
+    """Mask (n,) of outliers among distinct positions (n, 3), n >= LEAST_POINTS."""
+    tree = cKDTree(positions)
+    distances, near = tree.query(positions, NEIGHBOURS + 1, workers=-1)
+    mean = distances[:, 1:].mean(axis=1)
+    expected = np.median(mean[near[:, 1:]], axis=1)
+    sparse = np.flatnonzero(mean > SPARSE * np.median(mean))
+    around = tree.query(positions[sparse], min(WIDE, len(positions)), workers=-1)[1]
+    expected[sparse] = np.minimum(expected[sparse], np.median(mean[around], axis=1))
+    score = np.log(mean / expected)
+    middle = np.median(score)
+    deviation = 1.4826 * np.median(np.abs(score - middle))  # of a normal distribution with this MAD
+    unlisted = np.bincount(near[:, 1:].ravel(), minlength=len(positions)) == 0
+    borne = np.where(unlisted, UNLISTED, 1.0) * max(DEVIATIONS[strength] * deviation, np.log(LEAST_RATIO[strength]))
+    apart = score > middle + borne
+    if apart.sum() <= FEW + CHANCE * len(positions):
+        apart = score > middle + SURE * borne
+    return apart
+
+
+def noise(positions: Float[np.ndarray, "points 3"]) -> tuple[float, float]:
+    """Standard deviation of the points' heights above their surface, and their spacing; (0, 0) of too few points.
+
+    From LEAST_DENSE points on they can be told from curvature.  Both are medians over a sample, in the units of the
+    positions.
+    """
+    distinct, _ = _distinct(positions)
+    if len(distinct) < LEAST_DENSE:
+        return 0.0, 0.0
+    tree = cKDTree(distinct)
+    sample = distinct[:: -(-len(distinct) // SAMPLE)]
+    count = HEIGHTS
+    while True:
+        distances, near = tree.query(sample, [1 + count * i // HEIGHTS for i in range(1, HEIGHTS + 1)], workers=-1)
+        radius = float(np.median(distances[:, -1]))
+        sigma = float(np.median(_heights(distinct[near]))) / GAUSSIAN
+        if sigma * GAUSSIAN < FLAT * radius or WIDER**2 * count > len(distinct):
+            return sigma, radius * np.sqrt(np.pi / (count + 1))
+        count *= WIDER
+
+
+def _heights(near: np.ndarray) -> np.ndarray:
+    """Distance (n,) within which SHARE of the neighbours (n, HEIGHTS, 3) lie of the best plane through three."""
+    rng = np.random.default_rng(0)
+    best = np.full(len(near), np.inf)
+    for a, b, c in (rng.choice(HEIGHTS, 3, replace=False) for _ in range(PLANES)):
+        normal = np.cross(near[:, b] - near[:, a], near[:, c] - near[:, a])
+        length = np.linalg.norm(normal, axis=1, keepdims=True)
+        normal = normal / np.where(length > 0, length, np.inf)
+        offset = np.abs(np.einsum("nkc,nc->nk", near - near[:, a, None], normal))
+        reach = np.partition(offset, int(SHARE * HEIGHTS), axis=1)[:, int(SHARE * HEIGHTS)]
+        best = np.where(length[:, 0] > 0, np.minimum(best, reach), best)
+    return np.where(np.isfinite(best), best, 0)  # three neighbours in a line span no plane: nothing is known
+
+
+def averaged(
+    positions: Float[np.ndarray, "points 3"], values: Values, voxel: float
+) -> tuple[Float[np.ndarray, "voxels 3"], Values]:
+    """Means over the voxels of this side, those of the positions moved onto the plane of the means around them.
+
+    Normals stay of unit length, 0 where they contradict each other.
+    """
+    low = positions.min(axis=0)
+    # the numbers of the slices along an axis that hold points stay small, however far one lies
+    x, y, z = (np.unique(np.floor(axis / voxel), return_inverse=True)[1] for axis in (positions - low).T)
+    keys = (x * (y.max() + 1) + y) * (z.max() + 1) + z
+    _, rows, counts = np.unique(keys, return_inverse=True, return_counts=True)
+
+    def mean(column: np.ndarray) -> np.ndarray:
+        channels = column.reshape(len(column), -1).T
+        sums = np.stack([np.bincount(rows, channel) for channel in channels], axis=-1)
+        return (sums / counts[:, None]).reshape(-1, *column.shape[1:])
+
+    values = {name: mean(column) for name, column in values.items()}
+    if "normals" in values:
+        length = np.linalg.norm(values["normals"], axis=1, keepdims=True)
+        agreed = length > CANCELLED
+        values["normals"] = np.where(agreed, values["normals"] / np.where(agreed, length, 1), 0)
+    return _onto_planes(mean(positions), counts, voxel), values
+
+
+def _onto_planes(means: np.ndarray, counts: np.ndarray, voxel: float) -> np.ndarray:
+    """Means (voxels, 3) moved along the normal onto the plane of those around them, which count by their points.
+
+    A voxel's border may cut the band of noise anywhere: without this, means of slices of it would stay apart.
+    """
+    if len(means) < SMOOTHED:
+        return means
+    distances, near = cKDTree(means).query(means, SMOOTHED, workers=-1)
+    weights = counts[near] * np.exp(-0.5 * (distances / voxel) ** 2)
+    weights = (weights / weights.sum(axis=1, keepdims=True))[..., None]
+    middle = (weights * means[near]).sum(axis=1)
+    offset = means[near] - middle[:, None]
+    normal = np.linalg.eigh(np.swapaxes(offset * weights, 1, 2) @ offset)[1][..., 0]
+    return means - np.sum((means - middle) * normal, axis=1, keepdims=True) * normal
