@@ -23,7 +23,7 @@ from tqdm import tqdm
 from experiments import entry_point
 from experiments.comparison import figures, results_folder
 from experiments.comparison.result_tables import Cell, Table, number
-from experiments.studies.sharpness import smaller
+from experiments.studies.sharpness import smaller, told
 from spnr_jax.devices import machine
 from spnr_jax.formats import data_sets, images
 from spnr_jax.kernels import cameras
@@ -122,7 +122,7 @@ def _draw(
     options: RelightingStudy, item: data_sets.ObjectData, method: str, count: int, model: Model
 ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Image, opacity and reference of each view."""
-    volume = model.encode(jax.tree.map(lambda x: x[:count], item.cloud))
+    volume = model.encode(told(jax.tree.map(lambda x: x[:count], item.cloud), normals=False))
     volume = unshadowed(volume) if method == UNSHADOWED else volume
     drawn = []
     for view, light in enumerate((item.own_lights or [])[: options.views]):

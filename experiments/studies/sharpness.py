@@ -10,6 +10,7 @@ grey should be smooth, a plate red in front should show no blue.
     OUT/gallery.png   OUT/ID.png                 references and pictures beside each other, at full size
 """
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,7 +28,7 @@ from experiments.comparison.result_tables import Cell, Table, number
 from spnr_jax.devices import machine
 from spnr_jax.formats import data_sets, images
 from spnr_jax.kernels import cameras
-from spnr_jax.kernels.records import PointCloud
+from spnr_jax.kernels.records import Camera, PointCloud
 from spnr_jax.kernels.resizing import mean_of_squares
 from spnr_jax.method.model import Model, Quality
 from spnr_jax.model_config import SurfelConfig
@@ -58,6 +59,8 @@ class SharpnessStudy:
     """Views of an object."""
     objects: int | None = None
     """Test objects (default: all)."""
+    normals: bool = False
+    """Give the networks the normals of the data set, too; without them they are estimated."""
     shown: tuple[str, ...] = ()
     """Objects whose pictures are written at full size (default: the first four)."""
 
@@ -67,7 +70,9 @@ def main(options: SharpnessStudy) -> None:
     dataset = data_sets.open_dataset(options.data)
     names = dataset.splits["test"][: options.objects]
     asked = {"runs": list(options.runs), "counts": list(options.counts), "views": options.views, "objects": list(names)}
-    results_folder.claim(options.out, "sharpness", asked | {"resolution": options.resolution}, dataset)
+    results_folder.claim(
+        options.out, "sharpness", asked | {"resolution": options.resolution, "normals": options.normals}, dataset
+    )
     rows, known = {}, {}
     for label, model, quality in _methods(options.runs):
         for count in options.counts:
@@ -75,7 +80,7 @@ def main(options: SharpnessStudy) -> None:
                 _kept_scores(options, dataset, name, label, model, quality, count)
                 for name in tqdm(names, desc=f"{label}, {count:,} points")
             ]
-            known[f"{label}, {count:,}"] = _known(options.out, label, model, quality, count)
+            known[f"{label}, {count:,}"] = _known(options, label, model, quality, count)
     _pictures(options, dataset, options.shown or names[:4])
     table = Table(
         title=f"Sharpness, {len(names)} objects x {options.views} views",
@@ -128,26 +133,36 @@ def _scores(
 def _draw(
     options: SharpnessStudy, item: data_sets.ObjectData, model: Model, quality: Quality, count: int
 ) -> tuple[list[tuple[np.ndarray, np.ndarray, np.ndarray]], tuple[float, float]]:
-    """Image, opacity and reference of each view; the fastest picture's seconds, which compiles nothing."""
-    cloud = jax.tree.map(lambda x: x[:count], item.cloud)
+    """Image, opacity and reference of each view; seconds to encode, and of a picture once all is compiled."""
+    cloud = told(jax.tree.map(lambda x: x[:count], item.cloud), options.normals)
     model.encode(cloud)
     begin = perf_counter()
     volume = model.encode(cloud)
     jax.block_until_ready(jax.tree.leaves(volume.scene))
-    encode, drawn, fastest = perf_counter() - begin, [], np.inf
-    for view in range(min(options.views, len(item.images))):
-        reference = item.images[view].astype(np.float32) / 255
-        camera = jax.tree.map(lambda x, view=view: x[view], item.camera)
-        if options.resolution and options.resolution != camera.height:
-            reference = smaller(reference, camera.height // options.resolution)
-            camera = cameras.resize(camera, options.resolution, options.resolution)
-        for _ in range(2):
-            begin = perf_counter()
-            rendering = model.render(volume, camera, quality)
-            image, opacity = np.asarray(rendering.image), np.asarray(rendering.acc)
-            fastest = min(fastest, perf_counter() - begin)
-        drawn.append((image, opacity, reference))
-    return drawn, (encode, fastest)
+    encode = perf_counter() - begin
+    pairs = [_view(options, item, view) for view in range(min(options.views, len(item.images)))]
+    views = [camera for camera, _ in pairs]
+    for _ in range(2):
+        begin = perf_counter()
+        found = [(np.asarray(r.image), np.asarray(r.acc)) for r in model.render_each(volume, views, quality)]
+        seconds = (perf_counter() - begin) / len(views)
+    drawn = [(image, opacity, reference) for (image, opacity), (_, reference) in zip(found, pairs, strict=True)]
+    return drawn, (encode, seconds)
+
+
+def told(cloud: PointCloud, normals: bool) -> PointCloud:
+    """The cloud with its normals or without."""
+    return cloud if normals else dataclasses.replace(cloud, normals=None)
+
+
+def _view(options: SharpnessStudy, item: data_sets.ObjectData, view: int) -> tuple[Camera, np.ndarray]:
+    """Camera and reference of a view at the asked resolution."""
+    reference = item.images[view].astype(np.float32) / 255
+    camera = jax.tree.map(lambda x: x[view], item.camera)
+    if options.resolution and options.resolution != camera.height:
+        reference = smaller(reference, camera.height // options.resolution)
+        camera = cameras.resize(camera, options.resolution, options.resolution)
+    return camera, reference
 
 
 def smaller(reference: np.ndarray, side: int) -> np.ndarray:
@@ -157,11 +172,11 @@ def smaller(reference: np.ndarray, side: int) -> np.ndarray:
     return np.concatenate([weighted[..., :3] / np.maximum(weighted[..., 3:], 1e-4), weighted[..., 3:]], axis=-1)
 
 
-def _known(out: Path, label: str, model: Model, quality: Quality, count: int) -> dict[str, float]:
+def _known(options: SharpnessStudy, label: str, model: Model, quality: Quality, count: int) -> dict[str, float]:
     """Scores of the ball and the plate."""
 
     def of(cloud: PointCloud, score: Any, **view: float) -> float:
-        volume = model.encode(cloud)
+        volume = model.encode(told(cloud, options.normals))
         rendering = model.render(volume, model.camera(volume, resolution=512, **view), quality)
         return float(score(np.asarray(rendering.image), np.asarray(rendering.acc)))
 
@@ -169,7 +184,7 @@ def _known(out: Path, label: str, model: Model, quality: Quality, count: int) ->
         front = {"azimuth": 0.0, "elevation": 0.0}
         return {"ball": of(ball(count), ball_waves), "plate": of(plate(count), blue_share, **front)}
 
-    return results_folder.kept(out / "known" / label.replace("/", "_") / f"{count}.json", make)
+    return results_folder.kept(options.out / "known" / label.replace("/", "_") / f"{count}.json", make)
 
 
 def _cells(found: Sequence[Mapping[str, float]], known: Mapping[str, float]) -> tuple[Cell, ...]:

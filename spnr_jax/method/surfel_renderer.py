@@ -131,7 +131,8 @@ def _drawn(
         return _nothing(camera), least_slots
     inside = _seen_through(_scaled(camera, plan.doublings, plan.side), plan)
     found, covered = splatting.entries(scene.surfels, inside, total=_rounded(total, 2**15, splatting.MOST_ENTRIES))
-    slots = _rounded(max(int(covered), least_slots), LEAST_SLOTS, inside.height * inside.width)
+    pixels = inside.height * inside.width
+    slots = _rounded(min(max(int(covered), least_slots), pixels), LEAST_SLOTS, pixels)
     looked = _look(found, scene.surfels, light, inside, slots=slots)
     return _placed(_shade(variables, *looked, config=config, doublings=plan.doublings), camera, plan), slots
 
