@@ -23,10 +23,9 @@ from tqdm import tqdm
 from experiments import entry_point
 from experiments.comparison import figures, results_folder
 from experiments.comparison.result_tables import Cell, Table, number
-from experiments.studies.sharpness import smaller, told
+from experiments.studies.sharpness import told, view_of
 from spnr_jax.devices import machine
 from spnr_jax.formats import data_sets, images
-from spnr_jax.kernels import cameras
 from spnr_jax.kernels.colors import srgb_to_linear
 from spnr_jax.method.model import Model, Quality, Volume
 from spnr_jax.scoring import intervals
@@ -124,16 +123,10 @@ def _draw(
     """Image, opacity and reference of each view."""
     volume = model.encode(told(jax.tree.map(lambda x: x[:count], item.cloud), normals=False))
     volume = unshadowed(volume) if method == UNSHADOWED else volume
-    drawn = []
-    for view, light in enumerate((item.own_lights or [])[: options.views]):
-        reference = item.images[view].astype(np.float32) / 255
-        camera = jax.tree.map(lambda x, view=view: x[view], item.camera)
-        if options.resolution and options.resolution != camera.height:
-            reference = smaller(reference, camera.height // options.resolution)
-            camera = cameras.resize(camera, options.resolution, options.resolution)
-        rendering = model.render(volume, camera, METHODS[method], light)
-        drawn.append((np.asarray(rendering.image), np.asarray(rendering.acc), reference))
-    return drawn
+    lights = (item.own_lights or [])[: options.views]
+    pairs = [view_of(item, view, options.resolution) for view in range(len(lights))]
+    found = model.render_each(volume, [camera for camera, _ in pairs], METHODS[method], lights)
+    return [(np.asarray(r.image), np.asarray(r.acc), reference) for r, (_, reference) in zip(found, pairs, strict=True)]
 
 
 def unshadowed(volume: Volume) -> Volume:

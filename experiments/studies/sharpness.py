@@ -140,7 +140,7 @@ def _draw(
     volume = model.encode(cloud)
     jax.block_until_ready(jax.tree.leaves(volume.scene))
     encode = perf_counter() - begin
-    pairs = [_view(options, item, view) for view in range(min(options.views, len(item.images)))]
+    pairs = [view_of(item, view, options.resolution) for view in range(min(options.views, len(item.images)))]
     views = [camera for camera, _ in pairs]
     for _ in range(2):
         begin = perf_counter()
@@ -155,13 +155,13 @@ def told(cloud: PointCloud, normals: bool) -> PointCloud:
     return cloud if normals else dataclasses.replace(cloud, normals=None)
 
 
-def _view(options: SharpnessStudy, item: data_sets.ObjectData, view: int) -> tuple[Camera, np.ndarray]:
-    """Camera and reference of a view at the asked resolution."""
+def view_of(item: data_sets.ObjectData, view: int, resolution: int | None) -> tuple[Camera, np.ndarray]:
+    """Camera and reference of a view at a resolution, None for its own."""
     reference = item.images[view].astype(np.float32) / 255
     camera = jax.tree.map(lambda x: x[view], item.camera)
-    if options.resolution and options.resolution != camera.height:
-        reference = smaller(reference, camera.height // options.resolution)
-        camera = cameras.resize(camera, options.resolution, options.resolution)
+    if resolution and resolution != camera.height:
+        reference = smaller(reference, camera.height // resolution)
+        camera = cameras.resize(camera, resolution, resolution)
     return camera, reference
 
 

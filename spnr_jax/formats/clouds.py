@@ -183,7 +183,8 @@ def _sound(columns: Columns) -> np.ndarray:
     """Mask (points,) of rows whose position and materials are numbers that float32 holds."""
     names = [name for name in (*POSITION, *LINEAR, *SRGB, *DEFAULTS) if name in columns]
     largest = np.finfo(np.float32).max
-    return np.logical_and.reduce([np.abs(np.asarray(columns[name], np.float64)) < largest for name in names])
+    with np.errstate(all="ignore"):  # signalling NaN and what leaves the type
+        return np.logical_and.reduce([np.abs(np.asarray(columns[name], np.float64)) < largest for name in names])
 
 
 def _all_sound(columns: Columns) -> Columns:

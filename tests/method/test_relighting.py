@@ -72,7 +72,7 @@ def test_object_camera_and_light_turned_together_give_nearly_the_same_picture(mo
 def test_a_matt_convex_body_in_uniform_light_shows_its_albedo(model, albedo):
     ball = cloud(shape("sphere", 3000)[0], base_color=np.full((3000, 3), albedo), roughness=np.ones(3000))
     image, solid = linear(model, model.encode(ball), spnr_jax.ambient())
-    assert np.mean(image[solid]) == pytest.approx(albedo, abs=0.03)  # what is not metal mirrors some of it, too
+    assert np.mean(image[solid]) == pytest.approx(albedo, abs=0.05)  # what is not metal mirrors some of it, too
 
 
 @pytest.mark.parametrize("radiance", [1e-6, 1.0, 1e6])

@@ -1,6 +1,7 @@
 """Every picture that was asked for lies where it was said, and a cloud in any file comes out as pictures."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -27,7 +28,7 @@ def cloud_file(folder, name="chair.xyz", count=40):
 
 def rendered(cloud, out, **options):
     notes: list[str] = []
-    command = Render(cloud=cloud, run=tiny_dataset.run(), out=out, **OPTIONS | options)
+    command = Render(cloud=cloud, out=out, **{"run": tiny_dataset.run()} | OPTIONS | options)
     return [*pictures.render_file(command, notes.append), *notes]
 
 
@@ -168,7 +169,7 @@ def in_light(tmp_path_factory):
 
     def render(out, **options):
         lighting = Lighting(**{name: options.pop(name) for name in tuple(options) if hasattr(Lighting, name)})
-        common = {"run": "surfels", "quality": "draft", "views": 1, "turntable": "none", "lighting": lighting}
+        common = {"run": Path("surfels"), "quality": "draft", "views": 1, "turntable": "none", "lighting": lighting}
         rendered(cloud, folder / out, **common | options)
         return folder / out
 
