@@ -285,3 +285,30 @@ def test_scans_are_cleaned_unless_it_is_said_otherwise(command, capsys):
     for value in ("off", "strong"):
         assert cli.parse([command, "a.ply", "--clean", value]).clean == value
     assert "--clean" in refused(capsys, command, "a.ply", "--clean", "very")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["--sun", "30", "95"], "--sun: expected an azimuth and an elevation of -90 to 90 degrees"),
+        (["--sun", "nan", "5"], "--sun: expected an azimuth"),
+        (["--light-yaw", "inf"], "--light-yaw must be a number of degrees"),
+        (["--exposure", "21"], "--exposure must be -20 to 20 stops"),
+        (["--light", "absent.hdr"], "absent.hdr: no such file"),
+        (["--transparent", "--background", "light"], "--background light: not together with --transparent"),
+        (
+            ["--run", "small", "--light", "studio"],
+            "--light: the network of --run small knows the light of its training",
+        ),
+        (["--run", "small", "--turn", "light"], "--turn light: the network of --run small knows the light"),
+        (["--run", "small", "--exposure", "1", "--sun", "0", "9"], "--sun, --exposure: the network of --run small"),
+    ],
+)
+def test_light_that_cannot_be_is_one_line_and_code_2_before_the_cloud_is_read(arguments, expected, tmp_path, capsys):
+    with pytest.raises(SystemExit) as left:
+        cli.main(["render", str(tmp_path / "missing.ply"), "--out", str(tmp_path / "out"), *arguments])
+    said = capsys.readouterr().err
+    assert left.value.code == 2
+    assert expected in said
+    assert said.count("\n") == 1
+    assert "missing.ply" not in said

@@ -9,7 +9,6 @@ import trimesh
 from PIL import Image
 from support import tiny_dataset
 
-from spnr_jax import cli
 from spnr_jax.formats.up_axis import ROTATIONS
 from spnr_jax.tools import pictures
 from spnr_jax.tools.light_options import Lighting
@@ -202,30 +201,3 @@ def test_a_turntable_of_the_light_differs_from_frame_to_frame_and_keeps_the_outl
     assert all(np.abs(frames[0] - other).max() > 8 for other in frames[1:])
     outlines = [(frame > 250).all(axis=-1) for frame in frames]
     assert all((outline == outlines[0]).mean() > 0.95 for outline in outlines)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "expected"),
-    [
-        (["--sun", "30", "95"], "--sun: expected an azimuth and an elevation of -90 to 90 degrees"),
-        (["--sun", "nan", "5"], "--sun: expected an azimuth"),
-        (["--light-yaw", "inf"], "--light-yaw must be a number of degrees"),
-        (["--exposure", "21"], "--exposure must be -20 to 20 stops"),
-        (["--light", "absent.hdr"], "absent.hdr: no such file"),
-        (["--transparent", "--background", "light"], "--background light: not together with --transparent"),
-        (
-            ["--run", "small", "--light", "studio"],
-            "--light: the network of --run small knows the light of its training",
-        ),
-        (["--run", "small", "--turn", "light"], "--turn light: the network of --run small knows the light"),
-        (["--run", "small", "--exposure", "1", "--sun", "0", "9"], "--sun, --exposure: the network of --run small"),
-    ],
-)
-def test_light_that_cannot_be_is_one_line_and_code_2_before_the_cloud_is_read(arguments, expected, tmp_path, capsys):
-    with pytest.raises(SystemExit) as left:
-        cli.main(["render", str(tmp_path / "missing.ply"), "--out", str(tmp_path / "out"), *arguments])
-    said = capsys.readouterr().err
-    assert left.value.code == 2
-    assert expected in said
-    assert said.count("\n") == 1
-    assert "missing.ply" not in said
