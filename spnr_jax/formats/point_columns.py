@@ -98,11 +98,11 @@ def normals(columns: Columns) -> np.ndarray | None:
     """Normals (points, 3) of unit length, 0 where a row has none that can be used; None if no row has one."""
     if not set(NORMAL) <= columns.keys() or any(columns[name].dtype.kind == "u" for name in NORMAL):
         return None  # numbers without a sign encode a normal in some way of their own
-    vectors = np.stack([np.asarray(columns[name], np.float64) for name in NORMAL], axis=-1)
-    with np.errstate(over="ignore"):
+    with np.errstate(all="ignore"):  # signalling NaN, too
+        vectors = np.stack([np.asarray(columns[name], np.float64) for name in NORMAL], axis=-1)
         length = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    usable = np.isfinite(length) & (length > SHORTEST)
-    return np.where(usable, vectors / np.where(usable, length, 1), 0) if usable.any() else None
+        usable = np.isfinite(length) & (length > SHORTEST)
+        return np.where(usable, vectors / np.where(usable, length, 1), 0) if usable.any() else None
 
 
 def _scalar(columns: Columns, name: str) -> np.ndarray | None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from support.point_clouds import NUMPY, ROWS, VERTEX, ply_bytes
 
-from spnr_jax.formats import npz, ply, text
+from spnr_jax.formats import clouds, npz, ply, text
 from spnr_jax.formats.point_files import column_pieces, read_columns
 
 
@@ -208,3 +208,14 @@ def test_an_array_that_announces_more_than_its_file_holds_is_refused_before_memo
     (tmp_path / "a.npy").write_bytes(content.replace(b"'shape'", b"'shape("))  # numpy's own error here is no ValueError
     with pytest.raises(ValueError, match="broken"):
         read_columns(tmp_path / "a.npy")
+
+
+@pytest.mark.parametrize(("kind", "bits"), [("<f4", 0x7FA00000), ("<f8", 0x7FF4000000000000)])
+@pytest.mark.parametrize("column", [0, 4, 7])
+def test_a_signalling_nan_costs_its_row_or_its_normal_and_no_warning(tmp_path, kind, bits, column):
+    table = np.random.default_rng(0).random((50, 9)).astype(kind)
+    table.view(kind.replace("f", "u"))[3, column] = bits
+    np.save(tmp_path / "cloud.npy", table)
+    cloud = clouds.read_cloud(tmp_path / "cloud.npy")  # warnings are errors in the tests
+    assert len(cloud.positions) in (49, 50)
+    assert np.isfinite(cloud.positions).all()
