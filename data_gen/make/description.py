@@ -3,12 +3,12 @@
 import hashlib
 from collections.abc import Sequence
 from dataclasses import asdict
-from pathlib import Path
 
 from data_gen import procedural
 from data_gen.plan.tasks import GenerateConfig, Plan, source_of
 from data_gen.render import light
 from data_gen.store import layout
+from data_gen.store.check import checksum_of
 
 # options that say where or how fast, or whose content is described instead
 PLACES = ("out", "workers", "cluster", "root", "meshes", "objects", "envmap", "lights", "test_list", "split_file")
@@ -54,11 +54,6 @@ def describe_kind(name: str) -> dict:
     if name in ("room", "random"):
         return {"name": name}
     return {"name": "maps", "sha256": {file.name: checksum_of(file) for file in light.map_files(name)}}
-
-
-def checksum_of(path: Path) -> str:
-    """Return the SHA-256 of a file."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def text_checksum(lines: Sequence[str]) -> str:

@@ -15,12 +15,13 @@ from data_gen import procedural
 from data_gen.make import augmentation, reshaping
 from data_gen.plan.tasks import Task
 from data_gen.render import views
-from data_gen.render.light import KEPT_HEIGHT, Lights
+from data_gen.render.light import Lights
 from data_gen.render.variant import LLVM, choose_variant, mitsuba_module
 from data_gen.store import layout
 from spnr_jax.formats.mesh import meshes, surface_points
 from spnr_jax.formats.mesh.assets import Asset, Material, RejectedAsset
 from spnr_jax.surfels.envmaps import resampled
+from spnr_jax.surfels.lighting import HEIGHT
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,7 +79,7 @@ def make_record(bench: Workbench, task: Task) -> layout.ObjectRecord:
         transforms=layout.nerf_transforms(cam_to_world, bench.view.resolution, bench.view.fov, bench.view.focal_length),
         images=images,
         conditions=conditions,
-        lights=None if bench.lights.shared is not None else np.stack([resampled(x, KEPT_HEIGHT) for x in maps]),
+        lights=None if bench.lights.shared is not None else np.stack([resampled(x, HEIGHT) for x in maps]),
         details=object_details(task, asset, seeds) | details,
     )
 

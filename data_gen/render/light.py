@@ -22,7 +22,6 @@ from spnr_jax.surfels import envmaps, room, skies
 WHITE_SPHERE_RADIANCE = 0.6  # far enough below 1 that white objects keep their shading against the white background
 
 DRAWN_HEIGHT = 256  # rows of a map that a view draws
-KEPT_HEIGHT = 32  # rows of the same as the data set keeps it: what `spnr_jax.light_of` looks at
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,7 @@ from spnr_jax.scoring.report import psnr
 PHASES = {  # functions whose cumulative time is a phase; the rest is "other"
     "load": ("load_asset",),
     "points": ("normalise", "sample_surface"),
-    "scene": ("build_scene",),
+    "scene": ("mitsuba_shapes", "lit_scene"),
     "render": ("render_view",),
     "visibility": ("visible_points",),
     "encode and write": ("straight_srgb", "condition_image", "write_object"),

@@ -24,13 +24,12 @@ from spnr_jax.formats import clouds
 from spnr_jax.formats.npz import read_arrays
 from spnr_jax.formats.shards import Shards, is_plain_name, open_shards, read_files
 from spnr_jax.kernels.records import Camera, Light, PointCloud
-from spnr_jax.surfels.lighting import light_of
+from spnr_jax.surfels.lighting import HEIGHT, WIDTH, light_of
 
 # what a file that breaks its rules makes its reader raise; Pillow raises SyntaxError
 UNREADABLE = (OSError, ValueError, LookupError, TypeError, ArithmeticError, AttributeError, RecursionError, SyntaxError)
 # errors of a network drive that is away for a moment, and the seconds after which its file is read again
 PASSING = (errno.EIO, errno.ESTALE, errno.ETIMEDOUT, errno.EAGAIN, errno.ENOTCONN)
-LIGHT_SIZE = (32, 64)  # texels of a view's map
 PAUSES = (0.1, 0.5, 2.0)
 
 
@@ -132,8 +131,8 @@ def has_lights(dataset: Dataset) -> bool:
 
 def _lights(content: bytes, views: int) -> np.ndarray:
     lights = read_arrays(io.BytesIO(content), ("lights",))["lights"].astype(np.float32)
-    if lights.shape != (views, *LIGHT_SIZE, 3) or not np.isfinite(lights).all() or lights.min() < 0:
-        raise ValueError(f"expected {views} maps of {LIGHT_SIZE} texels of radiance, got {lights.shape}")
+    if lights.shape != (views, HEIGHT, WIDTH, 3) or not np.isfinite(lights).all() or lights.min() < 0:
+        raise ValueError(f"expected {views} maps of {HEIGHT} x {WIDTH} texels of radiance, got {lights.shape}")
     return lights
 
 

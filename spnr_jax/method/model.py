@@ -92,7 +92,10 @@ class Model:
         `trained` renders as the network was trained.  Other networks than ours know one number of samples.
         """
         if isinstance(self.config, SurfelConfig):
-            return self._shaded(volume, camera, quality, lighting.room_light() if light is None else light)
+            draw = surfel_renderer.render if camera.cam_to_world.ndim == 2 else surfel_renderer.render_views
+            inside = _in_box(camera, volume.centre, volume.scale)
+            drawn = draw(self._shader(quality), volume.scene, inside, _or_room(light), config=self.config)
+            return _in_units(drawn, volume)
         if light is not None:
             raise ValueError("this network knows the light of its training alone; give no light")
         if self.config.upsamples and (camera.height % 2 or camera.width % 2):
@@ -121,21 +124,16 @@ class Model:
             yield from (self.render(volume, view, quality, light) for view, light in zip(views, lights, strict=True))
             return
         inside = [_in_box(view, volume.centre, volume.scale) for view in views]
-        shone = [lighting.room_light() if light is None else light for light in lights]
-        variables = None if quality == "draft" else self.variables
-        for drawn in surfel_renderer.render_each(variables, volume.scene, inside, shone, config=self.config):
-            yield dataclasses.replace(drawn, depth=drawn.depth / np.asarray(volume.scale))
+        shone = [_or_room(light) for light in lights]
+        for drawn in surfel_renderer.render_each(
+            self._shader(quality), volume.scene, inside, shone, config=self.config
+        ):
+            yield _in_units(drawn, volume)
 
-    def _shaded(self, volume: Volume, camera: Camera, quality: Quality, light: Light) -> Rendering:
-        """Views by the network over surfels."""
-        if quality not in (*SAMPLES, "trained"):
-            raise ValueError(f"quality must be one of {', '.join(SAMPLES)}, trained, got {quality}")
-        assert isinstance(self.config, SurfelConfig)
-        variables = None if quality == "draft" else self.variables
-        inside = _in_box(camera, volume.centre, volume.scale)
-        draw = surfel_renderer.render if inside.cam_to_world.ndim == 2 else surfel_renderer.render_views
-        drawn = draw(variables, volume.scene, inside, light, config=self.config)
-        return dataclasses.replace(drawn, depth=drawn.depth / np.asarray(volume.scale))
+    def _shader(self, quality: Quality) -> dict | None:
+        """Variables of the CNN over surfels; None where a quality leaves it out."""
+        _check_quality(quality)
+        return None if quality == "draft" else self.variables
 
     @cached_property
     def _spread(self) -> dict:
@@ -188,13 +186,26 @@ def _orbiting(azimuth, elevation, distance, centre, *, size: int) -> Camera:
     return cameras.pinhole(cameras.orbit(azimuth, elevation, distance, centre), FIELD_OF_VIEW, size, size)
 
 
+def _or_room(light: Light | None) -> Light:
+    return lighting.room_light() if light is None else light
+
+
+def _in_units(drawn: Rendering, volume: Volume) -> Rendering:
+    """What was drawn in the box with its depth in the cloud's units."""
+    return dataclasses.replace(drawn, depth=drawn.depth / np.asarray(volume.scale))
+
+
+def _check_quality(quality: str) -> None:
+    if quality not in (*SAMPLES, "trained"):
+        raise ValueError(f"quality must be one of {', '.join(SAMPLES)}, trained, got {quality}")
+
+
 def at_quality(config: NetworkConfig, quality: Quality, reach: int) -> NetworkConfig:
     """The config that renders at a quality, with samples within `reach` voxels of points.
 
     A network that sees the surface keeps its own reach: the cells of the surface's grid grow with the spacing.
     """
-    if quality not in (*SAMPLES, "trained"):
-        raise ValueError(f"quality must be one of {', '.join(SAMPLES)}, trained, got {quality}")
+    _check_quality(quality)
     if quality == "trained" or not isinstance(config, ModelConfig):
         return config
     counts = config.sampling

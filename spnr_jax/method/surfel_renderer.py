@@ -133,7 +133,7 @@ def _drawn(
     found, covered = splatting.entries(scene.surfels, inside, total=_rounded(total, 2**15, splatting.MOST_ENTRIES))
     pixels = inside.height * inside.width
     slots = _rounded(min(max(int(covered), least_slots), pixels), LEAST_SLOTS, pixels)
-    looked = _look(found, scene.surfels, light, inside, slots=slots)
+    looked = jitted_look(found, scene.surfels, light, inside, slots=slots)
     return _placed(_shade(variables, *looked, config=config, doublings=plan.doublings), camera, plan), slots
 
 
@@ -203,7 +203,7 @@ def look(
     return seen, maps, lighting.projected(light, jnp.asarray(camera.cam_to_world)[:, :3]), buffer.depth
 
 
-_look = jax.jit(look, static_argnames="slots")
+jitted_look = jax.jit(look, static_argnames="slots")
 
 
 @partial(jax.jit, static_argnames=("config", "doublings"))

@@ -55,7 +55,6 @@ CLOUD, CROP = 3, 4  # streams of random numbers under one seed, beside those of 
 
 Arrays = dict[str, np.ndarray]
 NAMES = ("seen", "maps", "ambient", "target")
-look = jax.jit(surfel_renderer.look, static_argnames="slots")
 
 
 class View(NamedTuple):
@@ -164,7 +163,9 @@ def make_view(
         return None
     found, slots = splatting.entries(scene.surfels, drawn, total=_size(total, 2**16))
     slots = min(_size(int(slots), drawn.height * drawn.width // 16), drawn.height * drawn.width)
-    seen, maps, ambient, _ = map(np.asarray, look(found, scene.surfels, light, drawn, slots=slots))
+    seen, maps, ambient, _ = map(
+        np.asarray, surfel_renderer.jitted_look(found, scene.surfels, light, drawn, slots=slots)
+    )
     target = averaged(image, side)
     shown = target[..., 3].reshape(drawn.height, scale, drawn.width, scale).max(axis=(1, 3))
     inside = (seen[..., 0] > FAINT) | (shown > 0)
