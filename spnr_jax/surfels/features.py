@@ -21,13 +21,14 @@ ODD = (14, 17), (15, 18)  # features that change their sign when the picture is 
 FAINT = 0.02  # opacity from which on a pixel's numbers begin to count
 WINDOWS = 2, 6  # pixels to each side over which the depth is compared
 EDGE = 0.6  # coverage at the outline: discs reach beyond the surface, half of their weight
+HAZE = 0.05  # of the opacity that is left where discs hardly cover a pixel: the network may make it solid
 TRUST = 0.25  # most that a colour to first order leaves the blended one
 
 
 def turned(surfels: Surfels, camera: Camera) -> Surfels:
-    """The surfels as seen from a camera: the normals of those without a side point to it."""
+    """The surfels as seen from a camera: all normals point to it, of what is seen from behind too."""
     view = camera.cam_to_world[:, 3][None] - surfels.position
-    behind = (jnp.sum(view * surfels.normal, axis=1, keepdims=True) < 0) & (surfels.sided[:, None] < 0.5)
+    behind = jnp.sum(view * surfels.normal, axis=1, keepdims=True) < 0
     return dataclasses.replace(surfels, normal=jnp.where(behind, -surfels.normal, surfels.normal))
 
 
@@ -71,7 +72,7 @@ def features(
     drawn = (buffer.opacity / (buffer.opacity + FAINT))[..., None]
     seen = jnp.concatenate([drawn * jnp.concatenate([jnp.stack(told, axis=-1), *vectors], axis=-1), drawn], axis=-1)
     unshadowed = lighting.irradiance(light, turned[0]), lighting.mirrored(light, turned[1], roughness)
-    solid = buffer.opacity * -jnp.expm1(-((buffer.coverage / EDGE) ** 2))
+    solid = buffer.opacity * jnp.maximum(-jnp.expm1(-((buffer.coverage / EDGE) ** 2)), HAZE)
     maps = [*jnp.moveaxis(color, -1, 0), metallic, solid, factor, summand, *arriving]
     return seen, jnp.stack([*maps, *unshadowed[0], *unshadowed[1], reflected], axis=-1)
 

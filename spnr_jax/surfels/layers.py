@@ -12,7 +12,7 @@ from jaxtyping import Float
 from spnr_jax.surfels.neighbours import LEAST_SPACING, Near, close, in_plane, spread
 from spnr_jax.surfels.visibility import tangents
 
-PAIRED = 6  # nearest points whose pairs span the planes that are tried
+PAIRED = 8  # nearest points whose pairs span the planes that are tried
 SLIVER = 0.2  # sine between two of them from which on they span one
 FLAT = 0.1  # spacings from a plane at which a point supports it half
 TRUSTED = 1.15  # the plane of least spread counts so much more: it is the better one where points are noisy
@@ -69,9 +69,11 @@ def fitted(near: Near, spacing: np.ndarray, normal: np.ndarray, given: bool) -> 
     A layer is a quadric through its point (Cazals and Pouget 2003), fitted in rounds to the neighbours that lie close
     to it.
     """
-    spacing, normal = spacing[near.rows], normal[near.rows]
+    spacing, of_all, normal = spacing[near.rows], normal, normal[near.rows]
     weight, scale = close(near, spacing), np.full(len(normal), START, np.float32)
     height = in_plane(near, normal, spacing)[2]
+    if given:  # the other side of a wall is told apart by its normals
+        weight = weight * np.clip(0.5 + np.einsum("nki,ni->nk", of_all[near.number], normal), 0, 1)
     for _ in range(ROUNDS):
         one, two, up = in_plane(near, normal, spacing)
         own = weight * np.exp(-0.5 * (height / scale[:, None]) ** 2)

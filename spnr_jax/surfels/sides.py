@@ -15,6 +15,7 @@ HIDDEN = 0.4  # directions, counted by their cosines, that see a point at most t
 LEAST_SHOWN = 0.3  # share of the points that has to be left
 EVIDENCE = 1.0  # votes that a lean is measured against: few of them are none
 UNSURE, SURE = 0.15, 0.45  # lean of the votes from which a side begins to count, and counts whole
+LEAK = 0.02  # what a disc with a side still weighs from behind, where its back can be seen: better than a hole
 
 
 def visible_from(positions: np.ndarray, normal: np.ndarray, spacing: np.ndarray, middle: float) -> np.ndarray:
@@ -71,14 +72,15 @@ def outward(
     """
     normal = np.concatenate([of.normal for of in layer])
     normals, spacings = ([x] * len(near) for x in (normal, spacing))
-    towards = lean(normal, visible_from(positions, normal, spacing, middle))
+    seen = visible_from(positions, normal, spacing, middle)
+    towards = lean(normal, seen)
 
     def vote(votes: np.ndarray) -> np.ndarray:
         return joined(voted, near, layer, normals, spacings, [votes] * len(near))
 
-    towards = vote(towards)
-    if given:
-        return np.where(towards[:, None] < -TURN, -normal, normal), np.ones_like(towards)
-    towards = vote(np.clip(towards + joined(of_walls, near, layer, normals, spacings), -1, 1))
+    towards = vote(np.clip(vote(towards) + joined(of_walls, near, layer, normals, spacings), -1, 1))
     sided = np.clip((np.abs(towards) - UNSURE) / (SURE - UNSURE), 0, 1)
-    return np.where(towards[:, None] < 0, -normal, normal), sided
+    wrong = towards < (-TURN if given else 0)
+    normal = np.where(wrong[:, None], -normal, normal)
+    behind = np.einsum("nd,nd->n", seen, np.maximum(-normal @ DIRECTIONS.T, 0)) > HIDDEN
+    return normal, np.where(behind, np.minimum(sided, 1 - LEAK), sided)

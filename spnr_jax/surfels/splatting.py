@@ -29,6 +29,7 @@ from spnr_jax.kernels.records import AnyArray, Camera, GBuffer, Surfels
 RADIUS = 1.6  # of a disc, in spacings
 FLOOR = 1.0  # smallest radius on the picture, in pixels
 RIM_WIDTH = 0.4  # spacings over which a disc passes to 0 at the end of its layer
+SKIRT = 0.15  # of the kernel left beyond the end of a layer: for the network, which may know better where that is
 OPACITY = 3.0  # optical depth at the middle of a disc
 LIST = 24  # entries of a pixel at most
 NEAR = 8  # places in the list before and after an entry that are compared in depth; those farther in front hide it
@@ -168,7 +169,8 @@ def entries(surfels: Surfels, camera: Camera, *, total: int) -> tuple[Entries, I
     ends = [r[point] - x for r, x in zip(reach, (along, -along, across, -across), strict=True)]
     cut = reduce(mul, (jnp.clip(0.5 + end / RIM_WIDTH, 0, 1) for end in ends))
     on_picture = ((column + 0.5 - foot.column[point]) ** 2 + (row + 0.5 - foot.row[point]) ** 2) / FLOOR**2
-    kernel = jnp.clip(1 - jnp.minimum(in_plane + (1 - cut), on_picture), 0, 1)
+    cut = jnp.maximum(cut - in_plane, SKIRT * (1 - in_plane))
+    kernel = jnp.clip(jnp.maximum(cut, 1 - on_picture), 0, 1)
     depth = jnp.clip(met, -z - radius, -z + radius)
     pixel = jnp.where((place < end[-1]) & (kernel > 0), row * camera.width + column, camera.height * camera.width)
     order, pixel = _sorted(pixel, depth, place, camera.height * camera.width)

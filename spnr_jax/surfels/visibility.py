@@ -1,9 +1,10 @@
 """Which directions see a point: orthographic depth buffers of the points themselves.
 
 From each of 64 directions the points are drawn into a grid whose cells are CELL spacings wide, every point into the
-four cells around it.  A point is seen where, lifted off the surface by a spacing, it lies at most a spacing behind what
-the grid holds.  So one pass over the points gives the side that a surface shows, ambient occlusion, and the share of
-any light that arrives.
+four cells around it, at the depth that its plane has in the middle of the cell.  A point is seen where, lifted off the
+surface by a spacing, it lies before what the grid holds, both where its plane meets the middle of its cell.  So no
+plane hides itself at whatever angle, and one pass over the points gives the side that a surface shows, ambient
+occlusion, and the share of any light that arrives.
 """
 
 from functools import partial
@@ -15,6 +16,9 @@ from jaxtyping import Array, Bool, Float
 
 NUM_DIRECTIONS = 64
 CELL = 1.5  # spacings
+STEEPEST = 8.0  # slope of a plane against the direction, at most
+REACH = 1.6  # spacings that a point's plane comes nearer in the cells around it, at most
+SOFT = 1.0  # spacings behind the depth buffer over which a point passes from seen to hidden
 FINEST = 1024  # cells along the box at most
 BOX = 2.2  # side of the square that every direction draws: the box's diagonal is 2
 
@@ -67,22 +71,33 @@ def seen_from(
     def cell_of(column, row):
         return jnp.clip(row, 0, grid - 1) * grid + jnp.clip(column, 0, grid - 1)
 
+    def beside(column, row, right, up, slopes):
+        """How much nearer a plane through (right, up), in cells, is in the middle of a cell."""
+        return cell * ((column + 0.5 - right) * slopes[0] + (row + 0.5 - up) * slopes[1])
+
     def one(axes):
         towards, right, up = axes
-        column = jnp.floor(along(right, (x, y, z)) / cell + grid / 2 - 0.5).astype(jnp.int32)
-        row = jnp.floor(along(up, (x, y, z)) / cell + grid / 2 - 0.5).astype(jnp.int32)
+        facing = along(towards, normals.T)
+        steep = [
+            -along(axis, normals.T) * jnp.sign(facing) / jnp.maximum(jnp.abs(facing), 1e-3) for axis in (right, up)
+        ]
+        slope = jnp.sqrt(steep[0] ** 2 + steep[1] ** 2)
+        steep = [x * jnp.minimum(1, STEEPEST / jnp.maximum(slope, 1e-3)) for x in steep]
+        across, high = (along(axis, (x, y, z)) / cell + grid / 2 for axis in (right, up))
+        column, row = (jnp.floor(v - 0.5).astype(jnp.int32) for v in (across, high))
         depth = along(towards, (x, y, z))
+        most = REACH * spacing * jnp.sqrt(jnp.clip(1 - facing**2, 0, 1))
         nearest = jnp.full(grid * grid, -2 * BOX)
-        for step in ((0, 0), (0, 1), (1, 0), (1, 1)):
-            index = jnp.where(mask, cell_of(column + step[0], row + step[1]), grid * grid)
-            nearest = nearest.at[index].max(depth, mode="drop")
-        lift = jnp.sign(along(towards, normals.T)) * spacing
+        for j, i in ((0, 0), (0, 1), (1, 0), (1, 1)):
+            there = depth + jnp.minimum(beside(column + i, row + j, across, high, steep), most)
+            index = jnp.where(mask, cell_of(column + i, row + j), grid * grid)
+            nearest = nearest.at[index].max(there, mode="drop")
+        lift = jnp.sign(facing) * spacing
         lifted = [p + lift * n for p, n in zip((x, y, z), normals.T, strict=True)]
-        index = cell_of(
-            jnp.floor(along(right, lifted) / cell + grid / 2).astype(jnp.int32),
-            jnp.floor(along(up, lifted) / cell + grid / 2).astype(jnp.int32),
-        )
-        behind = (nearest[index] - along(towards, lifted)) / jnp.maximum(spacing, cell / CELL)
-        return jnp.clip(2.0 - behind, 0, 1)
+        across, high = (along(axis, lifted) / cell + grid / 2 for axis in (right, up))
+        column, row = (jnp.floor(v).astype(jnp.int32) for v in (across, high))
+        there = along(towards, lifted) + beside(column, row, across, high, steep)
+        behind = (nearest[cell_of(column, row)] - there) / jnp.maximum(spacing, cell / CELL)
+        return jnp.clip(1 - behind / SOFT, 0, 1)
 
     return jax.lax.map(one, (jnp.asarray(DIRECTIONS), *map(jnp.asarray, tangents(DIRECTIONS)))).T
