@@ -52,13 +52,15 @@ def voted(near: Near, layer: Layer, normal: np.ndarray, spacing: np.ndarray, lea
     return np.einsum("nk,nk->n", weight * np.sign(along), lean[near.number]) / np.maximum(weight.sum(axis=1), 1e-6)
 
 
-def of_walls(near: Near, layer: Layer, normal: np.ndarray, spacing: np.ndarray) -> np.ndarray:
+def of_walls(near: Near, layer: Layer, normal: np.ndarray, spacing: np.ndarray, given: bool) -> np.ndarray:
     """A lean from another layer, nearer than anything can be seen between: a wall's sides face away from each other.
 
-    A layer right under another, as under a sticker, is taken for a wall's inner side, and not seen from outside either.
+    A layer right under another, as under a sticker, is taken for a wall's inner side, and not seen from outside either;
+    given normals tell the two apart.
     """
     along = np.einsum("nki,ni->nk", normal[near.number], normal[near.rows])
-    wall = close(near, spacing[near.rows]) * (np.abs(along) > PARALLEL) * (np.abs(layer.height) < WALL)
+    other = (-along if given else np.abs(along)) > PARALLEL
+    wall = close(near, spacing[near.rows]) * other * (np.abs(layer.height) < WALL)
     above, below = (np.sum(wall * (sign * layer.height > APART * layer.scale[:, None]), axis=1) for sign in (1, -1))
     return SOLID * (below - above) / (above + below + EVIDENCE)
 
@@ -78,7 +80,7 @@ def outward(
     def vote(votes: np.ndarray) -> np.ndarray:
         return joined(voted, near, layer, normals, spacings, [votes] * len(near))
 
-    towards = vote(np.clip(vote(towards) + joined(of_walls, near, layer, normals, spacings), -1, 1))
+    towards = vote(np.clip(vote(towards) + joined(of_walls, near, layer, normals, spacings, [given] * len(near)), -1, 1))
     sided = np.clip((np.abs(towards) - UNSURE) / (SURE - UNSURE), 0, 1)
     wrong = towards < (-TURN if given else 0)
     normal = np.where(wrong[:, None], -normal, normal)

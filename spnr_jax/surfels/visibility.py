@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float
 NUM_DIRECTIONS = 64
 CELL = 1.5  # spacings
 STEEPEST = 8.0  # slope of a plane against the direction, at most
-REACH = 1.6  # spacings that a point's plane comes nearer in the cells around it, at most
+REACH = 1.6  # spacings that a disc reaches: in a cell beyond that it counts at its point's own depth
 SOFT = 1.0  # spacings behind the depth buffer over which a point passes from seen to hidden
 FINEST = 1024  # cells along the box at most
 BOX = 2.2  # side of the square that every direction draws: the box's diagonal is 2
@@ -89,7 +89,8 @@ def seen_from(
         most = REACH * spacing * jnp.sqrt(jnp.clip(1 - facing**2, 0, 1))
         nearest = jnp.full(grid * grid, -2 * BOX)
         for j, i in ((0, 0), (0, 1), (1, 0), (1, 1)):
-            there = depth + jnp.minimum(beside(column + i, row + j, across, high, steep), most)
+            nearer = beside(column + i, row + j, across, high, steep)
+            there = depth + jnp.where(nearer < most, nearer, 0)
             index = jnp.where(mask, cell_of(column + i, row + j), grid * grid)
             nearest = nearest.at[index].max(there, mode="drop")
         lift = jnp.sign(facing) * spacing

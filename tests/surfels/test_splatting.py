@@ -112,12 +112,11 @@ class TestEntries:
             side = np.cross(n, rim)
             ends = [e + (p - hit) @ way / 0.25 for e, way in zip(reach[i], (rim, -rim, side, -side), strict=True)]
             kept = np.prod([np.clip(0.5 + e / splatting.RIM_WIDTH, 0, 1) for e in ends], axis=0)
-            away = np.minimum(
-                ((hit - p) ** 2).sum(axis=1) / (splatting.RADIUS * 0.25) ** 2 + 1 - kept,
-                ((places - np.asarray(pixels)[i]) ** 2).sum(axis=1) / splatting.FLOOR**2,
-            )
-            clear = np.isfinite(away) & (directions @ (hit - eye).T[:, 0] > -9)
-            expected = facing[i] * np.clip(1 - away, 0, 1)
+            within = ((hit - p) ** 2).sum(axis=1) / (splatting.RADIUS * 0.25) ** 2
+            on_picture = 1 - ((places - np.asarray(pixels)[i]) ** 2).sum(axis=1) / splatting.FLOOR**2
+            drawn = np.max([kept - within, splatting.SKIRT * (1 - within), on_picture], axis=0)
+            clear = np.isfinite(drawn) & (directions @ (hit - eye).T[:, 0] > -9)
+            expected = facing[i] * np.clip(drawn, 0, 1)
             close(table[i][clear], expected[clear], atol=2e-3)
 
     def test_they_are_sorted_by_pixel_and_depth_whatever_the_size_of_the_picture(self):
