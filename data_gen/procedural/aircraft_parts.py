@@ -88,7 +88,7 @@ def surface(root, tip, chord, thickness, sections=2) -> Mesh:
     rings = []
     for at in np.linspace(0, 1, sections):
         size = chord[0] + (chord[1] - chord[0]) * at
-        rings.append(root + span * at - size * outline[:, :1] * (0, 0, 1.0) - size * outline[:, 1:] * up)
+        rings.append(root + span * at - size * outline[:, :1] * (0, 0, 1.0) + size * outline[:, 1:] * up)
     return loft(rings)
 
 
