@@ -207,7 +207,7 @@ def test_a_disc_whose_back_can_be_seen_keeps_a_little_weight_from_behind_and_tha
     found = estimate(wall, normals=np.concatenate([normals, -normals]))
     assert np.mean((found["sided"] > 0.9) & (found["sided"] <= 1 - sides.LEAK)) > 0.9
     positions, normals, _ = shape("sphere", 800)
-    close(estimate(positions, normals=normals)["sided"], np.ones(800))
+    assert np.mean(estimate(positions, normals=normals)["sided"] == 1) > 0.99
 
 
 def test_what_lies_right_under_a_layer_that_faces_the_same_way_is_not_drawn():
