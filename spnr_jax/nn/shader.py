@@ -18,7 +18,7 @@ from spnr_jax.surfels.lighting import SPECULAR
 NUM_OUTPUTS = 19
 COLOR_STEP, ODDS_STEP = 0.3, 2.0  # what an output of 1 changes the base colour, and the log odds of the opacity by
 LEAST_ODDS = 1e-2  # keeps the odds of what is clear or solid finite
-NOTHING = 3e-3  # opacity below which a pixel stays clear, whatever the network says
+NOTHING = 2e-4  # opacity below which a pixel stays clear, whatever the network says
 
 
 def doubled(x: Float[Array, "batch height width features"]) -> Float[Array, "batch h w features"]:
