@@ -4,7 +4,8 @@
 
 The networks draw the test objects of a data set (`spnr-data generate --spread even --points 65536 --resolution 512`)
 from so many of each object's first points, beside the same discs and light without a network (`draft`).  A ball of one
-grey should be smooth, a plate red in front should show no blue.
+grey should be smooth, a plate red in front should show no blue.  Two columns are an oracle: the same colours under the
+reference's opacity.
 
     OUT/results.json  OUT/table.md .csv .tex     `scoring/picture_scores.py`, of each network and number of points
     OUT/gallery.png   OUT/ID.png                 references and pictures beside each other, at full size
@@ -27,17 +28,28 @@ from experiments.comparison import figures, results_folder
 from experiments.comparison.result_tables import Cell, Table, number
 from spnr_jax.devices import machine
 from spnr_jax.formats import data_sets, images
-from spnr_jax.kernels import cameras
+from spnr_jax.kernels import cameras, metrics
 from spnr_jax.kernels.records import Camera, PointCloud
 from spnr_jax.kernels.resizing import mean_of_squares
 from spnr_jax.method.model import Model, Quality
 from spnr_jax.model_config import SurfelConfig
 from spnr_jax.scoring import intervals
-from spnr_jax.scoring.picture_scores import Sharpness, ball, ball_waves, blue_share, plate, sharpness
+from spnr_jax.scoring.flip import flip
+from spnr_jax.scoring.picture_scores import ball, ball_waves, blue_share, plate, sharpness, under_true_opacity
 from spnr_jax.training.weights import load
 
-DECIMALS = Sharpness(psnr=2, psnr_inside=2, outline_rmse=3, holes=2, detail=3)
-HEADS = ("PSNR, dB", "inside, dB", "outline RMSE", "holes, %", "detail", "encode, s", "a picture, s")
+COLUMNS = {  # scores of a view: heads, decimals
+    "psnr": ("PSNR, dB", 2),
+    "psnr_inside": ("inside, dB", 2),
+    "outline_rmse": ("outline RMSE", 3),
+    "holes": ("holes, %", 2),
+    "detail": ("detail", 3),
+    "ssim": ("SSIM", 3),
+    "flip": ("FLIP", 4),
+    "psnr_true_opacity": ("PSNR, true opacity", 2),
+    "inside_true_opacity": ("inside, true opacity", 2),
+}
+HEADS = (*(head for head, _ in COLUMNS.values()), "encode, s", "a picture, s")
 KNOWN_HEADS = ("ball: waves", "plate: blue share")
 
 
@@ -125,8 +137,8 @@ def _scores(
 ) -> dict[str, float]:
     """Mean scores of an object's views, seconds to encode it and to draw one."""
     drawn, seconds = _draw(options, item, model, quality, count)
-    scores = [sharpness(*picture) for picture in drawn]
-    means = {name: float(np.nanmean([getattr(s, name) for s in scores])) for name in Sharpness._fields}
+    scores = [all_scores(*picture) for picture in drawn]
+    means = {name: float(np.nanmean([of[name] for of in scores])) for name in COLUMNS}
     return means | dict(zip(("encode", "render"), seconds, strict=True))
 
 
@@ -148,6 +160,18 @@ def _draw(
         seconds = (perf_counter() - begin) / len(views)
     drawn = [(image, opacity, reference) for (image, opacity), (_, reference) in zip(found, pairs, strict=True)]
     return drawn, (encode, seconds)
+
+
+def all_scores(image: np.ndarray, opacity: np.ndarray, reference: np.ndarray) -> dict[str, float]:
+    """The scores of a picture by the names in COLUMNS."""
+    white = reference[..., :3] * reference[..., 3:] + 1 - reference[..., 3:]
+    oracle = sharpness(under_true_opacity(image, opacity, reference), reference[..., 3], reference)
+    return sharpness(image, opacity, reference)._asdict() | {
+        "ssim": float(metrics.ssim(jnp.asarray(image), jnp.asarray(white))),
+        "flip": float(flip(jnp.asarray(image), jnp.asarray(white))),
+        "psnr_true_opacity": oracle.psnr,
+        "inside_true_opacity": oracle.psnr_inside,
+    }
 
 
 def told(cloud: PointCloud, normals: bool) -> PointCloud:
@@ -189,10 +213,10 @@ def _known(options: SharpnessStudy, label: str, model: Model, quality: Quality, 
 
 def _cells(found: Sequence[Mapping[str, float]], known: Mapping[str, float]) -> tuple[Cell, ...]:
     cells = []
-    for name in Sharpness._fields:
+    for name, (_, decimals) in COLUMNS.items():
         values = [scores[name] for scores in found if not np.isnan(scores[name])]
         interval = intervals.interval([np.array([value]) for value in values]) if len(values) > 1 else None
-        cells.append(number(float(np.mean(values)) if values else None, getattr(DECIMALS, name), interval))
+        cells.append(number(float(np.mean(values)) if values else None, decimals, interval))
     cells += [number(float(np.median([scores[name] for scores in found])), 2) for name in ("encode", "render")]
     return (*cells, number(known["ball"], 4), number(known["plate"], 3))
 

@@ -7,13 +7,14 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.ndimage import binary_dilation, binary_erosion, gaussian_filter
+from scipy.ndimage import binary_dilation, binary_erosion, distance_transform_edt, gaussian_filter
 
 from spnr_jax.kernels.records import PointCloud
 
 OUTLINE = 3  # pixels to both sides of the true outline
 WELL_INSIDE = 4  # pixels from the outline
 SOLID = 0.9  # opacity below which a pixel well inside is a hole
+COVERED = 0.3  # opacity from which on a picture's colour is told
 DETAIL = 3.0  # standard deviation of the Gaussian whose residue is detail
 WAVES = 8.0  # the same for the ball
 GREY = 0.5  # base colour of the ball
@@ -48,6 +49,23 @@ def sharpness(
         holes=100 * _mean(opacity[deep] < SOLID),
         detail=_correlation(_residue(image, DETAIL)[deep], _residue(white, DETAIL)[deep]),
     )
+
+
+def under_true_opacity(
+    image: Float[np.ndarray, "height width 3"],
+    opacity: Float[np.ndarray, "height width"],
+    reference: Float[np.ndarray, "height width 4"],
+) -> Float[np.ndarray, "height width 3"]:
+    """The picture's own colours under the reference's opacity: what it would be with perfect outlines, no holes.
+
+    Where the picture shows little or nothing it takes the colour of the nearest pixel that it covers.
+    """
+    color = (image - 1 + opacity[..., None]) / np.maximum(opacity[..., None], COVERED)
+    shown = opacity >= COVERED
+    if shown.any():
+        color = color[tuple(distance_transform_edt(~shown, return_distances=False, return_indices=True))]
+    alpha = reference[..., 3:]
+    return np.clip(color, 0, 1) * alpha + 1 - alpha
 
 
 def _mean(values: np.ndarray) -> float:

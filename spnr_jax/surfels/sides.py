@@ -80,7 +80,9 @@ def outward(
     def vote(votes: np.ndarray) -> np.ndarray:
         return joined(voted, near, layer, normals, spacings, [votes] * len(near))
 
-    towards = vote(np.clip(vote(towards) + joined(of_walls, near, layer, normals, spacings, [given] * len(near)), -1, 1))
+    towards = vote(
+        np.clip(vote(towards) + joined(of_walls, near, layer, normals, spacings, [given] * len(near)), -1, 1)
+    )
     sided = np.clip((np.abs(towards) - UNSURE) / (SURE - UNSURE), 0, 1)
     wrong = towards < (-TURN if given else 0)
     normal = np.where(wrong[:, None], -normal, normal)

@@ -9,6 +9,7 @@ from support import tiny_dataset, tiny_surfels
 from data_gen.store import layout
 from experiments.studies import relighting, sharpness
 from spnr_jax.formats import data_sets
+from spnr_jax.scoring.picture_scores import under_true_opacity
 
 SPLITS = {"train": (), "val": (), "test": ("ball_000000",)}
 
@@ -60,6 +61,20 @@ def test_each_view_of_a_lit_data_set_has_its_light(lit):
     item = data_sets.read_object(data_sets.open_dataset(lit), "ball_000000")
     assert item.lights.shape == (len(item.images), 32, 64, 3)
     assert len(item.own_lights) == len(item.images)
+
+
+def test_colours_under_the_true_opacity_are_those_of_the_nearest_pixel_that_is_covered():
+    reference = np.zeros((32, 32, 4), np.float32)
+    reference[8:24, 8:24] = 0.2, 0.4, 0.6, 1
+    white = reference[..., :3] * reference[..., 3:] + 1 - reference[..., 3:]
+    found = under_true_opacity(white, reference[..., 3], reference)
+    np.testing.assert_allclose(found, white, atol=1e-6)
+    opacity = reference[..., 3].copy()
+    opacity[12:16, 8:16] = 0.05  # a hole, and half of an outline that is missing
+    torn = reference[..., :3] * opacity[..., None] + 1 - opacity[..., None]
+    np.testing.assert_allclose(under_true_opacity(torn, opacity, reference), white, atol=1e-6)
+    nothing = under_true_opacity(np.ones_like(white), np.zeros((32, 32), np.float32), reference)
+    assert np.isfinite(nothing).all()
 
 
 def test_scores_of_a_picture_that_is_right_and_of_one_half_as_bright():
