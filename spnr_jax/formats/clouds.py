@@ -169,7 +169,7 @@ def _read(path: Path, num_points: int | None, seed: int, clean: Clean, cut: Cut,
         lines += done
     for line in lines:
         report(line)
-    return positions, origin, values, sensor_of(path)
+    return positions, origin, values, sensor_of(path, positions + origin)
 
 
 def _sampled_mesh(path: Path, count: int, seed: int, report: Callable[[str], None]):

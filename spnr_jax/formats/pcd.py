@@ -33,7 +33,7 @@ class PcdHeader:
     encoding: str
     size: int  # bytes up to the data
     organised: bool  # one point for each pixel of a depth camera
-    sensor: tuple[float, ...] | None  # its place; None where the header does not say, which it has no word for
+    sensor: tuple[float, ...] | None  # its place; writers put 0 0 0 there if they do not know it
 
 
 def read_pcd_header(path: Path) -> PcdHeader:
@@ -102,19 +102,19 @@ def _header(data: bytes) -> PcdHeader:
     if num_points < 0:
         raise ValueError(f"has a PCD header that announces {num_points} points")
     organised = entries.get("HEIGHT", ["1"])[:1] not in (["0"], ["1"])
-    sensor = _sensor(entries.get("VIEWPOINT", []), organised)
+    sensor = _sensor(entries.get("VIEWPOINT", []))
     return PcdHeader(
         layout=layout, num_points=num_points, encoding=encoding, size=end.end(), organised=organised, sensor=sensor
     )
 
 
-def _sensor(viewpoint: list[str], organised: bool) -> tuple[float, ...] | None:
-    """The sensor's place (3,): x y z of VIEWPOINT.  Every writer puts 0 0 0 there: it holds of depth images alone."""
+def _sensor(viewpoint: list[str]) -> tuple[float, ...] | None:
+    """The sensor's place (3,): x y z of VIEWPOINT."""
     try:
         place = tuple(float(value) for value in viewpoint[:3])
     except ValueError:
         return None
-    return place if len(place) == 3 and all(map(math.isfinite, place)) and (organised or any(place)) else None
+    return place if len(place) == 3 and all(map(math.isfinite, place)) else None
 
 
 def _columns(body: bytes, header: PcdHeader) -> np.ndarray:

@@ -23,16 +23,16 @@ from spnr_jax.kernels.thinning import first_in_voxels, frame
 Values = dict[str, np.ndarray]
 Box = Sequence[float | int]
 
-CROWD = 8.0  # points of a voxel, on average
+CROWD = 4.0  # points of a voxel, on average
 COARSEST, FINER, TRIES = 4.0, 2**0.5, 40  # fewest voxels along the extent; ratio and number of the sides tried
 NEIGHBOURS = [(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if (x, y, z) > (0, 0, 0)]  # half
 SAMPLE, PLANES, ROUNDS = 4096, 512, 3  # points that vote, planes that are tried, fits to what lies close
 CLOSE = 0.5  # voxels from the plane, for the votes
-THICK = 3.0  # standard deviations of what lies close: a plane's noise goes with it
+THICK = 3.0  # standard deviations of what lies close, a voxel at most: a plane's noise goes with it
 LEAST_PLANE = 0.1  # share of the area that a plane needs
 LEAST_POINTS = 2000  # fewer are taken for one object
 LARGE = 0.05  # share of the points of a cluster that counts
-WIDE = 100.0  # spacings across, of a scene
+WIDE = 200.0  # spacings across, of a scene
 SMALL_THING = 0.6  # of the plane's extent: what stands on it, or before it, of a scene
 SCENE_PLANE, GROUND = 0.25, 0.6  # share of the area of a plane with such things; with whatever else
 
@@ -127,7 +127,8 @@ def object_of(
         labels = clusters(positions[rows])
         count = int(labels.max()) + 1
         if nth > count:
-            raise ValueError(f"--object {nth}: there are {count} clusters of points; choose one from 1 to {count}")
+            there = f"are {count} clusters" if count > 1 else "is 1 cluster"
+            raise ValueError(f"--object {nth}: there {there} of points; choose one from 1 to {count}")
         chosen = rows[labels == nth - 1]
         box = _written(positions[chosen].min(axis=0) + origin, positions[chosen].max(axis=0) + origin)
         lines.append(f"--object: cluster {nth} of {count:,}, {len(chosen):,} of {len(rows):,} points, in the box {box}")
@@ -202,7 +203,7 @@ def dominant_plane(positions: Float[np.ndarray, "points 3"], seed: int = 0) -> P
         offset = float(middle @ normal)
     heights = np.abs(evenly @ normal - offset)
     deviation = float(np.sqrt(np.mean(heights[heights < 2 * CLOSE * voxel] ** 2)))
-    thickness = max(CLOSE * voxel, THICK * deviation)
+    thickness = float(np.clip(THICK * deviation, CLOSE * voxel, voxel))
     share = float(np.mean(heights <= thickness))
     return None if share < LEAST_PLANE else Plane(normal=normal, offset=offset, thickness=thickness, share=share)
 
