@@ -36,7 +36,6 @@ from spnr_jax.scoring.flip import flip
 from spnr_jax.scoring.picture_scores import sharpness
 from spnr_jax.training.weights import load
 
-SCORES = ("psnr", "psnr_inside", "flip")
 HEADS = ("PSNR, dB", "inside, dB", "FLIP", "cleaned: PSNR, dB", "inside, dB", "FLIP", "points left, %")
 DECIMALS = (2, 2, 3)
 
@@ -80,15 +79,8 @@ def main(options: ScansStudy) -> None:
     for count in options.counts:
         for label, fault in faults(options.noise, options.outliers, options.scanners).items():
             row = f"{count:,}, {label}"
-            place = options.out / "scores" / f"{count} {label}".replace(" ", "_")
             rows[row] = [
-                results_folder.kept(
-                    place / f"{name}.json",
-                    lambda name=name, fault=fault, count=count: _scores(
-                        options, data_sets.read_object(dataset, name), model, fault, count
-                    ),
-                )
-                for name in tqdm(names, desc=row)
+                _kept_scores(options, dataset, name, label, model, fault, count) for name in tqdm(names, desc=row)
             ]
     table = Table(
         title=f"Scans, {len(names)} objects x {options.views} views",
@@ -98,6 +90,21 @@ def main(options: ScansStudy) -> None:
     )
     results_folder.write(options.out, {"objects": rows, "hardware": machine.hardware()}, [table])
     _gallery(options, dataset, names[: options.shown], model)
+
+
+def _kept_scores(
+    options: ScansStudy,
+    dataset: data_sets.Dataset,
+    name: str,
+    label: str,
+    model: Model,
+    fault: Fault | None,
+    count: int,
+) -> dict[str, Any]:
+    place = options.out / "scores" / f"{count} {label}".replace(" ", "_") / f"{name}.json"
+    return results_folder.kept(
+        place, lambda: _scores(options, data_sets.read_object(dataset, name), model, fault, count)
+    )
 
 
 def spoiled(cloud: PointCloud, fault: Fault | None) -> tuple[np.ndarray, dict[str, np.ndarray]]:
