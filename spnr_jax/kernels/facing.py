@@ -4,7 +4,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 
-NEIGHBOURS = 16
+NEIGHBOURS, MOST = 16, 64  # of a point, for its normal
+THICK = 0.1  # extent of most neighbourhoods across their planes, over that along them, from which on there is noise
 CELL = 2.0  # spacings: pixel of a sensor
 SAMPLE = 2048  # points at which the spacing is measured
 
@@ -14,11 +15,20 @@ def facing(
     among: Float[np.ndarray, "all 3"],
     place: Float[np.ndarray, "3"],
 ) -> Float[np.ndarray, "points 3"]:
-    """Unit normals of the planes through the nearest of all points, least squares, on the side of the place."""
-    count = min(NEIGHBOURS, len(among))
-    near = among[cKDTree(among).query(positions, list(range(1, count + 1)), workers=-1)[1]]
-    offset = near - near.mean(axis=1, keepdims=True)
-    normal = np.linalg.eigh(np.swapaxes(offset, 1, 2) @ offset)[1][..., 0]
+    """Unit normals of the planes through the nearest of all points, least squares, on the side of the place.
+
+    They are the more points the thicker these lie about their planes, so that noise does not tilt them.
+    """
+    tree, count = cKDTree(among), min(NEIGHBOURS, len(among))
+    while True:
+        near = among[tree.query(positions, list(range(1, count + 1)), workers=-1)[1]]
+        offset = near - near.mean(axis=1, keepdims=True)
+        squared, axes = np.linalg.eigh(np.swapaxes(offset, 1, 2) @ offset)
+        thick = np.median(squared[:, 0]) > THICK**2 * np.median(squared[:, 2])
+        if not thick or 2 * count > min(MOST, len(among)):
+            break
+        count *= 2
+    normal = axes[..., 0]
     towards = np.einsum("ni,ni->n", normal, place - positions)
     return np.where(towards[:, None] < 0, -normal, normal)
 

@@ -29,3 +29,10 @@ def test_a_sensor_sees_the_near_cap_of_a_ball_and_nothing_from_the_place_of_the_
     assert not seen[height < 0].any()
     assert not seen_from(np.ones((5, 3)), np.ones(3), 0.1, 2.0).any()
     assert spacing_of(np.zeros((1, 3))) == 0
+
+
+def test_noise_tilts_normals_less_because_more_points_are_asked():
+    points = spiral(8000)
+    noisy = points + np.random.default_rng(0).normal(size=points.shape) * 0.4 * spacing_of(points)
+    normals = facing(noisy, noisy, np.zeros(3))
+    assert np.median(np.sum(normals * -points, axis=1)) > 0.98
