@@ -294,7 +294,6 @@ def test_a_part_of_a_scene_is_asked_for_with_corners_of_either_sign(command):
     [
         (["--crop", "7", "7", "7", "8", "8", "8"], "--crop 7 7 7 8 8 8: none of the 2,000 points, they lie in the box"),
         (["--object", "2"], "--object 2: there is 1 cluster"),
-        (["--remove-plane", "--crop", "-1", "-1", "-1", "1", "1", "-.5"], "--remove-plane: no plane holds 10% of"),
         (["--object", "smallest"], "--object must be largest or a number from 1, got 'smallest'"),
         (["--crop", "1", "0", "0", "0", "1", "1"], "--crop takes xmin ymin zmin xmax ymax zmax"),
         (["--crop", "0", "1"], "--crop"),
