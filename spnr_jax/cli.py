@@ -22,6 +22,7 @@ import tyro
 from spnr_jax import presets
 from spnr_jax.config import TrainConfig
 from spnr_jax.devices import allocator
+from spnr_jax.formats.cut import Cut
 from spnr_jax.formats.debugging import show_stack, without_debug
 from spnr_jax.model_config import SurfelConfig
 from spnr_jax.tools.light_options import Lighting
@@ -133,6 +134,8 @@ class View:
     clean: Literal["auto", "off", "strong"] = "auto"
     """Outliers of points are removed, and noisy ones averaged, before they are thinned; a clean cloud, and a mesh, stay
     as they are.  strong: at smaller deviations."""
+    cut: tyro.conf.OmitArgPrefixes[Cut] = Cut()
+    """Which part of a scene is shown first; files that are dropped on the page are shown whole."""
     up: Literal["auto", "x", "y", "z", "-x", "-y", "-z"] = "auto"
     """The file's upward axis; auto looks for it, and says what it found."""
 

@@ -9,10 +9,13 @@ import signal
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 from support import tiny_dataset
 
 from spnr_jax import presets
+from spnr_jax.formats.cut import Cut
+from spnr_jax.surfels.visibility import spiral
 
 
 def unchecked_cli():
@@ -277,6 +280,31 @@ def test_an_error_shows_its_call_stack_where_that_is_asked_for(capsys, monkeypat
     monkeypatch.setenv("SPNR_DEBUG", "")  # so that it is put back
     assert exit_code("runs", tmp_path / "none", "--debug") == 2
     assert "Traceback" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", ["render", "view"])
+def test_a_part_of_a_scene_is_asked_for_with_corners_of_either_sign(command):
+    cut = cli.parse([command, "a.ply", "--crop", "-1", "-1e-3", "-.5", "1", "2", "3", "--object", "largest"]).cut
+    assert cut == Cut(crop=(-1.0, -1e-3, -0.5, 1.0, 2.0, 3.0), object="largest")
+    assert cli.parse([command, "a.ply", "--remove-plane"]).cut == Cut(remove_plane=True)
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        (["--crop", "7", "7", "7", "8", "8", "8"], "--crop 7 7 7 8 8 8: none of the 2,000 points, they lie in the box"),
+        (["--object", "2"], "--object 2: there is 1 cluster"),
+        (["--object", "smallest"], "--object must be largest or a number from 1, got 'smallest'"),
+        (["--crop", "1", "0", "0", "0", "1", "1"], "--crop takes xmin ymin zmin xmax ymax zmax"),
+        (["--crop", "0", "1"], "--crop"),
+    ],
+)
+def test_a_part_that_is_not_there_is_refused_in_one_line(tmp_path, capsys, options, expected):
+    np.save(tmp_path / "ball.npy", spiral(2000))
+    assert exit_code("render", tmp_path / "ball.npy", "--out", tmp_path, *options) == 2
+    said = capsys.readouterr().err.splitlines()
+    assert expected in said[-1]
+    assert not any("Traceback" in line for line in said)
 
 
 @pytest.mark.parametrize("command", ["render", "view"])

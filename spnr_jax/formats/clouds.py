@@ -14,11 +14,15 @@ from typing import get_args
 
 import numpy as np
 
+from spnr_jax.formats.cut import Cut
 from spnr_jax.formats.ply import read_ply_header
 from spnr_jax.formats.point_columns import DEFAULTS, LINEAR, POSITION, SRGB, Columns, materials, normals, useful
 from spnr_jax.formats.point_files import READERS, column_pieces, parse_ply
+from spnr_jax.formats.sensor import sensor_of
 from spnr_jax.formats.up_axis import ROTATIONS, find_up
+from spnr_jax.kernels import scenes
 from spnr_jax.kernels.cleaning import Clean, cleaned
+from spnr_jax.kernels.facing import facing
 from spnr_jax.kernels.records import PointCloud
 from spnr_jax.kernels.thinning import THINNING, farthest_points, thin_stream
 
@@ -27,6 +31,8 @@ MESH_POINTS = 4096  # points drawn from a mesh if no number is asked for; the mo
 MOST_EVEN = 2**14  # points that are spread evenly over a mesh, in seconds; more lie close enough as they are drawn
 CAPACITY = 2**19  # points of a file that are in memory at most; more are thinned while reading
 BROKEN = "NaN, infinity or too large a number"
+CUT_MESH = 2**18  # points drawn from a mesh that something is cut out of
+WHOLE = Cut()
 COARSEST_STEP = 1e-3  # of the extent, that rounding to float32 may cost
 
 
@@ -47,6 +53,7 @@ def read_cloud(
     up: str = "y",
     seed: int = 0,
     clean: Clean = "off",
+    cut: Cut = WHOLE,
     report: Callable[[str], None] = lambda line: None,
 ) -> PointCloud:
     """The cloud in a file of points or on a mesh file's surface: (points, ...) float32, `mask` all True.
@@ -54,9 +61,10 @@ def read_cloud(
     More than `num_points` are thinned out evenly, fewer are kept; a mesh gives exactly `num_points` (4096 if None).
     `up` is the file's upward axis, or "auto".  Unless `clean` is "off" points are cleaned before they are thinned
     (spnr_jax/kernels/cleaning.py), those of meshes never; of a file that is thinned while reading, what that keeps.
-    Rows without finite numbers are left out.  ValueError, one line that names the file, for whatever cannot be read.
+    `cut` says which part of a scene is wanted.  Rows without finite numbers are left out.  ValueError, one line that
+    names the file, for whatever cannot be read.
     """
-    return place_cloud(path, num_points=num_points, up=up, seed=seed, clean=clean, report=report).cloud
+    return place_cloud(path, num_points=num_points, up=up, seed=seed, clean=clean, cut=cut, report=report).cloud
 
 
 def place_cloud(
@@ -66,6 +74,7 @@ def place_cloud(
     up: str = "auto",
     seed: int = 0,
     clean: Clean = "off",
+    cut: Cut = WHOLE,
     report: Callable[[str], None] = lambda line: None,
 ) -> PlacedCloud:
     """The cloud of `read_cloud` with the way back into the file's frame."""
@@ -78,23 +87,21 @@ def place_cloud(
         raise ValueError(f"clean must be one of {', '.join(get_args(Clean))}, got {clean!r}")
     _check_file(path)
     try:
-        if _is_mesh(path):
-            positions, origin, values = _sampled_mesh(path, num_points or MESH_POINTS, seed, report)
-        else:
-            columns = _bounded_columns(path, num_points, report)
-            positions, origin, values = _points_of_columns(columns, report)
-            if clean != "off":
-                positions, values, lines = cleaned(positions, values, clean)
-                for line in lines:
-                    report(line)
+        positions, origin, values, sensor = _read(path, num_points, seed, clean, cut, report)
     except (ValueError, OSError) as error:
         raise ValueError(f"{path}: {str(error).splitlines()[0]}") from error
+    kept = np.arange(len(positions))
     if num_points is not None and len(positions) > num_points:
         report(f"{num_points} of {len(positions)} points kept, evenly spread")
         kept = np.sort(farthest_points(positions, num_points, seed))
-        positions, values = positions[kept], {name: column[kept] for name, column in values.items()}
+    values = {name: column[kept] for name, column in values.items()}
+    if sensor and "normals" not in values:
+        values["normals"] = facing(positions[kept], positions, sensor.place - origin)
+        report("normals turned to the place of the sensor")
+    positions = positions[kept]
     if up == "auto":
-        up, reason = find_up(positions, path)
+        camera_up = sensor.up(positions + origin) if sensor else None
+        up, reason = (camera_up, "that of its camera") if camera_up else find_up(positions, path)
         report(f"{up} taken as up ({reason}); --up says otherwise")
     rotation = np.array(ROTATIONS[up], np.float64)
     if "normals" in values:
@@ -139,6 +146,32 @@ def _is_mesh(path: Path) -> bool:
         return read_ply_header(file).is_mesh
 
 
+def _read(path: Path, num_points: int | None, seed: int, clean: Clean, cut: Cut, report: Callable[[str], None]):
+    """Positions (points, 3) float64 of what is cut out of a file, cleaned; their origin, materials, and the sensor."""
+    mesh = _is_mesh(path)
+    if mesh:
+        count = max(CUT_MESH if cut.asked else 0, num_points or MESH_POINTS)
+        positions, origin, values = _sampled_mesh(path, count, seed, report)
+        if cut.crop:
+            inside = scenes.in_box(positions, cut.crop)
+            box = positions.min(axis=0), positions.max(axis=0)
+            report(scenes.cropped(int(inside.sum()), count, cut.crop, *box))
+            positions, values = positions[inside], {name: column[inside] for name, column in values.items()}
+    else:
+        columns = _bounded_columns(path, num_points, cut, report)
+        positions, origin, values = _points_of_columns(columns, report)
+        if not cut.asked and (line := scenes.scene_line(positions, seed)):
+            report(line)
+    rows, lines = scenes.object_of(positions, origin, cut.remove_plane, cut.nth, seed)
+    positions, values = positions[rows], {name: column[rows] for name, column in values.items()}
+    if not mesh and clean != "off":
+        positions, values, done = cleaned(positions, values, clean)
+        lines += done
+    for line in lines:
+        report(line)
+    return positions, origin, values, sensor_of(path, positions + origin)
+
+
 def _sampled_mesh(path: Path, count: int, seed: int, report: Callable[[str], None]):
     """Positions (count, 3) float64, their origin (3,), materials and normals of points spread evenly over a mesh."""
     from spnr_jax.formats.mesh.meshes import load_mesh  # here: points are read without trimesh
@@ -157,23 +190,36 @@ def _sampled_mesh(path: Path, count: int, seed: int, report: Callable[[str], Non
     return points.positions.astype(np.float64), np.zeros(3), values | {"normals": points.normals}
 
 
-def _bounded_columns(path: Path, num_points: int | None, report: Callable[[str], None]) -> Columns:
-    """The useful columns of a point file, thinned while reading to CAPACITY points or what `num_points` needs."""
-    capacity, broken = max(CAPACITY, THINNING * (num_points or 0)), 0
+def _bounded_columns(path: Path, num_points: int | None, cut: Cut, report: Callable[[str], None]) -> Columns:
+    """The useful columns of a point file inside the box to be cut out.
+
+    They are thinned while reading to CAPACITY points or what `num_points` needs.
+    """
+    capacity, broken, outside = max(CAPACITY, THINNING * (num_points or 0)), 0, 0
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
 
     def sound_pieces() -> Iterator[Columns]:
-        nonlocal broken
+        nonlocal broken, outside, low, high
         for piece in column_pieces(path):
             columns = useful(piece)
-            sound = _sound(columns)
-            broken += int(np.count_nonzero(~sound))
-            yield columns if sound.all() else {name: column[sound] for name, column in columns.items()}
+            wanted = _sound(columns)
+            broken += int(np.count_nonzero(~wanted))
+            if cut.crop:
+                positions = np.stack([np.asarray(columns[axis], np.float64) for axis in "xyz"], axis=-1)
+                low = np.minimum(low, positions[wanted].min(axis=0, initial=np.inf))
+                high = np.maximum(high, positions[wanted].max(axis=0, initial=-np.inf))
+                inside = scenes.in_box(positions, cut.crop)
+                outside += int(np.count_nonzero(wanted & ~inside))
+                wanted = wanted & inside
+            yield columns if wanted.all() else {name: column[wanted] for name, column in columns.items()}
 
     columns, seen = thin_stream(sound_pieces(), capacity)
-    if broken and not seen:
+    if broken and not seen + outside:
         raise ValueError(f"holds no point that can be used: {BROKEN} in all of its {broken} rows")
     if broken:
-        report(f"{broken:,} of {seen + broken:,} points left out: {BROKEN}")
+        report(f"{broken:,} of {seen + outside + broken:,} points left out: {BROKEN}")
+    if cut.crop and seen + outside:
+        report(scenes.cropped(seen, seen + outside, cut.crop, low, high))
     if seen > capacity:
         report(f"{len(columns['x'])} of {seen} points kept while reading, the first of each voxel")
     return columns

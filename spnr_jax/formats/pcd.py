@@ -6,6 +6,7 @@ They are read piece by piece, compressed ones whole.  A header of text lines nam
 file's name is added by the caller.
 """
 
+import math
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -31,6 +32,14 @@ class PcdHeader:
     num_points: int
     encoding: str
     size: int  # bytes up to the data
+    organised: bool  # one point for each pixel of a depth camera
+    sensor: tuple[float, ...] | None  # its place; writers put 0 0 0 there if they do not know it
+
+
+def read_pcd_header(path: Path) -> PcdHeader:
+    """The header of a PCD file."""
+    with path.open("rb") as file:
+        return _header(file.read(HEADER_LIMIT))
 
 
 def pcd_pieces(path: Path) -> Iterator[dict[str, np.ndarray]]:
@@ -92,7 +101,20 @@ def _header(data: bytes) -> PcdHeader:
         raise ValueError(f"has a PCD header whose FIELDS, SIZE, TYPE, COUNT and POINTS disagree ({error})") from None
     if num_points < 0:
         raise ValueError(f"has a PCD header that announces {num_points} points")
-    return PcdHeader(layout=layout, num_points=num_points, encoding=encoding, size=end.end())
+    organised = entries.get("HEIGHT", ["1"])[:1] not in (["0"], ["1"])
+    sensor = _sensor(entries.get("VIEWPOINT", []))
+    return PcdHeader(
+        layout=layout, num_points=num_points, encoding=encoding, size=end.end(), organised=organised, sensor=sensor
+    )
+
+
+def _sensor(viewpoint: list[str]) -> tuple[float, ...] | None:
+    """The sensor's place (3,): x y z of VIEWPOINT."""
+    try:
+        place = tuple(float(value) for value in viewpoint[:3])
+    except ValueError:
+        return None
+    return place if len(place) == 3 and all(map(math.isfinite, place)) else None
 
 
 def _columns(body: bytes, header: PcdHeader) -> np.ndarray:

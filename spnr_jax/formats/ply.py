@@ -98,6 +98,18 @@ def vertex_pieces(file: BufferedIOBase) -> Iterator[Columns]:
     raise ValueError(f"has no PLY element 'vertex', only {', '.join(name for name, _, _ in header.elements) or 'none'}")
 
 
+def camera_row(file: BufferedIOBase) -> dict[str, float]:
+    """The numbers of the camera that an open PLY file begins with, by their names; none if it begins with another."""
+    header = read_ply_header(file)
+    name, count, properties = header.elements[0] if header.elements else ("", 0, [])
+    if name != "camera" or not count or any(kind is None for _, kind in properties):
+        return {}
+    layout = np.dtype([(field, (header.byte_order or "=") + str(kind)) for field, kind in properties])
+    rows = _text_rows(file, 0, 1, layout) if header.byte_order is None else binary_rows(file, 1, layout)
+    row = next(rows)[0]
+    return {field: float(row[field]) for field in layout.names or ()}
+
+
 def _text_rows(file: BufferedIOBase, before: int, count: int, layout: np.dtype) -> Iterator[np.ndarray]:
     """`count` records of ASCII data behind `before` other lines."""
     lines = (text for line in file if (text := line.decode("ascii", "replace").strip()))

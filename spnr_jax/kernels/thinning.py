@@ -34,7 +34,7 @@ def thin_stream(pieces: Iterable[Columns], capacity: int) -> tuple[Columns, int]
             continue
         positions = np.stack([np.asarray(kept[axis], np.float64) for axis in "xyz"], axis=-1)
         if voxel is None:
-            corner, extent = _frame(positions)
+            corner, extent = frame(positions)
             voxel = extent / FINEST
         first = first_in_voxels(positions - corner, voxel)
         while len(first) > capacity:
@@ -55,7 +55,7 @@ def first_in_voxels(positions: np.ndarray, voxel: float) -> np.ndarray:
     return np.sort(first)
 
 
-def _frame(positions: np.ndarray) -> tuple[np.ndarray, float]:
+def frame(positions: np.ndarray) -> tuple[np.ndarray, float]:
     """Corner (3,) and side of a cube that holds most of the positions (n, 3)."""
     low, high = np.quantile(positions, INNER, axis=0)
     return low, max(float((high - low).max()), SMALLEST_EXTENT)
@@ -68,7 +68,7 @@ def candidates(positions: np.ndarray, count: int) -> np.ndarray:
     """
     if len(positions) <= THINNING * count:
         return np.arange(len(positions))
-    corner, extent = _frame(positions)
+    corner, extent = frame(positions)
     chosen = np.arange(1)
     for halving in range(HALVINGS):
         finer = first_in_voxels(positions - corner, extent / 2**halving)

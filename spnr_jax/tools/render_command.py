@@ -6,6 +6,7 @@ from typing import Literal
 
 import tyro
 
+from spnr_jax.formats.cut import Cut
 from spnr_jax.tools.light_options import Lighting
 
 Output = Literal["image", "depth", "opacity"]
@@ -30,8 +31,10 @@ class Render:
     clean: Literal["auto", "off", "strong"] = "auto"
     """Outliers of points are removed, and noisy ones averaged, before they are thinned; a clean cloud, and a mesh, stay
     as they are.  strong: at smaller deviations."""
+    cut: tyro.conf.OmitArgPrefixes[Cut] = Cut()
+    """Which part of a scene is drawn, before it is cleaned."""
     seed: int = 0
-    """Seed of the points that are chosen."""
+    """Seed of the points that are chosen, and of the planes that --remove-plane tries."""
     views: int = 4
     """Still pictures, evenly around the object."""
     elevation: float = 20.0

@@ -16,6 +16,7 @@ import numpy as np
 import viser
 
 from spnr_jax.formats import clouds
+from spnr_jax.formats.cut import Cut
 from spnr_jax.kernels.cleaning import Clean
 from spnr_jax.method.model import FIELD_OF_VIEW, Model
 from spnr_jax.tools.chosen_light import check_takes_light
@@ -110,6 +111,7 @@ def open_viewer(
     num_points: int,
     up: str,
     clean: Clean,
+    cut: Cut,
     lighting: Lighting,
 ) -> tuple[Viewer, list[str]]:
     """A running viewer of a file with a run's network, and what was assumed about the file, a line each.
@@ -122,7 +124,7 @@ def open_viewer(
         check_takes_light(named, lighting.asked, run)
     shining = lights.given(lighting)
     notes: list[str] = []
-    points = clouds.read_cloud(cloud, num_points=num_points, up=up, clean=clean, report=notes.append)
+    points = clouds.read_cloud(cloud, num_points=num_points, up=up, clean=clean, cut=cut, report=notes.append)
     model = named or load("surfels" if lighting.asked else suited_to(len(points.positions)))
     scene = open_scene(model, points, uploads.display_name(cloud.name))
     first = State(scene=scene, size=session.sizes(model)[1], lights=shining)

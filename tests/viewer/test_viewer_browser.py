@@ -18,6 +18,7 @@ pytest.importorskip("viser", reason="the viewer's extra is not installed: pip in
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install playwright")
 
 from spnr_jax import cli  # noqa: E402
+from spnr_jax.formats.cut import Cut  # noqa: E402
 from spnr_jax.tools.light_options import Lighting  # noqa: E402
 from spnr_jax.viewer import server  # noqa: E402
 from spnr_jax.viewer.gui import Reading  # noqa: E402
@@ -241,7 +242,7 @@ def test_a_port_in_use_is_refused_in_one_line_before_anything_is_read(capsys, tm
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         missing = {"cloud": tmp_path / "no.ply", "run": tmp_path, "num_points": 10, "up": "y"}
-        missing |= {"clean": "auto", "lighting": Lighting()}
+        missing |= {"clean": "auto", "cut": Cut(), "lighting": Lighting()}
         assert cli.guarded(lambda: server.open_viewer(host="127.0.0.1", port=port, **missing), "spnr") == 2
     assert capsys.readouterr().err == (
         f"spnr: --port {port} is in use on 127.0.0.1; choose another, or 0 for any free one\n"

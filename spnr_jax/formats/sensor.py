@@ -1,0 +1,72 @@
+"""Where the sensor stood that saw the points of a file, if the file says so: PCD headers and PLY camera elements do.
+
+Every point was seen from there, so that its normal points to it; and a camera's own axes say which way is up.  The
+place 0 0 0 that writers of PCD put there for want of a better one is believed if nothing hides the points from it.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from spnr_jax.formats.pcd import read_pcd_header
+from spnr_jax.formats.ply import camera_row
+from spnr_jax.formats.up_axis import ROTATIONS
+from spnr_jax.kernels.facing import seen_from, spacing_of
+
+AHEAD = 0.5  # least cosine between the z axis of a depth camera and the way to what it sees
+OPEN = 0.9  # share of the points that is seen from where they were scanned; of a whole object it is a half
+BEHIND = 5.0  # spacings behind the first of a pixel that count as seen: noise, and surfaces seen at an angle
+FARTHEST = 1e30  # a place beyond it is none
+PLACE, UP = ("view_px", "view_py", "view_pz"), ("y_axisx", "y_axisy", "y_axisz")  # of VCGLIB's element `camera`
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sensor:
+    """A place (3,) in the file's frame; `image` where the points are the pixels of one depth image, `above` (3,)."""
+
+    place: np.ndarray
+    image: bool = False
+    above: np.ndarray | None = None
+
+    def up(self, positions: np.ndarray) -> str | None:
+        """The upward axis of what a camera saw at these points (n, 3), None if this was none.
+
+        Depth images are in the camera's axes, which are y down looking along z or y up looking against it.
+        """
+        if self.above is not None:
+            return max(ROTATIONS, key=lambda axis: float(np.array(ROTATIONS[axis][1]) @ self.above))
+        if not self.image:
+            return None
+        way = np.median(positions - self.place, axis=0)
+        ahead = way[2] / max(float(np.linalg.norm(way)), np.finfo(np.float64).tiny)
+        return None if abs(ahead) < AHEAD else "-y" if ahead > 0 else "y"
+
+
+def sensor_of(path: Path, positions: np.ndarray) -> Sensor | None:
+    """The sensor of a file of these points (n, 3) or faces; ValueError for a header that cannot be read."""
+    suffix = path.suffix.lower()
+    if suffix == ".pcd":
+        header = read_pcd_header(path)
+        if header.sensor is None or max(map(abs, header.sensor)) > FARTHEST:
+            return None
+        place = np.array(header.sensor)
+        image = header.organised or _from_there(positions, place)
+        return Sensor(place=place, image=image) if image or place.any() else None
+    if suffix != ".ply":
+        return None
+    with path.open("rb") as file:
+        try:
+            row = camera_row(file)
+        except ValueError:  # the points can do without
+            return None
+    place, above = (np.array([row.get(name, np.nan) for name in names]) for names in (PLACE, UP))
+    if not (np.abs(place) < FARTHEST).all():
+        return None
+    return Sensor(place=place, above=above if np.isfinite(above).all() and above.any() else None)
+
+
+def _from_there(positions: np.ndarray, place: np.ndarray) -> bool:
+    """Whether nearly nothing hides the points from a place outside of their bounding box."""
+    inside = np.all((place > positions.min(axis=0)) & (place < positions.max(axis=0)))
+    return not inside and bool(seen_from(positions, place, spacing_of(positions), BEHIND).mean() > OPEN)

@@ -1,0 +1,248 @@
+"""Parts of a scene: points inside a box, the dominant plane, clusters; and whether points look like a scene at all.
+
+    voxel       side of the cubes in which CROWD points lie on average: some three spacings, whatever the pattern
+    clusters    components of voxels that touch by a face, an edge or a corner: things that lie farther apart are
+                several
+    plane       RANSAC (Fischler and Bolles 1981) over one point of each voxel, so that areas count, not how densely the
+                sensor sees them; fitted again to what lies close
+
+NumPy in, NumPy out, near linear in the points; the seed chooses the planes that are tried.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from spnr_jax.kernels.records import PointCloud
+from spnr_jax.kernels.thinning import first_in_voxels, frame
+
+Values = dict[str, np.ndarray]
+Box = Sequence[float | int]
+
+CROWD = 4.0  # points of a voxel, on average
+COARSEST, FINER, TRIES = 4.0, 2**0.5, 40  # fewest voxels along the extent; ratio and number of the sides tried
+NEIGHBOURS = [(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if (x, y, z) > (0, 0, 0)]  # half
+SAMPLE, PLANES, ROUNDS = 4096, 512, 3  # points that vote, planes that are tried, fits to what lies close
+CLOSE = 0.5  # voxels from the plane, for the votes
+THICK = 3.0  # standard deviations of what lies close, a voxel at most: a plane's noise goes with it
+LEAST_PLANE = 0.1  # share of the area that a plane needs
+LEAST_POINTS = 2000  # fewer are taken for one object
+LARGE = 0.05  # share of the points of a cluster that counts
+WIDE = 200.0  # spacings across, of a scene
+SMALL_THING = 0.6  # of the plane's extent: what stands on it, or before it, of a scene
+SCENE_PLANE, GROUND = 0.25, 0.6  # share of the area of a plane with such things; with whatever else
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Plane:
+    """normal . position = offset, `share` of the area within `thickness` of it."""
+
+    normal: Float[np.ndarray, "3"]
+    offset: float
+    thickness: float
+    share: float
+
+    def holds(self, positions: Float[np.ndarray, "points 3"]) -> Bool[np.ndarray, " points"]:
+        """True for points that belong to it."""
+        return np.abs(positions @ self.normal - self.offset) <= self.thickness
+
+
+def cut_out(
+    cloud: PointCloud,
+    *,
+    crop: Box | None = None,
+    remove_plane: bool = False,
+    nth: int | None = None,
+    seed: int = 0,
+) -> tuple[PointCloud, list[str]]:
+    """The part of a cloud that is one object, and a line about each step: box, plane, nth largest cluster from 1.
+
+    `crop` is xmin ymin zmin xmax ymax zmax.  ValueError, which names the step, where nothing is left.
+    """
+    if np.ndim(cloud.positions) != 2:
+        raise ValueError(f"cut_out takes one cloud, positions (points, 3); got shape {np.shape(cloud.positions)}")
+    left, lines = np.flatnonzero(np.asarray(cloud.mask)), []
+    positions = np.asarray(cloud.positions, np.float64)
+    if not len(left) or not (crop or remove_plane or nth):
+        return cloud, []
+    if crop is not None:
+        inside = in_box(positions[left], crop)
+        low, high = positions[left].min(axis=0), positions[left].max(axis=0)
+        lines.append(cropped(int(inside.sum()), len(left), crop, low, high))
+        left = left[inside]
+    chosen, said = object_of(positions[left], np.zeros(3), remove_plane, nth, seed)
+    columns = {name: np.asarray(x)[left[chosen]] for name, x in vars(cloud).items() if x is not None}
+    return dataclasses.replace(cloud, **columns), lines + said
+
+
+def in_box(positions: Float[np.ndarray, "points 3"], box: Box) -> Bool[np.ndarray, " points"]:
+    """True for points between the corners xmin ymin zmin and xmax ymax zmax, borders included."""
+    return np.all((positions >= np.asarray(box[:3])) & (positions <= np.asarray(box[3:])), axis=-1)
+
+
+def cropped(kept: int, seen: int, box: Box, low: np.ndarray, high: np.ndarray) -> str:
+    """The line about a box, of points that lie from low (3,) to high (3,); ValueError if it holds none of them."""
+    if not kept:
+        asked = " ".join(f"{value:g}" for value in box)
+        raise ValueError(f"--crop {asked}: none of the {seen:,} points, they lie in the box {_written(low, high)}")
+    return f"--crop: {kept:,} of {seen:,} points lie inside"
+
+
+def _written(low: np.ndarray, high: np.ndarray) -> str:
+    """A box as --crop takes it, to a thousandth of its size."""
+    size = float(np.max(high - low, initial=np.finfo(np.float64).tiny))
+    decimals = int(np.clip(3 - np.floor(np.log10(size)), 0, 12))
+    return " ".join(f"{value + 0.0:.{decimals}f}" for value in (*low, *high))
+
+
+def object_of(
+    positions: Float[np.ndarray, "points 3"],
+    origin: Float[np.ndarray, "3"],
+    remove_plane: bool,
+    nth: int | None,
+    seed: int,
+) -> tuple[Int[np.ndarray, " left"], list[str]]:
+    """Rows of what is left without the dominant plane, of that the nth largest cluster (None: all); a line for each.
+
+    Lines say places as positions + origin.  ValueError where there is no such plane, or nothing beside it, or not so
+    many clusters.
+    """
+    rows, lines = np.arange(len(positions)), []
+    if remove_plane:
+        plane = dominant_plane(positions, seed)
+        if plane is None:
+            raise ValueError(f"--remove-plane: no plane holds {LEAST_PLANE:.0%} of the surface; leave it out")
+        rows = np.flatnonzero(~plane.holds(positions))
+        if not len(rows):
+            raise ValueError(f"--remove-plane: all of the {len(positions):,} points lie in one plane; leave it out")
+        lines.append(
+            f"--remove-plane: {len(rows):,} of {len(positions):,} points left, without those within "
+            f"{plane.thickness:.3g} of the plane through most of the surface"
+        )
+    if nth is not None:
+        labels = clusters(positions[rows])
+        count = int(labels.max()) + 1
+        if nth > count:
+            there = f"are {count} clusters" if count > 1 else "is 1 cluster"
+            raise ValueError(f"--object {nth}: there {there} of points; choose one from 1 to {count}")
+        chosen = rows[labels == nth - 1]
+        box = _written(positions[chosen].min(axis=0) + origin, positions[chosen].max(axis=0) + origin)
+        lines.append(f"--object: cluster {nth} of {count:,}, {len(chosen):,} of {len(rows):,} points, in the box {box}")
+        rows = chosen
+    return rows, lines
+
+
+def voxel_side(positions: Float[np.ndarray, "points 3"]) -> float:
+    """Side of the finest voxels that hold CROWD points on average."""
+    corner, extent = frame(positions)
+    coarse, fine = 0, TRIES  # steps; the first is taken whatever it holds
+    while fine - coarse > 1:
+        step = (coarse + fine) // 2
+        crowded = len(positions) >= CROWD * len(first_in_voxels(positions - corner, extent / COARSEST / FINER**step))
+        coarse, fine = (step, fine) if crowded else (coarse, step)
+    return extent / COARSEST / FINER**coarse
+
+
+def clusters(positions: Float[np.ndarray, "points 3"], voxel: float | None = None) -> Int[np.ndarray, " points"]:
+    """The number of each point's cluster: 0 of the largest, 1 of the next.  `voxel` is voxel_side unless given.
+
+    Clusters of equally many points are numbered in the order of their first points.
+    """
+    x, y, z = (_slices(axis, voxel or voxel_side(positions)) for axis in positions.T)
+    deep, wide = int(z.max()) + 2, int(y.max()) + 2
+    keys, first, rows = np.unique((x * wide + y) * deep + z, return_index=True, return_inverse=True)
+    ends = []
+    for dx, dy, dz in NEIGHBOURS:
+        wanted = keys + (dx * wide + dy) * deep + dz
+        place = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
+        touching = np.flatnonzero(keys[place] == wanted)
+        ends.append(np.stack([touching, place[touching]]))
+    one, two = np.concatenate(ends, axis=1)
+    graph = coo_array((np.ones(len(one), bool), (one, two)), shape=(len(keys), len(keys)))
+    count, labels = connected_components(graph, directed=False)
+    sizes = np.bincount(labels[rows], minlength=count)
+    begins = np.full(count, len(positions))
+    np.minimum.at(begins, labels, first)
+    rank = np.empty(count, np.int64)
+    rank[np.lexsort((begins, -sizes))] = np.arange(count)
+    return rank[labels[rows]]
+
+
+def _slices(axis: np.ndarray, voxel: float) -> np.ndarray:
+    """Numbers (points,) from 1 of the slices along an axis; empty ones between two count once, however many."""
+    found, rows = np.unique(np.floor((axis - axis.min()) / voxel), return_inverse=True)
+    return 1 + np.concatenate([[0], np.cumsum(np.minimum(np.diff(found), 2))]).astype(np.int64)[rows]
+
+
+def dominant_plane(positions: Float[np.ndarray, "points 3"], seed: int = 0) -> Plane | None:
+    """The plane with most of the surface close to it; None if that is less than LEAST_PLANE of it."""
+    voxel = voxel_side(positions)
+    corner, _ = frame(positions)
+    rng = np.random.default_rng(seed)
+    evenly = positions[first_in_voxels(positions - corner, voxel)]
+    sample = evenly[rng.permutation(len(evenly))[:SAMPLE]]
+    if len(sample) < 3:
+        return None
+    a, b, c = (sample[rng.integers(len(sample), size=PLANES)] for _ in range(3))
+    normals = np.cross(b - a, c - a)
+    length = np.linalg.norm(normals, axis=1)
+    if not length.any():
+        return None
+    normals = normals[length > 0] / length[length > 0, None]
+    offsets = np.sum(normals * a[length > 0], axis=1)
+    votes = [np.sum(np.abs(sample @ n - o) < CLOSE * voxel) for n, o in zip(normals, offsets, strict=True)]
+    normal, offset = normals[np.argmax(votes)], offsets[np.argmax(votes)]
+    for _ in range(ROUNDS):
+        close = evenly[np.abs(evenly @ normal - offset) < 2 * CLOSE * voxel]
+        middle = close.mean(axis=0)
+        normal = np.linalg.eigh((close - middle).T @ (close - middle))[1][:, 0]
+        offset = float(middle @ normal)
+    heights = np.abs(evenly @ normal - offset)
+    deviation = float(np.sqrt(np.mean(heights[heights < 2 * CLOSE * voxel] ** 2)))
+    thickness = float(np.clip(THICK * deviation, CLOSE * voxel, voxel))
+    share = float(np.mean(heights <= thickness))
+    return None if share < LEAST_PLANE else Plane(normal=normal, offset=offset, thickness=thickness, share=share)
+
+
+def scene_line(positions: Float[np.ndarray, "points 3"], seed: int = 0) -> str | None:
+    """A line if the points look like a room or a street, not like one object; else None.
+
+    Several large clusters say so, or a plane much wider than what is left without it, in a cloud many spacings across.
+    """
+    if len(positions) < LEAST_POINTS:
+        return None
+    voxel = voxel_side(positions)
+    across = frame(positions)[1] / voxel * np.sqrt(CROWD)
+    if across < WIDE:
+        return None
+    reasons = []
+    sizes = np.bincount(clusters(positions, voxel)) / len(positions)
+    if (large := int(np.sum(sizes > LARGE))) > 1:
+        reasons.append(f"{large} large clusters")
+    plane = dominant_plane(positions, seed)
+    if plane is not None and plane.share > SCENE_PLANE and _stands_on(positions, plane, voxel):
+        reasons.append(f"a plane with {plane.share:.0%} of the surface")
+    if not reasons:
+        return None
+    return (
+        f"looks like a scene, not one object: {' and '.join(reasons)}, {across:.0f} spacings across; "
+        "--crop, --remove-plane and --object cut one out"
+    )
+
+
+def _stands_on(positions: np.ndarray, plane: Plane, voxel: float) -> bool:
+    """Whether something lies beside a plane that is much wider than all of it, or that is nearly all there is."""
+    in_plane = plane.holds(positions)
+    rest = positions[~in_plane]
+    if len(rest) < LARGE * len(positions):
+        return False
+    labels = clusters(rest, voxel)
+    large = rest[np.bincount(labels)[labels] > LARGE * len(rest)]
+    if plane.share > GROUND or not len(large):
+        return True
+    extent, wide = (np.linalg.norm(np.ptp(points, axis=0)) for points in (large, positions[in_plane]))
+    return bool(extent < SMALL_THING * wide)

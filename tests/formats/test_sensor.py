@@ -1,0 +1,88 @@
+"""Files that say where the sensor stood: normals point to it, and a camera's picture comes upright."""
+
+import numpy as np
+import pytest
+from support.point_clouds import ply_bytes
+
+from spnr_jax.formats.clouds import place_cloud, read_cloud
+from spnr_jax.formats.sensor import sensor_of
+from spnr_jax.surfels.visibility import spiral
+
+AXES = ["view_px", "view_py", "view_pz", "y_axisx", "y_axisy", "y_axisz"]
+
+
+def pcd(folder, points: np.ndarray, height: int = 1, viewpoint: str = "0 0 0 1 0 0 0"):
+    """A PCD file of the points as a picture of so many rows."""
+    head = f"VERSION 0.7\nFIELDS x y z\nSIZE 8 8 8\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {len(points) // height}\n"
+    head += f"HEIGHT {height}\nVIEWPOINT {viewpoint}\nPOINTS {len(points)}\nDATA binary\n"
+    (folder / "a.pcd").write_bytes(head.encode() + points.astype("<f8").tobytes())
+    return folder / "a.pcd"
+
+
+def ply(folder, form: str, camera: list[float], names=AXES):
+    """A PLY file of a ball behind a camera."""
+    rows = [tuple(point) for point in spiral(300).tolist()]
+    content = ply_bytes(form, rows=rows, properties=[(axis, "double") for axis in "xyz"], before=0)
+    lines = "element camera 1\n" + "".join(f"property float {name}\n" for name in names)
+    text = " ".join(map(str, camera)).encode() + b"\n"
+    data = text if form == "ascii" else np.array(camera, "<f4" if "little" in form else ">f4").tobytes()
+    head, body = content.split(b"end_header\n", 1)
+    head = head.replace(b"element camera 0\nproperty float f\nproperty int id\n", lines.encode())
+    (folder / "a.ply").write_bytes(head + b"end_header\n" + data + body)
+    return folder / "a.ply"
+
+
+def half_ball(away: float) -> np.ndarray:
+    """The side of a ball that a camera sees from `away` along z."""
+    points = spiral(600)
+    return points[points[:, 2] * np.sign(away) > 0][:280] - [0, 0, away]
+
+
+@pytest.mark.parametrize(("away", "up"), [(-4.0, "-y"), (4.0, "y")])
+def test_a_depth_image_is_upright_and_its_normals_point_to_the_camera(tmp_path, away, up):
+    seen = half_ball(away)
+    placed = place_cloud(pcd(tmp_path, seen, height=20))
+    assert placed.up == up
+    normals = placed.cloud.normals @ placed.rotation
+    assert np.all(np.sum(normals * -seen, axis=1) > 0)
+    np.testing.assert_allclose(normals[100], seen[100] + [0, 0, away], atol=0.1)
+
+
+def sensor(path):
+    return sensor_of(path, read_cloud(path).positions.astype(np.float64))
+
+
+def test_the_viewpoint_that_every_writer_puts_there_is_believed_if_nothing_hides_the_points_from_it(tmp_path):
+    ball = spiral(600) + [0, 0, 4]
+    assert sensor(pcd(tmp_path, ball)) is None
+    assert read_cloud(tmp_path / "a.pcd").normals is None
+    seen = ball[ball[:, 2] < 3.75]
+    assert sensor(pcd(tmp_path, seen)).image
+    assert np.all(np.sum(read_cloud(tmp_path / "a.pcd").normals * -seen, axis=1) > 0)
+    assert sensor(pcd(tmp_path, ball, viewpoint="0 0 9 1 0 0 0")).place.tolist() == [0, 0, 9]
+    for viewpoint in ("nan 0 0 1 0 0 0", "1e300 0 0 1 0 0 0", "x y z", ""):
+        assert sensor(pcd(tmp_path, seen, viewpoint=viewpoint)) is None
+
+
+@pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
+def test_the_camera_of_a_ply_file_gives_the_sides_of_the_points_and_the_way_up(tmp_path, form):
+    placed = place_cloud(ply(tmp_path, form, [0, 0, 0, 0.1, -0.9, 0.2]))
+    assert placed.up == "-y"
+    normals = placed.cloud.normals @ placed.rotation
+    np.testing.assert_allclose(normals, -spiral(300), atol=0.1)  # seen from within
+
+
+@pytest.mark.parametrize(
+    ("camera", "names"),
+    [([np.nan, 0, 0, 0, 1, 0], AXES), ([1, 2], AXES[:2]), ([1, 2, 3], ["f", "g", "h"])],
+)
+def test_a_camera_that_stands_nowhere_is_none(tmp_path, camera, names):
+    path = ply(tmp_path, "ascii", camera, names)
+    assert sensor(path) is None
+    assert read_cloud(path).normals is None
+
+
+def test_a_camera_that_cannot_be_read_costs_nothing(tmp_path):
+    path = ply(tmp_path, "ascii", [1, 2, 3])
+    assert sensor(path) is None
+    assert len(read_cloud(path).positions) == 300

@@ -1,0 +1,38 @@
+import numpy as np
+import pytest
+
+from spnr_jax.kernels.facing import facing, seen_from, spacing_of
+from spnr_jax.surfels.visibility import spiral
+
+
+def test_normals_of_a_ball_point_to_a_sensor_in_its_middle_or_far_from_it():
+    points = spiral(3000)
+    from_within = facing(points, points, np.zeros(3))
+    np.testing.assert_allclose(from_within, -points, atol=0.03)
+    front = points[points[:, 2] > 0.2]
+    np.testing.assert_allclose(facing(front[::7], points, np.array([0, 0, 9.0])), front[::7], atol=0.03)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 40])
+@pytest.mark.parametrize("size", [0.0, 1e-30, 1e30])
+def test_points_that_span_no_plane_have_some_normal_of_unit_length(count, size):
+    points = size * np.linspace([0, 0, 0], [1, 2, 3], count)
+    np.testing.assert_allclose(np.linalg.norm(facing(points, points, np.array([0, 0, 1.0])), axis=1), 1, atol=1e-6)
+
+
+def test_a_sensor_sees_the_near_cap_of_a_ball_and_nothing_from_the_place_of_the_points():
+    points, place = spiral(5000), np.array([0, 3.0, 0])
+    spacing = spacing_of(points)
+    np.testing.assert_allclose(spacing, np.sqrt(4 * np.pi / 5000), rtol=0.1)
+    seen, height = seen_from(points, place, spacing, 4), points[:, 1]
+    assert seen[height > 0.5].all()
+    assert not seen[height < 0].any()
+    assert not seen_from(np.ones((5, 3)), np.ones(3), 0.1, 2.0).any()
+    assert spacing_of(np.zeros((1, 3))) == 0
+
+
+def test_noise_tilts_normals_less_because_more_points_are_asked():
+    points = spiral(8000)
+    noisy = points + np.random.default_rng(0).normal(size=points.shape) * 0.4 * spacing_of(points)
+    normals = facing(noisy, noisy, np.zeros(3))
+    assert np.median(np.sum(normals * -points, axis=1)) > 0.98
