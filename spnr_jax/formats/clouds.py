@@ -10,7 +10,7 @@ spread evenly over meshes, with their materials.  What a file does not say is gr
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import get_args
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -26,6 +26,7 @@ MESHES = (".glb", ".gltf", ".obj", ".stl", ".off")
 MESH_POINTS = 4096  # points drawn from a mesh if no number is asked for; the most that training draws
 MOST_EVEN = 2**14  # points that are spread evenly over a mesh, in seconds; more lie close enough as they are drawn
 CAPACITY = 2**19  # points of a file that are in memory at most; more are thinned while reading
+ShownParts = Literal["opaque", "skip"]  # what is made of a mesh's transparent parts
 BROKEN = "NaN, infinity or too large a number"
 COARSEST_STEP = 1e-3  # of the extent, that rounding to float32 may cost
 
@@ -47,6 +48,7 @@ def read_cloud(
     up: str = "y",
     seed: int = 0,
     clean: Clean = "off",
+    transparent_parts: ShownParts = "opaque",
     report: Callable[[str], None] = lambda line: None,
 ) -> PointCloud:
     """The cloud in a file of points or on a mesh file's surface: (points, ...) float32, `mask` all True.
@@ -54,9 +56,18 @@ def read_cloud(
     More than `num_points` are thinned out evenly, fewer are kept; a mesh gives exactly `num_points` (4096 if None).
     `up` is the file's upward axis, or "auto".  Unless `clean` is "off" points are cleaned before they are thinned
     (spnr_jax/kernels/cleaning.py), those of meshes never; of a file that is thinned while reading, what that keeps.
-    Rows without finite numbers are left out.  ValueError, one line that names the file, for whatever cannot be read.
+    Rows without finite numbers are left out.  Transparent parts of a mesh are taken as opaque, or left out ("skip").
+    ValueError, one line that names the file, for whatever cannot be read.
     """
-    return place_cloud(path, num_points=num_points, up=up, seed=seed, clean=clean, report=report).cloud
+    return place_cloud(
+        path,
+        num_points=num_points,
+        up=up,
+        seed=seed,
+        clean=clean,
+        transparent_parts=transparent_parts,
+        report=report,
+    ).cloud
 
 
 def place_cloud(
@@ -66,6 +77,7 @@ def place_cloud(
     up: str = "auto",
     seed: int = 0,
     clean: Clean = "off",
+    transparent_parts: ShownParts = "opaque",
     report: Callable[[str], None] = lambda line: None,
 ) -> PlacedCloud:
     """The cloud of `read_cloud` with the way back into the file's frame."""
@@ -74,12 +86,16 @@ def place_cloud(
         raise ValueError(f"up must be one of {', '.join(ROTATIONS)}, auto, got {up!r}")
     if num_points is not None and num_points < 1:
         raise ValueError(f"num_points must be at least 1, got {num_points}")
+    if transparent_parts not in get_args(ShownParts):
+        raise ValueError(
+            f"transparent_parts must be one of {', '.join(get_args(ShownParts))}, got {transparent_parts!r}"
+        )
     if clean not in get_args(Clean):
         raise ValueError(f"clean must be one of {', '.join(get_args(Clean))}, got {clean!r}")
     _check_file(path)
     try:
         if _is_mesh(path):
-            positions, origin, values = _sampled_mesh(path, num_points or MESH_POINTS, seed, report)
+            positions, origin, values = _sampled_mesh(path, num_points or MESH_POINTS, seed, transparent_parts, report)
         else:
             columns = _bounded_columns(path, num_points, report)
             positions, origin, values = _points_of_columns(columns, report)
@@ -139,14 +155,16 @@ def _is_mesh(path: Path) -> bool:
         return read_ply_header(file).is_mesh
 
 
-def _sampled_mesh(path: Path, count: int, seed: int, report: Callable[[str], None]):
+def _sampled_mesh(path: Path, count: int, seed: int, transparent_parts: ShownParts, report: Callable[[str], None]):
     """Positions (count, 3) float64, their origin (3,), materials and normals of points spread evenly over a mesh."""
     from spnr_jax.formats.mesh.meshes import load_mesh  # here: points are read without trimesh
     from spnr_jax.formats.mesh.surface_points import sample_surface
 
-    asset = load_mesh(path)
-    for feature in asset.ignored:
-        report(f"ignored: {feature}")
+    asset = load_mesh(path, transparent_parts=transparent_parts)
+    if asset.ignored:
+        report(f"ignored: {'; '.join(asset.ignored)}")
+    for note in asset.notes:
+        report(note)
     points = sample_surface(asset, count, seed, "even" if count <= MOST_EVEN else "random")
     if not np.isfinite(points.positions).all():
         raise ValueError(f"holds vertices too large for float32, more than {np.finfo(np.float32).max:.2g}")

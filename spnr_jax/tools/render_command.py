@@ -30,6 +30,9 @@ class Render:
     clean: Literal["auto", "off", "strong"] = "auto"
     """Outliers of points are removed, and noisy ones averaged, before they are thinned; a clean cloud, and a mesh, stay
     as they are.  strong: at smaller deviations."""
+    transparent_parts: Literal["opaque", "skip"] = "opaque"
+    """Glass and other parts of a mesh that light passes through: drawn in their colour, or left out.  What the alpha of
+    a texture cuts out is left out either way."""
     seed: int = 0
     """Seed of the points that are chosen."""
     views: int = 4

@@ -10,6 +10,7 @@ import io
 import numpy as np
 from PIL import Image, UnidentifiedImageError
 
+from spnr_jax.formats.mesh import ktx2
 from spnr_jax.formats.mesh.assets import RejectedAsset, Wrap
 
 MAX_SIZE = 1024
@@ -26,6 +27,8 @@ SRGB_TABLE = srgb_to_linear(np.arange(256) / 255).astype(np.float32)
 
 def read_image(data: bytes, name: str) -> np.ndarray:
     """Texels (height, width, 4) uint8 of an image file as they are encoded; alpha is 255 where it has none."""
+    if data.startswith(ktx2.IDENTIFIER):
+        return ktx2.decode(data, name, MOST_PIXELS)
     try:
         with Image.open(io.BytesIO(data)) as image:
             if image.width * image.height > MOST_PIXELS:  # before memory is taken for them
