@@ -87,9 +87,7 @@ def place_cloud(
     if num_points is not None and num_points < 1:
         raise ValueError(f"num_points must be at least 1, got {num_points}")
     if transparent_parts not in get_args(ShownParts):
-        raise ValueError(
-            f"transparent_parts must be one of {', '.join(get_args(ShownParts))}, got {transparent_parts!r}"
-        )
+        raise ValueError(f"transparent_parts must be opaque or skip, got {transparent_parts!r}")
     if clean not in get_args(Clean):
         raise ValueError(f"clean must be one of {', '.join(get_args(Clean))}, got {clean!r}")
     _check_file(path)

@@ -101,8 +101,9 @@ def _settle_texture(part: Part, notes: set[str]) -> Part:
         notes.add("texture on faces without texture coordinates (its mean is used)")
         material = part.material
         means = material.base_color.reshape(-1, 3).mean(axis=0), material.roughness.mean(), material.metallic.mean()
-        values = {name: np.asarray(mean, np.float32) for name, mean in zip(CHANNELS, means, strict=True)}
-        return replace(part, material=replace(material, **values, opacity=None, normal_map=None, coordinates={}))
+        base_color, roughness, metallic = (np.asarray(mean, np.float32) for mean in means)
+        plain = Material(base_color=base_color, roughness=roughness, metallic=metallic, wrap=material.wrap)
+        return replace(part, material=plain)
     if not (np.abs(part.texcoords) < MAX_TEXCOORD).all():
         raise RejectedAsset(f"has texture coordinates that are not finite, or beyond {MAX_TEXCOORD:g}: broken file")
     return part

@@ -7,8 +7,8 @@ Conventions, fixed here and nowhere else:
               rows (as in glTF; mitsuba's `bitmap` reads the same way)
   faces       counted through all parts of an object in order: global face = faces of the parts before + local face
 The renderer (what the network is shown) and the point sampler (what it is told) both read these records, so the two
-cannot disagree about a material.  What only a picture of points needs (cut-outs, normal maps, textures with coordinates of
-their own) is read where transparent parts are allowed, and never reaches the renderer.
+cannot disagree about a material.  What only a picture of points needs (cut-outs, normal maps, textures with
+coordinates of their own) is read where transparent parts are allowed, and never reaches the renderer.
 """
 
 from collections.abc import Mapping

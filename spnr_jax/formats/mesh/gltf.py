@@ -120,7 +120,7 @@ def _placed(shape: Shape, look: GltfMaterial, matrix: np.ndarray) -> Part:
 
 def _texcoords(shape: Shape, look: GltfMaterial) -> np.ndarray | None:
     """Texture coordinates (v, 2 n), pair after pair as the material counts them; None without the first pair."""
-    found = []
+    found: list[np.ndarray] = []
     for place in look.placements:
         texcoords = shape.columns.get(f"TEXCOORD_{place.texcoord_set}")
         if texcoords is None and not found:

@@ -86,7 +86,7 @@ class GltfFile:
         for name in MESHOPT:
             if name in extensions:
                 if index not in self._unpacked:
-                    self._unpacked[index] = _unpack(self._slice(extensions[name]), extensions[name])
+                    self._unpacked[index] = unpack(self._slice(extensions[name]), extensions[name])
                 return memoryview(self._unpacked[index])
         return self._slice(view)
 
@@ -116,7 +116,7 @@ def scaled(values: np.ndarray, accessor: dict) -> np.ndarray:
     return values.astype(np.float64 if values.dtype.kind == "f" else np.int64)
 
 
-def _unpack(data: memoryview, packed: dict) -> bytes:
+def unpack(data: memoryview, packed: dict) -> bytes:
     """The bytes of a buffer view that meshopt packed, as its extension describes them."""
     mode, count, stride = packed["mode"], packed["count"], packed["byteStride"]
     if mode == "ATTRIBUTES":

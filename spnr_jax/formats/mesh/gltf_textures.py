@@ -102,8 +102,5 @@ def _placement(info: dict[str, Any]) -> Placement:
     scale = np.asarray(moved.get("scale", (1, 1)), np.float64)
     (a, b), (c, d) = np.array([[cos, sin], [-sin, cos]]) * scale
     x, y = np.asarray(moved.get("offset", (0, 0)), np.float64)
-    return Placement(
-        moved.get("texCoord", info.get("texCoord", 0)),
-        ((float(a), float(b)), (float(c), float(d))),
-        (float(x), float(y)),
-    )
+    matrix = (float(a), float(b)), (float(c), float(d))
+    return Placement(moved.get("texCoord", info.get("texCoord", 0)), matrix, (float(x), float(y)))

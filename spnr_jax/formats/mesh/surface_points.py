@@ -1,8 +1,9 @@
 """Surface points with materials: normalisation of an object, and samples of its surface.
 
 Points are drawn uniformly by area over all parts, or spread evenly: each the farthest of several times as many from
-those before.  The material of each is looked up with the interpolation of the renderer (texels.py) and
-multiplied by the interpolated vertex colour.  Points that a material cuts out are drawn again.  `face` counts through all parts, as the renderer reports its hits.
+those before.  The material of each is looked up with the interpolation of the renderer (texels.py) and multiplied by
+the interpolated vertex colour; those that it cuts out are replaced.  `face` counts through all parts, as the renderer
+reports its hits.
 """
 
 from dataclasses import dataclass, fields, replace
