@@ -44,7 +44,9 @@ def test_filters_give_the_floats_back_that_went_in(name, dtype, scale, atol):
     meant = np.frombuffer(case["meant"], "<f4").reshape(-1, 4)
     found = np.frombuffer(unpack(memoryview(case["packed"]), case), dtype).reshape(-1, 4) / scale
     if name == "rotations":  # a quaternion and its negative are the same turn
-        meant, found = (q * np.sign(q[np.arange(len(q)), np.abs(meant).argmax(axis=1)])[:, None] for q in (meant, found))
+        meant, found = (
+            q * np.sign(q[np.arange(len(q)), np.abs(meant).argmax(axis=1)])[:, None] for q in (meant, found)
+        )
     width = 3 if "directions" in name else 4
     np.testing.assert_allclose(found[:, :width], meant[:, :width], atol=atol)
 
