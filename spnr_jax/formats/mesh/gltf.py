@@ -27,8 +27,11 @@ MODES = {
     6: "TRIANGLE_FAN",
 }
 READABLE = {MOVED, WEBP, BASIS, DRACO, *MESHOPT, INSTANCING, "KHR_mesh_quantization", "KHR_lights_punctual"}
+NO_COLORS = np.ones((1, 3))
 OTHERS = ("POSITION", "NORMAL", "COLOR_0")  # columns, beside texture coordinates, that are read
-MOST_REPEATED = 2**24  # faces that are drawn again, beside each mesh's first: a small file could ask for any number
+# Faces that are drawn again, beside each mesh's first: a small file could ask for any number.  To draw a mesh again
+# costs as much as PLACING faces.
+MOST_REPEATED, PLACING = 2**23, 64
 
 
 class Shape(NamedTuple):
@@ -67,9 +70,13 @@ def load_gltf(path: Path, transparent_parts: TransparentParts = "refuse") -> Ass
             again = (mesh, number) in shapes
             shape = shapes[mesh, number] if again else _shape(file, primitive, mode, look)
             shapes[mesh, number] = shape
-            repeated += len(shape.faces) * (len(matrices) - 1 + again)
+            if look.has_alpha and shape.columns.get("COLOR_0", NO_COLORS)[:, 3:].min(initial=1) < 1:
+                ignored.add("alpha of vertex colours")
+            repeated += (len(shape.faces) + PLACING) * (len(matrices) - 1 + again)
             if repeated > MOST_REPEATED:
-                raise RejectedAsset(f"draws more than {MOST_REPEATED} faces a second time: fewer instances can be read")
+                raise RejectedAsset(
+                    f"repeats its meshes more than can be read ({MOST_REPEATED} faces): fewer instances can"
+                )
             parts += [_placed(shape, look, matrix) for matrix in matrices]
     if not parts and any(look.nowhere for look in materials.values()):
         raise RejectedAsset(f"has nothing to draw: {'; '.join(tolerance.notes())}")

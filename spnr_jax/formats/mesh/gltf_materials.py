@@ -37,10 +37,11 @@ class Look(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class GltfMaterial:
-    """A material, the texture coordinates it wants, and whether it is nowhere to be seen."""
+    """A material, the texture coordinates it wants, whether its file asks for alpha, and whether it is nowhere seen."""
 
     material: Material
     placements: tuple[Placement, ...] = (Placement(),)
+    has_alpha: bool = False
     nowhere: bool = False
     ignored: frozenset[str] = frozenset()
 
@@ -70,8 +71,13 @@ def read_material(file: GltfFile, index: int | None, tolerance: Tolerance) -> Gl
         normal_map=normal_map,
         coordinates=textures.coordinates,
     )
-    placements = tuple(textures.placements) or (Placement(),)
-    return GltfMaterial(material=material, placements=placements, nowhere=opacity.nowhere, ignored=frozenset(ignored))
+    return GltfMaterial(
+        material=material,
+        placements=tuple(textures.placements) or (Placement(),),
+        has_alpha=not _opaque(spec),
+        nowhere=opacity.nowhere,
+        ignored=frozenset(ignored),
+    )
 
 
 def metallic_roughness(diffuse: np.ndarray, specular: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

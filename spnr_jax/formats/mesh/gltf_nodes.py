@@ -3,6 +3,8 @@
 EXT_mesh_gpu_instancing draws a node's mesh once for each row of its attributes.
 """
 
+from collections.abc import Iterator
+
 import numpy as np
 from trimesh.transformations import quaternion_matrix
 
@@ -11,9 +13,10 @@ from spnr_jax.formats.mesh.gltf_container import GltfFile
 
 INSTANCING = "EXT_mesh_gpu_instancing"
 PLACED = {"TRANSLATION": 3, "ROTATION": 4, "SCALE": 3}  # attributes of instances, and their widths
+MOST_INSTANCES = 2**17  # of a node
 
 
-def drawn_meshes(file: GltfFile) -> list[tuple[int, list[np.ndarray]]]:
+def drawn_meshes(file: GltfFile) -> Iterator[tuple[int, list[np.ndarray]]]:
     """(mesh, matrices to world (4, 4)) of every node of the default scene that draws a mesh, depth first."""
     document = file.document
     nodes = document.get("nodes", [])
@@ -21,7 +24,7 @@ def drawn_meshes(file: GltfFile) -> list[tuple[int, list[np.ndarray]]]:
         roots = scenes[document.get("scene", 0)].get("nodes", [])
     else:
         roots = sorted(set(range(len(nodes))) - {child for node in nodes for child in node.get("children", [])})
-    drawn, seen = [], set()
+    seen = set()
     stack = [(root, np.eye(4)) for root in reversed(roots)]
     while stack:
         index, parent = stack.pop()
@@ -31,9 +34,8 @@ def drawn_meshes(file: GltfFile) -> list[tuple[int, list[np.ndarray]]]:
         node = nodes[index]
         matrix = parent @ _node_matrix(node)
         if "mesh" in node:
-            drawn.append((node["mesh"], _instances(file, node, matrix)))
+            yield node["mesh"], _instances(file, node, matrix)
         stack += [(child, matrix) for child in reversed(node.get("children", []))]
-    return drawn
 
 
 def _instances(file: GltfFile, node: dict, matrix: np.ndarray) -> list[np.ndarray]:
@@ -46,6 +48,8 @@ def _instances(file: GltfFile, node: dict, matrix: np.ndarray) -> list[np.ndarra
     if len(counts) != 1 or any(column.shape[1] != PLACED[name] for name, column in columns.items()):
         raise RejectedAsset(f"has instances ({INSTANCING}) whose attributes do not agree: broken file")
     (count,) = counts
+    if count > MOST_INSTANCES:
+        raise RejectedAsset(f"has {count} instances of a mesh; at most {MOST_INSTANCES} can be read")
     each = [{name.lower(): columns[name][i] for name in columns} for i in range(count)]
     return [matrix @ _node_matrix(values) for values in each]
 

@@ -94,8 +94,10 @@ class TestInstances:
         extension = {INSTANCING: {"attributes": {"TRANSLATION": builder.accessor(rows)}}}
         indices = np.zeros(3 * 6000, np.uint16)
         builder.mesh(builder.primitive(indices=indices), extensions=extension)
-        with pytest.raises(RejectedAsset, match="fewer instances"):
+        with pytest.raises(RejectedAsset, match="repeats its meshes more than can be read"):
             load_mesh(builder.write(tmp_path / "many.glb"))
+        with pytest.raises(RejectedAsset, match="131073 instances"):
+            load_mesh(self.instanced(tmp_path, TRANSLATION=np.zeros((2**17 + 1, 3), np.float32)))
 
 
 def test_what_a_material_has_beyond_the_three_channels_is_named_in_one_line(tmp_path):

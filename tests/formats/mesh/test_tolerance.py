@@ -104,6 +104,16 @@ def test_what_is_called_blended_and_is_opaque_is_opaque(tmp_path):
     assert asset.notes == ()
 
 
+def test_alpha_of_vertices_is_named_where_it_would_count(tmp_path):
+    builder = GltfBuilder()
+    colors = np.float32([[1, 1, 1, 0.5]] * 4)
+    for mode in ("OPAQUE", "BLEND"):
+        material = builder.material(alphaMode=mode)
+        builder.mesh(builder.primitive(material=material, COLOR_0=colors))
+        asset = load_mesh(builder.write(tmp_path / "a.glb"), transparent_parts="opaque")
+        assert asset.ignored == (("alpha of vertex colours",) if mode == "BLEND" else ())
+
+
 def test_an_object_of_which_nothing_is_left_says_why(tmp_path):
     builder = GltfBuilder()
     material = builder.material(name="glass", alphaMode="BLEND", pbrMetallicRoughness={"baseColorFactor": [1, 1, 1, 0]})
