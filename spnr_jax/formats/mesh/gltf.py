@@ -72,7 +72,7 @@ def load_gltf(path: Path, transparent_parts: TransparentParts = "refuse") -> Ass
             shapes[mesh, number] = shape
             if look.has_alpha and shape.columns.get("COLOR_0", NO_COLORS)[:, 3:].min(initial=1) < 1:
                 ignored.add("alpha of vertex colours")
-            repeated += (len(shape.faces) + PLACING) * (len(matrices) - 1 + again)
+            repeated += (len(shape.faces) + PLACING) * max(0, len(matrices) - 1 + again)
             if repeated > MOST_REPEATED:
                 raise RejectedAsset(
                     f"repeats its meshes more than can be read ({MOST_REPEATED} faces): fewer instances can"
