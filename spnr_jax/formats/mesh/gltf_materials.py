@@ -14,7 +14,7 @@ import numpy as np
 from spnr_jax.formats.mesh.assets import Material, Values
 from spnr_jax.formats.mesh.gltf_container import GltfFile
 from spnr_jax.formats.mesh.gltf_textures import Placement, Textures
-from spnr_jax.formats.mesh.texels import color_texels, resize, shrink, value_texels
+from spnr_jax.formats.mesh.texels import color_texels, direction_texels, resize, value_texels
 from spnr_jax.formats.mesh.tolerance import Alpha, Opacity, Tolerance
 
 SPECULAR_GLOSSINESS = "KHR_materials_pbrSpecularGlossiness"
@@ -156,7 +156,7 @@ def _normal_map(textures: Textures, info: dict | None) -> np.ndarray | None:
     if info is None or encoded is None:
         return None
     scale = float(info.get("scale", 1.0))
-    return shrink(encoded[..., :3].astype(np.float32) / 255 * 2 - 1) * np.array([scale, scale, 1], np.float32)
+    return direction_texels(encoded) * np.array([scale, scale, 1], np.float32)
 
 
 def _channels(**channels: Values | float | int) -> dict[str, Any]:

@@ -5,6 +5,8 @@ third corner comes from: the next vertex, one of the last 16, or a difference in
 indices is a list of differences to one of two indices before.
 """
 
+from collections import deque
+
 import numpy as np
 
 from spnr_jax.formats.mesh.assets import RejectedAsset
@@ -66,15 +68,16 @@ class _Corners:
         self.data, self.place, self.end = data, place, len(data) - TABLE
         self.recent = recent  # codes below it are remembered vertices; in format 1 the two above are last - 1, last + 1
         self.next = self.last = 0
-        self.edges: list[tuple[int, int]] = [(-1, -1)] * EDGES  # the oldest first
-        self.vertices = [-1] * VERTICES
+        self.edges = deque([(-1, -1)] * EDGES, EDGES)  # the oldest first
+        self.vertices = deque([-1] * VERTICES, VERTICES)
 
     def triangle(self, edge: int, corner: int) -> tuple[int, int, int]:
         """The three indices of the next triangle."""
         if edge < 15:
             a, b = self.edges[-1 - edge]
             c = self._third(corner)
-            self._remember(edges=((c, b), (a, c)))
+            self.edges.append((c, b))
+            self.edges.append((a, c))
             return a, b, c
         if corner < 14:
             pair, fresh = self.data[self.end + corner], False
@@ -89,7 +92,9 @@ class _Corners:
         a = self._difference() if fresh else self._next()
         b, new_b = self._other(pair >> 4, own)
         c, new_c = self._other(pair & 15, own)
-        self._remember(*(a, *((b,) if new_b else ()), *((c,) if new_c else ())), edges=((b, a), (c, b), (a, c)))
+        self.vertices.append(a)
+        self.vertices.extend(corner for corner, new in ((b, new_b), (c, new_c)) if new)
+        self.edges.extend(((b, a), (c, b), (a, c)))
         return a, b, c
 
     def _third(self, code: int) -> int:
@@ -103,7 +108,7 @@ class _Corners:
         else:
             self.last += 1 if code == 14 else -1
             c = self.last
-        self._remember(c)
+        self.vertices.append(c)
         return c
 
     def _other(self, code: int, own: bool) -> tuple[int, bool]:
@@ -122,11 +127,3 @@ class _Corners:
         step, self.place = _number(self.data, self.place, self.end)
         self.last += step >> 1 ^ -(step & 1)
         return self.last
-
-    def _remember(self, *vertices: int, edges: tuple[tuple[int, int], ...] = ()) -> None:
-        self.vertices += vertices
-        self.edges += edges
-        if len(self.edges) > 4096:
-            del self.edges[:-EDGES]
-        if len(self.vertices) > 4096:
-            del self.vertices[:-VERTICES]

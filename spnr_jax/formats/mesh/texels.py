@@ -43,12 +43,22 @@ def read_image(data: bytes, name: str) -> np.ndarray:
 
 def color_texels(encoded: np.ndarray) -> np.ndarray:
     """Linear colours (h, w, 3) float32 of sRGB-encoded texels (h, w, 4) uint8, at most MAX_SIZE a side."""
-    return shrink(SRGB_TABLE[encoded[..., :3]])
+    return _shrunk_channels(SRGB_TABLE, encoded)
 
 
 def value_texels(encoded: np.ndarray) -> np.ndarray:
     """Values (h, w) float32 in [0, 1] of linearly encoded texels (h, w) uint8, at most MAX_SIZE a side."""
     return shrink(encoded.astype(np.float32) / 255)
+
+
+def direction_texels(encoded: np.ndarray) -> np.ndarray:
+    """Values (h, w, 3) float32 in [-1, 1] of encoded directions (h, w, 4) uint8, at most MAX_SIZE a side."""
+    return _shrunk_channels((np.arange(256) / 255 * 2 - 1).astype(np.float32), encoded)
+
+
+def _shrunk_channels(table: np.ndarray, encoded: np.ndarray) -> np.ndarray:
+    """Values (h, w, 3) by a table of encoded ones; channel by channel, for floats take four times the room."""
+    return np.stack([shrink(table[encoded[..., channel]]) for channel in range(3)], axis=-1)
 
 
 def shrink(texels: np.ndarray) -> np.ndarray:
