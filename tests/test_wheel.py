@@ -81,6 +81,7 @@ def test_no_dependency_of_an_extra_is_imported_before_it_is_needed():
     code = "import sys, spnr_jax.method.model, spnr_jax.formats.clouds, spnr_jax.tools.pictures; print(*sys.modules)"
     loaded = set(output_of(sys.executable, "-c", code, cwd=ROOT).split())
     unneeded = {"mitsuba", "dask", "fsspec", "viser", "laspy", "imageio_ffmpeg", "pymeshlab", "torch"}
+    unneeded |= {"DracoPy", "opengl_basisu"}
     assert not loaded & (unneeded | {"trimesh", "skimage", "matplotlib", "grain", "orbax"})
 
 

@@ -10,7 +10,7 @@ spread evenly over meshes, with their materials.  What a file does not say is gr
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import get_args
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -30,6 +30,7 @@ MESHES = (".glb", ".gltf", ".obj", ".stl", ".off")
 MESH_POINTS = 4096  # points drawn from a mesh if no number is asked for; the most that training draws
 MOST_EVEN = 2**14  # points that are spread evenly over a mesh, in seconds; more lie close enough as they are drawn
 CAPACITY = 2**19  # points of a file that are in memory at most; more are thinned while reading
+ShownParts = Literal["opaque", "skip"]  # what is made of a mesh's transparent parts
 BROKEN = "NaN, infinity or too large a number"
 CUT_MESH = 2**18  # points drawn from a mesh that something is cut out of
 WHOLE = Cut()
@@ -54,6 +55,7 @@ def read_cloud(
     seed: int = 0,
     clean: Clean = "off",
     cut: Cut = WHOLE,
+    transparent_parts: ShownParts = "opaque",
     report: Callable[[str], None] = lambda line: None,
 ) -> PointCloud:
     """The cloud in a file of points or on a mesh file's surface: (points, ...) float32, `mask` all True.
@@ -61,10 +63,19 @@ def read_cloud(
     More than `num_points` are thinned out evenly, fewer are kept; a mesh gives exactly `num_points` (4096 if None).
     `up` is the file's upward axis, or "auto".  Unless `clean` is "off" points are cleaned before they are thinned
     (spnr_jax/kernels/cleaning.py), those of meshes never; of a file that is thinned while reading, what that keeps.
-    `cut` says which part of a scene is wanted.  Rows without finite numbers are left out.  ValueError, one line that
-    names the file, for whatever cannot be read.
+    `cut` says which part of a scene is wanted.  Rows without finite numbers are left out.  Transparent parts of a mesh are
+    taken as opaque, or left out ("skip").  ValueError, one line that names the file, for whatever cannot be read.
     """
-    return place_cloud(path, num_points=num_points, up=up, seed=seed, clean=clean, cut=cut, report=report).cloud
+    return place_cloud(
+        path,
+        num_points=num_points,
+        up=up,
+        seed=seed,
+        clean=clean,
+        cut=cut,
+        transparent_parts=transparent_parts,
+        report=report,
+    ).cloud
 
 
 def place_cloud(
@@ -75,6 +86,7 @@ def place_cloud(
     seed: int = 0,
     clean: Clean = "off",
     cut: Cut = WHOLE,
+    transparent_parts: ShownParts = "opaque",
     report: Callable[[str], None] = lambda line: None,
 ) -> PlacedCloud:
     """The cloud of `read_cloud` with the way back into the file's frame."""
@@ -83,11 +95,13 @@ def place_cloud(
         raise ValueError(f"up must be one of {', '.join(ROTATIONS)}, auto, got {up!r}")
     if num_points is not None and num_points < 1:
         raise ValueError(f"num_points must be at least 1, got {num_points}")
+    if transparent_parts not in get_args(ShownParts):
+        raise ValueError(f"transparent_parts must be opaque or skip, got {transparent_parts!r}")
     if clean not in get_args(Clean):
         raise ValueError(f"clean must be one of {', '.join(get_args(Clean))}, got {clean!r}")
     _check_file(path)
     try:
-        positions, origin, values, sensor = _read(path, num_points, seed, clean, cut, report)
+        positions, origin, values, sensor = _read(path, num_points, seed, clean, cut, transparent_parts, report)
     except (ValueError, OSError) as error:
         raise ValueError(f"{path}: {str(error).splitlines()[0]}") from error
     kept = np.arange(len(positions))
@@ -146,12 +160,20 @@ def _is_mesh(path: Path) -> bool:
         return read_ply_header(file).is_mesh
 
 
-def _read(path: Path, num_points: int | None, seed: int, clean: Clean, cut: Cut, report: Callable[[str], None]):
+def _read(
+    path: Path,
+    num_points: int | None,
+    seed: int,
+    clean: Clean,
+    cut: Cut,
+    transparent_parts: ShownParts,
+    report: Callable[[str], None],
+):
     """Positions (points, 3) float64 of what is cut out of a file, cleaned; their origin, materials, and the sensor."""
     mesh = _is_mesh(path)
     if mesh:
         count = max(CUT_MESH if cut.asked else 0, num_points or MESH_POINTS)
-        positions, origin, values = _sampled_mesh(path, count, seed, report)
+        positions, origin, values = _sampled_mesh(path, count, seed, transparent_parts, report)
         if cut.crop:
             inside = scenes.in_box(positions, cut.crop)
             box = positions.min(axis=0), positions.max(axis=0)
@@ -172,14 +194,16 @@ def _read(path: Path, num_points: int | None, seed: int, clean: Clean, cut: Cut,
     return positions, origin, values, sensor_of(path, positions + origin)
 
 
-def _sampled_mesh(path: Path, count: int, seed: int, report: Callable[[str], None]):
+def _sampled_mesh(path: Path, count: int, seed: int, transparent_parts: ShownParts, report: Callable[[str], None]):
     """Positions (count, 3) float64, their origin (3,), materials and normals of points spread evenly over a mesh."""
     from spnr_jax.formats.mesh.meshes import load_mesh  # here: points are read without trimesh
     from spnr_jax.formats.mesh.surface_points import sample_surface
 
-    asset = load_mesh(path)
-    for feature in asset.ignored:
-        report(f"ignored: {feature}")
+    asset = load_mesh(path, transparent_parts=transparent_parts)
+    if asset.ignored:
+        report(f"ignored: {'; '.join(asset.ignored)}")
+    for note in asset.notes:
+        report(note)
     points = sample_surface(asset, count, seed, "even" if count <= MOST_EVEN else "random")
     if not np.isfinite(points.positions).all():
         raise ValueError(f"holds vertices too large for float32, more than {np.finfo(np.float32).max:.2g}")

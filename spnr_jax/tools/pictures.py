@@ -54,6 +54,7 @@ def render_file(options: Render, note: Callable[[str], None]) -> Iterator[str]:
         seed=options.seed,
         clean=options.clean,
         cut=options.cut,
+        transparent_parts=options.transparent_parts,
         report=note,
     )
     model = named or load("surfels" if light else suited_to(len(placed.cloud.positions)))

@@ -33,6 +33,9 @@ class Render:
     as they are.  strong: at smaller deviations."""
     cut: tyro.conf.OmitArgPrefixes[Cut] = Cut()
     """Which part of a scene is drawn, before it is cleaned."""
+    transparent_parts: Literal["opaque", "skip"] = "opaque"
+    """Glass and other parts of a mesh that light passes through: drawn in their colour, or left out.  What the alpha of
+    a texture cuts out is left out either way."""
     seed: int = 0
     """Seed of the points that are chosen, and of the planes that --remove-plane tries."""
     views: int = 4

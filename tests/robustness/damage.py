@@ -48,6 +48,7 @@ VALUES: list[Any] = [
 EXTREMES = [0, 1, -1, 127, 255, 32767, 65535, 2**31 - 1, 2**32 - 1, 2**63 - 1, -(2**31)]
 FLOATS = [float("nan"), float("inf"), 1e38, -1.0]
 DEEP = 100_000
+LARGEST = 2**24  # bytes that a doubled line may make: a deep nest is one line, and may be doubled again
 HEADER = 400  # bytes in which half of the damage is done: that is where the counts are
 
 
@@ -147,7 +148,8 @@ def line(data: bytes, rng: Random) -> bytes:
     """A line dropped, moved, or many times doubled."""
     lines = data.split(b"\n")
     kept, to = lines.pop(rng.randrange(len(lines))), rng.randrange(len(lines) + 1)
-    return b"\n".join(lines[:to] + [kept] * rng.choice((0, 1, 2, 500)) + lines[to:])
+    times = min(rng.choice((0, 1, 2, 500)), LARGEST // (len(kept) + 1))
+    return b"\n".join(lines[:to] + [kept] * times + lines[to:])
 
 
 def damage_json(data: bytes, rng: Random) -> bytes:

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import browser_messages
 import numpy as np
+import packed_gltfs
 import valid_files
 import valid_runs
 from damage import Files
@@ -37,6 +38,19 @@ def read_cloud(folder: Path, main: str) -> None:
     check_cloud(placed.cloud, MOST_POINTS)
     assert np.isfinite(placed.origin).all()
     assert np.linalg.det(placed.rotation) > 0.99
+
+
+def read_mesh(folder: Path, main: str) -> None:
+    """What the generator of data makes of a mesh file, and `spnr render` with either choice of transparent parts."""
+    from spnr_jax.formats import clouds
+    from spnr_jax.formats.mesh import assets, meshes, surface_points
+
+    with contextlib.suppress(assets.RejectedAsset):  # more is refused for references than for pictures
+        surface_points.sample_surface(meshes.load_mesh(folder / main), MOST_POINTS, 0)
+    with contextlib.suppress(ValueError):
+        cloud = clouds.read_cloud(folder / main, num_points=MOST_POINTS, transparent_parts="skip")
+        check_cloud(cloud, MOST_POINTS)
+    read_cloud(folder, main)
 
 
 def check_cloud(cloud, most: int | None = None) -> None:
@@ -178,10 +192,17 @@ CLOUDS: dict[str, Callable[[], list[Files]]] = {
     "ply": valid_files.plys, "ply-mesh": valid_files.ply_meshes, "pcd": valid_files.pcds, "text": valid_files.texts,
     "npz": valid_files.npzs, "npy": valid_files.npys, "las": functools.partial(valid_files.scans, "las"),
     "laz": functools.partial(valid_files.scans, "laz"), "stl": valid_files.stls, "off": valid_files.offs,
-    "obj": valid_files.objs, "gltf": valid_files.gltfs, "glb": valid_files.glbs,
 }  # fmt: skip
+MESHES: dict[str, Callable[[], list[Files]]] = {
+    "obj": valid_files.objs,
+    "gltf": valid_files.gltfs,
+    "glb": valid_files.glbs,
+    "gltf-packed": packed_gltfs.packed,
+    "gltf-looks": packed_gltfs.looks,
+}
 READERS = {
     **{name: Reader(seeds=seeds, read=read_cloud) for name, seeds in CLOUDS.items()},
+    **{name: Reader(seeds=seeds, read=read_mesh) for name, seeds in MESHES.items()},
     "config": Reader(seeds=valid_runs.configs, read=read_config),
     "metrics": Reader(seeds=valid_runs.metric_rows, read=read_metrics),
     "dataset": Reader(seeds=valid_runs.datasets, read=read_dataset),

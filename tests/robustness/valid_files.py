@@ -171,7 +171,9 @@ def objs() -> list[Files]:
     rich = ["mtllib a.mtl", *rows, *texcoords, "vn 0 0 1", "usemtl red", *faces[:2], "usemtl plain", *faces[2:], ""]
     library = "newmtl red\nKd 1 1 1\nmap_Kd -s 1 1 1 -clamp on a.png\nd 1.0\n"
     library += "newmtl plain\nKd 0.1 0.2 0.3\nNs 90\nPm 0.5\nTr 0\n"
+    holes = library.replace("Tr 0", "d 0.4").replace("d 1.0", "map_d b.png")
     return [{"cloud.obj": "\n".join(bare).encode()},
+            {"cloud.obj": "\n".join(rich).encode(), "a.mtl": holes.encode(), "a.png": png(3), "b.png": png()},
             {"cloud.obj": "\n".join(rich).encode(), "a.mtl": library.encode(), "a.png": png(3)}]  # fmt: skip
 
 

@@ -8,6 +8,7 @@ import pytest
 import trimesh
 from PIL import Image
 from support import tiny_dataset
+from support.gltf_files import CORNERS, GltfBuilder
 
 from spnr_jax.formats.up_axis import ROTATIONS
 from spnr_jax.tools import pictures
@@ -132,6 +133,16 @@ def test_the_density_grid_is_written_with_its_place_and_the_mesh_in_the_frame_of
 def test_no_views_and_no_turntable_write_nothing(tmp_path):
     rendered(cloud_file(tmp_path), tmp_path / "out", views=0, turntable="none")
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(("choice", "words"), [("opaque", "drawn as opaque"), ("skip", "left out")])
+def test_transparent_parts_of_a_mesh_are_drawn_or_left_out_as_asked(tmp_path, choice, words):
+    builder = GltfBuilder()
+    glass = builder.material(name="glass", alphaMode="BLEND", pbrMetallicRoughness={"baseColorFactor": [1, 0, 0, 0.1]})
+    builder.mesh(builder.primitive(material=glass), builder.primitive(positions=2 - CORNERS))
+    path = builder.write(tmp_path / "a.glb")
+    lines = rendered(path, tmp_path / "out", views=0, turntable="none", transparent_parts=choice)
+    assert [words in line for line in lines if line.startswith("transparent parts")] == [True]
 
 
 def test_a_cloud_of_one_point_gives_pictures(tmp_path):

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from spnr_jax.formats.mesh.assets import Asset, Material, Part, RejectedAsset
+from spnr_jax.formats.mesh.assets import CHANNELS, TEXTURES, Asset, Material, Part, RejectedAsset
 from spnr_jax.formats.mesh.surface_points import bounding_box, face_areas
 from spnr_jax.formats.mesh.tints import split_by_tint
 
@@ -51,6 +51,8 @@ def _check_columns(part: Part) -> None:
     count = len(part.positions)
     for name, width in WIDTHS.items():
         values = getattr(part, name)
+        if name == "texcoords" and values is not None and values.ndim == 2 and values.shape[1] > 0:
+            width = 2 * -(-values.shape[1] // 2)  # pairs, one or several
         if values is not None and values.shape != (count, width):
             raise RejectedAsset(f"has {name} of shape {values.shape} where ({count}, {width}) is needed: broken file")
     if part.faces.size and not 0 <= part.faces.min() <= part.faces.max() < count:
@@ -61,18 +63,14 @@ def _check_columns(part: Part) -> None:
 
 def _check_material(material: Material) -> None:
     """Refuse a material whose channels are not finite values, one or a texture of them."""
-    for name, inner in (("base_color", (3,)), ("roughness", ()), ("metallic", ())):
-        values = getattr(material, name)
+    present = [name for name in TEXTURES if getattr(material, name) is not None]
+    for name in (*CHANNELS, *present):
+        values, inner = getattr(material, name), (3,) * (CHANNELS | TEXTURES)[name]
         rows = values.shape[: values.ndim - len(inner)]
         if values.shape[len(rows) :] != inner or len(rows) not in (0, 2) or not values.size:
             raise RejectedAsset(f"has a material with {name} of shape {values.shape}: broken file")
         if not np.isfinite(values).all():
             raise RejectedAsset(f"has a material whose {name} is not finite (NaN or infinity)")
-
-
-def textured(material: Material) -> bool:
-    """Whether any channel is a texture."""
-    return material.base_color.ndim > 1 or material.roughness.ndim > 0 or material.metallic.ndim > 0
 
 
 def _cleaned(part: Part, notes: set[str]) -> list[Part]:
@@ -97,14 +95,15 @@ def _used_vertices(part: Part) -> Part:
 
 def _settle_texture(part: Part, notes: set[str]) -> Part:
     """The part with texture coordinates exactly where its material needs them; a texture without any: its mean."""
-    if not textured(part.material):
+    if not part.material.textured:
         return replace(part, texcoords=None)
     if part.texcoords is None:
         notes.add("texture on faces without texture coordinates (its mean is used)")
         material = part.material
         means = material.base_color.reshape(-1, 3).mean(axis=0), material.roughness.mean(), material.metallic.mean()
         base_color, roughness, metallic = (np.asarray(mean, np.float32) for mean in means)
-        return replace(part, material=replace(material, base_color=base_color, roughness=roughness, metallic=metallic))
+        plain = Material(base_color=base_color, roughness=roughness, metallic=metallic, wrap=material.wrap)
+        return replace(part, material=plain)
     if not (np.abs(part.texcoords) < MAX_TEXCOORD).all():
         raise RejectedAsset(f"has texture coordinates that are not finite, or beyond {MAX_TEXCOORD:g}: broken file")
     return part
@@ -144,7 +143,9 @@ def _checked_colors(part: Part, notes: set[str]) -> np.ndarray | None:
 def _identity(material: Material) -> str:
     """A digest of everything that a material says."""
     digest = hashlib.sha256(material.wrap.encode())
-    for values in (material.base_color, material.roughness, material.metallic):
+    present = [name for name in TEXTURES if getattr(material, name) is not None]
+    digest.update(repr((present, material.cutoff if present else None, sorted(material.coordinates.items()))).encode())
+    for values in (getattr(material, name) for name in (*CHANNELS, *present)):
         digest.update(repr((values.shape, values.dtype.str)).encode())
         digest.update(np.ascontiguousarray(values).tobytes())
     return digest.hexdigest()

@@ -11,13 +11,13 @@ import binascii
 from pathlib import Path, PurePosixPath
 from urllib.parse import unquote, unquote_to_bytes
 
-from spnr_jax.formats.mesh.assets import RejectedAsset
+from spnr_jax.formats.mesh.assets import MissingFile, RejectedAsset
 
 
 def read_companion(folder: Path, uri: str, root: Path | None = None) -> bytes:
     """Bytes of the file that `uri` names, relative to `folder` (percent escapes as in glTF), or of a data URI.
 
-    `root` is the object's folder, `folder` or one above it; RejectedAsset for a name that leads out of it.
+    `root` is the object's folder, `folder` or one above it; MissingFile for a name that leads out of it or to nothing.
     """
     if uri.startswith("data:"):
         return _data_uri(uri)
@@ -25,11 +25,11 @@ def read_companion(folder: Path, uri: str, root: Path | None = None) -> bytes:
     plain = _inside(root, folder, uri)
     path = plain if plain is not None and plain.is_file() else _inside(root, folder, unquote(uri))
     if path is None:
-        raise RejectedAsset(f"names a file outside its own folder: {uri!r}")
+        raise MissingFile(f"names a file outside its own folder: {uri!r}")
     try:
         return path.read_bytes()
     except (FileNotFoundError, IsADirectoryError, NotADirectoryError):
-        raise RejectedAsset(f"names a file that is missing: {unquote(uri)!r}") from None
+        raise MissingFile(f"names a file that is missing: {unquote(uri)!r}") from None
 
 
 def _inside(root: Path, folder: Path, name: str) -> Path | None:

@@ -1,17 +1,21 @@
-"""glTF 2.0 scenes as raw assets: one part per drawn primitive, node transforms applied.
+"""glTF 2.0 scenes as raw assets: one part per primitive of a node, node transforms applied.
 
 Normals go through the inverse transpose; a transform that mirrors flips the winding. The rest pose is read. What is
 not modelled is named in `ignored`; an extension that the file requires and that is not known here rejects the object.
 """
 
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
-from trimesh.transformations import quaternion_matrix
 
-from spnr_jax.formats.mesh.assets import Asset, Part, RejectedAsset
-from spnr_jax.formats.mesh.gltf_container import GltfFile
+from spnr_jax.formats.mesh.assets import Asset, Part, RejectedAsset, TransparentParts
+from spnr_jax.formats.mesh.draco import DRACO, decode_mesh
+from spnr_jax.formats.mesh.gltf_container import MESHOPT, GltfFile, scaled
 from spnr_jax.formats.mesh.gltf_materials import GltfMaterial, read_material
+from spnr_jax.formats.mesh.gltf_nodes import INSTANCING, drawn_meshes
+from spnr_jax.formats.mesh.gltf_textures import BASIS, MOVED, WEBP
+from spnr_jax.formats.mesh.tolerance import Tolerance
 
 MODES = {
     0: "POINTS",
@@ -22,13 +26,24 @@ MODES = {
     5: "TRIANGLE_STRIP",
     6: "TRIANGLE_FAN",
 }
-READABLE = {"KHR_texture_transform", "KHR_mesh_quantization", "EXT_texture_webp", "KHR_lights_punctual"}
-INSTANCING = "EXT_mesh_gpu_instancing"
+READABLE = {MOVED, WEBP, BASIS, DRACO, *MESHOPT, INSTANCING, "KHR_mesh_quantization", "KHR_lights_punctual"}
+NO_COLORS = np.ones((1, 3))
+OTHERS = ("POSITION", "NORMAL", "COLOR_0")  # columns, beside texture coordinates, that are read
+# Faces that are drawn again, beside each mesh's first: a small file could ask for any number.  To draw a mesh again
+# costs as much as PLACING faces.
+MOST_REPEATED, PLACING = 2**23, 64
 
 
-def load_gltf(path: Path) -> Asset:
+class Shape(NamedTuple):
+    """A primitive in its own frame: columns by name (v, width), and faces (f, 3)."""
+
+    columns: dict[str, np.ndarray]
+    faces: np.ndarray
+
+
+def load_gltf(path: Path, transparent_parts: TransparentParts = "refuse") -> Asset:
     """The scene's triangles with their materials, as they lie in the file; RejectedAsset if it cannot be used."""
-    file = GltfFile(path)
+    file, tolerance = GltfFile(path), Tolerance(transparent_parts)
     document = file.document
     for extension in document.get("extensionsRequired", []):
         if extension not in READABLE and not extension.startswith("KHR_materials_"):
@@ -37,87 +52,88 @@ def load_gltf(path: Path) -> Asset:
     if "KHR_lights_punctual" in document.get("extensions", {}):
         ignored.add("KHR_lights_punctual")
     materials: dict[int | None, GltfMaterial] = {}
-    parts = []
-    for mesh, matrix in _drawn_meshes(document):
-        for primitive in mesh["primitives"]:
+    shapes: dict[tuple[int, int], Shape] = {}
+    parts, repeated = [], 0
+    for mesh, matrices in drawn_meshes(file):
+        for number, primitive in enumerate(document["meshes"][mesh]["primitives"]):
             mode = MODES[primitive.get("mode", 4)]
             if not mode.startswith("TRIANGLE"):
                 ignored.add(f"{mode} primitives")
                 continue
             index = primitive.get("material")
             if index not in materials:
-                materials[index] = read_material(file, index)
-            parts.append(_part(file, primitive, mode, materials[index], matrix, ignored))
-            ignored |= materials[index].ignored
-    return Asset(parts=tuple(parts), ignored=tuple(sorted(ignored)))
+                materials[index] = read_material(file, index, tolerance)
+            look = materials[index]
+            ignored |= _left_out(primitive) | look.ignored
+            if look.nowhere:
+                continue
+            again = (mesh, number) in shapes
+            shape = shapes[mesh, number] if again else _shape(file, primitive, mode, look)
+            shapes[mesh, number] = shape
+            if look.has_alpha and shape.columns.get("COLOR_0", NO_COLORS)[:, 3:].min(initial=1) < 1:
+                ignored.add("alpha of vertex colours")
+            repeated += (len(shape.faces) + PLACING) * max(0, len(matrices) - 1 + again)
+            if repeated > MOST_REPEATED:
+                raise RejectedAsset(
+                    f"repeats its meshes more than can be read ({MOST_REPEATED} faces): fewer instances can"
+                )
+            parts += [_placed(shape, look, matrix) for matrix in matrices]
+    if not parts and any(look.nowhere for look in materials.values()):
+        raise RejectedAsset(f"has nothing to draw: {'; '.join(tolerance.notes())}")
+    return Asset(parts=tuple(parts), ignored=tuple(sorted(ignored)), notes=tuple(tolerance.notes()))
 
 
-def _drawn_meshes(document: dict) -> list[tuple[dict, np.ndarray]]:
-    """(mesh, matrix to world (4, 4)) of every node of the default scene that draws a mesh, depth first."""
-    nodes = document.get("nodes", [])
-    if scenes := document.get("scenes"):
-        roots = scenes[document.get("scene", 0)].get("nodes", [])
-    else:
-        roots = sorted(set(range(len(nodes))) - {child for node in nodes for child in node.get("children", [])})
-    drawn, seen = [], set()
-    stack = [(root, np.eye(4)) for root in reversed(roots)]
-    while stack:
-        index, parent = stack.pop()
-        if index in seen:
-            raise RejectedAsset(f"its node {index} is reached twice: the scene is not a tree")
-        seen.add(index)
-        node = nodes[index]
-        if INSTANCING in node.get("extensions", {}):
-            raise RejectedAsset(f"needs {INSTANCING}, which cannot be read: export it without that extension")
-        matrix = parent @ _node_matrix(node)
-        if "mesh" in node:
-            drawn.append((document["meshes"][node["mesh"]], matrix))
-        stack += [(child, matrix) for child in reversed(node.get("children", []))]
-    return drawn
+def _left_out(primitive: dict) -> set[str]:
+    """What of a primitive is not modelled."""
+    found = {name for name in primitive.get("extensions", {}) if name == "KHR_materials_variants"}
+    return found | {"morph targets"} if primitive.get("targets") else found
 
 
-def _node_matrix(node: dict) -> np.ndarray:
-    """Matrix (4, 4) from the node's frame to its parent's."""
-    if "matrix" in node:
-        return np.array(node["matrix"], np.float64).reshape(4, 4).T
-    x, y, z, w = node.get("rotation", (0, 0, 0, 1))
-    matrix = quaternion_matrix([w, x, y, z])
-    matrix[:3, :3] *= node.get("scale", (1, 1, 1))
-    matrix[:3, 3] = node.get("translation", (0, 0, 0))
-    return matrix
+def _shape(file: GltfFile, primitive: dict, mode: str, look: GltfMaterial) -> Shape:
+    """The columns that a material needs, and the faces, of a primitive."""
+    sets = [f"TEXCOORD_{place.texcoord_set}" for place in look.placements]
+    wanted = {name: index for name, index in primitive["attributes"].items() if name in (*OTHERS, *sets)}
+    packed = primitive.get("extensions", {}).get(DRACO)
+    if packed is None:
+        columns = {name: file.accessor(index) for name, index in wanted.items()}
+        given = file.accessor(primitive["indices"])[:, 0] if "indices" in primitive else None
+        order = np.arange(len(columns["POSITION"])) if given is None else given
+        return Shape(columns, _triangles(order, mode))
+    ids = {name: number for name, number in packed["attributes"].items() if name in wanted}
+    if "POSITION" not in ids:
+        raise RejectedAsset("has no POSITION in its Draco mesh: broken file")
+    unpacked, order = decode_mesh(file.view_bytes(packed["bufferView"]), ids)
+    accessors = file.document["accessors"]
+    columns = {name: scaled(values, accessors[wanted[name]]) for name, values in unpacked.items()}
+    columns |= {name: file.accessor(wanted[name]) for name in wanted if name not in ids}
+    return Shape(columns, _triangles(order, "TRIANGLES"))  # whatever the mode: Draco keeps triangles
 
 
-def _part(
-    file: GltfFile, primitive: dict, mode: str, look: GltfMaterial, matrix: np.ndarray, ignored: set[str]
-) -> Part:
+def _placed(shape: Shape, look: GltfMaterial, matrix: np.ndarray) -> Part:
     """One primitive in world space."""
-    attributes = {name: file.accessor(index) for name, index in primitive["attributes"].items() if _wanted(name, look)}
-    if primitive.get("targets"):
-        ignored.add("morph targets")
-    ignored.update(name for name in primitive.get("extensions", {}) if name == "KHR_materials_variants")
-    local = attributes["POSITION"]
-    order = file.accessor(primitive["indices"])[:, 0] if "indices" in primitive else np.arange(len(local))
-    faces = _triangles(order, mode)
     linear = matrix[:3, :3]
     mirrored = np.linalg.det(linear) < 0
-    normals, texcoords, colors = (attributes.get(name) for name in ("NORMAL", _texcoord(look), "COLOR_0"))
+    normals, colors = shape.columns.get("NORMAL"), shape.columns.get("COLOR_0")
     return Part(
-        positions=local @ linear.T + matrix[:3, 3],
-        faces=faces[:, ::-1] if mirrored else faces,
+        positions=shape.columns["POSITION"] @ linear.T + matrix[:3, 3],
+        faces=shape.faces[:, ::-1] if mirrored else shape.faces,
         material=look.material,
         # the adjugate's transpose: a multiple of the inverse transpose, defined for a singular matrix too
         normals=None if normals is None else normals @ _cofactors(linear).T * (-1 if mirrored else 1),
-        texcoords=None if texcoords is None else look.transform(texcoords),
+        texcoords=_texcoords(shape, look),
         colors=None if colors is None else colors[:, :3],
     )
 
 
-def _wanted(attribute: str, look: GltfMaterial) -> bool:
-    return attribute in ("POSITION", "NORMAL", "COLOR_0", _texcoord(look))
-
-
-def _texcoord(look: GltfMaterial) -> str:
-    return f"TEXCOORD_{look.texcoord_set}"
+def _texcoords(shape: Shape, look: GltfMaterial) -> np.ndarray | None:
+    """Texture coordinates (v, 2 n), pair after pair as the material counts them; None without the first pair."""
+    found: list[np.ndarray] = []
+    for place in look.placements:
+        texcoords = shape.columns.get(f"TEXCOORD_{place.texcoord_set}")
+        if texcoords is None and not found:
+            return None
+        found.append(np.zeros_like(found[0]) if texcoords is None else place.transform(texcoords))
+    return found[0] if len(found) == 1 else np.concatenate(found, axis=1)
 
 
 def _cofactors(matrix: np.ndarray) -> np.ndarray:

@@ -12,10 +12,13 @@ import numpy as np
 
 from spnr_jax.formats.mesh.assets import RejectedAsset
 from spnr_jax.formats.mesh.companions import read_companion
+from spnr_jax.formats.mesh.meshopt_indices import decode_sequence, decode_triangles
+from spnr_jax.formats.mesh.meshopt_vertices import decode_vertices, unfiltered
 
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 MOST_ZEROS = 2**22  # rows that an accessor without a buffer may announce: nothing in the file stands for them
+MESHOPT = ("EXT_meshopt_compression", "KHR_meshopt_compression")
 GLB_MAGIC, CHUNK_JSON, CHUNK_BIN = b"glTF", 0x4E4F534A, 0x004E4942
 
 
@@ -34,6 +37,7 @@ class GltfFile:
         if not version.startswith("2."):
             raise RejectedAsset(f"is glTF {version}; only glTF 2.0 can be read: convert it")
         self._buffers: dict[int, bytes] = {}
+        self._unpacked: dict[int, bytes] = {}  # buffer views that meshopt packed
 
     def accessor(self, index: int) -> np.ndarray:
         """Values (count, width) of an accessor: float64 for floats and normalised integers, int64 for other ones."""
@@ -57,14 +61,16 @@ class GltfFile:
             rows = self._rows(at["bufferView"], at.get("byteOffset", 0), index_type, 1, length)[:, 0]
             values = values.copy()
             values[rows] = self._rows(new["bufferView"], new.get("byteOffset", 0), dtype, width, length)
-        if accessor.get("normalized") and dtype.kind in "iu":
-            return np.maximum(values.astype(np.float64) / np.iinfo(dtype).max, -1)
-        return values.astype(np.float64 if dtype.kind == "f" else np.int64)
+        return scaled(values, accessor)
 
     def image_bytes(self, index: int) -> bytes:
         """The encoded file of an image."""
         image = self.document["images"][index]
-        return read_companion(self.folder, image["uri"]) if "uri" in image else bytes(self._view(image["bufferView"]))
+        return read_companion(self.folder, image["uri"]) if "uri" in image else self.view_bytes(image["bufferView"])
+
+    def view_bytes(self, index: int) -> bytes:
+        """What a buffer view holds."""
+        return bytes(self._view(index))
 
     def _rows(self, view_index: int, start: int, dtype: np.dtype, width: int, count: int) -> np.ndarray:
         """Rows (count, width) of a buffer view, read with the view's stride."""
@@ -76,9 +82,18 @@ class GltfFile:
 
     def _view(self, index: int) -> memoryview:
         view = self.document["bufferViews"][index]
+        extensions = view.get("extensions", {})
+        for name in MESHOPT:
+            if name in extensions:
+                if index not in self._unpacked:
+                    self._unpacked[index] = unpack(self._slice(extensions[name]), extensions[name])
+                return memoryview(self._unpacked[index])
+        return self._slice(view)
+
+    def _slice(self, view: dict) -> memoryview:
         start, length = view.get("byteOffset", 0), view["byteLength"]
         buffer = self._buffer(view["buffer"])
-        if start + length > len(buffer):
+        if min(start, length) < 0 or start + length > len(buffer):
             raise RejectedAsset(
                 f"buffer {view['buffer']} has {len(buffer)} bytes where {start + length} are needed: truncated file"
             )
@@ -92,6 +107,22 @@ class GltfFile:
                 raise RejectedAsset(f"buffer {index} has no data in the file")
             self._buffers[index] = data
         return self._buffers[index]
+
+
+def scaled(values: np.ndarray, accessor: dict) -> np.ndarray:
+    """Values as their accessor means them: float64 for floats and normalised integers, int64 for other ones."""
+    if accessor.get("normalized") and values.dtype.kind in "iu":
+        return np.maximum(values.astype(np.float64) / np.iinfo(values.dtype).max, -1)
+    return values.astype(np.float64 if values.dtype.kind == "f" else np.int64)
+
+
+def unpack(data: memoryview, packed: dict) -> bytes:
+    """The bytes of a buffer view that meshopt packed, as its extension describes them."""
+    mode, count, stride = packed["mode"], packed["count"], packed["byteStride"]
+    if mode == "ATTRIBUTES":
+        return unfiltered(decode_vertices(bytes(data), count, stride), packed.get("filter", "NONE")).tobytes()
+    decode = {"TRIANGLES": decode_triangles, "INDICES": decode_sequence}[mode]
+    return decode(bytes(data), count).astype({2: "<u2", 4: "<u4"}[stride]).tobytes()
 
 
 def _split_glb(data: bytes) -> tuple[bytes, bytes | None]:

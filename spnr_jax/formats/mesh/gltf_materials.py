@@ -2,66 +2,80 @@
 
 base colour = factor x texture (sRGB -> linear); roughness = factor x G, metallic = factor x B of the metallic-roughness
 texture; defaults white, 1, 1. KHR_materials_pbrSpecularGlossiness is converted with the formulas of the extension's
-reference converter. One set of texture coordinates serves a material: the base-colour texture's (its texCoord,
-KHR_texture_transform and wrap mode); a second texture that disagrees is replaced by its mean, and named.
+reference converter. Where a picture is wanted and no reference (tolerance.py), alpha says where there is surface, and
+the normal map is kept. Everything else that a material has is named as ignored.
 """
 
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from spnr_jax.formats.mesh.assets import Material, RejectedAsset, Values, Wrap
+from spnr_jax.formats.mesh.assets import Material, Values
 from spnr_jax.formats.mesh.gltf_container import GltfFile
-from spnr_jax.formats.mesh.texels import color_texels, read_image, resize, value_texels
+from spnr_jax.formats.mesh.gltf_textures import Placement, Textures
+from spnr_jax.formats.mesh.texels import color_texels, direction_texels, resize, value_texels
+from spnr_jax.formats.mesh.tolerance import Alpha, Opacity, Tolerance
 
-WRAPS: dict[int, Wrap] = {10497: "repeat", 33648: "mirror", 33071: "clamp"}
-NEAREST = 9728
 SPECULAR_GLOSSINESS = "KHR_materials_pbrSpecularGlossiness"
 DIELECTRIC = 0.04  # reflectance of a non-metal at normal incidence
 TRANSPARENT = {
     "KHR_materials_transmission": "transmissionFactor",
     "KHR_materials_diffuse_transmission": "diffuseTransmissionFactor",
 }
+# texels in place of a missing image: grey 0.5, roughness 0.5 of a non-metal, a specular colour of 0.04, flat
+GREY, DULL, GLOSS, FLAT = (188, 188, 188, 255), (255, 128, 0, 255), (56, 56, 56, 128), (128, 128, 255, 255)
+
+
+class Look(NamedTuple):
+    """The channels of a material, and the alpha of its colour: factor and texels (h, w), if it has any."""
+
+    channels: dict[str, Any]
+    alpha_factor: float | int
+    alpha_texels: np.ndarray | None
 
 
 @dataclass(frozen=True, kw_only=True)
 class GltfMaterial:
-    """A material with the texture coordinates it wants: `texcoord_set`, moved by uv @ rotate_scale.T + offset."""
+    """A material, the texture coordinates it wants, whether its file asks for alpha, and whether it is nowhere seen."""
 
     material: Material
-    texcoord_set: int = 0
-    rotate_scale: np.ndarray = field(default_factory=lambda: np.eye(2))
-    offset: np.ndarray = field(default_factory=lambda: np.zeros(2))
+    placements: tuple[Placement, ...] = (Placement(),)
+    has_alpha: bool = False
+    nowhere: bool = False
     ignored: frozenset[str] = frozenset()
 
-    def transform(self, texcoords: np.ndarray) -> np.ndarray:
-        """Texture coordinates (v, 2) after KHR_texture_transform."""
-        return texcoords @ self.rotate_scale.T + self.offset
 
-
-def read_material(file: GltfFile, index: int | None) -> GltfMaterial:
-    """The material `index` of a file (None: glTF's default); RejectedAsset if light passes through it."""
+def read_material(file: GltfFile, index: int | None, tolerance: Tolerance) -> GltfMaterial:
+    """The material `index` of a file (None: glTF's default); RejectedAsset if nothing may shine through."""
     spec = {} if index is None else file.document["materials"][index]
-    name = spec.get("name", f"number {index}")
+    name = str(spec.get("name", f"number {index}"))
     extensions = spec.get("extensions", {})
-    textures = _Textures(file, name)
+    textures = Textures(file, name, tolerance)
     glossy = extensions.get(SPECULAR_GLOSSINESS)
     convert = _metallic_roughness if glossy is None else _specular_glossiness
-    channels = convert(textures, spec.get("pbrMetallicRoughness", {}) if glossy is None else glossy)
-    _reject_transparent(spec, name)  # after the textures: a missing file is the plainer reason
+    look = convert(textures, spec.get("pbrMetallicRoughness", {}) if glossy is None else glossy)
+    opacity = _opacity(spec, name, look, tolerance)  # after the textures: a missing file is the plainer reason
+    normal_map = None if tolerance.strict else _normal_map(textures, spec.get("normalTexture"))
     ignored = textures.ignored | {key for key in extensions if key != SPECULAR_GLOSSINESS}
     ignored |= {key for key in ("normalTexture", "occlusionTexture") if key in spec}
+    if normal_map is not None:
+        ignored.discard("normalTexture")
     if any(spec.get("emissiveFactor", ())):
         ignored.add("emissive")
-    info = textures.leading or {}
-    moved = info.get("extensions", {}).get("KHR_texture_transform", {})
-    rotate_scale, offset = _texture_transform(moved)
+    material = Material(
+        **look.channels,
+        wrap=textures.wrap,
+        opacity=opacity.texels,
+        cutoff=opacity.cutoff,
+        normal_map=normal_map,
+        coordinates=textures.coordinates,
+    )
     return GltfMaterial(
-        material=Material(**channels, wrap=textures.wrap),
-        texcoord_set=moved.get("texCoord", info.get("texCoord", 0)),
-        rotate_scale=rotate_scale,
-        offset=offset,
+        material=material,
+        placements=tuple(textures.placements) or (Placement(),),
+        has_alpha=not _opaque(spec),
+        nowhere=opacity.nowhere,
         ignored=frozenset(ignored),
     )
 
@@ -80,22 +94,24 @@ def metallic_roughness(diffuse: np.ndarray, specular: np.ndarray) -> tuple[np.nd
     return np.clip(base_color, 0, 1), metallic[..., 0]
 
 
-def _metallic_roughness(textures: "_Textures", spec: dict) -> dict[str, Any]:
-    color = textures.read(spec.get("baseColorTexture"))
-    surface = textures.read(spec.get("metallicRoughnessTexture"))
-    base_color = np.asarray(spec.get("baseColorFactor", (1, 1, 1, 1)), np.float64)[:3]
+def _metallic_roughness(textures: Textures, spec: dict) -> Look:
+    color = textures.read(spec.get("baseColorTexture"), GREY)
+    surface = textures.read(spec.get("metallicRoughnessTexture"), DULL, ("roughness", "metallic"))
+    factor = np.asarray(spec.get("baseColorFactor", (1, 1, 1, 1)), np.float64)
     roughness, metallic = spec.get("roughnessFactor", 1.0), spec.get("metallicFactor", 1.0)
-    return _channels(
-        base_color=base_color if color is None else color_texels(color) * base_color,
+    channels = _channels(
+        base_color=factor[:3] if color is None else color_texels(color) * factor[:3],
         roughness=roughness if surface is None else value_texels(surface[..., 1]) * roughness,
         metallic=metallic if surface is None or metallic == 0 else value_texels(surface[..., 2]) * metallic,
     )
+    return Look(channels, *_alpha(factor, color, textures))
 
 
-def _specular_glossiness(textures: "_Textures", spec: dict) -> dict[str, Any]:
-    color = textures.read(spec.get("diffuseTexture"))
-    surface = textures.read(spec.get("specularGlossinessTexture"))
-    diffuse = np.asarray(spec.get("diffuseFactor", (1, 1, 1, 1)), np.float64)[:3]
+def _specular_glossiness(textures: Textures, spec: dict) -> Look:
+    color = textures.read(spec.get("diffuseTexture"), GREY)
+    surface = textures.read(spec.get("specularGlossinessTexture"), GLOSS)
+    factor = np.asarray(spec.get("diffuseFactor", (1, 1, 1, 1)), np.float64)
+    diffuse = factor[:3]
     specular = np.asarray(spec.get("specularFactor", (1, 1, 1)), np.float64)
     glossiness = np.asarray(spec.get("glossinessFactor", 1.0), np.float64)
     if color is not None:
@@ -107,67 +123,40 @@ def _specular_glossiness(textures: "_Textures", spec: dict) -> dict[str, Any]:
         height, width = np.maximum(diffuse.shape[:2], specular.shape[:2])
         diffuse, specular = resize(diffuse, height, width), resize(specular, height, width)
     base_color, metallic = metallic_roughness(diffuse, np.broadcast_to(specular, np.broadcast(diffuse, specular).shape))
-    return _channels(base_color=base_color, roughness=1 - glossiness, metallic=metallic)
+    channels = _channels(base_color=base_color, roughness=1 - glossiness, metallic=metallic)
+    return Look(channels, *_alpha(factor, color, textures))
 
 
-class _Textures:
-    """Reads a material's textures; the first one read decides the texture coordinates and the wrap mode."""
-
-    def __init__(self, file: GltfFile, name: str):
-        self.file, self.name = file, name
-        self.leading: dict | None = None
-        self.wrap: Wrap = "repeat"
-        self.ignored: set[str] = set()
-
-    def read(self, info: dict | None) -> np.ndarray | None:
-        """Encoded texels (h, w, 4) of a textureInfo; their mean (1, 1, 4) where its coordinates are its own."""
-        if info is None:
-            return None
-        texture = self.file.document["textures"][info["index"]]
-        texels = self._image(texture)
-        wrap = self._wrap(texture)
-        if self.leading is None:
-            self.leading, self.wrap = info, wrap
-        elif (_placement(info), wrap) != (_placement(self.leading), self.wrap):
-            self.ignored.add("second texture with its own coordinates (its mean is used)")
-            return texels.mean(axis=(0, 1), keepdims=True).round().astype(np.uint8)
-        return texels
-
-    def _image(self, texture: dict) -> np.ndarray:
-        webp = texture.get("extensions", {}).get("EXT_texture_webp", {})
-        source = webp.get("source", texture.get("source"))
-        if source is None:
-            formats = ", ".join(texture.get("extensions", {})) or "no image"
-            raise RejectedAsset(f"material {self.name!r} has a texture that cannot be read: {formats}")
-        label = self.file.document["images"][source].get("uri", f"image {source}")
-        return read_image(self.file.image_bytes(source), label[:80])
-
-    def _wrap(self, texture: dict) -> Wrap:
-        sampler = self.file.document["samplers"][texture["sampler"]] if "sampler" in texture else {}
-        wrap_s, wrap_t = WRAPS[sampler.get("wrapS", 10497)], WRAPS[sampler.get("wrapT", 10497)]
-        if wrap_s != wrap_t:
-            self.ignored.add(f"wrapT {wrap_t} (wrapS {wrap_s} is used for both)")
-        if sampler.get("magFilter") == NEAREST:
-            self.ignored.add("nearest-texel filter (bilinear is used)")
-        return wrap_s
+def _alpha(factor: np.ndarray, color: np.ndarray | None, textures: Textures) -> tuple[float, np.ndarray | None]:
+    """Factor and texels (h, w) of the alpha of a colour; nobody asks for it where transparent parts are refused."""
+    texels = None if color is None or textures.tolerance.strict else value_texels(color[..., 3])
+    return float(factor[3]) if len(factor) > 3 else 1.0, texels
 
 
-def _placement(info: dict) -> tuple:
-    """What decides the coordinates of a texture: its set and its transform, comparable."""
-    moved = info.get("extensions", {}).get("KHR_texture_transform", {})
-    rotate_scale, offset = _texture_transform(moved)
-    return moved.get("texCoord", info.get("texCoord", 0)), rotate_scale.tolist(), offset.tolist()
+def _opacity(spec: dict, name: str, look: Look, tolerance: Tolerance) -> Opacity:
+    """Where a material has surface."""
+    extensions = spec.get("extensions", {})
+    for extension, factor in TRANSPARENT.items():
+        if extensions.get(extension, {}).get(factor, 0) > 0 and (not tolerance.strict or _opaque(spec)):
+            return tolerance.opacity(name, Alpha(extension, transmits=True))
+    if _opaque(spec):
+        return Opacity()
+    mode = spec["alphaMode"]
+    cutoff = float(spec.get("alphaCutoff", 0.5)) if mode == "MASK" else None
+    return tolerance.opacity(name, Alpha(f"alphaMode {mode}", look.alpha_factor, look.alpha_texels, cutoff))
 
 
-def _texture_transform(moved: dict) -> tuple[np.ndarray, np.ndarray]:
-    """Matrix (2, 2) and offset (2,) of KHR_texture_transform.
+def _opaque(spec: dict) -> bool:
+    return spec.get("alphaMode", "OPAQUE") == "OPAQUE"
 
-    Counter-clockwise in a frame whose v runs down, as the extension's words and examples say (its GLSL snippet turns
-    the other way).
-    """
-    cos, sin = np.cos(moved.get("rotation", 0.0)), np.sin(moved.get("rotation", 0.0))
-    scale = np.asarray(moved.get("scale", (1, 1)), np.float64)
-    return np.array([[cos, sin], [-sin, cos]]) * scale, np.asarray(moved.get("offset", (0, 0)), np.float64)
+
+def _normal_map(textures: Textures, info: dict | None) -> np.ndarray | None:
+    """Normals (h, w, 3) along u, against v, outwards; None where there are none."""
+    encoded = textures.read(info, FLAT, ("normal_map",))
+    if info is None or encoded is None:
+        return None
+    scale = float(info.get("scale", 1.0))
+    return direction_texels(encoded) * np.array([scale, scale, 1], np.float32)
 
 
 def _channels(**channels: Values | float | int) -> dict[str, Any]:
@@ -177,11 +166,3 @@ def _channels(**channels: Values | float | int) -> dict[str, Any]:
 
 def _perceived_brightness(color: np.ndarray) -> Values:
     return np.sqrt((color * color) @ np.array([0.299, 0.587, 0.114]))
-
-
-def _reject_transparent(spec: dict, name: str) -> None:
-    if (mode := spec.get("alphaMode", "OPAQUE")) != "OPAQUE":
-        raise RejectedAsset(f"is transparent: material {name!r} has alphaMode {mode}")
-    for extension, factor in TRANSPARENT.items():
-        if spec.get("extensions", {}).get(extension, {}).get(factor, 0) > 0:
-            raise RejectedAsset(f"is transparent: material {name!r} has {extension}")

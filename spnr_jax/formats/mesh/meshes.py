@@ -22,7 +22,7 @@ from trimesh.exchange.stl import load_stl
 from trimesh.geometry import triangulate_quads
 
 from spnr_jax.formats.mesh.assemble import assemble
-from spnr_jax.formats.mesh.assets import Asset, Part, RejectedAsset
+from spnr_jax.formats.mesh.assets import Asset, Part, RejectedAsset, TransparentParts
 from spnr_jax.formats.mesh.gltf import load_gltf
 from spnr_jax.formats.mesh.obj import load_obj, principled
 from spnr_jax.formats.mesh.texels import srgb_to_linear
@@ -65,19 +65,21 @@ def find_meshes(folder: Path) -> list[tuple[str, Path]]:
     return sorted(ids.items())
 
 
-def load_mesh(path: Path, root: Path | None = None) -> Asset:
+def load_mesh(path: Path, root: Path | None = None, transparent_parts: TransparentParts = "refuse") -> Asset:
     """The object in a mesh file, parts merged by material; `source` names the file and its checksum.
 
     `root` is the object's folder, which may hold an .obj file's companions above it (default: the file's folder).
-    RejectedAsset, with one line, for a file that cannot be used: unreadable or truncated, compressed, transparent,
-    without faces or extent, or with companions (buffers, images, libraries) missing or outside its folder.
+    RejectedAsset, with one line, for a file that cannot be used: unreadable or truncated, without faces or extent,
+    with buffers missing or outside its folder.  "refuse", for references, also refuses what is transparent and images
+    and libraries that are missing; "opaque" and "skip", for pictures, say in `notes` what was made of them, and read
+    what the renderer of references does not know: cut-outs, normal maps, several texture coordinates (tolerance.py).
     """
     path = Path(path)
     try:
         with warnings.catch_warnings(), np.errstate(all="ignore"):  # assemble looks for what is not finite
             # numpy only warns where the text of a file stops being numbers
             warnings.filterwarnings("error", "string or file could not be read", DeprecationWarning)
-            asset = assemble(_load(path, root))
+            asset = assemble(_load(path, root, transparent_parts))
         checksum = hashlib.sha256(path.read_bytes()).hexdigest()
     except RejectedAsset:
         raise
@@ -97,13 +99,13 @@ def _raised_by_us(error: Exception) -> bool:
     return Path(innermost.filename).is_relative_to(Path(__file__).parents[2])
 
 
-def _load(path: Path, root: Path | None) -> Asset:
+def _load(path: Path, root: Path | None, transparent_parts: TransparentParts) -> Asset:
     """The raw asset of a file, by its suffix."""
     suffix = path.suffix.lower()
     if suffix in (".glb", ".gltf"):
-        return load_gltf(path)
+        return load_gltf(path, transparent_parts)
     if suffix == ".obj":
-        return load_obj(path, root)
+        return load_obj(path, root, transparent_parts)
     if suffix not in TEXT_OR_BINARY:
         raise RejectedAsset(f"has suffix {suffix!r}; expected one of {' '.join(SUFFIXES)}")
     data = path.read_bytes()

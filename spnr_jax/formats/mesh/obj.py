@@ -2,9 +2,10 @@
 
 Kd is linear (as Blender writes it) and counts only without map_Kd (sRGB), for most exporters leave a placeholder beside
 a map; roughness is Pr, else sqrt(2 / (Ns + 2)), else 0.5; metallic is Pm, else 0. Transparent: d below 1, map_d, or Tr
-strictly between 0 and 1 (writers disagree which end of Tr is the opaque one). Of faces with the same three corners,
-in either order, one is kept, that of the material used first: ShapeNet has many, one for each side, and a ray could
-not tell which it hits.
+strictly between 0 and 1 (writers disagree which end of Tr is the opaque one); where a picture is wanted (tolerance.py)
+map_d is a cut-out at a half, and a library or an image that is missing leaves grey. Of faces with the same three
+corners, in either order, one is kept, that of the material used first: ShapeNet has many, one for each side, and a ray
+could not tell which it hits.
 """
 
 import io
@@ -19,15 +20,16 @@ import numpy as np
 from trimesh.exchange.obj import load_obj as read_obj_text
 from trimesh.geometry import triangulate_quads
 
-from spnr_jax.formats.mesh.assets import Asset, Material, Part, RejectedAsset, Wrap
+from spnr_jax.formats.mesh.assets import Asset, Material, MissingFile, Part, RejectedAsset, TransparentParts, Wrap
 from spnr_jax.formats.mesh.companions import read_companion
 from spnr_jax.formats.mesh.texels import color_texels, read_image, value_texels
+from spnr_jax.formats.mesh.tolerance import MOSTLY_OPAQUE, Alpha, Opacity, Tolerance
 
 PLACE = "material-{}"  # name that trimesh sees for the n-th material, so that any name in the file is safe
 READ = {"newmtl", "kd", "map_kd", "pr", "map_pr", "pm", "map_pm", "ns", "d", "tr", "map_d"}
 SILENT = {"ka", "ks", "ni", "illum", "tf", "sharpness"}  # the older lighting model: has no principled counterpart
 Read = Callable[[str], bytes]  # the bytes of a companion file, by its name in the text
-MAPS = ("map_kd", "map_pr", "map_pm")
+MAPS = ("map_kd", "map_pr", "map_pm", "map_d")
 OPTION = re.compile(r"-(\w+)((?:\s+(?:on|off|[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)(?=\s))*)\s+")
 
 
@@ -39,31 +41,41 @@ class Placement(NamedTuple):
     offset: tuple[float, float] = (0.0, 0.0)
 
 
-def load_obj(path: Path, root: Path | None = None) -> Asset:
+class Look(NamedTuple):
+    """A material, how its maps lie, and whether it is nowhere to be seen."""
+
+    material: Material
+    placement: Placement = Placement()
+    nowhere: bool = False
+
+
+def load_obj(path: Path, root: Path | None = None, transparent_parts: TransparentParts = "refuse") -> Asset:
     """The file's faces grouped by material, as they lie in the file; RejectedAsset if it cannot be used.
 
     `root` is the folder that libraries and images must not lead out of (default: the file's own).
     """
-    read = partial(read_companion, path.parent, root=root)
+    read, tolerance = partial(read_companion, path.parent, root=root), Tolerance(transparent_parts)
     text = path.read_text("utf-8", errors="replace")
     text = re.sub(r"(?m)^ +", "", text.replace("\t", " "))  # trimesh looks for keywords at the line's start
     if not re.search(r"(?m)^f ", text):
         raise RejectedAsset("has no faces")
     library: dict[str, dict[str, str]] = {}
     for names in re.findall(r"(?m)^mtllib +(.+?) *$", text):
-        library |= parse_mtl(_read_library(read, path.parent, names))
+        library |= parse_mtl(_read_library(read, path.parent, names, tolerance))
     names = list(dict.fromkeys(re.findall(r"(?m)^usemtl +(.+?) *$", text)))
     ignored: set[str] = set()
-    materials = {PLACE.format(i): _material(read, name, library, ignored) for i, name in enumerate(names)}
-    loaded = read_obj_text(io.StringIO(_renamed(text, names)), resolver={"names": _name_list(materials)})
-    order = {name: number for number, name in enumerate(materials)}
+    looks = {PLACE.format(i): _look(read, name, library, ignored, tolerance) for i, name in enumerate(names)}
+    loaded = read_obj_text(io.StringIO(_renamed(text, names)), resolver={"names": _name_list(looks)})
+    order = {name: number for number, name in enumerate(looks)}
     meshes = sorted(loaded["geometry"].values(), key=lambda mesh: order.get(_material_name(mesh), -1))
-    default = principled(), Placement()
-    parts = [_part(mesh, *materials.get(_material_name(mesh), default)) for mesh in meshes]
+    dressed = [(mesh, looks.get(_material_name(mesh), Look(principled()))) for mesh in meshes]
+    parts = [_part(mesh, look.material, look.placement) for mesh, look in dressed if not look.nowhere]
+    if not parts and meshes:
+        raise RejectedAsset(f"has nothing to draw: {'; '.join(tolerance.notes())}")
     if re.search(r"(?m)^vn ", text) and any(part.normals is None for part in parts):
         ignored.add("normals that only some faces have (flat shading is used)")
     parts = _without_doubles(parts, ignored)
-    return Asset(parts=tuple(parts), ignored=tuple(sorted(ignored)))
+    return Asset(parts=tuple(parts), ignored=tuple(sorted(ignored)), notes=tuple(tolerance.notes()))
 
 
 def _without_doubles(parts: list[Part], ignored: set[str]) -> list[Part]:
@@ -112,35 +124,55 @@ def parse_mtl(text: str) -> dict[str, dict[str, str]]:
     return library
 
 
-def _read_library(read: Read, folder: Path, names: str) -> str:
+def _read_library(read: Read, folder: Path, names: str, tolerance: Tolerance) -> str:
     """Text of the material libraries of one `mtllib` line: one name with spaces, or several without."""
     single = (folder / names).is_file() or len(names.split()) == 1
-    found = [read(name.replace("\\", "/")) for name in ([names] if single else names.split())]
+    found = []
+    for name in [names] if single else names.split():
+        try:
+            found.append(read(name.replace("\\", "/")))
+        except MissingFile as missing:
+            tolerance.goes_on_without(missing)
     return "\n".join(data.decode("utf-8", errors="replace") for data in found)
 
 
-def _material(
-    read: Read, name: str, library: dict[str, dict[str, str]], ignored: set[str]
-) -> tuple[Material, Placement]:
-    """The principled material of an MTL entry, and how its maps lie."""
+def _look(read: Read, name: str, library: dict[str, dict[str, str]], ignored: set[str], tolerance: Tolerance) -> Look:
+    """The principled material of an MTL entry, how its maps lie, and where it has surface."""
     if name not in library:
-        raise RejectedAsset(f"uses material {name!r}, which no material library defines")
+        tolerance.goes_on_without(MissingFile(f"uses a material that no library defines: {name!r}"))
+        return Look(principled())
     entry = library[name]
-    _reject_transparent(entry, name)
+    maps = _read_maps(read, entry, name, tolerance)
+    opacity = _opacity(entry, maps.get("map_d"), name, tolerance)
     ignored |= {f"MTL {key}" for key in entry if key not in READ | SILENT and entry[key].strip("0. ")}
-    placement = _placement([entry[key] for key in MAPS if key in entry], ignored)
+    placement = _placement([entry[key] for key in MAPS if key in maps], ignored)
     color = np.array([float(x) for x in entry.get("kd", "0.5 0.5 0.5").split()[:3]])
-    if "map_kd" in entry:
+    if "map_kd" in maps:
         if "kd" in entry and not np.all(color == 1):
             ignored.add("MTL Kd beside map_Kd")
-        color = color_texels(_image(read, entry["map_kd"]))
+        color = color_texels(maps["map_kd"])
     roughness = np.sqrt(2 / (max(float(entry["ns"]), 0) + 2)) if "ns" in entry else 0.5
     channels: dict[str, float | np.ndarray]
     channels = {"roughness": float(entry.get("pr", roughness)), "metallic": float(entry.get("pm", 0))}
     for channel, key in (("roughness", "map_pr"), ("metallic", "map_pm")):
+        if key in maps:
+            channels[channel] = value_texels(maps[key][..., 0])
+    material = principled(color, **channels, wrap=placement.wrap)
+    return Look(replace(material, opacity=opacity.texels, cutoff=opacity.cutoff), placement, opacity.nowhere)
+
+
+def _read_maps(read: Read, entry: dict[str, str], name: str, tolerance: Tolerance) -> dict[str, np.ndarray]:
+    """Texels of the images that an entry names; without those that may be missing and are."""
+    if tolerance.strict:
+        _opacity(entry, None, name, tolerance)  # a transparent material is the plainer reason
+    maps = {}
+    for key in MAPS:
         if key in entry:
-            channels[channel] = value_texels(_image(read, entry[key])[..., 0])
-    return principled(color, **channels, wrap=placement.wrap), placement
+            try:
+                maps[key] = _image(read, entry[key])
+            except MissingFile as missing:
+                tolerance.goes_on_without(missing)
+    return maps
 
 
 def _placement(statements: list[str], ignored: set[str]) -> Placement:
@@ -177,13 +209,18 @@ def _image(read: Read, statement: str) -> np.ndarray:
     return read_image(read(name), name)
 
 
-def _reject_transparent(entry: dict[str, str], name: str) -> None:
+def _opacity(entry: dict[str, str], map_d: np.ndarray | None, name: str, tolerance: Tolerance) -> Opacity:
+    """Where a material has surface."""
     if "map_d" in entry:
-        raise RejectedAsset(f"is transparent: material {name!r} has map_d")
+        texels = None
+        if map_d is not None:  # grey, or the alpha of a picture that has one
+            texels = value_texels(map_d[..., 3 if map_d[..., 3].min() < 255 else 0])
+        return tolerance.opacity(name, Alpha("map_d", texels=texels, cutoff=MOSTLY_OPAQUE))
     if "d" in entry and (opacity := float(entry["d"].split()[-1])) < 1:
-        raise RejectedAsset(f"is transparent: material {name!r} has d {opacity:g}")
+        return tolerance.opacity(name, Alpha(f"d {opacity:g}", opacity))
     if "tr" in entry and 0 < (share := float(entry["tr"].split()[-1])) < 1:
-        raise RejectedAsset(f"is transparent: material {name!r} has Tr {share:g}")
+        return tolerance.opacity(name, Alpha(f"Tr {share:g}", 1 - share))
+    return Opacity()
 
 
 def _renamed(text: str, names: list[str]) -> str:

@@ -1,8 +1,9 @@
 """Surface points with materials: normalisation of an object, and samples of its surface.
 
 Points are drawn uniformly by area over all parts, or spread evenly: each the farthest of several times as many from
-those before.  The material of each is looked up with the interpolation of the renderer (texels.py) and
-multiplied by the interpolated vertex colour.  `face` counts through all parts, as the renderer reports its hits.
+those before.  The material of each is looked up with the interpolation of the renderer (texels.py) and multiplied by
+the interpolated vertex colour; those that it cuts out are replaced.  `face` counts through all parts, as the renderer
+reports its hits.
 """
 
 from dataclasses import dataclass, fields, replace
@@ -10,11 +11,13 @@ from typing import Literal
 
 import numpy as np
 
-from spnr_jax.formats.mesh.assets import Asset, Material, Part, RejectedAsset, Values
+from spnr_jax.formats.mesh.assets import CHANNELS, TEXTURES, Asset, Material, Part, RejectedAsset
+from spnr_jax.formats.mesh.tangents import tilted
 from spnr_jax.formats.mesh.texels import lookup
 from spnr_jax.kernels.thinning import farthest_points
 
 Spread = Literal["random", "even"]
+MOST_ROUNDS = 64  # of drawing points on a surface that is cut out, before it counts as nowhere
 CANDIDATES = 4  # points drawn for each that is kept of an even spread
 
 
@@ -71,11 +74,26 @@ def sample_surface(asset: Asset, num_points: int, seed: int, spread: Spread = "r
 
 
 def _random_points(asset: Asset, num_points: int, seed: int) -> SurfacePoints:
+    """Points uniform by area over what is not cut out."""
     bounding_box(asset)
     rng = np.random.default_rng(seed)
     cumulative = np.cumsum(np.concatenate([face_areas(part) for part in asset.parts]))
     if not cumulative[-1] > 0:
         raise RejectedAsset("has no face with an area")
+    rounds: list[dict[str, np.ndarray]] = []
+    found = 0
+    while found < num_points:
+        if len(rounds) == MOST_ROUNDS:
+            raise RejectedAsset("has next to no surface that its textures do not cut out")
+        columns = _drawn(asset, cumulative, num_points, rng)
+        solid = columns.pop("solid")
+        found += int(np.count_nonzero(solid))
+        rounds.append({name: values[solid] for name, values in columns.items()})
+    return SurfacePoints(**{name: np.concatenate([r[name] for r in rounds])[:num_points] for name in rounds[0]})
+
+
+def _drawn(asset: Asset, cumulative: np.ndarray, num_points: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
+    """The columns of SurfacePoints of random points on all faces, and whether there is surface at them: `solid`."""
     face = np.searchsorted(cumulative, rng.random(num_points) * cumulative[-1], side="right")
     face = np.minimum(face, np.searchsorted(cumulative, cumulative[-1]))  # the product can round up to the total
     barycentric = _uniform_barycentric(rng.random((num_points, 2)))
@@ -83,11 +101,12 @@ def _random_points(asset: Asset, num_points: int, seed: int) -> SurfacePoints:
     columns: dict[str, np.ndarray]
     columns = {name: np.zeros((num_points, 3), np.float32) for name in ("positions", "normals", "base_color")}
     columns |= {name: np.zeros(num_points, np.float32) for name in ("roughness", "metallic")}
+    columns["solid"] = np.ones(num_points, bool)
     for part, first in zip(asset.parts, first_face, strict=False):
         here = (face >= first) & (face < first + len(part.faces))
         for name, values in _sample_part(part, face[here] - first, barycentric[here]).items():
             columns[name][here] = values
-    return SurfacePoints(**columns, face=face.astype(np.int32))
+    return columns | {"face": face.astype(np.int32)}
 
 
 def face_areas(part: Part) -> np.ndarray:
@@ -96,34 +115,44 @@ def face_areas(part: Part) -> np.ndarray:
 
 
 def evaluate_material(material: Material, texcoords: np.ndarray | None, count: int) -> dict[str, np.ndarray]:
-    """base_color (count, 3), roughness (count,) and metallic (count,) of a material at texture coordinates."""
+    """The channels of a material at texture coordinates (count, 2 n), and its opacity and normal map if it has them.
 
-    def channel(values: Values, value_ndim: int) -> np.ndarray:
+    base_color, normal_map (count, 3); roughness, metallic, opacity (count,).
+    """
+
+    def channel(name: str, value_ndim: int) -> np.ndarray:
+        values = np.asarray(getattr(material, name))
         if values.ndim == value_ndim:
             return np.broadcast_to(values, (count, *values.shape))
         assert texcoords is not None, "a texture needs texture coordinates"
-        return lookup(np.asarray(values), texcoords, material.wrap)
+        pair, wrap = material.coordinates.get(name, (0, material.wrap))
+        return lookup(values, texcoords[:, 2 * pair : 2 * pair + 2], wrap)
 
-    return {
-        "base_color": channel(material.base_color, 1),
-        "roughness": channel(material.roughness, 0),
-        "metallic": channel(material.metallic, 0),
-    }
+    present = {name: axes for name, axes in TEXTURES.items() if getattr(material, name) is not None}
+    return {name: channel(name, axes) for name, axes in (CHANNELS | present).items()}
 
 
 def _sample_part(part: Part, face: np.ndarray, barycentric: np.ndarray) -> dict[str, np.ndarray]:
-    """Every column of SurfacePoints but `face`, at barycentric coordinates (n, 3) of local faces (n,)."""
+    """Every column but `face` that `_drawn` gives, at barycentric coordinates (n, 3) of local faces (n,)."""
 
     def interpolate(values: np.ndarray) -> np.ndarray:
         return np.einsum("nk,nkc->nc", barycentric, values[part.faces[face]])
 
     texcoords = None if part.texcoords is None else interpolate(part.texcoords)
     channels = evaluate_material(part.material, texcoords, len(face))
+    opacity, normal_map = (channels.pop(name, None) for name in TEXTURES)
     if part.colors is not None:
         channels["base_color"] = channels["base_color"] * interpolate(part.colors)
     geometric = unit(_face_cross(part)[face])
     normals = geometric if part.normals is None else unit(interpolate(part.normals), geometric)
-    return {"positions": interpolate(part.positions), "normals": normals, **channels}
+    if normal_map is not None:
+        assert part.texcoords is not None, "a normal map needs texture coordinates"
+        pair, _ = part.material.coordinates.get("normal_map", (0, part.material.wrap))
+        corners = part.faces[face]
+        own = part.texcoords[:, 2 * pair : 2 * pair + 2]
+        normals = tilted(normals, normal_map, part.positions[corners], own[corners])
+    solid = np.ones(len(face), bool) if opacity is None else opacity >= part.material.cutoff
+    return {"positions": interpolate(part.positions), "normals": normals, "solid": solid, **channels}
 
 
 def _uniform_barycentric(uniform: np.ndarray) -> np.ndarray:

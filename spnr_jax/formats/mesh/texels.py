@@ -10,6 +10,7 @@ import io
 import numpy as np
 from PIL import Image, UnidentifiedImageError
 
+from spnr_jax.formats.mesh import ktx2
 from spnr_jax.formats.mesh.assets import RejectedAsset, Wrap
 
 MAX_SIZE = 1024
@@ -26,6 +27,8 @@ SRGB_TABLE = srgb_to_linear(np.arange(256) / 255).astype(np.float32)
 
 def read_image(data: bytes, name: str) -> np.ndarray:
     """Texels (height, width, 4) uint8 of an image file as they are encoded; alpha is 255 where it has none."""
+    if data.startswith(ktx2.IDENTIFIER):
+        return ktx2.decode(data, name, MOST_PIXELS)
     try:
         with Image.open(io.BytesIO(data)) as image:
             if image.width * image.height > MOST_PIXELS:  # before memory is taken for them
@@ -40,12 +43,22 @@ def read_image(data: bytes, name: str) -> np.ndarray:
 
 def color_texels(encoded: np.ndarray) -> np.ndarray:
     """Linear colours (h, w, 3) float32 of sRGB-encoded texels (h, w, 4) uint8, at most MAX_SIZE a side."""
-    return shrink(SRGB_TABLE[encoded[..., :3]])
+    return _shrunk_channels(SRGB_TABLE, encoded)
 
 
 def value_texels(encoded: np.ndarray) -> np.ndarray:
     """Values (h, w) float32 in [0, 1] of linearly encoded texels (h, w) uint8, at most MAX_SIZE a side."""
     return shrink(encoded.astype(np.float32) / 255)
+
+
+def direction_texels(encoded: np.ndarray) -> np.ndarray:
+    """Values (h, w, 3) float32 in [-1, 1] of encoded directions (h, w, 4) uint8, at most MAX_SIZE a side."""
+    return _shrunk_channels((np.arange(256) / 255 * 2 - 1).astype(np.float32), encoded)
+
+
+def _shrunk_channels(table: np.ndarray, encoded: np.ndarray) -> np.ndarray:
+    """Values (h, w, 3) by a table of encoded ones; channel by channel, for floats take four times the room."""
+    return np.stack([shrink(table[encoded[..., channel]]) for channel in range(3)], axis=-1)
 
 
 def shrink(texels: np.ndarray) -> np.ndarray:
