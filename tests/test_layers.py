@@ -15,7 +15,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 SPNR_JAX = (
-    *("model_config", "config"),
+    *("errors", "model_config", "config"),
     *("devices", "kernels", "nn", "baselines", "method"),
     *("formats/mesh", "formats", "training", "scoring", "tools", "viewer"),
     *("presets", "cli", "__init__"),
@@ -33,7 +33,8 @@ ORDER = [
 ]
 PURE = ("kernels", "nn", "baselines", "method")
 WITHOUT_JIT = ("devices", "kernels", "nn", "baselines")
-OF_SPNR_JAX = {"spnr_jax/kernels", "spnr_jax/formats", "spnr_jax/formats/mesh"}  # that data_gen stands on
+# what data_gen stands on
+OF_SPNR_JAX = {"spnr_jax/errors", "spnr_jax/kernels", "spnr_jax/formats", "spnr_jax/formats/mesh"}
 IMPURE = {"os", "pathlib", "time", "io", "sys", "json", "shutil", "tempfile", "logging", "datetime", "random", "tqdm"}
 HEAVY = {"mitsuba", "pymeshlab", "trimesh", "viser", "torch", "matplotlib", "skimage", "grain", "dask", "distributed"}
 

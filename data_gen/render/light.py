@@ -13,6 +13,7 @@ import numpy as np
 
 from data_gen.render.variant import mitsuba_module, threads
 from data_gen.render.views import ViewConfig, make_sensor, spread_viewpoints
+from spnr_jax.errors import UserError
 
 WHITE_SPHERE_RADIANCE = 0.6  # far enough below 1 that white objects keep their shading against the white background
 
@@ -111,17 +112,15 @@ def load_envmap(path: Path) -> np.ndarray:
     """Return an environment map file (.hdr, .exr) as (height, width, 3) float32, unscaled; ValueError if unusable."""
     mi = mitsuba_module()
     if not Path(path).is_file():
-        raise ValueError(f"environment map {path}: no such file; give a latitude-longitude .hdr or .exr")
+        raise UserError(f"environment map {path}: no such file; give a latitude-longitude .hdr or .exr")
     try:
         with threads(2):  # with a single thread the OpenEXR reader waits for itself for ever (Mitsuba 3.9)
             bitmap = mi.Bitmap(str(path)).convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, srgb_gamma=False)
     except RuntimeError as error:
-        raise ValueError(
-            f"environment map {path}: not a readable .hdr or .exr ({str(error).splitlines()[0]})"
-        ) from None
+        raise UserError(f"environment map {path}: not a readable .hdr or .exr ({str(error).splitlines()[0]})") from None
     radiance = np.array(bitmap, dtype=np.float32)
     if not np.isfinite(radiance).all() or radiance.min() < 0 or radiance.max() <= 0:
-        raise ValueError(f"environment map {path}: expected finite radiance >= 0 with some light in it")
+        raise UserError(f"environment map {path}: expected finite radiance >= 0 with some light in it")
     return radiance
 
 

@@ -20,6 +20,7 @@ from jaxtyping import Array, Float
 from scipy.spatial import cKDTree
 
 from spnr_jax.devices.placement import by_all_devices, everywhere
+from spnr_jax.errors import UserError
 from spnr_jax.kernels import cameras, cloud_arrays, supersampling
 from spnr_jax.kernels.records import Camera, PointCloud, Rendering
 from spnr_jax.method import inference
@@ -57,10 +58,10 @@ class Model:
         positions = np.asarray(cloud.positions, np.float32)
         mask = np.asarray(cloud.mask)
         if not mask.any():
-            raise ValueError("the cloud has no points; give at least one")
+            raise UserError("the cloud has no points; give at least one")
         for field in dataclasses.fields(cloud):
             if not np.isfinite(np.asarray(getattr(cloud, field.name))[mask]).all():
-                raise ValueError(f"the cloud has NaN or infinity in its {field.name}; remove those points")
+                raise UserError(f"the cloud has NaN or infinity in its {field.name}; remove those points")
         centre, scale = cloud_arrays.normalization(positions[mask])
         # the ends of a thin stick lie on the faces of the box: rounding must not push them out of it
         inside = np.clip((positions - centre) * scale, -1, 1).astype(np.float32)
@@ -81,7 +82,7 @@ class Model:
         `trained` renders as the network was trained.  Other networks than ours know one number of samples.
         """
         if self.config.upsamples and (camera.height % 2 or camera.width % 2):
-            raise ValueError(f"this network doubles its pictures: {camera.width} x {camera.height} pixels must be even")
+            raise UserError(f"this network doubles its pictures: {camera.width} x {camera.height} pixels must be even")
         config = at_quality(self.config, quality, volume.reach)
         needed = supersampling.rays_per_side(config, camera.width)
         side = needed if quality == "best" else 1
@@ -143,7 +144,7 @@ def at_quality(config: NetworkConfig, quality: Quality, reach: int) -> NetworkCo
     A network that sees the surface keeps its own reach: the cells of the surface's grid grow with the spacing.
     """
     if quality not in (*SAMPLES, "trained"):
-        raise ValueError(f"quality must be one of {', '.join(SAMPLES)}, trained, got {quality}")
+        raise UserError(f"quality must be one of {', '.join(SAMPLES)}, trained, got {quality}")
     if quality == "trained" or not isinstance(config, ModelConfig):
         return config
     counts = config.sampling

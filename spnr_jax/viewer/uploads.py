@@ -9,6 +9,7 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path, PurePath
 
+from spnr_jax.errors import UserError
 from spnr_jax.formats import clouds
 from spnr_jax.kernels.records import PointCloud
 
@@ -32,4 +33,4 @@ def read_upload(
         try:
             return clouds.read_cloud(path, num_points=num_points, up=up, report=report)
         except ValueError as error:
-            raise ValueError(str(error).replace(str(path), shown)) from None
+            raise UserError(str(error).replace(str(path), shown)) from None
