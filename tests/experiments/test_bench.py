@@ -48,7 +48,7 @@ class TestTable:
             assert row["ratio"] == pytest.approx(expected, rel=0.4)
             assert row["ratio_low"] <= row["ratio"] <= row["ratio_high"]
             assert row["twin_ms"] >= row["twin_min_ms"] >= 4
-            assert row["foundpeak_mb"] > 5
+            assert row["ours_peak_mb"] > 5
             assert (row["compile_s"], row["batch"]) == (0.5, 2)
         assert "[3/3, about 0 min left] tiny batch 2 render, ours near points" in capsys.readouterr().out
         assert (options.out / "bench.png").read_bytes().startswith(b"\x89PNG")
@@ -100,7 +100,7 @@ def test_the_ratio_is_the_median_of_paired_ratios():
     theirs = Side([4.0, 4.0, 4.0], [80.0, 80.0, 80.0], [10.0, 1.0, 30.0])
     row = bench.compare(ours, theirs, cell, bench.Options(rounds=3))
     assert (row["ratio_low"], row["ratio"], row["ratio_high"]) == (0.4, 0.5, 0.5)
-    assert (row["foundms"], row["foundmin_ms"], row["twin_ms"], row["twin_min_ms"]) == (3.0, 1.0, 10.0, 1.0)
+    assert (row["ours_ms"], row["ours_min_ms"], row["twin_ms"], row["twin_min_ms"]) == (3.0, 1.0, 10.0, 1.0)
 
 
 def test_a_turn_lasts_as_long_as_asked_and_leaves_its_first_run_out():

@@ -57,7 +57,7 @@ def test_procedural_objects_are_made_unless_meshes_replace_them(
     def stop(*_):
         raise Generated
 
-    monkeypatch.setattr(demo.data, "open_dataset", stop)
+    monkeypatch.setattr(demo.data_sets, "open_dataset", stop)
     with pytest.raises(Generated):
         demo.main(demo.Demo(out=tmp_path, meshes=meshes and tmp_path / meshes, objects=objects))
     assert asked[0].objects == expected

@@ -25,8 +25,8 @@ def folder(tmp_path):
 def quick(monkeypatch):
     """A train step that takes 20 ms, and a preset that fits the tests' data set."""
     monkeypatch.setattr(loading.cli, "set_up_jax", lambda **_: None)
-    monkeypatch.setattr(loading.training, "jitted_create_state", lambda settings: 0)
-    monkeypatch.setattr(loading.training, "jitted_train_step", lambda *_, **__: time.sleep(0.02) or (0, {}))
+    monkeypatch.setattr(loading.optimisation, "jitted_create_state", lambda settings: 0)
+    monkeypatch.setattr(loading.optimisation, "jitted_train_step", lambda *_, **__: time.sleep(0.02) or (0, {}))
     monkeypatch.setitem(presets.PRESETS, "tiny", lambda: tiny_dataset.CONFIG)
 
 

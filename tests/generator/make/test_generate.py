@@ -153,7 +153,7 @@ def test_an_unexpected_error_leaves_out_that_object_only_but_a_full_disk_stops_t
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(objects, "make_record", lambda bench, task: None)
-    monkeypatch.setattr(objects.records, "write_object", full)
+    monkeypatch.setattr(objects.layout, "write_object", full)
     with pytest.raises(OSError, match="No space"):
         objects.make_and_write(bench, task)
 
