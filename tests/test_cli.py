@@ -12,7 +12,7 @@ import sys
 import pytest
 from support import tiny_dataset
 
-from spnr_jax import presets
+from spnr_jax import errors, presets
 
 
 def unchecked_cli():
@@ -264,19 +264,31 @@ def test_an_error_of_the_program_keeps_its_traceback():
         cli.guarded(broken, "spnr")
 
 
+def test_an_error_shows_its_call_stack_for_debug_alone_and_its_line_in_any_case(capsys, monkeypatch):
+    def refused():
+        raise errors.UserError("no such thing")
+
+    for debug in (False, True):
+        assert cli.guarded(refused, "spnr", debug) == 2
+        said = capsys.readouterr().err
+        assert ("in refused" in said) is debug
+        assert said.endswith("spnr: no such thing\n")
+    monkeypatch.delenv("SPNR_DEBUG", raising=False)
+    assert exit_code("render", "absent.ply", "--debug") == 2
+    said = capsys.readouterr().err
+    assert "Traceback" in said
+    assert "absent.ply" in said.splitlines()[-1]
+    assert exit_code("render", "absent.ply") == 2
+    assert len(capsys.readouterr().err.splitlines()) == 1
+    monkeypatch.setenv("SPNR_DEBUG", "1")
+    assert exit_code("render", "absent.ply") == 2
+    assert "Traceback" in capsys.readouterr().err
+
+
 def test_errors_of_many_lines_become_one():
     assert cli.one_line(ValueError("this\n  and\nthat")) == "this and that"
     assert cli.one_line(OSError(28, "No space left on device")) == "disk: No space left on device"
     assert cli.one_line(OSError(13, "Permission denied", "a/b")) == "a/b: Permission denied"
-
-
-def test_an_error_shows_its_call_stack_where_that_is_asked_for(capsys, monkeypatch, tmp_path):
-    monkeypatch.delenv("SPNR_DEBUG", raising=False)
-    assert exit_code("runs", tmp_path / "none") == 2
-    assert "Traceback" not in capsys.readouterr().err
-    monkeypatch.setenv("SPNR_DEBUG", "")  # so that it is put back
-    assert exit_code("runs", tmp_path / "none", "--debug") == 2
-    assert "Traceback" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("command", ["render", "view"])

@@ -19,6 +19,7 @@ from typing import Literal
 import jax
 
 from spnr_jax.config import TrainConfig
+from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
 from spnr_jax.presets import PRESETS
 from spnr_jax.training import batching, checkpoint, optimisation, trainer
@@ -45,7 +46,7 @@ def presets(budget: Budget, size: int, category: str | None) -> dict[str, str]:
     if budget != "paper":
         return {"ours": "tiny"} | {method: f"{method}_tiny" for method in NETWORKS[1:]}
     if size not in PAPER_SIZES:
-        raise ValueError(
+        raise UserError(
             f"--budget paper: the data's images have {size} pixels, the paper's 128 (ABO) or 200 (ShapeNet); generate "
             "with --resolution 128, or take --budget tiny"
         )

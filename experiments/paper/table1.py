@@ -29,6 +29,7 @@ from experiments.paper import table1_tables
 from spnr_jax import cli
 from spnr_jax.config import TrainConfig
 from spnr_jax.devices import machine
+from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
 from spnr_jax.presets import PRESETS
 from spnr_jax.scoring import evaluation
@@ -71,15 +72,15 @@ class Table1:
 
     def __post_init__(self) -> None:
         if self.minutes is not None and (self.budget == "quick" or not self.minutes > 0):
-            raise ValueError(
+            raise UserError(
                 f"--minutes {self.minutes}: expected more than 0 with --budget tiny or paper (quick takes "
                 f"{budget.QUICK_STEPS} steps); leave it out for the steps of the presets"
             )
         if not self.methods:
-            raise ValueError(f"--methods: name at least one of {', '.join(ROWS)}")
+            raise UserError(f"--methods: name at least one of {', '.join(ROWS)}")
         for name, value, least in (("objects", self.objects, 1), ("shown", self.shown, 0)):
             if value is not None and value < least:
-                raise ValueError(f"--{name}: expected {least} or more, got {value}")
+                raise UserError(f"--{name}: expected {least} or more, got {value}")
 
 
 def main(options: Table1) -> None:
@@ -101,7 +102,7 @@ def main(options: Table1) -> None:
     networks = {name: of_cloud(evaluation.network(t.variables, t.config), config) for name, t in trained.items()}
     methods = networks | surfaces | floors
     if not methods:
-        raise ValueError(f"--methods {' '.join(options.methods)}: none can be made here, {' '.join(missing.values())}")
+        raise UserError(f"--methods {' '.join(options.methods)}: none can be made here, {' '.join(missing.values())}")
     scored = score_objects(methods, config, dataset, names, options.shown, weights)
     found = {
         **asked,

@@ -17,6 +17,7 @@ from jaxtyping import Array, Float
 
 from spnr_jax.config import TrainConfig
 from spnr_jax.devices import machine
+from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
 from spnr_jax.kernels import metrics
 from spnr_jax.kernels.records import Camera, PointCloud
@@ -92,7 +93,7 @@ def choose_radius(dataset: data_sets.Dataset, config: TrainConfig, method: str, 
     """The radius factor with the highest PSNR over a few training objects."""
     items = [data_sets.read_object(dataset, name) for name in dataset.splits["train"][:num_objects]]
     if not items:
-        raise ValueError(f"{dataset.folder}: no training objects to choose the radius of `{method}` on; generate some")
+        raise UserError(f"{dataset.folder}: no training objects to choose the radius of `{method}` on; generate some")
 
     def mean_psnr(factor: float) -> float:
         values = []
@@ -142,7 +143,7 @@ def evaluate_object(
     """Pictures and scores of one object."""
     data_sets.check_renders(item, config)
     if item.lights is not None:
-        raise ValueError(
+        raise UserError(
             f"object {item.name}: each view has its own light; `experiments.studies.relighting` scores those"
         )
     cloud = data_sets.test_cloud(item, config)
@@ -224,7 +225,7 @@ def evaluate(
     config = trained.config
     names = dataset.splits[split]
     if not names:
-        raise ValueError(f"{dataset.folder}: the {split} split is empty; choose another one or generate more objects")
+        raise UserError(f"{dataset.folder}: the {split} split is empty; choose another one or generate more objects")
     factors = {method: choose_radius(dataset, config, method) for method in ("splat", "nearest")}
     methods = {"ours": network(trained.variables, config)}
     methods |= {name: floor(name, factors.get(name, 1.0)) for name in FLOORS}

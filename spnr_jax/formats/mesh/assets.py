@@ -15,11 +15,13 @@ from typing import Literal
 
 import numpy as np
 
+from spnr_jax.errors import UserError
+
 Wrap = Literal["repeat", "mirror", "clamp"]
 Values = np.ndarray | np.floating  # NumPy makes numbers of arrays without axes
 
 
-class RejectedAsset(ValueError):
+class RejectedAsset(UserError):
     """An object that cannot be used; the message is the one-line reason that goes into rejected.jsonl."""
 
 
