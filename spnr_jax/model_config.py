@@ -386,3 +386,10 @@ METHODS: dict[str, type[NetworkConfig]] = {
     "point_nerf": PointNeRFConfig,
     "points2nerf": Points2NeRFConfig,
 }
+
+
+def kind_of(config: NetworkConfig) -> str:
+    """What a network is, for tables: `surfels`, `near_points`, `paper` (a volume and rays alone), or a baseline."""
+    if isinstance(config, ModelConfig):
+        return "near_points" if config.num_neighbors else "paper"
+    return next(name for name, kind in METHODS.items() if isinstance(config, kind))

@@ -243,7 +243,7 @@ def test_train_then_evaluate_write_a_run_and_its_scores(capsys, tmp_path, data):
     assert exit_code("evaluate", data, run, "--gallery", 1, "--out", tmp_path / "scores") == 0
     metrics = json.loads((tmp_path / "scores" / "metrics.json").read_text())
     assert set(metrics["seconds"]) == {"evaluate", "total"}
-    assert metrics["methods"]["ours"]["objects"] == len(tiny_dataset.SPLITS["test"])
+    assert metrics["methods"]["paper"]["objects"] == len(tiny_dataset.SPLITS["test"])
     assert (tmp_path / "scores" / "report.html").is_file()
 
 

@@ -11,22 +11,17 @@ from pathlib import Path
 from spnr_jax.config import TrainConfig
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
-from spnr_jax.model_config import METHODS, ModelConfig
+from spnr_jax.model_config import kind_of
 from spnr_jax.scoring import evaluation
+from spnr_jax.scoring.report import METHODS
 from spnr_jax.training import weights
 
+FLOORS = tuple(reversed(evaluation.FLOORS))
 LABELS = {  # method -> its name in tables and pictures, in their order
-    "ours": "Ours",
-    "plus": "Ours, plus",
-    "surfels": "Surfels",
-    "npbg": "NPBG",
-    "point_nerf": "Point-NeRF",
-    "points2nerf": "Points2NeRF",
+    **{name: label for name, label in METHODS.items() if name not in FLOORS},
     "poisson": "Poisson",
     "poisson_trimmed": "Poisson, trimmed 0.3",
-    "nearest": "Nearest-point shading",
-    "splat": "Base-colour splat",
-    "white": "White image",
+    **{name: METHODS[name] for name in FLOORS},
 }
 
 
@@ -92,13 +87,10 @@ def load(run: Path, dataset: data_sets.Dataset) -> Network:
     trained = weights.read_trained(run, data=dataset.folder)
     config = trained.config
     data_sets.check_renders(data_sets.read_object(dataset, dataset.splits["test"][0]), config)
-    method = next(name for name, kind in METHODS.items() if isinstance(config.model, kind))
-    if isinstance(config.model, ModelConfig) and config.model.num_neighbors:
-        method = "plus"
     place = weights.place(run)
     described = place if place.is_file() else place / "config.json"
     return Network(
-        method=method,
+        method=kind_of(config.model),
         config=config,
         variables=trained.variables,
         steps=trained.steps,

@@ -37,8 +37,9 @@ from spnr_jax.scoring.lpips_weights import read_weights
 from spnr_jax.scoring.summary import differences, metric_settings, summarise
 
 Row = Literal[
-    "ours", "plus", "npbg", "point_nerf", "points2nerf", "poisson", "poisson_trimmed", "nearest", "splat", "white"
-]
+    "near_points", "paper", "npbg", "point_nerf", "points2nerf",
+    "poisson", "poisson_trimmed", "nearest", "splat", "white",
+]  # fmt: skip
 ROWS: tuple[Row, ...] = Row.__args__  # type: ignore[attr-defined]
 QUICK_OBJECTS = 3
 
@@ -91,7 +92,7 @@ def main(options: Table1) -> None:
     first = data_sets.read_object(dataset, names[0])
     category = dataset.settings.get("settings", {}).get("category")
     presets = budget.presets(options.budget, first.camera.height, category)
-    config = PRESETS[presets["ours"]]()  # its points and pixels are given to every method
+    config = PRESETS[presets["paper"]]()  # its points and pixels are given to every method
     data_sets.check_resolution(first, config)
     asked = {name: getattr(options, name) for name in ("budget", "minutes", "seed")}
     results_folder.claim(options.out, "a table", asked, dataset)
@@ -129,11 +130,13 @@ def conditions(dataset: data_sets.Dataset, names: tuple[str, ...], config: Train
 
 
 def numbers(scored: Scored) -> dict[str, dict]:
-    """The scores as tables: of every method, ours minus the others, and of each class of objects."""
+    """The scores as tables: of every method, the first network minus the others, and of each class of objects."""
     scores = list(scored.scores.values())
+    first = next((name for name in NETWORKS if name in scores[0]), None)
     return {
         "methods": summarise(scores),
-        "ours_minus": differences(scores) if "ours" in scores[0] else {},
+        "compared": first,
+        "differences": {} if first is None else differences(scores, first),
         "per_category": by_category(scored.scores),
     }
 
