@@ -126,9 +126,6 @@ class TrainConfig:
     """Share of the clouds that are evenly spread, not random points: an object's first ones in a data set of `--spread
     even`, or farthest points where the network sees G-buffers."""
 
-    shrinks: tuple[int, ...] = added((1, 1, 1, 1, 2, 4, 8))
-    """How many times smaller than its reference a view is learnt, drawn from these; of networks over G-buffers."""
-
     def __post_init__(self) -> None:
         for name in ("num_steps", "batch_objects", "views_per_object", "min_points", "test_points", "pixel_stride"):
             require(getattr(self, name) >= 1, f"{name} must be at least 1, got {getattr(self, name)}")
@@ -153,9 +150,6 @@ class TrainConfig:
         )
         require(
             self.crop == 0 or self.pixel_stride == 1, f"pixel_stride {self.pixel_stride} and crop {self.crop}: use one"
-        )
-        require(
-            len(self.shrinks) > 0 and min(self.shrinks) >= 1, f"shrinks must name numbers from 1 on, got {self.shrinks}"
         )
         require(0 <= self.even_share <= 1, f"even_share is a share of the clouds, got {self.even_share}")
         require(

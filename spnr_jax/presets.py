@@ -206,25 +206,6 @@ def surfels() -> TrainConfig:
     )
 
 
-def surfels_tiny() -> TrainConfig:
-    """Fewer features, 64 px, 512 to 1024 evenly spread points.  `spnr train --preset surfels_tiny DATA RUN`."""
-    large = surfels()
-    return dataclasses.replace(
-        large,
-        preset="surfels_tiny",
-        model=SurfelConfig(image_resolution=64, widths=(24, 48, 64), top=16),
-        optimizer=dataclasses.replace(large.optimizer, lr_generator=3e-3, warmup_steps=50, ema_decay=0.99),
-        num_steps=1200,
-        views_per_object=3,
-        min_points=512,
-        max_points=1024,
-        test_points=1024,
-        crop=48,
-        even_share=1.0,
-        shrinks=(1,),
-    )
-
-
 def _baseline_loss(pixel: Literal["l1", "mse"], masked: bool = False) -> LossConfig:
     return LossConfig(l1_weight=1.0, adversarial_weight=0.0, pixel=pixel, masked=masked)
 
@@ -364,5 +345,5 @@ BASELINES = (
     *(points2nerf_abo, points2nerf_shapenet, points2nerf_tiny),
 )
 PRESETS: dict[str, Callable[[], TrainConfig]] = {
-    preset.__name__: preset for preset in (*OURS, *PLUS, surfels, surfels_tiny, *BASELINES)
+    preset.__name__: preset for preset in (*OURS, *PLUS, surfels, *BASELINES)
 }

@@ -35,7 +35,6 @@ from spnr_jax.presets import PRESETS, tiny
         (TrainConfig, "min_points", 5000, "max_points 4096"),
         (TrainConfig, "pixel_stride", 0, "at least 1"),
         (TrainConfig, "even_share", 1.1, "a share"),
-        (TrainConfig, "shrinks", (1, 0), "from 1 on"),
         (TrainConfig, "pixel_stride", 2, "neighbours"),
     ],
 )

@@ -42,6 +42,7 @@ NOISE = 0.05, 0.6  # least and most standard deviation of their points, in dista
 STRAY = 0.0, 0.0, 0.003, 0.01  # shares of points that lie anywhere, drawn from these
 COLOR_NOISE = 0.05  # most standard deviation of their colours
 WITHOUT_NORMALS = 0.5  # share of the others whose normals are estimated
+SIDES = (1, 1, 1, 1, 2, 4, 8)  # pixels of a reference averaged along a side, drawn from these
 SMALL, FEWER = 4, 8  # side from which on a cloud has at most so many times fewer points
 MOST_ENTRIES = 2**22  # of a view: one with more is left out
 LEAST = 8  # pixels along the shorter side of a view
@@ -101,7 +102,7 @@ def _packed(arrays: Arrays) -> bytes:
 def make(item: ObjectData, number: int, light: Light, config: TrainConfig) -> Arrays:
     """The content of a file: views of the object's cloud of this number."""
     generator = np.random.default_rng((config.seed, CLOUD, zlib.crc32(item.name.encode()), number))
-    side = int(generator.choice(config.shrinks))
+    side = int(generator.choice(SIDES))
     scene = surfel_renderer.encode(random_cloud(item.cloud, side, config, generator))
     arrays: Arrays = {}
     doublings: list[int] = []

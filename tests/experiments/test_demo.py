@@ -1,12 +1,12 @@
 """The demo trains two networks, reuses what is there, and reports the seconds of the run that did the work."""
 
-import dataclasses
 import json
 import shutil
 from types import SimpleNamespace
 
 import pytest
-from support import tiny_dataset, tiny_surfels
+from support import tiny_dataset
+from support.tiny_baselines import SHRUNKEN
 
 from data_gen.store import layout
 from experiments.packaged import demo
@@ -25,10 +25,9 @@ def asked(monkeypatch):
             described = {"settings": {"spread": generation.spread}}
             layout.write_text(generation.out / "dataset.json", layout.json_text(described))
 
-    ours = dataclasses.replace(tiny_surfels.CONFIG, test_points=24, shrinks=(1,))
     monkeypatch.setattr(demo, "generate", generate)
     monkeypatch.setattr(presets, "tiny", lambda: tiny_dataset.CONFIG)
-    monkeypatch.setattr(presets, "surfels_tiny", lambda: ours)
+    monkeypatch.setattr(presets, "plus_tiny", lambda: SHRUNKEN["plus_tiny"])
     monkeypatch.setattr(cli, "set_up_jax", lambda **_: None)
     return configs
 
@@ -40,7 +39,7 @@ def test_the_demo_writes_its_report_and_a_second_call_reuses_everything(asked, t
     assert list(first["methods"]) == ["ours", "paper", "white", "splat", "nearest"]
     assert set(first["ours_minus"]) == {"paper", "white", "splat", "nearest"}
     trained = first["settings"]["networks"]
-    assert (trained["ours"]["preset"], trained["paper"]["preset"]) == ("surfels", "tiny")
+    assert (trained["ours"]["preset"], trained["paper"]["preset"]) == ("plus_tiny", "tiny")
     assert set(first["seconds"]) >= {"generate", "train", "train paper", "evaluate", "total"}
     parts = sum(seconds for name, seconds in first["seconds"].items() if name != "total")
     assert first["seconds"]["total"] == pytest.approx(parts, abs=0.3)
