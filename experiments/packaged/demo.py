@@ -16,6 +16,7 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -71,7 +72,7 @@ def main(demo: Demo) -> None:
     for number, (name, config) in enumerate(configs.items(), start=2):
         run = demo.out / name
         print(f"{number}/4 training {name}, preset {config.preset}, for {config.num_steps} steps in {run}", flush=True)
-        seconds.measure(PARTS[name], lambda c=config, r=run: trainer.train(c, dataset, r, trainer.Schedule()))
+        seconds.measure(PARTS[name], partial(trainer.train, config, dataset, run, trainer.Schedule()))
 
     print("4/4 evaluating on objects that the networks never saw", flush=True)
     start = time.monotonic()

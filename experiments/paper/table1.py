@@ -129,7 +129,7 @@ def conditions(dataset: data_sets.Dataset, names: tuple[str, ...], config: Train
     }
 
 
-def numbers(scored: Scored) -> dict[str, dict]:
+def numbers(scored: Scored) -> dict[str, str | dict | None]:
     """The scores as tables: of every method, the first network minus the others, and of each class of objects."""
     scores = list(scored.scores.values())
     first = next((name for name in NETWORKS if name in scores[0]), None)
