@@ -52,7 +52,7 @@ bench: setup
 	$(PY) -m experiments.speed.bench $(BENCH)
 
 test: setup
-	$(PY) -m pytest -q -rs -n 2 --dist loadfile -m "not slow and not ci"
+	$(PY) -m pytest -q -rs -n 2 --dist loadfile --durations=25 -m "not slow and not ci"
 
 test-ci: setup
 	$(PY) -m pytest -q -rs -n 2 --dist loadfile -m "ci and not slow"

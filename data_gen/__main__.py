@@ -1,9 +1,11 @@
 """The command `spnr-data`: generate a data set, check one, show one, pack one.
 
 Errors of the user and of the disk are one line on stderr and exit code 2; Ctrl-C is one line and exit code 130.
+`--debug` or SPNR_DEBUG=1 shows the call stack before the line.
 """
 
 import sys
+import traceback
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -16,7 +18,7 @@ from data_gen.plan.tasks import GenerateConfig
 from data_gen.store.check import check
 from data_gen.store.pack import PackConfig, pack
 from data_gen.store.show import ShowConfig, show
-from spnr_jax.formats.debugging import show_stack, without_debug
+from spnr_jax.errors import split_debug
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,13 +34,15 @@ Command = GenerateConfig | CheckConfig | ShowConfig | PackConfig
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line."""
-    config = parse(without_debug(sys.argv[1:] if arguments is None else arguments))
+    arguments, debug = split_debug(sys.argv[1:] if arguments is None else arguments)
+    config = parse(arguments)
     try:
         sys.exit(run(config))
     except KeyboardInterrupt:
         sys.exit(interrupted())
     except (ValueError, OSError) as error:
-        show_stack()
+        if debug:
+            traceback.print_exc()
         print(f"spnr-data: {one_line(error, config)}", file=sys.stderr)
         sys.exit(2)
 
@@ -52,7 +56,8 @@ def parse(arguments: list[str]) -> Command:
     return tyro.cli(
         generate_options | check_options | show_options | pack_options,  # type: ignore[arg-type]
         prog="spnr-data",
-        description="Data sets of rendered objects and their surface points.",
+        description="Data sets of rendered objects and their surface points. "
+        "With --debug or SPNR_DEBUG=1 an error shows its call stack.",
         args=arguments,
     )
 

@@ -7,14 +7,16 @@ from typing import Any, NoReturn
 
 import tyro
 
-from spnr_jax import cli
+from spnr_jax import cli, errors
 
 
 def run(main: Callable[[Any], object], options: type, name: str) -> NoReturn:
     """Calls `main` with the options of the command line `python -m experiments.NAME`, and ends the process."""
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
 
-    def work() -> None:
-        main(tyro.cli(options, prog=f"python -m experiments.{name}"))
+    arguments, debug = errors.split_debug(sys.argv[1:])
 
-    sys.exit(cli.guarded(work, name.rpartition(".")[2]))
+    def work() -> None:
+        main(tyro.cli(options, prog=f"python -m experiments.{name}", args=arguments))
+
+    sys.exit(cli.guarded(work, name.rpartition(".")[2], debug))

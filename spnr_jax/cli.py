@@ -12,6 +12,7 @@ import os
 import re
 import sys
 import time
+import traceback
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,8 +23,8 @@ import tyro
 from spnr_jax import presets
 from spnr_jax.config import TrainConfig
 from spnr_jax.devices import allocator
+from spnr_jax.errors import UserError, split_debug
 from spnr_jax.formats.cut import Cut
-from spnr_jax.formats.debugging import show_stack, without_debug
 from spnr_jax.model_config import SurfelConfig
 from spnr_jax.tools.light_options import Lighting
 from spnr_jax.tools.render_command import Render
@@ -153,8 +154,8 @@ Command = Train | Evaluate | Render | View | Export | Runs | ConvertLpips
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line."""
-    arguments = without_debug(sys.argv[1:] if arguments is None else arguments)
-    code = guarded(lambda: run(parse(arguments)), "spnr")
+    arguments, debug = split_debug(sys.argv[1:] if arguments is None else arguments)
+    code = guarded(lambda: run(parse(arguments)), "spnr", debug)
     if code == 2 and _one_of_several():
         sys.stdout.flush()
         sys.stderr.flush()
@@ -167,15 +168,19 @@ def _one_of_several() -> bool:
     return jax is not None and jax.distributed.is_initialized() and jax.process_count() > 1
 
 
-def guarded(work: Callable[[], None], name: str) -> int:
-    """Exit code of the work; an error that a person can mend is one line on stderr and code 2, a stop is code 130."""
+def guarded(work: Callable[[], None], name: str, debug: bool = False) -> int:
+    """Exit code of the work; an error that a person can mend is one line on stderr and code 2, a stop is code 130.
+
+    For `debug` the line stands behind the call stack.
+    """
     try:
         work()
     except KeyboardInterrupt as stop:
         print(f"{name}: {str(stop) or 'stopped'}", file=sys.stderr)
         return 130
     except (ValueError, OSError) as error:
-        show_stack()
+        if debug:
+            traceback.print_exc()
         print(f"{name}: {one_line(error)}", file=sys.stderr)
         return 2
     return 0
@@ -201,7 +206,7 @@ def parse(arguments: list[str]) -> Command:
             )
     except SystemExit as stop:
         if stop.code:
-            raise ValueError(re.sub(BOX, " ", said.getvalue().partition("\n")[2])) from None  # without the title
+            raise UserError(re.sub(BOX, " ", said.getvalue().partition("\n")[2])) from None  # without the title
         raise
 
 
@@ -212,7 +217,7 @@ def _train_defaults(arguments: list[str]) -> Train:
         if name == "--preset":
             preset = value or (arguments[i + 1] if i + 1 < len(arguments) else "")
     if preset not in presets.PRESETS:
-        raise ValueError(f"--preset {preset}: there are {', '.join(presets.PRESETS)}")
+        raise UserError(f"--preset {preset}: there are {', '.join(presets.PRESETS)}")
     return Train(data=tyro.MISSING, run=tyro.MISSING, config=presets.PRESETS[preset]())
 
 
@@ -301,7 +306,7 @@ def run_render(command: Render) -> None:
 def run_view(command: View) -> None:
     """`spnr view`."""
     if importlib.util.find_spec("viser") is None:
-        raise ValueError("spnr view needs the package viser; pip install 'spnr-jax[viewer]'")
+        raise UserError("spnr view needs the package viser; pip install 'spnr-jax[viewer]'")
     from spnr_jax.viewer.server import open_viewer
 
     viewer, notes = open_viewer(**{f.name: getattr(command, f.name) for f in dataclasses.fields(command)})
@@ -319,7 +324,7 @@ def run_export(command: Export) -> None:
 
     trained, where = weights.read_trained(command.run), command.platforms
     if isinstance(trained.config.model, SurfelConfig):
-        raise ValueError(
+        raise UserError(
             f"{command.run}: sizes of a picture of surfels are counted first, so it is no single function "
             "to export; use a network of rays, such as small"
         )

@@ -11,6 +11,8 @@ A network is found by its config (`inference.network`); METHODS are the names th
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal
 
+from spnr_jax.errors import UserError
+
 Material = Literal["base_color", "roughness", "metallic"]
 MATERIAL_CHANNELS = {"base_color": 3, "roughness": 1, "metallic": 1}
 CELLS = 1.0  # of the grid of nearest points along an axis, per square root of the number of points; 0.75 lost 0.1 dB
@@ -27,7 +29,7 @@ def added(default: Any) -> Any:
 def require(condition: bool, message: str) -> None:
     """ValueError with the message, unless the condition holds."""
     if not condition:
-        raise ValueError(message)
+        raise UserError(message)
 
 
 def surface_grid(num_points: int, least: int = 1) -> int:
@@ -384,3 +386,10 @@ METHODS: dict[str, type[NetworkConfig]] = {
     "point_nerf": PointNeRFConfig,
     "points2nerf": Points2NeRFConfig,
 }
+
+
+def kind_of(config: NetworkConfig) -> str:
+    """What a network is, for tables: `surfels`, `near_points`, `paper` (a volume and rays alone), or a baseline."""
+    if isinstance(config, ModelConfig):
+        return "near_points" if config.num_neighbors else "paper"
+    return next(name for name, kind in METHODS.items() if isinstance(config, kind))

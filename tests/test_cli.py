@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from support import tiny_dataset
 
-from spnr_jax import presets
+from spnr_jax import errors, presets
 from spnr_jax.formats.cut import Cut
 from spnr_jax.surfels.visibility import spiral
 
@@ -246,7 +246,7 @@ def test_train_then_evaluate_write_a_run_and_its_scores(capsys, tmp_path, data):
     assert exit_code("evaluate", data, run, "--gallery", 1, "--out", tmp_path / "scores") == 0
     metrics = json.loads((tmp_path / "scores" / "metrics.json").read_text())
     assert set(metrics["seconds"]) == {"evaluate", "total"}
-    assert metrics["methods"]["ours"]["objects"] == len(tiny_dataset.SPLITS["test"])
+    assert metrics["methods"]["paper"]["objects"] == len(tiny_dataset.SPLITS["test"])
     assert (tmp_path / "scores" / "report.html").is_file()
 
 
@@ -267,19 +267,31 @@ def test_an_error_of_the_program_keeps_its_traceback():
         cli.guarded(broken, "spnr")
 
 
+def test_an_error_shows_its_call_stack_for_debug_alone_and_its_line_in_any_case(capsys, monkeypatch):
+    def refused():
+        raise errors.UserError("no such thing")
+
+    for debug in (False, True):
+        assert cli.guarded(refused, "spnr", debug) == 2
+        said = capsys.readouterr().err
+        assert ("in refused" in said) is debug
+        assert said.endswith("spnr: no such thing\n")
+    monkeypatch.delenv("SPNR_DEBUG", raising=False)
+    assert exit_code("render", "absent.ply", "--debug") == 2
+    said = capsys.readouterr().err
+    assert "Traceback" in said
+    assert "absent.ply" in said.splitlines()[-1]
+    assert exit_code("render", "absent.ply") == 2
+    assert len(capsys.readouterr().err.splitlines()) == 1
+    monkeypatch.setenv("SPNR_DEBUG", "1")
+    assert exit_code("render", "absent.ply") == 2
+    assert "Traceback" in capsys.readouterr().err
+
+
 def test_errors_of_many_lines_become_one():
     assert cli.one_line(ValueError("this\n  and\nthat")) == "this and that"
     assert cli.one_line(OSError(28, "No space left on device")) == "disk: No space left on device"
     assert cli.one_line(OSError(13, "Permission denied", "a/b")) == "a/b: Permission denied"
-
-
-def test_an_error_shows_its_call_stack_where_that_is_asked_for(capsys, monkeypatch, tmp_path):
-    monkeypatch.delenv("SPNR_DEBUG", raising=False)
-    assert exit_code("runs", tmp_path / "none") == 2
-    assert "Traceback" not in capsys.readouterr().err
-    monkeypatch.setenv("SPNR_DEBUG", "")  # so that it is put back
-    assert exit_code("runs", tmp_path / "none", "--debug") == 2
-    assert "Traceback" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("command", ["render", "view"])

@@ -26,7 +26,7 @@ def workplace(tmp_path, monkeypatch):
     """A folder with what the examples use: what `make demo` leaves, a cloud, an exported network."""
     (tmp_path / "runs" / "demo").mkdir(parents=True)
     (tmp_path / "runs" / "demo" / "data").symlink_to(tiny_dataset.dataset().folder)
-    (tmp_path / "runs" / "demo" / "run").symlink_to(tiny_untrained.run())
+    (tmp_path / "runs" / "demo" / "paper").symlink_to(tiny_untrained.run())
     shutil.copy(tiny_dataset.dataset().folder / "objects" / "chair" / "points.ply", tmp_path / "chair.ply")
     monkeypatch.chdir(tmp_path)
     return tmp_path
@@ -55,14 +55,14 @@ def test_the_examples_of_the_thirteen_functions_run_in_their_order(workplace, mo
     monkeypatch.setattr(weights, "shipped", lambda name="small": tiny_untrained.run())
     names = execute(DOCS / "api.md")
     assert int(names["state"].step) == 1
-    assert "ours" in names["outcome"].summary["methods"]
+    assert "paper" in names["outcome"].summary["methods"]
     assert names["volume_of_means"][2, 2, :, 0].tolist() == [2, 0, 0, 7], "as its comment says"
     assert names["seen"][1] == pytest.approx(0.63, abs=0.005), "as its comment says"
     assert names["by_pose"].shape == (3, 4)
 
 
 def test_the_example_without_this_package_runs_on_what_the_command_writes(workplace):
-    model = spnr_jax.load("runs/demo/run")
+    model = spnr_jax.load("runs/demo/paper")
     (workplace / "exported").mkdir()
     (workplace / "exported" / "encode.jax").write_bytes(export.export_encode(model, num_points=1024))
     (workplace / "exported" / "render.jax").write_bytes(export.export_render(model, resolution=128))

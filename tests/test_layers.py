@@ -15,7 +15,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 SPNR_JAX = (
-    *("model_config", "config"),
+    *("errors", "model_config", "config"),
     *("devices", "kernels", "surfels", "nn", "baselines", "method"),
     *("formats/mesh", "formats", "training", "scoring", "tools", "viewer"),
     *("presets", "cli", "__init__"),
@@ -34,6 +34,7 @@ ORDER = [
 PURE = ("kernels", "surfels", "nn", "baselines", "method")
 WITHOUT_JIT = ("devices", "kernels", "nn", "baselines")
 OF_SPNR_JAX = {
+    "spnr_jax/errors",
     "spnr_jax/kernels",
     "spnr_jax/surfels",
     "spnr_jax/formats",

@@ -24,7 +24,7 @@ def workplace(tmp_path, monkeypatch):
     """The folder of the notebooks, beside what `make demo` leaves."""
     (tmp_path / "notebooks").mkdir()
     (tmp_path / "runs" / "demo").mkdir(parents=True)
-    (tmp_path / "runs" / "demo" / "run").symlink_to(tiny_untrained.run())
+    (tmp_path / "runs" / "demo" / "paper").symlink_to(tiny_untrained.run())
     monkeypatch.chdir(tmp_path / "notebooks")
     with warnings.catch_warnings(), matplotlib.rc_context():
         matplotlib.use("agg")

@@ -24,6 +24,8 @@ from multiprocessing import resource_tracker
 import dask
 from distributed import Client, KilledWorker, LocalCluster, WorkerPlugin, as_completed, get_worker
 
+from spnr_jax.errors import UserError
+
 WINDOW = 4096  # tasks that the scheduler holds at a time; more than any cluster has workers
 GRACE = 0.5  # seconds that a local worker has to end by itself
 PATIENCE = 10  # seconds that a scheduler has to answer
@@ -58,7 +60,7 @@ def connect(address: str | None, num_workers: int) -> Iterator[Client]:
         try:
             found = Client(address, name="spnr-data", timeout=PATIENCE)
         except ValueError as error:
-            raise ValueError(f"--cluster {address}: expected an address such as tcp://host:8786 ({error})") from None
+            raise UserError(f"--cluster {address}: expected an address such as tcp://host:8786 ({error})") from None
         with found as client:
             if not client.nthreads():
                 print(f"{address} has no workers yet; waiting for some", file=sys.stderr)
@@ -149,7 +151,7 @@ def do(function: Callable, bench: str, task):
     """Return function(state, task) in a worker that runs nothing else meanwhile."""
     worker = get_worker()
     if worker.state.nthreads != 1:
-        raise ValueError(f"worker {worker.address} has {worker.state.nthreads} threads; start it with --nthreads 1")
+        raise UserError(f"worker {worker.address} has {worker.state.nthreads} threads; start it with --nthreads 1")
     plugin = worker.plugins[bench]
     assert isinstance(plugin, Bench)
     return function(plugin.state, task)

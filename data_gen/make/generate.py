@@ -23,6 +23,7 @@ from data_gen.render import light, views
 from data_gen.render.variant import choose_variant, mitsuba_module
 from data_gen.store import layout, storage
 from data_gen.store.storage import Location
+from spnr_jax.errors import UserError
 from spnr_jax.formats.light_files import read_envmap
 from spnr_jax.surfels.room import indoor_envmap
 
@@ -76,12 +77,12 @@ def refuse_other_content(out: Location, settings: dict) -> None:
         try:
             before = json.loads(described)
         except ValueError:
-            raise ValueError(f"{out}/dataset.json is damaged: remove {out}, or choose another folder") from None
+            raise UserError(f"{out}/dataset.json is damaged: remove {out}, or choose another folder") from None
         if before != settings:
             changed = ", ".join(differences(before, settings))
-            raise ValueError(f"{out} holds a data set with other settings ({changed}): choose another folder")
+            raise UserError(f"{out} holds a data set with other settings ({changed}): choose another folder")
     elif not storage.is_empty(out):
-        raise ValueError(f"{out} is not empty and holds no data set: choose another folder")
+        raise UserError(f"{out} is not empty and holds no data set: choose another folder")
 
 
 def make_objects(config: GenerateConfig, tasks: Sequence[Task], lights: light.Lights, variant: str) -> dict[str, str]:
@@ -136,4 +137,4 @@ def finish(
     paper = "; the paper has {} train, {} test".format(*PAPER_COUNTS[config.preset]) if config.preset else ""
     print(f"{config.out}: {made} objects ({counts}), {len(rows)} left out{paper}", file=sys.stderr)
     if not made:
-        raise ValueError(f"{config.out}: every object was left out; {config.out}/rejected.jsonl says why")
+        raise UserError(f"{config.out}: every object was left out; {config.out}/rejected.jsonl says why")

@@ -18,6 +18,7 @@ from data_gen.render import views
 from data_gen.render.light import Lights
 from data_gen.render.variant import LLVM, choose_variant, mitsuba_module
 from data_gen.store import layout
+from spnr_jax.errors import UserError
 from spnr_jax.formats.mesh import meshes, surface_points
 from spnr_jax.formats.mesh.assets import Asset, Material, RejectedAsset
 from spnr_jax.surfels.envmaps import resampled
@@ -45,7 +46,7 @@ def make_and_write(bench: Workbench, task: Task) -> str | None:
     if layout.has_object(bench.out, task.object_id):  # another run on the same data set was faster
         return None
     if task.path and not task.path.exists():
-        raise ValueError(f"{task.path}: worker {socket.gethostname()} does not see this file; mount it there")
+        raise UserError(f"{task.path}: worker {socket.gethostname()} does not see this file; mount it there")
     prepare_renderer(bench.variant)
     try:
         record = make_record(bench, task)

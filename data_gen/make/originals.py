@@ -11,6 +11,7 @@ import numpy as np
 
 from data_gen.make.objects import make_asset
 from data_gen.plan.tasks import Task
+from spnr_jax.errors import UserError
 from spnr_jax.formats.mesh.assets import Asset, RejectedAsset
 from spnr_jax.formats.mesh.surface_points import Spread, sample_surface
 
@@ -26,17 +27,15 @@ def original(
     """
     task = task_of(details, root)
     if task.path and not task.path.is_file():
-        raise ValueError(
-            f"{task.path}: the mesh of object {task.object_id} is not there; give its folder with --meshes"
-        )
+        raise UserError(f"{task.path}: the mesh of object {task.object_id} is not there; give its folder with --meshes")
     try:
         asset = make_asset(task, seed)[0]
         again = sample_surface(asset, len(stored), details["seeds"]["points"], spread).positions
     except RejectedAsset as error:
-        raise ValueError(f"{task.shown_path or task.object_id}: cannot be made again ({error})") from None
+        raise UserError(f"{task.shown_path or task.object_id}: cannot be made again ({error})") from None
     moved = float(np.abs(again - stored).max(initial=0))
     if not moved < MOVED:
-        raise ValueError(
+        raise UserError(
             f"object {task.object_id}: its points do not lie on the mesh that is made now (off by up to {moved:.3g}): "
             "the mesh file or the generator has changed; generate the data set again"
         )
@@ -56,5 +55,5 @@ def task_of(details: dict, root: Path | None) -> Task:
     if "file" not in source:
         return Task(category=details["category"], **made)
     if root is None:
-        raise ValueError(f"object {name} was made from {source['file']}: give the folder of the meshes with --meshes")
+        raise UserError(f"object {name} was made from {source['file']}: give the folder of the meshes with --meshes")
     return Task(path=root / source["file"], folder=root, shown_path=source["file"], **made)

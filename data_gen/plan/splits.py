@@ -14,6 +14,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from data_gen.store.layout import SPLITS
+from spnr_jax.errors import UserError
 
 Listed = Mapping[str, Sequence[str]]  # ids of the splits that the user names
 
@@ -49,7 +50,7 @@ def read_test_list(path: Path, known: set[str]) -> Listed:
     try:
         ids = sorted(set(path.read_text().split()))
     except (OSError, UnicodeDecodeError) as error:
-        raise ValueError(f"--test-list {path}: not a readable text file ({error})") from None
+        raise UserError(f"--test-list {path}: not a readable text file ({error})") from None
     refuse_unknown(f"--test-list {path}", ids, known)
     return {"test": ids}
 
@@ -64,16 +65,16 @@ def read_split_file(path: Path, known: set[str], synset: str | None) -> Listed:
         text = path.read_text("utf-8")
         listed = splits_of_csv(text, synset) if path.suffix.lower() == ".csv" else json.loads(text)
     except (OSError, ValueError, RecursionError, csv.Error) as error:
-        raise ValueError(f"--split-file {path}: cannot be read ({error}); give .json or .csv") from None
+        raise UserError(f"--split-file {path}: cannot be read ({error}); give .json or .csv") from None
     lists = listed.values() if isinstance(listed, dict) and listed.keys() <= set(SPLITS) else [None]
     if not all(isinstance(ids, list) and all(isinstance(name, str) for name in ids) for ids in lists):
-        raise ValueError(f"--split-file {path}: expected lists of ids named {', '.join(SPLITS)}")
+        raise UserError(f"--split-file {path}: expected lists of ids named {', '.join(SPLITS)}")
     names = sorted(name for ids in listed.values() for name in ids)
     if not names:
-        raise ValueError(f"--split-file {path}: lists no objects{f' of synset {synset}' if synset else ''}")
+        raise UserError(f"--split-file {path}: lists no objects{f' of synset {synset}' if synset else ''}")
     if twice := [name for name, after in zip(names, names[1:], strict=False) if name == after]:
         places = [split for split in SPLITS if twice[0] in listed.get(split, ())]
-        raise ValueError(f"--split-file {path}: {twice[0]} is listed more than once ({', '.join(places)})")
+        raise UserError(f"--split-file {path}: {twice[0]} is listed more than once ({', '.join(places)})")
     refuse_unknown(f"--split-file {path}", names, known)
     return {split: sorted(ids) for split, ids in listed.items()}
 
@@ -84,7 +85,7 @@ def splits_of_csv(text: str, synset: str | None) -> dict[str, list[str]]:
     for number, row in enumerate(csv.DictReader(text.splitlines()), start=2):
         name, split = row.get("modelId") or row.get("id"), row.get("split")
         if not name or split not in SPLITS:
-            raise ValueError(f"line {number}: expected columns id (or modelId) and split, one of {', '.join(SPLITS)}")
+            raise UserError(f"line {number}: expected columns id (or modelId) and split, one of {', '.join(SPLITS)}")
         if synset is None or row.get("synsetId", synset) == synset:
             listed.setdefault(split, []).append(name)
     return listed
@@ -93,4 +94,4 @@ def splits_of_csv(text: str, synset: str | None) -> dict[str, list[str]]:
 def refuse_unknown(name: str, ids: Sequence[str], known: set[str]) -> None:
     """Raise ValueError if an id is none of the known ones."""
     if unknown := [object_id for object_id in ids if object_id not in known]:
-        raise ValueError(f"{name}: no object {unknown[0]} ({len(unknown)} of {len(ids)} ids unknown)")
+        raise UserError(f"{name}: no object {unknown[0]} ({len(unknown)} of {len(ids)} ids unknown)")

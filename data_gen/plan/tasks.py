@@ -20,6 +20,7 @@ from data_gen.plan import splits
 from data_gen.plan.sources import abo, shapenet
 from data_gen.plan.sources.shapenet import Category
 from data_gen.render.views import Visibility
+from spnr_jax.errors import UserError
 from spnr_jax.formats.mesh import meshes
 from spnr_jax.formats.mesh.surface_points import Spread
 
@@ -162,28 +163,26 @@ def check_options(config: GenerateConfig) -> None:
     for name in ("resolution", "views", "points", "spp", "visibility_grid", "max_depth"):
         least = 2 if name == "max_depth" else 1
         if getattr(config, name) < least:
-            raise ValueError(f"--{name.replace('_', '-')}: expected {least} or more, got {getattr(config, name)}")
+            raise UserError(f"--{name.replace('_', '-')}: expected {least} or more, got {getattr(config, name)}")
     for name in ("objects", "colour_variants", "train_objects", "test_objects", "workers"):
         least = 1 if name in ("train_objects", "workers") else 0
         if getattr(config, name) is not None and getattr(config, name) < least:
-            raise ValueError(f"--{name.replace('_', '-')}: expected {least} or more, got {getattr(config, name)}")
+            raise UserError(f"--{name.replace('_', '-')}: expected {least} or more, got {getattr(config, name)}")
     if config.seed < 0:
-        raise ValueError(f"--seed: expected 0 or more, got {config.seed}")
+        raise UserError(f"--seed: expected 0 or more, got {config.seed}")
     if not 0 < config.fov < 180:
-        raise ValueError(f"--fov: expected degrees between 0 and 180, got {config.fov:g}")
+        raise UserError(f"--fov: expected degrees between 0 and 180, got {config.fov:g}")
     if not config.distance > 1:
-        raise ValueError(f"--distance: expected more than 1, outside the object's unit sphere, got {config.distance:g}")
+        raise UserError(f"--distance: expected more than 1, outside the object's unit sphere, got {config.distance:g}")
     if min(config.val_fraction, config.test_fraction) < 0 or config.val_fraction + config.test_fraction >= 1:
-        raise ValueError("--val-fraction, --test-fraction: expected shares that leave some objects to train on")
+        raise UserError("--val-fraction, --test-fraction: expected shares that leave some objects to train on")
     if config.envmap and not config.envmap.is_file():
-        raise ValueError(f"--envmap {config.envmap}: no such file; give a latitude-longitude .hdr or .exr")
+        raise UserError(f"--envmap {config.envmap}: no such file; give a latitude-longitude .hdr or .exr")
     if config.envmap and config.lights:
-        raise ValueError(
-            f"--lights {config.lights[0]}: not together with --envmap, one light for all; give one of them"
-        )
+        raise UserError(f"--lights {config.lights[0]}: not together with --envmap, one light for all; give one of them")
     if unknown := set(config.categories) - set(procedural.CATEGORIES):
         known = ", ".join(procedural.CATEGORIES)
-        raise ValueError(f"--categories: no category {', '.join(sorted(unknown))}; there are {known}")
+        raise UserError(f"--categories: no category {', '.join(sorted(unknown))}; there are {known}")
     check_source(config)
 
 
@@ -191,17 +190,17 @@ def check_source(config: GenerateConfig) -> None:
     """Raise ValueError, naming the option, for options that do not say which objects are meant."""
     source = source_of(config)
     if config.meshes and (config.root or source != "meshes"):
-        raise ValueError(f"--meshes {config.meshes}: not together with --root or --source {source}; give one of them")
+        raise UserError(f"--meshes {config.meshes}: not together with --root or --source {source}; give one of them")
     if source == "procedural" and config.root:
-        raise ValueError(f"--root {config.root}: give --source meshes, abo or shapenet with it")
+        raise UserError(f"--root {config.root}: give --source meshes, abo or shapenet with it")
     if source != "procedural" and not mesh_root(config):
-        raise ValueError(f"--source {source}: give --root, the folder that holds it")
+        raise UserError(f"--source {source}: give --root, the folder that holds it")
     if source == "shapenet" and not config.category:
-        raise ValueError(f"--source shapenet: give --category, one of {', '.join(shapenet.SYNSETS)}")
+        raise UserError(f"--source shapenet: give --category, one of {', '.join(shapenet.SYNSETS)}")
     if source != "shapenet" and config.category:
-        raise ValueError(f"--category {config.category}: only with --source shapenet; --categories chooses procedural")
+        raise UserError(f"--category {config.category}: only with --source shapenet; --categories chooses procedural")
     if config.split_file and config.test_list:
-        raise ValueError(f"--test-list {config.test_list}: not together with --split-file; give one of them")
+        raise UserError(f"--test-list {config.test_list}: not together with --split-file; give one of them")
 
 
 def source_of(config: GenerateConfig) -> Source:
@@ -224,13 +223,13 @@ def plan_objects(config: GenerateConfig) -> list[Task]:
     if root := mesh_root(config):
         tasks += mesh_tasks(config, root)
     if not tasks:
-        raise ValueError("nothing to do: give --objects above 0, or --meshes with mesh files")
+        raise UserError("nothing to do: give --objects above 0, or --meshes with mesh files")
     tasks.sort(key=lambda task: task.object_id)
     for task, after in zip(tasks, tasks[1:], strict=False):
         if task.object_id == after.object_id:
-            raise ValueError(f"{task.object_id} is the id of two objects; rename the mesh file")
+            raise UserError(f"{task.object_id} is the id of two objects; rename the mesh file")
     if unsafe := [task.object_id for task in tasks if not SAFE_ID.fullmatch(task.object_id)]:
-        raise ValueError(f"{unsafe[0]!r} cannot be an object's id; expected letters, digits, dot, dash and underscore")
+        raise UserError(f"{unsafe[0]!r} cannot be an object's id; expected letters, digits, dot, dash and underscore")
     return tasks
 
 
@@ -267,7 +266,7 @@ def plan_data_set(config: GenerateConfig) -> Plan:
     num_free = len(tasks) - len(listed.get("test", ()))
     num_test = round(config.test_fraction * len(tasks)) if config.test_objects is None else config.test_objects
     if not listed and num_test >= len(tasks):
-        raise ValueError(f"--test-objects {num_test}: leaves none of the {len(tasks)} objects to train on")
+        raise UserError(f"--test-objects {num_test}: leaves none of the {len(tasks)} objects to train on")
     plan = Plan(
         tasks=tuple(tasks),
         listed=listed,

@@ -15,6 +15,7 @@ from data_gen.procedural.planes import plane
 from data_gen.procedural.shelves import shelf
 from data_gen.procedural.sofas import sofa
 from data_gen.procedural.tables import table
+from spnr_jax.errors import UserError
 from spnr_jax.formats.mesh.assets import Asset
 
 FAMILIES = {
@@ -38,8 +39,8 @@ def category_of(index: int) -> str:
 def make(category: str, seed: int) -> Asset:
     """The object of a category and a seed (0, 1, 2, ...): the same bytes in every process and on every machine."""
     if category not in FAMILIES:
-        raise ValueError(f"category {category!r} is not one of {', '.join(CATEGORIES)}")
+        raise UserError(f"category {category!r} is not one of {', '.join(CATEGORIES)}")
     if seed < 0:
-        raise ValueError(f"seed must be 0 or more, got {seed}")
+        raise UserError(f"seed must be 0 or more, got {seed}")
     rng = np.random.default_rng([CATEGORIES.index(category), seed])
     return assemble(FAMILIES[category](rng), category, {"generator": "procedural", "seed": int(seed)})

@@ -16,6 +16,7 @@ import numpy as np
 
 from data_gen.render.variant import mitsuba_module
 from data_gen.render.views import ViewConfig, make_sensor, spread_viewpoints
+from spnr_jax.errors import UserError
 from spnr_jax.formats.light_files import ENDINGS, read_envmap
 from spnr_jax.surfels import envmaps, room, skies
 
@@ -61,7 +62,7 @@ def map_files(folder: str) -> list[Path]:
     """Return the environment maps in a folder, by name; ValueError if there are none."""
     files = sorted(path for path in Path(folder).glob("*") if path.suffix.lower() in ENDINGS)
     if not files:
-        raise ValueError(f"--lights {folder}: expected room, random, or a folder with .hdr or .exr maps; found no map")
+        raise UserError(f"--lights {folder}: expected room, random, or a folder with .hdr or .exr maps; found no map")
     return files
 
 

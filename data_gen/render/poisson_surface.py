@@ -16,13 +16,14 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from data_gen.render.normals import NEIGHBOURS, oriented_normals
+from spnr_jax.errors import UserError
 from spnr_jax.formats.mesh.assets import Asset, Material, Part
 from spnr_jax.kernels.records import PointCloud
 
 STRAIGHT = 1e-5  # points spread less than this share of their extent beside a line have no surface
 
 
-class NoSurface(ValueError):
+class NoSurface(UserError):
     """Points that span no surface; the message is one line."""
 
 
@@ -39,11 +40,11 @@ class PoissonConfig:
 
     def __post_init__(self) -> None:
         if self.depth < 1:
-            raise ValueError(f"depth: expected 1 or more, got {self.depth}")
+            raise UserError(f"depth: expected 1 or more, got {self.depth}")
         if self.neighbours < 3:
-            raise ValueError(f"neighbours: expected 3 or more, which span a plane, got {self.neighbours}")
+            raise UserError(f"neighbours: expected 3 or more, which span a plane, got {self.neighbours}")
         if not 0 <= self.trim < 1:
-            raise ValueError(f"trim: expected a share of the vertices, at least 0 and below 1, got {self.trim}")
+            raise UserError(f"trim: expected a share of the vertices, at least 0 and below 1, got {self.trim}")
 
 
 def reconstruct(cloud: PointCloud, config: PoissonConfig) -> Asset:
@@ -121,4 +122,4 @@ def pymeshlab():
         return importlib.import_module("pymeshlab")
     except ImportError as error:
         needed = "Poisson reconstruction needs pymeshlab: pip install 'spnr-jax[baselines]'"
-        raise ValueError(f"{needed} ({error})") from None
+        raise UserError(f"{needed} ({error})") from None

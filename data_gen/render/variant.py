@@ -11,6 +11,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+from spnr_jax.errors import UserError
+
 LLVM, SCALAR = "llvm_ad_rgb", "scalar_rgb"
 OLDEST_LLVM = 16  # older libraries are refused by Dr.Jit or abort
 LIBRARY_PATTERNS = ("lib*/libLLVM*", "lib/*/libLLVM*", "lib/llvm*/lib/libLLVM*", "opt/llvm/lib/libLLVM*")
@@ -36,7 +38,7 @@ def choose_variant(requested: str = "auto") -> tuple[str, str | None]:
     Sets DRJIT_LIBLLVM_PATH for this process and its children when it settles on a library.
     """
     if requested not in ("auto", SCALAR, LLVM):
-        raise ValueError(f"variant: expected auto, {SCALAR} or {LLVM}, got {requested!r}")
+        raise UserError(f"variant: expected auto, {SCALAR} or {LLVM}, got {requested!r}")
     if requested == SCALAR:
         return SCALAR, None
     for library in llvm_libraries()[:2]:
@@ -44,7 +46,7 @@ def choose_variant(requested: str = "auto") -> tuple[str, str | None]:
             os.environ["DRJIT_LIBLLVM_PATH"] = str(library)
             return LLVM, None
     if requested == LLVM:
-        raise ValueError(f"variant: {LLVM} does not run here; install LLVM 17 or newer, or use --variant {SCALAR}")
+        raise UserError(f"variant: {LLVM} does not run here; install LLVM 17 or newer, or use --variant {SCALAR}")
     return SCALAR, SLOW_NOTICE
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from data_gen.store import layout
+from spnr_jax.errors import UserError
 
 COUNTS = ("views", "resolution", "points")  # settings that the files of every object are compared with
 LEAST_AGREEMENT = 0.9  # of the visible points, on opaque pixels; the rest sit on silhouettes, where pixels are cut
@@ -15,7 +16,7 @@ def check(dataset: Path) -> bool:
     """Print a table of what was found and each fault on a line of its own; return whether the data set is sound."""
     settings = read_description(dataset).get("settings")
     if not isinstance(settings, dict) or not all(isinstance(settings.get(name), int) for name in COUNTS):
-        raise ValueError(f"{dataset / 'dataset.json'}: expected settings {', '.join(COUNTS)}; generate it again")
+        raise UserError(f"{dataset / 'dataset.json'}: expected settings {', '.join(COUNTS)}; generate it again")
     object_ids = sorted(layout.completed_objects(dataset))
     faults = split_faults(dataset, set(object_ids))
     agreements, covered, num_views = [], [], 0
@@ -45,13 +46,13 @@ def read_description(dataset: Path) -> dict:
     """Return the dict of dataset.json; ValueError if there is none of this schema."""
     path = dataset / "dataset.json"
     if not path.is_file():
-        raise ValueError(f"{dataset} holds no data set: {path.name} is missing; make one with spnr-data generate")
+        raise UserError(f"{dataset} holds no data set: {path.name} is missing; make one with spnr-data generate")
     description = layout.read_document(path)
     if (dataset / "index.json").is_file():
-        raise ValueError(f"{dataset} is packed; look at the folder of objects that `spnr-data pack` read")
+        raise UserError(f"{dataset} is packed; look at the folder of objects that `spnr-data pack` read")
     if description.get("schema_version") != layout.SCHEMA_VERSION:
         found = description.get("schema_version")
-        raise ValueError(f"{path}: expected schema version {layout.SCHEMA_VERSION}, got {found}; generate it again")
+        raise UserError(f"{path}: expected schema version {layout.SCHEMA_VERSION}, got {found}; generate it again")
     return description
 
 

@@ -21,6 +21,7 @@ from PIL import Image
 
 from data_gen.store import storage
 from data_gen.store.storage import Location
+from spnr_jax.errors import UserError
 
 SCHEMA_VERSION = 1
 MOST_PIXELS = 2**26  # of a view
@@ -117,11 +118,11 @@ def read_object(folder: Path) -> ObjectRecord:
         names = [Path(frame["file_path"]).name for frame in transforms["frames"]]
         poses = np.array([frame["transform_matrix"] for frame in transforms["frames"]], np.float64)
     except (ValueError, LookupError, TypeError, ArithmeticError) as error:
-        raise ValueError(
+        raise UserError(
             f"{folder / 'transforms.json'}: holds no frames ({error!r}); generate the object again"
         ) from None
     if poses.shape[1:] != (4, 4) or not np.isfinite(poses).all():
-        raise ValueError(f"{folder / 'transforms.json'}: a camera is no 4 x 4 matrix of finite numbers")
+        raise UserError(f"{folder / 'transforms.json'}: a camera is no 4 x 4 matrix of finite numbers")
     return ObjectRecord(
         points=read_points(folder / "points.ply"),
         transforms=transforms,
@@ -136,9 +137,9 @@ def read_document(path: Path) -> dict:
     try:
         document = json.loads(path.read_text())
     except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path}: not readable ({error}); generate it again") from None
+        raise UserError(f"{path}: not readable ({error}); generate it again") from None
     if not isinstance(document, dict):
-        raise ValueError(f"{path}: expected named entries, found {type(document).__name__}; generate it again")
+        raise UserError(f"{path}: expected named entries, found {type(document).__name__}; generate it again")
     return document
 
 
@@ -154,11 +155,11 @@ def read_points(path: Path) -> np.ndarray:
     header, separator, body = path.read_bytes().partition(b"end_header\n")
     lines = header.decode("ascii", "replace").splitlines()
     if not separator or lines[1:2] != ["format binary_little_endian 1.0"] or lines[3:] != POINT_PROPERTIES:
-        raise ValueError(f"{path}: not a points.ply of this data set (another header); generate the object again")
+        raise UserError(f"{path}: not a points.ply of this data set (another header); generate the object again")
     announced = re.fullmatch(r"element vertex (\d{1,15})", lines[2])
     count = int(announced[1]) if announced else -1
     if len(body) != count * POINT_TYPE.itemsize:
-        raise ValueError(f"{path}: expected {count} points, found {len(body) / POINT_TYPE.itemsize:g}; file is cut off")
+        raise UserError(f"{path}: expected {count} points, found {len(body) / POINT_TYPE.itemsize:g}; file is cut off")
     return np.frombuffer(body, POINT_TYPE).copy()
 
 
@@ -182,11 +183,11 @@ def read_image(path: Path) -> np.ndarray:
     try:
         with Image.open(path) as image:
             if image.mode != "RGBA" or image.width * image.height > MOST_PIXELS:
-                raise ValueError(f"{path}: expected an RGBA image of a view, got {image.mode} of {image.size} pixels")
+                raise UserError(f"{path}: expected an RGBA image of a view, got {image.mode} of {image.size} pixels")
             image.load()
             return np.array(image)
     except (OSError, SyntaxError, Image.DecompressionBombError) as error:  # Pillow reports a damaged PNG as these
-        raise ValueError(f"{path}: not a readable PNG ({error})") from None
+        raise UserError(f"{path}: not a readable PNG ({error})") from None
 
 
 def has_object(dataset: Location, object_id: str) -> bool:

@@ -17,6 +17,7 @@ import tyro
 from tqdm import tqdm
 
 from data_gen.store import check, layout, storage
+from spnr_jax.errors import UserError
 
 OPTIONS = "group_size:1"  # each record by itself, so that one object is one read; zstd by default
 BYTES_PER_MB = 10**6
@@ -37,9 +38,9 @@ class PackConfig:
 def pack(config: PackConfig) -> None:
     """Write the packed form of a data set; ValueError or OSError, and nothing is left, if it cannot be."""
     if config.shard_mb < 1:
-        raise ValueError(f"--shard-mb: expected 1 or more, got {config.shard_mb}")
+        raise UserError(f"--shard-mb: expected 1 or more, got {config.shard_mb}")
     if config.out.exists():
-        raise ValueError(f"{config.out} exists already: choose another folder")
+        raise UserError(f"{config.out} exists already: choose another folder")
     check.read_description(config.dataset)
     config.out.parent.mkdir(parents=True, exist_ok=True)
     beside = Path(tempfile.mkdtemp(prefix=storage.unfinished_prefix(), dir=config.out.parent))
@@ -97,11 +98,11 @@ def object_files(dataset: Path, object_id: str) -> dict[str, bytes]:
     details = (folder / storage.LAST_FILE).read_bytes()
     checksums = layout.read_document(folder / storage.LAST_FILE).get("files")
     if not isinstance(checksums, dict) or any(layout.file_of(folder, name) is None for name in checksums):
-        raise ValueError(
+        raise UserError(
             f"{folder / storage.LAST_FILE}: expected the files of the object's own folder; generate it again"
         )
     files = {name: (folder / name).read_bytes() for name in checksums}
     for name, checksum in checksums.items():
         if hashlib.sha256(files[name]).hexdigest() != checksum:
-            raise ValueError(f"{folder / name} is not as it was written: run spnr-data check {dataset}")
+            raise UserError(f"{folder / name} is not as it was written: run spnr-data check {dataset}")
     return {**files, storage.LAST_FILE: details}

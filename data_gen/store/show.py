@@ -15,6 +15,7 @@ from PIL import Image
 
 from data_gen.render import views
 from data_gen.store import check, layout
+from spnr_jax.errors import UserError
 
 STYLE = """
 body { font: 14px/1.4 system-ui, sans-serif; margin: 24px; background: #f4f4f2; color: #222 }
@@ -43,10 +44,10 @@ def show(config: ShowConfig) -> Path:
     """Write the contact sheet; return its path."""
     check.read_description(config.dataset)
     if config.objects < 1:
-        raise ValueError(f"--objects: expected 1 or more, got {config.objects}")
+        raise UserError(f"--objects: expected 1 or more, got {config.objects}")
     object_ids = sorted(layout.completed_objects(config.dataset))
     if not object_ids:
-        raise ValueError(f"{config.dataset} holds no finished object yet; run spnr-data generate again")
+        raise UserError(f"{config.dataset} holds no finished object yet; run spnr-data generate again")
     chosen = np.unique(np.linspace(0, len(object_ids) - 1, min(config.objects, len(object_ids))).round().astype(int))
     sections = [object_section(config.dataset, object_ids[index]) for index in chosen]
     title = f"{config.dataset.resolve().name}: {len(chosen)} of {len(object_ids)} objects"

@@ -18,6 +18,8 @@ import fsspec
 import psutil
 from fsspec.implementations.local import LocalFileSystem
 
+from spnr_jax.errors import UserError
+
 LAST_FILE = "object.json"  # its presence makes an object complete
 UNFINISHED = ".unfinished-"  # prefix of what is still being written: .unfinished-HOST-PROCESS-SUFFIX
 STALE = 24 * 3600  # seconds after which unfinished work of another host is taken for abandoned
@@ -35,7 +37,7 @@ def open_place(location: Location) -> tuple[fsspec.AbstractFileSystem, str]:
     try:
         return fsspec.core.url_to_fs(str(location))
     except (ImportError, ValueError) as error:
-        raise ValueError(f"{location}: no such place can be opened ({error})") from None
+        raise UserError(f"{location}: no such place can be opened ({error})") from None
 
 
 def read_file(location: Location) -> bytes | None:
@@ -119,7 +121,7 @@ def write_and_rename(place: Path, files: dict[str, bytes]) -> None:
             if not place.is_dir():
                 raise
             if not (place / LAST_FILE).is_file():
-                raise ValueError(f"{place} is in the way: a folder without {LAST_FILE}; remove it") from None
+                raise UserError(f"{place} is in the way: a folder without {LAST_FILE}; remove it") from None
     finally:
         shutil.rmtree(beside, ignore_errors=True)
 

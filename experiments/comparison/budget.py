@@ -19,12 +19,14 @@ from typing import Literal
 import jax
 
 from spnr_jax.config import TrainConfig
+from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
 from spnr_jax.presets import PRESETS
 from spnr_jax.training import batching, checkpoint, optimisation, trainer
 
 Budget = Literal["quick", "tiny", "paper"]
-NETWORKS = ("ours", "plus", "npbg", "point_nerf", "points2nerf")
+NETWORKS = ("near_points", "paper", "npbg", "point_nerf", "points2nerf")
+FAMILIES = {"near_points": "plus"}  # network -> how its presets' names begin, where that is another name
 QUICK_STEPS = 4
 PAPER_SIZES = {128: "abo", 200: "shapenet"}
 PACE_SECONDS, PACE_STEPS = 5.0, 3  # a pace is measured over at least so long and so many steps
@@ -43,15 +45,16 @@ class Trained:
 def presets(budget: Budget, size: int, category: str | None) -> dict[str, str]:
     """The preset of each network for images of so many pixels; ValueError if the paper has no such size."""
     if budget != "paper":
-        return {"ours": "tiny"} | {method: f"{method}_tiny" for method in NETWORKS[1:]}
+        return {name: "tiny" if name == "paper" else f"{FAMILIES.get(name, name)}_tiny" for name in NETWORKS}
     if size not in PAPER_SIZES:
-        raise ValueError(
+        raise UserError(
             f"--budget paper: the data's images have {size} pixels, the paper's 128 (ABO) or 200 (ShapeNet); generate "
             "with --resolution 128, or take --budget tiny"
         )
     family = PAPER_SIZES[size]
-    ours = family if family == "abo" else f"shapenet_{category}"
-    return {"ours": ours if ours in PRESETS else "shapenet_car"} | {m: f"{m}_{family}" for m in NETWORKS[1:]}
+    paper = family if family == "abo" else f"shapenet_{category}"
+    found = {name: f"{FAMILIES.get(name, name)}_{family}" for name in NETWORKS}
+    return found | {"paper": paper if paper in PRESETS else "shapenet_car"}
 
 
 def config_of(

@@ -21,6 +21,7 @@ from data_gen.render import light, poisson_surface, views
 from data_gen.render.poisson_surface import PoissonConfig
 from data_gen.render.variant import choose_variant, mitsuba_module
 from data_gen.store import layout
+from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.images import write_whole
 from spnr_jax.formats.light_files import read_envmap
@@ -62,7 +63,7 @@ class Renderer:
 def view_config(settings: dict) -> views.ViewConfig:
     """What decides a data set's pictures, given the poses of their cameras."""
     if missing := [name for name in RENDERING if name not in settings["settings"]]:
-        raise ValueError(f"dataset.json: the setting {missing[0]} is missing; generate the data set again")
+        raise UserError(f"dataset.json: the setting {missing[0]} is missing; generate the data set again")
     return views.ViewConfig(**{name: settings["settings"][name] for name in RENDERING})
 
 
@@ -70,13 +71,13 @@ def unscaled_light(described: dict, envmap: Path | None) -> np.ndarray:
     """The environment map that a data set describes; ValueError if the file given is not it."""
     if described["sha256"] is None:
         if envmap:
-            raise ValueError(f"--envmap {envmap}: the {described['name']} lit the data set; leave the option out")
+            raise UserError(f"--envmap {envmap}: the {described['name']} lit the data set; leave the option out")
         return indoor_envmap()
     if envmap is None:
-        raise ValueError(f"--envmap: give {described['name']}, which lit the data set")
+        raise UserError(f"--envmap: give {described['name']}, which lit the data set")
     radiance = read_envmap(envmap)
     if hashlib.sha256(envmap.read_bytes()).hexdigest() != described["sha256"]:
-        raise ValueError(f"--envmap {envmap}: not the {described['name']} that lit the data set (another checksum)")
+        raise UserError(f"--envmap {envmap}: not the {described['name']} that lit the data set (another checksum)")
     return radiance
 
 
@@ -106,4 +107,4 @@ def check_packages() -> None:
     """Raise ValueError, with what to install, where one of the two optional packages is absent."""
     for package in ("pymeshlab", "mitsuba"):
         if importlib.util.find_spec(package) is None:
-            raise ValueError(f"this needs {package}: pip install 'spnr-jax[data,baselines]'")
+            raise UserError(f"this needs {package}: pip install 'spnr-jax[data,baselines]'")

@@ -17,6 +17,7 @@ from PIL import Image
 
 from experiments.comparison import result_tables
 from experiments.comparison.result_tables import Table
+from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets, images
 from spnr_jax.training import run_record
 
@@ -28,7 +29,7 @@ def claim(folder: Path, what: str, asked: Mapping, dataset: data_sets.Dataset | 
     if path.is_file():
         there = json.loads(path.read_text())
         if different := [name for name in asked if there.get(name) != json.loads(json.dumps(asked[name]))]:
-            raise ValueError(f"{folder} holds {what} with another {', '.join(different)}; choose another --out")
+            raise UserError(f"{folder} holds {what} with another {', '.join(different)}; choose another --out")
     images.write_whole(path, as_json(asked))
 
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from data_gen.make import originals
 from data_gen.render import depth
+from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets, shards
 from spnr_jax.formats.mesh.assets import Asset
 from spnr_jax.kernels import cameras
@@ -21,7 +22,7 @@ def mesh_of(dataset: data_sets.Dataset, item: data_sets.ObjectData, meshes: Path
     """
     seed = dataset.settings.get("settings", {}).get("seed")
     if seed is None:
-        raise ValueError(f"{dataset.folder / 'dataset.json'}: names no seed, so its meshes cannot be made again")
+        raise UserError(f"{dataset.folder / 'dataset.json'}: names no seed, so its meshes cannot be made again")
     positions = np.asarray(item.cloud.positions)
     return originals.original(details(dataset, item.name), seed, positions, meshes, dataset.spread)
 

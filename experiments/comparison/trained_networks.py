@@ -9,23 +9,19 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from spnr_jax.config import TrainConfig
+from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
-from spnr_jax.model_config import METHODS, ModelConfig
+from spnr_jax.model_config import kind_of
 from spnr_jax.scoring import evaluation
+from spnr_jax.scoring.report import METHODS
 from spnr_jax.training import weights
 
+FLOORS = tuple(reversed(evaluation.FLOORS))
 LABELS = {  # method -> its name in tables and pictures, in their order
-    "ours": "Ours",
-    "plus": "Ours, plus",
-    "surfels": "Surfels",
-    "npbg": "NPBG",
-    "point_nerf": "Point-NeRF",
-    "points2nerf": "Points2NeRF",
+    **{name: label for name, label in METHODS.items() if name not in FLOORS},
     "poisson": "Poisson",
     "poisson_trimmed": "Poisson, trimmed 0.3",
-    "nearest": "Nearest-point shading",
-    "splat": "Base-colour splat",
-    "white": "White image",
+    **{name: METHODS[name] for name in FLOORS},
 }
 
 
@@ -70,13 +66,13 @@ def networks(sources: Sources, dataset: data_sets.Dataset) -> dict[str, Network]
     if sources.table1 is not None:
         runs += sorted(path.parent for path in sources.table1.glob("runs/*/config.json"))
     if not runs:
-        raise ValueError("--runs: name at least one run folder, or --table1 with the folder of a table that has some")
+        raise UserError("--runs: name at least one run folder, or --table1 with the folder of a table that has some")
     found = [(run, load(run, dataset)) for run in runs]
     found.sort(key=lambda pair: list(LABELS).index(pair[1].method))
     times = Counter(network.method for _, network in found)
     named = {name_of(network.method, run, times[network.method] > 1): network for run, network in found}
     if len(named) < len(runs):
-        raise ValueError(f"--runs: a run folder is named twice in {', '.join(map(str, runs))}")
+        raise UserError(f"--runs: a run folder is named twice in {', '.join(map(str, runs))}")
     return named
 
 
@@ -91,13 +87,10 @@ def load(run: Path, dataset: data_sets.Dataset) -> Network:
     trained = weights.read_trained(run, data=dataset.folder)
     config = trained.config
     data_sets.check_renders(data_sets.read_object(dataset, dataset.splits["test"][0]), config)
-    method = next(name for name, kind in METHODS.items() if isinstance(config.model, kind))
-    if isinstance(config.model, ModelConfig) and config.model.num_neighbors:
-        method = "plus"
     place = weights.place(run)
     described = place if place.is_file() else place / "config.json"
     return Network(
-        method=method,
+        method=kind_of(config.model),
         config=config,
         variables=trained.variables,
         steps=trained.steps,
@@ -109,7 +102,7 @@ def test_objects(dataset: data_sets.Dataset, count: int | None) -> tuple[str, ..
     """Test objects, evenly out of the split, or all of them; ValueError if there is none."""
     names = dataset.splits["test"]
     if not names:
-        raise ValueError(f"{dataset.folder}: the test split is empty; generate more objects")
+        raise UserError(f"{dataset.folder}: the test split is empty; generate more objects")
     if count is not None and count < 1:
-        raise ValueError(f"--objects: expected 1 or more, got {count}")
+        raise UserError(f"--objects: expected 1 or more, got {count}")
     return evaluation.spread(names, count or len(names))

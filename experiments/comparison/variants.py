@@ -24,6 +24,7 @@ from experiments.comparison.budget import Trained
 from experiments.comparison.object_scores import Shown, of_cloud, score_objects
 from experiments.comparison.trained_networks import test_objects
 from spnr_jax.config import TrainConfig
+from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
 from spnr_jax.kernels import metrics
 from spnr_jax.presets import PRESETS
@@ -62,15 +63,15 @@ class Budget:
 
     def __post_init__(self) -> None:
         if not self.seeds or len(set(self.seeds)) < len(self.seeds):
-            raise ValueError(f"--seeds: expected one or more numbers, none of them twice, got {list(self.seeds)}")
+            raise UserError(f"--seeds: expected one or more numbers, none of them twice, got {list(self.seeds)}")
         if self.steps is not None and (self.quick or self.steps < 1):
-            raise ValueError(f"--steps: expected 1 or more, and not together with --quick, got {self.steps}")
+            raise UserError(f"--steps: expected 1 or more, and not together with --quick, got {self.steps}")
         if self.minutes is not None and (self.quick or self.steps is not None or not self.minutes > 0):
-            raise ValueError(
+            raise UserError(
                 f"--minutes: expected more than 0, and neither with --steps nor --quick, got {self.minutes:g}"
             )
         if self.shown < 1:
-            raise ValueError(f"--shown: expected 1 or more, got {self.shown}")
+            raise UserError(f"--shown: expected 1 or more, got {self.shown}")
 
     def config(self) -> TrainConfig:
         """The preset with the steps and the clouds of this budget."""

@@ -26,6 +26,7 @@ from tqdm import tqdm
 from experiments.comparison import results_folder
 from spnr_jax import presets
 from spnr_jax.config import TrainConfig
+from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.images import write_whole
 from spnr_jax.formats.npz import read_arrays
@@ -99,7 +100,7 @@ def read(place: Path) -> Iterator[tuple[np.ndarray, np.ndarray]]:
             arrays = read_arrays(file)
         return zip(arrays["seen"], arrays["reference"], strict=True)
     except (KeyError, ValueError) as error:
-        raise ValueError(f"{place}: not a file of kept pictures ({error}); delete it, and it is made again") from None
+        raise UserError(f"{place}: not a file of kept pictures ({error}); delete it, and it is made again") from None
 
 
 def train(config: TrainConfig, pictures: list[tuple[np.ndarray, np.ndarray]]) -> dict:

@@ -28,6 +28,7 @@ from experiments.comparison import budget, variants, variants_report
 from experiments.comparison.variants import Budget, Variant
 from spnr_jax import cli
 from spnr_jax.config import TrainConfig
+from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
 from spnr_jax.training import optimisation
 
@@ -48,9 +49,9 @@ class Fig1:
 
     def __post_init__(self) -> None:
         if not self.l1_weights or min(self.l1_weights) < 0 or len(set(self.l1_weights)) < len(self.l1_weights):
-            raise ValueError(f"--l1-weights: expected distinct numbers from 0 on, got {list(self.l1_weights)}")
+            raise UserError(f"--l1-weights: expected distinct numbers from 0 on, got {list(self.l1_weights)}")
         if self.pretrain < 0:
-            raise ValueError(f"--pretrain: expected 0 or more steps, got {self.pretrain}")
+            raise UserError(f"--pretrain: expected 0 or more steps, got {self.pretrain}")
 
 
 def main(options: Fig1) -> None:

@@ -25,6 +25,7 @@ from experiments import entry_point
 from experiments.comparison import figures, variants, variants_report
 from experiments.comparison.variants import Budget, Variant
 from spnr_jax import cli
+from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.images import png, write_whole
 from spnr_jax.scoring import evaluation
@@ -51,7 +52,7 @@ class Fig2:
     def __post_init__(self) -> None:
         for name in ("generated", "colour_variants"):
             if getattr(self, name) < 1:
-                raise ValueError(f"--{name.replace('_', '-')}: expected 1 or more, got {getattr(self, name)}")
+                raise UserError(f"--{name.replace('_', '-')}: expected 1 or more, got {getattr(self, name)}")
 
 
 def main(options: Fig2) -> None:
@@ -90,7 +91,7 @@ def trainings(options: Fig2, dataset: data_sets.Dataset) -> list[Variant]:
     """The training without variants, and that with them; ValueError if the data set has none."""
     plain, config = variants.without_colour_variants(dataset), options.budget.config()
     if plain.splits == dataset.splits:
-        raise ValueError(
+        raise UserError(
             f"{dataset.folder}: the training objects have no colour variants; generate a data set with "
             "`spnr-data generate DIR --colour-variants 5`, or leave out --data"
         )

@@ -36,6 +36,7 @@ from experiments.paper import depth_scores
 from experiments.paper.depth_scores import METRICS, OPAQUE
 from spnr_jax import cli
 from spnr_jax.devices import machine
+from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.images import depth_image, png
 from spnr_jax.kernels import cameras
@@ -132,7 +133,7 @@ def all_methods(options: Fig3, dataset: data_sets.Dataset) -> tuple[dict[str, Me
     found = {name: of_network(network) for name, network in trained.items() if network.has_depth}
     found |= {LABELS[name]: of_surface(SURFACES[name]) for name in options.surfaces}
     if not found:
-        raise ValueError("--runs: none of these predicts depth; name a run of another method, or --surfaces")
+        raise UserError("--runs: none of these predicts depth; name a run of another method, or --surfaces")
     return found, next(iter(trained.values())).config.test_points
 
 

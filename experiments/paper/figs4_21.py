@@ -29,6 +29,7 @@ from experiments.comparison.poisson import SURFACES
 from experiments.comparison.trained_networks import LABELS, Network, Sources
 from spnr_jax import cli
 from spnr_jax.devices import machine
+from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.images import png, write_whole
 from spnr_jax.scoring.report import psnr
@@ -59,7 +60,7 @@ class Gallery:
     def __post_init__(self) -> None:
         for name, least in (("objects", 1), ("view", 0), ("rows", 1), ("columns", 1)):
             if getattr(self, name) < least:
-                raise ValueError(f"--{name}: expected {least} or more, got {getattr(self, name)}")
+                raise UserError(f"--{name}: expected {least} or more, got {getattr(self, name)}")
 
 
 def main(options: Gallery) -> None:
@@ -108,7 +109,7 @@ def all_pictures(
     for number, name in enumerate(names, start=1):
         item = data_sets.read_object(dataset, name)
         if options.view >= len(item.images):
-            raise ValueError(f"--view {options.view}: object {name} has views 0 to {len(item.images) - 1}")
+            raise UserError(f"--view {options.view}: object {name} has views 0 to {len(item.images) - 1}")
         shown[REFERENCE].append(data_sets.on_white(item.images[options.view]))
         for label, network in trained.items():
             place = options.out / "pictures" / label / f"{name}.png"

@@ -29,6 +29,7 @@ from experiments.paper import table1_tables
 from spnr_jax import cli
 from spnr_jax.config import TrainConfig
 from spnr_jax.devices import machine
+from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
 from spnr_jax.presets import PRESETS
 from spnr_jax.scoring import evaluation
@@ -36,8 +37,9 @@ from spnr_jax.scoring.lpips_weights import read_weights
 from spnr_jax.scoring.summary import differences, metric_settings, summarise
 
 Row = Literal[
-    "ours", "plus", "npbg", "point_nerf", "points2nerf", "poisson", "poisson_trimmed", "nearest", "splat", "white"
-]
+    "near_points", "paper", "npbg", "point_nerf", "points2nerf",
+    "poisson", "poisson_trimmed", "nearest", "splat", "white",
+]  # fmt: skip
 ROWS: tuple[Row, ...] = Row.__args__  # type: ignore[attr-defined]
 QUICK_OBJECTS = 3
 
@@ -71,15 +73,15 @@ class Table1:
 
     def __post_init__(self) -> None:
         if self.minutes is not None and (self.budget == "quick" or not self.minutes > 0):
-            raise ValueError(
+            raise UserError(
                 f"--minutes {self.minutes}: expected more than 0 with --budget tiny or paper (quick takes "
                 f"{budget.QUICK_STEPS} steps); leave it out for the steps of the presets"
             )
         if not self.methods:
-            raise ValueError(f"--methods: name at least one of {', '.join(ROWS)}")
+            raise UserError(f"--methods: name at least one of {', '.join(ROWS)}")
         for name, value, least in (("objects", self.objects, 1), ("shown", self.shown, 0)):
             if value is not None and value < least:
-                raise ValueError(f"--{name}: expected {least} or more, got {value}")
+                raise UserError(f"--{name}: expected {least} or more, got {value}")
 
 
 def main(options: Table1) -> None:
@@ -90,7 +92,7 @@ def main(options: Table1) -> None:
     first = data_sets.read_object(dataset, names[0])
     category = dataset.settings.get("settings", {}).get("category")
     presets = budget.presets(options.budget, first.camera.height, category)
-    config = PRESETS[presets["ours"]]()  # its points and pixels are given to every method
+    config = PRESETS[presets["paper"]]()  # its points and pixels are given to every method
     data_sets.check_resolution(first, config)
     asked = {name: getattr(options, name) for name in ("budget", "minutes", "seed")}
     results_folder.claim(options.out, "a table", asked, dataset)
@@ -101,7 +103,7 @@ def main(options: Table1) -> None:
     networks = {name: of_cloud(evaluation.network(t.variables, t.config), config) for name, t in trained.items()}
     methods = networks | surfaces | floors
     if not methods:
-        raise ValueError(f"--methods {' '.join(options.methods)}: none can be made here, {' '.join(missing.values())}")
+        raise UserError(f"--methods {' '.join(options.methods)}: none can be made here, {' '.join(missing.values())}")
     scored = score_objects(methods, config, dataset, names, options.shown, weights)
     found = {
         **asked,
@@ -127,12 +129,14 @@ def conditions(dataset: data_sets.Dataset, names: tuple[str, ...], config: Train
     }
 
 
-def numbers(scored: Scored) -> dict[str, dict]:
-    """The scores as tables: of every method, ours minus the others, and of each class of objects."""
+def numbers(scored: Scored) -> dict[str, str | dict | None]:
+    """The scores as tables: of every method, the first network minus the others, and of each class of objects."""
     scores = list(scored.scores.values())
+    first = next((name for name in NETWORKS if name in scores[0]), None)
     return {
         "methods": summarise(scores),
-        "ours_minus": differences(scores) if "ours" in scores[0] else {},
+        "compared": first,
+        "differences": {} if first is None else differences(scores, first),
         "per_category": by_category(scored.scores),
     }
 

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from experiments.comparison.budget import QUICK_STEPS
 from experiments.comparison.result_tables import Cell, Table, number, text
 from experiments.comparison.trained_networks import LABELS
-from spnr_jax.scoring.report import ARROWS, QUALITY, duration
+from spnr_jax.scoring.report import ARROWS, QUALITY, duration, lowered
 from spnr_jax.scoring.summary import NO_WEIGHTS
 
 METRICS = ("psnr", "ssim", "lpips", "flip", "cpsnr", "iou")
@@ -21,8 +21,8 @@ BUDGETS = {
 def tables(results: Mapping) -> list[Table]:
     """The table of methods, the differences, and a table of each class of objects."""
     made = [methods_table(results)]
-    if results["ours_minus"]:
-        made.append(differences_table(results["ours_minus"]))
+    if results["differences"]:
+        made.append(differences_table(results["compared"], results["differences"]))
     for name, methods in results["per_category"].items():
         count = next(iter(methods.values()))["objects"]
         title = f"{name}, {count} object{'s' * (count != 1)}"
@@ -46,11 +46,11 @@ def methods_table(results: Mapping) -> Table:
     )
 
 
-def differences_table(ours_minus: Mapping) -> Table:
-    """Ours minus each other method, image by image."""
+def differences_table(first: str, differences: Mapping) -> Table:
+    """A network minus each other method, image by image."""
     rows = tuple(
-        (f"Ours minus {LABELS[name]}", tuple(_difference(row.get(metric), metric) for metric in METRICS))
-        for name, row in ours_minus.items()
+        (f"{LABELS[first]} minus {lowered(name)}", tuple(_difference(row.get(metric), metric) for metric in METRICS))
+        for name, row in differences.items()
     )
     note = "Image by image, with 95 % bootstrap intervals and the p-value of a sign-flip test, both over objects."
     return Table(title="Paired differences", heads=_metric_heads(), rows=rows, note=note)

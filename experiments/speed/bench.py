@@ -30,6 +30,7 @@ from experiments.comparison import results_folder
 from experiments.speed import bench_report as report
 from experiments.speed.bench_scene import BATCHES
 from experiments.speed.worker import Worker, worker
+from spnr_jax.errors import UserError
 from spnr_jax.formats.images import write_whole
 
 Preset = Literal["tiny", "small", "abo"]
@@ -68,7 +69,7 @@ class Options:
     def __post_init__(self) -> None:
         for name in ("rounds", "threads"):
             if getattr(self, name) < 1:
-                raise ValueError(f"--{name} must be at least 1, got {getattr(self, name)}")
+                raise UserError(f"--{name} must be at least 1, got {getattr(self, name)}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -182,7 +183,7 @@ def check_parity(options: Options, preset: str) -> None:
             found = ours.facts["differences"]
     for name, difference in found.items():
         if not difference <= AGREEMENT:
-            raise ValueError(
+            raise UserError(
                 f"{preset}: {name} differs from the twin's by {difference:.1e} of its norm, more than {AGREEMENT:g}; "
                 "nothing is timed, because the two are not the same network"
             )
@@ -233,7 +234,7 @@ def read_rows(path: Path) -> list[Row]:
     try:
         return json.loads(path.read_text())
     except ValueError as error:
-        raise ValueError(f"{path} is no JSON ({error}); remove it or choose another --out") from None
+        raise UserError(f"{path} is no JSON ({error}); remove it or choose another --out") from None
 
 
 if __name__ == "__main__":

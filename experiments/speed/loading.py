@@ -32,6 +32,7 @@ from experiments.comparison.result_tables import Table, number, text
 from spnr_jax import cli, presets
 from spnr_jax.config import TrainConfig
 from spnr_jax.devices import machine
+from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
 from spnr_jax.training import batching, optimisation
 
@@ -71,7 +72,7 @@ def main(options: Loading) -> None:
                 rows.append({"preset": preset, "form": form, "batch_objects": settings.batch_objects, **figures})
                 print(json.dumps(rows[-1]), file=sys.stderr)
     if not rows:
-        raise ValueError(f"{options.dataset}: no preset of {', '.join(options.presets)} has images of {size} px")
+        raise UserError(f"{options.dataset}: no preset of {', '.join(options.presets)} has images of {size} px")
     found = {"hardware": machine.hardware(), "image_size": size, "rows": rows}
     results_folder.write(options.out / str(size), found, [table(rows)], [machine.hardware()])
 

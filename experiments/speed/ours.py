@@ -15,6 +15,7 @@ import numpy as np
 from experiments.speed import bench_scene, twin_layout, worker
 from spnr_jax.config import TrainConfig
 from spnr_jax.devices import allocator
+from spnr_jax.errors import UserError
 from spnr_jax.kernels.records import Batch
 from spnr_jax.method import inference
 from spnr_jax.model_config import ModelConfig
@@ -110,7 +111,7 @@ def differences(config: TrainConfig, arrays: twin_layout.Arrays) -> dict[str, fl
     theirs = twin_layout.train_config(arrays)
     ours = config.model, config.loss.discriminator_width
     if ours != (theirs.model, theirs.loss.discriminator_width):
-        raise ValueError(f"{config.preset}: the twin has other sizes ({theirs.model}) than ours ({config.model})")
+        raise UserError(f"{config.preset}: the twin has other sizes ({theirs.model}) than ours ({config.model})")
     inputs = jax.device_put(twin_layout.batch(arrays))
     params, statistics = twin_layout.generator(arrays)
     variables = {"params": params, "batch_stats": statistics}
@@ -130,7 +131,7 @@ def differences(config: TrainConfig, arrays: twin_layout.Arrays) -> dict[str, fl
 def distance(ours: jax.Array, theirs: np.ndarray) -> float:
     """Norm of the difference over the norm of theirs."""
     if ours.shape != theirs.shape:
-        raise ValueError(f"the twin's output has shape {theirs.shape}, ours {ours.shape}")
+        raise UserError(f"the twin's output has shape {theirs.shape}, ours {ours.shape}")
     return float(jnp.linalg.norm((ours - theirs).ravel()) / np.linalg.norm(theirs))
 
 

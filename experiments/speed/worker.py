@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from spnr_jax.devices import allocator
+from spnr_jax.errors import UserError
 
 FEWEST = 3  # timed runs of a turn
 
@@ -47,7 +48,7 @@ class Worker:
             code = self._process.wait()
             self._errors.seek(0)
             words = self._errors.read().strip().splitlines() or ["it said nothing"]
-            raise ValueError(f"{self._name} stopped with code {code}: {words[-1]}")
+            raise UserError(f"{self._name} stopped with code {code}: {words[-1]}")
         return json.loads(line)
 
 

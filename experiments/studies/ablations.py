@@ -29,6 +29,7 @@ from experiments.comparison import variants, variants_report
 from experiments.comparison.variants import Budget, Variant
 from spnr_jax import cli, presets
 from spnr_jax.config import LossConfig, TrainConfig
+from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
 from spnr_jax.model_config import ModelConfig, SamplingConfig
 
@@ -83,7 +84,7 @@ class Ablations:
 
     def __post_init__(self) -> None:
         if self.folds < 1:
-            raise ValueError(f"--folds: expected 1 or more, got {self.folds}")
+            raise UserError(f"--folds: expected 1 or more, got {self.folds}")
 
 
 def main(options: Ablations) -> None:
@@ -113,7 +114,7 @@ def folds(dataset: data_sets.Dataset, count: int) -> list[data_sets.Dataset]:
     everything = sorted(name for names in dataset.splits.values() for name in names)
     objects = [name for name in everything if name == variants.original(name)]
     if len(objects) < 2 * count:
-        raise ValueError(f"--folds {count}: {dataset.folder} holds {len(objects)} objects, too few")
+        raise UserError(f"--folds {count}: {dataset.folder} holds {len(objects)} objects, too few")
     found = []
     for first in range(count):
         test = tuple(objects[first::count])

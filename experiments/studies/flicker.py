@@ -33,6 +33,7 @@ from experiments.comparison.source_meshes import cast_views, mesh_of
 from experiments.comparison.trained_networks import Network, Sources
 from spnr_jax import cli
 from spnr_jax.devices import machine
+from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.images import to_uint8, write_turntable
 from spnr_jax.kernels import cameras
@@ -72,7 +73,7 @@ class Flicker:
 def main(options: Flicker) -> None:
     """Makes what is missing of the references, then frames, scores and pictures."""
     if options.frames < 3:
-        raise ValueError(f"--frames: expected 3 or more, got {options.frames}")
+        raise UserError(f"--frames: expected 3 or more, got {options.frames}")
     cli.set_up_jax()
     dataset = data_sets.open_dataset(options.data)
     names = trained_networks.test_objects(dataset, options.objects)
@@ -101,7 +102,7 @@ def object_curves(
     shown |= {label: frames_of(network, item, camera) for label, network in trained.items()}
     found = {label: flicker(frames, distances, camera) for label, frames in shown.items()}
     if np.isnan(found[REFERENCE]).all():
-        raise ValueError(f"--frames {options.frames}: neighbouring ones see no place of {name} in common; take more")
+        raise UserError(f"--frames {options.frames}: neighbouring ones see no place of {name} in common; take more")
     strip = [np.concatenate([frames[i] for frames in shown.values()], axis=1) for i in range(options.frames)]
     write_turntable(options.out / f"{name}.gif", strip, fps=24)
     return found

@@ -32,6 +32,7 @@ from experiments.studies.point_count_report import METRICS
 from spnr_jax import cli
 from spnr_jax.config import TrainConfig
 from spnr_jax.devices import machine
+from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.images import png
 from spnr_jax.formats.mesh import surface_points
@@ -69,7 +70,7 @@ class PointCount:
 
     def __post_init__(self) -> None:
         if not self.counts or min(self.counts) < 1 or list(self.counts) != sorted(set(self.counts)):
-            raise ValueError(f"--counts: expected rising numbers of points, got {' '.join(map(str, self.counts))}")
+            raise UserError(f"--counts: expected rising numbers of points, got {' '.join(map(str, self.counts))}")
 
 
 @dataclass(frozen=True, kw_only=True)

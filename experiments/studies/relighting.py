@@ -25,6 +25,7 @@ from experiments.comparison import figures, results_folder
 from experiments.comparison.result_tables import Cell, Table, number
 from experiments.studies.sharpness import told, view_of
 from spnr_jax.devices import machine
+from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets, images
 from spnr_jax.kernels.colors import srgb_to_linear
 from spnr_jax.method.model import Model, Quality, Volume
@@ -93,7 +94,7 @@ def main(options: RelightingStudy) -> None:
 def name_of(dataset: data_sets.Dataset) -> str:
     """The light of a data set; ValueError if its views have none of their own."""
     if not data_sets.has_lights(dataset):
-        raise ValueError(f"{dataset.folder}: its views have no light of their own; generate it with --lights")
+        raise UserError(f"{dataset.folder}: its views have no light of their own; generate it with --lights")
     kinds = dataset.settings["environment_map"]["kinds"]
     return " and ".join(Path(name).stem for kind in kinds for name in kind.get("sha256", {kind["name"]: None}))
 

@@ -26,6 +26,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from spnr_jax.errors import UserError
 from spnr_jax.kernels import cameras, compositing, sampling
 from spnr_jax.kernels.numerics import per_feature, softplus
 from spnr_jax.kernels.records import Camera, Key, PointCloud, Rays, Rendering
@@ -217,7 +218,7 @@ class Points2NeRF(nn.Module):
         if not train:
             return self.render(self.weights(mean), camera, key)
         if key is None:
-            raise ValueError("training draws a code for each object: give a key")
+            raise UserError("training draws a code for each object: give a key")
         mode = self.config.mode
         self.sow("losses", "kl", self.config.kl_weight * jnp.mean(kl_divergence(mode, mean, log_scale)))
         code_key, key = jax.random.split(key)

@@ -20,6 +20,8 @@ import numpy as np
 from jax.experimental import multihost_utils
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
+from spnr_jax.errors import UserError
+
 OBJECTS, DEPTH = "objects", "depth"
 
 
@@ -27,7 +29,7 @@ def device_mesh(depth: int = 1) -> Mesh:
     """All devices of all processes, `depth` of them to each volume; ValueError if these do not divide their number."""
     count = jax.device_count()
     if depth < 1 or count % depth:
-        raise ValueError(f"--depth-devices {depth}: expected a divisor of the {count} devices")
+        raise UserError(f"--depth-devices {depth}: expected a divisor of the {count} devices")
     return jax.make_mesh((count // depth, depth), (OBJECTS, DEPTH), axis_types=(AxisType.Auto,) * 2)
 
 
@@ -78,7 +80,7 @@ def own_objects(mesh: Mesh, batch_objects: int) -> range:
     """Places in the global batch of the objects on this process's devices; ValueError if they cannot be divided."""
     shards = mesh.shape[OBJECTS]
     if batch_objects % shards:
-        raise ValueError(
+        raise UserError(
             f"batch_objects {batch_objects} cannot be divided among {shards} devices; use a multiple, or show JAX "
             "fewer devices (CUDA_VISIBLE_DEVICES)"
         )
@@ -115,7 +117,7 @@ def first_alone(work: Callable[[], object]) -> None:
     if error:
         raise error
     if failed:
-        raise ValueError("the first process of this training stopped, and says why")
+        raise UserError("the first process of this training stopped, and says why")
 
 
 class Agreement:
@@ -187,7 +189,7 @@ def divide_depth(volume: jax.Array, coarsest: int) -> jax.Array:
     """
     devices = _devices(DEPTH)
     if coarsest % devices:
-        raise ValueError(
+        raise UserError(
             f"--depth-devices {devices}: expected a divisor of {coarsest}, the sides of the network's coarsest grid "
             "(volume_resolution / 2^num_stages)"
         )

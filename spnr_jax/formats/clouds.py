@@ -14,6 +14,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from spnr_jax.errors import UserError
 from spnr_jax.formats.cut import Cut
 from spnr_jax.formats.ply import read_ply_header
 from spnr_jax.formats.point_columns import DEFAULTS, LINEAR, POSITION, SRGB, Columns, materials, normals, useful
@@ -92,18 +93,18 @@ def place_cloud(
     """The cloud of `read_cloud` with the way back into the file's frame."""
     path = Path(path)
     if up not in (*ROTATIONS, "auto"):
-        raise ValueError(f"up must be one of {', '.join(ROTATIONS)}, auto, got {up!r}")
+        raise UserError(f"up must be one of {', '.join(ROTATIONS)}, auto, got {up!r}")
     if num_points is not None and num_points < 1:
-        raise ValueError(f"num_points must be at least 1, got {num_points}")
+        raise UserError(f"num_points must be at least 1, got {num_points}")
     if transparent_parts not in get_args(ShownParts):
-        raise ValueError(f"transparent_parts must be opaque or skip, got {transparent_parts!r}")
+        raise UserError(f"transparent_parts must be opaque or skip, got {transparent_parts!r}")
     if clean not in get_args(Clean):
-        raise ValueError(f"clean must be one of {', '.join(get_args(Clean))}, got {clean!r}")
+        raise UserError(f"clean must be one of {', '.join(get_args(Clean))}, got {clean!r}")
     _check_file(path)
     try:
         positions, origin, values, sensor = _read(path, num_points, seed, clean, cut, transparent_parts, report)
     except (ValueError, OSError) as error:
-        raise ValueError(f"{path}: {str(error).splitlines()[0]}") from error
+        raise UserError(f"{path}: {str(error).splitlines()[0]}") from error
     kept = np.arange(len(positions))
     if num_points is not None and len(positions) > num_points:
         report(f"{num_points} of {len(positions)} points kept, evenly spread")
@@ -144,13 +145,13 @@ def _check_file(path: Path) -> None:
     """ValueError unless there is a file of a known kind with something in it."""
     known = tuple(dict.fromkeys((*READERS, *MESHES)))
     if path.is_dir():
-        raise ValueError(f"{path}: a folder; expected a file of one of {' '.join(known)}")
+        raise UserError(f"{path}: a folder; expected a file of one of {' '.join(known)}")
     if path.suffix.lower() not in known:
-        raise ValueError(f"{path}: unknown kind of file {path.suffix!r}; expected one of {' '.join(known)}")
+        raise UserError(f"{path}: unknown kind of file {path.suffix!r}; expected one of {' '.join(known)}")
     if not path.is_file():
-        raise ValueError(f"{path}: there is no such file")
+        raise UserError(f"{path}: there is no such file")
     if path.stat().st_size == 0:
-        raise ValueError(f"{path}: the file is empty")
+        raise UserError(f"{path}: the file is empty")
 
 
 def _is_mesh(path: Path) -> bool:
@@ -206,7 +207,7 @@ def _sampled_mesh(path: Path, count: int, seed: int, transparent_parts: ShownPar
         report(note)
     points = sample_surface(asset, count, seed, "even" if count <= MOST_EVEN else "random")
     if not np.isfinite(points.positions).all():
-        raise ValueError(f"holds vertices too large for float32, more than {np.finfo(np.float32).max:.2g}")
+        raise UserError(f"holds vertices too large for float32, more than {np.finfo(np.float32).max:.2g}")
     report(f"{count} points spread over the surface of the mesh")
     values = {name: getattr(points, name) for name in DEFAULTS}
     if all((values[name] == default).all() for name, default in DEFAULTS.items()):
@@ -239,7 +240,7 @@ def _bounded_columns(path: Path, num_points: int | None, cut: Cut, report: Calla
 
     columns, seen = thin_stream(sound_pieces(), capacity)
     if broken and not seen + outside:
-        raise ValueError(f"holds no point that can be used: {BROKEN} in all of its {broken} rows")
+        raise UserError(f"holds no point that can be used: {BROKEN} in all of its {broken} rows")
     if broken:
         report(f"{broken:,} of {seen + outside + broken:,} points left out: {BROKEN}")
     if cut.crop and seen + outside:
@@ -261,20 +262,20 @@ def _all_sound(columns: Columns) -> Columns:
     """The columns; ValueError if there is a row that is not sound."""
     broken = np.flatnonzero(~_sound(columns))
     if broken.size:
-        raise ValueError(f"holds {broken.size} points with {BROKEN}, first point {broken[0]}")
+        raise UserError(f"holds {broken.size} points with {BROKEN}, first point {broken[0]}")
     return columns
 
 
 def _points_of_columns(columns: Columns, report: Callable[[str], None]):
     """Positions (points, 3) float64, their origin (3,), materials and normals, if any, of useful columns."""
     if not columns or len(columns["x"]) == 0:
-        raise ValueError("holds 0 points")
+        raise UserError("holds 0 points")
     positions = np.stack([np.asarray(columns[axis], np.float64) for axis in "xyz"], axis=-1)
     origin = np.zeros(3)
     extent, step = np.ptp(positions, axis=0).max(), np.spacing(np.float32(np.abs(positions).max()))
     if step > COARSEST_STEP * extent > 0:
         if columns["x"].dtype == np.float32:
-            raise ValueError(
+            raise UserError(
                 f"holds points {step:g} apart at best in float32, for an extent of {extent:g}; move them to the origin"
             )
         origin = np.floor(positions.min(axis=0))

@@ -3,6 +3,8 @@
 import math
 from dataclasses import dataclass
 
+from spnr_jax.errors import UserError
+
 
 @dataclass(frozen=True, kw_only=True)
 class Cut:
@@ -28,9 +30,9 @@ class Cut:
     def __post_init__(self) -> None:
         """ValueError names the option that makes no sense."""
         if self.object not in (None, "largest") and not (self.object.isdecimal() and int(self.object) > 0):
-            raise ValueError(f"--object must be largest or a number from 1, got {self.object!r}")
+            raise UserError(f"--object must be largest or a number from 1, got {self.object!r}")
         if self.crop is None:
             return
         box = tuple(self.crop)
         if len(box) != 6 or not all(map(math.isfinite, box)) or any(a > b for a, b in zip(box, box[3:], strict=False)):
-            raise ValueError(f"--crop takes xmin ymin zmin xmax ymax zmax, each min up to its max, got {box}")
+            raise UserError(f"--crop takes xmin ymin zmin xmax ymax zmax, each min up to its max, got {box}")

@@ -20,14 +20,15 @@ import numpy as np
 from PIL import Image, UnidentifiedImageError
 
 from spnr_jax.config import TrainConfig
+from spnr_jax.errors import UserError, is_bug
 from spnr_jax.formats import clouds
 from spnr_jax.formats.npz import read_arrays
 from spnr_jax.formats.shards import Shards, is_plain_name, open_shards, read_files
 from spnr_jax.kernels.records import Camera, Light, PointCloud
 from spnr_jax.surfels.lighting import HEIGHT, WIDTH, light_of
 
-# what a file that breaks its rules makes its reader raise; Pillow raises SyntaxError
-UNREADABLE = (OSError, ValueError, LookupError, TypeError, ArithmeticError, AttributeError, RecursionError, SyntaxError)
+# what a file that breaks its rules makes its reader raise
+UNREADABLE = (OSError, ValueError, LookupError, TypeError, ArithmeticError, RecursionError)
 # errors of a network drive that is away for a moment, and the seconds after which its file is read again
 PASSING = (errno.EIO, errno.ESTALE, errno.ETIMEDOUT, errno.EAGAIN, errno.ENOTCONN)
 PAUSES = (0.1, 0.5, 2.0)
@@ -75,21 +76,21 @@ def open_dataset(folder: Path | str) -> Dataset:
     folder = Path(folder)
     description = folder / "dataset.json"
     if not description.is_file():
-        raise ValueError(f"{folder}: no finished data set (dataset.json is missing); run `spnr-data generate {folder}`")
+        raise UserError(f"{folder}: no finished data set (dataset.json is missing); run `spnr-data generate {folder}`")
     try:
         settings = json.loads(description.read_text())
     except (ValueError, RecursionError) as error:
-        raise ValueError(f"{description}: not valid JSON ({error}); generate the data set again") from None
+        raise UserError(f"{description}: not valid JSON ({error}); generate the data set again") from None
     if not isinstance(settings, dict):
-        raise ValueError(f"{description}: holds no settings; generate the data set again")
+        raise UserError(f"{description}: holds no settings; generate the data set again")
     splits = {}
     for split in ("train", "val", "test"):
         path = folder / "splits" / f"{split}.txt"
         if not path.is_file():
-            raise ValueError(f"{path}: missing; run `spnr-data generate {folder}` again, it completes the data set")
+            raise UserError(f"{path}: missing; run `spnr-data generate {folder}` again, it completes the data set")
         splits[split] = tuple(path.read_text(errors="replace").split())
         if strange := [name for name in splits[split] if not is_plain_name(name)]:
-            raise ValueError(f"{path}: {strange[0]!r} is no name of an object; generate the data set again")
+            raise UserError(f"{path}: {strange[0]!r} is no name of an object; generate the data set again")
     return Dataset(folder=folder, settings=settings, splits=splits, shards=open_shards(folder))
 
 
@@ -106,9 +107,9 @@ def read_object(dataset: Dataset, name: str) -> ObjectData:
         names = [Path(frame["file_path"]).name for frame in meta["frames"]]
         height, width = int(meta["h"]), int(meta["w"])
         if poses.shape[1:] != (3, 4) or not (np.isfinite(poses).all() and np.isfinite(intrinsics).all()):
-            raise ValueError("a camera holds NaN or infinity, or is no 4 x 4 matrix")
+            raise UserError("a camera holds NaN or infinity, or is no 4 x 4 matrix")
         if not min(intrinsics[0, 0], intrinsics[1, 1]) > 0:
-            raise ValueError(f"focal lengths {meta['fl_x']} and {meta['fl_y']}, expected positive ones")
+            raise UserError(f"focal lengths {meta['fl_x']} and {meta['fl_y']}, expected positive ones")
         images = np.stack([_rgba(read(file := f"images/{name}"), height, width) for name in names])
         conditions = np.stack([_rgba(read(file := f"conditions/{name}"), height, width) for name in names])
         cloud = clouds.cloud_of_ply(read(file := "points.ply"))
@@ -116,7 +117,7 @@ def read_object(dataset: Dataset, name: str) -> ObjectData:
     except UNREADABLE as error:
         path = folder / file
         reason = f"no entry {error}" if isinstance(error, KeyError) else str(error).replace(str(path), path.name)
-        raise ValueError(f"{path}: cannot be read ({reason}); run `spnr-data check {dataset.folder}`") from None
+        raise UserError(f"{path}: cannot be read ({reason}); run `spnr-data check {dataset.folder}`") from None
     camera = Camera(
         cam_to_world=poses, intrinsics=np.broadcast_to(intrinsics, (len(names), 3, 3)), height=height, width=width
     )
@@ -132,7 +133,7 @@ def has_lights(dataset: Dataset) -> bool:
 def _lights(content: bytes, views: int) -> np.ndarray:
     lights = read_arrays(io.BytesIO(content), ("lights",))["lights"].astype(np.float32)
     if lights.shape != (views, HEIGHT, WIDTH, 3) or not np.isfinite(lights).all() or lights.min() < 0:
-        raise ValueError(f"expected {views} maps of {HEIGHT} x {WIDTH} texels of radiance, got {lights.shape}")
+        raise UserError(f"expected {views} maps of {HEIGHT} x {WIDTH} texels of radiance, got {lights.shape}")
     return lights
 
 
@@ -157,12 +158,14 @@ def _rgba(content: bytes, height: int, width: int) -> np.ndarray:
         with warnings.catch_warnings(action="error", category=Image.DecompressionBombWarning):
             image = Image.open(io.BytesIO(content))
         if image.size != (width, height):  # before memory is taken for them
-            raise ValueError(f"{image.width} x {image.height} pixels, transforms.json says {width} x {height}")
+            raise UserError(f"{image.width} x {image.height} pixels, transforms.json says {width} x {height}")
         return np.asarray(image.convert("RGBA"))
     except UnidentifiedImageError:
-        raise ValueError("is not an image") from None
-    except (Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
-        raise ValueError(str(error)) from None
+        raise UserError("is not an image") from None
+    except (Image.DecompressionBombError, Image.DecompressionBombWarning, SyntaxError, AttributeError) as error:
+        if is_bug(error):
+            raise
+        raise UserError(str(error)) from None  # the last two are Pillow's for chunks that break their rules
 
 
 def on_white(rgba: np.ndarray) -> np.ndarray:
@@ -191,7 +194,7 @@ def check_resolution(data: ObjectData, config: TrainConfig) -> None:
     """ValueError if an object's images do not have the size that the config's network is trained on."""
     size = config.model.image_resolution
     if (data.camera.height, data.camera.width) != (size, size):
-        raise ValueError(
+        raise UserError(
             f"object {data.name} has images of {data.camera.width} x {data.camera.height} pixels, preset "
             f"{config.preset} needs {size} x {size}; use another preset or generate with --resolution {size}"
         )

@@ -16,6 +16,8 @@ import numpy as np
 from jaxtyping import Array
 from PIL import Image
 
+from spnr_jax.errors import UserError
+
 OPAQUE = 0.5  # opacity from which a pixel's depth counts for the range of the colours
 PALETTE_FRAMES = 24  # frames, spread over the film, that choose the colours of a GIF
 CENTISECOND = 0.01  # the clock of a GIF
@@ -27,7 +29,7 @@ def to_uint8(image: np.ndarray | Array) -> np.ndarray:
     if image.dtype == np.uint8:
         return image
     if not np.isfinite(image).all():
-        raise ValueError(f"an image of shape {image.shape} holds NaN or infinity")
+        raise UserError(f"an image of shape {image.shape} holds NaN or infinity")
     return np.round(255 * np.clip(image, 0, 1)).astype(np.uint8)
 
 
@@ -81,9 +83,9 @@ def write_turntable(path: str | Path, frames: list[np.ndarray], fps: float | int
     """
     path = Path(path)
     if path.suffix.lower() not in (".gif", ".mp4"):
-        raise ValueError(f"{path}: a turntable is a .gif or .mp4 file, not {path.suffix!r}")
+        raise UserError(f"{path}: a turntable is a .gif or .mp4 file, not {path.suffix!r}")
     if not frames or not fps > 0:
-        raise ValueError(f"{path}: a turntable needs frames and a positive rate, got {len(frames)} frames at {fps} fps")
+        raise UserError(f"{path}: a turntable needs frames and a positive rate, got {len(frames)} frames at {fps} fps")
     pictures = [to_uint8(frame) for frame in frames]
     if path.suffix.lower() == ".gif":
         write_whole(path, _gif(pictures, fps))

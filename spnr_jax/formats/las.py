@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from spnr_jax.errors import UserError, is_bug
 from spnr_jax.formats.laz import RECORD_HEAD, check_laz
 
 PIECE_BYTES = 2**23  # of points in memory at a time
@@ -28,9 +29,9 @@ def las_pieces(path: Path) -> Iterator[dict[str, np.ndarray]]:
     try:
         import laspy  # an extra: only here
     except ImportError:
-        raise ValueError(MISSING.format(package="laspy")) from None
+        raise UserError(MISSING.format(package="laspy")) from None
     if path.suffix.lower() == ".laz" and laspy.LazBackend.Lazrs not in laspy.LazBackend.detect_available():
-        raise ValueError(MISSING.format(package="lazrs"))
+        raise UserError(MISSING.format(package="lazrs"))
     # the parallel reader of lazrs ends the whole process on a damaged file
     backends = (laspy.LazBackend.Lazrs,)
     _check_header(path)
@@ -41,11 +42,13 @@ def las_pieces(path: Path) -> Iterator[dict[str, np.ndarray]]:
                 columns = {axis: np.asarray(getattr(points, axis), np.float64) for axis in "xyz"}
                 yield columns | {name: np.asarray(points[name]) for name in COLUMNS if name in present}
     except (laspy.errors.LaspyException, *UNREADABLE) as error:
-        raise ValueError(f"is a broken or truncated LAS file ({error})") from None
+        if is_bug(error):
+            raise
+        raise UserError(f"is a broken or truncated LAS file ({error})") from None
     except BaseException as error:  # lazrs, a library in Rust, panics, which is no Exception
         if type(error).__name__ != "PanicException":
             raise
-        raise ValueError(f"is a broken LAZ file ({error})") from None
+        raise UserError(f"is a broken LAZ file ({error})") from None
 
 
 def _check_header(path: Path) -> None:
@@ -54,14 +57,14 @@ def _check_header(path: Path) -> None:
     with path.open("rb") as file:
         head = file.read(COUNT_14 + 8)
     if head[:4] != b"LASF" or len(head) < SMALLEST_HEADER:
-        raise ValueError("is not a LAS file, or its header is cut off (expected 'LASF' and at least 227 bytes)")
+        raise UserError("is not a LAS file, or its header is cut off (expected 'LASF' and at least 227 bytes)")
     minor = head[25]
     header_size, data, records, kind, length, count = struct.unpack_from("<HIIBHI", head, SIZES)
     if minor >= 4 and len(head) == COUNT_14 + 8:
         (count,) = struct.unpack_from("<Q", head, COUNT_14)
     if not header_size + records * RECORD_HEAD <= data <= size:
-        raise ValueError(f"is broken: {records} records in its header, points from byte {data} on, in {size} bytes")
+        raise UserError(f"is broken: {records} records in its header, points from byte {data} on, in {size} bytes")
     if kind & COMPRESSED:
         check_laz(np.memmap(path, np.uint8, "r"), header_size, records, data, length, count)
     elif not length or data + count * length > size:
-        raise ValueError(f"is cut off: its header announces {count} points of {length} bytes, in {size} bytes")
+        raise UserError(f"is cut off: its header announces {count} points of {length} bytes, in {size} bytes")

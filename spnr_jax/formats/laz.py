@@ -12,6 +12,8 @@ import struct
 
 import numpy as np
 
+from spnr_jax.errors import UserError
+
 RECORD_HEAD, NAME, NUMBER = 54, b"laszip encoded", 22204
 LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}  # of an item of this type; those of extra bytes (14) have one a byte
 EXTRA_BYTES = 14
@@ -28,21 +30,21 @@ def check_laz(content: np.ndarray, first_record: int, records: int, data: int, l
     try:
         items, chunk_size = _items(content, first_record, records)
         if sum(size for _, size in items) != length:
-            raise ValueError(f"its points have {length} bytes, their items {[size for _, size in items]}")
+            raise UserError(f"its points have {length} bytes, their items {[size for _, size in items]}")
         if chunk_size != VARIABLE and not 0 < chunk_size <= LARGEST_CHUNK:
-            raise ValueError(f"chunks of {chunk_size} points, expected 1 to {LARGEST_CHUNK}")
+            raise UserError(f"chunks of {chunk_size} points, expected 1 to {LARGEST_CHUNK}")
         (table,) = _numbers(content, data, "<q")
         if table == -1:
             (table,) = _numbers(content, len(content) - 8, "<q")
         _, chunks = _numbers(content, table, "<II")
         if chunks * length > len(content):  # each begins with a point as it is
-            raise ValueError(f"{chunks} chunks in {len(content)} bytes")
+            raise UserError(f"{chunks} chunks in {len(content)} bytes")
         if chunks * (LARGEST_CHUNK if chunk_size == VARIABLE else chunk_size) < points:
-            raise ValueError(f"{points} points in {chunks} chunks")
+            raise UserError(f"{points} points in {chunks} chunks")
         if any(kind in LAYERS for kind, _ in items):
             _walk(content, data + 8, chunks, length, sum(LAYERS.get(kind, size) for kind, size in items))
     except struct.error:
-        raise ValueError("is cut off: its compressed data ends too early") from None
+        raise UserError("is cut off: its compressed data ends too early") from None
 
 
 def _items(content: np.ndarray, place: int, records: int) -> tuple[list[tuple[int, int]], int]:
@@ -56,7 +58,7 @@ def _items(content: np.ndarray, place: int, records: int) -> tuple[list[tuple[in
             found = [_numbers(content, start + ITEMS_AT + 2 + 6 * i, "<HH") for i in range(count)]
             return [(int(kind), int(wide)) for kind, wide in found], int(chunk_size)
         place += RECORD_HEAD + size
-    raise ValueError("has no record that says how its points are compressed")
+    raise UserError("has no record that says how its points are compressed")
 
 
 def _walk(content: np.ndarray, place: int, chunks: int, length: int, layers: int) -> None:
@@ -65,7 +67,7 @@ def _walk(content: np.ndarray, place: int, chunks: int, length: int, layers: int
         count, *sizes = _numbers(content, place + length, f"<{1 + layers}I")
         place += length + 4 + 4 * layers + sum(sizes)
         if place > len(content) or count > LARGEST_CHUNK:
-            raise ValueError(f"is cut off: a chunk of {count} points ends at byte {place} of {len(content)}")
+            raise UserError(f"is cut off: a chunk of {count} points ends at byte {place} of {len(content)}")
 
 
 def _numbers(content: np.ndarray, place: int, form: str) -> tuple:

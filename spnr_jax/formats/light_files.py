@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from spnr_jax.errors import UserError
 from spnr_jax.kernels.records import Light
 from spnr_jax.surfels import skies
 from spnr_jax.surfels.lighting import light_of
@@ -33,20 +34,20 @@ def read_envmap(path: Path) -> Float[np.ndarray, "height width 3"]:
     """Linear radiance of a latitude-longitude map; ValueError names the file and what is wrong with it."""
     if not path.is_file():
         known = ", ".join(NAMES)
-        raise ValueError(f"{path}: no such file; give a latitude-longitude .hdr or .exr, or one of {known}")
+        raise UserError(f"{path}: no such file; give a latitude-longitude .hdr or .exr, or one of {known}")
     if path.suffix.lower() not in ENDINGS:
-        raise ValueError(f"{path}: no map of radiance, which is .hdr or .exr; 8-bit pictures have no bright lamps")
+        raise UserError(f"{path}: no map of radiance, which is .hdr or .exr; 8-bit pictures have no bright lamps")
     if path.stat().st_size > MOST_BYTES:
         size = path.stat().st_size / 2**20
-        raise ValueError(f"{path}: {size:.0f} MB, more than {MOST_BYTES >> 20}; a map of 1024 x 512 texels is enough")
+        raise UserError(f"{path}: {size:.0f} MB, more than {MOST_BYTES >> 20}; a map of 1024 x 512 texels is enough")
     if find_spec("mitsuba") is None:
-        raise ValueError(f"{path}: maps are read by the package mitsuba; pip install 'spnr-jax[data]'")
+        raise UserError(f"{path}: maps are read by the package mitsuba; pip install 'spnr-jax[data]'")
     radiance = _read(path)
     height, width = radiance.shape[:2]
     if width != 2 * height:
-        raise ValueError(f"{path}: {width} x {height} texels; a latitude-longitude map is twice as wide as high")
+        raise UserError(f"{path}: {width} x {height} texels; a latitude-longitude map is twice as wide as high")
     if not np.isfinite(radiance).all() or radiance.min() < 0 or radiance.max() <= 0:
-        raise ValueError(f"{path}: expected finite radiance >= 0 with some light in it")
+        raise UserError(f"{path}: expected finite radiance >= 0 with some light in it")
     return radiance
 
 
@@ -58,10 +59,10 @@ def _read(path: Path) -> np.ndarray:
         with threads(2):  # with a single one the OpenEXR reader waits for itself for ever
             bitmap = mi.Bitmap(str(path))
             if bitmap.component_format() in (mi.Struct.Type.UInt8, mi.Struct.Type.UInt16):
-                raise ValueError(f"{path}: holds an 8- or 16-bit picture, not radiance; give a real .hdr or .exr")
+                raise UserError(f"{path}: holds an 8- or 16-bit picture, not radiance; give a real .hdr or .exr")
             bitmap = bitmap.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, srgb_gamma=False)
     except RuntimeError as error:
-        raise ValueError(f"{path}: not a readable .hdr or .exr ({str(error).splitlines()[0]})") from None
+        raise UserError(f"{path}: not a readable .hdr or .exr ({str(error).splitlines()[0]})") from None
     return np.array(bitmap, dtype=np.float32)
 
 

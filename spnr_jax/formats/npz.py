@@ -17,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
+from spnr_jax.errors import UserError
 from spnr_jax.formats.text import NUMBERS, Columns, plain_names
 
 HEADERS = threading.Lock()  # Python's parser, which NumPy reads headers with, fails in two threads at once (gh-106905)
@@ -45,11 +46,11 @@ def numpy_pieces(path: Path) -> Iterator[Columns]:
             yield _named_arrays(read_arrays(file, ARRAY_COLUMNS))
             return
     if not magic.startswith(b"\x93NUMPY"):
-        raise ValueError("is not a NumPy file")
+        raise UserError("is not a NumPy file")
     try:
         loaded = np.lib.format.open_memmap(path, mode="r")
     except UNREADABLE as error:
-        raise ValueError(f"is a broken, truncated or pickled NumPy file ({error})") from None
+        raise UserError(f"is a broken, truncated or pickled NumPy file ({error})") from None
     rows = np.atleast_1d(loaded)
     names = rows.dtype.names or plain_names(rows)
     step = max(1, PIECE_BYTES // max(1, rows[:1].nbytes))
@@ -71,15 +72,15 @@ def read_arrays(file: BufferedIOBase, wanted: Collection[str] | None = None) -> 
             names = [name for name in members if wanted is None or name in wanted]
             unpacked = sum(members[name].file_size for name in names)
             if unpacked > MOST_BYTES:
-                raise ValueError(
+                raise UserError(
                     f"unpacks to {unpacked} bytes, more than {MOST_BYTES}; use .npy, which is read in pieces"
                 )
             for name in names:
                 arrays[name] = _member(archive, members[name])
     except UNREADABLE as error:
-        raise ValueError(f"is a broken or truncated NumPy file ({error})") from None
+        raise UserError(f"is a broken or truncated NumPy file ({error})") from None
     if not arrays:
-        raise ValueError(f"has none of the arrays {', '.join(wanted or ())}; found {', '.join(members) or 'none'}")
+        raise UserError(f"has none of the arrays {', '.join(wanted or ())}; found {', '.join(members) or 'none'}")
     return arrays
 
 
@@ -90,9 +91,9 @@ def _member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
         read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
         shape, _, dtype = read_header(stream)
         if dtype.hasobject or any(size < 0 for size in shape):
-            raise ValueError(f"{info.filename} holds objects or a negative size, shape {shape} and type {dtype}")
+            raise UserError(f"{info.filename} holds objects or a negative size, shape {shape} and type {dtype}")
         if math.prod(shape) * dtype.itemsize > info.file_size:
-            raise ValueError(f"{info.filename} is cut off: shape {shape} of {dtype} in {info.file_size} bytes")
+            raise UserError(f"{info.filename} is cut off: shape {shape} of {dtype} in {info.file_size} bytes")
     with HEADERS, archive.open(info) as stream:
         return np.lib.format.read_array(stream, allow_pickle=False)
 
@@ -104,12 +105,10 @@ def _named_arrays(archive: dict[str, np.ndarray]) -> Columns:
         targets = ARRAY_COLUMNS[name]
         table = array[:, None] if array.ndim == 1 else array
         if table.ndim != 2 or table.shape[1] != len(targets) or table.dtype.kind not in NUMBERS:
-            raise ValueError(
-                f"has {name!r} of shape {array.shape} and type {array.dtype}, not (points, {len(targets)})"
-            )
+            raise UserError(f"has {name!r} of shape {array.shape} and type {array.dtype}, not (points, {len(targets)})")
         columns |= dict(zip(targets, table.T, strict=True))
     if "x" not in columns:
-        raise ValueError(f"has no array named positions, points or xyz; found {', '.join(archive) or 'none'}")
+        raise UserError(f"has no array named positions, points or xyz; found {', '.join(archive) or 'none'}")
     if len({len(column) for column in columns.values()}) > 1:
-        raise ValueError(f"has arrays of different lengths: { {name: len(array) for name, array in columns.items()} }")
+        raise UserError(f"has arrays of different lengths: { {name: len(array) for name, array in columns.items()} }")
     return columns

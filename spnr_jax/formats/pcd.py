@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from spnr_jax.errors import UserError
 from spnr_jax.formats.ply import binary_rows, text_rows
 
 HEADER_LIMIT = 2**16  # bytes
@@ -65,7 +66,7 @@ def _unpacked(points: np.ndarray) -> dict[str, np.ndarray]:
         return columns
     bits = columns.pop(packed)
     if bits.dtype.itemsize != 4:
-        raise ValueError(f"has a field {packed!r} of {bits.dtype.itemsize} bytes; expected one 4-byte number")
+        raise UserError(f"has a field {packed!r} of {bits.dtype.itemsize} bytes; expected one 4-byte number")
     numbers = bits.view(np.uint32)
     shifts = {"r": 16, "g": 8, "b": 0}
     return columns | {name: (numbers >> shift & 255).astype(np.uint8) for name, shift in shifts.items()}
@@ -75,17 +76,17 @@ def _header(data: bytes) -> PcdHeader:
     """The header of a PCD file."""
     end = re.search(rb"^DATA[ \t]+(\w+)[ \t]*\r?\n", data[:HEADER_LIMIT], re.MULTILINE)
     if end is None:
-        raise ValueError("is not a PCD file, or its header is cut off (expected '# .PCD' ... 'DATA')")
+        raise UserError("is not a PCD file, or its header is cut off (expected '# .PCD' ... 'DATA')")
     entries: dict[str, list[str]] = {}
     for line in data[: end.end()].decode("ascii", "replace").splitlines():
         word, *values = line.split() or ["#"]
         if word in ENTRIES:
             entries[word] = values
         elif not word.startswith("#"):
-            raise ValueError(f"has a PCD header line that is not understood: {line.strip()!r}")
+            raise UserError(f"has a PCD header line that is not understood: {line.strip()!r}")
     encoding = end[1].decode("ascii", "replace")
     if encoding not in ENCODINGS:
-        raise ValueError(f"has PCD data of kind {encoding!r}; expected one of {', '.join(ENCODINGS)}")
+        raise UserError(f"has PCD data of kind {encoding!r}; expected one of {', '.join(ENCODINGS)}")
     try:
         names, kinds = entries["FIELDS"], entries["TYPE"]
         sizes = [int(size) for size in entries["SIZE"]]
@@ -98,9 +99,9 @@ def _header(data: bytes) -> PcdHeader:
         ]
         layout = np.dtype(fields).newbyteorder("<")
     except (KeyError, IndexError, TypeError, ValueError) as error:
-        raise ValueError(f"has a PCD header whose FIELDS, SIZE, TYPE, COUNT and POINTS disagree ({error})") from None
+        raise UserError(f"has a PCD header whose FIELDS, SIZE, TYPE, COUNT and POINTS disagree ({error})") from None
     if num_points < 0:
-        raise ValueError(f"has a PCD header that announces {num_points} points")
+        raise UserError(f"has a PCD header that announces {num_points} points")
     organised = entries.get("HEIGHT", ["1"])[:1] not in (["0"], ["1"])
     sensor = _sensor(entries.get("VIEWPOINT", []))
     return PcdHeader(
@@ -120,12 +121,12 @@ def _sensor(viewpoint: list[str]) -> tuple[float, ...] | None:
 def _columns(body: bytes, header: PcdHeader) -> np.ndarray:
     """The points of a compressed file, one field of all points after the other."""
     if len(body) < 8:
-        raise ValueError("is cut off: its compressed data is missing")
+        raise UserError("is cut off: its compressed data is missing")
     compressed, plain = (int(size) for size in np.frombuffer(body, "<u4", 2))
     if len(body) - 8 < compressed:
-        raise ValueError(f"is cut off: expected {compressed} bytes of compressed data, found {len(body) - 8}")
+        raise UserError(f"is cut off: expected {compressed} bytes of compressed data, found {len(body) - 8}")
     if plain != header.num_points * header.layout.itemsize:
-        raise ValueError(f"announces {plain} bytes of points, its header {header.num_points * header.layout.itemsize}")
+        raise UserError(f"announces {plain} bytes of points, its header {header.num_points * header.layout.itemsize}")
     unpacked = decompress(body[8 : 8 + compressed], plain)
     points, start = np.empty(header.num_points, header.layout), 0
     for name in header.layout.names or ():
@@ -159,7 +160,7 @@ def decompress(data: bytes, size: int) -> bytes:
             # a copy may reach into itself: the piece so far is then repeated
             plain += (plain[start : start + length] * (length // distance + 1))[:length]
     except IndexError:
-        raise ValueError("has compressed data that is damaged") from None
+        raise UserError("has compressed data that is damaged") from None
     if len(plain) != size:
-        raise ValueError(f"has compressed data that is damaged: {len(plain)} bytes come out, {size} are announced")
+        raise UserError(f"has compressed data that is damaged: {len(plain)} bytes come out, {size} are announced")
     return bytes(plain)

@@ -14,6 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
+from spnr_jax.errors import UserError
+
 Columns = dict[str, np.ndarray]
 Element = tuple[str, int, list[tuple[str, str | None]]]  # name, count, [(property, type)]; the type of a list is None
 
@@ -46,7 +48,7 @@ def read_ply_header(file: BufferedIOBase) -> PlyHeader:
     data = file.read(HEADER_LIMIT)
     end = re.search(rb"^end_header[ \t]*(\r\n|\n|\r)", data, re.MULTILINE)
     if not data.startswith(b"ply") or end is None:
-        raise ValueError("is not a PLY file, or its header is cut off (expected 'ply' ... 'end_header')")
+        raise UserError("is not a PLY file, or its header is cut off (expected 'ply' ... 'end_header')")
     byte_order: str | None = "unknown"
     elements: list[Element] = []
     for line in data[: end.start()].decode("ascii", "replace").splitlines()[1:]:
@@ -62,9 +64,9 @@ def read_ply_header(file: BufferedIOBase) -> PlyHeader:
             case [] | ["comment" | "obj_info", *_]:
                 pass
             case _:
-                raise ValueError(f"has a PLY header line that is not understood: {line.strip()!r}")
+                raise UserError(f"has a PLY header line that is not understood: {line.strip()!r}")
     if byte_order == "unknown":
-        raise ValueError(f"has a PLY header without a known format; expected one of {', '.join(BYTE_ORDERS)}")
+        raise UserError(f"has a PLY header without a known format; expected one of {', '.join(BYTE_ORDERS)}")
     file.seek(end.end())
     return PlyHeader(byte_order=byte_order, elements=elements)
 
@@ -81,9 +83,7 @@ def vertex_pieces(file: BufferedIOBase) -> Iterator[Columns]:
     rows_before = bytes_before = 0
     for name, count, properties in header.elements:
         if count and any(kind is None for _, kind in properties):
-            raise ValueError(
-                f"has lists in its PLY element {name!r}, in or before the vertices: not readable as points"
-            )
+            raise UserError(f"has lists in its PLY element {name!r}, in or before the vertices: not readable as points")
         order = header.byte_order or "="
         layout = np.dtype([(field, order + kind) for field, kind in properties if kind is not None])
         if name == "vertex":
@@ -95,7 +95,7 @@ def vertex_pieces(file: BufferedIOBase) -> Iterator[Columns]:
             yield from ({field.lower(): piece[field] for field in layout.names or ()} for piece in rows)
             return
         rows_before, bytes_before = rows_before + count, bytes_before + count * layout.itemsize
-    raise ValueError(f"has no PLY element 'vertex', only {', '.join(name for name, _, _ in header.elements) or 'none'}")
+    raise UserError(f"has no PLY element 'vertex', only {', '.join(name for name, _, _ in header.elements) or 'none'}")
 
 
 def camera_row(file: BufferedIOBase) -> dict[str, float]:
@@ -125,7 +125,7 @@ def text_rows(lines: Iterator[str], count: int, layout: np.dtype) -> Iterator[np
         rows = list(islice(lines, min(PIECE_LINES, count - found)))
         found += len(rows)
         if not rows or (len(rows) < PIECE_LINES and found < count):
-            raise ValueError(f"is cut off: its header announces {count} points, the data ends after {found}")
+            raise UserError(f"is cut off: its header announces {count} points, the data ends after {found}")
         yield np.loadtxt(rows, dtype=layout, comments=None, ndmin=1)
     if not count:
         yield np.empty(0, layout)
@@ -138,7 +138,7 @@ def binary_rows(file: BufferedIOBase, count: int, layout: np.dtype) -> Iterator[
         wanted = min(max(1, PIECE_BYTES // size), count - found)
         data = file.read(wanted * size)
         if len(data) < wanted * size:
-            raise ValueError(
+            raise UserError(
                 f"is cut off: its header announces {count} points, the data ends after {found + len(data) // size}"
             )
         yield np.frombuffer(data, layout, wanted)

@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from spnr_jax.errors import UserError
 from spnr_jax.formats.splats import NAMES as SPLAT_NAMES
 from spnr_jax.formats.splats import points_of_splats
 from spnr_jax.kernels.colors import srgb_to_linear
@@ -73,7 +74,7 @@ def useful(columns: Columns) -> Columns:
         group = next((group for group in groups if set(group) <= plain.keys()), ())
         found |= {name: plain[alias] for name, alias in zip(names, group, strict=bool(group))}
     if not set(POSITION) <= found.keys():
-        raise ValueError(
+        raise UserError(
             "needs the properties x y z (and may have red green blue, roughness, metallic); "
             f"found {' '.join(columns) or 'none'}"
         )
@@ -148,7 +149,7 @@ def _full(values: np.ndarray, linear: bool = True) -> float:
     if linear or highest <= 1 + ROUNDING:
         return 1.0
     if highest < 2:
-        raise ValueError(f"has colours up to {highest:g}: neither 0 to 1 nor 0 to 255")
+        raise UserError(f"has colours up to {highest:g}: neither 0 to 1 nor 0 to 255")
     return 255.0
 
 
@@ -156,5 +157,5 @@ def _unit_interval(values: np.ndarray, name: str) -> np.ndarray:
     """The values, rounding errors removed; ValueError if they are not in [0, 1]."""
     low, high = values.min(), values.max()
     if not (low >= -ROUNDING and high <= 1 + ROUNDING):
-        raise ValueError(f"has {name} from {low:g} to {high:g}; expected 0 to 1 (colours: or 0 to 255)")
+        raise UserError(f"has {name} from {low:g} to {high:g}; expected 0 to 1 (colours: or 0 to 255)")
     return np.clip(values, 0, 1)

@@ -13,6 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from spnr_jax.errors import UserError
+
 INDEX = "index.json"
 LONGEST_NAME = 200  # file systems allow 255 bytes
 
@@ -35,21 +37,23 @@ def open_shards(folder: Path) -> Shards | None:
 
     try:
         index = json.loads(path.read_text())
+        if not isinstance(index["shards"], dict):
+            raise UserError("holds no table of shards")
         if strange := [name for name in (*index["shards"], *index["ids"]) if not is_plain_name(name)]:
-            raise ValueError(f"{strange[0]!r} is no name of a file or object")
+            raise UserError(f"{strange[0]!r} is no name of a file or object")
         files = {folder / "shards" / file: int(count) for file, count in index["shards"].items()}
         places = {name: place for place, name in enumerate(index["ids"])}
-    except (ValueError, LookupError, AttributeError, TypeError, OverflowError, RecursionError) as error:
-        raise ValueError(f"{path}: damaged ({error}); pack the data set again") from None
+    except (ValueError, LookupError, TypeError, OverflowError, RecursionError) as error:
+        raise UserError(f"{path}: damaged ({error}); pack the data set again") from None
     if absent := [file for file in files if not file.is_file()]:
-        raise ValueError(f"{absent[0]}: missing; pack the data set again")
+        raise UserError(f"{absent[0]}: missing; pack the data set again")
     try:
         records = grain.sources.ArrayRecordDataSource([str(file) for file in files])
         found = len(records)
     except (RuntimeError, ValueError, OSError) as error:
-        raise ValueError(f"{folder}: its shards cannot be read ({first_line(error)}); pack them again") from None
+        raise UserError(f"{folder}: its shards cannot be read ({first_line(error)}); pack them again") from None
     if not found == len(places) == sum(files.values()):
-        raise ValueError(f"{folder}: {found} objects in the shards, {len(places)} in {INDEX}; pack the data set again")
+        raise UserError(f"{folder}: {found} objects in the shards, {len(places)} in {INDEX}; pack the data set again")
     return Shards(folder=folder, places=places, records=records)
 
 
@@ -58,14 +62,14 @@ def read_files(shards: Shards, name: str) -> dict[str, bytes]:
     import msgpack
 
     if name not in shards.places:
-        raise ValueError(f"{shards.folder}: holds no object {name}; pack the data set again")
+        raise UserError(f"{shards.folder}: holds no object {name}; pack the data set again")
     try:
         files = msgpack.unpackb(shards.records[shards.places[name]])
         if not isinstance(files, dict) or not all(isinstance(content, bytes) for content in files.values()):
-            raise ValueError("its record holds no files")
+            raise UserError("its record holds no files")
         return files
     except (RuntimeError, ValueError, OSError, LookupError, TypeError) as error:
-        raise ValueError(
+        raise UserError(
             f"{shards.folder}: object {name} cannot be read ({first_line(error)}); pack the data set again"
         ) from None
 

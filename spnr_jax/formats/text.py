@@ -16,6 +16,8 @@ from pathlib import Path
 
 import numpy as np
 
+from spnr_jax.errors import UserError
+
 Columns = dict[str, np.ndarray]
 
 POSITION, COLOR, NORMAL = ("x", "y", "z"), ("r", "g", "b"), ("nx", "ny", "nz")
@@ -37,7 +39,7 @@ def text_pieces(path: Path) -> Iterator[Columns]:
             table = np.loadtxt(rows, delimiter=delimiter, comments=None, ndmin=2)
             names = names or _names(header, is_comment, table)
             if len(names) != table.shape[1]:
-                raise ValueError(f"the number of columns changed from {len(names)} to {table.shape[1]}")
+                raise UserError(f"the number of columns changed from {len(names)} to {table.shape[1]}")
             yield dict(zip(names, table.T, strict=True))
 
 
@@ -59,7 +61,7 @@ def _names(header: str, is_comment: bool, table: np.ndarray) -> tuple[str, ...]:
     if is_comment and ("x" not in names or len(names) != table.shape[1]):
         return plain_names(table)
     if len(names) != table.shape[1]:
-        raise ValueError(f"names {len(names)} columns ({' '.join(names)}) above {table.shape[1]} columns of numbers")
+        raise UserError(f"names {len(names)} columns ({' '.join(names)}) above {table.shape[1]} columns of numbers")
     return names
 
 
@@ -74,7 +76,7 @@ def plain_names(table: np.ndarray) -> tuple[str, ...]:
         if count == 9:
             rest = (*NORMAL, *COLOR) if _are_normals(table[:, 3:6]) else (*COLOR, *NORMAL)
             return (*POSITION, *rest)
-    raise ValueError(
+    raise UserError(
         f"has numbers of shape {table.shape} and type {table.dtype} without column names; expected rows of 3, 4, 6, 8 "
         "or 9 numbers (x y z; + intensity; + r g b; + r g b roughness metallic; + r g b nx ny nz), or a header line "
         "that names the columns"

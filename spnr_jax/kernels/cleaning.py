@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 
+from spnr_jax.errors import UserError
 from spnr_jax.kernels.records import PointCloud
 
 Strength = Literal["auto", "strong"]
@@ -57,9 +58,9 @@ def clean(cloud: PointCloud, strength: Strength = "auto") -> tuple[PointCloud, l
     averages at smaller deviations.  ValueError for a batch of clouds or an unknown strength.
     """
     if strength not in NOISY:
-        raise ValueError(f"strength must be one of {', '.join(NOISY)}, got {strength!r}")
+        raise UserError(f"strength must be one of {', '.join(NOISY)}, got {strength!r}")
     if np.ndim(cloud.positions) != 2:
-        raise ValueError(f"clean takes one cloud, positions (points, 3); got shape {np.shape(cloud.positions)}")
+        raise UserError(f"clean takes one cloud, positions (points, 3); got shape {np.shape(cloud.positions)}")
     real = np.asarray(cloud.mask)
     columns = {name: np.asarray(x)[real] for name, x in vars(cloud).items() if x is not None and name != "mask"}
     positions, values, lines = cleaned(columns.pop("positions"), columns, strength)

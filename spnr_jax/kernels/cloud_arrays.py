@@ -3,6 +3,7 @@
 import jax
 import numpy as np
 
+from spnr_jax.errors import UserError
 from spnr_jax.kernels.records import PointCloud
 
 SMALLEST_BUCKET = 512
@@ -12,7 +13,7 @@ def pad(cloud: PointCloud, size: int) -> PointCloud:
     """The cloud (points, ...) with zeros behind it up to `size` points, for which `mask` is False."""
     missing = size - len(cloud.mask)
     if missing < 0:
-        raise ValueError(f"a cloud of {len(cloud.mask)} points does not fit into {size}; thin it out first")
+        raise UserError(f"a cloud of {len(cloud.mask)} points does not fit into {size}; thin it out first")
 
     def extend(values):
         return np.concatenate([values, np.zeros((missing, *values.shape[1:]), values.dtype)])
@@ -23,7 +24,7 @@ def pad(cloud: PointCloud, size: int) -> PointCloud:
 def bucket(count: int) -> int:
     """The smallest of 512, 1024, 2048, ... that holds `count` points: few sizes, so few compilations."""
     if count < 1:
-        raise ValueError(f"a cloud needs at least 1 point, got {count}")
+        raise UserError(f"a cloud needs at least 1 point, got {count}")
     return max(SMALLEST_BUCKET, 1 << (count - 1).bit_length())
 
 

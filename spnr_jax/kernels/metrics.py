@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from spnr_jax.errors import UserError
 from spnr_jax.kernels.numerics import safe_divide
 
 PSNR_CAP = 100.0  # dB, of identical images
@@ -47,7 +48,7 @@ def ssim(
     Off by up to 1e-3 where both images are bright and flat: a small variance is the difference of large squares.
     """
     if min(image.shape[-3:-1]) < 2 * SSIM_RADIUS + 1:
-        raise ValueError(f"ssim needs images of at least {2 * SSIM_RADIUS + 1} pixels, got {image.shape[-3:-1]}")
+        raise UserError(f"ssim needs images of at least {2 * SSIM_RADIUS + 1} pixels, got {image.shape[-3:-1]}")
     taps = np.exp(-0.5 * (np.arange(-SSIM_RADIUS, SSIM_RADIUS + 1) / SSIM_SIGMA) ** 2)
     taps = (taps / taps.sum()).tolist()
 

@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from spnr_jax.errors import UserError
 from spnr_jax.kernels.records import PointCloud
 from spnr_jax.kernels.thinning import first_in_voxels, frame
 
@@ -64,7 +65,7 @@ def cut_out(
     `crop` is xmin ymin zmin xmax ymax zmax.  ValueError, which names the step, where nothing is left.
     """
     if np.ndim(cloud.positions) != 2:
-        raise ValueError(f"cut_out takes one cloud, positions (points, 3); got shape {np.shape(cloud.positions)}")
+        raise UserError(f"cut_out takes one cloud, positions (points, 3); got shape {np.shape(cloud.positions)}")
     left, lines = np.flatnonzero(np.asarray(cloud.mask)), []
     positions = np.asarray(cloud.positions, np.float64)
     if not len(left) or not (crop or remove_plane or nth):
@@ -88,7 +89,7 @@ def cropped(kept: int, seen: int, box: Box, low: np.ndarray, high: np.ndarray) -
     """The line about a box, of points that lie from low (3,) to high (3,); ValueError if it holds none of them."""
     if not kept:
         asked = " ".join(f"{value:g}" for value in box)
-        raise ValueError(f"--crop {asked}: none of the {seen:,} points, they lie in the box {_written(low, high)}")
+        raise UserError(f"--crop {asked}: none of the {seen:,} points, they lie in the box {_written(low, high)}")
     return f"--crop: {kept:,} of {seen:,} points lie inside"
 
 
@@ -115,10 +116,10 @@ def object_of(
     if remove_plane:
         plane = dominant_plane(positions, seed)
         if plane is None:
-            raise ValueError(f"--remove-plane: no plane holds {LEAST_PLANE:.0%} of the surface; leave it out")
+            raise UserError(f"--remove-plane: no plane holds {LEAST_PLANE:.0%} of the surface; leave it out")
         rows = np.flatnonzero(~plane.holds(positions))
         if not len(rows):
-            raise ValueError(f"--remove-plane: all of the {len(positions):,} points lie in one plane; leave it out")
+            raise UserError(f"--remove-plane: all of the {len(positions):,} points lie in one plane; leave it out")
         lines.append(
             f"--remove-plane: {len(rows):,} of {len(positions):,} points left, without those within "
             f"{plane.thickness:.3g} of the plane through most of the surface"
@@ -128,7 +129,7 @@ def object_of(
         count = int(labels.max()) + 1
         if nth > count:
             there = f"are {count} clusters" if count > 1 else "is 1 cluster"
-            raise ValueError(f"--object {nth}: there {there} of points; choose one from 1 to {count}")
+            raise UserError(f"--object {nth}: there {there} of points; choose one from 1 to {count}")
         chosen = rows[labels == nth - 1]
         box = _written(positions[chosen].min(axis=0) + origin, positions[chosen].max(axis=0) + origin)
         lines.append(f"--object: cluster {nth} of {count:,}, {len(chosen):,} of {len(rows):,} points, in the box {box}")

@@ -21,6 +21,7 @@ from jaxtyping import Array, Float
 from scipy.spatial import cKDTree
 
 from spnr_jax.devices.placement import by_all_devices, everywhere
+from spnr_jax.errors import UserError
 from spnr_jax.kernels import cameras, cloud_arrays, supersampling
 from spnr_jax.kernels.records import Camera, Light, PointCloud, Rendering
 from spnr_jax.method import inference, surfel_renderer
@@ -59,10 +60,10 @@ class Model:
         positions = np.asarray(cloud.positions, np.float32)
         mask = np.asarray(cloud.mask)
         if not mask.any():
-            raise ValueError("the cloud has no points; give at least one")
+            raise UserError("the cloud has no points; give at least one")
         for name, values in vars(cloud).items():
             if values is not None and not np.isfinite(np.asarray(values)[mask]).all():
-                raise ValueError(f"the cloud has NaN or infinity in its {name}; remove those points")
+                raise UserError(f"the cloud has NaN or infinity in its {name}; remove those points")
         centre, scale = cloud_arrays.normalization(positions[mask])
         # the ends of a thin stick lie on the faces of the box: rounding must not push them out of it
         inside = np.clip((positions - centre) * scale, -1, 1).astype(np.float32)
@@ -97,9 +98,9 @@ class Model:
             drawn = draw(self._shader(quality), volume.scene, inside, _or_room(light), config=self.config)
             return _in_units(drawn, volume)
         if light is not None:
-            raise ValueError("this network knows the light of its training alone; give no light")
+            raise UserError("this network knows the light of its training alone; give no light")
         if self.config.upsamples and (camera.height % 2 or camera.width % 2):
-            raise ValueError(f"this network doubles its pictures: {camera.width} x {camera.height} pixels must be even")
+            raise UserError(f"this network doubles its pictures: {camera.width} x {camera.height} pixels must be even")
         config = at_quality(self.config, quality, volume.reach)
         needed = supersampling.rays_per_side(config, camera.width)
         side = needed if quality == "best" else 1
@@ -197,7 +198,7 @@ def _in_units(drawn: Rendering, volume: Volume) -> Rendering:
 
 def _check_quality(quality: str) -> None:
     if quality not in (*SAMPLES, "trained"):
-        raise ValueError(f"quality must be one of {', '.join(SAMPLES)}, trained, got {quality}")
+        raise UserError(f"quality must be one of {', '.join(SAMPLES)}, trained, got {quality}")
 
 
 def at_quality(config: NetworkConfig, quality: Quality, reach: int) -> NetworkConfig:

@@ -18,6 +18,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float
 
+from spnr_jax.errors import UserError
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.compositing import WHITE
 from spnr_jax.kernels.records import AnyArray, Camera, Key, Light, PointCloud, Rendering, Surfels
@@ -168,7 +169,7 @@ def _window(box: np.ndarray, doublings: int, side: int) -> Plan:
 def _rounded(count: int, least: int, most: int) -> int:
     """A power of the root of two that holds the count: few sizes, few compilations."""
     if count > most:
-        raise ValueError(f"the picture needs {count} entries of discs, at most {most} are drawn; ask for a smaller one")
+        raise UserError(f"the picture needs {count} entries of discs, at most {most} are drawn; ask for a smaller one")
     return min(int(2 ** (np.ceil(2 * np.log2(max(count, least))) / 2)), most)
 
 

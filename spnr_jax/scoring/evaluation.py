@@ -5,6 +5,7 @@ scored by the same metrics.  The radius of the point renderers is chosen on trai
 spacing with the best PSNR.
 """
 
+import dataclasses
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
@@ -17,15 +18,17 @@ from jaxtyping import Array, Float
 
 from spnr_jax.config import TrainConfig
 from spnr_jax.devices import machine
+from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
 from spnr_jax.kernels import metrics
 from spnr_jax.kernels.records import Camera, PointCloud
 from spnr_jax.method import inference
+from spnr_jax.model_config import kind_of
 from spnr_jax.scoring import floors
 from spnr_jax.scoring.flip import flip
 from spnr_jax.scoring.lpips import LpipsWeights, lpips
 from spnr_jax.scoring.summary import Scores, differences, metric_settings, summarise
-from spnr_jax.training.weights import read_trained
+from spnr_jax.training.weights import Trained, read_trained
 
 RADIUS_FACTORS = (0.5, 0.75, 1.0, 1.5, 2.0)
 FLOORS = ("white", "splat", "nearest")
@@ -92,7 +95,7 @@ def choose_radius(dataset: data_sets.Dataset, config: TrainConfig, method: str, 
     """The radius factor with the highest PSNR over a few training objects."""
     items = [data_sets.read_object(dataset, name) for name in dataset.splits["train"][:num_objects]]
     if not items:
-        raise ValueError(f"{dataset.folder}: no training objects to choose the radius of `{method}` on; generate some")
+        raise UserError(f"{dataset.folder}: no training objects to choose the radius of `{method}` on; generate some")
 
     def mean_psnr(factor: float) -> float:
         values = []
@@ -105,9 +108,10 @@ def choose_radius(dataset: data_sets.Dataset, config: TrainConfig, method: str, 
 
 
 def network(variables: dict, config: TrainConfig) -> Method:
-    """The method of a trained network."""
+    """The method of a trained network; one that uses normals has to estimate them, because the others see none."""
 
     def show(cloud: PointCloud, camera: Camera) -> Pictures:
+        cloud = dataclasses.replace(cloud, normals=None)
         rendering = inference.render_views(variables, config.model, cloud, camera)
         return Pictures(image=rendering.image, acc=rendering.acc, depth=rendering.depth)
 
@@ -142,7 +146,7 @@ def evaluate_object(
     """Pictures and scores of one object."""
     data_sets.check_renders(item, config)
     if item.lights is not None:
-        raise ValueError(
+        raise UserError(
             f"object {item.name}: each view has its own light; `experiments.studies.relighting` scores those"
         )
     cloud = data_sets.test_cloud(item, config)
@@ -219,25 +223,39 @@ def evaluate(
     say: Callable[[str], None] = print,
     weights: LpipsWeights | None = None,
 ) -> Evaluation:
-    """Scores of a run's newest checkpoint on a split; LPIPS if there are weights for it."""
+    """Scores of a run's newest checkpoint on a split, named by what it is (`kind_of`); LPIPS if there are weights."""
     trained = read_trained(run, say, data=dataset.folder)
-    config = trained.config
+    return compare({kind_of(trained.config.model): trained}, dataset, split, gallery_objects, say, weights)
+
+
+def compare(
+    trained: dict[str, Trained],
+    dataset: data_sets.Dataset,
+    split: str = "test",
+    gallery_objects: int = 16,
+    say: Callable[[str], None] = print,
+    weights: LpipsWeights | None = None,
+) -> Evaluation:
+    """Scores of networks on a split, all with the points of the first, which the others are subtracted from."""
+    first = next(iter(trained))
+    config = trained[first].config
     names = dataset.splits[split]
     if not names:
-        raise ValueError(f"{dataset.folder}: the {split} split is empty; choose another one or generate more objects")
+        raise UserError(f"{dataset.folder}: the {split} split is empty; choose another one or generate more objects")
     factors = {method: choose_radius(dataset, config, method) for method in ("splat", "nearest")}
-    methods = {"ours": network(trained.variables, config)}
+    methods = {name: network(one.variables, one.config) for name, one in trained.items()}
     methods |= {name: floor(name, factors.get(name, 1.0)) for name in FLOORS}
     scores, gallery = score_methods(methods, config, dataset, names, gallery_objects, say, weights)
     summary = {
         "methods": summarise(list(scores.values())),
-        "ours_minus": differences(list(scores.values())),
+        f"{first}_minus": differences(list(scores.values()), first),
         "preset": config.preset,
-        "steps": trained.steps,
+        "steps": trained[first].steps,
         "seed": config.seed,
         "hardware": machine.hardware(),
         "settings": {
             "split": split,
+            "networks": {name: {"preset": one.config.preset, "steps": one.steps} for name, one in trained.items()},
             "points": config.test_points,
             "radius factors": factors,
             "metrics": metric_settings(with_lpips=weights is not None),

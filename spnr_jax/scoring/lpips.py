@@ -14,6 +14,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float
 
+from spnr_jax.errors import UserError
 from spnr_jax.kernels.records import AnyArray
 
 # of each convolution: channels, window, stride, padding; a 3 x 3 max-pooling of stride 2 stands before some
@@ -42,7 +43,7 @@ def lpips(
     """Distance of each pair of images; 0 with gradient 0 for identical ones."""
     *batch, height, width, _ = image.shape
     if min(height, width) < SMALLEST:
-        raise ValueError(f"lpips needs images of at least {SMALLEST} pixels, got {(height, width)}")
+        raise UserError(f"lpips needs images of at least {SMALLEST} pixels, got {(height, width)}")
     pair = jnp.stack([image, reference]).reshape(-1, height, width, 3)
     total = jnp.zeros(batch, image.dtype)
     for layer, head in zip(features(pair, weights), weights.heads, strict=True):

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from spnr_jax.errors import UserError
 from spnr_jax.formats.images import write_whole
 from spnr_jax.formats.npz import read_arrays
 from spnr_jax.scoring.lpips import CHANNELS, WINDOWS, LpipsWeights
@@ -28,12 +29,12 @@ def read_weights(path: Path) -> LpipsWeights:
     """The weights of a file; ValueError that says what is wrong with it."""
     advice = "make it with `spnr convert-lpips`"
     if not path.is_file():
-        raise ValueError(f"{path}: no such file of LPIPS weights; {advice}")
+        raise UserError(f"{path}: no such file of LPIPS weights; {advice}")
     try:
         with path.open("rb") as file:
             arrays = read_arrays(file, SHAPES)
     except ValueError as error:
-        raise ValueError(f"{path}: not an .npz file of LPIPS weights ({error}); {advice}") from None
+        raise UserError(f"{path}: not an .npz file of LPIPS weights ({error}); {advice}") from None
     return from_arrays(arrays, path)
 
 
@@ -42,9 +43,9 @@ def from_arrays(arrays: dict[str, np.ndarray], path: Path) -> LpipsWeights:
     for name, shape in SHAPES.items():
         found = arrays[name].shape if name in arrays else "nothing"
         if found != shape:
-            raise ValueError(f"{path}: {name} should be an array {shape}, found {found}; use AlexNet and heads v0.1")
+            raise UserError(f"{path}: {name} should be an array {shape}, found {found}; use AlexNet and heads v0.1")
         if not np.isfinite(arrays[name]).all():
-            raise ValueError(f"{path}: {name} holds NaN or infinity; fetch the file anew")
+            raise UserError(f"{path}: {name} holds NaN or infinity; fetch the file anew")
 
     def five(name):
         return tuple(np.asarray(arrays[f"{name}_{i}"], np.float32) for i in range(len(CHANNELS)))
@@ -70,19 +71,19 @@ def convert(alexnet: Path, heads: Path, out: Path) -> None:
 def _read_state(path: Path) -> dict:
     """The tensors of a PyTorch file, read without running what a pickle may hold."""
     if not path.is_file():
-        raise ValueError(f"{path}: no such file; give a .pth file of weights")
+        raise UserError(f"{path}: no such file; give a .pth file of weights")
     try:
         torch = importlib.import_module("torch")
     except ModuleNotFoundError:
-        raise ValueError("converting LPIPS weights needs PyTorch; `pip install torch`, once, anywhere") from None
+        raise UserError("converting LPIPS weights needs PyTorch; `pip install torch`, once, anywhere") from None
     try:
         return torch.load(path, map_location="cpu", weights_only=True)
     except (RuntimeError, EOFError, OSError, ValueError, KeyError, pickle.UnpicklingError) as error:
         reason = str(error).partition("\n")[0]
-        raise ValueError(f"{path}: not a PyTorch file of weights ({reason})") from None
+        raise UserError(f"{path}: not a PyTorch file of weights ({reason})") from None
 
 
 def _entry(state: dict, name: str, path: Path) -> np.ndarray:
     if name not in state:
-        raise ValueError(f"{path}: {name} is missing; expected torchvision's AlexNet and LPIPS's heads v0.1 (alex.pth)")
+        raise UserError(f"{path}: {name} is missing; expected torchvision's AlexNet and LPIPS's heads v0.1 (alex.pth)")
     return state[name].numpy()

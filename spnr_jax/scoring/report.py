@@ -18,7 +18,18 @@ from spnr_jax.scoring.learning_curve import learning_curve_svg
 from spnr_jax.scoring.report_style import STYLE
 from spnr_jax.scoring.summary import NO_WEIGHTS
 
-METHODS = {"ours": "Ours", "nearest": "Nearest-point shading", "splat": "Base-colour splat", "white": "White image"}
+METHODS = {  # method -> its name in tables and pictures, in their order
+    "ours": "Ours",
+    "surfels": "Surfels",
+    "near_points": "Near points",
+    "paper": "The paper's network",
+    "npbg": "NPBG",
+    "point_nerf": "Point-NeRF",
+    "points2nerf": "Points2NeRF",
+    "nearest": "Nearest-point shading",
+    "splat": "Base-colour splat",
+    "white": "White image",
+}
 HIGHER, LOWER = 1, -1  # what is better
 QUALITY = {  # metric -> head of its column, decimals, what is better
     "psnr": ("PSNR, dB", 2, HIGHER),
@@ -31,8 +42,8 @@ QUALITY = {  # metric -> head of its column, decimals, what is better
 ARROWS = {HIGHER: "\N{UPWARDS ARROW}", LOWER: "\N{DOWNWARDS ARROW}"}
 COUNTS = {"objects": "Objects", "views": "Views", "cpsnr_views": "cPSNR views"}
 GALLERY_NOTE = (
-    "The network never saw these objects. The number below a picture is its PSNR in dB. Depth: bright is near, dark "
-    "is far, spanning each picture's own range. Opacity: white is solid. Both are those of our network."
+    "No network saw these objects. The number below a picture is its PSNR in dB. Depth: bright is near, dark is far, "
+    "spanning each picture's own range. Opacity: white is solid. Both are those of the first network."
 )
 QUALITY_NOTE = (
     "Means over images, sRGB in [0, 1] over white. PSNR is capped at 100 dB. SSIM with a Gaussian window of sigma 1.5. "
@@ -41,16 +52,16 @@ QUALITY_NOTE = (
     "bootstrap interval over objects."
 )
 DIFFERENCES_NOTE = (
-    "Ours minus each other method, image by image, so what makes an object hard for both cancels. Small: 95 % "
-    "bootstrap interval over objects, and the p-value of a sign-flip test over objects."
+    "The first network minus each other method, image by image, so what makes an object hard for both cancels. Small: "
+    "95 % bootstrap interval over objects, and the p-value of a sign-flip test over objects."
 )
 
 
 @dataclass(frozen=True, kw_only=True)
 class GalleryRow:
-    """One view of one object, as the reference and as each method shows it, the network first.
+    """One view of one object, as the reference and as each method shows it, the networks first.
 
-    Pictures are (h, w, 3), uint8 or float sRGB in [0, 1]; depth and acc (h', w') float are the network's.
+    Pictures are (h, w, 3), uint8 or float sRGB in [0, 1]; depth and acc (h', w') float are the first network's.
     """
 
     name: str
@@ -73,21 +84,21 @@ def write_report(
 ) -> None:
     """Write the page in one piece.
 
-    `metrics` is the content of metrics.json ("methods", "ours_minus", "seconds", "preset", "steps", "seed",
-    "hardware"), `per_category` has a "methods" table for every category, `curve` the rows of metrics.jsonl, `settings`
-    any nested mapping.  Blank lines in the summary part paragraphs.
+    `metrics` is the content of metrics.json ("methods", the first of which is the network that "NAME_minus" subtracts
+    from, "seconds", "preset", "steps", "seed", "hardware"), `per_category` has a "methods" table for every category,
+    `curve` the rows of metrics.jsonl, `settings` any nested mapping.  Blank lines in the summary part paragraphs.
     """
     methods = metrics["methods"]
-    floors = {METHODS[m]: methods[m]["psnr"] for m in ("nearest", "splat", "white") if m in methods}
+    first = next(iter(methods))
+    levels = {METHODS[m]: methods[m]["psnr"] for m in METHODS if m in methods and m != first}
+    minus = metrics.get(f"{first}_minus")
     sections = [
         f"<header><h1>{escape(title)}</h1>{_paragraphs(summary)}{_key_numbers(metrics)}</header>",
         _section("Unseen objects", _gallery(gallery), GALLERY_NOTE),
         _section("Quality", _quality_table(methods), QUALITY_NOTE),
-        _section("Differences", _difference_table(metrics["ours_minus"]), DIFFERENCES_NOTE)
-        if metrics.get("ours_minus")
-        else "",
+        _section("Differences", _difference_table(first, minus), DIFFERENCES_NOTE) if minus else "",
         _section("Quality by category", _category_table(per_category), "PSNR in dB.") if per_category else "",
-        _section("Learning curve", f"<figure>{learning_curve_svg(curve, floors)}</figure>", "") if curve else "",
+        _section("Learning curve", f"<figure>{learning_curve_svg(curve, levels)}</figure>", "") if curve else "",
         _section("Run", _definitions(_run_facts(metrics)), ""),
         _section("Settings", _definitions(flatten(settings)), ""),
     ]
@@ -134,16 +145,17 @@ def _paragraphs(text: str) -> str:
 def _key_numbers(metrics: Mapping) -> str:
     """The numbers that a reader looks for first, as tiles."""
     methods, seconds = metrics["methods"], metrics.get("seconds", {})
-    ours = methods["ours"]["psnr"]
-    tiles = [("PSNR on unseen objects", f"{ours:.1f} dB")]
+    psnr = next(iter(methods.values()))["psnr"]
+    tiles = [("PSNR on unseen objects", f"{psnr:.1f} dB")]
     for name, words in (
+        ("paper", "over the paper's network"),
         ("white", "over the white image"),
         ("splat", "over the splat"),
         ("nearest", "over nearest point"),
     ):
-        if name in methods:
-            tiles.append((words, f"{ours - methods[name]['psnr']:+.1f} dB"))
-    tiles += [(f"to {stage}", duration(seconds[stage])) for stage in ("train",) if stage in seconds]
+        if name in list(methods)[1:]:
+            tiles.append((words, f"{psnr - methods[name]['psnr']:+.1f} dB"))
+    tiles += [(f"to {stage}", duration(seconds[stage])) for stage in ("train", "train paper") if stage in seconds]
     return f'<div class="tiles">{"".join(f"<div><b>{value}</b>{escape(words)}</div>" for words, value in tiles)}</div>'
 
 
@@ -186,13 +198,19 @@ def _quality_column(name: str, methods: Iterable[Mapping]) -> list[str]:
     return [f"{mean}{interval}" for mean, interval in zip(means, intervals, strict=True)]
 
 
-def _difference_table(ours_minus: Mapping[str, Mapping]) -> str:
+def lowered(method: str) -> str:
+    """A method's name inside a sentence."""
+    name = METHODS.get(method, method)
+    return name if name[:2].isupper() else name[:1].lower() + name[1:]
+
+
+def _difference_table(first: str, minus: Mapping[str, Mapping]) -> str:
     """Other methods against the difference in each metric."""
-    names = [name for name in QUALITY if any(name in row for row in ours_minus.values())]
+    names = [name for name in QUALITY if any(name in row for row in minus.values())]
     rows = []
-    for method, row in ours_minus.items():
+    for method, row in minus.items():
         cells = [_difference(row.get(name), name) for name in names]
-        rows.append((f"Ours minus {escape(METHODS.get(method, method).lower())}", *cells))
+        rows.append((f"{escape(METHODS.get(first, first))} minus {escape(lowered(method))}", *cells))
     return _table(["", *map(_head, names)], rows)
 
 
@@ -251,7 +269,7 @@ def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 def _run_facts(metrics: Mapping) -> dict[str, object]:
     """What made the scores, and how long that took; the rest of metrics.json has tables of its own."""
-    shown = ("methods", "ours_minus", "per_category", "settings", "seconds")
+    shown = ("methods", f"{next(iter(metrics['methods']))}_minus", "per_category", "settings", "seconds")
     facts = {name: value for name, value in metrics.items() if name not in shown}
     times = {f"time to {stage}": duration(seconds) for stage, seconds in metrics.get("seconds", {}).items()}
     if "time to total" in times:

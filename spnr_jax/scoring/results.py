@@ -8,7 +8,7 @@ import numpy as np
 from spnr_jax.config import to_dict
 from spnr_jax.formats.images import write_whole
 from spnr_jax.scoring.evaluation import FLOORS, Evaluation, ObjectResult, median_view
-from spnr_jax.scoring.report import QUALITY, GalleryRow, write_report
+from spnr_jax.scoring.report import METHODS, QUALITY, GalleryRow, lowered, write_report
 from spnr_jax.scoring.summary import NO_WEIGHTS
 
 
@@ -25,11 +25,16 @@ def write_results(
     write_whole(out / "metrics.json", (json.dumps(metrics, indent=2, allow_nan=False) + "\n").encode())
     methods = metrics["methods"]
     best = max(FLOORS, key=lambda name: methods[name]["psnr"])
+    network, *others = metrics["settings"]["networks"]
+    scores = methods[network]
+    compared = [(lowered(name), name) for name in others] + [("the white image", "white")]
+    compared += [(f"the best trivial renderer ({best})", best)]
     summary = (
-        f"Preset {metrics['preset']}, {metrics['steps']} steps, {evaluation.config.test_points} points per object. "
-        f"{methods['ours']['psnr']:.2f} dB PSNR on {methods['ours']['views']} views of {methods['ours']['objects']} "
-        f"unseen objects: {_difference(metrics, 'white')} against the white image, "
-        f"{_difference(metrics, best)} against the best trivial renderer ({best})."
+        f"{METHODS[network]}: preset {metrics['preset']}, {metrics['steps']} steps. "
+        f"{evaluation.config.test_points} points per object. "
+        f"{scores['psnr']:.2f} dB PSNR on {scores['views']} views of {scores['objects']} unseen objects: "
+        + ", ".join(f"{_difference(metrics, name)} against {words}" for words, name in compared)
+        + "."
     )
     write_report(
         out / "report.html",
@@ -44,8 +49,8 @@ def write_results(
 
 
 def _difference(metrics: dict, other: str) -> str:
-    """How many dB ours is above another method, with its interval."""
-    found = metrics["ours_minus"][other]["psnr"]
+    """How many dB the first network is above another method, with its interval."""
+    found = metrics[f"{next(iter(metrics['methods']))}_minus"][other]["psnr"]
     ends = found["interval"]
     return f"{found['mean']:+.2f} dB" + (f" [{ends[0]:+.2f}, {ends[1]:+.2f}]" if ends else "")
 
@@ -58,19 +63,20 @@ def text_table(methods: dict[str, dict]) -> list[str]:
         for name, (head, decimals, _) in QUALITY.items():
             missing = NO_WEIGHTS if name == "lpips" else "n/a"
             texts.append(f"{head.partition(',')[0]} " + (missing if row[name] is None else f"{row[name]:.{decimals}f}"))
-        lines.append(f"{method:8s} " + "   ".join(texts))
+        lines.append(f"{METHODS[method]:22s} " + "   ".join(texts))
     return lines
 
 
 def gallery_row(result: ObjectResult) -> GalleryRow:
-    """The view of an object whose PSNR is the median."""
-    view = median_view(result.scores["ours"]["psnr"])
-    ours = result.pictures["ours"]
-    assert ours.depth is not None
+    """The view of an object whose PSNR is the median, of the first network."""
+    first = next(iter(result.pictures))
+    view = median_view(result.scores[first]["psnr"])
+    shown = result.pictures[first]
+    assert shown.depth is not None
     return GalleryRow(
         name=result.name,
         reference=result.reference[view],
         images={m: np.asarray(p.image[view]) for m, p in result.pictures.items() if m != "white"},
-        depth=np.asarray(ours.depth[view]),
-        acc=np.asarray(ours.acc[view]),
+        depth=np.asarray(shown.depth[view]),
+        acc=np.asarray(shown.acc[view]),
     )

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from spnr_jax.errors import UserError
 from spnr_jax.formats.light_files import read_light
 from spnr_jax.kernels.cameras import camera_rays
 from spnr_jax.kernels.colors import linear_to_srgb
@@ -38,7 +39,7 @@ def takes_light(model: Model) -> bool:
 def check_takes_light(model: Model, asked: Sequence[str], run: Path | None) -> None:
     """ValueError, naming the options, where something is asked of the light and the network takes none."""
     if asked and not takes_light(model):
-        raise ValueError(
+        raise UserError(
             f"{', '.join(asked)}: the network of --run {run} knows the light of its training alone; "
             f"leave {'it' if len(asked) == 1 else 'them'} out, or give --run surfels"
         )

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from spnr_jax.errors import UserError
 from spnr_jax.formats.clouds import PlacedCloud
 from spnr_jax.kernels import occupancy, voxels
 from spnr_jax.kernels.numerics import normalize
@@ -36,7 +37,7 @@ class DensityGrid:
 def sample_density(model: Model, volume: Volume, placed: PlacedCloud, resolution: int) -> DensityGrid:
     """The density in the box of an object, with `resolution` places along each side."""
     if not isinstance(model.config, ModelConfig):
-        raise ValueError("--mesh and --density need a network with a density volume; this run's has none")
+        raise UserError("--mesh and --density need a network with a density volume; this run's has none")
     scale = float(volume.scale)
     steps = np.linspace(-1, 1, resolution, dtype=np.float32)
     plane = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2)

@@ -24,6 +24,7 @@ from flax.serialization import from_state_dict, to_state_dict
 from jax import export
 from jaxtyping import Array, Bool, Float
 
+from spnr_jax.errors import UserError
 from spnr_jax.kernels.records import Camera, PointCloud
 from spnr_jax.method import inference
 from spnr_jax.method.model import LARGEST_REACH, Model, Quality, Volume
@@ -38,7 +39,7 @@ def export_encode(model: Model, *, num_points: int = 1024, platforms: Sequence[s
     `platforms` are those that may run it, out of cpu, cuda, rocm, tpu; None is the one that JAX uses here.
     """
     if num_points < 1:
-        raise ValueError(f"num_points must be at least 1, got {num_points}")
+        raise UserError(f"num_points must be at least 1, got {num_points}")
 
     def encode(cloud: Arrays) -> Arrays:
         scene, centre, scale = _encode(model, cloud)
@@ -62,9 +63,9 @@ def export_render(
     """
     size = model.config.image_resolution if resolution is None else resolution
     if size < 16 or size % 4:
-        raise ValueError(f"resolution must be a multiple of 4 of at least 16, got {size}")
+        raise UserError(f"resolution must be a multiple of 4 of at least 16, got {size}")
     if not 1 <= reach <= LARGEST_REACH:
-        raise ValueError(f"reach must be 1 to {LARGEST_REACH} voxels, got {reach}")
+        raise UserError(f"reach must be 1 to {LARGEST_REACH} voxels, got {reach}")
     scene, centre, scale = jax.eval_shape(partial(_encode, model), _cloud_shapes(num_points=2))
 
     def render(volume: Arrays, camera: Arrays) -> Arrays:
@@ -137,13 +138,13 @@ def _serialised(function: Callable[..., Arrays], platforms: Sequence[str] | None
     try:
         return bytes(exported.serialize())
     except ImportError:
-        raise ValueError(MISSING) from None
+        raise UserError(MISSING) from None
 
 
 def _deserialised(content: bytes) -> export.Exported:
     try:
         return export.deserialize(bytearray(content))
     except ImportError:
-        raise ValueError(MISSING) from None
+        raise UserError(MISSING) from None
     except Exception as error:  # noqa: BLE001 - flatbuffers and JAX raise many kinds for bytes that are something else
-        raise ValueError(f"not a function that JAX exported ({type(error).__name__}); export it again") from None
+        raise UserError(f"not a function that JAX exported ({type(error).__name__}); export it again") from None

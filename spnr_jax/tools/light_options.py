@@ -5,6 +5,8 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
+from spnr_jax.errors import UserError
+
 MOST_STOPS = 20
 
 
@@ -33,8 +35,8 @@ class Lighting:
     def __post_init__(self) -> None:
         """ValueError names the option that makes no sense."""
         if not math.isfinite(self.light_yaw):
-            raise ValueError(f"--light-yaw must be a number of degrees, got {self.light_yaw}")
+            raise UserError(f"--light-yaw must be a number of degrees, got {self.light_yaw}")
         if self.sun and not (math.isfinite(self.sun[0]) and -90 <= self.sun[1] <= 90):
-            raise ValueError(f"--sun: expected an azimuth and an elevation of -90 to 90 degrees, got {self.sun}")
+            raise UserError(f"--sun: expected an azimuth and an elevation of -90 to 90 degrees, got {self.sun}")
         if not abs(self.exposure) <= MOST_STOPS:
-            raise ValueError(f"--exposure must be -{MOST_STOPS} to {MOST_STOPS} stops, got {self.exposure:g}")
+            raise UserError(f"--exposure must be -{MOST_STOPS} to {MOST_STOPS} stops, got {self.exposure:g}")

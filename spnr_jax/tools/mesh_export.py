@@ -11,6 +11,7 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.spatial import cKDTree
 
+from spnr_jax.errors import UserError
 from spnr_jax.formats.clouds import PlacedCloud
 from spnr_jax.tools.density_grid import DensityGrid
 
@@ -26,7 +27,7 @@ def mesh_of(grid: DensityGrid, placed: PlacedCloud, level: float) -> tuple[bytes
     from skimage.measure import marching_cubes  # here, so that rendering alone stays quick
 
     if not grid.density.max() > level:
-        raise ValueError(f"no surface to write as a mesh: the density is at most {grid.density.max():g}, not {level:g}")
+        raise UserError(f"no surface to write as a mesh: the density is at most {grid.density.max():g}, not {level:g}")
     closed = np.pad(grid.density, 1)  # the surface is closed also where it meets the box
     spacing = (grid.spacing,) * 3
     vertices, faces, normals, _ = marching_cubes(closed, level, spacing=spacing, gradient_direction="ascent")

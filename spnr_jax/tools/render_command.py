@@ -6,6 +6,7 @@ from typing import Literal
 
 import tyro
 
+from spnr_jax.errors import UserError
 from spnr_jax.formats.cut import Cut
 from spnr_jax.tools.light_options import Lighting
 
@@ -77,15 +78,15 @@ class Render:
     def __post_init__(self) -> None:
         """ValueError names the option that makes no sense."""
         if self.views < 0:
-            raise ValueError(f"--views must not be negative, got {self.views}")
+            raise UserError(f"--views must not be negative, got {self.views}")
         for name in ("frames", "num_points", "fps"):
             if getattr(self, name) < 1:
-                raise ValueError(f"--{name.replace('_', '-')} must be at least 1, got {getattr(self, name)}")
+                raise UserError(f"--{name.replace('_', '-')} must be at least 1, got {getattr(self, name)}")
         if self.resolution is not None and (self.resolution < 16 or self.resolution % 4):
-            raise ValueError(f"--resolution must be a multiple of 4 of at least 16, got {self.resolution}")
+            raise UserError(f"--resolution must be a multiple of 4 of at least 16, got {self.resolution}")
         if not -90 <= self.elevation <= 90:
-            raise ValueError(f"--elevation must be -90 to 90 degrees, got {self.elevation:g}")
+            raise UserError(f"--elevation must be -90 to 90 degrees, got {self.elevation:g}")
         if self.transparent and self.lighting.background != "white":
-            raise ValueError("--background light: not together with --transparent; give one of them")
+            raise UserError("--background light: not together with --transparent; give one of them")
         if not 8 <= self.grid_resolution <= 512:
-            raise ValueError(f"--grid-resolution must be 8 to 512, got {self.grid_resolution}")
+            raise UserError(f"--grid-resolution must be 8 to 512, got {self.grid_resolution}")

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from spnr_jax.errors import UserError
 from spnr_jax.scoring.learning_curve import series
 from spnr_jax.training import checkpoint, trainer
 from spnr_jax.training.run_record import read_starts
@@ -30,10 +31,10 @@ class Run:
 def read_runs(folder: Path) -> list[Run]:
     """The runs below a folder (or in it), the best validation PSNR first; ValueError if there is none."""
     if not folder.is_dir():
-        raise ValueError(f"{folder}: there is no such folder; name one that holds run folders")
+        raise UserError(f"{folder}: there is no such folder; name one that holds run folders")
     paths = sorted(path.parent for path in folder.rglob("config.json") if (path.parent / "metrics.jsonl").is_file())
     if not paths:
-        raise ValueError(f"{folder}: no run folders below it (config.json and metrics.jsonl); `spnr train` makes them")
+        raise UserError(f"{folder}: no run folders below it (config.json and metrics.jsonl); `spnr train` makes them")
     runs = [read_run(path, str(path.relative_to(folder)) if path != folder else path.name) for path in paths]
     return sorted(runs, key=lambda run: -run.best if math.isfinite(run.best) else math.inf)
 

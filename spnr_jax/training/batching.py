@@ -14,6 +14,7 @@ import jax
 import numpy as np
 
 from spnr_jax.config import TrainConfig
+from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.data_sets import Dataset, ObjectData, on_white
 from spnr_jax.kernels.cloud_arrays import pad
@@ -88,7 +89,7 @@ def batches(
     """
     names = dataset.splits["train"]
     if not names:
-        raise ValueError(f"{dataset.folder}: the train split is empty; generate more objects")
+        raise UserError(f"{dataset.folder}: the train split is empty; generate more objects")
     check_spread(dataset, config)
     read, own = cached_reader(dataset, config, cache_bytes), own or range(config.batch_objects)
 
@@ -122,7 +123,7 @@ def cached_reader(dataset: Dataset, config: TrainConfig, cache_bytes: int) -> Ca
         item = data_sets.read_object(dataset, name)
         data_sets.check_resolution(item, config)
         if len(item.images) < config.views_per_object:
-            raise ValueError(
+            raise UserError(
                 f"object {name} has {len(item.images)} views, views_per_object is {config.views_per_object}; lower it "
                 "or generate with more --views"
             )
@@ -138,7 +139,7 @@ def cached_reader(dataset: Dataset, config: TrainConfig, cache_bytes: int) -> Ca
 def check_spread(dataset: Dataset, config: TrainConfig) -> None:
     """ValueError if the config asks for evenly spread clouds where an object's points are random ones."""
     if config.even_share and dataset.spread != "even":
-        raise ValueError(
+        raise UserError(
             f"{dataset.folder}: its points are drawn at random, even_share is {config.even_share}; generate with "
             "--spread even, or use even_share 0"
         )

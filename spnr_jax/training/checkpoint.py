@@ -20,6 +20,7 @@ import jax
 
 from spnr_jax.config import TrainConfig, from_dict, to_dict
 from spnr_jax.devices import allocator
+from spnr_jax.errors import UserError
 from spnr_jax.training import optimisation
 
 KEPT = 3  # newest checkpoints that stay
@@ -38,7 +39,7 @@ def alone(run: Path) -> Iterator[None]:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise ValueError(f"{run}: another process trains in this folder; wait for it or choose a new one") from None
+            raise UserError(f"{run}: another process trains in this folder; wait for it or choose a new one") from None
         yield
 
 
@@ -49,7 +50,7 @@ def write_config(run: Path, config: TrainConfig) -> None:
         stored = to_dict(read_config(run))
         changed = _differences(stored, json.loads(json.dumps(to_dict(config))))
         if changed:
-            raise ValueError(
+            raise UserError(
                 f"{run} holds a run with another config ({'; '.join(changed[:4])}); choose a new run folder"
             )
         return
@@ -74,11 +75,11 @@ def read_config(run: Path | str) -> TrainConfig:
     """The config of a run folder; ValueError if there is none or it is not of this version."""
     path = Path(run) / "config.json"
     if not path.is_file():
-        raise ValueError(f"{run}: not a run folder (config.json is missing); train one with `spnr train DATA {run}`")
+        raise UserError(f"{run}: not a run folder (config.json is missing); train one with `spnr train DATA {run}`")
     try:
         return from_dict(json.loads(path.read_text()))
-    except (ValueError, TypeError, AttributeError, ArithmeticError, RecursionError) as error:
-        raise ValueError(f"{path}: not a config of this version ({error}); train a new run") from None
+    except (ValueError, TypeError, ArithmeticError, RecursionError) as error:
+        raise UserError(f"{path}: not a config of this version ({error}); train a new run") from None
 
 
 def _checkpointer(run: Path, *, writing: bool):
@@ -102,7 +103,7 @@ def save(run: Path, state: optimisation.TrainState) -> None:
     except (OSError, ValueError) as error:  # tensorstore raises ValueError for the disk's errors, too
         number = re.search(r"os_error_code='(\d+)'", str(error))
         reason = os.strerror(int(number[1])) if number else _first_line(error)
-        raise ValueError(
+        raise UserError(
             f"checkpoint {run / 'checkpoints' / str(step)} cannot be written ({reason}); the one before is kept: mend "
             "this, and the same command goes on from there"
         ) from None
@@ -141,7 +142,7 @@ def restore(
                 return state
             say(f"checkpoint {folder / str(step)} holds step {int(state.step)}; trying the one before")
     if steps:
-        raise ValueError(
+        raise UserError(
             f"{run / 'checkpoints'}: no checkpoint of this run can be read; remove the folder to start again"
         )
     return None
@@ -155,7 +156,7 @@ def _refuse_other_version(checkpointer: Any, path: Path, like: optimisation.Trai
         return
     different = sorted(name for name in found.keys() | wanted.keys() if found.get(name) != wanted.get(name))
     if found and different:  # of damaged files it finds nothing
-        raise ValueError(
+        raise UserError(
             f"checkpoint {path} is of another version of spnr_jax: {different[0]} has shape "
             f"{found.get(different[0], 'none')}, here {wanted.get(different[0], 'none')}; go on with that version, or "
             "choose a new run folder"
@@ -181,7 +182,7 @@ def load_run(
     config = read_config(run)
     state = restore(run, config, say)
     if state is None:
-        raise ValueError(f"{run}: the run has no checkpoint yet; go on with `spnr train {data} {run}`")
+        raise UserError(f"{run}: the run has no checkpoint yet; go on with `spnr train {data} {run}`")
     return config, state
 
 

@@ -24,6 +24,7 @@ from scipy.spatial import cKDTree
 from tqdm import tqdm
 
 from spnr_jax.config import TrainConfig
+from spnr_jax.errors import UserError
 from spnr_jax.formats.clouds import MOST_EVEN
 from spnr_jax.formats.data_sets import Dataset, ObjectData, read_object
 from spnr_jax.formats.images import to_uint8, write_whole
@@ -79,7 +80,7 @@ def complete(dataset: Dataset, light: Light, config: TrainConfig, folder: Path) 
                 found[number] = arrays["doublings"].tolist()
         views += [View(path, i, d) for path, of in zip(paths, found, strict=True) for i, d in enumerate(of or ())]
     if not views:
-        raise ValueError(f"{dataset.folder}: no object of its train split can be learnt from; generate more objects")
+        raise UserError(f"{dataset.folder}: no object of its train split can be learnt from; generate more objects")
     return views
 
 
@@ -231,7 +232,7 @@ def read_view(view: View) -> Arrays:
         with view.path.open("rb") as file:
             arrays = read_arrays(file, [f"{name}{view.number}" for name in NAMES])
     except ValueError as error:
-        raise ValueError(f"{view.path}: {error}; remove it, and the same command makes it again") from None
+        raise UserError(f"{view.path}: {error}; remove it, and the same command makes it again") from None
     return {name: arrays[f"{name}{view.number}"] for name in NAMES}
 
 

@@ -25,6 +25,7 @@ from flax.traverse_util import flatten_dict
 from jaxtyping import Array, Float
 
 from spnr_jax.config import TrainConfig
+from spnr_jax.errors import UserError
 from spnr_jax.kernels import losses
 from spnr_jax.kernels.metrics import psnr
 from spnr_jax.kernels.records import Batch, Camera, Key
@@ -129,7 +130,7 @@ def begun_with(state: TrainState, variables: dict) -> TrainState:
     for name in own | other:
         shapes = [weights[name].shape if name in weights else "none" for weights in (own, other)]
         if shapes[0] != shapes[1]:
-            raise ValueError(
+            raise UserError(
                 f"the weights to begin with are of another network: shape of {name} {shapes[1]}, needed {shapes[0]}; "
                 "use the preset that they were trained with"
             )

@@ -27,6 +27,7 @@ from tqdm import tqdm
 
 from spnr_jax.config import TrainConfig
 from spnr_jax.devices import allocator, placement
+from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.images import png, to_uint8, write_whole
 from spnr_jax.kernels.metrics import psnr
@@ -51,14 +52,14 @@ class Schedule:
     def __post_init__(self) -> None:
         for name, steps in vars(self).items():
             if steps < 1:
-                raise ValueError(f"{name} must be at least 1 step, got {steps}")
+                raise UserError(f"{name} must be at least 1 step, got {steps}")
 
 
 Phase = Literal["step", "row", "preview", "checkpoint", "end"]
 OnEvent = Callable[[Phase, int, object], object]  # phase that begins, steps done so far, its batch or row, else None
 
 
-class NotFinite(ValueError):
+class NotFinite(UserError):
     """A loss is NaN or infinite; the message names step and quantity."""
 
 

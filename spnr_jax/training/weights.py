@@ -21,13 +21,14 @@ import numpy as np
 from flax.traverse_util import flatten_dict, unflatten_dict
 
 from spnr_jax.config import TrainConfig, from_dict, to_dict
+from spnr_jax.errors import UserError
 from spnr_jax.formats.images import write_whole
 from spnr_jax.formats.npz import read_arrays
 from spnr_jax.method.inference import init
 from spnr_jax.method.model import Model
 
 # what a header of any content makes its readers raise
-UNREADABLE = (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError)
+UNREADABLE = (ValueError, LookupError, TypeError, ArithmeticError, RecursionError)
 MANY_POINTS = 6000  # chosen between 1,024, where rays score better at 512 pixels, and 16,384, where surfels do
 ADVICE = "write one with `spnr export RUN`"
 SHIPPED = ("surfels", "small", "tiny")  # what the package holds; the first renders where no other is named
@@ -83,7 +84,7 @@ def write_weights(path: Path, trained: Trained) -> None:
     arrays = {name: np.asarray(values) for name, values in flatten_dict(trained.variables, sep="/").items()}
     for name, values in arrays.items():
         if not np.abs(values).max(initial=0) <= np.finfo(np.float16).max:
-            raise ValueError(f"{path}: {name} reaches {np.abs(values).max():.3g}, which float16 does not hold")
+            raise UserError(f"{path}: {name} reaches {np.abs(values).max():.3g}, which float16 does not hold")
     halves = {name: values.astype(np.float16) for name, values in arrays.items()}
     described = np.frombuffer(json.dumps(to_dict(trained.config)).encode(), np.uint8)
     stream = io.BytesIO()
@@ -98,18 +99,18 @@ def read_weights(path: Path) -> Trained:
     their shapes; the package's own files are not asked again.
     """
     if not path.is_file():
-        raise ValueError(f"{path}: no such file of weights; {ADVICE}")
+        raise UserError(f"{path}: no such file of weights; {ADVICE}")
     try:
         with path.open("rb") as file:
             arrays = read_arrays(file)
         described, steps = json.loads(arrays.pop("config").tobytes()), int(arrays.pop("steps"))
         if not isinstance(described, dict):
-            raise ValueError("its config is no JSON object")
+            raise UserError("its config is no JSON object")
         config = from_dict(described)
         if path not in [shipped(name) for name in SHIPPED]:
             _check_weights(arrays, variable_shapes(config))
     except UNREADABLE as error:
-        raise ValueError(f"{path}: not a file of weights of this version ({error}); {ADVICE}") from None
+        raise UserError(f"{path}: not a file of weights of this version ({error}); {ADVICE}") from None
     variables = unflatten_dict({name: x.astype(np.float32) for name, x in arrays.items()}, sep="/")
     return Trained(config=config, variables=jax.device_put(variables), steps=steps)  # jnp.asarray would compile
 
@@ -117,11 +118,11 @@ def read_weights(path: Path) -> Trained:
 def _check_weights(arrays: dict[str, np.ndarray], shapes: dict[str, jax.ShapeDtypeStruct]) -> None:
     """ValueError for the first array that is not as a network of these shapes needs it."""
     if unknown := sorted(arrays.keys() - shapes):
-        raise ValueError(f"the network has no {unknown[0]}")
+        raise UserError(f"the network has no {unknown[0]}")
     for name, wanted in shapes.items():
         found = arrays.get(name, np.zeros(0))
         if found.shape != wanted.shape or found.dtype != np.float16 or not np.isfinite(found).all():
-            raise ValueError(
+            raise UserError(
                 f"{name} should hold {wanted.shape} finite float16 numbers, not {found.shape} of {found.dtype}"
             )
 

@@ -14,6 +14,7 @@ from jax.sharding import Mesh
 
 from spnr_jax.config import TrainConfig
 from spnr_jax.devices import placement
+from spnr_jax.errors import UserError
 from spnr_jax.formats.data_sets import Dataset
 from spnr_jax.kernels.records import Crops, Light
 from spnr_jax.model_config import SurfelConfig
@@ -61,7 +62,7 @@ def of_gbuffers(config: TrainConfig, dataset: Dataset, run: Path, light: Light) 
     The averaged weights are written to the run folder at the end.  All devices of a process do the same work.
     """
     if jax.process_count() > 1:
-        raise ValueError(f"preset {config.preset} trains in one process; start it without --distributed")
+        raise UserError(f"preset {config.preset} trains in one process; start it without --distributed")
     views = gbuffers.complete(dataset, light, config, run / "gbuffers")
 
     def step(state: TrainState, crops: Crops, number: int) -> tuple[TrainState, dict]:
@@ -79,7 +80,7 @@ def light_of(dataset: Dataset) -> Light:
     described = dataset.settings.get("environment_map")
     name = described.get("name", ROOM) if isinstance(described, dict) else ROOM
     if name != ROOM:
-        raise ValueError(
+        raise UserError(
             f"{dataset.folder}: lit by {name}, and the command trains in the {ROOM} alone; give the light of that map "
             "to spnr_jax.training.trainer.train"
         )

@@ -10,6 +10,8 @@ import numpy as np
 from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation, RotationSpline
 
+from spnr_jax.errors import UserError
+
 SAME = 1e-4  # radians between two keyframes below which the spline would divide by nothing
 
 
@@ -28,7 +30,7 @@ def poses(keyframes: tuple[Keyframe, ...], frames: int) -> list[tuple[np.ndarray
     ValueError for fewer than two keyframes or frames.
     """
     if len(keyframes) < 2 or frames < 2:
-        raise ValueError(f"a path needs at least 2 keyframes and 2 frames, got {len(keyframes)} and {frames}")
+        raise UserError(f"a path needs at least 2 keyframes and 2 frames, got {len(keyframes)} and {frames}")
     times, at = np.arange(len(keyframes)), np.linspace(0, len(keyframes) - 1, frames)
     targets = np.stack([frame.position - frame.distance * frame.rotation[:, 2] for frame in keyframes])
     distances = PchipInterpolator(times, [frame.distance for frame in keyframes])(at)

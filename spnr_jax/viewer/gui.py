@@ -13,6 +13,7 @@ from typing import Any, cast
 import numpy as np
 import viser
 
+from spnr_jax.errors import UserError
 from spnr_jax.kernels.cleaning import Clean
 from spnr_jax.method.model import Model, Quality
 from spnr_jax.tools.chosen_light import takes_light
@@ -284,7 +285,7 @@ class Browser:
 
     def _open_map(self, file: viser.UploadedFile) -> None:
         if self._light is None:
-            raise ValueError(ONE_LIGHT)
+            raise UserError(ONE_LIGHT)
         name, light = uploads.display_name(file.name), uploads.read_uploaded_map(file.name, file.content)
         self._change_lights(lambda old: lights.with_map(old, name, light))
         self.loop.submit(self._light.show)

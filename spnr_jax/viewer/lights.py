@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from spnr_jax.errors import UserError
 from spnr_jax.formats.light_files import NAMES, read_light
 from spnr_jax.kernels.records import Light
 from spnr_jax.tools.chosen_light import light_of_options
@@ -73,9 +74,9 @@ def options_of(
     except (TypeError, ValueError, OverflowError):
         values = np.zeros(0)
     if values.shape != (4,) or not np.isfinite(values).all():
-        raise ValueError("the light's angles and its exposure have to be numbers")
+        raise UserError("the light's angles and its exposure have to be numbers")
     if not isinstance(choice, str) or background not in ("white", "light"):
-        raise ValueError("a light has a name, and behind the object is one of white, light")
+        raise UserError("a light has a name, and behind the object is one of white, light")
     turn, around, above, stops = (float(value) for value in values)
     alone = choice == SUN_ALONE
     return Lighting(

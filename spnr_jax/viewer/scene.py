@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial import cKDTree
 
+from spnr_jax.errors import UserError
 from spnr_jax.formats.images import to_uint8
 from spnr_jax.kernels.colors import linear_to_srgb, srgb_to_linear
 from spnr_jax.kernels.records import Camera, PointCloud
@@ -85,7 +86,7 @@ def material_value(material: Material, value: Any) -> np.ndarray:
     except (TypeError, ValueError, OverflowError):
         new = np.zeros(0, np.float32)
     if new.shape != ((3,) if material == "base_color" else ()) or not np.isfinite(new).all():
-        raise ValueError(f"{material} has to be {'3 numbers' if material == 'base_color' else 'a number'} from 0 to 1")
+        raise UserError(f"{material} has to be {'3 numbers' if material == 'base_color' else 'a number'} from 0 to 1")
     return np.asarray(np.clip(new, 0, 1))
 
 

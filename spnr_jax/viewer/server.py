@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import viser
 
+from spnr_jax.errors import UserError
 from spnr_jax.formats import clouds
 from spnr_jax.formats.cut import Cut
 from spnr_jax.kernels.cleaning import Clean
@@ -55,7 +56,7 @@ class Viewer:
             self._server = Server(host=host, port=port, label="spnr view", verbose=False)
         if port not in (0, self._server.get_port()):
             self.stop()
-            raise ValueError(_in_use(host, port))  # taken in the moment since it was found free
+            raise UserError(_in_use(host, port))  # taken in the moment since it was found free
         self.url = f"http://{f'[{host}]' if ':' in host else host}:{self._server.get_port()}"
         self.lines = [f"{self.url} shows {first.scene.name} (Ctrl-C stops)"]
         if host not in LOOPBACK:
@@ -134,18 +135,18 @@ def open_viewer(
 def _check_free(host: str, port: int) -> None:
     """ValueError unless a server can listen there; viser itself would take another port, and wait for no host."""
     if not 0 <= port < 2**16:
-        raise ValueError(f"--port must be from 0 (any free one) to 65535, got {port}")
+        raise UserError(f"--port must be from 0 (any free one) to 65535, got {port}")
     try:
         family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
         socket.create_server((host, port), family=family).close()
     except socket.gaierror:
-        raise ValueError(
+        raise UserError(
             f"--host {host}: no such address; 127.0.0.1 is this machine alone, 0.0.0.0 all networks"
         ) from None
     except OSError as error:
         if error.errno == errno.EADDRINUSE:
-            raise ValueError(_in_use(host, port)) from None
-        raise ValueError(f"--host {host} --port {port}: {error.strerror}") from None
+            raise UserError(_in_use(host, port)) from None
+        raise UserError(f"--host {host} --port {port}: {error.strerror}") from None
 
 
 def _in_use(host: str, port: int) -> str:

@@ -13,6 +13,7 @@ from typing import Any, cast
 
 import numpy as np
 
+from spnr_jax.errors import UserError
 from spnr_jax.formats import images
 from spnr_jax.method.model import SAMPLES, Model, Quality
 from spnr_jax.viewer import camera_path, picture
@@ -55,9 +56,9 @@ def chosen(model: Model, layers: Sequence[Any], quality: Any, size: Any) -> dict
     """Fields of the state for what the controls say, "none" being no pane; ValueError for what they do not offer."""
     panes, sides = tuple(layer for layer in layers if layer != "none"), {str(n): n for n in sizes(model)}
     if not panes or any(pane not in LAYERS for pane in panes):
-        raise ValueError(f"a pane shows one of {', '.join(LAYERS)}")
+        raise UserError(f"a pane shows one of {', '.join(LAYERS)}")
     if quality not in QUALITIES or str(size) not in sides:
-        raise ValueError(f"a picture at rest has one of {', '.join(QUALITIES)}, and {', '.join(sides)} pixels")
+        raise UserError(f"a picture at rest has one of {', '.join(QUALITIES)}, and {', '.join(sides)} pixels")
     return {"panes": panes, "quality": quality, "size": sides[str(size)]}
 
 
@@ -94,7 +95,7 @@ def outline(model: Model, state: State) -> np.ndarray | None:
 def snapshot(model: Model, state: State) -> bytes:
     """The canvas at rest as a PNG file."""
     if state.view is None:
-        raise ValueError("nothing was drawn yet")
+        raise UserError("nothing was drawn yet")
     view, state = state.view, prepared(model, state)
     drawn = picture.draw(model, state.scene, view, state.panes, state.quality, state.size, LONGEST, **shone(state))
     return images.png(drawn.image)
@@ -109,10 +110,10 @@ def keyframe(view: View, target: np.ndarray) -> Keyframe:
 def path_poses(state: State, seconds: float) -> list[tuple[np.ndarray, np.ndarray]]:
     """Poses of the recorded path, `seconds` between keyframes; ValueError for a path too short or too long."""
     if not 0 < seconds <= LONGEST_PAUSE:
-        raise ValueError(f"between keyframes are 0 to {LONGEST_PAUSE:g} seconds, got {seconds:g}")
+        raise UserError(f"between keyframes are 0 to {LONGEST_PAUSE:g} seconds, got {seconds:g}")
     frames = round(seconds * FRAMES_PER_SECOND * max(len(state.keyframes) - 1, 1)) + 1
     if frames > MOST_FRAMES:
-        raise ValueError(f"the path has {frames} frames; at most {MOST_FRAMES}: use fewer keyframes or less time")
+        raise UserError(f"the path has {frames} frames; at most {MOST_FRAMES}: use fewer keyframes or less time")
     return camera_path.poses(state.keyframes, frames)
 
 
@@ -129,9 +130,9 @@ def film(
     `kind` is one of FILMS, ValueError else.
     """
     if state.view is None:
-        raise ValueError("nothing was drawn yet")
+        raise UserError("nothing was drawn yet")
     if kind not in FILMS or layer not in LAYERS:  # the kind becomes part of a file's name
-        raise ValueError(f"a film is one of {', '.join(FILMS)}, of one of {', '.join(LAYERS)}")
+        raise UserError(f"a film is one of {', '.join(FILMS)}, of one of {', '.join(LAYERS)}")
     begin, route, state = state.view, path_poses(state, seconds), prepared(model, state)
     frames = []
     for i, (position, rotation) in enumerate(route):

@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path, PurePath
 from typing import TypeVar
 
+from spnr_jax.errors import UserError
 from spnr_jax.formats import clouds, light_files
 from spnr_jax.kernels.cleaning import Clean
 from spnr_jax.kernels.records import Light, PointCloud
@@ -68,4 +69,4 @@ def _read(name: str, content: bytes, read: Callable[[Path], Read]) -> Read:
         try:
             return read(path)
         except ValueError as error:
-            raise ValueError(str(error).replace(str(path), shown)) from None
+            raise UserError(str(error).replace(str(path), shown)) from None

@@ -14,18 +14,18 @@ from spnr_jax.training import batching, checkpoint, optimisation
 
 
 @pytest.mark.parametrize(
-    ("budget", "size", "category", "ours", "npbg"),
+    ("budget", "size", "category", "paper", "near_points"),
     [
-        ("quick", 64, None, "tiny", "npbg_tiny"),
-        ("tiny", 64, "chair", "tiny", "npbg_tiny"),
-        ("paper", 128, None, "abo", "npbg_abo"),
-        ("paper", 200, "chair", "shapenet_chair", "npbg_shapenet"),
-        ("paper", 200, None, "shapenet_car", "npbg_shapenet"),
+        ("quick", 64, None, "tiny", "plus_tiny"),
+        ("tiny", 64, "chair", "tiny", "plus_tiny"),
+        ("paper", 128, None, "abo", "plus_abo"),
+        ("paper", 200, "chair", "shapenet_chair", "plus_shapenet"),
+        ("paper", 200, None, "shapenet_car", "plus_shapenet"),
     ],
 )
-def test_a_budget_has_a_preset_of_every_network(budget, size, category, ours, npbg):
+def test_a_budget_has_a_preset_of_every_network(budget, size, category, paper, near_points):
     found = budgets.presets(budget, size, category)
-    assert (found["ours"], found["npbg"]) == (ours, npbg)
+    assert (found["paper"], found["near_points"]) == (paper, near_points)
     assert tuple(found) == budgets.NETWORKS
     assert set(found.values()) <= set(presets.PRESETS)
 

@@ -1,4 +1,4 @@
-"""The demo reuses what is there, and its report counts the seconds of the run that did the work."""
+"""The demo trains two networks, reuses what is there, and reports the seconds of the run that did the work."""
 
 import json
 import shutil
@@ -6,7 +6,9 @@ from types import SimpleNamespace
 
 import pytest
 from support import tiny_dataset
+from support.tiny_baselines import SHRUNKEN
 
+from data_gen.store import layout
 from experiments.packaged import demo
 from spnr_jax import cli, presets
 
@@ -20,29 +22,38 @@ def asked(monkeypatch):
         configs.append(generation)
         if not generation.out.exists():
             shutil.copytree(tiny_dataset.dataset().folder, generation.out)
+            described = {"settings": {"spread": generation.spread}}
+            layout.write_text(generation.out / "dataset.json", layout.json_text(described))
 
     monkeypatch.setattr(demo, "generate", generate)
     monkeypatch.setattr(presets, "tiny", lambda: tiny_dataset.CONFIG)
+    monkeypatch.setattr(presets, "plus_tiny", lambda: SHRUNKEN["plus_tiny"])
     monkeypatch.setattr(cli, "set_up_jax", lambda **_: None)
     return configs
 
 
 @pytest.mark.ci
 def test_the_demo_writes_its_report_and_a_second_call_reuses_everything(asked, tmp_path, capsys):
-    demo.main(demo.Demo(out=tmp_path))
+    demo.main(demo.Demo(out=tmp_path, steps=3))
     first = json.loads((tmp_path / "metrics.json").read_text())
-    assert set(first["seconds"]) >= {"generate", "train", "evaluate", "total"}
+    assert list(first["methods"]) == ["ours", "paper", "white", "splat", "nearest"]
+    assert set(first["ours_minus"]) == {"paper", "white", "splat", "nearest"}
+    trained = first["settings"]["networks"]
+    assert (trained["ours"]["preset"], trained["paper"]["preset"]) == ("plus_tiny", "tiny")
+    assert set(first["seconds"]) >= {"generate", "train", "train paper", "evaluate", "total"}
     parts = sum(seconds for name, seconds in first["seconds"].items() if name != "total")
     assert first["seconds"]["total"] == pytest.approx(parts, abs=0.3)
-    assert first["steps"] == tiny_dataset.CONFIG.num_steps
+    assert first["steps"] == trained["ours"]["steps"] == trained["paper"]["steps"] == 3
     page = (tmp_path / "report.html").read_text()
     assert all(name in page for name in tiny_dataset.SPLITS["test"])
+    assert "<th>Ours</th><th>The paper&#x27;s network</th>" in page
     assert str(tmp_path / "report.html") in capsys.readouterr().out
 
-    checkpoints = {path: path.stat().st_mtime_ns for path in (tmp_path / "run" / "checkpoints").rglob("*")}
-    demo.main(demo.Demo(out=tmp_path))
+    checkpoints = {path: path.stat().st_mtime_ns for path in tmp_path.glob("*/checkpoints/**/*")}
+    assert {path.relative_to(tmp_path).parts[0] for path in checkpoints} == {"ours", "paper"}
+    demo.main(demo.Demo(out=tmp_path, steps=3))
     second = json.loads((tmp_path / "metrics.json").read_text())
-    assert checkpoints == {path: path.stat().st_mtime_ns for path in (tmp_path / "run" / "checkpoints").rglob("*")}
+    assert checkpoints == {path: path.stat().st_mtime_ns for path in tmp_path.glob("*/checkpoints/**/*")}
     assert second["methods"] == first["methods"]
     assert second["seconds"]["train"] == first["seconds"]["train"]
 

@@ -1,5 +1,6 @@
 """The measurement of the loader counts waiting as waiting, for both forms, and leaves out what does not fit."""
 
+import dataclasses
 import json
 import shutil
 import time
@@ -11,6 +12,7 @@ from data_gen.store import layout
 from experiments.speed import loading
 from spnr_jax import presets
 from spnr_jax.formats import data_sets
+from spnr_jax.training import batching
 
 
 @pytest.fixture
@@ -42,8 +44,10 @@ def test_both_forms_are_measured_and_a_preset_of_another_size_is_left_out(folder
 def test_a_slow_reader_is_seen_as_waiting(folder, quick, monkeypatch):
     read = data_sets.read_object
     monkeypatch.setattr(data_sets, "read_object", lambda *a: time.sleep(0.1) or read(*a))
-    waits, steps = loading.time_steps(data_sets.open_dataset(folder), presets.PRESETS["tiny"](), 4)
-    assert len(waits) == len(steps) == 4
+    count = 4 * batching.READ_AHEAD  # what is read ahead while a busy machine begins must not be all of it
+    config = dataclasses.replace(presets.PRESETS["tiny"](), num_steps=2 * count)
+    waits, steps = loading.time_steps(data_sets.open_dataset(folder), config, count)
+    assert len(waits) == len(steps) == count
     assert 0.5 < sum(waits) / sum(steps) < 1
 
 

@@ -69,7 +69,7 @@ def test_both_data_sets_train_one_network_and_its_file_is_what_was_scored(asked,
     starts = [run_record.read_starts(out / f"run{number}") for number in (1, 2, 3, 4)]
     assert [start.get("init") for (start,) in starts] == [None, *[f"{CONFIG.preset}, 2 steps"] * 3]
     scored = json.loads((out / "metrics.json").read_text())
-    assert scored["methods"]["ours"]["objects"] == len(joined.splits["test"])
+    assert scored["methods"]["near_points"]["objects"] == len(joined.splits["test"])
     assert "report.html" in capsys.readouterr().out
 
     pretrain.main(options)

@@ -80,12 +80,13 @@ def out(dataset, tmp_path_factory):
     return folder
 
 
-def test_scores_of_ours_and_the_floors_are_those_of_the_evaluation_of_its_run(out, dataset):
-    found = evaluation.evaluate(out / "runs" / "ours", data_sets.open_dataset(dataset)).summary
+def test_scores_of_a_network_and_the_floors_are_those_of_the_evaluation_of_its_run(out, dataset):
+    found = evaluation.evaluate(out / "runs" / "near_points", data_sets.open_dataset(dataset)).summary
     results = results_of(out)
-    for method in ("ours", *evaluation.FLOORS):
+    assert results["compared"] == "near_points"
+    for method in ("near_points", *evaluation.FLOORS):
         assert results["methods"][method] == found["methods"][method]
-        assert method == "ours" or results["ours_minus"][method] == found["ours_minus"][method]
+        assert method == "near_points" or results["differences"][method] == found["near_points_minus"][method]
 
 
 def test_a_finished_table_is_not_trained_again(out, dataset, monkeypatch):

@@ -13,23 +13,25 @@ from experiments.comparison.trained_networks import Sources, networks
 from spnr_jax.formats import data_sets
 from spnr_jax.training import weights
 
+PAPER = methods.LABELS["paper"]
+
 
 @pytest.fixture(scope="module")
 def table(tmp_path_factory):
     """What a table with two networks leaves behind."""
     folder = tmp_path_factory.mktemp("table")
-    for name, preset in (("npbg", "npbg_tiny"), ("ours", "tiny")):
+    for name, preset in (("npbg", "npbg_tiny"), ("paper", "tiny")):
         shutil.copytree(stand_ins.fresh(preset), folder / "runs" / name)
     return folder
 
 
 def test_networks_of_a_table_and_of_runs_are_named_after_their_methods_in_the_order_of_table_1(table):
     dataset = tiny_dataset.dataset()
-    assert list(networks(Sources(table1=table), dataset)) == ["Ours", "NPBG"]
+    assert list(networks(Sources(table1=table), dataset)) == [PAPER, "NPBG"]
     found = networks(Sources(runs=(stand_ins.fresh("tiny"),), table1=table), dataset)
-    assert list(found) == ["Ours (fresh, tiny)", "Ours (runs, ours)", "NPBG"]
+    assert list(found) == [f"{PAPER} (fresh, tiny)", f"{PAPER} (runs, paper)", "NPBG"]
     assert [network.has_depth for network in found.values()] == [True, True, False]
-    assert found["Ours (runs, ours)"].identity == found["Ours (fresh, tiny)"].identity
+    assert found[f"{PAPER} (runs, paper)"].identity == found[f"{PAPER} (fresh, tiny)"].identity
 
 
 def test_the_networks_of_the_package_go_by_their_names():

@@ -14,20 +14,23 @@ from support.tiny_lpips import WEIGHTS
 
 from spnr_jax.formats import data_sets
 from spnr_jax.kernels import metrics
+from spnr_jax.model_config import kind_of
+from spnr_jax.presets import PRESETS
 from spnr_jax.scoring import evaluation, floors
 from spnr_jax.scoring.flip import flip
 from spnr_jax.scoring.lpips import lpips
 from spnr_jax.scoring.summary import METRICS, NO_WEIGHTS
-from spnr_jax.training import checkpoint, optimisation
+from spnr_jax.training import checkpoint, optimisation, weights
 
 NAMES = tiny_dataset.SPLITS["test"]
 FACTORS = {"splat": 1.5, "nearest": 0.75}
+KINDS = {"surfels": "surfels", "plus_small": "near_points", "tiny": "paper", "npbg_tiny": "npbg"}
 
 
 def methods():
     variables = optimisation.averaged_variables(checkpoint.restore(tiny_dataset.run(), CONFIG))
     trivial = {name: evaluation.floor(name, FACTORS.get(name, 1.0)) for name in evaluation.FLOORS}
-    return {"ours": evaluation.network(variables, CONFIG), **trivial}
+    return {"paper": evaluation.network(variables, CONFIG), **trivial}
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +47,7 @@ def test_scores_are_those_of_the_metrics_called_by_hand(results):
     for name, result in zip(NAMES, results, strict=True):
         item = data_sets.read_object(tiny_dataset.dataset(), name)
         reference, mask = (jnp.asarray(x) for x in (data_sets.on_white(item.images), item.conditions[..., 3] > 0))
-        assert list(result.scores) == ["ours", "white", "splat", "nearest"]
+        assert list(result.scores) == ["paper", "white", "splat", "nearest"]
         for method, scores in result.scores.items():
             assert set(scores) == set(METRICS) - {"lpips"}
             image = jnp.asarray(result.pictures[method].image)
@@ -67,8 +70,8 @@ def test_the_floors_are_those_of_the_same_points_and_cameras(results):
 
 def test_opacity_is_compared_at_the_size_of_the_reference(results):
     item = data_sets.read_object(tiny_dataset.dataset(), NAMES[0])
-    assert results[0].pictures["ours"].acc.shape[1:] == (8, 8)
-    assert results[0].pictures["ours"].depth.shape[1:] == (8, 8)
+    assert results[0].pictures["paper"].acc.shape[1:] == (8, 8)
+    assert results[0].pictures["paper"].depth.shape[1:] == (8, 8)
     assert results[0].pictures["splat"].depth is None
     white = results[0].scores["white"]["iou"]
     assert np.all(white == 0), "an empty picture overlaps with nothing"
@@ -77,21 +80,34 @@ def test_opacity_is_compared_at_the_size_of_the_reference(results):
 
 
 def test_a_summary_is_the_mean_over_all_images_with_its_counts(outcome, results):
-    assert set(outcome.summary["methods"]) == {"ours", *evaluation.FLOORS}
-    assert set(outcome.summary["ours_minus"]) == set(evaluation.FLOORS)
+    assert set(outcome.summary["methods"]) == {"paper", *evaluation.FLOORS}
+    assert set(outcome.summary["paper_minus"]) == set(evaluation.FLOORS)
     for table in outcome.summary["methods"].values():
         assert table["objects"] == len(NAMES)
         assert table["views"] == len(NAMES) * tiny_dataset.VIEWS
-    ours = np.concatenate([result.scores["ours"]["psnr"] for result in results])
-    assert outcome.summary["methods"]["ours"]["psnr"] == pytest.approx(ours.mean(), abs=1e-4)
+    ours = np.concatenate([result.scores["paper"]["psnr"] for result in results])
+    assert outcome.summary["methods"]["paper"]["psnr"] == pytest.approx(ours.mean(), abs=1e-4)
     assert outcome.summary["steps"] == CONFIG.num_steps
     assert set(outcome.summary["settings"]["radius factors"].values()) <= set(evaluation.RADIUS_FACTORS)
 
 
+def test_networks_are_compared_under_the_names_that_they_are_given(outcome):
+    trained = weights.read_trained(tiny_dataset.run())
+    found = evaluation.compare({"ours": trained, "paper": trained}, tiny_dataset.dataset(), say=lambda line: None)
+    assert list(found.summary["methods"]) == ["ours", "paper", *evaluation.FLOORS]
+    assert found.summary["methods"]["ours"] == found.summary["methods"]["paper"] == outcome.summary["methods"]["paper"]
+    assert found.summary["ours_minus"]["paper"]["psnr"]["mean"] == 0
+    assert found.summary["settings"]["networks"] == dict.fromkeys(("ours", "paper"), {"preset": "tiny", "steps": 6})
+
+
+def test_a_network_is_named_by_what_it_is():
+    assert {name: kind_of(preset().model) for name, preset in PRESETS.items() if name in KINDS} == KINDS
+
+
 def test_categories_come_from_the_names_and_add_up(outcome):
     assert set(outcome.per_category) == {"ball", "cube", "meshes"}
-    counts = [table["ours"]["objects"] for table in outcome.per_category.values()]
-    assert sum(counts) == outcome.summary["methods"]["ours"]["objects"]
+    counts = [table["paper"]["objects"] for table in outcome.per_category.values()]
+    assert sum(counts) == outcome.summary["methods"]["paper"]["objects"]
     names = ("chair_000012", "office_chair_000012", "chair", "chair_12", "b_0000123")
     assert [evaluation.category_of(n) for n in names] == ["chair", "office_chair", "meshes", "meshes", "meshes"]
 
@@ -126,7 +142,7 @@ def test_the_test_points_are_always_the_first_ones():
 def test_the_gallery_holds_as_many_objects_as_asked_first_and_last_among_them():
     few = evaluation.evaluate(tiny_dataset.run(), tiny_dataset.dataset(), gallery_objects=2, say=lambda line: None)
     assert [result.name for result in few.gallery] == [NAMES[0], NAMES[-1]]
-    assert few.summary["methods"]["ours"]["objects"] == len(NAMES)
+    assert few.summary["methods"]["paper"]["objects"] == len(NAMES)
 
 
 def test_objects_of_one_view_are_evaluated_although_training_draws_two(tmp_path):
@@ -134,7 +150,7 @@ def test_objects_of_one_view_are_evaluated_although_training_draws_two(tmp_path)
     item = data_sets.read_object(data_sets.open_dataset(copy), NAMES[0])
     config = dataclasses.replace(CONFIG, views_per_object=len(item.images) + 1)
     (result,) = evaluation.evaluate_objects(methods(), config, data_sets.open_dataset(copy), NAMES[:1])
-    assert len(result.scores["ours"]["psnr"]) == tiny_dataset.VIEWS
+    assert len(result.scores["paper"]["psnr"]) == tiny_dataset.VIEWS
 
 
 @pytest.mark.parametrize(("split", "expected"), [("test", "the test split is empty"), ("train", "no training objects")])
@@ -176,7 +192,7 @@ def test_lpips_is_measured_with_weights_and_said_to_be_missing_without(outcome, 
     for result in (first, second):
         image, reference = result.pictures["white"].image, jnp.asarray(result.reference)
         close(result.scores["white"]["lpips"], lpips(jnp.asarray(image), reference, WEIGHTS), rtol=1e-4)
-    assert outcome.summary["methods"]["ours"]["lpips"] is None
+    assert outcome.summary["methods"]["paper"]["lpips"] is None
     assert outcome.summary["settings"]["metrics"]["LPIPS"] == NO_WEIGHTS
 
 
@@ -184,10 +200,10 @@ def test_weights_change_what_the_settings_say(monkeypatch):
     monkeypatch.setattr(evaluation, "score_methods", lambda *a: (dict.fromkeys(NAMES, RESULT), []))
     found = evaluation.evaluate(tiny_dataset.run(), tiny_dataset.dataset(), say=lambda line: None, weights=WEIGHTS)
     assert "AlexNet v0.1" in found.summary["settings"]["metrics"]["LPIPS"]
-    assert found.summary["methods"]["ours"]["lpips"] == 0.25
+    assert found.summary["methods"]["paper"]["lpips"] == 0.25
 
 
-RESULT = {method: {metric: np.full(2, 0.25) for metric in METRICS} for method in ("ours", *evaluation.FLOORS)}
+RESULT = {method: {metric: np.full(2, 0.25) for metric in METRICS} for method in ("paper", *evaluation.FLOORS)}
 
 
 def test_objects_are_spread_from_the_first_to_the_last():

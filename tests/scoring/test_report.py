@@ -150,6 +150,16 @@ def test_an_lpips_that_was_not_measured_is_said_to_lack_weights(tmp_path):
     assert page.all("td").count("n/a (no weights)") == 2
 
 
+def test_a_second_network_stands_beside_the_first_under_its_own_name(tmp_path):
+    methods = {"surfels": table()["ours"], "paper": table()["splat"], "npbg": table()["white"]}
+    found = {name: differences()["splat"] for name in ("paper", "npbg")}
+    metrics = {"methods": methods, "surfels_minus": found, "seconds": {"train": 1.0, "train paper": 2.0}}
+    page = write(tmp_path, metrics=metrics)
+    heads = page.all("th")
+    assert {"Surfels", "The paper's network", "Surfels minus the paper's network", "Surfels minus NPBG"} <= set(heads)
+    assert {"+3.1 dB", "1.0 s", "2.0 s"} <= set(page.all("b"))
+
+
 def test_differences_have_a_sign_an_interval_and_a_test(tmp_path):
     page = write(tmp_path, metrics={"methods": table(), "ours_minus": differences()})
     assert "Differences" in page.all("h2")

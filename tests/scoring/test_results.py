@@ -8,6 +8,7 @@ import pytest
 from support import tiny_dataset
 
 from spnr_jax.scoring import evaluation, results
+from spnr_jax.scoring.report import METHODS
 from spnr_jax.scoring.summary import METRICS
 from spnr_jax.training import trainer
 
@@ -33,9 +34,9 @@ def written(out, outcome):
 def test_metrics_json_has_exactly_these_keys(outcome, tmp_path):
     metrics = written(tmp_path, outcome)
     assert set(metrics) == {
-        "methods", "ours_minus", "seconds", "preset", "steps", "seed", "hardware", "settings", "per_category",
+        "methods", "paper_minus", "seconds", "preset", "steps", "seed", "hardware", "settings", "per_category",
     }  # fmt: skip
-    assert set(metrics["methods"]) == {"ours", "white", "splat", "nearest"}
+    assert set(metrics["methods"]) == {"paper", "white", "splat", "nearest"}
     assert all(set(values) == NUMBERS for values in metrics["methods"].values())
     assert (metrics["preset"], metrics["steps"], metrics["seed"]) == ("tiny", 6, 0)
     assert metrics["seconds"] == {"evaluate": 1.5, "total": 2.0}
@@ -45,7 +46,7 @@ def test_metrics_json_has_exactly_these_keys(outcome, tmp_path):
 def test_a_cpsnr_that_does_not_exist_is_null_and_the_report_is_written(outcome, tmp_path):
     methods = {name: values | {"cpsnr": None, "cpsnr_views": 0} for name, values in outcome.summary["methods"].items()}
     metrics = written(tmp_path, dataclasses.replace(outcome, summary=outcome.summary | {"methods": methods}))
-    assert metrics["methods"]["ours"]["cpsnr"] is None
+    assert metrics["methods"]["paper"]["cpsnr"] is None
     assert ">nan" not in (tmp_path / "report.html").read_text().lower()
 
 
@@ -63,7 +64,7 @@ def test_the_report_is_one_file_that_names_the_objects_and_the_best_floor(outcom
         assert name in page
     best = max(("white", "splat", "nearest"), key=lambda name: metrics["methods"][name]["psnr"])
     assert f"best trivial renderer ({best})" in page
-    found = metrics["ours_minus"][best]["psnr"]
+    found = metrics["paper_minus"][best]["psnr"]
     assert (
         f"{found['mean']:+.2f} dB [{found['interval'][0]:+.2f}, {found['interval'][1]:+.2f}] against the best" in page
     )
@@ -71,7 +72,7 @@ def test_the_report_is_one_file_that_names_the_objects_and_the_best_floor(outcom
 
 
 def test_intervals_are_pairs_around_plain_numbers(outcome, tmp_path):
-    ours = written(tmp_path, outcome)["methods"]["ours"]
+    ours = written(tmp_path, outcome)["methods"]["paper"]
     for name in ("psnr", "ssim", "cpsnr", "flip", "iou"):
         low, high = ours[f"{name}_interval"]
         assert low <= ours[name] <= high
@@ -80,7 +81,7 @@ def test_intervals_are_pairs_around_plain_numbers(outcome, tmp_path):
 def test_the_table_for_a_terminal_has_a_line_for_each_method_and_says_what_is_missing(outcome):
     methods = outcome.summary["methods"]
     lines = results.text_table(methods)
-    assert [line.split()[0] for line in lines] == list(methods)
+    assert [line.partition("  ")[0] for line in lines] == [METHODS[name] for name in methods]
     for line, row in zip(lines, methods.values(), strict=True):
         assert f"PSNR {row['psnr']:.2f} " in line
         assert f"FLIP {row['flip']:.3f} " in line
@@ -90,10 +91,10 @@ def test_the_table_for_a_terminal_has_a_line_for_each_method_and_says_what_is_mi
 def test_a_gallery_row_is_the_view_of_the_median_psnr(outcome):
     result = outcome.gallery[0]
     psnr = np.array([30.0, 10.0, 20.0], np.float32)
-    scores = result.scores | {"ours": result.scores["ours"] | {"psnr": psnr}}
+    scores = result.scores | {"paper": result.scores["paper"] | {"psnr": psnr}}
     row = results.gallery_row(dataclasses.replace(result, scores=scores))
     np.testing.assert_array_equal(row.reference, result.reference[2])
-    assert set(row.images) == {"ours", "splat", "nearest"}
+    assert set(row.images) == {"paper", "splat", "nearest"}
     for method, image in row.images.items():
         np.testing.assert_array_equal(image, result.pictures[method].image[2])
-    np.testing.assert_array_equal(row.depth, result.pictures["ours"].depth[2])
+    np.testing.assert_array_equal(row.depth, result.pictures["paper"].depth[2])

@@ -57,7 +57,7 @@ def stand_ins(*labels: str, checksum: str = "0") -> dict[str, methods.Network]:
     """Stand-ins by label; the first word of each names its method."""
     return {
         label: StandIn(
-            method="npbg" if label.startswith("NPBG") else "ours",
+            method="npbg" if label.startswith("NPBG") else "paper",
             config=tiny_dataset.CONFIG,
             variables={},
             steps=6,

@@ -14,6 +14,7 @@ import zlib
 from pathlib import Path
 
 from data_gen.plan.sources.listing import Listed, described
+from spnr_jax.errors import UserError
 
 FOLDER = "3dmodels"
 FILE = re.compile(r"([\w-]+/)*[\w-]+(\.[\w-]+)*")  # no way up, and none from the root
@@ -27,7 +28,7 @@ def find_products(root: Path) -> list[Listed]:
     table = next((folder / name for name in TABLES if (folder / name).is_file()), None)
     models = folder / "original"
     if table is None or not models.is_dir():
-        raise ValueError(
+        raise UserError(
             f"--root {root}: expected {FOLDER}/original/*/*.glb and {FOLDER}/{TABLES[0]}, as in the ABO 3D download; "
             f"{described(root)}"
         )
@@ -50,15 +51,15 @@ def read_table(table: Path) -> dict[str, str]:
             text = file.read(LONGEST_TABLE)
         rows = list(csv.DictReader(text.decode("utf-8").splitlines()))
     except (OSError, EOFError, UnicodeDecodeError, zlib.error, csv.Error) as error:
-        raise ValueError(f"{table}: cannot be read ({error}); unpack the download again") from None
+        raise UserError(f"{table}: cannot be read ({error}); unpack the download again") from None
     names: dict[str, str] = {}
     for number, row in enumerate(rows, start=2):
         object_id, name = row.get("3dmodel_id"), row.get("path")
         if not object_id or not name:
-            raise ValueError(f"{table}, line {number}: expected columns 3dmodel_id and path; unpack the download again")
+            raise UserError(f"{table}, line {number}: expected columns 3dmodel_id and path; unpack the download again")
         if object_id in names:
-            raise ValueError(f"{table}, line {number}: product {object_id} is listed twice; unpack the download again")
+            raise UserError(f"{table}, line {number}: product {object_id} is listed twice; unpack the download again")
         if not FILE.fullmatch(name):
-            raise ValueError(f"{table}, line {number}: {name!r} is no file below 3dmodels/original; unpack it again")
+            raise UserError(f"{table}, line {number}: {name!r} is no file below 3dmodels/original; unpack it again")
         names[object_id] = name
     return names

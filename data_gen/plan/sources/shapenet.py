@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Literal, get_args
 
 from data_gen.plan.sources.listing import Listed, described
+from spnr_jax.errors import UserError
 
 Category = Literal["car", "plane", "chair"]
 SYNSETS: dict[str, str] = {"car": "02958343", "plane": "02691156", "chair": "03001627"}  # WordNet 3.0
@@ -21,7 +22,7 @@ MESHES = ("models/model_normalized.obj", "model.obj")  # v2, v1
 def find_objects(root: Path, category: str) -> list[Listed]:
     """Every object of a class below a root (the folder that holds the synsets, or the synset), sorted by id."""
     if category not in SYNSETS:
-        raise ValueError(f"--category {category}: expected one of {', '.join(get_args(Category))}")
+        raise UserError(f"--category {category}: expected one of {', '.join(get_args(Category))}")
     synset = SYNSETS[category]
     folder = root if root.resolve().name == synset and root.is_dir() else root / synset
     objects = []
@@ -30,7 +31,7 @@ def find_objects(root: Path, category: str) -> list[Listed]:
         fault = "" if path else f"has neither {MESHES[0]} (ShapeNetCore v2) nor {MESHES[1]} (v1)"
         objects.append(Listed(object_id=place.name, path=path or place / MESHES[0], folder=place, fault=fault))
     if all(found.fault for found in objects):
-        raise ValueError(
+        raise UserError(
             f"--root {root}: expected {synset}/*/{MESHES[0]} or {synset}/*/{MESHES[1]}, as in ShapeNetCore v2 or v1 "
             f"({category} is {synset}); {described(root)}"
         )

@@ -17,6 +17,8 @@ from typing import Literal
 
 import numpy as np
 
+from spnr_jax.errors import UserError
+
 Wrap = Literal["repeat", "mirror", "clamp"]
 Values = np.ndarray | np.floating  # NumPy makes numbers of arrays without axes
 # What becomes of parts that light passes through: refuse the object, as references need, draw them as if they were
@@ -26,7 +28,7 @@ CHANNELS = {"base_color": 1, "roughness": 0, "metallic": 0}  # of a material, an
 TEXTURES = {"opacity": 0, "normal_map": 1}  # of a material that may be absent, and axes of one texel
 
 
-class RejectedAsset(ValueError):
+class RejectedAsset(UserError):
     """An object that cannot be used; the message is the one-line reason that goes into rejected.jsonl."""
 
 

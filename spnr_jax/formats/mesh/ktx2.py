@@ -25,7 +25,7 @@ def decode(data: bytes, name: str, most_pixels: int) -> np.ndarray:
     try:
         texture = opengl_basisu.open(data)
         if texture.width * texture.height > most_pixels:  # before memory is taken for them
-            raise ValueError(f"{texture.width} x {texture.height} pixels, more than {most_pixels}")
+            raise RejectedAsset(f"{texture.width} x {texture.height} pixels, more than {most_pixels}")
         return np.asarray(texture.transcode("rgba8").data, np.uint8)
     except (ValueError, LookupError, RuntimeError) as error:
         raise RejectedAsset(f"names an image that cannot be read: {name} ({error})") from None

@@ -9,7 +9,6 @@ import hashlib
 import io
 import re
 import struct
-import traceback
 import warnings
 from collections import Counter
 from dataclasses import replace
@@ -21,6 +20,7 @@ from trimesh.exchange.ply import load_ply
 from trimesh.exchange.stl import load_stl
 from trimesh.geometry import triangulate_quads
 
+from spnr_jax.errors import UserError, is_bug
 from spnr_jax.formats.mesh.assemble import assemble
 from spnr_jax.formats.mesh.assets import Asset, Part, RejectedAsset, TransparentParts
 from spnr_jax.formats.mesh.gltf import load_gltf
@@ -45,11 +45,11 @@ def find_meshes(folder: Path) -> list[tuple[str, Path]]:
     """
     folder = Path(folder)
     if not folder.is_dir():
-        raise ValueError(f"{folder} is not a folder: give a folder of {' '.join(SUFFIXES)} files")
+        raise UserError(f"{folder} is not a folder: give a folder of {' '.join(SUFFIXES)} files")
     relative = sorted(path.relative_to(folder) for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES)
     visible = [p for p in relative if (folder / p).is_file() and not any(part.startswith(".") for part in p.parts)]
     if not visible:
-        raise ValueError(f"{folder} holds no mesh file: expected {' '.join(SUFFIXES)}, in it or in its subfolders")
+        raise UserError(f"{folder} holds no mesh file: expected {' '.join(SUFFIXES)}, in it or in its subfolders")
     siblings = Counter(path.parent for path in visible)
     names = [_short_name(path, alone=siblings[path.parent] == 1) for path in visible]
     shared = Counter(name.casefold() for name in names)
@@ -84,19 +84,13 @@ def load_mesh(path: Path, root: Path | None = None, transparent_parts: Transpare
     except RejectedAsset:
         raise
     except UNREADABLE as error:
-        if isinstance(error, NameError) and _raised_by_us(error):
-            raise  # no file makes our own code name what is not there
+        if is_bug(error):
+            raise
         text = str(error).strip().split("\n")[0]
         raise RejectedAsset(
             f"cannot be read, the file is broken or truncated ({type(error).__name__}: {text})"
         ) from error
     return replace(asset, source={"file": path.name, "sha256": checksum})
-
-
-def _raised_by_us(error: Exception) -> bool:
-    """Whether the innermost call is one of this package."""
-    innermost = traceback.extract_tb(error.__traceback__)[-1]
-    return Path(innermost.filename).is_relative_to(Path(__file__).parents[2])
 
 
 def _load(path: Path, root: Path | None, transparent_parts: TransparentParts) -> Asset:

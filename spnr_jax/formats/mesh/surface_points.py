@@ -11,6 +11,7 @@ from typing import Literal
 
 import numpy as np
 
+from spnr_jax.errors import UserError
 from spnr_jax.formats.mesh.assets import CHANNELS, TEXTURES, Asset, Material, Part, RejectedAsset
 from spnr_jax.formats.mesh.tangents import tilted
 from spnr_jax.formats.mesh.texels import lookup
@@ -65,7 +66,7 @@ def sample_surface(asset: Asset, num_points: int, seed: int, spread: Spread = "r
     those before it, so that any first ones of them are spread evenly too, and thin parts have their share.
     """
     if num_points < 1:
-        raise ValueError(f"num_points must be at least 1, got {num_points}")
+        raise UserError(f"num_points must be at least 1, got {num_points}")
     if spread == "random":
         return _random_points(asset, num_points, seed)
     drawn = _random_points(asset, CANDIDATES * num_points, seed)

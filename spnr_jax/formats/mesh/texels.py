@@ -10,6 +10,7 @@ import io
 import numpy as np
 from PIL import Image, UnidentifiedImageError
 
+from spnr_jax.errors import UserError
 from spnr_jax.formats.mesh import ktx2
 from spnr_jax.formats.mesh.assets import RejectedAsset, Wrap
 
@@ -32,7 +33,7 @@ def read_image(data: bytes, name: str) -> np.ndarray:
     try:
         with Image.open(io.BytesIO(data)) as image:
             if image.width * image.height > MOST_PIXELS:  # before memory is taken for them
-                raise ValueError(f"{image.width} x {image.height} pixels, more than {MOST_PIXELS}")
+                raise UserError(f"{image.width} x {image.height} pixels, more than {MOST_PIXELS}")
             if image.mode.startswith("I"):  # PIL would clip 16-bit grey to 255 instead of scaling it
                 eight_bit = (np.asarray(image, np.int64) // 257).astype(np.uint8)
                 return np.asarray(Image.fromarray(eight_bit).convert("RGBA"))

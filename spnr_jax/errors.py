@@ -1,0 +1,28 @@
+"""The errors that a person can mend, the bugs that are ours, and when a call stack is shown."""
+
+import os
+import traceback
+
+JSON = (dict, list, str, int, float, bool, type(None))
+PACKAGES = ("spnr_jax", "data_gen", "experiments")
+
+
+class UserError(ValueError):
+    """What was asked for cannot be done; the message says what was expected, what came, and what to do."""
+
+
+def split_debug(arguments: list[str]) -> tuple[list[str], bool]:
+    """The arguments without `--debug`, and whether call stacks are shown: for it, or for SPNR_DEBUG=1."""
+    others = [argument for argument in arguments if argument != "--debug"]
+    return others, len(others) < len(arguments) or os.environ.get("SPNR_DEBUG", "0") not in ("", "0")
+
+
+def is_bug(error: Exception) -> bool:
+    """Whether code of this project used a name that there is not: no broken file is the cause.
+
+    An attribute of a JSON value is another matter: there a file holds a list, say, where an object should be.
+    """
+    frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
+    if not frames or frames[-1].f_globals.get("__name__", "").partition(".")[0] not in PACKAGES:
+        return False
+    return isinstance(error, NameError) or (isinstance(error, AttributeError) and not isinstance(error.obj, JSON))
