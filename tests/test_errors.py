@@ -37,7 +37,7 @@ def test_a_bug_in_a_reader_of_meshes_is_not_called_a_broken_file(tmp_path, monke
     with pytest.raises(RejectedAsset):
         meshes.load_mesh(tmp_path / "a.glb")
     space = {"__name__": meshes.__name__}
-    exec("def load(path): return absent", space)
+    exec("def load(path, transparent_parts): return absent", space)
     monkeypatch.setattr(meshes, "load_gltf", space["load"])
     with pytest.raises(NameError, match="absent"):
         meshes.load_mesh(tmp_path / "a.glb")
