@@ -21,8 +21,8 @@ SOLID = 0.6  # opacity from which a pixel has a colour of its own
 LEAST_FACING = 0.05  # weight of a splat that is seen from its edge
 RIDGE = 0.4  # in views
 BEFORE = 2.5  # sides of a cube before a picture's depth from which a view is against a splat
-EMPTY = 0.4  # opacity below which a picture is empty
-FEW = 0.2  # share of the views that see a splat
+EMPTY = 0.5  # opacity below which a picture is empty
+FEW = 0.1  # share of the views that see a splat
 
 
 def colored(gaussians: Gaussians, views: Sequence[View], *, side: float, degree: int) -> Gaussians:
