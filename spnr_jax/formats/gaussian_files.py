@@ -70,7 +70,13 @@ def ply_of(gaussians: Gaussians, note: str = "") -> bytes:
     rest = harmonics[:, 1:].transpose(0, 2, 1).reshape(len(opacity), -1)
     names = [*"xyz", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3)), *(f"f_rest_{i}" for i in range(rest.shape[1]))]
     names += ["opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
-    parts = [splats.position, np.zeros_like(splats.position), harmonics[:, 0], rest, np.log(opacity / (1 - opacity))[:, None]]
+    parts = [
+        splats.position,
+        np.zeros_like(splats.position),
+        harmonics[:, 0],
+        rest,
+        np.log(opacity / (1 - opacity))[:, None],
+    ]
     parts += [np.log(np.asarray(splats.scale)), splats.rotation]
     header = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in note.splitlines())]
     header += [f"element vertex {len(opacity)}", *(f"property float {name}" for name in names), "end_header"]

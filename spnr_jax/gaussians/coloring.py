@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float
+from scipy.ndimage import minimum_filter
 
 from spnr_jax.gaussians.drawing import rotations
 from spnr_jax.gaussians.harmonics import basis, coefficients
@@ -22,7 +23,7 @@ LEAST_FACING = 0.05  # weight of a splat that is seen from its edge
 RIDGE = 0.4  # in views
 BEFORE = 2.5  # sides of a cube before a picture's depth from which a view is against a splat
 EMPTY = 0.5  # opacity below which a picture is empty
-FEW = 0.1  # share of the views that see a splat
+FEW, ALWAYS = 0.12, 0.5  # views against a splat that do not count: share of those that see it, and number
 
 
 def colored(gaussians: Gaussians, views: Sequence[View], *, side: float, degree: int) -> Gaussians:
@@ -41,7 +42,7 @@ def colored(gaussians: Gaussians, views: Sequence[View], *, side: float, degree:
         opacity, depth = view.opacity[row, column], view.depth[row, column]
         with np.errstate(invalid="ignore"):
             near = inside & (distance < depth + BEHIND * side)
-            before = near & (distance < depth - BEFORE * side)
+            before = near & (distance < _nearest_around(view.depth)[row, column] - BEFORE * side)
         against += before | (inside & (opacity < EMPTY))
         visible = np.flatnonzero(near & ~before & (opacity > SOLID))
         facing = np.abs(np.einsum("ni,ni->n", towards[visible], normal[visible]))
@@ -53,7 +54,7 @@ def colored(gaussians: Gaussians, views: Sequence[View], *, side: float, degree:
         right[visible] += (weight * harmonics)[:, :, None] * (color - 0.5)[:, None]
         seen[visible] += 1
     held = np.diag([1e-4] + [RIDGE / (4 * np.pi)] * (count - 1)).astype(np.float32)
-    shown = (seen > 0) & (against <= FEW * seen)
+    shown = (seen > 0) & (against <= FEW * seen + ALWAYS)
     if not shown.any():
         raise ValueError("the pictures agree on no surface; give more views")
     harmonics = np.linalg.solve(matrix[shown] + held, right[shown])
@@ -61,9 +62,12 @@ def colored(gaussians: Gaussians, views: Sequence[View], *, side: float, degree:
     return Gaussians(**kept | {"harmonics": harmonics.astype(np.float32)})
 
 
-def _pixels(
-    position: Float[np.ndarray, "splats 3"], camera: Camera
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _nearest_around(depth: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "height width"]:
+    """The least depth of a pixel and those around it: the network's depth is blurred where it jumps."""
+    return minimum_filter(np.where(np.isnan(depth), np.inf, depth), 3)
+
+
+def _pixels(position: Float[np.ndarray, "splats 3"], camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Row and column of the pixel that each place lies in, and whether it lies in one."""
     pose, k = np.asarray(camera.cam_to_world), np.asarray(camera.intrinsics)
     local = (position - pose[:, 3]) @ pose[:, :3]

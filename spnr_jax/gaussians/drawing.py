@@ -58,8 +58,8 @@ def rotations(quaternion: Float[Array, "splats 4"]) -> Float[Array, "splats 3 3"
 def footprints(gaussians: Gaussians, camera: Camera, dilation: float | Array = DILATION) -> Footprints:
     """Where the splats lie on the picture of a camera (unbatched); behind it their depth is negative."""
     pose, k = jnp.asarray(camera.cam_to_world), jnp.asarray(camera.intrinsics)
-    turn = pose[:, :3] * jnp.array([1.0, -1.0, -1.0])  # to axes right, down, forward
-    local = jnp.matmul(jnp.asarray(gaussians.position) - pose[:, 3], turn, precision="highest")
+    turn = pose[:, :3] * jnp.array([[1.0, -1.0, -1.0]])  # to axes right, down, forward
+    local = jnp.matmul(jnp.asarray(gaussians.position) - pose[None, :, 3], turn, precision="highest")
     depth = local[:, 2]
     ahead = jnp.maximum(depth, NEAREST)
     across, down = local[:, 0] / ahead, local[:, 1] / ahead
@@ -78,13 +78,11 @@ def footprints(gaussians: Gaussians, camera: Camera, dilation: float | Array = D
 def colors(gaussians: Gaussians, eye: Float[Array, "3"]) -> Float[Array, "splats 3"]:
     """sRGB of the splats as seen from a place; not below 0."""
     harmonics = jnp.asarray(gaussians.harmonics)
-    seen = basis(normalize(jnp.asarray(gaussians.position) - eye), degree_of(harmonics.shape[1]))
+    seen = basis(normalize(jnp.asarray(gaussians.position) - eye[None]), degree_of(harmonics.shape[1]))
     return jnp.maximum(0.5 + jnp.einsum("nk,nkc->nc", seen, harmonics, precision="highest"), 0)
 
 
-def lists(
-    foot: Footprints, opacity: Float[np.ndarray, " splats"], height: int, width: int, most: int = LIST
-) -> Lists:
+def lists(foot: Footprints, opacity: Float[np.ndarray, " splats"], height: int, width: int, most: int = LIST) -> Lists:
     """The front-most splats of each pixel that any touches; NumPy."""
     centre, conic, depth = (np.asarray(x, np.float32) for x in foot)
     touching = (depth > NEAREST) & (opacity > LEAST_ALPHA)

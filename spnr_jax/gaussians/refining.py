@@ -23,7 +23,8 @@ SHARES = ((0, 0), (1, 1))  # column and row of the first pixel
 LIST = 24  # splats of a pixel that are seen in a step
 OPACITY_WEIGHT = 0.25  # of the opacity beside each colour
 RATES = {"base": 0.02, "rest": 0.006, "opacity": 0.12, "scale": 0.03, "moved": 0.05}  # of Adam
-WIDER = 1.25
+WIDER = 1.25  # than at first the splats are, by which is found what covers what
+BUCKET = 2**14  # splats
 NARROWEST, WIDEST = 0.25, 3.0  # a splat's width against that at first
 FARTHEST = 1.0  # that a splat moves along each axis, in its widths at first
 MOST_OPACITY = 0.99
@@ -92,22 +93,33 @@ def _step(
     wanted: Float[Array, "pixels 4"],
     rate: Float[Array, ""],
 ) -> tuple[Parameters, Any, Float[Array, ""]]:
-    loss, gradient = jax.value_and_grad(loss_of)(
-        parameters, first, camera, found, wanted, drawing.DILATION / STRIDE**2
-    )
+    loss, gradient = jax.value_and_grad(loss_of)(parameters, first, camera, found, wanted, drawing.DILATION / STRIDE**2)
     update, state = optimiser().update(gradient, state, parameters)
     moved = jax.tree.map(lambda x, dx: x + rate * dx, parameters, update)
     return moved, state, loss
+
+
+def _padded(gaussians: Gaussians) -> Gaussians:
+    """The splats with invisible ones behind them, up to a multiple of BUCKET: few sizes, few compilations."""
+    extra = -len(gaussians.opacity) % BUCKET
+
+    def longer(values: np.ndarray) -> np.ndarray:
+        return np.concatenate([values, np.repeat(values[:1], extra, axis=0)])
+
+    wide = jax.tree.map(lambda x: longer(np.asarray(x)), gaussians)
+    wide.opacity[len(wide.opacity) - extra :] = 0
+    return wide
 
 
 class Refinement:
     """The refining of one object: its splats at first, its views, who covers what in them, and how far it is."""
 
     def __init__(self, gaussians: Gaussians, views: Sequence[View], seed: int = 0):
-        self.first = jax.tree.map(jnp.asarray, gaussians)
+        self.count = len(gaussians.opacity)
+        self.first = jax.tree.map(jnp.asarray, _padded(gaussians))
         self.views = views
         self.steps = 0
-        self._parameters = parameters_of(gaussians)
+        self._parameters = parameters_of(self.first)
         self._state = optimiser().init(self._parameters)
         self._turns = np.random.default_rng(seed)
         self._order: list[int] = []
@@ -117,7 +129,7 @@ class Refinement:
     @property
     def gaussians(self) -> Gaussians:
         """The splats as they are now."""
-        return gaussians_of(self._parameters, self.first)
+        return jax.tree.map(lambda x: np.asarray(x)[: self.count], gaussians_of(self._parameters, self.first))
 
     def step(self, rate: float | int = 1.0) -> float:
         """The loss before a step on one view, at a share of the learning rates."""
@@ -125,9 +137,7 @@ class Refinement:
             self._order = list(self._turns.permutation(len(self.views)))
         share = self.steps // len(self.views) % len(SHARES)
         seen = self._seen(self._order.pop(), share)
-        self._parameters, self._state, loss = _step(
-            self._parameters, self._state, self.first, *seen, jnp.float32(rate)
-        )
+        self._parameters, self._state, loss = _step(self._parameters, self._state, self.first, *seen, jnp.float32(rate))
         self.steps += 1
         return float(loss)
 

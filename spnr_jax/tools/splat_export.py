@@ -152,4 +152,3 @@ def light_name(lighting: Lighting) -> str:
     parts += [f"sun {lighting.sun[0]:g} {lighting.sun[1]:g}"] if lighting.sun else []
     options = {"yaw": lighting.light_yaw, "exposure": lighting.exposure}
     return " + ".join(parts) + "".join(f", {name} {value:g}" for name, value in options.items() if value)
-

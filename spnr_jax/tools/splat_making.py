@@ -1,7 +1,7 @@
 """Gaussian splats of a cloud: the network draws it from all around, and splats are made and refined from that.
 
-    fitting cameras    even directions on the sphere, the same distance as `Model.camera`
-    splats             gaussians/placing.py, coloring.py, refining.py, in the box, then in the cloud's units
+fitting cameras    even directions on the sphere, the same distance as `Model.camera`
+splats             gaussians/placing.py, coloring.py, refining.py, in the box, then in the cloud's units
 """
 
 import dataclasses
@@ -107,6 +107,7 @@ def in_units(gaussians: Gaussians, volume: Volume) -> Gaussians:
 def _refined(gaussians: Gaussians, pictures: list[View], seconds: float | int) -> tuple[Gaussians, int]:
     """The splats refined until the time is over, and the steps that were taken."""
     refinement = refining.Refinement(gaussians, pictures)
+    refinement.step()  # compiles
     begin = time.monotonic()
     while (passed := (time.monotonic() - begin) / seconds) < 1:
         refinement.step(LEAST_RATE + (1 - LEAST_RATE) * (1 - passed))

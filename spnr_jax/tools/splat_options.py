@@ -12,7 +12,8 @@ class SplatMaking:
     """How Gaussian splats are made of a cloud."""
 
     seconds: float = 20.0
-    """Seconds that splats are refined against the network's pictures; 0 leaves them as they are first made."""
+    """Seconds that splats are refined against the network's pictures, compilation apart; 0 leaves them as they are
+    first made."""
     most_splats: int = 80_000
     """Splats at most."""
     harmonics: Literal[0, 1, 2, 3] = 1
