@@ -111,7 +111,12 @@ def _scores(options: SplatStudy, model: Model, item: data_sets.ObjectData) -> di
         report=said.append,
     )
     spz = gaussian_files.spz_of(made)
-    found = {"splats": len(made.opacity), "spz_mb": len(spz) / 1e6, "seconds": time.perf_counter() - begin, "said": said}
+    found = {
+        "splats": len(made.opacity),
+        "spz_mb": len(spz) / 1e6,
+        "seconds": time.perf_counter() - begin,
+        "said": said,
+    }
     for size in options.sizes:
         pairs = [view_of(item, view, size) for view in range(options.views)]
         drawn = {"network": [], "splats": [], "splats, by Mitsuba": []}
@@ -134,9 +139,7 @@ def _scores(options: SplatStudy, model: Model, item: data_sets.ObjectData) -> di
     return found
 
 
-def by_mitsuba(
-    gaussians: Gaussians, camera: Camera, spp: int, place: Path
-) -> tuple[np.ndarray, np.ndarray]:
+def by_mitsuba(gaussians: Gaussians, camera: Camera, spp: int, place: Path) -> tuple[np.ndarray, np.ndarray]:
     """Picture on white (sRGB) and opacity by Mitsuba, which reads the splats from a .ply at `place`."""
     white = np.zeros_like(gaussians.harmonics)
     white[:, 0] = 0.5 / C0

@@ -33,7 +33,7 @@ JSON_CHUNK, BINARY_CHUNK = b"JSON", b"BIN\0"
 
 
 def write_splats(path: Path, gaussians: Gaussians, note: str = "") -> int:
-    """Writes a file of the kind that its suffix says, in one piece; its size in bytes.  ValueError for other suffixes."""
+    """Writes a file of the kind that its suffix says, in one piece; its size in bytes.  ValueError for others."""
     makers = {".ply": ply_of, ".spz": lambda splats, note: spz_of(splats), ".glb": glb_of}
     check_suffix(path)
     content = makers[path.suffix.lower()](gaussians, note)

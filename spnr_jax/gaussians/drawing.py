@@ -1,4 +1,4 @@
-"""A differentiable picture of Gaussian splats, as splat viewers draw them (EWA, Zwicker et al. 2001; Kerbl et al. 2023).
+"""A differentiable picture of Gaussian splats, as viewers draw them (EWA, Zwicker et al. 2001; Kerbl et al. 2023).
 
     footprint   a splat on the picture: centre, inverse covariance (a, b, c: a dx^2 + 2 b dx dy + c dy^2), depth; its
                 covariance grows by `dilation` square pixels, so that no splat falls between the pixels
@@ -19,7 +19,7 @@ from jaxtyping import Array, Float, Int
 
 from spnr_jax.gaussians.harmonics import basis, degree_of
 from spnr_jax.kernels.numerics import gather_rows, normalize
-from spnr_jax.kernels.records import Camera, Gaussians
+from spnr_jax.kernels.records import AnyArray, Camera, Gaussians
 
 DILATION = 0.3  # square pixels, as every viewer has it
 LEAST_ALPHA = 1 / 255  # below which a splat does not touch a pixel
@@ -38,13 +38,13 @@ class Footprints(NamedTuple):
 
 
 class Lists(NamedTuple):
-    """Numbers of the splats of each covered pixel, front-most first, their count where there are no more; its number."""
+    """Numbers of the splats of each covered pixel, front-most first, then their count; and the pixel's number."""
 
     splats: Int[np.ndarray, "list pixels"]
     pixel: Int[np.ndarray, " pixels"]
 
 
-def rotations(quaternion: Float[Array, "splats 4"]) -> Float[Array, "splats 3 3"]:
+def rotations(quaternion: Float[AnyArray, "splats 4"]) -> Float[Array, "splats 3 3"]:
     """Rotation matrices of unit quaternions w x y z."""
     w, x, y, z = (quaternion[:, i] for i in range(4))
     rows = (
@@ -75,7 +75,7 @@ def footprints(gaussians: Gaussians, camera: Camera, dilation: float | Array = D
     return Footprints(centre, jnp.stack([yy, -xy, xx], axis=-1) / determinant[:, None], depth)
 
 
-def colors(gaussians: Gaussians, eye: Float[Array, "3"]) -> Float[Array, "splats 3"]:
+def colors(gaussians: Gaussians, eye: Float[AnyArray, "3"]) -> Float[Array, "splats 3"]:
     """sRGB of the splats as seen from a place; not below 0."""
     harmonics = jnp.asarray(gaussians.harmonics)
     seen = basis(normalize(jnp.asarray(gaussians.position) - eye[None]), degree_of(harmonics.shape[1]))
@@ -124,8 +124,8 @@ def padded(found: Lists, pixels: int, nothing: int) -> Lists:
 
 def blend(
     foot: Footprints,
-    color: Float[Array, "splats 3"],
-    opacity: Float[Array, " splats"],
+    color: Float[AnyArray, "splats 3"],
+    opacity: Float[AnyArray, " splats"],
     found: Lists,
     width: int,
 ) -> Float[Array, "pixels 4"]:
@@ -144,6 +144,7 @@ def blend(
 
 @jax.jit
 def looked(gaussians: Gaussians, camera: Camera, dilation: Float[Array, ""]) -> tuple[Footprints, Array]:
+    """Footprints and colours of splats as a camera sees them, compiled whole."""
     return footprints(gaussians, camera, dilation), colors(gaussians, camera.cam_to_world[:, 3])
 
 
@@ -151,7 +152,7 @@ _blend = jax.jit(blend, static_argnames="width")
 
 
 def draw(
-    gaussians: Gaussians, camera: Camera, dilation: float = DILATION, background: float = 1.0
+    gaussians: Gaussians, camera: Camera, dilation: float | int = DILATION, background: float | int = 1.0
 ) -> tuple[Float[np.ndarray, "height width 3"], Float[np.ndarray, "height width"]]:
     """Picture (sRGB) and opacity of the splats from a camera (unbatched), in the units and axes of their positions."""
     height, width = camera.height, camera.width

@@ -5,7 +5,7 @@ The order is that of Kerbl et al. 2023 and of KHR_gaussian_splatting: by degree,
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from spnr_jax.kernels.records import AnyArray
 
@@ -29,7 +29,7 @@ def degree_of(count: int) -> int:
     raise ValueError(f"spherical harmonics have 1, 4, 9 or 16 coefficients, got {count}")
 
 
-def basis(directions: Float[AnyArray, "*batch 3"], degree: int) -> Float[Array, "*batch coefficients"]:
+def basis(directions: Float[AnyArray, "*batch 3"], degree: int) -> Float[AnyArray, "*batch coefficients"]:
     """All harmonics up to a degree, 0 to 3, of unit vectors; of NumPy arrays as NumPy arrays."""
     x, y, z = (directions[..., i] for i in range(3))
     xx, yy, zz = x * x, y * y, z * z

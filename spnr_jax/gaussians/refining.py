@@ -134,7 +134,7 @@ class Refinement:
     def step(self, rate: float | int = 1.0) -> float:
         """The loss before a step on one view, at a share of the learning rates."""
         if not self._order:
-            self._order = list(self._turns.permutation(len(self.views)))
+            self._order = self._turns.permutation(len(self.views)).tolist()
         share = self.steps // len(self.views) % len(SHARES)
         seen = self._seen(self._order.pop(), share)
         self._parameters, self._state, loss = _step(self._parameters, self._state, self.first, *seen, jnp.float32(rate))

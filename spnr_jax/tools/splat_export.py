@@ -83,7 +83,7 @@ def share(options: Share, note: Callable[[str], None]) -> Iterator[str]:
 def page(
     gaussians: Gaussians, poster: np.ndarray, camera: Camera, view: tuple[float, float], title: str, note: str
 ) -> bytes:
-    """The page: splats, the network's picture from `camera`, which stands at `view`, azimuth and elevation in degrees."""
+    """The page: splats, a picture from `camera`, which stands at `view`, azimuth and elevation in degrees."""
     pose = np.asarray(camera.cam_to_world, np.float64)
     target = np.asarray(gaussians.position, np.float64).mean(axis=0)
     distance = float((pose[:, 3] - target) @ pose[:, 2])
