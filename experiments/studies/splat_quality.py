@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import jax
+import mitsuba
 import numpy as np
 
 from data_gen.render.variant import choose_variant
@@ -30,10 +31,11 @@ from spnr_jax.devices import machine
 from spnr_jax.formats import data_sets, gaussian_files, images
 from spnr_jax.gaussians import drawing
 from spnr_jax.gaussians.harmonics import C0
+from spnr_jax.gaussians.placing import View
 from spnr_jax.kernels.records import Camera, Gaussians
-from spnr_jax.method.model import Model
+from spnr_jax.method.model import Model, Volume
 from spnr_jax.scoring.picture_scores import sharpness
-from spnr_jax.tools.splat_making import splats
+from spnr_jax.tools.splat_making import drawn_views, fitting_cameras, in_box, splats_of_views
 from spnr_jax.training.weights import load
 
 LARGER = 100.0  # times, the scene for Mitsuba
@@ -56,6 +58,8 @@ class SplatStudy:
     """Points of an object, the first of its file."""
     objects: int = 4
     """Test objects, evenly out of all."""
+    names: tuple[str, ...] = ()
+    """Test objects by their names (default: by their number)."""
     views: int = 2
     """Views of an object."""
     sizes: tuple[int, ...] = SIZES
@@ -78,10 +82,10 @@ def main(options: SplatStudy) -> None:
     """Makes, draws, scores and writes."""
     dataset = data_sets.open_dataset(options.data)
     everyone = dataset.splits["test"]
-    names = everyone[:: max(len(everyone) // options.objects, 1)][: options.objects]
+    names = options.names or everyone[:: max(len(everyone) // options.objects, 1)][: options.objects]
     asked = {k: str(v) if isinstance(v, Path) else v for k, v in dataclasses.asdict(options).items()}
     results_folder.claim(options.out, "splat_quality", asked | {"out": "", "objects": list(names)}, dataset)
-    choose_variant()
+    mitsuba.set_variant(choose_variant()[0])
     model, rows = load(options.run), {}
     for name in names:
         item = data_sets.read_object(dataset, name)
@@ -99,17 +103,10 @@ def main(options: SplatStudy) -> None:
 def _scores(options: SplatStudy, model: Model, item: data_sets.ObjectData) -> dict:
     """Decibels by size and method, the number of splats, the megabytes as .spz, and seconds."""
     cloud = told(jax.tree.map(lambda x: x[: options.num_points], item.cloud), normals=False)
-    volume, begin, said = model.encode(cloud), time.perf_counter(), []
-    made = splats(
-        model,
-        cloud,
-        degree=options.degree,
-        most=options.most,
-        views=options.fitting_views,
-        resolution=options.fitting_resolution,
-        seconds=options.seconds,
-        report=said.append,
-    )
+    volume, said = model.encode(cloud), []
+    pictures = _pictures(options, model, volume, item.name)
+    begin = time.perf_counter()
+    made = splats_of_views(pictures, volume, cloud, options.degree, options.most, options.seconds, said.append)
     spz = gaussian_files.spz_of(made)
     found = {
         "splats": len(made.opacity),
@@ -139,6 +136,19 @@ def _scores(options: SplatStudy, model: Model, item: data_sets.ObjectData) -> di
     return found
 
 
+def _pictures(options: SplatStudy, model: Model, volume: Volume, name: str) -> list[View]:
+    """The network's pictures that splats are made from; they take longest, so they are kept."""
+    cameras = fitting_cameras(model, volume, options.fitting_views, options.fitting_resolution)
+
+    def drawn() -> tuple[np.ndarray, ...]:
+        views = drawn_views(model, volume, cameras, None)
+        return tuple(np.stack([view[i] for view in views]) for i in (1, 2, 3))
+
+    arrays = results_folder.kept(options.out / name / "pictures.npz", drawn)
+    inside = [in_box(camera, volume) for camera in cameras]
+    return [View(camera, *arrays) for camera, *arrays in zip(inside, *arrays, strict=True)]
+
+
 def by_mitsuba(gaussians: Gaussians, camera: Camera, spp: int, place: Path) -> tuple[np.ndarray, np.ndarray]:
     """Picture on white (sRGB) and opacity by Mitsuba, which reads the splats from a .ply at `place`."""
     white = np.zeros_like(gaussians.harmonics)
@@ -152,8 +162,6 @@ def by_mitsuba(gaussians: Gaussians, camera: Camera, spp: int, place: Path) -> t
 
 def _composited(gaussians: Gaussians, camera: Camera, spp: int, place: Path) -> np.ndarray:
     """Colours (sRGB) weighted by the opacity, (height, width, 3)."""
-    import mitsuba as mi
-
     larger = gaussians.replace(position=gaussians.position * LARGER, scale=gaussians.scale * LARGER)
     gaussian_files.write_splats(place, larger)
     pose = np.eye(4)
@@ -166,13 +174,13 @@ def _composited(gaussians: Gaussians, camera: Camera, spp: int, place: Path) -> 
         "fov": float(np.rad2deg(2 * np.arctan(0.5 * size / focal))),
         "near_clip": 0.1,
         "far_clip": 1e5,
-        "to_world": mi.ScalarTransform4f(HALF_TURN @ pose @ np.diag([-1.0, 1.0, -1.0, 1.0])),
+        "to_world": mitsuba.ScalarTransform4f(HALF_TURN @ pose @ np.diag([-1.0, 1.0, -1.0, 1.0])),
         "film": film | {"component_format": "float32"},
         "sampler": {"type": "multijitter", "sample_count": spp},
     }
     splats_of_file = {"type": "ellipsoids", "filename": str(place)}
     scene = {"type": "scene", "integrator": {"type": "volprim_rf_basic"}, "splats": splats_of_file, "sensor": sensor}
-    linear = np.maximum(np.array(mi.render(mi.load_dict(scene), spp=spp)), 0)
+    linear = np.maximum(np.array(mitsuba.render(mitsuba.load_dict(scene), spp=spp)), 0)
     return np.where(linear > 0.0031308, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055, 12.92 * linear)
 
 

@@ -59,6 +59,19 @@ def splats_of(
     """`splats` of a cloud that is encoded already."""
     pictures = drawn_views(model, volume, fitting_cameras(model, volume, views, resolution), light)
     report(f"the network drew {views} pictures of {resolution} x {resolution}")
+    return splats_of_views(pictures, volume, cloud, degree, most, seconds, report)
+
+
+def splats_of_views(
+    pictures: list[View],
+    volume: Volume,
+    cloud: PointCloud,
+    degree: int,
+    most: int,
+    seconds: float | int,
+    report: Callable[[str], None] = lambda line: None,
+) -> Gaussians:
+    """`splats` from pictures that the network has drawn."""
     surfels = (volume.scene if isinstance(volume.scene, SurfelScene) else _surfels(cloud, volume)).surfels
     focal = float(np.asarray(pictures[0].camera.intrinsics)[0, 0])
     seen = placing.seen_surface(pictures, surfels)
@@ -83,18 +96,21 @@ def fitting_cameras(model: Model, volume: Volume, count: int, resolution: int) -
 
 def drawn_views(model: Model, volume: Volume, cameras: list[Camera], light: Light | None) -> list[View]:
     """The network's pictures from cameras, with these in the box."""
-    scale, centre = np.asarray(volume.scale), np.asarray(volume.centre)
     found = []
     for camera, drawn in zip(cameras, model.render_each(volume, cameras, lights=[light] * len(cameras)), strict=True):
-        pose = np.array(camera.cam_to_world)
-        pose[:, 3] = (pose[:, 3] - centre) * scale
         image, opacity = np.asarray(drawn.image), np.asarray(drawn.acc)
-        depth = surface_depth(drawn, camera, volume) * scale
+        depth = surface_depth(drawn, camera, volume) * np.asarray(volume.scale)
         if opacity.shape != image.shape[:2]:  # a network that doubles its pictures
             opacity, depth = (x.repeat(2, axis=0).repeat(2, axis=1) for x in (opacity, depth))
-        inside = dataclasses.replace(camera, cam_to_world=pose, intrinsics=np.asarray(camera.intrinsics))
-        found.append(View(inside, image, opacity, depth))
+        found.append(View(in_box(camera, volume), image, opacity, depth))
     return found
+
+
+def in_box(camera: Camera, volume: Volume) -> Camera:
+    """A camera of the cloud's units in the box."""
+    pose = np.array(camera.cam_to_world)
+    pose[:, 3] = (pose[:, 3] - np.asarray(volume.centre)) * np.asarray(volume.scale)
+    return dataclasses.replace(camera, cam_to_world=pose, intrinsics=np.asarray(camera.intrinsics))
 
 
 def in_units(gaussians: Gaussians, volume: Volume) -> Gaussians:
