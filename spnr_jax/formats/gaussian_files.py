@@ -6,6 +6,8 @@
             rotation; axes right, up, back
     .glb    one primitive of points, y up; scales as they are, opacity 0 to 1, colours display-referred sRGB
 
+The first two say that splats which a viewer widens to a pixel lose opacity for it (anti-aliasing, mip).
+
 Splats go in with y up and z towards the viewer, in any unit.  A note, which names the cloud, the network and the light,
 becomes a comment of the .ply and the copyright line of the .glb; a .spz has no place for one.
 """
@@ -24,7 +26,8 @@ from spnr_jax.kernels.records import Gaussians
 
 SUFFIXES = (".ply", ".spz", ".glb")
 LEAST_OPACITY, MOST_OPACITY = 1e-4, 1 - 1e-4  # that the logistic function is inverted for
-MAGIC, VERSION = 0x5053474E, 3  # of .spz
+MAGIC, VERSION, ANTIALIASED = 0x5053474E, 3, 1  # of .spz; the last is a flag
+RENDER_MODE = "SplatRenderMode: mip"  # comment of a .ply: splats are drawn with the share of gaussians/drawing.py
 COLOR_STEP = 0.15  # of .spz: 255 steps for 1 / COLOR_STEP of a coefficient
 FRACTION_BITS = 24 - 2  # at most of a place in .spz; fewer where places lie further from the origin than 1
 SCALE_STEP, LEAST_SCALE = 16, -10  # of .spz: steps for each e-fold, logarithm of the smallest
@@ -78,7 +81,8 @@ def ply_of(gaussians: Gaussians, note: str = "") -> bytes:
         np.log(opacity / (1 - opacity))[:, None],
     ]
     parts += [np.log(np.asarray(splats.scale)), splats.rotation]
-    header = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in note.splitlines())]
+    header = ["ply", "format binary_little_endian 1.0", f"comment {RENDER_MODE}"]
+    header += [f"comment {line}" for line in note.splitlines()]
     header += [f"element vertex {len(opacity)}", *(f"property float {name}" for name in names), "end_header"]
     return ("\n".join(header) + "\n").encode("ascii", "replace") + np.concatenate(parts, axis=1).astype("<f4").tobytes()
 
@@ -117,7 +121,7 @@ def spz_of(gaussians: Gaussians) -> bytes:
     fixed = np.clip(np.round(position * 2.0**bits), -(2**23), 2**23 - 1).astype("<i4")
     places = fixed.view(np.uint8).reshape(len(position), 3, 4)[..., :3]
     header = np.array([MAGIC, VERSION, len(position)], "<u4").tobytes()
-    header += bytes([degree_of(harmonics.shape[1]), bits, 0, 0])
+    header += bytes([degree_of(harmonics.shape[1]), bits, ANTIALIASED, 0])
     parts = [
         places,
         _bytes(np.asarray(gaussians.opacity, np.float64) * 255),

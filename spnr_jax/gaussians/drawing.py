@@ -1,7 +1,9 @@
 """A differentiable picture of Gaussian splats, as viewers draw them (EWA, Zwicker et al. 2001; Kerbl et al. 2023).
 
     footprint   a splat on the picture: centre, inverse covariance (a, b, c: a dx^2 + 2 b dx dy + c dy^2), depth; its
-                covariance grows by `dilation` square pixels, so that no splat falls between the pixels
+                covariance grows by `dilation` square pixels, so that no splat falls between the pixels, and what it
+                hides stays: its opacity becomes that of `share` (Mip-Splatting, Yu et al. 2024), else small pictures
+                would show everything thicker
     lists       the front-most LIST splats of each covered pixel, in the order of the depth of their centres
     blend       alpha = opacity exp(-distance^2 / 2), laid over each other from the front, on a background
 
@@ -21,9 +23,10 @@ from spnr_jax.gaussians.harmonics import basis, degree_of
 from spnr_jax.kernels.numerics import gather_rows, normalize
 from spnr_jax.kernels.records import AnyArray, Camera, Gaussians
 
-DILATION = 0.3  # square pixels, as every viewer has it
+DILATION = 0.3  # square pixels, as viewers have it
 LEAST_ALPHA = 1 / 255  # below which a splat does not touch a pixel
 MOST_ALPHA = 0.99
+LEAST_SHARE = 1e-4  # square of the smallest share, of a splat that is seen from its edge
 NEAREST = 1e-6  # distance before the camera from which splats are drawn, in any unit
 WIDEST = 128  # pixels that a splat reaches to each side at most
 LIST = 32  # splats of a pixel at most; the rest lies behind what is opaque
@@ -35,6 +38,7 @@ class Footprints(NamedTuple):
     centre: Float[Array, "splats 2"]
     conic: Float[Array, "splats 3"]
     depth: Float[Array, " splats"]
+    share: Float[Array, " splats"]
 
 
 class Lists(NamedTuple):
@@ -71,8 +75,10 @@ def footprints(gaussians: Gaussians, camera: Camera, dilation: float | Array = D
     yy = jnp.sum(below * below, axis=-1) + dilation
     xy = jnp.sum(right * below, axis=-1)
     determinant = xx * yy - xy * xy
+    undilated = jnp.maximum(determinant - dilation * (xx + yy - dilation), 0)
+    share = jnp.sqrt(jnp.maximum(undilated / determinant, LEAST_SHARE))
     centre = jnp.stack([k[0, 0] * across + k[0, 2], k[1, 1] * down + k[1, 2]], axis=-1)
-    return Footprints(centre, jnp.stack([yy, -xy, xx], axis=-1) / determinant[:, None], depth)
+    return Footprints(centre, jnp.stack([yy, -xy, xx], axis=-1) / determinant[:, None], depth, share)
 
 
 def colors(gaussians: Gaussians, eye: Float[AnyArray, "3"]) -> Float[Array, "splats 3"]:
@@ -84,7 +90,8 @@ def colors(gaussians: Gaussians, eye: Float[AnyArray, "3"]) -> Float[Array, "spl
 
 def lists(foot: Footprints, opacity: Float[np.ndarray, " splats"], height: int, width: int, most: int = LIST) -> Lists:
     """The front-most splats of each pixel that any touches; NumPy."""
-    centre, conic, depth = (np.asarray(x, np.float32) for x in foot)
+    centre, conic, depth, share = (np.asarray(x, np.float32) for x in foot)
+    opacity = share * opacity
     touching = (depth > NEAREST) & (opacity > LEAST_ALPHA)
     order = np.flatnonzero(touching)
     order = order[np.argsort(depth[order], kind="stable")]
@@ -130,7 +137,7 @@ def blend(
     width: int,
 ) -> Float[Array, "pixels 4"]:
     """Colour, weighted by the opacity, and opacity of each listed pixel."""
-    rows = jnp.concatenate([foot.centre, foot.conic, opacity[:, None], color], axis=-1)
+    rows = jnp.concatenate([foot.centre, foot.conic, (foot.share * opacity)[:, None], color], axis=-1)
     rows = jnp.concatenate([rows, jnp.zeros((1, rows.shape[1]))])  # no splat
     x, y, a, b, c, strength, *shown = jnp.moveaxis(gather_rows(rows, jnp.asarray(found.splats)), -1, 0)
     row, column = jnp.divmod(jnp.asarray(found.pixel), width)

@@ -38,21 +38,29 @@ def test_a_picture_is_that_of_the_plain_twin(degree):
 
 def test_a_splat_in_the_middle_has_its_opacity_and_colour_there():
     camera = splat_balls.camera(0, 0, size=33)
-    image, opacity = drawing.draw(one(), camera)
+    image, opacity = drawing.draw(one(), camera, dilation=0)
     assert opacity[16, 16] == pytest.approx(0.8, abs=1e-4)
     np.testing.assert_allclose(image[16, 16], 0.8 * np.array([1, 0.5, 0]) + 0.2, atol=1e-4)
-    focal = float(camera.intrinsics[0, 0])
-    variance = (0.1 * focal / 3) ** 2 + drawing.DILATION
-    assert opacity[16, 19] == pytest.approx(0.8 * np.exp(-4.5 / variance), abs=1e-3)
+    variance = (0.1 * float(camera.intrinsics[0, 0]) / 3) ** 2
+    assert opacity[16, 17] == pytest.approx(0.8 * np.exp(-0.5 / variance), abs=1e-3)
+
+
+def test_a_splat_smaller_than_a_pixel_hides_as_much_as_it_should():
+    camera = splat_balls.camera(0, 0, size=33)
+    large, small = (drawing.draw(one(width=width), camera)[1].sum() for width in (0.1, 0.01))
+    assert small == pytest.approx(large / 100, rel=0.12)
 
 
 def test_what_is_nearer_hides_what_is_behind_in_whatever_order_they_come():
     near, far = one((0, 0, 0.5), color=(1, 0, 0), opacity=0.9), one((0, 0, -0.5), color=(0, 0, 1), opacity=0.9)
     camera = splat_balls.camera(0, 0, size=33)
-    first, _ = drawing.draw(joined(near, far), camera)
-    second, _ = drawing.draw(joined(far, near), camera)
+    first, _ = drawing.draw(joined(near, far), camera, dilation=0)
+    second, _ = drawing.draw(joined(far, near), camera, dilation=0)
     np.testing.assert_array_equal(first, second)
-    np.testing.assert_allclose(first[16, 16], [0.9 + 0.01, 0.01, 0.09 + 0.01], atol=1e-4)
+    red, green, blue = first[16, 16]
+    assert red > 0.8
+    assert blue < 0.2
+    assert green < 0.05
 
 
 def test_nothing_in_sight_is_the_background():

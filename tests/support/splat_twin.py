@@ -18,11 +18,13 @@ def draw(splats, camera, dilation):
             continue
         covariance = _covariance(splats.rotation[i], splats.scale[i])
         jacobian = np.array([[k[0, 0] / z, 0, -k[0, 0] * x / z**2], [0, k[1, 1] / z, -k[1, 1] * y / z**2]])
-        flat = jacobian @ to_camera @ covariance @ to_camera.T @ jacobian.T + dilation * np.eye(2)
+        sharp = jacobian @ to_camera @ covariance @ to_camera.T @ jacobian.T
+        flat = sharp + dilation * np.eye(2)
+        share = np.sqrt(max(np.linalg.det(sharp) / np.linalg.det(flat), 1e-4))
         inverse = np.linalg.inv(flat)
         dx, dy = columns[None] - (k[0, 0] * x / z + k[0, 2]), rows[:, None] - (k[1, 1] * y / z + k[1, 2])
         distance = inverse[0, 0] * dx**2 + 2 * inverse[0, 1] * dx * dy + inverse[1, 1] * dy**2
-        alpha = np.minimum(splats.opacity[i] * np.exp(-0.5 * distance), 0.99)
+        alpha = np.minimum(share * splats.opacity[i] * np.exp(-0.5 * distance), 0.99)
         alpha = np.where(alpha < 1 / 255, 0, alpha)
         towards = np.asarray(splats.position[i], np.float64) - pose[:, 3]
         harmonics = np.asarray(splats.harmonics[i], np.float64)

@@ -30,8 +30,8 @@ def small_pictures(monkeypatch):
 def made_by(*arguments):
     network = str(tiny_surfels.run())
     name = "--network" if arguments[0] == "export" else "--run"
+    options = (name, network, "--seconds", "0", "--fitting-views", "6", "--up", "y")
     with pytest.raises(SystemExit) as ended:
-        options = (name, network, "--seconds", "0", "--fitting-views", "6", "--up", "y")
         cli.main([*map(str, arguments), *options])
     return ended.value.code
 
