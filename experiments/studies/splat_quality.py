@@ -16,6 +16,7 @@ skipped.  It gives no opacity: that is what the same splats in white show.
 import dataclasses
 import time
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -90,7 +91,7 @@ def main(options: SplatStudy) -> None:
     for name in names:
         item = data_sets.read_object(dataset, name)
         place = options.out / "scores" / f"{name}.json"
-        rows[name] = results_folder.kept(place, lambda item=item: _scores(options, model, item))
+        rows[name] = results_folder.kept(place, partial(_scores, options, model, item))
         print(name, rows[name], flush=True)
     cells = [[_shown(options, name, method) for method in ("reference", *METHODS)] for name in names]
     images.write_whole(
@@ -103,7 +104,7 @@ def main(options: SplatStudy) -> None:
 def _scores(options: SplatStudy, model: Model, item: data_sets.ObjectData) -> dict:
     """Decibels by size and method, the number of splats, the megabytes as .spz, and seconds."""
     cloud = told(jax.tree.map(lambda x: x[: options.num_points], item.cloud), normals=False)
-    volume, said = model.encode(cloud), []
+    volume, said = model.encode(cloud), list[str]()
     pictures = _pictures(options, model, volume, item.name)
     begin = time.perf_counter()
     made = splats_of_views(pictures, volume, cloud, options.degree, options.most, options.seconds, said.append)
@@ -116,21 +117,21 @@ def _scores(options: SplatStudy, model: Model, item: data_sets.ObjectData) -> di
     }
     for size in options.sizes:
         pairs = [view_of(item, view, size) for view in range(options.views)]
-        drawn = {"network": [], "splats": [], "splats, by Mitsuba": []}
+        drawn: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {method: [] for method in METHODS}
         for rendering in model.render_each(volume, [camera for camera, _ in pairs]):
             drawn["network"].append((np.asarray(rendering.image), np.asarray(rendering.acc)))
         for camera, _ in pairs:
             drawn["splats"].append(drawing.draw(made, camera))
             drawn["splats, by Mitsuba"].append(by_mitsuba(made, camera, options.spp, options.out / "mitsuba.ply"))
-        for method, pictures in drawn.items():
-            scores = [sharpness(*picture, reference) for picture, (_, reference) in zip(pictures, pairs, strict=True)]
-            beside = [_decibels(a[0], b[0]) for a, b in zip(pictures, drawn["network"], strict=True)]
+        for method, shown in drawn.items():
+            scores = [sharpness(*picture, reference) for picture, (_, reference) in zip(shown, pairs, strict=True)]
+            beside = [_decibels(a[0], b[0]) for a, b in zip(shown, drawn["network"], strict=True)]
             found[f"{method}, {size}"] = {
                 "psnr": float(np.mean([s.psnr for s in scores])),
                 "inside": float(np.nanmean([s.psnr_inside for s in scores])),
                 "network": float(np.mean(beside)),
             }
-            images.write_whole(options.out / item.name / f"{method}.png", images.png(pictures[0][0]))
+            images.write_whole(options.out / item.name / f"{method}.png", images.png(shown[0][0]))
         reference = data_sets.on_white(images.to_uint8(pairs[0][1]))
         images.write_whole(options.out / item.name / "reference.png", images.png(reference))
     return found
@@ -142,11 +143,11 @@ def _pictures(options: SplatStudy, model: Model, volume: Volume, name: str) -> l
 
     def drawn() -> tuple[np.ndarray, ...]:
         views = drawn_views(model, volume, cameras, None)
-        return tuple(np.stack([view[i] for view in views]) for i in (1, 2, 3))
+        return tuple(np.stack(x) for x in zip(*((v.image, v.opacity, v.depth) for v in views), strict=True))
 
     arrays = results_folder.kept(options.out / name / "pictures.npz", drawn)
     inside = [in_box(camera, volume) for camera in cameras]
-    return [View(camera, *arrays) for camera, *arrays in zip(inside, *arrays, strict=True)]
+    return [View(*each) for each in zip(inside, *arrays, strict=True)]
 
 
 def by_mitsuba(gaussians: Gaussians, camera: Camera, spp: int, place: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -154,7 +155,7 @@ def by_mitsuba(gaussians: Gaussians, camera: Camera, spp: int, place: Path) -> t
     white = np.zeros_like(gaussians.harmonics)
     white[:, 0] = 0.5 / C0
     light, opacity = (
-        _composited(gaussians.replace(harmonics=harmonics), camera, spp, place)
+        _composited(dataclasses.replace(gaussians, harmonics=harmonics), camera, spp, place)
         for harmonics in (gaussians.harmonics, white)
     )
     return light + 1 - opacity, opacity.mean(axis=-1)
@@ -162,7 +163,7 @@ def by_mitsuba(gaussians: Gaussians, camera: Camera, spp: int, place: Path) -> t
 
 def _composited(gaussians: Gaussians, camera: Camera, spp: int, place: Path) -> np.ndarray:
     """Colours (sRGB) weighted by the opacity, (height, width, 3)."""
-    larger = gaussians.replace(position=gaussians.position * LARGER, scale=gaussians.scale * LARGER)
+    larger = dataclasses.replace(gaussians, position=gaussians.position * LARGER, scale=gaussians.scale * LARGER)
     gaussian_files.write_splats(place, larger)
     pose = np.eye(4)
     pose[:3] = camera.cam_to_world
@@ -174,7 +175,7 @@ def _composited(gaussians: Gaussians, camera: Camera, spp: int, place: Path) -> 
         "fov": float(np.rad2deg(2 * np.arctan(0.5 * size / focal))),
         "near_clip": 0.1,
         "far_clip": 1e5,
-        "to_world": mitsuba.ScalarTransform4f(HALF_TURN @ pose @ np.diag([-1.0, 1.0, -1.0, 1.0])),
+        "to_world": mitsuba.ScalarTransform4f((HALF_TURN @ pose @ np.diag([-1.0, 1.0, -1.0, 1.0])).astype(np.float32)),
         "film": film | {"component_format": "float32"},
         "sampler": {"type": "multijitter", "sample_count": spp},
     }

@@ -22,7 +22,7 @@ from jaxtyping import Float
 from spnr_jax.formats.images import write_whole
 from spnr_jax.formats.ply import vertex_pieces
 from spnr_jax.gaussians.harmonics import C0, degree_of, half_turn_signs
-from spnr_jax.kernels.records import Gaussians
+from spnr_jax.kernels.records import AnyArray, Gaussians
 
 SUFFIXES = (".ply", ".spz", ".glb")
 LEAST_OPACITY, MOST_OPACITY = 1e-4, 1 - 1e-4  # that the logistic function is inverted for
@@ -59,8 +59,10 @@ def turned(gaussians: Gaussians) -> Gaussians:
     )
     w, x, y, z = rotation.T
     signs = half_turn_signs(degree_of(harmonics.shape[1])).astype(np.float32)
-    return gaussians.replace(
-        position=position * np.float32([1, -1, -1]),
+    return Gaussians(
+        scale=gaussians.scale,
+        opacity=gaussians.opacity,
+        position=position * np.array([1, -1, -1], np.float32),
         rotation=np.stack([-x, w, -z, y], axis=-1),
         harmonics=harmonics * signs[:, None],
     )
@@ -184,7 +186,7 @@ def _chunk(kind: bytes, data: bytes) -> bytes:
     return np.array([len(data)], "<u4").tobytes() + kind + data
 
 
-def _inner(opacity: Float[np.ndarray, " splats"]) -> np.ndarray:
+def _inner(opacity: Float[AnyArray, " splats"]) -> np.ndarray:
     return np.clip(np.asarray(opacity, np.float64), LEAST_OPACITY, MOST_OPACITY)
 
 

@@ -4,7 +4,7 @@
                 covariance grows by `dilation` square pixels, so that no splat falls between the pixels, and what it
                 hides stays: its opacity becomes that of `share` (Mip-Splatting, Yu et al. 2024), else small pictures
                 would show everything thicker
-    lists       the front-most LIST splats of each covered pixel, in the order of the depth of their centres
+    lists       the front-most splats of each covered pixel, at most LIST, in the order of the depth of their centres
     blend       alpha = opacity exp(-distance^2 / 2), laid over each other from the front, on a background
 
 Lists are data: gradients pass through `footprints` and `blend` by shape, opacity and colour, not by what covers what.
@@ -29,7 +29,8 @@ MOST_ALPHA = 0.99
 LEAST_SHARE = 1e-4  # square of the smallest share, of a splat that is seen from its edge
 NEAREST = 1e-6  # distance before the camera from which splats are drawn, in any unit
 WIDEST = 128  # pixels that a splat reaches to each side at most
-LIST = 32  # splats of a pixel at most; the rest lies behind what is opaque
+LIST = 1024  # splats of a pixel at most; the rest lies behind what is opaque
+TOGETHER = 2**21  # entries of the lists of the pixels that are blended at a time
 
 
 class Footprints(NamedTuple):
@@ -89,7 +90,7 @@ def colors(gaussians: Gaussians, eye: Float[AnyArray, "3"]) -> Float[Array, "spl
 
 
 def lists(foot: Footprints, opacity: Float[np.ndarray, " splats"], height: int, width: int, most: int = LIST) -> Lists:
-    """The front-most splats of each pixel that any touches; NumPy."""
+    """The front-most splats of each pixel that any touches, in lists as long as is needed, a power of two; NumPy."""
     centre, conic, depth, share = (np.asarray(x, np.float32) for x in foot)
     opacity = share * opacity
     touching = (depth > NEAREST) & (opacity > LEAST_ALPHA)
@@ -116,8 +117,9 @@ def lists(foot: Footprints, opacity: Float[np.ndarray, " splats"], height: int, 
     first = np.flatnonzero(np.diff(pixel, prepend=-1))
     slot = np.cumsum(np.diff(pixel, prepend=-1) > 0) - 1
     depth_rank = np.arange(len(pixel)) - first[slot]
-    kept = depth_rank < most
-    table = np.full((most, len(first)), len(depth), np.int32)
+    length = min(most, 1 << int(depth_rank.max(initial=0)).bit_length())
+    kept = depth_rank < length
+    table = np.full((length, len(first)), len(depth), np.int32)
     table[depth_rank[kept], slot[kept]] = order[rank[kept]]
     return Lists(table, pixel[first].astype(np.int32))
 
@@ -166,12 +168,14 @@ def draw(
     foot, color = looked(gaussians, camera, jnp.float32(dilation))
     opacity = np.asarray(gaussians.opacity)
     found = lists(foot, opacity, height, width)
-    sums = np.zeros((height * width, 4), np.float32)
-    if len(found.pixel):
-        wide = padded(found, size_above(len(found.pixel)), len(opacity))
-        sums[found.pixel] = np.asarray(_blend(foot, color, jnp.asarray(opacity), wide, width))[: len(found.pixel)]
-    sums = sums.reshape(height, width, 4)
-    return sums[..., :3] + (1 - sums[..., 3:]) * np.float32(background), sums[..., 3]
+    sums, depth = np.zeros((height * width, 4), np.float32), len(found.splats)
+    for first in range(0, len(found.pixel), TOGETHER // depth):
+        some = Lists(*(x[..., first : first + TOGETHER // depth] for x in found))
+        number = len(some.pixel)
+        wide = padded(some, min(size_above(number), TOGETHER // depth), len(opacity))
+        sums[some.pixel] = np.asarray(_blend(foot, color, jnp.asarray(opacity), wide, width))[:number]
+    whole = sums.reshape(height, width, 4)
+    return whole[..., :3] + (1 - whole[..., 3:]) * np.float32(background), whole[..., 3]
 
 
 def size_above(count: int, least: int = 2**12) -> int:

@@ -83,7 +83,7 @@ def place(seen: Seen, *, most: int, pixel: float) -> tuple[Gaussians, float]:
         np.stack([np.bincount(group, x[:, i], number) for i in range(3)], axis=-1) / count for x in seen
     )
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
-    scale = np.broadcast_to(np.float32([WIDTH, WIDTH, THICKNESS]) * np.float32(side), (number, 3))
+    scale = np.broadcast_to(np.array([WIDTH, WIDTH, THICKNESS], np.float32) * side, (number, 3))
     placed = Gaussians(
         position=position.astype(np.float32),
         rotation=turned_to(normal).astype(np.float32),

@@ -20,7 +20,7 @@ from spnr_jax.kernels.records import Camera, Gaussians
 
 STRIDE = 2
 SHARES = ((0, 0), (1, 1))  # column and row of the first pixel
-LIST = 24  # splats of a pixel that are seen in a step
+LIST = 32  # splats of a pixel that are seen in a step
 OPACITY_WEIGHT = 0.25  # of the opacity beside each colour
 RATES = {"base": 0.02, "rest": 0.006, "opacity": 0.12, "scale": 0.03, "moved": 0.05}  # of Adam
 WIDER = 1.25  # than at first the splats are, by which is found what covers what
@@ -161,5 +161,10 @@ class Refinement:
         found = drawing.lists(foot, np.asarray(self.first.opacity), camera.height, camera.width, LIST)
         picture = np.concatenate([view.image, view.opacity[..., None]], axis=-1)[row::STRIDE, column::STRIDE]
         wanted = picture.reshape(-1, 4)[found.pixel].astype(np.float32)
+        found = found._replace(
+            splats=np.pad(
+                found.splats, ((0, LIST - len(found.splats)), (0, 0)), constant_values=len(self.first.opacity)
+            )
+        )
         self._pixels = max(self._pixels, drawing.size_above(len(found.pixel)))
         return camera, found, wanted

@@ -23,6 +23,11 @@ def one(position=(0.0, 0.0, 0.0), width=0.1, opacity=0.8, color=(1.0, 0.5, 0.0))
     )
 
 
+def _looked(splats, size):
+    foot, _ = drawing.looked(splats, splat_balls.camera(size=size), jnp.float32(drawing.DILATION))
+    return foot, splats.opacity
+
+
 def joined(*splats):
     return jax.tree.map(lambda *x: np.concatenate(x), *splats)
 
@@ -108,3 +113,19 @@ def test_harmonics_are_orthonormal_and_turn_half_around_by_signs():
     assert [degree_of(coefficients(degree)) for degree in range(4)] == [0, 1, 2, 3]
     with pytest.raises(ValueError, match="got 5"):
         degree_of(5)
+
+
+def test_a_small_picture_of_many_splats_is_as_opaque_as_a_large_one():
+    splats = splat_balls.ball(2000)
+    small, large = (drawing.draw(splats, splat_balls.camera(size=size))[1] for size in (24, 96))
+    inside = np.s_[8:16, 8:16]
+    assert drawing.lists(*_looked(splats, 24), 24, 24).splats.shape[0] >= 64
+    np.testing.assert_allclose(small[inside], large.reshape(24, 4, 24, 4).mean(axis=(1, 3))[inside], atol=0.12)
+
+
+def test_the_lists_are_no_longer_than_asked_for_and_hold_the_nearest():
+    many = joined(*(one((0, 0, 0.1 * i), opacity=0.5) for i in range(8)))
+    foot, _ = drawing.looked(many, splat_balls.camera(0, 0, size=9), jnp.float32(0.3))
+    found = drawing.lists(foot, many.opacity, 9, 9, most=4)
+    middle = found.splats[:, found.pixel.tolist().index(4 * 9 + 4)]
+    assert middle.tolist() == [7, 6, 5, 4]
