@@ -11,8 +11,11 @@ from types import ModuleType
 
 _PUBLIC = {"load": "training.weights", "Model": "method.model", "Volume": "method.model"}
 _PUBLIC |= {"read_cloud": "formats.clouds", "clean": "kernels.cleaning"}
+_PUBLIC |= {"splats": "tools.splat_making", "write_splats": "formats.gaussian_files"}
 _PUBLIC |= {"read_light": "formats.light_files"} | dict.fromkeys(("light_of", "sun", "ambient"), "surfels.lighting")
-_PUBLIC |= dict.fromkeys(("PointCloud", "Camera", "Light", "Rays", "Rendering", "Batch"), "kernels.records")
+_PUBLIC |= dict.fromkeys(
+    ("PointCloud", "Camera", "Light", "Gaussians", "Rays", "Rendering", "Batch"), "kernels.records"
+)
 _KERNELS = ("cameras", "sampling", "compositing", "voxels", "losses", "metrics")
 
 __all__ = sorted(_PUBLIC)

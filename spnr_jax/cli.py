@@ -1,4 +1,4 @@
-"""The command `spnr`: train a network, evaluate one, render a cloud, export a network.
+"""The command `spnr`: train a network, evaluate one, render a cloud, export a network or splats, share a page.
 
 Errors of the user and of the disk are one line on stderr and exit code 2; Ctrl-C keeps the state and exits with 130.
 """
@@ -28,8 +28,11 @@ from spnr_jax.formats.cut import Cut
 from spnr_jax.model_config import SurfelConfig
 from spnr_jax.tools.light_options import Lighting
 from spnr_jax.tools.render_command import Render
+from spnr_jax.tools.share_command import Share
+from spnr_jax.tools.splat_options import SplatMaking
 
 BOX = r"[╭╮╰╯│─•]+|__tyro-dummy-inner__\."  # what tyro draws around an error, and its name for the whole command
+MANY_POINTS = 16384  # of a cloud that splats are made of
 LONGEST_LINE = 800  # characters of an error
 DESCRIPTION = """Sparse-point neural rendering: train a network, evaluate one, render a cloud of points.
 --debug, or SPNR_DEBUG=1, shows the call stack of an error."""
@@ -98,14 +101,28 @@ class ConvertLpips:
 
 @dataclass(frozen=True, kw_only=True)
 class Export:
-    """Write a network as a file of weights, as functions for JAX without this package, and as StableHLO."""
+    """Write a network as a file of weights, as functions for JAX without this package, and as StableHLO; or, with
+    --splats, a cloud's object as Gaussian splats."""
 
     run: tyro.conf.Positional[Path]
-    """Run folder whose network is exported."""
+    """Run folder whose network is exported; with --splats a cloud, what `spnr render` reads."""
+    splats: Path | None = None
+    """Write Gaussian splats: .ply, .spz, or .glb (KHR_gaussian_splatting)."""
+    network: Path | None = None
+    """Network that draws the cloud for --splats, as `spnr render --run` (default: surfels)."""
+    lighting: tyro.conf.OmitArgPrefixes[Lighting] = field(default_factory=Lighting)
+    """The light of --splats, which is part of them."""
+    making: tyro.conf.OmitArgPrefixes[SplatMaking] = field(default_factory=SplatMaking)
+    """How --splats are made."""
+    up: Literal["auto", "x", "y", "z", "-x", "-y", "-z"] = "auto"
+    """The upward axis of the file for --splats; what is written has y up."""
+    clean: Literal["auto", "off", "strong"] = "auto"
+    """As for `spnr render`, for --splats."""
     out: Path = Path("exported")
     """Folder for weights.npz, encode.jax, render.jax, both as .stablehlo, and export.json: what they take and give."""
-    num_points: int = 1024
-    """Points of a cloud, padding included; exactly so many."""
+    num_points: int | None = None
+    """Points of a cloud, padding included; exactly so many (default: 1,024).  With --splats, points used of a bigger
+    cloud (default: 16,384)."""
     resolution: int | None = None
     """Pixels along each side (default: what the network was trained for)."""
     quality: Literal["draft", "balanced", "best", "trained"] = "best"
@@ -114,6 +131,19 @@ class Export:
     """Voxels around points that are looked at, 1 to 4: 1.6 times their median distance, rounded up, loses nothing."""
     platforms: tuple[Literal["cpu", "cuda", "rocm", "tpu"], ...] = ("cpu",)
     """Where the functions are to run."""
+
+    def __post_init__(self) -> None:
+        """ValueError names the option that makes no sense."""
+        if self.num_points is not None and self.num_points < 1:
+            raise ValueError(f"--num-points must be at least 1, got {self.num_points}")
+        given = [f.name for f in dataclasses.fields(self) if f.name in ("network", "up", "clean")]
+        given = [name for name in given if getattr(self, name) != getattr(type(self), name)]
+        given += ["light"] if self.lighting.asked else []
+        given += ["seconds"] if self.making != SplatMaking() else []
+        if self.splats is None and given:
+            raise ValueError(f"--{given[0]} is for --splats FILE, which is not given")
+        if self.lighting.background != "white":
+            raise ValueError("--background light: splats have no background; leave it out")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -149,7 +179,7 @@ class Runs:
     """Folder that holds run folders, at any depth."""
 
 
-Command = Train | Evaluate | Render | View | Export | Runs | ConvertLpips
+Command = Train | Evaluate | Render | View | Export | Share | Runs | ConvertLpips
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -193,13 +223,14 @@ def parse(arguments: list[str]) -> Command:
     render = Annotated[Render, tyro.conf.subcommand("render")]
     view = Annotated[View, tyro.conf.subcommand("view")]
     export = Annotated[Export, tyro.conf.subcommand("export")]
+    share = Annotated[Share, tyro.conf.subcommand("share")]
     runs = Annotated[Runs, tyro.conf.subcommand("runs")]
     convert = Annotated[ConvertLpips, tyro.conf.subcommand("convert-lpips")]
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said):
             return tyro.cli(
-                train | evaluate | render | view | export | runs | convert,
+                train | evaluate | render | view | export | share | runs | convert,
                 prog="spnr",
                 description=DESCRIPTION,
                 args=arguments,
@@ -235,6 +266,8 @@ def run(command: Command) -> None:
             run_view(command)
         case Export():
             run_export(command)
+        case Share():
+            run_share(command)
         case Runs():
             run_runs(command)
         case ConvertLpips():
@@ -317,6 +350,9 @@ def run_view(command: View) -> None:
 
 def run_export(command: Export) -> None:
     """`spnr export`."""
+    if command.splats is not None:
+        run_export_splats(command, command.splats)
+        return
     from spnr_jax.formats.images import write_whole
     from spnr_jax.method import model
     from spnr_jax.tools import export
@@ -331,7 +367,7 @@ def run_export(command: Export) -> None:
     handle = model.Model(config=trained.config.model, variables=trained.variables)
     weights.write_weights(command.out / "weights.npz", trained)
     functions = {
-        "encode": export.export_encode(handle, num_points=command.num_points, platforms=where),
+        "encode": export.export_encode(handle, num_points=command.num_points or 1024, platforms=where),
         "render": export.export_render(
             handle, resolution=command.resolution, quality=command.quality, reach=command.reach, platforms=where
         ),
@@ -342,6 +378,32 @@ def run_export(command: Export) -> None:
     signatures = {name: export.signature(content) for name, content in functions.items()}
     write_whole(command.out / "export.json", (json.dumps(signatures, indent=1) + "\n").encode())
     print(f"wrote weights.npz, encode and render to {command.out} (export.json says what they take and give)")
+
+
+def run_export_splats(command: Export, out: Path) -> None:
+    """`spnr export --splats`."""
+    from spnr_jax.tools.splat_export import export_splats
+
+    for line in export_splats(
+        command.run,
+        out,
+        run=command.network,
+        lighting=command.lighting,
+        making=command.making,
+        num_points=command.num_points or MANY_POINTS,
+        up=command.up,
+        clean=command.clean,
+        note=lambda line: print(f"{command.run}: {line}", file=sys.stderr),
+    ):
+        print(line, flush=True)
+
+
+def run_share(command: Share) -> None:
+    """`spnr share`."""
+    from spnr_jax.tools.splat_export import share
+
+    for line in share(command, note=lambda line: print(f"{command.cloud}: {line}", file=sys.stderr)):
+        print(line, flush=True)
 
 
 def run_runs(command: Runs) -> None:

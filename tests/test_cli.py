@@ -1,7 +1,6 @@
 """`spnr`: what a person can mend is one line on stderr and exit code 2, never a traceback; help costs no JAX."""
 
 import dataclasses
-import importlib.util
 import json
 import os
 import shutil
@@ -11,22 +10,13 @@ import sys
 
 import numpy as np
 import pytest
-from support import tiny_dataset
+from support import command_line, tiny_dataset
 
 from spnr_jax import errors, presets
 from spnr_jax.formats.cut import Cut
 from spnr_jax.surfels.visibility import spiral
 
-
-def unchecked_cli():
-    """The module without executed annotations: tyro's mark of a missing value stands where a Path will be."""
-    spec = importlib.util.spec_from_file_location("unchecked_cli", importlib.util.find_spec("spnr_jax.cli").origin)
-    module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-cli = unchecked_cli()
+cli = command_line.unchecked_cli()
 
 
 @pytest.fixture(autouse=True)

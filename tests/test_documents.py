@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from support import tiny_dataset, tiny_untrained
+from support import tiny_dataset, tiny_surfels, tiny_untrained
 
 import spnr_jax
 from spnr_jax.tools import export
@@ -50,9 +50,10 @@ def test_the_readmes_example_draws_a_picture(workplace):
 
 
 @pytest.mark.ci
-def test_the_examples_of_the_thirteen_functions_run_in_their_order(workplace, monkeypatch):
+def test_the_examples_of_the_fourteen_functions_run_in_their_order(workplace, monkeypatch):
     # the README's example draws with the package's network
-    monkeypatch.setattr(weights, "shipped", lambda name="small": tiny_untrained.run())
+    runs = {"surfels": tiny_surfels.run()}
+    monkeypatch.setattr(weights, "shipped", lambda name="small": runs.get(name, tiny_untrained.run()))
     names = execute(DOCS / "api.md")
     assert int(names["state"].step) == 1
     assert "paper" in names["outcome"].summary["methods"]
@@ -76,9 +77,9 @@ def test_the_lights_of_the_page_about_them_are_made_as_it_says():
     assert float(names["light"].tables.min()) > 0.1, "the ambient light is everywhere"
 
 
-def test_there_are_thirteen_functions_each_with_an_example_below_it():
+def test_there_are_fourteen_functions_each_with_an_example_below_it():
     parts = IDENTIFIER.split((DOCS / "api.md").read_text())
-    assert len(parts[1::2]) == 13
+    assert len(parts[1::2]) == 14
     for name, text in zip(parts[1::2], parts[2::2], strict=True):
         assert any(name.rpartition(".")[2] in block for block in CODE.findall(text)), f"no example of {name}"
 

@@ -16,7 +16,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 SPNR_JAX = (
     *("errors", "model_config", "config"),
-    *("devices", "kernels", "surfels", "nn", "baselines", "method"),
+    *("devices", "kernels", "surfels", "gaussians", "nn", "baselines", "method"),
     *("formats/mesh", "formats", "training", "scoring", "tools", "viewer"),
     *("presets", "cli", "__init__"),
 )
@@ -31,7 +31,7 @@ ORDER = [
     for package, entries in {"spnr_jax": SPNR_JAX, "data_gen": DATA_GEN, "experiments": EXPERIMENTS}.items()
     for entry in entries
 ]
-PURE = ("kernels", "surfels", "nn", "baselines", "method")
+PURE = ("kernels", "surfels", "gaussians", "nn", "baselines", "method")
 WITHOUT_JIT = ("devices", "kernels", "nn", "baselines")
 OF_SPNR_JAX = {
     "spnr_jax/errors",

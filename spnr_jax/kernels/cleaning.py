@@ -6,8 +6,8 @@
     noise       distance of the neighbours from the plane that most of them lie close to (least quantile of squares,
                 Rousseeuw 1984): at an edge or a thin wall that is one of the faces, so that neither counts as noise.
                 Around thick noise the neighbourhood grows until it is flat
-    averaging   means of positions and materials over voxels as wide as the noise, then each mean is moved along the
-                normal onto the plane of those around it
+    averaging   each point is moved along the normal onto the plane of those around it, twice, as moving least squares
+                do (Alexa et al. 2001), within a radius that the noise gives; its materials become their mean
 
 NumPy in, NumPy out, near linear in the points; the order of the points does not matter.
 """
@@ -42,12 +42,15 @@ SAMPLE = 2048  # points at which the noise is measured
 PLANES = 48  # through three neighbours each, of which the best is taken
 HEIGHTS = 32  # neighbours whose distances from a plane are measured
 SHARE = 0.35  # of them that have to lie close to it
-GAUSSIAN = 0.3  # their largest distance from the best plane, over the standard deviation of the noise
+FLATTEST = 0.25  # share of the places that the noise is told by: elsewhere edges and thin walls add to it
+GAUSSIAN = 0.215  # their largest distance from the best plane there, over the standard deviation of the noise
 FLAT = 0.07  # of the neighbourhood's radius: thinner noise is measured there, thicker in a wider one
 WIDER = 4  # times as many neighbours
-VOXEL = 3.0  # standard deviations of the noise
-LEAST_VOXEL = 2.0  # spacings: four points of a surface in a voxel
-SMOOTHED = 16  # voxels whose plane a mean is moved onto
+RADIUS = 1.5  # standard deviations of the noise in that of a neighbour's weight
+LEAST_RADIUS = 1.0  # spacings: the same at least
+AROUND = 48  # points that give a plane
+MOVED = 2  # times that points are moved
+MOST_MOVED = 2**17  # points that are moved; of more, a part
 CANCELLED = 0.5  # length of a mean of unit normals below which they contradict each other
 
 
@@ -85,7 +88,7 @@ def cleaned(
     sigma, spacing = noise(positions)
     if sigma > NOISY[strength] * spacing > 0:
         before = len(positions)
-        positions, values = averaged(positions, values, max(VOXEL * sigma, LEAST_VOXEL * spacing))
+        positions, values = averaged(positions, values, max(RADIUS * sigma, LEAST_RADIUS * spacing), spacing)
         lines.append(f"averaged {before:,} points to {len(positions):,}: noise of {sigma / spacing:.1f} spacings")
     return positions, values, lines
 
@@ -140,8 +143,7 @@ def _apart(positions: np.ndarray, strength: Strength) -> np.ndarray:
 def noise(positions: Float[np.ndarray, "points 3"]) -> tuple[float, float]:
     """Standard deviation of the points' heights above their surface, and their spacing; (0, 0) of too few points.
 
-    From LEAST_DENSE points on they can be told from curvature.  Both are medians over a sample, in the units of the
-    positions.
+    From LEAST_DENSE points on they can be told from curvature.  In the units of the positions.
     """
     distinct, _ = _distinct(positions)
     if len(distinct) < LEAST_DENSE:
@@ -152,7 +154,7 @@ def noise(positions: Float[np.ndarray, "points 3"]) -> tuple[float, float]:
     while True:
         distances, near = tree.query(sample, [1 + count * i // HEIGHTS for i in range(1, HEIGHTS + 1)], workers=-1)
         radius = float(np.median(distances[:, -1]))
-        sigma = float(np.median(_heights(distinct[near]))) / GAUSSIAN
+        sigma = float(np.quantile(_heights(distinct[near]), FLATTEST)) / GAUSSIAN
         if sigma * GAUSSIAN < FLAT * radius or WIDER**2 * count > len(distinct):
             return sigma, radius * np.sqrt(np.pi / (count + 1))
         count *= WIDER
@@ -173,42 +175,32 @@ def _heights(near: np.ndarray) -> np.ndarray:
 
 
 def averaged(
-    positions: Float[np.ndarray, "points 3"], values: Values, voxel: float
-) -> tuple[Float[np.ndarray, "voxels 3"], Values]:
-    """Means over the voxels of this side, those of the positions moved onto the plane of the means around them.
+    positions: Float[np.ndarray, "points 3"], values: Values, radius: float, spacing: float
+) -> tuple[Float[np.ndarray, "moved 3"], Values]:
+    """Points moved onto the planes of those around them, by weights of this radius, and the means of their values.
 
     Normals stay of unit length, 0 where they contradict each other.
     """
-    low = positions.min(axis=0)
-    # the numbers of the slices along an axis that hold points stay small, however far one lies
-    x, y, z = (np.unique(np.floor(axis / voxel), return_inverse=True)[1] for axis in (positions - low).T)
-    keys = (x * (y.max() + 1) + y) * (z.max() + 1) + z
-    _, rows, counts = np.unique(keys, return_inverse=True, return_counts=True)
+    order = np.lexsort(positions.T)  # so that a part is spread over the cloud, and the same whatever the points' order
+    within = 2 * np.pi * (radius / spacing) ** 2  # points whose weight counts
+    basis = order[:: max(1, int(within / (AROUND / 2)))]
+    moved = positions[order[:: -(-len(order) // MOST_MOVED)]].astype(np.float64)
+    tree, known = cKDTree(positions[basis]), positions[basis].astype(np.float64)
+    for _ in range(MOVED):
+        distances, near = tree.query(moved, min(AROUND, len(basis)), workers=-1)
+        weights = np.exp(-0.5 * (distances / radius) ** 2)
+        weights = weights / np.maximum(weights.sum(axis=1, keepdims=True), 1e-30)
+        middle = np.einsum("nk,nki->ni", weights, known[near])
+        offset = known[near] - middle[:, None]
+        normal = np.linalg.eigh(np.einsum("nk,nki,nkj->nij", weights, offset, offset, optimize=True))[1][..., 0]
+        moved = moved - np.sum((moved - middle) * normal, axis=1, keepdims=True) * normal
 
     def mean(column: np.ndarray) -> np.ndarray:
-        channels = column.reshape(len(column), -1).T
-        sums = np.stack([np.bincount(rows, channel) for channel in channels], axis=-1)
-        return (sums / counts[:, None]).reshape(-1, *column.shape[1:])
+        return np.einsum("nk,nk...->n...", weights, column[basis][near])
 
     values = {name: mean(column) for name, column in values.items()}
     if "normals" in values:
         length = np.linalg.norm(values["normals"], axis=1, keepdims=True)
         agreed = length > CANCELLED
         values["normals"] = np.where(agreed, values["normals"] / np.where(agreed, length, 1), 0)
-    return _onto_planes(mean(positions), counts, voxel), values
-
-
-def _onto_planes(means: np.ndarray, counts: np.ndarray, voxel: float) -> np.ndarray:
-    """Means (voxels, 3) moved along the normal onto the plane of those around them, which count by their points.
-
-    A voxel's border may cut the band of noise anywhere: without this, means of slices of it would stay apart.
-    """
-    if len(means) < SMOOTHED:
-        return means
-    distances, near = cKDTree(means).query(means, SMOOTHED, workers=-1)
-    weights = counts[near] * np.exp(-0.5 * (distances / voxel) ** 2)
-    weights = (weights / weights.sum(axis=1, keepdims=True))[..., None]
-    middle = (weights * means[near]).sum(axis=1)
-    offset = means[near] - middle[:, None]
-    normal = np.linalg.eigh(np.swapaxes(offset * weights, 1, 2) @ offset)[1][..., 0]
-    return means - np.sum((means - middle) * normal, axis=1, keepdims=True) * normal
+    return moved, values

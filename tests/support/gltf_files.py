@@ -92,3 +92,10 @@ class GltfBuilder:
             (path.parent / "data.bin").write_bytes(self.binary)
             path.write_text(json.dumps(self.document))
         return path
+
+
+def parts_of(content: bytes) -> tuple[dict, bytes]:
+    """Document and binary chunk of a .glb file."""
+    assert content[:4] == b"glTF"
+    size = struct.unpack_from("<I", content, 12)[0]
+    return json.loads(content[20 : 20 + size]), content[20 + size + 8 :]

@@ -1,0 +1,215 @@
+"""Gaussian splats as files: .ply of Kerbl et al. 2023, .spz of Niantic (version 3), .glb with KHR_gaussian_splatting.
+
+    .ply    x y z, nx ny nz (0), f_dc_0..2, f_rest_* (all of red, then green, then blue), opacity before the logistic
+            function, logarithms of the scales, rotation w x y z, all float32; axes right, down, forward
+    .spz    gzip; 24-bit fixed-point places, 8 bits of opacity, colour, logarithms of scales and harmonics, 32 of the
+            rotation; axes right, up, back
+    .glb    one primitive of points, y up; scales as they are, opacity 0 to 1, colours display-referred sRGB
+
+The first two say that splats which a viewer widens to a pixel lose opacity for it (anti-aliasing, mip).
+
+Splats go in with y up and z towards the viewer, in any unit.  A note, which names the cloud, the network and the light,
+becomes a comment of the .ply and the copyright line of the .glb; a .spz has no place for one.
+"""
+
+import gzip
+import json
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from spnr_jax.errors import UserError
+from spnr_jax.formats.images import write_whole
+from spnr_jax.formats.ply import vertex_pieces
+from spnr_jax.gaussians.harmonics import C0, degree_of, half_turn_signs
+from spnr_jax.kernels.records import AnyArray, Gaussians
+
+SUFFIXES = (".ply", ".spz", ".glb")
+LEAST_OPACITY, MOST_OPACITY = 1e-4, 1 - 1e-4  # that the logistic function is inverted for
+MAGIC, VERSION, ANTIALIASED = 0x5053474E, 3, 1  # of .spz; the last is a flag
+RENDER_MODE = "SplatRenderMode: mip"  # comment of a .ply: splats are drawn with the share of gaussians/drawing.py
+COLOR_STEP = 0.15  # of .spz: 255 steps for 1 / COLOR_STEP of a coefficient
+FRACTION_BITS = 24 - 2  # at most of a place in .spz; fewer where places lie further from the origin than 1
+SCALE_STEP, LEAST_SCALE = 16, -10  # of .spz: steps for each e-fold, logarithm of the smallest
+HARMONIC_BITS = (5, 4)  # of .spz: of the coefficients of degree 1, and above
+JSON_CHUNK, BINARY_CHUNK = b"JSON", b"BIN\0"
+
+
+def write_splats(path: Path, gaussians: Gaussians, note: str = "") -> int:
+    """Writes a file of the kind that its suffix says, in one piece; its size in bytes.  ValueError for others."""
+    makers = {".ply": ply_of, ".spz": lambda splats, note: spz_of(splats), ".glb": glb_of}
+    check_suffix(path)
+    content = makers[path.suffix.lower()](gaussians, note)
+    write_whole(path, content)
+    return len(content)
+
+
+def check_suffix(path: Path) -> None:
+    """ValueError unless the path is that of a file of splats."""
+    if path.suffix.lower() not in SUFFIXES:
+        raise UserError(f"{path}: splats are written as {', '.join(SUFFIXES)}, not {path.suffix or 'a folder'}")
+    if path.is_dir():
+        raise UserError(f"{path}: a folder; expected the name of a file of splats")
+
+
+def turned(gaussians: Gaussians) -> Gaussians:
+    """The splats half a turn around the x axis: axes right, up, back become right, down, forward, and back again."""
+    position, rotation, harmonics = (
+        np.asarray(x, np.float32) for x in (gaussians.position, gaussians.rotation, gaussians.harmonics)
+    )
+    w, x, y, z = rotation.T
+    signs = half_turn_signs(degree_of(harmonics.shape[1])).astype(np.float32)
+    return Gaussians(
+        scale=gaussians.scale,
+        opacity=gaussians.opacity,
+        position=position * np.array([1, -1, -1], np.float32),
+        rotation=np.stack([-x, w, -z, y], axis=-1),
+        harmonics=harmonics * signs[:, None],
+    )
+
+
+def ply_of(gaussians: Gaussians, note: str = "") -> bytes:
+    """The splats as a .ply file."""
+    splats = turned(gaussians)
+    harmonics, opacity = np.asarray(splats.harmonics), _inner(splats.opacity)
+    rest = harmonics[:, 1:].transpose(0, 2, 1).reshape(len(opacity), -1)
+    names = [*"xyz", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3)), *(f"f_rest_{i}" for i in range(rest.shape[1]))]
+    names += ["opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
+    parts = [
+        splats.position,
+        np.zeros_like(splats.position),
+        harmonics[:, 0],
+        rest,
+        np.log(opacity / (1 - opacity))[:, None],
+    ]
+    parts += [np.log(np.asarray(splats.scale)), splats.rotation]
+    header = ["ply", "format binary_little_endian 1.0", f"comment {RENDER_MODE}"]
+    header += [f"comment {line}" for line in note.splitlines()]
+    header += [f"element vertex {len(opacity)}", *(f"property float {name}" for name in names), "end_header"]
+    return ("\n".join(header) + "\n").encode("ascii", "replace") + np.concatenate(parts, axis=1).astype("<f4").tobytes()
+
+
+def read_ply(path: Path) -> Gaussians:
+    """The splats of a .ply file as `ply_of` writes it; ValueError if it lacks a property."""
+    with path.open("rb") as file:
+        pieces = list(vertex_pieces(file))
+    columns = {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
+    rest = sum(name.startswith("f_rest_") for name in columns)
+    names = {"position": tuple("xyz"), "rotation": tuple(f"rot_{i}" for i in range(4))}
+    names |= {"scale": tuple(f"scale_{i}" for i in range(3)), "opacity": ("opacity",)}
+    names |= {"base": tuple(f"f_dc_{i}" for i in range(3)), "rest": tuple(f"f_rest_{i}" for i in range(rest))}
+    missing = [name for group in names.values() for name in group if name not in columns]
+    if missing:
+        raise UserError(f"{path}: no file of Gaussian splats, it has no {missing[0]}")
+    found = {key: np.stack([columns[name] for name in group], axis=-1) for key, group in names.items() if group}
+    count = len(columns["x"])
+    harmonics = found["base"][:, None]
+    if rest:
+        harmonics = np.concatenate([harmonics, found["rest"].reshape(count, 3, rest // 3).swapaxes(1, 2)], axis=1)
+    gaussians = Gaussians(
+        position=found["position"],
+        rotation=found["rotation"],
+        scale=np.exp(found["scale"]),
+        opacity=1 / (1 + np.exp(-found["opacity"][:, 0])),
+        harmonics=harmonics,
+    )
+    return turned(gaussians)
+
+
+def spz_of(gaussians: Gaussians) -> bytes:
+    """The splats as a .spz file."""
+    position, harmonics = np.asarray(gaussians.position, np.float64), np.asarray(gaussians.harmonics, np.float64)
+    bits = int(np.clip(FRACTION_BITS - np.ceil(np.log2(max(np.abs(position).max(), 1e-6))), 0, 31))
+    fixed = np.clip(np.round(position * 2.0**bits), -(2**23), 2**23 - 1).astype("<i4")
+    places = fixed.view(np.uint8).reshape(len(position), 3, 4)[..., :3]
+    header = np.array([MAGIC, VERSION, len(position)], "<u4").tobytes()
+    header += bytes([degree_of(harmonics.shape[1]), bits, ANTIALIASED, 0])
+    parts = [
+        places,
+        _bytes(np.asarray(gaussians.opacity, np.float64) * 255),
+        _bytes(harmonics[:, 0] * COLOR_STEP * 255 + 127.5),
+        _bytes((np.log(np.asarray(gaussians.scale, np.float64)) - LEAST_SCALE) * SCALE_STEP),
+        _smallest_three(np.asarray(gaussians.rotation, np.float64)),
+        _harmonic_bytes(harmonics[:, 1:]),
+    ]
+    return gzip.compress(header + b"".join(part.tobytes() for part in parts), mtime=0)
+
+
+def glb_of(gaussians: Gaussians, note: str = "") -> bytes:
+    """The splats as a binary glTF 2.0 file with the extension KHR_gaussian_splatting."""
+    harmonics = np.asarray(gaussians.harmonics)
+    color = np.clip(0.5 + C0 * harmonics[:, 0], 0, 1)
+    name = "KHR_gaussian_splatting:"
+    arrays = {
+        "POSITION": np.asarray(gaussians.position),
+        "COLOR_0": np.concatenate([color, np.asarray(gaussians.opacity)[:, None]], axis=1),
+        f"{name}ROTATION": np.asarray(gaussians.rotation)[:, [1, 2, 3, 0]],
+        f"{name}SCALE": np.asarray(gaussians.scale),
+        f"{name}OPACITY": np.asarray(gaussians.opacity)[:, None],
+    }
+    for degree in range(degree_of(harmonics.shape[1]) + 1):
+        for i in range(2 * degree + 1):
+            arrays[f"{name}SH_DEGREE_{degree}_COEF_{i}"] = harmonics[:, degree**2 + i]
+    views, accessors, chunks, size = [], [], [], 0
+    for array in arrays.values():
+        data = np.ascontiguousarray(array, "<f4").tobytes()
+        views.append({"buffer": 0, "byteOffset": size, "byteLength": len(data)})
+        kind = "SCALAR" if array.shape[1] == 1 else f"VEC{array.shape[1]}"
+        accessors.append({"bufferView": len(views) - 1, "componentType": 5126, "count": len(array), "type": kind})
+        chunks.append(data)
+        size += len(data)
+    accessors[0] |= {"min": arrays["POSITION"].min(axis=0).tolist(), "max": arrays["POSITION"].max(axis=0).tolist()}
+    said = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display", "projection": "perspective"}
+    primitive = {
+        "mode": 0,
+        "attributes": {name: i for i, name in enumerate(arrays)},
+        "extensions": {name[:-1]: said | {"sortingMethod": "cameraDistance"}},
+    }
+    document = {
+        "asset": {"version": "2.0", "generator": "spnr_jax"} | ({"copyright": note} if note else {}),
+        "extensionsUsed": [name[:-1]],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [primitive]}],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": size}],
+    }
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    body = _chunk(JSON_CHUNK, text) + _chunk(BINARY_CHUNK, b"".join(chunks))
+    return b"glTF" + np.array([2, 12 + len(body)], "<u4").tobytes() + body
+
+
+def _chunk(kind: bytes, data: bytes) -> bytes:
+    return np.array([len(data)], "<u4").tobytes() + kind + data
+
+
+def _inner(opacity: Float[AnyArray, " splats"]) -> np.ndarray:
+    return np.clip(np.asarray(opacity, np.float64), LEAST_OPACITY, MOST_OPACITY)
+
+
+def _bytes(values: np.ndarray) -> np.ndarray:
+    return np.clip(np.round(values), 0, 255).astype(np.uint8)
+
+
+def _harmonic_bytes(rest: Float[np.ndarray, "splats coefficients 3"]) -> np.ndarray:
+    """Bytes whose lowest bits are those of the middle of a step, as the format's own writer rounds them."""
+    bits = np.where(np.arange(rest.shape[1]) < 3, *HARMONIC_BITS)
+    step = 2.0 ** (8 - bits)[None, :, None]
+    return _bytes(np.minimum(np.round((rest * 128 + 128) / step) * step, 255))
+
+
+def _smallest_three(rotation: Float[np.ndarray, "splats 4"]) -> np.ndarray:
+    """Rotations as 32 bits: which of x y z w is largest, and sign and nine bits of each of the others."""
+    quaternion = rotation[:, [1, 2, 3, 0]]
+    largest = np.abs(quaternion).argmax(axis=1)
+    quaternion = quaternion * np.where(np.take_along_axis(quaternion, largest[:, None], 1) < 0, -1, 1)
+    packed = largest.astype(np.uint32)
+    for i in range(4):
+        value = quaternion[:, i]
+        size = np.minimum(np.floor(511 * np.abs(value) * np.sqrt(2) + 0.5), 511).astype(np.uint32)
+        packed = np.where(largest == i, packed, packed << 10 | (value < 0).astype(np.uint32) << 9 | size)
+    return packed.astype("<u4")

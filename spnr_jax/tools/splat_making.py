@@ -1,0 +1,135 @@
+"""Gaussian splats of a cloud: the network draws it from all around, and splats are made and refined from that.
+
+fitting cameras    even directions on the sphere, the same distance as `Model.camera`
+splats             gaussians/placing.py, coloring.py, refining.py, in the box, then in the cloud's units
+"""
+
+import dataclasses
+import time
+from collections.abc import Callable
+
+import jax
+import numpy as np
+
+from spnr_jax.gaussians import coloring, placing, refining
+from spnr_jax.gaussians.placing import View
+from spnr_jax.kernels.records import Camera, Gaussians, Light, PointCloud
+from spnr_jax.method import surfel_renderer
+from spnr_jax.method.model import DISTANCE, Model, Volume
+from spnr_jax.method.surfel_renderer import SurfelScene
+from spnr_jax.tools.depth_maps import surface_depth
+
+GOLDEN_ANGLE = 180 * (3 - np.sqrt(5))  # degrees between the azimuths of one direction and the next
+LEAST_RATE = 0.1  # share of the learning rates that is left at the end
+
+
+def splats(
+    model: Model,
+    cloud: PointCloud,
+    *,
+    light: Light | None = None,
+    degree: int = 1,
+    most: int = 80_000,
+    views: int = 32,
+    resolution: int = 512,
+    seconds: float | int = 20.0,
+    report: Callable[[str], None] = lambda line: None,
+) -> Gaussians:
+    """Gaussian splats of a cloud as the network draws it, in the cloud's units, y up: what splat viewers show.
+
+    The network draws `views` pictures of `resolution` pixels in the light; splats, at most `most`, lie on the surface
+    that these show, with colours as spherical harmonics of a `degree` 0 to 3, and are refined against the pictures for
+    so many `seconds`.  ValueError if the pictures show no surface.  `spnr_jax.write_splats` writes them.
+    """
+    return splats_of(model, model.encode(cloud), cloud, light, degree, most, views, resolution, seconds, report)
+
+
+def splats_of(
+    model: Model,
+    volume: Volume,
+    cloud: PointCloud,
+    light: Light | None,
+    degree: int,
+    most: int,
+    views: int,
+    resolution: int,
+    seconds: float | int,
+    report: Callable[[str], None] = lambda line: None,
+) -> Gaussians:
+    """`splats` of a cloud that is encoded already."""
+    pictures = drawn_views(model, volume, fitting_cameras(model, volume, views, resolution), light)
+    report(f"the network drew {views} pictures of {resolution} x {resolution}")
+    return splats_of_views(pictures, volume, cloud, degree, most, seconds, report)
+
+
+def splats_of_views(
+    pictures: list[View],
+    volume: Volume,
+    cloud: PointCloud,
+    degree: int,
+    most: int,
+    seconds: float | int,
+    report: Callable[[str], None] = lambda line: None,
+) -> Gaussians:
+    """`splats` from pictures that the network has drawn."""
+    surfels = (volume.scene if isinstance(volume.scene, SurfelScene) else _surfels(cloud, volume)).surfels
+    focal = float(np.asarray(pictures[0].camera.intrinsics)[0, 0])
+    seen = placing.seen_surface(pictures, surfels)
+    placed, side = placing.place(seen, most=most, pixel=DISTANCE / focal)
+    gaussians = coloring.colored(placed, pictures, side=side, degree=degree)
+    report(f"{len(gaussians.opacity):,} splats placed")
+    if seconds > 0:
+        gaussians, steps = _refined(gaussians, pictures, seconds)
+        report(f"refined by {steps} steps")
+    return in_units(gaussians, volume)
+
+
+def fitting_cameras(model: Model, volume: Volume, count: int, resolution: int) -> list[Camera]:
+    """Cameras in even directions around an object, from the top down along a spiral."""
+    heights = 1 - (2 * np.arange(count) + 1) / count
+    azimuths = np.arange(count) * GOLDEN_ANGLE % 360
+    return [
+        model.camera(volume, float(azimuth), float(np.degrees(np.arcsin(height))), resolution)
+        for azimuth, height in zip(azimuths, heights, strict=True)
+    ]
+
+
+def drawn_views(model: Model, volume: Volume, cameras: list[Camera], light: Light | None) -> list[View]:
+    """The network's pictures from cameras, with these in the box."""
+    found = []
+    for camera, drawn in zip(cameras, model.render_each(volume, cameras, lights=[light] * len(cameras)), strict=True):
+        image, opacity = np.asarray(drawn.image), np.asarray(drawn.acc)
+        depth = surface_depth(drawn, camera, volume) * np.asarray(volume.scale)
+        if opacity.shape != image.shape[:2]:  # a network that doubles its pictures
+            opacity, depth = (x.repeat(2, axis=0).repeat(2, axis=1) for x in (opacity, depth))
+        found.append(View(in_box(camera, volume), image, opacity, depth))
+    return found
+
+
+def in_box(camera: Camera, volume: Volume) -> Camera:
+    """A camera of the cloud's units in the box."""
+    pose = np.array(camera.cam_to_world)
+    pose[:, 3] = (pose[:, 3] - np.asarray(volume.centre)) * np.asarray(volume.scale)
+    return dataclasses.replace(camera, cam_to_world=pose, intrinsics=np.asarray(camera.intrinsics))
+
+
+def in_units(gaussians: Gaussians, volume: Volume) -> Gaussians:
+    """The splats of the box in the cloud's units."""
+    scale, arrays = np.asarray(volume.scale), jax.tree.map(np.asarray, gaussians)
+    position = arrays.position / scale + np.asarray(volume.centre)
+    return arrays.replace(position=position, scale=arrays.scale / scale)
+
+
+def _refined(gaussians: Gaussians, pictures: list[View], seconds: float | int) -> tuple[Gaussians, int]:
+    """The splats refined until the time is over, and the steps that were taken."""
+    refinement = refining.Refinement(gaussians, pictures)
+    refinement.step()  # compiles
+    begin = time.monotonic()
+    while (passed := (time.monotonic() - begin) / seconds) < 1:
+        refinement.step(LEAST_RATE + (1 - LEAST_RATE) * (1 - passed))
+    return refinement.gaussians, refinement.steps
+
+
+def _surfels(cloud: PointCloud, volume: Volume) -> SurfelScene:
+    inside = np.clip((np.asarray(cloud.positions) - np.asarray(volume.centre)) * np.asarray(volume.scale), -1, 1)
+    return surfel_renderer.encode(dataclasses.replace(cloud, positions=inside.astype(np.float32)))

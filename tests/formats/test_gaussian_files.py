@@ -1,0 +1,176 @@
+"""Files of splats: what they say is what was written, by our reader, by plain ones, and by npm's splat-transform."""
+
+import csv
+import gzip
+import json
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support import gltf_files, splat_balls
+
+from spnr_jax.formats import gaussian_files
+from spnr_jax.formats.clouds import read_cloud
+from spnr_jax.formats.images import write_whole
+from spnr_jax.gaussians.harmonics import C0
+
+NOTE = "ball.ply, drawn by spnr_jax (surfels), light: room"
+
+
+def transform_program():
+    """The program of npm's @playcanvas/splat-transform, where node and it are installed."""
+    named = os.environ.get("SPNR_SPLAT_TRANSFORM") or shutil.which("splat-transform")
+    return Path(named) if named and shutil.which("node") else None
+
+
+needs_transform = pytest.mark.skipif(
+    transform_program() is None,
+    reason="no splat-transform on PATH or in SPNR_SPLAT_TRANSFORM: npm install -g @playcanvas/splat-transform",
+)
+
+
+def rotation_matrices(quaternions):
+    w, x, y, z = np.asarray(quaternions, np.float64).T
+    return np.stack(
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+         2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+         2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], axis=-1
+    ).reshape(-1, 3, 3)  # fmt: skip
+
+
+@pytest.mark.parametrize("degree", [0, 1, 3])
+def test_a_ply_is_read_back_as_it_was_written(tmp_path, degree):
+    splats, path = splat_balls.ball(50, degree), tmp_path / "ball.ply"
+    size = gaussian_files.write_splats(path, splats, NOTE)
+    assert path.stat().st_size == size
+    back = gaussian_files.read_ply(path)
+    for name, values in vars(splats).items():
+        if name != "rotation":  # of either sign
+            np.testing.assert_allclose(getattr(back, name), values, rtol=1e-4, atol=1e-5, err_msg=name)
+    np.testing.assert_allclose(rotation_matrices(back.rotation), rotation_matrices(splats.rotation), atol=1e-5)
+    assert f"comment {NOTE}".encode() in path.read_bytes()[:300]
+
+
+def test_a_ply_has_the_axes_and_colours_that_the_reader_of_points_expects(tmp_path):
+    splats, path = splat_balls.ball(50), tmp_path / "ball.ply"
+    gaussian_files.write_splats(path, splats)
+    cloud = read_cloud(path, up="-y")
+    order = np.lexsort(np.round(cloud.positions, 3).T), np.lexsort(np.round(splats.position, 3).T)
+    wanted = np.clip(0.5 + C0 * splats.harmonics[:, 0], 0, 1)
+    heights = cloud.positions[order[0], 1], splats.position[order[1], 1]
+    np.testing.assert_allclose(np.sort(heights[0]), np.sort(heights[1]), atol=1e-4)
+    assert cloud.base_color.shape == wanted.shape
+
+
+def test_an_spz_holds_what_its_format_says():
+    splats = splat_balls.ball(50, 1)
+    content = gzip.decompress(gaussian_files.spz_of(splats))
+    magic, version, count = np.frombuffer(content, "<u4", 3)
+    degree, bits = content[12:14]
+    assert (magic, version, count, degree) == (0x5053474E, 3, 50, 1)
+    assert len(content) == 16 + 50 * (9 + 1 + 3 + 3 + 4 + 9)
+    places = np.frombuffer(content, np.uint8, 450, 16).reshape(50, 3, 3).astype(np.int64)
+    fixed = places[..., 0] | places[..., 1] << 8 | places[..., 2] << 16
+    fixed = np.where(fixed >= 2**23, fixed - 2**24, fixed)
+    np.testing.assert_allclose(fixed * 2.0**-bits, splats.position, atol=2.0**-bits)
+
+
+@pytest.mark.parametrize("far", [1e-3, 1.0, 5000.0])
+def test_an_spz_keeps_objects_of_any_size(far):
+    splats = splat_balls.ball(20)
+    content = gzip.decompress(gaussian_files.spz_of(splats.replace(position=splats.position * np.float32(far))))
+    places = np.frombuffer(content, np.uint8, 180, 16).reshape(20, 3, 3).astype(np.int64)
+    fixed = places[..., 0] | places[..., 1] << 8 | places[..., 2] << 16
+    fixed = np.where(fixed >= 2**23, fixed - 2**24, fixed)
+    np.testing.assert_allclose(fixed * 2.0 ** -content[13], far * splats.position, atol=1e-5 * far)
+
+
+def test_a_glb_has_the_attributes_of_the_extension():
+    splats = splat_balls.ball(50, 1)
+    document, binary = gltf_files.parts_of(gaussian_files.glb_of(splats, NOTE))
+    (primitive,) = document["meshes"][0]["primitives"]
+    assert document["extensionsUsed"] == ["KHR_gaussian_splatting"]
+    assert primitive["mode"] == 0
+    assert document["asset"]["copyright"] == NOTE
+    name = "KHR_gaussian_splatting"
+    assert primitive["extensions"][name]["colorSpace"] == "srgb_rec709_display"
+
+    def values(attribute):
+        accessor = document["accessors"][primitive["attributes"][attribute]]
+        view = document["bufferViews"][accessor["bufferView"]]
+        return np.frombuffer(binary, "<f4", view["byteLength"] // 4, view["byteOffset"]).reshape(50, -1)
+
+    np.testing.assert_array_equal(values("POSITION"), splats.position)
+    np.testing.assert_array_equal(values(f"{name}:SCALE"), splats.scale)
+    np.testing.assert_array_equal(values(f"{name}:ROTATION"), splats.rotation[:, [1, 2, 3, 0]])
+    np.testing.assert_array_equal(values(f"{name}:OPACITY")[:, 0], splats.opacity)
+    for i, place in enumerate(("0_COEF_0", "1_COEF_0", "1_COEF_1", "1_COEF_2")):
+        np.testing.assert_array_equal(values(f"{name}:SH_DEGREE_{place}"), splats.harmonics[:, i])
+
+
+@pytest.mark.parametrize("name", ["out.obj", "out", "folder.ply"])
+def test_another_suffix_or_a_folder_is_refused_in_one_line(tmp_path, name):
+    (tmp_path / "folder.ply").mkdir()
+    with pytest.raises(ValueError, match="splats") as refused:
+        gaussian_files.write_splats(tmp_path / name, splat_balls.ball(10))
+    assert "\n" not in str(refused.value)
+    assert name in str(refused.value)
+
+
+def test_a_stopped_export_leaves_no_half_file(tmp_path, monkeypatch):
+    def stopped(self, data):
+        self.touch()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Path, "write_bytes", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        write_whole(tmp_path / "out.ply", gaussian_files.ply_of(splat_balls.ball(10)))
+    assert not list(tmp_path.iterdir())
+
+
+def converted(path, suffix):
+    out = path.with_name(f"converted{suffix}")
+    subprocess.run(
+        [transform_program(), "--quiet", "-g", "cpu", "-w", path, out], check=True, capture_output=True, timeout=120
+    )
+    return out
+
+
+@needs_transform
+@pytest.mark.parametrize("suffix", [".ply", ".spz"])
+def test_splat_transform_reads_what_we_write(tmp_path, suffix):
+    splats, path = splat_balls.ball(50, 2), tmp_path / f"ball{suffix}"
+    gaussian_files.write_splats(path, splats)
+    with converted(path, ".csv").open() as file:
+        rows = list(csv.DictReader(file))
+    columns = {name: np.array([float(row[name]) for row in rows]) for name in rows[0]}
+    assert len(rows) == 50
+    exact = suffix == ".ply"
+    wanted = gaussian_files.turned(splats)  # it takes every file to the axes of a .ply
+    for i, axis in enumerate("xyz"):
+        np.testing.assert_allclose(columns[axis], wanted.position[:, i], atol=1e-5)
+        np.testing.assert_allclose(columns[f"f_dc_{i}"], wanted.harmonics[:, 0, i], atol=1e-4 if exact else 0.014)
+        np.testing.assert_allclose(columns[f"scale_{i}"], np.log(wanted.scale[:, i]), atol=1e-4 if exact else 0.032)
+        rest = np.stack([columns[f"f_rest_{8 * i + k}"] for k in range(8)], axis=-1)
+        np.testing.assert_allclose(rest, wanted.harmonics[:, 1:, i], atol=1e-4 if exact else 0.07)
+    np.testing.assert_allclose(1 / (1 + np.exp(-columns["opacity"])), wanted.opacity, atol=1e-4 if exact else 0.003)
+    turns = rotation_matrices(np.stack([columns[f"rot_{i}"] for i in range(4)], axis=-1))
+    same_axes = np.abs(np.sum(turns * rotation_matrices(wanted.rotation), axis=1))  # a splat is alike from both ends
+    np.testing.assert_allclose(same_axes, 1, atol=1e-4)
+
+
+@needs_transform
+def test_our_glb_says_what_splat_transforms_does_of_the_same_splats(tmp_path):
+    splats, path = splat_balls.ball(50, 1), tmp_path / "ball.ply"
+    gaussian_files.write_splats(path, splats)
+    theirs, _ = gltf_files.parts_of(converted(path, ".glb").read_bytes())
+    ours, _ = gltf_files.parts_of(gaussian_files.glb_of(splats))
+    names, said = (
+        [document["meshes"][0]["primitives"][0][part] for document in (ours, theirs)]
+        for part in ("attributes", "extensions")
+    )
+    assert set(names[0]) == set(names[1])
+    assert json.dumps(said[0]["KHR_gaussian_splatting"]["colorSpace"]) in json.dumps(said[1])

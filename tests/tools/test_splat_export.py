@@ -1,0 +1,99 @@
+"""`spnr export --splats` and `spnr share`: what they write, and what they refuse in one line."""
+
+import numpy as np
+import pytest
+from support import command_line, splat_balls, tiny_surfels
+
+from spnr_jax.formats import gaussian_files
+from spnr_jax.formats.clouds import read_cloud
+from spnr_jax.tools import splat_export
+from spnr_jax.tools.light_options import Lighting
+
+cli = command_line.unchecked_cli()
+
+
+@pytest.fixture
+def cloud(tmp_path):
+    """The ball of the tiny data set as a file."""
+    path = tmp_path / "ball.ply"
+    path.write_bytes((tiny_surfels.dataset().folder / "objects" / tiny_surfels.NAME / "points.ply").read_bytes())
+    return path
+
+
+@pytest.fixture(autouse=True)
+def small_pictures(monkeypatch):
+    """Quick ones, and nothing is written to the home folder."""
+    monkeypatch.setattr(cli, "set_up_jax", lambda **_: None)
+    monkeypatch.setattr(splat_export, "RESOLUTION", tiny_surfels.SIZE)
+
+
+def made_by(*arguments):
+    network = str(tiny_surfels.run())
+    name = "--network" if arguments[0] == "export" else "--run"
+    options = (name, network, "--seconds", "0", "--fitting-views", "6", "--up", "y")
+    with pytest.raises(SystemExit) as ended:
+        cli.main([*map(str, arguments), *options])
+    return ended.value.code
+
+
+def test_splats_of_a_file_lie_around_its_points_in_its_units(cloud, tmp_path, capsys):
+    out = tmp_path / "out.ply"
+    code = made_by("export", cloud, "--splats", out, "--exposure", "-1")
+    assert code == 0, capsys.readouterr().err
+    splats, points = gaussian_files.read_ply(out), read_cloud(cloud).positions
+    low, high = points.min(axis=0), points.max(axis=0)
+    spare = 0.35 * (high - low).max()  # the ball has few points
+    assert ((splats.position > low - spare) & (splats.position < high + spare)).all()
+    note = "ball.ply, drawn by spnr_jax"
+    assert note.encode() in out.read_bytes()[:300]
+    assert b"exposure -1" in out.read_bytes()[:300]
+    assert "splats" in capsys.readouterr().out
+
+
+def test_a_page_holds_title_credit_and_splats(cloud, tmp_path, capsys):
+    out = tmp_path / "page.html"
+    code = made_by("share", cloud, "--out", out, "--title", "A <ball>", "--credit", "by nobody")
+    assert code == 0, capsys.readouterr().err
+    text = out.read_text()
+    assert "<title>A &lt;ball&gt;</title>" in text
+    assert "by nobody" in text
+    assert not {"@TITLE@", "@DATA@", "@CAMERA@"} & set(text.split())
+    assert "http" not in text.replace("http-equiv", "").replace("application/octet", "")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("export", "CLOUD", "--splats", "out.obj"), "out.obj"),
+        (("export", "CLOUD", "--splats", "."), "splats"),
+        (("export", "CLOUD", "--splats", "out.ply", "--most-splats", "300000"), "--most-splats"),
+        (("export", "CLOUD", "--light", "studio"), "--splats"),
+        (("export", "nowhere.ply", "--splats", "out.ply"), "nowhere.ply"),
+        (("share", "CLOUD", "--out", "page.pdf"), "page.pdf"),
+        (("share", "CLOUD", "--background", "light"), "--background"),
+        (("share", "CLOUD", "--fitting-views", "1"), "--fitting-views"),
+    ],
+)
+def test_what_makes_no_sense_is_one_line_and_code_2(cloud, tmp_path, monkeypatch, capsys, arguments, words):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as ended:
+        cli.main([str(cloud) if argument == "CLOUD" else argument for argument in arguments])
+    assert ended.value.code == 2
+    said = capsys.readouterr().err
+    assert words in said
+    assert said.count("\n") == 1
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["ball.ply"]
+
+
+def test_a_page_that_is_too_large_is_refused(monkeypatch):
+    monkeypatch.setattr(splat_export, "MOST_BYTES", 1000)
+    with pytest.raises(ValueError, match="--most-splats"):
+        splat_export.page(
+            splat_balls.ball(50), np.ones((8, 8, 3), np.float32), splat_balls.camera(size=8), (30.0, 20.0), "t", "n"
+        )
+
+
+def test_the_light_is_named_without_its_folder():
+    assert splat_export.light_name(Lighting()) == "room"
+    lighting = Lighting(light="/home/me/sky.hdr", sun=(40.0, 30.0), exposure=-1.0)
+    assert splat_export.light_name(lighting) == "sky.hdr + sun 40 30, exposure -1"

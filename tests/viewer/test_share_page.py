@@ -1,0 +1,105 @@
+"""The page of `spnr share` in a real browser, opened as a file: it draws what it should, turns, and finds no error.
+
+Chromium is found on PATH, or named by SPNR_CHROMIUM; without one these tests are skipped.
+"""
+
+import io
+import os
+import shutil
+
+import numpy as np
+import pytest
+from PIL import Image
+from support import splat_balls
+
+from spnr_jax.gaussians import drawing
+from spnr_jax.tools import splat_export
+
+playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install playwright")
+
+CHROMIUM = os.environ.get("SPNR_CHROMIUM") or next(
+    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome"))), None
+)
+OPTIONS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-background-networking")
+SIZE = 200
+WAIT = 60_000  # milliseconds, for a machine that does much else
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on PATH: apt-get install chromium")
+
+
+@pytest.fixture(scope="module")
+def chromium():
+    with playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=CHROMIUM, args=list(OPTIONS))
+        yield browser
+        browser.close()
+
+
+def opened(chromium, path):
+    """The page in a tab, ready, and what its console says."""
+    tab, said = chromium.new_page(viewport={"width": SIZE, "height": SIZE}), []
+    tab.on("console", lambda line: said.append((line.type, line.text)))
+    tab.on("pageerror", lambda error: said.append(("error", str(error))))
+    tab.on("request", lambda request: said.append(("request", request.url)) if request.url[:4] == "http" else None)
+    tab.goto(path.as_uri())
+    tab.wait_for_function("window.viewer.ready", timeout=WAIT)
+    return tab, said
+
+
+def shown(tab):
+    """What the canvas shows, without the words over it."""
+    tab.evaluate("document.querySelectorAll('header, footer').forEach((part) => part.style.display = 'none')")
+    tab.evaluate("viewer.draw()")
+    content = tab.screenshot()
+    return np.asarray(Image.open(io.BytesIO(content)).convert("RGB")).astype(np.float32) / 255
+
+
+def decibels(one, other):
+    return -10 * np.log10(np.mean((one - other) ** 2))
+
+
+def page(tmp_path, degree, title="A ball"):
+    camera = splat_balls.camera(size=SIZE)
+    splats = splat_balls.ball(degree=degree)
+    poster, _ = drawing.draw(splats, camera)
+    path = tmp_path / "page.html"
+    path.write_bytes(splat_export.page(splats, poster, camera, (30.0, 20.0), title, "a note"))
+    return path, poster
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_the_page_draws_what_the_poster_shows(chromium, tmp_path, degree):
+    path, poster = page(tmp_path, degree)
+    tab, said = opened(chromium, path)
+    assert decibels(shown(tab), poster) > 32
+    assert tab.locator("#poster").count() == 0, "the poster makes place"
+    assert not said
+    tab.close()
+
+
+def test_dragging_turns_the_object_as_a_camera_would_go_around_it(chromium, tmp_path):
+    path, poster = page(tmp_path, 1)
+    tab, said = opened(chromium, path)
+    tab.mouse.move(100, 100)
+    tab.mouse.down()
+    tab.mouse.move(150, 110, steps=3)
+    tab.mouse.up()
+    azimuth, elevation = tab.evaluate("[viewer.camera.azimuth, viewer.camera.elevation]")
+    assert (azimuth, elevation) == pytest.approx((10, 24))
+    turned, _ = drawing.draw(splat_balls.ball(), splat_balls.camera(azimuth, elevation, SIZE))
+    now = shown(tab)
+    assert decibels(now, turned) > 32
+    assert decibels(now, poster) < 28
+    tab.mouse.wheel(0, 200)
+    tab.wait_for_function("viewer.camera.distance > 3.3")
+    assert not said
+    tab.close()
+
+
+def test_a_title_with_signs_of_html_is_only_text(chromium, tmp_path):
+    title = '<b>"chair" & @DATA@</b>'
+    path, _ = page(tmp_path, 0, title)
+    tab, said = opened(chromium, path)
+    assert tab.title() == title
+    assert tab.locator("h1").inner_text() == title
+    assert not said
+    tab.close()
