@@ -46,9 +46,9 @@ FLATTEST = 0.25  # share of the places that the noise is told by: elsewhere edge
 GAUSSIAN = 0.215  # their largest distance from the best plane there, over the standard deviation of the noise
 FLAT = 0.07  # of the neighbourhood's radius: thinner noise is measured there, thicker in a wider one
 WIDER = 4  # times as many neighbours
-RADIUS = 1.5  # standard deviations of the noise in that of a neighbour's weight
+RADIUS = 2.0  # standard deviations of the noise in that of a neighbour's weight
 LEAST_RADIUS = 1.0  # spacings: the same at least
-AROUND = 48  # points that give a plane
+AROUND = 64  # points that give a plane
 MOVED = 2  # times that points are moved
 MOST_MOVED = 2**17  # points that are moved; of more, a part
 CANCELLED = 0.5  # length of a mean of unit normals below which they contradict each other
@@ -183,7 +183,7 @@ def averaged(
     """
     order = np.lexsort(positions.T)  # so that a part is spread over the cloud, and the same whatever the points' order
     within = 2 * np.pi * (radius / spacing) ** 2  # points whose weight counts
-    basis = order[:: max(1, int(within / (AROUND / 2)))]
+    basis = order[:: max(1, int(within / AROUND))]
     moved = positions[order[:: -(-len(order) // MOST_MOVED)]].astype(np.float64)
     tree, known = cKDTree(positions[basis]), positions[basis].astype(np.float64)
     for _ in range(MOVED):
