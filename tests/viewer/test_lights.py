@@ -76,7 +76,7 @@ def test_the_map_stands_behind_the_object_where_it_is_asked_for():
     assert (white[:4, :4] == 255).all()
     assert lit[:4, :4].mean() < 240
     changed = np.abs(white - lit)
-    assert changed[30, 60].mean() < changed[:4, :4].mean() / 2, "the object itself stays"
+    assert np.median(changed[20:40, 50:70].mean(axis=-1)) < changed[:4, :4].mean() / 2, "the object itself stays"
 
 
 def test_snapshots_and_films_have_the_light_of_the_canvas():
