@@ -208,7 +208,7 @@ def blend(
     depth, spacing = found.depth[table], jnp.asarray(surfels.spacing)[point]
     weight, depth, spacing = jax.lax.optimization_barrier((weight, depth, spacing))
     share, left = shares(OPACITY * weight, depth, spacing)
-    sharp = share * kernel**SHARP
+    sharp = share * kernel**SHARP * found.facing[table]
     share, sharp = jax.lax.optimization_barrier((share, sharp))
     rotation = camera.cam_to_world[:, :3]
     wide = [*attributes.T, *_turned(rotation, surfels.normal), jnp.log(surfels.spacing)]
