@@ -13,13 +13,13 @@ becomes a comment of the .ply and the copyright line of the .glb; a .spz has no 
 """
 
 import gzip
-import json
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
 from spnr_jax.errors import UserError
+from spnr_jax.formats.glb import packed
 from spnr_jax.formats.images import write_whole
 from spnr_jax.formats.ply import vertex_pieces
 from spnr_jax.gaussians.harmonics import C0, degree_of, half_turn_signs
@@ -33,7 +33,6 @@ COLOR_STEP = 0.15  # of .spz: 255 steps for 1 / COLOR_STEP of a coefficient
 FRACTION_BITS = 24 - 2  # at most of a place in .spz; fewer where places lie further from the origin than 1
 SCALE_STEP, LEAST_SCALE = 16, -10  # of .spz: steps for each e-fold, logarithm of the smallest
 HARMONIC_BITS = (5, 4)  # of .spz: of the coefficients of degree 1, and above
-JSON_CHUNK, BINARY_CHUNK = b"JSON", b"BIN\0"
 
 
 def write_splats(path: Path, gaussians: Gaussians, note: str = "") -> int:
@@ -175,16 +174,8 @@ def glb_of(gaussians: Gaussians, note: str = "") -> bytes:
         "meshes": [{"primitives": [primitive]}],
         "accessors": accessors,
         "bufferViews": views,
-        "buffers": [{"byteLength": size}],
     }
-    text = json.dumps(document).encode()
-    text += b" " * (-len(text) % 4)
-    body = _chunk(JSON_CHUNK, text) + _chunk(BINARY_CHUNK, b"".join(chunks))
-    return b"glTF" + np.array([2, 12 + len(body)], "<u4").tobytes() + body
-
-
-def _chunk(kind: bytes, data: bytes) -> bytes:
-    return np.array([len(data)], "<u4").tobytes() + kind + data
+    return packed(document, b"".join(chunks))
 
 
 def _inner(opacity: Float[AnyArray, " splats"]) -> np.ndarray:

@@ -5,7 +5,6 @@ for whole primitives only: faces are grouped by the two, rounded, and each group
 Coordinates are those of the file that the points came from, whatever its upward axis.
 """
 
-import json
 from collections.abc import Iterator
 
 import numpy as np
@@ -13,13 +12,13 @@ from scipy.spatial import cKDTree
 
 from spnr_jax.errors import UserError
 from spnr_jax.formats.clouds import PlacedCloud
+from spnr_jax.formats.glb import packed
 from spnr_jax.tools.density_grid import DensityGrid
 
 NEAREST = 4  # points whose materials a vertex takes the mean of
 LEVELS = 8  # steps that roughness and metallic are rounded to
 FLOAT, UNSIGNED, ARRAY_BUFFER, INDEX_BUFFER = 5126, 5125, 34962, 34963  # numbers of the glTF specification
 KINDS = {1: "SCALAR", 3: "VEC3"}
-JSON_CHUNK, BINARY_CHUNK = b"JSON", b"BIN\0"
 
 
 def mesh_of(grid: DensityGrid, placed: PlacedCloud, level: float) -> tuple[bytes, int]:
@@ -96,13 +95,5 @@ def glb(primitives: list[tuple[dict[str, np.ndarray], tuple[float, float]]], tra
         "materials": materials,
         "accessors": accessors,
         "bufferViews": views,
-        "buffers": [{"byteLength": size}],
     }
-    text = json.dumps(document).encode()
-    text += b" " * (-len(text) % 4)
-    body = _chunk(JSON_CHUNK, text) + _chunk(BINARY_CHUNK, b"".join(chunks))
-    return b"glTF" + np.array([2, 12 + len(body)], "<u4").tobytes() + body
-
-
-def _chunk(kind: bytes, data: bytes) -> bytes:
-    return np.array([len(data)], "<u4").tobytes() + kind + data
+    return packed(document, b"".join(chunks))
