@@ -4,12 +4,11 @@ Chromium is found on PATH, or named by SPNR_CHROMIUM; without one these tests ar
 """
 
 import io
-import os
-import shutil
 
 import numpy as np
 import pytest
 from PIL import Image
+from support import chromium as chromium_of
 from support import splat_balls
 
 from spnr_jax.gaussians import drawing
@@ -17,21 +16,15 @@ from spnr_jax.tools import splat_export
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install playwright")
 
-CHROMIUM = os.environ.get("SPNR_CHROMIUM") or next(
-    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome"))), None
-)
-OPTIONS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-background-networking")
 SIZE = 200
 WAIT = 60_000  # milliseconds, for a machine that does much else
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on PATH: apt-get install chromium")
+pytestmark = chromium_of.needed
 
 
 @pytest.fixture(scope="module")
 def chromium():
-    with playwright.sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=CHROMIUM, args=list(OPTIONS))
+    with chromium_of.launched(playwright) as browser:
         yield browser
-        browser.close()
 
 
 def opened(chromium, path):

@@ -4,14 +4,13 @@ Chromium is found on PATH, or named by SPNR_CHROMIUM; without one these tests ar
 """
 
 import io
-import os
-import shutil
 import socket
 import time
 
 import numpy as np
 import pytest
 from PIL import Image
+from support import chromium as chromium_of
 from support import tiny_viewer
 
 pytest.importorskip("viser", reason="the viewer's extra is not installed: pip install 'spnr-jax[viewer]'")
@@ -23,15 +22,7 @@ from spnr_jax.tools.light_options import Lighting  # noqa: E402
 from spnr_jax.viewer import server  # noqa: E402
 from spnr_jax.viewer.gui import Reading  # noqa: E402
 
-CHROMIUM = os.environ.get("SPNR_CHROMIUM") or next(
-    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome"))), None
-)
-OPTIONS = (
-    "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-quic", "--disable-sync",
-    "--disable-background-networking", "--disable-component-update",
-)  # fmt: skip
 WAIT = 40  # seconds, for a machine that does much else
-needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on PATH: apt-get install chromium")
 
 
 def viewer(host="127.0.0.1", port=0):
@@ -48,10 +39,8 @@ def running():
 
 @pytest.fixture(scope="module")
 def chromium():
-    with playwright.sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=CHROMIUM, args=list(OPTIONS))
+    with chromium_of.launched(playwright) as browser:
         yield browser
-        browser.close()
 
 
 class Page:
@@ -117,7 +106,7 @@ def drawn(canvas):
     return all((half(canvas, number) < 200).any(axis=-1).mean() > 0.01 for number in (0, 1))
 
 
-@needs_chromium
+@chromium_of.needed
 def test_points_and_picture_stand_side_by_side_and_an_orbit_turns_both(page):
     first = page.settled(drawn)
     page.orbit()
@@ -128,7 +117,7 @@ def test_points_and_picture_stand_side_by_side_and_an_orbit_turns_both(page):
     assert page.tab.get_by_text("(48²)").first.is_visible()
 
 
-@needs_chromium
+@chromium_of.needed
 @pytest.mark.slow
 def test_layers_differ_and_the_left_pane_stays(page):
     seen = {"picture": page.settled(drawn)}
@@ -139,7 +128,7 @@ def test_layers_differ_and_the_left_pane_stays(page):
     assert max(difference(left, lefts[0]) for left in lefts) < 2
 
 
-@needs_chromium
+@chromium_of.needed
 @pytest.mark.slow
 def test_an_edit_of_the_points_inside_a_rectangle_recolours_them_and_changes_the_picture(page):
     first = page.settled(drawn)
@@ -176,7 +165,7 @@ DROP = """([name, text]) => {
 }"""
 
 
-@needs_chromium
+@chromium_of.needed
 @pytest.mark.parametrize("way", ["button", "drop"])
 def test_a_file_is_opened_by_button_and_by_drop_and_a_bad_one_leaves_the_old(page, way):
     first = page.settled(drawn)
@@ -196,7 +185,7 @@ def test_a_file_is_opened_by_button_and_by_drop_and_a_bad_one_leaves_the_old(pag
     page.settled(lambda now: difference(half(now, 0), half(first, 0)) > 3)
 
 
-@needs_chromium
+@chromium_of.needed
 @pytest.mark.slow
 def test_a_path_is_recorded_played_and_saved_and_the_canvas_is_kept(page, tmp_path):
     start = page.settled(drawn)
@@ -219,7 +208,7 @@ def test_a_path_is_recorded_played_and_saved_and_the_canvas_is_kept(page, tmp_pa
             assert (picture.n_frames > 10) == (kind == "GIF")
 
 
-@needs_chromium
+@chromium_of.needed
 @pytest.mark.slow
 def test_two_browsers_have_their_own_camera_materials_and_file(chromium, running, page):
     first = page.settled(drawn)
