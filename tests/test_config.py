@@ -5,8 +5,10 @@ import json
 
 import pytest
 
-from spnr_jax.config import LossConfig, OptimizerConfig, TrainConfig, from_dict, to_dict
-from spnr_jax.model_config import METHODS, ModelConfig, NPBGConfig, PointNeRFConfig, SamplingConfig
+from spnr_jax.baselines.sizes import NPBGConfig, PointNeRFConfig
+from spnr_jax.config import LossConfig, OptimizerConfig, TrainConfig
+from spnr_jax.formats.config_json import BASELINES, OURS, from_dict, to_dict
+from spnr_jax.model_config import EncoderConfig, NearPointsConfig, PaperConfig, SamplingConfig
 from spnr_jax.presets import PRESETS, tiny
 
 
@@ -16,20 +18,20 @@ from spnr_jax.presets import PRESETS, tiny
         (SamplingConfig, "num_coarse", 0, "at least 1"),
         (SamplingConfig, "num_fine", -1, "at least 0"),
         (SamplingConfig, "padding", 0.0, "positive"),
-        (ModelConfig, "volume_resolution", 48, "multiple of 32"),
-        (ModelConfig, "volume_resolution", 0, "multiple of 32"),
-        (ModelConfig, "base_width", 12, "num_groups 8"),
-        (ModelConfig, "num_features", 2, "RGB"),
-        (ModelConfig, "materials", ("roughness", "roughness"), "distinct"),
-        (ModelConfig, "image_resolution", 100, "resize_resolution"),
-        (LossConfig, "l1_weight", -1.0, "negative"),
-        (LossConfig, "adversarial_weight", -0.1, "negative"),
+        (EncoderConfig, "volume_resolution", 48, "multiple of 32"),
+        (EncoderConfig, "volume_resolution", 0, "multiple of 32"),
+        (EncoderConfig, "base_width", 12, "num_groups 8"),
+        (PaperConfig, "num_features", 2, "RGB"),
+        (EncoderConfig, "materials", ("roughness", "roughness"), "distinct"),
+        (PaperConfig, "image_resolution", 100, "resize_resolution"),
+        (LossConfig, "l1_weight", -1.0, "at least 0"),
+        (LossConfig, "adversarial_weight", -0.1, "at least 0"),
         (LossConfig, "adversarial_start", 1.5, "share"),
         (LossConfig, "r1_interval", 0, "at least 1"),
         (OptimizerConfig, "lr_generator", 0.0, "positive"),
         (OptimizerConfig, "lr_discriminator", -1e-3, "positive"),
         (OptimizerConfig, "ema_decay", 1.0, "[0, 1)"),
-        (OptimizerConfig, "warmup_steps", -1, "negative"),
+        (OptimizerConfig, "warmup_steps", -1, "at least 0"),
         (TrainConfig, "num_steps", 0, "at least 1"),
         (TrainConfig, "batch_objects", 0, "at least 1"),
         (TrainConfig, "min_points", 5000, "max_points 4096"),
@@ -52,9 +54,9 @@ def test_a_wrong_number_names_the_field_what_came_and_what_is_possible(kind, fie
         (LossConfig, "condition", "true or false"),
         (OptimizerConfig, "algorithm", "radam"),
         (OptimizerConfig, "decay", "cosine"),
-        (ModelConfig, "scatter", "mean, max or trilinear"),
-        (ModelConfig, "skip", "add or concat"),
-        (ModelConfig, "sees_direction", "true or false"),
+        (EncoderConfig, "scatter", "mean, max or trilinear"),
+        (EncoderConfig, "skip", "add or concat"),
+        (PaperConfig, "sees_direction", "true or false"),
     ],
 )
 def test_an_unknown_word_names_the_known_ones(kind, field, known):
@@ -65,12 +67,12 @@ def test_an_unknown_word_names_the_known_ones(kind, field, known):
 
 
 def test_a_pointnet_of_very_many_layers_is_refused():
-    with pytest.raises(ValueError, match="point_widths must name at most 32 layers, got 33"):
-        ModelConfig(point_widths=(4,) * 33)
+    with pytest.raises(ValueError, match="point_widths must be at most 32 layers, got"):
+        EncoderConfig(point_widths=(4,) * 33)
 
 
 def test_an_unknown_material_names_the_known_ones():
-    config = ModelConfig()
+    config = EncoderConfig()
     object.__setattr__(config, "materials", ("colour",))  # the tests' type checker would be quicker than the config
     with pytest.raises(ValueError, match=r"materials.*base_color.*colour"):
         config.__post_init__()
@@ -93,7 +95,7 @@ class TestPresets:
 def test_paper_presets_have_the_papers_sizes(name):
     config = PRESETS[name]()
     model, counts = config.model, config.model.sampling
-    assert (model.point_widths, model.num_stages, model.render_resolution) == ((64, 128, 256), 5, 64)
+    assert (model.encoder.point_widths, model.encoder.num_stages, model.render_resolution) == ((64, 128, 256), 5, 64)
     assert (counts.num_coarse, counts.num_fine) == (64, 64)
     sizes = (model.resize_resolution, model.image_resolution)
     assert sizes == ((64, 128) if name == "abo" else (100, 200))
@@ -102,8 +104,10 @@ def test_paper_presets_have_the_papers_sizes(name):
 
 
 def test_a_larger_volume_and_a_wider_network_are_only_numbers():
-    config = dataclasses.replace(PRESETS["abo"](), model=ModelConfig(volume_resolution=128, base_width=32))
-    assert (config.model.volume_resolution, config.model.base_width) == (128, 32)
+    config = dataclasses.replace(
+        PRESETS["abo"](), model=PaperConfig(encoder=EncoderConfig(volume_resolution=128, base_width=32))
+    )
+    assert (config.model.encoder.volume_resolution, config.model.encoder.base_width) == (128, 32)
 
 
 class TestFromDict:
@@ -121,16 +125,16 @@ class TestFromDict:
 
     def test_a_wrong_number_from_a_file_is_refused_too(self):
         values = to_dict(TrainConfig())
-        values["model"]["volume_resolution"] = 33
+        values["model"]["encoder"]["volume_resolution"] = 33
         with pytest.raises(ValueError, match="volume_resolution"):
             from_dict(values)
 
 
 class TestMethods:
     def test_a_file_names_its_method_and_the_fields_are_those_of_that_method(self):
-        names = "tiny", "surfels", "npbg_tiny", "point_nerf_tiny", "points2nerf_tiny"
+        names = "surfels", "plus_tiny", "tiny", "npbg_tiny", "point_nerf_tiny", "points2nerf_tiny"
         methods = [to_dict(PRESETS[name]())["model"]["method"] for name in names]
-        assert methods == list(METHODS)
+        assert methods == [*OURS, *BASELINES]
         values = to_dict(PRESETS["npbg_tiny"]())
         values["model"]["radius"] = 0.1
         with pytest.raises(ValueError, match=r"unknown config field model\.radius.*encoder_widths"):
@@ -139,17 +143,14 @@ class TestMethods:
     def test_an_unknown_method_names_the_known_ones(self):
         values = to_dict(TrainConfig())
         values["model"]["method"] = "nerf"
-        with pytest.raises(ValueError, match=r"model\.method nerf is not one of ours, surfels, npbg"):
+        with pytest.raises(ValueError, match=r"model\.method nerf is not one of surfels, near_points, paper, npbg"):
             from_dict(values)
 
-    def test_a_file_from_before_there_were_baselines_is_read_as_ours(self):
+    def test_a_file_that_names_no_method_is_refused(self):
         values = to_dict(PRESETS["abo"]())
-        del values["model"]["method"], values["pixel_stride"]
-        del values["loss"]["pixel"], values["loss"]["masked"]
-        del values["optimizer"]["algorithm"], values["optimizer"]["decay"]
-        del values["loss"]["condition"]
-        del values["model"]["scatter"], values["model"]["skip"], values["model"]["sees_direction"]
-        assert from_dict(values) == PRESETS["abo"]()
+        del values["model"]["method"]
+        with pytest.raises(ValueError, match=r"model\.method None is not one of"):
+            from_dict(values)
 
     @pytest.mark.parametrize("name", [name for name in PRESETS if isinstance(PRESETS[name]().model, NPBGConfig)])
     def test_the_discriminator_judges_no_baseline(self, name):
@@ -170,13 +171,13 @@ def test_unknown_options_are_errors():
 
 
 def test_material_channels_are_counted_from_the_names():
-    assert ModelConfig().num_material_channels == 5
-    assert ModelConfig(materials=("roughness",)).num_material_channels == 1
-    assert ModelConfig(materials=()).num_material_channels == 0
+    assert EncoderConfig().num_material_channels == 5
+    assert EncoderConfig(materials=("roughness",)).num_material_channels == 1
+    assert EncoderConfig(materials=()).num_material_channels == 0
 
 
 def test_an_image_too_small_for_the_discriminator_is_named():
-    small = ModelConfig(render_resolution=8, resize_resolution=8, image_resolution=16)
+    small = PaperConfig(render_resolution=8, resize_resolution=8, image_resolution=16)
     with pytest.raises(ValueError, match="image_resolution 16 is too small"):
         TrainConfig(model=small)
     assert TrainConfig(model=small, loss=LossConfig(adversarial_weight=0.0)).model is small
@@ -185,12 +186,36 @@ def test_an_image_too_small_for_the_discriminator_is_named():
 @pytest.mark.parametrize(
     "change",
     [
-        {"num_stages": 2**62}, {"num_stages": 10**400}, {"num_groups": 0}, {"base_width": 16.0}, {"materials": [["a"]]},
-        {"sees_direction": 1}, {"precision": None}, {"point_widths": 8}, {"field_width": True},
-        {"sampling": 3}, {"image_resolution": -64},
+        {"field_width": True}, {"field_width": 16.0}, {"sees_direction": 1}, {"precision": None}, {"sampling": 3},
+        {"image_resolution": -64}, {"encoder": None},
     ],
 )  # fmt: skip
 def test_a_stored_value_of_another_type_or_size_is_refused(change):
     values = json.loads(json.dumps(to_dict(tiny())))
     with pytest.raises(ValueError, match=next(iter(change))):
         from_dict(values | {"model": values["model"] | change})
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"num_stages": 2**62}, {"num_stages": 10**400}, {"num_groups": 0}, {"base_width": 16.0}, {"materials": [["a"]]},
+        {"point_widths": 8},
+    ],
+)  # fmt: skip
+def test_so_is_one_of_the_encoder(change):
+    values = json.loads(json.dumps(to_dict(tiny())))
+    encoder = {"encoder": values["model"]["encoder"] | change}
+    with pytest.raises(ValueError, match=next(iter(change))):
+        from_dict(values | {"model": values["model"] | encoder})
+
+
+def test_a_number_that_is_not_finite_is_refused():
+    for number in (float("nan"), float("inf")):
+        with pytest.raises(ValueError, match="mse_weight must be a number, got"):
+            LossConfig(mse_weight=number)
+
+
+def test_a_network_near_points_has_no_sizes_of_the_paper_s_network():
+    with pytest.raises(TypeError, match="num_features"):
+        NearPointsConfig(num_features=16)

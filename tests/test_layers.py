@@ -185,6 +185,30 @@ def test_a_picture_needs_nothing_that_trains_or_compares():
     assert not loaded & {"spnr_jax.nn.discriminator", "spnr_jax.training.trainer", "spnr_jax.training.optimisation"}
 
 
+def own_code(names: set[str]) -> set[str]:
+    """Modules of the package that hold code: the __init__ of a folder holds a docstring."""
+    return {name for name in names if name.startswith("spnr_jax.") and MODULES[name].name != "__init__.py"}
+
+
+@pytest.mark.parametrize("name", ["small", "tiny"])
+def test_a_picture_of_rays_is_drawn_by_few_modules_and_by_one_network(name):
+    code = (
+        "import jax, numpy as np, spnr_jax; "
+        f"model = spnr_jax.load('{name}'); points = np.eye(3, dtype=np.float32); "
+        "cloud = spnr_jax.PointCloud(positions=points, base_color=points, roughness=points[0], metallic=points[0], "
+        "mask=np.ones(3, bool)); "
+        "jax.eval_shape(lambda: (lambda volume: model.render(volume, model.camera(volume, resolution=16)))"
+        "(model.encode(cloud)))"
+    )
+    loaded = own_code(modules_after(code))
+    reading = {"config", "formats.config_json", "formats.npz", "formats.text", "formats.images", "training.weights"}
+    drawing = loaded - {f"spnr_jax.{part}" for part in reading}
+    assert len(drawing) <= 25, sorted(drawing)
+    assert "spnr_jax.method.near_points" in drawing
+    assert not drawing & {f"spnr_jax.method.{other}" for other in ("paper", "surfel_renderer")}
+    assert not {part for part in drawing if part.split(".")[1] in ("surfels", "baselines", "training", "scoring")}
+
+
 @pytest.mark.parametrize("name", ["cameras", "sampling", "compositing", "voxels", "losses", "metrics"])
 def test_the_kernels_of_the_specification_are_one_module_under_both_names(name):
     code = (

@@ -11,7 +11,6 @@ from support.laws import close, same_bits
 from support.tiny_model import PLUS
 
 from experiments.packaged import refinement
-from spnr_jax import presets
 from spnr_jax.config import LossConfig
 from spnr_jax.formats import data_sets
 from spnr_jax.kernels import cloud_arrays
@@ -23,10 +22,10 @@ from spnr_jax.training.weights import Trained
 SIZE = tiny_dataset.CONFIG.model.image_resolution
 PLAIN = dataclasses.replace(
     tiny_dataset.CONFIG,
-    model=dataclasses.replace(PLUS, render_resolution=SIZE, image_resolution=SIZE),
+    model=dataclasses.replace(PLUS, image_resolution=SIZE),
     loss=LossConfig(l1_weight=1.0, mse_weight=1.0, adversarial_weight=0.0),
 )
-CONFIG = dataclasses.replace(presets.with_refiner(PLAIN), num_steps=40)
+CONFIG = dataclasses.replace(refinement.with_refiner(PLAIN), num_steps=40)
 
 
 @pytest.fixture(scope="module")

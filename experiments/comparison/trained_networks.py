@@ -11,7 +11,6 @@ from pathlib import Path
 from spnr_jax.config import TrainConfig
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
-from spnr_jax.model_config import kind_of
 from spnr_jax.scoring import evaluation
 from spnr_jax.scoring.report import METHODS
 from spnr_jax.training import weights
@@ -90,7 +89,7 @@ def load(run: Path, dataset: data_sets.Dataset) -> Network:
     place = weights.place(run)
     described = place if place.is_file() else place / "config.json"
     return Network(
-        method=kind_of(config.model),
+        method=config.model.method,
         config=config,
         variables=trained.variables,
         steps=trained.steps,

@@ -28,6 +28,7 @@ from spnr_jax import cli, presets
 from spnr_jax.config import TrainConfig
 from spnr_jax.formats import data_sets as data
 from spnr_jax.formats.images import write_whole
+from spnr_jax.model_config import NearPointsConfig, surface_grid
 from spnr_jax.scoring import evaluation
 from spnr_jax.scoring.results import text_table, write_results
 from spnr_jax.training import trainer, weights
@@ -93,7 +94,7 @@ def recipe(options: Pretrain) -> list[TrainConfig]:
     if options.network == "tiny":
         runs = [presets.plus_lite()]
     else:
-        first = presets.packaged(presets.plus_small(), presets.PACKAGE_SAMPLES)
+        first = packaged(presets.plus_small())
         runs = [
             first,
             later(first, steps=9000, seed=first.seed + 1, lr=1.5e-3),
@@ -103,10 +104,22 @@ def recipe(options: Pretrain) -> list[TrainConfig]:
     return runs if options.steps is None else [dataclasses.replace(run, num_steps=options.steps) for run in runs]
 
 
+def packaged(config: TrainConfig) -> TrainConfig:
+    """The config of a network near points with the samples of the package's `small`, seeing the view direction."""
+    assert isinstance(config.model, NearPointsConfig)
+    sampling = presets.near(16)
+    return dataclasses.replace(config, model=dataclasses.replace(config.model, sampling=sampling, sees_direction=True))
+
+
 def later(config: TrainConfig, steps: int, seed: int, lr: float) -> TrainConfig:
     """The config of a run after the first: few and many points, other batches, a lower learning rate."""
+    assert isinstance(config.model, NearPointsConfig)
+    most = presets.plus_refined().max_points
     return dataclasses.replace(
-        presets.of_any_density(config),
+        config,
+        model=dataclasses.replace(config.model, surface_cells=surface_grid(most)),
+        min_points=presets.plus_refined().min_points,
+        max_points=most,
         optimizer=dataclasses.replace(config.optimizer, lr_generator=lr),
         num_steps=steps,
         seed=seed,

@@ -34,8 +34,9 @@ from spnr_jax.kernels import cameras, cloud_arrays, losses
 from spnr_jax.kernels.colors import LEAST_OPACITY
 from spnr_jax.kernels.records import Camera, PointCloud
 from spnr_jax.kernels.resizing import mean_of_squares
-from spnr_jax.method.renderer import Renderer
-from spnr_jax.model_config import ModelConfig
+from spnr_jax.method import inference
+from spnr_jax.method.march import trace
+from spnr_jax.model_config import AS_TRAINED, NearPointsConfig
 from spnr_jax.nn.refiner import Refiner
 from spnr_jax.training import batching, optimisation
 from spnr_jax.training.weights import Trained
@@ -51,7 +52,7 @@ LEAST_DEVIATION = 1e-3
 
 def refined(trained: Trained, dataset: data_sets.Dataset, folder: Path, steps: int | None = None) -> Trained:
     """The network with a refiner, trained on pictures of the training objects, for the preset's steps by default."""
-    config = presets.with_refiner(trained.config)
+    config = with_refiner(trained.config)
     config = dataclasses.replace(config, num_steps=steps or config.num_steps)
     batching.check_spread(dataset, config)
     numbers = b"".join(np.asarray(x).tobytes() for x in jax.tree.leaves(trained.variables))
@@ -65,6 +66,25 @@ def refined(trained: Trained, dataset: data_sets.Dataset, folder: Path, steps: i
     weights = train(config, pictures)
     params = trained.variables["params"] | {"refiner": jax.device_get(weights)}
     return Trained(config=config, variables=trained.variables | {"params": params}, steps=config.num_steps)
+
+
+def with_refiner(config: TrainConfig) -> TrainConfig:
+    """The config of a network near points with a refiner, trained as the preset of the package's network."""
+    assert isinstance(config.model, NearPointsConfig)
+    preset = presets.plus_refined()
+    assert isinstance(preset.model, NearPointsConfig)
+    loss = dataclasses.replace(
+        config.loss, mse_weight=preset.loss.mse_weight, opacity_weight=preset.loss.opacity_weight
+    )
+    return dataclasses.replace(
+        config,
+        preset=preset.preset,
+        model=dataclasses.replace(config.model, refiner_width=preset.model.refiner_width),
+        loss=loss,
+        num_steps=preset.num_steps,
+        pixel_stride=1,
+        crop=config.model.image_resolution // 2,
+    )
 
 
 def keep(place: Path, variables: dict, config: TrainConfig, item: data_sets.ObjectData) -> None:
@@ -81,16 +101,16 @@ def keep(place: Path, variables: dict, config: TrainConfig, item: data_sets.Obje
 
 @partial(jax.jit, static_argnames="config")
 def rendered(
-    variables: dict, cloud: PointCloud, camera: Camera, *, config: ModelConfig
+    variables: dict, cloud: PointCloud, camera: Camera, *, config: NearPointsConfig
 ) -> Float[Array, "views height width features"]:
     """What the refiner sees of the views of one object at the size of its training."""
     cloud, camera = jax.tree.map(lambda x: jnp.asarray(x)[None], (cloud, camera))
     size = config.image_resolution
     camera = cameras.resize(camera, size, size)
-    renderer = Renderer(config).bind(variables)
-    outputs = renderer.render_rays(renderer.encode(cloud), renderer.rays(camera))
-    features, depth, acc = (x.reshape(-1, size, size, *x.shape[2:]) for x in outputs)
-    return renderer.seen(camera, features, depth, acc)
+    module = inference.network(config).bind(variables)
+    traced = trace(module, module.encode(cloud), module.rays(camera), config.sampling, AS_TRAINED, None)
+    pictures = jax.tree.map(lambda x: x.reshape(-1, size, size, *x.shape[2:]), traced)
+    return module.looked_over(camera, pictures)
 
 
 def read(place: Path) -> Iterator[tuple[np.ndarray, np.ndarray]]:
@@ -105,7 +125,7 @@ def read(place: Path) -> Iterator[tuple[np.ndarray, np.ndarray]]:
 
 def train(config: TrainConfig, pictures: list[tuple[np.ndarray, np.ndarray]]) -> dict:
     """Averaged weights of a refiner after the config's steps on (seen, reference) of views."""
-    assert isinstance(config.model, ModelConfig)
+    assert isinstance(config.model, NearPointsConfig)
     refiner = Refiner(config.model.refiner_width)
     generator = np.random.default_rng(config.seed)
     weights = start(refiner, pictures)

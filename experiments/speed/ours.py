@@ -18,7 +18,7 @@ from spnr_jax.devices import allocator
 from spnr_jax.errors import UserError
 from spnr_jax.kernels.records import Batch
 from spnr_jax.method import inference
-from spnr_jax.model_config import ModelConfig
+from spnr_jax.model_config import RayNetworkConfig
 from spnr_jax.presets import PRESETS
 from spnr_jax.training import optimisation
 
@@ -52,7 +52,7 @@ def make(spec: dict) -> tuple[Callable[[], object], dict]:
 def twin_sized(preset: str, mode: str = "train", objects: int = 1) -> TrainConfig:
     """The preset with the sizes of the twin, without R1; "train_l1" has no discriminator."""
     config = PRESETS[preset]()
-    assert isinstance(config.model, ModelConfig)
+    assert isinstance(config.model, RayNetworkConfig)
     loss = dataclasses.replace(
         config.loss,
         adversarial_weight=0.0 if mode == "train_l1" else 1.0,
@@ -62,7 +62,9 @@ def twin_sized(preset: str, mode: str = "train", objects: int = 1) -> TrainConfi
     )
     return dataclasses.replace(
         config,
-        model=dataclasses.replace(config.model, num_groups=NUM_GROUPS),
+        model=dataclasses.replace(
+            config.model, encoder=dataclasses.replace(config.model.encoder, num_groups=NUM_GROUPS)
+        ),
         loss=loss,
         batch_objects=objects,
         views_per_object=1,
@@ -73,7 +75,7 @@ def twin_sized(preset: str, mode: str = "train", objects: int = 1) -> TrainConfi
 
 def near_points(config: TrainConfig) -> TrainConfig:
     """The config that evaluates the field near points alone."""
-    assert isinstance(config.model, ModelConfig)
+    assert isinstance(config.model, RayNetworkConfig)
     coarse, fine = NEAR_POINTS[config.preset]
     sampling = dataclasses.replace(config.model.sampling, num_coarse=coarse, num_fine=fine, reach=1)
     return dataclasses.replace(config, model=dataclasses.replace(config.model, sampling=sampling))

@@ -31,7 +31,7 @@ from spnr_jax.config import TrainConfig
 from spnr_jax.devices import machine
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.records import Batch
-from spnr_jax.model_config import ModelConfig
+from spnr_jax.model_config import RayNetworkConfig
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,14 +69,15 @@ def with_pixels(config: TrainConfig, size: int) -> tuple[TrainConfig, Batch]:
 
 def with_volume(config: TrainConfig, resolution: int) -> tuple[TrainConfig, Batch]:
     """Volumes of so many voxels along each side."""
-    assert isinstance(config.model, ModelConfig)
-    model = dataclasses.replace(config.model, volume_resolution=resolution)
+    assert isinstance(config.model, RayNetworkConfig)
+    encoder = dataclasses.replace(config.model.encoder, volume_resolution=resolution)
+    model = dataclasses.replace(config.model, encoder=encoder)
     return dataclasses.replace(config, model=model), ours.batch(config)
 
 
 def with_samples(config: TrainConfig, count: int) -> tuple[TrainConfig, Batch]:
     """So many samples on each ray, half of them coarse."""
-    assert isinstance(config.model, ModelConfig)
+    assert isinstance(config.model, RayNetworkConfig)
     sampling = dataclasses.replace(config.model.sampling, num_coarse=count // 2, num_fine=count // 2)
     model = dataclasses.replace(config.model, sampling=sampling)
     return dataclasses.replace(config, model=model), ours.batch(config)

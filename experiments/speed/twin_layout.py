@@ -12,7 +12,7 @@ import numpy as np
 
 from spnr_jax.config import LossConfig, OptimizerConfig, TrainConfig
 from spnr_jax.kernels.records import Batch, Camera, PointCloud
-from spnr_jax.model_config import ModelConfig, SamplingConfig
+from spnr_jax.model_config import EncoderConfig, PaperConfig, SamplingConfig
 
 Arrays = Mapping[str, np.ndarray]
 
@@ -20,13 +20,16 @@ Arrays = Mapping[str, np.ndarray]
 def train_config(arrays: Arrays) -> TrainConfig:
     """The config with all sizes that "meta" names."""
     c = json.loads(str(arrays["meta"]))["config"]
-    model = ModelConfig(
+    encoder = EncoderConfig(
         point_widths=tuple(c["point_widths"]),
         point_features=c["point_features"],
         volume_resolution=c["grid"],
         base_width=c["base"],
         num_stages=c["stages"],
         num_groups=c["groups"],
+    )
+    model = PaperConfig(
+        encoder=encoder,
         field_width=c["field_hidden"],
         num_features=c["features"],
         direction_frequencies=c["dir_freqs"],
@@ -116,8 +119,8 @@ def generator(arrays: Arrays, prefix: str = "param/gen.") -> tuple[dict, dict]:
     }
     upsampler = {f"kernel_{i}": _conv(get[f"upsampler.conv{i}.weight"]) for i in range(4)}
     upsampler |= {f"bias_{i}": get[f"upsampler.conv{i}.bias"] for i in range(4)}
-    params = {"pointnet": pointnet, "unet": unet, "field": field, "upsampler": upsampler}
-    return params, {"pointnet": stats}
+    params = {"encoder": {"pointnet": pointnet, "unet": unet}, "field": field, "upsampler": upsampler}
+    return params, {"encoder": {"pointnet": stats}}
 
 
 def discriminator(arrays: Arrays, prefix: str = "param/disc.") -> dict:

@@ -31,7 +31,7 @@ from spnr_jax import cli, presets
 from spnr_jax.config import LossConfig, TrainConfig
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
-from spnr_jax.model_config import ModelConfig, SamplingConfig
+from spnr_jax.model_config import EncoderConfig, NearPointsConfig, PaperConfig, RayNetworkConfig, SamplingConfig
 
 REFERENCE = "reference"
 LABELS = {
@@ -141,7 +141,7 @@ def paper_network(config: TrainConfig) -> TrainConfig:
     made = {"plus_tiny": presets.tiny, "plus_abo": presets.abo, "plus_shapenet": presets.shapenet_car}
     if config.preset == "plus_small":  # tiny's sizes, pictures twice as large
         tiny = presets.tiny()
-        assert isinstance(tiny.model, ModelConfig)
+        assert isinstance(tiny.model, PaperConfig)
         model = dataclasses.replace(tiny.model, render_resolution=64, resize_resolution=64, image_resolution=128)
         paper = dataclasses.replace(tiny, model=model)
     else:
@@ -153,16 +153,27 @@ def changed(row: Row, config: TrainConfig) -> TrainConfig:
     """The config with the one change of a row."""
     if row == "paper":
         return paper_network(config)
-    assert isinstance(config.model, ModelConfig)
+    assert isinstance(config.model, RayNetworkConfig)
     return dataclasses.replace(
         config,
-        model=dataclasses.replace(config.model, **model_changes(config.model).get(row, {})),
+        model=changed_model(row, config.model),
         loss=dataclasses.replace(config.loss, **loss_changes(config.loss).get(row, {})),
         **recipe_changes(config).get(row, {}),
     )
 
 
-def model_changes(model: ModelConfig) -> dict[str, dict]:
+def changed_model(row: Row, model: RayNetworkConfig) -> RayNetworkConfig:
+    """The network with the one change of a row; without neighbours it is the paper's, its samples near the points."""
+    if row == "no_neighbours" and isinstance(model, NearPointsConfig):
+        shared = {f.name: getattr(model, f.name) for f in dataclasses.fields(RayNetworkConfig)}
+        return PaperConfig(**shared, render_resolution=model.image_resolution)
+    fields = model_changes(model).get(row, {})
+    inner = {f.name: fields[f.name] for f in dataclasses.fields(EncoderConfig) if f.name in fields}
+    outer = {name: value for name, value in fields.items() if name not in inner}
+    return dataclasses.replace(model, **outer, encoder=dataclasses.replace(model.encoder, **inner))
+
+
+def model_changes(model: RayNetworkConfig) -> dict[str, dict]:
     """The fields of a network that rows change."""
     samples = model.sampling
     changes: dict[str, dict] = {
@@ -179,10 +190,9 @@ def model_changes(model: ModelConfig) -> dict[str, dict]:
         "half_samples": {"sampling": scaled(samples, 0.5)},
         "twice_samples": {"sampling": scaled(samples, 2)},
     }
-    if model.num_neighbors:
+    if isinstance(model, NearPointsConfig):
         changes |= {
             "free_colour": {"color": "free"},
-            "no_neighbours": {"color": "free", "num_neighbors": 0, "num_features": ModelConfig.num_features},
             "three_neighbours": {"num_neighbors": 3},
             "twelve_neighbours": {"num_neighbors": 12},
         }

@@ -38,9 +38,8 @@ from spnr_jax import cli
 from spnr_jax.config import TrainConfig
 from spnr_jax.devices import machine
 from spnr_jax.formats import data_sets
-from spnr_jax.kernels.supersampling import rays_per_side
 from spnr_jax.method import inference
-from spnr_jax.model_config import ModelConfig, SamplingConfig
+from spnr_jax.model_config import PaperConfig, RayNetworkConfig, SamplingConfig
 from spnr_jax.scoring import evaluation
 from spnr_jax.training import checkpoint, optimisation
 
@@ -85,7 +84,7 @@ class Setting:
 def settings(config: TrainConfig) -> list[Setting]:
     """Every way to render a network, the trained one first."""
     model = config.model
-    assert isinstance(model, ModelConfig)
+    assert isinstance(model, RayNetworkConfig)
 
     def variant(group: str, name: str, points: int = config.test_points, **fields) -> Setting:
         changed = dataclasses.replace(config, test_points=points, model=dataclasses.replace(model, **fields))
@@ -96,21 +95,17 @@ def settings(config: TrainConfig) -> list[Setting]:
 
     total = model.sampling.num_coarse + model.sampling.num_fine
     halves = [max(total // k, 2) for k in (1, 2, 4)]
-    if model.num_neighbors:
+    if model.sampling.reach:
         anywhere, near = [], [(n, model.sampling.reach) for n in (2 * total, 3 * total // 4, *halves[1:])]
     else:
         anywhere = [(n // 2, n // 2) for n in (2 * total, *halves[1:])] + [(n, 0) for n in halves[:2]]
         near = [(n, reach) for reach in (1, 2, 3) for n in (*halves, total // 8 + 1)]
-    size = model.render_resolution
+    size = model.render_resolution if isinstance(model, PaperConfig) and model.upsamples else 0
     ways = [
         variant("trained", "as trained"),
         *(variant("samples", f"{coarse} + {fine}", sampling=samples(coarse, fine)) for coarse, fine in anywhere),
         *(variant("near points", f"{n} within {reach}", sampling=samples(n, reach=reach)) for n, reach in near),
-        *(
-            variant("rays", f"{n} x {n} rays", render_resolution=n)
-            for n in (size // 2, size * 3 // 4)
-            if model.upsamples
-        ),
+        *(variant("rays", f"{n} x {n} rays", render_resolution=n) for n in (size // 2, size * 3 // 4) if size),
         variant("bfloat16", "bfloat16", precision="bfloat16"),
         *(variant("points", f"{n} points", points=n) for n in (256, 512, 2048, 4096)),
     ]
@@ -158,7 +153,9 @@ def measure(
         camera = jax.tree.map(lambda x: jnp.asarray(x)[None, :1], item.camera)
         encodes.append(fastest(lambda c=cloud: inference.jitted_encode(variables, c, config=model)))
         scene = inference.jitted_encode(variables, cloud, config=model)
-        render = partial(inference.jitted_render, config=model, rays_per_side=rays_per_side(model, item.camera.width))
+        side = inference.rays_per_side(model, item.camera.width)
+        options = dataclasses.replace(inference.trained(model), rays_per_side=side)
+        render = partial(inference.jitted_render, config=model, options=options)
         views.append(fastest(partial(render, variables, scene, camera)))
     analysis = inference.jitted_render.lower(variables, scene, camera, **render.keywords).compile().memory_analysis()
     memory = analysis.temp_size_in_bytes / 2**20 if analysis else float("nan")

@@ -16,11 +16,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from spnr_jax.baselines.sizes import NPBGConfig
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.numerics import per_feature
 from spnr_jax.kernels.records import Camera, Key, PointCloud, Rendering
 from spnr_jax.kernels.resizing import bilinear
-from spnr_jax.model_config import NPBGConfig
+from spnr_jax.model_config import RenderOptions
 from spnr_jax.nn.convolution import conv
 
 
@@ -129,8 +130,8 @@ class NPBG(nn.Module):
         """The cloud."""
         return cloud
 
-    def render(self, cloud: PointCloud, camera: Camera, key: Key | None = None) -> Rendering:
-        """Views of each cloud; nothing is random."""
+    def render(self, cloud: PointCloud, camera: Camera, options: RenderOptions | None = None) -> Rendering:
+        """Views of each cloud; nothing is random, and there is nothing to choose."""
         scales = range(len(self.config.encoder_widths))
         rasters, distances = zip(*(self.rasters(cloud, camera, 2**i) for i in scales), strict=True)
         flat = [x.reshape(-1, *x.shape[2:]) for x in rasters]
@@ -154,7 +155,7 @@ class NPBG(nn.Module):
 
     def __call__(self, cloud: PointCloud, camera: Camera, key: Key | None = None, train: bool = False) -> Rendering:
         """Views of each cloud from its cameras."""
-        return self.render(self.encode(cloud, train), camera, key)
+        return self.render(self.encode(cloud, train), camera)
 
 
 def _rays(camera):

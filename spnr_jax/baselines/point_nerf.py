@@ -22,12 +22,14 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
+from spnr_jax.baselines import ray_chunks
+from spnr_jax.baselines.sizes import PointNeRFConfig
 from spnr_jax.devices.placement import on_own_rays
 from spnr_jax.kernels import cameras, compositing, sampling
 from spnr_jax.kernels.numerics import length, per_feature, softplus
 from spnr_jax.kernels.occupancy import map_existing
 from spnr_jax.kernels.records import Camera, Key, PointCloud, Rays, Rendering
-from spnr_jax.model_config import MATERIAL_CHANNELS, PointNeRFConfig
+from spnr_jax.model_config import MATERIAL_CHANNELS, RenderOptions
 
 BLOCK = 1024  # shading points at once: 8 MB for a layer of 256 with 8 neighbours
 SLOPE, GAIN = 0.01, math.sqrt(2 / (1 + 0.01**2))  # of the leaky ReLU, and what it asks of the weights before it
@@ -218,17 +220,13 @@ class PointNeRF(nn.Module):
         cloud = jax.tree.map(jnp.asarray, cloud)
         return on_own_rays(own, self.weights, *jax.lax.stop_gradient((cloud, (view, distances, far, hit))))
 
-    def develop(self, camera: Camera, rgb: Array, depth: Array, acc: Array) -> Rendering:
-        """Images from the rays of `rays`."""
-        return cameras.as_images(camera, rgb, depth, acc)
-
-    def render(self, cloud: PointCloud, camera: Camera, key: Key | None = None) -> Rendering:
-        """Views of each cloud.  A key moves the candidates (training)."""
-        return self.develop(camera, *self.render_rays(cloud, self.rays(camera), key))
+    def render(self, cloud: PointCloud, camera: Camera, options: RenderOptions | None = None) -> Rendering:
+        """Views of each cloud, some rays at a time; there is nothing to choose."""
+        return ray_chunks.render(self, cloud, camera, self.config.ray_chunk)
 
     def __call__(self, cloud: PointCloud, camera: Camera, key: Key | None = None, train: bool = False) -> Rendering:
-        """Views of each cloud from its cameras."""
-        return self.render(self.encode(cloud, train), camera, key)
+        """Views of each cloud from its cameras, all rays at once.  A key moves the candidates (training)."""
+        return cameras.as_images(camera, *self.render_rays(self.encode(cloud, train), self.rays(camera), key))
 
 
 def render_object(

@@ -26,11 +26,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from spnr_jax.baselines import ray_chunks
+from spnr_jax.baselines.sizes import Points2NeRFConfig
 from spnr_jax.errors import UserError
 from spnr_jax.kernels import cameras, compositing, sampling
 from spnr_jax.kernels.numerics import per_feature, softplus
 from spnr_jax.kernels.records import Camera, Key, PointCloud, Rays, Rendering
-from spnr_jax.model_config import Points2NeRFConfig
+from spnr_jax.model_config import RenderOptions
 from spnr_jax.nn.encoding import encode_direction
 
 PAINTED = 1e10  # length of a ray's last interval in faithful mode
@@ -185,17 +187,17 @@ class Points2NeRF(nn.Module):
         """Each object's NeRF from the mean of its code."""
         return self.weights(self.code(cloud)[0])
 
-    def render(self, weights: Weights, camera: Camera, key: Key | None = None) -> Rendering:
-        """Views of encoded objects; a key jitters the samples (training)."""
-        return self.develop(camera, *self.render_rays(weights, self.rays(camera), key))
+    def render(self, weights: Weights, camera: Camera, options: RenderOptions | None = None) -> Rendering:
+        """Views of encoded objects, some rays at a time; there is nothing to choose."""
+        return ray_chunks.render(self, weights, camera, self.config.ray_chunk)
+
+    def whole(self, weights: Weights, camera: Camera, key: Key | None) -> Rendering:
+        """Views of encoded objects, all rays at once; a key jitters the samples (training)."""
+        return cameras.as_images(camera, *self.render_rays(weights, self.rays(camera), key))
 
     def rays(self, camera: Camera) -> Rays:
         """Rays of all views of an object in one axis, (objects, views * height * width, 3)."""
         return cameras.view_rays(camera)
-
-    def develop(self, camera: Camera, rgb: Array, depth: Array, acc: Array) -> Rendering:
-        """Images from the rays of `rays`."""
-        return cameras.as_images(camera, rgb, depth, acc)
 
     def render_rays(
         self, weights: Weights, rays: Rays, key: Key | None = None
@@ -216,11 +218,11 @@ class Points2NeRF(nn.Module):
         """Views of each cloud from its cameras; training draws the codes with the key and adds the KL term."""
         mean, log_scale = self.code(cloud)
         if not train:
-            return self.render(self.weights(mean), camera, key)
+            return self.whole(self.weights(mean), camera, key)
         if key is None:
             raise UserError("training draws a code for each object: give a key")
         mode = self.config.mode
         self.sow("losses", "kl", self.config.kl_weight * jnp.mean(kl_divergence(mode, mean, log_scale)))
         code_key, key = jax.random.split(key)
         code = mean + code_scale(mode, log_scale) * jax.random.normal(code_key, mean.shape)
-        return self.render(self.weights(code), camera, key)
+        return self.whole(self.weights(code), camera, key)

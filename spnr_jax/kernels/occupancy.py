@@ -44,26 +44,34 @@ def open_path(
     near: Float[Array, "*batch"],
     far: Float[Array, "*batch"],
     num_cells: int,
+    objects: Int[Array, "*batch"] | None = None,
 ) -> Path:
     """Cells between near and far; the first axes of the rays are the objects of `near_points`.  No gradient.
 
-    A cell is as open as the voxel of its middle; on a face between two voxels, rounding decides which.
+    With `objects`, which says to which object each ray belongs, the rays have any axes.  A cell is as open as the voxel
+    of its middle; on a face between two voxels, rounding decides which.
     """
-    if near_points.ndim > 3:
+    if near_points.ndim > 3 and objects is None:
         return jax.vmap(partial(open_path, num_cells=num_cells))(near_points, rays, near, far)
     near, far = near[..., None], far[..., None]
     fractions = jnp.arange(num_cells + 1, dtype=near.dtype).reshape(*[1] * (near.ndim - 1), -1) / num_cells
     edges = near + (far - near) * fractions
     middles = 0.5 * (edges[..., 1:] + edges[..., :-1])
-    resolution = near_points.shape[0]
+    resolution = near_points.shape[-1]
     # an axis at a time: the voxels of all cells are then found in one loop
     x, y, z = (
         voxel_of(rays.origins[..., i, None] + middles * rays.directions[..., i, None], resolution) for i in range(3)
     )
-    is_open = gather_rows(near_points.reshape(-1, 1).astype(near.dtype), row_at(x, y, z, resolution))[..., 0]
+    first = 0 if objects is None else objects[..., None] * resolution**3
+    is_open = gather_rows(near_points.reshape(-1, 1).astype(near.dtype), first + row_at(x, y, z, resolution))[..., 0]
     # equal cells are counted, in a product: a running sum takes a CPU longer, docs/performance.md
     count = is_open @ jnp.triu(jnp.ones((num_cells, num_cells + 1), near.dtype), 1)
     return jax.lax.stop_gradient(Path(edges=edges, travelled=count * ((far - near) / num_cells)))
+
+
+def whole_path(near: Float[Array, "*batch"], far: Float[Array, "*batch"]) -> Path:
+    """All of the ray between near and far, as one open cell."""
+    return Path(edges=jnp.stack([near, far], axis=-1), travelled=jnp.stack([jnp.zeros_like(near), far - near], axis=-1))
 
 
 def distance_at(path: Path, travelled: Float[Array, "*batch samples"]) -> Float[Array, "*batch samples"]:
@@ -72,6 +80,8 @@ def distance_at(path: Path, travelled: Float[Array, "*batch samples"]) -> Float[
     What exceeds the open length of the ray ends at the last edge.
     """
     ends = path.travelled[..., 1:]
+    if ends.shape[-1] == 1:
+        return jnp.clip(path.edges[..., :1] + travelled, path.edges[..., :1], path.edges[..., 1:])
     index = jnp.minimum(sampling.count_at_most(ends, travelled, strictly=True), ends.shape[-1] - 1)
     start, behind = (jnp.take_along_axis(x[..., :-1], index, axis=-1) for x in (path.edges, path.travelled))
     end = jnp.take_along_axis(path.edges[..., 1:], index, axis=-1)

@@ -4,6 +4,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from spnr_jax.kernels.colors import over, srgb_to_linear, unweighted
+from spnr_jax.kernels.compositing import WHITE
+from spnr_jax.kernels.records import Rendering
+
 
 def bilinear(
     x: Float[Array, "batch height width features"], height: int, width: int
@@ -34,3 +38,15 @@ def squares(x: Float[Array, "*batch height width features"], side: int) -> Array
     """The picture cut into squares of side x side pixels, (*batch, h, side, w, side, features)."""
     *batch, height, width, features = x.shape
     return x.reshape(*batch, height // side, side, width // side, side, features)
+
+
+def averaged(rendering: Rendering, side: int) -> Rendering:
+    """The rendering with every square of side x side pixels averaged: the light of the object, its opacity, the depth.
+
+    Colours are averaged as linear light of the object alone and laid on white as sRGB, as the references are.
+    """
+    opacity, depth = rendering.acc[..., None], rendering.depth[..., None]
+    straight = unweighted(rendering.image - (1 - opacity) * WHITE, opacity)
+    light, depth, acc = (mean_of_squares(x, side) for x in (opacity * srgb_to_linear(straight), depth, opacity))
+    image = over(light, acc, WHITE)
+    return Rendering(image=image, image_lr=image, depth=depth[..., 0], acc=acc[..., 0])

@@ -1,39 +1,50 @@
-"""What a trained network is asked for: scenes of clouds, and views of scenes, in chunks of rays that bound the memory.
+"""What a trained network is asked for: scenes of clouds, and views of scenes.
 
-The config of a network finds its module (`network`): any with `encode`, `render` and `develop`.  One that renders rays
-each by itself has `rays` and `render_rays`; the others, whose `ray_chunk` is None, render whole images.
+The config of a network finds its module (`network`): any Linen module with `encode(cloud, train)` and
+`render(scene, camera, options)`.  A network is imported when it is first asked for, and no other with it.  The network
+over surfels, whose sizes are counted before they are compiled, is a module of functions beside these.
 """
 
+import dataclasses
 from collections.abc import Sequence
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from spnr_jax.devices.placement import by_all_devices, on_own_rays
-from spnr_jax.kernels import cameras, supersampling
+from spnr_jax.devices.placement import by_all_devices
+from spnr_jax.kernels import cameras
 from spnr_jax.kernels.records import Camera, Key, Light, PointCloud, Rendering
-from spnr_jax.method import surfel_renderer
-from spnr_jax.method.renderer import Renderer
-from spnr_jax.model_config import ModelConfig, NetworkConfig, SurfelConfig
-from spnr_jax.surfels.lighting import room_light
+from spnr_jax.kernels.resizing import averaged
+from spnr_jax.model_config import NearPointsConfig, NetworkConfig, PaperConfig, RenderOptions, SurfelConfig
+
+WHOLE_BLOCK = 1024  # rays that are sampled through all the box at once: about 80 MB at 128 samples
 
 
 def network(config: NetworkConfig) -> nn.Module:
     """The module that a network's config describes."""
-    if isinstance(config, ModelConfig):
-        return Renderer(config)
-    from spnr_jax.baselines.networks import NETWORKS  # here: our own network is drawn without them
+    match config.method:
+        case "paper":
+            from spnr_jax.method.paper import PaperNetwork
 
-    return NETWORKS[type(config)](config)
+            return PaperNetwork(cast(PaperConfig, config))
+        case "near_points":
+            from spnr_jax.method.near_points import NearPointsNetwork
+
+            return NearPointsNetwork(cast(NearPointsConfig, config))
+    from spnr_jax.baselines.networks import NETWORKS
+
+    return NETWORKS[config.method](config)
 
 
 def init(key: Key, config: NetworkConfig) -> dict:
     """Fresh variables of a config's network."""
-    if isinstance(config, SurfelConfig):
-        return surfel_renderer.init(key, config)
+    if config.method == "surfels":
+        from spnr_jax.method import surfel_renderer
+
+        return surfel_renderer.init(key, cast(SurfelConfig, config))
     return dict(network(config).init(key, *example_inputs(config)))
 
 
@@ -54,51 +65,38 @@ def encode(variables: dict, cloud: PointCloud, *, config: NetworkConfig) -> Any:
 
 
 def render(
-    variables: dict,
-    scene: Any,
-    camera: Camera,
-    *,
-    config: NetworkConfig,
-    ray_chunk: int | None = None,
-    rays_per_side: int = 1,
+    variables: dict, scene: Any, camera: Camera, *, config: NetworkConfig, options: RenderOptions | None = None
 ) -> Rendering:
     """Views of encoded scenes, samples at the middles of their strata, rays_per_side^2 rays a pixel averaged.
 
-    So many rays of each object (the network's own number by default) are rendered at a time, which bounds the memory.
-    On a CPU a pixel of one object of ours has the same bits for every chunk from 256 to 2048 rays, whatever is rendered
-    beside it: the matrix products then add up in one order.
+    On a CPU a pixel of one object of the paper's network has the same bits for every block from 256 to 2048 rays: the
+    matrix products then add up in one order.
     """
-    if rays_per_side > 1:
-        wide = cameras.resize(camera, rays_per_side * camera.height, rays_per_side * camera.width)
-        rendering = render(variables, scene, wide, config=config, ray_chunk=ray_chunk)
-        return supersampling.averaged(rendering, rays_per_side)
-    module = network(config)
-    if (ray_chunk := ray_chunk or config.ray_chunk) is None:
-        return module.bind(variables).render(scene, camera)
-    in_chunks = partial(_in_chunks, module, ray_chunk)
-    outputs = on_own_rays(in_chunks, variables, scene, module.rays(camera))
-    return module.bind(variables).develop(camera, *outputs)
+    options = options or trained(config)
+    if (side := options.rays_per_side) > 1:
+        wide = cameras.resize(camera, side * camera.height, side * camera.width)
+        narrow = dataclasses.replace(options, rays_per_side=1)
+        return averaged(render(variables, scene, wide, config=config, options=narrow), side)
+    return network(config).bind(variables).render(scene, camera, options)
 
 
-def _in_chunks(module: nn.Module, ray_chunk: int, variables: dict, scene: Any, rays: Any) -> Any:
-    """What the module's `render_rays` gives for rays (objects, rays, ...), so many of each object at a time."""
-    num_rays = jax.tree.leaves(rays)[0].shape[1]
-    chunk = min(ray_chunk, num_rays)
+def trained(config: NetworkConfig) -> RenderOptions:
+    """Pictures as the network was trained; where a ray is sampled through all the box, few rays at once."""
+    return RenderOptions(block=WHOLE_BLOCK if config.method == "paper" else None)
 
-    def chunked(x):
-        padded = jnp.pad(x, ((0, 0), (0, -num_rays % chunk), *[(0, 0)] * (x.ndim - 2)), mode="edge")
-        return padded.reshape(x.shape[0], -1, chunk, *x.shape[2:])
 
-    chunks = jax.tree.map(chunked, rays)
-    outputs = jax.lax.map(
-        lambda rays: module.bind(variables).render_rays(scene, rays),
-        jax.tree.map(lambda x: jnp.moveaxis(x, 1, 0), chunks),
-    )
-    return jax.tree.map(lambda x: jnp.moveaxis(x, 0, 1).reshape(x.shape[1], -1, *x.shape[3:])[:, :num_rays], outputs)
+def rays_per_side(config: NetworkConfig, size: int) -> int:
+    """Rays along each side of a pixel of a picture `size` pixels wide, so that they lie as close as in the training.
+
+    A network that renders pictures of any size has learnt what a ray of its training sees, a cone of one pixel there.
+    The pixels of a smaller picture are wider: each is the mean of the rays that it would have had in the training.
+    """
+    sees_rays = config.any_size and config.method != "surfels"
+    return max(round(config.image_resolution / size), 1) if sees_rays else 1
 
 
 jitted_encode = jax.jit(encode, static_argnames="config")
-jitted_render = jax.jit(render, static_argnames=("config", "ray_chunk", "rays_per_side"))
+jitted_render = jax.jit(render, static_argnames=("config", "options"))
 
 
 def render_views(
@@ -112,12 +110,16 @@ def render_views(
 
     The light, or one for each view, is for a network that sees it; None is the package's room.
     """
-    if isinstance(config, SurfelConfig):
+    if config.method == "surfels":
+        from spnr_jax.method import surfel_renderer
+        from spnr_jax.surfels.lighting import room_light
+
         scene = surfel_renderer.encode(cloud)
-        return surfel_renderer.render_views(variables, scene, camera, light or room_light(), config=config)
+        sizes = cast(SurfelConfig, config)
+        return surfel_renderer.render_views(variables, scene, camera, light or room_light(), config=sizes)
     cloud, camera = jax.tree.map(lambda x: jnp.asarray(x)[None], (cloud, camera))
     volume = jitted_encode(variables, cloud, config=config)
-    side = supersampling.rays_per_side(config, camera.width)
-    render = partial(jitted_render, config=config, rays_per_side=side)
+    options = dataclasses.replace(trained(config), rays_per_side=rays_per_side(config, camera.width))
+    render = partial(jitted_render, config=config, options=options)
     rendering = by_all_devices(render, variables, volume, camera)
     return jax.tree.map(lambda x: x[0], rendering)

@@ -11,7 +11,8 @@ import dataclasses
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import Any, Literal
+from types import ModuleType
+from typing import Any, Literal, cast
 
 import jax
 import jax.numpy as jnp
@@ -22,11 +23,10 @@ from scipy.spatial import cKDTree
 
 from spnr_jax.devices.placement import by_all_devices, everywhere
 from spnr_jax.errors import UserError
-from spnr_jax.kernels import cameras, cloud_arrays, supersampling
+from spnr_jax.kernels import cameras, cloud_arrays
 from spnr_jax.kernels.records import Camera, Light, PointCloud, Rendering
-from spnr_jax.method import inference, surfel_renderer
-from spnr_jax.model_config import ModelConfig, NetworkConfig, SamplingConfig, SurfelConfig
-from spnr_jax.surfels import lighting
+from spnr_jax.method import inference
+from spnr_jax.model_config import NetworkConfig, PaperConfig, RayNetworkConfig, RenderOptions, SamplingConfig
 
 FIELD_OF_VIEW, DISTANCE = np.deg2rad(40.0), 3.0  # of the training cameras; the object fits into the unit sphere
 Quality = Literal["draft", "balanced", "best", "trained"]
@@ -68,16 +68,17 @@ class Model:
         # the ends of a thin stick lie on the faces of the box: rounding must not push them out of it
         inside = np.clip((positions - centre) * scale, -1, 1).astype(np.float32)
         cloud = dataclasses.replace(cloud, positions=inside)
-        if isinstance(self.config, SurfelConfig):
-            scene = surfel_renderer.encode(cloud)
+        if self._surfels is not None:
+            scene = self._surfels.encode(cloud)
             return Volume(scene=scene, centre=jnp.asarray(centre), scale=jnp.asarray(scale))
         cloud = dataclasses.replace(cloud, normals=None)
         cloud = cloud_arrays.pad(cloud, cloud_arrays.bucket(len(positions)))
         scene = _encode(self.variables, cloud, config=self.config)
         volume = Volume(scene=scene, centre=jnp.asarray(centre), scale=jnp.asarray(scale))
-        if not isinstance(self.config, ModelConfig):
+        if self.config.method != "paper":
             return volume
-        return dataclasses.replace(volume, reach=reach_of(inside[mask], self.config.volume_resolution))
+        resolution = cast(PaperConfig, self.config).encoder.volume_resolution
+        return dataclasses.replace(volume, reach=reach_of(inside[mask], resolution))
 
     def render(
         self, volume: Volume, camera: Camera, quality: Quality = "best", light: Light | None = None
@@ -92,8 +93,8 @@ class Model:
         the network's refiner, if it has one, is left out of `draft`, and of smaller pictures by any other than `best`;
         `trained` renders as the network was trained.  Other networks than ours know one number of samples.
         """
-        if isinstance(self.config, SurfelConfig):
-            draw = surfel_renderer.render if camera.cam_to_world.ndim == 2 else surfel_renderer.render_views
+        if self._surfels is not None:
+            draw = self._surfels.render if camera.cam_to_world.ndim == 2 else self._surfels.render_views
             inside = _in_box(camera, volume.centre, volume.scale)
             drawn = draw(self._shader(quality), volume.scene, inside, _or_room(light), config=self.config)
             return _in_units(drawn, volume)
@@ -101,12 +102,8 @@ class Model:
             raise UserError("this network knows the light of its training alone; give no light")
         if self.config.upsamples and (camera.height % 2 or camera.width % 2):
             raise UserError(f"this network doubles its pictures: {camera.width} x {camera.height} pixels must be even")
-        config = at_quality(self.config, quality, volume.reach)
-        needed = supersampling.rays_per_side(config, camera.width)
-        side = needed if quality == "best" else 1
-        if side < needed:  # it has learnt to see pictures of the training's size
-            config = without_refiner(config)
-        render = partial(_render, config=config, side=side)
+        options = at_quality(self.config, quality, volume.reach, camera.width)
+        render = partial(_render, config=self.config, options=options)
         return by_all_devices(render, self._spread, volume.scene, volume.centre, volume.scale, camera)
 
     def render_each(
@@ -121,15 +118,22 @@ class Model:
         The network over surfels gives its pictures common sizes, so that it is compiled once and not for most of them.
         """
         lights = lights or [None] * len(views)
-        if not isinstance(self.config, SurfelConfig):
+        if self._surfels is None:
             yield from (self.render(volume, view, quality, light) for view, light in zip(views, lights, strict=True))
             return
         inside = [_in_box(view, volume.centre, volume.scale) for view in views]
         shone = [_or_room(light) for light in lights]
-        for drawn in surfel_renderer.render_each(
-            self._shader(quality), volume.scene, inside, shone, config=self.config
-        ):
+        for drawn in self._surfels.render_each(self._shader(quality), volume.scene, inside, shone, config=self.config):
             yield _in_units(drawn, volume)
+
+    @property
+    def _surfels(self) -> ModuleType | None:
+        """The module that draws this network if it is the one over surfels: no other needs it imported."""
+        if self.config.method != "surfels":
+            return None
+        from spnr_jax.method import surfel_renderer
+
+        return surfel_renderer
 
     def _shader(self, quality: Quality) -> dict | None:
         """Variables of the CNN over surfels; None where a quality leaves it out."""
@@ -160,15 +164,15 @@ def _encode(variables: dict, cloud: PointCloud, *, config: NetworkConfig) -> Any
     return jax.tree.map(lambda x: x[0], scene)
 
 
-@partial(jax.jit, static_argnames=("config", "side"))
+@partial(jax.jit, static_argnames=("config", "options"))
 def _render(
-    variables: dict, scene: Any, centre, scale, camera: Camera, *, config: NetworkConfig, side: int = 1
+    variables: dict, scene: Any, centre, scale, camera: Camera, *, config: NetworkConfig, options: RenderOptions
 ) -> Rendering:
-    """`Model.render` with the config and the rays per side of a pixel of a quality."""
+    """`Model.render` with the options of a quality."""
     single = camera.cam_to_world.ndim == 2
     inside = jax.tree.map(lambda x: x.reshape(1, -1, *x.shape[-2:]), _in_box(camera, centre, scale))
     scene = jax.tree.map(lambda x: x[None], scene)
-    rendering = inference.render(variables, scene, inside, config=config, rays_per_side=side)
+    rendering = inference.render(variables, scene, inside, config=config, options=options)
     rendering = dataclasses.replace(rendering, depth=rendering.depth / scale)
     return jax.tree.map(lambda x: x[0, 0] if single else x[0], rendering)
 
@@ -188,6 +192,8 @@ def _orbiting(azimuth, elevation, distance, centre, *, size: int) -> Camera:
 
 
 def _or_room(light: Light | None) -> Light:
+    from spnr_jax.surfels import lighting  # networks of rays know no lights
+
     return lighting.room_light() if light is None else light
 
 
@@ -201,26 +207,24 @@ def _check_quality(quality: str) -> None:
         raise UserError(f"quality must be one of {', '.join(SAMPLES)}, trained, got {quality}")
 
 
-def at_quality(config: NetworkConfig, quality: Quality, reach: int) -> NetworkConfig:
-    """The config that renders at a quality, with samples within `reach` voxels of points.
+def at_quality(config: NetworkConfig, quality: Quality, reach: int, width: int) -> RenderOptions:
+    """The options that render a picture so wide at a quality, with samples within `reach` voxels of points.
 
-    A network that sees the surface keeps its own reach: the cells of the surface's grid grow with the spacing.
+    A network near points keeps its own reach: the cells of the surface's grid grow with the spacing.
     """
     _check_quality(quality)
-    if quality == "trained" or not isinstance(config, ModelConfig):
-        return config
+    needed = inference.rays_per_side(config, width)
+    side = needed if quality == "best" else 1
+    # a refiner has learnt to see pictures of the training's size
+    options = dataclasses.replace(
+        inference.trained(config), rays_per_side=side, refine=quality != "draft" and side == needed
+    )
+    if quality == "trained" or not isinstance(config, RayNetworkConfig):
+        return options
     counts = config.sampling
-    reach = counts.reach if config.num_neighbors else reach
     samples = max(round(SAMPLES[quality] * (counts.num_coarse + counts.num_fine)), 1)
-    config = dataclasses.replace(config, sampling=SamplingConfig(num_coarse=samples, num_fine=0, reach=reach))
-    return without_refiner(config) if quality == "draft" else config
-
-
-def without_refiner(config: NetworkConfig) -> NetworkConfig:
-    """The config that shows what the refiner would see."""
-    if not isinstance(config, ModelConfig) or not config.refiner_width:
-        return config
-    return dataclasses.replace(config, refiner_width=0, num_features=3)
+    sampling = SamplingConfig(num_coarse=samples, num_fine=0, reach=reach if config.method == "paper" else counts.reach)
+    return dataclasses.replace(options, sampling=sampling, block=None)
 
 
 def reach_of(positions: np.ndarray, resolution: int, num_queries: int = 4096) -> int:

@@ -32,7 +32,12 @@ SPACING_SCALE = 10.0  # brings the spacing of a thousand points to the order of 
 NOWHERE = 10.0  # spacings, of what is not there
 
 
-def told(surface: SurfaceSample, facing: Float[Array, " samples"]) -> tuple[Array, Array]:
+def facing_of(surface: SurfaceSample, directions: Float[Array, "samples 3"]) -> Float[Array, " samples"]:
+    """How much the surface faces the viewer: cosine of the angle between its normal and the way back along the ray."""
+    return -jnp.sum(surface.normal * directions, axis=-1)
+
+
+def told(surface: SurfaceSample, directions: Float[Array, "samples 3"]) -> tuple[Array, Array]:
     """What samples tell the refiner: (samples, 9), of which a ray's mean counts, and (samples, 4), of which the least.
 
     The least are how near the ray passes points, their planes, their rim and the surface, large where there is none.
@@ -40,7 +45,7 @@ def told(surface: SurfaceSample, facing: Float[Array, " samples"]) -> tuple[Arra
     s = surface
     means = (s.height, s.beside, s.nearest, s.miss, s.outside, s.flatness, s.narrowness, SPACING_SCALE * s.spacing)
     least = [jnp.where(s.exists, length, NOWHERE) for length in (s.nearest, s.miss, s.outside, s.height)]
-    return jnp.stack([*means, facing], axis=-1), jnp.stack(least, axis=-1)
+    return jnp.stack([*means, facing_of(s, directions)], axis=-1), jnp.stack(least, axis=-1)
 
 
 class SurfaceField(nn.Module):
@@ -50,7 +55,6 @@ class SurfaceField(nn.Module):
     direction_frequencies: int
     sees_direction: bool
     lit: bool
-    tells: bool = False
 
     def setup(self) -> None:
         """Layers: near -> shape -> density, shape + direction -> deep -> light."""
@@ -76,10 +80,9 @@ class SurfaceField(nn.Module):
         """Density, 0 where no point is near, and what the light depends on: the layer `shape`, the material's colours.
 
         With `lit` these are the diffuse colour and the specular colour at normal incidence, else there are none.
-        What is `told` comes last, if the field tells.
         """
         base, metallic = surface.base_color, surface.metallic[:, None]
-        facing = -jnp.sum(surface.normal * directions, axis=-1)
+        facing = facing_of(surface, directions)
         lengths = (surface.height, surface.beside, surface.nearest, surface.ahead, surface.miss, surface.outside)
         shape = (surface.flatness, surface.narrowness, SPACING_SCALE * surface.spacing, facing)
         numbers = jnp.stack([*lengths, *shape, surface.roughness, surface.metallic], axis=-1)
@@ -92,7 +95,7 @@ class SurfaceField(nn.Module):
         behind = nn.sigmoid(shift - SHARPNESS * surface.height)
         density = jnp.where(surface.exists, STRENGTH * softplus(strength) * steep * behind, 0)
         colors = (base * (1 - metallic), DIELECTRIC * (1 - metallic) + base * metallic) if self.lit else ()
-        return density, (seen, *colors, *(told(surface, facing) if self.tells else ()))
+        return density, (seen, *colors)
 
     def finish(
         self, emitted: tuple[Array, ...], acc: Float[Array, "*rays"], view: Float[Array, "*rays hidden"]

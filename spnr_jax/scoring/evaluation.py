@@ -23,7 +23,6 @@ from spnr_jax.formats import data_sets
 from spnr_jax.kernels import metrics
 from spnr_jax.kernels.records import Camera, PointCloud
 from spnr_jax.method import inference
-from spnr_jax.model_config import kind_of
 from spnr_jax.scoring import floors
 from spnr_jax.scoring.flip import flip
 from spnr_jax.scoring.lpips import LpipsWeights, lpips
@@ -223,9 +222,9 @@ def evaluate(
     say: Callable[[str], None] = print,
     weights: LpipsWeights | None = None,
 ) -> Evaluation:
-    """Scores of a run's newest checkpoint on a split, named by what it is (`kind_of`); LPIPS if there are weights."""
+    """Scores of a run's newest checkpoint on a split, named by what it is; LPIPS if there are weights."""
     trained = read_trained(run, say, data=dataset.folder)
-    return compare({kind_of(trained.config.model): trained}, dataset, split, gallery_objects, say, weights)
+    return compare({trained.config.model.method: trained}, dataset, split, gallery_objects, say, weights)
 
 
 def compare(

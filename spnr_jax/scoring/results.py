@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from spnr_jax.config import to_dict
+from spnr_jax.formats.config_json import to_dict
 from spnr_jax.formats.images import write_whole
 from spnr_jax.scoring.evaluation import FLOORS, Evaluation, ObjectResult, median_view
 from spnr_jax.scoring.report import METHODS, QUALITY, GalleryRow, lowered, write_report

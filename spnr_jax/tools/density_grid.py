@@ -18,9 +18,9 @@ from spnr_jax.formats.clouds import PlacedCloud
 from spnr_jax.kernels import occupancy, voxels
 from spnr_jax.kernels.numerics import normalize
 from spnr_jax.kernels.records import Rays
+from spnr_jax.method.inference import network
 from spnr_jax.method.model import Model, Volume
-from spnr_jax.method.renderer import Renderer
-from spnr_jax.model_config import ModelConfig
+from spnr_jax.model_config import RayNetworkConfig, RenderOptions
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,7 +36,7 @@ class DensityGrid:
 
 def sample_density(model: Model, volume: Volume, placed: PlacedCloud, resolution: int) -> DensityGrid:
     """The density in the box of an object, with `resolution` places along each side."""
-    if not isinstance(model.config, ModelConfig):
+    if not isinstance(model.config, RayNetworkConfig):
         raise UserError("--mesh and --density need a network with a density volume; this run's has none")
     scale = float(volume.scale)
     steps = np.linspace(-1, 1, resolution, dtype=np.float32)
@@ -52,24 +52,24 @@ def sample_density(model: Model, volume: Volume, placed: PlacedCloud, resolution
         density=density,
         lowest=lowest,
         spacing=2 / (resolution - 1) / scale,
-        voxel=2 / model.config.volume_resolution / scale,
+        voxel=2 / model.config.encoder.volume_resolution / scale,
         origin=placed.origin,
     )
 
 
 @partial(jax.jit, static_argnames=("config", "reach"))
-def _density_at(variables: dict, scene: Any, places: Float[Array, "n 3"], *, config: ModelConfig, reach: int) -> Array:
+def _density_at(
+    variables: dict, scene: Any, places: Float[Array, "n 3"], *, config: RayNetworkConfig, reach: int
+) -> Array:
     """Density (n,) per unit of the box at places in the box, as seen on the way to its centre.
 
     That way matters to a network that turns normals to the viewer: an object is solid behind what is seen from outside.
     """
-
-    def look_up(renderer: Renderer):
-        rays = Rays(origins=places[None], directions=-normalize(places)[None])
-        density, _ = renderer.shade(scene, rays, renderer.field.view(rays.directions), jnp.zeros((1, len(places), 1)))
-        near_points = occupancy.dilate(scene.occupied[0], reach)
-        cell, _ = voxels.locate(places, len(near_points))
-        return jnp.where(near_points[cell[:, 2], cell[:, 1], cell[:, 0]], density[0, :, 0], 0.0)
-
     scene = jax.tree.map(lambda x: x[None], scene)
-    return look_up(Renderer(config).bind(variables))
+    rays = Rays(origins=places, directions=-normalize(places))
+    module = network(config).bind(variables)
+    field, _ = module.along(scene, rays, jnp.zeros(len(places), jnp.int32), RenderOptions(refine=False))
+    density = field(jnp.zeros((len(places), 1))).density[:, 0]
+    near_points = occupancy.dilate(scene.occupied[0], reach)
+    cell, _ = voxels.locate(places, len(near_points))
+    return jnp.where(near_points[cell[:, 2], cell[:, 1], cell[:, 0]], density, 0.0)

@@ -26,7 +26,7 @@ from spnr_jax.formats import clouds, images
 from spnr_jax.formats.clouds import PlacedCloud
 from spnr_jax.kernels.records import Camera, Light, Rendering
 from spnr_jax.method.model import Model, Volume
-from spnr_jax.model_config import ModelConfig
+from spnr_jax.model_config import RayNetworkConfig
 from spnr_jax.tools import depth_maps
 from spnr_jax.tools.chosen_light import before, check_takes_light, light_of_options
 from spnr_jax.tools.render_command import Render
@@ -154,7 +154,7 @@ def _write_solids(model: Model, volume: Volume, placed: PlacedCloud, options: Re
     """Writes the density grid, and its surface as a mesh."""
     from spnr_jax.tools import density_grid, mesh_export  # here: pictures alone do without
 
-    if not isinstance(model.config, ModelConfig):
+    if not isinstance(model.config, RayNetworkConfig):
         yield f"the network that renders has no density: that of the package's {SOLID} is taken"
         model = load(SOLID)
         volume = model.encode(placed.cloud)

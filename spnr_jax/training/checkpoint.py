@@ -18,9 +18,10 @@ from typing import Any
 
 import jax
 
-from spnr_jax.config import TrainConfig, from_dict, to_dict
+from spnr_jax.config import TrainConfig
 from spnr_jax.devices import allocator
 from spnr_jax.errors import UserError
+from spnr_jax.formats.config_json import from_dict, to_dict
 from spnr_jax.training import optimisation
 
 KEPT = 3  # newest checkpoints that stay

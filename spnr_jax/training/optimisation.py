@@ -30,7 +30,7 @@ from spnr_jax.kernels import losses
 from spnr_jax.kernels.metrics import psnr
 from spnr_jax.kernels.records import Batch, Camera, Key
 from spnr_jax.method.inference import init, network
-from spnr_jax.model_config import ModelConfig
+from spnr_jax.model_config import RayNetworkConfig
 from spnr_jax.nn.discriminator import Discriminator
 
 
@@ -90,8 +90,8 @@ def first_adversarial_step(config: TrainConfig) -> int:
 
 def discriminator_of(config: TrainConfig) -> Discriminator:
     """The discriminator's module."""
-    assert isinstance(config.model, ModelConfig), "the config refuses an adversarial loss of other networks"
-    return Discriminator(config.loss.discriminator_width, config.model.num_groups, config.model.bf16)
+    assert isinstance(config.model, RayNetworkConfig), "the config refuses an adversarial loss of other networks"
+    return Discriminator(config.loss.discriminator_width, config.model.encoder.num_groups, config.model.bf16)
 
 
 def create_state(config: TrainConfig, seed: int | Array | None = None) -> TrainState:

@@ -20,8 +20,9 @@ import jax
 import numpy as np
 from flax.traverse_util import flatten_dict, unflatten_dict
 
-from spnr_jax.config import TrainConfig, from_dict, to_dict
+from spnr_jax.config import TrainConfig
 from spnr_jax.errors import UserError
+from spnr_jax.formats.config_json import from_dict, to_dict
 from spnr_jax.formats.images import write_whole
 from spnr_jax.formats.npz import read_arrays
 from spnr_jax.method.inference import init

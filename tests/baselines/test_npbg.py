@@ -12,9 +12,9 @@ from support.tiny_model import NUM_POINTS, camera, cloud, wobbled
 from support.tiny_training import BATCH, L1_ONLY, create, run, step
 
 from spnr_jax.baselines.npbg import NPBG, GatedConv, half, raster, visible_points
+from spnr_jax.baselines.sizes import NPBGConfig
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.records import Camera
-from spnr_jax.model_config import NPBGConfig
 from spnr_jax.presets import PRESETS
 from spnr_jax.training import optimisation
 

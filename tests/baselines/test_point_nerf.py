@@ -13,11 +13,11 @@ from support.tiny_training import BATCH, L1_ONLY, create, run, step
 
 from spnr_jax.baselines import point_nerf
 from spnr_jax.baselines.point_nerf import PointNeRF
+from spnr_jax.baselines.sizes import PointNeRFConfig
 from spnr_jax.config import LossConfig
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.records import Rays
 from spnr_jax.method import inference
-from spnr_jax.model_config import PointNeRFConfig
 from spnr_jax.presets import PRESETS
 from spnr_jax.training import optimisation
 
@@ -41,8 +41,9 @@ def whole(variables, cloud, camera):
     return MODULE.apply(variables, cloud, camera)
 
 
-def chunked(variables, cloud, camera, **options):
-    return inference.jitted_render(variables, cloud, camera, config=CONFIG, **options)
+def chunked(variables, cloud, camera, ray_chunk):
+    config = dataclasses.replace(CONFIG, ray_chunk=ray_chunk)
+    return inference.jitted_render(variables, cloud, camera, config=config)
 
 
 def waves(x, frequencies):
@@ -120,7 +121,7 @@ class TestPicture:
 
     def test_chunks_of_rays_and_of_shading_points_do_not_change_it(self, variables, monkeypatch):
         expected = whole(variables, cloud(), camera())
-        for ray_chunk in (None, 7):
+        for ray_chunk in (CONFIG.ray_chunk, 7):
             close(chunked(variables, cloud(), camera(), ray_chunk=ray_chunk), expected, rtol=1e-4, atol=1e-5)
         monkeypatch.setattr(point_nerf, "BLOCK", 37)
         small = jax.jit(lambda *inputs: MODULE.apply(*inputs))

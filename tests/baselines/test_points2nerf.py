@@ -12,9 +12,10 @@ from support.laws import close, numbers
 
 from spnr_jax.baselines import points2nerf
 from spnr_jax.baselines.points2nerf import Hypernetwork, Points2NeRF
-from spnr_jax.config import OptimizerConfig, from_dict, to_dict
+from spnr_jax.baselines.sizes import Points2NeRFConfig
+from spnr_jax.config import OptimizerConfig
+from spnr_jax.formats.config_json import from_dict, to_dict
 from spnr_jax.method import inference
-from spnr_jax.model_config import Points2NeRFConfig
 from spnr_jax.presets import points2nerf_abo, points2nerf_tiny
 
 FAITHFUL = Points2NeRFConfig(
@@ -203,7 +204,9 @@ def test_rays_beside_the_box_are_white_whatever_the_weights(config):
 @BOTH
 def test_chunks_of_rays_give_the_picture_of_all_rays_at_once(config):
     scene = scenes(config)
-    chunked = inference.jitted_render(variables_of(config), scene, CAMERA, config=config, ray_chunk=30)
+    chunked = inference.jitted_render(
+        variables_of(config), scene, CAMERA, config=dataclasses.replace(config, ray_chunk=30)
+    )
     close(chunked, rendered(config, scene), atol=1e-5)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from support import tiny_dataset, tiny_model
 
-from experiments.packaged import pretrain
+from experiments.packaged import pretrain, refinement
 from spnr_jax import cli, presets
 from spnr_jax.formats import data_sets
 from spnr_jax.training import run_record, weights
@@ -19,7 +19,7 @@ pytestmark = pytest.mark.ci  # it trains several networks
 SIZE = tiny_dataset.CONFIG.model.image_resolution
 CONFIG = dataclasses.replace(
     tiny_dataset.CONFIG,
-    model=dataclasses.replace(tiny_model.PLUS, render_resolution=SIZE, image_resolution=SIZE, surface_cells=45),
+    model=dataclasses.replace(tiny_model.PLUS, image_resolution=SIZE, surface_cells=45),
     loss=dataclasses.replace(tiny_dataset.CONFIG.loss, adversarial_weight=0.0),
 )
 
@@ -61,7 +61,7 @@ def test_both_data_sets_train_one_network_and_its_file_is_what_was_scored(asked,
         assert set(joined.splits[split]) == {*names, *(f"mesh-{name}" for name in names)}
     assert data_sets.read_object(joined, f"mesh-{single.splits['test'][0]}").images.size
     trained, out = weights.read_trained(options.out / "small.npz"), options.out / "small"
-    last = presets.with_refiner(pretrain.recipe(options)[-1])
+    last = refinement.with_refiner(pretrain.recipe(options)[-1])
     assert (trained.config, trained.steps) == (dataclasses.replace(last, num_steps=2), 2)
     before = weights.read_trained(out / "run4").variables["params"]
     for part, kept in before.items():
@@ -86,7 +86,7 @@ def test_without_meshes_the_procedural_objects_train_alone(asked, tmp_path):
 def test_tiny_has_one_run_and_each_run_of_small_begins_where_the_one_before_ended():
     assert pretrain.recipe(pretrain.Pretrain(network="tiny")) == [presets.plus_lite()]
     first, *later = pretrain.recipe(pretrain.Pretrain())
-    assert first == presets.packaged(presets.plus_small(), 16)
+    assert first == pretrain.packaged(presets.plus_small())
     assert [run.num_steps for run in later] == [9000, 6000, 4000]
     assert [run.even_share for run in (first, *later)] == [0, 0, 0, 0.5]
     assert len({run.seed for run in (first, *later)}) == 4

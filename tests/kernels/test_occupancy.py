@@ -14,9 +14,8 @@ from support.tiny_model import camera, cloud, wobbled
 from spnr_jax.kernels import cameras, occupancy, voxels
 from spnr_jax.kernels.occupancy import distance_at, map_existing, open_path
 from spnr_jax.kernels.records import Rays, Scene
-from spnr_jax.method import inference, renderer
-from spnr_jax.method.renderer import Renderer
-from spnr_jax.model_config import SamplingConfig
+from spnr_jax.method import inference
+from spnr_jax.model_config import RenderOptions, SamplingConfig
 
 CONFIG = tiny_model.WITHOUT_UPSAMPLER
 RNG = np.random.default_rng(0)
@@ -28,7 +27,7 @@ def near_points(config, reach):
 
 @pytest.fixture(scope="module")
 def variables():
-    return wobbled(jax.jit(Renderer(CONFIG).init)(jax.random.key(0), cloud(), camera()), 4)
+    return wobbled(jax.jit(inference.network(CONFIG).init)(jax.random.key(0), cloud(), camera()), 4)
 
 
 @pytest.fixture(scope="module")
@@ -170,9 +169,9 @@ class TestRendering:
 
     def test_rays_that_miss_the_points_are_white_and_transparent(self, variables, scene):
         rendering = inference.jitted_render(variables, scene, camera(), config=near_points(CONFIG, 1))
-        rays = Renderer(CONFIG).bind(variables).rays(camera())
+        rays = inference.network(CONFIG).bind(variables).rays(camera())
         near, far, _ = cameras.intersect_box(rays.origins, rays.directions)
-        cells = 2 * CONFIG.volume_resolution
+        cells = 2 * CONFIG.encoder.volume_resolution
         path = open_path(occupancy.dilate(scene.occupied, 1), rays, near, far, cells)
         missed = np.asarray(path.travelled[..., -1] == 0).reshape(rendering.acc.shape)
         assert missed.any()
@@ -181,12 +180,13 @@ class TestRendering:
         assert (np.asarray(rendering.acc)[missed] == 0).all()
         close(np.asarray(rendering.depth)[missed], np.asarray(far).reshape(missed.shape)[missed])
 
-    @pytest.mark.parametrize("ray_chunk", [7, 300])
-    def test_the_chunk_does_not_matter(self, variables, scene, ray_chunk):
+    @pytest.mark.parametrize("block", [7, 300])
+    def test_the_chunk_does_not_matter(self, variables, scene, block):
         config = near_points(CONFIG, 1)
         generic = camera(target=0.013)  # no cell has its middle on a face between voxels, where rounding would decide
         whole, chunked = (
-            inference.jitted_render(variables, scene, generic, config=config, ray_chunk=n) for n in (4096, ray_chunk)
+            inference.jitted_render(variables, scene, generic, config=config, options=RenderOptions(block=n))
+            for n in (4096, block)
         )
         close(chunked, whole, atol=1e-5)
 
@@ -196,22 +196,13 @@ class TestRendering:
 
         @partial(jax.jit, static_argnames="block")
         def jittered(key, block):
-            monkeypatch.setattr(renderer, "RAY_BLOCK", block)
-            return Renderer(config).bind(variables).render(scene, generic, key)
+            options = RenderOptions(block=block)
+            return inference.network(config).bind(variables).render(scene, generic, options, key)
 
         few, many = (jittered(jax.random.key(0), block) for block in (7, 256))
         close(few, many, atol=1e-5)
         still = inference.jitted_render(variables, scene, generic, config=config)
         assert np.abs(np.asarray(many.image) - np.asarray(still.image)).max() > 1e-3, "a key moves the samples"
-
-    @pytest.mark.skipif(jax.default_backend() != "cpu", reason="other devices have one size of blocks")
-    def test_pictures_do_not_depend_on_the_size_of_blocks(self, variables, scene, monkeypatch):
-        @partial(jax.jit, static_argnames="block")
-        def still(block):
-            monkeypatch.setattr(renderer, "CPU_BLOCK", block)
-            return Renderer(near_points(CONFIG, 1)).bind(variables).render(scene, camera(target=0.013))
-
-        close(still(7), still(4096), atol=1e-5)
 
     def test_no_point_gives_a_white_picture(self, variables):
         empty = dataclasses.replace(cloud(), mask=jnp.zeros_like(cloud().mask))
@@ -221,7 +212,7 @@ class TestRendering:
         assert (rendering.image == 1).all()
 
     def test_occupied_voxels_are_those_of_the_points(self, scene):
-        cell, _ = voxels.locate(cloud().positions, CONFIG.volume_resolution)
+        cell, _ = voxels.locate(cloud().positions, CONFIG.encoder.volume_resolution)
         for i in range(2):
             inside = np.asarray(cloud().mask[i]) & (np.abs(cloud().positions[i]) <= 1).all(-1)
             x, y, z = np.asarray(cell[i])[inside].T
@@ -230,5 +221,5 @@ class TestRendering:
             same_bits(scene.occupied[i], jnp.array(expected))
 
     def test_a_negative_reach_is_refused(self):
-        with pytest.raises(ValueError, match="reach must not be negative, got -1"):
+        with pytest.raises(ValueError, match="reach must be at least 0, got -1"):
             SamplingConfig(reach=-1)

@@ -9,14 +9,14 @@ import pytest
 from support.laws import close, numbers, same_bits
 from support.tiny_model import MODEL, PLUS, camera, cloud, wobbled
 
+from spnr_jax.baselines.sizes import NPBGConfig
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.records import Rendering
-from spnr_jax.kernels.resizing import mean_of_squares
-from spnr_jax.kernels.supersampling import averaged, rays_per_side
+from spnr_jax.kernels.resizing import averaged, mean_of_squares
 from spnr_jax.method import inference
+from spnr_jax.method.inference import rays_per_side
 from spnr_jax.method.model import Model
-from spnr_jax.method.renderer import Renderer
-from spnr_jax.model_config import NPBGConfig
+from spnr_jax.model_config import RenderOptions
 
 SIDE = 2
 
@@ -83,26 +83,26 @@ def test_squares_of_a_constant_are_that_constant():
 
 @pytest.mark.parametrize(("size", "side"), [(16, 1), (32, 1), (8, 2), (4, 4), (11, 1)])
 def test_rays_lie_as_close_as_in_the_training(size, side):
-    plus = dataclasses.replace(PLUS, render_resolution=16, image_resolution=16)
+    plus = dataclasses.replace(PLUS, image_resolution=16)
     assert rays_per_side(plus, size) == side
     assert rays_per_side(NPBGConfig(image_resolution=32), size) == 1, "it sees all pixels at once"
 
 
 def test_a_small_picture_is_the_large_one_averaged():
-    config = dataclasses.replace(PLUS, render_resolution=16, image_resolution=16)
-    variables = wobbled(jax.jit(Renderer(config).init)(jax.random.key(0), cloud(), camera()), 4)
+    config = dataclasses.replace(PLUS, image_resolution=16)
+    variables = wobbled(jax.jit(inference.network(config).init)(jax.random.key(0), cloud(), camera()), 4)
     scene = inference.jitted_encode(variables, cloud(), config=config)
     small, large = camera(8, target=0.0171), cameras.resize(camera(8, target=0.0171), 16, 16)
     whole = inference.jitted_render(variables, scene, large, config=config)
     assert np.ptp(np.asarray(whole.acc)) > 0.5
-    several = inference.jitted_render(variables, scene, small, config=config, rays_per_side=2)
+    several = inference.jitted_render(variables, scene, small, config=config, options=RenderOptions(rays_per_side=2))
     apart = np.abs(np.asarray(several.image - averaged(whole, 2).image))
     assert np.mean(apart > 1e-4) < 0.01  # but for a ray that rounding moves over a face of a cell
 
 
 def test_the_handle_takes_several_rays_for_the_best_picture_alone():
-    config = dataclasses.replace(PLUS, render_resolution=16, image_resolution=16)
-    variables = wobbled(jax.jit(Renderer(config).init)(jax.random.key(0), cloud(), camera()), 4)
+    config = dataclasses.replace(PLUS, image_resolution=16)
+    variables = wobbled(jax.jit(inference.network(config).init)(jax.random.key(0), cloud(), camera()), 4)
     handle, single = Model(config=config, variables=variables), jax.tree.map(lambda x: np.asarray(x[0]), cloud())
     volume = handle.encode(single)
     view, wide = (handle.camera(volume, azimuth=17.3, elevation=36.1, resolution=n) for n in (8, 16))

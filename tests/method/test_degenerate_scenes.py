@@ -16,8 +16,8 @@ from support.laws import close, numbers
 from spnr_jax.kernels import losses
 from spnr_jax.kernels.cameras import camera_rays, intersect_box, look_at, pinhole, resize
 from spnr_jax.kernels.records import PointCloud
+from spnr_jax.method import inference
 from spnr_jax.method.model import Model
-from spnr_jax.method.renderer import Renderer
 
 MODEL, SIZE, NUM_POINTS = tiny_model.MODEL, tiny_model.SIZE, 32
 RANDOM = 0.6 * np.asarray(numbers(0, NUM_POINTS, 3))
@@ -40,7 +40,7 @@ def camera(eye=(0.5, 0.8, 3.0), target=(0.0, 0.0, 0.0), field_of_view=0.9):
 
 @pytest.fixture(scope="module")
 def variables():
-    fresh = jax.jit(Renderer(MODEL).init)(jax.random.key(0), cloud(), camera())
+    fresh = jax.jit(inference.network(MODEL).init)(jax.random.key(0), cloud(), camera())
     return tiny_model.wobbled(fresh, 4)
 
 
@@ -53,7 +53,7 @@ def rendered(variables, cloud, camera):
     def loss(params, inputs):
         places = {name: inputs[name] for name in ("cam_to_world", "intrinsics")}
         points = {name: x for name, x in inputs.items() if name not in places}
-        rendering, _ = Renderer(MODEL).apply(
+        rendering, _ = inference.network(MODEL).apply(
             variables | {"params": params},
             dataclasses.replace(cloud, **points),
             dataclasses.replace(camera, **places),
@@ -174,7 +174,7 @@ def test_looking_away_is_exactly_white_and_pulls_at_nothing_in_the_scene(variabl
     assert (rendering.image_lr == 1).all()
     assert (rendering.acc == 0).all()
     assert all((x == 0).all() for x in jax.tree.leaves(by_inputs))
-    assert all((x == 0).all() for part in ("pointnet", "unet", "field") for x in jax.tree.leaves(by_weights[part]))
+    assert all((x == 0).all() for part in ("encoder", "field") for x in jax.tree.leaves(by_weights[part]))
 
 
 class TestUnits:

@@ -14,7 +14,6 @@ from support.tiny_training import BATCH, CONFIG
 
 from spnr_jax.kernels import voxels
 from spnr_jax.method import inference
-from spnr_jax.method.renderer import Renderer
 from spnr_jax.training import optimisation
 
 
@@ -46,7 +45,7 @@ def picture_and_gradient(variables):
     """Pictures of two objects, and the gradient of their sum of squares by the weights."""
 
     def rendering(params):
-        return Renderer(MODEL).apply({**variables, "params": params}, cloud(), camera(24))
+        return inference.network(MODEL).apply({**variables, "params": params}, cloud(), camera(24))
 
     gradient = jax.grad(lambda params: jnp.mean(rendering(params).image ** 2))(variables["params"])
     picture = rendering(variables["params"])
@@ -55,7 +54,7 @@ def picture_and_gradient(variables):
 
 @pytest.mark.parametrize("precision", TOLERANCE)
 def test_pictures_and_gradients_are_those_of_the_cpu(precision):
-    variables = wobbled(Renderer(MODEL).init(jax.random.key(0), *inference.example_inputs(CONFIG.model)), 1)
+    variables = wobbled(inference.network(MODEL).init(jax.random.key(0), *inference.example_inputs(CONFIG.model)), 1)
     with jax.default_matmul_precision(precision):
         gpu = on("gpu", picture_and_gradient, variables)
     agree(gpu, on("cpu", picture_and_gradient, variables), TOLERANCE[precision])

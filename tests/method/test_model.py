@@ -10,11 +10,12 @@ from support import tiny_dataset
 from support.laws import close
 
 import spnr_jax
+from spnr_jax.baselines.sizes import NPBGConfig
 from spnr_jax.formats import data_sets
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.records import Camera, PointCloud
 from spnr_jax.method import inference, model
-from spnr_jax.model_config import NPBGConfig, SamplingConfig
+from spnr_jax.model_config import RenderOptions, SamplingConfig
 
 
 @pytest.fixture(scope="module")
@@ -144,17 +145,18 @@ class TestQuality:
     def test_a_quality_is_a_share_of_the_samples_near_the_points(self, quality, samples):
         config = dataclasses.replace(tiny_dataset.CONFIG.model, sampling=SamplingConfig(num_coarse=4, num_fine=4))
         expected = SamplingConfig(num_coarse=samples, num_fine=0, reach=3)
-        assert model.at_quality(config, quality, 3) == dataclasses.replace(config, sampling=expected)
+        refine = quality != "draft"
+        assert model.at_quality(config, quality, 3, 24) == RenderOptions(sampling=expected, refine=refine)
 
-    def test_trained_is_the_config_of_the_network_and_so_is_every_quality_of_other_networks(self):
+    def test_trained_takes_the_samples_of_the_training_and_so_does_every_quality_of_other_networks(self):
         config = tiny_dataset.CONFIG.model
-        assert model.at_quality(config, "trained", 3) == config
-        assert model.at_quality(NPBGConfig(), "draft", 3) == NPBGConfig()
+        assert model.at_quality(config, "trained", 3, 24) == inference.trained(config) == RenderOptions(block=1024)
+        assert model.at_quality(NPBGConfig(), "draft", 3, 24).sampling is None
 
     def test_another_word_is_refused(self):
         unchecked = inspect.unwrap(model.at_quality)  # the tests' type check would refuse it first
         with pytest.raises(ValueError, match="quality must be one of draft, balanced, best, trained, got fast"):
-            unchecked(tiny_dataset.CONFIG.model, "fast", 1)
+            unchecked(tiny_dataset.CONFIG.model, "fast", 1, 24)
 
     @pytest.mark.parametrize("quality", ["draft", "balanced", "best", "trained"])
     def test_every_quality_shows_the_object(self, handle, quality):

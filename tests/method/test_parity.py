@@ -11,7 +11,9 @@ from support import twin
 
 from experiments.speed import twin_layout
 from spnr_jax.kernels import cameras, compositing, losses, sampling, voxels
-from spnr_jax.method.renderer import Renderer
+from spnr_jax.method import inference
+from spnr_jax.method.march import trace
+from spnr_jax.model_config import AS_TRAINED
 from spnr_jax.nn.encoding import encode_direction
 from spnr_jax.training import optimisation
 
@@ -42,20 +44,20 @@ def stages():
 
     @jax.jit
     def run(variables, cloud, camera):
-        renderer = Renderer(CONFIG.model)
+        renderer = inference.network(CONFIG.model)
         module = renderer.bind(variables)
-        resolution, counts = CONFIG.model.volume_resolution, CONFIG.model.sampling
-        point_features = module.pointnet(module.point_inputs(cloud), cloud.mask, False)
+        resolution, counts = CONFIG.model.encoder.volume_resolution, CONFIG.model.sampling
+        point_features = module.encoder.point_features(cloud)
         scene = module.encode(cloud)
         volume = scene.volume
         rays = module.rays(camera)
         near, far, _ = cameras.intersect_box(rays.origins, rays.directions)
-        view = module.field.view(rays.directions)
+        objects = jnp.zeros(rays.origins.shape[:-1], jnp.int32)
         coarse, edges = sampling.stratified(None, near, far, counts.num_coarse)
         positions = rays.origins[..., None, :] + coarse[..., None] * rays.directions[..., None, :]
-        density, (rgb, _) = module.shade(scene, rays, view, coarse)
+        density, (rgb, _), _ = module.along(scene, rays, objects, AS_TRAINED)[0](coarse)
         weights, _ = compositing.volume_weights(density, compositing.interval_lengths(coarse, far))
-        features, depth, acc = module.render_rays(scene, rays)
+        features, depth, acc = trace(module, scene, rays, counts, AS_TRAINED, None)
         return {
             "voxel": voxels.locate(cloud.positions, resolution),
             "point_features": point_features[0],
@@ -83,7 +85,7 @@ def stages():
 class TestGeneratorStages:
     def test_points_lie_in_the_same_voxels_at_the_same_offsets(self, stages):
         cell, offset = (np.asarray(x[0]) for x in stages["voxel"])
-        d = CONFIG.model.volume_resolution
+        d = CONFIG.model.encoder.volume_resolution
         np.testing.assert_array_equal((cell[:, 2] * d + cell[:, 1]) * d + cell[:, 0], ARRAYS["eval/voxel_index"])
         agree(offset, ARRAYS["eval/voxel_offset"][0])
 
@@ -149,7 +151,7 @@ def trained():
     def run(params):
         def loss(params):
             variables = {"params": params, "batch_stats": STATISTICS}
-            rendering, updated = Renderer(CONFIG.model).apply(
+            rendering, updated = inference.network(CONFIG.model).apply(
                 variables, BATCH.cloud, BATCH.camera, train=True, mutable=["batch_stats"]
             )
             l1 = optimisation.reconstruction_loss(CONFIG, rendering.image, rendering.image_lr, BATCH.image)
@@ -179,7 +181,7 @@ class TestGeneratorTraining:
 
     @pytest.mark.parametrize("layer", range(3))
     def test_running_statistics_after_one_forward(self, trained, layer):
-        ours = trained[1]["pointnet"][f"norm_{layer}"]
+        ours = trained[1]["encoder"]["pointnet"][f"norm_{layer}"]
         agree(ours["mean"], ARRAYS[f"train/after/points.norms.{layer}.running_mean"])
         agree(ours["variance"], ARRAYS[f"train/after/points.norms.{layer}.running_var"])
 
@@ -203,7 +205,7 @@ def twin_named(tree):
     def conv(x):
         return np.moveaxis(np.asarray(x), (-1, -2), (0, 1))
 
-    points, unet, upsampler = tree["pointnet"], tree["unet"], tree["upsampler"]
+    points, unet, upsampler = tree["encoder"]["pointnet"], tree["encoder"]["unet"], tree["upsampler"]
     named = {"points.out.weight": points["out"]["kernel"].T, "points.out.bias": points["out"]["bias"]}
     for i in range(3):
         named[f"points.linears.{i}.weight"] = points[f"hidden_{i}"]["kernel"].T

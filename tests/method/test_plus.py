@@ -15,9 +15,9 @@ from spnr_jax.config import LossConfig, OptimizerConfig
 from spnr_jax.formats.clouds import PlacedCloud
 from spnr_jax.kernels import occupancy
 from spnr_jax.method import inference
+from spnr_jax.method.march import trace
 from spnr_jax.method.model import Model
-from spnr_jax.method.renderer import Renderer
-from spnr_jax.model_config import ModelConfig, SamplingConfig, surface_grid
+from spnr_jax.model_config import AS_TRAINED, NearPointsConfig, PaperConfig, RenderOptions, SamplingConfig, surface_grid
 from spnr_jax.tools.density_grid import sample_density
 from spnr_jax.training import optimisation
 
@@ -31,7 +31,7 @@ def config(request):
 
 @pytest.fixture(scope="module")
 def variables(config):
-    return wobbled(jax.jit(Renderer(config).init)(jax.random.key(0), cloud(), camera()), 4)
+    return wobbled(jax.jit(inference.network(config).init)(jax.random.key(0), cloud(), camera()), 4)
 
 
 @pytest.fixture(scope="module")
@@ -55,11 +55,9 @@ class TestRendering:
 
         @jax.jit
         def both(everywhere):
-            renderer = Renderer(config).bind(variables)
-            rays = renderer.rays(GENERIC)
-            plain = object.__new__(type(config))
-            plain.__dict__.update(vars(config) | {"sampling": dataclasses.replace(config.sampling, reach=0)})
-            return renderer.render_rays(everywhere, rays), Renderer(plain).bind(variables).render_rays(everywhere, rays)
+            module = inference.network(config).bind(variables)
+            reaches = config.sampling, dataclasses.replace(config.sampling, reach=0)
+            return [trace(module, everywhere, module.rays(GENERIC), samples, AS_TRAINED, None) for samples in reaches]
 
         ours, expected = both(everywhere)
         assert (np.asarray(expected[2]) > 0.5).any()
@@ -78,9 +76,9 @@ class TestRendering:
         )(scene, GENERIC)
         close(jax.tree.map(lambda x: x[:, 0], mapped), whole, atol=1e-5)
 
-    @pytest.mark.parametrize("ray_chunk", [7, 300])
-    def test_the_chunk_does_not_matter(self, config, variables, scene, ray_chunk):
-        whole, chunked = (render(variables, scene, config, ray_chunk=n) for n in (4096, ray_chunk))
+    @pytest.mark.parametrize("block", [7, 300])
+    def test_the_block_does_not_matter(self, config, variables, scene, block):
+        whole, chunked = (render(variables, scene, config, options=RenderOptions(block=n)) for n in (4096, block))
         close(chunked, whole, atol=1e-5)
 
     def test_the_order_of_the_points_and_what_fills_the_padding_do_not_matter(self, config, variables):
@@ -106,7 +104,9 @@ class TestRendering:
     ):
         """Heights, distances and planes turn with the object; the view of the axes by the network is cut."""
         blind = jax.tree.map(jnp.zeros_like, variables["params"]["field"]["near"]["kernel"])
-        told = jnp.arange(len(blind)) - config.base_width  # rows: volume, then 12 scalars, normal, colour, mirrored
+        told = (
+            jnp.arange(len(blind)) - config.encoder.base_width
+        )  # rows: volume, then 12 scalars, normal, colour, mirrored
         kernel = jnp.where(((told >= 0) & (told < 12))[:, None], variables["params"]["field"]["near"]["kernel"], blind)
         field = variables["params"]["field"] | {"near": variables["params"]["field"]["near"] | {"kernel": kernel}}
         variables = variables | {"params": variables["params"] | {"field": field}}
@@ -140,7 +140,7 @@ class TestTraining:
     def test_learns_two_balls_and_their_opacity(self):
         config = dataclasses.replace(
             tiny_training.L1_ONLY,
-            model=dataclasses.replace(PLUS, render_resolution=tiny_model.SIZE, image_resolution=tiny_model.SIZE),
+            model=dataclasses.replace(PLUS, image_resolution=tiny_model.SIZE),
             loss=LossConfig(l1_weight=1.0, mse_weight=2.0, adversarial_weight=0.0, opacity_weight=0.5),
             optimizer=OptimizerConfig(lr_generator=5e-3, warmup_steps=4),
             pixel_stride=2,
@@ -164,11 +164,10 @@ class TestConfig:
     @pytest.mark.parametrize(
         ("changes", "message"),
         [
-            ({"num_neighbors": 0, "num_features": 5}, "color lit needs the nearest points; use num_neighbors 6"),
-            ({"num_neighbors": 0, "color": "free"}, "num_features must be 4 or more, RGB first, got 3"),
-            ({"num_neighbors": -1}, "num_neighbors must not be negative, got -1"),
+            ({"num_neighbors": 0}, "num_neighbors must be at least 1, got 0"),
+            ({"num_neighbors": -1}, "num_neighbors must be at least 1, got -1"),
             ({"sampling": SamplingConfig(num_coarse=4, reach=0)}, "use reach 1"),
-            ({"image_resolution": 24}, "render_resolution 24"),
+            ({"sampling": SamplingConfig(num_coarse=4, reach=2)}, "use reach 1"),
         ],
     )
     def test_what_does_not_go_together_is_refused(self, changes, message):
@@ -182,4 +181,5 @@ class TestConfig:
         dataclasses.replace(config, max_points=2048, model=dataclasses.replace(config.model, surface_cells=45))
 
     def test_the_papers_network_sees_no_surface(self):
-        assert (ModelConfig().num_neighbors, ModelConfig().color, ModelConfig().point_norm) == (0, "free", "batch")
+        assert not {f.name for f in dataclasses.fields(PaperConfig)} & {"num_neighbors", "color", "refiner_width"}
+        assert (PaperConfig().encoder.point_norm, NearPointsConfig().encoder.point_norm) == ("batch", "layer")

@@ -13,7 +13,9 @@ from support.tiny_model import MODEL, camera, cloud
 from support.tiny_training import BATCH, CONFIG, L1_ONLY, create, step
 
 from spnr_jax.kernels.records import Rays, Scene
-from spnr_jax.method.renderer import Renderer
+from spnr_jax.method import inference
+from spnr_jax.method.march import trace
+from spnr_jax.model_config import AS_TRAINED
 from spnr_jax.training import optimisation
 
 BF16_MODEL = dataclasses.replace(MODEL, precision="bfloat16")
@@ -28,7 +30,7 @@ def traced(config) -> tuple[str, dict]:
 
     def everything():
         state = optimisation.create_state(config)
-        picture = Renderer(config.model).apply(optimisation.averaged_variables(state), cloud(), camera(24))
+        picture = inference.network(config.model).apply(optimisation.averaged_variables(state), cloud(), camera(24))
         state, metrics = optimisation.train_step(state, BATCH, config=config, adversarial=True)
         return {"state": state, "metrics": metrics, "picture": picture}
 
@@ -52,14 +54,15 @@ def test_statistics_of_the_normalisations_stay_float32():
 def test_points_field_sampling_and_compositing_stay_float32():
     rays = Rays(origins=numbers(0, 2, 6, 3), directions=numbers(1, 2, 6, 3))
     scene = Scene(volume=jnp.zeros((2, 8, 8, 8, 4)), occupied=jnp.ones((2, 8, 8, 8), bool))
-    variables = jax.eval_shape(lambda: Renderer(BF16_MODEL).init(jax.random.key(0), cloud(), camera(24)))
+    variables = jax.eval_shape(lambda: inference.network(BF16_MODEL).init(jax.random.key(0), cloud(), camera(24)))
 
     def samples(variables, key):
-        return Renderer(BF16_MODEL).bind(variables).render_rays(scene, rays, key)
+        module = inference.network(BF16_MODEL).bind(variables)
+        return trace(module, scene, rays, BF16_MODEL.sampling, AS_TRAINED, key)
 
     def points(variables):
-        module = Renderer(BF16_MODEL).bind(variables)
-        return module.pointnet(module.point_inputs(cloud()), cloud().mask, False)
+        module = inference.network(BF16_MODEL).bind(variables)
+        return module.encoder.point_features(cloud())
 
     assert "bf16" not in str(jax.make_jaxpr(samples)(variables, jax.random.key(0)))
     assert "bf16" not in str(jax.make_jaxpr(points)(variables))

@@ -18,7 +18,9 @@ from spnr_jax.kernels import sampling
 from spnr_jax.kernels.cameras import intersect_box, view_rays
 from spnr_jax.kernels.records import Rays, Scene
 from spnr_jax.method import inference
-from spnr_jax.method.renderer import Renderer, union_weights
+from spnr_jax.method.march import union_weights
+from spnr_jax.model_config import AS_TRAINED, RenderOptions
+from spnr_jax.nn.encoder import Encoder
 
 SUPPORT = Path(__file__).parents[1] / "support"
 CONFIG = tiny_model.WITHOUT_UPSAMPLER
@@ -26,7 +28,7 @@ CONFIG = tiny_model.WITHOUT_UPSAMPLER
 
 @pytest.fixture(scope="module")
 def variables():
-    return wobbled(jax.jit(Renderer(CONFIG).init)(jax.random.key(0), cloud(), camera()), 4)
+    return wobbled(jax.jit(inference.network(CONFIG).init)(jax.random.key(0), cloud(), camera()), 4)
 
 
 def encode(variables, cloud, config=CONFIG):
@@ -43,7 +45,7 @@ def render(variables, volume, camera, config=CONFIG, **options):
 
 @jax.jit
 def jittered(variables, cloud, camera, key):
-    return Renderer(CONFIG).apply(variables, cloud, camera, key, train=True, mutable=["batch_stats"])
+    return inference.network(CONFIG).apply(variables, cloud, camera, key, train=True, mutable=["batch_stats"])
 
 
 class TestCloud:
@@ -75,11 +77,11 @@ class TestCloud:
     def test_what_fills_the_padding_does_not_reach_the_gradient(self, variables):
         def gradient(cloud):
             def total(params):
-                module = Renderer(CONFIG).bind({**variables, "params": params})
-                features = module.pointnet(module.point_inputs(cloud), cloud.mask, train=False)
+                module = inference.network(CONFIG).bind({**variables, "params": params})
+                features = module.encoder.point_features(cloud)
                 return jnp.sum(jnp.where(cloud.mask[..., None], features, 0) ** 2)
 
-            return jax.grad(total)(variables["params"])["pointnet"]
+            return jax.grad(total)(variables["params"])["encoder"]["pointnet"]
 
         mask = cloud().mask.at[:, 5:].set(False)
         zeros, spoilt = (
@@ -104,7 +106,7 @@ class TestCloud:
     @pytest.mark.parametrize("scatter", ["max", "trilinear"])
     def test_another_scatter_gives_another_volume_and_the_same_occupied_voxels(self, variables, scatter):
         """Rendering near points looks around the voxels that hold points, however these are scattered."""
-        config = dataclasses.replace(CONFIG, scatter=scatter)
+        config = tiny_model.with_encoder(CONFIG, scatter=scatter)
         plain, other = encode(variables, cloud()), encode(variables, cloud(), config)
         same_bits(other.occupied, plain.occupied)
         assert (jnp.abs(other.volume - plain.volume) > 1e-3).any()
@@ -118,8 +120,8 @@ class TestCloud:
 
     @pytest.mark.parametrize("materials", [(), ("roughness",), ("base_color", "metallic")], ids=str)
     def test_materials_that_the_config_leaves_out_are_not_read(self, materials):
-        config = dataclasses.replace(CONFIG, materials=materials)
-        module, unread = Renderer(config), {"base_color", "roughness", "metallic"} - set(materials)
+        config = tiny_model.with_encoder(CONFIG, materials=materials).encoder
+        module, unread = Encoder(config), {"base_color", "roughness", "metallic"} - set(materials)
         spoilt = dataclasses.replace(
             cloud(), **{name: jnp.full_like(getattr(cloud(), name), jnp.nan) for name in unread}
         )
@@ -143,20 +145,21 @@ class TestViews:
         """Rounding puts many of them a little outside the box, where there is nothing."""
         rays = view_rays(camera(32))
         near, far, hit = intersect_box(rays.origins, rays.directions)
-        volume = jnp.ones((2, *[CONFIG.volume_resolution] * 3, CONFIG.base_width))
-        module = Renderer(CONFIG).bind(variables)
+        volume = jnp.ones((2, *[CONFIG.encoder.volume_resolution] * 3, CONFIG.encoder.base_width))
+        module = inference.network(CONFIG).bind(variables)
         distances = jnp.stack([near, 0.5 * (near + far), far], axis=-1)
-        density, _ = module.shade(scene(volume), rays, module.field.view(rays.directions), distances)
+        objects = jnp.broadcast_to(jnp.arange(2).reshape(2, *[1] * (near.ndim - 1)), near.shape)
+        density = module.along(scene(volume), rays, objects, AS_TRAINED)[0](distances).density
         assert hit.sum() > 500
         close(density[hit], jnp.broadcast_to(density[hit][:, 1:2], density[hit].shape))
 
-    @pytest.mark.parametrize("ray_chunk", [1, 7, 64])
-    def test_rays_do_not_know_their_chunk(self, variables, ray_chunk):
+    @pytest.mark.parametrize("block", [1, 7, 64])
+    def test_rays_do_not_know_their_block(self, variables, block):
         """To a few roundings: a matrix product of another size adds in another order."""
         volume = encode(variables, cloud())
-        whole, chunked = (render(variables, volume, camera(), ray_chunk=chunk) for chunk in (1000, ray_chunk))
-        close(chunked, whole, rtol=1e-6, atol=1e-6)
-        same_bits(render(variables, volume, camera(), ray_chunk=ray_chunk), chunked)
+        whole, part = (render(variables, volume, camera(), options=RenderOptions(block=n)) for n in (1000, block))
+        close(part, whole, rtol=1e-6, atol=1e-6)
+        same_bits(render(variables, volume, camera(), options=RenderOptions(block=block)), part)
 
     @pytest.mark.slow
     def test_rays_of_one_object_have_the_same_bits_in_every_chunk_of_a_fair_size(self):
@@ -190,9 +193,10 @@ class TestViews:
 
         @jax.jit
         def densities(rays, distances):
-            module = Renderer(CONFIG).bind(variables)
+            module = inference.network(CONFIG).bind(variables)
             everywhere = scene(jnp.ones((1, 8, 8, 8, 4)))
-            return module.shade(everywhere, rays, module.field.view(rays.directions), distances)[0]
+            field, _ = module.along(everywhere, rays, jnp.zeros(rays.origins.shape[:-1], jnp.int32), AS_TRAINED)
+            return field(distances).density
 
         found = np.asarray(densities(rays, jnp.asarray((near + far) / 2)[..., None]))[..., 0][hit]
         close(found, np.full(found.shape, found[0]))
@@ -222,14 +226,14 @@ class TestViews:
         close(np.asarray(rendering.acc)[hit], np.ones(hit.sum()), atol=1e-5)
 
     def test_without_an_upsampler_the_image_is_the_rendering_and_no_upsampler_is_built(self, variables):
-        assert set(variables["params"]) == {"pointnet", "unet", "field"}
+        assert set(variables["params"]) == {"encoder", "field"}
         rendering = render(variables, encode(variables, cloud()), camera())
         same_bits(rendering.image, rendering.image_lr)
 
     @pytest.mark.parametrize(("resize", "size"), [(8, 16), (12, 24)])
     def test_with_fresh_weights_the_upsampler_shows_the_rendering_resized(self, variables, resize, size):
         config = dataclasses.replace(CONFIG, resize_resolution=resize, image_resolution=size)
-        fresh = jax.jit(Renderer(config).init)(jax.random.key(2), cloud(), camera(size))
+        fresh = jax.jit(inference.network(config).init)(jax.random.key(2), cloud(), camera(size))
         assert "upsampler" in fresh["params"]
         merged = {"params": fresh["params"] | variables["params"], "batch_stats": variables["batch_stats"]}
         rendering = render(merged, encode(variables, cloud()), camera(size), config)
@@ -253,7 +257,7 @@ class TestJitter:
 
         @jax.jit
         def numbers_drawn(key):
-            Renderer(CONFIG).apply(variables, cloud(), camera(), key)
+            inference.network(CONFIG).apply(variables, cloud(), camera(), key)
             return tuple(drawn)
 
         coarse, fine = numbers_drawn(jax.random.key(6))

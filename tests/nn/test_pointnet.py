@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from support.laws import close, numbers
 
-from spnr_jax.nn.pointnet import PointNet
+from spnr_jax.nn.encoder import PointNet
 
 X, MASK = numbers(0, 2, 6, 5), jnp.ones((2, 6), bool).at[1, 4:].set(False)
 MODULE = PointNet(widths=(8, 4), num_features=3)

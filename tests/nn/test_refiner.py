@@ -14,16 +14,16 @@ from support.tiny_model import PLUS, camera, cloud, wobbled
 from spnr_jax import presets
 from spnr_jax.config import LossConfig, OptimizerConfig, TrainConfig
 from spnr_jax.kernels import cameras
-from spnr_jax.kernels.resizing import bilinear, folded, mean_of_squares, unfolded
-from spnr_jax.kernels.supersampling import averaged, rays_per_side
+from spnr_jax.kernels.resizing import averaged, bilinear, folded, mean_of_squares, unfolded
 from spnr_jax.method import inference
+from spnr_jax.method.inference import rays_per_side
 from spnr_jax.method.model import Model, at_quality
-from spnr_jax.method.renderer import Renderer
+from spnr_jax.model_config import RenderOptions
 from spnr_jax.nn.refiner import FOLD, LEAST, LEVELS, ODDS, Refiner
-from spnr_jax.training import optimisation
+from spnr_jax.training import optimisation, weights
 
 SQUARE = FOLD * 2 ** (LEVELS - 1)  # pixels that the coarsest level takes as one
-REFINED = dataclasses.replace(PLUS, refiner_width=4, num_features=16)
+REFINED = dataclasses.replace(PLUS, refiner_width=4)
 REFINER = Refiner(width=4)
 FEATURES = 8
 
@@ -143,7 +143,7 @@ class TestSize:
 
 @pytest.fixture(scope="module")
 def network():
-    return wobbled(jax.jit(Renderer(REFINED).init)(jax.random.key(0), cloud(), camera()), 4)
+    return wobbled(jax.jit(inference.network(REFINED).init)(jax.random.key(0), cloud(), camera()), 4)
 
 
 @pytest.fixture(scope="module")
@@ -176,10 +176,10 @@ class TestRendering:
         nothing = np.asarray(plain.acc) == 0
         close(whole.depth[nothing], far[nothing], atol=1e-6)
 
-    @pytest.mark.parametrize("ray_chunk", [7, 300])
-    def test_the_chunk_does_not_matter(self, network, scene, ray_chunk):
+    @pytest.mark.parametrize("block", [7, 300])
+    def test_the_block_does_not_matter(self, network, scene, block):
         whole = inference.jitted_render(network, scene, camera(), config=REFINED)
-        chunked = inference.jitted_render(network, scene, camera(), config=REFINED, ray_chunk=ray_chunk)
+        chunked = inference.jitted_render(network, scene, camera(), config=REFINED, options=RenderOptions(block=block))
         close(chunked, whole, atol=1e-4)
 
     def test_a_view_does_not_know_what_is_beside_it(self, network, scene):
@@ -194,12 +194,13 @@ class TestRendering:
         assert rays_per_side(REFINED, 4) == 2
         render = inference.render
         monkeypatch.setattr(inference, "render", inference.jitted_render)
-        several = render(network, scene, camera(4), config=REFINED, rays_per_side=2)
+        several = render(network, scene, camera(4), config=REFINED, options=RenderOptions(rays_per_side=2))
         same_bits(several, averaged(inference.jitted_render(network, scene, camera(8), config=REFINED), 2))
 
     def test_draft_does_without(self):
-        assert at_quality(REFINED, "draft", 1).refiner_width == 0
-        assert at_quality(REFINED, "balanced", 1).refiner_width == at_quality(REFINED, "best", 1).refiner_width == 4
+        assert not at_quality(REFINED, "draft", 1, REFINED.image_resolution).refine
+        assert at_quality(REFINED, "balanced", 1, REFINED.image_resolution).refine
+        assert at_quality(REFINED, "best", 1, REFINED.image_resolution).refine
 
     @pytest.mark.parametrize("quality", ["balanced", "trained"])
     def test_a_smaller_picture_of_one_ray_a_pixel_is_not_looked_over(self, network, quality):
@@ -224,7 +225,7 @@ class TestRendering:
 
 
 CONFIG = TrainConfig(
-    model=dataclasses.replace(REFINED, render_resolution=24, image_resolution=24, surface_cells=6),
+    model=dataclasses.replace(REFINED, image_resolution=24, surface_cells=6),
     loss=LossConfig(l1_weight=1.0, mse_weight=4.0, adversarial_weight=0.0, opacity_weight=2.0),
     optimizer=OptimizerConfig(lr_generator=1e-2, warmup_steps=0),
     num_steps=30,
@@ -250,7 +251,7 @@ class TestTraining:
         assert np.abs(state.generator["field"]["near"]["kernel"] - begun["field"]["near"]["kernel"]).max() > 0
 
     def test_begins_behind_a_network_without_it(self):
-        plain = dataclasses.replace(CONFIG, model=dataclasses.replace(CONFIG.model, refiner_width=0, num_features=3))
+        plain = dataclasses.replace(CONFIG, model=dataclasses.replace(CONFIG.model, refiner_width=0))
         other = optimisation.averaged_variables(optimisation.jitted_create_state(plain, seed=7))
         state = optimisation.begun_with(optimisation.jitted_create_state(CONFIG), other)
         same_bits({name: state.generator[name] for name in other["params"]}, other["params"])
@@ -281,16 +282,15 @@ class TestTraining:
 
 
 class TestConfig:
-    def test_the_preset_is_that_of_the_weights_with_a_refiner(self):
-        refined, small = presets.plus_refined(), presets.of_any_density(presets.packaged(presets.plus_small(), 16))
-        assert refined.model.refiner_width > 0
-        assert dataclasses.replace(refined.model, refiner_width=0, num_features=3) == small.model
+    def test_the_presets_are_those_of_the_package_s_networks(self):
+        for preset, name in ((presets.plus_refined(), "small"), (presets.plus_lite(), "tiny")):
+            assert preset.model == weights.read_trained(name).config.model
 
     @pytest.mark.parametrize(
         ("changes", "message"),
         [
             ({"crop": 25}, "crop 25 needs .* at most its image_resolution \\(24\\)"),
-            ({"crop": -1}, "crop -1 needs"),
+            ({"crop": -1}, "crop must be at least 0, got -1"),
             ({"pixel_stride": 2, "crop": 0}, "pixel_stride 2 needs a network whose pixels do not depend"),
         ],
     )
@@ -299,16 +299,6 @@ class TestConfig:
             dataclasses.replace(CONFIG, **changes)
 
     def test_a_lattice_and_a_crop_exclude_each_other(self):
-        plain = dataclasses.replace(CONFIG.model, refiner_width=0, num_features=3)
+        plain = dataclasses.replace(CONFIG.model, refiner_width=0)
         with pytest.raises(ValueError, match="pixel_stride 2 and crop 16: use one"):
             dataclasses.replace(CONFIG, model=plain, pixel_stride=2)
-
-    def test_it_needs_the_nearest_points(self):
-        with pytest.raises(ValueError, match="a refiner looks over pictures rendered near the points"):
-            dataclasses.replace(REFINED, num_neighbors=0, color="free", num_features=16)
-        with pytest.raises(ValueError, match="num_features must be 16, RGB and what rays tell .* got 3"):
-            dataclasses.replace(REFINED, num_features=3)
-        with pytest.raises(ValueError, match="looks over coarse samples; use num_fine 0"):
-            dataclasses.replace(REFINED, sampling=dataclasses.replace(REFINED.sampling, num_fine=2))
-        with pytest.raises(ValueError, match="num_features must be 3, RGB, .* got 4"):
-            dataclasses.replace(PLUS, num_features=4)

@@ -29,15 +29,14 @@ from support import tiny_dataset, tiny_model
 from spnr_jax.config import LossConfig
 from spnr_jax.devices import placement
 from spnr_jax.devices.placement import DEPTH, OBJECTS
-from spnr_jax.method import inference, renderer
-from spnr_jax.method.renderer import Renderer
-from spnr_jax.model_config import SamplingConfig
+from spnr_jax.method import inference
+from spnr_jax.method import march as marching
+from spnr_jax.model_config import RenderOptions, SamplingConfig
 from spnr_jax.training import batching, optimisation
 
 PLUS = dataclasses.replace(
     tiny_model.PLUS,
     image_resolution=24,
-    render_resolution=24,
     sampling=SamplingConfig(num_coarse=4, num_fine=4, reach=1),
 )
 MODELS = {
@@ -72,7 +71,7 @@ def inputs(model, size: int):
 def rendered(model, size: int) -> float:
     """Largest difference between the renderings of one device and of all."""
     arguments = inputs(model, size)
-    render = partial(inference.jitted_render, config=model, ray_chunk=16)
+    render = partial(inference.jitted_render, config=model, options=RenderOptions(block=16))
     one, all_of_them = render(*arguments), placement.by_all_devices(render, *arguments)
     assert all_of_them.image.sharding.device_set == one.image.sharding.device_set
     return max(float(jnp.abs(a - b).max()) for a, b in zip(*map(jax.tree.leaves, (one, all_of_them)), strict=True))
@@ -104,22 +103,22 @@ def gradients_apart(model, precision: str) -> float:
 def counting() -> Iterator[Counter[int]]:
     """While it lasts programs are compiled that count the blocks of rays near points which each device renders."""
     found: Counter[int] = Counter()
-    march = Renderer.march_open
+    march = marching.march
 
-    def counted(self, *arguments):
+    def counted(*arguments):
         divided = jax.sharding.get_abstract_mesh().manual_axes
         device = jax.lax.axis_index((OBJECTS, DEPTH)) if divided else 0
         jax.debug.callback(lambda i: found.update([int(i)]), device)
-        return march(self, *arguments)
+        return march(*arguments)
 
-    with mock.patch.object(Renderer, "march_open", counted):
+    with mock.patch.object(marching, "march", counted):
         yield found
 
 
 def blocks() -> list[list[int]]:
     """How many blocks of four rays one device renders, and each of eight."""
     counts = []
-    with counting() as ran, mock.patch.object(renderer, "CPU_BLOCK", 4):
+    with counting() as ran, mock.patch.object(marching, "CPU_BLOCK", 4):
         arguments = inputs(PLUS, SIZES["near points"])
         render = jax.jit(partial(inference.render, config=PLUS))
         for run in (render, partial(placement.by_all_devices, render)):

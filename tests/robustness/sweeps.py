@@ -6,6 +6,7 @@ kernel's value in float64 NumPy, mostly the plain loops of tests/support/referen
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -15,8 +16,8 @@ from support import reference
 
 from spnr_jax.kernels import cameras, compositing, losses, metrics, sampling, voxels
 from spnr_jax.kernels.records import Camera, Rays, Scene
-from spnr_jax.method.renderer import Renderer
-from spnr_jax.model_config import ModelConfig, SamplingConfig
+from spnr_jax.method import inference, march
+from spnr_jax.model_config import AS_TRAINED, PaperConfig, SamplingConfig
 from spnr_jax.nn.normalization import BatchNorm, GroupNorm
 
 RAYS = 16
@@ -172,21 +173,22 @@ def ssim_twin(image, other):
 
 def render(volume, origins, directions, bias):
     """Features, depth and opacity of rays through a volume by a small network; `bias` moves every density."""
-    config = ModelConfig(
+    config = PaperConfig(
         field_width=8,
         num_features=4,
         direction_frequencies=1,
         sampling=SamplingConfig(num_coarse=16, num_fine=16),
     )
-    module, rays = Renderer(config), Rays(origins=origins, directions=directions)
+    module, rays = inference.network(config), Rays(origins=origins, directions=directions)
     encoded, rng = Scene(volume=volume, occupied=jnp.ones(volume.shape[:-1], bool)), np.random.default_rng(7)
-    shapes = jax.eval_shape(lambda: module.init(jax.random.key(0), encoded, rays, method="render_rays"))
+    traced = partial(march.trace, samples=config.sampling, options=AS_TRAINED, key=None)
+    shapes = jax.eval_shape(lambda: module.init(jax.random.key(0), encoded, rays, method=traced))
     draw = lambda x: np.float32(rng.normal(size=x.shape) / max(int(np.prod(x.shape[:-1])), 1) ** 0.5)  # noqa: E731
     variables = jax.tree.map(lambda x: jnp.asarray(draw(x), volume.dtype), shapes)
     head = variables["params"]["field"]["head"]
     # no gradient by the bias: one number for all rays, whose gradients would cancel
     head["bias"] = head["bias"] + jnp.concatenate([jax.lax.stop_gradient(bias), jnp.zeros(3, bias.dtype)])
-    return module.apply(variables, encoded, rays, method="render_rays")
+    return traced(module.bind(variables), encoded, rays)
 
 
 def scene(rng, density=3.0, distance=3.0):

@@ -11,7 +11,7 @@ from valid_files import POINTS, SIZE, VIEWS, numbers
 
 from data_gen.store import layout
 from spnr_jax import presets
-from spnr_jax.config import to_dict
+from spnr_jax.formats.config_json import to_dict
 
 
 def configs() -> list[Files]:
@@ -103,13 +103,16 @@ def lpips() -> list[Files]:
 
 def weights() -> list[Files]:
     """Files of weights of very small networks, one of them NPBG's."""
-    from spnr_jax.model_config import ModelConfig, SamplingConfig
+    from spnr_jax.model_config import EncoderConfig, PaperConfig, SamplingConfig
     from spnr_jax.training.weights import variable_shapes
 
     ours = presets.tiny()
-    assert isinstance(ours.model, ModelConfig)
+    assert isinstance(ours.model, PaperConfig)
     small = dataclasses.replace(
-        ours.model, point_widths=(4,), point_features=4, volume_resolution=8, base_width=4, num_stages=2, field_width=4,
+        ours.model, field_width=4,
+        encoder=EncoderConfig(
+            point_widths=(4,), point_features=4, volume_resolution=8, base_width=4, num_stages=2, num_groups=1
+        ),
         sampling=SamplingConfig(num_coarse=2, num_fine=0), render_resolution=16, resize_resolution=16,
         image_resolution=32, upsampler_width=4,
     )  # fmt: skip

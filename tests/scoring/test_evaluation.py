@@ -14,7 +14,6 @@ from support.tiny_lpips import WEIGHTS
 
 from spnr_jax.formats import data_sets
 from spnr_jax.kernels import metrics
-from spnr_jax.model_config import kind_of
 from spnr_jax.presets import PRESETS
 from spnr_jax.scoring import evaluation, floors
 from spnr_jax.scoring.flip import flip
@@ -101,7 +100,7 @@ def test_networks_are_compared_under_the_names_that_they_are_given(outcome):
 
 
 def test_a_network_is_named_by_what_it_is():
-    assert {name: kind_of(preset().model) for name, preset in PRESETS.items() if name in KINDS} == KINDS
+    assert {name: preset().model.method for name, preset in PRESETS.items() if name in KINDS} == KINDS
 
 
 def test_categories_come_from_the_names_and_add_up(outcome):

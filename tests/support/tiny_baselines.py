@@ -2,8 +2,9 @@
 
 import dataclasses
 
+from spnr_jax.baselines.sizes import NPBGConfig, PointNeRFConfig, Points2NeRFConfig
 from spnr_jax.config import LossConfig, OptimizerConfig
-from spnr_jax.model_config import NetworkConfig, NPBGConfig, PointNeRFConfig, Points2NeRFConfig
+from spnr_jax.model_config import NetworkConfig
 from support import tiny_dataset, tiny_model
 
 SIZE = tiny_dataset.SIZE
@@ -12,7 +13,7 @@ BASELINE = dataclasses.replace(
     loss=LossConfig(l1_weight=1.0, adversarial_weight=0.0, pixel="mse"),
     optimizer=OptimizerConfig(lr_generator=1e-2, warmup_steps=2, ema_decay=0.9),
 )
-PLUS = dataclasses.replace(tiny_model.PLUS, surface_cells=32, render_resolution=SIZE, image_resolution=SIZE)
+PLUS = dataclasses.replace(tiny_model.PLUS, surface_cells=32, image_resolution=SIZE)
 NETWORKS: dict[str, NetworkConfig] = {
     "plus_tiny": PLUS,
     "npbg_tiny": NPBGConfig(encoder_widths=(8, 9), decoder_widths=(5,), image_resolution=SIZE),

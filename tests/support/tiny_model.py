@@ -6,19 +6,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from spnr_jax.baselines.sizes import PointNeRFConfig
 from spnr_jax.kernels.cameras import look_at, pinhole
 from spnr_jax.kernels.records import PointCloud
-from spnr_jax.model_config import ModelConfig, PointNeRFConfig, SamplingConfig
+from spnr_jax.model_config import EncoderConfig, NearPointsConfig, PaperConfig, SamplingConfig
 from support.laws import numbers
 
 SIZE = 24  # the smallest image that the discriminator can judge
-MODEL = ModelConfig(
-    point_widths=(8,),
-    point_features=4,
-    volume_resolution=8,
-    base_width=4,
-    num_stages=1,
-    num_groups=2,
+ENCODER = EncoderConfig(
+    point_widths=(8,), point_features=4, volume_resolution=8, base_width=4, num_stages=1, num_groups=2
+)
+MODEL = PaperConfig(
+    encoder=ENCODER,
     field_width=8,
     num_features=5,
     direction_frequencies=1,
@@ -29,14 +28,14 @@ MODEL = ModelConfig(
     upsampler_width=4,
 )
 WITHOUT_UPSAMPLER = dataclasses.replace(MODEL, image_resolution=8)
-PLUS = dataclasses.replace(
-    WITHOUT_UPSAMPLER,
-    num_features=3,
+PLUS = NearPointsConfig(
+    encoder=dataclasses.replace(ENCODER, point_norm="layer"),
+    field_width=8,
+    direction_frequencies=1,
     num_neighbors=3,
     surface_cells=6,  # of 40 points
-    color="lit",
-    point_norm="layer",
     sampling=SamplingConfig(num_coarse=6, num_fine=0, reach=1),
+    image_resolution=8,
 )
 POINT_NERF = PointNeRFConfig(
     radius=0.25,
@@ -53,6 +52,11 @@ POINT_NERF = PointNeRFConfig(
     ray_chunk=20,
 )
 NUM_POINTS = 40
+
+
+def with_encoder(model, **changes):
+    """A network with other sizes of its encoder."""
+    return dataclasses.replace(model, encoder=dataclasses.replace(model.encoder, **changes))
 
 
 def cloud():

@@ -7,8 +7,8 @@ import jax
 import numpy as np
 
 from spnr_jax.kernels.records import PointCloud
+from spnr_jax.method import inference
 from spnr_jax.method.model import Model
-from spnr_jax.method.renderer import Renderer
 from spnr_jax.viewer.scene import Scene, open_scene
 from spnr_jax.viewer.session import State
 from spnr_jax.viewer.viewpoint import OPENCV, View, from_browser, to_browser
@@ -20,7 +20,9 @@ RED, BLUE = (0.8, 0.05, 0.05), (0.05, 0.05, 0.8)
 @functools.cache
 def model() -> Model:
     """The network of the tests, its weights away from zero."""
-    weights = jax.jit(Renderer(tiny_model.MODEL).init)(jax.random.key(0), tiny_model.cloud(), tiny_model.camera())
+    weights = jax.jit(inference.network(tiny_model.MODEL).init)(
+        jax.random.key(0), tiny_model.cloud(), tiny_model.camera()
+    )
     return Model(config=tiny_model.MODEL, variables=tiny_model.wobbled(weights, 4))
 
 

@@ -9,16 +9,17 @@ import numpy as np
 import optax
 import pytest
 from support.laws import close, numbers, same_bits
-from support.tiny_model import MODEL, SIZE
+from support.tiny_model import MODEL, PLUS, SIZE
 from support.tiny_training import BATCH, CONFIG, L1_ONLY, copied, create, run, step
 
 from spnr_jax.baselines import networks
+from spnr_jax.baselines.sizes import NPBGConfig
 from spnr_jax.config import LossConfig, OptimizerConfig
 from spnr_jax.kernels import cameras, losses
 from spnr_jax.kernels.records import Rendering
 from spnr_jax.method import inference
-from spnr_jax.method.renderer import Renderer
-from spnr_jax.model_config import NPBGConfig, PointNeRFConfig
+from spnr_jax.method.near_points import NearPointsNetwork
+from spnr_jax.method.paper import PaperNetwork
 from spnr_jax.training import optimisation
 
 
@@ -120,7 +121,7 @@ class TestStep:
 
             def forward(params):
                 variables = {"params": params, "batch_stats": start.batch_stats}
-                return Renderer(MODEL).apply(
+                return inference.network(MODEL).apply(
                     variables, data.cloud, data.camera, jax.random.clone(key), train=True, mutable=["batch_stats"]
                 )
 
@@ -305,7 +306,7 @@ class OneColor(nn.Module):
 
 def test_a_method_is_a_network_and_a_loss(monkeypatch):
     """One weight g, no statistics: the gradient of 2 mean (g - reference)^2 + 3 g^2, written out."""
-    monkeypatch.setitem(networks.NETWORKS, OneColorConfig, OneColor)
+    monkeypatch.setitem(networks.NETWORKS, "one_color", OneColor)
     config = dataclasses.replace(
         L1_ONLY,
         model=OneColorConfig(image_resolution=32),
@@ -323,9 +324,10 @@ def test_a_method_is_a_network_and_a_loss(monkeypatch):
     assert after.averaged["grey"] != after.generator["grey"]
 
 
-def test_a_network_of_rays_is_shown_in_chunks_and_one_of_pictures_whole():
-    assert {PointNeRFConfig().ray_chunk, NPBGConfig.ray_chunk, MODEL.ray_chunk} == {256, None, 1024}
-    assert isinstance(inference.network(MODEL), Renderer)
+def test_rays_through_all_the_box_are_shown_in_blocks_and_those_near_points_in_their_own():
+    assert (inference.trained(MODEL).block, inference.trained(PLUS).block) == (1024, None)
+    assert isinstance(inference.network(MODEL), PaperNetwork)
+    assert isinstance(inference.network(PLUS), NearPointsNetwork)
 
 
 class TestReproducibility:

@@ -12,15 +12,15 @@ from functools import partial
 import jax
 import numpy as np
 import pytest
-from support import tiny_dataset
+from support import tiny_dataset, tiny_model
 from support.laws import close, same_bits
 from support.tiny_dataset import CONFIG, SCHEDULE
 
 import spnr_jax
 from spnr_jax import cli
+from spnr_jax.baselines.sizes import NPBGConfig, PointNeRFConfig
 from spnr_jax.config import LossConfig
 from spnr_jax.formats import data_sets
-from spnr_jax.model_config import NPBGConfig, PointNeRFConfig
 from spnr_jax.scoring import evaluation
 from spnr_jax.training import batching, checkpoint, optimisation, run_record, trainer, weights
 
@@ -82,7 +82,7 @@ class TestBeginningWithOtherWeights:
         same_bits(trainer.train(CONFIG, tiny_dataset.dataset(), run, SCHEDULE, init=zero), restored(tiny_dataset.run()))
 
     def test_weights_of_another_network_are_refused_in_one_line(self, tmp_path, capsys):
-        small = dataclasses.replace(CONFIG.model, base_width=2 * CONFIG.model.base_width)
+        small = tiny_model.with_encoder(CONFIG.model, base_width=2 * CONFIG.model.encoder.base_width)
         config, init = dataclasses.replace(CONFIG, model=small), weights.read_trained(tiny_dataset.run())
         work = partial(trainer.train, config, tiny_dataset.dataset(), tmp_path, SCHEDULE, init=init)
         assert cli.guarded(work, "spnr") == 2

@@ -17,7 +17,6 @@ from spnr_jax.config import LossConfig, OptimizerConfig, TrainConfig
 from spnr_jax.formats import data_sets
 from spnr_jax.kernels import losses
 from spnr_jax.method import inference
-from spnr_jax.method.renderer import Renderer
 from spnr_jax.presets import BASELINES, OURS, PLUS, tiny
 from spnr_jax.training import batching, optimisation, trainer
 
@@ -154,15 +153,18 @@ class TestOddBatches:
 def shrunken(config: TrainConfig, precision: str, num_steps: int) -> TrainConfig:
     """A preset with its own stages, passes, losses and schedule, at 16 rays a side and the narrowest layers."""
     m, smaller = config.model, config.model.render_resolution // 16
-    groups = min(m.num_groups, 2)
+    encoder = dataclasses.replace(
+        m.encoder,
+        point_widths=tuple(width // 16 for width in m.encoder.point_widths),
+        point_features=4,
+        volume_resolution=2**m.encoder.num_stages,
+        base_width=2,
+        num_groups=min(m.encoder.num_groups, 2),
+    )
     sizes = {f"{n}_resolution": getattr(m, f"{n}_resolution") // smaller for n in ("render", "resize", "image")}
     model = dataclasses.replace(
         m,
-        point_widths=tuple(width // 16 for width in m.point_widths),
-        point_features=4,
-        volume_resolution=2**m.num_stages,
-        base_width=2,
-        num_groups=groups,
+        encoder=encoder,
         field_width=8,
         num_features=5,
         sampling=dataclasses.replace(m.sampling, num_coarse=4, num_fine=4),
@@ -247,7 +249,7 @@ def test_no_seed_of_twenty_has_a_dead_density():
 
     def begin(key):
         init_key, step_key = jax.random.split(key)
-        variables = Renderer(config.model).init(init_key, *inference.example_inputs(config.model))
+        variables = inference.network(config.model).init(init_key, *inference.example_inputs(config.model))
         fresh = tiny_training.create(config)
         return dataclasses.replace(fresh, key=step_key, generator=variables["params"])
 
@@ -260,7 +262,7 @@ def test_no_seed_of_twenty_has_a_dead_density():
     @jax.vmap
     def opacity(state):
         variables = {"params": state.generator, "batch_stats": state.batch_stats}
-        acc = Renderer(config.model).apply(variables, batch.cloud, batch.camera).acc
+        acc = inference.network(config.model).apply(variables, batch.cloud, batch.camera).acc
         white = losses.area_downsample(batch.image, config.model.render_resolution)
         return jnp.mean(acc, where=(white < 0.99).any(axis=-1))
 

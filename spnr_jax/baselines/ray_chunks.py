@@ -1,0 +1,32 @@
+"""Pictures of a baseline whose rays know nothing of each other, some rays at a time, which bounds the memory."""
+
+from functools import partial
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+from spnr_jax.devices.placement import on_own_rays
+from spnr_jax.kernels import cameras
+from spnr_jax.kernels.records import Camera, Rendering
+
+
+def render(module: Any, scene: Any, camera: Camera, chunk: int) -> Rendering:
+    """Views of encoded objects by a bound module with `rays` and `render_rays`, `chunk` rays of each object at once."""
+    network, variables = module.unbind()
+    in_chunks = partial(_in_chunks, network, chunk)
+    return cameras.as_images(camera, *on_own_rays(in_chunks, variables, scene, module.rays(camera)))
+
+
+def _in_chunks(module: nn.Module, chunk: int, variables: dict, scene: Any, rays: Any) -> Any:
+    """What the module's `render_rays` gives for rays (objects, rays, ...), so many of each object at a time."""
+    num_rays = jax.tree.leaves(rays)[0].shape[1]
+    chunk = min(chunk, num_rays)
+
+    def chunked(x):
+        padded = jnp.pad(x, ((0, 0), (0, -num_rays % chunk), *[(0, 0)] * (x.ndim - 2)), mode="edge")
+        return jnp.moveaxis(padded.reshape(x.shape[0], -1, chunk, *x.shape[2:]), 1, 0)
+
+    outputs = jax.lax.map(lambda rays: module.bind(variables).render_rays(scene, rays), jax.tree.map(chunked, rays))
+    return jax.tree.map(lambda x: jnp.moveaxis(x, 0, 1).reshape(x.shape[1], -1, *x.shape[3:])[:, :num_rays], outputs)

@@ -1,0 +1,188 @@
+"""Rays through a field, whichever network it is: where their samples lie, and what of them is seen.
+
+    trace    all rays: those that meet nothing are left out, the others rendered in blocks, by the devices of the mesh
+    march    rays of a block: coarse samples, fine samples where the coarse weights are large, compositing
+
+What is marched through is a *field*: a function of distances (*rays, samples) that gives `Samples`.
+"""
+
+import operator
+from collections.abc import Callable
+from functools import partial, reduce
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from spnr_jax.devices.placement import on_own_rays
+from spnr_jax.kernels import cameras, compositing, occupancy, sampling
+from spnr_jax.kernels.numerics import clamp
+from spnr_jax.kernels.occupancy import Path
+from spnr_jax.kernels.records import Key, Rays, Scene
+from spnr_jax.model_config import RenderOptions, SamplingConfig
+
+CELLS_PER_VOXEL = 1  # of a path through the box, counted along an axis
+RAY_BLOCK = 256  # rays near points that are rendered at once
+CPU_BLOCK = 64  # the same on a CPU without a training's key: what they read stays in its first cache
+LOOKED_AT = 2**14  # rays of which it is found out at once whether they meet anything
+
+
+class Samples(NamedTuple):
+    """A field at samples: trees of numbers (*rays, samples, ...) that are composited, or of which the least counts."""
+
+    density: Array
+    summed: Any
+    least: Any = ()
+
+
+class Seen(NamedTuple):
+    """Rays after compositing: `summed` and `least` of the samples, opacity, and the expected distance."""
+
+    summed: Any
+    least: Any
+    acc: Array
+    depth: Array
+
+
+class Traced(NamedTuple):
+    """Rays of objects: features, of which the first three are RGB on white, expected distance, opacity."""
+
+    features: Float[Array, "*rays k"]
+    depth: Float[Array, "*rays"]
+    acc: Float[Array, "*rays"]
+
+
+Field = Callable[[Float[Array, "*rays samples"]], Samples]
+Finish = Callable[[Seen], Float[Array, "*rays k"]]
+
+
+def trace(
+    module: Any, scene: Scene, rays: Rays, samples: SamplingConfig, options: RenderOptions, key: Key | None
+) -> Traced:
+    """The rays (objects, rays, ...) of a network; a key jitters the samples of each ray by the ray's number.
+
+    The network is a bound Linen module: `along(scene, rays, objects, options)` is its field along rays, and the
+    function that makes features of what is `Seen`; `num_features(options)` are the features of a ray.
+    """
+    shape = rays.origins.shape[:-1]
+    number = jnp.arange(shape[0] * shape[1]).reshape(shape)
+    if module.is_initializing():
+        return _on_one_device(lambda: module, scene, rays, number, samples, options, key)
+    network, variables = module.unbind()  # transformations of JAX must not close over a bound module
+
+    def own(whole, scene, own_rays):
+        variables, key = whole
+        return _on_one_device(lambda: network.bind(variables), scene, *own_rays, samples, options, key)
+
+    return on_own_rays(own, (variables, key), scene, (rays, number))
+
+
+def _on_one_device(
+    bound: Callable[[], Any],
+    scene: Scene,
+    rays: Rays,
+    number: Int[Array, "objects rays"],
+    samples: SamplingConfig,
+    options: RenderOptions,
+    key: Key | None,
+) -> Traced:
+    """`trace` of the device's own rays."""
+    shape = number.shape
+    objects = jnp.broadcast_to(jnp.arange(shape[0])[:, None], shape)
+    inputs = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), (objects, number, rays))
+    near_points = occupancy.dilate(scene.occupied, samples.reach) if samples.reach else None
+
+    def block(objects, number, rays):
+        field, finish = bound().along(scene, rays, objects, options)
+        keys = None if key is None else jax.vmap(jax.random.fold_in, (None, 0))(key, number)
+        seen = march(field, _path(near_points, rays, objects), samples, keys)
+        return Traced(finish(seen), seen.depth, seen.acc)
+
+    size = options.block
+    if size is None and samples.reach:
+        size = CPU_BLOCK if key is None and jax.default_backend() == "cpu" else RAY_BLOCK
+    if size is None or bound().is_initializing():  # a module that is made has no weights yet for a block to read
+        traced = block(*inputs)
+    else:
+        objects, _, rays = inputs
+        _, far, _ = cameras.intersect_box(rays.origins, rays.directions)
+        white = jnp.zeros((far.size, bound().num_features(options))).at[:, :3].set(compositing.WHITE)
+        nothing = Traced(white, far, jnp.zeros_like(far))
+        traced = occupancy.map_existing(block, _meets(near_points, rays, objects), inputs, nothing, size)
+    return jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), traced)
+
+
+def _path(near_points: Bool[Array, "objects g g g"] | None, rays: Rays, objects: Int[Array, " rays"]) -> Path:
+    """The part of each ray that is sampled: what lies near points, or all that lies in the box."""
+    near, far, _ = cameras.intersect_box(rays.origins, rays.directions)
+    if near_points is None:
+        return occupancy.whole_path(near, far)
+    return occupancy.open_path(near_points, rays, near, far, CELLS_PER_VOXEL * near_points.shape[-1], objects)
+
+
+def _meets(
+    near_points: Bool[Array, "objects g g g"] | None, rays: Rays, objects: Int[Array, " rays"]
+) -> Bool[Array, " rays"]:
+    """Whether there is anything to sample on each ray; paths are many numbers, so they are not kept."""
+    total = objects.size
+    size = min(total, LOOKED_AT)
+
+    def chunked(x):
+        return jnp.pad(x, ((0, -total % size), *[(0, 0)] * (x.ndim - 1)), mode="edge").reshape(-1, size, *x.shape[1:])
+
+    found = jax.lax.map(lambda x: _path(near_points, *x).travelled[:, -1] > 0, jax.tree.map(chunked, (rays, objects)))
+    return found.reshape(-1)[:total]
+
+
+def places(rays: Rays, distances: Float[Array, "*rays samples"]) -> Float[Array, "*rays samples 3"]:
+    """Positions of samples: rays end on the faces of the box, and rounding must not push them out of it."""
+    return clamp(rays.origins[..., None, :] + distances[..., None] * rays.directions[..., None, :], -1, 1)
+
+
+def march(field: Field, path: Path, counts: SamplingConfig, key: Key | None) -> Seen:
+    """What is seen of a field along paths; the key is one for all rays, or one for each."""
+    coarse_key, fine_key = (None, None) if key is None else sampling.split(key)
+    length, far = path.travelled[..., -1], path.edges[..., -1]
+    coarse, edges = sampling.stratified(coarse_key, jnp.zeros_like(length), length, counts.num_coarse)
+    passes = [field(occupancy.distance_at(path, coarse))]
+    weights, _ = compositing.volume_weights(passes[0].density, compositing.interval_lengths(coarse, length))
+    travelled, shares = coarse, [weights]
+    if counts.num_fine:
+        # 64 fine samples where the coarse weights are large [paper]; the union of both is composited
+        fine = sampling.importance(fine_key, edges, weights, counts.num_fine, counts.padding)
+        passes.append(field(occupancy.distance_at(path, fine)))
+        density = jnp.concatenate([samples.density for samples in passes], axis=-1)
+        weights = union_weights(coarse, fine, density, length)
+        travelled = jnp.concatenate([coarse, fine], axis=-1)
+        shares = jnp.split(weights, [counts.num_coarse], axis=-1)
+
+    # each pass is composited where it lies: sums do not mind the order, and nothing wide is concatenated
+    sums = [
+        jax.tree.map(partial(compositing.composite, share), samples.summed)
+        for share, samples in zip(shares, passes, strict=True)
+    ]
+    least = [jax.tree.map(partial(jnp.min, axis=-2), samples.least) for samples in passes]
+    return Seen(
+        summed=jax.tree.map(lambda *parts: reduce(operator.add, parts), *sums),
+        least=jax.tree.map(lambda *parts: reduce(jnp.minimum, parts), *least),
+        acc=jnp.sum(weights, axis=-1),
+        depth=compositing.expected_distance(weights, occupancy.distance_at(path, travelled), far),
+    )
+
+
+def union_weights(
+    coarse: Float[Array, "*batch n"],
+    fine: Float[Array, "*batch m"],
+    density: Float[Array, "*batch n+m"],
+    far: Float[Array, "*batch"],
+) -> Float[Array, "*batch n+m"]:
+    """Compositing weights of coarse and fine samples together, in the order [coarse, fine].
+
+    Only densities are sorted along the ray; what the weights multiply can stay where it is.
+    """
+    order, rank = sampling.merge(coarse, fine)
+    distances = jnp.concatenate([coarse, fine], axis=-1)
+    distances, density = (jnp.take_along_axis(x, order, axis=-1) for x in (distances, density))
+    weights, _ = compositing.volume_weights(density, compositing.interval_lengths(distances, far))
+    return jnp.take_along_axis(weights, rank, axis=-1)

@@ -1,0 +1,70 @@
+"""From points to a feature volume: PointNet on every point, mean per voxel, 3D U-Net [paper]."""
+
+from functools import partial
+from typing import Literal
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from spnr_jax.kernels import voxels
+from spnr_jax.kernels.records import PointCloud
+from spnr_jax.model_config import EncoderConfig
+from spnr_jax.nn.normalization import BatchNorm
+from spnr_jax.nn.unet3d import UNet3D
+
+
+class PointNet(nn.Module):
+    """Shared MLP; each hidden layer is followed by normalisation and ReLU, the output is linear.
+
+    `norm` is "batch" [paper], or "layer", which knows no statistics of other points.
+    """
+
+    widths: tuple[int, ...]
+    num_features: int
+    norm: Literal["batch", "layer"] = "batch"
+
+    @nn.compact
+    def __call__(
+        self, x: Float[Array, "*batch points channels"], mask: Bool[Array, "*batch points"], train: bool
+    ) -> Float[Array, "*batch points features"]:
+        """Features of every point; masked points do not touch the statistics of a batch."""
+        # one long axis of points: XLA's CPU gradient of a product that sums over several axes takes four times as long
+        shape, x, mask = mask.shape, x.reshape(-1, x.shape[-1]), mask.reshape(-1)
+        for i, width in enumerate(self.widths):
+            x = nn.Dense(width, use_bias=False, name=f"hidden_{i}")(x)
+            name = f"norm_{i}"
+            x = nn.relu(BatchNorm(name=name)(x, mask, train) if self.norm == "batch" else nn.LayerNorm(name=name)(x))
+        return nn.Dense(self.num_features, name="out")(x).reshape(*shape, self.num_features)
+
+
+class Encoder(nn.Module):
+    """Both networks of rays begin with it; with bf16 the convolutions of the U-Net run in bfloat16."""
+
+    config: EncoderConfig
+    bf16: bool = False
+
+    def setup(self) -> None:
+        """The two networks."""
+        c = self.config
+        self.pointnet = PointNet(c.point_widths, c.point_features, c.point_norm)
+        self.unet = UNet3D(c.volume_resolution, c.base_width, c.num_stages, c.num_groups, self.bf16, c.skip)
+
+    def __call__(self, cloud: PointCloud, train: bool = False) -> Float[Array, "objects d d d features"]:
+        """Feature volume of each object, (z, y, x)."""
+        positions, mask = jnp.asarray(cloud.positions), jnp.asarray(cloud.mask)
+        spread = partial(voxels.spread, self.config.scatter, resolution=self.config.volume_resolution)
+        return self.unet(*jax.vmap(spread)(positions, self.point_features(cloud, train), mask))
+
+    def point_features(self, cloud: PointCloud, train: bool = False) -> Float[Array, "objects points features"]:
+        """What the PointNet makes of each point."""
+        return self.pointnet(self.point_inputs(cloud), jnp.asarray(cloud.mask), train)
+
+    def point_inputs(self, cloud: PointCloud) -> Float[Array, "objects points channels"]:
+        """Position, offset from the centre of the own voxel, and the materials that the network is built for."""
+        _, offset = voxels.locate(jnp.asarray(cloud.positions), self.config.volume_resolution)
+        materials = [getattr(cloud, name) for name in self.config.materials]
+        materials = [m[..., None] if m.ndim < cloud.positions.ndim else m for m in materials]
+        inputs = jnp.concatenate([cloud.positions, offset, *materials], axis=-1)
+        return jnp.where(cloud.mask[..., None], inputs, 0.0)
