@@ -1,7 +1,7 @@
 """The sizes of the package's networks, as frozen dataclasses, and how a render is asked for.
 
     EncoderConfig      points to a volume, which both networks of rays begin with
-    PaperConfig        the paper's network             method/paper.py
+    PaperConfig        the paper's network             method/paper_network.py
     NearPointsConfig   the network near points         method/near_points.py
     SurfelConfig       the network over surfels        method/surfel_renderer.py
 
@@ -17,7 +17,6 @@ from typing import Annotated, Any, ClassVar, Literal, get_args, get_origin, get_
 from spnr_jax.errors import UserError
 
 Material = Literal["base_color", "roughness", "metallic"]
-Precision = Literal["float32", "bfloat16"]
 MATERIAL_CHANNELS = {"base_color": 3, "roughness": 1, "metallic": 1}
 CELLS = 1.0  # of the grid of nearest points along an axis, per square root of the number of points; 0.75 lost 0.1 dB
 MOST_CELLS = 96
@@ -169,11 +168,6 @@ class EncoderConfig:
             f"base_width {self.base_width} must be a positive multiple of num_groups {self.num_groups}",
         )
 
-    @property
-    def num_material_channels(self) -> int:
-        """Numbers a point carries besides its position."""
-        return sum(MATERIAL_CHANNELS[name] for name in self.materials)
-
 
 @dataclass(frozen=True, kw_only=True)
 class NetworkConfig:
@@ -213,7 +207,7 @@ class RayNetworkConfig(NetworkConfig):
     """Frequencies of the view direction's encoding; 0 gives the field the bare direction."""
     sees_direction: bool = True
     """Whether colour and features depend on the view direction."""
-    precision: Precision = "float32"
+    precision: Literal["float32", "bfloat16"] = "float32"
     """Format of the convolutions in U-Net, refiner, upsampler, discriminator; all else, parameters too, is float32."""
 
     @property

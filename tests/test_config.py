@@ -170,12 +170,6 @@ def test_unknown_options_are_errors():
         SamplingConfig(num_samples=3)
 
 
-def test_material_channels_are_counted_from_the_names():
-    assert EncoderConfig().num_material_channels == 5
-    assert EncoderConfig(materials=("roughness",)).num_material_channels == 1
-    assert EncoderConfig(materials=()).num_material_channels == 0
-
-
 def test_an_image_too_small_for_the_discriminator_is_named():
     small = PaperConfig(render_resolution=8, resize_resolution=8, image_resolution=16)
     with pytest.raises(ValueError, match="image_resolution 16 is too small"):

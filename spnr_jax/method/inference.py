@@ -27,7 +27,7 @@ def network(config: NetworkConfig) -> nn.Module:
     """The module that a network's config describes."""
     match config.method:
         case "paper":
-            from spnr_jax.method.paper import PaperNetwork
+            from spnr_jax.method.paper_network import PaperNetwork
 
             return PaperNetwork(cast(PaperConfig, config))
         case "near_points":

@@ -13,7 +13,6 @@ the uninterrupted one bit for bit.
 """
 
 import dataclasses
-from collections.abc import Callable
 from functools import partial
 from typing import Any, no_type_check
 
@@ -28,10 +27,11 @@ from spnr_jax.config import TrainConfig
 from spnr_jax.errors import UserError
 from spnr_jax.kernels import losses
 from spnr_jax.kernels.metrics import psnr
-from spnr_jax.kernels.records import Batch, Camera, Key
+from spnr_jax.kernels.records import Batch, Key
 from spnr_jax.method.inference import init, network
 from spnr_jax.model_config import RayNetworkConfig
 from spnr_jax.nn.discriminator import Discriminator
+from spnr_jax.training import pixels
 
 
 @no_type_check
@@ -147,46 +147,6 @@ def begun_with(state: TrainState, variables: dict) -> TrainState:
     )
 
 
-def lattice(key: Key, batch: Batch, stride: int) -> Batch:
-    """The batch with every `stride`-th row and column of its views, from a random first one on: images still."""
-    first = jax.random.randint(key, (2,), 0, stride)
-
-    def thinned(x):
-        for axis, start in zip((2, 3), first, strict=True):
-            x = x.reshape(*x.shape[:axis], x.shape[axis] // stride, stride, *x.shape[axis + 1 :])
-            x = jax.lax.dynamic_index_in_dim(x, start, axis + 1, keepdims=False)
-        return x
-
-    # pixel i of the lattice has its centre at first + stride * i + 0.5 of the view
-    shift = 0.5 - (first[::-1] + 0.5) / stride
-    zoom = jnp.diag(jnp.array([1 / stride, 1 / stride, 1.0])).at[:2, 2].set(shift)
-    intrinsics = jnp.einsum("ij,...jk->...ik", zoom, batch.camera.intrinsics, precision="highest")
-    return _some_pixels(batch, thinned, intrinsics)
-
-
-def cropped(key: Key, batch: Batch, size: int) -> Batch:
-    """The batch with a square of `size` pixels of each view, at one random place for all: images still."""
-    height, width = batch.image.shape[2:4]
-    first = jax.random.randint(key, (2,), 0, jnp.array([height, width]) - size + 1)
-
-    def cut(x):
-        for axis, start in zip((2, 3), first, strict=True):
-            x = jax.lax.dynamic_slice_in_dim(x, start, size, axis)
-        return x
-
-    return _some_pixels(batch, cut, jnp.asarray(batch.camera.intrinsics).at[..., :2, 2].add(-first[::-1]))
-
-
-def _some_pixels(batch: Batch, some: Callable[[Array], Array], intrinsics: Array) -> Batch:
-    """The batch with some of the pixels of its images, which cameras of these intrinsics see."""
-    images = (batch.image, batch.alpha, batch.condition, batch.condition_mask)
-    image, alpha, condition, mask = (some(jnp.asarray(x)) for x in images)
-    camera = Camera(
-        cam_to_world=batch.camera.cam_to_world, intrinsics=intrinsics, height=image.shape[2], width=image.shape[3]
-    )
-    return Batch(cloud=batch.cloud, camera=camera, image=image, alpha=alpha, condition=condition, condition_mask=mask)
-
-
 def pixel_error(config: TrainConfig, image: Array, reference: Array, seen: Array | None = None) -> Float[Array, ""]:
     """Mean error of all pixels, or of those that are `seen` (0 if there are none)."""
     if seen is None:
@@ -246,10 +206,10 @@ def train_step(
     key = jax.random.fold_in(state.key, state.step)
     if config.pixel_stride > 1:
         key, lattice_key = jax.random.split(key)
-        batch = lattice(lattice_key, batch, config.pixel_stride)
+        batch = pixels.lattice(lattice_key, batch, config.pixel_stride)
     if config.crop:
         key, crop_key = jax.random.split(key)
-        batch = cropped(crop_key, batch, config.crop)
+        batch = pixels.cropped(crop_key, batch, config.crop)
     module, reference = network(config.model), jnp.asarray(batch.image)
     generator_adam, discriminator_adam = optimizers(config)
 

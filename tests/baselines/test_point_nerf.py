@@ -19,7 +19,7 @@ from spnr_jax.kernels import cameras
 from spnr_jax.kernels.records import Rays
 from spnr_jax.method import inference
 from spnr_jax.presets import PRESETS
-from spnr_jax.training import optimisation
+from spnr_jax.training import optimisation, pixels
 
 CONFIG = tiny_model.POINT_NERF
 MODULE = PointNeRF(CONFIG)
@@ -239,7 +239,7 @@ class TestTraining:
         _, metrics = step(fresh, TRAINING, BATCH)
         key = jax.random.fold_in(fresh.key, 0)
         key, lattice_key = jax.random.split(key)
-        seen = optimisation.lattice(lattice_key, BATCH, 3)
+        seen = pixels.lattice(lattice_key, BATCH, 3)
         rendering = jax.jit(PointNeRF(TRAINING.model).apply)({"params": fresh.generator}, seen.cloud, seen.camera, key)
         hit = np.asarray(rendering.acc > 0)
         assert 0.05 < hit.mean() < 0.95

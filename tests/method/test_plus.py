@@ -19,7 +19,7 @@ from spnr_jax.method.march import trace
 from spnr_jax.method.model import Model
 from spnr_jax.model_config import AS_TRAINED, NearPointsConfig, PaperConfig, RenderOptions, SamplingConfig, surface_grid
 from spnr_jax.tools.density_grid import sample_density
-from spnr_jax.training import optimisation
+from spnr_jax.training import pixels
 
 GENERIC = camera(target=0.0171)  # no cell has its middle on a face between cells, where rounding would decide
 
@@ -154,7 +154,7 @@ class TestTraining:
 
     def test_the_opacity_that_is_learnt_is_that_of_the_thinned_pixels(self):
         batch = tiny_training.BATCH
-        thinned = optimisation.lattice(jax.random.key(3), batch, 3)
+        thinned = pixels.lattice(jax.random.key(3), batch, 3)
         # the balls are opaque where they are not white
         same_bits(thinned.alpha > 0, (thinned.image != 1).any(axis=-1))
         assert thinned.alpha.shape == thinned.image.shape[:-1]

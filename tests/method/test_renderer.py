@@ -19,7 +19,7 @@ from spnr_jax.kernels.cameras import intersect_box, view_rays
 from spnr_jax.kernels.records import Rays, Scene
 from spnr_jax.method import inference
 from spnr_jax.method.march import union_weights
-from spnr_jax.model_config import AS_TRAINED, RenderOptions
+from spnr_jax.model_config import AS_TRAINED, MATERIAL_CHANNELS, RenderOptions
 from spnr_jax.nn.encoder import Encoder
 
 SUPPORT = Path(__file__).parents[1] / "support"
@@ -126,7 +126,7 @@ class TestCloud:
             cloud(), **{name: jnp.full_like(getattr(cloud(), name), jnp.nan) for name in unread}
         )
         inputs = module.apply({}, spoilt, method="point_inputs")
-        assert inputs.shape[-1] == 6 + config.num_material_channels
+        assert inputs.shape[-1] == 6 + sum(MATERIAL_CHANNELS[name] for name in materials)
         assert jnp.isfinite(inputs).all()
         names = iter(range(6, inputs.shape[-1]))
         for name in materials:

@@ -20,7 +20,7 @@ from spnr_jax.method.inference import rays_per_side
 from spnr_jax.method.model import Model, at_quality
 from spnr_jax.model_config import RenderOptions
 from spnr_jax.nn.refiner import FOLD, LEAST, LEVELS, ODDS, Refiner
-from spnr_jax.training import optimisation, weights
+from spnr_jax.training import optimisation, pixels, weights
 
 SQUARE = FOLD * 2 ** (LEVELS - 1)  # pixels that the coarsest level takes as one
 REFINED = dataclasses.replace(PLUS, refiner_width=4)
@@ -261,7 +261,7 @@ class TestTraining:
 
     def test_a_crop_is_a_square_of_picture_condition_and_rays(self):
         batch, firsts = tiny_training.batch(), set()
-        made, whole = jax.jit(optimisation.cropped, static_argnums=2), cameras.camera_rays(batch.camera).directions
+        made, whole = jax.jit(pixels.cropped, static_argnums=2), cameras.camera_rays(batch.camera).directions
         for seed in range(6):
             crop = made(jax.random.key(seed), batch, 10)
             rays = cameras.camera_rays(crop.camera).directions
@@ -278,7 +278,7 @@ class TestTraining:
 
     def test_a_crop_as_large_as_the_view_is_the_view(self):
         batch = tiny_training.batch()
-        same_bits(optimisation.cropped(jax.random.key(0), batch, batch.image.shape[2]), batch)
+        same_bits(pixels.cropped(jax.random.key(0), batch, batch.image.shape[2]), batch)
 
 
 class TestConfig:

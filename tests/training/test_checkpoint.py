@@ -11,7 +11,8 @@ from support import tiny_dataset
 from support.laws import same_bits
 from support.tiny_dataset import CONFIG
 
-from spnr_jax import config, presets
+from spnr_jax import presets
+from spnr_jax.formats.config_json import to_dict
 from spnr_jax.training import checkpoint, optimisation
 
 # Orbax's reader drops a coroutine of its Zarr store when a file is not what it expects
@@ -152,7 +153,7 @@ def test_a_run_that_never_got_to_a_checkpoint_may_begin_again_with_another_confi
 
 
 @pytest.mark.parametrize(
-    "text", ["", "{", "[]", "3", '{"preset": "tiny"}', json.dumps(config.to_dict(CONFIG) | {"num_steps": "many"})]
+    "text", ["", "{", "[]", "3", '{"preset": "tiny"}', json.dumps(to_dict(CONFIG) | {"num_steps": "many"})]
 )
 def test_a_config_that_is_none_is_an_error_with_its_path(text, tmp_path):
     (tmp_path / "config.json").write_text(text)

@@ -1,6 +1,7 @@
 """The training step: two networks, one forward, and a state that repeats itself bit for bit."""
 
 import dataclasses
+from typing import ClassVar
 
 import flax.linen as nn
 import jax
@@ -19,8 +20,8 @@ from spnr_jax.kernels import cameras, losses
 from spnr_jax.kernels.records import Rendering
 from spnr_jax.method import inference
 from spnr_jax.method.near_points import NearPointsNetwork
-from spnr_jax.method.paper import PaperNetwork
-from spnr_jax.training import optimisation
+from spnr_jax.method.paper_network import PaperNetwork
+from spnr_jax.training import optimisation, pixels
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +50,7 @@ def through_host(state):
 class TestState:
     def test_equal_seeds_give_equal_bits_and_other_seeds_other_weights(self, fresh, fresh_l1):
         same_bits(create(CONFIG), fresh)
-        kernels = [state.generator["unet"]["stem"]["kernel"] for state in (fresh, fresh_l1)]
+        kernels = [state.generator["encoder"]["unet"]["stem"]["kernel"] for state in (fresh, fresh_l1)]
         assert (kernels[0] != kernels[1]).mean() > 0.99
 
     def test_the_average_starts_as_the_generator(self, fresh):
@@ -167,7 +168,7 @@ class TestStep:
 
     def test_running_statistics_are_those_of_the_forward(self, fresh_l1):
         state, _ = step(fresh_l1, L1_ONLY)
-        stats = state.batch_stats["pointnet"]["norm_0"]
+        stats = state.batch_stats["encoder"]["pointnet"]["norm_0"]
         assert (stats["mean"] != 0).all()
         assert (stats["variance"] != 1).all()
 
@@ -260,7 +261,7 @@ class TestLearningRate:
 
 class TestLattice:
     def test_is_every_so_many_th_pixel_of_picture_condition_and_rays(self):
-        made, firsts = jax.jit(optimisation.lattice, static_argnums=2), set()
+        made, firsts = jax.jit(pixels.lattice, static_argnums=2), set()
         whole = cameras.camera_rays(BATCH.camera).directions
         for seed in range(6):
             thin = made(jax.random.key(seed), BATCH, 4)
@@ -291,6 +292,8 @@ class TestPixelError:
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class OneColorConfig(NPBGConfig):
     """A network of one weight, to see what the step asks of a network."""
+
+    method: ClassVar[str] = "one_color"
 
 
 class OneColor(nn.Module):

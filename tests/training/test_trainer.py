@@ -205,7 +205,7 @@ def test_rows_are_json_without_nan():
 def test_a_state_that_is_not_finite_is_named_though_every_loss_is(monkeypatch, tmp_path):
     """Training normalises batches with their own statistics: an overflown running variance shows in no loss."""
     fresh = optimisation.jitted_create_state(CONFIG)
-    fresh.batch_stats["pointnet"]["norm_0"]["variance"] *= np.inf
+    fresh.batch_stats["encoder"]["pointnet"]["norm_0"]["variance"] *= np.inf
     monkeypatch.setattr(optimisation, "jitted_create_state", lambda config: fresh)
     with pytest.raises(trainer.NotFinite, match="batch_stats_pointnet_norm_0_variance is inf at step 2"):
         trainer.train(CONFIG, tiny_dataset.dataset(), tmp_path, SCHEDULE)

@@ -111,7 +111,7 @@ class TestBrokenFiles:
         self.reason(file)
 
     def test_a_weight_that_is_missing_or_of_another_shape_type_or_not_finite(self, file):
-        name = next(name for name in np.load(file).files if name.startswith("params/unet"))
+        name = next(name for name in np.load(file).files if name.startswith("params/encoder/unet"))
         values = np.load(file)[name]
         for wrong in (None, values[..., :1], values.astype(np.float32), np.full_like(values, np.nan)):
             rewritten(file, **{name: wrong})

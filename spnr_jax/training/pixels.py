@@ -1,0 +1,49 @@
+"""Some of the pixels of a training batch: a lattice of them, or a square, at a place that a key draws."""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from spnr_jax.kernels.records import Batch, Camera, Key
+
+
+def lattice(key: Key, batch: Batch, stride: int) -> Batch:
+    """The batch with every `stride`-th row and column of its views, from a random first one on: images still."""
+    first = jax.random.randint(key, (2,), 0, stride)
+
+    def thinned(x):
+        for axis, start in zip((2, 3), first, strict=True):
+            x = x.reshape(*x.shape[:axis], x.shape[axis] // stride, stride, *x.shape[axis + 1 :])
+            x = jax.lax.dynamic_index_in_dim(x, start, axis + 1, keepdims=False)
+        return x
+
+    # pixel i of the lattice has its centre at first + stride * i + 0.5 of the view
+    shift = 0.5 - (first[::-1] + 0.5) / stride
+    zoom = jnp.diag(jnp.array([1 / stride, 1 / stride, 1.0])).at[:2, 2].set(shift)
+    intrinsics = jnp.einsum("ij,...jk->...ik", zoom, batch.camera.intrinsics, precision="highest")
+    return _some_pixels(batch, thinned, intrinsics)
+
+
+def cropped(key: Key, batch: Batch, size: int) -> Batch:
+    """The batch with a square of `size` pixels of each view, at one random place for all: images still."""
+    height, width = batch.image.shape[2:4]
+    first = jax.random.randint(key, (2,), 0, jnp.array([height, width]) - size + 1)
+
+    def cut(x):
+        for axis, start in zip((2, 3), first, strict=True):
+            x = jax.lax.dynamic_slice_in_dim(x, start, size, axis)
+        return x
+
+    return _some_pixels(batch, cut, jnp.asarray(batch.camera.intrinsics).at[..., :2, 2].add(-first[::-1]))
+
+
+def _some_pixels(batch: Batch, some: Callable[[Array], Array], intrinsics: Array) -> Batch:
+    """The batch with some of the pixels of its images, which cameras of these intrinsics see."""
+    images = (batch.image, batch.alpha, batch.condition, batch.condition_mask)
+    image, alpha, condition, mask = (some(jnp.asarray(x)) for x in images)
+    camera = Camera(
+        cam_to_world=batch.camera.cam_to_world, intrinsics=intrinsics, height=image.shape[2], width=image.shape[3]
+    )
+    return Batch(cloud=batch.cloud, camera=camera, image=image, alpha=alpha, condition=condition, condition_mask=mask)
