@@ -1,6 +1,6 @@
 """Where the time of a training step and of a film frame goes, and what the machine's limit would be.
 
-    python -m experiments.speed.profile [--out runs/profile] [--points 4096] [--size 512] [--quick]
+    python -m experiments.speed.where_time_goes [--out runs/where_time_goes] [--points 4096] [--size 512] [--quick]
 
 The programs that a step of the surfel network and a frame of it are made of are timed alone, in turns; beside each
 stand the operations that the compiler counts in it (`cost_analysis`) and how long they would take at the pace of a
@@ -41,10 +41,10 @@ SIDE = 1024  # of the matrices whose product is the machine's pace
 
 
 @dataclass(frozen=True, kw_only=True)
-class Profile:
+class WhereTimeGoes:
     """Time the programs of a training step and of a film frame, beside the machine's limit."""
 
-    out: Path = Path("runs/profile")
+    out: Path = Path("runs/where_time_goes")
     """Folder of the results."""
     points: int = 4096
     """Points of the object that is drawn."""
@@ -70,7 +70,7 @@ class Program(NamedTuple):
     operations: float | None
 
 
-def main(options: Profile) -> None:
+def main(options: WhereTimeGoes) -> None:
     """Times both, and writes a table of each."""
     cli.set_up_jax()
     if options.quick:
@@ -98,13 +98,14 @@ def peak() -> Program:
     return Program(program(jnp.matmul, ones, ones).run, 2.0 * SIDE**3)
 
 
-def step_programs(options: Profile) -> dict[str, Program]:
+def step_programs(options: WhereTimeGoes) -> dict[str, Program]:
     """The training step of the preset `surfels` and what it is made of."""
     config = PRESETS["surfels"]()
     if options.quick:
         config = dataclasses.replace(config, model=SurfelConfig(widths=(4, 6), top=4), crop=16, batch_objects=2)
     state = optimisation.jitted_create_state(config)
     crops = random_crops(config, options.doublings)
+    assert isinstance(config.model, SurfelConfig)
     shader = Shader(config.model.widths, config.model.top)
     loss = partial(shading.loss, config=config)
 
@@ -124,7 +125,7 @@ def step_programs(options: Profile) -> dict[str, Program]:
     }
 
 
-def frame_programs(options: Profile) -> dict[str, Program]:
+def frame_programs(options: WhereTimeGoes) -> dict[str, Program]:
     """A frame as `surfel_renderer.render` draws it, and its programs alone, on the object's window."""
     config = SurfelConfig(image_resolution=options.size)
     variables = surfel_renderer.init(jax.random.key(0), config)
@@ -182,4 +183,4 @@ def table(title: str, programs: Mapping[str, Program], taken: Mapping[str, float
 
 
 if __name__ == "__main__":
-    entry_point.run(main, Profile, "speed.profile")
+    entry_point.run(main, WhereTimeGoes, "speed.where_time_goes")

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from experiments.speed import bench, gpu, profile
+from experiments.speed import bench, gpu, where_time_goes
 from spnr_jax import cli
 
 
@@ -15,7 +15,7 @@ def without_cache(monkeypatch):
 
 @pytest.mark.ci
 def test_a_profile_times_the_parts_of_a_step_and_of_a_frame(tmp_path):
-    profile.main(profile.Profile(out=tmp_path, quick=True))
+    where_time_goes.main(where_time_goes.WhereTimeGoes(out=tmp_path, quick=True))
     found = json.loads((tmp_path / "results.json").read_text())
     step, frame = found["a training step"], found["a frame of 64 px"]
     assert step["network alone"] < step["network and its gradient"] < 2 * step["whole step"]
