@@ -99,8 +99,9 @@ def main(options: Options) -> None:
 def rows_of(options: Options) -> list[Row]:
     """All rows that the folder holds of these options, those that were missing measured now."""
     start, variants = time.monotonic(), twin_variants(options)
+    cores = min(options.threads, len(os.sched_getaffinity(0)))  # that the sides can be held to
     setting = {
-        "hardware": f"{options.threads} of {os.cpu_count()} cores, {machine.processor()}",
+        "hardware": f"{cores} of {os.cpu_count()} cores, {machine.processor()}",
         "rounds": options.rounds,
         "turn_s": options.seconds,
         "platform": options.platform,

@@ -55,7 +55,12 @@ class TestTable:
         assert "[3/3, about 0 min left] tiny batch 2 render, ours near points" in capsys.readouterr().out
         assert (options.out / "bench.png").read_bytes().startswith(b"\x89PNG")
         written = (options.out / "table.md").read_text()
-        for said in (machine.processor(), "fake 1", "load of the machine before the rows"):
+        cores = min(2, len(os.sched_getaffinity(0)))
+        for said in (
+            f"{cores} of {os.cpu_count()} cores, {machine.processor()}",
+            "fake 1",
+            "load of the machine before the rows",
+        ):
             assert said in written
 
     def test_without_torch_one_line_says_so_and_ours_is_timed_alone(self, options, monkeypatch, capsys):
