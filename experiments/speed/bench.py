@@ -15,7 +15,6 @@ import hashlib
 import importlib.util
 import json
 import os
-import platform
 import statistics
 import tempfile
 import time
@@ -30,6 +29,7 @@ from experiments.comparison import results_folder
 from experiments.speed import bench_report as report
 from experiments.speed.bench_scene import BATCHES
 from experiments.speed.worker import Worker, worker
+from spnr_jax.devices import machine
 from spnr_jax.errors import UserError
 from spnr_jax.formats.images import write_whole
 
@@ -63,6 +63,10 @@ class Options:
     """Length of a turn; at least three runs."""
     threads: int = 2
     """Cores that both sides are held to."""
+    platform: Literal["cpu", "cuda"] = "cpu"
+    """Where both sides compute; what peak memory says is the host's."""
+    bf16: bool = False
+    """Convolutions of ours, and the twin under torch.autocast, in bfloat16; both are compared in float32 on the CPU."""
     quick: bool = False
     """A check that everything works: tiny, two rounds, short turns, into OUT-quick."""
 
@@ -87,11 +91,21 @@ def main(options: Options) -> None:
     if options.quick:
         out = options.out.with_name(f"{options.out.name}-quick")
         options = dataclasses.replace(options, out=out, presets=("tiny",), rounds=2, seconds=0.1)
+    rows = rows_of(options)
+    files = {"bench.png": report.plot(rows)}
+    results_folder.write(options.out, {"rows": rows}, [report.table(rows)], report.settings(rows), files)
+
+
+def rows_of(options: Options) -> list[Row]:
+    """All rows that the folder holds of these options, those that were missing measured now."""
     start, variants = time.monotonic(), twin_variants(options)
+    cores = min(options.threads, len(os.sched_getaffinity(0)))  # that the sides can be held to
     setting = {
-        "hardware": f"{options.threads} of {os.cpu_count()} cores {platform.machine()}",
+        "hardware": f"{cores} of {os.cpu_count()} cores, {machine.processor()}",
         "rounds": options.rounds,
         "turn_s": options.seconds,
+        "platform": options.platform,
+        "bf16": options.bf16,
         "code": fingerprint(),
     }
     path, cells = options.out / "rows.json", cells_of(options, variants)
@@ -105,9 +119,7 @@ def main(options: Options) -> None:
         write_whole(path, results_folder.as_json(list(kept.values())))
         left = (time.monotonic() - start) / done * (len(todo) - done)
         print(f"[{done}/{len(todo)}, about {left / 60:.0f} min left] {report.line(row)}", flush=True)
-    rows = [kept[cell] for cell in cells_of(Options(), (*VARIANTS, ALONE)) if cell in kept]
-    files = {"bench.png": report.plot(rows)}
-    results_folder.write(options.out, {"rows": rows}, [report.table(rows)], report.settings(rows), files)
+    return [kept[cell] for cell in cells_of(Options(), (*VARIANTS, ALONE)) if cell in kept]
 
 
 def twin_variants(options: Options) -> tuple[str, ...]:
@@ -152,6 +164,7 @@ def measured(options: Options, cells: Sequence[Cell], with_twin: bool) -> Iterat
         for mode in dict.fromkeys(cell.mode for cell in cells if cell.preset == preset):
             here = [cell for cell in cells if (cell.preset, cell.mode) == (preset, mode)]
             spec = {"preset": preset, "mode": mode, "batch": BATCHES[preset], "threads": options.threads}
+            spec |= {"platform": options.platform, "bf16": options.bf16}
             with ExitStack() as stack:
                 ours = {
                     function: stack.enter_context(worker(OURS, spec | {"function": function}))
@@ -192,10 +205,10 @@ def check_parity(options: Options, preset: str) -> None:
 
 def compare(ours: Worker, twin: Worker | None, cell: Cell, options: Options) -> Row:
     """The rest of a row, from the turns of both."""
-    rounds = []
+    rounds, load = [], machine.load()
     for _ in range(options.rounds):
         rounds.append((ours.turn(options.seconds), twin.turn(options.seconds) if twin else None))
-    row: Row = {"batch": BATCHES[cell.preset], **side("ours", [a for a, _ in rounds])}
+    row: Row = {"batch": BATCHES[cell.preset], "load": load, **side("ours", [a for a, _ in rounds])}
     row |= {"compile_s": ours.facts["compile_s"], "ours_software": ours.facts["software"]}
     names = ("twin_ms", "twin_min_ms", "twin_peak_mb", "twin_idle_cpu_s", "ratio", "ratio_low", "ratio_high")
     row |= dict.fromkeys(names) | {"twin_variant": None, "twin_software": None}

@@ -42,9 +42,11 @@ def table(rows: Sequence[Row]) -> Table:
 
 
 def settings(rows: Sequence[Row]) -> list[str]:
-    """What the rows were measured on, each setting once."""
+    """What the rows were measured on and with, each setting once, and how busy the machine was."""
     names = ("hardware", "ours_software", "twin_software", "date")
-    return list(dict.fromkeys(", ".join(str(row[name]) for name in names if row[name]) for row in rows))
+    loads = [row["load"] for row in rows]
+    busy = f"load of the machine before the rows, both sides and others: {min(loads):.1f} to {max(loads):.1f}"
+    return [*dict.fromkeys(", ".join(str(row[name]) for name in names if row[name]) for row in rows), busy]
 
 
 @figures.drawing

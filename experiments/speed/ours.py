@@ -10,6 +10,7 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+import jaxlib
 import numpy as np
 
 from experiments.speed import bench_scene, twin_layout, worker
@@ -34,13 +35,15 @@ def main() -> None:
 
 def make(spec: dict) -> tuple[Callable[[], object], dict]:
     """(function to time, facts); in the mode "parity" nothing is timed, and the facts are the differences."""
-    facts = {"software": f"jax {jax.__version__}"}
+    facts = {"software": f"jax {jax.__version__}, jaxlib {jaxlib.__version__}, numpy {np.__version__}"}
     config = twin_sized(spec["preset"], spec["mode"], spec["batch"])
     if spec["mode"] == "parity":
         with np.load(spec["parity"], allow_pickle=False) as arrays:
             return lambda: None, facts | {"differences": differences(config, dict(arrays))}
     if spec["function"] == "near points":
         config = near_points(config)
+    if spec.get("bf16"):
+        config = in_bf16(config)
     run = function(config, batch(config), spec["mode"])
     start = time.perf_counter()
     run()
@@ -71,6 +74,12 @@ def twin_sized(preset: str, mode: str = "train", objects: int = 1) -> TrainConfi
         min_points=bench_scene.NUM_POINTS,
         max_points=bench_scene.NUM_POINTS,
     )
+
+
+def in_bf16(config: TrainConfig) -> TrainConfig:
+    """The config whose convolutions run in bfloat16."""
+    assert isinstance(config.model, ModelConfig)
+    return dataclasses.replace(config, model=dataclasses.replace(config.model, precision="bfloat16"))
 
 
 def near_points(config: TrainConfig) -> TrainConfig:

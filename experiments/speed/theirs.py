@@ -26,15 +26,25 @@ def make(spec: dict) -> tuple[Callable[[], object], dict]:
     """(function to time, facts); in the mode "parity" nothing is timed and a file is written."""
     torch.set_num_threads(spec["threads"])
     torch.manual_seed(0)
-    config = twin.PRESETS[spec["preset"]]
+    config, device = twin.PRESETS[spec["preset"]], spec.get("platform", "cpu")
+    torch.set_default_device(device)
     inputs = bench_scene.arrays(spec["batch"], config.image, config.points)
-    batch = twin.Batch(**{name.removeprefix("in/"): torch.from_numpy(array) for name, array in inputs.items()})
-    facts = {"software": f"torch {torch.__version__}"}
+    batch = twin.Batch(
+        **{name.removeprefix("in/"): torch.from_numpy(array).to(device) for name, array in inputs.items()}
+    )
+    facts = {"software": f"torch {torch.__version__}, {torch.backends.cpu.get_cpu_capability()}"}
     if spec["mode"] == "parity":
         found: dict[str, Any] = {**inputs, **outputs(config, batch)}
         np.savez(spec["parity"], **found)
         return lambda: None, facts
-    run = function(config, batch, spec["mode"], *VARIANTS[spec["variant"]])
+    work = function(config, batch, spec["mode"], *VARIANTS[spec["variant"]])
+
+    def run() -> None:
+        with torch.autocast(device, torch.bfloat16, enabled=bool(spec.get("bf16"))):
+            work()
+        if device == "cuda":
+            torch.cuda.synchronize()
+
     for _ in range(WARM_UP):
         run()
     return run, facts

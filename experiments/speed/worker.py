@@ -56,7 +56,8 @@ class Worker:
 def worker(module: str, spec: dict) -> Iterator[Worker]:
     """The child `python -m module SPEC`, ready to be asked; it ends with the block."""
     # no persistent compilation cache: its hits would be taken for the compiler's time
-    settings = {"JAX_PLATFORMS": "cpu", "JAX_ENABLE_COMPILATION_CACHE": "false"}
+    settings = {"JAX_PLATFORMS": spec.get("platform", "cpu"), "JAX_ENABLE_COMPILATION_CACHE": "false"}
+    settings["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"  # of a GPU's memory: both sides live on it
     with (
         tempfile.TemporaryFile("w+") as errors,
         subprocess.Popen(

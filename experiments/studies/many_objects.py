@@ -2,10 +2,8 @@
 
     python -m experiments.studies.many_objects --data DIR --out DIR [--runs 8] [--steps 20] [--preset tiny]
 
-M runs (seeds) of `optimisation.train_step`, and N objects that are encoded and rendered, are each done by a Python loop
-over the jitted function and by one program under vmap, in turns.  States and batches of all runs are one tree with an
-axis of runs first; `step` alone is shared, so that what depends on it (R1 every so many steps) stays a branch.  The
-learning rate is no axis of runs: the config, which holds it, is static, so that each value is a program of its own.
+M runs (seeds) of a training step (`spnr_jax/training/many_runs.py`), and N objects that are encoded and rendered, are
+each done by a Python loop over the jitted function and by one program under vmap, in turns.
 """
 
 import dataclasses
@@ -30,11 +28,7 @@ from spnr_jax.formats import data_sets
 from spnr_jax.kernels.records import Batch
 from spnr_jax.method import inference
 from spnr_jax.presets import PRESETS
-from spnr_jax.training import batching, optimisation
-from spnr_jax.training.optimisation import TrainState
-
-OF_A_RUN = tuple(f.name for f in dataclasses.fields(TrainState) if f.name != "step")
-AXES: Any = TrainState(step=None, **dict.fromkeys(OF_A_RUN, 0))  # type: ignore[arg-type]
+from spnr_jax.training import batching, many_runs, optimisation
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,7 +81,7 @@ def row(found: Mapping[str, Any], count: int) -> tuple:
 def train(dataset: data_sets.Dataset, config: TrainConfig, seeds: Sequence[int]) -> dict[str, Any]:
     """Seconds of a step of all runs in both forms, and the largest relative difference of a loss, first and in all."""
     singles = [optimisation.jitted_create_state(config, jnp.uint32(seed)) for seed in seeds]
-    stacked = stack(singles)
+    stacked = many_runs.stack(singles)
     adversarial_from = optimisation.first_adversarial_step(config)
     seconds: dict[str, list[float]] = {"loop": [], "vmap": []}
     apart = []
@@ -98,7 +92,9 @@ def train(dataset: data_sets.Dataset, config: TrainConfig, seeds: Sequence[int])
         start = time.perf_counter()
         stepped = jax.block_until_ready([one(state, piece) for state, piece in zip(singles, pieces, strict=True)])
         middle = time.perf_counter()
-        stacked, metrics = jax.block_until_ready(vmapped(stacked, batch, config, late))
+        stacked, metrics = jax.block_until_ready(
+            many_runs.jitted_train_step(stacked, batch, config=config, adversarial=late)
+        )
         for form, taken in (("loop", middle - start), ("vmap", time.perf_counter() - middle)):
             seconds[form].append(taken)
         singles = [state for state, _ in stepped]
@@ -106,20 +102,6 @@ def train(dataset: data_sets.Dataset, config: TrainConfig, seeds: Sequence[int])
         apart.append(float(np.abs(np.asarray(metrics["loss"]) / losses - 1).max()))
     warm = {form: [s for i, s in enumerate(found) if i not in (0, adversarial_from)] for form, found in seconds.items()}
     return {"seconds": warm, "apart": [apart[0], max(apart)]}
-
-
-@partial(jax.jit, static_argnames=("config", "adversarial"), donate_argnums=0)
-def vmapped(states: TrainState, batch: Batch, config: TrainConfig, adversarial: bool):
-    """One step of all runs in one program."""
-    one = partial(optimisation.train_step, config=config, adversarial=adversarial)
-    return jax.vmap(one, in_axes=(AXES, 0), out_axes=(AXES, 0))(states, batch)
-
-
-def stack(states: Sequence[TrainState]) -> TrainState:
-    """Several states of one step as one tree; keys are stacked as plain numbers, which are not drawn from."""
-    plain = [dataclasses.replace(state, key=jax.random.key_data(state.key)) for state in states]
-    stacked = jax.tree.map(lambda *x: jnp.stack(x), *plain)
-    return dataclasses.replace(stacked, step=jnp.copy(states[0].step), key=jax.random.wrap_key_data(stacked.key))
 
 
 def batches(dataset: data_sets.Dataset, config: TrainConfig, seeds: Sequence[int]) -> Iterator[Batch]:

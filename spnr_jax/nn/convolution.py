@@ -6,15 +6,21 @@ convolutions of XLA are right; on a CPU (measurements: docs/performance.md)
   3D   a sum over depth taps of 2D convolutions, or one matrix product for tiny volumes
   2D   native, but as matrix products the gradients of 2-wide windows, the kernel's of 4-wide windows and of few output
        features; 128 input features or more in one matrix product
+  vmap over kernels   one run after the other, where XLA's grouped convolution takes two to eight times
 """
 
 import itertools
-from functools import partial
+from collections.abc import Callable
+from functools import cache, partial
+from typing import Any
 
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
+
+from spnr_jax.kernels.numerics import per_feature
 
 FEW_FEATURES = 4  # of a convolution's output, for which XLA's gradient of the kernel is slow
 FEW_PIXELS = 2  # an axis, for which a kernel is larger than what it is folded for
@@ -34,21 +40,99 @@ def conv(
 
     With bf16 the convolution and its gradients run in bfloat16; what goes in and comes out keeps its own format.
     """
-    on_cpu, result = _conv2d_cpu if x.ndim == 4 else _conv3d_cpu, x.dtype
+    result = x.dtype
     if bf16:
         x, kernel = x.astype(jnp.bfloat16), kernel.astype(jnp.bfloat16)
     out = lax.platform_dependent(
-        x, kernel, cpu=lambda x, k: on_cpu(x, k, stride, padding), default=lambda x, k: _native(x, k, stride, padding)
+        x, kernel, cpu=_on_cpu(x.ndim, stride, padding), default=lambda x, k: _native(x, k, stride, padding)
     )
     return out.astype(result)
 
 
+class Conv(nn.Module):
+    """3 x 3 convolution of pictures with a bias; its weights have the names and shapes of Flax's own."""
+
+    features: int
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "batch height width in"]) -> Float[Array, "batch height width features"]:
+        """A picture of the same size."""
+        kernel = self.param("kernel", nn.initializers.lecun_normal(), (3, 3, x.shape[-1], self.features))
+        y = conv(x, jnp.asarray(kernel))
+        return y + per_feature(self.param("bias", nn.initializers.zeros, (self.features,)), y)
+
+
+@cache
+def _on_cpu(rank: int, stride: int, padding: int) -> Callable[[Array, Array], Array]:
+    """The CPU's form for inputs of so many axes."""
+    form = _conv2d_cpu if rank == 4 else _conv3d_cpu
+    return _run_by_run(lambda x, kernel: form(x, kernel, stride, padding))
+
+
+def _run_by_run(form: Callable[[Array, Array], Array]) -> Callable[[Array, Array], Array]:
+    """A convolution `form(x, kernel)` of which vmap computes one run after the other, in its gradients, too.
+
+    With its two gradients it is one of three maps, each linear in two out of input, kernel and what is given for the
+    output, and the gradients of each of the three are the other two: so there are gradients of any order.
+    """
+
+    @cache
+    def of_input(shape: tuple[int, ...]) -> Callable:
+        return _bilinear(
+            lambda kernel, cotangent: _pulled(lambda x: form(x, kernel), shape, cotangent),
+            lambda kernel, given, cotangent: (of_kernel(kernel.shape)(cotangent, given), convolved(cotangent, kernel)),
+        )
+
+    @cache
+    def of_kernel(shape: tuple[int, ...]) -> Callable:
+        return _bilinear(
+            lambda x, cotangent: _pulled(lambda kernel: form(x, kernel), shape, cotangent),
+            lambda x, given, cotangent: (of_input(x.shape)(cotangent, given), convolved(x, cotangent)),
+        )
+
+    convolved = _bilinear(
+        form, lambda x, kernel, cotangent: (of_input(x.shape)(kernel, cotangent), of_kernel(kernel.shape)(x, cotangent))
+    )
+    return convolved
+
+
+def _pulled(linear: Callable[[Array], Array], shape: tuple[int, ...], cotangent: Array) -> Array:
+    """The transpose of a linear function of an array of this shape, applied to the cotangent."""
+    _, pull_back = jax.vjp(linear, jnp.zeros(shape, cotangent.dtype))
+    return pull_back(cotangent)[0]
+
+
+def _bilinear(function: Callable[[Array, Array], Array], transposed: Callable[..., Any]) -> Callable:
+    """`function(a, b)` with the gradients `transposed(a, b, cotangent)`; under vmap a loop over what is mapped."""
+    single = jax.custom_batching.custom_vmap(function)
+
+    @single.def_vmap
+    def mapped(axis_size: int, in_batched: list[bool], *arguments: Array) -> tuple[Array, bool]:
+        del axis_size
+        moving = [x for x, batched in zip(arguments, in_batched, strict=True) if batched]
+
+        def one(parts: list[Array]) -> Array:
+            rest = iter(parts)
+            return single(*(next(rest) if batched else x for x, batched in zip(arguments, in_batched, strict=True)))
+
+        return lax.map(one, moving), True
+
+    differentiable = jax.custom_vjp(lambda a, b: single(a, b))
+    differentiable.defvjp(
+        lambda a, b: (differentiable(a, b), (a, b)), lambda inputs, cotangent: transposed(*inputs, cotangent)
+    )
+    return differentiable
+
+
 def _native(x, kernel, stride, padding):
     n = x.ndim - 2
-    axes = "DHW"[-n:]
-    return lax.conv_general_dilated(
-        x, kernel, (stride,) * n, [(padding, padding)] * n, dimension_numbers=(f"N{axes}C", f"{axes}IO", f"N{axes}C")
-    )
+    return _plain(x, kernel, (stride,) * n, [(padding, padding)] * n)
+
+
+def _plain(x, kernel, stride, padding, x_dilation=None, kernel_dilation=None):
+    axes = "DHW"[-(x.ndim - 2) :]
+    numbering = f"N{axes}C", f"{axes}IO", f"N{axes}C"
+    return lax.conv_general_dilated(x, kernel, stride, padding, x_dilation, kernel_dilation, numbering)
 
 
 def _windows(x, window: int, stride: int):
@@ -65,30 +149,55 @@ def _pad(x, padding: int):
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(2, 3))
-def _conv2d_products(x, kernel, stride, padding):
+def _conv2d(x, kernel, stride, padding):
     return _native(x, kernel, stride, padding)
 
 
 def _conv2d_backward(stride, padding, inputs, cotangent):
-    """XLA's gradient for the input, or one matrix product; for the kernel one per place in the window, or one for all.
+    """XLA's gradient for the input, or one matrix product; for the kernel XLA's, one per place, or one for all.
 
     With few output features the cotangents that every input pixel meets in the window are put side by side.
     """
     x, kernel = inputs
-    if kernel.shape[0] == 2 and (stride, padding) == (1, 1):
+    window, (features_in, features_out) = kernel.shape[0], kernel.shape[2:]
+    if window == 2 and (stride, padding) == (1, 1):
         dx = _input_gradient_of_pairs(x, kernel, cotangent)
     else:
-        (dx,) = jax.linear_transpose(lambda x: _native(x, kernel, stride, padding), x)(cotangent)
-    window, (features_in, features_out) = kernel.shape[0], kernel.shape[2:]
+        dx = _input_gradient(x, kernel, cotangent, stride, padding)
     if stride == 1 and features_out <= FEW_FEATURES:
         met = list(_windows(_pad(cotangent, window - 1 - padding), window, 1))
         columns = jnp.concatenate(met[::-1], axis=-1)
         dk = x.reshape(-1, features_in).T @ columns.reshape(-1, window**2 * features_out)
         return dx, dk.reshape(features_in, window, window, features_out).transpose(1, 2, 0, 3)
+    if window == 3 and features_out > FEW_FEATURES:
+        return dx, _kernel_gradient(x, kernel, cotangent, stride, padding)
     flat = cotangent.reshape(-1, features_out)
     seen = _windows(_pad(x, padding), window, stride)
     dk = jnp.stack([s.reshape(flat.shape[0], -1).T @ flat for s in seen])
     return dx, dk.reshape(kernel.shape)
+
+
+def _input_gradient(x, kernel, cotangent, stride, padding):
+    """The convolution of the cotangents with the kernel turned round, input and output features exchanged.
+
+    JAX's own gradient is the same sum with the axes in another order.  Of that XLA's CPU compiler makes a fast program
+    outside of loops alone: within one (`lax.scan`, `lax.map`) it took 5 to 29 times as long, that of
+    `_kernel_gradient` 46 to 97.
+    """
+    window = kernel.shape[0]
+    first = window - 1 - padding
+    last = [n + padding - (m - 1) * stride - 1 for n, m in zip(x.shape[1:3], cotangent.shape[1:3], strict=True)]
+    turned = jnp.swapaxes(jnp.flip(kernel, (0, 1)), 2, 3)
+    return _plain(cotangent, turned, (1, 1), [(first, n) for n in last], x_dilation=(stride,) * 2)
+
+
+def _kernel_gradient(x, kernel, cotangent, stride, padding):
+    """The convolution of the input, features as pictures, with the cotangents as one large window."""
+    sizes = zip(x.shape[1:3], cotangent.shape[1:3], strict=True)
+    pads = [(padding, (m - 1) * stride + kernel.shape[0] - n - padding) for n, m in sizes]
+    large = jnp.transpose(cotangent, (1, 2, 0, 3))
+    dk = _plain(jnp.transpose(x, (3, 1, 2, 0)), large, (1, 1), pads, kernel_dilation=(stride,) * 2)
+    return jnp.transpose(dk, (1, 2, 0, 3))
 
 
 def _input_gradient_of_pairs(x, kernel, cotangent):
@@ -99,15 +208,14 @@ def _input_gradient_of_pairs(x, kernel, cotangent):
     return sum(given[:, 1 - i : 1 - i + height, 1 - j : 1 - j + width, i, j] for i in (0, 1) for j in (0, 1))
 
 
-_conv2d_products.defvjp(lambda x, k, stride, padding: (_native(x, k, stride, padding), (x, k)), _conv2d_backward)
+_conv2d.defvjp(lambda x, k, stride, padding: (_native(x, k, stride, padding), (x, k)), _conv2d_backward)
 
 
 def _conv2d_cpu(x, kernel, stride, padding):
-    window, (features_in, features_out) = kernel.shape[0], kernel.shape[2:]
+    features_in, features_out = kernel.shape[2:]
     if features_in >= MANY_FEATURES and features_out > FEW_FEATURES:
         return _columns(x, kernel, stride, padding)
-    form = _conv2d_products if window != 3 or features_out <= FEW_FEATURES else _native
-    return form(x, kernel, stride, padding)
+    return _conv2d(x, kernel, stride, padding)
 
 
 def _columns(x, kernel, stride, padding):

@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 
 from spnr_jax.kernels.colors import linear_to_srgb
 from spnr_jax.kernels.resizing import mean_of_squares, unfolded
+from spnr_jax.nn.convolution import Conv
 from spnr_jax.surfels.lighting import SPECULAR
 
 NUM_OUTPUTS = 19
@@ -43,8 +44,8 @@ class Block(nn.Module):
     def __call__(self, x: Float[Array, "batch height width features"]) -> Float[Array, "batch height width features"]:
         """The features, changed."""
         y = nn.LayerNorm(name="norm")(x)
-        y = nn.relu(nn.Conv(x.shape[-1], (3, 3), name="a")(y))
-        return x + nn.Conv(x.shape[-1], (3, 3), name="b")(y)
+        y = nn.relu(Conv(x.shape[-1], name="a")(y))
+        return x + Conv(x.shape[-1], name="b")(y)
 
 
 class Double(nn.Module):
@@ -55,8 +56,8 @@ class Double(nn.Module):
         """Bilinear, plus four new pixels from each, plus two convolutions."""
         features = x.shape[-1]
         x = doubled(x) + unfolded(nn.Dense(4 * features, name="expand")(x), 2)
-        y = nn.relu(nn.Conv(features, (3, 3), name="a")(x))
-        return x + nn.Conv(features, (3, 3), name="b")(y)
+        y = nn.relu(Conv(features, name="a")(x))
+        return x + Conv(features, name="b")(y)
 
 
 class Shader(nn.Module):
@@ -75,7 +76,7 @@ class Shader(nn.Module):
         x = jnp.pad(seen, ((0, 0), (0, -height % square), (0, -width % square), (0, 0)))
         skips = []
         for level, features in enumerate(self.widths):
-            x = nn.Conv(features, (3, 3), name=f"in{level}")(mean_of_squares(x, 2) if level else x)
+            x = Conv(features, name=f"in{level}")(mean_of_squares(x, 2) if level else x)
             x = Block(name=f"down{level}")(x)
             skips.append(x)
         for level in reversed(range(len(self.widths) - 1)):

@@ -200,9 +200,17 @@ def _flatten_views(x):
 
 
 def train_step(
-    state: TrainState, batch: Batch, *, config: TrainConfig, adversarial: bool
+    state: TrainState,
+    batch: Batch,
+    *,
+    config: TrainConfig,
+    adversarial: bool,
+    lr_scale: Float[Array, ""] | None = None,
 ) -> tuple[TrainState, dict[str, Array]]:
-    """State after one step of both networks from one generator forward, and scalar metrics."""
+    """State after one step of both networks from one generator forward, and scalar metrics.
+
+    `lr_scale` multiplies both learning rates, which are static: as an array it may be one for each run under vmap.
+    """
     key = jax.random.fold_in(state.key, state.step)
     if config.pixel_stride > 1:
         key, lattice_key = jax.random.split(key)
@@ -234,6 +242,7 @@ def train_step(
             discriminator, fake, batch, state.step
         )
         update, discriminator_optimizer = discriminator_adam.update(gradient, discriminator_optimizer)
+        update = _scaled(update, lr_scale)
         discriminator = optax.apply_updates(discriminator, update)
         metrics |= more
 
@@ -250,7 +259,7 @@ def train_step(
     loss, cotangents = jax.value_and_grad(whole_loss, argnums=(0, 1, 2))(image, image_lr, sown)
     (gradient,) = pull_back(cotangents)
     update, generator_optimizer = generator_adam.update(gradient, state.generator_optimizer)
-    generator = optax.apply_updates(state.generator, update)
+    generator = optax.apply_updates(state.generator, _scaled(update, lr_scale))
     metrics |= {"loss": loss, "gradient_norm": optax.tree.norm(gradient)} | sown
 
     averaged, averaged_stats = moving_average(
@@ -268,6 +277,10 @@ def train_step(
         discriminator_optimizer=discriminator_optimizer,
     )
     return state, metrics
+
+
+def _scaled(update: Any, factor: Array | None) -> Any:
+    return update if factor is None else jax.tree.map(lambda x: factor * x, update)
 
 
 def moving_average(averaged: Any, newest: Any, step: Array, decay: float) -> Any:

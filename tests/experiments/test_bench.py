@@ -16,6 +16,7 @@ from support import twin
 
 from experiments.speed import bench, bench_scene, ours, twin_layout
 from experiments.speed import worker as workers
+from spnr_jax.devices import machine
 from spnr_jax.kernels import cameras
 
 OPTIONS = {"presets": ("tiny",), "modes": ("render",), "variants": ("plain", "fast"), "rounds": 3, "seconds": 0.02}
@@ -50,8 +51,28 @@ class TestTable:
             assert row["twin_ms"] >= row["twin_min_ms"] >= 4
             assert row["ours_peak_mb"] > 5
             assert (row["compile_s"], row["batch"]) == (0.5, 2)
+            assert row["load"] >= 0
         assert "[3/3, about 0 min left] tiny batch 2 render, ours near points" in capsys.readouterr().out
         assert (options.out / "bench.png").read_bytes().startswith(b"\x89PNG")
+        written = (options.out / "table.md").read_text()
+        cores = min(2, len(os.sched_getaffinity(0)))
+        for said in (
+            f"{cores} of {os.cpu_count()} cores, {machine.processor()}",
+            "fake 1",
+            "load of the machine before the rows",
+        ):
+            assert said in written
+
+    def test_without_torch_one_line_says_so_and_ours_is_timed_alone(self, options, monkeypatch, capsys):
+        monkeypatch.setattr(bench.importlib.util, "find_spec", lambda name: None)
+        bench.main(options)
+        said = capsys.readouterr().out.splitlines()
+        assert [i for i, line in enumerate(said) if "ours is timed alone" in line] == [0]
+        assert said[0].startswith("torch is not installed")
+        assert [(r["function"], r["twin_variant"], r["ratio"]) for r in rows_of(options)] == [
+            ("network", None, None),
+            ("near points", None, None),
+        ]
 
     def test_a_stop_loses_no_row_and_a_rerun_measures_the_rest(self, options, monkeypatch, capsys):
         compared = []
@@ -101,6 +122,14 @@ def test_the_ratio_is_the_median_of_paired_ratios():
     row = bench.compare(ours, theirs, cell, bench.Options(rounds=3))
     assert (row["ratio_low"], row["ratio"], row["ratio_high"]) == (0.4, 0.5, 0.5)
     assert (row["ours_ms"], row["ours_min_ms"], row["twin_ms"], row["twin_min_ms"]) == (3.0, 1.0, 10.0, 1.0)
+
+
+def test_a_processor_is_named_with_the_sets_that_it_has(tmp_path, monkeypatch):
+    told = tmp_path / "cpuinfo"
+    monkeypatch.setattr(machine, "CPUINFO", told)
+    assert machine.processor().endswith("(instruction sets unknown)")
+    told.write_text("processor\t: 0\nmodel name\t: Some CPU: 9\nflags\t\t: sse avx2 avx512f xavx512_bf16\n")
+    assert machine.processor() == "Some CPU: 9 (avx2, avx512f)"
 
 
 def test_a_turn_lasts_as_long_as_asked_and_leaves_its_first_run_out():

@@ -13,7 +13,7 @@ from support.tiny_baselines import SHRUNKEN
 
 from experiments.studies import many_objects
 from spnr_jax import cli, presets
-from spnr_jax.training import batching, optimisation
+from spnr_jax.training import batching, many_runs, optimisation
 
 SEEDS = (3, 4, 5)
 QUICK = dataclasses.replace(SHRUNKEN["points2nerf_tiny"], num_steps=3)  # no convolutions: compiles in a second
@@ -30,7 +30,7 @@ def test_the_batches_of_a_run_are_those_that_it_would_see_alone():
 @pytest.mark.ci
 def test_stacked_states_share_their_step_and_keep_their_keys():
     states = [optimisation.jitted_create_state(QUICK, jnp.uint32(seed)) for seed in SEEDS]
-    stacked = many_objects.stack(states)
+    stacked = many_runs.stack(states)
     assert stacked.step.shape == ()
     np.testing.assert_array_equal(jax.random.key_data(stacked.key)[1], jax.random.key_data(states[1].key))
     same_bits(jax.tree.map(lambda x: x[1], stacked.generator), states[1].generator)

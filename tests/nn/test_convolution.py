@@ -1,14 +1,17 @@
 """The convolution forms of the CPU against XLA's native one and against a loop."""
 
+import re
+
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import lax
 from support import reference
-from support.laws import close, gradient_law, numbers
+from support.laws import close, gradient_law, numbers, same_bits
 
-from spnr_jax.nn.convolution import conv, upsample_conv
+from spnr_jax.nn.convolution import Conv, conv, upsample_conv
 
 
 def native(x, kernel, stride=1, padding=1):
@@ -91,3 +94,63 @@ def test_second_order_gradients_are_those_of_the_native_form(window):
         return jax.jit(jax.value_and_grad(squared, (0, 1)))(x, kernel)
 
     close(penalty(conv), penalty(native), rtol=1e-4, atol=1e-5)
+
+
+RUNS = {  # mapped axes of input and kernel
+    "2D, both": (0, 0, (5, 6), 8),
+    "2D, few features": (0, 0, (5, 6), 3),
+    "2D, kernel alone": (None, 0, (5, 6), 8),
+    "2D, input alone": (0, None, (5, 6), 8),
+    "3D, both": (0, 0, (5, 6, 7), 5),
+    "3D, one matrix product": (0, 0, (4, 3, 3), 5),
+}
+
+
+@pytest.mark.parametrize(("x_axis", "kernel_axis", "shape", "features"), RUNS.values(), ids=RUNS)
+def test_runs_under_vmap_are_the_loop_over_runs_in_value_and_gradients(x_axis, kernel_axis, shape, features):
+    x, kernel = numbers(10, 3, 2, *shape, 2), numbers(11, 3, *[3] * len(shape), 2, features)
+    x, kernel = (a if axis == 0 else a[0] for a, axis in ((x, x_axis), (kernel, kernel_axis)))
+
+    def both(form):
+        return lambda x, kernel: value_and_gradients(form, x, kernel)
+
+    mapped = jax.jit(jax.vmap(both(conv), in_axes=(x_axis, kernel_axis)))(x, kernel)
+    one = jax.jit(both(native))
+    for i in range(3):
+        alone = one(x if x_axis is None else x[i], kernel if kernel_axis is None else kernel[i])
+        close(jax.tree.map(lambda a, i=i: a[i], mapped), alone, rtol=1e-5, atol=1e-5)
+
+
+def test_runs_of_runs_and_their_second_order_gradients_are_those_of_the_native_form():
+    x, kernel = numbers(12, 2, 2, 1, 5, 5, 2), numbers(13, 2, 2, 3, 3, 2, 5)
+
+    def mapped(form):
+        def squared(x, kernel):
+            return jnp.sum(jax.grad(lambda x: jnp.sum(jnp.tanh(form(x, kernel))))(x) ** 2)
+
+        return jax.jit(jax.vmap(jax.vmap(jax.grad(squared, (0, 1)))))(x, kernel)
+
+    close(mapped(conv), mapped(native), rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize(("window", "stride"), [(3, 1), (3, 2), (4, 2)])
+def test_no_program_of_many_runs_has_what_the_cpu_is_slow_at(window, stride):
+    """Grouped convolutions, and axes in an order that XLA's CPU compiler puts right outside of loops alone."""
+    x, kernel = numbers(14, 3, 2, 6, 6, 2), numbers(15, 3, window, window, 2, 5)
+    gradient = jax.grad(lambda x, k: jnp.sum(jnp.sin(conv(x, k, stride))), (0, 1))
+    program = jax.jit(jax.vmap(gradient)).lower(x, kernel).as_text()
+    assert set(re.findall(r"feature_group_count = (\d+)", program)) == {"1"}
+    assert set(re.findall(r"dim_numbers = (.*?),\s*window", program)) == {"[b, 0, 1, f]x[0, 1, i, o]->[b, 0, 1, f]"}
+
+
+def test_the_layer_is_that_of_flax():
+    x, own, flax = numbers(16, 2, 6, 5, 3), Conv(8), nn.Conv(8, (3, 3))
+    variables = own.init(jax.random.key(0), x)
+    same_bits(variables, flax.init(jax.random.key(0), x))
+    variables = jax.tree.map(lambda a: a + 0.1, variables)  # a bias of 0 says nothing
+
+    def gradient(layer):
+        return jax.jit(jax.value_and_grad(lambda v: jnp.sum(jnp.sin(layer.apply(v, x)))))(variables)
+
+    close(own.apply(variables, x), flax.apply(variables, x), atol=1e-5)
+    close(gradient(own), gradient(flax), rtol=1e-4, atol=1e-5)

@@ -21,7 +21,7 @@ from spnr_jax.kernels.records import Rendering
 from spnr_jax.method import inference
 from spnr_jax.method.near_points import NearPointsNetwork
 from spnr_jax.method.paper_network import PaperNetwork
-from spnr_jax.training import optimisation, pixels
+from spnr_jax.training import many_runs, optimisation, pixels
 
 
 @pytest.fixture(scope="module")
@@ -349,15 +349,17 @@ class TestReproducibility:
         assert first["loss"] != later["loss"]
 
 
-def test_seeds_in_one_compiled_step_are_the_loop_over_seeds(fresh_l1):
+def test_runs_in_one_compiled_step_are_the_loop_over_runs(fresh_l1):
+    """Seeds, and learning rates as factors: what a run moves by is the factor times what it would move by alone."""
+
     def varied(seed):
         generator = jax.tree.map(lambda x: x + 0.1 * numbers(seed, *x.shape), fresh_l1.generator)
         return dataclasses.replace(fresh_l1, generator=generator, key=jax.random.key(seed))
 
-    states = [varied(seed) for seed in (3, 4)]
-    stacked = jax.tree.map(lambda *x: jnp.stack(x), *states)
-    mapped = jax.vmap(lambda s, b: optimisation.train_step(s, b, config=L1_ONLY, adversarial=False), in_axes=(0, None))
-    after, metrics = jax.jit(mapped)(stacked, BATCH)
+    states, scales = [varied(seed) for seed in (3, 4)], jnp.array([1.0, 0.25])
+    stacked, batches = many_runs.stack(states), jax.tree.map(lambda x: jnp.stack([x, x]), BATCH)
+    mapped = jax.jit(many_runs.train_step, static_argnames=("config", "adversarial"))
+    after, metrics = mapped(stacked, batches, scales, config=L1_ONLY, adversarial=False)
     together = (
         metrics,
         after.batch_stats,
@@ -367,6 +369,14 @@ def test_seeds_in_one_compiled_step_are_the_loop_over_seeds(fresh_l1):
         alone, alone_metrics = step(state, L1_ONLY)
         expected = alone_metrics, alone.batch_stats, alone.generator_optimizer[0].mu
         near(jax.tree.map(lambda x, i=i: x[i], together), expected)
+        moved, alone_moved = (
+            sum(float(jnp.sum(jnp.abs(x - y))) for x, y in zip(*map(jax.tree.leaves, pair), strict=True))
+            for pair in (
+                (jax.tree.map(lambda x, i=i: x[i], after.generator), state.generator),
+                (alone.generator, state.generator),
+            )
+        )
+        assert moved == pytest.approx(float(scales[i]) * alone_moved, rel=1e-2)
 
 
 def test_one_batch_is_learnt_by_heart(fresh_l1):

@@ -1,0 +1,217 @@
+"""All that a GPU is asked for, in one command that ends with one table; on a CPU with --quick, a check of itself.
+
+    python -m experiments.speed.gpu [--out runs/gpu] [--quick]
+
+    the paper's network      beside the compiled PyTorch twin, both in bfloat16 (experiments/speed/bench.py)
+    the surfel network       frames a second at 512 and 1,024 px, as `spnr render` draws a film; training steps
+    many trainings at once   runs of `tiny` under one `jax.vmap`, and the same ones in a loop
+
+Memory is what the compiler lays out for a program: its arguments, its results, and what it needs between.
+JAX takes the memory of a GPU piece by piece here, so that both sides of the first part fit beside each other.
+
+    OUT/results.json  table.md   OUT/bench the rows of the first part
+"""
+
+import dataclasses
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from experiments import entry_point
+from experiments.comparison import results_folder
+from experiments.comparison.result_tables import Table, number, text
+from experiments.speed import bench, ours
+from experiments.speed.surfel_scene import orbiting, random_crops, sphere
+from spnr_jax import cli
+from spnr_jax.config import TrainConfig
+from spnr_jax.devices import machine
+from spnr_jax.method import surfel_renderer
+from spnr_jax.model_config import ModelConfig, SurfelConfig
+from spnr_jax.presets import PRESETS
+from spnr_jax.surfels.lighting import room_light
+from spnr_jax.training import many_runs, optimisation, shading
+
+
+@dataclass(frozen=True, kw_only=True)
+class OnGPU:
+    """Time what a GPU is for; write one table."""
+
+    out: Path = Path("runs/gpu")
+    """Folder of the results."""
+    points: int = 4096
+    """Points of the object that frames show."""
+    frames: int = 48
+    """Frames of a film."""
+    runs: int = 8
+    """Trainings at once."""
+    rounds: int = 10
+    """Turns of what is timed in turns."""
+    quick: bool = False
+    """A check that everything works, on any device: small networks, two turns."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Found:
+    """A row of the table."""
+
+    what: str
+    unit: str
+    a_second: float
+    beside: float | None = None
+    """The same by the other side: the twin, or the loop."""
+    megabytes: float | None = None
+
+
+def main(options: OnGPU) -> None:
+    """Measures one part after the other, a line for each row."""
+    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
+    cli.set_up_jax()
+    if options.quick:
+        options = dataclasses.replace(options, points=128, frames=2, runs=2, rounds=2)
+    parts: tuple[Callable[[OnGPU], list[Found]], ...] = (films, surfel_steps, many_trainings, beside_twin)
+    rows = []
+    for part in parts:
+        for row in part(options):
+            rows.append(row)
+            print(f"{row.what}: {row.a_second:.1f} {row.unit} a second", flush=True)
+    notes = [f"{machine.hardware()}; {machine.processor()}; jax {jax.__version__}; {time.strftime('%Y-%m-%d')}."]
+    found = {"hardware": machine.hardware(), "rows": [dataclasses.asdict(row) for row in rows]}
+    results_folder.write(options.out, found, [table(rows)], notes)
+
+
+def films(options: OnGPU) -> list[Found]:
+    """Frames of an orbit, each of them brought to the host."""
+    config = SurfelConfig(widths=(4, 6), top=4) if options.quick else SurfelConfig()
+    variables, light = surfel_renderer.init(jax.random.key(0), config), room_light()
+    scene, rows = surfel_renderer.encode(sphere(options.points)), []
+    for size in (32, 64) if options.quick else (512, 1024):
+        views = [orbiting(size, 0.1 * frame) for frame in range(options.frames)]
+
+        def film(views: list = views) -> None:
+            for frame in surfel_renderer.render_each(variables, scene, views, [light] * len(views), config=config):
+                np.asarray(frame.image)
+
+        seconds = least(film, 2)
+        rows.append(Found(what=f"surfel network, {size} px", unit="frames", a_second=options.frames / seconds))
+    return rows
+
+
+def surfel_steps(options: OnGPU) -> list[Found]:
+    """Training steps of the preset `surfels`, on crops that are on the device."""
+    config = PRESETS["surfels"]()
+    if options.quick:
+        config = dataclasses.replace(config, model=SurfelConfig(widths=(4, 6), top=4), crop=16, batch_objects=2)
+    crops = random_crops(config, doublings=1)
+    compiled = compile_of(partial(shading.train_step, config=config), optimisation.jitted_create_state(config), crops)
+    seconds = least(compiled.run, options.rounds)
+    what = f"training of `surfels`, {len(crops.seen)} crops of {crops.seen.shape[1]} px doubled once"
+    return [Found(what=what, unit="steps", a_second=1 / seconds, megabytes=compiled.megabytes)]
+
+
+def many_trainings(options: OnGPU) -> list[Found]:
+    """Steps of a run, of all runs under one vmap, beside those of a loop over the same step."""
+    config = small(PRESETS["tiny"]()) if options.quick else ours.twin_sized("tiny", "train_l1", 2)
+    batch, runs = ours.batch(config), options.runs
+    states = [optimisation.jitted_create_state(config, jnp.uint32(seed)) for seed in range(runs)]
+    batches = jax.tree.map(lambda x: jnp.stack([x] * runs), batch)
+    step = partial(optimisation.train_step, config=config, adversarial=False)
+    one = compile_of(step, states[0], batch)
+    together = compile_of(
+        partial(many_runs.train_step, config=config, adversarial=False), many_runs.stack(states), batches
+    )
+
+    def loop() -> list:
+        return [one.run() for _ in range(runs)]
+
+    pairs = [(least(together.run), least(loop)) for _ in range(options.rounds)]
+    by_vmap, by_loop = np.median(pairs, axis=0)
+    what = f"{runs} trainings of `tiny` at once"
+    return [
+        Found(
+            what=what,
+            unit="steps of a run",
+            a_second=runs / by_vmap,
+            beside=runs / by_loop,
+            megabytes=together.megabytes,
+        )
+    ]
+
+
+def small(config: TrainConfig) -> TrainConfig:
+    """The config of a network that compiles in seconds, for whole views."""
+    assert isinstance(config.model, ModelConfig)
+    model = dataclasses.replace(
+        config.model, point_widths=(8,), point_features=8, volume_resolution=8, num_stages=1, field_width=8
+    )
+    loss = dataclasses.replace(config.loss, adversarial_weight=0.0)
+    return dataclasses.replace(config, model=model, loss=loss, batch_objects=1, min_points=64, max_points=64)
+
+
+def beside_twin(options: OnGPU) -> list[Found]:
+    """Rows of the benchmark in bfloat16 on this device; ours alone without torch."""
+    platform: Any = "cpu" if jax.default_backend() == "cpu" else "cuda"
+    asked = bench.Options(
+        out=options.out / "bench", variants=("compiled",), platform=platform, bf16=True, rounds=options.rounds
+    )
+    if options.quick:
+        asked = dataclasses.replace(asked, presets=("tiny",), modes=("render",), seconds=0.1)
+    rows = bench.rows_of(asked)
+    return [
+        Found(
+            what=f"paper's network `{row['preset']}` in bfloat16, {row['mode']}, {row['function']}",
+            unit="objects",
+            a_second=1e3 * row["batch"] / row["ours_ms"],
+            beside=row["twin_ms"] and 1e3 * row["batch"] / row["twin_ms"],
+        )
+        for row in rows
+    ]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Compiled:
+    """A program with its arguments, and the memory that it takes."""
+
+    run: Callable[[], object]
+    megabytes: float
+
+
+def compile_of(function: Callable, *arguments: Any) -> Compiled:
+    """The function compiled for these arguments."""
+    program = jax.jit(function).lower(*arguments).compile()
+    sizes: Any = program.memory_analysis()
+    whole = sizes.argument_size_in_bytes + sizes.output_size_in_bytes + sizes.temp_size_in_bytes
+    return Compiled(run=lambda: program(*arguments), megabytes=whole / 2**20)
+
+
+def least(run: Callable[[], object], times: int = 1) -> float:
+    """Seconds of the fastest of so many runs, after one that compiles or fills the caches."""
+    taken = []
+    for _ in range(times + 1):
+        start = time.perf_counter()
+        jax.block_until_ready(run())
+        taken.append(time.perf_counter() - start)
+    return min(taken[1:])
+
+
+def table(rows: list[Found]) -> Table:
+    """A line for each row."""
+    heads = ("a second", "of", "by the twin or the loop", "times that", "MB")
+    lines = []
+    for row in rows:
+        ratio = None if row.beside is None else row.a_second / row.beside
+        compared = number(row.beside, 2, missing="-"), number(ratio, 2, missing="-")
+        cells = (number(row.a_second, 2), text(row.unit), *compared, number(row.megabytes, 0, missing="-"))
+        lines.append((row.what, cells))
+    return Table(title="What a GPU is for", heads=heads, rows=tuple(lines))
+
+
+if __name__ == "__main__":
+    entry_point.run(main, OnGPU, "speed.gpu")

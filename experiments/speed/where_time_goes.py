@@ -1,0 +1,186 @@
+"""Where the time of a training step and of a film frame goes, and what the machine's limit would be.
+
+    python -m experiments.speed.where_time_goes [--out runs/where_time_goes] [--points 4096] [--size 512] [--quick]
+
+The programs that a step of the surfel network and a frame of it are made of are timed alone, in turns; beside each
+stand the operations that the compiler counts in it (`cost_analysis`) and how long they would take at the pace of a
+product of matrices, which is measured in the same turns.  On a CPU time is that of the processor, all threads added up,
+so that other work on the machine changes little.  Weights are fresh: no time depends on them.
+
+    OUT/results.json  table.md
+"""
+
+import dataclasses
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from experiments import entry_point
+from experiments.comparison import results_folder
+from experiments.comparison.result_tables import Table, number
+from experiments.speed.surfel_scene import orbiting, random_crops, sphere
+from spnr_jax import cli
+from spnr_jax.devices import machine
+from spnr_jax.errors import UserError
+from spnr_jax.method import surfel_renderer
+from spnr_jax.model_config import SurfelConfig
+from spnr_jax.nn.shader import Shader, picture
+from spnr_jax.presets import PRESETS
+from spnr_jax.surfels import splatting
+from spnr_jax.surfels.lighting import room_light
+from spnr_jax.training import optimisation, shading
+
+SIDE = 1024  # of the matrices whose product is the machine's pace
+
+
+@dataclass(frozen=True, kw_only=True)
+class WhereTimeGoes:
+    """Time the programs of a training step and of a film frame, beside the machine's limit."""
+
+    out: Path = Path("runs/where_time_goes")
+    """Folder of the results."""
+    points: int = 4096
+    """Points of the object that is drawn."""
+    size: int = 512
+    """Pixels along each side of a frame."""
+    doublings: int = 1
+    """Of the crops of the training step: 0 to 4, most steps have 0 to 2."""
+    rounds: int = 9
+    """Turns of each program."""
+    quick: bool = False
+    """A check that everything works: a few points and pixels, two turns."""
+
+    def __post_init__(self) -> None:
+        for name in ("points", "size", "rounds"):
+            if getattr(self, name) < 1:
+                raise UserError(f"--{name} must be at least 1, got {getattr(self, name)}")
+
+
+class Program(NamedTuple):
+    """What to run, and the operations that are counted in it (None where it is not one program)."""
+
+    run: Callable[[], object]
+    operations: float | None
+
+
+def main(options: WhereTimeGoes) -> None:
+    """Times both, and writes a table of each."""
+    cli.set_up_jax()
+    if options.quick:
+        options = dataclasses.replace(options, points=256, size=64, rounds=2)
+    parts = {"a training step": step_programs(options), f"a frame of {options.size} px": frame_programs(options)}
+    found: dict[str, Any] = {"hardware": machine.hardware(), "processor": machine.processor(), "load": machine.load()}
+    tables = []
+    for name, programs in parts.items():
+        found[name], shown = timed(programs, options.rounds), name[0].upper() + name[1:]
+        tables.append(table(shown, programs, found[name]))
+    sizes = f"{options.points} points, {options.size} px, crops of {options.doublings} doublings"
+    results_folder.write(options.out, found, tables, [f"{sizes}; {found['processor']}, load {found['load']}."])
+
+
+def program(function: Callable, *arguments: Any) -> Program:
+    """The function compiled for these arguments."""
+    compiled = jax.jit(function).lower(*arguments).compile()
+    cost: Any = compiled.cost_analysis() or {}
+    return Program(lambda: compiled(*arguments), cost.get("flops"))
+
+
+def peak() -> Program:
+    """The product of two matrices."""
+    ones = jnp.ones((SIDE, SIDE))
+    return Program(program(jnp.matmul, ones, ones).run, 2.0 * SIDE**3)
+
+
+def step_programs(options: WhereTimeGoes) -> dict[str, Program]:
+    """The training step of the preset `surfels` and what it is made of."""
+    config = PRESETS["surfels"]()
+    if options.quick:
+        config = dataclasses.replace(config, model=SurfelConfig(widths=(4, 6), top=4), crop=16, batch_objects=2)
+    state = optimisation.jitted_create_state(config)
+    crops = random_crops(config, options.doublings)
+    assert isinstance(config.model, SurfelConfig)
+    shader = Shader(config.model.widths, config.model.top)
+    loss = partial(shading.loss, config=config)
+
+    def network(params: dict, seen: jax.Array) -> Any:
+        return shader.apply({"params": params}, seen, options.doublings)
+
+    def network_gradient(params: dict, seen: jax.Array) -> Any:
+        return jax.grad(lambda params: jnp.sum(network(params, seen)))(params)
+
+    return {
+        "whole step": program(partial(shading.train_step, config=config), state, crops),
+        "loss and its gradient": program(lambda p, c: jax.grad(loss, has_aux=True)(p, c)[0], state.generator, crops),
+        "loss alone": program(lambda p, c: loss(p, c)[0], state.generator, crops),
+        "network and its gradient": program(network_gradient, state.generator, crops.seen),
+        "network alone": program(network, state.generator, crops.seen),
+        "product of matrices": peak(),
+    }
+
+
+def frame_programs(options: WhereTimeGoes) -> dict[str, Program]:
+    """A frame as `surfel_renderer.render` draws it, and its programs alone, on the object's window."""
+    config = SurfelConfig(image_resolution=options.size)
+    variables = surfel_renderer.init(jax.random.key(0), config)
+    camera, light = orbiting(options.size), room_light()
+    scene = surfel_renderer.encode(sphere(options.points))
+    doublings, side = surfel_renderer.resolution_of(scene.spacing, camera)
+    small = orbiting(options.size * side >> doublings)
+    total = int(splatting.count(scene.surfels, small))
+    found, covered = splatting.entries(scene.surfels, small, total=total)
+    look = partial(surfel_renderer.look, slots=int(covered))
+    seen, maps, ambient, _ = jax.jit(look)(found, scene.surfels, light, small)
+    shader = Shader(config.widths, config.top)
+    outputs = shader.apply(variables, seen[None], doublings)
+
+    def whole() -> object:
+        return surfel_renderer.render(variables, scene, camera, light, config=config).image
+
+    return {
+        "whole frame": Program(whole, None),
+        "entries counted": program(splatting.count, scene.surfels, small),
+        "entries made and sorted": program(partial(splatting.entries, total=total), scene.surfels, small),
+        "blended, lit, put before the network": program(look, found, scene.surfels, light, small),
+        "network": program(lambda v, s: shader.apply(v, s[None], doublings), variables, seen),
+        "light on materials": program(lambda o, m, a: picture(o, m[None], a[None], doublings), outputs, maps, ambient),
+        "product of matrices": peak(),
+    }
+
+
+def timed(programs: Mapping[str, Program], rounds: int) -> dict[str, float]:
+    """Milliseconds of each, the median of turns; those of the processor on a CPU."""
+    clock = time.process_time if jax.default_backend() == "cpu" else time.perf_counter
+    taken: dict[str, list[float]] = {name: [] for name in programs}
+    for turn in range(rounds + 1):
+        for name, one in programs.items():
+            start = clock()
+            jax.block_until_ready(one.run())
+            if turn:  # the first compiles, or fills the caches
+                taken[name].append(1e3 * (clock() - start))
+    return {name: float(np.median(values)) for name, values in taken.items()}
+
+
+def table(title: str, programs: Mapping[str, Program], taken: Mapping[str, float]) -> Table:
+    """A row for each program: its time, its share of the whole, its operations, and the machine's limit for them."""
+    whole, *_, last = taken
+    pace = 2.0 * SIDE**3 / taken[last]  # operations a millisecond
+    rows = []
+    for name, one in programs.items():
+        count, ms = one.operations, taken[name]
+        limit = None if count is None else count / pace
+        cells = (number(ms, 1), number(ms / taken[whole], 2))
+        counted = (number(None if count is None else 1e-9 * count, 3, missing="-"), number(limit, 1, missing="-"))
+        rows.append((name, (*cells, *counted, number(None if limit is None else limit / ms, 2, missing="-"))))
+    heads = ("ms", "of the whole", "10^9 operations", "ms at the pace of a product", "of that pace")
+    return Table(title=title, heads=heads, rows=tuple(rows))
+
+
+if __name__ == "__main__":
+    entry_point.run(main, WhereTimeGoes, "speed.where_time_goes")
