@@ -253,7 +253,7 @@ def _train_defaults(arguments: list[str]) -> Train:
 
 def run(command: Command) -> None:
     """Carries a command out."""
-    set_up_jax(repeats=not isinstance(command, Render | View))
+    set_up_jax(repeats=not isinstance(command, View) and not (isinstance(command, Render) and command.few))
     match command:
         case Train():
             run_train(command)

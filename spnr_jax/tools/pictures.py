@@ -107,15 +107,21 @@ def made_ready(options: Render, note: Callable[[str], None], loaded: Callable[[P
 
 
 def drawn(ready: Ready, options: Render, name: Path) -> Iterator[Callable[[], Written]]:
-    """Draws what the options ask for; yields what writes it, under the name and its endings, in any thread."""
-    cameras = still_cameras(ready, options)
-    for i, (camera, rendering) in enumerate(zip(cameras, _still_views(ready, cameras, options), strict=True)):
+    """Draws what the options ask for; yields what writes it, under the name and its endings, in any thread.
+
+    Stills and film are drawn in one go: views that share their sizes share their programs.
+    """
+    stills = [(camera, ready.light) for camera in still_cameras(ready, options)]
+    film = turntable_views(ready, options) if options.turntable != "none" else []
+    views = _views(ready, [*stills, *film], options)
+    cameras = [camera for camera, _ in stills]
+    for i, (camera, rendering) in enumerate(zip(cameras, views, strict=False)):  # the film's are left for below
         yield partial(_write_still, rendering, camera, ready.volume, options, f"{name}_{i:03d}")
     if cameras:
         yield partial(_write_cameras, cameras, ready, name)
-    if options.turntable != "none":
-        film = turntable_frames(ready, options)
-        yield partial(_write_film, Path(f"{name}_turntable.{options.turntable}"), film, options)
+    if film:
+        pictures = [np.asarray(rendering.image) for rendering in views]
+        yield partial(_write_film, Path(f"{name}_turntable.{options.turntable}"), pictures, options)
     if options.mesh or options.density:
         yield from _solids(ready, options, name)
     if options.splats != "none":
@@ -128,16 +134,24 @@ def still_cameras(ready: Ready, options: Render) -> list[Camera]:
     return [_camera(ready, float(FIRST_AZIMUTH + turn), options) for turn in turns]
 
 
+def turntable_views(ready: Ready, options: Render) -> list[tuple[Camera, Light | None]]:
+    """Camera and light of each image of one turn around the object, or of its light."""
+    turns, light = np.arange(options.frames) * 360.0 / options.frames, ready.light
+    azimuths = np.full(options.frames, FIRST_AZIMUTH) if options.turn == "light" else turns
+    lights = [light.turned(turn) if light and options.turn == "light" else light for turn in turns]
+    return [(_camera(ready, float(azimuth), options), shone) for azimuth, shone in zip(azimuths, lights, strict=True)]
+
+
 def _camera(ready: Ready, azimuth: float, options: Render) -> Camera:
     return ready.model.camera(ready.volume, azimuth, options.elevation, options.resolution)
 
 
-def _still_views(ready: Ready, cameras: list[Camera], options: Render) -> Iterator[Rendering]:
-    lights = [ready.light] * len(cameras)
-    for camera, view in zip(
-        cameras, ready.model.render_each(ready.volume, cameras, options.quality, lights), strict=True
-    ):
-        yield before(options.lighting.background, view, camera, ready.light)
+def _views(ready: Ready, views: list[tuple[Camera, Light | None]], options: Render) -> Iterator[Rendering]:
+    """The pictures of cameras in lights, one after the other, before what is wanted behind them."""
+    cameras, lights = [camera for camera, _ in views], [light for _, light in views]
+    renderings = ready.model.render_each(ready.volume, cameras, options.quality, lights)
+    for (camera, light), rendering in zip(views, renderings, strict=True):
+        yield before(options.lighting.background, rendering, camera, light)
 
 
 def _write_still(rendering: Rendering, camera: Camera, volume: Volume, options: Render, stem: str) -> Written:
@@ -182,16 +196,6 @@ def straight_alpha(image: np.ndarray, acc: np.ndarray) -> np.ndarray:
     alpha = np.clip(alpha, 0, 1)[..., None]
     color = (np.clip(image, 0, 1) - (1 - alpha)) / np.maximum(alpha, INVISIBLE)
     return np.concatenate([np.clip(np.where(alpha < INVISIBLE, 1, color), 0, 1), alpha], axis=-1)
-
-
-def turntable_frames(ready: Ready, options: Render) -> list[np.ndarray]:
-    """Images of one turn around the object, or of its light."""
-    turns, light = np.arange(options.frames) * 360.0 / options.frames, ready.light
-    azimuths = np.full(options.frames, FIRST_AZIMUTH) if options.turn == "light" else turns
-    lights = [light.turned(turn) if light and options.turn == "light" else light for turn in turns]
-    views = [_camera(ready, float(azimuth), options) for azimuth in azimuths]
-    pictures = zip(ready.model.render_each(ready.volume, views, options.quality, lights), views, lights, strict=True)
-    return [np.asarray(before(options.lighting.background, *of).image) for of in pictures]
 
 
 def cameras_document(cameras: list[Camera], name: str, placed: PlacedCloud, volume: Volume) -> dict:

@@ -91,6 +91,11 @@ class Render:
         """Names of the options that need a network that takes a light."""
         return (*self.lighting.asked, *(("--turn light",) if self.turn == "light" else ()))
 
+    @property
+    def few(self) -> bool:
+        """Whether so few pictures are drawn that the first one counts most."""
+        return self.turntable == "none" and self.splats == "none" and not is_catalogue(self.cloud)
+
     def __post_init__(self) -> None:
         """ValueError names the option that makes no sense."""
         if self.views < 0:
