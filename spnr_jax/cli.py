@@ -22,18 +22,17 @@ import tyro
 
 from spnr_jax import presets
 from spnr_jax.config import TrainConfig
-from spnr_jax.devices import allocator
-from spnr_jax.errors import UserError, split_debug
+from spnr_jax.devices import allocator, compilation
+from spnr_jax.errors import UserError, one_line, split_debug
 from spnr_jax.formats.cut import Cut
 from spnr_jax.model_config import SurfelConfig
 from spnr_jax.tools.light_options import Lighting
-from spnr_jax.tools.render_command import Render
+from spnr_jax.tools.render_command import Render, is_catalogue
 from spnr_jax.tools.share_command import Share
 from spnr_jax.tools.splat_options import SplatMaking
 
 BOX = r"[╭╮╰╯│─•]+|__tyro-dummy-inner__\."  # what tyro draws around an error, and its name for the whole command
 MANY_POINTS = 16384  # of a cloud that splats are made of
-LONGEST_LINE = 800  # characters of an error
 DESCRIPTION = """Sparse-point neural rendering: train a network, evaluate one, render a cloud of points.
 --debug, or SPNR_DEBUG=1, shows the call stack of an error."""
 
@@ -254,7 +253,7 @@ def _train_defaults(arguments: list[str]) -> Train:
 
 def run(command: Command) -> None:
     """Carries a command out."""
-    set_up_jax(repeats=not isinstance(command, Render | View))
+    set_up_jax(repeats=not isinstance(command, View) and not (isinstance(command, Render) and command.few))
     match command:
         case Train():
             run_train(command)
@@ -275,17 +274,13 @@ def run(command: Command) -> None:
 
 
 def set_up_jax(*, repeats: bool = True) -> None:
-    """Lets a second run skip XLA's compilation; JAX_COMPILATION_CACHE_DIR moves the cache.
+    """Lets a second run skip XLA's compilation, and arrays lie where others lay.
 
     Work that repeats itself on a CPU uses the memory of the time before; a first picture comes 0.1 s sooner without.
     """
-    import jax
-
     if repeats:
         allocator.keep_arrays()
-    if jax.config.values["jax_compilation_cache_dir"] is None:
-        jax.config.update("jax_compilation_cache_dir", str(Path.home() / ".cache" / "spnr_jax"))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+    compilation.keep_programs()
 
 
 def run_train(command: Train) -> None:
@@ -330,9 +325,15 @@ def run_evaluate(command: Evaluate) -> None:
 
 def run_render(command: Render) -> None:
     """`spnr render`."""
-    from spnr_jax.tools.pictures import render_file
+    if is_catalogue(command.cloud):
+        from spnr_jax.tools.catalogue import render_catalogue
 
-    for line in render_file(command, note=lambda line: print(f"{command.cloud}: {line}", file=sys.stderr)):
+        lines = render_catalogue(command)
+    else:
+        from spnr_jax.tools.pictures import render_file
+
+        lines = render_file(command, note=lambda line: print(f"{command.cloud}: {line}", file=sys.stderr))
+    for line in lines:
         print(line, flush=True)
 
 
@@ -419,16 +420,6 @@ def run_convert_lpips(command: ConvertLpips) -> None:
 
     lpips_weights.convert(command.alexnet, command.heads, command.out)
     print(f"wrote {command.out} (score with `spnr evaluate DATA RUN --lpips {command.out}`)")
-
-
-def one_line(error: Exception) -> str:
-    """What an error says, on one line that a person can read whole; an error of the disk with its place."""
-    said = str(error)
-    if isinstance(error, OSError) and error.strerror:
-        said = f"{error.filename or 'disk'}: {error.strerror}"
-    line = " ".join(said.split())
-    # a name or number in a broken file may be of any length
-    return line if len(line) <= LONGEST_LINE else f"{line[: LONGEST_LINE // 2]} ... {line[-LONGEST_LINE // 2 :]}"
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@ import os
 import traceback
 
 JSON = (dict, list, str, int, float, bool, type(None))
+LONGEST_LINE = 800  # characters of an error
 PACKAGES = ("spnr_jax", "data_gen", "experiments")
 
 
@@ -26,3 +27,13 @@ def is_bug(error: Exception) -> bool:
     if not frames or frames[-1].f_globals.get("__name__", "").partition(".")[0] not in PACKAGES:
         return False
     return isinstance(error, NameError) or (isinstance(error, AttributeError) and not isinstance(error.obj, JSON))
+
+
+def one_line(error: Exception) -> str:
+    """What an error says, on one line that a person can read whole; an error of the disk with its place."""
+    said = str(error)
+    if isinstance(error, OSError) and error.strerror:
+        said = f"{error.filename or 'disk'}: {error.strerror}"
+    line = " ".join(said.split())
+    # a name or number in a broken file may be of any length
+    return line if len(line) <= LONGEST_LINE else f"{line[: LONGEST_LINE // 2]} ... {line[-LONGEST_LINE // 2 :]}"

@@ -37,7 +37,14 @@ print(jax.config.values["jax_cpu_enable_async_dispatch"], jax.config.values["jax
 """
 
 
-@pytest.mark.parametrize(("arguments", "said"), [(["render", "x.ply"], ["True"]), (["runs", "."], ["kept", "False"])])
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["render", "x.ply", "--turntable", "none"], ["True"]),
+        (["render", "x.ply"], ["kept", "False"]),
+        (["runs", "."], ["kept", "False"]),
+    ],
+)
 def test_memory_is_kept_where_work_repeats_itself_and_compilations_always(arguments, said, tmp_path):
     done = subprocess.run(
         [sys.executable, "-c", SETTING_UP, *arguments],

@@ -35,6 +35,7 @@ PURE = ("kernels", "surfels", "gaussians", "nn", "baselines", "method")
 WITHOUT_JIT = ("devices", "kernels", "nn", "baselines")
 OF_SPNR_JAX = {
     "spnr_jax/errors",
+    "spnr_jax/devices",
     "spnr_jax/kernels",
     "spnr_jax/surfels",
     "spnr_jax/formats",

@@ -1,4 +1,4 @@
-"""A data set from its plan: what is missing is made by workers (cluster.py), then the lists are written.
+"""A data set from its plan: what is missing is made by workers (devices/cluster.py), then the lists are written.
 
 Products are made first, split, and then the colour variants of those that train (plan/splits.py). A run may stop
 anywhere: finished objects stay, and the same command makes the others, to the same bytes. dataset.json
@@ -14,7 +14,6 @@ from dataclasses import fields, replace
 
 from tqdm import tqdm
 
-from data_gen.make.cluster import Died, connect, run_tasks
 from data_gen.make.description import describe, differences
 from data_gen.make.objects import Workbench, make_and_write
 from data_gen.plan.data_presets import PAPER_COUNTS
@@ -23,6 +22,7 @@ from data_gen.render import light, views
 from data_gen.render.variant import choose_variant, mitsuba_module
 from data_gen.store import layout, storage
 from data_gen.store.storage import Location
+from spnr_jax.devices.cluster import Died, connect, run_tasks
 from spnr_jax.errors import UserError
 from spnr_jax.formats.light_files import read_envmap
 from spnr_jax.surfels.room import indoor_envmap

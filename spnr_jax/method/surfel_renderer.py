@@ -140,7 +140,7 @@ def _drawn(
 
 def resolution_of(spacing: float, camera: Camera) -> tuple[int, int]:
     """Doublings by the network, and pixels averaged along each side, for points this far apart around the origin."""
-    focal, eye = (np.asarray(x, np.float64) for x in (camera.intrinsics[0, 0], camera.cam_to_world[:, 3]))
+    focal, eye = np.asarray(camera.intrinsics)[0, 0], np.asarray(camera.cam_to_world, np.float64)[:, 3]
     pixels = spacing * float(focal) / max(float(np.linalg.norm(eye)), 1e-3)
     doublings = int(np.clip(np.floor(np.log2(max(pixels / COARSEST, 1e-9))) + 1, 0, MOST_DOUBLINGS))
     return doublings, 2 if pixels < FINEST else 1
@@ -176,17 +176,18 @@ def _rounded(count: int, least: int, most: int) -> int:
 def _scaled(camera: Camera, doublings: int, side: int) -> Camera:
     """The camera at the network's resolution; doubled, its picture may be larger than asked for, and is cut."""
     height, width = (-(-n * side // 2**doublings) for n in (camera.height, camera.width))
-    scale = jnp.array([[side / 2**doublings], [side / 2**doublings], [1.0]], jnp.float32)
-    intrinsics = jnp.asarray(camera.intrinsics, jnp.float32) * scale
+    scale = np.array([[side / 2**doublings], [side / 2**doublings], [1.0]], np.float32)
+    intrinsics = np.asarray(camera.intrinsics, np.float32) * scale
     return Camera(cam_to_world=camera.cam_to_world, intrinsics=intrinsics, height=height, width=width)
 
 
 def _seen_through(camera: Camera, plan: Plan) -> Camera:
     """The camera whose picture is the window."""
-    shift = jnp.zeros((3, 3)).at[:2, 2].set(jnp.array([plan.left, plan.top], jnp.float32))
+    intrinsics = np.array(camera.intrinsics, np.float32)
+    intrinsics[:2, 2] -= plan.left, plan.top
     return Camera(
-        cam_to_world=jnp.asarray(camera.cam_to_world, jnp.float32),
-        intrinsics=jnp.asarray(camera.intrinsics, jnp.float32) - shift,
+        cam_to_world=np.asarray(camera.cam_to_world, np.float32),
+        intrinsics=intrinsics,
         height=plan.height,
         width=plan.width,
     )
@@ -248,13 +249,20 @@ def _placed(drawn: Float[AnyArray, "h w 5"], camera: Camera, plan: Plan) -> Rend
     if plan.side > 1:
         sums = np.asarray(mean_of_squares(jnp.asarray(sums), plan.side))
     acc = sums[..., 3]
-    rays = cameras.camera_rays(jax.tree.map(jnp.asarray, camera))
-    _, far, _ = cameras.intersect_box(rays.origins, rays.directions)
-    along = np.maximum(-np.asarray(rays.directions) @ np.asarray(camera.cam_to_world)[:, 2], 1e-6)
+    along, far = jax.device_get(_along_and_far(camera))
     image = sums[..., :3] + (1 - acc[..., None]) * WHITE
-    depth = sums[..., 4] / along + (1 - acc) * np.asarray(far)
-    whole, opacity = jnp.asarray(image, jnp.float32), jnp.asarray(acc)
-    return Rendering(image=whole, image_lr=whole, depth=jnp.asarray(depth, jnp.float32), acc=opacity)
+    depth = sums[..., 4] / along + (1 - acc) * far
+    whole, depth, opacity = jax.device_put((image.astype(np.float32), depth.astype(np.float32), acc))
+    return Rendering(image=whole, image_lr=whole, depth=depth, acc=opacity)
+
+
+@jax.jit  # operations outside of it would be compiled one by one: 50 of them, 2 s of a first picture
+def _along_and_far(camera: Camera) -> tuple[Float[Array, "height width"], Float[Array, "height width"]]:
+    """Cosine between each pixel's ray and the camera's axis, and where the ray leaves the box."""
+    rays = cameras.camera_rays(camera)
+    _, far, _ = cameras.intersect_box(rays.origins, rays.directions)
+    along = -jnp.einsum("hwi,i->hw", rays.directions, camera.cam_to_world[:, 2], precision="highest")
+    return jnp.maximum(along, 1e-6), far
 
 
 def _nothing(camera: Camera) -> Rendering:

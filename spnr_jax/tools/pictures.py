@@ -7,6 +7,7 @@
     NAME_000_opacity.png
     NAME_turntable.gif          or .mp4
     NAME_mesh.glb               in the file's frame and units
+    NAME_splats.ply             or .spz, .glb
     NAME_density.npz            density (x, y, z) per unit, lowest, spacing: place = lowest + spacing * index
     NAME_cameras.json           cameras in the nerfstudio convention in the file's frame, up axis, normalisation
 
@@ -17,13 +18,19 @@ import io
 import json
 import os
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cache, partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from PIL import Image
 
+from spnr_jax.devices.side_by_side import beside
+from spnr_jax.errors import UserError
 from spnr_jax.formats import clouds, images
 from spnr_jax.formats.clouds import PlacedCloud
+from spnr_jax.formats.gaussian_files import write_splats
 from spnr_jax.kernels.records import Camera, Light, Rendering
 from spnr_jax.method.model import Model, Volume
 from spnr_jax.model_config import RayNetworkConfig
@@ -40,12 +47,49 @@ MESH_OPACITY = 0.3
 SOLID = "small"  # network of the package that has a density
 
 
+class Written(NamedTuple):
+    """The line about what has been written, or what else is to be said; the files."""
+
+    line: str
+    paths: tuple[Path, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ready:
+    """A cloud that is read and encoded, and what draws it."""
+
+    placed: PlacedCloud
+    network: str
+    model: Model
+    volume: Volume
+    light: Light | None
+
+
 def render_file(options: Render, note: Callable[[str], None]) -> Iterator[str]:
     """Writes what the options ask for; yields a line about each file, `note` gets the assumptions about the cloud."""
-    _check_writable(options.out)
-    named = load(options.run) if options.run else None  # a run that is none is said before the cloud is read
+    if options.cluster or options.workers:
+        raise UserError(f"{options.cloud}: a single file; --cluster and --workers draw those of a folder or pattern")
+    check_writable(options.out)
+    loaded = cache(load)
+    load_named(options, loaded)  # a run that is none is said before the cloud is read
+    ready = made_ready(options, note, loaded)
+    yield f"encoded {len(ready.placed.cloud.positions)} points of {options.cloud}"
+    for written in beside(drawn(ready, options, options.out / options.cloud.stem)):
+        if written.line:
+            yield written.line
+
+
+def load_named(options: Render, loaded: Callable[[Path | str], Model]) -> Model | None:
+    """The network that the options name, if they do; ValueError if it cannot draw what they ask for."""
+    named = loaded(options.run) if options.run else None
     if named:
         check_takes_light(named, options.asked_of_light, options.run)
+    return named
+
+
+def made_ready(options: Render, note: Callable[[str], None], loaded: Callable[[Path | str], Model]) -> Ready:
+    """The cloud of the options read and encoded; `note` gets the assumptions about it, `loaded` gives a network."""
+    named = load_named(options, loaded)
     light = light_of_options(options.lighting) if options.asked_of_light else None
     placed = clouds.place_cloud(
         options.cloud,
@@ -57,29 +101,77 @@ def render_file(options: Render, note: Callable[[str], None]) -> Iterator[str]:
         transparent_parts=options.transparent_parts,
         report=note,
     )
-    model = named or load("surfels" if light else suited_to(len(placed.cloud.positions)))
-    volume = model.encode(placed.cloud)
-    yield f"encoded {len(placed.cloud.positions)} points of {options.cloud}"
-    name = options.out / options.cloud.stem
-    frames = []
-    for i, azimuth in enumerate(FIRST_AZIMUTH + np.arange(options.views) * 360 / max(options.views, 1)):
-        camera = model.camera(volume, float(azimuth), options.elevation, options.resolution)
-        rendering = model.render(volume, camera, options.quality, light)
-        rendering = before(options.lighting.background, rendering, camera, light)
-        stem = f"{name}_{i:03d}"
-        for suffix, data in still_files(rendering, camera, volume, options):
-            images.write_whole(Path(stem + suffix), data)
-        frames.append({"file_path": f"{Path(stem).name}.png", "camera": camera})
-        yield f"wrote {stem}.png"
-    if frames:
-        document = cameras_document(frames, placed, volume)
-        images.write_whole(Path(f"{name}_cameras.json"), (json.dumps(document, indent=1) + "\n").encode())
-    if options.turntable != "none":
-        film = turntable_frames(model, volume, options, light)
-        path, reason = images.write_turntable(Path(f"{name}_turntable.{options.turntable}"), film, options.fps)
-        yield f"wrote {path}" + (f" ({reason})" if reason else "")
+    network = str(options.run or ("surfels" if light else suited_to(len(placed.cloud.positions))))
+    model = named or loaded(network)
+    return Ready(placed=placed, network=network, model=model, volume=model.encode(placed.cloud), light=light)
+
+
+def drawn(ready: Ready, options: Render, name: Path) -> Iterator[Callable[[], Written]]:
+    """Draws what the options ask for; yields what writes it, under the name and its endings, in any thread.
+
+    Stills and film are drawn in one go: views that share their sizes share their programs.
+    """
+    stills = [(camera, ready.light) for camera in still_cameras(ready, options)]
+    film = turntable_views(ready, options) if options.turntable != "none" else []
+    views = _views(ready, [*stills, *film], options)
+    cameras = [camera for camera, _ in stills]
+    for i, (camera, rendering) in enumerate(zip(cameras, views, strict=False)):  # the film's are left for below
+        yield partial(_write_still, rendering, camera, ready.volume, options, f"{name}_{i:03d}")
+    if cameras:
+        yield partial(_write_cameras, cameras, ready, name)
+    if film:
+        pictures = [np.asarray(rendering.image) for rendering in views]
+        yield partial(_write_film, Path(f"{name}_turntable.{options.turntable}"), pictures, options)
     if options.mesh or options.density:
-        yield from _write_solids(model, volume, placed, options, name)
+        yield from _solids(ready, options, name)
+    if options.splats != "none":
+        yield from _splats(ready, options, Path(f"{name}_splats.{options.splats}"))
+
+
+def still_cameras(ready: Ready, options: Render) -> list[Camera]:
+    """Cameras evenly around the object."""
+    turns = np.arange(options.views) * 360 / max(options.views, 1)
+    return [_camera(ready, float(FIRST_AZIMUTH + turn), options) for turn in turns]
+
+
+def turntable_views(ready: Ready, options: Render) -> list[tuple[Camera, Light | None]]:
+    """Camera and light of each image of one turn around the object, or of its light."""
+    turns, light = np.arange(options.frames) * 360.0 / options.frames, ready.light
+    azimuths = np.full(options.frames, FIRST_AZIMUTH) if options.turn == "light" else turns
+    lights = [light.turned(turn) if light and options.turn == "light" else light for turn in turns]
+    return [(_camera(ready, float(azimuth), options), shone) for azimuth, shone in zip(azimuths, lights, strict=True)]
+
+
+def _camera(ready: Ready, azimuth: float, options: Render) -> Camera:
+    return ready.model.camera(ready.volume, azimuth, options.elevation, options.resolution)
+
+
+def _views(ready: Ready, views: list[tuple[Camera, Light | None]], options: Render) -> Iterator[Rendering]:
+    """The pictures of cameras in lights, one after the other, before what is wanted behind them."""
+    cameras, lights = [camera for camera, _ in views], [light for _, light in views]
+    renderings = ready.model.render_each(ready.volume, cameras, options.quality, lights)
+    for (camera, light), rendering in zip(views, renderings, strict=True):
+        yield before(options.lighting.background, rendering, camera, light)
+
+
+def _write_still(rendering: Rendering, camera: Camera, volume: Volume, options: Render, stem: str) -> Written:
+    paths = []
+    for suffix, data in still_files(rendering, camera, volume, options):
+        paths.append(Path(stem + suffix))
+        images.write_whole(paths[-1], data)
+    return Written(f"wrote {stem}.png", tuple(paths))
+
+
+def _write_cameras(cameras: list[Camera], ready: Ready, name: Path) -> Written:
+    path = Path(f"{name}_cameras.json")
+    document = cameras_document(cameras, name.name, ready.placed, ready.volume)
+    images.write_whole(path, (json.dumps(document, indent=1) + "\n").encode())
+    return Written("", (path,))
+
+
+def _write_film(path: Path, film: list[np.ndarray], options: Render) -> Written:
+    path, reason = images.write_turntable(path, film, options.fps)
+    return Written(f"wrote {path}" + (f" ({reason})" if reason else ""), (path,))
 
 
 def still_files(rendering: Rendering, camera: Camera, volume: Volume, options: Render) -> Iterator[tuple[str, bytes]]:
@@ -106,19 +198,9 @@ def straight_alpha(image: np.ndarray, acc: np.ndarray) -> np.ndarray:
     return np.concatenate([np.clip(np.where(alpha < INVISIBLE, 1, color), 0, 1), alpha], axis=-1)
 
 
-def turntable_frames(model: Model, volume: Volume, options: Render, light: Light | None) -> list[np.ndarray]:
-    """Images of one turn around the object, or of its light."""
-    turns = np.arange(options.frames) * 360.0 / options.frames
-    azimuths = np.full(options.frames, FIRST_AZIMUTH) if options.turn == "light" else turns
-    lights = [light.turned(turn) if light and options.turn == "light" else light for turn in turns]
-    views = [model.camera(volume, float(a), options.elevation, options.resolution) for a in azimuths]
-    pictures = zip(model.render_each(volume, views, options.quality, lights), views, lights, strict=True)
-    return [np.asarray(before(options.lighting.background, *of).image) for of in pictures]
-
-
-def cameras_document(frames: list[dict], placed: PlacedCloud, volume: Volume) -> dict:
+def cameras_document(cameras: list[Camera], name: str, placed: PlacedCloud, volume: Volume) -> dict:
     """The views in the nerfstudio convention, and what was done to the points: box = scale * (rotation p - centre)."""
-    camera: Camera = frames[0]["camera"]
+    camera = cameras[0]
     intrinsics, scale = np.asarray(camera.intrinsics, np.float64), float(volume.scale)
     return {
         "camera_model": "OPENCV",
@@ -129,8 +211,8 @@ def cameras_document(frames: list[dict], placed: PlacedCloud, volume: Volume) ->
         "cx": intrinsics[0, 2],
         "cy": intrinsics[1, 2],
         "frames": [
-            {"file_path": frame["file_path"], "transform_matrix": _pose_in_file(frame["camera"], placed).tolist()}
-            for frame in frames
+            {"file_path": f"{name}_{i:03d}.png", "transform_matrix": _pose_in_file(camera, placed).tolist()}
+            for i, camera in enumerate(cameras)
         ],
         "up": placed.up,
         "normalization": {
@@ -150,25 +232,37 @@ def _pose_in_file(camera: Camera, placed: PlacedCloud) -> np.ndarray:
     return pose
 
 
-def _write_solids(model: Model, volume: Volume, placed: PlacedCloud, options: Render, name: Path) -> Iterator[str]:
-    """Writes the density grid, and its surface as a mesh."""
+def _solids(ready: Ready, options: Render, name: Path) -> Iterator[Callable[[], Written]]:
+    """The density grid, and its surface as a mesh."""
     from spnr_jax.tools import density_grid, mesh_export  # here: pictures alone do without
 
+    model, volume = ready.model, ready.volume
     if not isinstance(model.config, RayNetworkConfig):
-        yield f"the network that renders has no density: that of the package's {SOLID} is taken"
+        yield partial(Written, f"the network that renders has no density: that of the package's {SOLID} is taken")
         model = load(SOLID)
-        volume = model.encode(placed.cloud)
-    grid = density_grid.sample_density(model, volume, placed, options.grid_resolution)
+        volume = model.encode(ready.placed.cloud)
+    grid = density_grid.sample_density(model, volume, ready.placed, options.grid_resolution)
     if options.density:
         arrays = {"density": grid.density, "lowest": grid.lowest + grid.origin, "spacing": grid.spacing}
-        images.write_whole(
-            Path(f"{name}_density.npz"), _saved(lambda file, _: np.savez_compressed(file, **arrays), None)
-        )
-        yield f"wrote {name}_density.npz"
+        content = _saved(lambda file, _: np.savez_compressed(file, **arrays), None)
+        yield partial(_write_solid, Path(f"{name}_density.npz"), content)
     if options.mesh:
-        content, num_faces = mesh_export.mesh_of(grid, placed, -np.log1p(-MESH_OPACITY) / grid.voxel)
-        images.write_whole(Path(f"{name}_mesh.glb"), content)
-        yield f"wrote {name}_mesh.glb ({num_faces} faces)"
+        content, num_faces = mesh_export.mesh_of(grid, ready.placed, -np.log1p(-MESH_OPACITY) / grid.voxel)
+        yield partial(_write_solid, Path(f"{name}_mesh.glb"), content, f" ({num_faces} faces)")
+
+
+def _write_solid(path: Path, content: bytes, details: str = "") -> Written:
+    images.write_whole(path, content)
+    return Written(f"wrote {path}{details}", (path,))
+
+
+def _splats(ready: Ready, options: Render, path: Path) -> Iterator[Callable[[], Written]]:
+    """Gaussian splats of the cloud as the network draws it."""
+    from spnr_jax.tools import splat_export  # here: pictures alone do without
+
+    made = splat_export.splats_of_volume(ready.model, ready.volume, ready.placed.cloud, ready.light, options.making)
+    note = splat_export.note_of(options.cloud, Path(ready.network), options.lighting)
+    yield lambda: Written(f"wrote {path} ({write_splats(path, made, note) / 1e6:.1f} MB)", (path,))
 
 
 def _saved(write: Callable, content) -> bytes:
@@ -178,7 +272,7 @@ def _saved(write: Callable, content) -> bytes:
     return stream.getvalue()
 
 
-def _check_writable(out: Path) -> None:
+def check_writable(out: Path) -> None:
     """OSError if the folder can neither be written to nor be made."""
     existing = next(path for path in (out, *out.absolute().parents) if path.exists())
     if not existing.is_dir():

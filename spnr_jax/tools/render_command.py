@@ -1,6 +1,6 @@
 """The options of `spnr render`, and nothing that takes time to import: `--help` reads this file alone."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
@@ -9,22 +9,34 @@ import tyro
 from spnr_jax.errors import UserError
 from spnr_jax.formats.cut import Cut
 from spnr_jax.tools.light_options import Lighting
+from spnr_jax.tools.splat_options import SplatMaking
 
 Output = Literal["image", "depth", "opacity"]
+WILDCARDS = "*?["  # of a pattern of files
+
+
+def is_catalogue(cloud: Path) -> bool:
+    """Whether a folder or a pattern is meant, and not a file, whatever its name."""
+    return cloud.is_dir() or (not cloud.exists() and any(mark in str(cloud) for mark in WILDCARDS))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Render:
-    """Render a point cloud or mesh file: views as .png, a turntable, depth, opacity, a mesh, the density grid."""
+    """Render a point cloud or mesh file: views as .png, a turntable, depth, opacity, a mesh, the density grid, splats.
+    Of a folder, or a pattern in quotation marks, every file is drawn, and a page shows them all."""
 
     cloud: tyro.conf.Positional[Path]
     """.ply (also 3D Gaussian splats) .pcd .xyz .txt .csv .las .laz .npz .npy, or a mesh: .glb .gltf .obj .stl .off (its
-    surface is sampled)."""
+    surface is sampled).  Or a folder, with all folders in it, or a pattern such as 'scans/**/*.ply'."""
     run: Path | None = None
     """Network that renders: `surfels`, `small` or `tiny` of the package, a run folder, a file of weights
     (default: surfels, of fewer than 6,000 points small)."""
     out: Path = Path("renders")
-    """Folder for what is written."""
+    """Folder for what is written; what stands there of a folder's or pattern's files is not drawn again."""
+    workers: int | None = None
+    """Processes that draw the files of a folder or pattern (default: this one; extra `cluster`)."""
+    cluster: str | None = None
+    """Address of a Dask scheduler whose workers draw instead.  They see the files and OUT under the same names."""
     up: Literal["auto", "x", "y", "z", "-x", "-y", "-z"] = "auto"
     """The file's upward axis; auto: by the format, else y or z, as the object would stand."""
     num_points: int = 16384
@@ -69,11 +81,20 @@ class Render:
     """Also write the density on a grid as .npz."""
     grid_resolution: int = 96
     """Places along each side of the grid of --mesh and --density."""
+    splats: Literal["none", "ply", "spz", "glb"] = "none"
+    """Also write Gaussian splats."""
+    making: SplatMaking = field(default_factory=SplatMaking)
+    """How they are made."""
 
     @property
     def asked_of_light(self) -> tuple[str, ...]:
         """Names of the options that need a network that takes a light."""
         return (*self.lighting.asked, *(("--turn light",) if self.turn == "light" else ()))
+
+    @property
+    def few(self) -> bool:
+        """Whether so few pictures are drawn that the first one counts most."""
+        return self.turntable == "none" and self.splats == "none" and not is_catalogue(self.cloud)
 
     def __post_init__(self) -> None:
         """ValueError names the option that makes no sense."""
@@ -82,6 +103,8 @@ class Render:
         for name in ("frames", "num_points", "fps"):
             if getattr(self, name) < 1:
                 raise UserError(f"--{name.replace('_', '-')} must be at least 1, got {getattr(self, name)}")
+        if self.workers is not None and (self.workers < 1 or self.cluster is not None):
+            raise UserError(f"--workers must be at least 1, and without --cluster, got {self.workers}")
         if self.resolution is not None and (self.resolution < 16 or self.resolution % 4):
             raise UserError(f"--resolution must be a multiple of 4 of at least 16, got {self.resolution}")
         if not -90 <= self.elevation <= 90:

@@ -19,7 +19,7 @@ from PIL import Image
 from spnr_jax.errors import UserError
 from spnr_jax.formats import clouds, images
 from spnr_jax.formats.gaussian_files import check_suffix, spz_of, write_splats
-from spnr_jax.kernels.records import Camera, Gaussians, Light
+from spnr_jax.kernels.records import Camera, Gaussians, Light, PointCloud
 from spnr_jax.method.model import FIELD_OF_VIEW, Model, Volume
 from spnr_jax.tools.chosen_light import check_takes_light, light_of_options
 from spnr_jax.tools.light_options import Lighting
@@ -129,22 +129,28 @@ def _made(
     light = light_of_options(lighting) if lighting.asked else None
     placed = clouds.place_cloud(cloud, num_points=num_points, up=up, clean=clean, report=note)
     volume = model.encode(placed.cloud)
-    gaussians = splats_of(
-        model,
-        volume,
-        placed.cloud,
-        light,
-        making.harmonics,
-        making.most_splats,
-        making.fitting_views,
-        RESOLUTION,
-        making.seconds,
-        report,
-    )
+    gaussians = splats_of_volume(model, volume, placed.cloud, light, making, report)
     if placed.origin.any():
         note(f"splats lie around the origin; it is at {' '.join(f'{x:.0f}' for x in placed.origin)} in the file")
-    said = f"{cloud.name}, drawn by spnr_jax ({run.name if run else NETWORK}), light: {light_name(lighting)}"
-    return Made(gaussians=gaussians, model=model, volume=volume, light=light, note=said)
+    return Made(gaussians=gaussians, model=model, volume=volume, light=light, note=note_of(cloud, run, lighting))
+
+
+def splats_of_volume(
+    model: Model,
+    volume: Volume,
+    cloud: PointCloud,
+    light: Light | None,
+    making: SplatMaking,
+    report: Callable[[str], None] = lambda line: None,
+) -> Gaussians:
+    """Splats of a cloud that is encoded already, as the options ask for them."""
+    sizes = making.harmonics, making.most_splats, making.fitting_views, RESOLUTION
+    return splats_of(model, volume, cloud, light, *sizes, making.seconds, report)
+
+
+def note_of(cloud: Path, run: Path | None, lighting: Lighting) -> str:
+    """The line that names cloud, network and light."""
+    return f"{cloud.name}, drawn by spnr_jax ({run.name if run else NETWORK}), light: {light_name(lighting)}"
 
 
 def light_name(lighting: Lighting) -> str:

@@ -1,8 +1,8 @@
 """Tasks on a Dask scheduler: worker processes of this machine, or those of a cluster, by the same code.
 
-A local worker is a fresh process with one thread (the renderer's noise depends on its thread count) and is killed with
+A local worker is a fresh process with one thread (the noise of Mitsuba depends on its thread count) and is killed with
 its parent, however that ends. A worker on a cluster is started by others, `dask worker ADDRESS --nthreads 1 --nworkers
-N`, with this package installed and with the mesh files and the output under the same paths or URLs.
+N`, with this package installed and with the files and the output under the same paths or URLs.
 
 A worker may be killed at any time: Dask gives its tasks to others. The scheduler cannot tell which of a dead worker's
 tasks killed it, so those that it gives up are tried again one at a time; only what kills its worker even then has Died.
@@ -46,7 +46,7 @@ class Bench(WorkerPlugin):
     """What every task of one run needs; Dask sends it once to each worker, also to those that join later."""
 
     def __init__(self, state: object) -> None:
-        self.name = f"spnr-data-{uuid.uuid4()}"
+        self.name = f"spnr-{uuid.uuid4()}"
         self.state = state
 
 
@@ -58,7 +58,7 @@ def connect(address: str | None, num_workers: int) -> Iterator[Client]:
     """
     if address is not None:
         try:
-            found = Client(address, name="spnr-data", timeout=PATIENCE)
+            found = Client(address, name="spnr", timeout=PATIENCE)
         except ValueError as error:
             raise UserError(f"--cluster {address}: expected an address such as tcp://host:8786 ({error})") from None
         with found as client:

@@ -1,0 +1,214 @@
+"""Every file of a folder or pattern drawn in one go: `spnr render FOLDER`.
+
+    here          a thread reads and encodes the next cloud, this one draws, another one writes
+    by workers    on a Dask scheduler (devices/cluster.py), each object by one of them
+
+A file that cannot be drawn is listed with its reason and stops no other; errors of the disk that is written to end the
+run.  What is drawn stands, however the run ends (catalogue_files.py), and the same command goes on.
+"""
+
+import dataclasses
+import socket
+import sys
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache, partial
+from itertools import islice
+from pathlib import Path
+
+from tqdm import tqdm
+
+from spnr_jax.devices import compilation
+from spnr_jax.errors import UserError, one_line
+from spnr_jax.tools import catalogue_files, catalogue_page
+from spnr_jax.tools.catalogue_files import Item, Record, folder_of
+from spnr_jax.tools.pictures import Ready, Written, check_writable, drawn, load_named, made_ready
+from spnr_jax.tools.render_command import Render
+from spnr_jax.training.weights import SHIPPED, load
+
+AHEAD = 2  # clouds that are read before they are drawn
+loaded = cache(load)  # of a process that draws many clouds
+
+
+class UndrawnError(Exception):
+    """Why one file cannot be drawn."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bench:
+    """What is needed for any file: the options, with absolute paths, and their digest."""
+
+    options: Render
+    digest: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Begun:
+    """A cloud that is read and encoded, and the record to be."""
+
+    ready: Ready
+    record: Record
+
+
+def render_catalogue(options: Render) -> Iterator[str]:
+    """Draws what does not stand yet; yields what became of it.  ValueError if there is nothing that can be drawn."""
+    check_writable(options.out)
+    options = _with_absolute_paths(options)
+    items = catalogue_files.find(options.cloud, options.out)
+    load_named(options, loaded)  # a run that is none is said before anything is read
+    bench = Bench(options=options, digest=catalogue_files.digest(options))
+    missing = [item for item in items if not catalogue_files.standing(item, options.out, bench.digest)]
+    begin, faults, made = time.monotonic(), dict[str, str](), 0
+    try:
+        with tqdm(total=len(items), initial=len(items) - len(missing), unit="file", dynamic_ncols=True) as bar:
+            for item, fault in _outcomes(bench, missing):
+                if fault is None:
+                    made += 1
+                else:
+                    faults[item.name] = fault
+                    tqdm.write(f"left out {item.cloud}: {fault}", file=sys.stderr)
+                bar.update()
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt("stopped: what is drawn stands, and the same command goes on") from None
+    finally:  # also after Ctrl-C: what stands is shown
+        page = catalogue_page.write_pages(items, options.out, bench.digest, faults)
+    rate = made / max(time.monotonic() - begin, 1e-9)
+    standing = len(items) - len(missing)
+    if not made + standing:
+        raise UserError(f"{options.cloud}: none of the {len(items)} files can be drawn; {page} says why")
+    yield f"drew {made} of {len(items)} files ({60 * rate:.1f} a minute), {standing} stood, {len(faults)} left out"
+    yield f"wrote {page}"
+
+
+def _with_absolute_paths(options: Render) -> Render:
+    """The options as processes in other folders understand them."""
+    run, light = options.run, options.lighting.light
+    if run and str(run) not in SHIPPED:
+        run = run.absolute()
+    if light and Path(light).suffix:  # a file, not a name of the package
+        light = str(Path(light).absolute())
+    lighting = dataclasses.replace(options.lighting, light=light)
+    return dataclasses.replace(options, out=options.out.absolute(), run=run, lighting=lighting)
+
+
+def _outcomes(bench: Bench, items: Sequence[Item]) -> Iterator[tuple[Item, str | None]]:
+    """Each file and, if it could not be drawn, why: as they are finished."""
+    if not items:
+        return
+    if bench.options.cluster is None and bench.options.workers is None:
+        yield from draw_here(bench, items)
+        return
+    try:
+        from spnr_jax.devices import cluster
+    except ModuleNotFoundError as error:
+        raise UserError(f"--cluster and --workers need {error.name}; pip install 'spnr-jax[cluster]'") from None
+    with cluster.connect(bench.options.cluster, min(bench.options.workers or 1, len(items))) as client:
+        for item, fault in cluster.run_tasks(client, draw_item, bench, items):
+            if isinstance(fault, cluster.Died):
+                fault = f"the process that drew it died {fault.times} times; out of memory?"
+            yield item, fault
+
+
+def draw_here(bench: Bench, items: Sequence[Item]) -> Iterator[tuple[Item, str | None]]:
+    """Each file and why it could not be drawn, in their order: reading, drawing and writing side by side."""
+    with ThreadPoolExecutor(1) as reader, ThreadPoolExecutor(1) as writer:
+        try:
+            reading = deque((item, reader.submit(read, bench, item)) for item in items[:AHEAD])
+            writing: deque[tuple[Item, Callable[[], None]]] = deque()
+            following = iter(items[AHEAD:])
+            while reading:
+                item, begun = reading.popleft()
+                reading.extend((after, reader.submit(read, bench, after)) for after in islice(following, 1))
+                writing.append((item, _begin_to_draw(bench, item, begun, writer)))
+                if len(writing) > 1:  # the pictures of two objects are in memory at most
+                    yield _outcome(*writing.popleft())
+            while writing:
+                yield _outcome(*writing.popleft())
+        finally:
+            reader.shutdown(wait=False, cancel_futures=True)
+            writer.shutdown(wait=False, cancel_futures=True)
+
+
+def _begin_to_draw(
+    bench: Bench, item: Item, reading: "Future[Begun]", writer: ThreadPoolExecutor
+) -> Callable[[], None]:
+    """Draws a file, and has it written; what waits for that."""
+    try:
+        begun = reading.result()
+        writing = [writer.submit(_perform, job) for job in _jobs(bench, item, begun.ready)]
+    except UndrawnError as fault:
+        return partial(_raise, fault)
+    return writer.submit(_finish, bench, item, begun, lambda: [job.result() for job in writing]).result
+
+
+def _outcome(item: Item, wait: Callable[[], None]) -> tuple[Item, str | None]:
+    try:
+        wait()
+    except UndrawnError as fault:
+        return item, str(fault)
+    return item, None
+
+
+def draw_item(bench: Bench, item: Item) -> str | None:
+    """Draws a file in a worker; None, or the reason why it cannot be drawn.
+
+    What is wrong with the worker and not with the file is raised: errors of the disk, a file that it does not see.
+    """
+    if catalogue_files.standing(item, bench.options.out, bench.digest):  # another run was faster
+        return None
+    if not item.cloud.exists():
+        raise UserError(f"{item.cloud}: worker {socket.gethostname()} does not see this file; mount it there")
+    compilation.keep_programs()
+
+    def whole() -> None:
+        begun = read(bench, item)
+        _finish(bench, item, begun, lambda: [_perform(job) for job in _jobs(bench, item, begun.ready)])
+
+    return _outcome(item, whole)[1]
+
+
+def read(bench: Bench, item: Item) -> Begun:
+    """A file read and encoded; what was drawn of it before is gone."""
+    record = catalogue_files.begin(item, bench.options.out, bench.digest)
+    notes: list[str] = []
+    with _blamed():
+        ready = made_ready(dataclasses.replace(bench.options, cloud=item.cloud), notes.append, loaded)
+    return Begun(ready=ready, record=dataclasses.replace(record, notes=tuple(notes)))
+
+
+def _jobs(bench: Bench, item: Item, ready: Ready) -> Iterator[Callable[[], Written]]:
+    options = dataclasses.replace(bench.options, cloud=item.cloud)
+    with _blamed():
+        yield from drawn(ready, options, folder_of(item, options.out) / item.cloud.stem)
+
+
+def _perform(job: Callable[[], Written]) -> Written:
+    """Writes; errors of the disk are the run's business, values that are no picture the file's."""
+    try:
+        return job()
+    except ValueError as error:
+        raise UndrawnError(one_line(error)) from error
+
+
+def _finish(bench: Bench, item: Item, begun: Begun, written: Callable[[], list[Written]]) -> None:
+    names = tuple(path.name for one in written() for path in one.paths)
+    catalogue_files.finish(item, bench.options.out, dataclasses.replace(begun.record, files=names))
+
+
+@contextmanager
+def _blamed() -> Iterator[None]:
+    """Whatever is wrong with one file must not stop the others; its reason says what it was."""
+    try:
+        yield
+    except ValueError as error:
+        raise UndrawnError(one_line(error)) from error
+    except Exception as error:
+        raise UndrawnError(f"unexpected {type(error).__name__}: {one_line(error)}") from error
+
+
+def _raise(error: Exception) -> None:
+    raise error
