@@ -32,8 +32,8 @@ from spnr_jax.viewer.viewpoint import View
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 EYE = (1.7, 1.2, 2.9)  # in the box: where a browser looks from at first, at its middle
 EXPOSED = (
-    "--host {host}: whoever reaches this machine on port {port} and knows the token of the address sees {name}, can send "
-    "files that this process reads, and makes it compute; there is no encryption: who listens on the way reads the token"
+    "--host {host}: whoever reaches this machine on port {port} and knows the token of the address sees {name}, can "
+    "send files that this process reads, and makes it compute; there is no encryption: who listens reads the token"
 )
 UNGUARDED = "spnr view cannot keep other pages out of viser {version}; pip install 'viser==1.1.1'"
 

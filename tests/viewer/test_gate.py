@@ -85,7 +85,9 @@ def test_another_origin_is_refused_also_with_the_token(running, origin):
     assert b"Viser" not in content
 
 
-@pytest.mark.parametrize("change", [lambda token: "", lambda token: token[:-1], lambda token: token + "a", str.swapcase])
+@pytest.mark.parametrize(
+    "change", [lambda token: "", lambda token: token[:-1], lambda token: token + "a", str.swapcase]
+)
 def test_without_the_whole_token_nobody_is_let_in_and_no_page_is_served(running, change):
     address = Address(running.url)
     wrong = change(address.token)
@@ -172,7 +174,9 @@ def foreign():
 
 @chromium_of.needed
 def test_a_page_of_another_site_reads_nothing_while_the_viewer_is_open_in_the_same_browser(running, foreign):
-    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install playwright")
+    playwright = pytest.importorskip(
+        "playwright.sync_api", reason="playwright is not installed: pip install playwright"
+    )
     address = Address(running.url)
     with chromium_of.launched(playwright) as browser:
         context = browser.new_context()
