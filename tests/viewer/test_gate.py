@@ -174,9 +174,7 @@ def foreign():
 
 @chromium_of.needed
 def test_a_page_of_another_site_reads_nothing_while_the_viewer_is_open_in_the_same_browser(running, foreign):
-    playwright = pytest.importorskip(
-        "playwright.sync_api", reason="playwright is not installed: pip install playwright"
-    )
+    playwright = pytest.importorskip("playwright.sync_api", reason="pip install playwright")
     address = Address(running.url)
     with chromium_of.launched(playwright) as browser:
         context = browser.new_context()

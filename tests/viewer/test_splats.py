@@ -1,4 +1,4 @@
-"""Splats in the viewer: made while other pictures are drawn, given to the browser as it draws them, shown and hidden."""
+"""Splats in the viewer: made while other pictures are drawn, given to the browser in its terms, shown and hidden."""
 
 import dataclasses
 import functools
@@ -233,34 +233,35 @@ def until(tab, accept):
     raise AssertionError("the canvas did not come to what was expected")
 
 
-def thirds(image):
-    """Share of each third that is covered by something."""
-    covered = (image < 220).any(axis=-1)
-    return [covered[:, i * 200 + 15 : (i + 1) * 200 - 15].mean() for i in range(3)]
+BETWEEN, RIGHT = np.s_[60:, 260:316], np.s_[60:, 400:560]  # where two panes meet, and in the last of both two and three
+
+
+def covered(image, part):
+    return (image[part] < 220).any(axis=-1).mean()
+
+
+@pytest.fixture
+def viewer(few, monkeypatch):
+    monkeypatch.setattr(splats, "SECONDS", 0.0)
+    opened = server.Viewer(
+        model(), state(view=None), Reading(num_points=100, up="y", clean="auto"), host="127.0.0.1", port=0
+    )
+    yield opened
+    opened.stop()
 
 
 @chromium_of.needed
-def test_in_a_browser_the_splats_stand_between_points_and_picture_and_can_be_hidden(few, monkeypatch):
-    playwright = pytest.importorskip(
-        "playwright.sync_api", reason="playwright is not installed: pip install playwright"
-    )
-    monkeypatch.setattr(splats, "SECONDS", 0.0)
-    reading = Reading(num_points=100, up="y", clean="auto")
-    viewer = server.Viewer(model(), state(view=None), reading, "127.0.0.1", 0)
+def test_in_a_browser_the_splats_stand_between_points_and_picture_and_can_be_hidden(viewer):
+    playwright = pytest.importorskip("playwright.sync_api", reason="pip install playwright")
     with chromium_of.launched(playwright) as browser:
         tab, said = browser.new_page(viewport={"width": 900, "height": 420}), []
         tab.on("console", lambda line: said.append(line.text) if line.type == "error" else None)
         tab.on("pageerror", lambda error: said.append(str(error)))
         tab.goto(f"{viewer.url}?fixedDpr=1")
         tab.get_by_role("button", name="Make splats").click(timeout=1000 * WAIT)
-        beside = until(tab, lambda image: min(thirds(image)) > 0.1)
-        splat_pane, points = beside[:, 200:400], beside[:, :200]
-        assert (
-            np.abs(splat_pane[80:180, 50:150].mean(axis=(0, 1)) - points[80:180, 50:150].mean(axis=(0, 1))).max() < 80
-        )
+        beside = until(tab, lambda image: min(covered(image, BETWEEN), covered(image, RIGHT)) > 0.3)
+        middle, right = beside[80:180, 250:330].mean(axis=(0, 1)), beside[80:180, 440:520].mean(axis=(0, 1))
+        assert np.abs(middle - right).max() < 60  # both grey
         tab.get_by_label("Show splats").click()
-        between = np.s_[60:, 260:316]  # where points and picture meet, when nothing is in between
-        assert (beside[between] < 220).any(axis=-1).mean() > 0.3
-        until(tab, lambda image: (image[between] < 220).any(axis=-1).mean() < 0.1 < thirds(image)[2])
+        until(tab, lambda image: covered(image, BETWEEN) < 0.1 and covered(image, RIGHT) > 0.3)
         assert not said
-    viewer.stop()
