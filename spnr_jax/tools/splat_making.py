@@ -59,10 +59,10 @@ def splats_of(
     """`splats` of a cloud that is encoded already."""
     pictures = drawn_views(model, volume, fitting_cameras(model, volume, views, resolution), light)
     report(f"the network drew {views} pictures of {resolution} x {resolution}")
-    return splats_of_views(pictures, volume, cloud, degree, most, seconds, report)
+    return in_units(splats_in_box(pictures, volume, cloud, degree, most, seconds, report), volume)
 
 
-def splats_of_views(
+def splats_in_box(
     pictures: list[View],
     volume: Volume,
     cloud: PointCloud,
@@ -70,18 +70,44 @@ def splats_of_views(
     most: int,
     seconds: float | int,
     report: Callable[[str], None] = lambda line: None,
+    watch: Callable[[float], None] = lambda share: None,
 ) -> Gaussians:
-    """`splats` from pictures that the network has drawn."""
+    """Splats in the box from pictures that the network has drawn; `watch` gets the share of the seconds that is over.
+
+    An exception of `watch` ends it.
+    """
+    gaussians = placed(pictures, volume, cloud, degree, most)
+    report(f"{len(gaussians.opacity):,} splats placed")
+    if seconds > 0:
+        gaussians, steps = refined(gaussians, pictures, seconds, watch=watch)
+        report(f"refined by {steps} steps")
+    return gaussians
+
+
+def placed(pictures: list[View], volume: Volume, cloud: PointCloud, degree: int, most: int) -> Gaussians:
+    """Splats in the box as they are before they are refined."""
     surfels = (volume.scene if isinstance(volume.scene, SurfelScene) else _surfels(cloud, volume)).surfels
     focal = float(np.asarray(pictures[0].camera.intrinsics)[0, 0])
     seen = placing.seen_surface(pictures, surfels)
-    placed, side = placing.place(seen, most=most, pixel=DISTANCE / focal)
-    gaussians = coloring.colored(placed, pictures, side=side, degree=degree)
-    report(f"{len(gaussians.opacity):,} splats placed")
-    if seconds > 0:
-        gaussians, steps = _refined(gaussians, pictures, seconds)
-        report(f"refined by {steps} steps")
-    return in_units(gaussians, volume)
+    grey, side = placing.place(seen, most=most, pixel=DISTANCE / focal)
+    return coloring.colored(grey, pictures, side=side, degree=degree)
+
+
+def refined(
+    gaussians: Gaussians,
+    pictures: list[View],
+    seconds: float | int,
+    clock: Callable[[], float] = time.monotonic,
+    watch: Callable[[float], None] = lambda share: None,
+) -> tuple[Gaussians, int]:
+    """The splats refined until the time of a clock is over, compilation apart, and the steps that were taken."""
+    refinement = refining.Refinement(gaussians, pictures)
+    refinement.step()  # compiles
+    begin = clock()
+    while (passed := (clock() - begin) / seconds) < 1:
+        watch(passed)
+        refinement.step(LEAST_RATE + (1 - LEAST_RATE) * (1 - passed))
+    return refinement.gaussians, refinement.steps
 
 
 def fitting_cameras(model: Model, volume: Volume, count: int, resolution: int) -> list[Camera]:
@@ -100,8 +126,8 @@ def drawn_views(model: Model, volume: Volume, cameras: list[Camera], light: Ligh
     for camera, drawn in zip(cameras, model.render_each(volume, cameras, lights=[light] * len(cameras)), strict=True):
         image, opacity = np.asarray(drawn.image), np.asarray(drawn.acc)
         depth = surface_depth(drawn, camera, volume) * np.asarray(volume.scale)
-        if opacity.shape != image.shape[:2]:  # a network that doubles its pictures
-            opacity, depth = (x.repeat(2, axis=0).repeat(2, axis=1) for x in (opacity, depth))
+        times = len(image) // len(opacity)  # of a network that enlarges its pictures
+        opacity, depth = (x.repeat(times, axis=0).repeat(times, axis=1) for x in (opacity, depth))
         found.append(View(in_box(camera, volume), image, opacity, depth))
     return found
 
@@ -118,16 +144,6 @@ def in_units(gaussians: Gaussians, volume: Volume) -> Gaussians:
     scale, arrays = np.asarray(volume.scale), jax.tree.map(np.asarray, gaussians)
     position = arrays.position / scale + np.asarray(volume.centre)
     return arrays.replace(position=position, scale=arrays.scale / scale)
-
-
-def _refined(gaussians: Gaussians, pictures: list[View], seconds: float | int) -> tuple[Gaussians, int]:
-    """The splats refined until the time is over, and the steps that were taken."""
-    refinement = refining.Refinement(gaussians, pictures)
-    refinement.step()  # compiles
-    begin = time.monotonic()
-    while (passed := (time.monotonic() - begin) / seconds) < 1:
-        refinement.step(LEAST_RATE + (1 - LEAST_RATE) * (1 - passed))
-    return refinement.gaussians, refinement.steps
 
 
 def _surfels(cloud: PointCloud, volume: Volume) -> SurfelScene:

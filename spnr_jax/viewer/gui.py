@@ -7,7 +7,7 @@ value of a slider wins.  Slow ones (reading a file, a film) are plain functions,
 import dataclasses
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any, cast
 
 import numpy as np
@@ -23,6 +23,7 @@ from spnr_jax.viewer.loop import Loop
 from spnr_jax.viewer.picture import LAYERS
 from spnr_jax.viewer.scene import Material, Scene
 from spnr_jax.viewer.session import State
+from spnr_jax.viewer.splats import SplatControls
 
 LONGEST_NOTE = 500  # characters
 MOVING_JPEG, RESTING_JPEG = 75, 92  # qualities of the pictures sent
@@ -58,6 +59,8 @@ class Browser:
         self._light: LightControls | None = None
         with gui.add_folder("Light"):
             self._add_light(gui)
+        with gui.add_folder("Splats"):
+            self._splats = SplatControls(client, model, self.loop, network, self._slowly)
         with gui.add_folder("Camera path"):
             self._add_path(gui)
         with gui.add_folder("File"):
@@ -73,12 +76,13 @@ class Browser:
             self._send(outline, MOVING_JPEG)
         with self._network:
             state, drawn = session.draw(self._model, state, moving)
+        self._splats.follow(state)
         if drawn is not None and (moving or not self.loop.superseded):
             self._send(drawn.image, MOVING_JPEG if moving else RESTING_JPEG)
             if drawn.quality is not None and drawn.milliseconds is not None:
                 self._measured = {key: ms for key, ms in self._measured.items() if key[0] != drawn.quality}
                 self._measured[drawn.quality, drawn.size] = drawn.milliseconds
-                self._table.content = _pace(self._measured)
+                self._table.content = session.pace(self._measured)
         return state
 
     def _send(self, canvas: np.ndarray, jpeg_quality: int) -> None:
@@ -130,7 +134,7 @@ class Browser:
             "At rest", session.QUALITIES, initial_value="best", hint="While the camera moves: draft"
         )
         size = gui.add_dropdown("Pixels", [str(n) for n in available], initial_value=str(available[1]))
-        self._table = gui.add_markdown(_pace({}))
+        self._table = gui.add_markdown(session.pace({}))
         controls = (left, right, quality, size)
 
         async def changed(_: Any) -> None:
@@ -280,6 +284,7 @@ class Browser:
         cloud = uploads.read_upload(file.name, file.content, **dataclasses.asdict(self._reading), report=notes.append)
         opened = scene.open_scene(self._model, cloud, uploads.display_name(file.name))
         self._change_scene(lambda old: opened)
+        self._splats.drop()
         self.loop.submit(self._show_materials)
         self._note(opened.name, "; ".join(notes) or f"{len(opened.selected)} points")
 
@@ -290,9 +295,3 @@ class Browser:
         self._change_lights(lambda old: lights.with_map(old, name, light))
         self.loop.submit(self._light.show)
         self._note(name, "is the light now")
-
-
-def _pace(measured: Mapping[tuple[Quality, int], float]) -> str:
-    """Markdown: the newest milliseconds of each quality measured here, with the pixels drawn."""
-    rows = [f"| {quality} | {ms:.0f} ({size}²) |" for (quality, size), ms in sorted(measured.items())]
-    return "\n".join(["| quality | ms here |", "|---|---:|", *rows])

@@ -4,6 +4,7 @@ points     discs of the points' base colour, selected ones ringed; drawn without
 picture    what the network renders
 depth      distance in colours, near bright
 opacity    white where the object is opaque
+splats     nothing: the browser draws them there
 """
 
 import time
@@ -21,8 +22,9 @@ from spnr_jax.viewer import viewpoint
 from spnr_jax.viewer.scene import Scene
 from spnr_jax.viewer.viewpoint import View
 
-Layer = Literal["points", "picture", "depth", "opacity"]
-LAYERS: tuple[Layer, ...] = ("points", "picture", "depth", "opacity")
+Layer = Literal["points", "picture", "depth", "opacity", "splats"]
+LAYERS: tuple[Layer, ...] = ("points", "picture", "depth", "opacity")  # that can be chosen
+WITHOUT_NETWORK: tuple[Layer, ...] = ("points", "splats")
 SELECTED = np.array([255, 140, 0], np.uint8)
 LINE = (160, 160, 160)
 TEXT = (110, 110, 110)
@@ -60,21 +62,21 @@ def draw(
     """
     width, height = viewpoint.pane_size(view, len(panes), longest)
     rendering, milliseconds = None, None
-    if quality is not None and any(layer != "points" for layer in panes):
+    if quality is not None and any(layer not in WITHOUT_NETWORK for layer in panes):
         begin = time.perf_counter()
         camera = viewpoint.square_camera(view, scene.volume, width, height, size)
         rendering = before(background, model.render(scene.volume, camera, quality, light), camera, light)
-        squares = {layer: _square(rendering, layer) for layer in panes if layer != "points"}
+        squares = {layer: _square(rendering, layer) for layer in panes if layer not in WITHOUT_NETWORK}
         milliseconds = 1000 * (time.perf_counter() - begin)
     drawn = []
     for layer in panes:
         if layer == "points":
             picture = draw_points(scene, viewpoint.pane_camera(view, scene.volume, width, height))
-        elif rendering is None:
+        elif rendering is None or layer == "splats":
             picture = np.full((height, width, 3), 255, np.uint8)
         else:
             picture = viewpoint.cut(squares[layer], width, height)
-        waiting = layer != "points" and rendering is None
+        waiting = layer not in WITHOUT_NETWORK and rendering is None
         label = f"{layer}: the network is being prepared" if waiting else layer
         drawn.append(_labelled(picture, label) if labels else picture)
     return Drawn(image=_beside_each_other(drawn), quality=quality, size=size, milliseconds=milliseconds)

@@ -1,7 +1,7 @@
 """The server behind `spnr view`: loads the network and a cloud, and gives every browser that comes its own session.
 
-It listens on this machine alone unless `--host` says otherwise; there is no password.  viser's tunnel to a public
-address, which any browser could ask for, is closed.
+It listens on this machine alone unless `--host` says otherwise, and talks to its own page alone (gate.py): the address
+that is printed holds a token.  viser's tunnel to a public address, which any browser could ask for, is closed.
 """
 
 import contextlib
@@ -23,7 +23,7 @@ from spnr_jax.method.model import FIELD_OF_VIEW, Model
 from spnr_jax.tools.chosen_light import check_takes_light
 from spnr_jax.tools.light_options import Lighting
 from spnr_jax.training.weights import load, suited_to
-from spnr_jax.viewer import lights, session, uploads
+from spnr_jax.viewer import gate, lights, session, uploads
 from spnr_jax.viewer.gui import Browser, Reading
 from spnr_jax.viewer.scene import open_scene
 from spnr_jax.viewer.session import State
@@ -32,9 +32,10 @@ from spnr_jax.viewer.viewpoint import View
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 EYE = (1.7, 1.2, 2.9)  # in the box: where a browser looks from at first, at its middle
 EXPOSED = (
-    "--host {host}: whoever reaches this machine on port {port} sees {name}, can send files that this process reads, "
-    "and makes it compute; there is no password and no encryption"
+    "--host {host}: whoever reaches this machine on port {port} and knows the token of the address sees {name}, can "
+    "send files that this process reads, and makes it compute; there is no encryption: who listens reads the token"
 )
+UNGUARDED = "spnr view cannot keep other pages out of viser {version}; pip install 'viser==1.1.1'"
 
 
 class Server(viser.ViserServer):
@@ -45,19 +46,23 @@ class Server(viser.ViserServer):
 
 
 class Viewer:
-    """A running server; `url` is where it listens, `lines` what a person should know about it."""
+    """A running server; `url` is its page, with the token, `lines` what a person should know about it."""
 
     def __init__(self, model: Model, first: State, reading: Reading, host: str, port: int) -> None:
         _check_free(host, port)
         self._model, self._first, self._reading = model, first, reading
         self._network = threading.Lock()
         self._browsers: dict[int, Browser] = {}
-        with contextlib.redirect_stdout(io.StringIO()):  # viser's banner; it names other addresses than ours
+        token = gate.new_token()
+        with gate.guarded(token) as opened, contextlib.redirect_stdout(io.StringIO()):  # viser's banner names addresses
             self._server = Server(host=host, port=port, label="spnr view", verbose=False)
+        if not opened:
+            self.stop()
+            raise UserError(UNGUARDED.format(version=viser.__version__))
         if port not in (0, self._server.get_port()):
             self.stop()
             raise UserError(_in_use(host, port))  # taken in the moment since it was found free
-        self.url = f"http://{f'[{host}]' if ':' in host else host}:{self._server.get_port()}"
+        self.url = f"http://{f'[{host}]' if ':' in host else host}:{self._server.get_port()}/{token}/"
         self.lines = [f"{self.url} shows {first.scene.name} (Ctrl-C stops)"]
         if host not in LOOPBACK:
             self.lines.append(EXPOSED.format(host=host, port=self._server.get_port(), name=first.scene.name))

@@ -6,7 +6,7 @@ network.
 
 import dataclasses
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -45,6 +45,15 @@ class State:
     """Pixels along a side of the network's square at rest; while the camera moves it is what the network learnt."""
     lights: Lights = Lights()
     keyframes: tuple[Keyframe, ...] = ()
+    splats: bool = False
+    """Whether the browser draws its splats, which is in the middle of the canvas."""
+
+    @property
+    def shown(self) -> tuple[Layer, ...]:
+        """The panes of the canvas, one left free for the splats: the middle one, or all."""
+        if not self.splats:
+            return self.panes
+        return (self.panes[0], "splats", self.panes[1]) if len(self.panes) == 2 else ("splats",)
 
 
 def sizes(model: Model) -> tuple[int, ...]:
@@ -72,7 +81,7 @@ def draw(model: Model, state: State, moving: bool) -> tuple[State, Drawn | None]
     view, state = state.view, prepared(model, state)
     quality, size = (MOVING, sizes(model)[0]) if moving else (state.quality, state.size)
     longest = MOVING_LONGEST if moving else LONGEST
-    return state, picture.draw(model, state.scene, view, state.panes, quality, size, longest, **shone(state))
+    return state, picture.draw(model, state.scene, view, state.shown, quality, size, longest, **shone(state))
 
 
 def prepared(model: Model, state: State) -> State:
@@ -89,11 +98,11 @@ def outline(model: Model, state: State) -> np.ndarray | None:
     """The canvas without the network, which may have to be compiled first: points at once."""
     if state.view is None:
         return None
-    return picture.draw(model, state.scene, state.view, state.panes, None, state.size, MOVING_LONGEST).image
+    return picture.draw(model, state.scene, state.view, state.shown, None, state.size, MOVING_LONGEST).image
 
 
 def snapshot(model: Model, state: State) -> bytes:
-    """The canvas at rest as a PNG file."""
+    """The canvas at rest as a PNG file; without the splats, which are the browser's."""
     if state.view is None:
         raise UserError("nothing was drawn yet")
     view, state = state.view, prepared(model, state)
@@ -185,9 +194,15 @@ def select(state: State, low: Any, high: Any, add: bool) -> State:
     if state.view is None or low is None or high is None:
         return state
     low, high = np.clip(low, -1, 2), np.clip(high, -1, 2)  # a little outside is as good as far outside
-    count = len(state.panes)
+    count = len(state.shown)
     width, height = pane_size(state.view, count, LONGEST)
     camera = pane_camera(state.view, state.scene.volume, width, height)
     middle = (low[0] + high[0]) / 2
     corners = [in_pane(x, y, middle, count) for x, y in (low, high)]
     return dataclasses.replace(state, scene=select_rectangle(state.scene, camera, corners[0], corners[1], add))
+
+
+def pace(measured: Mapping[tuple[Quality, int], float]) -> str:
+    """Markdown: the newest milliseconds of each quality measured here, with the pixels drawn."""
+    rows = [f"| {quality} | {ms:.0f} ({size}²) |" for (quality, size), ms in sorted(measured.items())]
+    return "\n".join(["| quality | ms here |", "|---|---:|", *rows])

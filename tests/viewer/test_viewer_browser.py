@@ -255,7 +255,7 @@ def test_it_listens_on_this_machine_alone_and_says_what_another_host_exposes(run
     everywhere = viewer("0.0.0.0")
     everywhere.stop()
     assert "whoever reaches this machine" in everywhere.lines[1]
-    assert "no password" in everywhere.lines[1]
+    assert "no encryption" in everywhere.lines[1]
 
 
 def test_no_browser_can_open_the_tunnel_to_a_public_address(running):
