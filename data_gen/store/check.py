@@ -7,6 +7,8 @@ import numpy as np
 
 from data_gen.store import layout
 from spnr_jax.errors import UserError
+from spnr_jax.formats.npz import read_arrays
+from spnr_jax.surfels.lighting import HEIGHT, WIDTH
 
 COUNTS = ("views", "resolution", "points")  # settings that the files of every object are compared with
 LEAST_AGREEMENT = 0.9  # of the visible points, on opaque pixels; the rest sit on silhouettes, where pixels are cut
@@ -14,9 +16,12 @@ LEAST_AGREEMENT = 0.9  # of the visible points, on opaque pixels; the rest sit o
 
 def check(dataset: Path) -> bool:
     """Print a table of what was found and each fault on a line of its own; return whether the data set is sound."""
-    settings = read_description(dataset).get("settings")
+    description = read_description(dataset)
+    settings = description.get("settings")
     if not isinstance(settings, dict) or not all(isinstance(settings.get(name), int) for name in COUNTS):
         raise UserError(f"{dataset / 'dataset.json'}: expected settings {', '.join(COUNTS)}; generate it again")
+    described = description.get("environment_map")
+    own_lights = isinstance(described, dict) and "kinds" in described
     object_ids = sorted(layout.completed_objects(dataset))
     faults = split_faults(dataset, set(object_ids))
     agreements, covered, num_views = [], [], 0
@@ -25,7 +30,7 @@ def check(dataset: Path) -> bool:
         folder = dataset / "objects" / object_id
         try:
             record = layout.read_object(folder)
-            found = object_faults(folder, record, settings)
+            found = object_faults(folder, record, settings) + light_faults(folder, record.details, len(record.images), own_lights)
         except (ValueError, OSError) as error:
             faults.append(f"{object_id}: {type(error).__name__}: {error}")
             continue
@@ -137,6 +142,29 @@ def point_faults(points: np.ndarray, count: int) -> list[str]:
     if values[:, 6:].min(initial=0) < 0 or values[:, 6:].max(initial=0) > 1:
         faults.append("colours or materials lie outside [0, 1]")
     return faults
+
+
+def light_faults(folder: Path, details: dict, views: int, own_lights: bool) -> list[str]:
+    """Return what is wrong with the lights of one object's views, which are there where each has its own."""
+    listed = "lights.npz" in details.get("files", {})
+    if listed != own_lights:
+        said = "a light of its own for each view" if own_lights else "one light for all"
+        return [f"lights.npz is {'there' if listed else 'missing'}, but dataset.json says {said}"]
+    if not own_lights:
+        return []
+    try:
+        with (folder / "lights.npz").open("rb") as file:
+            lights = read_arrays(file, ("lights",))["lights"]
+    except OSError:
+        return []  # a missing file has another checksum, which is told already
+    except UserError as error:
+        return [f"lights.npz {error}"]
+    if lights.shape != (views, HEIGHT, WIDTH, 3) or lights.dtype.kind != "f":
+        return [f"lights.npz: expected floats {(views, HEIGHT, WIDTH, 3)}, got {lights.dtype} {lights.shape}"]
+    if not np.isfinite(lights).all() or lights.min() < 0:
+        return ["lights.npz holds radiance that is negative or not finite"]
+    dark = [view for view, light in enumerate(lights) if not light.any()]
+    return [f"lights.npz: view {dark[0]} is lit by a black map"] if dark else []
 
 
 def points_on_object(record: layout.ObjectRecord) -> float:

@@ -15,7 +15,7 @@ from jax.sharding import Mesh
 from spnr_jax.config import TrainConfig
 from spnr_jax.devices import placement
 from spnr_jax.errors import UserError
-from spnr_jax.formats.data_sets import Dataset
+from spnr_jax.formats.data_sets import Dataset, has_lights
 from spnr_jax.kernels.records import Crops, Light
 from spnr_jax.model_config import SurfelConfig
 from spnr_jax.surfels import lighting
@@ -44,7 +44,15 @@ def work_of(
 
 
 def of_views(config: TrainConfig, dataset: Dataset, mesh: Mesh | None, own: range | None) -> Work:
-    """Of a network that renders whole views; a mesh's devices share the objects of a batch."""
+    """Of a network that renders whole views; a mesh's devices share the objects of a batch.
+
+    ValueError where the views have lights of their own: these networks cannot be told which.
+    """
+    if has_lights(dataset):
+        raise UserError(
+            f"{dataset.folder}: each view has a light of its own, and preset {config.preset} learns one light alone; "
+            "train --preset surfels, or generate the data set without --lights"
+        )
     adversarial_from = optimisation.first_adversarial_step(config)
 
     def step(state: Any, batch: Any, number: int) -> tuple[Any, dict]:

@@ -6,7 +6,7 @@ import signal
 import jax
 import numpy as np
 import pytest
-from support import tiny_surfels
+from support import tiny_dataset, tiny_surfels
 from support.laws import close, same_bits
 from support.tiny_surfels import CONFIG, LIGHT, SCHEDULE
 
@@ -116,3 +116,10 @@ def test_the_room_is_the_light_where_a_data_set_names_no_other_one():
     other = dataclasses.replace(dataset, settings={"environment_map": {"name": "forest.hdr"}})
     with pytest.raises(ValueError, match=r"lit by forest\.hdr"):
         work.light_of(other)
+
+
+def test_networks_of_rays_refuse_views_with_lights_of_their_own_in_one_line():
+    dataset = dataclasses.replace(tiny_dataset.dataset(), settings={"environment_map": {"kinds": [{"name": "random"}]}})
+    with pytest.raises(ValueError, match="preset tiny learns one light alone; train --preset surfels") as refused:
+        work.of_views(tiny_dataset.CONFIG, dataset, None, None)
+    assert "\n" not in str(refused.value)
