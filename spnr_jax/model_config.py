@@ -362,7 +362,7 @@ class SurfelConfig:
 
     image_resolution: int = 512
     """Pixels along each side of a picture where no other size is asked for."""
-    widths: tuple[int, ...] = (24, 48, 64, 64)
+    widths: tuple[int, ...] = (24, 48, 96, 160)
     """Features of the U-Net's levels, at the resolution of the points first."""
     top: int = 24
     """Features of the blocks that double the resolution."""
