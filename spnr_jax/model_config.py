@@ -290,7 +290,7 @@ class SurfelConfig(NetworkConfig):
 
     image_resolution: Count = 512
     """Pixels along each side of a picture where no other size is asked for."""
-    widths: Annotated[Widths, Limit("at least one", lambda x: len(x) > 0)] = (24, 48, 64, 64)
+    widths: Annotated[Widths, Limit("at least one", lambda x: len(x) > 0)] = (24, 48, 96, 160)
     """Features of the U-Net's levels, at the resolution of the points first."""
     top: Count = 24
     """Features of the blocks that double the resolution."""

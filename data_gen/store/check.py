@@ -30,7 +30,9 @@ def check(dataset: Path) -> bool:
         folder = dataset / "objects" / object_id
         try:
             record = layout.read_object(folder)
-            found = object_faults(folder, record, settings) + light_faults(folder, record.details, len(record.images), own_lights)
+            found = object_faults(folder, record, settings) + light_faults(
+                folder, record.details, len(record.images), own_lights
+            )
         except (ValueError, OSError) as error:
             faults.append(f"{object_id}: {type(error).__name__}: {error}")
             continue

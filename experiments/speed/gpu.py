@@ -34,7 +34,7 @@ from spnr_jax import cli
 from spnr_jax.config import TrainConfig
 from spnr_jax.devices import machine
 from spnr_jax.method import surfel_renderer
-from spnr_jax.model_config import ModelConfig, SurfelConfig
+from spnr_jax.model_config import RayNetworkConfig, SurfelConfig
 from spnr_jax.presets import PRESETS
 from spnr_jax.surfels.lighting import room_light
 from spnr_jax.training import many_runs, optimisation, shading
@@ -147,10 +147,11 @@ def many_trainings(options: OnGPU) -> list[Found]:
 
 def small(config: TrainConfig) -> TrainConfig:
     """The config of a network that compiles in seconds, for whole views."""
-    assert isinstance(config.model, ModelConfig)
-    model = dataclasses.replace(
-        config.model, point_widths=(8,), point_features=8, volume_resolution=8, num_stages=1, field_width=8
+    assert isinstance(config.model, RayNetworkConfig)
+    encoder = dataclasses.replace(
+        config.model.encoder, point_widths=(8,), point_features=8, volume_resolution=8, num_stages=1
     )
+    model = dataclasses.replace(config.model, encoder=encoder, field_width=8)
     loss = dataclasses.replace(config.loss, adversarial_weight=0.0)
     return dataclasses.replace(config, model=model, loss=loss, batch_objects=1, min_points=64, max_points=64)
 

@@ -78,7 +78,7 @@ def twin_sized(preset: str, mode: str = "train", objects: int = 1) -> TrainConfi
 
 def in_bf16(config: TrainConfig) -> TrainConfig:
     """The config whose convolutions run in bfloat16."""
-    assert isinstance(config.model, ModelConfig)
+    assert isinstance(config.model, RayNetworkConfig)
     return dataclasses.replace(config, model=dataclasses.replace(config.model, precision="bfloat16"))
 
 

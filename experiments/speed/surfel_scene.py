@@ -39,14 +39,16 @@ def orbiting(size: int, azimuth: float = 0.5) -> Camera:
 def random_crops(config: TrainConfig, doublings: int, seed: int = 0) -> Crops:
     """A batch as `gbuffers.make_batch` makes it, of random numbers."""
     rng = np.random.default_rng(seed)
-    count = max(config.batch_objects // (2 if doublings >= gbuffers.HALVED else 1), 1)
-    size = -(-config.crop * gbuffers.SIZES[doublings] // gbuffers.SIZES[0])
-    large = size << doublings
+    count = config.batch_objects
+    size, margin = (-(-config.crop * n[doublings] // gbuffers.SIZES[0]) for n in (gbuffers.SIZES, gbuffers.MARGINS))
+    inner = size - 2 * margin
+    large = inner << doublings
     crops = Crops(
         seen=rng.random((count, size, size, features.NUM_FEATURES), np.float32),
-        maps=rng.random((count, size, size, features.NUM_MAPS), np.float32),
+        maps=rng.random((count, inner, inner, features.NUM_MAPS), np.float32),
         ambient=rng.random((count, 9, 3), np.float32),
         target=rng.integers(0, 256, (count, large, large, 4), np.uint8),
         doublings=doublings,
+        margin=margin,
     )
     return jax.device_put(crops)

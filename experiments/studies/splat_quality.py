@@ -36,7 +36,7 @@ from spnr_jax.gaussians.placing import View
 from spnr_jax.kernels.records import Camera, Gaussians
 from spnr_jax.method.model import Model, Volume
 from spnr_jax.scoring.picture_scores import sharpness
-from spnr_jax.tools.splat_making import drawn_views, fitting_cameras, in_box, placed
+from spnr_jax.tools.splat_making import drawn_views, fitting_cameras, in_box, splats_in_box
 from spnr_jax.training.weights import load
 
 LARGER = 100.0  # times, the scene for Mitsuba
@@ -107,7 +107,7 @@ def _scores(options: SplatStudy, model: Model, item: data_sets.ObjectData) -> di
     volume, said = model.encode(cloud), list[str]()
     pictures = _pictures(options, model, volume, item.name)
     begin = time.perf_counter()
-    made = placed(pictures, volume, cloud, options.degree, options.most, options.seconds, said.append)
+    made = splats_in_box(pictures, volume, cloud, options.degree, options.most, options.seconds, said.append)
     spz = gaussian_files.spz_of(made)
     found = {
         "splats": len(made.opacity),

@@ -187,7 +187,8 @@ class GBuffer:
 
     `opacity` is that of all surfels along the ray, `coverage` the summed weights of those in front, `depth` along the
     camera's axis, `spread` its standard deviation, `color` to first order, the rest blended with the wider kernel.
-    Where nothing is drawn all is 0.
+    `centres` are the summed weights of the narrower one, `beside` how far its discs' centres lie from the pixel's, in
+    pixels.  Where nothing is drawn all is 0.
     """
 
     opacity: Float[Array, "height width"]
@@ -198,6 +199,8 @@ class GBuffer:
     normal: Float[Array, "height width 3"]
     color: Float[Array, "height width 3"]
     attributes: Float[Array, "height width features"]
+    centres: Float[Array, "height width"]
+    beside: Float[Array, "height width 2"]
 
 
 @no_type_check
@@ -218,14 +221,16 @@ class Batch:
 class Crops:
     """One training batch of the shader network: squares of G-buffers as it sees them (`surfels/features.py`).
 
-    `target` is the reference, 8-bit RGBA with straight alpha, at 2^doublings times the resolution.
+    `target` is the reference, 8-bit RGBA with straight alpha, at 2^doublings times the resolution; `seen` reaches
+    `margin` pixels beyond it and the maps to each side.
     """
 
-    seen: Float[AnyArray, "crops height width 27"]
+    seen: Float[AnyArray, "crops rows columns 30"]
     maps: Float[AnyArray, "crops height width 17"]
     ambient: Float[AnyArray, "crops 9 3"]
     target: UInt8[AnyArray, "crops h w 4"]
     doublings: int = struct.field(pytree_node=False)
+    margin: int = struct.field(pytree_node=False, default=0)
 
 
 @no_type_check

@@ -196,7 +196,7 @@ def _seen_through(camera: Camera, plan: Plan) -> Camera:
 def look(
     found: splatting.Entries, surfels: Surfels, light: Light, camera: Camera, *, slots: int
 ) -> tuple[
-    Float[Array, "height width 27"], Float[Array, "height width 17"], Float[Array, "9 3"], Float[Array, "height width"]
+    Float[Array, "height width 30"], Float[Array, "height width 17"], Float[Array, "9 3"], Float[Array, "height width"]
 ]:
     """What the network sees of a picture's entries, the light maps, the light's harmonics in camera axes, the depth."""
     surfels = features.turned(surfels, camera)
@@ -211,7 +211,7 @@ jitted_look = jax.jit(look, static_argnames="slots")
 @partial(jax.jit, static_argnames=("config", "doublings"))
 def _shade(
     variables: dict | None,
-    seen: Float[Array, "height width 27"],
+    seen: Float[Array, "height width 30"],
     maps: Float[Array, "height width 17"],
     ambient: Float[Array, "9 3"],
     depth: Float[Array, "height width"],

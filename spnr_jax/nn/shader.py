@@ -68,9 +68,9 @@ class Shader(nn.Module):
 
     @nn.compact
     def __call__(
-        self, seen: Float[Array, "batch height width features"], doublings: int
+        self, seen: Float[Array, "batch height width features"], doublings: int, margin: int = 0
     ) -> Float[Array, "batch h w 19"]:
-        """Outputs at 2^doublings times the resolution."""
+        """Outputs at 2^doublings times the resolution, but for a margin of pixels that only tell what is around."""
         height, width = seen.shape[1:3]
         square = 2 ** (len(self.widths) - 1)
         x = jnp.pad(seen, ((0, 0), (0, -height % square), (0, -width % square), (0, 0)))
@@ -82,7 +82,7 @@ class Shader(nn.Module):
         for level in reversed(range(len(self.widths) - 1)):
             x = skips[level] + doubled(nn.Dense(self.widths[level], name=f"up{level}")(x))
             x = Block(name=f"dec{level}")(x)
-        x = nn.Dense(self.top, name="top")(x[:, :height, :width])
+        x = nn.Dense(self.top, name="top")(x[:, margin : height - margin, margin : width - margin])
         double = Double(name="double")
         for _ in range(doublings):
             x = double(x)

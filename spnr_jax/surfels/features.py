@@ -16,8 +16,8 @@ from spnr_jax.kernels.records import Camera, GBuffer, Light, Surfels
 from spnr_jax.surfels import lighting
 from spnr_jax.surfels.visibility import DIRECTIONS
 
-NUM_FEATURES, NUM_MAPS = 27, 17
-ODD = (14, 17), (15, 18)  # features that change their sign when the picture is mirrored along x, or along y
+NUM_FEATURES, NUM_MAPS = 30, 17
+ODD = (14, 17, 28), (15, 18, 29)  # features that change their sign when the picture is mirrored along x, or along y
 FAINT = 0.02  # opacity from which on a pixel's numbers begin to count
 WINDOWS = 2, 6  # pixels to each side over which the depth is compared
 EDGE = 0.6  # coverage at the outline: discs reach beyond the surface, half of their weight
@@ -52,7 +52,7 @@ def attributes(surfels: Surfels, light: Light, camera: Camera) -> Float[Array, "
 
 def features(
     buffer: GBuffer, light: Light, camera: Camera
-) -> tuple[Float[Array, "height width 27"], Float[Array, "height width 17"]]:
+) -> tuple[Float[Array, "height width 30"], Float[Array, "height width 17"]]:
     """The network's input, which knows no light, and the maps of materials and light for `nn.shader.picture`."""
     roughness, metallic, *arriving, reflected, openness = jnp.moveaxis(buffer.attributes, -1, 0)[:7]
     bent, blended = buffer.attributes[..., 7:10], buffer.attributes[..., 10:13]
@@ -70,7 +70,9 @@ def features(
     told += [0.5 * jnp.log(in_pixels), planarity, linearity, sided, cosine]
     vectors = [buffer.normal, bent, linear_to_srgb(color), linear_to_srgb(blended)]
     drawn = (buffer.opacity / (buffer.opacity + FAINT))[..., None]
-    seen = jnp.concatenate([drawn * jnp.concatenate([jnp.stack(told, axis=-1), *vectors], axis=-1), drawn], axis=-1)
+    pattern = [jnp.log1p(8 * buffer.centres)[..., None], jnp.clip(buffer.beside / in_pixels[..., None], -2, 2)]
+    seen = jnp.concatenate([jnp.stack(told, axis=-1), *vectors], axis=-1)
+    seen = jnp.concatenate([drawn * seen, drawn, *(drawn * x for x in pattern)], axis=-1)
     unshadowed = lighting.irradiance(light, turned[0]), lighting.mirrored(light, turned[1], roughness)
     solid = buffer.opacity * jnp.maximum(-jnp.expm1(-((buffer.coverage / EDGE) ** 2)), HAZE)
     maps = [*jnp.moveaxis(color, -1, 0), metallic, solid, factor, summand, *arriving]

@@ -35,6 +35,7 @@ LIST = 24  # entries of a pixel at most
 NEAR = 8  # places in the list before and after an entry that are compared in depth; those farther in front hide it
 EDGE = 0.02  # cosine between ray and plane below which the plane counts as seen at this angle
 SHARP = 4  # power of the kernel by which colours are blended more narrowly than everything else
+FAR = 1e-4  # summed narrow weights that the centres' distances pass to 0 at
 NEAREST = 0.05  # distance before the camera from which discs are drawn
 DEPTH_BITS, ENTRY_BITS = 19, 24  # of the sorted number of 64, at most; pixels have those above
 MOST_ENTRIES = 2**ENTRY_BITS
@@ -214,7 +215,8 @@ def blend(
     rotation = camera.cam_to_world[:, :3]
     wide = [*attributes.T, *_turned(rotation, surfels.normal), jnp.log(surfels.spacing)]
     offset = surfels.base_color - jnp.sum(surfels.gradient * surfels.position[:, None], axis=-1)
-    narrow = [*offset.T, *surfels.gradient.reshape(-1, 9).T]
+    foot = footprints(surfels, camera)
+    narrow = [*offset.T, *surfels.gradient.reshape(-1, 9).T, foot.column, foot.row]
     wide, narrow = jax.lax.optimization_barrier((wide, narrow))
     sums = [jnp.sum(share * column[point], axis=0) for column in wide]
     sums += [jnp.sum(x, axis=0) for x in (share, weight * left, share * depth, share * depth**2)]
@@ -269,13 +271,14 @@ def _gathered(sums: list[Array], features: int, camera: Camera) -> GBuffer:
     inverse = 1 / jnp.maximum(share, 1e-4)
     *wide, log_spacing = (x * inverse for x in wide)
     depth = deep * inverse
-    *narrow, sharp, sharp_deep = narrow
+    *narrow, column, row, sharp, sharp_deep = narrow
     told = sharp > 1e-7
     inverse_sharp = jnp.where(told, 1 / jnp.where(told, sharp, 1), 0)
     ahead = sharp_deep * inverse_sharp
     columns, rows = jnp.arange(camera.width) + 0.5, jnp.arange(camera.height) + 0.5
     right = ahead * ((columns - camera.intrinsics[0, 2]) / camera.intrinsics[0, 0])[None]
     up = ahead * -((rows - camera.intrinsics[1, 2]) / camera.intrinsics[1, 1])[:, None]
+    beside = (column, columns[None]), (row, rows[:, None])
     pose = camera.cam_to_world
     place = [pose[i, 0] * right + pose[i, 1] * up - pose[i, 2] * ahead + pose[i, 3] for i in range(3)]
     color = [narrow[c] + sum(narrow[3 + 3 * c + i] * place[i] for i in range(3)) for c in range(3)]
@@ -288,4 +291,6 @@ def _gathered(sums: list[Array], features: int, camera: Camera) -> GBuffer:
         normal=jnp.stack(wide[features:], axis=-1),
         color=jnp.stack([c * inverse_sharp for c in color], axis=-1),
         attributes=jnp.stack(wide[:features], axis=-1),
+        centres=sharp,
+        beside=jnp.stack([(total - sharp * pixels) / (sharp + FAR) for total, pixels in beside], axis=-1),
     )

@@ -47,9 +47,9 @@ SMALL, FEWER = 4, 8  # side from which on a cloud has at most so many times fewe
 MOST_ENTRIES = 2**22  # of a view: one with more is left out
 LEAST = 8  # pixels along the shorter side of a view
 MARGIN, FAINT = 6, 0.01  # pixels around the window, and opacity from which on a pixel is in it
-SIZES = (96, 64, 32, 20, 12)  # pixels along a crop by doublings; of another config.crop than the first in proportion
-SHARES = (0.36, 0.26, 0.24, 0.12, 0.02)  # of the steps, by doublings
-HALVED = 3  # doublings from which on a batch has half the crops
+SIZES = (96, 72, 48, 48, 32)  # pixels along a crop by doublings; of another config.crop than the first in proportion
+MARGINS = (0, 4, 8, 14, 10)  # of these, to each side, that the network sees and does not draw
+SHARES = (0.3, 0.22, 0.22, 0.2, 0.06)  # of the steps, by doublings
 TRIES, COVERED, DRAWN = 4, 0.15, 0.02  # places that are tried for a crop, until this share of it has this opacity
 LARGEST = 6e4  # in float16; no light makes a picture brighter than white
 CLOUD, CROP = 3, 4  # streams of random numbers under one seed, beside those of `batching`
@@ -215,15 +215,16 @@ def make_batch(views: dict[int, list[View]], config: TrainConfig, step: int) -> 
     generator = np.random.default_rng((config.seed, CROP, step))
     shares = np.array([SHARES[doublings] for doublings in sorted(views)])
     doublings = int(generator.choice(sorted(views), p=shares / shares.sum()))
-    size = -(-config.crop * SIZES[doublings] // SIZES[0])
+    size, margin = (-(-config.crop * n[doublings] // SIZES[0]) for n in (SIZES, MARGINS))
     crops = []
-    for _ in range(max(config.batch_objects // (2 if doublings >= HALVED else 1), 1)):
+    for _ in range(config.batch_objects):
         view = views[doublings][generator.integers(len(views[doublings]))]
-        crop = cropped(read_view(view), size, 2**doublings, generator)
+        crop = cropped(read_view(view), size, margin, 2**doublings, generator)
         for axis in (0, 1):
             crop = mirrored(crop, axis) if generator.random() < 0.5 else crop
         crops.append(crop)
-    return Crops(**{name: np.stack([crop[name] for crop in crops]) for name in NAMES}, doublings=doublings)
+    stacked = {name: np.stack([crop[name] for crop in crops]) for name in NAMES}
+    return Crops(**stacked, doublings=doublings, margin=margin)
 
 
 def read_view(view: View) -> Arrays:
@@ -236,23 +237,26 @@ def read_view(view: View) -> Arrays:
     return {name: arrays[f"{name}{view.number}"] for name in NAMES}
 
 
-def cropped(view: Arrays, size: int, scale: int, generator: np.random.Generator) -> Arrays:
+def cropped(view: Arrays, size: int, margin: int, scale: int, generator: np.random.Generator) -> Arrays:
     """A square of a view that shows something of the object; empty beyond the view's ends."""
-    seen = view["seen"]
+    seen, inner = view["seen"], size - 2 * margin
     for _ in range(TRIES):
-        top, left = (int(generator.integers(0, max(n - size, 0) + 1)) for n in seen.shape[:2])
-        if np.mean(seen[top : top + size, left : left + size, 0] > DRAWN) > COVERED:
+        top, left = (int(generator.integers(0, max(n - inner, 0) + 1)) for n in seen.shape[:2])
+        if np.mean(seen[top : top + inner, left : left + inner, 0] > DRAWN) > COVERED:
             break
 
-    def cut(values: np.ndarray, scale: int) -> np.ndarray:
-        part = values[scale * top : scale * (top + size), scale * left : scale * (left + size)]
-        return np.pad(part, [(0, scale * size - n) for n in part.shape[:2]] + [(0, 0)])
+    def cut(values: np.ndarray, margin: int, scale: int) -> np.ndarray:
+        places = [(scale * (first - margin), scale * (first + inner + margin)) for first in (top, left)]
+        rows, columns = (slice(max(first, 0), max(end, 0)) for first, end in places)
+        part = values[rows, columns]
+        lacking = [(max(-f, 0), max(e - n, 0)) for (f, e), n in zip(places, values.shape, strict=False)]
+        return np.pad(part, [*lacking, (0, 0)])
 
     return {
-        "seen": cut(seen, 1).astype(np.float32),
-        "maps": cut(view["maps"], 1).astype(np.float32),
+        "seen": cut(seen, margin, 1).astype(np.float32),
+        "maps": cut(view["maps"], 0, 1).astype(np.float32),
         "ambient": view["ambient"],
-        "target": cut(view["target"], scale),
+        "target": cut(view["target"], 0, scale),
     }
 
 

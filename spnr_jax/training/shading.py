@@ -28,7 +28,7 @@ def loss(params: dict, crops: Crops, *, config: TrainConfig) -> tuple[Float[Arra
     """(loss, metrics): errors of the picture on white and of the opacity, weighted as the config says."""
     assert isinstance(config.model, SurfelConfig)
     shader = Shader(config.model.widths, config.model.top)
-    outputs: Any = shader.apply({"params": params}, jnp.asarray(crops.seen), crops.doublings)
+    outputs: Any = shader.apply({"params": params}, jnp.asarray(crops.seen), crops.doublings, crops.margin)
     color, alpha = picture(outputs, jnp.asarray(crops.maps), jnp.asarray(crops.ambient), crops.doublings)
     image = color * alpha[..., None] + 1 - alpha[..., None]  # on white, as the reference is
     target = jnp.asarray(crops.target, jnp.float32) / 255

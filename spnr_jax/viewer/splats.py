@@ -84,7 +84,7 @@ class SplatControls:
         gui = client.gui
         self._seconds = gui.add_slider("Refined, seconds", 0.0, LONGEST, 1.0, SECONDS)
         self._button = gui.add_button("Make splats")
-        self._shown = gui.add_checkbox("Show splats", False, disabled=True)
+        self._shown: Any = gui.add_checkbox("Show splats", False, disabled=True)
         self._said = gui.add_markdown("")
 
         @self._button.on_click

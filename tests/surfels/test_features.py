@@ -102,6 +102,7 @@ def test_a_pixel_in_a_dent_lies_behind_the_mean_around_it_and_one_on_a_bump_befo
     buffer = features.GBuffer(
         opacity=ones, coverage=ones, depth=depth, spread=zeros, log_spacing=jnp.log(0.1 * ones),
         normal=normal, color=normal, attributes=jnp.full((32, 32, 16), 0.5),
+        centres=ones, beside=jnp.zeros((32, 32, 2)),
     )  # fmt: skip
     view = Camera(cam_to_world=jnp.eye(3, 4), intrinsics=camera(32).intrinsics, height=32, width=32)
     seen, _ = features.features(buffer, light_of(sky()), view)

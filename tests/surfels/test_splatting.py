@@ -152,6 +152,18 @@ class TestBlend:
         close(buffer.color[inner], (0.5 + hit @ slopes.T)[inner], atol=1e-4)
         assert np.abs(buffer.attributes[inner] - (0.5 + hit @ slopes.T)[inner]).max() > 1e-3  # to order zero only
 
+    def test_a_lone_disc_says_how_far_its_centre_lies_beside_each_pixel(self):
+        position = np.where(np.arange(500)[:, None] < 1, [0.1, -0.2, 0.0], [0.0, 0.0, 9.0])
+        found, view = surfels(position, (0, 0, 1.0), 0.3), camera()
+        buffer, _ = draw(found, view)
+        (centre, *_), _ = cameras.project(view, found.position)
+        columns, rows = np.meshgrid(*[np.arange(view.width) + 0.5] * 2)
+        near = buffer.centres > 0.1
+        assert 10 < near.sum() < (buffer.opacity > 0.1).sum()
+        expected = np.stack([centre[0] - columns, centre[1] - rows], axis=-1)
+        close(buffer.beside[near], expected[near], atol=0.01 * np.abs(expected[near]).max())
+        close(np.hypot(*buffer.beside[buffer.centres == buffer.centres.max()].T).min(), 0.5, atol=0.5)
+
     def test_nothing_seen_is_a_buffer_of_zeros(self):
         buffer, _ = draw(layer(height=3.0), camera())
         for values in jax.tree.leaves(buffer):
@@ -169,7 +181,8 @@ class TestBlend:
         )
         one, other = (draw(found, camera(24, (0.3 + step, 0.2, 2.4)))[0] for step in (0.0, 1e-6))
         assert np.abs(one.opacity - other.opacity).max() < 2e-4
-        for name in ("attributes", "normal", "color"):
+        assert np.abs(one.centres - other.centres).max() < 2e-4
+        for name in ("attributes", "normal", "color", "beside"):
             change = one.opacity[..., None] * getattr(one, name) - other.opacity[..., None] * getattr(other, name)
             assert np.abs(change).max() < 2e-4, name
 

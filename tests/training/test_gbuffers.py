@@ -78,25 +78,28 @@ def test_steps_meet_every_resolution_in_its_share_with_crops_of_its_size(monkeyp
     kept, config, steps = tiny_surfels.views()[0], dataclasses.replace(CONFIG, crop=48), []
     view = gbuffers.read_view(kept)
     monkeypatch.setattr(gbuffers, "read_view", lambda _: view)
-    monkeypatch.setattr(gbuffers, "cropped", lambda view, size, scale, _: steps[-1].append((size, scale)) or view)
+    monkeypatch.setattr(gbuffers, "cropped", lambda view, *sizes: steps[-1].append(sizes[:3]) or view)
     for step in range(400):
         steps.append([])
         gbuffers.make_batch({doublings: [kept] for doublings in range(5)}, config, step)
-    doublings = [int(np.log2(crops[0][1])) for crops in steps]
+    doublings = [int(np.log2(crops[0][2])) for crops in steps]
     np.testing.assert_allclose(np.bincount(doublings) / 400, gbuffers.SHARES, atol=0.06)
-    expected = {((48, 1),) * 2, ((32, 2),) * 2, ((16, 4),) * 2, ((10, 8),), ((6, 16),)}
-    assert {tuple(crops) for crops in steps} == expected
+    expected = {(48, 0, 1), (36, 2, 2), (24, 4, 4), (24, 7, 8), (16, 5, 16)}
+    assert {tuple(crops) for crops in steps} == {(sizes, sizes) for sizes in expected}
 
 
-def test_a_crop_shows_the_same_place_in_what_is_seen_and_in_the_reference():
+@pytest.mark.parametrize("margin", [0, 3])
+def test_a_crop_shows_the_same_place_in_what_is_seen_and_in_the_reference(margin):
     rows, columns = np.mgrid[:7, :9]
     place = (10 * rows + columns + 1)[..., None]
     fine = np.repeat(np.repeat(place, 4, axis=0), 4, axis=1)
     view = {"seen": place / 100, "maps": place, "ambient": np.zeros((9, 3)), "target": fine.astype(np.uint8)}
     for seed in range(8):
-        crop = gbuffers.cropped(view, 8, 4, np.random.default_rng(seed))
-        assert crop["seen"].shape == (8, 8, 1)
-        np.testing.assert_allclose(100 * crop["seen"], crop["target"][::4, ::4], atol=1e-4)
+        crop = gbuffers.cropped(view, 8 + 2 * margin, margin, 4, np.random.default_rng(seed))
+        inner = slice(margin, margin + 8)
+        assert crop["seen"].shape == (8 + 2 * margin, 8 + 2 * margin, 1)
+        np.testing.assert_allclose(100 * crop["seen"][inner, inner], crop["target"][::4, ::4], atol=1e-4)
+        assert np.isin(np.round(100 * crop["seen"]), [0, *place.ravel()]).all()
         np.testing.assert_array_equal(crop["maps"], crop["target"][2::4, 2::4])
         assert (crop["maps"][7] == 0).all(), "the view has seven rows"
 
@@ -112,7 +115,7 @@ def test_a_smaller_reference_is_the_mean_of_what_is_seen_on_white():
 def test_mirroring_leaves_the_loss_of_the_untrained_network_as_it_is(axis):
     params, kept = optimisation.create_state(CONFIG).generator, tiny_surfels.views()[0]
     view = gbuffers.read_view(kept)
-    whole = gbuffers.cropped(view, max(view["seen"].shape[:2]), 2**kept.doublings, np.random.default_rng(0))
+    whole = gbuffers.cropped(view, max(view["seen"].shape[:2]), 0, 2**kept.doublings, np.random.default_rng(0))
     turned = gbuffers.mirrored(whole, axis)
     loss = jax.jit(partial(shading.loss, config=CONFIG))
     losses = [
