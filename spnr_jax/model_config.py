@@ -12,6 +12,7 @@ import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache
+from types import UnionType
 from typing import Annotated, Any, ClassVar, Literal, get_args, get_origin, get_type_hints
 
 from spnr_jax.errors import UserError
@@ -74,6 +75,8 @@ def mismatch(value: Any, kind: Any) -> str:
     if origin is Annotated:
         base, *limits = inside
         return mismatch(value, base) or next((limit.words for limit in limits if not limit.holds(value)), "")
+    if origin is UnionType:  # of something and None
+        return "" if value is None else mismatch(value, inside[0])
     if origin is Literal:
         return "" if isinstance(value, str) and value in inside else " or ".join([", ".join(inside[:-1]), inside[-1]])
     if origin is tuple:
@@ -294,6 +297,8 @@ class SurfelConfig(NetworkConfig):
     """Features of the U-Net's levels, at the resolution of the points first."""
     top: Count = 24
     """Features of the blocks that double the resolution."""
+    solid: NearPointsConfig | None = None
+    """The network of rays that tells, from a few of the points, where the object is solid; None: there is none."""
 
     def __post_init__(self) -> None:
         check(self)

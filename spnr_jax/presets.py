@@ -30,6 +30,9 @@ def near(num_samples: int) -> SamplingConfig:
     return SamplingConfig(num_coarse=num_samples, num_fine=0, reach=1)
 
 
+REFINED = NearPointsConfig(encoder=SMALL, sampling=near(16), surface_cells=surface_grid(2048), refiner_width=32)
+
+
 def abo() -> TrainConfig:
     """Paper sizes for Amazon Berkeley Objects, 128 px.  `spnr train --preset abo DATA RUN`; meant for one GPU."""
     return TrainConfig(preset="abo", loss=LossConfig(adversarial_start=0.1))
@@ -169,7 +172,7 @@ def plus_refined() -> TrainConfig:
     """
     return TrainConfig(
         preset="plus_refined",
-        model=NearPointsConfig(encoder=SMALL, sampling=near(16), surface_cells=surface_grid(2048), refiner_width=32),
+        model=REFINED,
         loss=dataclasses.replace(NEAR, mse_weight=4.0, opacity_weight=2.0),
         optimizer=LONGER,
         num_steps=20_000,
@@ -188,7 +191,7 @@ def surfels() -> TrainConfig:
     """
     return TrainConfig(
         preset="surfels",
-        model=SurfelConfig(),
+        model=SurfelConfig(solid=REFINED),
         loss=LossConfig(
             l1_weight=1.0, mse_weight=5.0, adversarial_weight=0.0, opacity_weight=1.0, opacity_l1_weight=0.3
         ),

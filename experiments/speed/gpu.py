@@ -91,7 +91,7 @@ def films(options: OnGPU) -> list[Found]:
     """Frames of an orbit, each of them brought to the host."""
     config = SurfelConfig(widths=(4, 6), top=4) if options.quick else SurfelConfig()
     variables, light = surfel_renderer.init(jax.random.key(0), config), room_light()
-    scene, rows = surfel_renderer.encode(sphere(options.points)), []
+    scene, rows = surfel_renderer.encode(variables, sphere(options.points), config=config), []
     for size in (32, 64) if options.quick else (512, 1024):
         views = [orbiting(size, 0.1 * frame) for frame in range(options.frames)]
 

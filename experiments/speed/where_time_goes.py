@@ -130,7 +130,7 @@ def frame_programs(options: WhereTimeGoes) -> dict[str, Program]:
     config = SurfelConfig(image_resolution=options.size)
     variables = surfel_renderer.init(jax.random.key(0), config)
     camera, light = orbiting(options.size), room_light()
-    scene = surfel_renderer.encode(sphere(options.points))
+    scene = surfel_renderer.encode(variables, sphere(options.points), config=config)
     doublings, side = surfel_renderer.resolution_of(scene.spacing, camera)
     small = orbiting(options.size * side >> doublings)
     total = int(splatting.count(scene.surfels, small))

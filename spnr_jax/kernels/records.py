@@ -225,8 +225,8 @@ class Crops:
     `margin` pixels beyond it and the maps to each side.
     """
 
-    seen: Float[AnyArray, "crops rows columns 30"]
-    maps: Float[AnyArray, "crops height width 17"]
+    seen: Float[AnyArray, "crops rows columns 33"]
+    maps: Float[AnyArray, "crops height width 18"]
     ambient: Float[AnyArray, "crops 9 3"]
     target: UInt8[AnyArray, "crops h w 4"]
     doublings: int = struct.field(pytree_node=False)

@@ -16,6 +16,21 @@ def bilinear(
     return jax.image.resize(x, (x.shape[0], height, width, x.shape[-1]), "bilinear", antialias=False)
 
 
+def doubled(x: Float[Array, "batch height width features"]) -> Float[Array, "batch h w features"]:
+    """Twice the size, bilinear; the border repeats."""
+    for axis in (1, 2):
+        size = x.shape[axis]
+        before = jnp.concatenate([_part(x, axis, 0, 1), _part(x, axis, 0, size - 1)], axis)
+        after = jnp.concatenate([_part(x, axis, 1, size), _part(x, axis, size - 1, size)], axis)
+        pair = jnp.stack([0.75 * x + 0.25 * before, 0.75 * x + 0.25 * after], axis + 1)
+        x = pair.reshape(*x.shape[:axis], 2 * size, *x.shape[axis + 1 :])
+    return x
+
+
+def _part(x: Array, axis: int, first: int, end: int) -> Array:
+    return jax.lax.slice_in_dim(x, first, end, axis=axis)
+
+
 def mean_of_squares(x: Float[Array, "*batch height width features"], side: int) -> Float[Array, "*batch h w features"]:
     """The mean of each square of side x side pixels."""
     return jnp.mean(squares(x, side), axis=(-4, -2))

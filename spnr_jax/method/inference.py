@@ -44,7 +44,9 @@ def init(key: Key, config: NetworkConfig) -> dict:
     if config.method == "surfels":
         from spnr_jax.method import surfel_renderer
 
-        return surfel_renderer.init(key, cast(SurfelConfig, config))
+        sizes = cast(SurfelConfig, config)
+        variables = surfel_renderer.init(key, sizes)
+        return variables | ({} if sizes.solid is None else {"batch_stats": init(key, sizes.solid)})
     return dict(network(config).init(key, *example_inputs(config)))
 
 
@@ -114,8 +116,8 @@ def render_views(
         from spnr_jax.method import surfel_renderer
         from spnr_jax.surfels.lighting import room_light
 
-        scene = surfel_renderer.encode(cloud)
         sizes = cast(SurfelConfig, config)
+        scene = surfel_renderer.encode(variables, cloud, config=sizes)
         return surfel_renderer.render_views(variables, scene, camera, light or room_light(), config=sizes)
     cloud, camera = jax.tree.map(lambda x: jnp.asarray(x)[None], (cloud, camera))
     volume = jitted_encode(variables, cloud, config=config)

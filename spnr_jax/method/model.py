@@ -69,7 +69,7 @@ class Model:
         inside = np.clip((positions - centre) * scale, -1, 1).astype(np.float32)
         cloud = dataclasses.replace(cloud, positions=inside)
         if self._surfels is not None:
-            scene = self._surfels.encode(cloud)
+            scene = self._surfels.encode(self.variables, cloud, config=self.config)
             return Volume(scene=scene, centre=jnp.asarray(centre), scale=jnp.asarray(scale))
         cloud = dataclasses.replace(cloud, normals=None)
         cloud = cloud_arrays.pad(cloud, cloud_arrays.bucket(len(positions)))

@@ -21,10 +21,11 @@ from jaxtyping import Array, Float
 from spnr_jax.errors import UserError
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.compositing import WHITE
-from spnr_jax.kernels.records import AnyArray, Camera, Key, Light, PointCloud, Rendering, Surfels
-from spnr_jax.kernels.resizing import mean_of_squares
+from spnr_jax.kernels.records import AnyArray, Camera, Key, Light, PointCloud, Rendering, Scene, Surfels
+from spnr_jax.kernels.resizing import doubled, mean_of_squares
+from spnr_jax.method import solid
 from spnr_jax.model_config import SurfelConfig
-from spnr_jax.nn.shader import NUM_OUTPUTS, Shader, doubled, picture
+from spnr_jax.nn.shader import NUM_OUTPUTS, Shader, picture
 from spnr_jax.surfels import features, lighting, splatting
 from spnr_jax.surfels.estimate import estimate
 
@@ -38,10 +39,14 @@ GRID = 8  # of which a window's corner is a multiple: the network's levels see t
 
 @struct.dataclass
 class SurfelScene:
-    """An encoded object: its surfels, and their median spacing, which decides at what size a picture is drawn."""
+    """An encoded object: its surfels, and their median spacing, which decides at what size a picture is drawn.
+
+    `solid` is what the network of rays makes of it, where there is one (`method/solid.py`).
+    """
 
     surfels: Surfels
     spacing: float = struct.field(pytree_node=False)
+    solid: Scene | None = None
 
 
 class Plan(NamedTuple):
@@ -61,15 +66,23 @@ def init(key: Key, config: SurfelConfig) -> dict:
     return dict(Shader(config.widths, config.top).init(key, jnp.zeros((1, side, side, features.NUM_FEATURES)), 1))
 
 
-def encode(cloud: PointCloud) -> SurfelScene:
-    """Surfels of a cloud (unbatched, in the box)."""
+def encode(variables: dict | None, cloud: PointCloud, *, config: SurfelConfig) -> SurfelScene:
+    """Surfels of a cloud (unbatched, in the box), and where it is solid; without variables surfels alone.
+
+    Variables of the network of rays are `batch_stats`: what a state holds that is not trained.
+    """
     mask = np.asarray(cloud.mask)
     names = ("positions", "base_color", "roughness", "metallic", "normals")
     columns: dict[str, Any] = {
         name: None if (x := getattr(cloud, name)) is None else np.asarray(x)[mask] for name in names
     }
     surfels = estimate(**columns)
-    return SurfelScene(surfels=jax.device_put(surfels), spacing=float(np.median(surfels.spacing[surfels.mask])))
+    known = None
+    if variables is not None and config.solid is not None:
+        whole = jax.tree.map(lambda x: np.asarray(x)[mask], cloud)
+        known = solid.encode(variables["batch_stats"], whole, config=config.solid)
+    spacing = float(np.median(surfels.spacing[surfels.mask]))
+    return SurfelScene(surfels=jax.device_put(surfels), spacing=spacing, solid=known)
 
 
 def render(
@@ -130,11 +143,14 @@ def _drawn(
     """A planned view, and the size of its table of pixels."""
     if total == 0:
         return _nothing(camera), least_slots
-    inside = _seen_through(_scaled(camera, plan.doublings, plan.side), plan)
+    whole = _scaled(camera, plan.doublings, plan.side)
+    inside = _seen_through(whole, plan)
     found, covered = splatting.entries(scene.surfels, inside, total=_rounded(total, 2**15, splatting.MOST_ENTRIES))
     pixels = inside.height * inside.width
     slots = _rounded(min(max(int(covered), least_slots), pixels), LEAST_SLOTS, pixels)
-    looked = jitted_look(found, scene.surfels, light, inside, slots=slots)
+    known = known_of(variables, scene, whole, config)
+    within = None if known is None else jnp.asarray(_in_window(known, plan))
+    looked = jitted_look(found, scene.surfels, light, inside, within, slots=slots)
     return _placed(_shade(variables, *looked, config=config, doublings=plan.doublings), camera, plan), slots
 
 
@@ -193,15 +209,37 @@ def _seen_through(camera: Camera, plan: Plan) -> Camera:
     )
 
 
+def known_of(
+    variables: dict | None, scene: SurfelScene, camera: Camera, config: SurfelConfig
+) -> Float[Array, "height width 2"] | None:
+    """Opacity and depth of a view as the network of rays sees it, where there is one."""
+    if variables is None or scene.solid is None or config.solid is None:
+        return None
+    return solid.seen(variables["batch_stats"], scene.solid, camera, config=config.solid)
+
+
+def _in_window(picture: Float[Array, "h w features"], plan: Plan) -> Float[np.ndarray, "height width features"]:
+    """The part of a picture in the window, which may reach beyond it."""
+    ends = plan.top + plan.height, plan.left + plan.width
+    lacking = [(0, max(end - n, 0)) for end, n in zip(ends, picture.shape, strict=False)]
+    return np.pad(np.asarray(picture), [*lacking, (0, 0)])[plan.top : ends[0], plan.left : ends[1]]
+
+
 def look(
-    found: splatting.Entries, surfels: Surfels, light: Light, camera: Camera, *, slots: int
+    found: splatting.Entries,
+    surfels: Surfels,
+    light: Light,
+    camera: Camera,
+    known: Float[Array, "height width 2"] | None = None,
+    *,
+    slots: int,
 ) -> tuple[
-    Float[Array, "height width 30"], Float[Array, "height width 17"], Float[Array, "9 3"], Float[Array, "height width"]
+    Float[Array, "height width 33"], Float[Array, "height width 18"], Float[Array, "9 3"], Float[Array, "height width"]
 ]:
     """What the network sees of a picture's entries, the light maps, the light's harmonics in camera axes, the depth."""
     surfels = features.turned(surfels, camera)
     buffer = splatting.blend(found, surfels, features.attributes(surfels, light, camera), camera, slots=slots)
-    seen, maps = features.features(buffer, light, camera)
+    seen, maps = features.features(buffer, light, camera, known)
     return seen, maps, lighting.projected(light, jnp.asarray(camera.cam_to_world)[:, :3]), buffer.depth
 
 
@@ -211,8 +249,8 @@ jitted_look = jax.jit(look, static_argnames="slots")
 @partial(jax.jit, static_argnames=("config", "doublings"))
 def _shade(
     variables: dict | None,
-    seen: Float[Array, "height width 30"],
-    maps: Float[Array, "height width 17"],
+    seen: Float[Array, "height width 33"],
+    maps: Float[Array, "height width 18"],
     ambient: Float[Array, "9 3"],
     depth: Float[Array, "height width"],
     *,
@@ -226,7 +264,9 @@ def _shade(
     if variables is None:
         outputs = jnp.zeros((1, *(n << doublings for n in seen.shape[:2]), NUM_OUTPUTS))
     else:
-        outputs = jnp.asarray(Shader(config.widths, config.top).apply(variables, seen[None], doublings))
+        outputs = jnp.asarray(
+            Shader(config.widths, config.top).apply({"params": variables["params"]}, seen[None], doublings)
+        )
     color, alpha = picture(outputs, maps[None], ambient[None], doublings)
     depth = depth[None, ..., None]
     for _ in range(doublings):

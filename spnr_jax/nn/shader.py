@@ -7,34 +7,18 @@ light, and a picture is linear in it up to the sRGB curve.
 """
 
 import flax.linen as nn
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from spnr_jax.kernels.colors import linear_to_srgb
-from spnr_jax.kernels.resizing import mean_of_squares, unfolded
+from spnr_jax.kernels.resizing import doubled, mean_of_squares, unfolded
 from spnr_jax.nn.convolution import Conv
 from spnr_jax.surfels.lighting import SPECULAR
 
-NUM_OUTPUTS = 19
+NUM_OUTPUTS = 20
 COLOR_STEP, ODDS_STEP = 0.3, 2.0  # what an output of 1 changes the base colour, and the log odds of the opacity by
 LEAST_ODDS = 1e-2  # keeps the odds of what is clear or solid finite
 NOTHING = 2e-4  # opacity below which a pixel stays clear, whatever the network says
-
-
-def doubled(x: Float[Array, "batch height width features"]) -> Float[Array, "batch h w features"]:
-    """Twice the size, bilinear; the border repeats."""
-    for axis in (1, 2):
-        size = x.shape[axis]
-        before = jnp.concatenate([_part(x, axis, 0, 1), _part(x, axis, 0, size - 1)], axis)
-        after = jnp.concatenate([_part(x, axis, 1, size), _part(x, axis, size - 1, size)], axis)
-        pair = jnp.stack([0.75 * x + 0.25 * before, 0.75 * x + 0.25 * after], axis + 1)
-        x = pair.reshape(*x.shape[:axis], 2 * size, *x.shape[axis + 1 :])
-    return x
-
-
-def _part(x: Array, axis: int, first: int, end: int) -> Array:
-    return jax.lax.slice_in_dim(x, first, end, axis=axis)
 
 
 class Block(nn.Module):
@@ -69,7 +53,7 @@ class Shader(nn.Module):
     @nn.compact
     def __call__(
         self, seen: Float[Array, "batch height width features"], doublings: int, margin: int = 0
-    ) -> Float[Array, "batch h w 19"]:
+    ) -> Float[Array, "batch h w 20"]:
         """Outputs at 2^doublings times the resolution, but for a margin of pixels that only tell what is around."""
         height, width = seen.shape[1:3]
         square = 2 ** (len(self.widths) - 1)
@@ -89,9 +73,14 @@ class Shader(nn.Module):
         return nn.Dense(NUM_OUTPUTS, kernel_init=nn.initializers.zeros, name="out")(nn.LayerNorm(name="norm")(x))
 
 
+def log_odds(opacity: Float[Array, "*pixels"]) -> Float[Array, "*pixels"]:
+    """Finite ones, also of 0 and 1."""
+    return jnp.log(opacity + LEAST_ODDS) - jnp.log(1 + LEAST_ODDS - opacity)
+
+
 def picture(
-    outputs: Float[Array, "batch h w 19"],
-    maps: Float[Array, "batch height width 17"],
+    outputs: Float[Array, "batch h w 20"],
+    maps: Float[Array, "batch height width 18"],
     ambient: Float[Array, "batch 9 3"],
     doublings: int,
 ) -> tuple[Float[Array, "batch h w 3"], Float[Array, "batch h w"]]:
@@ -103,8 +92,10 @@ def picture(
         maps = doubled(maps)
     color, metallic, opacity, factor, summand = (maps[..., i:j] for i, j in ((0, 3), (3, 4), (4, 5), (5, 6), (6, 7)))
     arriving, unshadowed, mirrored, reflected = (maps[..., i:j] for i, j in ((7, 10), (10, 13), (13, 16), (16, 17)))
+    solid = maps[..., 17:18]
     base = jnp.clip(color + COLOR_STEP * outputs[..., 0:3], 0, 1)
-    odds = jnp.log(opacity + LEAST_ODDS) - jnp.log(1 + LEAST_ODDS - opacity)
+    share = nn.sigmoid(outputs[..., 19:20])  # how far the rays are trusted beside the discs
+    odds = (1 - share) * log_odds(opacity) + share * log_odds(solid)
     alpha = nn.sigmoid(odds + ODDS_STEP * outputs[..., 3:4]) * -jnp.expm1(-opacity / NOTHING)
     bounced = outputs[..., 8:11] * ambient[:, None, None, 0]
     bounced += jnp.einsum("bhwk,bkc->bhwc", outputs[..., 11:19], ambient[:, 1:], precision="highest")

@@ -16,11 +16,12 @@ from spnr_jax.kernels.records import Camera, GBuffer, Light, Surfels
 from spnr_jax.surfels import lighting
 from spnr_jax.surfels.visibility import DIRECTIONS
 
-NUM_FEATURES, NUM_MAPS = 30, 17
+NUM_FEATURES, NUM_MAPS = 33, 18
 ODD = (14, 17, 28), (15, 18, 29)  # features that change their sign when the picture is mirrored along x, or along y
 FAINT = 0.02  # opacity from which on a pixel's numbers begin to count
 WINDOWS = 2, 6  # pixels to each side over which the depth is compared
 EDGE = 0.6  # coverage at the outline: discs reach beyond the surface, half of their weight
+LEAST = 0.01  # opacity from which on a pixel's depth says something
 HAZE = 0.05  # of the opacity that is left where discs hardly cover a pixel: the network may make it solid
 TRUST = 0.25  # most that a colour to first order leaves the blended one
 
@@ -51,9 +52,12 @@ def attributes(surfels: Surfels, light: Light, camera: Camera) -> Float[Array, "
 
 
 def features(
-    buffer: GBuffer, light: Light, camera: Camera
-) -> tuple[Float[Array, "height width 30"], Float[Array, "height width 17"]]:
-    """The network's input, which knows no light, and the maps of materials and light for `nn.shader.picture`."""
+    buffer: GBuffer, light: Light, camera: Camera, solid: Float[Array, "height width 2"] | None = None
+) -> tuple[Float[Array, "height width 33"], Float[Array, "height width 18"]]:
+    """The network's input, which knows no light, and the maps of materials and light for `nn.shader.picture`.
+
+    `solid` is the opacity and the depth along the camera's axis that the network of rays sees; None is not known.
+    """
     roughness, metallic, *arriving, reflected, openness = jnp.moveaxis(buffer.attributes, -1, 0)[:7]
     bent, blended = buffer.attributes[..., 7:10], buffer.attributes[..., 10:13]
     planarity, linearity, sided = jnp.moveaxis(buffer.attributes, -1, 0)[13:16]
@@ -72,11 +76,16 @@ def features(
     drawn = (buffer.opacity / (buffer.opacity + FAINT))[..., None]
     pattern = [jnp.log1p(8 * buffer.centres)[..., None], jnp.clip(buffer.beside / in_pixels[..., None], -2, 2)]
     seen = jnp.concatenate([jnp.stack(told, axis=-1), *vectors], axis=-1)
-    seen = jnp.concatenate([drawn * seen, drawn, *(drawn * x for x in pattern)], axis=-1)
+    covered = buffer.opacity * jnp.maximum(-jnp.expm1(-((buffer.coverage / EDGE) ** 2)), HAZE)
+    opacity = covered if solid is None else solid[..., 0]
+    known = jnp.zeros((*covered.shape, 3))
+    if solid is not None:
+        behind = jnp.tanh(opacity * (solid[..., 1] - buffer.depth) / spacing)
+        known = jnp.stack([jnp.ones_like(opacity), opacity, jnp.where(buffer.opacity > LEAST, behind, 0)], axis=-1)
+    seen = jnp.concatenate([drawn * seen, drawn, *(drawn * x for x in pattern), known], axis=-1)
     unshadowed = lighting.irradiance(light, turned[0]), lighting.mirrored(light, turned[1], roughness)
-    solid = buffer.opacity * jnp.maximum(-jnp.expm1(-((buffer.coverage / EDGE) ** 2)), HAZE)
-    maps = [*jnp.moveaxis(color, -1, 0), metallic, solid, factor, summand, *arriving]
-    return seen, jnp.stack([*maps, *unshadowed[0], *unshadowed[1], reflected], axis=-1)
+    maps = [*jnp.moveaxis(color, -1, 0), metallic, covered, factor, summand, *arriving]
+    return seen, jnp.stack([*maps, *unshadowed[0], *unshadowed[1], reflected, opacity], axis=-1)
 
 
 def _directions(buffer: GBuffer, camera: Camera) -> tuple[list[Array], list[Array]]:
@@ -101,7 +110,7 @@ def _to_world(camera: Camera, direction: list[Array]) -> list[Array]:
 def _relief(buffer: GBuffer, spacing: Float[Array, "height width"], reach: int) -> Float[Array, "height width"]:
     """How far each pixel lies behind the mean around it, in spacings, squeezed into (-1, 1)."""
     mean = _box(buffer.opacity * buffer.depth, reach) / jnp.maximum(_box(buffer.opacity, reach), 1e-3)
-    return jnp.where(buffer.opacity > 0.01, jnp.tanh((buffer.depth - mean) / (4 * spacing)), 0)
+    return jnp.where(buffer.opacity > LEAST, jnp.tanh((buffer.depth - mean) / (4 * spacing)), 0)
 
 
 def _box(values: Float[Array, "height width"], reach: int) -> Float[Array, "height width"]:

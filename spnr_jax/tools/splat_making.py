@@ -17,6 +17,7 @@ from spnr_jax.kernels.records import Camera, Gaussians, Light, PointCloud
 from spnr_jax.method import surfel_renderer
 from spnr_jax.method.model import DISTANCE, Model, Volume
 from spnr_jax.method.surfel_renderer import SurfelScene
+from spnr_jax.model_config import SurfelConfig
 from spnr_jax.tools.depth_maps import surface_depth
 
 GOLDEN_ANGLE = 180 * (3 - np.sqrt(5))  # degrees between the azimuths of one direction and the next
@@ -148,4 +149,5 @@ def in_units(gaussians: Gaussians, volume: Volume) -> Gaussians:
 
 def _surfels(cloud: PointCloud, volume: Volume) -> SurfelScene:
     inside = np.clip((np.asarray(cloud.positions) - np.asarray(volume.centre)) * np.asarray(volume.scale), -1, 1)
-    return surfel_renderer.encode(dataclasses.replace(cloud, positions=inside.astype(np.float32)))
+    placed = dataclasses.replace(cloud, positions=inside.astype(np.float32))
+    return surfel_renderer.encode(None, placed, config=SurfelConfig())

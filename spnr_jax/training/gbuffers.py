@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Array, Float, UInt8
 from scipy.spatial import cKDTree
 from tqdm import tqdm
 
@@ -33,6 +33,7 @@ from spnr_jax.kernels import cameras
 from spnr_jax.kernels.records import Camera, Crops, Light, PointCloud
 from spnr_jax.kernels.thinning import farthest_points
 from spnr_jax.method import surfel_renderer
+from spnr_jax.model_config import SurfelConfig
 from spnr_jax.surfels import features, lighting, splatting
 from spnr_jax.training.batching import read_ahead
 
@@ -41,6 +42,7 @@ SCANNED = 0.2  # share of them that are made noisy
 NOISE = 0.05, 0.6  # least and most standard deviation of their points, in distances between nearest ones
 STRAY = 0.0, 0.0, 0.003, 0.01  # shares of points that lie anywhere, drawn from these
 COLOR_NOISE = 0.05  # most standard deviation of their colours
+UNKNOWN = 0.15  # share of the clouds of which it is not known where they are solid
 WITHOUT_NORMALS = 0.5  # share of the others whose normals are estimated
 SIDES = (1, 1, 1, 1, 2, 4, 8)  # pixels of a reference averaged along a side, drawn from these
 SMALL, FEWER = 4, 8  # side from which on a cloud has at most so many times fewer points
@@ -66,8 +68,8 @@ class View(NamedTuple):
     doublings: int
 
 
-def complete(dataset: Dataset, light: Light, config: TrainConfig, folder: Path) -> list[View]:
-    """The views of the data set's objects; files that are missing or broken are made."""
+def complete(dataset: Dataset, light: Light, config: TrainConfig, folder: Path, solid: dict) -> list[View]:
+    """The views of the data set's objects; files that are missing or broken are made; `solid` are variables."""
     views = []
     for name in tqdm(dataset.splits["train"], "G-buffers", unit="object"):
         paths = [folder / f"{name}.{number}.npz" for number in range(CLOUDS)]
@@ -75,7 +77,7 @@ def complete(dataset: Dataset, light: Light, config: TrainConfig, folder: Path) 
         item = read_object(dataset, name) if None in found else None
         for number, path in enumerate(paths):
             if item is not None and found[number] is None:
-                arrays = make(item, number, light, config)
+                arrays = make(item, number, light, config, solid)
                 write_whole(path, _packed(arrays))
                 found[number] = arrays["doublings"].tolist()
         views += [View(path, i, d) for path, of in zip(paths, found, strict=True) for i, d in enumerate(of or ())]
@@ -99,17 +101,21 @@ def _packed(arrays: Arrays) -> bytes:
     return stream.getvalue()
 
 
-def make(item: ObjectData, number: int, light: Light, config: TrainConfig) -> Arrays:
+def make(item: ObjectData, number: int, light: Light, config: TrainConfig, solid: dict) -> Arrays:
     """The content of a file: views of the object's cloud of this number."""
+    assert isinstance(config.model, SurfelConfig)
     generator = np.random.default_rng((config.seed, CLOUD, zlib.crc32(item.name.encode()), number))
     side = int(generator.choice(SIDES))
-    scene = surfel_renderer.encode(random_cloud(item.cloud, side, config, generator))
+    cloud = random_cloud(item.cloud, side, config, generator)
+    variables = None if generator.random() < UNKNOWN else {"batch_stats": solid}
+    scene = surfel_renderer.encode(variables, cloud, config=config.model)
+    known = partial(surfel_renderer.known_of, variables, scene, config=config.model)
     arrays: Arrays = {}
     doublings: list[int] = []
     for index in generator.permutation(len(item.images))[: config.views_per_object]:
         camera = jax.tree.map(lambda x, i=index: np.asarray(x[i]), item.camera)
         own = light if item.lights is None else lighting.light_of(item.lights[index])
-        if view := make_view(scene, camera, item.images[index], side, own):
+        if view := make_view(scene, camera, item.images[index], side, own, known):
             arrays |= {f"{name}{len(doublings)}": view[1][name] for name in NAMES}
             doublings.append(view[0])
     return arrays | {"doublings": np.array(doublings, np.int64)}
@@ -151,8 +157,12 @@ def make_view(
     image: UInt8[np.ndarray, "height width 4"],
     side: int,
     light: Light,
+    known: Callable[[Camera], Float[Array, "height width 2"] | None] = lambda camera: None,
 ) -> tuple[int, Arrays] | None:
-    """Doublings and arrays of a view, `side` times smaller than its reference is kept; None if it teaches nothing."""
+    """Doublings and arrays of a view, `side` times smaller than its reference is kept; None if it teaches nothing.
+
+    `known` is the opacity and depth that the network of rays sees from a camera.
+    """
     small = cameras.resize(camera, camera.height // side, camera.width // side)
     doublings, finer = surfel_renderer.resolution_of(scene.spacing, small)
     side, scale = side // finer, 2**doublings  # what is drawn at twice the size is compared at that size
@@ -165,7 +175,7 @@ def make_view(
     found, slots = splatting.entries(scene.surfels, drawn, total=_size(total, 2**16))
     slots = min(_size(int(slots), drawn.height * drawn.width // 16), drawn.height * drawn.width)
     seen, maps, ambient, _ = map(
-        np.asarray, surfel_renderer.jitted_look(found, scene.surfels, light, drawn, slots=slots)
+        np.asarray, surfel_renderer.jitted_look(found, scene.surfels, light, drawn, known(drawn), slots=slots)
     )
     target = averaged(image, side)
     shown = target[..., 3].reshape(drawn.height, scale, drawn.width, scale).max(axis=(1, 3))

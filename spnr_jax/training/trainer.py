@@ -9,6 +9,7 @@ Of several processes that train together (placement.py) the first writes all of 
 together.
 """
 
+import dataclasses
 import json
 import math
 import os
@@ -35,7 +36,7 @@ from spnr_jax.kernels.records import Light
 from spnr_jax.method import inference
 from spnr_jax.training import checkpoint, optimisation, work
 from spnr_jax.training.run_record import Clock, RunRecord
-from spnr_jax.training.weights import Trained
+from spnr_jax.training.weights import Trained, solid_variables
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -173,6 +174,8 @@ def _train(
 def new_state(config: TrainConfig, init: Trained | None) -> optimisation.TrainState:
     """The state before the first step."""
     state = optimisation.jitted_create_state(config)
+    if solid := solid_variables(config.model):
+        state = dataclasses.replace(state, batch_stats=solid, averaged_stats=jax.tree.map(jnp.copy, solid))
     return state if init is None else optimisation.begun_with(state, init.variables)
 
 

@@ -27,11 +27,13 @@ from spnr_jax.formats.images import write_whole
 from spnr_jax.formats.npz import read_arrays
 from spnr_jax.method.inference import init
 from spnr_jax.method.model import Model
+from spnr_jax.model_config import NetworkConfig, SurfelConfig
 
 # what a header of any content makes its readers raise
 UNREADABLE = (ValueError, LookupError, TypeError, ArithmeticError, RecursionError)
 MANY_POINTS = 6000  # chosen between 1,024, where rays score better at 512 pixels, and 16,384, where surfels do
 ADVICE = "write one with `spnr export RUN`"
+SOLID = "small"  # of the package's: tells where objects are solid
 SHIPPED = ("surfels", "small", "tiny")  # what the package holds; the first renders where no other is named
 
 
@@ -47,6 +49,19 @@ class Trained:
 def shipped(name: str = SHIPPED[0]) -> Path:
     """The file of a network that the package holds."""
     return Path(str(resources.files("spnr_jax") / "pretrained" / f"{name}.npz"))
+
+
+def solid_variables(config: NetworkConfig) -> dict:
+    """Weights of the network of rays that one over surfels asks (`method/solid.py`): the package's, or none.
+
+    ValueError if it asks another than the package has.
+    """
+    if not isinstance(config, SurfelConfig) or config.solid is None:
+        return {}
+    found = read_weights(shipped(SOLID))
+    if found.config.model != config.solid:
+        raise UserError(f"model.solid is another network than the package's {SOLID}; use its sizes")
+    return found.variables
 
 
 def suited_to(num_points: int) -> str:

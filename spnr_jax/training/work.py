@@ -21,7 +21,7 @@ from spnr_jax.model_config import SurfelConfig
 from spnr_jax.surfels import lighting
 from spnr_jax.training import batching, gbuffers, optimisation, shading
 from spnr_jax.training.optimisation import TrainState
-from spnr_jax.training.weights import Trained, write_weights
+from spnr_jax.training.weights import Trained, solid_variables, write_weights
 
 ROOM = "procedural room"  # as the generator of data sets calls it
 
@@ -71,7 +71,7 @@ def of_gbuffers(config: TrainConfig, dataset: Dataset, run: Path, light: Light) 
     """
     if jax.process_count() > 1:
         raise UserError(f"preset {config.preset} trains in one process; start it without --distributed")
-    views = gbuffers.complete(dataset, light, config, run / "gbuffers")
+    views = gbuffers.complete(dataset, light, config, run / "gbuffers", solid_variables(config.model))
 
     def step(state: TrainState, crops: Crops, number: int) -> tuple[TrainState, dict]:
         return shading.jitted_train_step(state, crops, config=config)

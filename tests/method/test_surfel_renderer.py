@@ -23,7 +23,9 @@ RADIUS = 0.6
 
 
 def ball(count=600):
-    return encode(cloud(shape("sphere", count)[0], base_color=np.full((count, 3), [0.7, 0.3, 0.1])))
+    return encode(
+        None, cloud(shape("sphere", count)[0], base_color=np.full((count, 3), [0.7, 0.3, 0.1])), config=CONFIG
+    )
 
 
 @pytest.fixture(scope="module")
@@ -121,5 +123,7 @@ def test_padding_of_the_cloud_and_points_outside_the_picture_change_nothing(scen
     color = np.full((600, 3), [0.7, 0.3, 0.1])
     padded = cloud(np.concatenate([positions, 0 * positions]), base_color=np.concatenate([color, color]))
     padded = dataclasses.replace(padded, mask=np.arange(1200) < 600)
-    found, expected = (render(None, s, camera(64), LIGHT, config=CONFIG) for s in (encode(padded), scene))
+    found, expected = (
+        render(None, s, camera(64), LIGHT, config=CONFIG) for s in (encode(None, padded, config=CONFIG), scene)
+    )
     close(found, expected)

@@ -42,7 +42,7 @@ def dataset() -> data_sets.Dataset:
 @functools.cache
 def views() -> list[gbuffers.View]:
     """The views of the ball's clouds, in a folder that a test copies to change it."""
-    return gbuffers.complete(dataset(), LIGHT, CONFIG, tiny_dataset.folder() / "gbuffers")
+    return gbuffers.complete(dataset(), LIGHT, CONFIG, tiny_dataset.folder() / "gbuffers", {})
 
 
 @functools.cache

@@ -29,7 +29,7 @@ def grouped(views):
 
 def made(seed, number):
     item = data_sets.read_object(tiny_surfels.dataset(), NAME)
-    return gbuffers.make(item, number, LIGHT, dataclasses.replace(CONFIG, seed=seed))
+    return gbuffers.make(item, number, LIGHT, dataclasses.replace(CONFIG, seed=seed), {})
 
 
 def test_a_file_is_what_its_seed_object_and_cloud_make_of_it():
@@ -50,7 +50,7 @@ def test_a_file_cut_off_by_a_crash_is_made_again_and_no_other_one(tmp_path):
     whole = broken.read_bytes()
     broken.write_bytes(whole[: len(whole) // 2])
     written = {path: path.stat().st_mtime_ns for path in folder.iterdir()}
-    again = gbuffers.complete(tiny_surfels.dataset(), LIGHT, CONFIG, folder)
+    again = gbuffers.complete(tiny_surfels.dataset(), LIGHT, CONFIG, folder, {})
     assert [view._replace(path=view.path.name) for view in again] == [v._replace(path=v.path.name) for v in views]
     assert broken.read_bytes() == whole
     assert {path for path in folder.iterdir() if path.stat().st_mtime_ns != written[path]} == {broken}
@@ -175,7 +175,7 @@ def test_harmonics_of_the_mirrored_light_are_the_mirrored_ones(axis):
 def test_points_too_far_apart_or_too_near_for_the_reference_teach_nothing():
     item = data_sets.read_object(tiny_surfels.dataset(), NAME)
     camera = jax.tree.map(lambda x: x[0], item.camera)
-    scene = surfel_renderer.encode(item.cloud)
+    scene = surfel_renderer.encode(None, item.cloud, config=CONFIG.model)
     for spacing in (3.0, 0.01):  # G-buffers of three pixels, and pictures of twice the reference's size
         other = dataclasses.replace(scene, spacing=spacing)
         assert gbuffers.make_view(other, camera, item.images[0], 1, LIGHT) is None

@@ -1,0 +1,61 @@
+"""Where an object is solid, as the network near points tells it: thin parts and outlines between points far apart.
+
+    encode   a few of the points, evenly spread      once per object
+    seen     opacity and depth of a small picture    once per view
+
+Discs of points tell where a surface is that they cover; a field that has learnt shapes tells where it ends.  The
+network is trained before the shader, whose input this is, and stays as it is.
+"""
+
+import dataclasses
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from spnr_jax.kernels import cameras, cloud_arrays
+from spnr_jax.kernels.records import Camera, PointCloud, Scene
+from spnr_jax.kernels.resizing import averaged, doubled
+from spnr_jax.kernels.thinning import farthest_points
+from spnr_jax.method.near_points import NearPointsNetwork
+from spnr_jax.model_config import NearPointsConfig, RenderOptions
+
+MOST_POINTS, MOST_PIXELS = 4096, 128  # of the cloud, and along a side of the picture
+LEAST_OPACITY = 1e-3  # that a depth is divided by
+
+
+def encode(variables: dict, cloud: PointCloud, *, config: NearPointsConfig) -> Scene:
+    """The scene of an unmasked cloud (unbatched, in the box), objects first on every array."""
+    count = len(cloud.positions)
+    few = farthest_points(np.asarray(cloud.positions), MOST_POINTS, 0) if count > MOST_POINTS else np.arange(count)
+    thinned = jax.tree.map(lambda x: np.asarray(x)[few], dataclasses.replace(cloud, normals=None))
+    return _encoded(variables, cloud_arrays.pad(thinned, cloud_arrays.bucket(len(few))), config=config)
+
+
+# this option halves the compilation of the U-Net and costs it no time
+@partial(jax.jit, static_argnames="config", compiler_options={"xla_cpu_use_fusion_emitters": False})
+def _encoded(variables: dict, cloud: PointCloud, *, config: NearPointsConfig) -> Scene:
+    return NearPointsNetwork(config).bind(variables).encode(jax.tree.map(lambda x: x[None], cloud))
+
+
+@partial(jax.jit, static_argnames="config")
+def seen(variables: dict, scene: Scene, camera: Camera, *, config: NearPointsConfig) -> Float[Array, "height width 2"]:
+    """Opacity, and depth along the camera's axis, of a view (camera unbatched, in the box)."""
+    halvings = max(int(np.ceil(np.log2(max(camera.height, camera.width) / MOST_PIXELS))), 0)
+    height, width = (-(-n // 2**halvings) for n in (camera.height, camera.width))
+    side = max(round(config.image_resolution / max(height, width)), 1)  # rays as close as in the training
+    whole = dataclasses.replace(camera, height=height << halvings, width=width << halvings)
+    view = cameras.resize(whole, side * height, side * width)
+    network = NearPointsNetwork(config).bind(variables)
+    drawn = averaged(network.render(scene, jax.tree.map(lambda x: x[None, None], view), RenderOptions()), side)
+    acc, depth = drawn.acc[0, 0], drawn.depth[0, 0]
+    rays = cameras.camera_rays(cameras.resize(whole, height, width))
+    _, far, _ = cameras.intersect_box(rays.origins, rays.directions)
+    along = -jnp.einsum("hwi,i->hw", rays.directions, jnp.asarray(camera.cam_to_world)[:, 2], precision="highest")
+    layers = jnp.stack([acc, (depth - (1 - acc) * far) * along], axis=-1)[None]
+    for _ in range(halvings):
+        layers = doubled(layers)
+    acc, depth = jnp.moveaxis(layers[0, : camera.height, : camera.width], -1, 0)
+    return jnp.stack([acc, depth / jnp.maximum(acc, LEAST_OPACITY)], axis=-1)
