@@ -12,7 +12,6 @@ import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache
-from types import UnionType
 from typing import Annotated, Any, ClassVar, Literal, get_args, get_origin, get_type_hints
 
 from spnr_jax.errors import UserError
@@ -75,8 +74,6 @@ def mismatch(value: Any, kind: Any) -> str:
     if origin is Annotated:
         base, *limits = inside
         return mismatch(value, base) or next((limit.words for limit in limits if not limit.holds(value)), "")
-    if origin is UnionType:  # of something and None
-        return "" if value is None else mismatch(value, inside[0])
     if origin is Literal:
         return "" if isinstance(value, str) and value in inside else " or ".join([", ".join(inside[:-1]), inside[-1]])
     if origin is tuple:
@@ -285,6 +282,15 @@ class NearPointsConfig(RayNetworkConfig):
         return not self.refiner_width
 
 
+SOLID = NearPointsConfig(
+    encoder=EncoderConfig(volume_resolution=32, base_width=8, num_stages=3, num_groups=1, point_norm="layer"),
+    sampling=SamplingConfig(num_coarse=16, num_fine=0, reach=1),
+    surface_cells=surface_grid(2048),
+    refiner_width=32,
+)
+"""Sizes of the package's network `small`."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class SurfelConfig(NetworkConfig):
     """Our network over the G-buffer of surfels (`method/surfel_renderer.py`)."""
@@ -297,8 +303,8 @@ class SurfelConfig(NetworkConfig):
     """Features of the U-Net's levels, at the resolution of the points first."""
     top: Count = 24
     """Features of the blocks that double the resolution."""
-    solid: NearPointsConfig | None = None
-    """The network of rays that tells, from a few of the points, where the object is solid; None: there is none."""
+    solid: bool = False
+    """Whether the network of rays `SOLID` tells where an object of few points is solid (`method/solid.py`)."""
 
     def __post_init__(self) -> None:
         check(self)

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from spnr_jax.baselines.baseline_presets import BASELINES
 from spnr_jax.config import LossConfig, OptimizerConfig, TrainConfig
 from spnr_jax.model_config import (
+    SOLID,
     EncoderConfig,
     NearPointsConfig,
     PaperConfig,
@@ -28,9 +29,6 @@ LONGER = OptimizerConfig(lr_generator=2e-3, warmup_steps=100, ema_decay=0.999)
 def near(num_samples: int) -> SamplingConfig:
     """So many samples of a ray, near points alone: at 8 a picture takes less time than the paper's network."""
     return SamplingConfig(num_coarse=num_samples, num_fine=0, reach=1)
-
-
-REFINED = NearPointsConfig(encoder=SMALL, sampling=near(16), surface_cells=surface_grid(2048), refiner_width=32)
 
 
 def abo() -> TrainConfig:
@@ -172,7 +170,7 @@ def plus_refined() -> TrainConfig:
     """
     return TrainConfig(
         preset="plus_refined",
-        model=REFINED,
+        model=SOLID,
         loss=dataclasses.replace(NEAR, mse_weight=4.0, opacity_weight=2.0),
         optimizer=LONGER,
         num_steps=20_000,
@@ -191,7 +189,7 @@ def surfels() -> TrainConfig:
     """
     return TrainConfig(
         preset="surfels",
-        model=SurfelConfig(solid=REFINED),
+        model=SurfelConfig(solid=True),
         loss=LossConfig(
             l1_weight=1.0, mse_weight=5.0, adversarial_weight=0.0, opacity_weight=1.0, opacity_l1_weight=0.3
         ),

@@ -1,8 +1,7 @@
 """A training's config as JSON: nested objects of its fields, in which `model.method` names the network."""
 
 import dataclasses
-from types import UnionType
-from typing import Any, get_args, get_origin
+from typing import Any
 
 from spnr_jax.config import TrainConfig
 from spnr_jax.errors import UserError
@@ -27,8 +26,6 @@ def from_dict(values: dict, kind: type = TrainConfig, path: str = "") -> Any:
     for name, expected in kinds.items():
         require(name in values, f"config field {path}{name} is missing")
         value = values[name]
-        if get_origin(expected) is UnionType and value is not None:
-            expected = get_args(expected)[0]
         if dataclasses.is_dataclass(expected):
             require(isinstance(value, dict), f"config field {path}{name} holds {value!r}, which is no JSON object")
             if expected is NetworkConfig:

@@ -18,7 +18,7 @@ from spnr_jax.devices.placement import by_all_devices
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.records import Camera, Key, Light, PointCloud, Rendering
 from spnr_jax.kernels.resizing import averaged
-from spnr_jax.model_config import NearPointsConfig, NetworkConfig, PaperConfig, RenderOptions, SurfelConfig
+from spnr_jax.model_config import SOLID, NearPointsConfig, NetworkConfig, PaperConfig, RenderOptions, SurfelConfig
 
 WHOLE_BLOCK = 1024  # rays that are sampled through all the box at once: about 80 MB at 128 samples
 
@@ -46,7 +46,7 @@ def init(key: Key, config: NetworkConfig) -> dict:
 
         sizes = cast(SurfelConfig, config)
         variables = surfel_renderer.init(key, sizes)
-        return variables | ({} if sizes.solid is None else {"batch_stats": init(key, sizes.solid)})
+        return variables | ({"batch_stats": init(key, SOLID)} if sizes.solid else {})
     return dict(network(config).init(key, *example_inputs(config)))
 
 

@@ -1,10 +1,11 @@
 """Where an object is solid, as the network near points tells it: thin parts and outlines between points far apart.
 
-    encode   a few of the points, evenly spread      once per object
+    encode   the points of a sparse cloud            once per object
     seen     opacity and depth of a small picture    once per view
 
-Discs of points tell where a surface is that they cover; a field that has learnt shapes tells where it ends.  The
-network is trained before the shader, whose input this is, and stays as it is.
+Discs of points tell where a surface is that they cover; a field that has learnt shapes tells where it ends.  Where
+points lie close the discs tell it better, so dense clouds do without.  The network is trained before the shader, whose
+input this is, and stays as it is.
 """
 
 import dataclasses
@@ -18,20 +19,21 @@ from jaxtyping import Array, Float
 from spnr_jax.kernels import cameras, cloud_arrays
 from spnr_jax.kernels.records import Camera, PointCloud, Scene
 from spnr_jax.kernels.resizing import averaged, doubled
-from spnr_jax.kernels.thinning import farthest_points
 from spnr_jax.method.near_points import NearPointsNetwork
 from spnr_jax.model_config import NearPointsConfig, RenderOptions
 
-MOST_POINTS, MOST_PIXELS = 4096, 128  # of the cloud, and along a side of the picture
+MOST_POINTS, MOST_PIXELS = 6000, 128  # of a sparse cloud, and along a side of the picture
 LEAST_OPACITY = 1e-3  # that a depth is divided by
 
 
-def encode(variables: dict, cloud: PointCloud, *, config: NearPointsConfig) -> Scene:
-    """The scene of an unmasked cloud (unbatched, in the box), objects first on every array."""
-    count = len(cloud.positions)
-    few = farthest_points(np.asarray(cloud.positions), MOST_POINTS, 0) if count > MOST_POINTS else np.arange(count)
-    thinned = jax.tree.map(lambda x: np.asarray(x)[few], dataclasses.replace(cloud, normals=None))
-    return _encoded(variables, cloud_arrays.pad(thinned, cloud_arrays.bucket(len(few))), config=config)
+def encode(variables: dict, cloud: PointCloud, *, config: NearPointsConfig) -> Scene | None:
+    """The scene of a cloud (unbatched, in the box), objects first on every array; None of a dense one."""
+    mask = np.asarray(cloud.mask)
+    count = int(mask.sum())
+    if count > MOST_POINTS:
+        return None
+    points = jax.tree.map(lambda x: np.asarray(x)[mask], dataclasses.replace(cloud, normals=None))
+    return _encoded(variables, cloud_arrays.pad(points, cloud_arrays.bucket(count)), config=config)
 
 
 # this option halves the compilation of the U-Net and costs it no time

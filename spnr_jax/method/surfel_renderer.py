@@ -24,7 +24,7 @@ from spnr_jax.kernels.compositing import WHITE
 from spnr_jax.kernels.records import AnyArray, Camera, Key, Light, PointCloud, Rendering, Scene, Surfels
 from spnr_jax.kernels.resizing import doubled, mean_of_squares
 from spnr_jax.method import solid
-from spnr_jax.model_config import SurfelConfig
+from spnr_jax.model_config import SOLID, SurfelConfig
 from spnr_jax.nn.shader import NUM_OUTPUTS, Shader, picture
 from spnr_jax.surfels import features, lighting, splatting
 from spnr_jax.surfels.estimate import estimate
@@ -78,9 +78,8 @@ def encode(variables: dict | None, cloud: PointCloud, *, config: SurfelConfig) -
     }
     surfels = estimate(**columns)
     known = None
-    if variables is not None and config.solid is not None:
-        whole = jax.tree.map(lambda x: np.asarray(x)[mask], cloud)
-        known = solid.encode(variables["batch_stats"], whole, config=config.solid)
+    if variables is not None and config.solid:
+        known = solid.encode(variables["batch_stats"], cloud, config=SOLID)
     spacing = float(np.median(surfels.spacing[surfels.mask]))
     return SurfelScene(surfels=jax.device_put(surfels), spacing=spacing, solid=known)
 
@@ -213,9 +212,9 @@ def known_of(
     variables: dict | None, scene: SurfelScene, camera: Camera, config: SurfelConfig
 ) -> Float[Array, "height width 2"] | None:
     """Opacity and depth of a view as the network of rays sees it, where there is one."""
-    if variables is None or scene.solid is None or config.solid is None:
+    if variables is None or scene.solid is None:
         return None
-    return solid.seen(variables["batch_stats"], scene.solid, camera, config=config.solid)
+    return solid.seen(variables["batch_stats"], scene.solid, camera, config=SOLID)
 
 
 def _in_window(picture: Float[Array, "h w features"], plan: Plan) -> Float[np.ndarray, "height width features"]:

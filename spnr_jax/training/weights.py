@@ -33,7 +33,6 @@ from spnr_jax.model_config import NetworkConfig, SurfelConfig
 UNREADABLE = (ValueError, LookupError, TypeError, ArithmeticError, RecursionError)
 MANY_POINTS = 6000  # chosen between 1,024, where rays score better at 512 pixels, and 16,384, where surfels do
 ADVICE = "write one with `spnr export RUN`"
-SOLID = "small"  # of the package's: tells where objects are solid
 SHIPPED = ("surfels", "small", "tiny")  # what the package holds; the first renders where no other is named
 
 
@@ -52,16 +51,9 @@ def shipped(name: str = SHIPPED[0]) -> Path:
 
 
 def solid_variables(config: NetworkConfig) -> dict:
-    """Weights of the network of rays that one over surfels asks (`method/solid.py`): the package's, or none.
-
-    ValueError if it asks another than the package has.
-    """
-    if not isinstance(config, SurfelConfig) or config.solid is None:
-        return {}
-    found = read_weights(shipped(SOLID))
-    if found.config.model != config.solid:
-        raise UserError(f"model.solid is another network than the package's {SOLID}; use its sizes")
-    return found.variables
+    """Weights of the network of rays that one over surfels asks (`method/solid.py`): the package's, or none."""
+    asks = isinstance(config, SurfelConfig) and config.solid
+    return read_weights(shipped("small")).variables if asks else {}
 
 
 def suited_to(num_points: int) -> str:

@@ -3,6 +3,7 @@
 import dataclasses
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from support.laws import close
@@ -10,7 +11,7 @@ from support.surfel_clouds import camera, cloud, shape
 
 from spnr_jax.kernels import cameras
 from spnr_jax.method import inference, solid, surfel_renderer
-from spnr_jax.model_config import EncoderConfig, NearPointsConfig, RenderOptions, SamplingConfig, SurfelConfig
+from spnr_jax.model_config import SOLID, RenderOptions, SurfelConfig
 from spnr_jax.nn.shader import NUM_OUTPUTS, picture
 from spnr_jax.surfels.features import NUM_MAPS
 from spnr_jax.surfels.lighting import room_light
@@ -24,6 +25,10 @@ def trained():
     return weights.read_trained("small")
 
 
+def test_its_sizes_are_those_of_the_package_s_network(trained):
+    assert trained.config.model == SOLID
+
+
 @pytest.fixture(scope="module")
 def points():
     return cloud(shape("sphere", NUM_POINTS)[0])
@@ -31,21 +36,21 @@ def points():
 
 @pytest.fixture(scope="module")
 def scene(trained, points):
-    return solid.encode(trained.variables, points, config=trained.config.model)
+    return solid.encode(trained.variables, points, config=SOLID)
 
 
 def test_a_small_picture_is_the_network_s_own(trained, scene):
     view = camera(solid.MOST_PIXELS)
-    found = solid.seen(trained.variables, scene, view, config=trained.config.model)
+    found = solid.seen(trained.variables, scene, view, config=SOLID)
     batched = jax.tree.map(lambda x: x[None, None], view)
-    twin = inference.render(trained.variables, scene, batched, config=trained.config.model, options=RenderOptions())
+    twin = inference.render(trained.variables, scene, batched, config=SOLID, options=RenderOptions())
     close(found[..., 0], twin.acc[0, 0], atol=1e-5)
 
 
 @pytest.mark.parametrize("size", [(128, 128), (200, 150), (64, 96)])
 def test_it_lies_where_the_object_is(trained, scene, size):
     view = cameras.resize(camera(128), *size)
-    found = np.asarray(solid.seen(trained.variables, scene, view, config=trained.config.model))
+    found = np.asarray(solid.seen(trained.variables, scene, view, config=SOLID))
     assert found.shape == (*size, 2)
     rays = jax.tree.map(np.float64, cameras.camera_rays(view))
     along = -np.sum(rays.origins * rays.directions, axis=-1)
@@ -58,28 +63,15 @@ def test_it_lies_where_the_object_is(trained, scene, size):
     assert np.abs(found[..., 1] - distance * axis)[inside].max() < 0.1
 
 
-def test_more_points_than_it_takes_are_thinned(trained, monkeypatch):
-    many = cloud(shape("sphere", 2 * NUM_POINTS)[0])
-    monkeypatch.setattr(solid, "MOST_POINTS", NUM_POINTS)
-    found = solid.encode(trained.variables, many, config=trained.config.model)
-    assert found.surface.points.shape[1] <= 1024 + 1  # a bucket, and what is nowhere
+def test_dense_clouds_do_without(trained):
+    many = cloud(shape("sphere", solid.MOST_POINTS + 1)[0])
+    assert solid.encode(trained.variables, many, config=SOLID) is None
 
 
-def test_the_picture_of_the_renderer_asks_it():
-    config = SurfelConfig(
-        widths=(4, 4),
-        top=4,
-        solid=NearPointsConfig(
-            image_resolution=32,
-            encoder=EncoderConfig(
-                point_widths=(4,), point_features=4, volume_resolution=4, base_width=4, num_stages=1, num_groups=1
-            ),
-            sampling=SamplingConfig(num_coarse=4, num_fine=0, reach=1),
-            field_width=4,
-        ),
-    )
-    variables = inference.init(jax.random.key(0), config)
-    points = cloud(shape("sphere", 200)[0])
+def test_the_renderer_asks_it_for_its_picture(trained):
+    config = SurfelConfig(widths=(4, 4), top=4, solid=True)
+    variables = surfel_renderer.init(jax.random.key(0), config) | {"batch_stats": trained.variables}
+    points = cloud(shape("sphere", NUM_POINTS)[0])
     scene = surfel_renderer.encode(variables, points, config=config)
     view = dataclasses.replace(camera(32), width=40)  # the window reaches beyond the picture
     with_rays = surfel_renderer.render(variables, scene, view, room_light(), config=config)
@@ -98,7 +90,7 @@ def test_rays_and_discs_share_the_opacity():
     def opacity(trust, changed):
         outputs = np.zeros((1, 4, 4, NUM_OUTPUTS), np.float32)
         outputs[..., 19] = trust
-        return np.asarray(picture(outputs, changed, ambient, 0)[1])
+        return np.asarray(picture(*map(jnp.asarray, (outputs, changed, ambient)), 0)[1])
 
     other = maps.copy()
     other[..., 17] = rng.random((1, 4, 4))
