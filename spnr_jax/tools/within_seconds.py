@@ -67,7 +67,7 @@ TIMING = Timing()
 
 
 def choose(options: Render, model: Model, num_points: int, timing: Timing = TIMING) -> tuple[Render, str]:
-    """The options with the level and size that keep to `options.seconds`, and a line that says what was chosen."""
+    """The options with the level and size that keep to their seconds instead, and a line that says what was chosen."""
     pictures = max(options.views + (options.frames if options.turntable != "none" else 0), 1)
     known = _Known(model, num_points, timing)
     for level in levels(model.config, options.resolution):
@@ -77,7 +77,7 @@ def choose(options: Render, model: Model, num_points: int, timing: Timing = TIMI
     kept = "" if seconds <= options.seconds else "; nothing that is known here keeps to it, this comes nearest"
     line = f"--seconds {options.seconds:g}: {level.quality} at {level.pixels} px, "
     line += f"about {seconds:.2g} s for {pictures} pictures{kept}"
-    return replace(options, quality=level.quality, resolution=level.pixels), line
+    return replace(options, quality=level.quality, resolution=level.pixels, seconds=None), line
 
 
 def levels(config: NetworkConfig, resolution: int | None) -> list[Level]:

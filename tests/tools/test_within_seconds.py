@@ -2,18 +2,23 @@
 
 import dataclasses
 import json
+from pathlib import Path
 from types import SimpleNamespace
 
+import jax
 import numpy as np
 import pytest
 from PIL import Image
-from support import tiny_dataset, tiny_model, tiny_surfels
+from support import tiny_model, tiny_surfels
 
+from spnr_jax.method import inference
 from spnr_jax.method.model import Model
 from spnr_jax.model_config import SurfelConfig
 from spnr_jax.tools import catalogue, pictures, within_seconds
 from spnr_jax.tools.render_command import Render
 from spnr_jax.tools.within_seconds import Level, Timing, choose, levels
+from spnr_jax.training import weights
+from spnr_jax.training.weights import Trained
 
 CONFIG = SurfelConfig(image_resolution=512)
 PICTURES = 10  # 4 stills, 6 frames
@@ -28,7 +33,7 @@ class Slow(Model):
         object.__setattr__(self, "drawn", [])
         return self
 
-    def encode(self, cloud):
+    def encode(self, cloud):  # the volume is its number of points
         return len(cloud.positions)
 
     def camera(self, volume, resolution):
@@ -48,7 +53,7 @@ def slow(weights=0.0):
 
 
 def asked(seconds, **options):
-    return Render(cloud=tiny_dataset.run() / "x.ply", seconds=seconds, views=4, frames=6, **options)
+    return Render(cloud=Path("chair.ply"), seconds=seconds, views=4, frames=6, **options)
 
 
 def chosen(model, folder, seconds, points=1000, **options):
@@ -113,7 +118,9 @@ def test_the_command_draws_as_was_chosen_and_says_it(tmp_path, monkeypatch):
     cloud = tmp_path / "chair.xyz"
     np.savetxt(cloud, np.random.default_rng(0).uniform(-1, 1, (40, 3)))
     one = {"turntable": "none", "outputs": ("image",), "views": 1, "up": "y"}
-    command = Render(cloud=cloud, out=tmp_path / "out", run=tiny_surfels.run(), seconds=1e-9, **one)
+    untrained = inference.init(jax.random.key(0), tiny_surfels.CONFIG.model)
+    weights.write_weights(tmp_path / "w.npz", Trained(config=tiny_surfels.CONFIG, variables=untrained, steps=0))
+    command = Render(cloud=cloud, out=tmp_path / "out", run=tmp_path / "w.npz", seconds=1e-9, **one)
     lines = list(pictures.render_file(command, lambda line: None))
     level = levels(tiny_surfels.CONFIG.model, None)[-1]
     assert sum(line.startswith(f"--seconds 1e-09: {level.quality} at {level.pixels} px") for line in lines) == 1
