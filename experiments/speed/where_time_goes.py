@@ -85,9 +85,10 @@ def main(options: WhereTimeGoes) -> None:
     results_folder.write(options.out, found, tables, [f"{sizes}; {found['processor']}, load {found['load']}."])
 
 
-def program(function: Callable, *arguments: Any) -> Program:
-    """The function compiled for these arguments."""
-    compiled = jax.jit(function).lower(*arguments).compile()
+def program(function: Callable, *arguments: Any, **static: Any) -> Program:
+    """The function compiled for these arguments; one that is jitted keeps its compiler's options."""
+    jitted: Any = function if hasattr(function, "lower") else jax.jit(function)
+    compiled = jitted.lower(*arguments, **static).compile()
     cost: Any = compiled.cost_analysis() or {}
     return Program(lambda: compiled(*arguments), cost.get("flops"))
 
@@ -146,7 +147,7 @@ def frame_programs(options: WhereTimeGoes) -> dict[str, Program]:
     return {
         "whole frame": Program(whole, None),
         "entries counted": program(splatting.count, scene.surfels, small),
-        "entries made and sorted": program(partial(splatting.entries, total=total), scene.surfels, small),
+        "entries made and sorted": program(splatting.entries, scene.surfels, small, total=total),
         "blended, lit, put before the network": program(look, found, scene.surfels, light, small),
         "network": program(lambda v, s: shader.apply(v, s[None], doublings), variables, seen),
         "light on materials": program(lambda o, m, a: picture(o, m[None], a[None], doublings), outputs, maps, ambient),

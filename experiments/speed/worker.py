@@ -6,19 +6,17 @@ passed while it waited (a few ms at most with the defaults of OpenMP and XLA, so
 of the turns; what making the function took (a compiler takes more than the function) is given back before.
 """
 
-import gc
 import json
 import os
-import resource
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from pathlib import Path
 from typing import IO, Any
 
+from experiments.comparison.peak_memory import forget_peak, peak_mb
 from spnr_jax.devices import allocator
 from spnr_jax.errors import UserError
 
@@ -104,21 +102,3 @@ def turn(run: Callable[[], object], seconds: float) -> list[float]:
         run()
         taken.append(round(1e3 * (time.perf_counter() - start), 3))
     return taken
-
-
-def forget_peak() -> None:
-    """Gives unused memory back and has the kernel count the peak from here on, where it can (Linux)."""
-    gc.collect()
-    allocator.give_back()
-    counter = Path("/proc/self/clear_refs")
-    if counter.exists():
-        counter.write_text("5")
-
-
-def peak_mb() -> int:
-    """Largest resident memory since `forget_peak`, in MB of 2^20 bytes; since the start where that does nothing."""
-    status = Path("/proc/self/status")
-    if status.exists():
-        line = next(line for line in status.read_text().splitlines() if line.startswith("VmHWM"))
-        return int(line.split()[1]) // 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024

@@ -1,24 +1,23 @@
-"""What speed costs in quality: a trained network rendered in many ways, and which of them nothing beats.
+"""What speed costs in quality: networks asked for pictures in many ways, and which of these nothing beats.
 
-    python -m experiments.studies.speed_accuracy DATA RUN [RUN ...] [--out runs/speed_accuracy] [--objects 24]
+    python -m experiments.studies.speed_accuracy DATA [surfels small RUN ...] [--sizes 128 512] [--out OUT]
 
-Every run is rendered as it was trained, and with other sample counts, with samples near the points alone, with fewer
-rays, in bfloat16 and from other numbers of points.  Networks that see the nearest points have samples nowhere else, and
-as many rays as pixels.  Runs of other volume resolutions or widths add their own points.
-Keeps every setting in a file of its own (an interrupted call goes on); writes the table and front.png: PSNR, SSIM and
-FLIP against milliseconds a view, and PSNR against memory.
+Each network draws test objects at every level of `--quality`, from other numbers of points, and in pictures of fewer
+pixels that are enlarged.  Networks of rays also draw with other samples, in all of the box and near the points, and in
+bfloat16.  `draft` of the network over surfels is discs and light alone.  A size that a network has not learnt is left
+out.  Keeps every setting in a file of its own (an interrupted call goes on); writes the tables and front.png.
 
-ms a view   median over objects of the fastest of several renderings of one view, the volume encoded before
-ms encode   the same for the volume
-MB          temporary memory of the compiled rendering
-front       settings that no other beats in both PSNR and ms a view; its knee lies farthest above the line from its
-            cheapest to its best, PSNR against the logarithm of the time
+ms a view   median over objects of the fastest of several drawings of one view, the cloud encoded before
+s to encode the same for a cloud
+MB          of memory at most above what was held before the picture, the largest over objects
+front       settings of a size that no other beats in both PSNR and ms a view; its knee lies farthest above the line
+            from its cheapest to its best, PSNR against the logarithm of the time
 """
 
 import dataclasses
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
@@ -26,141 +25,197 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import tyro
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 
 from experiments import entry_point
-from experiments.comparison import figures, results_folder
+from experiments.comparison import results_folder
+from experiments.comparison.peak_memory import forget_peak, peak_mb
 from experiments.comparison.result_tables import Table, number, text
 from experiments.comparison.trained_networks import test_objects
+from experiments.studies.sharpness import told, view_of
+from experiments.studies.speed_accuracy_plot import plot
 from spnr_jax import cli
-from spnr_jax.config import TrainConfig
 from spnr_jax.devices import machine
 from spnr_jax.formats import data_sets
-from spnr_jax.method import inference
-from spnr_jax.model_config import PaperConfig, RayNetworkConfig, SamplingConfig
-from spnr_jax.scoring import evaluation
-from spnr_jax.training import checkpoint, optimisation
+from spnr_jax.kernels import cameras, metrics
+from spnr_jax.kernels.records import Camera
+from spnr_jax.method.model import Model, Quality, Volume
+from spnr_jax.model_config import NetworkConfig, RayNetworkConfig, SurfelConfig
+from spnr_jax.scoring.flip import flip
+from spnr_jax.training.weights import load
 
 REPEATS = 5
 TIMED_OBJECTS = 8
-MARKERS = "osD^v<>P"  # of runs
-GROUPS = {  # of settings, as the plot colours them
-    "trained": "#1d2330",
-    "samples": "#2457d6",
-    "near points": "#2f9e44",
-    "rays": "#d9480f",
-    "bfloat16": "#9c36b5",
-    "points": "#868e96",
-}
+SHARES = (0.75, 0.5, 0.25)  # of the pixels along a side that are drawn; the picture is enlarged from there
 
 
 @dataclass(frozen=True, kw_only=True)
 class SpeedAccuracy:
-    """Render trained networks in many ways and draw quality against cost."""
+    """Draw with trained networks in many ways, and show quality against cost."""
 
     data: tyro.conf.Positional[Path]
-    """Folder of the data set; its test objects are rendered."""
-    runs: tyro.conf.Positional[tuple[Path, ...]]
-    """Run folders."""
+    """Folder of the data set; its test objects are drawn."""
+    runs: tyro.conf.Positional[tuple[str, ...]] = ("surfels", "small")
+    """Networks: of the package, run folders (the paper's, published methods) or files of weights."""
     out: Path = Path("runs/speed_accuracy")
-    """Folder of results.json, table.md and front.png."""
-    objects: int = 24
+    """Folder of the results."""
+    sizes: tuple[int, ...] = (128, 512)
+    """Pixels along each side of the pictures that are looked at: those of the data set, or a whole share of them."""
+    counts: tuple[int, ...] = (16384, 1024, 4096)
+    """Points of an object, the first of its file; all settings with the first number, the levels with the others."""
+    objects: int = 16
     """Test objects, evenly out of the split."""
+    views: int = 2
+    """Views of an object."""
     quick: bool = False
-    """A few settings of the first run, for a test."""
+    """A few settings of each network, for a test."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Setting:
-    """A way to render a run."""
+    """A way to ask a network for a picture; `share` of its pixels along a side are drawn."""
 
     group: str
     name: str
-    config: TrainConfig
+    config: NetworkConfig
+    points: int
+    quality: Quality = "best"
+    share: float | int = 1
 
 
-def settings(config: TrainConfig) -> list[Setting]:
-    """Every way to render a network, the trained one first."""
-    model = config.model
-    assert isinstance(model, RayNetworkConfig)
+@dataclass
+class Drawn:
+    """What was measured of one setting, object by object."""
 
-    def variant(group: str, name: str, points: int = config.test_points, **fields) -> Setting:
-        changed = dataclasses.replace(config, test_points=points, model=dataclasses.replace(model, **fields))
-        return Setting(group=group, name=name, config=changed)
+    scores: list[dict[str, float]] = field(default_factory=list)
+    view_ms: list[float] = field(default_factory=list)
+    encode_s: list[float] = field(default_factory=list)
+    mb: list[int] = field(default_factory=list)
 
-    def samples(coarse: int, fine: int = 0, reach: int = 0) -> SamplingConfig:
-        return dataclasses.replace(model.sampling, num_coarse=coarse, num_fine=fine, reach=reach)
 
-    total = model.sampling.num_coarse + model.sampling.num_fine
+def settings(config: NetworkConfig, counts: Sequence[int]) -> list[Setting]:
+    """Every way to ask a network, its best level first; of all but the first number of points the levels alone."""
+    levels: tuple[Quality, ...] = ("best",)
+    if isinstance(config, SurfelConfig):
+        levels = ("best", "draft")
+    elif isinstance(config, RayNetworkConfig):
+        levels = ("best", "balanced", "draft", "trained")
+    common = {"config": config, "points": counts[0]}
+    ways = [Setting(group="level", name=level, quality=level, **common) for level in levels]
+    if config.any_size:
+        enlarged = {"group": "fewer pixels", **common}
+        ways += [Setting(name=f"best, {share:g} of the size", share=share, **enlarged) for share in SHARES]
+        if "draft" in levels:
+            ways.append(Setting(name="draft, 0.5 of the size", quality="draft", share=0.5, **enlarged))
+    if isinstance(config, RayNetworkConfig):
+        ways += _of_rays(config, counts[0])
+    for count in counts[1:]:
+        ways += [
+            Setting(group="points", name=f"{level}, {count:,} points", config=config, points=count, quality=level)
+            for level in levels
+        ]
+    return ways
+
+
+def _of_rays(config: RayNetworkConfig, points: int) -> list[Setting]:
+    """Other samples along a ray, each drawn as the network was trained but for these, and bfloat16."""
+    total, reach = config.sampling.num_coarse + config.sampling.num_fine, config.sampling.reach
     halves = [max(total // k, 2) for k in (1, 2, 4)]
-    if model.sampling.reach:
-        anywhere, near = [], [(n, model.sampling.reach) for n in (2 * total, 3 * total // 4, *halves[1:])]
+    if reach:
+        ways = [("near points", f"{n} near points", (n, 0, reach)) for n in (2 * total, 3 * total // 4, *halves[1:])]
     else:
-        anywhere = [(n // 2, n // 2) for n in (2 * total, *halves[1:])] + [(n, 0) for n in halves[:2]]
-        near = [(n, reach) for reach in (1, 2, 3) for n in (*halves, total // 8 + 1)]
-    size = model.render_resolution if isinstance(model, PaperConfig) and model.upsamples else 0
-    ways = [
-        variant("trained", "as trained"),
-        *(variant("samples", f"{coarse} + {fine}", sampling=samples(coarse, fine)) for coarse, fine in anywhere),
-        *(variant("near points", f"{n} within {reach}", sampling=samples(n, reach=reach)) for n, reach in near),
-        *(variant("rays", f"{n} x {n} rays", render_resolution=n) for n in (size // 2, size * 3 // 4) if size),
-        variant("bfloat16", "bfloat16", precision="bfloat16"),
-        *(variant("points", f"{n} points", points=n) for n in (256, 512, 2048, 4096)),
+        ways = [("samples", f"{n // 2} + {n // 2} in the box", (n // 2, n // 2, 0)) for n in (2 * total, *halves[1:])]
+        ways += [("near points", f"{n} within {r} voxels", (n, 0, r)) for r in (1, 2, 3) for n in halves]
+
+    def made(group: str, name: str, **changed: object) -> Setting:
+        other = dataclasses.replace(config, **changed)
+        return Setting(group=group, name=name, config=other, points=points, quality="trained")
+
+    names = ("num_coarse", "num_fine", "reach")
+    found = [
+        made(group, name, sampling=dataclasses.replace(config.sampling, **dict(zip(names, values, strict=True))))
+        for group, name, values in ways
     ]
-    return list({way.name: way for way in ways}.values())  # small counts give one setting twice
+    found.append(made("bfloat16", "bfloat16", precision="bfloat16"))
+    return list({way.name: way for way in found}.values())  # small counts give one setting twice
 
 
 def main(options: SpeedAccuracy) -> None:
-    """Measures the settings that are not measured, then writes the table and the plot."""
+    """Measures the settings that are not measured, then writes the tables and the plot."""
     cli.set_up_jax()
     dataset = data_sets.open_dataset(options.data)
     names = test_objects(dataset, options.objects)
-    results_folder.claim(options.out, "results", {"objects": list(names)}, dataset)
-    todo = [(run, setting) for run in options.runs for setting in settings(checkpoint.read_config(run))]
-    todo = todo[:: len(todo) // 4] if options.quick else todo
-    rows, loaded = [], dict[Path, dict]()
-
-    def measured(run: Path, setting: Setting) -> dict:
-        if run not in loaded:
-            loaded[run] = optimisation.averaged_variables(checkpoint.load_run(run)[1])
-        found = measure(loaded[run], setting.config, dataset, names)
-        print(f"{run.name}: {setting.name}: {found['psnr']:.2f} dB, {found['ms_view']:.2f} ms", flush=True)
-        return {"run": str(run), "group": setting.group, "name": setting.name, **found}
-
-    for count, (run, setting) in enumerate(todo):
-        place = options.out / "settings" / f"{options.runs.index(run)} {setting.name}.json"
-        rows.append(results_folder.kept(place, partial(measured, run, setting)))
-        print(f"{count + 1} of {len(todo)}", flush=True)
-    chosen = front(rows)
-    found = {"hardware": machine.hardware(), "date": time.strftime("%Y-%m-%d"), "objects": len(names), "rows": rows}
-    best = f"The knee of the front is {rows[knee(rows, chosen)]['name']}."
-    results_folder.write(options.out, found, [table(rows, chosen)], [best], {"front.png": plot(rows, chosen)})
+    asked = {"objects": list(names), "views": options.views, "runs": list(options.runs)}
+    results_folder.claim(options.out, "speed_accuracy", asked, dataset)
+    rows = []
+    for number_of_run, run in enumerate(options.runs):
+        model = load(run)
+        ways = settings(model.config, options.counts)
+        for size in options.sizes:
+            if not model.config.any_size and size != model.config.image_resolution:
+                print(f"{run}: it has not learnt pictures of {size} pixels", flush=True)
+                continue
+            for way in ways[:: max(len(ways) // 3, 1)] if options.quick else ways:
+                make = partial(measure, model, way, dataset, names, size, options.views)
+                name = f"{number_of_run} {size} {way.points} {way.name}.json"
+                found = results_folder.kept(options.out / "settings" / name, make)
+                rows.append({"run": run, "size": size, "group": way.group, "name": way.name, **found})
+                print(f"{run}, {size} px, {way.name}: {found['psnr']:.2f} dB, {found['ms_view']:.1f} ms", flush=True)
+    found = {"hardware": machine.hardware(), "load": machine.load(), "date": time.strftime("%Y-%m-%d"), "rows": rows}
+    tables = [made for size in options.sizes if (of := [r for r in rows if r["size"] == size]) for made in _both(of)]
+    fronts = [[r for r in rows if r["size"] == size] for size in options.sizes]
+    picture = plot([(of, front(of), knee(of, front(of))) for of in fronts if of])
+    note = f"{len(names)} objects x {options.views} views, {options.counts[0]:,} points where nothing else is said."
+    notes = [note, f"{found['hardware']}, load {found['load']}, {found['date']}."]
+    results_folder.write(options.out, found, tables, notes, {"front.png": picture})
 
 
 def measure(
-    variables: dict, config: TrainConfig, dataset: data_sets.Dataset, names: tuple[str, ...]
+    model: Model, way: Setting, dataset: data_sets.Dataset, names: Sequence[str], size: int, views: int
 ) -> dict[str, float]:
-    """Mean scores over the objects' images, times and memory of one setting."""
-    show = {"ours": evaluation.network(variables, config)}
-    scores = [result.scores["ours"] for result in evaluation.evaluate_objects(show, config, dataset, names)]
-    means = {m: float(np.mean(np.concatenate([s[m] for s in scores]))) for m in ("psnr", "ssim", "flip", "iou")}
-    model, encodes, views = config.model, [], []
-    for name in names[:TIMED_OBJECTS]:
+    """Mean scores over the objects' pictures, times and memory of one setting at one size."""
+    model, found = dataclasses.replace(model, config=way.config), Drawn()
+    for number_of_object, name in enumerate(names):
         item = data_sets.read_object(dataset, name)
-        cloud = jax.tree.map(lambda x: jnp.asarray(x)[None], data_sets.test_cloud(item, config))
-        camera = jax.tree.map(lambda x: jnp.asarray(x)[None, :1], item.camera)
-        encodes.append(fastest(lambda c=cloud: inference.jitted_encode(variables, c, config=model)))
-        scene = inference.jitted_encode(variables, cloud, config=model)
-        side = inference.rays_per_side(model, item.camera.width)
-        options = dataclasses.replace(inference.trained(model), rays_per_side=side)
-        render = partial(inference.jitted_render, config=model, options=options)
-        views.append(fastest(partial(render, variables, scene, camera)))
-    analysis = inference.jitted_render.lower(variables, scene, camera, **render.keywords).compile().memory_analysis()
-    memory = analysis.temp_size_in_bytes / 2**20 if analysis else float("nan")
-    times = {"ms_view": float(np.median(views)), "ms_encode": float(np.median(encodes))}
-    return {name: round(value, 4) for name, value in (means | times | {"temporary_mb": memory}).items()}
+        cloud = told(jax.tree.map(lambda x: x[: way.points], item.cloud), normals=False)
+        volume = model.encode(cloud)
+        pairs = [view_of(item, view, size) for view in range(min(views, len(item.images)))]
+        drawn = max(round(way.share * size / 4) * 4, 16)
+        asked = [cameras.resize(camera, drawn, drawn) if drawn != size else camera for camera, _ in pairs]
+        for rendering, (_, reference) in zip(model.render_each(volume, asked, way.quality), pairs, strict=True):
+            found.scores.append(_scores(np.asarray(rendering.image), np.asarray(rendering.acc), reference))
+        if number_of_object < TIMED_OBJECTS:
+            found.encode_s.append(fastest(lambda c=cloud: model.encode(c).scene) / 1e3)
+            _time_view(found, model, volume, asked[0], way.quality)
+    means = {name: float(np.mean([of[name] for of in found.scores])) for name in found.scores[0]}
+    costs = {"ms_view": float(np.median(found.view_ms)), "s_encode": float(np.median(found.encode_s))}
+    return {name: round(value, 4) for name, value in (means | costs | {"mb": max(found.mb)}).items()}
+
+
+def _scores(image: np.ndarray, opacity: np.ndarray, reference: np.ndarray) -> dict[str, float]:
+    """Of a picture, enlarged to its reference (RGBA) where it is smaller."""
+    shape = reference.shape[:2]
+    image = np.clip(np.asarray(jax.image.resize(image, (*shape, 3), "cubic")), 0, 1)
+    opacity = np.asarray(jax.image.resize(opacity, shape, "linear"))
+    white = reference[..., :3] * reference[..., 3:] + 1 - reference[..., 3:]
+    return {
+        "psnr": float(metrics.psnr(jnp.asarray(image), jnp.asarray(white))),
+        "ssim": float(metrics.ssim(jnp.asarray(image), jnp.asarray(white))),
+        "flip": float(flip(jnp.asarray(image), jnp.asarray(white))),
+        "iou": float(metrics.opacity_iou(jnp.asarray(opacity), jnp.asarray(reference[..., 3]))),
+    }
+
+
+def _time_view(found: Drawn, model: Model, volume: Volume, camera: Camera, quality: Quality) -> None:
+    """Adds time and memory of one view, which was drawn before."""
+
+    def draw() -> jax.Array:
+        return model.render(volume, camera, quality).image
+
+    found.view_ms.append(fastest(draw))
+    forget_peak()
+    before = peak_mb()
+    jax.block_until_ready(draw())
+    found.mb.append(peak_mb() - before)
 
 
 def fastest(work: Callable) -> float:
@@ -174,7 +229,7 @@ def fastest(work: Callable) -> float:
     return min(times)
 
 
-def front(rows: list[dict]) -> list[int]:
+def front(rows: Sequence[dict]) -> list[int]:
     """Rows that no other beats in PSNR and time, cheapest first."""
     order = sorted(range(len(rows)), key=lambda i: (rows[i]["ms_view"], -rows[i]["psnr"]))
     chosen: list[int] = []
@@ -184,7 +239,7 @@ def front(rows: list[dict]) -> list[int]:
     return chosen
 
 
-def knee(rows: list[dict], chosen: list[int]) -> int:
+def knee(rows: Sequence[dict], chosen: Sequence[int]) -> int:
     """The row of the front that lies farthest above the line from its cheapest to its best."""
     x = np.log([rows[i]["ms_view"] for i in chosen])
     y = np.array([rows[i]["psnr"] for i in chosen])
@@ -192,52 +247,38 @@ def knee(rows: list[dict], chosen: list[int]) -> int:
     return chosen[int(np.argmax(y - x))]
 
 
-def table(rows: list[dict], chosen: list[int]) -> Table:
-    """Settings of the front are marked, and differences are to the run as trained."""
-    heads = ("setting", "PSNR, dB", "SSIM", "FLIP", "IoU", "ms a view", "ms encode", "MB")
-    decimals = {"ssim": 3, "flip": 3, "iou": 3, "ms_view": 1, "ms_encode": 1, "temporary_mb": 0}
+def _both(rows: Sequence[dict]) -> tuple[Table, Table]:
+    return table(rows, front(rows)), steps(rows, front(rows))
+
+
+def table(rows: Sequence[dict], chosen: Sequence[int]) -> Table:
+    """Settings of one size; those of the front are marked, and differences are to the network's best level."""
+    heads = ("setting", "PSNR, dB", "SSIM", "FLIP", "IoU", "ms a view", "s to encode", "MB")
+    decimals = {"ssim": 3, "flip": 3, "iou": 3, "ms_view": 1, "s_encode": 2, "mb": 0}
     made = []
     for i, row in enumerate(rows):
-        base = next((r for r in rows if r["run"] == row["run"] and r["group"] == "trained"), row)
-        mark = " (front, knee)" if chosen and i == knee(rows, chosen) else " (front)" if i in chosen else ""
+        base = next(r for r in rows if r["run"] == row["run"])
+        mark = " (front, knee)" if i == knee(rows, chosen) else " (front)" if i in chosen else ""
         change = () if row is base else (f"({row['psnr'] - base['psnr']:+.2f})",)
         cells = [text(row["name"] + mark), number(row["psnr"], 2, more=change)]
         made.append((Path(row["run"]).name, (*cells, *(number(row[name], n) for name, n in decimals.items()))))
-    return Table(title="Quality and cost of each setting", heads=heads, rows=tuple(made))
+    return Table(title=f"Quality and cost at {rows[0]['size']} px", heads=heads, rows=tuple(made))
 
 
-@figures.drawing
-def plot(rows: list[dict], chosen: list[int]) -> Figure:
-    """Quality against cost: colours are groups of settings, markers are runs."""
-    figure = Figure(figsize=(14, 3.9))
-    labels = {"psnr": "PSNR, dB", "ssim": "SSIM", "flip": "FLIP (lower is better)"}
-    panels = [("ms_view", "psnr"), ("ms_view", "ssim"), ("ms_view", "flip"), ("temporary_mb", "psnr")]
-    for axes, (x, y) in zip(figure.subplots(1, 4), panels, strict=True):
-        scatter(axes, rows, x, y)
-        axes.set_xscale("log")
-        axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-        axes.xaxis.set_major_formatter(ScalarFormatter())
-        axes.xaxis.set_minor_formatter(NullFormatter())
-        axes.set_xlabel("ms a view" if x == "ms_view" else "MB of temporary memory")
-        axes.set_ylabel(labels[y])
-    first = figure.axes[0]
-    first.plot([rows[i]["ms_view"] for i in chosen], [rows[i]["psnr"] for i in chosen], color="#adb5bd", zorder=2)
-    best = rows[knee(rows, chosen)]
-    place = (best["ms_view"], best["psnr"])
-    first.annotate(f"knee: {best['name']}", place, xytext=(12, -24), textcoords="offset points")
-    figure.legend(*first.get_legend_handles_labels(), loc="outside lower center", ncols=8)
-    return figure
-
-
-def scatter(axes: Axes, rows: list[dict], x: str, y: str) -> None:
-    """A point for each setting."""
-    runs = list(dict.fromkeys(row["run"] for row in rows))
-    for group, color in GROUPS.items():
-        for marker, run in zip(MARKERS, runs, strict=False):
-            shown = [row for row in rows if (row["group"], row["run"]) == (group, run)]
-            label = group if len(runs) == 1 else f"{Path(run).name}, {group}"
-            x_values, y_values = ([row[name] for row in shown] for name in (x, y))
-            axes.scatter(x_values, y_values, s=26, c=color, marker=marker, zorder=3, label=label)
+def steps(rows: Sequence[dict], chosen: Sequence[int]) -> Table:
+    """The front from its cheapest on: what each step costs and gives."""
+    made = []
+    for before, i in zip((None, *chosen), chosen, strict=False):
+        row = rows[i]
+        cells = [text(row["name"]), number(row["psnr"], 2), number(row["ms_view"], 1)]
+        if before is not None:
+            last = rows[before]
+            cells.append(number(row["ms_view"] / last["ms_view"], 2))
+            differences = {"psnr": 2, "flip": 3, "iou": 3}
+            cells += [number(row[name] - last[name], n, sign="+") for name, n in differences.items()]
+        made.append((Path(row["run"]).name, tuple(cells)))
+    heads = ("setting", "PSNR, dB", "ms a view", "times as long as the row before", "PSNR", "FLIP", "IoU")
+    return Table(title=f"The front at {rows[0]['size']} px, step by step", heads=heads, rows=tuple(made))
 
 
 if __name__ == "__main__":

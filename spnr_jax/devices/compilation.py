@@ -5,10 +5,15 @@ from pathlib import Path
 SHORTEST = 0.1  # seconds of compilation from which on a program is kept
 
 
+def folder() -> Path:
+    """Where this package keeps what can be made again, of this user."""
+    return Path.home() / ".cache" / "spnr_jax"
+
+
 def keep_programs() -> None:
     """Lets a second run skip XLA's compilation; JAX_COMPILATION_CACHE_DIR moves the cache."""
     import jax
 
     if jax.config.values["jax_compilation_cache_dir"] is None:
-        jax.config.update("jax_compilation_cache_dir", str(Path.home() / ".cache" / "spnr_jax"))
+        jax.config.update("jax_compilation_cache_dir", str(folder()))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", SHORTEST)

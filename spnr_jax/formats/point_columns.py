@@ -20,8 +20,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from spnr_jax.errors import UserError
-from spnr_jax.formats.splats import NAMES as SPLAT_NAMES
-from spnr_jax.formats.splats import points_of_splats
+from spnr_jax.formats.splat_points import NAMES as SPLAT_NAMES
+from spnr_jax.formats.splat_points import points_of_splats
 from spnr_jax.kernels.colors import srgb_to_linear
 
 Columns = dict[str, np.ndarray]

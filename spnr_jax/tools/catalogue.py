@@ -56,6 +56,8 @@ class Begun:
 
 def render_catalogue(options: Render) -> Iterator[str]:
     """Draws what does not stand yet; yields what became of it.  ValueError if there is nothing that can be drawn."""
+    if options.seconds is not None:
+        raise UserError("--seconds: of a single file; give --quality and --resolution to a folder or pattern")
     check_writable(options.out)
     options = _with_absolute_paths(options)
     items = catalogue_files.find(options.cloud, options.out)

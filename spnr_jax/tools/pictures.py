@@ -73,7 +73,13 @@ def render_file(options: Render, note: Callable[[str], None]) -> Iterator[str]:
     loaded = cache(load)
     load_named(options, loaded)  # a run that is none is said before the cloud is read
     ready = made_ready(options, note, loaded)
-    yield f"encoded {len(ready.placed.cloud.positions)} points of {options.cloud}"
+    num_points = len(ready.placed.cloud.positions)
+    yield f"encoded {num_points} points of {options.cloud}"
+    if options.seconds is not None:
+        from spnr_jax.tools.within_seconds import choose  # here: others do without
+
+        options, line = choose(options, ready.model, num_points)
+        yield line
     for written in beside(drawn(ready, options, options.out / options.cloud.stem)):
         if written.line:
             yield written.line

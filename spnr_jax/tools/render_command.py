@@ -60,6 +60,9 @@ class Render:
     quality: Literal["draft", "balanced", "best", "trained"] = "best"
     """draft: discs and light alone, without the CNN.  Of networks of rays: a quarter, half or all of the samples that a
     ray was trained with, near the points; or just as trained."""
+    seconds: float | int | None = None
+    """Draw all pictures of the file in so many seconds (after reading, encoding and compiling): the best quality and
+    size that keep to it, measured on this machine once.  A --resolution that is given is kept."""
     outputs: tuple[Output, ...] = ("image", "depth", "opacity")
     """What is written of each view; depth comes coloured, as .npy and as 16-bit .png."""
     transparent: bool = False
@@ -107,6 +110,10 @@ class Render:
             raise UserError(f"--workers must be at least 1, and without --cluster, got {self.workers}")
         if self.resolution is not None and (self.resolution < 16 or self.resolution % 4):
             raise UserError(f"--resolution must be a multiple of 4 of at least 16, got {self.resolution}")
+        if self.seconds is not None and not (self.seconds > 0 and self.quality == "best"):
+            raise UserError(
+                f"--seconds must be positive, and without --quality, which it chooses; got {self.seconds:g}"
+            )
         if not -90 <= self.elevation <= 90:
             raise UserError(f"--elevation must be -90 to 90 degrees, got {self.elevation:g}")
         if self.transparent and self.lighting.background != "white":

@@ -141,7 +141,7 @@ def test_a_turn_lasts_as_long_as_asked_and_leaves_its_first_run_out():
 
 def test_the_peak_of_a_turn_is_not_that_of_what_was_before():
     code = (
-        "from experiments.speed import worker as w; b = b'x' * (200 << 20); del b; first = w.peak_mb();"
+        "from experiments.comparison import peak_memory as w; b = b'x' * (200 << 20); del b; first = w.peak_mb();"
         "w.forget_peak(); second = w.peak_mb(); b = b'x' * (50 << 20); print(first, second, w.peak_mb())"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=bench.ROOT)

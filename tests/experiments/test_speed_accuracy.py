@@ -4,12 +4,14 @@ import dataclasses
 import json
 
 import pytest
-from support import tiny_dataset, tiny_model
+from support import tiny_dataset, tiny_model, tiny_surfels
 
-from experiments.studies import speed_accuracy
+from experiments.studies import speed_accuracy, speed_accuracy_plot
 from experiments.studies.speed_accuracy import SpeedAccuracy, front, knee, main, settings
-from spnr_jax.config import LossConfig
-from spnr_jax.training import checkpoint, optimisation
+from spnr_jax import cli
+from spnr_jax.formats import data_sets
+from spnr_jax.model_config import SurfelConfig
+from spnr_jax.training.weights import load
 
 
 def row(ms, psnr):
@@ -29,35 +31,51 @@ class TestFront:
         assert knee([row(1, 1.0)], front([row(1, 1.0)])) == 0
 
 
-def test_the_trained_way_comes_first_and_every_name_once():
-    ways = settings(tiny_dataset.CONFIG)
-    assert ways[0].config == tiny_dataset.CONFIG
+COUNTS = (64, 32)
+SURFELS = SurfelConfig(image_resolution=48)
+
+
+@pytest.mark.parametrize("config", [tiny_model.MODEL, tiny_model.WITHOUT_UPSAMPLER, tiny_model.PLUS, SURFELS])
+def test_the_best_level_comes_first_and_every_name_once(config):
+    ways = settings(config, COUNTS)
+    first = ways[0]
+    assert (first.config, first.quality, first.share, first.points) == (config, "best", 1, 64)
     assert len({way.name for way in ways}) == len(ways)
-    assert {way.group for way in ways} == set(speed_accuracy.GROUPS)
+    assert {way.group for way in ways} <= set(speed_accuracy_plot.GROUPS)
+    assert {way.points for way in ways if way.group == "points"} == {32}
+    assert any(way.share < 1 for way in ways) == config.any_size
 
 
-def test_a_network_near_the_points_is_rendered_with_other_samples_there_and_as_many_rays():
-    alone = LossConfig(adversarial_weight=0.0)
-    config = dataclasses.replace(tiny_dataset.CONFIG, model=tiny_model.PLUS, loss=alone)
-    ways = settings(config)
-    assert ways[0].config == config
-    assert {way.group for way in ways} == {"trained", "near points", "bfloat16", "points"}
-    total = config.model.sampling.num_coarse
-    found = {way.config.model.sampling.num_coarse for way in ways if way.group == "near points"}
+def test_the_network_over_surfels_has_levels_sizes_and_points_alone():
+    assert {way.group for way in settings(SURFELS, COUNTS)} == {"level", "fewer pixels", "points"}
+
+
+def test_networks_of_rays_have_other_samples_where_they_have_learnt_them():
+    boxed, near = (settings(config, COUNTS) for config in (tiny_model.MODEL, tiny_model.PLUS))
+    assert {way.group for way in boxed} == {"level", "samples", "near points", "bfloat16", "points"}
+    assert {way.config.sampling.reach for way in near} == {tiny_model.PLUS.sampling.reach}
+    total = tiny_model.PLUS.sampling.num_coarse
+    found = {way.config.sampling.num_coarse for way in near if way.group == "near points"}
     assert found == {2 * total, 3 * total // 4, total // 2, max(total // 4, 2)}
 
 
-def test_a_second_call_goes_on_where_the_first_one_stopped(tmp_path, monkeypatch):
-    options = SpeedAccuracy(
-        data=tiny_dataset.dataset().folder, runs=(tiny_dataset.run(),), out=tmp_path, objects=1, quick=True
-    )
-    measured = []
+@pytest.fixture(scope="module")
+def balls(tmp_path_factory):
+    """A data set of two balls of 48 pixels."""
+    splits = {"train": (), "val": (), "test": ("ball_000000", "ball_000001")}
+    return tiny_dataset.write_dataset(tmp_path_factory.mktemp("balls") / "set", splits, tiny_surfels.SIZE)
 
-    def measure(variables, config, dataset, names):
-        measured.append(config)
+
+def test_a_second_call_goes_on_where_the_first_one_stopped(balls, tmp_path, monkeypatch):
+    monkeypatch.setattr(cli, "set_up_jax", lambda **_: None)
+    runs, measured = (str(tiny_surfels.run()), str(tiny_dataset.run())), []
+    options = SpeedAccuracy(data=balls, runs=runs, out=tmp_path, objects=2, sizes=(24, 48), quick=True)
+
+    def measure(model, way, dataset, names, size, views):
+        measured.append((size, way.name))
         if len(measured) == 3:
             raise KeyboardInterrupt
-        same = {"ssim": 0.8, "flip": 0.1, "iou": 0.9, "ms_encode": 1.0, "temporary_mb": 1.0}
+        same = {"ssim": 0.8, "flip": 0.1, "iou": 0.9, "s_encode": 1.0, "mb": 1.0}
         return same | {"psnr": 20.0 + len(measured), "ms_view": 1.0 + len(measured)}
 
     monkeypatch.setattr(speed_accuracy, "measure", measure)
@@ -66,18 +84,33 @@ def test_a_second_call_goes_on_where_the_first_one_stopped(tmp_path, monkeypatch
     main(options)
     rows = json.loads((tmp_path / "results.json").read_text())["rows"]
     assert [row["psnr"] for row in rows[:2]] == [21.0, 22.0]
-    assert len({row["name"] for row in rows}) == len(rows) == len(measured) - 1
+    assert len(rows) == len(measured) - 1
+    assert {row["size"] for row in rows if row["run"] == runs[0]} == {24, 48}
+    assert {row["size"] for row in rows if row["run"] == runs[1]} == {24}, "its upsampler has learnt no other"
     assert (tmp_path / "front.png").stat().st_size > 1000
-    with pytest.raises(ValueError, match="results with another objects; choose another --out"):
-        main(dataclasses.replace(options, objects=2))
+    text = (tmp_path / "table.md").read_text()
+    assert "Quality and cost at 24 px" in text
+    assert "The front at 48 px, step by step" in text
+    with pytest.raises(ValueError, match="speed_accuracy with another objects; choose another --out"):
+        main(dataclasses.replace(options, objects=1))
 
 
-def test_a_setting_is_scored_and_timed():
-    config, state = checkpoint.load_run(tiny_dataset.run())
-    dataset = tiny_dataset.dataset()
-    figures = speed_accuracy.measure(
-        optimisation.averaged_variables(state), config, dataset, dataset.splits["test"][:1]
-    )
-    assert figures["psnr"] > 5
-    assert figures["ms_view"] > 0
-    assert figures["temporary_mb"] > 0
+@pytest.mark.ci
+def test_a_setting_is_scored_and_timed_and_fewer_pixels_are_enlarged(balls):
+    dataset, model = data_sets.open_dataset(balls), load(str(tiny_surfels.run()))
+    ways = {way.name: way for way in settings(model.config, COUNTS)}
+    found = [
+        speed_accuracy.measure(model, ways[name], dataset, dataset.splits["test"][:1], 48, 1)
+        for name in ("best", "draft, 0.5 of the size")
+    ]
+    for figures in found:
+        assert 5 < figures["psnr"] < 60
+        assert figures["ms_view"] > 0
+        assert figures["mb"] >= 0
+    assert found[0] != found[1]
+
+
+def test_the_pictures_of_a_network_of_rays_are_scored_too(balls):
+    dataset, model = data_sets.open_dataset(balls), load(str(tiny_dataset.run()))
+    way = settings(model.config, COUNTS)[0]
+    assert speed_accuracy.measure(model, way, dataset, dataset.splits["test"][:1], 24, 1)["psnr"] > 5
