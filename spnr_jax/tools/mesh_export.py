@@ -1,28 +1,40 @@
 """The surface of a density grid as a .glb file, with the materials of the nearest points.
 
 Marching cubes finds where the density crosses a level.  glTF has colours for each vertex but roughness and metallic
-for whole primitives only: faces are grouped by the two, rounded, and each group is a primitive with its own material.
+only as textures or for whole primitives: each vertex points into one small texture that holds every pair of the two, a
+ramp, so the surface stays one mesh whose faces share their vertices, with one material.
 Coordinates are those of the file that the points came from, whatever its upward axis.
 """
 
-from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
 from spnr_jax.errors import UserError
+from spnr_jax.formats import images
 from spnr_jax.formats.clouds import PlacedCloud
 from spnr_jax.formats.glb import packed
 from spnr_jax.tools.density_grid import DensityGrid
 
 NEAREST = 4  # points whose materials a vertex takes the mean of
-LEVELS = 8  # steps that roughness and metallic are rounded to
+RAMP = 52  # texels along each side of the ramp: steps of 5 in 8 bits, so what lies between them is exact
 FLOAT, UNSIGNED, ARRAY_BUFFER, INDEX_BUFFER = 5126, 5125, 34962, 34963  # numbers of the glTF specification
-KINDS = {1: "SCALAR", 3: "VEC3"}
+LINEAR, CLAMPED = 9729, 33071
+KINDS = {1: "SCALAR", 2: "VEC2", 3: "VEC3"}
 
 
-def mesh_of(grid: DensityGrid, placed: PlacedCloud, level: float) -> tuple[bytes, int]:
-    """(.glb file, number of faces) of the surface at a density; ValueError if there is none."""
+class Solid(NamedTuple):
+    """A .glb file, its number of faces, and whether its surface is closed: each edge lies between two faces."""
+
+    content: bytes
+    faces: int
+    watertight: bool
+
+
+def mesh_of(grid: DensityGrid, placed: PlacedCloud, level: float) -> Solid:
+    """The surface at a density; ValueError if there is none."""
     from skimage.measure import marching_cubes  # here, so that rendering alone stays quick
 
     if not grid.density.max() > level:
@@ -36,63 +48,58 @@ def mesh_of(grid: DensityGrid, placed: PlacedCloud, level: float) -> tuple[bytes
     nearest = nearest.reshape(len(vertices), -1)
     cloud = placed.cloud
     color, roughness, metallic = (m[nearest].mean(axis=1) for m in (cloud.base_color, cloud.roughness, cloud.metallic))
-    primitives = list(_primitives(vertices, faces, normals, color, np.stack([roughness, metallic], axis=-1)))
-    return glb(primitives, grid.origin), len(faces)
+    columns = {
+        "POSITION": vertices,
+        "NORMAL": normals,
+        "COLOR_0": color,
+        "TEXCOORD_0": (np.stack([roughness, metallic], axis=-1) * (RAMP - 1) + 0.5) / RAMP,
+    }
+    arrays = {name: np.asarray(values, np.float32) for name, values in columns.items()}
+    return Solid(glb(arrays | {"indices": faces.astype(np.uint32).ravel()}, grid.origin), len(faces), is_closed(faces))
 
 
-def _primitives(vertices, faces, normals, color, shine) -> Iterator[tuple[dict[str, np.ndarray], tuple[float, float]]]:
-    """Arrays of each group of faces that share their (roughness, metallic), and these."""
-    rounded = np.round(shine[faces].mean(axis=1) * LEVELS) / LEVELS
-    groups, group = np.unique(rounded, axis=0, return_inverse=True)
-    for i, (roughness, metallic) in enumerate(groups):
-        used, index = np.unique(faces[group.ravel() == i], return_inverse=True)
-        arrays = {
-            "POSITION": vertices[used].astype(np.float32),
-            "NORMAL": normals[used].astype(np.float32),
-            "COLOR_0": color[used].astype(np.float32),
-            "indices": index.astype(np.uint32).ravel(),
-        }
-        yield arrays, (float(roughness), float(metallic))
+def is_closed(faces: Int[np.ndarray, "faces 3"]) -> bool:
+    """Whether each edge lies between two faces that agree which side is outside."""
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
+    there, back = (np.sort(edges[:, i] << 32 | edges[:, 1 - i]) for i in (0, 1))
+    return bool((there[1:] != there[:-1]).all() and (there == back).all())
 
 
-def glb(primitives: list[tuple[dict[str, np.ndarray], tuple[float, float]]], translation: np.ndarray) -> bytes:
+def ramp() -> Float[np.ndarray, "metallic roughness 3"]:
+    """The texture: roughness grows to the right in green, metallic downwards in blue, as glTF reads them."""
+    metallic, roughness = np.meshgrid(*[np.linspace(0, 1, RAMP, dtype=np.float32)] * 2, indexing="ij")
+    return np.stack([np.zeros_like(roughness), roughness, metallic], axis=-1)
+
+
+def glb(arrays: dict[str, np.ndarray], translation: np.ndarray) -> bytes:
     """A binary glTF 2.0 file of one mesh; vertex colours are linear, as glTF has them."""
     views: list[dict] = []
     accessors: list[dict] = []
-    materials: list[dict] = []
-    entries: list[dict] = []
     chunks: list[bytes] = []
-    size = 0
-    for arrays, (roughness, metallic) in primitives:
-        places = {}
-        for name, array in arrays.items():
-            is_index = name == "indices"
-            data = np.ascontiguousarray(array).tobytes()
-            target = INDEX_BUFFER if is_index else ARRAY_BUFFER
-            views.append({"buffer": 0, "byteOffset": size, "byteLength": len(data), "target": target})
-            accessor = {
-                "bufferView": len(views) - 1,
-                "componentType": UNSIGNED if is_index else FLOAT,
-                "count": len(array),
-                "type": KINDS[array.size // len(array)],
-            }
-            if name == "POSITION":
-                accessor |= {"min": array.min(axis=0).tolist(), "max": array.max(axis=0).tolist()}
-            places[name] = len(accessors)
-            accessors.append(accessor)
-            chunks.append(data)
-            size += len(data)
-        factors = {"baseColorFactor": [1, 1, 1, 1], "roughnessFactor": roughness, "metallicFactor": metallic}
-        entries.append({"indices": places.pop("indices"), "attributes": places, "material": len(materials)})
-        materials.append({"pbrMetallicRoughness": factors})
-    node = {"mesh": 0} | ({"translation": translation.tolist()} if translation.any() else {})
+
+    def added(data: bytes, **more: int) -> int:
+        views.append({"buffer": 0, "byteOffset": sum(map(len, chunks)), "byteLength": len(data), **more})
+        chunks.append(data + bytes(-len(data) % 4))
+        return len(views) - 1
+
+    for name, array in arrays.items():
+        is_index = name == "indices"
+        view = added(np.ascontiguousarray(array).tobytes(), target=INDEX_BUFFER if is_index else ARRAY_BUFFER)
+        kind = {"componentType": UNSIGNED if is_index else FLOAT, "type": KINDS[array.size // len(array)]}
+        ends = {"min": array.min(axis=0).tolist(), "max": array.max(axis=0).tolist()} if name == "POSITION" else {}
+        accessors.append({"bufferView": view, "count": len(array)} | kind | ends)
+    attributes = {name: number for number, name in enumerate(arrays) if name != "indices"}
+    shine = {"metallicRoughnessTexture": {"index": 0}, "metallicFactor": 1, "roughnessFactor": 1}
     document = {
         "asset": {"version": "2.0", "generator": "spnr_jax"},
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [node],
-        "meshes": [{"primitives": entries}],
-        "materials": materials,
+        "nodes": [{"mesh": 0} | ({"translation": translation.tolist()} if translation.any() else {})],
+        "meshes": [{"primitives": [{"attributes": attributes, "indices": len(attributes), "material": 0}]}],
+        "materials": [{"pbrMetallicRoughness": shine}],
+        "textures": [{"source": 0, "sampler": 0}],
+        "images": [{"bufferView": added(images.png(ramp())), "mimeType": "image/png"}],
+        "samplers": [{"magFilter": LINEAR, "minFilter": LINEAR, "wrapS": CLAMPED, "wrapT": CLAMPED}],
         "accessors": accessors,
         "bufferViews": views,
     }

@@ -253,8 +253,9 @@ def _solids(ready: Ready, options: Render, name: Path) -> Iterator[Callable[[], 
         content = _saved(lambda file, _: np.savez_compressed(file, **arrays), None)
         yield partial(_write_solid, Path(f"{name}_density.npz"), content)
     if options.mesh:
-        content, num_faces = mesh_export.mesh_of(grid, ready.placed, -np.log1p(-MESH_OPACITY) / grid.voxel)
-        yield partial(_write_solid, Path(f"{name}_mesh.glb"), content, f" ({num_faces} faces)")
+        solid = mesh_export.mesh_of(grid, ready.placed, -np.log1p(-MESH_OPACITY) / grid.voxel)
+        details = f" ({solid.faces:,} faces, {'watertight' if solid.watertight else 'not watertight'})"
+        yield partial(_write_solid, Path(f"{name}_mesh.glb"), solid.content, details)
 
 
 def _write_solid(path: Path, content: bytes, details: str = "") -> Written:

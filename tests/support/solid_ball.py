@@ -1,0 +1,36 @@
+"""A ball as a density grid, and as points in two materials, somewhere in the frame of a file."""
+
+import numpy as np
+
+from spnr_jax.formats.clouds import PlacedCloud
+from spnr_jax.formats.up_axis import ROTATIONS
+from spnr_jax.kernels.records import PointCloud
+from spnr_jax.tools.density_grid import DensityGrid
+
+RADIUS, CENTRE = 2.0, np.array([5.0, -3.0, 1.0])
+
+
+def ball_grid(origin=(0, 0, 0)) -> DensityGrid:
+    """Density that falls with the distance from CENTRE, RADIUS at RADIUS."""
+    spacing, lowest = 0.2, CENTRE - 3.07  # no vertex falls on a place of the grid
+    axes = [lowest[i] + spacing * np.arange(31) for i in range(3)]
+    distance = np.linalg.norm(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1) - CENTRE, axis=-1)
+    density = (2 * RADIUS - distance).astype(np.float32)
+    return DensityGrid(density=density, lowest=lowest, spacing=spacing, voxel=1.0, origin=np.array(origin, float))
+
+
+def ball_cloud(up="y", origin=(0, 0, 0)) -> PlacedCloud:
+    """Points of the ball: red, rough and no metal where the file's x is large, else blue, smooth and metal."""
+    rng = np.random.default_rng(0)
+    directions = rng.normal(size=(600, 3))
+    in_file = CENTRE + RADIUS * directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    right = in_file[:, 0] > CENTRE[0]
+    rotation = np.array(ROTATIONS[up], float)
+    cloud = PointCloud(
+        positions=np.float32(in_file @ rotation.T),
+        base_color=np.where(right[:, None], np.float32([1, 0, 0]), np.float32([0, 0, 1])),
+        roughness=np.where(right, np.float32(1), np.float32(0.25)),
+        metallic=np.where(right, np.float32(0), np.float32(1)),
+        mask=np.ones(600, bool),
+    )
+    return PlacedCloud(cloud=cloud, up=up, rotation=rotation, origin=np.array(origin, float))
