@@ -5,6 +5,7 @@ import each other in a circle.  Files at the top of a package are entries of the
 """
 
 import ast
+import functools
 import subprocess
 import sys
 from collections import Counter
@@ -61,6 +62,7 @@ def imports(tree: ast.AST) -> set[str]:
     return names
 
 
+@functools.cache
 def parsed(path: Path) -> ast.Module:
     return ast.parse(path.read_text())
 
@@ -78,12 +80,13 @@ MODULES = {".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix("
 named = {"ids": lambda path: "/".join(path.relative_to(ROOT).parts)}
 
 
-def own_imports(path: Path) -> set[Path]:
+@functools.cache
+def own_imports(path: Path) -> frozenset[Path]:
     """The files of the project that a file imports; of a folder, what its __init__.py holds."""
     names = {name for name in imports(parsed(path)) if name in MODULES}
     # `from a import b` of a module b reads nothing from a
     inner = {name for name in names if any(other.startswith(f"{name}.") for other in names)}
-    return {MODULES[name] for name in names - inner}
+    return frozenset(MODULES[name] for name in names - inner)
 
 
 def test_the_order_names_every_folder_once_and_nothing_else():
@@ -207,12 +210,15 @@ def test_a_picture_of_rays_is_drawn_by_few_modules_and_by_one_network():
     assert not {part for part in drawing if part.split(".")[1] in ("surfels", "baselines", "training", "scoring")}
 
 
-@pytest.mark.parametrize("name", ["cameras", "sampling", "compositing", "voxels", "losses", "metrics"])
-def test_the_kernels_of_the_specification_are_one_module_under_both_names(name):
-    code = (
-        f"import importlib; import spnr_jax.{name}; short = sys.modules['spnr_jax.{name}']; "
-        f"from spnr_jax import {name}; from spnr_jax.kernels import {name} as whole; "
-        f"assert short is {name} is whole is importlib.import_module('spnr_jax.kernels.{name}'); "
-        f"assert whole.__name__ == whole.__spec__.name == 'spnr_jax.kernels.{name}'"
+def test_the_kernels_of_the_specification_are_one_module_under_both_names():
+    names = "cameras", "sampling", "compositing", "voxels", "losses", "metrics"
+    loaded = modules_after(
+        "; ".join(
+            f"import importlib; import spnr_jax.{name}; short = sys.modules['spnr_jax.{name}']; "
+            f"from spnr_jax import {name}; from spnr_jax.kernels import {name} as whole; "
+            f"assert short is {name} is whole is importlib.import_module('spnr_jax.kernels.{name}'); "
+            f"assert whole.__name__ == whole.__spec__.name == 'spnr_jax.kernels.{name}'"
+            for name in names
+        )
     )
-    assert f"spnr_jax.{name}" in modules_after(code)
+    assert {f"spnr_jax.{name}" for name in names} <= loaded

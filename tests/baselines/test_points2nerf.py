@@ -11,12 +11,12 @@ from support import tiny_model, tiny_training
 from support.laws import close, numbers
 
 from spnr_jax.baselines import points2nerf
+from spnr_jax.baselines.baseline_presets import points2nerf_abo, points2nerf_tiny
 from spnr_jax.baselines.points2nerf import Hypernetwork, Points2NeRF
 from spnr_jax.baselines.sizes import Points2NeRFConfig
 from spnr_jax.config import OptimizerConfig
 from spnr_jax.formats.config_json import from_dict, to_dict
 from spnr_jax.method import inference
-from spnr_jax.presets import points2nerf_abo, points2nerf_tiny
 
 FAITHFUL = Points2NeRFConfig(
     kl_weight=0.01,

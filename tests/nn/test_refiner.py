@@ -1,6 +1,7 @@
 """The refiner: what it may change of a picture, at which sizes, and how it is trained behind a network that stays."""
 
 import dataclasses
+import functools
 
 import flax.linen as nn
 import jax
@@ -39,7 +40,7 @@ def picture(height=24, width=16, seed=0):
 
 @pytest.fixture(scope="module")
 def fresh():
-    return REFINER.init(jax.random.key(0), picture())
+    return jax.jit(REFINER.init)(jax.random.key(0), picture())
 
 
 @pytest.fixture(scope="module")
@@ -53,21 +54,30 @@ class Changes(Refiner):
         return self.change(seen[..., :-1], seen[..., -1:], shrink)
 
 
+@functools.partial(jax.jit, static_argnums=2)
 def changes(variables, seen, shrink=1):
     return Changes(width=4).apply(variables, seen, shrink)
+
+
+refine = jax.jit(REFINER.apply)
+
+
+@jax.jit
+def total_and_gradients(variables, seen):
+    return jax.value_and_grad(lambda *x: sum(map(jnp.sum, REFINER.apply(*x))), (0, 1))(variables, seen)
 
 
 class TestPicture:
     def test_a_fresh_one_changes_nothing_to_speak_of(self, fresh):
         seen = picture()
-        image, acc = REFINER.apply(fresh, seen)
+        image, acc = refine(fresh, seen)
         solid = np.asarray((seen[..., -1] == 0) | (seen[..., -1] > 0.05))  # else there is hardly a colour
         close(acc, seen[..., -1], atol=ODDS)
         close(image[solid], seen[..., :3][solid], atol=2 * ODDS)
 
     def test_nothing_is_drawn_where_no_point_is_near(self, variables):
         seen = picture()
-        image, acc = REFINER.apply(variables, seen)
+        image, acc = refine(variables, seen)
         nothing = np.asarray(jnp.all(seen[..., 3:6] == 0, axis=-1))
         assert 0 < nothing.mean() < 1
         assert (np.asarray(image)[nothing] == 1).all()
@@ -76,7 +86,7 @@ class TestPicture:
 
     def test_a_ray_that_passed_near_points_can_become_opaque(self, variables):
         seen = picture().at[..., 3:6].set(1.0)
-        _, acc = REFINER.apply(variables, seen)
+        _, acc = refine(variables, seen)
         assert np.asarray(acc)[np.asarray(seen[..., -1]) == 0].min() > 0
 
     def test_what_is_seen_is_standardised_and_changed_as_odds_and_colour(self, variables):
@@ -87,7 +97,7 @@ class TestPicture:
         scaled = near * (seen - mean[None, None, None]) / deviation[None, None, None]
         expected = changes(plain, jnp.concatenate([scaled, near], axis=-1))
         odds = jnp.log(seen[..., -1] + ODDS) - jnp.log1p(ODDS - seen[..., -1])
-        image, acc = REFINER.apply(known, seen)
+        image, acc = refine(known, seen)
         close(acc, near[..., 0] * jax.nn.sigmoid(odds + expected[..., 3]), atol=1e-5)
         color = (seen[..., :3] - 1 + seen[..., -1:]) / jnp.maximum(seen[..., -1:], LEAST) + expected[..., :3]
         close(image, acc[..., None] * color + 1 - acc[..., None], atol=1e-4)
@@ -95,20 +105,15 @@ class TestPicture:
     def test_pixels_around_are_seen(self, variables):
         seen = picture()
         elsewhere = seen.at[:, 8:10, 8:10, -1].set(1.0)
-        changed = np.asarray(REFINER.apply(variables, seen)[1] != REFINER.apply(variables, elsewhere)[1])
+        changed = np.asarray(refine(variables, seen)[1] != refine(variables, elsewhere)[1])
         assert changed[:, 8:10, 8:10].any()
         assert changed[:, 12:, 8:].any()
 
     @pytest.mark.parametrize("value", [0.0, 1e-30, 1e-8, 1.0])
     def test_extremes_of_opacity_have_finite_pictures_and_gradients(self, variables, value):
         seen = jnp.full((1, 8, 8, FEATURES), 1e4).at[..., :3].set(1 - value).at[..., -2:].set(value)
-
-        def total(variables, seen):
-            return sum(jnp.sum(x) for x in REFINER.apply(variables, seen))
-
-        for part in jax.tree.leaves(jax.grad(total, argnums=(0, 1))(variables, seen)):
-            assert jnp.isfinite(part).all()
-        assert jnp.isfinite(total(variables, seen))
+        for part in jax.tree.leaves(total_and_gradients(variables, seen)):
+            assert np.isfinite(part).all()
 
 
 class TestSize:

@@ -63,7 +63,7 @@ def test_a_state_without_statistics_comes_back_too(tmp_path):
 def test_a_run_of_another_method_is_refused_with_its_name(tmp_path):
     checkpoint.write_config(tmp_path, presets.tiny())
     (tmp_path / "checkpoints").mkdir()
-    with pytest.raises(ValueError, match=r"model\.method ours there, npbg asked"):
+    with pytest.raises(ValueError, match=r"model\.method paper there, npbg asked"):
         checkpoint.write_config(tmp_path, presets.PRESETS["npbg_tiny"]())
 
 

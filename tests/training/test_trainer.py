@@ -207,7 +207,7 @@ def test_a_state_that_is_not_finite_is_named_though_every_loss_is(monkeypatch, t
     fresh = optimisation.jitted_create_state(CONFIG)
     fresh.batch_stats["encoder"]["pointnet"]["norm_0"]["variance"] *= np.inf
     monkeypatch.setattr(optimisation, "jitted_create_state", lambda config: fresh)
-    with pytest.raises(trainer.NotFinite, match="batch_stats_pointnet_norm_0_variance is inf at step 2"):
+    with pytest.raises(trainer.NotFinite, match="batch_stats_encoder_pointnet_norm_0_variance is inf at step 2"):
         trainer.train(CONFIG, tiny_dataset.dataset(), tmp_path, SCHEDULE)
     assert not (tmp_path / "checkpoints").exists()
 
