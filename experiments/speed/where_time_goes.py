@@ -135,7 +135,7 @@ def frame_programs(options: WhereTimeGoes) -> dict[str, Program]:
     doublings, side = surfel_renderer.resolution_of(scene.spacing, camera)
     small = orbiting(options.size * side >> doublings)
     total = int(splatting.count(scene.surfels, small))
-    found, covered = splatting.entries(scene.surfels, small, total=total)
+    found, covered = splatting.jitted_entries(scene.surfels, small, total=total)
     look = partial(surfel_renderer.look, slots=int(covered))
     seen, maps, ambient, _ = jax.jit(look)(found, scene.surfels, light, small)
     shader = Shader(config.widths, config.top)

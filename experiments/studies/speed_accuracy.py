@@ -20,6 +20,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -99,10 +100,10 @@ def settings(config: NetworkConfig, counts: Sequence[int]) -> list[Setting]:
         levels = ("best", "draft")
     elif isinstance(config, RayNetworkConfig):
         levels = ("best", "balanced", "draft", "trained")
-    common = {"config": config, "points": counts[0]}
+    common: dict[str, Any] = {"config": config, "points": counts[0]}
     ways = [Setting(group="level", name=level, quality=level, **common) for level in levels]
     if config.any_size:
-        enlarged = {"group": "fewer pixels", **common}
+        enlarged: dict[str, Any] = {"group": "fewer pixels", **common}
         ways += [Setting(name=f"best, {share:g} of the size", share=share, **enlarged) for share in SHARES]
         if "draft" in levels:
             ways.append(Setting(name="draft, 0.5 of the size", quality="draft", share=0.5, **enlarged))
@@ -126,7 +127,7 @@ def _of_rays(config: RayNetworkConfig, points: int) -> list[Setting]:
         ways = [("samples", f"{n // 2} + {n // 2} in the box", (n // 2, n // 2, 0)) for n in (2 * total, *halves[1:])]
         ways += [("near points", f"{n} within {r} voxels", (n, 0, r)) for r in (1, 2, 3) for n in halves]
 
-    def made(group: str, name: str, **changed: object) -> Setting:
+    def made(group: str, name: str, **changed: Any) -> Setting:
         other = dataclasses.replace(config, **changed)
         return Setting(group=group, name=name, config=other, points=points, quality="trained")
 

@@ -46,8 +46,8 @@ def _scatter(axes: Axes, rows: Sequence[dict], x: str, y: str) -> None:
         for marker, run in zip(MARKERS, runs, strict=False):
             if shown := [row for row in rows if (row["group"], row["run"]) == (group, run)]:
                 label = group if len(runs) == 1 else f"{Path(run).name}, {group}"
-                values = ([max(row[name], 1) if name == "mb" else row[name] for row in shown] for name in (x, y))
-                axes.scatter(*values, s=26, c=color, marker=marker, zorder=3, label=label)
+                across, up = ([max(row[name], 1) if name == "mb" else row[name] for row in shown] for name in (x, y))
+                axes.scatter(across, up, s=26, c=color, marker=marker, zorder=3, label=label)
     axes.set_xscale("log")
     axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     axes.xaxis.set_major_formatter(ScalarFormatter())

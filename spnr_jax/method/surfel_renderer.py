@@ -144,7 +144,9 @@ def _drawn(
         return _nothing(camera), least_slots
     whole = _scaled(camera, plan.doublings, plan.side)
     inside = _seen_through(whole, plan)
-    found, covered = splatting.entries(scene.surfels, inside, total=_rounded(total, 2**15, splatting.MOST_ENTRIES))
+    found, covered = splatting.jitted_entries(
+        scene.surfels, inside, total=_rounded(total, 2**15, splatting.MOST_ENTRIES)
+    )
     pixels = inside.height * inside.width
     slots = _rounded(min(max(int(covered), least_slots), pixels), LEAST_SLOTS, pixels)
     known = known_of(variables, scene, whole, config)

@@ -16,7 +16,7 @@ sizes come from counts that the caller reads back: a picture is three programs, 
 """
 
 from collections.abc import Sequence
-from functools import partial, reduce
+from functools import reduce
 from operator import add, mul
 from typing import NamedTuple
 
@@ -138,8 +138,6 @@ def count(surfels: Surfels, camera: Camera) -> Int[Array, ""]:
     return jnp.sum(footprints(surfels, camera).covered)
 
 
-# this option takes a quarter off the compilation and costs the program no time
-@partial(jax.jit, static_argnames="total", compiler_options={"xla_cpu_use_fusion_emitters": False})
 def entries(surfels: Surfels, camera: Camera, *, total: int) -> tuple[Entries, Int[Array, ""]]:
     """The sorted entries, `total` of them with the empty ones, and the number of covered pixels."""
     foot = footprints(surfels, camera)
@@ -180,6 +178,10 @@ def entries(surfels: Surfels, camera: Camera, *, total: int) -> tuple[Entries, I
     slot = jnp.cumsum(first.astype(jnp.int32)) - 1
     rank = place - jax.lax.cummax(jnp.where(first, place, 0))
     return Entries(point, kernel, depth, foot.facing[point], order, pixel, slot, rank), slot[-1] + 1
+
+
+# this option takes a quarter off the compilation and costs the program no time
+jitted_entries = jax.jit(entries, static_argnames="total", compiler_options={"xla_cpu_use_fusion_emitters": False})
 
 
 def _sorted(

@@ -68,6 +68,7 @@ TIMING = Timing()
 
 def choose(options: Render, model: Model, num_points: int, timing: Timing = TIMING) -> tuple[Render, str]:
     """The options with the level and size that keep to their seconds instead, and a line that says what was chosen."""
+    assert options.seconds is not None
     pictures = max(options.views + (options.frames if options.turntable != "none" else 0), 1)
     known = _Known(model, num_points, timing)
     for level in levels(model.config, options.resolution):

@@ -172,7 +172,7 @@ def make_view(
     total = int(splatting.count(scene.surfels, drawn))
     if not 0 < total <= MOST_ENTRIES:
         return None
-    found, slots = splatting.entries(scene.surfels, drawn, total=_size(total, 2**16))
+    found, slots = splatting.jitted_entries(scene.surfels, drawn, total=_size(total, 2**16))
     slots = min(_size(int(slots), drawn.height * drawn.width // 16), drawn.height * drawn.width)
     seen, maps, ambient, _ = map(
         np.asarray, surfel_renderer.jitted_look(found, scene.surfels, light, drawn, known(drawn), slots=slots)

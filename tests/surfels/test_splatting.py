@@ -18,7 +18,7 @@ blend = jax.jit(splatting.blend, static_argnames="slots")
 def draw(found, view, attributes=None):
     """G-buffer (as NumPy arrays) of surfels, and the entries that it was blended from."""
     attributes = found.base_color if attributes is None else attributes
-    entries, slots = splatting.entries(found, view, total=TOTAL)
+    entries, slots = splatting.jitted_entries(found, view, total=TOTAL)
     assert (
         int(np.sum(np.asarray(entries.pixel) < view.height * view.width)) <= int(splatting.count(found, view)) <= TOTAL
     )
@@ -124,7 +124,7 @@ class TestEntries:
         for size in (24, 2100):  # the second has more pixels than 21 bits count
             view = camera(size, field_of_view=2.9 if size > 24 else 0.7)
             total = int(splatting.count(found, view))
-            entries, slots = splatting.entries(found, view, total=total)
+            entries, slots = splatting.jitted_entries(found, view, total=total)
             order, pixel = np.asarray(entries.order), np.asarray(entries.pixel)
             live = pixel < size**2
             assert np.all(np.diff(pixel) >= 0)
