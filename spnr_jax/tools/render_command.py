@@ -30,7 +30,7 @@ class Render:
     surface is sampled).  Or a folder, with all folders in it, or a pattern such as 'scans/**/*.ply'."""
     run: Path | None = None
     """Network that renders: `surfels`, `small` or `tiny` of the package, a run folder, a file of weights
-    (default: surfels, of fewer than 6,000 points small)."""
+    (default: surfels, of fewer than 2,000 points small)."""
     out: Path = Path("renders")
     """Folder for what is written; what stands there of a folder's or pattern's files is not drawn again."""
     workers: int | None = None

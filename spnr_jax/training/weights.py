@@ -31,7 +31,7 @@ from spnr_jax.model_config import NetworkConfig, SurfelConfig
 
 # what a header of any content makes its readers raise
 UNREADABLE = (ValueError, LookupError, TypeError, ArithmeticError, RecursionError)
-MANY_POINTS = 6000  # chosen between 1,024, where rays score better at 512 pixels, and 16,384, where surfels do
+MANY_POINTS = 2000  # chosen between 1,024, where rays score better at 512 pixels, and 4,096, where surfels do
 ADVICE = "write one with `spnr export RUN`"
 SHIPPED = ("surfels", "small", "tiny")  # what the package holds; the first renders where no other is named
 

@@ -261,7 +261,7 @@ class TestTraining:
         ("num_neighbors", 0, "at least 1"),
         ("num_samples", 401, "num_candidates 400"),
         ("density_scale", 0.0, "positive"),
-        ("jitter", 1.5, "share of a step"),
+        ("jitter", 1.5, "a share"),
         ("ray_chunk", 0, "at least 1"),
     ],
 )
