@@ -27,7 +27,7 @@ def test_work_is_what_the_axis_multiplies(name):
         "objects": lambda config, batch: batch.image.shape[0],
         "views": lambda config, batch: batch.camera.cam_to_world.shape[1],
         "image": lambda config, batch: batch.camera.height * batch.camera.width,
-        "volume": lambda config, batch: config.model.volume_resolution**3,
+        "volume": lambda config, batch: config.model.encoder.volume_resolution**3,
         "samples": lambda config, batch: config.model.sampling.num_coarse + config.model.sampling.num_fine,
     }
     for axis, count in counts.items():

@@ -7,8 +7,8 @@ import pytest
 from support.laws import close, numbers
 
 from spnr_jax.kernels.colors import srgb_to_linear
-from spnr_jax.kernels.resizing import bilinear
-from spnr_jax.nn.shader import COLOR_STEP, LEAST_ODDS, NOTHING, NUM_OUTPUTS, ODDS_STEP, Shader, doubled, picture
+from spnr_jax.kernels.resizing import bilinear, doubled
+from spnr_jax.nn.shader import COLOR_STEP, LEAST_ODDS, NOTHING, NUM_OUTPUTS, ODDS_STEP, Shader, picture
 from spnr_jax.surfels.features import NUM_MAPS
 from spnr_jax.surfels.lighting import SPECULAR
 
@@ -38,10 +38,12 @@ class TestPicture:
         values, ambient = maps(), numbers(1, 1, 9, 3)
         linear, alpha = drawn(jnp.zeros((1, 6, 6, NUM_OUTPUTS)), values, ambient)
         color, metallic, opacity, factor, summand = np.split(np.float64(values[..., :7]), [3, 4, 5, 6], axis=-1)
-        arriving, _, mirrored, reflected = np.split(np.float64(values[..., 7:]), [3, 6, 9], axis=-1)
+        arriving, _, mirrored, reflected, solid = np.split(np.float64(values[..., 7:]), [3, 6, 9, 10], axis=-1)
         specular = ((SPECULAR * (1 - metallic) + color * metallic) * factor + summand) * mirrored * reflected
         close(linear, color * (1 - metallic) * arriving + specular, rtol=1e-4)
-        close(alpha, (opacity[..., 0] + LEAST_ODDS) / (1 + 2 * LEAST_ODDS), rtol=1e-4)
+        full = (opacity + LEAST_ODDS) * (solid + LEAST_ODDS)
+        clear = (1 - opacity + LEAST_ODDS) * (1 - solid + LEAST_ODDS)
+        close(alpha, (1 / (1 + np.sqrt(clear / full)))[..., 0], rtol=1e-4)  # both are trusted alike
 
     def test_it_is_linear_in_the_light_whatever_the_outputs(self):
         outputs, values = 0.3 * numbers(2, 1, 12, 12, NUM_OUTPUTS), maps()

@@ -117,7 +117,7 @@ def weights() -> list[Files]:
         image_resolution=32, upsampler_width=4,
     )  # fmt: skip
     files = []
-    for config in (dataclasses.replace(ours, model=small), presets.npbg_tiny()):
+    for config in (dataclasses.replace(ours, model=small), presets.PRESETS["npbg_tiny"]()):
         described = np.frombuffer(json.dumps(to_dict(config)).encode(), np.uint8)
         halves = {name: np.zeros(x.shape, np.float16) for name, x in variable_shapes(config).items()}
         stream = io.BytesIO()
