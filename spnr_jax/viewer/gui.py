@@ -77,7 +77,7 @@ class Browser:
         with self._network:
             state, drawn = session.draw(self._model, state, moving)
         self._splats.follow(state)
-        if drawn is not None and (moving or not self.loop.superseded):
+        if drawn is not None and not self.loop.stopped and (moving or not self.loop.superseded):
             self._send(drawn.image, MOVING_JPEG if moving else RESTING_JPEG)
             if drawn.quality is not None and drawn.milliseconds is not None:
                 self._measured = {key: ms for key, ms in self._measured.items() if key[0] != drawn.quality}

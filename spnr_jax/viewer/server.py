@@ -10,6 +10,7 @@ import errno
 import io
 import socket
 import threading
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -76,6 +77,7 @@ class Viewer:
 
     def wait(self) -> None:
         """Serve until Ctrl-C."""
+        warnings.filterwarnings("ignore", "Queued a .* on a closed connection")  # a browser left while one was drawn
         try:
             threading.Event().wait()
         finally:

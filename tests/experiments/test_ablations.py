@@ -181,8 +181,8 @@ def test_minutes_give_every_variant_the_steps_that_fit(tmp_path, monkeypatch):
     paces, measured = {"add": 2.0, "concat": 6.0}, []
 
     def step_seconds(config, *_):
-        measured.append((config.model.skip, config.seed))
-        return paces[config.model.skip]
+        measured.append((config.model.encoder.skip, config.seed))
+        return paces[config.model.encoder.skip]
 
     monkeypatch.setattr(budgets, "step_seconds", step_seconds)
     main(asked(tmp_path, quick=False, minutes=0.2, seeds=(0, 1)))

@@ -2,7 +2,7 @@
 
     python many_devices.py [float64]      with float64 only the gradients of the plain network, in that precision
 
-    renderings  largest difference of a picture, a depth or an opacity
+    renderings  largest difference of a picture, a depth or an opacity, and of all but a fiftieth of the numbers
     gradients   largest difference of a first step's gradients, relative to the largest entry of the array
     blocks      of rays near points that were rendered: on one device, and on each of the eight
 
@@ -22,7 +22,6 @@ from unittest import mock
 sys.path.insert(0, str(Path(__file__).parents[1]))  # the helpers of all tests
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from support import tiny_dataset, tiny_model
 
@@ -68,13 +67,18 @@ def inputs(model, size: int):
     return variables, inference.jitted_encode(variables, cloud, config=model), camera
 
 
-def rendered(model, size: int) -> float:
-    """Largest difference between the renderings of one device and of all."""
+def rendered(model, size: int) -> tuple[float, float]:
+    """Largest difference between the renderings of one device and of all, and that of all but a fiftieth of them.
+
+    What a sample near points sees jumps at the borders of the nearest-point grid: on some processors a rounding of its
+    place moves a pixel by 1e-3.
+    """
     arguments = inputs(model, size)
     render = partial(inference.jitted_render, config=model, options=RenderOptions(block=16))
     one, all_of_them = render(*arguments), placement.by_all_devices(render, *arguments)
     assert all_of_them.image.sharding.device_set == one.image.sharding.device_set
-    return max(float(jnp.abs(a - b).max()) for a, b in zip(*map(jax.tree.leaves, (one, all_of_them)), strict=True))
+    apart = [np.abs(np.asarray(a - b)) for a, b in zip(*map(jax.tree.leaves, (one, all_of_them)), strict=True)]
+    return max(float(x.max()) for x in apart), max(float(np.quantile(x, 0.98)) for x in apart)
 
 
 def gradients_apart(model, precision: str) -> float:

@@ -188,7 +188,7 @@ def render(volume, origins, directions, bias):
     head = variables["params"]["field"]["head"]
     # no gradient by the bias: one number for all rays, whose gradients would cancel
     head["bias"] = head["bias"] + jnp.concatenate([jax.lax.stop_gradient(bias), jnp.zeros(3, bias.dtype)])
-    return traced(module.bind(variables), encoded, rays)
+    return tuple(traced(module.bind(variables), encoded, rays))
 
 
 def scene(rng, density=3.0, distance=3.0):
