@@ -6,7 +6,7 @@ from jaxtyping import Array
 
 from spnr_jax.config import TrainConfig
 from spnr_jax.kernels import losses
-from spnr_jax.kernels.records import Batch
+from spnr_jax.kernels.records import AnyArray, Batch
 from spnr_jax.model_config import RayNetworkConfig
 from spnr_jax.nn.discriminator import Discriminator
 
@@ -47,6 +47,6 @@ def discriminator_loss(config: TrainConfig, params: dict, fake: Array, batch: Ba
     return loss, metrics
 
 
-def flatten_views(x: Array) -> Array:
+def flatten_views(x: AnyArray) -> AnyArray:
     """(objects, views, ...) as (objects * views, ...)."""
     return x.reshape(-1, *x.shape[2:])
