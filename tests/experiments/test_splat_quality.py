@@ -30,6 +30,7 @@ def test_the_study_scores_every_method_at_every_size_and_goes_on_where_it_stoppe
     options = splat_quality.SplatStudy(
         data=folder,
         out=tmp_path / "out",
+        run=str(tiny_surfels.run()),
         sizes=(tiny_surfels.SIZE // 2, tiny_surfels.SIZE),
         views=2,
         seconds=1.0,
