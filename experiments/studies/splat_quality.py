@@ -96,8 +96,9 @@ def main(options: SplatStudy) -> None:
     asked = {k: str(v) if isinstance(v, Path) else v for k, v in dataclasses.asdict(options).items()}
     which = ("out", "names", "objects")  # those that are made in one go
     results_folder.claim(options.out, "splat_quality", {k: v for k, v in asked.items() if k not in which}, dataset)
-    mitsuba.set_variant(choose_variant()[0])
-    renderer, rows = poisson.Renderer(dataset.settings, variant=mitsuba.variant()), {}
+    variant = choose_variant()[0]
+    mitsuba.set_variant(variant)
+    renderer, rows = poisson.Renderer(dataset.settings, variant=variant), {}
     models = load(options.run), load(options.mesh_run)
     for name in names:
         item = data_sets.read_object(dataset, name)
