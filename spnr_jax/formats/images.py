@@ -65,6 +65,17 @@ def npz(*arrays: np.ndarray) -> bytes:
     return stream.getvalue()
 
 
+def check_place(path: Path) -> None:
+    """ValueError if no file can be written at a path: it is asked before the work, not after it."""
+    if path.is_dir():
+        raise UserError(f"{path}: a folder; expected the name of a file")
+    above = next(folder for folder in path.absolute().parents if folder.exists())
+    if not above.is_dir():
+        raise UserError(f"{path}: {above} is a file, not a folder; choose another place")
+    if not os.access(above, os.W_OK | os.X_OK):
+        raise UserError(f"{path}: nothing can be written in {above}; choose another place")
+
+
 def write_whole(path: Path, data: bytes) -> None:
     """Write a file in one piece; folders that are missing are made."""
     path.parent.mkdir(parents=True, exist_ok=True)
