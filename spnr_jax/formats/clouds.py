@@ -22,7 +22,7 @@ from spnr_jax.formats.point_files import READERS, column_pieces, parse_ply
 from spnr_jax.formats.sensor import sensor_of
 from spnr_jax.formats.up_axis import ROTATIONS, find_up
 from spnr_jax.kernels import scenes
-from spnr_jax.kernels.cleaning import Clean, cleaned
+from spnr_jax.kernels.cleaning import Clean, beside, cleaned
 from spnr_jax.kernels.facing import facing
 from spnr_jax.kernels.records import PointCloud
 from spnr_jax.kernels.thinning import THINNING, farthest_points, thin_stream
@@ -31,6 +31,7 @@ MESHES = (".glb", ".gltf", ".obj", ".stl", ".off")
 MESH_POINTS = 4096  # points drawn from a mesh if no number is asked for; the most that training draws
 MOST_EVEN = 2**14  # points that are spread evenly over a mesh, in seconds; more lie close enough as they are drawn
 CAPACITY = 2**19  # points of a file that are in memory at most; more are thinned while reading
+SAMPLE = 2**17  # of them that say where a file is dense
 ShownParts = Literal["opaque", "skip"]  # what is made of a mesh's transparent parts
 BROKEN = "NaN, infinity or too large a number"
 CUT_MESH = 2**18  # points drawn from a mesh that something is cut out of
@@ -181,7 +182,7 @@ def _read(
             report(scenes.cropped(int(inside.sum()), count, cut.crop, *box))
             positions, values = positions[inside], {name: column[inside] for name, column in values.items()}
     else:
-        columns = _bounded_columns(path, num_points, cut, report)
+        columns = _bounded_columns(path, num_points, clean, cut, report)
         positions, origin, values = _points_of_columns(columns, report)
         if not cut.asked and (line := scenes.scene_line(positions, seed)):
             report(line)
@@ -215,10 +216,13 @@ def _sampled_mesh(path: Path, count: int, seed: int, transparent_parts: ShownPar
     return points.positions.astype(np.float64), np.zeros(3), values | {"normals": points.normals}
 
 
-def _bounded_columns(path: Path, num_points: int | None, cut: Cut, report: Callable[[str], None]) -> Columns:
+def _bounded_columns(
+    path: Path, num_points: int | None, clean: Clean, cut: Cut, report: Callable[[str], None]
+) -> Columns:
     """The useful columns of a point file inside the box to be cut out.
 
-    They are thinned while reading to CAPACITY points or what `num_points` needs.
+    They are thinned while reading to CAPACITY points or what `num_points` needs; unless `clean` is "off" without those
+    that lie apart in the file.
     """
     capacity, broken, outside = max(CAPACITY, THINNING * (num_points or 0)), 0, 0
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
@@ -238,7 +242,8 @@ def _bounded_columns(path: Path, num_points: int | None, cut: Cut, report: Calla
                 wanted = wanted & inside
             yield columns if wanted.all() else {name: column[wanted] for name, column in columns.items()}
 
-    columns, seen = thin_stream(sound_pieces(), capacity)
+    columns, sample = thin_stream(sound_pieces(), capacity, 0 if clean == "off" else SAMPLE)
+    seen = sample.seen
     if broken and not seen + outside:
         raise UserError(f"holds no point that can be used: {BROKEN} in all of its {broken} rows")
     if broken:
@@ -247,6 +252,11 @@ def _bounded_columns(path: Path, num_points: int | None, cut: Cut, report: Calla
         report(scenes.cropped(seen, seen + outside, cut.crop, low, high))
     if seen > capacity:
         report(f"{len(columns['x'])} of {seen} points kept while reading, the first of each voxel")
+    if seen > capacity and clean != "off":
+        inside = beside(np.stack([np.asarray(columns[axis], np.float64) for axis in "xyz"], axis=-1), sample.positions, clean)
+        if not inside.all():
+            report(f"removed {np.count_nonzero(~inside):,} of them, outliers against a sample of the file")
+        columns = {name: column[inside] for name, column in columns.items()}
     return columns
 
 

@@ -51,6 +51,7 @@ LEAST_RADIUS = 1.0  # spacings: the same at least
 AROUND = 64  # points that give a plane
 MOVED = 2  # times that points are moved
 MOST_MOVED = 2**17  # points that are moved; of more, a part
+BESIDE = 2.0  # times the distance of a sample's neighbours, within which a point belongs to it
 CANCELLED = 0.5  # length of a mean of unit normals below which they contradict each other
 
 
@@ -97,16 +98,37 @@ def outliers(positions: Float[np.ndarray, "points 3"], strength: Strength = "aut
     """True for points that are much farther from their neighbours than these from theirs."""
     distinct, copies = _distinct(positions)
     left = np.arange(len(distinct))
+    if len(left) >= LEAST_POINTS:
+        tree = cKDTree(distinct)
+        distances, near = tree.query(distinct, NEIGHBOURS + 1, workers=-1)
     for _ in range(ROUNDS):
         if len(left) < LEAST_POINTS:
             break
-        apart = _apart(distinct[left], strength)
+        apart = _apart(tree, distances[:, 1:], near[:, 1:], strength)
         if not apart.any():
             break
-        left = left[~apart]
+        left, tree = left[~apart], cKDTree(distinct[left[~apart]])
+        distances, near = _without(apart, tree, distances, near)
     removed = np.ones(len(distinct), bool)
     removed[left] = False
     return removed[copies]
+
+
+def beside(
+    positions: Float[np.ndarray, "points 3"], sample: Float[np.ndarray, "some 3"], strength: Strength = "auto"
+) -> Bool[np.ndarray, " points"]:
+    """True for points of a cloud that lie beside a sample of it without the sample's outliers.
+
+    For clouds thinned by voxels, where few outliers have become many: a sample of points that were taken with the same
+    chance shows what is dense.
+    """
+    sample = _distinct(sample[~outliers(sample, strength)])[0]
+    if len(sample) < LEAST_POINTS:
+        return np.ones(len(positions), bool)
+    tree = cKDTree(sample)
+    reach = tree.query(sample, NEIGHBOURS + 1, workers=-1)[0][:, 1:].mean(axis=1)
+    distance, nearest = tree.query(positions, workers=-1)
+    return distance <= BESIDE * reach[nearest]
 
 
 def _distinct(positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -120,19 +142,28 @@ def _distinct(positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return ranked[new], rows
 
 
-def _apart(positions: np.ndarray, strength: Strength) -> np.ndarray:
-    """Mask (n,) of outliers among distinct positions (n, 3), n >= LEAST_POINTS."""
-    tree = cKDTree(positions)
-    distances, near = tree.query(positions, NEIGHBOURS + 1, workers=-1)
-    mean = distances[:, 1:].mean(axis=1)
-    expected = np.median(mean[near[:, 1:]], axis=1)
+def _without(apart: np.ndarray, tree: cKDTree, distances: np.ndarray, near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Distances and rows of the neighbours, itself first, of every point that is left; the tree holds these."""
+    distances, near = distances[~apart], near[~apart]
+    lost = apart[near].any(axis=1)
+    near = (np.cumsum(~apart) - 1)[near]
+    if lost.any():
+        distances[lost], near[lost] = tree.query(tree.data[lost], near.shape[1], workers=-1)
+    return distances, near
+
+
+def _apart(tree: cKDTree, distances: np.ndarray, near: np.ndarray, strength: Strength) -> np.ndarray:
+    """Mask (n,) of outliers among distinct points (n, 3), n >= LEAST_POINTS, from their neighbours (n, NEIGHBOURS)."""
+    positions = tree.data
+    mean = distances.mean(axis=1)
+    expected = np.median(mean[near], axis=1)
     sparse = np.flatnonzero(mean > SPARSE * np.median(mean))
     around = tree.query(positions[sparse], min(WIDE, len(positions)), workers=-1)[1]
     expected[sparse] = np.minimum(expected[sparse], np.median(mean[around], axis=1))
     score = np.log(mean / expected)
     middle = np.median(score)
     deviation = 1.4826 * np.median(np.abs(score - middle))  # of a normal distribution with this MAD
-    unlisted = np.bincount(near[:, 1:].ravel(), minlength=len(positions)) == 0
+    unlisted = np.bincount(near.ravel(), minlength=len(positions)) == 0
     borne = np.where(unlisted, UNLISTED, 1.0) * max(DEVIATIONS[strength] * deviation, np.log(LEAST_RATIO[strength]))
     apart = score > middle + borne
     if apart.sum() <= FEW + CHANCE * len(positions):
