@@ -25,7 +25,7 @@ from spnr_jax.kernels import scenes
 from spnr_jax.kernels.cleaning import Clean, beside, cleaned
 from spnr_jax.kernels.facing import facing
 from spnr_jax.kernels.records import PointCloud
-from spnr_jax.kernels.thinning import THINNING, farthest_points, thin_stream
+from spnr_jax.kernels.thinning import THINNING, farthest_points, stacked, thin_stream
 
 MESHES = (".glb", ".gltf", ".obj", ".stl", ".off")
 MESH_POINTS = 4096  # points drawn from a mesh if no number is asked for; the most that training draws
@@ -234,7 +234,7 @@ def _bounded_columns(
             wanted = _sound(columns)
             broken += int(np.count_nonzero(~wanted))
             if cut.crop:
-                positions = np.stack([np.asarray(columns[axis], np.float64) for axis in "xyz"], axis=-1)
+                positions = stacked(columns)
                 low = np.minimum(low, positions[wanted].min(axis=0, initial=np.inf))
                 high = np.maximum(high, positions[wanted].max(axis=0, initial=-np.inf))
                 inside = scenes.in_box(positions, cut.crop)
@@ -250,14 +250,20 @@ def _bounded_columns(
         report(f"{broken:,} of {seen + outside + broken:,} points left out: {BROKEN}")
     if cut.crop and seen + outside:
         report(scenes.cropped(seen, seen + outside, cut.crop, low, high))
-    if seen > capacity:
-        report(f"{len(columns['x'])} of {seen} points kept while reading, the first of each voxel")
-    if seen > capacity and clean != "off":
-        inside = beside(np.stack([np.asarray(columns[axis], np.float64) for axis in "xyz"], axis=-1), sample.positions, clean)
-        if not inside.all():
-            report(f"removed {np.count_nonzero(~inside):,} of them, outliers against a sample of the file")
-        columns = {name: column[inside] for name, column in columns.items()}
-    return columns
+    if seen <= capacity:
+        return columns
+    report(f"{len(columns['x'])} of {seen} points kept while reading, the first of each voxel")
+    return columns if clean == "off" else _beside(columns, sample.positions, clean, report)
+
+
+def _beside(
+    columns: Columns, sample: np.ndarray, strength: Literal["auto", "strong"], report: Callable[[str], None]
+) -> Columns:
+    """The columns without points that lie apart from the sample of their file, of which voxels keep too many."""
+    near = beside(stacked(columns), sample, strength)
+    if not near.all():
+        report(f"removed {np.count_nonzero(~near):,} outliers of {len(near):,} points, told by a sample of the file")
+    return {name: column[near] for name, column in columns.items()}
 
 
 def _sound(columns: Columns) -> np.ndarray:
@@ -280,7 +286,7 @@ def _points_of_columns(columns: Columns, report: Callable[[str], None]):
     """Positions (points, 3) float64, their origin (3,), materials and normals, if any, of useful columns."""
     if not columns or len(columns["x"]) == 0:
         raise UserError("holds 0 points")
-    positions = np.stack([np.asarray(columns[axis], np.float64) for axis in "xyz"], axis=-1)
+    positions = stacked(columns)
     origin = np.zeros(3)
     extent, step = np.ptp(positions, axis=0).max(), np.spacing(np.float32(np.abs(positions).max()))
     if step > COARSEST_STEP * extent > 0:

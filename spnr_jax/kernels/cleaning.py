@@ -142,7 +142,9 @@ def _distinct(positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return ranked[new], rows
 
 
-def _without(apart: np.ndarray, tree: cKDTree, distances: np.ndarray, near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _without(
+    apart: np.ndarray, tree: cKDTree, distances: np.ndarray, near: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Distances and rows of the neighbours, itself first, of every point that is left; the tree holds these."""
     distances, near = distances[~apart], near[~apart]
     lost = apart[near].any(axis=1)

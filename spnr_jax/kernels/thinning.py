@@ -55,11 +55,11 @@ def thin_stream(pieces: Iterable[Columns], capacity: int, most_sampled: int = 0)
     kept: Columns = {}
     sample, voxel, corner = Sample(), None, np.zeros(3)
     for piece in pieces:
-        sample = sampled(sample, _positions(piece), most_sampled)
+        sample = sampled(sample, stacked(piece), most_sampled)
         kept = {name: np.concatenate([kept[name], piece[name]]) if kept else piece[name] for name in piece}
         if len(kept["x"]) <= capacity and voxel is None:
             continue
-        positions = _positions(kept)
+        positions = stacked(kept)
         if voxel is None:
             corner, extent = frame(positions)
             voxel = extent / FINEST
@@ -71,7 +71,8 @@ def thin_stream(pieces: Iterable[Columns], capacity: int, most_sampled: int = 0)
     return kept, sample
 
 
-def _positions(columns: Columns) -> np.ndarray:
+def stacked(columns: Columns) -> np.ndarray:
+    """Positions (points, 3) float64 of columns x, y, z."""
     return np.stack([np.asarray(columns[axis], np.float64) for axis in "xyz"], axis=-1)
 
 
