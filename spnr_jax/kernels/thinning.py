@@ -77,14 +77,18 @@ def stacked(columns: Columns) -> np.ndarray:
 
 
 def first_in_voxels(positions: np.ndarray, voxel: float) -> np.ndarray:
-    """Sorted indices of the first point of positions (n, 3) in each cube of side `voxel`.
+    """Sorted indices of the first point of positions (n, 3) in each cube of side `voxel`."""
+    return np.sort(np.unique(voxel_keys(positions, voxel), return_index=True)[1])
+
+
+def voxel_keys(positions: np.ndarray, voxel: float) -> np.ndarray:
+    """A number for each of positions (n, 3), the same for those in one cube of side `voxel`.
 
     What lies more than 2^20 voxels from 0 falls into the outermost ones.
     """
     half = 2.0 ** (KEY_BITS - 1)
     x, y, z = (np.clip(np.floor(positions.T / voxel), -half, half - 1) + half).astype(np.int64)
-    _, first = np.unique((x << 2 * KEY_BITS) | (y << KEY_BITS) | z, return_index=True)
-    return np.sort(first)
+    return (x << 2 * KEY_BITS) | (y << KEY_BITS) | z
 
 
 def frame(positions: np.ndarray) -> tuple[np.ndarray, float]:

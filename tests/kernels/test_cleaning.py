@@ -110,13 +110,13 @@ def test_materials_are_averaged_with_the_points_and_normals_stay_of_unit_length(
     points = sphere(4000, "even")
     rng = np.random.default_rng(0)
     values = {"normals": points, "base_color": np.repeat(points[:, :1], 3, axis=1) + rng.normal(size=(4000, 3)) * 0.1}
-    means, values = averaged(points, values, 0.2, 0.056)
+    means, values = averaged(points, values, 0.1, 0.056)
     assert len(means) == len(points)
     np.testing.assert_allclose(np.linalg.norm(values["normals"], axis=1), 1, atol=1e-6)
     np.testing.assert_allclose(values["normals"], means, atol=0.1)
     assert np.abs(values["base_color"] - means[:, :1]).mean() < 0.06
     against = np.where(rng.uniform(size=(4000, 1)) < 0.5, points, -points)
-    lengths = np.linalg.norm(averaged(points, {"normals": against}, 0.5, 0.056)[1]["normals"], axis=1)
+    lengths = np.linalg.norm(averaged(points, {"normals": against}, 0.25, 0.056)[1]["normals"], axis=1)
     assert np.all((np.abs(lengths - 1) < 1e-6) | (lengths == 0))
     assert (lengths == 0).any()
 
@@ -151,7 +151,7 @@ def test_a_point_far_away_is_removed_and_the_rest_averaged():
     cleaned, lines = spnr_jax.clean(cloud(np.concatenate([noisy, [[1e30, 0, 0]]])))
     assert np.abs(cleaned.positions).max() < 2
     assert len(lines) == 2
-    assert np.isfinite(averaged(np.concatenate([noisy, [[1e30, 0, 0]]]), {}, 0.1, 0.025)[0]).all()
+    assert np.isfinite(averaged(np.concatenate([noisy, [[1e30, 0, 0]]]), {}, 0.05, 0.025)[0]).all()
 
 
 def test_masked_points_neither_count_nor_stay_where_something_is_done():
