@@ -35,13 +35,15 @@ LEAST_POINTS = 100  # fewer say nothing of what lies apart
 NEIGHBOURS = 8  # of a point whose mean distance counts
 SPARSE = 3.0  # times the median distance, from which on the neighbours may be outliers themselves
 WIDE = 64  # neighbours that are asked then
+ROUND = 16, 0.05  # neighbours of a sparse point, and the share of their variance that the plane has across, on which
+MOST_ROUND = 0.1  # they lie in space and not on a surface: an outlier unless so large a share of all points does
 UNLISTED = 0.6  # of what else is borne, for a point that is among the neighbours of none
 FEW, CHANCE = 4, 3e-4  # points, and share of all, that chance sets apart in a cloud sampled at random
 SURE = 2.0  # of what is borne, from which on even these are outliers
 ROUNDS = 3  # outliers hide others behind them
 DEVIATIONS = {"auto": 7.0, "strong": 5.0}  # standard deviations of the logarithm, from the MAD, that are borne
 LEAST_RATIO = {"auto": 2.0, "strong": 1.6}  # to the neighbours' distance that is always borne: corners have it
-LEAST_DENSE = 1500  # points; of fewer, curvature would count as noise
+LEAST_DENSE = 1500  # points; of fewer, curvature would count as noise, and a bar as points in space
 NOISY = {"auto": 0.45, "strong": 0.25}  # spacings of noise from which on points are averaged
 SAMPLE = 2048  # points at which the noise is measured
 PLANES = 48  # through three neighbours each, of which the best is taken
@@ -180,7 +182,17 @@ def _apart(tree: cKDTree, distances: np.ndarray, near: np.ndarray, strength: Str
     apart = score > middle + borne
     if apart.sum() <= FEW + CHANCE * len(positions):
         apart = score > middle + SURE * borne
+    in_space = sparse[_across(positions[around[:, : ROUND[0]]]) > ROUND[1]]
+    if len(positions) >= LEAST_DENSE and len(in_space) <= MOST_ROUND * len(positions):
+        apart[in_space] = True
     return apart
+
+
+def _across(near: np.ndarray) -> np.ndarray:
+    """Share (n,) of the variance of points (n, k, 3) that lies along its least axis: 0 of a plane, a third of a ball."""
+    offset = near - near.mean(axis=1, keepdims=True)
+    squared = np.linalg.eigvalsh(np.swapaxes(offset, 1, 2) @ offset)
+    return squared[:, 0] / np.maximum(squared.sum(axis=1), np.finfo(np.float64).tiny)
 
 
 def noise(positions: Float[np.ndarray, "points 3"]) -> tuple[float, float]:
