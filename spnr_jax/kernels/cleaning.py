@@ -189,7 +189,7 @@ def _apart(tree: cKDTree, distances: np.ndarray, near: np.ndarray, strength: Str
 
 
 def _across(near: np.ndarray) -> np.ndarray:
-    """Share (n,) of the variance of points (n, k, 3) that lies along its least axis: 0 of a plane, a third of a ball."""
+    """Share (n,) of the variance of points (n, k, 3) along its least axis: 0 of a plane, a third of a ball."""
     offset = near - near.mean(axis=1, keepdims=True)
     squared = np.linalg.eigvalsh(np.swapaxes(offset, 1, 2) @ offset)
     return squared[:, 0] / np.maximum(squared.sum(axis=1), np.finfo(np.float64).tiny)
