@@ -22,15 +22,16 @@ from spnr_jax.formats.point_files import READERS, column_pieces, parse_ply
 from spnr_jax.formats.sensor import sensor_of
 from spnr_jax.formats.up_axis import ROTATIONS, find_up
 from spnr_jax.kernels import scenes
-from spnr_jax.kernels.cleaning import Clean, cleaned
+from spnr_jax.kernels.cleaning import Clean, beside, cleaned
 from spnr_jax.kernels.facing import facing
 from spnr_jax.kernels.records import PointCloud
-from spnr_jax.kernels.thinning import THINNING, farthest_points, thin_stream
+from spnr_jax.kernels.thinning import THINNING, farthest_points, stacked, thin_stream
 
 MESHES = (".glb", ".gltf", ".obj", ".stl", ".off")
 MESH_POINTS = 4096  # points drawn from a mesh if no number is asked for; the most that training draws
 MOST_EVEN = 2**14  # points that are spread evenly over a mesh, in seconds; more lie close enough as they are drawn
 CAPACITY = 2**19  # points of a file that are in memory at most; more are thinned while reading
+SAMPLE = 2**17  # of them that say where a file is dense
 ShownParts = Literal["opaque", "skip"]  # what is made of a mesh's transparent parts
 BROKEN = "NaN, infinity or too large a number"
 CUT_MESH = 2**18  # points drawn from a mesh that something is cut out of
@@ -181,7 +182,7 @@ def _read(
             report(scenes.cropped(int(inside.sum()), count, cut.crop, *box))
             positions, values = positions[inside], {name: column[inside] for name, column in values.items()}
     else:
-        columns = _bounded_columns(path, num_points, cut, report)
+        columns = _bounded_columns(path, num_points, clean, cut, report)
         positions, origin, values = _points_of_columns(columns, report)
         if not cut.asked and (line := scenes.scene_line(positions, seed)):
             report(line)
@@ -215,10 +216,13 @@ def _sampled_mesh(path: Path, count: int, seed: int, transparent_parts: ShownPar
     return points.positions.astype(np.float64), np.zeros(3), values | {"normals": points.normals}
 
 
-def _bounded_columns(path: Path, num_points: int | None, cut: Cut, report: Callable[[str], None]) -> Columns:
+def _bounded_columns(
+    path: Path, num_points: int | None, clean: Clean, cut: Cut, report: Callable[[str], None]
+) -> Columns:
     """The useful columns of a point file inside the box to be cut out.
 
-    They are thinned while reading to CAPACITY points or what `num_points` needs.
+    They are thinned while reading to CAPACITY points or what `num_points` needs; unless `clean` is "off" without those
+    that lie apart in the file.
     """
     capacity, broken, outside = max(CAPACITY, THINNING * (num_points or 0)), 0, 0
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
@@ -230,7 +234,7 @@ def _bounded_columns(path: Path, num_points: int | None, cut: Cut, report: Calla
             wanted = _sound(columns)
             broken += int(np.count_nonzero(~wanted))
             if cut.crop:
-                positions = np.stack([np.asarray(columns[axis], np.float64) for axis in "xyz"], axis=-1)
+                positions = stacked(columns)
                 low = np.minimum(low, positions[wanted].min(axis=0, initial=np.inf))
                 high = np.maximum(high, positions[wanted].max(axis=0, initial=-np.inf))
                 inside = scenes.in_box(positions, cut.crop)
@@ -238,16 +242,28 @@ def _bounded_columns(path: Path, num_points: int | None, cut: Cut, report: Calla
                 wanted = wanted & inside
             yield columns if wanted.all() else {name: column[wanted] for name, column in columns.items()}
 
-    columns, seen = thin_stream(sound_pieces(), capacity)
+    columns, sample = thin_stream(sound_pieces(), capacity, 0 if clean == "off" else SAMPLE)
+    seen = sample.seen
     if broken and not seen + outside:
         raise UserError(f"holds no point that can be used: {BROKEN} in all of its {broken} rows")
     if broken:
         report(f"{broken:,} of {seen + outside + broken:,} points left out: {BROKEN}")
     if cut.crop and seen + outside:
         report(scenes.cropped(seen, seen + outside, cut.crop, low, high))
-    if seen > capacity:
-        report(f"{len(columns['x'])} of {seen} points kept while reading, the first of each voxel")
-    return columns
+    if seen <= capacity:
+        return columns
+    report(f"{len(columns['x'])} of {seen} points kept while reading, the first of each voxel")
+    return columns if clean == "off" else _beside(columns, sample.positions, clean, report)
+
+
+def _beside(
+    columns: Columns, sample: np.ndarray, strength: Literal["auto", "strong"], report: Callable[[str], None]
+) -> Columns:
+    """The columns without points that lie apart from the sample of their file, of which voxels keep too many."""
+    near = beside(stacked(columns), sample, strength)
+    if not near.all():
+        report(f"removed {np.count_nonzero(~near):,} outliers of {len(near):,} points, told by a sample of the file")
+    return {name: column[near] for name, column in columns.items()}
 
 
 def _sound(columns: Columns) -> np.ndarray:
@@ -270,7 +286,7 @@ def _points_of_columns(columns: Columns, report: Callable[[str], None]):
     """Positions (points, 3) float64, their origin (3,), materials and normals, if any, of useful columns."""
     if not columns or len(columns["x"]) == 0:
         raise UserError("holds 0 points")
-    positions = np.stack([np.asarray(columns[axis], np.float64) for axis in "xyz"], axis=-1)
+    positions = stacked(columns)
     origin = np.zeros(3)
     extent, step = np.ptp(positions, axis=0).max(), np.spacing(np.float32(np.abs(positions).max()))
     if step > COARSEST_STEP * extent > 0:

@@ -6,8 +6,12 @@
     noise       distance of the neighbours from the plane that most of them lie close to (least quantile of squares,
                 Rousseeuw 1984): at an edge or a thin wall that is one of the faces, so that neither counts as noise.
                 Around thick noise the neighbourhood grows until it is flat
-    averaging   each point is moved along the normal onto the plane of those around it, twice, as moving least squares
-                do (Alexa et al. 2001), within a radius that the noise gives; its materials become their mean
+    averaging   each point is moved to where it most likely was, and then along the normal onto the plane of those
+                around it, as moving least squares do (Alexa et al. 2001), within a radius that the noise gives; its
+                materials become their mean.  Where it was is Tweedie's formula (Efron 2011), x + sigma^2 times the
+                gradient of the logarithm of the density, which mean m and covariance C of the points around it tell
+                in a window (Hjort & Jones 1996): C^-1 (m - x).  A plane becomes flat, a thin bar keeps its thickness
+    fringe      what noise left in places that few points share, beside those that many do, is removed
 
 NumPy in, NumPy out, near linear in the points; the order of the points does not matter.
 """
@@ -21,6 +25,7 @@ from scipy.spatial import cKDTree
 
 from spnr_jax.errors import UserError
 from spnr_jax.kernels.records import PointCloud
+from spnr_jax.kernels.thinning import voxel_keys
 
 Strength = Literal["auto", "strong"]
 Clean = Literal["auto", "off", "strong"]
@@ -30,13 +35,15 @@ LEAST_POINTS = 100  # fewer say nothing of what lies apart
 NEIGHBOURS = 8  # of a point whose mean distance counts
 SPARSE = 3.0  # times the median distance, from which on the neighbours may be outliers themselves
 WIDE = 64  # neighbours that are asked then
+ROUND = 16, 0.05  # neighbours of a sparse point, and the share of their variance that the plane has across, on which
+MOST_ROUND = 0.1  # they lie in space and not on a surface: an outlier unless so large a share of all points does
 UNLISTED = 0.6  # of what else is borne, for a point that is among the neighbours of none
 FEW, CHANCE = 4, 3e-4  # points, and share of all, that chance sets apart in a cloud sampled at random
 SURE = 2.0  # of what is borne, from which on even these are outliers
 ROUNDS = 3  # outliers hide others behind them
 DEVIATIONS = {"auto": 7.0, "strong": 5.0}  # standard deviations of the logarithm, from the MAD, that are borne
 LEAST_RATIO = {"auto": 2.0, "strong": 1.6}  # to the neighbours' distance that is always borne: corners have it
-LEAST_DENSE = 1500  # points; of fewer, curvature would count as noise
+LEAST_DENSE = 1500  # points; of fewer, curvature would count as noise, and a bar as points in space
 NOISY = {"auto": 0.45, "strong": 0.25}  # spacings of noise from which on points are averaged
 SAMPLE = 2048  # points at which the noise is measured
 PLANES = 48  # through three neighbours each, of which the best is taken
@@ -49,8 +56,12 @@ WIDER = 4  # times as many neighbours
 RADIUS = 2.0  # standard deviations of the noise in that of a neighbour's weight
 LEAST_RADIUS = 1.0  # spacings: the same at least
 AROUND = 64  # points that give a plane
-MOVED = 2  # times that points are moved
+ROWS = 2**13  # points that are moved at a time: their neighbours fit into the cache
+CELL = 1.0, 3.0  # standard deviations of the noise, spacings: side of a voxel that shows the fringe, the larger of both
+CELLS = 27  # voxels that are compared
+THIN = 0.3  # of the points that those hold, for a point of theirs, below which a voxel is fringe
 MOST_MOVED = 2**17  # points that are moved; of more, a part
+BESIDE = 2.0  # times the distance of a sample's neighbours, within which a point belongs to it
 CANCELLED = 0.5  # length of a mean of unit normals below which they contradict each other
 
 
@@ -88,7 +99,9 @@ def cleaned(
     sigma, spacing = noise(positions)
     if sigma > NOISY[strength] * spacing > 0:
         before = len(positions)
-        positions, values = averaged(positions, values, max(RADIUS * sigma, LEAST_RADIUS * spacing), spacing)
+        positions, values = averaged(positions, values, sigma, spacing)
+        kept = ~fringe(positions, max(CELL[0] * sigma, CELL[1] * spacing))
+        positions, values = positions[kept], {name: x[kept] for name, x in values.items()}
         lines.append(f"averaged {before:,} points to {len(positions):,}: noise of {sigma / spacing:.1f} spacings")
     return positions, values, lines
 
@@ -97,16 +110,37 @@ def outliers(positions: Float[np.ndarray, "points 3"], strength: Strength = "aut
     """True for points that are much farther from their neighbours than these from theirs."""
     distinct, copies = _distinct(positions)
     left = np.arange(len(distinct))
+    if len(left) >= LEAST_POINTS:
+        tree = cKDTree(distinct)
+        distances, near = tree.query(distinct, NEIGHBOURS + 1, workers=-1)
     for _ in range(ROUNDS):
         if len(left) < LEAST_POINTS:
             break
-        apart = _apart(distinct[left], strength)
+        apart = _apart(tree, distances[:, 1:], near[:, 1:], strength)
         if not apart.any():
             break
-        left = left[~apart]
+        left, tree = left[~apart], cKDTree(distinct[left[~apart]])
+        distances, near = _without(apart, tree, distances, near)
     removed = np.ones(len(distinct), bool)
     removed[left] = False
     return removed[copies]
+
+
+def beside(
+    positions: Float[np.ndarray, "points 3"], sample: Float[np.ndarray, "some 3"], strength: Strength = "auto"
+) -> Bool[np.ndarray, " points"]:
+    """True for points of a cloud that lie beside a sample of it without the sample's outliers.
+
+    For clouds thinned by voxels, where few outliers have become many: a sample of points that were taken with the same
+    chance shows what is dense.
+    """
+    sample = _distinct(sample[~outliers(sample, strength)])[0]
+    if len(sample) < LEAST_POINTS:
+        return np.ones(len(positions), bool)
+    tree = cKDTree(sample)
+    reach = tree.query(sample, NEIGHBOURS + 1, workers=-1)[0][:, 1:].mean(axis=1)
+    distance, nearest = tree.query(positions, workers=-1)
+    return distance <= BESIDE * reach[nearest]
 
 
 def _distinct(positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -120,24 +154,45 @@ def _distinct(positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return ranked[new], rows
 
 
-def _apart(positions: np.ndarray, strength: Strength) -> np.ndarray:
-    """Mask (n,) of outliers among distinct positions (n, 3), n >= LEAST_POINTS."""
-    tree = cKDTree(positions)
-    distances, near = tree.query(positions, NEIGHBOURS + 1, workers=-1)
-    mean = distances[:, 1:].mean(axis=1)
-    expected = np.median(mean[near[:, 1:]], axis=1)
+def _without(
+    apart: np.ndarray, tree: cKDTree, distances: np.ndarray, near: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Distances and rows of the neighbours, itself first, of every point that is left; the tree holds these."""
+    distances, near = distances[~apart], near[~apart]
+    lost = apart[near].any(axis=1)
+    near = (np.cumsum(~apart) - 1)[near]
+    if lost.any():
+        distances[lost], near[lost] = tree.query(tree.data[lost], near.shape[1], workers=-1)
+    return distances, near
+
+
+def _apart(tree: cKDTree, distances: np.ndarray, near: np.ndarray, strength: Strength) -> np.ndarray:
+    """Mask (n,) of outliers among distinct points (n, 3), n >= LEAST_POINTS, from their neighbours (n, NEIGHBOURS)."""
+    positions = tree.data
+    mean = distances.mean(axis=1)
+    expected = np.median(mean[near], axis=1)
     sparse = np.flatnonzero(mean > SPARSE * np.median(mean))
     around = tree.query(positions[sparse], min(WIDE, len(positions)), workers=-1)[1]
     expected[sparse] = np.minimum(expected[sparse], np.median(mean[around], axis=1))
     score = np.log(mean / expected)
     middle = np.median(score)
     deviation = 1.4826 * np.median(np.abs(score - middle))  # of a normal distribution with this MAD
-    unlisted = np.bincount(near[:, 1:].ravel(), minlength=len(positions)) == 0
+    unlisted = np.bincount(near.ravel(), minlength=len(positions)) == 0
     borne = np.where(unlisted, UNLISTED, 1.0) * max(DEVIATIONS[strength] * deviation, np.log(LEAST_RATIO[strength]))
     apart = score > middle + borne
     if apart.sum() <= FEW + CHANCE * len(positions):
         apart = score > middle + SURE * borne
+    in_space = sparse[_across(positions[around[:, : ROUND[0]]]) > ROUND[1]]
+    if len(positions) >= LEAST_DENSE and len(in_space) <= MOST_ROUND * len(positions):
+        apart[in_space] = True
     return apart
+
+
+def _across(near: np.ndarray) -> np.ndarray:
+    """Share (n,) of the variance of points (n, k, 3) along its least axis: 0 of a plane, a third of a ball."""
+    offset = near - near.mean(axis=1, keepdims=True)
+    squared = np.linalg.eigvalsh(np.swapaxes(offset, 1, 2) @ offset)
+    return squared[:, 0] / np.maximum(squared.sum(axis=1), np.finfo(np.float64).tiny)
 
 
 def noise(positions: Float[np.ndarray, "points 3"]) -> tuple[float, float]:
@@ -175,32 +230,64 @@ def _heights(near: np.ndarray) -> np.ndarray:
 
 
 def averaged(
-    positions: Float[np.ndarray, "points 3"], values: Values, radius: float, spacing: float
+    positions: Float[np.ndarray, "points 3"], values: Values, sigma: float, spacing: float
 ) -> tuple[Float[np.ndarray, "moved 3"], Values]:
-    """Points moved onto the planes of those around them, by weights of this radius, and the means of their values.
+    """Points moved against noise of this standard deviation, at most MOST_MOVED, and the means of their values.
 
     Normals stay of unit length, 0 where they contradict each other.
     """
+    radius = max(RADIUS * sigma, LEAST_RADIUS * spacing)
     order = np.lexsort(positions.T)  # so that a part is spread over the cloud, and the same whatever the points' order
     within = 2 * np.pi * (radius / spacing) ** 2  # points whose weight counts
     basis = order[:: max(1, int(within / AROUND))]
-    moved = positions[order[:: -(-len(order) // MOST_MOVED)]].astype(np.float64)
-    tree, known = cKDTree(positions[basis]), positions[basis].astype(np.float64)
-    for _ in range(MOVED):
-        distances, near = tree.query(moved, min(AROUND, len(basis)), workers=-1)
-        weights = np.exp(-0.5 * (distances / radius) ** 2)
-        weights = weights / np.maximum(weights.sum(axis=1, keepdims=True), 1e-30)
-        middle = np.einsum("nk,nki->ni", weights, known[near])
-        offset = known[near] - middle[:, None]
-        normal = np.linalg.eigh(np.einsum("nk,nki,nkj->nij", weights, offset, offset, optimize=True))[1][..., 0]
-        moved = moved - np.sum((moved - middle) * normal, axis=1, keepdims=True) * normal
-
-    def mean(column: np.ndarray) -> np.ndarray:
-        return np.einsum("nk,nk...->n...", weights, column[basis][near])
-
-    values = {name: mean(column) for name, column in values.items()}
+    start = positions[order[:: -(-len(order) // MOST_MOVED)]].astype(np.float64)
+    known = positions[basis].astype(np.float64)
+    tree, columns = cKDTree(known), {name: column[basis] for name, column in values.items()}
+    pieces = [_moved(start[i : i + ROWS], tree, known, columns, sigma, radius) for i in range(0, len(start), ROWS)]
+    moved = np.concatenate([piece for piece, _ in pieces])
+    values = {name: np.concatenate([means[name] for _, means in pieces]) for name in values}
     if "normals" in values:
         length = np.linalg.norm(values["normals"], axis=1, keepdims=True)
         agreed = length > CANCELLED
         values["normals"] = np.where(agreed, values["normals"] / np.where(agreed, length, 1), 0)
     return moved, values
+
+
+def _moved(
+    start: np.ndarray, tree: cKDTree, known: np.ndarray, columns: Values, sigma: float, radius: float
+) -> tuple[np.ndarray, Values]:
+    """Points (n, 3) moved, and the means of the columns of the known ones around where they are then."""
+    near, weights = _around(start, tree, radius)
+    towards, squared, axes = _spread(start, known[near], weights)
+    squared = np.maximum(squared, 1 / (1 / sigma**2 + 1 / radius**2))  # the least that a window of noise leaves
+    moved = start + np.einsum("nij,nj->ni", axes, sigma**2 / squared * towards)
+    near, weights = _around(moved, tree, radius)
+    towards, _, axes = _spread(moved, known[near], weights)
+    moved = moved + towards[:, :1] * axes[..., 0]
+    return moved, {name: np.einsum("nk,nk...->n...", weights, column[near]) for name, column in columns.items()}
+
+
+def _around(points: np.ndarray, tree: cKDTree, radius: float) -> tuple[np.ndarray, np.ndarray]:
+    """Rows (n, k) of the neighbours of points (n, 3), and their weights, of sum 1."""
+    distances, near = tree.query(points, list(range(1, min(AROUND, tree.n) + 1)), workers=-1)
+    weights = np.exp(-0.5 * (distances / radius) ** 2)
+    return near, weights / np.maximum(weights.sum(axis=1, keepdims=True), 1e-30)
+
+
+def _spread(points: np.ndarray, near: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Way to the mean of the neighbours (n, k, 3) along the axes of their covariance, its eigenvalues, and the axes."""
+    offset = near - points[:, None]
+    mean = (weights[:, None] @ offset)[:, 0]
+    offset = (offset - mean[:, None]) * np.sqrt(weights)[..., None]
+    squared, axes = np.linalg.eigh(np.swapaxes(offset, 1, 2) @ offset)
+    return np.einsum("nij,ni->nj", axes, mean), squared, axes
+
+
+def fringe(positions: Float[np.ndarray, "points 3"], side: float) -> Bool[np.ndarray, " points"]:
+    """True for points in voxels of this side that hold far fewer than the voxels of the points around them."""
+    _, first, rows, count = np.unique(
+        voxel_keys(positions - positions.min(axis=0), side), return_index=True, return_inverse=True, return_counts=True
+    )
+    centres = positions[first]
+    near = cKDTree(centres).query(centres, list(range(1, min(CELLS, len(centres)) + 1)), workers=-1)[1]
+    return (count < THIN * (count[near] ** 2).sum(axis=1) / count[near].sum(axis=1))[rows.ravel()]

@@ -5,6 +5,7 @@ that the result depends on the points and their order alone.  Memory and time of
 thinning with voxels first.
 """
 
+import dataclasses
 from collections.abc import Iterable
 
 import numpy as np
@@ -22,21 +23,47 @@ FIRST = 256  # farthest points that are found among all; after them a new one is
 FAR = 0.95  # of the largest squared distance, from which on points are looked at for the farthest
 BEYOND = 1 + 1e-5  # times the distance within which points are asked for, whatever single precision makes of it
 KEY_BITS = 21  # of a voxel's index along an axis
+SCATTER = np.uint64(0x9E3779B97F4A7C15)  # odd, 2^64 over the golden ratio: multiples of it are spread over 0..2^64 - 1
 
 
-def thin_stream(pieces: Iterable[Columns], capacity: int) -> tuple[Columns, int]:
-    """The columns of all pieces, thinned evenly to `capacity` points where there are more, and how many there were.
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Sample:
+    """Rows of a stream, each with the same chance, whatever lies around it: where many points lie many are taken."""
 
-    No more than the kept points and one piece are in memory.  Where they are too many the voxels are doubled.
+    positions: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
+    keys: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0, np.uint64))
+    seen: int = 0
+    halvings: int = 0  # of the share that is taken
+
+
+def sampled(sample: Sample, positions: np.ndarray, most: int) -> Sample:
+    """The sample of at most so many points after the stream's next positions (n, 3)."""
+    keys = np.arange(sample.seen + 1, sample.seen + len(positions) + 1, dtype=np.uint64) * SCATTER
+    seen, halvings = sample.seen + len(positions), sample.halvings
+    taken = keys >> np.uint64(64 - halvings) == 0 if halvings else slice(None)
+    positions = np.concatenate([sample.positions, positions[taken]])
+    keys = np.concatenate([sample.keys, keys[taken]])
+    while len(keys) > most:
+        halvings += 1
+        taken = keys >> np.uint64(64 - halvings) == 0
+        positions, keys = positions[taken], keys[taken]
+    return Sample(positions=positions, keys=keys, seen=seen, halvings=halvings)
+
+
+def thin_stream(pieces: Iterable[Columns], capacity: int, most_sampled: int = 0) -> tuple[Columns, Sample]:
+    """The columns of all pieces, thinned evenly to `capacity` points where there are more, and a sample of all.
+
+    No more than the kept points, the sample and one piece are in memory.  Where the kept ones are too many the voxels
+    are doubled.
     """
     kept: Columns = {}
-    seen, voxel, corner = 0, None, np.zeros(3)
+    sample, voxel, corner = Sample(), None, np.zeros(3)
     for piece in pieces:
-        seen += len(piece["x"])
+        sample = sampled(sample, stacked(piece), most_sampled)
         kept = {name: np.concatenate([kept[name], piece[name]]) if kept else piece[name] for name in piece}
         if len(kept["x"]) <= capacity and voxel is None:
             continue
-        positions = np.stack([np.asarray(kept[axis], np.float64) for axis in "xyz"], axis=-1)
+        positions = stacked(kept)
         if voxel is None:
             corner, extent = frame(positions)
             voxel = extent / FINEST
@@ -45,18 +72,27 @@ def thin_stream(pieces: Iterable[Columns], capacity: int) -> tuple[Columns, int]
             voxel *= 2
             first = first[first_in_voxels(positions[first] - corner, voxel)]
         kept = {name: values[first] for name, values in kept.items()}
-    return kept, seen
+    return kept, sample
+
+
+def stacked(columns: Columns) -> np.ndarray:
+    """Positions (points, 3) float64 of columns x, y, z."""
+    return np.stack([np.asarray(columns[axis], np.float64) for axis in "xyz"], axis=-1)
 
 
 def first_in_voxels(positions: np.ndarray, voxel: float) -> np.ndarray:
-    """Sorted indices of the first point of positions (n, 3) in each cube of side `voxel`.
+    """Sorted indices of the first point of positions (n, 3) in each cube of side `voxel`."""
+    return np.sort(np.unique(voxel_keys(positions, voxel), return_index=True)[1])
+
+
+def voxel_keys(positions: np.ndarray, voxel: float) -> np.ndarray:
+    """A number for each of positions (n, 3), the same for those in one cube of side `voxel`.
 
     What lies more than 2^20 voxels from 0 falls into the outermost ones.
     """
     half = 2.0 ** (KEY_BITS - 1)
     x, y, z = (np.clip(np.floor(positions.T / voxel), -half, half - 1) + half).astype(np.int64)
-    _, first = np.unique((x << 2 * KEY_BITS) | (y << KEY_BITS) | z, return_index=True)
-    return np.sort(first)
+    return (x << 2 * KEY_BITS) | (y << KEY_BITS) | z
 
 
 def frame(positions: np.ndarray) -> tuple[np.ndarray, float]:

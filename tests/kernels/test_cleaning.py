@@ -3,7 +3,7 @@ import pytest
 from support.surfel_clouds import cloud, even_square
 
 import spnr_jax
-from spnr_jax.kernels.cleaning import averaged, noise, outliers
+from spnr_jax.kernels.cleaning import averaged, beside, noise, outliers
 from spnr_jax.surfels.visibility import spiral
 
 SIZE = np.array([1.0, 0.7, 0.5])
@@ -78,6 +78,17 @@ def test_nine_in_ten_uniform_outliers_go_and_the_surface_stays(shape, count):
     assert np.mean([mask[: -(count // 100)] for mask in apart]) < 0.001
 
 
+def test_outliers_that_thinning_made_many_are_told_by_a_sample_of_the_cloud():
+    """Of 200,000 points with 1 % outliers voxels keep 10,000 and all of those."""
+    rng = np.random.default_rng(0)
+    sample = np.concatenate([sphere(10000, "random"), rng.uniform(-2, 2, (100, 3))])
+    surface, apart = sphere(10000, "even"), rng.uniform(-2, 2, (2000, 3))
+    apart = apart[from_sphere(apart) > 0.1]
+    assert beside(surface, sample).mean() > 0.999
+    assert beside(apart, sample).mean() < 0.02
+    assert outliers(np.concatenate([surface, apart]))[len(surface) :].mean() < 0.98  # it was needed
+
+
 @pytest.mark.parametrize(("shape", "distance"), [("sphere", from_sphere), ("box", from_box)])
 def test_averaging_takes_three_quarters_of_the_noise_of_one_per_cent(shape, distance):
     surface = SHAPES[shape](60000, "random")
@@ -99,13 +110,13 @@ def test_materials_are_averaged_with_the_points_and_normals_stay_of_unit_length(
     points = sphere(4000, "even")
     rng = np.random.default_rng(0)
     values = {"normals": points, "base_color": np.repeat(points[:, :1], 3, axis=1) + rng.normal(size=(4000, 3)) * 0.1}
-    means, values = averaged(points, values, 0.2, 0.056)
+    means, values = averaged(points, values, 0.1, 0.056)
     assert len(means) == len(points)
     np.testing.assert_allclose(np.linalg.norm(values["normals"], axis=1), 1, atol=1e-6)
     np.testing.assert_allclose(values["normals"], means, atol=0.1)
     assert np.abs(values["base_color"] - means[:, :1]).mean() < 0.06
     against = np.where(rng.uniform(size=(4000, 1)) < 0.5, points, -points)
-    lengths = np.linalg.norm(averaged(points, {"normals": against}, 0.5, 0.056)[1]["normals"], axis=1)
+    lengths = np.linalg.norm(averaged(points, {"normals": against}, 0.25, 0.056)[1]["normals"], axis=1)
     assert np.all((np.abs(lengths - 1) < 1e-6) | (lengths == 0))
     assert (lengths == 0).any()
 
@@ -140,7 +151,7 @@ def test_a_point_far_away_is_removed_and_the_rest_averaged():
     cleaned, lines = spnr_jax.clean(cloud(np.concatenate([noisy, [[1e30, 0, 0]]])))
     assert np.abs(cleaned.positions).max() < 2
     assert len(lines) == 2
-    assert np.isfinite(averaged(np.concatenate([noisy, [[1e30, 0, 0]]]), {}, 0.1, 0.025)[0]).all()
+    assert np.isfinite(averaged(np.concatenate([noisy, [[1e30, 0, 0]]]), {}, 0.05, 0.025)[0]).all()
 
 
 def test_masked_points_neither_count_nor_stay_where_something_is_done():

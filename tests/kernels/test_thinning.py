@@ -65,25 +65,38 @@ def test_a_voxel_keeps_the_first_of_its_points():
 def test_a_stream_that_fits_is_kept_as_it_is_whatever_its_pieces():
     positions = sphere_points(0, 100)
     for size in (7, 50, 100):
-        kept, seen = thin_stream(pieces_of(positions, size), capacity=100)
-        assert seen == 100
+        kept, sample = thin_stream(pieces_of(positions, size), capacity=100)
+        assert sample.seen == 100
         np.testing.assert_array_equal(kept["tag"], np.arange(100))
         np.testing.assert_array_equal(kept["y"], positions[:, 1])
-    assert thin_stream([], capacity=3) == ({}, 0)
+    nothing, sample = thin_stream([], capacity=3)
+    assert (nothing, sample.seen) == ({}, 0)
 
 
 @pytest.mark.parametrize("size", [500, 20_000])
 def test_a_stream_that_is_too_long_is_thinned_evenly_and_rows_stay_together(size):
     positions, capacity = sphere_points(1, 20_000), 800
-    kept, seen = thin_stream(pieces_of(positions, size), capacity)
+    kept, sample = thin_stream(pieces_of(positions, size), capacity)
     rows = kept["tag"].astype(int)
-    assert seen == 20_000
+    assert sample.seen == 20_000
     assert capacity / 8 <= len(rows) <= capacity
     np.testing.assert_array_equal(np.stack([kept[axis] for axis in "xyz"], axis=-1), positions[rows])
     gap, _ = cKDTree(positions[rows]).query(positions)
     random = np.random.default_rng(0).choice(20_000, len(rows), replace=False)
     random_gap, _ = cKDTree(positions[random]).query(positions)
     assert gap.max() < 0.7 * random_gap.max()
+
+
+@pytest.mark.parametrize("size", [77, 20_000])
+def test_the_sample_of_a_stream_is_as_dense_as_the_stream_whatever_its_pieces(size):
+    positions = sphere_points(1, 20_000)
+    positions[:15_000] *= 0.1
+    whole = thin_stream(pieces_of(positions, 20_000), 100, 1000)[1]
+    sample = thin_stream(pieces_of(positions, size), 100, 1000)[1]
+    np.testing.assert_array_equal(sample.positions, whole.positions)
+    assert 500 <= len(sample.positions) <= 1000
+    np.testing.assert_allclose(np.mean(np.linalg.norm(sample.positions, axis=1) < 0.5), 0.75, atol=0.02)
+    assert len(thin_stream(pieces_of(positions, size), 100)[1].positions) == 0
 
 
 def test_points_far_outside_do_not_make_the_voxels_of_the_others_larger():
