@@ -25,6 +25,7 @@ from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.images import write_whole
 from spnr_jax.formats.light_files import read_envmap
+from spnr_jax.formats.mesh.assets import Asset
 from spnr_jax.scoring.evaluation import Pictures
 from spnr_jax.surfels.room import indoor_envmap
 
@@ -53,11 +54,15 @@ class Renderer:
             asset = poisson_surface.reconstruct(jax.tree.map(lambda x: np.asarray(x)[:num_points], item.cloud), surface)
         except poisson_surface.NoSurface as error:
             return np.zeros(item.images.shape, np.uint8), str(error)
+        return self.drawn(asset, item), ""
+
+    def drawn(self, asset: Asset, item: data_sets.ObjectData) -> np.ndarray:
+        """Straight-alpha sRGB (views, height, width, 4) uint8 of any asset from the object's cameras."""
         scene = views.build_scene(asset, self._light)
         poses = np.tile(np.eye(4), (len(item.images), 1, 1))
         poses[:, :3] = item.camera.cam_to_world
         radiance = [views.render_view(scene, p, self._view, self._seed + view) for view, p in enumerate(poses)]
-        return np.stack([views.straight_srgb(r) for r in radiance]), ""
+        return np.stack([views.straight_srgb(r) for r in radiance])
 
 
 def view_config(settings: dict) -> views.ViewConfig:

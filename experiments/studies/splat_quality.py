@@ -1,19 +1,22 @@
-"""What is lost when a network's object becomes Gaussian splats?
+"""What is lost when a network's object becomes Gaussian splats, or a mesh?
 
     python -m experiments.studies.splat_quality --data DIR --out OUT [--objects 4] [--views 2] [--seconds 20]
 
 The network draws test objects of a data set at its cameras; so do their splats (`spnr_jax.splats`), once drawn by this
 package (gaussians/drawing.py) and once by Mitsuba (`volprim_rf_basic` on the .ply that the package writes: a reader and
-a renderer that share nothing with it).  Each is compared with the reference, and the splats with the network.
+a renderer that share nothing with it), and the mesh of `spnr render --mesh`, which Mitsuba draws in the data set's own
+light.  Each is compared with the reference, and the others with the network.
 
-    OUT/results.json  OUT/table.md .csv .tex   PSNR of whole pictures and inside the silhouettes, by size
-    OUT/gallery.png                            reference, network, both pictures of the splats, at the largest size
+    OUT/results.json  OUT/table.md .csv .tex   PSNR of whole pictures and inside the silhouettes, by size and by object
+    OUT/gallery.png                            reference, network, splats, mesh at the largest size; megabytes, s, dB
 
-Mitsuba draws the scene a hundred times as large: it steps 1e-4 past each hit, and thin splats of a unit scene are
-skipped.  It gives no opacity: that is what the same splats in white show.
+An object's scores are kept in OUT/scores, so objects can be asked for one at a time (--names), and then all together.
+Refining ends by the clock.  On a machine that does much else, --step-seconds says what a step is to count for: what it
+takes on that machine alone.
 """
 
 import dataclasses
+import itertools
 import time
 from dataclasses import dataclass
 from functools import partial
@@ -25,23 +28,22 @@ import numpy as np
 
 from data_gen.render.variant import choose_variant
 from experiments import entry_point
-from experiments.comparison import figures, results_folder
+from experiments.comparison import exported_mesh, figures, poisson, results_folder, splats_by_mitsuba
 from experiments.comparison.result_tables import Cell, Table, number
-from experiments.studies.sharpness import told, view_of
+from experiments.studies.sharpness import smaller, told, view_of
 from spnr_jax.devices import machine
+from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets, gaussian_files, images
 from spnr_jax.gaussians import drawing
-from spnr_jax.gaussians.harmonics import C0
 from spnr_jax.gaussians.placing import View
-from spnr_jax.kernels.records import Camera, Gaussians
+from spnr_jax.kernels.records import Gaussians, PointCloud
 from spnr_jax.method.model import Model, Volume
 from spnr_jax.scoring.picture_scores import sharpness
-from spnr_jax.tools.splat_making import drawn_views, fitting_cameras, in_box, splats_in_box
+from spnr_jax.tools import splat_making
+from spnr_jax.tools.splat_making import drawn_views, fitting_cameras, in_box
 from spnr_jax.training.weights import load
 
-LARGER = 100.0  # times, the scene for Mitsuba
-METHODS = ("network", "splats", "splats, by Mitsuba")
-HALF_TURN = np.diag([1.0, -1.0, -1.0, 1.0])  # y up <-> the axes of a .ply of splats
+METHODS = ("network", "splats", "splats, by Mitsuba", "mesh, by Mitsuba")
 SIZES = (128, 512)
 
 
@@ -67,10 +69,14 @@ class SplatStudy:
     """Pixels along each side."""
     seconds: float = 20.0
     """Seconds of refining."""
+    step_seconds: float | None = None
+    """Seconds that a step of it counts for (default: those that it takes)."""
     most: int = 80_000
     """Splats of an object at most."""
     degree: int = 1
     """Of their spherical harmonics."""
+    mesh_run: str = "small"
+    """Network of the mesh, one that has a density."""
     fitting_views: int = 32
     """Pictures that splats are made from."""
     fitting_resolution: int = 512
@@ -79,62 +85,121 @@ class SplatStudy:
     """Rays a pixel of Mitsuba's pictures."""
 
 
+Drawn = tuple[np.ndarray, np.ndarray]  # a picture on white (sRGB), and opacity
+
+
 def main(options: SplatStudy) -> None:
     """Makes, draws, scores and writes."""
     dataset = data_sets.open_dataset(options.data)
     everyone = dataset.splits["test"]
     names = options.names or everyone[:: max(len(everyone) // options.objects, 1)][: options.objects]
     asked = {k: str(v) if isinstance(v, Path) else v for k, v in dataclasses.asdict(options).items()}
-    results_folder.claim(options.out, "splat_quality", asked | {"out": "", "objects": list(names)}, dataset)
-    mitsuba.set_variant(choose_variant()[0])
-    model, rows = load(options.run), {}
+    which = ("out", "names", "objects")  # those that are made in one go
+    results_folder.claim(options.out, "splat_quality", {k: v for k, v in asked.items() if k not in which}, dataset)
+    variant = choose_variant()[0]
+    mitsuba.set_variant(variant)
+    renderer, rows = poisson.Renderer(dataset.settings, variant=variant), {}
+    models = load(options.run), load(options.mesh_run)
     for name in names:
         item = data_sets.read_object(dataset, name)
         place = options.out / "scores" / f"{name}.json"
-        rows[name] = results_folder.kept(place, partial(_scores, options, model, item))
+        rows[name] = results_folder.kept(place, partial(_scores, options, models, renderer, item))
         print(name, rows[name], flush=True)
     cells = [[_shown(options, name, method) for method in ("reference", *METHODS)] for name in names]
-    images.write_whole(
-        options.out / "gallery.png",
-        images.png(figures.grid(cells, ("reference", *METHODS), names, size=256)),
-    )
-    results_folder.write(options.out, {"objects": rows, "hardware": machine.hardware()}, [_table(options, rows)])
+    captions = [["", *(_caption(rows[name], method, options.sizes[-1]) for method in METHODS)] for name in names]
+    picture = figures.grid(cells, ("reference", *METHODS), names, size=256, below=captions)
+    images.write_whole(options.out / "gallery.png", images.png(picture))
+    tables = [_table(options, rows), *(_by_object(rows, size) for size in options.sizes)]
+    results_folder.write(options.out, {"objects": rows, "hardware": machine.hardware()}, tables)
 
 
-def _scores(options: SplatStudy, model: Model, item: data_sets.ObjectData) -> dict:
-    """Decibels by size and method, the number of splats, the megabytes as .spz, and seconds."""
+def _scores(
+    options: SplatStudy, models: tuple[Model, Model], renderer: poisson.Renderer, item: data_sets.ObjectData
+) -> dict:
+    """Decibels by size and method; numbers of splats and faces, megabytes as .spz and .glb, and seconds."""
     cloud = told(jax.tree.map(lambda x: x[: options.num_points], item.cloud), normals=False)
-    volume, said = model.encode(cloud), list[str]()
-    pictures = _pictures(options, model, volume, item.name)
-    begin = time.perf_counter()
-    made = splats_in_box(pictures, volume, cloud, options.degree, options.most, options.seconds, said.append)
-    spz = gaussian_files.spz_of(made)
-    found = {
-        "splats": len(made.opacity),
-        "spz_mb": len(spz) / 1e6,
-        "seconds": time.perf_counter() - begin,
-        "said": said,
-    }
+    model, solid = models
+    volume = model.encode(cloud)
+    made, found = _made(options, _pictures(options, model, volume, item.name), volume, cloud)
+    meshed, of_mesh = _meshed(options, solid, renderer, cloud, item)
+    found |= of_mesh
     for size in options.sizes:
         pairs = [view_of(item, view, size) for view in range(options.views)]
-        drawn: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {method: [] for method in METHODS}
-        for rendering in model.render_each(volume, [camera for camera, _ in pairs]):
-            drawn["network"].append((np.asarray(rendering.image), np.asarray(rendering.acc)))
-        for camera, _ in pairs:
-            drawn["splats"].append(drawing.draw(made, camera))
-            drawn["splats, by Mitsuba"].append(by_mitsuba(made, camera, options.spp, options.out / "mitsuba.ply"))
+        cameras = [camera for camera, _ in pairs]
+        renderings = list(model.render_each(volume, cameras))
+        drawn: dict[str, list[Drawn]] = {
+            "network": [(np.asarray(r.image), np.asarray(r.acc)) for r in renderings],
+            "splats": [drawing.draw(made, camera) for camera in cameras],
+            "splats, by Mitsuba": [
+                splats_by_mitsuba.drawn(made, camera, options.spp, options.out / f"{item.name}.ply")
+                for camera in cameras
+            ],
+            "mesh, by Mitsuba": [_at(rgba, size) for rgba in meshed],
+        }
+        (options.out / f"{item.name}.ply").unlink()
         for method, shown in drawn.items():
-            scores = [sharpness(*picture, reference) for picture, (_, reference) in zip(shown, pairs, strict=True)]
-            beside = [_decibels(a[0], b[0]) for a, b in zip(shown, drawn["network"], strict=True)]
-            found[f"{method}, {size}"] = {
-                "psnr": float(np.mean([s.psnr for s in scores])),
-                "inside": float(np.nanmean([s.psnr_inside for s in scores])),
-                "network": float(np.mean(beside)),
-            }
+            found[f"{method}, {size}"] = _scored(shown, [reference for _, reference in pairs], drawn["network"])
             images.write_whole(options.out / item.name / f"{method}.png", images.png(shown[0][0]))
         reference = data_sets.on_white(images.to_uint8(pairs[0][1]))
         images.write_whole(options.out / item.name / "reference.png", images.png(reference))
     return found
+
+
+def _made(options: SplatStudy, pictures: list[View], volume: Volume, cloud: PointCloud) -> tuple[Gaussians, dict]:
+    """The splats in the box, their number, the megabytes as .spz, steps of refining and the seconds of all that."""
+    begin = time.perf_counter()
+    made, steps = splat_making.placed(pictures, volume, cloud, options.degree, options.most), 0
+    placed = time.perf_counter() - begin
+    if options.seconds > 0:
+        each = options.step_seconds
+        clock = time.monotonic if each is None else partial(next, itertools.count(0, each))
+        made, steps = splat_making.refined(made, pictures, options.seconds, clock)
+    spz = len(gaussian_files.spz_of(made)) / 1e6
+    seconds = {"placing_seconds": placed, "splat_seconds": time.perf_counter() - begin}
+    return made, {"splats": len(made.opacity), "spz_mb": spz, "steps": steps} | seconds
+
+
+def _meshed(
+    options: SplatStudy, solid: Model, renderer: poisson.Renderer, cloud: PointCloud, item: data_sets.ObjectData
+) -> tuple[np.ndarray, dict]:
+    """Pictures (views, height, width, 4) of the object's mesh, sRGB with straight alpha, and what it is.
+
+    Where the network shows no surface they are empty.
+    """
+    begin = time.perf_counter()
+    try:
+        mesh = exported_mesh.exported(solid, cloud)
+    except UserError as error:
+        nothing = {"faces": 0, "glb_mb": 0.0, "watertight": False, "empty": str(error)}
+        return np.zeros(item.images[: options.views].shape, np.uint8), nothing | {"mesh_seconds": 0.0}
+    found = {"faces": mesh.faces, "glb_mb": mesh.size / 1e6, "watertight": mesh.watertight, "empty": ""}
+    found["mesh_seconds"] = time.perf_counter() - begin
+    seen = dataclasses.replace(
+        item,
+        images=item.images[: options.views],
+        camera=jax.tree.map(lambda x: x[: options.views], item.camera),
+    )
+    return renderer.drawn(mesh.asset, seen), found
+
+
+def _at(rgba: np.ndarray, size: int) -> Drawn:
+    """A picture (height, width, 4) uint8 on white at a size of which its own is a multiple, and its opacity."""
+    picture = rgba.astype(np.float32) / 255
+    if size != len(picture):
+        picture = smaller(picture, len(picture) // size)
+    alpha = picture[..., 3:]
+    return picture[..., :3] * alpha + 1 - alpha, picture[..., 3]
+
+
+def _scored(shown: list[Drawn], references: list[np.ndarray], of_network: list[Drawn]) -> dict[str, float]:
+    """Mean decibels of some views: whole, inside the silhouettes, and against the network's pictures."""
+    scores = [sharpness(*picture, reference) for picture, reference in zip(shown, references, strict=True)]
+    beside = [_decibels(one[0], other[0]) for one, other in zip(shown, of_network, strict=True)]
+    return {
+        "psnr": float(np.mean([s.psnr for s in scores])),
+        "inside": float(np.nanmean([s.psnr_inside for s in scores])),
+        "network": float(np.mean(beside)),
+    }
 
 
 def _pictures(options: SplatStudy, model: Model, volume: Volume, name: str) -> list[View]:
@@ -150,41 +215,6 @@ def _pictures(options: SplatStudy, model: Model, volume: Volume, name: str) -> l
     return [View(*each) for each in zip(inside, *arrays, strict=True)]
 
 
-def by_mitsuba(gaussians: Gaussians, camera: Camera, spp: int, place: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Picture on white (sRGB) and opacity by Mitsuba, which reads the splats from a .ply at `place`."""
-    white = np.zeros_like(gaussians.harmonics)
-    white[:, 0] = 0.5 / C0
-    light, opacity = (
-        _composited(dataclasses.replace(gaussians, harmonics=harmonics), camera, spp, place)
-        for harmonics in (gaussians.harmonics, white)
-    )
-    return light + 1 - opacity, opacity.mean(axis=-1)
-
-
-def _composited(gaussians: Gaussians, camera: Camera, spp: int, place: Path) -> np.ndarray:
-    """Colours (sRGB) weighted by the opacity, (height, width, 3)."""
-    larger = dataclasses.replace(gaussians, position=gaussians.position * LARGER, scale=gaussians.scale * LARGER)
-    gaussian_files.write_splats(place, larger)
-    pose = np.eye(4)
-    pose[:3] = camera.cam_to_world
-    pose[:3, 3] *= LARGER
-    size, focal = camera.width, float(camera.intrinsics[0, 0])
-    film = {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
-    sensor = {
-        "type": "perspective",
-        "fov": float(np.rad2deg(2 * np.arctan(0.5 * size / focal))),
-        "near_clip": 0.1,
-        "far_clip": 1e5,
-        "to_world": mitsuba.ScalarTransform4f((HALF_TURN @ pose @ np.diag([-1.0, 1.0, -1.0, 1.0])).astype(np.float32)),
-        "film": film | {"component_format": "float32"},
-        "sampler": {"type": "multijitter", "sample_count": spp},
-    }
-    splats_of_file = {"type": "ellipsoids", "filename": str(place)}
-    scene = {"type": "scene", "integrator": {"type": "volprim_rf_basic"}, "splats": splats_of_file, "sensor": sensor}
-    linear = np.maximum(np.array(mitsuba.render(mitsuba.load_dict(scene), spp=spp)), 0)
-    return np.where(linear > 0.0031308, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055, 12.92 * linear)
-
-
 def _decibels(one: np.ndarray, other: np.ndarray) -> float:
     squared = float(np.mean((one - other) ** 2))
     return 100.0 if squared == 0 else float(-10 * np.log10(squared))
@@ -192,6 +222,15 @@ def _decibels(one: np.ndarray, other: np.ndarray) -> float:
 
 def _shown(options: SplatStudy, name: str, method: str) -> np.ndarray:
     return results_folder.kept(options.out / name / f"{method}.png", lambda: None)
+
+
+def _caption(row: dict, method: str, size: int) -> str:
+    """What stands below a picture: its decibels, and of what is a file its megabytes and seconds."""
+    told = {
+        "splats": f"{row['spz_mb']:.1f} MB, {row['splat_seconds']:.0f} s, ",
+        "mesh, by Mitsuba": f"{row['glb_mb']:.1f} MB, {row['mesh_seconds']:.0f} s, ",
+    }
+    return f"{told.get(method, '')}{row[f'{method}, {size}']['psnr']:.1f} dB"
 
 
 def _table(options: SplatStudy, rows: dict) -> Table:
@@ -203,12 +242,28 @@ def _table(options: SplatStudy, rows: dict) -> Table:
             means = [float(np.mean([scores[name] for scores in found])) for name in ("psnr", "inside", "network")]
             of_network = number(None if method == "network" else means[2], 1)
             made.append((f"{method}, {size} px", (number(means[0], 2), number(means[1], 2), of_network)))
-    mean = {name: np.mean([row[name] for row in rows.values()]) for name in ("splats", "spz_mb")}
+    mean = {name: np.mean([row[name] for row in rows.values()]) for name in ("splats", "spz_mb", "glb_mb", "steps")}
+    closed = sum(row["watertight"] for row in rows.values())
     return Table(
-        title=f"Splats, {len(rows)} objects x {options.views} views",
+        title=f"Splats and meshes, {len(rows)} objects x {options.views} views",
         heads=("PSNR, dB", "inside, dB", "against the network, dB"),
         rows=tuple(made),
-        note=f"{mean['splats']:,.0f} splats, {mean['spz_mb']:.1f} MB as .spz on average.",
+        note=f"{mean['splats']:,.0f} splats, {mean['spz_mb']:.1f} MB as .spz, {mean['steps']:.0f} steps; "
+        f"meshes of {mean['glb_mb']:.1f} MB, {closed} of them watertight. Means.",
+    )
+
+
+def _by_object(rows: dict, size: int) -> Table:
+    """A row for each object: what its files hold, and the decibels of each method at a size."""
+
+    def cells(row: dict) -> tuple[Cell, ...]:
+        counts = (number(row["splats"], 0), number(row["spz_mb"], 2), number(row["faces"], 0), number(row["glb_mb"], 2))
+        return *counts, *(number(row[f"{method}, {size}"]["psnr"], 2) for method in METHODS)
+
+    return Table(
+        title=f"By object, {size} px",
+        heads=("splats", ".spz, MB", "faces", ".glb, MB", *(f"{method}, dB" for method in METHODS)),
+        rows=tuple((name, cells(row)) for name, row in rows.items()),
     )
 
 

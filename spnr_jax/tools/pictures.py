@@ -253,9 +253,14 @@ def _solids(ready: Ready, options: Render, name: Path) -> Iterator[Callable[[], 
         content = _saved(lambda file, _: np.savez_compressed(file, **arrays), None)
         yield partial(_write_solid, Path(f"{name}_density.npz"), content)
     if options.mesh:
-        solid = mesh_export.mesh_of(grid, ready.placed, -np.log1p(-MESH_OPACITY) / grid.voxel)
+        solid = mesh_export.mesh_of(grid, ready.placed, mesh_level(grid.voxel))
         details = f" ({solid.faces:,} faces, {'watertight' if solid.watertight else 'not watertight'})"
         yield partial(_write_solid, Path(f"{name}_mesh.glb"), solid.content, details)
+
+
+def mesh_level(voxel: float) -> float:
+    """The density, per unit of the file, at which the surface of a mesh lies; the network's voxels have such sides."""
+    return float(-np.log1p(-MESH_OPACITY) / voxel)
 
 
 def _write_solid(path: Path, content: bytes, details: str = "") -> Written:
