@@ -31,7 +31,7 @@ def is_bug(error: Exception) -> bool:
 
 def one_line(error: Exception) -> str:
     """What an error says, on one line that a person can read whole; an error of the disk with its place."""
-    said = str(error)
+    said = str(error) or type(error).__name__
     if isinstance(error, OSError) and error.strerror:
         said = f"{error.filename or 'disk'}: {error.strerror}"
     line = " ".join(said.split())

@@ -100,8 +100,14 @@ def local_cluster(num_workers: int) -> Iterator[LocalCluster]:
 
 
 async def end_workers(cluster: LocalCluster) -> None:
-    """End a local cluster's workers: soon, and not when their tasks are done."""
-    await asyncio.gather(*(nanny.close(timeout=GRACE) for nanny in cluster.workers.values()))
+    """End a local cluster's workers: soon, and not when their tasks are done.
+
+    One that does not end by itself is killed, and a busy machine may take longer than GRACE to clear it away.
+    """
+    closing = (nanny.close(timeout=GRACE) for nanny in cluster.workers.values())
+    for fault in await asyncio.gather(*closing, return_exceptions=True):
+        if isinstance(fault, BaseException) and not isinstance(fault, TimeoutError):
+            raise fault
 
 
 def run_tasks(client: Client, function: Callable, state: object, tasks: Iterable) -> Generator[tuple, None, None]:

@@ -45,6 +45,14 @@ def test_an_error_in_a_worker_is_raised_in_the_parent_and_the_workers_end(tmp_pa
     assert not [child for child in set(psutil.Process().children(recursive=True)) - before if is_worker(child)]
 
 
+def test_workers_that_a_busy_machine_takes_long_to_clear_away_cost_no_result(tmp_path, monkeypatch):
+    monkeypatch.setattr(cluster, "GRACE", 1e-6)  # nothing ends so fast, not even when it is killed
+    before = set(psutil.Process().children(recursive=True))
+    assert run(tmp_path, [1, 2], 2) == {1: 2, 2: 4}
+    started = [child for child in set(psutil.Process().children(recursive=True)) - before if is_worker(child)]
+    assert not psutil.wait_procs(started, timeout=10)[1]
+
+
 def echo(state, task):
     return state, task, os.getpid()
 
