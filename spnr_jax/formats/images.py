@@ -126,13 +126,31 @@ def _gif(pictures: list[np.ndarray], fps: float | int) -> bytes:
     chosen = np.unique(np.linspace(0, len(pictures) - 1, PALETTE_FRAMES).round().astype(int))
     strip = Image.fromarray(np.concatenate([pictures[i] for i in chosen]))
     palette = strip.quantize(256, method=Image.Quantize.MEDIANCUT, kmeans=2, dither=Image.Dither.NONE)
-    images = [Image.fromarray(picture).quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
+    nearest = _nearest(palette)
+    images = [_indexed(picture, nearest, palette) for picture in pictures]
     milliseconds = round(1 / (fps * CENTISECOND)) * round(1000 * CENTISECOND)
     stream = io.BytesIO()
     images[0].save(
         stream, "gif", save_all=True, append_images=images[1:], duration=milliseconds, loop=0, optimize=False
     )
     return stream.getvalue()
+
+
+def _nearest(palette: Image.Image) -> np.ndarray:
+    """Number of the palette's nearest colour of each cell of 4 x 4 x 4 colours, which Pillow tells no further apart.
+
+    Pillow itself looks for it anew in every picture: 170 ms of one of 512 pixels, a table 10.
+    """
+    cells = np.stack(np.mgrid[0:256:4, 0:256:4, 0:256:4], axis=-1).astype(np.uint8).reshape(512, 512, 3)
+    return np.asarray(Image.fromarray(cells).quantize(palette=palette, dither=Image.Dither.NONE)).reshape(64, 64, 64)
+
+
+def _indexed(picture: np.ndarray, nearest: np.ndarray, palette: Image.Image) -> Image.Image:
+    """The picture in the palette's colours."""
+    red, green, blue = np.moveaxis(picture >> 2, -1, 0)
+    image = Image.fromarray(nearest[red, green, blue])
+    image.putpalette(palette.getpalette() or [])
+    return image
 
 
 def _write_mp4(path: Path, pictures: list[np.ndarray], fps: float | int) -> None:

@@ -18,6 +18,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float, Int
 
+from spnr_jax.devices.side_by_side import two_at_a_time
 from spnr_jax.errors import UserError
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.compositing import WHITE
@@ -115,11 +116,16 @@ def render_each(
     for plan, total in plans:  # those of one resolution share their sizes
         sizes = np.array([plan.width, plan.height, total, LEAST_SLOTS])
         largest[plan[:2]] = np.maximum(largest.get(plan[:2], sizes), sizes)
-    for view, light, (plan, total) in zip(views, lights, plans, strict=True):
+
+    def one(asked: tuple[Camera, Light, tuple[Plan, int]]) -> Rendering:
+        view, light, (plan, total) = asked
         width, height, most, slots = map(int, largest[plan[:2]])
         shared = plan._replace(width=width, height=height)
-        found, largest[plan[:2]][3] = _drawn(variables, scene, view, light, shared, most if total else 0, slots, config)
-        yield found
+        found, slots = _drawn(variables, scene, view, light, shared, most if total else 0, slots, config)
+        largest[plan[:2]][3] = max(slots, largest[plan[:2]][3])
+        return found
+
+    yield from two_at_a_time(one, zip(views, lights, plans, strict=True))
 
 
 def _planned(scene: SurfelScene, camera: Camera) -> tuple[Plan, int]:

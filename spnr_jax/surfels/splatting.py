@@ -225,9 +225,8 @@ def blend(
     sums = [_summed(share, point, wide)]
     sums += [jnp.sum(x, axis=0)[:, None] for x in (share, weight * left, share * depth, share * depth**2)]
     sums += [_summed(sharp, point, narrow), *(jnp.sum(x, axis=0)[:, None] for x in (sharp, sharp * depth))]
-    slot_of = (
-        jnp.full(height * width, slots, jnp.int32).at[pixel_of].set(jnp.arange(slots, dtype=jnp.int32), mode="drop")
-    )
+    slot = jnp.arange(slots, dtype=jnp.int32)
+    slot_of = jnp.full(height * width, slots, jnp.int32).at[pixel_of].set(slot, mode="drop")
     of_slot = jax.lax.optimization_barrier(jnp.pad(jnp.concatenate(sums, axis=1), ((0, 1), (0, 0))))
     of_pixel = of_slot[slot_of].reshape(height, width, -1)
     return _gathered(list(jnp.moveaxis(of_pixel, -1, 0)), attributes.shape[1], camera)
@@ -236,9 +235,10 @@ def blend(
 def _summed(
     weights: Float[Array, "list slots"], point: Int[Array, "list slots"], rows: Float[Array, "points features"]
 ) -> Float[Array, "slots features"]:
-    """Weighted sums of rows over each list; whole rows, place by place in the list, are read ten times faster on a CPU
-    than column by column."""
-    return reduce(add, (weight[:, None] * rows[chosen] for weight, chosen in zip(weights, point, strict=True)))
+    """Weighted sums over each list, whole rows at a time: ten times as fast on a CPU as column by column."""
+    empty = jnp.zeros((point.shape[1], rows.shape[1]), rows.dtype)
+    places = (weights, point)
+    return jax.lax.scan(lambda sums, at: (sums + at[0][:, None] * rows[at[1]], None), empty, places, unroll=8)[0]
 
 
 def _lists(found: Entries, slots: int, pixels: int) -> tuple[Int[Array, "list slots"], Int[Array, " slots"]]:
