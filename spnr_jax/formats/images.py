@@ -19,6 +19,7 @@ from PIL import Image
 from spnr_jax.errors import UserError
 
 OPAQUE = 0.5  # opacity from which a pixel's depth counts for the range of the colours
+PALETTE_PIXELS = 128  # along a side of a frame that the palette is chosen from, at least
 PALETTE_FRAMES = 24  # frames, spread over the film, that choose the colours of a GIF
 CENTISECOND = 0.01  # the clock of a GIF
 
@@ -63,6 +64,17 @@ def npz(*arrays: np.ndarray) -> bytes:
     stream = io.BytesIO()
     np.savez_compressed(stream, *arrays)
     return stream.getvalue()
+
+
+def check_place(path: Path) -> None:
+    """ValueError if no file can be written at a path: it is asked before the work, not after it."""
+    if path.is_dir():
+        raise UserError(f"{path}: a folder; expected the name of a file")
+    above = next(folder for folder in path.absolute().parents if folder.exists())
+    if not above.is_dir():
+        raise UserError(f"{path}: {above} is a file, not a folder; choose another place")
+    if not os.access(above, os.W_OK | os.X_OK):
+        raise UserError(f"{path}: nothing can be written in {above}; choose another place")
 
 
 def write_whole(path: Path, data: bytes) -> None:
@@ -124,33 +136,16 @@ def _quiet_forks() -> Iterator[None]:
 def _gif(pictures: list[np.ndarray], fps: float | int) -> bytes:
     """A GIF that loops; all frames share one palette, or still surfaces would flicker."""
     chosen = np.unique(np.linspace(0, len(pictures) - 1, PALETTE_FRAMES).round().astype(int))
-    strip = Image.fromarray(np.concatenate([pictures[i] for i in chosen]))
+    step = max(min(pictures[0].shape[:2]) // PALETTE_PIXELS, 1)  # of 24 frames of 512 pixels whole, 5.9 s
+    strip = Image.fromarray(np.concatenate([pictures[i][::step, ::step] for i in chosen]))
     palette = strip.quantize(256, method=Image.Quantize.MEDIANCUT, kmeans=2, dither=Image.Dither.NONE)
-    nearest = _nearest(palette)
-    images = [_indexed(picture, nearest, palette) for picture in pictures]
+    images = [Image.fromarray(picture).quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
     milliseconds = round(1 / (fps * CENTISECOND)) * round(1000 * CENTISECOND)
     stream = io.BytesIO()
     images[0].save(
         stream, "gif", save_all=True, append_images=images[1:], duration=milliseconds, loop=0, optimize=False
     )
     return stream.getvalue()
-
-
-def _nearest(palette: Image.Image) -> np.ndarray:
-    """Number of the palette's nearest colour of each cell of 4 x 4 x 4 colours, which Pillow tells no further apart.
-
-    Pillow itself looks for it anew in every picture: 170 ms of one of 512 pixels, a table 10.
-    """
-    cells = np.moveaxis(np.mgrid[0:256:4, 0:256:4, 0:256:4], 0, -1).astype(np.uint8).reshape(512, 512, 3)
-    return np.asarray(Image.fromarray(cells).quantize(palette=palette, dither=Image.Dither.NONE)).reshape(64, 64, 64)
-
-
-def _indexed(picture: np.ndarray, nearest: np.ndarray, palette: Image.Image) -> Image.Image:
-    """The picture in the palette's colours."""
-    red, green, blue = np.moveaxis(picture >> 2, -1, 0)
-    image = Image.fromarray(nearest[red, green, blue])
-    image.putpalette(palette.getpalette() or [])
-    return image
 
 
 def _write_mp4(path: Path, pictures: list[np.ndarray], fps: float | int) -> None:

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from spnr_jax.formats import images
 from spnr_jax.formats.images import depth_image, png, to_uint8, write_turntable, write_whole
 
 
@@ -143,11 +142,3 @@ def test_an_mp4_has_every_frame(tmp_path):
 def test_a_turntable_that_cannot_be_is_refused(tmp_path, name, count, fps, reason):
     with pytest.raises(ValueError, match=reason):
         write_turntable(tmp_path / name, shaded_frames(count), fps)
-
-
-def test_the_frames_of_a_film_take_the_colours_that_pillow_finds_nearest():
-    picture = np.random.default_rng(0).integers(0, 256, (40, 60, 3), dtype=np.uint8)
-    palette = Image.fromarray(picture[:20]).quantize(64, method=Image.Quantize.MEDIANCUT)
-    found = images._indexed(picture, images._nearest(palette), palette)
-    expected = Image.fromarray(picture).quantize(palette=palette, dither=Image.Dither.NONE)
-    assert np.array_equal(found.convert("RGB"), expected.convert("RGB"))
