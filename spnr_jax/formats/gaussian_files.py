@@ -20,7 +20,7 @@ from jaxtyping import Float
 
 from spnr_jax.errors import UserError
 from spnr_jax.formats.glb import packed
-from spnr_jax.formats.images import write_whole
+from spnr_jax.formats.images import check_place, write_whole
 from spnr_jax.formats.ply import vertex_pieces
 from spnr_jax.gaussians.harmonics import C0, degree_of, half_turn_signs
 from spnr_jax.kernels.records import AnyArray, Gaussians
@@ -45,11 +45,10 @@ def write_splats(path: Path, gaussians: Gaussians, note: str = "") -> int:
 
 
 def check_suffix(path: Path) -> None:
-    """ValueError unless the path is that of a file of splats."""
+    """ValueError unless the path is that of a file of splats, where one can be written."""
     if path.suffix.lower() not in SUFFIXES:
         raise UserError(f"{path}: splats are written as {', '.join(SUFFIXES)}, not {path.suffix or 'a folder'}")
-    if path.is_dir():
-        raise UserError(f"{path}: a folder; expected the name of a file of splats")
+    check_place(path)
 
 
 def turned(gaussians: Gaussians) -> Gaussians:

@@ -68,6 +68,7 @@ def export_splats(
 
 def share(options: Share, note: Callable[[str], None]) -> Iterator[str]:
     """Writes the page of a cloud; yields a line about each step, `note` gets the assumptions about the cloud."""
+    images.check_place(options.out)
     lines: list[str] = []
     arguments = options.lighting, options.making, options.num_points, options.up, options.clean
     made = _made(options.cloud, options.run, *arguments, note, lines.append)

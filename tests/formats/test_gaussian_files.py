@@ -114,7 +114,7 @@ def test_a_glb_has_the_attributes_of_the_extension():
 @pytest.mark.parametrize("name", ["out.obj", "out", "folder.ply"])
 def test_another_suffix_or_a_folder_is_refused_in_one_line(tmp_path, name):
     (tmp_path / "folder.ply").mkdir()
-    with pytest.raises(ValueError, match="splats") as refused:
+    with pytest.raises(ValueError, match="splats|a folder") as refused:
         gaussian_files.write_splats(tmp_path / name, splat_balls.ball(10))
     assert "\n" not in str(refused.value)
     assert name in str(refused.value)

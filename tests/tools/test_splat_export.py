@@ -1,12 +1,17 @@
 """`spnr export --splats` and `spnr share`: what they write, and what they refuse in one line."""
 
+import signal
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from support import command_line, splat_balls, tiny_surfels
 
-from spnr_jax.formats import gaussian_files
+from spnr_jax.formats import gaussian_files, images
 from spnr_jax.formats.clouds import read_cloud
-from spnr_jax.tools import splat_export
+from spnr_jax.gaussians.placing import View
+from spnr_jax.tools import splat_export, splat_making
 from spnr_jax.tools.light_options import Lighting
 
 cli = command_line.unchecked_cli()
@@ -69,6 +74,8 @@ def test_a_page_holds_title_credit_and_splats(cloud, tmp_path, capsys):
         (("export", "CLOUD", "--splats", "out.ply", "--most-splats", "300000"), "--most-splats"),
         (("export", "CLOUD", "--light", "studio"), "--splats"),
         (("export", "nowhere.ply", "--splats", "out.ply"), "nowhere.ply"),
+        (("export", "CLOUD", "--splats", "ball.ply/out.ply"), "a file, not a folder"),
+        (("share", "CLOUD", "--out", "ball.ply/page.html"), "a file, not a folder"),
         (("share", "CLOUD", "--out", "page.pdf"), "page.pdf"),
         (("share", "CLOUD", "--background", "light"), "--background"),
         (("share", "CLOUD", "--fitting-views", "1"), "--fitting-views"),
@@ -83,6 +90,67 @@ def test_what_makes_no_sense_is_one_line_and_code_2(cloud, tmp_path, monkeypatch
     assert words in said
     assert said.count("\n") == 1
     assert sorted(path.name for path in tmp_path.iterdir()) == ["ball.ply"]
+
+
+@pytest.mark.parametrize(("command", "option", "name"), [("export", "--splats", "a.ply"), ("share", "--out", "a.html")])
+def test_a_folder_in_the_place_of_the_file_is_refused_before_the_work(cloud, tmp_path, capsys, command, option, name):
+    (tmp_path / name).mkdir()
+    assert made_by(command, cloud, option, tmp_path / name) == 2
+    said = capsys.readouterr().err
+    assert name in said
+    assert said.count("\n") == 1
+    assert not list((tmp_path / name).iterdir())
+
+
+def test_a_place_where_nothing_can_be_written_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(images.os, "access", lambda folder, mode: folder != tmp_path)  # root may write everywhere
+    with pytest.raises(ValueError, match="nothing can be written"):
+        gaussian_files.check_suffix(tmp_path / "new" / "out.spz")
+
+
+@pytest.mark.parametrize(("command", "option", "name"), [("export", "--splats", "a.ply"), ("share", "--out", "a.html")])
+def test_pictures_without_a_surface_are_one_line(cloud, tmp_path, monkeypatch, capsys, command, option, name):
+    def empty(model, volume, cameras, light):
+        size = (cameras[0].height, cameras[0].width)
+        nothing = np.ones((*size, 3), np.float32), np.zeros(size, np.float32), np.full(size, np.nan, np.float32)
+        return [View(splat_making.in_box(camera, volume), *nothing) for camera in cameras]
+
+    monkeypatch.setattr(splat_making, "drawn_views", empty)
+    assert made_by(command, cloud, option, tmp_path / name) == 2
+    said = capsys.readouterr().err
+    assert "no surface" in said.splitlines()[-1]
+    assert "Traceback" not in said
+    assert not (tmp_path / name).exists()
+
+
+def test_ctrl_c_while_a_file_is_written_leaves_what_was_there(cloud, tmp_path, monkeypatch, capsys):
+    out = tmp_path / "out.spz"
+    out.write_bytes(b"before")
+
+    def stopped(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(images.os, "replace", stopped)
+    assert made_by("export", cloud, "--splats", out) == 130
+    assert out.read_bytes() == b"before"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["ball.ply", "out.spz"]
+    assert "Traceback" not in capsys.readouterr().err
+
+
+KILLED = """
+import os, pathlib, signal, sys
+from spnr_jax.formats import images
+images.os.replace = lambda *_: os.kill(os.getpid(), signal.SIGKILL)
+images.write_whole(pathlib.Path(sys.argv[1]), b"half of it")
+"""
+
+
+def test_a_process_that_is_killed_while_it_writes_leaves_no_half_file(tmp_path):
+    out = tmp_path / "page.html"
+    out.write_bytes(b"before")
+    ended = subprocess.run([sys.executable, "-c", KILLED, str(out)], check=False)
+    assert ended.returncode == -signal.SIGKILL
+    assert out.read_bytes() == b"before"
 
 
 def test_a_page_that_is_too_large_is_refused(monkeypatch):

@@ -88,6 +88,30 @@ def test_dragging_turns_the_object_as_a_camera_would_go_around_it(chromium, tmp_
     tab.close()
 
 
+def test_a_coarse_picture_shows_the_same_object_and_rest_brings_the_whole_one(chromium, tmp_path):
+    path, poster = page(tmp_path, 1)
+    tab, said = opened(chromium, path)
+    tab.evaluate("document.querySelectorAll('header, footer').forEach((part) => part.style.display = 'none')")
+    tab.evaluate("viewer.draw(0.5)")
+    assert tab.evaluate("document.getElementById('canvas').width") == SIZE // 2
+    content = tab.screenshot()
+    coarse = np.asarray(Image.open(io.BytesIO(content)).convert("RGB")).astype(np.float32) / 255
+    assert 18 < decibels(coarse, poster) < 40
+    tab.evaluate("viewer.share = 0.3")  # as after a picture that took long
+    tab.evaluate("document.getElementById('canvas').focus()")
+    tab.keyboard.press("ArrowLeft")
+    for _ in range(WAIT // 50):  # no wait_for_function: the page allows no evaluated strings
+        width, frames = tab.evaluate("[document.getElementById('canvas').width, viewer.frames]")
+        if width == SIZE and frames >= 4:
+            break
+        tab.wait_for_timeout(50)
+    assert (width, frames) == (SIZE, 4), "first, coarse, coarse again, whole"
+    tab.evaluate("document.getElementById('canvas').blur()")  # without the ring around what has the keys
+    assert decibels(shown(tab), drawing.draw(splat_balls.ball(), splat_balls.camera(38.0, 20.0, SIZE))[0]) > 28
+    assert not said
+    tab.close()
+
+
 def test_a_title_with_signs_of_html_is_only_text(chromium, tmp_path):
     title = '<b>"chair" & @DATA@</b>'
     path, _ = page(tmp_path, 0, title)
