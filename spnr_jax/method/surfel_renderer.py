@@ -16,8 +16,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
+from spnr_jax.devices.side_by_side import two_at_a_time
 from spnr_jax.errors import UserError
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.compositing import WHITE
@@ -115,11 +116,16 @@ def render_each(
     for plan, total in plans:  # those of one resolution share their sizes
         sizes = np.array([plan.width, plan.height, total, LEAST_SLOTS])
         largest[plan[:2]] = np.maximum(largest.get(plan[:2], sizes), sizes)
-    for view, light, (plan, total) in zip(views, lights, plans, strict=True):
+
+    def one(asked: tuple[Camera, Light, tuple[Plan, int]]) -> Rendering:
+        view, light, (plan, total) = asked
         width, height, most, slots = map(int, largest[plan[:2]])
         shared = plan._replace(width=width, height=height)
-        found, largest[plan[:2]][3] = _drawn(variables, scene, view, light, shared, most if total else 0, slots, config)
-        yield found
+        found, slots = _drawn(variables, scene, view, light, shared, most if total else 0, slots, config)
+        largest[plan[:2]][3] = max(slots, largest[plan[:2]][3])
+        return found
+
+    yield from two_at_a_time(one, zip(views, lights, plans, strict=True))
 
 
 def _planned(scene: SurfelScene, camera: Camera) -> tuple[Plan, int]:
@@ -278,32 +284,29 @@ def _shade(
 def _placed(drawn: Float[AnyArray, "h w 5"], camera: Camera, plan: Plan) -> Rendering:
     """The window in its place in the picture."""
     scale = 2**plan.doublings
-    height, width = (n * plan.side for n in (camera.height, camera.width))
-    values = np.asarray(drawn)
-    top, left = plan.top * scale, plan.left * scale
-    values = values[: max(height - top, 0), : max(width - left, 0)]
-    alpha = values[..., 3:4]
-    sums = np.zeros((height, width, 5), np.float32)
-    sums[top : top + values.shape[0], left : left + values.shape[1]] = np.concatenate(
-        [values[..., :3] * alpha, alpha, values[..., 4:] * alpha], axis=-1
-    )
-    if plan.side > 1:
-        sums = np.asarray(mean_of_squares(jnp.asarray(sums), plan.side))
+    corner = np.array([plan.top * scale, plan.left * scale], np.int32)
+    image, depth, acc = _laid(drawn, corner, camera, side=plan.side)
+    return Rendering(image=image, image_lr=image, depth=depth, acc=acc)
+
+
+@partial(jax.jit, static_argnames="side")  # operations outside of it would be compiled one by one: 50 of them, 2 s
+def _laid(
+    drawn: Float[AnyArray, "h w 5"], corner: Int[AnyArray, "2"], camera: Camera, *, side: int
+) -> tuple[Float[Array, "height width 3"], Float[Array, "height width"], Float[Array, "height width"]]:
+    """Image, depth along the rays and opacity of a picture that is empty but for a window, which may reach beyond."""
+    height, width = (n * side for n in (camera.height, camera.width))
+    alpha = drawn[..., 3:4]
+    layers = jnp.concatenate([drawn[..., :3] * alpha, alpha, drawn[..., 4:] * alpha], axis=-1)
+    empty = jnp.zeros((height + drawn.shape[0], width + drawn.shape[1], 5))
+    sums = jax.lax.dynamic_update_slice(empty, layers, (*corner, jnp.zeros((), jnp.int32)))[:height, :width]
+    if side > 1:
+        sums = mean_of_squares(sums, side)
     acc = sums[..., 3]
-    along, far = jax.device_get(_along_and_far(camera))
-    image = sums[..., :3] + (1 - acc[..., None]) * WHITE
-    depth = sums[..., 4] / along + (1 - acc) * far
-    whole, depth, opacity = jax.device_put((image.astype(np.float32), depth.astype(np.float32), acc))
-    return Rendering(image=whole, image_lr=whole, depth=depth, acc=opacity)
-
-
-@jax.jit  # operations outside of it would be compiled one by one: 50 of them, 2 s of a first picture
-def _along_and_far(camera: Camera) -> tuple[Float[Array, "height width"], Float[Array, "height width"]]:
-    """Cosine between each pixel's ray and the camera's axis, and where the ray leaves the box."""
     rays = cameras.camera_rays(camera)
     _, far, _ = cameras.intersect_box(rays.origins, rays.directions)
     along = -jnp.einsum("hwi,i->hw", rays.directions, camera.cam_to_world[:, 2], precision="highest")
-    return jnp.maximum(along, 1e-6), far
+    depth = sums[..., 4] / jnp.maximum(along, 1e-6) + (1 - acc) * far
+    return sums[..., :3] + (1 - acc[..., None]) * WHITE, depth, acc
 
 
 def _nothing(camera: Camera) -> Rendering:

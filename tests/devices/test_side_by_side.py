@@ -5,7 +5,7 @@ from functools import partial
 
 import pytest
 
-from spnr_jax.devices.side_by_side import beside
+from spnr_jax.devices.side_by_side import beside, two_at_a_time
 
 
 def test_results_come_in_their_order_from_another_thread():
@@ -40,3 +40,41 @@ def test_an_error_of_a_job_or_of_their_maker_is_raised():
         list(beside(broken()))
     with pytest.raises(ValueError, match="invalid literal"):
         list(beside(iter([int, partial(int, "word"), int])))
+
+
+class TestTwoAtATime:
+    def test_results_come_in_their_order_and_the_second_and_third_meet(self):
+        both = threading.Barrier(2, timeout=10)
+
+        def work(i):
+            if i in (1, 2):
+                both.wait()
+            return i
+
+        assert list(two_at_a_time(work, range(6))) == list(range(6))
+
+    def test_the_first_is_alone_and_no_more_than_two_are_ahead(self):
+        begun = []
+        results = two_at_a_time(begun.append, range(9))
+        next(results)
+        next(results)
+        assert len(begun) <= 4
+        results.close()
+        assert len(begun) <= 4
+        running, most = [], []
+
+        def work(i):
+            running.append(i)
+            most.append((i, len(running)))
+            running.remove(i)
+
+        assert not any(list(two_at_a_time(work, range(9))))
+        assert most[0] == (0, 1)
+        assert max(count for _, count in most) <= 2
+
+    def test_an_error_is_raised_in_its_place_and_nothing_is_done_for_no_items(self):
+        assert list(two_at_a_time(int, [])) == []
+        results = two_at_a_time(lambda i: 1 // i, [1, 0, 1])
+        assert next(results) == 1
+        with pytest.raises(ZeroDivisionError):
+            next(results)

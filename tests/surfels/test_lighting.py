@@ -30,6 +30,10 @@ def columns(towards):
     return list(jnp.asarray(towards, jnp.float32).reshape(-1, 3).T)
 
 
+def test_the_room_of_the_package_is_what_its_map_gives():
+    close(lighting.room_light().tables, lighting.made_room_light().tables, rtol=1e-5, atol=1e-6)
+
+
 def test_all_tables_of_constant_light_are_that_light():
     light = light_of(np.broadcast_to(COLOR, (20, 40, 3)))
     close(light.tables, np.broadcast_to(COLOR, light.tables.shape), rtol=1e-4)
