@@ -17,6 +17,7 @@ import time
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -105,9 +106,7 @@ def main(options: TimeToQuality) -> None:
     for name in options.presets:
         for seed in options.seeds:
             place = options.out / "curves" / f"{name}_{seed}.json"
-            curves[name][seed] = results_folder.kept(
-                place, lambda name=name, seed=seed: curve(name, seed, options, paces[name], dataset)
-            )
+            curves[name][seed] = results_folder.kept(place, partial(curve, name, seed, options, paces[name], dataset))
     found = {"paces": {name: dataclasses.asdict(pace) for name, pace in paces.items()}, "target": options.target}
     found |= {"curves": {name: {str(seed): rows for seed, rows in runs.items()} for name, runs in curves.items()}}
     notes = [f"{name}: pace measured on {pace.hardware}, load {pace.load}." for name, pace in paces.items()]
