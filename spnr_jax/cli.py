@@ -14,168 +14,23 @@ import sys
 import time
 import traceback
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import tyro
 
 from spnr_jax import presets
-from spnr_jax.config import TrainConfig
 from spnr_jax.devices import allocator, compilation
 from spnr_jax.errors import UserError, one_line, split_debug
-from spnr_jax.formats.cut import Cut
 from spnr_jax.model_config import SurfelConfig
-from spnr_jax.tools.light_options import Lighting
+from spnr_jax.tools.commands import ConvertLpips, Evaluate, Export, Runs, Train, View
 from spnr_jax.tools.render_command import Render, is_catalogue
 from spnr_jax.tools.share_command import Share
-from spnr_jax.tools.splat_options import SplatMaking
 
 BOX = r"[╭╮╰╯│─•]+|__tyro-dummy-inner__\."  # what tyro draws around an error, and its name for the whole command
 MANY_POINTS = 16384  # of a cloud that splats are made of
 DESCRIPTION = """Sparse-point neural rendering: train a network, evaluate one, render a cloud of points.
 --debug, or SPNR_DEBUG=1, shows the call stack of an error."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Train:
-    """Train a network on a data set.  A run folder that holds an unfinished run of the same config is continued."""
-
-    data: tyro.conf.Positional[Path]
-    """Folder of the data set."""
-    run: tyro.conf.Positional[Path]
-    """Folder of the run: config, checkpoints, metrics, previews."""
-    config: tyro.conf.AvoidSubcommands[tyro.conf.OmitArgPrefixes[TrainConfig]] = field(default_factory=presets.tiny)
-    """Every number of the run; --preset chooses the defaults."""
-    init: str | None = None
-    """Weights that a new run begins with: a run folder, a file of weights, or `small` or `tiny`, the networks in the
-    package, which are of the presets plus_refined and plus_lite (default: random)."""
-    log_every: int = 20
-    """Steps between rows of metrics.jsonl and TensorBoard."""
-    preview_every: int = 500
-    """Steps between preview images with validation scores."""
-    checkpoint_every: int = 500
-    """Steps between checkpoints."""
-    distributed: bool = False
-    """One of several processes that a launcher started (SLURM, Open MPI, Kubernetes) and that train together."""
-    coordinator: str | None = None
-    """Without a launcher: HOST:PORT at which process 0 is found by all; with --num-processes and --process-id."""
-    num_processes: int | None = None
-    """Processes that train together."""
-    process_id: int | None = None
-    """Which of them this is, from 0."""
-    depth_devices: int = 1
-    """Devices that share each volume, cut along one axis, if it is too big for one."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Evaluate:
-    """Score a run's newest checkpoint beside the trivial renderers; write metrics.json and report.html."""
-
-    data: tyro.conf.Positional[Path]
-    """Folder of the data set."""
-    run: tyro.conf.Positional[Path]
-    """Folder of the run, a file of weights, or `small` or `tiny`, the networks in the package."""
-    out: Path | None = None
-    """Folder for metrics.json and report.html (default: the run, or the name of the file without its suffix)."""
-    split: Literal["train", "val", "test"] = "test"
-    """Objects to score."""
-    gallery: int = 16
-    """Objects shown in the report."""
-    lpips: Path | None = None
-    """LPIPS weights, an .npz that `spnr convert-lpips` wrote; without them LPIPS is n/a."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ConvertLpips:
-    """Convert LPIPS weights for `spnr evaluate --lpips`; needs PyTorch to read the two files."""
-
-    alexnet: tyro.conf.Positional[Path]
-    """AlexNet weights of torchvision: alexnet-owt-....pth."""
-    heads: tyro.conf.Positional[Path]
-    """Linear heads of LPIPS, version 0.1: alex.pth, in weights/v0.1 of the package `lpips`."""
-    out: tyro.conf.Positional[Path]
-    """The .npz to write."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Export:
-    """Write a network as a file of weights, as functions for JAX without this package, and as StableHLO; or, with
-    --splats, a cloud's object as Gaussian splats."""
-
-    run: tyro.conf.Positional[Path]
-    """Run folder whose network is exported; with --splats a cloud, what `spnr render` reads."""
-    splats: Path | None = None
-    """Write Gaussian splats: .ply, .spz, or .glb (KHR_gaussian_splatting)."""
-    network: Path | None = None
-    """Network that draws the cloud for --splats, as `spnr render --run` (default: surfels)."""
-    lighting: tyro.conf.OmitArgPrefixes[Lighting] = field(default_factory=Lighting)
-    """The light of --splats, which is part of them."""
-    making: tyro.conf.OmitArgPrefixes[SplatMaking] = field(default_factory=SplatMaking)
-    """How --splats are made."""
-    up: Literal["auto", "x", "y", "z", "-x", "-y", "-z"] = "auto"
-    """The upward axis of the file for --splats; what is written has y up."""
-    clean: Literal["auto", "off", "strong"] = "auto"
-    """As for `spnr render`, for --splats."""
-    out: Path = Path("exported")
-    """Folder for weights.npz, encode.jax, render.jax, both as .stablehlo, and export.json: what they take and give."""
-    num_points: int | None = None
-    """Points of a cloud, padding included; exactly so many (default: 1,024).  With --splats, points used of a bigger
-    cloud (default: 16,384)."""
-    resolution: int | None = None
-    """Pixels along each side (default: what the network was trained for)."""
-    quality: Literal["draft", "balanced", "best", "trained"] = "best"
-    """As for `spnr render`."""
-    reach: int = 4
-    """Voxels around points that are looked at, 1 to 4: 1.6 times their median distance, rounded up, loses nothing."""
-    platforms: tuple[Literal["cpu", "cuda", "rocm", "tpu"], ...] = ("cpu",)
-    """Where the functions are to run."""
-
-    def __post_init__(self) -> None:
-        """ValueError names the option that makes no sense."""
-        if self.num_points is not None and self.num_points < 1:
-            raise ValueError(f"--num-points must be at least 1, got {self.num_points}")
-        given = [f.name for f in dataclasses.fields(self) if f.name in ("network", "up", "clean")]
-        given = [name for name in given if getattr(self, name) != getattr(type(self), name)]
-        given += ["light"] if self.lighting.asked else []
-        given += ["seconds"] if self.making != SplatMaking() else []
-        if self.splats is None and given:
-            raise ValueError(f"--{given[0]} is for --splats FILE, which is not given")
-        if self.lighting.background != "white":
-            raise ValueError("--background light: splats have no background; leave it out")
-
-
-@dataclass(frozen=True, kw_only=True)
-class View:
-    """Look at a point cloud or mesh file in the browser: its points and what a network makes of them, edited live."""
-
-    cloud: tyro.conf.Positional[Path]
-    """What `spnr render` reads."""
-    run: Path | None = None
-    """As for `spnr render`."""
-    lighting: tyro.conf.OmitArgPrefixes[Lighting] = Lighting()
-    """The light at first; of the networks of the package `surfels` alone takes another than that of its training."""
-    host: str = "127.0.0.1"
-    """Address to listen on; another than this machine's own opens the viewer to a network."""
-    port: int = 8080
-    """Port to listen on; 0 takes any free one."""
-    num_points: int = 16384
-    """Points used of a bigger cloud or sampled from a mesh; fewer work too."""
-    clean: Literal["auto", "off", "strong"] = "auto"
-    """Outliers of points are removed, and noisy ones averaged, before they are thinned; a clean cloud, and a mesh, stay
-    as they are.  strong: at smaller deviations."""
-    cut: tyro.conf.OmitArgPrefixes[Cut] = Cut()
-    """Which part of a scene is shown first; files that are dropped on the page are shown whole."""
-    up: Literal["auto", "x", "y", "z", "-x", "-y", "-z"] = "auto"
-    """The file's upward axis; auto looks for it, and says what it found."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Runs:
-    """List the runs below a folder: best validation PSNR, time, learning curve."""
-
-    folder: tyro.conf.Positional[Path] = Path()
-    """Folder that holds run folders, at any depth."""
 
 
 Command = Train | Evaluate | Render | View | Export | Share | Runs | ConvertLpips
@@ -310,7 +165,7 @@ def run_evaluate(command: Evaluate) -> None:
     from spnr_jax.formats import data_sets
     from spnr_jax.scoring import evaluation, lpips_weights
     from spnr_jax.scoring.results import text_table, write_results
-    from spnr_jax.training import trainer
+    from spnr_jax.training import metrics_log
 
     start = time.monotonic()
     dataset = data_sets.open_dataset(command.data)
@@ -318,7 +173,7 @@ def run_evaluate(command: Evaluate) -> None:
     outcome = evaluation.evaluate(command.run, dataset, command.split, command.gallery, weights=weights)
     out = command.out or (command.run.with_suffix("") if command.run.suffix == ".npz" else command.run)
     seconds = dict.fromkeys(("evaluate", "total"), round(time.monotonic() - start, 1))
-    write_results(out, outcome, dataset.settings, trainer.read_rows(command.run), seconds)
+    write_results(out, outcome, dataset.settings, metrics_log.read_rows(command.run), seconds)
     print("\n".join(text_table(outcome.summary["methods"])))
     print(f"wrote {out / 'metrics.json'} and {out / 'report.html'}")
 

@@ -111,6 +111,8 @@ class TrainConfig:
     """Most points drawn per object and step; the padded size of the cloud."""
     test_points: Count = 1024
     """Points per object in evaluation."""
+    trains: Literal["network", "refiner"] = "network"
+    """What steps change: all, or the refiner alone, on pictures of the network that the run begins with (`--init`)."""
     seed: int = 0
     """Seed of weights, batches and jitter."""
     pixel_stride: Count = 1
@@ -148,6 +150,11 @@ class TrainConfig:
         require(
             self.min_points <= self.max_points,
             f"min_points {self.min_points} must not exceed max_points {self.max_points}",
+        )
+        refines = isinstance(self.model, NearPointsConfig) and self.model.refiner_width > 0 and self.crop > 0
+        require(
+            self.trains == "network" or (refines and self.loss.adversarial_weight == 0),
+            "trains refiner needs a network near points with a refiner_width, a crop, and adversarial_weight 0",
         )
         if isinstance(self.model, NearPointsConfig):
             cells = surface_grid(self.max_points)

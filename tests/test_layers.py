@@ -17,9 +17,9 @@ import pytest
 ROOT = Path(__file__).parents[1]
 SPNR_JAX = (
     *("errors", "model_config", "config"),
-    *("devices", "kernels", "surfels", "gaussians", "nn", "baselines", "method"),
+    *("devices", "kernels", "surfels", "gaussians", "nn", "baselines", "method", "presets"),
     *("formats/mesh", "formats", "training", "scoring", "tools", "viewer"),
-    *("presets", "cli", "__init__"),
+    *("cli", "__init__"),
 )
 DATA_GEN = (
     *("shapes", "procedural", "render", "store", "plan/sources", "plan", "make"),

@@ -30,7 +30,7 @@ from spnr_jax.kernels import metrics
 from spnr_jax.presets import PRESETS
 from spnr_jax.scoring import evaluation
 from spnr_jax.scoring.summary import Scores
-from spnr_jax.training import checkpoint, optimisation, trainer
+from spnr_jax.training import checkpoint, metrics_log, optimisation
 
 PaperPreset = Literal["abo", "shapenet_car", "shapenet_plane", "shapenet_chair", "small", "tiny"]
 PlusPreset = Literal["plus_abo", "plus_lite", "plus_refined", "plus_shapenet", "plus_small", "plus_tiny"]
@@ -151,7 +151,7 @@ def train(variants: Sequence[Variant], budget: Budget, out: Path) -> dict[str, l
 
 def step_milliseconds(run: Path) -> float | None:
     """Median milliseconds of a run's steps over the rows of its log; None of a few, which are mostly compilation."""
-    found = [row["ms_per_step"] for row in trainer.read_rows(run) if "ms_per_step" in row]
+    found = [row["ms_per_step"] for row in metrics_log.read_rows(run) if "ms_per_step" in row]
     return round(statistics.median(found), 2) if len(found) >= FEWEST_ROWS else None
 
 

@@ -29,7 +29,7 @@ from spnr_jax.formats import data_sets
 from spnr_jax.formats.images import write_whole
 from spnr_jax.scoring import evaluation
 from spnr_jax.scoring.results import text_table, write_results
-from spnr_jax.training import trainer
+from spnr_jax.training import metrics_log, trainer
 from spnr_jax.training.weights import read_trained
 
 POINTS = 2048  # of an object; of evenly spread ones the first 1024, which a test sees, are evenly spread, too
@@ -80,7 +80,7 @@ def main(demo: Demo) -> None:
     parts = {**install_seconds(), **seconds.values, "evaluate": time.monotonic() - start}
     parts["total"] = sum(parts.values())
     parts = {name: round(value, 1) for name, value in parts.items()}
-    write_results(demo.out, outcome, dataset.settings, trainer.read_rows(demo.out / "ours"), parts, TITLE)
+    write_results(demo.out, outcome, dataset.settings, metrics_log.read_rows(demo.out / "ours"), parts, TITLE)
     print("\n".join(text_table(outcome.summary["methods"])))
     print(f"metrics: {demo.out / 'metrics.json'}\nreport:  {demo.out / 'report.html'}")
 

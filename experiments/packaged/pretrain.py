@@ -3,11 +3,11 @@
     python -m experiments.packaged.pretrain --meshes DIR --test-list FILE [--network tiny] [--out runs/pretrain]
 
 Two data sets lie below OUT: `procedural`, objects of all classes, and `meshes`, those that the list does not hold out,
-each with variants of colour and shape.  `data` joins them by links.  `small` is trained on it in three runs of which
-each begins where the one before ended: OUT/small/run1 with the points of the preset, the others with 128 to 2048 an
-object; then its refiner is, on what the network shows (OUT/small/pictures).  `tiny` is trained in one run.  The
-held-out meshes score it (OUT/small/report.html), and OUT/small.npz is the file that the package holds.  What is there
-already is reused: finished objects, trained steps, pictures.
+each with variants of colour and shape.  `data` joins them by links.  `small` is trained on it in five runs of which
+each begins where the one before ended: OUT/small/run1 with the points of the preset, the next three with 128 to 2048 an
+object, the last its refiner alone, on what the network shows.  `tiny` is trained in one run.  The held-out meshes score
+it (OUT/small/report.html), and OUT/small.npz is the file that the package holds.  What is there already is reused:
+finished objects, trained steps, pictures.
 """
 
 import dataclasses
@@ -22,7 +22,6 @@ from data_gen.make.generate import generate
 from data_gen.plan.tasks import GenerateConfig
 from data_gen.store.layout import SPLITS
 from experiments import entry_point
-from experiments.packaged import refinement
 from experiments.packaged.demo import Seconds
 from spnr_jax import cli, presets
 from spnr_jax.config import TrainConfig
@@ -31,7 +30,7 @@ from spnr_jax.formats.images import write_whole
 from spnr_jax.model_config import NearPointsConfig, surface_grid
 from spnr_jax.scoring import evaluation
 from spnr_jax.scoring.results import text_table, write_results
-from spnr_jax.training import trainer, weights
+from spnr_jax.training import metrics_log, trainer, weights
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,12 +78,9 @@ def main(options: Pretrain) -> None:
         trained = weights.read_trained(run)
     file = options.out / f"{options.network}.npz"
     assert trained is not None, "there is at least one run"
-    if options.network == "small":
-        refine = partial(refinement.refined, trained, dataset, out / "pictures", options.steps)
-        trained = seconds.measure("refine", refine)
     weights.write_weights(file, trained)
     outcome = evaluation.evaluate(file, dataset, "test" if dataset.splits["test"] else "val")
-    write_results(out, outcome, dataset.settings, trainer.read_rows(run), seconds.values)
+    write_results(out, outcome, dataset.settings, metrics_log.read_rows(run), seconds.values)
     print("\n".join(text_table(outcome.summary["methods"])))
     print(f"weights: {file}\nreport:  {out / 'report.html'}")
 
@@ -101,6 +97,7 @@ def recipe(options: Pretrain) -> list[TrainConfig]:
             later(first, steps=6000, seed=first.seed + 2, lr=1e-3),
             dataclasses.replace(later(first, steps=4000, seed=first.seed + 3, lr=1e-3), even_share=0.5),
         ]
+        runs.append(refiner_behind(runs[-1]))
     return runs if options.steps is None else [dataclasses.replace(run, num_steps=options.steps) for run in runs]
 
 
@@ -123,6 +120,20 @@ def later(config: TrainConfig, steps: int, seed: int, lr: float) -> TrainConfig:
         optimizer=dataclasses.replace(config.optimizer, lr_generator=lr),
         num_steps=steps,
         seed=seed,
+    )
+
+
+def refiner_behind(config: TrainConfig) -> TrainConfig:
+    """The config of the run of a refiner behind the network of a run."""
+    preset = presets.plus_refiner()
+    assert isinstance(config.model, NearPointsConfig)
+    assert isinstance(preset.model, NearPointsConfig)
+    return dataclasses.replace(
+        preset,
+        model=dataclasses.replace(config.model, refiner_width=preset.model.refiner_width),
+        crop=config.model.image_resolution // 2,
+        even_share=config.even_share,
+        seed=config.seed,
     )
 
 

@@ -21,7 +21,7 @@ from spnr_jax.kernels.records import Batch
 from spnr_jax.method import inference
 from spnr_jax.model_config import RayNetworkConfig
 from spnr_jax.presets import PRESETS
-from spnr_jax.training import optimisation
+from spnr_jax.training import adversary, optimisation
 
 NUM_GROUPS, DISCRIMINATOR_WIDTH = 8, 64  # the twin's, for every preset
 NEAR_POINTS = {"tiny": (16, 0), "small": (16, 16), "abo": (32, 32)}  # coarse and fine samples
@@ -128,7 +128,7 @@ def differences(config: TrainConfig, arrays: twin_layout.Arrays) -> dict[str, fl
     variables = {"params": params, "batch_stats": statistics}
     volume = inference.jitted_encode(variables, inputs.cloud, config=config.model)
     image = inference.jitted_render(variables, volume, inputs.camera, config=config.model).image[:, 0]
-    judge = jax.jit(optimisation.discriminator_of(config).apply)
+    judge = jax.jit(adversary.discriminator_of(config).apply)
     params = {"params": twin_layout.discriminator(arrays)}
     logits = judge(params, image, inputs.condition[:, 0], inputs.condition_mask[:, 0])
     stages = {"volume": volume.volume, "image": image, "logits": logits}

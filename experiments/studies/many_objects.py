@@ -35,7 +35,7 @@ from spnr_jax.kernels.records import Batch, PointCloud
 from spnr_jax.method import inference
 from spnr_jax.model_config import RayNetworkConfig
 from spnr_jax.presets import PRESETS
-from spnr_jax.training import batching, many_runs, optimisation
+from spnr_jax.training import adversary, batching, many_runs, optimisation
 
 MOST_POINTS = 4096  # of an object that is encoded
 
@@ -129,7 +129,7 @@ def train(
     """
     singles = [optimisation.jitted_create_state(config, jnp.uint32(seed)) for seed in seeds]
     stacked = many_runs.stack(singles)
-    adversarial_from = optimisation.first_adversarial_step(config)
+    adversarial_from = adversary.first_adversarial_step(config)
     seconds: dict[str, list[float]] = {"loop": [], "vmap": []}
     memory, apart, losses = {"loop": 0.0, "vmap": 0.0}, [], []
     for step, batch in enumerate(batches(dataset, config, seeds, objects)):

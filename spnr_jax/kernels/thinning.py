@@ -8,6 +8,7 @@ thinning with voxels first.
 from collections.abc import Iterable
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 Columns = dict[str, np.ndarray]
 
@@ -17,6 +18,9 @@ FINEST = 2**10  # voxels along the extent that streaming starts with
 HALVINGS = 20  # of the extent, to the smallest voxel that is tried
 SMALLEST_EXTENT = 1e-30  # where all points coincide
 FARTHEST = 1e18  # from the middle, in the file's units, up to which distances are squared as they are
+FIRST = 256  # farthest points that are found among all; after them a new one is the nearest of few
+FAR = 0.95  # of the largest squared distance, from which on points are looked at for the farthest
+BEYOND = 1 + 1e-5  # times the distance within which points are asked for, whatever single precision makes of it
 KEY_BITS = 21  # of a voxel's index along an axis
 
 
@@ -83,21 +87,55 @@ def candidates(positions: np.ndarray, count: int) -> np.ndarray:
 def farthest_points(positions: np.ndarray, count: int, seed: int) -> np.ndarray:
     """Indices (count,) of points (n, 3), each the farthest from those before it; n >= count.
 
-    So any first ones of them are evenly spread.  The seed chooses the very first.  Beyond THINNING * count points
-    voxels thin them before: the time is count^2 at most.
+    So any first ones of them are evenly spread.  The seed chooses the very first; of points equally far the first in
+    the file comes first.  Beyond THINNING * count points voxels thin them before: the time is near count log count.
     """
     among = candidates(positions, count)
     centred = positions[among] - positions.mean(axis=0)
     largest = np.abs(centred).max(initial=0)
     if largest > FARTHEST:  # else the squares leave float32
         centred = centred / largest
-    x, y, z = np.ascontiguousarray(centred.T, np.float32)
+    columns = np.ascontiguousarray(centred.T, np.float32)
     squared = np.full(len(among), np.inf, np.float32)
     chosen = np.empty(count, np.int64)
     chosen[0] = np.random.default_rng(seed).integers(len(among))
-    for step in range(1, count):
+    for step in range(1, min(count, FIRST)):
         last = chosen[step - 1]
-        np.minimum(squared, (x - x[last]) ** 2 + (y - y[last]) ** 2 + (z - z[last]) ** 2, out=squared)
-        squared[last] = -1  # never again, not even where points coincide
+        np.minimum(squared, _squares(columns, columns[:, last]), out=squared)
+        squared[last] = -1
         chosen[step] = np.argmax(squared)
+    if count > FIRST:
+        _go_on(chosen, columns, squared)
     return among[chosen]
+
+
+def _squares(columns: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """Squared distances (n,) of points, as columns (3, n), from a place (3,)."""
+    (x, y, z), (a, b, c) = columns, place
+    return (x - a) ** 2 + (y - b) ** 2 + (z - c) ** 2
+
+
+def _go_on(chosen: np.ndarray, columns: np.ndarray, squared: np.ndarray) -> None:
+    """Chooses points from FIRST on: a new point changes the distances of those alone that are nearer to it than it was
+    to the ones before.
+
+    Distances only shrink, so while one of the far points is still far, the farthest of all is among them.
+    """
+    rows = np.ascontiguousarray(columns.T)
+    tree = cKDTree(rows)
+    far, least = np.arange(0), np.inf
+    for step in range(FIRST, len(chosen)):
+        last = chosen[step - 1]
+        reach = max(float(squared[last]), 0.0) ** 0.5
+        near = np.array(tree.query_ball_point(rows[last], BEYOND * reach), np.int64)
+        squared[near] = np.minimum(squared[near], _squares(columns[:, near], rows[last]))
+        squared[last] = -1  # never again, not even where points coincide
+        among = squared[far]
+        if not (among >= least).any():
+            least = FAR * squared.max()
+            if least == 0:  # what is left coincides with what is chosen
+                chosen[step:] = np.flatnonzero(squared == 0)[: len(chosen) - step]
+                return
+            far = np.flatnonzero(squared >= least)
+            among = squared[far]
+        chosen[step] = far[np.argmax(among)]

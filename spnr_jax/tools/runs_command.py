@@ -7,7 +7,7 @@ from pathlib import Path
 
 from spnr_jax.errors import UserError
 from spnr_jax.scoring.learning_curve import series
-from spnr_jax.training import checkpoint, trainer
+from spnr_jax.training import checkpoint, metrics_log
 from spnr_jax.training.run_record import read_starts
 
 BARS = "▁▂▃▄▅▆▇█"
@@ -41,7 +41,7 @@ def read_runs(folder: Path) -> list[Run]:
 
 def read_run(path: Path, name: str) -> Run:
     """One run, from its config, metrics and record."""
-    config, rows = checkpoint.read_config(path), trainer.read_rows(path)
+    config, rows = checkpoint.read_config(path), metrics_log.read_rows(path)
     at, psnr = series(rows, "val_psnr")
     best = int(psnr.argmax()) if len(psnr) else -1
     losses = [row["loss"] for row in rows if "loss" in row]

@@ -29,9 +29,7 @@ from spnr_jax.kernels import losses
 from spnr_jax.kernels.metrics import psnr
 from spnr_jax.kernels.records import Batch, Key
 from spnr_jax.method.inference import init, network
-from spnr_jax.model_config import RayNetworkConfig
-from spnr_jax.nn.discriminator import Discriminator
-from spnr_jax.training import pixels
+from spnr_jax.training import adversary, pixels
 
 
 @no_type_check
@@ -82,16 +80,9 @@ def optimizers(config: TrainConfig) -> tuple[optax.GradientTransformation, optax
     )
 
 
-def first_adversarial_step(config: TrainConfig) -> int:
-    """Step from which the discriminator takes part; num_steps if it never does."""
-    share = config.loss.adversarial_start if config.loss.adversarial_weight else 1.0
-    return round(share * config.num_steps)
-
-
-def discriminator_of(config: TrainConfig) -> Discriminator:
-    """The discriminator's module."""
-    assert isinstance(config.model, RayNetworkConfig), "the config refuses an adversarial loss of other networks"
-    return Discriminator(config.loss.discriminator_width, config.model.encoder.num_groups, config.model.bf16)
+def changed(config: TrainConfig, generator: dict) -> dict:
+    """The part of a generator that steps change."""
+    return generator if config.trains == "network" else generator[config.trains]
 
 
 def create_state(config: TrainConfig, seed: int | Array | None = None) -> TrainState:
@@ -102,15 +93,17 @@ def create_state(config: TrainConfig, seed: int | Array | None = None) -> TrainS
     generator_adam, discriminator_adam = optimizers(config)
     generator, batch_stats = variables["params"], variables.get("batch_stats", {})
     discriminator = None
-    if first_adversarial_step(config) < config.num_steps:
+    if adversary.first_adversarial_step(config) < config.num_steps:
         image = jnp.zeros((1, *[config.model.image_resolution] * 2, 3))
-        discriminator = discriminator_of(config).init(discriminator_key, image, image, image[..., 0] > 0)["params"]
+        discriminator = adversary.discriminator_of(config).init(discriminator_key, image, image, image[..., 0] > 0)[
+            "params"
+        ]
     return TrainState(
         step=jnp.zeros((), jnp.int32),
         key=key,
         generator=generator,
         batch_stats=batch_stats,
-        generator_optimizer=generator_adam.init(generator),
+        generator_optimizer=generator_adam.init(changed(config, generator)),
         averaged=jax.tree.map(jnp.copy, generator),  # a donated state must not hold one buffer twice
         averaged_stats=jax.tree.map(jnp.copy, batch_stats),
         discriminator=discriminator,
@@ -171,34 +164,6 @@ def reconstruction_loss(
     return error + config.loss.mse_weight * losses.mse(image, reference) if config.loss.mse_weight else error
 
 
-def logits(config: TrainConfig, params: dict, image: Array, condition: Array, mask: Array) -> Array:
-    """What the discriminator says of the images under its parameters."""
-    if not config.loss.condition:
-        condition, mask = jnp.zeros_like(condition), jnp.zeros_like(mask)
-    return discriminator_of(config).bind({"params": params})(image, condition, mask)
-
-
-def discriminator_loss(config: TrainConfig, params: dict, fake: Array, batch: Batch, step: Array):
-    """(loss, metrics) of the discriminator on references and renderings; R1 every r1_interval steps."""
-    real, condition, mask = (_flatten_views(x) for x in (batch.image, batch.condition, batch.condition_mask))
-    both = logits(config, params, *(jnp.concatenate(x) for x in ((real, fake), (condition,) * 2, (mask,) * 2)))
-    real_logits, fake_logits = jnp.split(both, 2)
-    loss = losses.discriminator_adversarial(real_logits, fake_logits)
-    metrics = {"discriminator": loss, "logit_real": jnp.mean(real_logits), "logit_fake": jnp.mean(fake_logits)}
-    if config.loss.r1_gamma:
-
-        def penalty():
-            return losses.r1(lambda image: logits(config, params, image, condition, mask), real)
-
-        due = step % config.loss.r1_interval == 0
-        loss = loss + config.loss.r1_interval * config.loss.r1_gamma * jax.lax.cond(due, penalty, lambda: 0.0)
-    return loss, metrics
-
-
-def _flatten_views(x):
-    return x.reshape(-1, *x.shape[2:])
-
-
 def train_step(
     state: TrainState,
     batch: Batch,
@@ -237,8 +202,8 @@ def train_step(
     metrics = {"psnr": jnp.mean(psnr(image, reference)), "l1": losses.l1(image, reference)}
     discriminator, discriminator_optimizer = state.discriminator, state.discriminator_optimizer
     if adversarial:
-        fake = _flatten_views(image)
-        gradient, more = jax.grad(partial(discriminator_loss, config), has_aux=True)(
+        fake = adversary.flatten_views(image)
+        gradient, more = jax.grad(partial(adversary.discriminator_loss, config), has_aux=True)(
             discriminator, fake, batch, state.step
         )
         update, discriminator_optimizer = discriminator_adam.update(gradient, discriminator_optimizer)
@@ -251,8 +216,8 @@ def train_step(
         for term in sown.values():
             loss = loss + term
         if adversarial:
-            views = (_flatten_views(x) for x in (image, batch.condition, batch.condition_mask))
-            fake_logits = logits(config, discriminator, *views)
+            views = (adversary.flatten_views(x) for x in (image, batch.condition, batch.condition_mask))
+            fake_logits = adversary.logits(config, discriminator, *views)
             loss = loss + config.loss.adversarial_weight * losses.generator_adversarial(fake_logits)
         return loss
 

@@ -10,9 +10,7 @@ together.
 """
 
 import dataclasses
-import json
 import math
-import os
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
@@ -30,11 +28,12 @@ from spnr_jax.config import TrainConfig
 from spnr_jax.devices import allocator, placement
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
-from spnr_jax.formats.images import png, to_uint8, write_whole
+from spnr_jax.formats.images import png, write_whole
 from spnr_jax.kernels.metrics import psnr
 from spnr_jax.kernels.records import Light
 from spnr_jax.method import inference
 from spnr_jax.training import checkpoint, optimisation, work
+from spnr_jax.training.metrics_log import MetricsLog, Unwritten
 from spnr_jax.training.run_record import Clock, RunRecord
 from spnr_jax.training.weights import Trained, solid_variables
 
@@ -117,7 +116,8 @@ def _train(
         return state
     if first:
         say(f"resuming {run} at step {first} of {config.num_steps}")
-    task = work.work_of(config, dataset, run, mesh, own, light)
+    task = work.work_of(config, dataset, run, mesh, own, light, state)
+    state = state if first else task.begin(state)
     agreed = placement.Agreement(mesh)
     pending: list[tuple[int, dict]] = []
     with (
@@ -172,7 +172,9 @@ def _train(
 
 
 def new_state(config: TrainConfig, init: Trained | None) -> optimisation.TrainState:
-    """The state before the first step."""
+    """The state before the first step; ValueError for a refiner without the network before it."""
+    if config.trains == "refiner" and init is None:
+        raise UserError(f"preset {config.preset} trains a refiner behind a network that is trained: name it by --init")
     state = optimisation.jitted_create_state(config)
     if solid := solid_variables(config.model):
         state = dataclasses.replace(state, batch_stats=solid, averaged_stats=jax.tree.map(jnp.copy, solid))
@@ -217,63 +219,6 @@ def stop_requests() -> Iterator[list[int]]:
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)
-
-
-class MetricsLog:
-    """metrics.jsonl and TensorBoard of a run; rows after `first_step` of an earlier run are dropped."""
-
-    def __init__(self, run: Path, first_step: int) -> None:
-        """Opens both for appending."""
-        from tensorboardX import SummaryWriter
-
-        path = run / "metrics.jsonl"
-        kept = [row for row in read_rows(run) if row["step"] <= first_step]
-        temporary = path.with_suffix(".partial")
-        temporary.write_text("".join(json.dumps(row) + "\n" for row in kept))
-        temporary.replace(path)
-        self._file = path.open("a")
-        self._board = SummaryWriter(str(run / "tensorboard"), purge_step=first_step + 1)
-
-    def write(self, row: dict[str, int | float], picture: np.ndarray | None = None) -> None:
-        """Appends one row, to the disk itself; in TensorBoard its entries are scalars, and the picture is an image."""
-        self._file.write(json.dumps(row) + "\n")
-        self._file.flush()
-        os.fsync(self._file.fileno())  # a checkpoint that outlives a power cut needs the rows before it
-        for name, value in row.items():
-            if name != "step":
-                self._board.add_scalar(name, value, row["step"])
-        if picture is not None:
-            self._board.add_image("preview", to_uint8(picture), row["step"], dataformats="HWC")
-
-    def close(self) -> None:
-        """Closes both."""
-        self._file.close()
-        self._board.close()
-
-
-class Unwritten:
-    """The log and the record of a process that does not write them."""
-
-    def write(self, *what: object) -> None:
-        """Writes nothing."""
-
-    def close(self) -> None:
-        """Closes nothing."""
-
-
-def read_rows(run: Path) -> list[dict]:
-    """Rows of a run's metrics.jsonl; a last line that a crash cut off is left out, and what follows a broken one."""
-    path = run / "metrics.jsonl"
-    rows: list[dict] = []
-    for line in path.read_text(errors="replace").splitlines() if path.exists() else []:
-        try:
-            row = json.loads(line)
-        except (ValueError, RecursionError):
-            break
-        if not isinstance(row, dict) or not all(isinstance(value, int | float) for value in row.values()):
-            break
-        rows.append(row)
-    return rows
 
 
 def preview(

@@ -1,7 +1,8 @@
 """What the training loop need not know of a network: its batches and its step.
 
-There are two kinds: networks that learn from whole views of clouds (`of_views`: the paper's, ours near points, the
-baselines), and the shader network, which learns from crops of G-buffers (`of_gbuffers`).
+There are three kinds: networks that learn from whole views of clouds (`of_views`: the paper's, ours near points, the
+baselines), the shader network, which learns from crops of G-buffers (`of_gbuffers`), and a refiner alone, which learns
+from crops of the pictures of the network before it (`of_pictures`).
 """
 
 from collections.abc import Callable, Generator
@@ -19,7 +20,7 @@ from spnr_jax.formats.data_sets import Dataset, has_lights
 from spnr_jax.kernels.records import Crops, Light
 from spnr_jax.model_config import SurfelConfig
 from spnr_jax.surfels import lighting
-from spnr_jax.training import batching, gbuffers, optimisation, shading
+from spnr_jax.training import adversary, batching, gbuffers, optimisation, refiner_training, shading
 from spnr_jax.training.optimisation import TrainState
 from spnr_jax.training.weights import Trained, solid_variables, write_weights
 
@@ -31,13 +32,25 @@ class Work(NamedTuple):
 
     batches: Callable[[int], Generator[Any, None, None]]  # from a step on
     step: Callable[[TrainState, Any, int], tuple[TrainState, dict]]  # with the step's number
+    begin: Callable[[TrainState], TrainState] = lambda state: state  # called with the state before the first step
     finish: Callable[[TrainState], object] = lambda state: None  # called with the last state
 
 
 def work_of(
-    config: TrainConfig, dataset: Dataset, run: Path, mesh: Mesh | None, own: range | None, light: Light | None
+    config: TrainConfig,
+    dataset: Dataset,
+    run: Path,
+    mesh: Mesh | None,
+    own: range | None,
+    light: Light | None,
+    state: TrainState,
 ) -> Work:
-    """That of the config's network; the mesh and its share of a batch, or the light, are for one of the two kinds."""
+    """That of the config's network.
+
+    The mesh and its share of a batch, the light, or the state's network are for one of the kinds each.
+    """
+    if config.trains == "refiner":
+        return of_pictures(config, dataset, run, state)
     if isinstance(config.model, SurfelConfig):
         return of_gbuffers(config, dataset, run, light or light_of(dataset))
     return of_views(config, dataset, mesh, own)
@@ -53,7 +66,7 @@ def of_views(config: TrainConfig, dataset: Dataset, mesh: Mesh | None, own: rang
             f"{dataset.folder}: each view has a light of its own, and preset {config.preset} learns one light alone; "
             "train --preset surfels, or generate the data set without --lights"
         )
-    adversarial_from = optimisation.first_adversarial_step(config)
+    adversarial_from = adversary.first_adversarial_step(config)
 
     def step(state: Any, batch: Any, number: int) -> tuple[Any, dict]:
         with placement.using(mesh):
@@ -69,8 +82,7 @@ def of_gbuffers(config: TrainConfig, dataset: Dataset, run: Path, light: Light) 
 
     The averaged weights are written to the run folder at the end.  All devices of a process do the same work.
     """
-    if jax.process_count() > 1:
-        raise UserError(f"preset {config.preset} trains in one process; start it without --distributed")
+    check_one_process(config)
     views = gbuffers.complete(dataset, light, config, run / "gbuffers", solid_variables(config.model))
 
     def step(state: TrainState, crops: Crops, number: int) -> tuple[TrainState, dict]:
@@ -80,7 +92,28 @@ def of_gbuffers(config: TrainConfig, dataset: Dataset, run: Path, light: Light) 
         variables = placement.on_this_process(optimisation.averaged_variables(state))
         write_weights(run / "weights.npz", Trained(config=config, variables=variables, steps=int(state.step)))
 
-    return Work(partial(gbuffers.batches, views, config), step, finish)
+    return Work(partial(gbuffers.batches, views, config), step, finish=finish)
+
+
+def of_pictures(config: TrainConfig, dataset: Dataset, run: Path, state: TrainState) -> Work:
+    """Of a refiner behind a network; its pictures that are missing in the run folder are made first."""
+    check_one_process(config)
+    params = {name: part for name, part in state.generator.items() if name != "refiner"}
+    variables = {"params": params, "batch_stats": state.batch_stats}
+    views = refiner_training.complete(dataset, variables, config, run / "pictures")
+
+    def step(state: TrainState, view: Any, number: int) -> tuple[TrainState, dict]:
+        return refiner_training.jitted_train_step(state, view, config=config)
+
+    return Work(
+        partial(refiner_training.batches, views, config), step, begin=partial(refiner_training.begun, views=views)
+    )
+
+
+def check_one_process(config: TrainConfig) -> None:
+    """ValueError where several processes train together: of these kinds each would do the same work."""
+    if jax.process_count() > 1:
+        raise UserError(f"preset {config.preset} trains in one process; start it without --distributed")
 
 
 def light_of(dataset: Dataset) -> Light:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from support import tiny_dataset, tiny_model
 
-from experiments.packaged import pretrain, refinement
+from experiments.packaged import pretrain
 from spnr_jax import cli, presets
 from spnr_jax.formats import data_sets
 from spnr_jax.training import run_record, weights
@@ -61,13 +61,12 @@ def test_both_data_sets_train_one_network_and_its_file_is_what_was_scored(asked,
         assert set(joined.splits[split]) == {*names, *(f"mesh-{name}" for name in names)}
     assert data_sets.read_object(joined, f"mesh-{single.splits['test'][0]}").images.size
     trained, out = weights.read_trained(options.out / "small.npz"), options.out / "small"
-    last = refinement.with_refiner(pretrain.recipe(options)[-1])
-    assert (trained.config, trained.steps) == (dataclasses.replace(last, num_steps=2), 2)
+    assert (trained.config, trained.steps) == (pretrain.recipe(options)[-1], 2)
     before = weights.read_trained(out / "run4").variables["params"]
     for part, kept in before.items():
         jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, atol=1e-3), trained.variables["params"][part], kept)
-    starts = [run_record.read_starts(out / f"run{number}") for number in (1, 2, 3, 4)]
-    assert [start.get("init") for (start,) in starts] == [None, *[f"{CONFIG.preset}, 2 steps"] * 3]
+    starts = [run_record.read_starts(out / f"run{number}") for number in range(1, 6)]
+    assert [start.get("init") for (start,) in starts] == [None, *[f"{CONFIG.preset}, 2 steps"] * 4]
     scored = json.loads((out / "metrics.json").read_text())
     assert scored["methods"]["near_points"]["objects"] == len(joined.splits["test"])
     assert "report.html" in capsys.readouterr().out
@@ -85,9 +84,11 @@ def test_without_meshes_the_procedural_objects_train_alone(asked, tmp_path):
 
 def test_tiny_has_one_run_and_each_run_of_small_begins_where_the_one_before_ended():
     assert pretrain.recipe(pretrain.Pretrain(network="tiny")) == [presets.plus_lite()]
-    first, *later = pretrain.recipe(pretrain.Pretrain())
+    first, *later, refiner = pretrain.recipe(pretrain.Pretrain())
     assert first == pretrain.packaged(presets.plus_small())
     assert [run.num_steps for run in later] == [9000, 6000, 4000]
     assert [run.even_share for run in (first, *later)] == [0, 0, 0, 0.5]
     assert len({run.seed for run in (first, *later)}) == 4
     assert all(run.model.surface_cells == presets.plus_lite().model.surface_cells for run in later)
+    assert (refiner.trains, refiner.num_steps, refiner.even_share, refiner.crop) == ("refiner", 20_000, 0.5, 64)
+    assert refiner.model == presets.plus_refined().model, "what the package holds"

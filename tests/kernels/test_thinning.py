@@ -28,6 +28,22 @@ def test_farthest_points_are_those_of_the_plain_loop():
     np.testing.assert_array_equal(farthest_points(positions, 20, seed=7), kept)
 
 
+def in_a_grid(positions: np.ndarray) -> np.ndarray:
+    return np.round(positions, 1)
+
+
+@pytest.mark.parametrize("moved", [np.asarray, in_a_grid], ids=["anywhere", "many as far as each other, many coincide"])
+def test_many_farthest_points_are_those_of_the_loop_over_all(moved):
+    positions, count = moved(sphere_points(3, 3000)), 2500
+    x, y, z = np.ascontiguousarray((positions - positions.mean(axis=0)).T, np.float32)
+    squared, kept = np.full(3000, np.inf, np.float32), [int(np.random.default_rng(7).integers(3000))]
+    while len(kept) < count:
+        squared = np.minimum(squared, (x - x[kept[-1]]) ** 2 + (y - y[kept[-1]]) ** 2 + (z - z[kept[-1]]) ** 2)
+        squared[kept[-1]] = -1
+        kept.append(int(np.argmax(squared)))
+    np.testing.assert_array_equal(farthest_points(positions, count, seed=7), kept)
+
+
 def test_points_that_coincide_are_never_kept_twice():
     assert sorted(farthest_points(np.zeros((9, 3)), 9, seed=0)) == list(range(9))
 

@@ -9,6 +9,7 @@ from support.tiny_lpips import ARRAYS, WEIGHTS, files
 from spnr_jax import cli
 from spnr_jax.scoring import lpips_weights
 from spnr_jax.scoring.lpips_weights import convert, read_weights
+from spnr_jax.tools import commands
 
 
 @pytest.fixture
@@ -65,7 +66,7 @@ def test_missing_files_are_named(tmp_path):
 
 def test_the_command_converts_what_the_reader_reads(torch, tmp_path, capsys):
     alexnet, heads = files(tmp_path, torch)
-    cli.run(cli.ConvertLpips(alexnet=alexnet, heads=heads, out=tmp_path / "w.npz"))
+    cli.run(commands.ConvertLpips(alexnet=alexnet, heads=heads, out=tmp_path / "w.npz"))
     assert f"--lpips {tmp_path / 'w.npz'}" in capsys.readouterr().out
     weights = read_weights(tmp_path / "w.npz")
     for name in ("kernels", "biases", "heads"):

@@ -10,7 +10,7 @@ from support import tiny_dataset
 from spnr_jax.scoring import evaluation, results
 from spnr_jax.scoring.report import METHODS
 from spnr_jax.scoring.summary import METRICS
-from spnr_jax.training import trainer
+from spnr_jax.training import metrics_log
 
 NUMBERS = {"objects", "views", "cpsnr_views", *METRICS, *(f"{metric}_interval" for metric in METRICS)}
 
@@ -22,7 +22,7 @@ def outcome():
 
 def written(out, outcome):
     results.write_results(
-        out, outcome, {"seed": 0}, trainer.read_rows(tiny_dataset.run()), {"evaluate": 1.5, "total": 2.0}
+        out, outcome, {"seed": 0}, metrics_log.read_rows(tiny_dataset.run()), {"evaluate": 1.5, "total": 2.0}
     )
 
     def refuse(name):

@@ -1,5 +1,6 @@
 """The command line for tests that run it whole."""
 
+import importlib
 import importlib.util
 import sys
 from types import ModuleType
@@ -7,7 +8,17 @@ from types import ModuleType
 
 def unchecked_cli() -> ModuleType:
     """The module without executed annotations: tyro's mark of a missing value stands where a Path will be."""
-    spec = importlib.util.spec_from_file_location("unchecked_cli", importlib.util.find_spec("spnr_jax.cli").origin)
-    module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
+    name = "spnr_jax.tools.commands"
+    checked = importlib.import_module(name)
+    sys.modules[name] = _unchecked(name, "unchecked_commands")
+    try:
+        return _unchecked("spnr_jax.cli", "unchecked_cli")
+    finally:
+        sys.modules[name] = checked
+
+
+def _unchecked(name: str, own: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(own, importlib.util.find_spec(name).origin)
+    module = sys.modules[own] = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module

@@ -12,7 +12,7 @@ from spnr_jax import cli
 from spnr_jax.formats import data_sets
 from spnr_jax.tools import runs_command
 from spnr_jax.tools.runs_command import BARS, sparkline
-from spnr_jax.training import run_record, trainer
+from spnr_jax.training import metrics_log, run_record, trainer
 
 SCHEDULE = trainer.Schedule(log_every=1, preview_every=2, checkpoint_every=2)
 
@@ -107,7 +107,7 @@ class TestList:
     def test_a_run_itself_is_a_list_of_one(self, folder):
         (run,) = runs_command.read_runs(folder / "a")
         assert (run.name, run.best, run.best_step) == ("a", 11.0, 2)
-        rows = trainer.read_rows(folder / "a")
+        rows = metrics_log.read_rows(folder / "a")
         assert run.loss == [row["loss"] for row in rows if "loss" in row][-1]
 
     @pytest.mark.parametrize("name", ["empty", "none"])

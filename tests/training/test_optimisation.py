@@ -21,7 +21,7 @@ from spnr_jax.kernels.records import Rendering
 from spnr_jax.method import inference
 from spnr_jax.method.near_points import NearPointsNetwork
 from spnr_jax.method.paper_network import PaperNetwork
-from spnr_jax.training import many_runs, optimisation, pixels
+from spnr_jax.training import adversary, many_runs, optimisation, pixels
 
 
 @pytest.fixture(scope="module")
@@ -62,13 +62,13 @@ class TestState:
         assert fresh_l1.discriminator is None
         assert fresh_l1.discriminator_optimizer is None
         late = dataclasses.replace(CONFIG, loss=dataclasses.replace(CONFIG.loss, adversarial_start=1.0))
-        assert optimisation.first_adversarial_step(late) == late.num_steps
+        assert adversary.first_adversarial_step(late) == late.num_steps
         assert jax.eval_shape(lambda: optimisation.create_state(late)).discriminator is None
 
     @pytest.mark.parametrize(("share", "first"), [(0.0, 0), (0.25, 25), (1.0, 100)])
     def test_the_discriminator_joins_after_its_share_of_the_steps(self, share, first):
         loss = dataclasses.replace(CONFIG.loss, adversarial_start=share)
-        assert optimisation.first_adversarial_step(dataclasses.replace(CONFIG, loss=loss)) == first
+        assert adversary.first_adversarial_step(dataclasses.replace(CONFIG, loss=loss)) == first
 
 
 class TestGraph:
@@ -127,7 +127,7 @@ class TestStep:
                 )
 
             def judge(params, image):
-                return optimisation.discriminator_of(CONFIG).apply({"params": params}, image, condition, mask)
+                return adversary.discriminator_of(CONFIG).apply({"params": params}, image, condition, mask)
 
             def discriminator_loss(params):
                 fake = jax.lax.stop_gradient(forward(start.generator)[0].image[:, 0])
@@ -179,7 +179,7 @@ class TestCondition:
         image, condition, mask = (x[:, 0] for x in (BATCH.image, BATCH.condition, BATCH.condition_mask))
         empty = jnp.zeros_like(condition), jnp.zeros_like(mask)
         seen, unseen, expected = (
-            jax.jit(optimisation.logits, static_argnums=0)(config, fresh.discriminator, image, *inputs)
+            jax.jit(adversary.logits, static_argnums=0)(config, fresh.discriminator, image, *inputs)
             for config, inputs in ((CONFIG, (condition, mask)), (blind, (condition, mask)), (CONFIG, empty))
         )
         same_bits(unseen, expected)
@@ -194,8 +194,8 @@ class TestLazyR1:
 
         @jax.jit
         def parts(params, step):
-            loss, metrics = optimisation.discriminator_loss(CONFIG, params, fake, data, step)
-            module = optimisation.discriminator_of(CONFIG)
+            loss, metrics = adversary.discriminator_loss(CONFIG, params, fake, data, step)
+            module = adversary.discriminator_of(CONFIG)
             penalty = losses.r1(lambda image: module.apply({"params": params}, image, condition, mask), real)
             return loss - metrics["discriminator"], 2 * 10 * penalty
 

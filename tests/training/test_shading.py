@@ -13,11 +13,11 @@ from support.tiny_surfels import CONFIG, LIGHT, SCHEDULE
 import spnr_jax
 from spnr_jax.model_config import SurfelConfig
 from spnr_jax.surfels import lighting
-from spnr_jax.training import checkpoint, gbuffers, optimisation, shading, trainer, work
+from spnr_jax.training import checkpoint, gbuffers, metrics_log, optimisation, shading, trainer, work
 
 
 def rows_without_time(run):
-    return [{k: v for k, v in row.items() if k != "ms_per_step"} for row in trainer.read_rows(run)]
+    return [{k: v for k, v in row.items() if k != "ms_per_step"} for row in metrics_log.read_rows(run)]
 
 
 def interrupted(monkeypatch, step):
@@ -83,7 +83,7 @@ def test_the_run_and_the_file_that_it_ends_with_are_one_network():
     assert isinstance(of_file.config, SurfelConfig)
     assert of_run.config == of_file.config == CONFIG.model
     close(of_file.variables, jax.tree.map(np.asarray, of_run.variables), rtol=1e-3, atol=1e-4)
-    assert "val_psnr" in trainer.read_rows(tiny_surfels.run())[-1]
+    assert "val_psnr" in metrics_log.read_rows(tiny_surfels.run())[-1]
 
 
 def test_a_loss_that_is_not_finite_stops_the_run_and_names_the_step(monkeypatch, tmp_path):

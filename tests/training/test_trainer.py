@@ -22,7 +22,7 @@ from spnr_jax.baselines.sizes import NPBGConfig, PointNeRFConfig
 from spnr_jax.config import LossConfig
 from spnr_jax.formats import data_sets
 from spnr_jax.scoring import evaluation
-from spnr_jax.training import batching, checkpoint, optimisation, run_record, trainer, weights
+from spnr_jax.training import batching, checkpoint, metrics_log, optimisation, run_record, trainer, weights
 
 KEPT_STEPS = {"2", "4", "6"}
 
@@ -48,7 +48,7 @@ def stopped_run(monkeypatch, run, step):
 
 
 def rows_without_time(run):
-    return [{k: v for k, v in row.items() if k != "ms_per_step"} for row in trainer.read_rows(run)]
+    return [{k: v for k, v in row.items() if k != "ms_per_step"} for row in metrics_log.read_rows(run)]
 
 
 def restored(run):
@@ -121,8 +121,8 @@ def test_a_finished_run_is_left_alone():
 
 def test_previews_and_rows_come_when_the_schedule_says():
     run = tiny_dataset.run()
-    assert [row["step"] for row in trainer.read_rows(run) if "loss" in row] == [1, 2, 3, 4, 5, 6]
-    assert [row["step"] for row in trainer.read_rows(run) if "val_psnr" in row] == [3, 6]
+    assert [row["step"] for row in metrics_log.read_rows(run) if "loss" in row] == [1, 2, 3, 4, 5, 6]
+    assert [row["step"] for row in metrics_log.read_rows(run) if "val_psnr" in row] == [3, 6]
     assert {path.name for path in (run / "previews").iterdir()} == {"0000003.png", "0000006.png"}
     assert {path.name for path in (run / "checkpoints").iterdir() if path.is_dir()} == KEPT_STEPS
 
@@ -172,7 +172,7 @@ def test_a_full_disk_is_one_line_and_exit_code_2(monkeypatch, tmp_path, capsys):
     def full(log, row):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(tmp_path / "metrics.jsonl"))
 
-    monkeypatch.setattr(trainer.MetricsLog, "write", full)
+    monkeypatch.setattr(metrics_log.MetricsLog, "write", full)
     code = cli.guarded(lambda: trainer.train(CONFIG, tiny_dataset.dataset(), tmp_path, SCHEDULE), "spnr")
     assert code == 2
     line = capsys.readouterr().err.splitlines()[-1]

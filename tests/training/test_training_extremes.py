@@ -18,7 +18,7 @@ from spnr_jax.formats import data_sets
 from spnr_jax.kernels import losses
 from spnr_jax.method import inference
 from spnr_jax.presets import BASELINES, OURS, PLUS, tiny
-from spnr_jax.training import batching, optimisation, trainer
+from spnr_jax.training import adversary, batching, metrics_log, optimisation, trainer
 
 EVERY_STEP = trainer.Schedule(log_every=1, preview_every=100, checkpoint_every=100)
 NAMED = re.compile(r"(\w+) is (?:nan|inf|-inf) at step (\d+); the last checkpoint is kept")
@@ -64,9 +64,9 @@ def train_to_the_end_or_a_name(config, dataset, run) -> str | None:
     else:
         assert_finite(state)
         updates = state.generator_optimizer[0].count, state.discriminator_optimizer[0].count
-        assert updates == (config.num_steps, config.num_steps - optimisation.first_adversarial_step(config))
+        assert updates == (config.num_steps, config.num_steps - adversary.first_adversarial_step(config))
         quantity, whole = None, config.num_steps
-    rows = [row for row in trainer.read_rows(run) if "loss" in row]
+    rows = [row for row in metrics_log.read_rows(run) if "loss" in row]
     assert [row["step"] for row in rows] == list(range(1, whole + 1))
     assert all(np.isfinite(value) for row in rows for value in row.values())
     return quantity
@@ -207,7 +207,7 @@ def train_under_debug_nans(config: TrainConfig, dataset):
     with jax.debug_nans(True), closing(batching.batches(dataset, config, 0)) as batches:
         state = optimisation.jitted_create_state(config)
         for step, batch in enumerate(batches):
-            adversarial = step >= optimisation.first_adversarial_step(config)
+            adversarial = step >= adversary.first_adversarial_step(config)
             state, metrics = optimisation.jitted_train_step(
                 state, jax.device_put(batch), config=config, adversarial=adversarial
             )
@@ -226,7 +226,7 @@ class TestNoNaN:
     @pytest.mark.parametrize("preset", OURS)
     def test_twenty_steps_of_each_shrunken_preset_make_none(self, preset, precision, tmp_path):
         config = shrunken(preset(), precision, 20)
-        assert optimisation.first_adversarial_step(config) in range(1, 20), "both phases are trained"
+        assert adversary.first_adversarial_step(config) in range(1, 20), "both phases are trained"
         assert train_under_debug_nans(config, images_of(config, tmp_path)).step == 20
 
     @pytest.mark.slow

@@ -12,7 +12,7 @@ from support import tiny_dataset
 from tensorboardX.proto.event_pb2 import Event
 
 from spnr_jax.formats.images import png
-from spnr_jax.training import checkpoint, optimisation, trainer
+from spnr_jax.training import checkpoint, metrics_log, optimisation, trainer
 
 PICTURE = np.random.default_rng(0).random((8, 6, 3)).astype(np.float32)
 
@@ -35,7 +35,7 @@ def pixels(content):
 
 
 def test_a_row_with_a_picture_is_scalars_and_an_image_of_the_same_pixels_as_the_file(tmp_path):
-    log = trainer.MetricsLog(tmp_path, 0)
+    log = metrics_log.MetricsLog(tmp_path, 0)
     log.write({"step": 2, "loss": 3.0})
     log.write({"step": 3, "val_psnr": 20.5}, PICTURE)
     log.close()
@@ -44,7 +44,7 @@ def test_a_row_with_a_picture_is_scalars_and_an_image_of_the_same_pixels_as_the_
     assert (at, score.tag, score.simple_value) == (3, "val_psnr", 20.5)
     assert (shown, picture.tag) == (3, "preview")
     np.testing.assert_array_equal(pixels(picture.image.encoded_image_string), pixels(png(PICTURE)))
-    assert trainer.read_rows(tmp_path) == [{"step": 2, "loss": 3.0}, {"step": 3, "val_psnr": 20.5}]
+    assert metrics_log.read_rows(tmp_path) == [{"step": 2, "loss": 3.0}, {"step": 3, "val_psnr": 20.5}]
 
 
 @pytest.fixture
