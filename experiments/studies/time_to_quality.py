@@ -37,7 +37,7 @@ from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
 from spnr_jax.presets import PRESETS
 from spnr_jax.scoring import evaluation
-from spnr_jax.training import batching, optimisation
+from spnr_jax.training import adversary, batching, optimisation
 
 Row = dict[str, float]
 
@@ -87,7 +87,7 @@ class Pace:
 
     def seconds(self, config: TrainConfig, steps: int) -> float:
         """Of so many first steps of a training."""
-        judged = max(0, steps - optimisation.first_adversarial_step(config))
+        judged = max(0, steps - adversary.first_adversarial_step(config))
         return (steps - judged) * self.alone + judged * (self.adversarial or self.alone)
 
 
@@ -128,7 +128,7 @@ def kept_pace(preset: str, options: TimeToQuality, dataset: data_sets.Dataset) -
 
 def judged(config: TrainConfig) -> bool:
     """Whether some steps of the training have a discriminator."""
-    return optimisation.first_adversarial_step(config) < config.num_steps
+    return adversary.first_adversarial_step(config) < config.num_steps
 
 
 def config_of(preset: str, options: TimeToQuality, steps: int, seed: int = 0) -> TrainConfig:
@@ -152,7 +152,7 @@ def curve(preset: str, seed: int, options: TimeToQuality, pace: Pace, dataset: d
     names = test_objects(dataset, options.objects)
     marks = {round(config.num_steps * (i + 1) / options.marks) for i in range(options.marks)}
     state, rows = optimisation.jitted_create_state(config), []
-    first_judged, start = optimisation.first_adversarial_step(config), time.monotonic()
+    first_judged, start = adversary.first_adversarial_step(config), time.monotonic()
     with closing(batching.batches(dataset, config, 0)) as batches:
         for step, batch in enumerate(batches):
             state, metrics = optimisation.jitted_train_step(
