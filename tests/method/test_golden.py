@@ -1,4 +1,4 @@
-"""Both networks of the package draw what they drew before: two clouds, within what processors may differ by."""
+"""The networks of the package draw what they drew before: two clouds, within what processors may differ by."""
 
 import numpy as np
 import pytest
