@@ -56,7 +56,7 @@ def room_light() -> Light:
     Kept in a file of the package: making it takes 1.4 s of a first picture.
     """
     with (resources.files("spnr_jax") / "pretrained" / ROOM).open("rb") as file:
-        return Light(tables=np.load(file)["tables"])
+        return Light(tables=np.load(file, allow_pickle=False)["tables"])
 
 
 def made_room_light() -> Light:

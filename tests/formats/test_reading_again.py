@@ -8,7 +8,6 @@ import shutil
 import threading
 from contextlib import closing
 from pathlib import Path
-from types import SimpleNamespace
 
 import msgpack
 import pytest
@@ -111,7 +110,8 @@ def test_packed_objects_are_read_again_too():
 @pytest.fixture
 def stepless(monkeypatch):
     """A network without numbers, whose step does nothing: the reader alone is tested."""
-    monkeypatch.setattr(trainer, "new_state", lambda config, init: SimpleNamespace(step=0))
+    nothing = optimisation.TrainState(**dict.fromkeys(optimisation.TrainState.__dataclass_fields__) | {"step": 0})
+    monkeypatch.setattr(trainer, "new_state", lambda config, init: nothing)
     monkeypatch.setattr(
         optimisation, "jitted_train_step", lambda state, batch, **_: (state, {"loss": batch.image.mean()})
     )
