@@ -22,6 +22,7 @@ from PIL import Image
 from data_gen.store import storage
 from data_gen.store.storage import Location
 from spnr_jax.errors import UserError
+from spnr_jax.formats.npz import packed
 
 SCHEMA_VERSION = 1
 MOST_PIXELS = 2**26  # of a view
@@ -172,10 +173,8 @@ def encode_image(pixels: np.ndarray) -> bytes:
 
 def encode_lights(lights: np.ndarray) -> bytes:
     """Return environment maps (views, height, width, 3) as an .npz of halves, cut where they are too bright."""
-    buffer = io.BytesIO()
     halves = np.minimum(lights, np.finfo(np.float16).max).astype(np.float16)
-    np.savez_compressed(buffer, allow_pickle=False, lights=halves)
-    return buffer.getvalue()
+    return packed({"lights": halves}, compressed=True)
 
 
 def read_image(path: Path) -> np.ndarray:

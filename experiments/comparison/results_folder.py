@@ -19,6 +19,7 @@ from experiments.comparison import result_tables
 from experiments.comparison.result_tables import Table
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets, images
+from spnr_jax.formats.npz import packed
 from spnr_jax.training import run_record
 
 
@@ -57,7 +58,7 @@ def _picture(place: Path) -> np.ndarray:
 
 WRITERS: dict[str, Callable[[Any], bytes]] = {
     ".json": lambda content: (json.dumps(content, indent=1) + "\n").encode(),  # scores may be NaN
-    ".npz": lambda arrays: images.npz(*arrays),
+    ".npz": lambda arrays: packed({str(number): array for number, array in enumerate(arrays)}, compressed=True),
     ".png": images.png,
 }
 READERS: dict[str, Callable[[Path], Any]] = {

@@ -23,6 +23,7 @@ from functools import partial
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import mitsuba
 import numpy as np
 
@@ -36,6 +37,7 @@ from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets, gaussian_files, images
 from spnr_jax.gaussians import drawing
 from spnr_jax.gaussians.placing import View
+from spnr_jax.kernels.metrics import psnr
 from spnr_jax.kernels.records import Gaussians, PointCloud
 from spnr_jax.method.model import Model, Volume
 from spnr_jax.scoring.picture_scores import sharpness
@@ -194,11 +196,11 @@ def _at(rgba: np.ndarray, size: int) -> Drawn:
 def _scored(shown: list[Drawn], references: list[np.ndarray], of_network: list[Drawn]) -> dict[str, float]:
     """Mean decibels of some views: whole, inside the silhouettes, and against the network's pictures."""
     scores = [sharpness(*picture, reference) for picture, reference in zip(shown, references, strict=True)]
-    beside = [_decibels(one[0], other[0]) for one, other in zip(shown, of_network, strict=True)]
+    own, networks = (jnp.stack([image for image, _ in drawn]) for drawn in (shown, of_network))
     return {
         "psnr": float(np.mean([s.psnr for s in scores])),
         "inside": float(np.nanmean([s.psnr_inside for s in scores])),
-        "network": float(np.mean(beside)),
+        "network": float(jnp.mean(psnr(own, networks))),
     }
 
 
@@ -213,11 +215,6 @@ def _pictures(options: SplatStudy, model: Model, volume: Volume, name: str) -> l
     arrays = results_folder.kept(options.out / name / "pictures.npz", drawn)
     inside = [in_box(camera, volume) for camera in cameras]
     return [View(*each) for each in zip(inside, *arrays, strict=True)]
-
-
-def _decibels(one: np.ndarray, other: np.ndarray) -> float:
-    squared = float(np.mean((one - other) ** 2))
-    return 100.0 if squared == 0 else float(-10 * np.log10(squared))
 
 
 def _shown(options: SplatStudy, name: str, method: str) -> np.ndarray:

@@ -59,13 +59,6 @@ def png(image: np.ndarray | Array) -> bytes:
     return stream.getvalue()
 
 
-def npz(*arrays: np.ndarray) -> bytes:
-    """The arrays as a compressed NPZ file, in their order."""
-    stream = io.BytesIO()
-    np.savez_compressed(stream, *arrays)
-    return stream.getvalue()
-
-
 def check_place(path: Path) -> None:
     """ValueError if no file can be written at a path: it is asked before the work, not after it."""
     if path.is_dir():

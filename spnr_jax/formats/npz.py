@@ -6,13 +6,13 @@
 Pickled objects, which could run code, are refused.  Every fault is a ValueError; the caller adds the file's name.
 """
 
+import io
 import math
 import threading
 import tokenize
 import zipfile
 import zlib
 from collections.abc import Collection, Iterator
-from io import BufferedIOBase
 from pathlib import Path
 
 import numpy as np
@@ -60,7 +60,15 @@ def numpy_pieces(path: Path) -> Iterator[Columns]:
         yield {name.lower(): column for name, column in zip(names, values, strict=True)}
 
 
-def read_arrays(file: BufferedIOBase, wanted: Collection[str] | None = None) -> dict[str, np.ndarray]:
+def packed(arrays: dict[str, np.ndarray], *, compressed: bool = False) -> bytes:
+    """An .npz archive of arrays by their names."""
+    stream = io.BytesIO()
+    save = np.savez_compressed if compressed else np.savez
+    save(stream, allow_pickle=False, **arrays)
+    return stream.getvalue()
+
+
+def read_arrays(file: io.BufferedIOBase, wanted: Collection[str] | None = None) -> dict[str, np.ndarray]:
     """The arrays of an .npz archive, those whose names are wanted; ValueError if it is broken or unpacks to too much.
 
     An array's size is checked before memory is taken for it: its header must not announce more than its bytes.

@@ -36,12 +36,14 @@ class Sample:
     halvings: int = 0  # of the share that is taken
 
 
-def sampled(sample: Sample, positions: np.ndarray, most: int) -> Sample:
-    """The sample of at most so many points after the stream's next positions (n, 3)."""
-    keys = np.arange(sample.seen + 1, sample.seen + len(positions) + 1, dtype=np.uint64) * SCATTER
-    seen, halvings = sample.seen + len(positions), sample.halvings
+def sampled(sample: Sample, piece: Columns, most: int) -> Sample:
+    """The sample of at most so many points after the stream's next ones."""
+    seen, halvings = sample.seen + len(piece["x"]), sample.halvings
+    if most == 0:
+        return Sample(seen=seen)
+    keys = np.arange(sample.seen + 1, seen + 1, dtype=np.uint64) * SCATTER
     taken = keys >> np.uint64(64 - halvings) == 0 if halvings else slice(None)
-    positions = np.concatenate([sample.positions, positions[taken]])
+    positions = np.concatenate([sample.positions, stacked(piece)[taken]])
     keys = np.concatenate([sample.keys, keys[taken]])
     while len(keys) > most:
         halvings += 1
@@ -59,7 +61,7 @@ def thin_stream(pieces: Iterable[Columns], capacity: int, most_sampled: int = 0)
     kept: Columns = {}
     sample, voxel, corner = Sample(), None, np.zeros(3)
     for piece in pieces:
-        sample = sampled(sample, stacked(piece), most_sampled)
+        sample = sampled(sample, piece, most_sampled)
         kept = {name: np.concatenate([kept[name], piece[name]]) if kept else piece[name] for name in piece}
         if len(kept["x"]) <= capacity and voxel is None:
             continue

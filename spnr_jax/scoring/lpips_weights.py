@@ -5,7 +5,6 @@ They are made once from two files that others publish: AlexNet's weights as torc
 """
 
 import importlib
-import io
 import pickle
 from pathlib import Path
 
@@ -13,7 +12,7 @@ import numpy as np
 
 from spnr_jax.errors import UserError
 from spnr_jax.formats.images import write_whole
-from spnr_jax.formats.npz import read_arrays
+from spnr_jax.formats.npz import packed, read_arrays
 from spnr_jax.scoring.lpips import CHANNELS, WINDOWS, LpipsWeights
 
 CONVOLUTIONS = (0, 3, 6, 8, 10)  # places of the convolutions among AlexNet's features
@@ -63,9 +62,7 @@ def convert(alexnet: Path, heads: Path, out: Path) -> None:
         arrays[f"bias_{i}"] = _entry(trunk, f"features.{place}.bias", alexnet)
         arrays[f"head_{i}"] = _entry(linear, f"lin{i}.model.1.weight", heads).ravel()
     from_arrays(arrays, out)
-    stream = io.BytesIO()
-    np.savez(stream, allow_pickle=False, **arrays)
-    write_whole(out, stream.getvalue())
+    write_whole(out, packed(arrays))
 
 
 def _read_state(path: Path) -> dict:

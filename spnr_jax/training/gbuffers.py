@@ -10,7 +10,6 @@ again.  A batch is a pure function of (seed, step) and the list of files: square
 """
 
 import dataclasses
-import io
 import zlib
 from collections.abc import Callable, Generator
 from functools import partial
@@ -28,7 +27,7 @@ from spnr_jax.errors import UserError
 from spnr_jax.formats.clouds import MOST_EVEN
 from spnr_jax.formats.data_sets import Dataset, ObjectData, read_object
 from spnr_jax.formats.images import to_uint8, write_whole
-from spnr_jax.formats.npz import read_arrays
+from spnr_jax.formats.npz import packed, read_arrays
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.records import Camera, Crops, Light, PointCloud
 from spnr_jax.kernels.thinning import farthest_points
@@ -78,7 +77,7 @@ def complete(dataset: Dataset, light: Light, config: TrainConfig, folder: Path, 
         for number, path in enumerate(paths):
             if item is not None and found[number] is None:
                 arrays = make(item, number, light, config, solid)
-                write_whole(path, _packed(arrays))
+                write_whole(path, packed(arrays))  # not compressed: a view is read for each crop
                 found[number] = arrays["doublings"].tolist()
         views += [View(path, i, d) for path, of in zip(paths, found, strict=True) for i, d in enumerate(of or ())]
     if not views:
@@ -93,12 +92,6 @@ def _doublings(path: Path) -> list[int] | None:
             return read_arrays(file, ("doublings",))["doublings"].tolist()
     except (OSError, ValueError):
         return None
-
-
-def _packed(arrays: Arrays) -> bytes:
-    stream = io.BytesIO()
-    np.savez(stream, allow_pickle=False, **arrays)  # not compressed: a view is read for each crop
-    return stream.getvalue()
 
 
 def make(item: ObjectData, number: int, light: Light, config: TrainConfig, solid: dict) -> Arrays:

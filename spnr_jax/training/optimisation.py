@@ -95,9 +95,8 @@ def create_state(config: TrainConfig, seed: int | Array | None = None) -> TrainS
     discriminator = None
     if adversary.first_adversarial_step(config) < config.num_steps:
         image = jnp.zeros((1, *[config.model.image_resolution] * 2, 3))
-        discriminator = adversary.discriminator_of(config).init(discriminator_key, image, image, image[..., 0] > 0)[
-            "params"
-        ]
+        judge = adversary.discriminator_of(config)
+        discriminator = judge.init(discriminator_key, image, image, image[..., 0] > 0)["params"]
     return TrainState(
         step=jnp.zeros((), jnp.int32),
         key=key,

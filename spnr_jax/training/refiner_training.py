@@ -11,7 +11,6 @@ of the pictures, mirrored and upside down too; a batch is a pure function of (se
 
 import dataclasses
 import hashlib
-import io
 import zlib
 from collections.abc import Generator
 from functools import partial
@@ -28,7 +27,7 @@ from tqdm import tqdm
 from spnr_jax.config import TrainConfig
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.images import write_whole
-from spnr_jax.formats.npz import read_arrays
+from spnr_jax.formats.npz import packed, read_arrays
 from spnr_jax.kernels import cameras, cloud_arrays, losses
 from spnr_jax.kernels.colors import LEAST_OPACITY
 from spnr_jax.kernels.metrics import psnr
@@ -60,22 +59,21 @@ def complete(dataset: data_sets.Dataset, variables: dict, config: TrainConfig, f
         kept = read(place, network)
         if kept is None:
             arrays = drawn(variables, config, data_sets.read_object(dataset, name))
-            stream = io.BytesIO()
-            np.savez(stream, allow_pickle=False, network=network, **arrays)
-            write_whole(place, stream.getvalue())
+            write_whole(place, packed({"network": network} | arrays))
             kept = arrays
         views += zip(kept["seen"], kept["reference"], strict=True)
     return views
 
 
 def read(place: Path, network: np.ndarray) -> dict[str, np.ndarray] | None:
-    """The arrays of a file; None if there is none of this network that can be read."""
+    """The arrays of a file; None if there is none of this network that can be read and is whole."""
+    names = {"network", "seen", "reference"}
     try:
         with place.open("rb") as file:
-            arrays = read_arrays(file, ("network", "seen", "reference"))
+            arrays = read_arrays(file, names)
     except (OSError, ValueError):
         return None
-    return arrays if np.array_equal(arrays["network"], network) else None
+    return arrays if arrays.keys() == names and np.array_equal(arrays["network"], network) else None
 
 
 def drawn(variables: dict, config: TrainConfig, item: data_sets.ObjectData) -> dict[str, np.ndarray]:

@@ -8,7 +8,6 @@ The package holds three networks (docs/model_card.md), of which `surfels` render
 the file of one.
 """
 
-import io
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -24,7 +23,7 @@ from spnr_jax.config import TrainConfig
 from spnr_jax.errors import UserError
 from spnr_jax.formats.config_json import from_dict, to_dict
 from spnr_jax.formats.images import write_whole
-from spnr_jax.formats.npz import read_arrays
+from spnr_jax.formats.npz import packed, read_arrays
 from spnr_jax.method.inference import init
 from spnr_jax.method.model import Model
 from spnr_jax.model_config import NetworkConfig, SurfelConfig
@@ -95,9 +94,8 @@ def write_weights(path: Path, trained: Trained) -> None:
             raise UserError(f"{path}: {name} reaches {np.abs(values).max():.3g}, which float16 does not hold")
     halves = {name: values.astype(np.float16) for name, values in arrays.items()}
     described = np.frombuffer(json.dumps(to_dict(trained.config)).encode(), np.uint8)
-    stream = io.BytesIO()
-    np.savez_compressed(stream, allow_pickle=False, config=described, steps=np.int64(trained.steps), **halves)
-    write_whole(path, stream.getvalue())
+    content: dict[str, np.ndarray] = {"config": described, "steps": np.array(trained.steps, np.int64)}
+    write_whole(path, packed(content | halves, compressed=True))
 
 
 def read_weights(path: Path) -> Trained:
