@@ -4,6 +4,7 @@ The file is in the cloud's own frame, which in a data set is that of the cameras
 """
 
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,12 +13,10 @@ import numpy as np
 from spnr_jax.formats.clouds import PlacedCloud
 from spnr_jax.formats.mesh.assets import Asset
 from spnr_jax.formats.mesh.meshes import load_mesh
+from spnr_jax.gaussians.placing import View
 from spnr_jax.kernels.records import PointCloud
-from spnr_jax.method.model import Model
-from spnr_jax.tools import density_grid, mesh_export
-from spnr_jax.tools.pictures import mesh_level
-
-RESOLUTION = 96  # places along each side of the grid, as the command has it
+from spnr_jax.method.model import Volume
+from spnr_jax.tools import fused_surface, mesh_export
 
 
 class ExportedMesh(NamedTuple):
@@ -29,11 +28,10 @@ class ExportedMesh(NamedTuple):
     watertight: bool
 
 
-def exported(model: Model, cloud: PointCloud, resolution: int = RESOLUTION) -> ExportedMesh:
-    """The mesh of a cloud by a network that has a density; ValueError where that shows no surface."""
+def exported(views: Sequence[View], volume: Volume, cloud: PointCloud) -> ExportedMesh:
+    """The mesh of an encoded cloud by a network's pictures of it; ValueError where they show no surface."""
     placed = PlacedCloud(cloud=cloud, up="y", rotation=np.eye(3), origin=np.zeros(3))
-    grid = density_grid.sample_density(model, model.encode(cloud), placed, resolution)
-    solid = mesh_export.mesh_of(grid, placed, mesh_level(grid.voxel))
+    solid = mesh_export.mesh_of(fused_surface.solidity(views, volume, placed), placed)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "mesh.glb"
         path.write_bytes(solid.content)

@@ -1,11 +1,12 @@
 """What is lost when a network's object becomes Gaussian splats, or a mesh?
 
-    python -m experiments.studies.splat_quality --data DIR --out OUT [--objects 4] [--views 2] [--seconds 20]
+    python -m experiments.studies.splat_quality --data DIR --out OUT [--objects 4] [--views 2] [--seconds 5 20]
 
-The network draws test objects of a data set at its cameras; so do their splats (`spnr_jax.splats`), once drawn by this
-package (gaussians/drawing.py) and once by Mitsuba (`volprim_rf_basic` on the .ply that the package writes: a reader and
-a renderer that share nothing with it), and the mesh of `spnr render --mesh`, which Mitsuba draws in the data set's own
-light.  Each is compared with the reference, and the others with the network.
+The network draws test objects of a data set at its cameras; so do their splats (`spnr_jax.splats`), drawn by this
+package (gaussians/drawing.py) after so many seconds of refining each, and the last of them by Mitsuba
+(`volprim_rf_basic` on the .ply that the package writes: a reader and a renderer that share nothing with it); and the
+mesh of `spnr render --mesh`, which Mitsuba draws in the data set's own light.  Each is compared with the reference, and
+the others with the network.
 
     OUT/results.json  OUT/table.md .csv .tex   PSNR of whole pictures and inside the silhouettes, by size and by object
     OUT/gallery.png                            reference, network, splats, mesh at the largest size; megabytes, s, dB
@@ -18,6 +19,7 @@ takes on that machine alone.
 import dataclasses
 import itertools
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -30,6 +32,7 @@ import numpy as np
 from data_gen.render.variant import choose_variant
 from experiments import entry_point
 from experiments.comparison import exported_mesh, figures, poisson, results_folder, splats_by_mitsuba
+from experiments.comparison.exported_mesh import ExportedMesh
 from experiments.comparison.result_tables import Cell, Table, number
 from experiments.studies.sharpness import smaller, told, view_of
 from spnr_jax.devices import machine
@@ -45,7 +48,7 @@ from spnr_jax.tools import splat_making
 from spnr_jax.tools.splat_making import drawn_views, fitting_cameras, in_box
 from spnr_jax.training.weights import load
 
-METHODS = ("network", "splats", "splats, by Mitsuba", "mesh, by Mitsuba")
+BY_MITSUBA, MESH = "splats, by Mitsuba", "mesh, by Mitsuba"
 SIZES = (128, 512)
 
 
@@ -69,22 +72,25 @@ class SplatStudy:
     """Views of an object."""
     sizes: tuple[int, ...] = SIZES
     """Pixels along each side."""
-    seconds: float = 20.0
-    """Seconds of refining."""
+    seconds: tuple[float, ...] = (5.0, 20.0)
+    """Seconds of refining, each from the beginning."""
     step_seconds: float | None = None
     """Seconds that a step of it counts for (default: those that it takes)."""
     most: int = 80_000
     """Splats of an object at most."""
     degree: int = 1
     """Of their spherical harmonics."""
-    mesh_run: str = "small"
-    """Network of the mesh, one that has a density."""
     fitting_views: int = 32
     """Pictures that splats are made from."""
     fitting_resolution: int = 512
     """Pixels of these along each side."""
     spp: int = 16
     """Rays a pixel of Mitsuba's pictures."""
+
+    @property
+    def methods(self) -> tuple[str, ...]:
+        """What is compared."""
+        return ("network", *(_after(seconds) for seconds in self.seconds), BY_MITSUBA, MESH)
 
 
 Drawn = tuple[np.ndarray, np.ndarray]  # a picture on white (sRGB), and opacity
@@ -100,69 +106,104 @@ def main(options: SplatStudy) -> None:
     results_folder.claim(options.out, "splat_quality", {k: v for k, v in asked.items() if k not in which}, dataset)
     variant = choose_variant()[0]
     mitsuba.set_variant(variant)
-    renderer, rows = poisson.Renderer(dataset.settings, variant=variant), {}
-    models = load(options.run), load(options.mesh_run)
-    for name in names:
-        item = data_sets.read_object(dataset, name)
-        place = options.out / "scores" / f"{name}.json"
-        rows[name] = results_folder.kept(place, partial(_scores, options, models, renderer, item))
-        print(name, rows[name], flush=True)
-    cells = [[_shown(options, name, method) for method in ("reference", *METHODS)] for name in names]
-    captions = [["", *(_caption(rows[name], method, options.sizes[-1]) for method in METHODS)] for name in names]
-    picture = figures.grid(cells, ("reference", *METHODS), names, size=256, below=captions)
+    renderer, rows = poisson.Renderer(dataset.settings, variant=variant), dict[str, dict]()
+    model = load(options.run)
+    for part, scores in ("splats", _splat_scores), ("mesh", _mesh_scores):
+        for name in names:
+            item = data_sets.read_object(dataset, name)
+            place = options.out / "scores" / f"{name}_{part}.json"
+            found = results_folder.kept(place, partial(scores, options, model, renderer, item))
+            rows[name] = rows.get(name, {}) | found
+            print(name, found, flush=True)
+    cells = [[_shown(options, name, method) for method in ("reference", *options.methods)] for name in names]
+    captions = [
+        ["", *(_caption(rows[name], method, options.sizes[-1]) for method in options.methods)] for name in names
+    ]
+    picture = figures.grid(cells, ("reference", *options.methods), names, size=256, below=captions)
     images.write_whole(options.out / "gallery.png", images.png(picture))
-    tables = [_table(options, rows), *(_by_object(rows, size) for size in options.sizes)]
+    tables = [_table(options, rows), *(_by_object(options, rows, size) for size in options.sizes)]
     results_folder.write(options.out, {"objects": rows, "hardware": machine.hardware()}, tables)
 
 
-def _scores(
-    options: SplatStudy, models: tuple[Model, Model], renderer: poisson.Renderer, item: data_sets.ObjectData
-) -> dict:
-    """Decibels by size and method; numbers of splats and faces, megabytes as .spz and .glb, and seconds."""
-    cloud = told(jax.tree.map(lambda x: x[: options.num_points], item.cloud), normals=False)
-    model, solid = models
+def _splat_scores(options: SplatStudy, model: Model, renderer: poisson.Renderer, item: data_sets.ObjectData) -> dict:
+    """Decibels by size and method; splats, megabytes as .spz, steps and seconds of each making."""
+    cloud = _cloud(options, item)
     volume = model.encode(cloud)
-    made, found = _made(options, _pictures(options, model, volume, item.name), volume, cloud)
-    meshed, of_mesh = _meshed(options, solid, renderer, cloud, item)
-    found |= of_mesh
+    pictures, splats, found = _pictures(options, model, volume, item.name), {}, {}
+    for seconds in options.seconds:
+        splats[_after(seconds)], found[f"{_after(seconds)}, made"] = _made(options, pictures, volume, cloud, seconds)
+    last, place = splats[_after(options.seconds[-1])], options.out / f"{item.name}.ply"
     for size in options.sizes:
-        pairs = [view_of(item, view, size) for view in range(options.views)]
-        cameras = [camera for camera, _ in pairs]
-        renderings = list(model.render_each(volume, cameras))
-        drawn: dict[str, list[Drawn]] = {
-            "network": [(np.asarray(r.image), np.asarray(r.acc)) for r in renderings],
-            "splats": [drawing.draw(made, camera) for camera in cameras],
-            "splats, by Mitsuba": [
-                splats_by_mitsuba.drawn(made, camera, options.spp, options.out / f"{item.name}.ply")
-                for camera in cameras
-            ],
-            "mesh, by Mitsuba": [_at(rgba, size) for rgba in meshed],
-        }
-        (options.out / f"{item.name}.ply").unlink()
-        for method, shown in drawn.items():
-            found[f"{method}, {size}"] = _scored(shown, [reference for _, reference in pairs], drawn["network"])
-            images.write_whole(options.out / item.name / f"{method}.png", images.png(shown[0][0]))
-        reference = data_sets.on_white(images.to_uint8(pairs[0][1]))
-        images.write_whole(options.out / item.name / "reference.png", images.png(reference))
+        cameras = [view_of(item, view, size)[0] for view in range(options.views)]
+        drawn = {name: [drawing.draw(made, camera) for camera in cameras] for name, made in splats.items()}
+        drawn[BY_MITSUBA] = [splats_by_mitsuba.drawn(last, camera, options.spp, place) for camera in cameras]
+        found |= _compared(options, model, volume, item, size, drawn)
+    place.unlink()
     return found
 
 
-def _made(options: SplatStudy, pictures: list[View], volume: Volume, cloud: PointCloud) -> tuple[Gaussians, dict]:
+def _mesh_scores(options: SplatStudy, model: Model, renderer: poisson.Renderer, item: data_sets.ObjectData) -> dict:
+    """Decibels of the mesh by size; its faces, megabytes as .glb and seconds."""
+    cloud = _cloud(options, item)
+    volume = model.encode(cloud)
+    pictures, found = _meshed(
+        options,
+        partial(exported_mesh.exported, _pictures(options, model, volume, item.name), volume, cloud),
+        renderer,
+        item,
+    )
+    for size in options.sizes:
+        found |= _compared(options, model, volume, item, size, {MESH: [_at(rgba, size) for rgba in pictures]})
+    return found
+
+
+def _cloud(options: SplatStudy, item: data_sets.ObjectData) -> PointCloud:
+    return told(jax.tree.map(lambda x: x[: options.num_points], item.cloud), normals=False)
+
+
+def _compared(
+    options: SplatStudy,
+    model: Model,
+    volume: Volume,
+    item: data_sets.ObjectData,
+    size: int,
+    drawn: dict[str, list[Drawn]],
+) -> dict:
+    """Decibels of pictures at the object's first cameras, and of the network's there; the first of each is written."""
+    cameras, references = zip(*(view_of(item, view, size) for view in range(options.views)), strict=True)
+    renderings = model.render_each(volume, list(cameras))
+    network = [(np.asarray(rendering.image), np.asarray(rendering.acc)) for rendering in renderings]
+    reference = data_sets.on_white(images.to_uint8(references[0]))
+    images.write_whole(options.out / item.name / "reference.png", images.png(reference))
+    found = {}
+    for method, shown in {"network": network, **drawn}.items():
+        found[f"{method}, {size}"] = _scored(shown, list(references), network)
+        images.write_whole(options.out / item.name / f"{method}.png", images.png(shown[0][0]))
+    return found
+
+
+def _after(seconds: float) -> str:
+    return f"splats, {seconds:g} s"
+
+
+def _made(
+    options: SplatStudy, pictures: list[View], volume: Volume, cloud: PointCloud, seconds: float
+) -> tuple[Gaussians, dict]:
     """The splats in the box, their number, the megabytes as .spz, steps of refining and the seconds of all that."""
     begin = time.perf_counter()
     made, steps = splat_making.placed(pictures, volume, cloud, options.degree, options.most), 0
     placed = time.perf_counter() - begin
-    if options.seconds > 0:
+    if seconds > 0:
         each = options.step_seconds
         clock = time.monotonic if each is None else partial(next, itertools.count(0, each))
-        made, steps = splat_making.refined(made, pictures, options.seconds, clock)
+        made, steps = splat_making.refined(made, pictures, seconds, clock)
     spz = len(gaussian_files.spz_of(made)) / 1e6
-    seconds = {"placing_seconds": placed, "splat_seconds": time.perf_counter() - begin}
-    return made, {"splats": len(made.opacity), "spz_mb": spz, "steps": steps} | seconds
+    took = {"placing_seconds": placed, "seconds": time.perf_counter() - begin}
+    return made, {"splats": len(made.opacity), "spz_mb": spz, "steps": steps} | took
 
 
 def _meshed(
-    options: SplatStudy, solid: Model, renderer: poisson.Renderer, cloud: PointCloud, item: data_sets.ObjectData
+    options: SplatStudy, make: Callable[[], ExportedMesh], renderer: poisson.Renderer, item: data_sets.ObjectData
 ) -> tuple[np.ndarray, dict]:
     """Pictures (views, height, width, 4) of the object's mesh, sRGB with straight alpha, and what it is.
 
@@ -170,7 +211,7 @@ def _meshed(
     """
     begin = time.perf_counter()
     try:
-        mesh = exported_mesh.exported(solid, cloud)
+        mesh = make()
     except UserError as error:
         nothing = {"faces": 0, "glb_mb": 0.0, "watertight": False, "empty": str(error)}
         return np.zeros(item.images[: options.views].shape, np.uint8), nothing | {"mesh_seconds": 0.0}
@@ -223,43 +264,50 @@ def _shown(options: SplatStudy, name: str, method: str) -> np.ndarray:
 
 def _caption(row: dict, method: str, size: int) -> str:
     """What stands below a picture: its decibels, and of what is a file its megabytes and seconds."""
-    told = {
-        "splats": f"{row['spz_mb']:.1f} MB, {row['splat_seconds']:.0f} s, ",
-        "mesh, by Mitsuba": f"{row['glb_mb']:.1f} MB, {row['mesh_seconds']:.0f} s, ",
-    }
-    return f"{told.get(method, '')}{row[f'{method}, {size}']['psnr']:.1f} dB"
+    made = row.get(f"{method}, made")
+    told = f"{made['spz_mb']:.1f} MB, {made['seconds']:.0f} s, " if made else ""
+    if method == MESH:
+        told = f"{row['glb_mb']:.1f} MB, {row['mesh_seconds']:.0f} s, "
+    return f"{told}{row[f'{method}, {size}']['psnr']:.1f} dB"
 
 
 def _table(options: SplatStudy, rows: dict) -> Table:
     """A row for each method and size, means over the objects."""
-    made: list[tuple[str, tuple[Cell, ...]]] = []
+    lines: list[tuple[str, tuple[Cell, ...]]] = []
     for size in options.sizes:
-        for method in METHODS:
+        for method in options.methods:
             found = [row[f"{method}, {size}"] for row in rows.values()]
             means = [float(np.mean([scores[name] for scores in found])) for name in ("psnr", "inside", "network")]
             of_network = number(None if method == "network" else means[2], 1)
-            made.append((f"{method}, {size} px", (number(means[0], 2), number(means[1], 2), of_network)))
-    mean = {name: np.mean([row[name] for row in rows.values()]) for name in ("splats", "spz_mb", "glb_mb", "steps")}
+            lines.append((f"{method}, {size} px", (number(means[0], 2), number(means[1], 2), of_network)))
+
+    def mean(name: str, *of: str) -> float:
+        return float(np.mean([(row[of[0]] if of else row)[name] for row in rows.values()]))
+
+    made = [f"{_after(seconds)}, made" for seconds in options.seconds]
+    steps = " and ".join(f"{mean('steps', each):.0f}" for each in made)
     closed = sum(row["watertight"] for row in rows.values())
     return Table(
         title=f"Splats and meshes, {len(rows)} objects x {options.views} views",
         heads=("PSNR, dB", "inside, dB", "against the network, dB"),
-        rows=tuple(made),
-        note=f"{mean['splats']:,.0f} splats, {mean['spz_mb']:.1f} MB as .spz, {mean['steps']:.0f} steps; "
-        f"meshes of {mean['glb_mb']:.1f} MB, {closed} of them watertight. Means.",
+        rows=tuple(lines),
+        note=f"{mean('splats', made[-1]):,.0f} splats, {mean('spz_mb', made[-1]):.1f} MB as .spz, {steps} steps; "
+        f"meshes of {mean('glb_mb'):.1f} MB, {closed} of them watertight. Means.",
     )
 
 
-def _by_object(rows: dict, size: int) -> Table:
+def _by_object(options: SplatStudy, rows: dict, size: int) -> Table:
     """A row for each object: what its files hold, and the decibels of each method at a size."""
 
     def cells(row: dict) -> tuple[Cell, ...]:
-        counts = (number(row["splats"], 0), number(row["spz_mb"], 2), number(row["faces"], 0), number(row["glb_mb"], 2))
-        return *counts, *(number(row[f"{method}, {size}"]["psnr"], 2) for method in METHODS)
+        made = row[f"{_after(options.seconds[-1])}, made"]
+        counts = ((made["splats"], 0), (made["spz_mb"], 2), (row["faces"], 0), (row["glb_mb"], 2))
+        scores = ((row[f"{method}, {size}"]["psnr"], 2) for method in options.methods)
+        return tuple(number(*each) for each in (*counts, *scores))
 
     return Table(
         title=f"By object, {size} px",
-        heads=("splats", ".spz, MB", "faces", ".glb, MB", *(f"{method}, dB" for method in METHODS)),
+        heads=("splats", ".spz, MB", "faces", ".glb, MB", *(f"{method}, dB" for method in options.methods)),
         rows=tuple((name, cells(row)) for name, row in rows.items()),
     )
 

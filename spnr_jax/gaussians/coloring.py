@@ -43,7 +43,7 @@ def colored(gaussians: Gaussians, views: Sequence[View], *, side: float, degree:
         opacity, depth = view.opacity[row, column], view.depth[row, column]
         with np.errstate(invalid="ignore"):
             near = inside & (distance < depth + BEHIND * side)
-            before = near & (distance < _nearest_around(view.depth)[row, column] - BEFORE * side)
+            before = near & (distance < nearest_around(view.depth)[row, column] - BEFORE * side)
         against += before | (inside & (opacity < EMPTY))
         visible = np.flatnonzero(near & ~before & (opacity > SOLID))
         facing = np.abs(np.einsum("ni,ni->n", towards[visible], normal[visible]))
@@ -63,8 +63,8 @@ def colored(gaussians: Gaussians, views: Sequence[View], *, side: float, degree:
     return Gaussians(**kept | {"harmonics": harmonics.astype(np.float32)})
 
 
-def _nearest_around(depth: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "height width"]:
-    """The least depth of a pixel and those around it: the network's depth is blurred where it jumps."""
+def nearest_around(depth: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "height width"]:
+    """The least depth of a pixel and those around it, infinite where none has one: depth is blurred where it jumps."""
     return minimum_filter(np.where(np.isnan(depth), np.inf, depth), 3)
 
 

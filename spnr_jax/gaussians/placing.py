@@ -21,7 +21,8 @@ STRIDE = 2  # of the pixels that are carried back
 WITHIN, OFF_PLANE = 1.2, 0.5  # spacings of a surfel from which and above whose plane a pixel belongs to it
 GRAZING = 0.1  # cosine between ray and normal below which a pixel's depth says little
 FINEST = 1.5  # pixels of the pictures that a cube is wide at least
-WIDTH, THICKNESS, OPACITY = 0.5, 0.08, 0.9  # of a splat at first: standard deviations in cubes, opacity
+WIDTH, THICKNESS, OPACITY = 0.45, 0.03, 0.9  # of a splat at first: standard deviations in cubes, opacity
+INSET = 0.5  # pixels that a splat lies below the surface: at outlines many are seen from their edge, and all reach out
 TRIES, ENOUGH = 6, 0.85  # sizes of cubes that are tried, share of the wanted number that is good
 
 
@@ -86,7 +87,7 @@ def place(seen: Seen, *, most: int, pixel: float) -> tuple[Gaussians, float]:
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
     scale = np.broadcast_to(np.array([WIDTH, WIDTH, THICKNESS], np.float32) * side, (number, 3))
     placed = Gaussians(
-        position=position.astype(np.float32),
+        position=(position - INSET * pixel * normal).astype(np.float32),
         rotation=turned_to(normal).astype(np.float32),
         scale=np.array(scale),
         opacity=np.full(number, OPACITY, np.float32),

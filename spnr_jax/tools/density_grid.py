@@ -1,10 +1,5 @@
-"""The density of an encoded object on a grid along the axes of its file, and where that grid lies in the file.
+"""The density of an encoded object on a grid; it is 0 far from every point, as in rendering."""
 
-grid[i, j, k] is the density, per unit of the file, at lowest + spacing * (i, j, k) in the file's x y z.  Density is 0
-far from every point, as in rendering.
-"""
-
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -21,40 +16,19 @@ from spnr_jax.kernels.records import Rays
 from spnr_jax.method.inference import network
 from spnr_jax.method.model import Model, Volume
 from spnr_jax.model_config import RayNetworkConfig, RenderOptions
+from spnr_jax.tools.grids import Grid, over_box
 
 
-@dataclass(frozen=True, kw_only=True)
-class DensityGrid:
-    """Density (x, y, z) float32 of an object; `lowest` (3,) float64 is the place of [0, 0, 0] relative to `origin`."""
-
-    density: np.ndarray
-    lowest: np.ndarray
-    spacing: float
-    voxel: float  # side of a voxel of the network
-    origin: np.ndarray  # (3,) float64 of the file: places are split so that float32 can hold what is added to it
-
-
-def sample_density(model: Model, volume: Volume, placed: PlacedCloud, resolution: int) -> DensityGrid:
-    """The density in the box of an object, with `resolution` places along each side."""
+def sample_density(model: Model, volume: Volume, placed: PlacedCloud, resolution: int) -> Grid:
+    """The density per unit of the file in the box of an object, with `resolution` places along each side."""
     if not isinstance(model.config, RayNetworkConfig):
-        raise UserError("--mesh and --density need a network with a density volume; this run's has none")
-    scale = float(volume.scale)
-    steps = np.linspace(-1, 1, resolution, dtype=np.float32)
-    plane = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2)
-    rotation = placed.rotation.astype(np.float32)
-    density = np.empty((resolution,) * 3, np.float32)
-    for i, x in enumerate(steps):
-        places = np.concatenate([np.full_like(plane[:, :1], x), plane], axis=-1) @ rotation.T
+        raise UserError("--density needs a network with a density volume; this run's has none")
+
+    def density(places: Float[np.ndarray, "places 3"]) -> Array:
         values = _density_at(model.variables, volume.scene, places, config=model.config, reach=volume.reach)
-        density[i] = scale * np.asarray(values).reshape(resolution, resolution)
-    lowest = placed.rotation.T @ np.asarray(volume.centre, np.float64) - 1 / scale
-    return DensityGrid(
-        density=density,
-        lowest=lowest,
-        spacing=2 / (resolution - 1) / scale,
-        voxel=2 / model.config.encoder.volume_resolution / scale,
-        origin=placed.origin,
-    )
+        return volume.scale * values
+
+    return over_box(density, volume, placed, resolution)
 
 
 @partial(jax.jit, static_argnames=("config", "reach"))

@@ -1,6 +1,6 @@
-"""The surface of a density grid as a .glb file, with the materials of the nearest points.
+"""The surface of what is solid as a .glb file, with the materials of the nearest points.
 
-Marching cubes finds where the density crosses a level.  glTF has colours for each vertex but roughness and metallic
+Marching cubes finds where the solidity crosses one half.  glTF has colours for each vertex but roughness and metallic
 only as textures or for whole primitives: each vertex points into one small texture that holds every pair of the two, a
 ramp, so the surface stays one mesh whose faces share their vertices, with one material.
 Coordinates are those of the file that the points came from, whatever its upward axis.
@@ -16,8 +16,9 @@ from spnr_jax.errors import UserError
 from spnr_jax.formats import images
 from spnr_jax.formats.clouds import PlacedCloud
 from spnr_jax.formats.glb import packed
-from spnr_jax.tools.density_grid import DensityGrid
+from spnr_jax.tools.grids import Grid
 
+SURFACE = 0.5  # solidity
 NEAREST = 4  # points whose materials a vertex takes the mean of
 RAMP = 52  # texels along each side of the ramp: steps of 5 in 8 bits, so what lies between them is exact
 FLOAT, UNSIGNED, ARRAY_BUFFER, INDEX_BUFFER = 5126, 5125, 34962, 34963  # numbers of the glTF specification
@@ -33,15 +34,15 @@ class Solid(NamedTuple):
     watertight: bool
 
 
-def mesh_of(grid: DensityGrid, placed: PlacedCloud, level: float) -> Solid:
-    """The surface at a density; ValueError if there is none."""
+def mesh_of(grid: Grid, placed: PlacedCloud) -> Solid:
+    """The surface of a grid of solidity, 0 outside to 1 inside; ValueError if there is none."""
     from skimage.measure import marching_cubes  # here, so that rendering alone stays quick
 
-    if not grid.density.max() > level:
-        raise UserError(f"no surface to write as a mesh: the density is at most {grid.density.max():g}, not {level:g}")
-    closed = np.pad(grid.density, 1)  # the surface is closed also where it meets the box
+    if not grid.values.max() > SURFACE:
+        raise UserError("no surface to write as a mesh: the network's pictures show nothing solid")
+    closed = np.pad(grid.values, 1)  # the surface is closed also where it meets the box
     spacing = (grid.spacing,) * 3
-    vertices, faces, normals, _ = marching_cubes(closed, level, spacing=spacing, gradient_direction="ascent")
+    vertices, faces, _, _ = marching_cubes(closed, SURFACE, spacing=spacing, gradient_direction="ascent")
     vertices = vertices - grid.spacing + grid.lowest
     points = placed.cloud.positions @ placed.rotation.astype(np.float32)  # in the file's frame, from its origin
     _, nearest = cKDTree(points).query(vertices, min(NEAREST, len(points)))
@@ -50,12 +51,25 @@ def mesh_of(grid: DensityGrid, placed: PlacedCloud, level: float) -> Solid:
     color, roughness, metallic = (m[nearest].mean(axis=1) for m in (cloud.base_color, cloud.roughness, cloud.metallic))
     columns = {
         "POSITION": vertices,
-        "NORMAL": normals,
+        "NORMAL": normals_of(vertices, faces),
         "COLOR_0": color,
         "TEXCOORD_0": (np.stack([roughness, metallic], axis=-1) * (RAMP - 1) + 0.5) / RAMP,
     }
     arrays = {name: np.asarray(values, np.float32) for name, values in columns.items()}
     return Solid(glb(arrays | {"indices": faces.astype(np.uint32).ravel()}, grid.origin), len(faces), is_closed(faces))
+
+
+def normals_of(
+    vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
+) -> Float[np.ndarray, "vertices 3"]:
+    """Unit normals of vertices, the mean of those of the faces around them by area; where that is nothing, up."""
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    of_face = np.cross(b - a, c - a)
+    normals = np.zeros(vertices.shape)
+    for corner in faces.T:
+        normals += np.stack([np.bincount(corner, x, len(vertices)) for x in of_face.T], axis=-1)
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    return np.where(length > 0, normals / np.where(length > 0, length, 1), [0.0, 1.0, 0.0])
 
 
 def is_closed(faces: Int[np.ndarray, "faces 3"]) -> bool:

@@ -41,10 +41,8 @@ from spnr_jax.training.weights import load, suited_to
 
 FIRST_AZIMUTH = 30.0  # degrees of the first still: a view that shows front and side
 INVISIBLE = 1 / 255  # opacity below which a pixel has no colour of its own
-# The surface lies where a voxel of the network stops this share of the light.  Silhouettes of the mesh and of the
-# opacity then agree to an IoU of 0.92 (10 real objects); with 0.2 and 0.5 to 0.88 and 0.78.
-MESH_OPACITY = 0.3
 SOLID = "small"  # network of the package that has a density
+DENSITY_RESOLUTION = 96  # places along each side of its grid
 
 
 class Written(NamedTuple):
@@ -128,8 +126,10 @@ def drawn(ready: Ready, options: Render, name: Path) -> Iterator[Callable[[], Wr
     if film:
         pictures = [np.asarray(rendering.image) for rendering in views]
         yield partial(_write_film, Path(f"{name}_turntable.{options.turntable}"), pictures, options)
-    if options.mesh or options.density:
-        yield from _solids(ready, options, name)
+    if options.density:
+        yield from _density(ready, options, Path(f"{name}_density.npz"))
+    if options.mesh:
+        yield _mesh(ready, options, Path(f"{name}_mesh.glb"))
     if options.splats != "none":
         yield from _splats(ready, options, Path(f"{name}_splats.{options.splats}"))
 
@@ -238,29 +238,27 @@ def _pose_in_file(camera: Camera, placed: PlacedCloud) -> np.ndarray:
     return pose
 
 
-def _solids(ready: Ready, options: Render, name: Path) -> Iterator[Callable[[], Written]]:
-    """The density grid, and its surface as a mesh."""
-    from spnr_jax.tools import density_grid, mesh_export  # here: pictures alone do without
+def _density(ready: Ready, options: Render, path: Path) -> Iterator[Callable[[], Written]]:
+    from spnr_jax.tools import density_grid  # here: pictures alone do without
 
     model, volume = ready.model, ready.volume
     if not isinstance(model.config, RayNetworkConfig):
         yield partial(Written, f"the network that renders has no density: that of the package's {SOLID} is taken")
         model = load(SOLID)
         volume = model.encode(ready.placed.cloud)
-    grid = density_grid.sample_density(model, volume, ready.placed, options.grid_resolution)
-    if options.density:
-        arrays = {"density": grid.density, "lowest": grid.lowest + grid.origin, "spacing": grid.spacing}
-        content = _saved(lambda file, _: np.savez_compressed(file, **arrays), None)
-        yield partial(_write_solid, Path(f"{name}_density.npz"), content)
-    if options.mesh:
-        solid = mesh_export.mesh_of(grid, ready.placed, mesh_level(grid.voxel))
-        details = f" ({solid.faces:,} faces, {'watertight' if solid.watertight else 'not watertight'})"
-        yield partial(_write_solid, Path(f"{name}_mesh.glb"), solid.content, details)
+    grid = density_grid.sample_density(model, volume, ready.placed, options.grid_resolution or DENSITY_RESOLUTION)
+    arrays = {"density": grid.values, "lowest": grid.lowest + grid.origin, "spacing": grid.spacing}
+    yield partial(_write_solid, path, _saved(lambda file, _: np.savez_compressed(file, **arrays), None))
 
 
-def mesh_level(voxel: float) -> float:
-    """The density, per unit of the file, at which the surface of a mesh lies; the network's voxels have such sides."""
-    return float(-np.log1p(-MESH_OPACITY) / voxel)
+def _mesh(ready: Ready, options: Render, path: Path) -> Callable[[], Written]:
+    from spnr_jax.tools import fused_surface, mesh_export, splat_making  # here: pictures alone do without
+
+    views = splat_making.drawn_views(ready.model, ready.volume, splat_making.fitting_cameras(ready.model, ready.volume))
+    resolution = options.grid_resolution or fused_surface.GRID
+    solid = mesh_export.mesh_of(fused_surface.solidity(views, ready.volume, ready.placed, resolution), ready.placed)
+    details = f" ({solid.faces:,} faces, {'watertight' if solid.watertight else 'not watertight'})"
+    return partial(_write_solid, path, solid.content, details)
 
 
 def _write_solid(path: Path, content: bytes, details: str = "") -> Written:

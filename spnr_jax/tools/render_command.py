@@ -82,8 +82,8 @@ class Render:
     renders has no density."""
     density: bool = False
     """Also write the density on a grid as .npz."""
-    grid_resolution: int = 96
-    """Places along each side of the grid of --mesh and --density."""
+    grid_resolution: int | None = None
+    """Places along each side of the grid of --mesh (default: 192) and --density (default: 96)."""
     splats: Literal["none", "ply", "spz", "glb"] = "none"
     """Also write Gaussian splats."""
     making: SplatMaking = field(default_factory=SplatMaking)
@@ -118,5 +118,5 @@ class Render:
             raise UserError(f"--elevation must be -90 to 90 degrees, got {self.elevation:g}")
         if self.transparent and self.lighting.background != "white":
             raise UserError("--background light: not together with --transparent; give one of them")
-        if not 8 <= self.grid_resolution <= 512:
+        if self.grid_resolution is not None and not 8 <= self.grid_resolution <= 512:
             raise UserError(f"--grid-resolution must be 8 to 512, got {self.grid_resolution}")

@@ -24,12 +24,11 @@ from spnr_jax.method.model import FIELD_OF_VIEW, Model, Volume
 from spnr_jax.tools.chosen_light import check_takes_light, light_of_options
 from spnr_jax.tools.light_options import Lighting
 from spnr_jax.tools.share_command import Share
-from spnr_jax.tools.splat_making import splats_of
+from spnr_jax.tools.splat_making import RESOLUTION, splats_of
 from spnr_jax.tools.splat_options import SplatMaking
 from spnr_jax.training.weights import load
 
 NETWORK = "surfels"  # that makes splats where no other is named
-RESOLUTION = 512  # of the network's pictures that splats are made from, and of a poster
 MOST_BYTES = 6_000_000  # of a page
 POSTER_QUALITY = 88  # of its JPEG
 

@@ -20,6 +20,7 @@ from spnr_jax.method.surfel_renderer import SurfelScene
 from spnr_jax.model_config import SurfelConfig
 from spnr_jax.tools.depth_maps import surface_depth
 
+VIEWS, RESOLUTION = 32, 512  # pictures, and their pixels along each side
 GOLDEN_ANGLE = 180 * (3 - np.sqrt(5))  # degrees between the azimuths of one direction and the next
 LEAST_RATE = 0.1  # share of the learning rates that is left at the end
 
@@ -31,8 +32,8 @@ def splats(
     light: Light | None = None,
     degree: int = 1,
     most: int = 80_000,
-    views: int = 32,
-    resolution: int = 512,
+    views: int = VIEWS,
+    resolution: int = RESOLUTION,
     seconds: float | int = 20.0,
     report: Callable[[str], None] = lambda line: None,
 ) -> Gaussians:
@@ -111,7 +112,7 @@ def refined(
     return refinement.gaussians, refinement.steps
 
 
-def fitting_cameras(model: Model, volume: Volume, count: int, resolution: int) -> list[Camera]:
+def fitting_cameras(model: Model, volume: Volume, count: int = VIEWS, resolution: int = RESOLUTION) -> list[Camera]:
     """Cameras in even directions around an object, from the top down along a spiral."""
     heights = 1 - (2 * np.arange(count) + 1) / count
     azimuths = np.arange(count) * GOLDEN_ANGLE % 360
@@ -121,7 +122,7 @@ def fitting_cameras(model: Model, volume: Volume, count: int, resolution: int) -
     ]
 
 
-def drawn_views(model: Model, volume: Volume, cameras: list[Camera], light: Light | None) -> list[View]:
+def drawn_views(model: Model, volume: Volume, cameras: list[Camera], light: Light | None = None) -> list[View]:
     """The network's pictures from cameras, with these in the box."""
     found = []
     for camera, drawn in zip(cameras, model.render_each(volume, cameras, lights=[light] * len(cameras)), strict=True):

@@ -33,7 +33,7 @@ def test_the_study_scores_every_method_at_every_size_and_goes_on_where_it_stoppe
         run=str(tiny_surfels.run()),
         sizes=(tiny_surfels.SIZE // 2, tiny_surfels.SIZE),
         views=2,
-        seconds=1.0,
+        seconds=(0.5, 1.0),
         step_seconds=0.5,
         fitting_views=6,
         fitting_resolution=tiny_surfels.SIZE,
@@ -41,14 +41,16 @@ def test_the_study_scores_every_method_at_every_size_and_goes_on_where_it_stoppe
     )
     splat_quality.main(options)
     row = json.loads((tmp_path / "out" / "results.json").read_text())["objects"][NAME]
-    for method in splat_quality.METHODS:
+    for method in options.methods:
         for size in options.sizes:
             assert np.isfinite([row[f"{method}, {size}"][score] for score in ("psnr", "inside")]).all()
     assert row[f"network, {tiny_surfels.SIZE}"]["network"] == 100
-    assert row["steps"] == 2, "of half a second each"
-    assert 0 < row["splats"] <= options.most
+    for seconds, steps in (("0.5", 1), ("1", 2)):
+        made = row[f"splats, {seconds} s, made"]
+        assert made["steps"] == steps, "of half a second each"
+        assert 0 < made["splats"] <= options.most
     assert (tmp_path / "out" / "gallery.png").is_file()
-    kept = tmp_path / "out" / "scores" / f"{NAME}.json"
+    kept = tmp_path / "out" / "scores" / f"{NAME}_splats.json"
     before = kept.stat().st_mtime_ns
     splat_quality.main(options)
     assert kept.stat().st_mtime_ns == before
@@ -90,15 +92,14 @@ def test_pictures_become_smaller_as_the_references_do():
     np.testing.assert_allclose(image[1], 1, atol=1e-5)
 
 
-def test_an_object_without_a_surface_is_an_empty_picture_with_the_reason(monkeypatch):
+def test_an_object_without_a_surface_is_an_empty_picture_with_the_reason():
     from types import SimpleNamespace
 
-    def nothing(*_):
+    def nothing():
         raise UserError("no surface to write as a mesh")
 
-    monkeypatch.setattr(splat_quality.exported_mesh, "exported", nothing)
     item, options = SimpleNamespace(images=np.ones((3, 4, 4, 4), np.uint8)), SimpleNamespace(views=2)
-    pictures, found = splat_quality._meshed(options, None, None, None, item)
+    pictures, found = splat_quality._meshed(options, nothing, None, item)
     assert pictures.shape == (2, 4, 4, 4)
     assert not pictures.any()
     assert found["empty"] == "no surface to write as a mesh"

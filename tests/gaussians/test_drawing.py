@@ -51,9 +51,15 @@ def test_a_splat_in_the_middle_has_its_opacity_and_colour_there():
 
 
 def test_a_splat_smaller_than_a_pixel_hides_as_much_as_it_should():
+    """On average over where in a pixel it lies: a picture samples it at the pixels' middles."""
     camera = splat_balls.camera(0, 0, size=33)
-    large, small = (drawing.draw(one(width=width), camera)[1].sum() for width in (0.1, 0.01))
-    assert small == pytest.approx(large / 100, rel=0.12)
+    pixel = 3 / float(camera.intrinsics[0, 0])
+    across = (np.arange(4) + 0.5) / 4 * pixel
+    large, small = (
+        np.mean([drawing.draw(one((x, y, 0), width=width), camera)[1].sum() for x in across for y in across])
+        for width in (0.1, 0.01)
+    )
+    assert small == pytest.approx(large / 100, rel=0.05)
 
 
 def test_what_is_nearer_hides_what_is_behind_in_whatever_order_they_come():
@@ -119,7 +125,7 @@ def test_a_small_picture_of_many_splats_is_as_opaque_as_a_large_one():
     splats = splat_balls.ball(2000)
     small, large = (drawing.draw(splats, splat_balls.camera(size=size))[1] for size in (24, 96))
     inside = np.s_[8:16, 8:16]
-    assert drawing.lists(*_looked(splats, 24), 24, 24).splats.shape[0] >= 64
+    assert drawing.lists(*_looked(splats, 24), 24, 24).splats.shape[0] >= 32
     np.testing.assert_allclose(small[inside], large.reshape(24, 4, 24, 4).mean(axis=(1, 3))[inside], atol=0.12)
 
 

@@ -67,7 +67,7 @@ def test_splats_lie_on_the_surface_and_along_it():
     splats, side = placed()
     distance = np.linalg.norm(splats.position, axis=1)
     assert 0.6 * MOST < len(distance) <= MOST
-    np.testing.assert_allclose(distance, RADIUS, atol=0.03)
+    np.testing.assert_allclose(distance, RADIUS - placing.INSET * PIXEL, atol=0.03)
     normal = np.asarray(rotations(splats.rotation))[:, :, 2]
     assert (np.abs(np.sum(normal * splats.position, axis=1)) / distance).min() > 0.97
     assert side >= placing.FINEST * PIXEL
@@ -89,7 +89,7 @@ def test_the_quaternions_turn_the_third_axis_to_the_normal_or_against_it():
 
 def test_colours_are_those_of_the_pictures():
     splats = colored()
-    wanted = 0.5 + 0.3 * splats.position / RADIUS
+    wanted = 0.5 + 0.3 * splats.position / np.linalg.norm(splats.position, axis=1, keepdims=True)
     inside = np.asarray(drawing.colors(splats, np.float32([0, 0, 3])))  # any eye: the ball does not shine
     facing = splats.position[:, 2] > 0.3
     np.testing.assert_allclose(inside[facing], wanted[facing], atol=0.06)

@@ -132,8 +132,8 @@ class TestHandle:
         same_bits(pictures[1], pictures[2])  # such a network is trained at its best
         placed = PlacedCloud(cloud=single, up="y", rotation=np.eye(3), origin=np.zeros(3))
         grid = sample_density(model, volume, placed, 12)
-        assert grid.density.max() > 1
-        assert grid.density[0, 0, 0] == 0
+        assert grid.values.max() > 1
+        assert grid.values[0, 0, 0] == 0
 
 
 class TestTraining:

@@ -1,22 +1,22 @@
-"""A ball as a density grid, and as points in two materials, somewhere in the frame of a file."""
+"""A ball as a grid of solidity, and as points in two materials, somewhere in the frame of a file."""
 
 import numpy as np
 
 from spnr_jax.formats.clouds import PlacedCloud
 from spnr_jax.formats.up_axis import ROTATIONS
 from spnr_jax.kernels.records import PointCloud
-from spnr_jax.tools.density_grid import DensityGrid
+from spnr_jax.tools.grids import Grid
 
 RADIUS, CENTRE = 2.0, np.array([5.0, -3.0, 1.0])
 
 
-def ball_grid(origin=(0, 0, 0)) -> DensityGrid:
-    """Density that falls with the distance from CENTRE, RADIUS at RADIUS."""
+def ball_grid(origin=(0, 0, 0)) -> Grid:
+    """Solidity that falls with the distance from CENTRE, one half at RADIUS."""
     spacing, lowest = 0.2, CENTRE - 3.07  # no vertex falls on a place of the grid
     axes = [lowest[i] + spacing * np.arange(31) for i in range(3)]
     distance = np.linalg.norm(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1) - CENTRE, axis=-1)
-    density = (2 * RADIUS - distance).astype(np.float32)
-    return DensityGrid(density=density, lowest=lowest, spacing=spacing, voxel=1.0, origin=np.array(origin, float))
+    values = np.clip(0.5 + RADIUS - distance, 0, 1).astype(np.float32)
+    return Grid(values=values, lowest=lowest, spacing=spacing, origin=np.array(origin, float))
 
 
 def ball_cloud(up="y", origin=(0, 0, 0)) -> PlacedCloud:

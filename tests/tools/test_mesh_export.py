@@ -1,5 +1,6 @@
-"""The surface of a density is a closed mesh in the file's frame, and wears the materials of the nearest points."""
+"""The surface of what is solid is a closed mesh in the file's frame, and wears the materials of the nearest points."""
 
+import dataclasses
 import io
 
 import numpy as np
@@ -8,7 +9,7 @@ import trimesh
 from support.solid_ball import CENTRE, RADIUS, ball_cloud, ball_grid
 
 from spnr_jax.formats.mesh.meshes import load_mesh
-from spnr_jax.tools.density_grid import DensityGrid
+from spnr_jax.tools.grids import Grid
 from spnr_jax.tools.mesh_export import is_closed, mesh_of
 
 
@@ -20,7 +21,7 @@ def loaded(content: bytes) -> trimesh.Trimesh:
 
 
 def test_a_ball_becomes_a_closed_mesh_of_its_size_in_its_place_with_the_outside_outside():
-    solid = mesh_of(ball_grid(), ball_cloud(), level=RADIUS)
+    solid = mesh_of(ball_grid(), ball_cloud())
     mesh = loaded(solid.content)
     assert len(mesh.faces) == solid.faces
     assert mesh.is_watertight
@@ -43,7 +44,7 @@ def shown_at(material, texcoords):
 
 @pytest.mark.parametrize("up", ["y", "z", "-x"])
 def test_each_place_wears_the_material_of_the_points_there_whichever_way_is_up(tmp_path, up):
-    (tmp_path / "a.glb").write_bytes(mesh_of(ball_grid(), ball_cloud(up), level=RADIUS).content)
+    (tmp_path / "a.glb").write_bytes(mesh_of(ball_grid(), ball_cloud(up)).content)
     (part,) = load_mesh(tmp_path / "a.glb").parts
     x = part.positions[:, 0] - CENTRE[0]
     roughness, metallic = shown_at(part.material, part.texcoords)
@@ -65,19 +66,18 @@ def test_a_surface_with_a_hole_or_a_face_that_is_turned_around_is_not_called_clo
 
 def test_a_mesh_far_from_the_origin_keeps_its_precision():
     origin = (500_000.0, 4_000_000.0, 100.0)
-    bounds = loaded(mesh_of(ball_grid(origin), ball_cloud(origin=origin), level=RADIUS).content).bounds
+    bounds = loaded(mesh_of(ball_grid(origin), ball_cloud(origin=origin)).content).bounds
     np.testing.assert_allclose(bounds, np.array(origin) + CENTRE + [[-RADIUS] * 3, [RADIUS] * 3], atol=0.02)
 
 
 def test_a_surface_at_the_edge_of_the_grid_is_closed():
-    grid = DensityGrid(
-        density=np.ones((5, 5, 5), np.float32), lowest=np.zeros(3), spacing=1.0, voxel=1.0, origin=np.zeros(3)
-    )
-    mesh = loaded(mesh_of(grid, ball_cloud(), level=0.5).content)
+    grid = Grid(values=np.ones((5, 5, 5), np.float32), lowest=np.zeros(3), spacing=1.0, origin=np.zeros(3))
+    mesh = loaded(mesh_of(grid, ball_cloud()).content)
     assert mesh.is_watertight
     np.testing.assert_allclose(mesh.bounds, [[-0.5] * 3, [4.5] * 3])
 
 
-def test_fog_without_a_surface_is_refused():
-    with pytest.raises(ValueError, match="no surface to write as a mesh: the density is at most 3.8.*, not 9"):
-        mesh_of(ball_grid(), ball_cloud(), level=9.0)
+def test_a_grid_without_a_surface_is_refused():
+    grid = ball_grid()
+    with pytest.raises(ValueError, match="no surface to write as a mesh: .* show nothing solid"):
+        mesh_of(dataclasses.replace(grid, values=0.5 * grid.values), ball_cloud())

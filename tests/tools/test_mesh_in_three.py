@@ -72,7 +72,7 @@ pytestmark = [
 @pytest.fixture(scope="module")
 def shown():
     """What three.js says of the ball's file, and how it draws it."""
-    content = mesh_of(ball_grid(), ball_cloud(), level=RADIUS).content
+    content = mesh_of(ball_grid(), ball_cloud()).content
     page = PAGE.replace("SIZE", str(SIZE)).replace("RADIUS", str(RADIUS))
 
     def answered(route):

@@ -11,7 +11,7 @@ from support import tiny_dataset
 from support.gltf_files import CORNERS, GltfBuilder
 
 from spnr_jax.formats.up_axis import ROTATIONS
-from spnr_jax.tools import pictures
+from spnr_jax.tools import depth_maps, pictures
 from spnr_jax.tools.light_options import Lighting
 from spnr_jax.tools.render_command import Render
 
@@ -117,7 +117,7 @@ def test_a_transparent_still_has_an_alpha_channel_and_chosen_outputs_alone_are_w
 
 
 def test_the_density_grid_is_written_with_its_place_and_the_mesh_in_the_frame_of_the_file(tmp_path, monkeypatch):
-    monkeypatch.setattr(pictures, "MESH_OPACITY", 1e-3)  # the tests' network is hardly trained: all fog
+    monkeypatch.setattr(depth_maps, "HIT", 1e-3)  # the tests' network is hardly trained: all fog
     np.save(tmp_path / "chair.npy", np.random.default_rng(0).uniform(-1, 1, (40, 3)) * [1, 2, 3] + [100, 200, 300])
     out = tmp_path / "out"
     rendered(tmp_path / "chair.npy", out, views=0, turntable="none", up="z", mesh=True, density=True, grid_resolution=9)

@@ -3,7 +3,9 @@
 Chromium is found on PATH, or named by SPNR_CHROMIUM; without one these tests are skipped.
 """
 
+import base64
 import io
+import re
 
 import numpy as np
 import pytest
@@ -13,6 +15,8 @@ from support import splat_balls
 
 from spnr_jax.gaussians import drawing
 from spnr_jax.tools import splat_export
+from spnr_jax.tools.share_command import Share
+from spnr_jax.tools.splat_options import SplatMaking
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install playwright")
 
@@ -74,6 +78,24 @@ def test_the_page_draws_what_the_poster_shows(chromium, tmp_path, degree):
     tab, said = opened(chromium, path)
     assert decibels(shown(tab), poster) > 32
     assert tab.locator("#poster").count() == 0, "the poster makes place"
+    assert not said
+    tab.close()
+
+
+def test_the_page_of_a_cloud_shows_what_the_network_draws(chromium, tmp_path, monkeypatch):
+    monkeypatch.setattr(splat_export, "RESOLUTION", SIZE)
+    points = np.random.default_rng(0).normal(size=(3000, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    stripes = np.where(np.sin(6 * points[:, :1]) > 0, [200, 40, 30], [30, 60, 200])
+    np.savetxt(tmp_path / "ball.txt", np.concatenate([points, stripes], axis=1), fmt="%.5f")
+    making = SplatMaking(fitting_views=12, seconds=1.0, most_splats=8000)
+    options = Share(cloud=tmp_path / "ball.txt", out=tmp_path / "page.html", up="y", making=making)
+    assert list(splat_export.share(options, lambda line: None))
+    poster = re.search(r'src="data:image/jpeg;base64,([^"]+)"', options.out.read_text())
+    network = np.asarray(Image.open(io.BytesIO(base64.b64decode(poster[1])))) / np.float32(255)
+    tab, said = opened(chromium, options.out)
+    assert decibels(shown(tab), network) > 24, "20 are asked for"
+    assert decibels(np.ones_like(network), network) < 15
     assert not said
     tab.close()
 

@@ -13,6 +13,8 @@ from PIL import Image
 from support import chromium as chromium_of
 from support import splat_balls, surfel_clouds, tiny_viewer
 
+from spnr_jax.gaussians import placing
+from spnr_jax.method.model import DISTANCE, FIELD_OF_VIEW
 from spnr_jax.training.weights import load
 
 viser = pytest.importorskip("viser", reason="the viewer's extra is not installed: pip install 'spnr-jax[viewer]'")
@@ -54,7 +56,9 @@ def test_splats_are_made_in_the_box_and_the_network_is_free_for_other_pictures_m
 
     made = splats.make(model(), state(), network, 0.05, progress)
     assert len(made.opacity) > 100
-    np.testing.assert_allclose(np.linalg.norm(made.position, axis=1), 3**-0.5, atol=0.03)  # a ball in the box
+    pixel = 2 * DISTANCE * np.tan(FIELD_OF_VIEW / 2) / splats.RESOLUTION
+    radius = 3**-0.5 - placing.INSET * pixel  # a ball in the box
+    np.testing.assert_allclose(np.linalg.norm(made.position, axis=1), radius, atol=0.03)
     assert shares[:6] == [splats.DRAWING * i / 6 for i in range(6)]
     assert shares == sorted(shares)
     assert shares[6] == splats.DRAWING
