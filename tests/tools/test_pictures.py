@@ -130,6 +130,12 @@ def test_the_density_grid_is_written_with_its_place_and_the_mesh_in_the_frame_of
     np.testing.assert_allclose(bounds.mean(axis=0), [100, 200, 300], atol=1.5)
 
 
+def test_fog_has_no_mesh_and_nothing_is_written(tmp_path):
+    with pytest.raises(ValueError, match="no surface to write as a mesh: .* nothing solid"):
+        rendered(cloud_file(tmp_path), tmp_path / "out", views=0, turntable="none", mesh=True, grid_resolution=9)
+    assert not (tmp_path / "out").exists()
+
+
 def test_no_views_and_no_turntable_write_nothing(tmp_path):
     rendered(cloud_file(tmp_path), tmp_path / "out", views=0, turntable="none")
     assert not (tmp_path / "out").exists()
