@@ -108,11 +108,11 @@ def main(options: SplatStudy) -> None:
     mitsuba.set_variant(variant)
     renderer, rows = poisson.Renderer(dataset.settings, variant=variant), dict[str, dict]()
     model = load(options.run)
-    for part, scores in ("splats", _splat_scores), ("mesh", _mesh_scores):
+    for part, scores in ("splats", _splat_scores), ("mesh", partial(_mesh_scores, renderer)):
         for name in names:
             item = data_sets.read_object(dataset, name)
             place = options.out / "scores" / f"{name}_{part}.json"
-            found = results_folder.kept(place, partial(scores, options, model, renderer, item))
+            found = results_folder.kept(place, partial(scores, options, model, item))
             rows[name] = rows.get(name, {}) | found
             print(name, found, flush=True)
     cells = [[_shown(options, name, method) for method in ("reference", *options.methods)] for name in names]
@@ -125,7 +125,7 @@ def main(options: SplatStudy) -> None:
     results_folder.write(options.out, {"objects": rows, "hardware": machine.hardware()}, tables)
 
 
-def _splat_scores(options: SplatStudy, model: Model, renderer: poisson.Renderer, item: data_sets.ObjectData) -> dict:
+def _splat_scores(options: SplatStudy, model: Model, item: data_sets.ObjectData) -> dict:
     """Decibels by size and method; splats, megabytes as .spz, steps and seconds of each making."""
     cloud = _cloud(options, item)
     volume = model.encode(cloud)
@@ -142,16 +142,12 @@ def _splat_scores(options: SplatStudy, model: Model, renderer: poisson.Renderer,
     return found
 
 
-def _mesh_scores(options: SplatStudy, model: Model, renderer: poisson.Renderer, item: data_sets.ObjectData) -> dict:
+def _mesh_scores(renderer: poisson.Renderer, options: SplatStudy, model: Model, item: data_sets.ObjectData) -> dict:
     """Decibels of the mesh by size; its faces, megabytes as .glb and seconds."""
     cloud = _cloud(options, item)
     volume = model.encode(cloud)
-    pictures, found = _meshed(
-        options,
-        partial(exported_mesh.exported, _pictures(options, model, volume, item.name), volume, cloud),
-        renderer,
-        item,
-    )
+    views = _pictures(options, model, volume, item.name)
+    pictures, found = _meshed(options, partial(exported_mesh.exported, views, volume, cloud), renderer, item)
     for size in options.sizes:
         found |= _compared(options, model, volume, item, size, {MESH: [_at(rgba, size) for rgba in pictures]})
     return found
