@@ -3,7 +3,7 @@
     python -m experiments.studies.scans --data DIR --out OUT [--run surfels] [--counts 4096 16384] [--resolution 128]
 
 The points of the test objects (`spnr-data generate --spread even`) are spoiled as scanners spoil them
-(comparison/scan_faults.py), cleaned or not, thinned evenly to so many as `spnr render` does, and drawn.  Noise is the
+(training/scan_faults.py), cleaned or not, thinned evenly to so many as `spnr render` does, and drawn.  Noise is the
 standard deviation along each axis, in units of the box whose half diagonal is 1; scanners see from random directions.
 
     OUT/results.json  OUT/table.md .csv .tex     dB, dB inside, FLIP of each fault, with and without cleaning
@@ -22,7 +22,7 @@ from tqdm import tqdm
 from experiments import entry_point
 from experiments.comparison import figures, results_folder
 from experiments.comparison.result_tables import Cell, Table, number
-from experiments.comparison.scan_faults import Fault, faults
+from spnr_jax.training.scan_faults import Fault, faults
 from experiments.studies.sharpness import view_of
 from spnr_jax.devices import machine
 from spnr_jax.formats import data_sets, images

@@ -213,6 +213,7 @@ def _sampled_mesh(path: Path, count: int, seed: int, transparent_parts: ShownPar
     values = {name: getattr(points, name) for name in DEFAULTS}
     if all((values[name] == default).all() for name, default in DEFAULTS.items()):
         report("no material in the mesh: base_color 0.5, roughness 0.5, metallic 0 taken everywhere")
+        values["materials_known"] = np.zeros(count)
     return points.positions.astype(np.float64), np.zeros(3), values | {"normals": points.normals}
 
 

@@ -84,7 +84,10 @@ def useful(columns: Columns) -> Columns:
 
 
 def materials(columns: Columns, report: Report) -> dict[str, np.ndarray]:
-    """base_color (points, 3) linear, roughness and metallic (points,); `report` gets a line for each assumption."""
+    """base_color (points, 3) linear, roughness and metallic (points,); `report` gets a line for each assumption.
+
+    `materials_known` (points,) is 0 where the file has neither of the latter.
+    """
     count, complete = len(columns["x"]), {}
     for name, default in DEFAULTS.items():
         values = _base_color(columns, report) if name == "base_color" else _scalar(columns, name)
@@ -92,6 +95,8 @@ def materials(columns: Columns, report: Report) -> dict[str, np.ndarray]:
             report(f"no {name} in the file: {default:g} taken for all points")
             values = np.full((count, 3) if name == "base_color" else count, default)
         complete[name] = values
+    if not {"roughness", "metallic"} & columns.keys():
+        complete["materials_known"] = np.zeros(count)
     return complete
 
 

@@ -28,6 +28,8 @@ class PointCloud:
     mask: Bool[AnyArray, "*batch points"]
     normals: Float[AnyArray, "*batch points 3"] | None = None
     """Of unit length, of either sign; None where the file has none: then they are estimated."""
+    materials_known: Float[AnyArray, "*batch points"] | None = None
+    """1 where roughness and metallic are known, 0 where they stand for any; None where all are known."""
 
 
 @no_type_check
@@ -130,6 +132,7 @@ class Surfels:
     colour along x, y, z; `sided` 1 where one side is outside, 0 where both are; `visible` how much each of 64
     directions sees; `shape` the planarity and linearity of the neighbourhood.  A disc ends `reach` spacings from its
     point along `rim`, a unit vector in its plane, against it, and along and against their cross product normal x rim.
+    `guessed` is 1 where roughness and metallic are not known.
     """
 
     position: Float[AnyArray, "points 3"]
@@ -139,6 +142,7 @@ class Surfels:
     gradient: Float[AnyArray, "points 3 3"]
     roughness: Float[AnyArray, " points"]
     metallic: Float[AnyArray, " points"]
+    guessed: Float[AnyArray, " points"]
     sided: Float[AnyArray, " points"]
     visible: Float[AnyArray, "points 64"]
     shape: Float[AnyArray, "points 2"]

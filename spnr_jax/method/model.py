@@ -71,7 +71,7 @@ class Model:
         if self._surfels is not None:
             scene = self._surfels.encode(self.variables, cloud, config=self.config)
             return Volume(scene=scene, centre=jnp.asarray(centre), scale=jnp.asarray(scale))
-        cloud = dataclasses.replace(cloud, normals=None)
+        cloud = dataclasses.replace(cloud, normals=None, materials_known=None)
         cloud = cloud_arrays.pad(cloud, cloud_arrays.bucket(len(positions)))
         scene = _encode(self.variables, cloud, config=self.config)
         volume = Volume(scene=scene, centre=jnp.asarray(centre), scale=jnp.asarray(scale))

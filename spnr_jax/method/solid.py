@@ -32,7 +32,7 @@ def encode(variables: dict, cloud: PointCloud, *, config: NearPointsConfig) -> S
     count = int(mask.sum())
     if count > MOST_POINTS:
         return None
-    points = jax.tree.map(lambda x: np.asarray(x)[mask], dataclasses.replace(cloud, normals=None))
+    points = jax.tree.map(lambda x: np.asarray(x)[mask], dataclasses.replace(cloud, normals=None, materials_known=None))
     return _encoded(variables, cloud_arrays.pad(points, cloud_arrays.bucket(count)), config=config)
 
 

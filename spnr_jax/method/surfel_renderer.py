@@ -73,7 +73,7 @@ def encode(variables: dict | None, cloud: PointCloud, *, config: SurfelConfig) -
     Variables of the network of rays are `batch_stats`: what a state holds that is not trained.
     """
     mask = np.asarray(cloud.mask)
-    names = ("positions", "base_color", "roughness", "metallic", "normals")
+    names = ("positions", "base_color", "roughness", "metallic", "normals", "materials_known")
     columns: dict[str, Any] = {
         name: None if (x := getattr(cloud, name)) is None else np.asarray(x)[mask] for name in names
     }
@@ -241,7 +241,7 @@ def look(
     *,
     slots: int,
 ) -> tuple[
-    Float[Array, "height width 33"], Float[Array, "height width 18"], Float[Array, "9 3"], Float[Array, "height width"]
+    Float[Array, "height width 34"], Float[Array, "height width 18"], Float[Array, "9 3"], Float[Array, "height width"]
 ]:
     """What the network sees of a picture's entries, the light maps, the light's harmonics in camera axes, the depth."""
     surfels = features.turned(surfels, camera)
@@ -256,7 +256,7 @@ jitted_look = jax.jit(look, static_argnames="slots")
 @partial(jax.jit, static_argnames=("config", "doublings"))
 def _shade(
     variables: dict | None,
-    seen: Float[Array, "height width 33"],
+    seen: Float[Array, "height width 34"],
     maps: Float[Array, "height width 18"],
     ambient: Float[Array, "9 3"],
     depth: Float[Array, "height width"],

@@ -15,7 +15,7 @@ from spnr_jax.kernels.resizing import doubled, mean_of_squares, unfolded
 from spnr_jax.nn.convolution import Conv
 from spnr_jax.surfels.lighting import SPECULAR
 
-NUM_OUTPUTS = 20
+NUM_OUTPUTS = 22
 COLOR_STEP, ODDS_STEP = 0.3, 2.0  # what an output of 1 changes the base colour, and the log odds of the opacity by
 LEAST_ODDS = 1e-2  # keeps the odds of what is clear or solid finite
 NOTHING = 2e-4  # opacity below which a pixel stays clear, whatever the network says
@@ -53,7 +53,7 @@ class Shader(nn.Module):
     @nn.compact
     def __call__(
         self, seen: Float[Array, "batch height width features"], doublings: int, margin: int = 0
-    ) -> Float[Array, "batch h w 20"]:
+    ) -> Float[Array, "batch h w 22"]:
         """Outputs at 2^doublings times the resolution, but for a margin of pixels that only tell what is around."""
         height, width = seen.shape[1:3]
         square = 2 ** (len(self.widths) - 1)
@@ -79,7 +79,7 @@ def log_odds(opacity: Float[Array, "*pixels"]) -> Float[Array, "*pixels"]:
 
 
 def picture(
-    outputs: Float[Array, "batch h w 20"],
+    outputs: Float[Array, "batch h w 22"],
     maps: Float[Array, "batch height width 18"],
     ambient: Float[Array, "batch 9 3"],
     doublings: int,
@@ -99,6 +99,8 @@ def picture(
     alpha = nn.sigmoid(odds + ODDS_STEP * outputs[..., 3:4]) * -jnp.expm1(-opacity / NOTHING)
     bounced = outputs[..., 8:11] * ambient[:, None, None, 0]
     bounced += jnp.einsum("bhwk,bkc->bhwc", outputs[..., 11:19], ambient[:, 1:], precision="highest")
+    metallic = jnp.clip(metallic + COLOR_STEP * outputs[..., 20:21], 0, 1)
+    mirrored += jnp.clip(outputs[..., 21:22], 0, 1) * (unshadowed - mirrored)  # rougher than it is said to be
     diffuse = (1 + outputs[..., 4:5]) * arriving + outputs[..., 5:6] * unshadowed + bounced
     specular = (1 + outputs[..., 6:7]) * reflected + outputs[..., 7:8]
     normal_incidence = SPECULAR * (1 - metallic) + base * metallic

@@ -30,6 +30,7 @@ def estimate(
     roughness: Float[np.ndarray, " points"],
     metallic: Float[np.ndarray, " points"],
     normals: Float[np.ndarray, "points 3"] | None = None,
+    materials_known: Float[np.ndarray, " points"] | None = None,
 ) -> Surfels:
     """Surfels of points in the box [-1, 1]^3, padded to a power of two; at least one point."""
     positions = np.asarray(positions, np.float32)
@@ -57,6 +58,7 @@ def estimate(
         "gradient": joined(_gradient, near, weight, *all_of(spacing, normal, base_color)),
         "roughness": roughness,
         "metallic": metallic,
+        "guessed": np.zeros(len(positions)) if materials_known is None else 1 - materials_known,
         "sided": sided,
         "visible": joined(_averaged, near, weight, *all_of(seen)),
         "shape": joined(layers.shape_of, near, layer, *all_of(raw)),

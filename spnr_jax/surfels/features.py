@@ -16,7 +16,7 @@ from spnr_jax.kernels.records import Camera, GBuffer, Light, Surfels
 from spnr_jax.surfels import lighting
 from spnr_jax.surfels.visibility import DIRECTIONS
 
-NUM_FEATURES, NUM_MAPS = 33, 18
+NUM_FEATURES, NUM_MAPS = 34, 18
 ODD = (14, 17, 28), (15, 18, 29)  # features that change their sign when the picture is mirrored along x, or along y
 FAINT = 0.02  # opacity from which on a pixel's numbers begin to count
 WINDOWS = 2, 6  # pixels to each side over which the depth is compared
@@ -33,7 +33,7 @@ def turned(surfels: Surfels, camera: Camera) -> Surfels:
     return dataclasses.replace(surfels, normal=jnp.where(behind, -surfels.normal, surfels.normal))
 
 
-def attributes(surfels: Surfels, light: Light, camera: Camera) -> Float[Array, "points 16"]:
+def attributes(surfels: Surfels, light: Light, camera: Camera) -> Float[Array, "points 17"]:
     """Numbers of each surfel that are blended over pixels; those of the light are linear in it."""
     rotation, eye = camera.cam_to_world[:, :3], camera.cam_to_world[:, 3]
     cosines = jnp.maximum(jnp.einsum("pi,di->pd", surfels.normal, DIRECTIONS, precision="highest"), 0)
@@ -47,20 +47,20 @@ def attributes(surfels: Surfels, light: Light, camera: Camera) -> Float[Array, "
     reflected = jnp.sum(surfels.visible * lobe, axis=1) / jnp.sum(lobe, axis=1)
     columns = [surfels.roughness, surfels.metallic, lighting.arriving(surfels, light), reflected, openness]
     columns += [jnp.einsum("pi,ij->pj", bent, rotation, precision="highest"), surfels.base_color, surfels.shape]
-    columns += [surfels.sided]
+    columns += [surfels.sided, surfels.guessed]
     return jnp.concatenate([x[:, None] if x.ndim == 1 else x for x in map(jnp.asarray, columns)], axis=1)
 
 
 def features(
     buffer: GBuffer, light: Light, camera: Camera, solid: Float[Array, "height width 2"] | None = None
-) -> tuple[Float[Array, "height width 33"], Float[Array, "height width 18"]]:
+) -> tuple[Float[Array, "height width 34"], Float[Array, "height width 18"]]:
     """The network's input, which knows no light, and the maps of materials and light for `nn.shader.picture`.
 
     `solid` is the opacity and the depth along the camera's axis that the network of rays sees; None is not known.
     """
     roughness, metallic, *arriving, reflected, openness = jnp.moveaxis(buffer.attributes, -1, 0)[:7]
     bent, blended = buffer.attributes[..., 7:10], buffer.attributes[..., 10:13]
-    planarity, linearity, sided = jnp.moveaxis(buffer.attributes, -1, 0)[13:16]
+    planarity, linearity, sided, guessed = jnp.moveaxis(buffer.attributes, -1, 0)[13:17]
     color = jnp.clip(jnp.clip(buffer.color, blended - TRUST, blended + TRUST), 0, 1)
     normal, view = _directions(buffer, camera)
     cosine = -sum(n * v for n, v in zip(normal, view, strict=True))
@@ -82,7 +82,8 @@ def features(
     if solid is not None:
         behind = jnp.tanh(opacity * (solid[..., 1] - buffer.depth) / spacing)
         known = jnp.stack([jnp.ones_like(opacity), opacity, jnp.where(buffer.opacity > LEAST, behind, 0)], axis=-1)
-    seen = jnp.concatenate([drawn * seen, drawn, *(drawn * x for x in pattern), known], axis=-1)
+    pattern = [drawn * x for x in pattern]
+    seen = jnp.concatenate([drawn * seen, drawn, *pattern, known, drawn * guessed[..., None]], axis=-1)
     unshadowed = lighting.irradiance(light, turned[0]), lighting.mirrored(light, turned[1], roughness)
     maps = [*jnp.moveaxis(color, -1, 0), metallic, covered, factor, summand, *arriving]
     return seen, jnp.stack([*maps, *unshadowed[0], *unshadowed[1], reflected, opacity], axis=-1)

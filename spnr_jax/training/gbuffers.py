@@ -19,7 +19,6 @@ from typing import NamedTuple
 import jax
 import numpy as np
 from jaxtyping import Array, Float, UInt8
-from scipy.spatial import cKDTree
 from tqdm import tqdm
 
 from spnr_jax.config import TrainConfig
@@ -29,19 +28,19 @@ from spnr_jax.formats.data_sets import Dataset, ObjectData, read_object
 from spnr_jax.formats.images import to_uint8, write_whole
 from spnr_jax.formats.npz import packed, read_arrays
 from spnr_jax.kernels import cameras
+from spnr_jax.kernels.cleaning import cleaned
 from spnr_jax.kernels.records import Camera, Crops, Light, PointCloud
 from spnr_jax.kernels.thinning import farthest_points
 from spnr_jax.method import surfel_renderer
 from spnr_jax.model_config import SurfelConfig
 from spnr_jax.surfels import features, lighting, splatting
 from spnr_jax.training.batching import read_ahead
+from spnr_jax.training.scan_faults import colours_alone, random_scan
 
 CLOUDS = 2  # of each object
-SCANNED = 0.2  # share of them that are made noisy
-NOISE = 0.05, 0.6  # least and most standard deviation of their points, in distances between nearest ones
-STRAY = 0.0, 0.0, 0.003, 0.01  # shares of points that lie anywhere, drawn from these
-COLOR_NOISE = 0.05  # most standard deviation of their colours
+SCANNED = 0.3  # share of them that are scanned and cleaned
 UNKNOWN = 0.15  # share of the clouds of which it is not known where they are solid
+UNKNOWN_MATERIALS = 0.1  # share of the others whose roughness and metallic are not known
 WITHOUT_NORMALS = 0.5  # share of the others whose normals are estimated
 SIDES = (1, 1, 1, 1, 2, 4, 8)  # pixels of a reference averaged along a side, drawn from these
 SMALL, FEWER = 4, 8  # side from which on a cloud has at most so many times fewer points
@@ -115,32 +114,37 @@ def make(item: ObjectData, number: int, light: Light, config: TrainConfig, solid
 
 
 def random_cloud(cloud: PointCloud, side: int, config: TrainConfig, generator: np.random.Generator) -> PointCloud:
-    """Random points of a cloud or evenly spread ones, with or without their normals."""
+    """Random points of a cloud or evenly spread ones, with or without their normals, or what is left of a scan."""
     most = max(config.max_points // (FEWER if side >= SMALL else 1), config.min_points)
     count = min(int(np.exp(generator.uniform(np.log(config.min_points), np.log(most)))), len(cloud.mask))
     even = generator.random() < config.even_share and count <= MOST_EVEN
-    chosen = generator.permutation(len(cloud.mask))[:count]
-    if even:
-        chosen = farthest_points(np.asarray(cloud.positions), count, int(chosen[0]))
-    cloud = jax.tree.map(lambda values: values[chosen], cloud)
     if generator.random() < SCANNED:
-        return scanned(cloud, generator)
+        return thinned(scanned(cloud, generator), min(count, MOST_EVEN), even, generator)
+    cloud = thinned(cloud, count, even, generator)
+    if generator.random() < UNKNOWN_MATERIALS:
+        positions, columns = colours_alone(np.asarray(cloud.positions), {}, generator)
+        cloud = dataclasses.replace(cloud, **columns)
     return dataclasses.replace(cloud, normals=None) if generator.random() < WITHOUT_NORMALS else cloud
 
 
+def thinned(cloud: PointCloud, count: int, even: bool, generator: np.random.Generator) -> PointCloud:
+    """So many points of a cloud, if it has more."""
+    chosen = generator.permutation(len(cloud.mask))[:count]
+    if even:
+        chosen = farthest_points(np.asarray(cloud.positions), len(chosen), int(chosen[0]))
+    return jax.tree.map(lambda values: values[chosen], cloud)
+
+
 def scanned(cloud: PointCloud, generator: np.random.Generator) -> PointCloud:
-    """The cloud as a scanner might have it: without normals, noisy, with points that belong to nothing."""
-    positions = np.asarray(cloud.positions)
-    near = cKDTree(positions).query(positions, min(2, len(positions)))[0].reshape(len(positions), -1)[:, -1]
-    noise = generator.uniform(*NOISE) * np.median(near) * generator.standard_normal(positions.shape)
-    stray = generator.random(len(positions)) < generator.choice(STRAY)
-    anywhere = generator.uniform(-1, 1, positions.shape)
-    color = cloud.base_color + generator.uniform(0, COLOR_NOISE) * generator.standard_normal(positions.shape)
-    return dataclasses.replace(
-        cloud,
-        positions=np.clip(np.where(stray[:, None], anywhere, positions + noise), -1, 1).astype(np.float32),
-        base_color=np.clip(color, 0, 1).astype(np.float32),
-        normals=None,
+    """The cloud as it is after a scanner and after cleaning: without normals, in the box of the one that was scanned."""
+    columns = {name: np.asarray(x) for name, x in vars(cloud).items() if x is not None and name != "mask"}
+    positions, values = random_scan(columns.pop("positions"), columns, generator)
+    values.pop("normals", None)
+    positions, values, _ = cleaned(positions, values)
+    return PointCloud(
+        positions=np.clip(positions, -1, 1).astype(np.float32),
+        mask=np.ones(len(positions), bool),
+        **{name: column.astype(np.float32) for name, column in values.items()},
     )
 
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from support import tiny_dataset, tiny_surfels
 
-from experiments.comparison import scan_faults
 from experiments.studies import scans
 from spnr_jax.surfels.visibility import spiral
+from spnr_jax.training import scan_faults
 
 SPLITS = {"train": (), "val": (), "test": ("ball_000000",)}
 
@@ -57,6 +57,46 @@ def test_faults_change_what_their_names_say_and_nothing_else():
     flat = scan_faults.colours_alone(points, values, rng())[1]
     assert set(flat["roughness"]) == {0.5}
     assert set(flat["metallic"]) == {0.0}
+    assert set(flat["materials_known"]) == {0.0}
+
+
+def test_scans_that_do_not_meet_are_moved_as_one_and_balls_leave_holes():
+    points, values = spiral(4000), {"roughness": np.arange(4000.0)}
+    moved = scan_faults.misregistered(points, values, rng(), sigma=0.01)[0] - points
+    apart = np.linalg.norm(moved, axis=1) > 1e-9
+    assert 0.3 < apart.mean() < 0.7
+    np.testing.assert_allclose(moved[apart], np.broadcast_to(moved[apart][0], moved[apart].shape), atol=1e-12)
+    left, columns = scan_faults.dropped(points, values, rng(), balls=3)
+    rows = columns["roughness"].astype(int)
+    np.testing.assert_array_equal(points[rows], left)
+    gone = np.setdiff1d(np.arange(4000), rows)
+    assert 0 < len(gone) < 400
+    nearest = np.linalg.norm(points[gone][:, None] - left[None], axis=-1).min(axis=1)
+    assert nearest.max() > 0.03  # a hole, not single points
+
+
+def test_colours_in_light_are_darkest_where_the_lamp_grazes_and_never_brighter():
+    points = spiral(4000)
+    values = {"base_color": np.full((4000, 3), 0.6), "normals": points}
+    shade = scan_faults.colours_in_light(points, values, rng())[1]["base_color"][:, 0] / 0.6
+    cosine = np.abs(points @ (lamp := rng().normal(size=3)) / np.linalg.norm(lamp))
+    assert shade.max() <= 1
+    order = np.argsort(cosine)
+    assert (np.diff(shade[order]) >= -1e-12).all()
+    assert 0.2 < 1 - shade.min() < 0.75
+
+
+def test_a_random_scan_is_a_function_of_its_generator_and_keeps_columns_beside_points():
+    points = spiral(3000).astype(np.float32)
+    values = {"base_color": np.full((3000, 3), 0.5), "roughness": np.full(3000, 0.3), "metallic": np.zeros(3000)}
+    values["normals"] = points
+    scans_of = [scan_faults.random_scan(points, values, np.random.default_rng(seed)) for seed in range(12)]
+    for seed, (positions, columns) in enumerate(scans_of):
+        assert all(len(column) == len(positions) > 0 for column in columns.values())
+        again = scan_faults.random_scan(points, values, np.random.default_rng(seed))[0]
+        np.testing.assert_array_equal(again, positions)
+    assert len({len(positions) for positions, _ in scans_of}) > 3
+    assert 0 < sum("materials_known" in columns for _, columns in scans_of) < 12
 
 
 def test_scanners_see_less_the_fewer_they_are_and_only_the_outside():

@@ -45,6 +45,12 @@ def test_roughness_and_metallic_have_many_names_and_whole_bytes(rough, metal):
     np.testing.assert_array_equal(values["metallic"], [0.25, 0.75])
 
 
+def test_materials_are_known_where_the_file_has_one_of_them():
+    assert "materials_known" not in read(roughness=[0.1, 0.2])[0]
+    assert "materials_known" not in read(metallic=[0.0, 1.0])[0]
+    np.testing.assert_array_equal(read(red=[1, 1], green=[0, 0], blue=[0, 0])[0]["materials_known"], [0, 0])
+
+
 def test_8_bit_colours_in_16_bit_fields_are_not_black():
     values, lines = read(**dict.fromkeys(("red", "green", "blue"), np.array([0, 255], np.uint16)))
     np.testing.assert_array_equal(values["base_color"], [[0] * 3, [1] * 3])

@@ -87,6 +87,10 @@ class TestPicture:
         close(change(6)[0], specular * values[..., 16:17], rtol=1e-3, atol=1e-6)
         close(change(7)[0], specular, rtol=1e-3, atol=1e-6)
         close(change(9, 0.1)[0][..., 1], np.full((1, 6, 6), 0.05 * ambient[0, 0, 1]), rtol=1e-3)
+        metal = 0.5 * (values[..., 5:6] * COLOR_STEP * (0.5 - SPECULAR)) * values[..., 13:16] * values[..., 16:17]
+        close(change(20, 0.5)[0], metal - 0.25 * COLOR_STEP * values[..., 7:10], rtol=1e-3, atol=1e-6)
+        rougher = (SPECULAR * values[..., 5:6] + values[..., 6:7]) * (values[..., 10:13] - values[..., 13:16])
+        close(change(21, 0.5)[0], 0.5 * rougher * values[..., 16:17], rtol=1e-3, atol=1e-6)
         for k in range(1, 9):
             close(change(10 + k, 0.1)[0], np.broadcast_to(0.05 * ambient[0, k], (1, 6, 6, 3)), rtol=1e-3, atol=1e-6)
 

@@ -53,6 +53,7 @@ def surfels(position, normal, spacing, **columns) -> Surfels:
         "gradient": np.zeros((count, 3, 3)),
         "roughness": np.full(count, 0.5),
         "metallic": np.zeros(count),
+        "guessed": np.zeros(count),
         "sided": np.ones(count),
         "visible": np.ones((count, NUM_DIRECTIONS)),
         "shape": np.zeros((count, 2)),

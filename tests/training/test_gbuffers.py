@@ -147,6 +147,7 @@ def test_a_mirrored_object_is_seen_as_the_mirrored_view(axis):
             gradient=np.zeros((60, 3, 3), np.float32),
             roughness=color[:, 0],
             metallic=color[:, 1],
+            guessed=color[:, 2],
             sided=np.ones(60, np.float32),
             visible=np.maximum((normal * sign) @ DIRECTIONS.T, 0),
             shape=color[:, :2],

@@ -1,0 +1,138 @@
+"""What scanners do to a clean cloud: noise, outliers, unseen surface, uneven density, colours without materials.
+
+All take and return (positions (n, 3), other columns by name) with a generator of random numbers; lengths are units of
+the box whose half diagonal is 1, in which the points have to lie.  `faults` are those that are measured one by one,
+`random_scan` draws several for a cloud of the training.
+"""
+
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+
+from spnr_jax.kernels.facing import seen_from, spacing_of
+
+Points = tuple[np.ndarray, dict[str, np.ndarray]]
+Fault = Callable[[np.ndarray, dict[str, np.ndarray], np.random.Generator], Points]
+
+SCANNER = 2.5  # distance of a virtual scanner from the middle of the box
+BEHIND = 3.0  # spacings behind the first of its pixel that a scanner still sees a point
+BALLS = 0.03, 0.15  # radii of what is left out
+SHADED = 0.2, 0.7  # of a colour that a lamp's direction takes away at most
+NOISE, OUTLIERS = (0.001, 0.02), (0.002, 0.05)  # of random scans, drawn from the logarithm
+MISREGISTERED, COLOUR_NOISE = 0.004, 0.08  # at most
+CHANCES = {  # of each fault in a random scan
+    "colours_in_light": 0.15,
+    "scanned": 0.4,
+    "uneven": 0.2,
+    "dropped": 0.15,
+    "misregistered": 0.15,
+    "noisy": 0.75,
+    "with_outliers": 0.35,
+    "colour_noise": 0.5,
+    "colours_alone": 0.5,
+}
+THINNEST = 0.1  # density at one end of a cloud of uneven density, over that at the other
+
+
+def noisy(positions, values, rng, *, sigma: float) -> Points:
+    """Normally distributed errors of this standard deviation along each axis."""
+    return positions + sigma * rng.normal(size=positions.shape), values
+
+
+def with_outliers(positions, values, rng, *, share: float) -> Points:
+    """So many more points, uniform in the bounding box, with the columns of points drawn at random."""
+    count = round(share * len(positions))
+    low, high = positions.min(axis=0), positions.max(axis=0)
+    copied = rng.integers(len(positions), size=count)
+    return (
+        np.concatenate([positions, rng.uniform(low, high, (count, 3))]),
+        {name: np.concatenate([column, column[copied]]) for name, column in values.items()},
+    )
+
+
+def scanned(positions, values, rng, *, scanners: int) -> Points:
+    """What scanners in random directions from the middle see."""
+    spacing, seen = spacing_of(positions), np.zeros(len(positions), bool)
+    for direction in rng.normal(size=(scanners, 3)):
+        seen |= seen_from(positions, SCANNER * direction / np.linalg.norm(direction), spacing, BEHIND)
+    return positions[seen], {name: column[seen] for name, column in values.items()}
+
+
+def misregistered(positions, values, rng, *, sigma: float) -> Points:
+    """Two scans that do not quite meet: the points on one side of a random plane are moved together."""
+    apart = positions @ rng.normal(size=3) > 0
+    return positions + apart[:, None] * sigma * rng.normal(size=3), values
+
+
+def dropped(positions, values, rng, *, balls: int) -> Points:
+    """Nothing is left in balls around random points."""
+    middles, radii = positions[rng.integers(len(positions), size=balls)], rng.uniform(*BALLS, balls)
+    kept = (((positions[:, None] - middles) ** 2).sum(axis=-1) > radii**2).all(axis=1)
+    kept[0] = True
+    return positions[kept], {name: column[kept] for name, column in values.items()}
+
+
+def colour_noise(positions, values, rng, *, sigma: float) -> Points:
+    """Normally distributed errors of the base colours."""
+    color = values["base_color"]
+    return positions, values | {"base_color": np.clip(color + sigma * rng.normal(size=color.shape), 0, 1)}
+
+
+def colours_in_light(positions, values, rng) -> Points:
+    """Base colours darkened as a lamp in a grey room would, as a photograph has them; of clouds with normals."""
+    lamp = rng.normal(size=3)
+    cosine = np.abs(values["normals"] @ lamp) / np.linalg.norm(lamp)
+    shade = 1 - rng.uniform(*SHADED) * (1 - cosine)
+    return positions, values | {"base_color": values["base_color"] * shade[:, None]}
+
+
+def colours_alone(positions, values, rng) -> Points:
+    """Roughness 0.5 and metallic 0 everywhere and not known, as a file without materials is read."""
+    flat = {"roughness": 0.5, "metallic": 0.0, "materials_known": 0.0}
+    return positions, values | {name: np.full(len(positions), x, np.float32) for name, x in flat.items()}
+
+
+def uneven(positions, values, rng) -> Points:
+    """A density that falls exponentially in a random direction, to THINNEST."""
+    along = positions @ rng.normal(size=3)
+    place = (along - along.min()) / max(float(np.ptp(along)), np.finfo(np.float64).tiny)
+    kept = rng.uniform(size=len(positions)) < THINNEST**place
+    kept[0] = True
+    return positions[kept], {name: column[kept] for name, column in values.items()}
+
+
+def random_scan(positions, values, rng) -> Points:
+    """The points after several faults, each drawn or not."""
+    drawn = {name: rng.random() < chance for name, chance in CHANCES.items()}
+    chosen: list[Fault] = []
+    if drawn["colours_in_light"] and "normals" in values:
+        chosen.append(colours_in_light)
+    if drawn["scanned"]:
+        chosen.append(partial(scanned, scanners=int(rng.integers(3, 9))))
+    if drawn["uneven"]:
+        chosen.append(uneven)
+    if drawn["dropped"]:
+        chosen.append(partial(dropped, balls=int(rng.integers(1, 5))))
+    if drawn["misregistered"]:
+        chosen.append(partial(misregistered, sigma=rng.uniform(0, MISREGISTERED)))
+    if drawn["noisy"]:
+        chosen.append(partial(noisy, sigma=float(np.exp(rng.uniform(*np.log(NOISE))))))
+    if drawn["with_outliers"]:
+        chosen.append(partial(with_outliers, share=float(np.exp(rng.uniform(*np.log(OUTLIERS))))))
+    if drawn["colour_noise"]:
+        chosen.append(partial(colour_noise, sigma=rng.uniform(0, COLOUR_NOISE)))
+    if drawn["colours_alone"]:
+        chosen.append(colours_alone)
+    for fault in chosen:
+        positions, values = fault(positions, values, rng)
+    return positions, values
+
+
+def faults(noise: tuple[float, ...], outliers: tuple[float, ...], scanners: tuple[int, ...]) -> dict[str, Fault | None]:
+    """Every fault by a name for the row of a table; None leaves the cloud clean."""
+    named: dict[str, Fault | None] = {"clean": None}
+    named |= {f"noise {sigma:.1%}": partial(noisy, sigma=sigma) for sigma in noise}
+    named |= {f"outliers {share:.0%}": partial(with_outliers, share=share) for share in outliers}
+    named |= {f"{n} scanner{'s' * (n > 1)}": partial(scanned, scanners=n) for n in scanners}
+    return named | {"colours alone": colours_alone, "uneven density": uneven}
