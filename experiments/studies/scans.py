@@ -22,7 +22,6 @@ from tqdm import tqdm
 from experiments import entry_point
 from experiments.comparison import figures, results_folder
 from experiments.comparison.result_tables import Cell, Table, number
-from spnr_jax.training.scan_faults import Fault, faults
 from experiments.studies.sharpness import view_of
 from spnr_jax.devices import machine
 from spnr_jax.formats import data_sets, images
@@ -34,6 +33,7 @@ from spnr_jax.method.model import Model
 from spnr_jax.scoring import intervals
 from spnr_jax.scoring.flip import flip
 from spnr_jax.scoring.picture_scores import sharpness
+from spnr_jax.training.scan_faults import Fault, faults
 from spnr_jax.training.weights import load
 
 HEADS = ("PSNR, dB", "inside, dB", "FLIP", "cleaned: PSNR, dB", "inside, dB", "FLIP", "points left, %")

@@ -136,7 +136,7 @@ def thinned(cloud: PointCloud, count: int, even: bool, generator: np.random.Gene
 
 
 def scanned(cloud: PointCloud, generator: np.random.Generator) -> PointCloud:
-    """The cloud as it is after a scanner and after cleaning: without normals, in the box of the one that was scanned."""
+    """The cloud as a scanner and cleaning leave it: without normals, in the box of the one that was scanned."""
     columns = {name: np.asarray(x) for name, x in vars(cloud).items() if x is not None and name != "mask"}
     positions, values = random_scan(columns.pop("positions"), columns, generator)
     values.pop("normals", None)
