@@ -204,7 +204,7 @@ def test_a_picture_of_rays_is_drawn_by_few_modules_and_by_one_network():
     loaded = own_code(modules_after(code))
     reading = {"config", "formats.config_json", "formats.npz", "formats.text", "formats.images", "training.weights"}
     drawing = loaded - {f"spnr_jax.{part}" for part in reading}  # without the file of weights
-    assert len(drawing) <= 25, sorted(drawing)
+    assert len(drawing) <= 26, sorted(drawing)
     assert "spnr_jax.method.near_points" in drawing
     assert not drawing & {f"spnr_jax.method.{other}" for other in ("paper_network", "surfel_renderer")}
     assert not {part for part in drawing if part.split(".")[1] in ("surfels", "baselines", "training", "scoring")}

@@ -136,7 +136,7 @@ def frame_programs(options: WhereTimeGoes) -> dict[str, Program]:
     small = orbiting(options.size * side >> doublings)
     total = int(splatting.count(scene.surfels, small))
     found, covered = splatting.jitted_entries(scene.surfels, small, total=total)
-    look = partial(surfel_renderer.look, slots=int(covered))
+    look = partial(surfel_renderer.jitted_look, slots=int(covered))
     seen, maps, ambient, _ = jax.jit(look)(found, scene.surfels, light, small)
     shader = Shader(config.widths, config.top)
     outputs = shader.apply(variables, seen[None], doublings)

@@ -27,6 +27,11 @@ def processor() -> str:
     return f"{names[0] if names else platform.machine()} ({', '.join(sets) or 'instruction sets unknown'})"
 
 
+def flags() -> str:
+    """Everything that the kernel says the first core can do."""
+    return next(iter(_told("flags") or _told("Features")), platform.machine())
+
+
 def load() -> float:
     """Threads that ran or waited to run on this machine, mean of the last minute: those of others, too."""
     return round(os.getloadavg()[0], 1)

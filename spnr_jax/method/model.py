@@ -21,6 +21,7 @@ from flax import struct
 from jaxtyping import Array, Float
 from scipy.spatial import cKDTree
 
+from spnr_jax.devices.kept_programs import kept
 from spnr_jax.devices.placement import by_all_devices, everywhere
 from spnr_jax.errors import UserError
 from spnr_jax.kernels import cameras, cloud_arrays
@@ -150,13 +151,14 @@ class Model:
         """Camera that sees the whole object: degrees around the y axis from +z, and above the horizon."""
         angles = np.deg2rad(np.float32(azimuth)), np.deg2rad(np.float32(elevation))
         size = resolution or self.config.image_resolution
-        return _orbiting(*angles, DISTANCE / volume.scale, volume.centre, size=size)
+        return _orbiting(*angles, np.float32(DISTANCE) / np.asarray(volume.scale), volume.centre, size=size)
 
 
-# The three are compiled whole: each operation outside of a jit would be compiled alone, 30 ms apiece at the first call.
+# These are compiled whole: each operation outside of a jit would be compiled alone, 30 ms apiece at the first call.
 
 
 # this option halves the compilation of the U-Net and costs it no time; rendering would take twice as long
+@partial(kept, static=("config",))
 @partial(jax.jit, static_argnames="config", compiler_options={"xla_cpu_use_fusion_emitters": False})
 def _encode(variables: dict, cloud: PointCloud, *, config: NetworkConfig) -> Any:
     """What the network makes of a cloud in the box (unbatched)."""
@@ -164,6 +166,7 @@ def _encode(variables: dict, cloud: PointCloud, *, config: NetworkConfig) -> Any
     return jax.tree.map(lambda x: x[0], scene)
 
 
+@partial(kept, static=("config", "options"))
 @partial(jax.jit, static_argnames=("config", "options"))
 def _render(
     variables: dict, scene: Any, centre, scale, camera: Camera, *, config: NetworkConfig, options: RenderOptions
@@ -177,6 +180,7 @@ def _render(
     return jax.tree.map(lambda x: x[0, 0] if single else x[0], rendering)
 
 
+@kept
 @jax.jit
 def _in_box(camera: Camera, centre, scale) -> Camera:
     """The camera in the coordinates of the box."""
@@ -185,6 +189,7 @@ def _in_box(camera: Camera, centre, scale) -> Camera:
     return dataclasses.replace(camera, cam_to_world=jnp.concatenate([rotation, eye[..., None]], axis=-1))
 
 
+@partial(kept, static=("size",))
 @partial(jax.jit, static_argnames="size")
 def _orbiting(azimuth, elevation, distance, centre, *, size: int) -> Camera:
     """Square camera of `size` pixels that looks at the centre; angles in radians."""
@@ -199,7 +204,13 @@ def _or_room(light: Light | None) -> Light:
 
 def _in_units(drawn: Rendering, volume: Volume) -> Rendering:
     """What was drawn in the box with its depth in the cloud's units."""
-    return dataclasses.replace(drawn, depth=drawn.depth / np.asarray(volume.scale))
+    return dataclasses.replace(drawn, depth=_over(drawn.depth, volume.scale))
+
+
+@kept
+@jax.jit
+def _over(depth, scale) -> Array:
+    return depth / scale
 
 
 def _check_quality(quality: str) -> None:

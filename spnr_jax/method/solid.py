@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from spnr_jax.devices.kept_programs import kept
 from spnr_jax.kernels import cameras, cloud_arrays
 from spnr_jax.kernels.records import Camera, PointCloud, Scene
 from spnr_jax.kernels.resizing import averaged, doubled
@@ -37,11 +38,13 @@ def encode(variables: dict, cloud: PointCloud, *, config: NearPointsConfig) -> S
 
 
 # this option halves the compilation of the U-Net and costs it no time
+@partial(kept, static=("config",))
 @partial(jax.jit, static_argnames="config", compiler_options={"xla_cpu_use_fusion_emitters": False})
 def _encoded(variables: dict, cloud: PointCloud, *, config: NearPointsConfig) -> Scene:
     return NearPointsNetwork(config).bind(variables).encode(jax.tree.map(lambda x: x[None], cloud))
 
 
+@partial(kept, static=("config",))
 @partial(jax.jit, static_argnames="config")
 def seen(variables: dict, scene: Scene, camera: Camera, *, config: NearPointsConfig) -> Float[Array, "height width 2"]:
     """Opacity, and depth along the camera's axis, of a view (camera unbatched, in the box)."""

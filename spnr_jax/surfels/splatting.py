@@ -24,6 +24,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from spnr_jax.devices.kept_programs import kept
 from spnr_jax.kernels.records import AnyArray, Camera, GBuffer, Surfels
 
 RADIUS = 1.6  # of a disc, in spacings
@@ -181,7 +182,10 @@ def entries(surfels: Surfels, camera: Camera, *, total: int) -> tuple[Entries, I
 
 
 # this option takes a quarter off the compilation and costs the program no time
-jitted_entries = jax.jit(entries, static_argnames="total", compiler_options={"xla_cpu_use_fusion_emitters": False})
+jitted_entries = kept(
+    jax.jit(entries, static_argnames="total", compiler_options={"xla_cpu_use_fusion_emitters": False}),
+    static=("total",),
+)
 
 
 def _sorted(

@@ -14,6 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from spnr_jax.devices.kept_programs import kept
+
 NUM_DIRECTIONS = 64
 CELL = 1.5  # spacings
 STEEPEST = 8.0  # slope of a plane against the direction, at most
@@ -52,6 +54,7 @@ def grid_of(spacing: float) -> tuple[np.float32, int]:
     return np.float32(cell), int(2 ** (np.ceil(2 * np.log2(needed)) / 2))
 
 
+@partial(kept, static=("grid",))
 @partial(jax.jit, static_argnames="grid")
 def seen_from(
     positions: Float[Array, "points 3"],
