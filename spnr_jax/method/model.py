@@ -150,10 +150,10 @@ class Model:
         """Camera that sees the whole object: degrees around the y axis from +z, and above the horizon."""
         angles = np.deg2rad(np.float32(azimuth)), np.deg2rad(np.float32(elevation))
         size = resolution or self.config.image_resolution
-        return _orbiting(*angles, DISTANCE / volume.scale, volume.centre, size=size)
+        return _orbiting(*angles, np.float32(DISTANCE) / np.asarray(volume.scale), volume.centre, size=size)
 
 
-# The three are compiled whole: each operation outside of a jit would be compiled alone, 30 ms apiece at the first call.
+# These are compiled whole: each operation outside of a jit would be compiled alone, 30 ms apiece at the first call.
 
 
 # this option halves the compilation of the U-Net and costs it no time; rendering would take twice as long
@@ -199,7 +199,12 @@ def _or_room(light: Light | None) -> Light:
 
 def _in_units(drawn: Rendering, volume: Volume) -> Rendering:
     """What was drawn in the box with its depth in the cloud's units."""
-    return dataclasses.replace(drawn, depth=drawn.depth / np.asarray(volume.scale))
+    return dataclasses.replace(drawn, depth=_over(drawn.depth, volume.scale))
+
+
+@jax.jit
+def _over(depth, scale) -> Array:
+    return depth / scale
 
 
 def _check_quality(quality: str) -> None:

@@ -22,7 +22,7 @@ from spnr_jax.devices.side_by_side import two_at_a_time
 from spnr_jax.errors import UserError
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.compositing import WHITE
-from spnr_jax.kernels.records import AnyArray, Camera, Key, Light, PointCloud, Rendering, Scene, Surfels
+from spnr_jax.kernels.records import AnyArray, Camera, GBuffer, Key, Light, PointCloud, Rendering, Scene, Surfels
 from spnr_jax.kernels.resizing import doubled, mean_of_squares
 from spnr_jax.method import solid
 from spnr_jax.model_config import SOLID, SurfelConfig
@@ -36,6 +36,9 @@ MOST_DOUBLINGS = 4
 STEP, MARGIN = 32, 8  # pixels of which a window is a multiple, and around the object in it
 LEAST_SLOTS = 2**11  # covered pixels that a table is made for
 GRID = 8  # of which a window's corner is a multiple: the network's levels see the same squares from every camera
+# of XLA, that take a third to two thirds off the compilation; entries, `_seen`, `_shade` and `_laid` run as long
+QUICK = {"xla_cpu_use_fusion_emitters": False}
+QUICKEST = QUICK | {"xla_backend_optimization_level": 1}
 
 
 @struct.dataclass
@@ -169,7 +172,7 @@ def resolution_of(spacing: float, camera: Camera) -> tuple[int, int]:
     return doublings, 2 if pixels < FINEST else 1
 
 
-@jax.jit
+@partial(jax.jit, compiler_options=QUICK)
 def _extent(surfels: Surfels, camera: Camera) -> tuple[Array, Array]:
     """Lowest and highest column and row that discs cover, and the number of entries at most."""
     foot = splatting.footprints(surfels, camera)
@@ -232,7 +235,28 @@ def _in_window(picture: Float[Array, "h w features"], plan: Plan) -> Float[np.nd
     return np.pad(np.asarray(picture), [*lacking, (0, 0)])[plan.top : ends[0], plan.left : ends[1]]
 
 
-def look(
+def blended(found: splatting.Entries, surfels: Surfels, light: Light, camera: Camera, *, slots: int) -> GBuffer:
+    """The G-buffer of a picture's entries, with what of the light arrives at each surfel."""
+    surfels = features.turned(surfels, camera)
+    return splatting.blend(found, surfels, features.attributes(surfels, light, camera), camera, slots=slots)
+
+
+def seen(
+    buffer: GBuffer, light: Light, camera: Camera, known: Float[Array, "height width 2"] | None = None
+) -> tuple[
+    Float[Array, "height width 34"], Float[Array, "height width 18"], Float[Array, "9 3"], Float[Array, "height width"]
+]:
+    """What the network sees of a G-buffer, the light maps, the light's harmonics in camera axes, the depth."""
+    told, maps = features.features(buffer, light, camera, known)
+    return told, maps, lighting.projected(light, jnp.asarray(camera.cam_to_world)[:, :3]), buffer.depth
+
+
+# two programs: of pictures with other numbers of covered pixels in the same window the second is not compiled again
+_blended = jax.jit(blended, static_argnames="slots")
+_seen = jax.jit(seen, compiler_options=QUICK)
+
+
+def jitted_look(
     found: splatting.Entries,
     surfels: Surfels,
     light: Light,
@@ -240,20 +264,12 @@ def look(
     known: Float[Array, "height width 2"] | None = None,
     *,
     slots: int,
-) -> tuple[
-    Float[Array, "height width 34"], Float[Array, "height width 18"], Float[Array, "9 3"], Float[Array, "height width"]
-]:
-    """What the network sees of a picture's entries, the light maps, the light's harmonics in camera axes, the depth."""
-    surfels = features.turned(surfels, camera)
-    buffer = splatting.blend(found, surfels, features.attributes(surfels, light, camera), camera, slots=slots)
-    seen, maps = features.features(buffer, light, camera, known)
-    return seen, maps, lighting.projected(light, jnp.asarray(camera.cam_to_world)[:, :3]), buffer.depth
+) -> tuple[Array, Array, Array, Array]:
+    """`seen` of what is `blended`, compiled."""
+    return _seen(_blended(found, surfels, light, camera, slots=slots), light, camera, known)
 
 
-jitted_look = jax.jit(look, static_argnames="slots")
-
-
-@partial(jax.jit, static_argnames=("config", "doublings"))
+@partial(jax.jit, static_argnames=("config", "doublings"), compiler_options=QUICKEST)
 def _shade(
     variables: dict | None,
     seen: Float[Array, "height width 34"],
@@ -264,10 +280,7 @@ def _shade(
     config: SurfelConfig,
     doublings: int,
 ) -> Float[Array, "h w 5"]:
-    """Colour, opacity and depth along the camera's axis, of the window, doubled.
-
-    A program of its own: the sizes that `look` is compiled for change from picture to picture, the network's seldom.
-    """
+    """Colour, opacity and depth along the camera's axis, of the window, doubled."""
     if variables is None:
         outputs = jnp.zeros((1, *(n << doublings for n in seen.shape[:2]), NUM_OUTPUTS))
     else:
@@ -289,7 +302,8 @@ def _placed(drawn: Float[AnyArray, "h w 5"], camera: Camera, plan: Plan) -> Rend
     return Rendering(image=image, image_lr=image, depth=depth, acc=acc)
 
 
-@partial(jax.jit, static_argnames="side")  # operations outside of it would be compiled one by one: 50 of them, 2 s
+# one program: its 50 operations alone would each be compiled, 2 s
+@partial(jax.jit, static_argnames="side", compiler_options=QUICKEST)
 def _laid(
     drawn: Float[AnyArray, "h w 5"], corner: Int[AnyArray, "2"], camera: Camera, *, side: int
 ) -> tuple[Float[Array, "height width 3"], Float[Array, "height width"], Float[Array, "height width"]]:

@@ -1,6 +1,5 @@
 """Which side of each layer is outside: votes of the directions that see it, and of walls."""
 
-import jax.numpy as jnp
 import numpy as np
 
 from spnr_jax.kernels.cloud_arrays import bucket
@@ -23,12 +22,11 @@ def visible_from(positions: np.ndarray, normal: np.ndarray, spacing: np.ndarray,
     size, count = bucket(len(positions)), len(positions)
 
     def pad(values):
-        return jnp.asarray(np.concatenate([values, np.zeros((size - count, *values.shape[1:]), values.dtype)]))
+        return np.concatenate([values, np.zeros((size - count, *values.shape[1:]), values.dtype)])
 
     cell, grid = grid_of(middle)
     bounded = np.clip(spacing, middle / 2, 2 * middle).astype(np.float32)
-    mask = jnp.arange(size) < count
-    seen = seen_from(pad(positions), pad(normal), pad(bounded), mask, jnp.float32(cell), grid=grid)
+    seen = seen_from(pad(positions), pad(normal), pad(bounded), np.arange(size) < count, cell, grid=grid)
     return np.asarray(seen)[:count]
 
 

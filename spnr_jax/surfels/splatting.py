@@ -18,10 +18,11 @@ sizes come from counts that the caller reads back: a picture is three programs, 
 from collections.abc import Sequence
 from functools import reduce
 from operator import add, mul
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from spnr_jax.kernels.records import AnyArray, Camera, GBuffer, Surfels
@@ -38,7 +39,17 @@ SHARP = 4  # power of the kernel by which colours are blended more narrowly than
 FAR = 1e-4  # summed narrow weights that the centres' distances pass to 0 at
 NEAREST = 0.05  # distance before the camera from which discs are drawn
 DEPTH_BITS, ENTRY_BITS = 19, 24  # of the sorted number of 64, at most; pixels have those above
+PIXEL_BITS = 64 - DEPTH_BITS - ENTRY_BITS  # that leave so many to the depth
 MOST_ENTRIES = 2**ENTRY_BITS
+
+
+class View(NamedTuple):
+    """A camera whose picture's size is a number like others, not one that programs are compiled for."""
+
+    cam_to_world: Float[AnyArray, "3 4"]
+    intrinsics: Float[AnyArray, "3 3"]
+    height: Int[AnyArray, ""]
+    width: Int[AnyArray, ""]
 
 
 class Footprints(NamedTuple):
@@ -93,7 +104,7 @@ def _dot(a: Sequence[Array], b: Sequence[Array]) -> Array:
     return reduce(add, (x * y for x, y in zip(a, b, strict=True)))
 
 
-def footprints(surfels: Surfels, camera: Camera) -> Footprints:
+def footprints(surfels: Surfels, camera: Camera | View) -> Footprints:
     """Discs before a camera; those turned away, behind it or beside the picture cover no pixel."""
     rotation, eye = camera.cam_to_world[:, :3], camera.cam_to_world[:, 3]
     x, y, z = (centre - e for centre, e in zip(_turned(rotation, surfels.position), eye @ rotation, strict=True))
@@ -138,8 +149,13 @@ def count(surfels: Surfels, camera: Camera) -> Int[Array, ""]:
     return jnp.sum(footprints(surfels, camera).covered)
 
 
-def entries(surfels: Surfels, camera: Camera, *, total: int) -> tuple[Entries, Int[Array, ""]]:
-    """The sorted entries, `total` of them with the empty ones, and the number of covered pixels."""
+def entries(
+    surfels: Surfels, camera: Camera | View, *, total: int, pixel_bits: int = PIXEL_BITS
+) -> tuple[Entries, Int[Array, ""]]:
+    """The sorted entries, `total` of them with the empty ones, and the number of covered pixels.
+
+    The numbers of the pixels, and of one more, have at most `pixel_bits`.
+    """
     foot = footprints(surfels, camera)
     end = jnp.cumsum(foot.covered)
     point = jnp.repeat(jnp.arange(len(foot.covered), dtype=jnp.int32), foot.covered, total_repeat_length=total)
@@ -173,7 +189,7 @@ def entries(surfels: Surfels, camera: Camera, *, total: int) -> tuple[Entries, I
     kernel = jnp.clip(jnp.maximum(cut, 1 - on_picture), 0, 1)
     depth = jnp.clip(met, -z - radius, -z + radius)
     pixel = jnp.where((place < end[-1]) & (kernel > 0), row * camera.width + column, camera.height * camera.width)
-    order, pixel = _sorted(pixel, depth, place, camera.height * camera.width)
+    order, pixel = _sorted(pixel, depth, place, 64 - ENTRY_BITS - pixel_bits)
     first = jnp.concatenate([jnp.ones(1, bool), pixel[1:] != pixel[:-1]]) & (pixel < camera.height * camera.width)
     slot = jnp.cumsum(first.astype(jnp.int32)) - 1
     rank = place - jax.lax.cummax(jnp.where(first, place, 0))
@@ -181,15 +197,23 @@ def entries(surfels: Surfels, camera: Camera, *, total: int) -> tuple[Entries, I
 
 
 # this option takes a quarter off the compilation and costs the program no time
-jitted_entries = jax.jit(entries, static_argnames="total", compiler_options={"xla_cpu_use_fusion_emitters": False})
+_entries = jax.jit(
+    entries, static_argnames=("total", "pixel_bits"), compiler_options={"xla_cpu_use_fusion_emitters": False}
+)
+
+
+def jitted_entries(surfels: Surfels, camera: Camera, *, total: int) -> Any:
+    """`entries` by a program that draws pictures of any size."""
+    size = np.asarray(camera.height, np.int32), np.asarray(camera.width, np.int32)
+    bits = max(PIXEL_BITS, (camera.height * camera.width).bit_length())
+    return _entries(surfels, View(camera.cam_to_world, camera.intrinsics, *size), total=total, pixel_bits=bits)
 
 
 def _sorted(
-    pixel: Int[Array, " entries"], depth: Float[Array, " entries"], place: Int[Array, " entries"], pixels: int
+    pixel: Int[Array, " entries"], depth: Float[Array, " entries"], place: Int[Array, " entries"], depth_bits: int
 ) -> tuple[Int[Array, " entries"], Int[Array, " entries"]]:
     """Places and pixels in the order of pixel and depth: one number of 64 bits sorts nine times faster than three."""
     low, high = jnp.min(depth), jnp.max(depth)
-    depth_bits = min(DEPTH_BITS, 64 - ENTRY_BITS - pixels.bit_length())
     steps = 2**depth_bits - 1
     with jax.enable_x64(True):
         level = (steps * (depth - low) / jnp.maximum(high - low, 1e-6)).astype(jnp.uint64)

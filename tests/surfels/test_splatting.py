@@ -135,6 +135,17 @@ class TestEntries:
             assert abs(rows.mean() + 0.5 - size / 2) < 0.1 * size
             assert abs(columns.mean() + 0.5 - size / 2) < 0.1 * size
 
+    def test_one_program_makes_them_for_pictures_of_any_size(self):
+        found, programs = layer(20, normal=(0, 1, 1)), splatting._entries.__wrapped__
+        before = programs._cache_size()
+        for size in (20, 28):
+            view = camera(size)
+            made, slots = splatting.jitted_entries(found, view, total=2**12)
+            wanted, filled = jax.jit(splatting.entries, static_argnames="total")(found, view, total=2**12)
+            assert int(slots) == int(filled) > 0
+            jax.tree.map(lambda x, y: close(x, y, atol=1e-5), made, wanted)
+        assert programs._cache_size() == before + 1
+
 
 class TestBlend:
     def test_a_colour_that_is_linear_over_a_plane_is_drawn_at_each_pixel(self):
