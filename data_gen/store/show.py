@@ -3,19 +3,17 @@
 Per object: its pictures, its condition images, and its points as a front view in base colour, roughness and metallic.
 """
 
-import base64
 import html
-import io
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import tyro
-from PIL import Image
 
 from data_gen.render import views
 from data_gen.store import check, layout
 from spnr_jax.errors import UserError
+from spnr_jax.formats.images import png_url
 
 STYLE = """
 body { font: 14px/1.4 system-ui, sans-serif; margin: 24px; background: #f4f4f2; color: #222 }
@@ -80,20 +78,13 @@ def channel_names() -> list[tuple[str, ...]]:
 
 def image_row(label: str, images: list[np.ndarray]) -> str:
     """Return a labelled row of pictures (height, width, 3) uint8, shown at 96 pixels or their own size."""
-    tags = "".join(f'<img width="{max(96, image.shape[1])}" src="{data_url(image)}" alt="">' for image in images)
+    tags = "".join(f'<img width="{max(96, image.shape[1])}" src="{png_url(image)}" alt="">' for image in images)
     return f"<div><span>{label}</span>{tags}</div>"
 
 
 def white_bytes(image: np.ndarray) -> np.ndarray:
     """Return an RGBA picture on white as (height, width, 3) uint8."""
     return np.round(255 * views.on_white(image)).astype(np.uint8)
-
-
-def data_url(image: np.ndarray) -> str:
-    """Return the picture as a PNG inside a URL."""
-    buffer = io.BytesIO()
-    Image.fromarray(image).save(buffer, "PNG")
-    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
 
 
 def point_image(points: np.ndarray, names: tuple[str, ...]) -> np.ndarray:

@@ -4,7 +4,6 @@ Key numbers and summary, pictures of unseen objects, quality beside the floors, 
 PNGs inside the page, the curve is an SVG; nothing is loaded from elsewhere, and no script runs.
 """
 
-import base64
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from spnr_jax.formats.images import depth_image, png, to_uint8, write_whole
+from spnr_jax.formats.images import depth_image, png_url, to_uint8, write_whole
 from spnr_jax.scoring.learning_curve import learning_curve_svg
 from spnr_jax.scoring.report_style import STYLE
 from spnr_jax.scoring.summary import NO_WEIGHTS
@@ -172,7 +171,7 @@ def _gallery_row(row: GalleryRow, heads: Sequence[str]) -> str:
     pictures += [(image, f"{psnr(image, row.reference):.1f}") for image in row.images.values()]
     pictures += [(depth_image(row.depth, row.acc), ""), (row.acc, "")]
     cells = "".join(
-        f'<td><img src="data:image/png;base64,{base64.b64encode(png(image)).decode()}" '
+        f'<td><img src="{png_url(image)}" '
         f'alt="{escape(row.name)}, {escape(head.lower())}"><small>{caption}</small></td>'
         for head, (image, caption) in zip(heads, pictures, strict=True)
     )
