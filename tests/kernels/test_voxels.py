@@ -1,5 +1,7 @@
 """Points to volume and back: scatter by voxel, the sparse convolution, trilinear lookup."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,9 +14,8 @@ from spnr_jax.kernels.voxels import (
     locate,
     row_of,
     scatter_conv,
-    scatter_max,
     scatter_mean,
-    scatter_trilinear,
+    scattered,
     share_voxels,
     spread,
     trilinear,
@@ -26,6 +27,7 @@ FEATURES = numbers(1, 2, 3, 12, 2)
 MASK = np.random.default_rng(2).uniform(size=(2, 3, 12)) > 0.3
 VOLUME = numbers(3, D, D, D, 2)
 scatter = jax.jit(scatter_mean, static_argnums=3)
+scatter_max, scatter_trilinear = (partial(scattered, how) for how in ("max", "trilinear"))
 lookup = jax.jit(trilinear)
 
 
@@ -86,7 +88,11 @@ class TestScatterMean:
 
 @pytest.mark.parametrize(
     ("kernel", "twin"),
-    [(kernel, getattr(reference, kernel.__name__)) for kernel in (scatter_mean, scatter_max, scatter_trilinear)],
+    [
+        (scatter_mean, reference.scatter_mean),
+        (scatter_max, reference.scatter_max),
+        (scatter_trilinear, reference.scatter_trilinear),
+    ],
     ids=["mean", "max", "trilinear"],
 )
 class TestScatters:
@@ -130,7 +136,7 @@ class TestScatters:
         assert all((x == 0).all() for x in empty)
 
     def test_is_the_sum_of_what_it_spreads_as_the_stem_reads_it(self, kernel, twin):
-        name = kernel.__name__.removeprefix("scatter_")
+        name = twin.__name__.removeprefix("scatter_")
         rows, values = spread(name, *self.cloud, D)
         volume, occupancy = kernel(*self.cloud, D)
         dense = jnp.concatenate([volume, occupancy[..., None]], axis=-1)
