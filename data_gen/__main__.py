@@ -48,7 +48,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def parse(arguments: list[str]) -> Command:
-    """Return the command with all its options; the preset named by --preset gives the defaults of the others."""
+    """The command with all its options; the preset named by --preset gives the defaults of the others."""
     generate_options = Annotated[GenerateConfig, tyro.conf.subcommand("generate", default=preset_defaults(arguments))]
     check_options = Annotated[CheckConfig, tyro.conf.subcommand("check")]
     show_options = Annotated[ShowConfig, tyro.conf.subcommand("show")]
@@ -63,7 +63,7 @@ def parse(arguments: list[str]) -> Command:
 
 
 def preset_defaults(arguments: list[str]) -> GenerateConfig:
-    """Return what --preset among the arguments stands for; tyro refuses a name that there is not."""
+    """What --preset among the arguments stands for; tyro refuses a name that there is not."""
     preset = None
     for name, following in zip(arguments, [*arguments[1:], ""], strict=True):
         option, _, value = name.partition("=")
@@ -73,7 +73,7 @@ def preset_defaults(arguments: list[str]) -> GenerateConfig:
 
 
 def run(config: Command) -> int:
-    """Return the exit code of one command."""
+    """The exit code of one command."""
     if isinstance(config, GenerateConfig):
         generate(config)
         return 0
@@ -93,7 +93,7 @@ def interrupted() -> int:
 
 
 def one_line(error: Exception, config: Command) -> str:
-    """Return what an error says, on one line; an error of the disk with its place and what to do."""
+    """What an error says, on one line; an error of the disk with its place and what to do."""
     if isinstance(error, OSError) and error.strerror:
         place = error.filename or (config.out if isinstance(config, GenerateConfig) else config.dataset)
         kept = "; finished objects are kept, the same command goes on from there"

@@ -7,6 +7,7 @@ naming the field, what came and what is possible.  Marks: [paper] stands in the 
 from dataclasses import dataclass, field
 from typing import Literal
 
+from spnr_jax.errors import require
 from spnr_jax.model_config import (
     Count,
     Decay,
@@ -19,7 +20,6 @@ from spnr_jax.model_config import (
     Weight,
     Whole,
     check,
-    require,
     surface_grid,
 )
 
@@ -51,7 +51,7 @@ class LossConfig:
     opacity_weight: Weight = 0.0
     """Mean squared error of the opacity against the reference's, beside the loss of the picture."""
     mse_weight: Weight = 0.0
-    """Mean squared error of the picture beside the weighted one: what L1 leaves undecided at an outline is averaged."""
+    """Mean squared error of the picture, in addition; where L1 is flat, as at outlines, it prefers the mean."""
     condition: bool = True
     """Whether the discriminator sees the true colours at visible input points [paper]; else an empty image and mask."""
 
@@ -116,12 +116,12 @@ class TrainConfig:
     seed: int = 0
     """Seed of weights, batches and jitter."""
     pixel_stride: Count = 1
-    """Every so many-th row and column of a view is rendered in training, from a random first one on."""
+    """Train on every n-th row and column of a view, at a random offset."""
     crop: Whole = 0
     """Pixels along each side of the square of a view that is rendered in training, at a random place; 0: all of it."""
     even_share: Share = 0.0
-    """Share of the clouds that are evenly spread, not random points: an object's first ones in a data set of `--spread
-    even`, or farthest points where the network sees G-buffers."""
+    """Share of the clouds that are spread evenly (farthest-point sampling), not at random: an object's first points in
+    a data set of `--spread even`, farthest points of it where the network sees G-buffers."""
 
     def __post_init__(self) -> None:
         check(self)

@@ -12,6 +12,12 @@ class UserError(ValueError):
     """What was asked for cannot be done; the message says what was expected, what came, and what to do."""
 
 
+def require(condition: bool, message: str) -> None:
+    """UserError with the message, unless the condition holds."""
+    if not condition:
+        raise UserError(message)
+
+
 def split_debug(arguments: list[str]) -> tuple[list[str], bool]:
     """The arguments without `--debug`, and whether call stacks are shown: for it, or for SPNR_DEBUG=1."""
     others = [argument for argument in arguments if argument != "--debug"]

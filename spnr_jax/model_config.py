@@ -14,13 +14,12 @@ from dataclasses import dataclass, field
 from functools import cache
 from typing import Annotated, Any, ClassVar, Literal, get_args, get_origin, get_type_hints
 
-from spnr_jax.errors import UserError
+from spnr_jax.errors import UserError, require
 
 Material = Literal["base_color", "roughness", "metallic"]
 MATERIAL_CHANNELS = {"base_color": 3, "roughness": 1, "metallic": 1}
 CELLS = 1.0  # of the grid of nearest points along an axis, per square root of the number of points; 0.75 lost 0.1 dB
 MOST_CELLS = 96
-NUM_TOLD = 13  # numbers of a ray for the refiner (`nn/surface_field.told`)
 MOST_LAYERS = 32  # of a network: a damaged file must not cost minutes of tracing
 LARGEST = 2**63  # of any number in a config
 
@@ -44,12 +43,6 @@ Widths = Annotated[tuple[Count, ...], Limit(f"at most {MOST_LAYERS} layers", lam
 Materials = Annotated[
     tuple[Material, ...], Limit(f"distinct names out of {tuple(MATERIAL_CHANNELS)}", lambda x: len(set(x)) == len(x))
 ]
-
-
-def require(condition: bool, message: str) -> None:
-    """ValueError with the message, unless the condition holds."""
-    if not condition:
-        raise UserError(message)
 
 
 def check(record: Any) -> None:
@@ -141,7 +134,7 @@ class EncoderConfig:
     point_features: Count = 32
     """Features of a point after the PointNet."""
     point_norm: Literal["batch", "layer"] = "batch"
-    """Normalisation in the PointNet: over points [paper] or over the features of one."""
+    """Normalisation in the PointNet: batch norm over the points [paper], or layer norm of each point."""
     scatter: Literal["mean", "max", "trilinear"] = "mean"
     """How the features of points meet in a voxel (`voxels.spread`)."""
     volume_resolution: Whole = 64
@@ -179,6 +172,9 @@ class NetworkConfig:
     image_resolution: Count = 128
     """Pixels along each side of the pictures of the training."""
 
+    def __post_init__(self) -> None:
+        check(self)
+
     @property
     def upsamples(self) -> bool:
         """Whether what is rendered along rays is smaller than the image."""
@@ -191,8 +187,8 @@ class NetworkConfig:
 
     @property
     def any_size(self) -> bool:
-        """Whether pictures of any size can be rendered."""
-        return True
+        """Whether pictures of any size can be rendered: an upsampler has learnt one."""
+        return not self.upsamples
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -232,7 +228,7 @@ class PaperConfig(RayNetworkConfig):
     """Channels of the upsampler before its x2; half of it after."""
 
     def __post_init__(self) -> None:
-        check(self)
+        super().__post_init__()
         require(
             self.image_resolution in (self.render_resolution, 2 * self.resize_resolution),
             f"image_resolution {self.image_resolution} must be render_resolution ({self.render_resolution}: no "
@@ -249,11 +245,6 @@ class PaperConfig(RayNetworkConfig):
         """The upsampler mixes pixels."""
         return not self.upsamples
 
-    @property
-    def any_size(self) -> bool:
-        """The upsampler has learnt one size."""
-        return not self.upsamples
-
 
 @dataclass(frozen=True, kw_only=True)
 class NearPointsConfig(RayNetworkConfig):
@@ -266,14 +257,14 @@ class NearPointsConfig(RayNetworkConfig):
     num_neighbors: Count = 6
     """Nearest points whose planes and materials a sample sees (`kernels/surface.py`)."""
     surface_cells: Whole = 0
-    """Cells along each axis of the grid of nearest points, at least; the presets' is that of the training's clouds."""
+    """Lowest resolution of the grid of nearest points; presets set it so that small clouds get the grid of training."""
     color: Literal["free", "lit"] = "lit"
     """Radiance: free RGB, or predicted light on the materials of the nearest points (`nn/surface_field.py`)."""
     refiner_width: Whole = 0
-    """Channels of the CNN that looks over the rendered picture (`nn/refiner.py`); 0: none."""
+    """Channels of the 2D CNN that refines the rendered picture (`nn/refiner.py`); 0: none."""
 
     def __post_init__(self) -> None:
-        check(self)
+        super().__post_init__()
         require(self.sampling.reach == 1, f"reach {self.sampling.reach}: nothing is known far from points; use reach 1")
 
     @property
@@ -305,6 +296,3 @@ class SurfelConfig(NetworkConfig):
     """Features of the blocks that double the resolution."""
     solid: bool = False
     """Whether the network of rays `SOLID` tells where an object of few points is solid (`method/solid.py`)."""
-
-    def __post_init__(self) -> None:
-        check(self)

@@ -33,23 +33,23 @@ class ColourRotation:
     fallback: bool
 
     def describe(self) -> dict:
-        """Return the rotation as it stands in object.json."""
+        """The rotation as it stands in object.json."""
         return {**vars(self), "matrix": self.matrix.tolist()}
 
 
 def rotate_colours(asset: Asset, seed: int) -> tuple[Asset, ColourRotation]:
-    """Return the asset with its base colours rotated, and the rotation, a function of the colours and the seed."""
+    """The asset with its base colours rotated, and the rotation, a function of the colours and the seed."""
     rotation = draw_rotation(base_colours(asset), seed)
     return replace(asset, parts=tuple(rotated_part(part, rotation.matrix) for part in asset.parts)), rotation
 
 
 def base_colours(asset: Asset) -> np.ndarray:
-    """Return every base colour (n, 3) of the asset: flat ones, at vertices, and all texels."""
+    """Every base colour (n, 3) of the asset: flat ones, at vertices, and all texels."""
     return np.concatenate([part_colours(part).reshape(-1, 3) for part in asset.parts])
 
 
 def part_colours(part: Part) -> np.ndarray:
-    """Return the base colours (3,), (v, 3) or (height, width, 3) of a part, vertex colours times the material's."""
+    """The base colours (3,), (v, 3) or (height, width, 3) of a part, vertex colours times the material's."""
     if part.colors is None:
         return part.material.base_color
     assert part.material.base_color.ndim == 1, "a textured part has no vertex colours: its texture is tinted instead"
@@ -57,7 +57,7 @@ def part_colours(part: Part) -> np.ndarray:
 
 
 def draw_rotation(colours: np.ndarray, seed: int) -> ColourRotation:
-    """Return a random rotation about the grey axis that keeps the colours (n, 3) in the gamut."""
+    """A random rotation about the grey axis that keeps the colours (n, 3) in the gamut."""
     rng = np.random.default_rng(seed)
     extreme = extreme_colours(colours)  # nearly every draw that fails, fails for one of these few
     for draw in range(1, MAX_DRAWS + 1):
@@ -70,7 +70,7 @@ def draw_rotation(colours: np.ndarray, seed: int) -> ColourRotation:
 
 
 def grey_rotation(degrees: float) -> np.ndarray:
-    """Return the rotation (3, 3) by an angle about the grey axis; 120 degrees take red to green (Rodrigues)."""
+    """The rotation (3, 3) by an angle about the grey axis; 120 degrees take red to green (Rodrigues)."""
     angle = np.radians(degrees)
     along = np.full((3, 3), 1 / 3)
     across = np.array([[0, -1, 1], [1, 0, -1], [-1, 1, 0]]) / np.sqrt(3)
@@ -78,7 +78,7 @@ def grey_rotation(degrees: float) -> np.ndarray:
 
 
 def extreme_colours(colours: np.ndarray, turns: int = 24) -> np.ndarray:
-    """Return the colours (m, 3) that some rotation of a coarse grid takes furthest up or down in a channel."""
+    """The colours (m, 3) that some rotation of a coarse grid takes furthest up or down in a channel."""
     rows = np.stack([grey_rotation(degrees)[0] for degrees in np.linspace(0, 360, turns, endpoint=False)])
     first = [
         np.array([values.argmin(), values.argmax()]) for values in (colours @ row.astype(colours.dtype) for row in rows)
@@ -87,13 +87,13 @@ def extreme_colours(colours: np.ndarray, turns: int = 24) -> np.ndarray:
 
 
 def in_gamut(colours: np.ndarray, matrix: np.ndarray) -> bool:
-    """Return whether the rotated colours all lie in [0, 1]^3, but for rounding."""
+    """Whether the rotated colours all lie in [0, 1]^3, but for rounding."""
     rotated = colours @ matrix.T.astype(colours.dtype)
     return bool(rotated.min() >= -ROUNDING and rotated.max() <= 1 + ROUNDING)
 
 
 def rotated_part(part: Part, matrix: np.ndarray) -> Part:
-    """Return the part with its base colours rotated; vertex colours take up the colour that they multiplied."""
+    """The part with its base colours rotated; vertex colours take up the colour that they multiplied."""
     rotated = np.clip(part_colours(part) @ matrix.T, 0, 1)
     if part.colors is None:
         return replace(part, material=replace(part.material, base_color=rotated.astype(np.float32)))

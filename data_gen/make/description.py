@@ -15,7 +15,7 @@ PLACES = ("out", "workers", "cluster", "root", "meshes", "objects", "envmap", "l
 
 
 def describe(plan: Plan, variant: str) -> dict:
-    """Return the content of dataset.json: all that decides the bytes, nothing of where or how fast."""
+    """The content of dataset.json: all that decides the bytes, nothing of where or how fast."""
     config = plan.config
     settings = {name: value for name, value in asdict(config).items() if name not in PLACES}
     for name, first in (("reshape_variants", False), ("spread", "random")):
@@ -40,7 +40,7 @@ def describe(plan: Plan, variant: str) -> dict:
 
 
 def describe_light(config: GenerateConfig) -> dict:
-    """Return what lights the pictures: names and checksums of maps, never where they lie."""
+    """What lights the pictures: names and checksums of maps, never where they lie."""
     white = {"white_sphere_radiance": light.WHITE_SPHERE_RADIANCE}
     if config.lights:
         return {"kinds": [describe_kind(name) for name in config.lights], **white}
@@ -50,19 +50,19 @@ def describe_light(config: GenerateConfig) -> dict:
 
 
 def describe_kind(name: str) -> dict:
-    """Return one kind of `--lights`."""
+    """One kind of `--lights`."""
     if name in ("room", "random"):
         return {"name": name}
     return {"name": "maps", "sha256": {file.name: checksum_of(file) for file in light.map_files(name)}}
 
 
 def text_checksum(lines: Sequence[str]) -> str:
-    """Return the SHA-256 of lines of text."""
+    """The SHA-256 of lines of text."""
     return hashlib.sha256("\n".join(lines).encode()).hexdigest()
 
 
 def differences(before: dict, after: dict) -> list[str]:
-    """Return the names of the entries that differ, one level into nested settings, each with both values if short."""
+    """The names of the entries that differ, one level into nested settings, each with both values if short."""
     flat = [
         {**{k: v for k, v in side.items() if k != "settings"}, **side.get("settings", {})} for side in (before, after)
     ]

@@ -63,7 +63,7 @@ def make_missing(config: GenerateConfig, tasks: Sequence[Task], settings: dict) 
 
 
 def make_lights(config: GenerateConfig, variant: str) -> light.Lights:
-    """Return the light of the data set: one scaled map for all views, or kinds that each view draws from."""
+    """The light of the data set: one scaled map for all views, or kinds that each view draws from."""
     mitsuba_module(variant)
     if config.lights:
         return light.Lights(kinds=light.read_kinds(config.lights))
@@ -71,7 +71,7 @@ def make_lights(config: GenerateConfig, variant: str) -> light.Lights:
 
 
 def refuse_other_content(out: Location, settings: dict) -> None:
-    """Raise ValueError if the place holds another data set, or anything else."""
+    """ValueError if the place holds another data set, or anything else."""
     described = storage.read_file(f"{out}/dataset.json")
     if described is not None:
         try:

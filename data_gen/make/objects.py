@@ -66,7 +66,7 @@ def prepare_renderer(variant: str) -> None:
 
 
 def make_record(bench: Workbench, task: Task) -> layout.ObjectRecord:
-    """Return one object, rendered: asset, points, views, condition images."""
+    """One object, rendered: asset, points, views, condition images."""
     seeds = object_seeds(bench.seed, task.object_id)
     asset, details = make_asset(task, bench.seed)
     surface = surface_points.sample_surface(asset, bench.num_points, seeds["points"], bench.spread)
@@ -86,7 +86,7 @@ def make_record(bench: Workbench, task: Task) -> layout.ObjectRecord:
 
 
 def make_asset(task: Task, seed: int) -> tuple[Asset, dict]:
-    """Return the object as it is rendered and sampled, and what was done to it as it stands in object.json."""
+    """The object as it is rendered and sampled, and what was done to it as it stands in object.json."""
     asset, seeds = load_asset(task, seed), object_seeds(seed, task.object_id)
     details: dict = {"colour_rotation": None}
     if task.colour_variant:
@@ -101,7 +101,7 @@ def make_asset(task: Task, seed: int) -> tuple[Asset, dict]:
 
 
 def load_asset(task: Task, seed: int) -> Asset:
-    """Return the object as its source has it; a colour variant has the shape of its product."""
+    """The object as its source has it; a colour variant has the shape of its product."""
     if task.path is None:
         return procedural.make(task.category, object_seeds(seed, task.product)["shape"])
     asset = meshes.load_mesh(task.path, task.folder)
@@ -109,14 +109,14 @@ def load_asset(task: Task, seed: int) -> Asset:
 
 
 def object_seeds(seed: int, object_id: str) -> dict[str, int]:
-    """Return an independent 32-bit seed for each purpose, a function of (seed, object id) alone."""
+    """An independent 32-bit seed for each purpose, a function of (seed, object id) alone."""
     digest = hashlib.sha256(f"{seed}/{object_id}".encode()).digest()
     purposes = ("shape", "points", "viewpoints", "noise", "colours", "pose")
     return {name: int.from_bytes(digest[4 * i : 4 * i + 4], "little") for i, name in enumerate(purposes)}
 
 
 def object_details(task: Task, asset: Asset, seeds: dict[str, int]) -> dict:
-    """Return the content of object.json (the checksums of the files are added when they are written)."""
+    """The content of object.json (the checksums of the files are added when they are written)."""
     return {
         "id": task.object_id,
         "product": task.product,
@@ -130,7 +130,7 @@ def object_details(task: Task, asset: Asset, seeds: dict[str, int]) -> dict:
 
 
 def describe_material(material: Material) -> dict:
-    """Return a material's channels as numbers, or as the size of their texture."""
+    """A material's channels as numbers, or as the size of their texture."""
     described: dict = {"wrap": material.wrap}
     for name, value_rank in (("base_color", 1), ("roughness", 0), ("metallic", 0)):
         channel = np.asarray(getattr(material, name))

@@ -21,7 +21,7 @@ MOVED = 1e-4  # of the object's half diagonal; the same mesh gives the same poin
 def original(
     details: dict, seed: int, stored: np.ndarray, root: Path | None = None, spread: Spread = "random"
 ) -> Asset:
-    """Return the normalised object of an object.json and the seed of its data set, checked against its points (n, 3).
+    """The normalised object of an object.json and the seed of its data set, checked against its points (n, 3).
 
     ValueError, with what to do, where it cannot be had.
     """
@@ -43,7 +43,7 @@ def original(
 
 
 def task_of(details: dict, root: Path | None) -> Task:
-    """Return what made the object: a category, or a mesh file under the root."""
+    """What made the object: a category, or a mesh file under the root."""
     name, source = details["id"], details["source"]
     variant = details.get("variant", 0)  # data sets from before there were colour variants do not say
     made = {

@@ -25,18 +25,18 @@ class Reshaping:
     roughness_exponent: float
 
     def matrix(self) -> np.ndarray:
-        """Return the linear map (3, 3) of positions."""
+        """The linear map (3, 3) of positions."""
         angle = np.radians(self.degrees)
         cos, sin = np.cos(angle), np.sin(angle)
         return np.array([[cos, 0, sin], [0, 1, 0], [-sin, 0, cos]]) @ np.diag(self.stretch)
 
     def describe(self) -> dict:
-        """Return the reshaping as it stands in object.json."""
+        """The reshaping as it stands in object.json."""
         return {**vars(self), "stretch": self.stretch.tolist()}
 
 
 def draw_reshaping(seed: int) -> Reshaping:
-    """Return a random reshaping, a function of the seed."""
+    """A random reshaping, a function of the seed."""
     rng = np.random.default_rng(seed)
     stretch = MOST_STRETCH ** rng.uniform(-1, 1, 3)
     stretch[0] *= rng.choice([-1, 1])
@@ -46,12 +46,12 @@ def draw_reshaping(seed: int) -> Reshaping:
 
 
 def reshape(asset: Asset, reshaping: Reshaping) -> Asset:
-    """Return the asset in its new shape; a mirror image's faces are turned round, so that they still face outwards."""
+    """The asset in its new shape; a mirror image's faces are turned round, so that they still face outwards."""
     return replace(asset, parts=tuple(reshaped_part(part, reshaping) for part in asset.parts))
 
 
 def reshaped_part(part: Part, reshaping: Reshaping) -> Part:
-    """Return a part with its positions, normals, faces and roughness changed."""
+    """A part with its positions, normals, faces and roughness changed."""
     matrix = reshaping.matrix()
     normals = part.normals
     if normals is not None:

@@ -22,7 +22,7 @@ PAPER_COUNTS: dict[Preset, tuple[int, int]] = {
 
 
 def abo(out: Path) -> GenerateConfig:
-    """Return Amazon Berkeley Objects at 128 x 128: `spnr-data generate OUT --preset abo --root DIR`.
+    """Amazon Berkeley Objects at 128 x 128: `spnr-data generate OUT --preset abo --root DIR`.
 
     Of 7,953 products 200 test and the others train, with as many colour variants of theirs, drawn by the seed from
     five each, as make 16,161. (All five of each would be 46,518; how the paper came to 16,161 it does not say.)
@@ -43,7 +43,7 @@ def abo(out: Path) -> GenerateConfig:
 
 
 def shapenet(out: Path, preset: Preset, category: Category) -> GenerateConfig:
-    """Return a class of ShapeNet at 200 x 200, without colour variants."""
+    """A class of ShapeNet at 200 x 200, without colour variants."""
     return GenerateConfig(
         out=out,
         preset=preset,
@@ -58,17 +58,17 @@ def shapenet(out: Path, preset: Preset, category: Category) -> GenerateConfig:
 
 
 def shapenet_car(out: Path) -> GenerateConfig:
-    """Return the cars of ShapeNetCore: `spnr-data generate OUT --preset shapenet_car --root DIR`."""
+    """The cars of ShapeNetCore: `spnr-data generate OUT --preset shapenet_car --root DIR`."""
     return shapenet(out, "shapenet_car", "car")
 
 
 def shapenet_plane(out: Path) -> GenerateConfig:
-    """Return the planes of ShapeNetCore: `spnr-data generate OUT --preset shapenet_plane --root DIR`."""
+    """The planes of ShapeNetCore: `spnr-data generate OUT --preset shapenet_plane --root DIR`."""
     return shapenet(out, "shapenet_plane", "plane")
 
 
 def shapenet_chair(out: Path) -> GenerateConfig:
-    """Return the chairs of ShapeNetCore: `spnr-data generate OUT --preset shapenet_chair --root DIR`."""
+    """The chairs of ShapeNetCore: `spnr-data generate OUT --preset shapenet_chair --root DIR`."""
     return shapenet(out, "shapenet_chair", "chair")
 
 

@@ -20,12 +20,12 @@ Listed = Mapping[str, Sequence[str]]  # ids of the splits that the user names
 
 
 def ranked(ids: Sequence[str], seed: int, purpose: str) -> list[str]:
-    """Return the ids in an order that depends on nothing but (purpose, seed, id)."""
+    """The ids in an order that depends on nothing but (purpose, seed, id)."""
     return sorted(ids, key=lambda name: hashlib.sha256(f"{purpose}/{seed}/{name}".encode()).digest())
 
 
 def split_products(ids: Sequence[str], listed: Listed, seed: int, num_test: int, num_val: int) -> dict[str, list[str]]:
-    """Return the sorted ids of each split, as the header of this file says."""
+    """The sorted ids of each split, as the header of this file says."""
     usable = set(ids)
     if "train" in listed:
         return {split: sorted(usable & set(listed.get(split, ()))) for split in SPLITS}
@@ -37,7 +37,7 @@ def split_products(ids: Sequence[str], listed: Listed, seed: int, num_test: int,
 
 
 def chosen_variants(products: Sequence[str], each: int, most: int | None, seed: int) -> list[tuple[str, int]]:
-    """Return (training product, number from 1) of the colour variants, sorted: `each` a product, `most` in all.
+    """(training product, number from 1) of the colour variants, sorted: `each` a product, `most` in all.
 
     Where there are more than `most`, they are drawn by a hash of (seed, product, number).
     """
@@ -46,7 +46,7 @@ def chosen_variants(products: Sequence[str], each: int, most: int | None, seed: 
 
 
 def read_test_list(path: Path, known: set[str]) -> Listed:
-    """Return the test split of a text file with one id per line; ValueError if it names an object that is not there."""
+    """The test split of a text file with one id per line; ValueError if it names an object that is not there."""
     try:
         ids = sorted(set(path.read_text().split()))
     except (OSError, UnicodeDecodeError) as error:
@@ -56,7 +56,7 @@ def read_test_list(path: Path, known: set[str]) -> Listed:
 
 
 def read_split_file(path: Path, known: set[str], synset: str | None) -> Listed:
-    """Return the splits of a JSON file {"train": [ids], "val": [ids], "test": [ids]} or of a CSV file.
+    """The splits of a JSON file {"train": [ids], "val": [ids], "test": [ids]} or of a CSV file.
 
     The CSV has columns id,split, or those of ShapeNet's all.csv, id,synsetId,subSynsetId,modelId,split, of which the
     rows of one synset count. ValueError if the file is neither, names an object twice or one that is not there.
@@ -80,7 +80,7 @@ def read_split_file(path: Path, known: set[str], synset: str | None) -> Listed:
 
 
 def splits_of_csv(text: str, synset: str | None) -> dict[str, list[str]]:
-    """Return the ids of each split of a CSV file's text."""
+    """The ids of each split of a CSV file's text."""
     listed: dict[str, list[str]] = {}
     for number, row in enumerate(csv.DictReader(text.splitlines()), start=2):
         name, split = row.get("modelId") or row.get("id"), row.get("split")
@@ -92,6 +92,6 @@ def splits_of_csv(text: str, synset: str | None) -> dict[str, list[str]]:
 
 
 def refuse_unknown(name: str, ids: Sequence[str], known: set[str]) -> None:
-    """Raise ValueError if an id is none of the known ones."""
+    """ValueError if an id is none of the known ones."""
     if unknown := [object_id for object_id in ids if object_id not in known]:
         raise UserError(f"{name}: no object {unknown[0]} ({len(unknown)} of {len(ids)} ids unknown)")

@@ -54,7 +54,7 @@ class GenerateConfig:
     colour_variants: int = 0
     """Variants of each training object with its base colours rotated in RGB space; test objects have none."""
     reshape_variants: bool = False
-    """Turn, mirror and stretch the variants too, and bend their roughness: a few meshes go further."""
+    """Also rotate, mirror and scale the variants, and change their roughness: more data from a few meshes."""
     train_objects: int | None = None
     """Training objects, variants included: variants are drawn until there are as many (default: all variants)."""
     test_objects: int | None = None
@@ -71,7 +71,7 @@ class GenerateConfig:
     points: int = 4096
     """Surface points per object."""
     spread: Spread = "random"
-    """How they lie: drawn by area, or each the farthest from those before it, as spnr render thins bigger clouds."""
+    """How they lie: drawn by area, or by farthest-point sampling, as spnr render thins bigger clouds."""
     spp: int = 64
     """Samples per pixel; Mitsuba rounds it up to a product of two near-equal numbers."""
     max_depth: int = 6
@@ -93,7 +93,7 @@ class GenerateConfig:
     workers: int | None = None
     """Local processes that render (default: one per CPU core)."""
     cluster: str | None = None
-    """Address of a Dask scheduler whose workers render instead. They see the mesh files and OUT under these names."""
+    """Address of a Dask scheduler whose workers render; they must see the mesh files and OUT under the same paths."""
     val_fraction: float = 0.05
     """Share of the objects that goes to the validation split."""
     test_fraction: float = 0.1
@@ -122,7 +122,7 @@ class Task:
 
     @property
     def product(self) -> str:
-        """Return the id of the object whose shape this one has: its own, or that of the variant's original."""
+        """The id of the object whose shape this one has: its own, or that of the variant's original."""
         return self.variant_of or self.object_id
 
 
@@ -137,11 +137,11 @@ class Plan:
     num_val: int
 
     def split(self, usable: Sequence[str]) -> dict[str, list[str]]:
-        """Return the sorted ids of each split of the products that can be rendered."""
+        """The sorted ids of each split of the products that can be rendered."""
         return splits.split_products(usable, self.listed, self.config.seed, self.num_test, self.num_val)
 
     def variants(self, train_ids: Sequence[str]) -> list[Task]:
-        """Return the colour variants of the training products, sorted by id."""
+        """The colour variants of the training products, sorted by id."""
         products = {task.object_id: task for task in self.tasks}
         total = self.config.train_objects
         most = None if total is None else max(total - len(train_ids), 0)
@@ -159,7 +159,7 @@ class Plan:
 
 
 def check_options(config: GenerateConfig) -> None:
-    """Raise ValueError, naming the option, for a value that no data set can be made with."""
+    """ValueError, naming the option, for a value that no data set can be made with."""
     for name in ("resolution", "views", "points", "spp", "visibility_grid", "max_depth"):
         least = 2 if name == "max_depth" else 1
         if getattr(config, name) < least:
@@ -187,7 +187,7 @@ def check_options(config: GenerateConfig) -> None:
 
 
 def check_source(config: GenerateConfig) -> None:
-    """Raise ValueError, naming the option, for options that do not say which objects are meant."""
+    """ValueError, naming the option, for options that do not say which objects are meant."""
     source = source_of(config)
     if config.meshes and (config.root or source != "meshes"):
         raise UserError(f"--meshes {config.meshes}: not together with --root or --source {source}; give one of them")
@@ -204,17 +204,17 @@ def check_source(config: GenerateConfig) -> None:
 
 
 def source_of(config: GenerateConfig) -> Source:
-    """Return where the objects come from."""
+    """Where the objects come from."""
     return config.source or ("meshes" if config.meshes else "procedural")
 
 
 def mesh_root(config: GenerateConfig) -> Path | None:
-    """Return the folder of the objects that are not procedural."""
+    """The folder of the objects that are not procedural."""
     return config.meshes or config.root
 
 
 def plan_objects(config: GenerateConfig) -> list[Task]:
-    """Return every product of the data set, sorted by id. A procedural object's id does not depend on --categories."""
+    """Every product of the data set, sorted by id. A procedural object's id does not depend on --categories."""
     num_objects = config.objects if config.objects is not None else 0 if mesh_root(config) else DEFAULT_OBJECTS
     wanted = set(config.categories or procedural.CATEGORIES)
     numbered = ((index, procedural.category_of(index)) for index in count())
@@ -234,7 +234,7 @@ def plan_objects(config: GenerateConfig) -> list[Task]:
 
 
 def mesh_tasks(config: GenerateConfig, root: Path) -> list[Task]:
-    """Return the objects of the source that are files, in any order."""
+    """The objects of the source that are files, in any order."""
     if source_of(config) == "meshes":
         found = meshes.find_meshes(root)
         return [Task(object_id=name, path=path, shown_path=shown(path, root)) for name, path in found]
@@ -253,12 +253,12 @@ def mesh_tasks(config: GenerateConfig, root: Path) -> list[Task]:
 
 
 def shown(path: Path, root: Path) -> str:
-    """Return a file's path as it is reported: from the source's root, for where that lies is nobody's business."""
+    """A file's path as it is reported: from the source's root, for where that lies is nobody's business."""
     return path.relative_to(root).as_posix()
 
 
 def plan_data_set(config: GenerateConfig) -> Plan:
-    """Return the products to render and the sizes of the splits; ValueError if the options do not fit the objects."""
+    """The products to render and the sizes of the splits; ValueError if the options do not fit the objects."""
     tasks = plan_objects(config)
     listed = read_listed(config, {task.object_id for task in tasks})
     named = {name for ids in listed.values() for name in ids}
@@ -282,7 +282,7 @@ def plan_data_set(config: GenerateConfig) -> Plan:
 
 
 def read_listed(config: GenerateConfig, known: set[str]) -> splits.Listed:
-    """Return the ids of the splits that the user's file names, none without a file."""
+    """The ids of the splits that the user's file names, none without a file."""
     if config.test_list:
         return splits.read_test_list(config.test_list, known)
     if not config.split_file:

@@ -151,7 +151,23 @@ def clock(rng) -> list[Piece]:
             [(0, radius, depth * 0.4), (0, radius * rng.uniform(1.4, 2.0), depth * 0.4)], [radius * 0.07, 0.004]
         )
         pieces.append((case, merge(turn(spike, "z", 360 / count * i) for i in range(count))))
-    face = depth * 0.6
+    pieces.append((dark, hands_and_marks(rng, radius, depth * 0.6)))
+    if rng.random() < 0.35 and style != "rays":
+        feet = [
+            tube(
+                [(s * radius * 0.7, -radius * 1.25, depth * 0.5), (s * radius * 0.5, -radius * 0.75, depth * 0.5)],
+                radius * 0.07,
+            )
+            for s in (1, -1)
+        ]
+        pieces.append((case, merge(feet)))
+        if style == "round":
+            pieces.append((dark, bells(radius, depth)))
+    return pieces
+
+
+def hands_and_marks(rng, radius: float, face: float) -> Mesh:
+    """Twelve marks, two hands at any time, and their pin, on a dial whose face lies at z."""
     mark = move(box((radius * 0.04, radius * 0.14, 0.006)), y=radius * 0.82, z=face)
     marks = [turn(mark, "z", 30 * i) for i in range(12)]
     hands = [
@@ -163,28 +179,14 @@ def clock(rng) -> list[Piece]:
         for w, long in ((0.06, 0.55), (0.04, 0.8))
     ]
     pin = move(turn(cylinder(radius * 0.05, 0.02, 12), "x", 90), z=face - 0.005)
-    pieces.append((dark, merge([*marks, *hands, pin])))
-    if rng.random() < 0.35 and style != "rays":
-        feet = [
-            tube(
-                [(s * radius * 0.7, -radius * 1.25, depth * 0.5), (s * radius * 0.5, -radius * 0.75, depth * 0.5)],
-                radius * 0.07,
-            )
-            for s in (1, -1)
-        ]
-        pieces.append((case, merge(feet)))
-        if style == "round":
-            bell = [
-                move(
-                    turn(superellipsoid((radius * 0.6, radius * 0.4, depth), 1, 1, 8, 16), "z", -s * 35),
-                    s * radius * 0.62,
-                    radius * 0.95,
-                    depth * 0.5,
-                )
-                for s in (1, -1)
-            ]
-            pieces.append((dark, merge(bell)))
-    return pieces
+    return merge([*marks, *hands, pin])
+
+
+def bells(radius: float, depth: float) -> Mesh:
+    """Two bells, left and right on top of an alarm clock."""
+    bell = superellipsoid((radius * 0.6, radius * 0.4, depth), 1, 1, 8, 16)
+    placed = [move(turn(bell, "z", -s * 35), s * radius * 0.62, radius * 0.95, depth * 0.5) for s in (1, -1)]
+    return merge(placed)
 
 
 def screen(rng) -> list[Piece]:

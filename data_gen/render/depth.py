@@ -18,7 +18,7 @@ Caster = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
 def caster(asset: Asset) -> Caster:
-    """Return a function of origins and unit directions (rays, 3): distances (rays,) float32, inf where a ray misses."""
+    """A function of origins and unit directions (rays, 3): distances (rays,) float32, inf where a ray misses."""
     mi, scene = mitsuba_module(), build_scene(asset, NO_LIGHT).handle
 
     def cast(origins: np.ndarray, directions: np.ndarray) -> np.ndarray:

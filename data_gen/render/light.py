@@ -33,7 +33,7 @@ class Lights:
     kinds: tuple[tuple[np.ndarray, ...], ...] = ()
 
     def of_views(self, count: int, seed: int) -> Iterator[np.ndarray]:
-        """Return the map of each of so many views, or the shared one once."""
+        """The map of each of so many views, or the shared one once."""
         if self.shared is not None:
             yield self.shared
             return
@@ -45,7 +45,7 @@ class Lights:
 
 
 def read_kinds(names: Sequence[str]) -> tuple[tuple[np.ndarray, ...], ...]:
-    """Return the kinds of light of --lights: `room`, `random`, or a folder's maps; ValueError if it has none."""
+    """The kinds of light of --lights: `room`, `random`, or a folder's maps; ValueError if it has none."""
     kinds: list[tuple[np.ndarray, ...]] = []
     for name in names:
         if name == "random":
@@ -59,7 +59,7 @@ def read_kinds(names: Sequence[str]) -> tuple[tuple[np.ndarray, ...], ...]:
 
 
 def map_files(folder: str) -> list[Path]:
-    """Return the environment maps in a folder, by name; ValueError if there are none."""
+    """The environment maps in a folder, by name; ValueError if there are none."""
     files = sorted(path for path in Path(folder).glob("*") if path.suffix.lower() in ENDINGS)
     if not files:
         raise UserError(f"--lights {folder}: expected room, random, or a folder with .hdr or .exr maps; found no map")
@@ -67,12 +67,12 @@ def map_files(folder: str) -> list[Path]:
 
 
 def scaled_to_white(envmap: np.ndarray, target: float = WHITE_SPHERE_RADIANCE) -> np.ndarray:
-    """Return the map times the factor that makes a white diffuse sphere average `target`, measured by rendering it."""
+    """The map times the factor that makes a white diffuse sphere average `target`, measured by rendering it."""
     return (envmap * (target / white_sphere_radiance(envmap))).astype(np.float32)
 
 
 def white_sphere_radiance(envmap: np.ndarray, num_views: int = 32, spp: int = 64, seed: int = 0) -> float:
-    """Return the mean linear radiance of a white diffuse sphere over views that surround it evenly."""
+    """The mean linear radiance of a white diffuse sphere over views that surround it evenly."""
     mi = mitsuba_module()
     scene = mi.load_dict(
         {

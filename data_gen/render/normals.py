@@ -16,20 +16,20 @@ SMALLEST_EDGE = 1e-6  # added to every edge: a sparse matrix takes 0 for no edge
 
 
 def oriented_normals(positions: np.ndarray, neighbours: int = NEIGHBOURS) -> np.ndarray:
-    """Return unit normals (points, 3) of positions (points, 3) that point outwards, float64."""
+    """Unit normals (points, 3) of positions (points, 3) that point outwards, float64."""
     positions = np.asarray(positions, np.float64)
     around = nearest_points(positions, neighbours)
     return orient(positions, plane_normals(positions, around), around)
 
 
 def nearest_points(positions: np.ndarray, neighbours: int) -> np.ndarray:
-    """Return the numbers (points, k) of each point's nearest points, itself among them; k <= neighbours, points."""
+    """The numbers (points, k) of each point's nearest points, itself among them; k <= neighbours, points."""
     count = min(neighbours, len(positions))
     return cKDTree(positions).query(positions, count)[1].reshape(len(positions), count)
 
 
 def plane_normals(positions: np.ndarray, around: np.ndarray) -> np.ndarray:
-    """Return the unit normals (points, 3) of the planes through the points' neighbours, of either sign.
+    """The unit normals (points, 3) of the planes through the points' neighbours, of either sign.
 
     The normal is the direction in which the neighbours spread least.
     """
@@ -38,7 +38,7 @@ def plane_normals(positions: np.ndarray, around: np.ndarray) -> np.ndarray:
 
 
 def orient(positions: np.ndarray, normals: np.ndarray, around: np.ndarray) -> np.ndarray:
-    """Return the normals, turned so that neighbours agree and each connected part faces outwards."""
+    """The normals, turned so that neighbours agree and each connected part faces outwards."""
     rows, columns = np.repeat(np.arange(len(around)), around.shape[1]), around.ravel()
     bend = 1 - np.abs(np.einsum("ni,ni->n", normals[rows], normals[columns])) + SMALLEST_EDGE
     edges = rows != columns

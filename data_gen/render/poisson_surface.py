@@ -48,7 +48,7 @@ class PoissonConfig:
 
 
 def reconstruct(cloud: PointCloud, config: PoissonConfig) -> Asset:
-    """Return the surface of one cloud (points, ...), smooth, with the materials of the nearest point at each vertex.
+    """The surface of one cloud (points, ...), smooth, with the materials of the nearest point at each vertex.
 
     NoSurface where there is none: too few points, or points on one line.
     """
@@ -86,7 +86,7 @@ def check_extent(positions: np.ndarray) -> None:
 def screened_poisson(
     positions: np.ndarray, normals: np.ndarray, depth: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return vertices (v, 3), faces (f, 3) and the density of points around each vertex (v,)."""
+    """Vertices (v, 3), faces (f, 3) and the density of points around each vertex (v,)."""
     solver = pymeshlab().MeshSet()
     solver.add_mesh(pymeshlab().Mesh(vertex_matrix=positions, v_normals_matrix=normals))
     solver.generate_surface_reconstruction_screened_poisson(depth=depth, threads=1)
@@ -99,7 +99,7 @@ def screened_poisson(
 def trimmed(
     vertices: np.ndarray, faces: np.ndarray, density: np.ndarray, share: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return vertices and faces without the share of the vertices that has the lowest density, and their faces."""
+    """Vertices and faces without the share of the vertices that has the lowest density, and their faces."""
     if not share or not len(faces):
         return vertices, faces
     kept = density >= np.quantile(density, share)
@@ -108,7 +108,7 @@ def trimmed(
 
 
 def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Return the unit mean normals (v, 3) of the faces around each vertex, weighted by area; y where there is none."""
+    """The unit mean normals (v, 3) of the faces around each vertex, weighted by area; y where there is none."""
     a, b, c = np.moveaxis(vertices[faces], 1, 0)
     sums = np.zeros_like(vertices)
     np.add.at(sums, faces, np.cross(b - a, c - a)[:, None])
@@ -117,7 +117,7 @@ def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def pymeshlab():
-    """Return the solver's module; ValueError, with what to install, if it is absent."""
+    """The solver's module; ValueError, with what to install, if it is absent."""
     try:
         return importlib.import_module("pymeshlab")
     except ImportError as error:

@@ -33,7 +33,7 @@ print(float(mi.render(scene, sensor=sensor, spp=2).array[0]))
 
 
 def choose_variant(requested: str = "auto") -> tuple[str, str | None]:
-    """Return (variant, notice): the fastest variant that works here, and one line for the user if it is the slow one.
+    """(variant, notice): the fastest variant that works here, and one line for the user if it is the slow one.
 
     Sets DRJIT_LIBLLVM_PATH for this process and its children when it settles on a library.
     """
@@ -51,7 +51,7 @@ def choose_variant(requested: str = "auto") -> tuple[str, str | None]:
 
 
 def llvm_libraries() -> list[Path]:
-    """Return the LLVM libraries worth trying: the one the user named, or all that are found, newest first."""
+    """The LLVM libraries worth trying: the one the user named, or all that are found, newest first."""
     if named := os.environ.get("DRJIT_LIBLLVM_PATH"):
         return [Path(named)]
     found = {path for root in LIBRARY_ROOTS for pattern in LIBRARY_PATTERNS for path in Path(root).glob(pattern)}
@@ -61,7 +61,7 @@ def llvm_libraries() -> list[Path]:
 
 
 def probe(library: Path) -> bool:
-    """Return whether a child process can render a small scene with this LLVM library."""
+    """Whether a child process can render a small scene with this LLVM library."""
     environment = {**os.environ, "DRJIT_LIBLLVM_PATH": str(library)}
     command = [sys.executable, "-c", PROBE]
     try:
@@ -71,7 +71,7 @@ def probe(library: Path) -> bool:
 
 
 def mitsuba_module(variant: str | None = None):
-    """Return the mitsuba module with `variant` set (scalar code if none was ever chosen), on one thread.
+    """The mitsuba module with `variant` set (scalar code if none was ever chosen), on one thread.
 
     One thread each because objects are spread over processes; it also fixes how Mitsuba cuts the image into blocks,
     and with it the random numbers: the bytes do not depend on the machine's core count.

@@ -44,7 +44,7 @@ class ViewConfig:
 
     @property
     def focal_length(self) -> float:
-        """Return the focal length in pixels."""
+        """The focal length in pixels."""
         return 0.5 * self.resolution / np.tan(np.radians(self.fov) / 2)
 
 
@@ -57,7 +57,7 @@ class Scene:
 
 
 def look_at(eye: np.ndarray) -> np.ndarray:
-    """Return cam_to_world (4, 4) of a camera at `eye` that looks at the origin, y up (z up at the poles)."""
+    """Cam_to_world (4, 4) of a camera at `eye` that looks at the origin, y up (z up at the poles)."""
     backward = eye / np.linalg.norm(eye)
     up = np.array([0.0, 0.0, 1.0]) if abs(backward[1]) > POLE_COSINE else np.array([0.0, 1.0, 0.0])
     right = np.cross(up, backward)
@@ -68,13 +68,13 @@ def look_at(eye: np.ndarray) -> np.ndarray:
 
 
 def random_viewpoints(num_views: int, distance: float, rng: np.random.Generator) -> np.ndarray:
-    """Return cam_to_world (views, 4, 4) of cameras spread uniformly at random over the sphere."""
+    """Cam_to_world (views, 4, 4) of cameras spread uniformly at random over the sphere."""
     eyes = rng.standard_normal((num_views, 3))
     return np.stack([look_at(distance * eye / np.linalg.norm(eye)) for eye in eyes])
 
 
 def spread_viewpoints(num_views: int, distance: float) -> np.ndarray:
-    """Return cam_to_world (views, 4, 4) of cameras that surround the origin evenly (a Fibonacci spiral)."""
+    """Cam_to_world (views, 4, 4) of cameras that surround the origin evenly (a Fibonacci spiral)."""
     height = 1 - (2 * np.arange(num_views) + 1) / num_views
     turn = np.arange(num_views) * np.pi * (3 - np.sqrt(5))
     radius = np.sqrt(1 - height**2)
@@ -83,19 +83,19 @@ def spread_viewpoints(num_views: int, distance: float) -> np.ndarray:
 
 
 def project(cam_to_world: np.ndarray, positions: np.ndarray, config: ViewConfig) -> np.ndarray:
-    """Return the image coordinates (points, 2) of positions (points, 3) before the camera: x right, y down, pixels."""
+    """The image coordinates (points, 2) of positions (points, 3) before the camera: x right, y down, pixels."""
     local = (positions - cam_to_world[:3, 3]) @ cam_to_world[:3, :3]
     plane = local[:, :2] / -local[:, 2:] * [1, -1]
     return config.focal_length * plane + config.resolution / 2
 
 
 def build_scene(asset: Asset, envmap: np.ndarray) -> Scene:
-    """Return the asset under the light of the map (height, width, 3), one Mitsuba shape for each part with faces."""
+    """The asset under the light of the map (height, width, 3), one Mitsuba shape for each part with faces."""
     return lit_scene(mitsuba_shapes(asset), envmap)
 
 
 def mitsuba_shapes(asset: Asset) -> dict[str, tuple]:
-    """Return a Mitsuba mesh for each part with faces, and the number of the asset's faces before it, by name."""
+    """A Mitsuba mesh for each part with faces, and the number of the asset's faces before it, by name."""
     shapes, faces_before = {}, 0
     for number, part in enumerate(asset.parts):
         if len(part.faces):
@@ -106,7 +106,7 @@ def mitsuba_shapes(asset: Asset) -> dict[str, tuple]:
 
 
 def lit_scene(shapes: dict[str, tuple], envmap: np.ndarray) -> Scene:
-    """Return the shapes under the light of the map (height, width, 3)."""
+    """The shapes under the light of the map (height, width, 3)."""
     mi = mitsuba_module()
     light = {"type": "envmap", "bitmap": mi.Bitmap(np.asarray(envmap, np.float32))}
     handle = mi.load_dict({"type": "scene", "light": light} | {name: mesh for name, (mesh, _) in shapes.items()})
@@ -115,7 +115,7 @@ def lit_scene(shapes: dict[str, tuple], envmap: np.ndarray) -> Scene:
 
 
 def shape_numbers(handle) -> list[int]:
-    """Return what Mitsuba's `shape_index` is for each shape of a loaded scene, in the order of the scene.
+    """What Mitsuba's `shape_index` is for each shape of a loaded scene, in the order of the scene.
 
     Scalar code counts the scene's shapes from 1; compiled variants report a number of the whole process, which goes on
     counting from one scene to the next and gives numbers of freed shapes out again.
@@ -128,7 +128,7 @@ def shape_numbers(handle) -> list[int]:
 
 
 def mitsuba_mesh(part: Part, name: str):
-    """Return the part as a Mitsuba mesh with its material; without normals of its own it is shaded flat."""
+    """The part as a Mitsuba mesh with its material; without normals of its own it is shaded flat."""
     mi = mitsuba_module()
     properties = mi.Properties()
     properties["bsdf"] = mi.load_dict({"type": "twosided", "inner": principled(part)})
@@ -159,12 +159,12 @@ def mitsuba_mesh(part: Part, name: str):
 
 
 def has_texture(material: Material) -> bool:
-    """Return whether any channel of the material needs texture coordinates."""
+    """Whether any channel of the material needs texture coordinates."""
     return np.ndim(material.base_color) == 3 or np.ndim(material.roughness) == 2 or np.ndim(material.metallic) == 2
 
 
 def principled(part: Part) -> dict:
-    """Return the part's material as a description of Mitsuba's principled BSDF."""
+    """The part's material as a description of Mitsuba's principled BSDF."""
     material = part.material
     if part.colors is not None and np.ndim(material.base_color) == 3:
         raise RejectedAsset("vertex colours on top of a base-colour texture cannot be rendered; bake them into one")
@@ -185,14 +185,14 @@ def principled(part: Part) -> dict:
 
 
 def bitmap_texture(texels: np.ndarray, wrap: str) -> dict:
-    """Return the texels (height, width, channels) as a Mitsuba texture, taken as they are (linear), bilinear."""
+    """The texels (height, width, channels) as a Mitsuba texture, taken as they are (linear), bilinear."""
     mi = mitsuba_module()
     bitmap = mi.Bitmap(np.ascontiguousarray(texels, dtype=np.float32))
     return {"type": "bitmap", "bitmap": bitmap, "raw": True, "filter_type": "bilinear", "wrap_mode": wrap}
 
 
 def make_sensor(cam_to_world: np.ndarray, config: ViewConfig, resolution: int):
-    """Return a Mitsuba camera with square pixels; a box filter, so that each pixel is the mean of its own rays."""
+    """A Mitsuba camera with square pixels; a box filter, so that each pixel is the mean of its own rays."""
     mi = mitsuba_module()
     film = {"type": "hdrfilm", "width": resolution, "height": resolution, "rfilter": {"type": "box"}}
     return mi.load_dict(
@@ -210,7 +210,7 @@ def make_sensor(cam_to_world: np.ndarray, config: ViewConfig, resolution: int):
 
 
 def render_view(scene: Scene, cam_to_world: np.ndarray, config: ViewConfig, seed: int) -> np.ndarray:
-    """Return the picture (height, width, 4): linear radiance premultiplied by alpha, and alpha, float32."""
+    """The picture (height, width, 4): linear radiance premultiplied by alpha, and alpha, float32."""
     mi = mitsuba_module()
     integrator = mi.load_dict({"type": "path", "max_depth": config.max_depth, "hide_emitters": True})
     sensor = make_sensor(cam_to_world, config, config.resolution)
@@ -219,14 +219,14 @@ def render_view(scene: Scene, cam_to_world: np.ndarray, config: ViewConfig, seed
 
 
 def visible_points(scene: Scene, surface, cam_to_world: np.ndarray, config: ViewConfig, seed: int) -> np.ndarray:
-    """Return which `SurfacePoints` the camera sees, (points,) bool, by the config's rule; see the header."""
+    """Which `SurfacePoints` the camera sees, (points,) bool, by the config's rule; see the header."""
     if config.visibility == "point":
         return unoccluded(scene, surface.positions, cam_to_world[:3, 3])
     return np.isin(surface.face, visible_faces(scene, cam_to_world, config, seed))
 
 
 def visible_faces(scene: Scene, cam_to_world: np.ndarray, config: ViewConfig, seed: int) -> np.ndarray:
-    """Return the sorted global numbers of the faces that the camera's primary rays hit, one ray per cell of a grid."""
+    """The sorted global numbers of the faces that the camera's primary rays hit, one ray per cell of a grid."""
     mi = mitsuba_module()
     integrator = mi.load_dict({"type": "aov", "aovs": "face:prim_index,shape:shape_index"})
     sensor = make_sensor(cam_to_world, config, config.resolution * config.visibility_grid)
@@ -236,7 +236,7 @@ def visible_faces(scene: Scene, cam_to_world: np.ndarray, config: ViewConfig, se
 
 
 def unoccluded(scene: Scene, positions: np.ndarray, eye: np.ndarray) -> np.ndarray:
-    """Return which surface points (points, 3) nothing hides from the eye (3,), (points,) bool; one ray for each."""
+    """Which surface points (points, 3) nothing hides from the eye (3,), (points,) bool; one ray for each."""
     mi = mitsuba_module()
     towards = np.asarray(eye, np.float64) - positions
     distance = np.linalg.norm(towards, axis=-1)
@@ -251,25 +251,25 @@ def unoccluded(scene: Scene, positions: np.ndarray, eye: np.ndarray) -> np.ndarr
 
 
 def straight_srgb(radiance: np.ndarray) -> np.ndarray:
-    """Return (height, width, 4) uint8 sRGB with straight alpha from premultiplied linear radiance with alpha."""
+    """(height, width, 4) uint8 sRGB with straight alpha from premultiplied linear radiance with alpha."""
     alpha = np.clip(radiance[..., 3:], 0, 1)
     color = np.where(alpha > 0, radiance[..., :3] / np.where(alpha > 0, alpha, 1), 0)
     return np.round(255 * np.concatenate([srgb_from_linear(np.clip(color, 0, 1)), alpha], axis=-1)).astype(np.uint8)
 
 
 def srgb_from_linear(linear: np.ndarray) -> np.ndarray:
-    """Return the sRGB encoding (IEC 61966-2-1) of linear values in [0, 1]."""
+    """The sRGB encoding (IEC 61966-2-1) of linear values in [0, 1]."""
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055)
 
 
 def on_white(image: np.ndarray) -> np.ndarray:
-    """Return (height, width, 3) in [0, 1]: an RGBA uint8 image composited on white, as readers of the set do."""
+    """(height, width, 3) in [0, 1]: an RGBA uint8 image composited on white, as readers of the set do."""
     alpha = image[..., 3:] / 255
     return image[..., :3] / 255 * alpha + 1 - alpha
 
 
 def condition_image(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """Return (height, width, 4) uint8: the picture's colour on white, alpha 255, at the pixels (points, 2); else 0."""
+    """(height, width, 4) uint8: the picture's colour on white, alpha 255, at the pixels (points, 2); else 0."""
     condition = np.zeros_like(image)
     columns, rows = np.floor(pixels).astype(np.int64).T
     inside = (columns >= 0) & (columns < image.shape[1]) & (rows >= 0) & (rows < image.shape[0])
@@ -282,7 +282,7 @@ def condition_image(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
 def render_views(
     asset: Asset, surface, cam_to_world: np.ndarray, envmaps: Sequence[np.ndarray], config: ViewConfig, seed: int
 ):
-    """Return (images, conditions), each (views, height, width, 4) uint8, of an asset and its `SurfacePoints`.
+    """(images, conditions), each (views, height, width, 4) uint8, of an asset and its `SurfacePoints`.
 
     There is one environment map for each view, or one for all.
     """

@@ -12,6 +12,7 @@ import numpy as np
 
 from data_gen.shapes import patterns
 from spnr_jax.formats.mesh.assets import Material
+from spnr_jax.formats.mesh.texels import srgb_to_linear
 
 METALS = {
     "steel": (0.56, 0.57, 0.58),
@@ -37,8 +38,7 @@ class Finish(NamedTuple):
 
 def linear(srgb) -> np.ndarray:
     """Linear RGB of sRGB in [0, 1]."""
-    srgb = np.asarray(srgb, float)
-    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    return srgb_to_linear(np.asarray(srgb, float))
 
 
 def hsv(hue, saturation, value) -> np.ndarray:

@@ -50,7 +50,7 @@ def check(dataset: Path) -> bool:
 
 
 def read_description(dataset: Path) -> dict:
-    """Return the dict of dataset.json; ValueError if there is none of this schema."""
+    """The dict of dataset.json; ValueError if there is none of this schema."""
     path = dataset / "dataset.json"
     if not path.is_file():
         raise UserError(f"{dataset} holds no data set: {path.name} is missing; make one with spnr-data generate")
@@ -64,7 +64,7 @@ def read_description(dataset: Path) -> dict:
 
 
 def split_faults(dataset: Path, object_ids: set[str]) -> list[str]:
-    """Return what is wrong with the splits: each object has to be in exactly one."""
+    """What is wrong with the splits: each object has to be in exactly one."""
     try:
         listed = [object_id for split in layout.SPLITS for object_id in layout.read_split(dataset, split)]
     except OSError as error:
@@ -80,7 +80,7 @@ def split_faults(dataset: Path, object_ids: set[str]) -> list[str]:
 
 
 def variant_faults(dataset: Path, details: dict[str, dict]) -> list[str]:
-    """Return what is wrong with colour variants: all of a product are in one split, and only train has any."""
+    """What is wrong with colour variants: all of a product are in one split, and only train has any."""
     split_of = {
         object_id: split
         for split in layout.SPLITS
@@ -103,7 +103,7 @@ def variant_faults(dataset: Path, details: dict[str, dict]) -> list[str]:
 
 
 def object_faults(folder: Path, record: layout.ObjectRecord, settings: dict) -> list[str]:
-    """Return what is wrong with one object."""
+    """What is wrong with one object."""
     files = record.details.get("files", {})
     if not isinstance(files, dict) or not {"product", "variant"} <= record.details.keys():
         return ["object.json: expected files, product and variant"]
@@ -117,12 +117,12 @@ def object_faults(folder: Path, record: layout.ObjectRecord, settings: dict) -> 
 
 
 def checksum_of(path: Path) -> str | None:
-    """Return the SHA-256 of a file, or None if there is none."""
+    """The SHA-256 of a file, or None if there is none."""
     return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else None
 
 
 def camera_faults(transforms: dict) -> list[str]:
-    """Return what is wrong with the cameras of one object."""
+    """What is wrong with the cameras of one object."""
     poses = cam_to_world(transforms)
     rotations = poses[:, :3, :3]
     products = rotations @ rotations.transpose(0, 2, 1)
@@ -132,7 +132,7 @@ def camera_faults(transforms: dict) -> list[str]:
 
 
 def point_faults(points: np.ndarray, count: int) -> list[str]:
-    """Return what is wrong with the points of one object."""
+    """What is wrong with the points of one object."""
     faults = [] if len(points) == count else [f"expected {count} points, got {len(points)}"]
     values = layout.point_columns(points, *layout.POINT_FIELDS)
     if not np.isfinite(values).all():
@@ -147,7 +147,7 @@ def point_faults(points: np.ndarray, count: int) -> list[str]:
 
 
 def light_faults(folder: Path, details: dict, views: int, own_lights: bool) -> list[str]:
-    """Return what is wrong with the lights of one object's views, which are there where each has its own."""
+    """What is wrong with the lights of one object's views, which are there where each has its own."""
     listed = "lights.npz" in details.get("files", {})
     if listed != own_lights:
         said = "a light of its own for each view" if own_lights else "one light for all"
@@ -170,13 +170,13 @@ def light_faults(folder: Path, details: dict, views: int, own_lights: bool) -> l
 
 
 def points_on_object(record: layout.ObjectRecord) -> float:
-    """Return the share of condition pixels (visible points) that are opaque or partly so in their pictures."""
+    """The share of condition pixels (visible points) that are opaque or partly so in their pictures."""
     seen = record.conditions[..., 3] > 0
     return float((record.images[..., 3][seen] > 0).mean()) if seen.any() else 1.0
 
 
 def cam_to_world(transforms: dict) -> np.ndarray:
-    """Return the cameras (views, 4, 4) of a transforms.json."""
+    """The cameras (views, 4, 4) of a transforms.json."""
     return np.array([frame["transform_matrix"] for frame in transforms["frames"]], np.float64)
 
 
@@ -198,5 +198,5 @@ def print_table(dataset: Path, object_ids, num_views: int, agreements, covered, 
 
 
 def has_split(dataset: Path, split: str) -> bool:
-    """Return whether the list of a split is there."""
+    """Whether the list of a split is there."""
     return (dataset / "splits" / f"{split}.txt").is_file()

@@ -61,7 +61,7 @@ class ObjectRecord:
 
 
 def pack_points(surface) -> np.ndarray:
-    """Return sampled surface points (`SurfacePoints`) as one array of POINT_TYPE (points,)."""
+    """Sampled surface points (`SurfacePoints`) as one array of POINT_TYPE (points,)."""
     columns = [surface.positions, surface.normals, surface.base_color, surface.roughness, surface.metallic]
     packed = np.empty(len(surface.positions), POINT_TYPE)
     for name, column in zip(POINT_FIELDS, np.column_stack(columns).T, strict=True):
@@ -71,12 +71,12 @@ def pack_points(surface) -> np.ndarray:
 
 
 def point_columns(points: np.ndarray, *names: str) -> np.ndarray:
-    """Return the named fields of a POINT_TYPE array as (points, len(names)) float64."""
+    """The named fields of a POINT_TYPE array as (points, len(names)) float64."""
     return np.stack([points[name] for name in names], axis=-1).astype(np.float64)
 
 
 def nerf_transforms(cam_to_world: np.ndarray, resolution: int, fov: float, focal_length: float) -> dict:
-    """Return transforms.json for cameras (views, 4, 4): NeRF's convention, with nerfstudio's intrinsics."""
+    """Transforms.json for cameras (views, 4, 4): NeRF's convention, with nerfstudio's intrinsics."""
     return {
         "camera_model": "OPENCV",
         "camera_angle_x": float(np.radians(fov)),
@@ -99,7 +99,7 @@ def write_object(dataset: Location, object_id: str, record: ObjectRecord) -> Non
 
 
 def object_files(record: ObjectRecord) -> dict[str, bytes]:
-    """Return the files of one object by their paths in its folder, object.json with the others' checksums last."""
+    """The files of one object by their paths in its folder, object.json with the others' checksums last."""
     files = {
         "points.ply": encode_points(record.points),
         "transforms.json": json_text(record.transforms).encode(),
@@ -113,7 +113,7 @@ def object_files(record: ObjectRecord) -> dict[str, bytes]:
 
 
 def read_object(folder: Path) -> ObjectRecord:
-    """Return the object in a folder; ValueError or OSError if a file is missing or damaged."""
+    """The object in a folder; ValueError or OSError if a file is missing or damaged."""
     transforms = read_document(folder / "transforms.json")
     try:
         names = [Path(frame["file_path"]).name for frame in transforms["frames"]]
@@ -134,7 +134,7 @@ def read_object(folder: Path) -> ObjectRecord:
 
 
 def read_document(path: Path) -> dict:
-    """Return the dict of a JSON file; ValueError or OSError if there is none."""
+    """The dict of a JSON file; ValueError or OSError if there is none."""
     try:
         document = json.loads(path.read_text())
     except (ValueError, RecursionError) as error:
@@ -145,14 +145,14 @@ def read_document(path: Path) -> dict:
 
 
 def encode_points(points: np.ndarray) -> bytes:
-    """Return a POINT_TYPE array as a binary little-endian PLY of vertices."""
+    """A POINT_TYPE array as a binary little-endian PLY of vertices."""
     size = f"element vertex {len(points)}"
     header = ["ply", "format binary_little_endian 1.0", size, *POINT_PROPERTIES, "end_header"]
     return ("\n".join(header) + "\n").encode("ascii") + points.tobytes()
 
 
 def read_points(path: Path) -> np.ndarray:
-    """Return the POINT_TYPE array (points,) of a file that `encode_points` made; ValueError for any other file."""
+    """The POINT_TYPE array (points,) of a file that `encode_points` made; ValueError for any other file."""
     header, separator, body = path.read_bytes().partition(b"end_header\n")
     lines = header.decode("ascii", "replace").splitlines()
     if not separator or lines[1:2] != ["format binary_little_endian 1.0"] or lines[3:] != POINT_PROPERTIES:
@@ -165,20 +165,20 @@ def read_points(path: Path) -> np.ndarray:
 
 
 def encode_image(pixels: np.ndarray) -> bytes:
-    """Return (height, width, 4) uint8 as a PNG."""
+    """(height, width, 4) uint8 as a PNG."""
     buffer = io.BytesIO()
     Image.fromarray(pixels, "RGBA").save(buffer, "PNG")
     return buffer.getvalue()
 
 
 def encode_lights(lights: np.ndarray) -> bytes:
-    """Return environment maps (views, height, width, 3) as an .npz of halves, cut where they are too bright."""
+    """Environment maps (views, height, width, 3) as an .npz of halves, cut where they are too bright."""
     halves = np.minimum(lights, np.finfo(np.float16).max).astype(np.float16)
     return packed({"lights": halves}, compressed=True)
 
 
 def read_image(path: Path) -> np.ndarray:
-    """Return an RGBA PNG as (height, width, 4) uint8; ValueError if it is damaged or of another kind."""
+    """An RGBA PNG as (height, width, 4) uint8; ValueError if it is damaged or of another kind."""
     try:
         with Image.open(path) as image:
             if image.mode != "RGBA" or image.width * image.height > MOST_PIXELS:
@@ -190,12 +190,12 @@ def read_image(path: Path) -> np.ndarray:
 
 
 def has_object(dataset: Location, object_id: str) -> bool:
-    """Return whether an object of the data set is complete."""
+    """Whether an object of the data set is complete."""
     return storage.has_object(f"{dataset}/objects", object_id)
 
 
 def completed_objects(dataset: Location) -> set[str]:
-    """Return the ids of the objects whose folders are complete."""
+    """The ids of the objects whose folders are complete."""
     return storage.complete_objects(f"{dataset}/objects")
 
 
@@ -205,7 +205,7 @@ def remove_unfinished(dataset: Location) -> None:
 
 
 def read_split(dataset: Path, split: str) -> list[str]:
-    """Return the object ids of one split."""
+    """The object ids of one split."""
     return (dataset / "splits" / f"{split}.txt").read_text().split()
 
 
@@ -215,11 +215,11 @@ def write_text(location: Location, text: str) -> None:
 
 
 def json_text(content) -> str:
-    """Return the content as indented JSON with sorted keys; a number that is not finite is an error."""
+    """The content as indented JSON with sorted keys; a number that is not finite is an error."""
     return json.dumps(content, indent=1, sort_keys=True, allow_nan=False) + "\n"
 
 
 def file_of(folder: Path, name: str) -> Path | None:
-    """Return the file that a name in an object.json means, None where it leads out of the object's folder."""
+    """The file that a name in an object.json means, None where it leads out of the object's folder."""
     parts = PurePosixPath(name).parts
     return folder / name if parts and not {"..", "/"} & set(parts) and "\\" not in name else None

@@ -93,7 +93,7 @@ def in_shards(contents: Iterator[bytes], shard_bytes: int) -> Iterator[Iterator[
 
 
 def object_files(dataset: Path, object_id: str) -> dict[str, bytes]:
-    """Return the files of an object by their paths in its folder; ValueError if one is not as it was written."""
+    """The files of an object by their paths in its folder; ValueError if one is not as it was written."""
     folder = dataset / "objects" / object_id
     details = (folder / storage.LAST_FILE).read_bytes()
     checksums = layout.read_document(folder / storage.LAST_FILE).get("files")

@@ -3,19 +3,17 @@
 Per object: its pictures, its condition images, and its points as a front view in base colour, roughness and metallic.
 """
 
-import base64
 import html
-import io
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import tyro
-from PIL import Image
 
 from data_gen.render import views
 from data_gen.store import check, layout
 from spnr_jax.errors import UserError
+from spnr_jax.formats.images import png_url
 
 STYLE = """
 body { font: 14px/1.4 system-ui, sans-serif; margin: 24px; background: #f4f4f2; color: #222 }
@@ -60,7 +58,7 @@ def show(config: ShowConfig) -> Path:
 
 
 def object_section(dataset: Path, object_id: str) -> str:
-    """Return the HTML of one object."""
+    """The HTML of one object."""
     record = layout.read_object(dataset / "objects" / object_id)
     ignored = "; ".join(record.details["ignored"])
     note = f"{record.details['category']}{', ignored: ' + ignored if ignored else ''}"
@@ -74,30 +72,23 @@ def object_section(dataset: Path, object_id: str) -> str:
 
 
 def channel_names() -> list[tuple[str, ...]]:
-    """Return the point fields that are shown: three for a colour, one for grey."""
+    """The point fields that are shown: three for a colour, one for grey."""
     return [("base_color_r", "base_color_g", "base_color_b"), ("roughness",), ("metallic",)]
 
 
 def image_row(label: str, images: list[np.ndarray]) -> str:
-    """Return a labelled row of pictures (height, width, 3) uint8, shown at 96 pixels or their own size."""
-    tags = "".join(f'<img width="{max(96, image.shape[1])}" src="{data_url(image)}" alt="">' for image in images)
+    """A labelled row of pictures (height, width, 3) uint8, shown at 96 pixels or their own size."""
+    tags = "".join(f'<img width="{max(96, image.shape[1])}" src="{png_url(image)}" alt="">' for image in images)
     return f"<div><span>{label}</span>{tags}</div>"
 
 
 def white_bytes(image: np.ndarray) -> np.ndarray:
-    """Return an RGBA picture on white as (height, width, 3) uint8."""
+    """An RGBA picture on white as (height, width, 3) uint8."""
     return np.round(255 * views.on_white(image)).astype(np.uint8)
 
 
-def data_url(image: np.ndarray) -> str:
-    """Return the picture as a PNG inside a URL."""
-    buffer = io.BytesIO()
-    Image.fromarray(image).save(buffer, "PNG")
-    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
-
-
 def point_image(points: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
-    """Return the points seen obliquely from the front as (128, 128, 3) uint8, near ones over far ones."""
+    """The points seen obliquely from the front as (128, 128, 3) uint8, near ones over far ones."""
     camera = views.ViewConfig(resolution=POINT_IMAGE)
     pose = views.look_at(camera.distance * np.array([0.5, 0.4, 0.77]))
     positions = layout.point_columns(points, "x", "y", "z")

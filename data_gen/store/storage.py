@@ -28,12 +28,12 @@ Location = str | Path
 
 
 def absolute(location: Location) -> str:
-    """Return the location as another working directory would name it: a URL as it is, a path from the root."""
+    """The location as another working directory would name it: a URL as it is, a path from the root."""
     return str(location) if "://" in str(location) else str(Path(location).absolute())
 
 
 def open_place(location: Location) -> tuple[fsspec.AbstractFileSystem, str]:
-    """Return the file system of a location and the path in it; ValueError if no installed package opens such URLs."""
+    """The file system of a location and the path in it; ValueError if no installed package opens such URLs."""
     try:
         return fsspec.core.url_to_fs(str(location))
     except (ImportError, ValueError) as error:
@@ -41,7 +41,7 @@ def open_place(location: Location) -> tuple[fsspec.AbstractFileSystem, str]:
 
 
 def read_file(location: Location) -> bytes | None:
-    """Return the content of a file, or None if there is none."""
+    """The content of a file, or None if there is none."""
     filesystem, path = open_place(location)
     try:
         return filesystem.cat_file(path)
@@ -68,13 +68,13 @@ def write_file(location: Location, content: bytes) -> None:
 
 
 def has_object(objects: Location, object_id: str) -> bool:
-    """Return whether an object in a folder of objects is complete."""
+    """Whether an object in a folder of objects is complete."""
     filesystem, path = open_place(objects)
     return filesystem.exists(f"{path}/{object_id}/{LAST_FILE}")
 
 
 def complete_objects(objects: Location) -> set[str]:
-    """Return the ids of the complete objects in a folder of objects."""
+    """The ids of the complete objects in a folder of objects."""
     filesystem, path = open_place(objects)
     if isinstance(filesystem, LocalFileSystem):  # looking into each folder beats listing all their files, as stores do
         folders = Path(path).iterdir() if Path(path).is_dir() else ()
@@ -85,7 +85,7 @@ def complete_objects(objects: Location) -> set[str]:
 
 
 def is_empty(location: Location) -> bool:
-    """Return whether a place holds nothing, apart from what is just being written."""
+    """Whether a place holds nothing, apart from what is just being written."""
     filesystem, path = open_place(location)
     if not filesystem.exists(path):
         return True
@@ -127,7 +127,7 @@ def write_and_rename(place: Path, files: dict[str, bytes]) -> None:
 
 
 def unfinished_prefix() -> str:
-    """Return how the names of this process's unfinished files and folders begin."""
+    """How the names of this process's unfinished files and folders begin."""
     return f"{UNFINISHED}{socket.gethostname()}-{os.getpid()}-"
 
 
@@ -142,7 +142,7 @@ def remove_unfinished(folder: Location) -> None:
 
 
 def is_abandoned(path: Path) -> bool:
-    """Return whether nobody writes an unfinished folder any more."""
+    """Whether nobody writes an unfinished folder any more."""
     owner = re.fullmatch(re.escape(UNFINISHED) + r"(.+)-(\d+)-\w+", path.name)
     if owner and owner[1] == socket.gethostname():
         return not psutil.pid_exists(int(owner[2]))

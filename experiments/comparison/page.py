@@ -5,25 +5,13 @@ method, up and down the object; holding the space bar, or the mouse on the pictu
 Without scripts the tables are still there.
 """
 
-import base64
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
-
 from experiments.comparison.object_scores import Shown
 from experiments.comparison.result_tables import Table
-from spnr_jax.formats.images import png
-from spnr_jax.scoring.report_style import STYLE
-
-ENVIRONMENT = Environment(
-    loader=FileSystemLoader(Path(__file__).parent),
-    autoescape=True,
-    undefined=StrictUndefined,
-    trim_blocks=True,
-    lstrip_blocks=True,
-)
+from spnr_jax.formats.images import png_url
+from spnr_jax.scoring.report_style import STYLE, template
 
 
 def page(title: str, tables: Sequence[Table], notes: Sequence[str], shown: Sequence[Shown] = ()) -> str:
@@ -34,17 +22,13 @@ def page(title: str, tables: Sequence[Table], notes: Sequence[str], shown: Seque
             {
                 "name": row.name,
                 "view": row.view,
-                "reference": address(row.reference),
-                "images": {method: address(image) for method, image in row.images.items()},
+                "reference": png_url(row.reference),
+                "images": {method: png_url(image) for method, image in row.images.items()},
                 "psnr": {method: round(value, 2) for method, value in row.psnr.items()},
             }
             for row in shown
         ],
     }
-    template = ENVIRONMENT.get_template("page.html")
-    return template.render(title=title, tables=tables, notes=notes, pictures=pictures, style=STYLE)
-
-
-def address(image: np.ndarray) -> str:
-    """The image (h, w, 3) as an address that holds it as PNG."""
-    return f"data:image/png;base64,{base64.b64encode(png(image)).decode()}"
+    return template(Path(__file__).with_name("page.html")).render(
+        title=title, tables=tables, notes=notes, pictures=pictures, style=STYLE
+    )

@@ -10,6 +10,7 @@ from pathlib import Path
 import mitsuba
 import numpy as np
 
+from data_gen.render.views import srgb_from_linear
 from spnr_jax.formats import gaussian_files
 from spnr_jax.gaussians.harmonics import C0
 from spnr_jax.kernels.records import Camera, Gaussians
@@ -50,4 +51,4 @@ def _composited(gaussians: Gaussians, camera: Camera, spp: int, place: Path) -> 
     splats_of_file = {"type": "ellipsoids", "filename": str(place)}
     scene = {"type": "scene", "integrator": {"type": "volprim_rf_basic"}, "splats": splats_of_file, "sensor": sensor}
     linear = np.maximum(np.array(mitsuba.render(mitsuba.load_dict(scene), spp=spp)), 0)
-    return np.where(linear > 0.0031308, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055, 12.92 * linear)
+    return srgb_from_linear(linear)

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
+from spnr_jax.errors import require
 from spnr_jax.model_config import (
     MATERIAL_CHANNELS,
     Count,
@@ -13,8 +14,6 @@ from spnr_jax.model_config import (
     Weight,
     Whole,
     Widths,
-    check,
-    require,
 )
 
 
@@ -32,7 +31,7 @@ class NPBGConfig(NetworkConfig):
     """Points closer to the plane of the eye than this are not drawn."""
 
     def __post_init__(self) -> None:
-        check(self)
+        super().__post_init__()
         require(
             len(self.encoder_widths) == len(self.decoder_widths) + 1 >= 2,
             f"encoder_widths must have one entry more than decoder_widths, got {self.encoder_widths} and "
@@ -85,7 +84,7 @@ class PointNeRFConfig(NetworkConfig):
     """Rays of an object rendered at once in evaluation."""
 
     def __post_init__(self) -> None:
-        check(self)
+        super().__post_init__()
         require(
             self.num_samples <= self.num_candidates,
             f"num_samples {self.num_samples} must not exceed num_candidates {self.num_candidates}",
@@ -135,7 +134,7 @@ class Points2NeRFConfig(NetworkConfig):
     """Rays of an object rendered at once in evaluation."""
 
     def __post_init__(self) -> None:
-        check(self)
+        super().__post_init__()
         require(
             self.nerf_depth >= 2 and self.nerf_depth % 2 == 0,
             f"nerf_depth must be even and at least 2, got {self.nerf_depth}",

@@ -8,7 +8,7 @@ TRIM_THRESHOLD, MMAP_MAX, ARENA_MAX = -1, -4, -8  # M_... of malloc.h
 
 
 def keep_arrays() -> None:
-    """Has JAX's arrays on a CPU lie where those of the step before lay; to be called before JAX computes anything.
+    """Makes JAX on a CPU reuse the heap of the step before (mallopt), without page faults; call it before JAX computes.
 
     Else the system fetches and clears a step's temporary memory each time, a fifth of the step.  JAX computes in the
     thread that calls it then: other threads' arenas hold 64 MB at most, whatever glibc is asked.

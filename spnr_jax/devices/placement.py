@@ -121,7 +121,7 @@ def first_alone(work: Callable[[], object]) -> None:
 
 
 class Agreement:
-    """Whether any process has asked for something: the same answer in each, one call late, so that none waits."""
+    """A flag that is true where any process has set it, all-reduced; delayed by one call, so that it never blocks."""
 
     def __init__(self, mesh: Mesh | None) -> None:
         """Nobody has asked yet."""
@@ -159,7 +159,7 @@ def on_own_rays(function: Callable[..., Any], whole: Any, scenes: Any, rays: Any
     """`function(whole, scenes, rays)`, in which each device of the mesh in use has its own objects and rays alone.
 
     Arrays of `scenes` have objects first, those of `rays` and of what is returned objects and rays; `whole` is what all
-    share.  Rays are dealt to the devices like cards: neighbours, which meet the same, go to different ones.
+    share.  Rays are assigned to the devices round-robin, which balances the load: neighbours cost about the same.
     """
     (objects, count), devices = jax.tree.leaves(rays)[0].shape[:2], _devices(DEPTH)
     if _devices(OBJECTS) * devices == 1 or objects % _devices(OBJECTS):  # a network is initialised with one object

@@ -16,6 +16,7 @@ import numpy as np
 
 from spnr_jax.errors import UserError
 from spnr_jax.formats.cut import Cut
+from spnr_jax.formats.mesh.assets import ShownParts
 from spnr_jax.formats.ply import read_ply_header
 from spnr_jax.formats.point_columns import DEFAULTS, LINEAR, POSITION, SRGB, Columns, materials, normals, useful
 from spnr_jax.formats.point_files import READERS, column_pieces, parse_ply
@@ -32,7 +33,6 @@ MESH_POINTS = 4096  # points drawn from a mesh if no number is asked for; the mo
 MOST_EVEN = 2**14  # points that are spread evenly over a mesh, in seconds; more lie close enough as they are drawn
 CAPACITY = 2**19  # points of a file that are in memory at most; more are thinned while reading
 SAMPLE = 2**17  # of them that say where a file is dense
-ShownParts = Literal["opaque", "skip"]  # what is made of a mesh's transparent parts
 BROKEN = "NaN, infinity or too large a number"
 CUT_MESH = 2**18  # points drawn from a mesh that something is cut out of
 WHOLE = Cut()

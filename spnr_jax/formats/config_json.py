@@ -4,8 +4,8 @@ import dataclasses
 from typing import Any
 
 from spnr_jax.config import TrainConfig
-from spnr_jax.errors import UserError
-from spnr_jax.model_config import NearPointsConfig, NetworkConfig, PaperConfig, SurfelConfig, hints, mismatch, require
+from spnr_jax.errors import UserError, require
+from spnr_jax.model_config import NearPointsConfig, NetworkConfig, PaperConfig, SurfelConfig, hints, mismatch
 
 OURS: dict[str, type[NetworkConfig]] = {kind.method: kind for kind in (SurfelConfig, NearPointsConfig, PaperConfig)}
 BASELINES = ("npbg", "point_nerf", "points2nerf")

@@ -19,9 +19,9 @@ import numpy as np
 from jaxtyping import Float
 
 from spnr_jax.errors import UserError
-from spnr_jax.formats.glb import packed
+from spnr_jax.formats.glb import Buffer
 from spnr_jax.formats.images import check_place, write_whole
-from spnr_jax.formats.ply import vertex_pieces
+from spnr_jax.formats.point_files import parse_ply
 from spnr_jax.gaussians.harmonics import C0, degree_of, half_turn_signs
 from spnr_jax.kernels.records import AnyArray, Gaussians
 
@@ -90,9 +90,7 @@ def ply_of(gaussians: Gaussians, note: str = "") -> bytes:
 
 def read_ply(path: Path) -> Gaussians:
     """The splats of a .ply file as `ply_of` writes it; ValueError if it lacks a property."""
-    with path.open("rb") as file:
-        pieces = list(vertex_pieces(file))
-    columns = {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
+    columns = parse_ply(path.read_bytes())
     rest = sum(name.startswith("f_rest_") for name in columns)
     names = {"position": tuple("xyz"), "rotation": tuple(f"rot_{i}" for i in range(4))}
     names |= {"scale": tuple(f"scale_{i}" for i in range(3)), "opacity": ("opacity",)}
@@ -140,7 +138,7 @@ def glb_of(gaussians: Gaussians, note: str = "") -> bytes:
     color = np.clip(0.5 + C0 * harmonics[:, 0], 0, 1)
     name = "KHR_gaussian_splatting:"
     arrays = {
-        "POSITION": np.asarray(gaussians.position),
+        "POSITION": np.asarray(gaussians.position, np.float32),
         "COLOR_0": np.concatenate([color, np.asarray(gaussians.opacity)[:, None]], axis=1),
         f"{name}ROTATION": np.asarray(gaussians.rotation)[:, [1, 2, 3, 0]],
         f"{name}SCALE": np.asarray(gaussians.scale),
@@ -149,19 +147,11 @@ def glb_of(gaussians: Gaussians, note: str = "") -> bytes:
     for degree in range(degree_of(harmonics.shape[1]) + 1):
         for i in range(2 * degree + 1):
             arrays[f"{name}SH_DEGREE_{degree}_COEF_{i}"] = harmonics[:, degree**2 + i]
-    views, accessors, chunks, size = [], [], [], 0
-    for array in arrays.values():
-        data = np.ascontiguousarray(array, "<f4").tobytes()
-        views.append({"buffer": 0, "byteOffset": size, "byteLength": len(data)})
-        kind = "SCALAR" if array.shape[1] == 1 else f"VEC{array.shape[1]}"
-        accessors.append({"bufferView": len(views) - 1, "componentType": 5126, "count": len(array), "type": kind})
-        chunks.append(data)
-        size += len(data)
-    accessors[0] |= {"min": arrays["POSITION"].min(axis=0).tolist(), "max": arrays["POSITION"].max(axis=0).tolist()}
+    buffer = Buffer()
     said = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display", "projection": "perspective"}
     primitive = {
         "mode": 0,
-        "attributes": {name: i for i, name in enumerate(arrays)},
+        "attributes": buffer.attributes(arrays),
         "extensions": {name[:-1]: said | {"sortingMethod": "cameraDistance"}},
     }
     document = {
@@ -171,10 +161,8 @@ def glb_of(gaussians: Gaussians, note: str = "") -> bytes:
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0}],
         "meshes": [{"primitives": [primitive]}],
-        "accessors": accessors,
-        "bufferViews": views,
     }
-    return packed(document, b"".join(chunks))
+    return buffer.glb(document)
 
 
 def _inner(opacity: Float[AnyArray, " splats"]) -> np.ndarray:

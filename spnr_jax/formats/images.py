@@ -4,6 +4,7 @@ Images are (height, width, 3) or grey (height, width), uint8 or float in [0, 1],
 place and renamed into it: a reader sees the old content or the new, never half of it.
 """
 
+import base64
 import contextlib
 import importlib.util
 import io
@@ -57,6 +58,11 @@ def png(image: np.ndarray | Array) -> bytes:
     stream = io.BytesIO()
     Image.fromarray(to_uint8(image)).save(stream, "png", optimize=True)
     return stream.getvalue()
+
+
+def png_url(image: np.ndarray | Array) -> str:
+    """The image as an address that holds it as PNG, for pages that load nothing."""
+    return f"data:image/png;base64,{base64.b64encode(png(image)).decode()}"
 
 
 def check_place(path: Path) -> None:

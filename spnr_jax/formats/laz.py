@@ -16,7 +16,6 @@ from spnr_jax.errors import UserError
 
 RECORD_HEAD, NAME, NUMBER = 54, b"laszip encoded", 22204
 LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}  # of an item of this type; those of extra bytes (14) have one a byte
-EXTRA_BYTES = 14
 ITEMS_AT, CHUNK_SIZE_AT = 32, 12
 LARGEST_CHUNK = 2**24  # points; writers use 50,000
 VARIABLE = 2**32 - 1  # chunk size that says that every chunk has its own

@@ -1,8 +1,8 @@
 """Empty space, where nothing is evaluated: which voxels lie near points, and the parts of rays that cross them.
 
-A ray is cut into equal cells; those whose middle lies in a voxel near points are `open`.  Along the ray, `travelled` is
-the length of the open cells behind: samples are laid out in it, as if the open cells stood end to end, so that none
-falls into a gap and a gap lends no length to a sample before it.  Density is 0 outside, by definition.
+A ray is cut into equal cells; those whose middle lies in a voxel near points are `open` (occupied segments).
+`travelled` is the length of the open cells up to a place: samples lie in the concatenated segments, so that none falls
+into a gap, and a gap adds no interval length.  Density is 0 outside, by definition.
 """
 
 from collections.abc import Callable

@@ -156,22 +156,14 @@ def describe(
     `objects` says to which of the surface's objects each sample belongs.  A point weighs exp(-d^2 / 2), d its distance
     in its own spacings.
     """
-    num_points, resolution, count = surface.points.shape[1], surface.nearest.shape[1], surface.nearest.shape[-1]
-    cell, _ = locate(positions, resolution)
-    rows = row_of(cell, jnp.ones(len(cell), bool), resolution) + objects * resolution**3
-    index = (surface.nearest.reshape(-1, count)[rows] + (objects * num_points)[:, None]).T
-    # numbers of one kind lie side by side, (count, samples): a CPU works on eight samples at a time
-    columns = surface.points.reshape(-1, surface.points.shape[-1]).T
-    *numbers, spacing = (column[index] for column in columns)
+    *numbers, spacing = _of_nearest(surface, positions, objects)
     position, normal, (red, green, blue, roughness, metallic) = numbers[:3], numbers[3:6], numbers[6:11]
     inward, (flatness, narrowness) = numbers[11:14], numbers[14:]
     exists = spacing > 0
     scale = jnp.where(exists, 1 / jnp.where(exists, spacing, 1), 0)
     offset = [(positions[None, :, i] - position[i]) * scale for i in range(3)]
     squared = jnp.where(exists, _dot(offset, offset), jnp.inf)
-    closest = jnp.min(squared, axis=0, keepdims=True)
-    share = jnp.where(exists, jnp.exp(-0.5 * (squared - jnp.where(jnp.isfinite(closest), closest, 0))), 0)
-    share = share / jnp.maximum(jnp.sum(share, axis=0, keepdims=True), 1)
+    share, closest = _weights(squared, exists)
     view = [directions[None, :, i] for i in range(3)]
     along = _dot(normal, view)
     sign = jnp.where(along < 0, 1, -1)  # turns the normal to the viewer
@@ -181,9 +173,7 @@ def describe(
     ahead = jnp.clip(height / jnp.maximum(jnp.abs(along), LEAST_FACING), -FAR, FAR)
     passed = [o + ahead * d for o, d in zip(offset, view, strict=True)]
     missed = jnp.where(exists, jnp.minimum(_dot(passed, passed), FAR**2), FAR**2)
-    least = jnp.min(missed, axis=0, keepdims=True)
-    met = jnp.where(exists, jnp.exp(-0.5 * (missed - least)), 0)
-    met = met / jnp.maximum(jnp.sum(met, axis=0, keepdims=True), 1)
+    met, least = _weights(missed, exists)
 
     def blend(*parts):
         return jnp.stack([jnp.sum(share * x, axis=0) for x in parts], axis=-1)
@@ -204,6 +194,26 @@ def describe(
         roughness=blend(roughness)[:, 0],
         metallic=blend(metallic)[:, 0],
     )
+
+
+def _of_nearest(
+    surface: Surface, positions: Float[Array, "samples 3"], objects: Int[Array, " samples"]
+) -> list[Float[Array, "count samples"]]:
+    """Each number of the points nearest to each sample; those of one kind lie side by side, as a CPU works on them."""
+    num_points, resolution, count = surface.points.shape[1], surface.nearest.shape[1], surface.nearest.shape[-1]
+    cell, _ = locate(positions, resolution)
+    rows = row_of(cell, jnp.ones(len(cell), bool), resolution) + objects * resolution**3
+    index = (surface.nearest.reshape(-1, count)[rows] + (objects * num_points)[:, None]).T
+    return [column[index] for column in surface.points.reshape(-1, surface.points.shape[-1]).T]
+
+
+def _weights(
+    squared: Float[Array, "count samples"], exists: Bool[Array, "count samples"]
+) -> tuple[Float[Array, "count samples"], Float[Array, "1 samples"]]:
+    """Weights exp(-d^2 / 2) of the points that exist, of sum 1, and the least of the squared distances."""
+    least = jnp.min(squared, axis=0, keepdims=True)
+    weights = jnp.where(exists, jnp.exp(-0.5 * (squared - jnp.where(jnp.isfinite(least), least, 0))), 0)
+    return weights / jnp.maximum(jnp.sum(weights, axis=0, keepdims=True), 1), least
 
 
 def _dot(a, b):

@@ -110,9 +110,21 @@ def _spread_trilinear(positions, inputs, mask, resolution):
     return rows, (share[..., None] * inputs[:, None]).reshape(-1, inputs.shape[1])
 
 
-def _scattered(scatter, positions, features, mask, resolution):
+def scattered(
+    scatter: Literal["mean", "max", "trilinear"],
+    positions: Float[Array, "*batch points 3"],
+    features: Float[Array, "*batch points features"],
+    mask: Bool[Array, "*batch points"],
+    resolution: int,
+) -> tuple[Float[Array, "*batch d d d features"], Float[Array, "*batch d d d"]]:
+    """Point features in voxels (0 where there is none), and how full these are; points outside the box are dropped.
+
+    `mean` and `max` of the points in a voxel, which is full (1) with any; the gradient of a maximum goes to the points
+    that reach it, in equal shares.  `trilinear`: spread over the eight nearest voxel centres, the sum of weights times
+    features over the sum of weights where that exceeds 1, so that no point moves from voxel to voxel in one step.
+    """
     if positions.ndim > 2:
-        return jax.vmap(lambda p, f, m: _scattered(scatter, p, f, m, resolution))(positions, features, mask)
+        return jax.vmap(lambda p, f, m: scattered(scatter, p, f, m, resolution))(positions, features, mask)
     rows, values = spread(scatter, positions, features, mask, resolution)
     summed = scatter_rows(rows, values, resolution**3 + 1)[:-1].reshape(*[resolution] * 3, -1)
     return summed[..., :-1], summed[..., -1]
@@ -128,34 +140,7 @@ def scatter_mean(
 
     Masked points and points outside the box are dropped.
     """
-    return _scattered("mean", positions, features, mask, resolution)
-
-
-def scatter_max(
-    positions: Float[Array, "*batch points 3"],
-    features: Float[Array, "*batch points features"],
-    mask: Bool[Array, "*batch points"],
-    resolution: int,
-) -> tuple[Float[Array, "*batch d d d features"], Float[Array, "*batch d d d"]]:
-    """Largest of the point features in each voxel (0 where there is none), and 1 where a voxel holds a point.
-
-    The gradient of a voxel goes to the points that reach the maximum, in equal shares.
-    """
-    return _scattered("max", positions, features, mask, resolution)
-
-
-def scatter_trilinear(
-    positions: Float[Array, "*batch points 3"],
-    features: Float[Array, "*batch points features"],
-    mask: Bool[Array, "*batch points"],
-    resolution: int,
-) -> tuple[Float[Array, "*batch d d d features"], Float[Array, "*batch d d d"]]:
-    """Point features over the eight nearest voxel centres, and how full these are, at most 1.
-
-    The sum of trilinear weights times features over the sum of weights where that exceeds 1: the mean, but for points
-    that do not move from voxel to voxel in one step.
-    """
-    return _scattered("trilinear", positions, features, mask, resolution)
+    return scattered("mean", positions, features, mask, resolution)
 
 
 def scatter_conv(

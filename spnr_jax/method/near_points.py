@@ -1,4 +1,4 @@
-"""The network near points on one page: its samples also see the points around them, and a CNN looks over the picture.
+"""The network near points on one page: its samples also see the points around them, and a CNN refines the picture.
 
     encode   the volume of the paper's network, and the surface that the points lie on      once per object
     render   a ray a pixel, samples near the points, light on their materials once per ray
@@ -19,10 +19,10 @@ from spnr_jax.kernels import cameras, surface, voxels
 from spnr_jax.kernels.numerics import length
 from spnr_jax.kernels.records import Camera, Key, PointCloud, Rays, Rendering, Scene
 from spnr_jax.method.march import Field, Finish, Samples, Seen, Traced, places, trace
-from spnr_jax.model_config import AS_TRAINED, NUM_TOLD, NearPointsConfig, RenderOptions, surface_grid
+from spnr_jax.model_config import AS_TRAINED, NearPointsConfig, RenderOptions, surface_grid
 from spnr_jax.nn.encoder import Encoder
 from spnr_jax.nn.refiner import ODDS, Refiner
-from spnr_jax.nn.surface_field import SurfaceField, told
+from spnr_jax.nn.surface_field import NUM_TOLD, SurfaceField, told
 
 
 class NearPointsNetwork(nn.Module):
@@ -61,11 +61,11 @@ class NearPointsNetwork(nn.Module):
         return divide_pixels(cameras.view_rays(camera))
 
     def refines(self, options: RenderOptions) -> bool:
-        """Whether the refiner looks over the picture, and rays tell it what they met."""
+        """Whether the refiner is used, and rays carry its inputs."""
         return options.refine and self.config.refiner_width > 0
 
     def num_features(self, options: RenderOptions) -> int:
-        """Of a ray: RGB, and what it tells the refiner."""
+        """Of a ray: RGB, and the inputs of the refiner."""
         return 3 + NUM_TOLD * self.refines(options)
 
     def along(

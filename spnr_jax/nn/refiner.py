@@ -1,10 +1,10 @@
-"""CNN that looks over a rendered picture: what no ray can know alone, such as that an outline goes on straight.
+"""CNN that refines a rendered picture: it sees neighbouring pixels, and continues a straight outline, say.
 
-A small U-Net over what the rays of a picture gave: colour, opacity, depth, and what they tell of the surface that they
-met or passed (`surface_field.told`).  It says by how much the log odds of the opacity and the colour of the object
-change at each pixel.  It works at half the picture's size, and of pictures larger than those of its training on their
-mean over squares of pixels: there it sees points as far apart as it has learnt, and its changes, which are smooth, are
-laid on the large picture.  Where no point is near, nothing is drawn.
+A small U-Net over what the rays of a picture gave: colour, opacity, depth, and geometry of the surface that they met or
+passed (`surface_field.told`). Its output is added to the log odds of the opacity and to the colour of the object. It
+works at half the picture's size, and of pictures larger than those of its training on their mean over squares of
+pixels: there it sees points as far apart as it has learnt, and its output, which is smooth, is added to the large
+picture. Where no point is near, nothing is drawn.
 """
 
 import flax.linen as nn

@@ -1,8 +1,8 @@
 """Radiance field that sees the surface: density and colour at a place from the volume's feature and the nearest points.
 
-Density is fog behind the surface, nothing before it: strength * facing / spacing * sigmoid(shift - SHARPNESS * height),
+Density fills what lies behind the surface: strength * facing / spacing * sigmoid(shift - SHARPNESS * height),
 height and spacing of the points, strength and shift from the network.  A ray that meets the surface at a right angle
-and one that grazes it then pass as much fog per depth, so that outlines do not grow by the path along them.
+and one that grazes it then gather as much optical depth per depth, so that outlines do not grow by the path along them.
 
 With `lit` the network does not invent colours, it predicts light.  Base colour b and metallic m of the points nearby
 give the specular colour at normal incidence, F0 = 0.04 (1 - m) + b m, and the radiance b (1 - m) E + F0 L in linear
@@ -25,11 +25,10 @@ from spnr_jax.nn.encoding import encode_direction
 
 DIELECTRIC = 0.04  # reflectance of plastic, wood, paint at normal incidence
 STRENGTH = 4.0  # optical depth per spacing of depth, of one unit of the network's output
-SHARPNESS = 4.0  # the fog sets in within about half a spacing
+SHARPNESS = 4.0  # density rises within about half a spacing
 SPACING_SCALE = 10.0  # brings the spacing of a thousand points to the order of 1
-
-
 NOWHERE = 10.0  # spacings, of what is not there
+NUM_TOLD = 13  # inputs of the refiner that `told` makes
 
 
 def facing_of(surface: SurfaceSample, directions: Float[Array, "samples 3"]) -> Float[Array, " samples"]:
@@ -38,9 +37,9 @@ def facing_of(surface: SurfaceSample, directions: Float[Array, "samples 3"]) -> 
 
 
 def told(surface: SurfaceSample, directions: Float[Array, "samples 3"]) -> tuple[Array, Array]:
-    """What samples tell the refiner: (samples, 9), of which a ray's mean counts, and (samples, 4), of which the least.
+    """Inputs of the refiner: 9 numbers of a sample that are composited, and 4 whose minimum along the ray is taken.
 
-    The least are how near the ray passes points, their planes, their rim and the surface, large where there is none.
+    The latter are how near the ray passes points, their planes, their rim and the surface, large where there is none.
     """
     s = surface
     means = (s.height, s.beside, s.nearest, s.miss, s.outside, s.flatness, s.narrowness, SPACING_SCALE * s.spacing)

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import binary_dilation, binary_erosion, distance_transform_edt, gaussian_filter
 
+from spnr_jax.formats.mesh.texels import srgb_to_linear
 from spnr_jax.kernels.records import PointCloud
 
 OUTLINE = 3  # pixels to both sides of the true outline
@@ -120,8 +121,7 @@ def plate(count: int, seed: int = 0) -> PointCloud:
 def blue_share(image: Float[np.ndarray, "height width 3"], opacity: Float[np.ndarray, "height width"]) -> float:
     """Share of blue in the colour of the plate's front, in linear light; .077 is true (its rims are not seen)."""
     inside = binary_erosion(opacity > 0.5, iterations=WELL_INSIDE)
-    linear = np.where(image > 0.04045, ((image + 0.055) / 1.055) ** 2.4, image / 12.92)
-    red, _, blue = linear[inside].mean(axis=0)
+    red, _, blue = srgb_to_linear(image)[inside].mean(axis=0)
     return float(blue / (red + blue))
 
 

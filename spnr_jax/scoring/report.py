@@ -1,21 +1,21 @@
 """The report of a run: one HTML file that holds everything, to open from disk, to mail, to keep.
 
 Key numbers and summary, pictures of unseen objects, quality beside the floors, learning curve, settings.  Images are
-PNGs inside the page, the curve is an SVG; nothing is loaded from elsewhere, and no script runs.
+PNGs inside the page (report.html is its template), the curve is an SVG; nothing is loaded from elsewhere, and no script
+runs.
 """
 
-import base64
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from html import escape
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
-from spnr_jax.formats.images import depth_image, png, to_uint8, write_whole
+from spnr_jax.formats.images import depth_image, png_url, to_uint8, write_whole
 from spnr_jax.scoring.learning_curve import learning_curve_svg
-from spnr_jax.scoring.report_style import STYLE
+from spnr_jax.scoring.report_style import STYLE, template
 from spnr_jax.scoring.summary import NO_WEIGHTS
 
 METHODS = {  # method -> its name in tables and pictures, in their order
@@ -71,6 +71,23 @@ class GalleryRow:
     acc: np.ndarray
 
 
+class Cell(NamedTuple):
+    """A text, smaller lines below it, and whether it is the best of its column."""
+
+    text: str
+    small: tuple[str, ...] = ()
+    best: bool = False
+
+
+class Table(NamedTuple):
+    """A section of the page with one table; a row is a name and cells."""
+
+    heading: str
+    note: str
+    heads: Sequence[str]
+    rows: Sequence[tuple[str, Sequence[Cell]]]
+
+
 def write_report(
     path: str | Path,
     *,
@@ -92,22 +109,24 @@ def write_report(
     first = next(iter(methods))
     levels = {METHODS[m]: methods[m]["psnr"] for m in METHODS if m in methods and m != first}
     minus = metrics.get(f"{first}_minus")
-    sections = [
-        f"<header><h1>{escape(title)}</h1>{_paragraphs(summary)}{_key_numbers(metrics)}</header>",
-        _section("Unseen objects", _gallery(gallery), GALLERY_NOTE),
-        _section("Quality", _quality_table(methods), QUALITY_NOTE),
-        _section("Differences", _difference_table(first, minus), DIFFERENCES_NOTE) if minus else "",
-        _section("Quality by category", _category_table(per_category), "PSNR in dB.") if per_category else "",
-        _section("Learning curve", f"<figure>{learning_curve_svg(curve, levels)}</figure>", "") if curve else "",
-        _section("Run", _definitions(_run_facts(metrics)), ""),
-        _section("Settings", _definitions(flatten(settings)), ""),
-    ]
-    page = (
-        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{escape(title)}</title><style>{STYLE}</style></head><body><main>{''.join(sections)}</main></body></html>\n"
+    tables = [_quality_table(methods)]
+    tables += [_difference_table(first, minus)] if minus else []
+    tables += [_category_table(per_category)] if per_category else []
+    shown = gallery[0].images if gallery else {}
+    page = template(Path(__file__).with_name("report.html")).render(
+        title=title,
+        style=STYLE,
+        paragraphs=[part for part in summary.split("\n\n") if part.strip()],
+        tiles=_key_numbers(metrics),
+        gallery_note=GALLERY_NOTE,
+        heads=["Reference", *(METHODS.get(method, method) for method in shown), "Depth", "Opacity"],
+        gallery=[(row.name, _pictures(row)) for row in gallery],
+        tables=tables,
+        curve=learning_curve_svg(curve, levels) if curve else "",
+        facts=_run_facts(metrics),
+        settings=flatten(settings),
     )
-    write_whole(Path(path), page.encode())
+    write_whole(Path(path), f"{page}\n".encode())
 
 
 def flatten(settings: Mapping, prefix: str = "") -> dict[str, object]:
@@ -133,16 +152,13 @@ def duration(seconds: float | int) -> str:
     return f"{whole // 60} min {whole % 60} s" if whole < 3600 else f"{whole // 3600} h {whole % 3600 // 60} min"
 
 
-def _section(heading: str, body: str, note: str) -> str:
-    note = f'<p class="note">{escape(note)}</p>' if note else ""
-    return f"<section><h2>{escape(heading)}</h2>{note}{body}</section>"
+def lowered(method: str) -> str:
+    """A method's name inside a sentence."""
+    name = METHODS.get(method, method)
+    return name if name[:2].isupper() else name[:1].lower() + name[1:]
 
 
-def _paragraphs(text: str) -> str:
-    return "".join(f"<p>{escape(part)}</p>" for part in text.split("\n\n") if part.strip())
-
-
-def _key_numbers(metrics: Mapping) -> str:
+def _key_numbers(metrics: Mapping) -> list[tuple[str, str]]:
     """The numbers that a reader looks for first, as tiles."""
     methods, seconds = metrics["methods"], metrics.get("seconds", {})
     psnr = next(iter(methods.values()))["psnr"]
@@ -155,74 +171,63 @@ def _key_numbers(metrics: Mapping) -> str:
     ):
         if name in list(methods)[1:]:
             tiles.append((words, f"{psnr - methods[name]['psnr']:+.1f} dB"))
-    tiles += [(f"to {stage}", duration(seconds[stage])) for stage in ("train", "train paper") if stage in seconds]
-    return f'<div class="tiles">{"".join(f"<div><b>{value}</b>{escape(words)}</div>" for words, value in tiles)}</div>'
+    return tiles + [(f"to {stage}", duration(seconds[stage])) for stage in ("train", "train paper") if stage in seconds]
 
 
-def _gallery(rows: Sequence[GalleryRow]) -> str:
-    methods = rows[0].images if rows else {}
-    heads = ["Reference", *(METHODS.get(method, method) for method in methods), "Depth", "Opacity"]
-    head = "".join(f"<th>{escape(text)}</th>" for text in heads)
-    body = "".join(_gallery_row(row, heads) for row in rows)
-    return f'<table class="gallery"><thead><tr><th></th>{head}</tr></thead><tbody>{body}</tbody></table>'
-
-
-def _gallery_row(row: GalleryRow, heads: Sequence[str]) -> str:
+def _pictures(row: GalleryRow) -> list[tuple[str, str]]:
+    """Address and caption of each picture of a row of the gallery."""
     pictures = [(row.reference, "")]
     pictures += [(image, f"{psnr(image, row.reference):.1f}") for image in row.images.values()]
     pictures += [(depth_image(row.depth, row.acc), ""), (row.acc, "")]
-    cells = "".join(
-        f'<td><img src="data:image/png;base64,{base64.b64encode(png(image)).decode()}" '
-        f'alt="{escape(row.name)}, {escape(head.lower())}"><small>{caption}</small></td>'
-        for head, (image, caption) in zip(heads, pictures, strict=True)
-    )
-    return f"<tr><th>{escape(row.name)}</th>{cells}</tr>"
+    return [(png_url(image), caption) for image, caption in pictures]
 
 
-def _quality_table(methods: Mapping[str, Mapping]) -> str:
+def _quality_table(methods: Mapping[str, Mapping]) -> Table:
     """Methods against metrics and counts; columns that no method has are left out."""
-    quality = [name for name in QUALITY if any(name in scores for scores in methods.values())]
-    counts = [name for name in COUNTS if any(name in scores for scores in methods.values())]
-    heads = ["", *map(_head, quality), *(COUNTS[name] for name in counts)]
+    quality, counts = ([name for name in of if any(name in s for s in methods.values())] for of in (QUALITY, COUNTS))
     columns = [_quality_column(name, methods.values()) for name in quality]
-    columns += [[escape(str(s.get(name, ""))) for s in methods.values()] for name in counts]
-    names = [escape(METHODS.get(method, method)) for method in methods]
-    return _table(heads, list(zip(names, *columns, strict=True)))
+    columns += [[Cell(str(scores.get(name, ""))) for scores in methods.values()] for name in counts]
+    names = [METHODS.get(method, method) for method in methods]
+    heads = [*map(_head, quality), *(COUNTS[name] for name in counts)]
+    return Table("Quality", QUALITY_NOTE, heads, list(zip(names, zip(*columns, strict=True), strict=True)))
 
 
-def _quality_column(name: str, methods: Iterable[Mapping]) -> list[str]:
+def _quality_column(name: str, methods: Iterable[Mapping]) -> list[Cell]:
     """The cells of a metric: the mean and, below it, its interval."""
     _, decimals, better = QUALITY[name]
-    means = _bold_best([scores.get(name) for scores in methods], decimals, better, _missing(name))
+    means = _with_best([scores.get(name) for scores in methods], decimals, better, _missing(name))
     intervals = [_interval(scores.get(f"{name}_interval"), decimals) for scores in methods]
-    return [f"{mean}{interval}" for mean, interval in zip(means, intervals, strict=True)]
+    return [mean._replace(small=interval) for mean, interval in zip(means, intervals, strict=True)]
 
 
-def lowered(method: str) -> str:
-    """A method's name inside a sentence."""
-    name = METHODS.get(method, method)
-    return name if name[:2].isupper() else name[:1].lower() + name[1:]
-
-
-def _difference_table(first: str, minus: Mapping[str, Mapping]) -> str:
+def _difference_table(first: str, minus: Mapping[str, Mapping]) -> Table:
     """Other methods against the difference in each metric."""
     names = [name for name in QUALITY if any(name in row for row in minus.values())]
-    rows = []
-    for method, row in minus.items():
-        cells = [_difference(row.get(name), name) for name in names]
-        rows.append((f"{escape(METHODS.get(first, first))} minus {escape(lowered(method))}", *cells))
-    return _table(["", *map(_head, names)], rows)
+    rows = [
+        (f"{METHODS.get(first, first)} minus {lowered(method)}", [_difference(row.get(name), name) for name in names])
+        for method, row in minus.items()
+    ]
+    return Table("Differences", DIFFERENCES_NOTE, [*map(_head, names)], rows)
 
 
-def _difference(found: Mapping | None, name: str) -> str:
+def _difference(found: Mapping | None, name: str) -> Cell:
     if found is None:
-        return _missing(name)
-    decimals = QUALITY[name][1]
-    p_value = found["p_value"]
-    test = (
-        "" if p_value is None else f"<small>p {'= ' if p_value >= 0.001 else '&lt; '}{max(p_value, 0.001):.3f}</small>"
-    )
-    return f"{found['mean']:+.{decimals}f}{_interval(found['interval'], decimals, sign='+')}{test}"
+        return Cell(_missing(name))
+    decimals, p_value = QUALITY[name][1], found["p_value"]
+    test = () if p_value is None else (f"p {'=' if p_value >= 0.001 else '<'} {max(p_value, 0.001):.3f}",)
+    return Cell(f"{found['mean']:+.{decimals}f}", (*_interval(found["interval"], decimals, sign="+"), *test))
+
+
+def _category_table(per_category: Mapping[str, Mapping]) -> Table:
+    """Categories against the PSNR of every method."""
+    methods = list(dict.fromkeys(method for scores in per_category.values() for method in scores))
+    rows = []
+    for category, scores in per_category.items():
+        objects = next((s["objects"] for s in scores.values() if "objects" in s), "")
+        values = [scores.get(method, {}).get("psnr") for method in methods]
+        rows.append((category, [*_with_best(values, 2), Cell(str(objects))]))
+    heads = [*(METHODS.get(method, method) for method in methods), "Objects"]
+    return Table("Quality by category", "PSNR in dB.", heads, rows)
 
 
 def _head(name: str) -> str:
@@ -234,37 +239,15 @@ def _missing(name: str) -> str:
     return NO_WEIGHTS if name == "lpips" else "n/a"
 
 
-def _interval(ends: Sequence[float] | None, decimals: int, sign: str = "") -> str:
-    if ends is None:
-        return ""
-    low, high = (f"{end:{sign}.{decimals}f}" for end in ends)
-    return f"<small>[{low}, {high}]</small>"
+def _interval(ends: Sequence[float] | None, decimals: int, sign: str = "") -> tuple[str, ...]:
+    return () if ends is None else (f"[{', '.join(f'{end:{sign}.{decimals}f}' for end in ends)}]",)
 
 
-def _category_table(per_category: Mapping[str, Mapping]) -> str:
-    """Categories against the PSNR of every method."""
-    methods = list(dict.fromkeys(method for scores in per_category.values() for method in scores))
-    rows = []
-    for category, scores in per_category.items():
-        objects = next((s["objects"] for s in scores.values() if "objects" in s), "")
-        values = [scores.get(method, {}).get("psnr") for method in methods]
-        rows.append((escape(category), *_bold_best(values, 2), escape(str(objects))))
-    return _table(["", *(METHODS.get(method, method) for method in methods), "Objects"], rows)
-
-
-def _bold_best(values: Sequence[float | None], decimals: int, better: int = HIGHER, missing: str = "n/a") -> list[str]:
-    """The values as text, the best in bold; what is missing or not a number is said to be so."""
+def _with_best(values: Sequence[float | None], decimals: int, better: int = HIGHER, missing: str = "n/a") -> list[Cell]:
+    """The values, the best marked; what is missing or not a number is said to be so."""
     finite = [value for value in values if value is not None and math.isfinite(value)]
     best = max(finite, default=None, key=lambda value: better * value)
-    texts: dict[float | None, str] = {value: f"{value:.{decimals}f}" for value in finite}
-    return [f"<b>{texts[v]}</b>" if v is not None and v == best else texts.get(v, missing) for v in values]
-
-
-def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table of cells that are HTML already; the first column names the rows."""
-    head = "".join(f"<th>{escape(text)}</th>" for text in heads)
-    body = "".join(f"<tr><th>{name}</th>{''.join(f'<td>{cell}</td>' for cell in cells)}</tr>" for name, *cells in rows)
-    return f'<table class="numbers"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>'
+    return [Cell(f"{v:.{decimals}f}", best=v == best) if v in finite else Cell(missing) for v in values]
 
 
 def _run_facts(metrics: Mapping) -> dict[str, object]:
@@ -275,8 +258,3 @@ def _run_facts(metrics: Mapping) -> dict[str, object]:
     if "time to total" in times:
         times["time in total"] = times.pop("time to total")
     return flatten(facts) | times
-
-
-def _definitions(entries: Mapping[str, object]) -> str:
-    items = "".join(f"<div><dt>{escape(str(k))}</dt><dd>{escape(str(v))}</dd></div>" for k, v in entries.items())
-    return f"<dl>{items}</dl>"

@@ -1,4 +1,8 @@
-"""The look of the report: one style sheet, light, no fonts or files from elsewhere."""
+"""The look of pages: one style sheet, light, no fonts or files from elsewhere; and their templates."""
+
+from pathlib import Path
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 
 STYLE = """
 :root { --ink: #1d2330; --soft: #5b6475; --line: #e3e7ee; --paper: #fff; --ground: #f5f6f8; --accent: #2457d6 }
@@ -54,3 +58,14 @@ dd { margin: 0; max-width: 65%; text-align: right; overflow-wrap: anywhere }
 }
 @media print { body { background: none } header, section { border: 0; padding: 10px 0 } tr { break-inside: avoid } }
 """
+
+
+def template(path: Path) -> Template:
+    """The template of a page in a file; a name that it uses and is not given is an error."""
+    return Environment(
+        loader=FileSystemLoader(path.parent),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    ).get_template(path.name)

@@ -7,22 +7,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from urllib.parse import quote
 
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
-
 from spnr_jax.formats.images import write_whole
+from spnr_jax.scoring.report_style import template
 from spnr_jax.tools.catalogue_files import Item, standing
 
 PER_PAGE = 200  # files on a page
 MOST_PICTURES = 4  # of a file on it
 FILM = "_turntable."
 NOT_PICTURES = ("_depth.png", "_depth_16bit.png", "_opacity.png")
-ENVIRONMENT = Environment(
-    loader=FileSystemLoader(Path(__file__).parent),
-    autoescape=True,
-    undefined=StrictUndefined,
-    trim_blocks=True,
-    lstrip_blocks=True,
-)
 
 
 def write_pages(items: Sequence[Item], out: Path, options: str, faults: Mapping[str, str]) -> Path:
@@ -30,7 +22,7 @@ def write_pages(items: Sequence[Item], out: Path, options: str, faults: Mapping[
     parts = [items[i : i + PER_PAGE] for i in range(0, len(items), PER_PAGE)]
     names = [_name(number) for number in range(len(parts))]
     for number, part in enumerate(parts):
-        text = ENVIRONMENT.get_template("catalogue_page.html").render(
+        text = template(Path(__file__).with_name("catalogue_page.html")).render(
             entries=[_entry(item, out, options, faults) for item in part],
             faults=faults,
             count=len(items),

@@ -104,7 +104,7 @@ class Export:
     quality: Literal["draft", "balanced", "best", "trained"] = "best"
     """As for `spnr render`."""
     reach: int = 4
-    """Voxels around points that are looked at, 1 to 4: 1.6 times their median distance, rounded up, loses nothing."""
+    """Sampling radius around the points in voxels, 1 to 4: 1.6 times their median spacing, rounded up, is lossless."""
     platforms: tuple[Literal["cpu", "cuda", "rocm", "tpu"], ...] = ("cpu",)
     """Where the functions are to run."""
 
@@ -124,7 +124,7 @@ class Export:
 
 @dataclass(frozen=True, kw_only=True)
 class View:
-    """Look at a point cloud or mesh file in the browser: its points and what a network makes of them, edited live."""
+    """View and edit a point cloud or mesh file in the browser, beside the network's rendering."""
 
     cloud: tyro.conf.Positional[Path]
     """What `spnr render` reads."""

@@ -15,15 +15,13 @@ from scipy.spatial import cKDTree
 from spnr_jax.errors import UserError
 from spnr_jax.formats import images
 from spnr_jax.formats.clouds import PlacedCloud
-from spnr_jax.formats.glb import packed
+from spnr_jax.formats.glb import Buffer
 from spnr_jax.tools.grids import Grid
 
 SURFACE = 0.5  # solidity
 NEAREST = 4  # points whose materials a vertex takes the mean of
 RAMP = 52  # texels along each side of the ramp: steps of 5 in 8 bits, so what lies between them is exact
-FLOAT, UNSIGNED, ARRAY_BUFFER, INDEX_BUFFER = 5126, 5125, 34962, 34963  # numbers of the glTF specification
-LINEAR, CLAMPED = 9729, 33071
-KINDS = {1: "SCALAR", 2: "VEC2", 3: "VEC3"}
+ARRAY_BUFFER, INDEX_BUFFER, LINEAR, CLAMPED = 34962, 34963, 9729, 33071  # numbers of the glTF specification
 
 
 class Solid(NamedTuple):
@@ -56,7 +54,7 @@ def mesh_of(grid: Grid, placed: PlacedCloud) -> Solid:
         "TEXCOORD_0": (np.stack([roughness, metallic], axis=-1) * (RAMP - 1) + 0.5) / RAMP,
     }
     arrays = {name: np.asarray(values, np.float32) for name, values in columns.items()}
-    return Solid(glb(arrays | {"indices": faces.astype(np.uint32).ravel()}, grid.origin), len(faces), is_closed(faces))
+    return Solid(glb(arrays, faces.astype(np.uint32).ravel(), grid.origin), len(faces), is_closed(faces))
 
 
 def normals_of(
@@ -85,36 +83,24 @@ def ramp() -> Float[np.ndarray, "metallic roughness 3"]:
     return np.stack([np.zeros_like(roughness), roughness, metallic], axis=-1)
 
 
-def glb(arrays: dict[str, np.ndarray], translation: np.ndarray) -> bytes:
+def glb(arrays: dict[str, np.ndarray], indices: np.ndarray, translation: np.ndarray) -> bytes:
     """A binary glTF 2.0 file of one mesh; vertex colours are linear, as glTF has them."""
-    views: list[dict] = []
-    accessors: list[dict] = []
-    chunks: list[bytes] = []
-
-    def added(data: bytes, **more: int) -> int:
-        views.append({"buffer": 0, "byteOffset": sum(map(len, chunks)), "byteLength": len(data), **more})
-        chunks.append(data + bytes(-len(data) % 4))
-        return len(views) - 1
-
-    for name, array in arrays.items():
-        is_index = name == "indices"
-        view = added(np.ascontiguousarray(array).tobytes(), target=INDEX_BUFFER if is_index else ARRAY_BUFFER)
-        kind = {"componentType": UNSIGNED if is_index else FLOAT, "type": KINDS[array.size // len(array)]}
-        ends = {"min": array.min(axis=0).tolist(), "max": array.max(axis=0).tolist()} if name == "POSITION" else {}
-        accessors.append({"bufferView": view, "count": len(array)} | kind | ends)
-    attributes = {name: number for number, name in enumerate(arrays) if name != "indices"}
+    buffer = Buffer()
+    primitive = {
+        "attributes": buffer.attributes(arrays, target=ARRAY_BUFFER),
+        "indices": buffer.accessor(indices, target=INDEX_BUFFER),
+        "material": 0,
+    }
     shine = {"metallicRoughnessTexture": {"index": 0}, "metallicFactor": 1, "roughnessFactor": 1}
     document = {
         "asset": {"version": "2.0", "generator": "spnr_jax"},
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0} | ({"translation": translation.tolist()} if translation.any() else {})],
-        "meshes": [{"primitives": [{"attributes": attributes, "indices": len(attributes), "material": 0}]}],
+        "meshes": [{"primitives": [primitive]}],
         "materials": [{"pbrMetallicRoughness": shine}],
         "textures": [{"source": 0, "sampler": 0}],
-        "images": [{"bufferView": added(images.png(ramp())), "mimeType": "image/png"}],
+        "images": [{"bufferView": buffer.view(images.png(ramp())), "mimeType": "image/png"}],
         "samplers": [{"magFilter": LINEAR, "minFilter": LINEAR, "wrapS": CLAMPED, "wrapT": CLAMPED}],
-        "accessors": accessors,
-        "bufferViews": views,
     }
-    return packed(document, b"".join(chunks))
+    return buffer.glb(document)

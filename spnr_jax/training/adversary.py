@@ -23,14 +23,14 @@ def discriminator_of(config: TrainConfig) -> Discriminator:
     return Discriminator(config.loss.discriminator_width, config.model.encoder.num_groups, config.model.bf16)
 
 
-def logits(config: TrainConfig, params: dict, image: Array, condition: Array, mask: Array) -> Array:
+def logits(config: TrainConfig, params: dict, image: AnyArray, condition: AnyArray, mask: AnyArray) -> Array:
     """What the discriminator says of the images under its parameters."""
     if not config.loss.condition:
         condition, mask = jnp.zeros_like(condition), jnp.zeros_like(mask)
-    return discriminator_of(config).bind({"params": params})(image, condition, mask)
+    return discriminator_of(config).bind({"params": params})(*map(jnp.asarray, (image, condition, mask)))
 
 
-def discriminator_loss(config: TrainConfig, params: dict, fake: Array, batch: Batch, step: Array):
+def discriminator_loss(config: TrainConfig, params: dict, fake: AnyArray, batch: Batch, step: Array):
     """(loss, metrics) of the discriminator on references and renderings; R1 every r1_interval steps."""
     real, condition, mask = (flatten_views(x) for x in (batch.image, batch.condition, batch.condition_mask))
     both = logits(config, params, *(jnp.concatenate(x) for x in ((real, fake), (condition,) * 2, (mask,) * 2)))

@@ -22,6 +22,7 @@ from spnr_jax.config import TrainConfig
 from spnr_jax.devices import allocator
 from spnr_jax.errors import UserError
 from spnr_jax.formats.config_json import from_dict, to_dict
+from spnr_jax.formats.images import write_whole
 from spnr_jax.training import optimisation
 
 KEPT = 3  # newest checkpoints that stay
@@ -31,7 +32,7 @@ KEPT = 3  # newest checkpoints that stay
 def alone(run: Path) -> Iterator[None]:
     """While it lasts no other process trains in the run folder, which is made; ValueError if one does already.
 
-    The operating system opens the lock when its process ends, however it ends.
+    The operating system releases the lock when the process exits, however it exits.
     """
     import fcntl  # Windows has none
 
@@ -55,10 +56,7 @@ def write_config(run: Path, config: TrainConfig) -> None:
                 f"{run} holds a run with another config ({'; '.join(changed[:4])}); choose a new run folder"
             )
         return
-    run.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_suffix(".partial")
-    temporary.write_text(json.dumps(to_dict(config), indent=2) + "\n")
-    temporary.replace(path)
+    write_whole(path, (json.dumps(to_dict(config), indent=2) + "\n").encode())
 
 
 def _differences(stored: dict, wanted: dict, path: str = "") -> list[str]:

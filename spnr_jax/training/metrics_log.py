@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from spnr_jax.formats.images import to_uint8
+from spnr_jax.formats.images import to_uint8, write_whole
 
 
 class MetricsLog:
@@ -18,9 +18,7 @@ class MetricsLog:
 
         path = run / "metrics.jsonl"
         kept = [row for row in read_rows(run) if row["step"] <= first_step]
-        temporary = path.with_suffix(".partial")
-        temporary.write_text("".join(json.dumps(row) + "\n" for row in kept))
-        temporary.replace(path)
+        write_whole(path, "".join(json.dumps(row) + "\n" for row in kept).encode())
         self._file = path.open("a")
         self._board = SummaryWriter(str(run / "tensorboard"), purge_step=first_step + 1)
 

@@ -27,7 +27,7 @@ from spnr_jax.config import TrainConfig
 from spnr_jax.errors import UserError
 from spnr_jax.kernels import losses
 from spnr_jax.kernels.metrics import psnr
-from spnr_jax.kernels.records import Batch, Key
+from spnr_jax.kernels.records import AnyArray, Batch, Key
 from spnr_jax.method.inference import init, network
 from spnr_jax.training import adversary, pixels
 
@@ -163,6 +163,57 @@ def reconstruction_loss(
     return error + config.loss.mse_weight * losses.mse(image, reference) if config.loss.mse_weight else error
 
 
+def forward(
+    config: TrainConfig, state: TrainState, batch: Batch, key: Key, params: dict
+) -> tuple[tuple[Array, Array, dict], tuple[dict, Array | None]]:
+    """Image, low-resolution image, losses of the network's own; and, without gradient, statistics and pixels seen."""
+    rendering, updated = network(config.model).apply(
+        {"params": params, "batch_stats": state.batch_stats},
+        batch.cloud,
+        batch.camera,
+        key,
+        train=True,
+        mutable=["batch_stats", "losses"],
+    )
+    sown = {name: value for name, (value,) in updated.get("losses", {}).items()}
+    if config.loss.opacity_weight:
+        opacity = losses.area_downsample(jnp.asarray(batch.alpha)[..., None], rendering.acc.shape[-1])[..., 0]
+        sown["opacity"] = config.loss.opacity_weight * losses.mse(rendering.acc, opacity)
+    seen = rendering.acc > 0 if config.loss.masked else None
+    return (rendering.image, rendering.image_lr, sown), (updated.get("batch_stats", {}), seen)
+
+
+def discriminator_step(
+    config: TrainConfig, state: TrainState, fake: AnyArray, batch: Batch, lr_scale: Array | None
+) -> tuple[dict, tuple, dict[str, Array]]:
+    """The discriminator and its optimiser after one step on references and renderings, and its metrics."""
+    gradient, metrics = jax.grad(partial(adversary.discriminator_loss, config), has_aux=True)(
+        state.discriminator, fake, batch, state.step
+    )
+    update, optimizer = optimizers(config)[1].update(gradient, state.discriminator_optimizer)
+    return optax.apply_updates(state.discriminator, _scaled(update, lr_scale)), optimizer, metrics
+
+
+def generator_loss(
+    config: TrainConfig,
+    batch: Batch,
+    seen: Array | None,
+    discriminator: dict | None,
+    image: Array,
+    image_lr: Array,
+    sown: dict[str, Array],
+) -> Float[Array, ""]:
+    """Errors of a rendering, losses of the network's own, and the adversarial loss if there is a discriminator."""
+    loss = reconstruction_loss(config, image, image_lr, jnp.asarray(batch.image), seen)
+    for term in sown.values():
+        loss = loss + term
+    if discriminator is not None:
+        views = (adversary.flatten_views(x) for x in (image, batch.condition, batch.condition_mask))
+        fake_logits = adversary.logits(config, discriminator, *views)
+        loss = loss + config.loss.adversarial_weight * losses.generator_adversarial(fake_logits)
+    return loss
+
+
 def train_step(
     state: TrainState,
     batch: Batch,
@@ -176,56 +227,24 @@ def train_step(
     `lr_scale` multiplies both learning rates, which are static: as an array it may be one for each run under vmap.
     """
     key = jax.random.fold_in(state.key, state.step)
-    if config.pixel_stride > 1:
-        key, lattice_key = jax.random.split(key)
-        batch = pixels.lattice(lattice_key, batch, config.pixel_stride)
-    if config.crop:
-        key, crop_key = jax.random.split(key)
-        batch = pixels.cropped(crop_key, batch, config.crop)
-    module, reference = network(config.model), jnp.asarray(batch.image)
-    generator_adam, discriminator_adam = optimizers(config)
-
-    def forward(params):
-        variables = {"params": params, "batch_stats": state.batch_stats}
-        rendering, updated = module.apply(
-            variables, batch.cloud, batch.camera, key, train=True, mutable=["batch_stats", "losses"]
-        )
-        sown = {name: value for name, (value,) in updated.get("losses", {}).items()}
-        if config.loss.opacity_weight:
-            opacity = losses.area_downsample(jnp.asarray(batch.alpha)[..., None], rendering.acc.shape[-1])[..., 0]
-            sown["opacity"] = config.loss.opacity_weight * losses.mse(rendering.acc, opacity)
-        seen = rendering.acc > 0 if config.loss.masked else None
-        return (rendering.image, rendering.image_lr, sown), (updated.get("batch_stats", {}), seen)
-
-    (image, image_lr, sown), pull_back, (batch_stats, seen) = jax.vjp(forward, state.generator, has_aux=True)
+    key, batch = pixels.chosen(key, batch, config)
+    (image, image_lr, sown), pull_back, (batch_stats, seen) = jax.vjp(
+        partial(forward, config, state, batch, key), state.generator, has_aux=True
+    )
+    reference = jnp.asarray(batch.image)
     metrics = {"psnr": jnp.mean(psnr(image, reference)), "l1": losses.l1(image, reference)}
     discriminator, discriminator_optimizer = state.discriminator, state.discriminator_optimizer
     if adversarial:
         fake = adversary.flatten_views(image)
-        gradient, more = jax.grad(partial(adversary.discriminator_loss, config), has_aux=True)(
-            discriminator, fake, batch, state.step
-        )
-        update, discriminator_optimizer = discriminator_adam.update(gradient, discriminator_optimizer)
-        update = _scaled(update, lr_scale)
-        discriminator = optax.apply_updates(discriminator, update)
+        discriminator, discriminator_optimizer, more = discriminator_step(config, state, fake, batch, lr_scale)
         metrics |= more
-
-    def whole_loss(image, image_lr, sown):
-        loss = reconstruction_loss(config, image, image_lr, reference, seen)
-        for term in sown.values():
-            loss = loss + term
-        if adversarial:
-            views = (adversary.flatten_views(x) for x in (image, batch.condition, batch.condition_mask))
-            fake_logits = adversary.logits(config, discriminator, *views)
-            loss = loss + config.loss.adversarial_weight * losses.generator_adversarial(fake_logits)
-        return loss
-
-    loss, cotangents = jax.value_and_grad(whole_loss, argnums=(0, 1, 2))(image, image_lr, sown)
+    loss, cotangents = jax.value_and_grad(
+        partial(generator_loss, config, batch, seen, discriminator if adversarial else None), argnums=(0, 1, 2)
+    )(image, image_lr, sown)
     (gradient,) = pull_back(cotangents)
-    update, generator_optimizer = generator_adam.update(gradient, state.generator_optimizer)
+    update, generator_optimizer = optimizers(config)[0].update(gradient, state.generator_optimizer)
     generator = optax.apply_updates(state.generator, _scaled(update, lr_scale))
     metrics |= {"loss": loss, "gradient_norm": optax.tree.norm(gradient)} | sown
-
     averaged, averaged_stats = moving_average(
         (state.averaged, state.averaged_stats), (generator, batch_stats), state.step, config.optimizer.ema_decay
     )

@@ -6,7 +6,19 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from spnr_jax.config import TrainConfig
 from spnr_jax.kernels.records import Batch, Camera, Key
+
+
+def chosen(key: Key, batch: Batch, config: TrainConfig) -> tuple[Key, Batch]:
+    """The key of what else a step draws, and the batch with the pixels that it renders."""
+    if config.pixel_stride > 1:
+        key, lattice_key = jax.random.split(key)
+        batch = lattice(lattice_key, batch, config.pixel_stride)
+    if config.crop:
+        key, crop_key = jax.random.split(key)
+        batch = cropped(crop_key, batch, config.crop)
+    return key, batch
 
 
 def lattice(key: Key, batch: Batch, stride: int) -> Batch:

@@ -81,94 +81,141 @@ def train(
     """
     allocator.few_arenas()
     own = None if mesh is None else placement.own_objects(mesh, config.batch_objects)
-    with ExitStack() as stack:
-        try:
-            placement.first_alone(lambda: stack.enter_context(checkpoint.alone(run)))
-            placement.first_alone(lambda: checkpoint.write_config(run, config))
-            tell = on_event or (lambda *event: None)
-            return _train(config, dataset, run, schedule, mesh, own, init, tell, light)
-        except OSError as error:
-            error.filename = error.filename or str(run)  # writing to a full disk does not say where
-            raise
-        except jax.errors.JaxRuntimeError as error:
-            raise placement.lost(error, run) from None
-
-
-def _train(
-    config: TrainConfig,
-    dataset: data_sets.Dataset,
-    run: Path,
-    schedule: Schedule,
-    mesh: Mesh | None,
-    own: range | None,
-    init: Trained | None,
-    tell: OnEvent,
-    light: Light | None,
-) -> optimisation.TrainState:
-    clock, leads = Clock(), placement.leads()
-    say: Callable[[str], object] = tqdm.write if leads else lambda line: None
-    with placement.using(mesh):
-        sharding = None if mesh is None else placement.replicated(mesh)
-        state = checkpoint.restore(run, config, say, sharding) or new_state(config, init)
-    first = int(state.step)
-    if first >= config.num_steps:
-        say(f"{run} is finished: {first} steps")
-        return state
-    if first:
-        say(f"resuming {run} at step {first} of {config.num_steps}")
-    task = work.work_of(config, dataset, run, mesh, own, light, state)
-    state = state if first else task.begin(state)
-    agreed = placement.Agreement(mesh)
-    pending: list[tuple[int, dict]] = []
-    with (
-        stop_requests() as requests,
-        closing(MetricsLog(run, first) if leads else Unwritten()) as log,
-        closing(task.batches(first)) as batches,
-        tqdm(total=config.num_steps, initial=first, unit="step", mininterval=1, disable=not leads) as bar,
-    ):
-        record = RunRecord(run, dataset, first, init) if leads else Unwritten()
+    with claimed(run, config), ExitStack() as stack:
+        clock = Clock()
+        state = begun(config, run, mesh, init)
+        if (first := int(state.step)) >= config.num_steps:
+            return state
+        task = work.work_of(config, dataset, run, mesh, own, light, state)
+        state = state if first else task.begin(state)
+        agreed, tell = placement.Agreement(mesh), on_event or (lambda *event: None)
+        requests = stack.enter_context(stop_requests())
+        progress = Progress(config, dataset, run, schedule, first, init, clock, tell, light)
+        stack.callback(progress.close)
+        batches = stack.enter_context(closing(task.batches(first)))
         clock.lap("restore")
         for step, batch in enumerate(batches, start=first):
             tell("step", step, batch)
             state, metrics = task.step(state, batch, step)
-            pending.append((step + 1, metrics))
-            bar.update()
-            if step == first:
-                jax.block_until_ready(metrics)
-                clock.lap("compilation")
-            last, stopping = step + 1 == config.num_steps, agreed(bool(requests))
-            save = last or stopping or (step + 1) % schedule.checkpoint_every == 0
-            if save or (step + 1) % schedule.log_every == 0:
-                rows = check_finite(jax.device_get(pending))
-                if save:
-                    check_state(state)
-                seconds, timed = clock.lap("steps"), [at for at, _ in rows if at > first + 1]
-                pace = 1000 * (seconds / len(timed) if timed else clock.seconds["compilation"])
-                row = {"step": step + 1, **mean_row(rows), "ms_per_step": round(pace, 2)}
-                tell("row", step + 1, row)
-                log.write(row)
-                bar.set_postfix(loss=f"{rows[-1][1]['loss']:.2f}", psnr=f"{rows[-1][1]['psnr']:.1f}", refresh=False)
-                pending = []
-            if leads and (last or (step + 1) % schedule.preview_every == 0):
-                tell("preview", step + 1, None)
-                scores, picture = preview(state, config, dataset, run, light)
-                log.write({"step": step + 1, **scores}, picture)
-                allocator.give_back()
-                clock.lap("previews")
+            done = step + 1
+            progress.step(done, metrics)
+            last, stopping = done == config.num_steps, agreed(bool(requests))
+            save = last or stopping or done % schedule.checkpoint_every == 0
+            progress.show(state, save, last)
             if last:
                 task.finish(state)
             if save:  # after the rows up to this step, which a run that goes on from here will not write again
-                tell("checkpoint", step + 1, None)
-                checkpoint.save(run, state)
-                clock.lap("checkpoints")
-                record.write(step + 1, clock)
+                progress.checkpoint(state)
             if last or stopping:
-                tell("end", step + 1, None)
+                tell("end", done, None)
             if stopping and not last:
                 raise KeyboardInterrupt(
-                    f"stopped at step {step + 1} of {config.num_steps}; the same command goes on from there"
+                    f"stopped at step {done} of {config.num_steps}; the same command goes on from there"
                 )
     return state
+
+
+@contextmanager
+def claimed(run: Path, config: TrainConfig) -> Iterator[None]:
+    """The run folder is this training's alone; errors of the disk and of other processes name it."""
+    try:
+        with ExitStack() as stack:
+            placement.first_alone(lambda: stack.enter_context(checkpoint.alone(run)))
+            placement.first_alone(lambda: checkpoint.write_config(run, config))
+            yield
+    except OSError as error:
+        error.filename = error.filename or str(run)  # writing to a full disk does not say where
+        raise
+    except jax.errors.JaxRuntimeError as error:
+        raise placement.lost(error, run) from None
+
+
+def begun(config: TrainConfig, run: Path, mesh: Mesh | None, init: Trained | None) -> optimisation.TrainState:
+    """The state to go on with, and a line about it: of the newest checkpoint, or before the first step."""
+    say: Callable[[str], object] = tqdm.write if placement.leads() else lambda line: None
+    with placement.using(mesh):
+        sharding = None if mesh is None else placement.replicated(mesh)
+        state = checkpoint.restore(run, config, say, sharding) or new_state(config, init)
+    if (step := int(state.step)) >= config.num_steps:
+        say(f"{run} is finished: {step} steps")
+    elif step:
+        say(f"resuming {run} at step {step} of {config.num_steps}")
+    return state
+
+
+class Progress:
+    """What the loop writes of itself: rows, previews, checkpoints; `tell` is told before each."""
+
+    def __init__(
+        self,
+        config: TrainConfig,
+        dataset: data_sets.Dataset,
+        run: Path,
+        schedule: Schedule,
+        first: int,
+        init: Trained | None,
+        clock: Clock,
+        tell: OnEvent,
+        light: Light | None,
+    ) -> None:
+        """Opens the log, and the bar of the process that shows one."""
+        leads = placement.leads()
+        self._of, self._schedule = (config, dataset, run, light), schedule
+        self._first, self._done, self._clock, self._tell = first, first, clock, tell
+        self._record = RunRecord(run, dataset, first, init) if leads else Unwritten()
+        self._log = MetricsLog(run, first) if leads else Unwritten()
+        self._bar = tqdm(total=config.num_steps, initial=first, unit="step", mininterval=1, disable=not leads)
+        self._pending: list[tuple[int, dict]] = []
+
+    def step(self, done: int, metrics: dict) -> None:
+        """Keeps a step's metrics for the next row; the first step is waited for, because it compiles."""
+        self._done = done
+        self._pending.append((done, metrics))
+        self._bar.update()
+        if done == self._first + 1:
+            jax.block_until_ready(metrics)
+            self._clock.lap("compilation")
+
+    def show(self, state: optimisation.TrainState, save: bool, last: bool) -> None:
+        """A row and a preview, where they are due."""
+        if save or self._done % self._schedule.log_every == 0:
+            self._row(state, save)
+        if placement.leads() and (last or self._done % self._schedule.preview_every == 0):
+            self._preview(state)
+
+    def _row(self, state: optimisation.TrainState, save: bool) -> None:
+        """The mean of the steps since the last row; NotFinite for one that is not, or for a state to be saved."""
+        rows = check_finite(jax.device_get(self._pending))
+        if save:
+            check_state(state)
+        seconds, timed = self._clock.lap("steps"), [at for at, _ in rows if at > self._first + 1]
+        pace = 1000 * (seconds / len(timed) if timed else self._clock.seconds["compilation"])
+        row, (_, newest) = {"step": self._done, **mean_row(rows), "ms_per_step": round(pace, 2)}, rows[-1]
+        self._tell("row", self._done, row)
+        self._log.write(row)
+        self._bar.set_postfix(loss=f"{newest['loss']:.2f}", psnr=f"{newest['psnr']:.1f}", refresh=False)
+        self._pending = []
+
+    def _preview(self, state: optimisation.TrainState) -> None:
+        """Pictures of a few objects, and their scores."""
+        self._tell("preview", self._done, None)
+        scores, picture = preview(state, *self._of)
+        self._log.write({"step": self._done, **scores}, picture)
+        allocator.give_back()
+        self._clock.lap("previews")
+
+    def checkpoint(self, state: optimisation.TrainState) -> None:
+        """The whole state, and how the time was spent."""
+        _, _, run, _ = self._of
+        self._tell("checkpoint", self._done, None)
+        checkpoint.save(run, state)
+        self._clock.lap("checkpoints")
+        self._record.write(self._done, self._clock)
+
+    def close(self) -> None:
+        """Closes bar and log."""
+        self._bar.close()
+        self._log.close()
 
 
 def new_state(config: TrainConfig, init: Trained | None) -> optimisation.TrainState:

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 from PIL import Image
-
-from data_gen.__main__ import main
+from support.command_line import spnr_data
 
 RESOLUTION = 48
 
@@ -25,10 +24,7 @@ def folder(tmp_path_factory):
     parts = [trimesh.creation.box(size, trimesh.transformations.translation_matrix(at)) for size, at in boxes]
     trimesh.util.concatenate(parts).export(base / "meshes" / "thing.ply")
     size = ["--resolution", RESOLUTION, "--views", 6, "--points", 4000, "--spp", 16, "--test-fraction", 0]
-    arguments = ["generate", base / "set", "--meshes", base / "meshes", *size, "--workers", 1]
-    with pytest.raises(SystemExit) as stopped:
-        main([str(argument) for argument in arguments])
-    assert stopped.value.code == 0
+    assert spnr_data("generate", base / "set", "--meshes", base / "meshes", *size, "--workers", 1) == 0
     return base / "set" / "objects" / "thing"
 
 

@@ -1,5 +1,7 @@
 """Points to volume and back: scatter by voxel, the sparse convolution, trilinear lookup."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,9 +14,8 @@ from spnr_jax.kernels.voxels import (
     locate,
     row_of,
     scatter_conv,
-    scatter_max,
     scatter_mean,
-    scatter_trilinear,
+    scattered,
     share_voxels,
     spread,
     trilinear,
@@ -26,6 +27,7 @@ FEATURES = numbers(1, 2, 3, 12, 2)
 MASK = np.random.default_rng(2).uniform(size=(2, 3, 12)) > 0.3
 VOLUME = numbers(3, D, D, D, 2)
 scatter = jax.jit(scatter_mean, static_argnums=3)
+scatter_max, scatter_trilinear = (partial(scattered, how) for how in ("max", "trilinear"))
 lookup = jax.jit(trilinear)
 
 
@@ -47,24 +49,6 @@ class TestLocate:
 
 
 class TestScatterMean:
-    def test_is_the_mean_of_a_list_per_voxel(self):
-        volume, occupancy = map(np.asarray, scatter(POSITIONS, FEATURES, jnp.asarray(MASK), D))
-        positions, features = np.asarray(POSITIONS), np.asarray(FEATURES)
-        for place in np.ndindex(2, 3):
-            expected = reference.scatter_mean(positions[place], features[place], MASK[place], D)
-            close((volume[place], occupancy[place]), expected)
-
-    def test_obeys_the_batch_law(self):
-        batch_law(lambda p, f, m: scatter_mean(p, f, m > 0.5, D), POSITIONS, FEATURES, jnp.asarray(MASK, jnp.float32))
-
-    def test_its_gradient_is_right_also_for_shared_voxels(self):
-        gradient_law(lambda f: scatter_mean(POSITIONS[0, 0], f, jnp.asarray(MASK[0, 0]), D), FEATURES[0, 0])
-
-    def test_the_order_of_the_points_does_not_matter(self):
-        order = np.random.default_rng(4).permutation(12)
-        shuffled = scatter(POSITIONS[0, 0, order], FEATURES[0, 0, order], jnp.asarray(MASK[0, 0, order]), D)
-        close(shuffled, scatter(POSITIONS[0, 0], FEATURES[0, 0], jnp.asarray(MASK[0, 0]), D))
-
     def test_the_order_of_points_in_voxels_of_their_own_does_not_matter_by_a_bit(self):
         cells = np.random.default_rng(9).permutation(D**3)[:12]
         positions = np.stack(np.unravel_index(cells, (D, D, D)), axis=-1).astype(np.float32) * (2 / D) - 1 + 0.1
@@ -77,19 +61,6 @@ class TestScatterMean:
 
     def test_is_the_adjoint_of_the_share_of_each_point(self):
         adjoint_law(lambda f: scatter_mean(POSITIONS[0, 0], f, jnp.asarray(MASK[0, 0]), D)[0], FEATURES[0, 0])
-
-    def test_padding_does_not_matter_whatever_it_holds(self):
-        def padded(fill):
-            extra = np.full((5, 3), fill, np.float32)
-            positions = np.concatenate([np.asarray(POSITIONS)[0, 0], extra])
-            features = np.concatenate([np.asarray(FEATURES)[0, 0], extra[:, :2]])
-            mask = np.concatenate([MASK[0, 0], np.zeros(5, bool)])
-            return scatter(jnp.asarray(positions), jnp.asarray(features), jnp.asarray(mask), D)
-
-        plain = scatter(POSITIONS[0, 0], FEATURES[0, 0], jnp.asarray(MASK[0, 0]), D)
-        same_bits(padded(0.0), plain)
-        same_bits(padded(1e30), plain)
-        same_bits(padded(np.nan), plain)
 
     @pytest.mark.parametrize(
         ("point", "kept"),
@@ -107,15 +78,6 @@ class TestScatterMean:
         assert volume.sum() == 2 * kept
         assert occupancy.sum() == kept
 
-    def test_all_masked_gives_zeros_and_zero_gradients(self):
-        def total(features):
-            volume, occupancy = scatter_mean(POSITIONS[0, 0], features, jnp.zeros(12, bool), D)
-            return jnp.sum(volume) + jnp.sum(occupancy)
-
-        value, gradient = jax.jit(jax.value_and_grad(total))(FEATURES[0, 0])
-        assert value == 0
-        assert (gradient == 0).all()
-
     @pytest.mark.parametrize("count", [1, 1000])
     def test_identical_points_are_one_point(self, count):
         positions = jnp.broadcast_to(jnp.array([0.3, -0.2, 0.9]), (count, 3))
@@ -126,10 +88,14 @@ class TestScatterMean:
 
 @pytest.mark.parametrize(
     ("kernel", "twin"),
-    [(scatter_max, reference.scatter_max), (scatter_trilinear, reference.scatter_trilinear)],
-    ids=["max", "trilinear"],
+    [
+        (scatter_mean, reference.scatter_mean),
+        (scatter_max, reference.scatter_max),
+        (scatter_trilinear, reference.scatter_trilinear),
+    ],
+    ids=["mean", "max", "trilinear"],
 )
-class TestOtherScatters:
+class TestScatters:
     cloud = POSITIONS[0, 0], FEATURES[0, 0], jnp.asarray(MASK[0, 0])
 
     def test_is_the_loop_over_points(self, kernel, twin):
@@ -170,7 +136,7 @@ class TestOtherScatters:
         assert all((x == 0).all() for x in empty)
 
     def test_is_the_sum_of_what_it_spreads_as_the_stem_reads_it(self, kernel, twin):
-        name = kernel.__name__.removeprefix("scatter_")
+        name = twin.__name__.removeprefix("scatter_")
         rows, values = spread(name, *self.cloud, D)
         volume, occupancy = kernel(*self.cloud, D)
         dense = jnp.concatenate([volume, occupancy[..., None]], axis=-1)

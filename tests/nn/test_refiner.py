@@ -21,7 +21,7 @@ from spnr_jax.method.inference import rays_per_side
 from spnr_jax.method.model import Model, at_quality
 from spnr_jax.model_config import RenderOptions
 from spnr_jax.nn.refiner import FOLD, LEAST, LEVELS, ODDS, Refiner
-from spnr_jax.training import optimisation, pixels, weights
+from spnr_jax.training import optimisation, weights
 
 SQUARE = FOLD * 2 ** (LEVELS - 1)  # pixels that the coarsest level takes as one
 REFINED = dataclasses.replace(PLUS, refiner_width=4)
@@ -263,27 +263,6 @@ class TestTraining:
         same_bits(state.averaged, state.generator)
         with pytest.raises(ValueError, match="of another network: shape of params/refiner/.*, needed none"):
             optimisation.begun_with(optimisation.jitted_create_state(plain), optimisation.averaged_variables(state))
-
-    def test_a_crop_is_a_square_of_picture_condition_and_rays(self):
-        batch, firsts = tiny_training.batch(), set()
-        made, whole = jax.jit(pixels.cropped, static_argnums=2), cameras.camera_rays(batch.camera).directions
-        for seed in range(6):
-            crop = made(jax.random.key(seed), batch, 10)
-            rays = cameras.camera_rays(crop.camera).directions
-            assert crop.image.shape == (*batch.image.shape[:2], 10, 10, 3)
-            distance = np.abs(np.asarray(whole[0, 0]) - np.asarray(rays[0, 0, 0, 0])).sum(-1)
-            row, column = np.unravel_index(distance.argmin(), distance.shape)
-            firsts.add((row, column))
-            inside = np.s_[:, :, row : row + 10, column : column + 10]
-            close(rays, whole[inside], atol=1e-6)
-            for name in ("image", "alpha", "condition", "condition_mask"):
-                same_bits(getattr(crop, name), getattr(batch, name)[inside])
-            same_bits(crop.cloud, batch.cloud)
-        assert len(firsts) > 3, "another place for another key"
-
-    def test_a_crop_as_large_as_the_view_is_the_view(self):
-        batch = tiny_training.batch()
-        same_bits(pixels.cropped(jax.random.key(0), batch, batch.image.shape[2]), batch)
 
 
 class TestConfig:

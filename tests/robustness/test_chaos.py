@@ -134,7 +134,7 @@ def test_a_write_that_does_not_say_where_is_given_the_run_folder(tmp_path, monke
     def full(*arguments):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(trainer, "_train", full)
+    monkeypatch.setattr(trainer, "begun", full)
     work = lambda: trainer.train(CONFIG, tiny_dataset.dataset(), tmp_path, tiny_dataset.SCHEDULE)  # noqa: E731
     assert cli.guarded(work, "spnr") == 2
     assert capsys.readouterr().err == f"spnr: {tmp_path}: No space left on device\n"

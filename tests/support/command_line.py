@@ -5,6 +5,10 @@ import importlib.util
 import sys
 from types import ModuleType
 
+import pytest
+
+import data_gen.__main__
+
 
 def unchecked_cli() -> ModuleType:
     """The module without executed annotations: tyro's mark of a missing value stands where a Path will be."""
@@ -15,6 +19,13 @@ def unchecked_cli() -> ModuleType:
         return _unchecked("spnr_jax.cli", "unchecked_cli")
     finally:
         sys.modules[name] = checked
+
+
+def spnr_data(*arguments: object) -> int:
+    """The exit code of `spnr-data` in this process."""
+    with pytest.raises(SystemExit) as stopped:
+        data_gen.__main__.main([str(argument) for argument in arguments])
+    return stopped.value.code
 
 
 def _unchecked(name: str, own: str) -> ModuleType:

@@ -7,6 +7,8 @@ import struct
 import numpy as np
 from PIL import Image
 
+from spnr_jax.formats.mesh.meshes import load_mesh
+
 COMPONENT = {"i1": 5120, "u1": 5121, "i2": 5122, "u2": 5123, "u4": 5125, "f4": 5126}
 KIND = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
 CORNERS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float32)  # a square that faces +z
@@ -99,3 +101,27 @@ def parts_of(content: bytes) -> tuple[dict, bytes]:
     assert content[:4] == b"glTF"
     size = struct.unpack_from("<I", content, 12)[0]
     return json.loads(content[20 : 20 + size]), content[20 + size + 8 :]
+
+
+UV = np.array([[0, 1], [1, 1], [1, 0], [0, 0]], np.float32)
+
+
+CHECKER = np.random.default_rng(0).integers(0, 256, (4, 6, 3))
+
+
+def one_square(tmp_path, builder=None, node=None, **primitive):
+    builder = builder or GltfBuilder()
+    builder.mesh(builder.primitive(**primitive), **(node or {}))
+    return load_mesh(builder.write(tmp_path / "square.glb"))
+
+
+def textured_square(tmp_path, info=None, factors=None, sampler=None, **attributes):
+    builder = GltfBuilder()
+    texture = builder.texture(CHECKER, **(sampler or {}))
+    pbr = {"baseColorTexture": {"index": texture, **(info or {})}, **(factors or {})}
+    return one_square(
+        tmp_path,
+        builder,
+        material=builder.material(pbrMetallicRoughness=pbr),
+        **({"TEXCOORD_0": UV} | attributes),
+    )

@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from spnr_jax.formats.clouds import read_cloud
+
 VERTEX = [("y", "double"), ("red", "uchar"), ("x", "float"), ("label", "short"), ("z", "float")]
 NUMPY = {"double": "f8", "uchar": "u1", "float": "f4", "short": "i2"}
 ROWS = [(0.125, 255, -1.5, -7, 3.0), (2.5, 0, 1e-3, 300, -4.25), (0.0, 7, 9.0, 0, 1.0)]
@@ -27,3 +29,18 @@ def sphere_points(seed: int, num_points: int) -> np.ndarray:
     """Points on a sphere, much denser at one pole."""
     points = np.random.default_rng(seed).normal(size=(num_points, 3)) + [0, 1.5, 0]
     return points / np.linalg.norm(points, axis=-1, keepdims=True)
+
+
+XYZRGB = [("x", "float"), ("y", "float"), ("z", "float"), ("red", "uchar"), ("green", "uchar"), ("blue", "uchar")]
+
+
+def write(folder, name: str, content: bytes | str):
+    path = folder / name
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    return path
+
+
+def read(path, **options):
+    """The cloud and the lines that it reported."""
+    lines: list[str] = []
+    return read_cloud(path, report=lines.append, **options), lines

@@ -22,6 +22,7 @@ SPLITS = {
     "val": ("ball_000003",),
     "test": ("ball_000004", "cube_000002", "chair"),
 }
+NAMES = SPLITS["train"]
 CONFIG = TrainConfig(
     preset="tiny",
     model=tiny_model.MODEL,
@@ -92,6 +93,11 @@ def folder() -> Path:
 def dataset() -> data_sets.Dataset:
     """The data set on disk; copy its folder to change it."""
     return data_sets.open_dataset(write_dataset(folder() / "data"))
+
+
+def one_object(name: str = NAMES[0]) -> data_sets.ObjectData:
+    """An object as it is read."""
+    return data_sets.read_object(dataset(), name)
 
 
 @functools.cache

@@ -10,6 +10,7 @@ from spnr_jax.config import LossConfig, OptimizerConfig, TrainConfig
 from spnr_jax.kernels.cameras import look_at, pinhole
 from spnr_jax.kernels.records import Batch, PointCloud
 from spnr_jax.training import optimisation
+from support.laws import close
 from support.tiny_model import MODEL, NUM_POINTS, SIZE
 
 CONFIG = TrainConfig(
@@ -71,3 +72,9 @@ def run(state, steps, config=CONFIG, data=BATCH):
     for _ in range(steps):
         state, metrics = step(state, config, data)
     return state, metrics
+
+
+def near(actual, expected):
+    """Gradients agree to a thousandth of the largest entry of each leaf."""
+    for ours, theirs in zip(jax.tree.leaves(actual), jax.tree.leaves(expected), strict=True):
+        close(ours, theirs, rtol=1e-3, atol=1e-3 * float(np.abs(theirs).max()) + 1e-9)

@@ -9,6 +9,7 @@ import numpy as np
 from spnr_jax.kernels.records import PointCloud
 from spnr_jax.method import inference
 from spnr_jax.method.model import Model
+from spnr_jax.viewer import session
 from spnr_jax.viewer.scene import Scene, open_scene
 from spnr_jax.viewer.session import State
 from spnr_jax.viewer.viewpoint import OPENCV, View, from_browser, to_browser
@@ -59,3 +60,11 @@ def view(azimuth: float = 0.0, width: int = 120, height: int = 60) -> View:
 def state(**changes) -> State:
     """Points beside the picture, drawn as small as the network draws."""
     return dataclasses.replace(State(scene=scene(), view=view(), size=48), **changes)
+
+
+def drawn(moving=False, **changes):
+    return session.draw(model(), state(**changes), moving)[1]
+
+
+def canvas(**changes):
+    return drawn(**changes).image

@@ -11,17 +11,17 @@ import optax
 import pytest
 from support.laws import close, numbers, same_bits
 from support.tiny_model import MODEL, PLUS, SIZE
-from support.tiny_training import BATCH, CONFIG, L1_ONLY, copied, create, run, step
+from support.tiny_training import BATCH, CONFIG, L1_ONLY, copied, create, near, run, step
 
 from spnr_jax.baselines import networks
 from spnr_jax.baselines.sizes import NPBGConfig
-from spnr_jax.config import LossConfig, OptimizerConfig
-from spnr_jax.kernels import cameras, losses
+from spnr_jax.config import LossConfig
+from spnr_jax.kernels import losses
 from spnr_jax.kernels.records import Rendering
 from spnr_jax.method import inference
 from spnr_jax.method.near_points import NearPointsNetwork
 from spnr_jax.method.paper_network import PaperNetwork
-from spnr_jax.training import adversary, many_runs, optimisation, pixels
+from spnr_jax.training import adversary, optimisation
 
 
 @pytest.fixture(scope="module")
@@ -32,12 +32,6 @@ def fresh():
 @pytest.fixture(scope="module")
 def fresh_l1():
     return create(L1_ONLY)
-
-
-def near(actual, expected):
-    """Gradients agree to a thousandth of the largest entry of each leaf."""
-    for ours, theirs in zip(jax.tree.leaves(actual), jax.tree.leaves(expected), strict=True):
-        close(ours, theirs, rtol=1e-3, atol=1e-3 * float(np.abs(theirs).max()) + 1e-9)
 
 
 def through_host(state):
@@ -173,37 +167,6 @@ class TestStep:
         assert (stats["variance"] != 1).all()
 
 
-class TestCondition:
-    def test_without_it_the_discriminator_sees_an_empty_image_and_mask(self, fresh):
-        blind = dataclasses.replace(CONFIG, loss=dataclasses.replace(CONFIG.loss, condition=False))
-        image, condition, mask = (x[:, 0] for x in (BATCH.image, BATCH.condition, BATCH.condition_mask))
-        empty = jnp.zeros_like(condition), jnp.zeros_like(mask)
-        seen, unseen, expected = (
-            jax.jit(adversary.logits, static_argnums=0)(config, fresh.discriminator, image, *inputs)
-            for config, inputs in ((CONFIG, (condition, mask)), (blind, (condition, mask)), (CONFIG, empty))
-        )
-        same_bits(unseen, expected)
-        assert (seen != unseen).any()
-
-
-class TestLazyR1:
-    @pytest.mark.parametrize(("at", "due"), [(0, True), (1, False), (2, True), (3, False)])
-    def test_the_penalty_comes_every_interval_and_is_scaled_by_it(self, fresh, at, due):
-        data, fake = BATCH, numbers(2, 2, SIZE, SIZE, 3)
-        real, condition, mask = data.image[:, 0], data.condition[:, 0], data.condition_mask[:, 0]
-
-        @jax.jit
-        def parts(params, step):
-            loss, metrics = adversary.discriminator_loss(CONFIG, params, fake, data, step)
-            module = adversary.discriminator_of(CONFIG)
-            penalty = losses.r1(lambda image: module.apply({"params": params}, image, condition, mask), real)
-            return loss - metrics["discriminator"], 2 * 10 * penalty
-
-        added, penalty = parts(fresh.discriminator, jnp.int32(at))
-        assert penalty > 0
-        close(added, penalty * due, rtol=1e-3, atol=1e-5)
-
-
 class TestAverage:
     def test_moves_by_a_decay_that_grows_from_a_tenth_to_its_end(self, fresh_l1):
         state = fresh_l1
@@ -223,59 +186,6 @@ class TestAverage:
         state, _ = run(fresh_l1, 3, L1_ONLY)
         variables = optimisation.averaged_variables(state)
         same_bits(variables, {"params": state.averaged, "batch_stats": state.averaged_stats})
-
-
-class TestLearningRate:
-    @pytest.mark.parametrize(("warmup", "steps"), [(10, 100), (0, 50), (500, 100), (1, 1)])
-    def test_rises_linearly_then_falls_by_a_cosine_to_its_last_share(self, warmup, steps):
-        o = OptimizerConfig(lr_generator=2e-3, warmup_steps=warmup, final_lr_scale=0.1)
-        rate = optimisation.learning_rate(dataclasses.replace(CONFIG, optimizer=o, num_steps=steps))
-        warmup = min(warmup, steps)
-        start = 2e-3 / max(warmup, 1)
-        for at in sorted({0, warmup // 2, warmup, (warmup + steps) // 2, steps - 1}):
-            if at <= warmup and warmup:
-                expected = start + (2e-3 - start) * at / warmup
-            else:
-                share = min((at - warmup) / (max(steps, warmup + 1) - warmup), 1)
-                expected = 2e-3 * (0.1 + 0.9 * 0.5 * (1 + np.cos(np.pi * share)))
-            assert float(rate(at)) == pytest.approx(expected, rel=1e-5)
-        assert float(rate(0)) > 0, "no step is lost"
-
-    def test_or_by_an_exponential(self):
-        """Point-NeRF's: a tenth after half a million of a million steps."""
-        o = OptimizerConfig(lr_generator=5e-4, warmup_steps=0, final_lr_scale=0.01, decay="exponential")
-        rate = optimisation.learning_rate(dataclasses.replace(CONFIG, optimizer=o, num_steps=1_000_000))
-        for at, expected in ((0, 5e-4), (500_000, 5e-5), (1_000_000, 5e-6)):
-            assert float(rate(at)) == pytest.approx(expected, rel=1e-4)
-
-    def test_the_algorithm_is_the_one_asked_for(self):
-        gradient, updates = jnp.array([0.5, -2.0]), {}
-        for name, algorithm in (("adam", optax.adam), ("radam", optax.radam)):
-            config = dataclasses.replace(CONFIG, optimizer=dataclasses.replace(CONFIG.optimizer, algorithm=name))
-            expected = algorithm(optimisation.learning_rate(config))
-            ours, _ = optimisation.optimizers(config)
-            updates[name], _ = ours.update(gradient, ours.init(gradient))
-            close(updates[name], expected.update(gradient, expected.init(gradient))[0])
-        assert (updates["adam"] != updates["radam"]).all()
-
-
-class TestLattice:
-    def test_is_every_so_many_th_pixel_of_picture_condition_and_rays(self):
-        made, firsts = jax.jit(pixels.lattice, static_argnums=2), set()
-        whole = cameras.camera_rays(BATCH.camera).directions
-        for seed in range(6):
-            thin = made(jax.random.key(seed), BATCH, 4)
-            assert thin.image.shape == (2, 1, SIZE // 4, SIZE // 4, 3)
-            rays = cameras.camera_rays(thin.camera).directions
-            distance = np.abs(np.asarray(whole[0, 0]) - np.asarray(rays[0, 0, 0, 0])).sum(-1)
-            row, column = np.unravel_index(distance.argmin(), distance.shape)
-            assert max(row, column) < 4
-            firsts.add((row, column))
-            close(rays, whole[:, :, row::4, column::4], atol=1e-6)
-            for name in ("image", "condition", "condition_mask"):
-                same_bits(getattr(thin, name), getattr(BATCH, name)[:, :, row::4, column::4])
-            same_bits(thin.cloud, BATCH.cloud)
-        assert len(firsts) > 3, "another first pixel for another key"
 
 
 class TestPixelError:
@@ -347,36 +257,6 @@ class TestReproducibility:
         """The same weights and batch, one step later: another jitter, another loss."""
         (_, first), (_, later) = (step(dataclasses.replace(fresh_l1, step=jnp.int32(s)), L1_ONLY) for s in (0, 1))
         assert first["loss"] != later["loss"]
-
-
-def test_runs_in_one_compiled_step_are_the_loop_over_runs(fresh_l1):
-    """Seeds, and learning rates as factors: what a run moves by is the factor times what it would move by alone."""
-
-    def varied(seed):
-        generator = jax.tree.map(lambda x: x + 0.1 * numbers(seed, *x.shape), fresh_l1.generator)
-        return dataclasses.replace(fresh_l1, generator=generator, key=jax.random.key(seed))
-
-    states, scales = [varied(seed) for seed in (3, 4)], jnp.array([1.0, 0.25])
-    stacked, batches = many_runs.stack(states), jax.tree.map(lambda x: jnp.stack([x, x]), BATCH)
-    mapped = jax.jit(many_runs.train_step, static_argnames=("config", "adversarial"))
-    after, metrics = mapped(stacked, batches, scales, config=L1_ONLY, adversarial=False)
-    together = (
-        metrics,
-        after.batch_stats,
-        after.generator_optimizer[0].mu,
-    )  # Adam's first step hides sizes, mu shows them
-    for i, state in enumerate(states):
-        alone, alone_metrics = step(state, L1_ONLY)
-        expected = alone_metrics, alone.batch_stats, alone.generator_optimizer[0].mu
-        near(jax.tree.map(lambda x, i=i: x[i], together), expected)
-        moved, alone_moved = (
-            sum(float(jnp.sum(jnp.abs(x - y))) for x, y in zip(*map(jax.tree.leaves, pair), strict=True))
-            for pair in (
-                (jax.tree.map(lambda x, i=i: x[i], after.generator), state.generator),
-                (alone.generator, state.generator),
-            )
-        )
-        assert moved == pytest.approx(float(scales[i]) * alone_moved, rel=1e-2)
 
 
 def test_one_batch_is_learnt_by_heart(fresh_l1):

@@ -1,8 +1,6 @@
 """The viewer without a browser: one camera for all panes, edits that the network sees, and pictures in time."""
 
 import dataclasses
-import io
-import re
 import threading
 from pathlib import Path
 
@@ -10,25 +8,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from PIL import Image
 from support import tiny_viewer
-from support.tiny_viewer import model, scene, state, view
+from support.tiny_viewer import canvas, drawn, model, scene, state, view
 
 from spnr_jax import cli
 from spnr_jax.kernels import cameras
-from spnr_jax.viewer import camera_path, picture, session, uploads, viewpoint
+from spnr_jax.viewer import picture, session, viewpoint
 from spnr_jax.viewer import scene as scenes
 from spnr_jax.viewer.loop import Loop
 
 ROOT = Path(__file__).parents[2]
-
-
-def drawn(moving=False, **changes):
-    return session.draw(model(), state(**changes), moving)[1]
-
-
-def canvas(**changes):
-    return drawn(**changes).image
 
 
 def pane(image, number, count=2):
@@ -211,61 +200,6 @@ def test_selected_points_are_ringed():
 # camera path
 
 
-def keyframes(*azimuths):
-    frames = (session.keyframe(view(azimuth), np.zeros(3)) for azimuth in azimuths)
-    return tuple(frames)
-
-
-def test_a_path_passes_its_keyframes_and_goes_around_what_it_looks_at():
-    poses = camera_path.poses(keyframes(0.0, 1.5, 3.0), 41)
-    for at, azimuth in ((0, 0.0), (20, 1.5), (40, 3.0)):
-        np.testing.assert_allclose(poses[at][0], view(azimuth).position, atol=1e-9)
-        np.testing.assert_allclose(poses[at][1], view(azimuth).rotation, atol=1e-9)
-    for position, rotation in poses:
-        assert np.linalg.norm(position) == pytest.approx(4)
-        np.testing.assert_allclose(position - 4 * rotation[:, 2], 0, atol=1e-9)
-    steps = [np.linalg.norm(b[0] - a[0]) for a, b in zip(poses, poses[1:], strict=False)]
-    assert max(steps) < 2 * np.mean(steps)
-
-
-def test_a_camera_that_only_moves_keeps_its_rotation():
-    near, far = keyframes(0.3, 0.3)
-    far = dataclasses.replace(far, position=2 * far.position, distance=2 * far.distance)
-    poses = camera_path.poses((near, far), 5)
-    assert [np.linalg.norm(position) for position, _ in poses] == pytest.approx([4, 5, 6, 7, 8])
-    for _, rotation in poses:
-        np.testing.assert_allclose(rotation, near.rotation)
-
-
-def test_one_keyframe_is_no_path_and_a_path_of_an_hour_is_refused():
-    with pytest.raises(ValueError, match="at least 2 keyframes"):
-        session.path_poses(state(keyframes=keyframes(0.0)), 1.0)
-    with pytest.raises(ValueError, match="at most"):
-        session.path_poses(state(keyframes=keyframes(*np.linspace(0, 6, 100))), 10.0)
-
-
-def test_keyframes_are_recorded_where_the_browser_looks_and_cleared():
-    after = session.record(np.zeros(3))(session.record(np.zeros(3))(state()))
-    assert [frame.distance for frame in after.keyframes] == pytest.approx([4, 4])
-    assert session.without_keyframes(after).keyframes == ()
-    assert session.record(np.zeros(3))(state(view=None)).keyframes == ()
-
-
-def test_a_film_shows_the_path_and_a_snapshot_the_canvas():
-    moving = state(keyframes=keyframes(0.0, 1.0))
-    shares = []
-    name, content, reason = session.film(model(), moving, 0.25, "gif", "points", shares.append)
-    assert (name, reason) == ("path.gif", "")
-    assert shares[-1] == 1
-    with Image.open(io.BytesIO(content)) as film:
-        assert (film.n_frames, film.size) == (5, (48, 48))
-        first = np.asarray(film.convert("RGB")).astype(int)
-        film.seek(4)
-        assert np.abs(np.asarray(film.convert("RGB")) - first).mean() > 2
-    still = np.asarray(Image.open(io.BytesIO(session.snapshot(model(), state()))))
-    np.testing.assert_array_equal(still, canvas())
-
-
 # the loop
 
 
@@ -323,76 +257,4 @@ def test_without_viser_the_command_says_what_to_install(monkeypatch):
         cli.run_view(cli.View(cloud=Path("a.ply"), run=Path("run")))
 
 
-@pytest.mark.parametrize(
-    ("name", "shown"),
-    [
-        ("chair.ply", "chair.ply"), ("../../etc/passwd", "passwd"), ("C:\\x\\..\\a b.xyz", "a b.xyz"), ("", "file"),
-        ("..", ".."), ("a\x00[b](http://c).ply", "c_.ply"), ("x" * 500 + ".ply", "x" * 56 + ".ply"),
-    ],
-)  # fmt: skip
-def test_of_a_browsers_file_name_only_its_last_part_is_shown(name, shown):
-    assert uploads.display_name(name) == shown
-
-
-def test_an_uploaded_cloud_is_read_in_a_temporary_folder_that_is_gone_afterwards(tmp_path, monkeypatch):
-    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    content = "\n".join(f"{x} {x * x} 0" for x in range(30)).encode()
-    lines = []
-    cloud = uploads.read_upload("../../up.xyz", content, num_points=10, up="y", report=lines.append)
-    assert len(cloud.positions) == 10
-    assert lines
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize(
-    ("name", "content", "words"),
-    [
-        ("a.ply", b"", "a.ply: the file is empty"),
-        ("a.exe", b"MZ", "a.exe: unknown kind"), ("ply", b"", "ply: unknown"),
-        ("../evil/.ply", b"x", "unknown kind"), ("n.xyz", b"0 0 nan\n", "n.xyz"), ("p.npz", b"\x80\x04N.", "p.npz"),
-    ],
-)  # fmt: skip
-def test_a_file_that_cannot_be_read_is_refused_under_the_browsers_name(name, content, words, tmp_path, monkeypatch):
-    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    with pytest.raises(ValueError, match=re.escape(words)) as refused:
-        uploads.read_upload(name, content, num_points=10, up="y")
-    assert str(tmp_path) not in str(refused.value)
-    assert "\n" not in str(refused.value)
-    assert list(tmp_path.iterdir()) == []
-
-
 # what a browser may send
-
-
-@pytest.mark.parametrize("kind", ["x/../../../evil.gif", "exe", None, 3])
-def test_a_film_of_a_kind_that_is_not_offered_writes_nothing(kind, tmp_path, monkeypatch):
-    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    with pytest.raises(ValueError, match="a film is one of mp4, gif"):
-        session.film(model(), state(), 1.0, kind, "points")
-    assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize("sent", [(("points",), "best", "1000000"), (("secret",), "best", "24"), ((), "x", "a")])
-def test_controls_that_say_what_they_do_not_offer_are_refused(sent):
-    with pytest.raises(ValueError, match="one of"):
-        session.chosen(model(), *sent)
-
-
-@pytest.mark.parametrize("value", [float("nan"), "a", [1, 2], None, 10**400, {}])
-def test_an_edit_with_no_number_is_refused_and_one_outside_is_clipped(value):
-    with pytest.raises(ValueError, match="roughness has to be a number"):
-        scenes.edited(scene(), "roughness", value)
-    assert (scenes.edited(scene(), "roughness", 7).cloud.roughness == 1).all()
-
-
-@pytest.mark.parametrize("corner", [[float("nan"), 0], "ab", None, [0], [[0, 1], 2]])
-def test_a_selection_or_target_that_is_no_point_changes_nothing(corner):
-    before = state()
-    assert session.select(before, corner, [1, 1], add=False) is before
-    assert session.record(corner)(before) is before
-
-
-@pytest.mark.parametrize("seconds", [float("nan"), float("inf"), 0.0, -1.0, 1e9])
-def test_a_path_of_no_or_endless_time_is_refused(seconds):
-    with pytest.raises(ValueError, match="between keyframes"):
-        session.path_poses(state(), seconds)

@@ -21,9 +21,10 @@ from spnr_jax.errors import UserError
 
 Wrap = Literal["repeat", "mirror", "clamp"]
 Values = np.ndarray | np.floating  # NumPy makes numbers of arrays without axes
+ShownParts = Literal["opaque", "skip"]
 # What becomes of parts that light passes through: refuse the object, as references need, draw them as if they were
 # opaque, or leave them out; where they are not refused, a texture that is missing is no reason to refuse either.
-TransparentParts = Literal["refuse", "opaque", "skip"]
+TransparentParts = Literal["refuse", ShownParts]
 CHANNELS = {"base_color": 1, "roughness": 0, "metallic": 0}  # of a material, and axes of one value
 TEXTURES = {"opacity": 0, "normal_map": 1}  # of a material that may be absent, and axes of one texel
 

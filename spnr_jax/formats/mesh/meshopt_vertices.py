@@ -17,7 +17,6 @@ MOST_BYTES = 2**30  # of what is unpacked: zeros take next to nothing
 TAIL = (32, 24)  # bytes at least behind the blocks, by format
 WIDTHS = ((0, 2, 4, 8), (0, 1, 2, 4), (1, 2, 4, 8))  # bits of a difference by a group's mode: format 0; 1, control 0, 1
 ZEROS, PLAIN = 2, 3  # control: no data, all bytes as they are
-FILTERS = ("NONE", "OCTAHEDRAL", "QUATERNION", "EXPONENTIAL", "COLOR")
 # by width: which differences of a byte of packed ones are followed by a byte, as a count
 _BITS = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1)
 ESCAPES = {1: _BITS.sum(axis=1), 2: (_BITS[:, 0::2] & _BITS[:, 1::2]).sum(axis=1)}

@@ -5,9 +5,9 @@ import json
 
 import numpy as np
 import pytest
+from support.command_line import spnr_data
 from support.gltf_files import CORNERS, SQUARE, GltfBuilder
 
-from data_gen.__main__ import main
 from data_gen.plan.sources import abo
 from data_gen.store import layout
 
@@ -53,12 +53,6 @@ def download(tmp_path_factory):
     return root
 
 
-def run(*arguments):
-    with pytest.raises(SystemExit) as stopped:
-        main([str(argument) for argument in arguments])
-    return stopped.value.code
-
-
 def test_the_metadata_say_what_a_product_is(download):
     listed = abo.find_products(download)
     assert [item.object_id for item in listed] == sorted([*PRODUCTS, "B00EXTRA01"])
@@ -83,12 +77,12 @@ def test_a_table_that_is_not_compressed_reads_the_same(tmp_path):
 def test_another_folder_is_refused_with_what_was_expected_and_found(tmp_path, capsys):
     for name in ("listings", "spins"):
         (tmp_path / name).mkdir()
-    assert run("generate", tmp_path / "set", "--source", "abo", "--root", tmp_path) == 2
+    assert spnr_data("generate", tmp_path / "set", "--source", "abo", "--root", tmp_path) == 2
     message = capsys.readouterr().err
     assert "3dmodels/original/*/*.glb and 3dmodels/metadata/3dmodels.csv.gz" in message
     assert "it holds listings, spins" in message
     assert message.count("\n") == 1
-    assert run("generate", tmp_path / "set", "--source", "abo", "--root", tmp_path / "absent") == 2
+    assert spnr_data("generate", tmp_path / "set", "--source", "abo", "--root", tmp_path / "absent") == 2
     assert "there is no such folder" in capsys.readouterr().err
 
 
@@ -116,7 +110,7 @@ def test_the_preset_makes_the_data_set_with_variants_of_training_products_only(d
     out = tmp_path / "set"
     command = ["generate", out, "--preset", "abo", "--root", download, *TINY, "--variant", "scalar_rgb"]
     command += ["--test-objects", 2, "--train-objects", 9, "--colour-variants", 2]
-    assert run(*command) == 0
+    assert spnr_data(*command) == 0
     assert "the paper has 16161 train, 200 test" in capsys.readouterr().err
     splits = {split: layout.read_split(out, split) for split in layout.SPLITS}
     details = {path.parent.name: json.loads(path.read_text()) for path in (out / "objects").glob("*/object.json")}
@@ -132,7 +126,7 @@ def test_the_preset_makes_the_data_set_with_variants_of_training_products_only(d
         assert details[name]["variant"] == 0
         assert details[name]["colour_rotation"] is None
     before = {path: path.stat().st_mtime_ns for path in (out / "objects").rglob("*")}
-    assert run(*command) == 0
+    assert spnr_data(*command) == 0
     assert {path: path.stat().st_mtime_ns for path in (out / "objects").rglob("*")} == before
     settings = json.loads((out / "dataset.json").read_text())["settings"]
     assert (settings["preset"], settings["source"], settings["colour_variants"]) == ("abo", "abo", 2)

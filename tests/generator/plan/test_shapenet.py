@@ -4,9 +4,10 @@ import json
 
 import numpy as np
 import pytest
+from support.command_line import spnr_data
 from support.gltf_files import png
 
-from data_gen.__main__ import main, parse
+from data_gen.__main__ import parse
 from data_gen.plan import tasks
 from data_gen.plan.sources import shapenet
 from data_gen.store import layout
@@ -90,12 +91,6 @@ def load(folder):
     return load_mesh(item.path, item.folder)
 
 
-def run(*arguments):
-    with pytest.raises(SystemExit) as stopped:
-        main([str(argument) for argument in arguments])
-    return stopped.value.code
-
-
 @pytest.mark.parametrize("version", [1, 2])
 def test_both_layouts_give_the_same_object_with_its_texture_and_without_doubled_faces(tmp_path, version):
     asset = load(add(tmp_path, "car", "abc", version))
@@ -155,7 +150,7 @@ def test_another_folder_is_refused_with_what_was_expected_and_found(tmp_path, ca
     (tmp_path / "03001627" / "empty").mkdir(parents=True)
     for category, synset in (("car", "02958343"), ("chair", "03001627")):
         arguments = ["--source", "shapenet", "--category", category, "--root", tmp_path]
-        assert run("generate", tmp_path / "set", *arguments) == 2
+        assert spnr_data("generate", tmp_path / "set", *arguments) == 2
         message = capsys.readouterr().err
         assert f"expected {synset}/*/models/model_normalized.obj or {synset}/*/model.obj" in message
         assert "it holds 02691156, 03001627" in message
@@ -166,7 +161,7 @@ def test_another_folder_is_refused_with_what_was_expected_and_found(tmp_path, ca
 def test_the_preset_makes_the_data_set(tmp_path, capsys, version, category):
     root, out = download(tmp_path / "ShapeNetCore", category, version), tmp_path / "set"
     preset = ["--preset", f"shapenet_{category}", "--root", root, "--test-objects", 2]
-    assert run("generate", out, *preset, *TINY, "--variant", "scalar_rgb") == 0
+    assert spnr_data("generate", out, *preset, *TINY, "--variant", "scalar_rgb") == 0
     assert ("128 test" if category == "car" else "105 test") in capsys.readouterr().err
     assert [len(layout.read_split(out, split)) for split in layout.SPLITS] == [4, 0, 2]
     reasons = {row["id"]: row["reason"] for row in map(json.loads, (out / "rejected.jsonl").read_text().splitlines())}
@@ -177,7 +172,7 @@ def test_the_preset_makes_the_data_set(tmp_path, capsys, version, category):
     details = json.loads((out / "objects" / f"{3:032x}" / "object.json").read_text())
     assert details["category"] == category
     assert details["source"]["file"] == f"{shapenet.SYNSETS[category]}/{3:032x}/{PLACES[version][0]}.obj"
-    assert run("check", out) == 0
+    assert spnr_data("check", out) == 0
 
 
 def test_a_split_file_of_shapenet_makes_those_objects_only_and_an_option_overrides_the_preset(tmp_path):

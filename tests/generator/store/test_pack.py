@@ -6,10 +6,10 @@ import shutil
 
 import pytest
 from support import tiny_dataset
+from support.command_line import spnr_data
 from support.laws import same_bits
 from support.tiny_dataset import CONFIG
 
-from data_gen.__main__ import main
 from data_gen.store import layout, pack, storage
 from spnr_jax.formats import data_sets, shards
 from spnr_jax.training import batching
@@ -96,9 +96,7 @@ def test_nothing_is_left_where_packing_fails(folder, tmp_path, monkeypatch):
 )
 def test_a_bad_option_is_one_line_and_exit_code_2(arguments, expected, folder, tmp_path, capsys):
     options = ["--out", str(tmp_path / "x"), *(argument.format(folder=folder) for argument in arguments)]
-    with pytest.raises(SystemExit) as stopped:
-        main(["pack", str(folder), *options])
-    assert stopped.value.code == 2
+    assert spnr_data("pack", folder, *options) == 2
     message = capsys.readouterr().err
     assert expected in message
     assert message.count("\n") == 1
@@ -167,9 +165,7 @@ def test_unfinished_packing_carries_the_name_of_unfinished_things(folder, tmp_pa
 @pytest.mark.parametrize("command", ["check", "show", "pack"])
 def test_commands_that_look_at_folders_of_objects_say_so_of_a_packed_one(command, packed, tmp_path, capsys):
     out = ["--out", str(tmp_path / "again")] if command == "pack" else []
-    with pytest.raises(SystemExit) as stopped:
-        main([command, str(packed), *out])
-    assert stopped.value.code == 2
+    assert spnr_data(command, packed, *out) == 2
     assert "is packed; look at the folder of objects" in capsys.readouterr().err
 
 

@@ -1,0 +1,100 @@
+"""Clouds of more points than are wanted, or than the memory holds."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.point_clouds import XYZRGB, ply_bytes, read, sphere_points
+
+from spnr_jax.formats import clouds
+from spnr_jax.formats.clouds import read_cloud
+
+ROOT = Path(__file__).parents[2]
+
+
+def test_a_point_that_is_kept_keeps_its_normal(tmp_path, monkeypatch):
+    positions = sphere_points(2, 900)
+    np.savez(tmp_path / "a.npz", xyz=positions, normals=2 * positions)
+    monkeypatch.setattr(clouds, "CAPACITY", 400)
+    cloud = read_cloud(tmp_path / "a.npz", num_points=20)
+    assert len(cloud.mask) == 20
+    np.testing.assert_allclose(cloud.normals, cloud.positions, atol=1e-6)
+
+
+def test_thinning_keeps_points_of_the_file_with_their_materials_and_depends_on_the_seed_alone(tmp_path):
+    positions = sphere_points(1, 900)
+    np.savez(tmp_path / "a.npz", xyz=positions, roughness=np.arange(900) / 900)
+    cloud, lines = read(tmp_path / "a.npz", num_points=100, seed=5)
+    source = np.round(cloud.roughness * 900).astype(int)
+    assert len(set(source)) == 100
+    np.testing.assert_array_equal(cloud.positions, positions[source].astype(np.float32))
+    assert lines[-1] == "100 of 900 points kept, evenly spread"
+    np.testing.assert_array_equal(read_cloud(tmp_path / "a.npz", num_points=100, seed=5).roughness, cloud.roughness)
+    assert (read_cloud(tmp_path / "a.npz", num_points=100, seed=6).roughness != cloud.roughness).any()
+    np.testing.assert_array_equal(
+        read_cloud(tmp_path / "a.npz", num_points=2000).positions, positions.astype(np.float32)
+    )
+
+
+LITTLE_MEMORY = """
+import resource, sys
+from spnr_jax.formats.clouds import read_cloud
+before = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
+resource.setrlimit(resource.RLIMIT_AS, (before + int(sys.argv[2]),) * 2)
+cloud = read_cloud(sys.argv[1], num_points=256)
+print(len(cloud.mask), *cloud.positions.min(axis=0), *cloud.positions.max(axis=0))
+"""
+
+
+def big_file(folder, suffix: str):
+    """A file of a cube's surface, several times larger than the memory that its reader gets."""
+    rng = np.random.default_rng(0)
+    if suffix == ".xyz":
+        points = rng.uniform(-1, 1, (20_000, 3))
+        points[np.arange(20_000), np.arange(20_000) % 3] = np.where(np.arange(20_000) % 2, 1, -1)
+        block = "".join(f"{x:.60f} {y:.60f} {z:.60f}\n" for x, y, z in points)
+        with (folder / "big.xyz").open("w") as file:
+            for _ in range(100):
+                file.write(block)
+        return folder / "big.xyz"
+    path, count = folder / "big.ply", 4_000_000
+    properties = [(f"p{i}", "double") for i in range(20)]
+    header = ply_bytes("binary_little_endian", rows=[], properties=XYZRGB[:3] + properties, before=0)
+    header = header[: header.index(b"element edge")] + b"end_header\n"
+    points = np.zeros(count // 100, [(name, "<f4") for name in "xyz"] + [(name, "<f8") for name, _ in properties])
+    for axis in "xyz":
+        points[axis] = rng.uniform(-1, 1, len(points))
+    for i, axis in enumerate("xyz"):
+        points[axis][i::3] = rng.choice([-1, 1], len(points[i::3]))
+    with path.open("wb") as file:
+        file.write(header.replace(b"element vertex 0", b"element vertex %d" % count))
+        for _ in range(100):
+            file.write(points.tobytes())
+    return path
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("suffix", "memory"), [(".ply", 400e6), (".xyz", 220e6)])
+def test_a_cloud_larger_than_the_memory_is_read(tmp_path, suffix, memory):
+    path = big_file(tmp_path, suffix)
+    assert path.stat().st_size > 1.7 * memory
+    done = subprocess.run(
+        [sys.executable, "-c", LITTLE_MEMORY, path, str(int(memory))], capture_output=True, text=True, cwd=ROOT
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    count, *bounds = done.stdout.split()
+    assert int(count) == 256
+    np.testing.assert_allclose(np.float64(bounds), [-1, -1, -1, 1, 1, 1], atol=0.01)
+
+
+def test_a_cloud_beyond_the_capacity_is_thinned_while_reading_and_says_so(tmp_path, monkeypatch):
+    monkeypatch.setattr(clouds, "CAPACITY", 500)
+    positions = sphere_points(1, 4000)
+    np.savez(tmp_path / "a.npz", xyz=positions, roughness=np.arange(4000) / 4000)
+    cloud, lines = read(tmp_path / "a.npz")
+    assert 60 <= len(cloud.mask) <= 500
+    assert lines[0] == f"{len(cloud.mask)} of 4000 points kept while reading, the first of each voxel"
+    source = np.round(cloud.roughness * 4000).astype(int)
+    np.testing.assert_array_equal(cloud.positions, positions[source].astype(np.float32))

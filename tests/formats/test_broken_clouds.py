@@ -1,0 +1,120 @@
+"""What is no cloud is refused in one line, and rows without numbers are left out and counted."""
+
+import re
+
+import numpy as np
+import pytest
+from support.point_clouds import XYZRGB, ply_bytes, read, sphere_points, write
+
+from spnr_jax.formats import clouds
+from spnr_jax.formats.clouds import read_cloud
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "reason"),
+    [
+        ("a.ply", None, "no such file"),
+        ("a.xyz", "", "the file is empty"),
+        (
+            "a.jpeg",
+            "1 2 3",
+            r"unknown kind of file '.jpeg'; expected one of .ply .pcd .xyz .txt .csv .npz .npy .las .laz .glb",
+        ),
+        ("a.xyz", "# nothing yet\n", "holds 0 points"),
+        ("a.ply", ply_bytes("binary_little_endian", rows=[]), "holds 0 points"),
+        ("a.xyz", "nan 0 0\n1 nan 0\n", "no point that can be used: NaN, infinity .* in all of its 2 rows"),
+        ("a.xyz", "0 0 1e39\n", "too large a number"),
+        ("a.csv", "px,py,pz\n0,0,0\n", r"needs the properties x y z \(and may have .*\); found px py pz"),
+        ("a.xyz", "0 0 0 0.5 0.5 -0.2\n", "has red green blue from -0.2 to 0.5; expected 0 to 1"),
+        ("a.xyz", "0 0 0 0.5 1.3 0.2\n", "colours up to 1.3: neither 0 to 1 nor 0 to 255"),
+        ("a.xyz", "0 0 0 3 4 256\n", "from 0.01.* to 1.00392"),
+        ("a.csv", "x y z base_color_r base_color_g base_color_b\n0 0 0 0 0 9\n", "from 0 to 9"),
+        ("a.csv", "x y z roughness\n0 0 0 nan\n", "no point that can be used"),
+        (
+            "a.ply",
+            ply_bytes("binary_little_endian", rows=[(0.0, 0.0, 5e6), (0.0, 0.0, 5e6 + 1)], properties=XYZRGB[:3]),
+            "0.5 apart at best .* extent of 1; move them to the origin",
+        ),
+        ("a.ply", ply_bytes("binary_little_endian")[:-20], "announces 3 points, the data ends after 2"),
+        ("a.obj", "v 0 0 0\n", "has no faces"),
+        ("a.glb", b"glTF\2\0\0\0\xff\xff\0\0", "broken or truncated|cut off|truncated"),
+    ],
+)
+def test_every_bad_file_is_one_line_that_names_it_and_the_reason(tmp_path, name, content, reason):
+    path = tmp_path / name
+    if content is not None:
+        write(tmp_path, name, content)
+    with pytest.raises(ValueError, match=reason) as caught:
+        read_cloud(path)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_folder_is_no_cloud(tmp_path):
+    with pytest.raises(ValueError, match=r"a folder; expected a file of one of .ply .pcd"):
+        read(tmp_path)
+
+
+def test_wrong_options_are_refused_before_the_file_is_touched():
+    with pytest.raises(ValueError, match="up must be one of y, -y, z, -z, x, -x, auto, got 'w'"):
+        read_cloud("absent.ply", up="w")
+    with pytest.raises(ValueError, match="num_points must be at least 1, got 0"):
+        read_cloud("absent.ply", num_points=0)
+
+
+BROKEN_ROWS = np.array(
+    [(0, 0, 0, 0.25), (np.nan, 1, 1, 0.5), (1, 2, 3, 1), (0, -np.inf, 0, 0), (4, 5, 6, np.nan), (1e39, 0, 0, 0)],
+    [("x", "f8"), ("y", "f8"), ("z", "f8"), ("roughness", "f8")],
+)
+
+
+def broken_file(folder, name: str):
+    """A file of BROKEN_ROWS, of which two can be used."""
+    path, table = folder / name, np.stack([BROKEN_ROWS[field] for field in BROKEN_ROWS.dtype.names], axis=-1)
+    text = "\n".join(" ".join(map(repr, map(float, row))) for row in table)
+    if name.endswith(".npz"):
+        np.savez(path, xyz=table[:, :3], roughness=table[:, 3])
+    elif name.endswith(".npy"):
+        np.save(path, BROKEN_ROWS)
+    elif name.endswith(".ply"):
+        properties = [(field, "double") for field in BROKEN_ROWS.dtype.names]
+        path.write_bytes(ply_bytes("binary_little_endian", rows=BROKEN_ROWS.tolist(), properties=properties))
+    elif name.endswith(".pcd"):
+        # an organised cloud, as a depth camera writes it
+        head = "VERSION 0.7\nFIELDS x y z roughness\nSIZE 8 8 8 8\nTYPE F F F F\nCOUNT 1 1 1 1\nWIDTH 3\nHEIGHT 2\n"
+        path.write_bytes((head + "POINTS 6\nDATA binary\n").encode() + BROKEN_ROWS.tobytes())
+    else:
+        path.write_text(("x y z roughness\n" if name.endswith(".csv") else "# x y z roughness\n") + text)
+    return path
+
+
+@pytest.mark.parametrize("name", ["a.pcd", "a.ply", "a.npz", "a.npy", "a.xyz", "a.csv"])
+def test_rows_without_finite_numbers_are_left_out_and_counted_in_one_line(tmp_path, name):
+    cloud, lines = read(broken_file(tmp_path, name))
+    np.testing.assert_array_equal(cloud.positions, [[0, 0, 0], [1, 2, 3]])
+    np.testing.assert_array_equal(cloud.roughness, [0.25, 1])
+    assert [line for line in lines if "left out" in line] == [
+        "4 of 6 points left out: NaN, infinity or too large a number"
+    ]
+
+
+def test_rows_without_finite_numbers_are_left_out_while_a_big_file_is_thinned(tmp_path, monkeypatch):
+    monkeypatch.setattr(clouds, "CAPACITY", 16)
+    monkeypatch.setattr("spnr_jax.formats.text.PIECE_LINES", 7)
+    positions = np.concatenate([np.full((20, 3), np.nan), sphere_points(3, 300), np.full((9, 3), np.inf)])
+    np.savetxt(tmp_path / "a.xyz", positions)
+    cloud, lines = read(tmp_path / "a.xyz", num_points=1)
+    assert np.isfinite(cloud.positions).all()
+    assert lines[0] == "29 of 329 points left out: NaN, infinity or too large a number"
+    assert re.fullmatch(r"\d+ of 300 points kept while reading.*", lines[1])
+
+
+def test_a_data_set_with_a_broken_row_is_refused():
+    with pytest.raises(ValueError, match="holds 4 points with NaN, infinity .* first point 1"):
+        clouds.cloud_of_ply(
+            ply_bytes(
+                "binary_little_endian",
+                rows=BROKEN_ROWS.tolist(),
+                properties=[(field, "double") for field in BROKEN_ROWS.dtype.names],
+            )
+        )
