@@ -5,7 +5,7 @@
 The network draws test objects of a data set at its cameras; so do their splats (`spnr_jax.splats`), drawn by this
 package (gaussians/drawing.py) after so many seconds of refining each, and the last of them by Mitsuba
 (`volprim_rf_basic` on the .ply that the package writes: a reader and a renderer that share nothing with it); and the
-mesh of `spnr render --mesh`, which Mitsuba draws in the data set's own light.  Each is compared with the reference, and
+mesh of `spnr export --mesh`, which Mitsuba draws in the data set's own light.  Each is compared with the reference, and
 the others with the network.
 
     OUT/results.json  OUT/table.md .csv .tex   PSNR of whole pictures and inside the silhouettes, by size and by object

@@ -7,6 +7,7 @@ import subprocess
 from pathlib import Path
 
 import pytest
+
 from support import chromium
 
 ORIGIN = "http://page.test"
