@@ -13,9 +13,8 @@ import re
 import sys
 import time
 import traceback
-from collections.abc import Callable
-from pathlib import Path
-from typing import Annotated
+from collections.abc import Callable, Iterator
+from typing import Annotated, Any
 
 import tyro
 
@@ -206,8 +205,8 @@ def run_view(command: View) -> None:
 
 def run_export(command: Export) -> None:
     """`spnr export`."""
-    if command.splats is not None:
-        run_export_splats(command, command.splats)
+    if command.splats is not None or command.mesh is not None:
+        run_export_object(command)
         return
     from spnr_jax.formats.images import write_whole
     from spnr_jax.method import model
@@ -236,21 +235,24 @@ def run_export(command: Export) -> None:
     print(f"wrote weights.npz, encode and render to {command.out} (export.json says what they take and give)")
 
 
-def run_export_splats(command: Export, out: Path) -> None:
-    """`spnr export --splats`."""
-    from spnr_jax.tools.splat_export import export_splats
+def run_export_object(command: Export) -> None:
+    """`spnr export --splats` and `--mesh`."""
+    from spnr_jax.tools import mesh_making, splat_export
 
-    for line in export_splats(
-        command.run,
-        out,
-        run=command.network,
-        lighting=command.lighting,
-        making=command.making,
-        num_points=command.num_points or MANY_POINTS,
-        up=command.up,
-        clean=command.clean,
-        note=lambda line: print(f"{command.run}: {line}", file=sys.stderr),
-    ):
+    of_cloud: dict[str, Any] = {
+        "run": command.network,
+        "num_points": command.num_points or MANY_POINTS,
+        "up": command.up,
+        "clean": command.clean,
+        "note": lambda line: print(f"{command.run}: {line}", file=sys.stderr),
+    }
+    lines: Iterator[str] = iter(())
+    if command.mesh is not None:
+        lines = mesh_making.export_mesh(command.run, command.mesh, **of_cloud)
+    if command.splats is not None:
+        lighting, making = command.lighting, command.making
+        lines = splat_export.export_splats(command.run, command.splats, lighting=lighting, making=making, **of_cloud)
+    for line in lines:
         print(line, flush=True)
 
 

@@ -67,7 +67,7 @@ def test_the_example_without_this_package_runs_on_what_the_command_writes(workpl
     (workplace / "exported").mkdir()
     (workplace / "exported" / "encode.jax").write_bytes(export.export_encode(model, num_points=1024))
     (workplace / "exported" / "render.jax").write_bytes(export.export_render(model, resolution=128))
-    names = execute(DOCS / "exporting.md")
+    names = execute(DOCS / "functions.md")
     assert "spnr_jax" not in names
 
 

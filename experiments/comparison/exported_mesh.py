@@ -1,4 +1,4 @@
-"""The mesh that `spnr render --mesh` writes of a cloud, read back from its file for the renderer of references.
+"""The mesh that `spnr export --mesh` writes of a cloud, read back from its file for the renderer of references.
 
 The file is in the cloud's own frame, which in a data set is that of the cameras.
 """

@@ -5,7 +5,7 @@
 The network draws test objects of a data set at its cameras; so do their splats (`spnr_jax.splats`), drawn by this
 package (gaussians/drawing.py) after so many seconds of refining each, and the last of them by Mitsuba
 (`volprim_rf_basic` on the .ply that the package writes: a reader and a renderer that share nothing with it); and the
-mesh of `spnr render --mesh`, which Mitsuba draws in the data set's own light.  Each is compared with the reference, and
+mesh of `spnr export --mesh`, which Mitsuba draws in the data set's own light.  Each is compared with the reference, and
 the others with the network.
 
     OUT/results.json  OUT/table.md .csv .tex   PSNR of whole pictures and inside the silhouettes, by size and by object
@@ -33,8 +33,8 @@ from data_gen.render.variant import choose_variant
 from experiments import entry_point
 from experiments.comparison import exported_mesh, figures, poisson, results_folder, splats_by_mitsuba
 from experiments.comparison.exported_mesh import ExportedMesh
-from experiments.comparison.result_tables import Cell, Table, number
 from experiments.studies.sharpness import smaller, told, view_of
+from experiments.studies.splat_quality_report import BY_MITSUBA, MESH, after, caption, methods_of, tables_of
 from spnr_jax.devices import machine
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets, gaussian_files, images
@@ -48,7 +48,6 @@ from spnr_jax.tools import splat_making
 from spnr_jax.tools.splat_making import drawn_views, fitting_cameras, in_box
 from spnr_jax.training.weights import load
 
-BY_MITSUBA, MESH = "splats, by Mitsuba", "mesh, by Mitsuba"
 SIZES = (128, 512)
 
 
@@ -90,7 +89,7 @@ class SplatStudy:
     @property
     def methods(self) -> tuple[str, ...]:
         """What is compared."""
-        return ("network", *(_after(seconds) for seconds in self.seconds), BY_MITSUBA, MESH)
+        return methods_of(self.seconds)
 
 
 Drawn = tuple[np.ndarray, np.ndarray]  # a picture on white (sRGB), and opacity
@@ -116,12 +115,10 @@ def main(options: SplatStudy) -> None:
             rows[name] = rows.get(name, {}) | found
             print(name, found, flush=True)
     cells = [[_shown(options, name, method) for method in ("reference", *options.methods)] for name in names]
-    captions = [
-        ["", *(_caption(rows[name], method, options.sizes[-1]) for method in options.methods)] for name in names
-    ]
+    captions = [["", *(caption(rows[name], method, options.sizes[-1]) for method in options.methods)] for name in names]
     picture = figures.grid(cells, ("reference", *options.methods), names, size=256, below=captions)
     images.write_whole(options.out / "gallery.png", images.png(picture))
-    tables = [_table(options, rows), *(_by_object(options, rows, size) for size in options.sizes)]
+    tables = tables_of(rows, options.seconds, options.sizes, options.views)
     results_folder.write(options.out, {"objects": rows, "hardware": machine.hardware()}, tables)
 
 
@@ -131,8 +128,8 @@ def _splat_scores(options: SplatStudy, model: Model, item: data_sets.ObjectData)
     volume = model.encode(cloud)
     pictures, splats, found = _pictures(options, model, volume, item.name), {}, {}
     for seconds in options.seconds:
-        splats[_after(seconds)], found[f"{_after(seconds)}, made"] = _made(options, pictures, volume, cloud, seconds)
-    last, place = splats[_after(options.seconds[-1])], options.out / f"{item.name}.ply"
+        splats[after(seconds)], found[f"{after(seconds)}, made"] = _made(options, pictures, volume, cloud, seconds)
+    last, place = splats[after(options.seconds[-1])], options.out / f"{item.name}.ply"
     for size in options.sizes:
         cameras = [view_of(item, view, size)[0] for view in range(options.views)]
         drawn = {name: [drawing.draw(made, camera) for camera in cameras] for name, made in splats.items()}
@@ -176,10 +173,6 @@ def _compared(
         found[f"{method}, {size}"] = _scored(shown, list(references), network)
         images.write_whole(options.out / item.name / f"{method}.png", images.png(shown[0][0]))
     return found
-
-
-def _after(seconds: float) -> str:
-    return f"splats, {seconds:g} s"
 
 
 def _made(
@@ -256,56 +249,6 @@ def _pictures(options: SplatStudy, model: Model, volume: Volume, name: str) -> l
 
 def _shown(options: SplatStudy, name: str, method: str) -> np.ndarray:
     return results_folder.kept(options.out / name / f"{method}.png", lambda: None)
-
-
-def _caption(row: dict, method: str, size: int) -> str:
-    """What stands below a picture: its decibels, and of what is a file its megabytes and seconds."""
-    made = row.get(f"{method}, made")
-    told = f"{made['spz_mb']:.1f} MB, {made['seconds']:.0f} s, " if made else ""
-    if method == MESH:
-        told = f"{row['glb_mb']:.1f} MB, {row['mesh_seconds']:.0f} s, "
-    return f"{told}{row[f'{method}, {size}']['psnr']:.1f} dB"
-
-
-def _table(options: SplatStudy, rows: dict) -> Table:
-    """A row for each method and size, means over the objects."""
-    lines: list[tuple[str, tuple[Cell, ...]]] = []
-    for size in options.sizes:
-        for method in options.methods:
-            found = [row[f"{method}, {size}"] for row in rows.values()]
-            means = [float(np.mean([scores[name] for scores in found])) for name in ("psnr", "inside", "network")]
-            of_network = number(None if method == "network" else means[2], 1)
-            lines.append((f"{method}, {size} px", (number(means[0], 2), number(means[1], 2), of_network)))
-
-    def mean(name: str, *of: str) -> float:
-        return float(np.mean([(row[of[0]] if of else row)[name] for row in rows.values()]))
-
-    made = [f"{_after(seconds)}, made" for seconds in options.seconds]
-    steps = " and ".join(f"{mean('steps', each):.0f}" for each in made)
-    closed = sum(row["watertight"] for row in rows.values())
-    return Table(
-        title=f"Splats and meshes, {len(rows)} objects x {options.views} views",
-        heads=("PSNR, dB", "inside, dB", "against the network, dB"),
-        rows=tuple(lines),
-        note=f"{mean('splats', made[-1]):,.0f} splats, {mean('spz_mb', made[-1]):.1f} MB as .spz, {steps} steps; "
-        f"meshes of {mean('glb_mb'):.1f} MB, {closed} of them watertight. Means.",
-    )
-
-
-def _by_object(options: SplatStudy, rows: dict, size: int) -> Table:
-    """A row for each object: what its files hold, and the decibels of each method at a size."""
-
-    def cells(row: dict) -> tuple[Cell, ...]:
-        made = row[f"{_after(options.seconds[-1])}, made"]
-        counts = ((made["splats"], 0), (made["spz_mb"], 2), (row["faces"], 0), (row["glb_mb"], 2))
-        scores = ((row[f"{method}, {size}"]["psnr"], 2) for method in options.methods)
-        return tuple(number(*each) for each in (*counts, *scores))
-
-    return Table(
-        title=f"By object, {size} px",
-        heads=("splats", ".spz, MB", "faces", ".glb, MB", *(f"{method}, dB" for method in options.methods)),
-        rows=tuple((name, cells(row)) for name, row in rows.items()),
-    )
 
 
 if __name__ == "__main__":

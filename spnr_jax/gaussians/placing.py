@@ -107,8 +107,11 @@ def _groups(seen: Seen, low: np.ndarray, side: float) -> tuple[int, np.ndarray]:
 
 
 def turned_to(normal: Float[np.ndarray, "splats 3"]) -> Float[np.ndarray, "splats 4"]:
-    """Quaternions w x y z that turn the third axis to a normal or against it, by at most a right angle."""
-    upright = normal * np.where(normal[:, 2:] < 0, -1, 1)
-    w = 1 + upright[:, 2]
-    quaternion = np.stack([w, -upright[:, 1], upright[:, 0], np.zeros_like(w)], axis=-1)
+    """Quaternions w x y z that turn the third axis to a normal, some after half a turn around the first axis."""
+    below = normal[:, 2:] < 0
+    x, y, z = np.split(normal * np.where(below, -1, 1), 3, axis=-1)
+    w, nothing = 1 + z, np.zeros_like(z)
+    upright = np.concatenate([w, -y, x, nothing], axis=-1)
+    turned = np.concatenate([y, w, nothing, -x], axis=-1)  # the same rotation behind that half turn
+    quaternion = np.where(below, turned, upright)
     return quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)

@@ -1,6 +1,5 @@
 """The options of the commands of `spnr`, as records; of `spnr render` and `spnr share`, in files of their own."""
 
-import dataclasses
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -77,28 +76,30 @@ class ConvertLpips:
 
 @dataclass(frozen=True, kw_only=True)
 class Export:
-    """Write a network as a file of weights, as functions for JAX without this package, and as StableHLO; or, with
-    --splats, a cloud's object as Gaussian splats."""
+    """Write a network as a file of weights, as functions for JAX without this package, and as StableHLO; or a cloud's
+    object, with --splats as Gaussian splats, with --mesh as its surface."""
 
     run: tyro.conf.Positional[Path]
-    """Run folder whose network is exported; with --splats a cloud, what `spnr render` reads."""
+    """Run folder whose network is exported; with --splats or --mesh a cloud, what `spnr render` reads."""
     splats: Path | None = None
     """Write Gaussian splats: .ply, .spz, or .glb (KHR_gaussian_splatting)."""
+    mesh: Path | None = None
+    """Write the surface with its materials: .glb, in the frame and units of the cloud's file."""
     network: Path | None = None
-    """Network that draws the cloud for --splats, as `spnr render --run` (default: surfels)."""
+    """Network that draws the cloud for --splats and --mesh, as `spnr render --run` (default: surfels)."""
     lighting: tyro.conf.OmitArgPrefixes[Lighting] = field(default_factory=Lighting)
     """The light of --splats, which is part of them."""
     making: tyro.conf.OmitArgPrefixes[SplatMaking] = field(default_factory=SplatMaking)
     """How --splats are made."""
     up: Literal["auto", "x", "y", "z", "-x", "-y", "-z"] = "auto"
-    """The upward axis of the file for --splats; what is written has y up."""
+    """The upward axis of the file for --splats and --mesh; splats are written with y up."""
     clean: Literal["auto", "off", "strong"] = "auto"
-    """As for `spnr render`, for --splats."""
+    """As for `spnr render`, for --splats and --mesh."""
     out: Path = Path("exported")
     """Folder for weights.npz, encode.jax, render.jax, both as .stablehlo, and export.json: what they take and give."""
     num_points: int | None = None
-    """Points of a cloud, padding included; exactly so many (default: 1,024).  With --splats, points used of a bigger
-    cloud (default: 16,384)."""
+    """Points of a cloud, padding included; exactly so many (default: 1,024).  With --splats and --mesh, points used
+    of a bigger cloud (default: 16,384)."""
     resolution: int | None = None
     """Pixels along each side (default: what the network was trained for)."""
     quality: Literal["draft", "balanced", "best", "trained"] = "best"
@@ -112,12 +113,15 @@ class Export:
         """ValueError names the option that makes no sense."""
         if self.num_points is not None and self.num_points < 1:
             raise ValueError(f"--num-points must be at least 1, got {self.num_points}")
-        given = [f.name for f in dataclasses.fields(self) if f.name in ("network", "up", "clean")]
-        given = [name for name in given if getattr(self, name) != getattr(type(self), name)]
-        given += ["light"] if self.lighting.asked else []
+        if self.splats is not None and self.mesh is not None:
+            raise ValueError("--splats and --mesh are written one at a time")
+        given = ["light"] if self.lighting.asked else []
         given += ["seconds"] if self.making != SplatMaking() else []
         if self.splats is None and given:
             raise ValueError(f"--{given[0]} is for --splats FILE, which is not given")
+        given = [name for name in ("network", "up", "clean") if getattr(self, name) != getattr(type(self), name)]
+        if self.splats is None and self.mesh is None and given:
+            raise ValueError(f"--{given[0]} is for --splats FILE or --mesh FILE, which is not given")
         if self.lighting.background != "white":
             raise ValueError("--background light: splats have no background; leave it out")
 

@@ -252,13 +252,11 @@ def _density(ready: Ready, options: Render, path: Path) -> Iterator[Callable[[],
 
 
 def _mesh(ready: Ready, options: Render, path: Path) -> Callable[[], Written]:
-    from spnr_jax.tools import fused_surface, mesh_export, splat_making  # here: pictures alone do without
+    from spnr_jax.tools import fused_surface, mesh_making  # here: pictures alone do without
 
-    views = splat_making.drawn_views(ready.model, ready.volume, splat_making.fitting_cameras(ready.model, ready.volume))
     resolution = options.grid_resolution or fused_surface.GRID
-    solid = mesh_export.mesh_of(fused_surface.solidity(views, ready.volume, ready.placed, resolution), ready.placed)
-    details = f" ({solid.faces:,} faces, {'watertight' if solid.watertight else 'not watertight'})"
-    return partial(_write_solid, path, solid.content, details)
+    solid = mesh_making.mesh_of_volume(ready.model, ready.volume, ready.placed, resolution)
+    return partial(_write_solid, path, solid.content, f" ({mesh_making.told(solid)})")
 
 
 def _write_solid(path: Path, content: bytes, details: str = "") -> Written:

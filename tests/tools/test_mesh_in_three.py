@@ -1,17 +1,12 @@
 """A surface of `spnr render --mesh` in three.js, in a headless Chromium: one mesh, its colours and its materials.
 
-Chromium and npm's three are found where they are installed (or named by SPNR_CHROMIUM and SPNR_THREE, the folder of the
-package); without them these tests are skipped.
+Without a Chromium and npm's three (support/three_js.py) these tests are skipped.
 """
-
-import os
-import shutil
-import subprocess
-from pathlib import Path
 
 import numpy as np
 import pytest
 from support import chromium as chromium_of
+from support import three_js
 from support.solid_ball import RADIUS, ball_cloud, ball_grid
 
 from spnr_jax.tools.mesh_export import mesh_of
@@ -19,12 +14,9 @@ from spnr_jax.tools.mesh_export import mesh_of
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install playwright")
 
 SIZE = 96
-ORIGIN = "http://page.test"
-PAGE = """<!doctype html><link rel="icon" href="data:,"><script type="importmap">{"imports":
-{"three": "/three/build/three.module.js", "loaders": "/three/examples/jsm/loaders/GLTFLoader.js"}}</script>
-<script type="module">
+SCRIPT = """
 import * as THREE from "three";
-import { GLTFLoader } from "loaders";
+import { GLTFLoader } from "add/loaders/GLTFLoader.js";
 const { scene } = await new GLTFLoader().loadAsync("/ball.glb"), meshes = [];
 scene.traverse((node) => { if (node.isMesh) meshes.push(node); });
 const [mesh] = meshes, own = mesh.material, size = SIZE;
@@ -48,49 +40,16 @@ window.shown = {
   shine: drawn(new THREE.MeshBasicMaterial({ map: own.metalnessMap })), same: own.metalnessMap === own.roughnessMap,
   factors: [own.roughness, own.metalness],
 };
-</script>"""
-
-
-def three() -> Path | None:
-    """The folder of npm's three, where it is installed."""
-    if named := os.environ.get("SPNR_THREE"):
-        return Path(named)
-    npm = shutil.which("npm")
-    found = (
-        npm and subprocess.run([npm, "root", "--global"], capture_output=True, text=True, check=False).stdout.strip()
-    )
-    return Path(found) / "three" if found and (Path(found) / "three").is_dir() else None
-
-
-THREE = three()
-pytestmark = [
-    chromium_of.needed,
-    pytest.mark.skipif(THREE is None, reason="no three in npm's global folder or SPNR_THREE: npm install -g three"),
-]
+"""
+pytestmark = [chromium_of.needed, three_js.needed]
 
 
 @pytest.fixture(scope="module")
 def shown():
     """What three.js says of the ball's file, and how it draws it."""
     content = mesh_of(ball_grid(), ball_cloud()).content
-    page = PAGE.replace("SIZE", str(SIZE)).replace("RADIUS", str(RADIUS))
-
-    def answered(route):
-        path = route.request.url.removeprefix(ORIGIN)
-        if path.startswith("/three/"):
-            route.fulfill(path=THREE / path.removeprefix("/three/"), content_type="text/javascript")
-        elif path == "/ball.glb":
-            route.fulfill(body=content, content_type="model/gltf-binary")
-        else:
-            route.fulfill(body=page, content_type="text/html")
-
-    with chromium_of.launched(playwright) as browser:
-        tab, said = browser.new_page(), []
-        tab.on("console", lambda line: said.append(line.text) if line.type in ("error", "warning") else None)
-        tab.on("pageerror", lambda error: said.append(str(error)))
-        tab.route(ORIGIN + "/**", answered)
-        tab.goto(ORIGIN)
-        tab.wait_for_function("window.shown", timeout=60_000)
+    script = SCRIPT.replace("SIZE", str(SIZE)).replace("RADIUS", str(RADIUS))
+    with three_js.run(playwright, script, {"/ball.glb": content}, SIZE) as (tab, said):
         found = tab.evaluate("window.shown")
     found["said"] = [line for line in said if "GPU stall" not in line]  # what this test's reading of pixels costs
     for name in ("whole", "color", "shine"):

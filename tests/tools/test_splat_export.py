@@ -1,4 +1,4 @@
-"""`spnr export --splats` and `spnr share`: what they write, and what they refuse in one line."""
+"""`spnr export --splats`, `--mesh` and `spnr share`: what they write, and what they refuse in one line."""
 
 import signal
 import subprocess
@@ -10,8 +10,9 @@ from support import command_line, splat_balls, tiny_surfels
 
 from spnr_jax.formats import gaussian_files, images
 from spnr_jax.formats.clouds import read_cloud
+from spnr_jax.formats.mesh.meshes import load_mesh
 from spnr_jax.gaussians.placing import View
-from spnr_jax.tools import splat_export, splat_making
+from spnr_jax.tools import mesh_making, splat_export, splat_making
 from spnr_jax.tools.light_options import Lighting
 
 cli = command_line.unchecked_cli()
@@ -55,6 +56,24 @@ def test_splats_of_a_file_lie_around_its_points_in_its_units(cloud, tmp_path, ca
     assert "splats" in capsys.readouterr().out
 
 
+def test_the_mesh_of_a_file_lies_around_its_points_in_its_units(cloud, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(splat_making.fitting_cameras, "__defaults__", (8, tiny_surfels.SIZE))
+    monkeypatch.setattr(mesh_making.mesh_of_volume, "__defaults__", (40,))
+    out = tmp_path / "new" / "ball.glb"
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["export", str(cloud), "--mesh", str(out), "--network", str(tiny_surfels.run()), "--up", "y"])
+    said = capsys.readouterr()
+    assert ended.value.code == 0, said.err
+    assert f"wrote {out} (" in said.out
+    assert "watertight" in said.out
+    points = read_cloud(cloud).positions
+    vertices = np.concatenate([part.positions for part in load_mesh(out).parts])
+    spare = 0.25 * np.ptp(points, axis=0).max()  # the ball has few points
+    for end in (np.min, np.max):
+        np.testing.assert_allclose(end(vertices, axis=0), end(points, axis=0), atol=spare)
+    assert [path.name for path in out.parent.iterdir()] == ["ball.glb"]
+
+
 def test_a_page_holds_title_credit_and_splats(cloud, tmp_path, capsys):
     out = tmp_path / "page.html"
     code = made_by("share", cloud, "--out", out, "--title", "A <ball>", "--credit", "by nobody")
@@ -73,6 +92,12 @@ def test_a_page_holds_title_credit_and_splats(cloud, tmp_path, capsys):
         (("export", "CLOUD", "--splats", "."), "splats"),
         (("export", "CLOUD", "--splats", "out.ply", "--most-splats", "300000"), "--most-splats"),
         (("export", "CLOUD", "--light", "studio"), "--splats"),
+        (("export", "CLOUD", "--mesh", "out.obj"), "out.obj"),
+        (("export", "CLOUD", "--mesh", "out.glb", "--sun", "40", "30"), "--splats"),
+        (("export", "CLOUD", "--mesh", "out.glb", "--splats", "out.ply"), "one at a time"),
+        (("export", "CLOUD", "--up", "z"), "--mesh"),
+        (("export", "nowhere.ply", "--mesh", "out.glb"), "nowhere.ply"),
+        (("export", "CLOUD", "--mesh", "ball.ply/out.glb"), "a file, not a folder"),
         (("export", "nowhere.ply", "--splats", "out.ply"), "nowhere.ply"),
         (("export", "CLOUD", "--splats", "ball.ply/out.ply"), "a file, not a folder"),
         (("share", "CLOUD", "--out", "ball.ply/page.html"), "a file, not a folder"),
