@@ -14,7 +14,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-
 NUM_DIRECTIONS = 64
 CELL = 1.5  # spacings
 STEEPEST = 8.0  # slope of a plane against the direction, at most
