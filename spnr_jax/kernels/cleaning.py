@@ -5,7 +5,7 @@
                 is robust: a multiple of the median absolute deviation (MAD), and never below a fixed ratio
     noise       distance of the neighbours from the plane that most of them lie close to (least quantile of squares,
                 Rousseeuw 1984): at an edge or a thin wall that is one of the faces, so that neither counts as noise.
-                Around thick noise the neighbourhood grows until it is flat
+                A plane with that noise would have these heights; around thick noise the neighbourhood grows
     averaging   each point is moved to where it most likely was, and then along the normal onto the plane of those
                 around it, as moving least squares do (Alexa et al. 2001), within a radius that the noise gives; its
                 materials become their mean.  Where it was is Tweedie's formula (Efron 2011), x + sigma^2 times the
@@ -50,9 +50,11 @@ PLANES = 48  # through three neighbours each, of which the best is taken
 HEIGHTS = 32  # neighbours whose distances from a plane are measured
 SHARE = 0.35  # of them that have to lie close to it
 FLATTEST = 0.25  # share of the places that the noise is told by: elsewhere edges and thin walls add to it
-GAUSSIAN = 0.215  # their largest distance from the best plane there, over the standard deviation of the noise
-FLAT = 0.07  # of the neighbourhood's radius: thinner noise is measured there, thicker in a wider one
-WIDER = 4  # times as many neighbours
+NOISES = (0.0, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5, 0.55, 0.6)  # over the neighbourhood's radius
+THICKNESS = (0.0, 0.012, 0.024, 0.0355, 0.047, 0.0556, 0.0624, 0.0681, 0.0726, 0.0766, 0.0798, 0.0822, 0.0836)
+# largest distance from the best plane, over the radius, in a plane with these noises: what is thick looks like any ball
+THICKEST = 0.08  # that tells the noise; of thicker neighbourhoods wider ones are asked
+WIDER, MOST_WIDE = 2, 16  # times as many neighbours, and share of all points that they stay below
 RADIUS = 2.0  # standard deviations of the noise in that of a neighbour's weight
 LEAST_RADIUS = 1.0  # spacings: the same at least
 AROUND = 64  # points that give a plane
@@ -209,9 +211,9 @@ def noise(positions: Float[np.ndarray, "points 3"]) -> tuple[float, float]:
     while True:
         distances, near = tree.query(sample, [1 + count * i // HEIGHTS for i in range(1, HEIGHTS + 1)], workers=-1)
         radius = float(np.median(distances[:, -1]))
-        sigma = float(np.quantile(_heights(distinct[near]), FLATTEST)) / GAUSSIAN
-        if sigma * GAUSSIAN < FLAT * radius or WIDER**2 * count > len(distinct):
-            return sigma, radius * np.sqrt(np.pi / (count + 1))
+        thickness = float(np.quantile(_heights(distinct[near]), FLATTEST)) / radius
+        if thickness < THICKEST or MOST_WIDE * count > len(distinct):
+            return radius * float(np.interp(thickness, THICKNESS, NOISES)), radius * np.sqrt(np.pi / (count + 1))
         count *= WIDER
 
 
