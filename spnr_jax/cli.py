@@ -13,7 +13,8 @@ import re
 import sys
 import time
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from functools import partial
 from typing import Annotated, Any
 
 import tyro
@@ -245,23 +246,20 @@ def run_export_object(command: Export) -> None:
         "up": command.up,
         "clean": command.clean,
         "note": lambda line: print(f"{command.run}: {line}", file=sys.stderr),
+        "report": partial(print, flush=True),
     }
-    lines: Iterator[str] = iter(())
     if command.mesh is not None:
-        lines = mesh_making.export_mesh(command.run, command.mesh, **of_cloud)
+        mesh_making.export_mesh(command.run, command.mesh, **of_cloud)
     if command.splats is not None:
         lighting, making = command.lighting, command.making
-        lines = splat_export.export_splats(command.run, command.splats, lighting=lighting, making=making, **of_cloud)
-    for line in lines:
-        print(line, flush=True)
+        splat_export.export_splats(command.run, command.splats, lighting=lighting, making=making, **of_cloud)
 
 
 def run_share(command: Share) -> None:
     """`spnr share`."""
     from spnr_jax.tools.splat_export import share
 
-    for line in share(command, note=lambda line: print(f"{command.cloud}: {line}", file=sys.stderr)):
-        print(line, flush=True)
+    share(command, lambda line: print(f"{command.cloud}: {line}", file=sys.stderr), partial(print, flush=True))
 
 
 def run_runs(command: Runs) -> None:

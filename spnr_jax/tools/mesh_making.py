@@ -1,6 +1,6 @@
 """The surface of an object as a .glb file: the network draws it from all around, and a mesh is made from that."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Literal
 
@@ -35,8 +35,9 @@ def export_mesh(
     up: Literal["auto", "x", "y", "z", "-x", "-y", "-z"],
     clean: Literal["auto", "off", "strong"],
     note: Callable[[str], None],
-) -> Iterator[str]:
-    """Writes a cloud's mesh in the file's frame and units; yields a line about it, `note` gets the assumptions."""
+    report: Callable[[str], None],
+) -> None:
+    """Writes a cloud's mesh in the file's frame and units; `note` gets the assumptions, `report` a line about it."""
     if out.suffix.lower() != ".glb":
         raise UserError(f"{out}: a mesh is written as .glb, not {out.suffix or 'a folder'}")
     images.check_place(out)
@@ -44,4 +45,4 @@ def export_mesh(
     placed = clouds.place_cloud(cloud, num_points=num_points, up=up, clean=clean, report=note)
     solid = mesh_of_volume(model, model.encode(placed.cloud), placed)
     images.write_whole(out, solid.content)
-    yield f"wrote {out} ({told(solid)}, {len(solid.content) / 1e6:.1f} MB)"
+    report(f"wrote {out} ({told(solid)}, {len(solid.content) / 1e6:.1f} MB)")

@@ -7,7 +7,7 @@ import base64
 import html
 import io
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -55,30 +55,27 @@ def export_splats(
     up: Literal["auto", "x", "y", "z", "-x", "-y", "-z"],
     clean: Literal["auto", "off", "strong"],
     note: Callable[[str], None],
-) -> Iterator[str]:
-    """Writes a cloud's splats; yields a line about each step, `note` gets the assumptions about the cloud."""
+    report: Callable[[str], None],
+) -> None:
+    """Writes a cloud's splats; `note` gets the assumptions about the cloud, `report` a line after each step."""
     check_suffix(out)
-    lines: list[str] = []
-    made = _made(cloud, run, lighting, making, num_points, up, clean, note, lines.append)
-    yield from lines
+    made = _made(cloud, run, lighting, making, num_points, up, clean, note, report)
     size = write_splats(out, made.gaussians, made.note)
-    yield f"wrote {out} ({len(made.gaussians.opacity):,} splats, {size / 1e6:.1f} MB)"
+    report(f"wrote {out} ({len(made.gaussians.opacity):,} splats, {size / 1e6:.1f} MB)")
 
 
-def share(options: Share, note: Callable[[str], None]) -> Iterator[str]:
-    """Writes the page of a cloud; yields a line about each step, `note` gets the assumptions about the cloud."""
+def share(options: Share, note: Callable[[str], None], report: Callable[[str], None]) -> None:
+    """Writes the page of a cloud; `note` gets the assumptions about the cloud, `report` a line after each step."""
     images.check_place(options.out)
-    lines: list[str] = []
     arguments = options.lighting, options.making, options.num_points, options.up, options.clean
-    made = _made(options.cloud, options.run, *arguments, note, lines.append)
-    yield from lines
+    made = _made(options.cloud, options.run, *arguments, note, report)
     camera = made.model.camera(made.volume, options.azimuth, options.elevation, RESOLUTION)
     poster = np.asarray(made.model.render(made.volume, camera, light=made.light).image)
     said = " · ".join(filter(None, [made.note, options.credit]))
     view = (options.azimuth, options.elevation)
     content = page(made.gaussians, poster, camera, view, options.title or options.cloud.stem, said)
     images.write_whole(options.out, content)
-    yield f"wrote {options.out} ({len(made.gaussians.opacity):,} splats, {len(content) / 1e6:.1f} MB)"
+    report(f"wrote {options.out} ({len(made.gaussians.opacity):,} splats, {len(content) / 1e6:.1f} MB)")
 
 
 def page(
