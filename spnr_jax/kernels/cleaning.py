@@ -55,7 +55,7 @@ THICKNESS = (0.0, 0.012, 0.024, 0.0355, 0.047, 0.0556, 0.0624, 0.0681, 0.0726, 0
 # largest distance from the best plane, over the radius, in a plane with these noises: what is thick looks like any ball
 THICKEST = 0.08  # that tells the noise; of thicker neighbourhoods wider ones are asked
 WIDER, MOST_WIDE = 2, 16  # times as many neighbours, and share of all points that they stay below
-RADIUS = 2.0  # standard deviations of the noise in that of a neighbour's weight
+RADIUS = 1.0  # standard deviations of the noise in that of a neighbour's weight; wider ones eat thin parts
 LEAST_RADIUS = 1.0  # spacings: the same at least
 AROUND = 64  # points that give a plane
 ROWS = 2**13  # points that are moved at a time: their neighbours fit into the cache

@@ -90,11 +90,11 @@ def test_outliers_that_thinning_made_many_are_told_by_a_sample_of_the_cloud():
 
 
 @pytest.mark.parametrize(("shape", "distance"), [("sphere", from_sphere), ("box", from_box)])
-def test_averaging_takes_three_quarters_of_the_noise_of_one_per_cent(shape, distance):
+def test_averaging_takes_three_fifths_of_the_noise_of_one_per_cent(shape, distance):
     surface = SHAPES[shape](60000, "random")
     noisy = surface + np.random.default_rng(0).normal(size=surface.shape) * 0.01
     cleaned, lines = spnr_jax.clean(cloud(noisy))
-    assert distance(np.asarray(cleaned.positions)).mean() < 0.3 * distance(noisy).mean()
+    assert distance(np.asarray(cleaned.positions)).mean() < 0.4 * distance(noisy).mean()
     assert lines[-1].startswith("averaged ")
 
 
