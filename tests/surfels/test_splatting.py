@@ -136,7 +136,7 @@ class TestEntries:
             assert abs(columns.mean() + 0.5 - size / 2) < 0.1 * size
 
     def test_one_program_makes_them_for_pictures_of_any_size(self):
-        found, programs = layer(20, normal=(0, 1, 1)), splatting._entries.__wrapped__
+        found, programs = layer(20, normal=(0, 1, 1)), splatting._entries
         before = programs._cache_size()
         for size in (20, 28):
             view = camera(size)
