@@ -137,7 +137,7 @@ def frame_programs(options: WhereTimeGoes) -> dict[str, Program]:
     total = int(splatting.count(scene.surfels, small))
     found, covered = splatting.jitted_entries(scene.surfels, small, total=total)
     look = partial(surfel_renderer.jitted_look, slots=int(covered))
-    seen, maps, ambient, _ = jax.jit(look)(found, scene.surfels, light, small)
+    seen, maps, ambient, _ = look(found, scene.surfels, light, small)
     shader = Shader(config.widths, config.top)
     outputs = shader.apply(variables, seen[None], doublings)
 
@@ -147,8 +147,8 @@ def frame_programs(options: WhereTimeGoes) -> dict[str, Program]:
     return {
         "whole frame": Program(whole, None),
         "entries counted": program(splatting.count, scene.surfels, small),
-        "entries made and sorted": program(partial(splatting.jitted_entries, total=total), scene.surfels, small),
-        "blended, lit, put before the network": program(look, found, scene.surfels, light, small),
+        "entries made and sorted": Program(partial(splatting.jitted_entries, scene.surfels, small, total=total), None),
+        "blended, lit, put before the network": Program(partial(look, found, scene.surfels, light, small), None),
         "network": program(lambda v, s: shader.apply(v, s[None], doublings), variables, seen),
         "light on materials": program(lambda o, m, a: picture(o, m[None], a[None], doublings), outputs, maps, ambient),
         "product of matrices": peak(),
