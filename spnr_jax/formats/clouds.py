@@ -2,9 +2,9 @@
 
 `read_cloud` makes a PointCloud of NumPy float32 arrays, not padded, in the file's own units, turned so that y is up;
 `place_cloud` also says how to get back into the file's frame.  Files of points are read as named columns
-(point_files.py, what they mean: point_columns.py), of any size in bounded memory; points are
-spread evenly over meshes, with their materials.  What a file does not say is grey 0.5, roughness 0.5, metallic 0;
-`report` is told so, and of every other assumption, one line each.
+(point_files.py, what they mean: point_columns.py), of any size in bounded memory; points are spread evenly over meshes,
+with their materials.  What a file does not say is grey 0.5, roughness 0.5, metallic 0; `report` is told so, and of
+every other assumption, one line each.
 """
 
 from collections.abc import Callable, Iterator
