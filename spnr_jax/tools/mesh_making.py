@@ -12,8 +12,6 @@ from spnr_jax.tools import fused_surface, mesh_export, splat_making
 from spnr_jax.tools.mesh_export import Solid
 from spnr_jax.training.weights import load
 
-NETWORK = "surfels"  # where no other is named
-
 
 def mesh_of_volume(model: Model, volume: Volume, placed: PlacedCloud, resolution: int = fused_surface.GRID) -> Solid:
     """The mesh of a cloud that is encoded, from a grid of so many places along each side of the box."""
@@ -41,7 +39,7 @@ def export_mesh(
     if out.suffix.lower() != ".glb":
         raise UserError(f"{out}: a mesh is written as .glb, not {out.suffix or 'a folder'}")
     images.check_place(out)
-    model = load(run or NETWORK)
+    model = load(run)
     placed = clouds.place_cloud(cloud, num_points=num_points, up=up, clean=clean, report=note)
     solid = mesh_of_volume(model, model.encode(placed.cloud), placed)
     images.write_whole(out, solid.content)

@@ -26,9 +26,8 @@ from spnr_jax.tools.light_options import Lighting
 from spnr_jax.tools.share_command import Share
 from spnr_jax.tools.splat_making import RESOLUTION, splats_of
 from spnr_jax.tools.splat_options import SplatMaking
-from spnr_jax.training.weights import load
+from spnr_jax.training.weights import SHIPPED, load
 
-NETWORK = "surfels"  # that makes splats where no other is named
 MOST_BYTES = 6_000_000  # of a page
 POSTER_QUALITY = 88  # of its JPEG
 
@@ -120,7 +119,7 @@ def _made(
     report: Callable[[str], None],
 ) -> Made:
     """Reads the cloud, loads the network, makes the splats."""
-    model = load(run or NETWORK)
+    model = load(run)
     if run:
         check_takes_light(model, lighting.asked, run)
     light = light_of_options(lighting) if lighting.asked else None
@@ -147,7 +146,7 @@ def splats_of_volume(
 
 def note_of(cloud: Path, run: Path | None, lighting: Lighting) -> str:
     """The line that names cloud, network and light."""
-    return f"{cloud.name}, drawn by spnr_jax ({run.name if run else NETWORK}), light: {light_name(lighting)}"
+    return f"{cloud.name}, drawn by spnr_jax ({run.name if run else SHIPPED[0]}), light: {light_name(lighting)}"
 
 
 def light_name(lighting: Lighting) -> str:

@@ -122,7 +122,7 @@ def random_cloud(cloud: PointCloud, side: int, config: TrainConfig, generator: n
         return thinned(scanned(cloud, generator), min(count, MOST_EVEN), even, generator)
     cloud = thinned(cloud, count, even, generator)
     if generator.random() < UNKNOWN_MATERIALS:
-        positions, columns = colours_alone(np.asarray(cloud.positions), {}, generator)
+        _, columns = colours_alone(np.asarray(cloud.positions), {}, generator)
         cloud = dataclasses.replace(cloud, **columns)
     return dataclasses.replace(cloud, normals=None) if generator.random() < WITHOUT_NORMALS else cloud
 
