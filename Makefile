@@ -52,13 +52,13 @@ bench: setup
 	$(PY) -m experiments.speed.bench $(BENCH)
 
 test: setup
-	$(PY) -m pytest -q -rs -n 2 --dist loadfile --durations=25 -m "not slow and not ci"
+	$(PY) -m pytest -q -rsfE -n 2 --dist loadfile --durations=25 -m "not slow and not ci"
 
 test-ci: setup
-	$(PY) -m pytest -q -rs -n 2 --dist loadfile -m "ci and not slow"
+	$(PY) -m pytest -q -rsfE -n 2 --dist loadfile -m "ci and not slow"
 
 test-all: setup
-	$(PY) -m pytest -q -rs -n 2 --dist loadfile
+	$(PY) -m pytest -q -rsfE -n 2 --dist loadfile
 
 test-wheel: setup
 	$(PY) -m pytest -q tests/test_wheel.py
