@@ -22,8 +22,8 @@ from tqdm import tqdm
 
 from experiments import entry_point
 from experiments.comparison import figures, results_folder
+from experiments.comparison.object_views import told, view_of
 from experiments.comparison.result_tables import Cell, Table, number
-from experiments.studies.sharpness import told, view_of
 from spnr_jax.devices import machine
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets, images

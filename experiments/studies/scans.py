@@ -21,8 +21,8 @@ from tqdm import tqdm
 
 from experiments import entry_point
 from experiments.comparison import figures, results_folder
+from experiments.comparison.object_views import view_of
 from experiments.comparison.result_tables import Cell, Table, number
-from experiments.studies.sharpness import view_of
 from spnr_jax.devices import machine
 from spnr_jax.formats import data_sets, images
 from spnr_jax.kernels.cleaning import cleaned

@@ -3,40 +3,37 @@
     python -m experiments.studies.sharpness --data DIR --out OUT [--runs surfels small] [--counts 1024 4096 16384 65536]
 
 The networks draw the test objects of a data set (`spnr-data generate --spread even --points 65536 --resolution 512`)
-from so many of each object's first points, beside the same discs and light without a network (`draft`).  A ball of one
-grey should be smooth, a plate red in front should show no blue.  Two columns are an oracle: the same colours under the
+from so many of each object's first points, beside the same discs and light without a network (`draft`), and, if asked
+for, trimmed Poisson surfaces in Mitsuba (`--poisson`) and pictures that other programs, Pointersect for one, made of
+the same points and cameras (`--elsewhere FOLDER`, its FOLDER/POINTS/ID/000.png, RGBA, a view each).  A ball of one grey
+should be smooth, a plate red in front should show no blue.  Two columns are an oracle: the same colours under the
 reference's opacity.
 
     OUT/results.json  OUT/table.md .csv .tex     `scoring/picture_scores.py`, of each network and number of points
     OUT/gallery.png   OUT/ID.png                 references and pictures beside each other, at full size
 """
 
-import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from time import perf_counter
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
 from experiments import entry_point
 from experiments.comparison import figures, results_folder
+from experiments.comparison.object_views import cut, on_white, told, view_of
 from experiments.comparison.result_tables import Cell, Table, number
+from experiments.studies.sharpness_methods import Method, Network, methods, resized
 from spnr_jax.devices import machine
 from spnr_jax.formats import data_sets, images
-from spnr_jax.kernels import cameras, metrics
-from spnr_jax.kernels.records import Camera, PointCloud
-from spnr_jax.kernels.resizing import mean_of_squares
-from spnr_jax.method.model import Model, Quality
-from spnr_jax.model_config import SurfelConfig
+from spnr_jax.kernels import metrics
+from spnr_jax.kernels.records import PointCloud
 from spnr_jax.scoring import intervals
 from spnr_jax.scoring.flip import flip
 from spnr_jax.scoring.picture_scores import ball, ball_waves, blue_share, plate, sharpness, under_true_opacity
-from spnr_jax.training.weights import load
 
 COLUMNS = {  # scores of a view: heads, decimals
     "psnr": ("PSNR, dB", 2),
@@ -71,6 +68,10 @@ class SharpnessStudy:
     """Views of an object."""
     objects: int | None = None
     """Test objects (default: all)."""
+    poisson: bool = False
+    """Trimmed Poisson surfaces of the same points, path-traced by Mitsuba, too."""
+    elsewhere: tuple[Path, ...] = ()
+    """Folders of pictures that other programs made."""
     normals: bool = False
     """Give the networks the normals of the data set, too; without them they are estimated."""
     shown: tuple[str, ...] = ()
@@ -85,15 +86,16 @@ def main(options: SharpnessStudy) -> None:
     results_folder.claim(
         options.out, "sharpness", asked | {"resolution": options.resolution, "normals": options.normals}, dataset
     )
+    compared = methods(options.runs, options.poisson, options.elsewhere, dataset)
     rows, known = {}, {}
-    for label, model, quality in _methods(options.runs):
+    for method in compared:
         for count in options.counts:
-            rows[f"{label}, {count:,}"] = [
-                _kept_scores(options, dataset, name, label, model, quality, count)
-                for name in tqdm(names, desc=f"{label}, {count:,} points")
+            row = f"{method.label}, {count:,}"
+            rows[row] = [
+                _kept_scores(options, dataset, name, method, count) for name in tqdm(names, desc=f"{row} points")
             ]
-            known[f"{label}, {count:,}"] = _known(options, label, model, quality, count)
-    _pictures(options, dataset, options.shown or names[:4])
+            known[row] = _known(options, method, count)
+    _pictures(options, dataset, compared, options.shown or names[:4])
     table = Table(
         title=f"Sharpness, {len(names)} objects x {options.views} views",
         heads=(*HEADS, *KNOWN_HEADS),
@@ -103,63 +105,32 @@ def main(options: SharpnessStudy) -> None:
     results_folder.write(options.out, {"objects": rows, "known": known, "hardware": machine.hardware()}, [table])
 
 
-def _levels(model: Model) -> tuple[Quality, ...]:
-    return ("best", "draft") if isinstance(model.config, SurfelConfig) else ("best",)
-
-
-def _methods(runs: Sequence[str]) -> list[tuple[str, Model, Quality]]:
-    """Label, network and quality of every row of the table."""
-    found = []
-    for run in runs:
-        model = load(run)
-        for quality in _levels(model):
-            found.append((run if quality == "best" else f"{run}, discs and light alone", model, quality))
-    return found
-
-
 def _kept_scores(
-    options: SharpnessStudy,
-    dataset: data_sets.Dataset,
-    name: str,
-    label: str,
-    model: Model,
-    quality: Quality,
-    count: int,
-) -> dict[str, float]:
-    place = options.out / "scores" / label.replace("/", "_") / f"{name}_{count}.json"
-    return results_folder.kept(
-        place, lambda: _scores(options, data_sets.read_object(dataset, name), model, quality, count)
-    )
-
-
-def _scores(
-    options: SharpnessStudy, item: data_sets.ObjectData, model: Model, quality: Quality, count: int
-) -> dict[str, float]:
+    options: SharpnessStudy, dataset: data_sets.Dataset, name: str, method: Method, count: int
+) -> dict[str, float | None]:
     """Mean scores of an object's views, seconds to encode it and to draw one."""
-    drawn, seconds = _draw(options, item, model, quality, count)
-    scores = [all_scores(*picture) for picture in drawn]
-    means = {name: float(np.nanmean([of[name] for of in scores])) for name in COLUMNS}
-    return means | dict(zip(("encode", "render"), seconds, strict=True))
+
+    def make() -> dict[str, float | None]:
+        item = cut(data_sets.read_object(dataset, name), count, options.views, options.normals)
+        drawn = method.draw(item, options.resolution)
+        scores = [
+            all_scores(*picture, view_of(item, view, options.resolution)[1])
+            for view, picture in enumerate(drawn.pictures)
+        ]
+        means = {column: _mean(np.array([of[column] for of in scores])) for column in COLUMNS}
+        return means | {"encode": drawn.encode, "render": drawn.render}
+
+    return results_folder.kept(options.out / "scores" / _folder(method) / f"{name}_{count}.json", make)
 
 
-def _draw(
-    options: SharpnessStudy, item: data_sets.ObjectData, model: Model, quality: Quality, count: int
-) -> tuple[list[tuple[np.ndarray, np.ndarray, np.ndarray]], tuple[float, float]]:
-    """Image, opacity and reference of each view; seconds to encode, and of a picture once all is compiled."""
-    cloud = told(jax.tree.map(lambda x: x[:count], item.cloud), options.normals)
-    model.encode(cloud)
-    begin = perf_counter()
-    volume = model.encode(cloud)
-    jax.block_until_ready(jax.tree.leaves(volume.scene))
-    encode = perf_counter() - begin
-    pairs = [view_of(item, view, options.resolution) for view in range(min(options.views, len(item.images)))]
-    views = [camera for camera, _ in pairs]
-    for _ in range(2):
-        begin = perf_counter()
-        found = [(np.asarray(r.image), np.asarray(r.acc)) for r in model.render_each(volume, views, quality)]
-        seconds = (perf_counter() - begin) / len(views)
-    drawn = [(image, opacity, reference) for (image, opacity), (_, reference) in zip(found, pairs, strict=True)]
-    return drawn, (encode, seconds)
+def _folder(method: Method) -> str:
+    return method.label.replace("/", "_")
+
+
+def _mean(values: np.ndarray) -> float | None:
+    """The mean of the numbers among them."""
+    numbers = values[~np.isnan(values)]
+    return float(numbers.mean()) if len(numbers) else None
 
 
 def all_scores(image: np.ndarray, opacity: np.ndarray, reference: np.ndarray) -> dict[str, float]:
@@ -174,67 +145,51 @@ def all_scores(image: np.ndarray, opacity: np.ndarray, reference: np.ndarray) ->
     }
 
 
-def told(cloud: PointCloud, normals: bool) -> PointCloud:
-    """The cloud with its normals or without."""
-    return cloud if normals else dataclasses.replace(cloud, normals=None)
-
-
-def view_of(item: data_sets.ObjectData, view: int, resolution: int | None) -> tuple[Camera, np.ndarray]:
-    """Camera and reference of a view at a resolution, None for its own."""
-    reference = item.images[view].astype(np.float32) / 255
-    camera = jax.tree.map(lambda x: x[view], item.camera)
-    if resolution and resolution != camera.height:
-        reference = smaller(reference, camera.height // resolution)
-        camera = cameras.resize(camera, resolution, resolution)
-    return camera, reference
-
-
-def smaller(reference: np.ndarray, side: int) -> np.ndarray:
-    """The mean of squares of pixels, colours weighted by their opacity."""
-    weighted = np.concatenate([reference[..., :3] * reference[..., 3:], reference[..., 3:]], axis=-1)
-    weighted = np.asarray(mean_of_squares(jnp.asarray(weighted), side))
-    return np.concatenate([weighted[..., :3] / np.maximum(weighted[..., 3:], 1e-4), weighted[..., 3:]], axis=-1)
-
-
-def _known(options: SharpnessStudy, label: str, model: Model, quality: Quality, count: int) -> dict[str, float]:
-    """Scores of the ball and the plate."""
+def _known(options: SharpnessStudy, method: Method, count: int) -> dict[str, float]:
+    """Scores of the ball and the plate, of networks."""
+    if not isinstance(method, Network):
+        return {}
 
     def of(cloud: PointCloud, score: Any, **view: float) -> float:
+        model = method.model
         volume = model.encode(told(cloud, options.normals))
-        rendering = model.render(volume, model.camera(volume, resolution=512, **view), quality)
-        return float(score(np.asarray(rendering.image), np.asarray(rendering.acc)))
+        rendering = model.render(volume, model.camera(volume, resolution=512, **view), method.quality)
+        image = np.asarray(rendering.image)
+        return float(score(image, resized(np.asarray(rendering.acc), image.shape[:2])))
 
     def make() -> dict[str, float]:
         front = {"azimuth": 0.0, "elevation": 0.0}
         return {"ball": of(ball(count), ball_waves), "plate": of(plate(count), blue_share, **front)}
 
-    return results_folder.kept(options.out / "known" / label.replace("/", "_") / f"{count}.json", make)
+    return results_folder.kept(options.out / "known" / _folder(method) / f"{count}.json", make)
 
 
-def _cells(found: Sequence[Mapping[str, float]], known: Mapping[str, float]) -> tuple[Cell, ...]:
+def _cells(found: Sequence[Mapping[str, float | None]], known: Mapping[str, float]) -> tuple[Cell, ...]:
     cells = []
     for name, (_, decimals) in COLUMNS.items():
-        values = [scores[name] for scores in found if not np.isnan(scores[name])]
+        values = [x for scores in found if (x := scores[name]) is not None]
         interval = intervals.interval([np.array([value]) for value in values]) if len(values) > 1 else None
         cells.append(number(float(np.mean(values)) if values else None, decimals, interval))
-    cells += [number(float(np.median([scores[name] for scores in found])), 2) for name in ("encode", "render")]
-    return (*cells, number(known["ball"], 4), number(known["plate"], 3))
+    for name in ("encode", "render"):
+        seconds = [x for scores in found if (x := scores[name]) is not None]
+        cells.append(number(float(np.median(seconds)) if seconds else None, 2))
+    return (*cells, number(known.get("ball"), 4), number(known.get("plate"), 3))
 
 
-def _pictures(options: SharpnessStudy, dataset: data_sets.Dataset, names: Sequence[str]) -> None:
+def _pictures(
+    options: SharpnessStudy, dataset: data_sets.Dataset, compared: Sequence[Method], names: Sequence[str]
+) -> None:
     """A sheet of each shown object at full size, and one of all, smaller."""
     cells = []
-    methods = _methods(options.runs)
-    heads = ["reference", *(f"{label}, {count:,} points" for label, _, _ in methods for count in options.counts)]
+    heads = ["reference", *(f"{method.label}, {count:,} points" for method in compared for count in options.counts)]
     for name in names:
         item = data_sets.read_object(dataset, name)
-        row = []
-        for _, model, quality in methods:
-            for count in options.counts:
-                (image, _, reference), *_ = _draw(options, item, model, quality, count)[0]
-                row.append(image)
-        alpha = reference[..., 3:]
-        cells.append([reference[..., :3] * alpha + 1 - alpha, *row])
+        row = [
+            method.draw(cut(item, count, 1, options.normals), options.resolution).pictures[0][0]
+            for method in compared
+            for count in options.counts
+        ]
+        cells.append([on_white(view_of(item, 0, options.resolution)[1])[0], *row])
         full = figures.grid([cells[-1]], heads, size=cells[-1][0].shape[0])
         images.write_whole(options.out / f"{name}.png", images.png(full))
     images.write_whole(options.out / "gallery.png", images.png(figures.grid(cells, heads, names, size=192)))

@@ -29,10 +29,10 @@ import tyro
 
 from experiments import entry_point
 from experiments.comparison import results_folder
+from experiments.comparison.object_views import told, view_of
 from experiments.comparison.peak_memory import forget_peak, peak_mb
 from experiments.comparison.result_tables import Table, number, text
 from experiments.comparison.trained_networks import test_objects
-from experiments.studies.sharpness import told, view_of
 from experiments.studies.speed_accuracy_plot import plot
 from spnr_jax import cli
 from spnr_jax.devices import machine

@@ -33,7 +33,7 @@ from data_gen.render.variant import choose_variant
 from experiments import entry_point
 from experiments.comparison import exported_mesh, figures, poisson, results_folder, splats_by_mitsuba
 from experiments.comparison.exported_mesh import ExportedMesh
-from experiments.studies.sharpness import smaller, told, view_of
+from experiments.comparison.object_views import smaller, told, view_of
 from experiments.studies.splat_quality_report import BY_MITSUBA, MESH, after, caption, methods_of, tables_of
 from spnr_jax.devices import machine
 from spnr_jax.errors import UserError

@@ -13,6 +13,8 @@ from data_gen.render import light, views
 from data_gen.render.poisson_surface import PoissonConfig
 from data_gen.store import layout
 from experiments.comparison import poisson
+from experiments.comparison.object_views import at, cut, on_white
+from experiments.studies.sharpness_methods import Poisson
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.mesh import surface_points
 from spnr_jax.formats.mesh.assets import Asset
@@ -80,6 +82,23 @@ def test_a_ball_is_rendered_as_its_reference_and_a_line_is_an_empty_picture_with
     written = [path.stat().st_mtime_ns for path in pictures]
     show(items["ball"])  # nothing is left to do
     assert [path.stat().st_mtime_ns for path in pictures] == written
+
+
+@needs_solver
+def test_the_sharpness_study_draws_the_same_surfaces_of_the_first_points_and_views(dataset):
+    found = data_sets.open_dataset(dataset)
+    surfaces = Poisson("Poisson", poisson.Renderer(found.settings, variant="scalar_rgb"))
+    item = data_sets.read_object(found, "ball")
+    (image, opacity), *more = surfaces.draw(cut(item, 500, 1, normals=False), None).pictures
+    reference, alpha = on_white(at(item.images[0], None))
+    assert not more
+    assert -10 * np.log10(np.square(image - reference).mean()) > 25
+    assert ((opacity > 0.5) == (alpha > 0.5)).mean() > 0.95
+    half = surfaces.draw(cut(item, 500, 1, normals=False), VIEW.resolution // 2).pictures[0][1]
+    np.testing.assert_allclose(half.mean(), opacity.mean(), atol=1e-5)
+    (image, opacity), *_ = surfaces.draw(data_sets.read_object(found, "line"), None).pictures
+    assert (image == 1).all()
+    assert (opacity == 0).all()
 
 
 def test_the_light_has_to_be_that_of_the_data_set(tmp_path):

@@ -1,6 +1,7 @@
 """Sharpness and relighting: the whole of both studies on one ball, and what their scores are of known pictures."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -29,12 +30,22 @@ def lit(tmp_path_factory):
 @pytest.mark.ci
 def test_the_sharpness_study_ends_with_a_table_and_pictures_and_goes_on_where_it_stopped(tmp_path):
     folder = tiny_dataset.write_dataset(tmp_path / "set", SPLITS, tiny_surfels.SIZE)
+    right = tmp_path / "right"  # pictures of another program that are the references
+    for count in (16, 32):
+        shutil.copytree(folder / "objects" / "ball_000000" / "images", right / str(count) / "ball_000000")
     options = sharpness.SharpnessStudy(
-        data=folder, out=tmp_path / "out", runs=(str(tiny_surfels.run()),), counts=(16, 32), views=1
+        data=folder,
+        out=tmp_path / "out",
+        runs=(str(tiny_surfels.run()),),
+        counts=(16, 32),
+        views=1,
+        elsewhere=(right,),
     )
     sharpness.main(options)
     results = json.loads((tmp_path / "out" / "results.json").read_text())
-    assert len(results["objects"]) == len(results["known"]) == 4  # network and discs alone, two numbers of points
+    assert len(results["objects"]) == len(results["known"]) == 6  # network, discs and right, two numbers of points
+    assert results["objects"]["right, 32"][0]["psnr"] == pytest.approx(100, abs=1e-3)
+    assert results["objects"]["right, 32"][0]["outline_rmse"] == pytest.approx(0, abs=1e-6)
     scores = next(iter(results["objects"].values()))[0]
     assert np.isfinite([scores[name] for name in ("psnr", "psnr_inside", "outline_rmse", "encode", "render")]).all()
     assert (tmp_path / "out" / "gallery.png").is_file()
