@@ -33,7 +33,7 @@ from spnr_jax.method import surfel_renderer
 from spnr_jax.model_config import SurfelConfig
 from spnr_jax.nn.shader import Shader, picture
 from spnr_jax.presets import PRESETS
-from spnr_jax.surfels import splatting
+from spnr_jax.surfels import projection
 from spnr_jax.surfels.lighting import room_light
 from spnr_jax.training import optimisation, shading
 
@@ -134,8 +134,8 @@ def frame_programs(options: WhereTimeGoes) -> dict[str, Program]:
     scene = surfel_renderer.encode(variables, sphere(options.points), config=config)
     doublings, side = surfel_renderer.resolution_of(scene.spacing, camera)
     small = orbiting(options.size * side >> doublings)
-    total = int(splatting.count(scene.surfels, small))
-    found, covered = splatting.jitted_entries(scene.surfels, small, total=total)
+    total = int(projection.count(scene.surfels, small))
+    found, covered = projection.jitted_entries(scene.surfels, small, total=total)
     look = partial(surfel_renderer.jitted_look, slots=int(covered))
     seen, maps, ambient, _ = look(found, scene.surfels, light, small)
     shader = Shader(config.widths, config.top)
@@ -146,8 +146,8 @@ def frame_programs(options: WhereTimeGoes) -> dict[str, Program]:
 
     return {
         "whole frame": Program(whole, None),
-        "entries counted": program(splatting.count, scene.surfels, small),
-        "entries made and sorted": Program(partial(splatting.jitted_entries, scene.surfels, small, total=total), None),
+        "entries counted": program(projection.count, scene.surfels, small),
+        "entries made and sorted": Program(partial(projection.jitted_entries, scene.surfels, small, total=total), None),
         "blended, lit, put before the network": Program(partial(look, found, scene.surfels, light, small), None),
         "network": program(lambda v, s: shader.apply(v, s[None], doublings), variables, seen),
         "light on materials": program(lambda o, m, a: picture(o, m[None], a[None], doublings), outputs, maps, ambient),

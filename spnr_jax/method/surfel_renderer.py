@@ -27,7 +27,7 @@ from spnr_jax.kernels.resizing import doubled, mean_of_squares
 from spnr_jax.method import solid
 from spnr_jax.model_config import SOLID, SurfelConfig
 from spnr_jax.nn.shader import NUM_OUTPUTS, Shader, picture
-from spnr_jax.surfels import features, lighting, splatting
+from spnr_jax.surfels import features, lighting, projection, splatting
 from spnr_jax.surfels.estimate import estimate
 
 COARSEST = 3.5  # pixels between points from which on a picture is drawn at half the size
@@ -153,8 +153,8 @@ def _drawn(
         return _nothing(camera), least_slots
     whole = _scaled(camera, plan.doublings, plan.side)
     inside = _seen_through(whole, plan)
-    found, covered = splatting.jitted_entries(
-        scene.surfels, inside, total=_rounded(total, 2**15, splatting.MOST_ENTRIES)
+    found, covered = projection.jitted_entries(
+        scene.surfels, inside, total=_rounded(total, 2**15, projection.MOST_ENTRIES)
     )
     pixels = inside.height * inside.width
     slots = _rounded(min(max(int(covered), least_slots), pixels), LEAST_SLOTS, pixels)
@@ -175,7 +175,7 @@ def resolution_of(spacing: float, camera: Camera) -> tuple[int, int]:
 @partial(jax.jit, compiler_options=QUICK)
 def _extent(surfels: Surfels, camera: Camera) -> tuple[Array, Array]:
     """Lowest and highest column and row that discs cover, and the number of entries at most."""
-    foot = splatting.footprints(surfels, camera)
+    foot = projection.footprints(surfels, camera)
     drawn = foot.covered > 0
     rows = foot.covered // foot.width
     low = [jnp.min(jnp.where(drawn, x, 2**20)) for x in (foot.left, foot.top)]
@@ -235,7 +235,7 @@ def _in_window(picture: Float[Array, "h w features"], plan: Plan) -> Float[np.nd
     return np.pad(np.asarray(picture), [*lacking, (0, 0)])[plan.top : ends[0], plan.left : ends[1]]
 
 
-def blended(found: splatting.Entries, surfels: Surfels, light: Light, camera: Camera, *, slots: int) -> GBuffer:
+def blended(found: projection.Entries, surfels: Surfels, light: Light, camera: Camera, *, slots: int) -> GBuffer:
     """The G-buffer of a picture's entries, with what of the light arrives at each surfel."""
     surfels = features.turned(surfels, camera)
     return splatting.blend(found, surfels, features.attributes(surfels, light, camera), camera, slots=slots)
@@ -257,7 +257,7 @@ _seen = jax.jit(seen, compiler_options=QUICK)
 
 
 def jitted_look(
-    found: splatting.Entries,
+    found: projection.Entries,
     surfels: Surfels,
     light: Light,
     camera: Camera,

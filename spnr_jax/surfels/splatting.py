@@ -1,225 +1,25 @@
-"""G-buffer of surfels: discs projected into a picture and blended layer by layer, without order artefacts.
+"""G-buffer of surfels: their discs blended layer by layer, without order artefacts.
 
-An entry is a pair of a disc and a pixel that it covers.  Entries are counted, made, and sorted by pixel and depth;
-then each covered pixel has the list of its LIST front-most entries:
+Each covered pixel has the list of its LIST front-most entries (`projection.py`):
 
-    weight      (1 - r^2)^2, r the distance from the disc's centre in its plane over RADIUS spacings; a disc seen from
-                its edge, or smaller than a pixel, is as wide as FLOOR pixels (the low-pass of EWA splatting, Zwicker
-                et al. 2001)
     layers      entries less than a spacing apart in depth blend and do not hide each other; from two spacings on what
                 is in front hides what is behind
     share       of an entry in its pixel: those of a layer add up to 1 - exp(-optical depth), times what is left by the
                 layers before it; over all layers they add up to the opacity
-
-Everything passes to 0 at the border of a disc, so a picture is continuous in the camera and in the points.  Static
-sizes come from counts that the caller reads back: a picture is three programs, `count`, `entries`, `blend`.
 """
-
-from collections.abc import Sequence
-from functools import reduce
-from operator import add, mul
-from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float, Int
 
-from spnr_jax.kernels.records import AnyArray, Camera, GBuffer, Surfels
+from spnr_jax.kernels.records import Camera, GBuffer, Surfels
+from spnr_jax.surfels.projection import Entries, footprints, smoothstep, turned
 
-RADIUS = 1.6  # of a disc, in spacings
-FLOOR = 1.0  # smallest radius on the picture, in pixels
-RIM_WIDTH = 0.4  # spacings over which a disc passes to 0 at the end of its layer
-SKIRT = 0.15  # of the kernel left beyond the end of a layer: for the network, which may know better where that is
 OPACITY = 3.0  # optical depth at the middle of a disc
 LIST = 24  # entries of a pixel at most
 NEAR = 8  # places in the list before and after an entry that are compared in depth; those farther in front hide it
-EDGE = 0.02  # cosine between ray and plane below which the plane counts as seen at this angle
 SHARP = 4  # power of the kernel by which colours are blended more narrowly than everything else
 FAR = 1e-4  # summed narrow weights that the centres' distances pass to 0 at
-NEAREST = 0.05  # distance before the camera from which discs are drawn
-DEPTH_BITS, ENTRY_BITS = 19, 24  # of the sorted number of 64, at most; pixels have those above
-PIXEL_BITS = 64 - DEPTH_BITS - ENTRY_BITS  # that leave so many to the depth
-MOST_ENTRIES = 2**ENTRY_BITS
-
-
-class View(NamedTuple):
-    """A camera whose picture's size is a number like others, not one that programs are compiled for."""
-
-    cam_to_world: Float[AnyArray, "3 4"]
-    intrinsics: Float[AnyArray, "3 3"]
-    height: Int[AnyArray, ""]
-    width: Int[AnyArray, ""]
-
-
-class Footprints(NamedTuple):
-    """Where each disc lies in the picture: camera coordinates, size, and the rectangle of pixels around it."""
-
-    centre: tuple[Array, Array, Array]
-    normal: tuple[Array, Array, Array]
-    radius: Float[Array, " points"]
-    facing: Float[Array, " points"]
-    column: Float[Array, " points"]
-    row: Float[Array, " points"]
-    left: Int[Array, " points"]
-    top: Int[Array, " points"]
-    width: Int[Array, " points"]
-    covered: Int[Array, " points"]
-
-
-class Entries(NamedTuple):
-    """Pairs of disc and pixel; `order` sorts them by pixel and depth, `pixel`, `slot`, `rank` are sorted already.
-
-    A covered pixel has a slot, an entry its rank in the list of the slot.
-    """
-
-    point: Int[Array, " entries"]
-    kernel: Float[Array, " entries"]
-    depth: Float[Array, " entries"]
-    facing: Float[Array, " entries"]
-    order: Int[Array, " entries"]
-    pixel: Int[Array, " entries"]
-    slot: Int[Array, " entries"]
-    rank: Int[Array, " entries"]
-
-
-def smoothstep(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """0 below 0, 1 above 1, a cubic without a kink between."""
-    x = jnp.clip(x, 0, 1)
-    return x * x * (3 - 2 * x)
-
-
-def _turned(matrix: Float[AnyArray, "3 3"], vectors: Float[AnyArray, "points 3"]) -> tuple[Array, Array, Array]:
-    """Columns of vectors @ matrix."""
-    x, y, z = jnp.asarray(vectors).T
-    one, two, three = (x * matrix[0, i] + y * matrix[1, i] + z * matrix[2, i] for i in range(3))
-    return one, two, three
-
-
-def _cross(a: tuple[Array, Array, Array], b: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-
-
-def _dot(a: Sequence[Array], b: Sequence[Array]) -> Array:
-    return reduce(add, (x * y for x, y in zip(a, b, strict=True)))
-
-
-def footprints(surfels: Surfels, camera: Camera | View) -> Footprints:
-    """Discs before a camera; those turned away, behind it or beside the picture cover no pixel."""
-    rotation, eye = camera.cam_to_world[:, :3], camera.cam_to_world[:, 3]
-    x, y, z = (centre - e for centre, e in zip(_turned(rotation, surfels.position), eye @ rotation, strict=True))
-    normal = _turned(rotation, surfels.normal)
-    distance = jnp.sqrt(x * x + y * y + z * z)
-    cosine = -(normal[0] * x + normal[1] * y + normal[2] * z) / jnp.maximum(distance, NEAREST)
-    facing = 1 - jnp.asarray(surfels.sided) * (1 - smoothstep((cosine + 0.1) / 0.3))
-    ahead = jnp.maximum(-z, NEAREST)
-    column = camera.intrinsics[0, 0] * x / ahead + camera.intrinsics[0, 2]
-    row = -camera.intrinsics[1, 1] * y / ahead + camera.intrinsics[1, 2]
-    radius = RADIUS * jnp.asarray(surfels.spacing)
-    nearest = jnp.maximum(ahead - radius * jnp.sqrt(jnp.clip(1 - normal[2] ** 2, 0, 1)), NEAREST)  # of the disc
-    sides = []
-    for middle, focal, aside, along, size in (
-        (column, camera.intrinsics[0, 0], x / ahead, normal[0], camera.width),
-        (row, camera.intrinsics[1, 1], y / ahead, normal[1], camera.height),
-    ):
-        # a place of the disc at (dx, dz) from its centre lies focal * (dx + aside * dz) / (ahead - dz) beside it
-        extent = jnp.sqrt(jnp.maximum(1 + aside**2 - (along + aside * normal[2]) ** 2, 0))
-        half = jnp.maximum(focal * radius * extent / nearest, FLOOR)
-        first = jnp.clip(jnp.ceil(middle - half - 0.5), 0, size)
-        sides.append((first, jnp.maximum(jnp.clip(jnp.floor(middle + half - 0.5) + 1, 0, size) - first, 0)))
-    (left, width), (top, height) = sides
-    drawn = surfels.mask & (facing > 0) & (-z > NEAREST)
-    return Footprints(
-        centre=(x, y, z),
-        normal=normal,
-        radius=radius,
-        facing=facing,
-        column=column,
-        row=row,
-        left=left.astype(jnp.int32),
-        top=top.astype(jnp.int32),
-        width=jnp.maximum(width, 1).astype(jnp.int32),
-        covered=jnp.where(drawn, width * height, 0).astype(jnp.int32),
-    )
-
-
-@jax.jit
-def count(surfels: Surfels, camera: Camera) -> Int[Array, ""]:
-    """Number of entries that a picture makes at most."""
-    return jnp.sum(footprints(surfels, camera).covered)
-
-
-def entries(
-    surfels: Surfels, camera: Camera | View, *, total: int, pixel_bits: int = PIXEL_BITS
-) -> tuple[Entries, Int[Array, ""]]:
-    """The sorted entries, `total` of them with the empty ones, and the number of covered pixels.
-
-    The numbers of the pixels, and of one more, have at most `pixel_bits`.
-    """
-    foot = footprints(surfels, camera)
-    end = jnp.cumsum(foot.covered)
-    point = jnp.repeat(jnp.arange(len(foot.covered), dtype=jnp.int32), foot.covered, total_repeat_length=total)
-    # whole columns are gathered one by one, and not computed anew at every use: twenty times faster on a CPU
-    rotation = camera.cam_to_world[:, :3]
-    rim = _turned(rotation, surfels.rim)
-    side = _cross(foot.normal, rim)
-    reach = tuple(jnp.asarray(surfels.reach).T)
-    foot, begin, point, rim, side, reach = jax.lax.optimization_barrier(
-        (foot, end - foot.covered, point, rim, side, reach)
-    )
-    x, y, z, nx, ny, nz = (column[point] for column in (*foot.centre, *foot.normal))
-    radius = foot.radius[point]
-    place = jnp.arange(total, dtype=jnp.int32)
-    inside, width = place - begin[point], foot.width[point]
-    row = inside // width
-    column = foot.left[point] + inside - row * width
-    row = foot.top[point] + row
-    right = (column + 0.5 - camera.intrinsics[0, 2]) / camera.intrinsics[0, 0]
-    up = -(row + 0.5 - camera.intrinsics[1, 2]) / camera.intrinsics[1, 1]
-    slope = nx * right + ny * up - nz
-    slope = jnp.where(slope < 0, jnp.minimum(slope, -EDGE), jnp.maximum(slope, EDGE))
-    met = jnp.clip((nx * x + ny * y + nz * z) / slope, -z - 2 * radius, -z + 2 * radius)
-    there = [RADIUS / radius * x for x in (met * right - x, met * up - y, -met - z)]  # in spacings
-    in_plane = _dot(there, there) / RADIUS**2
-    along, across = _dot(there, [c[point] for c in rim]), _dot(there, [c[point] for c in side])
-    ends = [r[point] - x for r, x in zip(reach, (along, -along, across, -across), strict=True)]
-    cut = reduce(mul, (jnp.clip(0.5 + end / RIM_WIDTH, 0, 1) for end in ends))
-    on_picture = ((column + 0.5 - foot.column[point]) ** 2 + (row + 0.5 - foot.row[point]) ** 2) / FLOOR**2
-    cut = jnp.maximum(cut - in_plane, SKIRT * (1 - in_plane))
-    kernel = jnp.clip(jnp.maximum(cut, 1 - on_picture), 0, 1)
-    depth = jnp.clip(met, -z - radius, -z + radius)
-    pixel = jnp.where((place < end[-1]) & (kernel > 0), row * camera.width + column, camera.height * camera.width)
-    order, pixel = _sorted(pixel, depth, place, 64 - ENTRY_BITS - pixel_bits)
-    first = jnp.concatenate([jnp.ones(1, bool), pixel[1:] != pixel[:-1]]) & (pixel < camera.height * camera.width)
-    slot = jnp.cumsum(first.astype(jnp.int32)) - 1
-    rank = place - jax.lax.cummax(jnp.where(first, place, 0))
-    return Entries(point, kernel, depth, foot.facing[point], order, pixel, slot, rank), slot[-1] + 1
-
-
-# this option takes a quarter off the compilation and costs the program no time
-_entries = jax.jit(
-    entries, static_argnames=("total", "pixel_bits"), compiler_options={"xla_cpu_use_fusion_emitters": False}
-)
-
-
-def jitted_entries(surfels: Surfels, camera: Camera, *, total: int) -> Any:
-    """`entries` by a program that draws pictures of any size."""
-    size = np.asarray(camera.height, np.int32), np.asarray(camera.width, np.int32)
-    bits = max(PIXEL_BITS, (camera.height * camera.width).bit_length())
-    return _entries(surfels, View(camera.cam_to_world, camera.intrinsics, *size), total=total, pixel_bits=bits)
-
-
-def _sorted(
-    pixel: Int[Array, " entries"], depth: Float[Array, " entries"], place: Int[Array, " entries"], depth_bits: int
-) -> tuple[Int[Array, " entries"], Int[Array, " entries"]]:
-    """Places and pixels in the order of pixel and depth: one number of 64 bits sorts nine times faster than three."""
-    low, high = jnp.min(depth), jnp.max(depth)
-    steps = 2**depth_bits - 1
-    with jax.enable_x64(True):
-        level = (steps * (depth - low) / jnp.maximum(high - low, 1e-6)).astype(jnp.uint64)
-        key = pixel.astype(jnp.uint64) << (depth_bits + ENTRY_BITS) | level << ENTRY_BITS | place.astype(jnp.uint64)
-        key = jax.lax.sort(key)
-        return (key & (2**ENTRY_BITS - 1)).astype(jnp.int32), (key >> (depth_bits + ENTRY_BITS)).astype(jnp.int32)
 
 
 def blend(
@@ -239,7 +39,7 @@ def blend(
     sharp = share * kernel**SHARP * found.facing[table]
     share, sharp = jax.lax.optimization_barrier((share, sharp))
     rotation = camera.cam_to_world[:, :3]
-    normal = jnp.stack(_turned(rotation, surfels.normal), axis=-1)
+    normal = jnp.stack(turned(rotation, surfels.normal), axis=-1)
     wide = jnp.concatenate([attributes, normal, jnp.log(surfels.spacing)[:, None]], axis=1)
     offset = surfels.base_color - jnp.sum(surfels.gradient * surfels.position[:, None], axis=-1)
     foot = footprints(surfels, camera)

@@ -33,7 +33,7 @@ from spnr_jax.kernels.records import Camera, Crops, Light, PointCloud
 from spnr_jax.kernels.thinning import farthest_points
 from spnr_jax.method import surfel_renderer
 from spnr_jax.model_config import SurfelConfig
-from spnr_jax.surfels import features, lighting, splatting
+from spnr_jax.surfels import features, lighting, projection
 from spnr_jax.training.batching import read_ahead
 from spnr_jax.training.scan_faults import colours_alone, random_scan
 
@@ -166,10 +166,10 @@ def make_view(
     if side == 0 or any(n % (side * scale) or n // (side * scale) < LEAST for n in image.shape[:2]):
         return None
     drawn = cameras.resize(camera, *(n // (side * scale) for n in image.shape[:2]))
-    total = int(splatting.count(scene.surfels, drawn))
+    total = int(projection.count(scene.surfels, drawn))
     if not 0 < total <= MOST_ENTRIES:
         return None
-    found, slots = splatting.jitted_entries(scene.surfels, drawn, total=_size(total, 2**16))
+    found, slots = projection.jitted_entries(scene.surfels, drawn, total=_size(total, 2**16))
     slots = min(_size(int(slots), drawn.height * drawn.width // 16), drawn.height * drawn.width)
     seen, maps, ambient, _ = map(
         np.asarray, surfel_renderer.jitted_look(found, scene.surfels, light, drawn, known(drawn), slots=slots)

@@ -113,7 +113,7 @@ def test_views_are_those_drawn_one_by_one(scene):
 
 
 def test_more_entries_than_can_be_sorted_are_refused_in_one_line(scene, monkeypatch):
-    monkeypatch.setattr(surfel_renderer.splatting, "MOST_ENTRIES", 100)
+    monkeypatch.setattr(surfel_renderer.projection, "MOST_ENTRIES", 100)
     with pytest.raises(ValueError, match="ask for a smaller one"):
         render(None, scene, camera(64), LIGHT, config=CONFIG)
 

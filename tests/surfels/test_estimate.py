@@ -7,7 +7,7 @@ from support.surfel_clouds import even_square, shape
 
 from spnr_jax.surfels import estimate as module
 from spnr_jax.surfels import neighbours, rims, sides
-from spnr_jax.surfels.splatting import RADIUS
+from spnr_jax.surfels.projection import RADIUS
 from spnr_jax.surfels.visibility import tangents
 
 FIELDS = ("normal", "spacing", "gradient", "sided", "visible", "shape")

@@ -10,7 +10,7 @@ from support.laws import close
 from support.surfel_clouds import camera, even_square, shape, surfels
 
 from spnr_jax.kernels.records import Camera
-from spnr_jax.surfels import features, splatting
+from spnr_jax.surfels import features, projection, splatting
 from spnr_jax.surfels.estimate import estimate
 from spnr_jax.surfels.lighting import WIDTH, light_of
 
@@ -46,7 +46,7 @@ def told(turn, visible=None):
 @jax.jit
 def drawn(found, light, view):
     found = features.turned(found, view)
-    entries, _ = splatting.entries(found, view, total=2**15)
+    entries, _ = projection.entries(found, view, total=2**15)
     buffer = splatting.blend(entries, found, features.attributes(found, light, view), view, slots=24**2)
     return buffer, *features.features(buffer, light, view)
 

@@ -8,7 +8,7 @@ from support.laws import close, numbers
 from support.surfel_clouds import camera, even_square, shape, surfels
 
 from spnr_jax.kernels import cameras
-from spnr_jax.surfels import splatting
+from spnr_jax.surfels import projection, splatting
 from spnr_jax.surfels.splatting import shares
 
 TOTAL = 2**15  # entries, and 500 points in most scenes: few programs are compiled
@@ -18,9 +18,9 @@ blend = jax.jit(splatting.blend, static_argnames="slots")
 def draw(found, view, attributes=None):
     """G-buffer (as NumPy arrays) of surfels, and the entries that it was blended from."""
     attributes = found.base_color if attributes is None else attributes
-    entries, slots = splatting.jitted_entries(found, view, total=TOTAL)
+    entries, slots = projection.jitted_entries(found, view, total=TOTAL)
     assert (
-        int(np.sum(np.asarray(entries.pixel) < view.height * view.width)) <= int(splatting.count(found, view)) <= TOTAL
+        int(np.sum(np.asarray(entries.pixel) < view.height * view.width)) <= int(projection.count(found, view)) <= TOTAL
     )
     assert int(slots) <= view.height * view.width
     buffer = blend(entries, found, jnp.asarray(attributes), view, slots=view.height * view.width)
@@ -104,17 +104,17 @@ class TestEntries:
         directions, eye = np.float64(rays.directions).reshape(-1, 3), np.float64(view.cam_to_world[:, 3])
         pixels, _ = cameras.project(view, found.position)
         places = np.stack(np.meshgrid(*[np.arange(20) + 0.5] * 2), axis=-1).reshape(-1, 2)
-        facing = np.asarray(splatting.footprints(found, view).facing) > 0
+        facing = np.asarray(projection.footprints(found, view).facing) > 0
         for i, (p, n) in enumerate(zip(np.float64(position), np.float64(normal), strict=True)):
             slope = directions @ n
             hit = eye + directions * ((n @ (p - eye)) / np.where(abs(slope) < 0.05, np.nan, slope))[:, None]
             rim = np.float64(found.rim[i])
             side = np.cross(n, rim)
             ends = [e + (p - hit) @ way / 0.25 for e, way in zip(reach[i], (rim, -rim, side, -side), strict=True)]
-            kept = np.prod([np.clip(0.5 + e / splatting.RIM_WIDTH, 0, 1) for e in ends], axis=0)
-            within = ((hit - p) ** 2).sum(axis=1) / (splatting.RADIUS * 0.25) ** 2
-            on_picture = 1 - ((places - np.asarray(pixels)[i]) ** 2).sum(axis=1) / splatting.FLOOR**2
-            drawn = np.max([kept - within, splatting.SKIRT * (1 - within), on_picture], axis=0)
+            kept = np.prod([np.clip(0.5 + e / projection.RIM_WIDTH, 0, 1) for e in ends], axis=0)
+            within = ((hit - p) ** 2).sum(axis=1) / (projection.RADIUS * 0.25) ** 2
+            on_picture = 1 - ((places - np.asarray(pixels)[i]) ** 2).sum(axis=1) / projection.FLOOR**2
+            drawn = np.max([kept - within, projection.SKIRT * (1 - within), on_picture], axis=0)
             clear = np.isfinite(drawn) & (directions @ (hit - eye).T[:, 0] > -9)
             expected = facing[i] * np.clip(drawn, 0, 1)
             close(table[i][clear], expected[clear], atol=2e-3)
@@ -123,8 +123,8 @@ class TestEntries:
         found = layer(20, normal=(0, 1, 1))
         for size in (24, 2100):  # the second has more pixels than 21 bits count
             view = camera(size, field_of_view=2.9 if size > 24 else 0.7)
-            total = int(splatting.count(found, view))
-            entries, slots = splatting.jitted_entries(found, view, total=total)
+            total = int(projection.count(found, view))
+            entries, slots = projection.jitted_entries(found, view, total=total)
             order, pixel = np.asarray(entries.order), np.asarray(entries.pixel)
             live = pixel < size**2
             assert np.all(np.diff(pixel) >= 0)
@@ -136,12 +136,12 @@ class TestEntries:
             assert abs(columns.mean() + 0.5 - size / 2) < 0.1 * size
 
     def test_one_program_makes_them_for_pictures_of_any_size(self):
-        found, programs = layer(20, normal=(0, 1, 1)), splatting._entries
+        found, programs = layer(20, normal=(0, 1, 1)), projection._entries
         before = programs._cache_size()
         for size in (20, 28):
             view = camera(size)
-            made, slots = splatting.jitted_entries(found, view, total=2**12)
-            wanted, filled = jax.jit(splatting.entries, static_argnames="total")(found, view, total=2**12)
+            made, slots = projection.jitted_entries(found, view, total=2**12)
+            wanted, filled = jax.jit(projection.entries, static_argnames="total")(found, view, total=2**12)
             assert int(slots) == int(filled) > 0
             jax.tree.map(lambda x, y: close(x, y, atol=1e-5), made, wanted)
         assert programs._cache_size() == before + 1

@@ -16,7 +16,7 @@ from spnr_jax.formats import data_sets
 from spnr_jax.kernels.cameras import pinhole
 from spnr_jax.kernels.records import Crops, Surfels
 from spnr_jax.method import surfel_renderer
-from spnr_jax.surfels import features, lighting, splatting
+from spnr_jax.surfels import features, lighting, projection
 from spnr_jax.surfels.visibility import DIRECTIONS, tangents
 from spnr_jax.training import gbuffers, optimisation, shading
 
@@ -155,7 +155,7 @@ def test_a_mirrored_object_is_seen_as_the_mirrored_view(axis):
             reach=reach if sign.min() > 0 else reach[:, [0, 1, 3, 2]],  # normal x rim is not mirrored
             mask=np.ones(60, bool),
         )
-        found, slots = splatting.jitted_entries(surfels, camera, total=2**14)
+        found, slots = projection.jitted_entries(surfels, camera, total=2**14)
         seen.append(np.asarray(surfel_renderer.jitted_look(found, surfels, LIGHT, camera, slots=24 * 24)[0]))
     view = {"seen": seen[0], "maps": seen[0], "target": seen[0], "ambient": np.zeros((9, 3))}
     np.testing.assert_allclose(gbuffers.mirrored(view, axis)["seen"], seen[1], atol=0.05)
