@@ -16,7 +16,7 @@ from spnr_jax.kernels.cloud_arrays import bucket
 from spnr_jax.kernels.records import Surfels
 from spnr_jax.surfels import layers, sides
 from spnr_jax.surfels.neighbours import LEAST_SPACING, Near, each, first_spacing, joined, neighbourhoods
-from spnr_jax.surfels.rims import rims
+from spnr_jax.surfels.rims import EVEN, bridged, evenness, rims
 from spnr_jax.surfels.visibility import tangents
 
 OWN_DISC = 5.5  # neighbours, by their weights, in the disc that gives the spacing; sums of ones jump at whole numbers
@@ -47,6 +47,8 @@ def estimate(
     weight = each(layers.weights, near, layer, *all_of(normal, sided))
     spacing = joined(_own_spacing, near, weight, *all_of(raw))
     spacing = joined(_smoothed, near, weight, *all_of(spacing))
+    if np.median(joined(evenness, near, weight, *all_of(spacing))) < EVEN:
+        spacing = joined(bridged, near, weight, *all_of(spacing, normal))
     rim, reach = joined(rims, near, weight, *all_of(spacing, normal, sided))
     seen = sides.visible_from(positions, normal, spacing, middle)
     shown = sides.shown(normal, seen, joined(layers.covered, near, layer, *all_of(normal)))

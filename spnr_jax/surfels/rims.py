@@ -1,4 +1,4 @@
-"""Where discs end: at the rim of their layer, and where another face cuts theirs."""
+"""Where discs end: at the rim of their layer, where another face cuts theirs, and beyond the gaps between random points."""
 
 import numpy as np
 
@@ -12,6 +12,36 @@ EDGE = 0.1  # spacings that a disc goes beyond the line where another face cuts 
 ALIGNED = 0.8  # cosine between a line's direction and one of the four
 FAR = 4.0  # where a disc without an end ends
 BEYOND = 0.25  # spacings that a surface goes beyond the last point of its layer
+EVEN = 0.62  # spacings from a point to the next from which on points are spread evenly: a gap is a hole of the surface
+WIDEST = 2.2  # spacings, radius of the widest gap between random points: there is one of 1.9 among 65,536
+BRIDGED = 1.2  # spacings to the middle of a gap that the discs around it still cover
+
+
+def bridged(near: Near, layer: np.ndarray, spacing: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """The spacing of the block, wider beside gaps, so that the discs around a gap cover its middle.
+
+    A gap is an empty circle through the point with other points all around it (a vertex of the Voronoi diagram in the
+    tangent plane).  The empty circle whose centre lies in a direction ends at the first point that it meets, and is
+    largest, among its neighbours in direction, at a vertex; where the layer ends it grows without limit.
+    """
+    one, two, _ = in_plane(near, normal[near.rows], spacing[near.rows])
+    squared = one**2 + two**2
+    there = (layer > 0.5) & (squared > 1e-6)
+    turn = (2 * np.pi / RIM_DIRECTIONS * np.arange(RIM_DIRECTIONS)).astype(np.float32)
+    radii = []
+    for t in turn:
+        ahead = one * np.cos(t) + two * np.sin(t)
+        met = np.where(there & (ahead > 1e-3), squared / (2 * np.maximum(ahead, 1e-3)), np.inf)
+        radii.append(met.min(axis=1))
+    radius = np.stack(radii, axis=1)
+    vertex = (radius >= np.roll(radius, 1, axis=1)) & (radius >= np.roll(radius, -1, axis=1)) & (radius < WIDEST)
+    return spacing[near.rows] * np.maximum(np.where(vertex, radius, 0).max(axis=1) / BRIDGED, 1).astype(np.float32)
+
+
+def evenness(near: Near, layer: np.ndarray, spacing: np.ndarray) -> np.ndarray:
+    """Spacings to the nearest other point of the layer: a median of .47 where points are random, .8 if spread evenly."""
+    distance = np.where(layer[:, 1:] > 0.5, near.distance[:, 1:], np.inf).min(axis=1, initial=np.inf)
+    return distance / spacing[near.rows]
 
 
 def rims(
