@@ -1,4 +1,4 @@
-"""Where discs end: at the rim of their layer, where another face cuts theirs, and beyond the gaps between random points."""
+"""Where discs end: at the rim of their layer, where another face cuts theirs, and beyond gaps between random points."""
 
 import numpy as np
 
@@ -14,7 +14,7 @@ FAR = 4.0  # where a disc without an end ends
 BEYOND = 0.25  # spacings that a surface goes beyond the last point of its layer
 EVEN = 0.62  # spacings from a point to the next from which on points are spread evenly: a gap is a hole of the surface
 WIDEST = 2.2  # spacings, radius of the widest gap between random points: there is one of 1.9 among 65,536
-BRIDGED = 1.2  # spacings to the middle of a gap that the discs around it still cover
+BRIDGED = 0.95  # spacings from a disc to the middle of a gap, at most
 
 
 def bridged(near: Near, layer: np.ndarray, spacing: np.ndarray, normal: np.ndarray) -> np.ndarray:
@@ -39,7 +39,7 @@ def bridged(near: Near, layer: np.ndarray, spacing: np.ndarray, normal: np.ndarr
 
 
 def evenness(near: Near, layer: np.ndarray, spacing: np.ndarray) -> np.ndarray:
-    """Spacings to the nearest other point of the layer: a median of .47 where points are random, .8 if spread evenly."""
+    """Spacings to the nearest other point of the layer: .5 in the median of random points, .7 to .8 of even ones."""
     distance = np.where(layer[:, 1:] > 0.5, near.distance[:, 1:], np.inf).min(axis=1, initial=np.inf)
     return distance / spacing[near.rows]
 
