@@ -33,7 +33,20 @@ def estimate(
     materials_known: Float[np.ndarray, " points"] | None = None,
 ) -> Surfels:
     """Surfels of points in the box [-1, 1]^3, padded to a power of two; at least one point."""
-    positions = np.asarray(positions, np.float32)
+    return padded(
+        *_columns(np.asarray(positions, np.float32), base_color, roughness, metallic, normals, materials_known)
+    )
+
+
+def _columns(
+    positions: np.ndarray,
+    base_color: np.ndarray,
+    roughness: np.ndarray,
+    metallic: np.ndarray,
+    normals: np.ndarray | None,
+    materials_known: np.ndarray | None,
+) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """The fields of `Surfels` for all points, and which of them are drawn; what they were made of is let go."""
     near = neighbourhoods(positions)
 
     def all_of(*arrays: np.ndarray) -> list[list[np.ndarray]]:
@@ -68,18 +81,20 @@ def estimate(
         "reach": reach,
         "mask": np.ones(len(positions), bool),
     }
-    return padded(Surfels(**{name: np.asarray(values)[shown] for name, values in columns.items()}))
+    return columns, shown
 
 
-def padded(surfels: Surfels) -> Surfels:
-    """The surfels with zeros behind them up to a power of two."""
-    columns = {}
-    for name, values in vars(surfels).items():
+def padded(columns: dict[str, np.ndarray], drawn: np.ndarray) -> Surfels:
+    """Surfels of the points that are drawn, zeros behind them up to a power of two; the columns are taken out."""
+    count = int(drawn.sum())
+    whole = {}
+    for name in tuple(columns):
+        values = columns.pop(name)
         kind = bool if name == "mask" else np.float32
-        extra = bucket(len(values)) - len(values)
-        columns[name] = np.concatenate([np.asarray(values, kind), np.zeros((extra, *values.shape[1:]), kind)])
-    columns["spacing"] = np.where(columns["mask"], columns["spacing"], 1).astype(np.float32)  # its logarithm is taken
-    return Surfels(**columns)
+        whole[name] = np.zeros((bucket(count), *values.shape[1:]), kind)
+        whole[name][:count] = values[drawn]
+    whole["spacing"][count:] = 1  # its logarithm is taken
+    return Surfels(**whole)
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:

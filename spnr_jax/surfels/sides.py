@@ -1,10 +1,12 @@
 """Which side of each layer is outside: votes of the directions that see it, and of walls."""
 
+from collections.abc import Callable
+
 import numpy as np
 
 from spnr_jax.kernels.cloud_arrays import bucket
 from spnr_jax.surfels.layers import APART, PARALLEL, Layer
-from spnr_jax.surfels.neighbours import Near, close, joined
+from spnr_jax.surfels.neighbours import BLOCK, Near, close, joined
 from spnr_jax.surfels.visibility import DIRECTIONS, grid_of, seen_from
 
 WALL = 1.5  # spacings within which another layer is the other side of a wall
@@ -32,15 +34,24 @@ def visible_from(positions: np.ndarray, normal: np.ndarray, spacing: np.ndarray,
 
 def shown(normal: np.ndarray, seen: np.ndarray, covered: np.ndarray) -> np.ndarray:
     """Which points something outside sees; all, where that would leave too few."""
-    shown = ~covered & (np.einsum("nd,nd->n", seen, np.abs(normal @ DIRECTIONS.T)) > HIDDEN)
+    shown = ~covered & (_directions(seen, normal, np.abs) > HIDDEN)
     return shown if shown.mean() > LEAST_SHOWN else np.ones_like(shown)
 
 
 def lean(normal: np.ndarray, seen: np.ndarray) -> np.ndarray:
     """From -1 to 1: how much more is seen of the side that the normal points to than of the other."""
-    cosines = normal @ DIRECTIONS.T
-    front, back = (np.einsum("nd,nd->n", seen, np.maximum(side, 0)) for side in (cosines, -cosines))
+    front, back = (_directions(seen, side, _ahead) for side in (normal, -normal))
     return (front - back) / (front + back + EVIDENCE)
+
+
+def _directions(seen: np.ndarray, normal: np.ndarray, weight: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    """How many directions see each point, each with a weight that depends on its cosine with the normal; in blocks."""
+    blocks = (slice(i, i + BLOCK) for i in range(0, len(seen), BLOCK))
+    return np.concatenate([np.einsum("nd,nd->n", seen[b], weight(normal[b] @ DIRECTIONS.T)) for b in blocks])
+
+
+def _ahead(cosine: np.ndarray) -> np.ndarray:
+    return np.maximum(cosine, 0)
 
 
 def voted(near: Near, layer: Layer, normal: np.ndarray, spacing: np.ndarray, lean: np.ndarray) -> np.ndarray:
@@ -84,5 +95,5 @@ def outward(
     sided = np.clip((np.abs(towards) - UNSURE) / (SURE - UNSURE), 0, 1)
     wrong = towards < (-TURN if given else 0)
     normal = np.where(wrong[:, None], -normal, normal)
-    behind = np.einsum("nd,nd->n", seen, np.maximum(-normal @ DIRECTIONS.T, 0)) > HIDDEN
+    behind = _directions(seen, -normal, _ahead) > HIDDEN
     return normal, np.where(behind, np.minimum(sided, 1 - LEAK), sided)
