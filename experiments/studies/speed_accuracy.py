@@ -8,8 +8,8 @@ bfloat16.  `draft` of the network over surfels is discs and light alone.  What a
 one size that it has learnt is enlarged (or averaged).  Screened Poisson surfaces are drawn by Mitsuba as the references
 were.  Keeps every setting in a file of its own (an interrupted call goes on); writes the tables and front.png.
 
-ms a view   median over objects of the fastest of several drawings of one view, the cloud encoded before; on a CPU
-            milliseconds of the processor, all cores together: other work on the machine does not count
+ms a view   median over objects of the fastest of several drawings of all views, as of a film, the cloud encoded before;
+            on a CPU of the processor, all cores together: other work on the machine does not count
 s to encode the same for a cloud, once, all compiled
 MB          of memory at most above what was held before the picture, the largest over objects
 front       settings of a size that no other beats in both PSNR and ms a view; its knee lies farthest above the line
@@ -22,7 +22,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -37,13 +37,13 @@ from experiments.comparison.trained_networks import test_objects
 from experiments.studies.sharpness import told, view_of
 from experiments.studies.speed_accuracy_plot import plot
 from experiments.studies.speed_accuracy_report import both, front, knee
+from experiments.studies.speed_accuracy_settings import Setting, settings
 from spnr_jax import cli
 from spnr_jax.devices import machine
 from spnr_jax.formats import data_sets
 from spnr_jax.kernels import cameras, metrics
-from spnr_jax.kernels.records import Rendering
+from spnr_jax.kernels.records import Camera, Rendering
 from spnr_jax.method.model import Model, Quality, Volume
-from spnr_jax.model_config import NetworkConfig, RayNetworkConfig, SurfelConfig
 from spnr_jax.scoring.flip import flip
 from spnr_jax.training.weights import load
 
@@ -52,7 +52,6 @@ Scores = dict[str, float]
 Volumes = dict[tuple[str, int, str], tuple[Volume, float]]  # of object, points, precision: encoded, in so many ms
 REPEATS = 3
 TIMED_OBJECTS = 4
-SHARES = (0.75, 0.5, 0.25)  # of the pixels along a side that are drawn; the picture is enlarged from there
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,18 +78,6 @@ class SpeedAccuracy:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Setting:
-    """A way to ask a network for a picture; `share` of its pixels along a side are drawn."""
-
-    group: str
-    name: str
-    config: NetworkConfig
-    points: int
-    quality: Quality = "best"
-    share: float | int = 1
-
-
-@dataclass(frozen=True, kw_only=True)
 class Surface:
     """A surface through so many points (`comparison/poisson.py`)."""
 
@@ -114,54 +101,6 @@ class Drawn:
         found = {name: float(np.mean([of[name] for of in self.scores])) for name in self.scores[0]}
         found |= {"ms_view": float(np.median(self.view_ms)), "s_encode": float(np.median(self.encode_s))}
         return {name: round(value, 4) for name, value in (found | {"mb": max(self.mb)}).items()}
-
-
-def settings(config: NetworkConfig, counts: Sequence[int]) -> list[Setting]:
-    """Every way to ask a network, its best level first; of all but the first number of points the levels alone."""
-    levels: tuple[Quality, ...] = ("best",)
-    if isinstance(config, SurfelConfig):
-        levels = ("best", "draft")
-    elif isinstance(config, RayNetworkConfig):
-        levels = ("best", "balanced", "draft", "trained")
-    common: dict[str, Any] = {"config": config, "points": counts[0]}
-    ways = [Setting(group="level", name=level, quality=level, **common) for level in levels]
-    if config.any_size:
-        enlarged: dict[str, Any] = {"group": "fewer pixels", **common}
-        ways += [Setting(name=f"best, {share:g} of the size", share=share, **enlarged) for share in SHARES]
-        if "draft" in levels:
-            ways.append(Setting(name="draft, 0.5 of the size", quality="draft", share=0.5, **enlarged))
-    if isinstance(config, RayNetworkConfig):
-        ways += _of_rays(config, counts[0])
-    for count in counts[1:]:
-        ways += [
-            Setting(group="points", name=f"{level}, {count:,} points", config=config, points=count, quality=level)
-            for level in ("best", "draft")
-            if level in levels
-        ]
-    return ways
-
-
-def _of_rays(config: RayNetworkConfig, points: int) -> list[Setting]:
-    """Other samples along a ray, each drawn as the network was trained but for these, and bfloat16."""
-    total, reach = config.sampling.num_coarse + config.sampling.num_fine, config.sampling.reach
-    halves = [max(total // k, 2) for k in (1, 2, 4)]
-    if reach:
-        ways = [("near points", f"{n} near points", (n, 0, reach)) for n in (2 * total, 3 * total // 4, *halves[1:])]
-    else:
-        ways = [("samples", f"{n // 2} + {n // 2} in the box", (n // 2, n // 2, 0)) for n in (2 * total, *halves[1:])]
-        ways += [("near points", f"{n} within {r} voxels", (n, 0, r)) for r in (1, 2, 3) for n in halves]
-
-    def made(group: str, name: str, **changed: Any) -> Setting:
-        other = dataclasses.replace(config, **changed)
-        return Setting(group=group, name=name, config=other, points=points, quality="trained")
-
-    names = ("num_coarse", "num_fine", "reach")
-    found = [
-        made(group, name, sampling=dataclasses.replace(config.sampling, **dict(zip(names, values, strict=True))))
-        for group, name, values in ways
-    ]
-    found.append(made("bfloat16", "bfloat16", precision="bfloat16"))
-    return list({way.name: way for way in found}.values())  # small counts give one setting twice
 
 
 def main(options: SpeedAccuracy) -> None:
@@ -221,16 +160,17 @@ def measure(
         key = name, way.points, getattr(way.config, "precision", "")
         if key not in volumes:  # samples and sizes share it
             model.encode(cloud)
-            volumes[key] = timed(lambda c=cloud: model.encode(c))
+            volumes[key] = timed(partial(model.encode, cloud))
         volume, ms = volumes[key]
         pairs = [view_of(item, view, size) for view in range(min(views, len(item.images)))]
         drawn = max(round(way.share * size / 4) * 4, 16) if way.config.any_size else way.config.image_resolution
         asked = [cameras.resize(camera, drawn, drawn) if drawn != size else camera for camera, _ in pairs]
-        for rendering, (_, reference) in zip(model.render_each(volume, asked, way.quality), pairs, strict=True):
+        film = partial(_film, model, volume, asked, way.quality)
+        for rendering, (_, reference) in zip(film(), pairs, strict=True):
             found.scores.append(_scores(np.asarray(rendering.image), np.asarray(rendering.acc), reference))
         found.encode_s.append(ms / 1e3)
         if number_of_object < TIMED_OBJECTS:
-            _time_view(found, partial(model.render, volume, asked[0], way.quality))
+            _time_views(found, film)
     return found.means()
 
 
@@ -247,11 +187,11 @@ def measure_surface(
         few = dataclasses.replace(
             item, images=item.images[:views], camera=jax.tree.map(lambda x: x[:views], item.camera)
         )
-        asset, ms = timed(lambda c=cloud: poisson_surface.reconstruct(c, poisson.SURFACES[surface.kind]))
+        asset, ms = timed(partial(poisson_surface.reconstruct, cloud, poisson.SURFACES[surface.kind]))
         found.encode_s.append(ms / 1e3)
         forget_peak()
         before = peak_mb()
-        pictures, ms = timed(lambda a=asset, i=few: renderer.drawn(a, i))
+        pictures, ms = timed(partial(renderer.drawn, asset, few))
         found.view_ms.append(ms / len(pairs))
         found.mb.append(peak_mb() - before)
         for picture, (_, reference) in zip(pictures, pairs, strict=True):
@@ -273,10 +213,17 @@ def _scores(image: np.ndarray, opacity: np.ndarray, reference: np.ndarray) -> di
     }
 
 
-def _time_view(found: Drawn, draw: Callable[[], Rendering]) -> None:
-    """Adds time and memory of one view, which may have to be compiled."""
-    draw()
-    found.view_ms.append(min(timed(draw)[1] for _ in range(REPEATS)))
+def _film(model: Model, volume: Volume, views: Sequence[Camera], quality: Quality) -> list[Rendering]:
+    return list(model.render_each(volume, views, quality))
+
+
+def _time_views(found: Drawn, draw: Callable[[], list[Rendering]]) -> None:
+    """Adds time and memory of a view of those that are drawn, which were drawn before."""
+    taken = []
+    for _ in range(REPEATS):
+        views, ms = timed(draw)
+        taken.append(ms / len(views))
+    found.view_ms.append(min(taken))
     forget_peak()
     before = peak_mb()
     jax.block_until_ready(draw())

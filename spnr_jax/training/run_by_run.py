@@ -20,7 +20,9 @@ def run_by_run(function: Callable) -> Callable:
 
         def whole(parts: list) -> tuple:
             rest = iter(parts)
-            return tree.unflatten([next(rest) if moves else x for x, moves in zip(leaves, batched, strict=True)])
+            return jax.tree.unflatten(
+                tree, [next(rest) if moves else x for x, moves in zip(leaves, batched, strict=True)]
+            )
 
         out = lax.platform_dependent(
             moving,

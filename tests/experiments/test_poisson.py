@@ -13,6 +13,7 @@ from data_gen.render import light, views
 from data_gen.render.poisson_surface import PoissonConfig
 from data_gen.store import layout
 from experiments.comparison import poisson
+from experiments.studies import speed_accuracy
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.mesh import surface_points
 from spnr_jax.formats.mesh.assets import Asset
@@ -80,6 +81,15 @@ def test_a_ball_is_rendered_as_its_reference_and_a_line_is_an_empty_picture_with
     written = [path.stat().st_mtime_ns for path in pictures]
     show(items["ball"])  # nothing is left to do
     assert [path.stat().st_mtime_ns for path in pictures] == written
+
+
+@needs_solver
+@pytest.mark.ci
+def test_a_surface_is_scored_beside_the_settings_of_networks(dataset):
+    surface = speed_accuracy.Surface(kind="poisson", name="500 points", points=500)
+    found = speed_accuracy.measure_surface(surface, data_sets.open_dataset(dataset), ["ball"], 16, 1)
+    assert found["psnr"] > 25
+    assert min(found["ms_view"], found["s_encode"]) > 0
 
 
 def test_the_light_has_to_be_that_of_the_data_set(tmp_path):

@@ -7,8 +7,9 @@ import pytest
 from support import tiny_dataset, tiny_model, tiny_surfels
 
 from experiments.studies import speed_accuracy, speed_accuracy_plot
-from experiments.studies.speed_accuracy import SpeedAccuracy, main, settings
+from experiments.studies.speed_accuracy import SpeedAccuracy, main
 from experiments.studies.speed_accuracy_report import front, knee
+from experiments.studies.speed_accuracy_settings import settings
 from spnr_jax import cli
 from spnr_jax.formats import data_sets
 from spnr_jax.model_config import SurfelConfig
