@@ -50,7 +50,7 @@ from spnr_jax.training.weights import load
 Result = TypeVar("Result")
 Scores = dict[str, float]
 Volumes = dict[tuple[str, int, str], tuple[Volume, float]]  # of object, points, precision: encoded, in so many ms
-REPEATS = 3
+REPEATS = 2
 TIMED_OBJECTS = 4
 
 

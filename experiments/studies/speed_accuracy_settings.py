@@ -52,11 +52,11 @@ def _of_rays(config: RayNetworkConfig, points: int) -> list[Setting]:
     """Other samples along a ray, each drawn as the network was trained but for these, and bfloat16."""
     total, reach = config.sampling.num_coarse + config.sampling.num_fine, config.sampling.reach
     halves = [max(total // k, 2) for k in (1, 2, 4)]
-    if reach:
-        ways = [("near points", f"{n} near points", (n, 0, reach)) for n in (2 * total, 3 * total // 4, *halves[1:])]
+    if reach:  # the levels have fewer
+        ways = [("near points", f"{2 * total} near points", (2 * total, 0, reach))]
     else:
         ways = [("samples", f"{n // 2} + {n // 2} in the box", (n // 2, n // 2, 0)) for n in (2 * total, *halves[1:])]
-        ways += [("near points", f"{n} within {r} voxels", (n, 0, r)) for r in (1, 2, 3) for n in halves]
+        ways += [("near points", f"{n} within {r} voxels", (n, 0, r)) for r in (1, 2) for n in halves]
 
     def made(group: str, name: str, **changed: Any) -> Setting:
         other = dataclasses.replace(config, **changed)
