@@ -18,11 +18,11 @@ front       settings of a size that no other beats in both PSNR and ms a view; i
 
 import dataclasses
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -65,7 +65,7 @@ class SpeedAccuracy:
     `poisson_trimmed`."""
     out: Path = Path("runs/speed_accuracy")
     """Folder of the results."""
-    sizes: tuple[int, ...] = (128, 512)
+    sizes: tuple[int, ...] = (512, 128)
     """Pixels along each side of the pictures that are looked at: those of the data set, or a whole share of them."""
     counts: tuple[int, ...] = (16384, 1024, 4096, 65536)
     """Points of an object, the first of its file; all settings with the first number, `best` and `draft` with more."""
@@ -85,6 +85,26 @@ class Surface:
     name: str
     points: int
     group: str = "surface"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Job:
+    """A setting at a size, and what measures it."""
+
+    number_of_run: int
+    run: str
+    size: int
+    way: Setting | Surface
+    make: Callable[[], Scores]
+
+    def row(self) -> dict[str, Any]:
+        """What tables and plots call it."""
+        return {"run": self.run, "size": self.size, "group": self.way.group, "name": self.way.name}
+
+    def kept(self, out: Path) -> Scores:
+        """What was measured; it is measured if it was not."""
+        name = f"{self.number_of_run} {self.size} {self.way.points} {self.way.name}.json"
+        return results_folder.kept(out / "settings" / name, self.make)
 
 
 @dataclass
@@ -110,13 +130,14 @@ def main(options: SpeedAccuracy) -> None:
     names = test_objects(dataset, options.objects)
     asked = {"objects": list(names), "views": options.views, "runs": list(options.runs)}
     results_folder.claim(options.out, "speed_accuracy", asked, dataset)
-    rows = []
-    for number_of_run, run in enumerate(options.runs):
-        for size, way, make in ways_of(run, options, dataset, names):
-            place = options.out / "settings" / f"{number_of_run} {size} {way.points} {way.name}.json"
-            found = results_folder.kept(place, make)
-            rows.append({"run": run, "size": size, "group": way.group, "name": way.name, **found})
-            print(f"{run}, {size} px, {way.name}: {found['psnr']:.2f} dB, {found['ms_view']:.1f} ms", flush=True)
+    jobs = [
+        job for number_of_run in range(len(options.runs)) for job in jobs_of(number_of_run, options, dataset, names)
+    ]
+    for job in sorted(jobs, key=lambda job: job.way.group not in ("level", "surface")):  # the most telling ones first
+        found = job.kept(options.out)
+        told_of = f"{job.run}, {job.size} px, {job.way.name}"
+        print(f"{told_of}: {found['psnr']:.2f} dB, {found['ms_view']:.1f} ms", flush=True)
+    rows = [job.row() | job.kept(options.out) for job in jobs]
     found = {"hardware": machine.hardware(), "load": machine.load(), "date": time.strftime("%Y-%m-%d"), "rows": rows}
     tables = [made for size in options.sizes if (of := [r for r in rows if r["size"] == size]) for made in both(of)]
     fronts = [[r for r in rows if r["size"] == size] for size in options.sizes]
@@ -126,21 +147,25 @@ def main(options: SpeedAccuracy) -> None:
     results_folder.write(options.out, found, tables, notes, {"front.png": picture})
 
 
-def ways_of(
-    run: str, options: SpeedAccuracy, dataset: data_sets.Dataset, names: Sequence[str]
-) -> Iterator[tuple[int, Setting | Surface, Callable[[], Scores]]]:
-    """Size, setting, and what measures it, of a network or a surface."""
+def jobs_of(number_of_run: int, options: SpeedAccuracy, dataset: data_sets.Dataset, names: Sequence[str]) -> list[Job]:
+    """All settings of a network or a surface at all sizes."""
+    run = options.runs[number_of_run]
+    seen: dict[str, Any] = {"dataset": dataset, "names": names, "views": options.views}
+    counts = options.counts[:1] if options.quick else options.counts
+    made: list[tuple[Setting | Surface, Callable[..., Scores]]]
     if run in poisson.SURFACES:
-        for size in options.sizes:
-            for count in options.counts[:1] if options.quick else options.counts:
-                surface = Surface(kind=run, points=count, name=f"{count:,} points")
-                yield size, surface, partial(measure_surface, surface, dataset, names, size, options.views)
-        return
-    model, volumes = load(run), Volumes({})
-    ways = settings(model.config, options.counts)
-    for size in options.sizes:
-        for way in ways[:: max(len(ways) // 3, 1)] if options.quick else ways:
-            yield size, way, partial(measure, model, way, dataset, names, size, options.views, volumes)
+        surfaces = [Surface(kind=run, points=count, name=f"{count:,} points") for count in counts]
+        made = [(surface, partial(measure_surface, surface, **seen)) for surface in surfaces]
+    else:
+        model, volumes = load(run), Volumes({})
+        ways = settings(model.config, options.counts)
+        ways = ways[:: max(len(ways) // 3, 1)] if options.quick else ways
+        made = [(way, partial(measure, model, way, volumes=volumes, **seen)) for way in ways]
+    return [
+        Job(number_of_run=number_of_run, run=run, size=size, way=way, make=partial(one, size=size))
+        for size in options.sizes
+        for way, one in made
+    ]
 
 
 def measure(
@@ -148,9 +173,9 @@ def measure(
     way: Setting,
     dataset: data_sets.Dataset,
     names: Sequence[str],
-    size: int,
     views: int,
     volumes: Volumes,
+    size: int,
 ) -> Scores:
     """Mean scores over the objects' pictures, times and memory of one setting at one size."""
     model, found = dataclasses.replace(model, config=way.config), Drawn()
@@ -175,7 +200,7 @@ def measure(
 
 
 def measure_surface(
-    surface: Surface, dataset: data_sets.Dataset, names: Sequence[str], size: int, views: int
+    surface: Surface, dataset: data_sets.Dataset, names: Sequence[str], views: int, size: int
 ) -> Scores:
     """The same of a surface through the points, drawn by Mitsuba as the references were; loading it is in its time."""
     described = dataset.settings | {"settings": dataset.settings["settings"] | {"resolution": size}}

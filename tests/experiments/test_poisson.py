@@ -87,7 +87,7 @@ def test_a_ball_is_rendered_as_its_reference_and_a_line_is_an_empty_picture_with
 @pytest.mark.ci
 def test_a_surface_is_scored_beside_the_settings_of_networks(dataset):
     surface = speed_accuracy.Surface(kind="poisson", name="500 points", points=500)
-    found = speed_accuracy.measure_surface(surface, data_sets.open_dataset(dataset), ["ball"], 16, 1)
+    found = speed_accuracy.measure_surface(surface, data_sets.open_dataset(dataset), ["ball"], 1, 16)
     assert found["psnr"] > 25
     assert min(found["ms_view"], found["s_encode"]) > 0
 
