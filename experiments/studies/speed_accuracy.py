@@ -130,13 +130,11 @@ def main(options: SpeedAccuracy) -> None:
     names = test_objects(dataset, options.objects)
     asked = {"objects": list(names), "views": options.views, "runs": list(options.runs)}
     results_folder.claim(options.out, "speed_accuracy", asked, dataset)
-    jobs = [
-        job for number_of_run in range(len(options.runs)) for job in jobs_of(number_of_run, options, dataset, names)
-    ]
+    numbers = range(len(options.runs))
+    jobs = [job for number_of_run in numbers for job in jobs_of(number_of_run, options, dataset, names)]
     for job in sorted(jobs, key=lambda job: job.way.group not in ("level", "surface")):  # the most telling ones first
-        found = job.kept(options.out)
-        told_of = f"{job.run}, {job.size} px, {job.way.name}"
-        print(f"{told_of}: {found['psnr']:.2f} dB, {found['ms_view']:.1f} ms", flush=True)
+        scores, what = job.kept(options.out), f"{job.run}, {job.size} px, {job.way.name}"
+        print(f"{what}: {scores['psnr']:.2f} dB, {scores['ms_view']:.1f} ms", flush=True)
     rows = [job.row() | job.kept(options.out) for job in jobs]
     found = {"hardware": machine.hardware(), "load": machine.load(), "date": time.strftime("%Y-%m-%d"), "rows": rows}
     tables = [made for size in options.sizes if (of := [r for r in rows if r["size"] == size]) for made in both(of)]
