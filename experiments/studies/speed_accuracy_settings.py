@@ -27,7 +27,7 @@ def settings(config: NetworkConfig, counts: Sequence[int]) -> list[Setting]:
     """Every way to ask a network, its best level first; of all but the first number of points the levels alone."""
     levels: tuple[Quality, ...] = ("best",)
     if isinstance(config, SurfelConfig):
-        levels = ("best", "draft")
+        levels = ("best", "balanced", "draft")
     elif isinstance(config, RayNetworkConfig):
         levels = ("best", "balanced", "draft") if config.sampling.reach else ("best", "balanced", "draft", "trained")
     common: dict[str, Any] = {"config": config, "points": counts[0]}
