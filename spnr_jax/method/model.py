@@ -213,7 +213,7 @@ def _over(depth, scale) -> Array:
 
 
 def _share(quality: Quality) -> float:
-    return BALANCED if quality == "balanced" else 1
+    return BALANCED if quality == "balanced" else 1.0
 
 
 def _check_quality(quality: str) -> None:

@@ -89,7 +89,13 @@ def encode(variables: dict | None, cloud: PointCloud, *, config: SurfelConfig) -
 
 
 def render(
-    variables: dict | None, scene: SurfelScene, camera: Camera, light: Light, *, config: SurfelConfig, share: float = 1
+    variables: dict | None,
+    scene: SurfelScene,
+    camera: Camera,
+    light: Light,
+    *,
+    config: SurfelConfig,
+    share: float = 1.0,
 ) -> Rendering:
     """One view (camera unbatched, in the box) of an encoded object; without variables discs and light alone.
 
@@ -108,7 +114,7 @@ def render_views(
     light: Light | Sequence[Light],
     *,
     config: SurfelConfig,
-    share: float = 1,
+    share: float = 1.0,
 ) -> Rendering:
     """Views (one axis of cameras) in one light or each in its own."""
     views = [jax.tree.map(lambda x, i=i: x[i], cameras) for i in range(len(cameras.cam_to_world))]
@@ -124,7 +130,7 @@ def render_each(
     lights: Sequence[Light],
     *,
     config: SurfelConfig,
-    share: float = 1,
+    share: float = 1.0,
 ) -> Iterator[Rendering]:
     """Views one after the other; they share the sizes of the largest of them, so that few programs are compiled."""
     small = [_smaller(view, share) for view in views]
@@ -184,7 +190,7 @@ def _drawn(
     return _placed(_shade(variables, *looked, config=config, doublings=plan.doublings), camera, plan), slots
 
 
-def resolution_of(spacing: float, camera: Camera, share: float = 1) -> tuple[int, int]:
+def resolution_of(spacing: float, camera: Camera, share: float = 1.0) -> tuple[int, int]:
     """Doublings by the network, and pixels averaged along each side, for points this far apart around the origin.
 
     They are those of the picture of which the camera has a share of the pixels along a side.
