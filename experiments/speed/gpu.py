@@ -4,8 +4,9 @@
 
     the paper's network      beside the compiled PyTorch twin, both in bfloat16 (experiments/speed/bench.py)
     the surfel network       frames a second at 512 and 1,024 px, as `spnr render` draws a film; training steps
-    many trainings at once   runs of `tiny` under one `jax.vmap`, and the same ones in a loop
+    many trainings at once   runs of `tiny` and of the surfel network under one `jax.vmap`, and the same ones in a loop
 
+Seconds are those of the clock, on a CPU of the processor, all cores together: other work does not count there.
 Memory is what the compiler lays out for a program: its arguments, its results, and what it needs between.
 JAX takes the memory of a GPU piece by piece here, so that both sides of the first part fit beside each other.
 
@@ -106,9 +107,7 @@ def films(options: OnGPU) -> list[Found]:
 
 def surfel_steps(options: OnGPU) -> list[Found]:
     """Training steps of the preset `surfels`, on crops that are on the device."""
-    config = PRESETS["surfels"]()
-    if options.quick:
-        config = dataclasses.replace(config, model=SurfelConfig(widths=(4, 6), top=4), crop=16, batch_objects=2)
+    config = surfel_config(options)
     crops = random_crops(config, doublings=1)
     compiled = compile_of(partial(shading.train_step, config=config), optimisation.jitted_create_state(config), crops)
     seconds = least(compiled.run, options.rounds)
@@ -116,33 +115,45 @@ def surfel_steps(options: OnGPU) -> list[Found]:
     return [Found(what=what, unit="steps", a_second=1 / seconds, megabytes=compiled.megabytes)]
 
 
+def surfel_config(options: OnGPU) -> TrainConfig:
+    """The preset `surfels`, for a check with a small network."""
+    config = PRESETS["surfels"]()
+    if not options.quick:
+        return config
+    return dataclasses.replace(config, model=SurfelConfig(widths=(4, 6), top=4), crop=16, batch_objects=2)
+
+
 def many_trainings(options: OnGPU) -> list[Found]:
     """Steps of a run, of all runs under one vmap, beside those of a loop over the same step."""
     config = small(PRESETS["tiny"]()) if options.quick else ours.twin_sized("tiny", "train_l1", 2)
-    batch, runs = ours.batch(config), options.runs
+    tiny = partial(optimisation.train_step, config=config, adversarial=False)
+    surfels = dataclasses.replace(surfel_config(options), batch_objects=2)
+    crops = random_crops(surfels, doublings=1)
+    over_crops = partial(shading.train_step, config=surfels)
+    return [
+        at_once(options, "`tiny`", tiny, config, ours.batch(config)),
+        at_once(options, f"`surfels`, 2 crops of {crops.seen.shape[1]} px,", over_crops, surfels, crops),
+    ]
+
+
+def at_once(options: OnGPU, name: str, step: Callable, config: TrainConfig, batch: Any) -> Found:
+    """A step of all runs under one vmap beside a loop, in turns."""
+    runs = options.runs
     states = [optimisation.jitted_create_state(config, jnp.uint32(seed)) for seed in range(runs)]
     batches = jax.tree.map(lambda x: jnp.stack([x] * runs), batch)
-    step = partial(optimisation.train_step, config=config, adversarial=False)
     one = compile_of(step, states[0], batch)
-    together = compile_of(
-        partial(many_runs.train_step, config=config, adversarial=False), many_runs.stack(states), batches
-    )
+    axes = many_runs.AXES
+    mapped = jax.vmap(step, in_axes=(axes, 0), out_axes=(axes, 0))
+    together = compile_of(mapped, many_runs.stack(states), batches)
 
     def loop() -> list:
         return [one.run() for _ in range(runs)]
 
     pairs = [(least(together.run), least(loop)) for _ in range(options.rounds)]
     by_vmap, by_loop = np.median(pairs, axis=0)
-    what = f"{runs} trainings of `tiny` at once"
-    return [
-        Found(
-            what=what,
-            unit="steps of a run",
-            a_second=runs / by_vmap,
-            beside=runs / by_loop,
-            megabytes=together.megabytes,
-        )
-    ]
+    what = f"{runs} trainings of {name} at once"
+    rates = {"a_second": runs / by_vmap, "beside": runs / by_loop}
+    return Found(what=what, unit="steps of a run", megabytes=together.megabytes, **rates)
 
 
 def small(config: TrainConfig) -> TrainConfig:
@@ -194,11 +205,11 @@ def compile_of(function: Callable, *arguments: Any) -> Compiled:
 
 def least(run: Callable[[], object], times: int = 1) -> float:
     """Seconds of the fastest of so many runs, after one that compiles or fills the caches."""
-    taken = []
+    clock, taken = time.process_time if jax.default_backend() == "cpu" else time.perf_counter, []
     for _ in range(times + 1):
-        start = time.perf_counter()
+        start = clock()
         jax.block_until_ready(run())
-        taken.append(time.perf_counter() - start)
+        taken.append(clock() - start)
     return min(taken[1:])
 
 

@@ -1,14 +1,16 @@
 """What speed costs in quality: networks asked for pictures in many ways, and which of these nothing beats.
 
-    python -m experiments.studies.speed_accuracy DATA [surfels small RUN ...] [--sizes 128 512] [--out OUT]
+    python -m experiments.studies.speed_accuracy DATA [surfels small poisson_trimmed RUN ...] [--sizes 128 512]
 
 Each network draws test objects at every level of `--quality`, from other numbers of points, and in pictures of fewer
 pixels that are enlarged.  Networks of rays also draw with other samples, in all of the box and near the points, and in
-bfloat16.  `draft` of the network over surfels is discs and light alone.  A size that a network has not learnt is left
-out.  Keeps every setting in a file of its own (an interrupted call goes on); writes the tables and front.png.
+bfloat16.  `draft` of the network over surfels is discs and light alone.  What a network with an upsampler draws at the
+one size that it has learnt is enlarged (or averaged).  Screened Poisson surfaces are drawn by Mitsuba as the references
+were.  Keeps every setting in a file of its own (an interrupted call goes on); writes the tables and front.png.
 
-ms a view   median over objects of the fastest of several drawings of one view, the cloud encoded before
-s to encode the same for a cloud
+ms a view   median over objects of the fastest of several drawings of all views, as of a film, the cloud encoded before;
+            on a CPU of the processor, all cores together: other work on the machine does not count
+s to encode the same for a cloud, once, all compiled
 MB          of memory at most above what was held before the picture, the largest over objects
 front       settings of a size that no other beats in both PSNR and ms a view; its knee lies farthest above the line
             from its cheapest to its best, PSNR against the logarithm of the time
@@ -20,33 +22,36 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import tyro
 
+from data_gen.render import poisson_surface
 from experiments import entry_point
-from experiments.comparison import results_folder
+from experiments.comparison import poisson, results_folder
 from experiments.comparison.object_views import told, view_of
 from experiments.comparison.peak_memory import forget_peak, peak_mb
-from experiments.comparison.result_tables import Table, number, text
 from experiments.comparison.trained_networks import test_objects
 from experiments.studies.speed_accuracy_plot import plot
+from experiments.studies.speed_accuracy_report import both, front, knee
+from experiments.studies.speed_accuracy_settings import Setting, settings
 from spnr_jax import cli
 from spnr_jax.devices import machine
 from spnr_jax.formats import data_sets
 from spnr_jax.kernels import cameras, metrics
-from spnr_jax.kernels.records import Camera
+from spnr_jax.kernels.records import Camera, Rendering
 from spnr_jax.method.model import Model, Quality, Volume
-from spnr_jax.model_config import NetworkConfig, RayNetworkConfig, SurfelConfig
 from spnr_jax.scoring.flip import flip
 from spnr_jax.training.weights import load
 
-REPEATS = 5
-TIMED_OBJECTS = 8
-SHARES = (0.75, 0.5, 0.25)  # of the pixels along a side that are drawn; the picture is enlarged from there
+Result = TypeVar("Result")
+Scores = dict[str, float]
+Volumes = dict[tuple[str, int, str], tuple[Volume, float]]  # of object, points, precision: encoded, in so many ms
+REPEATS = 2
+TIMED_OBJECTS = 4
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,14 +61,15 @@ class SpeedAccuracy:
     data: tyro.conf.Positional[Path]
     """Folder of the data set; its test objects are drawn."""
     runs: tyro.conf.Positional[tuple[str, ...]] = ("surfels", "small")
-    """Networks: of the package, run folders (the paper's, published methods) or files of weights."""
+    """Networks: of the package, run folders (the paper's, published methods) or files of weights; also `poisson` and
+    `poisson_trimmed`."""
     out: Path = Path("runs/speed_accuracy")
     """Folder of the results."""
-    sizes: tuple[int, ...] = (128, 512)
+    sizes: tuple[int, ...] = (512, 128)
     """Pixels along each side of the pictures that are looked at: those of the data set, or a whole share of them."""
-    counts: tuple[int, ...] = (16384, 1024, 4096)
-    """Points of an object, the first of its file; all settings with the first number, the levels with the others."""
-    objects: int = 16
+    counts: tuple[int, ...] = (16384, 1024, 4096, 65536)
+    """Points of an object, the first of its file; all settings with the first number, `best` and `draft` with more."""
+    objects: int = 8
     """Test objects, evenly out of the split."""
     views: int = 2
     """Views of an object."""
@@ -72,15 +78,33 @@ class SpeedAccuracy:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Setting:
-    """A way to ask a network for a picture; `share` of its pixels along a side are drawn."""
+class Surface:
+    """A surface through so many points (`comparison/poisson.py`)."""
 
-    group: str
+    kind: str
     name: str
-    config: NetworkConfig
     points: int
-    quality: Quality = "best"
-    share: float | int = 1
+    group: str = "surface"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Job:
+    """A setting at a size, and what measures it."""
+
+    number_of_run: int
+    run: str
+    size: int
+    way: Setting | Surface
+    make: Callable[[], Scores]
+
+    def row(self) -> dict[str, Any]:
+        """What tables and plots call it."""
+        return {"run": self.run, "size": self.size, "group": self.way.group, "name": self.way.name}
+
+    def kept(self, out: Path) -> Scores:
+        """What was measured; it is measured if it was not."""
+        name = f"{self.number_of_run} {self.size} {self.way.points} {self.way.name}.json"
+        return results_folder.kept(out / "settings" / name, self.make)
 
 
 @dataclass
@@ -92,52 +116,11 @@ class Drawn:
     encode_s: list[float] = field(default_factory=list)
     mb: list[int] = field(default_factory=list)
 
-
-def settings(config: NetworkConfig, counts: Sequence[int]) -> list[Setting]:
-    """Every way to ask a network, its best level first; of all but the first number of points the levels alone."""
-    levels: tuple[Quality, ...] = ("best",)
-    if isinstance(config, SurfelConfig):
-        levels = ("best", "draft")
-    elif isinstance(config, RayNetworkConfig):
-        levels = ("best", "balanced", "draft", "trained")
-    common: dict[str, Any] = {"config": config, "points": counts[0]}
-    ways = [Setting(group="level", name=level, quality=level, **common) for level in levels]
-    if config.any_size:
-        enlarged: dict[str, Any] = {"group": "fewer pixels", **common}
-        ways += [Setting(name=f"best, {share:g} of the size", share=share, **enlarged) for share in SHARES]
-        if "draft" in levels:
-            ways.append(Setting(name="draft, 0.5 of the size", quality="draft", share=0.5, **enlarged))
-    if isinstance(config, RayNetworkConfig):
-        ways += _of_rays(config, counts[0])
-    for count in counts[1:]:
-        ways += [
-            Setting(group="points", name=f"{level}, {count:,} points", config=config, points=count, quality=level)
-            for level in levels
-        ]
-    return ways
-
-
-def _of_rays(config: RayNetworkConfig, points: int) -> list[Setting]:
-    """Other samples along a ray, each drawn as the network was trained but for these, and bfloat16."""
-    total, reach = config.sampling.num_coarse + config.sampling.num_fine, config.sampling.reach
-    halves = [max(total // k, 2) for k in (1, 2, 4)]
-    if reach:
-        ways = [("near points", f"{n} near points", (n, 0, reach)) for n in (2 * total, 3 * total // 4, *halves[1:])]
-    else:
-        ways = [("samples", f"{n // 2} + {n // 2} in the box", (n // 2, n // 2, 0)) for n in (2 * total, *halves[1:])]
-        ways += [("near points", f"{n} within {r} voxels", (n, 0, r)) for r in (1, 2, 3) for n in halves]
-
-    def made(group: str, name: str, **changed: Any) -> Setting:
-        other = dataclasses.replace(config, **changed)
-        return Setting(group=group, name=name, config=other, points=points, quality="trained")
-
-    names = ("num_coarse", "num_fine", "reach")
-    found = [
-        made(group, name, sampling=dataclasses.replace(config.sampling, **dict(zip(names, values, strict=True))))
-        for group, name, values in ways
-    ]
-    found.append(made("bfloat16", "bfloat16", precision="bfloat16"))
-    return list({way.name: way for way in found}.values())  # small counts give one setting twice
+    def means(self) -> Scores:
+        """Means of the scores, medians of the times, the most memory."""
+        found = {name: float(np.mean([of[name] for of in self.scores])) for name in self.scores[0]}
+        found |= {"ms_view": float(np.median(self.view_ms)), "s_encode": float(np.median(self.encode_s))}
+        return {name: round(value, 4) for name, value in (found | {"mb": max(self.mb)}).items()}
 
 
 def main(options: SpeedAccuracy) -> None:
@@ -147,22 +130,14 @@ def main(options: SpeedAccuracy) -> None:
     names = test_objects(dataset, options.objects)
     asked = {"objects": list(names), "views": options.views, "runs": list(options.runs)}
     results_folder.claim(options.out, "speed_accuracy", asked, dataset)
-    rows = []
-    for number_of_run, run in enumerate(options.runs):
-        model = load(run)
-        ways = settings(model.config, options.counts)
-        for size in options.sizes:
-            if not model.config.any_size and size != model.config.image_resolution:
-                print(f"{run}: it has not learnt pictures of {size} pixels", flush=True)
-                continue
-            for way in ways[:: max(len(ways) // 3, 1)] if options.quick else ways:
-                make = partial(measure, model, way, dataset, names, size, options.views)
-                name = f"{number_of_run} {size} {way.points} {way.name}.json"
-                found = results_folder.kept(options.out / "settings" / name, make)
-                rows.append({"run": run, "size": size, "group": way.group, "name": way.name, **found})
-                print(f"{run}, {size} px, {way.name}: {found['psnr']:.2f} dB, {found['ms_view']:.1f} ms", flush=True)
+    numbers = range(len(options.runs))
+    jobs = [job for number_of_run in numbers for job in jobs_of(number_of_run, options, dataset, names)]
+    for job in sorted(jobs, key=lambda job: job.way.group not in ("level", "surface")):  # the most telling ones first
+        scores, what = job.kept(options.out), f"{job.run}, {job.size} px, {job.way.name}"
+        print(f"{what}: {scores['psnr']:.2f} dB, {scores['ms_view']:.1f} ms", flush=True)
+    rows = [job.row() | job.kept(options.out) for job in jobs]
     found = {"hardware": machine.hardware(), "load": machine.load(), "date": time.strftime("%Y-%m-%d"), "rows": rows}
-    tables = [made for size in options.sizes if (of := [r for r in rows if r["size"] == size]) for made in _both(of)]
+    tables = [made for size in options.sizes if (of := [r for r in rows if r["size"] == size]) for made in both(of)]
     fronts = [[r for r in rows if r["size"] == size] for size in options.sizes]
     picture = plot([(of, front(of), knee(of, front(of))) for of in fronts if of])
     note = f"{len(names)} objects x {options.views} views, {options.counts[0]:,} points where nothing else is said."
@@ -170,26 +145,81 @@ def main(options: SpeedAccuracy) -> None:
     results_folder.write(options.out, found, tables, notes, {"front.png": picture})
 
 
+def jobs_of(number_of_run: int, options: SpeedAccuracy, dataset: data_sets.Dataset, names: Sequence[str]) -> list[Job]:
+    """All settings of a network or a surface at all sizes."""
+    run = options.runs[number_of_run]
+    seen: dict[str, Any] = {"dataset": dataset, "names": names, "views": options.views}
+    counts = options.counts[:1] if options.quick else options.counts
+    made: list[tuple[Setting | Surface, Callable[..., Scores]]]
+    if run in poisson.SURFACES:
+        surfaces = [Surface(kind=run, points=count, name=f"{count:,} points") for count in counts]
+        made = [(surface, partial(measure_surface, surface, **seen)) for surface in surfaces]
+    else:
+        model, volumes = load(run), Volumes({})
+        ways = settings(model.config, options.counts)
+        ways = ways[:: max(len(ways) // 3, 1)] if options.quick else ways
+        made = [(way, partial(measure, model, way, volumes=volumes, **seen)) for way in ways]
+    return [
+        Job(number_of_run=number_of_run, run=run, size=size, way=way, make=partial(one, size=size))
+        for size in options.sizes
+        for way, one in made
+    ]
+
+
 def measure(
-    model: Model, way: Setting, dataset: data_sets.Dataset, names: Sequence[str], size: int, views: int
-) -> dict[str, float]:
+    model: Model,
+    way: Setting,
+    dataset: data_sets.Dataset,
+    names: Sequence[str],
+    views: int,
+    volumes: Volumes,
+    size: int,
+) -> Scores:
     """Mean scores over the objects' pictures, times and memory of one setting at one size."""
     model, found = dataclasses.replace(model, config=way.config), Drawn()
     for number_of_object, name in enumerate(names):
         item = data_sets.read_object(dataset, name)
         cloud = told(jax.tree.map(lambda x: x[: way.points], item.cloud), normals=False)
-        volume = model.encode(cloud)
+        key = name, way.points, getattr(way.config, "precision", "")
+        if key not in volumes:  # samples and sizes share it
+            model.encode(cloud)
+            volumes[key] = timed(partial(model.encode, cloud))
+        volume, ms = volumes[key]
         pairs = [view_of(item, view, size) for view in range(min(views, len(item.images)))]
-        drawn = max(round(way.share * size / 4) * 4, 16)
+        drawn = max(round(way.share * size / 4) * 4, 16) if way.config.any_size else way.config.image_resolution
         asked = [cameras.resize(camera, drawn, drawn) if drawn != size else camera for camera, _ in pairs]
-        for rendering, (_, reference) in zip(model.render_each(volume, asked, way.quality), pairs, strict=True):
+        film = partial(_film, model, volume, asked, way.quality)
+        for rendering, (_, reference) in zip(film(), pairs, strict=True):
             found.scores.append(_scores(np.asarray(rendering.image), np.asarray(rendering.acc), reference))
+        found.encode_s.append(ms / 1e3)
         if number_of_object < TIMED_OBJECTS:
-            found.encode_s.append(fastest(lambda c=cloud: model.encode(c).scene) / 1e3)
-            _time_view(found, model, volume, asked[0], way.quality)
-    means = {name: float(np.mean([of[name] for of in found.scores])) for name in found.scores[0]}
-    costs = {"ms_view": float(np.median(found.view_ms)), "s_encode": float(np.median(found.encode_s))}
-    return {name: round(value, 4) for name, value in (means | costs | {"mb": max(found.mb)}).items()}
+            _time_views(found, film)
+    return found.means()
+
+
+def measure_surface(
+    surface: Surface, dataset: data_sets.Dataset, names: Sequence[str], views: int, size: int
+) -> Scores:
+    """The same of a surface through the points, drawn by Mitsuba as the references were; loading it is in its time."""
+    described = dataset.settings | {"settings": dataset.settings["settings"] | {"resolution": size}}
+    renderer, found = poisson.Renderer(described), Drawn()
+    for name in names:
+        item = data_sets.read_object(dataset, name)
+        cloud = jax.tree.map(lambda x: np.asarray(x)[: surface.points], item.cloud)
+        pairs = [view_of(item, view, size) for view in range(min(views, len(item.images)))]
+        few = dataclasses.replace(
+            item, images=item.images[:views], camera=jax.tree.map(lambda x: x[:views], item.camera)
+        )
+        asset, ms = timed(partial(poisson_surface.reconstruct, cloud, poisson.SURFACES[surface.kind]))
+        found.encode_s.append(ms / 1e3)
+        forget_peak()
+        before = peak_mb()
+        pictures, ms = timed(partial(renderer.drawn, asset, few))
+        found.view_ms.append(ms / len(pairs))
+        found.mb.append(peak_mb() - before)
+        for picture, (_, reference) in zip(pictures, pairs, strict=True):
+            found.scores.append(_scores(data_sets.on_white(picture), picture[..., 3] / 255, reference))
+    return found.means()
 
 
 def _scores(image: np.ndarray, opacity: np.ndarray, reference: np.ndarray) -> dict[str, float]:
@@ -206,80 +236,29 @@ def _scores(image: np.ndarray, opacity: np.ndarray, reference: np.ndarray) -> di
     }
 
 
-def _time_view(found: Drawn, model: Model, volume: Volume, camera: Camera, quality: Quality) -> None:
-    """Adds time and memory of one view, which was drawn before."""
+def _film(model: Model, volume: Volume, views: Sequence[Camera], quality: Quality) -> list[Rendering]:
+    return list(model.render_each(volume, views, quality))
 
-    def draw() -> jax.Array:
-        return model.render(volume, camera, quality).image
 
-    found.view_ms.append(fastest(draw))
+def _time_views(found: Drawn, draw: Callable[[], list[Rendering]]) -> None:
+    """Adds time and memory of a view of those that are drawn, which were drawn before."""
+    taken = []
+    for _ in range(REPEATS):
+        views, ms = timed(draw)
+        taken.append(ms / len(views))
+    found.view_ms.append(min(taken))
     forget_peak()
     before = peak_mb()
     jax.block_until_ready(draw())
     found.mb.append(peak_mb() - before)
 
 
-def fastest(work: Callable) -> float:
-    """Milliseconds of the fastest of several calls; the first one, which compiles, does not count."""
-    jax.block_until_ready(work())
-    times = []
-    for _ in range(REPEATS):
-        start = time.perf_counter()
-        jax.block_until_ready(work())
-        times.append(1000 * (time.perf_counter() - start))
-    return min(times)
-
-
-def front(rows: Sequence[dict]) -> list[int]:
-    """Rows that no other beats in PSNR and time, cheapest first."""
-    order = sorted(range(len(rows)), key=lambda i: (rows[i]["ms_view"], -rows[i]["psnr"]))
-    chosen: list[int] = []
-    for i in order:
-        if not chosen or rows[i]["psnr"] > rows[chosen[-1]]["psnr"]:
-            chosen.append(i)
-    return chosen
-
-
-def knee(rows: Sequence[dict], chosen: Sequence[int]) -> int:
-    """The row of the front that lies farthest above the line from its cheapest to its best."""
-    x = np.log([rows[i]["ms_view"] for i in chosen])
-    y = np.array([rows[i]["psnr"] for i in chosen])
-    x, y = ((v - v[0]) / (v[-1] - v[0]) if v[-1] != v[0] else np.zeros_like(v) for v in (x, y))
-    return chosen[int(np.argmax(y - x))]
-
-
-def _both(rows: Sequence[dict]) -> tuple[Table, Table]:
-    return table(rows, front(rows)), steps(rows, front(rows))
-
-
-def table(rows: Sequence[dict], chosen: Sequence[int]) -> Table:
-    """Settings of one size; those of the front are marked, and differences are to the network's best level."""
-    heads = ("setting", "PSNR, dB", "SSIM", "FLIP", "IoU", "ms a view", "s to encode", "MB")
-    decimals = {"ssim": 3, "flip": 3, "iou": 3, "ms_view": 1, "s_encode": 2, "mb": 0}
-    made = []
-    for i, row in enumerate(rows):
-        base = next(r for r in rows if r["run"] == row["run"])
-        mark = " (front, knee)" if i == knee(rows, chosen) else " (front)" if i in chosen else ""
-        change = () if row is base else (f"({row['psnr'] - base['psnr']:+.2f})",)
-        cells = [text(row["name"] + mark), number(row["psnr"], 2, more=change)]
-        made.append((Path(row["run"]).name, (*cells, *(number(row[name], n) for name, n in decimals.items()))))
-    return Table(title=f"Quality and cost at {rows[0]['size']} px", heads=heads, rows=tuple(made))
-
-
-def steps(rows: Sequence[dict], chosen: Sequence[int]) -> Table:
-    """The front from its cheapest on: what each step costs and gives."""
-    made = []
-    for before, i in zip((None, *chosen), chosen, strict=False):
-        row = rows[i]
-        cells = [text(row["name"]), number(row["psnr"], 2), number(row["ms_view"], 1)]
-        if before is not None:
-            last = rows[before]
-            cells.append(number(row["ms_view"] / last["ms_view"], 2))
-            differences = {"psnr": 2, "flip": 3, "iou": 3}
-            cells += [number(row[name] - last[name], n, sign="+") for name, n in differences.items()]
-        made.append((Path(row["run"]).name, tuple(cells)))
-    heads = ("setting", "PSNR, dB", "ms a view", "times as long as the row before", "PSNR", "FLIP", "IoU")
-    return Table(title=f"The front at {rows[0]['size']} px, step by step", heads=heads, rows=tuple(made))
+def timed(work: Callable[[], Result]) -> tuple[Result, float]:
+    """What the work gives, and its milliseconds: of the processor, where that is what computes."""
+    clock = time.process_time if jax.default_backend() == "cpu" else time.perf_counter
+    start = clock()
+    result = jax.block_until_ready(work())
+    return result, 1000 * (clock() - start)
 
 
 if __name__ == "__main__":

@@ -17,6 +17,7 @@ GROUPS = {  # of settings, as the plot colours them
     "samples": "#2457d6",
     "near points": "#2f9e44",
     "bfloat16": "#9c36b5",
+    "surface": "#e8a200",
 }
 LABELS = {"psnr": "PSNR, dB", "flip": "FLIP (lower is better)", "iou": "opacity IoU"}
 PANELS = (("ms_view", "psnr"), ("ms_view", "flip"), ("ms_view", "iou"), ("mb", "psnr"))

@@ -55,6 +55,13 @@ def squares(x: Float[Array, "*batch height width features"], side: int) -> Array
     return x.reshape(*batch, height // side, side, width // side, side, features)
 
 
+def enlarged(rendering: Rendering, height: int, width: int) -> Rendering:
+    """The rendering at a larger size: colours by cubics, depth and opacity between their neighbours."""
+    color = jnp.clip(jax.image.resize(rendering.image, (height, width, 3), "cubic"), 0, 1)
+    depth, acc = (jax.image.resize(x, (height, width), "linear") for x in (rendering.depth, rendering.acc))
+    return Rendering(image=color, image_lr=color, depth=depth, acc=acc)
+
+
 def averaged(rendering: Rendering, side: int) -> Rendering:
     """The rendering with every square of side x side pixels averaged: the light of the object, its opacity, the depth.
 

@@ -31,6 +31,7 @@ from spnr_jax.model_config import NetworkConfig, PaperConfig, RayNetworkConfig, 
 FIELD_OF_VIEW, DISTANCE = np.deg2rad(40.0), 3.0  # of the training cameras; the object fits into the unit sphere
 Quality = Literal["draft", "balanced", "best", "trained"]
 SAMPLES = {"draft": 0.25, "balanced": 0.5, "best": 1.0}  # share of the samples a ray was trained with
+BALANCED = 0.75  # of the pixels along a side, which the network over surfels draws and enlarges: docs/quality.md
 REACH_PER_SPACING, LARGEST_REACH = 1.6, 4  # what loses nothing from 128 to 4096 points, docs/performance.md
 
 
@@ -85,8 +86,9 @@ class Model:
     ) -> Rendering:
         """The object as the camera (unbatched, or with one axis of views) sees it; depth in the cloud's units.
 
-        The network over surfels takes a light (default: the package's room), and leaves its CNN out of `draft`; the
-        networks of rays know the light that they were trained in alone, and have these levels:
+        The network over surfels takes a light (default: the package's room), leaves its CNN out of `draft`, and draws
+        fewer pixels at `balanced`, which are enlarged; the networks of rays know the light that they were trained in
+        alone, and have these levels:
 
         `draft`, `balanced` and `best` look near the points alone, with a quarter, half and all of the samples of a ray,
         and `best` has several rays a pixel where pictures are smaller than those of the training (`supersampling.py`);
@@ -96,7 +98,8 @@ class Model:
         if self._surfels is not None:
             draw = self._surfels.render if camera.cam_to_world.ndim == 2 else self._surfels.render_views
             inside = _in_box(camera, volume.centre, volume.scale)
-            drawn = draw(self._shader(quality), volume.scene, inside, _or_room(light), config=self.config)
+            shader, share = self._shader(quality), _share(quality)
+            drawn = draw(shader, volume.scene, inside, _or_room(light), config=self.config, share=share)
             return _in_units(drawn, volume)
         if light is not None:
             raise UserError("this network knows the light of its training alone; give no light")
@@ -123,7 +126,9 @@ class Model:
             return
         inside = [_in_box(view, volume.centre, volume.scale) for view in views]
         shone = [_or_room(light) for light in lights]
-        for drawn in self._surfels.render_each(self._shader(quality), volume.scene, inside, shone, config=self.config):
+        shader, share = self._shader(quality), _share(quality)
+        draw = self._surfels.render_each
+        for drawn in draw(shader, volume.scene, inside, shone, config=self.config, share=share):
             yield _in_units(drawn, volume)
 
     @property
@@ -205,6 +210,10 @@ def _in_units(drawn: Rendering, volume: Volume) -> Rendering:
 @jax.jit
 def _over(depth, scale) -> Array:
     return depth / scale
+
+
+def _share(quality: Quality) -> float:
+    return BALANCED if quality == "balanced" else 1.0
 
 
 def _check_quality(quality: str) -> None:

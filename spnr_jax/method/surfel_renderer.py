@@ -23,7 +23,7 @@ from spnr_jax.errors import UserError
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.compositing import WHITE
 from spnr_jax.kernels.records import AnyArray, Camera, GBuffer, Key, Light, PointCloud, Rendering, Scene, Surfels
-from spnr_jax.kernels.resizing import doubled, mean_of_squares
+from spnr_jax.kernels.resizing import doubled, enlarged, mean_of_squares
 from spnr_jax.method import solid
 from spnr_jax.model_config import SOLID, SurfelConfig
 from spnr_jax.nn.shader import NUM_OUTPUTS, Shader, picture
@@ -89,20 +89,38 @@ def encode(variables: dict | None, cloud: PointCloud, *, config: SurfelConfig) -
 
 
 def render(
-    variables: dict | None, scene: SurfelScene, camera: Camera, light: Light, *, config: SurfelConfig
+    variables: dict | None,
+    scene: SurfelScene,
+    camera: Camera,
+    light: Light,
+    *,
+    config: SurfelConfig,
+    share: float = 1.0,
 ) -> Rendering:
-    """One view (camera unbatched, in the box) of an encoded object; without variables discs and light alone."""
-    plan, total = _planned(scene, camera)
-    return _drawn(variables, scene, camera, light, plan, total, LEAST_SLOTS, config)[0]
+    """One view (camera unbatched, in the box) of an encoded object; without variables discs and light alone.
+
+    With a `share` below 1 of the pixels along a side the picture is drawn smaller, doubled as often, and enlarged.
+    """
+    small = _smaller(camera, share)
+    plan, total = _planned(scene, small, share)
+    drawn, _ = _drawn(variables, scene, small, light, plan, total, LEAST_SLOTS, config)
+    return drawn if share == 1 else _enlarged(drawn, camera.height, camera.width)
 
 
 def render_views(
-    variables: dict | None, scene: SurfelScene, cameras: Camera, light: Light | Sequence[Light], *, config: SurfelConfig
+    variables: dict | None,
+    scene: SurfelScene,
+    cameras: Camera,
+    light: Light | Sequence[Light],
+    *,
+    config: SurfelConfig,
+    share: float = 1.0,
 ) -> Rendering:
     """Views (one axis of cameras) in one light or each in its own."""
     views = [jax.tree.map(lambda x, i=i: x[i], cameras) for i in range(len(cameras.cam_to_world))]
     lights = [light] * len(views) if isinstance(light, Light) else light
-    return jax.tree.map(lambda *x: np.stack(x), *render_each(variables, scene, views, lights, config=config))
+    drawn = render_each(variables, scene, views, lights, config=config, share=share)
+    return jax.tree.map(lambda *x: np.stack(x), *drawn)
 
 
 def render_each(
@@ -112,28 +130,36 @@ def render_each(
     lights: Sequence[Light],
     *,
     config: SurfelConfig,
+    share: float = 1.0,
 ) -> Iterator[Rendering]:
     """Views one after the other; they share the sizes of the largest of them, so that few programs are compiled."""
-    plans = [_planned(scene, view) for view in views]
+    small = [_smaller(view, share) for view in views]
+    plans = [_planned(scene, view, share) for view in small]
     largest: dict[tuple, np.ndarray] = {}
     for plan, total in plans:  # those of one resolution share their sizes
         sizes = np.array([plan.width, plan.height, total, LEAST_SLOTS])
         largest[plan[:2]] = np.maximum(largest.get(plan[:2], sizes), sizes)
 
-    def one(asked: tuple[Camera, Light, tuple[Plan, int]]) -> Rendering:
-        view, light, (plan, total) = asked
+    def one(asked: tuple[Camera, Camera, Light, tuple[Plan, int]]) -> Rendering:
+        view, whole, light, (plan, total) = asked
         width, height, most, slots = map(int, largest[plan[:2]])
         shared = plan._replace(width=width, height=height)
         found, slots = _drawn(variables, scene, view, light, shared, most if total else 0, slots, config)
         largest[plan[:2]][3] = max(slots, largest[plan[:2]][3])
-        return found
+        return found if share == 1 else _enlarged(found, whole.height, whole.width)
 
-    yield from two_at_a_time(one, zip(views, lights, plans, strict=True))
+    yield from two_at_a_time(one, zip(small, views, lights, plans, strict=True))
 
 
-def _planned(scene: SurfelScene, camera: Camera) -> tuple[Plan, int]:
+def _smaller(camera: Camera, share: float) -> Camera:
+    if share == 1:
+        return camera
+    return cameras.resize(camera, *(max(round(share * n / 4) * 4, 4) for n in (camera.height, camera.width)))
+
+
+def _planned(scene: SurfelScene, camera: Camera, share: float) -> tuple[Plan, int]:
     """Where and at what size a view is drawn, and its entries at most."""
-    doublings, side = resolution_of(scene.spacing, camera)
+    doublings, side = resolution_of(scene.spacing, camera, share)
     box, total = jax.device_get(_extent(scene.surfels, _scaled(camera, doublings, side)))
     return _window(box, doublings, side), int(total)
 
@@ -164,10 +190,13 @@ def _drawn(
     return _placed(_shade(variables, *looked, config=config, doublings=plan.doublings), camera, plan), slots
 
 
-def resolution_of(spacing: float, camera: Camera) -> tuple[int, int]:
-    """Doublings by the network, and pixels averaged along each side, for points this far apart around the origin."""
+def resolution_of(spacing: float, camera: Camera, share: float = 1.0) -> tuple[int, int]:
+    """Doublings by the network, and pixels averaged along each side, for points this far apart around the origin.
+
+    They are those of the picture of which the camera has a share of the pixels along a side.
+    """
     focal, eye = np.asarray(camera.intrinsics)[0, 0], np.asarray(camera.cam_to_world, np.float64)[:, 3]
-    pixels = spacing * float(focal) / max(float(np.linalg.norm(eye)), 1e-3)
+    pixels = spacing * float(focal) / share / max(float(np.linalg.norm(eye)), 1e-3)
     doublings = int(np.clip(np.floor(np.log2(max(pixels / COARSEST, 1e-9))) + 1, 0, MOST_DOUBLINGS))
     return doublings, 2 if pixels < FINEST else 1
 
@@ -321,6 +350,9 @@ def _laid(
     along = -jnp.einsum("hwi,i->hw", rays.directions, camera.cam_to_world[:, 2], precision="highest")
     depth = sums[..., 4] / jnp.maximum(along, 1e-6) + (1 - acc) * far
     return sums[..., :3] + (1 - acc[..., None]) * WHITE, depth, acc
+
+
+_enlarged = jax.jit(enlarged, static_argnums=(1, 2), compiler_options=QUICK)
 
 
 def _nothing(camera: Camera) -> Rendering:

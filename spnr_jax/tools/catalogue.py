@@ -22,7 +22,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from spnr_jax.devices import compilation
+from spnr_jax.devices import allocator, compilation
 from spnr_jax.errors import UserError, one_line
 from spnr_jax.tools import catalogue_files, catalogue_page
 from spnr_jax.tools.catalogue_files import Item, Record, folder_of
@@ -164,6 +164,7 @@ def draw_item(bench: Bench, item: Item) -> str | None:
         return None
     if not item.cloud.exists():
         raise UserError(f"{item.cloud}: worker {socket.gethostname()} does not see this file; mount it there")
+    allocator.keep_arrays()
     compilation.keep_programs()
 
     def whole() -> None:

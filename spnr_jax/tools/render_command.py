@@ -58,8 +58,8 @@ class Render:
     resolution: int | None = None
     """Pixels along each side (default: 512 of surfels, else what the network was trained for)."""
     quality: Literal["draft", "balanced", "best", "trained"] = "best"
-    """draft: discs and light alone, without the CNN.  Of networks of rays: a quarter, half or all of the samples that a
-    ray was trained with, near the points; or just as trained."""
+    """balanced: three quarters of the size, enlarged; draft: discs and light alone, without the CNN.  Of networks of
+    rays: a quarter, half or all of the samples that a ray was trained with, near the points; or just as trained."""
     seconds: float | int | None = None
     """Draw all pictures of the file in so many seconds (after reading, encoding and compiling): the best quality and
     size that keep to it, measured on this machine once.  A --resolution that is given is kept."""

@@ -20,6 +20,7 @@ from spnr_jax.model_config import SurfelConfig
 from spnr_jax.nn.shader import Shader, picture
 from spnr_jax.training import optimisation
 from spnr_jax.training.optimisation import TrainState
+from spnr_jax.training.run_by_run import run_by_run
 
 LEAST_INSIDE = 1.0  # pixels; where nothing of the object is seen its error is 0
 
@@ -49,7 +50,8 @@ def loss(params: dict, crops: Crops, *, config: TrainConfig) -> tuple[Float[Arra
 
 def train_step(state: TrainState, crops: Crops, *, config: TrainConfig) -> tuple[TrainState, dict[str, Array]]:
     """State after one step, and scalar metrics."""
-    (value, metrics), gradient = jax.value_and_grad(partial(loss, config=config), has_aux=True)(state.generator, crops)
+    of_run = run_by_run(jax.value_and_grad(partial(loss, config=config), has_aux=True))
+    (value, metrics), gradient = of_run(state.generator, crops)
     adam, _ = optimisation.optimizers(config)
     update, optimizer = adam.update(gradient, state.generator_optimizer)
     generator = optax.apply_updates(state.generator, update)

@@ -14,6 +14,7 @@ from data_gen.render.poisson_surface import PoissonConfig
 from data_gen.store import layout
 from experiments.comparison import poisson
 from experiments.comparison.object_views import at, cut, on_white
+from experiments.studies import speed_accuracy
 from experiments.studies.sharpness_methods import Poisson
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.mesh import surface_points
@@ -99,6 +100,15 @@ def test_the_sharpness_study_draws_the_same_surfaces_of_the_first_points_and_vie
     (image, opacity), *_ = surfaces.draw(data_sets.read_object(found, "line"), None).pictures
     assert (image == 1).all()
     assert (opacity == 0).all()
+
+
+@needs_solver
+@pytest.mark.ci
+def test_a_surface_is_scored_beside_the_settings_of_networks(dataset):
+    surface = speed_accuracy.Surface(kind="poisson", name="500 points", points=500)
+    found = speed_accuracy.measure_surface(surface, data_sets.open_dataset(dataset), ["ball"], 1, 16)
+    assert found["psnr"] > 25
+    assert min(found["ms_view"], found["s_encode"]) > 0
 
 
 def test_the_light_has_to_be_that_of_the_data_set(tmp_path):

@@ -104,6 +104,21 @@ def test_the_picture_moves_with_the_principal_point(wobbled):
     assert np.abs(one - np.asarray(render(None, scene, view, LIGHT, config=CONFIG).image)).max() > 0.01
 
 
+@pytest.mark.parametrize("size", [60, 96])
+def test_a_share_of_the_pixels_is_doubled_as_often_and_enlarged_to_nearly_the_same_picture(scene, size):
+    view, share = camera(size, (0.6, 0.4, 2.6)), 0.75
+    for spacing in np.geomspace(0.01, 1, 40):
+        small = cameras.resize(view, round(share * size), round(share * size))
+        assert resolution_of(spacing, small, share) == resolution_of(spacing, view)
+    whole, found = (render(None, scene, view, LIGHT, config=CONFIG, share=n) for n in (1.0, share))
+    assert jax.tree.map(jnp.shape, found) == jax.tree.map(jnp.shape, whole)
+    for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(whole), strict=True):
+        assert np.abs(np.asarray(one) - np.asarray(other)).mean() < 0.05  # depth jumps at the outline
+    views = jax.tree.map(lambda x: x[None], view)
+    together = render_views(None, scene, views, LIGHT, config=CONFIG, share=share)
+    close(jax.tree.map(lambda x: x[0], together), found)
+
+
 def test_views_are_those_drawn_one_by_one(scene):
     views = [camera(64, eye) for eye in ((0.0, 0.0, 2.5), (1.5, 1.0, 1.5))]
     together = render_views(None, scene, jax.tree.map(lambda *x: jnp.stack(x), *views), LIGHT, config=CONFIG)
