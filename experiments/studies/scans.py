@@ -152,9 +152,9 @@ def _scores(
     """Mean scores of an object's views without and with cleaning, and the share of its points that is left."""
     positions, values = spoiled(item.cloud, fault)
     cloud, said = _cleaned(positions, values, count)
-    views = _views(options, item)
-    auto, draft = (_mean_scores(_drawn(model, cloud, views, quality), views) for quality in ("best", "draft"))
-    off = _mean_scores(_drawn(model, thinned(positions, values, count), views), views) if said else auto
+    views = views_of(item, options.views, options.resolution)
+    auto, draft = (mean_scores(drawn_of(model, cloud, views, quality), views) for quality in ("best", "draft"))
+    off = mean_scores(drawn_of(model, thinned(positions, values, count), views), views) if said else auto
     left = len(positions) / len(item.cloud.positions)
     return {"off": off, "auto": auto, "draft": draft, "said": said, "left": left}
 
@@ -172,8 +172,10 @@ def _poisson_scores(
     )
     pictures, _ = renderer.pictures(seen, count, poisson.SURFACES["poisson_trimmed"])
     drawn = dataclasses.replace(seen, images=pictures)
-    views = _views(options, item)
-    return _mean_scores([(_on_white(rgba), rgba[..., 3]) for _, rgba in _views(options, drawn)], views)
+    views = views_of(item, options.views, options.resolution)
+    return mean_scores(
+        [(_on_white(rgba), rgba[..., 3]) for _, rgba in views_of(drawn, options.views, options.resolution)], views
+    )
 
 
 def _cleaned(positions: np.ndarray, values: dict[str, np.ndarray], count: int) -> tuple[PointCloud, list[str]]:
@@ -181,16 +183,19 @@ def _cleaned(positions: np.ndarray, values: dict[str, np.ndarray], count: int) -
     return thinned(positions, values, count), said
 
 
-def _views(options: ScansStudy, item: data_sets.ObjectData) -> list[View]:
-    return [view_of(item, view, options.resolution) for view in range(min(options.views, len(item.images)))]
+def views_of(item: data_sets.ObjectData, views: int, resolution: int | None) -> list[View]:
+    """The first views of an object at a resolution, None for its own."""
+    return [view_of(item, view, resolution) for view in range(min(views, len(item.images)))]
 
 
-def _drawn(model: Model, cloud: PointCloud, views: Sequence[View], quality: Quality = "best") -> list[Drawn]:
+def drawn_of(model: Model, cloud: PointCloud, views: Sequence[View], quality: Quality = "best") -> list[Drawn]:
+    """Pictures of a cloud from cameras."""
     found = model.render_each(model.encode(cloud), [camera for camera, _ in views], quality)
     return [(np.asarray(r.image), np.asarray(r.acc)) for r in found]
 
 
-def _mean_scores(drawn: Sequence[Drawn], views: Sequence[View]) -> list[float]:
+def mean_scores(drawn: Sequence[Drawn], views: Sequence[View]) -> list[float]:
+    """Mean PSNR, PSNR inside and FLIP of pictures."""
     found = []
     for (image, opacity), (_, reference) in zip(drawn, views, strict=True):
         scores = sharpness(image, opacity, reference)
@@ -222,7 +227,7 @@ def _gallery(options: ScansStudy, dataset: data_sets.Dataset, names: Sequence[st
         def picture(label: str, name: str = name, item: data_sets.ObjectData = item) -> np.ndarray:
             def make() -> np.ndarray:
                 cloud, _ = _cleaned(*spoiled(item.cloud, kinds[label]), max(options.counts))
-                return images.to_uint8(_drawn(model, cloud, _views(options, item)[:1])[0][0])
+                return images.to_uint8(drawn_of(model, cloud, views_of(item, 1, options.resolution))[0][0])
 
             return results_folder.kept(options.out / "pictures" / f"{name}_{label}.png".replace(" ", "_"), make)
 

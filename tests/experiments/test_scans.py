@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from support import tiny_dataset, tiny_surfels
 
-from experiments.studies import scans
+from experiments.studies import noise_parts, scans
 from spnr_jax.surfels.visibility import spiral
 from spnr_jax.training import scan_faults
 
@@ -57,6 +57,27 @@ def test_the_study_ends_with_a_table_and_pictures_and_goes_on_where_it_stopped(t
     before = [path.stat().st_mtime_ns for path in kept]
     scans.main(options)
     assert [path.stat().st_mtime_ns for path in kept] == before
+
+
+@pytest.mark.ci
+def test_a_noisy_cloud_is_drawn_with_each_part_of_it_put_right(tmp_path):
+    folder = tiny_dataset.write_dataset(tmp_path / "set", SPLITS, tiny_surfels.SIZE)
+    noise_parts.main(
+        noise_parts.NoiseParts(
+            data=folder,
+            out=tmp_path / "out",
+            run=str(tiny_surfels.run()),
+            count=32,
+            noise=(0.02,),
+            views=1,
+            resolution=tiny_surfels.SIZE,
+        )
+    )
+    results = json.loads((tmp_path / "out" / "results.json").read_text())["objects"]
+    assert list(results)[:3] == ["clean", "2.0%, cleaned", "2.0%, places put right"]
+    assert results["2.0%, colours put right"] == results["2.0%, cleaned"]  # the ball has one colour
+    assert results["2.0%, places put right"] != results["2.0%, cleaned"]
+    assert np.isfinite(list(results["2.0%, averaged alone"].values())).all()
 
 
 def test_faults_change_what_their_names_say_and_nothing_else():
