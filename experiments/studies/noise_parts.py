@@ -84,7 +84,10 @@ def main(options: NoiseParts) -> None:
 
 def _clouds(true: PointCloud, noise: tuple[float, ...], count: int) -> Iterator[tuple[str, Callable[[], PointCloud]]]:
     """A row's name, and what makes its cloud."""
-    yield "clean", lambda: thinned(*spoiled(true, None), count)
+    positions, values = spoiled(true, None)
+    normals = {"normals": np.asarray(true.normals)}
+    yield "clean", partial(thinned, positions, values, count)
+    yield "clean, with normals", partial(thinned, positions, values | normals, count)
     for sigma in noise:
         points = spoiled(true, partial(noisy, sigma=sigma))
         dirty = thinned(*cleaned(*points)[:2], count)

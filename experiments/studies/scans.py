@@ -108,7 +108,8 @@ def main(options: ScansStudy) -> None:
     )
     hardware = machine.hardware()
     results_folder.write(options.out, {"objects": rows, "hardware": hardware}, [table, _rivals(options, rows)])
-    _gallery(options, dataset, names[: options.shown], model)
+    if options.shown:
+        _gallery(options, dataset, names[: options.shown], model)
 
 
 def _rivals(options: ScansStudy, rows: dict[str, list[dict]]) -> Table:

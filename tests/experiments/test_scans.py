@@ -74,7 +74,7 @@ def test_a_noisy_cloud_is_drawn_with_each_part_of_it_put_right(tmp_path):
         )
     )
     results = json.loads((tmp_path / "out" / "results.json").read_text())["objects"]
-    assert list(results)[:3] == ["clean", "2.0%, cleaned", "2.0%, places put right"]
+    assert list(results)[:3] == ["clean", "clean, with normals", "2.0%, cleaned"]
     assert results["2.0%, colours put right"] == results["2.0%, cleaned"]  # the ball has one colour
     assert results["2.0%, places put right"] != results["2.0%, cleaned"]
     assert np.isfinite(list(results["2.0%, averaged alone"].values())).all()
