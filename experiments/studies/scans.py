@@ -5,31 +5,35 @@
 The points of the test objects (`spnr-data generate --spread even`) are spoiled as scanners spoil them
 (training/scan_faults.py), cleaned or not, thinned evenly to so many as `spnr render` does, and drawn.  Noise is the
 standard deviation along each axis, in units of the box whose half diagonal is 1; scanners see from random directions.
+Rivals draw the same cleaned points: discs and light alone, and of --meshed objects trimmed Poisson surfaces.
 
-    OUT/results.json  OUT/table.md .csv .tex     dB, dB inside, FLIP of each fault, with and without cleaning
+    OUT/results.json  OUT/table.md .csv .tex     dB, dB inside, FLIP of each fault, with and without cleaning; of rivals
     OUT/gallery.png                              references and pictures of the first objects, a fault a column
 """
 
-from collections.abc import Sequence
+import dataclasses
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
 from experiments import entry_point
-from experiments.comparison import figures, results_folder
+from experiments.comparison import figures, poisson, results_folder
 from experiments.comparison.object_views import view_of
 from experiments.comparison.result_tables import Cell, Table, number
 from spnr_jax.devices import machine
 from spnr_jax.formats import data_sets, images
 from spnr_jax.kernels.cleaning import cleaned
 from spnr_jax.kernels.cloud_arrays import normalization
-from spnr_jax.kernels.records import PointCloud
+from spnr_jax.kernels.records import Camera, PointCloud
 from spnr_jax.kernels.thinning import farthest_points
-from spnr_jax.method.model import Model
+from spnr_jax.method.model import Model, Quality
 from spnr_jax.scoring import intervals
 from spnr_jax.scoring.flip import flip
 from spnr_jax.scoring.picture_scores import sharpness
@@ -38,6 +42,9 @@ from spnr_jax.training.weights import load
 
 HEADS = ("PSNR, dB", "inside, dB", "FLIP", "cleaned: PSNR, dB", "inside, dB", "FLIP", "points left, %")
 DECIMALS = (2, 2, 3)
+View = tuple[Camera, np.ndarray]  # and its reference
+Drawn = tuple[np.ndarray, np.ndarray]  # a picture on white, and opacity
+RIVALS = {"auto": "network", "draft": "discs and light alone", "poisson": "trimmed Poisson"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,6 +71,8 @@ class ScansStudy:
     """Views of an object."""
     objects: int | None = None
     """Test objects (default: all)."""
+    meshed: int = 0
+    """Objects, of these the first, of which Poisson surfaces are drawn, too (extras `data` and `baselines`)."""
     shown: int = 4
     """Objects in the gallery."""
 
@@ -74,37 +83,48 @@ def main(options: ScansStudy) -> None:
     names = dataset.splits["test"][: options.objects]
     asked = {"run": options.run, "views": options.views, "resolution": options.resolution}
     results_folder.claim(options.out, "scans", asked, dataset)
-    model = load(options.run)
+    model, meshed = load(options.run), names[: options.meshed]
+    surface = poisson.Renderer(dataset.settings) if meshed else None
     rows: dict[str, list[dict]] = {}
     for count in options.counts:
         for label, fault in faults(options.noise, options.outliers, options.scanners).items():
-            row = f"{count:,}, {label}"
+            row, place = f"{count:,}, {label}", options.out / "scores" / f"{count} {label}".replace(" ", "_")
             rows[row] = [
-                _kept_scores(options, dataset, name, label, model, fault, count) for name in tqdm(names, desc=row)
+                _kept(place, dataset, name, partial(_scores, options, model, fault, count))
+                for name in tqdm(names, desc=row)
             ]
+            if surface is not None:
+                for name, found in zip(meshed, rows[row], strict=False):
+                    scores = partial(_poisson_scores, options, surface, fault, count)
+                    found["poisson"] = _kept(place / "poisson", dataset, name, scores)
     table = Table(
         title=f"Scans, {len(names)} objects x {options.views} views",
         heads=HEADS,
-        rows=tuple((row, _cells(found)) for row, found in rows.items()),
+        rows=tuple(
+            (row, (*_cells(found, ("off", "auto")), number(100 * np.mean([of["left"] for of in found]), 0)))
+            for row, found in rows.items()
+        ),
         note="Means over objects with 95 % intervals; points left: of the data set's, before cleaning.",
     )
-    results_folder.write(options.out, {"objects": rows, "hardware": machine.hardware()}, [table])
-    _gallery(options, dataset, names[: options.shown], model)
+    hardware = machine.hardware()
+    results_folder.write(options.out, {"objects": rows, "hardware": hardware}, [table, _rivals(options, rows)])
+    if options.shown:
+        _gallery(options, dataset, names[: options.shown], model)
 
 
-def _kept_scores(
-    options: ScansStudy,
-    dataset: data_sets.Dataset,
-    name: str,
-    label: str,
-    model: Model,
-    fault: Fault | None,
-    count: int,
-) -> dict[str, Any]:
-    place = options.out / "scores" / f"{count} {label}".replace(" ", "_") / f"{name}.json"
-    return results_folder.kept(
-        place, lambda: _scores(options, data_sets.read_object(dataset, name), model, fault, count)
+def _rivals(options: ScansStudy, rows: dict[str, list[dict]]) -> Table:
+    """Scores of all who draw the same cleaned points, over the objects that all of them drew."""
+    ways = [way for way in RIVALS if way != "poisson" or options.meshed]
+    counted = {row: found[: options.meshed or len(found)] for row, found in rows.items()}
+    return Table(
+        title=f"The same cleaned points drawn otherwise, {len(next(iter(counted.values())))} objects",
+        heads=tuple(head for way in ways for head in (f"{RIVALS[way]}: PSNR, dB", "inside, dB", "FLIP")),
+        rows=tuple((row, _cells(found, ways)) for row, found in counted.items()),
     )
+
+
+def _kept(place: Path, dataset: data_sets.Dataset, name: str, scores: Callable[[data_sets.ObjectData], Any]) -> Any:
+    return results_folder.kept(place / f"{name}.json", lambda: scores(data_sets.read_object(dataset, name)))
 
 
 def spoiled(cloud: PointCloud, fault: Fault | None) -> tuple[np.ndarray, dict[str, np.ndarray]]:
@@ -128,41 +148,74 @@ def thinned(positions: np.ndarray, values: dict[str, np.ndarray], count: int) ->
 
 
 def _scores(
-    options: ScansStudy, item: data_sets.ObjectData, model: Model, fault: Fault | None, count: int
+    options: ScansStudy, model: Model, fault: Fault | None, count: int, item: data_sets.ObjectData
 ) -> dict[str, Any]:
     """Mean scores of an object's views without and with cleaning, and the share of its points that is left."""
     positions, values = spoiled(item.cloud, fault)
-    off = _mean_scores(options, item, model, thinned(positions, values, count))
-    done = cleaned(positions, values)
-    auto = _mean_scores(options, item, model, thinned(*done[:2], count)) if done[2] else off
-    return {"off": off, "auto": auto, "said": done[2], "left": len(positions) / len(item.cloud.positions)}
+    cloud, said = _cleaned(positions, values, count)
+    views = views_of(item, options.views, options.resolution)
+    auto, draft = (mean_scores(drawn_of(model, cloud, views, quality), views) for quality in ("best", "draft"))
+    off = mean_scores(drawn_of(model, thinned(positions, values, count), views), views) if said else auto
+    left = len(positions) / len(item.cloud.positions)
+    return {"off": off, "auto": auto, "draft": draft, "said": said, "left": left}
 
 
-def _mean_scores(options: ScansStudy, item: data_sets.ObjectData, model: Model, cloud: PointCloud) -> list[float]:
+def _poisson_scores(
+    options: ScansStudy, renderer: poisson.Renderer, fault: Fault | None, count: int, item: data_sets.ObjectData
+) -> list[float]:
+    """Mean scores of the trimmed Poisson surface of the cleaned points."""
+    cloud, _ = _cleaned(*spoiled(item.cloud, fault), count)
+    seen = dataclasses.replace(
+        item,
+        cloud=cloud,
+        images=item.images[: options.views],
+        camera=jax.tree.map(lambda x: x[: options.views], item.camera),
+    )
+    pictures, _ = renderer.pictures(seen, count, poisson.SURFACES["poisson_trimmed"])
+    drawn = dataclasses.replace(seen, images=pictures)
+    views = views_of(item, options.views, options.resolution)
+    return mean_scores(
+        [(_on_white(rgba), rgba[..., 3]) for _, rgba in views_of(drawn, options.views, options.resolution)], views
+    )
+
+
+def _cleaned(positions: np.ndarray, values: dict[str, np.ndarray], count: int) -> tuple[PointCloud, list[str]]:
+    positions, values, said = cleaned(positions, values)
+    return thinned(positions, values, count), said
+
+
+def views_of(item: data_sets.ObjectData, views: int, resolution: int | None) -> list[View]:
+    """The first views of an object at a resolution, None for its own."""
+    return [view_of(item, view, resolution) for view in range(min(views, len(item.images)))]
+
+
+def drawn_of(model: Model, cloud: PointCloud, views: Sequence[View], quality: Quality = "best") -> list[Drawn]:
+    """Pictures of a cloud from cameras."""
+    found = model.render_each(model.encode(cloud), [camera for camera, _ in views], quality)
+    return [(np.asarray(r.image), np.asarray(r.acc)) for r in found]
+
+
+def mean_scores(drawn: Sequence[Drawn], views: Sequence[View]) -> list[float]:
+    """Mean PSNR, PSNR inside and FLIP of pictures."""
     found = []
-    for image, opacity, reference in _drawn(options, item, model, cloud, options.views):
-        scores, alpha = sharpness(image, opacity, reference), reference[..., 3:]
-        white = reference[..., :3] * alpha + 1 - alpha
-        found.append([scores.psnr, scores.psnr_inside, float(flip(jnp.asarray(image), jnp.asarray(white)))])
+    for (image, opacity), (_, reference) in zip(drawn, views, strict=True):
+        scores = sharpness(image, opacity, reference)
+        distance = float(flip(jnp.asarray(image), jnp.asarray(_on_white(reference))))
+        found.append([scores.psnr, scores.psnr_inside, distance])
     return np.nanmean(found, axis=0).tolist()
 
 
-def _drawn(
-    options: ScansStudy, item: data_sets.ObjectData, model: Model, cloud: PointCloud, views: int
-) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Image, opacity and reference of an object's first views."""
-    pairs = [view_of(item, view, options.resolution) for view in range(min(views, len(item.images)))]
-    found = model.render_each(model.encode(cloud), [camera for camera, _ in pairs])
-    return [(np.asarray(r.image), np.asarray(r.acc), reference) for r, (_, reference) in zip(found, pairs, strict=True)]
+def _on_white(rgba: np.ndarray) -> np.ndarray:
+    return rgba[..., :3] * rgba[..., 3:] + 1 - rgba[..., 3:]
 
 
-def _cells(found: Sequence[dict]) -> tuple[Cell, ...]:
+def _cells(found: Sequence[dict], ways: Sequence[str]) -> tuple[Cell, ...]:
     cells = []
-    for way in ("off", "auto"):
+    for way in ways:
         for values, decimals in zip(np.array([scores[way] for scores in found]).T, DECIMALS, strict=True):
             interval = intervals.interval([np.array([x]) for x in values]) if len(values) > 1 else None
             cells.append(number(float(np.mean(values)), decimals, interval))
-    return (*cells, number(100 * float(np.mean([scores["left"] for scores in found])), 0))
+    return tuple(cells)
 
 
 def _gallery(options: ScansStudy, dataset: data_sets.Dataset, names: Sequence[str], model: Model) -> None:
@@ -174,15 +227,13 @@ def _gallery(options: ScansStudy, dataset: data_sets.Dataset, names: Sequence[st
 
         def picture(label: str, name: str = name, item: data_sets.ObjectData = item) -> np.ndarray:
             def make() -> np.ndarray:
-                positions, values, _ = cleaned(*spoiled(item.cloud, kinds[label]))
-                cloud = thinned(positions, values, max(options.counts))
-                return images.to_uint8(_drawn(options, item, model, cloud, 1)[0][0])
+                cloud, _ = _cleaned(*spoiled(item.cloud, kinds[label]), max(options.counts))
+                return images.to_uint8(drawn_of(model, cloud, views_of(item, 1, options.resolution))[0][0])
 
             return results_folder.kept(options.out / "pictures" / f"{name}_{label}.png".replace(" ", "_"), make)
 
         reference = view_of(item, 0, options.resolution)[1]
-        alpha = reference[..., 3:]
-        cells.append([reference[..., :3] * alpha + 1 - alpha, *map(picture, kinds)])
+        cells.append([_on_white(reference), *map(picture, kinds)])
     sheet = figures.grid(cells, ["reference", *kinds], names, size=cells[0][0].shape[0])
     images.write_whole(options.out / "gallery.png", images.png(sheet))
 

@@ -122,6 +122,8 @@ def _base_color(columns: Columns, report: Report) -> np.ndarray | None:
         if not set(names) <= columns.keys():
             continue
         channels = np.stack([columns[name] for name in names], axis=-1)
+        if not channels.any() and "intensity" in columns:  # a lidar's record has colours whether or not it saw them
+            continue
         white = _full(channels, linear=names == LINEAR)
         colors = _unit_interval(channels / white, " ".join(names))
         if names == LINEAR:

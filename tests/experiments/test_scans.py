@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from support import tiny_dataset, tiny_surfels
 
-from experiments.studies import scans
+from experiments.studies import noise_parts, scans
 from spnr_jax.surfels.visibility import spiral
 from spnr_jax.training import scan_faults
 
@@ -17,8 +17,18 @@ def rng() -> np.random.Generator:
     return np.random.default_rng(0)
 
 
+class EmptySurfaces:
+    """Stands in for Poisson surfaces, which have tests of their own."""
+
+    def __init__(self, settings: dict) -> None: ...
+
+    def pictures(self, item, num_points, surface) -> tuple[np.ndarray, str]:
+        return np.zeros(item.images.shape, np.uint8), "no surface"
+
+
 @pytest.mark.ci
-def test_the_study_ends_with_a_table_and_pictures_and_goes_on_where_it_stopped(tmp_path):
+def test_the_study_ends_with_a_table_and_pictures_and_goes_on_where_it_stopped(tmp_path, monkeypatch):
+    monkeypatch.setattr(scans.poisson, "Renderer", EmptySurfaces)
     folder = tiny_dataset.write_dataset(tmp_path / "set", SPLITS, tiny_surfels.SIZE)
     options = scans.ScansStudy(
         data=folder,
@@ -29,6 +39,7 @@ def test_the_study_ends_with_a_table_and_pictures_and_goes_on_where_it_stopped(t
         outliers=(0.1,),
         scanners=(2,),
         views=1,
+        meshed=1,
     )
     scans.main(options)
     results = json.loads((tmp_path / "out" / "results.json").read_text())["objects"]
@@ -37,6 +48,8 @@ def test_the_study_ends_with_a_table_and_pictures_and_goes_on_where_it_stopped(t
     (clean,) = results["32, clean"]
     assert np.isfinite(clean["off"]).all()
     assert clean["auto"] == clean["off"]
+    assert clean["draft"] != clean["auto"]
+    assert np.isfinite(clean["poisson"][0])
     assert clean["left"] == 1
     assert results["32, outliers 10%"][0]["left"] == 1.1
     assert (tmp_path / "out" / "gallery.png").is_file()
@@ -44,6 +57,27 @@ def test_the_study_ends_with_a_table_and_pictures_and_goes_on_where_it_stopped(t
     before = [path.stat().st_mtime_ns for path in kept]
     scans.main(options)
     assert [path.stat().st_mtime_ns for path in kept] == before
+
+
+@pytest.mark.ci
+def test_a_noisy_cloud_is_drawn_with_each_part_of_it_put_right(tmp_path):
+    folder = tiny_dataset.write_dataset(tmp_path / "set", SPLITS, tiny_surfels.SIZE)
+    noise_parts.main(
+        noise_parts.NoiseParts(
+            data=folder,
+            out=tmp_path / "out",
+            run=str(tiny_surfels.run()),
+            count=32,
+            noise=(0.02,),
+            views=1,
+            resolution=tiny_surfels.SIZE,
+        )
+    )
+    results = json.loads((tmp_path / "out" / "results.json").read_text())["objects"]
+    assert list(results)[:3] == ["clean", "clean, with normals", "2.0%, cleaned"]
+    assert results["2.0%, colours put right"] == results["2.0%, cleaned"]  # the ball has one colour
+    assert results["2.0%, places put right"] != results["2.0%, cleaned"]
+    assert np.isfinite(list(results["2.0%, averaged alone"].values())).all()
 
 
 def test_faults_change_what_their_names_say_and_nothing_else():

@@ -57,12 +57,16 @@ def test_8_bit_colours_in_16_bit_fields_are_not_black():
     assert lines[0].endswith("0..255")
 
 
+INTENSITY_SHOWN = "no colour in the file: intensity 100..298 shown as grey"
+
+
 def test_intensity_is_grey_where_there_is_no_colour_and_unused_where_there_is():
     values, lines = read(scalar_intensity=[100, 300])
     np.testing.assert_allclose(values["base_color"][:, 0], [0, 1])
-    assert lines[0] == "no colour in the file: intensity 100..298 shown as grey"
+    assert lines[0] == INTENSITY_SHOWN
     values, lines = read(intensity=[100, 300], red=[1, 1], green=[0, 0], blue=[0, 0])
     np.testing.assert_array_equal(values["base_color"], [[1, 0, 0]] * 2)
+    assert read(intensity=[100, 300], red=[0, 0], green=[0, 0], blue=[0, 0])[1][0] == INTENSITY_SHOWN
     values, lines = read(intensity=[5, 5])
     assert lines[0].startswith("no base_color in the file")
 

@@ -1,0 +1,128 @@
+"""What of a noisy cloud costs the picture: places, colours, normals, or which points are kept?
+
+    python -m experiments.studies.noise_parts --data DIR --out OUT [--resolution 128]
+
+Clouds of the test objects are made noisy, cleaned and thinned as in scans.py; then a part of what is left is put right:
+
+    places             each point is moved to the nearest point of the true surface (the nearest of the data set)
+    colours            base colour, roughness and metallic are those of that point
+    normals            so are the normals, which else are estimated
+    averaged alone     no cleaning, but the mean of the noisy points in so many voxels
+
+    OUT/results.json  OUT/table.md .csv .tex     dB, dB inside, FLIP
+"""
+
+import dataclasses
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from experiments import entry_point
+from experiments.comparison import results_folder
+from experiments.comparison.result_tables import Table, number
+from experiments.studies.scans import DECIMALS, drawn_of, mean_scores, spoiled, thinned, views_of
+from spnr_jax.devices import machine
+from spnr_jax.formats import data_sets
+from spnr_jax.kernels.cleaning import cleaned
+from spnr_jax.kernels.records import PointCloud
+from spnr_jax.kernels.thinning import voxel_keys
+from spnr_jax.training.scan_faults import noisy
+from spnr_jax.training.weights import load
+
+MATERIALS = ("base_color", "roughness", "metallic")
+HALVINGS = 30  # of the interval in which the voxels' side is looked for
+
+
+@dataclass(frozen=True, kw_only=True)
+class NoiseParts:
+    """Scores of noisy clouds of which a part was put right."""
+
+    data: Path
+    """Folder of a data set whose points are spread evenly."""
+    out: Path
+    """Folder of the results; the same command goes on there."""
+    run: str = "surfels"
+    """Network: of the package, a run folder or a file of weights."""
+    count: int = 4096
+    """Points that are drawn."""
+    noise: tuple[float, ...] = (0.01, 0.02)
+    """Standard deviations, in units of the box whose half diagonal is 1."""
+    resolution: int = 128
+    """Pixels along each side: a whole share of the data set's."""
+    views: int = 2
+    """Views of an object."""
+    names: tuple[str, ...] = ()
+    """Test objects (default: all)."""
+
+
+def main(options: NoiseParts) -> None:
+    """Draws, scores and writes."""
+    dataset = data_sets.open_dataset(options.data)
+    names = options.names or tuple(dataset.splits["test"])
+    asked = {name: getattr(options, name) for name in ("run", "count", "resolution", "views")}
+    results_folder.claim(options.out, "noise_parts", asked, dataset)
+    model, rows = load(options.run), dict[str, dict[str, list[float]]]()
+    for name in names:
+        item = data_sets.read_object(dataset, name)
+        views = views_of(item, options.views, options.resolution)
+        for row, make in _clouds(item.cloud, options.noise, options.count):
+            place = options.out / "scores" / row.replace(" ", "_") / f"{name}.json"
+            found = results_folder.kept(place, lambda: mean_scores(drawn_of(model, make(), views), views))  # noqa: B023
+            rows.setdefault(row, {})[name] = found
+    means = {row: np.mean(list(found.values()), axis=0) for row, found in rows.items()}
+    table = Table(
+        title=f"What of noise costs the picture, {len(names)} objects x {options.views} views",
+        heads=("PSNR, dB", "inside, dB", "FLIP"),
+        rows=tuple((row, tuple(map(number, mean, DECIMALS))) for row, mean in means.items()),
+    )
+    results_folder.write(options.out, {"objects": rows, "hardware": machine.hardware()}, [table])
+
+
+def _clouds(true: PointCloud, noise: tuple[float, ...], count: int) -> Iterator[tuple[str, Callable[[], PointCloud]]]:
+    """A row's name, and what makes its cloud."""
+    positions, values = spoiled(true, None)
+    normals = {"normals": np.asarray(true.normals)}
+    yield "clean", partial(thinned, positions, values, count)
+    yield "clean, with normals", partial(thinned, positions, values | normals, count)
+    for sigma in noise:
+        points = spoiled(true, partial(noisy, sigma=sigma))
+        dirty = thinned(*cleaned(*points)[:2], count)
+        nearest = cKDTree(true.positions).query(np.asarray(dirty.positions, np.float64))[1]
+        right = {name: np.asarray(getattr(true, name))[nearest] for name in ("positions", "normals", *MATERIALS)}
+        colours = {name: right[name] for name in MATERIALS}
+        parts = {
+            "cleaned": {},
+            "places put right": {"positions": right["positions"]},
+            "colours put right": colours,
+            "places and colours put right": colours | {"positions": right["positions"]},
+            "normals put right": {"normals": right["normals"]},
+        }
+        for name, part in parts.items():
+            yield f"{sigma:.1%}, {name}", partial(dataclasses.replace, dirty, **part)
+        yield f"{sigma:.1%}, averaged alone", partial(_averaged, *points, count)
+
+
+def _averaged(positions: np.ndarray, values: dict[str, np.ndarray], count: int) -> PointCloud:
+    """Means of at most so many voxels."""
+    low, high = 1e-3 * np.ptp(positions), np.ptp(positions)
+    for _ in range(HALVINGS):
+        side = np.sqrt(low * high)
+        many = len(np.unique(voxel_keys(positions - positions.min(axis=0), side))) > count
+        low, high = (side, high) if many else (low, side)
+    voxel = np.unique(voxel_keys(positions - positions.min(axis=0), high), return_inverse=True)[1].ravel()
+    points = np.bincount(voxel)
+
+    def mean(column: np.ndarray) -> np.ndarray:
+        sums = np.zeros((len(points), *column.shape[1:]))
+        np.add.at(sums, voxel, column)
+        return sums / points.reshape(-1, *[1] * (column.ndim - 1))
+
+    return thinned(mean(positions), {name: mean(column) for name, column in values.items()}, count)
+
+
+if __name__ == "__main__":
+    entry_point.run(main, NoiseParts, "studies.noise_parts")
