@@ -29,7 +29,7 @@ from experiments.speed.surfel_scene import orbiting, random_crops, sphere
 from spnr_jax import cli
 from spnr_jax.devices import machine
 from spnr_jax.errors import UserError
-from spnr_jax.method import surfel_renderer
+from spnr_jax.method import surfel_plan, surfel_renderer
 from spnr_jax.model_config import SurfelConfig
 from spnr_jax.nn.shader import Shader, picture
 from spnr_jax.presets import PRESETS
@@ -132,7 +132,7 @@ def frame_programs(options: WhereTimeGoes) -> dict[str, Program]:
     variables = surfel_renderer.init(jax.random.key(0), config)
     camera, light = orbiting(options.size), room_light()
     scene = surfel_renderer.encode(variables, sphere(options.points), config=config)
-    doublings, side = surfel_renderer.resolution_of(scene.spacing, camera)
+    doublings, side = surfel_plan.resolution_of(scene.spacing, camera)
     small = orbiting(options.size * side >> doublings)
     total = int(projection.count(scene.surfels, small))
     found, covered = projection.jitted_entries(scene.surfels, small, total=total)

@@ -3,14 +3,12 @@
     encode   neighbours, normals, sides, visibility by direction              once per object, NumPy and SciPy
     render   discs splatted to a G-buffer, a CNN over it, light               once per view
 
-A picture is drawn at the resolution at which the points lie FINEST to COARSEST pixels apart and doubled from there by
-the network, so its work follows the points and the pixels that they cover.  Only a window around the object is drawn.
-Sizes that shape arrays are counted first and rounded up to few values: each new one is compiled once.
+At what size, and in which window of the picture: `surfel_plan.py`.
 """
 
 from collections.abc import Iterator, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,23 +17,18 @@ from flax import struct
 from jaxtyping import Array, Float, Int
 
 from spnr_jax.devices.side_by_side import two_at_a_time
-from spnr_jax.errors import UserError
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.compositing import WHITE
 from spnr_jax.kernels.records import AnyArray, Camera, GBuffer, Key, Light, PointCloud, Rendering, Scene, Surfels
 from spnr_jax.kernels.resizing import doubled, enlarged, mean_of_squares
 from spnr_jax.method import solid
+from spnr_jax.method.surfel_plan import Plan, in_window, planned, rounded, scaled, seen_through
 from spnr_jax.model_config import SOLID, SurfelConfig
 from spnr_jax.nn.shader import NUM_OUTPUTS, Shader, picture
 from spnr_jax.surfels import features, lighting, projection, splatting
 from spnr_jax.surfels.estimate import estimate
 
-COARSEST = 3.5  # pixels between points from which on a picture is drawn at half the size
-FINEST = 0.8  # below which it is drawn at twice the size and averaged
-MOST_DOUBLINGS = 4
-STEP, MARGIN = 32, 8  # pixels of which a window is a multiple, and around the object in it
 LEAST_SLOTS = 2**11  # covered pixels that a table is made for
-GRID = 8  # of which a window's corner is a multiple: the network's levels see the same squares from every camera
 # of XLA, that take a third to two thirds off the compilation; entries, `_seen`, `_shade` and `_laid` run as long
 QUICK = {"xla_cpu_use_fusion_emitters": False}
 QUICKEST = QUICK | {"xla_backend_optimization_level": 1}
@@ -51,17 +44,6 @@ class SurfelScene:
     surfels: Surfels
     spacing: float = struct.field(pytree_node=False)
     solid: Scene | None = None
-
-
-class Plan(NamedTuple):
-    """Doublings by the network, pixels averaged along a side, and the window of the G-buffer."""
-
-    doublings: int
-    side: int
-    left: int
-    top: int
-    width: int
-    height: int
 
 
 def init(key: Key, config: SurfelConfig) -> dict:
@@ -102,7 +84,7 @@ def render(
     With a `share` below 1 of the pixels along a side the picture is drawn smaller, doubled as often, and enlarged.
     """
     small = _smaller(camera, share)
-    plan, total = _planned(scene, small, share)
+    plan, total = planned(scene.surfels, scene.spacing, small, share)
     drawn, _ = _drawn(variables, scene, small, light, plan, total, LEAST_SLOTS, config)
     return drawn if share == 1 else _enlarged(drawn, camera.height, camera.width)
 
@@ -134,7 +116,7 @@ def render_each(
 ) -> Iterator[Rendering]:
     """Views one after the other; they share the sizes of the largest of them, so that few programs are compiled."""
     small = [_smaller(view, share) for view in views]
-    plans = [_planned(scene, view, share) for view in small]
+    plans = [planned(scene.surfels, scene.spacing, view, share) for view in small]
     largest: dict[tuple, np.ndarray] = {}
     for plan, total in plans:  # those of one resolution share their sizes
         sizes = np.array([plan.width, plan.height, total, LEAST_SLOTS])
@@ -157,13 +139,6 @@ def _smaller(camera: Camera, share: float) -> Camera:
     return cameras.resize(camera, *(max(round(share * n / 4) * 4, 4) for n in (camera.height, camera.width)))
 
 
-def _planned(scene: SurfelScene, camera: Camera, share: float) -> tuple[Plan, int]:
-    """Where and at what size a view is drawn, and its entries at most."""
-    doublings, side = resolution_of(scene.spacing, camera, share)
-    box, total = jax.device_get(_extent(scene.surfels, _scaled(camera, doublings, side)))
-    return _window(box, doublings, side), int(total)
-
-
 def _drawn(
     variables: dict | None,
     scene: SurfelScene,
@@ -177,75 +152,17 @@ def _drawn(
     """A planned view, and the size of its table of pixels."""
     if total == 0:
         return _nothing(camera), least_slots
-    whole = _scaled(camera, plan.doublings, plan.side)
-    inside = _seen_through(whole, plan)
+    whole = scaled(camera, plan.doublings, plan.side)
+    inside = seen_through(whole, plan)
     found, covered = projection.jitted_entries(
-        scene.surfels, inside, total=_rounded(total, 2**15, projection.MOST_ENTRIES)
+        scene.surfels, inside, total=rounded(total, 2**15, projection.MOST_ENTRIES)
     )
     pixels = inside.height * inside.width
-    slots = _rounded(min(max(int(covered), least_slots), pixels), LEAST_SLOTS, pixels)
+    slots = rounded(min(max(int(covered), least_slots), pixels), LEAST_SLOTS, pixels)
     known = known_of(variables, scene, whole, config)
-    within = None if known is None else jnp.asarray(_in_window(known, plan))
+    within = None if known is None else jnp.asarray(in_window(known, plan))
     looked = jitted_look(found, scene.surfels, light, inside, within, slots=slots)
     return _placed(_shade(variables, *looked, config=config, doublings=plan.doublings), camera, plan), slots
-
-
-def resolution_of(spacing: float, camera: Camera, share: float = 1.0) -> tuple[int, int]:
-    """Doublings by the network, and pixels averaged along each side, for points this far apart around the origin.
-
-    They are those of the picture of which the camera has a share of the pixels along a side.
-    """
-    focal, eye = np.asarray(camera.intrinsics)[0, 0], np.asarray(camera.cam_to_world, np.float64)[:, 3]
-    pixels = spacing * float(focal) / share / max(float(np.linalg.norm(eye)), 1e-3)
-    doublings = int(np.clip(np.floor(np.log2(max(pixels / COARSEST, 1e-9))) + 1, 0, MOST_DOUBLINGS))
-    return doublings, 2 if pixels < FINEST else 1
-
-
-@partial(jax.jit, compiler_options=QUICK)
-def _extent(surfels: Surfels, camera: Camera) -> tuple[Array, Array]:
-    """Lowest and highest column and row that discs cover, and the number of entries at most."""
-    foot = projection.footprints(surfels, camera)
-    drawn = foot.covered > 0
-    rows = foot.covered // foot.width
-    low = [jnp.min(jnp.where(drawn, x, 2**20)) for x in (foot.left, foot.top)]
-    high = [jnp.max(jnp.where(drawn, x + n, 0)) for x, n in ((foot.left, foot.width), (foot.top, rows))]
-    return jnp.stack([*low, *high]), jnp.sum(foot.covered)
-
-
-def _window(box: np.ndarray, doublings: int, side: int) -> Plan:
-    left, top = (max(int(x) - MARGIN, 0) // GRID * GRID for x in box[:2])
-    width, height = (
-        max(-(-(int(end) + MARGIN - first) // STEP) * STEP, STEP)
-        for first, end in zip((left, top), box[2:], strict=True)
-    )
-    return Plan(doublings, side, left, top, width, height)
-
-
-def _rounded(count: int, least: int, most: int) -> int:
-    """A power of the root of two that holds the count: few sizes, few compilations."""
-    if count > most:
-        raise UserError(f"the picture needs {count} entries of discs, at most {most} are drawn; ask for a smaller one")
-    return min(int(2 ** (np.ceil(2 * np.log2(max(count, least))) / 2)), most)
-
-
-def _scaled(camera: Camera, doublings: int, side: int) -> Camera:
-    """The camera at the network's resolution; doubled, its picture may be larger than asked for, and is cut."""
-    height, width = (-(-n * side // 2**doublings) for n in (camera.height, camera.width))
-    scale = np.array([[side / 2**doublings], [side / 2**doublings], [1.0]], np.float32)
-    intrinsics = np.asarray(camera.intrinsics, np.float32) * scale
-    return Camera(cam_to_world=camera.cam_to_world, intrinsics=intrinsics, height=height, width=width)
-
-
-def _seen_through(camera: Camera, plan: Plan) -> Camera:
-    """The camera whose picture is the window."""
-    intrinsics = np.array(camera.intrinsics, np.float32)
-    intrinsics[:2, 2] -= plan.left, plan.top
-    return Camera(
-        cam_to_world=np.asarray(camera.cam_to_world, np.float32),
-        intrinsics=intrinsics,
-        height=plan.height,
-        width=plan.width,
-    )
 
 
 def known_of(
@@ -255,13 +172,6 @@ def known_of(
     if variables is None or scene.solid is None:
         return None
     return solid.seen(variables["batch_stats"], scene.solid, camera, config=SOLID)
-
-
-def _in_window(picture: Float[Array, "h w features"], plan: Plan) -> Float[np.ndarray, "height width features"]:
-    """The part of a picture in the window, which may reach beyond it."""
-    ends = plan.top + plan.height, plan.left + plan.width
-    lacking = [(0, max(end - n, 0)) for end, n in zip(ends, picture.shape, strict=False)]
-    return np.pad(np.asarray(picture), [*lacking, (0, 0)])[plan.top : ends[0], plan.left : ends[1]]
 
 
 def blended(found: projection.Entries, surfels: Surfels, light: Light, camera: Camera, *, slots: int) -> GBuffer:

@@ -31,7 +31,7 @@ from spnr_jax.kernels import cameras
 from spnr_jax.kernels.cleaning import cleaned
 from spnr_jax.kernels.records import Camera, Crops, Light, PointCloud
 from spnr_jax.kernels.thinning import farthest_points
-from spnr_jax.method import surfel_renderer
+from spnr_jax.method import surfel_plan, surfel_renderer
 from spnr_jax.model_config import SurfelConfig
 from spnr_jax.surfels import features, lighting, projection
 from spnr_jax.training.batching import read_ahead
@@ -161,7 +161,7 @@ def make_view(
     `known` is the opacity and depth that the network of rays sees from a camera.
     """
     small = cameras.resize(camera, camera.height // side, camera.width // side)
-    doublings, finer = surfel_renderer.resolution_of(scene.spacing, small)
+    doublings, finer = surfel_plan.resolution_of(scene.spacing, small)
     side, scale = side // finer, 2**doublings  # what is drawn at twice the size is compared at that size
     if side == 0 or any(n % (side * scale) or n // (side * scale) < LEAST for n in image.shape[:2]):
         return None

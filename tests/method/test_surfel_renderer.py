@@ -11,7 +11,8 @@ from support.surfel_clouds import camera, cloud, shape
 
 from spnr_jax.kernels import cameras
 from spnr_jax.method import surfel_renderer
-from spnr_jax.method.surfel_renderer import GRID, encode, render, render_views, resolution_of
+from spnr_jax.method.surfel_plan import GRID, resolution_of
+from spnr_jax.method.surfel_renderer import encode, render, render_views
 from spnr_jax.model_config import SurfelConfig
 from spnr_jax.nn.shader import Shader
 from spnr_jax.surfels.features import NUM_FEATURES
