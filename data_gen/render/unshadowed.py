@@ -33,8 +33,9 @@ def render_unshadowed(
 def _integrator(occlusion: bool) -> Any:
     """An integrator of direct light that tests no shadow ray; Mitsuba's classes exist once it has a variant."""
     mi, dr = mitsuba_module(), importlib.import_module("drjit")
+    integrator: Any = mi.SamplingIntegrator
 
-    class Unshadowed(mi.SamplingIntegrator):
+    class Unshadowed(integrator):
         """Light of the map by both ways of sampling it (balance heuristic, Veach 1995)."""
 
         def sample(self, scene, sampler, ray, medium=None, active=True):

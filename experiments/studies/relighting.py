@@ -29,7 +29,7 @@ from spnr_jax.devices import machine
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets, images
 from spnr_jax.kernels.colors import srgb_to_linear
-from spnr_jax.kernels.records import Camera, Light, PointCloud, Rendering
+from spnr_jax.kernels.records import Camera, Light, PointCloud
 from spnr_jax.method.model import Model, Quality, Volume
 from spnr_jax.scoring import intervals
 from spnr_jax.scoring.flip import flip
@@ -43,6 +43,7 @@ GALLERY = 8  # objects in the gallery
 NETWORK, DISCS, UNSHADOWED = "network", "discs and light", "discs and light, nothing hides anything"
 METHODS: dict[str, Quality] = {NETWORK: "best", DISCS: "draft", UNSHADOWED: "draft"}
 ROOM = "room"
+Picture = tuple[np.ndarray, np.ndarray]  # on white (height, width, 3), opacity (height, width)
 Found = dict[tuple[str, int], list[dict[str, list[float]]]]  # light, points -> objects: method -> scores
 
 _flip = jax.jit(flip)
@@ -114,9 +115,9 @@ def _kept(
         )
         volume = model.encode(first_points(item.cloud, count))
         drawn = {method: draw(model, volume, method, cameras, lights) for method in METHODS}
-        images.write_whole(place.with_suffix(".png"), images.png(drawn[NETWORK][0].image))
+        images.write_whole(place.with_suffix(".png"), images.png(drawn[NETWORK][0][0]))
         return {
-            method: np.mean([scores(x.image, x.acc, y) for x, y in zip(of, references, strict=True)], axis=0).tolist()
+            method: np.mean([scores(*picture, y) for picture, y in zip(of, references, strict=True)], axis=0).tolist()
             for method, of in drawn.items()
         }
 
@@ -130,10 +131,11 @@ def first_points(cloud: PointCloud, count: int) -> PointCloud:
 
 def draw(
     model: Model, volume: Volume, method: str, cameras: Sequence[Camera], lights: Sequence[Light]
-) -> list[Rendering]:
+) -> list[Picture]:
     """What a method shows of an encoded object, each camera in its light."""
     volume = unshadowed(volume) if method == UNSHADOWED else volume
-    return [jax.tree.map(np.asarray, x) for x in model.render_each(volume, cameras, METHODS[method], lights)]
+    found = model.render_each(volume, cameras, METHODS[method], lights)
+    return [(np.asarray(x.image), np.asarray(x.acc)) for x in found]
 
 
 def unshadowed(volume: Volume) -> Volume:
@@ -162,7 +164,9 @@ def linear(image: np.ndarray) -> np.ndarray:
     return np.asarray(srgb_to_linear(jnp.asarray(image)))
 
 
-def row_of(label: str, values: Sequence[Sequence[float]], decimals: Sequence[int], sign: str = "") -> tuple:
+def row_of(
+    label: str, values: Sequence[Sequence[float]] | np.ndarray, decimals: Sequence[int], sign: str = ""
+) -> tuple:
     """A row of a table: means of columns over objects, with intervals; NaN is left out."""
     cells: list[Cell] = []
     for column, digits in zip(np.asarray(values).T, decimals, strict=True):
@@ -198,9 +202,10 @@ def _margins(found: Found) -> Table:
     rows = []
     for (light, count), objects in found.items():
         own = np.array([of[NETWORK][:2] for of in objects])
-        others = [[of[method][:2] for of in objects] for method in (UNSHADOWED, DISCS)]
-        others.append([of[NETWORK][:2] for of in found.get((ROOM, count), [])] or np.full_like(own, np.nan))
-        rows.append(row_of(f"{light}, {count:,}", np.hstack([own - np.array(x) for x in others]), (2,) * 6, "+"))
+        others = [np.array([of[method][:2] for of in objects]) for method in (UNSHADOWED, DISCS)]
+        room = found.get((ROOM, count))
+        others.append(np.array([of[NETWORK][:2] for of in room]) if room else np.full_like(own, np.nan))
+        rows.append(row_of(f"{light}, {count:,}", np.hstack([own - x for x in others]), (2,) * 6, "+"))
     heads = tuple(
         f"{what}, {than}"
         for than in ("above split-sum", "above discs", "above the room")

@@ -28,6 +28,7 @@ from experiments.studies.relighting import (
     METHODS,
     NETWORK,
     UNSHADOWED,
+    Picture,
     draw,
     first_points,
     linear,
@@ -49,8 +50,6 @@ POISSON, NO_SHADOWS, OCCLUSION = "Poisson, trimmed .3", "true mesh, no shadows",
 DARK = 1e-3  # linear light below which the logarithm is not taken
 CLIPPED = 0.995  # sRGB from which on a pixel says "at least"
 SHOWN = 192  # pixels of a picture on a sheet
-
-Picture = tuple[np.ndarray, np.ndarray]  # on white (height, width, 3), opacity (height, width)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -161,7 +160,7 @@ def _by_mitsuba(
     options: BesideStudy, dataset: data_sets.Dataset, item: data_sets.ObjectData, made: Made
 ) -> dict[str, list[np.ndarray]]:
     """Straight-alpha pictures of the first views, of surfaces and oracles."""
-    poses = np.asarray(item.camera.cam_to_world)[: options.views]
+    poses = list(np.asarray(item.camera.cam_to_world)[: options.views])
     maps = relit.maps_of(dataset, item, options.maps)[: options.views]
     view = relit.view_config(dataset, options.spp)
     surfaces = {f"{POISSON}, {n:,}": relit.pictures(x, poses, maps, view) for n, x in made.surfaces.items()}
@@ -178,7 +177,7 @@ def _ours(
     cameras = [view_of(item, view, size)[0] for view in range(options.views)]
     lights = (item.own_lights or [])[: options.views]
     return {
-        f"{method}, {count:,}": [(x.image, x.acc) for x in draw(model, volume, method, cameras, lights)]
+        f"{method}, {count:,}": draw(model, volume, method, cameras, lights)
         for count, volume in made.volumes.items()
         for method in METHODS
     }
