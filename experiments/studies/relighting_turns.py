@@ -71,7 +71,7 @@ class TurnsStudy:
     """Object of gallery and film (default: the first)."""
     view: int = 0
     """View of every object."""
-    size: int = 256
+    size: int = 192
     """Pixels along each side in gallery and film."""
     frames: int = 24
     """Frames of the film."""
@@ -93,7 +93,7 @@ def main(options: TurnsStudy) -> None:
     """Draws, scores and writes."""
     relit.prepare()
     dataset, model = data_sets.open_dataset(options.data), load(options.run)
-    asked = {name: getattr(options, name) for name in ("run", "count", "steps", "resolution", "view", "size", "spp")}
+    asked = {name: getattr(options, name) for name in ("run", "count", "steps", "resolution", "view", "spp")}
     results_folder.claim(options.out, "turned lights", asked, dataset)
     maps = {Path(name).stem: read_map(name) for name in options.lights}
     names = evaluation.spread(dataset.splits["test"], options.objects)
