@@ -31,6 +31,7 @@ from spnr_jax.method.model import Model
 from spnr_jax.tools.light_options import Lighting
 from spnr_jax.training.weights import load
 from spnr_jax.viewer import lights, session
+from spnr_jax.viewer.picture import Layer
 from spnr_jax.viewer.scene import open_scene
 from spnr_jax.viewer.viewpoint import from_browser
 
@@ -89,8 +90,9 @@ def pictures(model: Model, cloud: PointCloud, size: int, rounds: int) -> dict[st
 def viewer_changes(model: Model, cloud: PointCloud, rounds: int) -> dict[str, float]:
     """Seconds from a step of the slider to the canvas, moving and at rest, by the panes that are shown."""
     view = from_browser((0, 1, 0, 0), (0, 0, 3.0), 0.7, 1024, 512)
-    found = {}
-    for panes in (("picture",), ("points", "picture")):
+    found: dict[str, float] = {}
+    shown: tuple[tuple[Layer, ...], ...] = (("picture",), ("points", "picture"))
+    for panes in shown:
         state = session.State(scene=open_scene(model, cloud, "cloud"), view=view, panes=panes, size=256)
         state, _ = session.draw(model, state, moving=True)  # encodes
 
