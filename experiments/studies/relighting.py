@@ -5,8 +5,9 @@
 Each data set holds the same objects under one kind of light (`spnr-data generate --lights FOLDER_OF_ONE_MAP`, or
 `--lights room`), turned for every view and kept beside it.  Beside the network: the same discs and light alone, with
 and without the visibility of the points (split-sum shading, Karis 2013).  Nothing is rescaled to the reference.
+What Mitsuba makes of the same points stands in `relighting_beside.py`, turned lights in `relighting_turns.py`.
 
-    OUT/results.json  OUT/table.md .csv .tex     dB, dB inside, FLIP, log error of linear light, of each light
+    OUT/results.json  OUT/table.md .csv .tex     dB, dB inside, FLIP, log error of linear light, of each light; margins
     OUT/gallery.png                              references over pictures, an object a row, a light a column
 """
 
@@ -28,6 +29,7 @@ from spnr_jax.devices import machine
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets, images
 from spnr_jax.kernels.colors import srgb_to_linear
+from spnr_jax.kernels.records import Camera, Light, PointCloud
 from spnr_jax.method.model import Model, Quality, Volume
 from spnr_jax.scoring import intervals
 from spnr_jax.scoring.flip import flip
@@ -38,8 +40,13 @@ HEADS = ("PSNR, dB", "inside, dB", "FLIP", "log error")
 DECIMALS = (2, 2, 3, 3)
 DARK = 1e-3  # linear light below which the logarithm is not taken
 GALLERY = 8  # objects in the gallery
-UNSHADOWED = "discs and light, nothing hides anything"
-METHODS: dict[str, Quality] = {"network": "best", "discs and light": "draft", UNSHADOWED: "draft"}
+NETWORK, DISCS, UNSHADOWED = "network", "discs and light", "discs and light, nothing hides anything"
+METHODS: dict[str, Quality] = {NETWORK: "best", DISCS: "draft", UNSHADOWED: "draft"}
+ROOM = "room"
+Picture = tuple[np.ndarray, np.ndarray]  # on white (height, width, 3), opacity (height, width)
+Found = dict[tuple[str, int], list[dict[str, list[float]]]]  # light, points -> objects: method -> scores
+
+_flip = jax.jit(flip)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,7 +72,8 @@ class RelightingStudy:
 def main(options: RelightingStudy) -> None:
     """Draws, scores and writes."""
     model = load(options.run)
-    rows, pictures = {}, {}
+    found: Found = {}
+    shown: list[list[np.ndarray]] = []
     for folder in options.data:
         dataset = data_sets.open_dataset(folder)
         names = dataset.splits["test"][: options.objects]
@@ -73,22 +81,12 @@ def main(options: RelightingStudy) -> None:
         asked = {"run": options.run, "views": options.views, "objects": list(names), "resolution": options.resolution}
         results_folder.claim(options.out / "scores" / light, "relighting", asked, dataset)
         for count in options.counts:
-            for method in METHODS:
-                label = f"{light}, {count:,}, {method}"
-                rows[label] = [
-                    _kept(options, dataset, name, light, method, count, model) for name in tqdm(names, desc=label)
-                ]
-        pictures[light] = [_shown(options, dataset, name, max(options.counts), model) for name in names[:GALLERY]]
-    table = Table(
-        title="Relighting",
-        heads=HEADS,
-        rows=tuple((label, _cells(found)) for label, found in rows.items()),
-        note="Means over objects with 95 % intervals; pictures are never rescaled.",
-    )
-    results_folder.write(options.out, {"objects": rows, "hardware": machine.hardware()}, [table])
-    grid = [[cell for of in pictures.values() for cell in of[i]] for i in range(len(next(iter(pictures.values()))))]
-    heads = [text for light in pictures for text in (f"{light}: reference", "ours")]
-    images.write_whole(options.out / "gallery.png", images.png(figures.grid(grid, heads, size=256)))
+            found[light, count] = [
+                _kept(options, dataset, name, light, count, model)
+                for name in tqdm(names, desc=f"{light}, {count:,} points")
+            ]
+        shown += [[picture for name in names[:GALLERY] for picture in _shown(options, dataset, name, light)]]
+    _write(options.out, found, shown)
 
 
 def name_of(dataset: data_sets.Dataset) -> str:
@@ -99,35 +97,45 @@ def name_of(dataset: data_sets.Dataset) -> str:
     return " and ".join(Path(name).stem for kind in kinds for name in kind.get("sha256", {kind["name"]: None}))
 
 
-def _kept(
-    options: RelightingStudy,
-    dataset: data_sets.Dataset,
-    name: str,
-    light: str,
-    method: str,
-    count: int,
-    model: Model,
-) -> list[float]:
-    """Mean scores of an object's views."""
-    place = options.out / "scores" / light / method.replace(" ", "_") / f"{name}_{count}.json"
+def _place(options: RelightingStudy, light: str, name: str, count: int) -> Path:
+    return options.out / "scores" / light / f"{name}_{count}.json"
 
-    def make() -> list[float]:
-        drawn = _draw(options, data_sets.read_object(dataset, name), method, count, model)
-        return np.mean([scores(*picture) for picture in drawn], axis=0).tolist()
+
+def _kept(
+    options: RelightingStudy, dataset: data_sets.Dataset, name: str, light: str, count: int, model: Model
+) -> dict[str, list[float]]:
+    """Mean scores of an object's views, by method; the network's first picture is kept beside them."""
+    place = _place(options, light, name, count)
+
+    def make() -> dict[str, list[float]]:
+        item = data_sets.read_object(dataset, name)
+        lights = (item.own_lights or [])[: options.views]
+        cameras, references = zip(
+            *(view_of(item, view, options.resolution) for view in range(len(lights))), strict=True
+        )
+        volume = model.encode(first_points(item.cloud, count))
+        drawn = {method: draw(model, volume, method, cameras, lights) for method in METHODS}
+        images.write_whole(place.with_suffix(".png"), images.png(drawn[NETWORK][0][0]))
+        return {
+            method: np.mean([scores(*picture, y) for picture, y in zip(of, references, strict=True)], axis=0).tolist()
+            for method, of in drawn.items()
+        }
 
     return results_folder.kept(place, make)
 
 
-def _draw(
-    options: RelightingStudy, item: data_sets.ObjectData, method: str, count: int, model: Model
-) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Image, opacity and reference of each view."""
-    volume = model.encode(told(jax.tree.map(lambda x: x[:count], item.cloud), normals=False))
+def first_points(cloud: PointCloud, count: int) -> PointCloud:
+    """The first points of a cloud, without normals."""
+    return told(jax.tree.map(lambda x: x[:count], cloud), normals=False)
+
+
+def draw(
+    model: Model, volume: Volume, method: str, cameras: Sequence[Camera], lights: Sequence[Light]
+) -> list[Picture]:
+    """What a method shows of an encoded object, each camera in its light."""
     volume = unshadowed(volume) if method == UNSHADOWED else volume
-    lights = (item.own_lights or [])[: options.views]
-    pairs = [view_of(item, view, options.resolution) for view in range(len(lights))]
-    found = model.render_each(volume, [camera for camera, _ in pairs], METHODS[method], lights)
-    return [(np.asarray(r.image), np.asarray(r.acc), reference) for r, (_, reference) in zip(found, pairs, strict=True)]
+    found = model.render_each(volume, cameras, METHODS[method], lights)
+    return [(np.asarray(x.image), np.asarray(x.acc)) for x in found]
 
 
 def unshadowed(volume: Volume) -> Volume:
@@ -139,31 +147,80 @@ def unshadowed(volume: Volume) -> Volume:
 
 def scores(image: np.ndarray, opacity: np.ndarray, reference: np.ndarray) -> list[float]:
     """PSNR, PSNR inside, FLIP on white, and the root mean square of the ratio of linear light inside, in nepers."""
-    found, alpha = sharpness(image, opacity, reference), reference[..., 3:]
-    white = reference[..., :3] * alpha + 1 - alpha
-    inside = alpha[..., 0] > 0.999
-    ours, theirs = (np.log(np.maximum(np.asarray(srgb_to_linear(jnp.asarray(x))), DARK)) for x in (image, white))
+    found, white = sharpness(image, opacity, reference), on_white(reference)
+    inside = reference[..., 3] > 0.999
+    ours, theirs = (np.log(np.maximum(linear(x), DARK)) for x in (image, white))
     error = float(np.sqrt(np.mean((ours - theirs)[inside] ** 2))) if inside.any() else 0.0
-    return [found.psnr, found.psnr_inside, float(flip(jnp.asarray(image), jnp.asarray(white))), error]
+    return [found.psnr, found.psnr_inside, float(_flip(jnp.asarray(image), jnp.asarray(white))), error]
 
 
-def _cells(found: Sequence[Sequence[float]]) -> tuple[Cell, ...]:
-    columns = np.asarray(found).T
-    means = [intervals.interval([np.array([x]) for x in values]) if len(values) > 1 else None for values in columns]
-    return tuple(
-        number(float(np.mean(values)), decimals, interval)
-        for values, decimals, interval in zip(columns, DECIMALS, means, strict=True)
+def on_white(rgba: np.ndarray) -> np.ndarray:
+    """The picture (height, width, 3) of straight alpha (height, width, 4), on white."""
+    return rgba[..., :3] * rgba[..., 3:] + 1 - rgba[..., 3:]
+
+
+def linear(image: np.ndarray) -> np.ndarray:
+    """Linear light of an sRGB picture."""
+    return np.asarray(srgb_to_linear(jnp.asarray(image)))
+
+
+def row_of(
+    label: str, values: Sequence[Sequence[float]] | np.ndarray, decimals: Sequence[int], sign: str = ""
+) -> tuple:
+    """A row of a table: means of columns over objects, with intervals; NaN is left out."""
+    cells: list[Cell] = []
+    for column, digits in zip(np.asarray(values).T, decimals, strict=True):
+        known = column[~np.isnan(column)]
+        interval = intervals.interval([np.array([x]) for x in known]) if len(known) > 1 else None
+        cells.append(number(float(known.mean()) if len(known) else None, digits, interval, sign=sign))
+    return label, tuple(cells)
+
+
+def _write(out: Path, found: Found, shown: Sequence[Sequence]) -> None:
+    """Tables, results.json and the gallery."""
+    rows = {
+        f"{light}, {count:,}, {method}": [of[method] for of in objects]
+        for (light, count), objects in found.items()
+        for method in METHODS
+    }
+    note = "Means over objects with 95 % intervals; pictures are never rescaled."
+    table = Table(
+        title="Relighting",
+        heads=HEADS,
+        rows=tuple(row_of(label, values, DECIMALS) for label, values in rows.items()),
+        note=note,
     )
+    results = {"objects": rows, "hardware": machine.hardware()}
+    results_folder.write(out, results, [table, _margins(found)])
+    columns = [text for light in dict.fromkeys(light for light, _ in found) for text in (f"{light}: reference", "ours")]
+    grid = [[picture for of in shown for picture in of[2 * i : 2 * i + 2]] for i in range(min(map(len, shown)) // 2)]
+    images.write_whole(out / "gallery.png", images.png(figures.grid(grid, columns, size=256)))
+
+
+def _margins(found: Found) -> Table:
+    """The network beside split-sum shading, discs and light, and itself in the room; objects are paired."""
+    rows = []
+    for (light, count), objects in found.items():
+        own = np.array([of[NETWORK][:2] for of in objects])
+        others = [np.array([of[method][:2] for of in objects]) for method in (UNSHADOWED, DISCS)]
+        room = found.get((ROOM, count))
+        others.append(np.array([of[NETWORK][:2] for of in room]) if room else np.full_like(own, np.nan))
+        rows.append(row_of(f"{light}, {count:,}", np.hstack([own - x for x in others]), (2,) * 6, "+"))
+    heads = tuple(
+        f"{what}, {than}"
+        for than in ("above split-sum", "above discs", "above the room")
+        for what in ("PSNR", "inside")
+    )
+    return Table(title="The network's margins, dB", heads=heads, rows=tuple(rows), note="Of the same objects.")
 
 
 def _shown(
-    options: RelightingStudy, dataset: data_sets.Dataset, name: str, count: int, model: Model
+    options: RelightingStudy, dataset: data_sets.Dataset, name: str, light: str
 ) -> tuple[np.ndarray, np.ndarray]:
     """Reference and picture of an object's first view."""
-    item = data_sets.read_object(dataset, name)
-    (image, _, reference), *_ = _draw(dataclasses.replace(options, views=1), item, "network", count, model)
-    alpha = reference[..., 3:]
-    return reference[..., :3] * alpha + 1 - alpha, image
+    _, reference = view_of(data_sets.read_object(dataset, name), 0, options.resolution)
+    place = _place(options, light, name, max(options.counts)).with_suffix(".png")
+    return on_white(reference), results_folder.kept(place, lambda: None)
 
 
 if __name__ == "__main__":

@@ -90,21 +90,15 @@ def test_what_is_not_shadowed_turns_with_object_camera_and_light(model, body):
     assert unlike < 0.01
 
 
-@pytest.mark.parametrize("albedo", [0.2, 0.8])
-def test_a_matt_convex_body_in_uniform_light_shows_its_albedo(model, albedo):
-    ball = cloud(shape("sphere", 3000)[0], base_color=np.full((3000, 3), albedo), roughness=np.ones(3000))
-    image, solid = linear(model, model.encode(ball), spnr_jax.ambient())
-    assert np.mean(image[solid]) == pytest.approx(albedo, abs=0.05)  # what is not metal mirrors some of it, too
-
-
+@pytest.mark.parametrize("quality", ["best", "draft"])
 @pytest.mark.parametrize("color", [(1.0, 1.0, 1.0), (0.8, 0.5, 0.2)])
-def test_without_the_network_uniform_light_shows_the_albedo_of_a_matt_convex_body(model, color):
+def test_uniform_light_shows_the_albedo_of_a_matt_convex_body_within_three_per_cent(model, color, quality):
     """What it mirrors is that of a black body, and is taken away."""
 
     def shown(albedo):
         columns = {"base_color": np.tile(albedo, (3000, 1)), "roughness": np.ones(3000)}
         volume = model.encode(cloud(shape("sphere", 3000)[0], **columns))
-        return linear(model, volume, 0.9 * spnr_jax.ambient(), quality="draft")
+        return linear(model, volume, 0.9 * spnr_jax.ambient(), quality=quality)
 
     (body, solid), (black, _) = shown(color), shown((0.0, 0.0, 0.0))
     np.testing.assert_allclose((body - black)[solid].mean(axis=0), 0.9 * np.array(color), rtol=0.03)
