@@ -21,6 +21,7 @@ from tqdm import tqdm
 
 from experiments import entry_point
 from experiments.comparison import figures, relit, results_folder, source_meshes
+from experiments.comparison.object_views import smaller, view_of
 from experiments.comparison.result_tables import Table
 from experiments.studies.relighting import (
     DECIMALS,
@@ -37,7 +38,6 @@ from experiments.studies.relighting import (
     row_of,
     scores,
 )
-from experiments.studies.sharpness import smaller, view_of
 from spnr_jax.devices import machine
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets, images

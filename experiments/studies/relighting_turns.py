@@ -22,9 +22,9 @@ from tqdm import tqdm
 from data_gen.render import light
 from experiments import entry_point
 from experiments.comparison import figures, relit, results_folder, source_meshes
+from experiments.comparison.object_views import view_of
 from experiments.comparison.result_tables import Table
 from experiments.studies.relighting import METHODS, NETWORK, Picture, draw, first_points, linear, on_white, row_of
-from experiments.studies.sharpness import view_of
 from spnr_jax.devices import machine
 from spnr_jax.formats import data_sets, images
 from spnr_jax.formats.light_files import read_envmap

@@ -178,8 +178,7 @@ def _read(
         positions, origin, values = _sampled_mesh(path, count, seed, transparent_parts, report)
         if cut.crop:
             inside = scenes.in_box(positions, cut.crop)
-            box = positions.min(axis=0), positions.max(axis=0)
-            report(scenes.cropped(int(inside.sum()), count, cut.crop, *box))
+            report(scenes.cropped(int(inside.sum()), count, cut.crop, positions.min(axis=0), positions.max(axis=0)))
             positions, values = positions[inside], {name: column[inside] for name, column in values.items()}
     else:
         columns = _bounded_columns(path, num_points, clean, cut, report)
