@@ -9,6 +9,7 @@ splats     nothing: the browser draws them there
 
 import time
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
@@ -71,7 +72,7 @@ def draw(
     drawn = []
     for layer in panes:
         if layer == "points":
-            picture = draw_points(scene, viewpoint.pane_camera(view, scene.volume, width, height))
+            picture = _points_of(scene, view, width, height)
         elif rendering is None or layer == "splats":
             picture = np.full((height, width, 3), 255, np.uint8)
         else:
@@ -89,6 +90,11 @@ def _square(rendering: Rendering, layer: Layer) -> np.ndarray:
     if layer == "depth":
         return images.depth_image(rendering.depth, rendering.acc)
     return np.repeat(images.to_uint8(rendering.acc)[..., None], 3, axis=-1)
+
+
+@lru_cache(maxsize=4)  # the light moves and the points stand: most of a step of the light would go here
+def _points_of(scene: Scene, view: View, width: int, height: int) -> np.ndarray:
+    return draw_points(scene, viewpoint.pane_camera(view, scene.volume, width, height))
 
 
 def draw_points(scene: Scene, camera: Camera) -> np.ndarray:

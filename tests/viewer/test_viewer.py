@@ -115,6 +115,18 @@ def test_points_need_no_network_and_say_so_by_no_time():
     assert (pane(outline, 1)[:30] == 255).all()
 
 
+def test_points_are_drawn_once_for_a_scene_and_view_and_anew_for_an_edited_scene(monkeypatch):
+    asked, draw_points = [], picture.draw_points
+    monkeypatch.setattr(picture, "draw_points", lambda *scene: asked.append(scene) or draw_points(*scene))
+    known = state()
+    first, again = (picture.draw(model(), known.scene, known.view, ("points",), None, 8, 60).image for _ in range(2))
+    assert len(asked) == 1
+    np.testing.assert_array_equal(first, again)
+    blue = scenes.edited(known.scene, "base_color", (0.0, 0.0, 1.0))
+    assert bluish(picture.draw(model(), blue, known.view, ("points",), None, 8, 60).image).any()
+    assert len(asked) == 2
+
+
 def test_nearer_points_hide_farther_ones():
     two = dataclasses.replace(
         tiny_viewer.cloud(),
