@@ -1,6 +1,6 @@
 """What another light costs: a picture of an encoded object, a map that is prepared, a change in the viewer.
 
-    python -m experiments.speed.lights CLOUD [--map sky.hdr] [--out runs/lights] [--points 16384] [--size 512]
+    python -m experiments.speed.light_times CLOUD [--map sky.hdr] [--out runs/lights] [--points 16384] [--size 512]
 
 Pictures in the room and in a light that is another each time are drawn in turns.  The viewer's own functions draw what
 a browser of 1024 x 512 pixels shows after a step of the slider that turns the light: `draft` while it moves, then
@@ -119,4 +119,4 @@ def timed(work: list[Callable[[int], object]], rounds: int) -> list[float]:
 
 
 if __name__ == "__main__":
-    entry_point.run(main, LightTimes, "speed.lights")
+    entry_point.run(main, LightTimes, "speed.light_times")
