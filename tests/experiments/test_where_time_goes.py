@@ -31,8 +31,8 @@ def test_the_command_for_a_gpu_ends_with_one_table(tmp_path, monkeypatch):
     gpu.main(gpu.OnGPU(out=tmp_path, quick=True))
     assert asked[0].bf16
     rows = json.loads((tmp_path / "results.json").read_text())["rows"]
-    assert [row["unit"] for row in rows] == ["frames", "frames", "steps", "steps of a run", "objects"]
+    assert [row["unit"] for row in rows] == ["frames", "frames", "steps", *["steps of a run"] * 2, "objects"]
     assert (rows[-1]["a_second"], rows[-1]["beside"]) == (500.0, 250.0)
-    assert rows[3]["beside"] > 0
-    assert all(row["megabytes"] > 0 for row in rows[2:4])
+    assert all(row["beside"] > 0 for row in rows[3:5])
+    assert all(row["megabytes"] > 0 for row in rows[2:5])
     assert (tmp_path / "table.md").read_text().count("What a GPU is for") == 1
