@@ -16,7 +16,7 @@ Picture = tuple[np.ndarray, np.ndarray]  # image (height, width, 3) on white and
 
 def cut(item: data_sets.ObjectData, count: int, views: int, normals: bool) -> data_sets.ObjectData:
     """An object with its first points and views alone, with its normals or without."""
-    cloud = told(jax.tree.map(lambda x: x[:count], item.cloud), normals)
+    cloud = told(data_sets.first_points(item, count), normals)
     camera = jax.tree.map(lambda x: x[:views], item.camera)
     return dataclasses.replace(item, cloud=cloud, camera=camera, images=item.images[:views])
 

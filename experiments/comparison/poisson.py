@@ -26,6 +26,7 @@ from spnr_jax.formats import data_sets
 from spnr_jax.formats.images import write_whole
 from spnr_jax.formats.light_files import read_envmap
 from spnr_jax.formats.mesh.assets import Asset
+from spnr_jax.kernels.records import PointCloud
 from spnr_jax.scoring.evaluation import Pictures
 from spnr_jax.surfels.room import indoor_envmap
 
@@ -63,6 +64,14 @@ class Renderer:
         poses[:, :3] = item.camera.cam_to_world
         radiance = [views.render_view(scene, p, self._view, self._seed + view) for view, p in enumerate(poses)]
         return np.stack([views.straight_srgb(r) for r in radiance])
+
+
+def trimmed_surface(cloud: PointCloud) -> Asset:
+    """The trimmed Poisson surface of a cloud; without parts where its points span none."""
+    try:
+        return poisson_surface.reconstruct(cloud, SURFACES["poisson_trimmed"])
+    except poisson_surface.NoSurface:
+        return Asset(parts=())
 
 
 def view_config(settings: dict) -> views.ViewConfig:

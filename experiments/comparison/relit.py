@@ -14,14 +14,13 @@ from typing import Literal
 
 import numpy as np
 
-from data_gen.render import light, poisson_surface, unshadowed, views
+from data_gen.render import light, unshadowed, views
 from data_gen.render.variant import choose_variant, mitsuba_module
 from experiments.comparison import poisson, source_meshes
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.light_files import read_envmap
 from spnr_jax.formats.mesh.assets import Asset
-from spnr_jax.kernels.records import PointCloud
 from spnr_jax.surfels import envmaps
 
 How = Literal["path", "unshadowed", "occlusion"]
@@ -71,14 +70,6 @@ def _map(path: Path) -> np.ndarray:
 def turned(envmap: np.ndarray, degrees: float | int) -> np.ndarray:
     """The map turned about the up axis as `Light.turned` turns a light, to the nearest texel."""
     return np.roll(envmap, -round(degrees / 360 * envmap.shape[1]), axis=1)
-
-
-def surface(cloud: PointCloud) -> Asset:
-    """The trimmed Poisson surface of a cloud; without parts where its points span none."""
-    try:
-        return poisson_surface.reconstruct(cloud, poisson.SURFACES["poisson_trimmed"])
-    except poisson_surface.NoSurface:
-        return Asset(parts=())
 
 
 def pictures(

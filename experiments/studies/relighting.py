@@ -23,13 +23,13 @@ from tqdm import tqdm
 
 from experiments import entry_point
 from experiments.comparison import figures, results_folder
-from experiments.comparison.object_views import told, view_of
+from experiments.comparison.object_views import Picture, on_white, told, view_of
 from experiments.comparison.result_tables import Cell, Table, number
 from spnr_jax.devices import machine
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets, images
 from spnr_jax.kernels.colors import srgb_to_linear
-from spnr_jax.kernels.records import Camera, Light, PointCloud
+from spnr_jax.kernels.records import Camera, Light
 from spnr_jax.method.model import Model, Quality, Volume
 from spnr_jax.scoring import intervals
 from spnr_jax.scoring.flip import flip
@@ -43,7 +43,6 @@ GALLERY = 8  # objects in the gallery
 NETWORK, DISCS, UNSHADOWED = "network", "discs and light", "discs and light, nothing hides anything"
 METHODS: dict[str, Quality] = {NETWORK: "best", DISCS: "draft", UNSHADOWED: "draft"}
 ROOM = "room"
-Picture = tuple[np.ndarray, np.ndarray]  # on white (height, width, 3), opacity (height, width)
 Found = dict[tuple[str, int], list[dict[str, list[float]]]]  # light, points -> objects: method -> scores
 
 _flip = jax.jit(flip)
@@ -113,7 +112,7 @@ def _kept(
         cameras, references = zip(
             *(view_of(item, view, options.resolution) for view in range(len(lights))), strict=True
         )
-        volume = model.encode(first_points(item.cloud, count))
+        volume = model.encode(told(data_sets.first_points(item, count), normals=False))
         drawn = {method: draw(model, volume, method, cameras, lights) for method in METHODS}
         images.write_whole(place.with_suffix(".png"), images.png(drawn[NETWORK][0][0]))
         return {
@@ -122,11 +121,6 @@ def _kept(
         }
 
     return results_folder.kept(place, make)
-
-
-def first_points(cloud: PointCloud, count: int) -> PointCloud:
-    """The first points of a cloud, without normals."""
-    return told(jax.tree.map(lambda x: x[:count], cloud), normals=False)
 
 
 def draw(
@@ -147,16 +141,11 @@ def unshadowed(volume: Volume) -> Volume:
 
 def scores(image: np.ndarray, opacity: np.ndarray, reference: np.ndarray) -> list[float]:
     """PSNR, PSNR inside, FLIP on white, and the root mean square of the ratio of linear light inside, in nepers."""
-    found, white = sharpness(image, opacity, reference), on_white(reference)
+    found, white = sharpness(image, opacity, reference), on_white(reference)[0]
     inside = reference[..., 3] > 0.999
     ours, theirs = (np.log(np.maximum(linear(x), DARK)) for x in (image, white))
     error = float(np.sqrt(np.mean((ours - theirs)[inside] ** 2))) if inside.any() else 0.0
     return [found.psnr, found.psnr_inside, float(_flip(jnp.asarray(image), jnp.asarray(white))), error]
-
-
-def on_white(rgba: np.ndarray) -> np.ndarray:
-    """The picture (height, width, 3) of straight alpha (height, width, 4), on white."""
-    return rgba[..., :3] * rgba[..., 3:] + 1 - rgba[..., 3:]
 
 
 def linear(image: np.ndarray) -> np.ndarray:
@@ -220,7 +209,7 @@ def _shown(
     """Reference and picture of an object's first view."""
     _, reference = view_of(data_sets.read_object(dataset, name), 0, options.resolution)
     place = _place(options, light, name, max(options.counts)).with_suffix(".png")
-    return on_white(reference), results_folder.kept(place, lambda: None)
+    return on_white(reference)[0], results_folder.kept(place, lambda: None)
 
 
 if __name__ == "__main__":

@@ -20,8 +20,8 @@ import numpy as np
 from tqdm import tqdm
 
 from experiments import entry_point
-from experiments.comparison import figures, relit, results_folder, source_meshes
-from experiments.comparison.object_views import smaller, view_of
+from experiments.comparison import figures, poisson, relit, results_folder, source_meshes
+from experiments.comparison.object_views import Picture, on_white, smaller, told, view_of
 from experiments.comparison.result_tables import Table
 from experiments.studies.relighting import (
     DECIMALS,
@@ -29,12 +29,9 @@ from experiments.studies.relighting import (
     METHODS,
     NETWORK,
     UNSHADOWED,
-    Picture,
     draw,
-    first_points,
     linear,
     name_of,
-    on_white,
     row_of,
     scores,
 )
@@ -115,11 +112,11 @@ def main(options: BesideStudy) -> None:
 
 def _made(options: BesideStudy, dataset: data_sets.Dataset, name: str, model: Model) -> Made:
     item = data_sets.read_object(dataset, name)
-    clouds = {count: first_points(item.cloud, count) for count in options.counts}
+    clouds = {count: told(data_sets.first_points(item, count), normals=False) for count in options.counts}
     return Made(
         positions=np.asarray(item.cloud.positions),
         mesh=source_meshes.mesh_of(dataset, item, options.meshes),
-        surfaces={count: relit.surface(cloud) for count, cloud in clouds.items()},
+        surfaces={count: poisson.trimmed_surface(cloud) for count, cloud in clouds.items()},
         volumes={count: model.encode(cloud) for count, cloud in clouds.items()},
     )
 
@@ -146,7 +143,7 @@ def _kept(
             side = item.camera.height // size
             reduced = {label: [smaller(x, side) if side > 1 else x for x in of] for label, of in mitsuba.items()}
             bare = reduced[NO_SHADOWS]
-            drawn = {label: [(on_white(x), x[..., 3]) for x in of] for label, of in reduced.items()}
+            drawn = {label: [on_white(x) for x in of] for label, of in reduced.items()}
             drawn = _ours(options, item, made(), model, size) | drawn
             for label, of in drawn.items():
                 rows.setdefault(label, {})[str(size)] = _mean_scores(of, references, bare)
@@ -210,7 +207,7 @@ def shadow_score(image: np.ndarray, reference: np.ndarray, bare: np.ndarray) -> 
 
 
 def _sheet(light: str, reference: np.ndarray, drawn: Mapping[str, Sequence[Picture]]) -> np.ndarray:
-    cells = [on_white(reference), *(of[0][0] for of in drawn.values())]
+    cells = [on_white(reference)[0], *(of[0][0] for of in drawn.values())]
     return figures.grid([cells], ["reference", *drawn], [light], size=SHOWN)
 
 

@@ -22,9 +22,9 @@ from tqdm import tqdm
 from data_gen.render import light
 from experiments import entry_point
 from experiments.comparison import figures, relit, results_folder, source_meshes
-from experiments.comparison.object_views import view_of
+from experiments.comparison.object_views import Picture, on_white, told, view_of
 from experiments.comparison.result_tables import Table
-from experiments.studies.relighting import METHODS, NETWORK, Picture, draw, first_points, linear, on_white, row_of
+from experiments.studies.relighting import METHODS, NETWORK, draw, linear, row_of
 from spnr_jax.devices import machine
 from spnr_jax.formats import data_sets, images
 from spnr_jax.formats.light_files import read_envmap
@@ -138,7 +138,7 @@ def _subject(options: TurnsStudy, dataset: data_sets.Dataset, name: str, model: 
         name=name,
         camera=view_of(item, options.view, None)[0],
         mesh=source_meshes.mesh_of(dataset, item, options.meshes),
-        volume=model.encode(first_points(item.cloud, options.count)),
+        volume=model.encode(told(data_sets.first_points(item, options.count), normals=False)),
     )
 
 
@@ -194,7 +194,7 @@ def _pictures(options: TurnsStudy, dataset: data_sets.Dataset, model: Model, map
     def both(shown: Sequence[np.ndarray]) -> list[list[np.ndarray]]:
         references = _references(options, dataset, subject, shown, options.size)
         drawn = _drawn(model, subject, NETWORK, shown, options.size)
-        return [[on_white(x) for x in references], [x for x, _ in drawn]]
+        return [[on_white(x)[0] for x in references], [x for x, _ in drawn]]
 
     sheet = figures.grid(both(list(maps.values())), list(maps), ["reference", "ours"], size=options.size)
     images.write_whole(options.out / "gallery.png", images.png(sheet))

@@ -25,7 +25,7 @@ from tqdm import tqdm
 
 from experiments import entry_point
 from experiments.comparison import figures, poisson, results_folder
-from experiments.comparison.object_views import view_of
+from experiments.comparison.object_views import on_white, view_of
 from experiments.comparison.result_tables import Cell, Table, number
 from spnr_jax.devices import machine
 from spnr_jax.formats import data_sets, images
@@ -174,9 +174,7 @@ def _poisson_scores(
     pictures, _ = renderer.pictures(seen, count, poisson.SURFACES["poisson_trimmed"])
     drawn = dataclasses.replace(seen, images=pictures)
     views = views_of(item, options.views, options.resolution)
-    return mean_scores(
-        [(_on_white(rgba), rgba[..., 3]) for _, rgba in views_of(drawn, options.views, options.resolution)], views
-    )
+    return mean_scores([on_white(rgba) for _, rgba in views_of(drawn, options.views, options.resolution)], views)
 
 
 def _cleaned(positions: np.ndarray, values: dict[str, np.ndarray], count: int) -> tuple[PointCloud, list[str]]:
@@ -200,13 +198,9 @@ def mean_scores(drawn: Sequence[Drawn], views: Sequence[View]) -> list[float]:
     found = []
     for (image, opacity), (_, reference) in zip(drawn, views, strict=True):
         scores = sharpness(image, opacity, reference)
-        distance = float(flip(jnp.asarray(image), jnp.asarray(_on_white(reference))))
+        distance = float(flip(jnp.asarray(image), jnp.asarray(on_white(reference)[0])))
         found.append([scores.psnr, scores.psnr_inside, distance])
     return np.nanmean(found, axis=0).tolist()
-
-
-def _on_white(rgba: np.ndarray) -> np.ndarray:
-    return rgba[..., :3] * rgba[..., 3:] + 1 - rgba[..., 3:]
 
 
 def _cells(found: Sequence[dict], ways: Sequence[str]) -> tuple[Cell, ...]:
@@ -233,7 +227,7 @@ def _gallery(options: ScansStudy, dataset: data_sets.Dataset, names: Sequence[st
             return results_folder.kept(options.out / "pictures" / f"{name}_{label}.png".replace(" ", "_"), make)
 
         reference = view_of(item, 0, options.resolution)[1]
-        cells.append([_on_white(reference), *map(picture, kinds)])
+        cells.append([on_white(reference)[0], *map(picture, kinds)])
     sheet = figures.grid(cells, ["reference", *kinds], names, size=cells[0][0].shape[0])
     images.write_whole(options.out / "gallery.png", images.png(sheet))
 

@@ -10,10 +10,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from data_gen.render import poisson_surface
 from data_gen.store import layout
 from experiments.comparison.object_views import Picture, at, on_white, view_of
-from experiments.comparison.poisson import SURFACES, Renderer
+from experiments.comparison.poisson import Renderer, trimmed_surface
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
 from spnr_jax.method.model import Model, Quality
@@ -65,12 +64,9 @@ class Poisson:
     def draw(self, item: data_sets.ObjectData, resolution: int | None) -> Drawn:
         """The pictures; empty ones where the points span no surface."""
         begin = perf_counter()
-        try:
-            asset = poisson_surface.reconstruct(item.cloud, SURFACES["poisson_trimmed"])
-        except poisson_surface.NoSurface:
-            asset = None
+        asset = trimmed_surface(item.cloud)
         middle = perf_counter()
-        rgba = np.zeros_like(item.images) if asset is None else self.renderer.drawn(asset, item)
+        rgba = self.renderer.drawn(asset, item) if asset.parts else np.zeros_like(item.images)
         seconds = (perf_counter() - middle) / len(rgba)
         return Drawn([on_white(at(picture, resolution)) for picture in rgba], middle - begin, seconds)
 

@@ -179,7 +179,7 @@ def measure(
     model, found = dataclasses.replace(model, config=way.config), Drawn()
     for number_of_object, name in enumerate(names):
         item = data_sets.read_object(dataset, name)
-        cloud = told(jax.tree.map(lambda x: x[: way.points], item.cloud), normals=False)
+        cloud = told(data_sets.first_points(item, way.points), normals=False)
         key = name, way.points, getattr(way.config, "precision", "")
         if key not in volumes:  # samples and sizes share it
             model.encode(cloud)

@@ -151,7 +151,7 @@ def _mesh_scores(renderer: poisson.Renderer, options: SplatStudy, model: Model, 
 
 
 def _cloud(options: SplatStudy, item: data_sets.ObjectData) -> PointCloud:
-    return told(jax.tree.map(lambda x: x[: options.num_points], item.cloud), normals=False)
+    return told(data_sets.first_points(item, options.num_points), normals=False)
 
 
 def _compared(
