@@ -14,8 +14,7 @@ from spnr_jax.formats.clouds import PlacedCloud
 from spnr_jax.formats.mesh.assets import Asset
 from spnr_jax.formats.mesh.meshes import load_mesh
 from spnr_jax.gaussians.placing import View
-from spnr_jax.kernels.records import PointCloud
-from spnr_jax.method.model import Volume
+from spnr_jax.kernels.records import PointCloud, Volume
 from spnr_jax.tools import fused_surface, mesh_export
 
 

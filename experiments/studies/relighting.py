@@ -29,8 +29,8 @@ from spnr_jax.devices import machine
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets, images
 from spnr_jax.kernels.colors import srgb_to_linear
-from spnr_jax.kernels.records import Camera, Light
-from spnr_jax.method.model import Model, Quality, Volume
+from spnr_jax.kernels.records import Camera, Light, Volume
+from spnr_jax.method.model import Model, Quality
 from spnr_jax.scoring import intervals
 from spnr_jax.scoring.flip import flip
 from spnr_jax.scoring.picture_scores import sharpness

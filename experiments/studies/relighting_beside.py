@@ -39,7 +39,8 @@ from spnr_jax.devices import machine
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets, images
 from spnr_jax.formats.mesh.assets import Asset
-from spnr_jax.method.model import Model, Volume
+from spnr_jax.kernels.records import Volume
+from spnr_jax.method.model import Model
 from spnr_jax.scoring import evaluation
 from spnr_jax.training.weights import load
 

@@ -30,8 +30,8 @@ from spnr_jax.formats import data_sets, images
 from spnr_jax.formats.light_files import read_envmap
 from spnr_jax.formats.mesh.assets import Asset
 from spnr_jax.kernels import cameras
-from spnr_jax.kernels.records import Camera
-from spnr_jax.method.model import Model, Volume
+from spnr_jax.kernels.records import Camera, Volume
+from spnr_jax.method.model import Model
 from spnr_jax.scoring import evaluation
 from spnr_jax.scoring.picture_scores import sharpness
 from spnr_jax.surfels import envmaps, skies

@@ -42,8 +42,8 @@ from spnr_jax import cli
 from spnr_jax.devices import machine
 from spnr_jax.formats import data_sets
 from spnr_jax.kernels import cameras, metrics
-from spnr_jax.kernels.records import Camera, Rendering
-from spnr_jax.method.model import Model, Quality, Volume
+from spnr_jax.kernels.records import Camera, Rendering, Volume
+from spnr_jax.method.model import Model, Quality
 from spnr_jax.scoring.flip import flip
 from spnr_jax.training.weights import load
 

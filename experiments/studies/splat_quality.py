@@ -41,8 +41,8 @@ from spnr_jax.formats import data_sets, gaussian_files, images
 from spnr_jax.gaussians import drawing
 from spnr_jax.gaussians.placing import View
 from spnr_jax.kernels.metrics import psnr
-from spnr_jax.kernels.records import Gaussians, PointCloud
-from spnr_jax.method.model import Model, Volume
+from spnr_jax.kernels.records import Gaussians, PointCloud, Volume
+from spnr_jax.method.model import Model
 from spnr_jax.scoring.picture_scores import sharpness
 from spnr_jax.tools import splat_making
 from spnr_jax.tools.splat_making import drawn_views, fitting_cameras, in_box

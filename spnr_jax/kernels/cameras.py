@@ -116,3 +116,10 @@ def orbit(
     # seen from straight above or below, the picture's up is where the back of the object is
     up = jnp.where(horizontal > 1e-6, jnp.array([0.0, 1.0, 0.0]), jnp.array([0.0, 0.0, -1.0]) * jnp.sign(elevation))
     return look_at(centre + distance * direction, centre, up)
+
+
+def in_box(camera: Camera, centre: Float[Array, "3"], scale: Float[Array, ""]) -> Camera:
+    """The camera (any axes of views) in the coordinates of the box."""
+    rotation, eye = camera.cam_to_world[..., :3], camera.cam_to_world[..., 3]
+    eye = (eye - jnp.broadcast_to(centre, eye.shape)) * scale
+    return dataclasses.replace(camera, cam_to_world=jnp.concatenate([rotation, eye[..., None]], axis=-1))

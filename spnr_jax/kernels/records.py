@@ -6,7 +6,7 @@ in [0, 1].  Image sizes are static fields because they shape arrays.
 """
 
 import math
-from typing import no_type_check
+from typing import Any, no_type_check
 
 import jax
 import numpy as np
@@ -14,6 +14,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
 AnyArray = jax.Array | np.ndarray
+LARGEST_REACH = 4  # voxels around points that rays look at, at most
 
 
 @no_type_check  # pytree transformations rebuild records with leaves that are no arrays
@@ -121,6 +122,21 @@ class Scene:
     volume: Float[Array, "*batch d d d features"]
     occupied: Bool[Array, "*batch g g g"]
     surface: Surface | None = None
+
+
+@no_type_check
+@struct.dataclass
+class Volume:
+    """An encoded object in the box [-1, 1]^3, which is (position - centre) * scale of the cloud.
+
+    `scene` is what the network encodes a cloud as: for networks of rays a `Scene`.
+    """
+
+    scene: Any
+    centre: Float[AnyArray, "3"]
+    scale: Float[AnyArray, ""]
+    reach: int = struct.field(pytree_node=False, default=LARGEST_REACH)
+    """Voxels around points that rays look at, from how far the points lie apart."""
 
 
 @no_type_check

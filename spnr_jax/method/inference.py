@@ -3,23 +3,41 @@
 The config of a network finds its module (`network`): any Linen module with `encode(cloud, train)` and
 `render(scene, camera, options)`.  A network is imported when it is first asked for, and no other with it.  The network
 over surfels, whose sizes are counted before they are compiled, is a module of functions beside these.
+
+    encode, render               batches of objects, in the box: for training and scores
+    encode_volume, draw          one object, for the handle (model.py), which finds the same in surfel_pictures.py
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from typing import Any, cast
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from scipy.spatial import cKDTree
 
-from spnr_jax.devices.placement import by_all_devices
-from spnr_jax.kernels import cameras
-from spnr_jax.kernels.records import Camera, Key, Light, PointCloud, Rendering
+from spnr_jax.devices.placement import by_all_devices, everywhere
+from spnr_jax.errors import UserError
+from spnr_jax.kernels import cameras, cloud_arrays
+from spnr_jax.kernels.records import LARGEST_REACH, Camera, Key, Light, PointCloud, Rendering, Volume
 from spnr_jax.kernels.resizing import averaged
-from spnr_jax.model_config import SOLID, NearPointsConfig, NetworkConfig, PaperConfig, RenderOptions, SurfelConfig
+from spnr_jax.model_config import (
+    SOLID,
+    NearPointsConfig,
+    NetworkConfig,
+    PaperConfig,
+    RayNetworkConfig,
+    RenderOptions,
+    SamplingConfig,
+    SurfelConfig,
+)
 
+SAMPLES = {"draft": 0.25, "balanced": 0.5, "best": 1.0}  # share of the samples a ray was trained with
+REACH_PER_SPACING = 1.6  # what loses nothing from 128 to 4096 points, docs/performance.md
 WHOLE_BLOCK = 1024  # rays that are sampled through all the box at once: about 80 MB at 128 samples
 
 
@@ -125,3 +143,113 @@ def render_views(
     render = partial(jitted_render, config=config, options=options)
     rendering = by_all_devices(render, variables, volume, camera)
     return jax.tree.map(lambda x: x[0], rendering)
+
+
+def placed(variables: dict) -> dict:
+    """The variables where pictures are drawn: whole on every device."""
+    return everywhere(variables)
+
+
+def encode_volume(
+    variables: dict, cloud: PointCloud, centre: np.ndarray, scale: np.floating, *, config: NetworkConfig
+) -> Volume:
+    """Volume of a cloud in the box (unbatched), one compilation per bucket of points."""
+    positions = np.asarray(cloud.positions)
+    reach = LARGEST_REACH
+    if isinstance(config, PaperConfig):
+        reach = reach_of(positions[np.asarray(cloud.mask)], config.encoder.volume_resolution)
+    cloud = dataclasses.replace(cloud, normals=None, materials_known=None)
+    cloud = cloud_arrays.pad(cloud, cloud_arrays.bucket(len(positions)))
+    scene = _encode(variables, cloud, config=config)
+    return Volume(scene=scene, centre=jnp.asarray(centre), scale=jnp.asarray(scale), reach=reach)
+
+
+def draw(
+    variables: dict, volume: Volume, camera: Camera, light: Light | None, *, config: NetworkConfig, quality: str
+) -> Rendering:
+    """A view, or one axis of views; UserError for a light, and for odd sizes of a network that doubles its pictures."""
+    if light is not None:
+        raise UserError("this network knows the light of its training alone; give no light")
+    if config.upsamples and (camera.height % 2 or camera.width % 2):
+        raise UserError(f"this network doubles its pictures: {camera.width} x {camera.height} pixels must be even")
+    options = at_quality(config, quality, volume.reach, camera.width)
+    drawing = partial(_render, config=config, options=options)
+    return by_all_devices(drawing, variables, volume.scene, volume.centre, volume.scale, camera)
+
+
+def draw_each(
+    variables: dict,
+    volume: Volume,
+    views: Sequence[Camera],
+    lights: Sequence[Light | None],
+    *,
+    config: NetworkConfig,
+    quality: str,
+) -> Iterator[Rendering]:
+    """Views one after the other."""
+    for view, light in zip(views, lights, strict=True):
+        yield draw(variables, volume, view, light, config=config, quality=quality)
+
+
+# These are compiled whole: each operation outside of a jit would be compiled alone, 30 ms apiece at the first call.
+
+
+# this option halves the compilation of the U-Net and costs it no time; rendering would take twice as long
+@partial(jax.jit, static_argnames="config", compiler_options={"xla_cpu_use_fusion_emitters": False})
+def _encode(variables: dict, cloud: PointCloud, *, config: NetworkConfig) -> Any:
+    """What the network makes of a cloud in the box (unbatched)."""
+    scene = encode(variables, jax.tree.map(lambda x: x[None], cloud), config=config)
+    return jax.tree.map(lambda x: x[0], scene)
+
+
+@partial(jax.jit, static_argnames=("config", "options"))
+def _render(
+    variables: dict,
+    scene: Any,
+    centre: Float[Array, "3"],
+    scale: Float[Array, ""],
+    camera: Camera,
+    *,
+    config: NetworkConfig,
+    options: RenderOptions,
+) -> Rendering:
+    """A view, or one axis of views, with the options of a quality; depth in the cloud's units."""
+    single = camera.cam_to_world.ndim == 2
+    inside = jax.tree.map(lambda x: x.reshape(1, -1, *x.shape[-2:]), cameras.in_box(camera, centre, scale))
+    scene = jax.tree.map(lambda x: x[None], scene)
+    rendering = render(variables, scene, inside, config=config, options=options)
+    rendering = dataclasses.replace(rendering, depth=rendering.depth / scale)
+    return jax.tree.map(lambda x: x[0, 0] if single else x[0], rendering)
+
+
+def at_quality(config: NetworkConfig, quality: str, reach: int, width: int) -> RenderOptions:
+    """The options that render a picture so wide at a quality, with samples within `reach` voxels of points.
+
+    A network near points keeps its own reach: the cells of the surface's grid grow with the spacing.
+    """
+    needed = rays_per_side(config, width)
+    side = needed if quality == "best" else 1
+    # a refiner has learnt to see pictures of the training's size
+    options = dataclasses.replace(trained(config), rays_per_side=side, refine=quality != "draft" and side == needed)
+    if quality == "trained" or not isinstance(config, RayNetworkConfig):
+        return options
+    counts = config.sampling
+    samples = max(round(SAMPLES[quality] * (counts.num_coarse + counts.num_fine)), 1)
+    sampling = SamplingConfig(num_coarse=samples, num_fine=0, reach=reach if config.method == "paper" else counts.reach)
+    return dataclasses.replace(options, sampling=sampling, block=None)
+
+
+def reach_of(positions: np.ndarray, resolution: int, num_queries: int = 4096) -> int:
+    """Voxels around points in which their surface lies, from the median distance to the nearest other point.
+
+    Copies of a point, closer than a 1024th of the box, count once.
+    """
+    x, y, z = np.floor((positions.T + 1) * 512).astype(np.int64)
+    _, distinct = np.unique((x * 2048 + y) * 2048 + z, return_index=True)
+    positions = positions[distinct]
+    if len(positions) < 2:
+        return LARGEST_REACH
+    queries = positions[:: -(-len(positions) // num_queries)]
+    distances, _ = cKDTree(positions).query(queries, 2)
+    spacing = np.median(distances[:, 1]) * resolution / 2
+    return int(np.clip(np.ceil(REACH_PER_SPACING * spacing), 1, LARGEST_REACH))

@@ -12,9 +12,9 @@ from spnr_jax.errors import UserError
 from spnr_jax.formats.clouds import PlacedCloud
 from spnr_jax.kernels import occupancy, voxels
 from spnr_jax.kernels.numerics import normalize
-from spnr_jax.kernels.records import Rays
+from spnr_jax.kernels.records import Rays, Volume
 from spnr_jax.method.inference import network
-from spnr_jax.method.model import Model, Volume
+from spnr_jax.method.model import Model
 from spnr_jax.model_config import RayNetworkConfig, RenderOptions
 from spnr_jax.tools.grids import Grid, over_box
 

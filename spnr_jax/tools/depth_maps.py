@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from spnr_jax.kernels import cameras
-from spnr_jax.kernels.records import Camera, Rendering
-from spnr_jax.method.model import DISTANCE, Volume
+from spnr_jax.kernels.records import Camera, Rendering, Volume
+from spnr_jax.method.model import DISTANCE
 
 HIT = 0.5  # opacity from which a pixel has a depth
 FARTHEST = DISTANCE + np.sqrt(3)  # of the box from a camera of `Model.camera`, in units of the box

@@ -25,9 +25,9 @@ from jax import export
 from jaxtyping import Array, Bool, Float
 
 from spnr_jax.errors import UserError
-from spnr_jax.kernels.records import Camera, PointCloud
+from spnr_jax.kernels.records import LARGEST_REACH, Camera, PointCloud, Volume
 from spnr_jax.method import inference
-from spnr_jax.method.model import LARGEST_REACH, Model, Quality, Volume
+from spnr_jax.method.model import Model, Quality
 
 Arrays = dict[str, Any]
 MISSING = "exported functions need the package flatbuffers; pip install 'spnr-jax[export]'"

@@ -18,8 +18,7 @@ from jaxtyping import Array, Float
 from spnr_jax.formats.clouds import PlacedCloud
 from spnr_jax.gaussians.coloring import nearest_around
 from spnr_jax.gaussians.placing import View
-from spnr_jax.kernels.records import Camera
-from spnr_jax.method.model import Volume
+from spnr_jax.kernels.records import Camera, Volume
 from spnr_jax.tools.grids import Grid, over_box
 
 GRID = 192  # places along each side of the box

@@ -7,8 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from spnr_jax.formats.clouds import PlacedCloud
-from spnr_jax.kernels.records import AnyArray
-from spnr_jax.method.model import Volume
+from spnr_jax.kernels.records import AnyArray, Volume
 
 
 @dataclass(frozen=True, kw_only=True)

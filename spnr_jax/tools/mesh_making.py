@@ -7,7 +7,8 @@ from typing import Literal
 from spnr_jax.errors import UserError
 from spnr_jax.formats import clouds, images
 from spnr_jax.formats.clouds import PlacedCloud
-from spnr_jax.method.model import Model, Volume
+from spnr_jax.kernels.records import Volume
+from spnr_jax.method.model import Model
 from spnr_jax.tools import fused_surface, mesh_export, splat_making
 from spnr_jax.tools.mesh_export import Solid
 from spnr_jax.training.weights import load

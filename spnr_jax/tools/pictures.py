@@ -31,8 +31,8 @@ from spnr_jax.errors import UserError
 from spnr_jax.formats import clouds, images
 from spnr_jax.formats.clouds import PlacedCloud
 from spnr_jax.formats.gaussian_files import write_splats
-from spnr_jax.kernels.records import Camera, Light, Rendering
-from spnr_jax.method.model import Model, Volume
+from spnr_jax.kernels.records import Camera, Light, Rendering, Volume
+from spnr_jax.method.model import Model
 from spnr_jax.model_config import RayNetworkConfig
 from spnr_jax.tools import depth_maps
 from spnr_jax.tools.chosen_light import before, check_takes_light, light_of_options

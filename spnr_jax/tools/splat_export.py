@@ -19,8 +19,8 @@ from PIL import Image
 from spnr_jax.errors import UserError
 from spnr_jax.formats import clouds, images
 from spnr_jax.formats.gaussian_files import check_suffix, spz_of, write_splats
-from spnr_jax.kernels.records import Camera, Gaussians, Light, PointCloud
-from spnr_jax.method.model import FIELD_OF_VIEW, Model, Volume
+from spnr_jax.kernels.records import Camera, Gaussians, Light, PointCloud, Volume
+from spnr_jax.method.model import FIELD_OF_VIEW, Model
 from spnr_jax.tools.chosen_light import check_takes_light, light_of_options
 from spnr_jax.tools.light_options import Lighting
 from spnr_jax.tools.share_command import Share

@@ -15,8 +15,8 @@ from scipy.spatial import cKDTree
 from spnr_jax.errors import UserError
 from spnr_jax.formats.images import to_uint8
 from spnr_jax.kernels.colors import linear_to_srgb, srgb_to_linear
-from spnr_jax.kernels.records import Camera, PointCloud
-from spnr_jax.method.model import Model, Volume
+from spnr_jax.kernels.records import Camera, PointCloud, Volume
+from spnr_jax.method.model import Model
 from spnr_jax.viewer.viewpoint import project
 
 Material = Literal["base_color", "roughness", "metallic"]

@@ -9,13 +9,13 @@ import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, get_args
 
 import numpy as np
 
 from spnr_jax.errors import UserError
 from spnr_jax.formats import images
-from spnr_jax.method.model import SAMPLES, Model, Quality
+from spnr_jax.method.model import Model, Quality
 from spnr_jax.viewer import camera_path, picture
 from spnr_jax.viewer.camera_path import Keyframe
 from spnr_jax.viewer.lights import Lights, made
@@ -30,7 +30,7 @@ FRAMES_PER_SECOND = 16
 MOST_FRAMES = 960
 LONGEST_PAUSE = 10.0  # seconds between keyframes
 FILMS = ("mp4", "gif")
-QUALITIES: tuple[Quality, ...] = (*cast(tuple[Quality, ...], tuple(SAMPLES)), "trained")
+QUALITIES: tuple[Quality, ...] = get_args(Quality)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -14,8 +14,7 @@ import numpy as np
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from spnr_jax.kernels.records import Camera
-from spnr_jax.method.model import Volume
+from spnr_jax.kernels.records import Camera, Volume
 
 FARTHEST = 1e3  # boxes; beyond, float32 rays miss (README, "Numerical domain")
 MOST_PIXELS = 2**16  # along a side of a browser's canvas

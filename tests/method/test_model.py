@@ -13,7 +13,7 @@ import spnr_jax
 from spnr_jax.baselines.sizes import NPBGConfig
 from spnr_jax.formats import data_sets
 from spnr_jax.kernels import cameras
-from spnr_jax.kernels.records import Camera, PointCloud
+from spnr_jax.kernels.records import LARGEST_REACH, Camera, PointCloud, Volume
 from spnr_jax.method import inference, model
 from spnr_jax.model_config import RenderOptions, SamplingConfig
 
@@ -90,7 +90,7 @@ def test_the_handle_shows_what_the_evaluation_shows(handle):
     encoded = inference.jitted_encode(
         handle.variables, jax.tree.map(lambda x: jax.numpy.asarray(x)[None], item.cloud), config=handle.config
     )
-    volume = model.Volume(
+    volume = Volume(
         scene=jax.tree.map(lambda x: x[0], encoded),
         centre=jax.numpy.zeros(3),
         scale=jax.numpy.ones(()),
@@ -146,17 +146,18 @@ class TestQuality:
         config = dataclasses.replace(tiny_dataset.CONFIG.model, sampling=SamplingConfig(num_coarse=4, num_fine=4))
         expected = SamplingConfig(num_coarse=samples, num_fine=0, reach=3)
         refine = quality != "draft"
-        assert model.at_quality(config, quality, 3, 24) == RenderOptions(sampling=expected, refine=refine)
+        assert inference.at_quality(config, quality, 3, 24) == RenderOptions(sampling=expected, refine=refine)
 
     def test_trained_takes_the_samples_of_the_training_and_so_does_every_quality_of_other_networks(self):
         config = tiny_dataset.CONFIG.model
-        assert model.at_quality(config, "trained", 3, 24) == inference.trained(config) == RenderOptions(block=1024)
-        assert model.at_quality(NPBGConfig(), "draft", 3, 24).sampling is None
+        assert inference.at_quality(config, "trained", 3, 24) == inference.trained(config) == RenderOptions(block=1024)
+        assert inference.at_quality(NPBGConfig(), "draft", 3, 24).sampling is None
 
-    def test_another_word_is_refused(self):
-        unchecked = inspect.unwrap(model.at_quality)  # the tests' type check would refuse it first
+    def test_another_word_is_refused(self, handle):
+        volume = handle.encode(example_cloud())
+        unchecked = inspect.unwrap(model.Model.render)  # the tests' type check would refuse it first
         with pytest.raises(ValueError, match="quality must be one of draft, balanced, best, trained, got fast"):
-            unchecked(tiny_dataset.CONFIG.model, "fast", 1, 24)
+            unchecked(handle, volume, handle.camera(volume), "fast")
 
     @pytest.mark.parametrize("quality", ["draft", "balanced", "best", "trained"])
     def test_every_quality_shows_the_object(self, handle, quality):
@@ -167,5 +168,5 @@ class TestQuality:
 
     def test_reach_follows_the_distance_between_the_points(self):
         grid = np.stack(np.meshgrid(*[np.linspace(-1, 1, 9)] * 3), axis=-1).reshape(-1, 3)  # a quarter apart
-        assert [model.reach_of(grid, resolution) for resolution in (4, 8, 16, 64)] == [1, 2, 4, 4]
-        assert model.reach_of(grid[:1], 32) == model.LARGEST_REACH
+        assert [inference.reach_of(grid, resolution) for resolution in (4, 8, 16, 64)] == [1, 2, 4, 4]
+        assert inference.reach_of(grid[:1], 32) == LARGEST_REACH

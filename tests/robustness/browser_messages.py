@@ -15,8 +15,8 @@ import numpy as np
 import valid_files
 from damage import Files
 
-from spnr_jax.kernels.records import PointCloud
-from spnr_jax.method.model import Model, Volume
+from spnr_jax.kernels.records import PointCloud, Volume
+from spnr_jax.method.model import Model
 from spnr_jax.presets import tiny
 from spnr_jax.viewer import picture, scene, session, uploads, viewpoint
 from spnr_jax.viewer.scene import Scene

@@ -13,7 +13,7 @@ from support.solid_ball import ball_cloud
 
 from spnr_jax.gaussians.placing import View
 from spnr_jax.kernels.cameras import camera_rays
-from spnr_jax.method.model import Volume
+from spnr_jax.kernels.records import Volume
 from spnr_jax.tools import fused_surface
 from spnr_jax.tools.mesh_export import mesh_of
 
