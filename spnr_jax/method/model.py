@@ -31,8 +31,8 @@ from spnr_jax.model_config import NetworkConfig, PaperConfig, RayNetworkConfig, 
 FIELD_OF_VIEW, DISTANCE = np.deg2rad(40.0), 3.0  # of the training cameras; the object fits into the unit sphere
 Quality = Literal["draft", "balanced", "best", "trained"]
 SAMPLES = {"draft": 0.25, "balanced": 0.5, "best": 1.0}  # share of the samples a ray was trained with
-BALANCED = 0.75  # of the pixels along a side, which the network over surfels draws and enlarges: docs/quality.md
-REACH_PER_SPACING, LARGEST_REACH = 1.6, 4  # what loses nothing from 128 to 4096 points, docs/performance.md
+BALANCED = 0.75  # of the pixels along a side, which the network over surfels draws and enlarges: docs/performance.md
+REACH_PER_SPACING, LARGEST_REACH = 1.6, 4  # what loses nothing from 128 to 4096 points, docs/cpu_forms.md
 
 
 @struct.dataclass
