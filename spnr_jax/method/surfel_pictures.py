@@ -15,7 +15,7 @@ from spnr_jax.model_config import SurfelConfig
 from spnr_jax.surfels.lighting import room_light
 
 _in_box = jax.jit(cameras.in_box)  # compiled whole: each operation alone takes 30 ms at the first call
-BALANCED = 0.75  # of the pixels along a side, which are drawn and enlarged: docs/quality.md
+BALANCED = 0.75  # of the pixels along a side, which are drawn and enlarged: docs/performance.md
 
 
 def placed(variables: dict) -> dict:

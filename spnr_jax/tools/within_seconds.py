@@ -32,7 +32,7 @@ from spnr_jax.tools.render_command import Render
 FILE = "seconds.json"
 REPEATS = 3
 GOLDEN_ANGLE = np.pi * (3 - 5**0.5)
-# From the best to the cheapest, with the share of the pixels along a side: docs/quality.md
+# From the best to the cheapest, with the share of the pixels along a side: docs/performance.md
 OF_SURFELS: tuple[tuple[Quality, float], ...] = (
     ("best", 1),
     ("balanced", 1),
