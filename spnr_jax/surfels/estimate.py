@@ -93,7 +93,7 @@ def _columns(
         "metallic": metallic,
         "guessed": np.zeros(len(positions)) if materials_known is None else 1 - materials_known,
         "sided": sided,
-        "visible": joined(_averaged, near, weight, *all_of(seen)),
+        "visible": _averaged(near, weight, seen),
         "shape": joined(layers.shape_of, near, layer, *all_of(raw)),
         "rim": rim,
         "reach": reach,
@@ -110,7 +110,7 @@ def padded(columns: dict[str, np.ndarray], drawn: np.ndarray) -> Surfels:
         values = columns.pop(name)
         kind = bool if name == "mask" else np.float32
         whole[name] = np.zeros((bucket(count), *values.shape[1:]), kind)
-        whole[name][:count] = values[drawn]
+        np.take(np.asarray(values, kind), drawn, axis=0, out=whole[name][:count], mode="clip")  # whose mode copies none
     whole["spacing"][count:] = 1  # its logarithm is taken
     return Surfels(**whole)
 
@@ -141,12 +141,13 @@ def _smoothed(near: Near, layer: np.ndarray, spacing: np.ndarray) -> np.ndarray:
     return np.exp(np.sum(weight * logarithm, axis=0) / weight.sum(axis=0))
 
 
-def _averaged(near: Near, layer: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """Mean over the nearest of the layer: a depth buffer of points is noisy."""
-    weight = layer[:SMOOTHED] / layer[:SMOOTHED].sum(axis=0)
+def _averaged(near: list[Near], layer: list[np.ndarray], seen: np.ndarray) -> np.ndarray:
+    """Mean over the nearest of the layer: a depth buffer of points is noisy.  All blocks are one sparse matrix."""
+    number = np.concatenate([block.number[:SMOOTHED] for block in near], axis=1)
+    weight = np.concatenate([block[:SMOOTHED] for block in layer], axis=1)
+    weight /= weight.sum(axis=0)
     ends = np.arange(0, weight.size + 1, len(weight), dtype=np.int32)
-    entries = weight.T.ravel(), near.number[: len(weight)].T.ravel(), ends
-    return csr_array(entries, shape=(weight.shape[1], len(seen))) @ seen
+    return csr_array((weight.ravel("F"), number.ravel("F"), ends), shape=(len(seen), len(seen))) @ seen
 
 
 def _gradient(near: Near, layer: np.ndarray, spacing: np.ndarray, normal: np.ndarray, color: np.ndarray) -> np.ndarray:

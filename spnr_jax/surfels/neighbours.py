@@ -20,7 +20,7 @@ REACH = 1.2  # spacings, standard deviation of the weight of a neighbour's dista
 LEAST_SPACING = 1e-5  # in units of the box, for points that coincide
 ALONE = 0.1  # of the box, the spacing of a single point
 BLOCK = 2**11  # points that are worked on at once: they stay in a core's cache
-THREADS = 2
+THREADS = 2  # four wait for Python's lock
 
 
 class Near(NamedTuple):

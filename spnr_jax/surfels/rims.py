@@ -29,16 +29,16 @@ def bridged(near: Near, layer: np.ndarray, spacing: np.ndarray, normal: np.ndarr
 
     A gap is an empty circle through the point with other points all around it (a vertex of the Voronoi diagram in the
     tangent plane).  The empty circle whose centre lies in a direction ends at the first point that it meets, and is
-    largest, among its neighbours in direction, at a vertex; where the layer ends it grows without limit.  Inverted at
-    the circle of radius root 2 points lie as far in a direction as the radii of the circles that meet them are short.
+    largest, among its neighbours in direction, at a vertex; where the layer ends it grows without limit.  With all
+    places inverted, p to 2 p / |p|^2, the farthest in a direction is as far away as that circle is curved.
     """
     own = spacing[near.rows]
     one, two = (along(near.offset, axis) for axis in frame(normal[near.rows].T)[:2] / own)
     half = (one**2 + two**2) / 2
     inverse = ((layer > 0.5) & (half > LEAST)) / np.maximum(half, LEAST)
-    short = farthest(one * inverse, two * inverse)
-    vertex = (short <= np.roll(short, 1, axis=0)) & (short <= np.roll(short, -1, axis=0)) & (short > 1 / WIDEST)
-    return own * np.maximum(1 / (np.where(vertex, short, np.inf).min(axis=0) * BRIDGED), 1)
+    curved = farthest(one * inverse, two * inverse)
+    vertex = (curved <= np.roll(curved, 1, axis=0)) & (curved <= np.roll(curved, -1, axis=0)) & (curved > 1 / WIDEST)
+    return own * np.maximum(1 / (np.where(vertex, curved, np.inf).min(axis=0) * BRIDGED), 1)
 
 
 def evenness(near: Near, layer: np.ndarray, spacing: np.ndarray) -> np.ndarray:
