@@ -11,13 +11,25 @@ shape       planarity and linearity: ratios of the neighbours' extents, 0 in a p
 
 import numpy as np
 from jaxtyping import Float
+from scipy.sparse import csr_array
 
 from spnr_jax.kernels.cloud_arrays import bucket
 from spnr_jax.kernels.records import Surfels
 from spnr_jax.surfels import layers, sides
-from spnr_jax.surfels.neighbours import LEAST_SPACING, Near, each, first_spacing, joined, neighbourhoods
+from spnr_jax.surfels.neighbours import (
+    LEAST_SPACING,
+    Near,
+    along,
+    around,
+    each,
+    first_spacing,
+    frame,
+    in_order_of_space,
+    joined,
+    neighbourhoods,
+)
 from spnr_jax.surfels.rims import EVEN, bridged, evenness, rims
-from spnr_jax.surfels.visibility import tangents
+from spnr_jax.surfels.small_systems import solved
 
 OWN_DISC = 5.5  # neighbours, by their weights, in the disc that gives the spacing; sums of ones jump at whole numbers
 SMOOTHED = 9  # neighbours over which the spacing is averaged
@@ -33,9 +45,15 @@ def estimate(
     materials_known: Float[np.ndarray, " points"] | None = None,
 ) -> Surfels:
     """Surfels of points in the box [-1, 1]^3, padded to a power of two; at least one point."""
-    return padded(
-        *_columns(np.asarray(positions, np.float32), base_color, roughness, metallic, normals, materials_known)
-    )
+    order = in_order_of_space(positions)
+
+    def ordered(values: np.ndarray) -> np.ndarray:
+        return np.asfortranarray(np.asarray(values, np.float32)[order])
+
+    given = (ordered(x) for x in (positions, base_color, roughness, metallic))
+    columns, shown = _columns(*given, *(None if x is None else ordered(x) for x in (normals, materials_known)))
+    place = np.argsort(order)
+    return padded(columns, place[shown[place]])
 
 
 def _columns(
@@ -54,7 +72,7 @@ def _columns(
 
     raw = joined(first_spacing, near)
     middle, given = float(np.median(raw)), normals is not None
-    first = joined(layers.first_normals, near, *all_of(raw)) if normals is None else _unit(normals)
+    first = joined(layers.first_normals, near, *all_of(raw)) if normals is None else np.asfortranarray(_unit(normals))
     layer = each(layers.fitted, near, *all_of(raw, first), [given] * len(near))
     normal, sided = sides.outward(near, layer, raw, given, positions, middle)
     weight = each(layers.weights, near, layer, *all_of(normal, sided))
@@ -75,7 +93,7 @@ def _columns(
         "metallic": metallic,
         "guessed": np.zeros(len(positions)) if materials_known is None else 1 - materials_known,
         "sided": sided,
-        "visible": joined(_averaged, near, weight, *all_of(seen)),
+        "visible": _averaged(near, weight, seen),
         "shape": joined(layers.shape_of, near, layer, *all_of(raw)),
         "rim": rim,
         "reach": reach,
@@ -85,14 +103,14 @@ def _columns(
 
 
 def padded(columns: dict[str, np.ndarray], drawn: np.ndarray) -> Surfels:
-    """Surfels of the points that are drawn, zeros behind them up to a power of two; the columns are taken out."""
-    count = int(drawn.sum())
+    """Surfels of the points of these numbers, zeros behind them up to a power of two; the columns are taken out."""
+    count = len(drawn)
     whole = {}
     for name in tuple(columns):
         values = columns.pop(name)
         kind = bool if name == "mask" else np.float32
         whole[name] = np.zeros((bucket(count), *values.shape[1:]), kind)
-        whole[name][:count] = values[drawn]
+        np.take(np.asarray(values, kind), drawn, axis=0, out=whole[name][:count], mode="clip")  # whose mode copies none
     whole["spacing"][count:] = 1  # its logarithm is taken
     return Surfels(**whole)
 
@@ -106,39 +124,41 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
 def _own_spacing(near: Near, layer: np.ndarray, raw: np.ndarray) -> np.ndarray:
     """From the area of the disc that holds OWN_DISC neighbours of the layer."""
     raw = raw[near.rows]
-    if near.number.shape[1] == 1:
+    if len(near.number) == 1:
         return raw
-    held = np.cumsum(layer[:, 1:], axis=1)
-    wanted = np.minimum(OWN_DISC, np.maximum(held[:, -1] * 0.6, 0.5))
-    last = np.minimum((held < wanted[:, None]).sum(axis=1) + 1, near.number.shape[1] - 1)
+    held = np.cumsum(layer[1:], axis=0)
+    wanted = np.minimum(OWN_DISC, np.maximum(held[-1] * 0.6, 0.5))
+    last = np.minimum((held < wanted).sum(axis=0) + 1, len(near.number) - 1)
     row = np.arange(len(raw))
-    spacing = np.sqrt(np.pi / np.maximum(held[row, last - 1], 1)) * near.distance[row, last]
+    spacing = np.sqrt(np.pi / np.maximum(held[last - 1, row], 1)) * near.distance[last, row]
     return np.clip(spacing, 0.5 * raw, 1.6 * raw)
 
 
 def _smoothed(near: Near, layer: np.ndarray, spacing: np.ndarray) -> np.ndarray:
     """Geometric mean over the nearest of the layer."""
-    weight = layer[:, :SMOOTHED]
-    logarithm = np.log(np.maximum(spacing, LEAST_SPACING))[near.number[:, :SMOOTHED]]
-    return np.exp((weight * logarithm).sum(axis=1) / weight.sum(axis=1)).astype(np.float32)
+    weight = layer[:SMOOTHED]
+    logarithm = np.log(np.maximum(np.take(spacing, near.number[:SMOOTHED]), LEAST_SPACING))
+    return np.exp(np.sum(weight * logarithm, axis=0) / weight.sum(axis=0))
 
 
-def _averaged(near: Near, layer: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """Mean over the nearest of the layer: a depth buffer of points is noisy."""
-    weight = layer[:, :SMOOTHED] / layer[:, :SMOOTHED].sum(axis=1, keepdims=True)
-    return sum(weight[:, k, None] * seen[near.number[:, k]] for k in range(weight.shape[1])).astype(np.float32)
+def _averaged(near: list[Near], layer: list[np.ndarray], seen: np.ndarray) -> np.ndarray:
+    """Mean over the nearest of the layer: a depth buffer of points is noisy.  All blocks are one sparse matrix."""
+    number = np.concatenate([block.number[:SMOOTHED] for block in near], axis=1)
+    weight = np.concatenate([block[:SMOOTHED] for block in layer], axis=1)
+    weight /= weight.sum(axis=0)
+    ends = np.arange(0, weight.size + 1, len(weight), dtype=np.int32)
+    return csr_array((weight.ravel("F"), number.ravel("F"), ends), shape=(len(seen), len(seen))) @ seen
 
 
 def _gradient(near: Near, layer: np.ndarray, spacing: np.ndarray, normal: np.ndarray, color: np.ndarray) -> np.ndarray:
     """Change of each colour along x, y, z (block, colour, axis): weighted least squares in the tangent plane."""
-    spacing, own = spacing[near.rows], color[near.rows]
-    first, second = tangents(normal[near.rows])
-    plane = np.stack([np.einsum("nki,ni->nk", near.offset, t) for t in (first, second)], axis=-1)
-    inputs = np.concatenate([np.ones((*near.number.shape, 1), np.float32), plane / spacing[:, None, None]], axis=-1)
-    weight = layer * np.exp(-0.5 * (near.distance / spacing[:, None]) ** 2)
-    weight[:, 0] = 1
-    weighted = (weight[..., None] * inputs).swapaxes(1, 2)
-    normal_equations = weighted @ inputs + np.diag([1e-6, RIDGE, RIDGE])
-    slopes = np.linalg.solve(normal_equations, weighted @ (color[near.number] - own[:, None]))[:, 1:]
-    along = slopes[:, 0, :, None] * first[:, None] + slopes[:, 1, :, None] * second[:, None]
-    return along / spacing[:, None, None]
+    spacing, (first, second, _) = spacing[near.rows], frame(normal[near.rows].T)
+    plane = (along(near.offset, axis / spacing) for axis in (first, second))
+    inputs = np.stack([np.ones_like(near.distance), *plane])
+    weight = layer * np.exp(-0.5 * (near.distance / spacing) ** 2)
+    weight[0] = 1
+    change = around(near, color) - color[near.rows].T[:, None]
+    sums = np.einsum("ikn,jkn->ijn", weight * inputs, np.concatenate([inputs, change]))
+    ridge = np.diag(np.array([1e-6, RIDGE, RIDGE], np.float32))[..., None]
+    slopes = solved(sums[:, :3] + ridge, sums[:, 3:])[1:] / spacing
+    return np.einsum("tcn,tin->nci", slopes, np.stack([first, second]))

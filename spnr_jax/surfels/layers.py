@@ -4,20 +4,21 @@ Walls thinner than what anything sees between, stickers and edges put points of 
 spacings and normals of one must not mix with those of another.  Lengths are spacings unless they are said not to be.
 """
 
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from spnr_jax.surfels.neighbours import LEAST_SPACING, Near, close, in_plane, spread
-from spnr_jax.surfels.visibility import tangents
+from spnr_jax.surfels.neighbours import LEAST_SPACING, Near, along, around, close, covariance, frame
+from spnr_jax.surfels.small_systems import cross, narrowest, solved, variances
 
 PAIRED = 8  # nearest points whose pairs span the planes that are tried
 SLIVER = 0.2  # sine between two of them from which on they span one
 FLAT = 0.1  # spacings from a plane at which a point supports it half
 TRUSTED = 1.15  # the plane of least spread counts so much more: it is the better one where points are noisy
 ROUNDS = 4  # of the quadric's fit
-STIFF = np.diag(np.array([1e-3, 1e-3, 0.1, 0.1, 0.1], np.float32))  # ridge of its slopes and curvatures
+STIFF = np.diag(np.array([1e-3, 1e-3, 0.1, 0.1, 0.1], np.float32))[..., None]  # ridge of its slopes and curvatures
 THICK, THINNEST = 0.3, 0.04  # most and least standard deviation of a neighbour's weight as one of the layer
 START = 0.12  # the same in the first round
 SPREADS = 2.0  # this deviation over the mean height of those that count
@@ -30,9 +31,9 @@ STICKER, COVERING = 0.8, 2.0  # most height, and fewest neighbours above, of a l
 class Layer(NamedTuple):
     """Of a block of points: unit normals of either sign, the layer's thickness, the neighbours' height over it."""
 
-    normal: Float[np.ndarray, "block 3"]
+    normal: Float[np.ndarray, "3 block"]
     scale: Float[np.ndarray, " block"]
-    height: Float[np.ndarray, "block k"]
+    height: Float[np.ndarray, "k block"]
 
 
 def first_normals(near: Near, spacing: np.ndarray) -> np.ndarray:
@@ -41,26 +42,23 @@ def first_normals(near: Near, spacing: np.ndarray) -> np.ndarray:
     The plane of least spread is tried, too.  So a point at an edge gets the plane of one of the faces, not one between
     them.
     """
-    spacing = spacing[near.rows]
-    weight = close(near, spacing)
-    best = spread(near, weight)[1][..., 0].astype(np.float32)
-    most = TRUSTED * _supported(near, weight, best, spacing)
-    last = min(PAIRED, near.number.shape[1] - 1)
-    for one in range(1, last):
-        for two in range(one + 1, last + 1):
-            across = np.cross(near.offset[:, one], near.offset[:, two])
-            size = np.linalg.norm(across, axis=1)
-            wide = size > SLIVER * near.distance[:, one] * near.distance[:, two]
-            normal = across / np.maximum(size, 1e-12)[:, None]
-            support = np.where(wide, _supported(near, weight, normal, spacing), 0)
-            best = np.where((support > most)[:, None], normal, best)
-            most = np.maximum(most, support)
-    return best
+    flat = FLAT * spacing[near.rows]
+    weight = close(near, spacing[near.rows])
 
+    def support(normal: np.ndarray) -> np.ndarray:
+        return np.sum(weight / (1 + along(near.offset, normal / flat) ** 2), axis=0)
 
-def _supported(near: Near, weight: np.ndarray, normal: np.ndarray, spacing: np.ndarray) -> np.ndarray:
-    height = np.einsum("nki,ni->nk", near.offset, normal) / spacing[:, None]
-    return np.sum(weight / (1 + (height / FLAT) ** 2), axis=1)
+    best = narrowest(covariance(near, weight)).astype(np.float32)
+    most = TRUSTED * support(best)
+    last = min(PAIRED, len(near.number) - 1)
+    for one, two in combinations(range(1, last + 1), 2):
+        across = cross(near.offset[:, one], near.offset[:, two])
+        size = np.linalg.norm(across, axis=0)
+        normal = across / np.maximum(size, 1e-12)
+        supported = support(normal) * (size > SLIVER * near.distance[one] * near.distance[two])
+        best = np.where(supported > most, normal, best)
+        most = np.maximum(most, supported)
+    return best.T
 
 
 def fitted(near: Near, spacing: np.ndarray, normal: np.ndarray, given: bool) -> Layer:
@@ -69,49 +67,50 @@ def fitted(near: Near, spacing: np.ndarray, normal: np.ndarray, given: bool) -> 
     A layer is a quadric through its point (Cazals and Pouget 2003), fitted in rounds to the neighbours that lie close
     to it.
     """
-    spacing, of_all, normal = spacing[near.rows], normal, normal[near.rows]
-    weight, scale = close(near, spacing), np.full(len(normal), START, np.float32)
-    height = in_plane(near, normal, spacing)[2]
+    spacing, of_all, normal = spacing[near.rows], normal, normal[near.rows].T
+    weight, scale = close(near, spacing), np.full(len(spacing), START, np.float32)
+    height = along(near.offset, normal / spacing)
     if given:  # the other side of a wall is told apart by its normals
-        weight = weight * np.clip(0.5 + np.einsum("nki,ni->nk", of_all[near.number], normal), 0, 1)
+        weight *= np.clip(0.5 + along(around(near, of_all), normal), 0, 1)
     for _ in range(ROUNDS):
-        one, two, up = in_plane(near, normal, spacing)
-        own = weight * np.exp(-0.5 * (height / scale[:, None]) ** 2)
-        terms = np.stack([one, two, one * one, one * two, two * two], axis=-1)
-        weighted = (own[..., None] * terms).swapaxes(1, 2)
-        solution = np.linalg.solve(weighted @ terms + STIFF, weighted @ up[..., None])
+        axes = frame(normal)
+        one, two, up = (along(near.offset, axis) for axis in axes / spacing)
+        own = weight * np.exp(-0.5 * (height / scale) ** 2)
+        terms = np.stack([one, two, one * one, one * two, two * two, up])
+        sums = np.einsum("ikn,jkn->ijn", own * terms[:5], terms)
+        solution = solved(sums[:, :5] + STIFF, sums[:, 5:])[:, 0]
         if given:
-            solution[:, :2] = 0
-        height = up - (terms @ solution)[..., 0]
-        first, second = tangents(normal)
-        normal = normal - solution[:, 0] * first - solution[:, 1] * second
-        normal = normal / np.linalg.norm(normal, axis=1, keepdims=True)
-        away = np.sum(own * np.abs(height), axis=1) / np.maximum(own.sum(axis=1) - 1, 0.5)  # the point itself is at 0
+            solution[:2] = 0
+        height = up - np.einsum("ikn,in->kn", terms[:5], solution)
+        normal = axes[2] - solution[0] * axes[0] - solution[1] * axes[1]
+        normal = normal / np.linalg.norm(normal, axis=0)
+        away = np.einsum("kn,kn->n", own, np.abs(height)) / np.maximum(own.sum(axis=0) - 1, 0.5)  # it is at 0 itself
         scale = np.clip(SPREADS * away, THINNEST, THICK)
     return Layer(normal, scale, height)
 
 
 def shape_of(near: Near, layer: Layer, spacing: np.ndarray) -> np.ndarray:
     """Ratios of the extents of the layer's neighbours (block, 2): planarity and linearity."""
-    own = close(near, spacing[near.rows]) * np.exp(-0.5 * (layer.height / layer.scale[:, None]) ** 2)
-    extent = np.sqrt(np.maximum(spread(near, own + 1e-6)[0], 0))
-    return extent[:, :2] / np.maximum(extent[:, 1:], 1e-6)
+    own = close(near, spacing[near.rows]) * np.exp(-0.5 * (layer.height / layer.scale) ** 2)
+    extent = np.sqrt(np.maximum(variances(covariance(near, own + 1e-6)), 0))
+    return (extent[:2] / np.maximum(extent[1:], 1e-6)).T.astype(np.float32)
 
 
 def weights(near: Near, layer: Layer, normal: np.ndarray, sided: np.ndarray) -> np.ndarray:
     """Weight of each neighbour as one of the same layer: near the quadric, and turned to the same side."""
-    along = np.einsum("nki,ni->nk", normal[near.number], normal[near.rows])
-    weight = np.exp(-0.5 * (layer.height / (LOOSE * layer.scale[:, None])) ** 2)
-    weight = weight * np.where(sided[near.rows, None] > 0.5, np.clip(0.5 + along, 0, 1), 1)
-    weight[:, 0] = 1
+    cosine = along(around(near, normal), normal[near.rows].T)
+    weight = np.exp(-0.5 * (layer.height / (LOOSE * layer.scale)) ** 2)
+    weight *= np.where(sided[near.rows] > 0.5, np.clip(0.5 + cosine, 0, 1), 1)
+    weight[0] = 1
     return weight
 
 
 def covered(near: Near, layer: Layer, normal: np.ndarray) -> np.ndarray:
     """Whether another layer that faces the same way lies right above a point, as a sticker does (block,)."""
-    along = np.einsum("nki,ni->nk", normal[near.number], normal[near.rows])
-    outward = np.sign(np.einsum("ni,ni->n", normal[near.rows], layer.normal))[:, None] * layer.height
-    farthest = np.maximum(near.distance[:, -1:], LEAST_SPACING)
-    other = (along > PARALLEL) * np.exp(-0.5 * (near.distance / farthest) ** 2) * (np.abs(outward) < STICKER)
-    above, below = (np.sum(other * (sign * outward > APART * layer.scale[:, None]), axis=1) for sign in (1, -1))
+    own = normal[near.rows].T
+    outward = np.sign(np.einsum("in,in->n", own, layer.normal)) * layer.height
+    farthest = np.maximum(near.distance[-1], LEAST_SPACING)
+    other = np.exp(-0.5 * (near.distance / farthest) ** 2) * (np.abs(outward) < STICKER)
+    other *= along(around(near, normal), own) > PARALLEL
+    above, below = (np.sum(other * (sign * outward > APART * layer.scale), axis=0) for sign in (1, -1))
     return above > np.maximum(COVERING, 2 * below)

@@ -1,12 +1,10 @@
 """Which side of each layer is outside: votes of the directions that see it, and of walls."""
 
-from collections.abc import Callable
-
 import numpy as np
 
 from spnr_jax.kernels.cloud_arrays import bucket
 from spnr_jax.surfels.layers import APART, PARALLEL, Layer
-from spnr_jax.surfels.neighbours import BLOCK, Near, close, joined
+from spnr_jax.surfels.neighbours import BLOCK, Near, along, around, close, joined
 from spnr_jax.surfels.visibility import DIRECTIONS, grid_of, seen_from
 
 WALL = 1.5  # spacings within which another layer is the other side of a wall
@@ -34,31 +32,27 @@ def visible_from(positions: np.ndarray, normal: np.ndarray, spacing: np.ndarray,
 
 def shown(normal: np.ndarray, seen: np.ndarray, covered: np.ndarray) -> np.ndarray:
     """Which points something outside sees; all, where that would leave too few."""
-    shown = ~covered & (_directions(seen, normal, np.abs) > HIDDEN)
+    shown = ~covered & (sum(facing(normal, seen)) > HIDDEN)
     return shown if shown.mean() > LEAST_SHOWN else np.ones_like(shown)
 
 
-def lean(normal: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """From -1 to 1: how much more is seen of the side that the normal points to than of the other."""
-    front, back = (_directions(seen, side, _ahead) for side in (normal, -normal))
-    return (front - back) / (front + back + EVIDENCE)
-
-
-def _directions(seen: np.ndarray, normal: np.ndarray, weight: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-    """How many directions see each point, each with a weight that depends on its cosine with the normal; in blocks."""
-    blocks = (slice(i, i + BLOCK) for i in range(0, len(seen), BLOCK))
-    return np.concatenate([np.einsum("nd,nd->n", seen[b], weight(normal[b] @ DIRECTIONS.T)) for b in blocks])
-
-
-def _ahead(cosine: np.ndarray) -> np.ndarray:
-    return np.maximum(cosine, 0)
+def facing(normal: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """How many directions before each point see it, counted by their cosines with its normal, and how many behind."""
+    front, total = [], []
+    for rows in (slice(i, i + BLOCK) for i in range(0, len(seen), BLOCK)):
+        cosine = normal[rows] @ DIRECTIONS.T
+        total.append(np.einsum("nd,nd->n", seen[rows], cosine))
+        front.append(np.einsum("nd,nd->n", seen[rows], np.maximum(cosine, 0, out=cosine)))
+    ahead = np.concatenate(front)
+    return ahead, ahead - np.concatenate(total)
 
 
 def voted(near: Near, layer: Layer, normal: np.ndarray, spacing: np.ndarray, lean: np.ndarray) -> np.ndarray:
     """The lean of each point and of its neighbours on the same layer, whichever way their normals point (block,)."""
-    along = np.einsum("nki,ni->nk", normal[near.number], normal[near.rows])
-    weight = close(near, spacing[near.rows]) * along**2 * np.exp(-0.5 * (layer.height / layer.scale[:, None]) ** 2)
-    return np.einsum("nk,nk->n", weight * np.sign(along), lean[near.number]) / np.maximum(weight.sum(axis=1), 1e-6)
+    cosine = along(around(near, normal), normal[near.rows].T)
+    weight = close(near, spacing[near.rows]) * np.exp(-0.5 * (layer.height / layer.scale) ** 2) * cosine**2
+    votes = np.einsum("kn,kn->n", weight * np.sign(cosine), np.take(lean, near.number))
+    return votes / np.maximum(weight.sum(axis=0), 1e-6)
 
 
 def of_walls(near: Near, layer: Layer, normal: np.ndarray, spacing: np.ndarray, given: bool) -> np.ndarray:
@@ -67,10 +61,10 @@ def of_walls(near: Near, layer: Layer, normal: np.ndarray, spacing: np.ndarray, 
     A layer right under another, as under a sticker, is taken for a wall's inner side, and not seen from outside either;
     given normals tell the two apart.
     """
-    along = np.einsum("nki,ni->nk", normal[near.number], normal[near.rows])
-    other = (-along if given else np.abs(along)) > PARALLEL
+    cosine = along(around(near, normal), normal[near.rows].T)
+    other = (-cosine if given else np.abs(cosine)) > PARALLEL
     wall = close(near, spacing[near.rows]) * other * (np.abs(layer.height) < WALL)
-    above, below = (np.sum(wall * (sign * layer.height > APART * layer.scale[:, None]), axis=1) for sign in (1, -1))
+    above, below = (np.sum(wall * (sign * layer.height > APART * layer.scale), axis=0) for sign in (1, -1))
     return SOLID * (below - above) / (above + below + EVIDENCE)
 
 
@@ -81,19 +75,18 @@ def outward(
 
     Given normals have a side; they are turned only where the votes are clear.
     """
-    normal = np.concatenate([of.normal for of in layer])
+    normal = np.concatenate([of.normal for of in layer], axis=1).T
     normals, spacings = ([x] * len(near) for x in (normal, spacing))
     seen = visible_from(positions, normal, spacing, middle)
-    towards = lean(normal, seen)
+    front, back = facing(normal, seen)
+    lean = (front - back) / (front + back + EVIDENCE)
 
     def vote(votes: np.ndarray) -> np.ndarray:
         return joined(voted, near, layer, normals, spacings, [votes] * len(near))
 
-    towards = vote(
-        np.clip(vote(towards) + joined(of_walls, near, layer, normals, spacings, [given] * len(near)), -1, 1)
-    )
+    towards = vote(np.clip(vote(lean) + joined(of_walls, near, layer, normals, spacings, [given] * len(near)), -1, 1))
     sided = np.clip((np.abs(towards) - UNSURE) / (SURE - UNSURE), 0, 1)
     wrong = towards < (-TURN if given else 0)
-    normal = np.where(wrong[:, None], -normal, normal)
-    behind = _directions(seen, -normal, _ahead) > HIDDEN
+    normal = np.asfortranarray(np.where(wrong[:, None], -normal, normal))
+    behind = np.where(wrong, front, back) > HIDDEN
     return normal, np.where(behind, np.minimum(sided, 1 - LEAK), sided)
