@@ -43,7 +43,8 @@ def splats(
     that these show, with colours as spherical harmonics of a `degree` 0 to 3, and are refined against the pictures for
     so many `seconds`.  ValueError if the pictures show no surface.  `spnr_jax.write_splats` writes them.
     """
-    return splats_of(model, model.encode(cloud), cloud, light, degree, most, views, resolution, seconds, report)
+    sizes = {"degree": degree, "most": most, "views": views, "resolution": resolution, "seconds": seconds}
+    return splats_of(model, model.encode(cloud), cloud, light, report, **sizes)
 
 
 def splats_of(
@@ -51,12 +52,13 @@ def splats_of(
     volume: Volume,
     cloud: PointCloud,
     light: Light | None,
+    report: Callable[[str], None],
+    *,
     degree: int,
     most: int,
     views: int,
-    resolution: int,
     seconds: float | int,
-    report: Callable[[str], None] = lambda line: None,
+    resolution: int = RESOLUTION,
 ) -> Gaussians:
     """`splats` of a cloud that is encoded already."""
     pictures = drawn_views(model, volume, fitting_cameras(model, volume, views, resolution), light)
