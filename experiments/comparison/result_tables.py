@@ -10,7 +10,10 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 from tabulate import tabulate
+
+from spnr_jax.scoring import intervals
 
 SIGNS = {"\N{UPWARDS ARROW}": r"$\uparrow$", "\N{DOWNWARDS ARROW}": r"$\downarrow$", "\N{NO-BREAK SPACE}": "~"}
 BOLD, SMALL, END = "\x01", "\x02", "\x03"  # stand for LaTeX commands until tabulate has escaped the texts
@@ -61,6 +64,18 @@ def number(
         low, high = (factor * end for end in interval)
         small, ends = (f"[{low:{form}}, {high:{form}}]", *more), (low, high)
     return Cell(text=f"{factor * value:{form}}", small=small, best=best, value=factor * value, interval=ends)
+
+
+def mean_row(
+    label: str, objects: Sequence[Sequence[float | None]] | np.ndarray, decimals: Sequence[int], sign: str = ""
+) -> tuple[str, tuple[Cell, ...]]:
+    """A row of means of columns over objects, with intervals; None and NaN are left out."""
+    cells = []
+    for column, digits in zip(np.array(objects, float).T, decimals, strict=True):
+        known = column[~np.isnan(column)]
+        interval = intervals.interval([np.array([x]) for x in known]) if len(known) > 1 else None
+        cells.append(number(float(known.mean()) if len(known) else None, digits, interval, sign=sign))
+    return label, tuple(cells)
 
 
 def markdown(tables: Sequence[Table], notes: Sequence[str] = ()) -> str:

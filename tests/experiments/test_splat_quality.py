@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from support import tiny_dataset, tiny_surfels
 
+from experiments.comparison.object_views import at, on_white
 from experiments.studies import splat_quality
 from spnr_jax.errors import UserError
 from spnr_jax.formats.mesh.assets import Asset, Material, Part
@@ -85,7 +86,7 @@ def test_pictures_become_smaller_as_the_references_do():
     rgba = np.zeros((4, 4, 4), np.uint8)
     rgba[:2, :2] = 255, 0, 0, 255
     rgba[0, 2] = 0, 0, 255, 255  # a quarter of the next square
-    image, opacity = splat_quality._at(rgba, 2)
+    image, opacity = on_white(at(rgba, 2))
     np.testing.assert_allclose(opacity, [[1, 0.25], [0, 0]], atol=1e-6)
     np.testing.assert_allclose(image[0, 0], [1, 0, 0], atol=1e-5)
     np.testing.assert_allclose(image[0, 1], [0.75, 0.75, 1], atol=1e-5)
