@@ -9,9 +9,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from experiments.comparison.object_scores import Shown
-from experiments.comparison.result_tables import Table
 from spnr_jax.formats.images import png_url
 from spnr_jax.scoring.report_style import STYLE, template
+from spnr_jax.scoring.tables import Table
 
 
 def page(title: str, tables: Sequence[Table], notes: Sequence[str], shown: Sequence[Shown] = ()) -> str:

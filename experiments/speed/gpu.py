@@ -28,7 +28,6 @@ import numpy as np
 
 from experiments import entry_point
 from experiments.comparison import results_folder
-from experiments.comparison.result_tables import Table, number, text
 from experiments.speed import bench, ours
 from experiments.speed.surfel_scene import orbiting, random_crops, sphere
 from spnr_jax import cli
@@ -37,6 +36,7 @@ from spnr_jax.devices import machine
 from spnr_jax.method import surfel_renderer
 from spnr_jax.model_config import RayNetworkConfig, SurfelConfig
 from spnr_jax.presets import PRESETS
+from spnr_jax.scoring.tables import Table, number, text
 from spnr_jax.surfels.lighting import room_light
 from spnr_jax.training import many_runs, optimisation, shading
 

@@ -24,7 +24,6 @@ import numpy as np
 
 from experiments import entry_point
 from experiments.comparison import results_folder
-from experiments.comparison.result_tables import Table, number
 from experiments.speed.surfel_scene import orbiting, random_crops, sphere
 from spnr_jax import cli
 from spnr_jax.devices import machine
@@ -33,6 +32,7 @@ from spnr_jax.method import surfel_plan, surfel_renderer
 from spnr_jax.model_config import SurfelConfig
 from spnr_jax.nn.shader import Shader, picture
 from spnr_jax.presets import PRESETS
+from spnr_jax.scoring.tables import Table, number
 from spnr_jax.surfels import projection
 from spnr_jax.surfels.lighting import room_light
 from spnr_jax.training import optimisation, shading

@@ -28,7 +28,6 @@ from data_gen.render.variant import choose_variant, mitsuba_module
 from experiments import entry_point
 from experiments.comparison import figures, results_folder, trained_networks
 from experiments.comparison.poisson import unscaled_light, view_config
-from experiments.comparison.result_tables import Table, number, text
 from experiments.comparison.source_meshes import cast_views, mesh_of
 from experiments.comparison.trained_networks import Network, Sources
 from spnr_jax import cli
@@ -39,6 +38,7 @@ from spnr_jax.formats.images import to_uint8, write_turntable
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.records import Camera
 from spnr_jax.scoring import evaluation, intervals
+from spnr_jax.scoring.tables import Table, number, text
 
 SAME_PLACE = 0.01  # half diagonals that what frame t sees there may be nearer or farther than the place
 REFERENCE = "references"

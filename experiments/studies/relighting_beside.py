@@ -22,7 +22,6 @@ from tqdm import tqdm
 from experiments import entry_point
 from experiments.comparison import figures, poisson, relit, results_folder, source_meshes
 from experiments.comparison.object_views import Picture, on_white, smaller, told, view_of
-from experiments.comparison.result_tables import Table, mean_row
 from experiments.studies.relighting import (
     DECIMALS,
     HEADS,
@@ -41,6 +40,7 @@ from spnr_jax.formats import data_sets, images
 from spnr_jax.formats.mesh.assets import Asset
 from spnr_jax.method.model import Model, Volume
 from spnr_jax.scoring import evaluation
+from spnr_jax.scoring.tables import Table, mean_row
 from spnr_jax.training.weights import load
 
 POISSON, NO_SHADOWS, OCCLUSION = "Poisson, trimmed .3", "true mesh, no shadows", "true mesh, ambient occlusion"

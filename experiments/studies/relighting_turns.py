@@ -23,7 +23,6 @@ from data_gen.render import light
 from experiments import entry_point
 from experiments.comparison import figures, relit, results_folder, source_meshes
 from experiments.comparison.object_views import Picture, on_white, told, view_of
-from experiments.comparison.result_tables import Table, mean_row
 from experiments.studies.relighting import METHODS, NETWORK, correlation, draw, log_light
 from spnr_jax.devices import machine
 from spnr_jax.formats import data_sets, images
@@ -34,6 +33,7 @@ from spnr_jax.kernels.records import Camera
 from spnr_jax.method.model import Model, Volume
 from spnr_jax.scoring import evaluation
 from spnr_jax.scoring.picture_scores import sharpness
+from spnr_jax.scoring.tables import Table, mean_row
 from spnr_jax.surfels import envmaps, skies
 from spnr_jax.surfels.lighting import light_of
 from spnr_jax.training.weights import load

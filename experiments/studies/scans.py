@@ -24,7 +24,6 @@ from tqdm import tqdm
 from experiments import entry_point
 from experiments.comparison import figures, poisson, results_folder
 from experiments.comparison.object_views import Picture, drawn, few, on_white, view_of, view_scores
-from experiments.comparison.result_tables import Cell, Table, mean_row, number
 from spnr_jax.devices import machine
 from spnr_jax.formats import data_sets, images
 from spnr_jax.kernels.cleaning import cleaned
@@ -32,6 +31,7 @@ from spnr_jax.kernels.cloud_arrays import normalization
 from spnr_jax.kernels.records import Camera, PointCloud
 from spnr_jax.kernels.thinning import farthest_points
 from spnr_jax.method.model import Model, Quality
+from spnr_jax.scoring.tables import Cell, Table, mean_row, number
 from spnr_jax.training.scan_faults import Fault, faults
 from spnr_jax.training.weights import load
 

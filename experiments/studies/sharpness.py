@@ -25,7 +25,6 @@ from tqdm import tqdm
 from experiments import entry_point
 from experiments.comparison import figures, results_folder
 from experiments.comparison.object_views import cut, on_white, told, view_of
-from experiments.comparison.result_tables import Cell, Table, mean_row, number
 from experiments.studies.sharpness_methods import Method, Network, methods, resized
 from spnr_jax.devices import machine
 from spnr_jax.formats import data_sets, images
@@ -33,6 +32,7 @@ from spnr_jax.kernels import metrics
 from spnr_jax.kernels.records import PointCloud
 from spnr_jax.scoring.flip import flip
 from spnr_jax.scoring.picture_scores import ball, ball_waves, blue_share, plate, sharpness, under_true_opacity
+from spnr_jax.scoring.tables import Cell, Table, mean_row, number
 
 COLUMNS = {  # scores of a view: heads, decimals
     "psnr": ("PSNR, dB", 2),

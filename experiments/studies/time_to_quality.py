@@ -27,7 +27,6 @@ from matplotlib.figure import Figure
 
 from experiments import entry_point
 from experiments.comparison import budget, figures, results_folder
-from experiments.comparison.result_tables import Table, number
 from experiments.comparison.trained_networks import test_objects
 from experiments.comparison.variants import Preset
 from spnr_jax import cli
@@ -37,6 +36,7 @@ from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
 from spnr_jax.presets import PRESETS
 from spnr_jax.scoring import evaluation
+from spnr_jax.scoring.tables import Table, number
 from spnr_jax.training import adversary, batching, optimisation
 
 Row = dict[str, float]
