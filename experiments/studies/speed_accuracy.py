@@ -31,7 +31,7 @@ import tyro
 
 from data_gen.render import poisson_surface
 from experiments import entry_point
-from experiments.comparison import poisson, results_folder
+from experiments.comparison import clock, poisson, results_folder
 from experiments.comparison.object_views import few, on_white, told, view_of
 from experiments.comparison.peak_memory import forget_peak, peak_mb
 from experiments.comparison.trained_networks import test_objects
@@ -252,10 +252,9 @@ def _time_views(found: Drawn, draw: Callable[[], list[Rendering]]) -> None:
 
 def timed(work: Callable[[], Result]) -> tuple[Result, float]:
     """What the work gives, and its milliseconds: of the processor, where that is what computes."""
-    clock = time.process_time if jax.default_backend() == "cpu" else time.perf_counter
-    start = clock()
+    start = clock.now()
     result = jax.block_until_ready(work())
-    return result, 1000 * (clock() - start)
+    return result, 1000 * (clock.now() - start)
 
 
 if __name__ == "__main__":

@@ -7,6 +7,7 @@ splats             gaussians/placing.py, coloring.py, refining.py, in the box, t
 import dataclasses
 import time
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import numpy as np
@@ -43,7 +44,13 @@ def splats(
     that these show, with colours as spherical harmonics of a `degree` 0 to 3, and are refined against the pictures for
     so many `seconds`.  ValueError if the pictures show no surface.  `spnr_jax.write_splats` writes them.
     """
-    sizes = {"degree": degree, "most": most, "views": views, "resolution": resolution, "seconds": seconds}
+    sizes: dict[str, Any] = {
+        "degree": degree,
+        "most": most,
+        "views": views,
+        "resolution": resolution,
+        "seconds": seconds,
+    }
     return splats_of(model, model.encode(cloud), cloud, light, report, **sizes)
 
 
