@@ -10,7 +10,7 @@ from pathlib import Path
 
 from experiments.comparison.object_scores import Shown
 from spnr_jax.formats.images import png_url
-from spnr_jax.scoring.report_style import STYLE, template
+from spnr_jax.scoring.report_style import template
 from spnr_jax.scoring.tables import Table
 
 
@@ -30,5 +30,5 @@ def page(title: str, tables: Sequence[Table], notes: Sequence[str], shown: Seque
         ],
     }
     return template(Path(__file__).with_name("page.html")).render(
-        title=title, tables=tables, notes=notes, pictures=pictures, style=STYLE
+        title=title, tables=tables, notes=notes, pictures=pictures
     )

@@ -29,6 +29,24 @@ COSTS = {"parameters": "Parameters", "ms_per_step": "ms per step", "ms_per_view"
 BETTER, WORSE, OPEN = figures.GREEN, figures.RED, figures.COLORS[6]
 
 
+def study(
+    out: Path,
+    what: str,
+    trainings: Sequence[Variant],
+    reference: str,
+    budget: Budget,
+    dataset: data_sets.Dataset,
+    more: Mapping[str, object] | None = None,
+    **asked: object,
+) -> None:
+    """Trains what is not trained in a folder that is this experiment's, scores all variants, writes the files."""
+    names = budget.names(dataset)
+    data_sets.check_resolution(data_sets.read_object(dataset, names[0]), trainings[0].config)
+    variants.claim(out, what, budget, dataset, **asked)
+    compared = variants.score(variants.train(trainings, budget, out), reference, dataset, names, budget.shown)
+    write(out, trainings, reference, compared, budget, dataset, more)
+
+
 def write(
     out: Path,
     trained: Sequence[Variant],

@@ -64,13 +64,8 @@ def main(options: Fig2) -> None:
         generate(generation(options, folder))
     dataset = data_sets.open_dataset(folder)
     runs = trainings(options, dataset)
-    names, config = options.budget.names(dataset), runs[0].config
-    data_sets.check_resolution(data_sets.read_object(dataset, names[0]), config)
-    variants.claim(options.out, "fig2", options.budget, dataset)
+    variants_report.study(options.out, "fig2", runs, "without", options.budget, dataset)
     write_whole(options.out / "variants.png", variants_picture(dataset, options.budget.shown))
-    trained = variants.train(runs, options.budget, options.out)
-    compared = variants.score(trained, "without", dataset, names, options.budget.shown)
-    variants_report.write(options.out, runs, "without", compared, options.budget, dataset)
 
 
 def generation(options: Fig2, folder: Path) -> GenerateConfig:

@@ -14,7 +14,7 @@ import numpy as np
 
 from spnr_jax.formats.images import depth_image, png_url, to_uint8, write_whole
 from spnr_jax.scoring.learning_curve import learning_curve_svg
-from spnr_jax.scoring.report_style import STYLE, template
+from spnr_jax.scoring.report_style import template
 from spnr_jax.scoring.tables import METHODS, QUALITY, Table, difference, head, lowered, quality, text
 
 COUNTS = {"objects": "Objects", "views": "Views", "cpsnr_views": "cPSNR views"}
@@ -75,7 +75,6 @@ def write_report(
     shown = gallery[0].images if gallery else {}
     page = template(Path(__file__).with_name("report.html")).render(
         title=title,
-        style=STYLE,
         paragraphs=[part for part in summary.split("\n\n") if part.strip()],
         tiles=_key_numbers(metrics),
         gallery_note=GALLERY_NOTE,
