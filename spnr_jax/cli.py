@@ -12,7 +12,6 @@ import os
 import re
 import sys
 import time
-import traceback
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -22,7 +21,7 @@ import tyro
 
 from spnr_jax import presets
 from spnr_jax.devices import allocator, compilation
-from spnr_jax.errors import UserError, one_line, split_debug
+from spnr_jax.errors import UserError, guarded, split_debug
 from spnr_jax.model_config import SurfelConfig
 from spnr_jax.tools.commands import ConvertLpips, Evaluate, Export, Runs, Train, View
 from spnr_jax.tools.render_command import Render, is_catalogue
@@ -50,24 +49,6 @@ def main(arguments: list[str] | None = None) -> None:
 def _one_of_several() -> bool:
     jax = sys.modules.get("jax")  # a mistyped option need not wait until it is imported
     return jax is not None and jax.distributed.is_initialized() and jax.process_count() > 1
-
-
-def guarded(work: Callable[[], None], name: str, debug: bool = False) -> int:
-    """Exit code of the work; an error that a person can mend is one line on stderr and code 2, a stop is code 130.
-
-    For `debug` the line stands behind the call stack.
-    """
-    try:
-        work()
-    except KeyboardInterrupt as stop:
-        print(f"{name}: {str(stop) or 'stopped'}", file=sys.stderr)
-        return 130
-    except (ValueError, OSError) as error:
-        if debug:
-            traceback.print_exc()
-        print(f"{name}: {one_line(error)}", file=sys.stderr)
-        return 2
-    return 0
 
 
 def parse(arguments: list[str]) -> Command:

@@ -17,7 +17,7 @@ import tyro
 from tqdm import tqdm
 
 from data_gen.store import check, layout, storage
-from spnr_jax.errors import UserError
+from spnr_jax.errors import UserError, at_least
 
 OPTIONS = "group_size:1"  # each record by itself, so that one object is one read; zstd by default
 BYTES_PER_MB = 10**6
@@ -37,8 +37,7 @@ class PackConfig:
 
 def pack(config: PackConfig) -> None:
     """Write the packed form of a data set; ValueError or OSError, and nothing is left, if it cannot be."""
-    if config.shard_mb < 1:
-        raise UserError(f"--shard-mb: expected 1 or more, got {config.shard_mb}")
+    at_least(config, 1, "shard_mb")
     if config.out.exists():
         raise UserError(f"{config.out} exists already: choose another folder")
     check.read_description(config.dataset)

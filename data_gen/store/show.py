@@ -11,9 +11,9 @@ import tyro
 
 from data_gen.render import views
 from data_gen.store import check, layout
-from spnr_jax.errors import UserError
+from spnr_jax.errors import UserError, at_least
 from spnr_jax.formats.images import png_url
-from spnr_jax.scoring.report_style import template
+from spnr_jax.formats.pages import template
 
 # point fields that are shown: three for a colour, one for grey
 CHANNELS = (("base_color_r", "base_color_g", "base_color_b"), ("roughness",), ("metallic",))
@@ -36,8 +36,7 @@ class ShowConfig:
 def show(config: ShowConfig) -> Path:
     """Write the contact sheet; return its path."""
     check.read_description(config.dataset)
-    if config.objects < 1:
-        raise UserError(f"--objects: expected 1 or more, got {config.objects}")
+    at_least(config, 1, "objects")
     object_ids = sorted(layout.completed_objects(config.dataset))
     if not object_ids:
         raise UserError(f"{config.dataset} holds no finished object yet; run spnr-data generate again")

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from experiments.comparison.object_scores import Shown
 from spnr_jax.formats.images import png_url
-from spnr_jax.scoring.report_style import template
+from spnr_jax.formats.pages import template
 from spnr_jax.scoring.tables import Table
 
 

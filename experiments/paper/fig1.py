@@ -61,8 +61,8 @@ def main(options: Fig1) -> None:
     runs = [variant(options, weight, options.budget.config(), dataset) for weight in options.l1_weights]
     reference = runs[options.l1_weights.index(100.0) if 100.0 in options.l1_weights else 0].name
     start = f"{options.pretrain} steps of L1 alone" if options.pretrain else "scratch"
-    asked = {"more": {"start": start}, "pretrain": options.pretrain}
-    variants_report.study(options.out, "fig1", runs, reference, options.budget, dataset, **asked)
+    given = (options.out, "fig1", runs, reference, options.budget, dataset)
+    variants_report.study(*given, {"start": start}, pretrain=options.pretrain)
 
 
 def variant(options: Fig1, weight: float, config: TrainConfig, dataset: data_sets.Dataset) -> Variant:

@@ -30,7 +30,7 @@ from experiments.speed import bench_report as report
 from experiments.speed.bench_scene import BATCHES
 from experiments.speed.worker import Worker, worker
 from spnr_jax.devices import machine
-from spnr_jax.errors import UserError
+from spnr_jax.errors import UserError, at_least
 from spnr_jax.formats.images import write_whole
 
 Preset = Literal["tiny", "small", "abo"]
@@ -71,9 +71,7 @@ class Options:
     """A check that everything works: tiny, two rounds, short turns, into OUT-quick."""
 
     def __post_init__(self) -> None:
-        for name in ("rounds", "threads"):
-            if getattr(self, name) < 1:
-                raise UserError(f"--{name} must be at least 1, got {getattr(self, name)}")
+        at_least(self, 1, "rounds", "threads")
 
 
 @dataclass(frozen=True, kw_only=True)

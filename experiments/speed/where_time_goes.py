@@ -26,7 +26,7 @@ from experiments.comparison import clock, results_folder
 from experiments.speed.surfel_scene import orbiting, random_crops, sphere
 from spnr_jax import cli
 from spnr_jax.devices import machine
-from spnr_jax.errors import UserError
+from spnr_jax.errors import at_least
 from spnr_jax.method import surfel_plan, surfel_renderer
 from spnr_jax.model_config import SurfelConfig
 from spnr_jax.nn.shader import Shader, picture
@@ -57,9 +57,7 @@ class WhereTimeGoes:
     """A check that everything works: a few points and pixels, two turns."""
 
     def __post_init__(self) -> None:
-        for name in ("points", "size", "rounds"):
-            if getattr(self, name) < 1:
-                raise UserError(f"--{name} must be at least 1, got {getattr(self, name)}")
+        at_least(self, 1, "points", "size", "rounds")
 
 
 class Program(NamedTuple):

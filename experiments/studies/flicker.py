@@ -32,7 +32,7 @@ from experiments.comparison.source_meshes import cast_views, mesh_of
 from experiments.comparison.trained_networks import Network, Sources
 from spnr_jax import cli
 from spnr_jax.devices import machine
-from spnr_jax.errors import UserError
+from spnr_jax.errors import UserError, at_least
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.images import to_uint8, write_turntable
 from spnr_jax.kernels import cameras
@@ -72,8 +72,7 @@ class Flicker:
 
 def main(options: Flicker) -> None:
     """Makes what is missing of the references, then frames, scores and pictures."""
-    if options.frames < 3:
-        raise UserError(f"--frames: expected 3 or more, got {options.frames}")
+    at_least(options, 3, "frames")
     cli.set_up_jax()
     dataset = data_sets.open_dataset(options.data)
     names = trained_networks.test_objects(dataset, options.objects)

@@ -32,7 +32,7 @@ from experiments.comparison.variants import Preset
 from spnr_jax import cli
 from spnr_jax.config import TrainConfig
 from spnr_jax.devices import machine
-from spnr_jax.errors import UserError
+from spnr_jax.errors import UserError, at_least
 from spnr_jax.formats import data_sets
 from spnr_jax.presets import PRESETS
 from spnr_jax.scoring import evaluation
@@ -72,8 +72,7 @@ class TimeToQuality:
             raise UserError(f"--seeds: expected one or more numbers, none of them twice, got {list(self.seeds)}")
         if not self.seconds > 0:
             raise UserError(f"--seconds: expected more than 0, got {self.seconds:g}")
-        if self.marks < 1:
-            raise UserError(f"--marks: expected 1 or more, got {self.marks}")
+        at_least(self, 1, "marks")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -21,11 +21,10 @@ from spnr_jax.formats.gaussian_files import check_suffix, spz_of, write_splats
 from spnr_jax.kernels.records import Camera, Gaussians
 from spnr_jax.method.model import FIELD_OF_VIEW
 from spnr_jax.tools import mesh_making
-from spnr_jax.tools.light_options import Lighting
 from spnr_jax.tools.pictures import Ready, made_ready
 from spnr_jax.tools.render_command import Render
 from spnr_jax.tools.share_command import Share
-from spnr_jax.tools.splat_making import RESOLUTION, splats_of
+from spnr_jax.tools.splat_making import RESOLUTION, note_of, splats_of
 from spnr_jax.training.weights import SHIPPED, load
 
 MOST_BYTES = 6_000_000  # of a page
@@ -116,17 +115,3 @@ def page(
             "ask for fewer splats (--most-splats) or plainer ones (--harmonics 0)"
         )
     return content
-
-
-def note_of(asked: Render, network: str = "") -> str:
-    """The line that names cloud, network and light; the network is that of the options, or another."""
-    drawn_by = Path(network or str(asked.run)).name
-    return f"{asked.cloud.name}, drawn by spnr_jax ({drawn_by}), light: {light_name(asked.lighting)}"
-
-
-def light_name(lighting: Lighting) -> str:
-    """The light in words, without folders."""
-    parts = [Path(lighting.light).name] if lighting.light else ([] if lighting.sun else ["room"])
-    parts += [f"sun {lighting.sun[0]:g} {lighting.sun[1]:g}"] if lighting.sun else []
-    options = {"yaw": lighting.light_yaw, "exposure": lighting.exposure}
-    return " + ".join(parts) + "".join(f", {name} {value:g}" for name, value in options.items() if value)

@@ -7,6 +7,7 @@ splats             gaussians/placing.py, coloring.py, refining.py, in the box, t
 import dataclasses
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -20,6 +21,8 @@ from spnr_jax.method.model import DISTANCE, Model, Volume
 from spnr_jax.method.surfel_renderer import SurfelScene
 from spnr_jax.model_config import SurfelConfig
 from spnr_jax.tools.depth_maps import surface_depth
+from spnr_jax.tools.light_options import Lighting
+from spnr_jax.tools.render_command import Render
 
 VIEWS, RESOLUTION = 32, 512  # pictures, and their pixels along each side
 GOLDEN_ANGLE = 180 * (3 - np.sqrt(5))  # degrees between the azimuths of one direction and the next
@@ -155,6 +158,20 @@ def in_units(gaussians: Gaussians, volume: Volume) -> Gaussians:
     scale, arrays = np.asarray(volume.scale), jax.tree.map(np.asarray, gaussians)
     position = arrays.position / scale + np.asarray(volume.centre)
     return arrays.replace(position=position, scale=arrays.scale / scale)
+
+
+def note_of(asked: Render, network: str = "") -> str:
+    """The line that names cloud, network and light; the network is that of the options, or another."""
+    drawn_by = Path(network or str(asked.run)).name
+    return f"{asked.cloud.name}, drawn by spnr_jax ({drawn_by}), light: {light_name(asked.lighting)}"
+
+
+def light_name(lighting: Lighting) -> str:
+    """The light in words, without folders."""
+    parts = [Path(lighting.light).name] if lighting.light else ([] if lighting.sun else ["room"])
+    parts += [f"sun {lighting.sun[0]:g} {lighting.sun[1]:g}"] if lighting.sun else []
+    options = {"yaw": lighting.light_yaw, "exposure": lighting.exposure}
+    return " + ".join(parts) + "".join(f", {name} {value:g}" for name, value in options.items() if value)
 
 
 def _surfels(cloud: PointCloud, volume: Volume) -> SurfelScene:
