@@ -6,6 +6,7 @@ A cell is a text, smaller ones behind it (an interval), whether it stands out, a
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -44,8 +45,8 @@ class Cell:
     text: str
     small: tuple[str, ...] = ()
     best: bool = False
-    value: float | None = None
-    interval: tuple[float, float] | None = None
+    value: Any = None
+    interval: tuple[Any, Any] | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,12 +65,12 @@ def text(value: object) -> Cell:
 
 
 def number(
-    value: float | None,
+    value: Any,
     decimals: int,
-    interval: Sequence[float] | None = None,
+    interval: Sequence[Any] | None = None,
     *,
     sign: str = "",
-    factor: float = 1,
+    factor: float | int = 1,
     missing: str = "n/a",
     best: bool = False,
     more: tuple[str, ...] = (),
@@ -85,7 +86,7 @@ def number(
 
 
 def mean_row(
-    label: str, objects: Sequence[Sequence[float | None]] | np.ndarray, decimals: Sequence[int], sign: str = ""
+    label: str, objects: Sequence[Sequence[Any]] | np.ndarray, decimals: Sequence[int], sign: str = ""
 ) -> tuple[str, tuple[Cell, ...]]:
     """A row of means of columns over objects, with intervals; None and NaN are left out."""
     cells = []
