@@ -18,8 +18,9 @@ takes on that machine alone.
 
 import dataclasses
 import itertools
+import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -30,20 +31,22 @@ import numpy as np
 
 from data_gen.render.variant import choose_variant
 from experiments import entry_point
-from experiments.comparison import exported_mesh, figures, poisson, results_folder, splats_by_mitsuba
-from experiments.comparison.exported_mesh import ExportedMesh
+from experiments.comparison import figures, poisson, results_folder, splats_by_mitsuba
 from experiments.comparison.object_views import Picture, at, drawn, few, on_white, told, view_of
 from experiments.studies.splat_quality_report import BY_MITSUBA, MESH, after, caption, methods_of, tables_of
 from spnr_jax.devices import machine
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets, gaussian_files, images
+from spnr_jax.formats.clouds import PlacedCloud
+from spnr_jax.formats.mesh.assets import Asset
+from spnr_jax.formats.mesh.meshes import load_mesh
 from spnr_jax.gaussians import drawing
 from spnr_jax.gaussians.placing import View
 from spnr_jax.kernels.metrics import psnr
 from spnr_jax.kernels.records import Gaussians, PointCloud
 from spnr_jax.method.model import Model, Volume
 from spnr_jax.scoring.picture_scores import sharpness
-from spnr_jax.tools import splat_making
+from spnr_jax.tools import fused_surface, mesh_export, splat_making
 from spnr_jax.tools.splat_making import drawn_views, fitting_cameras, in_box
 from spnr_jax.training.weights import load
 
@@ -139,8 +142,10 @@ def _mesh_scores(renderer: poisson.Renderer, options: SplatStudy, model: Model, 
     """Decibels of the mesh by size; its faces, megabytes as .glb and seconds."""
     cloud = _cloud(options, item)
     volume = model.encode(cloud)
-    views = _pictures(options, model, volume, item.name)
-    pictures, found = _meshed(options, partial(exported_mesh.exported, views, volume, cloud), renderer, item)
+    asset, found = _meshed(_pictures(options, model, volume, item.name), volume, cloud)
+    # where the network shows no surface the pictures are empty
+    nothing = np.zeros(item.images[: options.views].shape, np.uint8)
+    pictures = renderer.drawn(asset, few(item, options.views)) if asset else nothing
     for size in options.sizes:
         found |= _compared(options, model, volume, item, size, {MESH: [on_white(at(rgba, size)) for rgba in pictures]})
     return found
@@ -186,22 +191,19 @@ def _made(
     return made, {"splats": len(made.opacity), "spz_mb": spz, "steps": steps} | took
 
 
-def _meshed(
-    options: SplatStudy, make: Callable[[], ExportedMesh], renderer: poisson.Renderer, item: data_sets.ObjectData
-) -> tuple[np.ndarray, dict]:
-    """Pictures (views, height, width, 4) of the object's mesh, sRGB with straight alpha, and what it is.
-
-    Where the network shows no surface they are empty.
-    """
-    begin = time.perf_counter()
+def _meshed(views: Sequence[View], volume: Volume, cloud: PointCloud) -> tuple[Asset | None, dict]:
+    """The mesh that `spnr export --mesh` writes, read from its file, and what it is; None without a surface."""
+    begin, placed = time.perf_counter(), PlacedCloud(cloud=cloud, up="y", rotation=np.eye(3), origin=np.zeros(3))
     try:
-        mesh = make()
+        solid = mesh_export.mesh_of(fused_surface.solidity(views, volume, placed), placed)
     except UserError as error:
-        nothing = {"faces": 0, "glb_mb": 0.0, "watertight": False, "empty": str(error)}
-        return np.zeros(item.images[: options.views].shape, np.uint8), nothing | {"mesh_seconds": 0.0}
-    found = {"faces": mesh.faces, "glb_mb": mesh.size / 1e6, "watertight": mesh.watertight, "empty": ""}
-    found["mesh_seconds"] = time.perf_counter() - begin
-    return renderer.drawn(mesh.asset, few(item, options.views)), found
+        return None, {"faces": 0, "glb_mb": 0.0, "watertight": False, "empty": str(error), "mesh_seconds": 0.0}
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "mesh.glb"
+        path.write_bytes(solid.content)
+        asset = load_mesh(path)
+    found = {"faces": solid.faces, "glb_mb": len(solid.content) / 1e6, "watertight": solid.watertight, "empty": ""}
+    return asset, found | {"mesh_seconds": time.perf_counter() - begin}
 
 
 def _scored(shown: list[Picture], references: list[np.ndarray], of_network: list[Picture]) -> dict[str, float]:

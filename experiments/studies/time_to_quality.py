@@ -14,6 +14,7 @@ their pace: neither compilation nor scoring is in them, nor what else the machin
 
 import dataclasses
 import time
+from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
@@ -137,12 +138,10 @@ def config_of(preset: str, options: TimeToQuality, steps: int, seed: int = 0) ->
 
 def steps_of(preset: str, options: TimeToQuality, pace: Pace) -> int:
     """The most steps that fit into the seconds, at least one a mark."""
-    few, many = options.marks, options.marks + int(options.seconds / pace.alone) + 1
-    while few < many:  # the longest training that is in time
-        middle = (few + many + 1) // 2
-        in_time = pace.seconds(config_of(preset, options, middle), middle) <= options.seconds
-        few, many = (middle, many) if in_time else (few, middle - 1)
-    return few
+    longer = range(options.marks + 1, options.marks + int(options.seconds / pace.alone) + 2)
+    return options.marks + bisect_right(
+        longer, options.seconds, key=lambda steps: pace.seconds(config_of(preset, options, steps), steps)
+    )
 
 
 def curve(preset: str, seed: int, options: TimeToQuality, pace: Pace, dataset: data_sets.Dataset) -> list[Row]:

@@ -93,15 +93,12 @@ def test_pictures_become_smaller_as_the_references_do():
     np.testing.assert_allclose(image[1], 1, atol=1e-5)
 
 
-def test_an_object_without_a_surface_is_an_empty_picture_with_the_reason():
-    from types import SimpleNamespace
-
-    def nothing():
+def test_an_object_without_a_surface_has_no_mesh_and_the_reason(monkeypatch):
+    def nothing(*_):
         raise UserError("no surface to write as a mesh")
 
-    item, options = SimpleNamespace(images=np.ones((3, 4, 4, 4), np.uint8)), SimpleNamespace(views=2)
-    pictures, found = splat_quality._meshed(options, nothing, None, item)
-    assert pictures.shape == (2, 4, 4, 4)
-    assert not pictures.any()
+    monkeypatch.setattr(splat_quality.fused_surface, "solidity", nothing)
+    asset, found = splat_quality._meshed([], None, None)
+    assert asset is None
     assert found["empty"] == "no surface to write as a mesh"
     assert found["faces"] == 0
