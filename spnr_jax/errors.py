@@ -46,6 +46,11 @@ def is_bug(error: Exception) -> bool:
     return isinstance(error, NameError) or (isinstance(error, AttributeError) and not isinstance(error.obj, JSON))
 
 
+def first_line(error: Exception) -> str:
+    """What an error of a library says, without the call stacks that some append; its kind if it says nothing."""
+    return (str(error).strip().splitlines() or [type(error).__name__])[0][:200]
+
+
 def one_line(error: Exception) -> str:
     """What an error says, on one line that a person can read whole; an error of the disk with its place."""
     said = str(error) or type(error).__name__

@@ -132,8 +132,12 @@ def _begin_to_draw(bench: Bench, item: Item, begun: Begun | UndrawnError) -> Cal
 
 def _written(bench: Bench, item: Item, begun: Begun, jobs: Iterable[Callable[[], Written]]) -> str | None:
     """Writes what is drawn of a file, its record last; None, or why it cannot be drawn."""
-    done = _tried(lambda: _finish(bench, item, begun, [_perform(job) for job in jobs]))
-    return None if done is None else str(done)
+    done = _tried(lambda: [_perform(job) for job in jobs])
+    if isinstance(done, UndrawnError):
+        return str(done)
+    names = tuple(path.name for one in done for path in one.paths)
+    catalogue_files.finish(item, bench.options.out, dataclasses.replace(begun.record, files=names))
+    return None
 
 
 def _tried(work: Callable[[], Result]) -> Result | UndrawnError:
@@ -154,11 +158,7 @@ def draw_item(bench: Bench, item: Item) -> str | None:
         raise UserError(f"{item.cloud}: worker {socket.gethostname()} does not see this file; mount it there")
     allocator.keep_arrays()
     compilation.keep_programs()
-
-    begun = _tried(partial(read, bench, item))
-    return (
-        str(begun) if isinstance(begun, UndrawnError) else _written(bench, item, begun, _jobs(bench, item, begun.ready))
-    )
+    return _begin_to_draw(bench, item, _tried(partial(read, bench, item)))()
 
 
 def read(bench: Bench, item: Item) -> Begun:
@@ -182,11 +182,6 @@ def _perform(job: Callable[[], Written]) -> Written:
         return job()
     except ValueError as error:
         raise UndrawnError(one_line(error)) from error
-
-
-def _finish(bench: Bench, item: Item, begun: Begun, written: list[Written]) -> None:
-    names = tuple(path.name for one in written for path in one.paths)
-    catalogue_files.finish(item, bench.options.out, dataclasses.replace(begun.record, files=names))
 
 
 @contextmanager
