@@ -54,18 +54,11 @@ def _one_of_several() -> bool:
 def parse(arguments: list[str]) -> Command:
     """The command with all its options; the preset named by --preset gives the defaults of the others."""
     train = Annotated[Train, tyro.conf.subcommand("train", default=_train_defaults(arguments))]
-    evaluate = Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
-    render = Annotated[Render, tyro.conf.subcommand("render")]
-    view = Annotated[View, tyro.conf.subcommand("view")]
-    export = Annotated[Export, tyro.conf.subcommand("export")]
-    share = Annotated[Share, tyro.conf.subcommand("share")]
-    runs = Annotated[Runs, tyro.conf.subcommand("runs")]
-    convert = Annotated[ConvertLpips, tyro.conf.subcommand("convert-lpips")]
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said):
             return tyro.cli(
-                train | evaluate | render | view | export | share | runs | convert,
+                train | Evaluate | Render | View | Export | Share | Runs | ConvertLpips,
                 prog="spnr",
                 description=DESCRIPTION,
                 args=arguments,
