@@ -1,4 +1,4 @@
-"""Tables of results (spnr_jax/scoring/tables.py) as Markdown, LaTeX and CSV.
+"""Tables of results (spnr_jax/scoring/score_tables.py) as Markdown, LaTeX and CSV.
 
 The CSV holds the numbers behind the cells unrounded: a line a cell, with the title of its table, its row and column.
 """
@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 from tabulate import tabulate
 
-from spnr_jax.scoring.tables import Cell, Table
+from spnr_jax.scoring.score_tables import Cell, Table
 
 SIGNS = {"\N{UPWARDS ARROW}": r"$\uparrow$", "\N{DOWNWARDS ARROW}": r"$\downarrow$", "\N{NO-BREAK SPACE}": "~"}
 BOLD, SMALL, END = "\x01", "\x02", "\x03"  # stand for LaTeX commands until tabulate has escaped the texts

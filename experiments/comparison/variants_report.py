@@ -16,8 +16,8 @@ from experiments.comparison.variants import OPAQUE, Budget, Compared, Variant
 from spnr_jax.devices import machine
 from spnr_jax.formats import data_sets, images
 from spnr_jax.scoring import evaluation
+from spnr_jax.scoring.score_tables import ARROWS, HIGHER, QUALITY, Cell, Table, number, text
 from spnr_jax.scoring.summary import difference, means, metric_settings
-from spnr_jax.scoring.tables import ARROWS, HIGHER, QUALITY, Cell, Table, number, text
 
 METRICS = {  # head, decimals, what is better
     "psnr": QUALITY["psnr"],

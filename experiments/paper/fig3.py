@@ -41,7 +41,7 @@ from spnr_jax.formats.images import depth_image, png
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.records import Camera, PointCloud
 from spnr_jax.scoring import evaluation
-from spnr_jax.scoring.tables import Table, number, text
+from spnr_jax.scoring.score_tables import Table, number, text
 
 FLOATER, MISSED = np.array([0.85, 0.1, 0.1]), np.array([0.15, 0.35, 0.85])
 WORST = 0.2  # error, in half diagonals, that the picture shows black

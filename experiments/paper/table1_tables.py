@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from experiments.comparison.budget import QUICK_STEPS
 from experiments.comparison.trained_networks import LABELS
 from spnr_jax.scoring.report import duration
-from spnr_jax.scoring.tables import Cell, Table, difference, head, lowered, number, quality
+from spnr_jax.scoring.score_tables import Cell, Table, difference, head, lowered, number, quality
 
 METRICS = ("psnr", "ssim", "lpips", "flip", "cpsnr", "iou")
 COSTS = {"parameters": "Parameters", "steps": "Steps", "training_seconds": "Training", "ms_per_view": "ms per view"}

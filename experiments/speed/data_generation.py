@@ -26,7 +26,7 @@ from experiments.comparison import results_folder
 from spnr_jax.devices import machine
 from spnr_jax.formats.mesh import surface_points
 from spnr_jax.scoring.report import psnr
-from spnr_jax.scoring.tables import Table, number
+from spnr_jax.scoring.score_tables import Table, number
 
 PHASES = {  # functions whose cumulative time is a phase; the rest is "other"
     "load": ("load_asset",),

@@ -36,7 +36,7 @@ from spnr_jax.devices import machine
 from spnr_jax.method import surfel_renderer
 from spnr_jax.model_config import RayNetworkConfig, SurfelConfig
 from spnr_jax.presets import PRESETS
-from spnr_jax.scoring.tables import Table, number, text
+from spnr_jax.scoring.score_tables import Table, number, text
 from spnr_jax.surfels.lighting import room_light
 from spnr_jax.training import many_runs, optimisation, shading
 

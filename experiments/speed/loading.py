@@ -33,7 +33,7 @@ from spnr_jax.config import TrainConfig
 from spnr_jax.devices import machine
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
-from spnr_jax.scoring.tables import Table, number, text
+from spnr_jax.scoring.score_tables import Table, number, text
 from spnr_jax.training import batching, optimisation
 
 TARGET = 0.02  # share of a step

@@ -31,7 +31,7 @@ from spnr_jax.devices import machine
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.records import Batch
 from spnr_jax.model_config import RayNetworkConfig
-from spnr_jax.scoring.tables import Table, number, text
+from spnr_jax.scoring.score_tables import Table, number, text
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -31,7 +31,7 @@ from spnr_jax.method import surfel_plan, surfel_renderer
 from spnr_jax.model_config import SurfelConfig
 from spnr_jax.nn.shader import Shader, picture
 from spnr_jax.presets import PRESETS
-from spnr_jax.scoring.tables import Table, number
+from spnr_jax.scoring.score_tables import Table, number
 from spnr_jax.surfels import projection
 from spnr_jax.surfels.lighting import room_light
 from spnr_jax.training import optimisation, shading

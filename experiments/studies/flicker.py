@@ -38,7 +38,7 @@ from spnr_jax.formats.images import to_uint8, write_turntable
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.records import Camera
 from spnr_jax.scoring import evaluation, intervals
-from spnr_jax.scoring.tables import Table, number, text
+from spnr_jax.scoring.score_tables import Table, number, text
 
 SAME_PLACE = 0.01  # half diagonals that what frame t sees there may be nearer or farther than the place
 REFERENCE = "references"

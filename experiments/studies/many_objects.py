@@ -33,7 +33,7 @@ from spnr_jax.kernels.records import Batch, PointCloud
 from spnr_jax.method import inference
 from spnr_jax.model_config import RayNetworkConfig
 from spnr_jax.presets import PRESETS
-from spnr_jax.scoring.tables import Table, number
+from spnr_jax.scoring.score_tables import Table, number
 from spnr_jax.training import adversary, batching, many_runs, optimisation
 
 MOST_POINTS = 4096  # of an object that is encoded

@@ -29,7 +29,7 @@ from spnr_jax.formats import data_sets
 from spnr_jax.kernels.cleaning import cleaned
 from spnr_jax.kernels.records import PointCloud
 from spnr_jax.kernels.thinning import voxel_keys
-from spnr_jax.scoring.tables import Table, number
+from spnr_jax.scoring.score_tables import Table, number
 from spnr_jax.training.scan_faults import noisy
 from spnr_jax.training.weights import load
 

@@ -29,7 +29,7 @@ from spnr_jax.formats import data_sets, images
 from spnr_jax.kernels.colors import srgb_to_linear
 from spnr_jax.kernels.records import Camera, Light
 from spnr_jax.method.model import Model, Quality, Volume
-from spnr_jax.scoring.tables import Table, mean_row
+from spnr_jax.scoring.score_tables import Table, mean_row
 from spnr_jax.training.weights import load
 
 HEADS = ("PSNR, dB", "inside, dB", "FLIP", "log error")

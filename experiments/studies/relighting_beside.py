@@ -40,7 +40,7 @@ from spnr_jax.formats import data_sets, images
 from spnr_jax.formats.mesh.assets import Asset
 from spnr_jax.method.model import Model, Volume
 from spnr_jax.scoring import evaluation
-from spnr_jax.scoring.tables import Table, mean_row
+from spnr_jax.scoring.score_tables import Table, mean_row
 from spnr_jax.training.weights import load
 
 POISSON, NO_SHADOWS, OCCLUSION = "Poisson, trimmed .3", "true mesh, no shadows", "true mesh, ambient occlusion"

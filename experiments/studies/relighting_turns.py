@@ -33,7 +33,7 @@ from spnr_jax.kernels.records import Camera
 from spnr_jax.method.model import Model, Volume
 from spnr_jax.scoring import evaluation
 from spnr_jax.scoring.picture_scores import sharpness
-from spnr_jax.scoring.tables import Table, mean_row
+from spnr_jax.scoring.score_tables import Table, mean_row
 from spnr_jax.surfels import envmaps, skies
 from spnr_jax.surfels.lighting import light_of
 from spnr_jax.training.weights import load

@@ -31,7 +31,7 @@ from spnr_jax.kernels.cloud_arrays import normalization
 from spnr_jax.kernels.records import Camera, PointCloud
 from spnr_jax.kernels.thinning import farthest_points
 from spnr_jax.method.model import Model, Quality
-from spnr_jax.scoring.tables import Cell, Table, mean_row, number
+from spnr_jax.scoring.score_tables import Cell, Table, mean_row, number
 from spnr_jax.training.scan_faults import Fault, faults
 from spnr_jax.training.weights import load
 

@@ -32,7 +32,7 @@ from spnr_jax.kernels import metrics
 from spnr_jax.kernels.records import PointCloud
 from spnr_jax.scoring.flip import flip
 from spnr_jax.scoring.picture_scores import ball, ball_waves, blue_share, plate, sharpness, under_true_opacity
-from spnr_jax.scoring.tables import Cell, Table, mean_row, number
+from spnr_jax.scoring.score_tables import Cell, Table, mean_row, number
 
 COLUMNS = {  # scores of a view: heads, decimals
     "psnr": ("PSNR, dB", 2),

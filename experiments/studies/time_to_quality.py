@@ -37,7 +37,7 @@ from spnr_jax.errors import UserError, at_least
 from spnr_jax.formats import data_sets
 from spnr_jax.presets import PRESETS
 from spnr_jax.scoring import evaluation
-from spnr_jax.scoring.tables import Table, number
+from spnr_jax.scoring.score_tables import Table, number
 from spnr_jax.training import adversary, batching, optimisation
 
 Row = dict[str, float]

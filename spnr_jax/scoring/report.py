@@ -15,7 +15,7 @@ import numpy as np
 from spnr_jax.formats.images import depth_image, png_url, to_uint8, write_whole
 from spnr_jax.formats.pages import template
 from spnr_jax.scoring.learning_curve import learning_curve_svg
-from spnr_jax.scoring.tables import METHODS, QUALITY, Table, difference, head, lowered, quality, text
+from spnr_jax.scoring.score_tables import METHODS, QUALITY, Table, difference, head, lowered, quality, text
 
 COUNTS = {"objects": "Objects", "views": "Views", "cpsnr_views": "cPSNR views"}
 GALLERY_NOTE = (

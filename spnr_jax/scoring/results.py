@@ -9,7 +9,7 @@ from spnr_jax.formats.config_json import to_dict
 from spnr_jax.formats.images import write_whole
 from spnr_jax.scoring.evaluation import FLOORS, Evaluation, ObjectResult, median_view
 from spnr_jax.scoring.report import GalleryRow, write_report
-from spnr_jax.scoring.tables import METHODS, MISSING, QUALITY, lowered, number
+from spnr_jax.scoring.score_tables import METHODS, MISSING, QUALITY, lowered, number
 
 
 def write_results(

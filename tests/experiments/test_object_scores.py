@@ -9,7 +9,7 @@ from experiments.comparison import object_scores, page
 from experiments.comparison.object_scores import Shown
 from experiments.paper import table1_tables
 from spnr_jax.scoring import evaluation
-from spnr_jax.scoring.tables import quality
+from spnr_jax.scoring.score_tables import quality
 
 
 def test_the_best_of_a_column_is_the_highest_or_for_errors_the_lowest():

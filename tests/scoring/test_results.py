@@ -8,8 +8,8 @@ import pytest
 from support import tiny_dataset
 
 from spnr_jax.scoring import evaluation, results
+from spnr_jax.scoring.score_tables import METHODS
 from spnr_jax.scoring.summary import METRICS
-from spnr_jax.scoring.tables import METHODS
 from spnr_jax.training import metrics_log
 
 NUMBERS = {"objects", "views", "cpsnr_views", *METRICS, *(f"{metric}_interval" for metric in METRICS)}
