@@ -10,6 +10,7 @@ from experiments.comparison.object_views import at, on_white
 from experiments.studies import splat_quality
 from spnr_jax.errors import UserError
 from spnr_jax.formats.mesh.assets import Asset, Material, Part
+from spnr_jax.kernels.cloud_arrays import plain_cloud
 
 NAME = "ball_000000"
 SETTINGS = {"resolution": tiny_surfels.SIZE, "fov": 40.0, "spp": 4, "max_depth": 3}
@@ -98,7 +99,7 @@ def test_an_object_without_a_surface_has_no_mesh_and_the_reason(monkeypatch):
         raise UserError("no surface to write as a mesh")
 
     monkeypatch.setattr(splat_quality.fused_surface, "solidity", nothing)
-    asset, found = splat_quality._meshed([], None, None)
+    asset, found = splat_quality._meshed([], None, plain_cloud(np.zeros((1, 3), np.float32)))
     assert asset is None
     assert found["empty"] == "no surface to write as a mesh"
     assert found["faces"] == 0
