@@ -21,7 +21,7 @@ from typing import Any, Literal
 import numpy as np
 
 from data_gen.render.variant import mitsuba_module
-from spnr_jax.formats.mesh.assets import Asset, Part, RejectedAsset
+from spnr_jax.formats.mesh.assets import Asset, Material, Part, RejectedAsset
 
 POLE_COSINE = 0.999  # nearer to the y axis than this, z takes the part of "up"
 SURFACE_MARGIN = 1e-4  # a ray to the camera starts this far from its point: float32 places a point to about 1e-7
@@ -132,7 +132,7 @@ def mitsuba_mesh(part: Part, name: str):
     mi = mitsuba_module()
     properties = mi.Properties()
     properties["bsdf"] = mi.load_dict({"type": "twosided", "inner": principled(part)})
-    textured = part.material.textured
+    textured = has_texture(part.material)
     mesh = mi.Mesh(
         name,
         vertex_count=len(part.positions),
@@ -156,6 +156,11 @@ def mitsuba_mesh(part: Part, name: str):
         buffers["vertex_texcoords"] = np.asarray(part.texcoords, np.float32).ravel()
     buffers.update()
     return mesh
+
+
+def has_texture(material: Material) -> bool:
+    """Whether any channel of the material needs texture coordinates."""
+    return np.ndim(material.base_color) == 3 or np.ndim(material.roughness) == 2 or np.ndim(material.metallic) == 2
 
 
 def principled(part: Part) -> dict:
