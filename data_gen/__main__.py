@@ -5,7 +5,6 @@ Errors of the user and of the disk are one line on stderr and exit code 2; Ctrl-
 """
 
 import sys
-import traceback
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -18,7 +17,7 @@ from data_gen.plan.tasks import GenerateConfig
 from data_gen.store.check import check
 from data_gen.store.pack import PackConfig, pack
 from data_gen.store.show import ShowConfig, show
-from spnr_jax.errors import split_debug
+from spnr_jax.errors import UserError, guarded, split_debug
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,16 +34,9 @@ Command = GenerateConfig | CheckConfig | ShowConfig | PackConfig
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line."""
     arguments, debug = split_debug(sys.argv[1:] if arguments is None else arguments)
-    config = parse(arguments)
-    try:
-        sys.exit(run(config))
-    except KeyboardInterrupt:
-        sys.exit(interrupted())
-    except (ValueError, OSError) as error:
-        if debug:
-            traceback.print_exc()
-        print(f"spnr-data: {one_line(error, config)}", file=sys.stderr)
-        sys.exit(2)
+    config, codes = parse(arguments), []
+    code = guarded(lambda: codes.append(run(config)), "spnr-data", debug)
+    sys.exit(code or codes[0])
 
 
 def parse(arguments: list[str]) -> Command:
@@ -73,32 +65,26 @@ def preset_defaults(arguments: list[str]) -> GenerateConfig:
 
 
 def run(config: Command) -> int:
-    """The exit code of one command."""
-    if isinstance(config, GenerateConfig):
-        generate(config)
-        return 0
-    if isinstance(config, CheckConfig):
-        return 0 if check(config.dataset) else 1
-    if isinstance(config, PackConfig):
-        pack(config)
-        return 0
-    show(config)
+    """The exit code of one command; errors of the disk and stops say what is kept."""
+    kept = "; finished objects are kept, the same command goes on from there"
+    try:
+        if isinstance(config, CheckConfig):
+            return 0 if check(config.dataset) else 1
+        if isinstance(config, GenerateConfig):
+            generate(config)
+        elif isinstance(config, PackConfig):
+            pack(config)
+        else:
+            show(config)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(f"stopped{kept}") from None
+    except OSError as error:
+        generating = isinstance(config, GenerateConfig)
+        if error.strerror:
+            place = error.filename or (config.out if isinstance(config, GenerateConfig) else config.dataset)
+            raise UserError(f"{place}: {error.strerror}{kept if generating else ''}") from error
+        raise
     return 0
-
-
-def interrupted() -> int:
-    """Say that the run was stopped; return the exit code."""
-    print("spnr-data: stopped; finished objects are kept, the same command goes on from there", file=sys.stderr)
-    return 130
-
-
-def one_line(error: Exception, config: Command) -> str:
-    """What an error says, on one line; an error of the disk with its place and what to do."""
-    if isinstance(error, OSError) and error.strerror:
-        place = error.filename or (config.out if isinstance(config, GenerateConfig) else config.dataset)
-        kept = "; finished objects are kept, the same command goes on from there"
-        return f"{place}: {error.strerror}{kept if isinstance(config, GenerateConfig) else ''}"
-    return " ".join(str(error).split())
 
 
 if __name__ == "__main__":

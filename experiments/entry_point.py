@@ -7,7 +7,7 @@ from typing import Any, NoReturn
 
 import tyro
 
-from spnr_jax import cli, errors
+from spnr_jax import errors
 
 
 def run(main: Callable[[Any], object], options: type, name: str) -> NoReturn:
@@ -19,4 +19,4 @@ def run(main: Callable[[Any], object], options: type, name: str) -> NoReturn:
     def work() -> None:
         main(tyro.cli(options, prog=f"python -m experiments.{name}", args=arguments))
 
-    sys.exit(cli.guarded(work, name.rpartition(".")[2], debug))
+    sys.exit(errors.guarded(work, name.rpartition(".")[2], debug))

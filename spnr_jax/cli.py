@@ -12,23 +12,22 @@ import os
 import re
 import sys
 import time
-import traceback
 from collections.abc import Callable
 from functools import partial
-from typing import Annotated, Any
+from pathlib import Path
+from typing import Annotated
 
 import tyro
 
 from spnr_jax import presets
 from spnr_jax.devices import allocator, compilation
-from spnr_jax.errors import UserError, one_line, split_debug
+from spnr_jax.errors import UserError, guarded, split_debug
 from spnr_jax.model_config import SurfelConfig
 from spnr_jax.tools.commands import ConvertLpips, Evaluate, Export, Runs, Train, View
 from spnr_jax.tools.render_command import Render, is_catalogue
 from spnr_jax.tools.share_command import Share
 
 BOX = r"[╭╮╰╯│─•]+|__tyro-dummy-inner__\."  # what tyro draws around an error, and its name for the whole command
-MANY_POINTS = 16384  # of a cloud that splats are made of
 DESCRIPTION = """Sparse-point neural rendering: train a network, evaluate one, render a cloud of points.
 --debug, or SPNR_DEBUG=1, shows the call stack of an error."""
 
@@ -52,39 +51,14 @@ def _one_of_several() -> bool:
     return jax is not None and jax.distributed.is_initialized() and jax.process_count() > 1
 
 
-def guarded(work: Callable[[], None], name: str, debug: bool = False) -> int:
-    """Exit code of the work; an error that a person can mend is one line on stderr and code 2, a stop is code 130.
-
-    For `debug` the line stands behind the call stack.
-    """
-    try:
-        work()
-    except KeyboardInterrupt as stop:
-        print(f"{name}: {str(stop) or 'stopped'}", file=sys.stderr)
-        return 130
-    except (ValueError, OSError) as error:
-        if debug:
-            traceback.print_exc()
-        print(f"{name}: {one_line(error)}", file=sys.stderr)
-        return 2
-    return 0
-
-
 def parse(arguments: list[str]) -> Command:
     """The command with all its options; the preset named by --preset gives the defaults of the others."""
     train = Annotated[Train, tyro.conf.subcommand("train", default=_train_defaults(arguments))]
-    evaluate = Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
-    render = Annotated[Render, tyro.conf.subcommand("render")]
-    view = Annotated[View, tyro.conf.subcommand("view")]
-    export = Annotated[Export, tyro.conf.subcommand("export")]
-    share = Annotated[Share, tyro.conf.subcommand("share")]
-    runs = Annotated[Runs, tyro.conf.subcommand("runs")]
-    convert = Annotated[ConvertLpips, tyro.conf.subcommand("convert-lpips")]
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said):
             return tyro.cli(
-                train | evaluate | render | view | export | share | runs | convert,
+                train | Evaluate | Render | View | Export | Share | Runs | ConvertLpips,
                 prog="spnr",
                 description=DESCRIPTION,
                 args=arguments,
@@ -138,6 +112,11 @@ def set_up_jax(*, repeats: bool = True) -> None:
     compilation.keep_programs()
 
 
+def _noted(cloud: Path) -> Callable[[str], None]:
+    """What tells a person the assumptions about a cloud."""
+    return lambda line: print(f"{cloud}: {line}", file=sys.stderr)
+
+
 def run_train(command: Train) -> None:
     """`spnr train`."""
     import jax
@@ -187,7 +166,7 @@ def run_render(command: Render) -> None:
     else:
         from spnr_jax.tools.pictures import render_file
 
-        lines = render_file(command, note=lambda line: print(f"{command.cloud}: {line}", file=sys.stderr))
+        lines = render_file(command, _noted(command.cloud))
     for line in lines:
         print(line, flush=True)
 
@@ -207,7 +186,13 @@ def run_view(command: View) -> None:
 def run_export(command: Export) -> None:
     """`spnr export`."""
     if command.splats is not None or command.mesh is not None:
-        run_export_object(command)
+        from spnr_jax.tools import splat_export
+
+        asked, said = splat_export.asked_of(command, command.run, command.network), _noted(command.run)
+        if command.mesh is not None:
+            splat_export.export_mesh(asked, command.mesh, said, partial(print, flush=True))
+        if command.splats is not None:
+            splat_export.export_splats(asked, command.splats, said, partial(print, flush=True))
         return
     from spnr_jax.formats.images import write_whole
     from spnr_jax.method import model
@@ -236,30 +221,11 @@ def run_export(command: Export) -> None:
     print(f"wrote weights.npz, encode and render to {command.out} (export.json says what they take and give)")
 
 
-def run_export_object(command: Export) -> None:
-    """`spnr export --splats` and `--mesh`."""
-    from spnr_jax.tools import mesh_making, splat_export
-
-    of_cloud: dict[str, Any] = {
-        "run": command.network,
-        "num_points": command.num_points or MANY_POINTS,
-        "up": command.up,
-        "clean": command.clean,
-        "note": lambda line: print(f"{command.run}: {line}", file=sys.stderr),
-        "report": partial(print, flush=True),
-    }
-    if command.mesh is not None:
-        mesh_making.export_mesh(command.run, command.mesh, **of_cloud)
-    if command.splats is not None:
-        lighting, making = command.lighting, command.making
-        splat_export.export_splats(command.run, command.splats, lighting=lighting, making=making, **of_cloud)
-
-
 def run_share(command: Share) -> None:
     """`spnr share`."""
     from spnr_jax.tools.splat_export import share
 
-    share(command, lambda line: print(f"{command.cloud}: {line}", file=sys.stderr), partial(print, flush=True))
+    share(command, _noted(command.cloud), partial(print, flush=True))
 
 
 def run_runs(command: Runs) -> None:

@@ -1,7 +1,10 @@
 """The errors that a person can mend, the bugs that are ours, and when a call stack is shown."""
 
 import os
+import sys
 import traceback
+from collections.abc import Callable
+from typing import Any
 
 JSON = (dict, list, str, int, float, bool, type(None))
 LONGEST_LINE = 800  # characters of an error
@@ -16,6 +19,14 @@ def require(condition: bool, message: str) -> None:
     """UserError with the message, unless the condition holds."""
     if not condition:
         raise UserError(message)
+
+
+def at_least(options: Any, least: int, *names: str) -> None:
+    """UserError for the first of these options that is given and smaller."""
+    for name in names:
+        value = getattr(options, name)
+        if value is not None and value < least:
+            raise UserError(f"--{name.replace('_', '-')}: expected {least} or more, got {value}")
 
 
 def split_debug(arguments: list[str]) -> tuple[list[str], bool]:
@@ -35,6 +46,11 @@ def is_bug(error: Exception) -> bool:
     return isinstance(error, NameError) or (isinstance(error, AttributeError) and not isinstance(error.obj, JSON))
 
 
+def first_line(error: Exception) -> str:
+    """What an error of a library says, without the call stacks that some append; its kind if it says nothing."""
+    return (str(error).strip().splitlines() or [type(error).__name__])[0][:200]
+
+
 def one_line(error: Exception) -> str:
     """What an error says, on one line that a person can read whole; an error of the disk with its place."""
     said = str(error) or type(error).__name__
@@ -43,3 +59,21 @@ def one_line(error: Exception) -> str:
     line = " ".join(said.split())
     # a name or number in a broken file may be of any length
     return line if len(line) <= LONGEST_LINE else f"{line[: LONGEST_LINE // 2]} ... {line[-LONGEST_LINE // 2 :]}"
+
+
+def guarded(work: Callable[[], None], name: str, debug: bool = False) -> int:
+    """Exit code of the work; an error that a person can mend is one line on stderr and code 2, a stop is code 130.
+
+    For `debug` the line stands behind the call stack.
+    """
+    try:
+        work()
+    except KeyboardInterrupt as stop:
+        print(f"{name}: {str(stop) or 'stopped'}", file=sys.stderr)
+        return 130
+    except (ValueError, OSError) as error:
+        if debug:
+            traceback.print_exc()
+        print(f"{name}: {one_line(error)}", file=sys.stderr)
+        return 2
+    return 0

@@ -278,9 +278,9 @@ def test_an_error_shows_its_call_stack_for_debug_alone_and_its_line_in_any_case(
 
 
 def test_errors_of_many_lines_become_one():
-    assert cli.one_line(ValueError("this\n  and\nthat")) == "this and that"
-    assert cli.one_line(OSError(28, "No space left on device")) == "disk: No space left on device"
-    assert cli.one_line(OSError(13, "Permission denied", "a/b")) == "a/b: Permission denied"
+    assert errors.one_line(ValueError("this\n  and\nthat")) == "this and that"
+    assert errors.one_line(OSError(28, "No space left on device")) == "disk: No space left on device"
+    assert errors.one_line(OSError(13, "Permission denied", "a/b")) == "a/b: Permission denied"
 
 
 @pytest.mark.parametrize("command", ["render", "view"])

@@ -20,7 +20,7 @@ from data_gen.plan import splits
 from data_gen.plan.sources import abo, shapenet
 from data_gen.plan.sources.shapenet import Category
 from data_gen.render.views import Visibility
-from spnr_jax.errors import UserError
+from spnr_jax.errors import UserError, at_least
 from spnr_jax.formats.mesh import meshes
 from spnr_jax.formats.mesh.surface_points import Spread
 
@@ -160,16 +160,9 @@ class Plan:
 
 def check_options(config: GenerateConfig) -> None:
     """ValueError, naming the option, for a value that no data set can be made with."""
-    for name in ("resolution", "views", "points", "spp", "visibility_grid", "max_depth"):
-        least = 2 if name == "max_depth" else 1
-        if getattr(config, name) < least:
-            raise UserError(f"--{name.replace('_', '-')}: expected {least} or more, got {getattr(config, name)}")
-    for name in ("objects", "colour_variants", "train_objects", "test_objects", "workers"):
-        least = 1 if name in ("train_objects", "workers") else 0
-        if getattr(config, name) is not None and getattr(config, name) < least:
-            raise UserError(f"--{name.replace('_', '-')}: expected {least} or more, got {getattr(config, name)}")
-    if config.seed < 0:
-        raise UserError(f"--seed: expected 0 or more, got {config.seed}")
+    at_least(config, 2, "max_depth")
+    at_least(config, 1, "resolution", "views", "points", "spp", "visibility_grid", "train_objects", "workers")
+    at_least(config, 0, "objects", "colour_variants", "test_objects", "seed")
     if not 0 < config.fov < 180:
         raise UserError(f"--fov: expected degrees between 0 and 180, got {config.fov:g}")
     if not config.distance > 1:

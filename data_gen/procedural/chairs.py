@@ -4,12 +4,7 @@ import numpy as np
 
 from data_gen.procedural.easy_chairs import armchair, tub_chair
 from data_gen.procedural.joining import Piece
-from data_gen.procedural.legs import (
-    four_legs,
-    leg_style,
-    pedestal,
-    star_base,
-)
+from data_gen.procedural.legs import four_legs, leg_style, pedestal, star_base
 from data_gen.procedural.wooden_chairs import side_chair, stool
 from data_gen.shapes import finishes
 from data_gen.shapes.outlines import bent_line, curve, rounded_rectangle

@@ -3,12 +3,7 @@
 import numpy as np
 
 from data_gen.procedural.joining import Piece
-from data_gen.procedural.legs import (
-    four_legs,
-    leg_style,
-    post,
-    round_legs,
-)
+from data_gen.procedural.legs import four_legs, leg_style, post, round_legs
 from data_gen.shapes import finishes
 from data_gen.shapes.outlines import superellipse
 from data_gen.shapes.primitives import both_sides, box, cylinder, merge, move, shell, superellipsoid, turn

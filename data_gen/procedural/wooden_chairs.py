@@ -3,14 +3,7 @@
 import numpy as np
 
 from data_gen.procedural.joining import Piece
-from data_gen.procedural.legs import (
-    four_legs,
-    leg_style,
-    pedestal,
-    round_legs,
-    stretchers,
-    turned_profile,
-)
+from data_gen.procedural.legs import four_legs, leg_style, pedestal, round_legs, stretchers, turned_profile
 from data_gen.shapes import finishes
 from data_gen.shapes.outlines import curve, rounded_rectangle, superellipse
 from data_gen.shapes.primitives import (

@@ -18,6 +18,7 @@ from scipy.spatial import cKDTree
 from data_gen.render.normals import NEIGHBOURS, oriented_normals
 from spnr_jax.errors import UserError
 from spnr_jax.formats.mesh.assets import Asset, Material, Part
+from spnr_jax.formats.mesh.surface_points import vertex_normals
 from spnr_jax.kernels.records import PointCloud
 
 STRAIGHT = 1e-5  # points spread less than this share of their extent beside a line have no surface
@@ -105,15 +106,6 @@ def trimmed(
     kept = density >= np.quantile(density, share)
     number = np.cumsum(kept) - 1
     return vertices[kept], number[faces[kept[faces].all(axis=1)]]
-
-
-def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """The unit mean normals (v, 3) of the faces around each vertex, weighted by area; y where there is none."""
-    a, b, c = np.moveaxis(vertices[faces], 1, 0)
-    sums = np.zeros_like(vertices)
-    np.add.at(sums, faces, np.cross(b - a, c - a)[:, None])
-    length = np.linalg.norm(sums, axis=1, keepdims=True)
-    return np.where(length > 0, sums / np.where(length > 0, length, 1), [0.0, 1.0, 0.0])
 
 
 def pymeshlab():

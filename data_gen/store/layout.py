@@ -27,19 +27,7 @@ from spnr_jax.formats.npz import packed
 SCHEMA_VERSION = 1
 MOST_PIXELS = 2**26  # of a view
 SPLITS = ("train", "val", "test")
-POINT_FIELDS = (
-    "x",
-    "y",
-    "z",
-    "nx",
-    "ny",
-    "nz",
-    "base_color_r",
-    "base_color_g",
-    "base_color_b",
-    "roughness",
-    "metallic",
-)
+POINT_FIELDS = (*"xyz", "nx", "ny", "nz", "base_color_r", "base_color_g", "base_color_b", "roughness", "metallic")
 POINT_TYPE = np.dtype([(name, "<f4") for name in POINT_FIELDS] + [("face", "<i4")])
 POINT_PROPERTIES = [*(f"property float {name}" for name in POINT_FIELDS), "property int face"]  # POINT_TYPE in a PLY
 

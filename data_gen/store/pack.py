@@ -17,7 +17,7 @@ import tyro
 from tqdm import tqdm
 
 from data_gen.store import check, layout, storage
-from spnr_jax.errors import UserError
+from spnr_jax.errors import UserError, at_least, first_line
 
 OPTIONS = "group_size:1"  # each record by itself, so that one object is one read; zstd by default
 BYTES_PER_MB = 10**6
@@ -37,8 +37,7 @@ class PackConfig:
 
 def pack(config: PackConfig) -> None:
     """Write the packed form of a data set; ValueError or OSError, and nothing is left, if it cannot be."""
-    if config.shard_mb < 1:
-        raise UserError(f"--shard-mb: expected 1 or more, got {config.shard_mb}")
+    at_least(config, 1, "shard_mb")
     if config.out.exists():
         raise UserError(f"{config.out} exists already: choose another folder")
     check.read_description(config.dataset)
@@ -74,7 +73,7 @@ def write_shards(folder: Path, dataset: Path, ids: list[str], shard_bytes: int) 
                 shards[path.name] = shards.get(path.name, 0) + 1
             writer.close()
         except RuntimeError as error:  # the writer's word for every error of the disk
-            raise OSError(f"{path}: cannot be written ({str(error).splitlines()[0]})") from None
+            raise OSError(f"{path}: cannot be written ({first_line(error)})") from None
     return shards
 
 

@@ -3,7 +3,6 @@
 Per object: its pictures, its condition images, and its points as a front view in base colour, roughness and metallic.
 """
 
-import html
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,16 +11,12 @@ import tyro
 
 from data_gen.render import views
 from data_gen.store import check, layout
-from spnr_jax.errors import UserError
+from spnr_jax.errors import UserError, at_least
 from spnr_jax.formats.images import png_url
+from spnr_jax.formats.pages import template
 
-STYLE = """
-body { font: 14px/1.4 system-ui, sans-serif; margin: 24px; background: #f4f4f2; color: #222 }
-section { background: #fff; padding: 12px 16px; margin: 0 0 14px; border-radius: 6px }
-h2 { font-size: 15px; margin: 0 0 6px } h2 small { color: #777; font-weight: normal; margin-left: 8px }
-div { display: flex; align-items: center; gap: 4px } span { width: 86px; color: #777; font-size: 12px }
-img { image-rendering: pixelated }
-"""
+# point fields that are shown: three for a colour, one for grey
+CHANNELS = (("base_color_r", "base_color_g", "base_color_b"), ("roughness",), ("metallic",))
 POINT_IMAGE = 128  # pixels
 BACKDROP = np.array([186, 202, 222], np.uint8)  # neither black nor white, which roughness and metallic often are
 
@@ -41,45 +36,35 @@ class ShowConfig:
 def show(config: ShowConfig) -> Path:
     """Write the contact sheet; return its path."""
     check.read_description(config.dataset)
-    if config.objects < 1:
-        raise UserError(f"--objects: expected 1 or more, got {config.objects}")
+    at_least(config, 1, "objects")
     object_ids = sorted(layout.completed_objects(config.dataset))
     if not object_ids:
         raise UserError(f"{config.dataset} holds no finished object yet; run spnr-data generate again")
     chosen = np.unique(np.linspace(0, len(object_ids) - 1, min(config.objects, len(object_ids))).round().astype(int))
-    sections = [object_section(config.dataset, object_ids[index]) for index in chosen]
-    title = f"{config.dataset.resolve().name}: {len(chosen)} of {len(object_ids)} objects"
-    page = f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{html.escape(title)}</title>'
-    page += f"<style>{STYLE}</style><h1>{html.escape(title)}</h1>{''.join(sections)}</html>\n"
+    page = template(Path(__file__).with_name("contact_sheet.html")).render(
+        title=f"{config.dataset.resolve().name}: {len(chosen)} of {len(object_ids)} objects",
+        objects=(shown(config.dataset, object_ids[index]) for index in chosen),
+    )
     path = config.to or config.dataset / "contact_sheet.html"
     layout.write_text(path, page)
     print(path)
     return path
 
 
-def object_section(dataset: Path, object_id: str) -> str:
-    """The HTML of one object."""
+def shown(dataset: Path, object_id: str) -> dict:
+    """An object as the page shows it: its name, what it is, and rows of pictures, each a width and an address."""
     record = layout.read_object(dataset / "objects" / object_id)
     ignored = "; ".join(record.details["ignored"])
-    note = f"{record.details['category']}{', ignored: ' + ignored if ignored else ''}"
-    heading = f"<h2>{html.escape(object_id)}<small>{html.escape(note)}</small></h2>"
-    rows = [
-        image_row("pictures", [white_bytes(image) for image in record.images]),
-        image_row("visible", [white_bytes(condition) for condition in record.conditions]),
-        image_row("points", [point_image(record.points, names) for names in channel_names()]),
-    ]
-    return f"<section>{heading}{''.join(rows)}</section>"
-
-
-def channel_names() -> list[tuple[str, ...]]:
-    """The point fields that are shown: three for a colour, one for grey."""
-    return [("base_color_r", "base_color_g", "base_color_b"), ("roughness",), ("metallic",)]
-
-
-def image_row(label: str, images: list[np.ndarray]) -> str:
-    """A labelled row of pictures (height, width, 3) uint8, shown at 96 pixels or their own size."""
-    tags = "".join(f'<img width="{max(96, image.shape[1])}" src="{png_url(image)}" alt="">' for image in images)
-    return f"<div><span>{label}</span>{tags}</div>"
+    rows = {
+        "pictures": [white_bytes(image) for image in record.images],
+        "visible": [white_bytes(condition) for condition in record.conditions],
+        "points": [point_image(record.points, names) for names in CHANNELS],
+    }
+    return {
+        "name": object_id,
+        "note": f"{record.details['category']}{', ignored: ' + ignored if ignored else ''}",
+        "rows": {label: [(max(96, x.shape[1]), png_url(x)) for x in pictures] for label, pictures in rows.items()},
+    }
 
 
 def white_bytes(image: np.ndarray) -> np.ndarray:

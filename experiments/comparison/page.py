@@ -9,9 +9,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from experiments.comparison.object_scores import Shown
-from experiments.comparison.result_tables import Table
 from spnr_jax.formats.images import png_url
-from spnr_jax.scoring.report_style import STYLE, template
+from spnr_jax.formats.pages import template
+from spnr_jax.scoring.score_tables import Table
 
 
 def page(title: str, tables: Sequence[Table], notes: Sequence[str], shown: Sequence[Shown] = ()) -> str:
@@ -30,5 +30,5 @@ def page(title: str, tables: Sequence[Table], notes: Sequence[str], shown: Seque
         ],
     }
     return template(Path(__file__).with_name("page.html")).render(
-        title=title, tables=tables, notes=notes, pictures=pictures, style=STYLE
+        title=title, tables=tables, notes=notes, pictures=pictures
     )

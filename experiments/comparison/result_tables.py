@@ -1,66 +1,19 @@
-"""A table of results, and its Markdown, LaTeX and CSV.
+"""Tables of results (spnr_jax/scoring/score_tables.py) as Markdown, LaTeX and CSV.
 
-A cell is a text, smaller ones behind it (an interval), whether it stands out, and the number behind it, which the CSV
-holds unrounded: a line a cell, with the title of its table, its row and its column.
+The CSV holds the numbers behind the cells unrounded: a line a cell, with the title of its table, its row and column.
 """
 
 import csv
 import io
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 from tabulate import tabulate
 
+from spnr_jax.scoring.score_tables import Cell, Table
+
 SIGNS = {"\N{UPWARDS ARROW}": r"$\uparrow$", "\N{DOWNWARDS ARROW}": r"$\downarrow$", "\N{NO-BREAK SPACE}": "~"}
 BOLD, SMALL, END = "\x01", "\x02", "\x03"  # stand for LaTeX commands until tabulate has escaped the texts
-
-
-@dataclass(frozen=True, kw_only=True)
-class Cell:
-    """A text, smaller ones behind it, whether it is to stand out; and the number and interval that it shows."""
-
-    text: str
-    small: tuple[str, ...] = ()
-    best: bool = False
-    value: float | None = None
-    interval: tuple[float, float] | None = None
-
-
-@dataclass(frozen=True, kw_only=True)
-class Table:
-    """Heads (with units), rows of a name and cells, and a line that says how to read them."""
-
-    title: str
-    heads: tuple[str, ...]
-    rows: tuple[tuple[str, tuple[Cell, ...]], ...]
-    note: str = ""
-
-
-def text(value: object) -> Cell:
-    """A cell that is no measurement."""
-    return Cell(text=str(value))
-
-
-def number(
-    value: float | None,
-    decimals: int,
-    interval: Sequence[float] | None = None,
-    *,
-    sign: str = "",
-    factor: float = 1,
-    missing: str = "n/a",
-    best: bool = False,
-    more: tuple[str, ...] = (),
-) -> Cell:
-    """A number (times a factor) and its interval; `sign` is "+" for differences, `more` stands behind the interval."""
-    if value is None:
-        return Cell(text=missing)
-    form, small, ends = f"{sign},.{decimals}f", more, None
-    if interval is not None:
-        low, high = (factor * end for end in interval)
-        small, ends = (f"[{low:{form}}, {high:{form}}]", *more), (low, high)
-    return Cell(text=f"{factor * value:{form}}", small=small, best=best, value=factor * value, interval=ends)
 
 
 def markdown(tables: Sequence[Table], notes: Sequence[str] = ()) -> str:

@@ -16,10 +16,10 @@ import numpy as np
 from PIL import Image
 
 from experiments.comparison import result_tables
-from experiments.comparison.result_tables import Table
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets, images
 from spnr_jax.formats.npz import packed
+from spnr_jax.scoring.score_tables import Table
 from spnr_jax.training import run_record
 
 

@@ -12,7 +12,7 @@ from spnr_jax.config import TrainConfig
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
 from spnr_jax.scoring import evaluation
-from spnr_jax.scoring.report import METHODS
+from spnr_jax.scoring.score_tables import METHODS
 from spnr_jax.training import weights
 
 FLOORS = tuple(reversed(evaluation.FLOORS))

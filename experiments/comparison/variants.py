@@ -24,7 +24,7 @@ from experiments.comparison.budget import Trained
 from experiments.comparison.object_scores import Shown, of_cloud, score_objects
 from experiments.comparison.trained_networks import test_objects
 from spnr_jax.config import TrainConfig
-from spnr_jax.errors import UserError
+from spnr_jax.errors import UserError, at_least
 from spnr_jax.formats import data_sets
 from spnr_jax.kernels import metrics
 from spnr_jax.presets import PRESETS
@@ -70,8 +70,7 @@ class Budget:
             raise UserError(
                 f"--minutes: expected more than 0, and neither with --steps nor --quick, got {self.minutes:g}"
             )
-        if self.shown < 1:
-            raise UserError(f"--shown: expected 1 or more, got {self.shown}")
+        at_least(self, 1, "shown")
 
     def config(self) -> TrainConfig:
         """The preset with the steps and the clouds of this budget."""

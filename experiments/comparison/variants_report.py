@@ -7,19 +7,17 @@ In the plot a bar is an interval, the large dot the mean, and small dots are the
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from experiments.comparison import figures, results_folder, variants
-from experiments.comparison.result_tables import Cell, Table, number, text
 from experiments.comparison.variants import OPAQUE, Budget, Compared, Variant
 from spnr_jax.devices import machine
 from spnr_jax.formats import data_sets, images
-from spnr_jax.scoring import evaluation, intervals
-from spnr_jax.scoring.report import ARROWS, HIGHER, QUALITY
-from spnr_jax.scoring.summary import Scores, metric_settings
+from spnr_jax.scoring import evaluation
+from spnr_jax.scoring.score_tables import ARROWS, HIGHER, QUALITY, Cell, Table, number, text
+from spnr_jax.scoring.summary import difference, means, metric_settings
 
 METRICS = {  # head, decimals, what is better
     "psnr": QUALITY["psnr"],
@@ -29,6 +27,24 @@ METRICS = {  # head, decimals, what is better
 }
 COSTS = {"parameters": "Parameters", "ms_per_step": "ms per step", "ms_per_view": "ms per view"}
 BETTER, WORSE, OPEN = figures.GREEN, figures.RED, figures.COLORS[6]
+
+
+def study(
+    out: Path,
+    what: str,
+    trainings: Sequence[Variant],
+    reference: str,
+    budget: Budget,
+    dataset: data_sets.Dataset,
+    more: Mapping[str, object] | None = None,
+    **asked: object,
+) -> None:
+    """Trains what is not trained in a folder that is this experiment's, scores all variants, writes the files."""
+    names = budget.names(dataset)
+    data_sets.check_resolution(data_sets.read_object(dataset, names[0]), trainings[0].config)
+    variants.claim(out, what, budget, dataset, **asked)
+    compared = variants.score(variants.train(trainings, budget, out), reference, dataset, names, budget.shown)
+    write(out, trainings, reference, compared, budget, dataset, more)
 
 
 def write(
@@ -92,7 +108,7 @@ def numbers(
 def comparison(compared: Compared, reference: str) -> dict:
     """Quality of every variant on the objects that were compared, and all differences to the reference."""
     return {
-        "variants": {name: means(scores) for name, scores in compared.scores.items()},
+        "variants": {name: means(scores, METRICS) for name, scores in compared.scores.items()},
         "minus_reference": {
             name: {metric: change(compared, name, reference, metric) for metric in METRICS}
             for name in compared.scores
@@ -102,34 +118,14 @@ def comparison(compared: Compared, reference: str) -> dict:
     }
 
 
-def means(objects: Sequence[Scores]) -> dict[str, float | list[float] | None]:
-    """Mean of each metric over views (of all seeds) and its interval; None where there is no number."""
-    row: dict[str, float | list[float] | None] = {}
-    for metric in METRICS:
-        values = [scores[metric] for scores in objects]
-        every = np.concatenate(values)
-        ends = None if np.isnan(every).all() else intervals.interval(values)
-        row[metric] = None if np.isnan(every).all() else float(np.nanmean(every))
-        row[f"{metric}_interval"] = None if ends is None else list(ends)
-    return row
-
-
 def change(compared: Compared, variant: str, reference: str, metric: str) -> dict | None:
     """The variant minus the reference: mean, interval, p-value, and the mean of each seed alone."""
-
-    def minus(first: Sequence[Scores], second: Sequence[Scores]) -> intervals.Difference | None:
-        return intervals.difference([s[metric] for s in first], [s[metric] for s in second])
-
-    found = minus(compared.scores[variant], compared.scores[reference])
+    found = difference(compared.scores[variant], compared.scores[reference], metric)
     if found is None:
         return None
-    seeds = [minus(*pair) for pair in zip(compared.by_seed[variant], compared.by_seed[reference], strict=True)]
-    return {
-        "mean": found.mean,
-        "interval": None if found.interval is None else list(found.interval),
-        "p_value": found.p_value,
-        "by_seed": [None if one is None else one.mean for one in seeds],
-    }
+    pairs = zip(compared.by_seed[variant], compared.by_seed[reference], strict=True)
+    seeds = [difference(*pair, metric) for pair in pairs]
+    return found | {"by_seed": [None if one is None else one["mean"] for one in seeds]}
 
 
 def heads() -> tuple[str, ...]:
@@ -163,7 +159,7 @@ def quality_table(results: Mapping, origin: str = "") -> Table:
 def differences_table(results: Mapping, origin: str = "") -> Table:
     """Every variant minus the reference."""
 
-    def difference(found: Mapping | None, decimals: int) -> Cell:
+    def cell(found: Mapping | None, decimals: int) -> Cell:
         if found is None:
             return text("n/a")
         ends = found["interval"]
@@ -173,7 +169,7 @@ def differences_table(results: Mapping, origin: str = "") -> Table:
     rows = tuple(
         (
             results["variants"][name]["label"],
-            tuple(difference(changes[metric], decimals) for metric, (_, decimals, _) in METRICS.items()),
+            tuple(cell(changes[metric], decimals) for metric, (_, decimals, _) in METRICS.items()),
         )
         for name, changes in results["minus_reference"].items()
     )

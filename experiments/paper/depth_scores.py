@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import distance_transform_edt
 
-from spnr_jax.scoring import intervals
+from spnr_jax.scoring.summary import means
 
 OPAQUE = 0.5
 EDGE = 1 / 32  # of the picture's width
@@ -72,13 +72,5 @@ def mean(values: np.ndarray) -> float:
 
 def summarise(objects: Sequence[dict[str, np.ndarray]]) -> dict[str, dict]:
     """Mean of each metric over all views, with its bootstrap interval over objects; None where nothing was measured."""
-    table = {}
-    for name in METRICS:
-        values = [found[name] for found in objects]
-        known = not np.isnan(np.concatenate(values)).all()
-        ends = intervals.interval(values) if known else None
-        table[name] = {
-            "mean": float(np.nanmean(np.concatenate(values))) if known else None,
-            "interval": None if ends is None else list(ends),
-        }
-    return table
+    found = means(objects, METRICS)
+    return {name: {"mean": found[name], "interval": found[f"{name}_interval"]} for name in METRICS}

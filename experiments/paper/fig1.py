@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import tyro
 
 from experiments import entry_point
-from experiments.comparison import budget, variants, variants_report
+from experiments.comparison import budget, variants_report
 from experiments.comparison.variants import Budget, Variant
 from spnr_jax import cli
 from spnr_jax.config import TrainConfig
@@ -58,15 +58,11 @@ def main(options: Fig1) -> None:
     """Trains what is not trained, scores all weights, writes tables and pictures."""
     cli.set_up_jax()
     dataset = data_sets.open_dataset(options.data)
-    names, config = options.budget.names(dataset), options.budget.config()
-    data_sets.check_resolution(data_sets.read_object(dataset, names[0]), config)
-    variants.claim(options.out, "fig1", options.budget, dataset, pretrain=options.pretrain)
-    runs = [variant(options, weight, config, dataset) for weight in options.l1_weights]
+    runs = [variant(options, weight, options.budget.config(), dataset) for weight in options.l1_weights]
     reference = runs[options.l1_weights.index(100.0) if 100.0 in options.l1_weights else 0].name
-    trained = variants.train(runs, options.budget, options.out)
-    compared = variants.score(trained, reference, dataset, names, options.budget.shown)
     start = f"{options.pretrain} steps of L1 alone" if options.pretrain else "scratch"
-    variants_report.write(options.out, runs, reference, compared, options.budget, dataset, {"start": start})
+    given = (options.out, "fig1", runs, reference, options.budget, dataset)
+    variants_report.study(*given, {"start": start}, pretrain=options.pretrain)
 
 
 def variant(options: Fig1, weight: float, config: TrainConfig, dataset: data_sets.Dataset) -> Variant:

@@ -25,7 +25,7 @@ from experiments import entry_point
 from experiments.comparison import figures, variants, variants_report
 from experiments.comparison.variants import Budget, Variant
 from spnr_jax import cli
-from spnr_jax.errors import UserError
+from spnr_jax.errors import UserError, at_least
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.images import png, write_whole
 from spnr_jax.scoring import evaluation
@@ -50,9 +50,7 @@ class Fig2:
     budget: tyro.conf.OmitArgPrefixes[Budget] = field(default_factory=Budget)
 
     def __post_init__(self) -> None:
-        for name in ("generated", "colour_variants"):
-            if getattr(self, name) < 1:
-                raise UserError(f"--{name.replace('_', '-')}: expected 1 or more, got {getattr(self, name)}")
+        at_least(self, 1, "generated", "colour_variants")
 
 
 def main(options: Fig2) -> None:
@@ -64,13 +62,8 @@ def main(options: Fig2) -> None:
         generate(generation(options, folder))
     dataset = data_sets.open_dataset(folder)
     runs = trainings(options, dataset)
-    names, config = options.budget.names(dataset), runs[0].config
-    data_sets.check_resolution(data_sets.read_object(dataset, names[0]), config)
-    variants.claim(options.out, "fig2", options.budget, dataset)
+    variants_report.study(options.out, "fig2", runs, "without", options.budget, dataset)
     write_whole(options.out / "variants.png", variants_picture(dataset, options.budget.shown))
-    trained = variants.train(runs, options.budget, options.out)
-    compared = variants.score(trained, "without", dataset, names, options.budget.shown)
-    variants_report.write(options.out, runs, "without", compared, options.budget, dataset)
 
 
 def generation(options: Fig2, folder: Path) -> GenerateConfig:

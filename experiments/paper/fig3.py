@@ -28,7 +28,6 @@ from data_gen.render.variant import choose_variant, mitsuba_module
 from experiments import entry_point
 from experiments.comparison import figures, results_folder, trained_networks
 from experiments.comparison.poisson import SURFACES
-from experiments.comparison.result_tables import Table, number, text
 from experiments.comparison.results_folder import kept
 from experiments.comparison.source_meshes import cast_views, mesh_of
 from experiments.comparison.trained_networks import LABELS, Sources
@@ -42,6 +41,7 @@ from spnr_jax.formats.images import depth_image, png
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.records import Camera, PointCloud
 from spnr_jax.scoring import evaluation
+from spnr_jax.scoring.score_tables import Table, number, text
 
 FLOATER, MISSED = np.array([0.85, 0.1, 0.1]), np.array([0.15, 0.35, 0.85])
 WORST = 0.2  # error, in half diagonals, that the picture shows black

@@ -29,7 +29,7 @@ from experiments.comparison.poisson import SURFACES
 from experiments.comparison.trained_networks import LABELS, Network, Sources
 from spnr_jax import cli
 from spnr_jax.devices import machine
-from spnr_jax.errors import UserError
+from spnr_jax.errors import UserError, at_least
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.images import png, write_whole
 from spnr_jax.scoring.report import psnr
@@ -58,9 +58,8 @@ class Gallery:
     """A check that everything works: three objects."""
 
     def __post_init__(self) -> None:
-        for name, least in (("objects", 1), ("view", 0), ("rows", 1), ("columns", 1)):
-            if getattr(self, name) < least:
-                raise UserError(f"--{name}: expected {least} or more, got {getattr(self, name)}")
+        at_least(self, 1, "objects", "rows", "columns")
+        at_least(self, 0, "view")
 
 
 def main(options: Gallery) -> None:

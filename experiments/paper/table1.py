@@ -29,7 +29,7 @@ from experiments.paper import table1_tables
 from spnr_jax import cli
 from spnr_jax.config import TrainConfig
 from spnr_jax.devices import machine
-from spnr_jax.errors import UserError
+from spnr_jax.errors import UserError, at_least
 from spnr_jax.formats import data_sets
 from spnr_jax.presets import PRESETS
 from spnr_jax.scoring import evaluation
@@ -79,9 +79,8 @@ class Table1:
             )
         if not self.methods:
             raise UserError(f"--methods: name at least one of {', '.join(ROWS)}")
-        for name, value, least in (("objects", self.objects, 1), ("shown", self.shown, 0)):
-            if value is not None and value < least:
-                raise UserError(f"--{name}: expected {least} or more, got {value}")
+        at_least(self, 1, "objects")
+        at_least(self, 0, "shown")
 
 
 def main(options: Table1) -> None:

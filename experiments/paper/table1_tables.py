@@ -3,14 +3,13 @@
 from collections.abc import Mapping
 
 from experiments.comparison.budget import QUICK_STEPS
-from experiments.comparison.result_tables import Cell, Table, number, text
 from experiments.comparison.trained_networks import LABELS
-from spnr_jax.scoring.report import ARROWS, QUALITY, duration, lowered
-from spnr_jax.scoring.summary import NO_WEIGHTS
+from spnr_jax.scoring.report import duration
+from spnr_jax.scoring.score_tables import Cell, Table, difference, head, lowered, number, quality
 
 METRICS = ("psnr", "ssim", "lpips", "flip", "cpsnr", "iou")
 COSTS = {"parameters": "Parameters", "steps": "Steps", "training_seconds": "Training", "ms_per_view": "ms per view"}
-MISSING = {"lpips": NO_WEIGHTS, "iou": "n/a (no opacity)"}
+HEADS = tuple(map(head, METRICS))
 BUDGETS = {
     "quick": f"the tiny presets for {QUICK_STEPS} steps each, which shows that everything runs and nothing else",
     "tiny": "the tiny presets, 64 px",
@@ -26,21 +25,28 @@ def tables(results: Mapping) -> list[Table]:
     for name, methods in results["per_category"].items():
         count = next(iter(methods.values()))["objects"]
         title = f"{name}, {count} object{'s' * (count != 1)}"
-        made.append(Table(title=title, heads=_metric_heads(), rows=_rows(methods, _quality(methods))))
+        made.append(
+            Table(
+                title=title,
+                heads=HEADS,
+                rows=tuple((LABELS[name], cells) for name, cells in quality(methods, METRICS).items()),
+            )
+        )
     return made
 
 
 def methods_table(results: Mapping) -> Table:
     """Quality and cost of every method; rows that could not be made say why."""
     methods, missing = results["methods"], results["missing"]
-    cost = {name: tuple(_cost(results["costs"][name], column) for column in COSTS) for name in methods}
-    quality = _quality(methods)
-    rows = dict(_rows(methods, {name: quality[name] + cost[name] for name in methods}))
+    rows = {
+        LABELS[name]: (*cells, *(_cost(results["costs"][name], column) for column in COSTS))
+        for name, cells in quality(methods, METRICS).items()
+    }
     rows |= {LABELS[name]: (Cell(text=reason),) for name, reason in missing.items()}
     counts = next(iter(methods.values()))
     return Table(
         title=f"Methods, {counts['objects']} unseen objects, {counts['views']} views",
-        heads=(*_metric_heads(), *COSTS.values()),
+        heads=(*HEADS, *COSTS.values()),
         rows=tuple((label, rows[label]) for label in LABELS.values() if label in rows),
         note="Means over images with 95 % bootstrap intervals over objects; the best of a column stands out.",
     )
@@ -49,49 +55,11 @@ def methods_table(results: Mapping) -> Table:
 def differences_table(first: str, differences: Mapping) -> Table:
     """A network minus each other method, image by image."""
     rows = tuple(
-        (f"{LABELS[first]} minus {lowered(name)}", tuple(_difference(row.get(metric), metric) for metric in METRICS))
+        (f"{LABELS[first]} minus {lowered(name)}", tuple(difference(row.get(metric), metric) for metric in METRICS))
         for name, row in differences.items()
     )
     note = "Image by image, with 95 % bootstrap intervals and the p-value of a sign-flip test, both over objects."
-    return Table(title="Paired differences", heads=_metric_heads(), rows=rows, note=note)
-
-
-def _metric_heads() -> tuple[str, ...]:
-    return tuple(f"{QUALITY[m][0]}\N{NO-BREAK SPACE}{ARROWS[QUALITY[m][2]]}" for m in METRICS)
-
-
-def _rows(methods: Mapping, cells: Mapping[str, tuple[Cell, ...]]) -> tuple[tuple[str, tuple[Cell, ...]], ...]:
-    return tuple((LABELS[name], cells[name]) for name in methods)
-
-
-def _quality(methods: Mapping[str, Mapping]) -> dict[str, tuple[Cell, ...]]:
-    """The cells of all metrics by method."""
-    columns = []
-    for metric in METRICS:
-        _, decimals, better = QUALITY[metric]
-        values = [row[metric] for row in methods.values() if row[metric] is not None]
-        best = max(values, key=lambda value: better * value) if values else None
-        columns.append(
-            [
-                number(
-                    row[metric],
-                    decimals,
-                    row[f"{metric}_interval"],
-                    missing=MISSING.get(metric, "n/a"),
-                    best=row[metric] == best,
-                )
-                for row in methods.values()
-            ]
-        )
-    return dict(zip(methods, zip(*columns, strict=True), strict=True))
-
-
-def _difference(found: Mapping | None, metric: str) -> Cell:
-    if found is None:
-        return text(MISSING.get(metric, "n/a"))
-    p_value = found["p_value"]
-    test = () if p_value is None else ("p < 0.001",) if p_value < 0.001 else (f"p = {p_value:.3f}",)
-    return number(found["mean"], QUALITY[metric][1], found["interval"], sign="+", more=test)
+    return Table(title="Paired differences", heads=HEADS, rows=rows, note=note)
 
 
 def _cost(cost: Mapping, column: str) -> Cell:

@@ -24,13 +24,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+
 from experiments import entry_point
 from experiments.comparison import results_folder
 from experiments.speed import bench_report as report
 from experiments.speed.bench_scene import BATCHES
 from experiments.speed.worker import Worker, worker
 from spnr_jax.devices import machine
-from spnr_jax.errors import UserError
+from spnr_jax.errors import UserError, at_least
 from spnr_jax.formats.images import write_whole
 
 Preset = Literal["tiny", "small", "abo"]
@@ -71,9 +73,7 @@ class Options:
     """A check that everything works: tiny, two rounds, short turns, into OUT-quick."""
 
     def __post_init__(self) -> None:
-        for name in ("rounds", "threads"):
-            if getattr(self, name) < 1:
-                raise UserError(f"--{name} must be at least 1, got {getattr(self, name)}")
+        at_least(self, 1, "rounds", "threads")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -216,7 +216,7 @@ def compare(ours: Worker, twin: Worker | None, cell: Cell, options: Options) -> 
         return row
     theirs = [b for _, b in rounds if b is not None]
     ratios = [statistics.median(a["ms"]) / statistics.median(b["ms"]) for (a, _), b in zip(rounds, theirs, strict=True)]
-    low, middle, high = quartiles(ratios)
+    low, middle, high = np.quantile(ratios, (0.25, 0.5, 0.75)).tolist()
     row |= side("twin", theirs) | {"ratio": round(middle, 4), "ratio_low": round(low, 4), "ratio_high": round(high, 4)}
     return row | {"twin_variant": cell.variant, "twin_software": twin.facts["software"]}
 
@@ -230,14 +230,6 @@ def side(name: str, turns: Sequence[dict]) -> Row:
         f"{name}_peak_mb": max(turn["peak_mb"] for turn in turns),
         f"{name}_idle_cpu_s": round(max(turn["idle_cpu_s"] for turn in turns), 4),
     }
-
-
-def quartiles(values: Sequence[float]) -> tuple[float, float, float]:
-    """First quartile, median and third quartile; of a single value, that one."""
-    if len(values) == 1:
-        return values[0], values[0], values[0]
-    low, middle, high = statistics.quantiles(values, n=4, method="inclusive")
-    return low, middle, high
 
 
 def read_rows(path: Path) -> list[Row]:

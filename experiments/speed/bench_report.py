@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from experiments.comparison import figures
-from experiments.comparison.result_tables import Cell, Table, number, text
+from spnr_jax.scoring.score_tables import Cell, Table, number, text
 
 Row = dict[str, Any]
 

@@ -23,10 +23,10 @@ from data_gen.render.light import Lights
 from data_gen.render.variant import choose_variant, mitsuba_module
 from experiments import entry_point
 from experiments.comparison import results_folder
-from experiments.comparison.result_tables import Table, number
 from spnr_jax.devices import machine
 from spnr_jax.formats.mesh import surface_points
 from spnr_jax.scoring.report import psnr
+from spnr_jax.scoring.score_tables import Table, number
 
 PHASES = {  # functions whose cumulative time is a phase; the rest is "other"
     "load": ("load_asset",),

@@ -27,8 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments import entry_point
-from experiments.comparison import results_folder
-from experiments.comparison.result_tables import Table, number, text
+from experiments.comparison import clock, results_folder
 from experiments.speed import bench, ours
 from experiments.speed.surfel_scene import orbiting, random_crops, sphere
 from spnr_jax import cli
@@ -37,6 +36,7 @@ from spnr_jax.devices import machine
 from spnr_jax.method import surfel_renderer
 from spnr_jax.model_config import RayNetworkConfig, SurfelConfig
 from spnr_jax.presets import PRESETS
+from spnr_jax.scoring.score_tables import Table, number, text
 from spnr_jax.surfels.lighting import room_light
 from spnr_jax.training import many_runs, optimisation, shading
 
@@ -205,12 +205,7 @@ def compile_of(function: Callable, *arguments: Any) -> Compiled:
 
 def least(run: Callable[[], object], times: int = 1) -> float:
     """Seconds of the fastest of so many runs, after one that compiles or fills the caches."""
-    clock, taken = time.process_time if jax.default_backend() == "cpu" else time.perf_counter, []
-    for _ in range(times + 1):
-        start = clock()
-        jax.block_until_ready(run())
-        taken.append(clock() - start)
-    return min(taken[1:])
+    return min(clock.in_turns({"": run}, times)[""])
 
 
 def table(rows: list[Found]) -> Table:

@@ -21,13 +21,13 @@ import tyro
 
 from experiments import entry_point
 from experiments.comparison import results_folder
-from experiments.comparison.result_tables import Table, number
 from spnr_jax import cli
 from spnr_jax.devices import machine
 from spnr_jax.formats.clouds import read_cloud
 from spnr_jax.formats.light_files import read_light
 from spnr_jax.kernels.records import Light, PointCloud
 from spnr_jax.method.model import Model
+from spnr_jax.scoring.score_tables import Table, number
 from spnr_jax.tools.light_options import Lighting
 from spnr_jax.training.weights import load
 from spnr_jax.viewer import lights, session

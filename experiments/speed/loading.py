@@ -28,12 +28,12 @@ from tqdm import tqdm
 from data_gen.store.pack import PackConfig, pack
 from experiments import entry_point
 from experiments.comparison import results_folder
-from experiments.comparison.result_tables import Table, number, text
 from spnr_jax import cli, presets
 from spnr_jax.config import TrainConfig
 from spnr_jax.devices import machine
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
+from spnr_jax.scoring.score_tables import Table, number, text
 from spnr_jax.training import batching, optimisation
 
 TARGET = 0.02  # share of a step

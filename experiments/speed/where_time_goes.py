@@ -11,7 +11,6 @@ so that other work on the machine changes little.  Weights are fresh: no time de
 """
 
 import dataclasses
-import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -23,16 +22,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments import entry_point
-from experiments.comparison import results_folder
-from experiments.comparison.result_tables import Table, number
+from experiments.comparison import clock, results_folder
 from experiments.speed.surfel_scene import orbiting, random_crops, sphere
 from spnr_jax import cli
 from spnr_jax.devices import machine
-from spnr_jax.errors import UserError
+from spnr_jax.errors import at_least
 from spnr_jax.method import surfel_plan, surfel_renderer
 from spnr_jax.model_config import SurfelConfig
 from spnr_jax.nn.shader import Shader, picture
 from spnr_jax.presets import PRESETS
+from spnr_jax.scoring.score_tables import Table, number
 from spnr_jax.surfels import projection
 from spnr_jax.surfels.lighting import room_light
 from spnr_jax.training import optimisation, shading
@@ -58,9 +57,7 @@ class WhereTimeGoes:
     """A check that everything works: a few points and pixels, two turns."""
 
     def __post_init__(self) -> None:
-        for name in ("points", "size", "rounds"):
-            if getattr(self, name) < 1:
-                raise UserError(f"--{name} must be at least 1, got {getattr(self, name)}")
+        at_least(self, 1, "points", "size", "rounds")
 
 
 class Program(NamedTuple):
@@ -157,15 +154,8 @@ def frame_programs(options: WhereTimeGoes) -> dict[str, Program]:
 
 def timed(programs: Mapping[str, Program], rounds: int) -> dict[str, float]:
     """Milliseconds of each, the median of turns; those of the processor on a CPU."""
-    clock = time.process_time if jax.default_backend() == "cpu" else time.perf_counter
-    taken: dict[str, list[float]] = {name: [] for name in programs}
-    for turn in range(rounds + 1):
-        for name, one in programs.items():
-            start = clock()
-            jax.block_until_ready(one.run())
-            if turn:  # the first compiles, or fills the caches
-                taken[name].append(1e3 * (clock() - start))
-    return {name: float(np.median(values)) for name, values in taken.items()}
+    taken = clock.in_turns({name: one.run for name, one in programs.items()}, rounds)
+    return {name: 1e3 * float(np.median(seconds)) for name, seconds in taken.items()}
 
 
 def table(title: str, programs: Mapping[str, Program], taken: Mapping[str, float]) -> Table:

@@ -29,7 +29,7 @@ from experiments.comparison import variants, variants_report
 from experiments.comparison.variants import Budget, Variant
 from spnr_jax import cli, presets
 from spnr_jax.config import LossConfig, TrainConfig
-from spnr_jax.errors import UserError
+from spnr_jax.errors import UserError, at_least
 from spnr_jax.formats import data_sets
 from spnr_jax.model_config import EncoderConfig, NearPointsConfig, PaperConfig, RayNetworkConfig, SamplingConfig
 
@@ -83,8 +83,7 @@ class Ablations:
     budget: tyro.conf.OmitArgPrefixes[Budget] = field(default_factory=Budget)
 
     def __post_init__(self) -> None:
-        if self.folds < 1:
-            raise UserError(f"--folds: expected 1 or more, got {self.folds}")
+        at_least(self, 1, "folds")
 
 
 def main(options: Ablations) -> None:

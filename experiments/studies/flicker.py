@@ -28,17 +28,17 @@ from data_gen.render.variant import choose_variant, mitsuba_module
 from experiments import entry_point
 from experiments.comparison import figures, results_folder, trained_networks
 from experiments.comparison.poisson import unscaled_light, view_config
-from experiments.comparison.result_tables import Table, number, text
 from experiments.comparison.source_meshes import cast_views, mesh_of
 from experiments.comparison.trained_networks import Network, Sources
 from spnr_jax import cli
 from spnr_jax.devices import machine
-from spnr_jax.errors import UserError
+from spnr_jax.errors import UserError, at_least
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.images import to_uint8, write_turntable
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.records import Camera
 from spnr_jax.scoring import evaluation, intervals
+from spnr_jax.scoring.score_tables import Table, number, text
 
 SAME_PLACE = 0.01  # half diagonals that what frame t sees there may be nearer or farther than the place
 REFERENCE = "references"
@@ -72,8 +72,7 @@ class Flicker:
 
 def main(options: Flicker) -> None:
     """Makes what is missing of the references, then frames, scores and pictures."""
-    if options.frames < 3:
-        raise UserError(f"--frames: expected 3 or more, got {options.frames}")
+    at_least(options, 3, "frames")
     cli.set_up_jax()
     dataset = data_sets.open_dataset(options.data)
     names = trained_networks.test_objects(dataset, options.objects)

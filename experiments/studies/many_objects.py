@@ -7,13 +7,12 @@ and N objects that are encoded and rendered, are each done by a Python loop over
 under vmap, in turns.  Objects of many sizes are encoded in a loop, each padded to its own power of two, by one program
 padded to the largest, and by one program for each power of two.
 
-seconds  of the processor, all cores together: other work on the machine does not count
+seconds  of the processor on a CPU, all cores together: other work on the machine does not count
 MB       temporary memory of the compiled program, the largest where there are several
 apart    largest relative difference of a loss, and largest difference of a pixel or of an encoded number
 """
 
 import dataclasses
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,8 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments import entry_point
-from experiments.comparison import results_folder
-from experiments.comparison.result_tables import Table, number
+from experiments.comparison import clock, results_folder
 from spnr_jax import cli
 from spnr_jax.config import TrainConfig
 from spnr_jax.devices import machine
@@ -35,6 +33,7 @@ from spnr_jax.kernels.records import Batch, PointCloud
 from spnr_jax.method import inference
 from spnr_jax.model_config import RayNetworkConfig
 from spnr_jax.presets import PRESETS
+from spnr_jax.scoring.score_tables import Table, number
 from spnr_jax.training import adversary, batching, many_runs, optimisation
 
 MOST_POINTS = 4096  # of an object that is encoded
@@ -139,11 +138,11 @@ def train(
             one = optimisation.jitted_train_step.lower(singles[0], pieces[0], **static).compile()
             many = many_runs.jitted_train_step.lower(stacked, batch, **static).compile()
             memory = {form: max(memory[form], temporary_mb(p)) for form, p in (("loop", one), ("vmap", many))}
-        start = time.process_time()
+        start = clock.now()
         stepped = jax.block_until_ready([one(state, piece) for state, piece in zip(singles, pieces, strict=True)])
-        middle = time.process_time()
+        middle = clock.now()
         stacked, metrics = jax.block_until_ready(many(stacked, batch))
-        for form, taken in (("loop", middle - start), ("vmap", time.process_time() - middle)):
+        for form, taken in (("loop", middle - start), ("vmap", clock.now() - middle)):
             seconds[form].append(taken)
         singles = [state for state, _ in stepped]
         alone = np.array([float(metrics_of["loss"]) for _, metrics_of in stepped])
@@ -193,18 +192,7 @@ def render(dataset: data_sets.Dataset, config: TrainConfig, names: Sequence[str]
     work: dict[str, Callable] = {"loop": lambda: [single(*piece) for piece in pieces], "vmap": lambda: many(*stacked)}
     apart = float(np.abs(np.asarray(work["vmap"]()) - np.stack(work["loop"]())).max())
     memory = {"loop": temporary_mb(single), "vmap": temporary_mb(many)}
-    return {"seconds": in_turns(work, rounds), "apart": [apart, apart], "mb": memory}
-
-
-def in_turns(work: Mapping[str, Callable], rounds: int) -> dict[str, list[float]]:
-    """Seconds of the processor that each form took, one after the other, round by round; the first one is left out."""
-    seconds: dict[str, list[float]] = {form: [] for form in work}
-    for _ in range(rounds + 1):
-        for form, make in work.items():
-            start = time.process_time()
-            jax.block_until_ready(make())
-            seconds[form].append(time.process_time() - start)
-    return {form: taken[1:] for form, taken in seconds.items()}
+    return {"seconds": clock.in_turns(work, rounds), "apart": [apart, apart], "mb": memory}
 
 
 def encode(dataset: data_sets.Dataset, config: TrainConfig, count: int, rounds: int = 4) -> dict[str, Any]:
@@ -232,7 +220,7 @@ def encode(dataset: data_sets.Dataset, config: TrainConfig, count: int, rounds: 
     programs = (by_bucket.values(), [at_once], of_groups.values())
     held = (sum(buckets), max(buckets) * count, sum(buckets))
     return {
-        "seconds": in_turns(work, rounds),
+        "seconds": clock.in_turns(work, rounds),
         "points": [min(points), max(points)],
         "padding": {form: with_padding / sum(points) for form, with_padding in zip(work, held, strict=True)},
         "mb": {form: max(map(temporary_mb, made)) for form, made in zip(work, programs, strict=True)},

@@ -23,13 +23,13 @@ from scipy.spatial import cKDTree
 
 from experiments import entry_point
 from experiments.comparison import results_folder
-from experiments.comparison.result_tables import Table, number
 from experiments.studies.scans import DECIMALS, drawn_of, mean_scores, spoiled, thinned, views_of
 from spnr_jax.devices import machine
 from spnr_jax.formats import data_sets
 from spnr_jax.kernels.cleaning import cleaned
 from spnr_jax.kernels.records import PointCloud
 from spnr_jax.kernels.thinning import voxel_keys
+from spnr_jax.scoring.score_tables import Table, number
 from spnr_jax.training.scan_faults import noisy
 from spnr_jax.training.weights import load
 

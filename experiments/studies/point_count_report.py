@@ -6,8 +6,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from experiments.comparison import figures
-from experiments.comparison.result_tables import Table, number, text
-from spnr_jax.scoring.report import QUALITY
+from spnr_jax.scoring.score_tables import QUALITY, Table, number, text
 
 METRICS = ("psnr", "flip", "iou")
 

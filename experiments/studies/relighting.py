@@ -16,24 +16,20 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
 from experiments import entry_point
 from experiments.comparison import figures, results_folder
-from experiments.comparison.object_views import Picture, on_white, told, view_of
-from experiments.comparison.result_tables import Cell, Table, number
+from experiments.comparison.object_views import Picture, drawn, on_white, told, view_of, view_scores
 from spnr_jax.devices import machine
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets, images
 from spnr_jax.kernels.colors import srgb_to_linear
 from spnr_jax.kernels.records import Camera, Light, Volume
 from spnr_jax.method.model import Model, Quality
-from spnr_jax.scoring import intervals
-from spnr_jax.scoring.flip import flip
-from spnr_jax.scoring.picture_scores import sharpness
+from spnr_jax.scoring.score_tables import Table, mean_row
 from spnr_jax.training.weights import load
 
 HEADS = ("PSNR, dB", "inside, dB", "FLIP", "log error")
@@ -44,8 +40,6 @@ NETWORK, DISCS, UNSHADOWED = "network", "discs and light", "discs and light, not
 METHODS: dict[str, Quality] = {NETWORK: "best", DISCS: "draft", UNSHADOWED: "draft"}
 ROOM = "room"
 Found = dict[tuple[str, int], list[dict[str, list[float]]]]  # light, points -> objects: method -> scores
-
-_flip = jax.jit(flip)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,11 +107,11 @@ def _kept(
             *(view_of(item, view, options.resolution) for view in range(len(lights))), strict=True
         )
         volume = model.encode(told(data_sets.first_points(item, count), normals=False))
-        drawn = {method: draw(model, volume, method, cameras, lights) for method in METHODS}
-        images.write_whole(place.with_suffix(".png"), images.png(drawn[NETWORK][0][0]))
+        found = {method: draw(model, volume, method, cameras, lights) for method in METHODS}
+        images.write_whole(place.with_suffix(".png"), images.png(found[NETWORK][0][0]))
         return {
             method: np.mean([scores(*picture, y) for picture, y in zip(of, references, strict=True)], axis=0).tolist()
-            for method, of in drawn.items()
+            for method, of in found.items()
         }
 
     return results_folder.kept(place, make)
@@ -127,9 +121,7 @@ def draw(
     model: Model, volume: Volume, method: str, cameras: Sequence[Camera], lights: Sequence[Light]
 ) -> list[Picture]:
     """What a method shows of an encoded object, each camera in its light."""
-    volume = unshadowed(volume) if method == UNSHADOWED else volume
-    found = model.render_each(volume, cameras, METHODS[method], lights)
-    return [(np.asarray(x.image), np.asarray(x.acc)) for x in found]
+    return drawn(model, unshadowed(volume) if method == UNSHADOWED else volume, cameras, METHODS[method], lights)
 
 
 def unshadowed(volume: Volume) -> Volume:
@@ -140,12 +132,11 @@ def unshadowed(volume: Volume) -> Volume:
 
 
 def scores(image: np.ndarray, opacity: np.ndarray, reference: np.ndarray) -> list[float]:
-    """PSNR, PSNR inside, FLIP on white, and the root mean square of the ratio of linear light inside, in nepers."""
-    found, white = sharpness(image, opacity, reference), on_white(reference)[0]
+    """`view_scores`, and the root mean square of the ratio of linear light inside, in nepers."""
     inside = reference[..., 3] > 0.999
-    ours, theirs = (np.log(np.maximum(linear(x), DARK)) for x in (image, white))
+    ours, theirs = (np.log(np.maximum(linear(x), DARK)) for x in (image, on_white(reference)[0]))
     error = float(np.sqrt(np.mean((ours - theirs)[inside] ** 2))) if inside.any() else 0.0
-    return [found.psnr, found.psnr_inside, float(_flip(jnp.asarray(image), jnp.asarray(white))), error]
+    return [*view_scores(image, opacity, reference), error]
 
 
 def linear(image: np.ndarray) -> np.ndarray:
@@ -153,16 +144,16 @@ def linear(image: np.ndarray) -> np.ndarray:
     return np.asarray(srgb_to_linear(jnp.asarray(image)))
 
 
-def row_of(
-    label: str, values: Sequence[Sequence[float]] | np.ndarray, decimals: Sequence[int], sign: str = ""
-) -> tuple:
-    """A row of a table: means of columns over objects, with intervals; NaN is left out."""
-    cells: list[Cell] = []
-    for column, digits in zip(np.asarray(values).T, decimals, strict=True):
-        known = column[~np.isnan(column)]
-        interval = intervals.interval([np.array([x]) for x in known]) if len(known) > 1 else None
-        cells.append(number(float(known.mean()) if len(known) else None, digits, interval, sign=sign))
-    return label, tuple(cells)
+def log_light(picture: np.ndarray, where: np.ndarray) -> np.ndarray:
+    """Logarithm of the linear light, mean of the colours, of some pixels of a picture."""
+    return np.log(np.maximum(linear(picture[..., :3])[where].mean(axis=-1), DARK))
+
+
+def correlation(ours: np.ndarray, theirs: np.ndarray) -> float:
+    """Of two changes of light; 0 where one of them is flat."""
+    if not ours.size or min(ours.std(), theirs.std()) < 1e-6:
+        return 0.0
+    return float(np.corrcoef(ours, theirs)[0, 1])
 
 
 def _write(out: Path, found: Found, shown: Sequence[Sequence]) -> None:
@@ -176,7 +167,7 @@ def _write(out: Path, found: Found, shown: Sequence[Sequence]) -> None:
     table = Table(
         title="Relighting",
         heads=HEADS,
-        rows=tuple(row_of(label, values, DECIMALS) for label, values in rows.items()),
+        rows=tuple(mean_row(label, values, DECIMALS) for label, values in rows.items()),
         note=note,
     )
     results = {"objects": rows, "hardware": machine.hardware()}
@@ -194,7 +185,7 @@ def _margins(found: Found) -> Table:
         others = [np.array([of[method][:2] for of in objects]) for method in (UNSHADOWED, DISCS)]
         room = found.get((ROOM, count))
         others.append(np.array([of[NETWORK][:2] for of in room]) if room else np.full_like(own, np.nan))
-        rows.append(row_of(f"{light}, {count:,}", np.hstack([own - x for x in others]), (2,) * 6, "+"))
+        rows.append(mean_row(f"{light}, {count:,}", np.hstack([own - x for x in others]), (2,) * 6, "+"))
     heads = tuple(
         f"{what}, {than}"
         for than in ("above split-sum", "above discs", "above the room")

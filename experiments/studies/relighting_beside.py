@@ -22,17 +22,16 @@ from tqdm import tqdm
 from experiments import entry_point
 from experiments.comparison import figures, poisson, relit, results_folder, source_meshes
 from experiments.comparison.object_views import Picture, on_white, smaller, told, view_of
-from experiments.comparison.result_tables import Table
 from experiments.studies.relighting import (
     DECIMALS,
     HEADS,
     METHODS,
     NETWORK,
     UNSHADOWED,
+    correlation,
     draw,
-    linear,
+    log_light,
     name_of,
-    row_of,
     scores,
 )
 from spnr_jax.devices import machine
@@ -42,10 +41,10 @@ from spnr_jax.formats.mesh.assets import Asset
 from spnr_jax.kernels.records import Volume
 from spnr_jax.method.model import Model
 from spnr_jax.scoring import evaluation
+from spnr_jax.scoring.score_tables import Table, mean_row
 from spnr_jax.training.weights import load
 
 POISSON, NO_SHADOWS, OCCLUSION = "Poisson, trimmed .3", "true mesh, no shadows", "true mesh, ambient occlusion"
-DARK = 1e-3  # linear light below which the logarithm is not taken
 CLIPPED = 0.995  # sRGB from which on a pixel says "at least"
 SHOWN = 192  # pixels of a picture on a sheet
 
@@ -198,13 +197,8 @@ def shadow_score(image: np.ndarray, reference: np.ndarray, bare: np.ndarray) -> 
     """
     solid = np.minimum(reference[..., 3], bare[..., 3]) > 0.999
     clear = solid & (np.maximum(reference, bare)[..., :3].max(axis=-1) < CLIPPED)
-    ours, theirs, without = (
-        np.log(np.maximum(linear(x[..., :3])[clear].mean(axis=-1), DARK)) for x in (image, reference, bare)
-    )
-    changes = ours - without, theirs - without
-    if not clear.any() or min(change.std() for change in changes) < 1e-6:
-        return 0.0
-    return float(np.corrcoef(*changes)[0, 1])
+    ours, theirs, without = (log_light(x, clear) for x in (image, reference, bare))
+    return correlation(ours - without, theirs - without)
 
 
 def _sheet(light: str, reference: np.ndarray, drawn: Mapping[str, Sequence[Picture]]) -> np.ndarray:
@@ -214,7 +208,7 @@ def _sheet(light: str, reference: np.ndarray, drawn: Mapping[str, Sequence[Pictu
 
 def _table(found: Found, size: str) -> Table:
     rows = [
-        row_of(f"{light}, {label}", [of[label][size] for of in objects], (*DECIMALS, 2))
+        mean_row(f"{light}, {label}", [of[label][size] for of in objects], (*DECIMALS, 2))
         for light, objects in found.items()
         for label in objects[0]
     ]
@@ -232,7 +226,7 @@ def _margins(found: Found, size: str) -> Table:
                 continue
             others = (f"{UNSHADOWED}, {count}", f"{POISSON}, {count}", NO_SHADOWS, OCCLUSION)
             values = [[of[label][size][i] - of[x][size][i] for x in others for i in (0, 1)] for of in objects]
-            rows.append(row_of(f"{light}, {count}", values, (2,) * 8, "+"))
+            rows.append(mean_row(f"{light}, {count}", values, (2,) * 8, "+"))
     heads = tuple(
         f"{what}, above {x}" for x in ("split-sum", POISSON, NO_SHADOWS, OCCLUSION) for what in ("PSNR", "inside")
     )

@@ -23,8 +23,7 @@ from data_gen.render import light
 from experiments import entry_point
 from experiments.comparison import figures, relit, results_folder, source_meshes
 from experiments.comparison.object_views import Picture, on_white, told, view_of
-from experiments.comparison.result_tables import Table
-from experiments.studies.relighting import METHODS, NETWORK, draw, linear, row_of
+from experiments.studies.relighting import METHODS, NETWORK, correlation, draw, log_light
 from spnr_jax.devices import machine
 from spnr_jax.formats import data_sets, images
 from spnr_jax.formats.light_files import read_envmap
@@ -34,12 +33,12 @@ from spnr_jax.kernels.records import Camera, Volume
 from spnr_jax.method.model import Model
 from spnr_jax.scoring import evaluation
 from spnr_jax.scoring.picture_scores import sharpness
+from spnr_jax.scoring.score_tables import Table, mean_row
 from spnr_jax.surfels import envmaps, skies
 from spnr_jax.surfels.lighting import light_of
 from spnr_jax.training.weights import load
 
 HEADS = ("inside, dB", "best step", "worst step", "change: correlation")
-DARK = 1e-3  # linear light below which the logarithm is not taken
 FPS = 10
 
 
@@ -109,7 +108,7 @@ def main(options: TurnsStudy) -> None:
     table = Table(
         title=f"Turned lights, {options.resolution} pixels",
         heads=HEADS,
-        rows=tuple(row_of(label, values, (2, 2, 2, 3)) for label, values in rows.items()),
+        rows=tuple(mean_row(label, values, (2, 2, 2, 3)) for label, values in rows.items()),
         note=f"{options.steps} steps around; means over objects with 95 % intervals.",
     )
     results_folder.write(options.out, {"objects": rows, "names": names, "hardware": machine.hardware()}, [table])
@@ -180,11 +179,10 @@ def change_score(drawn: Sequence[np.ndarray], references: Sequence[np.ndarray]) 
     solid = np.min([x[..., 3] for x in references], axis=0) > 0.999
 
     def changes(pictures: Sequence[np.ndarray]) -> np.ndarray:
-        logs = [np.log(np.maximum(linear(x[..., :3])[solid].mean(axis=-1), DARK)) for x in pictures]
+        logs = [log_light(x, solid) for x in pictures]
         return np.concatenate([after - before for before, after in zip(logs, logs[1:] + logs[:1], strict=True)])
 
-    ours, theirs = changes(drawn), changes(references)
-    return float(np.corrcoef(ours, theirs)[0, 1]) if min(ours.std(), theirs.std()) > 1e-6 else 0.0
+    return correlation(changes(drawn), changes(references))
 
 
 def _pictures(options: TurnsStudy, dataset: data_sets.Dataset, model: Model, maps: Mapping[str, np.ndarray]) -> None:

@@ -18,15 +18,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
 from experiments import entry_point
 from experiments.comparison import figures, poisson, results_folder
-from experiments.comparison.object_views import on_white, view_of
-from experiments.comparison.result_tables import Cell, Table, number
+from experiments.comparison.object_views import Picture, drawn, few, on_white, view_of, view_scores
 from spnr_jax.devices import machine
 from spnr_jax.formats import data_sets, images
 from spnr_jax.kernels.cleaning import cleaned
@@ -34,16 +31,13 @@ from spnr_jax.kernels.cloud_arrays import normalization
 from spnr_jax.kernels.records import Camera, PointCloud
 from spnr_jax.kernels.thinning import farthest_points
 from spnr_jax.method.model import Model, Quality
-from spnr_jax.scoring import intervals
-from spnr_jax.scoring.flip import flip
-from spnr_jax.scoring.picture_scores import sharpness
+from spnr_jax.scoring.score_tables import Cell, Table, mean_row, number
 from spnr_jax.training.scan_faults import Fault, faults
 from spnr_jax.training.weights import load
 
 HEADS = ("PSNR, dB", "inside, dB", "FLIP", "cleaned: PSNR, dB", "inside, dB", "FLIP", "points left, %")
 DECIMALS = (2, 2, 3)
 View = tuple[Camera, np.ndarray]  # and its reference
-Drawn = tuple[np.ndarray, np.ndarray]  # a picture on white, and opacity
 RIVALS = {"auto": "network", "draft": "discs and light alone", "poisson": "trimmed Poisson"}
 
 
@@ -101,7 +95,7 @@ def main(options: ScansStudy) -> None:
         title=f"Scans, {len(names)} objects x {options.views} views",
         heads=HEADS,
         rows=tuple(
-            (row, (*_cells(found, ("off", "auto")), number(100 * np.mean([of["left"] for of in found]), 0)))
+            (row, (*_row(row, found, ("off", "auto"))[1], number(100 * np.mean([of["left"] for of in found]), 0)))
             for row, found in rows.items()
         ),
         note="Means over objects with 95 % intervals; points left: of the data set's, before cleaning.",
@@ -119,7 +113,7 @@ def _rivals(options: ScansStudy, rows: dict[str, list[dict]]) -> Table:
     return Table(
         title=f"The same cleaned points drawn otherwise, {len(next(iter(counted.values())))} objects",
         heads=tuple(head for way in ways for head in (f"{RIVALS[way]}: PSNR, dB", "inside, dB", "FLIP")),
-        rows=tuple((row, _cells(found, ways)) for row, found in counted.items()),
+        rows=tuple(_row(row, found, ways) for row, found in counted.items()),
     )
 
 
@@ -165,16 +159,12 @@ def _poisson_scores(
 ) -> list[float]:
     """Mean scores of the trimmed Poisson surface of the cleaned points."""
     cloud, _ = _cleaned(*spoiled(item.cloud, fault), count)
-    seen = dataclasses.replace(
-        item,
-        cloud=cloud,
-        images=item.images[: options.views],
-        camera=jax.tree.map(lambda x: x[: options.views], item.camera),
-    )
+    seen = dataclasses.replace(few(item, options.views), cloud=cloud)
     pictures, _ = renderer.pictures(seen, count, poisson.SURFACES["poisson_trimmed"])
-    drawn = dataclasses.replace(seen, images=pictures)
-    views = views_of(item, options.views, options.resolution)
-    return mean_scores([on_white(rgba) for _, rgba in views_of(drawn, options.views, options.resolution)], views)
+    made, views = (
+        views_of(x, options.views, options.resolution) for x in (dataclasses.replace(seen, images=pictures), item)
+    )
+    return mean_scores([on_white(rgba) for _, rgba in made], views)
 
 
 def _cleaned(positions: np.ndarray, values: dict[str, np.ndarray], count: int) -> tuple[PointCloud, list[str]]:
@@ -187,29 +177,19 @@ def views_of(item: data_sets.ObjectData, views: int, resolution: int | None) -> 
     return [view_of(item, view, resolution) for view in range(min(views, len(item.images)))]
 
 
-def drawn_of(model: Model, cloud: PointCloud, views: Sequence[View], quality: Quality = "best") -> list[Drawn]:
+def drawn_of(model: Model, cloud: PointCloud, views: Sequence[View], quality: Quality = "best") -> list[Picture]:
     """Pictures of a cloud from cameras."""
-    found = model.render_each(model.encode(cloud), [camera for camera, _ in views], quality)
-    return [(np.asarray(r.image), np.asarray(r.acc)) for r in found]
+    return drawn(model, model.encode(cloud), [camera for camera, _ in views], quality)
 
 
-def mean_scores(drawn: Sequence[Drawn], views: Sequence[View]) -> list[float]:
+def mean_scores(drawn: Sequence[Picture], views: Sequence[View]) -> list[float]:
     """Mean PSNR, PSNR inside and FLIP of pictures."""
-    found = []
-    for (image, opacity), (_, reference) in zip(drawn, views, strict=True):
-        scores = sharpness(image, opacity, reference)
-        distance = float(flip(jnp.asarray(image), jnp.asarray(on_white(reference)[0])))
-        found.append([scores.psnr, scores.psnr_inside, distance])
+    found = [view_scores(*picture, reference) for picture, (_, reference) in zip(drawn, views, strict=True)]
     return np.nanmean(found, axis=0).tolist()
 
 
-def _cells(found: Sequence[dict], ways: Sequence[str]) -> tuple[Cell, ...]:
-    cells = []
-    for way in ways:
-        for values, decimals in zip(np.array([scores[way] for scores in found]).T, DECIMALS, strict=True):
-            interval = intervals.interval([np.array([x]) for x in values]) if len(values) > 1 else None
-            cells.append(number(float(np.mean(values)), decimals, interval))
-    return tuple(cells)
+def _row(row: str, found: Sequence[dict], ways: Sequence[str]) -> tuple[str, tuple[Cell, ...]]:
+    return mean_row(row, [[x for way in ways for x in scores[way]] for scores in found], DECIMALS * len(ways))
 
 
 def _gallery(options: ScansStudy, dataset: data_sets.Dataset, names: Sequence[str], model: Model) -> None:

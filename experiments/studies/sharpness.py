@@ -25,15 +25,14 @@ from tqdm import tqdm
 from experiments import entry_point
 from experiments.comparison import figures, results_folder
 from experiments.comparison.object_views import cut, on_white, told, view_of
-from experiments.comparison.result_tables import Cell, Table, number
 from experiments.studies.sharpness_methods import Method, Network, methods, resized
 from spnr_jax.devices import machine
 from spnr_jax.formats import data_sets, images
 from spnr_jax.kernels import metrics
 from spnr_jax.kernels.records import PointCloud
-from spnr_jax.scoring import intervals
 from spnr_jax.scoring.flip import flip
 from spnr_jax.scoring.picture_scores import ball, ball_waves, blue_share, plate, sharpness, under_true_opacity
+from spnr_jax.scoring.score_tables import Cell, Table, mean_row, number
 
 COLUMNS = {  # scores of a view: heads, decimals
     "psnr": ("PSNR, dB", 2),
@@ -99,7 +98,7 @@ def main(options: SharpnessStudy) -> None:
     table = Table(
         title=f"Sharpness, {len(names)} objects x {options.views} views",
         heads=(*HEADS, *KNOWN_HEADS),
-        rows=tuple((name, _cells(found, known[name])) for name, found in rows.items()),
+        rows=tuple(_row(name, found, known[name]) for name, found in rows.items()),
         note="Means over objects with 95 % intervals; a true plate shows a blue share of .077.",
     )
     results_folder.write(options.out, {"objects": rows, "known": known, "hardware": machine.hardware()}, [table])
@@ -135,7 +134,7 @@ def _mean(values: np.ndarray) -> float | None:
 
 def all_scores(image: np.ndarray, opacity: np.ndarray, reference: np.ndarray) -> dict[str, float]:
     """The scores of a picture by the names in COLUMNS."""
-    white = reference[..., :3] * reference[..., 3:] + 1 - reference[..., 3:]
+    white = on_white(reference)[0]
     oracle = sharpness(under_true_opacity(image, opacity, reference), reference[..., 3], reference)
     return sharpness(image, opacity, reference)._asdict() | {
         "ssim": float(metrics.ssim(jnp.asarray(image), jnp.asarray(white))),
@@ -164,16 +163,14 @@ def _known(options: SharpnessStudy, method: Method, count: int) -> dict[str, flo
     return results_folder.kept(options.out / "known" / _folder(method) / f"{count}.json", make)
 
 
-def _cells(found: Sequence[Mapping[str, float | None]], known: Mapping[str, float]) -> tuple[Cell, ...]:
-    cells = []
-    for name, (_, decimals) in COLUMNS.items():
-        values = [x for scores in found if (x := scores[name]) is not None]
-        interval = intervals.interval([np.array([value]) for value in values]) if len(values) > 1 else None
-        cells.append(number(float(np.mean(values)) if values else None, decimals, interval))
-    for name in ("encode", "render"):
-        seconds = [x for scores in found if (x := scores[name]) is not None]
-        cells.append(number(float(np.median(seconds)) if seconds else None, 2))
-    return (*cells, number(known.get("ball"), 4), number(known.get("plate"), 3))
+def _row(
+    name: str, found: Sequence[Mapping[str, float | None]], known: Mapping[str, float]
+) -> tuple[str, tuple[Cell, ...]]:
+    columns = COLUMNS.items()
+    _, cells = mean_row(name, [[of[column] for column, _ in columns] for of in found], [n for _, (_, n) in columns])
+    seconds = ([x for of in found if (x := of[what]) is not None] for what in ("encode", "render"))
+    times = (number(float(np.median(taken)) if taken else None, 2) for taken in seconds)
+    return name, (*cells, *times, number(known.get("ball"), 4), number(known.get("plate"), 3))
 
 
 def _pictures(

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from data_gen.store import layout
-from experiments.comparison.object_views import Picture, at, on_white, view_of
+from experiments.comparison.object_views import Picture, at, drawn, on_white, view_of
 from experiments.comparison.poisson import Renderer, trimmed_surface
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
@@ -46,9 +46,7 @@ class Network:
         views = [view_of(item, view, resolution)[0] for view in range(len(item.images))]
         for _ in range(2):
             begin = perf_counter()
-            found = [
-                (np.asarray(r.image), np.asarray(r.acc)) for r in self.model.render_each(volume, views, self.quality)
-            ]
+            found = drawn(self.model, volume, views, self.quality)
             seconds = (perf_counter() - begin) / len(views)
         size = views[0].height, views[0].width
         return Drawn([(image, resized(opacity, size)) for image, opacity in found], encode, seconds)

@@ -31,8 +31,8 @@ import tyro
 
 from data_gen.render import poisson_surface
 from experiments import entry_point
-from experiments.comparison import poisson, results_folder
-from experiments.comparison.object_views import told, view_of
+from experiments.comparison import clock, poisson, results_folder
+from experiments.comparison.object_views import few, on_white, told, view_of
 from experiments.comparison.peak_memory import forget_peak, peak_mb
 from experiments.comparison.trained_networks import test_objects
 from experiments.studies.speed_accuracy_plot import plot
@@ -207,14 +207,11 @@ def measure_surface(
         item = data_sets.read_object(dataset, name)
         cloud = jax.tree.map(lambda x: np.asarray(x)[: surface.points], item.cloud)
         pairs = [view_of(item, view, size) for view in range(min(views, len(item.images)))]
-        few = dataclasses.replace(
-            item, images=item.images[:views], camera=jax.tree.map(lambda x: x[:views], item.camera)
-        )
         asset, ms = timed(partial(poisson_surface.reconstruct, cloud, poisson.SURFACES[surface.kind]))
         found.encode_s.append(ms / 1e3)
         forget_peak()
         before = peak_mb()
-        pictures, ms = timed(partial(renderer.drawn, asset, few))
+        pictures, ms = timed(partial(renderer.drawn, asset, few(item, views)))
         found.view_ms.append(ms / len(pairs))
         found.mb.append(peak_mb() - before)
         for picture, (_, reference) in zip(pictures, pairs, strict=True):
@@ -227,7 +224,7 @@ def _scores(image: np.ndarray, opacity: np.ndarray, reference: np.ndarray) -> di
     shape = reference.shape[:2]
     image = np.clip(np.asarray(jax.image.resize(image, (*shape, 3), "cubic")), 0, 1)
     opacity = np.asarray(jax.image.resize(opacity, shape, "linear"))
-    white = reference[..., :3] * reference[..., 3:] + 1 - reference[..., 3:]
+    white = on_white(reference)[0]
     return {
         "psnr": float(metrics.psnr(jnp.asarray(image), jnp.asarray(white))),
         "ssim": float(metrics.ssim(jnp.asarray(image), jnp.asarray(white))),
@@ -255,10 +252,9 @@ def _time_views(found: Drawn, draw: Callable[[], list[Rendering]]) -> None:
 
 def timed(work: Callable[[], Result]) -> tuple[Result, float]:
     """What the work gives, and its milliseconds: of the processor, where that is what computes."""
-    clock = time.process_time if jax.default_backend() == "cpu" else time.perf_counter
-    start = clock()
+    start = clock.now()
     result = jax.block_until_ready(work())
-    return result, 1000 * (clock() - start)
+    return result, 1000 * (clock.now() - start)
 
 
 if __name__ == "__main__":

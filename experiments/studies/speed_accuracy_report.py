@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.comparison.result_tables import Table, number, text
+from spnr_jax.scoring.score_tables import Table, number, text
 
 
 def front(rows: Sequence[dict]) -> list[int]:

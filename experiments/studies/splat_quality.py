@@ -18,33 +18,35 @@ takes on that machine alone.
 
 import dataclasses
 import itertools
+import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-import jax
 import jax.numpy as jnp
 import mitsuba
 import numpy as np
 
 from data_gen.render.variant import choose_variant
 from experiments import entry_point
-from experiments.comparison import exported_mesh, figures, poisson, results_folder, splats_by_mitsuba
-from experiments.comparison.exported_mesh import ExportedMesh
-from experiments.comparison.object_views import smaller, told, view_of
+from experiments.comparison import figures, poisson, results_folder, splats_by_mitsuba
+from experiments.comparison.object_views import Picture, at, drawn, few, on_white, told, view_of
 from experiments.studies.splat_quality_report import BY_MITSUBA, MESH, after, caption, methods_of, tables_of
 from spnr_jax.devices import machine
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets, gaussian_files, images
+from spnr_jax.formats.clouds import PlacedCloud
+from spnr_jax.formats.mesh.assets import Asset
+from spnr_jax.formats.mesh.meshes import load_mesh
 from spnr_jax.gaussians import drawing
 from spnr_jax.gaussians.placing import View
 from spnr_jax.kernels.metrics import psnr
 from spnr_jax.kernels.records import Gaussians, PointCloud, Volume
 from spnr_jax.method.model import Model
 from spnr_jax.scoring.picture_scores import sharpness
-from spnr_jax.tools import splat_making
+from spnr_jax.tools import fused_surface, mesh_export, splat_making
 from spnr_jax.tools.splat_making import drawn_views, fitting_cameras, in_box
 from spnr_jax.training.weights import load
 
@@ -92,9 +94,6 @@ class SplatStudy:
         return methods_of(self.seconds)
 
 
-Drawn = tuple[np.ndarray, np.ndarray]  # a picture on white (sRGB), and opacity
-
-
 def main(options: SplatStudy) -> None:
     """Makes, draws, scores and writes."""
     dataset = data_sets.open_dataset(options.data)
@@ -132,9 +131,9 @@ def _splat_scores(options: SplatStudy, model: Model, item: data_sets.ObjectData)
     last, place = splats[after(options.seconds[-1])], options.out / f"{item.name}.ply"
     for size in options.sizes:
         cameras = [view_of(item, view, size)[0] for view in range(options.views)]
-        drawn = {name: [drawing.draw(made, camera) for camera in cameras] for name, made in splats.items()}
-        drawn[BY_MITSUBA] = [splats_by_mitsuba.drawn(last, camera, options.spp, place) for camera in cameras]
-        found |= _compared(options, model, volume, item, size, drawn)
+        shown = {name: [drawing.draw(made, camera) for camera in cameras] for name, made in splats.items()}
+        shown[BY_MITSUBA] = [splats_by_mitsuba.drawn(last, camera, options.spp, place) for camera in cameras]
+        found |= _compared(options, model, volume, item, size, shown)
     place.unlink()
     return found
 
@@ -143,10 +142,12 @@ def _mesh_scores(renderer: poisson.Renderer, options: SplatStudy, model: Model, 
     """Decibels of the mesh by size; its faces, megabytes as .glb and seconds."""
     cloud = _cloud(options, item)
     volume = model.encode(cloud)
-    views = _pictures(options, model, volume, item.name)
-    pictures, found = _meshed(options, partial(exported_mesh.exported, views, volume, cloud), renderer, item)
+    asset, found = _meshed(_pictures(options, model, volume, item.name), volume, cloud)
+    # where the network shows no surface the pictures are empty
+    nothing = np.zeros(item.images[: options.views].shape, np.uint8)
+    pictures = renderer.drawn(asset, few(item, options.views)) if asset else nothing
     for size in options.sizes:
-        found |= _compared(options, model, volume, item, size, {MESH: [_at(rgba, size) for rgba in pictures]})
+        found |= _compared(options, model, volume, item, size, {MESH: [on_white(at(rgba, size)) for rgba in pictures]})
     return found
 
 
@@ -160,16 +161,15 @@ def _compared(
     volume: Volume,
     item: data_sets.ObjectData,
     size: int,
-    drawn: dict[str, list[Drawn]],
+    made: dict[str, list[Picture]],
 ) -> dict:
     """Decibels of pictures at the object's first cameras, and of the network's there; the first of each is written."""
     cameras, references = zip(*(view_of(item, view, size) for view in range(options.views)), strict=True)
-    renderings = model.render_each(volume, list(cameras))
-    network = [(np.asarray(rendering.image), np.asarray(rendering.acc)) for rendering in renderings]
+    network = drawn(model, volume, cameras)
     reference = data_sets.on_white(images.to_uint8(references[0]))
     images.write_whole(options.out / item.name / "reference.png", images.png(reference))
     found = {}
-    for method, shown in {"network": network, **drawn}.items():
+    for method, shown in {"network": network, **made}.items():
         found[f"{method}, {size}"] = _scored(shown, list(references), network)
         images.write_whole(options.out / item.name / f"{method}.png", images.png(shown[0][0]))
     return found
@@ -191,42 +191,25 @@ def _made(
     return made, {"splats": len(made.opacity), "spz_mb": spz, "steps": steps} | took
 
 
-def _meshed(
-    options: SplatStudy, make: Callable[[], ExportedMesh], renderer: poisson.Renderer, item: data_sets.ObjectData
-) -> tuple[np.ndarray, dict]:
-    """Pictures (views, height, width, 4) of the object's mesh, sRGB with straight alpha, and what it is.
-
-    Where the network shows no surface they are empty.
-    """
-    begin = time.perf_counter()
+def _meshed(views: Sequence[View], volume: Volume, cloud: PointCloud) -> tuple[Asset | None, dict]:
+    """The mesh that `spnr export --mesh` writes, read from its file, and what it is; None without a surface."""
+    begin, placed = time.perf_counter(), PlacedCloud(cloud=cloud, up="y", rotation=np.eye(3), origin=np.zeros(3))
     try:
-        mesh = make()
+        solid = mesh_export.mesh_of(fused_surface.solidity(views, volume, placed), placed)
     except UserError as error:
-        nothing = {"faces": 0, "glb_mb": 0.0, "watertight": False, "empty": str(error)}
-        return np.zeros(item.images[: options.views].shape, np.uint8), nothing | {"mesh_seconds": 0.0}
-    found = {"faces": mesh.faces, "glb_mb": mesh.size / 1e6, "watertight": mesh.watertight, "empty": ""}
-    found["mesh_seconds"] = time.perf_counter() - begin
-    seen = dataclasses.replace(
-        item,
-        images=item.images[: options.views],
-        camera=jax.tree.map(lambda x: x[: options.views], item.camera),
-    )
-    return renderer.drawn(mesh.asset, seen), found
+        return None, {"faces": 0, "glb_mb": 0.0, "watertight": False, "empty": str(error), "mesh_seconds": 0.0}
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "mesh.glb"
+        path.write_bytes(solid.content)
+        asset = load_mesh(path)
+    found = {"faces": solid.faces, "glb_mb": len(solid.content) / 1e6, "watertight": solid.watertight, "empty": ""}
+    return asset, found | {"mesh_seconds": time.perf_counter() - begin}
 
 
-def _at(rgba: np.ndarray, size: int) -> Drawn:
-    """A picture (height, width, 4) uint8 on white at a size of which its own is a multiple, and its opacity."""
-    picture = rgba.astype(np.float32) / 255
-    if size != len(picture):
-        picture = smaller(picture, len(picture) // size)
-    alpha = picture[..., 3:]
-    return picture[..., :3] * alpha + 1 - alpha, picture[..., 3]
-
-
-def _scored(shown: list[Drawn], references: list[np.ndarray], of_network: list[Drawn]) -> dict[str, float]:
+def _scored(shown: list[Picture], references: list[np.ndarray], of_network: list[Picture]) -> dict[str, float]:
     """Mean decibels of some views: whole, inside the silhouettes, and against the network's pictures."""
     scores = [sharpness(*picture, reference) for picture, reference in zip(shown, references, strict=True)]
-    own, networks = (jnp.stack([image for image, _ in drawn]) for drawn in (shown, of_network))
+    own, networks = (jnp.stack([image for image, _ in of]) for of in (shown, of_network))
     return {
         "psnr": float(np.mean([s.psnr for s in scores])),
         "inside": float(np.nanmean([s.psnr_inside for s in scores])),
@@ -238,11 +221,11 @@ def _pictures(options: SplatStudy, model: Model, volume: Volume, name: str) -> l
     """The network's pictures that splats are made from; they take longest, so they are kept."""
     cameras = fitting_cameras(model, volume, options.fitting_views, options.fitting_resolution)
 
-    def drawn() -> tuple[np.ndarray, ...]:
+    def made() -> tuple[np.ndarray, ...]:
         views = drawn_views(model, volume, cameras, None)
         return tuple(np.stack(x) for x in zip(*((v.image, v.opacity, v.depth) for v in views), strict=True))
 
-    arrays = results_folder.kept(options.out / name / "pictures.npz", drawn)
+    arrays = results_folder.kept(options.out / name / "pictures.npz", made)
     inside = [in_box(camera, volume) for camera in cameras]
     return [View(*each) for each in zip(inside, *arrays, strict=True)]
 

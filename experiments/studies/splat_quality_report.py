@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from experiments.comparison.result_tables import Cell, Table, number
+from spnr_jax.scoring.score_tables import Cell, Table, number
 
 BY_MITSUBA, MESH = "splats, by Mitsuba", "mesh, by Mitsuba"
 

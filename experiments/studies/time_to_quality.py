@@ -14,6 +14,7 @@ their pace: neither compilation nor scoring is in them, nor what else the machin
 
 import dataclasses
 import time
+from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
@@ -27,16 +28,16 @@ from matplotlib.figure import Figure
 
 from experiments import entry_point
 from experiments.comparison import budget, figures, results_folder
-from experiments.comparison.result_tables import Table, number
 from experiments.comparison.trained_networks import test_objects
 from experiments.comparison.variants import Preset
 from spnr_jax import cli
 from spnr_jax.config import TrainConfig
 from spnr_jax.devices import machine
-from spnr_jax.errors import UserError
+from spnr_jax.errors import UserError, at_least
 from spnr_jax.formats import data_sets
 from spnr_jax.presets import PRESETS
 from spnr_jax.scoring import evaluation
+from spnr_jax.scoring.score_tables import Table, number
 from spnr_jax.training import adversary, batching, optimisation
 
 Row = dict[str, float]
@@ -72,8 +73,7 @@ class TimeToQuality:
             raise UserError(f"--seeds: expected one or more numbers, none of them twice, got {list(self.seeds)}")
         if not self.seconds > 0:
             raise UserError(f"--seconds: expected more than 0, got {self.seconds:g}")
-        if self.marks < 1:
-            raise UserError(f"--marks: expected 1 or more, got {self.marks}")
+        at_least(self, 1, "marks")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -138,12 +138,10 @@ def config_of(preset: str, options: TimeToQuality, steps: int, seed: int = 0) ->
 
 def steps_of(preset: str, options: TimeToQuality, pace: Pace) -> int:
     """The most steps that fit into the seconds, at least one a mark."""
-    few, many = options.marks, options.marks + int(options.seconds / pace.alone) + 1
-    while few < many:  # the longest training that is in time
-        middle = (few + many + 1) // 2
-        in_time = pace.seconds(config_of(preset, options, middle), middle) <= options.seconds
-        few, many = (middle, many) if in_time else (few, middle - 1)
-    return few
+    longer = range(options.marks + 1, options.marks + int(options.seconds / pace.alone) + 2)
+    return options.marks + bisect_right(
+        longer, options.seconds, key=lambda steps: pace.seconds(config_of(preset, options, steps), steps)
+    )
 
 
 def curve(preset: str, seed: int, options: TimeToQuality, pace: Pace, dataset: data_sets.Dataset) -> list[Row]:

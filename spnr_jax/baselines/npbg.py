@@ -136,7 +136,8 @@ class NPBG(nn.Module):
         rasters, distances = zip(*(self.rasters(cloud, camera, 2**i) for i in scales), strict=True)
         flat = [x.reshape(-1, *x.shape[2:]) for x in rasters]
         image = self.network(flat).reshape(*rasters[0].shape[:-1], 3)
-        _, far, _ = cameras.intersect_box(*_rays(camera))
+        rays = cameras.camera_rays(camera)
+        _, far, _ = cameras.intersect_box(rays.origins, rays.directions)
         seen = jnp.isfinite(distances[0])
         return Rendering(
             image=image, image_lr=image, depth=jnp.where(seen, distances[0], far), acc=seen.astype(image.dtype)
@@ -156,8 +157,3 @@ class NPBG(nn.Module):
     def __call__(self, cloud: PointCloud, camera: Camera, key: Key | None = None, train: bool = False) -> Rendering:
         """Views of each cloud from its cameras."""
         return self.render(self.encode(cloud, train), camera)
-
-
-def _rays(camera):
-    rays = cameras.camera_rays(camera)
-    return rays.origins, rays.directions

@@ -20,7 +20,7 @@ import numpy as np
 from jax.experimental import multihost_utils
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
-from spnr_jax.errors import UserError
+from spnr_jax.errors import UserError, first_line
 
 OBJECTS, DEPTH = "objects", "depth"
 
@@ -142,10 +142,9 @@ def lost(error: jax.errors.JaxRuntimeError, run: object) -> Exception:
     """What to raise of an error of the runtime: of several processes, that another one is gone."""
     if jax.process_count() == 1:
         return error
-    reason = str(error).partition("\n")[0][:160]
     return ValueError(
-        f"{run}: another process of this training ended ({reason}); start all again, and they go on from the last "
-        "checkpoint"
+        f"{run}: another process of this training ended ({first_line(error)}); start all again, and they go on from "
+        "the last checkpoint"
     )
 
 

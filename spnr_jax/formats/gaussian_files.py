@@ -23,7 +23,7 @@ from spnr_jax.formats.glb import Buffer
 from spnr_jax.formats.images import check_place, write_whole
 from spnr_jax.formats.point_files import parse_ply
 from spnr_jax.gaussians.harmonics import C0, degree_of, half_turn_signs
-from spnr_jax.kernels.records import AnyArray, Gaussians
+from spnr_jax.kernels.records import Gaussians
 
 SUFFIXES = (".ply", ".spz", ".glb")
 LEAST_OPACITY, MOST_OPACITY = 1e-4, 1 - 1e-4  # that the logistic function is inverted for
@@ -70,7 +70,8 @@ def turned(gaussians: Gaussians) -> Gaussians:
 def ply_of(gaussians: Gaussians, note: str = "") -> bytes:
     """The splats as a .ply file."""
     splats = turned(gaussians)
-    harmonics, opacity = np.asarray(splats.harmonics), _inner(splats.opacity)
+    harmonics = np.asarray(splats.harmonics)
+    opacity = np.clip(np.asarray(splats.opacity, np.float64), LEAST_OPACITY, MOST_OPACITY)
     rest = harmonics[:, 1:].transpose(0, 2, 1).reshape(len(opacity), -1)
     names = [*"xyz", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3)), *(f"f_rest_{i}" for i in range(rest.shape[1]))]
     names += ["opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
@@ -163,10 +164,6 @@ def glb_of(gaussians: Gaussians, note: str = "") -> bytes:
         "meshes": [{"primitives": [primitive]}],
     }
     return buffer.glb(document)
-
-
-def _inner(opacity: Float[AnyArray, " splats"]) -> np.ndarray:
-    return np.clip(np.asarray(opacity, np.float64), LEAST_OPACITY, MOST_OPACITY)
 
 
 def _bytes(values: np.ndarray) -> np.ndarray:

@@ -78,10 +78,17 @@ def check_place(path: Path) -> None:
 
 def write_whole(path: Path, data: bytes) -> None:
     """Write a file in one piece; folders that are missing are made."""
+    with _in_its_place(path) as unfinished:
+        unfinished.write_bytes(data)
+
+
+@contextlib.contextmanager
+def _in_its_place(path: Path) -> Iterator[Path]:
+    """The path beside it where a file is written, which is renamed when that is done, or removed."""
     path.parent.mkdir(parents=True, exist_ok=True)
     unfinished = path.with_name(f".unfinished-{path.name}")
     try:
-        unfinished.write_bytes(data)
+        yield unfinished
         os.replace(unfinished, path)
     finally:
         unfinished.unlink(missing_ok=True)
@@ -152,9 +159,7 @@ def _write_mp4(path: Path, pictures: list[np.ndarray], fps: float | int) -> None
     import imageio_ffmpeg
 
     height, width = (size - size % 2 for size in pictures[0].shape[:2])
-    path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(f".unfinished-{path.name}")
-    try:
+    with _in_its_place(path) as unfinished:
         writer = imageio_ffmpeg.write_frames(
             str(unfinished), (width, height), fps=fps, quality=8, macro_block_size=2, ffmpeg_log_level="error"
         )
@@ -163,6 +168,3 @@ def _write_mp4(path: Path, pictures: list[np.ndarray], fps: float | int) -> None
         for picture in pictures:
             writer.send(np.ascontiguousarray(picture[:height, :width]))
         writer.close()
-        os.replace(unfinished, path)
-    finally:
-        unfinished.unlink(missing_ok=True)

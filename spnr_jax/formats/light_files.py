@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from spnr_jax.errors import UserError
+from spnr_jax.errors import UserError, first_line
 from spnr_jax.kernels.records import Light
 from spnr_jax.surfels import skies
 from spnr_jax.surfels.lighting import light_of
@@ -62,7 +62,7 @@ def _read(path: Path) -> np.ndarray:
                 raise UserError(f"{path}: holds an 8- or 16-bit picture, not radiance; give a real .hdr or .exr")
             bitmap = bitmap.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, srgb_gamma=False)
     except RuntimeError as error:
-        raise UserError(f"{path}: not a readable .hdr or .exr ({str(error).splitlines()[0]})") from None
+        raise UserError(f"{path}: not a readable .hdr or .exr ({first_line(error)})") from None
     return np.array(bitmap, dtype=np.float32)
 
 

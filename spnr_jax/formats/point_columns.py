@@ -90,7 +90,10 @@ def materials(columns: Columns, report: Report) -> dict[str, np.ndarray]:
     """
     count, complete = len(columns["x"]), {}
     for name, default in DEFAULTS.items():
-        values = _base_color(columns, report) if name == "base_color" else _scalar(columns, name)
+        if name == "base_color":
+            values = _base_color(columns, report)
+        else:
+            values = _unit_interval(columns[name] / _full(columns[name]), name) if name in columns else None
         if values is None:
             report(f"no {name} in the file: {default:g} taken for all points")
             values = np.full((count, 3) if name == "base_color" else count, default)
@@ -109,11 +112,6 @@ def normals(columns: Columns) -> np.ndarray | None:
         length = np.linalg.norm(vectors, axis=-1, keepdims=True)
         usable = np.isfinite(length) & (length > SHORTEST)
         return np.where(usable, vectors / np.where(usable, length, 1), 0) if usable.any() else None
-
-
-def _scalar(columns: Columns, name: str) -> np.ndarray | None:
-    """Roughness or metallic (points,), None if there is no such column."""
-    return _unit_interval(columns[name] / _full(columns[name]), name) if name in columns else None
 
 
 def _base_color(columns: Columns, report: Report) -> np.ndarray | None:

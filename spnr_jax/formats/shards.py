@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from spnr_jax.errors import UserError
+from spnr_jax.errors import UserError, first_line
 
 INDEX = "index.json"
 LONGEST_NAME = 200  # file systems allow 255 bytes
@@ -82,8 +82,3 @@ def is_plain_name(name: object) -> bool:
         and name.isprintable()
         and not (name.startswith(".") or set(name) & set("/\\:"))
     )
-
-
-def first_line(error: Exception) -> str:
-    """What an error of the reader says, without its call stack."""
-    return (str(error).splitlines() or [type(error).__name__])[0][:200]

@@ -2,6 +2,7 @@
 
 import jax
 import numpy as np
+from jaxtyping import Float
 
 from spnr_jax.errors import UserError
 from spnr_jax.kernels.records import PointCloud
@@ -36,3 +37,20 @@ def normalization(positions: np.ndarray) -> tuple[np.ndarray, np.float32]:
     low, high = (np.asarray(bound, np.float64) for bound in (positions.min(axis=0), positions.max(axis=0)))
     diagonal = np.linalg.norm(high - low)
     return ((low + high) / 2).astype(np.float32), np.float32(2 / diagonal if diagonal > 0 else 1)
+
+
+def plain_cloud(
+    positions: Float[np.ndarray, "points 3"],
+    base_color: Float[np.ndarray, "points 3"] | float = 0.5,
+    normals: Float[np.ndarray, "points 3"] | None = None,
+) -> PointCloud:
+    """Points of one material, grey unless said otherwise: roughness 0.5, metallic 0; all are real."""
+    count = len(positions)
+    return PointCloud(
+        positions=positions,
+        base_color=np.broadcast_to(np.float32(base_color), (count, 3)),
+        roughness=np.full(count, 0.5, np.float32),
+        metallic=np.zeros(count, np.float32),
+        mask=np.ones(count, bool),
+        normals=normals,
+    )

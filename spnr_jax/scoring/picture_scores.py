@@ -10,6 +10,7 @@ from jaxtyping import Float
 from scipy.ndimage import binary_dilation, binary_erosion, distance_transform_edt, gaussian_filter
 
 from spnr_jax.formats.mesh.texels import srgb_to_linear
+from spnr_jax.kernels.cloud_arrays import plain_cloud
 from spnr_jax.kernels.records import PointCloud
 
 OUTLINE = 3  # pixels to both sides of the true outline
@@ -94,7 +95,7 @@ def ball(count: int, seed: int = 0) -> PointCloud:
     """Random points of a grey ball: its picture should be smooth."""
     towards = np.random.default_rng(seed).standard_normal((count, 3))
     towards = (towards / np.linalg.norm(towards, axis=1, keepdims=True)).astype(np.float32)
-    return _cloud(towards, np.full((count, 3), GREY, np.float32), towards)
+    return plain_cloud(towards, GREY, towards)
 
 
 def ball_waves(image: Float[np.ndarray, "height width 3"], opacity: Float[np.ndarray, "height width"]) -> float:
@@ -115,7 +116,7 @@ def plate(count: int, seed: int = 0) -> PointCloud:
     normals = np.zeros((count, 3), np.float32)
     normals[np.arange(count), axis] = 2 * sign
     color = np.where((side == 0)[:, None], [0.8, 0.05, 0.05], [0.05, 0.05, 0.8])
-    return _cloud((places * PLATE).astype(np.float32), color.astype(np.float32), normals)
+    return plain_cloud((places * PLATE).astype(np.float32), color.astype(np.float32), normals)
 
 
 def blue_share(image: Float[np.ndarray, "height width 3"], opacity: Float[np.ndarray, "height width"]) -> float:
@@ -123,15 +124,3 @@ def blue_share(image: Float[np.ndarray, "height width 3"], opacity: Float[np.nda
     inside = binary_erosion(opacity > 0.5, iterations=WELL_INSIDE)
     red, _, blue = srgb_to_linear(image)[inside].mean(axis=0)
     return float(blue / (red + blue))
-
-
-def _cloud(positions: np.ndarray, base_color: np.ndarray, normals: np.ndarray) -> PointCloud:
-    count = len(positions)
-    return PointCloud(
-        positions=positions,
-        base_color=base_color,
-        roughness=np.full(count, 0.5, np.float32),
-        metallic=np.zeros(count, np.float32),
-        mask=np.ones(count, bool),
-        normals=normals,
-    )

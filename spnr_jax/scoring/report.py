@@ -6,40 +6,17 @@ runs.
 """
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
 from spnr_jax.formats.images import depth_image, png_url, to_uint8, write_whole
+from spnr_jax.formats.pages import template
 from spnr_jax.scoring.learning_curve import learning_curve_svg
-from spnr_jax.scoring.report_style import STYLE, template
-from spnr_jax.scoring.summary import NO_WEIGHTS
+from spnr_jax.scoring.score_tables import METHODS, QUALITY, Table, difference, head, lowered, quality, text
 
-METHODS = {  # method -> its name in tables and pictures, in their order
-    "ours": "Ours",
-    "surfels": "Surfels",
-    "near_points": "Near points",
-    "paper": "The paper's network",
-    "npbg": "NPBG",
-    "point_nerf": "Point-NeRF",
-    "points2nerf": "Points2NeRF",
-    "nearest": "Nearest-point shading",
-    "splat": "Base-colour splat",
-    "white": "White image",
-}
-HIGHER, LOWER = 1, -1  # what is better
-QUALITY = {  # metric -> head of its column, decimals, what is better
-    "psnr": ("PSNR, dB", 2, HIGHER),
-    "ssim": ("SSIM", 3, HIGHER),
-    "cpsnr": ("cPSNR, dB", 2, HIGHER),
-    "flip": ("FLIP", 3, LOWER),
-    "lpips": ("LPIPS", 3, LOWER),
-    "iou": ("Opacity IoU", 3, HIGHER),
-}
-ARROWS = {HIGHER: "\N{UPWARDS ARROW}", LOWER: "\N{DOWNWARDS ARROW}"}
 COUNTS = {"objects": "Objects", "views": "Views", "cpsnr_views": "cPSNR views"}
 GALLERY_NOTE = (
     "No network saw these objects. The number below a picture is its PSNR in dB. Depth: bright is near, dark is far, "
@@ -71,23 +48,6 @@ class GalleryRow:
     acc: np.ndarray
 
 
-class Cell(NamedTuple):
-    """A text, smaller lines below it, and whether it is the best of its column."""
-
-    text: str
-    small: tuple[str, ...] = ()
-    best: bool = False
-
-
-class Table(NamedTuple):
-    """A section of the page with one table; a row is a name and cells."""
-
-    heading: str
-    note: str
-    heads: Sequence[str]
-    rows: Sequence[tuple[str, Sequence[Cell]]]
-
-
 def write_report(
     path: str | Path,
     *,
@@ -115,7 +75,6 @@ def write_report(
     shown = gallery[0].images if gallery else {}
     page = template(Path(__file__).with_name("report.html")).render(
         title=title,
-        style=STYLE,
         paragraphs=[part for part in summary.split("\n\n") if part.strip()],
         tiles=_key_numbers(metrics),
         gallery_note=GALLERY_NOTE,
@@ -152,12 +111,6 @@ def duration(seconds: float | int) -> str:
     return f"{whole // 60} min {whole % 60} s" if whole < 3600 else f"{whole // 3600} h {whole % 3600 // 60} min"
 
 
-def lowered(method: str) -> str:
-    """A method's name inside a sentence."""
-    name = METHODS.get(method, method)
-    return name if name[:2].isupper() else name[:1].lower() + name[1:]
-
-
 def _key_numbers(metrics: Mapping) -> list[tuple[str, str]]:
     """The numbers that a reader looks for first, as tiles."""
     methods, seconds = metrics["methods"], metrics.get("seconds", {})
@@ -184,38 +137,24 @@ def _pictures(row: GalleryRow) -> list[tuple[str, str]]:
 
 def _quality_table(methods: Mapping[str, Mapping]) -> Table:
     """Methods against metrics and counts; columns that no method has are left out."""
-    quality, counts = ([name for name in of if any(name in s for s in methods.values())] for of in (QUALITY, COUNTS))
-    columns = [_quality_column(name, methods.values()) for name in quality]
-    columns += [[Cell(str(scores.get(name, ""))) for scores in methods.values()] for name in counts]
-    names = [METHODS.get(method, method) for method in methods]
-    heads = [*map(_head, quality), *(COUNTS[name] for name in counts)]
-    return Table("Quality", QUALITY_NOTE, heads, list(zip(names, zip(*columns, strict=True), strict=True)))
-
-
-def _quality_column(name: str, methods: Iterable[Mapping]) -> list[Cell]:
-    """The cells of a metric: the mean and, below it, its interval."""
-    _, decimals, better = QUALITY[name]
-    means = _with_best([scores.get(name) for scores in methods], decimals, better, _missing(name))
-    intervals = [_interval(scores.get(f"{name}_interval"), decimals) for scores in methods]
-    return [mean._replace(small=interval) for mean, interval in zip(means, intervals, strict=True)]
+    shown, counts = ([name for name in of if any(name in s for s in methods.values())] for of in (QUALITY, COUNTS))
+    cells = quality(methods, shown)
+    rows = tuple(
+        (METHODS.get(method, method), (*cells[method], *(text(scores.get(name, "")) for name in counts)))
+        for method, scores in methods.items()
+    )
+    heads = (*map(head, shown), *(COUNTS[name] for name in counts))
+    return Table(title="Quality", note=QUALITY_NOTE, heads=heads, rows=rows)
 
 
 def _difference_table(first: str, minus: Mapping[str, Mapping]) -> Table:
     """Other methods against the difference in each metric."""
     names = [name for name in QUALITY if any(name in row for row in minus.values())]
-    rows = [
-        (f"{METHODS.get(first, first)} minus {lowered(method)}", [_difference(row.get(name), name) for name in names])
+    rows = tuple(
+        (f"{METHODS.get(first, first)} minus {lowered(method)}", tuple(difference(row.get(m), m) for m in names))
         for method, row in minus.items()
-    ]
-    return Table("Differences", DIFFERENCES_NOTE, [*map(_head, names)], rows)
-
-
-def _difference(found: Mapping | None, name: str) -> Cell:
-    if found is None:
-        return Cell(_missing(name))
-    decimals, p_value = QUALITY[name][1], found["p_value"]
-    test = () if p_value is None else (f"p {'=' if p_value >= 0.001 else '<'} {max(p_value, 0.001):.3f}",)
-    return Cell(f"{found['mean']:+.{decimals}f}", (*_interval(found["interval"], decimals, sign="+"), *test))
+    )
+    return Table(title="Differences", note=DIFFERENCES_NOTE, heads=tuple(map(head, names)), rows=rows)
 
 
 def _category_table(per_category: Mapping[str, Mapping]) -> Table:
@@ -224,30 +163,10 @@ def _category_table(per_category: Mapping[str, Mapping]) -> Table:
     rows = []
     for category, scores in per_category.items():
         objects = next((s["objects"] for s in scores.values() if "objects" in s), "")
-        values = [scores.get(method, {}).get("psnr") for method in methods]
-        rows.append((category, [*_with_best(values, 2), Cell(str(objects))]))
-    heads = [*(METHODS.get(method, method) for method in methods), "Objects"]
-    return Table("Quality by category", "PSNR in dB.", heads, rows)
-
-
-def _head(name: str) -> str:
-    text, _, better = QUALITY[name]
-    return f"{text}\N{NO-BREAK SPACE}{ARROWS[better]}"
-
-
-def _missing(name: str) -> str:
-    return NO_WEIGHTS if name == "lpips" else "n/a"
-
-
-def _interval(ends: Sequence[float] | None, decimals: int, sign: str = "") -> tuple[str, ...]:
-    return () if ends is None else (f"[{', '.join(f'{end:{sign}.{decimals}f}' for end in ends)}]",)
-
-
-def _with_best(values: Sequence[float | None], decimals: int, better: int = HIGHER, missing: str = "n/a") -> list[Cell]:
-    """The values, the best marked; what is missing or not a number is said to be so."""
-    finite = [value for value in values if value is not None and math.isfinite(value)]
-    best = max(finite, default=None, key=lambda value: better * value)
-    return [Cell(f"{v:.{decimals}f}", best=v == best) if v in finite else Cell(missing) for v in values]
+        of_all = quality({m: {"psnr": scores.get(m, {}).get("psnr")} for m in methods}, ["psnr"])
+        rows.append((category, (*(cell for (cell,) in of_all.values()), text(objects))))
+    heads = (*(METHODS.get(method, method) for method in methods), "Objects")
+    return Table(title="Quality by category", note="PSNR in dB.", heads=heads, rows=tuple(rows))
 
 
 def _run_facts(metrics: Mapping) -> dict[str, object]:

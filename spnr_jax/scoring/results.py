@@ -8,8 +8,8 @@ import numpy as np
 from spnr_jax.formats.config_json import to_dict
 from spnr_jax.formats.images import write_whole
 from spnr_jax.scoring.evaluation import FLOORS, Evaluation, ObjectResult, median_view
-from spnr_jax.scoring.report import METHODS, QUALITY, GalleryRow, lowered, write_report
-from spnr_jax.scoring.summary import NO_WEIGHTS
+from spnr_jax.scoring.report import GalleryRow, write_report
+from spnr_jax.scoring.score_tables import METHODS, MISSING, QUALITY, lowered, number
 
 
 def write_results(
@@ -59,10 +59,10 @@ def text_table(methods: dict[str, dict]) -> list[str]:
     """Lines of the table of methods for a terminal: means, and what could not be measured."""
     lines = []
     for method, row in methods.items():
-        texts = []
-        for name, (head, decimals, _) in QUALITY.items():
-            missing = NO_WEIGHTS if name == "lpips" else "n/a"
-            texts.append(f"{head.partition(',')[0]} " + (missing if row[name] is None else f"{row[name]:.{decimals}f}"))
+        texts = [
+            f"{head.partition(',')[0]} {number(row[name], decimals, missing=MISSING.get(name, 'n/a')).text}"
+            for name, (head, decimals, _) in QUALITY.items()
+        ]
         lines.append(f"{METHODS[method]:22s} " + "   ".join(texts))
     return lines
 

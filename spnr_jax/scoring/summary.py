@@ -4,7 +4,8 @@ Means are over images.  A condition PSNR leaves out images in which no input poi
 None stands where there is no number: a metric that was not measured, an interval from a single object.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -36,29 +37,36 @@ def summarise(results: Sequence[dict[str, Scores]]) -> dict[str, dict]:
 
 def differences(results: Sequence[dict[str, Scores]], method: str = "ours") -> dict[str, dict]:
     """The method minus each other one, view by view: mean, interval and p-value of each metric."""
+    own = [scores[method] for scores in results]
     return {
-        other: {metric: _difference(results, method, other, metric) for metric in METRICS}
+        other: {metric: difference(own, [scores[other] for scores in results], metric) for metric in METRICS}
         for other in results[0]
         if other != method
     }
 
 
-def _row(objects: list[Scores]) -> dict[str, object]:
-    row: dict[str, object] = {}
-    for metric in METRICS:
+def means(objects: Sequence[Scores], metrics: Iterable[str] = METRICS) -> dict[str, Any]:
+    """Mean of each metric over all images, and its interval, None where there is no number."""
+    row: dict[str, Any] = {}
+    for metric in metrics:
         values = [scores[metric] for scores in objects if metric in scores]
         found = bool(values) and not np.isnan(np.concatenate(values)).all()
         row[metric] = float(np.nanmean(np.concatenate(values))) if found else None
         row[f"{metric}_interval"] = _as_list(intervals.interval(values)) if found else None
+    return row
+
+
+def _row(objects: list[Scores]) -> dict[str, Any]:
     visible = np.concatenate([scores["cpsnr"] for scores in objects])
     counts = {"objects": len(objects), "views": len(visible), "cpsnr_views": int(np.sum(~np.isnan(visible)))}
-    return row | counts
+    return means(objects) | counts
 
 
-def _difference(results: Sequence[dict[str, Scores]], method: str, other: str, metric: str) -> dict | None:
-    if metric not in results[0][method] or metric not in results[0][other]:
+def difference(first: Sequence[Scores], second: Sequence[Scores], metric: str) -> dict[str, Any] | None:
+    """Scores of objects minus others of the same ones, view by view: mean, interval, p-value; None without a view."""
+    if metric not in first[0] or metric not in second[0]:
         return None
-    found = intervals.difference([r[method][metric] for r in results], [r[other][metric] for r in results])
+    found = intervals.difference([scores[metric] for scores in first], [scores[metric] for scores in second])
     if found is None:
         return None
     return {"mean": found.mean, "interval": _as_list(found.interval), "p_value": found.p_value}

@@ -11,18 +11,17 @@ import dataclasses
 import socket
 import sys
 import time
-from collections import deque
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache, partial
-from itertools import islice
 from pathlib import Path
+from typing import TypeVar
 
 from tqdm import tqdm
 
 from spnr_jax.devices import allocator, compilation
+from spnr_jax.devices.side_by_side import beside
 from spnr_jax.errors import UserError, one_line
 from spnr_jax.tools import catalogue_files, catalogue_page
 from spnr_jax.tools.catalogue_files import Item, Record, folder_of
@@ -31,6 +30,7 @@ from spnr_jax.tools.render_command import Render
 from spnr_jax.training.weights import SHIPPED, load
 
 AHEAD = 2  # clouds that are read before they are drawn
+Result = TypeVar("Result")
 loaded = cache(load)  # of a process that draws many clouds
 
 
@@ -117,42 +117,34 @@ def _outcomes(bench: Bench, items: Sequence[Item]) -> Iterator[tuple[Item, str |
 
 def draw_here(bench: Bench, items: Sequence[Item]) -> Iterator[tuple[Item, str | None]]:
     """Each file and why it could not be drawn, in their order: reading, drawing and writing side by side."""
-    with ThreadPoolExecutor(1) as reader, ThreadPoolExecutor(1) as writer:
-        try:
-            reading = deque((item, reader.submit(read, bench, item)) for item in items[:AHEAD])
-            writing: deque[tuple[Item, Callable[[], None]]] = deque()
-            following = iter(items[AHEAD:])
-            while reading:
-                item, begun = reading.popleft()
-                reading.extend((after, reader.submit(read, bench, after)) for after in islice(following, 1))
-                writing.append((item, _begin_to_draw(bench, item, begun, writer)))
-                if len(writing) > 1:  # the pictures of two objects are in memory at most
-                    yield _outcome(*writing.popleft())
-            while writing:
-                yield _outcome(*writing.popleft())
-        finally:
-            reader.shutdown(wait=False, cancel_futures=True)
-            writer.shutdown(wait=False, cancel_futures=True)
+    reading = beside((partial(_tried, partial(read, bench, item)) for item in items), AHEAD)
+    # the pictures of two objects are in memory at most
+    yield from zip(items, beside(map(partial(_begin_to_draw, bench), items, reading), 1), strict=True)
 
 
-def _begin_to_draw(
-    bench: Bench, item: Item, reading: "Future[Begun]", writer: ThreadPoolExecutor
-) -> Callable[[], None]:
-    """Draws a file, and has it written; what waits for that."""
+def _begin_to_draw(bench: Bench, item: Item, begun: Begun | UndrawnError) -> Callable[[], str | None]:
+    """Draws a file that is read; what writes it, and says why it cannot be drawn."""
+    jobs = begun if isinstance(begun, UndrawnError) else _tried(lambda: list(_jobs(bench, item, begun.ready)))
+    if isinstance(jobs, UndrawnError) or isinstance(begun, UndrawnError):
+        return partial(str, jobs)
+    return partial(_written, bench, item, begun, jobs)
+
+
+def _written(bench: Bench, item: Item, begun: Begun, jobs: Iterable[Callable[[], Written]]) -> str | None:
+    """Writes what is drawn of a file, its record last; None, or why it cannot be drawn."""
+    done = _tried(lambda: [_perform(job) for job in jobs])
+    if isinstance(done, UndrawnError):
+        return str(done)
+    names = tuple(path.name for one in done for path in one.paths)
+    catalogue_files.finish(item, bench.options.out, dataclasses.replace(begun.record, files=names))
+    return None
+
+
+def _tried(work: Callable[[], Result]) -> Result | UndrawnError:
     try:
-        begun = reading.result()
-        writing = [writer.submit(_perform, job) for job in _jobs(bench, item, begun.ready)]
+        return work()
     except UndrawnError as fault:
-        return partial(_raise, fault)
-    return writer.submit(_finish, bench, item, begun, lambda: [job.result() for job in writing]).result
-
-
-def _outcome(item: Item, wait: Callable[[], None]) -> tuple[Item, str | None]:
-    try:
-        wait()
-    except UndrawnError as fault:
-        return item, str(fault)
-    return item, None
+        return fault
 
 
 def draw_item(bench: Bench, item: Item) -> str | None:
@@ -166,12 +158,7 @@ def draw_item(bench: Bench, item: Item) -> str | None:
         raise UserError(f"{item.cloud}: worker {socket.gethostname()} does not see this file; mount it there")
     allocator.keep_arrays()
     compilation.keep_programs()
-
-    def whole() -> None:
-        begun = read(bench, item)
-        _finish(bench, item, begun, lambda: [_perform(job) for job in _jobs(bench, item, begun.ready)])
-
-    return _outcome(item, whole)[1]
+    return _begin_to_draw(bench, item, _tried(partial(read, bench, item)))()
 
 
 def read(bench: Bench, item: Item) -> Begun:
@@ -197,11 +184,6 @@ def _perform(job: Callable[[], Written]) -> Written:
         raise UndrawnError(one_line(error)) from error
 
 
-def _finish(bench: Bench, item: Item, begun: Begun, written: Callable[[], list[Written]]) -> None:
-    names = tuple(path.name for one in written() for path in one.paths)
-    catalogue_files.finish(item, bench.options.out, dataclasses.replace(begun.record, files=names))
-
-
 @contextmanager
 def _blamed() -> Iterator[None]:
     """Whatever is wrong with one file must not stop the others; its reason says what it was."""
@@ -211,7 +193,3 @@ def _blamed() -> Iterator[None]:
         raise UndrawnError(one_line(error)) from error
     except Exception as error:
         raise UndrawnError(f"unexpected {type(error).__name__}: {one_line(error)}") from error
-
-
-def _raise(error: Exception) -> None:
-    raise error

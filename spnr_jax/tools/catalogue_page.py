@@ -8,7 +8,7 @@ from pathlib import Path
 from urllib.parse import quote
 
 from spnr_jax.formats.images import write_whole
-from spnr_jax.scoring.report_style import template
+from spnr_jax.formats.pages import template
 from spnr_jax.tools.catalogue_files import Item, standing
 
 PER_PAGE = 200  # files on a page

@@ -266,10 +266,11 @@ def _write_solid(path: Path, content: bytes, details: str = "") -> Written:
 
 def _splats(ready: Ready, options: Render, path: Path) -> Iterator[Callable[[], Written]]:
     """Gaussian splats of the cloud as the network draws it."""
-    from spnr_jax.tools import splat_export  # here: pictures alone do without
+    from spnr_jax.tools import splat_making  # here: pictures alone do without
 
-    made = splat_export.splats_of_volume(ready.model, ready.volume, ready.placed.cloud, ready.light, options.making)
-    note = splat_export.note_of(options.cloud, Path(ready.network), options.lighting)
+    given = (ready.model, ready.volume, ready.placed.cloud, ready.light)
+    made = splat_making.splats_of(*given, lambda line: None, **options.making.asked)
+    note = splat_making.note_of(options, ready.network)
     yield lambda: Written(f"wrote {path} ({write_splats(path, made, note) / 1e6:.1f} MB)", (path,))
 
 

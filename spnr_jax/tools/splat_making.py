@@ -7,18 +7,22 @@ splats             gaussians/placing.py, coloring.py, refining.py, in the box, t
 import dataclasses
 import time
 from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
 
 from spnr_jax.gaussians import coloring, placing, refining
 from spnr_jax.gaussians.placing import View
-from spnr_jax.kernels.records import Camera, Gaussians, Light, PointCloud
+from spnr_jax.kernels.records import Camera, Gaussians, Light, PointCloud, Volume
 from spnr_jax.method import surfel_renderer
-from spnr_jax.method.model import DISTANCE, Model, Volume
+from spnr_jax.method.model import DISTANCE, Model
 from spnr_jax.method.surfel_renderer import SurfelScene
 from spnr_jax.model_config import SurfelConfig
 from spnr_jax.tools.depth_maps import surface_depth
+from spnr_jax.tools.light_options import Lighting
+from spnr_jax.tools.render_command import Render
 
 VIEWS, RESOLUTION = 32, 512  # pictures, and their pixels along each side
 GOLDEN_ANGLE = 180 * (3 - np.sqrt(5))  # degrees between the azimuths of one direction and the next
@@ -43,7 +47,14 @@ def splats(
     that these show, with colours as spherical harmonics of a `degree` 0 to 3, and are refined against the pictures for
     so many `seconds`.  ValueError if the pictures show no surface.  `spnr_jax.write_splats` writes them.
     """
-    return splats_of(model, model.encode(cloud), cloud, light, degree, most, views, resolution, seconds, report)
+    sizes: dict[str, Any] = {
+        "degree": degree,
+        "most": most,
+        "views": views,
+        "resolution": resolution,
+        "seconds": seconds,
+    }
+    return splats_of(model, model.encode(cloud), cloud, light, report, **sizes)
 
 
 def splats_of(
@@ -51,12 +62,13 @@ def splats_of(
     volume: Volume,
     cloud: PointCloud,
     light: Light | None,
+    report: Callable[[str], None],
+    *,
     degree: int,
     most: int,
     views: int,
-    resolution: int,
     seconds: float | int,
-    report: Callable[[str], None] = lambda line: None,
+    resolution: int = RESOLUTION,
 ) -> Gaussians:
     """`splats` of a cloud that is encoded already."""
     pictures = drawn_views(model, volume, fitting_cameras(model, volume, views, resolution), light)
@@ -146,6 +158,20 @@ def in_units(gaussians: Gaussians, volume: Volume) -> Gaussians:
     scale, arrays = np.asarray(volume.scale), jax.tree.map(np.asarray, gaussians)
     position = arrays.position / scale + np.asarray(volume.centre)
     return arrays.replace(position=position, scale=arrays.scale / scale)
+
+
+def note_of(asked: Render, network: str = "") -> str:
+    """The line that names cloud, network and light; the network is that of the options, or another."""
+    drawn_by = Path(network or str(asked.run)).name
+    return f"{asked.cloud.name}, drawn by spnr_jax ({drawn_by}), light: {light_name(asked.lighting)}"
+
+
+def light_name(lighting: Lighting) -> str:
+    """The light in words, without folders."""
+    parts = [Path(lighting.light).name] if lighting.light else ([] if lighting.sun else ["room"])
+    parts += [f"sun {lighting.sun[0]:g} {lighting.sun[1]:g}"] if lighting.sun else []
+    options = {"yaw": lighting.light_yaw, "exposure": lighting.exposure}
+    return " + ".join(parts) + "".join(f", {name} {value:g}" for name, value in options.items() if value)
 
 
 def _surfels(cloud: PointCloud, volume: Volume) -> SurfelScene:

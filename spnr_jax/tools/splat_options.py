@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 from spnr_jax.errors import UserError
 
@@ -22,6 +22,12 @@ class SplatMaking:
     """Degree of the spherical harmonics by which a splat's colour follows the view; 0: it does not."""
     fitting_views: int = 32
     """Pictures of the network that splats are made from."""
+
+    @property
+    def asked(self) -> dict[str, Any]:
+        """What `splat_making.splats_of` is asked for."""
+        sizes = {"degree": self.harmonics, "most": self.most_splats, "views": self.fitting_views}
+        return {**sizes, "seconds": self.seconds}
 
     def __post_init__(self) -> None:
         """ValueError names the option that makes no sense."""

@@ -23,9 +23,9 @@ import numpy as np
 
 from spnr_jax.devices import compilation, machine
 from spnr_jax.formats.images import write_whole
-from spnr_jax.kernels.cloud_arrays import bucket
-from spnr_jax.kernels.records import PointCloud
-from spnr_jax.method.model import Model, Quality, Volume
+from spnr_jax.kernels.cloud_arrays import bucket, plain_cloud
+from spnr_jax.kernels.records import PointCloud, Volume
+from spnr_jax.method.model import Model, Quality
 from spnr_jax.model_config import NetworkConfig, RayNetworkConfig, SurfelConfig
 from spnr_jax.tools.render_command import Render
 
@@ -142,9 +142,4 @@ def sphere(count: int) -> PointCloud:
     number = np.arange(count) + 0.5
     height, turn = 1 - 2 * number / count, GOLDEN_ANGLE * number
     wide = np.sqrt(1 - height**2)
-    positions = np.stack([wide * np.cos(turn), height, wide * np.sin(turn)], axis=-1).astype(np.float32)
-    half = np.full(count, 0.5, np.float32)
-    color = np.repeat(half[:, None], 3, axis=1)
-    return PointCloud(
-        positions=positions, base_color=color, roughness=half, metallic=0 * half, mask=np.ones(count, bool)
-    )
+    return plain_cloud(np.stack([wide * np.cos(turn), height, wide * np.sin(turn)], axis=-1).astype(np.float32))

@@ -20,7 +20,7 @@ import jax
 
 from spnr_jax.config import TrainConfig
 from spnr_jax.devices import allocator
-from spnr_jax.errors import UserError
+from spnr_jax.errors import UserError, first_line
 from spnr_jax.formats.config_json import from_dict, to_dict
 from spnr_jax.formats.images import write_whole
 from spnr_jax.training import optimisation
@@ -101,7 +101,7 @@ def save(run: Path, state: optimisation.TrainState) -> None:
             checkpointer.save(step, state, force=True, overwrite=True)
     except (OSError, ValueError) as error:  # tensorstore raises ValueError for the disk's errors, too
         number = re.search(r"os_error_code='(\d+)'", str(error))
-        reason = os.strerror(int(number[1])) if number else _first_line(error)
+        reason = os.strerror(int(number[1])) if number else first_line(error)
         raise UserError(
             f"checkpoint {run / 'checkpoints' / str(step)} cannot be written ({reason}); the one before is kept: mend "
             "this, and the same command goes on from there"
@@ -135,7 +135,7 @@ def restore(
                 jax.block_until_ready(state)
             except Exception as error:  # noqa: BLE001 - Orbax and tensorstore raise many kinds for a damaged file
                 _refuse_other_version(checkpointer, folder / str(step), like)
-                say(f"checkpoint {folder / str(step)} is damaged ({_first_line(error)}); trying the one before")
+                say(f"checkpoint {folder / str(step)} is damaged ({first_line(error)}); trying the one before")
                 continue
             if int(state.step) == step:
                 return state
@@ -183,8 +183,3 @@ def load_run(
     if state is None:
         raise UserError(f"{run}: the run has no checkpoint yet; go on with `spnr train {data} {run}`")
     return config, state
-
-
-def _first_line(error: Exception) -> str:
-    lines = str(error).strip().splitlines() or [type(error).__name__]
-    return lines[0][:160]

@@ -272,6 +272,21 @@ def moving_average(averaged: Any, newest: Any, step: Array, decay: float) -> Any
     return jax.tree.map(lambda old, new: share * old + (1 - share) * new, averaged, newest)
 
 
+def stepped(config: TrainConfig, state: TrainState, gradient: dict, part: str | None = None) -> TrainState:
+    """The state after a step of the generator by its gradient, or of one part of it."""
+    before, averaged = ((tree if part is None else tree[part]) for tree in (state.generator, state.averaged))
+    update, optimizer = optimizers(config)[0].update(gradient, state.generator_optimizer)
+    after = optax.apply_updates(before, update)
+    average = moving_average(averaged, after, state.step, config.optimizer.ema_decay)
+    return dataclasses.replace(
+        state,
+        step=state.step + 1,
+        generator=after if part is None else state.generator | {part: after},
+        generator_optimizer=optimizer,
+        averaged=average if part is None else state.averaged | {part: average},
+    )
+
+
 def averaged_variables(state: TrainState) -> dict:
     """The generator that evaluation uses, as Linen variables."""
     return {"params": state.averaged, "batch_stats": state.averaged_stats}

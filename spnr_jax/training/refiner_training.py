@@ -153,19 +153,9 @@ def loss(
 
 def train_step(state: TrainState, view: Any, *, config: TrainConfig) -> tuple[TrainState, dict[str, Array]]:
     """State after one step of the refiner, and scalar metrics."""
-    before = state.generator["refiner"]
-    (value, metrics), gradient = jax.value_and_grad(partial(loss, config=config), has_aux=True)(before, *view)
-    algorithm, _ = optimisation.optimizers(config)
-    update, optimizer = algorithm.update(gradient, state.generator_optimizer)
-    refiner = optax.apply_updates(before, update)
-    average = optimisation.moving_average(state.averaged["refiner"], refiner, state.step, config.optimizer.ema_decay)
-    state = dataclasses.replace(
-        state,
-        step=state.step + 1,
-        generator=state.generator | {"refiner": refiner},
-        generator_optimizer=optimizer,
-        averaged=state.averaged | {"refiner": average},
-    )
+    of_crops = jax.value_and_grad(partial(loss, config=config), has_aux=True)
+    (value, metrics), gradient = of_crops(state.generator["refiner"], *view)
+    state = optimisation.stepped(config, state, gradient, "refiner")
     return state, metrics | {"loss": value, "gradient_norm": optax.tree.norm(gradient)}
 
 

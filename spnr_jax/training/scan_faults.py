@@ -21,17 +21,6 @@ BALLS = 0.03, 0.15  # radii of what is left out
 SHADED = 0.2, 0.7  # of a colour that a lamp's direction takes away at most
 NOISE, OUTLIERS = (0.001, 0.02), (0.002, 0.05)  # of random scans, drawn from the logarithm
 MISREGISTERED, COLOUR_NOISE = 0.004, 0.08  # at most
-CHANCES = {  # of each fault in a random scan
-    "colours_in_light": 0.15,
-    "scanned": 0.4,
-    "uneven": 0.2,
-    "dropped": 0.15,
-    "misregistered": 0.15,
-    "noisy": 0.75,
-    "with_outliers": 0.35,
-    "colour_noise": 0.5,
-    "colours_alone": 0.5,
-}
 THINNEST = 0.1  # density at one end of a cloud of uneven density, over that at the other
 
 
@@ -80,7 +69,9 @@ def colour_noise(positions, values, rng, *, sigma: float) -> Points:
 
 
 def colours_in_light(positions, values, rng) -> Points:
-    """Base colours darkened as a lamp in a grey room would, as a photograph has them; of clouds with normals."""
+    """Base colours darkened as a lamp in a grey room would, as a photograph has them; as they are without normals."""
+    if "normals" not in values:
+        return positions, values
     lamp = rng.normal(size=3)
     cosine = np.abs(values["normals"] @ lamp) / np.linalg.norm(lamp)
     shade = 1 - rng.uniform(*SHADED) * (1 - cosine)
@@ -102,29 +93,24 @@ def uneven(positions, values, rng) -> Points:
     return positions[kept], {name: column[kept] for name, column in values.items()}
 
 
+SCANS: tuple[tuple[float, Callable[[np.random.Generator], Fault]], ...] = (
+    # of a random scan: the chance of each fault, and how it is drawn
+    (0.15, lambda rng: colours_in_light),
+    (0.4, lambda rng: partial(scanned, scanners=int(rng.integers(3, 9)))),
+    (0.2, lambda rng: uneven),
+    (0.15, lambda rng: partial(dropped, balls=int(rng.integers(1, 5)))),
+    (0.15, lambda rng: partial(misregistered, sigma=rng.uniform(0, MISREGISTERED))),
+    (0.75, lambda rng: partial(noisy, sigma=float(np.exp(rng.uniform(*np.log(NOISE)))))),
+    (0.35, lambda rng: partial(with_outliers, share=float(np.exp(rng.uniform(*np.log(OUTLIERS)))))),
+    (0.5, lambda rng: partial(colour_noise, sigma=rng.uniform(0, COLOUR_NOISE))),
+    (0.5, lambda rng: colours_alone),
+)
+
+
 def random_scan(positions, values, rng) -> Points:
     """The points after several faults, each drawn or not."""
-    drawn = {name: rng.random() < chance for name, chance in CHANCES.items()}
-    chosen: list[Fault] = []
-    if drawn["colours_in_light"] and "normals" in values:
-        chosen.append(colours_in_light)
-    if drawn["scanned"]:
-        chosen.append(partial(scanned, scanners=int(rng.integers(3, 9))))
-    if drawn["uneven"]:
-        chosen.append(uneven)
-    if drawn["dropped"]:
-        chosen.append(partial(dropped, balls=int(rng.integers(1, 5))))
-    if drawn["misregistered"]:
-        chosen.append(partial(misregistered, sigma=rng.uniform(0, MISREGISTERED)))
-    if drawn["noisy"]:
-        chosen.append(partial(noisy, sigma=float(np.exp(rng.uniform(*np.log(NOISE))))))
-    if drawn["with_outliers"]:
-        chosen.append(partial(with_outliers, share=float(np.exp(rng.uniform(*np.log(OUTLIERS))))))
-    if drawn["colour_noise"]:
-        chosen.append(partial(colour_noise, sigma=rng.uniform(0, COLOUR_NOISE)))
-    if drawn["colours_alone"]:
-        chosen.append(colours_alone)
-    for fault in chosen:
+    chosen = [draw for chance, draw in SCANS if rng.random() < chance]
+    for fault in [draw(rng) for draw in chosen]:
         positions, values = fault(positions, values, rng)
     return positions, values
 

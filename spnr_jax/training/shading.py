@@ -3,7 +3,6 @@
 The state, its checkpoints, and the loop are those of the other networks (`optimisation.TrainState`, `trainer.py`).
 """
 
-import dataclasses
 from functools import partial
 from typing import Any
 
@@ -52,17 +51,7 @@ def train_step(state: TrainState, crops: Crops, *, config: TrainConfig) -> tuple
     """State after one step, and scalar metrics."""
     of_run = run_by_run(jax.value_and_grad(partial(loss, config=config), has_aux=True))
     (value, metrics), gradient = of_run(state.generator, crops)
-    adam, _ = optimisation.optimizers(config)
-    update, optimizer = adam.update(gradient, state.generator_optimizer)
-    generator = optax.apply_updates(state.generator, update)
-    decay = config.optimizer.ema_decay
-    state = dataclasses.replace(
-        state,
-        step=state.step + 1,
-        generator=generator,
-        generator_optimizer=optimizer,
-        averaged=optimisation.moving_average(state.averaged, generator, state.step, decay),
-    )
+    state = optimisation.stepped(config, state, gradient)
     return state, metrics | {"loss": value, "gradient_norm": optax.tree.norm(gradient)}
 
 

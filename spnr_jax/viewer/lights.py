@@ -11,14 +11,13 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from spnr_jax.errors import UserError
 from spnr_jax.formats.light_files import NAMES, read_light
 from spnr_jax.kernels.records import Light
 from spnr_jax.tools.chosen_light import light_of_options
 from spnr_jax.tools.light_options import Lighting
 from spnr_jax.viewer.uploads import display_name
+from spnr_jax.viewer.viewpoint import numbers
 
 SUN_ALONE = "sun alone"  # the choice of no map
 FIRST_SUN = (30.0, 40.0)  # degrees: where the controls have it before it is asked for
@@ -69,11 +68,8 @@ def options_of(
     *, choice: Any, yaw: Any, shines: Any, azimuth: Any, elevation: Any, exposure: Any, background: Any
 ) -> Lighting:
     """The options for what the controls say: a sun where it shines or is chosen alone; ValueError for no numbers."""
-    try:
-        values = np.asarray([yaw, azimuth, elevation, exposure], np.float64)
-    except (TypeError, ValueError, OverflowError):
-        values = np.zeros(0)
-    if values.shape != (4,) or not np.isfinite(values).all():
+    values = numbers([yaw, azimuth, elevation, exposure], 4)
+    if values is None:
         raise UserError("the light's angles and its exposure have to be numbers")
     if not isinstance(choice, str) or background not in ("white", "light"):
         raise UserError("a light has a name, and behind the object is one of white, light")

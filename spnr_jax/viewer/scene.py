@@ -17,7 +17,7 @@ from spnr_jax.formats.images import to_uint8
 from spnr_jax.kernels.colors import linear_to_srgb, srgb_to_linear
 from spnr_jax.kernels.records import Camera, PointCloud, Volume
 from spnr_jax.method.model import Model
-from spnr_jax.viewer.viewpoint import project
+from spnr_jax.viewer.viewpoint import numbers, project
 
 Material = Literal["base_color", "roughness", "metallic"]
 RADIUS_PER_SPACING = 0.7
@@ -81,13 +81,10 @@ def edited(scene: Scene, material: Material, value: Any) -> Scene:
 
 def material_value(material: Material, value: Any) -> np.ndarray:
     """A control's value, () or of a colour (3,), in [0, 1]; ValueError for one that is no finite number."""
-    try:
-        new = np.asarray(value, np.float32)
-    except (TypeError, ValueError, OverflowError):
-        new = np.zeros(0, np.float32)
-    if new.shape != ((3,) if material == "base_color" else ()) or not np.isfinite(new).all():
+    new = numbers(value, 3) if material == "base_color" else numbers(value)
+    if new is None:
         raise UserError(f"{material} has to be {'3 numbers' if material == 'base_color' else 'a number'} from 0 to 1")
-    return np.asarray(np.clip(new, 0, 1))
+    return np.asarray(np.clip(new, 0, 1), np.float32)
 
 
 def restored(scene: Scene) -> Scene:

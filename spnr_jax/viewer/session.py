@@ -21,7 +21,7 @@ from spnr_jax.viewer.camera_path import Keyframe
 from spnr_jax.viewer.lights import Lights, made
 from spnr_jax.viewer.picture import LAYERS, Drawn, Layer
 from spnr_jax.viewer.scene import Scene, encoded, select_rectangle
-from spnr_jax.viewer.viewpoint import FARTHEST, View, in_pane, pane_camera, pane_size
+from spnr_jax.viewer.viewpoint import FARTHEST, View, in_pane, numbers, pane_camera, pane_size
 
 MOVING: Quality = "draft"
 MOVING_SIZE = 256  # pixels of the network's square while it moves, at most
@@ -174,15 +174,6 @@ def record(target: Any) -> Callable[[State], State]:
 def without_keyframes(state: State) -> State:
     """The state with no recorded path."""
     return dataclasses.replace(state, keyframes=())
-
-
-def numbers(values: Any, count: int) -> np.ndarray | None:
-    """What a browser sent as so many finite numbers, None if it is something else."""
-    try:
-        array = np.asarray(values, np.float64)
-    except (TypeError, ValueError, OverflowError):
-        return None
-    return array if array.shape == (count,) and np.isfinite(array).all() else None
 
 
 def select(state: State, low: Any, high: Any, add: bool) -> State:

@@ -19,7 +19,8 @@ from spnr_jax.kernels.records import Gaussians
 from spnr_jax.method.model import Model
 from spnr_jax.tools.splat_making import drawn_views, fitting_cameras, splats_in_box
 from spnr_jax.viewer.loop import Loop
-from spnr_jax.viewer.session import State, numbers, prepared
+from spnr_jax.viewer.session import State, prepared
+from spnr_jax.viewer.viewpoint import numbers
 
 VIEWS, RESOLUTION = 24, 384  # of the network's pictures: fewer and smaller than an export's, since a person waits
 MOST, DEGREE = 60_000, 1

@@ -34,27 +34,32 @@ class View:
     height: int
 
 
-def from_browser(wxyz: Any, position: Any, field_of_view: Any, width: Any, height: Any) -> View | None:
-    """The view of a browser's message of any values; None if nothing can be drawn from it (NaN, no pixels, far)."""
+def numbers(values: Any, *shape: int) -> np.ndarray | None:
+    """What a browser sent as finite numbers of a shape, None if it is something else."""
     try:
-        wxyz, position = np.asarray(wxyz, np.float64), np.asarray(position, np.float64)
-        field_of_view, width, height = float(field_of_view), int(width), int(height)
+        array = np.asarray(values, np.float64)
     except (TypeError, ValueError, OverflowError):
         return None
-    if wxyz.shape != (4,) or position.shape != (3,):
+    return array if array.shape == shape and np.isfinite(array).all() else None
+
+
+def from_browser(wxyz: Any, position: Any, field_of_view: Any, width: Any, height: Any) -> View | None:
+    """The view of a browser's message of any values; None if nothing can be drawn from it (NaN, no pixels, far)."""
+    turn, place, canvas = numbers(wxyz, 4), numbers(position, 3), numbers([field_of_view, width, height], 3)
+    if turn is None or place is None or canvas is None:
         return None
     drawable = (
-        np.isfinite(wxyz).all()
-        and np.linalg.norm(wxyz) > 1e-6
-        and bool((np.abs(position) < FARTHEST).all())
-        and NARROWEST <= field_of_view <= WIDEST
-        and 1 < width <= MOST_PIXELS
-        and 1 < height <= MOST_PIXELS
+        np.linalg.norm(turn) > 1e-6
+        and (np.abs(place) < FARTHEST).all()
+        and NARROWEST <= canvas[0] <= WIDEST
+        and (canvas[1:] >= 2).all()
+        and (canvas[1:] <= MOST_PIXELS).all()
     )
     if not drawable:
         return None
-    rotation = Rotation.from_quat(wxyz, scalar_first=True).as_matrix() @ OPENCV
-    return View(position=position, rotation=rotation, field_of_view=field_of_view, width=width, height=height)
+    rotation = Rotation.from_quat(turn, scalar_first=True).as_matrix() @ OPENCV
+    pixels, lines = (int(count) for count in canvas[1:])
+    return View(position=place, rotation=rotation, field_of_view=float(canvas[0]), width=pixels, height=lines)
 
 
 def to_browser(rotation: np.ndarray) -> np.ndarray:

@@ -16,7 +16,7 @@ from spnr_jax import cli, presets
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.config_json import to_dict
 from spnr_jax.model_config import RayNetworkConfig
-from spnr_jax.scoring import evaluation
+from spnr_jax.scoring import evaluation, summary
 from spnr_jax.training import checkpoint, optimisation
 
 pytestmark = pytest.mark.ci  # it trains several networks
@@ -224,7 +224,7 @@ class TestReport:
 
     def test_a_metric_that_no_view_has_is_none(self):
         nothing = [{metric: np.full(2, np.nan) for metric in variants_report.METRICS}] * 3
-        assert variants_report.means(nothing)["detail"] is None
+        assert summary.means(nothing, ["detail"])["detail"] is None
         scores = {"a": nothing, "b": nothing}
         compared = dataclasses.replace(self.compared, scores=scores)
         assert variants_report.change(compared, "b", "a", "detail") is None

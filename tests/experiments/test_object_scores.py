@@ -9,6 +9,7 @@ from experiments.comparison import object_scores, page
 from experiments.comparison.object_scores import Shown
 from experiments.paper import table1_tables
 from spnr_jax.scoring import evaluation
+from spnr_jax.scoring.score_tables import quality
 
 
 def test_the_best_of_a_column_is_the_highest_or_for_errors_the_lowest():
@@ -17,7 +18,7 @@ def test_the_best_of_a_column_is_the_highest_or_for_errors_the_lowest():
             f"{m}_interval": None for m in table1_tables.METRICS
         }
 
-    found = table1_tables._quality({"ours": row(psnr=20.0, flip=0.2), "npbg": row(psnr=21.0, flip=0.1)})
+    found = quality({"ours": row(psnr=20.0, flip=0.2), "npbg": row(psnr=21.0, flip=0.1)}, table1_tables.METRICS)
     best = {name: [cell.text for cell in cells if cell.best] for name, cells in found.items()}
     assert best == {"ours": [], "npbg": ["21.00", "0.100"]}
 

@@ -9,7 +9,8 @@ import pytest
 from support import tiny_dataset
 
 from experiments.comparison import figures, results_folder
-from experiments.comparison.result_tables import Table, csv_text, latex, markdown, number, text
+from experiments.comparison.result_tables import csv_text, latex, markdown
+from spnr_jax.scoring.score_tables import Table, number, text
 
 ROWS = (
     ("ours_1", (number(21.456, 2, (20.0, 22.5), best=True), number(0.25, 1, factor=100))),

@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 from support import tiny_dataset, tiny_surfels
 
+from experiments.comparison.object_views import at, on_white
 from experiments.studies import splat_quality
 from spnr_jax.errors import UserError
 from spnr_jax.formats.mesh.assets import Asset, Material, Part
+from spnr_jax.kernels.cloud_arrays import plain_cloud
 
 NAME = "ball_000000"
 SETTINGS = {"resolution": tiny_surfels.SIZE, "fov": 40.0, "spp": 4, "max_depth": 3}
@@ -85,22 +87,19 @@ def test_pictures_become_smaller_as_the_references_do():
     rgba = np.zeros((4, 4, 4), np.uint8)
     rgba[:2, :2] = 255, 0, 0, 255
     rgba[0, 2] = 0, 0, 255, 255  # a quarter of the next square
-    image, opacity = splat_quality._at(rgba, 2)
+    image, opacity = on_white(at(rgba, 2))
     np.testing.assert_allclose(opacity, [[1, 0.25], [0, 0]], atol=1e-6)
     np.testing.assert_allclose(image[0, 0], [1, 0, 0], atol=1e-5)
     np.testing.assert_allclose(image[0, 1], [0.75, 0.75, 1], atol=1e-5)
     np.testing.assert_allclose(image[1], 1, atol=1e-5)
 
 
-def test_an_object_without_a_surface_is_an_empty_picture_with_the_reason():
-    from types import SimpleNamespace
-
-    def nothing():
+def test_an_object_without_a_surface_has_no_mesh_and_the_reason(monkeypatch):
+    def nothing(*_):
         raise UserError("no surface to write as a mesh")
 
-    item, options = SimpleNamespace(images=np.ones((3, 4, 4, 4), np.uint8)), SimpleNamespace(views=2)
-    pictures, found = splat_quality._meshed(options, nothing, None, item)
-    assert pictures.shape == (2, 4, 4, 4)
-    assert not pictures.any()
+    monkeypatch.setattr(splat_quality.fused_surface, "solidity", nothing)
+    asset, found = splat_quality._meshed([], None, plain_cloud(np.zeros((1, 3), np.float32)))
+    assert asset is None
     assert found["empty"] == "no surface to write as a mesh"
     assert found["faces"] == 0

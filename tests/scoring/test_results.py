@@ -8,7 +8,7 @@ import pytest
 from support import tiny_dataset
 
 from spnr_jax.scoring import evaluation, results
-from spnr_jax.scoring.report import METHODS
+from spnr_jax.scoring.score_tables import METHODS
 from spnr_jax.scoring.summary import METRICS
 from spnr_jax.training import metrics_log
 

@@ -191,6 +191,6 @@ def test_a_page_that_is_too_large_is_refused(monkeypatch):
 
 
 def test_the_light_is_named_without_its_folder():
-    assert splat_export.light_name(Lighting()) == "room"
+    assert splat_making.light_name(Lighting()) == "room"
     lighting = Lighting(light="/home/me/sky.hdr", sun=(40.0, 30.0), exposure=-1.0)
-    assert splat_export.light_name(lighting) == "sky.hdr + sun 40 30, exposure -1"
+    assert splat_making.light_name(lighting) == "sky.hdr + sun 40 30, exposure -1"

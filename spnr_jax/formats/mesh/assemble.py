@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from spnr_jax.formats.mesh.assets import CHANNELS, TEXTURES, Asset, Material, Part, RejectedAsset
-from spnr_jax.formats.mesh.surface_points import bounding_box, face_areas
+from spnr_jax.formats.mesh.surface_points import bounding_box, face_areas, unit, vertex_normals
 from spnr_jax.formats.mesh.tints import split_by_tint
 
 # Faces below this share of the squared box diagonal are float32 rounding, not surface.
@@ -121,12 +121,8 @@ def _unit_normals(part: Part, notes: set[str]) -> np.ndarray | None:
     if good.all():
         return part.normals / length[:, None]
     notes.add("some normals without a direction (the faces' are used)")
-    a, b, c = np.moveaxis(part.positions[part.faces], 1, 0)
-    from_faces = np.zeros_like(part.positions)
-    np.add.at(from_faces, part.faces, np.cross(b - a, c - a)[:, None])
-    normals = np.where(good[:, None], part.normals, from_faces)
-    length = np.linalg.norm(normals, axis=-1, keepdims=True)
-    return np.where(length > 0, normals / np.where(length > 0, length, 1), [0.0, 1.0, 0.0])
+    own = unit(np.where(good[:, None], part.normals, 0))
+    return np.where(good[:, None], own, vertex_normals(part.positions, part.faces))
 
 
 def _checked_colors(part: Part, notes: set[str]) -> np.ndarray | None:

@@ -10,7 +10,7 @@ could not tell which it hits.
 
 import io
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -65,7 +65,10 @@ def load_obj(path: Path, root: Path | None = None, transparent_parts: Transparen
     names = list(dict.fromkeys(re.findall(r"(?m)^usemtl +(.+?) *$", text)))
     ignored: set[str] = set()
     looks = {PLACE.format(i): _look(read, name, library, ignored, tolerance) for i, name in enumerate(names)}
-    loaded = read_obj_text(io.StringIO(_renamed(text, names)), resolver={"names": _name_list(looks)})
+    # an MTL text of names only makes trimesh keep the material of each face
+    loaded = read_obj_text(
+        io.StringIO(_renamed(text, names)), resolver={"names": "\n".join(f"newmtl {name}" for name in looks)}
+    )
     order = {name: number for number, name in enumerate(looks)}
     meshes = sorted(loaded["geometry"].values(), key=lambda mesh: order.get(_material_name(mesh), -1))
     dressed = [(mesh, looks.get(_material_name(mesh), Look(principled()))) for mesh in meshes]
@@ -249,11 +252,6 @@ def _absolute(text: str) -> str:
             line = " ".join(["f", *absolute])
         lines.append(line)
     return "\n".join(lines)
-
-
-def _name_list(materials: Iterable[str]) -> str:
-    """An MTL text of names only, which makes trimesh keep the material of each face."""
-    return "\n".join(f"newmtl {name}" for name in materials)
 
 
 def _material_name(mesh: dict) -> str:

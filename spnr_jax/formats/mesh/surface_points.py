@@ -168,6 +168,14 @@ def _face_cross(part: Part) -> np.ndarray:
     return np.cross(b - a, c - a)
 
 
+def vertex_normals(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Unit mean normals (v, 3) of the faces (f, 3) around each vertex, weighted by area; y where there is none."""
+    a, b, c = np.moveaxis(positions[faces], 1, 0)
+    sums = np.zeros_like(positions)
+    np.add.at(sums, faces, np.cross(b - a, c - a)[:, None])
+    return unit(sums, np.array([0.0, 1.0, 0.0]))
+
+
 def unit(vectors: np.ndarray, fallback: np.ndarray | None = None) -> np.ndarray:
     """Vectors (n, 3) of length 1; where one has no length, the fallback."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
