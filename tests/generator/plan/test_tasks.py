@@ -92,11 +92,6 @@ def test_variants_are_reshaped_if_asked_for_and_older_data_sets_that_were_not_st
         assert ("reshape_variants" in describe(made, "scalar_rgb")["settings"]) == asked
 
 
-def test_a_variant_sorts_right_behind_its_product():
-    names = ["a", "a--1", "a--2", "a-2", "a.b", "a1", "aB", "a_1", "ab"]
-    assert sorted(names) == names
-
-
 def test_fewer_training_objects_than_there_are_leave_some_aside():
     made = planned(test_objects=10, val_fraction=0.1, train_objects=7)
     split = made.split(ids(made.tasks))
