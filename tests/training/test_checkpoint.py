@@ -7,7 +7,6 @@ import shutil
 
 import jax
 import pytest
-from support import tiny_dataset
 from support.laws import same_bits
 from support.tiny_baselines import SHRUNKEN
 from support.tiny_dataset import CONFIG
@@ -41,9 +40,23 @@ def halved(path):
 DAMAGES = {"emptied": emptied, "overwritten": overwritten, "halved": halved, "deleted": lambda path: path.unlink()}
 
 
+def saved(folder, *steps):
+    """A run folder with checkpoints of untrained weights at these steps."""
+    state = optimisation.jitted_create_state(CONFIG)
+    checkpoint.write_config(folder, CONFIG)
+    for step in steps:
+        checkpoint.save(folder, dataclasses.replace(state, step=jax.numpy.full_like(state.step, step)))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def whole_run(tmp_path_factory):
+    return saved(tmp_path_factory.mktemp("run"), 2, 4, 6)
+
+
 @pytest.fixture
-def run(tmp_path):
-    return shutil.copytree(tiny_dataset.run(), tmp_path / "run")
+def run(whole_run, tmp_path):
+    return shutil.copytree(whole_run, tmp_path / "run")
 
 
 def test_a_state_comes_back_bit_by_bit(tmp_path):
@@ -126,9 +139,7 @@ def test_reading_leaves_what_a_running_training_is_writing(run):
 
 
 def test_the_newest_three_checkpoints_stay(tmp_path):
-    state = optimisation.jitted_create_state(CONFIG)
-    for step in range(1, 6):
-        checkpoint.save(tmp_path, dataclasses.replace(state, step=jax.numpy.full_like(state.step, step)))
+    saved(tmp_path, *range(1, 6))
     assert {path.name for path in (tmp_path / "checkpoints").iterdir() if path.is_dir()} == {"3", "4", "5"}
 
 
