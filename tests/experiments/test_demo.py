@@ -82,3 +82,9 @@ def test_seconds_add_up_over_calls_and_idle_ones_add_nothing(tmp_path, monkeypat
         seconds = demo.Seconds(tmp_path / "seconds.json")
         seconds.measure("train", lambda: None)
         assert json.loads((tmp_path / "seconds.json").read_text()) == {"train": expected}
+
+
+def test_seconds_of_work_that_was_stopped_are_kept(tmp_path):
+    with pytest.raises(KeyboardInterrupt):
+        demo.Seconds(tmp_path / "seconds.json").measure("train", lambda: (_ for _ in ()).throw(KeyboardInterrupt))
+    assert "train" in json.loads((tmp_path / "seconds.json").read_text())

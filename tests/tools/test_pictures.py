@@ -131,6 +131,11 @@ def test_the_density_grid_is_written_with_its_place_and_the_mesh_in_the_frame_of
     np.testing.assert_allclose(bounds.mean(axis=0), [100, 200, 300], atol=1.5)
 
 
+def test_no_views_and_no_turntable_write_nothing(tmp_path):
+    rendered(cloud_file(tmp_path), tmp_path / "out", views=0, turntable="none")
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.parametrize(("choice", "words"), [("opaque", "drawn as opaque"), ("skip", "left out")])
 def test_transparent_parts_of_a_mesh_are_drawn_or_left_out_as_asked(tmp_path, choice, words):
     builder = GltfBuilder()

@@ -147,16 +147,8 @@ class TestStep:
             moved = [(a != b).any() for a, b in zip(jax.tree.leaves(before), jax.tree.leaves(after), strict=True)]
             assert np.mean(moved) > 0.5
         assert all(np.isfinite(value) for value in metrics.values())
-
-    def test_metrics_are_those_of_the_rendering(self, fresh_l1):
-        _, metrics = step(fresh_l1, L1_ONLY)
-        assert set(metrics) == {"psnr", "l1", "loss", "gradient_norm"}
-        assert metrics["loss"] > 100 * metrics["l1"], "the low-resolution part comes on top"
-
-    def test_running_statistics_are_those_of_the_forward(self, fresh_l1):
-        state, _ = step(fresh_l1, L1_ONLY)
         stats = state.batch_stats["encoder"]["pointnet"]["norm_0"]
-        assert (stats["mean"] != 0).all()
+        assert (stats["mean"] != 0).all(), "running statistics are those of the forward"
         assert (stats["variance"] != 1).all()
 
 
@@ -174,11 +166,8 @@ class TestAverage:
             )
             close((after.averaged, after.averaged_stats), expected, atol=1e-7)
             state = after
-
-    def test_evaluation_uses_it(self, fresh_l1):
-        state, _ = run(fresh_l1, 3, L1_ONLY)
-        variables = optimisation.averaged_variables(state)
-        same_bits(variables, {"params": state.averaged, "batch_stats": state.averaged_stats})
+        evaluated = {"params": state.averaged, "batch_stats": state.averaged_stats}
+        same_bits(optimisation.averaged_variables(state), evaluated)
 
 
 class TestPixelError:

@@ -182,14 +182,6 @@ def test_the_presets_hold_the_papers_numbers():
     assert data_presets.shapenet_chair(Path("x")).test_objects == 105
 
 
-def test_help_shows_the_presets_values(capsys):
-    with pytest.raises(SystemExit):
-        parse(["generate", "--preset", "shapenet_plane", "--help"])
-    said = " ".join(capsys.readouterr().out.split())
-    assert "default: 406" in said
-    assert "default: 200" in said
-
-
 def test_an_unknown_preset_or_class_is_refused_and_the_known_are_named(capsys):
     for arguments, known in ((["--preset", "abc"], "shapenet_chair"), (["--category", "boat"], "plane")):
         with pytest.raises(SystemExit) as stopped:
