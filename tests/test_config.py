@@ -5,11 +5,12 @@ import json
 
 import pytest
 
-from spnr_jax.baselines.sizes import NPBGConfig, PointNeRFConfig
+from spnr_jax.baselines.sizes import NPBGConfig, PointNeRFConfig, Points2NeRFConfig
 from spnr_jax.config import LossConfig, OptimizerConfig, TrainConfig
 from spnr_jax.formats.config_json import BASELINES, OURS, from_dict, to_dict
 from spnr_jax.model_config import EncoderConfig, NearPointsConfig, PaperConfig, SamplingConfig
 from spnr_jax.presets import PRESETS, tiny
+from spnr_jax.training.trainer import Schedule
 
 
 @pytest.mark.parametrize(
@@ -38,6 +39,24 @@ from spnr_jax.presets import PRESETS, tiny
         (TrainConfig, "pixel_stride", 0, "at least 1"),
         (TrainConfig, "even_share", 1.1, "a share"),
         (TrainConfig, "pixel_stride", 2, "neighbours"),
+        (SamplingConfig, "reach", -1, "at least 0"),
+        (NearPointsConfig, "num_neighbors", 0, "at least 1"),
+        (NPBGConfig, "encoder_widths", (16,), "one entry more"),
+        (NPBGConfig, "encoder_widths", (16, 6, 48, 64, 80), "6 channels of a raster"),
+        (NPBGConfig, "near", 0.0, "positive"),
+        (NPBGConfig, "image_resolution", 31, "at least 32"),
+        (PointNeRFConfig, "radius", 0.0, "positive"),
+        (PointNeRFConfig, "num_neighbors", 0, "at least 1"),
+        (PointNeRFConfig, "num_samples", 401, "num_candidates 400"),
+        (PointNeRFConfig, "density_scale", 0.0, "positive"),
+        (PointNeRFConfig, "jitter", 1.5, "a share"),
+        (PointNeRFConfig, "ray_chunk", 0, "at least 1"),
+        (Points2NeRFConfig, "nerf_depth", 3, "even"),
+        (Points2NeRFConfig, "kl_weight", -1.0, "at least 0"),
+        (Points2NeRFConfig, "materials", ("base_color", "base_color"), "distinct"),
+        (Schedule, "log_every", 0, "at least 1"),
+        (Schedule, "preview_every", 0, "at least 1"),
+        (Schedule, "checkpoint_every", 0, "at least 1"),
     ],
 )
 def test_a_wrong_number_names_the_field_what_came_and_what_is_possible(kind, field, value, hint):
@@ -87,9 +106,6 @@ class TestPresets:
     def test_survives_json(self, preset):
         assert from_dict(json.loads(json.dumps(to_dict(preset())))) == preset()
 
-    def test_is_hashable_so_that_it_can_be_static(self, preset):
-        assert hash(preset()) == hash(preset())
-
 
 @pytest.mark.parametrize("name", ["abo", "shapenet_car", "shapenet_plane", "shapenet_chair"])
 def test_paper_presets_have_the_papers_sizes(name):
@@ -101,13 +117,6 @@ def test_paper_presets_have_the_papers_sizes(name):
     assert sizes == ((64, 128) if name == "abo" else (100, 200))
     assert config.loss.l1_weight == (5000 if name == "shapenet_chair" else 100)
     assert config.loss.adversarial_weight == 1
-
-
-def test_a_larger_volume_and_a_wider_network_are_only_numbers():
-    config = dataclasses.replace(
-        PRESETS["abo"](), model=PaperConfig(encoder=EncoderConfig(volume_resolution=128, base_width=32))
-    )
-    assert (config.model.encoder.volume_resolution, config.model.encoder.base_width) == (128, 32)
 
 
 class TestFromDict:
@@ -165,11 +174,6 @@ class TestMethods:
                 TrainConfig(model=model, loss=quiet, pixel_stride=4)
 
 
-def test_unknown_options_are_errors():
-    with pytest.raises(TypeError, match="num_samples"):
-        SamplingConfig(num_samples=3)
-
-
 def test_an_image_too_small_for_the_discriminator_is_named():
     small = PaperConfig(render_resolution=8, resize_resolution=8, image_resolution=16)
     with pytest.raises(ValueError, match="image_resolution 16 is too small"):
@@ -208,8 +212,3 @@ def test_a_number_that_is_not_finite_is_refused():
     for number in (float("nan"), float("inf")):
         with pytest.raises(ValueError, match="mse_weight must be a number, got"):
             LossConfig(mse_weight=number)
-
-
-def test_a_network_near_points_has_no_sizes_of_the_paper_s_network():
-    with pytest.raises(TypeError, match="num_features"):
-        NearPointsConfig(num_features=16)

@@ -215,18 +215,3 @@ def test_the_training_step_learns_two_balls_by_heart():
     _, end = run(fresh, 60, config, BATCH)
     assert set(end) == {"psnr", "l1", "loss", "gradient_norm"}
     assert end["loss"] < start["loss"] / 3
-
-
-@pytest.mark.parametrize(
-    ("field", "value", "hint"),
-    [
-        ("encoder_widths", (16,), "one entry more"),
-        ("encoder_widths", (16, 6, 48, 64, 80), "6 channels of a raster"),
-        ("near", 0.0, "positive"),
-        ("image_resolution", 31, "at least 32"),
-    ],
-)
-def test_a_wrong_number_names_its_field(field, value, hint):
-    with pytest.raises(ValueError, match=field) as error:
-        NPBGConfig(**{field: value})
-    assert hint in str(error.value)

@@ -13,7 +13,6 @@ from support.tiny_training import BATCH, L1_ONLY, create, run, step
 
 from spnr_jax.baselines import point_nerf
 from spnr_jax.baselines.point_nerf import PointNeRF
-from spnr_jax.baselines.sizes import PointNeRFConfig
 from spnr_jax.config import LossConfig
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.records import Rays
@@ -252,20 +251,3 @@ class TestTraining:
         _, end = run(fresh, 40, TRAINING, BATCH)
         assert end["loss"] < 0.7 * start["loss"]
         same_bits(run(fresh, 2, TRAINING, BATCH), run(create(TRAINING), 2, TRAINING, BATCH))
-
-
-@pytest.mark.parametrize(
-    ("field", "value", "hint"),
-    [
-        ("radius", 0.0, "positive"),
-        ("num_neighbors", 0, "at least 1"),
-        ("num_samples", 401, "num_candidates 400"),
-        ("density_scale", 0.0, "positive"),
-        ("jitter", 1.5, "a share"),
-        ("ray_chunk", 0, "at least 1"),
-    ],
-)
-def test_a_wrong_number_names_its_field(field, value, hint):
-    with pytest.raises(ValueError, match=field) as error:
-        PointNeRFConfig(**{field: value})
-    assert hint in str(error.value)

@@ -11,11 +11,10 @@ from support import tiny_model, tiny_training
 from support.laws import close, numbers
 
 from spnr_jax.baselines import points2nerf
-from spnr_jax.baselines.baseline_presets import points2nerf_abo, points2nerf_tiny
+from spnr_jax.baselines.baseline_presets import points2nerf_abo
 from spnr_jax.baselines.points2nerf import Hypernetwork, Points2NeRF
 from spnr_jax.baselines.sizes import Points2NeRFConfig
 from spnr_jax.config import OptimizerConfig
-from spnr_jax.formats.config_json import from_dict, to_dict
 from spnr_jax.method import inference
 
 FAITHFUL = Points2NeRFConfig(
@@ -247,22 +246,3 @@ def test_training_learns_two_coloured_balls():
     state, first = tiny_training.step(tiny_training.create(config), config)
     _, last = tiny_training.run(state, 399, config)
     assert last["loss"] < 0.1 * first["loss"]
-
-
-def test_the_presets_survive_json_and_tell_the_method():
-    for config in (points2nerf_abo(), points2nerf_tiny()):
-        assert to_dict(config)["model"]["method"] == "points2nerf"
-        assert from_dict(to_dict(config)) == config
-
-
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
-        ({"nerf_depth": 3}, "nerf_depth"),
-        ({"kl_weight": -1.0}, "kl_weight"),
-        ({"materials": ("base_color", "base_color")}, "materials"),
-    ],
-)
-def test_wrong_sizes_are_refused_by_name(wrong, message):
-    with pytest.raises(ValueError, match=message):
-        Points2NeRFConfig(**wrong)

@@ -8,11 +8,10 @@ import pytest
 from support import tiny_dataset
 from support.tiny_runs import check_conditions, results_of, shrunken
 
-from experiments.comparison import budget as budgets
 from experiments.comparison import variants, variants_report
 from experiments.comparison.variants import Budget, Compared
 from experiments.studies.ablations import LABELS, ROWS, Ablations, changed, folds, main, rows
-from spnr_jax import cli, presets
+from spnr_jax import presets
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.config_json import to_dict
 from spnr_jax.model_config import RayNetworkConfig
@@ -92,20 +91,6 @@ class TestRows:
         for field in dataclasses.fields(RayNetworkConfig):
             assert getattr(paper, field.name) == getattr(near, field.name)
 
-    def test_a_plus_network_is_trained_in_other_ways(self):
-        expected = {
-            "adversarial": {
-                "loss.adversarial_weight": 0.01,
-                "loss.adversarial_start": 0.85,
-                "loss.discriminator_width": 16,
-                "pixel_stride": 1,
-            },
-            "more_views": {"views_per_object": 4, "pixel_stride": 4},
-            "half_samples": {"model.sampling.num_coarse": 4},
-            "twice_samples": {"model.sampling.num_coarse": 16},
-        }
-        assert {row: self.changes(row, presets.plus_tiny()) for row in expected} == expected
-
     def test_the_paper_s_network_is_the_preset_that_a_plus_one_was_made_of(self):
         plus = dataclasses.replace(presets.plus_tiny(), num_steps=77)
         assert changed("paper", plus) == dataclasses.replace(presets.tiny(), num_steps=77)
@@ -175,21 +160,6 @@ def test_variants_are_held_out_with_their_object():
     assert second.splits == {"train": ("a", "a--1", "c"), "val": (), "test": ("b", "d")}
     with pytest.raises(ValueError, match="--folds 3.*holds 4 objects, too few"):
         folds(dataset, 3)
-
-
-def test_minutes_give_every_variant_the_steps_that_fit(tmp_path, monkeypatch):
-    paces, measured = {"add": 2.0, "concat": 6.0}, []
-
-    def step_seconds(config, *_):
-        measured.append((config.model.encoder.skip, config.seed))
-        return paces[config.model.encoder.skip]
-
-    monkeypatch.setattr(budgets, "step_seconds", step_seconds)
-    main(asked(tmp_path, quick=False, minutes=0.2, seeds=(0, 1)))
-    steps = {name: row["steps"] for name, row in results_of(tmp_path)["variants"].items()}
-    assert steps == {"reference": [6, 6], "skip_concat": [2, 2]}
-    assert set(measured) == {("add", 0), ("concat", 0)}, "once for all seeds"
-    assert cli.guarded(lambda: main(asked(tmp_path, quick=False, minutes=0.4)), "ablations") == 2
 
 
 class TestReport:

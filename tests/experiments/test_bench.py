@@ -8,8 +8,6 @@ import sys
 import time
 from pathlib import Path
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from support import twin
@@ -17,7 +15,6 @@ from support import twin
 from experiments.speed import bench, bench_scene, ours, twin_layout
 from experiments.speed import worker as workers
 from spnr_jax.devices import machine
-from spnr_jax.kernels import cameras
 
 OPTIONS = {"presets": ("tiny",), "modes": ("render",), "variants": ("plain", "fast"), "rounds": 3, "seconds": 0.02}
 
@@ -156,14 +153,6 @@ class TestOurs:
         theirs = twin_layout.train_config(twin.load())
         assert ours.twin_sized("tiny").model == theirs.model
 
-    @pytest.mark.parametrize("preset", ["tiny", "small", "abo"])
-    def test_near_points_has_at_most_half_of_the_samples(self, preset):
-        config = ours.twin_sized(preset)
-        whole, near = config.model.sampling, ours.near_points(config).model.sampling
-        assert near.reach == 1
-        assert whole.reach == 0
-        assert 2 * (near.num_coarse + near.num_fine) <= whole.num_coarse + whole.num_fine
-
     def test_another_size_is_refused(self):
         config = ours.twin_sized("small")
         with pytest.raises(ValueError, match="small: the twin has other sizes"):
@@ -207,11 +196,3 @@ class TestScene:
         sphere, box = bench_scene.arrays(2, 4)["in/pos"]
         np.testing.assert_allclose(np.linalg.norm(sphere, axis=-1), bench_scene.SPHERE, rtol=1e-5)
         np.testing.assert_allclose(np.abs(box).max(axis=-1), bench_scene.BOX, rtol=1e-5)
-
-    def test_cameras_look_at_the_middle(self):
-        camera = twin_layout.batch(bench_scene.arrays(3, 8)).camera
-        pixels, distance = cameras.project(jax.tree.map(jnp.asarray, camera), jnp.zeros((3, 1, 1, 3)))
-        np.testing.assert_allclose(pixels, np.full((3, 1, 1, 2), 4.0), atol=1e-4)
-        np.testing.assert_allclose(distance, bench_scene.DISTANCE, rtol=1e-5)
-        rotation = camera.cam_to_world[..., :3]
-        np.testing.assert_allclose(np.linalg.det(rotation), np.ones((3, 1)), rtol=1e-5)

@@ -75,11 +75,6 @@ def test_procedural_objects_are_made_unless_meshes_replace_them(
     assert asked[0].objects == expected
 
 
-def test_zero_steps_are_refused(asked, tmp_path):
-    with pytest.raises(ValueError, match="num_steps must be at least 1, got 0"):
-        demo.main(demo.Demo(out=tmp_path, steps=0))
-
-
 def test_seconds_add_up_over_calls_and_idle_ones_add_nothing(tmp_path, monkeypatch):
     clock = iter([0.0, 30.0, 100.0, 112.0, 200.0, 203.0])
     monkeypatch.setattr(demo, "time", SimpleNamespace(monotonic=lambda: next(clock)))

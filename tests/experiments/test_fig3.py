@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 from support import stand_ins, tiny_dataset
 from support.handmade import ball
+from support.surfel_clouds import cloud
+from support.tiny_runs import forbidden
 
 from data_gen.render.poisson_surface import PoissonConfig
 from experiments.comparison import trained_networks
@@ -15,7 +17,6 @@ from experiments.paper.fig3 import Fig3
 from spnr_jax import cli
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.mesh.assets import Asset
-from spnr_jax.kernels.records import PointCloud
 
 SIZE = 64
 TRUTH = np.full((SIZE, SIZE), np.inf)
@@ -123,9 +124,6 @@ def test_the_error_of_a_depth_behind_the_mesh_is_how_far_it_lies_behind(out):
 
 
 def test_a_second_call_makes_nothing_again_and_gives_the_same(out, monkeypatch):
-    def forbidden(*_):
-        raise AssertionError("something was made again")
-
     before = (out / "results.json").read_bytes()
     monkeypatch.setattr(fig3, "true_depth", forbidden)
     monkeypatch.setattr(stand_ins.StandIn, "show", forbidden)
@@ -140,9 +138,7 @@ def test_a_poisson_surface_of_many_points_has_the_depth_of_the_ball():
     item = data_sets.read_object(dataset, dataset.splits["test"][0])
     normals = np.random.default_rng(0).normal(size=(800, 3)).astype(np.float32)
     positions = tiny_dataset.RADIUS * normals / np.linalg.norm(normals, axis=1, keepdims=True)
-    color, one = np.zeros_like(positions), np.zeros(800, np.float32)
-    cloud = PointCloud(positions=positions, base_color=color, roughness=one, metallic=one, mask=np.ones(800, bool))
-    seen, acc = fig3.of_surface(PoissonConfig(depth=5)).show(item, cloud)
+    seen, acc = fig3.of_surface(PoissonConfig(depth=5)).show(item, cloud(positions))
     expected, opaque = stand_ins.disc(tiny_dataset.SIZE)
     assert np.mean(acc == opaque) > 0.95
     both = (acc > 0) & (opaque > 0) & (expected < expected.min() + 0.3)

@@ -6,11 +6,12 @@ import json
 import numpy as np
 import pytest
 from support import tiny_dataset, tiny_untrained
+from support.handmade import box
 
 from data_gen.render.variant import choose_variant, mitsuba_module
 from experiments.comparison.trained_networks import Sources
 from experiments.studies import flicker
-from spnr_jax.formats import data_sets
+from spnr_jax.formats.mesh.assets import Asset
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.records import Camera
 
@@ -85,7 +86,7 @@ def test_the_whole_way(tmp_path, monkeypatch):
         frames=20, spp=1,
     )  # fmt: skip
     mitsuba_module(choose_variant("scalar_rgb")[0])
-    monkeypatch.setattr(flicker, "mesh_of", lambda *_: box())
+    monkeypatch.setattr(flicker, "mesh_of", lambda *_: Asset(parts=(box(),)))
     monkeypatch.setattr(flicker, "view_config", lambda _: flicker.views.ViewConfig(resolution=tiny_dataset.SIZE))
     monkeypatch.setattr(flicker, "light_of", lambda *_: np.ones((4, 8, 3), np.float32))
     flicker.main(options)
@@ -99,12 +100,3 @@ def test_the_whole_way(tmp_path, monkeypatch):
         ValueError, match="--frames 3: neighbouring ones see no place of ball_000004 in common; take more"
     ):
         flicker.main(dataclasses.replace(options, frames=3, out=tmp_path / "few"))
-    assert isinstance(data_sets.open_dataset(options.data), data_sets.Dataset)
-
-
-def box():
-    from support.handmade import box as part
-
-    from spnr_jax.formats.mesh.assets import Asset
-
-    return Asset(parts=(part(),))

@@ -5,7 +5,6 @@ import json
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import pytest
 from support import tiny_dataset
 from support.laws import same_bits
@@ -14,7 +13,7 @@ from support.tiny_baselines import SHRUNKEN
 from experiments.studies import many_objects
 from spnr_jax import cli, presets
 from spnr_jax.formats import data_sets
-from spnr_jax.training import batching, many_runs, optimisation
+from spnr_jax.training import batching
 
 SEEDS = (3, 4, 5)
 QUICK = dataclasses.replace(SHRUNKEN["points2nerf_tiny"], num_steps=3)  # no convolutions: compiles in a second
@@ -46,15 +45,6 @@ def test_clouds_of_many_sizes_are_the_first_points_of_objects():
     assert sizes[0] == 2
     assert sizes[-1] == tiny_dataset.POINTS
     assert len(set(sizes)) > 6
-
-
-@pytest.mark.ci
-def test_stacked_states_share_their_step_and_keep_their_keys():
-    states = [optimisation.jitted_create_state(QUICK, jnp.uint32(seed)) for seed in SEEDS]
-    stacked = many_runs.stack(states)
-    assert stacked.step.shape == ()
-    np.testing.assert_array_equal(jax.random.key_data(stacked.key)[1], jax.random.key_data(states[1].key))
-    same_bits(jax.tree.map(lambda x: x[1], stacked.generator), states[1].generator)
 
 
 @pytest.mark.ci

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from support import stand_ins, tiny_dataset
 from support.handmade import RED, ball, plain
+from support.tiny_runs import forbidden
 
 from experiments.comparison import trained_networks
 from experiments.studies import point_count
@@ -105,9 +106,6 @@ def test_classes_have_the_means_of_their_objects_and_the_best_method_is_counted(
 
 
 def test_what_was_measured_is_not_measured_again(out, tmp_path, monkeypatch):
-    def forbidden(*_):
-        raise AssertionError("something was measured again")
-
     before = (out / "results.json").read_bytes()
     measure = point_count.measure
     monkeypatch.setattr(point_count, "measure", forbidden)

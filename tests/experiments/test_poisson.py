@@ -86,7 +86,9 @@ def test_a_ball_is_rendered_as_its_reference_and_a_line_is_an_empty_picture_with
 
 
 @needs_solver
-def test_the_sharpness_study_draws_the_same_surfaces_of_the_first_points_and_views(dataset):
+def test_the_sharpness_study_draws_the_same_surfaces_of_the_first_points_and_views(dataset, monkeypatch):
+    coarse = replace(poisson.SURFACES["poisson_trimmed"], depth=6)
+    monkeypatch.setitem(poisson.SURFACES, "poisson_trimmed", coarse)
     found = data_sets.open_dataset(dataset)
     renderer = poisson.Renderer(found.settings, variant="scalar_rgb")
     surfaces, item = Poisson("Poisson", renderer), data_sets.read_object(found, "ball")
@@ -127,9 +129,3 @@ def test_a_data_set_without_a_renderer_setting_is_refused_by_name():
     with pytest.raises(ValueError, match="fov"):
         poisson.view_config({"settings": {k: v for k, v in vars(VIEW).items() if k != "fov"}})
     assert poisson.view_config({"settings": {**vars(VIEW), "seed": 3}}) == replace(VIEW, views=views.ViewConfig.views)
-
-
-def test_absent_packages_are_named(monkeypatch):
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(ValueError, match="pymeshlab"):
-        poisson.check_packages()

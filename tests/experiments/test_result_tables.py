@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from support import tiny_dataset
 
-from experiments.comparison import figures, results_folder
+from experiments.comparison import results_folder
 from experiments.comparison.result_tables import csv_text, latex, markdown
 from spnr_jax.scoring.score_tables import Table, number, text
 
@@ -73,10 +73,3 @@ def test_a_folder_is_one_requests_of_one_data_set(tmp_path):
         results_folder.claim(tmp_path, "scores", {"seed": 1, "objects": ["a", "b"]}, dataset)
     with pytest.raises(ValueError, match="another of, data"):
         results_folder.claim(tmp_path, "pictures", {"seed": 0, "data": "another"})
-
-
-def test_a_line_stands_below_each_picture():
-    picture = np.zeros((4, 4, 3), np.uint8)
-    bare, named = (figures.grid([[picture]], size=80, below=below) for below in ((), [["20.1 dB"]]))
-    assert named.shape[0] > bare.shape[0]
-    assert (named[84:] < 128).any()

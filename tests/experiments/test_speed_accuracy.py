@@ -4,7 +4,7 @@ import dataclasses
 import json
 
 import pytest
-from support import tiny_dataset, tiny_model, tiny_surfels
+from support import tiny_dataset, tiny_model, tiny_surfels, tiny_untrained
 
 from experiments.studies import speed_accuracy, speed_accuracy_plot
 from experiments.studies.speed_accuracy import SpeedAccuracy, main
@@ -69,7 +69,7 @@ def balls(tmp_path_factory):
 
 def test_a_second_call_goes_on_where_the_first_one_stopped(balls, tmp_path, monkeypatch):
     monkeypatch.setattr(cli, "set_up_jax", lambda **_: None)
-    runs, measured = (str(tiny_surfels.run()), str(tiny_dataset.run())), []
+    runs, measured = (str(tiny_surfels.run()), str(tiny_untrained.run())), []
     options = SpeedAccuracy(data=balls, runs=runs, out=tmp_path, objects=2, sizes=(24, 48), quick=True)
 
     def measure(model, way, *, size, **_):
@@ -114,6 +114,6 @@ def test_a_setting_is_scored_and_timed_and_fewer_pixels_are_enlarged(balls):
 
 @pytest.mark.parametrize("size", [24, 48])
 def test_what_an_upsampler_draws_at_its_own_size_is_scored_at_any(balls, size):
-    dataset, model = data_sets.open_dataset(balls), load(str(tiny_dataset.run()))
+    dataset, model = data_sets.open_dataset(balls), load(str(tiny_untrained.run()))
     way = settings(model.config, COUNTS)[0]
     assert speed_accuracy.measure(model, way, dataset, dataset.splits["test"][:1], 1, {}, size)["psnr"] > 5

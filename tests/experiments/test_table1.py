@@ -16,6 +16,7 @@ import pytest
 from PIL import Image
 from support import tiny_dataset
 from support.tiny_baselines import BASELINE, SHRUNKEN, SIZE
+from support.tiny_runs import forbidden
 
 from data_gen.render import poisson_surface as surfaces
 from data_gen.render import views
@@ -90,9 +91,6 @@ def test_scores_of_a_network_and_the_floors_are_those_of_the_evaluation_of_its_r
 
 
 def test_a_finished_table_is_not_trained_again(out, dataset, monkeypatch):
-    def forbidden(*_, **__):
-        raise AssertionError("something was made again")
-
     monkeypatch.setattr(optimisation, "jitted_train_step", forbidden)
     monkeypatch.setattr(poisson.Renderer, "pictures", forbidden)
     before, costs = results_of(out), json.loads((out / "results.json").read_text())["costs"]

@@ -14,15 +14,6 @@ from spnr_jax.formats.clouds import read_cloud
 ROOT = Path(__file__).parents[2]
 
 
-def test_a_point_that_is_kept_keeps_its_normal(tmp_path, monkeypatch):
-    positions = sphere_points(2, 900)
-    np.savez(tmp_path / "a.npz", xyz=positions, normals=2 * positions)
-    monkeypatch.setattr(clouds, "CAPACITY", 400)
-    cloud = read_cloud(tmp_path / "a.npz", num_points=20)
-    assert len(cloud.mask) == 20
-    np.testing.assert_allclose(cloud.normals, cloud.positions, atol=1e-6)
-
-
 def test_thinning_keeps_points_of_the_file_with_their_materials_and_depends_on_the_seed_alone(tmp_path):
     positions = sphere_points(1, 900)
     np.savez(tmp_path / "a.npz", xyz=positions, roughness=np.arange(900) / 900)
@@ -92,9 +83,12 @@ def test_a_cloud_larger_than_the_memory_is_read(tmp_path, suffix, memory):
 def test_a_cloud_beyond_the_capacity_is_thinned_while_reading_and_says_so(tmp_path, monkeypatch):
     monkeypatch.setattr(clouds, "CAPACITY", 500)
     positions = sphere_points(1, 4000)
-    np.savez(tmp_path / "a.npz", xyz=positions, roughness=np.arange(4000) / 4000)
+    np.savez(tmp_path / "a.npz", xyz=positions, normals=2 * positions, roughness=np.arange(4000) / 4000)
     cloud, lines = read(tmp_path / "a.npz")
     assert 60 <= len(cloud.mask) <= 500
     assert lines[0] == f"{len(cloud.mask)} of 4000 points kept while reading, the first of each voxel"
     source = np.round(cloud.roughness * 4000).astype(int)
     np.testing.assert_array_equal(cloud.positions, positions[source].astype(np.float32))
+    np.testing.assert_allclose(cloud.normals, cloud.positions, atol=1e-6)
+    few = read_cloud(tmp_path / "a.npz", num_points=20)
+    np.testing.assert_allclose(few.normals, few.positions, atol=1e-6)

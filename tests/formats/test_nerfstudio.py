@@ -23,8 +23,9 @@ def folder(tmp_path_factory):
     boxes = [((1, 0.4, 0.3), (0, 0, 0)), ((0.2, 1.2, 0.2), (0.4, 0.6, 0)), ((0.2, 0.2, 0.9), (-0.4, 0.1, 0.5))]
     parts = [trimesh.creation.box(size, trimesh.transformations.translation_matrix(at)) for size, at in boxes]
     trimesh.util.concatenate(parts).export(base / "meshes" / "thing.ply")
-    size = ["--resolution", RESOLUTION, "--views", 6, "--points", 4000, "--spp", 16, "--test-fraction", 0]
-    assert spnr_data("generate", base / "set", "--meshes", base / "meshes", *size, "--workers", 1) == 0
+    size = ["--resolution", RESOLUTION, "--views", 6, "--points", 4000, "--spp", 16, "--visibility-grid", 1]
+    options = ["--meshes", base / "meshes", "--test-fraction", 0, "--workers", 1]
+    assert spnr_data("generate", base / "set", *options, *size) == 0
     return base / "set" / "objects" / "thing"
 
 

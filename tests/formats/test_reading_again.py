@@ -13,11 +13,12 @@ import msgpack
 import pytest
 from support import tiny_dataset
 from support.laws import same_bits
+from support.stopped_runs import without_network
 
 from spnr_jax import cli
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.shards import Shards
-from spnr_jax.training import batching, optimisation, trainer
+from spnr_jax.training import batching, trainer
 
 CONFIG = tiny_dataset.CONFIG
 RETRIES = len(data_sets.PAUSES)
@@ -109,12 +110,8 @@ def test_packed_objects_are_read_again_too():
 
 @pytest.fixture
 def stepless(monkeypatch):
-    """A network without numbers, whose step does nothing: the reader alone is tested."""
-    nothing = optimisation.TrainState(**dict.fromkeys(optimisation.TrainState.__dataclass_fields__) | {"step": 0})
-    monkeypatch.setattr(trainer, "new_state", lambda config, init: nothing)
-    monkeypatch.setattr(
-        optimisation, "jitted_train_step", lambda state, batch, **_: (state, {"loss": batch.image.mean()})
-    )
+    """The reader alone is tested."""
+    without_network(monkeypatch)
 
 
 def test_an_error_in_a_reading_thread_ends_the_training_with_one_line(stepless, monkeypatch, tmp_path, capsys):

@@ -17,7 +17,7 @@ from spnr_jax.kernels import occupancy
 from spnr_jax.method import inference
 from spnr_jax.method.march import trace
 from spnr_jax.method.model import Model
-from spnr_jax.model_config import AS_TRAINED, NearPointsConfig, PaperConfig, RenderOptions, SamplingConfig, surface_grid
+from spnr_jax.model_config import AS_TRAINED, RenderOptions, SamplingConfig, surface_grid
 from spnr_jax.tools.density_grid import sample_density
 from spnr_jax.training import pixels
 
@@ -164,8 +164,6 @@ class TestConfig:
     @pytest.mark.parametrize(
         ("changes", "message"),
         [
-            ({"num_neighbors": 0}, "num_neighbors must be at least 1, got 0"),
-            ({"num_neighbors": -1}, "num_neighbors must be at least 1, got -1"),
             ({"sampling": SamplingConfig(num_coarse=4, reach=0)}, "use reach 1"),
             ({"sampling": SamplingConfig(num_coarse=4, reach=2)}, "use reach 1"),
         ],
@@ -179,7 +177,3 @@ class TestConfig:
         with pytest.raises(ValueError, match="surface_cells 32: with max_points 2048 .* use at least 45"):
             dataclasses.replace(config, max_points=2048)
         dataclasses.replace(config, max_points=2048, model=dataclasses.replace(config.model, surface_cells=45))
-
-    def test_the_papers_network_sees_no_surface(self):
-        assert not {f.name for f in dataclasses.fields(PaperConfig)} & {"num_neighbors", "color", "refiner_width"}
-        assert (PaperConfig().encoder.point_norm, NearPointsConfig().encoder.point_norm) == ("batch", "layer")

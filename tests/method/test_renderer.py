@@ -113,10 +113,6 @@ class TestCloud:
         shuffled = jax.tree.map(lambda x: x[:, order], cloud())
         close(encode(variables, shuffled, config), other, rtol=1e-4, atol=1e-5)
 
-    def test_no_point_gives_a_finite_volume(self, variables):
-        empty = dataclasses.replace(cloud(), mask=jnp.zeros((2, NUM_POINTS), bool))
-        assert jnp.isfinite(encode(variables, empty).volume).all()
-
     @pytest.mark.parametrize("materials", [(), ("roughness",), ("base_color", "metallic")], ids=str)
     def test_materials_that_the_config_leaves_out_are_not_read(self, materials):
         config = tiny_model.with_encoder(CONFIG, materials=materials).encoder

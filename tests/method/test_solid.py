@@ -70,7 +70,9 @@ def test_dense_clouds_do_without(trained):
 
 def test_the_renderer_asks_it_for_its_picture(trained):
     config = SurfelConfig(widths=(4, 4), top=4, solid=True)
-    variables = surfel_renderer.init(jax.random.key(0), config) | {"batch_stats": trained.variables}
+    variables = jax.jit(surfel_renderer.init, static_argnums=1)(jax.random.key(0), config) | {
+        "batch_stats": trained.variables
+    }
     points = cloud(shape("sphere", NUM_POINTS)[0])
     scene = surfel_renderer.encode(variables, points, config=config)
     view = dataclasses.replace(camera(32), width=40)  # the window reaches beyond the picture

@@ -1,138 +1,93 @@
 """Valid glTF files of what other people's tools write: packed meshes and textures, instances, looks of every kind.
 
-Packed data lies in files of its own, so that damage reaches it as it is.
+Packed images lie in files of their own, so that damage reaches them as they are.
 """
 
 import io
-import json
 
 import numpy as np
 from damage import Files
 from PIL import Image
+from support.gltf_files import GltfBuilder
 from support.packed_meshes import ETC1S_ALPHA, MESHOPT, UASTC
 from valid_files import CORNERS, FACES, numbers, png
 
 FLOAT, SHORT = 5126, 5123
 
 
-def _accessor(count: int, kind: str, component: int = FLOAT, **more) -> dict:
-    return {"count": count, "type": kind, "componentType": component, **more}
-
-
-def _document(**more) -> dict:
-    """A document that draws its first mesh once."""
-    start = {"asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}]}
-    return start | more
-
-
-def _file(document: dict, **companions: bytes) -> Files:
-    """The document with buffers and images in files beside it, named as the keywords with a dot for the underscore."""
-    return {"cloud.gltf": json.dumps(document).encode()} | {k.replace("_", "."): v for k, v in companions.items()}
-
-
 def packed() -> list[Files]:
     """Files with Draco, meshopt, KTX2 and WebP data, and instances."""
-    return [*_draco(), _meshopt(), *map(_basis, (UASTC, ETC1S_ALPHA)), _webp(), _instances()]
+    return [*map(_draco, (True, False)), _meshopt(), *map(_basis, (UASTC, ETC1S_ALPHA)), _webp(), _instances()]
 
 
-def _draco() -> list[Files]:
-    """A mesh packed in the two ways that Draco has."""
+def _draco(in_order: bool) -> Files:
+    """A mesh packed in one of the two ways that Draco has."""
     import DracoPy
 
-    name, files = "KHR_draco_mesh_compression", []
-    for in_order in (True, False):
-        normals = np.tile([0.0, 0.0, 1.0], (len(CORNERS), 1))
-        data = DracoPy.encode(CORNERS, FACES.astype(np.uint32), normals=normals, preserve_order=in_order)
-        ids = {entry["attribute_type"]: entry["unique_id"] for entry in DracoPy.decode(data).attributes}
-        extension = {name: {"bufferView": 0, "attributes": {"POSITION": ids[0], "NORMAL": ids[1]}}}
-        primitive = {"attributes": {"POSITION": 0, "NORMAL": 1}, "indices": 2, "extensions": extension}
-        vectors = [_accessor(len(CORNERS), "VEC3") for _ in range(2)]
-        document = _document(
-            extensionsRequired=[name],
-            meshes=[{"primitives": [primitive]}],
-            accessors=[*vectors, _accessor(FACES.size, "SCALAR", SHORT)],
-            bufferViews=[{"buffer": 0, "byteLength": len(data)}],
-            buffers=[{"byteLength": len(data), "uri": "mesh.drc"}],
-        )
-        files.append(_file(document, mesh_drc=data))
-    return files
+    name, normals = "KHR_draco_mesh_compression", np.tile([0.0, 0.0, 1.0], (len(CORNERS), 1))
+    data = DracoPy.encode(CORNERS, FACES.astype(np.uint32), normals=normals, preserve_order=in_order)
+    ids = {entry["attribute_type"]: entry["unique_id"] for entry in DracoPy.decode(data).attributes}
+    builder = GltfBuilder(extensionsRequired=[name])
+    extension = {name: {"bufferView": builder.view(data), "attributes": {"POSITION": ids[0], "NORMAL": ids[1]}}}
+    vectors = {"count": len(CORNERS), "type": "VEC3", "componentType": FLOAT}
+    indices = {"count": FACES.size, "type": "SCALAR", "componentType": SHORT}
+    builder.document["accessors"] = [vectors, vectors, indices]
+    builder.mesh({"attributes": {"POSITION": 0, "NORMAL": 1}, "indices": 2, "extensions": extension})
+    return builder.files("cloud.gltf")
 
 
 def _meshopt() -> Files:
     """Packed vertices, directions behind a filter, and the triangles of a grid."""
     name = "EXT_meshopt_compression"
-    cases = [MESHOPT[case] for case in ("two blocks of steps, format 1", "directions in 4 bytes", "a grid")]
-    views = []
-    for number, case in enumerate(cases):
+    builder = GltfBuilder(extensionsRequired=[name])
+    views = builder.document["bufferViews"]
+    for case in (MESHOPT[key] for key in ("two blocks of steps, format 1", "directions in 4 bytes", "a grid")):
         described = {key: case[key] for key in ("count", "byteStride", "mode", "filter")}
-        extension = {name: {"buffer": number, "byteLength": len(case["packed"]), **described}}
-        stride = {"byteStride": case["byteStride"]} if number < 2 else {}
-        views.append({"buffer": 3, "byteLength": case["count"] * case["byteStride"], "extensions": extension} | stride)
-    files = {f"{letter}_bin": case["packed"] for letter, case in zip("abc", cases, strict=True)}
-    buffers = [{"byteLength": len(data), "uri": key.replace("_", ".")} for key, data in files.items()]
-    positions = _accessor(300, "VEC3", SHORT, bufferView=0, normalized=True)
-    primitive = {"attributes": {"POSITION": 0}, "indices": 2}
+        extension = views[builder.view(case["packed"])] | described
+        views[-1] = {"buffer": 1, "byteLength": case["count"] * case["byteStride"], "extensions": {name: extension}}
+        if case["mode"] == "ATTRIBUTES":
+            views[-1]["byteStride"] = case["byteStride"]
+    positions = {"bufferView": 0, "count": 300, "type": "VEC3", "componentType": SHORT, "normalized": True}
+    normals = {"bufferView": 1, "count": 6, "type": "VEC3", "componentType": 5120, "normalized": True}
+    indices = {"bufferView": 2, "count": MESHOPT["a grid"]["count"], "type": "SCALAR", "componentType": 5125}
+    builder.document["accessors"] = [positions, normals, indices, positions | {"count": 6}]
     small = {"attributes": {"POSITION": 3, "NORMAL": 1}}
-    document = _document(
-        extensionsRequired=[name],
-        meshes=[{"primitives": [primitive, small]}],
-        accessors=[
-            positions,
-            _accessor(6, "VEC3", 5120, bufferView=1, normalized=True),
-            _accessor(MESHOPT["a grid"]["count"], "SCALAR", 5125, bufferView=2),
-            positions | {"count": 6},
-        ],
-        bufferViews=views,
-        buffers=[*buffers, {"byteLength": 2400, "extensions": {name: {"fallback": True}}}],
-    )
-    return _file(document, **files)
+    builder.mesh({"attributes": {"POSITION": 0}, "indices": 2}, small)
+    return builder.files("cloud.gltf", {"byteLength": 2400, "extensions": {name: {"fallback": True}}})
 
 
-def _plain(**more) -> tuple[dict, bytes]:
-    """A document of the small mesh with texture coordinates, and its buffer."""
-    blocks = [CORNERS.tobytes(), FACES.tobytes(), numbers(len(CORNERS), 2).tobytes(), numbers(3, 3).tobytes()]
-    starts = np.cumsum([0, *map(len, blocks)]).tolist()
-    views = [{"buffer": 0, "byteOffset": at, "byteLength": len(b)} for at, b in zip(starts, blocks, strict=False)]
-    document = _document(
-        meshes=[{"primitives": [{"attributes": {"POSITION": 0, "TEXCOORD_0": 2}, "indices": 1, "material": 0}]}],
-        accessors=[
-            _accessor(len(CORNERS), "VEC3", bufferView=0),
-            _accessor(FACES.size, "SCALAR", SHORT, bufferView=1),
-            _accessor(len(CORNERS), "VEC2", bufferView=2),
-            _accessor(3, "VEC3", bufferView=3),
-        ],
-        bufferViews=views,
-        buffers=[{"byteLength": starts[-1], "uri": "data.bin"}],
-        **more,
-    )
-    return document, b"".join(blocks)
+def _square(builder: GltfBuilder, material: int) -> dict:
+    """The small mesh with texture coordinates."""
+    return builder.primitive(CORNERS, FACES.ravel(), material=material, TEXCOORD_0=numbers(len(CORNERS), 2))
 
 
 def _textured(extension: str, image: str, data: bytes) -> Files:
     """The small mesh with one image that only an extension names."""
-    document, binary = _plain(
-        materials=[{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}],
-        textures=[{"extensions": {extension: {"source": 0}}}],
-        images=[{"uri": image.replace("_", ".")}],
-    )
-    return _file(document, data_bin=binary, **{image: data})
+    builder = GltfBuilder()
+    texture = builder.texture(uri=image)
+    builder.document["textures"][texture] = {"extensions": {extension: {"source": 0}}}
+    material = builder.material(pbrMetallicRoughness={"baseColorTexture": {"index": texture}})
+    builder.mesh(_square(builder, material))
+    return builder.files("cloud.gltf") | {image: data}
 
 
 def _basis(data: bytes) -> Files:
-    return _textured("KHR_texture_basisu", "a_ktx2", data)
+    return _textured("KHR_texture_basisu", "a.ktx2", data)
 
 
 def _webp() -> Files:
     stream = io.BytesIO()
     Image.fromarray((255 * numbers(4, 4, 4)).astype(np.uint8)).save(stream, "webp", lossless=True)
-    return _textured("EXT_texture_webp", "a_webp", stream.getvalue())
+    return _textured("EXT_texture_webp", "a.webp", stream.getvalue())
 
 
 def _instances() -> Files:
     """The small mesh three times."""
-    document, binary = _plain(materials=[{}])
-    extension = {"EXT_mesh_gpu_instancing": {"attributes": {"TRANSLATION": 3, "SCALE": 3}}}
-    return _file(document | {"nodes": [{"mesh": 0, "extensions": extension}]}, data_bin=binary)
+    builder = GltfBuilder()
+    places = builder.accessor(numbers(3, 3))
+    extension = {"EXT_mesh_gpu_instancing": {"attributes": {"TRANSLATION": places, "SCALE": places}}}
+    builder.mesh(_square(builder, builder.material()), extensions=extension)
+    return builder.files("cloud.gltf")
 
 
 def looks() -> list[Files]:
@@ -149,13 +104,11 @@ def looks() -> list[Files]:
     ]
     files = []
     for material in materials:
-        document, binary = _plain(
-            materials=[material, {}],
-            textures=[{"source": 0, "sampler": 0}, {"source": 1}],
-            samplers=[{"wrapS": 33071, "wrapT": 33071}],
-            images=[{"uri": "a.png"}, {"uri": "b.png"}],
-        )
-        primitives = document["meshes"][0]["primitives"]
-        primitives.append({"attributes": {"POSITION": 0}, "indices": 1, "material": 1})  # something opaque beside it
-        files.append(_file(document, data_bin=binary, a_png=png(), b_png=png(3)))
+        builder = GltfBuilder()
+        builder.texture(uri="a.png", wrapS=33071, wrapT=33071)
+        builder.texture(uri="b.png")
+        opaque = builder.primitive(CORNERS, FACES.ravel(), material=1)  # beside what is not
+        builder.mesh(_square(builder, builder.material(**material)), opaque)
+        builder.material()
+        files.append(builder.files("cloud.gltf") | {"a.png": png(), "b.png": png(3)})
     return files

@@ -5,13 +5,13 @@ literal seeds; damage to a few hundred bytes hits what matters.
 """
 
 import io
-import json
 import struct
 from collections.abc import Sequence
 
 import numpy as np
 from damage import Files
-from PIL import Image
+from support import gltf_files, pcd_files
+from support.gltf_files import GltfBuilder
 
 SIZE, VIEWS, POINTS = 8, 2, 12
 CORNERS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0.5, 0.5, 1]], np.float32)
@@ -25,13 +25,7 @@ def numbers(*shape: int) -> np.ndarray:
 
 def png(channels: int = 4) -> bytes:
     """A picture of 4 x 4 pixels."""
-    return _png((255 * numbers(4, 4, channels)).astype(np.uint8))
-
-
-def _png(pixels: np.ndarray) -> bytes:
-    stream = io.BytesIO()
-    Image.fromarray(pixels).save(stream, "png")
-    return stream.getvalue()
+    return gltf_files.png(255 * numbers(4, 4, channels))
 
 
 def ply(form: str, columns: Sequence[tuple[str, str]], faces: bool = False) -> bytes:
@@ -76,19 +70,7 @@ def ply_meshes() -> list[Files]:
 
 def pcds() -> list[Files]:
     """PCD files: text, binary, compressed."""
-    layout = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "<u4")])
-    points = np.zeros(POINTS, layout)
-    for i, name in enumerate("xyz"):
-        points[name] = numbers(POINTS, 3)[:, i]
-    points["rgb"] = np.arange(POINTS) * 65793
-    head = "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z rgb\nSIZE 4 4 4 4\nTYPE F F F U\nCOUNT 1 1 1 1\n"
-    head += f"WIDTH {POINTS}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {POINTS}\nDATA "
-    text = "\n".join(" ".join(f"{v:g}" for v in row) for row in points.tolist()) + "\n"
-    plain = b"".join(points[name].tobytes() for name in layout.names or ())
-    packed = b"".join(bytes([len(plain[i : i + 32]) - 1]) + plain[i : i + 32] for i in range(0, len(plain), 32))
-    bodies = {"ascii": text.encode(), "binary": points.tobytes()}
-    bodies["binary_compressed"] = struct.pack("<II", len(packed), len(plain)) + packed
-    return [{"cloud.pcd": f"{head}{kind}\n".encode() + body} for kind, body in bodies.items()]
+    return [{"cloud.pcd": pcd_files.content(kind, pcd_files.points())} for kind in pcd_files.ENCODINGS]
 
 
 def texts() -> list[Files]:
@@ -177,43 +159,25 @@ def objs() -> list[Files]:
             {"cloud.obj": "\n".join(rich).encode(), "a.mtl": library.encode(), "a.png": png(3)}]  # fmt: skip
 
 
-def _gltf(uri: str | None, images: bool) -> tuple[dict, bytes]:
-    """Document and buffer of a textured mesh under a node; the image is in the buffer or a file."""
-    blocks = [CORNERS.tobytes(), FACES.tobytes(), numbers(len(CORNERS), 2).tobytes(), png()]
-    blocks += [np.array([0, 3], np.uint16).tobytes(), CORNERS[:2].tobytes()]
-    offsets = np.cumsum([0, *(len(block) + -len(block) % 4 for block in blocks)]).tolist()
-    views = [{"buffer": 0, "byteOffset": o, "byteLength": len(b)} for o, b in zip(offsets, blocks, strict=False)]
-    sparse = {"count": 2, "indices": {"bufferView": 4, "componentType": 5123}, "values": {"bufferView": 5}}
-    buffer: dict = {"byteLength": offsets[-1]}
-    document = {
-        "asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}],
-        "nodes": [
-            {"children": [1], "rotation": [0, 0, 0, 1], "scale": [1, 2, 1]}, {"mesh": 0, "translation": [1, 0, 0]},
-        ],
-        "meshes": [{"primitives": [{"attributes": {"POSITION": 0, "TEXCOORD_0": 2}, "indices": 1, "material": 0}]}],
-        "accessors": [
-            {"bufferView": 0, "componentType": 5126, "count": len(CORNERS), "type": "VEC3", "sparse": sparse},
-            {"bufferView": 1, "componentType": 5123, "count": FACES.size, "type": "SCALAR"},
-            {"bufferView": 2, "componentType": 5126, "count": len(CORNERS), "type": "VEC2"},
-        ],
-        "bufferViews": views, "buffers": [buffer if uri is None else {**buffer, "uri": uri}],
-        "materials": [{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}, "roughnessFactor": 0.5}}],
-        "textures": [{"source": 0, "sampler": 0}], "samplers": [{"wrapS": 10497}],
-        "images": [{"uri": "a.png"} if images else {"bufferView": 3, "mimeType": "image/png"}],
-    }  # fmt: skip
-    return document, b"".join(block + b"\0" * (-len(block) % 4) for block in blocks)
+def _gltf(**image) -> GltfBuilder:
+    """A textured mesh with moved corners under a node that stretches it; the image is embedded or a file."""
+    builder = GltfBuilder()
+    color = {"index": builder.texture(**image, wrapS=10497)}
+    material = builder.material(pbrMetallicRoughness={"baseColorTexture": color, "roughnessFactor": 0.5})
+    square = builder.primitive(CORNERS, FACES.ravel(), material=material, TEXCOORD_0=numbers(len(CORNERS), 2))
+    rows, values = builder.view(np.array([0, 3], np.uint16).tobytes()), builder.view(CORNERS[:2].tobytes())
+    sparse = {"count": 2, "indices": {"bufferView": rows, "componentType": 5123}, "values": {"bufferView": values}}
+    builder.document["accessors"][0]["sparse"] = sparse
+    child = builder.mesh(square, root=False, translation=[1, 0, 0])
+    builder.node(children=[child], rotation=[0, 0, 0, 1], scale=[1, 2, 1])
+    return builder
 
 
 def gltfs() -> list[Files]:
     """A glTF document with a buffer and a texture beside it."""
-    document, binary = _gltf("data.bin", True)
-    return [{"cloud.gltf": json.dumps(document).encode(), "data.bin": binary, "a.png": png()}]
+    return [_gltf(uri="a.png").files("cloud.gltf") | {"a.png": png()}]
 
 
 def glbs() -> list[Files]:
     """A GLB file with all inside."""
-    document, binary = _gltf(None, False)
-    text = json.dumps(document).encode()
-    text += b" " * (-len(text) % 4)
-    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
-    return [{"cloud.glb": struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks}]
+    return [{"cloud.glb": _gltf(texels=255 * numbers(4, 4, 4)).glb()}]

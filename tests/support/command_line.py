@@ -23,8 +23,13 @@ def unchecked_cli() -> ModuleType:
 
 def spnr_data(*arguments: object) -> int:
     """The exit code of `spnr-data` in this process."""
+    return exit_code(data_gen.__main__, *arguments)
+
+
+def exit_code(program: ModuleType, *arguments: object) -> int:
+    """The exit code of a program's main in this process."""
     with pytest.raises(SystemExit) as stopped:
-        data_gen.__main__.main([str(argument) for argument in arguments])
+        program.main([str(argument) for argument in arguments])
     return stopped.value.code
 
 

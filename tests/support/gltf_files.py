@@ -87,13 +87,15 @@ class GltfBuilder:
 
     def write(self, path):
         """Write a .glb, or a .gltf with its buffer beside it in data.bin; the path."""
-        if path.suffix == ".glb":
-            path.write_bytes(self.glb())
-        else:
-            self.document["buffers"] = [{"byteLength": len(self.binary), "uri": "data.bin"}]
-            (path.parent / "data.bin").write_bytes(self.binary)
-            path.write_text(json.dumps(self.document))
+        files = {path.name: self.glb()} if path.suffix == ".glb" else self.files(path.name)
+        for name, content in files.items():
+            (path.parent / name).write_bytes(content)
         return path
+
+    def files(self, name: str, *more_buffers: dict) -> dict[str, bytes]:
+        """The document under a name, and its buffer beside it; further buffers are described alone."""
+        self.document["buffers"] = [{"byteLength": len(self.binary), "uri": "data.bin"}, *more_buffers]
+        return {name: json.dumps(self.document).encode(), "data.bin": self.binary}
 
 
 def parts_of(content: bytes) -> tuple[dict, bytes]:
@@ -103,9 +105,7 @@ def parts_of(content: bytes) -> tuple[dict, bytes]:
     return json.loads(content[20 : 20 + size]), content[20 + size + 8 :]
 
 
-UV = np.array([[0, 1], [1, 1], [1, 0], [0, 0]], np.float32)
-
-
+UV = np.array([[0, 1], [1, 1], [1, 0], [0, 0]], np.float32)  # upright: v runs down the picture
 CHECKER = np.random.default_rng(0).integers(0, 256, (4, 6, 3))
 
 

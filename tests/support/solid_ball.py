@@ -4,8 +4,8 @@ import numpy as np
 
 from spnr_jax.formats.clouds import PlacedCloud
 from spnr_jax.formats.up_axis import ROTATIONS
-from spnr_jax.kernels.records import PointCloud
 from spnr_jax.tools.grids import Grid
+from support.surfel_clouds import cloud
 
 RADIUS, CENTRE = 2.0, np.array([5.0, -3.0, 1.0])
 
@@ -26,11 +26,6 @@ def ball_cloud(up="y", origin=(0, 0, 0)) -> PlacedCloud:
     in_file = CENTRE + RADIUS * directions / np.linalg.norm(directions, axis=1, keepdims=True)
     right = in_file[:, 0] > CENTRE[0]
     rotation = np.array(ROTATIONS[up], float)
-    cloud = PointCloud(
-        positions=np.float32(in_file @ rotation.T),
-        base_color=np.where(right[:, None], np.float32([1, 0, 0]), np.float32([0, 0, 1])),
-        roughness=np.where(right, np.float32(1), np.float32(0.25)),
-        metallic=np.where(right, np.float32(0), np.float32(1)),
-        mask=np.ones(600, bool),
-    )
-    return PlacedCloud(cloud=cloud, up=up, rotation=rotation, origin=np.array(origin, float))
+    color = np.where(right[:, None], [1, 0, 0], [0, 0, 1])
+    points = cloud(in_file @ rotation.T, base_color=color, roughness=np.where(right, 1, 0.25), metallic=~right)
+    return PlacedCloud(cloud=points, up=up, rotation=rotation, origin=np.array(origin, float))

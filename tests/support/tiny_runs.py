@@ -39,3 +39,17 @@ def check_conditions(out):
     assert {"hardware", "seeds", "preset", "metrics", "data"} <= results.keys()
     for name in ("gallery.png", "differences.png"):
         assert (out / name).read_bytes().startswith(b"\x89PNG")
+
+
+def goes_on(main, options):
+    """Called again, a study measures nothing again: the scores that it keeps stay as they are."""
+    kept = [path for path in (options.out / "scores").rglob("*.json") if path.name != "asked.json"]
+    assert kept
+    before = [path.stat().st_mtime_ns for path in kept]
+    main(options)
+    assert [path.stat().st_mtime_ns for path in kept] == before
+
+
+def forbidden(*_, **__):
+    """Stands for what a finished experiment does not do again."""
+    raise AssertionError("something was made again")

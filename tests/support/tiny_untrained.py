@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 
+from spnr_jax.scoring import evaluation
 from spnr_jax.training import checkpoint, optimisation
 from support import tiny_dataset
 
@@ -18,3 +19,9 @@ def run():
     checkpoint.write_config(folder, CONFIG)
     checkpoint.save(folder, optimisation.jitted_create_state(CONFIG))
     return folder
+
+
+@functools.cache
+def evaluated() -> evaluation.Evaluation:
+    """Its scores on the test split."""
+    return evaluation.evaluate(run(), tiny_dataset.dataset(), say=lambda line: None)

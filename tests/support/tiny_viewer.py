@@ -13,7 +13,7 @@ from spnr_jax.viewer import session
 from spnr_jax.viewer.scene import Scene, open_scene
 from spnr_jax.viewer.session import State
 from spnr_jax.viewer.viewpoint import OPENCV, View, from_browser, to_browser
-from support import tiny_model
+from support import surfel_clouds, tiny_model
 
 RED, BLUE = (0.8, 0.05, 0.05), (0.05, 0.05, 0.8)
 
@@ -30,13 +30,8 @@ def model() -> Model:
 def cloud() -> PointCloud:
     """Red points in the half with x < 5, blue ones beyond, in units far from the box's."""
     x, y, z = np.random.default_rng(0).uniform(0, 10, (3, 200)).astype(np.float32)
-    return PointCloud(
-        positions=np.stack([x, y, z], axis=1),
-        base_color=np.where(x[:, None] < 5, np.float32(RED), np.float32(BLUE)),
-        roughness=np.full(200, 0.5, np.float32),
-        metallic=np.zeros(200, np.float32),
-        mask=np.ones(200, bool),
-    )
+    color = np.where(x[:, None] < 5, np.float32(RED), np.float32(BLUE))
+    return surfel_clouds.cloud(np.stack([x, y, z], axis=1), base_color=color)
 
 
 @functools.cache
@@ -68,3 +63,11 @@ def drawn(moving=False, **changes):
 
 def canvas(**changes):
     return drawn(**changes).image
+
+
+def viewer(host="127.0.0.1", port=0):
+    """A viewer that waits for browsers; whoever opens it stops it."""
+    from spnr_jax.viewer.gui import Reading
+    from spnr_jax.viewer.server import Viewer
+
+    return Viewer(model(), state(view=None), Reading(num_points=100, up="y", clean="auto"), host, port)

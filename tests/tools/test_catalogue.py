@@ -9,7 +9,7 @@ from urllib.parse import unquote
 
 import numpy as np
 import pytest
-from support import tiny_dataset
+from support import tiny_untrained
 from support.schedulers import in_this_process
 
 from spnr_jax.tools import catalogue, catalogue_files, catalogue_page, pictures
@@ -26,7 +26,7 @@ def write_cloud(path, seed):
 
 
 def command(cloud, out, **options):
-    return Render(cloud=cloud, out=out, **{"run": tiny_dataset.run()} | OPTIONS | options)
+    return Render(cloud=cloud, out=out, **{"run": tiny_untrained.run()} | OPTIONS | options)
 
 
 def render(cloud, out, **options):

@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
-from support import tiny_dataset
+from support import tiny_untrained
+from support.surfel_clouds import cloud
 
 import spnr_jax
-from spnr_jax.kernels.records import PointCloud, Rendering
+from spnr_jax.kernels.records import Rendering
 from spnr_jax.tools import depth_maps
 
 UNIT = 10.0  # half diagonal of the cloud, in its own units
@@ -15,15 +16,8 @@ UNIT = 10.0  # half diagonal of the cloud, in its own units
 def scene():
     """Volume and camera of a cube of points that is large and far from 0."""
     corners = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3), axis=-1).reshape(-1, 3) * UNIT / np.sqrt(3)
-    cloud = PointCloud(
-        positions=np.float32(corners + [50, 0, -20]),
-        base_color=np.full((8, 3), 0.5, np.float32),
-        roughness=np.full(8, 0.5, np.float32),
-        metallic=np.zeros(8, np.float32),
-        mask=np.ones(8, bool),
-    )
-    model = spnr_jax.load(tiny_dataset.run())
-    volume = model.encode(cloud)
+    model = spnr_jax.load(tiny_untrained.run())
+    volume = model.encode(cloud(corners + [50, 0, -20]))
     return volume, model.camera(volume, 0.0, 0.0, 24)
 
 

@@ -1,6 +1,7 @@
 """What pictures with known depth say is solid: a ball, a plate thinner than the band, what no picture sees."""
 
 import dataclasses
+import functools
 import io
 
 import jax
@@ -39,6 +40,7 @@ def plate(origin, direction):
     return np.where(enter < leave, enter, np.nan)
 
 
+@functools.cache
 def views(shape, elevations=(-75, -40, -10, 10, 40, 75)):
     """Pictures of it from all around."""
     found = []

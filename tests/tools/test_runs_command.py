@@ -6,6 +6,7 @@ import subprocess
 import numpy as np
 import pytest
 from support import tiny_dataset
+from support.stopped_runs import without_network
 from support.tiny_runs import L1_ONLY
 
 from spnr_jax import cli
@@ -22,6 +23,7 @@ def folder(tmp_path_factory):
     """A run that was stopped after two steps and went on, beside one without a preview and what is no run."""
     folder, dataset = tmp_path_factory.mktemp("runs"), tiny_dataset.dataset()
     with pytest.MonkeyPatch.context() as patch:
+        without_network(patch)
         wanted = trainer.preview
 
         def stopping(*arguments):

@@ -1,9 +1,5 @@
 """`spnr export --splats`, `--mesh` and `spnr share`: what they write, and what they refuse in one line."""
 
-import signal
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 from support import command_line, splat_balls, tiny_surfels
@@ -38,9 +34,7 @@ def made_by(*arguments):
     network = str(tiny_surfels.run())
     name = "--network" if arguments[0] == "export" else "--run"
     options = (name, network, "--seconds", "0", "--fitting-views", "6", "--up", "y")
-    with pytest.raises(SystemExit) as ended:
-        cli.main([*map(str, arguments), *options])
-    return ended.value.code
+    return command_line.exit_code(cli, *arguments, *options)
 
 
 def test_splats_of_a_file_lie_around_its_points_in_its_units(cloud, tmp_path, capsys):
@@ -62,10 +56,9 @@ def test_the_mesh_of_a_file_lies_around_its_points_in_its_units(tmp_path, monkey
     monkeypatch.setattr(mesh_making.mesh_of_volume, "__defaults__", (40,))
     cloud, out = tmp_path / "ball.xyz", tmp_path / "new" / "ball.glb"
     np.savetxt(cloud, 3 * spiral(1000) + [5, 0, 0])
-    with pytest.raises(SystemExit) as ended:
-        cli.main(["export", str(cloud), "--mesh", str(out), "--up", "y"])
+    code = command_line.exit_code(cli, "export", cloud, "--mesh", out, "--up", "y")
     said = capsys.readouterr()
-    assert ended.value.code == 0, said.err
+    assert code == 0, said.err
     assert f"wrote {out} (" in said.out
     assert "watertight" in said.out
     points = read_cloud(cloud).positions
@@ -110,25 +103,11 @@ def test_a_page_holds_title_credit_and_splats(cloud, tmp_path, capsys):
 )
 def test_what_makes_no_sense_is_one_line_and_code_2(cloud, tmp_path, monkeypatch, capsys, arguments, words):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(SystemExit) as ended:
-        cli.main([str(cloud) if argument == "CLOUD" else argument for argument in arguments])
-    assert ended.value.code == 2
+    assert command_line.exit_code(cli, *(cloud if argument == "CLOUD" else argument for argument in arguments)) == 2
     said = capsys.readouterr().err
     assert words in said
     assert said.count("\n") == 1
     assert sorted(path.name for path in tmp_path.iterdir()) == ["ball.ply"]
-
-
-@pytest.mark.parametrize(("command", "option", "name"), [("export", "--splats", "a.ply"), ("share", "--out", "a.html")])
-def test_a_folder_in_the_place_of_the_file_is_refused_before_the_work(cloud, tmp_path, capsys, command, option, name):
-    (tmp_path / name).mkdir()
-    tiny_surfels.run()  # whichever test comes first trains it, and says so
-    capsys.readouterr()
-    assert made_by(command, cloud, option, tmp_path / name) == 2
-    said = capsys.readouterr().err
-    assert name in said
-    assert said.count("\n") == 1
-    assert not list((tmp_path / name).iterdir())
 
 
 def test_a_place_where_nothing_can_be_written_is_refused(tmp_path, monkeypatch):
@@ -164,22 +143,6 @@ def test_ctrl_c_while_a_file_is_written_leaves_what_was_there(cloud, tmp_path, m
     assert out.read_bytes() == b"before"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["ball.ply", "out.spz"]
     assert "Traceback" not in capsys.readouterr().err
-
-
-KILLED = """
-import os, pathlib, signal, sys
-from spnr_jax.formats import images
-images.os.replace = lambda *_: os.kill(os.getpid(), signal.SIGKILL)
-images.write_whole(pathlib.Path(sys.argv[1]), b"half of it")
-"""
-
-
-def test_a_process_that_is_killed_while_it_writes_leaves_no_half_file(tmp_path):
-    out = tmp_path / "page.html"
-    out.write_bytes(b"before")
-    ended = subprocess.run([sys.executable, "-c", KILLED, str(out)], check=False)
-    assert ended.returncode == -signal.SIGKILL
-    assert out.read_bytes() == b"before"
 
 
 def test_a_page_that_is_too_large_is_refused(monkeypatch):

@@ -35,11 +35,8 @@ def test_steps_and_seeds_give_different_points_and_views():
         batching.make_batch(objects, dataclasses.replace(CONFIG, seed=1), 0),
     ):
         assert not np.array_equal(batch.cloud.positions, other.cloud.positions)
-
-
-def test_places_in_a_batch_draw_independently():
-    batch = batching.make_batch([one_object(), one_object()], CONFIG, 0)
-    assert not np.array_equal(batch.cloud.positions[0], batch.cloud.positions[1])
+    two = batching.make_batch([one_object(), one_object()], CONFIG, 0)
+    assert not np.array_equal(*two.cloud.positions), "places in a batch draw independently"
 
 
 @pytest.mark.parametrize("batch_objects", [1, 2, 3, 7])
@@ -63,23 +60,18 @@ def test_points_are_a_subset_without_repetition_and_padding_is_masked():
     assert not any(np.any(column[9:]) for column in jax.tree.leaves(chosen))
 
 
-def test_normals_are_read_and_stay_with_their_points_and_a_cloud_may_lack_them():
+def test_normals_and_materials_stay_with_their_points_and_a_cloud_may_lack_normals():
     item = one_object()
+    roughness = {tuple(p): r for p, r in zip(item.cloud.positions, item.cloud.roughness, strict=True)}
     np.testing.assert_allclose(item.cloud.normals, item.cloud.positions / tiny_dataset.RADIUS, atol=1e-6)
     chosen = batching.choose_points(item.cloud, 9, 16, np.random.default_rng(1))
     np.testing.assert_allclose(chosen.normals, chosen.positions / tiny_dataset.RADIUS, atol=1e-6)
+    assert [roughness[tuple(p)] for p in chosen.positions[:9]] == chosen.roughness[:9].tolist()
     np.testing.assert_array_equal(data_sets.first_points(item, 5).normals, item.cloud.normals[:5])
     without = dataclasses.replace(item, cloud=item.cloud.replace(normals=None))
     assert batching.choose_points(without.cloud, 9, 16, np.random.default_rng(1)).normals is None
     assert data_sets.first_points(without, 5).normals is None
     assert item.num_bytes - without.num_bytes == item.cloud.normals.nbytes
-
-
-def test_materials_stay_with_their_points():
-    cloud = one_object().cloud
-    chosen = batching.choose_points(cloud, 12, 12, np.random.default_rng(3))
-    roughness = {tuple(p): r for p, r in zip(cloud.positions, cloud.roughness, strict=True)}
-    assert [roughness[tuple(p)] for p in chosen.positions] == chosen.roughness.tolist()
 
 
 @pytest.mark.parametrize("share", [0.0, 0.5, 1.0])

@@ -7,8 +7,8 @@ import shutil
 
 import jax
 import pytest
-from support import tiny_dataset
 from support.laws import same_bits
+from support.tiny_baselines import SHRUNKEN
 from support.tiny_dataset import CONFIG
 
 from spnr_jax import presets
@@ -40,19 +40,33 @@ def halved(path):
 DAMAGES = {"emptied": emptied, "overwritten": overwritten, "halved": halved, "deleted": lambda path: path.unlink()}
 
 
+def saved(folder, *steps):
+    """A run folder with checkpoints of untrained weights at these steps."""
+    state = optimisation.jitted_create_state(CONFIG)
+    checkpoint.write_config(folder, CONFIG)
+    for step in steps:
+        checkpoint.save(folder, dataclasses.replace(state, step=jax.numpy.full_like(state.step, step)))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def whole_run(tmp_path_factory):
+    return saved(tmp_path_factory.mktemp("run"), 2, 4, 6)
+
+
 @pytest.fixture
-def run(tmp_path):
-    return shutil.copytree(tiny_dataset.run(), tmp_path / "run")
+def run(whole_run, tmp_path):
+    return shutil.copytree(whole_run, tmp_path / "run")
 
 
 def test_a_state_comes_back_bit_by_bit(tmp_path):
-    state = optimisation.create_state(CONFIG)
+    state = optimisation.jitted_create_state(CONFIG)
     checkpoint.save(tmp_path, state)
     same_bits(checkpoint.restore(tmp_path, CONFIG), state)
 
 
 def test_a_state_without_statistics_comes_back_too(tmp_path):
-    tiny = presets.PRESETS["npbg_tiny"]()
+    tiny = SHRUNKEN["npbg_tiny"]
     state = optimisation.jitted_create_state(tiny)
     checkpoint.write_config(tmp_path, tiny)
     checkpoint.save(tmp_path, state)
@@ -125,15 +139,8 @@ def test_reading_leaves_what_a_running_training_is_writing(run):
 
 
 def test_the_newest_three_checkpoints_stay(tmp_path):
-    state = optimisation.create_state(CONFIG)
-    for step in range(1, 6):
-        checkpoint.save(tmp_path, dataclasses.replace(state, step=jax.numpy.full_like(state.step, step)))
+    saved(tmp_path, *range(1, 6))
     assert {path.name for path in (tmp_path / "checkpoints").iterdir() if path.is_dir()} == {"3", "4", "5"}
-
-
-def test_a_config_comes_back_from_the_run_folder(tmp_path):
-    checkpoint.write_config(tmp_path / "run", presets.small())
-    assert checkpoint.read_config(tmp_path / "run") == presets.small()
 
 
 def test_a_run_of_another_preset_is_refused_with_the_fields_that_differ(run):
@@ -148,6 +155,7 @@ def test_a_run_of_another_preset_is_refused_with_the_fields_that_differ(run):
 
 def test_a_run_that_never_got_to_a_checkpoint_may_begin_again_with_another_config(tmp_path):
     checkpoint.write_config(tmp_path, presets.small())
+    assert checkpoint.read_config(tmp_path) == presets.small()
     checkpoint.write_config(tmp_path, CONFIG)
     assert checkpoint.read_config(tmp_path) == CONFIG
 

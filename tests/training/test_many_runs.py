@@ -64,7 +64,7 @@ def test_what_is_computed_run_by_run_is_what_vmap_alone_computes(axes):
 def test_runs_of_the_surfel_network_in_one_step_are_the_loop_over_them():
     config = tiny_surfels.CONFIG
     crops = [random_crops(config, 1, seed) for seed in (0, 1)]
-    states = [optimisation.create_state(config, jnp.uint32(seed)) for seed in (3, 4)]
+    states = [optimisation.jitted_create_state(config, jnp.uint32(seed)) for seed in (3, 4)]
     step = partial(shading.train_step, config=config)
     axes = many_runs.AXES
     mapped = jax.jit(jax.vmap(step, in_axes=(axes, 0), out_axes=(axes, 0)))

@@ -34,13 +34,6 @@ def fresh_l1():
     return create(L1_ONLY)
 
 
-def through_host(state):
-    """The state as it would come back from a file: NumPy arrays, the key as its data."""
-    data = jax.tree.map(np.asarray, dataclasses.replace(state, key=jax.random.key_data(state.key)))
-    restored = jax.tree.map(jnp.asarray, data)
-    return dataclasses.replace(restored, key=jax.random.wrap_key_data(restored.key))
-
-
 class TestState:
     def test_equal_seeds_give_equal_bits_and_other_seeds_other_weights(self, fresh, fresh_l1):
         same_bits(create(CONFIG), fresh)
@@ -154,16 +147,8 @@ class TestStep:
             moved = [(a != b).any() for a, b in zip(jax.tree.leaves(before), jax.tree.leaves(after), strict=True)]
             assert np.mean(moved) > 0.5
         assert all(np.isfinite(value) for value in metrics.values())
-
-    def test_metrics_are_those_of_the_rendering(self, fresh_l1):
-        _, metrics = step(fresh_l1, L1_ONLY)
-        assert set(metrics) == {"psnr", "l1", "loss", "gradient_norm"}
-        assert metrics["loss"] > 100 * metrics["l1"], "the low-resolution part comes on top"
-
-    def test_running_statistics_are_those_of_the_forward(self, fresh_l1):
-        state, _ = step(fresh_l1, L1_ONLY)
         stats = state.batch_stats["encoder"]["pointnet"]["norm_0"]
-        assert (stats["mean"] != 0).all()
+        assert (stats["mean"] != 0).all(), "running statistics are those of the forward"
         assert (stats["variance"] != 1).all()
 
 
@@ -181,11 +166,8 @@ class TestAverage:
             )
             close((after.averaged, after.averaged_stats), expected, atol=1e-7)
             state = after
-
-    def test_evaluation_uses_it(self, fresh_l1):
-        state, _ = run(fresh_l1, 3, L1_ONLY)
-        variables = optimisation.averaged_variables(state)
-        same_bits(variables, {"params": state.averaged, "batch_stats": state.averaged_stats})
+        evaluated = {"params": state.averaged, "batch_stats": state.averaged_stats}
+        same_bits(optimisation.averaged_variables(state), evaluated)
 
 
 class TestPixelError:
@@ -244,15 +226,6 @@ def test_rays_through_all_the_box_are_shown_in_blocks_and_those_near_points_in_t
 
 
 class TestReproducibility:
-    def test_two_runs_from_one_seed_are_equal_bit_by_bit(self, fresh):
-        same_bits(run(fresh, 3), run(create(CONFIG), 3))
-
-    def test_a_run_that_stops_and_resumes_is_the_run_that_did_not(self, fresh):
-        whole, _ = run(fresh, 4)
-        half, _ = run(fresh, 2)
-        resumed, _ = run(through_host(half), 2)
-        same_bits(resumed, whole)
-
     def test_every_step_draws_new_samples(self, fresh_l1):
         """The same weights and batch, one step later: another jitter, another loss."""
         (_, first), (_, later) = (step(dataclasses.replace(fresh_l1, step=jnp.int32(s)), L1_ONLY) for s in (0, 1))

@@ -1,7 +1,6 @@
 """The refiner's training: what is kept, what a step sees, what it learns, and that nothing before it moves."""
 
 import dataclasses
-import signal
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +8,7 @@ import numpy as np
 import pytest
 from support import tiny_dataset
 from support.laws import close, same_bits
+from support.stopped_runs import interrupted
 from support.tiny_model import PLUS
 
 from spnr_jax import presets
@@ -41,7 +41,8 @@ NETWORK = np.zeros(32, np.uint8)
 
 @pytest.fixture(scope="module")
 def trained():
-    return Trained(config=PLAIN, variables=optimisation.averaged_variables(optimisation.create_state(PLAIN)), steps=0)
+    variables = optimisation.averaged_variables(optimisation.jitted_create_state(PLAIN))
+    return Trained(config=PLAIN, variables=variables, steps=0)
 
 
 @pytest.fixture(scope="module")
@@ -66,8 +67,8 @@ def majorities(count=6, size=24):
 def state_for(config, pictures):
     """A state of a refiner alone, for pictures of other features than a network's."""
     module = refiner_training.Refiner(config.model.refiner_width)
-    refiner = module.init(jax.random.key(0), jnp.asarray(pictures[0][0], jnp.float32)[None])["params"]
-    state = optimisation.create_state(config)
+    refiner = jax.jit(module.init)(jax.random.key(0), jnp.asarray(pictures[0][0], jnp.float32)[None])["params"]
+    state = optimisation.jitted_create_state(CONFIG)
     algorithm, _ = optimisation.optimizers(config)
     state = dataclasses.replace(
         state,
@@ -88,22 +89,14 @@ def test_the_network_before_the_refiner_stays_bit_for_bit_and_the_refiner_moves(
     assert moved.max() > 0
     assert np.abs(state.generator["refiner"]["out"]["kernel"]).max() > 0, "it began with zeros"
     assert jax.tree.map(np.shape, state.generator) == jax.tree.map(
-        np.shape, optimisation.create_state(CONFIG).generator
+        np.shape, optimisation.jitted_create_state(CONFIG).generator
     )
 
 
 def test_a_stopped_run_goes_on_to_the_same_bits(trained, finished, tmp_path, monkeypatch):
-    real = refiner_training.batches
-
-    def batches(views, config, first):
-        for i, batch in enumerate(real(views, config, first), start=first):
-            if i == 1:
-                signal.raise_signal(signal.SIGTERM)
-            yield batch
-
     arguments = CONFIG, tiny_dataset.dataset(), tmp_path, tiny_dataset.SCHEDULE
     with monkeypatch.context() as patch:
-        patch.setattr(refiner_training, "batches", batches)
+        interrupted(patch, refiner_training, 2)
         with pytest.raises(KeyboardInterrupt, match="stopped at step 2 of 4"):
             trainer.train(*arguments, init=trained)
     times = {path: path.stat().st_mtime_ns for path in (tmp_path / "pictures").iterdir()}
@@ -136,11 +129,10 @@ def test_kept_is_what_the_network_shows_and_its_references(trained):
     item = data_sets.read_object(tiny_dataset.dataset(), tiny_dataset.dataset().splits["train"][0])
     kept = refiner_training.drawn(trained.variables, CONFIG, item)
     assert len(kept["seen"]) == len(item.images)
-    plain = inference.network(PLAIN.model)
     assert len(item.cloud.mask) < min(refiner_training.COUNTS), "all points of this object are kept"
     cloud = cloud_arrays.pad(item.cloud, cloud_arrays.bucket(len(item.cloud.mask)))
     cloud, camera = jax.tree.map(lambda x: jnp.asarray(x)[None], (cloud, item.camera))
-    shown = plain.bind(trained.variables)(cloud, camera)
+    shown = jax.jit(inference.network(PLAIN.model).apply)(trained.variables, cloud, camera)
     same_bits(kept["reference"], item.images)
     assert kept["seen"].dtype == np.float16
     for seen, image, acc in zip(kept["seen"], shown.image[0], shown.acc[0], strict=True):

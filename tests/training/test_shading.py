@@ -1,13 +1,13 @@
 """Training of the shader network: a step learns, a stopped run goes on to the same bits, its file is a network."""
 
 import dataclasses
-import signal
 
 import jax
 import numpy as np
 import pytest
 from support import tiny_dataset, tiny_surfels
 from support.laws import close, same_bits
+from support.stopped_runs import interrupted, rows_without_time
 from support.tiny_surfels import CONFIG, LIGHT, SCHEDULE
 
 import spnr_jax
@@ -15,51 +15,43 @@ from spnr_jax.model_config import SurfelConfig
 from spnr_jax.surfels import lighting
 from spnr_jax.training import checkpoint, gbuffers, metrics_log, optimisation, shading, trainer, work
 
-
-def rows_without_time(run):
-    return [{k: v for k, v in row.items() if k != "ms_per_step"} for row in metrics_log.read_rows(run)]
+loss = jax.jit(shading.loss, static_argnames="config")
 
 
-def interrupted(monkeypatch, step):
-    real = gbuffers.batches
-
-    def batches(views, config, first):
-        for i, batch in enumerate(real(views, config, first), start=first):
-            if i + 1 == step:
-                signal.raise_signal(signal.SIGTERM)
-            yield batch
-
-    monkeypatch.setattr(gbuffers, "batches", batches)
+@pytest.fixture(scope="module")
+def crops():
+    return next(iter(gbuffers.batches(tiny_surfels.views(), CONFIG, 0)))
 
 
-def test_a_clear_pixel_costs_nothing_whatever_colour_lies_under_it():
-    state = optimisation.create_state(CONFIG)
-    crops = next(iter(gbuffers.batches(tiny_surfels.views(), CONFIG, 0)))
+@pytest.fixture(scope="module")
+def params():
+    return optimisation.jitted_create_state(CONFIG).generator
+
+
+def test_a_clear_pixel_costs_nothing_whatever_colour_lies_under_it(crops, params):
     maps = np.array(crops.maps)
     maps[..., 4] = 0  # opacity
     clear = dataclasses.replace(crops, maps=maps, target=np.zeros_like(crops.target))
-    assert float(shading.loss(state.averaged, clear, config=CONFIG)[0]) < 1e-6
+    assert float(loss(params, clear, config=CONFIG)[0]) < 1e-6
 
 
-def test_steps_lower_the_loss_on_one_object():
+def test_steps_lower_the_loss_on_one_object(crops):
     config = dataclasses.replace(CONFIG, num_steps=100)
-    state, losses = optimisation.create_state(config), []
-    crops = next(iter(gbuffers.batches(tiny_surfels.views(), config, 0)))
+    state, losses = optimisation.jitted_create_state(config), []
     for _ in range(90):
         state, metrics = shading.jitted_train_step(state, crops, config=config)
         losses.append(float(metrics["loss"]))
     assert losses[-1] < 0.6 * losses[0]
-    assert float(shading.loss(state.averaged, crops, config=config)[0]) < losses[0]
+    assert float(loss(state.averaged, crops, config=config)[0]) < losses[0]
 
 
-def test_the_loss_is_the_sum_of_its_weighted_errors():
-    crops = next(iter(gbuffers.batches(tiny_surfels.views(), CONFIG, 0)))
-    params, terms = optimisation.create_state(CONFIG).generator, {}
-    value, metrics = shading.loss(params, crops, config=CONFIG)
+def test_the_loss_is_the_sum_of_its_weighted_errors(crops, params):
+    value, metrics = loss(params, crops, config=CONFIG)
+    terms = {}
     names = "l1_weight", "mse_weight", "opacity_weight", "opacity_l1_weight"
     for name in names:
         weights = dataclasses.replace(CONFIG.loss, **(dict.fromkeys(names, 0.0) | {name: 1.0}))
-        terms[name] = float(shading.loss(params, crops, config=dataclasses.replace(CONFIG, loss=weights))[0])
+        terms[name] = float(loss(params, crops, config=dataclasses.replace(CONFIG, loss=weights))[0])
     assert min(terms.values()) > 0
     assert float(value) == pytest.approx(sum(getattr(CONFIG.loss, name) * terms[name] for name in names), rel=1e-5)
     assert terms["l1_weight"] == pytest.approx(float(metrics["l1"]))
@@ -68,7 +60,7 @@ def test_the_loss_is_the_sum_of_its_weighted_errors():
 
 def test_a_stopped_run_goes_on_to_the_same_bits_and_rows(monkeypatch, tmp_path):
     with monkeypatch.context() as patch:
-        interrupted(patch, 3)
+        interrupted(patch, gbuffers, 3)
         with pytest.raises(KeyboardInterrupt, match="stopped at step 3 of 4"):
             trainer.train(CONFIG, tiny_surfels.dataset(), tmp_path, SCHEDULE, light=LIGHT)
     assert not (tmp_path / "weights.npz").exists()
@@ -84,18 +76,6 @@ def test_the_run_and_the_file_that_it_ends_with_are_one_network():
     assert of_run.config == of_file.config == CONFIG.model
     close(of_file.variables, jax.tree.map(np.asarray, of_run.variables), rtol=1e-3, atol=1e-4)
     assert "val_psnr" in metrics_log.read_rows(tiny_surfels.run())[-1]
-
-
-def test_a_loss_that_is_not_finite_stops_the_run_and_names_the_step(monkeypatch, tmp_path):
-    real = gbuffers.make_batch
-
-    def poisoned(views, config, step):
-        crops = real(views, config, step)
-        return dataclasses.replace(crops, maps=crops.maps * np.float32(np.nan)) if step == 1 else crops
-
-    monkeypatch.setattr(gbuffers, "make_batch", poisoned)
-    with pytest.raises(trainer.NotFinite, match=r"is nan at step 2; the last checkpoint is kept"):
-        trainer.train(CONFIG, tiny_surfels.dataset(), tmp_path, SCHEDULE, light=LIGHT)
 
 
 def test_a_gradient_longer_than_the_configs_norm_counts_as_one_of_that_norm():

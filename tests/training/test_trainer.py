@@ -2,7 +2,6 @@
 
 import dataclasses
 import errno
-import json
 import os
 import re
 import shutil
@@ -12,8 +11,9 @@ from functools import partial
 import jax
 import numpy as np
 import pytest
-from support import tiny_dataset, tiny_model
+from support import tiny_dataset, tiny_model, tiny_untrained
 from support.laws import close, same_bits
+from support.stopped_runs import interrupted, rows_without_time
 from support.tiny_dataset import CONFIG, SCHEDULE
 
 import spnr_jax
@@ -27,36 +27,15 @@ from spnr_jax.training import batching, checkpoint, metrics_log, optimisation, r
 KEPT_STEPS = {"2", "4", "6"}
 
 
-def interrupted(monkeypatch, step, number=signal.SIGTERM):
-    """Makes the signal arrive while the batch after `step` steps is fetched."""
-    real = batching.batches
-
-    def batches(dataset, config, first, **options):
-        for i, batch in enumerate(real(dataset, config, first, **options), start=first):
-            if i + 1 == step:
-                signal.raise_signal(number)
-            yield batch
-
-    monkeypatch.setattr(batching, "batches", batches)
-
-
-def stopped_run(monkeypatch, run, step):
-    with monkeypatch.context() as patch:
-        interrupted(patch, step)
-        with pytest.raises(KeyboardInterrupt, match=f"stopped at step {step} of 6"):
-            trainer.train(CONFIG, tiny_dataset.dataset(), run, SCHEDULE)
-
-
-def rows_without_time(run):
-    return [{k: v for k, v in row.items() if k != "ms_per_step"} for row in metrics_log.read_rows(run)]
-
-
 def restored(run):
     return checkpoint.restore(run, CONFIG)
 
 
 def test_a_stopped_run_goes_on_to_the_same_bits_and_rows(monkeypatch, tmp_path):
-    stopped_run(monkeypatch, tmp_path, 3)
+    with monkeypatch.context() as patch:
+        interrupted(patch, batching, 3)
+        with pytest.raises(KeyboardInterrupt, match="stopped at step 3 of 6"):
+            trainer.train(CONFIG, tiny_dataset.dataset(), tmp_path, SCHEDULE)
     assert int(restored(tmp_path).step) == 3
     trainer.train(CONFIG, tiny_dataset.dataset(), tmp_path, SCHEDULE)
     same_bits(restored(tmp_path), restored(tiny_dataset.run()))
@@ -65,8 +44,9 @@ def test_a_stopped_run_goes_on_to_the_same_bits_and_rows(monkeypatch, tmp_path):
 
 class TestBeginningWithOtherWeights:
     def test_the_first_step_starts_from_them_and_the_record_names_them(self, tmp_path):
-        slow = dataclasses.replace(CONFIG.optimizer, lr_generator=1e-12, warmup_steps=0)
-        config = dataclasses.replace(CONFIG, optimizer=slow, seed=CONFIG.seed + 1)
+        plain = tiny_untrained.CONFIG  # without a discriminator, which is not begun with
+        slow = dataclasses.replace(plain.optimizer, lr_generator=1e-12, warmup_steps=0)
+        config = dataclasses.replace(plain, optimizer=slow, seed=plain.seed + 1)
         init = weights.read_trained(tiny_dataset.run())
         state = trainer.train(config, tiny_dataset.dataset(), tmp_path, SCHEDULE, init=init)
         close(state.generator, init.variables["params"], atol=1e-9)
@@ -120,9 +100,10 @@ def test_a_finished_run_is_left_alone():
 
 
 def test_previews_and_rows_come_when_the_schedule_says():
-    run = tiny_dataset.run()
-    assert [row["step"] for row in metrics_log.read_rows(run) if "loss" in row] == [1, 2, 3, 4, 5, 6]
-    assert [row["step"] for row in metrics_log.read_rows(run) if "val_psnr" in row] == [3, 6]
+    run, rows = tiny_dataset.run(), metrics_log.read_rows(tiny_dataset.run())
+    assert [row["step"] for row in rows if "loss" in row] == [1, 2, 3, 4, 5, 6]
+    assert [row["step"] for row in rows if "val_psnr" in row] == [3, 6]
+    assert all(np.isfinite(value) for row in rows for value in row.values())
     assert {path.name for path in (run / "previews").iterdir()} == {"0000003.png", "0000006.png"}
     assert {path.name for path in (run / "checkpoints").iterdir() if path.is_dir()} == KEPT_STEPS
 
@@ -180,26 +161,12 @@ def test_a_full_disk_is_one_line_and_exit_code_2(monkeypatch, tmp_path, capsys):
 
 
 def test_ctrl_c_is_exit_code_130_and_says_how_to_go_on(monkeypatch, tmp_path, capsys):
-    interrupted(monkeypatch, 1, signal.SIGINT)
+    interrupted(monkeypatch, batching, 1, signal.SIGINT)
     code = cli.guarded(lambda: trainer.train(CONFIG, tiny_dataset.dataset(), tmp_path, SCHEDULE), "spnr")
     assert code == 130
     expected = "spnr: stopped at step 1 of 6; the same command goes on from there"
     assert capsys.readouterr().err.splitlines()[-1] == expected
     assert int(restored(tmp_path).step) == 1
-
-
-@pytest.mark.parametrize("name", ["log_every", "preview_every", "checkpoint_every"])
-def test_a_schedule_of_no_steps_is_refused(name):
-    with pytest.raises(ValueError, match=f"{name} must be at least 1 step, got 0"):
-        trainer.Schedule(**{name: 0})
-
-
-def test_rows_are_json_without_nan():
-    def refuse(name):
-        raise AssertionError(f"{name} is no JSON")
-
-    for line in (tiny_dataset.run() / "metrics.jsonl").read_text().splitlines():
-        json.loads(line, parse_constant=refuse)
 
 
 def test_a_state_that_is_not_finite_is_named_though_every_loss_is(monkeypatch, tmp_path):
@@ -226,7 +193,7 @@ def test_a_baseline_is_trained_resumed_previewed_evaluated_and_loaded_like_ours(
     dataset, whole, broken = tiny_dataset.dataset(), tmp_path / "whole", tmp_path / "broken"
     trainer.train(config, dataset, whole, SCHEDULE)
     with monkeypatch.context() as patch:
-        interrupted(patch, 3)
+        interrupted(patch, batching, 3)
         with pytest.raises(KeyboardInterrupt):
             trainer.train(config, dataset, broken, SCHEDULE)
     trainer.train(config, dataset, broken, SCHEDULE)

@@ -3,18 +3,15 @@
 import io
 import struct
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from PIL import Image
 from support import tiny_dataset
+from support.stopped_runs import PICTURE, without_network
 from tensorboardX.proto.event_pb2 import Event
 
 from spnr_jax.formats.images import png
-from spnr_jax.training import checkpoint, metrics_log, optimisation, trainer
-
-PICTURE = np.random.default_rng(0).random((8, 6, 3)).astype(np.float32)
+from spnr_jax.training import metrics_log, trainer
 
 
 def events(run):
@@ -47,28 +44,8 @@ def test_a_row_with_a_picture_is_scalars_and_an_image_of_the_same_pixels_as_the_
     assert metrics_log.read_rows(tmp_path) == [{"step": 2, "loss": 3.0}, {"step": 3, "val_psnr": 20.5}]
 
 
-@pytest.fixture
-def stepless(monkeypatch):
-    """A training without a network: its previews are PICTURE."""
-    state = optimisation.TrainState(
-        step=jnp.zeros((), jnp.int32),
-        key=jax.random.key(0),
-        generator={},
-        batch_stats={},
-        generator_optimizer=(),
-        averaged={},
-        averaged_stats={},
-        discriminator=None,
-        discriminator_optimizer=None,
-    )
-    metrics = {"loss": np.float32(1), "psnr": np.float32(20)}
-    monkeypatch.setattr(optimisation, "jitted_create_state", lambda config: state)
-    monkeypatch.setattr(optimisation, "jitted_train_step", lambda state, batch, **_: (state, metrics))
-    monkeypatch.setattr(trainer, "preview", lambda *_: ({"val_psnr": 20.0}, PICTURE))
-    monkeypatch.setattr(checkpoint, "save", lambda run, state: None)
-
-
-def test_every_preview_of_a_training_is_an_image_at_its_step(stepless, tmp_path):
+def test_every_preview_of_a_training_is_an_image_at_its_step(monkeypatch, tmp_path):
+    without_network(monkeypatch)
     trainer.train(tiny_dataset.CONFIG, tiny_dataset.dataset(), tmp_path, tiny_dataset.SCHEDULE)
     assert [step for step, value in events(tmp_path) if value.HasField("image")] == [3, 6]
 

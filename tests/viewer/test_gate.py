@@ -7,7 +7,7 @@ from urllib.parse import urlsplit
 
 import pytest
 from support import chromium as chromium_of
-from support import tiny_viewer
+from support.tiny_viewer import viewer
 
 viser = pytest.importorskip("viser", reason="the viewer's extra is not installed: pip install 'spnr-jax[viewer]'")
 
@@ -16,14 +16,8 @@ from websockets.exceptions import InvalidStatus  # noqa: E402
 from websockets.sync.client import connect  # noqa: E402
 
 from spnr_jax.viewer import server  # noqa: E402
-from spnr_jax.viewer.gui import Reading  # noqa: E402
 
 PROTOCOL = f"viser-v{viser.__version__}"
-
-
-def viewer(host="127.0.0.1"):
-    reading = Reading(num_points=100, up="y", clean="auto")
-    return server.Viewer(tiny_viewer.model(), tiny_viewer.state(view=None), reading, host, 0)
 
 
 @pytest.fixture(scope="module")

@@ -29,7 +29,7 @@ QUIET = {
 
 @functools.cache
 def model():
-    return Model(config=CONFIG, variables=surfel_renderer.init(jax.random.key(0), CONFIG))
+    return Model(config=CONFIG, variables=jax.jit(surfel_renderer.init, static_argnums=1)(jax.random.key(0), CONFIG))
 
 
 @functools.cache

@@ -209,9 +209,6 @@ def test_selected_points_are_ringed():
     assert not (canvas(panes=("points",)) == picture.SELECTED).all(axis=-1).any()
 
 
-# camera path
-
-
 # the loop
 
 
@@ -260,13 +257,7 @@ def test_changes_that_come_while_a_picture_is_drawn_wait_together_and_supersede_
     assert seen == [True]
 
 
-# files and figures
-
-
 def test_without_viser_the_command_says_what_to_install(monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(ValueError, match=r"pip install 'spnr-jax\[viewer\]'"):
         cli.run_view(cli.View(cloud=Path("a.ply"), run=Path("run")))
-
-
-# what a browser may send

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from support import chromium as chromium_of
-from support import tiny_viewer
+from support.tiny_viewer import viewer
 
 pytest.importorskip("viser", reason="the viewer's extra is not installed: pip install 'spnr-jax[viewer]'")
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install playwright")
@@ -20,14 +20,8 @@ from spnr_jax import cli  # noqa: E402
 from spnr_jax.formats.cut import Cut  # noqa: E402
 from spnr_jax.tools.light_options import Lighting  # noqa: E402
 from spnr_jax.viewer import server  # noqa: E402
-from spnr_jax.viewer.gui import Reading  # noqa: E402
 
 WAIT = 40  # seconds, for a machine that does much else
-
-
-def viewer(host="127.0.0.1", port=0):
-    reading = Reading(num_points=100, up="y", clean="auto")
-    return server.Viewer(tiny_viewer.model(), tiny_viewer.state(view=None), reading, host, port)
 
 
 @pytest.fixture(scope="module")

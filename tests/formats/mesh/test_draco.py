@@ -10,7 +10,6 @@ from spnr_jax.formats.mesh.assets import RejectedAsset
 from spnr_jax.formats.mesh.draco import DRACO
 from spnr_jax.formats.mesh.meshes import load_mesh
 
-UV = np.array([[0, 1], [1, 1], [1, 0], [0, 0]], np.float32)
 COLORS = np.array([[255, 0, 51], [255, 0, 51], [0, 255, 0], [0, 0, 255]], np.uint8)
 
 

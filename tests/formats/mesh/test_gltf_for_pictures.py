@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.gltf_files import CORNERS, GltfBuilder
+from support.gltf_files import CORNERS, UV, GltfBuilder
 
 from spnr_jax.formats.clouds import place_cloud
 from spnr_jax.formats.mesh.assets import RejectedAsset
@@ -12,7 +12,6 @@ from spnr_jax.formats.mesh.gltf_nodes import INSTANCING
 from spnr_jax.formats.mesh.meshes import find_meshes, load_mesh
 from spnr_jax.formats.mesh.surface_points import sample_surface
 
-UV = np.array([[0, 1], [1, 1], [1, 0], [0, 0]], np.float32)
 HARD = Path(__file__).parents[4] / "shared" / "data" / "hard"
 
 

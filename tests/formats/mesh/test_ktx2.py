@@ -5,7 +5,7 @@ import sys
 
 import numpy as np
 import pytest
-from support.gltf_files import GltfBuilder
+from support.gltf_files import UV, GltfBuilder
 from support.packed_meshes import ETC1S_ALPHA, UASTC
 
 from spnr_jax.formats.mesh import ktx2
@@ -13,7 +13,6 @@ from spnr_jax.formats.mesh.assets import RejectedAsset
 from spnr_jax.formats.mesh.meshes import load_mesh
 from spnr_jax.formats.mesh.texels import read_image, srgb_to_linear
 
-UV = np.array([[0, 1], [1, 1], [1, 0], [0, 0]], np.float32)
 BASIS = "KHR_texture_basisu"
 QUARTERS = [[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [200, 200, 200]]]
 needs_package = pytest.mark.skipif(importlib.util.find_spec(ktx2.PACKAGE) is None, reason="the extra is not there")

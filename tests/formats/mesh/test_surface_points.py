@@ -123,12 +123,6 @@ class TestSampleSurface:
         np.testing.assert_array_equal(first.positions, again.positions)
         assert not np.array_equal(first.positions, other.positions)
 
-    def test_columns_are_float32_and_faces_int32(self):
-        points = sample_surface(Asset(parts=(square(),)), 10, 0)
-        dtypes = {name: str(values.dtype) for name, values in vars(points).items()}
-        columns = ("positions", "normals", "base_color", "roughness", "metallic")
-        assert dtypes == {**dict.fromkeys(columns, "float32"), "face": "int32"}
-
     def test_impossible_requests_say_so(self):
         with pytest.raises(ValueError, match="num_points must be at least 1, got 0"):
             sample_surface(Asset(parts=(square(),)), 0, 0)

@@ -2,13 +2,12 @@
 
 import numpy as np
 import pytest
-from support.gltf_files import CORNERS, GltfBuilder
+from support.gltf_files import CORNERS, UV, GltfBuilder
 
 from spnr_jax.formats.mesh.meshes import load_mesh
 from spnr_jax.formats.mesh.surface_points import sample_surface
 from spnr_jax.formats.mesh.tangents import tilted
 
-UV = np.array([[0, 1], [1, 1], [1, 0], [0, 0]], np.float32)  # upright: v runs down the picture
 RED, GREEN, FLAT = (0.6, 0.0, 0.8), (0.0, 0.6, 0.8), (0.0, 0.0, 1.0)
 X, Y = np.array([0.6, 0, 0.8]), np.array([0, 0.6, 0.8])
 

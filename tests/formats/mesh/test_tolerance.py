@@ -2,13 +2,12 @@
 
 import numpy as np
 import pytest
-from support.gltf_files import CORNERS, GltfBuilder
+from support.gltf_files import CORNERS, UV, GltfBuilder
 
 from spnr_jax.formats.mesh.assets import RejectedAsset
 from spnr_jax.formats.mesh.meshes import load_mesh
 from spnr_jax.formats.mesh.surface_points import sample_surface
 
-UV = np.array([[0, 1], [1, 1], [1, 0], [0, 0]], np.float32)
 AWAY = [10.0, 0.0, 0.0]  # where the opaque square stands
 
 

@@ -91,10 +91,11 @@ def test_another_folder_is_refused_with_what_was_expected_and_found(tmp_path, ca
     [
         (b"not gzip", "cannot be read"),
         (gzip.compress(rows(PRODUCTS).encode())[:60], "cannot be read"),
+        (gzip.compress(b"3dmodel_id,path\na,A/a.glb\n", mtime=0)[:12] + b"\xff" * 20, "cannot be read"),
         (gzip.compress(b"id,file\nA,B\n"), "line 2: expected columns 3dmodel_id and path"),
         (gzip.compress(rows(["B1", "B1"]).encode()), "line 3: product B1 is listed twice"),
     ],
-    ids=["not compressed", "cut off", "other columns", "listed twice"],
+    ids=["not compressed", "cut off", "damaged", "other columns", "listed twice"],
 )
 def test_a_damaged_table_is_one_line(tmp_path, content, expected):
     (tmp_path / "metadata").mkdir()
@@ -151,12 +152,7 @@ def check_variant(out, details):
 
 
 @pytest.mark.parametrize("path", ["../../secret.glb", "/etc/a.glb", "A/../../a.glb", "A\\a.glb"])
-def test_a_table_whose_paths_lead_elsewhere_or_that_is_damaged_is_refused(path, tmp_path):
+def test_a_table_whose_paths_lead_elsewhere_is_refused(path, tmp_path):
     (tmp_path / "3dmodels.csv").write_text(f"3dmodel_id,path\na,{path}\n")
     with pytest.raises(ValueError, match="no file below"):
         abo.read_table(tmp_path / "3dmodels.csv")
-    damaged = bytearray(gzip.compress(b"3dmodel_id,path\na,A/a.glb\n" * 20, mtime=0))
-    damaged[12:20] = b"\xff" * 8
-    (tmp_path / "3dmodels.csv.gz").write_bytes(damaged)
-    with pytest.raises(ValueError, match="cannot be read"):
-        abo.read_table(tmp_path / "3dmodels.csv.gz")

@@ -92,11 +92,6 @@ def test_variants_are_reshaped_if_asked_for_and_older_data_sets_that_were_not_st
         assert ("reshape_variants" in describe(made, "scalar_rgb")["settings"]) == asked
 
 
-def test_a_variant_sorts_right_behind_its_product():
-    names = ["a", "a--1", "a--2", "a-2", "a.b", "a1", "aB", "a_1", "ab"]
-    assert sorted(names) == names
-
-
 def test_fewer_training_objects_than_there_are_leave_some_aside():
     made = planned(test_objects=10, val_fraction=0.1, train_objects=7)
     split = made.split(ids(made.tasks))
@@ -185,14 +180,6 @@ def test_the_presets_hold_the_papers_numbers():
     assert (car.resolution, car.views, car.colour_variants, car.category, car.test_objects) == (200, 10, 0, "car", 128)
     assert data_presets.shapenet_plane(Path("x")).test_objects == 406
     assert data_presets.shapenet_chair(Path("x")).test_objects == 105
-
-
-def test_help_shows_the_presets_values(capsys):
-    with pytest.raises(SystemExit):
-        parse(["generate", "--preset", "shapenet_plane", "--help"])
-    said = " ".join(capsys.readouterr().out.split())
-    assert "default: 406" in said
-    assert "default: 200" in said
 
 
 def test_an_unknown_preset_or_class_is_refused_and_the_known_are_named(capsys):

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.gltf_files import CORNERS, GltfBuilder, png
+from support.gltf_files import CORNERS, UV, GltfBuilder, png
 from support.handmade import ball, box, plain
 
 from data_gen.render import views
@@ -24,7 +24,6 @@ REAL = Path(__file__).parents[4] / "shared" / "data" / "real" / "train"
 EYE = np.array([0.5, 0.4, 2.9])
 STEP = 1 / 255
 GRAZING = 0.1  # cosine of a view so flat that float32 moves the spot where the ray lands
-UV = np.array([[0, 1], [1, 1], [1, 0], [0, 0]], np.float32)
 NOISE = np.random.default_rng(0).integers(0, 256, (5, 7, 3))
 CHANNELS = ("base_color", "roughness", "metallic")
 

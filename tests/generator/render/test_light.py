@@ -5,8 +5,6 @@ import pytest
 from support.handmade import ball, plain
 
 from data_gen.render import light, views
-from data_gen.render.variant import mitsuba_module
-from spnr_jax.formats.light_files import read_envmap, threads
 from spnr_jax.formats.mesh.assets import Asset
 from spnr_jax.surfels.envmaps import directions
 from spnr_jax.surfels.room import indoor_envmap
@@ -17,12 +15,6 @@ def solid_angle_mean(envmap):
     theta = np.pi * (np.arange(len(envmap)) + 0.5) / len(envmap)
     weights = np.broadcast_to(np.sin(theta)[:, None], envmap.shape[:2])
     return float((envmap.mean(-1) * weights).sum() / weights.sum())
-
-
-def write_exr(path, envmap):
-    mi = mitsuba_module()
-    with threads(2):
-        mi.Bitmap(envmap).write(str(path))
 
 
 @pytest.fixture(scope="module")
@@ -58,19 +50,3 @@ def test_the_room_has_light_from_above_and_a_dynamic_range_that_a_camera_can_hol
     assert room.min() > 0
     assert 5 < room.max() / room.mean() < 50
     assert room[:16].mean() > 1.5 * room[-16:].mean()
-
-
-def test_an_environment_map_file_reads_back_as_it_was_written(tmp_path, room):
-    write_exr(tmp_path / "room.exr", room)
-    np.testing.assert_array_equal(read_envmap(tmp_path / "room.exr"), room)
-
-
-def test_an_unusable_environment_map_is_refused_with_its_name(tmp_path):
-    (tmp_path / "broken.hdr").write_bytes(b"#?RADIANCE\n")
-    with pytest.raises(ValueError, match=r"broken\.hdr: not a readable"):
-        read_envmap(tmp_path / "broken.hdr")
-    with pytest.raises(ValueError, match="no such file"):
-        read_envmap(tmp_path / "absent.exr")
-    write_exr(tmp_path / "black.exr", np.zeros((4, 8, 3), np.float32))
-    with pytest.raises(ValueError, match="some light"):
-        read_envmap(tmp_path / "black.exr")

@@ -5,11 +5,11 @@ import importlib.util
 import numpy as np
 import pytest
 from support.handmade import ball, plain
+from support.surfel_clouds import cloud
 
 from data_gen.render import normals, poisson_surface, views
 from data_gen.render.poisson_surface import NoSurface, PoissonConfig
 from spnr_jax.formats.mesh.assets import Asset
-from spnr_jax.kernels.records import PointCloud
 
 needs_solver = pytest.mark.skipif(importlib.util.find_spec("pymeshlab") is None, reason="pymeshlab is not installed")
 RADIUS, COUNT = 0.7, 600
@@ -22,14 +22,9 @@ def directions(count=COUNT, seed=0):
 
 
 def cloud_of(positions, seed=1):
-    rng = np.random.default_rng(seed)
-    return PointCloud(
-        positions=np.asarray(positions, np.float32),
-        base_color=rng.random((len(positions), 3), np.float32),
-        roughness=rng.random(len(positions), np.float32),
-        metallic=rng.random(len(positions), np.float32),
-        mask=np.ones(len(positions), bool),
-    )
+    rng, count = np.random.default_rng(seed), len(positions)
+    columns = {"base_color": rng.random((count, 3)), "roughness": rng.random(count), "metallic": rng.random(count)}
+    return cloud(positions, **columns)
 
 
 SPHERE = cloud_of(RADIUS * directions())

@@ -6,7 +6,7 @@ from support.handmade import BLUE, GREEN, GREY, RED, ball, box, checked_box_and_
 
 from data_gen.render import views
 from spnr_jax.formats.mesh import surface_points
-from spnr_jax.formats.mesh.assets import Asset, Material, RejectedAsset
+from spnr_jax.formats.mesh.assets import Asset, RejectedAsset
 
 WHITE_LIGHT = np.ones((8, 16, 3), np.float32)
 CONFIG = views.ViewConfig(resolution=32, spp=16, views=2)
@@ -92,33 +92,6 @@ def test_condition_pixels_carry_the_reference_colour_and_hidden_points_leave_non
         np.testing.assert_array_equal(conditions[view, expected, :3], reference[expected])
         assert (conditions[view, ~expected] == 0).all()
         assert (images[view, expected, 3] > 0).mean() > 0.95
-
-
-def test_the_colour_a_point_carries_is_the_colour_that_the_renderer_shows():
-    # an object of one flat-lit side: under white light its radiance is the base colour times one factor, at every point
-    rng = np.random.default_rng(4)
-    texture = rng.uniform(0.1, 0.9, (6, 5, 3)).astype(np.float32)
-    material = Material(base_color=texture, roughness=np.float32(1), metallic=np.float32(0))
-    asset = Asset(parts=(box((0, 0, 0), (0.6, 0.6, 0.01), material, texcoords=True),))
-    config = views.ViewConfig(resolution=64, spp=144)
-    pose = views.look_at(np.array([0, 0, 3.0]))
-    radiance = views.render_view(views.build_scene(asset, WHITE_LIGHT), pose, config, 0)
-    surface = surface_points.sample_surface(asset, 4000, 1)
-    front = surface.face >= 10  # the +z side
-    columns, rows = np.floor(views.project(pose, surface.positions[front], config)).astype(int).T
-    inner = radiance[rows, columns, 3] == 1
-    shown, carried = radiance[rows, columns, :3][inner], surface.base_color[front][inner]
-    for channel in range(3):
-        assert np.corrcoef(shown[:, channel], carried[:, channel])[0, 1] > 0.98
-
-
-def test_vertex_colours_are_rendered_where_they_are():
-    part = box(half=(0.5, 0.5, 0.02), material=plain((1.0, 1.0, 1.0)))
-    colors = np.where(part.positions[:, :1] > 0, RED, GREEN)
-    part = type(part)(positions=part.positions, faces=part.faces, material=part.material, colors=colors)
-    image = picture(Asset(parts=(part,)), (0, 0, 3))
-    assert strongest_channel(image, slice(12, 20), slice(10, 13)) == 1
-    assert strongest_channel(image, slice(12, 20), slice(19, 22)) == 0
 
 
 def test_vertex_colours_on_a_texture_are_rejected_with_the_reason():

@@ -1,5 +1,6 @@
 """Laws of the procedural objects: sound geometry, one connected thing, a function of its category and seed only."""
 
+import functools
 import hashlib
 import subprocess
 import sys
@@ -10,9 +11,17 @@ import pytest
 from data_gen.procedural import CATEGORIES, category_of, make
 
 SEEDS = range(12)
-ASSETS = {(category, seed): make(category, seed) for category in CATEGORIES for seed in SEEDS}
-CASES = [pytest.param(asset, id=f"{category}-{seed}") for (category, seed), asset in ASSETS.items()]
+CASES = [(category, seed) for category in CATEGORIES for seed in SEEDS]
 PIXELS = 48  # of the voxel grid along the longest side
+made = functools.cache(make)
+
+
+@pytest.fixture
+def asset(request):
+    return made(*request.param)
+
+
+every_asset = pytest.mark.parametrize("asset", CASES, indirect=True, ids=lambda case: f"{case[0]}-{case[1]}")
 
 
 def digest(asset):
@@ -39,7 +48,7 @@ def corner_agreement(part):
     return np.einsum("fk,fck->fc", facing, part.normals[part.faces])
 
 
-@pytest.mark.parametrize("asset", CASES)
+@every_asset
 def test_geometry_is_finite_indexed_and_without_zero_area(asset):
     for part in asset.parts:
         for array in (part.positions, part.normals, part.texcoords):
@@ -51,7 +60,7 @@ def test_geometry_is_finite_indexed_and_without_zero_area(asset):
         assert (corner_agreement(part) > 0).mean() > 0.985
 
 
-@pytest.mark.parametrize("asset", CASES)
+@every_asset
 def test_objects_enclose_volume_stand_on_the_floor_and_have_few_parts(asset):
     corners = triangles(asset)
     assert np.einsum("fk,fk->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) > 0
@@ -61,7 +70,7 @@ def test_objects_enclose_volume_stand_on_the_floor_and_have_few_parts(asset):
     assert 60 <= len(corners) <= 9000
 
 
-@pytest.mark.parametrize("asset", CASES)
+@every_asset
 def test_every_part_touches_the_rest(asset):
     ndimage = pytest.importorskip("scipy.ndimage")
     rng = np.random.default_rng(0)
@@ -78,7 +87,7 @@ def test_every_part_touches_the_rest(asset):
     assert components == 1
 
 
-@pytest.mark.parametrize("asset", CASES)
+@every_asset
 def test_materials_are_physical_and_textures_are_of_moderate_size(asset):
     for part in asset.parts:
         material = part.material
@@ -89,9 +98,9 @@ def test_materials_are_physical_and_textures_are_of_moderate_size(asset):
 
 @pytest.mark.parametrize("category", CATEGORIES)
 def test_a_seed_gives_the_same_bytes_again_and_other_seeds_other_shapes_and_colours(category):
-    assert digest(make(category, 3)) == digest(ASSETS[category, 3])
-    assert len({digest(ASSETS[category, seed]) for seed in SEEDS}) == len(SEEDS)
-    shapes = {tuple(np.ptp(triangles(ASSETS[category, seed]).reshape(-1, 3), axis=0).round(4)) for seed in SEEDS}
+    assert digest(make(category, 3)) == digest(made(category, 3))
+    assert len({digest(made(category, seed)) for seed in SEEDS}) == len(SEEDS)
+    shapes = {tuple(np.ptp(triangles(made(category, seed)).reshape(-1, 3), axis=0).round(4)) for seed in SEEDS}
     assert len(shapes) == len(SEEDS)
 
 
@@ -101,7 +110,7 @@ def test_another_process_makes_the_same_bytes():
         "print(hashlib.sha256(b''.join(p.positions.tobytes() for p in a.parts)).hexdigest())"
     )
     printed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip()
-    here = hashlib.sha256(b"".join(part.positions.tobytes() for part in ASSETS["car", 5].parts)).hexdigest()
+    here = hashlib.sha256(b"".join(part.positions.tobytes() for part in made("car", 5).parts)).hexdigest()
     assert printed == here
 
 

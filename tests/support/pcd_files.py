@@ -1,0 +1,62 @@
+"""PCD files made by hand, in every encoding."""
+
+import numpy as np
+
+ENCODINGS = "ascii", "binary", "binary_compressed"
+LAYOUT = np.dtype([("x", "<f4"), ("y", "<f4"), ("pad", "u1", (3,)), ("z", "<f4"), ("rgb", "<f4"), ("roughness", "<f8")])
+COLORS = np.array([[255, 0, 3], [1, 128, 250], [7, 7, 7], [0, 255, 0]], np.uint32)
+
+
+def points() -> np.ndarray:
+    """Four points with colours packed into floats, and padding between their columns."""
+    rows = np.zeros(4, LAYOUT)
+    rows["x"], rows["y"], rows["z"] = [1.5, -2, 0, 3], [0.25, 1, 1, 1], [9, 8, 7, -6]
+    rows["rgb"] = (COLORS[:, 0] << 16 | COLORS[:, 1] << 8 | COLORS[:, 2]).astype(np.uint32).view(np.float32)
+    rows["roughness"] = [0, 0.25, 0.5, 1]
+    return rows
+
+
+def compress(data: bytes) -> bytes:
+    """LZF, the slow way: the longest earlier match of up to 264 bytes at each place, else plain bytes."""
+    packed, plain, place = bytearray(), bytearray(), 0
+
+    def flush():
+        for start in range(0, len(plain), 32):
+            piece = plain[start : start + 32]
+            packed.extend(bytes([len(piece) - 1]) + piece)
+        plain.clear()
+
+    while place < len(data):
+        best, distance = 0, 0
+        for start in range(max(0, place - 8191), place):
+            length = 0
+            while length < 264 and place + length < len(data) and data[start + length] == data[place + length]:
+                length += 1
+            if length > best:
+                best, distance = length, place - start
+        if best < 3:
+            plain.append(data[place])
+            place += 1
+            continue
+        flush()
+        high, low = divmod(distance - 1, 256)
+        packed.extend([best - 2 << 5 | high, low] if best < 9 else [7 << 5 | high, best - 9, low])
+        place += best
+    flush()
+    return bytes(packed)
+
+
+def content(encoding: str, rows: np.ndarray, newline: str = "\n") -> bytes:
+    """A PCD file of the points in an encoding."""
+    header = ["# .PCD v0.7 - Point Cloud Data file format", "VERSION 0.7", "FIELDS x y _ z rgb roughness"]
+    header += ["SIZE 4 4 1 4 4 8", "TYPE F F U F F F", "COUNT 1 1 3 1 1 1", f"WIDTH {len(rows)}", "HEIGHT 1"]
+    header += ["VIEWPOINT 0 0 0 1 0 0 0", f"POINTS {len(rows)}", f"DATA {encoding}", ""]
+    head = newline.join(header).encode()
+    if encoding == "ascii":
+        lines = [" ".join(repr(float(value)) for value in np.hstack([np.ravel(cell) for cell in row])) for row in rows]
+        return head + newline.join([line.replace(".0 ", " ") for line in lines] + [""]).encode()
+    if encoding == "binary":
+        return head + rows.tobytes()
+    plain = b"".join(np.ascontiguousarray(rows[name]).tobytes() for name in rows.dtype.names)
+    packed = compress(plain)
+    return head + np.array([len(packed), len(plain)], "<u4").tobytes() + packed
