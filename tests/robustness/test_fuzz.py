@@ -30,7 +30,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from watched import limited_memory, watched
 
-from spnr_jax.cli import one_line
+from spnr_jax.errors import one_line
 from spnr_jax.formats.config_json import from_dict, to_dict
 from spnr_jax.presets import tiny
 from spnr_jax.viewer import session, viewpoint
