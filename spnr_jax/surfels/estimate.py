@@ -4,7 +4,7 @@ spacing     side of the square that a point stands for, from the neighbours on i
 normal      given, or that of the layer (layers.py), outward by the votes of directions and walls (sides.py)
 sided       1 where the votes say which side is outside, 0 where both are seen alike (a sheet)
 gradient    of the colour along the surface, a ridge regression over the layer: colours are interpolated to first
-            order
+            order, but for points beside the border of two colours (borders.py)
 rim, reach  where the disc ends: at the rim of the layer or where another face cuts it (rims.py)
 shape       planarity and linearity: ratios of the neighbours' extents, 0 in a plane, 0 on a line
 """
@@ -16,6 +16,7 @@ from scipy.sparse import csr_array
 from spnr_jax.kernels.cloud_arrays import bucket
 from spnr_jax.kernels.records import Surfels
 from spnr_jax.surfels import layers, sides
+from spnr_jax.surfels.borders import borders
 from spnr_jax.surfels.neighbours import (
     LEAST_SPACING,
     Near,
@@ -83,12 +84,16 @@ def _columns(
     rim, reach = joined(rims, near, weight, *all_of(spacing, normal, sided))
     seen = sides.visible_from(positions, normal, spacing, middle)
     shown = sides.shown(normal, seen, joined(layers.covered, near, layer, *all_of(normal)))
+    border, jump, sure = joined(borders, near, weight, *all_of(spacing, normal, base_color))
+    gradient = joined(_gradient, near, weight, *all_of(spacing, normal, base_color))
     columns = {
         "position": positions,
         "normal": normal,
         "spacing": spacing,
         "base_color": base_color,
-        "gradient": joined(_gradient, near, weight, *all_of(spacing, normal, base_color)),
+        "gradient": (1 - sure[:, None, None]) * gradient,
+        "border": border,
+        "jump": jump,
         "roughness": roughness,
         "metallic": metallic,
         "guessed": np.zeros(len(positions)) if materials_known is None else 1 - materials_known,

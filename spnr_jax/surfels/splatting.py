@@ -19,6 +19,7 @@ OPACITY = 3.0  # optical depth at the middle of a disc
 LIST = 24  # entries of a pixel at most
 NEAR = 8  # places in the list before and after an entry that are compared in depth; those farther in front hide it
 SHARP = 4  # power of the kernel by which colours are blended more narrowly than everything else
+TOLD = 1e-7  # summed narrow weights from which on they say something
 FAR = 1e-4  # summed narrow weights that the centres' distances pass to 0 at
 
 
@@ -45,10 +46,14 @@ def blend(
     foot = footprints(surfels, camera)
     place = jnp.stack([foot.column, foot.row], axis=-1)
     narrow = jnp.concatenate([offset, surfels.gradient.reshape(-1, 9), place], axis=1)
-    wide, narrow = jax.lax.optimization_barrier((wide, narrow))
+    border = surfels.border[:, 3] + jnp.sum(surfels.border[:, :3] * surfels.position, axis=-1)
+    steps = jnp.concatenate([surfels.border[:, :3], border[:, None], surfels.jump], axis=1)
+    wide, narrow, steps = jax.lax.optimization_barrier((wide, narrow, steps))
     sums = [_summed(share, point, wide)]
     sums += [jnp.sum(x, axis=0)[:, None] for x in (share, weight * left, share * depth, share * depth**2)]
-    sums += [_summed(sharp, point, narrow), *(jnp.sum(x, axis=0)[:, None] for x in (sharp, sharp * depth))]
+    total, deep = (jnp.sum(x, axis=0) for x in (sharp, sharp * depth))
+    blended = _summed(sharp, point, narrow).at[:, :3].add(_stepped(sharp, point, steps, pixel_of, deep, total, camera))
+    sums += [blended, total[:, None], deep[:, None]]
     slot = jnp.arange(slots, dtype=jnp.int32)
     slot_of = jnp.full(height * width, slots, jnp.int32).at[pixel_of].set(slot, mode="drop")
     of_slot = jax.lax.optimization_barrier(jnp.pad(jnp.concatenate(sums, axis=1), ((0, 1), (0, 0))))
@@ -63,6 +68,37 @@ def _summed(
     empty = jnp.zeros((point.shape[1], rows.shape[1]), rows.dtype)
     places = (weights, point)
     return jax.lax.scan(lambda sums, at: (sums + at[0][:, None] * rows[at[1]], None), empty, places, unroll=8)[0]
+
+
+def _stepped(
+    sharp: Float[Array, "list slots"],
+    point: Int[Array, "list slots"],
+    steps: Float[Array, "points 7"],
+    pixel_of: Int[Array, " slots"],
+    deep: Float[Array, " slots"],
+    total: Float[Array, " slots"],
+    camera: Camera,
+) -> Float[Array, "slots 3"]:
+    """What the colours of discs gain beyond their borders, weighted sums; a border is a pixel wide."""
+    ahead = deep / jnp.where(total > TOLD, total, 1)
+    column, row = pixel_of % camera.width + 0.5, pixel_of // camera.width + 0.5
+    where = _on_surface(column, row, ahead, camera)
+    pixel = jnp.maximum(ahead, 1e-6) / camera.intrinsics[0, 0]
+
+    def add(sums: Array, at: tuple[Array, Array]) -> tuple[Array, None]:
+        of = steps[at[1]]
+        beyond = sum(of[:, i] * where[i] for i in range(3)) - of[:, 3]
+        return sums + (at[0] * jnp.clip(0.5 + beyond / pixel, 0, 1))[:, None] * of[:, 4:], None
+
+    return jax.lax.scan(add, jnp.zeros((point.shape[1], 3), steps.dtype), (sharp, point), unroll=8)[0]
+
+
+def _on_surface(column: Array, row: Array, ahead: Array, camera: Camera) -> list[Array]:
+    """x, y, z of places so far along the camera's axis behind pixels."""
+    right = ahead * ((column - camera.intrinsics[0, 2]) / camera.intrinsics[0, 0])
+    up = ahead * -((row - camera.intrinsics[1, 2]) / camera.intrinsics[1, 1])
+    pose = camera.cam_to_world
+    return [pose[i, 0] * right + pose[i, 1] * up - pose[i, 2] * ahead + pose[i, 3] for i in range(3)]
 
 
 def _lists(found: Entries, slots: int, pixels: int) -> tuple[Int[Array, "list slots"], Int[Array, " slots"]]:
@@ -108,15 +144,12 @@ def _gathered(sums: list[Array], features: int, camera: Camera) -> GBuffer:
     *wide, log_spacing = (x * inverse for x in wide)
     depth = deep * inverse
     *narrow, column, row, sharp, sharp_deep = narrow
-    told = sharp > 1e-7
+    told = sharp > TOLD
     inverse_sharp = jnp.where(told, 1 / jnp.where(told, sharp, 1), 0)
     ahead = sharp_deep * inverse_sharp
-    columns, rows = jnp.arange(camera.width) + 0.5, jnp.arange(camera.height) + 0.5
-    right = ahead * ((columns - camera.intrinsics[0, 2]) / camera.intrinsics[0, 0])[None]
-    up = ahead * -((rows - camera.intrinsics[1, 2]) / camera.intrinsics[1, 1])[:, None]
-    beside = (column, columns[None]), (row, rows[:, None])
-    pose = camera.cam_to_world
-    place = [pose[i, 0] * right + pose[i, 1] * up - pose[i, 2] * ahead + pose[i, 3] for i in range(3)]
+    columns, rows = (jnp.arange(camera.width) + 0.5)[None], (jnp.arange(camera.height) + 0.5)[:, None]
+    beside = (column, columns), (row, rows)
+    place = _on_surface(columns, rows, ahead, camera)
     color = [narrow[c] + sum(narrow[3 + 3 * c + i] * place[i] for i in range(3)) for c in range(3)]
     return GBuffer(
         opacity=jnp.minimum(share, 1),

@@ -51,6 +51,8 @@ def surfels(position, normal, spacing, **columns) -> Surfels:
     columns = {
         "base_color": np.full((count, 3), 0.5),
         "gradient": np.zeros((count, 3, 3)),
+        "border": np.zeros((count, 4)),
+        "jump": np.zeros((count, 3)),
         "roughness": np.full(count, 0.5),
         "metallic": np.zeros(count),
         "guessed": np.zeros(count),

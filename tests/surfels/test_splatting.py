@@ -163,6 +163,25 @@ class TestBlend:
         close(buffer.color[inner], (0.5 + hit @ slopes.T)[inner], atol=1e-4)
         assert np.abs(buffer.attributes[inner] - (0.5 + hit @ slopes.T)[inner]).max() > 1e-3  # to order zero only
 
+    def test_a_border_of_two_colours_is_a_line_a_pixel_wide_on_a_plane(self):
+        across, at, jump = np.array([0.6, 0.8, 0.0]), 0.15, np.array([0.3, -0.2, 0.1])
+        found, view = layer(), camera()
+        distance = at - np.asarray(found.position) @ across
+        ahead = distance > 0  # the line lies before these points; those beyond it have the other colour
+        border = np.concatenate([np.where(ahead[:, None], across, -across), np.abs(distance)[:, None]], axis=1)
+        color = np.where(ahead[:, None], 0.5, 0.5 + jump)
+        jumps = np.where(ahead[:, None], jump, -jump)
+        buffer, _ = draw(
+            surfels(found.position, (0, 0, 1.0), found.spacing, base_color=color, border=border, jump=jumps), view
+        )
+        rays = np.asarray(cameras.camera_rays(view).directions)
+        hit = [0, 0, 2.5] - 2.5 * rays / rays[..., 2:]
+        pixel = 2.5 / float(view.intrinsics[0, 0])
+        share = np.clip(0.5 + (hit @ across - at) / pixel, 0, 1)[..., None]
+        inner = buffer.opacity > 0.9
+        assert np.any((share > 0.1) & (share < 0.9) & inner[..., None])
+        close(buffer.color[inner], (0.5 + share * jump)[inner], atol=1e-4)
+
     def test_a_lone_disc_says_how_far_its_centre_lies_beside_each_pixel(self):
         position = np.where(np.arange(500)[:, None] < 1, [0.1, -0.2, 0.0], [0.0, 0.0, 9.0])
         found, view = surfels(position, (0, 0, 1.0), 0.3), camera()
