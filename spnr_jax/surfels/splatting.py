@@ -42,18 +42,14 @@ def blend(
     rotation = camera.cam_to_world[:, :3]
     normal = jnp.stack(turned(rotation, surfels.normal), axis=-1)
     wide = jnp.concatenate([attributes, normal, jnp.log(surfels.spacing)[:, None]], axis=1)
-    offset = surfels.base_color - jnp.sum(surfels.gradient * surfels.position[:, None], axis=-1)
     foot = footprints(surfels, camera)
-    place = jnp.stack([foot.column, foot.row], axis=-1)
-    narrow = jnp.concatenate([offset, surfels.gradient.reshape(-1, 9), place], axis=1)
-    border = surfels.border[:, 3] + jnp.sum(surfels.border[:, :3] * surfels.position, axis=-1)
-    steps = jnp.concatenate([surfels.border[:, :3], border[:, None], surfels.jump], axis=1)
-    wide, narrow, steps = jax.lax.optimization_barrier((wide, narrow, steps))
+    narrow = jnp.concatenate([_colors(surfels), jnp.stack([foot.column, foot.row], axis=-1)], axis=1)
+    wide, narrow = jax.lax.optimization_barrier((wide, narrow))
     sums = [_summed(share, point, wide)]
     sums += [jnp.sum(x, axis=0)[:, None] for x in (share, weight * left, share * depth, share * depth**2)]
     total, deep = (jnp.sum(x, axis=0) for x in (sharp, sharp * depth))
-    blended = _summed(sharp, point, narrow).at[:, :3].add(_stepped(sharp, point, steps, pixel_of, deep, total, camera))
-    sums += [blended, total[:, None], deep[:, None]]
+    ahead = deep / jnp.where(total > TOLD, total, 1)
+    sums += [_colored(sharp, point, narrow, pixel_of, ahead, camera), total[:, None]]
     slot = jnp.arange(slots, dtype=jnp.int32)
     slot_of = jnp.full(height * width, slots, jnp.int32).at[pixel_of].set(slot, mode="drop")
     of_slot = jax.lax.optimization_barrier(jnp.pad(jnp.concatenate(sums, axis=1), ((0, 1), (0, 0))))
@@ -70,35 +66,39 @@ def _summed(
     return jax.lax.scan(lambda sums, at: (sums + at[0][:, None] * rows[at[1]], None), empty, places, unroll=8)[0]
 
 
-def _stepped(
+def _colors(surfels: Surfels) -> Float[Array, "points 19"]:
+    """Of each disc: its colour at the origin and the change along x, y, z, the plane of its border, the jump there."""
+    offset = surfels.base_color - jnp.sum(surfels.gradient * surfels.position[:, None], axis=-1)
+    border = surfels.border[:, 3] + jnp.sum(surfels.border[:, :3] * surfels.position, axis=-1)
+    columns = offset, surfels.gradient.reshape(-1, 9), surfels.border[:, :3], border[:, None], surfels.jump
+    return jnp.concatenate(columns, axis=1)
+
+
+def _colored(
     sharp: Float[Array, "list slots"],
     point: Int[Array, "list slots"],
-    steps: Float[Array, "points 7"],
+    rows: Float[Array, "points 21"],
     pixel_of: Int[Array, " slots"],
-    deep: Float[Array, " slots"],
-    total: Float[Array, " slots"],
+    ahead: Float[Array, " slots"],
     camera: Camera,
-) -> Float[Array, "slots 3"]:
-    """What the colours of discs gain beyond their borders, weighted sums; a border is a pixel wide."""
-    ahead = deep / jnp.where(total > TOLD, total, 1)
-    column, row = pixel_of % camera.width + 0.5, pixel_of // camera.width + 0.5
-    where = _on_surface(column, row, ahead, camera)
-    pixel = jnp.maximum(ahead, 1e-6) / camera.intrinsics[0, 0]
+) -> Float[Array, "slots 5"]:
+    """Weighted sums of the colours that discs (`_colors`) have where the ray meets the surface, and of their centres.
+
+    A border is a pixel wide.
+    """
+    right = ahead * ((pixel_of % camera.width + 0.5 - camera.intrinsics[0, 2]) / camera.intrinsics[0, 0])
+    up = ahead * -((pixel_of // camera.width + 0.5 - camera.intrinsics[1, 2]) / camera.intrinsics[1, 1])
+    pose, pixel = camera.cam_to_world, jnp.maximum(ahead, 1e-6) / camera.intrinsics[0, 0]
+    where = [pose[i, 0] * right + pose[i, 1] * up - pose[i, 2] * ahead + pose[i, 3] for i in range(3)]
 
     def add(sums: Array, at: tuple[Array, Array]) -> tuple[Array, None]:
-        of = steps[at[1]]
-        beyond = sum(of[:, i] * where[i] for i in range(3)) - of[:, 3]
-        return sums + (at[0] * jnp.clip(0.5 + beyond / pixel, 0, 1))[:, None] * of[:, 4:], None
+        color, change, across, border, jump, centre = jnp.split(rows[at[1]], (3, 12, 15, 16, 19), axis=1)
+        beyond = sum(across[:, i] * where[i] for i in range(3)) - border[:, 0]
+        color += jnp.clip(0.5 + beyond / pixel, 0, 1)[:, None] * jump
+        color += sum(change[:, i::3] * where[i][:, None] for i in range(3))
+        return sums + at[0][:, None] * jnp.concatenate([color, centre], axis=1), None
 
-    return jax.lax.scan(add, jnp.zeros((point.shape[1], 3), steps.dtype), (sharp, point), unroll=8)[0]
-
-
-def _on_surface(column: Array, row: Array, ahead: Array, camera: Camera) -> list[Array]:
-    """x, y, z of places so far along the camera's axis behind pixels."""
-    right = ahead * ((column - camera.intrinsics[0, 2]) / camera.intrinsics[0, 0])
-    up = ahead * -((row - camera.intrinsics[1, 2]) / camera.intrinsics[1, 1])
-    pose = camera.cam_to_world
-    return [pose[i, 0] * right + pose[i, 1] * up - pose[i, 2] * ahead + pose[i, 3] for i in range(3)]
+    return jax.lax.scan(add, jnp.zeros((point.shape[1], 5), rows.dtype), (sharp, point), unroll=8)[0]
 
 
 def _lists(found: Entries, slots: int, pixels: int) -> tuple[Int[Array, "list slots"], Int[Array, " slots"]]:
@@ -143,14 +143,11 @@ def _gathered(sums: list[Array], features: int, camera: Camera) -> GBuffer:
     inverse = 1 / jnp.maximum(share, 1e-4)
     *wide, log_spacing = (x * inverse for x in wide)
     depth = deep * inverse
-    *narrow, column, row, sharp, sharp_deep = narrow
+    *color, column, row, sharp = narrow
     told = sharp > TOLD
     inverse_sharp = jnp.where(told, 1 / jnp.where(told, sharp, 1), 0)
-    ahead = sharp_deep * inverse_sharp
     columns, rows = (jnp.arange(camera.width) + 0.5)[None], (jnp.arange(camera.height) + 0.5)[:, None]
     beside = (column, columns), (row, rows)
-    place = _on_surface(columns, rows, ahead, camera)
-    color = [narrow[c] + sum(narrow[3 + 3 * c + i] * place[i] for i in range(3)) for c in range(3)]
     return GBuffer(
         opacity=jnp.minimum(share, 1),
         coverage=coverage,
