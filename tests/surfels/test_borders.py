@@ -48,7 +48,8 @@ def test_one_colour_a_gradient_and_speckles_have_no_borders():
     positions, _, beyond, _ = parted()
     smooth = 0.5 + 0.4 * beyond[:, None] * [1.0, -1, 0.5]
     speckled = np.where(np.random.default_rng(0).uniform(size=(len(positions), 1)) < 0.4, BLUE, RED)
-    for color, most in ((np.tile(RED, (len(positions), 1)), 0), (smooth, 0), (speckled, 0.03)):
+    steep = 0.6 + 0.3 * np.sin(10 * beyond)[:, None] * [1.0, -1, 1]
+    for color, most in ((np.tile(RED, (len(positions), 1)), 0), (smooth, 0), (steep, 0), (speckled, 0.03)):
         jump = estimate(positions, color)["jump"]
         assert np.mean(np.abs(jump).max(axis=1) > 0.1) <= most
 
