@@ -79,11 +79,10 @@ def run(config: Command) -> int:
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"stopped{kept}") from None
     except OSError as error:
-        generating = isinstance(config, GenerateConfig)
-        if error.strerror:
-            place = error.filename or (config.out if isinstance(config, GenerateConfig) else config.dataset)
-            raise UserError(f"{place}: {error.strerror}{kept if generating else ''}") from error
-        raise
+        if not error.strerror:
+            raise
+        place, kept = (config.out, kept) if isinstance(config, GenerateConfig) else (config.dataset, "")
+        raise UserError(f"{error.filename or place}: {error.strerror}{kept}") from error
     return 0
 
 
