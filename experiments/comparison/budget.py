@@ -11,6 +11,7 @@ number is kept in the run's config.json.
 
 import dataclasses
 import time
+from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -90,8 +91,13 @@ def steps_within(seconds: float, config: TrainConfig, dataset: data_sets.Dataset
     return max(1, int(seconds / pace))
 
 
-def step_seconds(config: TrainConfig, dataset: data_sets.Dataset, adversarial: bool) -> float:
-    """Seconds of a training step, reading the data included, compilation not."""
+def step_seconds(
+    config: TrainConfig,
+    dataset: data_sets.Dataset,
+    adversarial: bool,
+    clock: Callable[[], float] = time.monotonic,
+) -> float:
+    """Seconds of a training step by a clock, reading the data included, compilation not."""
     state = optimisation.jitted_create_state(config)
     steps, start = -1, 0.0
     with closing(batching.batches(dataset, config, 0)) as batches:
@@ -102,10 +108,10 @@ def step_seconds(config: TrainConfig, dataset: data_sets.Dataset, adversarial: b
             jax.block_until_ready(metrics)
             steps += 1
             if steps == 0:  # this one compiled
-                start = time.monotonic()
-            elif steps >= PACE_STEPS and time.monotonic() - start >= PACE_SECONDS:
+                start = clock()
+            elif steps >= PACE_STEPS and clock() - start >= PACE_SECONDS:
                 break
-    return (time.monotonic() - start) / max(steps, 1)
+    return (clock() - start) / max(steps, 1)
 
 
 def train(config: TrainConfig, dataset: data_sets.Dataset, run: Path) -> Trained:

@@ -1,22 +1,24 @@
-"""How good a network is after so many seconds of training: PSNR of unseen objects over time, seed by seed.
+"""How good a network is after so many seconds of the processor: scores of unseen objects over the time of training.
 
     python -m experiments.studies.time_to_quality --data DIR --out DIR [--presets ...] [--seconds 90] [--only-pace]
 
-The pace of each preset's steps is measured first and kept: `--only-pace` stops there, so that it can be measured while
-the machine is idle.  Every run then trains for the steps that fit into the seconds at that pace, its warm-up and decay
-over exactly these, and its averaged network is scored a few times on the way.  The seconds of a row are its steps times
-their pace: neither compilation nor scoring is in them, nor what else the machine did meanwhile.
+The pace of each preset's steps is measured first and kept: `--only-pace` stops there.  Every run then trains for the
+steps that fit into the seconds at that pace, its warm-up and decay over exactly these, and its averaged network is
+scored a few times on the way, the last time on all test objects.  Seconds are those of the processor, all threads
+together, that the steps took: neither compilation nor scoring nor other work on the machine is in them.  A stopped
+study goes on from the last checkpoint; several may share a folder, if each trains its own presets.
 
-    OUT/paces/PRESET.json           seconds of a step, without and with the discriminator
-    OUT/curves/PRESET_SEED.json     a run's rows; a finished run is only read
-    OUT/results.json  table.md  curves.png
+    OUT/paces/PRESET.json           processor seconds of a step, without and with the discriminator
+    OUT/runs/PRESET_SEED/           the run folder
+    OUT/marks/PRESET_SEED/STEP.json scores of each object, and seconds; STEP.npz pictures of a few objects
+    OUT/results.json  table.md  curves_GROUP.png  sheet_GROUP.png
 """
 
 import dataclasses
+import itertools
+import json
 import time
 from bisect import bisect_right
-from collections.abc import Mapping, Sequence
-from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -24,12 +26,13 @@ from typing import Any
 
 import jax
 import numpy as np
-from matplotlib.figure import Figure
 
 from experiments import entry_point
-from experiments.comparison import budget, figures, results_folder
+from experiments.comparison import budget, results_folder
 from experiments.comparison.trained_networks import test_objects
-from experiments.comparison.variants import Preset
+from experiments.comparison.variants import OPAQUE
+from experiments.studies import time_to_quality_report as report
+from experiments.studies.time_to_quality_report import Marks
 from spnr_jax import cli
 from spnr_jax.config import TrainConfig
 from spnr_jax.devices import machine
@@ -37,26 +40,25 @@ from spnr_jax.errors import UserError, at_least
 from spnr_jax.formats import data_sets
 from spnr_jax.presets import PRESETS
 from spnr_jax.scoring import evaluation
-from spnr_jax.scoring.score_tables import Table, number
-from spnr_jax.training import adversary, batching, optimisation
+from spnr_jax.training import adversary, optimisation, run_record, trainer
 
-Row = dict[str, float]
+MOST_DECIBELS = 100.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class TimeToQuality:
-    """Train presets for so many seconds, and score them on unseen objects on the way."""
+    """Train presets for so many seconds of the processor, and score them on unseen objects on the way."""
 
     data: Path
     """Folder of the data set; its test split is scored."""
     out: Path = Path("runs/time_to_quality")
     """Folder of the results; the same command goes on there."""
-    presets: tuple[Preset, ...] = ("tiny", "plus_tiny")
-    """Networks and losses."""
+    presets: tuple[str, ...] = ("tiny", "plus_tiny")
+    """Networks and losses: names of `spnr train --preset`."""
     seeds: tuple[int, ...] = (0, 1)
     """Seeds of weights, batches and jitter."""
-    seconds: float = 90.0
-    """Of training steps, for each run."""
+    seconds: float = 180.0
+    """Of the processor in training steps, for each run."""
     marks: int = 6
     """Times that a run is scored, evenly spaced, the last one after its last step."""
     even_share: float = 1.0
@@ -64,21 +66,25 @@ class TimeToQuality:
     target: float = 24.0
     """PSNR in dB whose time is looked for."""
     objects: int | None = None
-    """Test objects, spread over the split (default: all)."""
+    """Test objects scored on the way, spread over the split; after the last step all are (default: all)."""
+    shown: int = 8
+    """Of these, objects whose pictures are kept."""
     only_pace: bool = False
     """Measure the pace of the steps, and stop."""
 
     def __post_init__(self) -> None:
+        if unknown := [name for name in self.presets if name not in PRESETS]:
+            raise UserError(f"--presets: there is no {unknown[0]}; the presets are {', '.join(PRESETS)}")
         if not self.seeds or len(set(self.seeds)) < len(self.seeds):
             raise UserError(f"--seeds: expected one or more numbers, none of them twice, got {list(self.seeds)}")
         if not self.seconds > 0:
             raise UserError(f"--seconds: expected more than 0, got {self.seconds:g}")
-        at_least(self, 1, "marks")
+        at_least(self, 1, "marks", "shown")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Pace:
-    """Seconds of a step without and with the discriminator, and where they were measured."""
+    """Processor seconds of a step without and with the discriminator, and where they were measured."""
 
     alone: float
     adversarial: float | None
@@ -92,26 +98,25 @@ class Pace:
 
 
 def main(options: TimeToQuality) -> None:
-    """Measures paces, trains and scores what is not there yet, writes table and plot."""
+    """Measures paces, trains and scores what is not there yet, writes table and plots."""
     cli.set_up_jax()
     dataset = data_sets.open_dataset(options.data)
-    asked = {"seconds": options.seconds, "marks": options.marks, "even_share": options.even_share}
-    results_folder.claim(options.out, "time_to_quality", asked | {"objects": options.objects}, dataset)
+    asked = {name: getattr(options, name) for name in ("seconds", "marks", "even_share", "objects", "shown")}
+    results_folder.claim(options.out, "time_to_quality", asked, dataset)
     paces = {name: kept_pace(name, options, dataset) for name in options.presets}
     for name, pace in paces.items():
         print(f"{name}: {1e3 * pace.alone:.0f} ms a step, {steps_of(name, options, pace)} steps", flush=True)
     if options.only_pace:
         return
-    curves: dict[str, dict[int, list[Row]]] = {name: {} for name in options.presets}
-    for name in options.presets:
-        for seed in options.seeds:
-            place = options.out / "curves" / f"{name}_{seed}.json"
-            curves[name][seed] = results_folder.kept(place, partial(curve, name, seed, options, paces[name], dataset))
+    curves: dict[str, dict[int, list[Marks]]] = {name: {} for name in options.presets}
+    for name, seed in itertools.product(options.presets, options.seeds):
+        curves[name][seed] = curve(name, seed, options, paces[name], dataset)
+    notes = [f"{name}: pace measured on {pace.hardware}, load {pace.load}." for name, pace in paces.items()]
     found = {"paces": {name: dataclasses.asdict(pace) for name, pace in paces.items()}, "target": options.target}
     found |= {"curves": {name: {str(seed): rows for seed, rows in runs.items()} for name, runs in curves.items()}}
-    notes = [f"{name}: pace measured on {pace.hardware}, load {pace.load}." for name, pace in paces.items()]
-    files = {"curves.png": plot(curves, options.target)}
-    results_folder.write(options.out, found, [table(curves, options.target)], notes, files)
+    folders = {name: options.out / "marks" / f"{name}_{options.seeds[0]}" for name in options.presets}
+    files = report.pictures(curves, options.target) | report.sheets(curves, folders)
+    results_folder.write(options.out, found, report.tables(curves, options.target), notes, files)
 
 
 def kept_pace(preset: str, options: TimeToQuality, dataset: data_sets.Dataset) -> Pace:
@@ -119,16 +124,12 @@ def kept_pace(preset: str, options: TimeToQuality, dataset: data_sets.Dataset) -
 
     def measure() -> dict[str, Any]:
         config, load = config_of(preset, options, 1000), machine.load()
-        seconds = {flag: budget.step_seconds(config, dataset, flag) for flag in sorted({False, judged(config)})}
+        judged = adversary.first_adversarial_step(config) < config.num_steps
+        seconds = {flag: budget.step_seconds(config, dataset, flag, time.process_time) for flag in {False, judged}}
         pace = Pace(alone=seconds[False], adversarial=seconds.get(True), hardware=machine.hardware(), load=load)
         return dataclasses.asdict(pace)
 
     return Pace(**results_folder.kept(options.out / "paces" / f"{preset}.json", measure))
-
-
-def judged(config: TrainConfig) -> bool:
-    """Whether some steps of the training have a discriminator."""
-    return adversary.first_adversarial_step(config) < config.num_steps
 
 
 def config_of(preset: str, options: TimeToQuality, steps: int, seed: int = 0) -> TrainConfig:
@@ -144,74 +145,66 @@ def steps_of(preset: str, options: TimeToQuality, pace: Pace) -> int:
     )
 
 
-def curve(preset: str, seed: int, options: TimeToQuality, pace: Pace, dataset: data_sets.Dataset) -> list[Row]:
-    """The scores of one run at each mark."""
+def curve(preset: str, seed: int, options: TimeToQuality, pace: Pace, dataset: data_sets.Dataset) -> list[Marks]:
+    """The scores of one run at each mark; it is trained as far as it is not."""
     config = config_of(preset, options, steps_of(preset, options, pace), seed)
-    names = test_objects(dataset, options.objects)
-    marks = {round(config.num_steps * (i + 1) / options.marks) for i in range(options.marks)}
-    state, rows = optimisation.jitted_create_state(config), []
-    first_judged, start = adversary.first_adversarial_step(config), time.monotonic()
-    with closing(batching.batches(dataset, config, 0)) as batches:
-        for step, batch in enumerate(batches):
-            state, metrics = optimisation.jitted_train_step(
-                state, jax.device_put(batch), config=config, adversarial=step >= first_judged
-            )
-            if step + 1 in marks:
-                jax.block_until_ready(metrics)
-                scores = score(optimisation.averaged_variables(state), config, dataset, names)
-                rows.append({"step": step + 1, "seconds": round(pace.seconds(config, step + 1), 2), **scores})
-                spent = time.monotonic() - start
-                print(f"{preset}, seed {seed}: {rows[-1]} ({spent:.0f} s of this machine)", flush=True)
-    return rows
+    run, folder = (options.out / part / f"{preset}_{seed}" for part in ("runs", "marks"))
+    every = -(-config.num_steps // options.marks)
+    marks = [min(every * (i + 1), config.num_steps) for i in range(options.marks)]
+
+    def saved(phase: str, step: int, state: Any) -> None:
+        place = folder / f"{step:07d}.json"
+        if phase == "saved" and step in marks and not place.is_file():
+            row = results_folder.kept(place, partial(mark, state, config, options, dataset, run, place))
+            print(f"{preset}, seed {seed}: {report.line(row)}", flush=True)
+
+    schedule = trainer.Schedule(preview_every=every, checkpoint_every=every)
+    state = trainer.train(config, dataset, run, schedule, on_event=saved)
+    saved("saved", config.num_steps, state)  # if an earlier call was stopped between the last step and its scores
+    jax.clear_caches()
+    return [json.loads(place.read_text()) for place in sorted(folder.glob("*.json"))]
 
 
-def score(variables: dict, config: TrainConfig, dataset: data_sets.Dataset, names: Sequence[str]) -> Row:
-    """Means over the objects of the means over their views."""
-    methods = {"network": evaluation.network(variables, config)}
-    results = evaluation.evaluate_objects(methods, config, dataset, tuple(names))
-    scores = [result.scores["network"] for result in results]
-    return {metric: float(np.mean([one[metric].mean() for one in scores])) for metric in ("psnr", "flip", "iou")}
+def mark(
+    state: optimisation.TrainState,
+    config: TrainConfig,
+    options: TimeToQuality,
+    dataset: data_sets.Dataset,
+    run: Path,
+    place: Path,
+) -> Marks:
+    """Scores of the averaged network, and what its training took so far; its pictures are kept beside."""
+    step, variables = int(state.step), optimisation.averaged_variables(state)
+    shown = test_objects(dataset, options.objects)
+    names = test_objects(dataset, None) if step == config.num_steps else shown
+    methods, scores, strips = {"network": evaluation.network(variables, config)}, {}, []
+    to_show = evaluation.spread(shown, options.shown)
+    for name in names:
+        item = data_sets.read_object(dataset, name)
+        result = evaluation.evaluate_object(methods, config, item)
+        found = {metric: result.scores["network"][metric] for metric in ("psnr", "flip", "iou")}
+        if config.model.method == "npbg":
+            del found["iou"]  # it predicts colours alone
+        found["color"] = color_psnr(item, result.reference, np.asarray(result.pictures["network"].image))
+        scores[name] = {metric: np.asarray(values).tolist() for metric, values in found.items()}
+        if name in to_show:
+            strips += [result.reference[0], np.asarray(result.pictures["network"].image)[0]]
+    strips = [np.uint8(np.round(255 * np.clip(strip, 0, 1))) for strip in strips]
+    results_folder.kept(place.with_suffix(".npz"), lambda: strips)
+    return {"step": step, "seconds": training_seconds(run), "shown": list(to_show), "scores": scores}
 
 
-def reached(rows: Sequence[Row], target: float) -> float | None:
-    """Seconds at which a curve crosses the target, on a line between its rows; None if it never does."""
-    for before, after in zip([{"seconds": 0.0, "psnr": -np.inf}, *rows], rows, strict=False):
-        if after["psnr"] >= target:
-            if not np.isfinite(before["psnr"]):
-                return after["seconds"]
-            share = (target - before["psnr"]) / (after["psnr"] - before["psnr"])
-            return before["seconds"] + share * (after["seconds"] - before["seconds"])
-    return None
+def training_seconds(run: Path) -> float:
+    """Processor seconds of a run's steps over all calls: not compilation, previews, saving and scoring."""
+    return round(sum(start["processor_seconds"].get("steps", 0.0) for start in run_record.read_starts(run)), 2)
 
 
-def table(curves: Mapping[str, Mapping[int, Sequence[Row]]], target: float) -> Table:
-    """A line for each run: its steps, its last scores, and when it reached the target."""
-    rows = []
-    for name, runs in curves.items():
-        for seed, marks in runs.items():
-            last = marks[-1]
-            cells = [number(last["step"], 0), number(last["seconds"], 0)]
-            cells += [number(last["psnr"], 2), number(last["flip"], 3), number(last["iou"], 3)]
-            rows.append((f"{name}, seed {seed}", (*cells, number(reached(marks, target), 0, missing="not reached"))))
-    heads = ("steps", "seconds", "PSNR, dB", "FLIP", "opacity IoU", f"{target:g} dB after, s")
-    return Table(title="Unseen objects after a training of so many seconds", heads=heads, rows=tuple(rows))
-
-
-@figures.drawing
-def plot(curves: Mapping[str, Mapping[int, Sequence[Row]]], target: float) -> Figure:
-    """PSNR over minutes: a colour for each preset, a line for each seed."""
-    figure = Figure(figsize=(6.4, 3.6))
-    axes = figure.subplots()
-    for (name, runs), color in zip(curves.items(), figures.COLORS, strict=False):
-        for number_of, rows in enumerate(runs.values()):
-            minutes, psnr = ([row["seconds"] / 60 for row in rows], [row["psnr"] for row in rows])
-            axes.plot(minutes, psnr, "o-", color=color, markersize=3.5, label=None if number_of else name)
-    axes.axhline(target, color=figures.INK_COLOR, linestyle="--", linewidth=1, label=f"{target:g} dB")
-    axes.set_xlim(left=0)
-    axes.set_xlabel("minutes of training steps")
-    axes.set_ylabel("PSNR of unseen objects, dB")
-    axes.legend()
-    return figure
+def color_psnr(item: data_sets.ObjectData, reference: np.ndarray, image: np.ndarray) -> np.ndarray:
+    """PSNR (views,) of the mean colour inside the silhouette: whether a red car is red."""
+    inside = (item.images[..., 3:] > 255 * OPAQUE).astype(np.float64)
+    pixels = np.maximum(inside.sum(axis=(1, 2)), 1)
+    error = ((np.asarray(image, np.float64) - reference) * inside).sum(axis=(1, 2)) / pixels
+    return np.minimum(-10 * np.log10(np.maximum(np.mean(error**2, axis=-1), 1e-30)), MOST_DECIBELS)
 
 
 if __name__ == "__main__":

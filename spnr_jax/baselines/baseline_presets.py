@@ -11,6 +11,18 @@ def _baseline_loss(pixel: Literal["l1", "mse"], masked: bool = False) -> LossCon
     return LossConfig(l1_weight=1.0, adversarial_weight=0.0, pixel=pixel, masked=masked)
 
 
+def small_of(tiny: TrainConfig, name: str) -> TrainConfig:
+    """A tiny preset at 128 px, on clouds of up to 2,048 points, its weights averaged over more steps."""
+    return dataclasses.replace(
+        tiny,
+        preset=name,
+        model=dataclasses.replace(tiny.model, image_resolution=128),
+        optimizer=dataclasses.replace(tiny.optimizer, ema_decay=0.999),
+        num_steps=20_000,
+        max_points=2048,
+    )
+
+
 def npbg_abo() -> TrainConfig:
     """NPBG as adapted, paper sizes, 128 px.  `spnr train --preset npbg_abo DATA RUN`; meant for one GPU."""
     return TrainConfig(
@@ -38,6 +50,11 @@ def npbg_tiny() -> TrainConfig:
         batch_objects=4,
         max_points=1024,
     )
+
+
+def npbg_small() -> TrainConfig:
+    """npbg_tiny at 128 px, on clouds as `small` has them.  `spnr train --preset npbg_small DATA RUN`."""
+    return small_of(npbg_tiny(), "npbg_small")
 
 
 def point_nerf_abo() -> TrainConfig:
@@ -79,6 +96,11 @@ def point_nerf_tiny() -> TrainConfig:
         max_points=1024,
         pixel_stride=4,
     )
+
+
+def point_nerf_small() -> TrainConfig:
+    """point_nerf_tiny at 128 px, on clouds as `small` has them.  `spnr train --preset point_nerf_small DATA RUN`."""
+    return small_of(point_nerf_tiny(), "point_nerf_small")
 
 
 def points2nerf_shapenet() -> TrainConfig:
@@ -138,8 +160,13 @@ def points2nerf_tiny() -> TrainConfig:
     )
 
 
+def points2nerf_small() -> TrainConfig:
+    """points2nerf_tiny at 128 px, on clouds as `small` has them.  `spnr train --preset points2nerf_small DATA RUN`."""
+    return small_of(points2nerf_tiny(), "points2nerf_small")
+
+
 BASELINES = (
-    *(npbg_abo, npbg_shapenet, npbg_tiny),
-    *(point_nerf_abo, point_nerf_shapenet, point_nerf_tiny),
-    *(points2nerf_abo, points2nerf_shapenet, points2nerf_tiny),
+    *(npbg_abo, npbg_shapenet, npbg_small, npbg_tiny),
+    *(point_nerf_abo, point_nerf_shapenet, point_nerf_small, point_nerf_tiny),
+    *(points2nerf_abo, points2nerf_shapenet, points2nerf_small, points2nerf_tiny),
 )

@@ -1,7 +1,8 @@
 """What a run folder says of its making: RUN/run.json, an entry for every start of the trainer.
 
 began, first_step, last_step    when, and from where to where it trained
-seconds                         by phase: restore, compilation (the first step), steps, previews, checkpoints
+seconds                         by phase: restore, compilation (the first step), steps, previews, checkpoints, listeners
+processor_seconds               the same, of all threads: what other work on the machine does not stretch
 version, commit, jax, hardware  of the code ("+" behind a commit: the checkout was changed), of JAX, of the machine
 data, data_checksum             the folder, and a number that tells data sets apart
 init                            the training whose weights a new run began with, where it was not random ones
@@ -25,18 +26,21 @@ from spnr_jax.training.weights import Trained
 
 
 class Clock:
-    """Seconds since it was made, by phase: each lap belongs to one."""
+    """Seconds since it was made, and those of the processor, by phase: each lap belongs to one."""
 
     def __init__(self) -> None:
         """Starts it."""
         self.seconds: dict[str, float] = {}
-        self._since = time.monotonic()
+        self.processor_seconds: dict[str, float] = {}
+        self._since = time.monotonic(), time.process_time()
 
     def lap(self, phase: str) -> float:
         """Seconds since the lap before, counted towards the phase."""
-        now = time.monotonic()
-        elapsed, self._since = now - self._since, now
+        now = time.monotonic(), time.process_time()
+        elapsed, worked = (new - old for new, old in zip(now, self._since, strict=True))
+        self._since = now
         self.seconds[phase] = self.seconds.get(phase, 0.0) + elapsed
+        self.processor_seconds[phase] = self.processor_seconds.get(phase, 0.0) + worked
         return elapsed
 
 
@@ -61,8 +65,9 @@ class RunRecord:
 
     def write(self, last_step: int, clock: Clock) -> None:
         """Writes what is known by now."""
-        seconds = {phase: round(value, 2) for phase, value in clock.seconds.items()}
-        starts = [*self._earlier, self._entry | {"last_step": last_step, "seconds": seconds}]
+        spent = {"seconds": clock.seconds, "processor_seconds": clock.processor_seconds}
+        rounded = {name: {phase: round(value, 2) for phase, value in by.items()} for name, by in spent.items()}
+        starts = [*self._earlier, self._entry | {"last_step": last_step} | rounded]
         write_whole(self._path, (json.dumps({"starts": starts}, indent=1) + "\n").encode())
 
 

@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -55,8 +55,8 @@ class Schedule:
                 raise UserError(f"{name} must be at least 1 step, got {steps}")
 
 
-Phase = Literal["step", "row", "preview", "checkpoint", "end"]
-OnEvent = Callable[[Phase, int, object], object]  # phase that begins, steps done so far, its batch or row, else None
+Phase = Literal["step", "row", "preview", "checkpoint", "saved", "end"]
+OnEvent = Callable[[Phase, int, Any], object]  # phase that begins, steps done, its batch, row or state
 
 
 class NotFinite(UserError):
@@ -211,6 +211,8 @@ class Progress:
         checkpoint.save(run, state)
         self._clock.lap("checkpoints")
         self._record.write(self._done, self._clock)
+        self._tell("saved", self._done, state)
+        self._clock.lap("listeners")
 
     def close(self) -> None:
         """Closes bar and log."""

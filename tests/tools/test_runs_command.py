@@ -44,8 +44,10 @@ class TestRecord:
     def test_a_start_says_when_where_and_with_what_it_trained(self, folder):
         (entry,) = run_record.read_starts(folder / "a")
         assert (entry["first_step"], entry["last_step"]) == (0, L1_ONLY.num_steps)
-        assert set(entry["seconds"]) == {"restore", "compilation", "steps", "previews", "checkpoints"}
-        assert all(seconds >= 0 for seconds in entry["seconds"].values())
+        phases = {"restore", "compilation", "steps", "previews", "checkpoints", "listeners"}
+        for spent in (entry["seconds"], entry["processor_seconds"]):
+            assert set(spent) == phases
+            assert all(seconds >= 0 for seconds in spent.values())
         assert entry["data_checksum"] == run_record.checksum(tiny_dataset.dataset())
         assert "cores" in entry["hardware"]
 
