@@ -129,6 +129,8 @@ class EncoderConfig:
 
     materials: Materials = ("base_color", "roughness", "metallic")
     """Material channels that the points carry into the network."""
+    inputs: Literal["plain", "spread"] = "plain"
+    """Materials as they are, or spread: sRGB as brightness and hue, each channel around 0 with a spread near 1."""
     point_widths: Widths = (64, 128, 256)
     """Hidden layers of the PointNet [paper]."""
     point_features: Count = 32

@@ -18,6 +18,8 @@ from spnr_jax.scoring.summary import Scores, summarise
 
 ObjectMethod = Callable[[data_sets.ObjectData], evaluation.Pictures]
 PROGRESS_LINES = 20
+OPAQUE = 0.5  # opacity of the reference from which a pixel lies inside the silhouette
+MOST_DECIBELS = 100.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,3 +108,11 @@ def by_category(scores: dict[str, dict[str, Scores]]) -> dict[str, dict]:
     """The summary of each class of objects, if there are several."""
     classes = evaluation.classes_of(scores)
     return {c: summarise([scores[name] for name in names]) for c, names in classes.items()} if len(classes) > 1 else {}
+
+
+def color_psnr(item: data_sets.ObjectData, reference: np.ndarray, image: np.ndarray) -> np.ndarray:
+    """PSNR (views,) of the mean colour inside the silhouette: whether a red car is red."""
+    inside = (item.images[..., 3:] > 255 * OPAQUE).astype(np.float64)
+    pixels = np.maximum(inside.sum(axis=(1, 2)), 1)
+    error = ((np.asarray(image, np.float64) - reference) * inside).sum(axis=(1, 2)) / pixels
+    return np.minimum(-10 * np.log10(np.maximum(np.mean(error**2, axis=-1), 1e-30)), MOST_DECIBELS)

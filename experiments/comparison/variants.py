@@ -21,7 +21,7 @@ import numpy as np
 from experiments.comparison import budget as budgets
 from experiments.comparison import results_folder
 from experiments.comparison.budget import Trained
-from experiments.comparison.object_scores import Shown, of_cloud, score_objects
+from experiments.comparison.object_scores import OPAQUE, Shown, color_psnr, of_cloud, score_objects
 from experiments.comparison.trained_networks import test_objects
 from spnr_jax.config import TrainConfig
 from spnr_jax.errors import UserError, at_least
@@ -37,7 +37,6 @@ PlusPreset = Literal["plus_abo", "plus_lite", "plus_refined", "plus_shapenet", "
 Preset = PaperPreset | PlusPreset
 QUICK_STEPS, QUICK_OBJECTS = 4, 2
 FEWEST_ROWS = 8  # of a log, two of which may hold a compilation
-OPAQUE = 0.5  # opacity of the reference from which a pixel lies inside the silhouette
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -256,9 +255,10 @@ def joined(seeds: Sequence[Scores]) -> Scores:
 
 
 def more_scores(item: data_sets.ObjectData, pictures: evaluation.Pictures) -> Scores:
-    """PSNR inside the silhouette, and high-frequency energy over the reference's, of each view."""
+    """PSNR inside the silhouette and of its mean colour, high-frequency energy over the reference's, of each view."""
     inside = item.images[..., 3] > 255 * OPAQUE
-    return jax.device_get(_more_scores(np.asarray(pictures.image), data_sets.on_white(item.images), inside))
+    image, reference = np.asarray(pictures.image), data_sets.on_white(item.images)
+    return jax.device_get(_more_scores(image, reference, inside)) | {"color": color_psnr(item, reference, image)}
 
 
 @jax.jit

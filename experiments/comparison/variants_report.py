@@ -22,6 +22,7 @@ from spnr_jax.scoring.summary import difference, means, metric_settings
 METRICS = {  # head, decimals, what is better
     "psnr": QUALITY["psnr"],
     "inside": ("PSNR inside, dB", 2, HIGHER),
+    "color": ("Mean colour: PSNR, dB", 2, HIGHER),
     **{name: QUALITY[name] for name in ("ssim", "flip", "iou")},
     "detail": ("HF energy", 2, 0),
 }

@@ -29,8 +29,8 @@ import numpy as np
 
 from experiments import entry_point
 from experiments.comparison import budget, results_folder
+from experiments.comparison.object_scores import color_psnr
 from experiments.comparison.trained_networks import test_objects
-from experiments.comparison.variants import OPAQUE
 from experiments.studies import time_to_quality_report as report
 from experiments.studies.time_to_quality_report import Marks
 from spnr_jax import cli
@@ -41,8 +41,6 @@ from spnr_jax.formats import data_sets
 from spnr_jax.presets import PRESETS
 from spnr_jax.scoring import evaluation
 from spnr_jax.training import adversary, optimisation, run_record, trainer
-
-MOST_DECIBELS = 100.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -197,14 +195,6 @@ def mark(
 def training_seconds(run: Path) -> float:
     """Processor seconds of a run's steps over all calls: not compilation, previews, saving and scoring."""
     return round(sum(start["processor_seconds"].get("steps", 0.0) for start in run_record.read_starts(run)), 2)
-
-
-def color_psnr(item: data_sets.ObjectData, reference: np.ndarray, image: np.ndarray) -> np.ndarray:
-    """PSNR (views,) of the mean colour inside the silhouette: whether a red car is red."""
-    inside = (item.images[..., 3:] > 255 * OPAQUE).astype(np.float64)
-    pixels = np.maximum(inside.sum(axis=(1, 2)), 1)
-    error = ((np.asarray(image, np.float64) - reference) * inside).sum(axis=(1, 2)) / pixels
-    return np.minimum(-10 * np.log10(np.maximum(np.mean(error**2, axis=-1), 1e-30)), MOST_DECIBELS)
 
 
 if __name__ == "__main__":

@@ -6,13 +6,20 @@ from typing import Literal
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from spnr_jax.kernels import voxels
+from spnr_jax.kernels.colors import linear_to_srgb
 from spnr_jax.kernels.records import PointCloud
 from spnr_jax.model_config import EncoderConfig
 from spnr_jax.nn.normalization import BatchNorm
 from spnr_jax.nn.unet3d import UNet3D
+
+# columns: mean of R, G, B; green to red; blue to yellow; about the inverse of their spread over the training's points
+BRIGHTNESS_AND_HUE = np.array(
+    [[4 / 3] * 3, np.array([10, -10, 0]) / 2**0.5, np.array([10, 10, -20]) / 6**0.5], np.float32
+).T
 
 
 class PointNet(nn.Module):
@@ -37,6 +44,16 @@ class PointNet(nn.Module):
             name = f"norm_{i}"
             x = nn.relu(BatchNorm(name=name)(x, mask, train) if self.norm == "batch" else nn.LayerNorm(name=name)(x))
         return nn.Dense(self.num_features, name="out")(x).reshape(*shape, self.num_features)
+
+
+def spread_out(material: Float[Array, "*batch channels"]) -> Float[Array, "*batch channels"]:
+    """Values around 0 of a material in [0, 1]: of base colours (linear RGB) the sRGB brightness and two axes of hue.
+
+    As they are, hues are a twentieth of what varies between points, and a stem of few channels learns to drop them.
+    """
+    if material.shape[-1] == 1:
+        return 2 * material - 1
+    return jnp.matmul(linear_to_srgb(material) - 0.5, jnp.asarray(BRIGHTNESS_AND_HUE), precision="highest")
 
 
 class Encoder(nn.Module):
@@ -66,5 +83,7 @@ class Encoder(nn.Module):
         _, offset = voxels.locate(jnp.asarray(cloud.positions), self.config.volume_resolution)
         materials = [getattr(cloud, name) for name in self.config.materials]
         materials = [m[..., None] if m.ndim < cloud.positions.ndim else m for m in materials]
+        if self.config.inputs == "spread":
+            materials = [spread_out(m) for m in materials]
         inputs = jnp.concatenate([cloud.positions, offset, *materials], axis=-1)
         return jnp.where(cloud.mask[..., None], inputs, 0.0)
