@@ -56,7 +56,7 @@ def shapenet_chair() -> TrainConfig:
 
 
 def small() -> TrainConfig:
-    """Half the paper's volume, a quarter of its samples, 128 px.  `spnr train --preset small DATA RUN`; hours on a CPU."""
+    """Half the paper's volume, a quarter of its samples, 128 px, hours on a CPU.  `spnr train --preset small ...`."""
     return TrainConfig(
         preset="small",
         model=PaperConfig(
@@ -76,7 +76,7 @@ def tiny() -> TrainConfig:
     return TrainConfig(
         preset="tiny",
         model=PaperConfig(
-            encoder=EncoderConfig(volume_resolution=32, base_width=8, num_stages=3, num_groups=1),
+            encoder=dataclasses.replace(PAPER, volume_resolution=32, base_width=12, num_stages=3),
             sampling=SamplingConfig(num_coarse=16, num_fine=16),
             render_resolution=32,
             resize_resolution=32,

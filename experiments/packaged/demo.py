@@ -33,7 +33,7 @@ from spnr_jax.training import metrics_log, trainer
 from spnr_jax.training.weights import read_trained
 
 POINTS = 2048  # of an object; of evenly spread ones the first 1024, which a test sees, are evenly spread, too
-STEPS = {"ours": 800, "paper": 500}  # which take both networks about the same time
+STEPS = {"ours": 800, "paper": 390}  # which take both networks about the same time
 TITLE = "Sparse-point neural rendering: objects that no network saw"
 
 
