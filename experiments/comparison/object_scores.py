@@ -110,9 +110,10 @@ def by_category(scores: dict[str, dict[str, Scores]]) -> dict[str, dict]:
     return {c: summarise([scores[name] for name in names]) for c, names in classes.items()} if len(classes) > 1 else {}
 
 
-def color_psnr(item: data_sets.ObjectData, reference: np.ndarray, image: np.ndarray) -> np.ndarray:
-    """PSNR (views,) of the mean colour inside the silhouette: whether a red car is red."""
+def color_psnr(item: data_sets.ObjectData, reference: np.ndarray, image: np.ndarray, hue: bool = False) -> np.ndarray:
+    """PSNR (views,) of the mean colour inside the silhouette, or of its hue, which lies around its mean channel."""
     inside = (item.images[..., 3:] > 255 * OPAQUE).astype(np.float64)
     pixels = np.maximum(inside.sum(axis=(1, 2)), 1)
     error = ((np.asarray(image, np.float64) - reference) * inside).sum(axis=(1, 2)) / pixels
+    error = error - error.mean(axis=-1, keepdims=True) if hue else error
     return np.minimum(-10 * np.log10(np.maximum(np.mean(error**2, axis=-1), 1e-30)), MOST_DECIBELS)

@@ -255,10 +255,11 @@ def joined(seeds: Sequence[Scores]) -> Scores:
 
 
 def more_scores(item: data_sets.ObjectData, pictures: evaluation.Pictures) -> Scores:
-    """PSNR inside the silhouette and of its mean colour, high-frequency energy over the reference's, of each view."""
+    """PSNR inside the silhouette, of its mean colour and hue; high-frequency energy over the reference's; by view."""
     inside = item.images[..., 3] > 255 * OPAQUE
     image, reference = np.asarray(pictures.image), data_sets.on_white(item.images)
-    return jax.device_get(_more_scores(image, reference, inside)) | {"color": color_psnr(item, reference, image)}
+    colors = {name: color_psnr(item, reference, image, name == "hue") for name in ("color", "hue")}
+    return jax.device_get(_more_scores(image, reference, inside)) | colors
 
 
 @jax.jit

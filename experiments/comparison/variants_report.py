@@ -23,6 +23,7 @@ METRICS = {  # head, decimals, what is better
     "psnr": QUALITY["psnr"],
     "inside": ("PSNR inside, dB", 2, HIGHER),
     "color": ("Mean colour: PSNR, dB", 2, HIGHER),
+    "hue": ("Its hue: PSNR, dB", 2, HIGHER),
     **{name: QUALITY[name] for name in ("ssim", "flip", "iou")},
     "detail": ("HF energy", 2, 0),
 }
