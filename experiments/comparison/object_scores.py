@@ -110,10 +110,14 @@ def by_category(scores: dict[str, dict[str, Scores]]) -> dict[str, dict]:
     return {c: summarise([scores[name] for name in names]) for c, names in classes.items()} if len(classes) > 1 else {}
 
 
+def mean_colors(item: data_sets.ObjectData, image: np.ndarray) -> np.ndarray:
+    """Mean colour (views, 3) of pictures of an object inside the silhouette."""
+    inside = (item.images[..., 3:] > 255 * OPAQUE).astype(np.float64)
+    return (np.asarray(image, np.float64) * inside).sum(axis=(1, 2)) / np.maximum(inside.sum(axis=(1, 2)), 1)
+
+
 def color_psnr(item: data_sets.ObjectData, reference: np.ndarray, image: np.ndarray, hue: bool = False) -> np.ndarray:
     """PSNR (views,) of the mean colour inside the silhouette, or of its hue, which lies around its mean channel."""
-    inside = (item.images[..., 3:] > 255 * OPAQUE).astype(np.float64)
-    pixels = np.maximum(inside.sum(axis=(1, 2)), 1)
-    error = ((np.asarray(image, np.float64) - reference) * inside).sum(axis=(1, 2)) / pixels
+    error = mean_colors(item, image) - mean_colors(item, reference)
     error = error - error.mean(axis=-1, keepdims=True) if hue else error
     return np.minimum(-10 * np.log10(np.maximum(np.mean(error**2, axis=-1), 1e-30)), MOST_DECIBELS)

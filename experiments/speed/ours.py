@@ -24,6 +24,8 @@ from spnr_jax.presets import PRESETS
 from spnr_jax.training import adversary, optimisation
 
 NUM_GROUPS, DISCRIMINATOR_WIDTH = 8, 64  # the twin's, for every preset
+WIDTHS = {"tiny": 8, "small": 16, "abo": 16}  # the twin's channels of the volume, and coarse and fine samples
+SAMPLES = {"tiny": (16, 16), "small": (32, 32), "abo": (64, 64)}
 NEAR_POINTS = {"tiny": (16, 0), "small": (16, 16), "abo": (32, 32)}  # coarse and fine samples
 
 
@@ -56,6 +58,11 @@ def twin_sized(preset: str, mode: str = "train", objects: int = 1) -> TrainConfi
     """The preset with the sizes of the twin, without R1; "train_l1" has no discriminator."""
     config = PRESETS[preset]()
     assert isinstance(config.model, RayNetworkConfig)
+    coarse, fine = SAMPLES[preset]
+    encoder = dataclasses.replace(
+        config.model.encoder, base_width=WIDTHS[preset], num_groups=NUM_GROUPS, inputs="plain"
+    )
+    sampling = dataclasses.replace(config.model.sampling, num_coarse=coarse, num_fine=fine)
     loss = dataclasses.replace(
         config.loss,
         adversarial_weight=0.0 if mode == "train_l1" else 1.0,
@@ -65,9 +72,7 @@ def twin_sized(preset: str, mode: str = "train", objects: int = 1) -> TrainConfi
     )
     return dataclasses.replace(
         config,
-        model=dataclasses.replace(
-            config.model, encoder=dataclasses.replace(config.model.encoder, num_groups=NUM_GROUPS)
-        ),
+        model=dataclasses.replace(config.model, encoder=encoder, sampling=sampling),
         loss=loss,
         batch_objects=objects,
         views_per_object=1,

@@ -126,7 +126,7 @@ def sheets(curves: Mapping[str, Mapping[int, Sequence[Marks]]], folders: Mapping
         rows = next(iter(runs.values()))
         chosen = [min(rows, key=lambda row: abs(row["step"] / rows[-1]["step"] - share)) for share in SHEET_MARKS]
         for row in {row["step"]: row for row in chosen}.values():
-            with np.load(folders[preset] / f"{row['step']:07d}.npz") as strips:
+            with np.load(folders[preset] / f"{row['step']:07d}.npz", allow_pickle=False) as strips:
                 found = [strips[name] for name in strips.files]
             if not cells:
                 cells, heads, columns = [found[::2]], ["reference"], row["shown"]
