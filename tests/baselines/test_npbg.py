@@ -18,6 +18,8 @@ from spnr_jax.kernels.records import Camera
 from spnr_jax.presets import PRESETS
 from spnr_jax.training import optimisation
 
+pytestmark = pytest.mark.ci  # it trains a baseline
+
 CONFIG = NPBGConfig(encoder_widths=(8, 9, 10), decoder_widths=(5, 4), image_resolution=16)
 SIZE = CONFIG.image_resolution
 BACKGROUND = jnp.array([0.1, 0.2, 0.3, 0.4, 0.5])

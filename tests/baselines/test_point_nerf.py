@@ -20,6 +20,8 @@ from spnr_jax.method import inference
 from spnr_jax.presets import PRESETS
 from spnr_jax.training import optimisation, pixels
 
+pytestmark = pytest.mark.ci  # it trains a baseline
+
 CONFIG = tiny_model.POINT_NERF
 MODULE = PointNeRF(CONFIG)
 TRAINING = dataclasses.replace(

@@ -17,6 +17,8 @@ from spnr_jax.baselines.sizes import Points2NeRFConfig
 from spnr_jax.config import OptimizerConfig
 from spnr_jax.method import inference
 
+pytestmark = pytest.mark.ci  # it trains a baseline
+
 FAITHFUL = Points2NeRFConfig(
     kl_weight=0.01,
     point_widths=(8, 6),

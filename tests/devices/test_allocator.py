@@ -10,6 +10,8 @@ import pytest
 
 from spnr_jax.devices import allocator
 
+pytestmark = pytest.mark.ci  # it measures memory
+
 THREADS = 6
 CHILD = f"""
 import ctypes, os, sys, threading

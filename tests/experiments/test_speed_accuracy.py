@@ -112,6 +112,7 @@ def test_a_setting_is_scored_and_timed_and_fewer_pixels_are_enlarged(balls):
     assert found[0] != found[1]
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("size", [24, 48])
 def test_what_an_upsampler_draws_at_its_own_size_is_scored_at_any(balls, size):
     dataset, model = data_sets.open_dataset(balls), load(str(tiny_untrained.run()))

@@ -18,7 +18,7 @@ from spnr_jax.gaussians.harmonics import C0
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install playwright")
 
 SIZE = 200
-pytestmark = [chromium_of.needed, three_js.needed_with_splats]
+pytestmark = [chromium_of.needed, three_js.needed_with_splats, pytest.mark.ci]  # it opens a browser
 SCRIPT = """
 import * as THREE from "three/webgpu";
 import { GLTFLoader } from "add/loaders/GLTFLoader.js";

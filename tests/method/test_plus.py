@@ -136,6 +136,7 @@ class TestHandle:
         assert grid.values[0, 0, 0] == 0
 
 
+@pytest.mark.ci
 class TestTraining:
     def test_learns_two_balls_and_their_opacity(self):
         config = dataclasses.replace(

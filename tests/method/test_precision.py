@@ -18,6 +18,8 @@ from spnr_jax.method.march import trace
 from spnr_jax.model_config import AS_TRAINED
 from spnr_jax.training import optimisation
 
+pytestmark = pytest.mark.ci  # it trains several networks
+
 BF16_MODEL = dataclasses.replace(MODEL, precision="bfloat16")
 BF16 = dataclasses.replace(CONFIG, model=BF16_MODEL)
 CONVOLUTION = re.compile(r":(\w+)\[[\d,]*\] = conv_general_dilated")

@@ -39,6 +39,7 @@ def scene(trained, points):
     return solid.encode(trained.variables, points, config=SOLID)
 
 
+@pytest.mark.ci
 def test_a_small_picture_is_the_network_s_own(trained, scene):
     view = camera(solid.MOST_PIXELS)
     found = solid.seen(trained.variables, scene, view, config=SOLID)

@@ -240,6 +240,7 @@ CONFIG = TrainConfig(
 )
 
 
+@pytest.mark.ci
 class TestTraining:
     def test_learns_with_the_network_before_it(self):
         batch, state = tiny_training.batch(), optimisation.jitted_create_state(CONFIG)

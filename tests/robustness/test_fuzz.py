@@ -127,6 +127,7 @@ def test_damaged_files_are_read_or_refused_with_one_line_and_nothing_else_is_tou
     assert name == "metrics" or table[name]["refused"]
 
 
+@pytest.mark.ci
 @pytest.mark.skipif(IN_CHILD, reason="this is the child")
 def test_damaged_laz_files_end_no_process():
     """The library that unpacks .laz can abort its process: they are read in a child."""

@@ -41,7 +41,7 @@ window.shown = {
   factors: [own.roughness, own.metalness],
 };
 """
-pytestmark = [chromium_of.needed, three_js.needed]
+pytestmark = [chromium_of.needed, three_js.needed, pytest.mark.ci]  # it opens a browser
 
 
 @pytest.fixture(scope="module")

@@ -37,6 +37,7 @@ def made_by(*arguments):
     return command_line.exit_code(cli, *arguments, *options)
 
 
+@pytest.mark.ci
 def test_splats_of_a_file_lie_around_its_points_in_its_units(cloud, tmp_path, capsys):
     out = tmp_path / "out.ply"
     code = made_by("export", cloud, "--splats", out, "--exposure", "-1")
@@ -51,6 +52,7 @@ def test_splats_of_a_file_lie_around_its_points_in_its_units(cloud, tmp_path, ca
     assert "splats" in capsys.readouterr().out
 
 
+@pytest.mark.ci
 def test_the_mesh_of_a_file_lies_around_its_points_in_its_units(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(splat_making.fitting_cameras, "__defaults__", (16, 64))
     monkeypatch.setattr(mesh_making.mesh_of_volume, "__defaults__", (40,))

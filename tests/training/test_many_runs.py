@@ -15,6 +15,8 @@ from experiments.speed.surfel_scene import random_crops
 from spnr_jax.training import many_runs, optimisation, shading
 from spnr_jax.training.run_by_run import run_by_run
 
+pytestmark = pytest.mark.ci  # it compiles steps of several runs
+
 
 def test_runs_in_one_compiled_step_are_the_loop_over_runs():
     """Seeds, and learning rates as factors: what a run moves by is the factor times what it would move by alone."""

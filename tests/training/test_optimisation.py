@@ -58,6 +58,7 @@ class TestState:
         assert adversary.first_adversarial_step(dataclasses.replace(CONFIG, loss=loss)) == first
 
 
+@pytest.mark.ci
 class TestGraph:
     @staticmethod
     def traced(state, config, adversarial):
@@ -232,6 +233,7 @@ class TestReproducibility:
         assert first["loss"] != later["loss"]
 
 
+@pytest.mark.ci
 def test_one_batch_is_learnt_by_heart(fresh_l1):
     """Two balls on white: sixty steps leave less than a third of the loss."""
     _, start = step(fresh_l1, L1_ONLY)
@@ -239,6 +241,7 @@ def test_one_batch_is_learnt_by_heart(fresh_l1):
     assert end["loss"] < start["loss"] / 3
 
 
+@pytest.mark.ci
 def test_adversarial_training_stays_finite_and_still_learns(fresh):
     _, start = step(fresh)
     _, end = run(fresh, 40)

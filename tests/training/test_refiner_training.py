@@ -20,6 +20,8 @@ from spnr_jax.method import inference
 from spnr_jax.training import checkpoint, metrics_log, optimisation, refiner_training, trainer
 from spnr_jax.training.weights import Trained
 
+pytestmark = pytest.mark.ci  # it trains several networks
+
 SIZE = tiny_dataset.CONFIG.model.image_resolution
 PLAIN = dataclasses.replace(
     tiny_dataset.CONFIG,

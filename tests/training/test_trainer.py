@@ -42,6 +42,7 @@ def test_a_stopped_run_goes_on_to_the_same_bits_and_rows(monkeypatch, tmp_path):
     assert rows_without_time(tmp_path) == rows_without_time(tiny_dataset.run())
 
 
+@pytest.mark.ci
 class TestBeginningWithOtherWeights:
     def test_the_first_step_starts_from_them_and_the_record_names_them(self, tmp_path):
         plain = tiny_untrained.CONFIG  # without a discriminator, which is not begun with
@@ -179,6 +180,7 @@ def test_a_state_that_is_not_finite_is_named_though_every_loss_is(monkeypatch, t
     assert not (tmp_path / "checkpoints").exists()
 
 
+@pytest.mark.ci
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["npbg", "point_nerf"])
 def test_a_baseline_is_trained_resumed_previewed_evaluated_and_loaded_like_ours(name, monkeypatch, tmp_path):

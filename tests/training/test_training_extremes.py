@@ -20,6 +20,8 @@ from spnr_jax.method import inference
 from spnr_jax.presets import BASELINES, OURS, PLUS, tiny
 from spnr_jax.training import adversary, batching, metrics_log, optimisation, trainer
 
+pytestmark = pytest.mark.ci  # it trains several networks
+
 EVERY_STEP = trainer.Schedule(log_every=1, preview_every=100, checkpoint_every=100)
 NAMED = re.compile(r"(\w+) is (?:nan|inf|-inf) at step (\d+); the last checkpoint is kept")
 TAME = dataclasses.replace(

@@ -22,7 +22,7 @@ playwright = pytest.importorskip("playwright.sync_api", reason="playwright is no
 
 SIZE = 200
 WAIT = 60_000  # milliseconds, for a machine that does much else
-pytestmark = chromium_of.needed
+pytestmark = [chromium_of.needed, pytest.mark.ci]  # it opens a browser
 
 
 @pytest.fixture(scope="module")

@@ -24,6 +24,8 @@ from spnr_jax.viewer import server, session, splats  # noqa: E402
 from spnr_jax.viewer.gui import Reading  # noqa: E402
 from spnr_jax.viewer.loop import Loop  # noqa: E402
 
+pytestmark = pytest.mark.ci  # it opens a browser
+
 
 @functools.cache
 def model():

@@ -21,6 +21,8 @@ from spnr_jax.formats.cut import Cut  # noqa: E402
 from spnr_jax.tools.light_options import Lighting  # noqa: E402
 from spnr_jax.viewer import server  # noqa: E402
 
+pytestmark = pytest.mark.ci  # it opens a browser
+
 WAIT = 40  # seconds, for a machine that does much else
 
 

@@ -51,6 +51,7 @@ def finished(meshes, tmp_path_factory):
     return out
 
 
+@pytest.mark.ci
 def test_two_workers_an_interruption_and_killed_workers_end_with_the_same_bytes(meshes, finished, tmp_path):
     out = tmp_path / "set"
     command = ["generate", str(out), "--meshes", str(meshes), *SMALL, "--workers", "2", "--test-fraction", "0.25"]

@@ -16,6 +16,8 @@ from data_gen.render import views
 from data_gen.store import check, layout, storage
 from spnr_jax.devices import cluster
 
+pytestmark = pytest.mark.ci  # it renders several data sets
+
 ROOT = Path(__file__).parents[3]
 
 

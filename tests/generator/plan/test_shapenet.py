@@ -15,6 +15,8 @@ from spnr_jax.formats.mesh.assets import RejectedAsset
 from spnr_jax.formats.mesh.meshes import load_mesh
 from spnr_jax.formats.mesh.texels import srgb_to_linear
 
+pytestmark = pytest.mark.ci  # it renders several data sets
+
 TINY = ["--resolution", 16, "--views", 2, "--points", 64, "--spp", 4, "--visibility-grid", 1, "--workers", 2]
 TEXELS = np.random.default_rng(2).integers(60, 200, (4, 4, 3))
 # as the converters wrote them: doubled faces, an unused texture coordinate, a face group, several kinds of statement
