@@ -71,6 +71,8 @@ def test_an_untrained_network_is_probed_in_every_layer_and_others_are_refused(tm
     assert set(found["layers"]) == {"points", "stem", "volume"}
     assert all(np.isfinite(values).all() and max(values) <= 1 for values in found["layers"].values())
     with pytest.raises(UserError, match="no volume"):
-        color_probe.probed(dataclasses.replace(network(config), config=presets.PRESETS["npbg_tiny"]()), dataset, options)
+        color_probe.probed(
+            dataclasses.replace(network(config), config=presets.PRESETS["npbg_tiny"]()), dataset, options
+        )
     with pytest.raises(UserError, match="objects"):
         dataclasses.replace(options, objects=0)

@@ -50,6 +50,7 @@ def test_a_pcd_cut_anywhere_is_refused_in_one_line(tmp_path, encoding):
         (b"TYPE F F U F F F", b"TYPE F F U F F", "disagree"),
         (b"TYPE F F U F F F", b"TYPE F F U F F Q", "disagree"),
         (b"SIZE 4 4 1 4 4 8", b"SIZE 4 4 1 4 8 4", "rgb"),
+        (b"COUNT 1 1 3 1 1 1", b"COUNT 1 1 2147483647 1 1 1", "bytes; expected at most"),
         (b"POINTS 4", b"POINTS -4", "-4"),
         (b"DATA binary", b"DATA packed", "packed"),
         (b"HEIGHT 1", b"SHAPE 1", "SHAPE"),
