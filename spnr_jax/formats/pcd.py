@@ -18,7 +18,7 @@ from spnr_jax.errors import UserError
 from spnr_jax.formats.ply import binary_rows, text_rows
 
 HEADER_LIMIT = 2**16  # bytes
-POINT_LIMIT = 2**16  # bytes: the largest histograms have some hundreds of numbers, and NumPy crashes on records of GiB
+POINT_LIMIT = 2**16  # bytes: histograms have some hundreds of numbers, and NumPy crashes on records of 2 GiB
 ENTRIES = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA")
 ENCODINGS = ("ascii", "binary", "binary_compressed")
 KINDS = {"F": "f", "I": "i", "U": "u"}
@@ -101,8 +101,9 @@ def _header(data: bytes) -> PcdHeader:
         layout = np.dtype(fields).newbyteorder("<")
     except (KeyError, IndexError, TypeError, ValueError) as error:
         raise UserError(f"has a PCD header whose FIELDS, SIZE, TYPE, COUNT and POINTS disagree ({error})") from None
-    if layout.itemsize > POINT_LIMIT:
-        raise UserError(f"has a PCD header with points of {layout.itemsize} bytes; expected at most {POINT_LIMIT}")
+    size = sum(size * count for size, count in zip(sizes, counts, strict=True))  # that of the layout can overflow
+    if size > POINT_LIMIT:
+        raise UserError(f"has a PCD header with points of {size} bytes; expected at most {POINT_LIMIT}")
     if num_points < 0:
         raise UserError(f"has a PCD header that announces {num_points} points")
     organised = entries.get("HEIGHT", ["1"])[:1] not in (["0"], ["1"])
