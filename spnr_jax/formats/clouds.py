@@ -125,6 +125,7 @@ def place_cloud(
     return PlacedCloud(cloud=_float32(positions @ rotation.T, values), up=up, rotation=rotation, origin=origin)
 
 
+@np.errstate(all="ignore")  # of signalling NaN, and what leaves its type: both are looked for
 def cloud_of_ply(content: bytes) -> PointCloud:
     """The cloud in the bytes of a PLY file of points, y up: (points, ...) float32; ValueError says what is wrong.
 
@@ -162,6 +163,7 @@ def _is_mesh(path: Path) -> bool:
         return read_ply_header(file).is_mesh
 
 
+@np.errstate(all="ignore")  # of signalling NaN, and what leaves its type: both are looked for
 def _read(
     path: Path,
     num_points: int | None,
@@ -270,8 +272,7 @@ def _sound(columns: Columns) -> np.ndarray:
     """Mask (points,) of rows whose position and materials are numbers that float32 holds."""
     names = [name for name in (*POSITION, *LINEAR, *SRGB, *DEFAULTS) if name in columns]
     largest = np.finfo(np.float32).max
-    with np.errstate(all="ignore"):  # signalling NaN and what leaves the type
-        return np.logical_and.reduce([np.abs(np.asarray(columns[name], np.float64)) < largest for name in names])
+    return np.logical_and.reduce([np.abs(np.asarray(columns[name], np.float64)) < largest for name in names])
 
 
 def _all_sound(columns: Columns) -> Columns:

@@ -107,11 +107,10 @@ def normals(columns: Columns) -> np.ndarray | None:
     """Normals (points, 3) of unit length, 0 where a row has none that can be used; None if no row has one."""
     if not set(NORMAL) <= columns.keys() or any(columns[name].dtype.kind == "u" for name in NORMAL):
         return None  # numbers without a sign encode a normal in some way of their own
-    with np.errstate(all="ignore"):  # signalling NaN, too
-        vectors = np.stack([np.asarray(columns[name], np.float64) for name in NORMAL], axis=-1)
-        length = np.linalg.norm(vectors, axis=-1, keepdims=True)
-        usable = np.isfinite(length) & (length > SHORTEST)
-        return np.where(usable, vectors / np.where(usable, length, 1), 0) if usable.any() else None
+    vectors = np.stack([np.asarray(columns[name], np.float64) for name in NORMAL], axis=-1)
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    usable = np.isfinite(length) & (length > SHORTEST)
+    return np.where(usable, vectors / np.where(usable, length, 1), 0) if usable.any() else None
 
 
 def _base_color(columns: Columns, report: Report) -> np.ndarray | None:

@@ -14,7 +14,6 @@ C0 = 0.5 / np.sqrt(np.pi)  # the constant spherical harmonic
 LEAST_OPACITY = 0.2  # splats below it are fog, not surface
 
 
-@np.errstate(invalid="ignore")  # of a NaN that signals, as damaged files hold them; the reader leaves its row out
 def points_of_splats(columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """The columns x y z red green blue (0 to 1) of the splats that are opaque enough."""
     kept = slice(None)
