@@ -287,8 +287,7 @@ def _points_of_columns(columns: Columns, report: Callable[[str], None]):
     """Positions (points, 3) float64, their origin (3,), materials and normals, if any, of useful columns."""
     if not columns or len(columns["x"]) == 0:
         raise UserError("holds 0 points")
-    positions = stacked(columns)
-    origin = np.zeros(3)
+    positions, origin = stacked(columns), np.zeros(3)
     extent, step = np.ptp(positions, axis=0).max(), np.spacing(np.float32(np.abs(positions).max()))
     if step > COARSEST_STEP * extent > 0:
         if columns["x"].dtype == np.float32:
