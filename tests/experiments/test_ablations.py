@@ -60,6 +60,8 @@ class TestRows:
             "skip_concat": {"model.encoder.skip": "concat"},
             "no_fine_samples": {"model.sampling.num_coarse": 32, "model.sampling.num_fine": 0},
             "no_view_direction": {"model.sees_direction": False},
+            "plain_inputs": {"model.encoder.inputs": "plain"},
+            "fewer_channels": {"model.encoder.base_width": 8},
             "scatter_max": {"model.encoder.scatter": "max"},
             "scatter_trilinear": {"model.encoder.scatter": "trilinear"},
             "adversarial": {},  # tiny has it
@@ -95,9 +97,12 @@ class TestRows:
         plus = dataclasses.replace(presets.plus_tiny(), num_steps=77)
         assert changed("paper", plus) == dataclasses.replace(presets.tiny(), num_steps=77)
         model, larger = changed("paper", presets.plus_small()).model, presets.plus_small().model
+        tiny = presets.tiny().model
         assert (model.image_resolution, model.method) == (128, "paper")
         assert model.field_width == larger.field_width
-        assert model.encoder == dataclasses.replace(larger.encoder, point_norm="batch")
+        assert model == dataclasses.replace(
+            tiny, render_resolution=64, resize_resolution=64, image_resolution=larger.image_resolution
+        )
         assert changed("paper", presets.tiny()) == presets.tiny()
 
     @staticmethod

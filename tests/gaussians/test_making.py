@@ -103,6 +103,7 @@ def test_splats_that_stick_out_of_the_silhouettes_are_left_out():
     assert np.linalg.norm(kept.position, axis=1).max() < 1.05 * RADIUS
 
 
+@pytest.mark.ci
 def test_refining_brings_decibels_and_moves_splats_little():
     refinement = refining.Refinement(colored(), views())
     losses = [refinement.step() for _ in range(40)]

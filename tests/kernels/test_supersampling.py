@@ -100,6 +100,7 @@ def test_a_small_picture_is_the_large_one_averaged():
     assert np.mean(apart > 1e-4) < 0.01  # but for a ray that rounding moves over a face of a cell
 
 
+@pytest.mark.ci
 def test_the_handle_takes_several_rays_for_the_best_picture_alone():
     config = dataclasses.replace(PLUS, image_resolution=16)
     variables = wobbled(jax.jit(inference.network(config).init)(jax.random.key(0), cloud(), camera()), 4)

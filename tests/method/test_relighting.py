@@ -39,6 +39,7 @@ def linear(model, volume, light, azimuth=30.0, quality="best"):
     return np.asarray(srgb_to_linear(jnp.clip(jnp.asarray(straight), 0, 1))), solid
 
 
+@pytest.mark.ci
 def test_black_light_gives_black(model, body):
     image, solid = linear(model, model.encode(body), spnr_jax.ambient((0.0, 0.0, 0.0)))
     assert image[solid].max() < 2e-3  # what an opacity of .999 leaves of the white behind

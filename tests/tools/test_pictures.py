@@ -116,6 +116,7 @@ def test_a_transparent_still_has_an_alpha_channel_and_chosen_outputs_alone_are_w
     assert shown(out / "chair_000.png").shape == (24, 24, 4)
 
 
+@pytest.mark.ci
 def test_the_density_grid_is_written_with_its_place_and_the_mesh_in_the_frame_of_the_file(tmp_path, monkeypatch):
     monkeypatch.setattr(depth_maps, "HIT", 1e-3)  # the tests' network is untrained: all fog
     monkeypatch.setattr(splat_making.fitting_cameras, "__defaults__", (12, 24))

@@ -12,6 +12,8 @@ from spnr_jax.surfels.visibility import spiral
 from spnr_jax.tools import mesh_making, splat_export, splat_making
 from spnr_jax.tools.light_options import Lighting
 
+pytestmark = pytest.mark.ci  # it makes splats with the network of the package
+
 cli = command_line.unchecked_cli()
 
 
@@ -37,7 +39,6 @@ def made_by(*arguments):
     return command_line.exit_code(cli, *arguments, *options)
 
 
-@pytest.mark.ci
 def test_splats_of_a_file_lie_around_its_points_in_its_units(cloud, tmp_path, capsys):
     out = tmp_path / "out.ply"
     code = made_by("export", cloud, "--splats", out, "--exposure", "-1")
@@ -52,7 +53,6 @@ def test_splats_of_a_file_lie_around_its_points_in_its_units(cloud, tmp_path, ca
     assert "splats" in capsys.readouterr().out
 
 
-@pytest.mark.ci
 def test_the_mesh_of_a_file_lies_around_its_points_in_its_units(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(splat_making.fitting_cameras, "__defaults__", (16, 64))
     monkeypatch.setattr(mesh_making.mesh_of_volume, "__defaults__", (40,))

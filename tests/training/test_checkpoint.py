@@ -97,6 +97,7 @@ def test_a_damaged_newest_checkpoint_is_named_and_the_one_before_is_taken(damage
     assert "\n" not in said[0]
 
 
+@pytest.mark.ci
 def test_damage_to_a_single_file_costs_the_checkpoint_or_nothing(run):
     whole = checkpoint.restore(run, CONFIG)
     taken = []

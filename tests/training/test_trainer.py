@@ -31,6 +31,7 @@ def restored(run):
     return checkpoint.restore(run, CONFIG)
 
 
+@pytest.mark.ci
 def test_a_stopped_run_goes_on_to_the_same_bits_and_rows(monkeypatch, tmp_path):
     with monkeypatch.context() as patch:
         interrupted(patch, batching, 3)

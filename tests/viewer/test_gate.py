@@ -166,6 +166,7 @@ def foreign():
         site.shutdown()
 
 
+@pytest.mark.ci
 @chromium_of.needed
 def test_a_page_of_another_site_reads_nothing_while_the_viewer_is_open_in_the_same_browser(running, foreign):
     playwright = pytest.importorskip("playwright.sync_api", reason="pip install playwright")

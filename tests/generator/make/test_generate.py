@@ -245,6 +245,7 @@ def test_generating_a_finished_set_again_does_nothing(meshes, finished):
     assert {path: path.stat().st_mtime_ns for path in (finished / "objects").rglob("*")} == before
 
 
+@pytest.mark.ci
 def test_each_view_may_have_its_own_light_which_is_kept_and_lights_its_picture(meshes, tmp_path):
     two, out, again = tmp_path / "meshes", tmp_path / "set", tmp_path / "again"
     two.mkdir()
