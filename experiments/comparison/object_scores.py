@@ -7,10 +7,12 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import jax.numpy as jnp
 import numpy as np
 
 from spnr_jax.config import TrainConfig
 from spnr_jax.formats import data_sets
+from spnr_jax.kernels.metrics import psnr
 from spnr_jax.scoring import evaluation
 from spnr_jax.scoring.lpips import LpipsWeights
 from spnr_jax.scoring.report import duration
@@ -19,7 +21,6 @@ from spnr_jax.scoring.summary import Scores, summarise
 ObjectMethod = Callable[[data_sets.ObjectData], evaluation.Pictures]
 PROGRESS_LINES = 20
 OPAQUE = 0.5  # opacity of the reference from which a pixel lies inside the silhouette
-MOST_DECIBELS = 100.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,14 +111,29 @@ def by_category(scores: dict[str, dict[str, Scores]]) -> dict[str, dict]:
     return {c: summarise([scores[name] for name in names]) for c, names in classes.items()} if len(classes) > 1 else {}
 
 
+def silhouette(item: data_sets.ObjectData) -> np.ndarray:
+    """Pixels (views, height, width) that the object covers by more than half."""
+    return item.images[..., 3] > 255 * OPAQUE
+
+
 def mean_colors(item: data_sets.ObjectData, image: np.ndarray) -> np.ndarray:
     """Mean colour (views, 3) of pictures of an object inside the silhouette."""
-    inside = (item.images[..., 3:] > 255 * OPAQUE).astype(np.float64)
+    inside = silhouette(item)[..., None].astype(np.float64)
     return (np.asarray(image, np.float64) * inside).sum(axis=(1, 2)) / np.maximum(inside.sum(axis=(1, 2)), 1)
 
 
-def color_psnr(item: data_sets.ObjectData, reference: np.ndarray, image: np.ndarray, hue: bool = False) -> np.ndarray:
-    """PSNR (views,) of the mean colour inside the silhouette, or of its hue, which lies around its mean channel."""
-    error = mean_colors(item, image) - mean_colors(item, reference)
-    error = error - error.mean(axis=-1, keepdims=True) if hue else error
-    return np.minimum(-10 * np.log10(np.maximum(np.mean(error**2, axis=-1), 1e-30)), MOST_DECIBELS)
+def hue(colors: np.ndarray) -> np.ndarray:
+    """What colours (..., 3) have beside their mean channel; grey has none."""
+    return colors - colors.mean(axis=-1, keepdims=True)
+
+
+def color_scores(item: data_sets.ObjectData, reference: np.ndarray, image: np.ndarray) -> Scores:
+    """PSNR of the mean colour inside the silhouette, and of its hue, of each view: whether a red car is red."""
+    pair = [mean_colors(item, picture) for picture in (image, reference)]
+    return {"color": _psnr_of_colors(pair), "hue": _psnr_of_colors([hue(colors) for colors in pair])}
+
+
+def _psnr_of_colors(pair: list[np.ndarray]) -> np.ndarray:
+    return np.asarray(
+        psnr(*(jnp.asarray(colors, jnp.float32)[:, None, None] for colors in pair))
+    )  # pictures of a pixel

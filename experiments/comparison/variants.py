@@ -21,7 +21,7 @@ import numpy as np
 from experiments.comparison import budget as budgets
 from experiments.comparison import results_folder
 from experiments.comparison.budget import Trained
-from experiments.comparison.object_scores import OPAQUE, Shown, color_psnr, of_cloud, score_objects
+from experiments.comparison.object_scores import Shown, color_scores, of_cloud, score_objects, silhouette
 from experiments.comparison.trained_networks import test_objects
 from spnr_jax.config import TrainConfig
 from spnr_jax.errors import UserError, at_least
@@ -256,10 +256,9 @@ def joined(seeds: Sequence[Scores]) -> Scores:
 
 def more_scores(item: data_sets.ObjectData, pictures: evaluation.Pictures) -> Scores:
     """PSNR inside the silhouette, of its mean colour and hue; high-frequency energy over the reference's; by view."""
-    inside = item.images[..., 3] > 255 * OPAQUE
     image, reference = np.asarray(pictures.image), data_sets.on_white(item.images)
-    colors = {name: color_psnr(item, reference, image, name == "hue") for name in ("color", "hue")}
-    return jax.device_get(_more_scores(image, reference, inside)) | colors
+    more = jax.device_get(_more_scores(image, reference, silhouette(item)))
+    return more | color_scores(item, reference, image)
 
 
 @jax.jit

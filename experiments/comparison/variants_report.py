@@ -12,7 +12,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from experiments.comparison import figures, results_folder, variants
-from experiments.comparison.variants import OPAQUE, Budget, Compared, Variant
+from experiments.comparison.object_scores import OPAQUE
+from experiments.comparison.variants import Budget, Compared, Variant
 from spnr_jax.devices import machine
 from spnr_jax.formats import data_sets, images
 from spnr_jax.scoring import evaluation

@@ -22,7 +22,7 @@ from jaxtyping import Float
 
 from experiments import entry_point
 from experiments.comparison import results_folder
-from experiments.comparison.object_scores import mean_colors
+from experiments.comparison.object_scores import hue, mean_colors
 from experiments.comparison.trained_networks import Network, Sources, networks
 from spnr_jax import cli
 from spnr_jax.devices import machine
@@ -136,8 +136,7 @@ def hue_followed(network: Network, dataset: data_sets.Dataset) -> tuple[float, f
         item = data_sets.read_object(dataset, name)
         image = method(data_sets.test_cloud(item, network.config), item.camera).image
         pairs.append([mean_colors(item, picture) for picture in (data_sets.on_white(item.images), np.asarray(image))])
-    reference, drawn = (np.concatenate(colors) for colors in zip(*pairs, strict=True))
-    reference, drawn = (colors - colors.mean(axis=-1, keepdims=True) for colors in (reference, drawn))
+    reference, drawn = (hue(np.concatenate(colors)) for colors in zip(*pairs, strict=True))
     product, power = np.sum(reference * drawn), np.sum(reference**2)
     return float(product / power), float(product / np.sqrt(power * np.sum(drawn**2)))
 

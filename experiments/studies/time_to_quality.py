@@ -11,7 +11,7 @@ study goes on from the last checkpoint; several may share a folder, if each trai
     OUT/paces/PRESET.json           processor seconds of a step, without and with the discriminator
     OUT/runs/PRESET_SEED/           the run folder
     OUT/marks/PRESET_SEED/STEP.json scores of each object, and seconds; STEP.npz pictures of a few objects
-    OUT/results.json  table.md  curves_GROUP.png  sheet_GROUP.png
+    OUT/results.json  table.md  curves_GROUP.png  sheet.png
 """
 
 import dataclasses
@@ -29,7 +29,7 @@ import numpy as np
 
 from experiments import entry_point
 from experiments.comparison import budget, results_folder
-from experiments.comparison.object_scores import color_psnr
+from experiments.comparison.object_scores import color_scores, of_cloud, score_objects
 from experiments.comparison.trained_networks import test_objects
 from experiments.studies import time_to_quality_report as report
 from experiments.studies.time_to_quality_report import Marks
@@ -38,8 +38,10 @@ from spnr_jax.config import TrainConfig
 from spnr_jax.devices import machine
 from spnr_jax.errors import UserError, at_least
 from spnr_jax.formats import data_sets
+from spnr_jax.formats.images import to_uint8
 from spnr_jax.presets import PRESETS
 from spnr_jax.scoring import evaluation
+from spnr_jax.scoring.summary import Scores
 from spnr_jax.training import adversary, optimisation, run_record, trainer
 
 
@@ -172,22 +174,23 @@ def mark(
     place: Path,
 ) -> Marks:
     """Scores of the averaged network, and what its training took so far; its pictures are kept beside."""
-    step, variables = int(state.step), optimisation.averaged_variables(state)
+    step, method = int(state.step), config.model.method
     shown = test_objects(dataset, options.objects)
     names = test_objects(dataset, None) if step == config.num_steps else shown
-    methods, scores, strips = {"network": evaluation.network(variables, config)}, {}, []
-    to_show = evaluation.spread(shown, options.shown)
-    for name in names:
-        item = data_sets.read_object(dataset, name)
-        result = evaluation.evaluate_object(methods, config, item)
-        found = {metric: result.scores["network"][metric] for metric in ("psnr", "flip", "iou")}
-        if config.model.method == "npbg":
-            del found["iou"]  # it predicts colours alone
-        found["color"] = color_psnr(item, result.reference, np.asarray(result.pictures["network"].image))
-        scores[name] = {metric: np.asarray(values).tolist() for metric, values in found.items()}
-        if name in to_show:
-            strips += [result.reference[0], np.asarray(result.pictures["network"].image)[0]]
-    strips = [np.uint8(np.round(255 * np.clip(strip, 0, 1))) for strip in strips]
+    to_show, strips = evaluation.spread(shown, options.shown), []
+
+    def more(item: data_sets.ObjectData, pictures: evaluation.Pictures) -> Scores:
+        reference, image = data_sets.on_white(item.images), np.asarray(pictures.image)
+        if item.name in to_show:
+            strips.extend(to_uint8(picture[0]) for picture in (reference, image))
+        return color_scores(item, reference, image)
+
+    network = of_cloud(evaluation.network(optimisation.averaged_variables(state), config), config)
+    scored = score_objects({method: network}, config, dataset, names, 0, None, more)
+    scores = {
+        name: {metric: of[method][metric].tolist() for metric in report.METRICS if metric in of[method]}
+        for name, of in scored.scores.items()
+    }
     results_folder.kept(place.with_suffix(".npz"), lambda: strips)
     return {"step": step, "seconds": training_seconds(run), "shown": list(to_show), "scores": scores}
 

@@ -85,8 +85,7 @@ def plain_names(table: np.ndarray) -> tuple[str, ...]:
 
 def _are_normals(vectors: np.ndarray) -> bool:
     """Whether vectors (n, 3) have length 1, up to rounding, and are not all in the octant of colours."""
-    with np.errstate(all="ignore"):  # signalling NaN
-        lengths = np.linalg.norm(np.asarray(vectors, np.float64), axis=-1)
+    lengths = np.linalg.norm(np.asarray(vectors, np.float64), axis=-1)
     return bool((vectors < 0).any() and np.median(np.abs(lengths - 1)) < UNIT_LENGTH)
 
 

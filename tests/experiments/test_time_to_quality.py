@@ -8,8 +8,9 @@ import pytest
 from support import tiny_dataset
 from support.tiny_runs import forbidden, shrunken
 
+from experiments.comparison.object_scores import color_scores
 from experiments.studies import time_to_quality
-from experiments.studies.time_to_quality import Pace, TimeToQuality, color_psnr
+from experiments.studies.time_to_quality import Pace, TimeToQuality
 from experiments.studies.time_to_quality_report import reached
 from spnr_jax import presets
 from spnr_jax.errors import UserError
@@ -57,10 +58,12 @@ def test_the_colour_error_is_of_the_mean_inside_the_silhouette_alone():
     reference = data_sets.on_white(item.images)
     inside = item.images[..., 3:] > 127.5
     assert inside.any(axis=(1, 2)).all()
-    np.testing.assert_allclose(color_psnr(item, reference, reference + np.where(inside, 0.1, 0.5)), 20.0, atol=1e-4)
+    found = color_scores(item, reference, reference + np.where(inside, 0.1, 0.5))
+    np.testing.assert_allclose(found["color"], 20.0, atol=1e-4)
+    assert (found["hue"] > 99).all()
     checks = np.indices(inside.shape[1:3]).sum(axis=0)[..., None] % 2 - 0.5
     balance = (checks * inside).sum(axis=(1, 2), keepdims=True) / inside.sum(axis=(1, 2), keepdims=True)
-    assert (color_psnr(item, reference, reference + np.where(inside, checks - balance, 0.5)) > 60).all()
+    assert (color_scores(item, reference, reference + np.where(inside, checks - balance, 0.5))["color"] > 60).all()
 
 
 @pytest.mark.ci  # it trains a network
@@ -89,7 +92,7 @@ def test_a_stopped_run_goes_on_and_a_finished_one_is_only_read(tmp_path, monkeyp
         assert set(rows[1]["scores"]) == set(tiny_dataset.dataset().splits["test"])
         for picture in [*tmp_path.glob("curves_*.png"), tmp_path / "sheet.png"]:
             assert picture.read_bytes().startswith(b"\x89PNG")
-        monkeypatch.setattr(time_to_quality.evaluation, "evaluate_object", forbidden)
+        monkeypatch.setattr(time_to_quality, "score_objects", forbidden)
         time_to_quality.main(options)
         assert (tmp_path / "results.json").read_bytes() == first
     with pytest.raises(UserError, match="seconds"):
