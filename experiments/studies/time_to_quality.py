@@ -177,7 +177,7 @@ def mark(
     step, method = int(state.step), config.model.method
     shown = test_objects(dataset, options.objects)
     names = test_objects(dataset, None) if step == config.num_steps else shown
-    to_show, strips = evaluation.spread(shown, options.shown), []
+    to_show, strips = evaluation.spread(shown, options.shown), list[np.ndarray]()
 
     def more(item: data_sets.ObjectData, pictures: evaluation.Pictures) -> Scores:
         reference, image = data_sets.on_white(item.images), np.asarray(pictures.image)
