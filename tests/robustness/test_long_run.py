@@ -86,7 +86,7 @@ def test_each_kind_of_work_compiles_when_it_is_done_for_the_first_time_and_never
     assert {"step", "preview"} <= {phase for phase, _, _ in seen.compiled}
     assert not again(seen)
     assert [step for step, *_ in seen.samples] == [8, 16, 24], "read when the preview's memory was given back"
-    assert seen.phases[-5:] == ["step", "row", "preview", "checkpoint", "saved", "end"]
+    assert seen.phases[-6:] == ["step", "row", "preview", "checkpoint", "saved", "end"]
 
 
 def test_what_compiles_at_every_preview_is_seen():
