@@ -75,7 +75,7 @@ def test_no_dependency_of_an_extra_is_imported_before_it_is_needed():
     code += ", spnr_jax.scoring.report; print(*sys.modules)"
     loaded = set(output_of(sys.executable, "-c", code, cwd=ROOT).split())
     unneeded = {"mitsuba", "dask", "fsspec", "viser", "laspy", "imageio_ffmpeg", "pymeshlab", "torch"}
-    unneeded |= {"DracoPy", "opengl_basisu"}
+    unneeded |= {"DracoPy", "meshoptimizer", "opengl_basisu"}
     assert not loaded & (unneeded | {"trimesh", "skimage", "matplotlib", "grain", "orbax"})
 
 

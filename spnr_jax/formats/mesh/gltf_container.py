@@ -12,8 +12,7 @@ import numpy as np
 
 from spnr_jax.formats.mesh.assets import RejectedAsset
 from spnr_jax.formats.mesh.companions import read_companion
-from spnr_jax.formats.mesh.meshopt_indices import decode_sequence, decode_triangles
-from spnr_jax.formats.mesh.meshopt_vertices import decode_vertices, unfiltered
+from spnr_jax.formats.mesh.meshopt import unpack
 
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
@@ -114,15 +113,6 @@ def scaled(values: np.ndarray, accessor: dict) -> np.ndarray:
     if accessor.get("normalized") and values.dtype.kind in "iu":
         return np.maximum(values.astype(np.float64) / np.iinfo(values.dtype).max, -1)
     return values.astype(np.float64 if values.dtype.kind == "f" else np.int64)
-
-
-def unpack(data: memoryview, packed: dict) -> bytes:
-    """The bytes of a buffer view that meshopt packed, as its extension describes them."""
-    mode, count, stride = packed["mode"], packed["count"], packed["byteStride"]
-    if mode == "ATTRIBUTES":
-        return unfiltered(decode_vertices(bytes(data), count, stride), packed.get("filter", "NONE")).tobytes()
-    decode = {"TRIANGLES": decode_triangles, "INDICES": decode_sequence}[mode]
-    return decode(bytes(data), count).astype({2: "<u2", 4: "<u4"}[stride]).tobytes()
 
 
 def _split_glb(data: bytes) -> tuple[bytes, bytes | None]:

@@ -35,7 +35,7 @@ def read_image(data: bytes, name: str) -> np.ndarray:
             if image.width * image.height > MOST_PIXELS:  # before memory is taken for them
                 raise UserError(f"{image.width} x {image.height} pixels, more than {MOST_PIXELS}")
             if image.mode.startswith("I"):  # PIL would clip 16-bit grey to 255 instead of scaling it
-                eight_bit = (np.asarray(image, np.int64) // 257).astype(np.uint8)
+                eight_bit = (np.asarray(image) // 257).astype(np.uint8)
                 return np.asarray(Image.fromarray(eight_bit).convert("RGBA"))
             return np.asarray(image.convert("RGBA"))
     except (UnidentifiedImageError, OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:

@@ -1,22 +1,17 @@
 """What meshopt packed is read as meshoptimizer's own decoder reads it; damaged and boasting data is refused."""
 
+import sys
+
 import numpy as np
 import pytest
 from support.gltf_files import CORNERS, SQUARE, GltfBuilder
 from support.packed_meshes import MESHOPT
 
 from spnr_jax.formats.mesh.assets import RejectedAsset
-from spnr_jax.formats.mesh.gltf_container import unpack
 from spnr_jax.formats.mesh.meshes import load_mesh
-from spnr_jax.formats.mesh.meshopt_indices import decode_sequence, decode_triangles
-from spnr_jax.formats.mesh.meshopt_vertices import decode_vertices, unfiltered
+from spnr_jax.formats.mesh.meshopt import unpack
 
 ROUNDED = {"directions in 8 bytes": "<i2"}  # the only one in which the last bit is a matter of rounding
-DECODERS = {
-    "ATTRIBUTES": lambda data, case: decode_vertices(data, case["count"], case["byteStride"]),
-    "TRIANGLES": lambda data, case: decode_triangles(data, case["count"]),
-    "INDICES": lambda data, case: decode_sequence(data, case["count"]),
-}
 
 
 @pytest.mark.parametrize("name", MESHOPT)
@@ -56,7 +51,7 @@ def test_data_cut_anywhere_is_refused(name):
     case = MESHOPT[name]
     for length in {*range(0, len(case["packed"]), 7), len(case["packed"]) - 1}:
         with pytest.raises(RejectedAsset):
-            DECODERS[case["mode"]](case["packed"][:length], case)
+            unpack(memoryview(case["packed"][:length]), case)
 
 
 @pytest.mark.parametrize("name", ["colours, format 0", "colours, format 1", "a grid", "a grid as a sequence"])
@@ -64,20 +59,27 @@ def test_a_count_that_the_data_does_not_hold_is_refused_before_room_is_made_for_
     case = MESHOPT[name]
     for count in (case["count"] * 2**6, 3 * 2**28, -3):
         with pytest.raises(RejectedAsset):
-            DECODERS[case["mode"]](case["packed"], case | {"count": count})
+            unpack(memoryview(case["packed"]), case | {"count": count})
 
 
 def test_widths_formats_and_filters_that_there_are_not_are_refused():
-    packed = MESHOPT["noise, format 0"]["packed"]
+    case = MESHOPT["noise, format 0"]
+    packed = case["packed"]
     for stride in (0, 3, 6, 260):
         with pytest.raises(RejectedAsset, match="broken"):
-            decode_vertices(packed, 40, stride)
-    with pytest.raises(RejectedAsset, match="unknown format"):
-        decode_vertices(b"\xa7" + packed[1:], 40, 4)
-    with pytest.raises(RejectedAsset, match="'SEPIA'"):
-        unfiltered(np.zeros((2, 4), np.uint8), "SEPIA")
-    with pytest.raises(RejectedAsset, match="filter"):
-        unfiltered(np.zeros((2, 12), np.uint8), "OCTAHEDRAL")
+            unpack(memoryview(packed), case | {"byteStride": stride})
+    with pytest.raises(RejectedAsset, match="broken"):
+        unpack(memoryview(b"\xa7" + packed[1:]), case)
+    for kind in ("SEPIA", "QUATERNION"):
+        with pytest.raises(RejectedAsset, match=f"filter '{kind}'"):
+            unpack(memoryview(packed), case | {"filter": kind})
+
+
+def test_a_missing_package_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "meshoptimizer", None)
+    case = MESHOPT["a grid"]
+    with pytest.raises(RejectedAsset, match=r"needs the package meshoptimizer .* 'spnr-jax\[meshes\]'"):
+        unpack(memoryview(case["packed"]), case)
 
 
 def plain_vertices(elements: np.ndarray) -> bytes:
