@@ -50,7 +50,7 @@ def _scatter(axes: Axes, rows: Sequence[dict], x: str, y: str) -> None:
                 across, up = ([max(row[name], 1) if name == "mb" else row[name] for row in shown] for name in (x, y))
                 axes.scatter(across, up, s=26, c=color, marker=marker, zorder=3, label=label)
     axes.set_xscale("log")
-    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axes.xaxis.set_major_locator(LogLocator(subs=(1, 3)))
     axes.xaxis.set_major_formatter(ScalarFormatter())
     axes.xaxis.set_minor_formatter(NullFormatter())
     axes.set_xlabel("ms a view" if x == "ms_view" else "MB of memory")

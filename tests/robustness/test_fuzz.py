@@ -80,6 +80,7 @@ def attempt(read, folder: Path, main: str) -> str:
     """Whether the files in a folder were read or refused; AssertionError for anything else."""
     start = time.process_time()
     with (
+        limited_memory(),
         watched(folder) as broken,
         warnings.catch_warnings(record=True) as said,
         contextlib.redirect_stdout(sys.stderr),
@@ -122,8 +123,7 @@ def fuzzed(name: str, folder: Path) -> Counter:
         counts[attempt(reader.read, folder, next(iter(seeds[number])))] += 1
         counts["slowest"] = max(counts["slowest"], time.perf_counter() - begin)
 
-    with limited_memory():
-        law()
+    law()
     return counts
 
 
@@ -166,7 +166,7 @@ MISDEEDS = {
 @pytest.mark.parametrize("name", MISDEEDS)
 def test_whatever_a_reader_does_that_it_must_not_is_seen(name, folder):
     misdeed, words = MISDEEDS[name]
-    with limited_memory(), pytest.raises(AssertionError, match=words):
+    with pytest.raises(AssertionError, match=words):
         attempt(lambda place, main: misdeed(place), folder, "a")
 
 

@@ -16,6 +16,7 @@ from spnr_jax.formats.mesh.assets import RejectedAsset, Wrap
 
 MAX_SIZE = 1024
 MOST_PIXELS = 2**26  # of an image file: 8192 x 8192
+STRIP = 512  # rows that are converted at a time
 
 
 def srgb_to_linear(encoded: np.ndarray) -> np.ndarray:
@@ -35,11 +36,19 @@ def read_image(data: bytes, name: str) -> np.ndarray:
             if image.width * image.height > MOST_PIXELS:  # before memory is taken for them
                 raise UserError(f"{image.width} x {image.height} pixels, more than {MOST_PIXELS}")
             if image.mode.startswith("I"):  # PIL would clip 16-bit grey to 255 instead of scaling it
-                eight_bit = (np.asarray(image) // 257).astype(np.uint8)
-                return np.asarray(Image.fromarray(eight_bit).convert("RGBA"))
-            return np.asarray(image.convert("RGBA"))
+                return _rgba(Image.fromarray((np.asarray(image) // 257).astype(np.uint8)))
+            return _rgba(image)
     except (UnidentifiedImageError, OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         raise RejectedAsset(f"names an image that cannot be read: {name} ({error})") from None
+
+
+def _rgba(image: Image.Image) -> np.ndarray:
+    """The pixels (height, width, 4) uint8, converted strip by strip: PIL takes four times their memory for the whole."""
+    pixels = np.empty((image.height, image.width, 4), np.uint8)
+    for top in range(0, image.height, STRIP):
+        strip = image.crop((0, top, image.width, min(top + STRIP, image.height)))
+        pixels[top : top + STRIP] = np.asarray(strip.convert("RGBA"))
+    return pixels
 
 
 def color_texels(encoded: np.ndarray) -> np.ndarray:

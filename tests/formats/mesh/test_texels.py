@@ -8,6 +8,7 @@ from PIL import Image
 from support.gltf_files import png
 
 from data_gen.render.variant import mitsuba_module
+from spnr_jax.formats.mesh import texels
 from spnr_jax.formats.mesh.texels import lookup, read_image, shrink, srgb_to_linear, value_texels
 
 MODES = ("repeat", "mirror", "clamp")
@@ -72,3 +73,13 @@ def test_sixteen_bit_grey_images_are_scaled_not_clipped():
 
 def test_srgb_curve_meets_its_published_points():
     np.testing.assert_allclose(srgb_to_linear(np.array([0, 0.04045, 0.5, 1])), [0, 0.0031308, 0.21404114, 1], atol=1e-6)
+
+
+@pytest.mark.parametrize("mode", ["RGB", "RGBA", "P", "LA", "1"])
+def test_an_image_read_in_strips_is_the_whole_converted(mode, monkeypatch):
+    monkeypatch.setattr(texels, "STRIP", 4)
+    pixels = np.random.default_rng(0).integers(0, 256, (9, 7, 4), dtype=np.uint8)
+    stream = io.BytesIO()
+    Image.fromarray(pixels).convert(mode).save(stream, "png", **({"transparency": 3} if mode == "P" else {}))
+    whole = np.asarray(Image.open(io.BytesIO(stream.getvalue())).convert("RGBA"))
+    np.testing.assert_array_equal(read_image(stream.getvalue(), "a.png"), whole)
