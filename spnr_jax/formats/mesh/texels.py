@@ -43,7 +43,7 @@ def read_image(data: bytes, name: str) -> np.ndarray:
 
 
 def _rgba(image: Image.Image) -> np.ndarray:
-    """The pixels (height, width, 4) uint8, converted strip by strip: PIL takes four times their memory for the whole."""
+    """The pixels (height, width, 4) uint8, converted in strips: PIL takes four times their memory for the whole."""
     pixels = np.empty((image.height, image.width, 4), np.uint8)
     for top in range(0, image.height, STRIP):
         strip = image.crop((0, top, image.width, min(top + STRIP, image.height)))
