@@ -30,9 +30,7 @@ def check(dataset: Path) -> bool:
         folder = dataset / "objects" / object_id
         try:
             record = layout.read_object(folder)
-            found = object_faults(folder, record, settings) + light_faults(
-                folder, record.details, len(record.images), own_lights
-            )
+            found = object_faults(folder, record, settings, own_lights)
         except (ValueError, OSError) as error:
             faults.append(f"{object_id}: {type(error).__name__}: {error}")
             continue
@@ -102,7 +100,7 @@ def variant_faults(dataset: Path, details: dict[str, dict]) -> list[str]:
     return faults
 
 
-def object_faults(folder: Path, record: layout.ObjectRecord, settings: dict) -> list[str]:
+def object_faults(folder: Path, record: layout.ObjectRecord, settings: dict, own_lights: bool) -> list[str]:
     """What is wrong with one object."""
     files = record.details.get("files", {})
     if not isinstance(files, dict) or not {"product", "variant"} <= record.details.keys():
@@ -113,7 +111,8 @@ def object_faults(folder: Path, record: layout.ObjectRecord, settings: dict) -> 
     for name in ("images", "conditions"):
         if getattr(record, name).shape != size:
             faults.append(f"{name}: expected {size}, got {getattr(record, name).shape}")
-    return faults + camera_faults(record.transforms) + point_faults(record.points, settings["points"])
+    faults += camera_faults(record.transforms) + point_faults(record.points, settings["points"])
+    return faults + light_faults(folder, "lights.npz" in files, len(record.images), own_lights)
 
 
 def checksum_of(path: Path) -> str | None:
@@ -146,9 +145,8 @@ def point_faults(points: np.ndarray, count: int) -> list[str]:
     return faults
 
 
-def light_faults(folder: Path, details: dict, views: int, own_lights: bool) -> list[str]:
-    """What is wrong with the lights of one object's views, which are there where each has its own."""
-    listed = "lights.npz" in details.get("files", {})
+def light_faults(folder: Path, listed: bool, views: int, own_lights: bool) -> list[str]:
+    """What is wrong with the lights of one object's views, which its files list where each view has its own."""
     if listed != own_lights:
         said = "a light of its own for each view" if own_lights else "one light for all"
         return [f"lights.npz is {'there' if listed else 'missing'}, but dataset.json says {said}"]

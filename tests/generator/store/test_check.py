@@ -6,7 +6,8 @@ import re
 import numpy as np
 import pytest
 
-from data_gen.store.check import light_faults, variant_faults
+from data_gen.store.check import light_faults, object_faults, variant_faults
+from data_gen.store.layout import ObjectRecord
 
 DETAILS = {
     "lamp": {"product": "lamp", "variant": 0},
@@ -40,9 +41,6 @@ def test_the_colour_variants_of_a_product_may_only_train_and_only_together(tmp_p
     assert variant_faults(write_splits(tmp_path, **splits), DETAILS) == faults
 
 
-LISTED = {"files": {"lights.npz": "0"}}
-
-
 def lights(height=32, value=1.0, dtype=np.float16):
     return np.full((2, height, 64, 3), value, dtype)
 
@@ -69,7 +67,7 @@ def npz(**arrays):
 )
 def test_the_lights_of_an_object_are_maps_of_radiance_one_for_each_view(tmp_path, content, fault):
     (tmp_path / "lights.npz").write_bytes(content)
-    found = light_faults(tmp_path, LISTED, views=2, own_lights=True)
+    found = light_faults(tmp_path, True, views=2, own_lights=True)
     if fault is None:
         assert found == []
     else:
@@ -77,7 +75,14 @@ def test_the_lights_of_an_object_are_maps_of_radiance_one_for_each_view(tmp_path
         assert re.search(fault, line), line
 
 
+def test_an_object_whose_files_are_no_table_is_a_fault_of_its_own(tmp_path):
+    nothing, details = np.zeros(0), {"files": None, "product": "lamp", "variant": 0}
+    record = ObjectRecord(points=nothing, transforms={}, images=nothing, conditions=nothing, details=details)
+    faults = object_faults(tmp_path, record, {}, own_lights=True)
+    assert faults == ["object.json: expected files, product and variant"]
+
+
 def test_lights_are_there_if_and_only_if_the_data_set_says_so(tmp_path):
-    assert light_faults(tmp_path, {"files": {}}, views=2, own_lights=False) == []
-    assert "is missing" in light_faults(tmp_path, {"files": {}}, views=2, own_lights=True)[0]
-    assert "is there" in light_faults(tmp_path, LISTED, views=2, own_lights=False)[0]
+    assert light_faults(tmp_path, False, views=2, own_lights=False) == []
+    assert "is missing" in light_faults(tmp_path, False, views=2, own_lights=True)[0]
+    assert "is there" in light_faults(tmp_path, True, views=2, own_lights=False)[0]
