@@ -15,6 +15,16 @@ error_map = jax.jit(flip_map, static_argnums=2)
 value_and_gradients = jax.jit(jax.value_and_grad(flip, (0, 1)))
 
 
+def correlate(plane, taps):
+    half = len(taps) // 2
+    windows = np.lib.stride_tricks.sliding_window_view(np.pad(plane, half, mode="edge"), taps.shape)
+    return np.einsum("ijkl,kl->ij", windows, taps)
+
+
+def hyab(p, q):
+    return np.abs(p[..., 0] - q[..., 0]) + np.hypot(p[..., 1] - q[..., 1], p[..., 2] - q[..., 2])
+
+
 def twin(image, reference, pixels_per_degree=67.0206):
     """The error map from the paper's formulas: whole filters, and colours through YCxCz with their offsets."""
     to_xyz = np.array(
@@ -28,20 +38,12 @@ def twin(image, reference, pixels_per_degree=67.0206):
         s = sum(a * np.sqrt(np.pi / b) * np.exp(-(np.pi**2) * (x**2 + y**2) / b) for a, b in terms)
         filters.append(s / s.sum())
 
-    def correlate(plane, taps):
-        half = len(taps) // 2
-        windows = np.lib.stride_tricks.sliding_window_view(np.pad(plane, half, mode="edge"), taps.shape)
-        return np.einsum("ijkl,kl->ij", windows, taps)
-
     def lab(rgb):
         t = (rgb @ to_xyz.T) / white
         t = np.where(t > (6 / 29) ** 3, np.cbrt(t), t / (3 * (6 / 29) ** 2) + 4 / 29)
         lightness = 116 * t[..., 1] - 16
         a, b = 500 * (t[..., 0] - t[..., 1]), 200 * (t[..., 1] - t[..., 2])
         return np.stack([lightness, 0.01 * lightness * a, 0.01 * lightness * b], axis=-1)
-
-    def hyab(p, q):
-        return np.abs(p[..., 0] - q[..., 0]) + np.hypot(p[..., 1] - q[..., 1], p[..., 2] - q[..., 2])
 
     deviation = 0.5 * 0.082 * pixels_per_degree
     radius = int(np.ceil(3 * deviation))
