@@ -2,9 +2,8 @@
 
 `read_cloud` makes a PointCloud of NumPy float32 arrays, not padded, in the file's own units, turned so that y is up;
 `place_cloud` also says how to get back into the file's frame.  Files of points are read as named columns
-(point_files.py, what they mean: point_columns.py), of any size in bounded memory; points are spread evenly over meshes,
-with their materials.  What a file does not say is grey 0.5, roughness 0.5, metallic 0; `report` is told so, and of
-every other assumption, one line each.
+(point_files.py, what they mean: point_columns.py), of any size in bounded memory; points are spread evenly over meshes.
+What a file does not say is grey 0.5, roughness 0.5, metallic 0; `report` gets a line about every assumption.
 """
 
 from collections.abc import Callable, Iterator
@@ -23,7 +22,7 @@ from spnr_jax.formats.point_files import READERS, column_pieces, parse_ply
 from spnr_jax.formats.sensor import sensor_of
 from spnr_jax.formats.up_axis import ROTATIONS, find_up
 from spnr_jax.kernels import scenes
-from spnr_jax.kernels.cleaning import Clean, beside, cleaned
+from spnr_jax.kernels.cleaning import Clean, beside, cleaned, is_noisy, noise
 from spnr_jax.kernels.facing import facing
 from spnr_jax.kernels.records import PointCloud
 from spnr_jax.kernels.thinning import THINNING, farthest_points, stacked, thin_stream
@@ -32,7 +31,7 @@ MESHES = (".glb", ".gltf", ".obj", ".stl", ".off")
 MESH_POINTS = 4096  # points drawn from a mesh if no number is asked for; the most that training draws
 MOST_EVEN = 2**14  # points that are spread evenly over a mesh, in seconds; more lie close enough as they are drawn
 CAPACITY = 2**19  # points of a file that are in memory at most; more are thinned while reading
-SAMPLE = 2**17  # of them that say where a file is dense
+SAMPLE = 2**18  # of them that say where a file is dense, and stand for it where it is noisy
 BROKEN = "NaN, infinity or too large a number"
 CUT_MESH = 2**18  # points drawn from a mesh that something is cut out of
 WHOLE = Cut()
@@ -221,10 +220,9 @@ def _sampled_mesh(path: Path, count: int, seed: int, transparent_parts: ShownPar
 def _bounded_columns(
     path: Path, num_points: int | None, clean: Clean, cut: Cut, report: Callable[[str], None]
 ) -> Columns:
-    """The useful columns of a point file inside the box to be cut out.
+    """The useful columns of a point file inside the box to be cut out; few enough are kept while reading.
 
-    They are thinned while reading to CAPACITY points or what `num_points` needs; unless `clean` is "off" without those
-    that lie apart in the file.
+    Unless `clean` is "off" they are a sample of a noisy file, and of any other lack points that lie apart in it.
     """
     capacity, broken, outside = max(CAPACITY, THINNING * (num_points or 0)), 0, 0
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
@@ -254,8 +252,11 @@ def _bounded_columns(
         report(scenes.cropped(seen, seen + outside, cut.crop, low, high))
     if seen <= capacity:
         return columns
+    if clean != "off" and is_noisy(*noise(stacked(sample.columns)), clean):  # voxels keep what lies off the surface
+        report(f"{len(sample.keys)} of {seen} points kept while reading, drawn at random: they are noisy")
+        return sample.columns
     report(f"{len(columns['x'])} of {seen} points kept while reading, the first of each voxel")
-    return columns if clean == "off" else _beside(columns, sample.positions, clean, report)
+    return columns if clean == "off" else _beside(columns, stacked(sample.columns), clean, report)
 
 
 def _beside(
@@ -263,8 +264,7 @@ def _beside(
 ) -> Columns:
     """The columns without points that lie apart from the sample of their file, of which voxels keep too many."""
     near = beside(stacked(columns), sample, strength)
-    if not near.all():
-        report(f"removed {np.count_nonzero(~near):,} outliers of {len(near):,} points, told by a sample of the file")
+    report(f"removed {np.count_nonzero(~near):,} outliers of {len(near):,} points, told by a sample of the file")
     return {name: column[near] for name, column in columns.items()}
 
 

@@ -99,7 +99,7 @@ def cleaned(
         lines.append(f"removed {apart.sum():,} outliers of {len(positions):,} points")
         positions, values = positions[~apart], {name: x[~apart] for name, x in values.items()}
     sigma, spacing = noise(positions)
-    if sigma > NOISY[strength] * spacing > 0:
+    if is_noisy(sigma, spacing, strength):
         before = len(positions)
         positions, values = averaged(positions, values, sigma, spacing)
         kept = ~fringe(positions, max(CELL[0] * sigma, CELL[1] * spacing))
@@ -215,6 +215,11 @@ def noise(positions: Float[np.ndarray, "points 3"]) -> tuple[float, float]:
         if thickness < THICKEST or MOST_WIDE * count > len(distinct):
             return radius * float(np.interp(thickness, THICKNESS, NOISES)), radius * np.sqrt(np.pi / (count + 1))
         count *= WIDER
+
+
+def is_noisy(sigma: float, spacing: float, strength: Strength = "auto") -> bool:
+    """Whether points with this noise and spacing are averaged."""
+    return bool(sigma > NOISY[strength] * spacing > 0)
 
 
 def _heights(near: np.ndarray) -> np.ndarray:

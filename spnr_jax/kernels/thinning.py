@@ -30,7 +30,7 @@ SCATTER = np.uint64(0x9E3779B97F4A7C15)  # odd, 2^64 over the golden ratio: mult
 class Sample:
     """Rows of a stream, each with the same chance, whatever lies around it: where many points lie many are taken."""
 
-    positions: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
+    columns: Columns = dataclasses.field(default_factory=dict)
     keys: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0, np.uint64))
     seen: int = 0
     halvings: int = 0  # of the share that is taken
@@ -43,13 +43,18 @@ def sampled(sample: Sample, piece: Columns, most: int) -> Sample:
         return Sample(seen=seen)
     keys = np.arange(sample.seen + 1, seen + 1, dtype=np.uint64) * SCATTER
     taken = keys >> np.uint64(64 - halvings) == 0 if halvings else slice(None)
-    positions = np.concatenate([sample.positions, stacked(piece)[taken]])
+    columns = _joined(sample.columns, {name: values[taken] for name, values in piece.items()})
     keys = np.concatenate([sample.keys, keys[taken]])
     while len(keys) > most:
         halvings += 1
         taken = keys >> np.uint64(64 - halvings) == 0
-        positions, keys = positions[taken], keys[taken]
-    return Sample(positions=positions, keys=keys, seen=seen, halvings=halvings)
+        columns, keys = {name: values[taken] for name, values in columns.items()}, keys[taken]
+    return Sample(columns=columns, keys=keys, seen=seen, halvings=halvings)
+
+
+def _joined(before: Columns, piece: Columns) -> Columns:
+    """The columns with those of the stream's next points behind them."""
+    return {name: np.concatenate([before[name], piece[name]]) for name in piece} if before else dict(piece)
 
 
 def thin_stream(pieces: Iterable[Columns], capacity: int, most_sampled: int = 0) -> tuple[Columns, Sample]:
@@ -62,7 +67,7 @@ def thin_stream(pieces: Iterable[Columns], capacity: int, most_sampled: int = 0)
     sample, voxel, corner = Sample(), None, np.zeros(3)
     for piece in pieces:
         sample = sampled(sample, piece, most_sampled)
-        kept = {name: np.concatenate([kept[name], piece[name]]) if kept else piece[name] for name in piece}
+        kept = _joined(kept, piece)
         if len(kept["x"]) <= capacity and voxel is None:
             continue
         positions = stacked(kept)

@@ -207,6 +207,19 @@ class TestCleaning:
             re.fullmatch(r"removed 6 outliers of \d\d\d points, told by a sample of the file", line) for line in lines
         )
 
+    def test_averages_a_sample_of_a_noisy_file_that_is_thinned_while_reading(self, tmp_path, monkeypatch):
+        monkeypatch.setattr(clouds, "CAPACITY", 5000)
+        monkeypatch.setattr(clouds, "SAMPLE", 8000)
+        rng = np.random.default_rng(0)
+        surface = rng.normal(size=(40_000, 3))
+        surface /= np.linalg.norm(surface, axis=1, keepdims=True)
+        noise = 0.05 * rng.normal(size=surface.shape)
+        np.savez(tmp_path / "a.npz", xyz=surface + noise, base_color=(1 + surface) / 2)
+        cloud, lines = read(tmp_path / "a.npz", clean="auto")
+        assert re.fullmatch(r"\d{4} of 40000 points kept while reading, drawn at random: they are noisy", lines[0])
+        assert np.abs(np.linalg.norm(cloud.positions, axis=1) - 1).mean() < 0.4 * 0.05
+        assert np.abs(2 * cloud.base_color - 1 - cloud.positions).mean() < 0.03
+
     def test_leaves_meshes_alone(self, tmp_path):
         path = write(tmp_path, "a.obj", SQUARE_OBJ)
         plain, lines = read(path, num_points=200, clean="strong")

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial import cKDTree
 from support.point_clouds import sphere_points
 
-from spnr_jax.kernels.thinning import THINNING, candidates, farthest_points, first_in_voxels, thin_stream
+from spnr_jax.kernels.thinning import THINNING, candidates, farthest_points, first_in_voxels, stacked, thin_stream
 
 
 @pytest.mark.parametrize("num_points", [500, 6000])  # 6000 is thinned at random before
@@ -93,10 +93,10 @@ def test_the_sample_of_a_stream_is_as_dense_as_the_stream_whatever_its_pieces(si
     positions[:15_000] *= 0.1
     whole = thin_stream(pieces_of(positions, 20_000), 100, 1000)[1]
     sample = thin_stream(pieces_of(positions, size), 100, 1000)[1]
-    np.testing.assert_array_equal(sample.positions, whole.positions)
-    assert 500 <= len(sample.positions) <= 1000
-    np.testing.assert_allclose(np.mean(np.linalg.norm(sample.positions, axis=1) < 0.5), 0.75, atol=0.02)
-    assert len(thin_stream(pieces_of(positions, size), 100)[1].positions) == 0
+    np.testing.assert_array_equal(stacked(sample.columns), stacked(whole.columns))
+    assert 500 <= len(sample.keys) <= 1000
+    np.testing.assert_allclose(np.mean(np.linalg.norm(stacked(sample.columns), axis=1) < 0.5), 0.75, atol=0.02)
+    assert len(thin_stream(pieces_of(positions, size), 100)[1].keys) == 0
 
 
 def test_points_far_outside_do_not_make_the_voxels_of_the_others_larger():
