@@ -9,7 +9,7 @@ What a file does not say is grey 0.5, roughness 0.5, metallic 0; `report` gets a
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, get_args
+from typing import get_args
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from spnr_jax.formats.point_files import READERS, column_pieces, parse_ply
 from spnr_jax.formats.sensor import sensor_of
 from spnr_jax.formats.up_axis import ROTATIONS, find_up
 from spnr_jax.kernels import scenes
-from spnr_jax.kernels.cleaning import Clean, beside, cleaned, is_noisy, noise
+from spnr_jax.kernels.cleaning import Clean, Strength, beside, cleaned, is_noisy, noise
 from spnr_jax.kernels.facing import facing
 from spnr_jax.kernels.records import PointCloud
 from spnr_jax.kernels.thinning import THINNING, farthest_points, stacked, thin_stream
@@ -259,12 +259,11 @@ def _bounded_columns(
     return columns if clean == "off" else _beside(columns, stacked(sample.columns), clean, report)
 
 
-def _beside(
-    columns: Columns, sample: np.ndarray, strength: Literal["auto", "strong"], report: Callable[[str], None]
-) -> Columns:
+def _beside(columns: Columns, sample: np.ndarray, strength: Strength, report: Callable[[str], None]) -> Columns:
     """The columns without points that lie apart from the sample of their file, of which voxels keep too many."""
     near = beside(stacked(columns), sample, strength)
-    report(f"removed {np.count_nonzero(~near):,} outliers of {len(near):,} points, told by a sample of the file")
+    if not near.all():
+        report(f"removed {np.count_nonzero(~near):,} outliers of {len(near):,} points, told by a sample of the file")
     return {name: column[near] for name, column in columns.items()}
 
 

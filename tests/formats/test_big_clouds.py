@@ -87,6 +87,8 @@ def test_a_cloud_beyond_the_capacity_is_thinned_while_reading_and_says_so(tmp_pa
     cloud, lines = read(tmp_path / "a.npz")
     assert 60 <= len(cloud.mask) <= 500
     assert lines[0] == f"{len(cloud.mask)} of 4000 points kept while reading, the first of each voxel"
+    assert "kept while reading" in read(tmp_path / "a.npz", clean="auto")[1][0]
+    assert not any("outliers" in line for line in read(tmp_path / "a.npz", clean="auto")[1])  # where there are none
     source = np.round(cloud.roughness * 4000).astype(int)
     np.testing.assert_array_equal(cloud.positions, positions[source].astype(np.float32))
     np.testing.assert_allclose(cloud.normals, cloud.positions, atol=1e-6)

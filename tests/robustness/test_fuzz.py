@@ -26,7 +26,7 @@ import numpy as np
 import pytest
 from damage import DECOY, OPENERS, Files, mutated
 from file_readers import READERS
-from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from watched import limited_memory, watched
 
@@ -109,13 +109,7 @@ def fuzzed(name: str, folder: Path) -> Counter:
         write_input(folder, files)
         reader.read(folder, next(iter(files)))
 
-    @settings(
-        max_examples=INPUTS,
-        deadline=None,
-        derandomize=INPUTS == 16,
-        suppress_health_check=list(HealthCheck),
-        phases=set(Phase) - {Phase.explain},  # which watches every line, and would be what needs the memory
-    )
+    @settings(max_examples=INPUTS, deadline=None, derandomize=INPUTS == 16, suppress_health_check=list(HealthCheck))
     @given(st.sampled_from(range(len(seeds))), st.randoms(use_true_random=False))
     def law(number, rng):
         write_input(folder, mutated(seeds[number], rng))
