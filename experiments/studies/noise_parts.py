@@ -5,6 +5,9 @@
 Clouds of the test objects are made noisy, cleaned and thinned as in scans.py; then a part of what is left is put right:
 
     places             each point is moved to the nearest point of the true surface (the nearest of the data set)
+    half of places     half the way there
+    best radius        each point is averaged in RADII of the noise, and lies where it came nearest to the true surface:
+                       what no rule that chooses a radius for each point can do better
     colours            base colour, roughness and metallic are those of that point
     normals            so are the normals, which else are estimated
     averaged alone     no cleaning, but the mean of the noisy points in so many voxels
@@ -26,14 +29,15 @@ from experiments.comparison import results_folder
 from experiments.studies.scans import DECIMALS, drawn_of, mean_scores, spoiled, thinned, views_of
 from spnr_jax.devices import machine
 from spnr_jax.formats import data_sets
-from spnr_jax.kernels.cleaning import cleaned
+from spnr_jax.kernels.cleaning import RADIUS, Values, averaged, cleaned, fringe, fringe_cell, is_noisy, noise, outliers
 from spnr_jax.kernels.records import PointCloud
-from spnr_jax.kernels.thinning import voxel_keys
+from spnr_jax.kernels.thinning import farthest_points, voxel_keys
 from spnr_jax.scoring.score_tables import Table, number
 from spnr_jax.training.scan_faults import noisy
 from spnr_jax.training.weights import load
 
 MATERIALS = ("base_color", "roughness", "metallic")
+RADII = (0.5, 0.7, 1.0, 1.4, 2.0, 3.0)  # standard deviations of the noise; RADIUS is one of them
 HALVINGS = 30  # of the interval in which the voxels' side is looked for
 
 
@@ -97,13 +101,35 @@ def _clouds(true: PointCloud, noise: tuple[float, ...], count: int) -> Iterator[
         parts = {
             "cleaned": {},
             "places put right": {"positions": right["positions"]},
+            "half of places put right": {"positions": (right["positions"] + np.asarray(dirty.positions)) / 2},
             "colours put right": colours,
             "places and colours put right": colours | {"positions": right["positions"]},
             "normals put right": {"normals": right["normals"]},
         }
         for name, part in parts.items():
             yield f"{sigma:.1%}, {name}", partial(dataclasses.replace, dirty, **part)
+        yield f"{sigma:.1%}, best radius", partial(_best_radius, *points, count, cKDTree(true.positions))
         yield f"{sigma:.1%}, averaged alone", partial(_averaged, *points, count)
+
+
+def _best_radius(positions: np.ndarray, values: Values, count: int, surface: cKDTree) -> PointCloud:
+    """The points that cleaning and thinning keep, each averaged in the radius that brings it nearest to the surface."""
+    left = ~outliers(positions)
+    positions, values = positions[left], {name: column[left] for name, column in values.items()}
+    sigma, spacing = noise(positions)
+    if not is_noisy(sigma, spacing):
+        return thinned(positions, values, count)
+    found = [averaged(positions, values, sigma, spacing, radius) for radius in RADII]
+    moved = found[RADII.index(RADIUS)][0]
+    kept = np.flatnonzero(~fringe(moved, fringe_cell(sigma, spacing)))
+    rows = kept[np.sort(farthest_points(moved[kept], count, seed=0))]
+    best = np.argmin([surface.query(places[rows])[0] for places, _ in found], axis=0)
+
+    def chosen(columns: list[np.ndarray]) -> np.ndarray:
+        return np.stack([column[rows] for column in columns])[best, np.arange(len(rows))].astype(np.float32)
+
+    means = {name: chosen([columns[name] for _, columns in found]) for name in values}
+    return PointCloud(positions=chosen([places for places, _ in found]), mask=np.ones(len(rows), bool), **means)
 
 
 def _averaged(positions: np.ndarray, values: dict[str, np.ndarray], count: int) -> PointCloud:

@@ -43,6 +43,7 @@ from spnr_jax.presets import PRESETS
 from spnr_jax.scoring import evaluation
 from spnr_jax.scoring.summary import Scores
 from spnr_jax.training import adversary, optimisation, run_record, trainer
+from spnr_jax.training.weights import read_trained
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,6 +70,8 @@ class TimeToQuality:
     """Test objects scored on the way, spread over the split; after the last step all are (default: all)."""
     shown: int = 8
     """Of these, objects whose pictures are kept."""
+    init: Path | None = None
+    """Run folder or file of weights that trainings go on from, with a fresh optimiser (default: random weights)."""
     only_pace: bool = False
     """Measure the pace of the steps, and stop."""
 
@@ -102,7 +105,8 @@ def main(options: TimeToQuality) -> None:
     cli.set_up_jax()
     dataset = data_sets.open_dataset(options.data)
     asked = {name: getattr(options, name) for name in ("seconds", "marks", "even_share", "objects", "shown")}
-    results_folder.claim(options.out, "time_to_quality", asked, dataset)
+    before = {} if options.init is None else {"init": str(options.init)}
+    results_folder.claim(options.out, "time_to_quality", asked | before, dataset)
     paces = {name: kept_pace(name, options, dataset) for name in options.presets}
     for name, pace in paces.items():
         print(f"{name}: {1e3 * pace.alone:.0f} ms a step, {steps_of(name, options, pace)} steps", flush=True)
@@ -159,7 +163,8 @@ def curve(preset: str, seed: int, options: TimeToQuality, pace: Pace, dataset: d
             print(f"{preset}, seed {seed}: {report.line(row)}", flush=True)
 
     schedule = trainer.Schedule(preview_every=every, checkpoint_every=every)
-    state = trainer.train(config, dataset, run, schedule, on_event=saved)
+    init = None if options.init is None else read_trained(options.init)
+    state = trainer.train(config, dataset, run, schedule, init=init, on_event=saved)
     saved("saved", config.num_steps, state)  # if an earlier call was stopped between the last step and its scores
     jax.clear_caches()
     return [json.loads(place.read_text()) for place in sorted(folder.glob("*.json"))]

@@ -102,7 +102,7 @@ def cleaned(
     if is_noisy(sigma, spacing, strength):
         before = len(positions)
         positions, values = averaged(positions, values, sigma, spacing)
-        kept = ~fringe(positions, max(CELL[0] * sigma, CELL[1] * spacing))
+        kept = ~fringe(positions, fringe_cell(sigma, spacing))
         positions, values = positions[kept], {name: x[kept] for name, x in values.items()}
         lines.append(f"averaged {before:,} points to {len(positions):,}: noise of {sigma / spacing:.1f} spacings")
     return positions, values, lines
@@ -237,13 +237,14 @@ def _heights(near: np.ndarray) -> np.ndarray:
 
 
 def averaged(
-    positions: Float[np.ndarray, "points 3"], values: Values, sigma: float, spacing: float
+    positions: Float[np.ndarray, "points 3"], values: Values, sigma: float, spacing: float, deviations: float = RADIUS
 ) -> tuple[Float[np.ndarray, "moved 3"], Values]:
     """Points moved against noise of this standard deviation, at most MOST_MOVED, and the means of their values.
 
-    Normals stay of unit length, 0 where they contradict each other.
+    `deviations` of the noise are the radius of a neighbour's weight; the same rows come back for each.  Normals stay of
+    unit length, 0 where they contradict each other.
     """
-    radius = max(RADIUS * sigma, LEAST_RADIUS * spacing)
+    radius = max(deviations * sigma, LEAST_RADIUS * spacing)
     order = np.lexsort(positions.T)  # so that a part is spread over the cloud, and the same whatever the points' order
     within = 2 * np.pi * (radius / spacing) ** 2  # points whose weight counts
     basis = order[:: max(1, int(within / AROUND))]
@@ -288,6 +289,11 @@ def _spread(points: np.ndarray, near: np.ndarray, weights: np.ndarray) -> tuple[
     offset = (offset - mean[:, None]) * np.sqrt(weights)[..., None]
     squared, axes = np.linalg.eigh(np.swapaxes(offset, 1, 2) @ offset)
     return np.einsum("nij,ni->nj", axes, mean), squared, axes
+
+
+def fringe_cell(sigma: float, spacing: float) -> float:
+    """Side of the voxels that show the fringe of points with this noise and spacing."""
+    return max(CELL[0] * sigma, CELL[1] * spacing)
 
 
 def fringe(positions: Float[np.ndarray, "points 3"], side: float) -> Bool[np.ndarray, " points"]:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from experiments.studies.time_to_quality_report import reached
 from spnr_jax import presets
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
+from spnr_jax.training import run_record
 
 PACE = Pace(alone=0.1, adversarial=0.2, hardware="a machine", load=0.0)
 
@@ -92,6 +94,10 @@ def test_a_stopped_run_goes_on_and_a_finished_one_is_only_read(tmp_path, monkeyp
         assert set(rows[1]["scores"]) == set(tiny_dataset.dataset().splits["test"])
         for picture in [*tmp_path.glob("curves_*.png"), tmp_path / "sheet.png"]:
             assert picture.read_bytes().startswith(b"\x89PNG")
+        further = dataclasses.replace(options, out=tmp_path / "further", init=tmp_path / "runs" / "tiny_0", marks=1)
+        shutil.copytree(place.parent, further.out / "paces")
+        time_to_quality.main(further)
+        assert run_record.read_starts(further.out / "runs" / "tiny_0")[0]["init"] == "tiny, 5 steps"
         monkeypatch.setattr(time_to_quality, "score_objects", forbidden)
         time_to_quality.main(options)
         assert (tmp_path / "results.json").read_bytes() == first
