@@ -89,13 +89,13 @@ def main(options: NoiseParts) -> None:
 def _clouds(true: PointCloud, noise: tuple[float, ...], count: int) -> Iterator[tuple[str, Callable[[], PointCloud]]]:
     """A row's name, and what makes its cloud."""
     positions, values = spoiled(true, None)
-    normals = {"normals": np.asarray(true.normals)}
+    normals, surface = {"normals": np.asarray(true.normals)}, cKDTree(true.positions)
     yield "clean", partial(thinned, positions, values, count)
     yield "clean, with normals", partial(thinned, positions, values | normals, count)
     for sigma in noise:
         points = spoiled(true, partial(noisy, sigma=sigma))
         dirty = thinned(*cleaned(*points)[:2], count)
-        nearest = cKDTree(true.positions).query(np.asarray(dirty.positions, np.float64))[1]
+        nearest = surface.query(np.asarray(dirty.positions, np.float64))[1]
         right = {name: np.asarray(getattr(true, name))[nearest] for name in ("positions", "normals", *MATERIALS)}
         colours = {name: right[name] for name in MATERIALS}
         parts = {
@@ -108,7 +108,7 @@ def _clouds(true: PointCloud, noise: tuple[float, ...], count: int) -> Iterator[
         }
         for name, part in parts.items():
             yield f"{sigma:.1%}, {name}", partial(dataclasses.replace, dirty, **part)
-        yield f"{sigma:.1%}, best radius", partial(_best_radius, *points, count, cKDTree(true.positions))
+        yield f"{sigma:.1%}, best radius", partial(_best_radius, *points, count, surface)
         yield f"{sigma:.1%}, averaged alone", partial(_averaged, *points, count)
 
 
@@ -132,7 +132,7 @@ def _best_radius(positions: np.ndarray, values: Values, count: int, surface: cKD
     return PointCloud(positions=chosen([places for places, _ in found]), mask=np.ones(len(rows), bool), **means)
 
 
-def _averaged(positions: np.ndarray, values: dict[str, np.ndarray], count: int) -> PointCloud:
+def _averaged(positions: np.ndarray, values: Values, count: int) -> PointCloud:
     """Means of at most so many voxels."""
     low, high = 1e-3 * np.ptp(positions), np.ptp(positions)
     for _ in range(HALVINGS):
