@@ -8,8 +8,9 @@ Clouds of the test objects are made noisy, cleaned and thinned as in scans.py; t
     half of places     half the way there
     best radius        each point is averaged in RADII of the noise, and lies where it came nearest to the true surface:
                        what no rule that chooses a radius for each point can do better
+    all places         every cleaned point is moved there before the cloud is thinned
     colours            base colour, roughness and metallic are those of that point
-    normals            so are the normals, which else are estimated
+    normals            so are the normals, which else are estimated from all cleaned points
     averaged alone     no cleaning, but the mean of the noisy points in so many voxels
 
     OUT/results.json  OUT/table.md .csv .tex     dB, dB inside, FLIP
@@ -26,13 +27,14 @@ from scipy.spatial import cKDTree
 
 from experiments import entry_point
 from experiments.comparison import results_folder
-from experiments.studies.scans import DECIMALS, drawn_of, mean_scores, spoiled, thinned, views_of
+from experiments.studies.scans import DECIMALS, as_it_is, drawn_of, mean_scores, spoiled, thinned, views_of
 from spnr_jax.devices import machine
 from spnr_jax.formats import data_sets
 from spnr_jax.kernels.cleaning import RADIUS, Values, averaged, cleaned, fringe, fringe_cell, is_noisy, noise, outliers
 from spnr_jax.kernels.records import PointCloud
 from spnr_jax.kernels.thinning import farthest_points, voxel_keys
 from spnr_jax.scoring.score_tables import Table, number
+from spnr_jax.surfels.outward import outward_normals
 from spnr_jax.training.scan_faults import noisy
 from spnr_jax.training.weights import load
 
@@ -90,13 +92,13 @@ def _clouds(true: PointCloud, noise: tuple[float, ...], count: int) -> Iterator[
     """A row's name, and what makes its cloud."""
     positions, values = spoiled(true, None)
     normals, surface = {"normals": np.asarray(true.normals)}, cKDTree(true.positions)
-    yield "clean", partial(thinned, positions, values, count)
-    yield "clean, with normals", partial(thinned, positions, values | normals, count)
+    yield "clean", partial(thinned, as_it_is(positions, values), count)
+    yield "clean, with normals", partial(thinned, as_it_is(positions, values | normals), count)
     for sigma in noise:
         points = spoiled(true, partial(noisy, sigma=sigma))
-        dirty = thinned(*cleaned(*points)[:2], count)
-        nearest = surface.query(np.asarray(dirty.positions, np.float64))[1]
-        right = {name: np.asarray(getattr(true, name))[nearest] for name in ("positions", "normals", *MATERIALS)}
+        clean = cleaned(*points)
+        dirty = thinned(clean, count)
+        right = _nearest(true, surface, np.asarray(dirty.positions))
         colours = {name: right[name] for name in MATERIALS}
         parts = {
             "cleaned": {},
@@ -105,11 +107,23 @@ def _clouds(true: PointCloud, noise: tuple[float, ...], count: int) -> Iterator[
             "colours put right": colours,
             "places and colours put right": colours | {"positions": right["positions"]},
             "normals put right": {"normals": right["normals"]},
+            "places and normals put right": {name: right[name] for name in ("positions", "normals")},
         }
         for name, part in parts.items():
             yield f"{sigma:.1%}, {name}", partial(dataclasses.replace, dirty, **part)
+        all_right = _nearest(true, surface, clean.positions)
+        places, normals = all_right["positions"], {"normals": all_right["normals"]}
+        yield f"{sigma:.1%}, all places put right", partial(thinned, as_it_is(places, clean.values), count)
+        of_all = as_it_is(places, clean.values | normals)
+        yield f"{sigma:.1%}, all places and normals put right", partial(thinned, of_all, count)
         yield f"{sigma:.1%}, best radius", partial(_best_radius, *points, count, surface)
         yield f"{sigma:.1%}, averaged alone", partial(_averaged, *points, count)
+
+
+def _nearest(true: PointCloud, surface: cKDTree, positions: np.ndarray) -> Values:
+    """Places, normals and materials of the points of the true surface that are nearest to some."""
+    rows = surface.query(np.asarray(positions, np.float64))[1]
+    return {name: np.asarray(getattr(true, name))[rows] for name in ("positions", "normals", *MATERIALS)}
 
 
 def _best_radius(positions: np.ndarray, values: Values, count: int, surface: cKDTree) -> PointCloud:
@@ -118,7 +132,7 @@ def _best_radius(positions: np.ndarray, values: Values, count: int, surface: cKD
     positions, values = positions[left], {name: column[left] for name, column in values.items()}
     sigma, spacing = noise(positions)
     if not is_noisy(sigma, spacing):
-        return thinned(positions, values, count)
+        return thinned(as_it_is(positions, values), count)
     found = [averaged(positions, values, sigma, spacing, radius) for radius in RADII]
     moved = found[RADII.index(RADIUS)][0]
     kept = np.flatnonzero(~fringe(moved, fringe_cell(sigma, spacing)))
@@ -129,6 +143,7 @@ def _best_radius(positions: np.ndarray, values: Values, count: int, surface: cKD
         return np.stack([column[rows] for column in columns])[best, np.arange(len(rows))].astype(np.float32)
 
     means = {name: chosen([columns[name] for _, columns in found]) for name in values}
+    means["normals"] = outward_normals(moved[kept], np.searchsorted(kept, rows), sigma).astype(np.float32)
     return PointCloud(positions=chosen([places for places, _ in found]), mask=np.ones(len(rows), bool), **means)
 
 
@@ -147,7 +162,7 @@ def _averaged(positions: np.ndarray, values: Values, count: int) -> PointCloud:
         np.add.at(sums, voxel, column)
         return sums / points.reshape(-1, *[1] * (column.ndim - 1))
 
-    return thinned(mean(positions), {name: mean(column) for name, column in values.items()}, count)
+    return thinned(as_it_is(mean(positions), {name: mean(column) for name, column in values.items()}), count)
 
 
 if __name__ == "__main__":

@@ -26,12 +26,13 @@ from experiments.comparison import figures, poisson, results_folder
 from experiments.comparison.object_views import Picture, drawn, few, on_white, view_of, view_scores
 from spnr_jax.devices import machine
 from spnr_jax.formats import data_sets, images
-from spnr_jax.kernels.cleaning import cleaned
+from spnr_jax.kernels.cleaning import Cleaned, Values, cleaned
 from spnr_jax.kernels.cloud_arrays import normalization
 from spnr_jax.kernels.records import Camera, PointCloud
 from spnr_jax.kernels.thinning import farthest_points
 from spnr_jax.method.model import Model, Quality
 from spnr_jax.scoring.score_tables import Cell, Table, mean_row, number
+from spnr_jax.surfels.outward import outward_normals
 from spnr_jax.training.scan_faults import Fault, faults
 from spnr_jax.training.weights import load
 
@@ -121,7 +122,7 @@ def _kept(place: Path, dataset: data_sets.Dataset, name: str, scores: Callable[[
     return results_folder.kept(place / f"{name}.json", lambda: scores(data_sets.read_object(dataset, name)))
 
 
-def spoiled(cloud: PointCloud, fault: Fault | None) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+def spoiled(cloud: PointCloud, fault: Fault | None) -> tuple[np.ndarray, Values]:
     """Positions in the cloud's units and materials after a fault, the same at every call; normals are dropped."""
     positions = np.asarray(cloud.positions, np.float64)
     values = {name: np.asarray(getattr(cloud, name)) for name in ("base_color", "roughness", "metallic")}
@@ -132,44 +133,49 @@ def spoiled(cloud: PointCloud, fault: Fault | None) -> tuple[np.ndarray, dict[st
     return positions / scale + centre, values
 
 
-def thinned(positions: np.ndarray, values: dict[str, np.ndarray], count: int) -> PointCloud:
-    """At most so many points, as `read_cloud` keeps them."""
-    kept = np.arange(len(positions))
+def as_it_is(positions: np.ndarray, values: Values) -> Cleaned:
+    """Points that nothing is done to."""
+    return Cleaned(positions, values, [], 0.0)
+
+
+def thinned(points: Cleaned, count: int) -> PointCloud:
+    """At most so many points, with normals from all, as `read_cloud` keeps them."""
+    positions, values, _, noise = points
     if len(positions) > count:
         kept = np.sort(farthest_points(positions, count, seed=0))
-    columns = {name: np.asarray(column[kept], np.float32) for name, column in values.items()}
-    return PointCloud(positions=positions[kept].astype(np.float32), mask=np.ones(len(kept), bool), **columns)
+        values = {name: column[kept] for name, column in values.items()}
+        if "normals" not in values:
+            values["normals"] = outward_normals(positions, kept, noise)
+        positions = positions[kept]
+    columns = {name: np.asarray(column, np.float32) for name, column in values.items()}
+    return PointCloud(positions=positions.astype(np.float32), mask=np.ones(len(positions), bool), **columns)
 
 
 def _scores(
     options: ScansStudy, model: Model, fault: Fault | None, count: int, item: data_sets.ObjectData
 ) -> dict[str, Any]:
     """Mean scores of an object's views without and with cleaning, and the share of its points that is left."""
-    positions, values = spoiled(item.cloud, fault)
-    cloud, said = _cleaned(positions, values, count)
+    dirty = as_it_is(*spoiled(item.cloud, fault))
+    clean = cleaned(dirty.positions, dirty.values)
+    cloud = thinned(clean, count)
     views = views_of(item, options.views, options.resolution)
     auto, draft = (mean_scores(drawn_of(model, cloud, views, quality), views) for quality in ("best", "draft"))
-    off = mean_scores(drawn_of(model, thinned(positions, values, count), views), views) if said else auto
-    left = len(positions) / len(item.cloud.positions)
-    return {"off": off, "auto": auto, "draft": draft, "said": said, "left": left}
+    off = mean_scores(drawn_of(model, thinned(dirty, count), views), views) if clean.lines else auto
+    left = len(dirty.positions) / len(item.cloud.positions)
+    return {"off": off, "auto": auto, "draft": draft, "said": clean.lines, "left": left}
 
 
 def _poisson_scores(
     options: ScansStudy, renderer: poisson.Renderer, fault: Fault | None, count: int, item: data_sets.ObjectData
 ) -> list[float]:
     """Mean scores of the trimmed Poisson surface of the cleaned points."""
-    cloud, _ = _cleaned(*spoiled(item.cloud, fault), count)
+    cloud = thinned(cleaned(*spoiled(item.cloud, fault)), count)
     seen = dataclasses.replace(few(item, options.views), cloud=cloud)
     pictures, _ = renderer.pictures(seen, count, poisson.SURFACES["poisson_trimmed"])
     made, views = (
         views_of(x, options.views, options.resolution) for x in (dataclasses.replace(seen, images=pictures), item)
     )
     return mean_scores([on_white(rgba) for _, rgba in made], views)
-
-
-def _cleaned(positions: np.ndarray, values: dict[str, np.ndarray], count: int) -> tuple[PointCloud, list[str]]:
-    positions, values, said = cleaned(positions, values)
-    return thinned(positions, values, count), said
 
 
 def views_of(item: data_sets.ObjectData, views: int, resolution: int | None) -> list[View]:
@@ -201,7 +207,7 @@ def _gallery(options: ScansStudy, dataset: data_sets.Dataset, names: Sequence[st
 
         def picture(label: str, name: str = name, item: data_sets.ObjectData = item) -> np.ndarray:
             def make() -> np.ndarray:
-                cloud, _ = _cleaned(*spoiled(item.cloud, kinds[label]), max(options.counts))
+                cloud = thinned(cleaned(*spoiled(item.cloud, kinds[label])), max(options.counts))
                 return images.to_uint8(drawn_of(model, cloud, views_of(item, 1, options.resolution))[0][0])
 
             return results_folder.kept(options.out / "pictures" / f"{name}_{label}.png".replace(" ", "_"), make)

@@ -23,9 +23,10 @@ from spnr_jax.formats.sensor import sensor_of
 from spnr_jax.formats.up_axis import ROTATIONS, find_up
 from spnr_jax.kernels import scenes
 from spnr_jax.kernels.cleaning import Clean, Strength, beside, cleaned, is_noisy, noise
-from spnr_jax.kernels.facing import facing
+from spnr_jax.kernels.facing import facing, planes
 from spnr_jax.kernels.records import PointCloud
 from spnr_jax.kernels.thinning import THINNING, farthest_points, stacked, thin_stream
+from spnr_jax.surfels.outward import outward_normals
 
 MESHES = (".glb", ".gltf", ".obj", ".stl", ".off")
 MESH_POINTS = 4096  # points drawn from a mesh if no number is asked for; the most that training draws
@@ -102,7 +103,7 @@ def place_cloud(
         raise UserError(f"clean must be one of {', '.join(get_args(Clean))}, got {clean!r}")
     _check_file(path)
     try:
-        positions, origin, values, sensor = _read(path, num_points, seed, clean, cut, transparent_parts, report)
+        positions, origin, values, sensor, sigma = _read(path, num_points, seed, clean, cut, transparent_parts, report)
     except (ValueError, OSError) as error:
         raise UserError(f"{path}: {str(error).splitlines()[0]}") from error
     kept = np.arange(len(positions))
@@ -110,9 +111,12 @@ def place_cloud(
         report(f"{num_points} of {len(positions)} points kept, evenly spread")
         kept = np.sort(farthest_points(positions, num_points, seed))
     values = {name: column[kept] for name, column in values.items()}
-    if sensor and "normals" not in values:
-        values["normals"] = facing(positions[kept], positions, sensor.place - origin)
+    if "normals" not in values and sensor:
+        directions = planes(positions[kept], positions, sigma)
+        values["normals"] = facing(directions, positions[kept], sensor.place - origin)
         report("normals turned to the place of the sensor")
+    elif "normals" not in values and len(kept) < len(positions):
+        values["normals"] = outward_normals(positions, kept, sigma)
     positions = positions[kept]
     if up == "auto":
         camera_up = sensor.up(positions + origin) if sensor else None
@@ -172,7 +176,7 @@ def _read(
     transparent_parts: ShownParts,
     report: Callable[[str], None],
 ):
-    """Positions (points, 3) float64 of what is cut out of a file, cleaned; their origin, materials, and the sensor."""
+    """Positions (points, 3) float64 of what is cut out of a file, cleaned; their origin, materials, sensor, noise."""
     mesh = _is_mesh(path)
     if mesh:
         count = max(CUT_MESH if cut.asked else 0, num_points or MESH_POINTS)
@@ -188,12 +192,13 @@ def _read(
             report(line)
     rows, lines = scenes.object_of(positions, origin, cut.remove_plane, cut.nth, seed)
     positions, values = positions[rows], {name: column[rows] for name, column in values.items()}
+    sigma = 0.0
     if not mesh and clean != "off":
-        positions, values, done = cleaned(positions, values, clean)
+        positions, values, done, sigma = cleaned(positions, values, clean)
         lines += done
     for line in lines:
         report(line)
-    return positions, origin, values, sensor_of(path, positions + origin)
+    return positions, origin, values, sensor_of(path, positions + origin), sigma
 
 
 def _sampled_mesh(path: Path, count: int, seed: int, transparent_parts: ShownParts, report: Callable[[str], None]):

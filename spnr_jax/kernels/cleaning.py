@@ -7,17 +7,19 @@
                 Rousseeuw 1984): at an edge or a thin wall that is one of the faces, so that neither counts as noise.
                 A plane with that noise would have these heights; around thick noise the neighbourhood grows
     averaging   each point is moved to where it most likely was, and then along the normal onto the plane of those
-                around it, as moving least squares do (Alexa et al. 2001), within a radius that the noise gives; its
-                materials become their mean.  Where it was is Tweedie's formula (Efron 2011), x + sigma^2 times the
-                gradient of the logarithm of the density, which mean m and covariance C of the points around it tell
-                in a window (Hjort & Jones 1996): C^-1 (m - x).  A plane becomes flat, a thin bar keeps its thickness
+                around it, as moving least squares do (Alexa et al. 2001), within a radius that the noise gives; points
+                of like colour count (Tomasi & Manduchi 1998), so that letters stay and two layers do not become one.
+                Materials become the mean of those that then lie close.  Where a point was is Tweedie's formula (Efron
+                2011), x + sigma^2 times the gradient of the logarithm of the density, which mean m and covariance C of
+                the points around it tell in a window (Hjort & Jones 1996): C^-1 (m - x).  A plane becomes flat, a thin
+                bar keeps its thickness
     fringe      what noise left in places that few points share, beside those that many do, is removed
 
 NumPy in, NumPy out, near linear in the points; the order of the points does not matter.
 """
 
 import dataclasses
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -58,6 +60,8 @@ WIDER, MOST_WIDE = 2, 16  # times as many neighbours, and share of all points th
 RADIUS = 1.0  # standard deviations of the noise in that of a neighbour's weight; wider ones eat thin parts
 LEAST_RADIUS = 1.0  # spacings: the same at least
 AROUND = 64  # points that give a plane
+ALIKE, COLOUR_NOISE = 0.1, 2.0  # deviation of the weight of a colour (square roots), at least; times their own noise
+MEAN, MEANT = 0.7, 32  # radius of the mean of the values over the noise, or the spacing; points that it takes
 ROWS = 2**13  # points that are moved at a time: their neighbours fit into the cache
 CELL = 1.0, 3.0  # standard deviations of the noise, spacings: side of a voxel that shows the fringe, the larger of both
 CELLS = 27  # voxels that are compared
@@ -65,6 +69,18 @@ THIN = 0.3  # of the points that those hold, for a point of theirs, below which 
 MOST_MOVED = 2**17  # points that are moved; of more, a part
 BESIDE = 2.0  # times the distance of a sample's neighbours, within which a point belongs to it
 CANCELLED = 0.5  # length of a mean of unit normals below which they contradict each other
+
+
+class Cleaned(NamedTuple):
+    """Points that are left and their other columns; a line about each thing that was done; the noise averaged.
+
+    `noise` is its standard deviation in the units of the positions, 0 where none was averaged.
+    """
+
+    positions: Float[np.ndarray, "left 3"]
+    values: Values
+    lines: list[str]
+    noise: float
 
 
 def clean(cloud: PointCloud, strength: Strength = "auto") -> tuple[PointCloud, list[str]]:
@@ -79,33 +95,29 @@ def clean(cloud: PointCloud, strength: Strength = "auto") -> tuple[PointCloud, l
         raise UserError(f"clean takes one cloud, positions (points, 3); got shape {np.shape(cloud.positions)}")
     real = np.asarray(cloud.mask)
     columns = {name: np.asarray(x)[real] for name, x in vars(cloud).items() if x is not None and name != "mask"}
-    positions, values, lines = cleaned(columns.pop("positions"), columns, strength)
+    positions, values, lines, _ = cleaned(columns.pop("positions"), columns, strength)
     if not lines:
         return cloud, []
     values = {name: np.asarray(x, np.float32) for name, x in (values | {"positions": positions}).items()}
     return dataclasses.replace(cloud, mask=np.ones(len(positions), bool), **values), lines
 
 
-def cleaned(
-    positions: Float[np.ndarray, "points 3"], values: Values, strength: Strength = "auto"
-) -> tuple[Float[np.ndarray, "left 3"], Values, list[str]]:
-    """Positions and other columns (points, ...) of what is left, and a line about each thing that was done.
-
-    The same arrays come back where nothing was done.
-    """
+def cleaned(positions: Float[np.ndarray, "points 3"], values: Values, strength: Strength = "auto") -> Cleaned:
+    """The points and other columns (points, ...) without outliers, and averaged; what is sound is not copied."""
     lines = []
     apart = outliers(positions, strength)
     if apart.any():
         lines.append(f"removed {apart.sum():,} outliers of {len(positions):,} points")
         positions, values = positions[~apart], {name: x[~apart] for name, x in values.items()}
     sigma, spacing = noise(positions)
-    if is_noisy(sigma, spacing, strength):
+    averages = is_noisy(sigma, spacing, strength)
+    if averages:
         before = len(positions)
         positions, values = averaged(positions, values, sigma, spacing)
         kept = ~fringe(positions, fringe_cell(sigma, spacing))
         positions, values = positions[kept], {name: x[kept] for name, x in values.items()}
         lines.append(f"averaged {before:,} points to {len(positions):,}: noise of {sigma / spacing:.1f} spacings")
-    return positions, values, lines
+    return Cleaned(positions, values, lines, sigma if averages else 0.0)
 
 
 def outliers(positions: Float[np.ndarray, "points 3"], strength: Strength = "auto") -> Bool[np.ndarray, " points"]:
@@ -247,37 +259,69 @@ def averaged(
     radius = max(deviations * sigma, LEAST_RADIUS * spacing)
     order = np.lexsort(positions.T)  # so that a part is spread over the cloud, and the same whatever the points' order
     within = 2 * np.pi * (radius / spacing) ** 2  # points whose weight counts
-    basis = order[:: max(1, int(within / AROUND))]
-    start = positions[order[:: -(-len(order) // MOST_MOVED)]].astype(np.float64)
-    known = positions[basis].astype(np.float64)
-    tree, columns = cKDTree(known), {name: column[basis] for name, column in values.items()}
-    pieces = [_moved(start[i : i + ROWS], tree, known, columns, sigma, radius) for i in range(0, len(start), ROWS)]
-    moved = np.concatenate([piece for piece, _ in pieces])
-    values = {name: np.concatenate([means[name] for _, means in pieces]) for name in values}
-    if "normals" in values:
-        length = np.linalg.norm(values["normals"], axis=1, keepdims=True)
+    basis, rows = order[:: max(1, int(within / AROUND))], order[:: -(-len(order) // MOST_MOVED)]
+    start, known = positions[rows].astype(np.float64), positions[basis].astype(np.float64)
+    color = np.sqrt(np.maximum(values.get("base_color", np.zeros((len(positions), 1))), 0))
+    tree, own, others = cKDTree(known), color[rows], color[basis]
+    alike = _alike(known, tree, others)
+
+    def moved_of(piece: slice) -> np.ndarray:
+        return _moved(start[piece], own[piece], tree, others, sigma, radius, alike)
+
+    moved = np.concatenate([moved_of(slice(i, i + ROWS)) for i in range(0, len(start), ROWS)])
+    means = _means(moved, {name: column[rows] for name, column in values.items()}, MEAN * max(sigma, spacing))
+    if "normals" in means:
+        length = np.linalg.norm(means["normals"], axis=1, keepdims=True)
         agreed = length > CANCELLED
-        values["normals"] = np.where(agreed, values["normals"] / np.where(agreed, length, 1), 0)
-    return moved, values
+        means["normals"] = np.where(agreed, means["normals"] / np.where(agreed, length, 1), 0)
+    return moved, means
+
+
+def _alike(positions: np.ndarray, tree: cKDTree, color: np.ndarray) -> float:
+    """Standard deviation of the weight of a neighbour's colour: wider than the colours' own noise."""
+    sample = slice(None, None, -(-len(positions) // SAMPLE))
+    near = tree.query(positions[sample], list(range(1, min(AROUND, tree.n) + 1)), workers=-1)[1]
+    apart = np.linalg.norm(color[near] - color[sample, None], axis=-1)
+    return max(ALIKE, COLOUR_NOISE * float(np.median(np.quantile(apart, 0.25, axis=1))))
 
 
 def _moved(
-    start: np.ndarray, tree: cKDTree, known: np.ndarray, columns: Values, sigma: float, radius: float
-) -> tuple[np.ndarray, Values]:
-    """Points (n, 3) moved, and the means of the columns of the known ones around where they are then."""
-    near, weights = _around(start, tree, radius)
-    towards, squared, axes = _spread(start, known[near], weights)
+    start: np.ndarray,
+    own: np.ndarray,
+    tree: cKDTree,
+    color: np.ndarray,
+    sigma: float,
+    radius: float,
+    alike: float,
+) -> np.ndarray:
+    """Points (n, 3) with colours moved by what the tree's points of like colour around them tell."""
+
+    def spread(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        near, weights = _around(points, tree, radius, AROUND)
+        weights *= np.exp(-0.5 * np.sum(((color[near] - own[:, None]) / alike) ** 2, axis=-1))
+        weights /= np.maximum(weights.sum(axis=1, keepdims=True), 1e-30)
+        return _spread(points, tree.data[near], weights)
+
+    towards, squared, axes = spread(start)
     squared = np.maximum(squared, 1 / (1 / sigma**2 + 1 / radius**2))  # the least that a window of noise leaves
     moved = start + np.einsum("nij,nj->ni", axes, sigma**2 / squared * towards)
-    near, weights = _around(moved, tree, radius)
-    towards, _, axes = _spread(moved, known[near], weights)
-    moved = moved + towards[:, :1] * axes[..., 0]
-    return moved, {name: np.einsum("nk,nk...->n...", weights, column[near]) for name, column in columns.items()}
+    towards, _, axes = spread(moved)
+    return moved + towards[:, :1] * axes[..., 0]
 
 
-def _around(points: np.ndarray, tree: cKDTree, radius: float) -> tuple[np.ndarray, np.ndarray]:
-    """Rows (n, k) of the neighbours of points (n, 3), and their weights, of sum 1."""
-    distances, near = tree.query(points, list(range(1, min(AROUND, tree.n) + 1)), workers=-1)
+def _means(positions: np.ndarray, columns: Values, radius: float) -> Values:
+    """Means of the columns of the points around each."""
+    tree = cKDTree(positions)
+    pieces = [_around(positions[i : i + ROWS], tree, radius, MEANT) for i in range(0, len(positions), ROWS)]
+    return {
+        name: np.concatenate([np.einsum("nk,nk...->n...", weights, column[near]) for near, weights in pieces])
+        for name, column in columns.items()
+    }
+
+
+def _around(points: np.ndarray, tree: cKDTree, radius: float, most: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rows (n, k) of at most so many neighbours of points (n, 3), and their weights, of sum 1."""
+    distances, near = tree.query(points, list(range(1, min(most, tree.n) + 1)), workers=-1)
     weights = np.exp(-0.5 * (distances / radius) ** 2)
     return near, weights / np.maximum(weights.sum(axis=1, keepdims=True), 1e-30)
 

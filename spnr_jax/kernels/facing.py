@@ -1,36 +1,57 @@
-"""What one sensor saw: which points nothing hides from its place, and their normals, turned to it."""
+"""Normals of points from all the points around them, and what one sensor saw: what nothing hides from its place."""
 
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 
-NEIGHBOURS, MOST = 16, 64  # of a point, for its normal
-THICK = 0.1  # extent of most neighbourhoods across their planes, over that along them, from which on there is noise
+NEIGHBOURS = 16  # of a point, for the spacing
+REACH = 2.0  # standard deviation of the weight of a neighbour's distance: spacings, or as many deviations of the noise
+DISCS = 2.5  # of this radius, that hold the neighbours that are asked
+MOST = 128  # neighbours
+THICK = 0.15, 0.7  # standard deviation of the weight of a height over the plane: spacings, deviations of the noise
+ROUNDS = 3  # in which neighbours that lie off the plane before count less
+ROWS = 2**12  # points that are worked on at a time: their neighbours fit into the cache
 CELL = 2.0  # spacings: pixel of a sensor
 SAMPLE = 2048  # points at which the spacing is measured
+TINY = np.finfo(np.float64).tiny
+
+
+def planes(
+    positions: Float[np.ndarray, "points 3"], among: Float[np.ndarray, "all 3"], noise: float = 0.0
+) -> Float[np.ndarray, "points 3"]:
+    """Unit normals, of either sign, of the surface at some points from all points of their cloud.
+
+    Each is that of the plane of least squares through the neighbours, in rounds: those that lie off the plane before
+    count less, so that an edge gets one of its faces (moving least squares with robust weights, Fleishman et al. 2005).
+    `noise` is the standard deviation that the points had before they were averaged: it makes the neighbourhood wider.
+    """
+    spacing = spacing_of(among)
+    radius, thick = REACH * max(noise, spacing), max(THICK[0] * spacing, THICK[1] * noise)
+    count = DISCS * np.pi * (radius / spacing) ** 2 if spacing > 0 else MOST
+    tree, count = cKDTree(among), round(min(count, MOST, len(among)))
+    pieces = (positions[i : i + ROWS] for i in range(0, len(positions), ROWS))
+    return np.concatenate([_planes(piece, tree, count, radius, thick) for piece in pieces])
+
+
+def _planes(points: np.ndarray, tree: cKDTree, count: int, radius: float, thick: float) -> np.ndarray:
+    distance, near = tree.query(points, list(range(1, count + 1)), workers=-1)
+    offset = tree.data[near] - points[:, None]
+    close = np.exp(-0.5 * (distance / max(radius, TINY)) ** 2)
+    weight = close
+    for last in range(ROUNDS, -1, -1):
+        share = weight / weight.sum(axis=1, keepdims=True)
+        centred = offset - (share[:, None] @ offset)
+        normal = np.linalg.eigh(np.swapaxes(centred * share[..., None], 1, 2) @ centred)[1][..., 0]
+        if last:
+            weight = close * np.exp(-0.5 * (np.einsum("nki,ni->nk", offset, normal) / max(thick, TINY)) ** 2)
+    return normal
 
 
 def facing(
-    positions: Float[np.ndarray, "points 3"],
-    among: Float[np.ndarray, "all 3"],
-    place: Float[np.ndarray, "3"],
+    normals: Float[np.ndarray, "points 3"], positions: Float[np.ndarray, "points 3"], place: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "points 3"]:
-    """Unit normals of the planes through the nearest of all points, least squares, on the side of the place.
-
-    They are the more points the thicker these lie about their planes, so that noise does not tilt them.
-    """
-    tree, count = cKDTree(among), min(NEIGHBOURS, len(among))
-    while True:
-        near = among[tree.query(positions, list(range(1, count + 1)), workers=-1)[1]]
-        offset = near - near.mean(axis=1, keepdims=True)
-        squared, axes = np.linalg.eigh(np.swapaxes(offset, 1, 2) @ offset)
-        thick = np.median(squared[:, 0]) > THICK**2 * np.median(squared[:, 2])
-        if not thick or 2 * count > min(MOST, len(among)):
-            break
-        count *= 2
-    normal = axes[..., 0]
-    towards = np.einsum("ni,ni->n", normal, place - positions)
-    return np.where(towards[:, None] < 0, -normal, normal)
+    """The normals turned to a place."""
+    return np.where(np.einsum("ni,ni->n", normals, place - positions)[:, None] < 0, -normals, normals)
 
 
 def seen_from(

@@ -74,7 +74,7 @@ def _columns(
     raw = joined(first_spacing, near)
     middle, given = float(np.median(raw)), normals is not None
     first = joined(layers.first_normals, near, *all_of(raw)) if normals is None else np.asfortranarray(_unit(normals))
-    layer = each(layers.fitted, near, *all_of(raw, first), [given] * len(near))
+    layer = each(layers.fitted, near, *all_of(raw, first), [given] * len(near), [given] * len(near))
     normal, sided = sides.outward(near, layer, raw, given, positions, middle)
     weight = each(layers.weights, near, layer, *all_of(normal, sided))
     spacing = joined(_own_spacing, near, weight, *all_of(raw))

@@ -61,8 +61,8 @@ def first_normals(near: Near, spacing: np.ndarray) -> np.ndarray:
     return best.T
 
 
-def fitted(near: Near, spacing: np.ndarray, normal: np.ndarray, given: bool) -> Layer:
-    """The layers of a block of points from first normals (all points' arrays); given normals are kept.
+def fitted(near: Near, spacing: np.ndarray, normal: np.ndarray, sided: bool, firm: bool) -> Layer:
+    """The layers of a block of points from first normals (all points' arrays), which are kept if they are firm.
 
     A layer is a quadric through its point (Cazals and Pouget 2003), fitted in rounds to the neighbours that lie close
     to it.
@@ -70,7 +70,7 @@ def fitted(near: Near, spacing: np.ndarray, normal: np.ndarray, given: bool) -> 
     spacing, of_all, normal = spacing[near.rows], normal, normal[near.rows].T
     weight, scale = close(near, spacing), np.full(len(spacing), START, np.float32)
     height = along(near.offset, normal / spacing)
-    if given:  # the other side of a wall is told apart by its normals
+    if sided:  # the other side of a wall is told apart by its normals
         weight *= np.clip(0.5 + along(around(near, of_all), normal), 0, 1)
     for _ in range(ROUNDS):
         axes = frame(normal)
@@ -79,7 +79,7 @@ def fitted(near: Near, spacing: np.ndarray, normal: np.ndarray, given: bool) -> 
         terms = np.stack([one, two, one * one, one * two, two * two, up])
         sums = np.einsum("ikn,jkn->ijn", own * terms[:5], terms)
         solution = solved(sums[:, :5] + STIFF, sums[:, 5:])[:, 0]
-        if given:
+        if firm:
             solution[:2] = 0
         height = up - np.einsum("ikn,in->kn", terms[:5], solution)
         normal = axes[2] - solution[0] * axes[0] - solution[1] * axes[1]

@@ -140,7 +140,7 @@ def scanned(cloud: PointCloud, generator: np.random.Generator) -> PointCloud:
     columns = {name: np.asarray(x) for name, x in vars(cloud).items() if x is not None and name != "mask"}
     positions, values = random_scan(columns.pop("positions"), columns, generator)
     values.pop("normals", None)
-    positions, values, _ = cleaned(positions, values)
+    positions, values, *_ = cleaned(positions, values)
     return PointCloud(
         positions=np.clip(positions, -1, 1).astype(np.float32),
         mask=np.ones(len(positions), bool),

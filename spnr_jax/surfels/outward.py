@@ -1,0 +1,31 @@
+"""Normals of the points that are kept of a dense cloud, from all of it: thinned points alone know them worse."""
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from spnr_jax.kernels.cloud_arrays import normalization
+from spnr_jax.kernels.facing import planes
+from spnr_jax.surfels import layers, sides
+from spnr_jax.surfels.neighbours import each, first_spacing, joined, neighbourhoods
+
+VOTERS = 2**15  # points that votes are taken of, those that are kept among them
+
+
+def outward_normals(
+    positions: Float[np.ndarray, "all 3"], kept: Int[np.ndarray, " points"], noise: float = 0.0
+) -> Float[np.ndarray, "points 3"]:
+    """Unit normals of the points of these numbers; outward by the votes of directions and walls (sides.py).
+
+    `noise` is that of `planes`.
+    """
+    rest = np.setdiff1d(np.arange(len(positions)), kept)
+    others = max(0, VOTERS - len(kept))
+    voters = np.concatenate([kept, np.random.default_rng(0).permutation(rest)[:others]])
+    centre, scale = normalization(positions)
+    places = np.asarray((positions[voters] - centre) * scale, np.float32)
+    normal = np.asfortranarray(planes(positions[voters], positions, noise), np.float32)
+    near = neighbourhoods(places)
+    raw = joined(first_spacing, near)
+    spacings, normals, unsided, firm = ([x] * len(near) for x in (raw, normal, False, True))
+    layer = each(layers.fitted, near, spacings, normals, unsided, firm)
+    return sides.outward(near, layer, raw, False, places, float(np.median(raw)))[0][: len(kept)]
