@@ -31,7 +31,8 @@ def claim(folder: Path, what: str, asked: Mapping, dataset: data_sets.Dataset | 
         there = json.loads(path.read_text())
         if different := [name for name in asked if there.get(name) != json.loads(json.dumps(asked[name]))]:
             raise UserError(f"{folder} holds {what} with another {', '.join(different)}; choose another --out")
-    images.write_whole(path, as_json(asked))
+    else:  # what is there stays as it is: studies may share a folder
+        images.write_whole(path, as_json(asked))
 
 
 def as_json(content: object) -> bytes:

@@ -23,7 +23,7 @@ from spnr_jax.formats.sensor import sensor_of
 from spnr_jax.formats.up_axis import ROTATIONS, find_up
 from spnr_jax.kernels import scenes
 from spnr_jax.kernels.cleaning import Clean, Strength, beside, cleaned, is_noisy, noise
-from spnr_jax.kernels.facing import facing, planes
+from spnr_jax.kernels.facing import facing
 from spnr_jax.kernels.records import PointCloud
 from spnr_jax.kernels.thinning import THINNING, farthest_points, stacked, thin_stream
 from spnr_jax.surfels.outward import outward_normals
@@ -112,8 +112,7 @@ def place_cloud(
         kept = np.sort(farthest_points(positions, num_points, seed))
     values = {name: column[kept] for name, column in values.items()}
     if "normals" not in values and sensor:
-        directions = planes(positions[kept], positions, sigma)
-        values["normals"] = facing(directions, positions[kept], sensor.place - origin)
+        values["normals"] = facing(positions[kept], positions, sensor.place - origin, sigma)
         report("normals turned to the place of the sensor")
     elif "normals" not in values and len(kept) < len(positions):
         values["normals"] = outward_normals(positions, kept, sigma)

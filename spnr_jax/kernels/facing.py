@@ -9,6 +9,7 @@ REACH = 2.0  # standard deviation of the weight of a neighbour's distance: spaci
 DISCS = 2.5  # of this radius, that hold the neighbours that are asked
 MOST = 128  # neighbours
 THICK = 0.15, 0.7  # standard deviation of the weight of a height over the plane: spacings, deviations of the noise
+FLAT, ROUGH = 32, 4.0  # neighbours whose thickness tells what a sensor's noise is, and times that thickness
 ROUNDS = 3  # in which neighbours that lie off the plane before count less
 ROWS = 2**12  # points that are worked on at a time: their neighbours fit into the cache
 CELL = 2.0  # spacings: pixel of a sensor
@@ -48,10 +49,26 @@ def _planes(points: np.ndarray, tree: cKDTree, count: int, radius: float, thick:
 
 
 def facing(
-    normals: Float[np.ndarray, "points 3"], positions: Float[np.ndarray, "points 3"], place: Float[np.ndarray, "3"]
+    positions: Float[np.ndarray, "points 3"],
+    among: Float[np.ndarray, "all 3"],
+    place: Float[np.ndarray, "3"],
+    noise: float = 0.0,
 ) -> Float[np.ndarray, "points 3"]:
-    """The normals turned to a place."""
-    return np.where(np.einsum("ni,ni->n", normals, place - positions)[:, None] < 0, -normals, normals)
+    """Those normals turned to the place of the sensor that saw the points.
+
+    One sensor sees one side of everything, so that all heights over the planes count as noise, steps of depth as well.
+    """
+    normals = planes(positions, among, max(noise, ROUGH * _thickness(among)))
+    towards = np.einsum("ni,ni->n", normals, place - positions)
+    return np.where(towards[:, None] < 0, -normals, normals)
+
+
+def _thickness(positions: np.ndarray) -> float:
+    """Median over a sample of the points of how thick their neighbours lie about the plane of least squares."""
+    sample = positions[:: -(-len(positions) // SAMPLE)]
+    near = positions[cKDTree(positions).query(sample, list(range(1, min(FLAT, len(positions)) + 1)), workers=-1)[1]]
+    offset = near - near.mean(axis=1, keepdims=True)
+    return float(np.sqrt(np.median((np.linalg.svd(offset, compute_uv=False)[:, -1] ** 2) / near.shape[1])))
 
 
 def seen_from(

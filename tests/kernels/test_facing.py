@@ -7,17 +7,17 @@ from spnr_jax.surfels.visibility import spiral
 
 def test_normals_of_a_ball_point_to_a_sensor_in_its_middle_or_far_from_it():
     points = spiral(3000)
-    from_within = facing(planes(points, points), points, np.zeros(3))
+    from_within = facing(points, points, np.zeros(3))
     np.testing.assert_allclose(from_within, -points, atol=0.03)
     front = points[points[:, 2] > 0.2][::7]
-    np.testing.assert_allclose(facing(planes(front, points), front, np.array([0, 0, 9.0])), front, atol=0.03)
+    np.testing.assert_allclose(facing(front, points, np.array([0, 0, 9.0])), front, atol=0.03)
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 40])
 @pytest.mark.parametrize("size", [0.0, 1e-30, 1e30])
 def test_points_that_span_no_plane_have_some_normal_of_unit_length(count, size):
     points = size * np.linspace([0, 0, 0], [1, 2, 3], count)
-    np.testing.assert_allclose(np.linalg.norm(planes(points, points), axis=1), 1, atol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(facing(points, points, np.array([0, 0, 1.0])), axis=1), 1, atol=1e-6)
 
 
 def test_a_sensor_sees_the_near_cap_of_a_ball_and_nothing_from_the_place_of_the_points():
@@ -37,6 +37,14 @@ def test_noise_tilts_normals_less_because_more_points_are_asked():
     noisy = points + np.random.default_rng(0).normal(size=points.shape) * noise
     told, untold = (1 - np.abs(np.sum(planes(noisy, noisy, sigma) * points, axis=1)) for sigma in (4 * noise, 0.0))
     assert np.median(told) < 0.5 * np.median(untold) < 0.01
+
+
+def test_steps_of_a_sensors_depth_hardly_tilt_normals():
+    x, y = (axis.ravel() for axis in np.meshgrid(*2 * [np.linspace(0, 1, 100)]))
+    steps = np.stack([x, y, np.round(0.3 * x / 0.012) * 0.012], axis=1)
+    true = np.array([-0.3, 0, 1]) / np.hypot(0.3, 1)
+    seen, flat = facing(steps, steps, np.array([0, 0, 9.0])) @ true, np.abs(planes(steps, steps) @ true)
+    assert np.degrees(np.arccos(np.median(seen))) < 0.5 * np.degrees(np.arccos(np.median(flat)))
 
 
 def test_points_at_an_edge_have_the_normals_of_its_faces():
