@@ -121,6 +121,51 @@ def test_materials_are_averaged_with_the_points_and_normals_stay_of_unit_length(
     assert (lengths == 0).any()
 
 
+def layers(sigma, apart):
+    """A red plate, and a blue one over it, with noise; heights where they were, and colours."""
+    rng = np.random.default_rng(0)
+    height = np.repeat([0.0, apart], 5000)
+    flat = np.stack([*rng.uniform(-0.5, 0.5, (2, 10_000)), height], axis=1)
+    color = np.where(height[:, None] > 0, [0.1, 0.1, 0.8], [0.8, 0.1, 0.1])
+    return flat + rng.normal(size=flat.shape) * sigma, height, color
+
+
+def test_two_layers_of_different_colours_nearer_than_the_noise_are_told_apart():
+    points, height, color = layers(sigma=0.02, apart=0.02)
+    order = np.lexsort(points.T)
+    moved, values = averaged(points, {"base_color": color}, 0.02, 0.01)
+    for layer in (height[order] > 0, height[order] == 0):
+        inner = layer & (np.abs(moved[:, :2]).max(axis=1) < 0.4)
+        assert np.abs(moved[inner, 2] - height[order][inner]).mean() < 0.4 * 0.016
+    plain, mixed = averaged(points, {"roughness": color[:, 0]}, 0.02, 0.01)
+    assert np.abs(plain[:, 2] - height[order]).mean() > 0.5 * 0.016
+    upper = np.argsort(moved[:, 2])[-1000:]
+    assert values["base_color"][upper, 2].mean() > 0.6 > 0.5 > mixed["roughness"].mean()
+
+
+def test_a_pattern_stays_where_it_is_and_keeps_its_colours():
+    rng = np.random.default_rng(0)
+    flat = np.concatenate([rng.uniform(-0.5, 0.5, (2, 15_000)), np.zeros((1, 15_000))]).T
+    white = (np.floor(flat[:, 0] / 0.05) % 2)[:, None] * np.ones(3)
+    noisy = flat + rng.normal(size=flat.shape) * 0.01
+    order = np.lexsort(noisy.T)
+    moved, values = averaged(noisy, {"base_color": white}, 0.01, 0.008)
+    along = np.abs(moved[:, 0] - flat[order, 0]).mean()
+    assert along < np.abs(noisy[order, 0] - flat[order, 0]).mean()
+    assert np.abs(values["base_color"] - white[order]).mean() < 0.1
+
+
+def test_noise_of_colours_hardly_keeps_points_from_being_averaged():
+    rng = np.random.default_rng(0)
+    flat = np.concatenate([rng.uniform(-0.5, 0.5, (2, 10_000)), np.zeros((1, 10_000))]).T
+    noisy = flat + rng.normal(size=flat.shape) * 0.02
+    left = [
+        averaged(noisy, {"base_color": 0.5 + rng.normal(size=(10_000, 3)) * spread}, 0.02, 0.01)[0][:, 2].std()
+        for spread in (0, 0.05, 0.15)
+    ]
+    assert max(left) < 1.35 * left[0] < 0.5 * 0.02
+
+
 def test_the_order_of_the_points_does_not_matter():
     surface = with_outliers(sphere(5000, "random"), 0)
     noisy = surface + np.random.default_rng(1).normal(size=surface.shape) * 0.03
