@@ -3,7 +3,6 @@
 import numpy as np
 from jaxtyping import Float, Int
 
-from spnr_jax.kernels.cloud_arrays import normalization
 from spnr_jax.kernels.facing import planes
 from spnr_jax.surfels import layers, sides
 from spnr_jax.surfels.neighbours import each, first_spacing, joined, neighbourhoods
@@ -21,8 +20,9 @@ def outward_normals(
     rest = np.setdiff1d(np.arange(len(positions)), kept)
     others = max(0, VOTERS - len(kept))
     voters = np.concatenate([kept, np.random.default_rng(0).permutation(rest)[:others]])
-    centre, scale = normalization(positions)
-    places = np.asarray((positions[voters] - centre) * scale, np.float32)
+    low, high = positions.min(axis=0), positions.max(axis=0)
+    half = np.linalg.norm(high - low) / 2 or 1.0
+    places = np.asarray((positions[voters] - (low + high) / 2) / half, np.float32)  # in the box
     normal = np.asfortranarray(planes(positions[voters], positions, noise), np.float32)
     near = neighbourhoods(places)
     raw = joined(first_spacing, near)
