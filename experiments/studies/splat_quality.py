@@ -29,7 +29,7 @@ import jax.numpy as jnp
 import mitsuba
 import numpy as np
 
-from data_gen.render.variant import choose_variant
+from data_gen.render.variant import LLVM, choose_variant
 from experiments import entry_point
 from experiments.comparison import figures, poisson, results_folder, splats_by_mitsuba
 from experiments.comparison.object_views import Picture, at, drawn, few, on_white, told, view_of
@@ -101,8 +101,10 @@ def main(options: SplatStudy) -> None:
     names = options.names or everyone[:: max(len(everyone) // options.objects, 1)][: options.objects]
     asked = {k: str(v) if isinstance(v, Path) else v for k, v in dataclasses.asdict(options).items()}
     which = ("out", "names", "objects")  # those that are made in one go
-    results_folder.claim(options.out, "splat_quality", {k: v for k, v in asked.items() if k not in which}, dataset)
     variant = choose_variant()[0]
+    if variant != LLVM:
+        raise UserError(f"Mitsuba draws splats in {LLVM} alone, which does not run here; install LLVM 17 or newer")
+    results_folder.claim(options.out, "splat_quality", {k: v for k, v in asked.items() if k not in which}, dataset)
     mitsuba.set_variant(variant)
     renderer, rows = poisson.Renderer(dataset.settings, variant=variant), dict[str, dict]()
     model = load(options.run)

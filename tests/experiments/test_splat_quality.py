@@ -7,6 +7,7 @@ import pytest
 from support import tiny_dataset, tiny_surfels
 from support.tiny_runs import goes_on
 
+from data_gen.render.variant import LLVM, SCALAR, choose_variant
 from experiments.comparison.object_views import at, on_white
 from experiments.studies import splat_quality
 from spnr_jax.errors import UserError
@@ -30,6 +31,8 @@ def folder(tmp_path):
 @pytest.mark.ci
 def test_the_study_scores_every_method_at_every_size_and_goes_on_where_it_stopped(folder, tmp_path):
     pytest.importorskip("mitsuba")
+    if choose_variant()[0] != LLVM:
+        pytest.skip("needs an LLVM library that Mitsuba's compiled variant works with")
     options = splat_quality.SplatStudy(
         data=folder,
         out=tmp_path / "out",
@@ -54,6 +57,15 @@ def test_the_study_scores_every_method_at_every_size_and_goes_on_where_it_stoppe
         assert 0 < made["splats"] <= options.most
     assert (tmp_path / "out" / "gallery.png").is_file()
     goes_on(splat_quality.main, options)
+
+
+@pytest.mark.ci
+def test_without_the_compiled_variant_the_study_says_so_and_writes_nothing(folder, tmp_path, monkeypatch):
+    pytest.importorskip("mitsuba")
+    monkeypatch.setattr(splat_quality, "choose_variant", lambda: (SCALAR, None))
+    with pytest.raises(UserError, match="install LLVM 17 or newer"):
+        splat_quality.main(splat_quality.SplatStudy(data=folder, out=tmp_path / "out"))
+    assert not (tmp_path / "out").exists()
 
 
 def red_square() -> Asset:
