@@ -65,6 +65,7 @@ def read_cloud(
     More than `num_points` are thinned out evenly, fewer are kept; a mesh gives exactly `num_points` (4096 if None).
     `up` is the file's upward axis, or "auto".  Unless `clean` is "off" points are cleaned before they are thinned
     (spnr_jax/kernels/cleaning.py), those of meshes never; of a file that is thinned while reading, what that keeps.
+    Points that are thinned out have normals, the file's or those that all of its points tell (surfels/outward.py).
     `cut` says which part of a scene is wanted.  Rows without finite numbers are left out.  Transparent parts of a mesh
     are taken as opaque, or left out ("skip").  ValueError, one line that names the file, for whatever cannot be read.
     """

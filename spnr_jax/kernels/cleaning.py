@@ -263,7 +263,7 @@ def averaged(
     start, known = positions[rows].astype(np.float64), positions[basis].astype(np.float64)
     color = np.sqrt(np.maximum(values.get("base_color", np.zeros((len(positions), 1))), 0))
     tree, own, others = cKDTree(known), color[rows], color[basis]
-    alike = _alike(known, tree, others)
+    alike = _alike(tree, others)
 
     def moved_of(piece: slice) -> np.ndarray:
         return _moved(start[piece], own[piece], tree, others, sigma, radius, alike)
@@ -277,10 +277,10 @@ def averaged(
     return moved, means
 
 
-def _alike(positions: np.ndarray, tree: cKDTree, color: np.ndarray) -> float:
-    """Standard deviation of the weight of a neighbour's colour: wider than the colours' own noise."""
-    sample = slice(None, None, -(-len(positions) // SAMPLE))
-    near = tree.query(positions[sample], list(range(1, min(AROUND, tree.n) + 1)), workers=-1)[1]
+def _alike(tree: cKDTree, color: np.ndarray) -> float:
+    """Standard deviation of the weight of a neighbour's colour: wider than the noise of the colours (n, channels)."""
+    sample = slice(None, None, -(-tree.n // SAMPLE))
+    near = tree.query(tree.data[sample], list(range(1, min(AROUND, tree.n) + 1)), workers=-1)[1]
     apart = np.linalg.norm(color[near] - color[sample, None], axis=-1)
     return max(ALIKE, COLOUR_NOISE * float(np.median(np.quantile(apart, 0.25, axis=1))))
 

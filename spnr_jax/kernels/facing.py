@@ -26,26 +26,33 @@ def planes(
     count less, so that an edge gets one of its faces (moving least squares with robust weights, Fleishman et al. 2005).
     `noise` is the standard deviation that the points had before they were averaged: it makes the neighbourhood wider.
     """
-    spacing = spacing_of(among)
+    return _planes(positions, cKDTree(among), noise)
+
+
+def _planes(positions: np.ndarray, tree: cKDTree, noise: float) -> np.ndarray:
+    """The normals of `planes` from a tree of all points."""
+    spacing = _spacing(tree)
     radius, thick = REACH * max(noise, spacing), max(THICK[0] * spacing, THICK[1] * noise)
     count = DISCS * np.pi * (radius / spacing) ** 2 if spacing > 0 else MOST
-    tree, count = cKDTree(among), round(min(count, MOST, len(among)))
-    pieces = (positions[i : i + ROWS] for i in range(0, len(positions), ROWS))
-    return np.concatenate([_planes(piece, tree, count, radius, thick) for piece in pieces])
+    ranks = list(range(1, round(min(count, MOST, tree.n)) + 1))
+
+    def of_rows(points: np.ndarray) -> np.ndarray:
+        distance, near = tree.query(points, ranks, workers=-1)
+        offset = tree.data[near] - points[:, None]
+        weight = close = np.exp(-0.5 * (distance / max(radius, TINY)) ** 2)
+        for _ in range(ROUNDS):
+            height = np.einsum("nki,ni->nk", offset, _narrowest(offset, weight))
+            weight = close * np.exp(-0.5 * (height / max(thick, TINY)) ** 2)
+        return _narrowest(offset, weight)
+
+    return np.concatenate([of_rows(positions[i : i + ROWS]) for i in range(0, len(positions), ROWS)])
 
 
-def _planes(points: np.ndarray, tree: cKDTree, count: int, radius: float, thick: float) -> np.ndarray:
-    distance, near = tree.query(points, list(range(1, count + 1)), workers=-1)
-    offset = tree.data[near] - points[:, None]
-    close = np.exp(-0.5 * (distance / max(radius, TINY)) ** 2)
-    weight = close
-    for last in range(ROUNDS, -1, -1):
-        share = weight / weight.sum(axis=1, keepdims=True)
-        centred = offset - (share[:, None] @ offset)
-        normal = np.linalg.eigh(np.swapaxes(centred * share[..., None], 1, 2) @ centred)[1][..., 0]
-        if last:
-            weight = close * np.exp(-0.5 * (np.einsum("nki,ni->nk", offset, normal) / max(thick, TINY)) ** 2)
-    return normal
+def _narrowest(offset: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Unit vectors (n, 3) along which weighted neighbours (n, k, 3) spread least."""
+    share = weight / weight.sum(axis=1, keepdims=True)
+    centred = offset - (share[:, None] @ offset)
+    return np.linalg.eigh(np.swapaxes(centred * share[..., None], 1, 2) @ centred)[1][..., 0]
 
 
 def facing(
@@ -54,19 +61,20 @@ def facing(
     place: Float[np.ndarray, "3"],
     noise: float = 0.0,
 ) -> Float[np.ndarray, "points 3"]:
-    """Those normals turned to the place of the sensor that saw the points.
+    """The normals of `planes`, turned to the place of the sensor that saw the points.
 
     One sensor sees one side of everything, so that all heights over the planes count as noise, steps of depth as well.
     """
-    normals = planes(positions, among, max(noise, ROUGH * _thickness(among)))
+    tree = cKDTree(among)
+    normals = _planes(positions, tree, max(noise, ROUGH * _thickness(tree)))
     towards = np.einsum("ni,ni->n", normals, place - positions)
     return np.where(towards[:, None] < 0, -normals, normals)
 
 
-def _thickness(positions: np.ndarray) -> float:
+def _thickness(tree: cKDTree) -> float:
     """Median over a sample of the points of how thick their neighbours lie about the plane of least squares."""
-    sample = positions[:: -(-len(positions) // SAMPLE)]
-    near = positions[cKDTree(positions).query(sample, list(range(1, min(FLAT, len(positions)) + 1)), workers=-1)[1]]
+    sample = tree.data[:: -(-tree.n // SAMPLE)]
+    near = tree.data[tree.query(sample, list(range(1, min(FLAT, tree.n) + 1)), workers=-1)[1]]
     offset = near - near.mean(axis=1, keepdims=True)
     return float(np.sqrt(np.median((np.linalg.svd(offset, compute_uv=False)[:, -1] ** 2) / near.shape[1])))
 
@@ -98,9 +106,12 @@ def seen_from(
 
 def spacing_of(positions: Float[np.ndarray, "points 3"]) -> float:
     """Median side of the square that a point stands for, at a sample of the points; 0 of fewer than two."""
-    if len(positions) < 2:
+    return _spacing(cKDTree(positions))
+
+
+def _spacing(tree: cKDTree) -> float:
+    if tree.n < 2:
         return 0.0
-    count = min(NEIGHBOURS, len(positions))
-    sample = positions[:: -(-len(positions) // SAMPLE)]
-    radius = cKDTree(positions).query(sample, [count], workers=-1)[0]
+    count = min(NEIGHBOURS, tree.n)
+    radius = tree.query(tree.data[:: -(-tree.n // SAMPLE)], [count], workers=-1)[0]
     return float(np.median(radius)) * float(np.sqrt(np.pi / count))

@@ -28,7 +28,7 @@ class PointCloud:
     metallic: Float[AnyArray, "*batch points"]
     mask: Bool[AnyArray, "*batch points"]
     normals: Float[AnyArray, "*batch points 3"] | None = None
-    """Of unit length, of either sign; None where the file has none: then they are estimated."""
+    """Of unit length, of either sign; None where none are known: then they are estimated from these points."""
     materials_known: Float[AnyArray, "*batch points"] | None = None
     """1 where roughness and metallic are known, 0 where they stand for any; None where all are known."""
 

@@ -37,6 +37,7 @@ def test_noise_tilts_normals_less_because_more_points_are_asked():
     noisy = points + np.random.default_rng(0).normal(size=points.shape) * noise
     told, untold = (1 - np.abs(np.sum(planes(noisy, noisy, sigma) * points, axis=1)) for sigma in (4 * noise, 0.0))
     assert np.median(told) < 0.25 * np.median(untold) < 0.01
+    assert np.median(np.sum(facing(noisy, noisy, np.zeros(3)) * -points, axis=1)) > 0.98
 
 
 def test_steps_of_a_sensors_depth_hardly_tilt_normals():
