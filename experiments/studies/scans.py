@@ -32,7 +32,7 @@ from spnr_jax.kernels.records import Camera, PointCloud
 from spnr_jax.kernels.thinning import farthest_points
 from spnr_jax.method.model import Model, Quality
 from spnr_jax.scoring.score_tables import Cell, Table, mean_row, number
-from spnr_jax.surfels.outward import outward_normals
+from spnr_jax.surfels import outward
 from spnr_jax.training.scan_faults import Fault, faults
 from spnr_jax.training.weights import load
 
@@ -139,16 +139,10 @@ def as_it_is(positions: np.ndarray, values: Values) -> Cleaned:
 
 
 def thinned(points: Cleaned, count: int) -> PointCloud:
-    """At most so many points, with normals from all, as `read_cloud` keeps them."""
-    positions, values, _, noise = points
-    if len(positions) > count:
-        kept = np.sort(farthest_points(positions, count, seed=0))
-        values = {name: column[kept] for name, column in values.items()}
-        if "normals" not in values:
-            values["normals"] = outward_normals(positions, kept, noise)
-        positions = positions[kept]
-    columns = {name: np.asarray(column, np.float32) for name, column in values.items()}
-    return PointCloud(positions=positions.astype(np.float32), mask=np.ones(len(positions), bool), **columns)
+    """At most so many points, evenly spread, with normals from all, as `read_cloud` keeps them."""
+    if len(points.positions) <= count:
+        return outward.thinned(points, np.arange(len(points.positions)))
+    return outward.thinned(points, np.sort(farthest_points(points.positions, count, seed=0)))
 
 
 def _scores(

@@ -3,11 +3,26 @@
 import numpy as np
 from jaxtyping import Float, Int
 
+from spnr_jax.kernels.cleaning import Cleaned
 from spnr_jax.kernels.facing import planes
+from spnr_jax.kernels.records import PointCloud
 from spnr_jax.surfels import layers, sides
 from spnr_jax.surfels.neighbours import each, first_spacing, joined, neighbourhoods
 
 VOTERS = 2**15  # points that votes are taken of, those that are kept among them
+
+
+def thinned(points: Cleaned, kept: Int[np.ndarray, " points"]) -> PointCloud:
+    """The points of these numbers, (points, ...) float32; with normals from all where the columns have none.
+
+    Where all are kept normals are not looked for: what draws the cloud estimates them from the same points.
+    """
+    values = {name: column[kept] for name, column in points.values.items()}
+    if "normals" not in values and len(kept) < len(points.positions):
+        values["normals"] = outward_normals(points.positions, kept, points.noise)
+    columns = {name: np.asarray(column, np.float32) for name, column in values.items()}
+    positions = points.positions[kept].astype(np.float32)
+    return PointCloud(positions=positions, mask=np.ones(len(kept), bool), **columns)
 
 
 def outward_normals(

@@ -9,7 +9,6 @@ A file is a pure function of (seed, object, cloud); it appears whole or not at a
 again.  A batch is a pure function of (seed, step) and the list of files: squares of views of equal doublings.
 """
 
-import dataclasses
 import zlib
 from collections.abc import Callable, Generator
 from functools import partial
@@ -28,20 +27,21 @@ from spnr_jax.formats.data_sets import Dataset, ObjectData, read_object
 from spnr_jax.formats.images import to_uint8, write_whole
 from spnr_jax.formats.npz import packed, read_arrays
 from spnr_jax.kernels import cameras
-from spnr_jax.kernels.cleaning import cleaned
+from spnr_jax.kernels.cleaning import Cleaned, cleaned
 from spnr_jax.kernels.records import Camera, Crops, Light, PointCloud
 from spnr_jax.kernels.thinning import farthest_points
 from spnr_jax.method import surfel_plan, surfel_renderer
 from spnr_jax.model_config import SurfelConfig
-from spnr_jax.surfels import features, lighting, projection
+from spnr_jax.surfels import features, lighting, outward, projection
 from spnr_jax.training.batching import read_ahead
 from spnr_jax.training.scan_faults import colours_alone, random_scan
 
 CLOUDS = 2  # of each object
-SCANNED = 0.3  # share of them that are scanned and cleaned
+SCANNED = 0.5  # share of them that are scanned and cleaned
 UNKNOWN = 0.15  # share of the clouds of which it is not known where they are solid
 UNKNOWN_MATERIALS = 0.1  # share of the others whose roughness and metallic are not known
 WITHOUT_NORMALS = 0.5  # share of the others whose normals are estimated
+ALONE = 0.5  # share of these whose normals are estimated from the points that are kept alone, as of a small file
 SIDES = (1, 1, 1, 1, 2, 4, 8)  # pixels of a reference averaged along a side, drawn from these
 SMALL, FEWER = 4, 8  # side from which on a cloud has at most so many times fewer points
 MOST_ENTRIES = 2**22  # of a view: one with more is left out
@@ -117,35 +117,33 @@ def random_cloud(cloud: PointCloud, side: int, config: TrainConfig, generator: n
     """Random points of a cloud or evenly spread ones, with or without their normals, or what is left of a scan."""
     most = max(config.max_points // (FEWER if side >= SMALL else 1), config.min_points)
     count = min(int(np.exp(generator.uniform(np.log(config.min_points), np.log(most)))), len(cloud.mask))
-    even = generator.random() < config.even_share and count <= MOST_EVEN
-    if generator.random() < SCANNED:
-        return thinned(scanned(cloud, generator), min(count, MOST_EVEN), even, generator)
-    cloud = thinned(cloud, count, even, generator)
-    if generator.random() < UNKNOWN_MATERIALS:
-        _, columns = colours_alone(np.asarray(cloud.positions), {}, generator)
-        cloud = dataclasses.replace(cloud, **columns)
-    return dataclasses.replace(cloud, normals=None) if generator.random() < WITHOUT_NORMALS else cloud
-
-
-def thinned(cloud: PointCloud, count: int, even: bool, generator: np.random.Generator) -> PointCloud:
-    """So many points of a cloud, if it has more."""
-    chosen = generator.permutation(len(cloud.mask))[:count]
-    if even:
-        chosen = farthest_points(np.asarray(cloud.positions), len(chosen), int(chosen[0]))
-    return jax.tree.map(lambda values: values[chosen], cloud)
-
-
-def scanned(cloud: PointCloud, generator: np.random.Generator) -> PointCloud:
-    """The cloud as a scanner and cleaning leave it: without normals, in the box of the one that was scanned."""
+    even = generator.random() < config.even_share
     columns = {name: np.asarray(x) for name, x in vars(cloud).items() if x is not None and name != "mask"}
-    positions, values = random_scan(columns.pop("positions"), columns, generator)
+    points = Cleaned(columns.pop("positions"), columns, [], 0.0)
+    alone = False
+    if generator.random() < SCANNED:
+        points = scanned(points, generator)
+    else:
+        if generator.random() < UNKNOWN_MATERIALS:
+            points = points._replace(values=colours_alone(*points[:2], generator)[1])
+        if generator.random() < WITHOUT_NORMALS:
+            points.values.pop("normals", None)
+            alone = generator.random() < ALONE
+    chosen = generator.permutation(len(points.positions))[:count]
+    if even and len(chosen) <= MOST_EVEN:
+        chosen = farthest_points(points.positions, len(chosen), int(chosen[0]))
+    if alone:
+        points = Cleaned(points.positions[chosen], {name: x[chosen] for name, x in points.values.items()}, [], 0.0)
+        chosen = np.arange(len(chosen))
+    return outward.thinned(points, chosen)
+
+
+def scanned(points: Cleaned, generator: np.random.Generator) -> Cleaned:
+    """The cloud as a scanner and cleaning leave it: without normals, in the box of the one that was scanned."""
+    positions, values = random_scan(*points[:2], generator)
     values.pop("normals", None)
-    positions, values, *_ = cleaned(positions, values)
-    return PointCloud(
-        positions=np.clip(positions, -1, 1).astype(np.float32),
-        mask=np.ones(len(positions), bool),
-        **{name: column.astype(np.float32) for name, column in values.items()},
-    )
+    left = cleaned(positions, values)
+    return left._replace(positions=np.clip(left.positions, -1, 1))
 
 
 def make_view(
