@@ -1,6 +1,6 @@
 """Figure 1 of the supplement: the adversarial loss with weight 1 beside L1 losses of weight 0, 100 and 5000.
 
-    python -m experiments.paper.fig1 --data DIR --out DIR [--steps N] [--pretrain N] [--l1-weights 0 100 5000]
+    python -m experiments.paper.fig1 --data DIR --out DIR [--steps N] [--pretrain N] [--init RUN] [--l1-weights 0 100]
 
     OUT/runs/l1_WEIGHT_SEED/           run folders; finished ones are only read.  OUT/runs/pretrained_SEED/
     OUT/results.json  table.md         scores, high-frequency energy over the reference's, differences to weight 100
@@ -11,7 +11,7 @@ first step on, whatever the preset does.  By default they start from scratch: so
 an L1 loss.  From scratch the adversarial loss alone needs far more steps than a CPU has patience for, and its pictures
 then show that it has not converged, not what it converges to.  With --pretrain N all of them start from one network
 that was trained for N steps with the L1 loss alone (weight 100): the fair comparison of a small budget, in which the
-weights decide where each goes from there.
+weights decide where each goes from there.  --init RUN starts from a network that is trained already.
 """
 
 import dataclasses
@@ -19,8 +19,6 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
-import jax
-import jax.numpy as jnp
 import tyro
 
 from experiments import entry_point
@@ -30,7 +28,8 @@ from spnr_jax import cli
 from spnr_jax.config import TrainConfig
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
-from spnr_jax.training import optimisation
+from spnr_jax.training import optimisation, trainer
+from spnr_jax.training.weights import read_trained
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,6 +44,8 @@ class Fig1:
     """Weights of the L1 loss; differences are to 100, or to the first of them."""
     pretrain: int = 0
     """Steps with the L1 loss alone that all runs start after; 0 starts from scratch."""
+    init: Path | None = None
+    """Run folder or file of weights that all runs start from instead."""
     budget: tyro.conf.OmitArgPrefixes[Budget] = field(default_factory=Budget)
 
     def __post_init__(self) -> None:
@@ -52,6 +53,8 @@ class Fig1:
             raise UserError(f"--l1-weights: expected distinct numbers from 0 on, got {list(self.l1_weights)}")
         if self.pretrain < 0:
             raise UserError(f"--pretrain: expected 0 or more steps, got {self.pretrain}")
+        if self.pretrain and self.init:
+            raise UserError("--init: leave --pretrain out; the runs start from a network that is trained")
 
 
 def main(options: Fig1) -> None:
@@ -60,7 +63,7 @@ def main(options: Fig1) -> None:
     dataset = data_sets.open_dataset(options.data)
     runs = [variant(options, weight, options.budget.config(), dataset) for weight in options.l1_weights]
     reference = runs[options.l1_weights.index(100.0) if 100.0 in options.l1_weights else 0].name
-    start = f"{options.pretrain} steps of L1 alone" if options.pretrain else "scratch"
+    start = str(options.init or (f"{options.pretrain} steps of L1 alone" if options.pretrain else "scratch"))
     given = (options.out, "fig1", runs, reference, options.budget, dataset)
     variants_report.study(*given, {"start": start}, pretrain=options.pretrain)
 
@@ -73,25 +76,20 @@ def variant(options: Fig1, weight: float, config: TrainConfig, dataset: data_set
         label=f"L1 weight {weight:g}",
         config=dataclasses.replace(config, loss=loss),
         dataset=dataset,
-        start=partial(pretrained, options, dataset) if options.pretrain else None,
+        start=partial(pretrained, options, dataset) if options.pretrain or options.init else None,
     )
 
 
 def pretrained(options: Fig1, dataset: data_sets.Dataset, config: TrainConfig) -> optimisation.TrainState:
-    """A fresh state whose generator was trained with the L1 loss alone."""
+    """A fresh state whose generator is the one of --init, or was trained with the L1 loss alone."""
+    if options.init:
+        return trainer.new_state(config, read_trained(options.init))
     loss = dataclasses.replace(config.loss, l1_weight=100.0, adversarial_weight=0.0)
     before = dataclasses.replace(config, loss=loss, num_steps=options.pretrain)
     run = options.out / "runs" / f"pretrained_{config.seed}"
     print(f"before it, {options.pretrain} steps of the L1 loss alone in {run}", flush=True)
-    found = budget.train(before, dataset, run).variables
-    state = optimisation.jitted_create_state(config)
-    return dataclasses.replace(
-        state,
-        generator=found["params"],
-        batch_stats=found["batch_stats"],
-        averaged=jax.tree.map(jnp.copy, found["params"]),
-        averaged_stats=jax.tree.map(jnp.copy, found["batch_stats"]),
-    )
+    budget.train(before, dataset, run)
+    return trainer.new_state(config, read_trained(run))
 
 
 if __name__ == "__main__":

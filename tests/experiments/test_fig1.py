@@ -68,3 +68,12 @@ def test_all_weights_start_from_the_network_that_the_l1_loss_trained(out):
         same_bits((start.generator, start.averaged), (before.averaged,) * 2)
         same_bits((start.batch_stats, start.averaged_stats), (before.averaged_stats,) * 2)
         assert np.isfinite(start.discriminator["kernel_0"]).all()
+
+
+def test_all_weights_start_from_a_network_that_is_named(out):
+    run = out / "runs" / "l1_0_0"
+    _, before = checkpoint.load_run(run)
+    start = pretrained(asked(out, init=run), tiny_dataset.dataset(), dataclasses.replace(L1_ONLY, num_steps=2))
+    same_bits((start.generator, start.averaged), (before.averaged,) * 2)
+    with pytest.raises(ValueError, match="leave --pretrain out"):
+        asked(out, init=run, pretrain=2)
