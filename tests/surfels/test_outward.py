@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from spnr_jax.surfels.outward import VOTERS, outward_normals
+from spnr_jax.kernels.cleaning import Cleaned
+from spnr_jax.surfels.outward import VOTERS, outward_normals, thinned
 from spnr_jax.surfels.visibility import spiral
 
 
@@ -41,3 +42,15 @@ def test_noise_that_was_averaged_makes_the_neighbourhood_wider():
     told, untold = (1 - np.sum(outward_normals(noisy, kept, noise) * points[kept], axis=1) for noise in (0.06, 0.0))
     assert np.quantile(told, 0.97) < 0.05
     assert np.median(told) < 0.5 * np.median(untold)
+
+
+def test_thinned_points_keep_the_normals_of_their_file_and_else_get_those_of_all_points():
+    ball, kept = spiral(3000), np.arange(0, 3000, 11)
+    normals = np.roll(ball, 1, axis=0)
+    flat = {name: np.full(3000, 0.5) for name in ("roughness", "metallic")} | {"base_color": np.abs(ball)}
+    for values, expected in (({"normals": normals}, normals[kept]), ({}, outward_normals(ball, kept))):
+        cloud = thinned(Cleaned(ball, flat | values, [], 0.0), kept)
+        np.testing.assert_array_equal(cloud.positions, ball[kept])
+        np.testing.assert_array_equal(cloud.base_color, np.abs(ball[kept]))
+        np.testing.assert_allclose(cloud.normals, expected, atol=1e-6)
+    assert thinned(Cleaned(ball, flat, [], 0.0), np.arange(3000)).normals is None

@@ -14,10 +14,10 @@ from support.tiny_surfels import CONFIG, LIGHT, NAME
 
 from spnr_jax.formats import data_sets
 from spnr_jax.kernels.cameras import pinhole
-from spnr_jax.kernels.records import Crops, Surfels
+from spnr_jax.kernels.records import Crops, PointCloud, Surfels
 from spnr_jax.method import surfel_renderer
 from spnr_jax.surfels import features, lighting, projection
-from spnr_jax.surfels.visibility import DIRECTIONS, tangents
+from spnr_jax.surfels.visibility import DIRECTIONS, spiral, tangents
 from spnr_jax.training import gbuffers, optimisation, shading
 
 AXES = pytest.mark.parametrize("axis", [0, 1])
@@ -41,6 +41,24 @@ def test_a_file_is_what_its_seed_object_and_cloud_make_of_it():
         assert all(np.array_equal(again[name], file[name]) for name in file)
         others = made(CONFIG.seed, number + 1), made(CONFIG.seed + 1, number)
         assert all(not np.array_equal(other.get("seen0"), file["seen0"]) for other in others)
+
+
+def test_clouds_have_normals_of_their_file_or_of_all_its_points_or_none():
+    ball = spiral(1500).astype(np.float32)
+    flat = {name: np.full(len(ball), 0.5, np.float32) for name in ("roughness", "metallic")}
+    whole = PointCloud(positions=ball, mask=np.ones(len(ball), bool), base_color=np.abs(ball), normals=ball, **flat)
+    clouds = [
+        gbuffers.random_cloud(whole, 1, dataclasses.replace(CONFIG, max_points=200), np.random.default_rng(seed))
+        for seed in range(80)
+    ]
+    told = [cloud for cloud in clouds if cloud.normals is not None]
+    agree = np.array([np.median(np.sum(cloud.normals * cloud.positions, axis=1)) for cloud in told])
+    assert 0.04 < 1 - len(told) / len(clouds) < 0.22, "an eighth are files of few points without normals"
+    assert np.quantile(agree, 0.1) > 0.9, "outward, of scans too"
+    for cloud in clouds:
+        assert 32 <= len(cloud.positions) <= 200
+        assert np.abs(cloud.positions).max() <= 1
+        assert {x.dtype for name, x in vars(cloud).items() if x is not None and name != "mask"} == {np.dtype("f4")}
 
 
 def test_a_file_cut_off_by_a_crash_is_made_again_and_no_other_one(tmp_path):
