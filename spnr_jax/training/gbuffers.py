@@ -37,7 +37,7 @@ from spnr_jax.training.batching import read_ahead
 from spnr_jax.training.scan_faults import colours_alone, random_scan
 
 CLOUDS = 2  # of each object
-SCANNED = 0.5  # share of them that are scanned and cleaned
+SCANNED = 0.3  # share of them that are scanned and cleaned
 UNKNOWN = 0.15  # share of the clouds of which it is not known where they are solid
 UNKNOWN_MATERIALS = 0.1  # share of the others whose roughness and metallic are not known
 WITHOUT_NORMALS = 0.5  # share of the others whose normals are estimated

@@ -53,7 +53,7 @@ def test_clouds_have_normals_of_their_file_or_of_all_its_points_or_none():
     ]
     told = [cloud for cloud in clouds if cloud.normals is not None]
     agree = np.array([np.median(np.sum(cloud.normals * cloud.positions, axis=1)) for cloud in told])
-    assert 0.04 < 1 - len(told) / len(clouds) < 0.22, "an eighth are files of few points without normals"
+    assert 0.08 < 1 - len(told) / len(clouds) < 0.28, "a sixth are files of few points without normals"
     assert np.quantile(agree, 0.1) > 0.9, "outward, of scans too"
     for cloud in clouds:
         assert 32 <= len(cloud.positions) <= 200
