@@ -139,8 +139,9 @@ def train(variants: Sequence[Variant], budget: Budget, out: Path) -> dict[str, l
             steps[variant.name] = config.num_steps  # its other seeds train for as many
         print(f"{place}: {config.num_steps} steps in {run}", flush=True)
         if variant.start and not (run / "checkpoints").is_dir():
+            state = variant.start(config)
             checkpoint.write_config(run, config)
-            checkpoint.save(run, variant.start(config))
+            checkpoint.save(run, state)
         trained = budgets.train(config, variant.dataset, run)
         runs[variant.name].append(Run(trained=trained, ms_per_step=step_milliseconds(run)))
         jax.clear_caches()  # two dozen trainings' programs are more pieces of memory than Linux maps for a process

@@ -61,11 +61,14 @@ def main(options: Fig1) -> None:
     """Trains what is not trained, scores all weights, writes tables and pictures."""
     cli.set_up_jax()
     dataset = data_sets.open_dataset(options.data)
+    if options.init:  # what does not fit is said before the folder is made
+        trainer.new_state(options.budget.config(), read_trained(options.init))
     runs = [variant(options, weight, options.budget.config(), dataset) for weight in options.l1_weights]
     reference = runs[options.l1_weights.index(100.0) if 100.0 in options.l1_weights else 0].name
-    start = str(options.init or (f"{options.pretrain} steps of L1 alone" if options.pretrain else "scratch"))
+    init = str(options.init) if options.init else None
+    start = init or (f"{options.pretrain} steps of L1 alone" if options.pretrain else "scratch")
     given = (options.out, "fig1", runs, reference, options.budget, dataset)
-    variants_report.study(*given, {"start": start}, pretrain=options.pretrain)
+    variants_report.study(*given, {"start": start}, pretrain=options.pretrain, init=init)
 
 
 def variant(options: Fig1, weight: float, config: TrainConfig, dataset: data_sets.Dataset) -> Variant:

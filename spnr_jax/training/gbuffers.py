@@ -9,6 +9,7 @@ A file is a pure function of (seed, object, cloud); it appears whole or not at a
 again.  A batch is a pure function of (seed, step) and the list of files: squares of views of equal doublings.
 """
 
+import dataclasses
 import zlib
 from collections.abc import Callable, Generator
 from functools import partial
@@ -117,25 +118,24 @@ def random_cloud(cloud: PointCloud, side: int, config: TrainConfig, generator: n
     """Random points of a cloud or evenly spread ones, with or without their normals, or what is left of a scan."""
     most = max(config.max_points // (FEWER if side >= SMALL else 1), config.min_points)
     count = min(int(np.exp(generator.uniform(np.log(config.min_points), np.log(most)))), len(cloud.mask))
-    even = generator.random() < config.even_share
+    even = generator.random() < config.even_share and count <= MOST_EVEN
     columns = {name: np.asarray(x) for name, x in vars(cloud).items() if x is not None and name != "mask"}
     points = Cleaned(columns.pop("positions"), columns, [], 0.0)
     alone = False
     if generator.random() < SCANNED:
-        points = scanned(points, generator)
+        points, count = scanned(points, generator), min(count, MOST_EVEN)
     else:
         if generator.random() < UNKNOWN_MATERIALS:
             points = points._replace(values=colours_alone(*points[:2], generator)[1])
         if generator.random() < WITHOUT_NORMALS:
-            points.values.pop("normals", None)
             alone = generator.random() < ALONE
+            if not alone:
+                points.values.pop("normals", None)
     chosen = generator.permutation(len(points.positions))[:count]
-    if even and len(chosen) <= MOST_EVEN:
+    if even:
         chosen = farthest_points(points.positions, len(chosen), int(chosen[0]))
-    if alone:
-        points = Cleaned(points.positions[chosen], {name: x[chosen] for name, x in points.values.items()}, [], 0.0)
-        chosen = np.arange(len(chosen))
-    return outward.thinned(points, chosen)
+    cloud = outward.thinned(points, chosen)
+    return dataclasses.replace(cloud, normals=None) if alone else cloud
 
 
 def scanned(points: Cleaned, generator: np.random.Generator) -> Cleaned:

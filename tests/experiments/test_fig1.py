@@ -1,6 +1,7 @@
 """Figure 1: the runs differ in the L1 weight alone, from scratch or from one network that the L1 loss trained."""
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -77,3 +78,12 @@ def test_all_weights_start_from_a_network_that_is_named(out):
     same_bits((start.generator, start.averaged), (before.averaged,) * 2)
     with pytest.raises(ValueError, match="leave --pretrain out"):
         asked(out, init=run, pretrain=2)
+    with pytest.raises(ValueError, match="another pretrain, init; choose another --out"):
+        main(asked(out, init=run))
+
+
+def test_a_start_that_is_not_there_or_of_another_network_is_said_before_anything_is_written(tmp_path):
+    for init, said in ((tmp_path / "none.npz", "no such file"), (Path("small"), "are of another network")):
+        with pytest.raises(ValueError, match=said):
+            main(asked(tmp_path / "out", init=init))
+    assert not any(tmp_path.iterdir())
