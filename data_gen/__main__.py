@@ -34,8 +34,8 @@ Command = GenerateConfig | CheckConfig | ShowConfig | PackConfig
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line."""
     arguments, debug = split_debug(sys.argv[1:] if arguments is None else arguments)
-    config, codes = parse(arguments), []
-    code = guarded(lambda: codes.append(run(config)), "spnr-data", debug)
+    codes: list[int] = []
+    code = guarded(lambda: codes.append(run(parse(arguments))), "spnr-data", debug)
     sys.exit(code or codes[0])
 
 

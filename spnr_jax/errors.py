@@ -1,5 +1,6 @@
 """The errors that a person can mend, the bugs that are ours, and when a call stack is shown."""
 
+import contextlib
 import os
 import sys
 import traceback
@@ -67,10 +68,18 @@ def guarded(work: Callable[[], None], name: str, debug: bool = False) -> int:
     For `debug` the line stands behind the call stack.
     """
     try:
-        work()
+        try:
+            work()
+        finally:
+            sys.stdout.flush()
     except KeyboardInterrupt as stop:
         print(f"{name}: {str(stop) or 'stopped'}", file=sys.stderr)
         return 130
+    except BrokenPipeError:
+        with contextlib.suppress(OSError):  # Python flushes what is left at its end
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        print(f"{name}: stopped, as what read the output was closed", file=sys.stderr)
+        return 2
     except (ValueError, OSError) as error:
         if debug:
             traceback.print_exc()

@@ -258,6 +258,21 @@ def test_an_error_shows_its_call_stack_for_debug_alone_and_its_line_in_any_case(
     assert "Traceback" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("command", ["spnr_jax.cli train --help", "data_gen generate --help"])
+def test_output_that_nothing_reads_is_one_line_and_no_call_stack(command):
+    read, write = os.pipe()
+    os.close(read)
+    try:
+        ended = subprocess.run(
+            [sys.executable, "-m", *command.split()], stdout=write, stderr=subprocess.PIPE, text=True, check=False
+        )
+    finally:
+        os.close(write)
+    assert ended.returncode == 2
+    assert ended.stderr.endswith("stopped, as what read the output was closed\n")
+    assert len(ended.stderr.splitlines()) == 1
+
+
 def test_errors_of_many_lines_become_one():
     assert errors.one_line(ValueError("this\n  and\nthat")) == "this and that"
     assert errors.one_line(OSError(28, "No space left on device")) == "disk: No space left on device"

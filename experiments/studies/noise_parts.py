@@ -143,7 +143,8 @@ def _best_radius(positions: np.ndarray, values: Values, count: int, surface: cKD
         return np.stack([column[rows] for column in columns])[best, np.arange(len(rows))].astype(np.float32)
 
     means = {name: chosen([columns[name] for _, columns in found]) for name in values}
-    means["normals"] = outward_normals(moved[kept], np.searchsorted(kept, rows), sigma).astype(np.float32)
+    colors, numbers = values["base_color"][kept], np.searchsorted(kept, rows)
+    means["normals"] = outward_normals(moved[kept], colors, numbers, sigma).astype(np.float32)
     return PointCloud(positions=chosen([places for places, _ in found]), mask=np.ones(len(rows), bool), **means)
 
 

@@ -111,12 +111,12 @@ def place_cloud(
     if num_points is not None and len(positions) > num_points:
         report(f"{num_points} of {len(positions)} points kept, evenly spread")
         kept = np.sort(farthest_points(positions, num_points, seed))
-    values = {name: column[kept] for name, column in values.items()}
+    all_colors, values = values["base_color"], {name: column[kept] for name, column in values.items()}
     if "normals" not in values and sensor:
         values["normals"] = facing(positions[kept], positions, sensor.place - origin, sigma)
         report("normals turned to the place of the sensor")
     elif "normals" not in values and len(kept) < len(positions):
-        values["normals"] = outward_normals(positions, kept, sigma)
+        values["normals"] = outward_normals(positions, all_colors, kept, sigma)
     positions = positions[kept]
     if up == "auto":
         camera_up = sensor.up(positions + origin) if sensor else None

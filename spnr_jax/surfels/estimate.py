@@ -15,7 +15,7 @@ from scipy.sparse import csr_array
 
 from spnr_jax.kernels.cloud_arrays import bucket
 from spnr_jax.kernels.records import Surfels
-from spnr_jax.surfels import layers, sides
+from spnr_jax.surfels import layers, sheets, sides
 from spnr_jax.surfels.borders import borders
 from spnr_jax.surfels.neighbours import (
     LEAST_SPACING,
@@ -75,6 +75,8 @@ def _columns(
     middle, given = float(np.median(raw)), normals is not None
     first = joined(layers.first_normals, near, *all_of(raw)) if normals is None else np.asfortranarray(_unit(normals))
     layer = each(layers.fitted, near, *all_of(raw, first), [given] * len(near), [given] * len(near))
+    if normals is None:
+        layer = sheets.parted(near, layer, raw, base_color)
     normal, sided = sides.outward(near, layer, raw, given, positions, middle)
     weight = each(layers.weights, near, layer, *all_of(normal, sided))
     spacing = joined(_own_spacing, near, weight, *all_of(raw))

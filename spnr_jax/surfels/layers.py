@@ -18,8 +18,10 @@ SLIVER = 0.2  # sine between two of them from which on they span one
 FLAT = 0.1  # spacings from a plane at which a point supports it half
 TRUSTED = 1.15  # the plane of least spread counts so much more: it is the better one where points are noisy
 ROUNDS = 4  # of the quadric's fit
-STIFF = np.diag(np.array([1e-3, 1e-3, 0.1, 0.1, 0.1], np.float32))[..., None]  # ridge of its slopes and curvatures
+# ridge of its slopes and curvatures, and of a step between two colours
+STIFF = np.diag(np.array([1e-3, 1e-3, 0.1, 0.1, 0.1, 0.01], np.float32))[..., None]
 THICK, THINNEST = 0.3, 0.04  # most and least standard deviation of a neighbour's weight as one of the layer
+SHEET = 0.02  # the least where colours or normals tell two sheets apart
 START = 0.12  # the same in the first round
 SPREADS = 2.0  # this deviation over the mean height of those that count
 LOOSE = 2.0  # the same of the layer that colours and spacings come from, over that of the fit
@@ -69,24 +71,44 @@ def fitted(near: Near, spacing: np.ndarray, normal: np.ndarray, sided: bool, fir
     """
     spacing, of_all, normal = spacing[near.rows], normal, normal[near.rows].T
     weight, scale = close(near, spacing), np.full(len(spacing), START, np.float32)
-    height = along(near.offset, normal / spacing)
     if sided:  # the other side of a wall is told apart by its normals
         weight *= np.clip(0.5 + along(around(near, of_all), normal), 0, 1)
+    first = Layer(normal, scale, along(near.offset, normal / spacing))
+    return quadric(near.offset, spacing, weight, first, None, firm).layer
+
+
+class Fit(NamedTuple):
+    """A layer, the neighbours' weights in it, their sums over products of unknowns, the step to those unlike."""
+
+    layer: Layer
+    weight: Float[np.ndarray, "k block"]
+    sums: Float[np.ndarray, "unknowns unknowns block"]
+    step: Float[np.ndarray, " block"]
+
+
+def quadric(
+    offset: np.ndarray, spacing: np.ndarray, weight: np.ndarray, first: Layer, unlike: np.ndarray | None, firm: bool
+) -> Fit:
+    """Fit in rounds from a first layer; where `unlike` is given, those neighbours lie a step from the quadric."""
+    normal, scale, rest = first
+    others, stiff, thinnest = ([], STIFF[:5, :5], THINNEST) if unlike is None else ([unlike], STIFF, SHEET)
     for _ in range(ROUNDS):
         axes = frame(normal)
-        one, two, up = (along(near.offset, axis) for axis in axes / spacing)
-        own = weight * np.exp(-0.5 * (height / scale) ** 2)
-        terms = np.stack([one, two, one * one, one * two, two * two, up])
-        sums = np.einsum("ikn,jkn->ijn", own * terms[:5], terms)
-        solution = solved(sums[:, :5] + STIFF, sums[:, 5:])[:, 0]
+        one, two, up = (along(offset, axis) for axis in axes / spacing)
+        own = weight * np.exp(-0.5 * (rest / scale) ** 2)
+        terms = np.stack([one, two, one * one, one * two, two * two, *others, up])
+        sums = np.einsum("ikn,jkn->ijn", own * terms[:-1], terms)
+        solution = solved(sums[:, :-1] + stiff, sums[:, -1:])[:, 0]
         if firm:
             solution[:2] = 0
-        height = up - np.einsum("ikn,in->kn", terms[:5], solution)
+        height = rest = up - np.einsum("ikn,in->kn", terms[:5], solution[:5])
+        if unlike is not None:
+            rest = height - solution[5] * unlike
         normal = axes[2] - solution[0] * axes[0] - solution[1] * axes[1]
         normal = normal / np.linalg.norm(normal, axis=0)
-        away = np.einsum("kn,kn->n", own, np.abs(height)) / np.maximum(own.sum(axis=0) - 1, 0.5)  # it is at 0 itself
-        scale = np.clip(SPREADS * away, THINNEST, THICK)
-    return Layer(normal, scale, height)
+        away = np.einsum("kn,kn->n", own, np.abs(rest)) / np.maximum(own.sum(axis=0) - 1, 0.5)  # it is at 0 itself
+        scale = np.clip(SPREADS * away, thinnest, THICK)
+    return Fit(Layer(normal, scale, height), own, sums[:, :-1], solution[-1])
 
 
 def shape_of(near: Near, layer: Layer, spacing: np.ndarray) -> np.ndarray:

@@ -3,7 +3,7 @@
 import numpy as np
 
 from spnr_jax.kernels.cloud_arrays import bucket
-from spnr_jax.surfels.layers import APART, PARALLEL, Layer
+from spnr_jax.surfels.layers import APART, PARALLEL, SHEET, THINNEST, Layer
 from spnr_jax.surfels.neighbours import BLOCK, Near, along, around, close, joined
 from spnr_jax.surfels.visibility import DIRECTIONS, grid_of, seen_from
 
@@ -64,7 +64,8 @@ def of_walls(near: Near, layer: Layer, normal: np.ndarray, spacing: np.ndarray, 
     cosine = along(around(near, normal), normal[near.rows].T)
     other = (-cosine if given else np.abs(cosine)) > PARALLEL
     wall = close(near, spacing[near.rows]) * other * (np.abs(layer.height) < WALL)
-    above, below = (np.sum(wall * (sign * layer.height > APART * layer.scale), axis=0) for sign in (1, -1))
+    scale = np.where(layer.scale > THINNEST, layer.scale, SHEET) if given else layer.scale
+    above, below = (np.sum(wall * (sign * layer.height > APART * scale), axis=0) for sign in (1, -1))
     return SOLID * (below - above) / (above + below + EVIDENCE)
 
 
