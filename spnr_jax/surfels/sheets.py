@@ -33,7 +33,8 @@ def parted(
     near: list[Near], layer: list[Layer], spacing: Float[np.ndarray, " points"], color: Float[np.ndarray, "points 3"]
 ) -> list[Layer]:
     """The layers of all blocks of points, of one sheet alone where linear colours tell two apart."""
-    spacings, colors = ([x] * len(near) for x in (spacing, color))
+    root = np.asfortranarray(np.sqrt(np.maximum(color, 0)))
+    spacings, colors = ([x] * len(near) for x in (spacing, root))
     found = each(_sheets, near, layer, spacings, colors)
     certain = np.zeros(len(spacing), bool)
     for block, sheets in zip(near, found, strict=True):
@@ -41,37 +42,46 @@ def parted(
     return each(_agreed, near, layer, found, colors, [certain] * len(near))
 
 
-def _unlike(near: Near, color: np.ndarray) -> np.ndarray:
-    """How far each neighbour is of another colour than the point, 0 to 1 (k, block)."""
-    colors = np.sqrt(np.maximum(around(near, color), 0))
+def _unlike(near: Near, root: np.ndarray, some: np.ndarray) -> np.ndarray:
+    """How far the neighbours of some points of a block are of another colour than the point, 0 to 1 (k, some)."""
+    colors = np.take(root.T, near.number[:, some], axis=1)
     return -np.expm1(-0.5 / LIKE**2 * np.sum((colors - colors[:, :1]) ** 2, axis=0))
 
 
-def _sheets(near: Near, layer: Layer, spacing: np.ndarray, color: np.ndarray) -> Sheets:
+def _fewer(weight: np.ndarray, unlike: np.ndarray) -> np.ndarray:
+    """Neighbours of the point's colour or of another, by their weights, whichever are fewer."""
+    others = np.sum(weight * unlike, axis=0)
+    return np.minimum(others, weight.sum(axis=0) - others - 1)  # it is its own neighbour
+
+
+def _sheets(near: Near, layer: Layer, spacing: np.ndarray, root: np.ndarray) -> Sheets:
     """Fits the quadric with the step to the other colour as one more unknown.
 
     The border of two colours on a bent surface is no step: slope and curvature beyond it explain as much.
     """
-    unlike = _unlike(near, color)
-    some = np.flatnonzero(unlike.max(axis=0) > 0.5)
-    offset, unlike, weight = near.offset[..., some], unlike[:, some], close(near, spacing[near.rows])[:, some]
+    colors = around(near, root)
+    some = np.flatnonzero((colors.max(axis=1) - colors.min(axis=1)).max(axis=0) > LIKE)
+    weight, unlike = close(near, spacing[near.rows])[:, some], _unlike(near, root, some)
+    mixed = _fewer(weight, unlike) > SURE[2][0]
+    some, weight, unlike = some[mixed], weight[:, mixed], unlike[:, mixed]
+    offset = near.offset[..., some]
     spacing, normal = spacing[near.rows][some], layer.normal[:, some]
     first = Layer(normal, np.full(some.size, THICK, np.float32), along(offset, normal / spacing))
     found, weight, sums, step = quadric(offset, spacing, weight, first, unlike, firm=False)
     last = np.zeros((len(STIFF), 1, some.size), np.float32)
     last[-1] = 1
     variance = np.maximum(solved(sums + STIFF, last)[-1, 0], 1e-9)  # of the step, over that of the heights
-    total, others = weight.sum(axis=0), np.sum(weight * unlike, axis=0)
-    alone = 1 / np.maximum(np.sum(weight * (unlike - others / total) ** 2, axis=0), 1e-9)  # were nothing else unknown
+    mean = np.sum(weight * unlike, axis=0) / weight.sum(axis=0)
+    alone = 1 / np.maximum(np.sum(weight * (unlike - mean) ** 2, axis=0), 1e-9)  # were nothing else unknown
     high = np.abs(step) / found.scale
-    measured = high, alone / variance, np.minimum(others, total - others - 1), high * SPREADS / np.sqrt(variance)
+    measured = high, alone / variance, _fewer(weight, unlike), high * SPREADS / np.sqrt(variance)
     may, certain = (np.all([x > limits[i] for x, limits in zip(measured, SURE, strict=True)], axis=0) for i in (0, 1))
     return Sheets(some[may], Layer(*(values[..., may] for values in found)), certain[may])
 
 
-def _agreed(near: Near, layer: Layer, sheets: Sheets, color: np.ndarray, certain: np.ndarray) -> Layer:
+def _agreed(near: Near, layer: Layer, sheets: Sheets, root: np.ndarray, certain: np.ndarray) -> Layer:
     """The layers of a block, those of sheets where enough neighbours of a like colour are certain."""
-    like = 1 - _unlike(near, color)[1:, sheets.points]
+    like = 1 - _unlike(near, root, sheets.points)[1:]
     share = np.sum(like * certain[near.number[1:, sheets.points]], axis=0) / np.maximum(like.sum(axis=0), 1e-6)
     agreed = share > SHARE
     values = tuple(values.copy() for values in layer)

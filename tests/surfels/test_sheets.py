@@ -76,6 +76,19 @@ def test_the_border_of_two_colours_on_a_bent_surface_and_at_an_edge_is_no_step()
     assert changed(fold, np.where(lying[:, None], WHITE, BLACK)) < 0.02
 
 
+@pytest.mark.parametrize(("count", "inner"), [(1000, 0.4), (3000, 0.45)])
+def test_the_frame_around_the_faces_of_a_thin_box_is_no_step(count, inner):
+    rng = np.random.default_rng(1)
+    place, face = rng.uniform(-0.5, 0.5, (count, 2)), rng.integers(0, 6, count)
+    box = np.zeros((count, 3))
+    for axis in range(3):
+        of = face % 3 == axis
+        across = np.where(face[of] < 3, 0.5, -0.5)
+        box[of] = np.roll(np.column_stack([across, place[of]]), axis, axis=1)
+    framed = np.abs(place).max(axis=1, keepdims=True) > inner
+    assert changed(box * [1, 0.1, 1], np.where(framed, WHITE, BLACK)) < 0.001
+
+
 def test_two_colours_among_each_other_on_one_surface_are_one_sheet_with_noise_and_without():
     rng = np.random.default_rng(1)
     ball, colors = spiral(3000), np.where(rng.random((3000, 1)) < 0.5, WHITE, BLACK)
