@@ -122,5 +122,7 @@ def plate(count: int, seed: int = 0) -> PointCloud:
 def blue_share(image: Float[np.ndarray, "height width 3"], opacity: Float[np.ndarray, "height width"]) -> float:
     """Share of blue in the colour of the plate's front, in linear light; .077 is true (its rims are not seen)."""
     inside = binary_erosion(opacity > 0.5, iterations=WELL_INSIDE)
+    if not inside.any():
+        return float("nan")
     red, _, blue = srgb_to_linear(image)[inside].mean(axis=0)
     return float(blue / (red + blue))
