@@ -144,19 +144,19 @@ def all_scores(image: np.ndarray, opacity: np.ndarray, reference: np.ndarray) ->
     }
 
 
-def _known(options: SharpnessStudy, method: Method, count: int) -> dict[str, float]:
+def _known(options: SharpnessStudy, method: Method, count: int) -> dict[str, float | None]:
     """Scores of the ball and the plate, of networks."""
     if not isinstance(method, Network):
         return {}
 
-    def of(cloud: PointCloud, score: Any, **view: float) -> float:
+    def of(cloud: PointCloud, score: Any, **view: float) -> float | None:
         model = method.model
         volume = model.encode(told(cloud, options.normals))
         rendering = model.render(volume, model.camera(volume, resolution=512, **view), method.quality)
         image = np.asarray(rendering.image)
-        return float(score(image, resized(np.asarray(rendering.acc), image.shape[:2])))
+        return _mean(np.array([score(image, resized(np.asarray(rendering.acc), image.shape[:2]))]))
 
-    def make() -> dict[str, float]:
+    def make() -> dict[str, float | None]:
         front = {"azimuth": 0.0, "elevation": 0.0}
         return {"ball": of(ball(count), ball_waves), "plate": of(plate(count), blue_share, **front)}
 
@@ -164,7 +164,7 @@ def _known(options: SharpnessStudy, method: Method, count: int) -> dict[str, flo
 
 
 def _row(
-    name: str, found: Sequence[Mapping[str, float | None]], known: Mapping[str, float]
+    name: str, found: Sequence[Mapping[str, float | None]], known: Mapping[str, float | None]
 ) -> tuple[str, tuple[Cell, ...]]:
     columns = COLUMNS.items()
     _, cells = mean_row(name, [[of[column] for column, _ in columns] for of in found], [n for _, (_, n) in columns])
