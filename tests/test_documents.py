@@ -18,7 +18,7 @@ ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 CODE = re.compile(r"^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 IDENTIFIER = re.compile(r"^::: ([\w.]+)$", re.MULTILINE)
-PAGES = sorted(DOCS.glob("*.md"))
+PAGES = sorted(DOCS.rglob("*.md"))
 
 
 @pytest.fixture
@@ -107,7 +107,7 @@ def resolve(name):
 
 def test_every_page_is_in_the_sites_navigation_once():
     navigation = yaml.safe_load((ROOT / "mkdocs.yml").read_text())["nav"]
-    assert sorted(leaves(navigation)) == [page.name for page in PAGES]
+    assert sorted(leaves(navigation)) == sorted(page.relative_to(DOCS).as_posix() for page in PAGES)
 
 
 def leaves(node):

@@ -7,7 +7,7 @@ import pytest
 from support import tiny_dataset, tiny_surfels
 from support.tiny_runs import goes_on
 
-from experiments.studies import noise_parts, scans
+from experiments.studies import scans
 from spnr_jax.surfels.visibility import spiral
 from spnr_jax.training import scan_faults
 
@@ -55,27 +55,6 @@ def test_the_study_ends_with_a_table_and_pictures_and_goes_on_where_it_stopped(t
     assert results["32, outliers 10%"][0]["left"] == 1.1
     assert (tmp_path / "out" / "gallery.png").is_file()
     goes_on(scans.main, options)
-
-
-@pytest.mark.ci
-def test_a_noisy_cloud_is_drawn_with_each_part_of_it_put_right(tmp_path):
-    folder = tiny_dataset.write_dataset(tmp_path / "set", SPLITS, tiny_surfels.SIZE)
-    noise_parts.main(
-        noise_parts.NoiseParts(
-            data=folder,
-            out=tmp_path / "out",
-            run=str(tiny_surfels.run()),
-            count=32,
-            noise=(0.02,),
-            views=1,
-            resolution=tiny_surfels.SIZE,
-        )
-    )
-    results = json.loads((tmp_path / "out" / "results.json").read_text())["objects"]
-    assert list(results)[:3] == ["clean", "clean, with normals", "2.0%, cleaned"]
-    assert results["2.0%, colours put right"] == results["2.0%, cleaned"]  # the ball has one colour
-    assert results["2.0%, places put right"] != results["2.0%, cleaned"]
-    assert np.isfinite(list(results["2.0%, averaged alone"].values())).all()
 
 
 def test_faults_change_what_their_names_say_and_nothing_else():
