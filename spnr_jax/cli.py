@@ -20,9 +20,9 @@ from typing import Annotated
 import tyro
 
 from spnr_jax import presets
+from spnr_jax.config import SurfelConfig
 from spnr_jax.devices import allocator, compilation
 from spnr_jax.errors import UserError, guarded, split_debug
-from spnr_jax.model_config import SurfelConfig
 from spnr_jax.tools.commands import ConvertLpips, Evaluate, Export, Runs, Train, View
 from spnr_jax.tools.render_command import Render, is_catalogue
 from spnr_jax.tools.share_command import Share

@@ -1,93 +1,370 @@
-"""Every number of a training, as frozen dataclasses (`presets.py` fills them in); the network's: `model_config.py`.
+"""Every number of a network and of its training, as frozen dataclasses; `presets.py` fills them in.
 
-Configs are hashable, so they are static arguments of jit.  A wrong value raises ValueError when the config is made,
-naming the field, what came and what is possible.  Marks: [paper] stands in the supplement, the rest is our choice.
+    EncoderConfig      points to a volume, which both networks of rays begin with
+    PaperConfig        the paper's network             method/paper_network.py
+    NearPointsConfig   the network near points         method/near_points.py
+    SurfelConfig       the network over surfels        method/surfel_renderer.py
+    TrainConfig        a training: one of these, losses, optimiser, batches
+    RenderOptions      how a render is asked for
+
+Configs are hashable, so they are static arguments of jit.  All numbers are finite and at least 0; a wrong value raises
+ValueError when the config is made, with the field and what came.  Marks: [paper] stands in the supplement, the rest is
+our choice.
 """
 
+import dataclasses
+from collections.abc import Collection
 from dataclasses import dataclass, field
-from typing import Literal
+from functools import cache
+from typing import Any, ClassVar, Literal, get_args, get_origin, get_type_hints
 
 from spnr_jax.errors import require
-from spnr_jax.model_config import (
-    Count,
-    Decay,
-    NearPointsConfig,
-    NetworkConfig,
-    PaperConfig,
-    Positive,
-    RayNetworkConfig,
-    Share,
-    Weight,
-    Whole,
-    check,
-    surface_grid,
+
+Material = Literal["base_color", "roughness", "metallic"]
+MATERIAL_CHANNELS = {"base_color": 3, "roughness": 1, "metallic": 1}
+CELLS = 1.0  # of the grid of nearest points along an axis, per square root of the number of points; 0.75 lost 0.1 dB
+MOST_CELLS = 96
+MOST_LAYERS, MOST_STAGES = 32, 16  # of a network: a damaged file must not cost minutes of tracing
+LARGEST = 2**63  # of any number in a config
+
+
+def check(config: Any, positive: Collection[str] = (), shares: Collection[str] = ()) -> None:
+    """ValueError for the first field that is not of its type, 0 where it must be positive, or a share above 1."""
+    for name, kind in types_of(type(config)).items():
+        value = getattr(config, name)
+        words = mismatch(value, kind)
+        if not words and name in positive:
+            values = value if isinstance(value, tuple) else (value,)
+            words = "" if all(x > 0 for x in values) else "positive"
+        if not words and name in shares:
+            words = "" if value <= 1 else "a share, 0 to 1"
+        require(not words, f"{name} must be {words}, got {value}")
+
+
+@cache
+def types_of(kind: Any) -> dict[str, Any]:
+    """The type of each field of a config."""
+    known = get_type_hints(kind)
+    return {f.name: known[f.name] for f in dataclasses.fields(kind)}
+
+
+def mismatch(value: Any, kind: Any) -> str:
+    """What a value should have been by its type; nothing if it is that.  A whole number will do for a float."""
+    origin, inside = get_origin(kind), get_args(kind)
+    if origin is Literal:
+        return "" if isinstance(value, str) and value in inside else " or ".join([", ".join(inside[:-1]), inside[-1]])
+    if origin is tuple:
+        if not isinstance(value, tuple):
+            return "several values"
+        return next(filter(None, (mismatch(x, inside[0]) for x in value)), "")
+    if kind in (int, float):
+        fits = isinstance(value, int | kind) and not isinstance(value, bool) and 0 <= value < LARGEST
+        return "" if fits else {int: "a whole number, at least 0", float: "a number, at least 0"}[kind]
+    return "" if isinstance(value, kind) else "true or false" if kind is bool else f"of the type {kind.__name__}"
+
+
+def surface_grid(num_points: int, least: int = 1) -> int:
+    """Cells along each axis of the grid of nearest points for so many; a surface's lie in the order of its square.
+
+    Padding counts as points: with the `least` of a training, smaller clouds see the grid that they saw there.
+    """
+    return min(max(round(CELLS * num_points**0.5), least, 1), MOST_CELLS)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SamplingConfig:
+    """Samples along each ray."""
+
+    num_coarse: int = 64
+    """Stratified samples between entry into and exit from the box [paper]."""
+    num_fine: int = 64
+    """Samples drawn where the coarse weights are large [paper]; 0 renders the coarse samples alone."""
+    padding: float = 1e-5
+    """Added to each coarse weight before sampling: empty rays are sampled evenly, thin parts keep nearly all."""
+    reach: int = 0
+    """Samples lie within so many voxels of a voxel with a point, and density is 0 elsewhere; 0: all the box [paper]."""
+
+    def __post_init__(self) -> None:
+        check(self, positive=("num_coarse", "padding"))
+
+
+@dataclass(frozen=True, kw_only=True)
+class RenderOptions:
+    """How a network of rays is asked for pictures; its sizes and weights stay what they are."""
+
+    sampling: SamplingConfig | None = None
+    """Samples of a ray; None: those of the training."""
+    rays_per_side: int = 1
+    """Rays along each side of a pixel, averaged."""
+    refine: bool = True
+    """Whether a network that has a refiner uses it."""
+    block: int | None = None
+    """Rays rendered at once, which bounds the memory; None: as many as suit a picture of the network."""
+
+
+AS_TRAINED = RenderOptions()
+
+
+@dataclass(frozen=True, kw_only=True)
+class EncoderConfig:
+    """Sizes of PointNet and 3D U-Net, which make a volume of points (`nn/encoder.py`)."""
+
+    materials: tuple[Material, ...] = ("base_color", "roughness", "metallic")
+    """Material channels that the points carry into the network."""
+    inputs: Literal["plain", "spread"] = "plain"
+    """Materials as they are, or spread: sRGB as brightness and hue, each channel around 0 with a spread near 1."""
+    point_widths: tuple[int, ...] = (64, 128, 256)
+    """Hidden layers of the PointNet [paper]."""
+    point_features: int = 32
+    """Features of a point after the PointNet."""
+    point_norm: Literal["batch", "layer"] = "batch"
+    """Normalisation in the PointNet: batch norm over the points [paper], or layer norm of each point."""
+    scatter: Literal["mean", "max", "trilinear"] = "mean"
+    """How the features of points meet in a voxel (`voxels.spread`)."""
+    volume_resolution: int = 64
+    """Voxels along each axis of the box [-1, 1]^3; a multiple of 2 ** num_stages."""
+    base_width: int = 16
+    """Channels of the volume at full resolution; doubled by each encoder stage [paper]."""
+    num_stages: int = 5
+    """Encoder stages of the 3D U-Net; each halves the resolution (5: 1/32) [paper]."""
+    num_groups: int = 8
+    """Groups of each GroupNorm in U-Net and discriminator."""
+    skip: Literal["add", "concat"] = "add"
+    """How the U-Net's encoder joins its decoder: added to a stage's output [paper], or as input of its convolution."""
+
+    def __post_init__(self) -> None:
+        positive = "point_widths", "point_features", "num_groups", "volume_resolution", "base_width"
+        check(self, positive)
+        require(len(self.point_widths) <= MOST_LAYERS, f"point_widths: at most {MOST_LAYERS}, got {self.point_widths}")
+        require(len(set(self.materials)) == len(self.materials), f"materials must be distinct, got {self.materials}")
+        require(self.num_stages <= MOST_STAGES, f"num_stages must be at most {MOST_STAGES}, got {self.num_stages}")
+        step = 2**self.num_stages
+        require(
+            self.volume_resolution % step == 0,
+            f"volume_resolution {self.volume_resolution} cannot be halved {self.num_stages} times; use a multiple of "
+            f"{step} or fewer num_stages",
+        )
+        require(
+            self.base_width % self.num_groups == 0,
+            f"base_width {self.base_width} must be a multiple of num_groups {self.num_groups}",
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class NetworkConfig:
+    """What training and rendering ask of the sizes of any network."""
+
+    method: ClassVar[str] = "none"
+    """What the network is, for files and tables."""
+
+    image_resolution: int = 128
+    """Pixels along each side of the pictures of the training."""
+
+    def __post_init__(self) -> None:
+        check(self, positive=("image_resolution",))
+
+    @property
+    def upsamples(self) -> bool:
+        """Whether what is rendered along rays is smaller than the image."""
+        return False
+
+    @property
+    def per_pixel(self) -> bool:
+        """Whether a pixel does not depend on its neighbours, so that a lattice of them can be trained on."""
+        return False
+
+    @property
+    def any_size(self) -> bool:
+        """Whether pictures of any size can be rendered: an upsampler has learnt one."""
+        return not self.upsamples
+
+
+@dataclass(frozen=True, kw_only=True)
+class RayNetworkConfig(NetworkConfig):
+    """What both networks of rays have: an encoder, samples along rays, a field."""
+
+    encoder: EncoderConfig = field(default_factory=EncoderConfig)
+    sampling: SamplingConfig = field(default_factory=SamplingConfig)
+    field_width: int = 64
+    """Hidden layer of the radiance field."""
+    direction_frequencies: int = 4
+    """Frequencies of the view direction's encoding; 0 gives the field the bare direction."""
+    sees_direction: bool = True
+    """Whether colour and features depend on the view direction."""
+    precision: Literal["float32", "bfloat16"] = "float32"
+    """Format of the convolutions in U-Net, refiner, upsampler, discriminator; all else, parameters too, is float32."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check(self, positive=("field_width",))
+
+    @property
+    def bf16(self) -> bool:
+        """Whether the convolutions run in bfloat16."""
+        return self.precision == "bfloat16"
+
+
+@dataclass(frozen=True, kw_only=True)
+class PaperConfig(RayNetworkConfig):
+    """Sizes of the paper's network."""
+
+    method: ClassVar[str] = "paper"
+
+    num_features: int = 32
+    """Channels of the rendered feature image; the first three are RGB."""
+    render_resolution: int = 64
+    """Rays along each side of the volume-rendered image [paper]."""
+    resize_resolution: int = 64
+    """Bilinear resize of the feature image before the upsampler (64 to 100 for ShapeNet [paper])."""
+    upsampler_width: int = 64
+    """Channels of the upsampler before its x2; half of it after."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check(self, positive=("render_resolution", "resize_resolution", "upsampler_width"))
+        require(self.num_features >= 4, f"num_features must be 4 or more, RGB first, got {self.num_features}")
+        require(
+            self.image_resolution in (self.render_resolution, 2 * self.resize_resolution),
+            f"image_resolution {self.image_resolution} must be render_resolution ({self.render_resolution}: no "
+            f"upsampler) or twice resize_resolution ({2 * self.resize_resolution})",
+        )
+
+    @property
+    def upsamples(self) -> bool:
+        """Whether the graph contains the upsampler."""
+        return self.image_resolution != self.render_resolution
+
+    @property
+    def per_pixel(self) -> bool:
+        """The upsampler mixes pixels."""
+        return not self.upsamples
+
+
+@dataclass(frozen=True, kw_only=True)
+class NearPointsConfig(RayNetworkConfig):
+    """Sizes of the network near points: a ray a pixel, samples near the points alone."""
+
+    method: ClassVar[str] = "near_points"
+
+    encoder: EncoderConfig = field(default_factory=lambda: EncoderConfig(point_norm="layer"))
+    sampling: SamplingConfig = field(default_factory=lambda: SamplingConfig(num_coarse=32, num_fine=0, reach=1))
+    num_neighbors: int = 6
+    """Nearest points whose planes and materials a sample sees (`kernels/surface.py`)."""
+    surface_cells: int = 0
+    """Lowest resolution of the grid of nearest points; presets set it so that small clouds get the grid of training."""
+    color: Literal["free", "lit"] = "lit"
+    """Radiance: free RGB, or predicted light on the materials of the nearest points (`nn/surface_field.py`)."""
+    refiner_width: int = 0
+    """Channels of the 2D CNN that refines the rendered picture (`nn/refiner.py`); 0: none."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check(self, positive=("num_neighbors",))
+        require(self.sampling.reach == 1, f"reach {self.sampling.reach}: nothing is known far from points; use reach 1")
+
+    @property
+    def per_pixel(self) -> bool:
+        """A refiner mixes pixels."""
+        return not self.refiner_width
+
+
+SOLID = NearPointsConfig(
+    encoder=EncoderConfig(volume_resolution=32, base_width=8, num_stages=3, num_groups=1, point_norm="layer"),
+    sampling=SamplingConfig(num_coarse=16, num_fine=0, reach=1),
+    surface_cells=surface_grid(2048),
+    refiner_width=32,
 )
+"""Sizes of the package's network `small`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SurfelConfig(NetworkConfig):
+    """Our network over the G-buffer of surfels (`method/surfel_renderer.py`)."""
+
+    method: ClassVar[str] = "surfels"
+
+    image_resolution: int = 512
+    """Pixels along each side of a picture where no other size is asked for."""
+    widths: tuple[int, ...] = (24, 48, 96, 160)
+    """Features of the U-Net's levels, at the resolution of the points first."""
+    top: int = 24
+    """Features of the blocks that double the resolution."""
+    solid: bool = False
+    """Whether the network of rays `SOLID` tells where an object of few points is solid (`method/solid.py`)."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check(self, positive=("widths", "top"))
+        require(0 < len(self.widths) <= MOST_LAYERS, f"widths: 1 to {MOST_LAYERS} levels, got {self.widths}")
 
 
 @dataclass(frozen=True, kw_only=True)
 class LossConfig:
     """Weights of the losses and the discriminator's regulariser."""
 
-    l1_weight: Weight = 100.0
+    l1_weight: float = 100.0
     """L1 between image and reference [paper: 100; ShapeNet chair 5000]."""
-    low_resolution_weight: Weight = 0.5
+    low_resolution_weight: float = 0.5
     """L1 of the volume-rendered RGB, relative to l1_weight."""
-    adversarial_weight: Weight = 1.0
+    adversarial_weight: float = 1.0
     """Adversarial loss [paper: 1]; 0 leaves the discriminator out of the graph."""
-    adversarial_start: Share = 0.0
+    adversarial_start: float = 0.0
     """Share of the steps that train with L1 alone before the discriminator joins."""
-    r1_gamma: Weight = 10.0
+    r1_gamma: float = 10.0
     """R1 penalty on the discriminator's gradient at real images; 0 leaves it out."""
-    r1_interval: Count = 16
+    r1_interval: int = 16
     """Steps between R1 penalties; each is scaled by this number (lazy regularisation)."""
-    discriminator_width: Count = 64
+    discriminator_width: int = 64
     """Channels of the discriminator's first layer."""
     pixel: Literal["l1", "mse"] = "l1"
     """Error of a pixel; the weights named l1 apply to either."""
     masked: bool = False
     """Leave pixels of opacity 0 out of the pixel error: Point-NeRF's rays without a point in reach."""
-    opacity_l1_weight: Weight = 0.0
+    opacity_l1_weight: float = 0.0
     """L1 of the opacity against the reference's."""
-    opacity_weight: Weight = 0.0
+    opacity_weight: float = 0.0
     """Mean squared error of the opacity against the reference's, beside the loss of the picture."""
-    mse_weight: Weight = 0.0
+    mse_weight: float = 0.0
     """Mean squared error of the picture, in addition; where L1 is flat, as at outlines, it prefers the mean."""
     condition: bool = True
     """Whether the discriminator sees the true colours at visible input points [paper]; else an empty image and mask."""
 
     def __post_init__(self) -> None:
-        check(self)
+        check(self, positive=("r1_interval", "discriminator_width"), shares=("adversarial_start",))
 
 
 @dataclass(frozen=True, kw_only=True)
 class OptimizerConfig:
     """Adam for both networks, linear warm-up, cosine decay, average of the generator's weights."""
 
-    lr_generator: Positive = 5e-4
+    lr_generator: float = 5e-4
     """Peak learning rate of the generator."""
-    lr_discriminator: Positive = 2e-4
+    lr_discriminator: float = 2e-4
     """Learning rate of the discriminator."""
-    beta1: Decay = 0.9
+    beta1: float = 0.9
     """Adam's first moment, generator."""
-    beta1_discriminator: Decay = 0.5
+    beta1_discriminator: float = 0.5
     """Adam's first moment, discriminator."""
-    beta2: Decay = 0.999
+    beta2: float = 0.999
     """Adam's second moment, both."""
-    warmup_steps: Whole = 500
+    warmup_steps: int = 500
     """Steps of linear warm-up of the generator's learning rate."""
-    final_lr_scale: Weight = 0.01
+    final_lr_scale: float = 0.01
     """Learning rate of the last step relative to the peak."""
-    ema_decay: Decay = 0.999
+    ema_decay: float = 0.999
     """Decay per step of the averaged generator, which evaluation uses; ramps up from 0 in the first steps."""
     algorithm: Literal["adam", "radam"] = "adam"
     """Adam, or rectified Adam for the generator."""
     decay: Literal["cosine", "exponential"] = "cosine"
     """How the generator's learning rate falls after the warm-up."""
-    clip_norm: Weight = 0.0
+    clip_norm: float = 0.0
     """Norm to which the generator's gradient is shortened where it is longer; 0: never."""
 
     def __post_init__(self) -> None:
-        check(self)
+        decays = "beta1", "beta1_discriminator", "beta2", "ema_decay"
+        check(self, positive=("lr_generator", "lr_discriminator"), shares=decays)
+        for name in decays:
+            require(getattr(self, name) < 1, f"{name} must be below 1, got {getattr(self, name)}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,32 +376,33 @@ class TrainConfig:
     model: NetworkConfig = field(default_factory=PaperConfig)
     loss: LossConfig = field(default_factory=LossConfig)
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
-    num_steps: Count = 100_000
+    num_steps: int = 100_000
     """Optimiser steps."""
-    batch_objects: Count = 8
+    batch_objects: int = 8
     """Objects per step."""
-    views_per_object: Count = 1
+    views_per_object: int = 1
     """Views per object and step; they share one encoded volume."""
-    min_points: Count = 512
+    min_points: int = 512
     """Fewest points drawn per object and step."""
-    max_points: Count = 4096
+    max_points: int = 4096
     """Most points drawn per object and step; the padded size of the cloud."""
-    test_points: Count = 1024
+    test_points: int = 1024
     """Points per object in evaluation."""
     trains: Literal["network", "refiner"] = "network"
     """What steps change: all, or the refiner alone, on pictures of the network that the run begins with (`--init`)."""
     seed: int = 0
     """Seed of weights, batches and jitter."""
-    pixel_stride: Count = 1
+    pixel_stride: int = 1
     """Train on every n-th row and column of a view, at a random offset."""
-    crop: Whole = 0
+    crop: int = 0
     """Pixels along each side of the square of a view that is rendered in training, at a random place; 0: all of it."""
-    even_share: Share = 0.0
+    even_share: float = 0.0
     """Share of the clouds that are spread evenly (farthest-point sampling), not at random: an object's first points in
     a data set of `--spread even`, farthest points of it where the network sees G-buffers."""
 
     def __post_init__(self) -> None:
-        check(self)
+        counts = "num_steps", "batch_objects", "views_per_object", "min_points", "max_points", "test_points"
+        check(self, positive=(*counts, "pixel_stride"), shares=("even_share",))
         require(
             self.loss.adversarial_weight == 0 or self.model.image_resolution >= 24,
             f"image_resolution {self.model.image_resolution} is too small for the discriminator; use at "

@@ -8,14 +8,16 @@ import dataclasses
 from collections.abc import Callable
 
 from spnr_jax.baselines.baseline_presets import BASELINES
-from spnr_jax.config import LossConfig, OptimizerConfig, TrainConfig
-from spnr_jax.model_config import (
+from spnr_jax.config import (
     SOLID,
     EncoderConfig,
+    LossConfig,
     NearPointsConfig,
+    OptimizerConfig,
     PaperConfig,
     SamplingConfig,
     SurfelConfig,
+    TrainConfig,
     surface_grid,
 )
 

@@ -16,7 +16,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 SPNR_JAX = (
-    *("errors", "model_config", "config"),
+    *("errors", "config"),
     *("devices", "kernels", "surfels", "gaussians", "nn", "baselines", "method", "presets"),
     *("formats/mesh", "formats", "training", "scoring", "tools", "viewer"),
     *("cli", "__init__"),

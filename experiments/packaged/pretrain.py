@@ -24,10 +24,9 @@ from data_gen.store.layout import SPLITS
 from experiments import entry_point
 from experiments.packaged.demo import Seconds
 from spnr_jax import cli, presets
-from spnr_jax.config import TrainConfig
+from spnr_jax.config import NearPointsConfig, TrainConfig, surface_grid
 from spnr_jax.formats import data_sets as data
 from spnr_jax.formats.images import write_whole
-from spnr_jax.model_config import NearPointsConfig, surface_grid
 from spnr_jax.scoring import evaluation
 from spnr_jax.scoring.results import text_table, write_results
 from spnr_jax.training import metrics_log, trainer, weights

@@ -31,10 +31,9 @@ from experiments.comparison import clock, results_folder
 from experiments.speed import bench, ours
 from experiments.speed.surfel_scene import orbiting, random_crops, sphere
 from spnr_jax import cli
-from spnr_jax.config import TrainConfig
+from spnr_jax.config import RayNetworkConfig, SurfelConfig, TrainConfig
 from spnr_jax.devices import machine
 from spnr_jax.method import surfel_renderer
-from spnr_jax.model_config import RayNetworkConfig, SurfelConfig
 from spnr_jax.presets import PRESETS
 from spnr_jax.scoring.score_tables import Table, number, text
 from spnr_jax.surfels.lighting import room_light

@@ -14,12 +14,11 @@ import jaxlib
 import numpy as np
 
 from experiments.speed import bench_scene, twin_layout, worker
-from spnr_jax.config import TrainConfig
+from spnr_jax.config import RayNetworkConfig, TrainConfig
 from spnr_jax.devices import allocator
 from spnr_jax.errors import UserError
 from spnr_jax.kernels.records import Batch
 from spnr_jax.method import inference
-from spnr_jax.model_config import RayNetworkConfig
 from spnr_jax.presets import PRESETS
 from spnr_jax.training import adversary, optimisation
 

@@ -26,11 +26,10 @@ from experiments import entry_point
 from experiments.comparison import figures, results_folder
 from experiments.speed import ours, worker
 from spnr_jax import cli
-from spnr_jax.config import TrainConfig
+from spnr_jax.config import RayNetworkConfig, TrainConfig
 from spnr_jax.devices import machine
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.records import Batch
-from spnr_jax.model_config import RayNetworkConfig
 from spnr_jax.scoring.score_tables import Table, number, text
 
 

@@ -10,9 +10,8 @@ from collections.abc import Mapping
 import jax.numpy as jnp
 import numpy as np
 
-from spnr_jax.config import LossConfig, OptimizerConfig, TrainConfig
+from spnr_jax.config import EncoderConfig, LossConfig, OptimizerConfig, PaperConfig, SamplingConfig, TrainConfig
 from spnr_jax.kernels.records import Batch, Camera, PointCloud
-from spnr_jax.model_config import EncoderConfig, PaperConfig, SamplingConfig
 
 Arrays = Mapping[str, np.ndarray]
 

@@ -25,10 +25,10 @@ from experiments import entry_point
 from experiments.comparison import clock, results_folder
 from experiments.speed.surfel_scene import orbiting, random_crops, sphere
 from spnr_jax import cli
+from spnr_jax.config import SurfelConfig
 from spnr_jax.devices import machine
 from spnr_jax.errors import at_least
 from spnr_jax.method import surfel_plan, surfel_renderer
-from spnr_jax.model_config import SurfelConfig
 from spnr_jax.nn.shader import Shader, picture
 from spnr_jax.presets import PRESETS
 from spnr_jax.scoring.score_tables import Table, number

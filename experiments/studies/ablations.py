@@ -28,10 +28,17 @@ from experiments import entry_point
 from experiments.comparison import variants, variants_report
 from experiments.comparison.variants import Budget, Variant
 from spnr_jax import cli, presets
-from spnr_jax.config import LossConfig, TrainConfig
+from spnr_jax.config import (
+    EncoderConfig,
+    LossConfig,
+    NearPointsConfig,
+    PaperConfig,
+    RayNetworkConfig,
+    SamplingConfig,
+    TrainConfig,
+)
 from spnr_jax.errors import UserError, at_least
 from spnr_jax.formats import data_sets
-from spnr_jax.model_config import EncoderConfig, NearPointsConfig, PaperConfig, RayNetworkConfig, SamplingConfig
 
 REFERENCE = "reference"
 LABELS = {

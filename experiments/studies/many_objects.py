@@ -25,13 +25,12 @@ import numpy as np
 from experiments import entry_point
 from experiments.comparison import clock, results_folder
 from spnr_jax import cli
-from spnr_jax.config import TrainConfig
+from spnr_jax.config import RayNetworkConfig, TrainConfig
 from spnr_jax.devices import machine
 from spnr_jax.formats import data_sets
 from spnr_jax.kernels import cloud_arrays
 from spnr_jax.kernels.records import Batch, PointCloud
 from spnr_jax.method import inference
-from spnr_jax.model_config import RayNetworkConfig
 from spnr_jax.presets import PRESETS
 from spnr_jax.scoring.score_tables import Table, number
 from spnr_jax.training import adversary, batching, many_runs, optimisation

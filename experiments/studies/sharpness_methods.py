@@ -13,10 +13,10 @@ import numpy as np
 from data_gen.store import layout
 from experiments.comparison.object_views import Picture, at, drawn, on_white, view_of
 from experiments.comparison.poisson import Renderer, trimmed_surface
+from spnr_jax.config import SurfelConfig
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
 from spnr_jax.method.model import Model, Quality
-from spnr_jax.model_config import SurfelConfig
 from spnr_jax.training.weights import load
 
 

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from spnr_jax.config import NetworkConfig, RayNetworkConfig, SurfelConfig
 from spnr_jax.method.model import Quality
-from spnr_jax.model_config import NetworkConfig, RayNetworkConfig, SurfelConfig
 
 SHARES = (0.75, 0.5, 0.25)  # of the pixels along a side that are drawn; the picture is enlarged from there
 

@@ -17,11 +17,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from spnr_jax.baselines.sizes import NPBGConfig
+from spnr_jax.config import RenderOptions
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.numerics import per_feature
 from spnr_jax.kernels.records import Camera, Key, PointCloud, Rendering
 from spnr_jax.kernels.resizing import bilinear
-from spnr_jax.model_config import RenderOptions
 from spnr_jax.nn.convolution import conv
 
 

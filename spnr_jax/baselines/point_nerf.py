@@ -24,12 +24,12 @@ from jaxtyping import Array, Bool, Float, Int
 
 from spnr_jax.baselines import ray_chunks
 from spnr_jax.baselines.sizes import PointNeRFConfig
+from spnr_jax.config import MATERIAL_CHANNELS, RenderOptions
 from spnr_jax.devices.placement import on_own_rays
 from spnr_jax.kernels import cameras, compositing, sampling
 from spnr_jax.kernels.numerics import length, per_feature, softplus
 from spnr_jax.kernels.occupancy import map_existing
 from spnr_jax.kernels.records import Camera, Key, PointCloud, Rays, Rendering
-from spnr_jax.model_config import MATERIAL_CHANNELS, RenderOptions
 
 BLOCK = 1024  # shading points at once: 8 MB for a layer of 256 with 8 neighbours
 SLOPE, GAIN = 0.01, math.sqrt(2 / (1 + 0.01**2))  # of the leaky ReLU, and what it asks of the weights before it

@@ -28,11 +28,11 @@ from jaxtyping import Array, Bool, Float
 
 from spnr_jax.baselines import ray_chunks
 from spnr_jax.baselines.sizes import Points2NeRFConfig
+from spnr_jax.config import RenderOptions
 from spnr_jax.errors import UserError
 from spnr_jax.kernels import cameras, compositing, sampling
 from spnr_jax.kernels.numerics import per_feature, softplus
 from spnr_jax.kernels.records import Camera, Key, PointCloud, Rays, Rendering
-from spnr_jax.model_config import RenderOptions
 from spnr_jax.nn.encoding import encode_direction
 
 PAINTED = 1e10  # length of a ray's last interval in faithful mode

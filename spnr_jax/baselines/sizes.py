@@ -3,18 +3,8 @@
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
+from spnr_jax.config import MATERIAL_CHANNELS, Material, NetworkConfig, check
 from spnr_jax.errors import require
-from spnr_jax.model_config import (
-    MATERIAL_CHANNELS,
-    Count,
-    Materials,
-    NetworkConfig,
-    Positive,
-    Share,
-    Weight,
-    Whole,
-    Widths,
-)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,15 +13,16 @@ class NPBGConfig(NetworkConfig):
 
     method: ClassVar[str] = "npbg"
 
-    encoder_widths: Widths = (16, 32, 48, 64, 80)
+    encoder_widths: tuple[int, ...] = (16, 32, 48, 64, 80)
     """Channels at each scale, the finest first; each scale has half the pixels of the one before."""
-    decoder_widths: Widths = (48, 24, 12, 6)
+    decoder_widths: tuple[int, ...] = (48, 24, 12, 6)
     """Channels after each step back up, the coarsest first."""
-    near: Positive = 0.01
+    near: float = 0.01
     """Points closer to the plane of the eye than this are not drawn."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        check(self, positive=("encoder_widths", "decoder_widths", "near"))
         require(
             len(self.encoder_widths) == len(self.decoder_widths) + 1 >= 2,
             f"encoder_widths must have one entry more than decoder_widths, got {self.encoder_widths} and "
@@ -58,33 +49,35 @@ class PointNeRFConfig(NetworkConfig):
 
     method: ClassVar[str] = "point_nerf"
 
-    radius: Positive = 0.1
+    radius: float = 0.1
     """Reach of a point [paper], in units of the box [-1, 1]^3 whose object has a half-diagonal of 1."""
-    num_neighbors: Count = 8
+    num_neighbors: int = 8
     """Nearest points inside the radius that a shading point sees [paper]."""
-    num_candidates: Count = 400
+    num_candidates: int = 400
     """Even steps along each ray, of which those within reach of a point can be shaded."""
-    num_samples: Count = 64
+    num_samples: int = 64
     """Shading points of a ray: the first candidates within reach [paper]."""
-    jitter: Share = 0.3
+    jitter: float = 0.3
     """How far a candidate moves in training, as a share of a step."""
-    width: Count = 256
+    width: int = 256
     """Hidden layers of the MLPs that see a neighbour."""
-    color_width: Count = 128
+    color_width: int = 128
     """Hidden layers of the MLP that sees the averaged feature and the view direction."""
-    feature_frequencies: Count = 3
+    feature_frequencies: int = 3
     """Frequencies of the encoding of the materials."""
-    offset_frequencies: Count = 5
+    offset_frequencies: int = 5
     """Frequencies of the encoding of the offset from neighbour to shading point."""
-    direction_frequencies: Count = 4
+    direction_frequencies: int = 4
     """Frequencies of the encoding of the view direction."""
-    density_scale: Positive = 1.0
+    density_scale: float = 1.0
     """Density of one unit of the network's output, per unit of the box; 1 as published, where it learns slowly."""
-    ray_chunk: Count = 256
+    ray_chunk: int = 256
     """Rays of an object rendered at once in evaluation."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        counts = "num_neighbors", "num_candidates", "num_samples", "width", "color_width", "ray_chunk"
+        check(self, positive=(*counts, "radius", "density_scale"), shares=("jitter",))
         require(
             self.num_samples <= self.num_candidates,
             f"num_samples {self.num_samples} must not exceed num_candidates {self.num_candidates}",
@@ -106,35 +99,38 @@ class Points2NeRFConfig(NetworkConfig):
     """The published code's arithmetic, or that of a variational autoencoder over finite intervals."""
     initialization: Literal["published", "scaled"] = "published"
     """How the weights start: as published, or scaled so that signals keep their size on the way to the picture."""
-    kl_weight: Weight = 1.0
+    kl_weight: float = 1.0
     """Weight of the KL term, a sum over the code, beside the mean squared error of a pixel."""
-    materials: Materials = ("base_color",)
+    materials: tuple[Material, ...] = ("base_color",)
     """Material channels that the points carry into the encoder."""
-    point_widths: Widths = (64, 128, 256, 512, 512)
+    point_widths: tuple[int, ...] = (64, 128, 256, 512, 512)
     """Layers of the MLP that sees each point."""
-    hidden_width: Count = 512
+    hidden_width: int = 512
     """Hidden layer after the maximum over the points."""
-    code_size: Count = 4096
+    code_size: int = 4096
     """Numbers in an object's code."""
-    hypernetwork_widths: Widths = (4096, 8192)
+    hypernetwork_widths: tuple[int, ...] = (4096, 8192)
     """Hidden layers of the hypernetwork."""
-    chunk_size: Count = 16384
+    chunk_size: int = 16384
     """Weights that the hypernetwork writes at once."""
-    chunk_embedding: Count = 8
+    chunk_embedding: int = 8
     """Numbers that tell the hypernetwork which chunk it writes."""
-    frequencies: Whole = 10
+    frequencies: int = 10
     """Frequencies of the encoding of a position in the NeRF."""
-    nerf_width: Count = 256
+    nerf_width: int = 256
     """Hidden layers of the NeRF."""
-    nerf_depth: Count = 8
+    nerf_depth: int = 8
     """Hidden layers of the NeRF after its first one, and after the encoded position joins again, together."""
-    num_samples: Count = 256
+    num_samples: int = 256
     """Stratified samples along each ray."""
-    ray_chunk: Count = 1024
+    ray_chunk: int = 1024
     """Rays of an object rendered at once in evaluation."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        counts = "hidden_width", "code_size", "chunk_size", "chunk_embedding", "nerf_width", "num_samples", "ray_chunk"
+        check(self, positive=(*counts, "point_widths", "hypernetwork_widths"))
+        require(len(set(self.materials)) == len(self.materials), f"materials must be distinct, got {self.materials}")
         require(
             self.nerf_depth >= 2 and self.nerf_depth % 2 == 0,
             f"nerf_depth must be even and at least 2, got {self.nerf_depth}",

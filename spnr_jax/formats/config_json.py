@@ -3,9 +3,8 @@
 import dataclasses
 from typing import Any
 
-from spnr_jax.config import TrainConfig
-from spnr_jax.errors import UserError, require
-from spnr_jax.model_config import NearPointsConfig, NetworkConfig, PaperConfig, SurfelConfig, hints, mismatch
+from spnr_jax.config import NearPointsConfig, NetworkConfig, PaperConfig, SurfelConfig, TrainConfig, mismatch, types_of
+from spnr_jax.errors import require
 
 OURS: dict[str, type[NetworkConfig]] = {kind.method: kind for kind in (SurfelConfig, NearPointsConfig, PaperConfig)}
 BASELINES = ("npbg", "point_nerf", "points2nerf")
@@ -19,7 +18,7 @@ def to_dict(config: TrainConfig) -> dict:
 
 def from_dict(values: dict, kind: type = TrainConfig, path: str = "") -> Any:
     """Config from `to_dict`'s form; a field unknown, missing or of another type raises ValueError with its path."""
-    kinds = hints(kind)
+    kinds = types_of(kind)
     for name in values:
         require(name in kinds, f"unknown config field {path}{name}; known: {', '.join(kinds)}")
     arguments = {}
@@ -33,8 +32,8 @@ def from_dict(values: dict, kind: type = TrainConfig, path: str = "") -> Any:
                 value = {field: inner for field, inner in value.items() if field != "method"}
             value = from_dict(value, expected, f"{path}{name}.")
         value = tuple(value) if isinstance(value, list) else value
-        if words := mismatch(value, kinds[name]):
-            raise UserError(f"config field {path}{name} must be {words}, got {value!r}")
+        words = mismatch(value, expected)
+        require(not words, f"config field {path}{name} must be {words}, got {value!r}")
         arguments[name] = value
     return kind(**arguments)
 

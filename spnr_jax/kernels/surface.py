@@ -16,10 +16,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from spnr_jax.config import MOST_CELLS
 from spnr_jax.kernels.numerics import length
 from spnr_jax.kernels.records import PointCloud, Surface, SurfaceSample
 from spnr_jax.kernels.voxels import NEIGHBOURS, locate, row_of
-from spnr_jax.model_config import MOST_CELLS
 
 PLANE_POINTS = 10  # of a plane, the point itself among them
 SPACING_POINTS = 4  # nearest others whose root mean square distance is a point's spacing

@@ -20,12 +20,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.spatial import cKDTree
 
-from spnr_jax.devices.placement import by_all_devices, everywhere
-from spnr_jax.errors import UserError
-from spnr_jax.kernels import cameras, cloud_arrays
-from spnr_jax.kernels.records import LARGEST_REACH, Camera, Key, Light, PointCloud, Rendering, Volume
-from spnr_jax.kernels.resizing import averaged
-from spnr_jax.model_config import (
+from spnr_jax.config import (
     SOLID,
     NearPointsConfig,
     NetworkConfig,
@@ -35,6 +30,11 @@ from spnr_jax.model_config import (
     SamplingConfig,
     SurfelConfig,
 )
+from spnr_jax.devices.placement import by_all_devices, everywhere
+from spnr_jax.errors import UserError
+from spnr_jax.kernels import cameras, cloud_arrays
+from spnr_jax.kernels.records import LARGEST_REACH, Camera, Key, Light, PointCloud, Rendering, Volume
+from spnr_jax.kernels.resizing import averaged
 
 SAMPLES = {"draft": 0.25, "balanced": 0.5, "best": 1.0}  # share of the samples a ray was trained with
 REACH_PER_SPACING = 1.6  # what loses nothing from 128 to 4096 points, docs/cpu_forms.md

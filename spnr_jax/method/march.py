@@ -15,12 +15,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from spnr_jax.config import RenderOptions, SamplingConfig
 from spnr_jax.devices.placement import on_own_rays
 from spnr_jax.kernels import cameras, compositing, occupancy, sampling
 from spnr_jax.kernels.numerics import clamp
 from spnr_jax.kernels.occupancy import Path
 from spnr_jax.kernels.records import Key, Rays, Scene
-from spnr_jax.model_config import RenderOptions, SamplingConfig
 
 CELLS_PER_VOXEL = 1  # of a path through the box, counted along an axis
 RAY_BLOCK = 256  # rays near points that are rendered at once

@@ -14,12 +14,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from spnr_jax.config import AS_TRAINED, PaperConfig, RenderOptions
 from spnr_jax.devices.placement import divide_pixels, undivided
 from spnr_jax.kernels import cameras, voxels
 from spnr_jax.kernels.records import Camera, Key, PointCloud, Rays, Rendering, Scene
 from spnr_jax.kernels.resizing import bilinear
 from spnr_jax.method.march import Field, Finish, Samples, Seen, Traced, places, trace
-from spnr_jax.model_config import AS_TRAINED, PaperConfig, RenderOptions
 from spnr_jax.nn.encoder import Encoder
 from spnr_jax.nn.field import RadianceField
 from spnr_jax.nn.upsampler import Upsampler

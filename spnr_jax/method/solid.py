@@ -16,11 +16,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from spnr_jax.config import NearPointsConfig, RenderOptions
 from spnr_jax.kernels import cameras, cloud_arrays
 from spnr_jax.kernels.records import Camera, PointCloud, Scene
 from spnr_jax.kernels.resizing import averaged, doubled
 from spnr_jax.method.near_points import NearPointsNetwork
-from spnr_jax.model_config import NearPointsConfig, RenderOptions
 
 MOST_POINTS, MOST_PIXELS = 6000, 128  # of a sparse cloud, and along a side of the picture
 LEAST_OPACITY = 1e-3  # that a depth is divided by

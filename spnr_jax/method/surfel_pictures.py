@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from spnr_jax.config import SurfelConfig
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.records import Camera, Light, PointCloud, Rendering, Volume
 from spnr_jax.method import surfel_renderer
-from spnr_jax.model_config import SurfelConfig
 from spnr_jax.surfels.lighting import room_light
 
 _in_box = jax.jit(cameras.in_box)  # compiled whole: each operation alone takes 30 ms at the first call

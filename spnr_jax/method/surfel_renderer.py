@@ -16,6 +16,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float, Int
 
+from spnr_jax.config import SOLID, SurfelConfig
 from spnr_jax.devices.side_by_side import two_at_a_time
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.compositing import WHITE
@@ -23,7 +24,6 @@ from spnr_jax.kernels.records import AnyArray, Camera, GBuffer, Key, Light, Poin
 from spnr_jax.kernels.resizing import doubled, enlarged, mean_of_squares
 from spnr_jax.method import solid
 from spnr_jax.method.surfel_plan import Plan, in_window, planned, rounded, scaled, seen_through
-from spnr_jax.model_config import SOLID, SurfelConfig
 from spnr_jax.nn.shader import NUM_OUTPUTS, Shader, picture
 from spnr_jax.surfels import features, lighting, projection, splatting
 from spnr_jax.surfels.estimate import estimate

@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from spnr_jax.config import EncoderConfig
 from spnr_jax.kernels import voxels
 from spnr_jax.kernels.colors import linear_to_srgb
 from spnr_jax.kernels.records import PointCloud
-from spnr_jax.model_config import EncoderConfig
 from spnr_jax.nn.normalization import BatchNorm
 from spnr_jax.nn.unet3d import UNet3D
 

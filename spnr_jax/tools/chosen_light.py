@@ -11,13 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from spnr_jax.config import SurfelConfig
 from spnr_jax.errors import UserError
 from spnr_jax.formats.light_files import read_light
 from spnr_jax.kernels.cameras import camera_rays
 from spnr_jax.kernels.colors import linear_to_srgb
 from spnr_jax.kernels.records import Camera, Light, Rendering
 from spnr_jax.method.model import Model
-from spnr_jax.model_config import SurfelConfig
 from spnr_jax.surfels.lighting import background, sun
 from spnr_jax.tools.light_options import Lighting
 

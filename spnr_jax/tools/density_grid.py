@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from spnr_jax.config import RayNetworkConfig, RenderOptions
 from spnr_jax.errors import UserError
 from spnr_jax.formats.clouds import PlacedCloud
 from spnr_jax.kernels import occupancy, voxels
@@ -15,7 +16,6 @@ from spnr_jax.kernels.numerics import normalize
 from spnr_jax.kernels.records import Rays, Volume
 from spnr_jax.method.inference import network
 from spnr_jax.method.model import Model
-from spnr_jax.model_config import RayNetworkConfig, RenderOptions
 from spnr_jax.tools.grids import Grid, over_box
 
 

@@ -26,6 +26,7 @@ from typing import NamedTuple
 import numpy as np
 from PIL import Image
 
+from spnr_jax.config import RayNetworkConfig
 from spnr_jax.devices.side_by_side import beside
 from spnr_jax.errors import UserError
 from spnr_jax.formats import clouds, images
@@ -33,7 +34,6 @@ from spnr_jax.formats.clouds import PlacedCloud
 from spnr_jax.formats.gaussian_files import write_splats
 from spnr_jax.kernels.records import Camera, Light, Rendering, Volume
 from spnr_jax.method.model import Model
-from spnr_jax.model_config import RayNetworkConfig
 from spnr_jax.tools import depth_maps
 from spnr_jax.tools.chosen_light import before, check_takes_light, light_of_options
 from spnr_jax.tools.render_command import Render

@@ -13,13 +13,13 @@ from typing import Any
 import jax
 import numpy as np
 
+from spnr_jax.config import SurfelConfig
 from spnr_jax.gaussians import coloring, placing, refining
 from spnr_jax.gaussians.placing import View
 from spnr_jax.kernels.records import Camera, Gaussians, Light, PointCloud, Volume
 from spnr_jax.method import surfel_renderer
 from spnr_jax.method.model import DISTANCE, Model
 from spnr_jax.method.surfel_renderer import SurfelScene
-from spnr_jax.model_config import SurfelConfig
 from spnr_jax.tools.depth_maps import surface_depth
 from spnr_jax.tools.light_options import Lighting
 from spnr_jax.tools.render_command import Render

@@ -21,12 +21,12 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
+from spnr_jax.config import NetworkConfig, RayNetworkConfig, SurfelConfig
 from spnr_jax.devices import compilation, machine
 from spnr_jax.formats.images import write_whole
 from spnr_jax.kernels.cloud_arrays import bucket, plain_cloud
 from spnr_jax.kernels.records import PointCloud, Volume
 from spnr_jax.method.model import Model, Quality
-from spnr_jax.model_config import NetworkConfig, RayNetworkConfig, SurfelConfig
 from spnr_jax.tools.render_command import Render
 
 FILE = "seconds.json"

@@ -4,10 +4,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from spnr_jax.config import TrainConfig
+from spnr_jax.config import RayNetworkConfig, TrainConfig
 from spnr_jax.kernels import losses
 from spnr_jax.kernels.records import AnyArray, Batch
-from spnr_jax.model_config import RayNetworkConfig
 from spnr_jax.nn.discriminator import Discriminator
 
 

@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Array, Float, UInt8
 from tqdm import tqdm
 
-from spnr_jax.config import TrainConfig
+from spnr_jax.config import SurfelConfig, TrainConfig
 from spnr_jax.errors import UserError
 from spnr_jax.formats.clouds import MOST_EVEN
 from spnr_jax.formats.data_sets import Dataset, ObjectData, read_object
@@ -32,7 +32,6 @@ from spnr_jax.kernels.cleaning import Cleaned, cleaned
 from spnr_jax.kernels.records import Camera, Crops, Light, PointCloud
 from spnr_jax.kernels.thinning import farthest_points
 from spnr_jax.method import surfel_plan, surfel_renderer
-from spnr_jax.model_config import SurfelConfig
 from spnr_jax.surfels import features, lighting, outward, projection
 from spnr_jax.training.batching import read_ahead
 from spnr_jax.training.scan_faults import colours_alone, random_scan

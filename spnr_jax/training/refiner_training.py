@@ -24,7 +24,7 @@ import optax
 from jaxtyping import Array, Float
 from tqdm import tqdm
 
-from spnr_jax.config import TrainConfig
+from spnr_jax.config import AS_TRAINED, NearPointsConfig, TrainConfig
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.images import write_whole
 from spnr_jax.formats.npz import packed, read_arrays
@@ -35,7 +35,6 @@ from spnr_jax.kernels.records import Camera, PointCloud
 from spnr_jax.kernels.resizing import mean_of_squares
 from spnr_jax.method import inference
 from spnr_jax.method.march import trace
-from spnr_jax.model_config import AS_TRAINED, NearPointsConfig
 from spnr_jax.nn.refiner import Refiner
 from spnr_jax.training import batching, optimisation
 from spnr_jax.training.optimisation import TrainState

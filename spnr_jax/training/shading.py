@@ -11,11 +11,10 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float
 
-from spnr_jax.config import TrainConfig
+from spnr_jax.config import SurfelConfig, TrainConfig
 from spnr_jax.kernels import losses
 from spnr_jax.kernels.metrics import psnr
 from spnr_jax.kernels.records import Crops
-from spnr_jax.model_config import SurfelConfig
 from spnr_jax.nn.shader import Shader, picture
 from spnr_jax.training import optimisation
 from spnr_jax.training.optimisation import TrainState

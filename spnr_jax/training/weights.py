@@ -19,14 +19,13 @@ import jax
 import numpy as np
 from flax.traverse_util import flatten_dict, unflatten_dict
 
-from spnr_jax.config import TrainConfig
+from spnr_jax.config import NetworkConfig, SurfelConfig, TrainConfig
 from spnr_jax.errors import UserError
 from spnr_jax.formats.config_json import from_dict, to_dict
 from spnr_jax.formats.images import write_whole
 from spnr_jax.formats.npz import packed, read_arrays
 from spnr_jax.method.inference import init
 from spnr_jax.method.model import Model
-from spnr_jax.model_config import NetworkConfig, SurfelConfig
 
 # what a header of any content makes its readers raise
 UNREADABLE = (ValueError, LookupError, TypeError, ArithmeticError, RecursionError)

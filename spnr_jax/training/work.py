@@ -13,12 +13,11 @@ from typing import Any, NamedTuple
 import jax
 from jax.sharding import Mesh
 
-from spnr_jax.config import TrainConfig
+from spnr_jax.config import SurfelConfig, TrainConfig
 from spnr_jax.devices import placement
 from spnr_jax.errors import UserError
 from spnr_jax.formats.data_sets import Dataset, has_lights
 from spnr_jax.kernels.records import Crops, Light
-from spnr_jax.model_config import SurfelConfig
 from spnr_jax.surfels import lighting
 from spnr_jax.training import adversary, batching, gbuffers, optimisation, refiner_training, shading
 from spnr_jax.training.optimisation import TrainState

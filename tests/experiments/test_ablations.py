@@ -12,9 +12,9 @@ from experiments.comparison import variants, variants_report
 from experiments.comparison.variants import Budget, Compared
 from experiments.studies.ablations import LABELS, ROWS, Ablations, changed, folds, main, rows
 from spnr_jax import presets
+from spnr_jax.config import RayNetworkConfig
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.config_json import to_dict
-from spnr_jax.model_config import RayNetworkConfig
 from spnr_jax.scoring import evaluation, summary
 from spnr_jax.training import checkpoint, optimisation
 

@@ -11,8 +11,8 @@ from experiments.studies.speed_accuracy import SpeedAccuracy, main
 from experiments.studies.speed_accuracy_report import front, knee
 from experiments.studies.speed_accuracy_settings import settings
 from spnr_jax import cli
+from spnr_jax.config import SurfelConfig
 from spnr_jax.formats import data_sets
-from spnr_jax.model_config import SurfelConfig
 from spnr_jax.training.weights import load
 
 

@@ -11,11 +11,11 @@ from support import tiny_model
 from support.laws import close, same_bits
 from support.tiny_model import camera, cloud, wobbled
 
+from spnr_jax.config import RenderOptions
 from spnr_jax.kernels import cameras, occupancy, voxels
 from spnr_jax.kernels.occupancy import distance_at, map_existing, open_path
 from spnr_jax.kernels.records import Rays, Scene
 from spnr_jax.method import inference
-from spnr_jax.model_config import RenderOptions
 
 CONFIG = tiny_model.WITHOUT_UPSAMPLER
 RNG = np.random.default_rng(0)

@@ -10,13 +10,13 @@ from support.laws import close, numbers, same_bits
 from support.tiny_model import MODEL, PLUS, camera, cloud, wobbled
 
 from spnr_jax.baselines.sizes import NPBGConfig
+from spnr_jax.config import RenderOptions
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.records import Rendering
 from spnr_jax.kernels.resizing import averaged, mean_of_squares
 from spnr_jax.method import inference
 from spnr_jax.method.inference import rays_per_side
 from spnr_jax.method.model import Model
-from spnr_jax.model_config import RenderOptions
 
 SIDE = 2
 

@@ -11,10 +11,10 @@ import pytest
 from support import reference
 from support.laws import close, numbers, same_bits
 
+from spnr_jax.config import MOST_CELLS, surface_grid
 from spnr_jax.kernels import surface
 from spnr_jax.kernels.numerics import normalize
 from spnr_jax.kernels.records import PointCloud
-from spnr_jax.model_config import MOST_CELLS, surface_grid
 
 COUNT = 4
 

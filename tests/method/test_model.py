@@ -12,11 +12,11 @@ from support.surfel_clouds import cloud
 
 import spnr_jax
 from spnr_jax.baselines.sizes import NPBGConfig
+from spnr_jax.config import RenderOptions, SamplingConfig
 from spnr_jax.formats import data_sets
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.records import LARGEST_REACH, Camera, Volume
 from spnr_jax.method import inference, model
-from spnr_jax.model_config import RenderOptions, SamplingConfig
 
 
 @pytest.fixture(scope="module")

@@ -10,10 +10,10 @@ import pytest
 from support import twin
 
 from experiments.speed import twin_layout
+from spnr_jax.config import AS_TRAINED
 from spnr_jax.kernels import cameras, compositing, losses, sampling, voxels
 from spnr_jax.method import inference
 from spnr_jax.method.march import trace
-from spnr_jax.model_config import AS_TRAINED
 from spnr_jax.nn.encoding import encode_direction
 from spnr_jax.training import adversary, optimisation
 

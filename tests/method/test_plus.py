@@ -11,13 +11,12 @@ from support.laws import close, same_bits
 from support.tiny_model import PLUS, camera, cloud, wobbled
 
 from spnr_jax import presets
-from spnr_jax.config import LossConfig, OptimizerConfig
+from spnr_jax.config import AS_TRAINED, LossConfig, OptimizerConfig, RenderOptions, SamplingConfig, surface_grid
 from spnr_jax.formats.clouds import PlacedCloud
 from spnr_jax.kernels import occupancy
 from spnr_jax.method import inference
 from spnr_jax.method.march import trace
 from spnr_jax.method.model import Model
-from spnr_jax.model_config import AS_TRAINED, RenderOptions, SamplingConfig, surface_grid
 from spnr_jax.tools.density_grid import sample_density
 from spnr_jax.training import pixels
 

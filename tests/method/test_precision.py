@@ -12,10 +12,10 @@ from support.laws import numbers, same_bits
 from support.tiny_model import MODEL, camera, cloud
 from support.tiny_training import BATCH, CONFIG, L1_ONLY, create, step
 
+from spnr_jax.config import AS_TRAINED
 from spnr_jax.kernels.records import Rays, Scene
 from spnr_jax.method import inference
 from spnr_jax.method.march import trace
-from spnr_jax.model_config import AS_TRAINED
 from spnr_jax.training import optimisation
 
 pytestmark = pytest.mark.ci  # it trains several networks

@@ -14,11 +14,11 @@ from support import reference, tiny_model
 from support.laws import close, same_bits
 from support.tiny_model import NUM_POINTS, camera, cloud, wobbled
 
+from spnr_jax.config import AS_TRAINED, MATERIAL_CHANNELS, RenderOptions
 from spnr_jax.kernels import sampling
 from spnr_jax.kernels.cameras import intersect_box, view_rays
 from spnr_jax.kernels.records import Rays, Scene
 from spnr_jax.method import inference
-from spnr_jax.model_config import AS_TRAINED, MATERIAL_CHANNELS, RenderOptions
 from spnr_jax.nn.encoder import Encoder
 
 SUPPORT = Path(__file__).parents[1] / "support"

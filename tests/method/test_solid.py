@@ -9,9 +9,9 @@ import pytest
 from support.laws import close
 from support.surfel_clouds import camera, cloud, shape
 
+from spnr_jax.config import SOLID, RenderOptions, SurfelConfig
 from spnr_jax.kernels import cameras
 from spnr_jax.method import inference, solid, surfel_renderer
-from spnr_jax.model_config import SOLID, RenderOptions, SurfelConfig
 from spnr_jax.nn.shader import NUM_OUTPUTS, picture
 from spnr_jax.surfels.features import NUM_MAPS
 from spnr_jax.surfels.lighting import room_light

@@ -9,11 +9,11 @@ import pytest
 from support.laws import close, numbers
 from support.surfel_clouds import camera, cloud, shape
 
+from spnr_jax.config import SurfelConfig
 from spnr_jax.kernels import cameras
 from spnr_jax.method import surfel_renderer
 from spnr_jax.method.surfel_plan import GRID, resolution_of
 from spnr_jax.method.surfel_renderer import encode, render, render_views
-from spnr_jax.model_config import SurfelConfig
 from spnr_jax.nn.shader import Shader
 from spnr_jax.surfels.features import NUM_FEATURES
 from spnr_jax.surfels.lighting import light_of

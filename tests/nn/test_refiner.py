@@ -13,13 +13,12 @@ from support.laws import close, numbers, same_bits
 from support.tiny_model import PLUS, camera, cloud, wobbled
 
 from spnr_jax import presets
-from spnr_jax.config import LossConfig, OptimizerConfig, TrainConfig
+from spnr_jax.config import LossConfig, OptimizerConfig, RenderOptions, TrainConfig
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.resizing import averaged, bilinear, folded, mean_of_squares, unfolded
 from spnr_jax.method import inference
 from spnr_jax.method.inference import at_quality, rays_per_side
 from spnr_jax.method.model import Model
-from spnr_jax.model_config import RenderOptions
 from spnr_jax.nn.refiner import FOLD, LEAST, LEVELS, ODDS, Refiner
 from spnr_jax.training import optimisation, weights
 

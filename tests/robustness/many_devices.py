@@ -25,12 +25,11 @@ import jax
 import numpy as np
 from support import tiny_dataset, tiny_model
 
-from spnr_jax.config import LossConfig
+from spnr_jax.config import LossConfig, RenderOptions, SamplingConfig
 from spnr_jax.devices import placement
 from spnr_jax.devices.placement import DEPTH, OBJECTS
 from spnr_jax.method import inference
 from spnr_jax.method import march as marching
-from spnr_jax.model_config import RenderOptions, SamplingConfig
 from spnr_jax.training import batching, optimisation
 
 PLUS = dataclasses.replace(

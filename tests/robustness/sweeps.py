@@ -14,10 +14,10 @@ import numpy as np
 from skimage.metrics import structural_similarity
 from support import reference
 
+from spnr_jax.config import AS_TRAINED, PaperConfig, SamplingConfig
 from spnr_jax.kernels import cameras, compositing, losses, metrics, sampling, voxels
 from spnr_jax.kernels.records import Camera, Rays, Scene
 from spnr_jax.method import inference, march
-from spnr_jax.model_config import AS_TRAINED, PaperConfig, SamplingConfig
 from spnr_jax.nn.normalization import BatchNorm, GroupNorm
 
 RAYS = 16

@@ -103,7 +103,7 @@ def lpips() -> list[Files]:
 
 def weights() -> list[Files]:
     """Files of weights of very small networks, one of them NPBG's."""
-    from spnr_jax.model_config import EncoderConfig, PaperConfig, SamplingConfig
+    from spnr_jax.config import EncoderConfig, PaperConfig, SamplingConfig
     from spnr_jax.training.weights import variable_shapes
 
     ours = presets.tiny()

@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from spnr_jax import presets
+from spnr_jax.config import RenderOptions
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.records import Scene
 from spnr_jax.method import inference
-from spnr_jax.model_config import RenderOptions
 
 MODEL = presets.tiny().model
 

@@ -3,8 +3,7 @@
 import dataclasses
 
 from spnr_jax.baselines.sizes import NPBGConfig, PointNeRFConfig, Points2NeRFConfig
-from spnr_jax.config import LossConfig, OptimizerConfig
-from spnr_jax.model_config import NetworkConfig
+from spnr_jax.config import LossConfig, NetworkConfig, OptimizerConfig
 from support import tiny_dataset, tiny_model
 
 SIZE = tiny_dataset.SIZE

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from spnr_jax.baselines.sizes import PointNeRFConfig
+from spnr_jax.config import EncoderConfig, NearPointsConfig, PaperConfig, SamplingConfig
 from spnr_jax.kernels.cameras import look_at, pinhole
 from spnr_jax.kernels.records import PointCloud
-from spnr_jax.model_config import EncoderConfig, NearPointsConfig, PaperConfig, SamplingConfig
 from support.laws import numbers
 
 SIZE = 24  # the smallest image that the discriminator can judge

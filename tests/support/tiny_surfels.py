@@ -5,9 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from spnr_jax.config import LossConfig, OptimizerConfig, TrainConfig
+from spnr_jax.config import LossConfig, OptimizerConfig, SurfelConfig, TrainConfig
 from spnr_jax.formats import data_sets
-from spnr_jax.model_config import SurfelConfig
 from spnr_jax.surfels import lighting
 from spnr_jax.training import gbuffers, trainer
 from support import tiny_dataset

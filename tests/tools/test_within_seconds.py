@@ -11,9 +11,9 @@ import pytest
 from PIL import Image
 from support import tiny_model, tiny_surfels
 
+from spnr_jax.config import SurfelConfig
 from spnr_jax.method import inference
 from spnr_jax.method.model import Model
-from spnr_jax.model_config import SurfelConfig
 from spnr_jax.tools import catalogue, pictures, within_seconds
 from spnr_jax.tools.render_command import Render
 from spnr_jax.tools.within_seconds import Level, Timing, choose, levels

@@ -11,7 +11,7 @@ from support.stopped_runs import interrupted, rows_without_time
 from support.tiny_surfels import CONFIG, LIGHT, SCHEDULE
 
 import spnr_jax
-from spnr_jax.model_config import SurfelConfig
+from spnr_jax.config import SurfelConfig
 from spnr_jax.surfels import lighting
 from spnr_jax.training import checkpoint, gbuffers, metrics_log, optimisation, shading, trainer, work
 

@@ -10,12 +10,12 @@ import pytest
 from support import tiny_viewer
 from support.laws import close
 
+from spnr_jax.config import SurfelConfig
 from spnr_jax.formats import light_files
 from spnr_jax.formats.light_files import NAMES
 from spnr_jax.kernels.records import Light
 from spnr_jax.method import surfel_renderer
 from spnr_jax.method.model import Model
-from spnr_jax.model_config import SurfelConfig
 from spnr_jax.tools.light_options import Lighting
 from spnr_jax.viewer import lights, session, uploads
 from spnr_jax.viewer import scene as scenes
