@@ -3,7 +3,9 @@
 `import spnr_jax` loads nothing of JAX: what stands here is imported when it is first asked for.
 """
 
+import importlib.metadata
 import sys
+import warnings
 from importlib import import_module
 from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
@@ -18,7 +20,20 @@ _PUBLIC |= dict.fromkeys(
 )
 _KERNELS = ("cameras", "sampling", "compositing", "voxels", "losses", "metrics")
 
+WRONG = {"0.10.2": "jax-ml/jax#39103"}  # releases of jaxlib that compute wrong numbers, and who says so
+
 __all__ = sorted(_PUBLIC)
+
+
+def warn_of_wrong_numbers() -> None:
+    """Warns, in one line, of an installed jaxlib that is known to compute wrong numbers."""
+    version = importlib.metadata.version("jaxlib")
+    if version in WRONG:
+        line = f"jaxlib {version} computes wrong numbers on a CPU ({WRONG[version]}): pip install 'jax!={version}'"
+        warnings.warn(line, stacklevel=3)
+
+
+warn_of_wrong_numbers()
 
 
 def __getattr__(name: str):
