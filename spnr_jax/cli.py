@@ -23,7 +23,7 @@ from spnr_jax import presets
 from spnr_jax.config import SurfelConfig
 from spnr_jax.devices import allocator, compilation
 from spnr_jax.errors import UserError, guarded, split_debug
-from spnr_jax.tools.commands import ConvertLpips, Evaluate, Export, Runs, Train, View
+from spnr_jax.tools.commands import Evaluate, Export, Train, View
 from spnr_jax.tools.render_command import Render, is_catalogue
 from spnr_jax.tools.share_command import Share
 
@@ -32,7 +32,7 @@ DESCRIPTION = """Sparse-point neural rendering: train a network, evaluate one, r
 --debug, or SPNR_DEBUG=1, shows the call stack of an error."""
 
 
-Command = Train | Evaluate | Render | View | Export | Share | Runs | ConvertLpips
+Command = Train | Evaluate | Render | View | Export | Share
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -58,7 +58,7 @@ def parse(arguments: list[str]) -> Command:
     try:
         with contextlib.redirect_stderr(said):
             return tyro.cli(
-                train | Evaluate | Render | View | Export | Share | Runs | ConvertLpips,
+                train | Evaluate | Render | View | Export | Share,
                 prog="spnr",
                 description=DESCRIPTION,
                 args=arguments,
@@ -96,10 +96,6 @@ def run(command: Command) -> None:
             run_export(command)
         case Share():
             run_share(command)
-        case Runs():
-            run_runs(command)
-        case ConvertLpips():
-            run_convert_lpips(command)
 
 
 def set_up_jax(*, repeats: bool = True) -> None:
@@ -142,17 +138,16 @@ def run_train(command: Train) -> None:
 def run_evaluate(command: Evaluate) -> None:
     """`spnr evaluate`."""
     from spnr_jax.formats import data_sets
-    from spnr_jax.scoring import evaluation, lpips_weights
-    from spnr_jax.scoring.results import text_table, write_results
-    from spnr_jax.training import metrics_log
+    from spnr_jax.scoring import evaluation
+    from spnr_jax.scoring.report import scored, text_table, write_results
 
     start = time.monotonic()
     dataset = data_sets.open_dataset(command.data)
-    weights = None if command.lpips is None else lpips_weights.read_weights(command.lpips)
-    outcome = evaluation.evaluate(command.run, dataset, command.split, command.gallery, weights=weights)
+    outcome = evaluation.evaluate(command.run, dataset, command.split, command.gallery)
     out = command.out or (command.run.with_suffix("") if command.run.suffix == ".npz" else command.run)
     seconds = dict.fromkeys(("evaluate", "total"), round(time.monotonic() - start, 1))
-    write_results(out, outcome, dataset.settings, metrics_log.read_rows(command.run), seconds)
+    write_results(out, outcome, dataset.settings, seconds)
+    print(f"{len(dataset.splits[command.split])} {scored(outcome.summary)}")
     print("\n".join(text_table(outcome.summary["methods"])))
     print(f"wrote {out / 'metrics.json'} and {out / 'report.html'}")
 
@@ -226,21 +221,6 @@ def run_share(command: Share) -> None:
     from spnr_jax.tools.splat_export import share
 
     share(command, _noted(command.cloud), partial(print, flush=True))
-
-
-def run_runs(command: Runs) -> None:
-    """`spnr runs`."""
-    from spnr_jax.tools import runs_command
-
-    print("\n".join(runs_command.table(runs_command.read_runs(command.folder))))
-
-
-def run_convert_lpips(command: ConvertLpips) -> None:
-    """`spnr convert-lpips`."""
-    from spnr_jax.scoring import lpips_weights
-
-    lpips_weights.convert(command.alexnet, command.heads, command.out)
-    print(f"wrote {command.out} (score with `spnr evaluate DATA RUN --lpips {command.out}`)")
 
 
 if __name__ == "__main__":

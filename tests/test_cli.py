@@ -28,7 +28,7 @@ import sys
 import jax
 from spnr_jax import cli; from spnr_jax.devices import allocator as memory
 memory.keep = lambda: print("kept", end=" ")
-cli.run_render = cli.run_runs = lambda command: None
+cli.run_render = cli.run_evaluate = lambda command: None
 for line in sys.argv[1:]:
     jax.config.update("jax_cpu_enable_async_dispatch", True)
     cli.run(cli.parse(line.split()))
@@ -38,7 +38,7 @@ for line in sys.argv[1:]:
 
 def test_memory_is_kept_where_work_repeats_itself_and_compilations_always(tmp_path):
     done = subprocess.run(
-        [sys.executable, "-c", SETTING_UP, "render x.ply --turntable none", "render x.ply", "runs ."],
+        [sys.executable, "-c", SETTING_UP, "render x.ply --turntable none", "render x.ply", "evaluate a b"],
         env={k: v for k, v in os.environ.items() if k != "JAX_COMPILATION_CACHE_DIR"} | {"HOME": str(tmp_path)},
         capture_output=True,
         text=True,
@@ -149,6 +149,15 @@ def test_a_missing_data_folder_is_refused(capsys, tmp_path, run):
     assert not (tmp_path / "run").exists()
 
 
+def test_an_empty_test_split_is_refused_with_both_ways_out(capsys, tmp_path, run):
+    data = tiny_dataset.write_dataset(tmp_path / "data", {"train": tiny_dataset.NAMES, "val": (), "test": ()})
+    line = refused(capsys, "evaluate", data, run)
+    assert "the test split is empty" in line
+    assert "--split train" in line
+    assert "--test-objects" in line
+    assert not (run / "report.html").exists()
+
+
 def test_a_run_folder_that_is_none_is_refused(capsys, data, tmp_path):
     (tmp_path / "one.xyz").write_text("0 0 0\n")
     for arguments in (("evaluate", data, tmp_path), ("render", tmp_path / "one.xyz", "--run", tmp_path)):
@@ -212,6 +221,7 @@ def test_train_evaluate_and_render_write_a_run_its_scores_and_a_picture_of_the_n
     arguments = ("--run", run, "--out", tmp_path, "--views", 1, "--turntable", "none", "--resolution", 24)
     assert exit_code("render", tmp_path / "one.xyz", *arguments) == 0
     captured = capsys.readouterr()
+    assert "3 objects of the test split, unseen in training\n" in captured.out
     assert "trying the one before" in captured.out + captured.err
     assert (tmp_path / "one_000.png").is_file()
     metrics = json.loads((tmp_path / "scores" / "metrics.json").read_text())

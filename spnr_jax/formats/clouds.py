@@ -188,8 +188,6 @@ def _read(
     else:
         columns = _bounded_columns(path, num_points, clean, cut, report)
         positions, origin, values = _points_of_columns(columns, report)
-        if not cut.asked and (line := scenes.scene_line(positions, seed)):
-            report(line)
     rows, lines = scenes.object_of(positions, origin, cut.remove_plane, cut.nth, seed)
     positions, values = positions[rows], {name: column[rows] for name, column in values.items()}
     sigma = 0.0

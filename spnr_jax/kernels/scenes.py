@@ -1,4 +1,4 @@
-"""Parts of a scene: points inside a box, the dominant plane, clusters; and whether points look like a scene at all.
+"""Parts of a scene: points inside a box, the dominant plane, clusters.
 
     voxel       side of the cubes in which CROWD points lie on average: some three spacings, whatever the pattern
     clusters    components of voxels that touch by a face, an edge or a corner: things that lie farther apart are
@@ -31,11 +31,6 @@ SAMPLE, PLANES, ROUNDS = 4096, 512, 3  # points that vote, planes that are tried
 CLOSE = 0.5  # voxels from the plane, for the votes
 THICK = 3.0  # standard deviations of what lies close, a voxel at most: a plane's noise goes with it
 LEAST_PLANE = 0.1  # share of the area that a plane needs
-LEAST_POINTS = 2000  # fewer are taken for one object
-LARGE = 0.05  # share of the points of a cluster that counts
-WIDE = 200.0  # spacings across, of a scene
-SMALL_THING = 0.6  # of the plane's extent: what stands on it, or before it, of a scene
-SCENE_PLANE, GROUND = 0.25, 0.6  # share of the area of a plane with such things; with whatever else
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -207,43 +202,3 @@ def dominant_plane(positions: Float[np.ndarray, "points 3"], seed: int = 0) -> P
     thickness = float(np.clip(THICK * deviation, CLOSE * voxel, voxel))
     share = float(np.mean(heights <= thickness))
     return None if share < LEAST_PLANE else Plane(normal=normal, offset=offset, thickness=thickness, share=share)
-
-
-def scene_line(positions: Float[np.ndarray, "points 3"], seed: int = 0) -> str | None:
-    """A line if the points look like a room or a street, not like one object; else None.
-
-    Several large clusters say so, or a plane much wider than what is left without it, in a cloud many spacings across.
-    """
-    if len(positions) < LEAST_POINTS:
-        return None
-    voxel = voxel_side(positions)
-    across = frame(positions)[1] / voxel * np.sqrt(CROWD)
-    if across < WIDE:
-        return None
-    reasons = []
-    sizes = np.bincount(clusters(positions, voxel)) / len(positions)
-    if (large := int(np.sum(sizes > LARGE))) > 1:
-        reasons.append(f"{large} large clusters")
-    plane = dominant_plane(positions, seed)
-    if plane is not None and plane.share > SCENE_PLANE and _stands_on(positions, plane, voxel):
-        reasons.append(f"a plane with {plane.share:.0%} of the surface")
-    if not reasons:
-        return None
-    return (
-        f"looks like a scene, not one object: {' and '.join(reasons)}, {across:.0f} spacings across; "
-        "--crop, --remove-plane and --object cut one out"
-    )
-
-
-def _stands_on(positions: np.ndarray, plane: Plane, voxel: float) -> bool:
-    """Whether something lies beside a plane that is much wider than all of it, or that is nearly all there is."""
-    in_plane = plane.holds(positions)
-    rest = positions[~in_plane]
-    if len(rest) < LARGE * len(positions):
-        return False
-    labels = clusters(rest, voxel)
-    large = rest[np.bincount(labels)[labels] > LARGE * len(rest)]
-    if plane.share > GROUND or not len(large):
-        return True
-    extent, wide = (np.linalg.norm(np.ptp(points, axis=0)) for points in (large, positions[in_plane]))
-    return bool(extent < SMALL_THING * wide)

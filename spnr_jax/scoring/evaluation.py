@@ -6,7 +6,7 @@ spacing with the best PSNR.
 """
 
 import dataclasses
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -24,14 +24,15 @@ from spnr_jax.kernels import metrics
 from spnr_jax.kernels.records import Camera, PointCloud
 from spnr_jax.method import inference
 from spnr_jax.scoring import floors
-from spnr_jax.scoring.flip import flip
-from spnr_jax.scoring.lpips import LpipsWeights, lpips
+from spnr_jax.scoring.perceptual import flip, lpips
 from spnr_jax.scoring.summary import Scores, differences, metric_settings, summarise
-from spnr_jax.training.weights import Trained, read_trained
+from spnr_jax.training.run_record import seen_in_training
+from spnr_jax.training.weights import Trained, place, read_trained
 
 RADIUS_FACTORS = (0.5, 0.75, 1.0, 1.5, 2.0)
 FLOORS = ("white", "splat", "nearest")
 MESHES = "meshes"  # the class of all objects that come from mesh files
+EXPOSURE = {False: "unseen in training", True: "seen in training", None: "not known whether seen in training"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,24 +61,20 @@ class ObjectResult:
 
 
 @jax.jit
-def score(
+def _score(
     image: Float[Array, "views height width 3"],
     acc: Float[Array, "views height width"],
     reference: Array,
     alpha: Array,
     mask: Array,
-    weights: LpipsWeights | None = None,
 ) -> dict[str, Array]:
-    """All metrics of one object's views; LPIPS if there are weights for it."""
-    image = jnp.clip(image, 0, 1)
-    scores = {
+    """The metrics of JAX of one object's views."""
+    return {
         "psnr": metrics.psnr(image, reference),
         "ssim": metrics.ssim(image, reference),
         "cpsnr": metrics.conditional_psnr(image, reference, mask),
-        "flip": flip(image, reference),
         "iou": metrics.opacity_iou(acc, alpha),
     }
-    return scores if weights is None else scores | {"lpips": lpips(image, reference, weights)}
 
 
 @partial(jax.jit, static_argnames="method")
@@ -132,16 +129,13 @@ def evaluate_objects(
     config: TrainConfig,
     dataset: data_sets.Dataset,
     names: tuple[str, ...],
-    weights: LpipsWeights | None = None,
 ) -> Iterator[ObjectResult]:
     """Pictures and scores of each object of a data set; points and image size are the config's."""
     for name in names:
-        yield evaluate_object(methods, config, data_sets.read_object(dataset, name), weights)
+        yield evaluate_object(methods, config, data_sets.read_object(dataset, name))
 
 
-def evaluate_object(
-    methods: dict[str, Method], config: TrainConfig, item: data_sets.ObjectData, weights: LpipsWeights | None = None
-) -> ObjectResult:
+def evaluate_object(methods: dict[str, Method], config: TrainConfig, item: data_sets.ObjectData) -> ObjectResult:
     """Pictures and scores of one object."""
     data_sets.check_renders(item, config)
     if item.lights is not None:
@@ -152,18 +146,19 @@ def evaluate_object(
     pictures, scores = {}, {}
     for method, show in methods.items():
         shown = show(cloud, item.camera)
-        scores[method] = score_pictures(item, shown, weights)
+        scores[method] = score_pictures(item, shown)
         pictures[method] = on_host(shown)
     return ObjectResult(name=item.name, reference=data_sets.on_white(item.images), pictures=pictures, scores=scores)
 
 
-def score_pictures(item: data_sets.ObjectData, pictures: Pictures, weights: LpipsWeights | None = None) -> Scores:
-    """All metrics of pictures of an object's views; the opacity is interpolated to their size."""
+def score_pictures(item: data_sets.ObjectData, pictures: Pictures) -> Scores:
+    """All metrics of pictures of an object's views, LPIPS where it can be measured; the opacity is interpolated."""
     alpha, mask = item.images[..., 3] / np.float32(255), item.conditions[..., 3] > 0
+    image, reference = np.clip(np.asarray(pictures.image), 0, 1), data_sets.on_white(item.images)
     acc = jax.image.resize(jnp.asarray(pictures.acc), alpha.shape, "bilinear")
-    return jax.device_get(
-        score(jnp.asarray(pictures.image), acc, data_sets.on_white(item.images), alpha, mask, weights)
-    )
+    scores = jax.device_get(_score(image, acc, reference, alpha, mask)) | {"flip": flip(image, reference)}
+    distance = lpips(image, reference)
+    return scores if distance is None else scores | {"lpips": distance}
 
 
 def on_host(pictures: Pictures) -> Pictures:
@@ -199,13 +194,12 @@ def score_methods(
     names: tuple[str, ...],
     gallery_objects: int,
     say: Callable[[str], None],
-    weights: LpipsWeights | None,
 ) -> tuple[dict[str, dict[str, Scores]], list[ObjectResult]]:
     """Scores of every object by name, and the results of a few objects, spread over the names, to be looked at."""
     scores: dict[str, dict[str, Scores]] = {}
     gallery = []
     shown = spread(names, gallery_objects)
-    for i, result in enumerate(evaluate_objects(methods, config, dataset, names, weights)):
+    for i, result in enumerate(evaluate_objects(methods, config, dataset, names)):
         scores[result.name] = result.scores
         if result.name in shown:
             gallery.append(result)
@@ -220,11 +214,10 @@ def evaluate(
     split: str = "test",
     gallery_objects: int = 16,
     say: Callable[[str], None] = print,
-    weights: LpipsWeights | None = None,
 ) -> Evaluation:
-    """Scores of a run's newest checkpoint on a split, named by what it is; LPIPS if there are weights."""
+    """Scores of a run's newest checkpoint on a split, named by what it is."""
     trained = read_trained(run, say, data=dataset.folder)
-    return compare({trained.config.model.method: trained}, dataset, split, gallery_objects, say, weights)
+    return compare({trained.config.model.method: trained}, dataset, split, gallery_objects, say, (place(run),))
 
 
 def compare(
@@ -233,18 +226,25 @@ def compare(
     split: str = "test",
     gallery_objects: int = 16,
     say: Callable[[str], None] = print,
-    weights: LpipsWeights | None = None,
+    runs: Sequence[Path] = (),
 ) -> Evaluation:
-    """Scores of networks on a split, all with the points of the first, which the others are subtracted from."""
+    """Scores of networks on a split, all with the points of the first, which the others are subtracted from.
+
+    `runs` are the networks' run folders, which say whether they trained on these objects.
+    """
     first = next(iter(trained))
     config = trained[first].config
     names = dataset.splits[split]
     if not names:
-        raise UserError(f"{dataset.folder}: the {split} split is empty; choose another one or generate more objects")
+        others = " or ".join(f"--split {name}" for name, ids in dataset.splits.items() if ids) or "another split"
+        raise UserError(
+            f"{dataset.folder}: the {split} split is empty; score {others}, "
+            "or generate the data set anew with --test-objects N"
+        )
     factors = {method: choose_radius(dataset, config, method) for method in ("splat", "nearest")}
     methods = {name: network(one.variables, one.config) for name, one in trained.items()}
     methods |= {name: floor(name, factors.get(name, 1.0)) for name in FLOORS}
-    scores, gallery = score_methods(methods, config, dataset, names, gallery_objects, say, weights)
+    scores, gallery = score_methods(methods, config, dataset, names, gallery_objects, say)
     summary = {
         "methods": summarise(list(scores.values())),
         f"{first}_minus": differences(list(scores.values()), first),
@@ -254,15 +254,23 @@ def compare(
         "hardware": machine.hardware(),
         "settings": {
             "split": split,
+            "objects": exposure(runs, dataset, names),
             "networks": {name: {"preset": one.config.preset, "steps": one.steps} for name, one in trained.items()},
             "points": config.test_points,
             "radius factors": factors,
-            "metrics": metric_settings(with_lpips=weights is not None),
+            "metrics": metric_settings(),
         },
     }
     classes = classes_of(scores)
     per_category = {category: summarise([scores[name] for name in classes[category]]) for category in sorted(classes)}
     return Evaluation(config=config, summary=summary, per_category=per_category, gallery=gallery)
+
+
+def exposure(runs: Sequence[Path], dataset: data_sets.Dataset, names: Sequence[str]) -> str:
+    """Whether networks saw objects of a data set in training, as the records of their run folders have it."""
+    seen = [seen_in_training(run, dataset, names) for run in runs]
+    unseen = bool(seen) and not any(seen) and None not in seen
+    return EXPOSURE[True if any(seen) else False if unseen else None]
 
 
 def classes_of(names: Iterable[str]) -> dict[str, list[str]]:

@@ -1,10 +1,11 @@
-"""The report of a run: one HTML file that holds everything, to open from disk, to mail, to keep.
+"""An evaluation as files: metrics.json for programs, report.html for people.
 
-Key numbers and summary, pictures of unseen objects, quality beside the floors, learning curve, settings.  Images are
-PNGs inside the page (report.html is its template), the curve is an SVG; nothing is loaded from elsewhere, and no script
-runs.
+The report is one file that holds everything, to open from disk, to mail, to keep: key numbers and summary, which
+objects are scored and whether the networks trained on them, their pictures, quality beside the floors, settings.
+Images are PNGs inside the page (report.html is its template); nothing is loaded from elsewhere, and no script runs.
 """
 
+import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,15 +13,27 @@ from pathlib import Path
 
 import numpy as np
 
+from spnr_jax.formats.config_json import to_dict
 from spnr_jax.formats.images import depth_image, png_url, to_uint8, write_whole
 from spnr_jax.formats.pages import template
-from spnr_jax.scoring.learning_curve import learning_curve_svg
-from spnr_jax.scoring.score_tables import METHODS, QUALITY, Table, difference, head, lowered, quality, text
+from spnr_jax.scoring.evaluation import FLOORS, Evaluation, ObjectResult, median_view
+from spnr_jax.scoring.score_tables import (
+    METHODS,
+    MISSING,
+    QUALITY,
+    Table,
+    difference,
+    head,
+    lowered,
+    number,
+    quality,
+    text,
+)
 
 COUNTS = {"objects": "Objects", "views": "Views", "cpsnr_views": "cPSNR views"}
 GALLERY_NOTE = (
-    "No network saw these objects. The number below a picture is its PSNR in dB. Depth: bright is near, dark is far, "
-    "spanning each picture's own range. Opacity: white is solid. Both are those of the first network."
+    "The number below a picture is its PSNR in dB. Depth: bright is near, dark is far, spanning each picture's own "
+    "range. Opacity: white is solid. Both are those of the first network."
 )
 QUALITY_NOTE = (
     "Means over images, sRGB in [0, 1] over white. PSNR is capped at 100 dB. SSIM with a Gaussian window of sigma 1.5. "
@@ -48,44 +61,95 @@ class GalleryRow:
     acc: np.ndarray
 
 
-def write_report(
-    path: str | Path,
-    *,
-    title: str,
-    summary: str,
-    settings: Mapping,
-    metrics: Mapping,
-    gallery: Sequence[GalleryRow],
-    curve: Sequence[Mapping],
-    per_category: Mapping[str, Mapping] | None = None,
-) -> None:
-    """Write the page in one piece.
+def write_results(out: Path, evaluation: Evaluation, dataset_settings: dict, seconds: dict[str, float]) -> None:
+    """Writes metrics.json and report.html into a folder."""
+    metrics = {**evaluation.summary, "seconds": seconds, "per_category": evaluation.per_category}
+    write_whole(out / "metrics.json", (json.dumps(metrics, indent=2, allow_nan=False) + "\n").encode())
+    settings = {"training": to_dict(evaluation.config), "data": dataset_settings, **metrics["settings"]}
+    write_report(out / "report.html", settings, metrics, [gallery_row(result) for result in evaluation.gallery])
 
-    `metrics` is the content of metrics.json ("methods", the first of which is the network that "NAME_minus" subtracts
-    from, "seconds", "preset", "steps", "seed", "hardware"), `per_category` has a "methods" table for every category,
-    `curve` the rows of metrics.jsonl, `settings` any nested mapping.  Blank lines in the summary part paragraphs.
+
+def write_report(path: Path, settings: Mapping, metrics: Mapping, gallery: Sequence[GalleryRow]) -> None:
+    """Write the page in one piece: of the content of metrics.json, and any nested mapping of settings.
+
+    The first of the methods is the network that "NAME_minus" subtracts from.
     """
-    methods = metrics["methods"]
+    methods, per_category = metrics["methods"], metrics["per_category"]
     first = next(iter(methods))
-    levels = {METHODS[m]: methods[m]["psnr"] for m in METHODS if m in methods and m != first}
     minus = metrics.get(f"{first}_minus")
     tables = [_quality_table(methods)]
     tables += [_difference_table(first, minus)] if minus else []
     tables += [_category_table(per_category)] if per_category else []
     shown = gallery[0].images if gallery else {}
     page = template(Path(__file__).with_name("report.html")).render(
-        title=title,
-        paragraphs=[part for part in summary.split("\n\n") if part.strip()],
+        title=f"Sparse-point neural rendering: {scored(metrics)}",
+        summary=_summary(metrics),
         tiles=_key_numbers(metrics),
+        gallery_heading=scored(metrics),
         gallery_note=GALLERY_NOTE,
         heads=["Reference", *(METHODS.get(method, method) for method in shown), "Depth", "Opacity"],
         gallery=[(row.name, _pictures(row)) for row in gallery],
         tables=tables,
-        curve=learning_curve_svg(curve, levels) if curve else "",
         facts=_run_facts(metrics),
         settings=flatten(settings),
     )
-    write_whole(Path(path), f"{page}\n".encode())
+    write_whole(path, f"{page}\n".encode())
+
+
+def scored(metrics: Mapping) -> str:
+    """Which objects are scored, and whether the networks trained on them."""
+    settings = metrics["settings"]
+    return f"objects of the {settings['split']} split, {settings['objects']}"
+
+
+def _summary(metrics: Mapping) -> str:
+    """What the first network is, and how many dB it is above the others, in two sentences."""
+    methods, settings = metrics["methods"], metrics["settings"]
+    best = max(FLOORS, key=lambda name: methods[name]["psnr"])
+    network, *others = settings["networks"]
+    compared = [(lowered(name), name) for name in others] + [("the white image", "white")]
+    compared += [(f"the best trivial renderer ({best})", best)]
+    above = ", ".join(f"{_above(metrics, name)} against {words}" for words, name in compared)
+    row = methods[network]
+    return (
+        f"{METHODS.get(network, network)}: preset {metrics['preset']}, {metrics['steps']} steps. "
+        f"{settings['points']} points per object. "
+        f"{row['psnr']:.2f} dB PSNR on {row['views']} views of {row['objects']} {scored(metrics)}: {above}."
+    )
+
+
+def _above(metrics: Mapping, other: str) -> str:
+    """How many dB the first network is above another method, with its interval."""
+    found = metrics[f"{next(iter(metrics['methods']))}_minus"][other]["psnr"]
+    ends = found["interval"]
+    return f"{found['mean']:+.2f} dB" + (f" [{ends[0]:+.2f}, {ends[1]:+.2f}]" if ends else "")
+
+
+def text_table(methods: Mapping[str, Mapping]) -> list[str]:
+    """Lines of the table of methods for a terminal: means, and what could not be measured."""
+    lines = []
+    for method, row in methods.items():
+        texts = [
+            f"{head.partition(',')[0]} {number(row[name], decimals, missing=MISSING.get(name, 'n/a')).text}"
+            for name, (head, decimals, _) in QUALITY.items()
+        ]
+        lines.append(f"{METHODS.get(method, method):22s} " + "   ".join(texts))
+    return lines
+
+
+def gallery_row(result: ObjectResult) -> GalleryRow:
+    """The view of an object whose PSNR is the median, of the first network."""
+    first = next(iter(result.pictures))
+    view = median_view(result.scores[first]["psnr"])
+    shown = result.pictures[first]
+    assert shown.depth is not None
+    return GalleryRow(
+        name=result.name,
+        reference=result.reference[view],
+        images={m: np.asarray(p.image[view]) for m, p in result.pictures.items() if m != "white"},
+        depth=np.asarray(shown.depth[view]),
+        acc=np.asarray(shown.acc[view]),
+    )
 
 
 def flatten(settings: Mapping, prefix: str = "") -> dict[str, object]:
@@ -115,7 +179,7 @@ def _key_numbers(metrics: Mapping) -> list[tuple[str, str]]:
     """The numbers that a reader looks for first, as tiles."""
     methods, seconds = metrics["methods"], metrics.get("seconds", {})
     psnr = next(iter(methods.values()))["psnr"]
-    tiles = [("PSNR on unseen objects", f"{psnr:.1f} dB")]
+    tiles = [(f"PSNR on {scored(metrics)}", f"{psnr:.1f} dB")]
     for name, words in (
         ("paper", "over the paper's network"),
         ("white", "over the white image"),

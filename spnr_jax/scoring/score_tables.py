@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from spnr_jax.scoring import intervals
-from spnr_jax.scoring.summary import NO_WEIGHTS
+from spnr_jax.scoring.perceptual import NO_LPIPS
+from spnr_jax.scoring.summary import interval
 
 METHODS = {  # method -> its name in tables and pictures, in their order
     "ours": "Ours",
@@ -35,7 +35,7 @@ QUALITY = {  # metric -> head of its column, decimals, what is better
     "iou": ("Opacity IoU", 3, HIGHER),
 }
 ARROWS = {HIGHER: "\N{UPWARDS ARROW}", LOWER: "\N{DOWNWARDS ARROW}"}
-MISSING = {"lpips": NO_WEIGHTS, "iou": "n/a (no opacity)"}  # metric -> what stands where there is no number
+MISSING = {"lpips": NO_LPIPS, "iou": "n/a (no opacity)"}  # metric -> what stands where there is no number
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,8 +92,8 @@ def mean_row(
     cells = []
     for column, digits in zip(np.array(objects, float).T, decimals, strict=True):
         known = column[~np.isnan(column)]
-        interval = intervals.interval([np.array([x]) for x in known]) if len(known) > 1 else None
-        cells.append(number(float(known.mean()) if len(known) else None, digits, interval, sign=sign))
+        mean = float(known.mean()) if len(known) else None
+        cells.append(number(mean, digits, interval([np.array([x]) for x in known]) if len(known) else None, sign=sign))
     return label, tuple(cells)
 
 

@@ -1,195 +1,200 @@
-"""Every file of a folder or pattern drawn in one go: `spnr render FOLDER`.
+"""Every file of a folder or pattern drawn in one go: `spnr render FOLDER`, here or by a Dask cluster's workers.
 
-    here          a thread reads and encodes the next cloud, this one draws, another one writes
-    by workers    on a Dask scheduler (devices/cluster.py), each object by one of them
+    OUT/a/x.ply/            what is drawn of a/x.ply below the folder, or of a pattern, below its first wildcard
+    OUT/a/x.ply/drawn.json  written last: the file's size and time, a digest of options and networks, what was written
+    OUT/index.html          the pictures of each file, and why others have none
 
-A file that cannot be drawn is listed with its reason and stops no other; errors of the disk that is written to end the
-run.  What is drawn stands, however the run ends (catalogue_files.py), and the same command goes on.
+A folder without drawn.json, or with one of another file or of other options, is drawn anew: the same command goes on.
+A file that cannot be drawn is listed with its reason; errors of the disk that is written to end the run.
 """
 
 import dataclasses
+import hashlib
+import json
 import socket
 import sys
-import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
-from functools import cache, partial
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cache
 from pathlib import Path
-from typing import TypeVar
+from typing import NamedTuple
+from urllib.parse import quote
 
 from tqdm import tqdm
 
 from spnr_jax.devices import allocator, compilation
 from spnr_jax.devices.side_by_side import beside
 from spnr_jax.errors import UserError, one_line
-from spnr_jax.tools import catalogue_files, catalogue_page
-from spnr_jax.tools.catalogue_files import Item, Record, folder_of
-from spnr_jax.tools.pictures import Ready, Written, check_writable, drawn, load_named, made_ready
-from spnr_jax.tools.render_command import Render
-from spnr_jax.training.weights import SHIPPED, load
+from spnr_jax.formats.clouds import MESHES
+from spnr_jax.formats.images import write_whole
+from spnr_jax.formats.pages import template
+from spnr_jax.formats.point_files import READERS
+from spnr_jax.tools.pictures import check_writable, drawn, load_named, made_ready
+from spnr_jax.tools.render_command import WILDCARDS, Render
+from spnr_jax.training.weights import SHIPPED, load, place
 
-AHEAD = 2  # clouds that are read before they are drawn
-Result = TypeVar("Result")
+KINDS = tuple(dict.fromkeys((*READERS, *MESHES)))
+RECORD = "drawn.json"
 loaded = cache(load)  # of a process that draws many clouds
 
 
-class UndrawnError(Exception):
-    """Why one file cannot be drawn."""
+class Item(NamedTuple):
+    """A file to draw: its name below the folder or pattern, with slashes, and where it lies."""
+
+    name: str
+    cloud: Path
 
 
-@dataclass(frozen=True, kw_only=True)
-class Bench:
+class Batch(NamedTuple):
     """What is needed for any file: the options, with absolute paths, and their digest."""
 
     options: Render
     digest: str
 
 
-@dataclass(frozen=True, kw_only=True)
-class Begun:
-    """A cloud that is read and encoded, and the record to be."""
-
-    ready: Ready
-    record: Record
-
-
 def render_catalogue(options: Render) -> Iterator[str]:
     """Draws what does not stand yet; yields what became of it.  ValueError if there is nothing that can be drawn."""
-    if options.seconds is not None:
-        raise UserError("--seconds: of a single file; give --quality and --resolution to a folder or pattern")
     check_writable(options.out)
     options = _with_absolute_paths(options)
-    items = catalogue_files.find(options.cloud, options.out)
+    items = find(options.cloud, options.out)
     load_named(options, loaded)  # a run that is none is said before anything is read
-    bench = Bench(options=options, digest=catalogue_files.digest(options))
-    missing = [item for item in items if not catalogue_files.standing(item, options.out, bench.digest)]
-    begin, faults, made = time.monotonic(), dict[str, str](), 0
+    batch = Batch(options=options, digest=digest(options))
+    missing = [item for item in items if not standing(batch, item)]
+    faults: dict[str, str] = {}
     try:
         with tqdm(total=len(items), initial=len(items) - len(missing), unit="file", dynamic_ncols=True) as bar:
-            for item, fault in _outcomes(bench, missing):
-                if fault is None:
-                    made += 1
-                else:
+            for item, fault in _outcomes(batch, missing):
+                if fault is not None:
                     faults[item.name] = fault
                     tqdm.write(f"left out {item.cloud}: {fault}", file=sys.stderr)
                 bar.update()
     except KeyboardInterrupt:
         raise KeyboardInterrupt("stopped: what is drawn stands, and the same command goes on") from None
     finally:  # also after Ctrl-C: what stands is shown
-        page = catalogue_page.write_pages(items, options.out, bench.digest, faults)
-    rate = made / max(time.monotonic() - begin, 1e-9)
-    standing = len(items) - len(missing)
-    if not made + standing:
+        page = write_page(batch, items, faults)
+    if len(faults) == len(items):
         raise UserError(f"{options.cloud}: none of the {len(items)} files can be drawn; {page} says why")
-    yield f"drew {made} of {len(items)} files ({60 * rate:.1f} a minute), {standing} stood, {len(faults)} left out"
+    made = len(missing) - len(faults)
+    yield f"drew {made} of {len(items)} files, {len(items) - len(missing)} stood, {len(faults)} left out"
     yield f"wrote {page}"
 
 
 def _with_absolute_paths(options: Render) -> Render:
     """The options as processes in other folders understand them."""
     run, light = options.run, options.lighting.light
-    if run and str(run) not in SHIPPED:
-        run = run.absolute()
-    if light and Path(light).suffix:  # a file, not a name of the package
-        light = str(Path(light).absolute())
+    run = run.absolute() if run and str(run) not in SHIPPED else run
+    light = str(Path(light).absolute()) if light and Path(light).suffix else light  # a file, not a name of the package
     lighting = dataclasses.replace(options.lighting, light=light)
     return dataclasses.replace(options, out=options.out.absolute(), run=run, lighting=lighting)
 
 
-def _outcomes(bench: Bench, items: Sequence[Item]) -> Iterator[tuple[Item, str | None]]:
+def find(pattern: Path, out: Path) -> list[Item]:
+    """The files of a folder or pattern, by their names, none hidden or below `out`; ValueError if there are none."""
+    first = next((i for i, part in enumerate(pattern.parts) if any(mark in part for mark in WILDCARDS)), None)
+    if pattern.is_dir() or first is None:
+        root, wanted = pattern, "**/*"
+    else:
+        root, wanted = Path(*pattern.parts[:first]), str(Path(*pattern.parts[first:]))
+        if ".." in pattern.parts[first:]:
+            raise UserError(f"{pattern}: .. behind a wildcard; leave it out")
+    found = set()
+    for path in root.glob(wanted):
+        name = path.relative_to(root)
+        left_out = any(part.startswith(".") for part in name.parts) or out.resolve() in path.resolve().parents
+        if path.suffix.lower() in KINDS and path.is_file() and not left_out:
+            found.add(Item(name=name.as_posix(), cloud=path.absolute()))
+    if not found:
+        raise UserError(f"{pattern}: there is no file of one of {' '.join(KINDS)}; name a folder or pattern with some")
+    return sorted(found)
+
+
+def digest(options: Render) -> str:
+    """What pictures depend on but for the file: the options, and the bytes of networks and of a map of light."""
+    asked = {k: v for k, v in dataclasses.asdict(options).items() if k not in ("cloud", "out", "workers", "cluster")}
+    found = hashlib.sha256(json.dumps(asked, default=str, sort_keys=True).encode())
+    light = options.lighting.light
+    networks = [place(options.run)] if options.run else [place(name) for name in SHIPPED]
+    for path in networks + ([Path(light)] if light else []):
+        if path.is_file():
+            found.update(path.read_bytes())
+        elif path.is_dir():  # a run: its checkpoints
+            inside = sorted((path / "checkpoints").glob("*"))
+            found.update(str([(child.name, child.stat().st_mtime_ns) for child in inside]).encode())
+    return found.hexdigest()
+
+
+def standing(batch: Batch, item: Item) -> dict | None:
+    """The record of a file, if it was drawn as it is now, with these options, and all that was written is there."""
+    folder, record = batch.options.out / item.name, _read_record(batch, item)
+    same = record.items() >= _state(batch, item).items()
+    return record if same and all((folder / name).is_file() for name in record["files"]) else None
+
+
+def _read_record(batch: Batch, item: Item) -> dict:
+    """What was drawn of a file, empty where there is no record that can be read: its state, `files`, `notes`."""
+    try:
+        record = json.loads((batch.options.out / item.name / RECORD).read_bytes())
+        return record if all(isinstance(name, str) for name in record["files"] + record["notes"]) else {}
+    except (OSError, ValueError, TypeError, LookupError):
+        return {}
+
+
+def _state(batch: Batch, item: Item) -> dict:
+    """What a record must say to be of the file as it is now, drawn with these options."""
+    status = item.cloud.stat() if item.cloud.exists() else None
+    return {"file": [status.st_size, status.st_mtime_ns] if status else [], "options": batch.digest}
+
+
+def _outcomes(batch: Batch, items: Sequence[Item]) -> Iterator[tuple[Item, str | None]]:
     """Each file and, if it could not be drawn, why: as they are finished."""
-    if not items:
-        return
-    if bench.options.cluster is None and bench.options.workers is None:
-        yield from draw_here(bench, items)
+    cluster, workers = batch.options.cluster, batch.options.workers
+    if not items or (cluster is None and workers is None):
+        yield from ((item, draw_item(batch, item)) for item in items)
         return
     try:
-        from spnr_jax.devices import cluster
+        from spnr_jax.devices.cluster import Died, connect, run_tasks
     except ModuleNotFoundError as error:
         raise UserError(f"--cluster and --workers need {error.name}; pip install 'spnr-jax[cluster]'") from None
-    with cluster.connect(bench.options.cluster, min(bench.options.workers or 1, len(items))) as client:
-        for item, fault in cluster.run_tasks(client, draw_item, bench, items):
-            if isinstance(fault, cluster.Died):
-                fault = f"the process that drew it died {fault.times} times; out of memory?"
-            yield item, fault
+    with connect(cluster, min(workers or 1, len(items))) as client:
+        for item, fault in run_tasks(client, draw_item, batch, items):
+            died = isinstance(fault, Died)
+            yield item, f"the process that drew it died {fault.times} times; out of memory?" if died else fault
 
 
-def draw_here(bench: Bench, items: Sequence[Item]) -> Iterator[tuple[Item, str | None]]:
-    """Each file and why it could not be drawn, in their order: reading, drawing and writing side by side."""
-    reading = beside((partial(_tried, partial(read, bench, item)) for item in items), AHEAD)
-    # the pictures of two objects are in memory at most
-    yield from zip(items, beside(map(partial(_begin_to_draw, bench), items, reading), 1), strict=True)
-
-
-def _begin_to_draw(bench: Bench, item: Item, begun: Begun | UndrawnError) -> Callable[[], str | None]:
-    """Draws a file that is read; what writes it, and says why it cannot be drawn."""
-    jobs = begun if isinstance(begun, UndrawnError) else _tried(lambda: list(_jobs(bench, item, begun.ready)))
-    if isinstance(jobs, UndrawnError) or isinstance(begun, UndrawnError):
-        return partial(str, jobs)
-    return partial(_written, bench, item, begun, jobs)
-
-
-def _written(bench: Bench, item: Item, begun: Begun, jobs: Iterable[Callable[[], Written]]) -> str | None:
-    """Writes what is drawn of a file, its record last; None, or why it cannot be drawn."""
-    done = _tried(lambda: [_perform(job) for job in jobs])
-    if isinstance(done, UndrawnError):
-        return str(done)
-    names = tuple(path.name for one in done for path in one.paths)
-    catalogue_files.finish(item, bench.options.out, dataclasses.replace(begun.record, files=names))
+def draw_item(batch: Batch, item: Item) -> str | None:
+    """Draws a file, in any process; None, or why it cannot be drawn.  What is wrong with the process is raised."""
+    if batch.options.cluster and not item.cloud.exists():
+        raise UserError(f"{item.cloud}: worker {socket.gethostname()} does not see this file; mount it there")
+    if standing(batch, item):  # another run was faster
+        return None
+    allocator.keep_arrays()
+    compilation.keep_programs()
+    folder, state, notes = batch.options.out / item.name, _state(batch, item), list[str]()
+    before = _read_record(batch, item).get("files", [])
+    for name in (RECORD, *(name for name in before if Path(name).name == name)):
+        (folder / name).unlink(missing_ok=True)
+    options = dataclasses.replace(batch.options, cloud=item.cloud)
+    ready = None
+    try:
+        ready = made_ready(options, notes.append, loaded)
+        written = [path.name for one in beside(drawn(ready, options, folder / item.cloud.stem)) for path in one.paths]
+    except ValueError as error:
+        return one_line(error)
+    except Exception as error:
+        if ready and isinstance(error, OSError):  # of the disk that is written to
+            raise
+        return f"unexpected {type(error).__name__}: {one_line(error)}"
+    write_whole(folder / RECORD, (json.dumps(state | {"files": written, "notes": notes}, indent=1) + "\n").encode())
     return None
 
 
-def _tried(work: Callable[[], Result]) -> Result | UndrawnError:
-    try:
-        return work()
-    except UndrawnError as fault:
-        return fault
-
-
-def draw_item(bench: Bench, item: Item) -> str | None:
-    """Draws a file in a worker; None, or the reason why it cannot be drawn.
-
-    What is wrong with the worker and not with the file is raised: errors of the disk, a file that it does not see.
-    """
-    if catalogue_files.standing(item, bench.options.out, bench.digest):  # another run was faster
-        return None
-    if not item.cloud.exists():
-        raise UserError(f"{item.cloud}: worker {socket.gethostname()} does not see this file; mount it there")
-    allocator.keep_arrays()
-    compilation.keep_programs()
-    return _begin_to_draw(bench, item, _tried(partial(read, bench, item)))()
-
-
-def read(bench: Bench, item: Item) -> Begun:
-    """A file read and encoded; what was drawn of it before is gone."""
-    record = catalogue_files.begin(item, bench.options.out, bench.digest)
-    notes: list[str] = []
-    with _blamed():
-        ready = made_ready(dataclasses.replace(bench.options, cloud=item.cloud), notes.append, loaded)
-    return Begun(ready=ready, record=dataclasses.replace(record, notes=tuple(notes)))
-
-
-def _jobs(bench: Bench, item: Item, ready: Ready) -> Iterator[Callable[[], Written]]:
-    options = dataclasses.replace(bench.options, cloud=item.cloud)
-    with _blamed():
-        yield from drawn(ready, options, folder_of(item, options.out) / item.cloud.stem)
-
-
-def _perform(job: Callable[[], Written]) -> Written:
-    """Writes; errors of the disk are the run's business, values that are no picture the file's."""
-    try:
-        return job()
-    except ValueError as error:
-        raise UndrawnError(one_line(error)) from error
-
-
-@contextmanager
-def _blamed() -> Iterator[None]:
-    """Whatever is wrong with one file must not stop the others; its reason says what it was."""
-    try:
-        yield
-    except ValueError as error:
-        raise UndrawnError(one_line(error)) from error
-    except Exception as error:
-        raise UndrawnError(f"unexpected {type(error).__name__}: {one_line(error)}") from error
+def write_page(batch: Batch, items: Sequence[Item], faults: Mapping[str, str]) -> Path:
+    """Writes the page of the files that stand, those that cannot be drawn and those that are yet to be."""
+    entries = []
+    for item in items:
+        record = standing(batch, item) or {"files": [], "notes": []}
+        fault = faults.get(item.name) or (None if record["files"] else "not drawn yet")
+        places = {name: quote(f"{item.name}/{name}") for name in record["files"]}
+        entries.append({"name": item.name, "fault": fault, "places": places, "notes": record["notes"]})
+    page, text = batch.options.out / "index.html", template(Path(__file__).with_suffix(".html"))
+    write_whole(page, text.render(entries=entries, faults=faults).encode())
+    return page

@@ -58,20 +58,6 @@ class Evaluate:
     """Objects to score."""
     gallery: int = 16
     """Objects shown in the report."""
-    lpips: Path | None = None
-    """LPIPS weights, an .npz that `spnr convert-lpips` wrote; without them LPIPS is n/a."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ConvertLpips:
-    """Convert LPIPS weights for `spnr evaluate --lpips`; needs PyTorch to read the two files."""
-
-    alexnet: tyro.conf.Positional[Path]
-    """AlexNet weights of torchvision: alexnet-owt-....pth."""
-    heads: tyro.conf.Positional[Path]
-    """Linear heads of LPIPS, version 0.1: alex.pth, in weights/v0.1 of the package `lpips`."""
-    out: tyro.conf.Positional[Path]
-    """The .npz to write."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -149,11 +135,3 @@ class View:
     """Which part of a scene is shown first; files that are dropped on the page are shown whole."""
     up: Literal["auto", "x", "y", "z", "-x", "-y", "-z"] = "auto"
     """The file's upward axis; auto looks for it, and says what it found."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Runs:
-    """List the runs below a folder: best validation PSNR, time, learning curve."""
-
-    folder: tyro.conf.Positional[Path] = Path()
-    """Folder that holds run folders, at any depth."""

@@ -1,4 +1,4 @@
-"""A file of points in, pictures out: stills around the object, a turntable, depth, opacity, a mesh, the density.
+"""A file of points in, pictures out: stills around the object, a turntable, depth, opacity, a mesh, splats.
 
     NAME_000.png ...            images, sRGB, on white or with straight alpha
     NAME_000_depth.png          near bright, far dark, the range of this picture
@@ -8,7 +8,6 @@
     NAME_turntable.gif          or .mp4
     NAME_mesh.glb               in the file's frame and units
     NAME_splats.ply             or .spz, .glb
-    NAME_density.npz            density (x, y, z) per unit, lowest, spacing: place = lowest + spacing * index
     NAME_cameras.json           cameras in the nerfstudio convention in the file's frame, up axis, normalisation
 
 Depth and opacity have the resolution of the volume rendering, which an upsampler doubles for the image.
@@ -41,8 +40,6 @@ from spnr_jax.training.weights import load, suited_to
 
 FIRST_AZIMUTH = 30.0  # degrees of the first still: a view that shows front and side
 INVISIBLE = 1 / 255  # opacity below which a pixel has no colour of its own
-SOLID = "small"  # network of the package that has a density
-DENSITY_RESOLUTION = 96  # places along each side of its grid
 
 
 class Written(NamedTuple):
@@ -71,13 +68,7 @@ def render_file(options: Render, note: Callable[[str], None]) -> Iterator[str]:
     loaded = cache(load)
     load_named(options, loaded)  # a run that is none is said before the cloud is read
     ready = made_ready(options, note, loaded)
-    num_points = len(ready.placed.cloud.positions)
-    yield f"encoded {num_points} points of {options.cloud}"
-    if options.seconds is not None:
-        from spnr_jax.tools.within_seconds import choose  # here: others do without
-
-        options, line = choose(options, ready.model, num_points)
-        yield line
+    yield f"encoded {len(ready.placed.cloud.positions)} points of {options.cloud}"
     for written in beside(drawn(ready, options, options.out / options.cloud.stem)):
         if written.line:
             yield written.line
@@ -126,8 +117,6 @@ def drawn(ready: Ready, options: Render, name: Path) -> Iterator[Callable[[], Wr
     if film:
         pictures = [np.asarray(rendering.image) for rendering in views]
         yield partial(_write_film, Path(f"{name}_turntable.{options.turntable}"), pictures, options)
-    if options.density:
-        yield from _density(ready, options, Path(f"{name}_density.npz"))
     if options.mesh:
         yield _mesh(ready, options, Path(f"{name}_mesh.glb"))
     if options.splats != "none":
@@ -236,19 +225,6 @@ def _pose_in_file(camera: Camera, placed: PlacedCloud) -> np.ndarray:
     pose[:3] = placed.rotation.T @ np.asarray(camera.cam_to_world, np.float64)
     pose[:3, 3] += placed.origin
     return pose
-
-
-def _density(ready: Ready, options: Render, path: Path) -> Iterator[Callable[[], Written]]:
-    from spnr_jax.tools import density_grid  # here: pictures alone do without
-
-    model, volume = ready.model, ready.volume
-    if not isinstance(model.config, RayNetworkConfig):
-        yield partial(Written, f"the network that renders has no density: that of the package's {SOLID} is taken")
-        model = load(SOLID)
-        volume = model.encode(ready.placed.cloud)
-    grid = density_grid.sample_density(model, volume, ready.placed, options.grid_resolution or DENSITY_RESOLUTION)
-    arrays = {"density": grid.values, "lowest": grid.lowest + grid.origin, "spacing": grid.spacing}
-    yield partial(_write_solid, path, _saved(lambda file, _: np.savez_compressed(file, **arrays), None))
 
 
 def _mesh(ready: Ready, options: Render, path: Path) -> Callable[[], Written]:

@@ -22,7 +22,7 @@ def is_catalogue(cloud: Path) -> bool:
 
 @dataclass(frozen=True, kw_only=True)
 class Render:
-    """Render a point cloud or mesh file: views as .png, a turntable, depth, opacity, a mesh, the density grid, splats.
+    """Render a point cloud or mesh file: views as .png, a turntable, depth, opacity, a mesh, splats.
     Of a folder, or a pattern in quotation marks, every file is drawn, and a page shows them all."""
 
     cloud: tyro.conf.Positional[Path]
@@ -60,9 +60,6 @@ class Render:
     quality: Literal["draft", "balanced", "best", "trained"] = "best"
     """balanced: three quarters of the size, enlarged; draft: discs and light alone, without the CNN.  Of networks of
     rays: a quarter, half or all of the samples that a ray was trained with, near the points; or just as trained."""
-    seconds: float | int | None = None
-    """Draw all pictures of the file in so many seconds (after reading, encoding and compiling): the best quality and
-    size that keep to it, measured on this machine once.  A --resolution that is given is kept."""
     outputs: tuple[Output, ...] = ("image", "depth", "opacity")
     """What is written of each view; depth comes coloured, as .npy and as 16-bit .png."""
     transparent: bool = False
@@ -78,12 +75,9 @@ class Render:
     fps: int = 16
     """Frames a second of the turntable."""
     mesh: bool = False
-    """Also write the surface as .glb, with the materials of the nearest points; by the network `small` if the one that
-    renders has no density."""
-    density: bool = False
-    """Also write the density on a grid as .npz."""
+    """Also write the surface as .glb, with the materials of the nearest points."""
     grid_resolution: int | None = None
-    """Places along each side of the grid of --mesh (default: 192) and --density (default: 96)."""
+    """Places along each side of the grid of --mesh (default: 192)."""
     splats: Literal["none", "ply", "spz", "glb"] = "none"
     """Also write Gaussian splats."""
     making: SplatMaking = field(default_factory=SplatMaking)
@@ -110,10 +104,6 @@ class Render:
             raise UserError(f"--workers must be at least 1, and without --cluster, got {self.workers}")
         if self.resolution is not None and (self.resolution < 16 or self.resolution % 4):
             raise UserError(f"--resolution must be a multiple of 4 of at least 16, got {self.resolution}")
-        if self.seconds is not None and not (self.seconds > 0 and self.quality == "best"):
-            raise UserError(
-                f"--seconds must be positive, and without --quality, which it chooses; got {self.seconds:g}"
-            )
         if not -90 <= self.elevation <= 90:
             raise UserError(f"--elevation must be -90 to 90 degrees, got {self.elevation:g}")
         if self.transparent and self.lighting.background != "white":

@@ -13,6 +13,7 @@ import importlib.metadata
 import json
 import subprocess
 import time
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -78,6 +79,19 @@ def read_starts(run: Path) -> list[dict]:
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return []
     return [entry for entry in starts if isinstance(entry, dict)] if isinstance(starts, list) else []
+
+
+def seen_in_training(run: Path, dataset: data_sets.Dataset, names: Sequence[str]) -> bool | None:
+    """Whether a run trained on some of the objects of a data set, by its record; None where that does not say.
+
+    It does not if the run trained on another data set, which may hold the same objects, or began with weights of
+    another training.
+    """
+    starts, wanted = read_starts(run), checksum(dataset)
+    here = [entry.get("data_checksum") == wanted for entry in starts]
+    if any(here) and not set(names).isdisjoint(dataset.splits["train"]):
+        return True
+    return False if here and all(here) and not any("init" in entry for entry in starts) else None
 
 
 def checksum(dataset: data_sets.Dataset) -> str:

@@ -110,21 +110,11 @@ def test_few_points_of_any_size_have_clusters_and_perhaps_a_plane(count, size):
     assert sorted(set(labels.tolist())) == list(range(labels.max() + 1))
     plane = scenes.dominant_plane(positions)
     assert plane is None or np.isfinite(plane.normal).all()
-    assert scenes.scene_line(positions) is None
 
 
 def test_a_point_at_the_end_of_the_world_is_a_cluster_of_its_own():
     labels = scenes.clusters(np.concatenate([[[1e35, 0, 0]], spiral(5000)]))
     assert same(labels, np.arange(5001) == 0)
-
-
-def test_a_scene_is_said_to_be_one_and_an_object_is_not(monkeypatch):
-    monkeypatch.setattr(scenes, "WIDE", 60.0)
-    positions, part = table_scene()
-    assert "a plane with" in scenes.scene_line(positions)
-    assert "3 large clusters" in scenes.scene_line(positions[part < 3])
-    for thing in (spiral(20000), positions[part == 3], positions[part == 0]):
-        assert scenes.scene_line(thing) is None
 
 
 def test_a_batch_of_clouds_is_refused():

@@ -12,12 +12,10 @@ from support.tiny_model import PLUS, camera, cloud, wobbled
 
 from spnr_jax import presets
 from spnr_jax.config import AS_TRAINED, LossConfig, OptimizerConfig, RenderOptions, SamplingConfig, surface_grid
-from spnr_jax.formats.clouds import PlacedCloud
 from spnr_jax.kernels import occupancy
 from spnr_jax.method import inference
 from spnr_jax.method.march import trace
 from spnr_jax.method.model import Model
-from spnr_jax.tools.density_grid import sample_density
 from spnr_jax.training import pixels
 
 GENERIC = camera(target=0.0171)  # no cell has its middle on a face between cells, where rounding would decide
@@ -122,17 +120,13 @@ class TestRendering:
 
 
 class TestHandle:
-    def test_every_quality_is_a_picture_and_density_is_where_the_points_are(self, config, variables):
+    def test_every_quality_is_a_picture(self, config, variables):
         model = Model(config=config, variables=variables)
         single = jax.tree.map(lambda x: np.asarray(x[0]), cloud())
         volume = model.encode(single)
         pictures = [model.render(volume, model.camera(volume), quality) for quality in ("draft", "best", "trained")]
         assert all((np.asarray(p.acc) > 0.1).any() for p in pictures)
         same_bits(pictures[1], pictures[2])  # such a network is trained at its best
-        placed = PlacedCloud(cloud=single, up="y", rotation=np.eye(3), origin=np.zeros(3))
-        grid = sample_density(model, volume, placed, 12)
-        assert grid.values.max() > 1
-        assert grid.values[0, 0, 0] == 0
 
 
 @pytest.mark.ci

@@ -1,6 +1,7 @@
 """Scores are those of the metrics called by hand on the files' pictures; nothing is left out unsaid."""
 
 import dataclasses
+import json
 import shutil
 
 import jax
@@ -9,20 +10,18 @@ import numpy as np
 import pytest
 from support import tiny_dataset, tiny_untrained
 from support.laws import close
-from support.tiny_lpips import WEIGHTS
 from support.tiny_untrained import CONFIG
 
 from spnr_jax.formats import data_sets
 from spnr_jax.kernels import metrics
 from spnr_jax.presets import PRESETS
 from spnr_jax.scoring import evaluation, floors
-from spnr_jax.scoring.flip import flip
-from spnr_jax.scoring.lpips import lpips
-from spnr_jax.scoring.summary import METRICS, NO_WEIGHTS
-from spnr_jax.training import checkpoint, optimisation, weights
+from spnr_jax.scoring.perceptual import flip
+from spnr_jax.scoring.summary import METRICS
+from spnr_jax.training import checkpoint, optimisation, run_record, weights
 
 NAMES = tiny_dataset.SPLITS["test"]
-ssim, jitted_flip = jax.jit(metrics.ssim), jax.jit(flip)
+ssim = jax.jit(metrics.ssim)
 FACTORS = {"splat": 1.5, "nearest": 0.75}
 KINDS = {"surfels": "surfels", "plus_small": "near_points", "tiny": "paper", "npbg_tiny": "npbg"}
 
@@ -55,7 +54,7 @@ def test_scores_are_those_of_the_metrics_called_by_hand(results):
             close(scores["psnr"], -10 * np.log10(np.mean((image - reference) ** 2, axis=(1, 2, 3))), rtol=1e-4)
             close(scores["ssim"], ssim(image, reference), atol=1e-4)
             close(scores["cpsnr"], metrics.conditional_psnr(image, reference, mask), rtol=1e-4)
-            close(scores["flip"], jitted_flip(image, reference), atol=1e-5)
+            close(scores["flip"], flip(image, reference), atol=1e-5)
         assert np.all(result.pictures["white"].image == 1)
 
 
@@ -153,7 +152,13 @@ def test_objects_of_one_view_are_evaluated_although_training_draws_two(tmp_path)
     assert len(result.scores["paper"]["psnr"]) == tiny_dataset.VIEWS
 
 
-@pytest.mark.parametrize(("split", "expected"), [("test", "the test split is empty"), ("train", "no training objects")])
+@pytest.mark.parametrize(
+    ("split", "expected"),
+    [
+        ("test", "test split is empty; score --split train or --split val, or generate .* --test-objects N"),
+        ("train", "no training objects"),
+    ],
+)
 def test_an_empty_split_is_an_error_that_names_it(split, expected, tmp_path):
     copy = shutil.copytree(tiny_dataset.dataset().folder, tmp_path / "data")
     (copy / "splits" / f"{split}.txt").write_text("")
@@ -167,7 +172,7 @@ def test_any_number_of_methods_see_the_same_objects_and_are_scored_alike():
         return evaluation.Pictures(image=jnp.full((*size, 3), 0.5), acc=jnp.ones(size))
 
     asked = {"grey": half, "also grey": half, "white": evaluation.floor("white")}
-    scores, gallery = evaluation.score_methods(asked, CONFIG, tiny_dataset.dataset(), NAMES, 1, print, None)
+    scores, gallery = evaluation.score_methods(asked, CONFIG, tiny_dataset.dataset(), NAMES, 1, print)
     assert list(scores) == list(NAMES)
     for by_method in scores.values():
         assert list(by_method) == list(asked)
@@ -175,29 +180,47 @@ def test_any_number_of_methods_see_the_same_objects_and_are_scored_alike():
     assert [result.name for result in gallery] == [NAMES[0]]
 
 
-def test_lpips_is_measured_with_weights_and_said_to_be_missing_without(outcome, tmp_path):
-    size = 32  # the smallest multiple of 8 that AlexNet takes
-    folder = tiny_dataset.write_dataset(tmp_path / "data", {"train": (), "val": (), "test": ("a", "b")}, size=size)
-    model = dataclasses.replace(CONFIG.model, image_resolution=size, resize_resolution=size // 2)
-    config = dataclasses.replace(CONFIG, model=model)
+def test_an_lpips_that_can_be_measured_is_in_the_scores_of_each_method(monkeypatch):
+    monkeypatch.setattr(evaluation, "lpips", lambda image, reference: np.abs(image - reference).mean(axis=(1, 2, 3)))
     asked = {"white": evaluation.floor("white")}
-    dataset = data_sets.open_dataset(folder)
-    (first, second) = evaluation.evaluate_objects(asked, config, dataset, ("a", "b"), WEIGHTS)
-    for result in (first, second):
-        image, reference = result.pictures["white"].image, jnp.asarray(result.reference)
-        close(result.scores["white"]["lpips"], lpips(jnp.asarray(image), reference, WEIGHTS), rtol=1e-4)
-    assert outcome.summary["methods"]["paper"]["lpips"] is None
-    assert outcome.summary["settings"]["metrics"]["LPIPS"] == NO_WEIGHTS
+    (result,) = evaluation.evaluate_objects(asked, CONFIG, tiny_dataset.dataset(), NAMES[:1])
+    close(result.scores["white"]["lpips"], (1 - result.reference).mean(axis=(1, 2, 3)), rtol=1e-4)
 
 
-def test_weights_change_what_the_settings_say(monkeypatch):
-    monkeypatch.setattr(evaluation, "score_methods", lambda *a: (dict.fromkeys(NAMES, RESULT), []))
-    found = evaluation.evaluate(tiny_untrained.run(), tiny_dataset.dataset(), say=lambda line: None, weights=WEIGHTS)
-    assert "AlexNet v0.1" in found.summary["settings"]["metrics"]["LPIPS"]
-    assert found.summary["methods"]["paper"]["lpips"] == 0.25
+class TestExposure:
+    """Whether a report may say that its objects are unseen: by the records of the run folders alone."""
 
+    def record(self, folder, *entries):
+        folder.mkdir()
+        here = {"data_checksum": run_record.checksum(tiny_dataset.dataset())}
+        (folder / "run.json").write_text(json.dumps({"starts": [here | entry for entry in entries]}))
+        return folder
 
-RESULT = {method: {metric: np.full(2, 0.25) for metric in METRICS} for method in ("paper", *evaluation.FLOORS)}
+    def test_the_record_of_a_run_tells_its_training_objects_from_others(self, tmp_path):
+        dataset, run = tiny_dataset.dataset(), self.record(tmp_path / "run", {}, {})
+        names = [dataset.splits[split] for split in ("test", "val", "train")]
+        found = [evaluation.exposure((run,), dataset, some) for some in names]
+        assert found == ["unseen in training", "unseen in training", "seen in training"]
+        mixed = (*NAMES, dataset.splits["train"][0])
+        assert evaluation.exposure((run,), dataset, mixed) == "seen in training"
+
+    @pytest.mark.parametrize("entries", [(), ({"data_checksum": "another"},), ({}, {"data_checksum": "another"})])
+    def test_nothing_is_known_of_a_run_without_a_record_or_with_that_of_other_data(self, entries, tmp_path):
+        run = self.record(tmp_path / "run", *entries)
+        found = evaluation.exposure((run,), tiny_dataset.dataset(), NAMES)
+        assert found == "not known whether seen in training"
+
+    def test_nothing_is_known_of_a_run_that_began_with_other_weights_but_of_its_own_training_objects(self, tmp_path):
+        dataset, run = tiny_dataset.dataset(), self.record(tmp_path / "run", {"init": "small, 9 steps"})
+        assert evaluation.exposure((run,), dataset, NAMES) == "not known whether seen in training"
+        assert evaluation.exposure((run,), dataset, dataset.splits["train"]) == "seen in training"
+
+    def test_of_several_runs_the_least_favourable_counts(self, tmp_path):
+        dataset, run = tiny_dataset.dataset(), self.record(tmp_path / "run", {})
+        assert evaluation.exposure((run, run), dataset, NAMES) == "unseen in training"
+        assert evaluation.exposure((run, tmp_path), dataset, NAMES) == "not known whether seen in training"
+        assert evaluation.exposure((tmp_path, run), dataset, dataset.splits["train"]) == "seen in training"
+        assert evaluation.exposure((), dataset, NAMES) == "not known whether seen in training"
 
 
 def test_objects_are_spread_from_the_first_to_the_last():

@@ -1,13 +1,20 @@
+"""The report is one page that shows what was scored and says which objects; metrics.json has a form to rely on."""
+
 import base64
 import dataclasses
 import io
+import json
 from html.parser import HTMLParser
 
 import numpy as np
 import pytest
 from PIL import Image
+from support import tiny_dataset, tiny_untrained
 
+from spnr_jax.scoring import report
 from spnr_jax.scoring.report import GalleryRow, duration, psnr, write_report
+from spnr_jax.scoring.score_tables import METHODS
+from spnr_jax.scoring.summary import METRICS
 
 VOID = {"meta", "img", "br"}
 SETTINGS = {"model": {"widths": (64, 128), "sampling": {"num_coarse": 16}}, "light": "<studio & sky>", "augment": {}}
@@ -70,27 +77,22 @@ def differences() -> dict:
     return {"splat": {"psnr": found, "lpips": None}, "white": {"psnr": found | {"interval": None, "p_value": None}}}
 
 
-def content(**changes) -> dict:
-    metrics = {
-        "methods": table(),
-        "seconds": {"train": 372.0, "total": 8000.0},
-        "preset": "tiny",
-        "steps": 99,
-        "seed": 7,
-    }
-    whole = {
-        "title": "A <run>",
-        "summary": "First & <foremost>.\n\nSecond.",
-        "settings": SETTINGS,
-        "metrics": metrics | {"hardware": "2 cores"},
-        "gallery": [row(0), row(1)],
-        "curve": [{"step": 1, "psnr": 12.0}, {"step": 2, "psnr": 14.0}, {"step": 2, "val_psnr": 13.0}],
-    }
-    return whole | changes
+METRICS_JSON = {
+    "methods": table(),
+    "ours_minus": differences(),
+    "seconds": {"train": 372.0, "total": 8000.0},
+    "per_category": {},
+    "preset": "tiny",
+    "steps": 99,
+    "seed": 7,
+    "hardware": "2 cores",
+    "settings": {"split": "val", "objects": "seen in training", "networks": {"ours": {}}, "points": 24},
+}
 
 
-def write(tmp_path, **changes) -> Page:
-    write_report(tmp_path / "report.html", **content(**changes))
+def write(tmp_path, gallery=None, **changes) -> Page:
+    rows = [row(0), row(1)] if gallery is None else gallery
+    write_report(tmp_path / "report.html", SETTINGS, METRICS_JSON | changes, rows)
     return Page((tmp_path / "report.html").read_text(encoding="utf-8"))
 
 
@@ -132,23 +134,22 @@ def test_the_best_value_of_each_metric_alone_is_bold_and_what_is_missing_is_not_
     assert not any("Opacity IoU" in text or "LPIPS" in text for text in page.all("th"))
 
 
-def test_an_lpips_that_was_not_measured_is_said_to_lack_weights(tmp_path):
+def test_an_lpips_that_was_not_measured_says_what_it_needs(tmp_path):
     methods = {name: row | {"lpips": None} for name, row in table().items()}
-    page = write(tmp_path, metrics={"methods": methods})
-    assert page.all("td").count("n/a (no weights)") == 3
-    page = write(tmp_path, metrics={"methods": methods | {"ours": table()["ours"] | {"lpips": 0.125}}})
+    page = write(tmp_path, methods=methods)
+    assert page.all("td").count("n/a (pip install lpips)") == 3 + 2  # both differences lack it, too
+    page = write(tmp_path, methods=methods | {"ours": table()["ours"] | {"lpips": 0.125}})
     assert "0.125" in page.all("b")
-    assert page.all("td").count("n/a (no weights)") == 2
 
 
 def test_differences_have_a_sign_an_interval_and_a_test(tmp_path):
-    page = write(tmp_path, metrics={"methods": table(), "ours_minus": differences()})
+    page = write(tmp_path)
     assert "Differences" in page.all("h2")
     assert {"Ours minus base-colour splat", "Ours minus white image"} <= set(page.all("th"))
     assert page.all("td").count("+3.12") == 2
     assert {"[-0.50, +6.75]", "p = 0.012"} <= set(page.all("small"))
-    tiny = {"splat": {"psnr": {"mean": 3.0, "interval": [2.0, 4.0], "p_value": 0.0001}}}
-    page = write(tmp_path, metrics={"methods": table(), "ours_minus": tiny})
+    sure = {"psnr": {"mean": 3.0, "interval": [2.0, 4.0], "p_value": 0.0001}}
+    page = write(tmp_path, ours_minus={"splat": sure, "white": sure})
     assert "p < 0.001" in page.all("small")
 
 
@@ -169,11 +170,19 @@ def test_every_setting_and_fact_of_the_run_is_named(tmp_path):
     }
 
 
+def test_the_page_says_everywhere_which_objects_it_scores_and_whether_they_were_seen(tmp_path):
+    for split, objects in (("train", "seen in training"), ("test", "not known whether seen in training")):
+        page = write(tmp_path, settings=METRICS_JSON["settings"] | {"split": split, "objects": objects})
+        words = f"objects of the {split} split, {objects}"
+        assert page.all("h1") == page.all("title") == [f"Sparse-point neural rendering: {words}"]
+        assert f"PSNR on {words}" in page.all("div")
+        assert page.all("h2")[0] == "O" + words[1:]
+        assert f"on 30 views of 3 {words}: " in page.all("p")[0]
+        assert "unseen" not in " ".join(text for _, text in page.texts).lower()
+
+
 def test_texts_are_shown_as_they_are_written(tmp_path):
-    page = write(tmp_path)
-    assert page.all("h1") == page.all("title") == ["A <run>"]
-    assert page.all("p")[:2] == ["First & <foremost>.", "Second."]
-    assert "object<1>" in page.all("th")
+    assert "object<1>" in write(tmp_path).all("th")
 
 
 def test_categories_have_their_own_table_with_the_best_method_bold(tmp_path):
@@ -182,12 +191,6 @@ def test_categories_have_their_own_table_with_the_best_method_bold(tmp_path):
     assert "<car>" in page.all("th")
     assert [text for text in page.all("b") if text in ("21.12", "17.00", "8.88")] == ["21.12", "21.12", "17.00"]
     assert "5" in page.all("td")
-
-
-def test_a_run_without_curve_pictures_or_categories_is_still_a_page(tmp_path):
-    page = write(tmp_path, curve=[], gallery=[])
-    assert "svg" not in page.tags
-    assert page.all("h2") == ["Unseen objects", "Quality", "Run", "Settings"]
 
 
 def test_a_picture_that_is_not_finite_leaves_the_old_report(tmp_path):
@@ -219,3 +222,75 @@ def test_durations_are_said_in_the_units_that_people_use():
         "1 h 0 min",
         "2 h 5 min",
     ]
+
+
+NUMBERS = {"objects", "views", "cpsnr_views", *METRICS, *(f"{metric}_interval" for metric in METRICS)}
+
+
+class TestEvaluation:
+    @pytest.fixture(scope="class")
+    def outcome(self):
+        return tiny_untrained.evaluated()
+
+    def written(self, out, outcome):
+        report.write_results(out, outcome, {"seed": 0}, {"evaluate": 1.5, "total": 2.0})
+
+        def refuse(name):
+            raise AssertionError(f"{name} is no JSON")
+
+        return json.loads((out / "metrics.json").read_text(), parse_constant=refuse)
+
+    def test_metrics_json_has_exactly_these_keys(self, outcome, tmp_path):
+        metrics = self.written(tmp_path, outcome)
+        assert set(metrics) == {
+            "methods", "paper_minus", "seconds", "preset", "steps", "seed", "hardware", "settings", "per_category",
+        }  # fmt: skip
+        assert set(metrics["methods"]) == {"paper", "white", "splat", "nearest"}
+        assert all(set(values) == NUMBERS for values in metrics["methods"].values())
+        assert (metrics["preset"], metrics["steps"], metrics["seed"]) == ("tiny", 0, 0)
+        assert metrics["seconds"] == {"evaluate": 1.5, "total": 2.0}
+        assert (metrics["settings"]["split"], metrics["settings"]["objects"]) == (
+            "test",
+            "not known whether seen in training",
+        )
+
+    def test_a_cpsnr_that_does_not_exist_is_null_and_the_report_is_written(self, outcome, tmp_path):
+        rows = {name: row | {"cpsnr": None, "cpsnr_views": 0} for name, row in outcome.summary["methods"].items()}
+        metrics = self.written(tmp_path, dataclasses.replace(outcome, summary=outcome.summary | {"methods": rows}))
+        assert metrics["methods"]["paper"]["cpsnr"] is None
+        assert ">nan" not in (tmp_path / "report.html").read_text().lower()
+
+    def test_a_number_that_is_not_finite_is_refused_instead_of_written(self, outcome, tmp_path):
+        broken = dataclasses.replace(outcome, summary=outcome.summary | {"steps": float("nan")})
+        with pytest.raises(ValueError, match="not JSON compliant"):
+            self.written(tmp_path, broken)
+        assert not (tmp_path / "metrics.json").exists()
+
+    def test_the_report_names_the_objects_and_the_best_floor(self, outcome, tmp_path):
+        metrics = self.written(tmp_path, outcome)
+        page = (tmp_path / "report.html").read_text()
+        assert all(name in page for name in tiny_dataset.SPLITS["test"])
+        best = max(("white", "splat", "nearest"), key=lambda name: metrics["methods"][name]["psnr"])
+        found = metrics["paper_minus"][best]["psnr"]
+        low, high = found["interval"]
+        expected = f"{found['mean']:+.2f} dB [{low:+.2f}, {high:+.2f}] against the best trivial renderer ({best})"
+        assert expected in page
+
+    def test_the_table_for_a_terminal_has_a_line_for_each_method_and_says_what_is_missing(self, outcome):
+        methods = outcome.summary["methods"]
+        lines = report.text_table(methods)
+        assert [line.partition("  ")[0] for line in lines] == [METHODS[name] for name in methods]
+        for line, values in zip(lines, methods.values(), strict=True):
+            assert f"PSNR {values['psnr']:.2f} " in line
+            assert f"FLIP {values['flip']:.3f} " in line
+            assert "LPIPS n/a (pip install lpips)" in line
+
+    def test_a_gallery_row_is_the_view_of_the_median_psnr(self, outcome):
+        result = outcome.gallery[0]
+        scores = result.scores | {"paper": result.scores["paper"] | {"psnr": np.array([30.0, 10.0, 20.0])}}
+        shown = report.gallery_row(dataclasses.replace(result, scores=scores))
+        np.testing.assert_array_equal(shown.reference, result.reference[2])
+        assert set(shown.images) == {"paper", "splat", "nearest"}
+        for method, image in shown.images.items():
+            np.testing.assert_array_equal(image, result.pictures[method].image[2])
+        np.testing.assert_array_equal(shown.depth, result.pictures["paper"].depth[2])

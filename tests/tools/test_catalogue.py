@@ -12,7 +12,7 @@ import pytest
 from support import tiny_untrained
 from support.schedulers import in_this_process
 
-from spnr_jax.tools import catalogue, catalogue_files, catalogue_page, pictures
+from spnr_jax.tools import catalogue, pictures
 from spnr_jax.tools.render_command import Render, is_catalogue
 
 OPTIONS = {"views": 1, "resolution": 24, "num_points": 30, "up": "y", "turntable": "none", "outputs": ("image",)}
@@ -101,11 +101,11 @@ def test_pictures_of_a_run_that_was_cut_while_it_drew_anew_are_not_taken_for_the
     clouds, tmp_path, monkeypatch
 ):
     out, cloud = tmp_path / "out", clouds / "a" / "x.xyz"
-    for elevation in (20.0, 40.0):
-        with monkeypatch.context() as patch:
-            if elevation == 40.0:
-                patch.setattr(catalogue_files, "finish", lambda *_: None)  # as if killed just before
-            render(clouds / "a", out, elevation=elevation)
+    write = catalogue.write_whole
+    render(clouds / "a", out, elevation=20.0)
+    with monkeypatch.context() as patch:  # as if killed just before the record is written
+        patch.setattr(catalogue, "write_whole", lambda path, x: None if path.name == "drawn.json" else write(path, x))
+        render(clouds / "a", out, elevation=40.0)
     assert cloud.exists()
     assert render(clouds / "a", out, elevation=20.0)[0].startswith("drew 1 of 1 files")
 
@@ -212,31 +212,27 @@ def test_workers_draw_the_same_and_list_the_same(clouds, tmp_path):
 
 
 def test_a_worker_that_does_not_see_a_file_ends_the_run_with_its_name(tmp_path):
-    options = command(tmp_path, tmp_path / "out")
-    item = catalogue_files.Item(name="x.xyz", cloud=tmp_path / "x.xyz")
+    options = command(tmp_path, tmp_path / "out", cluster="tcp://a:1")
+    item = catalogue.Item(name="x.xyz", cloud=tmp_path / "x.xyz")
     with pytest.raises(ValueError, match=r"x\.xyz: worker .* does not see this file"):
-        catalogue.draw_item(catalogue.Bench(options=options, digest=""), item)
+        catalogue.draw_item(catalogue.Batch(options=options, digest=""), item)
+
+
+def test_a_file_that_is_gone_when_its_turn_comes_is_left_out(tmp_path):
+    batch = catalogue.Batch(options=command(tmp_path, tmp_path / "out"), digest="")
+    item = catalogue.Item(name="x.xyz", cloud=tmp_path / "x.xyz")
+    assert "there is no such file" in catalogue.draw_item(batch, item)
 
 
 def test_the_digest_follows_options_and_networks_and_not_where_they_work(tmp_path):
     network = tmp_path / "network.npz"
     network.write_bytes(b"one")
     options = command(tmp_path, tmp_path / "out", run=network)
-    first = catalogue_files.digest(options)
-    assert catalogue_files.digest(dataclasses.replace(options, cluster="tcp://a:1", out=tmp_path)) == first
-    assert catalogue_files.digest(dataclasses.replace(options, views=3)) != first
+    first = catalogue.digest(options)
+    assert catalogue.digest(dataclasses.replace(options, cluster="tcp://a:1", out=tmp_path)) == first
+    assert catalogue.digest(dataclasses.replace(options, views=3)) != first
     network.write_bytes(b"two")
-    assert catalogue_files.digest(options) != first
-
-
-def test_many_files_take_several_pages_and_pages_that_are_too_many_go(tmp_path, monkeypatch):
-    monkeypatch.setattr(catalogue_page, "PER_PAGE", 2)
-    items = [catalogue_files.Item(name=f"{i}.xyz", cloud=tmp_path / f"{i}.xyz") for i in range(5)]
-    catalogue_page.write_pages(items, tmp_path, "", {})
-    assert {path.name for path in tmp_path.glob("*.html")} == {"index.html", "index_2.html", "index_3.html"}
-    catalogue_page.write_pages(items[:3], tmp_path, "", {})
-    assert {path.name for path in tmp_path.glob("*.html")} == {"index.html", "index_2.html"}
-    assert 'href="index_2.html"' in (tmp_path / "index.html").read_text()
+    assert catalogue.digest(options) != first
 
 
 @pytest.mark.parametrize(
