@@ -138,3 +138,9 @@ def finish(
     print(f"{config.out}: {made} objects ({counts}), {len(rows)} left out{paper}", file=sys.stderr)
     if not made:
         raise UserError(f"{config.out}: every object was left out; {config.out}/rejected.jsonl says why")
+    if not split_ids["test"]:
+        print(
+            f"{config.out}: the test split is empty, so `spnr evaluate` needs --split; "
+            "for one, generate into another folder with --test-objects N",
+            file=sys.stderr,
+        )

@@ -14,7 +14,6 @@ from spnr_jax.config import TrainConfig
 from spnr_jax.formats import data_sets
 from spnr_jax.kernels.metrics import psnr
 from spnr_jax.scoring import evaluation
-from spnr_jax.scoring.lpips import LpipsWeights
 from spnr_jax.scoring.report import duration
 from spnr_jax.scoring.summary import Scores, summarise
 
@@ -54,7 +53,6 @@ def score_objects(
     dataset: data_sets.Dataset,
     names: tuple[str, ...],
     num_shown: int,
-    weights: LpipsWeights | None,
     more: Callable[[data_sets.ObjectData, evaluation.Pictures], Scores] | None = None,
 ) -> Scored:
     """All methods on these objects, with a line now and then; points and image size are the config's.
@@ -66,7 +64,7 @@ def score_objects(
     for number, name in enumerate(names, start=1):
         item = data_sets.read_object(dataset, name)
         shows = {method: timed(show, item, seconds[method]) for method, show in methods.items()}
-        result = evaluation.evaluate_object(shows, config, item, weights)
+        result = evaluation.evaluate_object(shows, config, item)
         if "npbg" in result.scores:
             del result.scores["npbg"]["iou"]  # it predicts colours alone
         if more:

@@ -13,12 +13,10 @@ from spnr_jax.kernels import cameras
 from spnr_jax.kernels.records import Camera, Light, PointCloud, Volume
 from spnr_jax.kernels.resizing import mean_of_squares
 from spnr_jax.method.model import Model, Quality
-from spnr_jax.scoring.flip import flip
+from spnr_jax.scoring.perceptual import flip
 from spnr_jax.scoring.picture_scores import sharpness
 
 Picture = tuple[np.ndarray, np.ndarray]  # image (height, width, 3) on white and opacity (height, width)
-
-_flip = jax.jit(flip)
 
 
 def cut(item: data_sets.ObjectData, count: int, views: int, normals: bool) -> data_sets.ObjectData:
@@ -78,4 +76,4 @@ def drawn(
 def view_scores(image: np.ndarray, opacity: np.ndarray, reference: np.ndarray) -> list[float]:
     """PSNR, PSNR inside and FLIP of a picture on white beside its reference (RGBA)."""
     found, white = sharpness(image, opacity, reference), on_white(reference)[0]
-    return [found.psnr, found.psnr_inside, float(_flip(jnp.asarray(image), jnp.asarray(white)))]
+    return [found.psnr, found.psnr_inside, float(flip(image, white))]

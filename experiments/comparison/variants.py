@@ -179,7 +179,7 @@ def score(
     shows = {
         key: of_cloud(evaluation.network(found.variables, found.config), config) for key, found in networks.items()
     }
-    scored = score_objects(shows, config, dataset, names, num_shown, None, more_scores)
+    scored = score_objects(shows, config, dataset, names, num_shown, more_scores)
     by_seed = {
         name: [[scores[f"{name}/{i}"] for scores in scored.scores.values()] for i in range(len(found))]
         for name, found in runs.items()

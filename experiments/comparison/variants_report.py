@@ -104,7 +104,7 @@ def numbers(
         "views": len(next(iter(compared.scores.values()))[0]["psnr"]) // len(budget.seeds),
         "points": config.test_points,
         "resolution": config.model.image_resolution,
-        "metrics": metric_settings(with_lpips=False),
+        "metrics": metric_settings(),
     }
 
 

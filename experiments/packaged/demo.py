@@ -28,12 +28,11 @@ from spnr_jax.config import TrainConfig
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.images import write_whole
 from spnr_jax.scoring import evaluation
-from spnr_jax.scoring.results import text_table, write_results
-from spnr_jax.training import metrics_log, trainer
+from spnr_jax.scoring.report import scored, text_table, write_results
+from spnr_jax.training import trainer
 from spnr_jax.training.weights import read_trained
 
 POINTS = 2048  # of an object; of evenly spread ones the first 1024, which a test sees, are evenly spread, too
-TITLE = "Sparse-point neural rendering: objects that no network saw"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,13 +72,16 @@ def main(demo: Demo) -> None:
         print(f"{number}/4 training {name}, preset {config.preset}, for {config.num_steps} steps in {run}", flush=True)
         seconds.measure(PARTS[name], partial(trainer.train, config, dataset, run, trainer.Schedule()))
 
-    print("4/4 evaluating on objects that the networks never saw", flush=True)
+    print("4/4 evaluating on the test split", flush=True)
     start = time.monotonic()
-    outcome = evaluation.compare({name: read_trained(demo.out / name) for name in configs}, dataset)
+    runs = {name: demo.out / name for name in configs}
+    trained = {name: read_trained(run) for name, run in runs.items()}
+    outcome = evaluation.compare(trained, dataset, runs=tuple(runs.values()))
     parts = {**install_seconds(), **seconds.values, "evaluate": time.monotonic() - start}
     parts["total"] = sum(parts.values())
     parts = {name: round(value, 1) for name, value in parts.items()}
-    write_results(demo.out, outcome, dataset.settings, metrics_log.read_rows(demo.out / "ours"), parts, TITLE)
+    write_results(demo.out, outcome, dataset.settings, parts)
+    print(f"{len(dataset.splits['test'])} {scored(outcome.summary)}")
     print("\n".join(text_table(outcome.summary["methods"])))
     print(f"metrics: {demo.out / 'metrics.json'}\nreport:  {demo.out / 'report.html'}")
 

@@ -28,8 +28,8 @@ from spnr_jax.config import NearPointsConfig, TrainConfig, surface_grid
 from spnr_jax.formats import data_sets as data
 from spnr_jax.formats.images import write_whole
 from spnr_jax.scoring import evaluation
-from spnr_jax.scoring.results import text_table, write_results
-from spnr_jax.training import metrics_log, trainer, weights
+from spnr_jax.scoring.report import text_table, write_results
+from spnr_jax.training import trainer, weights
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,7 +79,7 @@ def main(options: Pretrain) -> None:
     assert trained is not None, "there is at least one run"
     weights.write_weights(file, trained)
     outcome = evaluation.evaluate(file, dataset, "test" if dataset.splits["test"] else "val")
-    write_results(out, outcome, dataset.settings, metrics_log.read_rows(run), seconds.values)
+    write_results(out, outcome, dataset.settings, seconds.values)
     print("\n".join(text_table(outcome.summary["methods"])))
     print(f"weights: {file}\nreport:  {out / 'report.html'}")
 

@@ -33,7 +33,6 @@ from spnr_jax.errors import UserError, at_least
 from spnr_jax.formats import data_sets
 from spnr_jax.presets import PRESETS
 from spnr_jax.scoring import evaluation
-from spnr_jax.scoring.lpips_weights import read_weights
 from spnr_jax.scoring.summary import differences, metric_settings, summarise
 
 Row = Literal[
@@ -62,8 +61,6 @@ class Table1:
     """Test objects, spread over the split (default: all; 3 with --budget quick)."""
     shown: int = 24
     """Objects whose pictures are in the page."""
-    lpips: Path | None = None
-    """Weights that `spnr convert-lpips` made; without them the table says n/a."""
     envmap: Path | None = None
     """The environment map of the data set, where that is a file: Poisson surfaces are rendered in it."""
     variant: str = "auto"
@@ -95,7 +92,6 @@ def main(options: Table1) -> None:
     data_sets.check_resolution(first, config)
     asked = {name: getattr(options, name) for name in ("budget", "minutes", "seed")}
     results_folder.claim(options.out, "a table", asked, dataset)
-    weights = None if options.lpips is None else read_weights(options.lpips)
     surfaces, missing = surface_methods(options, dataset, config)  # before hours of training: something may be amiss
     trained = train_networks(options, dataset, presets)
     floors, factors = floor_methods(options, dataset, config)
@@ -103,12 +99,12 @@ def main(options: Table1) -> None:
     methods = networks | surfaces | floors
     if not methods:
         raise UserError(f"--methods {' '.join(options.methods)}: none can be made here, {' '.join(missing.values())}")
-    scored = score_objects(methods, config, dataset, names, options.shown, weights)
+    scored = score_objects(methods, config, dataset, names, options.shown)
     found = {
         **asked,
         **conditions(dataset, names, config),
         "radius_factors": factors,
-        "metrics": metric_settings(with_lpips=weights is not None),
+        "metrics": metric_settings(),
         "missing": missing,
         **numbers(scored),
         "costs": costs(options, trained, scored, config),

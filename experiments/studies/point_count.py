@@ -37,7 +37,7 @@ from spnr_jax.formats import data_sets
 from spnr_jax.formats.images import png
 from spnr_jax.formats.mesh import surface_points
 from spnr_jax.kernels.records import PointCloud
-from spnr_jax.scoring import evaluation, intervals
+from spnr_jax.scoring import evaluation, summary
 
 COUNTS = (128, 256, 512, 1024, 2048, 4096, 10_000)
 
@@ -237,7 +237,7 @@ def curve(method: Method, scores: dict[int, Scores]) -> dict[str, list[dict]]:
             {
                 "points": count,
                 "mean": mean(found, metric),
-                "interval": intervals.interval([np.array(row[metric]) for row in found.values()]),
+                "interval": summary.interval([np.array(row[metric]) for row in found.values()]),
             }
             for count, found in scores.items()
         ]

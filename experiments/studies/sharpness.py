@@ -30,7 +30,7 @@ from spnr_jax.devices import machine
 from spnr_jax.formats import data_sets, images
 from spnr_jax.kernels import metrics
 from spnr_jax.kernels.records import PointCloud
-from spnr_jax.scoring.flip import flip
+from spnr_jax.scoring.perceptual import flip
 from spnr_jax.scoring.picture_scores import ball, ball_waves, blue_share, plate, sharpness, under_true_opacity
 from spnr_jax.scoring.score_tables import Cell, Table, mean_row, number
 
@@ -138,7 +138,7 @@ def all_scores(image: np.ndarray, opacity: np.ndarray, reference: np.ndarray) ->
     oracle = sharpness(under_true_opacity(image, opacity, reference), reference[..., 3], reference)
     return sharpness(image, opacity, reference)._asdict() | {
         "ssim": float(metrics.ssim(jnp.asarray(image), jnp.asarray(white))),
-        "flip": float(flip(jnp.asarray(image), jnp.asarray(white))),
+        "flip": float(flip(image, white)),
         "psnr_true_opacity": oracle.psnr,
         "inside_true_opacity": oracle.psnr_inside,
     }

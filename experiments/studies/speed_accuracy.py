@@ -44,7 +44,7 @@ from spnr_jax.formats import data_sets
 from spnr_jax.kernels import cameras, metrics
 from spnr_jax.kernels.records import Camera, Rendering, Volume
 from spnr_jax.method.model import Model, Quality
-from spnr_jax.scoring.flip import flip
+from spnr_jax.scoring.perceptual import flip
 from spnr_jax.training.weights import load
 
 Result = TypeVar("Result")
@@ -228,7 +228,7 @@ def _scores(image: np.ndarray, opacity: np.ndarray, reference: np.ndarray) -> di
     return {
         "psnr": float(metrics.psnr(jnp.asarray(image), jnp.asarray(white))),
         "ssim": float(metrics.ssim(jnp.asarray(image), jnp.asarray(white))),
-        "flip": float(flip(jnp.asarray(image), jnp.asarray(white))),
+        "flip": float(flip(image, white)),
         "iou": float(metrics.opacity_iou(jnp.asarray(opacity), jnp.asarray(reference[..., 3]))),
     }
 

@@ -53,6 +53,5 @@ def lpips_network() -> Any:
 
 
 def _views(pictures: AnyArray) -> Float[np.ndarray, "views height width 3"]:
-    """The pictures one after the other, float32."""
-    pictures = np.asarray(pictures, np.float32)
-    return np.ascontiguousarray(pictures.reshape(-1, *pictures.shape[-3:]))
+    """The pictures one after the other, float32, in memory that may be written to, as the packages want it."""
+    return np.array(pictures, np.float32, order="C").reshape(-1, *np.shape(pictures)[-3:])

@@ -105,7 +105,7 @@ def scored(metrics: Mapping) -> str:
 def _summary(metrics: Mapping) -> str:
     """What the first network is, and how many dB it is above the others, in two sentences."""
     methods, settings = metrics["methods"], metrics["settings"]
-    best = max(FLOORS, key=lambda name: methods[name]["psnr"])
+    best = max((name for name in FLOORS if name in methods), key=lambda name: methods[name]["psnr"])
     network, *others = settings["networks"]
     compared = [(lowered(name), name) for name in others] + [("the white image", "white")]
     compared += [(f"the best trivial renderer ({best})", best)]

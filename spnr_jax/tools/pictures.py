@@ -25,7 +25,6 @@ from typing import NamedTuple
 import numpy as np
 from PIL import Image
 
-from spnr_jax.config import RayNetworkConfig
 from spnr_jax.devices.side_by_side import beside
 from spnr_jax.errors import UserError
 from spnr_jax.formats import clouds, images

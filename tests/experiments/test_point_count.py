@@ -16,7 +16,7 @@ from experiments.studies.point_count import PointCount, cloud_of, main
 from spnr_jax import cli
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.mesh.assets import Asset
-from spnr_jax.scoring import evaluation, intervals
+from spnr_jax.scoring import evaluation, summary
 
 pytestmark = pytest.mark.ci  # it trains several networks
 
@@ -73,13 +73,12 @@ def test_the_curves_are_the_scores_of_the_evaluation_at_each_count(out):
     for name in NAMES:
         item = data_sets.read_object(dataset, name)
         shown = evaluation.floor("splat", 1.5)(data_sets.first_points(item, 16), item.camera)
-        alpha = item.images[..., 3] / np.float32(255)
-        scores.append(evaluation.score(shown.image, shown.acc, data_sets.on_white(item.images), alpha, alpha > 0))
+        scores.append(evaluation.score_pictures(item, shown))
     for metric in point_count.METRICS:
         values = [np.asarray(row[metric], np.float64) for row in scores]
         (point,) = [p for p in results["curves"]["Base-colour splat"][metric] if p["points"] == 16]
         assert point["mean"] == pytest.approx(np.mean(values), rel=1e-6)
-        assert point["interval"] == pytest.approx(intervals.interval(values), rel=1e-6)
+        assert point["interval"] == pytest.approx(summary.interval(values), rel=1e-6)
 
 
 def test_a_method_without_opacity_has_no_curve_of_it(out):

@@ -174,13 +174,6 @@ def read_list(folder: Path, main: str) -> None:
     assert set(listed) <= {"train", "val", "test"}
 
 
-def read_lpips(folder: Path, main: str) -> None:
-    """LPIPS weights."""
-    from spnr_jax.scoring.lpips_weights import read_weights
-
-    read_weights(folder / main)
-
-
 def read_network(folder: Path, main: str) -> None:
     """A file of weights."""
     from spnr_jax.training.weights import Trained, read_weights
@@ -212,6 +205,5 @@ READERS = {
     "lists": Reader(seeds=valid_runs.lists, read=read_list),
     "viewer-message": Reader(seeds=browser_messages.messages, read=browser_messages.read_message),
     "viewer-upload": Reader(seeds=browser_messages.sent_files, read=browser_messages.read_upload),
-    "lpips": Reader(seeds=valid_runs.lpips, read=read_lpips),
     "weights": Reader(seeds=valid_runs.weights, read=read_network),
 }

@@ -40,7 +40,6 @@ INPUTS = int(os.environ.get("FUZZ_INPUTS", "16"))  # of each reader
 SECONDS = 10.0  # of the processor that an input may take
 LONGEST_REASON = 1000  # characters of a line that a person should read
 IN_CHILD = "FUZZ_CHILD" in os.environ
-EVERYDAY = [name for name in READERS if INPUTS > 16 or name != "lpips"]  # whose files are as large as the network
 SOURCES = sorted(path for folder in ("spnr_jax", "data_gen", "experiments") for path in (ROOT / folder).rglob("*.py"))
 json_values = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
@@ -121,7 +120,7 @@ def fuzzed(name: str, folder: Path) -> Counter:
     return counts
 
 
-@pytest.mark.parametrize("name", [name for name in EVERYDAY if (name == "laz") == IN_CHILD])
+@pytest.mark.parametrize("name", [name for name in READERS if (name == "laz") == IN_CHILD])
 def test_damaged_files_are_read_or_refused_with_one_line_and_nothing_else_is_touched(name, folder, table):
     table[name] = fuzzed(name, folder)
     assert name == "metrics" or table[name]["refused"]

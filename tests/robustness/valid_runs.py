@@ -90,17 +90,6 @@ def lists() -> list[Files]:
     ]
 
 
-def lpips() -> list[Files]:
-    """An archive of LPIPS weights, of zeros: they pack well."""
-    from spnr_jax.scoring.lpips_weights import SHAPES
-
-    stream = io.BytesIO()
-    np.savez_compressed(
-        stream, allow_pickle=False, **{name: np.zeros(shape, np.int8) for name, shape in SHAPES.items()}
-    )
-    return [{"weights.npz": stream.getvalue()}]
-
-
 def weights() -> list[Files]:
     """Files of weights of very small networks, one of them NPBG's."""
     from spnr_jax.config import EncoderConfig, PaperConfig, SamplingConfig

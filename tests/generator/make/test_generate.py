@@ -167,6 +167,17 @@ def test_a_bad_option_is_one_line_and_exit_code_2(arguments, expected, tmp_path,
     assert not Path("out").exists()
 
 
+@pytest.mark.parametrize(("num_test", "lines"), [(0, 1), (1, 0)])
+def test_a_data_set_without_a_test_split_says_so_in_one_line(num_test, lines, tmp_path, capsys):
+    config = tasks.GenerateConfig(out=str(tmp_path), test_objects=num_test)
+    made = [tasks.Task(object_id=name) for name in "abcde"]
+    names = [task.object_id for task in made]
+    generate.finish(config, made, {"train": names[num_test:], "val": [], "test": names[:num_test]}, {})
+    said = [line for line in capsys.readouterr().err.splitlines() if "the test split is empty" in line]
+    assert len(said) == lines
+    assert all("--split" in line and "--test-objects N" in line for line in said)
+
+
 def test_an_unknown_option_is_refused_and_the_nearest_is_named(capsys):
     assert spnr_data("generate", "out", "--resolutoin", 64) == 2
     assert "--resolution" in capsys.readouterr().err
