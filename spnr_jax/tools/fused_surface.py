@@ -5,9 +5,12 @@ steps of the grid, and by 1 where the picture is empty there.  The depth is the 
 would be cut off by the pixels that they cross.  What several pictures agree on counts: the AGREE-th largest of these.
 The mean, as for depth cameras, would let the far side of a thin wall fill what lies before it.  What no picture sees is
 solid, so the surface is closed.
+
+A grid lies over the box of an object, along the axes of its file.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 
 import jax
@@ -18,12 +21,46 @@ from jaxtyping import Array, Float
 from spnr_jax.formats.clouds import PlacedCloud
 from spnr_jax.gaussians.coloring import nearest_around
 from spnr_jax.gaussians.placing import View
-from spnr_jax.kernels.records import Camera, Volume
-from spnr_jax.tools.grids import Grid, over_box
+from spnr_jax.kernels.records import AnyArray, Camera, Volume
 
 GRID = 192  # places along each side of the box
 AGREE = 4  # pictures; with 3 solid objects are a little sharper, and thin parts are missing
 BAND = 3.5  # steps of the grid before and behind the surface
+
+
+@dataclass(frozen=True, kw_only=True)
+class Grid:
+    """Values (x, y, z) float32; [i, j, k] lies at origin + lowest + spacing * (i, j, k) in the file's x y z.
+
+    Places are split into an origin (3,) and a rest, so that float32 can hold what is added to it.
+    """
+
+    values: np.ndarray
+    lowest: np.ndarray
+    spacing: float
+    origin: np.ndarray
+
+
+def over_box(
+    value: Callable[[Float[np.ndarray, "places 3"]], Float[AnyArray, " places"]],
+    volume: Volume,
+    placed: PlacedCloud,
+    resolution: int,
+) -> Grid:
+    """The values of a function of places in the box, `resolution` along each side; it gets a plane at a time."""
+    steps = np.linspace(-1, 1, resolution, dtype=np.float32)
+    plane = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2)
+    rotation, scale = placed.rotation.astype(np.float32), float(volume.scale)
+    values = np.empty((resolution,) * 3, np.float32)
+    for i, x in enumerate(steps):
+        places = np.concatenate([np.full_like(plane[:, :1], x), plane], axis=-1) @ rotation.T
+        values[i] = np.asarray(value(places)).reshape(resolution, resolution)
+    return Grid(
+        values=values,
+        lowest=placed.rotation.T @ np.asarray(volume.centre, np.float64) - 1 / scale,
+        spacing=2 / (resolution - 1) / scale,
+        origin=placed.origin,
+    )
 
 
 def solidity(views: Sequence[View], volume: Volume, placed: PlacedCloud, resolution: int = GRID) -> Grid:

@@ -1,4 +1,4 @@
-"""The surface of what is solid as a .glb file, with the materials of the nearest points.
+"""The surface of an object as a .glb file, with the materials of the nearest points: made of a network's pictures.
 
 Marching cubes finds where the solidity crosses one half.  glTF has colours for each vertex but roughness and metallic
 only as textures or for whole primitives: each vertex points into one small texture that holds every pair of the two, a
@@ -16,7 +16,10 @@ from spnr_jax.errors import UserError
 from spnr_jax.formats import images
 from spnr_jax.formats.clouds import PlacedCloud
 from spnr_jax.formats.glb import Buffer
-from spnr_jax.tools.grids import Grid
+from spnr_jax.kernels.records import Volume
+from spnr_jax.method.model import Model
+from spnr_jax.tools import splat_making
+from spnr_jax.tools.fused_surface import GRID, Grid, solidity
 
 SURFACE = 0.5  # solidity
 NEAREST = 4  # points whose materials a vertex takes the mean of
@@ -30,6 +33,17 @@ class Solid(NamedTuple):
     content: bytes
     faces: int
     watertight: bool
+
+
+def mesh_of_volume(model: Model, volume: Volume, placed: PlacedCloud, resolution: int = GRID) -> Solid:
+    """The mesh of a cloud that is encoded, from a grid of so many places along each side of the box."""
+    views = splat_making.drawn_views(model, volume, splat_making.fitting_cameras(model, volume))
+    return mesh_of(solidity(views, volume, placed, resolution), placed)
+
+
+def describe(solid: Solid) -> str:
+    """What a mesh is, behind the name of its file."""
+    return f"{solid.faces:,} faces, {'watertight' if solid.watertight else 'not watertight'}"
 
 
 def mesh_of(grid: Grid, placed: PlacedCloud) -> Solid:

@@ -227,11 +227,11 @@ def _pose_in_file(camera: Camera, placed: PlacedCloud) -> np.ndarray:
 
 
 def _mesh(ready: Ready, options: Render, path: Path) -> Callable[[], Written]:
-    from spnr_jax.tools import fused_surface, mesh_making  # here: pictures alone do without
+    from spnr_jax.tools import mesh_export  # here: pictures alone do without
 
-    resolution = options.grid_resolution or fused_surface.GRID
-    solid = mesh_making.mesh_of_volume(ready.model, ready.volume, ready.placed, resolution)
-    return partial(_write_solid, path, solid.content, f" ({mesh_making.told(solid)})")
+    resolution = options.grid_resolution or mesh_export.GRID
+    solid = mesh_export.mesh_of_volume(ready.model, ready.volume, ready.placed, resolution)
+    return partial(_write_solid, path, solid.content, f" ({mesh_export.describe(solid)})")
 
 
 def _write_solid(path: Path, content: bytes, details: str = "") -> Written:

@@ -20,7 +20,7 @@ from spnr_jax.formats import images
 from spnr_jax.formats.gaussian_files import check_suffix, spz_of, write_splats
 from spnr_jax.kernels.records import Camera, Gaussians
 from spnr_jax.method.model import FIELD_OF_VIEW
-from spnr_jax.tools import mesh_making
+from spnr_jax.tools import mesh_export
 from spnr_jax.tools.pictures import Ready, made_ready
 from spnr_jax.tools.render_command import Render
 from spnr_jax.tools.share_command import Share
@@ -50,9 +50,9 @@ def export_mesh(asked: Render, out: Path, note: Callable[[str], None], report: C
         raise UserError(f"{out}: a mesh is written as .glb, not {out.suffix or 'a folder'}")
     images.check_place(out)
     ready = made_ready(asked, note, load)
-    solid = mesh_making.mesh_of_volume(ready.model, ready.volume, ready.placed)
+    solid = mesh_export.mesh_of_volume(ready.model, ready.volume, ready.placed)
     images.write_whole(out, solid.content)
-    report(f"wrote {out} ({mesh_making.told(solid)}, {len(solid.content) / 1e6:.1f} MB)")
+    report(f"wrote {out} ({mesh_export.describe(solid)}, {len(solid.content) / 1e6:.1f} MB)")
 
 
 def export_splats(asked: Render, out: Path, note: Callable[[str], None], report: Callable[[str], None]) -> None:

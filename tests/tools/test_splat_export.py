@@ -9,7 +9,7 @@ from spnr_jax.formats.clouds import read_cloud
 from spnr_jax.formats.mesh.meshes import load_mesh
 from spnr_jax.gaussians.placing import View
 from spnr_jax.surfels.visibility import spiral
-from spnr_jax.tools import mesh_making, splat_export, splat_making
+from spnr_jax.tools import mesh_export, splat_export, splat_making
 from spnr_jax.tools.light_options import Lighting
 
 pytestmark = pytest.mark.ci  # it makes splats with the network of the package
@@ -55,7 +55,7 @@ def test_splats_of_a_file_lie_around_its_points_in_its_units(cloud, tmp_path, ca
 
 def test_the_mesh_of_a_file_lies_around_its_points_in_its_units(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(splat_making.fitting_cameras, "__defaults__", (16, 64))
-    monkeypatch.setattr(mesh_making.mesh_of_volume, "__defaults__", (40,))
+    monkeypatch.setattr(mesh_export.mesh_of_volume, "__defaults__", (40,))
     cloud, out = tmp_path / "ball.xyz", tmp_path / "new" / "ball.glb"
     np.savetxt(cloud, 3 * spiral(1000) + [5, 0, 0])
     code = command_line.exit_code(cli, "export", cloud, "--mesh", out, "--up", "y")
