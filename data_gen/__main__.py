@@ -1,4 +1,4 @@
-"""The command `spnr-data`: generate a data set, check one, show one, pack one.
+"""The command `spnr-data`: generate a data set, check one, show one.
 
 Errors of the user and of the disk are one line on stderr and exit code 2; Ctrl-C is one line and exit code 130.
 `--debug` or SPNR_DEBUG=1 shows the call stack before the line.
@@ -15,7 +15,6 @@ from data_gen.make.generate import generate
 from data_gen.plan.data_presets import PRESETS
 from data_gen.plan.tasks import GenerateConfig
 from data_gen.store.check import check
-from data_gen.store.pack import PackConfig, pack
 from data_gen.store.show import ShowConfig, show
 from spnr_jax.errors import UserError, guarded, split_debug
 
@@ -28,7 +27,7 @@ class CheckConfig:
     """Folder of the data set."""
 
 
-Command = GenerateConfig | CheckConfig | ShowConfig | PackConfig
+Command = GenerateConfig | CheckConfig | ShowConfig
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -44,9 +43,8 @@ def parse(arguments: list[str]) -> Command:
     generate_options = Annotated[GenerateConfig, tyro.conf.subcommand("generate", default=preset_defaults(arguments))]
     check_options = Annotated[CheckConfig, tyro.conf.subcommand("check")]
     show_options = Annotated[ShowConfig, tyro.conf.subcommand("show")]
-    pack_options = Annotated[PackConfig, tyro.conf.subcommand("pack")]
     return tyro.cli(
-        generate_options | check_options | show_options | pack_options,  # type: ignore[arg-type]
+        generate_options | check_options | show_options,  # type: ignore[arg-type]
         prog="spnr-data",
         description="Data sets of rendered objects and their surface points. "
         "With --debug or SPNR_DEBUG=1 an error shows its call stack.",
@@ -72,8 +70,6 @@ def run(config: Command) -> int:
             return 0 if check(config.dataset) else 1
         if isinstance(config, GenerateConfig):
             generate(config)
-        elif isinstance(config, PackConfig):
-            pack(config)
         else:
             show(config)
     except KeyboardInterrupt:

@@ -4,12 +4,8 @@
 """
 
 import importlib.metadata
-import sys
 import warnings
 from importlib import import_module
-from importlib.abc import Loader, MetaPathFinder
-from importlib.machinery import ModuleSpec
-from types import ModuleType
 
 _PUBLIC = {"load": "training.weights", "Model": "method.model", "Volume": "method.model"}
 _PUBLIC |= {"read_cloud": "formats.clouds", "clean": "kernels.cleaning"}
@@ -37,30 +33,9 @@ warn_of_wrong_numbers()
 
 
 def __getattr__(name: str):
-    """Loads a public name on first use, so that importing the package stays quick."""
+    """Loads a public name, or one of the kernel modules, on first use, so that importing the package stays quick."""
+    if name in _KERNELS:
+        return import_module(f"spnr_jax.kernels.{name}")
     if name not in _PUBLIC:
         raise AttributeError(f"module 'spnr_jax' has no attribute {name!r}")
     return getattr(import_module(f"spnr_jax.{_PUBLIC[name]}"), name)
-
-
-class _Kernels(MetaPathFinder, Loader):
-    """Imports `spnr_jax.sampling` and the like as the module that lies in the folder kernels: the same object."""
-
-    def find_spec(self, fullname: str, path: object, target: object = None) -> ModuleSpec | None:
-        """A specification for the six names, none for any other."""
-        package, _, name = fullname.rpartition(".")
-        return ModuleSpec(fullname, self) if package == "spnr_jax" and name in _KERNELS else None
-
-    def create_module(self, spec: ModuleSpec) -> ModuleType:
-        """The module of the folder."""
-        module = import_module(spec.name.replace("spnr_jax.", "spnr_jax.kernels."))
-        spec.loader_state = module.__spec__  # the machinery puts this specification into its place
-        return module
-
-    def exec_module(self, module: ModuleType) -> None:
-        """Gives the module its own specification back: it has been executed."""
-        assert module.__spec__ is not None
-        module.__spec__ = module.__spec__.loader_state
-
-
-sys.meta_path.insert(0, _Kernels())

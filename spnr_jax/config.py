@@ -119,8 +119,6 @@ class EncoderConfig:
     """Features of a point after the PointNet."""
     point_norm: Literal["batch", "layer"] = "batch"
     """Normalisation in the PointNet: batch norm over the points [paper], or layer norm of each point."""
-    scatter: Literal["mean", "max", "trilinear"] = "mean"
-    """How the features of points meet in a voxel (`voxels.spread`)."""
     volume_resolution: int = 64
     """Voxels along each axis of the box [-1, 1]^3; a multiple of 2 ** num_stages."""
     base_width: int = 16
@@ -129,8 +127,6 @@ class EncoderConfig:
     """Encoder stages of the 3D U-Net; each halves the resolution (5: 1/32) [paper]."""
     num_groups: int = 8
     """Groups of each GroupNorm in U-Net and discriminator."""
-    skip: Literal["add", "concat"] = "add"
-    """How the U-Net's encoder joins its decoder: added to a stage's output [paper], or as input of its convolution."""
 
     def __post_init__(self) -> None:
         positive = "point_widths", "point_features", "num_groups", "volume_resolution", "base_width"

@@ -1,1 +1,1 @@
-"""The files of a data set: written, checked, packed, shown."""
+"""The files of a data set: written, checked, shown."""

@@ -53,8 +53,6 @@ def read_description(dataset: Path) -> dict:
     if not path.is_file():
         raise UserError(f"{dataset} holds no data set: {path.name} is missing; make one with spnr-data generate")
     description = layout.read_document(path)
-    if (dataset / "index.json").is_file():
-        raise UserError(f"{dataset} is packed; look at the folder of objects that `spnr-data pack` read")
     if description.get("schema_version") != layout.SCHEMA_VERSION:
         found = description.get("schema_version")
         raise UserError(f"{path}: expected schema version {layout.SCHEMA_VERSION}, got {found}; generate it again")

@@ -9,7 +9,7 @@ import numpy as np
 from data_gen.make import originals
 from data_gen.render import depth
 from spnr_jax.errors import UserError
-from spnr_jax.formats import data_sets, shards
+from spnr_jax.formats import data_sets
 from spnr_jax.formats.mesh.assets import Asset
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.records import Camera
@@ -28,9 +28,7 @@ def mesh_of(dataset: data_sets.Dataset, item: data_sets.ObjectData, meshes: Path
 
 
 def details(dataset: data_sets.Dataset, name: str) -> dict:
-    """What object.json says of an object, in either form of the data set."""
-    if dataset.shards is not None:
-        return json.loads(shards.read_files(dataset.shards, name)["object.json"])
+    """What object.json says of an object."""
     return json.loads((dataset.folder / "objects" / name / "object.json").read_bytes())
 
 

@@ -48,14 +48,11 @@ LABELS = {
     "depth_3": "U-Net of 3 stages",
     "depth_4": "U-Net of 4 stages",
     "depth_5": "U-Net of 5 stages",
-    "skip_concat": "Skips concatenated",
     "no_fine_samples": "No fine samples",
     "no_view_direction": "No view direction",
     "view_direction": "Sees the view direction",
     "plain_inputs": "Materials as they are",
     "fewer_channels": "Two thirds of the volume's channels",
-    "scatter_max": "Scatter: maximum",
-    "scatter_trilinear": "Scatter: trilinear",
     "free_colour": "Free colours, not light on materials",
     "no_neighbours": "No nearest points",
     "three_neighbours": "3 nearest points",
@@ -186,7 +183,6 @@ def model_changes(model: RayNetworkConfig) -> dict[str, dict]:
     samples = model.sampling
     changes: dict[str, dict] = {
         **{f"depth_{stages}": {"num_stages": stages} for stages in (3, 4, 5)},
-        "skip_concat": {"skip": "concat"},
         "no_fine_samples": {
             "sampling": dataclasses.replace(samples, num_coarse=samples.num_coarse + samples.num_fine, num_fine=0)
         },
@@ -194,8 +190,6 @@ def model_changes(model: RayNetworkConfig) -> dict[str, dict]:
         "view_direction": {"sees_direction": True},
         "plain_inputs": {"inputs": "plain"},
         "fewer_channels": {"base_width": 2 * model.encoder.base_width // 3 or 1},
-        "scatter_max": {"scatter": "max"},
-        "scatter_trilinear": {"scatter": "trilinear"},
         "batch_norm": {"point_norm": "batch"},
         "half_samples": {"sampling": scaled(samples, 0.5)},
         "twice_samples": {"sampling": scaled(samples, 2)},

@@ -8,6 +8,8 @@ from spnr_jax.errors import require
 
 OURS: dict[str, type[NetworkConfig]] = {kind.method: kind for kind in (SurfelConfig, NearPointsConfig, PaperConfig)}
 BASELINES = ("npbg", "point_nerf", "points2nerf")
+GONE = {"model.encoder.scatter": "mean", "model.encoder.skip": "add"}
+"""Fields of earlier versions, and the one value of each that is still computed."""
 
 
 def to_dict(config: TrainConfig) -> dict:
@@ -19,6 +21,13 @@ def to_dict(config: TrainConfig) -> dict:
 def from_dict(values: dict, kind: type = TrainConfig, path: str = "") -> Any:
     """Config from `to_dict`'s form; a field unknown, missing or of another type raises ValueError with its path."""
     kinds = types_of(kind)
+    for name in [name for name in values if f"{path}{name}" in GONE]:
+        kept = GONE[f"{path}{name}"]
+        require(
+            values[name] == kept,
+            f"config field {path}{name} {values[name]!r}: this version knows {kept!r} alone; train the network again",
+        )
+    values = {name: value for name, value in values.items() if f"{path}{name}" not in GONE}
     for name in values:
         require(name in kinds, f"unknown config field {path}{name}; known: {', '.join(kinds)}")
     arguments = {}

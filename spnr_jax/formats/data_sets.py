@@ -1,13 +1,11 @@
 """Data sets on disk, read: what they hold, and their objects as NumPy arrays.
 
-A data set is the folder that `spnr-data generate` writes (its form: README, "Data on disk"), or its packed form
-(spnr_jax/formats/shards.py); both give the same objects.
+A data set is the folder that `spnr-data generate` writes (its form: README, "Data on disk").
 """
 
 import errno
 import io
 import json
-import os
 import time
 import warnings
 from collections.abc import Callable
@@ -23,7 +21,6 @@ from spnr_jax.config import TrainConfig
 from spnr_jax.errors import UserError, is_bug
 from spnr_jax.formats import clouds
 from spnr_jax.formats.npz import read_arrays
-from spnr_jax.formats.shards import Shards, is_plain_name, open_shards, read_files
 from spnr_jax.kernels.records import Camera, Light, PointCloud
 from spnr_jax.surfels.lighting import HEIGHT, WIDTH, light_of
 
@@ -32,6 +29,7 @@ UNREADABLE = (OSError, ValueError, LookupError, TypeError, ArithmeticError, Recu
 # errors of a network drive that is away for a moment, and the seconds after which its file is read again
 PASSING = (errno.EIO, errno.ESTALE, errno.ETIMEDOUT, errno.EAGAIN, errno.ENOTCONN)
 PAUSES = (0.1, 0.5, 2.0)
+LONGEST_NAME = 200  # of an object, in bytes: file systems allow 255
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,12 +56,11 @@ class ObjectData:
 
 @dataclass(frozen=True, kw_only=True)
 class Dataset:
-    """The folder, its settings and the object names of each split; with its shards if it is packed."""
+    """The folder, its settings and the object names of each split."""
 
     folder: Path
     settings: dict
     splits: dict[str, tuple[str, ...]]
-    shards: Shards | None = None
 
     @property
     def spread(self) -> Literal["random", "even"]:
@@ -72,11 +69,13 @@ class Dataset:
 
 
 def open_dataset(folder: Path | str) -> Dataset:
-    """The data set in a folder, in either form; ValueError if it is none or unfinished."""
+    """The data set in a folder; ValueError if it is none or unfinished."""
     folder = Path(folder)
     description = folder / "dataset.json"
     if not description.is_file():
         raise UserError(f"{folder}: no finished data set (dataset.json is missing); run `spnr-data generate {folder}`")
+    if not (folder / "objects").is_dir() and (folder / "index.json").is_file():
+        raise UserError(f"{folder}: packed, a form that is no longer read; use the folder it was packed from")
     try:
         settings = json.loads(description.read_text())
     except (ValueError, RecursionError) as error:
@@ -91,14 +90,20 @@ def open_dataset(folder: Path | str) -> Dataset:
         splits[split] = tuple(path.read_text(errors="replace").split())
         if strange := [name for name in splits[split] if not is_plain_name(name)]:
             raise UserError(f"{path}: {strange[0]!r} is no name of an object; generate the data set again")
-    return Dataset(folder=folder, settings=settings, splits=splits, shards=open_shards(folder))
+    return Dataset(folder=folder, settings=settings, splits=splits)
+
+
+def is_plain_name(name: str) -> bool:
+    """Whether a name in a data set's lists is that of a folder right there: no path, nothing hidden."""
+    return (
+        0 < len(name) <= LONGEST_NAME and name.isprintable() and not (name.startswith(".") or set(name) & set("/\\:"))
+    )
 
 
 def read_object(dataset: Dataset, name: str) -> ObjectData:
     """One object of the data set; ValueError names the file that is missing or broken."""
     folder = dataset.folder / "objects" / name
-    shards, file = dataset.shards, "transforms.json"
-    read = _reader_of(folder) if shards is None else patiently(lambda: read_files(shards, name)).__getitem__
+    read, file = _reader_of(folder), "transforms.json"
     try:
         meta = json.loads(read(file))
         with np.errstate(over="ignore"):  # what leaves float32 is infinite, and refused
@@ -146,8 +151,8 @@ def patiently(read: Callable[[], Any]) -> Any:
     for pause in PAUSES:
         try:
             return read()
-        except (OSError, ValueError) as error:  # of shards the error's number is in the text alone
-            if not any(os.strerror(number) in str(error) for number in PASSING):
+        except OSError as error:
+            if error.errno not in PASSING:
                 raise
         time.sleep(pause)
     return read()

@@ -1,9 +1,6 @@
 """Points to volume and back: scatter by voxel, trilinear lookup.
 
-Every scatter is a sum: `spread` says to which rows of the flattened volume each point adds which share of its features.
-    mean        1 / (points in the voxel)
-    max         1 / (points that reach the maximum), for those, feature by feature
-    trilinear   the weights of the lookup at the eight nearest centres, over their sum in a voxel where that exceeds 1
+A scatter is a sum: each point adds 1 / (points in its voxel) of its features to the voxel's mean (`spread`).
 
 A volume covers the box [-1, 1]^3 with D voxels along each axis and is indexed (z, y, x, features); voxel i of an axis
 covers [-1 + 2 i / D, -1 + 2 (i + 1) / D].  Positions are (x, y, z).  In grid coordinates, (position + 1) * D / 2, voxel
@@ -11,7 +8,6 @@ centres lie at i + 0.5.  Leading batch axes pair a volume with its positions.
 """
 
 import itertools
-from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -76,58 +72,14 @@ def occupied(
 
 
 def spread(
-    scatter: Literal["mean", "max", "trilinear"],
     positions: Float[Array, "points 3"],
     features: Float[Array, "points features"],
     mask: Bool[Array, " points"],
     resolution: int,
-) -> tuple[Int[Array, " terms"], Float[Array, "terms features+1"]]:
-    """Rows of the flattened volume, and what of features and occupancy is added there."""
-    inputs = jnp.concatenate([features, jnp.ones_like(features[..., :1])], axis=-1)
-    if scatter == "mean":
-        rows, share = share_voxels(positions, mask, resolution)
-        return rows, inputs * share[:, None]
-    return (_spread_max if scatter == "max" else _spread_trilinear)(positions, inputs, mask, resolution)
-
-
-def _spread_max(positions, inputs, mask, resolution):
-    rows, valid = voxel_rows(positions, mask, resolution)
-    # voxels are numbered as they come, so that tables have as many rows as there are points
-    voxel = jnp.unique(rows, return_inverse=True, size=rows.size)[1]
-    fixed = jax.lax.stop_gradient(inputs)
-    largest = jnp.full(inputs.shape, -jnp.inf, inputs.dtype).at[voxel].max(fixed)
-    reaches = (valid[:, None] & (fixed == largest[voxel])).astype(inputs.dtype)
-    ties = gather_rows(scatter_rows(voxel, reaches, rows.size), voxel)
-    return rows, inputs * reaches / jnp.maximum(ties, 1)
-
-
-def _spread_trilinear(positions, inputs, mask, resolution):
-    lowest, weights, steps = corners(positions, resolution)
-    weights = jnp.where(mask[:, None], weights, 0)
-    rows = jnp.where(weights > 0, lowest[:, None] + jnp.array([steps]), resolution**3).reshape(-1)
-    total = gather_rows(scatter_rows(rows, weights.reshape(-1, 1), resolution**3 + 1), rows)
-    share = weights / jnp.maximum(total, 1).reshape(weights.shape)
-    return rows, (share[..., None] * inputs[:, None]).reshape(-1, inputs.shape[1])
-
-
-def scattered(
-    scatter: Literal["mean", "max", "trilinear"],
-    positions: Float[Array, "*batch points 3"],
-    features: Float[Array, "*batch points features"],
-    mask: Bool[Array, "*batch points"],
-    resolution: int,
-) -> tuple[Float[Array, "*batch d d d features"], Float[Array, "*batch d d d"]]:
-    """Point features in voxels (0 where there is none), and how full these are; points outside the box are dropped.
-
-    `mean` and `max` of the points in a voxel, which is full (1) with any; the gradient of a maximum goes to the points
-    that reach it, in equal shares.  `trilinear`: spread over the eight nearest voxel centres, the sum of weights times
-    features over the sum of weights where that exceeds 1, so that no point moves from voxel to voxel in one step.
-    """
-    if positions.ndim > 2:
-        return jax.vmap(lambda p, f, m: scattered(scatter, p, f, m, resolution))(positions, features, mask)
-    rows, values = spread(scatter, positions, features, mask, resolution)
-    summed = scatter_rows(rows, values, resolution**3 + 1)[:-1].reshape(*[resolution] * 3, -1)
-    return summed[..., :-1], summed[..., -1]
+) -> tuple[Int[Array, " points"], Float[Array, "points features+1"]]:
+    """Rows of the flattened volume, and what each point adds there to the means of features and to occupancy."""
+    rows, share = share_voxels(positions, mask, resolution)
+    return rows, jnp.concatenate([features, jnp.ones_like(features[..., :1])], axis=-1) * share[:, None]
 
 
 def scatter_mean(
@@ -140,7 +92,11 @@ def scatter_mean(
 
     Masked points and points outside the box are dropped.
     """
-    return scattered("mean", positions, features, mask, resolution)
+    if positions.ndim > 2:
+        return jax.vmap(lambda p, f, m: scatter_mean(p, f, m, resolution))(positions, features, mask)
+    rows, values = spread(positions, features, mask, resolution)
+    summed = scatter_rows(rows, values, resolution**3 + 1)[:-1].reshape(*[resolution] * 3, -1)
+    return summed[..., :-1], summed[..., -1]
 
 
 def scatter_conv(

@@ -66,12 +66,12 @@ class Encoder(nn.Module):
         """The two networks."""
         c = self.config
         self.pointnet = PointNet(c.point_widths, c.point_features, c.point_norm)
-        self.unet = UNet3D(c.volume_resolution, c.base_width, c.num_stages, c.num_groups, self.bf16, c.skip)
+        self.unet = UNet3D(c.volume_resolution, c.base_width, c.num_stages, c.num_groups, self.bf16)
 
     def __call__(self, cloud: PointCloud, train: bool = False) -> Float[Array, "objects d d d features"]:
         """Feature volume of each object, (z, y, x)."""
         positions, mask = jnp.asarray(cloud.positions), jnp.asarray(cloud.mask)
-        spread = partial(voxels.spread, self.config.scatter, resolution=self.config.volume_resolution)
+        spread = partial(voxels.spread, resolution=self.config.volume_resolution)
         return self.unet(*jax.vmap(spread)(positions, self.point_features(cloud, train), mask))
 
     def point_features(self, cloud: PointCloud, train: bool = False) -> Float[Array, "objects points features"]:

@@ -2,9 +2,8 @@
 
 Each encoder stage halves the resolution and doubles the channels; skip connections are additions [paper].  A stage is a
 stride-2 convolution and one at stride 1, a decoder stage nearest x2 and a convolution; each convolution is followed by
-GroupNorm and ReLU.  No transposed convolution.  With skip "concat" nothing is added: the decoder's convolution sees the
-skipped volume beside its own input.  With bf16 the convolutions after the stem run in bfloat16; the stem's scattered
-sums, normalisation and parameters stay float32.
+GroupNorm and ReLU.  No transposed convolution.  With bf16 the convolutions after the stem run in bfloat16; the stem's
+scattered sums, normalisation and parameters stay float32.
 """
 
 from typing import Literal
@@ -13,7 +12,6 @@ import flax.linen as nn
 import jax
 from jaxtyping import Array, Float, Int
 
-from spnr_jax.devices.placement import divide_depth
 from spnr_jax.kernels.voxels import scatter_conv
 from spnr_jax.nn.convolution import conv, kernel_init, upsample_conv
 from spnr_jax.nn.normalization import GroupNorm
@@ -45,19 +43,11 @@ class Block(nn.Module):
     bf16: bool = False
 
     @nn.compact
-    def __call__(
-        self,
-        x: Float[Array, "objects *space channels"],
-        beside: Float[Array, "objects *out_space more"] | None = None,
-    ) -> Float[Array, "objects *out_space features"]:
-        """The block's output; the convolution of an up block sees `beside`, too, which has the output's resolution."""
-        own, more = x.shape[-1], 0 if beside is None else beside.shape[-1]
-        kernel = self.param("kernel", kernel_init, (3, 3, 3, own + more, self.features))
+    def __call__(self, x: Float[Array, "objects *space channels"]) -> Float[Array, "objects *out_space features"]:
+        """The block's output."""
+        kernel = self.param("kernel", kernel_init, (3, 3, 3, x.shape[-1], self.features))
         if self.kind == "up":
-            # convolutions are linear: that of both together is the sum of one of each
-            x = upsample_conv(x, kernel[..., :own, :], self.bf16)
-            if beside is not None:
-                x = x + conv(beside, kernel[..., own:, :], bf16=self.bf16)
+            x = upsample_conv(x, kernel, self.bf16)
         else:
             x = conv(x, kernel, stride=2 if self.kind == "down" else 1, bf16=self.bf16)
         return nn.relu(GroupNorm(self.num_groups, name="norm")(x))
@@ -71,7 +61,6 @@ class UNet3D(nn.Module):
     num_stages: int
     num_groups: int
     bf16: bool = False
-    skip: Literal["add", "concat"] = "add"
 
     @nn.compact
     def __call__(
@@ -79,7 +68,6 @@ class UNet3D(nn.Module):
     ) -> Float[Array, "objects d d d features"]:
         """Feature volume of each object from its scattered points (`voxels.scatter_conv` says in which form)."""
         x = Stem(self.base_width, self.resolution, self.num_groups, name="stem")(rows, values)
-        x = divide_depth(x, self.resolution // 2**self.num_stages)
         skips, width = [], self.base_width
         for i in range(self.num_stages):
             skips.append(x)
@@ -88,6 +76,5 @@ class UNet3D(nn.Module):
             x = Block(width, "same", self.num_groups, self.bf16, name=f"same_{i}")(x)
         for i in range(self.num_stages):
             width //= 2
-            up = Block(width, "up", self.num_groups, self.bf16, name=f"up_{i}")
-            x = up(x, skips.pop()) if self.skip == "concat" else up(x) + skips.pop()
+            x = Block(width, "up", self.num_groups, self.bf16, name=f"up_{i}")(x) + skips.pop()
         return x

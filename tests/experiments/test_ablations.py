@@ -29,7 +29,7 @@ def _shrunken():
         yield
 
 
-def asked(out, wanted=("skip_concat",), dataset=None, folds=1, **budget):
+def asked(out, wanted=("plain_inputs",), dataset=None, folds=1, **budget):
     folder = dataset or tiny_dataset.dataset().folder
     return Ablations(data=folder, out=out, rows=wanted, folds=folds, budget=Budget(**{"quick": True} | budget))
 
@@ -57,13 +57,10 @@ class TestRows:
             "depth_3": {},  # tiny's own
             "depth_4": {"model.encoder.num_stages": 4},
             "depth_5": {"model.encoder.num_stages": 5},
-            "skip_concat": {"model.encoder.skip": "concat"},
             "no_fine_samples": {"model.sampling.num_coarse": 32, "model.sampling.num_fine": 0},
             "no_view_direction": {"model.sees_direction": False},
             "plain_inputs": {"model.encoder.inputs": "plain"},
             "fewer_channels": {"model.encoder.base_width": 8},
-            "scatter_max": {"model.encoder.scatter": "max"},
-            "scatter_trilinear": {"model.encoder.scatter": "trilinear"},
             "adversarial": {},  # tiny has it
             "no_average": {"optimizer.ema_decay": 0.0},
             "one_count": {"min_points": 1024},
@@ -120,7 +117,7 @@ class TestRows:
 
 def test_scores_and_differences_are_those_of_the_runs_on_the_same_views(out):
     results, psnr = results_of(out), {}
-    for row in ("reference", "skip_concat"):
+    for row in ("reference", "plain_inputs"):
         found, state = checkpoint.load_run(out / "runs" / f"{row}_0")
         show = {row: evaluation.network(optimisation.averaged_variables(state), found)}
         scored = evaluation.evaluate_objects(show, found, tiny_dataset.dataset(), ("ball_000004", "chair"))
@@ -132,8 +129,8 @@ def test_scores_and_differences_are_those_of_the_runs_on_the_same_views(out):
             assert part["test_objects"] == [name]
             assert part["variants"][row]["psnr"] == pytest.approx(own[name].mean(), abs=1e-5)
             assert results["by_object"][name][row]["psnr"] == pytest.approx(own[name].mean(), abs=1e-4)
-    difference = results["minus_reference"]["skip_concat"]["psnr"]
-    assert difference["mean"] == pytest.approx((psnr["skip_concat"] - psnr["reference"]).mean(), abs=1e-5)
+    difference = results["minus_reference"]["plain_inputs"]["psnr"]
+    assert difference["mean"] == pytest.approx((psnr["plain_inputs"] - psnr["reference"]).mean(), abs=1e-5)
     assert difference["by_seed"] == [difference["mean"]]
     assert results["test_objects"] == ["ball_000004", "chair"]
     check_conditions(out)

@@ -84,6 +84,13 @@ def test_a_folder_without_a_data_set_says_how_to_make_one(tmp_path):
         data_sets.open_dataset(tmp_path / "nothing")
 
 
+def test_a_packed_data_set_is_refused_with_the_form_that_is_read(copy):
+    (copy / "objects").rename(copy / "shards")
+    (copy / "index.json").write_text("{}")
+    with pytest.raises(ValueError, match="packed, a form that is no longer read; use the folder it was packed from"):
+        data_sets.open_dataset(copy)
+
+
 def test_an_unfinished_data_set_and_a_damaged_description_are_named(copy):
     (copy / "splits" / "val.txt").unlink()
     with pytest.raises(ValueError, match=r"val.txt: missing; run `spnr-data generate"):

@@ -9,7 +9,6 @@ import threading
 from contextlib import closing
 from pathlib import Path
 
-import msgpack
 import pytest
 from support import tiny_dataset
 from support.laws import same_bits
@@ -17,7 +16,6 @@ from support.stopped_runs import without_network
 
 from spnr_jax import cli
 from spnr_jax.formats import data_sets
-from spnr_jax.formats.shards import Shards
 from spnr_jax.training import batching, trainer
 
 CONFIG = tiny_dataset.CONFIG
@@ -86,26 +84,6 @@ def test_each_pause_is_waited(monkeypatch):
     failing(monkeypatch, 2, errno.ESTALE)
     data_sets.read_object(tiny_dataset.dataset(), "chair")
     assert waited == [0.1, 0.5]
-
-
-def test_packed_objects_are_read_again_too():
-    whole, tries = tiny_dataset.dataset(), []
-    folder = whole.folder / "objects" / "chair"
-    record = msgpack.packb(
-        {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-    )
-
-    class Away:
-        def __getitem__(self, place):
-            tries.append(place)
-            if len(tries) <= RETRIES:
-                raise RuntimeError(f"UNKNOWN: pread() failed: {os.strerror(errno.EIO)}; reading 00000.array_record")
-            return record
-
-    packed = Shards(folder=whole.folder, places={"chair": 0}, records=Away())
-    item = data_sets.read_object(dataclasses.replace(whole, shards=packed), "chair")
-    same_bits(item.images, data_sets.read_object(whole, "chair").images)
-    assert len(tries) == 1 + RETRIES
 
 
 @pytest.fixture

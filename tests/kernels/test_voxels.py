@@ -1,7 +1,5 @@
 """Points to volume and back: scatter by voxel, the sparse convolution, trilinear lookup."""
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,7 +13,6 @@ from spnr_jax.kernels.voxels import (
     row_of,
     scatter_conv,
     scatter_mean,
-    scattered,
     share_voxels,
     spread,
     trilinear,
@@ -27,7 +24,6 @@ FEATURES = numbers(1, 2, 3, 12, 2)
 MASK = np.random.default_rng(2).uniform(size=(2, 3, 12)) > 0.3
 VOLUME = numbers(3, D, D, D, 2)
 scatter = jax.jit(scatter_mean, static_argnums=3)
-scatter_max, scatter_trilinear = (partial(scattered, how) for how in ("max", "trilinear"))
 lookup = jax.jit(trilinear)
 
 
@@ -49,6 +45,8 @@ class TestLocate:
 
 
 class TestScatterMean:
+    cloud = POSITIONS[0, 0], FEATURES[0, 0], jnp.asarray(MASK[0, 0])
+
     def test_the_order_of_points_in_voxels_of_their_own_does_not_matter_by_a_bit(self):
         cells = np.random.default_rng(9).permutation(D**3)[:12]
         positions = np.stack(np.unravel_index(cells, (D, D, D)), axis=-1).astype(np.float32) * (2 / D) - 1 + 0.1
@@ -85,95 +83,52 @@ class TestScatterMean:
         assert (occupancy > 0).sum() == 1
         close((volume[3, 1, 2], occupancy[3, 1, 2]), (jnp.full(2, 0.7), 1.0), rtol=3e-5)
 
-
-@pytest.mark.parametrize(
-    ("kernel", "twin"),
-    [
-        (scatter_mean, reference.scatter_mean),
-        (scatter_max, reference.scatter_max),
-        (scatter_trilinear, reference.scatter_trilinear),
-    ],
-    ids=["mean", "max", "trilinear"],
-)
-class TestScatters:
-    cloud = POSITIONS[0, 0], FEATURES[0, 0], jnp.asarray(MASK[0, 0])
-
-    def test_is_the_loop_over_points(self, kernel, twin):
-        volume, occupancy = map(np.asarray, jax.jit(kernel, static_argnums=3)(POSITIONS, FEATURES, MASK, D))
+    def test_is_the_loop_over_points(self):
+        volume, occupancy = map(np.asarray, scatter(POSITIONS, FEATURES, MASK, D))
         positions, features = np.asarray(POSITIONS), np.asarray(FEATURES)
         for place in np.ndindex(2, 3):
-            close((volume[place], occupancy[place]), twin(positions[place], features[place], MASK[place], D))
+            close(
+                (volume[place], occupancy[place]),
+                reference.scatter_mean(positions[place], features[place], MASK[place], D),
+            )
 
-    def test_obeys_the_batch_law(self, kernel, twin):
-        batch_law(lambda p, f, m: kernel(p, f, m > 0.5, D), POSITIONS, FEATURES, jnp.asarray(MASK, jnp.float32))
+    def test_obeys_the_batch_law(self):
+        batch_law(lambda p, f, m: scatter_mean(p, f, m > 0.5, D), POSITIONS, FEATURES, jnp.asarray(MASK, jnp.float32))
 
-    def test_its_gradient_is_right_also_where_points_share_voxels(self, kernel, twin):
+    def test_its_gradient_is_right_also_where_points_share_voxels(self):
         positions, _, mask = self.cloud
-        gradient_law(lambda f: kernel(positions, f, mask, D), self.cloud[1])
+        gradient_law(lambda f: scatter_mean(positions, f, mask, D), self.cloud[1])
 
-    def test_the_order_of_the_points_does_not_matter(self, kernel, twin):
+    def test_the_order_of_the_points_does_not_matter(self):
         order = np.random.default_rng(4).permutation(12)
-        close(kernel(*(x[order] for x in self.cloud), D), kernel(*self.cloud, D))
+        close(scatter_mean(*(x[order] for x in self.cloud), D), scatter_mean(*self.cloud, D))
 
     @pytest.mark.parametrize("fill", [0.0, 1e30, np.nan])
-    def test_padding_does_not_matter_whatever_it_holds(self, kernel, twin, fill):
+    def test_padding_does_not_matter_whatever_it_holds(self, fill):
         extra = jnp.full((5, 3), fill, jnp.float32)
         fills = extra, extra[:, :2], jnp.zeros(5, bool)
         padded = (jnp.concatenate(pair) for pair in zip(self.cloud, fills, strict=True))
-        same_bits(kernel(*padded, D), kernel(*self.cloud, D))
+        same_bits(scatter_mean(*padded, D), scatter_mean(*self.cloud, D))
 
-    def test_no_point_gives_zeros_and_zero_gradients(self, kernel, twin):
+    def test_no_point_gives_zeros_and_zero_gradients(self):
         positions, features, mask = self.cloud
 
         def total(features, mask):
-            volume, occupancy = kernel(positions, features, mask, D)
+            volume, occupancy = scatter_mean(positions, features, mask, D)
             return jnp.sum(volume) + jnp.sum(occupancy)
 
         value, gradient = jax.jit(jax.value_and_grad(total))(features, jnp.zeros_like(mask))
         assert value == 0
         assert (gradient == 0).all()
-        empty = kernel(jnp.zeros((0, 3)), jnp.zeros((0, 2)), jnp.zeros(0, bool), D)
+        empty = scatter_mean(jnp.zeros((0, 3)), jnp.zeros((0, 2)), jnp.zeros(0, bool), D)
         assert all((x == 0).all() for x in empty)
 
-    def test_is_the_sum_of_what_it_spreads_as_the_stem_reads_it(self, kernel, twin):
-        name = twin.__name__.removeprefix("scatter_")
-        rows, values = spread(name, *self.cloud, D)
-        volume, occupancy = kernel(*self.cloud, D)
+    def test_is_the_sum_of_what_it_spreads_as_the_stem_reads_it(self):
+        rows, values = spread(*self.cloud, D)
+        volume, occupancy = scatter_mean(*self.cloud, D)
         dense = jnp.concatenate([volume, occupancy[..., None]], axis=-1)
         weights = numbers(5, 3, 3, 3, 3, 4)
         close(scatter_conv(rows, values, weights, D), reference.convolution(dense, weights), atol=1e-5)
-
-
-class TestScatterMax:
-    def test_points_that_tie_share_the_gradient(self):
-        positions = jnp.broadcast_to(jnp.array([0.3, -0.2, 0.9]), (3, 3))
-        features = jnp.array([[0.5], [0.5], [-1.0]])
-        gradient = jax.grad(lambda f: jnp.sum(scatter_max(positions, f, jnp.ones(3, bool), D)[0]))(features)
-        close(gradient, np.array([[0.5], [0.5], [0.0]]))
-
-
-class TestScatterTrilinear:
-    def test_a_point_at_a_voxel_centre_is_in_that_voxel_alone_however_often_it_is_there(self):
-        centre = jnp.broadcast_to(jnp.array([-0.25, 0.75, 0.25]), (3, 3))  # x, y, z
-        for count in (1, 3):
-            volume, full = scatter_trilinear(centre[:count], jnp.full((count, 2), 0.7), jnp.ones(count, bool), D)
-            assert (full > 0).sum() == 1
-            close((volume[2, 3, 1], full[2, 3, 1]), (jnp.full(2, 0.7), 1.0))
-
-    def test_a_lone_point_is_the_adjoint_of_the_lookup_and_loses_nothing(self):
-        position, feature = jnp.array([[0.1, -0.33, 0.6]]), jnp.array([[2.0, -1.0]])
-        volume, full = scatter_trilinear(position, feature, jnp.ones(1, bool), D)
-        (splat,) = jax.vjp(lambda v: trilinear(v, position), VOLUME)[1](feature)
-        close(volume, splat)
-        close((volume.sum((0, 1, 2)), full.sum()), (feature[0], 1.0))
-
-    def test_a_point_that_moves_a_little_changes_the_volume_a_little(self):
-        along = jnp.stack([jnp.linspace(-1, 1, 401), jnp.full(401, 0.1), jnp.full(401, -0.3)], axis=-1)[:, None]
-        ones = jnp.ones((401, 1, 1))
-        volumes, _ = jax.jit(scatter_trilinear, static_argnums=3)(along, ones, ones[..., 0] > 0, D)
-        assert jnp.abs(jnp.diff(volumes, axis=0)).max() < 2 * 2 / 400 * D / 2
-        hard, _ = scatter(along, ones, ones[..., 0] > 0, D)
-        assert jnp.abs(jnp.diff(hard, axis=0)).max() == 1
 
 
 class TestScatterConv:

@@ -102,17 +102,6 @@ class TestCloud:
             atol=1e-5,
         )
 
-    @pytest.mark.parametrize("scatter", ["max", "trilinear"])
-    def test_another_scatter_gives_another_volume_and_the_same_occupied_voxels(self, variables, scatter):
-        """Rendering near points looks around the voxels that hold points, however these are scattered."""
-        config = tiny_model.with_encoder(CONFIG, scatter=scatter)
-        plain, other = encode(variables, cloud()), encode(variables, cloud(), config)
-        same_bits(other.occupied, plain.occupied)
-        assert (jnp.abs(other.volume - plain.volume) > 1e-3).any()
-        order = np.random.default_rng(5).permutation(NUM_POINTS)
-        shuffled = jax.tree.map(lambda x: x[:, order], cloud())
-        close(encode(variables, shuffled, config), other, rtol=1e-4, atol=1e-5)
-
     @pytest.mark.parametrize("materials", [(), ("roughness",), ("base_color", "metallic")], ids=str)
     def test_materials_that_the_config_leaves_out_are_not_read(self, materials):
         config = tiny_model.with_encoder(CONFIG, materials=materials).encoder

@@ -3,10 +3,9 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-from support import reference
 from support.laws import close, numbers
 
-from spnr_jax.nn.unet3d import Block, UNet3D
+from spnr_jax.nn.unet3d import UNet3D
 
 ROWS = jnp.asarray(np.random.default_rng(0).integers(0, 513, (2, 20)), jnp.int32)
 VALUES = numbers(1, 2, 20, 3)
@@ -45,26 +44,6 @@ def test_without_its_decoder_the_stem_alone_reaches_the_output():
     assert (stem > 0).any()
     assert (out >= stem).all(), "a decoder block adds its ReLU"
     assert (out > stem).any()
-
-
-def test_concatenated_skips_are_seen_by_the_decoders_convolution_beside_its_own_input():
-    x, beside = numbers(5, 1, 4, 4, 4, 3), numbers(6, 1, 8, 8, 8, 2)
-    block = Block(features=4, kind="up", num_groups=2)
-    variables = jax.jit(block.init)(jax.random.key(1), x, beside)
-    params = jax.tree.map(np.float64, variables["params"])
-    both = np.concatenate([reference.repeat_twice(np.asarray(x[0])), np.asarray(beside[0])], axis=-1)
-    y = reference.convolution(both, params["kernel"])
-    y = reference.group_norm(y, 2, params["norm"]["scale"], params["norm"]["bias"])
-    close(jax.jit(block.apply)(variables, x, beside)[0], np.maximum(y, 0), rtol=1e-4, atol=1e-5)
-
-
-def test_concatenated_skips_widen_the_kernels_of_the_decoder_alone():
-    module = UNet3D(resolution=8, base_width=4, num_stages=2, num_groups=2, skip="concat")
-    shapes = jax.eval_shape(module.init, jax.random.key(0), ROWS, VALUES)["params"]
-    widths = {name: block["kernel"].shape[-2:] for name, block in shapes.items()}
-    plain = {name: block["kernel"].shape[-2:] for name, block in VARIABLES["params"].items()}
-    assert widths == plain | {"up_0": (16 + 8, 8), "up_1": (8 + 4, 4)}
-    assert jax.eval_shape(module.apply, {"params": shapes}, ROWS, VALUES).shape == (2, 8, 8, 8, 4)
 
 
 def test_a_point_reaches_the_whole_volume_through_the_coarsest_stage():

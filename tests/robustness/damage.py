@@ -16,8 +16,6 @@ from collections.abc import Callable
 from random import Random
 from typing import Any
 
-import msgpack
-
 Files = dict[str, bytes]
 Opened = tuple[Files, Callable[[Files], bytes]]  # parts of a container, and what closes it again
 
@@ -252,16 +250,4 @@ def open_npy(data: bytes) -> Opened | None:
     return {"header": data[10 : 10 + size], "numbers": data[10 + size :]}, close
 
 
-def open_map(data: bytes) -> Opened | None:
-    """The files in a record of a packed data set."""
-    if not data or not 0x80 <= data[0] <= 0x8F:
-        return None
-    try:
-        parts = msgpack.unpackb(data)
-    except Exception:  # noqa: BLE001 - damaged before: any error of msgpack says that there is nothing to open
-        return None
-    sound = all(isinstance(name, str) and isinstance(content, bytes) for name, content in parts.items())
-    return (parts, msgpack.packb) if sound and parts else None
-
-
-OPENERS: tuple[Callable[[bytes], Opened | None], ...] = (open_glb, open_zip, open_png, open_npy, open_map)
+OPENERS: tuple[Callable[[bytes], Opened | None], ...] = (open_glb, open_zip, open_png, open_npy)

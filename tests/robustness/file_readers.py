@@ -110,52 +110,13 @@ def read_dataset(folder: Path, main: str) -> None:
         assert (np.asarray(item.camera.intrinsics)[:, (0, 1), (0, 1)] > 0).all(), "a focal length below 0"
 
 
-def read_packed(folder: Path, main: str) -> None:
-    """The same of a packed data set; its record goes into a shard as `spnr-data pack` puts it."""
-    from array_record.python.array_record_module import ArrayRecordWriter
-
-    (folder / "shards").mkdir(exist_ok=True)
-    if (folder / "record").is_file():
-        writer = ArrayRecordWriter(str(folder / "shards" / "00000.array_record"), "group_size:1")
-        writer.write((folder / "record").read_bytes())
-        writer.close()
-    read_dataset(folder, main)
-
-
-def read_shard(folder: Path, main: str) -> None:
-    """A packed data set whose shard itself is damaged."""
-    (folder / "shards").mkdir(exist_ok=True)
-    if (folder / "shard").is_file():
-        (folder / "shard").replace(folder / "shards" / "00000.array_record")
-    read_dataset(folder, main)
-
-
-@functools.cache
-def shards() -> list[Files]:
-    """A packed data set with the bytes of its shard."""
-    import tempfile
-
-    from array_record.python.array_record_module import ArrayRecordWriter
-
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "shard"
-        writer = ArrayRecordWriter(str(path), "group_size:1")
-        (seed,) = (files for files in valid_runs.packed() if next(iter(files)) == "record")
-        writer.write(seed["record"])
-        writer.close()
-        shard = path.read_bytes()
-    return [{"shard": shard} | {name: content for name, content in seed.items() if name != "record"}]
-
-
 def check_dataset(folder: Path, main: str) -> None:
-    """What `spnr-data check` says, and what `spnr-data pack` would put into a record."""
-    from data_gen.store import check, pack
+    """What `spnr-data check` says."""
+    from data_gen.store import check
 
     with contextlib.redirect_stdout(io.StringIO()):
         sound = check.check(folder)
     assert isinstance(sound, bool)
-    files = pack.object_files(folder, "a")
-    assert all(isinstance(content, bytes) for content in files.values())
 
 
 def read_list(folder: Path, main: str) -> None:
@@ -200,8 +161,6 @@ READERS = {
     "metrics": Reader(seeds=valid_runs.metric_rows, read=read_metrics),
     "dataset": Reader(seeds=valid_runs.datasets, read=read_dataset),
     "dataset-check": Reader(seeds=valid_runs.datasets, read=check_dataset),
-    "packed": Reader(seeds=valid_runs.packed, read=read_packed),
-    "shard": Reader(seeds=shards, read=read_shard),
     "lists": Reader(seeds=valid_runs.lists, read=read_list),
     "viewer-message": Reader(seeds=browser_messages.messages, read=browser_messages.read_message),
     "viewer-upload": Reader(seeds=browser_messages.sent_files, read=browser_messages.read_upload),

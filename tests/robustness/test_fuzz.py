@@ -136,7 +136,7 @@ def test_damaged_laz_files_end_no_process():
     print("\n" + next(line for line in done.stdout.splitlines() if "laz: " in line), end="")
 
 
-@pytest.mark.parametrize("name", ["glb", "npz", "npy", "obj", "packed"])
+@pytest.mark.parametrize("name", ["glb", "npz", "npy", "obj"])
 def test_containers_are_closed_as_they_were_opened(name):
     contents = [content for files in READERS[name].seeds() for content in files.values()]
     found = [(opener, *opened) for content in contents for opener in OPENERS if (opened := opener(content))]

@@ -59,22 +59,6 @@ def datasets() -> list[Files]:
     return [{name: files[name]} | files for name in first]
 
 
-def packed() -> list[Files]:
-    """What a packed data set is made of: its index, and one record (a msgpack map) that goes into a shard."""
-    import msgpack
-
-    described = {"schema_version": layout.SCHEMA_VERSION, "settings": {}}
-    files = {
-        "index.json": json.dumps({"shards": {"00000.array_record": 1}, "ids": ["a"]}).encode(),
-        "record": msgpack.packb(object_files()),
-        "dataset.json": layout.json_text(described).encode(),
-        "splits/train.txt": b"a\n",
-        "splits/val.txt": b"",
-        "splits/test.txt": b"",
-    }
-    return [{name: files[name]} | files for name in ("index.json", "record")]
-
-
 def lists() -> list[Files]:
     """Split files, a test list, and the tables of ABO."""
     import gzip

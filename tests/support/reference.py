@@ -68,15 +68,6 @@ def voxel_of(position, resolution):
 
 def scatter_mean(positions, features, mask, resolution):
     """(mean of the features in each voxel, occupancy), a list of points per voxel."""
-    return _scatter_by(np.mean, positions, features, mask, resolution)
-
-
-def scatter_max(positions, features, mask, resolution):
-    """(largest of the features in each voxel, occupancy), a list of points per voxel."""
-    return _scatter_by(np.max, positions, features, mask, resolution)
-
-
-def _scatter_by(combine, positions, features, mask, resolution):
     inside = {}
     for position, feature, valid in zip(positions, np.float64(features), mask, strict=True):
         voxel = voxel_of(position, resolution)
@@ -85,20 +76,9 @@ def _scatter_by(combine, positions, features, mask, resolution):
     volume = np.zeros((*[resolution] * 3, features.shape[-1]))
     occupancy = np.zeros([resolution] * 3)
     for voxel, members in inside.items():
-        volume[voxel] = combine(members, axis=0)
+        volume[voxel] = np.mean(members, axis=0)
         occupancy[voxel] = 1
     return volume, occupancy
-
-
-def scatter_trilinear(positions, features, mask, resolution):
-    """(weighted sums of the features, sums of the weights) at the voxel centres, over the latter where above 1."""
-    volume, total = np.zeros((*[resolution] * 3, features.shape[-1])), np.zeros([resolution] * 3)
-    for position, feature, valid in zip(positions, np.float64(features), mask, strict=True):
-        for voxel, weight in trilinear_taps(position, resolution) if valid else ():
-            volume[voxel] += weight * feature
-            total[voxel] += weight
-    full = np.maximum(total, 1)
-    return volume / full[..., None], total / full
 
 
 def trilinear_taps(position, resolution):

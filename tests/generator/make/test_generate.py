@@ -275,7 +275,4 @@ def test_each_view_may_have_its_own_light_which_is_kept_and_lights_its_picture(m
     assert len({light.tobytes() for light in lights}) == len(lights)
     area = np.sin(np.pi * (np.arange(32) + 0.5) / 32)[:, None, None]
     np.testing.assert_allclose((lights * area).mean(axis=(1, 2, 3)) / area.mean(), 0.6, rtol=0.02)
-    assert spnr_data("pack", out, "--out", tmp_path / "packed") == 0
-    packed = data_sets.read_object(data_sets.open_dataset(tmp_path / "packed"), items[0].name)
-    np.testing.assert_array_equal(packed.lights, items[0].lights)
     assert items[0].own_lights[0].tables.shape == (7, 32, 64, 3)
