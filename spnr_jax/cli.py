@@ -115,16 +115,14 @@ def _noted(cloud: Path) -> Callable[[str], None]:
 
 def run_train(command: Train) -> None:
     """`spnr train`."""
-    import jax
-
-    from spnr_jax.devices import launch, placement
+    from spnr_jax.devices import placement
     from spnr_jax.formats import data_sets
     from spnr_jax.training import trainer, weights
 
     address = command.coordinator, command.num_processes, command.process_id
     if command.distributed or address != (None, None, None):
-        launch.join(*address)
-    mesh = placement.device_mesh(command.depth_devices) if jax.device_count() > 1 else None
+        placement.join(*address)
+    mesh = placement.device_mesh()
     dataset = data_sets.open_dataset(command.data)
     schedule = trainer.Schedule(
         log_every=command.log_every, preview_every=command.preview_every, checkpoint_every=command.checkpoint_every

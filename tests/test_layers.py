@@ -212,13 +212,9 @@ def test_a_picture_of_rays_is_drawn_by_few_modules_and_by_one_network():
 
 def test_the_kernels_of_the_specification_are_one_module_under_both_names():
     names = "cameras", "sampling", "compositing", "voxels", "losses", "metrics"
-    loaded = modules_after(
-        "; ".join(
-            f"import importlib; import spnr_jax.{name}; short = sys.modules['spnr_jax.{name}']; "
-            f"from spnr_jax import {name}; from spnr_jax.kernels import {name} as whole; "
-            f"assert short is {name} is whole is importlib.import_module('spnr_jax.kernels.{name}'); "
-            f"assert whole.__name__ == whole.__spec__.name == 'spnr_jax.kernels.{name}'"
-            for name in names
-        )
+    checks = (
+        f"from spnr_jax import {name}; import spnr_jax.kernels.{name} as full; assert spnr_jax.{name} is {name} is full"
+        for name in names
     )
-    assert {f"spnr_jax.{name}" for name in names} <= loaded
+    loaded = modules_after("import spnr_jax; assert 'jax' not in sys.modules; " + "; ".join(checks))
+    assert not {f"spnr_jax.{name}" for name in names} & loaded

@@ -25,7 +25,7 @@ from jaxtyping import Array, Bool, Float, Int
 from spnr_jax.baselines import ray_chunks
 from spnr_jax.baselines.sizes import PointNeRFConfig
 from spnr_jax.config import MATERIAL_CHANNELS, RenderOptions
-from spnr_jax.devices.placement import on_own_rays
+from spnr_jax.devices.placement import split_objects
 from spnr_jax.kernels import cameras, compositing, sampling
 from spnr_jax.kernels.numerics import length, per_feature, softplus
 from spnr_jax.kernels.occupancy import map_existing
@@ -218,7 +218,7 @@ class PointNeRF(nn.Module):
             return jax.lax.map(lambda x: one(*x), (cloud, *of_rays))
 
         cloud = jax.tree.map(jnp.asarray, cloud)
-        return on_own_rays(own, self.weights, *jax.lax.stop_gradient((cloud, (view, distances, far, hit))))
+        return split_objects(own, self.weights, *jax.lax.stop_gradient((cloud, (view, distances, far, hit))))
 
     def render(self, cloud: PointCloud, camera: Camera, options: RenderOptions | None = None) -> Rendering:
         """Views of each cloud, some rays at a time; there is nothing to choose."""

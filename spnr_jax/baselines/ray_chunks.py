@@ -1,13 +1,11 @@
 """Pictures of a baseline whose rays know nothing of each other, some rays at a time, which bounds the memory."""
 
-from functools import partial
 from typing import Any
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from spnr_jax.devices.placement import on_own_rays
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.records import Camera, Rendering
 
@@ -15,8 +13,7 @@ from spnr_jax.kernels.records import Camera, Rendering
 def render(module: Any, scene: Any, camera: Camera, chunk: int) -> Rendering:
     """Views of encoded objects by a bound module with `rays` and `render_rays`, `chunk` rays of each object at once."""
     network, variables = module.unbind()
-    in_chunks = partial(_in_chunks, network, chunk)
-    return cameras.as_images(camera, *on_own_rays(in_chunks, variables, scene, module.rays(camera)))
+    return cameras.as_images(camera, *_in_chunks(network, chunk, variables, scene, module.rays(camera)))
 
 
 def _in_chunks(module: nn.Module, chunk: int, variables: dict, scene: Any, rays: Any) -> Any:

@@ -30,7 +30,6 @@ from spnr_jax.config import (
     SamplingConfig,
     SurfelConfig,
 )
-from spnr_jax.devices.placement import by_all_devices, everywhere
 from spnr_jax.errors import UserError
 from spnr_jax.kernels import cameras, cloud_arrays
 from spnr_jax.kernels.records import LARGEST_REACH, Camera, Key, Light, PointCloud, Rendering, Volume
@@ -126,7 +125,7 @@ def render_views(
     camera: Camera,
     light: Light | Sequence[Light] | None = None,
 ) -> Rendering:
-    """All views of one object (clouds of data sets are normalised already), rays divided among the devices.
+    """All views of one object (clouds of data sets are normalised already), one compilation for each number of views.
 
     The light, or one for each view, is for a network that sees it; None is the package's room.
     """
@@ -140,14 +139,8 @@ def render_views(
     cloud, camera = jax.tree.map(lambda x: jnp.asarray(x)[None], (cloud, camera))
     volume = jitted_encode(variables, cloud, config=config)
     options = dataclasses.replace(trained(config), rays_per_side=rays_per_side(config, camera.width))
-    render = partial(jitted_render, config=config, options=options)
-    rendering = by_all_devices(render, variables, volume, camera)
+    rendering = jitted_render(variables, volume, camera, config=config, options=options)
     return jax.tree.map(lambda x: x[0], rendering)
-
-
-def placed(variables: dict) -> dict:
-    """The variables where pictures are drawn: whole on every device."""
-    return everywhere(variables)
 
 
 def encode_volume(
@@ -173,8 +166,7 @@ def draw(
     if config.upsamples and (camera.height % 2 or camera.width % 2):
         raise UserError(f"this network doubles its pictures: {camera.width} x {camera.height} pixels must be even")
     options = at_quality(config, quality, volume.reach, camera.width)
-    drawing = partial(_render, config=config, options=options)
-    return by_all_devices(drawing, variables, volume.scene, volume.centre, volume.scale, camera)
+    return _render(variables, volume.scene, volume.centre, volume.scale, camera, config=config, options=options)
 
 
 def draw_each(

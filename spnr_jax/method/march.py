@@ -1,6 +1,6 @@
 """Rays through a field, whichever network it is: where their samples lie, and what of them is seen.
 
-    trace    all rays: those that meet nothing are left out, the others rendered in blocks, by the devices of the mesh
+    trace    all rays: those that meet nothing are left out, the others rendered in blocks on the device of their object
     march    rays of a block: coarse samples, fine samples where the coarse weights are large, compositing
 
 What is marched through is a *field*: a function of distances (*rays, samples) that gives `Samples`.
@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from spnr_jax.config import RenderOptions, SamplingConfig
-from spnr_jax.devices.placement import on_own_rays
+from spnr_jax.devices.placement import split_objects
 from spnr_jax.kernels import cameras, compositing, occupancy, sampling
 from spnr_jax.kernels.numerics import clamp
 from spnr_jax.kernels.occupancy import Path
@@ -75,7 +75,7 @@ def trace(
         variables, key = whole
         return _on_one_device(lambda: network.bind(variables), scene, *own_rays, samples, options, key)
 
-    return on_own_rays(own, (variables, key), scene, (rays, number))
+    return split_objects(own, (variables, key), scene, (rays, number))
 
 
 def _on_one_device(

@@ -10,7 +10,7 @@ Clouds, cameras and depths are in the cloud's own units; the transform into the 
 import dataclasses
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import partial
 from types import ModuleType
 from typing import Literal, get_args
 
@@ -64,7 +64,7 @@ class Model:
         renders as the network was trained.  Other networks than ours know one number of samples.
         """
         _check_quality(quality)
-        return self._pictures.draw(self._placed, volume, camera, light, config=self.config, quality=quality)
+        return self._pictures.draw(self.variables, volume, camera, light, config=self.config, quality=quality)
 
     def render_each(
         self,
@@ -79,7 +79,7 @@ class Model:
         """
         _check_quality(quality)
         lights = lights or [None] * len(views)
-        return self._pictures.draw_each(self._placed, volume, views, lights, config=self.config, quality=quality)
+        return self._pictures.draw_each(self.variables, volume, views, lights, config=self.config, quality=quality)
 
     def camera(
         self, volume: Volume, azimuth: float = 30.0, elevation: float = 20.0, resolution: int | None = None
@@ -97,10 +97,6 @@ class Model:
 
             return surfel_pictures
         return inference
-
-    @cached_property
-    def _placed(self) -> dict:
-        return self._pictures.placed(self.variables)
 
 
 @partial(jax.jit, static_argnames="size")

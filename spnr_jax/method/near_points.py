@@ -15,7 +15,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from spnr_jax.config import AS_TRAINED, NearPointsConfig, RenderOptions, surface_grid
-from spnr_jax.devices.placement import divide_pixels, undivided
 from spnr_jax.kernels import cameras, surface, voxels
 from spnr_jax.kernels.numerics import length
 from spnr_jax.kernels.records import Camera, Key, PointCloud, Rays, Rendering, Scene
@@ -58,7 +57,7 @@ class NearPointsNetwork(nn.Module):
 
     def rays(self, camera: Camera) -> Rays:
         """Rays of all views of an object in one axis, (objects, views * height * width, 3)."""
-        return divide_pixels(cameras.view_rays(camera))
+        return cameras.view_rays(camera)
 
     def refines(self, options: RenderOptions) -> bool:
         """Whether the refiner is used, and rays carry its inputs."""
@@ -96,7 +95,7 @@ class NearPointsNetwork(nn.Module):
     def developed(self, camera: Camera, traced: Traced, refined: bool) -> Rendering:
         """Images from the rays of `rays`."""
         views, (height, width) = camera.cam_to_world.shape[:-2], (camera.height, camera.width)
-        features, depth, acc = (undivided(x).reshape(-1, height, width, *x.shape[2:]) for x in traced)
+        features, depth, acc = (x.reshape(-1, height, width, *x.shape[2:]) for x in traced)
         rgb = features[..., :3]
         image, depth, acc = self.refine(camera, Traced(features, depth, acc)) if refined else (rgb, depth, acc)
         images = (image, rgb, depth, acc)

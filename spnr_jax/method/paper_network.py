@@ -15,7 +15,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from spnr_jax.config import AS_TRAINED, PaperConfig, RenderOptions
-from spnr_jax.devices.placement import divide_pixels, undivided
 from spnr_jax.kernels import cameras, voxels
 from spnr_jax.kernels.records import Camera, Key, PointCloud, Rays, Rendering, Scene
 from spnr_jax.kernels.resizing import bilinear
@@ -53,7 +52,7 @@ class PaperNetwork(nn.Module):
 
     def rays(self, camera: Camera) -> Rays:
         """Rays of the volume rendering for all views of an object in one axis, (objects, views * height * width, 3)."""
-        return divide_pixels(cameras.view_rays(cameras.resize(camera, *self.render_size(camera))))
+        return cameras.view_rays(cameras.resize(camera, *self.render_size(camera)))
 
     def render_size(self, camera: Camera) -> tuple[int, int]:
         """Height and width of the volume rendering behind the camera's image."""
@@ -82,10 +81,10 @@ class PaperNetwork(nn.Module):
     def developed(self, camera: Camera, traced: Traced) -> Rendering:
         """Images from the rays of `rays`: the feature image is resized, and the upsampler doubles it."""
         views, (height, width) = camera.cam_to_world.shape[:-2], self.render_size(camera)
-        features = undivided(traced.features).reshape(-1, height, width, self.config.num_features)
+        features = traced.features.reshape(-1, height, width, self.config.num_features)
         image = features[..., :3]
         if self.config.upsamples:
-            image = undivided(self.upsampler(divide_pixels(bilinear(features, camera.height // 2, camera.width // 2))))
+            image = self.upsampler(bilinear(features, camera.height // 2, camera.width // 2))
         return Rendering(
             image=image.reshape(*views, camera.height, camera.width, 3),
             image_lr=features[..., :3].reshape(*views, height, width, 3),

@@ -18,11 +18,6 @@ _in_box = jax.jit(cameras.in_box)  # compiled whole: each operation alone takes 
 BALANCED = 0.75  # of the pixels along a side, which are drawn and enlarged: docs/performance.md
 
 
-def placed(variables: dict) -> dict:
-    """The variables where pictures are drawn: one device draws all of them."""
-    return variables
-
-
 def encode_volume(
     variables: dict, cloud: PointCloud, centre: np.ndarray, scale: np.floating, *, config: SurfelConfig
 ) -> Volume:

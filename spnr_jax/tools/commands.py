@@ -40,8 +40,6 @@ class Train:
     """Processes that train together."""
     process_id: int | None = None
     """Which of them this is, from 0."""
-    depth_devices: int = 1
-    """Devices that share each volume, cut along one axis, if it is too big for one."""
 
 
 @dataclass(frozen=True, kw_only=True)

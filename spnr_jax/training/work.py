@@ -69,7 +69,7 @@ def of_views(config: TrainConfig, dataset: Dataset, mesh: Mesh | None, own: rang
 
     def step(state: Any, batch: Any, number: int) -> tuple[Any, dict]:
         with placement.using(mesh):
-            batch = placement.placed(batch, mesh, config.batch_objects)
+            batch = placement.place_batch(batch, mesh, config.batch_objects)
             adversarial = number >= adversarial_from
             return optimisation.jitted_train_step(state, batch, config=config, adversarial=adversarial)
 

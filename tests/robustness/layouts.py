@@ -17,11 +17,12 @@ from typing import Literal
 import jax
 import numpy as np
 
-from spnr_jax.devices.launch import IN_ORDER
 from spnr_jax.training import checkpoint, metrics_log, optimisation
 
 ROOT = Path(__file__).parents[2]
 LIMIT = 3600.0  # seconds that a run may take
+# XLA's CPU runtime begins sums that do not need each other in any order: gloo of two processes then mixes them up
+IN_ORDER = "--xla_cpu_enable_concurrency_optimized_scheduler=false"
 QUICK_COMPILATION = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
 NETWORK = (
     "--point-widths 8 --point-features 4 --volume-resolution 8 --base-width 4 --num-stages 1 --num-groups 2"
@@ -33,12 +34,11 @@ NETWORK = (
 
 @dataclass(frozen=True, kw_only=True)
 class Layout:
-    """Where a training runs: processes, devices of each, how many of these share a volume, who starts the processes."""
+    """Where a training runs: processes, devices of each, who starts the processes."""
 
     name: str
     processes: int = 1
     devices: int = 1
-    depth: int = 1
     launcher: Literal["addresses", "SLURM's environment", "mpirun"] = "addresses"
 
 
@@ -46,8 +46,6 @@ def run(folder: Path, dataset: Path, layout: Layout, flags: Sequence[str]) -> Pa
     """The folder of a finished training; ValueError with what a process said last if one fails."""
     place = folder / layout.name
     command = [sys.executable, "-m", "spnr_jax.cli", "train", str(dataset), str(place), *flags]
-    if layout.depth > 1:
-        command += ["--depth-devices", str(layout.depth)]
     environment = os.environ | {
         "JAX_COMPILATION_CACHE_DIR": str((folder / "compiled").absolute()),
         "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]),
