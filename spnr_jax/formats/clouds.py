@@ -22,17 +22,16 @@ from spnr_jax.formats.point_files import READERS, column_pieces, parse_ply
 from spnr_jax.formats.sensor import sensor_of
 from spnr_jax.formats.up_axis import ROTATIONS, find_up
 from spnr_jax.kernels import scenes
-from spnr_jax.kernels.cleaning import Clean, Strength, beside, cleaned, is_noisy, noise
+from spnr_jax.kernels.cleaning import Clean, cleaned
 from spnr_jax.kernels.facing import facing
 from spnr_jax.kernels.records import PointCloud
-from spnr_jax.kernels.thinning import THINNING, farthest_points, stacked, thin_stream
+from spnr_jax.kernels.thinning import THINNING, farthest_points, sample_stream, stacked
 from spnr_jax.surfels.outward import outward_normals
 
 MESHES = (".glb", ".gltf", ".obj", ".stl", ".off")
 MESH_POINTS = 4096  # points drawn from a mesh if no number is asked for; the most that training draws
 MOST_EVEN = 2**14  # points that are spread evenly over a mesh, in seconds; more lie close enough as they are drawn
-CAPACITY = 2**19  # points of a file that are in memory at most; more are thinned while reading
-SAMPLE = 2**18  # of them that say where a file is dense, and stand for it where it is noisy
+CAPACITY = 2**19  # points of a file that are in memory at most; of more a random sample is kept while reading
 BROKEN = "NaN, infinity or too large a number"
 CUT_MESH = 2**18  # points drawn from a mesh that something is cut out of
 WHOLE = Cut()
@@ -64,7 +63,7 @@ def read_cloud(
 
     More than `num_points` are thinned out evenly, fewer are kept; a mesh gives exactly `num_points` (4096 if None).
     `up` is the file's upward axis, or "auto".  Unless `clean` is "off" points are cleaned before they are thinned
-    (spnr_jax/kernels/cleaning.py), those of meshes never; of a file that is thinned while reading, what that keeps.
+    (spnr_jax/kernels/cleaning.py), those of meshes never; of a file of more than CAPACITY, a random sample of these.
     Points that are thinned out have normals, the file's or those that all of its points tell (surfels/outward.py).
     `cut` says which part of a scene is wanted.  Rows without finite numbers are left out.  Transparent parts of a mesh
     are taken as opaque, or left out ("skip").  ValueError, one line that names the file, for whatever cannot be read.
@@ -186,7 +185,7 @@ def _read(
             report(scenes.cropped(int(inside.sum()), count, cut.crop, positions.min(axis=0), positions.max(axis=0)))
             positions, values = positions[inside], {name: column[inside] for name, column in values.items()}
     else:
-        columns = _bounded_columns(path, num_points, clean, cut, report)
+        columns = _bounded_columns(path, num_points, cut, report)
         positions, origin, values = _points_of_columns(columns, report)
     rows, lines = scenes.object_of(positions, origin, cut.remove_plane, cut.nth, seed)
     positions, values = positions[rows], {name: column[rows] for name, column in values.items()}
@@ -220,13 +219,8 @@ def _sampled_mesh(path: Path, count: int, seed: int, transparent_parts: ShownPar
     return points.positions.astype(np.float64), np.zeros(3), values | {"normals": points.normals}
 
 
-def _bounded_columns(
-    path: Path, num_points: int | None, clean: Clean, cut: Cut, report: Callable[[str], None]
-) -> Columns:
-    """The useful columns of a point file inside the box to be cut out; few enough are kept while reading.
-
-    Unless `clean` is "off" they are a sample of a noisy file, and of any other lack points that lie apart in it.
-    """
+def _bounded_columns(path: Path, num_points: int | None, cut: Cut, report: Callable[[str], None]) -> Columns:
+    """The useful columns of a point file inside the box to be cut out, of very many points those of a random sample."""
     capacity, broken, outside = max(CAPACITY, THINNING * (num_points or 0)), 0, 0
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
 
@@ -245,29 +239,16 @@ def _bounded_columns(
                 wanted = wanted & inside
             yield columns if wanted.all() else {name: column[wanted] for name, column in columns.items()}
 
-    columns, sample = thin_stream(sound_pieces(), capacity, 0 if clean == "off" else SAMPLE)
-    seen = sample.seen
+    columns, seen = sample_stream(sound_pieces(), capacity)
     if broken and not seen + outside:
         raise UserError(f"holds no point that can be used: {BROKEN} in all of its {broken} rows")
     if broken:
         report(f"{broken:,} of {seen + outside + broken:,} points left out: {BROKEN}")
     if cut.crop and seen + outside:
         report(scenes.cropped(seen, seen + outside, cut.crop, low, high))
-    if seen <= capacity:
-        return columns
-    if clean != "off" and is_noisy(*noise(stacked(sample.columns)), clean):  # voxels keep what lies off the surface
-        report(f"{len(sample.keys)} of {seen} points kept while reading, drawn at random: they are noisy")
-        return sample.columns
-    report(f"{len(columns['x'])} of {seen} points kept while reading, the first of each voxel")
-    return columns if clean == "off" else _beside(columns, stacked(sample.columns), clean, report)
-
-
-def _beside(columns: Columns, sample: np.ndarray, strength: Strength, report: Callable[[str], None]) -> Columns:
-    """The columns without points that lie apart from the sample of their file, of which voxels keep too many."""
-    near = beside(stacked(columns), sample, strength)
-    if not near.all():
-        report(f"removed {np.count_nonzero(~near):,} outliers of {len(near):,} points, told by a sample of the file")
-    return {name: column[near] for name, column in columns.items()}
+    if seen > capacity:
+        report(f"{len(columns['x'])} of {seen} points kept while reading, drawn at random")
+    return columns
 
 
 def _sound(columns: Columns) -> np.ndarray:

@@ -67,7 +67,6 @@ CELL = 1.0, 3.0  # standard deviations of the noise, spacings: side of a voxel t
 CELLS = 27  # voxels that are compared
 THIN = 0.3  # of the points that those hold, for a point of theirs, below which a voxel is fringe
 MOST_MOVED = 2**17  # points that are moved; of more, a part
-BESIDE = 2.0  # times the distance of a sample's neighbours, within which a point belongs to it
 CANCELLED = 0.5  # length of a mean of unit normals below which they contradict each other
 
 
@@ -110,7 +109,7 @@ def cleaned(positions: Float[np.ndarray, "points 3"], values: Values, strength: 
         lines.append(f"removed {apart.sum():,} outliers of {len(positions):,} points")
         positions, values = positions[~apart], {name: x[~apart] for name, x in values.items()}
     sigma, spacing = noise(positions)
-    averages = is_noisy(sigma, spacing, strength)
+    averages = bool(sigma > NOISY[strength] * spacing > 0)
     if averages:
         before = len(positions)
         positions, values = averaged(positions, values, sigma, spacing)
@@ -138,23 +137,6 @@ def outliers(positions: Float[np.ndarray, "points 3"], strength: Strength = "aut
     removed = np.ones(len(distinct), bool)
     removed[left] = False
     return removed[copies]
-
-
-def beside(
-    positions: Float[np.ndarray, "points 3"], sample: Float[np.ndarray, "some 3"], strength: Strength = "auto"
-) -> Bool[np.ndarray, " points"]:
-    """True for points of a cloud that lie beside a sample of it without the sample's outliers.
-
-    For clouds thinned by voxels, where few outliers have become many: a sample of points that were taken with the same
-    chance shows what is dense.
-    """
-    sample = _distinct(sample[~outliers(sample, strength)])[0]
-    if len(sample) < LEAST_POINTS:
-        return np.ones(len(positions), bool)
-    tree = cKDTree(sample)
-    reach = tree.query(sample, NEIGHBOURS + 1, workers=-1)[0][:, 1:].mean(axis=1)
-    distance, nearest = tree.query(positions, workers=-1)
-    return distance <= BESIDE * reach[nearest]
 
 
 def _distinct(positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -227,11 +209,6 @@ def noise(positions: Float[np.ndarray, "points 3"]) -> tuple[float, float]:
         if thickness < THICKEST or MOST_WIDE * count > len(distinct):
             return radius * float(np.interp(thickness, THICKNESS, NOISES)), radius * np.sqrt(np.pi / (count + 1))
         count *= WIDER
-
-
-def is_noisy(sigma: float, spacing: float, strength: Strength = "auto") -> bool:
-    """Whether points with this noise and spacing are averaged."""
-    return bool(sigma > NOISY[strength] * spacing > 0)
 
 
 def _heights(near: np.ndarray) -> np.ndarray:

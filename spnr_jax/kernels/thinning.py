@@ -1,11 +1,10 @@
-"""Fewer points that still cover the shape evenly: voxels for any number of points, then farthest points.
+"""Fewer points that still cover the shape evenly: a random sample while reading, voxels, then farthest points.
 
-A voxel keeps the first of its points in the order of the file.  Voxels are halved or doubled around a fixed corner, so
-that the result depends on the points and their order alone.  Memory and time of the farthest points are bounded by
-thinning with voxels first.
+A voxel keeps the first of its points in the order of the file.  Voxels are halved around a fixed corner, so that the
+result depends on the points and their order alone.  Memory and time of the farthest points are bounded by thinning with
+voxels first.
 """
 
-import dataclasses
 from collections.abc import Iterable
 
 import numpy as np
@@ -15,7 +14,6 @@ Columns = dict[str, np.ndarray]
 
 THINNING = 16  # farthest-point sampling starts from at most this many times the points that it keeps
 INNER = (0.05, 0.95)  # quantiles along each axis between which the extent of a cloud is measured: outliers do not count
-FINEST = 2**10  # voxels along the extent that streaming starts with
 HALVINGS = 20  # of the extent, to the smallest voxel that is tried
 SMALLEST_EXTENT = 1e-30  # where all points coincide
 FARTHEST = 1e18  # from the middle, in the file's units, up to which distances are squared as they are
@@ -26,60 +24,31 @@ KEY_BITS = 21  # of a voxel's index along an axis
 SCATTER = np.uint64(0x9E3779B97F4A7C15)  # odd, 2^64 over the golden ratio: multiples of it are spread over 0..2^64 - 1
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Sample:
-    """Rows of a stream, each with the same chance, whatever lies around it: where many points lie many are taken."""
+def sample_stream(pieces: Iterable[Columns], most: int) -> tuple[Columns, int]:
+    """Columns of at most `most` rows of all pieces, each with the same chance, and how many rows there are.
 
-    columns: Columns = dataclasses.field(default_factory=dict)
-    keys: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0, np.uint64))
-    seen: int = 0
-    halvings: int = 0  # of the share that is taken
-
-
-def sampled(sample: Sample, piece: Columns, most: int) -> Sample:
-    """The sample of at most so many points after the stream's next ones."""
-    seen, halvings = sample.seen + len(piece["x"]), sample.halvings
-    if most == 0:
-        return Sample(seen=seen)
-    keys = np.arange(sample.seen + 1, seen + 1, dtype=np.uint64) * SCATTER
-    taken = keys >> np.uint64(64 - halvings) == 0 if halvings else slice(None)
-    columns = _joined(sample.columns, {name: values[taken] for name, values in piece.items()})
-    keys = np.concatenate([sample.keys, keys[taken]])
-    while len(keys) > most:
-        halvings += 1
-        taken = keys >> np.uint64(64 - halvings) == 0
-        columns, keys = {name: values[taken] for name, values in columns.items()}, keys[taken]
-    return Sample(columns=columns, keys=keys, seen=seen, halvings=halvings)
-
-
-def _joined(before: Columns, piece: Columns) -> Columns:
-    """The columns with those of the stream's next points behind them."""
-    return {name: np.concatenate([before[name], piece[name]]) for name in piece} if before else dict(piece)
-
-
-def thin_stream(pieces: Iterable[Columns], capacity: int, most_sampled: int = 0) -> tuple[Columns, Sample]:
-    """The columns of all pieces, thinned evenly to `capacity` points where there are more, and a sample of all.
-
-    No more than the kept points, the sample and one piece are in memory.  Where the kept ones are too many the voxels
-    are doubled.
+    All where there are no more, else at least half as many.  Whether a row is kept depends on its number alone, and no
+    more than the kept rows and one piece are in memory.
     """
     kept: Columns = {}
-    sample, voxel, corner = Sample(), None, np.zeros(3)
+    keys, seen, halvings = np.zeros(0, np.uint64), 0, 0
     for piece in pieces:
-        sample = sampled(sample, piece, most_sampled)
-        kept = _joined(kept, piece)
-        if len(kept["x"]) <= capacity and voxel is None:
-            continue
-        positions = stacked(kept)
-        if voxel is None:
-            corner, extent = frame(positions)
-            voxel = extent / FINEST
-        first = first_in_voxels(positions - corner, voxel)
-        while len(first) > capacity:
-            voxel *= 2
-            first = first[first_in_voxels(positions[first] - corner, voxel)]
-        kept = {name: values[first] for name, values in kept.items()}
-    return kept, sample
+        rows = np.arange(seen + 1, seen + 1 + len(piece["x"]), dtype=np.uint64) * SCATTER
+        seen += len(rows)
+        if halvings:
+            piece, rows = _rows_below(piece, rows, halvings)
+        kept = {name: np.concatenate([kept[name], piece[name]]) for name in piece} if kept else dict(piece)
+        keys = np.concatenate([keys, rows])
+        while len(keys) > most:
+            halvings += 1
+            kept, keys = _rows_below(kept, keys, halvings)
+    return kept, seen
+
+
+def _rows_below(columns: Columns, keys: np.ndarray, halvings: int) -> tuple[Columns, np.ndarray]:
+    """Columns and keys of the rows whose key is in the lowest 1 / 2^halvings of all numbers."""
+    taken = keys >> np.uint64(64 - halvings) == 0
+    return {name: values[taken] for name, values in columns.items()}, keys[taken]
 
 
 def stacked(columns: Columns) -> np.ndarray:

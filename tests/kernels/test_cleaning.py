@@ -3,7 +3,7 @@ import pytest
 from support.surfel_clouds import cloud, even_square
 
 import spnr_jax
-from spnr_jax.kernels.cleaning import averaged, beside, noise, outliers
+from spnr_jax.kernels.cleaning import averaged, noise, outliers
 from spnr_jax.surfels.visibility import spiral
 
 SIZE = np.array([1.0, 0.7, 0.5])
@@ -76,17 +76,6 @@ def test_nine_in_ten_uniform_outliers_go_and_the_surface_stays(shape, count):
     apart = [outliers(with_outliers(SHAPES[shape](count, "random"), seed)) for seed in range(3)]
     assert np.mean([mask[-(count // 100) :] for mask in apart]) >= 0.9
     assert np.mean([mask[: -(count // 100)] for mask in apart]) < 0.001
-
-
-def test_outliers_that_thinning_made_many_are_told_by_a_sample_of_the_cloud():
-    """Of 200,000 points with 1 % outliers voxels keep 10,000 and all of those."""
-    rng = np.random.default_rng(0)
-    sample = np.concatenate([sphere(10000, "random"), rng.uniform(-2, 2, (100, 3))])
-    surface, apart = sphere(10000, "even"), rng.uniform(-2, 2, (2000, 3))
-    apart = apart[from_sphere(apart) > 0.1]
-    assert beside(surface, sample).mean() > 0.999
-    assert beside(apart, sample).mean() < 0.02
-    assert outliers(np.concatenate([surface, apart]))[len(surface) :].mean() < 0.98  # it was needed
 
 
 @pytest.mark.parametrize(("shape", "distance"), [("sphere", from_sphere), ("box", from_box)])

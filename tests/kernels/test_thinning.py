@@ -1,11 +1,10 @@
-"""Fewer points cover the shape as evenly, whatever their number and however the file is cut into pieces."""
+"""Fewer points cover the shape as evenly, whatever their number; a sample does not depend on the pieces of the file."""
 
 import numpy as np
 import pytest
-from scipy.spatial import cKDTree
 from support.point_clouds import sphere_points
 
-from spnr_jax.kernels.thinning import THINNING, candidates, farthest_points, first_in_voxels, stacked, thin_stream
+from spnr_jax.kernels.thinning import THINNING, candidates, farthest_points, first_in_voxels, sample_stream, stacked
 
 
 @pytest.mark.parametrize("num_points", [500, 6000])  # 6000 is thinned at random before
@@ -65,45 +64,29 @@ def test_a_voxel_keeps_the_first_of_its_points():
 def test_a_stream_that_fits_is_kept_as_it_is_whatever_its_pieces():
     positions = sphere_points(0, 100)
     for size in (7, 50, 100):
-        kept, sample = thin_stream(pieces_of(positions, size), capacity=100)
-        assert sample.seen == 100
+        kept, seen = sample_stream(pieces_of(positions, size), most=100)
+        assert seen == 100
         np.testing.assert_array_equal(kept["tag"], np.arange(100))
         np.testing.assert_array_equal(kept["y"], positions[:, 1])
-    nothing, sample = thin_stream([], capacity=3)
-    assert (nothing, sample.seen) == ({}, 0)
-
-
-@pytest.mark.parametrize("size", [500, 20_000])
-def test_a_stream_that_is_too_long_is_thinned_evenly_and_rows_stay_together(size):
-    positions, capacity = sphere_points(1, 20_000), 800
-    kept, sample = thin_stream(pieces_of(positions, size), capacity)
-    rows = kept["tag"].astype(int)
-    assert sample.seen == 20_000
-    assert capacity / 8 <= len(rows) <= capacity
-    np.testing.assert_array_equal(np.stack([kept[axis] for axis in "xyz"], axis=-1), positions[rows])
-    gap, _ = cKDTree(positions[rows]).query(positions)
-    random = np.random.default_rng(0).choice(20_000, len(rows), replace=False)
-    random_gap, _ = cKDTree(positions[random]).query(positions)
-    assert gap.max() < 0.7 * random_gap.max()
+    assert sample_stream([], most=3) == ({}, 0)
 
 
 @pytest.mark.parametrize("size", [77, 20_000])
-def test_the_sample_of_a_stream_is_as_dense_as_the_stream_whatever_its_pieces(size):
+def test_the_sample_of_a_longer_stream_is_as_dense_as_the_stream_whatever_its_pieces(size):
     positions = sphere_points(1, 20_000)
     positions[:15_000] *= 0.1
-    whole = thin_stream(pieces_of(positions, 20_000), 100, 1000)[1]
-    sample = thin_stream(pieces_of(positions, size), 100, 1000)[1]
-    np.testing.assert_array_equal(stacked(sample.columns), stacked(whole.columns))
-    assert 500 <= len(sample.keys) <= 1000
-    np.testing.assert_allclose(np.mean(np.linalg.norm(stacked(sample.columns), axis=1) < 0.5), 0.75, atol=0.02)
-    assert len(thin_stream(pieces_of(positions, size), 100)[1].keys) == 0
+    whole, _ = sample_stream(pieces_of(positions, 20_000), 1000)
+    sample, seen = sample_stream(pieces_of(positions, size), 1000)
+    rows = sample["tag"].astype(int)
+    assert seen == 20_000
+    np.testing.assert_array_equal(rows, whole["tag"])
+    np.testing.assert_array_equal(stacked(sample), positions[rows])
+    assert 500 <= len(rows) <= 1000
+    np.testing.assert_allclose(np.mean(rows < 15_000), 0.75, atol=0.02)
 
 
-def test_points_far_outside_do_not_make_the_voxels_of_the_others_larger():
-    positions = np.concatenate([sphere_points(2, 5000), [[1e7, 0, 0]]])
-    kept, _ = thin_stream(pieces_of(positions, 6000), capacity=1000)
-    assert len(kept["x"]) > 120
-    assert len(candidates(positions, 60)) > 200
+def test_a_point_far_outside_does_not_make_the_voxels_of_the_others_larger():
+    assert len(candidates(np.concatenate([sphere_points(2, 5000), [[1e7, 0, 0]]]), 60)) > 200
 
 
 def test_candidates_are_enough_and_not_too_many_even_where_points_coincide():
