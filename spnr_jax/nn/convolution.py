@@ -62,14 +62,44 @@ class Conv(nn.Module):
         return y + per_feature(self.param("bias", nn.initializers.zeros, (self.features,)), y)
 
 
+def run_by_run(function: Callable) -> Callable:
+    """The function of trees of arrays, without a gradient; under vmap a loop on a CPU, elsewhere vmap as it is.
+
+    Runs that are computed one after the other keep their arrays in a CPU's caches.
+    """
+    single = jax.custom_batching.custom_vmap(function)
+
+    @single.def_vmap
+    def mapped(axis_size: int, in_batched: Any, *arguments: Any) -> tuple[Any, Any]:
+        del axis_size
+        leaves, tree = jax.tree.flatten(arguments)
+        batched = jax.tree.leaves(in_batched)
+        moving = [x for x, moves in zip(leaves, batched, strict=True) if moves]
+
+        def whole(parts: list) -> tuple:
+            rest = iter(parts)
+            return jax.tree.unflatten(
+                tree, [next(rest) if moves else x for x, moves in zip(leaves, batched, strict=True)]
+            )
+
+        out = lax.platform_dependent(
+            moving,
+            cpu=lambda parts: lax.map(lambda one: single(*whole(one)), parts),
+            default=jax.vmap(lambda one: function(*whole(one))),
+        )
+        return out, jax.tree.map(lambda _: True, out)
+
+    return single
+
+
 @cache
 def _on_cpu(rank: int, stride: int, padding: int) -> Callable[[Array, Array], Array]:
     """The CPU's form for inputs of so many axes."""
     form = _conv2d_cpu if rank == 4 else _conv3d_cpu
-    return _run_by_run(lambda x, kernel: form(x, kernel, stride, padding))
+    return _with_gradients(lambda x, kernel: form(x, kernel, stride, padding))
 
 
-def _run_by_run(form: Callable[[Array, Array], Array]) -> Callable[[Array, Array], Array]:
+def _with_gradients(form: Callable[[Array, Array], Array]) -> Callable[[Array, Array], Array]:
     """A convolution `form(x, kernel)` of which vmap computes one run after the other, in its gradients, too.
 
     With its two gradients it is one of three maps, each linear in two out of input, kernel and what is given for the
@@ -104,19 +134,7 @@ def _pulled(linear: Callable[[Array], Array], shape: tuple[int, ...], cotangent:
 
 def _bilinear(function: Callable[[Array, Array], Array], transposed: Callable[..., Any]) -> Callable:
     """`function(a, b)` with the gradients `transposed(a, b, cotangent)`; under vmap a loop over what is mapped."""
-    single = jax.custom_batching.custom_vmap(function)
-
-    @single.def_vmap
-    def mapped(axis_size: int, in_batched: list[bool], *arguments: Array) -> tuple[Array, bool]:
-        del axis_size
-        moving = [x for x, batched in zip(arguments, in_batched, strict=True) if batched]
-
-        def one(parts: list[Array]) -> Array:
-            rest = iter(parts)
-            return single(*(next(rest) if batched else x for x, batched in zip(arguments, in_batched, strict=True)))
-
-        return lax.map(one, moving), True
-
+    single = run_by_run(function)
     differentiable = jax.custom_vjp(lambda a, b: single(a, b))
     differentiable.defvjp(
         lambda a, b: (differentiable(a, b), (a, b)), lambda inputs, cotangent: transposed(*inputs, cotangent)

@@ -15,10 +15,10 @@ from spnr_jax.config import SurfelConfig, TrainConfig
 from spnr_jax.kernels import losses
 from spnr_jax.kernels.metrics import psnr
 from spnr_jax.kernels.records import Crops
+from spnr_jax.nn.convolution import run_by_run
 from spnr_jax.nn.shader import Shader, picture
 from spnr_jax.training import optimisation
 from spnr_jax.training.optimisation import TrainState
-from spnr_jax.training.run_by_run import run_by_run
 
 LEAST_INSIDE = 1.0  # pixels; where nothing of the object is seen its error is 0
 

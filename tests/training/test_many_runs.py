@@ -12,8 +12,8 @@ from support.laws import numbers
 from support.tiny_training import BATCH, L1_ONLY, create, near, step
 
 from experiments.speed.surfel_scene import random_crops
+from spnr_jax.nn.convolution import run_by_run
 from spnr_jax.training import many_runs, optimisation, shading
-from spnr_jax.training.run_by_run import run_by_run
 
 pytestmark = pytest.mark.ci  # it compiles steps of several runs
 
