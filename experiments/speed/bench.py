@@ -1,63 +1,60 @@
-"""How fast the network is beside a PyTorch twin of the same sizes, in one run.
+"""How fast the paper's network is beside a PyTorch twin of the same sizes, in one process.
 
     python -m experiments.speed.bench [--out runs/bench] [--presets ...] [--modes ...] [--rounds N] [--quick]
 
-Before a preset is timed, both sides render the same scene with the same weights and must agree.  Then each side lives
-in its own process on the same cores, and the two are asked in turn (ours, twin, ours, twin ...) for some runs; the
-ratio is the median over the rounds of ours / theirs, each the median of its turn, so that a slow minute of the machine
-slows both.  "near points" is a function of ours that evaluates less (see `bench_ours`).
+Both are called in turn on the same cores (ours, twin, ours, twin ...); the ratio is the median over the rounds of
+ours / twin, each the median of its turn, so that a slow minute of the machine slows both.  That both are the same
+network the tests say: with the same weights both give the outputs of one fixture (tests/support/twin_fixture.npz).
 
-    OUT/rows.json  results.json  table.md  bench.png   rows.json is written after every row
+    OUT/rows/*.json  results.json  table.md   rows that are there are kept: take another OUT for other code
 """
 
 import dataclasses
-import hashlib
 import importlib.util
-import json
 import os
 import statistics
-import tempfile
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager, ExitStack, nullcontext
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, Literal
 
+import jax
 import numpy as np
 
 from experiments import entry_point
 from experiments.comparison import results_folder
-from experiments.speed import bench_report as report
-from experiments.speed.bench_scene import BATCHES
-from experiments.speed.worker import Worker, worker
-from spnr_jax.devices import machine
-from spnr_jax.errors import UserError, at_least
-from spnr_jax.formats.images import write_whole
+from experiments.speed import scenes, twin_layout
+from spnr_jax.config import TrainConfig
+from spnr_jax.devices import allocator, machine
+from spnr_jax.errors import at_least
+from spnr_jax.kernels.records import Batch
+from spnr_jax.method import inference
+from spnr_jax.scoring.score_tables import Table, number, text
+from spnr_jax.training import optimisation
 
-Preset = Literal["tiny", "small", "abo"]
 Mode = Literal["train", "train_l1", "encode", "render"]
-Variant = Literal["plain", "fast", "compiled"]
+Run = Callable[[], object]
 Row = dict[str, Any]
 
-VARIANTS: tuple[Variant, ...] = ("plain", "fast", "compiled")
-AGREEMENT = 1e-4  # of the norm of each output, between the sides
-ALONE = "none"  # the variant of a row without the twin
-OURS, TWIN = "experiments.speed.ours", "experiments.speed.theirs"
-ROOT = Path(__file__).parents[2]
+BATCHES = {"tiny": 2, "small": 2, "abo": 1}  # objects of a batch, one view of each
+VARIANTS = {"plain": ("plain", False), "fast": ("fast", False), "compiled": ("fast", True)}  # form, torch.compile
+FEWEST = 3  # timed runs of a turn
+WARM_UP = 8  # torch.compile and oneDNN settle later
 
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """Time the network beside its PyTorch twin; write the rows, a table and a plot."""
+    """Time the network beside its PyTorch twin; write a table."""
 
     out: Path = Path("runs/bench")
-    """Folder of the results; a rerun keeps the rows whose code and options are the same."""
-    presets: tuple[Preset, ...] = ("tiny", "small", "abo")
+    """Folder of the results; the same command goes on there."""
+    presets: tuple[Literal["tiny", "small", "abo"], ...] = ("tiny", "small", "abo")
     """Sizes."""
     modes: tuple[Mode, ...] = ("train", "train_l1", "encode", "render")
     """One step with and without the discriminator, points to volume, volume to image."""
-    variants: tuple[Variant, ...] = VARIANTS
+    variants: tuple[Literal["plain", "fast", "compiled"], ...] = ("plain", "fast", "compiled")
     """Of the twin: as a user writes it, tuned, tuned and compiled."""
     rounds: int = 12
     """Turns of each side in a row."""
@@ -65,10 +62,8 @@ class Options:
     """Length of a turn; at least three runs."""
     threads: int = 2
     """Cores that both sides are held to."""
-    platform: Literal["cpu", "cuda"] = "cpu"
-    """Where both sides compute; what peak memory says is the host's."""
     bf16: bool = False
-    """Convolutions of ours, and the twin under torch.autocast, in bfloat16; both are compared in float32 on the CPU."""
+    """Convolutions of ours, and the twin under torch.autocast, in bfloat16; both are compared in float32."""
     quick: bool = False
     """A check that everything works: tiny, two rounds, short turns, into OUT-quick."""
 
@@ -76,170 +71,149 @@ class Options:
         at_least(self, 1, "rounds", "threads")
 
 
-@dataclass(frozen=True, kw_only=True)
-class Cell:
-    """One row of the table."""
-
-    preset: str
-    mode: str
-    function: str
-    variant: str
-
-
 def main(options: Options) -> None:
     """Measures what is not yet measured, a line for each row."""
     if options.quick:
         out = options.out.with_name(f"{options.out.name}-quick")
         options = dataclasses.replace(options, out=out, presets=("tiny",), rounds=2, seconds=0.1)
-    rows = rows_of(options)
-    files = {"bench.png": report.plot(rows)}
-    results_folder.write(options.out, {"rows": rows}, [report.table(rows)], report.settings(rows), files)
+    os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[: options.threads])
+    allocator.keep_arrays()
+    load, rows = machine.load(), rows_of(options)
+    note = f"{machine.hardware()}, load before {load}; {machine.processor()}; {time.strftime('%Y-%m-%d')}"
+    results_folder.write(options.out, {"rows": rows}, [table(rows)], [note])
 
 
 def rows_of(options: Options) -> list[Row]:
-    """All rows that the folder holds of these options, those that were missing measured now."""
-    start, variants = time.monotonic(), twin_variants(options)
-    cores = min(options.threads, len(os.sched_getaffinity(0)))  # that the sides can be held to
-    setting = {
-        "hardware": f"{cores} of {os.cpu_count()} cores, {machine.processor()}",
-        "rounds": options.rounds,
-        "turn_s": options.seconds,
-        "platform": options.platform,
-        "bf16": options.bf16,
-        "code": fingerprint(),
-    }
-    path, cells = options.out / "rows.json", cells_of(options, variants)
-    kept = {cell_of(row): row for row in read_rows(path) if setting.items() <= row.items()}
-    todo = [cell for cell in cells if cell not in kept]
-    if kept:
-        print(f"{len(kept)} rows of the same code and options are kept; remove {path} to measure them again")
-    for done, row in enumerate(measured(options, todo, bool(variants)), start=1):
-        row = setting | row | {"date": time.strftime("%Y-%m-%d")}
-        kept[cell_of(row)] = row
-        write_whole(path, results_folder.as_json(list(kept.values())))
-        left = (time.monotonic() - start) / done * (len(todo) - done)
-        print(f"[{done}/{len(todo)}, about {left / 60:.0f} min left] {report.line(row)}", flush=True)
-    return [kept[cell] for cell in cells_of(Options(), (*VARIANTS, ALONE)) if cell in kept]
-
-
-def twin_variants(options: Options) -> tuple[str, ...]:
-    """The variants to time; none, and a line that says why, where the twin cannot run."""
+    """All rows of these options; those that were missing are measured now."""
+    asked = {name: getattr(options, name) for name in ("rounds", "seconds", "threads", "bf16")}
+    results_folder.claim(options.out, "times beside the twin", asked | {"processor": machine.processor()})
+    variants: tuple[str | None, ...] = options.variants
     if importlib.util.find_spec("torch") is None:
         print("torch is not installed (pip install -c constraints.txt -e '.[bench]'): ours is timed alone")
-        return ()
-    return options.variants
+        variants = (None,)
+    rows = []
+    for preset in options.presets:
+        for mode in options.modes:
+            ours = cache(partial(our_side, preset, mode, options))
+            for variant in variants:
+                place = options.out / "rows" / f"{preset}_{mode}_{variant}.json"
+                rows.append(results_folder.kept(place, partial(measured, preset, mode, variant, ours, options)))
+                print({name: rows[-1][name] for name in ("preset", "mode", "twin_variant", "ours_ms", "twin_ms")})
+            jax.clear_caches()
+    return rows
 
 
-def cells_of(options: Options, variants: Sequence[str]) -> list[Cell]:
-    """All rows of the table, those of one preset and mode together.
-
-    Encoding is the same for both functions; "near points" has nothing to learn from the twin that is not tuned.
-    """
-    return [
-        Cell(preset=preset, mode=mode, function=function, variant=variant)
-        for preset in options.presets
-        for mode in options.modes
-        for variant in variants or (ALONE,)
-        for function in ("network", "near points")
-        if function == "network" or (mode != "encode" and variant != "plain")
-    ]
+def measured(preset: str, mode: Mode, variant: str | None, ours: Callable, options: Options) -> Row:
+    """A row: both sides in turns, ours alone without a variant of the twin."""
+    run, compile_s = ours()
+    theirs = None if variant is None else twin_side(preset, mode, variant, options)
+    turns = [(turn(run, options.seconds), theirs and turn(theirs, options.seconds)) for _ in range(options.rounds)]
+    row: Row = {"preset": preset, "batch": BATCHES[preset], "mode": mode, "twin_variant": variant}
+    row |= {"ours_ms": statistics.median(ms for of, _ in turns for ms in of), "compile_s": compile_s}
+    if theirs is None:
+        return row | {"twin_ms": None, "ratio": None}
+    return row | {"twin_ms": statistics.median(ms for _, of in turns for ms in of), "ratio": paired_ratio(turns)}
 
 
-def cell_of(row: Row) -> Cell:
-    """Which row of the table this is."""
-    return Cell(preset=row["preset"], mode=row["mode"], function=row["function"], variant=row["twin_variant"] or ALONE)
+def paired_ratio(turns: Sequence[tuple[Sequence[float], Sequence[float]]]) -> list[float]:
+    """Quartiles over the rounds of the ratio of the medians of a turn of each side."""
+    ratios = [statistics.median(ours) / statistics.median(theirs) for ours, theirs in turns]
+    return np.quantile(ratios, (0.25, 0.5, 0.75)).tolist()
 
 
-def fingerprint() -> str:
-    """Hash of all code that is timed: a row of other code is measured again."""
-    files = sorted([*ROOT.glob("spnr_jax/**/*.py"), *ROOT.glob("experiments/speed/[!b]*.py")])
-    return hashlib.sha256(b"\0".join(path.read_bytes() for path in files)).hexdigest()[:12]
+def turn(run: Run, seconds: float) -> list[float]:
+    """Milliseconds of each run until so many seconds are full; one run before them refills the caches."""
+    run()
+    taken: list[float] = []
+    while len(taken) < FEWEST or sum(taken) < 1e3 * seconds:
+        start = time.perf_counter()
+        run()
+        taken.append(1e3 * (time.perf_counter() - start))
+    return taken
 
 
-def measured(options: Options, cells: Sequence[Cell], with_twin: bool) -> Iterator[Row]:
-    """A row for each cell; the processes of a preset and mode are shared by its rows."""
-    for preset in dict.fromkeys(cell.preset for cell in cells):
-        if with_twin:
-            check_parity(options, preset)
-        for mode in dict.fromkeys(cell.mode for cell in cells if cell.preset == preset):
-            here = [cell for cell in cells if (cell.preset, cell.mode) == (preset, mode)]
-            spec = {"preset": preset, "mode": mode, "batch": BATCHES[preset], "threads": options.threads}
-            spec |= {"platform": options.platform, "bf16": options.bf16}
-            with ExitStack() as stack:
-                ours = {
-                    function: stack.enter_context(worker(OURS, spec | {"function": function}))
-                    for function in dict.fromkeys(cell.function for cell in here)
-                }
-                for variant in dict.fromkeys(cell.variant for cell in here):
-                    with twin_worker(spec, variant) as twin:
-                        for cell in here:
-                            if cell.variant == variant:
-                                yield dataclasses.asdict(cell) | compare(ours[cell.function], twin, cell, options)
+def our_config(preset: str, mode: Mode = "train", objects: int = 1) -> TrainConfig:
+    """Our config of the twin's sizes, without R1; "train_l1" has no discriminator."""
+    sizes = twin_layout.PRESETS[preset]
+    return twin_layout.train_config(dataclasses.replace(sizes, adv_weight=float(mode != "train_l1")), objects)
 
 
-def twin_worker(spec: dict, variant: str) -> AbstractContextManager[Worker | None]:
-    """The twin's process; None for a row without the twin."""
-    if variant == ALONE:
-        return nullcontext()
-    return worker(TWIN, spec | {"variant": variant})
+def our_batch(config: TrainConfig) -> Batch:
+    """The benchmark's scene on the device."""
+    found = scenes.arrays(config.batch_objects, config.model.image_resolution, config.max_points)
+    return jax.device_put(twin_layout.batch(found))
 
 
-def check_parity(options: Options, preset: str) -> None:
-    """ValueError unless both sides make the same of the same scene with the same weights."""
-    with tempfile.TemporaryDirectory() as folder:
-        file = str(Path(folder) / "twin.npz")
-        spec = {"preset": preset, "mode": "parity", "batch": BATCHES[preset], "threads": options.threads}
-        spec |= {"parity": file}
-        with worker(TWIN, spec):  # writes the file
-            pass
-        with worker(OURS, spec) as ours:
-            found = ours.facts["differences"]
-    for name, difference in found.items():
-        if not difference <= AGREEMENT:
-            raise UserError(
-                f"{preset}: {name} differs from the twin's by {difference:.1e} of its norm, more than {AGREEMENT:g}; "
-                "nothing is timed, because the two are not the same network"
-            )
-    print(f"{preset}: the same network as the twin, within {max(found.values()):.1e} of the norm of every output")
+def our_side(preset: str, mode: Mode, options: Options) -> tuple[Run, float]:
+    """What to time, and the seconds that its compilation took."""
+    config = our_config(preset, mode, BATCHES[preset])
+    if options.bf16:
+        config = dataclasses.replace(config, model=dataclasses.replace(config.model, precision="bfloat16"))
+    run, start = function(config, our_batch(config), mode), time.perf_counter()
+    run()
+    first = time.perf_counter() - start
+    return run, first - 1e-3 * min(turn(run, seconds=0))
 
 
-def compare(ours: Worker, twin: Worker | None, cell: Cell, options: Options) -> Row:
-    """The rest of a row, from the turns of both."""
-    rounds, load = [], machine.load()
-    for _ in range(options.rounds):
-        rounds.append((ours.turn(options.seconds), twin.turn(options.seconds) if twin else None))
-    row: Row = {"batch": BATCHES[cell.preset], "load": load, **side("ours", [a for a, _ in rounds])}
-    row |= {"compile_s": ours.facts["compile_s"], "ours_software": ours.facts["software"]}
-    names = ("twin_ms", "twin_min_ms", "twin_peak_mb", "twin_idle_cpu_s", "ratio", "ratio_low", "ratio_high")
-    row |= dict.fromkeys(names) | {"twin_variant": None, "twin_software": None}
-    if twin is None:
-        return row
-    theirs = [b for _, b in rounds if b is not None]
-    ratios = [statistics.median(a["ms"]) / statistics.median(b["ms"]) for (a, _), b in zip(rounds, theirs, strict=True)]
-    low, middle, high = np.quantile(ratios, (0.25, 0.5, 0.75)).tolist()
-    row |= side("twin", theirs) | {"ratio": round(middle, 4), "ratio_low": round(low, 4), "ratio_high": round(high, 4)}
-    return row | {"twin_variant": cell.variant, "twin_software": twin.facts["software"]}
+def function(config: TrainConfig, batch: Batch, mode: Mode) -> Run:
+    """One step, one encoding of the batch, or one view of each of its volumes; returns when it is done."""
+    state = optimisation.jitted_create_state(config)
+    if mode.startswith("train"):
+
+        def step() -> None:
+            nonlocal state
+            state, metrics = optimisation.jitted_train_step(state, batch, config=config, adversarial=mode == "train")
+            jax.block_until_ready((state, metrics))
+
+        return step
+    variables, cloud = optimisation.averaged_variables(state), batch.cloud
+    encode = partial(inference.jitted_encode, variables, cloud, config=config.model)
+    if mode == "encode":
+        return lambda: jax.block_until_ready(encode())
+    draw = partial(inference.jitted_render, variables, encode(), batch.camera, config=config.model)
+    return lambda: jax.block_until_ready(draw())
 
 
-def side(name: str, turns: Sequence[dict]) -> Row:
-    """Median and least milliseconds of all runs of one side, its peak memory and what it used while it waited."""
-    runs = [ms for turn in turns for ms in turn["ms"]]
-    return {
-        f"{name}_ms": round(statistics.median(runs), 2),
-        f"{name}_min_ms": round(min(runs), 2),
-        f"{name}_peak_mb": max(turn["peak_mb"] for turn in turns),
-        f"{name}_idle_cpu_s": round(max(turn["idle_cpu_s"] for turn in turns), 4),
-    }
+def twin_side(preset: str, mode: Mode, variant: str, options: Options) -> Run:
+    """The same of the twin, warm."""
+    import torch
+
+    from experiments.speed import twin
+
+    device = "cpu" if jax.default_backend() == "cpu" else "cuda"  # where ours computes
+    torch.set_num_threads(options.threads)
+    torch.set_default_device(device)
+    sizes, (form, compiled) = twin_layout.PRESETS[preset], VARIANTS[variant]
+    inputs = scenes.arrays(BATCHES[preset], 2 * sizes.render, sizes.points).items()
+    batch = {name: torch.from_numpy(x).to(device) for name, x in inputs}
+    work = twin.function(sizes, batch, mode, form, compiled)
+
+    def run() -> None:
+        with torch.autocast(device, torch.bfloat16, enabled=options.bf16):
+            work()
+        if device == "cuda":
+            torch.cuda.synchronize()
+
+    for _ in range(WARM_UP):
+        run()
+    return run
 
 
-def read_rows(path: Path) -> list[Row]:
-    """The rows of an earlier run."""
-    if not path.exists():
-        return []
-    try:
-        return json.loads(path.read_text())
-    except ValueError as error:
-        raise UserError(f"{path} is no JSON ({error}); remove it or choose another --out") from None
+def table(rows: Sequence[Row]) -> Table:
+    """Medians of milliseconds, the ratio with its quartiles over the rounds."""
+    made = []
+    for row in rows:
+        low, middle, high = row["ratio"] or (0, None, 0)
+        cells = (
+            text(row["mode"]),
+            text(row["twin_variant"] or "-"),
+            *(number(row[name], 1, missing="-") for name in ("ours_ms", "twin_ms")),
+            number(middle, 2, (low, high), missing="-"),
+            number(row["compile_s"], 1),
+        )
+        made.append((f"{row['preset']}, batch {row['batch']}", cells))
+    heads = ("mode", "twin", "ours, ms", "twin, ms", "ours / twin", "compile, s")
+    return Table(title="One step, one encoding, one view", heads=heads, rows=tuple(made))
 
 
 if __name__ == "__main__":

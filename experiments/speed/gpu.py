@@ -28,8 +28,8 @@ import numpy as np
 
 from experiments import entry_point
 from experiments.comparison import clock, results_folder
-from experiments.speed import bench, ours
-from experiments.speed.surfel_scene import orbiting, random_crops, sphere
+from experiments.speed import bench
+from experiments.speed.scenes import orbiting, random_crops, sphere
 from spnr_jax import cli
 from spnr_jax.config import RayNetworkConfig, SurfelConfig, TrainConfig
 from spnr_jax.devices import machine
@@ -124,13 +124,13 @@ def surfel_config(options: OnGPU) -> TrainConfig:
 
 def many_trainings(options: OnGPU) -> list[Found]:
     """Steps of a run, of all runs under one vmap, beside those of a loop over the same step."""
-    config = small(PRESETS["tiny"]()) if options.quick else ours.twin_sized("tiny", "train_l1", 2)
+    config = small(PRESETS["tiny"]()) if options.quick else bench.our_config("tiny", "train_l1", 2)
     tiny = partial(optimisation.train_step, config=config, adversarial=False)
     surfels = dataclasses.replace(surfel_config(options), batch_objects=2)
     crops = random_crops(surfels, doublings=1)
     over_crops = partial(shading.train_step, config=surfels)
     return [
-        at_once(options, "`tiny`", tiny, config, ours.batch(config)),
+        at_once(options, "`tiny`", tiny, config, bench.our_batch(config)),
         at_once(options, f"`surfels`, 2 crops of {crops.seen.shape[1]} px,", over_crops, surfels, crops),
     ]
 
@@ -168,16 +168,13 @@ def small(config: TrainConfig) -> TrainConfig:
 
 def beside_twin(options: OnGPU) -> list[Found]:
     """Rows of the benchmark in bfloat16 on this device; ours alone without torch."""
-    platform: Any = "cpu" if jax.default_backend() == "cpu" else "cuda"
-    asked = bench.Options(
-        out=options.out / "bench", variants=("compiled",), platform=platform, bf16=True, rounds=options.rounds
-    )
+    asked = bench.Options(out=options.out / "bench", variants=("compiled",), bf16=True, rounds=options.rounds)
     if options.quick:
         asked = dataclasses.replace(asked, presets=("tiny",), modes=("render",), seconds=0.1)
     rows = bench.rows_of(asked)
     return [
         Found(
-            what=f"paper's network `{row['preset']}` in bfloat16, {row['mode']}, {row['function']}",
+            what=f"paper's network `{row['preset']}` in bfloat16, {row['mode']}",
             unit="objects",
             a_second=1e3 * row["batch"] / row["ours_ms"],
             beside=row["twin_ms"] and 1e3 * row["batch"] / row["twin_ms"],

@@ -1,4 +1,4 @@
-"""Where the time of a training step and of a film frame goes, and what the machine's limit would be.
+"""Where the time of a training step and of a film frame goes, the machine's limit, and how cost grows with the work.
 
     python -m experiments.speed.where_time_goes [--out runs/where_time_goes] [--points 4096] [--size 512] [--quick]
 
@@ -7,15 +7,19 @@ stand the operations that the compiler counts in it (`cost_analysis`) and how lo
 product of matrices, which is measured in the same turns.  On a CPU time is that of the processor, all threads added up,
 so that other work on the machine changes little.  Weights are fresh: no time depends on them.
 
+The paper's network (`tiny`, one object, one view, 1,024 points) is given more and more work along one axis at a time.
+Cost that is linear in the work has slope 1 on a log-log plot, less where something that does not grow takes a part; the
+table has the slope of a line through all values, and that of the last step, where the rest weighs least.
+
     OUT/results.json  table.md
 """
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,15 +27,18 @@ import numpy as np
 
 from experiments import entry_point
 from experiments.comparison import clock, results_folder
-from experiments.speed.surfel_scene import orbiting, random_crops, sphere
+from experiments.speed import bench
+from experiments.speed.scenes import orbiting, random_crops, sphere
 from spnr_jax import cli
-from spnr_jax.config import SurfelConfig
+from spnr_jax.config import RayNetworkConfig, SurfelConfig, TrainConfig
 from spnr_jax.devices import machine
 from spnr_jax.errors import at_least
+from spnr_jax.kernels import cameras
+from spnr_jax.kernels.records import Batch
 from spnr_jax.method import surfel_plan, surfel_renderer
 from spnr_jax.nn.shader import Shader, picture
 from spnr_jax.presets import PRESETS
-from spnr_jax.scoring.score_tables import Table, number
+from spnr_jax.scoring.score_tables import Table, number, text
 from spnr_jax.surfels import projection
 from spnr_jax.surfels.lighting import room_light
 from spnr_jax.training import optimisation, shading
@@ -53,6 +60,8 @@ class WhereTimeGoes:
     """Of the crops of the training step: 0 to 4, most steps have 0 to 2."""
     rounds: int = 9
     """Turns of each program."""
+    only: tuple[Literal["points", "volume", "image", "samples", "views", "objects"], ...] = ()
+    """Axes along which work grows (default: all)."""
     quick: bool = False
     """A check that everything works: a few points and pixels, two turns."""
 
@@ -68,7 +77,7 @@ class Program(NamedTuple):
 
 
 def main(options: WhereTimeGoes) -> None:
-    """Times both, and writes a table of each."""
+    """Times both and the growth of cost, and writes a table of each."""
     cli.set_up_jax()
     if options.quick:
         options = dataclasses.replace(options, points=256, size=64, rounds=2)
@@ -78,6 +87,8 @@ def main(options: WhereTimeGoes) -> None:
     for name, programs in parts.items():
         found[name], shown = timed(programs, options.rounds), name[0].upper() + name[1:]
         tables.append(table(shown, programs, found[name]))
+    found["growth"] = {name: grown(name, options) for name in options.only or AXES}
+    tables.append(growth_table(found["growth"]))
     sizes = f"{options.points} points, {options.size} px, crops of {options.doublings} doublings"
     results_folder.write(options.out, found, tables, [f"{sizes}; {found['processor']}, load {found['load']}."])
 
@@ -171,6 +182,92 @@ def table(title: str, programs: Mapping[str, Program], taken: Mapping[str, float
         rows.append((name, (*cells, *counted, number(None if limit is None else limit / ms, 2, missing="-"))))
     heads = ("ms", "of the whole", "10^9 operations", "ms at the pace of a product", "of that pace")
     return Table(title=title, heads=heads, rows=tuple(rows))
+
+
+class Axis(NamedTuple):
+    """`case` makes network and inputs of a value; the work grows with the value to this power."""
+
+    mode: bench.Mode
+    values: tuple[int, ...]
+    power: int
+    case: Callable[[TrainConfig, int], tuple[TrainConfig, Batch]]
+
+
+def with_points(config: TrainConfig, count: int) -> tuple[TrainConfig, Batch]:
+    """Clouds of so many points."""
+    return config, bench.our_batch(dataclasses.replace(config, min_points=count, max_points=count))
+
+
+def with_objects(config: TrainConfig, count: int) -> tuple[TrainConfig, Batch]:
+    """So many objects in a batch."""
+    return config, bench.our_batch(dataclasses.replace(config, batch_objects=count))
+
+
+def with_views(config: TrainConfig, count: int) -> tuple[TrainConfig, Batch]:
+    """So many cameras for each object."""
+    batch = bench.our_batch(config)
+    return config, dataclasses.replace(batch, camera=jax.tree.map(lambda x: jnp.repeat(x, count, 1), batch.camera))
+
+
+def with_pixels(config: TrainConfig, size: int) -> tuple[TrainConfig, Batch]:
+    """Images of so many pixels along each side, by the same network."""
+    batch = bench.our_batch(config)
+    return config, dataclasses.replace(batch, camera=cameras.resize(batch.camera, size, size))
+
+
+def with_volume(config: TrainConfig, resolution: int) -> tuple[TrainConfig, Batch]:
+    """Volumes of so many voxels along each side."""
+    assert isinstance(config.model, RayNetworkConfig)
+    encoder = dataclasses.replace(config.model.encoder, volume_resolution=resolution)
+    model = dataclasses.replace(config.model, encoder=encoder)
+    return dataclasses.replace(config, model=model), bench.our_batch(config)
+
+
+def with_samples(config: TrainConfig, count: int) -> tuple[TrainConfig, Batch]:
+    """So many samples on each ray, half of them coarse."""
+    assert isinstance(config.model, RayNetworkConfig)
+    sampling = dataclasses.replace(config.model.sampling, num_coarse=count // 2, num_fine=count // 2)
+    model = dataclasses.replace(config.model, sampling=sampling)
+    return dataclasses.replace(config, model=model), bench.our_batch(config)
+
+
+POWERS = tuple(2**i for i in range(21))
+AXES = {
+    "points": Axis("encode", POWERS[9::3], 1, with_points),
+    "volume": Axis("encode", POWERS[5:8], 3, with_volume),
+    "image": Axis("render", POWERS[6:11], 2, with_pixels),
+    "samples": Axis("render", POWERS[4:8], 1, with_samples),
+    "views": Axis("render", POWERS[:5], 1, with_views),
+    "objects": Axis("train_l1", POWERS[:5], 1, with_objects),
+}
+
+
+def grown(name: str, options: WhereTimeGoes) -> dict[str, Any]:
+    """Least milliseconds at each value of an axis, and the slopes that follow."""
+    axis = AXES[name]
+    values = axis.values[:2] if options.quick else axis.values
+    cases = [axis.case(bench.our_config("tiny", "train_l1"), value) for value in values]
+    runs = [bench.function(config, batch, axis.mode) for config, batch in cases]
+    ms = [1e3 * min(clock.in_turns({name: run}, options.rounds)[name]) for run in runs]
+    slope, last = slopes([value**axis.power for value in values], ms)
+    return {"mode": axis.mode, "ms": dict(zip(map(str, values), ms, strict=True)), "slope": slope, "last_slope": last}
+
+
+def slopes(work: Sequence[float], ms: Sequence[float]) -> tuple[float, float]:
+    """Slope of the log-log line through all points, and between the last two."""
+    x, y = np.log(work), np.log(ms)
+    return float(np.polyfit(x, y, 1)[0]), float((y[-1] - y[-2]) / (x[-1] - x[-2]))
+
+
+def growth_table(found: Mapping[str, Mapping]) -> Table:
+    """The milliseconds of each axis and its slopes."""
+    rows = []
+    for name, row in found.items():
+        label = f"{name}, to the power of {AXES[name].power}" if AXES[name].power > 1 else name
+        times = ", ".join(f"{value}: {ms:.1f}" for value, ms in row["ms"].items())
+        rows.append((label, (text(row["mode"]), text(times), number(row["slope"], 2), number(row["last_slope"], 2))))
+    heads = ("mode", "value: ms", "slope", "of the last step")
+    return Table(title="Milliseconds along each axis", heads=heads, rows=tuple(rows))
 
 
 if __name__ == "__main__":

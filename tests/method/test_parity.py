@@ -19,10 +19,10 @@ from spnr_jax.training import adversary, optimisation
 
 TOLERANCE = 1e-4
 ARRAYS = twin.load()
-CONFIG = twin_layout.train_config(ARRAYS)
-BATCH = jax.tree.map(jnp.asarray, twin_layout.batch(ARRAYS))
-GENERATOR, STATISTICS = twin_layout.generator(ARRAYS)
-DISCRIMINATOR = twin_layout.discriminator(ARRAYS)
+CONFIG = twin_layout.train_config(twin.config(ARRAYS))
+BATCH = jax.tree.map(jnp.asarray, twin_layout.batch(twin.inputs(ARRAYS)))
+GENERATOR, STATISTICS = twin.generator(ARRAYS)
+DISCRIMINATOR = twin.discriminator(ARRAYS)
 VARIABLES = {"params": GENERATOR, "batch_stats": STATISTICS}
 
 
