@@ -2,7 +2,7 @@
 
     OUT/asked.json     what was asked for; another request is refused, because its results would be mixed in
     OUT/results.json   every number and its conditions
-    OUT/table.md .csv .tex  and the pictures
+    OUT/table.md       and the pictures
 
 What was made stands in files of its own, so that the same command goes on where it was stopped.
 """
@@ -15,11 +15,10 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from experiments.comparison import result_tables
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets, images
 from spnr_jax.formats.npz import packed
-from spnr_jax.scoring.score_tables import Table
+from spnr_jax.scoring.score_tables import Cell, Table
 from spnr_jax.training import run_record
 
 
@@ -79,12 +78,25 @@ def write(
     """Writes results.json, the tables and what else there is, and prints the tables."""
     everything = {
         "results.json": as_json(results),
-        "table.md": result_tables.markdown(made, notes).encode(),
-        "table.csv": result_tables.csv_text(made).encode(),
-        "table.tex": result_tables.latex(made, notes).encode(),
+        "table.md": markdown(made, notes).encode(),
         **(files or {}),
     }
     for name, content in everything.items():
         images.write_whole(out / name, content)
-    print(result_tables.markdown(made))
+    print(markdown(made))
     print(f"wrote {', '.join(everything)} in {out}", flush=True)
+
+
+def markdown(tables: Sequence[Table], notes: Sequence[str] = ()) -> str:
+    """The tables, and the notes as a list; a row that could not be made has its reason alone."""
+    parts = []
+    for table in tables:
+        rows = [(name, *map(_words, cells), *[""] * (len(table.heads) - len(cells))) for name, cells in table.rows]
+        lines = [("", *table.heads), ("---", *["---:"] * len(table.heads)), *rows]
+        body = "\n".join(f"| {' | '.join(line)} |" for line in lines).replace("\N{NO-BREAK SPACE}", " ")
+        parts.append("\n".join([f"### {table.title}", "", *([table.note, ""] if table.note else []), body, ""]))
+    return "\n".join([*parts, *(f"- {line}" for line in notes)]).rstrip() + "\n"
+
+
+def _words(cell: Cell) -> str:
+    return " ".join([f"**{cell.text}**" if cell.best else cell.text, *cell.small])

@@ -5,7 +5,7 @@
     OUT/runs/METHOD/          the run folders of the networks (experiments/comparison/budget.py says what a budget is)
     OUT/poisson_1024/         pictures of the reconstructions from so many points; OUT/poisson_trimmed_1024/
     OUT/results.json          everything below as numbers: scores, costs, settings, hardware, seed
-    OUT/table.md .csv .tex    the tables
+    OUT/table.md    the tables
     OUT/table1.html           the tables, and pictures of unseen objects to flip through
 
 The same command goes on where it was stopped and trains nothing twice.  The same seed gives the same scores on a CPU;
@@ -14,6 +14,7 @@ times, and with --minutes the number of steps, are those of the machine.
 
 import dataclasses
 import statistics
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -22,10 +23,9 @@ from typing import Literal
 from data_gen.render.poisson_surface import pymeshlab
 from experiments import entry_point
 from experiments.comparison import budget, page, poisson, results_folder
-from experiments.comparison.budget import NETWORKS, Budget, Trained
+from experiments.comparison.budget import NETWORKS, QUICK_STEPS, Budget, Trained
 from experiments.comparison.object_scores import ObjectMethod, Scored, Shown, by_category, of_cloud, score_objects
 from experiments.comparison.trained_networks import LABELS, test_objects
-from experiments.paper import table1_tables
 from spnr_jax import cli
 from spnr_jax.config import TrainConfig
 from spnr_jax.devices import machine
@@ -33,7 +33,97 @@ from spnr_jax.errors import UserError, at_least
 from spnr_jax.formats import data_sets
 from spnr_jax.presets import PRESETS
 from spnr_jax.scoring import evaluation
+from spnr_jax.scoring.report import duration
+from spnr_jax.scoring.score_tables import Cell, Table, difference, head, lowered, number, quality
 from spnr_jax.scoring.summary import differences, metric_settings, summarise
+
+METRICS = ("psnr", "ssim", "lpips", "flip", "cpsnr", "iou")
+COSTS = {"parameters": "Parameters", "steps": "Steps", "training_seconds": "Training", "ms_per_view": "ms per view"}
+HEADS = tuple(map(head, METRICS))
+BUDGETS = {
+    "quick": f"the tiny presets for {QUICK_STEPS} steps each, which shows that everything runs and nothing else",
+    "tiny": "the tiny presets, 64 px",
+    "paper": "the paper presets",
+}
+
+
+def tables_of(results: Mapping) -> list[Table]:
+    """The table of methods, the differences, and a table of each class of objects."""
+    made = [methods_table(results)]
+    if results["differences"]:
+        made.append(differences_table(results["compared"], results["differences"]))
+    for name, methods in results["per_category"].items():
+        count = next(iter(methods.values()))["objects"]
+        title = f"{name}, {count} object{'s' * (count != 1)}"
+        made.append(
+            Table(
+                title=title,
+                heads=HEADS,
+                rows=tuple((LABELS[name], cells) for name, cells in quality(methods, METRICS).items()),
+            )
+        )
+    return made
+
+
+def methods_table(results: Mapping) -> Table:
+    """Quality and cost of every method; rows that could not be made say why."""
+    methods, missing = results["methods"], results["missing"]
+    rows = {
+        LABELS[name]: (*cells, *(_cost(results["costs"][name], column) for column in COSTS))
+        for name, cells in quality(methods, METRICS).items()
+    }
+    rows |= {LABELS[name]: (Cell(text=reason),) for name, reason in missing.items()}
+    counts = next(iter(methods.values()))
+    return Table(
+        title=f"Methods, {counts['objects']} unseen objects, {counts['views']} views",
+        heads=(*HEADS, *COSTS.values()),
+        rows=tuple((label, rows[label]) for label in LABELS.values() if label in rows),
+        note="Means over images with 95 % bootstrap intervals over objects; the best of a column stands out.",
+    )
+
+
+def differences_table(first: str, differences: Mapping) -> Table:
+    """A network minus each other method, image by image."""
+    rows = tuple(
+        (f"{LABELS[first]} minus {lowered(name)}", tuple(difference(row.get(metric), metric) for metric in METRICS))
+        for name, row in differences.items()
+    )
+    note = "Image by image, with 95 % bootstrap intervals and the p-value of a sign-flip test, both over objects."
+    return Table(title="Paired differences", heads=HEADS, rows=rows, note=note)
+
+
+def _cost(cost: Mapping, column: str) -> Cell:
+    value = cost.get(column)
+    if column == "training_seconds" and value is not None:
+        return Cell(text=duration(value), value=value)
+    return number(value, 1 if column == "ms_per_view" else 0, missing="-")
+
+
+def notes(results: Mapping) -> list[str]:
+    """What a reader has to know of the numbers: budget, data, machine, seed, how they were measured."""
+    counts, costs = next(iter(results["methods"].values())), results["costs"]
+    presets = ", ".join(f"{LABELS[name]} {cost['preset']}" for name, cost in costs.items() if "preset" in cost)
+    minutes = results["minutes"]
+    rule = (
+        "every network trains the steps of its preset"
+        if minutes is None
+        else f"every network trains as many steps as fit into {minutes:g} minutes on this machine, its warm-up and "
+        "decay over exactly these; measured beforehand, compilation, checkpoints and previews not counted"
+    )
+    budget = f"Budget {results['budget']}: {BUDGETS[results['budget']]}"
+    factors = ", ".join(f"{LABELS[name]} {value:g}" for name, value in results["radius_factors"].items())
+    objects = results["data"]
+    lines = [
+        budget + ("." if results["budget"] == "quick" else f"; {rule}.") + (f" Presets: {presets}." if presets else ""),
+        f"All methods: the same {objects['train objects']} training objects, {counts['objects']} test objects of "
+        f"{objects['test objects']}, cameras, and first {results['points']} points; {results['resolution']} px.",
+        f"Hardware: {results['hardware']}; Poisson surfaces are made and rendered on its CPU. Seed {results['seed']}.",
+        "Training is the time of the steps, without compilation. ms per view: median over the objects but the first; "
+        "what is done once per object is shared by its views.",
+        *(f"{name}: {text}." for name, text in results["metrics"].items()),
+    ]
+    return lines + ([f"Radius of a point, in point spacings, best on training objects: {factors}."] if factors else [])
+
 
 Row = Literal[
     "near_points", "paper", "npbg", "point_nerf", "points2nerf",
@@ -138,7 +228,7 @@ def numbers(scored: Scored) -> dict[str, str | dict | None]:
 
 def write(out: Path, found: dict, shown: list[Shown]) -> None:
     """Writes results, tables and page, and prints the tables."""
-    tables, notes = table1_tables.tables(found), table1_tables.notes(found)
+    tables, how = tables_of(found), notes(found)
     named = [
         dataclasses.replace(
             one,
@@ -147,8 +237,8 @@ def write(out: Path, found: dict, shown: list[Shown]) -> None:
         )
         for one in shown
     ]
-    whole = page.page("Table 1: every method on the same unseen objects", tables, notes, named)
-    results_folder.write(out, found, tables, notes, {"table1.html": whole.encode()})
+    whole = page.page("Table 1: every method on the same unseen objects", tables, how, named)
+    results_folder.write(out, found, tables, how, {"table1.html": whole.encode()})
 
 
 def surface_folder(options: Table1, config: TrainConfig, row: str) -> Path:
@@ -187,7 +277,7 @@ def train_networks(options: Table1, dataset: data_sets.Dataset, presets: dict[st
     """The networks of the table, one after another; finished ones are only read."""
     wanted: list[str] = [name for name in NETWORKS if name in options.methods]
     trained = {}
-    for number, name in enumerate(wanted):
+    for place_of, name in enumerate(wanted):
         run = options.out / "runs" / name
         if options.minutes and not (run / "config.json").is_file():
             print(f"{LABELS[name]}: measuring the pace of a step", flush=True)
@@ -195,9 +285,9 @@ def train_networks(options: Table1, dataset: data_sets.Dataset, presets: dict[st
         left = (
             ""
             if options.minutes is None
-            else f", {options.minutes * (len(wanted) - number):g} min of steps left in all"
+            else f", {options.minutes * (len(wanted) - place_of):g} min of steps left in all"
         )
-        place = f"network {number + 1} of {len(wanted)}, {LABELS[name]}"
+        place = f"network {place_of + 1} of {len(wanted)}, {LABELS[name]}"
         print(f"{place}: preset {config.preset}, {config.num_steps} steps in {run}{left}", flush=True)
         trained[name] = budget.train(config, dataset, run)
     return trained

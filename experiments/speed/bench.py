@@ -25,7 +25,7 @@ import numpy as np
 
 from experiments import entry_point
 from experiments.comparison import results_folder
-from experiments.speed import scenes, twin_layout
+from experiments.speed import speed_scenes, twin_layout
 from spnr_jax.config import TrainConfig
 from spnr_jax.devices import allocator, machine
 from spnr_jax.errors import at_least
@@ -140,7 +140,7 @@ def our_config(preset: str, mode: Mode = "train", objects: int = 1) -> TrainConf
 
 def our_batch(config: TrainConfig) -> Batch:
     """The benchmark's scene on the device."""
-    found = scenes.arrays(config.batch_objects, config.model.image_resolution, config.max_points)
+    found = speed_scenes.arrays(config.batch_objects, config.model.image_resolution, config.max_points)
     return jax.device_put(twin_layout.batch(found))
 
 
@@ -184,7 +184,7 @@ def twin_side(preset: str, mode: Mode, variant: str, options: Options) -> Run:
     torch.set_num_threads(options.threads)
     torch.set_default_device(device)
     sizes, (form, compiled) = twin_layout.PRESETS[preset], VARIANTS[variant]
-    inputs = scenes.arrays(BATCHES[preset], 2 * sizes.render, sizes.points).items()
+    inputs = speed_scenes.arrays(BATCHES[preset], 2 * sizes.render, sizes.points).items()
     batch = {name: torch.from_numpy(x).to(device) for name, x in inputs}
     work = twin.function(sizes, batch, mode, form, compiled)
 

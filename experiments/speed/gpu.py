@@ -29,7 +29,7 @@ import numpy as np
 from experiments import entry_point
 from experiments.comparison import clock, results_folder
 from experiments.speed import bench
-from experiments.speed.scenes import orbiting, random_crops, sphere
+from experiments.speed.speed_scenes import orbiting, random_crops, sphere
 from spnr_jax import cli
 from spnr_jax.config import RayNetworkConfig, SurfelConfig, TrainConfig
 from spnr_jax.devices import machine

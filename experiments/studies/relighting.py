@@ -6,7 +6,7 @@ Each data set holds the same objects under one kind of light (`spnr-data generat
 `--lights room`), turned for every view and kept beside it.  Beside the network: the same discs and light alone, with
 and without the visibility of the points (split-sum shading, Karis 2013).  Nothing is rescaled to the reference.
 
-    OUT/results.json  OUT/table.md .csv .tex     dB, dB inside, FLIP, log error of linear light, of each light; margins
+    OUT/results.json  OUT/table.md     dB, dB inside, FLIP, log error of linear light, of each light; margins
     OUT/gallery.png                              references over pictures, an object a row, a light a column
 """
 

@@ -7,7 +7,7 @@ The points of the test objects (`spnr-data generate --spread even`) are spoiled 
 standard deviation along each axis, in units of the box whose half diagonal is 1; scanners see from random directions.
 Rivals draw the same cleaned points: discs and light alone, and of --meshed objects trimmed Poisson surfaces.
 
-    OUT/results.json  OUT/table.md .csv .tex     dB, dB inside, FLIP of each fault, with and without cleaning; of rivals
+    OUT/results.json  OUT/table.md     dB, dB inside, FLIP of each fault, with and without cleaning; of rivals
     OUT/gallery.png                              references and pictures of the first objects, a fault a column
 """
 

@@ -11,7 +11,6 @@ were.  Keeps every setting in a file of its own (an interrupted call goes on); w
 ms a view   median over objects of the fastest of several drawings of all views, as of a film, the cloud encoded before;
             on a CPU of the processor, all cores together: other work on the machine does not count
 s to encode the same for a cloud, once, all compiled
-MB          of memory at most above what was held before the picture, the largest over objects
 front       settings of a size that no other beats in both PSNR and ms a view; its knee lies farthest above the line
             from its cheapest to its best, PSNR against the logarithm of the time
 """
@@ -28,24 +27,188 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import tyro
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 
 from data_gen.render import poisson_surface
 from experiments import entry_point
-from experiments.comparison import clock, poisson, results_folder
+from experiments.comparison import clock, figures, poisson, results_folder
 from experiments.comparison.object_views import few, on_white, told, view_of
-from experiments.comparison.peak_memory import forget_peak, peak_mb
 from experiments.comparison.trained_networks import test_objects
-from experiments.studies.speed_accuracy_plot import plot
-from experiments.studies.speed_accuracy_report import both, front, knee
-from experiments.studies.speed_accuracy_settings import Setting, settings
 from spnr_jax import cli
+from spnr_jax.config import NetworkConfig, RayNetworkConfig, SurfelConfig
 from spnr_jax.devices import machine
 from spnr_jax.formats import data_sets
 from spnr_jax.kernels import cameras, metrics
 from spnr_jax.kernels.records import Camera, Rendering, Volume
 from spnr_jax.method.model import Model, Quality
 from spnr_jax.scoring.perceptual import flip
+from spnr_jax.scoring.score_tables import Table, number, text
 from spnr_jax.training.weights import load
+
+SHARES = (0.75, 0.5, 0.25)  # of the pixels along a side that are drawn; the picture is enlarged from there
+
+
+@dataclass(frozen=True, kw_only=True)
+class Setting:
+    """A way to ask a network for a picture; `share` of its pixels along a side are drawn."""
+
+    group: str
+    name: str
+    config: NetworkConfig
+    points: int
+    quality: Quality = "best"
+    share: float | int = 1
+
+
+def settings(config: NetworkConfig, counts: Sequence[int]) -> list[Setting]:
+    """Every way to ask a network, its best level first; of all but the first number of points the levels alone."""
+    levels: tuple[Quality, ...] = ("best",)
+    if isinstance(config, SurfelConfig):
+        levels = ("best", "balanced", "draft")
+    elif isinstance(config, RayNetworkConfig):
+        levels = ("best", "balanced", "draft") if config.sampling.reach else ("best", "balanced", "draft", "trained")
+    common: dict[str, Any] = {"config": config, "points": counts[0]}
+    ways = [Setting(group="level", name=level, quality=level, **common) for level in levels]
+    if config.any_size:
+        enlarged: dict[str, Any] = {"group": "fewer pixels", **common}
+        ways += [Setting(name=f"best, {share:g} of the size", share=share, **enlarged) for share in SHARES]
+        if "draft" in levels:
+            ways.append(Setting(name="draft, 0.5 of the size", quality="draft", share=0.5, **enlarged))
+    if isinstance(config, RayNetworkConfig):
+        ways += _of_rays(config, counts[0])
+    for count in counts[1:]:
+        ways += [
+            Setting(group="points", name=f"{level}, {count:,} points", config=config, points=count, quality=level)
+            for level in ("best", "draft")
+            if level in levels
+        ]
+    return ways
+
+
+def _of_rays(config: RayNetworkConfig, points: int) -> list[Setting]:
+    """Other samples along a ray, each drawn as the network was trained but for these, and bfloat16."""
+    total, reach = config.sampling.num_coarse + config.sampling.num_fine, config.sampling.reach
+    halves = [max(total // k, 2) for k in (1, 2, 4)]
+    if reach:  # the levels have fewer
+        ways = [("near points", f"{2 * total} near points", (2 * total, 0, reach))]
+    else:
+        ways = [("samples", f"{n // 2} + {n // 2} in the box", (n // 2, n // 2, 0)) for n in (2 * total, *halves[1:])]
+        ways += [("near points", f"{n} within {r} voxels", (n, 0, r)) for r in (1, 2) for n in halves]
+
+    def made(group: str, name: str, **changed: Any) -> Setting:
+        other = dataclasses.replace(config, **changed)
+        return Setting(group=group, name=name, config=other, points=points, quality="trained")
+
+    names = ("num_coarse", "num_fine", "reach")
+    found = [
+        made(group, name, sampling=dataclasses.replace(config.sampling, **dict(zip(names, values, strict=True))))
+        for group, name, values in ways
+    ]
+    found.append(made("bfloat16", "bfloat16", precision="bfloat16"))
+    return list({way.name: way for way in found}.values())  # small counts give one setting twice
+
+
+def front(rows: Sequence[dict]) -> list[int]:
+    """Rows that no other beats in PSNR and time, cheapest first."""
+    order = sorted(range(len(rows)), key=lambda i: (rows[i]["ms_view"], -rows[i]["psnr"]))
+    chosen: list[int] = []
+    for i in order:
+        if not chosen or rows[i]["psnr"] > rows[chosen[-1]]["psnr"]:
+            chosen.append(i)
+    return chosen
+
+
+def knee(rows: Sequence[dict], chosen: Sequence[int]) -> int:
+    """The row of the front that lies farthest above the line from its cheapest to its best."""
+    x = np.log([rows[i]["ms_view"] for i in chosen])
+    y = np.array([rows[i]["psnr"] for i in chosen])
+    x, y = ((v - v[0]) / (v[-1] - v[0]) if v[-1] != v[0] else np.zeros_like(v) for v in (x, y))
+    return chosen[int(np.argmax(y - x))]
+
+
+def both(rows: Sequence[dict]) -> tuple[Table, Table]:
+    """All settings of a size, and the front alone."""
+    return table(rows, front(rows)), steps(rows, front(rows))
+
+
+def table(rows: Sequence[dict], chosen: Sequence[int]) -> Table:
+    """Settings of one size; those of the front are marked, and differences are to the network's best level."""
+    heads = ("setting", "PSNR, dB", "SSIM", "FLIP", "IoU", "ms a view", "s to encode")
+    decimals = {"ssim": 3, "flip": 3, "iou": 3, "ms_view": 1, "s_encode": 2}
+    made = []
+    for i, row in enumerate(rows):
+        base = next(r for r in rows if r["run"] == row["run"])
+        mark = " (front, knee)" if i == knee(rows, chosen) else " (front)" if i in chosen else ""
+        change = () if row is base else (f"({row['psnr'] - base['psnr']:+.2f})",)
+        cells = [text(row["name"] + mark), number(row["psnr"], 2, more=change)]
+        made.append((Path(row["run"]).name, (*cells, *(number(row[name], n) for name, n in decimals.items()))))
+    return Table(title=f"Quality and cost at {rows[0]['size']} px", heads=heads, rows=tuple(made))
+
+
+def steps(rows: Sequence[dict], chosen: Sequence[int]) -> Table:
+    """The front from its cheapest on: what each step costs and gives."""
+    made = []
+    for before, i in zip((None, *chosen), chosen, strict=False):
+        row = rows[i]
+        cells = [text(row["name"]), number(row["psnr"], 2), number(row["ms_view"], 1)]
+        if before is not None:
+            last = rows[before]
+            cells.append(number(row["ms_view"] / last["ms_view"], 2))
+            differences = {"psnr": 2, "flip": 3, "iou": 3}
+            cells += [number(row[name] - last[name], n, sign="+") for name, n in differences.items()]
+        made.append((Path(row["run"]).name, tuple(cells)))
+    heads = ("setting", "PSNR, dB", "ms a view", "times as long as the row before", "PSNR", "FLIP", "IoU")
+    return Table(title=f"The front at {rows[0]['size']} px, step by step", heads=heads, rows=tuple(made))
+
+
+MARKERS = "osD^v<>P"  # of networks
+GROUPS = {  # of settings, as the plot colours them
+    "level": "#1d2330",
+    "fewer pixels": "#d9480f",
+    "points": "#868e96",
+    "samples": "#2457d6",
+    "near points": "#2f9e44",
+    "bfloat16": "#9c36b5",
+    "surface": "#e8a200",
+}
+LABELS = {"psnr": "PSNR, dB", "flip": "FLIP (lower is better)", "iou": "opacity IoU"}
+
+
+@figures.drawing
+def plot(sizes: Sequence[tuple[Sequence[dict], Sequence[int], int]]) -> Figure:
+    """Quality against cost: of each size its rows, which of them make the front, and its knee."""
+    figure = Figure(figsize=(14, 0.6 + 3.3 * len(sizes)))
+    for line, (rows, chosen, knee) in zip(figure.subplots(len(sizes), 3, squeeze=False), sizes, strict=True):
+        for axes, y in zip(line, LABELS, strict=True):
+            _scatter(axes, rows, y)
+        first = line[0]
+        first.set_title(f"{rows[0]['size']} x {rows[0]['size']}")
+        first.plot([rows[i]["ms_view"] for i in chosen], [rows[i]["psnr"] for i in chosen], color="#adb5bd", zorder=2)
+        place = (rows[knee]["ms_view"], rows[knee]["psnr"])
+        first.annotate(f"knee: {rows[knee]['name']}", place, xytext=(8, -24), textcoords="offset points")
+    handles = {label: h for axes in figure.axes for h, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=6)
+    return figure
+
+
+def _scatter(axes: Axes, rows: Sequence[dict], y: str) -> None:
+    """A point for each setting."""
+    runs = list(dict.fromkeys(row["run"] for row in rows))
+    for group, color in GROUPS.items():
+        for marker, run in zip(MARKERS, runs, strict=False):
+            if shown := [row for row in rows if (row["group"], row["run"]) == (group, run)]:
+                label = group if len(runs) == 1 else f"{Path(run).name}, {group}"
+                across, up = ([row[name] for row in shown] for name in ("ms_view", y))
+                axes.scatter(across, up, s=26, c=color, marker=marker, zorder=3, label=label)
+    axes.set_xscale("log")
+    axes.xaxis.set_major_locator(LogLocator(subs=(1, 3)))
+    axes.xaxis.set_major_formatter(ScalarFormatter())
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.set_xlabel("ms a view")
+    axes.set_ylabel(LABELS[y])
+
 
 Result = TypeVar("Result")
 Scores = dict[str, float]
@@ -114,13 +277,12 @@ class Drawn:
     scores: list[dict[str, float]] = field(default_factory=list)
     view_ms: list[float] = field(default_factory=list)
     encode_s: list[float] = field(default_factory=list)
-    mb: list[int] = field(default_factory=list)
 
     def means(self) -> Scores:
-        """Means of the scores, medians of the times, the most memory."""
+        """Means of the scores, medians of the times."""
         found = {name: float(np.mean([of[name] for of in self.scores])) for name in self.scores[0]}
         found |= {"ms_view": float(np.median(self.view_ms)), "s_encode": float(np.median(self.encode_s))}
-        return {name: round(value, 4) for name, value in (found | {"mb": max(self.mb)}).items()}
+        return {name: round(value, 4) for name, value in found.items()}
 
 
 def main(options: SpeedAccuracy) -> None:
@@ -175,7 +337,7 @@ def measure(
     volumes: Volumes,
     size: int,
 ) -> Scores:
-    """Mean scores over the objects' pictures, times and memory of one setting at one size."""
+    """Mean scores over the objects' pictures and times of one setting at one size."""
     model, found = dataclasses.replace(model, config=way.config), Drawn()
     for number_of_object, name in enumerate(names):
         item = data_sets.read_object(dataset, name)
@@ -209,11 +371,8 @@ def measure_surface(
         pairs = [view_of(item, view, size) for view in range(min(views, len(item.images)))]
         asset, ms = timed(partial(poisson_surface.reconstruct, cloud, poisson.SURFACES[surface.kind]))
         found.encode_s.append(ms / 1e3)
-        forget_peak()
-        before = peak_mb()
         pictures, ms = timed(partial(renderer.drawn, asset, few(item, views)))
         found.view_ms.append(ms / len(pairs))
-        found.mb.append(peak_mb() - before)
         for picture, (_, reference) in zip(pictures, pairs, strict=True):
             found.scores.append(_scores(data_sets.on_white(picture), picture[..., 3] / 255, reference))
     return found.means()
@@ -238,16 +397,12 @@ def _film(model: Model, volume: Volume, views: Sequence[Camera], quality: Qualit
 
 
 def _time_views(found: Drawn, draw: Callable[[], list[Rendering]]) -> None:
-    """Adds time and memory of a view of those that are drawn, which were drawn before."""
+    """Adds the time of a view of those that are drawn, which were drawn before."""
     taken = []
     for _ in range(REPEATS):
         views, ms = timed(draw)
         taken.append(ms / len(views))
     found.view_ms.append(min(taken))
-    forget_peak()
-    before = peak_mb()
-    jax.block_until_ready(draw())
-    found.mb.append(peak_mb() - before)
 
 
 def timed(work: Callable[[], Result]) -> tuple[Result, float]:

@@ -8,7 +8,7 @@ package (gaussians/drawing.py) after so many seconds of refining each, and the l
 mesh of `spnr export --mesh`, which Mitsuba draws in the data set's own light.  Each is compared with the reference, and
 the others with the network.
 
-    OUT/results.json  OUT/table.md .csv .tex   PSNR of whole pictures and inside the silhouettes, by size and by object
+    OUT/results.json  OUT/table.md   PSNR of whole pictures and inside the silhouettes, by size and by object
     OUT/gallery.png                            reference, network, splats, mesh at the largest size; megabytes, s, dB
 
 An object's scores are kept in OUT/scores, so objects can be asked for one at a time (--names), and then all together.

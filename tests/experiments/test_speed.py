@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from support import twin
 
-from experiments.speed import bench, gpu, scenes, twin_layout, where_time_goes
+from experiments.speed import bench, gpu, speed_scenes, twin_layout, where_time_goes
 from spnr_jax import cli
 from spnr_jax.devices import machine
 
@@ -59,9 +59,9 @@ def test_the_sizes_of_the_fixture_are_those_that_are_timed_as_tiny():
 
 
 def test_points_lie_on_a_sphere_and_on_a_box():
-    sphere, box = scenes.arrays(2, 4, 1024)["pos"]
-    np.testing.assert_allclose(np.linalg.norm(sphere, axis=-1), scenes.SPHERE, rtol=1e-5)
-    np.testing.assert_allclose(np.abs(box).max(axis=-1), scenes.BOX, rtol=1e-5)
+    sphere, box = speed_scenes.arrays(2, 4, 1024)["pos"]
+    np.testing.assert_allclose(np.linalg.norm(sphere, axis=-1), speed_scenes.SPHERE, rtol=1e-5)
+    np.testing.assert_allclose(np.abs(box).max(axis=-1), speed_scenes.BOX, rtol=1e-5)
 
 
 def test_slopes_of_a_power_law_and_of_a_cost_with_a_constant_part():

@@ -11,7 +11,7 @@ from support import tiny_surfels
 from support.laws import numbers
 from support.tiny_training import BATCH, L1_ONLY, create, near, step
 
-from experiments.speed.scenes import random_crops
+from experiments.speed.speed_scenes import random_crops
 from spnr_jax.nn.convolution import run_by_run
 from spnr_jax.training import many_runs, optimisation, shading
 

@@ -1,22 +1,9 @@
-"""Depth errors are what their definitions say, and the command measures depths against the mesh, once."""
-
-import importlib.util
-import json
+"""Depth errors are what their definitions say."""
 
 import numpy as np
 import pytest
-from support import stand_ins, tiny_dataset
-from support.handmade import ball
-from support.surfel_clouds import cloud
-from support.tiny_runs import forbidden
 
-from data_gen.render.poisson_surface import PoissonConfig
-from experiments.comparison import trained_networks
 from experiments.paper import depth_scores, fig3
-from experiments.paper.fig3 import Fig3
-from spnr_jax import cli
-from spnr_jax.formats import data_sets
-from spnr_jax.formats.mesh.assets import Asset
 
 SIZE = 64
 TRUTH = np.full((SIZE, SIZE), np.inf)
@@ -81,70 +68,6 @@ class TestScores:
         assert depth_scores.summarise(views)["error"] == {"mean": 1.0, "interval": [1.0, 1.0]}
         nothing = [{name: np.array([np.nan]) for name in depth_scores.METRICS}]
         assert depth_scores.summarise(nothing)["error"] == {"mean": None, "interval": None}
-
-
-@pytest.fixture(autouse=True)
-def _no_cache(monkeypatch):
-    monkeypatch.setattr(cli, "set_up_jax", lambda **_: None)
-
-
-def painted_ball(*_):
-    """What the tiny data set's pictures show, as a mesh."""
-    return Asset(parts=(ball(radius=tiny_dataset.RADIUS, rows=64),))
-
-
-def asked(out, **options):
-    return Fig3(data=tiny_dataset.dataset().folder, out=out, **({"quick": True, "variant": "scalar_rgb"} | options))
-
-
-def show(patch, *labels, **identity):
-    patch.setattr(trained_networks, "networks", lambda *_: stand_ins.stand_ins(*labels, **identity))
-
-
-@pytest.fixture(scope="module")
-def out(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("fig3")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(fig3, "mesh_of", painted_ball)
-        patch.setattr(cli, "set_up_jax", lambda **_: None)
-        show(patch, "Ours", "NPBG")
-        fig3.main(asked(folder))
-    return folder
-
-
-def test_the_error_of_a_depth_behind_the_mesh_is_how_far_it_lies_behind(out):
-    results = json.loads((out / "results.json").read_text())
-    assert list(results["methods"]) == ["Ours"]  # the other one predicts no depth
-    found = results["methods"]["Ours"]
-    for name in ("error", "median", "bias", "surface"):
-        assert found[name]["mean"] == pytest.approx(stand_ins.OFFSET, abs=3e-3)
-        assert found[name]["interval"][0] == pytest.approx(stand_ins.OFFSET, abs=3e-3)
-    assert found["missed"]["mean"] == found["far_floaters"]["mean"] == 0
-    assert results["pixels"] == {"Ours": tiny_dataset.SIZE}
-
-
-def test_a_second_call_makes_nothing_again_and_gives_the_same(out, monkeypatch):
-    before = (out / "results.json").read_bytes()
-    monkeypatch.setattr(fig3, "true_depth", forbidden)
-    monkeypatch.setattr(stand_ins.StandIn, "show", forbidden)
-    show(monkeypatch, "Ours")
-    fig3.main(asked(out))
-    assert (out / "results.json").read_bytes() == before
-
-
-@pytest.mark.skipif(importlib.util.find_spec("pymeshlab") is None, reason="pymeshlab is not installed")
-def test_a_poisson_surface_of_many_points_has_the_depth_of_the_ball():
-    dataset = tiny_dataset.dataset()
-    item = data_sets.read_object(dataset, dataset.splits["test"][0])
-    normals = np.random.default_rng(0).normal(size=(800, 3)).astype(np.float32)
-    positions = tiny_dataset.RADIUS * normals / np.linalg.norm(normals, axis=1, keepdims=True)
-    seen, acc = fig3.of_surface(PoissonConfig(depth=5)).show(item, cloud(positions))
-    expected, opaque = stand_ins.disc(tiny_dataset.SIZE)
-    assert np.mean(acc == opaque) > 0.95
-    both = (acc > 0) & (opaque > 0) & (expected < expected.min() + 0.3)
-    np.testing.assert_allclose(seen[both] + stand_ins.OFFSET, np.tile(expected, (3, 1, 1))[both], atol=0.05)
-    line = data_sets.first_points(item, 1)
-    assert not fig3.of_surface(PoissonConfig(depth=5)).show(item, line)[1].any()
 
 
 def test_errors_are_grey_floaters_red_and_what_is_missed_blue():

@@ -1,60 +1,13 @@
-"""The study of scans: whole on one ball, and what the faults do to clouds whose answer is known."""
-
-import json
+"""What the faults of scans do to clouds whose answer is known."""
 
 import numpy as np
-import pytest
-from support import tiny_dataset, tiny_surfels
-from support.tiny_runs import goes_on
 
-from experiments.studies import scans
 from spnr_jax.surfels.visibility import spiral
 from spnr_jax.training import scan_faults
-
-SPLITS = {"train": (), "val": (), "test": ("ball_000000",)}
 
 
 def rng() -> np.random.Generator:
     return np.random.default_rng(0)
-
-
-class EmptySurfaces:
-    """Stands in for Poisson surfaces, which have tests of their own."""
-
-    def __init__(self, settings: dict) -> None: ...
-
-    def pictures(self, item, num_points, surface) -> tuple[np.ndarray, str]:
-        return np.zeros(item.images.shape, np.uint8), "no surface"
-
-
-@pytest.mark.ci
-def test_the_study_ends_with_a_table_and_pictures_and_goes_on_where_it_stopped(tmp_path, monkeypatch):
-    monkeypatch.setattr(scans.poisson, "Renderer", EmptySurfaces)
-    folder = tiny_dataset.write_dataset(tmp_path / "set", SPLITS, tiny_surfels.SIZE)
-    options = scans.ScansStudy(
-        data=folder,
-        out=tmp_path / "out",
-        run=str(tiny_surfels.run()),
-        counts=(32,),
-        noise=(0.02,),
-        outliers=(0.1,),
-        scanners=(2,),
-        views=1,
-        meshed=1,
-    )
-    scans.main(options)
-    results = json.loads((tmp_path / "out" / "results.json").read_text())["objects"]
-    faults = ["clean", "noise 2.0%", "outliers 10%", "2 scanners", "colours alone", "uneven density"]
-    assert list(results) == [f"32, {fault}" for fault in faults]
-    (clean,) = results["32, clean"]
-    assert np.isfinite(clean["off"]).all()
-    assert clean["auto"] == clean["off"]
-    assert clean["draft"] != clean["auto"]
-    assert np.isfinite(clean["poisson"][0])
-    assert clean["left"] == 1
-    assert results["32, outliers 10%"][0]["left"] == 1.1
-    assert (tmp_path / "out" / "gallery.png").is_file()
-    goes_on(scans.main, options)
 
 
 def test_faults_change_what_their_names_say_and_nothing_else():
