@@ -147,6 +147,7 @@ COLUMNS = {  # scores of a view: heads, decimals
     "inside_true_opacity": ("inside, true opacity", 2),
 }
 HEADS = (*(head for head, _ in COLUMNS.values()), "encode, s", "a picture, s")
+KNOWN_SIZE = 512  # pixels along each side of ball and plate
 KNOWN_HEADS = ("ball: waves", "plate: blue share")
 
 
@@ -253,7 +254,7 @@ def _known(options: SharpnessStudy, method: Method, count: int) -> dict[str, flo
     def of(cloud: PointCloud, score: Any, **view: float) -> float | None:
         model = method.model
         volume = model.encode(told(cloud, options.normals))
-        rendering = model.render(volume, model.camera(volume, resolution=512, **view), method.quality)
+        rendering = model.render(volume, model.camera(volume, resolution=KNOWN_SIZE, **view), method.quality)
         image = np.asarray(rendering.image)
         return _mean(np.array([score(image, resized(np.asarray(rendering.acc), image.shape[:2]))]))
 

@@ -104,7 +104,8 @@ def without_clock(found):
     return found
 
 
-def test_sharpness_of_networks_and_of_pictures_made_elsewhere(balls, tmp_path):
+def test_sharpness_of_networks_and_of_pictures_made_elsewhere(balls, tmp_path, monkeypatch):
+    monkeypatch.setattr(sharpness, "KNOWN_SIZE", 48)
     right = tmp_path / "right"  # pictures of another program that are the references
     for count in (16, 32):
         shutil.copytree(balls / "objects" / "ball_000000" / "images", right / str(count) / "ball_000000")
