@@ -7,6 +7,7 @@ from typing import Any, NoReturn
 
 import tyro
 
+import experiments.baselines  # noqa: F401 - registers them: runs of theirs are loaded by every command
 from spnr_jax import errors
 
 

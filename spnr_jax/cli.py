@@ -19,7 +19,7 @@ from typing import Annotated
 
 import tyro
 
-from spnr_jax import presets
+from spnr_jax import methods, presets
 from spnr_jax.config import SurfelConfig
 from spnr_jax.devices import allocator, compilation
 from spnr_jax.errors import UserError, guarded, split_debug
@@ -29,7 +29,8 @@ from spnr_jax.tools.share_command import Share
 
 BOX = r"[╭╮╰╯│─•]+|__tyro-dummy-inner__\."  # what tyro draws around an error, and its name for the whole command
 DESCRIPTION = """Sparse-point neural rendering: train a network, evaluate one, render a cloud of points.
---debug, or SPNR_DEBUG=1, shows the call stack of an error."""
+--debug, or SPNR_DEBUG=1, shows the call stack of an error.
+--methods FILE, a .py file or a module, adds methods and presets of your own to every command (docs/api.md)."""
 
 
 Command = Train | Evaluate | Render | View | Export | Share
@@ -52,7 +53,13 @@ def _one_of_several() -> bool:
 
 
 def parse(arguments: list[str]) -> Command:
-    """The command with all its options; the preset named by --preset gives the defaults of the others."""
+    """The command with all its options.
+
+    Two are read before the others: --methods, which adds methods and presets, and --preset, which gives the defaults.
+    """
+    source, arguments = _taken(arguments, "--methods")
+    if source is not None:
+        methods.include(source)
     train = Annotated[Train, tyro.conf.subcommand("train", default=_train_defaults(arguments))]
     said = io.StringIO()
     try:
@@ -70,14 +77,22 @@ def parse(arguments: list[str]) -> Command:
 
 
 def _train_defaults(arguments: list[str]) -> Train:
-    preset = "tiny"
-    for i, argument in enumerate(arguments):
-        name, _, value = argument.partition("=")
-        if name == "--preset":
-            preset = value or (arguments[i + 1] if i + 1 < len(arguments) else "")
+    """Those of the preset, whose network decides which options there are."""
+    preset, _ = _taken(arguments, "--preset")
+    preset = "tiny" if preset is None else preset
     if preset not in presets.PRESETS:
         raise UserError(f"--preset {preset}: there are {', '.join(presets.PRESETS)}")
     return Train(data=tyro.MISSING, run=tyro.MISSING, config=presets.PRESETS[preset]())
+
+
+def _taken(arguments: list[str], name: str) -> tuple[str | None, list[str]]:
+    """The value of an option, None where it is not given, and the arguments without it."""
+    for i, argument in enumerate(arguments):
+        if argument == name:
+            return "".join(arguments[i + 1 : i + 2]), arguments[:i] + arguments[i + 2 :]
+        if argument.startswith(f"{name}="):
+            return argument.removeprefix(f"{name}="), arguments[:i] + arguments[i + 1 :]
+    return None, arguments
 
 
 def run(command: Command) -> None:

@@ -270,7 +270,7 @@ SOLID = NearPointsConfig(
     surface_cells=surface_grid(2048),
     refiner_width=32,
 )
-"""Sizes of the package's network `small`."""
+"""Sizes of the package's network `near_points`."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,13 +1,12 @@
 """The presets: functions that return a TrainConfig, named as `spnr train --preset` takes them.
 
-The paper's network in its sizes and in smaller ones, then ours: near points, and over surfels.  What the trained
-networks of the package score: docs/model_card.md; `tiny` beside `plus_tiny`: `make demo`.
+The paper's network in its sizes and in smaller ones, then the network near points, and ours over surfels.  A trained
+network of the package has the name of its preset: `surfels`, `near_points`, `near_points_lite` (docs/model_card.md).
 """
 
 import dataclasses
 from collections.abc import Callable
 
-from spnr_jax.baselines.baseline_presets import BASELINES
 from spnr_jax.config import (
     SOLID,
     EncoderConfig,
@@ -22,16 +21,10 @@ from spnr_jax.config import (
 )
 
 PAPER = EncoderConfig(inputs="spread", num_groups=1)  # of the paper's network, with what lets it learn hues
-LARGE = EncoderConfig(point_norm="layer")  # of networks near points: the paper's sizes, and those of `tiny`
-SMALL = EncoderConfig(volume_resolution=32, base_width=8, num_stages=3, num_groups=1, point_norm="layer")
 NEAR = LossConfig(l1_weight=1.0, mse_weight=1.0, adversarial_weight=0.0, opacity_weight=1.0)
+EIGHT = SamplingConfig(num_coarse=8, num_fine=0, reach=1)  # a picture takes less time than the paper's network
 QUICK = OptimizerConfig(lr_generator=2e-3, warmup_steps=100, ema_decay=0.995)
 LONGER = OptimizerConfig(lr_generator=2e-3, warmup_steps=100, ema_decay=0.999)
-
-
-def near(num_samples: int) -> SamplingConfig:
-    """So many samples of a ray, near points alone: at 8 a picture takes less time than the paper's network."""
-    return SamplingConfig(num_coarse=num_samples, num_fine=0, reach=1)
 
 
 def abo() -> TrainConfig:
@@ -92,31 +85,13 @@ def tiny() -> TrainConfig:
     )
 
 
-def plus_abo() -> TrainConfig:
-    """Near points, a volume of the paper's size, 128 px.  `spnr train --preset plus_abo DATA RUN`; one GPU."""
+def near_points_tiny() -> TrainConfig:
+    """Near points, 64 px, minutes on two CPU cores.  `spnr train --preset near_points_tiny DATA RUN`."""
     return TrainConfig(
-        preset="plus_abo",
+        preset="near_points_tiny",
         model=NearPointsConfig(
-            encoder=LARGE, sampling=near(32), surface_cells=surface_grid(4096), sees_direction=False
-        ),
-        loss=NEAR,
-        pixel_stride=2,
-    )
-
-
-def plus_shapenet() -> TrainConfig:
-    """The same at 200 px.  `spnr train --preset plus_shapenet DATA RUN`; meant for one GPU."""
-    model = dataclasses.replace(plus_abo().model, image_resolution=200)
-    return TrainConfig(preset="plus_shapenet", model=model, loss=NEAR, pixel_stride=2)
-
-
-def plus_tiny() -> TrainConfig:
-    """Near points, 64 px, minutes on two CPU cores.  `spnr train --preset plus_tiny DATA RUN`."""
-    return TrainConfig(
-        preset="plus_tiny",
-        model=NearPointsConfig(
-            encoder=SMALL,
-            sampling=near(8),
+            encoder=SOLID.encoder,
+            sampling=EIGHT,
             surface_cells=surface_grid(1024),
             sees_direction=False,
             image_resolution=64,
@@ -130,28 +105,15 @@ def plus_tiny() -> TrainConfig:
     )
 
 
-def plus_small() -> TrainConfig:
-    """plus_tiny's network at 128 px, for longer.  `spnr train --preset plus_small DATA RUN`."""
+def near_points_lite() -> TrainConfig:
+    """Half the sizes of near_points, no refiner.  `spnr train --preset near_points_lite DATA RUN`."""
     return TrainConfig(
-        preset="plus_small",
-        model=NearPointsConfig(encoder=SMALL, sampling=near(8), surface_cells=surface_grid(1024), sees_direction=False),
-        loss=NEAR,
-        optimizer=LONGER,
-        num_steps=11_000,
-        batch_objects=4,
-        min_points=384,
-        max_points=1024,
-        pixel_stride=4,
-    )
-
-
-def plus_lite() -> TrainConfig:
-    """The package's network `tiny`: half the sizes of plus_small's.  `spnr train --preset plus_lite DATA RUN`."""
-    return TrainConfig(
-        preset="plus_lite",
+        preset="near_points_lite",
         model=NearPointsConfig(
-            encoder=dataclasses.replace(SMALL, point_widths=(32, 64, 128), point_features=16, volume_resolution=16),
-            sampling=near(8),
+            encoder=dataclasses.replace(
+                SOLID.encoder, point_widths=(32, 64, 128), point_features=16, volume_resolution=16
+            ),
+            sampling=EIGHT,
             surface_cells=surface_grid(2048),
             field_width=32,
         ),
@@ -165,13 +127,13 @@ def plus_lite() -> TrainConfig:
     )
 
 
-def plus_refined() -> TrainConfig:
-    """The package's network `small`: plus_small's with a refiner.  `spnr train --preset plus_refined --init small ...`.
+def near_points() -> TrainConfig:
+    """Near points, 128 px, with a refiner.  `spnr train --preset near_points --init near_points DATA RUN`.
 
-    Without --init, begin with a run of `plus_small --sees-direction`: a lattice of rays is quicker to learn from.
+    Without --init it learns slowly: `experiments.packaged.pretrain` begins with a lattice of rays and no refiner.
     """
     return TrainConfig(
-        preset="plus_refined",
+        preset="near_points",
         model=SOLID,
         loss=dataclasses.replace(NEAR, mse_weight=4.0, opacity_weight=2.0),
         optimizer=LONGER,
@@ -180,21 +142,6 @@ def plus_refined() -> TrainConfig:
         min_points=128,
         max_points=2048,
         crop=64,
-    )
-
-
-def plus_refiner() -> TrainConfig:
-    """The refiner of the network `small` alone.  `spnr train DATA RUN --preset plus_refiner --init RUN_BEFORE`.
-
-    Pictures of the network before are made first and kept in RUN/pictures (2.6 MB an object of 4 views): 14 minutes for
-    2,604 objects on one core, and 23 for the steps.  What it brings: docs/model_card.md.
-    """
-    return dataclasses.replace(
-        plus_refined(),
-        preset="plus_refiner",
-        trains="refiner",
-        optimizer=dataclasses.replace(QUICK, final_lr_scale=0.02, beta2=0.99, clip_norm=1.0),
-        batch_objects=8,
     )
 
 
@@ -223,8 +170,8 @@ def surfels() -> TrainConfig:
     )
 
 
-OURS = (abo, shapenet_car, shapenet_plane, shapenet_chair, small, tiny)
-PLUS = (plus_abo, plus_lite, plus_refined, plus_shapenet, plus_small, plus_tiny)
+PAPERS = (abo, shapenet_car, shapenet_plane, shapenet_chair, small, tiny)
 PRESETS: dict[str, Callable[[], TrainConfig]] = {
-    preset.__name__: preset for preset in (*OURS, *PLUS, plus_refiner, surfels, *BASELINES)
+    preset.__name__: preset for preset in (*PAPERS, near_points, near_points_lite, near_points_tiny, surfels)
 }
+"""By name; `methods.register` adds those of a method of one's own."""

@@ -20,7 +20,7 @@ LONG = 0.3  # seconds of a compilation that is kept
 os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {QUICK_COMPILATION}".strip()  # read at the first use
 
 gc.set_threshold(100_000, 50, 50)
-install_import_hook("spnr_jax", "beartype.beartype")
+install_import_hook(["spnr_jax", "experiments.baselines"], "beartype.beartype")
 
 # a shell that starts the suite in the background has it ignore Ctrl-C, and its children with it
 signal.signal(signal.SIGINT, signal.default_int_handler)

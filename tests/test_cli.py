@@ -99,10 +99,11 @@ def test_a_preset_gives_the_defaults_and_options_change_them(form):
 
 
 def test_the_preset_chooses_the_network_whose_options_there_are(capsys):
-    command = cli.parse(["train", "data", "run", "--preset", "point_nerf_tiny", "--radius", "0.2"])
+    form = ("train", "data", "run", "--methods", "experiments.baselines", "--preset")
+    command = cli.parse([*form, "point_nerf_tiny", "--radius", "0.2"])
     tiny = presets.PRESETS["point_nerf_tiny"]()
     assert command.config == dataclasses.replace(tiny, model=dataclasses.replace(tiny.model, radius=0.2))
-    assert "--radius" in refused(capsys, "train", "data", "run", "--preset", "npbg_tiny", "--radius", "0.2")
+    assert "--radius" in refused(capsys, *form, "npbg_tiny", "--radius", "0.2")
 
 
 def test_a_resolution_that_the_unet_cannot_divide_is_refused(capsys):

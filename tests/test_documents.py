@@ -53,7 +53,7 @@ def test_the_readmes_example_draws_a_picture(workplace):
 def test_the_examples_of_the_fourteen_functions_run_in_their_order(workplace, monkeypatch):
     # the README's example draws with the package's network
     runs = {"surfels": tiny_surfels.run()}
-    monkeypatch.setattr(weights, "shipped", lambda name="small": runs.get(name, tiny_untrained.run()))
+    monkeypatch.setattr(weights, "shipped", lambda name="surfels": runs.get(name, tiny_untrained.run()))
     names = execute(DOCS / "api.md")
     assert int(names["state"].step) == 1
     assert "paper" in names["outcome"].summary["methods"]

@@ -16,8 +16,8 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 SPNR_JAX = (
-    *("errors", "config"),
-    *("devices", "kernels", "surfels", "gaussians", "nn", "baselines", "method", "presets"),
+    *("errors", "config", "presets", "methods"),
+    *("devices", "kernels", "surfels", "gaussians", "nn", "method"),
     *("formats/mesh", "formats", "training", "scoring", "tools", "viewer"),
     *("cli", "__init__"),
 )
@@ -26,14 +26,14 @@ DATA_GEN = (
     *("__main__", "command", "__init__"),
 )
 QUESTIONS = ("paper", "studies", "speed", "packaged")  # folders of experiments, of which none knows another
-EXPERIMENTS = ("__init__", "entry_point", "comparison", *QUESTIONS)
+EXPERIMENTS = ("__init__", "baselines", "entry_point", "comparison", *QUESTIONS)
 ORDER = [
     f"{package}/{entry}"
     for package, entries in {"spnr_jax": SPNR_JAX, "data_gen": DATA_GEN, "experiments": EXPERIMENTS}.items()
     for entry in entries
 ]
-PURE = ("kernels", "surfels", "gaussians", "nn", "baselines", "method")
-WITHOUT_JIT = ("devices", "kernels", "nn", "baselines")
+PURE = ("kernels", "surfels", "gaussians", "nn", "method")
+WITHOUT_JIT = ("devices", "kernels", "nn")
 OF_SPNR_JAX = {
     "spnr_jax/errors",
     "spnr_jax/devices",
@@ -185,7 +185,6 @@ def test_importing_the_package_loads_no_heavy_module():
 def test_a_picture_needs_nothing_that_trains_or_compares():
     loaded = modules_after("import spnr_jax, spnr_jax.method.model; spnr_jax.load, spnr_jax.read_cloud")
     assert not {name.split(".")[0] for name in loaded} & (HEAVY | {"optax", "orbax", "data_gen", "experiments"})
-    assert not {name for name in loaded if name.startswith("spnr_jax.baselines.")}
     assert not loaded & {"spnr_jax.nn.discriminator", "spnr_jax.training.trainer", "spnr_jax.training.optimisation"}
 
 
@@ -196,18 +195,18 @@ def own_code(names: set[str]) -> set[str]:
 
 def test_a_picture_of_rays_is_drawn_by_few_modules_and_by_one_network():
     code = (
-        "import numpy as np, spnr_jax; model = spnr_jax.load('small'); points = np.eye(3, dtype=np.float32); "
+        "import numpy as np, spnr_jax; model = spnr_jax.load('near_points'); points = np.eye(3, dtype=np.float32); "
         "cloud = spnr_jax.PointCloud(positions=points, base_color=points, roughness=points[0], metallic=points[0], "
         "mask=np.ones(3, bool)); volume = model.encode(cloud); "
         "model.render(volume, model.camera(volume, resolution=16), 'draft')"
     )
     loaded = own_code(modules_after(code))
-    reading = {"config", "formats.config_json", "formats.npz", "formats.text", "formats.images", "training.weights"}
+    reading = {"config", "presets", "methods", "formats.npz", "formats.text", "formats.images", "training.weights"}
     drawing = loaded - {f"spnr_jax.{part}" for part in reading}  # without the file of weights
     assert len(drawing) <= 25, sorted(drawing)
     assert "spnr_jax.method.near_points" in drawing
     assert not drawing & {f"spnr_jax.method.{other}" for other in ("paper_network", "surfel_renderer")}
-    assert not {part for part in drawing if part.split(".")[1] in ("surfels", "baselines", "training", "scoring")}
+    assert not {part for part in drawing if part.split(".")[1] in ("surfels", "training", "scoring")}
 
 
 def test_the_kernels_of_the_specification_are_one_module_under_both_names():

@@ -19,6 +19,7 @@ from typing import Literal
 
 import jax
 
+from experiments.baselines import PUBLISHED
 from spnr_jax.config import TrainConfig
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
@@ -27,7 +28,6 @@ from spnr_jax.training import adversary, batching, checkpoint, metrics_log, opti
 
 Budget = Literal["quick", "tiny", "paper"]
 NETWORKS = ("near_points", "paper", "npbg", "point_nerf", "points2nerf")
-FAMILIES = {"near_points": "plus"}  # network -> how its presets' names begin, where that is another name
 QUICK_STEPS = 4
 PAPER_SIZES = {128: "abo", 200: "shapenet"}
 PACE_SECONDS, PACE_STEPS = 5.0, 3  # a pace is measured over at least so long and so many steps
@@ -43,26 +43,29 @@ class Trained:
     cost: dict[str, str | int | float]
 
 
-def presets(budget: Budget, size: int, category: str | None) -> dict[str, str]:
-    """The preset of each network for images of so many pixels; ValueError if the paper has no such size."""
+def configs(budget: Budget, size: int, category: str | None) -> dict[str, TrainConfig]:
+    """The training of each network for images of so many pixels; ValueError if the paper has no such size."""
     if budget != "paper":
-        return {name: "tiny" if name == "paper" else f"{FAMILIES.get(name, name)}_tiny" for name in NETWORKS}
+        return {name: PRESETS["tiny" if name == "paper" else f"{name}_tiny"]() for name in NETWORKS}
     if size not in PAPER_SIZES:
         raise UserError(
             f"--budget paper: the data's images have {size} pixels, the paper's 128 (ABO) or 200 (ShapeNet); generate "
             "with --resolution 128, or take --budget tiny"
         )
-    family = PAPER_SIZES[size]
-    paper = family if family == "abo" else f"shapenet_{category}"
-    found = {name: f"{FAMILIES.get(name, name)}_{family}" for name in NETWORKS}
-    return found | {"paper": paper if paper in PRESETS else "shapenet_car"}
+    paper = PAPER_SIZES[size] if size == 128 else f"shapenet_{category}"
+    near = PRESETS["near_points"]()
+    found = {
+        "near_points": dataclasses.replace(near, model=dataclasses.replace(near.model, image_resolution=size)),
+        "paper": PRESETS[paper if paper in PRESETS else "shapenet_car"](),
+    }
+    return found | {name: published(size) for name, published in PUBLISHED.items()}
 
 
 def config_of(
-    preset: str, budget: Budget, seed: int, minutes: float | None, dataset: data_sets.Dataset, run: Path
+    config: TrainConfig, budget: Budget, seed: int, minutes: float | None, dataset: data_sets.Dataset, run: Path
 ) -> TrainConfig:
-    """The preset with the seed and the steps of the budget; a run that was begun keeps its steps."""
-    config = dataclasses.replace(PRESETS[preset](), seed=seed)
+    """The training with the seed and the steps of the budget; a run that was begun keeps its steps."""
+    config = dataclasses.replace(config, seed=seed)
     if budget == "quick":
         return dataclasses.replace(config, num_steps=QUICK_STEPS)
     return config if minutes is None else within(minutes, config, dataset, run)

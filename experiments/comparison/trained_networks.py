@@ -8,19 +8,21 @@ from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
+import experiments.baselines  # noqa: F401 - registers them
 from spnr_jax.config import TrainConfig
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
+from spnr_jax.methods import METHODS
 from spnr_jax.scoring import evaluation
-from spnr_jax.scoring.score_tables import METHODS
+from spnr_jax.scoring.score_tables import label
 from spnr_jax.training import weights
 
 FLOORS = tuple(reversed(evaluation.FLOORS))
 LABELS = {  # method -> its name in tables and pictures, in their order
-    **{name: label for name, label in METHODS.items() if name not in FLOORS},
+    **{name: label(name) for name in ("ours", *METHODS)},
     "poisson": "Poisson",
     "poisson_trimmed": "Poisson, trimmed 0.3",
-    **{name: METHODS[name] for name in FLOORS},
+    **{name: label(name) for name in FLOORS},
 }
 
 
@@ -29,7 +31,7 @@ class Sources:
     """Where the networks are."""
 
     runs: tuple[Path, ...] = ()
-    """Run folders, files of weights, or `small` or `tiny`, the networks in the package."""
+    """Run folders, files of weights, or networks of the package: surfels, near_points, near_points_lite."""
     table1: Path | None = None
     """Folder of a table that experiments.paper.table1 made; its runs are taken too."""
 

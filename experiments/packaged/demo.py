@@ -108,7 +108,7 @@ def generation_of(demo: Demo) -> GenerateConfig:
 
 def configs_of(demo: Demo) -> dict[str, TrainConfig]:
     """The network near points and the paper's, ours first."""
-    presets_of = {"ours": presets.plus_tiny(), "paper": presets.tiny()}
+    presets_of = {"ours": presets.near_points_tiny(), "paper": presets.tiny()}
     return {
         name: dataclasses.replace(config, seed=demo.seed, num_steps=demo.steps, even_share=1.0)
         for name, config in presets_of.items()

@@ -1,13 +1,13 @@
 """A network of the package, made again: data, training, scores, file of weights.
 
-    python -m experiments.packaged.pretrain --meshes DIR --test-list FILE [--network tiny] [--out runs/pretrain]
+    python -m experiments.packaged.pretrain --meshes DIR --test-list FILE [--network NAME] [--out runs/pretrain]
 
 Two data sets lie below OUT: `procedural`, objects of all classes, and `meshes`, those that the list does not hold out,
-each with variants of colour and shape.  `data` joins them by links.  `small` is trained on it in five runs of which
-each begins where the one before ended: OUT/small/run1 with the points of the preset, the next three with 128 to 2048 an
-object, the last its refiner alone, on what the network shows.  `tiny` is trained in one run.  The held-out meshes score
-it (OUT/small/report.html), and OUT/small.npz is the file that the package holds.  What is there already is reused:
-finished objects, trained steps, pictures.
+each with variants of colour and shape.  `data` joins them by links.  `near_points` is trained on it in five runs of
+which each begins where the one before ended: OUT/near_points/run1 with many points an object, the next three with 128
+to 2048, the last its refiner alone, on what the network shows.  `near_points_lite` is trained in one run.  The held-out
+meshes score it (OUT/NAME/report.html), and OUT/NAME.npz is the file that the package holds.  What is there already is
+reused: finished objects, trained steps, pictures.
 """
 
 import dataclasses
@@ -24,7 +24,7 @@ from data_gen.store.layout import SPLITS
 from experiments import entry_point
 from experiments.packaged.demo import Seconds
 from spnr_jax import cli, presets
-from spnr_jax.config import NearPointsConfig, TrainConfig, surface_grid
+from spnr_jax.config import SOLID, NearPointsConfig, TrainConfig, surface_grid
 from spnr_jax.formats import data_sets as data
 from spnr_jax.formats.images import write_whole
 from spnr_jax.scoring import evaluation
@@ -36,7 +36,7 @@ from spnr_jax.training import trainer, weights
 class Pretrain:
     """Make a network of the package again."""
 
-    network: Literal["small", "tiny"] = "small"
+    network: Literal["near_points", "near_points_lite"] = "near_points"
     """Which one."""
     meshes: Path | None = None
     """Folder of .glb, .gltf, .obj and .ply files that train beside the procedural objects (default: none)."""
@@ -86,10 +86,10 @@ def main(options: Pretrain) -> None:
 
 def recipe(options: Pretrain) -> list[TrainConfig]:
     """The configs of the runs of a network."""
-    if options.network == "tiny":
-        runs = [presets.plus_lite()]
+    if options.network == "near_points_lite":
+        runs = [presets.near_points_lite()]
     else:
-        first = packaged(presets.plus_small())
+        first = first_run()
         runs = [
             first,
             later(first, steps=9000, seed=first.seed + 1, lr=1.5e-3),
@@ -100,21 +100,29 @@ def recipe(options: Pretrain) -> list[TrainConfig]:
     return runs if options.steps is None else [dataclasses.replace(run, num_steps=options.steps) for run in runs]
 
 
-def packaged(config: TrainConfig) -> TrainConfig:
-    """The config of a network near points with the samples of the package's `small`, seeing the view direction."""
-    assert isinstance(config.model, NearPointsConfig)
-    sampling = presets.near(16)
-    return dataclasses.replace(config, model=dataclasses.replace(config.model, sampling=sampling, sees_direction=True))
+def first_run() -> TrainConfig:
+    """The config of the run that begins with random weights: no refiner, rays of a lattice."""
+    tiny = presets.near_points_tiny()
+    model = dataclasses.replace(SOLID, refiner_width=0, surface_cells=surface_grid(1024))
+    return dataclasses.replace(
+        tiny,
+        preset="near_points, first run",
+        model=model,
+        optimizer=presets.LONGER,
+        num_steps=11_000,
+        min_points=384,
+        pixel_stride=4,
+    )
 
 
 def later(config: TrainConfig, steps: int, seed: int, lr: float) -> TrainConfig:
     """The config of a run after the first: few and many points, other batches, a lower learning rate."""
     assert isinstance(config.model, NearPointsConfig)
-    most = presets.plus_refined().max_points
+    most = presets.near_points().max_points
     return dataclasses.replace(
         config,
         model=dataclasses.replace(config.model, surface_cells=surface_grid(most)),
-        min_points=presets.plus_refined().min_points,
+        min_points=presets.near_points().min_points,
         max_points=most,
         optimizer=dataclasses.replace(config.optimizer, lr_generator=lr),
         num_steps=steps,
@@ -124,12 +132,15 @@ def later(config: TrainConfig, steps: int, seed: int, lr: float) -> TrainConfig:
 
 def refiner_behind(config: TrainConfig) -> TrainConfig:
     """The config of the run of a refiner behind the network of a run."""
-    preset = presets.plus_refiner()
+    preset = presets.near_points()
     assert isinstance(config.model, NearPointsConfig)
-    assert isinstance(preset.model, NearPointsConfig)
     return dataclasses.replace(
         preset,
-        model=dataclasses.replace(config.model, refiner_width=preset.model.refiner_width),
+        preset="near_points, refiner",
+        trains="refiner",
+        model=dataclasses.replace(config.model, refiner_width=SOLID.refiner_width),
+        optimizer=dataclasses.replace(presets.QUICK, final_lr_scale=0.02, beta2=0.99, clip_norm=1.0),
+        batch_objects=8,
         crop=config.model.image_resolution // 2,
         even_share=config.even_share,
         seed=config.seed,

@@ -31,7 +31,6 @@ from spnr_jax.config import TrainConfig
 from spnr_jax.devices import machine
 from spnr_jax.errors import UserError, at_least
 from spnr_jax.formats import data_sets
-from spnr_jax.presets import PRESETS
 from spnr_jax.scoring import evaluation
 from spnr_jax.scoring.report import duration
 from spnr_jax.scoring.score_tables import Cell, Table, difference, head, lowered, number, quality
@@ -177,13 +176,13 @@ def main(options: Table1) -> None:
     names = test_objects(dataset, options.objects or (QUICK_OBJECTS if options.budget == "quick" else None))
     first = data_sets.read_object(dataset, names[0])
     category = dataset.settings.get("settings", {}).get("category")
-    presets = budget.presets(options.budget, first.camera.height, category)
-    config = PRESETS[presets["paper"]]()  # its points and pixels are given to every method
+    configs = budget.configs(options.budget, first.camera.height, category)
+    config = configs["paper"]  # its points and pixels are given to every method
     data_sets.check_resolution(first, config)
     asked = {name: getattr(options, name) for name in ("budget", "minutes", "seed")}
     results_folder.claim(options.out, "a table", asked, dataset)
     surfaces, missing = surface_methods(options, dataset, config)  # before hours of training: something may be amiss
-    trained = train_networks(options, dataset, presets)
+    trained = train_networks(options, dataset, configs)
     floors, factors = floor_methods(options, dataset, config)
     networks = {name: of_cloud(evaluation.network(t.variables, t.config), config) for name, t in trained.items()}
     methods = networks | surfaces | floors
@@ -273,7 +272,7 @@ def floor_methods(
     return {name: of_cloud(evaluation.floor(name, factors.get(name, 1.0)), config) for name in wanted}, factors
 
 
-def train_networks(options: Table1, dataset: data_sets.Dataset, presets: dict[str, str]) -> dict[str, Trained]:
+def train_networks(options: Table1, dataset: data_sets.Dataset, configs: dict[str, TrainConfig]) -> dict[str, Trained]:
     """The networks of the table, one after another; finished ones are only read."""
     wanted: list[str] = [name for name in NETWORKS if name in options.methods]
     trained = {}
@@ -281,7 +280,7 @@ def train_networks(options: Table1, dataset: data_sets.Dataset, presets: dict[st
         run = options.out / "runs" / name
         if options.minutes and not (run / "config.json").is_file():
             print(f"{LABELS[name]}: measuring the pace of a step", flush=True)
-        config = budget.config_of(presets[name], options.budget, options.seed, options.minutes, dataset, run)
+        config = budget.config_of(configs[name], options.budget, options.seed, options.minutes, dataset, run)
         left = (
             ""
             if options.minutes is None

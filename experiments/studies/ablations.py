@@ -142,15 +142,8 @@ def rows(wanted: tuple[Row, ...], config: TrainConfig, dataset: data_sets.Datase
 
 
 def paper_network(config: TrainConfig) -> TrainConfig:
-    """The paper's network and training of the sizes that a plus preset has; any other config as it is."""
-    made = {"plus_tiny": presets.tiny, "plus_abo": presets.abo, "plus_shapenet": presets.shapenet_car}
-    if config.preset == "plus_small":  # tiny's sizes, pictures twice as large
-        tiny = presets.tiny()
-        assert isinstance(tiny.model, PaperConfig)
-        model = dataclasses.replace(tiny.model, render_resolution=64, resize_resolution=64, image_resolution=128)
-        paper = dataclasses.replace(tiny, model=model)
-    else:
-        paper = made.get(config.preset, lambda: config)()
+    """The paper's network and training of the sizes of near_points_tiny; any other config as it is."""
+    paper = presets.tiny() if config.preset == "near_points_tiny" else config
     return dataclasses.replace(paper, num_steps=config.num_steps, even_share=config.even_share)
 
 

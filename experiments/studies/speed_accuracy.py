@@ -223,7 +223,7 @@ class SpeedAccuracy:
 
     data: tyro.conf.Positional[Path]
     """Folder of the data set; its test objects are drawn."""
-    runs: tyro.conf.Positional[tuple[str, ...]] = ("surfels", "small")
+    runs: tyro.conf.Positional[tuple[str, ...]] = ("surfels", "near_points")
     """Networks: of the package, run folders (the paper's, published methods) or files of weights; also `poisson` and
     `poisson_trimmed`."""
     out: Path = Path("runs/speed_accuracy")

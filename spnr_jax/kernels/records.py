@@ -248,7 +248,7 @@ class Crops:
     `margin` pixels beyond it and the maps to each side.
     """
 
-    seen: Float[AnyArray, "crops rows columns 33"]
+    seen: Float[AnyArray, "crops rows columns 34"]
     maps: Float[AnyArray, "crops height width 18"]
     ambient: Float[AnyArray, "crops 9 3"]
     target: UInt8[AnyArray, "crops h w 4"]

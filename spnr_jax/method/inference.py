@@ -1,6 +1,6 @@
 """What a trained network is asked for: scenes of clouds, and views of scenes.
 
-The config of a network finds its module (`network`): any Linen module with `encode(cloud, train)` and
+The config of a network finds its module (`methods.network`): any Linen module with `encode(cloud, train)` and
 `render(scene, camera, options)`.  A network is imported when it is first asked for, and no other with it.  The network
 over surfels, whose sizes are counted before they are compiled, is a module of functions beside these.
 
@@ -13,7 +13,6 @@ from collections.abc import Iterator, Sequence
 from functools import partial
 from typing import Any, cast
 
-import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -22,7 +21,6 @@ from scipy.spatial import cKDTree
 
 from spnr_jax.config import (
     SOLID,
-    NearPointsConfig,
     NetworkConfig,
     PaperConfig,
     RayNetworkConfig,
@@ -34,26 +32,11 @@ from spnr_jax.errors import UserError
 from spnr_jax.kernels import cameras, cloud_arrays
 from spnr_jax.kernels.records import LARGEST_REACH, Camera, Key, Light, PointCloud, Rendering, Volume
 from spnr_jax.kernels.resizing import averaged
+from spnr_jax.methods import network
 
 SAMPLES = {"draft": 0.25, "balanced": 0.5, "best": 1.0}  # share of the samples a ray was trained with
 REACH_PER_SPACING = 1.6  # what loses nothing from 128 to 4096 points, docs/cpu_forms.md
 WHOLE_BLOCK = 1024  # rays that are sampled through all the box at once: about 80 MB at 128 samples
-
-
-def network(config: NetworkConfig) -> nn.Module:
-    """The module that a network's config describes."""
-    match config.method:
-        case "paper":
-            from spnr_jax.method.paper_network import PaperNetwork
-
-            return PaperNetwork(cast(PaperConfig, config))
-        case "near_points":
-            from spnr_jax.method.near_points import NearPointsNetwork
-
-            return NearPointsNetwork(cast(NearPointsConfig, config))
-    from spnr_jax.baselines.networks import NETWORKS
-
-    return NETWORKS[config.method](config)
 
 
 def init(key: Key, config: NetworkConfig) -> dict:

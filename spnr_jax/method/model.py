@@ -1,6 +1,6 @@
 """The handle for people who only want pictures: load a network, encode a cloud once, render it from anywhere.
 
-    model = spnr_jax.load()  # "small" of the package; or "tiny", a run folder, a file of weights
+    model = spnr_jax.load()  # "surfels" of the package; or "near_points", a run folder, a file of weights
     volume = model.encode(spnr_jax.read_cloud("chair.ply"))
     rendering = model.render(volume, model.camera(volume, azimuth=30, elevation=20))
 
@@ -29,7 +29,11 @@ Quality = Literal["draft", "balanced", "best", "trained"]
 
 @dataclass(frozen=True, kw_only=True)
 class Model:
-    """A trained network; `encode` and `render` are jitted, one compilation per bucket of points and image size."""
+    """A trained network.
+
+    Its programs are compiled once for each bucket of points and size of pictures; `encode` and `render` themselves also
+    work on the host, so they are not for `jax.jit` (networks of rays: `inference.encode` and `inference.render` are).
+    """
 
     config: NetworkConfig
     variables: dict

@@ -13,17 +13,17 @@ from pathlib import Path
 
 import numpy as np
 
-from spnr_jax.formats.config_json import to_dict
 from spnr_jax.formats.images import depth_image, png_url, to_uint8, write_whole
 from spnr_jax.formats.pages import template
+from spnr_jax.methods import to_dict
 from spnr_jax.scoring.evaluation import FLOORS, Evaluation, ObjectResult, median_view
 from spnr_jax.scoring.score_tables import (
-    METHODS,
     MISSING,
     QUALITY,
     Table,
     difference,
     head,
+    label,
     lowered,
     number,
     quality,
@@ -87,7 +87,7 @@ def write_report(path: Path, settings: Mapping, metrics: Mapping, gallery: Seque
         tiles=_key_numbers(metrics),
         gallery_heading=scored(metrics),
         gallery_note=GALLERY_NOTE,
-        heads=["Reference", *(METHODS.get(method, method) for method in shown), "Depth", "Opacity"],
+        heads=["Reference", *(label(method) for method in shown), "Depth", "Opacity"],
         gallery=[(row.name, _pictures(row)) for row in gallery],
         tables=tables,
         facts=_run_facts(metrics),
@@ -112,7 +112,7 @@ def _summary(metrics: Mapping) -> str:
     above = ", ".join(f"{_above(metrics, name)} against {words}" for words, name in compared)
     row = methods[network]
     return (
-        f"{METHODS.get(network, network)}: preset {metrics['preset']}, {metrics['steps']} steps. "
+        f"{label(network)}: preset {metrics['preset']}, {metrics['steps']} steps. "
         f"{settings['points']} points per object. "
         f"{row['psnr']:.2f} dB PSNR on {row['views']} views of {row['objects']} {scored(metrics)}: {above}."
     )
@@ -133,7 +133,7 @@ def text_table(methods: Mapping[str, Mapping]) -> list[str]:
             f"{head.partition(',')[0]} {number(row[name], decimals, missing=MISSING.get(name, 'n/a')).text}"
             for name, (head, decimals, _) in QUALITY.items()
         ]
-        lines.append(f"{METHODS.get(method, method):22s} " + "   ".join(texts))
+        lines.append(f"{label(method):22s} " + "   ".join(texts))
     return lines
 
 
@@ -204,7 +204,7 @@ def _quality_table(methods: Mapping[str, Mapping]) -> Table:
     shown, counts = ([name for name in of if any(name in s for s in methods.values())] for of in (QUALITY, COUNTS))
     cells = quality(methods, shown)
     rows = tuple(
-        (METHODS.get(method, method), (*cells[method], *(text(scores.get(name, "")) for name in counts)))
+        (label(method), (*cells[method], *(text(scores.get(name, "")) for name in counts)))
         for method, scores in methods.items()
     )
     heads = (*map(head, shown), *(COUNTS[name] for name in counts))
@@ -215,7 +215,7 @@ def _difference_table(first: str, minus: Mapping[str, Mapping]) -> Table:
     """Other methods against the difference in each metric."""
     names = [name for name in QUALITY if any(name in row for row in minus.values())]
     rows = tuple(
-        (f"{METHODS.get(first, first)} minus {lowered(method)}", tuple(difference(row.get(m), m) for m in names))
+        (f"{label(first)} minus {lowered(method)}", tuple(difference(row.get(m), m) for m in names))
         for method, row in minus.items()
     )
     return Table(title="Differences", note=DIFFERENCES_NOTE, heads=tuple(map(head, names)), rows=rows)
@@ -229,7 +229,7 @@ def _category_table(per_category: Mapping[str, Mapping]) -> Table:
         objects = next((s["objects"] for s in scores.values() if "objects" in s), "")
         of_all = quality({m: {"psnr": scores.get(m, {}).get("psnr")} for m in methods}, ["psnr"])
         rows.append((category, (*(cell for (cell,) in of_all.values()), text(objects))))
-    heads = (*(METHODS.get(method, method) for method in methods), "Objects")
+    heads = (*(label(method) for method in methods), "Objects")
     return Table(title="Quality by category", note="PSNR in dB.", heads=heads, rows=tuple(rows))
 
 

@@ -10,17 +10,12 @@ from typing import Any
 
 import numpy as np
 
+from spnr_jax.methods import label_of
 from spnr_jax.scoring.perceptual import NO_LPIPS
 from spnr_jax.scoring.summary import interval
 
-METHODS = {  # method -> its name in tables and pictures, in their order
+OTHERS = {  # what is shown beside the methods that are trained -> its name in tables and pictures
     "ours": "Ours",
-    "surfels": "Surfels",
-    "near_points": "Near points",
-    "paper": "The paper's network",
-    "npbg": "NPBG",
-    "point_nerf": "Point-NeRF",
-    "points2nerf": "Points2NeRF",
     "nearest": "Nearest-point shading",
     "splat": "Base-colour splat",
     "white": "White image",
@@ -127,7 +122,12 @@ def difference(found: Mapping | None, metric: str) -> Cell:
     return number(found["mean"], QUALITY[metric][1], found["interval"], sign="+", more=test)
 
 
+def label(method: str) -> str:
+    """What tables and pictures call a method."""
+    return OTHERS.get(method) or label_of(method)
+
+
 def lowered(method: str) -> str:
     """A method's name inside a sentence."""
-    name = METHODS.get(method, method)
+    name = label(method)
     return name if name[:2].isupper() else name[:1].lower() + name[1:]

@@ -24,8 +24,8 @@ class Train:
     config: tyro.conf.AvoidSubcommands[tyro.conf.OmitArgPrefixes[TrainConfig]] = field(default_factory=presets.tiny)
     """Every number of the run; --preset chooses the defaults."""
     init: str | None = None
-    """Weights that a new run begins with: a run folder, a file of weights, or `small` or `tiny`, the networks in the
-    package, which are of the presets plus_refined and plus_lite (default: random)."""
+    """Weights that a new run begins with: a run folder, a file of weights, or a network of the package, which has
+    the name of its preset: surfels, near_points, near_points_lite (default: random)."""
     log_every: int = 20
     """Steps between rows of metrics.jsonl and TensorBoard."""
     preview_every: int = 500
@@ -49,7 +49,7 @@ class Evaluate:
     data: tyro.conf.Positional[Path]
     """Folder of the data set."""
     run: tyro.conf.Positional[Path]
-    """Folder of the run, a file of weights, or `small` or `tiny`, the networks in the package."""
+    """Folder of the run, a file of weights, or a network of the package: surfels, near_points, near_points_lite."""
     out: Path | None = None
     """Folder for metrics.json and report.html (default: the run, or the name of the file without its suffix)."""
     split: Literal["train", "val", "test"] = "test"

@@ -29,8 +29,8 @@ class Render:
     """.ply (also 3D Gaussian splats) .pcd .xyz .txt .csv .las .laz .npz .npy, or a mesh: .glb .gltf .obj .stl .off (its
     surface is sampled).  Or a folder, with all folders in it, or a pattern such as 'scans/**/*.ply'."""
     run: Path | None = None
-    """Network that renders: `surfels`, `small` or `tiny` of the package, a run folder, a file of weights
-    (default: surfels, of fewer than 2,000 points small)."""
+    """Network that renders: `surfels`, `near_points` or `near_points_lite` of the package, a run folder, a file of
+    weights (default: surfels, of fewer than 2,000 points near_points)."""
     out: Path = Path("renders")
     """Folder for what is written; what stands there of a folder's or pattern's files is not drawn again."""
     workers: int | None = None

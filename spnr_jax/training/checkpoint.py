@@ -21,8 +21,8 @@ import jax
 from spnr_jax.config import TrainConfig
 from spnr_jax.devices import allocator
 from spnr_jax.errors import UserError, first_line
-from spnr_jax.formats.config_json import from_dict, to_dict
 from spnr_jax.formats.images import write_whole
+from spnr_jax.methods import UnknownMethod, from_dict, to_dict
 from spnr_jax.training import optimisation
 
 KEPT = 3  # newest checkpoints that stay
@@ -77,6 +77,8 @@ def read_config(run: Path | str) -> TrainConfig:
         raise UserError(f"{run}: not a run folder (config.json is missing); train one with `spnr train DATA {run}`")
     try:
         return from_dict(json.loads(path.read_text()))
+    except UnknownMethod as error:
+        raise UserError(f"{path}: {error}") from None
     except (ValueError, TypeError, ArithmeticError, RecursionError) as error:
         raise UserError(f"{path}: not a config of this version ({error}); train a new run") from None
 

@@ -32,7 +32,7 @@ from spnr_jax.formats.images import png, write_whole
 from spnr_jax.kernels.metrics import psnr
 from spnr_jax.kernels.records import Light
 from spnr_jax.method import inference
-from spnr_jax.training import checkpoint, optimisation, work
+from spnr_jax.training import adversary, checkpoint, optimisation, work
 from spnr_jax.training.metrics_log import MetricsLog, Unwritten
 from spnr_jax.training.run_record import Clock, RunRecord
 from spnr_jax.training.weights import Trained, solid_variables
@@ -94,7 +94,10 @@ def train(
         stack.callback(progress.close)
         batches = stack.enter_context(closing(task.batches(first)))
         clock.lap("restore")
+        joins = adversary.first_adversarial_step(config)
         for step, batch in enumerate(batches, start=first):
+            if first < step == joins and placement.leads():
+                tqdm.write(f"step {step}: the discriminator joins; the training step is compiled anew")
             tell("step", step, batch)
             state, metrics = task.step(state, batch, step)
             done = step + 1

@@ -21,17 +21,18 @@ from flax.traverse_util import flatten_dict, unflatten_dict
 
 from spnr_jax.config import NetworkConfig, SurfelConfig, TrainConfig
 from spnr_jax.errors import UserError
-from spnr_jax.formats.config_json import from_dict, to_dict
 from spnr_jax.formats.images import write_whole
 from spnr_jax.formats.npz import packed, read_arrays
 from spnr_jax.method.inference import init
 from spnr_jax.method.model import Model
+from spnr_jax.methods import UnknownMethod, from_dict, include, to_dict
 
 # what a header of any content makes its readers raise
 UNREADABLE = (ValueError, LookupError, TypeError, ArithmeticError, RecursionError)
 MANY_POINTS = 2000  # chosen between 1,024, where rays score better at 512 pixels, and 4,096, where surfels do
 ADVICE = "write one with `spnr export RUN`"
-SHIPPED = ("surfels", "small", "tiny")  # what the package holds; the first renders where no other is named
+# what the package holds, each named as its preset; the first renders where no other is named
+SHIPPED = ("surfels", "near_points", "near_points_lite")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,12 +52,12 @@ def shipped(name: str = SHIPPED[0]) -> Path:
 def solid_variables(config: NetworkConfig) -> dict:
     """Weights of the network of rays that one over surfels asks (`method/solid.py`): the package's, or none."""
     asks = isinstance(config, SurfelConfig) and config.solid
-    return read_weights(shipped("small")).variables if asks else {}
+    return read_weights(shipped("near_points")).variables if asks else {}
 
 
 def suited_to(num_points: int) -> str:
     """The package's network that draws so many points best (docs/surfels.md)."""
-    return "surfels" if num_points >= MANY_POINTS else "small"
+    return "surfels" if num_points >= MANY_POINTS else "near_points"
 
 
 def place(source: Path | str | None) -> Path:
@@ -79,8 +80,13 @@ def read_trained(source: Path | str | None, say: Callable[[str], None] = print, 
     return Trained(config=config, variables=optimisation.averaged_variables(state), steps=int(state.step))
 
 
-def load(run: Path | str | None = None) -> Model:
-    """A network of the package (SHIPPED; None is the first), of a run folder's newest checkpoint, or of a file."""
+def load(run: Path | str | None = None, methods: Path | str | None = None) -> Model:
+    """A network of the package (SHIPPED; None is the first), of a run folder's newest checkpoint, or of a file.
+
+    For a method of one's own, `methods` names the .py file or module that registers it: no file makes it be imported.
+    """
+    if methods is not None:
+        include(methods)
     trained = read_trained(run)
     return Model(config=trained.config.model, variables=trained.variables)
 
@@ -114,6 +120,8 @@ def read_weights(path: Path) -> Trained:
         config = from_dict(described)
         if path not in [shipped(name) for name in SHIPPED]:
             _check_weights(arrays, variable_shapes(config))
+    except UnknownMethod as error:
+        raise UserError(f"{path}: {error}") from None
     except UNREADABLE as error:
         raise UserError(f"{path}: not a file of weights of this version ({error}); {ADVICE}") from None
     variables = unflatten_dict({name: x.astype(np.float32) for name, x in arrays.items()}, sep="/")

@@ -10,17 +10,16 @@ import pytest
 from support import tiny_model, tiny_training
 from support.laws import close, numbers
 
-from spnr_jax.baselines import points2nerf
-from spnr_jax.baselines.baseline_presets import points2nerf_abo
-from spnr_jax.baselines.points2nerf import Hypernetwork, Points2NeRF
-from spnr_jax.baselines.sizes import Points2NeRFConfig
+from experiments.baselines import points2nerf
+from experiments.baselines.points2nerf import Hypernetwork, Points2NeRF, Points2NeRFConfig
 from spnr_jax.config import OptimizerConfig
 from spnr_jax.method import inference
 
 pytestmark = pytest.mark.ci  # it trains a baseline
 
-FAITHFUL = Points2NeRFConfig(
+CONFIG = Points2NeRFConfig(
     kl_weight=0.01,
+    materials=("base_color", "metallic"),
     point_widths=(8, 6),
     hidden_width=7,
     code_size=5,
@@ -33,9 +32,6 @@ FAITHFUL = Points2NeRFConfig(
     num_samples=4,
     image_resolution=8,
 )
-FIXED = dataclasses.replace(FAITHFUL, mode="fixed", initialization="scaled", materials=("base_color", "metallic"))
-LOSS = points2nerf_abo().loss
-BOTH = pytest.mark.parametrize("config", [FAITHFUL, FIXED], ids=["faithful", "fixed"])
 CLOUD, CAMERA = tiny_model.cloud(), tiny_model.camera()
 
 
@@ -51,11 +47,6 @@ def scenes(config, cloud=CLOUD):
 @functools.partial(jax.jit, static_argnums=0)
 def rendered(config, scene, camera=CAMERA):
     return Points2NeRF(config).apply({}, scene, camera, method="render")
-
-
-@functools.partial(jax.jit, static_argnums=0)
-def code_of(config, cloud=CLOUD):
-    return Points2NeRF(config).apply(variables_of(config), cloud, method="code")
 
 
 def object_of(tree, number):
@@ -82,10 +73,10 @@ def layer(params, x):
 
 
 def test_the_hypernetwork_writes_what_a_loop_over_chunks_and_layers_writes():
-    params = variables_of(FAITHFUL)["params"]["hypernetwork"]
+    params = variables_of(CONFIG)["params"]["hypernetwork"]
     code = np.float64(numbers(3, 2, 5))
     shapes = [(15, 8), (8, 8), (23, 8), (8, 8), (8, 4)]
-    module = Hypernetwork(FAITHFUL, sum(i * o + o for i, o in shapes))
+    module = Hypernetwork(CONFIG, sum(i * o + o for i, o in shapes))
     flat = jax.jit(module.apply)({"params": params}, jnp.asarray(code, jnp.float32))
     for number, row in enumerate(code):
         emitted = []
@@ -101,12 +92,8 @@ def test_the_hypernetwork_writes_what_a_loop_over_chunks_and_layers_writes():
             close(actual.bias, np.array([next(queue) for _ in range(outputs)]))
 
 
-def test_the_layers_of_a_nerf_are_those_that_its_config_asks_for():
-    assert points2nerf.nerf_layers(FAITHFUL.frequencies, 8, 2) == ((15, 8), (8, 8), (23, 8), (8, 8), (8, 4))
-
-
 def test_a_nerf_is_its_layers_with_the_encoded_position_joining_halfway():
-    weights = object_of(scenes(FIXED), 0)
+    weights = object_of(scenes(CONFIG), 0)
     weights = jax.tree.map(lambda x: x[0] + 0.1, weights)
     positions = numbers(5, 3, 2, 3)
     density, rgb = jax.jit(points2nerf.nerf)(weights, positions)
@@ -122,129 +109,34 @@ def test_a_nerf_is_its_layers_with_the_encoded_position_joining_halfway():
         close(rgb[place], 1 / (1 + np.exp(-raw[:3])))
 
 
-@BOTH
-def test_objects_mapped_over_equal_a_loop_over_objects(config):
-    scene = scenes(config)
-    whole = rendered(config, scene)
-    for number in range(2):
-        alone = scenes(config, object_of(CLOUD, number))
-        close(alone, object_of(scene, number))
-        close(rendered(config, alone, object_of(CAMERA, number)), object_of(whole, number), atol=1e-5)
+def test_chunks_of_rays_give_the_picture_of_all_rays_at_once():
+    scene, small = scenes(CONFIG), dataclasses.replace(CONFIG, ray_chunk=30)
+    chunked = inference.jitted_render(variables_of(CONFIG), scene, CAMERA, config=small)
+    close(chunked, rendered(CONFIG, scene), atol=1e-5)
 
 
-@BOTH
-def test_the_order_of_points_and_what_is_masked_do_not_matter(config):
-    code, order = code_of(config), np.random.default_rng(0).permutation(tiny_model.NUM_POINTS)
-    close(code_of(config, jax.tree.map(lambda x: x[:, order], CLOUD)), code)
-    masked = jax.tree.map(lambda x: jnp.concatenate([x, 100 * jnp.ones_like(x)], axis=1), CLOUD)
-    masked = dataclasses.replace(masked, mask=jnp.concatenate([CLOUD.mask, ~CLOUD.mask], axis=1))
-    close(code_of(config, masked), code)
-
-
-def test_the_kl_terms_are_those_of_the_formulas():
-    mean, log_scale = 2 * numbers(1, 4, 5), numbers(2, 4, 5)
-    m, v = np.float64(mean), np.float64(log_scale)
-    close(points2nerf.kl_divergence("fixed", mean, log_scale), 0.5 * (np.exp(v) + m**2 - 1 - v).sum(-1))
-    close(
-        points2nerf.kl_divergence("faithful", mean, log_scale),
-        0.5 * (np.exp(np.exp(v)) + m**2 - 1 - np.exp(v)).sum(-1),
-    )
-    close(points2nerf.code_scale("fixed", log_scale), np.exp(v / 2))
-    close(points2nerf.code_scale("faithful", log_scale), np.exp(v))
-
-
-def test_the_fixed_kl_term_is_the_divergence_of_the_code_that_is_drawn():
-    mean, log_scale = jnp.array([[0.4, -0.8]]), jnp.array([[-0.6, 0.3]])
-    scale = points2nerf.code_scale("fixed", log_scale)
+def test_the_kl_term_is_the_divergence_of_the_code_that_is_drawn():
+    mean, log_variance = jnp.array([[0.4, -0.8]]), jnp.array([[-0.6, 0.3]])
+    scale = jnp.exp(0.5 * log_variance)
     z = mean + scale * jax.random.normal(jax.random.key(4), (400_000, 2))
     log_ratio = -0.5 * ((z - mean) / scale) ** 2 - jnp.log(scale) + 0.5 * z**2
     expected = jnp.mean(jnp.sum(log_ratio, axis=-1))
-    close(points2nerf.kl_divergence("fixed", mean, log_scale)[0], expected, rtol=0.01)
+    close(points2nerf.kl_divergence(mean, log_variance)[0], expected, rtol=0.01)
 
 
-def test_the_faithful_kl_term_falls_as_the_noise_goes_to_zero():
-    zeros = jnp.zeros((6, 1))
-    terms = points2nerf.kl_divergence("faithful", zeros, jnp.array([[0.0], [-1.0], [-2.0], [-4.0], [-8.0], [-16.0]]))
-    assert (np.diff(terms) <= 0).all()
-    assert terms[-1] < 1e-6 < terms[0]
-
-
-def test_the_last_sample_of_a_faithful_ray_paints_the_background_and_fixed_rays_end_white():
-    empty = jax.tree.map(jnp.zeros_like, scenes(FAITHFUL))
-    # density softplus(-9) and the colour sigmoid(-2) everywhere
-    head = empty[-1]._replace(bias=jnp.broadcast_to(jnp.array([-2.0, -2.0, -2.0, -9.0]), empty[-1].bias.shape))
-    scene = (*empty[:-1], head)
-    painted, white = rendered(FAITHFUL, scene), rendered(FIXED, scene)
-    hit = np.asarray(white.acc > 0)
-    assert hit.mean() > 0.3
-    close(painted.acc[hit], np.ones(hit.sum()))
-    close(painted.image[hit], np.full((hit.sum(), 3), 1 / (1 + np.exp(2.0))))
-    close(white.image, np.ones(white.image.shape), atol=1e-3)
-
-
-@BOTH
-def test_gradients_are_finite_through_nerfs_that_are_empty_or_solid(config):
-    scene = scenes(config)
-
-    @jax.jit
-    def gradient(scene):
-        return jax.grad(lambda s: jnp.sum(rendered(config, s).image ** 2))(scene)
-
-    for raw in (-1e4, -90.0, -20.0, 20.0, 1e4):
-        shifted = (*scene[:-1], scene[-1]._replace(bias=scene[-1].bias.at[:, 3].set(raw)))
-        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient(shifted)))
-
-
-@BOTH
-def test_rays_beside_the_box_are_white_whatever_the_weights(config):
-    rendering = rendered(config, scenes(config), tiny_model.camera(target=50.0))
-    np.testing.assert_array_equal(rendering.image, 1)
-    np.testing.assert_array_equal(rendering.acc, 0)
-
-
-@BOTH
-def test_chunks_of_rays_give_the_picture_of_all_rays_at_once(config):
-    scene = scenes(config)
-    chunked = inference.jitted_render(
-        variables_of(config), scene, CAMERA, config=dataclasses.replace(config, ray_chunk=30)
-    )
-    close(chunked, rendered(config, scene), atol=1e-5)
-
-
-def test_training_without_a_key_is_refused():
-    with pytest.raises(ValueError, match="give a key"):
-        Points2NeRF(FIXED).apply(variables_of(FIXED), CLOUD, CAMERA, train=True)
-
-
-def train_config(model):
-    return dataclasses.replace(
+def test_a_step_adds_the_kl_term_to_the_pixel_error_and_moves_every_weight():
+    config = dataclasses.replace(
         tiny_training.L1_ONLY,
-        model=dataclasses.replace(model, image_resolution=tiny_training.SIZE),
+        model=dataclasses.replace(CONFIG, image_resolution=tiny_training.SIZE),
         optimizer=OptimizerConfig(lr_generator=5e-3, warmup_steps=2, algorithm="radam", ema_decay=0.9),
         pixel_stride=4,
-        loss=LOSS,
+        loss=points2nerf.SQUARES,
     )
-
-
-@BOTH
-def test_a_step_adds_the_kl_term_to_the_pixel_error_and_moves_every_weight(config):
-    config = train_config(config)
     before = tiny_training.create(config)
     after, metrics = tiny_training.step(before, config)
-    assert all(np.isfinite(value) for value in metrics.values())
-    squares = float(metrics["loss"] - metrics["kl"])
     assert metrics["kl"] > 0
-    assert 0 < squares < 1
+    assert 0 < float(metrics["loss"] - metrics["kl"]) < 1
     for path, moved in jax.tree_util.tree_leaves_with_path(
         jax.tree.map(lambda a, b: bool(jnp.any(a != b)), before.generator, after.generator)
     ):
         assert moved, jax.tree_util.keystr(path)
-
-
-def test_training_learns_two_coloured_balls():
-    sizes = {"code_size": 16, "hypernetwork_widths": (32, 64), "chunk_size": 200, "nerf_width": 16, "num_samples": 8}
-    config = train_config(dataclasses.replace(FIXED, kl_weight=1e-6, **sizes))
-    config = dataclasses.replace(config, num_steps=400)
-    state, first = tiny_training.step(tiny_training.create(config), config)
-    _, last = tiny_training.run(state, 399, config)
-    assert last["loss"] < 0.1 * first["loss"]

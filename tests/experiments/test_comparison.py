@@ -14,7 +14,6 @@ from experiments.comparison import budget as budgets
 from experiments.comparison import object_scores, page, results_folder, variants, variants_report
 from experiments.comparison.object_scores import Shown, color_scores
 from experiments.comparison.variants import Compared
-from spnr_jax import presets
 from spnr_jax.formats import data_sets
 from spnr_jax.scoring import evaluation, summary
 from spnr_jax.scoring.score_tables import Table, number, text
@@ -153,6 +152,17 @@ def test_the_colour_error_is_of_the_mean_inside_the_silhouette_alone():
     assert (found["hue"] > 99).all()
 
 
+@pytest.mark.parametrize(
+    ("budget", "size", "category", "paper"),
+    [("tiny", 64, "chair", "tiny"), ("paper", 128, None, "abo"), ("paper", 200, "chair", "shapenet_chair")],
+)
+def test_a_budget_has_a_training_of_every_network(budget, size, category, paper):
+    found = budgets.configs(budget, size, category)
+    assert found["paper"].preset == paper
+    assert {name: config.model.method for name, config in found.items()} == {name: name for name in budgets.NETWORKS}
+    assert {config.model.image_resolution for config in found.values()} == {size}
+
+
 def test_minutes_become_steps_at_the_pace_of_both_kinds_of_step(monkeypatch):
     monkeypatch.setattr(budgets, "step_seconds", lambda config, dataset, adversarial: 0.3 if adversarial else 0.1)
     half = dataclasses.replace(tiny_dataset.CONFIG, num_steps=10)  # the discriminator joins after half of the steps
@@ -173,13 +183,13 @@ def test_the_pace_leaves_out_the_step_that_compiles(monkeypatch):
 
 
 def test_a_run_that_was_begun_keeps_its_number_of_steps(tmp_path, monkeypatch):
-    monkeypatch.setitem(presets.PRESETS, "npbg_tiny", lambda: SHRUNKEN["npbg_tiny"])
+    tiny = SHRUNKEN["npbg_tiny"]
     monkeypatch.setattr(budgets, "steps_within", lambda seconds, config, dataset: round(seconds))
-    first = budgets.config_of("npbg_tiny", "tiny", 3, 2.0, None, tmp_path)
+    first = budgets.config_of(tiny, "tiny", 3, 2.0, None, tmp_path)
     assert (first.num_steps, first.seed, first.preset) == (120, 3, "npbg_tiny")
     checkpoint.write_config(tmp_path, first)
     monkeypatch.setattr(budgets, "steps_within", lambda *_: 7)
-    assert budgets.config_of("npbg_tiny", "tiny", 3, 2.0, None, tmp_path) == first
+    assert budgets.config_of(tiny, "tiny", 3, 2.0, None, tmp_path) == first
 
 
 def test_training_seconds_are_those_of_the_steps_over_all_calls(tmp_path):

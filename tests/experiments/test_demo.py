@@ -28,7 +28,7 @@ def asked(monkeypatch):
 
     monkeypatch.setattr(demo, "generate", generate)
     monkeypatch.setattr(presets, "tiny", lambda: tiny_dataset.CONFIG)
-    monkeypatch.setattr(presets, "plus_tiny", lambda: SHRUNKEN["plus_tiny"])
+    monkeypatch.setattr(presets, "near_points_tiny", lambda: SHRUNKEN["near_points_tiny"])
     monkeypatch.setattr(cli, "set_up_jax", lambda **_: None)
     return configs
 
@@ -40,7 +40,7 @@ def test_the_demo_writes_its_report_and_a_second_call_reuses_everything(asked, t
     assert list(first["methods"]) == ["ours", "paper", "white", "splat", "nearest"]
     assert set(first["ours_minus"]) == {"paper", "white", "splat", "nearest"}
     trained = first["settings"]["networks"]
-    assert (trained["ours"]["preset"], trained["paper"]["preset"]) == ("plus_tiny", "tiny")
+    assert (trained["ours"]["preset"], trained["paper"]["preset"]) == ("near_points_tiny", "tiny")
     assert set(first["seconds"]) >= {"generate", "train", "train paper", "evaluate", "total"}
     parts = sum(seconds for name, seconds in first["seconds"].items() if name != "total")
     assert first["seconds"]["total"] == pytest.approx(parts, abs=0.3)

@@ -43,7 +43,7 @@ def asked(monkeypatch):
                 path.write_text("".join(f"mesh-{name}\n" for name in path.read_text().split()))
 
     monkeypatch.setattr(pretrain, "generate", generate)
-    monkeypatch.setattr(presets, "plus_small", lambda: CONFIG)
+    monkeypatch.setattr(pretrain, "first_run", lambda: CONFIG)
     monkeypatch.setattr(cli, "set_up_jax", lambda **_: None)
     return configs
 
@@ -60,7 +60,7 @@ def test_both_data_sets_train_one_network_and_its_file_is_what_was_scored(asked,
     for split, names in single.splits.items():
         assert set(joined.splits[split]) == {*names, *(f"mesh-{name}" for name in names)}
     assert data_sets.read_object(joined, f"mesh-{single.splits['test'][0]}").images.size
-    trained, out = weights.read_trained(options.out / "small.npz"), options.out / "small"
+    trained, out = weights.read_trained(options.out / "near_points.npz"), options.out / "near_points"
     assert (trained.config, trained.steps) == (pretrain.recipe(options)[-1], 2)
     before = weights.read_trained(out / "run4").variables["params"]
     for part, kept in before.items():
@@ -82,13 +82,13 @@ def test_without_meshes_the_procedural_objects_train_alone(asked, tmp_path):
     assert [(part.objects, part.resolution, part.meshes) for part in parts] == [(5, 128, None)]
 
 
-def test_tiny_has_one_run_and_each_run_of_small_begins_where_the_one_before_ended():
-    assert pretrain.recipe(pretrain.Pretrain(network="tiny")) == [presets.plus_lite()]
+def test_the_lite_network_has_one_run_and_each_run_of_the_other_begins_where_the_one_before_ended():
+    assert pretrain.recipe(pretrain.Pretrain(network="near_points_lite")) == [presets.near_points_lite()]
     first, *later, refiner = pretrain.recipe(pretrain.Pretrain())
-    assert first == pretrain.packaged(presets.plus_small())
+    assert (first.model.refiner_width, first.crop, first.pixel_stride, first.num_steps) == (0, 0, 4, 11_000)
     assert [run.num_steps for run in later] == [9000, 6000, 4000]
     assert [run.even_share for run in (first, *later)] == [0, 0, 0, 0.5]
     assert len({run.seed for run in (first, *later)}) == 4
-    assert all(run.model.surface_cells == presets.plus_lite().model.surface_cells for run in later)
+    assert all(run.model.surface_cells == presets.near_points_lite().model.surface_cells for run in later)
     assert (refiner.trains, refiner.num_steps, refiner.even_share, refiner.crop) == ("refiner", 20_000, 0.5, 64)
-    assert refiner.model == presets.plus_refined().model, "what the package holds"
+    assert refiner.model == presets.near_points().model, "what the package holds"

@@ -13,7 +13,7 @@ from experiments.studies.ablations import LABELS, ROWS, changed, folds, rows
 from experiments.studies.speed_accuracy import front, knee
 from spnr_jax import config, presets
 from spnr_jax.config import RayNetworkConfig
-from spnr_jax.formats.config_json import to_dict
+from spnr_jax.methods import to_dict
 from spnr_jax.training import adversary
 
 PLUS_ROWS = ("free_colour", "no_neighbours", "three_neighbours", "twelve_neighbours", "batch_norm")
@@ -60,11 +60,12 @@ class TestRows:
             "no_squared_error": {"loss.mse_weight": 0.0},
             "view_direction": {"model.sees_direction": True},
         }
-        changed_rows = {row: self.changes(row, presets.plus_tiny()) for row in PLUS_ROWS if row != "no_neighbours"}
+        wanted = [row for row in PLUS_ROWS if row != "no_neighbours"]
+        changed_rows = {row: self.changes(row, presets.near_points_tiny()) for row in wanted}
         assert changed_rows == expected
 
     def test_without_neighbours_it_is_the_paper_s_field_near_the_points(self):
-        near, paper = (changed(row, presets.plus_tiny()).model for row in ("free_colour", "no_neighbours"))
+        near, paper = (changed(row, presets.near_points_tiny()).model for row in ("free_colour", "no_neighbours"))
         assert (paper.method, paper.num_features, paper.upsamples) == ("paper", 32, False)
         for field in dataclasses.fields(RayNetworkConfig):
             assert getattr(paper, field.name) == getattr(near, field.name)

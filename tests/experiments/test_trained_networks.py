@@ -35,10 +35,10 @@ def test_networks_of_a_table_and_of_runs_are_named_after_their_methods_in_the_or
 
 
 def test_the_networks_of_the_package_go_by_their_names():
-    found = networks(Sources(runs=(Path("small"), Path("tiny"))), tiny_dataset.dataset())
-    assert [name.rsplit(" ", 1)[1] for name in found] == ["(small)", "(tiny)"]
+    found = networks(Sources(runs=(Path("near_points"), Path("near_points_lite"))), tiny_dataset.dataset())
+    assert [name.rsplit(" ", 1)[1] for name in found] == ["(near_points)", "(near_points_lite)"]
     assert [network.identity["config"] for network in found.values()] == [
-        hashlib.sha256(weights.shipped(name).read_bytes()).hexdigest() for name in ("small", "tiny")
+        hashlib.sha256(weights.shipped(name).read_bytes()).hexdigest() for name in ("near_points", "near_points_lite")
     ]
 
 

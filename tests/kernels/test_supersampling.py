@@ -9,7 +9,7 @@ import pytest
 from support.laws import close, numbers, same_bits
 from support.tiny_model import MODEL, PLUS, camera, cloud, wobbled
 
-from spnr_jax.baselines.sizes import NPBGConfig
+from experiments.baselines.npbg import NPBGConfig
 from spnr_jax.config import RenderOptions
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.records import Rendering

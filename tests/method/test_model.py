@@ -11,7 +11,7 @@ from support.laws import close
 from support.surfel_clouds import cloud
 
 import spnr_jax
-from spnr_jax.baselines.sizes import NPBGConfig
+from experiments.baselines.npbg import NPBGConfig
 from spnr_jax.config import RenderOptions, SamplingConfig
 from spnr_jax.formats import data_sets
 from spnr_jax.kernels import cameras

@@ -167,7 +167,7 @@ class TestConfig:
             dataclasses.replace(PLUS, **changes)
 
     def test_the_grid_of_a_training_is_at_least_that_of_its_clouds(self):
-        config = presets.plus_tiny()
+        config = presets.near_points_tiny()
         with pytest.raises(ValueError, match="surface_cells 32: with max_points 2048 .* use at least 45"):
             dataclasses.replace(config, max_points=2048)
         dataclasses.replace(config, max_points=2048, model=dataclasses.replace(config.model, surface_cells=45))

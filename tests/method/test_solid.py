@@ -22,7 +22,7 @@ NUM_POINTS, RADIUS = 700, 0.6
 
 @pytest.fixture(scope="module")
 def trained():
-    return weights.read_trained("small")
+    return weights.read_trained("near_points")
 
 
 def test_its_sizes_are_those_of_the_package_s_network(trained):

@@ -266,7 +266,7 @@ class TestTraining:
 
 class TestConfig:
     def test_the_presets_are_those_of_the_package_s_networks(self):
-        for preset, name in ((presets.plus_refined(), "small"), (presets.plus_lite(), "tiny")):
+        for preset, name in ((presets.near_points(), "near_points"), (presets.near_points_lite(), "near_points_lite")):
             assert preset.model == weights.read_trained(name).config.model
 
     @pytest.mark.parametrize(

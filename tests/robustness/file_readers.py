@@ -73,7 +73,7 @@ def check_cloud(cloud, most: int | None = None) -> None:
 
 def read_config(folder: Path, main: str) -> None:
     """A run folder's config."""
-    from spnr_jax.formats.config_json import from_dict, to_dict
+    from spnr_jax.methods import from_dict, to_dict
     from spnr_jax.training.checkpoint import read_config
 
     config = read_config(folder)

@@ -21,7 +21,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))  # the helpers of all tests
 import jax
 import jax.numpy as jnp
 import numpy as np
-from support import tiny_dataset, tiny_model
+from support import tiny_baselines, tiny_dataset, tiny_model
 
 from spnr_jax.config import LossConfig, SamplingConfig
 from spnr_jax.devices import placement
@@ -37,7 +37,7 @@ PLUS = dataclasses.replace(
 MODELS = {
     "plain": tiny_model.MODEL,
     "near points": PLUS,
-    "Point-NeRF": dataclasses.replace(tiny_model.POINT_NERF, image_resolution=24),
+    "Point-NeRF": dataclasses.replace(tiny_baselines.POINT_NERF, image_resolution=24),
 }
 OBJECTS = 8
 

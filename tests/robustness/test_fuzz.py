@@ -31,7 +31,7 @@ from hypothesis import strategies as st
 from watched import limited_memory, watched
 
 from spnr_jax.errors import one_line
-from spnr_jax.formats.config_json import from_dict, to_dict
+from spnr_jax.methods import from_dict, to_dict
 from spnr_jax.presets import tiny
 from spnr_jax.viewer import session, viewpoint
 

@@ -11,7 +11,7 @@ from valid_files import POINTS, SIZE, VIEWS, numbers
 
 from data_gen.store import layout
 from spnr_jax import presets
-from spnr_jax.formats.config_json import to_dict
+from spnr_jax.methods import to_dict
 
 
 def configs() -> list[Files]:
@@ -75,7 +75,7 @@ def lists() -> list[Files]:
 
 
 def weights() -> list[Files]:
-    """Files of weights of very small networks, one of them NPBG's."""
+    """Files of weights of very small networks, one of them near points."""
     from spnr_jax.config import EncoderConfig, PaperConfig, SamplingConfig
     from spnr_jax.training.weights import variable_shapes
 
@@ -90,7 +90,7 @@ def weights() -> list[Files]:
         image_resolution=32, upsampler_width=4,
     )  # fmt: skip
     files = []
-    for config in (dataclasses.replace(ours, model=small), presets.PRESETS["npbg_tiny"]()):
+    for config in (dataclasses.replace(ours, model=small), presets.near_points_tiny()):
         described = np.frombuffer(json.dumps(to_dict(config)).encode(), np.uint8)
         halves = {name: np.zeros(x.shape, np.float16) for name, x in variable_shapes(config).items()}
         stream = io.BytesIO()

@@ -13,7 +13,7 @@ from support import tiny_dataset, tiny_untrained
 
 from spnr_jax.scoring import report
 from spnr_jax.scoring.report import GalleryRow, duration, psnr, write_report
-from spnr_jax.scoring.score_tables import METHODS
+from spnr_jax.scoring.score_tables import label
 from spnr_jax.scoring.summary import METRICS
 
 VOID = {"meta", "img", "br"}
@@ -279,7 +279,7 @@ class TestEvaluation:
     def test_the_table_for_a_terminal_has_a_line_for_each_method_and_says_what_is_missing(self, outcome):
         methods = outcome.summary["methods"]
         lines = report.text_table(methods)
-        assert [line.partition("  ")[0] for line in lines] == [METHODS[name] for name in methods]
+        assert [line.partition("  ")[0] for line in lines] == [label(name) for name in methods]
         for line, values in zip(lines, methods.values(), strict=True):
             assert f"PSNR {values['psnr']:.2f} " in line
             assert f"FLIP {values['flip']:.3f} " in line

@@ -12,7 +12,7 @@ import numpy as np
 import spnr_jax
 
 FILE = Path(__file__).with_name("golden.npz")
-NETWORKS = ("small", "tiny", "surfels")
+NETWORKS = ("near_points", "near_points_lite", "surfels")
 SIZE, VIEW = 64, {"azimuth": 35.0, "elevation": 25.0}
 
 

@@ -2,11 +2,27 @@
 
 import dataclasses
 
-from spnr_jax.baselines.sizes import NPBGConfig, PointNeRFConfig, Points2NeRFConfig
+from experiments.baselines.npbg import NPBGConfig
+from experiments.baselines.point_nerf import PointNeRFConfig
+from experiments.baselines.points2nerf import Points2NeRFConfig
 from spnr_jax.config import LossConfig, NetworkConfig, OptimizerConfig
 from support import tiny_dataset, tiny_model
 
 SIZE = tiny_dataset.SIZE
+POINT_NERF = PointNeRFConfig(
+    radius=0.25,
+    num_neighbors=4,
+    num_candidates=24,
+    num_samples=5,
+    width=8,
+    color_width=6,
+    feature_frequencies=2,
+    offset_frequencies=2,
+    direction_frequencies=1,
+    density_scale=3.0,
+    image_resolution=8,
+    ray_chunk=20,
+)
 BASELINE = dataclasses.replace(
     tiny_dataset.CONFIG,
     loss=LossConfig(l1_weight=1.0, adversarial_weight=0.0, pixel="mse"),
@@ -14,7 +30,7 @@ BASELINE = dataclasses.replace(
 )
 PLUS = dataclasses.replace(tiny_model.PLUS, surface_cells=32, image_resolution=SIZE)
 NETWORKS: dict[str, NetworkConfig] = {
-    "plus_tiny": PLUS,
+    "near_points_tiny": PLUS,
     "npbg_tiny": NPBGConfig(encoder_widths=(8, 9), decoder_widths=(5,), image_resolution=SIZE),
     "point_nerf_tiny": PointNeRFConfig(
         num_candidates=12,

@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from spnr_jax.baselines.sizes import PointNeRFConfig
 from spnr_jax.config import EncoderConfig, NearPointsConfig, PaperConfig, SamplingConfig
 from spnr_jax.kernels.cameras import look_at, pinhole
 from spnr_jax.kernels.records import PointCloud
@@ -36,20 +35,6 @@ PLUS = NearPointsConfig(
     surface_cells=6,  # of 40 points
     sampling=SamplingConfig(num_coarse=6, num_fine=0, reach=1),
     image_resolution=8,
-)
-POINT_NERF = PointNeRFConfig(
-    radius=0.25,
-    num_neighbors=4,
-    num_candidates=24,
-    num_samples=5,
-    width=8,
-    color_width=6,
-    feature_frequencies=2,
-    offset_frequencies=2,
-    direction_frequencies=1,
-    density_scale=3.0,
-    image_resolution=8,
-    ray_chunk=20,
 )
 NUM_POINTS = 40
 

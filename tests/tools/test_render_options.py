@@ -48,11 +48,14 @@ def test_a_part_that_is_not_there_is_refused_in_one_line(tmp_path, capsys, optio
         (["--light", "absent.hdr"], "absent.hdr: no such file"),
         (["--transparent", "--background", "light"], "--background light: not together with --transparent"),
         (
-            ["--run", "small", "--light", "studio"],
-            "--light: the network of --run small knows the light of its training",
+            ["--run", "near_points", "--light", "studio"],
+            "--light: the network of --run near_points knows the light of its training",
         ),
-        (["--run", "small", "--turn", "light"], "--turn light: the network of --run small knows the light"),
-        (["--run", "small", "--exposure", "1", "--sun", "0", "9"], "--sun, --exposure: the network of --run small"),
+        (["--run", "near_points", "--turn", "light"], "--turn light: the network of --run near_points knows the light"),
+        (
+            ["--run", "near_points", "--exposure", "1", "--sun", "0", "9"],
+            "--sun, --exposure: the network of --run near_points",
+        ),
     ],
 )
 def test_light_that_cannot_be_is_one_line_and_code_2_before_the_cloud_is_read(arguments, expected, tmp_path, capsys):

@@ -12,7 +12,7 @@ from support.tiny_baselines import SHRUNKEN
 from support.tiny_dataset import CONFIG
 
 from spnr_jax import presets
-from spnr_jax.formats.config_json import to_dict
+from spnr_jax.methods import to_dict
 from spnr_jax.training import checkpoint, optimisation
 
 # Orbax's reader drops a coroutine of its Zarr store when a file is not what it expects
@@ -78,7 +78,7 @@ def test_a_run_of_another_method_is_refused_with_its_name(tmp_path):
     checkpoint.write_config(tmp_path, presets.tiny())
     (tmp_path / "checkpoints").mkdir()
     with pytest.raises(ValueError, match=r"model\.method paper there, npbg asked"):
-        checkpoint.write_config(tmp_path, presets.PRESETS["npbg_tiny"]())
+        checkpoint.write_config(tmp_path, SHRUNKEN["npbg_tiny"])
 
 
 def test_a_folder_without_checkpoints_holds_no_state(tmp_path):

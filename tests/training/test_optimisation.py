@@ -13,9 +13,8 @@ from support.laws import close, numbers, same_bits
 from support.tiny_model import MODEL, PLUS, SIZE
 from support.tiny_training import BATCH, CONFIG, L1_ONLY, copied, create, near, run, step
 
-from spnr_jax.baselines import networks
-from spnr_jax.baselines.sizes import NPBGConfig
-from spnr_jax.config import LossConfig
+from spnr_jax import methods
+from spnr_jax.config import LossConfig, NetworkConfig
 from spnr_jax.kernels import losses
 from spnr_jax.kernels.records import Rendering
 from spnr_jax.method import inference
@@ -183,7 +182,7 @@ class TestPixelError:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class OneColorConfig(NPBGConfig):
+class OneColorConfig(NetworkConfig):
     """A network of one weight, to see what the step asks of a network."""
 
     method: ClassVar[str] = "one_color"
@@ -202,7 +201,7 @@ class OneColor(nn.Module):
 
 def test_a_method_is_a_network_and_a_loss(monkeypatch):
     """One weight g, no statistics: the gradient of 2 mean (g - reference)^2 + 3 g^2, written out."""
-    monkeypatch.setitem(networks.NETWORKS, "one_color", OneColor)
+    monkeypatch.setitem(methods.METHODS, "one_color", methods.Method(config=OneColorConfig, network=OneColor))
     config = dataclasses.replace(
         L1_ONLY,
         model=OneColorConfig(image_resolution=32),

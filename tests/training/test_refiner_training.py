@@ -29,7 +29,10 @@ PLAIN = dataclasses.replace(
     loss=LossConfig(l1_weight=1.0, mse_weight=1.0, adversarial_weight=0.0),
 )
 CONFIG = dataclasses.replace(
-    presets.plus_refiner(),
+    presets.near_points(),
+    preset="refiner",
+    trains="refiner",
+    optimizer=dataclasses.replace(presets.QUICK, beta2=0.99, clip_norm=1.0),
     model=dataclasses.replace(PLAIN.model, refiner_width=4),
     crop=SIZE // 2,
     num_steps=4,
@@ -110,7 +113,7 @@ def test_a_stopped_run_goes_on_to_the_same_bits(trained, finished, tmp_path, mon
 
 
 def test_a_refiner_without_the_network_before_it_is_refused(tmp_path):
-    with pytest.raises(ValueError, match="preset plus_refiner trains a refiner behind a network .* --init"):
+    with pytest.raises(ValueError, match="preset refiner trains a refiner behind a network .* --init"):
         trainer.train(CONFIG, tiny_dataset.dataset(), tmp_path, tiny_dataset.SCHEDULE)
 
 

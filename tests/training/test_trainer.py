@@ -17,8 +17,9 @@ from support.stopped_runs import interrupted, rows_without_time
 from support.tiny_dataset import CONFIG, SCHEDULE
 
 import spnr_jax
+from experiments.baselines.npbg import NPBGConfig
+from experiments.baselines.point_nerf import PointNeRFConfig
 from spnr_jax import cli
-from spnr_jax.baselines.sizes import NPBGConfig, PointNeRFConfig
 from spnr_jax.config import LossConfig
 from spnr_jax.formats import data_sets
 from spnr_jax.scoring import evaluation

@@ -17,7 +17,8 @@ from spnr_jax.config import LossConfig, OptimizerConfig, TrainConfig
 from spnr_jax.formats import data_sets
 from spnr_jax.kernels import losses
 from spnr_jax.method import inference
-from spnr_jax.presets import BASELINES, OURS, PLUS, tiny
+from spnr_jax.methods import METHODS
+from spnr_jax.presets import PAPERS, near_points, near_points_lite, near_points_tiny, tiny
 from spnr_jax.training import adversary, batching, metrics_log, optimisation, trainer
 
 pytestmark = pytest.mark.ci  # it trains several networks
@@ -179,9 +180,9 @@ def shrunken(config: TrainConfig, precision: str, num_steps: int) -> TrainConfig
 
 
 def shrunken_baseline(config: TrainConfig, num_steps: int) -> TrainConfig:
-    """A baseline's preset with its own units, mode, losses and schedule, 8 pixels a side and the narrowest layers."""
+    """A baseline's preset with its own units, losses and schedule, 8 pixels a side and the narrowest layers."""
     small = next(model for model in NETWORKS.values() if isinstance(model, type(config.model)))
-    kept = ("near", "radius", "jitter", "density_scale", "mode", "initialization", "kl_weight", "materials")
+    kept = ("near", "radius", "jitter", "density_scale", "kl_weight", "materials")
     kept = {name: getattr(config.model, name) for name in kept if hasattr(config.model, name)}
     model = dataclasses.replace(small, **kept, image_resolution=8 * config.pixel_stride)
     return shortened(dataclasses.replace(config, model=model), num_steps)
@@ -225,20 +226,20 @@ class TestNoNaN:
 
     @pytest.mark.slow
     @pytest.mark.parametrize("precision", ["float32", "bfloat16"])
-    @pytest.mark.parametrize("preset", OURS)
+    @pytest.mark.parametrize("preset", PAPERS)
     def test_twenty_steps_of_each_shrunken_preset_make_none(self, preset, precision, tmp_path):
         config = shrunken(preset(), precision, 20)
         assert adversary.first_adversarial_step(config) in range(1, 20), "both phases are trained"
         assert train_under_debug_nans(config, images_of(config, tmp_path)).step == 20
 
     @pytest.mark.slow
-    @pytest.mark.parametrize("preset", PLUS)
+    @pytest.mark.parametrize("preset", [near_points, near_points_lite, near_points_tiny])
     def test_twenty_steps_of_each_shrunken_network_that_sees_the_surface_make_none(self, preset, tmp_path):
         config = dataclasses.replace(preset(), model=PLUS_MODEL, num_steps=20, min_points=40, max_points=80)
         assert train_under_debug_nans(config, images_of(config, tmp_path)).step == 20
 
     @pytest.mark.slow
-    @pytest.mark.parametrize("preset", BASELINES)
+    @pytest.mark.parametrize("preset", [preset for method in METHODS.values() for preset in method.presets])
     def test_twenty_steps_of_each_shrunken_baseline_make_none(self, preset, tmp_path):
         config = shrunken_baseline(preset(), 20)
         assert train_under_debug_nans(config, images_of(config, tmp_path)).step == 20

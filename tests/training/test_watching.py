@@ -50,6 +50,17 @@ def test_every_preview_of_a_training_is_an_image_at_its_step(monkeypatch, tmp_pa
     assert [step for step, value in events(tmp_path) if value.HasField("image")] == [3, 6]
 
 
+def test_the_second_compilation_is_announced_before_the_step_that_needs_it(monkeypatch, tmp_path, capsys):
+    without_network(monkeypatch)
+    seen = []
+    trainer.train(
+        tiny_dataset.CONFIG, tiny_dataset.dataset(), tmp_path, tiny_dataset.SCHEDULE,
+        on_event=lambda phase, step, _: seen.append((phase, step, "discriminator joins" in capsys.readouterr().out)),
+    )  # fmt: skip
+    assert [step for phase, step, said in seen if said] == [3]
+    assert ("step", 3, True) in seen
+
+
 @pytest.mark.slow
 def test_the_image_is_that_of_the_previews_folder():
     run = tiny_dataset.run()

@@ -11,18 +11,92 @@ Pixel (row, column) of a raster is the half-open square (column, column + 1] x (
 into it the one with the smallest camera depth shows, and of equally deep ones the first.
 """
 
+from dataclasses import dataclass
+from typing import ClassVar
+
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from spnr_jax.baselines.sizes import NPBGConfig
-from spnr_jax.config import RenderOptions
+from spnr_jax.config import (
+    MATERIAL_CHANNELS,
+    LossConfig,
+    NetworkConfig,
+    OptimizerConfig,
+    RenderOptions,
+    TrainConfig,
+    check,
+)
+from spnr_jax.errors import require
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.numerics import per_feature
 from spnr_jax.kernels.records import Camera, Key, PointCloud, Rendering
 from spnr_jax.kernels.resizing import bilinear
 from spnr_jax.nn.convolution import conv
+
+
+@dataclass(frozen=True, kw_only=True)
+class NPBGConfig(NetworkConfig):
+    """Sizes of NPBG; the defaults are the published ones."""
+
+    method: ClassVar[str] = "npbg"
+
+    encoder_widths: tuple[int, ...] = (16, 32, 48, 64, 80)
+    """Channels at each scale, the finest first; each scale has half the pixels of the one before."""
+    decoder_widths: tuple[int, ...] = (48, 24, 12, 6)
+    """Channels after each step back up, the coarsest first."""
+    near: float = 0.01
+    """Points closer to the plane of the eye than this are not drawn."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check(self, positive=("encoder_widths", "decoder_widths", "near"))
+        require(
+            len(self.encoder_widths) == len(self.decoder_widths) + 1 >= 2,
+            f"encoder_widths must have one entry more than decoder_widths, got {self.encoder_widths} and "
+            f"{self.decoder_widths}",
+        )
+        inputs, widths = sum(MATERIAL_CHANNELS.values()) + 1, self.encoder_widths
+        require(min(widths[1:]) > inputs, f"encoder_widths must exceed the {inputs} channels of a raster, got {widths}")
+        smallest = 2 ** len(self.encoder_widths)  # reflection needs two pixels at the coarsest scale
+        require(
+            self.image_resolution >= smallest,
+            f"image_resolution {self.image_resolution} is too small for {len(self.encoder_widths)} scales; use at "
+            f"least {smallest}",
+        )
+
+    @property
+    def any_size(self) -> bool:
+        """It sees all pixels at once, of one size."""
+        return False
+
+
+def published(size: int) -> TrainConfig:
+    """The published training, for pictures of 128 (ABO) or 200 pixels (ShapeNet); meant for one GPU."""
+    return TrainConfig(
+        preset=f"npbg, {size} px, as published",
+        model=NPBGConfig(image_resolution=size),
+        loss=LossConfig(l1_weight=1.0, adversarial_weight=0.0),
+        optimizer=OptimizerConfig(lr_generator=1e-4, warmup_steps=0, final_lr_scale=1.0),
+        num_steps=40_000,  # 20 epochs of 16,161 objects
+    )
+
+
+def npbg_tiny() -> TrainConfig:
+    """The same network at 64 px, learning rate 20 times as high.
+
+    `spnr train --methods experiments.baselines --preset npbg_tiny DATA RUN`
+    """
+    return TrainConfig(
+        preset="npbg_tiny",
+        model=NPBGConfig(image_resolution=64),
+        loss=LossConfig(l1_weight=1.0, adversarial_weight=0.0),
+        optimizer=OptimizerConfig(lr_generator=2e-3, warmup_steps=100, ema_decay=0.995),
+        num_steps=3000,
+        batch_objects=4,
+        max_points=1024,
+    )
 
 
 def visible_points(

@@ -1,44 +1,141 @@
 """Points2NeRF: a hypernetwork writes the weights of one NeRF per object (Zimny et al., 2022, as its code has it).
 
-    cloud -> shared MLP, max over points -> mean and log scale of a code -> hypernetwork -> weights -> NeRF along rays
+    cloud -> shared MLP, max over points -> code -> hypernetwork -> weights -> NeRF along rays
 
 The NeRF is a pure function of a tree of weights, `nerf(weights, positions)`; the scene that a cloud encodes to is
 such a tree with objects first on every array, and rendering is `jax.vmap` over it.  The hypernetwork writes all weights
 as one vector, chunk by chunk: one MLP sees the code and a learnt embedding of the chunk's number.  The chunks are laid
 end to end and cut into kernel and bias, layer after layer (`split_weights`); what is left of the last one is dropped.
 
-Two modes, because the published code departs from a variational autoencoder (`l` is the second head of the encoder):
-    faithful  scale exp(l); the KL term takes exp(l) for the log variance, so it is smallest without noise; the last
-              interval of a ray is 1e10 long, so its sample is opaque and has to paint the background
-    fixed     scale exp(l / 2) and the KL term of that; finite intervals, white where nothing stops the ray
-A picture is made from the mean of the code; training draws the code around it.
-
-Two initialisations: published (all uniform in +-1/sqrt(inputs): the NeRF begins with weights near 0.006 and hardly sees
-its input), or scaled (He et al., 2015, a small scale of the code, and the NeRF's layers times sqrt(2 / inputs)).
+A picture is made from the mean of the code; training draws the code around it, and adds the KL term.
+The published code takes exp(l) for the scale and for the log variance of the second head l, and a last interval of 1e10
+that has to paint the background; here it is a variational autoencoder over finite intervals, white where nothing stops
+the ray.  Its layers start in +-1/sqrt(inputs), so that the NeRF hardly sees its input; here signals keep their size on
+the way to the picture: He et al., 2015, a small scale of the code, and the NeRF's layers times sqrt(2 / inputs).
 """
 
 import math
 from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from dataclasses import dataclass
+from typing import ClassVar, NamedTuple
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from spnr_jax.baselines import ray_chunks
-from spnr_jax.baselines.sizes import Points2NeRFConfig
-from spnr_jax.config import RenderOptions
-from spnr_jax.errors import UserError
+from experiments.baselines import ray_chunks
+from spnr_jax.config import LossConfig, Material, NetworkConfig, OptimizerConfig, RenderOptions, TrainConfig, check
+from spnr_jax.errors import UserError, require
 from spnr_jax.kernels import cameras, compositing, sampling
 from spnr_jax.kernels.numerics import per_feature, softplus
 from spnr_jax.kernels.records import Camera, Key, PointCloud, Rays, Rendering
 from spnr_jax.nn.encoding import encode_direction
 
-PAINTED = 1e10  # length of a ray's last interval in faithful mode
-QUIET = -6.0  # log variance that a scaled encoder begins with: codes are told apart from the first step on
+QUIET = -6.0  # log variance that the encoder begins with: codes are told apart from the first step on
 
-Mode = Literal["faithful", "fixed"]
+
+@dataclass(frozen=True, kw_only=True)
+class Points2NeRFConfig(NetworkConfig):
+    """Sizes of Points2NeRF; the defaults are the published ones."""
+
+    method: ClassVar[str] = "points2nerf"
+
+    kl_weight: float = 1.0
+    """Weight of the KL term, a sum over the code, beside the mean squared error of a pixel."""
+    materials: tuple[Material, ...] = ("base_color",)
+    """Material channels that the points carry into the encoder."""
+    point_widths: tuple[int, ...] = (64, 128, 256, 512, 512)
+    """Layers of the MLP that sees each point."""
+    hidden_width: int = 512
+    """Hidden layer after the maximum over the points."""
+    code_size: int = 4096
+    """Numbers in an object's code."""
+    hypernetwork_widths: tuple[int, ...] = (4096, 8192)
+    """Hidden layers of the hypernetwork."""
+    chunk_size: int = 16384
+    """Weights that the hypernetwork writes at once."""
+    chunk_embedding: int = 8
+    """Numbers that tell the hypernetwork which chunk it writes."""
+    frequencies: int = 10
+    """Frequencies of the encoding of a position in the NeRF."""
+    nerf_width: int = 256
+    """Hidden layers of the NeRF."""
+    nerf_depth: int = 8
+    """Hidden layers of the NeRF after its first one, and after the encoded position joins again, together."""
+    num_samples: int = 256
+    """Stratified samples along each ray."""
+    ray_chunk: int = 1024
+    """Rays of an object rendered at once in evaluation."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        counts = "hidden_width", "code_size", "chunk_size", "chunk_embedding", "nerf_width", "num_samples", "ray_chunk"
+        check(self, positive=(*counts, "point_widths", "hypernetwork_widths"))
+        require(len(set(self.materials)) == len(self.materials), f"materials must be distinct, got {self.materials}")
+        require(
+            self.nerf_depth >= 2 and self.nerf_depth % 2 == 0,
+            f"nerf_depth must be even and at least 2, got {self.nerf_depth}",
+        )
+
+    @property
+    def per_pixel(self) -> bool:
+        """Every ray is rendered by itself."""
+        return True
+
+
+SQUARES = LossConfig(l1_weight=1.0, adversarial_weight=0.0, pixel="mse")
+
+
+def published(size: int) -> TrainConfig:
+    """The published training at 128 (ABO) or 200 pixels (ShapeNet), 1024 or 1600 rays a step; meant for one GPU.
+
+    190 million parameters; the authors report two weeks and more per class.
+    """
+    return TrainConfig(
+        preset=f"points2nerf, {size} px, as published",
+        model=Points2NeRFConfig(image_resolution=size),
+        loss=SQUARES,
+        optimizer=OptimizerConfig(
+            lr_generator=5e-5, warmup_steps=0, algorithm="radam", decay="exponential", final_lr_scale=0.135
+        ),
+        num_steps=2_254_000,  # 2000 epochs of 1127 cars, the learning rate times 0.999 after each
+        batch_objects=1,
+        pixel_stride={128: 4, 200: 5}[size],
+    )
+
+
+def points2nerf_tiny() -> TrainConfig:
+    """A hundredth of the size, 64 px, minutes on two cores.
+
+    `spnr train --methods experiments.baselines --preset points2nerf_tiny DATA RUN`
+
+    The encoder sees all materials, as our network does.  The KL weight, 2 * 0.05^2 over an object's 768 numbers in a
+    step, is that of pixels with a Gaussian error of 0.05; at 1, beside a mean of squares, the code would say nothing.
+    """
+    return TrainConfig(
+        preset="points2nerf_tiny",
+        model=Points2NeRFConfig(
+            kl_weight=6.5e-6,
+            materials=("base_color", "roughness", "metallic"),
+            point_widths=(64, 128, 256),
+            hidden_width=256,
+            code_size=128,
+            hypernetwork_widths=(256, 512),
+            chunk_size=2048,
+            frequencies=6,
+            nerf_width=64,
+            nerf_depth=4,
+            num_samples=24,
+            image_resolution=64,
+        ),
+        loss=SQUARES,
+        optimizer=OptimizerConfig(lr_generator=3e-3, warmup_steps=30, ema_decay=0.995, algorithm="radam"),
+        num_steps=1200,
+        batch_objects=4,
+        max_points=1024,
+        pixel_stride=4,
+    )
 
 
 class Layer(NamedTuple):
@@ -82,44 +179,33 @@ def nerf(
     return softplus(raw[..., 3]), nn.sigmoid(raw[..., :3])
 
 
-def code_scale(mode: Mode, log_scale: Float[Array, "*batch code"]) -> Float[Array, "*batch code"]:
-    """Standard deviation of the code: exp(l), or exp(l / 2) of a log variance l."""
-    return jnp.exp(log_scale if mode == "faithful" else 0.5 * log_scale)
-
-
 def kl_divergence(
-    mode: Mode, mean: Float[Array, "*batch code"], log_scale: Float[Array, "*batch code"]
+    mean: Float[Array, "*batch code"], log_variance: Float[Array, "*batch code"]
 ) -> Float[Array, "*batch"]:
-    """0.5 sum(exp(v) + mean^2 - 1 - v) over the code; v is l, which makes it KL(N(mean, exp l) || N(0, 1)), or exp(l).
-
-    The latter (faithful) falls with l without end: what remains is an autoencoder whose means are kept small.
-    """
-    v = jnp.exp(log_scale) if mode == "faithful" else log_scale
-    return 0.5 * jnp.sum(jnp.exp(v) + mean**2 - 1 - v, axis=-1)
+    """KL(N(mean, exp(log_variance)) || N(0, 1)), summed over the code."""
+    return 0.5 * jnp.sum(jnp.exp(log_variance) + mean**2 - 1 - log_variance, axis=-1)
 
 
 class Dense(nn.Module):
-    """A dense layer that starts as published or scaled; `bias` is what a scaled one adds from the start."""
+    """A dense layer that keeps the size of signals; `bias` is what it adds from the start."""
 
     width: int
-    scaled: bool
     bias: float = 0.0
 
     @nn.compact
     def __call__(self, x: Float[Array, "*batch channels"]) -> Float[Array, "*batch {self.width}"]:
         """x times the kernel, plus the bias."""
-        bound = (6.0 if self.scaled else 1.0) ** 0.5 * x.shape[-1] ** -0.5
+        bound = (6 / x.shape[-1]) ** 0.5
 
         def uniform(key, shape):
             return jax.random.uniform(key, shape, minval=-bound, maxval=bound)
 
-        first_bias = nn.initializers.constant(self.bias) if self.scaled else uniform
         kernel = self.param("kernel", uniform, (x.shape[-1], self.width))
-        return x @ kernel + per_feature(self.param("bias", first_bias, (self.width,)), x)
+        return x @ kernel + per_feature(self.param("bias", nn.initializers.constant(self.bias), (self.width,)), x)
 
 
 class Encoder(nn.Module):
-    """Mean and log scale of an object's code from its points; their order and what is masked do not matter."""
+    """Mean and log variance of an object's code from its points; their order and what is masked do not matter."""
 
     config: Points2NeRFConfig
 
@@ -128,14 +214,13 @@ class Encoder(nn.Module):
         self, x: Float[Array, "objects points channels"], mask: Bool[Array, "objects points"]
     ) -> tuple[Float[Array, "objects code"], Float[Array, "objects code"]]:
         """The two heads."""
-        c, scaled = self.config, self.config.initialization == "scaled"
+        c = self.config
         for number, width in enumerate(c.point_widths):
             x = nn.relu(x) if number else x
-            x = Dense(width, scaled, name=f"point_{number}")(x)
+            x = Dense(width, name=f"point_{number}")(x)
         x = jnp.max(x, axis=1, where=mask[..., None], initial=jnp.finfo(x.dtype).min)
-        x = nn.relu(Dense(c.hidden_width, scaled, name="hidden")(x))
-        quiet = QUIET / 2 if c.mode == "faithful" else QUIET
-        return Dense(c.code_size, scaled, name="mean")(x), Dense(c.code_size, scaled, quiet, name="log_scale")(x)
+        x = nn.relu(Dense(c.hidden_width, name="hidden")(x))
+        return Dense(c.code_size, name="mean")(x), Dense(c.code_size, QUIET, name="log_variance")(x)
 
 
 class Hypernetwork(nn.Module):
@@ -147,14 +232,14 @@ class Hypernetwork(nn.Module):
     @nn.compact
     def __call__(self, code: Float[Array, "objects code"]) -> Float[Array, "objects {self.num_weights}"]:
         """The chunks end to end, without what the last has too much."""
-        c, scaled = self.config, self.config.initialization == "scaled"
+        c = self.config
         objects, chunks = code.shape[0], math.ceil(self.num_weights / c.chunk_size)
         embeddings = self.param("chunks", nn.initializers.normal(1.0), (chunks, c.chunk_embedding))
         codes = jnp.broadcast_to(code[:, None], (objects, chunks, code.shape[-1]))
         x = jnp.concatenate([codes, jnp.broadcast_to(embeddings[None], (objects, *embeddings.shape))], axis=-1)
         for number, width in enumerate(c.hypernetwork_widths):
-            x = nn.relu(Dense(width, scaled, name=f"hidden_{number}")(x))
-        return Dense(c.chunk_size, scaled, name="out")(x).reshape(objects, -1)[:, : self.num_weights]
+            x = nn.relu(Dense(width, name=f"hidden_{number}")(x))
+        return Dense(c.chunk_size, name="out")(x).reshape(objects, -1)[:, : self.num_weights]
 
 
 class Points2NeRF(nn.Module):
@@ -170,7 +255,7 @@ class Points2NeRF(nn.Module):
         self.hypernetwork = Hypernetwork(c, sum((inputs + 1) * outputs for inputs, outputs in self.layers))
 
     def code(self, cloud: PointCloud) -> tuple[Float[Array, "objects code"], Float[Array, "objects code"]]:
-        """Mean and log scale of each object's code."""
+        """Mean and log variance of each object's code."""
         materials = [getattr(cloud, name) for name in self.config.materials]
         materials = [m[..., None] if m.ndim < cloud.positions.ndim else m for m in materials]
         return self.encoder(jnp.concatenate([cloud.positions, *materials], axis=-1), jnp.asarray(cloud.mask))
@@ -178,8 +263,6 @@ class Points2NeRF(nn.Module):
     def weights(self, code: Float[Array, "objects code"]) -> Weights:
         """Each object's NeRF from its code."""
         weights = split_weights(self.hypernetwork(code), self.layers)
-        if self.config.initialization == "published":
-            return weights
         factors = [math.sqrt(2 / inputs) for inputs, _ in self.layers]
         return tuple(jax.tree.map(lambda x, f=f: f * x, layer) for layer, f in zip(weights, factors, strict=True))
 
@@ -203,26 +286,23 @@ class Points2NeRF(nn.Module):
         self, weights: Weights, rays: Rays, key: Key | None = None
     ) -> tuple[Float[Array, "objects rays 3"], Float[Array, "objects rays"], Float[Array, "objects rays"]]:
         """RGB, expected distance and opacity of each ray; a ray beside the box is white."""
-        near, far, hit = cameras.intersect_box(rays.origins, rays.directions)
+        near, far, _ = cameras.intersect_box(rays.origins, rays.directions)
         distances, _ = sampling.stratified(key, near, far, self.config.num_samples)
         positions = rays.origins[..., None, :] + distances[..., None] * rays.directions[..., None, :]
         density, rgb = jax.vmap(nerf)(weights, positions)
         delta = compositing.interval_lengths(distances, far)
-        if self.config.mode == "faithful":
-            delta = delta.at[..., -1].set(jnp.where(hit, PAINTED, 0.0))
         shares, _ = compositing.volume_weights(density, delta)
         depth = compositing.expected_distance(shares, distances, far)
         return compositing.composite(shares, rgb, compositing.WHITE), depth, jnp.sum(shares, axis=-1)
 
     def __call__(self, cloud: PointCloud, camera: Camera, key: Key | None = None, train: bool = False) -> Rendering:
         """Views of each cloud from its cameras; training draws the codes with the key and adds the KL term."""
-        mean, log_scale = self.code(cloud)
+        mean, log_variance = self.code(cloud)
         if not train:
             return self.whole(self.weights(mean), camera, key)
         if key is None:
             raise UserError("training draws a code for each object: give a key")
-        mode = self.config.mode
-        self.sow("losses", "kl", self.config.kl_weight * jnp.mean(kl_divergence(mode, mean, log_scale)))
+        self.sow("losses", "kl", self.config.kl_weight * jnp.mean(kl_divergence(mean, log_variance)))
         code_key, key = jax.random.split(key)
-        code = mean + code_scale(mode, log_scale) * jax.random.normal(code_key, mean.shape)
+        code = mean + jnp.exp(0.5 * log_variance) * jax.random.normal(code_key, mean.shape)
         return self.whole(self.weights(code), camera, key)

@@ -1,0 +1,23 @@
+"""The published methods to compare with: `spnr train DATA RUN --methods experiments.baselines --preset npbg_tiny`."""
+
+from experiments.baselines import npbg, point_nerf, points2nerf
+from spnr_jax.methods import Method, register
+
+for method in (
+    Method(config=npbg.NPBGConfig, network=npbg.NPBG, presets=(npbg.npbg_tiny,), label="NPBG"),
+    Method(
+        config=point_nerf.PointNeRFConfig,
+        network=point_nerf.PointNeRF,
+        presets=(point_nerf.point_nerf_tiny,),
+        label="Point-NeRF",
+    ),
+    Method(
+        config=points2nerf.Points2NeRFConfig,
+        network=points2nerf.Points2NeRF,
+        presets=(points2nerf.points2nerf_tiny,),
+        label="Points2NeRF",
+    ),
+):
+    register(method)
+
+PUBLISHED = {"npbg": npbg.published, "point_nerf": point_nerf.published, "points2nerf": points2nerf.published}

@@ -1,0 +1,190 @@
+"""The methods that there are, by name, and trainings as JSON, in which `model.method` names one of them.
+
+A file of one's own adds a method, and its presets to those of `spnr train --preset`:
+
+    register(Method(config=MyConfig, network=MyNetwork, presets=(mine_tiny,), label="Mine"))
+
+`spnr train DATA RUN --methods my_method.py --preset mine_tiny` reads that file; so do `spnr evaluate` and the others
+with `--methods`, and `spnr_jax.load(RUN, methods="my_method.py")`.  Runs and files of weights keep the file's name, but
+no code is imported because they say so.
+"""
+
+import dataclasses
+import importlib
+import importlib.util
+import sys
+from collections.abc import Callable
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from spnr_jax.config import (
+    NearPointsConfig,
+    NetworkConfig,
+    PaperConfig,
+    SurfelConfig,
+    TrainConfig,
+    mismatch,
+    types_of,
+)
+from spnr_jax.errors import UserError, first_line, require
+from spnr_jax.presets import PRESETS
+
+
+@dataclass(frozen=True, kw_only=True)
+class Method:
+    """What the package asks of a method."""
+
+    config: type[NetworkConfig]
+    """Its sizes; their `method` is its name."""
+    network: str | Callable[[Any], Any] | None
+    """Of sizes a Linen module with `encode(cloud, train)`, `render(scene, camera, options)` and
+    `__call__(cloud, camera, key, train)`, or its place as "package.module:Name"; what it sows into "losses" is added to
+    the loss of a training.  None: the network is no such module (surfels)."""
+    presets: tuple[Callable[[], TrainConfig], ...] = ()
+    """Trainings of it, each named as its function."""
+    label: str = ""
+    """Its name in tables and pictures."""
+    source: str = ""
+    """The file or module that brought it; empty for those of the package."""
+
+
+METHODS: dict[str, Method] = {
+    "surfels": Method(config=SurfelConfig, network=None, label="Surfels"),
+    "near_points": Method(
+        config=NearPointsConfig, network="spnr_jax.method.near_points:NearPointsNetwork", label="Near points"
+    ),
+    "paper": Method(
+        config=PaperConfig, network="spnr_jax.method.paper_network:PaperNetwork", label="The paper's network"
+    ),
+}
+
+
+GONE = {"model.encoder.scatter": "mean", "model.encoder.skip": "add"}
+"""Fields of earlier versions, and the one value of each that is still computed."""
+
+
+class UnknownMethod(UserError):
+    """A file names a method that is not registered."""
+
+
+_included: dict[str, Path | str] = {}  # what `include` imported -> where that is
+_including: list[str] = []  # what it imports now
+
+
+def register(method: Method) -> None:
+    """Adds a method and its presets; ValueError if another one has its name, or the name of a preset."""
+    name, source = method.config.method, _including[-1] if _including else method.config.__module__
+    if name in METHODS:
+        require(METHODS[name].config is method.config, f"there is a method {name} already; choose another name")
+        return
+    for preset in method.presets:
+        require(preset.__name__ not in PRESETS, f"there is a preset {preset.__name__} already; choose another name")
+    METHODS[name] = dataclasses.replace(method, source=source)
+    PRESETS.update({preset.__name__: preset for preset in method.presets})
+
+
+def include(source: Path | str) -> None:
+    """Imports a module, or a .py file, that registers methods; ValueError, in one line, if that cannot be done."""
+    name = str(source)
+    place = Path(name).resolve() if name.endswith(".py") else name
+    if place in _included.values():
+        return
+    before = len(METHODS)
+    _including.append(name)
+    try:
+        with _working_folder():
+            _import_file(place) if isinstance(place, Path) else importlib.import_module(place)
+    except (ImportError, SyntaxError, OSError) as error:
+        raise UserError(f"--methods {name}: it cannot be imported ({first_line(error)})") from None
+    finally:
+        _including.pop()
+    known = len(METHODS) > before or any(m.source.startswith(name) for m in METHODS.values())
+    require(known, f"--methods {name}: it registers no method; call spnr_jax.methods.register there")
+    _included[name] = place
+
+
+@contextmanager
+def _working_folder():
+    """Modules of the working folder are found, as `python` finds them and an installed command does not."""
+    sys.path.insert(0, str(Path.cwd()))
+    try:
+        yield
+    finally:
+        sys.path.remove(str(Path.cwd()))
+
+
+def _import_file(path: Path) -> None:
+    spec = importlib.util.spec_from_file_location(f"methods_of_{path.stem}", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)  # dataclasses look for theirs there
+    spec.loader.exec_module(module)
+
+
+def network(config: NetworkConfig) -> Any:
+    """The Linen module that a network's config describes; it is imported when it is first asked for."""
+    made = method_of(config).network
+    assert made is not None, f"{config.method} is no Linen module"
+    if isinstance(made, str):
+        module, _, name = made.partition(":")
+        made = getattr(importlib.import_module(module), name)
+    return made(config)
+
+
+def method_of(config: NetworkConfig) -> Method:
+    """The method of a network; ValueError if it was not registered."""
+    found = METHODS.get(config.method)
+    if found is None or not isinstance(config, found.config):
+        raise UnknownMethod(f"method {config.method} is not registered; call spnr_jax.methods.register first")
+    return found
+
+
+def label_of(name: str) -> str:
+    """What tables and pictures call a method."""
+    return METHODS[name].label if name in METHODS and METHODS[name].label else name
+
+
+def to_dict(config: TrainConfig) -> dict:
+    """Nested plain dict of a training, with the method of its network and the file that brought it."""
+    values, source = dataclasses.asdict(config), method_of(config.model).source
+    named = {"method": config.model.method} | ({"source": source} if source else {})
+    return values | {"model": named | values["model"]}
+
+
+def from_dict(values: dict, kind: type = TrainConfig, path: str = "") -> Any:
+    """Training from `to_dict`'s form; a field unknown, missing or of another type raises ValueError with its path."""
+    kinds = types_of(kind)
+    for name in [name for name in values if f"{path}{name}" in GONE]:
+        kept = GONE[f"{path}{name}"]
+        require(
+            values[name] == kept,
+            f"config field {path}{name} {values[name]!r}: this version knows {kept!r} alone; train the network again",
+        )
+    values = {name: value for name, value in values.items() if f"{path}{name}" not in GONE}
+    for name in values:
+        require(name in kinds, f"unknown config field {path}{name}; known: {', '.join(kinds)}")
+    arguments = {}
+    for name, expected in kinds.items():
+        require(name in values, f"config field {path}{name} is missing")
+        value = values[name]
+        if dataclasses.is_dataclass(expected):
+            require(isinstance(value, dict), f"config field {path}{name} holds {value!r}, which is no JSON object")
+            if expected is NetworkConfig:
+                expected = _sizes(value.get("method"), value.get("source"), path)
+                value = {field: inner for field, inner in value.items() if field not in ("method", "source")}
+            value = from_dict(value, expected, f"{path}{name}.")
+        value = tuple(value) if isinstance(value, list) else value
+        words = mismatch(value, expected)
+        require(not words, f"config field {path}{name} must be {words}, got {value!r}")
+        arguments[name] = value
+    return kind(**arguments)
+
+
+def _sizes(name: Any, source: Any, path: str) -> type[NetworkConfig]:
+    """Class of the config of a network that a file names; nothing is imported for it."""
+    if isinstance(name, str) and name in METHODS:
+        return METHODS[name].config
+    named = f"--methods {source}, or load(..., methods={source!r})" if source else "--methods and its file"
+    raise UnknownMethod(f"{path}model.method {name} is not one of {', '.join(METHODS)}; for another give {named}")
