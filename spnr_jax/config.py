@@ -30,7 +30,8 @@ LARGEST = 2**63  # of any number in a config
 
 def check(config: Any, positive: Collection[str] = (), shares: Collection[str] = ()) -> None:
     """ValueError for the first field that is not of its type, 0 where it must be positive, or a share above 1."""
-    for name, kind in types_of(type(config)).items():
+    of: Any = type(config)
+    for name, kind in types_of(of).items():
         value = getattr(config, name)
         words = mismatch(value, kind)
         if not words and name in positive:

@@ -26,7 +26,7 @@ import numpy as np
 from experiments import entry_point
 from experiments.comparison import results_folder
 from experiments.speed import speed_scenes, twin_layout
-from spnr_jax.config import TrainConfig
+from spnr_jax.config import PaperConfig, TrainConfig
 from spnr_jax.devices import allocator, machine
 from spnr_jax.errors import at_least
 from spnr_jax.kernels.records import Batch
@@ -107,7 +107,9 @@ def measured(preset: str, mode: Mode, variant: str | None, ours: Callable, optio
     """A row: both sides in turns, ours alone without a variant of the twin."""
     run, compile_s = ours()
     theirs = None if variant is None else twin_side(preset, mode, variant, options)
-    turns = [(turn(run, options.seconds), theirs and turn(theirs, options.seconds)) for _ in range(options.rounds)]
+    turns = [
+        (turn(run, options.seconds), turn(theirs, options.seconds) if theirs else []) for _ in range(options.rounds)
+    ]
     row: Row = {"preset": preset, "batch": BATCHES[preset], "mode": mode, "twin_variant": variant}
     row |= {"ours_ms": statistics.median(ms for of, _ in turns for ms in of), "compile_s": compile_s}
     if theirs is None:
@@ -148,6 +150,7 @@ def our_side(preset: str, mode: Mode, options: Options) -> tuple[Run, float]:
     """What to time, and the seconds that its compilation took."""
     config = our_config(preset, mode, BATCHES[preset])
     if options.bf16:
+        assert isinstance(config.model, PaperConfig)
         config = dataclasses.replace(config, model=dataclasses.replace(config.model, precision="bfloat16"))
     run, start = function(config, our_batch(config), mode), time.perf_counter()
     run()

@@ -77,8 +77,14 @@ def train_config(c: Config, objects: int = 1) -> TrainConfig:
         discriminator_width=c.disc_width,
     )
     optimizer = OptimizerConfig(lr_generator=c.lr_g, lr_discriminator=c.lr_d)
-    counts = {"batch_objects": objects, "min_points": c.points, "max_points": c.points}
-    return TrainConfig(model=model, loss=loss, optimizer=optimizer, **counts)
+    return TrainConfig(
+        model=model,
+        loss=loss,
+        optimizer=optimizer,
+        batch_objects=objects,
+        min_points=c.points,
+        max_points=c.points,
+    )
 
 
 def batch(arrays: Arrays) -> Batch:
