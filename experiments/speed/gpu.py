@@ -33,7 +33,8 @@ from experiments.speed.speed_scenes import orbiting, random_crops, sphere
 from spnr_jax import cli
 from spnr_jax.config import RayNetworkConfig, SurfelConfig, TrainConfig
 from spnr_jax.devices import machine
-from spnr_jax.method import surfel_renderer
+from spnr_jax.kernels.records import Volume
+from spnr_jax.method import surfel_pictures, surfel_renderer
 from spnr_jax.presets import PRESETS
 from spnr_jax.scoring.score_tables import Table, number, text
 from spnr_jax.surfels.lighting import room_light
@@ -91,12 +92,14 @@ def films(options: OnGPU) -> list[Found]:
     """Frames of an orbit, each of them brought to the host."""
     config = SurfelConfig(widths=(4, 6), top=4) if options.quick else SurfelConfig()
     variables, light = surfel_renderer.init(jax.random.key(0), config), room_light()
-    scene, rows = surfel_renderer.encode(variables, sphere(options.points), config=config), []
+    scene, rows = surfel_renderer.encode(sphere(options.points)), []
+    volume = Volume(scene=scene, centre=scene.centre, scale=scene.scale)
+    draw = partial(surfel_pictures.draw_each, variables, volume, config=config, quality="best")
     for size in (32, 64) if options.quick else (512, 1024):
         views = [orbiting(size, 0.1 * frame) for frame in range(options.frames)]
 
         def film(views: list = views) -> None:
-            for frame in surfel_renderer.render_each(variables, scene, views, [light] * len(views), config=config):
+            for frame in draw(views, [light] * len(views)):
                 np.asarray(frame.image)
 
         seconds = least(film, 2)

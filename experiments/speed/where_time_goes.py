@@ -34,9 +34,9 @@ from spnr_jax.config import RayNetworkConfig, SurfelConfig, TrainConfig
 from spnr_jax.devices import machine
 from spnr_jax.errors import at_least
 from spnr_jax.kernels import cameras
-from spnr_jax.kernels.records import Batch
-from spnr_jax.method import surfel_plan, surfel_renderer
-from spnr_jax.nn.shader import Shader, picture
+from spnr_jax.kernels.records import Batch, Light, Volume
+from spnr_jax.method import surfel_pictures, surfel_renderer
+from spnr_jax.nn.shader import Shader
 from spnr_jax.presets import PRESETS
 from spnr_jax.scoring.score_tables import Table, number, text
 from spnr_jax.surfels import projection
@@ -135,30 +135,31 @@ def step_programs(options: WhereTimeGoes) -> dict[str, Program]:
 
 
 def frame_programs(options: WhereTimeGoes) -> dict[str, Program]:
-    """A frame as `surfel_renderer.render` draws it, and its programs alone, on the object's window."""
+    """A frame as the handle draws it, and its programs alone."""
     config = SurfelConfig(image_resolution=options.size)
-    variables = surfel_renderer.init(jax.random.key(0), config)
-    camera, light = orbiting(options.size), room_light()
-    scene = surfel_renderer.encode(variables, sphere(options.points), config=config)
-    doublings, side = surfel_plan.resolution_of(scene.spacing, camera)
-    small = orbiting(options.size * side >> doublings)
-    total = int(projection.count(scene.surfels, small))
-    found, covered = projection.jitted_entries(scene.surfels, small, total=total)
-    look = partial(surfel_renderer.jitted_look, slots=int(covered))
-    seen, maps, ambient, _ = look(found, scene.surfels, light, small)
-    shader = Shader(config.widths, config.top)
-    outputs = shader.apply(variables, seen[None], doublings)
+    variables, light = surfel_renderer.init(jax.random.key(0), config), room_light()
+    scene, camera = surfel_renderer.encode(sphere(options.points)), orbiting(options.size)
+    volume = Volume(scene=scene, centre=scene.centre, scale=scene.scale)
+    doublings, side = surfel_renderer.resolution(scene, camera)
+    plan = surfel_renderer.plan(scene, camera)
+    count = partial(surfel_renderer.count_sizes, doublings=doublings, side=side)
+    window = surfel_renderer.scaled(camera, doublings, side)
+    found = jax.jit(projection.entries, static_argnames="room")(scene.surfels, window, room=plan.entries)[0]
+    blended = jax.jit(surfel_renderer.blend_window, static_argnames="plan")(scene, camera, light, plan=plan)
 
-    def whole() -> object:
-        return surfel_renderer.render(variables, scene, camera, light, config=config).image
+    def blend(found: projection.Entries, light: Light) -> object:
+        return surfel_renderer.blend_entries(found, scene.surfels, light, window, slots=plan.slots)
 
     return {
-        "whole frame": Program(whole, None),
-        "entries counted": program(projection.count, scene.surfels, small),
-        "entries made and sorted": Program(partial(projection.jitted_entries, scene.surfels, small, total=total), None),
-        "blended, lit, put before the network": Program(partial(look, found, scene.surfels, light, small), None),
-        "network": program(lambda v, s: shader.apply(v, s[None], doublings), variables, seen),
-        "light on materials": program(lambda o, m, a: picture(o, m[None], a[None], doublings), outputs, maps, ambient),
+        "whole frame": Program(
+            lambda: surfel_pictures.draw(variables, volume, camera, light, config=config, quality="best").image, None
+        ),
+        "sizes counted": program(count, scene, camera),
+        "entries made and sorted": program(partial(projection.entries, room=plan.entries), scene.surfels, window),
+        "blended, lit": program(blend, found, light),
+        "network, light on materials": program(
+            partial(surfel_renderer.shade_window, plan=plan), variables, scene, camera, light, blended, None
+        ),
         "product of matrices": peak(),
     }
 

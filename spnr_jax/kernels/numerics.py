@@ -74,6 +74,22 @@ def clamp(
     return jnp.where(x < low, low, jnp.where(x > high, high, x))
 
 
+def larger(a: Float[Array, "*shape"], b: Float[Array, "*shape"] | float | int) -> Float[Array, "*shape"]:
+    """The larger of two, jnp.maximum with a gradient that is always that of one of them (as in `clamp`)."""
+    return jnp.where(a > b, a, b)
+
+
+def smaller(a: Float[Array, "*shape"], b: Float[Array, "*shape"] | float | int) -> Float[Array, "*shape"]:
+    """The smaller of two, likewise."""
+    return jnp.where(a < b, a, b)
+
+
+def root(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """Square root; 0 with zero gradient where x is 0 or, by rounding, below."""
+    valid = x > 0
+    return jnp.where(valid, jnp.sqrt(jnp.where(valid, x, 1)), 0)
+
+
 def normalize(vectors: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3"]:
     """Vectors scaled to unit length; the zero vector stays zero with zero gradient."""
     vectors = vectors / _largest(vectors)

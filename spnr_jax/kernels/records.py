@@ -65,6 +65,8 @@ class Rendering:
     image_lr: Float[Array, "*batch height_lr width_lr 3"]
     depth: Float[Array, "*batch height_lr width_lr"]
     acc: Float[Array, "*batch height_lr width_lr"]
+    overflow: Int[Array, "*batch"] | None = None
+    """Of surfels: entries, pixels, columns and rows that did not fit into the sizes of the plan; 0: all is drawn."""
 
 
 @no_type_check
@@ -137,6 +139,8 @@ class Volume:
     scale: Float[AnyArray, ""]
     reach: int = struct.field(pytree_node=False, default=LARGEST_REACH)
     """Voxels around points that rays look at, from how far the points lie apart."""
+    solid: Scene | None = None
+    """Of sparse surfels: what the network of rays makes of the points (`method/solid.py`)."""
 
 
 @no_type_check
@@ -152,22 +156,37 @@ class Surfels:
     against their cross product normal x rim.  `guessed` is 1 where roughness and metallic are not known.
     """
 
-    position: Float[AnyArray, "points 3"]
-    normal: Float[AnyArray, "points 3"]
-    spacing: Float[AnyArray, " points"]
-    base_color: Float[AnyArray, "points 3"]
-    gradient: Float[AnyArray, "points 3 3"]
-    border: Float[AnyArray, "points 4"]
-    jump: Float[AnyArray, "points 3"]
-    roughness: Float[AnyArray, " points"]
-    metallic: Float[AnyArray, " points"]
-    guessed: Float[AnyArray, " points"]
-    sided: Float[AnyArray, " points"]
-    visible: Float[AnyArray, "points 64"]
-    shape: Float[AnyArray, "points 2"]
-    rim: Float[AnyArray, "points 3"]
-    reach: Float[AnyArray, "points 4"]
-    mask: Bool[AnyArray, " points"]
+    position: Float[AnyArray, "*batch points 3"]
+    normal: Float[AnyArray, "*batch points 3"]
+    spacing: Float[AnyArray, "*batch points"]
+    base_color: Float[AnyArray, "*batch points 3"]
+    gradient: Float[AnyArray, "*batch points 3 3"]
+    border: Float[AnyArray, "*batch points 4"]
+    jump: Float[AnyArray, "*batch points 3"]
+    roughness: Float[AnyArray, "*batch points"]
+    metallic: Float[AnyArray, "*batch points"]
+    guessed: Float[AnyArray, "*batch points"]
+    sided: Float[AnyArray, "*batch points"]
+    visible: Float[AnyArray, "*batch points 64"]
+    shape: Float[AnyArray, "*batch points 2"]
+    rim: Float[AnyArray, "*batch points 3"]
+    reach: Float[AnyArray, "*batch points 4"]
+    mask: Bool[AnyArray, "*batch points"]
+
+
+@no_type_check
+@struct.dataclass
+class SurfelScene:
+    """An encoded object of the network over surfels: arrays alone, so scenes of equally padded clouds stack.
+
+    The surfels lie in the box [-1, 1]^3, which is (position - centre) * scale of the cloud; `spacing` is the median of
+    theirs, in the box, and decides at what size a picture is drawn.
+    """
+
+    surfels: Surfels
+    spacing: Float[AnyArray, "*batch"]
+    centre: Float[AnyArray, "*batch 3"]
+    scale: Float[AnyArray, "*batch"]
 
 
 @no_type_check

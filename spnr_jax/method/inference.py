@@ -113,12 +113,9 @@ def render_views(
     The light, or one for each view, is for a network that sees it; None is the package's room.
     """
     if config.method == "surfels":
-        from spnr_jax.method import surfel_renderer
-        from spnr_jax.surfels.lighting import room_light
+        from spnr_jax.method import surfel_pictures
 
-        sizes = cast(SurfelConfig, config)
-        scene = surfel_renderer.encode(variables, cloud, config=sizes)
-        return surfel_renderer.render_views(variables, scene, camera, light or room_light(), config=sizes)
+        return surfel_pictures.draw_views(variables, cloud, camera, light, config=cast(SurfelConfig, config))
     cloud, camera = jax.tree.map(lambda x: jnp.asarray(x)[None], (cloud, camera))
     volume = jitted_encode(variables, cloud, config=config)
     options = dataclasses.replace(trained(config), rays_per_side=rays_per_side(config, camera.width))

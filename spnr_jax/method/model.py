@@ -15,6 +15,7 @@ from types import ModuleType
 from typing import Literal, get_args
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from spnr_jax.config import NetworkConfig
@@ -89,9 +90,13 @@ class Model:
         self, volume: Volume, azimuth: float = 30.0, elevation: float = 20.0, resolution: int | None = None
     ) -> Camera:
         """Camera that sees the whole object: degrees around the y axis from +z, and above the horizon."""
-        angles = np.deg2rad(np.float32(azimuth)), np.deg2rad(np.float32(elevation))
         size = resolution or self.config.image_resolution
-        return _orbiting(*angles, np.float32(DISTANCE) / np.asarray(volume.scale), volume.centre, size=size)
+        return _orbit(azimuth, elevation, volume.centre, volume.scale, size=size)
+
+    @property
+    def params(self) -> dict:
+        """The weights, a pytree of arrays: what `spnr_jax.encode` and `spnr_jax.render` take."""
+        return self.variables
 
     @property
     def _pictures(self) -> ModuleType:
@@ -104,9 +109,10 @@ class Model:
 
 
 @partial(jax.jit, static_argnames="size")
-def _orbiting(azimuth, elevation, distance, centre, *, size: int) -> Camera:
-    """Square camera of `size` pixels that looks at the centre; angles in radians."""
-    return cameras.pinhole(cameras.orbit(azimuth, elevation, distance, centre), FIELD_OF_VIEW, size, size)
+def _orbit(azimuth, elevation, centre, scale, *, size: int) -> Camera:
+    """Square camera of `size` pixels that looks at the centre; angles in degrees."""
+    angles = (jnp.deg2rad(jnp.asarray(angle, jnp.float32)) for angle in (azimuth, elevation))
+    return cameras.pinhole(cameras.orbit(*angles, DISTANCE / scale, centre), FIELD_OF_VIEW, size, size)
 
 
 def _check_quality(quality: str) -> None:

@@ -9,16 +9,15 @@ input this is, and stays as it is.
 """
 
 import dataclasses
-from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from spnr_jax.config import NearPointsConfig, RenderOptions
-from spnr_jax.kernels import cameras, cloud_arrays
-from spnr_jax.kernels.records import Camera, PointCloud, Scene
+from spnr_jax.config import SOLID, RenderOptions
+from spnr_jax.kernels import cameras
+from spnr_jax.kernels.records import Camera, PointCloud, Scene, Surfels
 from spnr_jax.kernels.resizing import averaged, doubled
 from spnr_jax.method.near_points import NearPointsNetwork
 
@@ -26,31 +25,26 @@ MOST_POINTS, MOST_PIXELS = 6000, 128  # of a sparse cloud, and along a side of t
 LEAST_OPACITY = 1e-3  # that a depth is divided by
 
 
-def encode(variables: dict, cloud: PointCloud, *, config: NearPointsConfig) -> Scene | None:
-    """The scene of a cloud (unbatched, in the box), objects first on every array; None of a dense one."""
-    mask = np.asarray(cloud.mask)
-    count = int(mask.sum())
-    if count > MOST_POINTS:
-        return None
-    points = jax.tree.map(lambda x: np.asarray(x)[mask], dataclasses.replace(cloud, normals=None, materials_known=None))
-    return _encoded(variables, cloud_arrays.pad(points, cloud_arrays.bucket(count)), config=config)
+def encode(variables: dict, cloud: PointCloud) -> Scene:
+    """The scene of a sparse cloud (unbatched, in the box), objects first on every array."""
+    plain = dataclasses.replace(cloud, normals=None, materials_known=None)
+    return NearPointsNetwork(SOLID).bind(variables).encode(jax.tree.map(lambda x: jnp.asarray(x)[None], plain))
 
 
-# this option halves the compilation of the U-Net and costs it no time
-@partial(jax.jit, static_argnames="config", compiler_options={"xla_cpu_use_fusion_emitters": False})
-def _encoded(variables: dict, cloud: PointCloud, *, config: NearPointsConfig) -> Scene:
-    return NearPointsNetwork(config).bind(variables).encode(jax.tree.map(lambda x: x[None], cloud))
+def of_surfels(variables: dict, surfels: Surfels) -> Scene:
+    """`encode` of the points of surfels."""
+    columns = (surfels.position, surfels.base_color, surfels.roughness, surfels.metallic, surfels.mask)
+    return encode(variables, PointCloud(**dict(zip(PointCloud.__dataclass_fields__, columns, strict=False))))
 
 
-@partial(jax.jit, static_argnames="config")
-def seen(variables: dict, scene: Scene, camera: Camera, *, config: NearPointsConfig) -> Float[Array, "height width 2"]:
+def seen(variables: dict, scene: Scene, camera: Camera) -> Float[Array, "height width 2"]:
     """Opacity, and depth along the camera's axis, of a view (camera unbatched, in the box)."""
     halvings = max(int(np.ceil(np.log2(max(camera.height, camera.width) / MOST_PIXELS))), 0)
     height, width = (-(-n // 2**halvings) for n in (camera.height, camera.width))
-    side = max(round(config.image_resolution / max(height, width)), 1)  # rays as close as in the training
+    side = max(round(SOLID.image_resolution / max(height, width)), 1)  # rays as close as in the training
     whole = dataclasses.replace(camera, height=height << halvings, width=width << halvings)
     view = cameras.resize(whole, side * height, side * width)
-    network = NearPointsNetwork(config).bind(variables)
+    network = NearPointsNetwork(SOLID).bind(variables)
     drawn = averaged(network.render(scene, jax.tree.map(lambda x: x[None, None], view), RenderOptions()), side)
     acc, depth = drawn.acc[0, 0], drawn.depth[0, 0]
     rays = cameras.camera_rays(cameras.resize(whole, height, width))

@@ -1,7 +1,13 @@
-"""How the handle draws with the network over surfels: at a quality, in a light, the package's room without one."""
+"""How the handle draws with the network over surfels: at a quality, in a light, several views of common sizes.
+
+`surfel_renderer.draw`, compiled as two programs: the first is compiled anew for other numbers of entries and pixels,
+the second, with most of what takes XLA long, for other windows alone.
+"""
 
 import dataclasses
 from collections.abc import Iterator, Sequence
+from functools import partial
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -9,31 +15,78 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from spnr_jax.config import SurfelConfig
-from spnr_jax.kernels import cameras
-from spnr_jax.kernels.records import Camera, Light, PointCloud, Rendering, Volume
-from spnr_jax.method import surfel_renderer
+from spnr_jax.devices.side_by_side import two_at_a_time
+from spnr_jax.kernels import cameras, cloud_arrays
+from spnr_jax.kernels.records import Camera, Light, PointCloud, Rendering, Scene, SurfelScene, Volume
+from spnr_jax.kernels.resizing import enlarged
+from spnr_jax.method import solid, surfel_renderer
+from spnr_jax.method.surfel_renderer import Plan, Sizes
 from spnr_jax.surfels.lighting import room_light
 
-_in_box = jax.jit(cameras.in_box)  # compiled whole: each operation alone takes 30 ms at the first call
 BALANCED = 0.75  # of the pixels along a side, which are drawn and enlarged: docs/performance.md
+# of XLA, that take a third to two thirds off the compilation; the U-Net and what follows it run as long
+QUICK = {"xla_cpu_use_fusion_emitters": False}
+QUICKEST = QUICK | {"xla_backend_optimization_level": 1}
+
+
+class Asked(NamedTuple):
+    """A view in its light, and what it needs: the camera that is drawn, doublings and side, sizes."""
+
+    camera: Camera
+    light: Light
+    resolution: tuple[int, int]
+    needed: Sizes
 
 
 def encode_volume(
-    variables: dict, cloud: PointCloud, centre: np.ndarray, scale: np.floating, *, config: SurfelConfig
+    variables: dict | None, cloud: PointCloud, centre: np.ndarray, scale: np.floating, *, config: SurfelConfig
 ) -> Volume:
     """Volume of a cloud in the box (unbatched)."""
-    scene = surfel_renderer.encode(variables, cloud, config=config)
-    return Volume(scene=scene, centre=jnp.asarray(centre), scale=jnp.asarray(scale))
+    scene = surfel_renderer.encode(cloud).replace(centre=jnp.asarray(centre), scale=jnp.asarray(scale))
+    return Volume(scene=scene, centre=scene.centre, scale=scene.scale, solid=encode_solid(variables, cloud, config))
+
+
+def encode_solid(variables: dict | None, cloud: PointCloud, config: SurfelConfig) -> Scene | None:
+    """What the network of rays makes of a sparse cloud."""
+    mask = np.asarray(cloud.mask)
+    count = int(mask.sum())
+    if variables is None or not config.solid or count > solid.MOST_POINTS:
+        return None
+    plain = dataclasses.replace(cloud, normals=None, materials_known=None)
+    points = jax.tree.map(lambda x: np.asarray(x)[mask], plain)
+    return _encode_solid(variables["batch_stats"], cloud_arrays.pad(points, cloud_arrays.bucket(count)))
 
 
 def draw(
     variables: dict, volume: Volume, camera: Camera, light: Light | None, *, config: SurfelConfig, quality: str
 ) -> Rendering:
     """A view, or one axis of views."""
-    render = surfel_renderer.render if camera.cam_to_world.ndim == 2 else surfel_renderer.render_views
-    inside = _in_box(camera, volume.centre, volume.scale)
-    shader, share = _at_quality(variables, quality)
-    return _in_units(render(shader, volume.scene, inside, light or room_light(), config=config, share=share), volume)
+    if camera.cam_to_world.ndim == 2:
+        return next(draw_each(variables, volume, [camera], [light], config=config, quality=quality))
+    views = _unstacked(camera)
+    drawn = draw_each(variables, volume, views, [light] * len(views), config=config, quality=quality)
+    return jax.tree.map(lambda *x: np.stack(x), *drawn)
+
+
+def draw_views(
+    variables: dict | None,
+    cloud: PointCloud,
+    camera: Camera,
+    light: Light | Sequence[Light] | None,
+    *,
+    config: SurfelConfig,
+    quality: str = "best",
+) -> Rendering:
+    """Views (one axis of cameras) of a cloud in the box, in one light or each in its own."""
+    volume = encode_volume(variables, cloud, np.zeros(3, np.float32), np.float32(1), config=config)
+    views = _unstacked(camera)
+    lights = [light] * len(views) if light is None or isinstance(light, Light) else light
+    drawn = draw_each(variables, volume, views, lights, config=config, quality=quality)
+    return jax.tree.map(lambda *x: np.stack(x), *drawn)
+
+
+def _unstacked(camera: Camera) -> list[Camera]:
+    return [jax.tree.map(lambda x, i=i: x[i], camera) for i in range(len(camera.cam_to_world))]
 
 
 def draw_each(
@@ -45,24 +98,64 @@ def draw_each(
     config: SurfelConfig,
     quality: str,
 ) -> Iterator[Rendering]:
-    """Views one after the other, of common sizes: compiled once and not for most of them."""
-    inside = [_in_box(view, volume.centre, volume.scale) for view in views]
-    shone = [light or room_light() for light in lights]
-    shader, share = _at_quality(variables, quality)
-    for drawn in surfel_renderer.render_each(shader, volume.scene, inside, shone, config=config, share=share):
-        yield _in_units(drawn, volume)
+    """Views one after the other; they share the sizes of the largest of them, so that few programs are compiled."""
+    del config
+    shader, share = (None if quality == "draft" else variables), (BALANCED if quality == "balanced" else 1.0)
+    asked = [look_at(volume.scene, view, light, share) for view, light in zip(views, lights, strict=True)]
+    common = {
+        of.resolution: surfel_renderer.largest(x.needed for x in asked if x.resolution == of.resolution) for of in asked
+    }
+
+    def one(of: Asked, whole: Camera) -> Rendering:
+        drawn = draw_planned(shader, volume, of, common[of.resolution])
+        return drawn if share == 1 else _enlarge(drawn, whole.height, whole.width)
+
+    if len(views) == 1:
+        yield one(asked[0], views[0])
+    else:
+        yield from two_at_a_time(lambda both: one(*both), zip(asked, views, strict=True))
 
 
-def _at_quality(variables: dict, quality: str) -> tuple[dict | None, float]:
-    """Variables of the CNN, None where the quality leaves it out, and the share of the pixels along a side."""
-    return None if quality == "draft" else variables, BALANCED if quality == "balanced" else 1.0
+def look_at(scene: SurfelScene, camera: Camera, light: Light | None, share: float) -> Asked:
+    """What is drawn of a view with a share of its pixels along a side, and what that needs."""
+    if share != 1:
+        camera = cameras.resize(camera, *(max(round(share * n / 4) * 4, 4) for n in (camera.height, camera.width)))
+    doublings, side = surfel_renderer.resolution(scene, camera, share)
+    needed = jax.device_get(surfel_renderer.count_sizes(scene, camera, doublings=doublings, side=side))
+    return Asked(camera, light or room_light(), (doublings, side), needed)
 
 
-def _in_units(drawn: Rendering, volume: Volume) -> Rendering:
-    """What was drawn in the box with its depth in the cloud's units."""
-    return dataclasses.replace(drawn, depth=_over(drawn.depth, volume.scale))
+def draw_planned(variables: dict | None, volume: Volume, asked: Asked, sizes: Sizes) -> Rendering:
+    """A view with room for these sizes."""
+    if not asked.needed.entries:
+        return _leave_empty(volume.scene, asked.camera)
+    plan = surfel_renderer.rounded(sizes, *asked.resolution, sparse=volume.solid is not None)
+    known = None
+    if variables is not None and volume.solid is not None:
+        known = _solid_picture(variables, volume, asked.camera, plan=plan)
+    blended = _blend(volume.scene, asked.camera, asked.light, plan=plan)
+    return _shade(variables, volume.scene, asked.camera, asked.light, blended, known, plan=plan)
+
+
+_encode_solid = jax.jit(solid.encode, compiler_options=QUICK)
+
+
+@partial(jax.jit, static_argnames="plan")
+def _solid_picture(variables: dict, volume: Volume, camera: Camera, *, plan: Plan) -> Float[Array, "h w 2"]:
+    inside = cameras.in_box(camera, volume.centre, volume.scale)
+    return surfel_renderer.solid_picture(variables, volume.solid, inside, plan)
+
+
+_blend = jax.jit(surfel_renderer.blend_window, static_argnames="plan")
+_shade = jax.jit(surfel_renderer.shade_window, static_argnames="plan", compiler_options=QUICKEST)
+_enlarge = jax.jit(enlarged, static_argnums=(1, 2), compiler_options=QUICK)
 
 
 @jax.jit
-def _over(depth: Float[Array, "*views height width"], scale: Float[Array, ""]) -> Float[Array, "*views height width"]:
-    return depth / scale
+def _leave_empty(scene: SurfelScene, camera: Camera) -> Rendering:
+    """A view in which nothing of the object is seen."""
+    inside = cameras.in_box(camera, scene.centre, scene.scale)
+    nothing = jnp.zeros((1, 1, 5)), jnp.zeros(2, jnp.int32)
+    image, depth, acc = surfel_renderer.paste(*nothing, inside, 1)
+    overflow = jnp.zeros((), jnp.int32)
+    return Rendering(image=image, image_lr=image, depth=depth / scene.scale, acc=acc, overflow=overflow)

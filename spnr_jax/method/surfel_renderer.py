@@ -1,49 +1,80 @@
 """Our method on one page: points -> surfels -> G-buffer -> shader network -> light on materials -> picture.
 
-    encode   neighbours, normals, sides, visibility by direction              once per object, NumPy and SciPy
-    render   discs splatted to a G-buffer, a CNN over it, light               once per view
+    encode   neighbours, normals, sides, visibility by direction              once per object
+    plan     the sizes of a picture, counted on the host: sizes shape arrays  once per view, or for many of them
+    render   discs splatted to a G-buffer, a CNN over it, light               once per view; pure
 
-At what size, and in which window of the picture: `surfel_plan.py`.
+A picture is drawn at the resolution at which the points lie FINEST to COARSEST pixels apart and doubled from there by
+the network, so its work follows the points and the pixels that they cover.  Only a window around the object is drawn;
+where it lies is a number like others, how large it is belongs to the plan.  Sizes are rounded up to few values: each
+new one is compiled once.
 """
 
-from collections.abc import Iterator, Sequence
+import dataclasses
+from collections.abc import Iterable
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
 from jaxtyping import Array, Float, Int
 
-from spnr_jax.config import SOLID, SurfelConfig
-from spnr_jax.devices.side_by_side import two_at_a_time
+from spnr_jax.config import SurfelConfig
+from spnr_jax.errors import UserError
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.compositing import WHITE
-from spnr_jax.kernels.records import AnyArray, Camera, GBuffer, Key, Light, PointCloud, Rendering, Scene, Surfels
-from spnr_jax.kernels.resizing import doubled, enlarged, mean_of_squares
+from spnr_jax.kernels.numerics import larger
+from spnr_jax.kernels.records import (
+    AnyArray,
+    Camera,
+    GBuffer,
+    Key,
+    Light,
+    PointCloud,
+    Rendering,
+    Surfels,
+    SurfelScene,
+)
+from spnr_jax.kernels.resizing import doubled, mean_of_squares
 from spnr_jax.method import solid
-from spnr_jax.method.surfel_plan import Plan, in_window, planned, rounded, scaled, seen_through
 from spnr_jax.nn.shader import NUM_OUTPUTS, Shader, picture
 from spnr_jax.surfels import features, lighting, projection, splatting
 from spnr_jax.surfels.estimate import estimate
+from spnr_jax.surfels.projection import MOST_ENTRIES, View
 
-LEAST_SLOTS = 2**11  # covered pixels that a table is made for
-# of XLA, that take a third to two thirds off the compilation; entries, `_seen`, `_shade` and `_laid` run as long
-QUICK = {"xla_cpu_use_fusion_emitters": False}
-QUICKEST = QUICK | {"xla_backend_optimization_level": 1}
+COARSEST = 3.5  # pixels between points from which on a picture is drawn at half the size
+FINEST = 0.8  # below which it is drawn at twice the size and averaged
+MOST_DOUBLINGS = 4
+STEP, MARGIN = 32, 8  # pixels of which a window is a multiple, and around the object in it
+GRID = 8  # of which a window's corner is a multiple: the network's levels see the same squares from every camera
+LEAST_ENTRIES, LEAST_SLOTS = 2**15, 2**11  # that a picture is planned for
 
 
-@struct.dataclass
-class SurfelScene:
-    """An encoded object: its surfels, and their median spacing, which decides at what size a picture is drawn.
+class Plan(NamedTuple):
+    """Static sizes of a picture: hashable, made by `plan` or by hand.
 
-    `solid` is what the network of rays makes of it, where there is one (`method/solid.py`).
+    `doublings` by the network, and `side` pixels averaged along each side of a pixel (1 or 2); `width` and `height` of
+    the window of the G-buffer, in its pixels; `entries` pairs of disc and pixel and `slots` covered pixels that there
+    is room for; `solid` whether the network of rays is asked where a sparse cloud is solid (`method/solid.py`).
     """
 
-    surfels: Surfels
-    spacing: float = struct.field(pytree_node=False)
-    solid: Scene | None = None
+    doublings: int
+    side: int
+    width: int
+    height: int
+    entries: int
+    slots: int
+    solid: bool = False
+
+
+class Sizes(NamedTuple):
+    """What a picture needs: columns and rows of the window, entries, covered pixels at most; arrays or ints."""
+
+    width: Any
+    height: Any
+    entries: Any
+    slots: Any
 
 
 def init(key: Key, config: SurfelConfig) -> dict:
@@ -52,135 +83,226 @@ def init(key: Key, config: SurfelConfig) -> dict:
     return dict(Shader(config.widths, config.top).init(key, jnp.zeros((1, side, side, features.NUM_FEATURES)), 1))
 
 
-def encode(variables: dict | None, cloud: PointCloud, *, config: SurfelConfig) -> SurfelScene:
-    """Surfels of a cloud (unbatched, in the box), and where it is solid; without variables surfels alone.
-
-    Variables of the network of rays are `batch_stats`: what a state holds that is not trained.
-    """
+def encode(cloud: PointCloud) -> SurfelScene:
+    """Surfels of a cloud (unbatched, in the box); of centre 0 and scale 1."""
     mask = np.asarray(cloud.mask)
     names = ("positions", "base_color", "roughness", "metallic", "normals", "materials_known")
     columns: dict[str, Any] = {
         name: None if (x := getattr(cloud, name)) is None else np.asarray(x)[mask] for name in names
     }
     surfels = estimate(**columns)
-    known = None
-    if variables is not None and config.solid:
-        known = solid.encode(variables["batch_stats"], cloud, config=SOLID)
-    spacing = float(np.median(surfels.spacing[surfels.mask]))
-    return SurfelScene(surfels=jax.device_put(surfels), spacing=spacing, solid=known)
+    spacing = np.float32(np.median(surfels.spacing[surfels.mask]))
+    return jax.device_put(
+        SurfelScene(surfels=surfels, spacing=spacing, centre=np.zeros(3, np.float32), scale=np.float32(1))
+    )
+
+
+# --- sizes ------------------------------------------------------------------------------------------------------------
+
+
+def plan(scene: SurfelScene, camera: Camera) -> Plan:
+    """Sizes that hold every view, of a camera or of a batch of them (leading axes), of one scene or of a stack.
+
+    On the host: what shapes arrays cannot be traced.  The axes of a stack of scenes lead those of the cameras, or the
+    cameras have none.  ValueError for a picture that needs more entries than can be sorted.
+    """
+    batch = np.shape(camera.cam_to_world)[:-2]
+    objects = np.shape(scene.spacing)
+    if batch[: len(objects)] != objects:
+        if batch:
+            raise UserError(f"scenes of axes {objects} need cameras of the same leading axes, or of none; got {batch}")
+        camera = jax.tree.map(lambda x: jnp.broadcast_to(x, (*objects, *x.shape)), camera)
+        batch = objects
+    camera = jax.tree.map(lambda x: jnp.reshape(x, (-1, *x.shape[-2:])), camera)
+    views = [jax.tree.map(lambda x, i=i: x[i], camera) for i in range(len(camera.cam_to_world))]
+    each = int(np.prod(batch[len(objects) :], dtype=int))
+    scenes = jax.tree.map(lambda x: x.reshape(-1, *x.shape[len(objects) :]), scene)
+    scenes = [jax.tree.map(lambda x, i=i: x[i], scenes) for i in range(int(np.prod(objects, dtype=int)))]
+    pairs = [(scenes[i // each], view) for i, view in enumerate(views)]
+    doublings, side = common_resolution([resolution(*pair) for pair in pairs])
+    needed = jax.device_get([count_sizes(*pair, doublings=doublings, side=side) for pair in pairs])
+    sparse = all(int(np.sum(of.surfels.mask)) <= solid.MOST_POINTS for of in scenes)
+    return rounded(largest(needed), doublings, side, sparse)
+
+
+def resolution(scene: SurfelScene, camera: Camera, share: float = 1.0) -> tuple[int, int]:
+    """Doublings by the network, and pixels averaged along each side, for the scene's spacing around its middle.
+
+    They are those of the picture of which the camera has a share of the pixels along a side.
+    """
+    eye = np.asarray(camera.cam_to_world, np.float64)[:, 3]
+    distance = float(np.linalg.norm((eye - np.asarray(scene.centre)) * np.asarray(scene.scale)))
+    pixels = float(scene.spacing) * float(np.asarray(camera.intrinsics)[0, 0]) / share / max(distance, 1e-3)
+    return resolution_of(pixels)
+
+
+def resolution_of(pixels: float) -> tuple[int, int]:
+    """Doublings, and pixels averaged along each side, for points that lie so many pixels apart."""
+    doublings = int(np.clip(np.floor(np.log2(max(pixels / COARSEST, 1e-9))) + 1, 0, MOST_DOUBLINGS))
+    return doublings, 2 if pixels < FINEST else 1
+
+
+def common_resolution(resolutions: Iterable[tuple[int, int]]) -> tuple[int, int]:
+    """The finest of several."""
+    return min(resolutions, key=lambda of: (of[0], -of[1]))
+
+
+@partial(jax.jit, static_argnames=("doublings", "side"))
+def count_sizes(scene: SurfelScene, camera: Camera, *, doublings: int, side: int) -> Sizes:
+    """What a view needs; the covered pixels are at most those of the rectangles around its discs."""
+    whole = scaled(cameras.in_box(camera, scene.centre, scene.scale), doublings, side)
+    corner, width, height = place_window(scene.surfels, whole)
+    window = seen_through(whole, corner, width, height)
+    foot = projection.footprints(scene.surfels, View(window.cam_to_world, window.intrinsics, height, width))
+    return Sizes(width, height, projection.total(foot.covered), projection.covered_by(foot, _most(whole)))
+
+
+def _most(camera: Camera) -> tuple[int, int]:
+    """Rows and columns of a window at most: it begins in the picture, and may reach beyond it."""
+    return camera.height + MARGIN + STEP, camera.width + MARGIN + STEP
+
+
+def largest(needed: Iterable[Sizes]) -> Sizes:
+    """Sizes that hold each of several."""
+    return Sizes(*(max(map(int, sizes)) for sizes in zip(*needed, strict=True)))
+
+
+def rounded(sizes: Sizes, doublings: int, side: int, sparse: bool) -> Plan:
+    """The plan that holds these sizes; powers of the root of two, so that few are compiled."""
+    entries, slots = (
+        _rounded(*x) for x in ((sizes.entries, LEAST_ENTRIES, MOST_ENTRIES), (sizes.slots, LEAST_SLOTS, MOST_ENTRIES))
+    )
+    return Plan(
+        doublings, side, sizes.width, sizes.height, entries, min(slots, sizes.width * sizes.height), solid=sparse
+    )
+
+
+def _rounded(count: int, least: int, most: int) -> int:
+    if count > most:
+        raise UserError(f"the picture needs {count} entries of discs, at most {most} are drawn; ask for a smaller one")
+    return min(int(2 ** (np.ceil(2 * np.log2(max(count, least))) / 2)), most)
+
+
+def scaled(camera: Camera, doublings: int, side: int) -> Camera:
+    """The camera at the network's resolution; doubled, its picture may be larger than asked for, and is cut."""
+    height, width = (-(-n * side // 2**doublings) for n in (camera.height, camera.width))
+    scale = jnp.array([[side / 2**doublings], [side / 2**doublings], [1.0]], jnp.float32)
+    return dataclasses.replace(camera, intrinsics=camera.intrinsics * scale, height=height, width=width)
+
+
+def place_window(surfels: Surfels, camera: Camera) -> tuple[Int[Array, "2"], Int[Array, ""], Int[Array, ""]]:
+    """Corner (column, row), width and height of the window around what is drawn of the surfels."""
+    foot = projection.footprints(surfels, camera)
+    drawn, rows = foot.covered > 0, foot.covered // foot.width
+    sides = []
+    for first, size in ((foot.left, foot.width), (foot.top, rows)):
+        low = jnp.min(jnp.where(drawn, first, 2**20)), jnp.max(jnp.where(drawn, first + size, 0))
+        begin = jnp.where(jnp.any(drawn), jnp.maximum(low[0] - MARGIN, 0) // GRID * GRID, 0)
+        sides.append((begin, jnp.maximum(-(-(low[1] + MARGIN - begin) // STEP) * STEP, STEP)))
+    (left, width), (top, height) = sides
+    return jnp.stack([left, top]), width, height
+
+
+def seen_through(camera: Camera, corner: Int[Array, "2"], width: Any, height: Any) -> Camera:
+    """The camera whose picture is the window."""
+    moved = jnp.asarray(camera.intrinsics).at[:2, 2].add(-corner.astype(camera.intrinsics.dtype))
+    return dataclasses.replace(camera, intrinsics=moved, height=height, width=width)
+
+
+# --- pictures ---------------------------------------------------------------------------------------------------------
 
 
 def render(
-    variables: dict | None,
-    scene: SurfelScene,
-    camera: Camera,
-    light: Light,
-    *,
-    config: SurfelConfig,
-    share: float = 1.0,
+    params: dict | None, scene: SurfelScene, camera: Camera, light: Light | None = None, *, plan: Plan
 ) -> Rendering:
-    """One view (camera unbatched, in the box) of an encoded object; without variables discs and light alone.
+    """The object as a camera sees it, a pure function; depth in the cloud's units; light None is the package's room.
 
-    With a `share` below 1 of the pixels along a side the picture is drawn smaller, doubled as often, and enlarged.
+    One object, one view, one light: batches are `jax.vmap` of it, the plan is static.  Without params discs and light
+    alone.  `overflow` counts what did not fit into the plan.  Gradients: docs/gradients.md.
     """
-    small = _smaller(camera, share)
-    plan, total = planned(scene.surfels, scene.spacing, small, share)
-    drawn, _ = _drawn(variables, scene, small, light, plan, total, LEAST_SLOTS, config)
-    return drawn if share == 1 else _enlarged(drawn, camera.height, camera.width)
+    _check(scene, camera, light, plan)
+    light = lighting.room_light() if light is None else light
+    known = None
+    if plan.solid and params is not None and "batch_stats" in params:
+        inside = cameras.in_box(camera, scene.centre, scene.scale)
+        known = solid_picture(params, solid.of_surfels(params["batch_stats"], scene.surfels), inside, plan)
+    blended = blend_window(scene, camera, light, plan=plan)
+    return shade_window(params, scene, camera, light, blended, known, plan=plan)
 
 
-def render_views(
-    variables: dict | None,
-    scene: SurfelScene,
-    cameras: Camera,
-    light: Light | Sequence[Light],
-    *,
-    config: SurfelConfig,
-    share: float = 1.0,
-) -> Rendering:
-    """Views (one axis of cameras) in one light or each in its own."""
-    views = [jax.tree.map(lambda x, i=i: x[i], cameras) for i in range(len(cameras.cam_to_world))]
-    lights = [light] * len(views) if isinstance(light, Light) else light
-    drawn = render_each(variables, scene, views, lights, config=config, share=share)
-    return jax.tree.map(lambda *x: np.stack(x), *drawn)
+def _check(scene: SurfelScene, camera: Camera, light: Light | None, plan: Plan) -> None:
+    """ValueError in one line for what has other axes than one object, one view and one light."""
+    for what, array, wanted in (
+        ("camera.cam_to_world", camera.cam_to_world, (3, 4)),
+        ("camera.intrinsics", camera.intrinsics, (3, 3)),
+        ("scene.centre", scene.centre, (3,)),
+        ("scene.surfels.position", scene.surfels.position, (*np.shape(scene.surfels.mask), 3)),
+        *(() if light is None else (("light.tables", light.tables, (7, lighting.HEIGHT, lighting.WIDTH, 3)),)),
+    ):
+        if np.shape(array) != wanted:
+            raise UserError(f"render: {what} has the shape {np.shape(array)}, expected {wanted}; use jax.vmap for more")
+    if min(plan[:6]) < 0 or min(plan[1:6]) < 1 or plan.entries > MOST_ENTRIES:
+        raise UserError(f"render: {plan} has a size below 1, or more than {MOST_ENTRIES} entries; use spnr_jax.plan")
 
 
-def render_each(
-    variables: dict | None,
-    scene: SurfelScene,
-    views: Sequence[Camera],
-    lights: Sequence[Light],
-    *,
-    config: SurfelConfig,
-    share: float = 1.0,
-) -> Iterator[Rendering]:
-    """Views one after the other; they share the sizes of the largest of them, so that few programs are compiled."""
-    small = [_smaller(view, share) for view in views]
-    plans = [planned(scene.surfels, scene.spacing, view, share) for view in small]
-    largest: dict[tuple, np.ndarray] = {}
-    for plan, total in plans:  # those of one resolution share their sizes
-        sizes = np.array([plan.width, plan.height, total, LEAST_SLOTS])
-        largest[plan[:2]] = np.maximum(largest.get(plan[:2], sizes), sizes)
-
-    def one(asked: tuple[Camera, Camera, Light, tuple[Plan, int]]) -> Rendering:
-        view, whole, light, (plan, total) = asked
-        width, height, most, slots = map(int, largest[plan[:2]])
-        shared = plan._replace(width=width, height=height)
-        found, slots = _drawn(variables, scene, view, light, shared, most if total else 0, slots, config)
-        largest[plan[:2]][3] = max(slots, largest[plan[:2]][3])
-        return found if share == 1 else _enlarged(found, whole.height, whole.width)
-
-    yield from two_at_a_time(one, zip(small, views, lights, plans, strict=True))
+def solid_picture(params: dict, rays: Any, camera: Camera, plan: Plan) -> Float[Array, "height width 2"]:
+    """Opacity and depth of a view (camera in the box) as the network of rays sees it, at the network's resolution."""
+    return solid.seen(params["batch_stats"], rays, scaled(camera, plan.doublings, plan.side))
 
 
-def _smaller(camera: Camera, share: float) -> Camera:
-    if share == 1:
-        return camera
-    return cameras.resize(camera, *(max(round(share * n / 4) * 4, 4) for n in (camera.height, camera.width)))
+class Blended(NamedTuple):
+    """The G-buffer of a picture's window, where that lies (column, row), and what did not fit into the plan."""
+
+    buffer: GBuffer
+    corner: Int[Array, "2"]
+    overflow: Int[Array, ""]
 
 
-def _drawn(
-    variables: dict | None,
+def blend_window(scene: SurfelScene, camera: Camera, light: Light, *, plan: Plan) -> Blended:
+    """The first half of `render`: discs, and what of the light arrives at them."""
+    whole = scaled(cameras.in_box(camera, scene.centre, scene.scale), plan.doublings, plan.side)
+    corner, width, height = jax.lax.stop_gradient(place_window(scene.surfels, whole))
+    window = seen_through(whole, corner, plan.width, plan.height)
+    buffer, lost = rasterize(scene.surfels, window, light, room=plan.entries, slots=plan.slots)
+    beyond = jnp.maximum(width - plan.width, 0) + jnp.maximum(height - plan.height, 0)
+    return Blended(buffer, corner, jnp.minimum(lost, projection.MOST) + beyond)
+
+
+def shade_window(
+    params: dict | None,
     scene: SurfelScene,
     camera: Camera,
     light: Light,
+    blended: Blended,
+    known: Float[Array, "h w 2"] | None,
+    *,
     plan: Plan,
-    total: int,
-    least_slots: int,
-    config: SurfelConfig,
-) -> tuple[Rendering, int]:
-    """A planned view, and the size of its table of pixels."""
-    if total == 0:
-        return _nothing(camera), least_slots
-    whole = scaled(camera, plan.doublings, plan.side)
-    inside = seen_through(whole, plan)
-    found, covered = projection.jitted_entries(
-        scene.surfels, inside, total=rounded(total, 2**15, projection.MOST_ENTRIES)
-    )
-    pixels = inside.height * inside.width
-    slots = rounded(min(max(int(covered), least_slots), pixels), LEAST_SLOTS, pixels)
-    known = known_of(variables, scene, whole, config)
-    within = None if known is None else jnp.asarray(in_window(known, plan))
-    looked = jitted_look(found, scene.surfels, light, inside, within, slots=slots)
-    return _placed(_shade(variables, *looked, config=config, doublings=plan.doublings), camera, plan), slots
+) -> Rendering:
+    """The second half: the network over the G-buffer, beside what that of rays knows of the view (`solid_picture`)."""
+    inside = cameras.in_box(camera, scene.centre, scene.scale)
+    window = seen_through(scaled(inside, plan.doublings, plan.side), blended.corner, plan.width, plan.height)
+    known = None if known is None else cut_window(known, blended.corner, plan)
+    drawn = shade(params, *look(blended.buffer, light, window, known), doublings=plan.doublings)
+    image, depth, acc = paste(drawn, blended.corner * 2**plan.doublings, inside, plan.side)
+    return Rendering(image=image, image_lr=image, depth=depth / scene.scale, acc=acc, overflow=blended.overflow)
 
 
-def known_of(
-    variables: dict | None, scene: SurfelScene, camera: Camera, config: SurfelConfig
-) -> Float[Array, "height width 2"] | None:
-    """Opacity and depth of a view as the network of rays sees it, where there is one."""
-    if variables is None or scene.solid is None:
-        return None
-    return solid.seen(variables["batch_stats"], scene.solid, camera, config=SOLID)
+def rasterize(
+    surfels: Surfels, camera: Camera, light: Light, *, room: int, slots: int
+) -> tuple[GBuffer, Int[Array, ""]]:
+    """The G-buffer of a view, with what of the light arrives at each surfel; entries and pixels that did not fit."""
+    found, lost = projection.entries(surfels, camera, room=room)
+    buffer = blend_entries(found, surfels, light, camera, slots=slots)
+    return buffer, lost + jnp.maximum(splatting.covered_pixels(found) - slots, 0)
 
 
-def blended(found: projection.Entries, surfels: Surfels, light: Light, camera: Camera, *, slots: int) -> GBuffer:
-    """The G-buffer of a picture's entries, with what of the light arrives at each surfel."""
+def blend_entries(found: projection.Entries, surfels: Surfels, light: Light, camera: Camera, *, slots: int) -> GBuffer:
+    """The G-buffer of a view's entries."""
     surfels = features.turned(surfels, camera)
     return splatting.blend(found, surfels, features.attributes(surfels, light, camera), camera, slots=slots)
 
 
-def seen(
+def look(
     buffer: GBuffer, light: Light, camera: Camera, known: Float[Array, "height width 2"] | None = None
 ) -> tuple[
     Float[Array, "height width 34"], Float[Array, "height width 18"], Float[Array, "9 3"], Float[Array, "height width"]
@@ -190,42 +312,20 @@ def seen(
     return told, maps, lighting.projected(light, jnp.asarray(camera.cam_to_world)[:, :3]), buffer.depth
 
 
-# two programs: of pictures with other numbers of covered pixels in the same window the second is not compiled again
-_blended = jax.jit(blended, static_argnames="slots")
-_seen = jax.jit(seen, compiler_options=QUICK)
-
-
-def jitted_look(
-    found: projection.Entries,
-    surfels: Surfels,
-    light: Light,
-    camera: Camera,
-    known: Float[Array, "height width 2"] | None = None,
-    *,
-    slots: int,
-) -> tuple[Array, Array, Array, Array]:
-    """`seen` of what is `blended`, compiled."""
-    return _seen(_blended(found, surfels, light, camera, slots=slots), light, camera, known)
-
-
-@partial(jax.jit, static_argnames=("config", "doublings"), compiler_options=QUICKEST)
-def _shade(
-    variables: dict | None,
+def shade(
+    params: dict | None,
     seen: Float[Array, "height width 34"],
     maps: Float[Array, "height width 18"],
     ambient: Float[Array, "9 3"],
     depth: Float[Array, "height width"],
     *,
-    config: SurfelConfig,
     doublings: int,
 ) -> Float[Array, "h w 5"]:
     """Colour, opacity and depth along the camera's axis, of the window, doubled."""
-    if variables is None:
+    if params is None:
         outputs = jnp.zeros((1, *(n << doublings for n in seen.shape[:2]), NUM_OUTPUTS))
     else:
-        outputs = jnp.asarray(
-            Shader(config.widths, config.top).apply({"params": variables["params"]}, seen[None], doublings)
-        )
+        outputs = jnp.asarray(shader_of(params).apply({"params": params["params"]}, seen[None], doublings))
     color, alpha = picture(outputs, maps[None], ambient[None], doublings)
     depth = depth[None, ..., None]
     for _ in range(doublings):
@@ -233,38 +333,38 @@ def _shade(
     return jnp.concatenate([color, alpha[..., None], depth], axis=-1)[0]
 
 
-def _placed(drawn: Float[AnyArray, "h w 5"], camera: Camera, plan: Plan) -> Rendering:
-    """The window in its place in the picture."""
-    scale = 2**plan.doublings
-    corner = np.array([plan.top * scale, plan.left * scale], np.int32)
-    image, depth, acc = _laid(drawn, corner, camera, side=plan.side)
-    return Rendering(image=image, image_lr=image, depth=depth, acc=acc)
+def shader_of(params: dict) -> Shader:
+    """The network that these weights belong to: its sizes are theirs."""
+    weights = params["params"]
+    levels = sum(name.startswith("down") for name in weights)
+    widths = tuple(weights[f"in{level}"]["kernel"].shape[-1] for level in range(levels))
+    return Shader(widths, weights["top"]["kernel"].shape[-1])
 
 
-# one program: its 50 operations alone would each be compiled, 2 s
-@partial(jax.jit, static_argnames="side", compiler_options=QUICKEST)
-def _laid(
-    drawn: Float[AnyArray, "h w 5"], corner: Int[AnyArray, "2"], camera: Camera, *, side: int
+def cut_window(
+    whole: Float[Array, "h w features"], corner: Int[Array, "2"], plan: Plan
+) -> Float[Array, "height width features"]:
+    """The window's part of a picture, which it may reach beyond."""
+    padded = jnp.pad(whole, ((0, plan.height), (0, plan.width), (0, 0)))
+    start = (corner[1], corner[0], jnp.zeros((), corner.dtype))
+    return jax.lax.dynamic_slice(padded, start, (plan.height, plan.width, whole.shape[-1]))
+
+
+def paste(
+    drawn: Float[AnyArray, "h w 5"], corner: Int[AnyArray, "2"], camera: Camera, side: int
 ) -> tuple[Float[Array, "height width 3"], Float[Array, "height width"], Float[Array, "height width"]]:
     """Image, depth along the rays and opacity of a picture that is empty but for a window, which may reach beyond."""
     height, width = (n * side for n in (camera.height, camera.width))
     alpha = drawn[..., 3:4]
     layers = jnp.concatenate([drawn[..., :3] * alpha, alpha, drawn[..., 4:] * alpha], axis=-1)
-    empty = jnp.zeros((height + drawn.shape[0], width + drawn.shape[1], 5))
-    sums = jax.lax.dynamic_update_slice(empty, layers, (*corner, jnp.zeros((), jnp.int32)))[:height, :width]
+    empty = jnp.zeros((height + drawn.shape[0], width + drawn.shape[1], 5), layers.dtype)
+    start = (corner[1], corner[0], jnp.zeros((), corner.dtype))
+    sums = jax.lax.dynamic_update_slice(empty, layers, start)[:height, :width]
     if side > 1:
         sums = mean_of_squares(sums, side)
     acc = sums[..., 3]
     rays = cameras.camera_rays(camera)
     _, far, _ = cameras.intersect_box(rays.origins, rays.directions)
     along = -jnp.einsum("hwi,i->hw", rays.directions, camera.cam_to_world[:, 2], precision="highest")
-    depth = sums[..., 4] / jnp.maximum(along, 1e-6) + (1 - acc) * far
+    depth = sums[..., 4] / larger(along, 1e-6) + (1 - acc) * far
     return sums[..., :3] + (1 - acc[..., None]) * WHITE, depth, acc
-
-
-_enlarged = jax.jit(enlarged, static_argnums=(1, 2), compiler_options=QUICK)
-
-
-def _nothing(camera: Camera) -> Rendering:
-    """A view in which nothing of the object is seen."""
-    return _placed(np.zeros((1, 1, 5), np.float32), camera, Plan(0, 1, 0, 0, 1, 1))

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from spnr_jax.kernels.colors import linear_to_srgb
+from spnr_jax.kernels.numerics import clamp, larger, one_minus_exp, smaller
 from spnr_jax.kernels.resizing import doubled, mean_of_squares, unfolded
 from spnr_jax.nn.convolution import Conv
 from spnr_jax.surfels.lighting import SPECULAR
@@ -93,16 +94,16 @@ def picture(
     color, metallic, opacity, factor, summand = (maps[..., i:j] for i, j in ((0, 3), (3, 4), (4, 5), (5, 6), (6, 7)))
     arriving, unshadowed, mirrored, reflected = (maps[..., i:j] for i, j in ((7, 10), (10, 13), (13, 16), (16, 17)))
     solid = maps[..., 17:18]
-    base = jnp.clip(color + COLOR_STEP * outputs[..., 0:3], 0, 1)
+    base = clamp(color + COLOR_STEP * outputs[..., 0:3], 0, 1)
     share = nn.sigmoid(outputs[..., 19:20])  # how far the rays are trusted beside the discs
     odds = (1 - share) * log_odds(opacity) + share * log_odds(solid)
-    alpha = nn.sigmoid(odds + ODDS_STEP * outputs[..., 3:4]) * -jnp.expm1(-opacity / NOTHING)
+    alpha = nn.sigmoid(odds + ODDS_STEP * outputs[..., 3:4]) * one_minus_exp(opacity / NOTHING)
     bounced = outputs[..., 8:11] * ambient[:, None, None, 0]
     bounced += jnp.einsum("bhwk,bkc->bhwc", outputs[..., 11:19], ambient[:, 1:], precision="highest")
-    metallic = jnp.clip(metallic + COLOR_STEP * outputs[..., 20:21], 0, 1)
-    mirrored += jnp.clip(outputs[..., 21:22], 0, 1) * (unshadowed - mirrored)  # rougher than it is said to be
+    metallic = clamp(metallic + COLOR_STEP * outputs[..., 20:21], 0, 1)
+    mirrored += clamp(outputs[..., 21:22], 0, 1) * (unshadowed - mirrored)  # rougher than it is said to be
     diffuse = (1 + outputs[..., 4:5]) * arriving + outputs[..., 5:6] * unshadowed + bounced
     specular = (1 + outputs[..., 6:7]) * reflected + outputs[..., 7:8]
     normal_incidence = SPECULAR * (1 - metallic) + base * metallic
     linear = base * (1 - metallic) * diffuse + (normal_incidence * factor + summand) * mirrored * specular
-    return jnp.minimum(linear_to_srgb(jnp.maximum(linear, 0)), 1), alpha[..., 0]
+    return smaller(linear_to_srgb(larger(linear, 0)), 1), alpha[..., 0]

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from spnr_jax.kernels.colors import linear_to_srgb
+from spnr_jax.kernels.numerics import clamp, larger, normalize, one_minus_exp, root, smaller
 from spnr_jax.kernels.records import Camera, GBuffer, Light, Surfels
 from spnr_jax.surfels import lighting
 from spnr_jax.surfels.visibility import DIRECTIONS
@@ -36,11 +37,10 @@ def turned(surfels: Surfels, camera: Camera) -> Surfels:
 def attributes(surfels: Surfels, light: Light, camera: Camera) -> Float[Array, "points 17"]:
     """Numbers of each surfel that are blended over pixels; those of the light are linear in it."""
     rotation, eye = camera.cam_to_world[:, :3], camera.cam_to_world[:, 3]
-    cosines = jnp.maximum(jnp.einsum("pi,di->pd", surfels.normal, DIRECTIONS, precision="highest"), 0)
-    openness = jnp.sum(surfels.visible * cosines, axis=1) / jnp.maximum(jnp.sum(cosines, axis=1), 1e-6)
+    cosines = larger(jnp.einsum("pi,di->pd", surfels.normal, DIRECTIONS, precision="highest"), 0)
+    openness = jnp.sum(surfels.visible * cosines, axis=1) / larger(jnp.sum(cosines, axis=1), 1e-6)
     bent = 4 / len(DIRECTIONS) * jnp.einsum("pd,di->pi", surfels.visible, DIRECTIONS, precision="highest")
-    view = eye[None] - surfels.position
-    view = view / jnp.maximum(jnp.linalg.norm(view, axis=1, keepdims=True), 1e-6)
+    view = normalize(eye[None] - surfels.position)
     along = jnp.sum(view * surfels.normal, axis=1, keepdims=True)
     mirror = 2 * jnp.abs(along) * jnp.where(along < 0, -1.0, 1.0) * surfels.normal - view
     lobe = jnp.exp(lighting.LOBE * (jnp.einsum("pi,di->pd", mirror, DIRECTIONS, precision="highest") - 1))
@@ -61,22 +61,22 @@ def features(
     roughness, metallic, *arriving, reflected, openness = jnp.moveaxis(buffer.attributes, -1, 0)[:7]
     bent, blended = buffer.attributes[..., 7:10], buffer.attributes[..., 10:13]
     planarity, linearity, sided, guessed = jnp.moveaxis(buffer.attributes, -1, 0)[13:17]
-    color = jnp.clip(jnp.clip(buffer.color, blended - TRUST, blended + TRUST), 0, 1)
+    color = clamp(clamp(buffer.color, blended - TRUST, blended + TRUST), 0, 1)
     normal, view = _directions(buffer, camera)
     cosine = -sum(n * v for n, v in zip(normal, view, strict=True))
     mirror = [v + 2 * cosine * n for n, v in zip(normal, view, strict=True)]
     turned = [_to_world(camera, direction) for direction in (normal, mirror)]
-    factor, summand = lighting.reflectance(roughness, jnp.clip(cosine, 0.05, 1))
+    factor, summand = lighting.reflectance(roughness, clamp(cosine, 0.05, 1))
     spacing = jnp.exp(buffer.log_spacing)
-    in_pixels = jnp.maximum(spacing, 1e-6) * camera.intrinsics[0, 0] / jnp.maximum(buffer.depth, 0.1)
+    in_pixels = larger(spacing, 1e-6) * camera.intrinsics[0, 0] / larger(buffer.depth, 0.1)
     told = [buffer.opacity, jnp.log1p(buffer.coverage), roughness, metallic, openness, reflected]
-    told += [jnp.minimum(buffer.spread / spacing, 4), *(_relief(buffer, spacing, reach) for reach in WINDOWS)]
+    told += [smaller(buffer.spread / spacing, 4), *(_relief(buffer, spacing, reach) for reach in WINDOWS)]
     told += [0.5 * jnp.log(in_pixels), planarity, linearity, sided, cosine]
     vectors = [buffer.normal, bent, linear_to_srgb(color), linear_to_srgb(blended)]
     drawn = (buffer.opacity / (buffer.opacity + FAINT))[..., None]
-    pattern = [jnp.log1p(8 * buffer.centres)[..., None], jnp.clip(buffer.beside / in_pixels[..., None], -2, 2)]
+    pattern = [jnp.log1p(8 * buffer.centres)[..., None], clamp(buffer.beside / in_pixels[..., None], -2, 2)]
     seen = jnp.concatenate([jnp.stack(told, axis=-1), *vectors], axis=-1)
-    covered = buffer.opacity * jnp.maximum(-jnp.expm1(-((buffer.coverage / EDGE) ** 2)), HAZE)
+    covered = buffer.opacity * larger(one_minus_exp((buffer.coverage / EDGE) ** 2), HAZE)
     opacity = covered if solid is None else solid[..., 0]
     known = jnp.zeros((*covered.shape, 3))
     if solid is not None:
@@ -91,9 +91,9 @@ def features(
 
 def _directions(buffer: GBuffer, camera: Camera) -> tuple[list[Array], list[Array]]:
     """Unit normals and rays' directions, camera axes, as columns; the camera's axis where there is no normal."""
-    size = jnp.sqrt(jnp.sum(buffer.normal**2, axis=-1))
+    size = root(jnp.sum(buffer.normal**2, axis=-1))
     known = size > 1e-3
-    normal = [buffer.normal[..., i] / jnp.maximum(size, 1e-4) for i in range(3)]
+    normal = [buffer.normal[..., i] / larger(size, 1e-4) for i in range(3)]
     normal = [jnp.where(known, n, c) for n, c in zip(normal, (0.0, 0.0, 1.0), strict=True)]
     columns, rows = jnp.arange(camera.width) + 0.5, jnp.arange(camera.height) + 0.5
     right = jnp.broadcast_to(((columns - camera.intrinsics[0, 2]) / camera.intrinsics[0, 0])[None], size.shape)
@@ -110,7 +110,7 @@ def _to_world(camera: Camera, direction: list[Array]) -> list[Array]:
 
 def _relief(buffer: GBuffer, spacing: Float[Array, "height width"], reach: int) -> Float[Array, "height width"]:
     """How far each pixel lies behind the mean around it, in spacings, squeezed into (-1, 1)."""
-    mean = _box(buffer.opacity * buffer.depth, reach) / jnp.maximum(_box(buffer.opacity, reach), 1e-3)
+    mean = _box(buffer.opacity * buffer.depth, reach) / larger(_box(buffer.opacity, reach), 1e-3)
     return jnp.where(buffer.opacity > LEAST, jnp.tanh((buffer.depth - mean) / (4 * spacing)), 0)
 
 

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from spnr_jax.kernels.numerics import clamp, larger, root, smaller
 from spnr_jax.kernels.records import AnyArray, Light, Surfels
 from spnr_jax.surfels import skies
 from spnr_jax.surfels.envmaps import directions, resampled, solid_angles
@@ -24,6 +25,7 @@ LEVELS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)  # of roughness
 TOLD = 2  # the level whose values at the directions of the visibility stand for what comes from there
 SPECULAR = 0.04  # reflectance of what is not metal, seen from straight above
 LOBE = 8.0  # of the directions around the mirrored one whose visibility counts
+POLE = 1e-6  # sine of the angle to straight up or down within which a direction has no azimuth
 SH_BANDS = 9  # spherical harmonics up to degree 2
 ODD = (3, 4, 7), (1, 4, 5)  # of them, those that change their sign when the light is mirrored along x, or along y
 
@@ -93,8 +95,11 @@ def look_up(tables: Float[Array, "rows 3"], towards: list[Array], first: Array |
     `first` is the row at which a table begins, for each direction.
     """
     x, y, z = towards
-    row = jnp.arccos(jnp.clip(y, -1, 1)) / jnp.pi * HEIGHT - 0.5
-    column = jnp.arctan2(x, -z) / (2 * jnp.pi) % 1.0 * WIDTH - 0.5
+    across = root(x * x + z * z)
+    aside = across > POLE  # straight up and down there is no azimuth, nor a gradient by it
+    polar = jnp.arctan2(jnp.where(aside, across, 0), jnp.where(aside, y, jnp.where(y < 0, -1, 1)))
+    azimuth = jnp.arctan2(jnp.where(aside, x, 0), jnp.where(aside, -z, 1))
+    row, column = polar / jnp.pi * HEIGHT - 0.5, azimuth / (2 * jnp.pi) % 1.0 * WIDTH - 0.5
     above, left = jnp.floor(row), jnp.floor(column)
     down, right = row - above, column - left
     above, left = above.astype(jnp.int32), left.astype(jnp.int32)
@@ -113,7 +118,7 @@ def irradiance(light: Light, normal: list[Array]) -> list[Array]:
 
 def mirrored(light: Light, towards: list[Array], roughness: Array) -> list[Array]:
     """Radiance that unshadowed surfaces mirror: between the tables of the two nearest roughnesses."""
-    level = jnp.clip(roughness, 0, 1) * (len(LEVELS) - 1)
+    level = clamp(roughness, 0, 1) * (len(LEVELS) - 1)
     below = jnp.clip(jnp.floor(level), 0, len(LEVELS) - 2)
     share, first = level - below, (1 + below.astype(jnp.int32)) * (HEIGHT * WIDTH)
     tables = jnp.asarray(light.tables).reshape(-1, 3)
@@ -125,13 +130,13 @@ def reflectance(roughness: Array, cosine: Array) -> tuple[Array, Array]:
     """Factor and summand of the reflectance at normal incidence, integrated over the lobe (Karis' fit, 2014)."""
     one = [r * s + o for r, s, o in ((roughness, -1, 1), (roughness, -0.0275, 0.0425))]
     two = [r * s + o for r, s, o in ((roughness, -0.572, 1.04), (roughness, 0.022, -0.04))]
-    grazing = jnp.minimum(one[0] ** 2, 2.0 ** (-9.28 * cosine)) * one[0] + one[1]
+    grazing = smaller(one[0] ** 2, 2.0 ** (-9.28 * cosine)) * one[0] + one[1]
     return two[0] - 1.04 * grazing, two[1] + 1.04 * grazing
 
 
 def arriving(surfels: Surfels, light: Light) -> Float[Array, "points 3"]:
     """Irradiance over pi at each surfel through the directions that see it."""
-    cosines = jnp.maximum(jnp.einsum("pi,di->pd", surfels.normal, DIRECTIONS, precision="highest"), 0)
+    cosines = larger(jnp.einsum("pi,di->pd", surfels.normal, DIRECTIONS, precision="highest"), 0)
     tables = jnp.asarray(light.tables)[1 + TOLD].reshape(-1, 3)
     radiance = jnp.stack(look_up(tables, [jnp.asarray(x) for x in DIRECTIONS.T]), axis=-1)
     return (4 / len(DIRECTIONS)) * jnp.einsum("pd,dc->pc", surfels.visible * cosines, radiance, precision="highest")

@@ -7,20 +7,22 @@ their weight is the square of a kernel:
                 edge, or smaller than a pixel, is as wide as FLOOR pixels (the low-pass of EWA splatting, Zwicker et al.
                 2001)
 
-Everything passes to 0 at the border of a disc, so a picture is continuous in the camera and in the points.  Static
-sizes come from counts that the caller reads back: a picture is three programs, `count`, `entries`, `splatting.blend`.
+Everything passes to 0 at the border of a disc, so a picture is continuous in the camera and in the points.  Which
+pixels a disc covers, and the order of the entries, are integers: constants to every gradient.  Sizes are static; what
+does not fit into them is counted.
 """
 
 from collections.abc import Sequence
 from functools import reduce
+from itertools import product
 from operator import add, mul
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float, Int
 
+from spnr_jax.kernels.numerics import clamp, larger, root, smaller
 from spnr_jax.kernels.records import AnyArray, Camera, Surfels
 
 RADIUS = 1.6  # of a disc, in spacings
@@ -32,6 +34,7 @@ NEAREST = 0.05  # distance before the camera from which discs are drawn
 DEPTH_BITS, ENTRY_BITS = 19, 24  # of the sorted number of 64, at most; pixels have those above
 PIXEL_BITS = 64 - DEPTH_BITS - ENTRY_BITS  # that leave so many to the depth
 MOST_ENTRIES = 2**ENTRY_BITS
+MOST = 2**30  # that is counted: sums of int32 wrap beyond twice that
 
 
 class View(NamedTuple):
@@ -76,7 +79,7 @@ class Entries(NamedTuple):
 
 def smoothstep(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
     """0 below 0, 1 above 1, a cubic without a kink between."""
-    x = jnp.clip(x, 0, 1)
+    x = clamp(x, 0, 1)
     return x * x * (3 - 2 * x)
 
 
@@ -98,27 +101,16 @@ def _dot(a: Sequence[Array], b: Sequence[Array]) -> Array:
 def footprints(surfels: Surfels, camera: Camera | View) -> Footprints:
     """Discs before a camera; those turned away, behind it or beside the picture cover no pixel."""
     rotation, eye = camera.cam_to_world[:, :3], camera.cam_to_world[:, 3]
-    x, y, z = (centre - e for centre, e in zip(turned(rotation, surfels.position), eye @ rotation, strict=True))
+    x, y, z = (a - b for a, b in zip(turned(rotation, surfels.position), turned(rotation, eye[None]), strict=True))
     normal = turned(rotation, surfels.normal)
-    distance = jnp.sqrt(x * x + y * y + z * z)
-    cosine = -(normal[0] * x + normal[1] * y + normal[2] * z) / jnp.maximum(distance, NEAREST)
+    cosine = -(normal[0] * x + normal[1] * y + normal[2] * z) / larger(root(x * x + y * y + z * z), NEAREST)
     facing = 1 - jnp.asarray(surfels.sided) * (1 - smoothstep((cosine + 0.1) / 0.3))
-    ahead = jnp.maximum(-z, NEAREST)
+    ahead = larger(-z, NEAREST)
     column = camera.intrinsics[0, 0] * x / ahead + camera.intrinsics[0, 2]
     row = -camera.intrinsics[1, 1] * y / ahead + camera.intrinsics[1, 2]
     radius = RADIUS * jnp.asarray(surfels.spacing)
-    nearest = jnp.maximum(ahead - radius * jnp.sqrt(jnp.clip(1 - normal[2] ** 2, 0, 1)), NEAREST)  # of the disc
-    sides = []
-    for middle, focal, aside, along, size in (
-        (column, camera.intrinsics[0, 0], x / ahead, normal[0], camera.width),
-        (row, camera.intrinsics[1, 1], y / ahead, normal[1], camera.height),
-    ):
-        # a place of the disc at (dx, dz) from its centre lies focal * (dx + aside * dz) / (ahead - dz) beside it
-        extent = jnp.sqrt(jnp.maximum(1 + aside**2 - (along + aside * normal[2]) ** 2, 0))
-        half = jnp.maximum(focal * radius * extent / nearest, FLOOR)
-        first = jnp.clip(jnp.ceil(middle - half - 0.5), 0, size)
-        sides.append((first, jnp.maximum(jnp.clip(jnp.floor(middle + half - 0.5) + 1, 0, size) - first, 0)))
-    (left, width), (top, height) = sides
+    known = jax.lax.stop_gradient((camera.intrinsics, (x, y, z), normal, radius, (column, row)))
+    left, top, width, height = _rectangles(*known, (camera.width, camera.height))
     drawn = surfels.mask & (facing > 0) & (-z > NEAREST)
     return Footprints(
         centre=(x, y, z),
@@ -127,40 +119,76 @@ def footprints(surfels: Surfels, camera: Camera | View) -> Footprints:
         facing=facing,
         column=column,
         row=row,
-        left=left.astype(jnp.int32),
-        top=top.astype(jnp.int32),
-        width=jnp.maximum(width, 1).astype(jnp.int32),
-        covered=jnp.where(drawn, width * height, 0).astype(jnp.int32),
+        left=left,
+        top=top,
+        width=jnp.maximum(width, 1),
+        covered=jnp.where(drawn, width * height, 0),
     )
 
 
-@jax.jit
-def count(surfels: Surfels, camera: Camera) -> Int[Array, ""]:
-    """Number of entries that a picture makes at most."""
-    return jnp.sum(footprints(surfels, camera).covered)
+def _rectangles(
+    intrinsics: Float[AnyArray, "3 3"],
+    centre: tuple[Array, Array, Array],
+    normal: tuple[Array, Array, Array],
+    radius: Float[Array, " points"],
+    place: tuple[Array, Array],
+    size: tuple[int | Array, int | Array],
+) -> tuple[Array, Array, Array, Array]:
+    """First column and row, width and height of the pixels around each disc, inside the picture; width 0 beside it."""
+    x, y, z = centre
+    ahead = jnp.maximum(-z, NEAREST)
+    nearest = jnp.maximum(ahead - radius * jnp.sqrt(jnp.clip(1 - normal[2] ** 2, 0, 1)), NEAREST)  # of the disc
+    sides = []
+    for middle, focal, aside, along, most in (
+        (place[0], intrinsics[0, 0], x / ahead, normal[0], size[0]),
+        (place[1], intrinsics[1, 1], y / ahead, normal[1], size[1]),
+    ):
+        # a place of the disc at (dx, dz) from its centre lies focal * (dx + aside * dz) / (ahead - dz) beside it
+        extent = jnp.sqrt(jnp.maximum(1 + aside**2 - (along + aside * normal[2]) ** 2, 0))
+        half = jnp.maximum(focal * radius * extent / nearest, FLOOR)
+        first = jnp.clip(jnp.ceil(middle - half - 0.5), 0, most)
+        sides.append((first, jnp.maximum(jnp.clip(jnp.floor(middle + half - 0.5) + 1, 0, most) - first, 0)))
+    (left, width), (top, height) = ([x.astype(jnp.int32) for x in side] for side in sides)
+    return left, top, width, height
 
 
-def entries(
-    surfels: Surfels, camera: Camera | View, *, total: int, pixel_bits: int = PIXEL_BITS
-) -> tuple[Entries, Int[Array, ""]]:
-    """The sorted entries, `total` of them with the empty ones, and the number of covered pixels.
+def total(covered: Int[Array, " points"]) -> Int[Array, ""]:
+    """Sum of the pixels that discs cover, at most MOST."""
+    return jnp.minimum(jnp.sum(covered.astype(jnp.float32)), MOST).astype(jnp.int32)
 
-    The numbers of the pixels, and of one more, have at most `pixel_bits`.
+
+def covered_by(foot: Footprints, most: tuple[int, int]) -> Int[Array, ""]:
+    """Number of the pixels in the rectangles around discs, of a picture of so many rows and columns at most."""
+    rows, columns = (n + 1 for n in most)
+    across = (foot.left, 1), (foot.left + foot.width, -1)
+    down = (foot.top, 1), (foot.top + foot.covered // foot.width, -1)
+    count = jnp.zeros(rows * columns, jnp.int32)
+    for (row, one), (column, other) in product(down, across):
+        count = count.at[row * columns + column].add(jnp.where(foot.covered > 0, one * other, 0), mode="drop")
+    inside = jnp.cumsum(jnp.cumsum(count.reshape(rows, columns), axis=0), axis=1)
+    return jnp.sum(inside > 0, dtype=jnp.int32)
+
+
+def entries(surfels: Surfels, camera: Camera, *, room: int) -> tuple[Entries, Int[Array, ""]]:
+    """The sorted entries of a picture, `room` of them with the empty ones, and how many did not fit in.
+
+    Discs that do not fit are left out whole, the last ones of the surfels.
     """
     foot = footprints(surfels, camera)
-    end = jnp.cumsum(foot.covered)
-    point = jnp.repeat(jnp.arange(len(foot.covered), dtype=jnp.int32), foot.covered, total_repeat_length=total)
+    end = jnp.cumsum(foot.covered.astype(jnp.float32))  # exact up to 2**24, and no int32 that wraps
+    covered = jnp.where(end <= room, foot.covered, 0)
+    lost = total(jnp.where(end <= room, 0, foot.covered))
+    end = jnp.cumsum(covered)
+    point = jnp.repeat(jnp.arange(len(covered), dtype=jnp.int32), covered, total_repeat_length=room)
     # whole columns are gathered one by one, and not computed anew at every use: twenty times faster on a CPU
     rotation = camera.cam_to_world[:, :3]
     rim = turned(rotation, surfels.rim)
     side = _cross(foot.normal, rim)
     reach = tuple(jnp.asarray(surfels.reach).T)
-    foot, begin, point, rim, side, reach = jax.lax.optimization_barrier(
-        (foot, end - foot.covered, point, rim, side, reach)
-    )
+    foot, begin, point, rim, side, reach = jax.lax.optimization_barrier((foot, end - covered, point, rim, side, reach))
     x, y, z, nx, ny, nz = (column[point] for column in (*foot.centre, *foot.normal))
     radius = foot.radius[point]
-    place = jnp.arange(total, dtype=jnp.int32)
+    place = jnp.arange(room, dtype=jnp.int32)
     inside, width = place - begin[point], foot.width[point]
     row = inside // width
     column = foot.left[point] + inside - row * width
@@ -168,43 +196,32 @@ def entries(
     right = (column + 0.5 - camera.intrinsics[0, 2]) / camera.intrinsics[0, 0]
     up = -(row + 0.5 - camera.intrinsics[1, 2]) / camera.intrinsics[1, 1]
     slope = nx * right + ny * up - nz
-    slope = jnp.where(slope < 0, jnp.minimum(slope, -EDGE), jnp.maximum(slope, EDGE))
-    met = jnp.clip((nx * x + ny * y + nz * z) / slope, -z - 2 * radius, -z + 2 * radius)
+    slope = jnp.where(slope < 0, smaller(slope, -EDGE), larger(slope, EDGE))
+    met = clamp((nx * x + ny * y + nz * z) / slope, -z - 2 * radius, -z + 2 * radius)
     there = [RADIUS / radius * x for x in (met * right - x, met * up - y, -met - z)]  # in spacings
     in_plane = _dot(there, there) / RADIUS**2
     along, across = _dot(there, [c[point] for c in rim]), _dot(there, [c[point] for c in side])
     ends = [r[point] - x for r, x in zip(reach, (along, -along, across, -across), strict=True)]
-    cut = reduce(mul, (jnp.clip(0.5 + end / RIM_WIDTH, 0, 1) for end in ends))
+    cut = reduce(mul, (clamp(0.5 + end / RIM_WIDTH, 0, 1) for end in ends))
     on_picture = ((column + 0.5 - foot.column[point]) ** 2 + (row + 0.5 - foot.row[point]) ** 2) / FLOOR**2
-    cut = jnp.maximum(cut - in_plane, SKIRT * (1 - in_plane))
-    kernel = jnp.clip(jnp.maximum(cut, 1 - on_picture), 0, 1)
-    depth = jnp.clip(met, -z - radius, -z + radius)
-    pixel = jnp.where((place < end[-1]) & (kernel > 0), row * camera.width + column, camera.height * camera.width)
-    order, pixel = _sorted(pixel, depth, place, 64 - ENTRY_BITS - pixel_bits)
-    first = jnp.concatenate([jnp.ones(1, bool), pixel[1:] != pixel[:-1]]) & (pixel < camera.height * camera.width)
+    cut = larger(cut - in_plane, SKIRT * (1 - in_plane))
+    kernel = clamp(larger(cut, 1 - on_picture), 0, 1)
+    depth = clamp(met, -z - radius, -z + radius)
+    pixels = camera.height * camera.width
+    pixel = jnp.where((place < end[-1]) & (kernel > 0), row * camera.width + column, pixels)
+    order, pixel = _sorted(pixel, jax.lax.stop_gradient(depth), place, max(PIXEL_BITS, pixels.bit_length()))
+    first = jnp.concatenate([jnp.ones(1, bool), pixel[1:] != pixel[:-1]]) & (pixel < pixels)
     slot = jnp.cumsum(first.astype(jnp.int32)) - 1
     rank = place - jax.lax.cummax(jnp.where(first, place, 0))
-    return Entries(point, kernel, depth, foot.facing[point], order, pixel, slot, rank), slot[-1] + 1
-
-
-# this option takes a quarter off the compilation and costs the program no time
-_entries = jax.jit(
-    entries, static_argnames=("total", "pixel_bits"), compiler_options={"xla_cpu_use_fusion_emitters": False}
-)
-
-
-def jitted_entries(surfels: Surfels, camera: Camera, *, total: int) -> Any:
-    """`entries` by a program that draws pictures of any size."""
-    size = np.asarray(camera.height, np.int32), np.asarray(camera.width, np.int32)
-    bits = max(PIXEL_BITS, (camera.height * camera.width).bit_length())
-    return _entries(surfels, View(camera.cam_to_world, camera.intrinsics, *size), total=total, pixel_bits=bits)
+    return Entries(point, kernel, depth, foot.facing[point], order, pixel, slot, rank), lost
 
 
 def _sorted(
-    pixel: Int[Array, " entries"], depth: Float[Array, " entries"], place: Int[Array, " entries"], depth_bits: int
+    pixel: Int[Array, " entries"], depth: Float[Array, " entries"], place: Int[Array, " entries"], pixel_bits: int
 ) -> tuple[Int[Array, " entries"], Int[Array, " entries"]]:
     """Places and pixels in the order of pixel and depth: one number of 64 bits sorts nine times faster than three."""
     low, high = jnp.min(depth), jnp.max(depth)
+    depth_bits = 64 - ENTRY_BITS - pixel_bits
     steps = 2**depth_bits - 1
     with jax.enable_x64(True):
         level = (steps * (depth - low) / jnp.maximum(high - low, 1e-6)).astype(jnp.uint64)

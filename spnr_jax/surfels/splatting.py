@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from spnr_jax.kernels.numerics import clamp, larger, one_minus_exp, root, smaller
 from spnr_jax.kernels.records import Camera, GBuffer, Surfels
 from spnr_jax.surfels.projection import Entries, footprints, smoothstep, turned
 
@@ -26,7 +27,7 @@ FAR = 1e-4  # summed narrow weights that the centres' distances pass to 0 at
 def blend(
     found: Entries, surfels: Surfels, attributes: Float[Array, "points features"], camera: Camera, *, slots: int
 ) -> GBuffer:
-    """The G-buffer from the entries of a picture; `slots` is at least the number of its covered pixels."""
+    """The G-buffer from the entries of a picture, of its first `slots` covered pixels (`covered_pixels`)."""
     height, width = camera.height, camera.width
     table, pixel_of = _lists(found, slots, height * width)
     listed = table >= 0
@@ -55,6 +56,11 @@ def blend(
     of_slot = jax.lax.optimization_barrier(jnp.pad(jnp.concatenate(sums, axis=1), ((0, 1), (0, 0))))
     of_pixel = of_slot[slot_of].reshape(height, width, -1)
     return _gathered(list(jnp.moveaxis(of_pixel, -1, 0)), attributes.shape[1], camera)
+
+
+def covered_pixels(found: Entries) -> Int[Array, ""]:
+    """Number of pixels that hold an entry."""
+    return found.slot[-1] + 1
 
 
 def _summed(
@@ -88,13 +94,13 @@ def _colored(
     """
     right = ahead * ((pixel_of % camera.width + 0.5 - camera.intrinsics[0, 2]) / camera.intrinsics[0, 0])
     up = ahead * -((pixel_of // camera.width + 0.5 - camera.intrinsics[1, 2]) / camera.intrinsics[1, 1])
-    pose, pixel = camera.cam_to_world, jnp.maximum(ahead, 1e-6) / camera.intrinsics[0, 0]
+    pose, pixel = camera.cam_to_world, larger(ahead, 1e-6) / camera.intrinsics[0, 0]
     where = [pose[i, 0] * right + pose[i, 1] * up - pose[i, 2] * ahead + pose[i, 3] for i in range(3)]
 
     def add(sums: Array, at: tuple[Array, Array]) -> tuple[Array, None]:
         color, change, across, border, jump, centre = jnp.split(rows[at[1]], (3, 12, 15, 16, 19), axis=1)
         beyond = sum(across[:, i] * where[i] for i in range(3)) - border[:, 0]
-        color += jnp.clip(0.5 + beyond / pixel, 0, 1)[:, None] * jump
+        color += clamp(0.5 + beyond / pixel, 0, 1)[:, None] * jump
         color += sum(change[:, i::3] * where[i][:, None] for i in range(3))
         return sums + at[0][:, None] * jnp.concatenate([color, centre], axis=1), None
 
@@ -132,15 +138,15 @@ def shares(
         band += other_tau * (1 - apart)
         if step < 0:
             hidden += other_tau * apart
-    left = jnp.exp(-hidden)
-    return tau * left * jnp.where(band > 1e-6, -jnp.expm1(-band) / jnp.maximum(band, 1e-6), 1), left
+    left, seen = jnp.exp(-hidden), band > 1e-6
+    return tau * left * jnp.where(seen, one_minus_exp(band) / jnp.where(seen, band, 1), 1), left
 
 
 def _gathered(sums: list[Array], features: int, camera: Camera) -> GBuffer:
     """Means from the sums of `blend`."""
     wide, rest, narrow = sums[: features + 4], sums[features + 4 : features + 8], sums[features + 8 :]
     share, coverage, deep, squared = rest
-    inverse = 1 / jnp.maximum(share, 1e-4)
+    inverse = 1 / larger(share, 1e-4)
     *wide, log_spacing = (x * inverse for x in wide)
     depth = deep * inverse
     *color, column, row, sharp = narrow
@@ -149,10 +155,10 @@ def _gathered(sums: list[Array], features: int, camera: Camera) -> GBuffer:
     columns, rows = (jnp.arange(camera.width) + 0.5)[None], (jnp.arange(camera.height) + 0.5)[:, None]
     beside = (column, columns), (row, rows)
     return GBuffer(
-        opacity=jnp.minimum(share, 1),
+        opacity=smaller(share, 1),
         coverage=coverage,
         depth=depth,
-        spread=jnp.sqrt(jnp.maximum(squared * inverse - depth**2, 0)),
+        spread=root(squared * inverse - depth**2),
         log_spacing=log_spacing,
         normal=jnp.stack(wide[features:], axis=-1),
         color=jnp.stack([c * inverse_sharp for c in color], axis=-1),

@@ -13,13 +13,11 @@ from typing import Any
 import jax
 import numpy as np
 
-from spnr_jax.config import SurfelConfig
 from spnr_jax.gaussians import coloring, placing, refining
 from spnr_jax.gaussians.placing import View
-from spnr_jax.kernels.records import Camera, Gaussians, Light, PointCloud, Volume
+from spnr_jax.kernels.records import Camera, Gaussians, Light, PointCloud, SurfelScene, Volume
 from spnr_jax.method import surfel_renderer
 from spnr_jax.method.model import DISTANCE, Model
-from spnr_jax.method.surfel_renderer import SurfelScene
 from spnr_jax.tools.depth_maps import surface_depth
 from spnr_jax.tools.light_options import Lighting
 from spnr_jax.tools.render_command import Render
@@ -100,9 +98,9 @@ def splats_in_box(
 
 def placed(pictures: list[View], volume: Volume, cloud: PointCloud, degree: int, most: int) -> Gaussians:
     """Splats in the box as they are before they are refined."""
-    surfels = (volume.scene if isinstance(volume.scene, SurfelScene) else _surfels(cloud, volume)).surfels
+    scene = volume.scene if isinstance(volume.scene, SurfelScene) else _encode_in_box(cloud, volume)
     focal = float(np.asarray(pictures[0].camera.intrinsics)[0, 0])
-    seen = placing.seen_surface(pictures, surfels)
+    seen = placing.seen_surface(pictures, scene.surfels)
     grey, side = placing.place(seen, most=most, pixel=DISTANCE / focal)
     return coloring.colored(grey, pictures, side=side, degree=degree)
 
@@ -174,7 +172,7 @@ def light_name(lighting: Lighting) -> str:
     return " + ".join(parts) + "".join(f", {name} {value:g}" for name, value in options.items() if value)
 
 
-def _surfels(cloud: PointCloud, volume: Volume) -> SurfelScene:
+def _encode_in_box(cloud: PointCloud, volume: Volume) -> SurfelScene:
     inside = np.clip((np.asarray(cloud.positions) - np.asarray(volume.centre)) * np.asarray(volume.scale), -1, 1)
     placed = dataclasses.replace(cloud, positions=inside.astype(np.float32))
-    return surfel_renderer.encode(None, placed, config=SurfelConfig())
+    return surfel_renderer.encode(placed)

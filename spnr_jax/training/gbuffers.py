@@ -29,10 +29,10 @@ from spnr_jax.formats.images import to_uint8, write_whole
 from spnr_jax.formats.npz import packed, read_arrays
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.cleaning import Cleaned, cleaned
-from spnr_jax.kernels.records import Camera, Crops, Light, PointCloud
+from spnr_jax.kernels.records import Camera, Crops, Light, PointCloud, Scene, Surfels, SurfelScene
 from spnr_jax.kernels.thinning import farthest_points
-from spnr_jax.method import surfel_plan, surfel_renderer
-from spnr_jax.surfels import features, lighting, outward, projection
+from spnr_jax.method import solid, surfel_pictures, surfel_renderer
+from spnr_jax.surfels import features, lighting, outward
 from spnr_jax.training.batching import read_ahead
 from spnr_jax.training.scan_faults import colours_alone, random_scan
 
@@ -93,21 +93,21 @@ def _doublings(path: Path) -> list[int] | None:
         return None
 
 
-def make(item: ObjectData, number: int, light: Light, config: TrainConfig, solid: dict) -> Arrays:
+def make(item: ObjectData, number: int, light: Light, config: TrainConfig, rays: dict) -> Arrays:
     """The content of a file: views of the object's cloud of this number."""
     assert isinstance(config.model, SurfelConfig)
     generator = np.random.default_rng((config.seed, CLOUD, zlib.crc32(item.name.encode()), number))
     side = int(generator.choice(SIDES))
     cloud = random_cloud(item.cloud, side, config, generator)
-    variables = None if generator.random() < UNKNOWN else {"batch_stats": solid}
-    scene = surfel_renderer.encode(variables, cloud, config=config.model)
-    known = partial(surfel_renderer.known_of, variables, scene, config=config.model)
+    variables = None if generator.random() < UNKNOWN else {"batch_stats": rays}
+    scene = surfel_renderer.encode(cloud)
+    known = surfel_pictures.encode_solid(variables, cloud, config.model)
     arrays: Arrays = {}
     doublings: list[int] = []
     for index in generator.permutation(len(item.images))[: config.views_per_object]:
         camera = jax.tree.map(lambda x, i=index: np.asarray(x[i]), item.camera)
         own = light if item.lights is None else lighting.light_of(item.lights[index])
-        if view := make_view(scene, camera, item.images[index], side, own, known):
+        if view := make_view(scene, camera, item.images[index], side, own, rays, known):
             arrays |= {f"{name}{len(doublings)}": view[1][name] for name in NAMES}
             doublings.append(view[0])
     return arrays | {"doublings": np.array(doublings, np.int64)}
@@ -146,31 +146,30 @@ def scanned(points: Cleaned, generator: np.random.Generator) -> Cleaned:
 
 
 def make_view(
-    scene: surfel_renderer.SurfelScene,
+    scene: SurfelScene,
     camera: Camera,
     image: UInt8[np.ndarray, "height width 4"],
     side: int,
     light: Light,
-    known: Callable[[Camera], Float[Array, "height width 2"] | None] = lambda camera: None,
+    rays: dict | None = None,
+    known: Scene | None = None,
 ) -> tuple[int, Arrays] | None:
     """Doublings and arrays of a view, `side` times smaller than its reference is kept; None if it teaches nothing.
 
-    `known` is the opacity and depth that the network of rays sees from a camera.
+    `known` is what the network of rays, whose variables are `rays`, makes of the object.
     """
     small = cameras.resize(camera, camera.height // side, camera.width // side)
-    doublings, finer = surfel_plan.resolution_of(scene.spacing, small)
+    doublings, finer = surfel_renderer.resolution(scene, small)
     side, scale = side // finer, 2**doublings  # what is drawn at twice the size is compared at that size
     if side == 0 or any(n % (side * scale) or n // (side * scale) < LEAST for n in image.shape[:2]):
         return None
     drawn = cameras.resize(camera, *(n // (side * scale) for n in image.shape[:2]))
-    total = int(projection.count(scene.surfels, drawn))
-    if not 0 < total <= MOST_ENTRIES:
+    needed = jax.device_get(surfel_renderer.count_sizes(scene, drawn, doublings=0, side=1))
+    if not 0 < needed.entries <= MOST_ENTRIES:
         return None
-    found, slots = projection.jitted_entries(scene.surfels, drawn, total=_size(total, 2**16))
-    slots = min(_size(int(slots), drawn.height * drawn.width // 16), drawn.height * drawn.width)
-    seen, maps, ambient, _ = map(
-        np.asarray, surfel_renderer.jitted_look(found, scene.surfels, light, drawn, known(drawn), slots=slots)
-    )
+    whole = drawn.height * drawn.width
+    room, slots = _size(int(needed.entries), 2**16), min(_size(int(needed.slots), whole // 16), whole)
+    seen, maps, ambient = map(np.asarray, look_at(scene.surfels, drawn, light, rays, known, room=room, slots=slots))
     target = averaged(image, side)
     shown = target[..., 3].reshape(drawn.height, scale, drawn.width, scale).max(axis=(1, 3))
     inside = (seen[..., 0] > FAINT) | (shown > 0)
@@ -183,6 +182,16 @@ def make_view(
         "ambient": ambient,
         "target": target[scale * rows.start : scale * rows.stop, scale * columns.start : scale * columns.stop],
     }
+
+
+@partial(jax.jit, static_argnames=("room", "slots"))
+def look_at(
+    surfels: Surfels, camera: Camera, light: Light, rays: dict | None, known: Scene | None, *, room: int, slots: int
+) -> tuple[Float[Array, "height width 34"], Float[Array, "height width 18"], Float[Array, "9 3"]]:
+    """What the network sees of a whole view, the light maps, and the light's harmonics."""
+    buffer, _ = surfel_renderer.rasterize(surfels, camera, light, room=room, slots=slots)
+    picture = None if known is None or rays is None else solid.seen(rays, known, camera)
+    return surfel_renderer.look(buffer, light, camera, picture)[:3]
 
 
 def _size(count: int, least: int) -> int:

@@ -11,13 +11,13 @@ from support.surfel_clouds import camera, cloud, shape
 
 from spnr_jax.config import SOLID, RenderOptions, SurfelConfig
 from spnr_jax.kernels import cameras
-from spnr_jax.method import inference, solid, surfel_renderer
+from spnr_jax.method import inference, solid, surfel_pictures, surfel_renderer
 from spnr_jax.nn.shader import NUM_OUTPUTS, picture
 from spnr_jax.surfels.features import NUM_MAPS
-from spnr_jax.surfels.lighting import room_light
 from spnr_jax.training import weights
 
 NUM_POINTS, RADIUS = 700, 0.6
+seen = jax.jit(solid.seen)
 
 
 @pytest.fixture(scope="module")
@@ -36,13 +36,13 @@ def points():
 
 @pytest.fixture(scope="module")
 def scene(trained, points):
-    return solid.encode(trained.variables, points, config=SOLID)
+    return jax.jit(solid.encode)(trained.variables, points)
 
 
 @pytest.mark.ci
 def test_a_small_picture_is_the_network_s_own(trained, scene):
     view = camera(solid.MOST_PIXELS)
-    found = solid.seen(trained.variables, scene, view, config=SOLID)
+    found = seen(trained.variables, scene, view)
     batched = jax.tree.map(lambda x: x[None, None], view)
     twin = inference.render(trained.variables, scene, batched, config=SOLID, options=RenderOptions())
     close(found[..., 0], twin.acc[0, 0], atol=1e-5)
@@ -51,7 +51,7 @@ def test_a_small_picture_is_the_network_s_own(trained, scene):
 @pytest.mark.parametrize("size", [(128, 128), (200, 150), (64, 96)])
 def test_it_lies_where_the_object_is(trained, scene, size):
     view = cameras.resize(camera(128), *size)
-    found = np.asarray(solid.seen(trained.variables, scene, view, config=SOLID))
+    found = np.asarray(seen(trained.variables, scene, view))
     assert found.shape == (*size, 2)
     rays = jax.tree.map(np.float64, cameras.camera_rays(view))
     along = -np.sum(rays.origins * rays.directions, axis=-1)
@@ -64,25 +64,41 @@ def test_it_lies_where_the_object_is(trained, scene, size):
     assert np.abs(found[..., 1] - distance * axis)[inside].max() < 0.1
 
 
-def test_dense_clouds_do_without(trained):
-    many = cloud(shape("sphere", solid.MOST_POINTS + 1)[0])
-    assert solid.encode(trained.variables, many, config=SOLID) is None
+def volume_of(trained, count, params, config):
+    """The handle's volume of a ball of so many points."""
+    points = cloud(shape("sphere", count)[0])
+    return surfel_pictures.encode_volume(params, points, np.zeros(3, np.float32), np.float32(1), config=config)
 
 
-def test_the_renderer_asks_it_for_its_picture(trained):
+@pytest.fixture(scope="module")
+def asking(trained):
+    """A config that asks the network of rays, and its variables."""
     config = SurfelConfig(widths=(4, 4), top=4, solid=True)
-    variables = jax.jit(surfel_renderer.init, static_argnums=1)(jax.random.key(0), config) | {
-        "batch_stats": trained.variables
-    }
-    points = cloud(shape("sphere", NUM_POINTS)[0])
-    scene = surfel_renderer.encode(variables, points, config=config)
+    shader = jax.jit(surfel_renderer.init, static_argnums=1)(jax.random.key(0), config)
+    return config, shader | {"batch_stats": trained.variables}
+
+
+def test_dense_clouds_do_without(trained, asking):
+    config, params = asking
+    dense = volume_of(trained, solid.MOST_POINTS + 1, params, config)
+    assert dense.solid is None
+    assert not surfel_renderer.plan(dense.scene, camera(32)).solid
+
+
+def test_the_renderer_asks_it_for_its_picture_and_the_pure_function_too(trained, asking):
+    config, params = asking
+    volume = volume_of(trained, NUM_POINTS, params, config)
     view = dataclasses.replace(camera(32), width=40)  # the window reaches beyond the picture
-    with_rays = surfel_renderer.render(variables, scene, view, room_light(), config=config)
-    without = surfel_renderer.render(
-        variables, dataclasses.replace(scene, solid=None), view, room_light(), config=config
+    with_rays, without = (
+        surfel_pictures.draw(params, of, view, None, config=config, quality="best")
+        for of in (volume, dataclasses.replace(volume, solid=None))
     )
     assert with_rays.image.shape == (32, 40, 3)
     assert np.abs(np.asarray(with_rays.acc) - np.asarray(without.acc)).max() > 0.01
+    plan = surfel_renderer.plan(volume.scene, view)
+    assert plan.solid
+    pure = jax.jit(surfel_renderer.render, static_argnames="plan")(params, volume.scene, view, plan=plan)
+    close(pure.acc, with_rays.acc, atol=0.01)
 
 
 def test_rays_and_discs_share_the_opacity():

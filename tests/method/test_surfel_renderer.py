@@ -11,9 +11,9 @@ from support.surfel_clouds import camera, cloud, shape
 
 from spnr_jax.config import SurfelConfig
 from spnr_jax.kernels import cameras
-from spnr_jax.method import surfel_renderer
-from spnr_jax.method.surfel_plan import GRID, resolution_of
-from spnr_jax.method.surfel_renderer import encode, render, render_views
+from spnr_jax.kernels.records import Volume
+from spnr_jax.method import surfel_pictures, surfel_renderer
+from spnr_jax.method.surfel_renderer import GRID, encode, resolution
 from spnr_jax.nn.shader import Shader
 from spnr_jax.surfels.features import NUM_FEATURES
 from spnr_jax.surfels.lighting import light_of
@@ -24,9 +24,14 @@ RADIUS = 0.6
 
 
 def ball(count=600):
-    return encode(
-        None, cloud(shape("sphere", count)[0], base_color=np.full((count, 3), [0.7, 0.3, 0.1])), config=CONFIG
-    )
+    return encode(cloud(shape("sphere", count)[0], base_color=np.full((count, 3), [0.7, 0.3, 0.1])))
+
+
+def render(variables, scene, view, quality="best"):
+    """As the handle draws it, without its network for None."""
+    volume = Volume(scene=scene, centre=scene.centre, scale=scene.scale)
+    quality = "draft" if variables is None else quality
+    return surfel_pictures.draw(variables or {}, volume, view, LIGHT, config=CONFIG, quality=quality)
 
 
 @pytest.fixture(scope="module")
@@ -67,28 +72,28 @@ def check_ball(found, view, spacing):
 
 def test_a_ball_is_drawn_where_it_is_on_white(scene, fresh):
     view = camera(64)
-    found = render(fresh, scene, view, LIGHT, config=CONFIG)
+    found = render(fresh, scene, view)
     check_ball(found, view, scene.spacing)
     middle = np.asarray(found.image)[28:36, 28:36].reshape(-1, 3)
     assert np.all(np.diff(middle, axis=1) < -0.1)  # a brown ball: red above green above blue
-    close(render(None, scene, view, LIGHT, config=CONFIG).image, found.image, atol=1e-5)  # fresh weights change nothing
+    close(render(None, scene, view).image, found.image, atol=1e-5)  # fresh weights change nothing
 
 
 @pytest.mark.parametrize("size", [(50, 70), (33, 47), (16, 16)])
 def test_pictures_of_any_size_show_the_ball_at_its_place(scene, size):
     height, width = size
     view = dataclasses.replace(cameras.pinhole(camera(8).cam_to_world, 0.9, height, width))
-    check_ball(render(None, scene, view, LIGHT, config=CONFIG), view, scene.spacing + 2.0 * 2.5 / view.intrinsics[0, 0])
+    check_ball(render(None, scene, view), view, scene.spacing + 2.0 * 2.5 / view.intrinsics[0, 0])
 
 
 def test_a_small_ball_in_the_corner_of_a_picture_is_drawn_there(scene):
     view = camera(96, eye=(0.0, 0.0, 9.0), target=(2.2, 2.2, 0.0))
-    check_ball(render(None, scene, view, LIGHT, config=CONFIG), view, 2 * scene.spacing)
+    check_ball(render(None, scene, view), view, 2 * scene.spacing)
 
 
 @pytest.mark.parametrize("target", [(0.0, 0.0, 9.0), (9.0, 0.0, 2.5)])
 def test_a_camera_that_looks_away_sees_white(scene, fresh, target):
-    found = render(fresh, scene, camera(64, target=target), LIGHT, config=CONFIG)
+    found = render(fresh, scene, camera(64, target=target))
     assert found.image.shape == (64, 64, 3)
     assert np.all(np.asarray(found.image) == 1)
     assert np.all(np.asarray(found.acc) == 0)
@@ -96,42 +101,40 @@ def test_a_camera_that_looks_away_sees_white(scene, fresh, target):
 
 def test_the_picture_moves_with_the_principal_point(wobbled):
     scene, view = ball(3000), camera(96, eye=(0.6, 0.4, 3.6))
-    doublings, side = resolution_of(scene.spacing, view)
+    doublings, side = resolution(scene, view)
     assert side == 1
     step = GRID * 2**doublings
     moved = dataclasses.replace(view, intrinsics=view.intrinsics.at[0, 2].add(step).at[1, 2].add(-step))
-    one, other = (np.asarray(render(wobbled, scene, v, LIGHT, config=CONFIG).image) for v in (view, moved))
+    one, other = (np.asarray(render(wobbled, scene, v).image) for v in (view, moved))
     close(other[: 96 - step, step:], one[step:, : 96 - step], atol=1e-4)
-    assert np.abs(one - np.asarray(render(None, scene, view, LIGHT, config=CONFIG).image)).max() > 0.01
+    assert np.abs(one - np.asarray(render(None, scene, view).image)).max() > 0.01
 
 
 @pytest.mark.parametrize("size", [60, 96])
-def test_a_share_of_the_pixels_is_doubled_as_often_and_enlarged_to_nearly_the_same_picture(scene, size):
+def test_a_share_of_the_pixels_is_doubled_as_often_and_enlarged_to_nearly_the_same_picture(scene, fresh, size):
     view, share = camera(size, (0.6, 0.4, 2.6)), 0.75
     for spacing in np.geomspace(0.01, 1, 40):
         small = cameras.resize(view, round(share * size), round(share * size))
-        assert resolution_of(spacing, small, share) == resolution_of(spacing, view)
-    whole, found = (render(None, scene, view, LIGHT, config=CONFIG, share=n) for n in (1.0, share))
+        other = scene.replace(spacing=spacing)
+        assert resolution(other, small, share) == resolution(other, view)
+    whole, found = (render(fresh, scene, view, quality) for quality in ("best", "balanced"))
     assert jax.tree.map(jnp.shape, found) == jax.tree.map(jnp.shape, whole)
     for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(whole), strict=True):
         assert np.abs(np.asarray(one) - np.asarray(other)).mean() < 0.05  # depth jumps at the outline
-    views = jax.tree.map(lambda x: x[None], view)
-    together = render_views(None, scene, views, LIGHT, config=CONFIG, share=share)
-    close(jax.tree.map(lambda x: x[0], together), found)
 
 
 def test_views_are_those_drawn_one_by_one(scene):
     views = [camera(64, eye) for eye in ((0.0, 0.0, 2.5), (1.5, 1.0, 1.5))]
-    together = render_views(None, scene, jax.tree.map(lambda *x: jnp.stack(x), *views), LIGHT, config=CONFIG)
+    together = render(None, scene, jax.tree.map(lambda *x: jnp.stack(x), *views))
     for i, view in enumerate(views):
-        one = render(None, scene, view, LIGHT, config=CONFIG)
+        one = render(None, scene, view)
         close(jax.tree.map(lambda x, i=i: x[i], together), one)
 
 
 def test_more_entries_than_can_be_sorted_are_refused_in_one_line(scene, monkeypatch):
-    monkeypatch.setattr(surfel_renderer.projection, "MOST_ENTRIES", 100)
+    monkeypatch.setattr(surfel_renderer, "MOST_ENTRIES", 100)
     with pytest.raises(ValueError, match="ask for a smaller one"):
-        render(None, scene, camera(64), LIGHT, config=CONFIG)
+        render(None, scene, camera(64))
 
 
 def test_padding_of_the_cloud_and_points_outside_the_picture_change_nothing(scene):
@@ -139,7 +142,5 @@ def test_padding_of_the_cloud_and_points_outside_the_picture_change_nothing(scen
     color = np.full((600, 3), [0.7, 0.3, 0.1])
     padded = cloud(np.concatenate([positions, 0 * positions]), base_color=np.concatenate([color, color]))
     padded = dataclasses.replace(padded, mask=np.arange(1200) < 600)
-    found, expected = (
-        render(None, s, camera(64), LIGHT, config=CONFIG) for s in (encode(None, padded, config=CONFIG), scene)
-    )
+    found, expected = (render(None, s, camera(64)) for s in (encode(padded), scene))
     close(found, expected)

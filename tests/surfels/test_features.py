@@ -46,7 +46,7 @@ def told(turn, visible=None):
 @jax.jit
 def drawn(found, light, view):
     found = features.turned(found, view)
-    entries, _ = projection.entries(found, view, total=2**15)
+    entries, _ = projection.entries(found, view, room=2**15)
     buffer = splatting.blend(entries, found, features.attributes(found, light, view), view, slots=24**2)
     return buffer, *features.features(buffer, light, view)
 

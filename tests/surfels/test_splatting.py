@@ -13,16 +13,17 @@ from spnr_jax.surfels.splatting import shares
 
 TOTAL = 2**15  # entries, and 500 points in most scenes: few programs are compiled
 blend = jax.jit(splatting.blend, static_argnames="slots")
+make_entries = jax.jit(projection.entries, static_argnames="room")
+count = jax.jit(lambda found, view: projection.total(projection.footprints(found, view).covered))
 
 
 def draw(found, view, attributes=None):
     """G-buffer (as NumPy arrays) of surfels, and the entries that it was blended from."""
     attributes = found.base_color if attributes is None else attributes
-    entries, slots = projection.jitted_entries(found, view, total=TOTAL)
-    assert (
-        int(np.sum(np.asarray(entries.pixel) < view.height * view.width)) <= int(projection.count(found, view)) <= TOTAL
-    )
-    assert int(slots) <= view.height * view.width
+    entries, lost = make_entries(found, view, room=TOTAL)
+    assert int(np.sum(np.asarray(entries.pixel) < view.height * view.width)) <= int(count(found, view)) <= TOTAL
+    assert int(lost) == 0
+    assert int(splatting.covered_pixels(entries)) <= view.height * view.width
     buffer = blend(entries, found, jnp.asarray(attributes), view, slots=view.height * view.width)
     return jax.tree.map(np.asarray, buffer), entries
 
@@ -123,8 +124,9 @@ class TestEntries:
         found = layer(20, normal=(0, 1, 1))
         for size in (24, 2100):  # the second has more pixels than 21 bits count
             view = camera(size, field_of_view=2.9 if size > 24 else 0.7)
-            total = int(projection.count(found, view))
-            entries, slots = projection.jitted_entries(found, view, total=total)
+            entries, lost = make_entries(found, view, room=int(count(found, view)))
+            slots = splatting.covered_pixels(entries)
+            assert int(lost) == 0
             order, pixel = np.asarray(entries.order), np.asarray(entries.pixel)
             live = pixel < size**2
             assert np.all(np.diff(pixel) >= 0)
@@ -135,16 +137,20 @@ class TestEntries:
             assert abs(rows.mean() + 0.5 - size / 2) < 0.1 * size
             assert abs(columns.mean() + 0.5 - size / 2) < 0.1 * size
 
-    def test_one_program_makes_them_for_pictures_of_any_size(self):
-        found, programs = layer(20, normal=(0, 1, 1)), projection._entries
-        before = programs._cache_size()
-        for size in (20, 28):
-            view = camera(size)
-            made, slots = projection.jitted_entries(found, view, total=2**12)
-            wanted, filled = jax.jit(projection.entries, static_argnames="total")(found, view, total=2**12)
-            assert int(slots) == int(filled) > 0
-            jax.tree.map(lambda x, y: close(x, y, atol=1e-5), made, wanted)
-        assert programs._cache_size() == before + 1
+    def test_discs_that_do_not_fit_are_left_out_whole_and_counted(self):
+        found, view = layer(20, normal=(0, 1, 1)), camera(20)
+        covered = np.asarray(projection.footprints(found, view).covered)
+        room = int(covered[:12].sum()) + 1
+        entries, lost = make_entries(found, view, room=room)
+        assert int(lost) == covered[12:].sum() > 0
+        live = np.asarray(entries.pixel) < 400
+        drawn = np.asarray(entries.point)[np.asarray(entries.order)[live]]
+        assert set(drawn) == set(np.flatnonzero(covered[:12]))
+
+    def test_numbers_that_int32_does_not_hold_do_not_wrap(self):
+        found, view = layer(500), camera(2100, eye=(0.0, 0.0, 0.06))
+        assert np.int64(projection.footprints(found, view).covered).sum() > 2**31
+        assert int(make_entries(found, view, room=2**12)[1]) == projection.MOST
 
 
 class TestBlend:

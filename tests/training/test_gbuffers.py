@@ -16,7 +16,7 @@ from spnr_jax.formats import data_sets
 from spnr_jax.kernels.cameras import pinhole
 from spnr_jax.kernels.records import Crops, PointCloud, Surfels
 from spnr_jax.method import surfel_renderer
-from spnr_jax.surfels import features, lighting, projection
+from spnr_jax.surfels import features, lighting
 from spnr_jax.surfels.visibility import DIRECTIONS, spiral, tangents
 from spnr_jax.training import gbuffers, optimisation, shading
 
@@ -175,8 +175,7 @@ def test_a_mirrored_object_is_seen_as_the_mirrored_view(axis):
             reach=reach if sign.min() > 0 else reach[:, [0, 1, 3, 2]],  # normal x rim is not mirrored
             mask=np.ones(60, bool),
         )
-        found, slots = projection.jitted_entries(surfels, camera, total=2**14)
-        seen.append(np.asarray(surfel_renderer.jitted_look(found, surfels, LIGHT, camera, slots=24 * 24)[0]))
+        seen.append(np.asarray(gbuffers.look_at(surfels, camera, LIGHT, None, None, room=2**14, slots=24 * 24)[0]))
     view = {"seen": seen[0], "maps": seen[0], "target": seen[0], "ambient": np.zeros((9, 3))}
     np.testing.assert_allclose(gbuffers.mirrored(view, axis)["seen"], seen[1], atol=0.05)
     assert np.abs(seen[1][..., features.ODD[axis]]).mean() > 0.1
@@ -196,7 +195,7 @@ def test_harmonics_of_the_mirrored_light_are_the_mirrored_ones(axis):
 def test_points_too_far_apart_or_too_near_for_the_reference_teach_nothing():
     item = data_sets.read_object(tiny_surfels.dataset(), NAME)
     camera = jax.tree.map(lambda x: x[0], item.camera)
-    scene = surfel_renderer.encode(None, item.cloud, config=CONFIG.model)
+    scene = surfel_renderer.encode(item.cloud)
     for spacing in (3.0, 0.01):  # G-buffers of three pixels, and pictures of twice the reference's size
         other = dataclasses.replace(scene, spacing=spacing)
         assert gbuffers.make_view(other, camera, item.images[0], 1, LIGHT) is None
