@@ -32,9 +32,15 @@ def encode(variables: dict, cloud: PointCloud) -> Scene:
 
 
 def of_surfels(variables: dict, surfels: Surfels) -> Scene:
-    """`encode` of the points of surfels."""
-    columns = (surfels.position, surfels.base_color, surfels.roughness, surfels.metallic, surfels.mask)
-    return encode(variables, PointCloud(**dict(zip(PointCloud.__dataclass_fields__, columns, strict=False))))
+    """`encode` of the points of surfels, those too that are not drawn: all that have a normal."""
+    cloud = PointCloud(
+        positions=surfels.position,
+        base_color=surfels.base_color,
+        roughness=surfels.roughness,
+        metallic=surfels.metallic,
+        mask=jnp.any(surfels.normal != 0, axis=-1),
+    )
+    return encode(variables, cloud)
 
 
 def seen(variables: dict, scene: Scene, camera: Camera) -> Float[Array, "height width 2"]:

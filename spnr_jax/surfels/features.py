@@ -24,6 +24,7 @@ WINDOWS = 2, 6  # pixels to each side over which the depth is compared
 EDGE = 0.6  # coverage at the outline: discs reach beyond the surface, half of their weight
 LEAST = 0.01  # opacity from which on a pixel's depth says something
 HAZE = 0.05  # of the opacity that is left where discs hardly cover a pixel: the network may make it solid
+LEAST_CENTRES = 1e-6  # summed narrow weights from which on the colour to first order counts
 TRUST = 0.25  # most that a colour to first order leaves the blended one
 
 
@@ -61,7 +62,8 @@ def features(
     roughness, metallic, *arriving, reflected, openness = jnp.moveaxis(buffer.attributes, -1, 0)[:7]
     bent, blended = buffer.attributes[..., 7:10], buffer.attributes[..., 10:13]
     planarity, linearity, sided, guessed = jnp.moveaxis(buffer.attributes, -1, 0)[13:17]
-    color = clamp(clamp(buffer.color, blended - TRUST, blended + TRUST), 0, 1)
+    told = (buffer.centres / (buffer.centres + LEAST_CENTRES))[..., None]  # without discs near by the blended one
+    color = clamp(blended + told * clamp(buffer.color - blended, -TRUST, TRUST), 0, 1)
     normal, view = _directions(buffer, camera)
     cosine = -sum(n * v for n, v in zip(normal, view, strict=True))
     mirror = [v + 2 * cosine * n for n, v in zip(normal, view, strict=True)]
@@ -69,13 +71,13 @@ def features(
     factor, summand = lighting.reflectance(roughness, clamp(cosine, 0.05, 1))
     spacing = jnp.exp(buffer.log_spacing)
     in_pixels = larger(spacing, 1e-6) * camera.intrinsics[0, 0] / larger(buffer.depth, 0.1)
-    told = [buffer.opacity, jnp.log1p(buffer.coverage), roughness, metallic, openness, reflected]
-    told += [smaller(buffer.spread / spacing, 4), *(_relief(buffer, spacing, reach) for reach in WINDOWS)]
-    told += [0.5 * jnp.log(in_pixels), planarity, linearity, sided, cosine]
+    numbers = [buffer.opacity, jnp.log1p(buffer.coverage), roughness, metallic, openness, reflected]
+    numbers += [smaller(buffer.spread / spacing, 4), *(_relief(buffer, spacing, reach) for reach in WINDOWS)]
+    numbers += [0.5 * jnp.log(in_pixels), planarity, linearity, sided, cosine]
     vectors = [buffer.normal, bent, linear_to_srgb(color), linear_to_srgb(blended)]
     drawn = (buffer.opacity / (buffer.opacity + FAINT))[..., None]
     pattern = [jnp.log1p(8 * buffer.centres)[..., None], clamp(buffer.beside / in_pixels[..., None], -2, 2)]
-    seen = jnp.concatenate([jnp.stack(told, axis=-1), *vectors], axis=-1)
+    seen = jnp.concatenate([jnp.stack(numbers, axis=-1), *vectors], axis=-1)
     covered = buffer.opacity * larger(one_minus_exp((buffer.coverage / EDGE) ** 2), HAZE)
     opacity = covered if solid is None else solid[..., 0]
     known = jnp.zeros((*covered.shape, 3))

@@ -20,7 +20,7 @@ OPACITY = 3.0  # optical depth at the middle of a disc
 LIST = 24  # entries of a pixel at most
 NEAR = 8  # places in the list before and after an entry that are compared in depth; those farther in front hide it
 SHARP = 4  # power of the kernel by which colours are blended more narrowly than everything else
-TOLD = 1e-7  # summed narrow weights from which on they say something
+TOLD = 1e-12  # summed narrow weights from which on they say something; float32 holds the square
 FAR = 1e-4  # summed narrow weights that the centres' distances pass to 0 at
 
 
