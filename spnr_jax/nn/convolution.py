@@ -58,7 +58,7 @@ class Conv(nn.Module):
     def __call__(self, x: Float[Array, "batch height width in"]) -> Float[Array, "batch height width features"]:
         """A picture of the same size."""
         kernel = self.param("kernel", nn.initializers.lecun_normal(), (3, 3, x.shape[-1], self.features))
-        y = conv(x, jnp.asarray(kernel))
+        y = _of_pictures(x, jnp.asarray(kernel))
         return y + per_feature(self.param("bias", nn.initializers.zeros, (self.features,)), y)
 
 
@@ -90,6 +90,29 @@ def run_by_run(function: Callable) -> Callable:
         return out, jax.tree.map(lambda _: True, out)
 
     return single
+
+
+def _of_pictures(x: Float[Array, "batch height width in"], kernel: Float[Array, "3 3 in out"]) -> Array:
+    """`conv` of pictures with derivatives of both modes; vmap over pictures is one convolution."""
+
+    def on_cpu(x: Array, kernel: Array) -> Array:
+        return _columns(x, kernel, 1, 1) if x.shape[-1] >= MANY_FEATURES else _conv_of_pictures(x, kernel)
+
+    return lax.platform_dependent(x, kernel, cpu=on_cpu, default=lambda x, kernel: _native(x, kernel, 1, 1))
+
+
+@jax.custom_jvp
+def _conv_of_pictures(x, kernel):
+    return _native(x, kernel, 1, 1)
+
+
+@_conv_of_pictures.defjvp
+def _conv_of_pictures_jvp(primals, tangents):
+    """Written as the transposes of the gradients that are fast on a CPU: transposed again they are these gradients."""
+    out = _conv_of_pictures(*primals)
+    of_input = jax.linear_transpose(lambda cotangent: _input_gradient(*primals, cotangent, 1, 1), out)
+    of_kernel = jax.linear_transpose(lambda cotangent: _kernel_gradient(*primals, cotangent, 1, 1), out)
+    return out, of_input(tangents[0])[0] + of_kernel(tangents[1])[0]
 
 
 @cache
