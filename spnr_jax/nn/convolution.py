@@ -18,6 +18,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
 from spnr_jax.kernels.numerics import per_feature
@@ -106,13 +107,18 @@ def _conv_of_pictures(x, kernel):
     return _native(x, kernel, 1, 1)
 
 
-@_conv_of_pictures.defjvp
 def _conv_of_pictures_jvp(primals, tangents):
     """Written as the transposes of the gradients that are fast on a CPU: transposed again they are these gradients."""
     out = _conv_of_pictures(*primals)
-    of_input = jax.linear_transpose(lambda cotangent: _input_gradient(*primals, cotangent, 1, 1), out)
-    of_kernel = jax.linear_transpose(lambda cotangent: _kernel_gradient(*primals, cotangent, 1, 1), out)
-    return out, of_input(tangents[0])[0] + of_kernel(tangents[1])[0]
+    changes = [
+        jax.linear_transpose(lambda cotangent, of=of: of(*primals, cotangent, 1, 1), out)(tangent)[0]
+        for of, tangent in zip((_input_gradient, _kernel_gradient), tangents, strict=True)
+        if not isinstance(tangent, SymbolicZero)
+    ]
+    return out, sum(changes[1:], changes[0])
+
+
+_conv_of_pictures.defjvp(_conv_of_pictures_jvp, symbolic_zeros=True)
 
 
 @cache
