@@ -19,6 +19,7 @@ from spnr_jax.surfels.projection import Entries, footprints, smoothstep, turned
 OPACITY = 3.0  # optical depth at the middle of a disc
 LIST = 24  # entries of a pixel at most
 NEAR = 8  # places in the list before and after an entry that are compared in depth; those farther in front hide it
+LEAST_SHARE = 1e-4  # of the entries of a pixel together, that means are divided by
 SHARP = 4  # power of the kernel by which colours are blended more narrowly than everything else
 TOLD = 1e-12  # summed narrow weights from which on they say something; float32 holds the square
 FAR = 1e-4  # summed narrow weights that the centres' distances pass to 0 at
@@ -47,7 +48,10 @@ def blend(
     narrow = jnp.concatenate([_colors(surfels), jnp.stack([foot.column, foot.row], axis=-1)], axis=1)
     wide, narrow = jax.lax.optimization_barrier((wide, narrow))
     sums = [_summed(share, point, wide)]
-    sums += [jnp.sum(x, axis=0)[:, None] for x in (share, weight * left, share * depth, share * depth**2)]
+    drawn, deep = jnp.sum(share, axis=0), jnp.sum(share * depth, axis=0)
+    mean = deep / larger(drawn, LEAST_SHARE)
+    squared = jnp.sum(share * (depth - mean[None]) ** 2, axis=0)  # about the mean: of squares no digit would be left
+    sums += [x[:, None] for x in (drawn, jnp.sum(weight * left, axis=0), mean, squared)]
     total, deep = (jnp.sum(x, axis=0) for x in (sharp, sharp * depth))
     ahead = deep / jnp.where(total > TOLD, total, 1)
     sums += [_colored(sharp, point, narrow, pixel_of, ahead, camera), total[:, None]]
@@ -145,10 +149,9 @@ def shares(
 def _gathered(sums: list[Array], features: int, camera: Camera) -> GBuffer:
     """Means from the sums of `blend`."""
     wide, rest, narrow = sums[: features + 4], sums[features + 4 : features + 8], sums[features + 8 :]
-    share, coverage, deep, squared = rest
-    inverse = 1 / larger(share, 1e-4)
+    share, coverage, depth, squared = rest
+    inverse = 1 / larger(share, LEAST_SHARE)
     *wide, log_spacing = (x * inverse for x in wide)
-    depth = deep * inverse
     *color, column, row, sharp = narrow
     told = sharp > TOLD
     inverse_sharp = jnp.where(told, 1 / jnp.where(told, sharp, 1), 0)
@@ -158,7 +161,7 @@ def _gathered(sums: list[Array], features: int, camera: Camera) -> GBuffer:
         opacity=smaller(share, 1),
         coverage=coverage,
         depth=depth,
-        spread=root(squared * inverse - depth**2),
+        spread=root(squared * inverse),
         log_spacing=log_spacing,
         normal=jnp.stack(wide[features:], axis=-1),
         color=jnp.stack([c * inverse_sharp for c in color], axis=-1),

@@ -1,0 +1,282 @@
+"""Laws of the pure `render`: jit, vmap, grad, jvp, remat, map, export; plans and overflow; finite at the extremes."""
+
+import dataclasses
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import export
+from support.laws import close, numbers
+from support.surfel_clouds import camera, cloud, shape
+
+from spnr_jax.config import SurfelConfig
+from spnr_jax.kernels.records import Rendering
+from spnr_jax.method import surfel_renderer
+from spnr_jax.method.surfel_renderer import Plan, encode, plan, render
+from spnr_jax.surfels.lighting import room_light, sun
+
+CONFIG = SurfelConfig(widths=(4, 6), top=4)
+EYES = (0.3, 0.4, 2.4), (1.5, 1.0, 1.5)
+ROOM = Plan(doublings=2, side=1, width=32, height=32, entries=2**12, slots=2**10)
+drawn = jax.jit(render, static_argnames="plan")
+
+
+def stacked(trees):
+    return jax.tree.map(lambda *x: jnp.stack(x), *trees)
+
+
+def in_units(scene, scale=0.5, centre=(0.3, -0.2, 0.1)):
+    """The scene of a larger object that stands elsewhere, and the camera that sees the same of it."""
+    return scene.replace(scale=jnp.float32(scale), centre=jnp.asarray(centre, jnp.float32))
+
+
+def view(size=24, eye=EYES[0], scale=0.5, centre=(0.3, -0.2, 0.1)):
+    eye, centre = np.asarray(eye), np.asarray(centre)
+    return camera(size, eye / scale + centre, 0.8, target=centre)
+
+
+def body(name, count=90):
+    color = np.random.default_rng(3).random((count, 3))
+    return in_units(encode(cloud(shape(name, count, "random")[0], base_color=color, metallic=np.full(count, 0.3))))
+
+
+@pytest.fixture(scope="module")
+def params():
+    fresh = jax.jit(surfel_renderer.init, static_argnums=1)(jax.random.key(0), CONFIG)
+    leaves, form = jax.tree.flatten(fresh)
+    return jax.tree.unflatten(form, [x + 0.1 * numbers(i, *x.shape) for i, x in enumerate(leaves)])
+
+
+@pytest.fixture(scope="module")
+def scenes():
+    return [body(name) for name in ("sphere", "rod")]
+
+
+@pytest.fixture(scope="module")
+def views():
+    return [view(eye=eye) for eye in EYES]
+
+
+@pytest.fixture(scope="module")
+def lights():
+    return [jax.tree.map(jnp.asarray, light) for light in (room_light(), sun(30, 40))]
+
+
+def test_mapped_over_objects_cameras_and_lights_it_is_the_loop_over_them_by_one_program(params, scenes, views, lights):
+    drawn.clear_cache()
+    loop = [[[drawn(params, s, v, x, plan=ROOM) for x in lights] for v in views] for s in scenes]
+    assert drawn._cache_size() == 1
+    each = partial(render, plan=ROOM)
+    for axes in ((None, None, None, 0), (None, None, 0, None), (None, 0, None, None)):
+        each = jax.vmap(each, axes)
+    together = jax.jit(each)(params, stacked(scenes), stacked(views), stacked(lights))
+    close(together, stacked([stacked([stacked(row) for row in rows]) for rows in loop]), rtol=1e-4, atol=1e-4)
+    assert np.std(np.asarray(together.image), axis=(0, 1, 2)).max() > 0.05  # they differ
+
+
+def test_what_does_not_fit_into_a_plan_is_counted_and_what_fits_is_whole(params, scenes, views):
+    scene, seen = scenes[0], views[0]
+    made = plan(scene, seen)._replace(solid=False)
+    whole = drawn(params, scene, seen, plan=made)
+    assert int(whole.overflow) == 0
+    sizes = jax.device_get(surfel_renderer.count_sizes(scene, seen, doublings=made.doublings, side=made.side))
+    exact = made._replace(entries=int(sizes.entries), slots=int(sizes.slots))
+    close(drawn(params, scene, seen, plan=exact), whole, rtol=1e-4, atol=1e-4)
+    for name, less in (("entries", exact.entries - 1), ("slots", 40), ("width", 16), ("height", 16)):
+        lacking = drawn(params, scene, seen, plan=exact._replace(**{name: less}))
+        assert int(lacking.overflow) > 0, name
+        assert np.isfinite(np.asarray(lacking.image)).all()
+
+
+def test_a_plan_holds_every_view_and_every_object_it_is_made_of(scenes, views):
+    singles = [plan(s, v) for s in scenes for v in views]
+    together = plan(stacked(scenes), jax.tree.map(lambda x: jnp.stack([x, x]), stacked(views)))
+    assert hash(together) == hash(Plan(*together))
+    for name in ("width", "height", "entries", "slots"):
+        assert getattr(together, name) == max(getattr(single, name) for single in singles)
+    assert plan(stacked(scenes), views[0]).entries == max(plan(s, views[0]).entries for s in scenes)
+    with pytest.raises(ValueError, match="same leading axes"):
+        plan(stacked([*scenes, scenes[0]]), stacked(views))
+
+
+def test_order_and_padding_of_the_points_do_not_matter(params, scenes, views):
+    def rolled(x):
+        return jnp.roll(x, 211, axis=0)  # what is real lies between two stretches of padding
+
+    moved = scenes[1].replace(surfels=jax.tree.map(rolled, scenes[1].surfels))
+    one, other = (drawn(params, scene, views[1], plan=ROOM) for scene in (scenes[1], moved))
+    close(other, one, rtol=1e-3, atol=1e-4)
+
+
+def test_forward_mode_is_reverse_mode_and_remat_map_and_export_draw_the_same(params, scenes, views, lights):
+    scene, seen, light = scenes[0], stacked(views), lights[0]
+
+    def loss(brightness, position, cameras):
+        surfels = scene.surfels.replace(position=position)
+        each = jax.checkpoint(
+            lambda c: render(params, scene.replace(surfels=surfels), c, brightness * light, plan=ROOM)
+        )
+        return jnp.sum(jax.lax.map(lambda c: each(c).image, cameras) ** 2, axis=(1, 2, 3))
+
+    inputs = jnp.float32(1.1), scene.surfels.position, seen
+    towards = jnp.float32(1.0), numbers(5, *scene.surfels.position.shape)
+
+    @jax.jit
+    def both(*inputs):
+        forward = jax.jvp(lambda *x: loss(*x, inputs[2]), inputs[:2], towards)[1]
+        by = jax.jacrev(loss, (0, 1))(*inputs)
+        return forward, by[0] * towards[0] + jnp.sum(by[1] * towards[1][None], axis=(1, 2)), loss(*inputs)
+
+    forward, reverse, value = both(*inputs)
+    close(forward, reverse, rtol=2e-3, atol=1e-3)
+    pictures = [drawn(params, scene, v, 1.1 * light, plan=ROOM).image for v in views]
+    close(value, [np.sum(np.asarray(p) ** 2) for p in pictures], rtol=1e-4)
+
+    def pictured(tables, pose):
+        asked = dataclasses.replace(views[0], cam_to_world=pose)
+        return render(params, scene, asked, dataclasses.replace(light, tables=tables), plan=ROOM).image
+
+    kept = export.export(jax.jit(pictured))(light.tables, views[0].cam_to_world)
+    close(kept.call(1.1 * light.tables, views[0].cam_to_world), pictures[0], rtol=1e-4, atol=1e-4)
+
+
+POSE = jnp.array([[0.0, -0.4, -0.5], [0.4, 0.0, 0.3], [0.5, -0.3, 0.0]])
+
+
+def moved(way, t, scene, seen, light):
+    """Scene, camera and light, changed by t along a way."""
+    surfels = scene.surfels
+    along = np.random.default_rng(7).normal(size=surfels.position.shape)
+    if way == "eye":
+        return scene, dataclasses.replace(seen, cam_to_world=seen.cam_to_world.at[:, 3].add(t * along[0])), light
+    if way == "turn":
+        turn = jnp.eye(3) + t * POSE
+        pose = seen.cam_to_world
+        return (
+            scene,
+            dataclasses.replace(seen, cam_to_world=jnp.concatenate([turn @ pose[:, :3], pose[:, 3:]], 1)),
+            light,
+        )
+    if way == "light":
+        return scene, seen, dataclasses.replace(light, tables=light.tables * (1 + t * numbers(3, *light.tables.shape)))
+    if way == "all points together":
+        return scene.replace(centre=scene.centre + t * along[0]), seen, light
+    if way == "size":
+        return scene.replace(scale=scene.scale * (1 + t)), seen, light
+    changed = {
+        "positions": lambda: {"position": surfels.position + 0.1 * t * along},
+        "normals": lambda: {"normal": surfels.normal + t * along * surfels.mask[:, None]},
+        "spacing": lambda: {"spacing": surfels.spacing * (1 + t)},
+        "base colour": lambda: {"base_color": surfels.base_color + 0.1 * t * along},
+        "roughness": lambda: {"roughness": surfels.roughness + 0.1 * t * along[:, 0]},
+        "metallic": lambda: {"metallic": surfels.metallic + 0.1 * t * along[:, 1]},
+    }[way]()
+    return scene.replace(surfels=surfels.replace(**changed)), seen, light
+
+
+WAYS = (
+    *("base colour", "roughness", "metallic", "light", "eye", "turn"),
+    *("positions", "all points together", "size", "normals", "spacing"),
+)
+
+
+def test_gradients_are_central_differences_of_float64(params, scenes, views, lights):
+    weights = np.random.default_rng(1).normal(size=(24, 24, 3))
+    with jax.enable_x64(True):
+
+        def wide(tree):
+            return jax.tree.map(lambda x: jnp.asarray(x, jnp.float64 if x.dtype == jnp.float32 else x.dtype), tree)
+
+        given = wide((params, scenes[0], views[0], lights[0]))
+
+        def loss(params, *asked):
+            return jnp.sum(weights * render(params, *asked, plan=ROOM).image)
+
+        value_and_gradient = jax.jit(jax.value_and_grad(loss, (1, 2, 3), allow_int=True))
+        _, gradient = value_and_gradient(*given)
+        table = {}
+        for way in WAYS:
+            change = jax.jvp(partial(moved, way, scene=given[1], seen=given[2], light=given[3]), (0.0,), (1.0,))[1]
+            slope = sum(
+                float(np.vdot(g, c))
+                for g, c in zip(jax.tree.leaves(gradient), jax.tree.leaves(change), strict=True)
+                if g.dtype == jnp.float64
+            )
+            ahead, behind = (value_and_gradient(given[0], *moved(way, t, *given[1:]))[0] for t in (1e-6, -1e-6))
+            table[way] = slope, float((ahead - behind) / 2e-6)
+    for way, (slope, difference) in table.items():
+        print(f"{way}: gradient {slope:.6g}, differences {difference:.6g}")
+    for way, (slope, difference) in table.items():
+        assert abs(difference) > 1e-3, way
+        np.testing.assert_allclose(slope, difference, rtol=1e-2, err_msg=way)
+
+
+LINE = np.linspace(-0.6, 0.6, 40)[:, None] * np.array([[0.6, 0.0, 0.8]])
+EXTREMES = {
+    "one point": np.zeros((1, 3)),
+    "two points": np.array([[0.1, 0, 0], [-0.1, 0, 0]]),
+    "three points": np.eye(3) * 0.3,
+    "duplicates": np.repeat(np.eye(3) * 0.4, 9, axis=0),
+    "a line": LINE,
+    "a plane": shape("plane", 60)[0],
+    "points 1e-7 apart": 1e-7 * shape("sphere", 40)[0],
+}
+
+
+@pytest.fixture(scope="module")
+def value_and_gradient():
+    def loss(params, scene, seen, light):
+        found: Rendering = render(params, scene, seen, light, plan=ROOM)
+        return jnp.sum(found.image**2) + jnp.sum(found.acc) + 1e-3 * jnp.sum(found.depth * scene.scale), found
+
+    return jax.jit(jax.value_and_grad(loss, (0, 1, 2, 3), has_aux=True, allow_int=True))
+
+
+def check_finite(found):
+    for place, leaf in jax.tree_util.tree_leaves_with_path(found):
+        if leaf.dtype != jax.dtypes.float0:
+            assert np.isfinite(np.asarray(leaf)).all(), jax.tree_util.keystr(place)
+
+
+@pytest.mark.parametrize("name", EXTREMES)
+def test_few_and_strange_points_have_finite_pictures_and_gradients(params, lights, value_and_gradient, name):
+    check_finite(value_and_gradient(params, in_units(encode(cloud(EXTREMES[name]))), view(), lights[0]))
+
+
+CASES = {
+    "a camera inside": (1.0, {"eye": (0.05, 0.02, 0.1)}, 1.0),
+    "a camera at a point": (1.0, {"eye": (0.6, 0.0, 0.0)}, 1.0),
+    "an empty picture": (1.0, {"eye": (0.0, 50.0, 0.1)}, 1.0),
+    "black light": (1.0, {}, 0.0),
+    "light of 1e6": (1.0, {}, 1e6),
+    "an object of 1e7": (1e-7, {}, 1.0),
+    "an object of 1e-7": (1e7, {}, 1.0),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_strange_cameras_lights_and_units_have_finite_pictures_and_gradients(
+    params, scenes, lights, value_and_gradient, name
+):
+    scale, seen, brightness = CASES[name]
+    centre = (0.3 / scale, -0.2 / scale, 0.1 / scale)
+    scene = in_units(scenes[0], scale, centre)
+    found = value_and_gradient(params, scene, view(scale=scale, centre=centre, **seen), brightness * lights[0])
+    check_finite(found)
+    if name == "an empty picture":
+        assert np.all(np.asarray(found[0][1].acc) == 0)
+        assert np.all(np.asarray(found[0][1].image) == 1)
+
+
+def test_other_shapes_than_one_object_one_view_and_one_light_are_refused_in_one_line(params, scenes, views, lights):
+    for scene, seen, light, named in (
+        (scenes[0], stacked(views), lights[0], "camera.cam_to_world"),
+        (stacked(scenes), views[0], lights[0], "scene.centre"),
+        (scenes[0], views[0], stacked(lights), "light.tables"),
+    ):
+        with pytest.raises(ValueError, match=named):
+            render(params, scene, seen, light, plan=ROOM)
+    with pytest.raises(ValueError, match="size below 1"):
+        render(params, scenes[0], views[0], plan=ROOM._replace(slots=0))
