@@ -15,7 +15,6 @@ HEAD = """<!doctype html><link rel="icon" href="data:,"><script type="importmap"
 "three": "/three/build/three.module.js", "three/webgpu": "/three/build/three.webgpu.js",
 "three/tsl": "/three/build/three.tsl.js", "add/": "/three/examples/jsm/"}}</script><script type="module">
 """
-SPLATS = Path("examples/jsm/objects/GaussianSplat.js")  # in newer ones
 
 
 def folder() -> Path | None:
@@ -32,9 +31,6 @@ def folder() -> Path | None:
 FOLDER = folder()
 needed = pytest.mark.skipif(
     FOLDER is None, reason="no three in npm's global folder or SPNR_THREE: npm install -g three"
-)
-needed_with_splats = pytest.mark.skipif(
-    FOLDER is None or not (FOLDER / SPLATS).is_file(), reason="no three that draws splats: npm install -g three"
 )
 
 
