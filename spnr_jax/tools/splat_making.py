@@ -32,7 +32,7 @@ def splats(
     *,
     light: Light | None = None,
     degree: int = 1,
-    most: int = 80_000,
+    most: int = 150_000,
     views: int = VIEWS,
     resolution: int = RESOLUTION,
     report: Callable[[str], None] = lambda line: None,

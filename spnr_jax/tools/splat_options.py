@@ -9,14 +9,14 @@ import tyro
 from spnr_jax.errors import UserError
 from spnr_jax.tools.light_options import Lighting
 
-MOST_SPLATS = 200_000  # that a file or page is asked for: more than viewers on telephones draw
+MOST_SPLATS = 300_000  # that a file or page is asked for: more than viewers on telephones draw
 
 
 @dataclass(frozen=True, kw_only=True)
 class SplatMaking:
     """How Gaussian splats are made of a cloud."""
 
-    most_splats: int = 80_000
+    most_splats: int = 150_000
     """Splats at most."""
     harmonics: Literal[0, 1, 2, 3] = 1
     """Degree of the spherical harmonics by which a splat's colour follows the view; 0: it does not."""

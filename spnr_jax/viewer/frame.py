@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from spnr_jax.errors import UserError
 from spnr_jax.formats import images
-from spnr_jax.formats.light_files import ENDINGS, NAMES, read_light
+from spnr_jax.formats.light_files import NAMES, read_light
 from spnr_jax.kernels.records import Camera, Light, PointCloud, Volume
 from spnr_jax.method.model import Model, Quality
 from spnr_jax.tools.chosen_light import before, light_of_options
@@ -52,11 +52,7 @@ class View:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class State:
-    """All that decides a frame; `view` is None until the browser said where it looks from.
-
-    `light` is that of `lighting` (None: nothing is asked of it), of `maps` by name or of the package; a change makes it
-    `stale` until it is needed, so that a slider costs one light for each picture.  `splats`: the browser draws these.
-    """
+    """All that decides a frame; `light` is made of `lighting` and `maps` when it is needed, `stale` until then."""
 
     name: str
     cloud: PointCloud
@@ -71,7 +67,7 @@ class State:
 
     @property
     def lights(self) -> tuple[str, ...]:
-        """Names of the lights that can be chosen."""
+        """Names that can be chosen."""
         return (*NAMES, *self.maps, *([SUN_ALONE] if self.lighting.sun else []))
 
     @property
@@ -176,7 +172,7 @@ def square_camera(view: View, volume: Volume, reach: float, size: int) -> Camera
 
 
 def fill(square: np.ndarray, view: View, reach: float, longest: int) -> np.ndarray:
-    """The canvas, whose longer side has at most `longest` pixels, with a square picture in its middle, on white."""
+    """The canvas, at most `longest` pixels along its longer side, with a square picture in its middle, on white."""
     shrink = min(1.0, longest / max(view.width, view.height))
     width, height = (max(round(side * shrink), 1) for side in (view.width, view.height))
     side = max(round(max(width, height) * reach / _covering(view)), 1)
@@ -204,11 +200,6 @@ def display_name(name: str) -> str:
     """The last part of a browser's file name, without what Markdown or a path could make of it."""
     last = PurePath(name.replace("\\", "/")).name
     return "".join(c if c.isalnum() or c in "._- " else "_" for c in last)[-LONGEST_NAME:].strip() or "file"
-
-
-def is_map(name: str) -> bool:
-    """Whether a file of that name is read as a map of light."""
-    return PurePath(display_name(name)).suffix.lower() in ENDINGS
 
 
 def read_upload(name: str, content: bytes, read: Callable[[Path], Read]) -> Read:

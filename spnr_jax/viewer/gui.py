@@ -1,15 +1,15 @@
 """The controls of one browser, bound to what it sees: every control submits a change to the loop that draws.
 
-Quick callbacks are coroutines: viser runs those one after another, in the order of the browser's messages, so the last
-value of a slider wins.  Slow ones (reading a file, making splats) are plain functions, which viser runs in threads.
-The browser itself draws splats: viser gives one a single colour for all directions, the mean of what an export has, and
-widens those smaller than a pixel without making them fainter.
+Quick callbacks are coroutines, which viser runs in the order of the browser's messages, so the last value of a slider
+wins; slow ones (reading a file, making splats) are plain functions, which it runs in threads.  Splats are drawn by the
+browser, each in one colour for all directions, the mean of what an export has.
 """
 
 import dataclasses
 import threading
 from collections.abc import Callable
 from functools import partial
+from pathlib import PurePath
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,7 @@ from spnr_jax.errors import UserError
 from spnr_jax.formats import clouds, images, light_files
 from spnr_jax.gaussians.harmonics import C0
 from spnr_jax.gaussians.placing import rotations
-from spnr_jax.kernels.records import Gaussians, PointCloud
+from spnr_jax.kernels.records import Gaussians
 from spnr_jax.method.model import Model
 from spnr_jax.tools import splat_making
 from spnr_jax.tools.chosen_light import takes_light
@@ -28,29 +28,26 @@ from spnr_jax.viewer.frame import State
 from spnr_jax.viewer.loop import Loop
 
 # A file dropped anywhere on the page goes into the file input of the upload button.
-DROP = """<img alt="" style="display:none" src="data:image/gif;base64,R0lGODlhAQABAAAAACwAAAAAAQABAAAC"
-onload="document.body.ondragover = event => event.preventDefault();
+DROP = """<img alt="" style="display:none" src="data:image/gif;base64,R0lGODlhAQABAAAAACwAAAAAAQABAAAC" onload="
+document.body.ondragover = event => event.preventDefault();
 document.body.ondrop = event => {
   if (!event.dataTransfer.files.length) return;
   event.preventDefault();
   const input = document.querySelector('input[type=file]');
   input.files = event.dataTransfer.files;
-  input.dispatchEvent(new Event('change', {bubbles: true}));
-};">"""
+  input.dispatchEvent(new Event('change', {bubbles: true})); };">"""
+TITLE = "{}: {:,} points"
 LONGEST_NOTE = 500  # characters
 MOVING_JPEG, RESTING_JPEG = 75, 92  # qualities of the pictures sent
 WIDEST_EXPOSURE = 4.0  # stops
-VIEWS, RESOLUTION, MOST, DEGREE = 24, 384, 60_000, 1  # of splats: fewer than an export's, since a person waits
+VIEWS, RESOLUTION, MOST, DEGREE = 24, 384, 100_000, 1  # of splats: fewer than an export's, since a person waits
 PREPARING = "The network is being prepared."
 LARGER = 100.0  # times, before numbers of 16 bits hold the squares of the splats' widths
 ONE_LIGHT = "This network knows the light of its training alone; `--run surfels` draws in any."
 
 
 class Browser:
-    """One browser: its controls, and the loop that draws for it.  `network` keeps two from drawing at once.
-
-    `reading` is how files are read: what `read_cloud` takes beside their path.
-    """
+    """Its controls, and the loop that draws for it; `network` keeps two from drawing at once, `reading` reads files."""
 
     def __init__(
         self, client: viser.ClientHandle, model: Model, first: State, reading: dict[str, Any], network: threading.Lock
@@ -61,7 +58,8 @@ class Browser:
         self._light: dict[str, Any] = {}
         self.loop = Loop(first, self._draw)
         gui = client.gui
-        self._title, self._said = gui.add_markdown(describe(first.name, first.cloud)), gui.add_markdown(PREPARING)
+        self._title = gui.add_markdown(TITLE.format(first.name, len(first.cloud.positions)))
+        self._said = gui.add_markdown(PREPARING)
         with gui.add_folder("Picture"):
             self._add_picture(gui)
         with gui.add_folder("Light"):
@@ -133,14 +131,11 @@ class Browser:
 
         async def move(event: viser.GuiEvent) -> None:
             if event.client is not None:  # not when the program itself chooses a new map
-                self._try(self._change_light)
+                said = {name: control.value for name, control in self._light.items()}
+                self._try(lambda: self._replace(lighting=frame.read_lighting(self.loop.state, **said), stale=True))
 
         for control in self._light.values():
             control.on_update(move)
-
-    def _change_light(self) -> None:
-        said = {name: control.value for name, control in self._light.items()}
-        self._replace(lighting=frame.read_lighting(self.loop.state, **said), stale=True)
 
     def _add_files(self, gui: viser.GuiApi) -> None:
         gui.add_html(DROP)
@@ -167,7 +162,7 @@ class Browser:
 
     def _open(self, file: viser.UploadedFile) -> None:
         name, notes = frame.display_name(file.name), list[str]()
-        if frame.is_map(name):
+        if PurePath(name).suffix.lower() in light_files.ENDINGS:
             if not self._light:
                 raise UserError(ONE_LIGHT)
             light = frame.read_upload(file.name, file.content, light_files.read_light)
@@ -176,7 +171,7 @@ class Browser:
         read = partial(clouds.read_cloud, **self._reading, report=notes.append)
         cloud = frame.read_upload(file.name, file.content, read)
         self._replace(name=name, cloud=cloud, volume=self._model.encode(cloud))
-        self._title.content = "; ".join([describe(name, cloud), *notes])
+        self._title.content = "; ".join([TITLE.format(name, len(cloud.positions)), *notes])
 
     def _show_choice(self, state: State) -> State:
         """Has the list of lights show those there are; the state as it is."""
@@ -214,11 +209,6 @@ class Browser:
         self._splats, self._splats_of = None, None
         self._shown.value, self._said.content = False, ""
         return dataclasses.replace(state, splats=False)
-
-
-def describe(name: str, cloud: PointCloud) -> str:
-    """The line about what is shown."""
-    return f"{name}: {len(cloud.positions):,} points"
 
 
 def splats_for_browser(splats: Gaussians) -> dict[str, Any]:

@@ -1,7 +1,7 @@
 """A thread that draws for one browser: at once while things change, once more and better when they rest.
 
-Changes are functions from state to state, submitted from any thread and applied here, in order, all that wait before
-the next picture: the state has one owner and needs no lock, and a slow picture never lets changes pile up.
+Changes are functions from state to state, submitted from any thread and applied here in order, all that wait before the
+next picture: the state has one owner, and a slow picture never lets changes pile up.
 """
 
 import threading

@@ -52,8 +52,7 @@ class Viewer:
         self._network = threading.Lock()
         self._browsers: dict[int, Browser] = {}
         token = gate.new_token()
-        quiet = contextlib.redirect_stdout(io.StringIO())  # viser's banner names addresses
-        with gate.guarded(token, reached_at) as opened, quiet:
+        with gate.guarded(token, reached_at) as opened, contextlib.redirect_stdout(io.StringIO()):  # no banner of viser
             self._server = Server(host=host, port=port, label="spnr view", verbose=False)
         if not opened:
             self.stop()
@@ -106,10 +105,7 @@ class Viewer:
 
 
 def open_viewer(asked: View) -> tuple[Viewer, list[str]]:
-    """The running viewer of a command, and what was assumed about its file, a line each.
-
-    ValueError for a port that is in use, a host that is not of this machine, and whatever cannot be read.
-    """
+    """The running viewer of a command, and what was assumed about its file, a line each; ValueError for a bad file."""
     _check_free(asked.host, asked.port)  # before the seconds that reading takes
     named = load(asked.run) if asked.run else None
     if named:

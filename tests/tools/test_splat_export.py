@@ -90,7 +90,7 @@ def test_a_page_holds_title_credit_and_splats(cloud, tmp_path, capsys):
         (("export", "CLOUD", "--splats", "out.obj"), "out.obj"),
         (("export", "CLOUD", "--splats", "out.glb"), ".ply or .spz"),
         (("export", "CLOUD", "--splats", "."), "splats"),
-        (("export", "CLOUD", "--splats", "out.ply", "--most-splats", "300000"), "--most-splats"),
+        (("export", "CLOUD", "--splats", "out.ply", "--most-splats", "300001"), "--most-splats"),
         (("export", "CLOUD", "--light", "studio"), "--splats"),
         (("export", "CLOUD", "--mesh", "out.obj"), "out.obj"),
         (("export", "CLOUD", "--mesh", "out.glb", "--sun", "40", "30"), "--splats"),

@@ -1,4 +1,4 @@
-"""The viewer in a real browser: a headless Chromium turns, lights, opens files, makes splats and saves, without an error.
+"""The viewer in a real browser: a headless Chromium turns, lights, opens files, makes splats, saves.
 
 Chromium is found on PATH, or named by SPNR_CHROMIUM; without one these tests are skipped.
 """
@@ -19,7 +19,7 @@ from spnr_jax.viewer import gui  # noqa: E402
 
 pytestmark = [pytest.mark.ci, chromium_of.needed]  # it opens a browser
 
-WAIT = 60  # seconds, for a machine that does much else
+WAIT = 180  # seconds, for a machine that does much else
 # viser gives the corners of a splat two coordinates, of which three.js computes bounds when a pointer passes
 NO_BOUNDS = "computeBoundingSphere(): Computed radius is NaN"
 
@@ -42,6 +42,7 @@ class Page:
 
     def __init__(self, chromium, url):
         self.tab = chromium.new_page(viewport={"width": 900, "height": 420})
+        self.tab.set_default_timeout(1000 * WAIT)
         self.said = []
         self.tab.on("console", lambda line: self.said.append(line.text) if line.type == "error" else None)
         self.tab.on("pageerror", lambda error: self.said.append(str(error)))
