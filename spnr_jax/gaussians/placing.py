@@ -20,8 +20,8 @@ from spnr_jax.kernels.records import Camera, Gaussians, Surfels
 STRIDE = 2  # of the pixels that are carried back
 WITHIN, OFF_PLANE = 1.2, 0.5  # spacings of a surfel from which and above whose plane a pixel belongs to it
 GRAZING = 0.1  # cosine between ray and normal below which a pixel's depth says little
-FINEST = 1.5  # pixels of the pictures that a cube is wide at least
-WIDTH, THICKNESS, OPACITY = 0.55, 0.03, 0.98  # of a splat: standard deviations in cubes, opacity
+FINEST = 1.25  # pixels of the pictures that a cube is wide at least
+WIDTH, THICKNESS, OPACITY = 0.57, 0.03, 0.98  # of a splat: standard deviations in cubes, opacity
 INSET = 0.5  # pixels that a splat lies below the surface: at outlines many are seen from their edge, and all reach out
 TRIES, ENOUGH = 6, 0.85  # sizes of cubes that are tried, share of the wanted number that is good
 
