@@ -4,6 +4,7 @@ Chromium is found on PATH, or named by SPNR_CHROMIUM; without one these tests ar
 """
 
 import io
+import re
 import time
 
 import numpy as np
@@ -165,20 +166,25 @@ def test_a_snapshot_is_the_picture(page, tmp_path):
     assert difference(saved[100:400, :560], shown) < SAME
 
 
-def test_splats_stand_where_the_picture_stood_can_be_hidden_and_go_with_a_change_of_the_light(page, monkeypatch):
+def test_splats_stand_where_the_picture_stood_can_be_hidden_and_go_with_a_change_of_the_light(
+    page, running, monkeypatch
+):
     for name, value in (("VIEWS", 6), ("RESOLUTION", 48), ("MOST", 400)):
         monkeypatch.setattr(gui, name, value)
     first = page.settled(drawn)
+    loop = list(running._browsers.values())[-1].loop
     box = page.tab.get_by_label("Splats", exact=True)
     box.click()
-    page.tab.get_by_text(" splats").first.wait_for(timeout=1000 * WAIT)
+    page.tab.get_by_text(re.compile(r"^[\d,]+ splats$")).wait_for(timeout=1000 * WAIT)
+    page.until(lambda: loop.state.splats)
     splats = page.settled(lambda now: drawn(now) and difference(now, first) > 0.5)
     both = [(canvas < 200).any(axis=-1) for canvas in (first, splats)]
     assert (both[0] & both[1]).sum() > 0.7 * (both[0] | both[1]).sum()
     box.click()
+    page.until(lambda: not loop.state.splats)
     page.settled(lambda now: difference(now, first) < SAME)
     box.click()
     page.settled(lambda now: difference(now, splats) < 0.5)
     page.enter(TURNED, "90")
+    page.until(lambda: not box.is_checked() and not loop.state.splats)
     page.settled(lambda now: drawn(now) and difference(now, splats) > 0.5)
-    assert not box.is_checked()
