@@ -1,6 +1,6 @@
 """Colours of splats from pictures: spherical harmonics by weighted least squares over the views that see each splat.
 
-A view sees a splat whose centre lies at its picture's depth there, and is against one that lies before that depth or
+A view sees a splat whose centre lies at its picture's depth there and that faces it, and is against one that lies before that depth or
 where the picture is empty: those that more than a few views are against stick out of the object, and are left out.  The
 weight of a view is the cosine under which it sees the splat; harmonics of higher degree are held back (ridge), so few
 views give a plain colour.
@@ -44,8 +44,9 @@ def color(gaussians: Gaussians, views: Sequence[View], *, side: float, degree: i
             near = inside & (distance < depth + BEHIND * side)
             before = near & (distance < nearest_around(view.depth)[row, column] - BEFORE * side)
         against += before | (inside & (opacity < EMPTY))
-        visible = np.flatnonzero(near & ~before & (opacity > SOLID))
-        facing = np.abs(np.einsum("ni,ni->n", towards[visible], normal[visible]))
+        cosine = -np.einsum("ni,ni->n", towards, normal)  # a thin sheet has splats on either side
+        visible = np.flatnonzero(near & ~before & (opacity > SOLID) & (cosine > 0))
+        facing = cosine[visible]
         weight = np.maximum(facing, LEAST_FACING)[:, None].astype(np.float32)
         opacity = opacity[visible, None]
         seen_color = (view.image[row[visible], column[visible]] - (1 - opacity)) / opacity
