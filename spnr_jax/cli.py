@@ -4,7 +4,6 @@ Errors of the user and of the disk are one line on stderr and exit code 2; Ctrl-
 """
 
 import contextlib
-import dataclasses
 import importlib.util
 import io
 import json
@@ -25,7 +24,7 @@ from spnr_jax.devices import allocator, compilation
 from spnr_jax.errors import UserError, guarded, split_debug
 from spnr_jax.tools.commands import Evaluate, Export, Train, View
 from spnr_jax.tools.render_command import Render, is_catalogue
-from spnr_jax.tools.share_command import Share
+from spnr_jax.tools.splat_options import Share
 
 BOX = r"[╭╮╰╯│─•]+|__tyro-dummy-inner__\."  # what tyro draws around an error, and its name for the whole command
 DESCRIPTION = """Sparse-point neural rendering: train a network, evaluate one, render a cloud of points.
@@ -185,7 +184,7 @@ def run_view(command: View) -> None:
         raise UserError("spnr view needs the package viser; pip install 'spnr-jax[viewer]'")
     from spnr_jax.viewer.server import open_viewer
 
-    viewer, notes = open_viewer(**{f.name: getattr(command, f.name) for f in dataclasses.fields(command)})
+    viewer, notes = open_viewer(command)
     for line in (*notes, *viewer.lines):
         print(line, flush=True)
     viewer.wait()

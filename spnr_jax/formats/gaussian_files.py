@@ -1,15 +1,14 @@
-"""Gaussian splats as files: .ply of Kerbl et al. 2023, .spz of Niantic (version 3), .glb with KHR_gaussian_splatting.
+"""Gaussian splats as files: .ply of Kerbl et al. 2023 and .spz of Niantic (version 3).
 
     .ply    x y z, nx ny nz (0), f_dc_0..2, f_rest_* (all of red, then green, then blue), opacity before the logistic
             function, logarithms of the scales, rotation w x y z, all float32; axes right, down, forward
     .spz    gzip; 24-bit fixed-point places, 8 bits of opacity, colour, logarithms of scales and harmonics, 32 of the
             rotation; axes right, up, back
-    .glb    one primitive of points, y up; scales as they are, opacity 0 to 1, colours display-referred sRGB
 
-The first two say that splats which a viewer widens to a pixel lose opacity for it (anti-aliasing, mip).
+Both say that splats which a viewer widens to a pixel lose opacity for it (anti-aliasing, mip).
 
 Splats go in with y up and z towards the viewer, in any unit.  A note, which names the cloud, the network and the light,
-becomes a comment of the .ply and the copyright line of the .glb; a .spz has no place for one.
+becomes a comment of the .ply; a .spz has no place for one.
 """
 
 import gzip
@@ -19,16 +18,14 @@ import numpy as np
 from jaxtyping import Float
 
 from spnr_jax.errors import UserError
-from spnr_jax.formats.glb import Buffer
 from spnr_jax.formats.images import check_place, write_whole
-from spnr_jax.formats.point_files import parse_ply
-from spnr_jax.gaussians.harmonics import C0, degree_of, half_turn_signs
+from spnr_jax.gaussians.harmonics import degree_of, half_turn_signs
 from spnr_jax.kernels.records import Gaussians
 
-SUFFIXES = (".ply", ".spz", ".glb")
+SUFFIXES = (".ply", ".spz")
 LEAST_OPACITY, MOST_OPACITY = 1e-4, 1 - 1e-4  # that the logistic function is inverted for
 MAGIC, VERSION, ANTIALIASED = 0x5053474E, 3, 1  # of .spz; the last is a flag
-RENDER_MODE = "SplatRenderMode: mip"  # comment of a .ply: splats are drawn with the share of gaussians/drawing.py
+RENDER_MODE = "SplatRenderMode: mip"  # comment of a .ply: what a viewer widens it makes fainter
 COLOR_STEP = 0.15  # of .spz: 255 steps for 1 / COLOR_STEP of a coefficient
 FRACTION_BITS = 24 - 2  # at most of a place in .spz; fewer where places lie further from the origin than 1
 SCALE_STEP, LEAST_SCALE = 16, -10  # of .spz: steps for each e-fold, logarithm of the smallest
@@ -37,9 +34,8 @@ HARMONIC_BITS = (5, 4)  # of .spz: of the coefficients of degree 1, and above
 
 def write_splats(path: Path, gaussians: Gaussians, note: str = "") -> int:
     """Writes a file of the kind that its suffix says, in one piece; its size in bytes.  ValueError for others."""
-    makers = {".ply": ply_of, ".spz": lambda splats, note: spz_of(splats), ".glb": glb_of}
     check_suffix(path)
-    content = makers[path.suffix.lower()](gaussians, note)
+    content = ply_of(gaussians, note) if path.suffix.lower() == ".ply" else spz_of(gaussians)
     write_whole(path, content)
     return len(content)
 
@@ -47,11 +43,11 @@ def write_splats(path: Path, gaussians: Gaussians, note: str = "") -> int:
 def check_suffix(path: Path) -> None:
     """ValueError unless the path is that of a file of splats, where one can be written."""
     if path.suffix.lower() not in SUFFIXES:
-        raise UserError(f"{path}: splats are written as {', '.join(SUFFIXES)}, not {path.suffix or 'a folder'}")
+        raise UserError(f"{path}: splats are written as {' or '.join(SUFFIXES)}, not {path.suffix or 'a folder'}")
     check_place(path)
 
 
-def turned(gaussians: Gaussians) -> Gaussians:
+def turn_half(gaussians: Gaussians) -> Gaussians:
     """The splats half a turn around the x axis: axes right, up, back become right, down, forward, and back again."""
     position, rotation, harmonics = (
         np.asarray(x, np.float32) for x in (gaussians.position, gaussians.rotation, gaussians.harmonics)
@@ -69,7 +65,7 @@ def turned(gaussians: Gaussians) -> Gaussians:
 
 def ply_of(gaussians: Gaussians, note: str = "") -> bytes:
     """The splats as a .ply file."""
-    splats = turned(gaussians)
+    splats = turn_half(gaussians)
     harmonics = np.asarray(splats.harmonics)
     opacity = np.clip(np.asarray(splats.opacity, np.float64), LEAST_OPACITY, MOST_OPACITY)
     rest = harmonics[:, 1:].transpose(0, 2, 1).reshape(len(opacity), -1)
@@ -89,31 +85,6 @@ def ply_of(gaussians: Gaussians, note: str = "") -> bytes:
     return ("\n".join(header) + "\n").encode("ascii", "replace") + np.concatenate(parts, axis=1).astype("<f4").tobytes()
 
 
-def read_ply(path: Path) -> Gaussians:
-    """The splats of a .ply file as `ply_of` writes it; ValueError if it lacks a property."""
-    columns = parse_ply(path.read_bytes())
-    rest = sum(name.startswith("f_rest_") for name in columns)
-    names = {"position": tuple("xyz"), "rotation": tuple(f"rot_{i}" for i in range(4))}
-    names |= {"scale": tuple(f"scale_{i}" for i in range(3)), "opacity": ("opacity",)}
-    names |= {"base": tuple(f"f_dc_{i}" for i in range(3)), "rest": tuple(f"f_rest_{i}" for i in range(rest))}
-    missing = [name for group in names.values() for name in group if name not in columns]
-    if missing:
-        raise UserError(f"{path}: no file of Gaussian splats, it has no {missing[0]}")
-    found = {key: np.stack([columns[name] for name in group], axis=-1) for key, group in names.items() if group}
-    count = len(columns["x"])
-    harmonics = found["base"][:, None]
-    if rest:
-        harmonics = np.concatenate([harmonics, found["rest"].reshape(count, 3, rest // 3).swapaxes(1, 2)], axis=1)
-    gaussians = Gaussians(
-        position=found["position"],
-        rotation=found["rotation"],
-        scale=np.exp(found["scale"]),
-        opacity=1 / (1 + np.exp(-found["opacity"][:, 0])),
-        harmonics=harmonics,
-    )
-    return turned(gaussians)
-
-
 def spz_of(gaussians: Gaussians) -> bytes:
     """The splats as a .spz file."""
     position, harmonics = np.asarray(gaussians.position, np.float64), np.asarray(gaussians.harmonics, np.float64)
@@ -131,39 +102,6 @@ def spz_of(gaussians: Gaussians) -> bytes:
         _harmonic_bytes(harmonics[:, 1:]),
     ]
     return gzip.compress(header + b"".join(part.tobytes() for part in parts), mtime=0)
-
-
-def glb_of(gaussians: Gaussians, note: str = "") -> bytes:
-    """The splats as a binary glTF 2.0 file with the extension KHR_gaussian_splatting."""
-    harmonics = np.asarray(gaussians.harmonics)
-    color = np.clip(0.5 + C0 * harmonics[:, 0], 0, 1)
-    name = "KHR_gaussian_splatting:"
-    arrays = {
-        "POSITION": np.asarray(gaussians.position, np.float32),
-        "COLOR_0": np.concatenate([color, np.asarray(gaussians.opacity)[:, None]], axis=1),
-        f"{name}ROTATION": np.asarray(gaussians.rotation)[:, [1, 2, 3, 0]],
-        f"{name}SCALE": np.asarray(gaussians.scale),
-        f"{name}OPACITY": np.asarray(gaussians.opacity)[:, None],
-    }
-    for degree in range(degree_of(harmonics.shape[1]) + 1):
-        for i in range(2 * degree + 1):
-            arrays[f"{name}SH_DEGREE_{degree}_COEF_{i}"] = harmonics[:, degree**2 + i]
-    buffer = Buffer()
-    said = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display", "projection": "perspective"}
-    primitive = {
-        "mode": 0,
-        "attributes": buffer.attributes(arrays),
-        "extensions": {name[:-1]: said | {"sortingMethod": "cameraDistance"}},
-    }
-    document = {
-        "asset": {"version": "2.0", "generator": "spnr_jax"} | ({"copyright": note} if note else {}),
-        "extensionsUsed": [name[:-1]],
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
-        "meshes": [{"primitives": [primitive]}],
-    }
-    return buffer.glb(document)
 
 
 def _bytes(values: np.ndarray) -> np.ndarray:

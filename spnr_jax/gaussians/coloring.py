@@ -1,6 +1,6 @@
 """Colours of splats from pictures: spherical harmonics by weighted least squares over the views that see each splat.
 
-A view sees a splat whose centre lies at its picture's depth there, and is against one that lies before that depth or
+A view sees a splat whose centre lies at its picture's depth there and that faces it, and is against one that lies before that depth or
 where the picture is empty: those that more than a few views are against stick out of the object, and are left out.  The
 weight of a view is the cosine under which it sees the splat; harmonics of higher degree are held back (ridge), so few
 views give a plain colour.
@@ -13,9 +13,8 @@ from jaxtyping import Float
 from scipy.ndimage import minimum_filter
 
 from spnr_jax.errors import UserError
-from spnr_jax.gaussians.drawing import rotations
 from spnr_jax.gaussians.harmonics import basis, coefficients
-from spnr_jax.gaussians.placing import View
+from spnr_jax.gaussians.placing import View, rotations
 from spnr_jax.kernels.records import Camera, Gaussians
 
 BEHIND = 2.0  # sides of a cube that a splat may lie behind a picture's depth
@@ -27,10 +26,10 @@ EMPTY = 0.5  # opacity below which a picture is empty
 FEW, ALWAYS = 0.12, 0.5  # views against a splat that do not count: share of those that see it, and number
 
 
-def colored(gaussians: Gaussians, views: Sequence[View], *, side: float, degree: int) -> Gaussians:
+def color(gaussians: Gaussians, views: Sequence[View], *, side: float, degree: int) -> Gaussians:
     """The splats in the colours of the views, of a degree 0 to 3; without those that no view sees."""
     position = np.asarray(gaussians.position)
-    normal = np.asarray(rotations(gaussians.rotation))[:, :, 2]
+    normal = rotations(gaussians.rotation)[:, :, 2]
     count = coefficients(degree)
     matrix = np.zeros((len(position), count, count), np.float32)
     right = np.zeros((len(position), count, 3), np.float32)
@@ -45,14 +44,15 @@ def colored(gaussians: Gaussians, views: Sequence[View], *, side: float, degree:
             near = inside & (distance < depth + BEHIND * side)
             before = near & (distance < nearest_around(view.depth)[row, column] - BEFORE * side)
         against += before | (inside & (opacity < EMPTY))
-        visible = np.flatnonzero(near & ~before & (opacity > SOLID))
-        facing = np.abs(np.einsum("ni,ni->n", towards[visible], normal[visible]))
+        cosine = -np.einsum("ni,ni->n", towards, normal)  # a thin sheet has splats on either side
+        visible = np.flatnonzero(near & ~before & (opacity > SOLID) & (cosine > 0))
+        facing = cosine[visible]
         weight = np.maximum(facing, LEAST_FACING)[:, None].astype(np.float32)
         opacity = opacity[visible, None]
-        color = (view.image[row[visible], column[visible]] - (1 - opacity)) / opacity
+        seen_color = (view.image[row[visible], column[visible]] - (1 - opacity)) / opacity
         harmonics = np.asarray(basis(towards[visible].astype(np.float32), degree))
         matrix[visible] += (weight * harmonics)[:, :, None] * harmonics[:, None]
-        right[visible] += (weight * harmonics)[:, :, None] * (color - 0.5)[:, None]
+        right[visible] += (weight * harmonics)[:, :, None] * (seen_color - 0.5)[:, None]
         seen[visible] += 1
     held = np.diag([1e-4] + [RIDGE / (4 * np.pi)] * (count - 1)).astype(np.float32)
     shown = (seen > 0) & (against <= FEW * seen + ALWAYS)

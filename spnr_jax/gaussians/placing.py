@@ -20,8 +20,8 @@ from spnr_jax.kernels.records import Camera, Gaussians, Surfels
 STRIDE = 2  # of the pixels that are carried back
 WITHIN, OFF_PLANE = 1.2, 0.5  # spacings of a surfel from which and above whose plane a pixel belongs to it
 GRAZING = 0.1  # cosine between ray and normal below which a pixel's depth says little
-FINEST = 1.5  # pixels of the pictures that a cube is wide at least
-WIDTH, THICKNESS, OPACITY = 0.45, 0.03, 0.9  # of a splat at first: standard deviations in cubes, opacity
+FINEST = 1.25  # pixels of the pictures that a cube is wide at least
+WIDTH, THICKNESS, OPACITY = 0.57, 0.03, 0.98  # of a splat: standard deviations in cubes, opacity
 INSET = 0.5  # pixels that a splat lies below the surface: at outlines many are seen from their edge, and all reach out
 TRIES, ENOUGH = 6, 0.85  # sizes of cubes that are tried, share of the wanted number that is good
 
@@ -88,7 +88,7 @@ def place(seen: Seen, *, most: int, pixel: float) -> tuple[Gaussians, float]:
     scale = np.broadcast_to(np.array([WIDTH, WIDTH, THICKNESS], np.float32) * side, (number, 3))
     placed = Gaussians(
         position=(position - INSET * pixel * normal).astype(np.float32),
-        rotation=turned_to(normal).astype(np.float32),
+        rotation=turn_to(normal).astype(np.float32),
         scale=np.array(scale),
         opacity=np.full(number, OPACITY, np.float32),
         harmonics=np.zeros((number, 1, 3), np.float32),
@@ -106,7 +106,18 @@ def _groups(seen: Seen, low: np.ndarray, side: float) -> tuple[int, np.ndarray]:
     return len(names), group.ravel()
 
 
-def turned_to(normal: Float[np.ndarray, "splats 3"]) -> Float[np.ndarray, "splats 4"]:
+def rotations(quaternion: Float[np.ndarray, "splats 4"]) -> Float[np.ndarray, "splats 3 3"]:
+    """Rotation matrices of unit quaternions w x y z."""
+    w, x, y, z = np.asarray(quaternion).T
+    rows = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def turn_to(normal: Float[np.ndarray, "splats 3"]) -> Float[np.ndarray, "splats 4"]:
     """Quaternions w x y z that turn the third axis to a normal, some after half a turn around the first axis."""
     below = normal[:, 2:] < 0
     x, y, z = np.split(normal * np.where(below, -1, 1), 3, axis=-1)

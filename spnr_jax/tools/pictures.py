@@ -7,7 +7,7 @@
     NAME_000_opacity.png
     NAME_turntable.gif          or .mp4
     NAME_mesh.glb               in the file's frame and units
-    NAME_splats.ply             or .spz, .glb
+    NAME_splats.ply             or .spz
     NAME_cameras.json           cameras in the nerfstudio convention in the file's frame, up axis, normalisation
 
 Depth and opacity have the resolution of the volume rendering, which an upsampler doubles for the image.

@@ -78,7 +78,7 @@ class Render:
     """Also write the surface as .glb, with the materials of the nearest points."""
     grid_resolution: int | None = None
     """Places along each side of the grid of --mesh (default: 192)."""
-    splats: Literal["none", "ply", "spz", "glb"] = "none"
+    splats: Literal["none", "ply", "spz"] = "none"
     """Also write Gaussian splats."""
     making: SplatMaking = field(default_factory=SplatMaking)
     """How they are made."""

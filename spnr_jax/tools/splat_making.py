@@ -1,19 +1,17 @@
-"""Gaussian splats of a cloud: the network draws it from all around, and splats are made and refined from that.
+"""Gaussian splats of a cloud: the network draws it from all around, and splats are placed and coloured from that.
 
 fitting cameras    even directions on the sphere, the same distance as `Model.camera`
-splats             gaussians/placing.py, coloring.py, refining.py, in the box, then in the cloud's units
+splats             gaussians/placing.py, coloring.py, in the box, then in the cloud's units
 """
 
 import dataclasses
-import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
 
-from spnr_jax.gaussians import coloring, placing, refining
+from spnr_jax.gaussians import coloring, placing
 from spnr_jax.gaussians.placing import View
 from spnr_jax.kernels.records import Camera, Gaussians, Light, PointCloud, SurfelScene, Volume
 from spnr_jax.method import surfel_renderer
@@ -24,7 +22,6 @@ from spnr_jax.tools.render_command import Render
 
 VIEWS, RESOLUTION = 32, 512  # pictures, and their pixels along each side
 GOLDEN_ANGLE = 180 * (3 - np.sqrt(5))  # degrees between the azimuths of one direction and the next
-LEAST_RATE = 0.1  # share of the learning rates that is left at the end
 
 
 def splats(
@@ -33,26 +30,19 @@ def splats(
     *,
     light: Light | None = None,
     degree: int = 1,
-    most: int = 80_000,
+    most: int = 150_000,
     views: int = VIEWS,
     resolution: int = RESOLUTION,
-    seconds: float | int = 20.0,
     report: Callable[[str], None] = lambda line: None,
 ) -> Gaussians:
     """Gaussian splats of a cloud as the network draws it, in the cloud's units, y up: what splat viewers show.
 
     The network draws `views` pictures of `resolution` pixels in the light; splats, at most `most`, lie on the surface
-    that these show, with colours as spherical harmonics of a `degree` 0 to 3, and are refined against the pictures for
-    so many `seconds`.  ValueError if the pictures show no surface.  `spnr_jax.write_splats` writes them.
+    that these show, with colours as spherical harmonics of a `degree` 0 to 3.  ValueError if the pictures show no
+    surface.  `spnr_jax.write_splats` writes them.
     """
-    sizes: dict[str, Any] = {
-        "degree": degree,
-        "most": most,
-        "views": views,
-        "resolution": resolution,
-        "seconds": seconds,
-    }
-    return splats_of(model, model.encode(cloud), cloud, light, report, **sizes)
+    volume = model.encode(cloud)
+    return splats_of(model, volume, cloud, light, report, degree=degree, most=most, views=views, resolution=resolution)
 
 
 def splats_of(
@@ -65,61 +55,21 @@ def splats_of(
     degree: int,
     most: int,
     views: int,
-    seconds: float | int,
     resolution: int = RESOLUTION,
 ) -> Gaussians:
     """`splats` of a cloud that is encoded already."""
     pictures = drawn_views(model, volume, fitting_cameras(model, volume, views, resolution), light)
     report(f"the network drew {views} pictures of {resolution} x {resolution}")
-    return in_units(splats_in_box(pictures, volume, cloud, degree, most, seconds, report), volume)
+    return in_units(splats_in_box(pictures, volume, cloud, degree, most), volume)
 
 
-def splats_in_box(
-    pictures: list[View],
-    volume: Volume,
-    cloud: PointCloud,
-    degree: int,
-    most: int,
-    seconds: float | int,
-    report: Callable[[str], None] = lambda line: None,
-    watch: Callable[[float], None] = lambda share: None,
-) -> Gaussians:
-    """Splats in the box from pictures that the network has drawn; `watch` gets the share of the seconds that is over.
-
-    An exception of `watch` ends it.
-    """
-    gaussians = placed(pictures, volume, cloud, degree, most)
-    report(f"{len(gaussians.opacity):,} splats placed")
-    if seconds > 0:
-        gaussians, steps = refined(gaussians, pictures, seconds, watch=watch)
-        report(f"refined by {steps} steps")
-    return gaussians
-
-
-def placed(pictures: list[View], volume: Volume, cloud: PointCloud, degree: int, most: int) -> Gaussians:
-    """Splats in the box as they are before they are refined."""
+def splats_in_box(pictures: list[View], volume: Volume, cloud: PointCloud, degree: int, most: int) -> Gaussians:
+    """Splats in the box from pictures that the network has drawn."""
     scene = volume.scene if isinstance(volume.scene, SurfelScene) else _encode_in_box(cloud, volume)
     focal = float(np.asarray(pictures[0].camera.intrinsics)[0, 0])
     seen = placing.seen_surface(pictures, scene.surfels)
     grey, side = placing.place(seen, most=most, pixel=DISTANCE / focal)
-    return coloring.colored(grey, pictures, side=side, degree=degree)
-
-
-def refined(
-    gaussians: Gaussians,
-    pictures: list[View],
-    seconds: float | int,
-    clock: Callable[[], float] = time.monotonic,
-    watch: Callable[[float], None] = lambda share: None,
-) -> tuple[Gaussians, int]:
-    """The splats refined until the time of a clock is over, compilation apart, and the steps that were taken."""
-    refinement = refining.Refinement(gaussians, pictures)
-    refinement.step()  # compiles
-    begin = clock()
-    while (passed := (clock() - begin) / seconds) < 1:
-        watch(passed)
-        refinement.step(LEAST_RATE + (1 - LEAST_RATE) * (1 - passed))
-    return refinement.gaussians, refinement.steps
+    return coloring.color(grey, pictures, side=side, degree=degree)
 
 
 def fitting_cameras(model: Model, volume: Volume, count: int = VIEWS, resolution: int = RESOLUTION) -> list[Camera]:

@@ -4,8 +4,10 @@ import numpy as np
 
 from spnr_jax.gaussians.harmonics import basis, degree_of
 
+DILATION = 0.1  # square pixels, as the page of `spnr share` has it
 
-def draw(splats, camera, dilation):
+
+def draw(splats, camera, dilation=DILATION):
     """Picture on white and opacity: every splat at every pixel, sorted by depth."""
     pose, k = np.asarray(camera.cam_to_world, np.float64), np.asarray(camera.intrinsics, np.float64)
     image, left = np.zeros((camera.height, camera.width, 3)), np.ones((camera.height, camera.width))
@@ -26,13 +28,16 @@ def draw(splats, camera, dilation):
         distance = inverse[0, 0] * dx**2 + 2 * inverse[0, 1] * dx * dy + inverse[1, 1] * dy**2
         alpha = np.minimum(share * splats.opacity[i] * np.exp(-0.5 * distance), 0.99)
         alpha = np.where(alpha < 1 / 255, 0, alpha)
-        towards = np.asarray(splats.position[i], np.float64) - pose[:, 3]
-        harmonics = np.asarray(splats.harmonics[i], np.float64)
-        seen = basis(towards / np.linalg.norm(towards), degree_of(len(harmonics)))
-        color = np.maximum(0.5 + seen @ harmonics, 0)
-        image += (left * alpha)[..., None] * color
+        image += (left * alpha)[..., None] * color(splats, i, pose[:, 3])
         left = left * (1 - alpha)
     return image + left[..., None], 1 - left
+
+
+def color(splats, number, eye):
+    """sRGB of one splat as seen from a place."""
+    towards = np.asarray(splats.position[number], np.float64) - eye
+    harmonics = np.asarray(splats.harmonics[number], np.float64)
+    return np.maximum(0.5 + basis(towards / np.linalg.norm(towards), degree_of(len(harmonics))) @ harmonics, 0)
 
 
 def _covariance(quaternion, scale):

@@ -15,7 +15,7 @@ HEAD = """<!doctype html><link rel="icon" href="data:,"><script type="importmap"
 "three": "/three/build/three.module.js", "three/webgpu": "/three/build/three.webgpu.js",
 "three/tsl": "/three/build/three.tsl.js", "add/": "/three/examples/jsm/"}}</script><script type="module">
 """
-SPLATS = Path("examples/jsm/objects/GaussianSplat.js")  # in newer ones
+SPZ = Path("examples/jsm/loaders/SPZLoader.js")  # from r187 on
 
 
 def folder() -> Path | None:
@@ -33,8 +33,9 @@ FOLDER = folder()
 needed = pytest.mark.skipif(
     FOLDER is None, reason="no three in npm's global folder or SPNR_THREE: npm install -g three"
 )
+
 needed_with_splats = pytest.mark.skipif(
-    FOLDER is None or not (FOLDER / SPLATS).is_file(), reason="no three that draws splats: npm install -g three"
+    FOLDER is None or not (FOLDER / SPZ).is_file(), reason="no three that reads .spz: npm install -g three@0.187"
 )
 
 

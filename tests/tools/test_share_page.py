@@ -11,12 +11,11 @@ import numpy as np
 import pytest
 from PIL import Image
 from support import chromium as chromium_of
-from support import splat_balls
+from support import splat_balls, splat_twin
 
-from spnr_jax.gaussians import drawing
+from spnr_jax.gaussians.placing import rotations
 from spnr_jax.tools import splat_export
-from spnr_jax.tools.share_command import Share
-from spnr_jax.tools.splat_options import SplatMaking
+from spnr_jax.tools.splat_options import Share, SplatMaking
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install playwright")
 
@@ -66,7 +65,7 @@ def decibels(one, other):
 def page(tmp_path, degree, title="A ball"):
     camera = splat_balls.camera(size=SIZE)
     splats = splat_balls.ball(degree=degree)
-    poster, _ = drawing.draw(splats, camera)
+    poster, _ = splat_twin.draw(splats, camera)
     path = tmp_path / "page.html"
     path.write_bytes(splat_export.page(splats, poster, camera, (30.0, 20.0), title, "a note"))
     return path, poster
@@ -88,7 +87,7 @@ def test_the_page_of_a_cloud_shows_what_the_network_draws(chromium, tmp_path, mo
     points /= np.linalg.norm(points, axis=1, keepdims=True)
     stripes = np.where(np.sin(6 * points[:, :1]) > 0, [200, 40, 30], [30, 60, 200])
     np.savetxt(tmp_path / "ball.txt", np.concatenate([points, stripes], axis=1), fmt="%.5f")
-    making = SplatMaking(fitting_views=12, seconds=1.0, most_splats=8000)
+    making = SplatMaking(fitting_views=12, most_splats=8000)
     options = Share(cloud=tmp_path / "ball.txt", out=tmp_path / "page.html", up="y", making=making)
     lines: list[str] = []
     splat_export.share(options, lambda line: None, lines.append)
@@ -111,7 +110,7 @@ def test_dragging_turns_the_object_as_a_camera_would_go_around_it(chromium, tmp_
     tab.mouse.up()
     azimuth, elevation = tab.evaluate("[viewer.camera.azimuth, viewer.camera.elevation]")
     assert (azimuth, elevation) == pytest.approx((10, 24))
-    turned, _ = drawing.draw(splat_balls.ball(), splat_balls.camera(azimuth, elevation, SIZE))
+    turned, _ = splat_twin.draw(splat_balls.ball(), splat_balls.camera(azimuth, elevation, SIZE))
     now = shown(tab)
     assert decibels(now, turned) > 32
     assert decibels(now, poster) < 28
@@ -136,7 +135,7 @@ def test_a_coarse_picture_shows_the_same_object_and_rest_brings_the_whole_one(ch
     until(tab, f"document.getElementById('canvas').width === {SIZE} && viewer.frames >= 4")
     assert tab.evaluate("viewer.frames") == 4, "first, coarse, coarse again, whole"
     tab.evaluate("document.getElementById('canvas').blur()")  # without the ring around what has the keys
-    assert decibels(shown(tab), drawing.draw(splat_balls.ball(), splat_balls.camera(38.0, 20.0, SIZE))[0]) > 28
+    assert decibels(shown(tab), splat_twin.draw(splat_balls.ball(), splat_balls.camera(38.0, 20.0, SIZE))[0]) > 28
     assert not said
     tab.close()
 
@@ -145,7 +144,7 @@ def test_a_coarse_picture_is_without_the_splats_that_face_away_and_a_whole_one_h
     path, _ = page(tmp_path, 0)
     tab, said = opened(chromium, path)
     splats = splat_balls.ball(degree=0)
-    outward = drawing.rotations(splats.rotation)[:, :, 2]
+    outward = rotations(splats.rotation)[:, :, 2]
     eye = np.asarray(splat_balls.camera(30.0, 20.0).cam_to_world)[:, 3]
     facing = np.einsum("ni,ni->n", outward, splats.position - eye) < 0
     for share, every, wanted in ((1, 1, np.ones_like(facing)), (0.5, 2, facing), (0.25, 4, facing)):
