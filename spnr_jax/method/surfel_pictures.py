@@ -21,6 +21,7 @@ from spnr_jax.kernels.records import Camera, Light, PointCloud, Rendering, Scene
 from spnr_jax.kernels.resizing import enlarged
 from spnr_jax.method import solid, surfel_renderer
 from spnr_jax.method.surfel_renderer import Plan, Sizes
+from spnr_jax.surfels.encoding import encode_in_box
 from spnr_jax.surfels.lighting import room_light
 
 BALANCED = 0.75  # of the pixels along a side, which are drawn and enlarged: docs/performance.md
@@ -42,7 +43,7 @@ def encode_volume(
     variables: dict | None, cloud: PointCloud, centre: np.ndarray, scale: np.floating, *, config: SurfelConfig
 ) -> Volume:
     """Volume of a cloud in the box (unbatched)."""
-    scene = surfel_renderer.encode(cloud).replace(centre=jnp.asarray(centre), scale=jnp.asarray(scale))
+    scene = encode_in_box(cloud).replace(centre=jnp.asarray(centre), scale=jnp.asarray(scale))
     return Volume(scene=scene, centre=scene.centre, scale=scene.scale, solid=encode_solid(variables, cloud, config))
 
 

@@ -1,8 +1,8 @@
 """What a disc shows and where it ends: spacings, rims of layers, edges, gaps between random points, colors.
 
-Pure functions of a block of points, which are the last axis.  `layer` (k, block) are the neighbors' weights as points of
-the same layer, `place` (k, 2, block) their places in the tangent plane.  Lengths are spacings unless they are said not
-to be.
+Pure functions of a block of points, which are the last axis.  `layer` (k, block) are the neighbors' weights as points
+of the same layer, `place` (k, 2, block) their places in the tangent plane.  Lengths are spacings unless they are said
+not to be.
 """
 
 from typing import NamedTuple
@@ -250,7 +250,9 @@ def _find_line(
     """
     one, two = (0.5 / jnp.maximum(sums[:1], 1e-6) * sums[:6] for sums in (own, other))
     (n, x, y, xx, xy, yy), side = one + two, two - one
-    normal = jnp.stack([jnp.stack([n, x, y, side[0]]), jnp.stack([x, xx, xy, side[1]]), jnp.stack([y, xy, yy, side[2]])])
+    normal = jnp.stack(
+        [jnp.stack([n, x, y, side[0]]), jnp.stack([x, xx, xy, side[1]]), jnp.stack([y, xy, yy, side[2]])]
+    )
     way = unit(_solve_plane(normal, rules.border_ridge)[:, 0])
     height = jax.lax.optimization_barrier(place[:, 0] * way[0][None] + place[:, 1] * way[1][None])
     there = weight > rules.border_least

@@ -143,8 +143,8 @@ def find_layers(
 ) -> tuple[Float[Array, " points"], Layer]:
     """First spacings, and the layers of given normals or of none.
 
-    Firm normals are kept; sided ones have a side, and tell the sides of a wall apart.  Of two sheets nearer than a layer
-    is thick a point gets its own, where linear colors tell them apart.
+    Firm normals are kept; sided ones have a side, and tell the sides of a wall apart.  Of two sheets nearer than a
+    layer is thick a point gets its own, where linear colors tell them apart.
     """
     roots = root(points.color)
 

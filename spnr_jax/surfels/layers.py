@@ -244,7 +244,11 @@ def _tell_apart(
 
 
 def agree_on_sheets(
-    hood: Hood, layer: Layer, sheets: Sheets, unlike: Float[Array, "k block"], certain: Float[Array, "k block"],
+    hood: Hood,
+    layer: Layer,
+    sheets: Sheets,
+    unlike: Float[Array, "k block"],
+    certain: Float[Array, "k block"],
     rules: Rules,
 ) -> Layer:
     """The layers, those of sheets where enough neighbors of a like color are certain."""

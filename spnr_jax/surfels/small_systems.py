@@ -13,7 +13,7 @@ SQUARINGS = 5  # after which a variance that is a tenth larger than another weig
 SMALLEST = 1e-7  # of the trace, below which a variance is rounding
 
 
-def total(values: Float[Array, "k *n"]) -> Float[Array, "*n"]:
+def total(values: Float[Array, "k ..."]) -> Float[Array, "..."]:
     """Sum over the first axis.  The barrier keeps XLA's CPU compiler from computing the terms one number at a time."""
     return jnp.sum(jax.lax.optimization_barrier(values), axis=0)
 
@@ -44,7 +44,7 @@ def solve(
     return jax.lax.fori_loop(0, len(matrix), eliminate, rows)[:, len(matrix) :]
 
 
-def dot(one: Float[Array, "3 *n"], two: Float[Array, "3 *n"]) -> Float[Array, "*n"]:
+def dot(one: Float[Array, "3 ..."], two: Float[Array, "3 ..."]) -> Float[Array, "..."]:
     """Scalar products."""
     return one[0] * two[0] + one[1] * two[1] + one[2] * two[2]
 

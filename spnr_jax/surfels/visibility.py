@@ -44,7 +44,7 @@ DIRECTIONS = spiral(NUM_DIRECTIONS)
 
 
 def grid_of(count: int) -> int:
-    """Cells along the depth buffers of so many points; their width follows the spacing, as far as the box is covered."""
+    """Cells along the depth buffers of so many points: their width follows the spacing where that covers the box."""
     return int(min(max(16 * -(-(4 * count**0.5) // 16), COARSEST), FINEST))
 
 

@@ -6,12 +6,12 @@ import jax
 import numpy as np
 import pytest
 from support import splat_balls
+from support.surfel_clouds import estimate
 
 from spnr_jax.gaussians import coloring, drawing, placing, refining
 from spnr_jax.gaussians.drawing import rotations
 from spnr_jax.gaussians.harmonics import C0
 from spnr_jax.kernels.cameras import camera_rays
-from spnr_jax.surfels.estimate import estimate
 
 RADIUS, SIZE, MOST = 0.8, 48, 500
 PIXEL = 3 / (0.5 * SIZE / np.tan(np.deg2rad(20)))
