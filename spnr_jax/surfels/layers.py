@@ -167,7 +167,7 @@ def fit_layers(
 
     def fit(normal: Array, again: Array) -> tuple[Array, Fit]:
         start = begin(normal, jnp.where(again, rules.scales[1], rules.start))
-        least = jnp.where(again, rules.sheet_scale, rules.scales[0]).astype(normal.dtype)
+        least = jnp.broadcast_to(jnp.where(again, rules.sheet_scale, rules.scales[0]), spacing.shape)
         slopes = jnp.where(again, 1.0, 0.0 if firm else 1.0).astype(normal.dtype)
 
         def fit_quadric() -> Fit:
@@ -187,7 +187,7 @@ def _fit_quadric(
     weight: Float[Array, "k block"],
     start: Fit,
     unlike: Float[Array, "k block"] | None,
-    least: Float[Array, ""] | float,
+    least: Float[Array, " block"] | float,
     slopes: Float[Array, ""] | float,
     rules: Rules,
 ) -> Fit:

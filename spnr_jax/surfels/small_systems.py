@@ -83,7 +83,7 @@ def project_largest(matrix: Float[Array, "3 3 points"]) -> Float[Array, "3 3 poi
     Where two are alike it is a mean of both projections, so it is smooth, as its gradient is.
     """
 
-    def square(_: int, power: Array) -> Array:
+    def square(_: Array, power: Array) -> Array:
         power = sum(power[:, i][:, None] * power[i][None] for i in range(3))
         return power / (power[0, 0] + power[1, 1] + power[2, 2])[None, None]
 

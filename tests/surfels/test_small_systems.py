@@ -35,6 +35,7 @@ def test_the_shape_is_that_of_the_roots_of_eigenvalues_and_smooth_where_two_are_
     matrix = covariances()
     extents = np.sqrt(np.maximum(np.linalg.eigvalsh(matrix), 0))
     expected = extents[:, :2] / np.maximum(extents[:, 1:], 1e-12)
+    expected[expected[:, 1] < 4e-4] = 0  # of a line float32 knows no more
     clear = extents[:, 2] > 0
     found = np.asarray(measure_shape(by_column(matrix))).T
     # a hundredth where two variances are so alike that five squarings do not part them
