@@ -57,17 +57,16 @@ def smooth_spacing(
 
 
 def average(
-    number: Int[Array, "k block"], layer: Float[Array, "k block"], seen: Float[Array, "all 64"], rules: Rules
+    number: Int[Array, "k block"], weight: Float[Array, "k block"], seen: Float[Array, "all 64"]
 ) -> Float[Array, "block 64"]:
-    """Mean over the nearest of the layer: a depth buffer of points is noisy."""
-    weight = layer[: rules.smoothed] / total(layer[: rules.smoothed])[None]
+    """Weighted means of the neighbors' rows."""
 
     def add(sums: Array, neighbor: tuple[Array, Array]) -> tuple[Array, None]:
         rows = seen.at[jnp.maximum(neighbor[0], 0)].get(mode="clip")
         return sums + neighbor[1][:, None] * rows, None
 
-    empty = jnp.zeros((layer.shape[1], seen.shape[1]), layer.dtype)
-    return jax.lax.scan(add, empty, (number[: rules.smoothed], weight))[0]
+    empty = jnp.zeros((weight.shape[1], seen.shape[1]), weight.dtype)
+    return jax.lax.scan(add, empty, (number, weight / total(weight)[None]))[0]
 
 
 def measure_evenness(

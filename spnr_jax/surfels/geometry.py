@@ -90,27 +90,35 @@ def map_blocks(
     """
     count = points.mask.shape[0]
     size = min(rules.block, count)
-    blocks = -(-count // size)
     table = jnp.concatenate([points.position, columns])
     number, packed = points.number, _pack((points.position, own))
     forms: list[Any] = []
 
-    def one(block: tuple[Array, Array]) -> Array:
-        number, packed = block
+    def compute(number: Array, packed: Array) -> Array:
         place, values = _unpack(packed, (points.position, own))
         out = work(layers.look_around(number, place, table), number, *values)
         forms.append(out)
         return _pack(out)
 
-    if blocks == 1:
-        return _unpack(one((number, packed)), forms[-1])
+    def skip(number: Array, packed: Array) -> Array:
+        rows = sum(leaf.size // size for leaf in jax.tree.leaves(forms[-1]))
+        return jnp.zeros((rows, size), packed.dtype)
 
-    def split(values: Array, fill: int) -> Array:
-        values = jnp.pad(values, [(0, 0), (0, blocks * size - count)], constant_values=fill)
-        return jnp.moveaxis(values.reshape(len(values), blocks, size), 1, 0)
+    def one(block: tuple[Array, Array]) -> Array:
+        return jax.lax.cond(jnp.any(block[0] >= 0), compute, skip, *block)  # blocks of padding cost nothing
 
-    found = jax.lax.map(one, (split(number, -1), split(packed, 0)))
+    if size == count:
+        return _unpack(compute(number, packed), forms[-1])
+
+    found = jax.lax.map(one, (_split(number, size, -1), _split(packed, size, 0)))
     return _unpack(jnp.moveaxis(found, 0, 1).reshape(found.shape[1], -1)[:, :count], forms[-1])
+
+
+def _split(values: Array, size: int, fill: int) -> Array:
+    """Columns of all points as blocks of so many, filled up."""
+    blocks = -(-values.shape[1] // size)
+    values = jnp.pad(values, [(0, 0), (0, blocks * size - values.shape[1])], constant_values=fill)
+    return jnp.moveaxis(values.reshape(len(values), blocks, size), 1, 0)
 
 
 def _pack(tree: Any) -> Float[Array, "columns points"]:
@@ -222,7 +230,6 @@ def describe(
 ) -> tuple[dict[str, Array], Bool[Array, " points"]]:
     """The fields that follow from layers and sides (..., points), and which points another layer covers."""
     rough, weight, random = find_spacings(points, raw, layer, normal, sided, rules)
-    seen_rows = seen.T
 
     def work(
         hood: Hood, number: Array, raw: Array, layer: Layer, weight: Array, normal: Array, sided: Array
@@ -241,7 +248,6 @@ def describe(
         own = layers.weigh_near(hood, raw, rules) * layers.weigh_height(layer)
         fields = colors._asdict() | {
             "spacing": spacing,
-            "visible": discs.average(number, weight, seen_rows, rules).T,
             "shape": measure_shape(layers.measure_covariance(hood, raw, own)),
             "rim": rim,
             "reach": reach,
@@ -249,7 +255,21 @@ def describe(
         return fields, layers.find_covered(hood, layer, normal, normals, rules)
 
     table = jnp.concatenate([normal, points.color, sided[None], rough[None]])
-    return map_blocks(work, points, table, rules, raw, layer, weight, normal, sided)
+    fields, covered = map_blocks(work, points, table, rules, raw, layer, weight, normal, sided)
+    return fields | {"visible": average_seen(points, weight, seen, rules)}, covered
+
+
+def average_seen(
+    points: Points, weight: Float[Array, "k points"], seen: Float[Array, "64 points"], rules: Rules = RULES
+) -> Float[Array, "64 points"]:
+    """What directions see of each point, averaged over the nearest of its layer: a depth buffer of points is noisy."""
+    size, rows = min(rules.block, len(points.mask)), seen.T
+
+    def one(block: tuple[Array, Array]) -> Array:
+        return discs.average(*block, rows)
+
+    near = _split(points.number[: rules.smoothed], size, -1), _split(weight[: rules.smoothed], size, 1)
+    return jax.lax.map(one, near).reshape(-1, len(seen))[: len(points.mask)].T
 
 
 def find_spacings(
