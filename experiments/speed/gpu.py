@@ -37,8 +37,8 @@ from spnr_jax.kernels.records import Volume
 from spnr_jax.method import surfel_pictures, surfel_renderer
 from spnr_jax.presets import PRESETS
 from spnr_jax.scoring.score_tables import Table, number, text
-from spnr_jax.surfels.encoding import encode_in_box
 from spnr_jax.surfels.lighting import room_light
+from spnr_jax.surfels.surfel_scenes import encode_in_box
 from spnr_jax.training import many_runs, optimisation, shading
 
 

@@ -40,8 +40,8 @@ from spnr_jax.nn.shader import Shader
 from spnr_jax.presets import PRESETS
 from spnr_jax.scoring.score_tables import Table, number, text
 from spnr_jax.surfels import projection
-from spnr_jax.surfels.encoding import encode_in_box
 from spnr_jax.surfels.lighting import room_light
+from spnr_jax.surfels.surfel_scenes import encode_in_box
 from spnr_jax.training import optimisation, shading
 
 SIDE = 1024  # of the matrices whose product is the machine's pace

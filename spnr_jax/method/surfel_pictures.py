@@ -21,8 +21,8 @@ from spnr_jax.kernels.records import Camera, Light, PointCloud, Rendering, Scene
 from spnr_jax.kernels.resizing import enlarged
 from spnr_jax.method import solid, surfel_renderer
 from spnr_jax.method.surfel_renderer import Plan, Sizes
-from spnr_jax.surfels.encoding import encode_in_box
 from spnr_jax.surfels.lighting import room_light
+from spnr_jax.surfels.surfel_scenes import encode_in_box
 
 BALANCED = 0.75  # of the pixels along a side, which are drawn and enlarged: docs/performance.md
 # of XLA, that take a third to two thirds off the compilation; the U-Net and what follows it run as long

@@ -17,7 +17,7 @@ from spnr_jax.gaussians import coloring, placing, refining
 from spnr_jax.gaussians.placing import View
 from spnr_jax.kernels.records import Camera, Gaussians, Light, PointCloud, SurfelScene, Volume
 from spnr_jax.method.model import DISTANCE, Model
-from spnr_jax.surfels.encoding import encode_in_box
+from spnr_jax.surfels.surfel_scenes import encode_in_box
 from spnr_jax.tools.depth_maps import surface_depth
 from spnr_jax.tools.light_options import Lighting
 from spnr_jax.tools.render_command import Render

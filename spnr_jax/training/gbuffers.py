@@ -33,7 +33,7 @@ from spnr_jax.kernels.records import Camera, Crops, Light, PointCloud, Scene, Su
 from spnr_jax.kernels.thinning import farthest_points
 from spnr_jax.method import solid, surfel_pictures, surfel_renderer
 from spnr_jax.surfels import features, lighting, outward
-from spnr_jax.surfels.encoding import encode_in_box
+from spnr_jax.surfels.surfel_scenes import encode_in_box
 from spnr_jax.training.batching import read_ahead
 from spnr_jax.training.scan_faults import colours_alone, random_scan
 

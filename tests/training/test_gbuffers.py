@@ -16,7 +16,7 @@ from spnr_jax.formats import data_sets
 from spnr_jax.kernels.cameras import pinhole
 from spnr_jax.kernels.records import Crops, PointCloud, Surfels
 from spnr_jax.surfels import features, lighting
-from spnr_jax.surfels.encoding import encode_in_box
+from spnr_jax.surfels.surfel_scenes import encode_in_box
 from spnr_jax.surfels.visibility import DIRECTIONS, spiral, tangents
 from spnr_jax.training import gbuffers, optimisation, shading
 
