@@ -9,6 +9,7 @@ from importlib import import_module
 
 _PUBLIC = {"load": "training.weights", "Model": "method.model", "Volume": "method.model"}
 _PUBLIC |= dict.fromkeys(("Plan", "plan", "render"), "method.surfel_renderer")
+_PUBLIC |= {"neighbors": "surfels.neighbors", "encode": "surfels.surfel_scenes"}
 _PUBLIC |= {"read_cloud": "formats.clouds", "clean": "kernels.cleaning"}
 _PUBLIC |= {"splats": "tools.splat_making", "write_splats": "formats.gaussian_files"}
 _PUBLIC |= {"read_light": "formats.light_files"} | dict.fromkeys(("light_of", "sun", "ambient"), "surfels.lighting")

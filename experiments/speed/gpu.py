@@ -38,6 +38,7 @@ from spnr_jax.method import surfel_pictures, surfel_renderer
 from spnr_jax.presets import PRESETS
 from spnr_jax.scoring.score_tables import Table, number, text
 from spnr_jax.surfels.lighting import room_light
+from spnr_jax.surfels.surfel_scenes import encode_in_box
 from spnr_jax.training import many_runs, optimisation, shading
 
 
@@ -92,7 +93,7 @@ def films(options: OnGPU) -> list[Found]:
     """Frames of an orbit, each of them brought to the host."""
     config = SurfelConfig(widths=(4, 6), top=4) if options.quick else SurfelConfig()
     variables, light = surfel_renderer.init(jax.random.key(0), config), room_light()
-    scene, rows = surfel_renderer.encode(sphere(options.points)), []
+    scene, rows = encode_in_box(sphere(options.points)), []
     volume = Volume(scene=scene, centre=scene.centre, scale=scene.scale)
     draw = partial(surfel_pictures.draw_each, variables, volume, config=config, quality="best")
     for size in (32, 64) if options.quick else (512, 1024):

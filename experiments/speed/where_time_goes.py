@@ -41,6 +41,7 @@ from spnr_jax.presets import PRESETS
 from spnr_jax.scoring.score_tables import Table, number, text
 from spnr_jax.surfels import projection
 from spnr_jax.surfels.lighting import room_light
+from spnr_jax.surfels.surfel_scenes import encode_in_box
 from spnr_jax.training import optimisation, shading
 
 SIDE = 1024  # of the matrices whose product is the machine's pace
@@ -138,7 +139,7 @@ def frame_programs(options: WhereTimeGoes) -> dict[str, Program]:
     """A frame as the handle draws it, and its programs alone."""
     config = SurfelConfig(image_resolution=options.size)
     variables, light = surfel_renderer.init(jax.random.key(0), config), room_light()
-    scene, camera = surfel_renderer.encode(sphere(options.points)), orbiting(options.size)
+    scene, camera = encode_in_box(sphere(options.points)), orbiting(options.size)
     volume = Volume(scene=scene, centre=scene.centre, scale=scene.scale)
     doublings, side = surfel_renderer.resolution(scene, camera)
     plan = surfel_renderer.plan(scene, camera)

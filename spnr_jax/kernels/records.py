@@ -146,7 +146,7 @@ class Volume:
 @no_type_check
 @struct.dataclass
 class Surfels:
-    """Surface elements of one object (`surfels/estimate.py`): discs with materials, padded; zeros where mask is False.
+    """Surface elements of one object (`surfels/geometry.py`): discs with materials, padded; zeros where mask is False.
 
     `spacing` is the side of the square that a point stands for, in units of the box; `gradient` the change of each
     colour along x, y, z; `jump` what is added to the colour beyond `border`, which is the unit vector across a line in

@@ -22,6 +22,7 @@ from spnr_jax.kernels.resizing import enlarged
 from spnr_jax.method import solid, surfel_renderer
 from spnr_jax.method.surfel_renderer import Plan, Sizes
 from spnr_jax.surfels.lighting import room_light
+from spnr_jax.surfels.surfel_scenes import encode_in_box
 
 BALANCED = 0.75  # of the pixels along a side, which are drawn and enlarged: docs/performance.md
 # of XLA, that take a third to two thirds off the compilation; the U-Net and what follows it run as long
@@ -42,7 +43,7 @@ def encode_volume(
     variables: dict | None, cloud: PointCloud, centre: np.ndarray, scale: np.floating, *, config: SurfelConfig
 ) -> Volume:
     """Volume of a cloud in the box (unbatched)."""
-    scene = surfel_renderer.encode(cloud).replace(centre=jnp.asarray(centre), scale=jnp.asarray(scale))
+    scene = encode_in_box(cloud).replace(centre=jnp.asarray(centre), scale=jnp.asarray(scale))
     return Volume(scene=scene, centre=scene.centre, scale=scene.scale, solid=encode_solid(variables, cloud, config))
 
 

@@ -1,6 +1,6 @@
 """Our method on one page: points -> surfels -> G-buffer -> shader network -> light on materials -> picture.
 
-    encode   neighbours, normals, sides, visibility by direction              once per object
+    encode   neighbors, layers, sides, visibility by direction (surfels/)     once per object; pure
     plan     the sizes of a picture, counted on the host: sizes shape arrays  once per view, or for many of them
     render   discs splatted to a G-buffer, a CNN over it, light               once per view; pure
 
@@ -31,7 +31,6 @@ from spnr_jax.kernels.records import (
     GBuffer,
     Key,
     Light,
-    PointCloud,
     Rendering,
     Surfels,
     SurfelScene,
@@ -40,7 +39,6 @@ from spnr_jax.kernels.resizing import doubled, mean_of_squares
 from spnr_jax.method import solid
 from spnr_jax.nn.shader import NUM_OUTPUTS, Shader, picture
 from spnr_jax.surfels import features, lighting, projection, splatting
-from spnr_jax.surfels.estimate import estimate
 from spnr_jax.surfels.projection import MOST_ENTRIES, View
 
 COARSEST = 3.5  # pixels between points from which on a picture is drawn at half the size
@@ -81,20 +79,6 @@ def init(key: Key, config: SurfelConfig) -> dict:
     """Fresh variables of the shader network."""
     side = 2 ** len(config.widths)
     return dict(Shader(config.widths, config.top).init(key, jnp.zeros((1, side, side, features.NUM_FEATURES)), 1))
-
-
-def encode(cloud: PointCloud) -> SurfelScene:
-    """Surfels of a cloud (unbatched, in the box); of centre 0 and scale 1."""
-    mask = np.asarray(cloud.mask)
-    names = ("positions", "base_color", "roughness", "metallic", "normals", "materials_known")
-    columns: dict[str, Any] = {
-        name: None if (x := getattr(cloud, name)) is None else np.asarray(x)[mask] for name in names
-    }
-    surfels = estimate(**columns)
-    spacing = np.float32(np.median(surfels.spacing[surfels.mask]))
-    return jax.device_put(
-        SurfelScene(surfels=surfels, spacing=spacing, centre=np.zeros(3, np.float32), scale=np.float32(1))
-    )
 
 
 # --- sizes ------------------------------------------------------------------------------------------------------------

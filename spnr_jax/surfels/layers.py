@@ -1,138 +1,295 @@
-"""The layer of the surface that each point lies on: a plane that its neighbours support, then a quadric through it.
+"""The layer of the surface that each point lies on: a plane that its neighbors support, then a quadric through it.
 
-Walls thinner than what anything sees between, stickers and edges put points of several layers side by side; colours,
-spacings and normals of one must not mix with those of another.  Lengths are spacings unless they are said not to be.
+Walls thinner than what anything sees between, stickers and edges put points of several layers side by side; colors,
+spacings and normals of one must not mix with those of another.  Two skins nearer to each other than a layer is thick
+are told apart by their colors.  Pure functions of a block of points, which are the last axis; k are the neighbors of a
+point, itself the first.  Lengths are spacings unless they are said not to be.
 """
 
 from itertools import combinations
 from typing import NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Bool, Float, Int
 
-from spnr_jax.surfels.neighbours import LEAST_SPACING, Near, along, around, close, covariance, frame
-from spnr_jax.surfels.small_systems import cross, narrowest, solved, variances
+from spnr_jax.kernels.numerics import clamp
+from spnr_jax.surfels.rules import Rules
+from spnr_jax.surfels.small_systems import cross, dot, find_narrowest, frame, solve, sum_products, total, unit
 
-PAIRED = 8  # nearest points whose pairs span the planes that are tried
-SLIVER = 0.2  # sine between two of them from which on they span one
-FLAT = 0.1  # spacings from a plane at which a point supports it half
-TRUSTED = 1.15  # the plane of least spread counts so much more: it is the better one where points are noisy
-ROUNDS = 4  # of the quadric's fit
-# ridge of its slopes and curvatures, and of a step between two colours
-STIFF = np.diag(np.array([1e-3, 1e-3, 0.1, 0.1, 0.1, 0.01], np.float32))[..., None]
-THICK, THINNEST = 0.3, 0.04  # most and least standard deviation of a neighbour's weight as one of the layer
-SHEET = 0.02  # the least where colours or normals tell two sheets apart
-START = 0.12  # the same in the first round
-SPREADS = 2.0  # this deviation over the mean height of those that count
-LOOSE = 2.0  # the same of the layer that colours and spacings come from, over that of the fit
-APART = 3.0  # deviations from which on a neighbour is of another layer
-PARALLEL = 0.8  # cosine between normals of layers that lie above each other
-STICKER, COVERING = 0.8, 2.0  # most height, and fewest neighbours above, of a layer that covers a point
+
+class Hood(NamedTuple):
+    """Neighborhoods of a block of points: which neighbors exist (1 or 0), the way to each in units of the box, its
+    squared length, and the columns that were asked of each."""
+
+    real: Float[Array, "k block"]
+    offset: Float[Array, "k 3 block"]
+    squared: Float[Array, "k block"]
+    columns: Float[Array, "k columns block"]
 
 
 class Layer(NamedTuple):
-    """Of a block of points: unit normals of either sign, the layer's thickness, the neighbours' height over it."""
+    """Unit normals of either sign, the layer's thickness, the neighbors' height over it."""
 
-    normal: Float[np.ndarray, "3 block"]
-    scale: Float[np.ndarray, " block"]
-    height: Float[np.ndarray, "k block"]
-
-
-def first_normals(near: Near, spacing: np.ndarray) -> np.ndarray:
-    """Unit normals (block, 3): of the planes through a point that two of its nearest span, that with most points.
-
-    The plane of least spread is tried, too.  So a point at an edge gets the plane of one of the faces, not one between
-    them.
-    """
-    flat = FLAT * spacing[near.rows]
-    weight = close(near, spacing[near.rows])
-
-    def support(normal: np.ndarray) -> np.ndarray:
-        return np.sum(weight / (1 + along(near.offset, normal / flat) ** 2), axis=0)
-
-    best = narrowest(covariance(near, weight)).astype(np.float32)
-    most = TRUSTED * support(best)
-    last = min(PAIRED, len(near.number) - 1)
-    for one, two in combinations(range(1, last + 1), 2):
-        across = cross(near.offset[:, one], near.offset[:, two])
-        size = np.linalg.norm(across, axis=0)
-        normal = across / np.maximum(size, 1e-12)
-        supported = support(normal) * (size > SLIVER * near.distance[one] * near.distance[two])
-        best = np.where(supported > most, normal, best)
-        most = np.maximum(most, supported)
-    return best.T
+    normal: Float[Array, "3 block"]
+    scale: Float[Array, " block"]
+    height: Float[Array, "k block"]
 
 
-def fitted(near: Near, spacing: np.ndarray, normal: np.ndarray, sided: bool, firm: bool) -> Layer:
-    """The layers of a block of points from first normals (all points' arrays), which are kept if they are firm.
+class Sheets(NamedTuple):
+    """The layers that points have if they lie on one of two sheets, whether they may, and whether that is certain."""
 
-    A layer is a quadric through its point (Cazals and Pouget 2003), fitted in rounds to the neighbours that lie close
-    to it.
-    """
-    spacing, of_all, normal = spacing[near.rows], normal, normal[near.rows].T
-    weight, scale = close(near, spacing), np.full(len(spacing), START, np.float32)
-    if sided:  # the other side of a wall is told apart by its normals
-        weight *= np.clip(0.5 + along(around(near, of_all), normal), 0, 1)
-    first = Layer(normal, scale, along(near.offset, normal / spacing))
-    return quadric(near.offset, spacing, weight, first, None, firm).layer
+    layer: Layer
+    possible: Bool[Array, " block"]
+    certain: Bool[Array, " block"]
 
 
 class Fit(NamedTuple):
-    """A layer, the neighbours' weights in it, their sums over products of unknowns, the step to those unlike."""
+    """A layer, the neighbors' weights in it, their sums over products of unknowns, the step to those unlike."""
 
     layer: Layer
-    weight: Float[np.ndarray, "k block"]
-    sums: Float[np.ndarray, "unknowns unknowns block"]
-    step: Float[np.ndarray, " block"]
+    weight: Float[Array, "k block"]
+    sums: Float[Array, "unknowns unknowns block"]
+    step: Float[Array, " block"]
 
 
-def quadric(
-    offset: np.ndarray, spacing: np.ndarray, weight: np.ndarray, first: Layer, unlike: np.ndarray | None, firm: bool
+def look_around(
+    number: Int[Array, "k block"], place: Float[Array, "3 block"], columns: Float[Array, "columns all"]
+) -> Hood:
+    """The neighborhoods of points at some places, from columns of all points, their positions the first three.
+
+    Numbers of neighbors that do not exist are negative.
+    """
+    real = number >= 0
+    found = gather(columns, number)
+    offset = jnp.where(real[:, None], found[:, :3] - place[None], 0)
+    offset, squared = jax.lax.optimization_barrier((offset, jnp.sum(offset**2, axis=1)))
+    return Hood(real.astype(place.dtype), offset, squared, found[:, 3:])
+
+
+def gather(columns: Float[Array, "columns all"], number: Int[Array, "k block"]) -> Float[Array, "k columns block"]:
+    """Columns of the neighbors; those of the first point where there is no neighbor."""
+    axes = jax.lax.GatherDimensionNumbers(offset_dims=(1,), collapsed_slice_dims=(1,), start_index_map=(1,))
+    found = jax.lax.gather(columns, jnp.maximum(number, 0)[..., None], axes, (len(columns), 1), mode="clip")
+    return jax.lax.optimization_barrier(found)
+
+
+def select(chosen: Bool[Array, " block"], new: Array, old: Array | float | int) -> Array:
+    """Of each point (the last axis) the new values where it is chosen, the old ones elsewhere."""
+    return jnp.where(chosen.reshape(*[1] * (new.ndim - 1), -1), new, old)
+
+
+def along(vectors: Float[Array, "k 3 block"], axis: Float[Array, "3 block"]) -> Float[Array, "k block"]:
+    """Components of the vectors along one axis for each point."""
+    return vectors[:, 0] * axis[0][None] + vectors[:, 1] * axis[1][None] + vectors[:, 2] * axis[2][None]
+
+
+def weigh_near(hood: Hood, spacing: Float[Array, " block"], rules: Rules) -> Float[Array, "k block"]:
+    """Weights of the neighbors by their distance."""
+    return hood.real * jnp.exp(hood.squared * (-0.5 / (rules.near * spacing) ** 2)[None])
+
+
+def weigh_height(layer: Layer, loose: float = 1.0) -> Float[Array, "k block"]:
+    """Weights of the neighbors by their height over the layer."""
+    return jnp.exp(-0.5 * (layer.height / (loose * layer.scale)[None]) ** 2)
+
+
+def measure_covariance(
+    hood: Hood, spacing: Float[Array, " block"], weight: Float[Array, "k block"]
+) -> Float[Array, "3 3 block"]:
+    """Of the weighted neighbors, in squared spacings."""
+    offset = hood.offset / spacing[None, None]
+    terms = jnp.concatenate([jnp.ones_like(offset[:, :1]), offset], axis=1)
+    sums = sum_products(weight[:, None] * terms, terms)
+    sums = sums / jnp.maximum(sums[:1, :1], 1e-9)
+    return sums[1:, 1:] - sums[1:, :1] * sums[:1, 1:]
+
+
+def find_planes(hood: Hood, spacing: Float[Array, " block"], rules: Rules) -> Float[Array, "3 block"]:
+    """Unit normals of the planes through a point that two of its nearest span: that which most neighbors support.
+
+    The plane of least squares is tried, too.  So a point at an edge gets the plane of one of the faces, not one between
+    them.  Which plane is chosen is a constant; its normal has a gradient.
+    """
+    weight = weigh_near(hood, spacing, rules)
+    narrowest = find_narrowest(measure_covariance(hood, spacing, weight))
+    pairs = np.array(list(combinations(range(1, rules.paired + 1), 2)), np.int32)
+    fixed = (hood.offset / spacing[None, None], hood.squared / spacing[None] ** 2, hood.real, narrowest, weight)
+    offset, squared, real, constant, weight = jax.lax.optimization_barrier(jax.lax.stop_gradient(fixed))
+
+    def support(normal: Array) -> Array:
+        return total(weight / (1 + (along(offset, normal) / rules.flat) ** 2))
+
+    def compare(best: tuple[Array, Array], pair: Array) -> tuple[tuple[Array, Array], None]:
+        one, two = pair
+        across = cross(offset[one], offset[two])
+        size = dot(across, across)
+        spans = (size > rules.sliver**2 * squared[one] * squared[two]) & (real[one] * real[two] > 0)
+        supported = jnp.where(spans, support(unit(across)), 0)
+        better = supported > best[0]
+        return (jnp.where(better, supported, best[0]), jnp.where(better[None], pair[:, None], best[1])), None
+
+    none = jnp.zeros((2, len(spacing)), jnp.int32)
+    _, chosen = jax.lax.scan(compare, (rules.trusted * support(constant), none), jnp.asarray(pairs))[0]
+    one, two = (jnp.take_along_axis(hood.offset, which[None, None], axis=0)[0] for which in chosen)
+    return jnp.where(chosen[:1] > 0, unit(cross(one / spacing[None], two / spacing[None])), narrowest)
+
+
+def fit_layers(
+    hood: Hood,
+    spacing: Float[Array, " block"],
+    normal: Float[Array, "3 block"],
+    weight: Float[Array, "k block"],
+    firm: bool,
+    unlike: Float[Array, "k block"] | None,
+    rules: Rules,
+) -> tuple[Layer, Sheets | None]:
+    """Layers from first normals, which are kept if they are firm; of sheets, too, where neighbors are `unlike` a point.
+
+    A layer is a quadric through its point (Cazals and Pouget 2003).  For sheets it is fitted once more with the step to
+    the neighbors of another color as one more unknown.  The border of two colors on a bent surface is no step: slope
+    and curvature beyond it explain as much.  Blocks in which no two colors lie among each other are not fitted again.
+    """
+    offset = jax.lax.optimization_barrier(hood.offset / spacing[None, None])
+    weight = jax.lax.optimization_barrier(weight)
+
+    def begin(normal: Array, scale: Array | float) -> Fit:
+        layer = Layer(normal, jnp.broadcast_to(jnp.asarray(scale, normal.dtype), spacing.shape), along(offset, normal))
+        unknowns = 5 if unlike is None else 6
+        sums = jnp.zeros((unknowns, unknowns, len(spacing)), normal.dtype)
+        return Fit(layer, weight, sums, jnp.zeros_like(spacing))
+
+    if unlike is None:
+        start = begin(normal, rules.start)
+        return _fit_quadric(offset, weight, start, None, rules.scales[0], 0.0 if firm else 1.0, rules).layer, None
+    mixed = _fewer(weight, unlike) > rules.step_points[0]
+
+    def fit(normal: Array, again: Array) -> tuple[Array, Fit]:
+        start = begin(normal, jnp.where(again, rules.scales[1], rules.start))
+        least = jnp.broadcast_to(jnp.where(again, rules.sheet_scale, rules.scales[0]), spacing.shape)
+        slopes = jnp.where(again, 1.0, 0.0 if firm else 1.0).astype(normal.dtype)
+
+        def fit_quadric() -> Fit:
+            return _fit_quadric(offset, weight, start, again * unlike, least, slopes, rules)
+
+        found = jax.lax.cond(~again | jnp.any(mixed), fit_quadric, lambda: start)
+        return found.layer.normal, found
+
+    _, fits = jax.lax.scan(fit, normal, jnp.array([False, True]))
+    first, second = (jax.tree.map(lambda x, i=i: x[i], fits) for i in (0, 1))
+    possible, certain = _tell_apart(second, unlike, rules)
+    return first.layer, Sheets(second.layer, possible & mixed, certain & mixed)
+
+
+def _fit_quadric(
+    offset: Float[Array, "k 3 block"],
+    weight: Float[Array, "k block"],
+    start: Fit,
+    unlike: Float[Array, "k block"] | None,
+    least: Float[Array, " block"] | float,
+    slopes: Float[Array, ""] | float,
+    rules: Rules,
 ) -> Fit:
-    """Fit in rounds from a first layer; where `unlike` is given, those neighbours lie a step from the quadric."""
-    normal, scale, rest = first
-    others, stiff, thinnest = ([], STIFF[:5, :5], THINNEST) if unlike is None else ([unlike], STIFF, SHEET)
-    for _ in range(ROUNDS):
-        axes = frame(normal)
-        one, two, up = (along(offset, axis) for axis in axes / spacing)
-        own = weight * np.exp(-0.5 * (rest / scale) ** 2)
-        terms = np.stack([one, two, one * one, one * two, two * two, *others, up])
-        sums = np.einsum("ikn,jkn->ijn", own * terms[:-1], terms)
-        solution = solved(sums[:, :-1] + stiff, sums[:, -1:])[:, 0]
-        if firm:
-            solution[:2] = 0
-        height = rest = up - np.einsum("ikn,in->kn", terms[:5], solution[:5])
+    """Fit in rounds to the neighbors that lie close to the layer before, with a least thickness.
+
+    Those that are unlike lie a step from the quadric.  With 0 for `slopes` normals are kept.
+    """
+    ridge = _ridge(rules, weight.dtype)[: len(start.sums), : len(start.sums)]
+
+    def improve(_: Array, last: tuple[Fit, Array]) -> tuple[Fit, Array]:
+        (_, scale, _), rest = last[0].layer, last[1]
+        axes = frame(last[0].layer.normal)
+        one, two, up = (along(offset, axis) for axis in axes)
+        own = weight * jnp.exp(-0.5 * (rest / scale[None]) ** 2)
+        terms = [one, two, one * one, one * two, two * two, *([] if unlike is None else [unlike])]
+        unknown = jnp.stack(terms, axis=1)
+        sums = sum_products(own[:, None] * unknown, jnp.concatenate([unknown, up[:, None]], axis=1))
+        solution = solve(sums[:, :-1] + ridge, sums[:, -1:])[:, 0]
+        slope = slopes * solution[:2]
+        bent = (solution[i][None] * terms[i] for i in (2, 3, 4))
+        height = rest = up - slope[0][None] * one - slope[1][None] * two - sum(bent)
         if unlike is not None:
-            rest = height - solution[5] * unlike
-        normal = axes[2] - solution[0] * axes[0] - solution[1] * axes[1]
-        normal = normal / np.linalg.norm(normal, axis=0)
-        away = np.einsum("kn,kn->n", own, np.abs(rest)) / np.maximum(own.sum(axis=0) - 1, 0.5)  # it is at 0 itself
-        scale = np.clip(SPREADS * away, thinnest, THICK)
-    return Fit(Layer(normal, scale, height), own, sums[:, :-1], solution[-1])
+            rest = height - solution[5][None] * unlike
+        normal = unit(axes[2] - slope[:1] * axes[0] - slope[1:] * axes[1])
+        away = total(own * jnp.abs(rest)) / jnp.maximum(total(own) - 1, 0.5)  # it is at 0 itself
+        scale = clamp(rules.spreads * away, least, rules.scales[1])
+        return Fit(Layer(normal, scale, height), own, sums[:, :-1], solution[-1]), rest
+
+    return jax.lax.fori_loop(0, rules.rounds, improve, (start, start.layer.height))[0]
 
 
-def shape_of(near: Near, layer: Layer, spacing: np.ndarray) -> np.ndarray:
-    """Ratios of the extents of the layer's neighbours (block, 2): planarity and linearity."""
-    own = close(near, spacing[near.rows]) * np.exp(-0.5 * (layer.height / layer.scale) ** 2)
-    extent = np.sqrt(np.maximum(variances(covariance(near, own + 1e-6)), 0))
-    return (extent[:2] / np.maximum(extent[1:], 1e-6)).T.astype(np.float32)
+def _ridge(rules: Rules, dtype: jnp.dtype) -> Float[Array, "6 6 1"]:
+    """What is added to the normal equations of a quadric's slopes, curvatures, and a step between two colors."""
+    bend = rules.bend_ridge
+    ridge = [rules.slope_ridge, rules.slope_ridge, bend, rules.mixed_ridge, bend, rules.step_ridge]
+    return jnp.diag(jnp.asarray(ridge, dtype))[..., None]
 
 
-def weights(near: Near, layer: Layer, normal: np.ndarray, sided: np.ndarray) -> np.ndarray:
-    """Weight of each neighbour as one of the same layer: near the quadric, and turned to the same side."""
-    cosine = along(around(near, normal), normal[near.rows].T)
-    weight = np.exp(-0.5 * (layer.height / (LOOSE * layer.scale)) ** 2)
-    weight *= np.where(sided[near.rows] > 0.5, np.clip(0.5 + cosine, 0, 1), 1)
-    weight[0] = 1
-    return weight
+def _tell_apart(
+    fit: Fit, unlike: Float[Array, "k block"], rules: Rules
+) -> tuple[Bool[Array, " block"], Bool[Array, " block"]]:
+    """Whether the step is one between two sheets: perhaps, and certainly."""
+    step, own = fit.step, fit.weight
+    last = jnp.zeros((6, 1, len(step)), step.dtype).at[-1].set(1)
+    error = jnp.maximum(solve(fit.sums + _ridge(rules, step.dtype), last)[-1, 0], 1e-9)
+    held, others, squares = total(own), total(own * unlike), total(own * unlike**2)
+    alone = jnp.maximum(squares - others**2 / jnp.maximum(held, 1e-9), 1e-9)  # were nothing else unknown
+    high = jnp.abs(step) / fit.layer.scale
+    fewer = jnp.minimum(others, held - others - 1)  # it is its own neighbor
+    measured = high, 1 / (alone * error), fewer, high * rules.spreads / jnp.sqrt(error)
+    limits = rules.step_high, rules.step_known, rules.step_points, rules.step_significant
+    passed = [[value > limit[i] for value, limit in zip(measured, limits, strict=True)] for i in (0, 1)]
+    return jnp.all(jnp.stack(passed[0]), axis=0), jnp.all(jnp.stack(passed[1]), axis=0)
 
 
-def covered(near: Near, layer: Layer, normal: np.ndarray) -> np.ndarray:
-    """Whether another layer that faces the same way lies right above a point, as a sticker does (block,)."""
-    own = normal[near.rows].T
-    outward = np.sign(np.einsum("in,in->n", own, layer.normal)) * layer.height
-    farthest = np.maximum(near.distance[-1], LEAST_SPACING)
-    other = np.exp(-0.5 * (near.distance / farthest) ** 2) * (np.abs(outward) < STICKER)
-    other *= along(around(near, normal), own) > PARALLEL
-    above, below = (np.sum(other * (sign * outward > APART * layer.scale), axis=0) for sign in (1, -1))
-    return above > np.maximum(COVERING, 2 * below)
+def agree_on_sheets(
+    hood: Hood,
+    layer: Layer,
+    sheets: Sheets,
+    unlike: Float[Array, "k block"],
+    certain: Float[Array, "k block"],
+    rules: Rules,
+) -> Layer:
+    """The layers, those of sheets where enough neighbors of a like color are certain."""
+    like = (hood.real * (1 - unlike))[1:]
+    sure = total(like * certain[1:]) > rules.agreed * jnp.maximum(total(like), 1e-6)
+    return jax.tree.map(lambda new, old: select(sheets.possible & sure, new, old), sheets.layer, layer)
+
+
+def compare_colors(hood: Hood, roots: Float[Array, "k 3 block"], rules: Rules) -> Float[Array, "k block"]:
+    """How far the neighbors are of another color than the point, 0 to 1, by the square roots of linear colors."""
+    change = roots - roots[:1]
+    return -jnp.expm1(-0.5 / rules.like**2 * jnp.sum(change**2, axis=1)) * hood.real
+
+
+def _fewer(weight: Float[Array, "k block"], unlike: Float[Array, "k block"]) -> Float[Array, " block"]:
+    """Neighbors of the point's color or of another, by their weights, whichever are fewer."""
+    others = total(weight * unlike)
+    return jnp.minimum(others, total(weight) - others - 1)  # it is its own neighbor
+
+
+def weigh_layer(
+    hood: Hood,
+    layer: Layer,
+    normal: Float[Array, "3 block"],
+    sided: Float[Array, " block"],
+    normals: Float[Array, "k 3 block"],
+    rules: Rules,
+) -> Float[Array, "k block"]:
+    """Weight of each neighbor as one of the same layer: near the quadric, and turned to the same side."""
+    weight = hood.real * weigh_height(layer, rules.loose)
+    weight = weight * jnp.where((sided > 0.5)[None], clamp(0.5 + along(normals, normal), 0, 1), 1)
+    return jax.lax.optimization_barrier(jnp.concatenate([jnp.ones_like(weight[:1]), weight[1:]]))
+
+
+def find_covered(
+    hood: Hood, layer: Layer, normal: Float[Array, "3 block"], normals: Float[Array, "k 3 block"], rules: Rules
+) -> Bool[Array, " block"]:
+    """Whether another layer that faces the same way lies right above a point, as a sticker does."""
+    outward = jnp.sign(dot(normal, layer.normal))[None] * layer.height / layer.scale[None]
+    farthest = jnp.maximum(jnp.max(hood.squared, axis=0), rules.least_spacing**2)
+    other = hood.real * jnp.exp(-0.5 * hood.squared / farthest[None]) * (along(normals, normal) > rules.parallel)
+    other = other * (jnp.abs(layer.height) < rules.sticker)
+    above, below = total(other * (outward > rules.apart)), total(other * (outward < -rules.apart))
+    return above > jnp.maximum(rules.covering, 2 * below)

@@ -1,13 +1,20 @@
 """Normals of the points that are kept of a dense cloud, from all of it: thinned points alone know them worse."""
 
-import numpy as np
-from jaxtyping import Float, Int
+from functools import partial
 
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from spnr_jax.kernels import cloud_arrays
 from spnr_jax.kernels.cleaning import Cleaned
 from spnr_jax.kernels.facing import planes
 from spnr_jax.kernels.records import PointCloud
-from spnr_jax.surfels import layers, sheets, sides
-from spnr_jax.surfels.neighbours import each, first_spacing, joined, neighbourhoods
+from spnr_jax.surfels import geometry
+from spnr_jax.surfels.geometry import Points
+from spnr_jax.surfels.neighbors import order_in_space
+from spnr_jax.surfels.rules import NEIGHBORS
 
 VOTERS = 2**15  # points that votes are taken of, those that are kept among them
 
@@ -33,7 +40,7 @@ def outward_normals(
 ) -> Float[np.ndarray, "points 3"]:
     """Unit normals of the points of these numbers; outward by the votes of directions and walls (sides.py).
 
-    Linear colours tell sheets apart that nearly touch; `noise` is that of `planes`.
+    Linear colors tell sheets apart that nearly touch; `noise` is that of `planes`.
     """
     rest = np.setdiff1d(np.arange(len(positions)), kept)
     others = max(0, VOTERS - len(kept))
@@ -41,11 +48,28 @@ def outward_normals(
     low, high = positions.min(axis=0), positions.max(axis=0)
     half = np.linalg.norm(high - low) / 2 or 1.0
     places = np.asarray((positions[voters] - (low + high) / 2) / half, np.float32)  # in the box
-    normal = np.asfortranarray(planes(positions[voters], positions, noise), np.float32)
-    near = neighbourhoods(places)
-    raw = joined(first_spacing, near)
-    color = np.asfortranarray(base_color[voters], np.float32)
-    spacings, normals, unsided, firm = ([x] * len(near) for x in (raw, normal, False, True))
-    layer = each(layers.fitted, near, spacings, normals, unsided, firm)
-    layer = sheets.parted(near, layer, raw, color)
-    return sides.outward(near, layer, raw, False, places, float(np.median(raw)))[0][: len(kept)]
+    order, near = order_in_space(places)
+    size = cloud_arrays.bucket(len(order))
+
+    def columns(values: np.ndarray, fill: int = 0) -> np.ndarray:
+        whole = np.full((values.shape[1], size), fill, values.dtype)
+        whole[:, : len(order)] = values.T
+        return whole
+
+    number = np.full((len(order), NEIGHBORS), -1, np.int32)
+    number[:, : near.shape[1]] = near
+    color = np.asarray(base_color[voters], np.float32)
+    normal = np.asarray(planes(positions[voters], positions, noise), np.float32)
+    points = Points(columns(number, -1), np.arange(size) < len(order), columns(places[order]), columns(color[order]))
+    found = np.empty_like(places)
+    found[order] = np.asarray(_turn(points, columns(normal[order])))[:, : len(order)].T
+    return found[: len(kept)]
+
+
+@partial(jax.jit, compiler_options={"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 1})
+def _turn(points: Points, normals: Float[Array, "3 points"]) -> Float[Array, "3 points"]:
+    """The normals that are given, but for those of sheets, outward."""
+    points = jax.tree.map(jnp.asarray, points)
+    raw, layer = geometry.find_layers(points, normals, firm=True, sided=False, sheets=True)
+    seen = geometry.look(points, layer.normal, raw)
+    return geometry.find_sides(points, raw, layer, seen, False)[0]

@@ -1,52 +1,119 @@
-"""Symmetric systems of a few unknowns, one for each point, worked on by columns: LAPACK takes ten times as long.
+"""Sums, systems and eigenvectors of a few unknowns, one for each point; the points are the last axis.
 
-The points are the last axis: every step is one pass over all of them.
+Every step is one pass over all points of a block, which a CPU does in vectors; LAPACK and batched matrix products take
+ten times as long.
 """
 
-import numpy as np
-from jaxtyping import Float
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
 
-APART = 1e-9  # of the trace, by which equal variances are told apart, so that there is always a narrowest axis
-SMALLEST = 1e-30  # of a trace
+ROUND = 1e-4  # of the trace, added to variances before they are inverted
+SQUARINGS = 5  # after which a variance that is a tenth larger than another weighs twenty times as much
+SMALLEST = 1e-7  # of the trace, below which a variance is rounding
 
 
-def solved(
-    matrix: Float[np.ndarray, "unknowns unknowns points"], right: Float[np.ndarray, "unknowns sides points"]
-) -> Float[np.ndarray, "unknowns sides points"]:
+def total(values: Float[Array, "k ..."]) -> Float[Array, "..."]:
+    """Sum over the first axis.  The barrier keeps XLA's CPU compiler from computing the terms one number at a time."""
+    return jnp.sum(jax.lax.optimization_barrier(values), axis=0)
+
+
+def sum_products(
+    left: Float[Array, "k rows points"], right: Float[Array, "k columns points"]
+) -> Float[Array, "rows columns points"]:
+    """Sums over the first axis of the products of all pairs: normal equations, moments."""
+
+    def add(sums: Array, terms: tuple[Array, Array]) -> tuple[Array, None]:
+        return sums + terms[0][:, None] * terms[1][None], None
+
+    empty = jnp.zeros((left.shape[1], right.shape[1], left.shape[2]), left.dtype)
+    return jax.lax.scan(add, empty, (left, right))[0]
+
+
+def solve(
+    matrix: Float[Array, "unknowns unknowns points"], right: Float[Array, "unknowns sides points"]
+) -> Float[Array, "unknowns sides points"]:
     """The solution of positive definite systems: Gauss-Jordan elimination, which needs no pivots for these."""
-    count = len(matrix)
-    rows = np.concatenate([matrix, right], axis=1)
-    for pivot in range(count):
-        rows[pivot, pivot:] /= rows[pivot, pivot].copy()
-        for other in (i for i in range(count) if i != pivot):
-            rows[other, pivot + 1 :] -= rows[other, pivot] * rows[pivot, pivot + 1 :]
-    return rows[:, count:]
+    places = jnp.arange(len(matrix))[:, None, None]
+
+    def eliminate(pivot: Array, rows: Array) -> Array:
+        row = rows[pivot] / rows[pivot, pivot][None]
+        return jnp.where(places == pivot, row[None], rows - rows[:, pivot][:, None] * row[None])
+
+    rows = jnp.concatenate([matrix, right], axis=1)
+    return jax.lax.fori_loop(0, len(matrix), eliminate, rows)[:, len(matrix) :]
 
 
-def cross(one: Float[np.ndarray, "3 points"], two: Float[np.ndarray, "3 points"]) -> Float[np.ndarray, "3 points"]:
+def dot(one: Float[Array, "3 ..."], two: Float[Array, "3 ..."]) -> Float[Array, "..."]:
+    """Scalar products."""
+    return one[0] * two[0] + one[1] * two[1] + one[2] * two[2]
+
+
+def cross(one: Float[Array, "3 points"], two: Float[Array, "3 points"]) -> Float[Array, "3 points"]:
     """Vector products."""
-    return np.stack([one[i - 2] * two[i - 1] - one[i - 1] * two[i - 2] for i in range(3)])
+    return jnp.stack([one[i - 2] * two[i - 1] - one[i - 1] * two[i - 2] for i in range(3)])
 
 
-def variances(matrix: Float[np.ndarray, "3 3 points"]) -> Float[np.ndarray, "3 points"]:
-    """Eigenvalues, rising, by the cosines of Smith (1961); of float64."""
-    middle = np.trace(matrix) / 3
-    rest = matrix - middle * np.eye(3)[..., None]
-    size = np.sqrt(np.einsum("ijn,ijn->n", rest, rest) / 6)
-    rest = rest / np.where(size > 0, size, 1)
-    determinant = np.einsum("in,in->n", rest[0], cross(rest[1], rest[2]))
-    angle = np.arccos(np.clip(determinant / 2, -1, 1)) / 3
-    return middle + 2 * size * np.cos(angle + 2 * np.pi / 3 * np.array([[1], [2], [0]]))
+def root(squared: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """Square roots; 0 with a gradient of 0 where there is none."""
+    valid = squared > 0
+    return jnp.where(valid, jnp.sqrt(jnp.where(valid, squared, 1)), 0)
 
 
-def narrowest(matrix: Float[np.ndarray, "3 3 points"]) -> Float[np.ndarray, "3 points"]:
-    """Unit eigenvectors of the least eigenvalue; of float64.
+def unit(vectors: Float[Array, "dimensions points"]) -> Float[Array, "dimensions points"]:
+    """Vectors of length 1; those that have no length stay 0."""
+    squared = jnp.sum(vectors * vectors, axis=0, keepdims=True)
+    valid = squared > 0
+    return jnp.where(valid, vectors * jax.lax.rsqrt(jnp.where(valid, squared, 1)), 0)
 
-    Rows of the matrix less its eigenvalue span what is at right angles to it: of their products the longest is taken.
+
+def frame(normal: Float[Array, "3 points"]) -> Float[Array, "3 3 points"]:
+    """Two tangents and the unit normal (Duff et al. 2017)."""
+    x, y, z = normal
+    sign = jnp.where(z >= 0, 1.0, -1.0).astype(normal.dtype)
+    a = -1 / (sign + z)
+    b = x * y * a
+    first = jnp.stack([1 + sign * x**2 * a, sign * b, -sign * x])
+    return jnp.stack([first, jnp.stack([b, sign + y**2 * a, -y]), normal])
+
+
+def project_largest(matrix: Float[Array, "3 3 points"]) -> Float[Array, "3 3 points"]:
+    """Onto the eigenvector of the largest eigenvalue of positive matrices: their powers, of trace 1.
+
+    Where two are alike it is a mean of both projections, so it is smooth, as its gradient is.
     """
-    matrix = matrix + (APART * np.trace(matrix) + SMALLEST) * np.diag([0.0, 1, 2])[..., None]
-    rows = matrix - variances(matrix)[0] * np.eye(3)[..., None]
-    products = np.stack([cross(rows[i], rows[(i + 1) % 3]) for i in range(3)])
-    size = np.einsum("pin,pin->pn", products, products)
-    longest = np.take_along_axis(products, size.argmax(axis=0)[None, None], axis=0)[0]
-    return longest / np.sqrt(size.max(axis=0))
+
+    def square(_: Array, power: Array) -> Array:
+        power = sum(power[:, i][:, None] * power[i][None] for i in range(3))
+        return power / (power[0, 0] + power[1, 1] + power[2, 2])[None, None]
+
+    scaled = matrix / (matrix[0, 0] + matrix[1, 1] + matrix[2, 2])[None, None]
+    return jax.lax.fori_loop(0, SQUARINGS, square, scaled)
+
+
+def split_variances(
+    matrix: Float[Array, "3 3 points"],
+) -> tuple[Float[Array, "3 3 points"], Float[Array, "3 3 points"], Float[Array, "3 3 points"]]:
+    """Covariances at trace 1 (0 without extent), projections onto the narrowest axis and onto the widest."""
+    trace = matrix[0, 0] + matrix[1, 1] + matrix[2, 2]
+    scaled = matrix / jnp.where(trace > 0, trace, 1)[None, None]
+    ones = jnp.broadcast_to(jnp.eye(3, dtype=matrix.dtype)[..., None], matrix.shape)
+    both = jnp.concatenate([solve(scaled + ROUND * ones, ones), scaled + ROUND * ones], axis=2)
+    narrowest, widest = jnp.split(project_largest(both), 2, axis=2)
+    return scaled, narrowest, widest
+
+
+def find_narrowest(matrix: Float[Array, "3 3 points"]) -> Float[Array, "3 points"]:
+    """Unit vectors, of either sign, along which points with these covariances spread least."""
+    _, (x, y, z), _ = split_variances(matrix)
+    last = jnp.where(y[1] > z[2], y, z)
+    return unit(jnp.where((x[0] > y[1]) & (x[0] > z[2]), x, last))
+
+
+def measure_shape(matrix: Float[Array, "3 3 points"]) -> Float[Array, "2 points"]:
+    """Ratios of the standard deviations along the axes: planarity, 0 in a plane, and linearity, 0 on a line."""
+    scaled, narrowest, widest = split_variances(matrix)
+    least, most = (jnp.sum(jax.lax.stop_gradient(x) * scaled, axis=(0, 1)) for x in (narrowest, widest))
+    middle = scaled[0, 0] + scaled[1, 1] + scaled[2, 2] - least - most
+    ratios = jnp.stack([least, middle]) / jnp.maximum(jnp.stack([middle, most]), SMALLEST)
+    return root(jnp.where(jnp.stack([least, middle]) > SMALLEST, jnp.minimum(ratios, 1), 0))

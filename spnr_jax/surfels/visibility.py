@@ -7,8 +7,6 @@ plane hides itself at whatever angle, and one pass over the points gives the sid
 occlusion, and the share of any light that arrives.
 """
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,7 +17,7 @@ CELL = 1.5  # spacings
 STEEPEST = 8.0  # slope of a plane against the direction, at most
 REACH = 1.6  # spacings that a disc reaches: in a cell beyond that it counts at its point's own depth
 SOFT = 1.0  # spacings behind the depth buffer over which a point passes from seen to hidden
-FINEST = 1024  # cells along the box at most
+COARSEST, FINEST = 256, 1024  # cells along the box at least and at most
 BOX = 2.2  # side of the square that every direction draws: the box's diagonal is 2
 
 
@@ -45,60 +43,66 @@ def tangents(normals: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "n 3"
 DIRECTIONS = spiral(NUM_DIRECTIONS)
 
 
-def grid_of(spacing: float) -> tuple[np.float32, int]:
-    """Width of a cell and number of cells along the grid, a power of the root of two: few sizes, few compilations."""
-    cell = max(CELL * spacing, BOX / FINEST)
-    needed = 16 * np.ceil(max(np.ceil(BOX / cell), 16) / 16)
-    return np.float32(cell), int(2 ** (np.ceil(2 * np.log2(needed)) / 2))
+def grid_of(count: int) -> int:
+    """Cells along the depth buffers of so many points: their width follows the spacing where that covers the box."""
+    return int(min(max(16 * -(-(4 * count**0.5) // 16), COARSEST), FINEST))
 
 
-@partial(jax.jit, static_argnames="grid")
+def cell_of(spacing: Float[Array, ""], grid: int) -> Float[Array, ""]:
+    """Width of a cell, from the median spacing."""
+    return jnp.maximum(CELL * spacing, BOX / grid)
+
+
 def seen_from(
-    positions: Float[Array, "points 3"],
-    normals: Float[Array, "points 3"],
+    positions: Float[Array, "3 points"],
+    normals: Float[Array, "3 points"],
     spacing: Float[Array, " points"],
     mask: Bool[Array, " points"],
     cell: Float[Array, ""],
     *,
     grid: int,
-) -> Float[Array, "points 64"]:
-    """How much each of DIRECTIONS sees of each point: 1 in front, 0 from two spacings behind the depth buffer on."""
-    x, y, z = positions.T
+) -> Float[Array, "64 points"]:
+    """How much each of DIRECTIONS sees of each point: 1 in front, 0 from two spacings behind the depth buffer on.
+
+    A constant to gradients: a depth buffer jumps where one point passes before another.  The sign of a normal does not
+    matter.
+    """
+    positions, normals, spacing, cell = jax.lax.stop_gradient((positions, normals, spacing, cell))
+    x, y, z = positions
 
     def along(axis, vectors):
         return vectors[0] * axis[0] + vectors[1] * axis[1] + vectors[2] * axis[2]
 
-    def cell_of(column, row):
+    def number_of(column, row):
         return jnp.clip(row, 0, grid - 1) * grid + jnp.clip(column, 0, grid - 1)
 
     def beside(column, row, right, up, slopes):
         """How much nearer a plane through (right, up), in cells, is in the middle of a cell."""
         return cell * ((column + 0.5 - right) * slopes[0] + (row + 0.5 - up) * slopes[1])
 
-    def one(axes):
+    def look(axes):
         towards, right, up = axes
-        facing = along(towards, normals.T)
-        steep = [
-            -along(axis, normals.T) * jnp.sign(facing) / jnp.maximum(jnp.abs(facing), 1e-3) for axis in (right, up)
-        ]
+        facing = along(towards, normals)
+        steep = [-along(axis, normals) * jnp.sign(facing) / jnp.maximum(jnp.abs(facing), 1e-3) for axis in (right, up)]
         slope = jnp.sqrt(steep[0] ** 2 + steep[1] ** 2)
         steep = [x * jnp.minimum(1, STEEPEST / jnp.maximum(slope, 1e-3)) for x in steep]
         across, high = (along(axis, (x, y, z)) / cell + grid / 2 for axis in (right, up))
         column, row = (jnp.floor(v - 0.5).astype(jnp.int32) for v in (across, high))
         depth = along(towards, (x, y, z))
         most = REACH * spacing * jnp.sqrt(jnp.clip(1 - facing**2, 0, 1))
-        nearest = jnp.full(grid * grid, -2 * BOX)
+        nearest = jnp.full(grid * grid, -2 * BOX, depth.dtype)
         for j, i in ((0, 0), (0, 1), (1, 0), (1, 1)):
             nearer = beside(column + i, row + j, across, high, steep)
             there = depth + jnp.where(nearer < most, nearer, 0)
-            index = jnp.where(mask, cell_of(column + i, row + j), grid * grid)
+            index = jnp.where(mask, number_of(column + i, row + j), grid * grid)
             nearest = nearest.at[index].max(there, mode="drop")
         lift = jnp.sign(facing) * spacing
-        lifted = [p + lift * n for p, n in zip((x, y, z), normals.T, strict=True)]
+        lifted = [p + lift * n for p, n in zip((x, y, z), normals, strict=True)]
         across, high = (along(axis, lifted) / cell + grid / 2 for axis in (right, up))
         column, row = (jnp.floor(v).astype(jnp.int32) for v in (across, high))
         there = along(towards, lifted) + beside(column, row, across, high, steep)
-        behind = (nearest[cell_of(column, row)] - there) / jnp.maximum(spacing, cell / CELL)
+        behind = (nearest[number_of(column, row)] - there) / jnp.maximum(spacing, cell / CELL)
         return jnp.clip(1 - behind / SOFT, 0, 1)
 
-    return jax.lax.map(one, (jnp.asarray(DIRECTIONS), *map(jnp.asarray, tangents(DIRECTIONS)))).T
+    axes = (jnp.asarray(axis, positions.dtype) for axis in (DIRECTIONS, *tangents(DIRECTIONS)))
+    return jax.lax.map(look, tuple(axes))

@@ -14,8 +14,8 @@ import numpy as np
 from spnr_jax.gaussians import coloring, placing
 from spnr_jax.gaussians.placing import View
 from spnr_jax.kernels.records import Camera, Gaussians, Light, PointCloud, SurfelScene, Volume
-from spnr_jax.method import surfel_renderer
 from spnr_jax.method.model import DISTANCE, Model
+from spnr_jax.surfels.surfel_scenes import encode_in_box
 from spnr_jax.tools.depth_maps import surface_depth
 from spnr_jax.tools.light_options import Lighting
 from spnr_jax.tools.render_command import Render
@@ -125,4 +125,4 @@ def light_name(lighting: Lighting) -> str:
 def _encode_in_box(cloud: PointCloud, volume: Volume) -> SurfelScene:
     inside = np.clip((np.asarray(cloud.positions) - np.asarray(volume.centre)) * np.asarray(volume.scale), -1, 1)
     placed = dataclasses.replace(cloud, positions=inside.astype(np.float32))
-    return surfel_renderer.encode(placed)
+    return encode_in_box(placed)

@@ -33,6 +33,7 @@ from spnr_jax.kernels.records import Camera, Crops, Light, PointCloud, Scene, Su
 from spnr_jax.kernels.thinning import farthest_points
 from spnr_jax.method import solid, surfel_pictures, surfel_renderer
 from spnr_jax.surfels import features, lighting, outward
+from spnr_jax.surfels.surfel_scenes import encode_in_box
 from spnr_jax.training.batching import read_ahead
 from spnr_jax.training.scan_faults import colours_alone, random_scan
 
@@ -100,7 +101,7 @@ def make(item: ObjectData, number: int, light: Light, config: TrainConfig, rays:
     side = int(generator.choice(SIDES))
     cloud = random_cloud(item.cloud, side, config, generator)
     variables = None if generator.random() < UNKNOWN else {"batch_stats": rays}
-    scene = surfel_renderer.encode(cloud)
+    scene = encode_in_box(cloud)
     known = surfel_pictures.encode_solid(variables, cloud, config.model)
     arrays: Arrays = {}
     doublings: list[int] = []

@@ -6,12 +6,12 @@ import jax
 import numpy as np
 import pytest
 from support import splat_balls, splat_twin
+from support.surfel_clouds import estimate
 
 from spnr_jax.gaussians import coloring, placing
 from spnr_jax.gaussians.harmonics import C0, basis, coefficients, degree_of, half_turn_signs
 from spnr_jax.gaussians.placing import rotations
 from spnr_jax.kernels.cameras import camera_rays
-from spnr_jax.surfels.estimate import estimate
 
 RADIUS, SIZE, MOST = 0.8, 48, 500
 PIXEL = 3 / (0.5 * SIZE / np.tan(np.deg2rad(20)))

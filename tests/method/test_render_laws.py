@@ -14,8 +14,9 @@ from support.surfel_clouds import camera, cloud, shape
 from spnr_jax.config import SurfelConfig
 from spnr_jax.kernels.records import Rendering
 from spnr_jax.method import surfel_renderer
-from spnr_jax.method.surfel_renderer import Plan, encode, plan, render
+from spnr_jax.method.surfel_renderer import Plan, plan, render
 from spnr_jax.surfels.lighting import room_light, sun
+from spnr_jax.surfels.surfel_scenes import encode_in_box
 
 CONFIG = SurfelConfig(widths=(4, 6), top=4)
 EYES = (0.3, 0.4, 2.4), (1.5, 1.0, 1.5)
@@ -39,7 +40,9 @@ def view(size=24, eye=EYES[0], scale=0.5, centre=(0.3, -0.2, 0.1)):
 
 def body(name, count=90):
     color = np.random.default_rng(3).random((count, 3))
-    return in_units(encode(cloud(shape(name, count, "random")[0], base_color=color, metallic=np.full(count, 0.3))))
+    return in_units(
+        encode_in_box(cloud(shape(name, count, "random")[0], base_color=color, metallic=np.full(count, 0.3)))
+    )
 
 
 @pytest.fixture(scope="module")
@@ -242,7 +245,7 @@ def check_finite(found):
 
 @pytest.mark.parametrize("name", EXTREMES)
 def test_few_and_strange_points_have_finite_pictures_and_gradients(params, lights, value_and_gradient, name):
-    check_finite(value_and_gradient(params, in_units(encode(cloud(EXTREMES[name]))), view(), lights[0]))
+    check_finite(value_and_gradient(params, in_units(encode_in_box(cloud(EXTREMES[name]))), view(), lights[0]))
 
 
 CASES = {

@@ -13,10 +13,11 @@ from spnr_jax.config import SurfelConfig
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.records import Volume
 from spnr_jax.method import surfel_pictures, surfel_renderer
-from spnr_jax.method.surfel_renderer import GRID, encode, resolution
+from spnr_jax.method.surfel_renderer import GRID, resolution
 from spnr_jax.nn.shader import Shader
 from spnr_jax.surfels.features import NUM_FEATURES
 from spnr_jax.surfels.lighting import light_of
+from spnr_jax.surfels.surfel_scenes import encode_in_box
 
 CONFIG = SurfelConfig(widths=(8, 8), top=8)
 LIGHT = jax.tree.map(jnp.asarray, light_of(np.full((32, 64, 3), 0.8, np.float32)))
@@ -24,7 +25,7 @@ RADIUS = 0.6
 
 
 def ball(count=600):
-    return encode(cloud(shape("sphere", count)[0], base_color=np.full((count, 3), [0.7, 0.3, 0.1])))
+    return encode_in_box(cloud(shape("sphere", count)[0], base_color=np.full((count, 3), [0.7, 0.3, 0.1])))
 
 
 def render(variables, scene, view, quality="best"):
@@ -142,5 +143,5 @@ def test_padding_of_the_cloud_and_points_outside_the_picture_change_nothing(scen
     color = np.full((600, 3), [0.7, 0.3, 0.1])
     padded = cloud(np.concatenate([positions, 0 * positions]), base_color=np.concatenate([color, color]))
     padded = dataclasses.replace(padded, mask=np.arange(1200) < 600)
-    found, expected = (render(None, s, camera(64)) for s in (encode(padded), scene))
+    found, expected = (render(None, s, camera(64)) for s in (encode_in_box(padded), scene))
     close(found, expected)

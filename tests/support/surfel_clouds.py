@@ -1,12 +1,18 @@
 """Clouds whose normals and spacing are known, surfels and cameras made by hand, for tests of `spnr_jax.surfels`."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from spnr_jax.kernels import cameras
+from spnr_jax.kernels.cloud_arrays import pad
 from spnr_jax.kernels.records import Camera, PointCloud, Surfels
-from spnr_jax.surfels.rims import FAR
+from spnr_jax.surfels.geometry import estimate_surfels
+from spnr_jax.surfels.neighbors import neighbors
+from spnr_jax.surfels.rules import RULES, Rules
 from spnr_jax.surfels.visibility import NUM_DIRECTIONS, spiral, tangents
+
+PADDED = (1024, 4096, 32768)  # sizes that clouds are padded to: each is compiled once
 
 
 def even_square(count: int) -> np.ndarray:
@@ -44,6 +50,23 @@ def cloud(positions, **columns) -> PointCloud:
     return PointCloud(positions=np.asarray(positions, np.float32), mask=np.ones(count, bool), **columns)
 
 
+_estimate = jax.jit(estimate_surfels, static_argnames="rules")
+
+
+def estimate(
+    positions, base_color=None, roughness=None, metallic=None, normals=None, materials_known=None, rules: Rules = RULES
+) -> Surfels:
+    """Surfels of points in the box, in their order, as NumPy arrays; computed padded, by few programs."""
+    given = {"base_color": base_color, "roughness": roughness, "metallic": metallic, "normals": normals}
+    given |= {"materials_known": materials_known}
+    points = cloud(positions, **{name: values for name, values in given.items() if values is not None})
+    points = pad(points, next(size for size in PADDED if size >= len(positions)))
+    found = jax.tree.map(np.asarray, _estimate(points, neighbors(points), rules=rules))
+    assert not found.mask[len(positions) :].any()
+    assert all(np.isfinite(values).all() for values in vars(found).values())
+    return jax.tree.map(lambda values: values[: len(positions)], found)
+
+
 def surfels(position, normal, spacing, **columns) -> Surfels:
     """Grey whole discs that every direction sees and that have one side."""
     count = len(position)
@@ -60,7 +83,7 @@ def surfels(position, normal, spacing, **columns) -> Surfels:
         "visible": np.ones((count, NUM_DIRECTIONS)),
         "shape": np.zeros((count, 2)),
         "rim": tangents(np.asarray(normal))[0],
-        "reach": np.full((count, 4), FAR),
+        "reach": np.full((count, 4), RULES.far),
     } | columns
     columns |= {"position": position, "normal": normal}
     columns |= {"spacing": np.broadcast_to(spacing, count)}

@@ -2,20 +2,10 @@
 
 import numpy as np
 import pytest
-from support.surfel_clouds import shape
-
-from spnr_jax.surfels.estimate import estimate as surfels_of
+from support.surfel_clouds import estimate, shape
 
 ACROSS, AT = np.array([0.8, 0.6]), 0.1
 RED, BLUE = np.array([0.7, 0.1, 0.1]), np.array([0.1, 0.2, 0.6])
-
-
-def estimate(positions, color):
-    """Fields of the surfels of points without gloss."""
-    count = len(positions)
-    found = surfels_of(np.float32(positions), np.float32(color), np.full(count, 0.5), np.zeros(count))
-    assert found.mask.sum() == count
-    return {name: getattr(found, name)[:count] for name in ("border", "jump", "gradient")}
 
 
 def parted(spread="even"):
@@ -30,7 +20,7 @@ def test_the_line_between_two_colours_is_found_beside_it_and_nowhere_else(spread
     positions, axes, beyond, spacing = parted(spread)
     found = estimate(positions, np.where(beyond[:, None] > 0, BLUE, RED))
     inner = np.abs(positions @ axes.T).max(axis=1) < 0.5 * np.abs(positions @ axes.T).max()
-    border, jump = found["border"], found["jump"]
+    border, jump = found.border, found.jump
     has = np.abs(jump).max(axis=1) > 0.9 * np.abs(RED - BLUE).max()
     assert np.mean(has[inner & (np.abs(beyond) < 0.7 * spacing)]) > most
     assert not jump[inner & (np.abs(beyond) > 4 * spacing)].any()
@@ -40,8 +30,8 @@ def test_the_line_between_two_colours_is_found_beside_it_and_nowhere_else(spread
     assert np.median(np.abs(border[near, 3] - np.abs(beyond[near]))) < 0.2 * spacing
     np.testing.assert_allclose(jump[near], np.where(beyond[near, None] > 0, RED - BLUE, BLUE - RED), atol=0.06)
     alone = estimate(positions, np.tile(RED, (len(positions), 1)))
-    assert np.abs(found["gradient"][near]).max() * spacing < 0.2
-    assert not alone["jump"].any()
+    assert np.abs(found.gradient[near]).max() * spacing < 0.2
+    assert not alone.jump.any()
 
 
 def test_one_colour_a_gradient_and_speckles_have_no_borders():
@@ -50,7 +40,7 @@ def test_one_colour_a_gradient_and_speckles_have_no_borders():
     speckled = np.where(np.random.default_rng(0).uniform(size=(len(positions), 1)) < 0.4, BLUE, RED)
     steep = 0.6 + 0.3 * np.sin(10 * beyond)[:, None] * [1.0, -1, 1]
     for color, most in ((np.tile(RED, (len(positions), 1)), 0), (smooth, 0), (steep, 0), (speckled, 0.03)):
-        jump = estimate(positions, color)["jump"]
+        jump = estimate(positions, color).jump
         assert np.mean(np.abs(jump).max(axis=1) > 0.1) <= most
 
 
@@ -59,4 +49,4 @@ def test_few_points_have_finite_borders(count):
     colors = np.stack([RED, BLUE] * 3)[:count]
     found = estimate(np.linspace(-0.5, 0.5, count)[:, None] * [1.0, 0.3, 0.2], colors)
     for name in ("border", "jump"):
-        assert np.isfinite(found[name]).all()
+        assert np.isfinite(getattr(found, name)).all()

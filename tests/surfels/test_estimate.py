@@ -1,27 +1,28 @@
 """Surfels of bodies whose normals, spacing and colours are known."""
 
+import dataclasses
+
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from support.laws import close
-from support.surfel_clouds import even_square, shape
+from support.surfel_clouds import cloud, even_square, shape
+from support.surfel_clouds import estimate as surfels_of
 
-from spnr_jax.surfels import estimate as module
-from spnr_jax.surfels import neighbours, rims, sides
+from spnr_jax.surfels import discs
+from spnr_jax.surfels.neighbors import neighbors
 from spnr_jax.surfels.projection import RADIUS
+from spnr_jax.surfels.rules import RULES
 from spnr_jax.surfels.visibility import tangents
 
 FIELDS = ("normal", "spacing", "gradient", "sided", "visible", "shape")
 
 
 def estimate(positions, color=None, normals=None):
-    """Fields of the surfels of the real points."""
-    count = len(positions)
-    color = np.full((count, 3), 0.5, np.float32) if color is None else np.float32(color)
-    found = module.estimate(np.float32(positions), color, np.full(count, 0.5), np.zeros(count), normals)
-    assert found.mask.sum() == count
-    assert len(found.mask) & (len(found.mask) - 1) == 0
-    assert all(np.isfinite(values).all() for values in vars(found).values())
-    return {name: getattr(found, name)[:count] for name in FIELDS}
+    """Fields of the surfels of points that are all drawn."""
+    found = surfels_of(positions, color, normals=normals)
+    assert found.mask.all()
+    return {name: getattr(found, name) for name in FIELDS}
 
 
 CASES = [
@@ -57,14 +58,21 @@ def test_the_shape_is_0_in_a_plane_and_on_a_line():
     assert estimate(line)["shape"][:, 1].max() < 0.01
 
 
-@pytest.mark.parametrize(("ridge", "off"), [(0.0, 2e-3), (module.RIDGE, 0.05)])
-def test_the_gradient_of_a_colour_that_is_linear_is_exact_but_for_the_ridge(monkeypatch, ridge, off):
-    monkeypatch.setattr(module, "RIDGE", ridge)
-    positions, normals, _ = shape("plane", 700)
+@pytest.mark.parametrize(("ridge", "off"), [(0.0, 2e-3), (RULES.color_ridge, 0.05)])
+def test_the_gradient_of_a_colour_that_is_linear_is_exact_but_for_the_ridge(ridge, off):
+    positions, normals, spacing = shape("plane", 700)
+    axes = np.stack([*tangents(normals[:1]), normals[:1]], axis=1)[0]
     slopes = np.array([[0.3, -0.2, 0.1], [0.0, 0.5, 0.2], [-0.1, 0.1, -0.4]])
-    along = np.stack(tangents(normals[:1]), axis=1)[0]
-    expected = slopes @ along.T @ along  # a plane shows nothing of how the colour changes off it
-    gradient = estimate(positions, 0.5 + positions @ slopes.T)["gradient"]
+    colors = np.float32(0.5 + positions @ slopes.T)
+    near = neighbors(cloud(positions)).T
+    place = ((positions[near] - positions) @ axes[:2].T / spacing).transpose(0, 2, 1)
+    found = discs.fit_colors(
+        *map(jnp.asarray, (place, np.ones(near.shape, np.float32), np.full(700, spacing, np.float32))),
+        *map(jnp.asarray, (np.broadcast_to(axes[..., None], (3, 3, 700)), colors[near].transpose(0, 2, 1))),
+        dataclasses.replace(RULES, color_ridge=ridge),
+    )
+    expected = slopes @ axes[:2].T @ axes[:2]  # a plane shows nothing of how the colour changes off it
+    gradient = np.asarray(found.gradient).T.reshape(-1, 3, 3)
     inner = np.abs(positions).max(axis=1) < 0.4
     assert np.abs(gradient[inner] - expected).max() < off * np.abs(expected).max()
     assert np.abs(estimate(positions)["gradient"]).max() == 0
@@ -90,13 +98,12 @@ def test_points_that_span_no_surface_give_finite_surfels_with_unit_normals(posit
     close(np.linalg.norm(given["normal"], axis=1), np.ones(len(positions)), atol=1e-4)
 
 
-def test_blocks_of_points_and_their_order_change_nothing(monkeypatch):
+def test_blocks_of_points_and_their_order_change_nothing():
     positions, _, _ = shape("sphere", 700, "random")
     color = 0.5 + 0.5 * positions
     whole = estimate(positions, color)
-    monkeypatch.setattr(neighbours, "BLOCK", 97)
     order = np.random.default_rng(3).permutation(len(positions))
-    shuffled = estimate(positions[order], color[order])
+    shuffled = vars(surfels_of(positions[order], color[order], rules=dataclasses.replace(RULES, block=97)))
     for name in FIELDS:
         off = np.abs(shuffled[name] - whole[name][order]).reshape(len(positions), -1).max(axis=1)
         # a visible cell's border is a border: rounding of a normal may move a lifted point over it
@@ -110,7 +117,7 @@ def test_normals_that_are_given_are_kept_and_those_of_the_wrong_sign_turned():
     wrong = np.random.default_rng(1).uniform(size=(800, 1)) < 0.3
     found = estimate(positions, normals=np.where(wrong, -3 * tilted, 3 * tilted))
     close(found["normal"], tilted, atol=1e-5)
-    assert found["sided"].min() >= 1 - sides.LEAK
+    assert found["sided"].min() >= 1 - RULES.leak
 
 
 def test_a_normal_given_on_a_sheet_keeps_its_sign():
@@ -144,11 +151,11 @@ def ends(found, count):
 def test_discs_end_where_the_faces_of_a_cube_meet(known, share):
     positions, normals, spacing = cube(500)
     grey = np.full(len(positions), 0.5, np.float32)
-    found = module.estimate(positions, np.stack([grey] * 3, axis=1), grey, grey, normals if known else None)
+    found = surfels_of(positions, np.stack([grey] * 3, axis=1), grey, grey, normals if known else None)
     assert found.mask.sum() == len(positions)
     places, reach = ends(found, len(positions))
     beyond = (np.abs(places).max(axis=(1, 2)) - 0.5) / spacing
-    assert np.mean(beyond < rims.EDGE + 0.15) > share
+    assert np.mean(beyond < RULES.edge + 0.15) > share
     edge = np.sort(np.abs(positions), axis=1)[:, 1] > 0.5 - 0.5 * spacing  # near an edge: cut there, and not sooner
     assert np.mean(beyond[edge] > -0.2) > share
     assert np.median(reach[np.sort(np.abs(positions), axis=1)[:, 1] < 0.3]) == pytest.approx(RADIUS, abs=0.2)
@@ -157,7 +164,7 @@ def test_discs_end_where_the_faces_of_a_cube_meet(known, share):
 def test_discs_of_a_sheet_end_a_little_beyond_its_last_points():
     positions, normals, spacing = shape("plane", 900)
     grey = np.full(900, 0.5, np.float32)
-    found = module.estimate(positions, np.stack([grey] * 3, axis=1), grey, grey, normals)
+    found = surfels_of(positions, np.stack([grey] * 3, axis=1), grey, grey, normals)
     first, second = np.array([0.8, 0, -0.6]), np.array([-0.36, 0.8, -0.48])
     places, _ = ends(found, 900)
     beyond = (np.abs(np.stack([places @ first, places @ second])).max(axis=(0, 2)) - 0.6) / spacing
@@ -205,7 +212,7 @@ def test_a_disc_whose_back_can_be_seen_keeps_a_little_weight_from_behind_and_tha
     positions, normals, spacing = shape("plane", 500)
     wall = np.concatenate([positions, positions - 0.3 * spacing * normals])
     found = estimate(wall, normals=np.concatenate([normals, -normals]))
-    assert np.mean((found["sided"] > 0.9) & (found["sided"] <= 1 - sides.LEAK)) > 0.9
+    assert np.mean((found["sided"] > 0.9) & (found["sided"] <= 1 - RULES.leak)) > 0.9
     positions, normals, _ = shape("sphere", 800)
     assert np.mean(estimate(positions, normals=normals)["sided"] == 1) > 0.99
 
@@ -216,7 +223,7 @@ def test_what_lies_right_under_a_layer_that_faces_the_same_way_is_not_drawn():
     positions = np.float32(np.concatenate([outer, inner]))
     grey = np.full(3000, 0.5, np.float32)
     normals = np.concatenate([normals, normals[::-1] * [1, 1, -1]]).astype(np.float32)
-    found = module.estimate(positions, np.stack([grey] * 3, axis=1), grey, grey, normals)
+    found = surfels_of(positions, np.stack([grey] * 3, axis=1), grey, grey, normals)
     radius = np.linalg.norm(found.position[found.mask], axis=1)
     assert np.mean(radius > 0.6 - 0.2 * spacing) > 0.97
     assert np.sum(radius > 0.6 - 0.2 * spacing) > 0.98 * 1500

@@ -7,11 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from support.laws import close
-from support.surfel_clouds import camera, even_square, shape, surfels
+from support.surfel_clouds import camera, estimate, even_square, shape, surfels
 
 from spnr_jax.kernels.records import Camera
 from spnr_jax.surfels import features, projection, splatting
-from spnr_jax.surfels.estimate import estimate
 from spnr_jax.surfels.lighting import WIDTH, light_of
 
 QUARTER = np.float32([[0, 0, -1], [0, 1, 0], [1, 0, 0]])  # x to z: from azimuth phi of a map to phi + a quarter turn

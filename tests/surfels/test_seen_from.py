@@ -1,27 +1,30 @@
 """Which directions see a point: laws on simple bodies, and a plain loop."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from support.laws import close
 from support.surfel_clouds import shape
 
 from spnr_jax.surfels import visibility
-from spnr_jax.surfels.visibility import DIRECTIONS, grid_of, seen_from, tangents
+from spnr_jax.surfels.visibility import DIRECTIONS, cell_of, grid_of, seen_from, tangents
+
+GRID = 64
+_seen_from = jax.jit(seen_from, static_argnames="grid")
 
 
 def seen(positions, normals, spacing, mask=None):
     """`seen_from` of NumPy arrays with points equally far apart."""
     count = len(positions)
-    arrays = (np.asarray(x, np.float32) for x in (positions, np.broadcast_to(normals, (count, 3))))
-    cell, grid = grid_of(spacing)
-    spacing = jnp.full(count, spacing, jnp.float32)
+    arrays = (jnp.asarray(np.asarray(x, np.float32).T) for x in (positions, np.broadcast_to(normals, (count, 3))))
     mask = jnp.asarray(np.ones(count, bool) if mask is None else mask)
-    return np.asarray(seen_from(*map(jnp.asarray, arrays), spacing, mask, jnp.float32(cell), grid=grid))
+    cell = cell_of(jnp.float32(spacing), GRID)
+    return np.asarray(_seen_from(*arrays, jnp.full(count, spacing, jnp.float32), mask, cell, grid=GRID)).T
 
 
 def loop(positions, normals, spacing):
     """The same in float64, cell by cell."""
-    cell, grid = grid_of(spacing)
+    cell, grid = float(cell_of(jnp.float32(spacing), GRID)), GRID
     out = np.zeros((len(positions), len(DIRECTIONS)))
     for d, axes in enumerate(zip(DIRECTIONS, *tangents(DIRECTIONS), strict=True)):
         towards, right, up = np.float64(axes)
@@ -93,11 +96,13 @@ def test_directions_are_spread_evenly_over_the_sphere():
 
 
 def test_the_grid_covers_the_box_with_few_sizes_and_never_more_than_1024_cells():
-    grids = {}
-    for spacing in np.geomspace(1e-7, 3.0, 200):
-        cell, grid = grid_of(float(spacing))
-        assert cell * grid >= visibility.BOX * (1 - 1e-6)
-        grids[grid] = cell
-    assert max(grids) == visibility.FINEST
-    assert min(grids) == 16
-    assert len(grids) <= 13
+    for count in 2 ** np.arange(25):
+        grid = grid_of(int(count))
+        assert visibility.COARSEST <= grid <= visibility.FINEST
+        assert grid % 16 == 0
+        for spacing in np.geomspace(1e-7, 3.0, 20):
+            cell = float(cell_of(jnp.float32(spacing), grid))
+            assert cell * grid >= visibility.BOX * (1 - 1e-6)
+            assert cell >= visibility.CELL * spacing * (1 - 1e-6)
+    assert grid_of(16384) == 512
+    assert grid_of(2**24) == visibility.FINEST

@@ -1,10 +1,15 @@
 """Two skins nearer to each other than a layer is thick: colours tell them apart, and nothing else looks like them."""
 
+import functools
+
+import jax
 import numpy as np
 import pytest
+from support.surfel_clouds import PADDED, cloud, estimate
 
-from spnr_jax.surfels import estimate, layers, outward, sheets
-from spnr_jax.surfels.neighbours import each, first_spacing, joined, neighbourhoods
+from spnr_jax.kernels.cloud_arrays import pad
+from spnr_jax.surfels import geometry, outward
+from spnr_jax.surfels.neighbors import neighbors
 from spnr_jax.surfels.visibility import spiral
 
 COUNT = 2000  # points of a skin
@@ -21,25 +26,31 @@ def lined_ball(gap):
     return positions, colors, np.concatenate([skin, -lining]).astype(np.float32)
 
 
+@functools.partial(jax.jit, static_argnames="sheets")
+def _normals(points, sheets):
+    return geometry.find_layers(points, None, firm=False, sided=True, sheets=sheets)[1]
+
+
 def layers_of(positions, colors):
-    """The blocks' layers before and after colours part them, a list of each."""
-    near = neighbourhoods(positions)
-    raw = joined(first_spacing, near)
-    first, no = joined(layers.first_normals, near, [raw] * len(near)), [False] * len(near)
-    before = each(layers.fitted, near, [raw] * len(near), [first] * len(near), no, no)
-    return before, sheets.parted(near, before, raw, np.asfortranarray(colors))
+    """The layers before and after colours part them."""
+    count = len(positions)
+    size = next(size for size in PADDED if size >= count)
+    padded = pad(cloud(positions, base_color=colors), size)
+    number = np.ascontiguousarray(neighbors(padded).T)
+    points = geometry.Points(number, padded.mask, *(np.float32(x).T for x in (padded.positions, padded.base_color)))
+    return [jax.tree.map(lambda x: np.asarray(x)[..., :count], _normals(points, sheets)) for sheets in (False, True)]
 
 
 def changed(positions, colors):
     """Share of the points whose layer colours change."""
-    pairs = zip(*layers_of(np.float32(positions), np.float32(colors)), strict=True)
-    return np.mean(np.concatenate([(one.height != two.height).any(axis=0) for one, two in pairs]))
+    one, two = layers_of(positions, colors)
+    return np.mean((np.abs(one.height - two.height) > 1e-3).any(axis=0))
 
 
 @pytest.mark.parametrize("gap", [0.1, 0.15, 0.3])
 def test_skin_and_lining_face_away_from_each_other_and_are_one_sheet_of_one_colour_without_colours(gap):
     positions, colors, normals = lined_ball(gap)
-    found = estimate.estimate(positions, colors, np.full(2 * COUNT, 0.5), np.zeros(2 * COUNT))
+    found = estimate(positions, colors)
     place, normal = found.position[found.mask], found.normal[found.mask]
     outer = np.linalg.norm(place, axis=1) > 0.6 - 0.5 * gap * SPACING
     outward_share = np.mean(np.sum(normal * place, axis=1)[outer] > 0)
@@ -53,7 +64,7 @@ def test_skin_and_lining_face_away_from_each_other_and_are_one_sheet_of_one_colo
 @pytest.mark.parametrize("gap", [0.1, 0.15])
 def test_true_normals_of_skin_and_lining_are_kept(gap):
     positions, colors, normals = lined_ball(gap)
-    found = estimate.estimate(positions, colors, np.full(2 * COUNT, 0.5), np.zeros(2 * COUNT), normals)
+    found = estimate(positions, colors, normals=normals)
     place, normal = found.position[found.mask], found.normal[found.mask]
     black = found.base_color[found.mask][:, 0] < 0.5
     assert np.mean(np.sum(normal * place, axis=1)[black] < 0) > 0.98 or np.mean(black) < 0.01
@@ -102,4 +113,4 @@ def test_few_points_and_points_that_coincide_have_finite_layers(count):
     for positions in (np.zeros((count, 3)), spiral(count)):
         colors = np.where(np.arange(count)[:, None] % 2, WHITE, BLACK)
         _, after = layers_of(np.float32(positions), np.float32(colors))
-        assert all(np.isfinite(values).all() for of in after for values in of)
+        assert all(np.isfinite(values).all() for values in after)

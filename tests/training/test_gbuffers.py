@@ -15,8 +15,8 @@ from support.tiny_surfels import CONFIG, LIGHT, NAME
 from spnr_jax.formats import data_sets
 from spnr_jax.kernels.cameras import pinhole
 from spnr_jax.kernels.records import Crops, PointCloud, Surfels
-from spnr_jax.method import surfel_renderer
 from spnr_jax.surfels import features, lighting
+from spnr_jax.surfels.surfel_scenes import encode_in_box
 from spnr_jax.surfels.visibility import DIRECTIONS, spiral, tangents
 from spnr_jax.training import gbuffers, optimisation, shading
 
@@ -195,7 +195,7 @@ def test_harmonics_of_the_mirrored_light_are_the_mirrored_ones(axis):
 def test_points_too_far_apart_or_too_near_for_the_reference_teach_nothing():
     item = data_sets.read_object(tiny_surfels.dataset(), NAME)
     camera = jax.tree.map(lambda x: x[0], item.camera)
-    scene = surfel_renderer.encode(item.cloud)
+    scene = encode_in_box(item.cloud)
     for spacing in (3.0, 0.01):  # G-buffers of three pixels, and pictures of twice the reference's size
         other = dataclasses.replace(scene, spacing=spacing)
         assert gbuffers.make_view(other, camera, item.images[0], 1, LIGHT) is None

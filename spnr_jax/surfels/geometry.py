@@ -1,0 +1,301 @@
+"""Surfels from points: what each point knows of the surface around it, as one pure program over given neighbors.
+
+spacing     side of the square that a point stands for, from the neighbors on its own layer of the surface
+normal      given, or that of the layer (layers.py), outward by the votes of directions and walls (sides.py)
+sided       1 where the votes say which side is outside, 0 where both are seen alike (a sheet)
+gradient    of the color along the surface, a ridge regression over the layer: colors are interpolated to first
+            order, but for points beside the border of two colors
+rim, reach  where the disc ends: at the rim of the layer or where another face cuts it (discs.py)
+shape       planarity and linearity: ratios of the neighbors' extents, 0 in a plane, 0 on a line
+
+Points are worked on in blocks, one after the other, so that a million fit into memory; a block reads its neighbors from
+arrays of all points, which are (columns, points) here.
+
+Gradients flow from positions, normals and colors through normals, spacings, ends of discs and colors.  Constants, whose
+gradient is none, are choices: the neighbors, the plane that a layer is fitted from, which neighbor ends a disc or is of
+another color, sides and what turns a normal, what is shown, and what each direction sees.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from spnr_jax.kernels.numerics import clamp
+from spnr_jax.kernels.records import PointCloud, Surfels
+from spnr_jax.surfels import discs, layers, sides
+from spnr_jax.surfels.layers import Hood, Layer, along
+from spnr_jax.surfels.rules import RULES, Rules
+from spnr_jax.surfels.small_systems import frame, measure_shape, root
+from spnr_jax.surfels.visibility import cell_of, grid_of, seen_from
+
+
+class Points(NamedTuple):
+    """All points of a cloud as columns, zeros where they are padding, and the numbers of their neighbors."""
+
+    number: Int[Array, "k points"]
+    mask: Bool[Array, " points"]
+    position: Float[Array, "3 points"]
+    color: Float[Array, "3 points"]
+
+
+def estimate_surfels(cloud: PointCloud, neighbors: Int[Array, "points 20"], rules: Rules = RULES) -> Surfels:
+    """Surfels of the points of a cloud (unbatched) in the box [-1, 1]^3; pure, differentiable, one structure.
+
+    As many as points and in their order.  `mask` is False for padding, and for what nothing outside sees.
+    `neighbors` are those of `spnr_jax.neighbors`: each point itself first, -1 for none.
+    """
+    mask = jnp.asarray(cloud.mask)
+
+    def columns(values: Array) -> Array:
+        return layers.select(mask, jnp.asarray(values).T, 0)
+
+    points = Points(
+        number=layers.select(mask, jnp.asarray(neighbors).T, -1),
+        mask=mask,
+        position=columns(cloud.positions),
+        color=columns(cloud.base_color),
+    )
+    given = None if cloud.normals is None else normalize(columns(cloud.normals))
+    raw, layer = find_layers(points, given, firm=given is not None, sided=True, sheets=given is None, rules=rules)
+    seen = look(points, layer.normal, raw, rules)
+    normal, sided, directions = find_sides(points, raw, layer, seen, given is not None, rules)
+    fields, covered = describe(points, raw, layer, normal, sided, seen, rules)
+    known = jnp.ones_like(raw) if cloud.materials_known is None else columns(cloud.materials_known)
+    fields |= {"roughness": columns(cloud.roughness), "metallic": columns(cloud.metallic), "guessed": 1 - known}
+    fields |= {"position": points.position, "normal": normal, "base_color": points.color, "sided": sided}
+    fields = {name: jnp.moveaxis(layers.select(mask, values, 0), -1, 0) for name, values in fields.items()}
+    fields["gradient"] = fields["gradient"].reshape(-1, 3, 3)
+    fields["spacing"] = jnp.where(mask, fields["spacing"], 1)  # its logarithm is taken
+    return Surfels(**fields, mask=sides.find_shown(directions, covered, mask, rules))
+
+
+def median(values: Float[Array, " points"], mask: Bool[Array, " points"]) -> Float[Array, ""]:
+    """Median of the values where the mask is True; of none, 1."""
+    count = jnp.sum(mask)
+    ordered = jnp.sort(jnp.where(mask, values, jnp.inf))
+    both = ordered[jnp.stack([jnp.maximum(count - 1, 0) // 2, jnp.minimum(count // 2, len(values) - 1)])]
+    return jnp.where(count > 0, jnp.mean(jnp.where(count > 0, both, 1)), 1)
+
+
+def map_blocks(
+    work: Callable[..., Any], points: Points, columns: Float[Array, "columns points"], rules: Rules, *own: Any
+) -> Any:
+    """What the work gives for each block of points, end to end.
+
+    It is called with the neighborhoods of the block, which hold these columns of the neighbors, with the neighbors'
+    numbers, and with the rows of `own` arrays (..., points).  All numbers of a block travel in one array.
+    """
+    count = points.mask.shape[0]
+    size = min(rules.block, count)
+    table = jnp.concatenate([points.position, columns])
+    number, packed = points.number, _pack((points.position, own))
+    forms: list[Any] = []
+
+    def compute(number: Array, packed: Array) -> Array:
+        place, values = _unpack(packed, (points.position, own))
+        out = work(layers.look_around(number, place, table), number, *values)
+        forms.append(out)
+        return _pack(out)
+
+    def skip(number: Array, packed: Array) -> Array:
+        rows = sum(leaf.size // size for leaf in jax.tree.leaves(forms[-1]))
+        return jnp.zeros((rows, size), packed.dtype)
+
+    def one(block: tuple[Array, Array]) -> Array:
+        return jax.lax.cond(jnp.any(block[0] >= 0), compute, skip, *block)  # blocks of padding cost nothing
+
+    if size == count:
+        return _unpack(compute(number, packed), forms[-1])
+
+    found = jax.lax.map(one, (_split(number, size, -1), _split(packed, size, 0)))
+    return _unpack(jnp.moveaxis(found, 0, 1).reshape(found.shape[1], -1)[:, :count], forms[-1])
+
+
+def _split(values: Array, size: int, fill: int) -> Array:
+    """Columns of all points as blocks of so many, filled up."""
+    blocks = -(-values.shape[1] // size)
+    values = jnp.pad(values, [(0, 0), (0, blocks * size - values.shape[1])], constant_values=fill)
+    return jnp.moveaxis(values.reshape(len(values), blocks, size), 1, 0)
+
+
+def _pack(tree: Any) -> Float[Array, "columns points"]:
+    """All arrays (..., points) of a tree below each other; truths as 0 and 1."""
+    leaves = jax.tree.leaves(tree)
+    kind = jnp.result_type(*(leaf.dtype for leaf in leaves if leaf.dtype != bool))
+    return jnp.concatenate([leaf.reshape(-1, leaf.shape[-1]).astype(kind) for leaf in leaves])
+
+
+def _unpack(packed: Float[Array, "columns points"], form: Any) -> Any:
+    """The tree of this form that was packed, of however many points."""
+    leaves, structure = jax.tree.flatten(form)
+    found, first = [], 0
+    for leaf in leaves:
+        rows = leaf.size // leaf.shape[-1]
+        values = packed[first : first + rows].reshape(*leaf.shape[:-1], packed.shape[-1])
+        found.append(values > 0.5 if leaf.dtype == bool else values)
+        first += rows
+    return jax.tree.unflatten(structure, found)
+
+
+def find_layers(
+    points: Points,
+    normals: Float[Array, "3 points"] | None,
+    *,
+    firm: bool,
+    sided: bool,
+    sheets: bool,
+    rules: Rules = RULES,
+) -> tuple[Float[Array, " points"], Layer]:
+    """First spacings, and the layers of given normals or of none.
+
+    Firm normals are kept; sided ones have a side, and tell the sides of a wall apart.  Of two sheets nearer than a
+    layer is thick a point gets its own, where linear colors tell them apart.
+    """
+    roots = root(points.color)
+
+    def fit(hood: Hood, number: Array, *own: Array) -> tuple[Array, Layer, layers.Sheets | None]:
+        raw = discs.first_spacing(hood, rules)
+        weight = layers.weigh_near(hood, raw, rules)
+        first = own[0] if own else layers.find_planes(hood, raw, rules)
+        if sided and own:
+            weight = weight * clamp(0.5 + along(hood.columns[:, 3:], first), 0, 1)
+        unlike = layers.compare_colors(hood, hood.columns[:, :3], rules) if sheets else None
+        return raw, *layers.fit_layers(hood, raw, first, weight, firm, unlike, rules)
+
+    given = () if normals is None else (normals,)
+    raw, layer, found = map_blocks(fit, points, jnp.concatenate([roots, *given]), rules, *given)
+    if found is None:
+        return raw, layer
+
+    def agree(hood: Hood, number: Array, layer: Layer, found: layers.Sheets) -> Layer:
+        unlike = layers.compare_colors(hood, hood.columns[:, :3], rules)
+        return layers.agree_on_sheets(hood, layer, found, unlike, hood.columns[:, 3], rules)
+
+    table = jnp.concatenate([roots, found.certain[None].astype(raw.dtype)])
+    layer = jax.lax.cond(
+        jnp.any(found.certain), lambda: map_blocks(agree, points, table, rules, layer, found), lambda: layer
+    )
+    return raw, layer
+
+
+def look(
+    points: Points, normal: Float[Array, "3 points"], spacing: Float[Array, " points"], rules: Rules = RULES
+) -> Float[Array, "64 points"]:
+    """How much each of 64 directions sees of each point."""
+    middle, grid = median(spacing, points.mask), grid_of(points.mask.shape[0])
+    low, high = rules.bounds_seen
+    bounded = jnp.clip(spacing, low * middle, high * middle)
+    return seen_from(points.position, normal, bounded, points.mask, cell_of(middle, grid), grid=grid)
+
+
+def find_sides(
+    points: Points,
+    raw: Float[Array, " points"],
+    layer: Layer,
+    seen: Float[Array, "64 points"],
+    given: bool,
+    rules: Rules = RULES,
+) -> tuple[Float[Array, "3 points"], Float[Array, " points"], Float[Array, " points"]]:
+    """Normals that point outward, how sure that is, and how many directions see each point, by their cosines."""
+    turned, fixed = layer.normal, jax.lax.stop_gradient((points.position, raw, layer))
+    position, raw, layer = fixed
+    points = points._replace(position=position)
+    front, back = sides.count_facing(layer.normal, seen)
+
+    def vote(votes: Array, first: Array) -> tuple[Array, None]:
+        def share(hood: Hood, number: Array, raw: Array, layer: Layer) -> Array:
+            normals, votes = hood.columns[:, :3], hood.columns[:, 3]
+            walls = sides.vote_of_walls(hood, layer, raw, normals, given, rules)
+            return sides.share_votes(hood, layer, raw, normals, votes, rules) + first * walls
+
+        table = jnp.concatenate([layer.normal, votes[None]])
+        return jnp.clip(map_blocks(share, points, table, rules, raw, layer), -1, 1), None
+
+    leans = (front - back) / (front + back + rules.evidence)
+    towards, _ = jax.lax.scan(vote, leans, jnp.asarray([1, 0], raw.dtype))
+    return *sides.turn_outward(turned, towards, front, back, given, rules), front + back
+
+
+def describe(
+    points: Points,
+    raw: Float[Array, " points"],
+    layer: Layer,
+    normal: Float[Array, "3 points"],
+    sided: Float[Array, " points"],
+    seen: Float[Array, "64 points"],
+    rules: Rules = RULES,
+) -> tuple[dict[str, Array], Bool[Array, " points"]]:
+    """The fields that follow from layers and sides (..., points), and which points another layer covers."""
+    rough, weight, random = find_spacings(points, raw, layer, normal, sided, rules)
+
+    def work(
+        hood: Hood, number: Array, raw: Array, layer: Layer, weight: Array, normal: Array, sided: Array
+    ) -> tuple[dict[str, Array], Array]:
+        normals, colors, sides, spacings = jnp.split(hood.columns, [3, 6, 7], axis=1)
+        axes, spacing = frame(normal), discs.smooth_spacing(weight, spacings[:, 0], rules)
+        flat = jnp.stack([along(hood.offset, axis) for axis in axes[:2]], axis=1)
+        wider = discs.bridge_gaps(flat / spacing[None, None], weight, rules)
+        spacing = spacing * jnp.where(random, wider, 1)
+        place = jax.lax.optimization_barrier(flat / spacing[None, None])
+        there = (weight > 0.5) & (hood.squared < (rules.rim_within * spacing[None]) ** 2)
+        ends = discs.find_farthest(jnp.where(there[:, None], place, 0)) + rules.beyond
+        cuts = discs.find_cuts(hood, axes, spacing, sided, normals, sides[:, 0], rules)
+        rim, reach = discs.find_rims(ends, cuts, axes, rules)
+        colors = discs.fit_colors(place, weight, spacing, axes, colors, rules)
+        own = layers.weigh_near(hood, raw, rules) * layers.weigh_height(layer)
+        fields = colors._asdict() | {
+            "spacing": spacing,
+            "shape": measure_shape(layers.measure_covariance(hood, raw, own)),
+            "rim": rim,
+            "reach": reach,
+        }
+        return fields, layers.find_covered(hood, layer, normal, normals, rules)
+
+    table = jnp.concatenate([normal, points.color, sided[None], rough[None]])
+    fields, covered = map_blocks(work, points, table, rules, raw, layer, weight, normal, sided)
+    return fields | {"visible": average_seen(points, weight, seen, rules)}, covered
+
+
+def average_seen(
+    points: Points, weight: Float[Array, "k points"], seen: Float[Array, "64 points"], rules: Rules = RULES
+) -> Float[Array, "64 points"]:
+    """What directions see of each point, averaged over the nearest of its layer: a depth buffer of points is noisy."""
+    size, rows = min(rules.block, len(points.mask)), seen.T
+
+    def one(block: tuple[Array, Array]) -> Array:
+        return discs.average(*block, rows)
+
+    near = _split(points.number[: rules.smoothed], size, -1), _split(weight[: rules.smoothed], size, 1)
+    return jax.lax.map(one, near).reshape(-1, len(seen))[: len(points.mask)].T
+
+
+def find_spacings(
+    points: Points,
+    raw: Float[Array, " points"],
+    layer: Layer,
+    normal: Float[Array, "3 points"],
+    sided: Float[Array, " points"],
+    rules: Rules = RULES,
+) -> tuple[Float[Array, " points"], Float[Array, "k points"], Bool[Array, ""]]:
+    """Spacings, the neighbors' weights as points of the same layer, and whether the points are spread at random."""
+
+    def weigh(
+        hood: Hood, number: Array, raw: Array, layer: Layer, normal: Array, sided: Array
+    ) -> tuple[Array, Array, Array]:
+        weight = layers.weigh_layer(hood, layer, normal, sided, hood.columns, rules)
+        spacing = discs.own_spacing(hood, weight, raw, rules)
+        return spacing, weight, discs.measure_evenness(*jax.lax.stop_gradient((hood, weight, spacing)))
+
+    rough, weight, evenness = map_blocks(weigh, points, normal, rules, raw, layer, normal, sided)
+    return rough, weight, median(evenness, points.mask) < rules.even
+
+
+def normalize(normals: Float[Array, "3 points"]) -> Float[Array, "3 points"]:
+    """The vectors at length 1; straight up where there is none."""
+    squared = jnp.sum(normals**2, axis=0)
+    some = squared > 0.25
+    up = jnp.asarray([0, 1, 0], normals.dtype)[:, None]
+    return layers.select(some, normals * jax.lax.rsqrt(jnp.where(some, squared, 1))[None], up)

@@ -1,0 +1,76 @@
+"""A cloud as the renderer takes it: its surfels in the box, with the way from the cloud's units to there."""
+
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from spnr_jax.kernels import cloud_arrays
+from spnr_jax.kernels.numerics import clamp, length
+from spnr_jax.kernels.records import AnyArray, PointCloud, SurfelScene
+from spnr_jax.surfels.geometry import estimate_surfels, median
+from spnr_jax.surfels.neighbors import order_in_space
+from spnr_jax.surfels.rules import NEIGHBORS, RULES, Rules
+
+# of XLA: a third to a half off the compilation, and the program runs as long
+QUICK = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 1}
+
+
+def encode(params: Any, cloud: PointCloud, neighbors: Int[AnyArray, "points 20"]) -> SurfelScene:
+    """The surfels of a cloud (unbatched, any units, y up); pure: jit, vmap over equally padded clouds, grad, float64.
+
+    `neighbors` are `spnr_jax.neighbors(cloud)`.  Positions, normals and colors must be finite, those of padding too.
+    The network's `params` are not needed by surfels; they stand here for networks that encode.  All clouds have one
+    structure, whether or not they have normals.  Gradients flow through the box as well: a shift of all points moves
+    the scene's centre.  What is a constant to them is said in `geometry.py`.
+    """
+    del params
+    centre, scale = fit_box(jnp.asarray(cloud.positions), jnp.asarray(cloud.mask))
+    inside = clamp((jnp.asarray(cloud.positions) - centre[None]) * scale, -1, 1)
+    return _make_scene(cloud.replace(positions=inside), neighbors, centre, scale, RULES)
+
+
+def fit_box(
+    positions: Float[Array, "points 3"], mask: Bool[Array, " points"]
+) -> tuple[Float[Array, "3"], Float[Array, ""]]:
+    """Centre and scale: (positions - centre) * scale has its bounding box around 0, with half diagonal 1.
+
+    The scale of points without extent is 1.  Masked points do not count.
+    """
+    some = jnp.any(mask)
+    low = jnp.min(jnp.where(mask[:, None], positions, jnp.inf), axis=0)
+    high = jnp.max(jnp.where(mask[:, None], positions, -jnp.inf), axis=0)
+    low, high = jnp.where(some, low, 0), jnp.where(some, high, 0)
+    diagonal = length(high - low)
+    scale = jnp.where(diagonal > 0, 2 / jnp.where(diagonal > 0, diagonal, 1), 1)
+    return low / 2 + high / 2, scale
+
+
+def encode_in_box(cloud: PointCloud) -> SurfelScene:
+    """Scene of a cloud in the box (unbatched), of centre 0 and scale 1; on the host, compiled once for a bucket.
+
+    Its surfels are those of the real points in an order in which close ones follow each other, padded.
+    """
+    mask = np.asarray(cloud.mask)
+    real = jax.tree.map(lambda x: np.asarray(x, np.float32)[mask], cloud).replace(mask=mask[mask])
+    order, near = order_in_space(real.positions)
+    size = cloud_arrays.bucket(len(order))
+    neighbors = np.full((size, NEIGHBORS), -1, np.int32)
+    neighbors[: len(order), : near.shape[1]] = near
+    return _encode(cloud_arrays.pad(jax.tree.map(lambda x: x[order], real), size), neighbors)
+
+
+def _make_scene(
+    cloud: PointCloud, neighbors: Int[AnyArray, "points 20"], centre: Array, scale: Array, rules: Rules
+) -> SurfelScene:
+    surfels = estimate_surfels(cloud, jnp.asarray(neighbors), rules)
+    spacing = median(jnp.asarray(surfels.spacing), jnp.asarray(surfels.mask))
+    return SurfelScene(surfels=surfels, spacing=spacing, centre=centre, scale=scale)
+
+
+@partial(jax.jit, compiler_options=QUICK)
+def _encode(cloud: PointCloud, neighbors: Int[Array, "points 20"]) -> SurfelScene:
+    return _make_scene(cloud, neighbors, jnp.zeros(3), jnp.ones(()), RULES)

@@ -1,0 +1,186 @@
+"""Laws of `spnr_jax.neighbors` and `spnr_jax.encode`: gradients, vmap, padding, rotation, float64, extremes."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support.laws import close
+from support.surfel_clouds import cloud, shape
+
+import spnr_jax
+from spnr_jax.kernels.cloud_arrays import normalization, pad
+from spnr_jax.surfels import surfel_scenes
+from spnr_jax.surfels.rules import NEIGHBORS
+
+COUNT, SIZE = 150, 160  # real points, and with padding
+CONSTANT = ("visible", "sided", "mask")  # to gradients
+
+
+@functools.cache
+def ball(seed=0):
+    """A lumpy ball of two colours in the cloud's own units, padded."""
+    rng = np.random.default_rng(seed)
+    normals = shape("sphere", COUNT, "random")[1]
+    positions = 30 + 7 * normals * (1 + 0.2 * np.sin(3 * normals[:, :1])) * [1, 1.3, 0.8]
+    colors = np.where(normals[:, :1] > 0.2, [0.8, 0.3, 0.1], [0.1, 0.3, 0.6]) + 0.1 * rng.random((COUNT, 3))
+    return pad(cloud(positions + rng.normal(size=(COUNT, 3)), base_color=colors), SIZE)
+
+
+def with_normals(points):
+    """The cloud with normals that are a little off those of a ball."""
+    away = points.positions - 30
+    away = away / np.linalg.norm(away, axis=1, keepdims=True) + 0.1 * np.roll(away, 1, axis=1) / 7
+    return dataclasses.replace(points, normals=np.float32(away))
+
+
+def projection(columns, points, near):
+    """A number that all of a scene's fields with a gradient take part in, and the scene."""
+    scene = surfel_scenes.encode(None, dataclasses.replace(points, **columns), near)
+    fields = {name: values for name, values in vars(scene.surfels).items() if name not in CONSTANT}
+    fields |= {name: getattr(scene, name) for name in ("spacing", "centre", "scale")}
+    rng = np.random.default_rng(5)
+    weights = {name: rng.normal(size=values.shape) for name, values in sorted(fields.items())}
+    real = scene.surfels.mask
+    total = jnp.zeros((), points.positions.dtype)
+    for name, values in sorted(fields.items()):
+        kept = (
+            jnp.where(real.reshape(-1, *[1] * (values.ndim - 1)), values, 0)
+            if len(values.shape) and len(values) == SIZE
+            else values
+        )
+        total += jnp.sum(jnp.asarray(weights[name], values.dtype) * kept)
+    return total, scene
+
+
+both = jax.jit(jax.value_and_grad(projection, has_aux=True))
+
+
+def columns_of(points):
+    names = ("positions", "base_color", *(() if points.normals is None else ("normals",)))
+    return {name: jnp.asarray(getattr(points, name)) for name in names}
+
+
+def run(points, near):
+    (_, scene), gradients = both(columns_of(points), jax.tree.map(jnp.asarray, points), jnp.asarray(near))
+    return jax.tree.map(np.asarray, (scene, gradients))
+
+
+@pytest.mark.parametrize("given", [False, True])
+def test_gradients_are_those_of_central_differences_in_float64_and_float32_is_near(given):
+    points = with_normals(ball()) if given else ball()
+    near = spnr_jax.neighbors(points)
+    single, gradients32 = run(points, near)
+    with jax.enable_x64(True):
+        wide = jax.tree.map(lambda x: jnp.asarray(np.float64(x) if x.dtype == np.float32 else x), points)
+        columns = columns_of(wide)
+        (_, double), gradients = both(columns, wide, jnp.asarray(near))
+        for name, gradient in gradients.items():
+            rng = np.random.default_rng(1)
+            for _ in range(3):
+                way = rng.normal(size=gradient.shape) * points.mask[:, None]
+                step = 1e-6 * (7 if name == "positions" else 1)
+                ends = [both(columns | {name: columns[name] + s * step * way}, wide, near)[0][0] for s in (1, -1)]
+                slope = float(ends[0] - ends[1]) / (2 * step)
+                np.testing.assert_allclose(np.vdot(gradient, way), slope, rtol=0.01, err_msg=name)
+            assert not np.asarray(gradient)[COUNT:].any()
+            scale = np.abs(gradient).max()
+            assert np.mean(np.abs(gradients32[name] - gradient) > 0.02 * scale) < 0.01
+    for name, values in vars(double.surfels).items():
+        off = np.abs(np.float64(getattr(single.surfels, name)) - np.float64(values)).reshape(SIZE, -1).max(axis=1)
+        assert np.mean(off > 1e-3 * max(np.abs(np.float64(values)).max(), 1)) < 0.02, name
+
+
+def test_clouds_of_equal_padding_are_mapped_as_they_are_encoded_one_by_one_and_stack():
+    clouds = [ball(0), ball(1)]
+    near = [spnr_jax.neighbors(points) for points in clouds]
+    stacked = jax.tree.map(lambda *x: jnp.stack(x), *clouds)
+    np.testing.assert_array_equal(spnr_jax.neighbors(stacked), np.stack(near))
+    mapped = jax.jit(jax.vmap(lambda points, near: surfel_scenes.encode(None, points, near)))(stacked, jnp.stack(near))
+    each = [run(points, of)[0] for points, of in zip(clouds, near, strict=True)]
+    close(mapped, jax.tree.map(lambda *x: np.stack(x), *each), rtol=1e-3, atol=2e-3)
+
+
+def test_the_scene_turns_and_moves_and_grows_with_the_cloud_but_for_what_fixed_directions_see():
+    points = ball()
+    turn = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
+    turn *= np.linalg.det(turn)
+    moved = np.where(points.mask[:, None], 1e3 * points.positions @ turn.T + [5, -4e3, 100], 0)
+    near = spnr_jax.neighbors(points)
+    one = run(points, near)[0]
+    other = run(dataclasses.replace(points, positions=np.float32(moved)), near)[0]
+    # the box does not turn with the points
+    ratio = float(other.scale / one.scale) * 1e3
+    real = one.surfels.mask & other.surfels.mask
+    assert np.mean(one.surfels.mask == other.surfels.mask) > 0.99
+    cosine = np.sum((one.surfels.normal @ turn.T * other.surfels.normal)[real], axis=1)
+    assert np.mean(np.abs(cosine) > 1 - 1e-4) > 0.95
+    close(other.surfels.spacing[real], ratio * one.surfels.spacing[real], rtol=0.05)
+    middle = (other.surfels.position / other.scale + other.centre)[real]
+    close(middle, moved[real], rtol=1e-3, atol=2)
+
+
+EXTREMES = {
+    "one": [[1.0, 2, 3]],
+    "two": [[1.0, 2, 3], [4, 5, 6]],
+    "three": [[1.0, 2, 3], [4, 5, 6], [0, 1, 0]],
+    "coincident": np.zeros((40, 3)),
+    "twice": np.repeat(np.random.default_rng(0).normal(size=(60, 3)), 2, axis=0),
+    "line": np.linspace(-1, 1, 50)[:, None] * [0.6, 0, 0.8],
+    "plane": np.stack(np.meshgrid(np.arange(12.0), np.arange(12.0), [0.0]), -1).reshape(-1, 3),
+    "close": 1e-7 * np.random.default_rng(1).normal(size=(80, 3)),
+    "far": 1e7 * np.random.default_rng(1).normal(size=(80, 3)),
+    "outlier": np.concatenate([1e-7 * np.random.default_rng(1).normal(size=(80, 3)), [[1e7, 0, 0]]]),
+    "none": np.zeros((0, 3)),
+}
+
+
+@pytest.mark.parametrize("given", [False, True])
+@pytest.mark.parametrize("name", EXTREMES)
+def test_values_and_gradients_are_finite_for_any_points(name, given):
+    positions = np.reshape(EXTREMES[name], (-1, 3))
+    colors = np.random.default_rng(2).integers(0, 2, (len(positions), 3))  # black among them
+    points = pad(cloud(positions, base_color=colors), SIZE)
+    if given:
+        points = dataclasses.replace(points, normals=np.zeros((SIZE, 3), np.float32))
+    scene, gradients = run(points, spnr_jax.neighbors(points))
+    for leaf in jax.tree.leaves((scene, gradients)):
+        assert np.isfinite(leaf).all()
+    assert scene.surfels.mask.sum() == len(positions)
+    close(np.linalg.norm(scene.surfels.normal[: len(positions)], axis=1), np.ones(len(positions)), atol=1e-4)
+
+
+def test_neighbors_are_the_nearest_of_the_real_points_and_each_is_its_own_first():
+    rng = np.random.default_rng(3)
+    points = cloud(rng.normal(size=(90, 3)))
+    points = dataclasses.replace(points, mask=rng.random(90) < 0.7)
+    found = spnr_jax.neighbors(points)
+    assert found.dtype == np.int32
+    assert found.shape == (90, NEIGHBORS)
+    distance = np.linalg.norm(points.positions[:, None] - points.positions, axis=2)
+    for i in range(90):
+        others = [j for j in np.argsort(distance[i]) if points.mask[j]][:NEIGHBORS]
+        np.testing.assert_array_equal(found[i], others if points.mask[i] else -1)
+    few = spnr_jax.neighbors(cloud(np.zeros((3, 3))))
+    np.testing.assert_array_equal(few[:, 0], np.arange(3))
+    assert np.all(np.sort(few[:, :3]) == np.arange(3))
+    assert np.all(few[:, 3:] == -1)
+    np.testing.assert_array_equal(spnr_jax.neighbors(cloud(np.zeros((50, 3))))[:, 0], np.arange(50))
+
+
+def test_the_box_is_that_of_the_handle_and_clouds_of_one_bucket_share_a_program():
+    points = ball()
+    centre, scale = normalization(points.positions[points.mask])
+    scene, _ = run(points, spnr_jax.neighbors(points))
+    close((scene.centre, scale), (centre, scene.scale), rtol=1e-6)
+    before = surfel_scenes._encode._cache_size()
+    for count in (300, 400):
+        positions = shape("sphere", count)[0]
+        found = surfel_scenes.encode_in_box(cloud(positions))
+        assert found.surfels.mask.shape == (512,)
+        assert found.surfels.mask.sum() == count
+        order = np.lexsort(np.asarray(found.surfels.position)[:count].T)
+        close(np.asarray(found.surfels.position)[order], positions[np.lexsort(positions.T)])
+    assert surfel_scenes._encode._cache_size() == before + 1
