@@ -20,7 +20,6 @@ from typing import Annotated
 import tyro
 
 from spnr_jax import methods, presets
-from spnr_jax.config import SurfelConfig
 from spnr_jax.devices import allocator, compilation
 from spnr_jax.errors import UserError, guarded, split_debug
 from spnr_jax.tools.commands import Evaluate, Export, Train, View
@@ -208,25 +207,21 @@ def run_export(command: Export) -> None:
     from spnr_jax.training import weights
 
     trained, where = weights.read_trained(command.run), command.platforms
-    if isinstance(trained.config.model, SurfelConfig):
-        raise UserError(
-            f"{command.run}: sizes of a picture of surfels are counted first, so it is no single function "
-            "to export; use a network of rays, such as small"
-        )
     handle = model.Model(config=trained.config.model, variables=trained.variables)
     weights.write_weights(command.out / "weights.npz", trained)
+    sizes = {"resolution": command.resolution, "reach": command.reach, "num_points": command.num_points or 1024}
     functions = {
-        "encode": export.export_encode(handle, num_points=command.num_points or 1024, platforms=where),
-        "render": export.export_render(
-            handle, resolution=command.resolution, quality=command.quality, reach=command.reach, platforms=where
-        ),
+        "encode": export.export_encode(handle, num_points=sizes["num_points"], platforms=where),
+        "render": export.export_render(handle, quality=command.quality, platforms=where, **sizes),
     }
+    if handle.config.method == "surfels":
+        write_whole(command.out / "light.npz", export.room_light())
     for name, content in functions.items():
         write_whole(command.out / f"{name}.jax", content)
         write_whole(command.out / f"{name}.stablehlo", export.stablehlo(content))
     signatures = {name: export.signature(content) for name, content in functions.items()}
     write_whole(command.out / "export.json", (json.dumps(signatures, indent=1) + "\n").encode())
-    print(f"wrote weights.npz, encode and render to {command.out} (export.json says what they take and give)")
+    print(f"wrote the weights, encode and render to {command.out} (export.json says what they take and give)")
 
 
 def run_share(command: Share) -> None:
