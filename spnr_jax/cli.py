@@ -209,10 +209,12 @@ def run_export(command: Export) -> None:
     trained, where = weights.read_trained(command.run), command.platforms
     handle = model.Model(config=trained.config.model, variables=trained.variables)
     weights.write_weights(command.out / "weights.npz", trained)
-    sizes = {"resolution": command.resolution, "reach": command.reach, "num_points": command.num_points or 1024}
+    points, size, quality = command.num_points or 1024, command.resolution, command.quality
     functions = {
-        "encode": export.export_encode(handle, num_points=sizes["num_points"], platforms=where),
-        "render": export.export_render(handle, quality=command.quality, platforms=where, **sizes),
+        "encode": export.export_encode(handle, num_points=points, platforms=where),
+        "render": export.export_render(
+            handle, resolution=size, quality=quality, reach=command.reach, num_points=points, platforms=where
+        ),
     }
     if handle.config.method == "surfels":
         write_whole(command.out / "light.npz", export.room_light())
