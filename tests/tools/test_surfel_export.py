@@ -54,6 +54,7 @@ def arrays(record, names):
     return {name: np.asarray(getattr(record, name)) for name in names.split()}
 
 
+@pytest.mark.ci
 def test_a_process_that_knows_jax_alone_draws_the_pictures_of_the_pure_functions(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(cli, "set_up_jax", lambda **_: None)  # it would write to the home folder
     folder = tmp_path / "exported"
