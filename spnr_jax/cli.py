@@ -19,7 +19,6 @@ from typing import Annotated
 import tyro
 
 from spnr_jax import methods, presets
-from spnr_jax.config import SurfelConfig
 from spnr_jax.devices import allocator, compilation
 from spnr_jax.errors import UserError, guarded, split_debug
 from spnr_jax.tools.commands import Evaluate, Export, Train, View
@@ -207,25 +206,23 @@ def run_export(command: Export) -> None:
     from spnr_jax.training import weights
 
     trained, where = weights.read_trained(command.run), command.platforms
-    if isinstance(trained.config.model, SurfelConfig):
-        raise UserError(
-            f"{command.run}: sizes of a picture of surfels are counted first, so it is no single function "
-            "to export; use a network of rays, such as small"
-        )
     handle = model.Model(config=trained.config.model, variables=trained.variables)
     weights.write_weights(command.out / "weights.npz", trained)
+    points, size, quality = command.num_points or 1024, command.resolution, command.quality
     functions = {
-        "encode": export.export_encode(handle, num_points=command.num_points or 1024, platforms=where),
+        "encode": export.export_encode(handle, num_points=points, platforms=where),
         "render": export.export_render(
-            handle, resolution=command.resolution, quality=command.quality, reach=command.reach, platforms=where
+            handle, resolution=size, quality=quality, reach=command.reach, num_points=points, platforms=where
         ),
     }
+    if handle.config.method == "surfels":
+        write_whole(command.out / "light.npz", export.room_light())
     for name, content in functions.items():
         write_whole(command.out / f"{name}.jax", content)
         write_whole(command.out / f"{name}.stablehlo", export.stablehlo(content))
     signatures = {name: export.signature(content) for name, content in functions.items()}
     write_whole(command.out / "export.json", (json.dumps(signatures, indent=1) + "\n").encode())
-    print(f"wrote weights.npz, encode and render to {command.out} (export.json says what they take and give)")
+    print(f"wrote the weights, encode and render to {command.out} (export.json says what they take and give)")
 
 
 def run_share(command: Share) -> None:

@@ -6,6 +6,8 @@ import shutil
 import tomllib
 from pathlib import Path
 
+import jax
+import numpy as np
 import pytest
 import yaml
 from support import tiny_dataset, tiny_surfels, tiny_untrained
@@ -43,10 +45,15 @@ def execute(path):
     return names
 
 
-def test_the_readmes_example_draws_a_picture(workplace):
+def test_the_readmes_example_draws_pictures_and_has_a_gradient(workplace, monkeypatch):
+    monkeypatch.setattr(weights, "shipped", lambda name: tiny_surfels.run())
     names = execute(ROOT / "README.md")
     assert names["rendering"].image.shape[-1] == 3
-    assert (workplace / "ball.png").stat().st_size > 100
+    pictures, by_color = np.asarray(names["pictures"]), np.asarray(names["by_color"])
+    assert pictures.shape == (2, 128, 128, 3)
+    assert np.abs(pictures[0] - pictures[1]).max() > 0.05, "two lights"
+    assert np.isfinite(by_color).all()
+    assert np.any(by_color)
 
 
 @pytest.mark.ci
@@ -63,12 +70,27 @@ def test_the_examples_of_the_fourteen_functions_run_in_their_order(workplace, mo
 
 
 def test_the_example_without_this_package_runs_on_what_the_command_writes(workplace):
-    model = spnr_jax.load("runs/demo/paper")
+    model = spnr_jax.load(tiny_surfels.run())
     (workplace / "exported").mkdir()
     (workplace / "exported" / "encode.jax").write_bytes(export.export_encode(model, num_points=1024))
     (workplace / "exported" / "render.jax").write_bytes(export.export_render(model, resolution=128))
+    (workplace / "exported" / "light.npz").write_bytes(export.room_light())
     names = execute(DOCS / "functions.md")
     assert "spnr_jax" not in names
+    assert names["picture"]["acc"].max() > 0.5
+
+
+@pytest.mark.ci
+def test_the_examples_of_differentiable_rendering_give_gradients_and_pictures_that_differ(workplace, monkeypatch):
+    monkeypatch.setattr(weights, "shipped", lambda name: tiny_surfels.run())
+    names = execute(DOCS / "differentiable.md")
+    pictures = np.asarray(names["pictures"])
+    assert pictures.shape == (2, 3, 64, 64, 3)
+    assert pictures.std(axis=(0, 1)).max() > 0.01
+    for name in ("by_color", "by_positions", "by_camera", "by_light"):
+        leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(names[name])]
+        assert all(np.isfinite(leaf).all() for leaf in leaves)
+        assert all(np.any(leaf) for leaf in leaves), f"{name}: nothing depends on it"
 
 
 def test_the_lights_of_the_page_about_them_are_made_as_it_says():

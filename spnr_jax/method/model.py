@@ -17,11 +17,12 @@ from typing import Literal, get_args
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from spnr_jax.config import NetworkConfig
 from spnr_jax.errors import UserError
 from spnr_jax.kernels import cameras, cloud_arrays
-from spnr_jax.kernels.records import Camera, Light, PointCloud, Rendering, Volume
+from spnr_jax.kernels.records import AnyArray, Camera, Light, PointCloud, Rendering, SurfelScene, Volume
 from spnr_jax.method import inference
 
 FIELD_OF_VIEW, DISTANCE = np.deg2rad(40.0), 3.0  # of the training cameras; the object fits into the unit sphere
@@ -87,9 +88,16 @@ class Model:
         return self._pictures.draw_each(self.variables, volume, views, lights, config=self.config, quality=quality)
 
     def camera(
-        self, volume: Volume, azimuth: float = 30.0, elevation: float = 20.0, resolution: int | None = None
+        self,
+        volume: Volume | SurfelScene,
+        azimuth: float | Float[AnyArray, ""] = 30.0,
+        elevation: float | Float[AnyArray, ""] = 20.0,
+        resolution: int | None = None,
     ) -> Camera:
-        """Camera that sees the whole object: degrees around the y axis from +z, and above the horizon."""
+        """Camera that sees the whole object: degrees around the y axis from +z, and above the horizon.
+
+        Pure: angles and object may be traced.
+        """
         size = resolution or self.config.image_resolution
         return _orbit(azimuth, elevation, volume.centre, volume.scale, size=size)
 

@@ -207,7 +207,7 @@ def render(
     _check(scene, camera, light, plan)
     light = lighting.room_light() if light is None else light
     known = None
-    if plan.solid and params is not None and "batch_stats" in params:
+    if plan.solid and params is not None and params.get("batch_stats"):
         inside = cameras.in_box(camera, scene.centre, scene.scale)
         known = solid_picture(params, solid.of_surfels(params["batch_stats"], scene.surfels), inside, plan)
     blended = blend_window(scene, camera, light, plan=plan)

@@ -81,7 +81,8 @@ class Export:
     clean: Literal["auto", "off", "strong"] = "auto"
     """As for `spnr render`, for --splats and --mesh."""
     out: Path = Path("exported")
-    """Folder for weights.npz, encode.jax, render.jax, both as .stablehlo, and export.json: what they take and give."""
+    """Folder for weights.npz, encode.jax, render.jax, both as .stablehlo, and export.json: what they take and give;
+    of a network over surfels also light.npz, the room."""
     num_points: int | None = None
     """Points of a cloud, padding included; exactly so many (default: 1,024).  With --splats and --mesh, points used
     of a bigger cloud (default: 16,384)."""

@@ -1,7 +1,7 @@
 """A trained network as bytes that need JAX alone: `encode` and `render` as serialised StableHLO, weights included.
 
     encode, render = (load_exported(content) for content in (export_encode(model), export_render(model)))
-    picture = render(encode(cloud), camera)
+    picture = render(encode(cloud), camera, light)  # without the light of a ray-marching network
 
 Inputs and outputs are dicts of arrays, so no class of this package is needed where they are used; there
 `jax.export.deserialize(content).call` does what `load_exported` does.  All sizes are fixed, those of one bucket:
@@ -11,6 +11,8 @@ Inputs and outputs are dicts of arrays, so no class of this package is needed wh
     volume      what the network makes of a cloud, to be passed on: scene, and the box around it, centre (3,), scale ()
     camera      cam_to_world (3, 4) in the cloud's frame and unit, OpenGL axes; intrinsics (3, 3) in pixels
     picture     image (h, w, 3) sRGB on white; image_lr, depth, acc at the size of the volume rendering
+
+What differs for the default network, over surfels, stands in `surfel_export.py`.
 """
 
 from collections.abc import Callable, Sequence
@@ -25,9 +27,13 @@ from jax import export
 from jaxtyping import Array, Bool, Float
 
 from spnr_jax.errors import UserError
+from spnr_jax.formats.npz import packed
 from spnr_jax.kernels.records import LARGEST_REACH, Camera, PointCloud, Volume
 from spnr_jax.method import inference
 from spnr_jax.method.model import Model, Quality
+from spnr_jax.method.surfel_renderer import Plan
+from spnr_jax.surfels import lighting
+from spnr_jax.tools import surfel_export
 
 Arrays = dict[str, Any]
 MISSING = "exported functions need the package flatbuffers; pip install 'spnr-jax[export]'"
@@ -40,12 +46,16 @@ def export_encode(model: Model, *, num_points: int = 1024, platforms: Sequence[s
     """
     if num_points < 1:
         raise UserError(f"num_points must be at least 1, got {num_points}")
+    if model.config.method == "surfels":
+        return _serialised(
+            partial(surfel_export.encode, model.params), platforms, surfel_export.cloud_shapes(num_points)
+        )
 
     def encode(cloud: Arrays) -> Arrays:
         scene, centre, scale = _encode(model, cloud)
         return {"scene": to_state_dict(scene), "centre": centre, "scale": scale}
 
-    return _serialised(encode, platforms, _cloud_shapes(num_points))
+    return _serialised(encode, platforms, surfel_export.cloud_shapes(num_points))
 
 
 def export_render(
@@ -54,9 +64,14 @@ def export_render(
     resolution: int | None = None,
     quality: Quality = "best",
     reach: int = LARGEST_REACH,
+    num_points: int = 1024,
+    plan: Plan | None = None,
     platforms: Sequence[str] | None = None,
 ) -> bytes:
     """The serialised function `(volume, camera) -> picture` for square pictures, by default of the network's size.
+
+    Of the default network `(volume, camera, light) -> picture`, for scenes of `num_points` points and with a plan's
+    sizes: by default those of a ball of so many points, with room to spare.  The others:
 
     `reach` is how far from points it looks, in voxels: `Model.encode` finds `volume.reach` from how densely the points
     lie, here it is fixed; less is quicker, and too little leaves holes.  `platforms` as for `export_encode`.
@@ -66,15 +81,27 @@ def export_render(
         raise UserError(f"resolution must be a multiple of 4 of at least 16, got {size}")
     if not 1 <= reach <= LARGEST_REACH:
         raise UserError(f"reach must be 1 to {LARGEST_REACH} voxels, got {reach}")
-    scene, centre, scale = jax.eval_shape(partial(_encode, model), _cloud_shapes(num_points=2))
+    camera = {"cam_to_world": _floats(3, 4), "intrinsics": _floats(3, 3)}
+    if model.config.method == "surfels":
+        if quality == "balanced":
+            raise UserError("balanced draws fewer pixels and enlarges them; export a smaller resolution")
+        sizes = plan or surfel_export.make_plan(model, num_points, size)
+        draw = partial(surfel_export.render, None if quality == "draft" else model.params, size=size, plan=sizes)
+        made = jax.eval_shape(partial(surfel_export.encode, model.params), surfel_export.cloud_shapes(num_points))
+        return _serialised(draw, platforms, made, camera, surfel_export.light_shapes())
+    scene, centre, scale = jax.eval_shape(partial(_encode, model), surfel_export.cloud_shapes(num_points=2))
 
     def render(volume: Arrays, camera: Arrays) -> Arrays:
         encoded = Volume(**volume | {"scene": from_state_dict(scene, volume["scene"])}, reach=reach)
         return to_state_dict(model.render(encoded, Camera(**camera, height=size, width=size), quality))
 
     volume = {"scene": to_state_dict(scene), "centre": centre, "scale": scale}
-    camera = {"cam_to_world": _floats(3, 4), "intrinsics": _floats(3, 3)}
     return _serialised(render, platforms, volume, camera)
+
+
+def room_light() -> bytes:
+    """The package's room as the light that the `render` of the default network takes: an .npz of its tables."""
+    return packed({"tables": lighting.room_light().tables}, compressed=True)
 
 
 def load_exported(content: bytes) -> Callable[..., Arrays]:
@@ -117,12 +144,6 @@ def _encode(model: Model, cloud: Arrays) -> tuple[Any, Array, Array]:
     one_object = jax.tree.map(lambda x: x[None], PointCloud(**cloud | {"positions": inside}))
     scene = inference.encode(model.variables, one_object, config=model.config)
     return jax.tree.map(lambda x: x[0], scene), centre, scale
-
-
-def _cloud_shapes(num_points: int) -> Arrays:
-    vectors, scalars = _floats(num_points, 3), _floats(num_points)
-    mask = jax.ShapeDtypeStruct((num_points,), np.bool_)
-    return {"positions": vectors, "base_color": vectors, "roughness": scalars, "metallic": scalars, "mask": mask}
 
 
 def _floats(*shape: int) -> jax.ShapeDtypeStruct:

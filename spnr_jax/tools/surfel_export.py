@@ -1,0 +1,87 @@
+"""The default network as functions of fixed sizes: `spnr_jax.encode` and `spnr_jax.render` over dicts of arrays.
+
+    volume      the scene of `spnr_jax.encode`: surfels, spacing, centre, scale
+    light       tables (7, 32, 64, 3): those of `Light`, linear in the light, so sums and multiples are lights
+    picture     image (h, w, 3) sRGB on white; depth, acc (h, w); overflow (): above 0 the plan was too small
+
+Sizes are fixed when it is exported: the number of points, padding included, and the plan of the picture.  The neighbors
+are found in the exported function, by all distances, a block of points at a time.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax.serialization import to_state_dict
+from jaxtyping import Array, Bool, Float, Int
+
+from spnr_jax.kernels.records import Camera, Light, PointCloud, Surfels, SurfelScene
+from spnr_jax.method import surfel_renderer
+from spnr_jax.method.model import Model
+from spnr_jax.method.surfel_renderer import Plan
+from spnr_jax.surfels import encoding, lighting
+from spnr_jax.surfels.rules import NEIGHBORS
+from spnr_jax.surfels.visibility import spiral
+
+RADIUS = 0.8  # of the ball in the box whose pictures the sizes are those of: as much surface as a cube has
+BLOCK = 256  # points whose distances to all are in memory at once
+
+Arrays = dict[str, Any]
+
+
+def encode(params: dict, cloud: Arrays) -> Arrays:
+    """The scene of a cloud as a dict of arrays; pure."""
+    points = PointCloud(**cloud)
+    near = nearest(jnp.asarray(points.positions), jnp.asarray(points.mask))
+    return dict(to_state_dict(encoding.encode(params, points, near)))
+
+
+def render(params: dict | None, volume: Arrays, camera: Arrays, light: Arrays, *, size: int, plan: Plan) -> Arrays:
+    """The picture of a scene as a dict of arrays; pure."""
+    scene = SurfelScene(**volume | {"surfels": Surfels(**volume["surfels"])})
+    seen = Camera(**camera, height=size, width=size)
+    drawn = surfel_renderer.render(params, scene, seen, Light(**light), plan=plan)
+    return {name: getattr(drawn, name) for name in ("image", "depth", "acc", "overflow")}
+
+
+def nearest(positions: Float[Array, "points 3"], mask: Bool[Array, " points"]) -> Int[Array, "points 20"]:
+    """`spnr_jax.neighbors` in JAX: the nearest points of each, itself first, -1 for none, by all distances."""
+    numbers = jnp.arange(len(mask))
+    count = min(NEIGHBORS, len(mask))
+
+    def of_one(number: Int[Array, ""]) -> Int[Array, " count"]:
+        apart = jnp.sum((positions - positions[number][None]) ** 2, axis=-1)
+        apart = jnp.where(mask, apart, jnp.inf).at[number].set(-1.0)
+        least, found = jax.lax.top_k(-apart, count)
+        return jnp.where(jnp.isfinite(least) & mask[number], found, -1).astype(jnp.int32)
+
+    found = jax.lax.map(of_one, numbers, batch_size=min(BLOCK, len(mask)))
+    return jnp.pad(found, ((0, 0), (0, NEIGHBORS - count)), constant_values=-1)
+
+
+def make_plan(model: Model, num_points: int, size: int) -> Plan:
+    """Sizes for pictures of any object of so many points from where `Model.camera` stands: with room to spare."""
+    ball = np.asarray(RADIUS * spiral(num_points), np.float32)
+    grey = np.full(num_points, 0.5, np.float32)
+    mask = np.ones(num_points, bool)
+    cloud = PointCloud(positions=ball, base_color=grey[:, None].repeat(3, 1), roughness=grey, metallic=grey, mask=mask)
+    scene = encoding.encode_in_box(cloud)
+    volume = scene.replace(centre=jnp.zeros(3), scale=jnp.ones(()))
+    camera = model.camera(volume, resolution=size)
+    made = surfel_renderer.plan(volume, camera)
+    whole = -(-size * made.side // 2**made.doublings) + surfel_renderer.MARGIN
+    side = -(-whole // surfel_renderer.STEP) * surfel_renderer.STEP
+    return made._replace(width=side, height=side, entries=2 * made.entries, slots=side * side)
+
+
+def cloud_shapes(num_points: int) -> Arrays:
+    """What `encode` takes."""
+    vectors, scalars = (jax.ShapeDtypeStruct((num_points, *axes), np.float32) for axes in ((3,), ()))
+    mask = jax.ShapeDtypeStruct((num_points,), np.bool_)
+    return {"positions": vectors, "base_color": vectors, "roughness": scalars, "metallic": scalars, "mask": mask}
+
+
+def light_shapes() -> Arrays:
+    """What `render` takes as its light."""
+    return {"tables": jax.ShapeDtypeStruct((7, lighting.HEIGHT, lighting.WIDTH, 3), np.float32)}
