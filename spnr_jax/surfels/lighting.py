@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from spnr_jax.kernels.numerics import clamp, larger, root, smaller
+from spnr_jax.kernels.numerics import clamp, columns, larger, root, smaller
 from spnr_jax.kernels.records import AnyArray, Light, Surfels
 from spnr_jax.surfels import skies
 from spnr_jax.surfels.envmaps import directions, resampled, solid_angles
@@ -104,11 +104,11 @@ def look_up(tables: Float[Array, "rows 3"], towards: list[Array], first: Array |
     down, right = row - above, column - left
     above, left = above.astype(jnp.int32), left.astype(jnp.int32)
     rows = [jnp.clip(above + i, 0, HEIGHT - 1) * WIDTH + first for i in (0, 1)]
-    columns = [(left + j) % WIDTH for j in (0, 1)]
+    texels = [(left + j) % WIDTH for j in (0, 1)]
     corners = [
-        (rows[i] + columns[j], (down if i else 1 - down) * (right if j else 1 - right)) for i in (0, 1) for j in (0, 1)
+        (rows[i] + texels[j], (down if i else 1 - down) * (right if j else 1 - right)) for i in (0, 1) for j in (0, 1)
     ]
-    return [sum(weight * channel[index] for index, weight in corners) for channel in jnp.asarray(tables).T]
+    return [sum(weight * channel[index] for index, weight in corners) for channel in columns(jnp.asarray(tables))]
 
 
 def irradiance(light: Light, normal: list[Array]) -> list[Array]:
