@@ -8,6 +8,8 @@ Subnormal numbers (below 1.2e-38) are zeros to XLA.
 
 from collections.abc import Callable
 from functools import partial
+from types import ModuleType
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -89,6 +91,11 @@ def root(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     """Square root; 0 with zero gradient where x is 0 or, by rounding, below."""
     valid = x > 0
     return jnp.where(valid, jnp.sqrt(jnp.where(valid, x, 1)), 0)
+
+
+def namespace(*values: Any) -> ModuleType:
+    """jax.numpy if any of the values is an array of JAX, traced or not; NumPy, which compiles nothing, otherwise."""
+    return jnp if any(isinstance(x, jax.Array) for x in values) else np
 
 
 def columns(x: Float[Array, "*batch features"]) -> list[Float[Array, "*batch"]]:

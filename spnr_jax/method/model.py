@@ -25,6 +25,7 @@ from spnr_jax.kernels.records import Camera, Light, PointCloud, Rendering, Volum
 from spnr_jax.method import inference
 
 FIELD_OF_VIEW, DISTANCE = np.deg2rad(40.0), 3.0  # of the training cameras; the object fits into the unit sphere
+Angle = float | int | np.floating | jax.Array  # degrees
 Quality = Literal["draft", "balanced", "best", "trained"]
 
 
@@ -87,9 +88,9 @@ class Model:
         return self._pictures.draw_each(self.variables, volume, views, lights, config=self.config, quality=quality)
 
     def camera(
-        self, volume: Volume, azimuth: float = 30.0, elevation: float = 20.0, resolution: int | None = None
+        self, volume: Volume, azimuth: Angle = 30.0, elevation: Angle = 20.0, resolution: int | None = None
     ) -> Camera:
-        """Camera that sees the whole object: degrees around the y axis from +z, and above the horizon."""
+        """Camera that sees the whole object: degrees around y from +z and above the horizon, which may be traced."""
         size = resolution or self.config.image_resolution
         return _orbit(azimuth, elevation, volume.centre, volume.scale, size=size)
 
