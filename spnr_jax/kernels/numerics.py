@@ -6,7 +6,10 @@ mesh there is one table for each group of objects: in a common one XLA would not
 Subnormal numbers (below 1.2e-38) are zeros to XLA.
 """
 
+from collections.abc import Callable
 from functools import partial
+from types import ModuleType
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -88,6 +91,35 @@ def root(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     """Square root; 0 with zero gradient where x is 0 or, by rounding, below."""
     valid = x > 0
     return jnp.where(valid, jnp.sqrt(jnp.where(valid, x, 1)), 0)
+
+
+def namespace(*values: Any) -> ModuleType:
+    """jax.numpy if any of the values is an array of JAX, traced or not; NumPy, which compiles nothing, otherwise."""
+    return jnp if any(isinstance(x, jax.Array) for x in values) else np
+
+
+def columns(x: Float[Array, "*batch features"]) -> list[Float[Array, "*batch"]]:
+    """The features one by one; their gradients are put side by side once, where those of slices are padded and added.
+
+    Of twenty columns XLA's CPU compiler computes the sum of the padded ones five times as long.
+    """
+    return [part[..., 0] for part in jnp.split(x, x.shape[-1], axis=-1)]
+
+
+def with_gradient(function: Callable, pull_back: Callable) -> Callable:
+    """The function of arrays with the gradient `pull_back(primals, cotangents)`, for both modes of differentiation.
+
+    `pull_back` is linear in the cotangents, a tuple as the outputs are.  A tangent is its transpose; transposed again,
+    as reverse mode does, that is `pull_back` itself, operation by operation.
+    """
+    differentiable = jax.custom_jvp(function)
+
+    def pushed_forward(primals: tuple, tangents: tuple) -> tuple:
+        out = differentiable(*primals)
+        return out, jax.linear_transpose(lambda *given: pull_back(primals, given), *out)(tangents)
+
+    differentiable.defjvp(pushed_forward)
+    return differentiable
 
 
 def normalize(vectors: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3"]:

@@ -5,13 +5,14 @@ batch objects views points rays samples height width features.  Colours of mater
 in [0, 1].  Image sizes are static fields because they shape arrays.
 """
 
-import math
 from typing import Any, no_type_check
 
 import jax
 import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int, UInt8
+
+from spnr_jax.kernels.numerics import namespace
 
 AnyArray = jax.Array | np.ndarray
 LARGEST_REACH = 4  # voxels around points that rays look at, at most
@@ -210,14 +211,17 @@ class Light:
 
     __rmul__ = __mul__
 
-    def turned(self, degrees: float | int) -> "Light":
+    def turned(self, degrees: float | int | jax.Array) -> "Light":
         """The light turned about the up axis: what stood at an azimuth (0 at +z, 90 at +x) stands so much further.
 
-        Exact for multiples of a texel, 5.625 degrees; between them neighbours are mixed.
+        Exact for multiples of a texel, 5.625 degrees; between them neighbours are mixed.  The angle may be traced.
         """
+        xp = namespace(degrees)
         columns = -degrees / 360 * self.tables.shape[-2]  # azimuths run against them
-        whole, part = math.floor(columns), columns - math.floor(columns)
-        places = np.arange(self.tables.shape[-2]) - whole  # indices: jnp.roll is compiled anew for every whole number
+        whole = xp.floor(columns)
+        part = columns - whole
+        # indices: jnp.roll is compiled anew for every whole number
+        places = xp.arange(self.tables.shape[-2]) - whole.astype(int)
         near, far = (self.tables[..., (places - i) % len(places), :] for i in (0, 1))
         return Light(tables=(1 - part) * near + part * far)
 

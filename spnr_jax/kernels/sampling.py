@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Shaped
 
+from spnr_jax.errors import UserError
 from spnr_jax.kernels.numerics import clamp, per_feature, safe_divide
 from spnr_jax.kernels.records import Key
 
@@ -23,13 +24,20 @@ def strata(key: Key | None, shape: tuple[int, ...], num_samples: int) -> Float[A
 
 def split(key: Key) -> tuple[Key, Key]:
     """Two new keys of each key."""
+    key = typed(key)
     if key.ndim:
         return jax.vmap(split)(key)
     first, second = jax.random.split(key)
     return first, second
 
 
+def typed(key: Key) -> Key:
+    """The key, or keys; those of `jax.random.PRNGKey`, pairs of numbers, as ones of `jax.random.key`."""
+    return key if jnp.issubdtype(key.dtype, jax.dtypes.prng_key) else jax.random.wrap_key_data(key)
+
+
 def _uniform(key, shape):
+    key = typed(key)
     return jax.random.uniform(key, shape) if key.ndim == 0 else jax.vmap(_uniform, (0, None))(key, shape[1:])
 
 
@@ -59,6 +67,8 @@ def importance(
     spread.  No gradient: the samples are where to look, not what is seen; through them the coarse weights would be
     pulled towards whatever the fine samples happen to find.
     """
+    if weights.shape[-1] + 1 != edges.shape[-1]:
+        raise UserError(f"importance: {edges.shape[-1]} edges have one weight less, got {weights.shape[-1]} weights")
     edges, weights = jax.lax.stop_gradient((edges, weights))
     mass = weights + padding
     cdf = jnp.cumsum(mass / jnp.sum(mass, axis=-1, keepdims=True), axis=-1)

@@ -26,6 +26,7 @@ from spnr_jax.kernels.records import AnyArray, Camera, Light, PointCloud, Render
 from spnr_jax.method import inference
 
 FIELD_OF_VIEW, DISTANCE = np.deg2rad(40.0), 3.0  # of the training cameras; the object fits into the unit sphere
+Angle = float | int | np.floating | jax.Array  # degrees
 Quality = Literal["draft", "balanced", "best", "trained"]
 
 
@@ -90,8 +91,8 @@ class Model:
     def camera(
         self,
         volume: Volume | SurfelScene,
-        azimuth: float | Float[AnyArray, ""] = 30.0,
-        elevation: float | Float[AnyArray, ""] = 20.0,
+        azimuth: Angle = 30.0,
+        elevation: Angle = 20.0,
         resolution: int | None = None,
     ) -> Camera:
         """Camera that sees the whole object: degrees around the y axis from +z, and above the horizon.

@@ -202,7 +202,11 @@ def render(
     """The object as a camera sees it, a pure function; depth in the cloud's units; light None is the package's room.
 
     One object, one view, one light: batches are `jax.vmap` of it, the plan is static.  Without params discs and light
-    alone.  `overflow` counts what did not fit into the plan.  Gradients: docs/gradients.md.
+    alone.  `overflow` counts what did not fit into the plan.
+
+    Gradients are those of the picture with its integers held: where the window lies, which pixels a disc covers, the
+    order of the discs in a pixel, and that no more than the first 24 count.  Where one of these changes, where a normal
+    turns its back, and at the kinks of clipped numbers the picture is only piecewise smooth.
     """
     _check(scene, camera, light, plan)
     light = lighting.room_light() if light is None else light

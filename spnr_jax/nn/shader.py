@@ -91,19 +91,22 @@ def picture(
     """
     for _ in range(doublings):
         maps = doubled(maps)
-    color, metallic, opacity, factor, summand = (maps[..., i:j] for i, j in ((0, 3), (3, 4), (4, 5), (5, 6), (6, 7)))
-    arriving, unshadowed, mirrored, reflected = (maps[..., i:j] for i, j in ((7, 10), (10, 13), (13, 16), (16, 17)))
-    solid = maps[..., 17:18]
-    base = clamp(color + COLOR_STEP * outputs[..., 0:3], 0, 1)
-    share = nn.sigmoid(outputs[..., 19:20])  # how far the rays are trusted beside the discs
+    color, metallic, opacity, factor, summand, arriving, unshadowed, mirrored, reflected, solid = jnp.split(
+        maps, (3, 4, 5, 6, 7, 10, 13, 16, 17), axis=-1
+    )
+    step, odds_step, shade, open_sky, shine, glow, bounce, bounces, trust, metal_step, rougher = jnp.split(
+        outputs, (3, 4, 5, 6, 7, 8, 11, 19, 20, 21), axis=-1
+    )
+    base = clamp(color + COLOR_STEP * step, 0, 1)
+    share = nn.sigmoid(trust)  # how far the rays are trusted beside the discs
     odds = (1 - share) * log_odds(opacity) + share * log_odds(solid)
-    alpha = nn.sigmoid(odds + ODDS_STEP * outputs[..., 3:4]) * one_minus_exp(opacity / NOTHING)
-    bounced = outputs[..., 8:11] * ambient[:, None, None, 0]
-    bounced += jnp.einsum("bhwk,bkc->bhwc", outputs[..., 11:19], ambient[:, 1:], precision="highest")
-    metallic = clamp(metallic + COLOR_STEP * outputs[..., 20:21], 0, 1)
-    mirrored += clamp(outputs[..., 21:22], 0, 1) * (unshadowed - mirrored)  # rougher than it is said to be
-    diffuse = (1 + outputs[..., 4:5]) * arriving + outputs[..., 5:6] * unshadowed + bounced
-    specular = (1 + outputs[..., 6:7]) * reflected + outputs[..., 7:8]
+    alpha = nn.sigmoid(odds + ODDS_STEP * odds_step) * one_minus_exp(opacity / NOTHING)
+    bounced = bounce * ambient[:, None, None, 0]
+    bounced += jnp.einsum("bhwk,bkc->bhwc", bounces, ambient[:, 1:], precision="highest")
+    metallic = clamp(metallic + COLOR_STEP * metal_step, 0, 1)
+    mirrored += clamp(rougher, 0, 1) * (unshadowed - mirrored)  # rougher than it is said to be
+    diffuse = (1 + shade) * arriving + open_sky * unshadowed + bounced
+    specular = (1 + shine) * reflected + glow
     normal_incidence = SPECULAR * (1 - metallic) + base * metallic
     linear = base * (1 - metallic) * diffuse + (normal_incidence * factor + summand) * mirrored * specular
     return smaller(linear_to_srgb(larger(linear, 0)), 1), alpha[..., 0]

@@ -7,6 +7,9 @@ along the azimuth phi = 2 pi (c + 0.5) / w, where the direction is (sin phi, 0, 
 import numpy as np
 from jaxtyping import Float
 
+from spnr_jax.kernels.numerics import namespace
+from spnr_jax.kernels.records import AnyArray
+
 
 def directions(height: int) -> Float[np.ndarray, "height width 3"]:
     """Unit directions through the middles of a map's texels."""
@@ -24,15 +27,16 @@ def solid_angles(height: int) -> Float[np.ndarray, "height width"]:
     return np.repeat(rows[:, None], 2 * height, axis=1).astype(np.float32)
 
 
-def resampled(envmap: Float[np.ndarray, "h w 3"], height: int) -> Float[np.ndarray, "height width 3"]:
+def resampled(envmap: Float[AnyArray, "h w 3"], height: int) -> Float[AnyArray, "height width 3"]:
     """A map of another size: each texel is the mean over its solid angle of those that it overlaps; energy is kept."""
     rows = _shares(
         -np.cos(np.pi * np.arange(envmap.shape[0] + 1) / envmap.shape[0]),
         -np.cos(np.pi * np.arange(height + 1) / height),
     )
     columns = _shares(np.linspace(0, 1, envmap.shape[1] + 1), np.linspace(0, 1, 2 * height + 1))
-    narrow = np.tensordot(rows, envmap, axes=(1, 0))
-    return np.ascontiguousarray(np.tensordot(narrow, columns, axes=(1, 1)).swapaxes(1, 2))
+    xp = namespace(envmap)
+    narrow = xp.tensordot(rows, envmap, axes=(1, 0))
+    return xp.tensordot(narrow, columns, axes=(1, 1)).swapaxes(1, 2)
 
 
 def _shares(old: np.ndarray, new: np.ndarray) -> np.ndarray:

@@ -5,14 +5,14 @@ how the object, the camera and the light are turned together, nor on the unit of
 """
 
 import dataclasses
-from functools import reduce
+from functools import partial, reduce
 from operator import add
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from spnr_jax.kernels.colors import linear_to_srgb
-from spnr_jax.kernels.numerics import clamp, larger, normalize, one_minus_exp, root, smaller
+from spnr_jax.kernels.numerics import clamp, columns, larger, normalize, one_minus_exp, root, smaller, with_gradient
 from spnr_jax.kernels.records import Camera, GBuffer, Light, Surfels
 from spnr_jax.surfels import lighting
 from spnr_jax.surfels.visibility import DIRECTIONS
@@ -46,10 +46,10 @@ def attributes(surfels: Surfels, light: Light, camera: Camera) -> Float[Array, "
     mirror = 2 * jnp.abs(along) * jnp.where(along < 0, -1.0, 1.0) * surfels.normal - view
     lobe = jnp.exp(lighting.LOBE * (jnp.einsum("pi,di->pd", mirror, DIRECTIONS, precision="highest") - 1))
     reflected = jnp.sum(surfels.visible * lobe, axis=1) / jnp.sum(lobe, axis=1)
-    columns = [surfels.roughness, surfels.metallic, lighting.arriving(surfels, light), reflected, openness]
-    columns += [jnp.einsum("pi,ij->pj", bent, rotation, precision="highest"), surfels.base_color, surfels.shape]
-    columns += [surfels.sided, surfels.guessed]
-    return jnp.concatenate([x[:, None] if x.ndim == 1 else x for x in map(jnp.asarray, columns)], axis=1)
+    parts = [surfels.roughness, surfels.metallic, lighting.arriving(surfels, light), reflected, openness]
+    parts += [jnp.einsum("pi,ij->pj", bent, rotation, precision="highest"), surfels.base_color, surfels.shape]
+    parts += [surfels.sided, surfels.guessed]
+    return jnp.concatenate([x[:, None] if x.ndim == 1 else x for x in map(jnp.asarray, parts)], axis=1)
 
 
 def features(
@@ -59,9 +59,10 @@ def features(
 
     `solid` is the opacity and the depth along the camera's axis that the network of rays sees; None is not known.
     """
-    roughness, metallic, *arriving, reflected, openness = jnp.moveaxis(buffer.attributes, -1, 0)[:7]
-    bent, blended = buffer.attributes[..., 7:10], buffer.attributes[..., 10:13]
-    planarity, linearity, sided, guessed = jnp.moveaxis(buffer.attributes, -1, 0)[13:17]
+    first, bent, blended, last = jnp.split(buffer.attributes, (7, 10, 13), axis=-1)
+    (roughness, metallic, *arriving, reflected, openness), (planarity, linearity, sided, guessed) = map(
+        columns, (first, last)
+    )
     told = (buffer.centres / (buffer.centres + LEAST_CENTRES))[..., None]  # without discs near by the blended one
     color = clamp(blended + told * clamp(buffer.color - blended, -TRUST, TRUST), 0, 1)
     normal, view = _directions(buffer, camera)
@@ -87,7 +88,7 @@ def features(
     pattern = [drawn * x for x in pattern]
     seen = jnp.concatenate([drawn * seen, drawn, *pattern, known, drawn * guessed[..., None]], axis=-1)
     unshadowed = lighting.irradiance(light, turned[0]), lighting.mirrored(light, turned[1], roughness)
-    maps = [*jnp.moveaxis(color, -1, 0), metallic, covered, factor, summand, *arriving]
+    maps = [*columns(color), metallic, covered, factor, summand, *arriving]
     return seen, jnp.stack([*maps, *unshadowed[0], *unshadowed[1], reflected, opacity], axis=-1)
 
 
@@ -95,11 +96,11 @@ def _directions(buffer: GBuffer, camera: Camera) -> tuple[list[Array], list[Arra
     """Unit normals and rays' directions, camera axes, as columns; the camera's axis where there is no normal."""
     size = root(jnp.sum(buffer.normal**2, axis=-1))
     known = size > 1e-3
-    normal = [buffer.normal[..., i] / larger(size, 1e-4) for i in range(3)]
+    normal = [n / larger(size, 1e-4) for n in columns(buffer.normal)]
     normal = [jnp.where(known, n, c) for n, c in zip(normal, (0.0, 0.0, 1.0), strict=True)]
-    columns, rows = jnp.arange(camera.width) + 0.5, jnp.arange(camera.height) + 0.5
-    right = jnp.broadcast_to(((columns - camera.intrinsics[0, 2]) / camera.intrinsics[0, 0])[None], size.shape)
-    up = jnp.broadcast_to(-((rows - camera.intrinsics[1, 2]) / camera.intrinsics[1, 1])[:, None], size.shape)
+    across, down = jnp.arange(camera.width) + 0.5, jnp.arange(camera.height) + 0.5
+    right = jnp.broadcast_to(((across - camera.intrinsics[0, 2]) / camera.intrinsics[0, 0])[None], size.shape)
+    up = jnp.broadcast_to(-((down - camera.intrinsics[1, 2]) / camera.intrinsics[1, 1])[:, None], size.shape)
     length = jnp.sqrt(right**2 + up**2 + 1)
     return normal, [right / length, up / length, -1 / length]
 
@@ -116,9 +117,15 @@ def _relief(buffer: GBuffer, spacing: Float[Array, "height width"], reach: int) 
     return jnp.where(buffer.opacity > LEAST, jnp.tanh((buffer.depth - mean) / (4 * spacing)), 0)
 
 
-def _box(values: Float[Array, "height width"], reach: int) -> Float[Array, "height width"]:
-    """Sums over squares of pixels; there is nothing beyond the picture."""
+def _plain_box(values: Float[Array, "height width"], reach: int) -> Float[Array, "height width"]:
     height, width = values.shape
     padded = jnp.pad(values, reach)
     down = reduce(add, [padded[i : i + height] for i in range(2 * reach + 1)])
     return reduce(add, [down[:, i : i + width] for i in range(2 * reach + 1)])
+
+
+def _box(values: Float[Array, "height width"], reach: int) -> Float[Array, "height width"]:
+    """Sums over squares of pixels; there is nothing beyond the picture.  It is its own transpose."""
+    plain = partial(_plain_box, reach=reach)
+    summed = with_gradient(lambda x: (plain(x),), lambda primals, given: (plain(*given),))
+    return summed(values)[0]

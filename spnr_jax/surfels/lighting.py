@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from spnr_jax.kernels.numerics import clamp, larger, root, smaller
+from spnr_jax.kernels.numerics import clamp, columns, larger, namespace, root, smaller
 from spnr_jax.kernels.records import AnyArray, Light, Surfels
 from spnr_jax.surfels import skies
 from spnr_jax.surfels.envmaps import directions, resampled, solid_angles
@@ -44,11 +44,12 @@ def _lobes() -> Float[np.ndarray, "tables texels texels"]:
     return weights / weights.sum(axis=-1, keepdims=True)
 
 
-def light_of(envmap: Float[np.ndarray, "height width 3"]) -> Light:
-    """The light of a map of any size whose width is twice its height; energy is kept."""
-    small = resampled(np.asarray(envmap, np.float32), HEIGHT)
-    tables = (_lobes() @ small.reshape(-1, 3)).reshape(-1, HEIGHT, WIDTH, 3)
-    return Light(tables=np.concatenate([tables[:1], small[None], tables[1:]]))
+def light_of(envmap: Float[AnyArray, "height width 3"]) -> Light:
+    """The light of a map of any size whose width is twice its height; energy is kept.  Of a traced map a traced one."""
+    xp = namespace(envmap)
+    small = resampled(envmap if xp is jnp else np.asarray(envmap, np.float32), HEIGHT)
+    tables = xp.matmul(_lobes(), small.reshape(-1, 3)).reshape(-1, HEIGHT, WIDTH, 3)
+    return Light(tables=xp.concatenate([tables[:1], small[None], tables[1:]]))
 
 
 @cache
@@ -66,22 +67,18 @@ def made_room_light() -> Light:
     return light_of(SCALE * indoor_envmap())
 
 
-def sun(
-    azimuth: float | int,
-    elevation: float | int,
-    size: float | int = 3.0,
-    color: tuple[float, float, float] = (1.0, 1.0, 1.0),
-) -> Light:
+def sun(azimuth: skies.Angle, elevation: skies.Angle, size: skies.Angle = 3.0, color: skies.Color = (1, 1, 1)) -> Light:
     """A round lamp far away: degrees as `Model.camera` counts them, `size` across, irradiance of what faces it.
 
-    Shadows come from 64 directions, so they are never sharper than some ten degrees.
+    Each of these may be traced.  Shadows come from 64 directions, so they are never sharper than some ten degrees.
     """
     return light_of(skies.lamp(azimuth, elevation, size, color))
 
 
-def ambient(color: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Light:
+def ambient(color: skies.Color = (1, 1, 1)) -> Light:
     """The same radiance from everywhere."""
-    return light_of(np.broadcast_to(np.array(color, np.float32), (HEIGHT, WIDTH, 3)))
+    xp = namespace(color)
+    return light_of(xp.broadcast_to(xp.asarray(color, np.float32), (HEIGHT, WIDTH, 3)))
 
 
 def background(light: Light, towards: list[Array]) -> list[Array]:
@@ -104,11 +101,11 @@ def look_up(tables: Float[Array, "rows 3"], towards: list[Array], first: Array |
     down, right = row - above, column - left
     above, left = above.astype(jnp.int32), left.astype(jnp.int32)
     rows = [jnp.clip(above + i, 0, HEIGHT - 1) * WIDTH + first for i in (0, 1)]
-    columns = [(left + j) % WIDTH for j in (0, 1)]
+    texels = [(left + j) % WIDTH for j in (0, 1)]
     corners = [
-        (rows[i] + columns[j], (down if i else 1 - down) * (right if j else 1 - right)) for i in (0, 1) for j in (0, 1)
+        (rows[i] + texels[j], (down if i else 1 - down) * (right if j else 1 - right)) for i in (0, 1) for j in (0, 1)
     ]
-    return [sum(weight * channel[index] for index, weight in corners) for channel in jnp.asarray(tables).T]
+    return [sum(weight * channel[index] for index, weight in corners) for channel in columns(jnp.asarray(tables))]
 
 
 def irradiance(light: Light, normal: list[Array]) -> list[Array]:

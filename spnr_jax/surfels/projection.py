@@ -22,7 +22,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from spnr_jax.kernels.numerics import clamp, larger, root, smaller
+from spnr_jax.kernels.numerics import clamp, columns, larger, root, smaller
 from spnr_jax.kernels.records import AnyArray, Camera, Surfels
 
 RADIUS = 1.6  # of a disc, in spacings
@@ -85,7 +85,7 @@ def smoothstep(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
 
 def turned(matrix: Float[AnyArray, "3 3"], vectors: Float[AnyArray, "points 3"]) -> tuple[Array, Array, Array]:
     """Columns of vectors @ matrix."""
-    x, y, z = jnp.asarray(vectors).T
+    x, y, z = columns(jnp.asarray(vectors))
     one, two, three = (x * matrix[0, i] + y * matrix[1, i] + z * matrix[2, i] for i in range(3))
     return one, two, three
 
@@ -184,7 +184,7 @@ def entries(surfels: Surfels, camera: Camera, *, room: int) -> tuple[Entries, In
     rotation = camera.cam_to_world[:, :3]
     rim = turned(rotation, surfels.rim)
     side = _cross(foot.normal, rim)
-    reach = tuple(jnp.asarray(surfels.reach).T)
+    reach = tuple(columns(jnp.asarray(surfels.reach)))
     foot, begin, point, rim, side, reach = jax.lax.optimization_barrier((foot, end - covered, point, rim, side, reach))
     x, y, z, nx, ny, nz = (column[point] for column in (*foot.centre, *foot.normal))
     radius = foot.radius[point]

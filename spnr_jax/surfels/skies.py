@@ -5,24 +5,30 @@ Conventions of maps: `envmaps.py`.  Maps add up and scale; none is normalised.
 
 from collections.abc import Callable, Sequence
 
+import jax
 import numpy as np
 from jaxtyping import Float
 
+from spnr_jax.kernels.numerics import namespace
+from spnr_jax.kernels.records import AnyArray
 from spnr_jax.surfels.envmaps import directions, solid_angles
 from spnr_jax.surfels.room import indoor_envmap
 
 HEIGHT = 128
 HORIZON = 0.08  # sine of the elevation over which ground and sky pass into each other
+MIDDLE = 1 - 1e-7  # cosine of the angle from a lamp's middle, at most
 MOST_LAMPS = 4  # of a random map
 
-Color = Sequence[float] | np.ndarray
-Map = Float[np.ndarray, "height width 3"]
+Color = Sequence[float | int] | np.ndarray | jax.Array
+Angle = float | int | np.floating | jax.Array  # degrees
+Map = Float[AnyArray, "height width 3"]
 
 
-def towards(azimuth: float | int, elevation: float | int) -> Float[np.ndarray, "3"]:
+def towards(azimuth: Angle, elevation: Angle) -> Float[AnyArray, "3"]:
     """Unit direction to a place of the sky, in degrees: azimuth 0 is +z, 90 is +x, elevation 90 straight up (+y)."""
-    turn, rise = np.radians([azimuth, elevation])
-    return np.array([np.cos(rise) * np.sin(turn), np.sin(rise), np.cos(rise) * np.cos(turn)])
+    xp = namespace(azimuth, elevation)
+    turn, rise = xp.radians(azimuth), xp.radians(elevation)
+    return xp.stack([xp.cos(rise) * xp.sin(turn), xp.sin(rise), xp.cos(rise) * xp.cos(turn)])
 
 
 def gradient(zenith: Color, horizon: Color, ground: Color, height: int = HEIGHT) -> Map:
@@ -33,19 +39,19 @@ def gradient(zenith: Color, horizon: Color, ground: Color, height: int = HEIGHT)
     return (np.asarray(ground) * (1 - up) + sky * up).astype(np.float32)
 
 
-def lamp(
-    azimuth: float | int, elevation: float | int, size: float | int, irradiance: Color, height: int = HEIGHT
-) -> Map:
+def lamp(azimuth: Angle, elevation: Angle, size: Angle, irradiance: Color, height: int = HEIGHT) -> Map:
     """A round lamp `size` degrees across, by what it throws on a surface that faces it; at least two texels wide.
 
     Its edge is a quarter of its radius wide.
     """
-    radius = np.radians(max(size / 2, 180 / height))
-    angle = np.arccos(np.clip(directions(height) @ towards(azimuth, elevation), -1, 1))
-    ramp = np.clip((1.125 - angle / radius) * 4, 0, 1)
+    xp = namespace(azimuth, elevation, size, irradiance)
+    radius = xp.radians(xp.maximum(size / 2, 180 / height))
+    cosine = xp.clip(directions(height) @ towards(azimuth, elevation), -MIDDLE, MIDDLE)
+    angle = xp.arccos(cosine)  # of no middle exactly, where it has no gradient
+    ramp = xp.clip((1.125 - angle / radius) * 4, 0, 1)
     disc = ramp * ramp * (3 - 2 * ramp)
-    held = np.sum(disc * np.maximum(np.cos(angle), 0) * solid_angles(height))
-    return (disc[..., None] * np.asarray(irradiance) / held).astype(np.float32)
+    held = xp.sum(disc * xp.maximum(xp.cos(angle), 0) * solid_angles(height))
+    return (disc[..., None] * xp.asarray(irradiance) / held).astype(np.float32)
 
 
 def studio(height: int = HEIGHT) -> Map:
