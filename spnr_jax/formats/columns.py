@@ -129,8 +129,7 @@ def _invisible(columns: Columns, report: Report) -> np.ndarray | None:
     if name is None or not len(columns[name]):
         return None
     highest = float(columns[name].max())
-    if not highest > 0:
-        report(f"{name} is 0 everywhere: not believed")
+    if not highest > 0:  # as packed colours have it where nobody wrote one
         return None
     return columns[name] < INVISIBLE * colors.full_scale(columns[name].dtype, max(1.0, highest), highest < 2)
 

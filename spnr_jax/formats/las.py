@@ -1,7 +1,8 @@
 """Airborne and terrestrial laser scans (.las, compressed .laz) as named columns, piece by piece, through laspy.
 
-Coordinates come scaled and shifted as the header says, in float64; colours are 16 bit.  What the header announces is compared with the size of the file before laspy, which
-takes memory and time for whatever is announced, sees it.  Every fault is a ValueError; the caller adds the file's name.
+Coordinates come scaled and shifted as the header says, in float64; colours are 16 bit.  What the header announces is
+compared with the size of the file before laspy, which takes memory and time for whatever is announced, sees it.  Every
+fault is a ValueError; the caller adds the file's name.
 """
 
 import struct

@@ -1,7 +1,7 @@
 """NumPy files of points (.npz .npy) as named columns, piece by piece where they are not compressed.
 
     .npz    arrays (points, 3) or (points,) under the names of ARRAY_COLUMNS
-    .npy    a structured array of named fields, or an array (points, columns) or (height, width, columns) as in text files
+    .npy    a structured array of named fields, or an array (points, columns) or (height, width, columns) as in text
 
 Pickled objects, which could run code, are refused.  Every fault is a ValueError; the caller adds the file's name.
 """

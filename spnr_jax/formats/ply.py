@@ -99,6 +99,8 @@ def element_rows(
 ) -> Iterator[np.ndarray]:
     """The records of an element, some at a time, without their lists; the file is left behind them."""
     layout = np.dtype([(field, (order or "=") + kind) for field, kind in properties if isinstance(kind, str)])
+    if not layout.names and properties and order is None:
+        raise UserError("has only lists in its PLY element: no numbers of points")
     if order is None:
         lines = (text for line in iter(file.readline, b"") if (text := line.decode("ascii", "replace").strip()))
         if any(not isinstance(kind, str) for _, kind in properties):

@@ -55,9 +55,9 @@ def text_pieces(path: Path) -> Iterator[Columns]:
         header, is_comment, first = _header(numbered)
         layout = _layout(first[1])
         lines = (
-            (number, layout.plain(text))
+            (number, plain)
             for number, text in chain([first], numbered)
-            if text and not text.startswith(COMMENTS) and not text.isdecimal()
+            if not text.startswith(COMMENTS) and not text.isdecimal() and (plain := layout.plain(text))
         )
         names: tuple[str, ...] = ()
         while rows := list(islice(lines, PIECE_LINES)):
@@ -124,7 +124,7 @@ def _names(header: str, is_comment: bool, table: np.ndarray, layout: Layout) -> 
 
 def _counts(column: np.ndarray) -> bool:
     """Whether a column only numbers the rows."""
-    return bool(np.all(np.diff(column) == 1))
+    return len(column) > 1 and bool(np.all(np.diff(column) == 1))
 
 
 def plain_names(table: np.ndarray) -> tuple[str, ...]:

@@ -1,8 +1,8 @@
 """The files that a mesh file names (buffers, images, material libraries), read only from its object's own folder.
 
 A name in a mesh file is somebody else's text: data URIs are decoded, a name that leaves the object's folder or points
-to the network is refused, and a file that is not there is a reason to reject the object, never a texture less. A path of
-another machine, or a name in other capitals, means the file of that name beside the mesh, if there is one. The
+to the network is refused, and a file that is not there is a reason to reject the object, never a texture less. A path
+of another machine, or a name in other capitals, means the file of that name beside the mesh, if there is one. The
 object's folder is the mesh's, unless its source says otherwise: a ShapeNet object keeps its images beside the folder
 of its mesh (`../images`).
 """

@@ -60,6 +60,7 @@ def _columns(data: dict | np.ndarray) -> dict[str, np.ndarray]:
     """The columns of numbers among what trimesh read of an element."""
     names = data if isinstance(data, dict) else data.dtype.names or ()
     columns = {name.lower(): np.asarray(data[name]) for name in names}
+    columns = {name: x[:, 0] if x.ndim == 2 and x.shape[1] == 1 else x for name, x in columns.items()}
     kinds = {name: column for name, column in columns.items() if column.ndim == 1 and column.dtype.kind in "fiu"}
     return {name: column for name, column in kinds.items() if name not in PACKED or column.dtype.itemsize >= 4}
 

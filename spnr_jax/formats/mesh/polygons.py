@@ -9,7 +9,7 @@ Corners = Sequence[int] | np.ndarray
 
 
 def triangulate(positions: np.ndarray, polygons: Sequence[Corners]) -> tuple[np.ndarray, np.ndarray]:
-    """Faces (f, 3) of polygons, vertex numbers each, and which polygon each face is of, in the order of the polygons."""
+    """Faces (f, 3) of polygons, vertex numbers each, in their order, and which polygon each face is of."""
     sizes = np.array([len(polygon) for polygon in polygons], np.int64)
     faces, owners = [], []
     for size in np.unique(sizes[sizes > 2]):
@@ -47,7 +47,7 @@ def _convex(corners: np.ndarray) -> np.ndarray:
 
 
 def ears(corners: np.ndarray) -> np.ndarray:
-    """Triangles (n - 2, 3) of a simple polygon (n, 3), as numbers of its corners; the rest of one that is not: a fan."""
+    """Triangles (n - 2, 3) of a simple polygon (n, 3), as numbers of its corners; a fan of what is not simple."""
     centred = corners - corners.mean(axis=0)
     normal = np.cross(centred, np.roll(centred, -1, axis=0)).sum(axis=0)
     axis = int(np.abs(normal).argmax())
