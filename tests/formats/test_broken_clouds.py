@@ -18,7 +18,7 @@ from spnr_jax.formats.clouds import read_cloud
         (
             "a.jpeg",
             "1 2 3",
-            r"unknown kind of file '.jpeg'; expected one of .ply .pcd .xyz .txt .csv .asc .pts .npz .npy .las .laz .spz .glb",
+            r"unknown kind of file '.jpeg'; expected one of .ply .pcd .xyz .txt .csv .asc .pts .npz .npy .las .laz",
         ),
         ("a.xyz", "# nothing yet\n", "holds 0 points"),
         ("a.ply", ply_bytes("binary_little_endian", rows=[]), "holds 0 points"),
