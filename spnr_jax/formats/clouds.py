@@ -1,41 +1,56 @@
-"""Point clouds from files.
+"""Point clouds from files: one path, for points and for meshes.
+
+    open        raw columns by the names that the file gives, positions in float64 (point_files.py, mesh/)
+    interpret   colours, materials, normals, opacity, classes (columns.py, mesh/colors.py, sensor.py)
+    cut         a box, without the dominant plane, one cluster
+    merge       equal and nearly equal points; what then is no surface is refused
+    clean, thin outliers and noise; evenly spread points
+    origin      subtracted where float32 is too coarse, then float32
 
 `read_cloud` makes a PointCloud of NumPy float32 arrays, not padded, in the file's own units, turned so that y is up;
-`place_cloud` also says how to get back into the file's frame.  Files of points are read as named columns
-(point_files.py, what they mean: point_columns.py), of any size in bounded memory; points are spread evenly over meshes.
+`place_cloud` also says how to get back into the file's frame.  Files of points are of any size, in bounded memory.
 What a file does not say is grey 0.5, roughness 0.5, metallic 0; `report` gets a line about every assumption.
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import get_args
+from typing import NamedTuple, get_args
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from spnr_jax.errors import UserError
+from spnr_jax.formats.columns import DEFAULTS, Columns, Report, believed, materials, normals, sound, useful
 from spnr_jax.formats.cut import Cut
 from spnr_jax.formats.mesh.assets import ShownParts
-from spnr_jax.formats.ply import read_ply_header
-from spnr_jax.formats.point_columns import DEFAULTS, LINEAR, POSITION, SRGB, Columns, materials, normals, useful
-from spnr_jax.formats.point_files import READERS, column_pieces, parse_ply
+from spnr_jax.formats.point_files import MESHES, column_pieces, is_mesh, kind_of, parse_ply
 from spnr_jax.formats.sensor import sensor_of
 from spnr_jax.formats.up_axis import ROTATIONS, find_up
 from spnr_jax.kernels import scenes
 from spnr_jax.kernels.cleaning import Clean, cleaned
-from spnr_jax.kernels.facing import facing
+from spnr_jax.kernels.facing import facing, planes
 from spnr_jax.kernels.records import PointCloud
+from spnr_jax.kernels.repeats import merge_repeats, require_surface, spacing
 from spnr_jax.kernels.thinning import THINNING, farthest_points, sample_stream, stacked
 from spnr_jax.surfels.outward import outward_normals
 
-MESHES = (".glb", ".gltf", ".obj", ".stl", ".off")
+__all__ = ("MESHES", "PlacedCloud", "cloud_of_ply", "place_cloud", "read_cloud")
+
 MESH_POINTS = 4096  # points drawn from a mesh if no number is asked for; the most that training draws
 MOST_EVEN = 2**14  # points that are spread evenly over a mesh, in seconds; more lie close enough as they are drawn
 CAPACITY = 2**19  # points of a file that are in memory at most; of more a random sample is kept while reading
 BROKEN = "NaN, infinity or too large a number"
 CUT_MESH = 2**18  # points drawn from a mesh that something is cut out of
 WHOLE = Cut()
-COARSEST_STEP = 1e-3  # of the extent, that rounding to float32 may cost
+COARSEST_STEP = 2e-5  # of the extent, that rounding to float32 may cost
+LOST_STEP = 1e-3  # of the extent, from which on what the file itself rounded is no shape any more
+SAMPLE = 512  # points at which the file's normals are compared with the points
+LEAST_POINTS = 100  # that tell normals, and what has no colour
+AGREEING = 0.6  # median cosine between normals and the points' planes, below which normals are not believed
+PARALLEL = 0.9  # cosine of what is a constant normal, and share of the surface that it must fit
+DEGREES, NEEDLE = 0.5, 100.0  # widest place in degrees; height over the width from which on degrees are suspected
+THIN = 0.1, 1.0  # spacings between which a plate's thickness lies whose sides cannot be told apart
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,27 +116,71 @@ def place_cloud(
         raise UserError(f"transparent_parts must be opaque or skip, got {transparent_parts!r}")
     if clean not in get_args(Clean):
         raise UserError(f"clean must be one of {', '.join(get_args(Clean))}, got {clean!r}")
-    _check_file(path)
+    kind = kind_of(path)
     try:
-        positions, origin, values, sensor, sigma = _read(path, num_points, seed, clean, cut, transparent_parts, report)
+        return _placed(path, kind, num_points, up, seed, clean, cut, transparent_parts, report)
     except (ValueError, OSError) as error:
         raise UserError(f"{path}: {str(error).splitlines()[0]}") from error
-    kept = np.arange(len(positions))
-    if num_points is not None and len(positions) > num_points:
-        report(f"{num_points} of {len(positions)} points kept, evenly spread")
-        kept = np.sort(farthest_points(positions, num_points, seed))
-    all_colors, values = values["base_color"], {name: column[kept] for name, column in values.items()}
-    if "normals" not in values and sensor:
-        values["normals"] = facing(positions[kept], positions, sensor.place - origin, sigma)
+
+
+class Points(NamedTuple):
+    """Positions (points, 3) float64 as they lie in the file less `origin`, and the other columns by name."""
+
+    positions: np.ndarray
+    values: dict[str, np.ndarray]
+    origin: np.ndarray
+
+    def chosen(self, rows: np.ndarray) -> "Points":
+        """The points of these rows."""
+        return Points(self.positions[rows], {name: column[rows] for name, column in self.values.items()}, self.origin)
+
+
+@np.errstate(all="ignore")  # of signalling NaN, and what leaves its type: both are looked for
+def _placed(
+    path: Path,
+    kind: str,
+    num_points: int | None,
+    up: str,
+    seed: int,
+    clean: Clean,
+    cut: Cut,
+    transparent_parts: ShownParts,
+    report: Report,
+) -> PlacedCloud:
+    """The whole path, from a file of a known kind to a cloud."""
+    mesh = is_mesh(path, kind)
+    if mesh:
+        points = _sampled_mesh(path, kind, num_points, seed, cut, transparent_parts, report)
+    else:
+        points = _interpreted(_bounded_columns(path, kind, num_points, cut, report), cut, report)
+        points = _without_repeats(points, report)
+    rows, lines = scenes.object_of(points.positions, points.origin, cut.remove_plane, cut.nth, seed)
+    points, noise = points.chosen(rows), 0.0
+    if not mesh and clean != "off":
+        positions, values, done, noise = cleaned(points.positions, points.values, clean)
+        points, lines = Points(positions, values, points.origin), lines + done
+    for line in lines:
+        report(line)
+    if not mesh:
+        points = _believing(points, report)
+    sensor = sensor_of(path, points.positions + points.origin, kind, report)
+    kept = np.arange(len(points.positions))
+    if num_points is not None and len(kept) > num_points:
+        report(f"{num_points} of {len(kept)} points kept, evenly spread")
+        kept = np.sort(farthest_points(points.positions, num_points, seed))
+    fewer = points.chosen(kept)
+    if "normals" not in points.values and sensor:
+        fewer.values["normals"] = facing(fewer.positions, points.positions, sensor.place - points.origin, noise)
         report("normals turned to the place of the sensor")
-    elif "normals" not in values and len(kept) < len(positions):
-        values["normals"] = outward_normals(positions, all_colors, kept, sigma)
-    positions = positions[kept]
+    elif "normals" not in points.values and len(kept) < len(points.positions):
+        fewer.values["normals"] = outward_normals(points.positions, points.values["base_color"], kept, noise)
     if up == "auto":
-        camera_up = sensor.up(positions + origin) if sensor else None
-        up, reason = (camera_up, "that of its camera") if camera_up else find_up(positions, path)
+        camera_up = sensor.up(fewer.positions + points.origin) if sensor else None
+        up, reason = (camera_up, "that of its camera") if camera_up else find_up(fewer.positions, Path(f"a{kind}"))
         report(f"{up} taken as up ({reason}); --up says otherwise")
     rotation = np.array(ROTATIONS[up], np.float64)
+    positions, origin = _moved(fewer.positions, points.origin, report)
+    values = fewer.values
     if "normals" in values:
         values["normals"] = values["normals"] @ rotation.T
     return PlacedCloud(cloud=_float32(positions @ rotation.T, values), up=up, rotation=rotation, origin=origin)
@@ -133,8 +192,14 @@ def cloud_of_ply(content: bytes) -> PointCloud:
 
     It is for data sets, which were written whole: a row without finite numbers is a fault there.
     """
-    positions, _, values = _points_of_columns(_all_sound(useful(parse_ply(content))), report=lambda line: None)
-    return _float32(positions, values)
+    columns = useful(parse_ply(content))
+    broken = np.flatnonzero(~sound(columns))
+    if broken.size:
+        raise UserError(f"holds {broken.size} points with {BROKEN}, first point {broken[0]}")
+    if not len(columns["x"]):
+        raise UserError("holds 0 points")
+    values, directions = materials(columns, lambda line: None), normals(columns)
+    return _float32(stacked(columns), values if directions is None else values | {"normals": directions})
 
 
 def _float32(positions: np.ndarray, values: dict[str, np.ndarray]) -> PointCloud:
@@ -145,90 +210,75 @@ def _float32(positions: np.ndarray, values: dict[str, np.ndarray]) -> PointCloud
     )
 
 
-def _check_file(path: Path) -> None:
-    """ValueError unless there is a file of a known kind with something in it."""
-    known = tuple(dict.fromkeys((*READERS, *MESHES)))
-    if path.is_dir():
-        raise UserError(f"{path}: a folder; expected a file of one of {' '.join(known)}")
-    if path.suffix.lower() not in known:
-        raise UserError(f"{path}: unknown kind of file {path.suffix!r}; expected one of {' '.join(known)}")
-    if not path.is_file():
-        raise UserError(f"{path}: there is no such file")
-    if path.stat().st_size == 0:
-        raise UserError(f"{path}: the file is empty")
+def _coarse(positions: np.ndarray) -> bool:
+    """Whether float32 is too coarse for positions (n, 3) where they lie."""
+    step = np.spacing(np.float32(np.abs(positions).max()))
+    return bool(step > COARSEST_STEP * np.ptp(positions, axis=0).max() > 0)
 
 
-def _is_mesh(path: Path) -> bool:
-    if path.suffix.lower() != ".ply":
-        return path.suffix.lower() in MESHES
-    with path.open("rb") as file:
-        return read_ply_header(file).is_mesh
+def _moved(positions: np.ndarray, before: np.ndarray, report: Report) -> tuple[np.ndarray, np.ndarray]:
+    """Positions (n, 3) from which `before` was subtracted, and the origin that is subtracted in the end."""
+    whole = positions + before
+    if not _coarse(whole):
+        return whole if before.any() else positions, np.zeros(3)
+    origin = np.floor(whole.min(axis=0))
+    report(f"moved by {' '.join(f'{0 - value:.0f}' for value in origin)} to keep precision")
+    return positions + (before - origin), origin
 
 
-@np.errstate(all="ignore")  # of signalling NaN, and what leaves its type: both are looked for
-def _read(
+def _sampled_mesh(
     path: Path,
+    kind: str,
     num_points: int | None,
     seed: int,
-    clean: Clean,
     cut: Cut,
     transparent_parts: ShownParts,
-    report: Callable[[str], None],
-):
-    """Positions (points, 3) float64 of what is cut out of a file, cleaned; their origin, materials, sensor, noise."""
-    mesh = _is_mesh(path)
-    if mesh:
-        count = max(CUT_MESH if cut.asked else 0, num_points or MESH_POINTS)
-        positions, origin, values = _sampled_mesh(path, count, seed, transparent_parts, report)
-        if cut.crop:
-            inside = scenes.in_box(positions, cut.crop)
-            report(scenes.cropped(int(inside.sum()), count, cut.crop, positions.min(axis=0), positions.max(axis=0)))
-            positions, values = positions[inside], {name: column[inside] for name, column in values.items()}
-    else:
-        columns = _bounded_columns(path, num_points, cut, report)
-        positions, origin, values = _points_of_columns(columns, report)
-    rows, lines = scenes.object_of(positions, origin, cut.remove_plane, cut.nth, seed)
-    positions, values = positions[rows], {name: column[rows] for name, column in values.items()}
-    sigma = 0.0
-    if not mesh and clean != "off":
-        positions, values, done, sigma = cleaned(positions, values, clean)
-        lines += done
-    for line in lines:
-        report(line)
-    return positions, origin, values, sensor_of(path, positions + origin), sigma
-
-
-def _sampled_mesh(path: Path, count: int, seed: int, transparent_parts: ShownParts, report: Callable[[str], None]):
-    """Positions (count, 3) float64, their origin (3,), materials and normals of points spread evenly over a mesh."""
+    report: Report,
+) -> Points:
+    """Points spread evenly over a mesh, those inside the box that is to be cut out."""
     from spnr_jax.formats.mesh.meshes import load_mesh  # here: points are read without trimesh
-    from spnr_jax.formats.mesh.surface_points import sample_surface
+    from spnr_jax.formats.mesh.surface_points import bounding_box, sample_surface
 
-    asset = load_mesh(path, transparent_parts=transparent_parts)
+    count = max(CUT_MESH if cut.asked else 0, num_points or MESH_POINTS)
+    asset = load_mesh(path, transparent_parts=transparent_parts, kind=kind)
     if asset.ignored:
         report(f"ignored: {'; '.join(asset.ignored)}")
     for note in asset.notes:
         report(note)
-    points = sample_surface(asset, count, seed, "even" if count <= MOST_EVEN else "random")
-    if not np.isfinite(points.positions).all():
+    corners, origin = np.stack(bounding_box(asset)), np.zeros(3)
+    if np.abs(corners).max() > np.finfo(np.float32).max:
+        raise UserError(f"holds vertices too large for float32, more than {np.finfo(np.float32).max:.2g}")
+    if _coarse(corners):  # before anything of it becomes float32
+        origin = np.floor(corners[0])
+        parts = tuple(replace(part, positions=part.positions - origin) for part in asset.parts)
+        asset = replace(asset, parts=parts)
+    drawn = sample_surface(asset, count, seed, "even" if count <= MOST_EVEN else "random")
+    if not np.isfinite(drawn.positions).all():
         raise UserError(f"holds vertices too large for float32, more than {np.finfo(np.float32).max:.2g}")
     report(f"{count} points spread over the surface of the mesh")
-    values = {name: getattr(points, name) for name in DEFAULTS}
+    values = {name: getattr(drawn, name) for name in DEFAULTS}
     if all((values[name] == default).all() for name, default in DEFAULTS.items()):
         report("no material in the mesh: base_color 0.5, roughness 0.5, metallic 0 taken everywhere")
         values["materials_known"] = np.zeros(count)
-    return points.positions.astype(np.float64), np.zeros(3), values | {"normals": points.normals}
+    points = Points(drawn.positions.astype(np.float64), values | {"normals": drawn.normals}, origin)
+    if not cut.crop:
+        return points
+    whole = points.positions + origin
+    inside = scenes.in_box(whole, cut.crop)
+    report(scenes.cropped(int(inside.sum()), count, cut.crop, whole.min(axis=0), whole.max(axis=0)))
+    return points.chosen(inside)
 
 
-def _bounded_columns(path: Path, num_points: int | None, cut: Cut, report: Callable[[str], None]) -> Columns:
+def _bounded_columns(path: Path, kind: str, num_points: int | None, cut: Cut, report: Report) -> Columns:
     """The useful columns of a point file inside the box to be cut out, of very many points those of a random sample."""
     capacity, broken, outside = max(CAPACITY, THINNING * (num_points or 0)), 0, 0
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
 
     def sound_pieces() -> Iterator[Columns]:
         nonlocal broken, outside, low, high
-        for piece in column_pieces(path):
+        for piece in column_pieces(path, kind):
             columns = useful(piece)
-            wanted = _sound(columns)
+            wanted = sound(columns)
             broken += int(np.count_nonzero(~wanted))
             if cut.crop:
                 positions = stacked(columns)
@@ -251,33 +301,93 @@ def _bounded_columns(path: Path, num_points: int | None, cut: Cut, report: Calla
     return columns
 
 
-def _sound(columns: Columns) -> np.ndarray:
-    """Mask (points,) of rows whose position and materials are numbers that float32 holds."""
-    names = [name for name in (*POSITION, *LINEAR, *SRGB, *DEFAULTS) if name in columns]
-    largest = np.finfo(np.float32).max
-    return np.logical_and.reduce([np.abs(np.asarray(columns[name], np.float64)) < largest for name in names])
-
-
-def _all_sound(columns: Columns) -> Columns:
-    """The columns; ValueError if there is a row that is not sound."""
-    broken = np.flatnonzero(~_sound(columns))
-    if broken.size:
-        raise UserError(f"holds {broken.size} points with {BROKEN}, first point {broken[0]}")
-    return columns
-
-
-def _points_of_columns(columns: Columns, report: Callable[[str], None]):
-    """Positions (points, 3) float64, their origin (3,), materials and normals, if any, of useful columns."""
+def _interpreted(columns: Columns, cut: Cut, report: Report) -> Points:
+    """What the columns of a file of points mean."""
     if not columns or len(columns["x"]) == 0:
         raise UserError("holds 0 points")
-    positions, origin = stacked(columns), np.zeros(3)
-    extent, step = np.ptp(positions, axis=0).max(), np.spacing(np.float32(np.abs(positions).max()))
-    if step > COARSEST_STEP * extent > 0:
-        if columns["x"].dtype == np.float32:
-            raise UserError(
-                f"holds points {step:g} apart at best in float32, for an extent of {extent:g}; move them to the origin"
-            )
-        origin = np.floor(positions.min(axis=0))
-        report(f"moved by {' '.join(f'{0 - value:.0f}' for value in origin)} to keep precision")
+    columns = believed(columns, cut.keep_noise, report)
+    positions = stacked(columns)
+    _check_steps(columns, positions, report)
+    origin = np.floor(positions.min(axis=0)) if _coarse(positions) else np.zeros(3)
     values, directions = materials(columns, report), normals(columns)
-    return positions - origin, origin, values if directions is None else values | {"normals": directions}
+    return Points(positions - origin, values if directions is None else values | {"normals": directions}, origin)
+
+
+def _check_steps(columns: Columns, positions: np.ndarray, report: Report) -> None:
+    """A line where the file rounds an axis coarsely or has it in degrees; ValueError where no shape is left."""
+    extent = np.ptp(positions, axis=0)
+    steps = np.zeros(3)
+    for i, axis in enumerate("xyz"):
+        if columns[axis].dtype.kind == "f" and columns[axis].dtype.itemsize <= 4:
+            steps[i] = np.spacing(np.abs(columns[axis]).max())
+    if steps.max() > LOST_STEP * extent.max() > 0:
+        raise UserError(
+            f"holds points {steps.max():g} apart at best in float32, for an extent of {extent.max():g}; "
+            "move them to the origin"
+        )
+    for axis, step, width, column in zip("xyz", steps, extent, positions.T, strict=True):
+        if step > LOST_STEP * width > 0:
+            report(f"only {len(np.unique(column))} distinct values along {axis}: the file's numbers are {step:g} apart")
+    x, y, z = extent
+    lowest, highest = positions.min(axis=0), positions.max(axis=0)
+    on_earth = lowest[0] >= -180 and highest[0] <= 180 and lowest[1] >= -90 and highest[1] <= 90
+    if on_earth and 0 < max(x, y) < DEGREES and z > NEEDLE * max(x, y):
+        report(
+            f"x and y look like degrees of longitude and latitude: {max(x, y):.2g} wide and {z:.3g} high; "
+            "project them to metres first"
+        )
+
+
+def _without_repeats(points: Points, report: Report) -> Points:
+    """The points, equal and nearly equal ones as one; ValueError where that is no surface."""
+    positions, values, merged = merge_repeats(points.positions, points.values)
+    if merged:
+        report(f"{merged:,} of {len(points.positions):,} points repeat others, and were merged with them")
+    require_surface(positions, len(points.positions))
+    return Points(positions, values, points.origin)
+
+
+def _believing(points: Points, report: Report) -> Points:
+    """The points with what the file says of them, where the points themselves do not speak against it."""
+    positions, values = points.positions, dict(points.values)
+    if len(positions) < LEAST_POINTS:
+        return points
+    tree = cKDTree(positions)
+    black = ~values["base_color"].any(axis=1)
+    if 0.1 < black.mean() < 0.9 and _mixed(tree, black):
+        report(
+            f"{int(black.sum()):,} of {len(black):,} points have no colour (0 0 0): that of their neighbours is taken"
+        )
+        near = cKDTree(positions[~black]).query(positions[black], 3)[1]
+        values["base_color"] = values["base_color"].copy()
+        values["base_color"][black] = values["base_color"][~black][near].mean(axis=1)
+    centred = positions - positions.mean(axis=0)
+    thickness = float(np.ptp(centred @ np.linalg.eigh(centred.T @ centred)[1][:, 0])) / max(spacing(tree), 1e-300)
+    if THIN[0] < thickness < THIN[1]:
+        report(f"the points lie in a plate {thickness:.2g} spacings thick: if both sides were seen, their colours mix")
+    if "normals" in values and (reason := _doubt(positions, values["normals"])):
+        report(f"normals of the file left out: {reason}")
+        del values["normals"]
+    return Points(positions, values, points.origin)
+
+
+def _mixed(tree: cKDTree, black: np.ndarray) -> bool:
+    """Whether black points lie among the others as if chosen by chance, and not in parts of their own."""
+    rows = np.flatnonzero(black)
+    near = tree.query(tree.data[rows[:: -(-len(rows) // SAMPLE)]], range(2, 10))[1]
+    share = black.mean()
+    return bool(black[near].mean() < share + 0.25 * (1 - share))
+
+
+def _doubt(positions: np.ndarray, normals: np.ndarray) -> str:
+    """Why normals (n, 3), 0 where unknown, are not those of the surface of the points; empty if they may be."""
+    known = np.flatnonzero(normals.any(axis=1))
+    if len(known) < LEAST_POINTS:
+        return ""
+    rows = known[:: -(-len(known) // SAMPLE)]
+    surface = planes(positions[rows], positions)
+    if np.abs(normals[rows] @ normals[rows[0]]).min() > 1 - 1e-6:
+        fits = float(np.mean(np.abs(surface @ normals[rows[0]]) > PARALLEL))
+        return "all are the same, and the points lie in no plane" if fits < PARALLEL else ""
+    cosine = float(np.median(np.abs(np.sum(surface * normals[rows], axis=1))))
+    return f"they lie across the surface of the points (cosine {cosine:.2f})" if cosine < AGREEING else ""

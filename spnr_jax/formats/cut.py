@@ -17,10 +17,13 @@ class Cut:
     object: str | None = None
     """Only one cluster of points: `largest`, or 2 for the second largest, and so on, after the plane is removed."""
 
+    keep_noise: bool = False
+    """Also points that a scan's classification calls noise (7, 18), withheld ones, and those of next to no opacity."""
+
     @property
     def asked(self) -> bool:
         """Whether anything is cut."""
-        return self != Cut()
+        return bool(self.crop or self.remove_plane or self.object)
 
     @property
     def nth(self) -> int | None:

@@ -1,8 +1,8 @@
 """Airborne and terrestrial laser scans (.las, compressed .laz) as named columns, piece by piece, through laspy.
 
-Coordinates come scaled and shifted as the header says, in float64; colours are 16 bit; where there are none the
-intensity of the echo stands in.  What the header announces is compared with the size of the file before laspy, which
-takes memory and time for whatever is announced, sees it.  Every fault is a ValueError; the caller adds the file's name.
+Coordinates come scaled and shifted as the header says, in float64; colours are 16 bit.  What the header announces is
+compared with the size of the file before laspy, which takes memory and time for whatever is announced, sees it.  Every
+fault is a ValueError; the caller adds the file's name.
 """
 
 import struct
@@ -15,7 +15,7 @@ from spnr_jax.errors import UserError, is_bug
 from spnr_jax.formats.laz import RECORD_HEAD, check_laz
 
 PIECE_BYTES = 2**23  # of points in memory at a time
-COLUMNS = ("red", "green", "blue", "intensity")
+COLUMNS = ("red", "green", "blue", "intensity", "classification", "withheld")
 MISSING = "needs the package {package} to be read: pip install 'spnr-jax[formats]'"
 # places in the header (ASPRS LAS 1.4 R15, table 3): sizes and counts, the count of version 1.4
 SIZES, COUNT_14, SMALLEST_HEADER = 94, 247, 227

@@ -30,6 +30,8 @@ def check_laz(content: np.ndarray, first_record: int, records: int, data: int, l
         items, chunk_size = _items(content, first_record, records)
         if sum(size for _, size in items) != length:
             raise UserError(f"its points have {length} bytes, their items {[size for _, size in items]}")
+        if not chunk_size and any(kind in LAYERS for kind, _ in items):
+            chunk_size = VARIABLE  # as writers of COPC put it
         if chunk_size != VARIABLE and not 0 < chunk_size <= LARGEST_CHUNK:
             raise UserError(f"chunks of {chunk_size} points, expected 1 to {LARGEST_CHUNK}")
         (table,) = _numbers(content, data, "<q")

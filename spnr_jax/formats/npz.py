@@ -1,7 +1,7 @@
 """NumPy files of points (.npz .npy) as named columns, piece by piece where they are not compressed.
 
     .npz    arrays (points, 3) or (points,) under the names of ARRAY_COLUMNS
-    .npy    a structured array of named fields, or an array (points, columns) as in text files
+    .npy    a structured array of named fields, or an array (points, columns) or (height, width, columns) as in text
 
 Pickled objects, which could run code, are refused.  Every fault is a ValueError; the caller adds the file's name.
 """
@@ -52,6 +52,8 @@ def numpy_pieces(path: Path) -> Iterator[Columns]:
     except UNREADABLE as error:
         raise UserError(f"is a broken, truncated or pickled NumPy file ({error})") from None
     rows = np.atleast_1d(loaded)
+    if rows.ndim == 3:  # the pixels of a picture
+        rows = rows.reshape(-1, rows.shape[2])
     names = rows.dtype.names or plain_names(rows)
     step = max(1, PIECE_BYTES // max(1, rows[:1].nbytes))
     for start in range(0, max(1, len(rows)), step):

@@ -1,9 +1,8 @@
 """Point files of the Point Cloud Library as named columns: .pcd 0.6 and 0.7, ASCII, binary or LZF-compressed.
 
 They are read piece by piece, compressed ones whole.  A header of text lines names the fields with their sizes, types
-(F, I, U) and counts; then come the points, row by row, or, compressed, one column after the other.  A field `rgb` or
-`rgba` packs 0xRRGGBB into the bits of one 4-byte number.  Every fault is a ValueError that says what is wrong; the
-file's name is added by the caller.
+(F, I, U) and counts; then come the points, row by row, or, compressed, one column after the other.  Every fault is a
+ValueError that says what is wrong; the file's name is added by the caller.
 """
 
 import math
@@ -22,7 +21,6 @@ POINT_LIMIT = 2**16  # bytes: histograms have some hundreds of numbers, and NumP
 ENTRIES = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA")
 ENCODINGS = ("ascii", "binary", "binary_compressed")
 KINDS = {"F": "f", "I": "i", "U": "u"}
-PACKED = ("rgb", "rgba")
 LONGEST_LITERAL = 32  # control bytes below it announce so many plain bytes, less one; the others copy earlier ones
 
 
@@ -56,21 +54,12 @@ def pcd_pieces(path: Path) -> Iterator[dict[str, np.ndarray]]:
             pieces = binary_rows(file, header.num_points, header.layout)
         else:
             pieces = iter([_columns(file.read(), header)])
-        yield from map(_unpacked, pieces)
+        yield from map(_named, pieces)
 
 
-def _unpacked(points: np.ndarray) -> dict[str, np.ndarray]:
-    """The fields of points as columns, packed colours as three."""
-    columns = {name.lower(): points[name] for name in points.dtype.names or () if points[name].ndim == 1}
-    packed = next((name for name in PACKED if name in columns), None)
-    if packed is None:
-        return columns
-    bits = columns.pop(packed)
-    if bits.dtype.itemsize != 4:
-        raise UserError(f"has a field {packed!r} of {bits.dtype.itemsize} bytes; expected one 4-byte number")
-    numbers = bits.view(np.uint32)
-    shifts = {"r": 16, "g": 8, "b": 0}
-    return columns | {name: (numbers >> shift & 255).astype(np.uint8) for name, shift in shifts.items()}
+def _named(points: np.ndarray) -> dict[str, np.ndarray]:
+    """The fields of points that are one number, as columns."""
+    return {name.lower(): points[name] for name in points.dtype.names or () if points[name].ndim == 1}
 
 
 def _header(data: bytes) -> PcdHeader:
@@ -131,13 +120,23 @@ def _columns(body: bytes, header: PcdHeader) -> np.ndarray:
         raise UserError(f"is cut off: expected {compressed} bytes of compressed data, found {len(body) - 8}")
     if plain != header.num_points * header.layout.itemsize:
         raise UserError(f"announces {plain} bytes of points, its header {header.num_points * header.layout.itemsize}")
-    unpacked = decompress(body[8 : 8 + compressed], plain)
+    packed = body[8 : 8 + compressed]
+    # some writers announce compressed data and store it as it is
+    unpacked = packed if compressed == plain and not _is_lzf(packed, plain) else decompress(packed, plain)
     points, start = np.empty(header.num_points, header.layout), 0
     for name in header.layout.names or ():
         column = points[name]
         points[name] = np.frombuffer(unpacked, column.dtype, column.size, start).reshape(column.shape)
         start += column.size * column.dtype.itemsize
     return points
+
+
+def _is_lzf(data: bytes, size: int) -> bool:
+    """Whether data can be unpacked to this size."""
+    try:
+        return bool(decompress(data, size))
+    except ValueError:
+        return False
 
 
 def decompress(data: bytes, size: int) -> bytes:

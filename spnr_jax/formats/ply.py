@@ -1,8 +1,8 @@
 """PLY files as named columns of their vertices, piece by piece: ASCII or binary, any order and scalar types.
 
-A header of text lines names the elements and their properties; the vertices may stand behind other elements, but not
-behind lists.  Only one piece of a file is in memory at a time.  Every fault is a ValueError that says what is wrong;
-the file's name is added by the caller.
+A header of text lines names the elements and their properties; the vertices may stand behind other elements.  Lists,
+in or before the vertices, are stepped over, one row at a time.  Only one piece of a file is in memory at a time.  Every
+fault is a ValueError that says what is wrong; the file's name is added by the caller.
 """
 
 import re
@@ -15,9 +15,11 @@ from pathlib import Path
 import numpy as np
 
 from spnr_jax.errors import UserError
+from spnr_jax.formats.text import SHOWN
 
 Columns = dict[str, np.ndarray]
-Element = tuple[str, int, list[tuple[str, str | None]]]  # name, count, [(property, type)]; the type of a list is None
+Lists = tuple[str, str]  # types of a list's length and of its items
+Element = tuple[str, int, list[tuple[str, str | Lists]]]  # name, count, [(property, type)]
 
 TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4"},
@@ -27,6 +29,7 @@ TYPES = {
 BYTE_ORDERS = {"ascii": None, "binary_little_endian": "<", "binary_big_endian": ">"}
 HEADER_LIMIT = 2**20  # bytes
 FACES = ("face", "tristrips")  # elements that make a PLY a mesh
+LONGEST_LIST = 2**20  # items
 PIECE_BYTES, PIECE_LINES = 2**25, 2**17  # of the vertices that are in memory at a time
 
 
@@ -46,7 +49,9 @@ class PlyHeader:
 def read_ply_header(file: BufferedIOBase) -> PlyHeader:
     """The header of an open PLY file, which is left at its data."""
     data = file.read(HEADER_LIMIT)
-    end = re.search(rb"^end_header[ \t]*(\r\n|\n|\r)", data, re.MULTILINE)
+    newline = re.search(rb"\r\n|\n|\r", data[:HEADER_LIMIT])
+    # lines that end in \r alone may be followed by a byte of data that is a \n
+    end = re.search(rb"(?<=[\r\n])end_header[ \t]*" + newline[0], data) if newline else None
     if not data.startswith(b"ply") or end is None:
         raise UserError("is not a PLY file, or its header is cut off (expected 'ply' ... 'end_header')")
     byte_order: str | None = "unknown"
@@ -57,8 +62,8 @@ def read_ply_header(file: BufferedIOBase) -> PlyHeader:
                 byte_order = BYTE_ORDERS.get(name, "unknown")
             case ["element", name, count] if count.isdecimal():
                 elements.append((name, int(count), []))
-            case ["property", "list", _, _, name] if elements:
-                elements[-1][2].append((name, None))
+            case ["property", "list", length, items, name] if elements and {length, items} <= TYPES.keys():
+                elements[-1][2].append((name, (TYPES[length], TYPES[items])))
             case ["property", kind, name] if elements and kind in TYPES:
                 elements[-1][2].append((name, TYPES[kind]))
             case [] | ["comment" | "obj_info", *_]:
@@ -80,42 +85,89 @@ def ply_pieces(path: Path) -> Iterator[Columns]:
 def vertex_pieces(file: BufferedIOBase) -> Iterator[Columns]:
     """The columns of the vertices of an open PLY file, some points at a time; elements before them are skipped."""
     header = read_ply_header(file)
-    rows_before = bytes_before = 0
     for name, count, properties in header.elements:
-        if count and any(kind is None for _, kind in properties):
-            raise UserError(f"has lists in its PLY element {name!r}, in or before the vertices: not readable as points")
-        order = header.byte_order or "="
-        layout = np.dtype([(field, order + kind) for field, kind in properties if kind is not None])
         if name == "vertex":
-            if header.byte_order is None:
-                rows = _text_rows(file, rows_before, count, layout)
-            else:
-                file.seek(bytes_before, 1)
-                rows = binary_rows(file, count, layout)
-            yield from ({field.lower(): piece[field] for field in layout.names or ()} for piece in rows)
+            rows = element_rows(file, count, properties, header.byte_order)
+            yield from ({field.lower(): piece[field] for field in piece.dtype.names or ()} for piece in rows)
             return
-        rows_before, bytes_before = rows_before + count, bytes_before + count * layout.itemsize
+        _skip(file, count, properties, header.byte_order)
     raise UserError(f"has no PLY element 'vertex', only {', '.join(name for name, _, _ in header.elements) or 'none'}")
+
+
+def element_rows(
+    file: BufferedIOBase, count: int, properties: list[tuple[str, str | Lists]], order: str | None
+) -> Iterator[np.ndarray]:
+    """The records of an element, some at a time, without their lists; the file is left behind them."""
+    layout = np.dtype([(field, (order or "=") + kind) for field, kind in properties if isinstance(kind, str)])
+    if not layout.names and properties and order is None:
+        raise UserError("has only lists in its PLY element: no numbers of points")
+    if order is None:
+        lines = (text for line in iter(file.readline, b"") if (text := line.decode("ascii", "replace").strip()))
+        if any(not isinstance(kind, str) for _, kind in properties):
+            lines = (" ".join(_without_lists(line.split(), properties)) for line in lines)
+        yield from text_rows(lines, count, layout)
+    elif all(isinstance(kind, str) for _, kind in properties):
+        yield from binary_rows(file, count, layout)
+    else:
+        yield from _rows_with_lists(file, count, properties, layout, order)
+
+
+def _skip(file: BufferedIOBase, count: int, properties: list[tuple[str, str | Lists]], order: str | None) -> None:
+    """Moves an open file behind an element."""
+    if order is None:
+        for _ in islice((line for line in iter(file.readline, b"") if line.strip()), count):
+            pass
+    elif all(isinstance(kind, str) for _, kind in properties):
+        file.seek(count * sum(np.dtype(kind).itemsize for _, kind in properties if isinstance(kind, str)), 1)
+    else:
+        for _ in element_rows(file, count, properties, order):
+            pass
+
+
+def _without_lists(words: list[str], properties: list[tuple[str, str | Lists]]) -> list[str]:
+    """The words of a row of text that stand for single numbers."""
+    kept, place = [], 0
+    for _, kind in properties:
+        if isinstance(kind, str):
+            kept += words[place : place + 1]
+            place += 1
+        elif place < len(words):
+            place += 1 + (int(words[place]) if words[place].isdecimal() else 0)
+    return kept
+
+
+def _rows_with_lists(
+    file: BufferedIOBase, count: int, properties: list[tuple[str, str | Lists]], layout: np.dtype, order: str
+) -> Iterator[np.ndarray]:
+    """`count` binary records that lists make of different lengths."""
+    for start in range(0, max(1, count), PIECE_LINES):
+        rows = []
+        for number in range(start, min(count, start + PIECE_LINES)):
+            row = []
+            for _, kind in properties:
+                length, items = (kind, kind) if isinstance(kind, str) else kind
+                data = file.read(np.dtype(length).itemsize)
+                if len(data) < np.dtype(length).itemsize:
+                    raise UserError(f"is cut off: its header announces {count} rows, the data ends after {number}")
+                if isinstance(kind, str):
+                    row.append(data)
+                    continue
+                size = int(np.frombuffer(data, order + length)[0])
+                if not 0 <= size <= LONGEST_LIST:
+                    raise UserError(f"has a list of {size} items in row {number} of a PLY element: broken file")
+                file.seek(size * np.dtype(items).itemsize, 1)
+            rows.append(b"".join(row))
+        yield np.frombuffer(b"".join(rows), layout, len(rows)) if layout.names else np.empty(len(rows), layout)
 
 
 def camera_row(file: BufferedIOBase) -> dict[str, float]:
     """The numbers of the camera that an open PLY file begins with, by their names; none if it begins with another."""
     header = read_ply_header(file)
     name, count, properties = header.elements[0] if header.elements else ("", 0, [])
-    if name != "camera" or not count or any(kind is None for _, kind in properties):
+    if name != "camera" or not count or not all(isinstance(kind, str) for _, kind in properties):
         return {}
-    layout = np.dtype([(field, (header.byte_order or "=") + str(kind)) for field, kind in properties])
-    rows = _text_rows(file, 0, 1, layout) if header.byte_order is None else binary_rows(file, 1, layout)
-    row = next(rows)[0]
-    return {field: float(row[field]) for field in layout.names or ()}
-
-
-def _text_rows(file: BufferedIOBase, before: int, count: int, layout: np.dtype) -> Iterator[np.ndarray]:
-    """`count` records of ASCII data behind `before` other lines."""
-    lines = (text for line in file if (text := line.decode("ascii", "replace").strip()))
-    for _ in islice(lines, before):
-        pass
-    yield from text_rows(lines, count, layout)
+    row = next(element_rows(file, 1, properties, header.byte_order))[0]
+    return {field: float(row[field]) for field in row.dtype.names or ()}
 
 
 def text_rows(lines: Iterator[str], count: int, layout: np.dtype) -> Iterator[np.ndarray]:
@@ -126,14 +178,31 @@ def text_rows(lines: Iterator[str], count: int, layout: np.dtype) -> Iterator[np
         found += len(rows)
         if not rows or (len(rows) < PIECE_LINES and found < count):
             raise UserError(f"is cut off: its header announces {count} points, the data ends after {found}")
-        yield np.loadtxt(rows, dtype=layout, comments=None, ndmin=1)
+        try:
+            yield np.loadtxt(rows, dtype=layout, comments=None, ndmin=1)
+        except ValueError:
+            wanted = len(layout.names or ())
+            broken = next((i for i, row in enumerate(rows) if not _fits(row, layout)), 0)
+            place = found - len(rows) + broken
+            raise UserError(f"point {place}: expected {wanted} numbers, found {rows[broken][:SHOWN]!r}") from None
     if not count:
         yield np.empty(0, layout)
 
 
+def _fits(row: str, layout: np.dtype) -> bool:
+    """Whether a line of text is one record."""
+    try:
+        return np.loadtxt([row], dtype=layout, comments=None, ndmin=1).size == 1
+    except ValueError:
+        return False
+
+
 def binary_rows(file: BufferedIOBase, count: int, layout: np.dtype) -> Iterator[np.ndarray]:
     """`count` records of binary data from the file's place on, some at a time."""
-    size, found = max(1, layout.itemsize), 0
+    size, found = layout.itemsize, 0
+    if not size:
+        yield np.empty(0, layout)
+        return
     while found < count:
         wanted = min(max(1, PIECE_BYTES // size), count - found)
         data = file.read(wanted * size)

@@ -1,14 +1,16 @@
-"""Files of points as named columns, whatever the format: {"x": (points,), "y": ..., "red": ...}, piece by piece.
+"""Files opened: which kind a file is, by its first bytes where they tell, and its points as named columns.
 
-    .ply              spnr_jax/formats/ply.py, also 3D Gaussian splats
-    .xyz .txt .csv    spnr_jax/formats/text.py
-    .pcd              spnr_jax/formats/pcd.py
-    .npz .npy         spnr_jax/formats/npz.py
-    .las .laz         spnr_jax/formats/las.py
+    .ply                        spnr_jax/formats/ply.py, also 3D Gaussian splats
+    .xyz .txt .csv .asc .pts    spnr_jax/formats/text.py
+    .pcd                        spnr_jax/formats/pcd.py
+    .npz .npy                   spnr_jax/formats/npz.py
+    .las .laz                   spnr_jax/formats/las.py
+    .spz                        spnr_jax/formats/splat_files.py
+    .glb .gltf .obj .off        meshes (spnr_jax/formats/mesh), as points where they have no faces
 
-A reader yields pieces of at most some ten megabytes (archives and compressed .pcd come whole), so that a file may be
-larger than the memory.  Columns keep the type that the file gives them; what they mean is the affair of
-spnr_jax/formats/point_columns.py.
+A reader yields pieces of at most some ten megabytes (archives, meshes and compressed files come whole), so that a file
+may be larger than the memory.  Columns are raw: names and types are those of the file, positions float64 where the file
+has them so; what they mean is the affair of spnr_jax/formats/columns.py.
 """
 
 import io
@@ -17,24 +19,112 @@ from pathlib import Path
 
 import numpy as np
 
+from spnr_jax.errors import UserError
+from spnr_jax.formats.columns import Columns
 from spnr_jax.formats.las import las_pieces
 from spnr_jax.formats.npz import numpy_pieces
 from spnr_jax.formats.pcd import pcd_pieces
-from spnr_jax.formats.ply import ply_pieces, vertex_pieces
-from spnr_jax.formats.text import Columns, text_pieces
+from spnr_jax.formats.ply import element_rows, ply_pieces, read_ply_header, vertex_pieces
+from spnr_jax.formats.splat_files import compressed_columns, spz_columns
+from spnr_jax.formats.text import text_pieces
 
 READERS = {
-    ".ply": ply_pieces,
+    ".ply": lambda path: _ply(path),
     ".pcd": pcd_pieces,
-    **dict.fromkeys((".xyz", ".txt", ".csv"), text_pieces),
+    **dict.fromkeys((".xyz", ".txt", ".csv", ".asc", ".pts"), text_pieces),
     **dict.fromkeys((".npz", ".npy"), numpy_pieces),
     **dict.fromkeys((".las", ".laz"), las_pieces),
+    ".spz": lambda path: iter([spz_columns(path)]),
+}
+MESHES = (".glb", ".gltf", ".obj", ".stl", ".off")
+MAGIC = (  # first bytes, and the kind that they tell; of kinds with several suffixes the file's own is kept
+    (b"ply", (".ply",)),
+    (b"glTF", (".glb",)),
+    (b"LASF", (".las", ".laz")),
+    (b"\x93NUMPY", (".npy",)),
+    (b"# .PCD", (".pcd",)),
+    (b"NGSP", (".spz",)),
+)
+BLENDER = "convert it to .glb, e.g. with Blender (File > Import, then File > Export > glTF 2.0)"
+CLOUDCOMPARE = "convert it to .las or .ply, e.g. with CloudCompare (File > Save)"
+FOREIGN = {  # first bytes or suffix -> what it is, where its version stands (place, length), how to convert it
+    b"PXR-USDC": ("USD (binary crate)", (8, 3), BLENDER),
+    b"#usda": ("USD (text)", (6, 3), BLENDER),
+    b"ASTM-E57": ("an E57 scan", (8, 8), CLOUDCOMPARE),
+    b"Kaydara FBX Binary": ("an FBX scene", (23, 4), BLENDER),
+    b"BLENDER": ("a Blender scene", (9, 3), "export it as .glb: File > Export > glTF 2.0"),
+    b"\x89HDF": ("an HDF5 file", None, "write its points as .npz: arrays points and colors"),
+    ".usdz": ("USD (package)", None, BLENDER),
+    **dict.fromkeys((".usd", ".usda", ".usdc"), ("USD", None, BLENDER)),
+    ".e57": ("an E57 scan", None, CLOUDCOMPARE),
+    **dict.fromkeys((".ptx", ".rcp", ".rcs", ".fls", ".bin"), ("a scan of its maker's own kind", None, CLOUDCOMPARE)),
+    **dict.fromkeys((".fbx", ".dae", ".3ds", ".3mf", ".blend", ".x3d", ".wrl"), ("a scene", None, BLENDER)),
+    **dict.fromkeys((".stp", ".step", ".iges", ".igs"), ("a CAD model", None, "export a mesh, .stl or .glb")),
+    **dict.fromkeys((".splat", ".ksplat", ".sog"), ("a file of splats", None, "convert it to .ply with SuperSplat")),
 }
 
 
-def column_pieces(path: Path) -> Iterator[Columns]:
-    """The columns of a point file, some points at a time, by its suffix (one of READERS)."""
-    return READERS[path.suffix.lower()](path)
+def kind_of(path: Path) -> str:
+    """The suffix that names how a file is read, by its first bytes, else its name; ValueError for what cannot be read.
+
+    The error names the format, its version and how to convert it.
+    """
+    known = tuple(dict.fromkeys((*READERS, *MESHES)))
+    if path.is_dir():
+        raise UserError(f"{path}: a folder; expected a file of one of {' '.join(known)}")
+    suffix = path.suffix.lower()
+    if not path.is_file():
+        if suffix in known or suffix in FOREIGN:
+            raise UserError(f"{path}: there is no such file")
+        raise UserError(f"{path}: unknown kind of file {path.suffix!r}; expected one of {' '.join(known)}")
+    with path.open("rb") as file:
+        head = file.read(64)
+    if not head:
+        raise UserError(f"{path}: the file is empty")
+    for magic, kinds in MAGIC:
+        if head.startswith(magic):
+            return suffix if suffix in kinds else kinds[0]
+    for sign, (name, version, convert) in FOREIGN.items():
+        if sign == suffix if isinstance(sign, str) else head.startswith(sign):
+            raise UserError(f"{path}: {name}{_version(head, version)}, which is not read: {convert}")
+    if suffix not in known:
+        raise UserError(f"{path}: unknown kind of file {path.suffix!r}; expected one of {' '.join(known)}")
+    return suffix
+
+
+def _version(head: bytes, place: tuple[int, int] | None) -> str:
+    """The version that stands in the first bytes of a file: text, numbers of one byte, or two numbers of four."""
+    if place is None:
+        return ""
+    field = head[place[0] : sum(place)]
+    if field.isascii() and all(byte in b".0123456789" for byte in field):
+        return f" of version {field.decode()}"
+    if place[1] == 3:
+        return f" of version {'.'.join(map(str, field))}"
+    numbers = [int.from_bytes(field[i : i + 4], "little") for i in range(0, place[1], 4)]
+    return f" of version {'.'.join(map(str, numbers))}"
+
+
+def is_mesh(path: Path, kind: str) -> bool:
+    """Whether a file of this kind has faces."""
+    if kind == ".ply":
+        with path.open("rb") as file:
+            return read_ply_header(file).is_mesh
+    if kind not in MESHES:
+        return False
+    from spnr_jax.formats.mesh.meshes import points_of  # here: points are read without trimesh
+
+    return points_of(path, kind) is None
+
+
+def column_pieces(path: Path, kind: str | None = None) -> Iterator[Columns]:
+    """The columns of a file of points, some points at a time; `kind` as kind_of says."""
+    kind = kind or kind_of(path)
+    if kind in READERS:
+        return READERS[kind](path)
+    from spnr_jax.formats.mesh.meshes import points_of
+
+    return iter([points_of(path, kind) or {}])
 
 
 def read_columns(path: Path) -> Columns:
@@ -45,6 +135,21 @@ def read_columns(path: Path) -> Columns:
 def parse_ply(content: bytes) -> Columns:
     """The columns of the vertices in the bytes of a PLY file."""
     return joined(vertex_pieces(io.BytesIO(content)))
+
+
+def _ply(path: Path) -> Iterator[Columns]:
+    """The columns of a .ply file, unpacked where it is one of compressed splats."""
+    with path.open("rb") as file:
+        header = read_ply_header(file)
+        names = [name for name, _, _ in header.elements]
+        fields = [name for element, _, fields in header.elements if element == "vertex" for name, _ in fields]
+        if names[:2] == ["chunk", "vertex"] and "packed_position" in fields:
+            _, count, properties = header.elements[0]
+            rows = np.concatenate(list(element_rows(file, count, properties, header.byte_order)))
+            chunks = {name: rows[name] for name in rows.dtype.names or ()}
+            yield compressed_columns(chunks, joined(ply_pieces(path)))
+            return
+    yield from ply_pieces(path)
 
 
 def joined(pieces: Iterable[Columns]) -> Columns:

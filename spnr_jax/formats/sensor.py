@@ -1,9 +1,11 @@
 """Where the sensor stood that saw the points of a file, if the file says so: PCD headers and PLY camera elements do.
 
 Every point was seen from there, so that its normal points to it; and a camera's own axes say which way is up.  The
-place 0 0 0 that writers of PCD put there for want of a better one is believed if nothing hides the points from it.
+place 0 0 0 that writers of PCD put there for want of a better one is believed if nothing hides the points from it,
+another place if it sees most of them.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,6 +17,7 @@ from spnr_jax.formats.up_axis import ROTATIONS
 from spnr_jax.kernels.facing import seen_from, spacing_of
 
 AHEAD = 0.5  # least cosine between the z axis of a depth camera and the way to what it sees
+MOST = 0.6  # share of the points that must be seen from a place that a file names
 OPEN = 0.9  # share of the points that is seen from where they were scanned; of a whole object it is a half
 BEHIND = 5.0  # spacings behind the first of a pixel that count as seen: noise, and surfaces seen at an angle
 FARTHEST = 1e30  # a place beyond it is none
@@ -43,17 +46,22 @@ class Sensor:
         return None if abs(ahead) < AHEAD else "-y" if ahead > 0 else "y"
 
 
-def sensor_of(path: Path, positions: np.ndarray) -> Sensor | None:
+def sensor_of(
+    path: Path, positions: np.ndarray, kind: str | None = None, report: Callable[[str], None] = lambda line: None
+) -> Sensor | None:
     """The sensor of a file of these points (n, 3) or faces; ValueError for a header that cannot be read."""
-    suffix = path.suffix.lower()
-    if suffix == ".pcd":
+    kind = kind or path.suffix.lower()
+    if kind == ".pcd":
         header = read_pcd_header(path)
         if header.sensor is None or max(map(abs, header.sensor)) > FARTHEST:
             return None
         place = np.array(header.sensor)
-        image = header.organised or _from_there(positions, place)
+        image = header.organised or _from_there(positions, place, OPEN)
+        if not image and place.any() and not _from_there(positions, place, MOST, within=True):
+            report(f"the place of the sensor left out: from {' '.join(f'{x:g}' for x in place)} few points are seen")
+            return None
         return Sensor(place=place, image=image) if image or place.any() else None
-    if suffix != ".ply":
+    if kind != ".ply":
         return None
     with path.open("rb") as file:
         try:
@@ -66,7 +74,8 @@ def sensor_of(path: Path, positions: np.ndarray) -> Sensor | None:
     return Sensor(place=place, above=above if np.isfinite(above).all() and above.any() else None)
 
 
-def _from_there(positions: np.ndarray, place: np.ndarray) -> bool:
-    """Whether nearly nothing hides the points from a place outside of their bounding box."""
-    inside = np.all((place > positions.min(axis=0)) & (place < positions.max(axis=0)))
-    return not inside and bool(seen_from(positions, place, spacing_of(positions), BEHIND).mean() > OPEN)
+def _from_there(positions: np.ndarray, place: np.ndarray, share: float, within: bool = False) -> bool:
+    """Whether that share of the points is seen from a place; `within` if one inside of their bounding box counts."""
+    if np.all((place > positions.min(axis=0)) & (place < positions.max(axis=0))):
+        return within
+    return bool(seen_from(positions, place, spacing_of(positions), BEHIND).mean() > share)

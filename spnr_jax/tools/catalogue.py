@@ -24,10 +24,9 @@ from tqdm import tqdm
 from spnr_jax.devices import allocator, compilation
 from spnr_jax.devices.side_by_side import beside
 from spnr_jax.errors import UserError, one_line
-from spnr_jax.formats.clouds import MESHES
 from spnr_jax.formats.images import write_whole
 from spnr_jax.formats.pages import template
-from spnr_jax.formats.point_files import READERS
+from spnr_jax.formats.point_files import MESHES, READERS
 from spnr_jax.tools.pictures import check_writable, drawn, load_named, made_ready
 from spnr_jax.tools.render_command import WILDCARDS, Render
 from spnr_jax.training.weights import SHIPPED, load, place

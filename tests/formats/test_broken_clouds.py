@@ -18,7 +18,7 @@ from spnr_jax.formats.clouds import read_cloud
         (
             "a.jpeg",
             "1 2 3",
-            r"unknown kind of file '.jpeg'; expected one of .ply .pcd .xyz .txt .csv .npz .npy .las .laz .glb",
+            r"unknown kind of file '.jpeg'; expected one of .ply .pcd .xyz .txt .csv .asc .pts .npz .npy .las .laz",
         ),
         ("a.xyz", "# nothing yet\n", "holds 0 points"),
         ("a.ply", ply_bytes("binary_little_endian", rows=[]), "holds 0 points"),
@@ -27,7 +27,17 @@ from spnr_jax.formats.clouds import read_cloud
         ("a.csv", "px,py,pz\n0,0,0\n", r"needs the properties x y z \(and may have .*\); found px py pz"),
         ("a.xyz", "0 0 0 0.5 0.5 -0.2\n", "has red green blue from -0.2 to 0.5; expected 0 to 1"),
         ("a.xyz", "0 0 0 0.5 1.3 0.2\n", "colours up to 1.3: neither 0 to 1 nor 0 to 255"),
-        ("a.xyz", "0 0 0 3 4 256\n", "from 0.01.* to 1.00392"),
+        ("a.xyz", "0 0 0 3 4 66000\n", "from .* to 1.0"),
+        ("a.xyz", "1 2 3\n" * 5, "holds 5 points in 1 place: no object"),
+        ("a.xyz", "1 2 3\n4 5 6\n" * 5, "holds 10 points in 2 places: no object"),
+        ("a.xyz", "".join(f"{i} {2 * i} 0.1\n" for i in range(50)), "50 points on one straight line"),
+        ("a.txt", "1 2 3\n4 5 6\n7 8\n", "line 3: expected 3 numbers, found '7 8'"),
+        ("a.txt", "1 2 3\n4 5 6\nend\n", "line 3: expected 3 numbers, found 'end'"),
+        ("a.e57", b"ASTM-E57\1\0\0\0\0\0\0\0", "E57 scan of version 1.0, which is not read: convert it to .las"),
+        ("a.usdc", b"PXR-USDC\0\x08\0", r"USD \(binary crate\) of version 0.8.0"),
+        ("a.usda", "#usda 1.0\n", r"USD \(text\) of version 1.0, .* Blender"),
+        ("a.usdz", b"PK\3\4", "USD .package., which is not read: convert it to .glb"),
+        ("a.spz", b"NGSP\4\0\0\0" + bytes(30), ".spz file of version 4; versions 2 and 3 can be read: convert"),
         ("a.csv", "x y z base_color_r base_color_g base_color_b\n0 0 0 0 0 9\n", "from 0 to 9"),
         ("a.csv", "x y z roughness\n0 0 0 nan\n", "no point that can be used"),
         (
@@ -36,7 +46,8 @@ from spnr_jax.formats.clouds import read_cloud
             "0.5 apart at best .* extent of 1; move them to the origin",
         ),
         ("a.ply", ply_bytes("binary_little_endian")[:-20], "announces 3 points, the data ends after 2"),
-        ("a.obj", "v 0 0 0\n", "has no faces"),
+        ("a.obj", "v 0 0 0\n", "holds 1 points in 1 place"),
+        ("b.obj", "# nothing\n", "no faces, and no vertices"),
         ("a.glb", b"glTF\2\0\0\0\xff\xff\0\0", "broken or truncated|cut off|truncated"),
     ],
 )
@@ -63,7 +74,15 @@ def test_wrong_options_are_refused_before_the_file_is_touched():
 
 
 BROKEN_ROWS = np.array(
-    [(0, 0, 0, 0.25), (np.nan, 1, 1, 0.5), (1, 2, 3, 1), (0, -np.inf, 0, 0), (4, 5, 6, np.nan), (1e39, 0, 0, 0)],
+    [
+        (0, 0, 0, 0.25),
+        (np.nan, 1, 1, 0.5),
+        (1, 2, 3, 1),
+        (0, -np.inf, 0, 0),
+        (4, 5, 6, np.nan),
+        (1e39, 0, 0, 0),
+        (0, 1, 0, 0),
+    ],
     [("x", "f8"), ("y", "f8"), ("z", "f8"), ("roughness", "f8")],
 )
 
@@ -80,9 +99,8 @@ def broken_file(folder, name: str):
         properties = [(field, "double") for field in BROKEN_ROWS.dtype.names]
         path.write_bytes(ply_bytes("binary_little_endian", rows=BROKEN_ROWS.tolist(), properties=properties))
     elif name.endswith(".pcd"):
-        # an organised cloud, as a depth camera writes it
-        head = "VERSION 0.7\nFIELDS x y z roughness\nSIZE 8 8 8 8\nTYPE F F F F\nCOUNT 1 1 1 1\nWIDTH 3\nHEIGHT 2\n"
-        path.write_bytes((head + "POINTS 6\nDATA binary\n").encode() + BROKEN_ROWS.tobytes())
+        head = "VERSION 0.7\nFIELDS x y z roughness\nSIZE 8 8 8 8\nTYPE F F F F\nCOUNT 1 1 1 1\nWIDTH 7\nHEIGHT 1\n"
+        path.write_bytes((head + "POINTS 7\nDATA binary\n").encode() + BROKEN_ROWS.tobytes())
     else:
         path.write_text(("x y z roughness\n" if name.endswith(".csv") else "# x y z roughness\n") + text)
     return path
@@ -91,10 +109,10 @@ def broken_file(folder, name: str):
 @pytest.mark.parametrize("name", ["a.pcd", "a.ply", "a.npz", "a.npy", "a.xyz", "a.csv"])
 def test_rows_without_finite_numbers_are_left_out_and_counted_in_one_line(tmp_path, name):
     cloud, lines = read(broken_file(tmp_path, name))
-    np.testing.assert_array_equal(cloud.positions, [[0, 0, 0], [1, 2, 3]])
-    np.testing.assert_array_equal(cloud.roughness, [0.25, 1])
+    np.testing.assert_array_equal(cloud.positions, [[0, 0, 0], [1, 2, 3], [0, 1, 0]])
+    np.testing.assert_array_equal(cloud.roughness, [0.25, 1, 0])
     assert [line for line in lines if "left out" in line] == [
-        "4 of 6 points left out: NaN, infinity or too large a number"
+        "4 of 7 points left out: NaN, infinity or too large a number"
     ]
 
 

@@ -29,6 +29,9 @@ def test_the_points_of_a_data_set_come_back_as_they_are_and_nothing_is_assumed(t
     points = np.zeros(700, POINT_TYPE)
     for name in POINT_TYPE.names:
         points[name] = rng.uniform(size=700)
+    for names in (("x", "y", "z"), ("nx", "ny", "nz")):
+        for name, column in zip(names, spiral(700).T, strict=True):
+            points[name] = column
     (tmp_path / "points.ply").write_bytes(encode_points(points))
     cloud, lines = read(tmp_path / "points.ply")
     np.testing.assert_array_equal(cloud.positions, np.stack([points[name] for name in "xyz"], axis=-1))
@@ -41,8 +44,8 @@ def test_the_points_of_a_data_set_come_back_as_they_are_and_nothing_is_assumed(t
 
 
 def test_8_bit_unit_and_255_colours_are_the_same_linear_colour_and_the_report_says_how_they_were_read(tmp_path):
-    levels = np.array([[0, 5, 188], [255, 64, 11]])
-    rows = [(0.0, 0.0, float(i), *map(int, level)) for i, level in enumerate(levels)]
+    levels = np.array([[0, 5, 188], [255, 64, 11], [9, 9, 9]])
+    rows = [(0.0, float(i * i), float(i), *map(int, level)) for i, level in enumerate(levels)]
     text = "\n".join(" ".join(map(str, (*row[:3], *(v / 255 for v in row[3:])))) for row in rows)
     files = {
         write(
@@ -60,18 +63,18 @@ def test_8_bit_unit_and_255_colours_are_the_same_linear_colour_and_the_report_sa
 
 
 def test_linear_base_colours_win_over_srgb_ones_and_are_not_decoded(tmp_path):
-    np.savez(tmp_path / "a.npz", xyz=np.zeros((2, 3)), base_color=np.full((2, 3), 0.2), rgb=np.full((2, 3), 0.9))
+    np.savez(tmp_path / "a.npz", xyz=np.eye(3), base_color=np.full((3, 3), 0.2), rgb=np.full((3, 3), 0.9))
     np.testing.assert_allclose(read_cloud(tmp_path / "a.npz").base_color, 0.2)
 
 
 def test_what_a_file_does_not_say_is_grey_half_rough_no_metal_and_reported(tmp_path):
-    cloud, lines = read(write(tmp_path, "a.xyz", "0 0 0\n1 2 3\n"))
+    cloud, lines = read(write(tmp_path, "a.xyz", "0 0 0\n1 2 3\n0 1 0\n"))
     assert (cloud.base_color == 0.5).all()
     assert (cloud.roughness == 0.5).all()
     assert (cloud.metallic == 0).all()
     assert [line.split()[:2] for line in lines] == [["no", name] for name in ("base_color", "roughness", "metallic")]
-    cloud, lines = read(write(tmp_path, "b.csv", "x,y,z,metalness\n0,0,0,0.25\n"))
-    assert cloud.metallic == [0.25]
+    cloud, lines = read(write(tmp_path, "b.csv", "x,y,z,metalness\n0,0,0,0.25\n1,0,0,0.25\n0,1,0,0.25\n"))
+    assert (cloud.metallic == 0.25).all()
     assert not any("metallic" in line for line in lines)
 
 
@@ -142,10 +145,11 @@ def test_normals_have_unit_length_and_turn_with_the_cloud_and_a_row_without_one_
 
 
 def test_a_cloud_without_a_usable_normal_has_none(tmp_path):
-    zeros = write(tmp_path, "zeros.csv", "x y z nx ny nz\n0 0 1 0 0 0\n0 1 0 nan 0 0")
-    part = write(tmp_path, "part.csv", "x y z nx ny\n0 0 1 0 1\n0 1 0 0 1")
-    packed = np.zeros(2, [(name, "f4") for name in "xyz"] + [(name, "u1") for name in ("nx", "ny", "nz")])
+    zeros = write(tmp_path, "zeros.csv", "x y z nx ny nz\n0 0 1 0 0 0\n0 1 0 nan 0 0\n1 0 0 0 0 0")
+    part = write(tmp_path, "part.csv", "x y z nx ny\n0 0 1 0 1\n0 1 0 0 1\n1 0 0 0 1")
+    packed = np.zeros(3, [(name, "f4") for name in "xyz"] + [(name, "u1") for name in ("nx", "ny", "nz")])
     packed["nx"] = 255
+    packed["x"], packed["y"] = [0, 1, 0], [0, 0, 1]
     np.save(tmp_path / "packed.npy", packed)
     for path in (zeros, part, tmp_path / "packed.npy"):
         assert read_cloud(path).normals is None

@@ -59,7 +59,10 @@ def test_the_viewpoint_that_every_writer_puts_there_is_believed_if_nothing_hides
     seen = ball[ball[:, 2] < 3.75]
     assert sensor(pcd(tmp_path, seen)).image
     assert np.all(np.sum(read_cloud(tmp_path / "a.pcd").normals * -seen, axis=1) > 0)
-    assert sensor(pcd(tmp_path, ball, viewpoint="0 0 9 1 0 0 0")).place.tolist() == [0, 0, 9]
+    assert sensor(pcd(tmp_path, seen, viewpoint="0.5 0 0 1 0 0 0")).place.tolist() == [0.5, 0, 0]
+    lines: list[str] = []
+    assert sensor_of(pcd(tmp_path, ball, viewpoint="0 0 9 1 0 0 0"), ball, report=lines.append) is None
+    assert lines == ["the place of the sensor left out: from 0 0 9 few points are seen"]
     for viewpoint in ("nan 0 0 1 0 0 0", "1e300 0 0 1 0 0 0", "x y z", ""):
         assert sensor(pcd(tmp_path, seen, viewpoint=viewpoint)) is None
 

@@ -1,7 +1,8 @@
 """The files that a mesh file names (buffers, images, material libraries), read only from its object's own folder.
 
 A name in a mesh file is somebody else's text: data URIs are decoded, a name that leaves the object's folder or points
-to the network is refused, and a file that is not there is a reason to reject the object, never a texture less. The
+to the network is refused, and a file that is not there is a reason to reject the object, never a texture less. A path
+of another machine, or a name in other capitals, means the file of that name beside the mesh, if there is one. The
 object's folder is the mesh's, unless its source says otherwise: a ShapeNet object keeps its images beside the folder
 of its mesh (`../images`).
 """
@@ -24,12 +25,22 @@ def read_companion(folder: Path, uri: str, root: Path | None = None) -> bytes:
     root = folder if root is None else root
     plain = _inside(root, folder, uri)
     path = plain if plain is not None and plain.is_file() else _inside(root, folder, unquote(uri))
+    if path is None or not path.is_file():
+        path = _beside(folder, uri) or path
     if path is None:
         raise MissingFile(f"names a file outside its own folder: {uri!r}")
     try:
         return path.read_bytes()
     except (FileNotFoundError, IsADirectoryError, NotADirectoryError):
         raise MissingFile(f"names a file that is missing: {unquote(uri)!r}") from None
+
+
+def _beside(folder: Path, uri: str) -> Path | None:
+    """The file in the folder that a path of another machine means: its last name, in any letter case."""
+    name = unquote(uri).replace("\\", "/").rpartition("/")[2].casefold()
+    if not name or not folder.is_dir():
+        return None
+    return next((path for path in sorted(folder.iterdir()) if path.name.casefold() == name and path.is_file()), None)
 
 
 def _inside(root: Path, folder: Path, name: str) -> Path | None:

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from spnr_jax.formats.mesh.assets import Asset, Part, RejectedAsset, TransparentParts
+from spnr_jax.formats.mesh.colors import LINEAR, SRGB
 from spnr_jax.formats.mesh.draco import DRACO, decode_mesh
 from spnr_jax.formats.mesh.gltf_container import MESHOPT, GltfFile, scaled
 from spnr_jax.formats.mesh.gltf_materials import GltfMaterial, read_material
@@ -27,6 +28,7 @@ MODES = {
     6: "TRIANGLE_FAN",
 }
 READABLE = {MOVED, WEBP, BASIS, DRACO, *MESHOPT, INSTANCING, "KHR_mesh_quantization", "KHR_lights_punctual"}
+SPLATS = "KHR_gaussian_splatting"
 NO_COLORS = np.ones((1, 3))
 OTHERS = ("POSITION", "NORMAL", "COLOR_0")  # columns, beside texture coordinates, that are read
 # Faces that are drawn again, beside each mesh's first: a small file could ask for any number.  To draw a mesh again
@@ -81,6 +83,44 @@ def load_gltf(path: Path, transparent_parts: TransparentParts = "refuse") -> Ass
     if not parts and any(look.nowhere for look in materials.values()):
         raise RejectedAsset(f"has nothing to draw: {'; '.join(tolerance.notes())}")
     return Asset(parts=tuple(parts), ignored=tuple(sorted(ignored)), notes=tuple(tolerance.notes()))
+
+
+def gltf_points(path: Path) -> dict[str, np.ndarray] | None:
+    """The columns of the points of a scene without triangles; None if it has some, or no points either.
+
+    Colours are linear, as the specification has them, or display-referred sRGB where a splat says so.
+    """
+    file = GltfFile(path)
+    meshes = file.document.get("meshes", [])
+    drawn = [(primitive, matrices) for mesh, matrices in drawn_meshes(file) for primitive in meshes[mesh]["primitives"]]
+    modes = {MODES[primitive.get("mode", 4)] for primitive, _ in drawn}
+    if "POINTS" not in modes or any(mode.startswith("TRIANGLE") for mode in modes):
+        return None
+    pieces = []
+    for primitive, matrices in drawn:
+        if primitive.get("mode") != 0:
+            continue
+        columns = _point_columns(file, primitive)
+        positions = np.stack([columns[axis] for axis in "xyz"], axis=-1)
+        for matrix in matrices[: max(1, MOST_REPEATED // max(1, len(positions)))]:
+            placed = positions @ matrix[:3, :3].T + matrix[:3, 3]
+            pieces.append(columns | dict(zip("xyz", placed.T, strict=True)))
+    shared = set(pieces[0]).intersection(*pieces[1:])
+    return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0] if name in shared}
+
+
+def _point_columns(file: GltfFile, primitive: dict) -> dict[str, np.ndarray]:
+    """The columns of a primitive of points in its own frame, without normals, which nodes turn."""
+    attributes = primitive["attributes"]
+    columns = dict(zip("xyz", file.accessor(attributes["POSITION"]).T, strict=True))
+    if "COLOR_0" in attributes:
+        colors = file.accessor(attributes["COLOR_0"]).T
+        shown = primitive.get("extensions", {}).get(SPLATS, {}).get("colorSpace") == "srgb_rec709_display"
+        columns |= dict(zip((*(SRGB if shown else LINEAR), "alpha"), colors, strict=False))
+    if f"{SPLATS}:OPACITY" in attributes:
+        columns.pop("alpha", None)
+        columns["splat_opacity"] = file.accessor(attributes[f"{SPLATS}:OPACITY"])[:, 0]
+    return columns
 
 
 def _left_out(primitive: dict) -> set[str]:

@@ -57,6 +57,8 @@ def read_material(file: GltfFile, index: int | None, tolerance: Tolerance) -> Gl
     look = convert(textures, spec.get("pbrMetallicRoughness", {}) if glossy is None else glossy)
     opacity = _opacity(spec, name, look, tolerance)  # after the textures: a missing file is the plainer reason
     normal_map = None if tolerance.strict else _normal_map(textures, spec.get("normalTexture"))
+    if "KHR_materials_unlit" in extensions:
+        tolerance.holds_light(name)
     ignored = textures.ignored | {key for key in extensions if key != SPECULAR_GLOSSINESS}
     ignored |= {key for key in ("normalTexture", "occlusionTexture") if key in spec}
     if normal_map is not None:

@@ -1,35 +1,32 @@
 """Mesh files as assets: which files a folder holds, and one of them read.
 
 glTF and GLB carry principled materials (gltf.py), OBJ gets them from its MTL (obj.py); PLY, STL and
-OFF have vertex or face colours at most (8-bit colours are sRGB, float ones linear), grey 0.5 otherwise.
+OFF (plain.py) have vertex or face colours at most, read as those of points are (colors.py), grey 0.5 otherwise.
 Every reason not to use a file is a RejectedAsset with one line.
 """
 
 import hashlib
-import io
 import re
 import struct
 import warnings
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
-from trimesh.exchange.off import load_off
-from trimesh.exchange.ply import load_ply
-from trimesh.exchange.stl import load_stl
-from trimesh.geometry import triangulate_quads
 
 from spnr_jax.errors import UserError, is_bug
 from spnr_jax.formats.mesh.assemble import assemble
-from spnr_jax.formats.mesh.assets import Asset, Part, RejectedAsset, TransparentParts
-from spnr_jax.formats.mesh.gltf import load_gltf
-from spnr_jax.formats.mesh.obj import load_obj, principled
-from spnr_jax.formats.mesh.texels import srgb_to_linear
+from spnr_jax.formats.mesh.assets import Asset, RejectedAsset, TransparentParts
+from spnr_jax.formats.mesh.gltf import gltf_points, load_gltf
+from spnr_jax.formats.mesh.obj import load_obj, obj_points
+from spnr_jax.formats.mesh.plain import PLAIN, off_points
 
-TEXT_OR_BINARY = {".ply": load_ply, ".stl": load_stl, ".off": load_off}
-SUFFIXES = (".glb", ".gltf", ".obj", *TEXT_OR_BINARY)
+SUFFIXES = (".glb", ".gltf", ".obj", *PLAIN)
 NAMED_BY_FOLDER = (".gltf", ".obj")  # files that come with companions, so that the folder is the object
+Result = TypeVar("Result")
 # What readers raise on files that break their rules; not MemoryError and not an interrupt.
 UNREADABLE: tuple[type[Exception], ...]
 UNREADABLE = (ValueError, LookupError, TypeError, AttributeError, NameError, ArithmeticError, OSError, RuntimeError)
@@ -65,23 +62,43 @@ def find_meshes(folder: Path) -> list[tuple[str, Path]]:
     return sorted(ids.items())
 
 
-def load_mesh(path: Path, root: Path | None = None, transparent_parts: TransparentParts = "refuse") -> Asset:
+def load_mesh(
+    path: Path, root: Path | None = None, transparent_parts: TransparentParts = "refuse", kind: str | None = None
+) -> Asset:
     """The object in a mesh file, parts merged by material; `source` names the file and its checksum.
 
     `root` is the object's folder, which may hold an .obj file's companions above it (default: the file's folder).
     RejectedAsset, with one line, for a file that cannot be used: unreadable or truncated, without faces or extent,
     with buffers missing or outside its folder.  "refuse", for references, also refuses what is transparent and images
-    and libraries that are missing; "opaque" and "skip", for pictures, say in `notes` what was made of them, and read
-    what the renderer of references does not know: cut-outs, normal maps, several texture coordinates (tolerance.py).
+    and libraries that are missing; "opaque" and "skip", for pictures, say in `notes` what was made of them, leave out
+    faces whose vertices are not finite, and read what the renderer of references does not know: cut-outs, normal maps,
+    several texture coordinates (tolerance.py).  `kind` is a suffix to go by instead of the file's.
     """
     path = Path(path)
+    kind = kind or path.suffix.lower()
+
+    def read() -> Asset:
+        asset = _load(path, kind, root, transparent_parts)
+        return assemble(asset if transparent_parts == "refuse" else _finite(asset))
+
+    asset = _guarded(read)
+    return replace(asset, source={"file": path.name, "sha256": hashlib.sha256(path.read_bytes()).hexdigest()})
+
+
+def points_of(path: Path, kind: str) -> dict[str, np.ndarray] | None:
+    """The columns of the points of a mesh file that has no faces, for pictures; None where it has some."""
+    readers = {".obj": obj_points, ".off": off_points, ".glb": gltf_points, ".gltf": gltf_points}
+    return _guarded(lambda: readers[kind](path)) if kind in readers else None
+
+
+def _guarded(read: Callable[[], Result]) -> Result:
+    """What `read` makes of a file; RejectedAsset where its libraries stumble over it."""
     try:
         with warnings.catch_warnings(), np.errstate(all="ignore"):  # assemble looks for what is not finite
             # numpy only warns where the text of a file stops being numbers
             warnings.filterwarnings("error", "string or file could not be read", DeprecationWarning)
-            asset = assemble(_load(path, root, transparent_parts))
-        checksum = hashlib.sha256(path.read_bytes()).hexdigest()
-    except RejectedAsset:
+            return read()
+    except UserError:
         raise
     except UNREADABLE as error:
         if is_bug(error):
@@ -90,51 +107,39 @@ def load_mesh(path: Path, root: Path | None = None, transparent_parts: Transpare
         raise RejectedAsset(
             f"cannot be read, the file is broken or truncated ({type(error).__name__}: {text})"
         ) from error
-    return replace(asset, source={"file": path.name, "sha256": checksum})
 
 
-def _load(path: Path, root: Path | None, transparent_parts: TransparentParts) -> Asset:
-    """The raw asset of a file, by its suffix."""
-    suffix = path.suffix.lower()
-    if suffix in (".glb", ".gltf"):
+def _finite(asset: Asset) -> Asset:
+    """The asset without faces that name a vertex which is not finite, and a note about how many these are."""
+    parts, lost = [], 0
+    for part in asset.parts:
+        sound = np.isfinite(part.positions).all(axis=-1)
+        if (
+            part.faces.ndim == 2
+            and part.faces.size
+            and not sound.all()
+            and part.faces.min() >= 0
+            and (part.faces.max() < len(sound))
+        ):
+            whole = sound[part.faces].all(axis=1)
+            lost += int((~whole).sum())
+            part = replace(part, faces=part.faces[whole], positions=np.where(sound[:, None], part.positions, 0))
+        parts.append(part)
+    if not lost:
+        return asset
+    note = f"{lost:,} faces left out: a vertex of theirs is NaN or infinity"
+    return replace(asset, parts=tuple(parts), notes=(*asset.notes, note))
+
+
+def _load(path: Path, kind: str, root: Path | None, transparent_parts: TransparentParts) -> Asset:
+    """The raw asset of a file of a kind."""
+    if kind in (".glb", ".gltf"):
         return load_gltf(path, transparent_parts)
-    if suffix == ".obj":
+    if kind == ".obj":
         return load_obj(path, root, transparent_parts)
-    if suffix not in TEXT_OR_BINARY:
-        raise RejectedAsset(f"has suffix {suffix!r}; expected one of {' '.join(SUFFIXES)}")
-    data = path.read_bytes()
-    loaded = TEXT_OR_BINARY[suffix](io.BytesIO(data))
-    meshes = loaded["geometry"].values() if "geometry" in loaded else [loaded]
-    ignored = {"COFF vertex colours"} if data.startswith(b"COFF") else set()
-    parts = tuple(_colored_part(mesh, ignored) for mesh in meshes if mesh.get("faces") is not None)
-    return Asset(parts=parts, ignored=tuple(ignored))
-
-
-def _colored_part(mesh: dict, ignored: set[str]) -> Part:
-    """A part of a PLY, STL or OFF file; face colours give every face its own three vertices."""
-    positions, faces = np.asarray(mesh["vertices"], np.float64), triangulate_quads(mesh["faces"]).reshape(-1, 3)
-    part = Part(positions=positions, faces=faces, material=principled(), normals=mesh.get("vertex_normals"))
-    vertex_colors, face_colors = mesh.get("vertex_colors"), mesh.get("face_colors")
-    if "visual" in mesh:
-        ignored.add("texture coordinates (of formats other than glTF and OBJ)")
-    if np.any(mesh.get("face_attributes", {}).get("stl", 0)):
-        ignored.add("STL attribute bytes")
-    if vertex_colors is not None:
-        return replace(part, colors=_linear(vertex_colors), material=principled(1.0))
-    if face_colors is None:
-        return part
-    if len(face_colors) != len(faces):
-        ignored.add("colours of faces with more than three corners")
-        return part
-    corners = np.arange(faces.size).reshape(-1, 3)
-    colors = np.repeat(_linear(face_colors), 3, axis=0)
-    return Part(positions=positions[faces.ravel()], faces=corners, material=principled(1.0), colors=colors)
-
-
-def _linear(colors: np.ndarray) -> np.ndarray:
-    """Linear RGB (n, 3) of file colours (n, 3 or 4): integers are sRGB in 0..255, floats linear."""
-    rgb = np.asarray(colors)[:, :3]
-    return rgb.astype(np.float64) if rgb.dtype.kind == "f" else srgb_to_linear(rgb / 255)
+    if kind not in PLAIN:
+        raise RejectedAsset(f"has suffix {kind!r}; expected one of {' '.join(SUFFIXES)}")
+    return PLAIN[kind](path.read_bytes())
 
 
 def _short_name(path: Path, alone: bool) -> str:

@@ -1,11 +1,11 @@
 """Wavefront OBJ + MTL as raw assets: geometry through trimesh, materials from the MTL text.
 
-Kd is linear (as Blender writes it) and counts only without map_Kd (sRGB), for most exporters leave a placeholder beside
-a map; roughness is Pr, else sqrt(2 / (Ns + 2)), else 0.5; metallic is Pm, else 0. Transparent: d below 1, map_d, or Tr
-strictly between 0 and 1 (writers disagree which end of Tr is the opaque one); where a picture is wanted (tolerance.py)
-map_d is a cut-out at a half, and a library or an image that is missing leaves grey. Of faces with the same three
-corners, in either order, one is kept, that of the material used first: ShapeNet has many, one for each side, and a ray
-could not tell which it hits.
+Vertex colours are sRGB, as those of points (colors.py).  Kd is linear (as Blender writes it) and counts only without
+map_Kd (sRGB), for most exporters leave a placeholder beside a map; roughness is Pr, else sqrt(2 / (Ns + 2)), else 0.5;
+metallic is Pm, else 0. Transparent: d below 1, map_d, or Tr strictly between 0 and 1 (writers disagree which end of Tr
+is the opaque one); where a picture is wanted (tolerance.py) map_d is a cut-out at a half, and a library or an image
+that is missing leaves grey. Of faces with the same three corners, in either order, one is kept, that of the material
+used first: ShapeNet has many, one for each side, and a ray could not tell which it hits.
 """
 
 import io
@@ -21,7 +21,9 @@ from trimesh.exchange.obj import load_obj as read_obj_text
 from trimesh.geometry import triangulate_quads
 
 from spnr_jax.formats.mesh.assets import Asset, Material, MissingFile, Part, RejectedAsset, TransparentParts, Wrap
+from spnr_jax.formats.mesh.colors import linear_colors
 from spnr_jax.formats.mesh.companions import read_companion
+from spnr_jax.formats.mesh.polygons import MOST_CORNERS, ears, is_concave
 from spnr_jax.formats.mesh.texels import color_texels, read_image, value_texels
 from spnr_jax.formats.mesh.tolerance import MOSTLY_OPAQUE, Alpha, Opacity, Tolerance
 
@@ -55,10 +57,10 @@ def load_obj(path: Path, root: Path | None = None, transparent_parts: Transparen
     `root` is the folder that libraries and images must not lead out of (default: the file's own).
     """
     read, tolerance = partial(read_companion, path.parent, root=root), Tolerance(transparent_parts)
-    text = path.read_text("utf-8", errors="replace")
-    text = re.sub(r"(?m)^ +", "", text.replace("\t", " "))  # trimesh looks for keywords at the line's start
+    text = _text(path)
     if not re.search(r"(?m)^f ", text):
         raise RejectedAsset("has no faces")
+    text = _without_notches(text)
     library: dict[str, dict[str, str]] = {}
     for names in re.findall(r"(?m)^mtllib +(.+?) *$", text):
         library |= parse_mtl(_read_library(read, path.parent, names, tolerance))
@@ -71,14 +73,86 @@ def load_obj(path: Path, root: Path | None = None, transparent_parts: Transparen
     )
     order = {name: number for number, name in enumerate(looks)}
     meshes = sorted(loaded["geometry"].values(), key=lambda mesh: order.get(_material_name(mesh), -1))
-    dressed = [(mesh, looks.get(_material_name(mesh), Look(principled()))) for mesh in meshes]
+    notes = _color(meshes)
+    # what has colours of its own and no material is not multiplied with grey
+    plain = {name for name, number in order.items() if names[number] not in library} | {""}
+    dressed = []
+    for mesh in meshes:
+        name = _material_name(mesh)
+        white = mesh.get("vertex_colors") is not None and (name in plain or name not in looks)
+        dressed.append((mesh, Look(principled(1.0)) if white else looks.get(name, Look(principled()))))
     parts = [_part(mesh, look.material, look.placement) for mesh, look in dressed if not look.nowhere]
     if not parts and meshes:
         raise RejectedAsset(f"has nothing to draw: {'; '.join(tolerance.notes())}")
     if re.search(r"(?m)^vn ", text) and any(part.normals is None for part in parts):
         ignored.add("normals that only some faces have (flat shading is used)")
     parts = _without_doubles(parts, ignored)
-    return Asset(parts=tuple(parts), ignored=tuple(sorted(ignored)), notes=tuple(tolerance.notes()))
+    return Asset(parts=tuple(parts), ignored=tuple(sorted(ignored)), notes=(*tolerance.notes(), *notes))
+
+
+def obj_points(path: Path) -> dict[str, np.ndarray] | None:
+    """The columns of the vertices of a file without faces; None if it has some."""
+    text = _text(path)
+    if re.search(r"(?m)^f ", text):
+        return None
+    rows = _vertices(text)
+    if not rows.size:
+        raise RejectedAsset("has no faces, and no vertices")
+    names = {3: "x y z", 4: "x y z w", 6: "x y z red green blue", 7: "x y z red green blue alpha"}.get(rows.shape[1])
+    if names is None:
+        raise RejectedAsset(f"has vertices of {rows.shape[1]} numbers; expected x y z, or x y z red green blue")
+    columns = dict(zip(names.split(), rows.T, strict=True))
+    normals = re.findall(r"(?m)^vn +(.+)$", text)
+    if len(normals) == len(rows):
+        columns |= dict(zip(("nx", "ny", "nz"), np.loadtxt(normals, ndmin=2).T, strict=True))
+    return columns
+
+
+def _text(path: Path) -> str:
+    """The text of a file, without blanks before keywords, which trimesh looks for at the line's start."""
+    return re.sub(r"(?m)^ +", "", path.read_text("utf-8", errors="replace").replace("\t", " "))
+
+
+def _vertices(text: str) -> np.ndarray:
+    """What stands behind the `v` of each line (n, columns)."""
+    found = re.findall(r"(?m)^v +(.+)$", text)
+    return np.loadtxt(found, ndmin=2, comments="#") if found else np.zeros((0, 3))
+
+
+def _without_notches(text: str) -> str:
+    """The text with triangles instead of polygons that are not convex; trimesh makes fans of all."""
+    polygon = re.compile(r"(?m)^f((?: +\S+){4,}) *$")
+    if not polygon.search(text):
+        return text
+    text = _absolute(text) if re.search(r"(?m)^f .*-", text) else text
+    positions = _vertices(text)[:, :3]
+
+    def cut(match: re.Match) -> str:
+        words = match[1].split()
+        rows = np.array([int(word.partition("/")[0]) - 1 for word in words])
+        if (
+            rows.min() < 0
+            or rows.max() >= len(positions)
+            or len(rows) > MOST_CORNERS
+            or not is_concave(positions[rows])
+        ):
+            return match[0]
+        return "\n".join(" ".join(["f", *(words[i] for i in face)]) for face in ears(positions[rows]))
+
+    return polygon.sub(cut, text)
+
+
+def _color(meshes: list[dict]) -> list[str]:
+    """Makes the vertex colours of groups of faces linear; lines about how they were read."""
+    own = [mesh for mesh in meshes if mesh.get("vertex_colors") is not None]
+    if not own:
+        return []
+    channels = np.concatenate([np.asarray(mesh["vertex_colors"])[:, :3] for mesh in own])
+    colors, lines = linear_colors(channels, "vertex colours")
+    ends = np.cumsum([len(mesh["vertex_colors"]) for mesh in own])[:-1]
+    for mesh, part in zip(own, np.split(colors, ends), strict=True):
+        mesh["vertex_colors"] = part
+    return lines
 
 
 def _without_doubles(parts: list[Part], ignored: set[str]) -> list[Part]:

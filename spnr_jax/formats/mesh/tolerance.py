@@ -78,6 +78,10 @@ class Tolerance:
         reason, _, name = str(error).partition(": ")
         self._say(f"plain values taken where it {reason}", name, quoted=False)
 
+    def holds_light(self, name: str) -> None:
+        """Keeps for the notes that a material's colours are what is to be seen, light and all."""
+        self._say("colours that hold light already (KHR_materials_unlit) taken as base colours", name)
+
     def notes(self) -> Iterable[str]:
         """One sentence for each thing that was decided."""
         for beginning, names in self.said.items():

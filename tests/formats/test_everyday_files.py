@@ -1,0 +1,444 @@
+"""Files as people have them, of every kind that went wrong in reports about other tools: what becomes of each.
+
+The small files are made here.  `test_all_reported_files` reads those of `../shared/data/reports`, where they are at
+hand, prints what becomes of each, and keeps the table of docs/your_data.md true.
+"""
+
+import gzip
+import os
+import re
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support import splat_balls
+from support.gltf_files import GltfBuilder
+from support.point_clouds import ply_bytes, read, write
+
+from spnr_jax.formats import gaussian_files
+from spnr_jax.formats.clouds import place_cloud, read_cloud
+from spnr_jax.formats.cut import Cut
+from spnr_jax.surfels.visibility import spiral
+
+ROOT = Path(__file__).parents[2]
+REPORTS = ROOT.parent / "shared" / "data" / "reports"
+PAGE = ROOT / "docs" / "your_data.md"
+BALL = np.round(spiral(420), 4)
+GREEN = (40, 170, 60)
+LINEAR = np.array([0.0212, 0.4020, 0.0452])  # of GREEN
+ROWS = [(*point, *GREEN) for point in BALL.tolist()]
+UTM = np.array([500_000.123, 5_200_000.377, 120.0])
+
+
+def table(separator: str, end: str = "", comma: bool = False, columns=ROWS) -> str:
+    text = "\n".join(separator.join(f"{value:g}" for value in row) + end for row in columns) + "\n"
+    return text.replace(".", ",") if comma else text
+
+
+# Points in text: (name, content, whether there are colours)
+TEXTS = {
+    "count line": ("a.xyz", "420\n" + table(" "), True),
+    "CloudCompare, count": ("a.txt", "//X Y Z R G B\n420\n" + table(" "), True),
+    "CloudCompare, names with blanks": (
+        "a.txt",
+        "//X;Y;Z;R;G;B;Illuminance (PCV)\n" + table(";", columns=[(*row, 0.5) for row in ROWS]),
+        True,
+    ),
+    "units in brackets": ("a.csv", "X [m],Y [m],Z [m],R,G,B\n" + table(","), True),
+    "units, blanks between": ("a.txt", "X[m] Y[m] Z[m] R G B\n" + table(" "), True),
+    "pandas' index": (
+        "a.csv",
+        ",x,y,z,red,green,blue\n" + table(",", columns=[(i, *row) for i, row in enumerate(ROWS)]),
+        True,
+    ),
+    "R's index": ("a.txt", "x y z r g b\n" + table(" ", columns=[(i + 1, *row) for i, row in enumerate(ROWS)]), True),
+    "trailing commas": ("a.csv", "x,y,z,r,g,b\n" + table(",", ","), True),
+    "trailing commas, names as well": ("a.csv", "x,y,z,r,g,b,\n" + table(",", ","), True),
+    "trailing semicolons": ("a.txt", table(";", ";"), True),
+    "decimal commas": ("a.csv", "x;y;z;r;g;b\n" + table(";", comma=True), True),
+    "decimal commas between blanks": ("a.txt", table(" ", comma=True), True),
+    ".asc": ("a.asc", table(" "), True),
+    ".pts with intensity": ("a.pts", "420\n" + table(" ", columns=[(*row[:3], -900, *GREEN) for row in ROWS]), True),
+    "rows of red green blue alpha": ("a.txt", table(" ", columns=[(*row, 255) for row in ROWS]), True),
+    "OBJ of points": ("a.obj", "".join("v {:g} {:g} {:g} 0.157 0.667 0.235\n".format(*p) for p in BALL), True),
+    "OBJ of v and p": (
+        "a.obj",
+        "".join("v {:g} {:g} {:g}\n".format(*p) for p in BALL) + "p " + " ".join(map(str, range(1, 421))),
+        False,
+    ),
+    "OFF of points": ("a.off", "OFF\n420 0 0\n" + table(" ", columns=BALL), False),
+    "a PLY under another name": (
+        "a.txt",
+        ply_bytes("ascii", rows=[tuple(p) for p in BALL], properties=[(axis, "float") for axis in "xyz"]),
+        False,
+    ),
+}
+
+
+@pytest.mark.parametrize("case", TEXTS)
+def test_files_of_points_are_read_whatever_stands_around_the_numbers(tmp_path, case):
+    name, content, colored = TEXTS[case]
+    cloud, _ = read(write(tmp_path, name, content))
+    np.testing.assert_allclose(cloud.positions, BALL, atol=1e-5)
+    np.testing.assert_allclose(cloud.base_color, np.broadcast_to(LINEAR if colored else 0.5, (420, 3)), atol=2e-3)
+
+
+def test_arrays_of_pictures_and_of_colours_with_alpha_are_points(tmp_path):
+    np.save(tmp_path / "a.npy", BALL.reshape(20, 21, 3))
+    np.testing.assert_allclose(read_cloud(tmp_path / "a.npy").positions, BALL, atol=1e-6)
+    np.save(tmp_path / "b.npy", np.column_stack([BALL, np.tile(np.array([*GREEN, 255]) / 255, (420, 1))]))
+    np.testing.assert_allclose(read_cloud(tmp_path / "b.npy").base_color[0], LINEAR, atol=1e-3)
+
+
+def test_a_scene_of_points_alone_is_a_cloud(tmp_path):
+    builder = GltfBuilder()
+    square = builder.primitive(mode=0)
+    builder.mesh(square, translation=[0, 0, 2])
+    builder.write(tmp_path / "a.glb")
+    cloud = read_cloud(tmp_path / "a.glb")
+    np.testing.assert_allclose(cloud.positions[:, 2], 2)
+    assert len(cloud.positions) == 4
+
+
+def with_lists(form: str) -> bytes:
+    """A PLY file of three points, with a list before and one among their properties."""
+    head = f"ply\nformat {form} 1.0\nelement edge 2\nproperty list uchar short ends\nelement vertex 3\n"
+    head += "property float x\nproperty list uchar int near\nproperty float y\nproperty float z\nend_header\n"
+    rows = [(1.5, [1, 2], 2, 0), (0, [], 1, 1), (4, [7], 0, 1)]
+    if form == "ascii":
+        lines = ["2 0 1", "1 5", *(" ".join(map(str, [x, len(near), *near, y, z])) for x, near, y, z in rows)]
+        return (head + "\n".join(lines) + "\n").encode()
+    order = "<" if "little" in form else ">"
+    body = struct.pack(f"{order}BhhBh", 2, 0, 1, 1, 5)
+    for x, near, y, z in rows:
+        body += struct.pack(f"{order}fB{len(near)}iff", x, len(near), *near, y, z)
+    return head.encode() + body
+
+
+@pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
+def test_lists_in_or_before_the_vertices_of_a_ply_are_stepped_over(tmp_path, form):
+    cloud = read_cloud(write(tmp_path, "a.ply", with_lists(form)))
+    np.testing.assert_allclose(cloud.positions, [[1.5, 2, 0], [0, 1, 1], [4, 0, 1]])
+    cut = with_lists(form)[:-9]
+    with pytest.raises(ValueError, match="cut off|expected 3 numbers"):
+        read_cloud(write(tmp_path, "a.ply", cut))
+
+
+def test_a_header_of_bare_carriage_returns_ends_before_data_that_begins_with_a_line_feed(tmp_path):
+    head = "ply\rformat binary_little_endian 1.0\relement vertex 3\r"
+    head += "property float x\rproperty float y\rproperty float z\rend_header\r"
+    rows = np.array([[0, 1, 2], [3, 4, 5], [3, 0, 1]], "<f4")
+    rows.view("u1")[0, 0] = 0x0A
+    cloud = read_cloud(write(tmp_path, "a.ply", head.encode() + rows.tobytes()))
+    np.testing.assert_array_equal(cloud.positions, rows)
+
+
+# Colours: one function for points and meshes
+
+SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], float)
+
+
+def square_ply(kind: str, names, color) -> str:
+    head = "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
+    head += "".join(f"property {kind} {name}\n" for name in names)
+    rows = "".join(" ".join(map(str, (*corner, *color))) + "\n" for corner in SQUARE)
+    faces = "element face 2\nproperty list uchar int vertex_indices\nend_header\n"
+    return head + faces + rows + "3 0 1 2\n3 0 2 3\n"
+
+
+RGB, OBJ_FACE = ("red", "green", "blue"), "f 1 2 3 4\n"
+PACKED = GREEN[0] << 16 | GREEN[1] << 8 | GREEN[2]
+CORNERS = [" ".join(map(str, corner)) for corner in SQUARE]
+COLORED_MESHES = {
+    "uchar": ("a.ply", square_ply("uchar", RGB, GREEN)),
+    "ushort": ("a.ply", square_ply("ushort", RGB, [257 * c for c in GREEN])),
+    "floats to 255": ("a.ply", square_ply("float", RGB, GREEN)),
+    "floats to 1": ("a.ply", square_ply("float", RGB, [c / 255 for c in GREEN])),
+    "r g b": ("a.ply", square_ply("uchar", "rgb", GREEN)),
+    "diffuse": ("a.ply", square_ply("uchar", [f"diffuse_{name}" for name in RGB], GREEN)),
+    "packed": ("a.ply", square_ply("uint", ["rgb"], [PACKED])),
+    "COFF": ("a.off", "COFF\n4 1 0\n" + "".join(f"{c} 40 170 60 255\n" for c in CORNERS) + "4 0 1 2 3\n"),
+    "OFF, colours of faces": ("a.off", "OFF\n4 1 0\n" + "\n".join(CORNERS) + "\n4 0 1 2 3 40 170 60\n"),
+    "OBJ": ("a.obj", "".join(f"v {c} 0.157 0.667 0.235\n" for c in CORNERS) + OBJ_FACE),
+}
+
+
+@pytest.mark.parametrize("case", COLORED_MESHES)
+def test_the_colours_of_a_mesh_are_read_as_those_of_points(tmp_path, case):
+    cloud, lines = read(write(tmp_path, *COLORED_MESHES[case]), num_points=50)
+    np.testing.assert_allclose(cloud.base_color, np.broadcast_to(LINEAR, (50, 3)), atol=2e-3)
+    assert any("taken as sRGB in 0.." in line for line in lines)
+
+
+def test_white_is_white(tmp_path):
+    content = "".join(f"v {corner} 1 1 1\n" for corner in CORNERS) + OBJ_FACE
+    assert (read_cloud(write(tmp_path, "a.obj", content), num_points=9).base_color == 1).all()
+
+
+def colored_ball(folder, colors: np.ndarray, kind: str = "<u2", **more: np.ndarray):
+    """A structured array of the ball with colours (420, 3) and other columns."""
+    fields = [(axis, "<f8") for axis in "xyz"] + [(name, kind) for name in RGB]
+    rows = np.zeros(420, fields + [(name, column.dtype.str) for name, column in more.items()])
+    for names, values in (("xyz", BALL), (RGB, colors)):
+        for name, column in zip(names, values.T, strict=True):
+            rows[name] = column
+    for name, column in more.items():
+        rows[name] = column
+    np.save(folder / "a.npy", rows)
+    return folder / "a.npy"
+
+
+@pytest.mark.parametrize(
+    ("factor", "stray", "white"), [(1, None, 255), (1, 65535, 255), (1, 256, 255), (16, None, 4095), (257, None, 65535)]
+)
+def test_the_range_of_colours_is_that_of_nearly_all_of_them(tmp_path, factor, stray, white):
+    colors = np.tile(np.array([200, *GREEN[1:]]) * factor, (420, 1))
+    if stray:
+        colors[7] = stray
+    cloud, lines = read(colored_ball(tmp_path, colors))
+    assert f"red green blue taken as sRGB in 0..{white}" in lines
+    assert cloud.base_color[0, 0] == pytest.approx(0.578, abs=0.03)
+    assert any("cut off there" in line for line in lines) == (stray is not None)
+
+
+def test_a_picture_that_will_be_black_is_said(tmp_path):
+    _, lines = read(colored_ball(tmp_path, np.full((420, 3), 3), "u1"))
+    assert any("nearly black" in line for line in lines)
+
+
+def test_points_without_colour_among_others_take_that_of_their_neighbours_and_black_parts_stay(tmp_path):
+    colors = np.tile(GREEN, (420, 1))
+    colors[::2] = 0
+    cloud, lines = read(colored_ball(tmp_path, colors))
+    np.testing.assert_allclose(cloud.base_color, np.broadcast_to(LINEAR, (420, 3)), atol=2e-3)
+    assert any(line.startswith("210 of 420 points have no colour") for line in lines)
+    colors = np.where(BALL[:, :1] > 0, 0, GREEN)
+    cloud, lines = read(colored_ball(tmp_path, colors))
+    assert (cloud.base_color[BALL[:, 0] > 0] == 0).all()
+    assert not any("no colour (0 0 0)" in line for line in lines)
+
+
+# What other columns say
+
+PART = np.arange(420) % 3 == 0
+
+
+@pytest.mark.parametrize(
+    ("name", "column"),
+    [
+        ("alpha", np.where(PART, 0, 255).astype(np.uint8)),
+        ("opacity", np.where(PART, 0.001, 0.9)),
+        ("scalar_Classification", np.where(PART, 7.0, 2.0)),
+        ("classification", np.where(PART, 18, 6).astype(np.uint8)),
+        ("withheld", PART.astype(np.uint8)),
+    ],
+)
+def test_what_is_not_to_be_seen_is_left_out_with_a_line_and_kept_on_demand(tmp_path, name, column):
+    path = colored_ball(tmp_path, np.tile(GREEN, (420, 1)), **{name: column})
+    cloud, lines = read(path)
+    np.testing.assert_allclose(cloud.positions, BALL[~PART], atol=1e-6)
+    assert any(re.match(r"140 of 420 points left out: .* \(--keep-noise keeps them\)", line) for line in lines)
+    assert len(read_cloud(path, cut=Cut(keep_noise=True)).positions) == 420
+
+
+def test_an_alpha_of_0_everywhere_and_noise_everywhere_are_not_believed(tmp_path):
+    for column in ({"alpha": np.zeros(420, np.uint8)}, {"classification": np.full(420, 7, np.uint8)}):
+        assert len(read_cloud(colored_ball(tmp_path, np.tile(GREEN, (420, 1)), **column)).positions) == 420
+
+
+def test_splats_whose_opacity_is_not_a_number_or_is_activated_already_are_told(tmp_path):
+    names = [*"xyz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
+    for opacity, left in ((np.where(PART, np.nan, 3.0), 280), (np.where(PART, 0.1, 0.9), 280), (np.full(420, 0.5), 420)):
+        rows = [tuple(row) for row in np.column_stack([BALL, np.zeros((420, 3)), opacity])]
+        properties = [(name, "float") for name in names]
+        content = ply_bytes("binary_little_endian", rows=rows, properties=properties)
+        assert len(read_cloud(write(tmp_path, "a.ply", content)).positions) == left
+
+
+@pytest.mark.parametrize(
+    ("normals", "reason"),
+    [
+        (np.tile([0.0, 0, 1], (420, 1)), "all are the same"),
+        (spiral(420)[:, [1, 2, 0]] * [1, -1, 1], "lie across the surface"),
+        (spiral(420), None),
+        (-spiral(420), None),
+    ],
+)
+def test_normals_are_left_out_where_the_points_speak_against_them(tmp_path, normals, reason):
+    columns = dict(zip(("nx", "ny", "nz"), normals.T, strict=True))
+    cloud, lines = read(colored_ball(tmp_path, np.tile(GREEN, (420, 1)), **columns))
+    assert (cloud.normals is None) == (reason is not None)
+    assert reason is None or any(line.startswith("normals of the file left out") and reason in line for line in lines)
+
+
+# Precision, repeats
+
+
+def test_meshes_at_map_coordinates_keep_their_shape(tmp_path):
+    content = "".join("v {:.4f} {:.4f} {:.4f}\n".format(*(UTM + 0.2 * corner)) for corner in SQUARE) + OBJ_FACE
+    placed = place_cloud(write(tmp_path, "a.obj", content), num_points=3000, up="y")
+    np.testing.assert_allclose(np.ptp(placed.cloud.positions, axis=0), [0.2, 0.2, 0], atol=2e-3)
+    back = placed.cloud.positions.astype(np.float64) @ placed.rotation + placed.origin
+    assert np.abs(back - (UTM + [0.1, 0.1, 0])).max() < 0.1001
+    assert len(np.unique(placed.cloud.positions[:, 1])) > 2000
+
+
+def test_the_origin_is_that_of_what_is_cut_out_and_cleaned(tmp_path):
+    far = np.array([[-4e6, 0, 0], [4e6, 0, 0], [0, 5e6, 0]])
+    np.save(tmp_path / "a.npy", np.concatenate([0.3 * BALL + UTM, far]))
+    for options in ({"cut": Cut(object="largest")}, {"clean": "auto"}):
+        placed = place_cloud(tmp_path / "a.npy", up="y", **options)
+        back = placed.cloud.positions + placed.origin
+        np.testing.assert_allclose(back, 0.3 * BALL + UTM, rtol=0, atol=1e-6)
+
+
+def test_a_file_that_rounds_an_axis_says_how_many_values_are_left(tmp_path):
+    rows = [tuple(row) for row in BALL + [0, 3e3, 0]]
+    properties = [("x", "double"), ("y", "float"), ("z", "double")]
+    flat = [(50 * x, y * 0.05 + 3e3, 50 * z) for x, y, z in BALL]
+    for content, coarse in ((rows, False), (flat, True)):
+        data = ply_bytes("binary_little_endian", rows=content, properties=properties)
+        _, lines = read(write(tmp_path, "a.ply", data))
+        assert any(re.match(r"only \d+ distinct values along y", line) for line in lines) == coarse
+
+
+@pytest.mark.parametrize("jitter", [0.0, 1e-6])
+def test_repeats_are_merged_before_anything_looks_at_neighbours(tmp_path, jitter):
+    rng = np.random.default_rng(0)
+    repeated = np.repeat(BALL, 6, axis=0) + jitter * rng.uniform(-1, 1, (2520, 3))
+    np.savez(tmp_path / "a.npz", points=repeated, roughness=np.repeat(np.arange(420) / 420, 6))
+    cloud, lines = read(tmp_path / "a.npz", clean="auto")
+    np.testing.assert_allclose(cloud.positions, BALL, atol=1e-5)
+    np.testing.assert_allclose(cloud.roughness, np.arange(420) / 420, atol=1e-6)
+    assert "2,100 of 2,520 points repeat others, and were merged with them" in lines
+
+
+def test_degrees_are_told_from_metres(tmp_path):
+    np.save(tmp_path / "a.npy", BALL * [5e-5, 5e-5, 8] + [8.5, 47.1, 400])
+    assert any(line.startswith("x and y look like degrees") for line in read(tmp_path / "a.npy")[1])
+
+
+# Meshes
+
+
+def test_an_l_of_one_face_keeps_its_notch_wherever_the_face_begins(tmp_path):
+    corners = [(0, 0), (2, 0), (2, 0.5), (0.5, 0.5), (0.5, 2), (0, 2)]
+    for roll in range(6):
+        rolled = corners[roll:] + corners[:roll]
+        vertices = "".join(f"v {x} {y} 0\n" for x, y in rolled)
+        off = "OFF\n6 1 0\n" + "".join(f"{x} {y} 0\n" for x, y in rolled) + "6 0 1 2 3 4 5\n"
+        for name, content in (("a.obj", vertices + "f 1 2 3 4 5 6\n"), ("a.off", off)):
+            cloud = read_cloud(write(tmp_path, name, content), num_points=1000)
+            assert not (cloud.positions[:, :2] > 0.501).all(axis=1).any()
+            assert (cloud.positions[:, 1] > 0.5).mean() == pytest.approx(0.75 / 1.75, abs=0.05)
+
+
+def stl(count: int, tail: bytes = b"") -> bytes:
+    """A binary STL file of two triangles."""
+    triangles = [SQUARE[[0, 1, 2]], SQUARE[[0, 2, 3]]]
+    body = b"".join(np.append(np.zeros(3), corners).astype("<f4").tobytes() + b"\0\0" for corners in triangles)
+    return b"made by a scanner".ljust(80, b"\0") + struct.pack("<I", count) + body + tail
+
+
+def test_a_binary_stl_with_a_tail_or_without_a_count_is_read_by_its_size(tmp_path):
+    for content in (stl(2), stl(2, b"a tail!"), stl(0)):
+        cloud, lines = read(write(tmp_path, "a.stl", content), num_points=200)
+        np.testing.assert_allclose(np.ptp(cloud.positions, axis=0), [1, 1, 0], atol=0.03)
+    assert "the header announces 0 triangles, 2 stand behind it: these are drawn" in lines
+    with pytest.raises(ValueError, match="announces 3 triangles, 2 are there"):
+        read(write(tmp_path, "a.stl", stl(3)))
+
+
+def test_faces_with_a_vertex_that_is_no_number_are_left_out_and_counted(tmp_path):
+    content = square_ply("uchar", RGB, GREEN).replace("0.0 1.0 0.0 40", "nan 1.0 0.0 40")
+    cloud, lines = read(write(tmp_path, "a.ply", content), num_points=100)
+    assert np.isfinite(cloud.positions).all()
+    assert "1 faces left out: a vertex of theirs is NaN or infinity" in lines
+
+
+@pytest.mark.parametrize("name", [r"C:\Users\me\Colors.PNG", "/home/me/colors.png", "COLORS.png"])
+def test_a_texture_beside_its_mesh_is_found_under_a_path_of_another_machine(tmp_path, name):
+    from PIL import Image
+
+    Image.new("RGB", (4, 4), GREEN).save(tmp_path / "colors.png")
+    write(tmp_path, "a.mtl", f"newmtl a\nmap_Kd {name}\n")
+    vertices = "".join(f"v {corner}\nvt {corner[:7]}\n" for corner in CORNERS)
+    write(tmp_path, "a.obj", f"mtllib A.MTL\n{vertices}usemtl a\nf 1/1 2/2 3/3 4/4\n")
+    cloud, lines = read(tmp_path / "a.obj", num_points=20)
+    np.testing.assert_allclose(cloud.base_color, np.broadcast_to(LINEAR, (20, 3)), atol=2e-3)
+    assert not any("missing" in line for line in lines)
+
+
+# Packed splats
+
+
+def test_our_own_spz_and_glb_files_are_read_as_clouds(tmp_path):
+    splats = splat_balls.ball(50)
+    for suffix in (".spz", ".glb"):
+        path = tmp_path / f"a{suffix}"
+        gaussian_files.write_splats(path, splats)
+        cloud = read_cloud(path, cut=Cut(keep_noise=True))
+        np.testing.assert_allclose(cloud.positions, splats.position, atol=1e-5)
+
+
+def test_spz_of_version_2_is_read_and_others_and_damaged_ones_are_named(tmp_path):
+    path = tmp_path / "a.spz"
+    content = gzip.decompress(gaussian_files.spz_of(splat_balls.ball(50)))
+    path.write_bytes(gzip.compress(content[:4] + b"\2" + content[5:]))
+    assert len(read_cloud(path, cut=Cut(keep_noise=True)).positions) == 50
+    for version in (1, 4):
+        path.write_bytes(gzip.compress(content[:4] + bytes([version]) + content[5:]))
+        with pytest.raises(ValueError, match=f"of version {version}; versions 2 and 3 can be read: convert it to .ply"):
+            read_cloud(path)
+    path.write_bytes(gzip.compress(content[:300]))
+    with pytest.raises(ValueError, match="cut off: its header announces 50 splats"):
+        read_cloud(path)
+
+
+def test_compressed_splats_in_a_ply_are_unpacked(tmp_path):
+    head = "ply\nformat binary_little_endian 1.0\nelement chunk 1\n"
+    head += "".join(f"property float {end}_{axis}\n" for end in ("min", "max") for axis in "xyz")
+    head += "element vertex 420\n"
+    head += "".join(f"property uint packed_{name}\n" for name in ("position", "rotation", "scale", "color"))
+    share = np.round((BALL + 1) / 2 * [2047, 1023, 2047]).astype(np.uint32)
+    rows = np.zeros((420, 4), "<u4")
+    rows[:, 0] = share[:, 0] << 21 | share[:, 1] << 11 | share[:, 2]
+    rows[:, 3] = PACKED << 8 | 255
+    content = (head + "end_header\n").encode() + np.array([-1] * 3 + [1] * 3, "<f4").tobytes() + rows.tobytes()
+    cloud = read_cloud(write(tmp_path, "a.ply", content))
+    np.testing.assert_allclose(cloud.positions, BALL, atol=1.1e-3)
+    np.testing.assert_allclose(cloud.base_color, np.broadcast_to(LINEAR, (420, 3)), atol=2e-3)
+
+
+# The reported files themselves
+
+
+def becomes(path: Path) -> str:
+    """What becomes of a file, in a line."""
+    lines: list[str] = []
+    try:
+        cloud = read_cloud(path, up="y", report=lines.append)
+    except ValueError as error:
+        return f"refused: {str(error).removeprefix(f'{path}: ')}"
+    plain = re.compile(r"no |\d+ points spread|moved by|.* taken as sRGB in 0..255$")
+    said = [line for line in lines if not plain.match(line)]
+    return "; ".join([f"{len(cloud.positions):,} points", *said])
+
+
+@pytest.mark.skipif(not REPORTS.is_dir(), reason="the reported files are not beside the checkout (../shared)")
+def test_all_reported_files_come_to_what_the_page_says():
+    """SPNR_WRITE=1 writes the table of the page anew."""
+    rows = [line.split("\t") for line in (REPORTS / "manifest.tsv").read_text().splitlines()[1:]]
+    lines = ["| file | how it was made | what becomes of it |", "|---|---|---|"]
+    for names, _, made, _ in rows:
+        for name in names.split():
+            outcome = becomes(REPORTS / name)
+            print(f"{name}: {outcome}")
+            lines.append(f"| `{name}` | {made} | {outcome} |")
+    assert len(lines) >= 46
+    page = PAGE.read_text()
+    begin, end = page.index(lines[0]), page.index("\n\n", page.index(lines[0]))
+    if os.environ.get("SPNR_WRITE"):
+        PAGE.write_text(page[:begin] + "\n".join(lines) + page[end:])
+    assert page[begin:end] == "\n".join(lines)
