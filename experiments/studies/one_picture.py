@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from jaxtyping import Array, Float, Int
+from spnr_jax.surfels.encoding import QUICK, fit_box
 
 import spnr_jax
 from experiments.comparison import clock
@@ -21,7 +22,6 @@ from spnr_jax.kernels.records import Camera, Light, PointCloud, Rendering
 from spnr_jax.method import surfel_renderer
 from spnr_jax.method.surfel_renderer import Plan
 from spnr_jax.surfels import lighting
-from spnr_jax.surfels.encoding import QUICK, fit_box
 from spnr_jax.surfels.envmaps import directions, solid_angles
 
 FIELD_OF_VIEW, DISTANCE = np.deg2rad(40.0), 3.0

@@ -17,12 +17,11 @@ from typing import Literal, get_args
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
 
 from spnr_jax.config import NetworkConfig
 from spnr_jax.errors import UserError
 from spnr_jax.kernels import cameras, cloud_arrays
-from spnr_jax.kernels.records import AnyArray, Camera, Light, PointCloud, Rendering, SurfelScene, Volume
+from spnr_jax.kernels.records import Camera, Light, PointCloud, Rendering, SurfelScene, Volume
 from spnr_jax.method import inference
 
 FIELD_OF_VIEW, DISTANCE = np.deg2rad(40.0), 3.0  # of the training cameras; the object fits into the unit sphere

@@ -249,7 +249,11 @@ def test_an_alpha_of_0_everywhere_and_noise_everywhere_are_not_believed(tmp_path
 
 def test_splats_whose_opacity_is_not_a_number_or_is_activated_already_are_told(tmp_path):
     names = [*"xyz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
-    for opacity, left in ((np.where(PART, np.nan, 3.0), 280), (np.where(PART, 0.1, 0.9), 280), (np.full(420, 0.5), 420)):
+    for opacity, left in (
+        (np.where(PART, np.nan, 3.0), 280),
+        (np.where(PART, 0.1, 0.9), 280),
+        (np.full(420, 0.5), 420),
+    ):
         rows = [tuple(row) for row in np.column_stack([BALL, np.zeros((420, 3)), opacity])]
         properties = [(name, "float") for name in names]
         content = ply_bytes("binary_little_endian", rows=rows, properties=properties)
