@@ -4,7 +4,6 @@ Errors of the user and of the disk are one line on stderr and exit code 2; Ctrl-
 """
 
 import contextlib
-import dataclasses
 import importlib.util
 import io
 import json
@@ -185,7 +184,7 @@ def run_view(command: View) -> None:
         raise UserError("spnr view needs the package viser; pip install 'spnr-jax[viewer]'")
     from spnr_jax.viewer.server import open_viewer
 
-    viewer, notes = open_viewer(**{f.name: getattr(command, f.name) for f in dataclasses.fields(command)})
+    viewer, notes = open_viewer(command)
     for line in (*notes, *viewer.lines):
         print(line, flush=True)
     viewer.wait()

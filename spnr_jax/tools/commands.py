@@ -1,5 +1,6 @@
 """The options of the commands of `spnr`, as records; of `spnr render` and `spnr share`, in files of their own."""
 
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -112,7 +113,7 @@ class Export:
 
 @dataclass(frozen=True, kw_only=True)
 class View:
-    """View and edit a point cloud or mesh file in the browser, beside the network's rendering."""
+    """Look at the network's picture of a point cloud or mesh file in the browser: turn it, light it, save it."""
 
     cloud: tyro.conf.Positional[Path]
     """What `spnr render` reads."""
@@ -124,6 +125,8 @@ class View:
     """Address to listen on; another than this machine's own opens the viewer to a network."""
     port: int = 8080
     """Port to listen on; 0 takes any free one."""
+    reached_at: str | None = None
+    """HOST or HOST:PORT by which browsers reach the viewer, where a proxy before it asks under another name."""
     num_points: int = 16384
     """Points used of a bigger cloud or sampled from a mesh; fewer work too."""
     clean: Literal["auto", "off", "strong"] = "auto"
@@ -133,3 +136,8 @@ class View:
     """Which part of a scene is shown first; files that are dropped on the page are shown whole."""
     up: Literal["auto", "x", "y", "z", "-x", "-y", "-z"] = "auto"
     """The file's upward axis; auto looks for it, and says what it found."""
+
+    def __post_init__(self) -> None:
+        """ValueError names the option that makes no sense."""
+        if self.reached_at is not None and not re.fullmatch(r"([\w.-]+|\[[\da-fA-F:.]+\])(:\d+)?", self.reached_at):
+            raise ValueError(f"--reached-at {self.reached_at}: expected HOST or HOST:PORT, without http:// and path")

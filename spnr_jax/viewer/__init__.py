@@ -1,1 +1,1 @@
-"""`spnr view`: a cloud's points and the network's picture of it side by side in the browser, edited live."""
+"""`spnr view`: the network's picture of a cloud in the browser, turned, lit and saved there."""

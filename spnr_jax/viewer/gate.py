@@ -3,7 +3,8 @@
 A web page of any address that is open in the same browser can connect to a server on this machine, and viser asks
 nobody who he is.  So the path of the viewer's address begins with a token, made anew for every viewer, without which
 no page is served and no WebSocket is opened; the page's own connection takes the token from its address.  Where a
-browser names the origin of what asks, it has to be the server itself, also with the token.
+browser names the origin of what asks, it has to be the server itself, also with the token: the address that was asked,
+or, behind a proxy that asks under a name of its own, the address at which the viewer is said to be reached.
 """
 
 import contextlib
@@ -22,6 +23,7 @@ from websockets.http11 import Request, Response
 LENGTH = 16  # bytes of a token
 CLOSED = "Open the address that `spnr view` printed, whole: it holds a token.\n"
 FOREIGN = "This page is not that of the viewer.\n"
+DEFAULT_PORTS = {"http": ":80", "https": ":443"}  # which a browser leaves out of an origin
 _guarding = threading.Lock()
 
 Asked = Callable[[Any, Request], Any]
@@ -32,20 +34,24 @@ def new_token() -> str:
     return secrets.token_urlsafe(LENGTH)
 
 
-def admitted(request: Request, token: str) -> Request | Response:
+def admitted(request: Request, token: str, reached_at: str | None = None) -> Request | Response:
     """The request with the path behind the token, or why it is refused."""
     first, _, rest = request.path.removeprefix("/").partition("/")
     if not hmac.compare_digest(first.partition("?")[0].encode(), token.encode()):
         return _refusal(CLOSED)
-    if any(not _own(origin, request.headers) for origin in request.headers.get_all("Origin")):
+    origins, asked = request.headers.get_all("Origin"), request.headers.get_all("Host")
+    if not all(_is_own(origin, asked, reached_at) for origin in origins):
         return _refusal(FOREIGN)
     return dataclasses.replace(request, path="/" + rest)
 
 
-def _own(origin: str, headers: Headers) -> bool:
-    """Whether an origin is the address that was asked; "null" (a file, a sandbox) is not."""
-    scheme, _, place = origin.partition("://")
-    return scheme in ("http", "https") and [place.lower()] == [host.lower() for host in headers.get_all("Host")]
+def _is_own(origin: str, asked: list[str], reached_at: str | None) -> bool:
+    """Whether an origin is the host that was asked, or reached_at; "null" (a file, a sandbox) is neither."""
+    scheme, _, place = origin.lower().partition("://")
+    if scheme not in DEFAULT_PORTS:
+        return False
+    known = (reached_at or "").lower().removesuffix(DEFAULT_PORTS[scheme])
+    return [place] == [host.lower() for host in asked] or (known != "" and place == known)
 
 
 def _refusal(why: str) -> Response:
@@ -55,7 +61,7 @@ def _refusal(why: str) -> Response:
 
 
 @contextlib.contextmanager
-def guarded(token: str) -> Iterator[list[Any]]:
+def guarded(token: str, reached_at: str | None = None) -> Iterator[list[Any]]:
     """Servers of websockets that are opened meanwhile, in whatever thread, admit what knows the token; their list.
 
     viser opens its server in its own thread and has no hook for who is let in, hence the replaced function.
@@ -65,7 +71,7 @@ def guarded(token: str) -> Iterator[list[Any]]:
 
     def serve(*arguments: Any, process_request: Asked | None = None, **options: Any) -> Any:
         def ask(connection: Any, request: Request) -> Any:
-            answer = admitted(request, token)
+            answer = admitted(request, token, reached_at)
             if isinstance(answer, Response) or process_request is None:
                 return answer if isinstance(answer, Response) else None
             return process_request(connection, answer)

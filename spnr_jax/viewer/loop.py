@@ -1,7 +1,7 @@
 """A thread that draws for one browser: at once while things change, once more and better when they rest.
 
-Changes are functions from state to state, submitted from any thread and applied here, in order, all that wait before
-the next picture: the state has one owner and needs no lock, and a slow picture never lets changes pile up.
+Changes are functions from state to state, submitted from any thread and applied here in order, all that wait before the
+next picture: the state has one owner, and a slow picture never lets changes pile up.
 """
 
 import threading
@@ -16,16 +16,12 @@ class Loop(Generic[State]):
     """Draws `show(state, moving)` after changes (moving), and when none came for `rest` seconds (not moving)."""
 
     def __init__(self, state: State, show: Callable[[State, bool], State], rest: float = REST) -> None:
-        self.state = state
+        self.state, self.stopped = state, False
         self._show, self._rest = show, rest
         self._changes: list[Callable[[State], State]] = []
         self._wake = threading.Condition()
-        self._stopped = False
         self._thread = threading.Thread(target=self._run, daemon=True)
-
-    def start(self) -> None:
-        """Begin to draw, the first picture at once."""
-        self._thread.start()
+        self.start, self.join = self._thread.start, self._thread.join
 
     def submit(self, change: Callable[[State], State]) -> None:
         """Have a change applied before the next picture."""
@@ -36,35 +32,21 @@ class Loop(Generic[State]):
     @property
     def superseded(self) -> bool:
         """Whether a change waits: a picture of the state as it is would be old before it is seen."""
-        return bool(self._changes) or self._stopped
-
-    @property
-    def stopped(self) -> bool:
-        """Whether `stop` was called."""
-        return self._stopped
+        return bool(self._changes) or self.stopped
 
     def stop(self) -> None:
-        """End the thread after the picture that it draws; without waiting, because that may be a browser's callback."""
+        """End the thread after the picture that it draws, without waiting: that may be a browser's callback."""
         with self._wake:
-            self._stopped = True
+            self.stopped = True
             self._wake.notify()
-
-    def join(self, timeout: float) -> None:
-        """Wait until the thread has ended."""
-        self._thread.join(timeout)
 
     def _run(self) -> None:
         moving = True
-        while not self._stopped:
+        while not self.stopped:
             self.state = self._show(self.state, moving)
-            changes = self._next_changes(self._rest if moving else None)
+            with self._wake:
+                self._wake.wait_for(lambda: self.superseded, self._rest if moving else None)
+                changes, self._changes = self._changes, []
             moving = bool(changes)
             for change in changes:
                 self.state = change(self.state)
-
-    def _next_changes(self, timeout: float | None) -> list[Callable[[State], State]]:
-        """The changes that wait; none after `timeout` seconds without any."""
-        with self._wake:
-            self._wake.wait_for(lambda: self.superseded, timeout)
-            changes, self._changes = self._changes, []
-        return changes

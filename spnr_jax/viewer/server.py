@@ -1,4 +1,4 @@
-"""The server behind `spnr view`: loads the network and a cloud, and gives every browser that comes its own session.
+"""The server behind `spnr view`: loads the network and a cloud, and gives every browser that comes its own controls.
 
 It listens on this machine alone unless `--host` says otherwise, and talks to its own page alone (gate.py): the address
 that is printed holds a token.  viser's tunnel to a public address, which any browser could ask for, is closed.
@@ -6,29 +6,24 @@ that is printed holds a token.  viser's tunnel to a public address, which any br
 
 import contextlib
 import dataclasses
-import errno
 import io
 import socket
 import threading
 import warnings
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 import viser
 
 from spnr_jax.errors import UserError
 from spnr_jax.formats import clouds
-from spnr_jax.formats.cut import Cut
-from spnr_jax.kernels.cleaning import Clean
 from spnr_jax.method.model import FIELD_OF_VIEW, Model
 from spnr_jax.tools.chosen_light import check_takes_light
-from spnr_jax.tools.light_options import Lighting
+from spnr_jax.tools.commands import View
 from spnr_jax.training.weights import load, suited_to
-from spnr_jax.viewer import gate, lights, session, uploads
-from spnr_jax.viewer.gui import Browser, Reading
-from spnr_jax.viewer.scene import open_scene
-from spnr_jax.viewer.session import State
-from spnr_jax.viewer.viewpoint import View
+from spnr_jax.viewer import frame, gate
+from spnr_jax.viewer.frame import State
+from spnr_jax.viewer.gui import Browser
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 EYE = (1.7, 1.2, 2.9)  # in the box: where a browser looks from at first, at its middle
@@ -49,30 +44,25 @@ class Server(viser.ViserServer):
 class Viewer:
     """A running server; `url` is its page, with the token, `lines` what a person should know about it."""
 
-    def __init__(self, model: Model, first: State, reading: Reading, host: str, port: int) -> None:
+    def __init__(
+        self, model: Model, first: State, reading: dict[str, Any], host: str, port: int, reached_at: str | None = None
+    ) -> None:
         _check_free(host, port)
         self._model, self._first, self._reading = model, first, reading
         self._network = threading.Lock()
         self._browsers: dict[int, Browser] = {}
         token = gate.new_token()
-        with gate.guarded(token) as opened, contextlib.redirect_stdout(io.StringIO()):  # viser's banner names addresses
+        with gate.guarded(token, reached_at) as opened, contextlib.redirect_stdout(io.StringIO()):  # no banner of viser
             self._server = Server(host=host, port=port, label="spnr view", verbose=False)
         if not opened:
             self.stop()
             raise UserError(UNGUARDED.format(version=viser.__version__))
-        if port not in (0, self._server.get_port()):
-            self.stop()
-            raise UserError(_in_use(host, port))  # taken in the moment since it was found free
-        self.url = f"http://{f'[{host}]' if ':' in host else host}:{self._server.get_port()}/{token}/"
-        self.lines = [f"{self.url} shows {first.scene.name} (Ctrl-C stops)"]
-        if host not in LOOPBACK:
-            self.lines.append(EXPOSED.format(host=host, port=self._server.get_port(), name=first.scene.name))
-        self._server.gui.configure_theme(show_share_button=False, show_logo=False)
-        self._server.gui.main_panel.dock_right()
-        self._server.scene.set_up_direction("+y")
-        self._set_first_camera()
-        self._server.on_client_connect(self._connected)
-        self._server.on_client_disconnect(self._disconnected)
+        port = self._server.get_port()  # another where this one was taken just now
+        self.url = f"http://{f'[{host}]' if ':' in host else host}:{port}/{token}/"
+        self.lines = [f"{self.url} shows {first.name} (Ctrl-C stops)"]
+        self.lines += [f"reached at {reached_at}: http(s)://{reached_at}/{token}/"] if reached_at else []
+        self.lines += [EXPOSED.format(host=host, port=port, name=first.name)] if host not in LOOPBACK else []
+        self._set_up_page()
         threading.Thread(target=self._warm_up, daemon=True).start()
 
     def wait(self) -> None:
@@ -90,71 +80,51 @@ class Viewer:
         with contextlib.redirect_stdout(io.StringIO()):
             self._server.stop()
 
-    def _set_first_camera(self) -> None:
+    def _set_up_page(self) -> None:
+        self._server.gui.configure_theme(show_share_button=False, show_logo=False)
+        self._server.gui.main_panel.dock_right()
+        self._server.scene.set_up_direction("+y")
         camera = self._server.initial_camera
         camera.position, camera.look_at, camera.fov = np.array(EYE), np.zeros(3), float(FIELD_OF_VIEW)
+        self._server.on_client_connect(self._connect)
+        self._server.on_client_disconnect(self._disconnect)
 
     def _warm_up(self) -> None:
         """Compile what the first browser will ask for while it still loads the page."""
-        view = View(position=np.array([0.0, 0.0, 3.0]), rotation=np.eye(3), field_of_view=1.0, width=64, height=64)
-        state = dataclasses.replace(self._first, view=view, panes=("picture",))
+        state = dataclasses.replace(self._first, view=frame.read_view((0, 1, 0, 0), (0, 0, 3), 1.0, 64, 64))
         for moving in (True, False):
             with self._network:
-                session.draw(self._model, state, moving)
+                frame.draw(self._model, state, moving)
 
-    def _connected(self, client: viser.ClientHandle) -> None:
+    def _connect(self, client: viser.ClientHandle) -> None:
         self._browsers[client.client_id] = Browser(client, self._model, self._first, self._reading, self._network)
 
-    def _disconnected(self, client: viser.ClientHandle) -> None:
+    def _disconnect(self, client: viser.ClientHandle) -> None:
         if (browser := self._browsers.pop(client.client_id, None)) is not None:
             browser.loop.stop()
 
 
-def open_viewer(
-    cloud: Path,
-    run: Path | None,
-    *,
-    host: str,
-    port: int,
-    num_points: int,
-    up: str,
-    clean: Clean,
-    cut: Cut,
-    lighting: Lighting,
-) -> tuple[Viewer, list[str]]:
-    """A running viewer of a file with a run's network, and what was assumed about the file, a line each.
-
-    ValueError for a port that is in use, a host that is not of this machine, and whatever cannot be read.
-    """
-    _check_free(host, port)  # before the seconds that reading takes
-    named = load(run) if run else None
+def open_viewer(asked: View) -> tuple[Viewer, list[str]]:
+    """The running viewer of a command, and what was assumed about its file, a line each; ValueError for a bad file."""
+    _check_free(asked.host, asked.port)  # before the seconds that reading takes
+    named = load(asked.run) if asked.run else None
     if named:
-        check_takes_light(named, lighting.asked, run)
-    shining = lights.given(lighting)
+        check_takes_light(named, asked.lighting.asked, asked.run)
     notes: list[str] = []
-    points = clouds.read_cloud(cloud, num_points=num_points, up=up, clean=clean, cut=cut, report=notes.append)
-    model = named or load("surfels" if lighting.asked else suited_to(len(points.positions)))
-    scene = open_scene(model, points, uploads.display_name(cloud.name))
-    first = State(scene=scene, size=session.sizes(model)[1], lights=shining)
-    return Viewer(model, first, Reading(num_points=num_points, up=up, clean=clean), host, port), notes
+    reading: dict[str, Any] = {"num_points": asked.num_points, "up": asked.up, "clean": asked.clean}
+    points = clouds.read_cloud(asked.cloud, **reading, cut=asked.cut, report=notes.append)
+    model = named or load("surfels" if asked.lighting.asked else suited_to(len(points.positions)))
+    first = frame.open_state(model, points, frame.display_name(asked.cloud.name), asked.lighting)
+    return Viewer(model, first, reading, asked.host, asked.port, asked.reached_at), notes
 
 
 def _check_free(host: str, port: int) -> None:
     """ValueError unless a server can listen there; viser itself would take another port, and wait for no host."""
     if not 0 <= port < 2**16:
-        raise UserError(f"--port must be from 0 (any free one) to 65535, got {port}")
+        raise UserError(f"--port must be 0 (any free one) to 65535, got {port}")
     try:
         family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
         socket.create_server((host, port), family=family).close()
-    except socket.gaierror:
-        raise UserError(
-            f"--host {host}: no such address; 127.0.0.1 is this machine alone, 0.0.0.0 all networks"
-        ) from None
     except OSError as error:
-        if error.errno == errno.EADDRINUSE:
-            raise UserError(_in_use(host, port)) from None
-        raise UserError(f"--host {host} --port {port}: {error.strerror}") from None
-
-
-def _in_use(host: str, port: int) -> str:
-    return f"--port {port} is in use on {host}; choose another, or 0 for any free one"
+        hint = "127.0.0.1 is this machine alone, 0.0.0.0 all networks; port 0 is any free one"
+        raise UserError(f"--host {host} --port {port}: {error.strerror} ({hint})") from None

@@ -33,7 +33,7 @@ from watched import limited_memory, watched
 from spnr_jax.errors import one_line
 from spnr_jax.methods import from_dict, to_dict
 from spnr_jax.presets import tiny
-from spnr_jax.viewer import session, viewpoint
+from spnr_jax.viewer import frame
 
 ROOT = Path(__file__).parents[2]
 INPUTS = int(os.environ.get("FUZZ_INPUTS", "16"))  # of each reader
@@ -211,6 +211,6 @@ def test_any_value_of_a_config_makes_a_config_of_right_types_or_a_valueerror(nam
 @settings(max_examples=150, deadline=None, derandomize=True)
 @given(json_values, json_values, json_values)
 def test_a_camera_message_of_any_values_is_a_view_or_none(wxyz, position, number):
-    assert viewpoint.from_browser(wxyz, position, number, number, number) is None or np.isfinite(position).all()
-    assert viewpoint.from_browser([1, 0, 0, 0], position, 0.5, 10, 10) is None or np.isfinite(position).all()
-    assert session.numbers(wxyz, 2) is None or np.isfinite(wxyz).all()
+    assert frame.read_view(wxyz, position, number, number, number) is None or np.isfinite(position).all()
+    assert frame.read_view([1, 0, 0, 0], position, 0.5, 10, 10) is None or np.isfinite(position).all()
+    assert frame.read_numbers(wxyz, 2) is None or np.isfinite(wxyz).all()

@@ -1,18 +1,19 @@
-"""An untrained network, two kinds of points and a view: what the tests of the viewer look at."""
+"""An untrained network of rays and points; surfels of a ball and a view: what the tests of the viewer look at."""
 
 import dataclasses
 import functools
 
 import jax
 import numpy as np
+from scipy.spatial.transform import Rotation
 
+from spnr_jax.config import SurfelConfig
 from spnr_jax.kernels.records import PointCloud
-from spnr_jax.method import inference
+from spnr_jax.method import inference, surfel_renderer
 from spnr_jax.method.model import Model
-from spnr_jax.viewer import session
-from spnr_jax.viewer.scene import Scene, open_scene
-from spnr_jax.viewer.session import State
-from spnr_jax.viewer.viewpoint import OPENCV, View, from_browser, to_browser
+from spnr_jax.tools.light_options import Lighting
+from spnr_jax.viewer import frame
+from spnr_jax.viewer.frame import OPENCV, State, View
 from support import surfel_clouds, tiny_model
 
 RED, BLUE = (0.8, 0.05, 0.05), (0.05, 0.05, 0.8)
@@ -35,9 +36,24 @@ def cloud() -> PointCloud:
 
 
 @functools.cache
-def scene() -> Scene:
-    """The opened cloud."""
-    return open_scene(model(), cloud(), "halves.xyz")
+def surfels() -> Model:
+    """A network over surfels, whose drafts are drawn without its CNN, which is untrained."""
+    config = SurfelConfig(image_resolution=24, widths=(4, 6), top=4)
+    return Model(config=config, variables=jax.jit(surfel_renderer.init, static_argnums=1)(jax.random.key(0), config))
+
+
+def ball(count: int = 400) -> PointCloud:
+    """A ball, red where x < 5, blue beyond."""
+    positions, normals, _ = surfel_clouds.shape("sphere", count)
+    color = np.where(positions[:, :1] < 0, np.float32(RED), np.float32(BLUE))
+    return surfel_clouds.cloud(5 + 4 * positions, normals=normals, base_color=color)
+
+
+@functools.cache
+def opened() -> State:
+    """The ball, opened."""
+    state = frame.open_state(surfels(), ball(), "ball.xyz", Lighting())
+    return dataclasses.replace(state, quality="draft")
 
 
 def view(azimuth: float = 0.0, width: int = 120, height: int = 60) -> View:
@@ -45,29 +61,26 @@ def view(azimuth: float = 0.0, width: int = 120, height: int = 60) -> View:
     turn = np.array(
         [[np.cos(azimuth), 0, np.sin(azimuth)], [0, 1, 0], [-np.sin(azimuth), 0, np.cos(azimuth)]]
     )  # fmt: skip
-    made = from_browser(to_browser(turn), 4 * turn[:, 2], 0.7, width, height)
+    wxyz = Rotation.from_matrix(turn @ OPENCV).as_quat(scalar_first=True)
+    made = frame.read_view(wxyz, 4 * turn[:, 2], 0.7, width, height)
     assert made is not None
     np.testing.assert_allclose(made.rotation, turn, atol=1e-12)
-    assert np.linalg.det(OPENCV) == 1
     return made
 
 
 def state(**changes) -> State:
-    """Points beside the picture, drawn as small as the network draws."""
-    return dataclasses.replace(State(scene=scene(), view=view(), size=48), **changes)
+    """The cloud as a browser sees it."""
+    return dataclasses.replace(opened(), **{"view": view()} | changes)
 
 
-def drawn(moving=False, **changes):
-    return session.draw(model(), state(**changes), moving)[1]
+def canvas(moving=False, **changes) -> np.ndarray:
+    """The frame of a state, int."""
+    return frame.draw(surfels(), state(**changes), moving)[1].astype(int)
 
 
-def canvas(**changes):
-    return drawn(**changes).image
-
-
-def viewer(host="127.0.0.1", port=0):
+def viewer(host="127.0.0.1", port=0, reached_at=None):
     """A viewer that waits for browsers; whoever opens it stops it."""
-    from spnr_jax.viewer.gui import Reading
     from spnr_jax.viewer.server import Viewer
 
-    return Viewer(model(), state(view=None), Reading(num_points=100, up="y", clean="auto"), host, port)
+    reading = {"num_points": 100, "up": "y", "clean": "auto"}
+    return Viewer(surfels(), opened(), reading, host, port, reached_at)

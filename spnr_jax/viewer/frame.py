@@ -1,0 +1,214 @@
+"""What one browser sees: its object and light, where it looks from, and the frame that the network draws of that.
+
+The browser lives in the network's box, (position - centre) * scale of the cloud.  `field_of_view` is vertical, in
+radians; `reach` is the tangent of half the angle that a square sees.  The network draws squares, one program for each
+size: the square in the middle of the canvas that holds the whole object or, where that is less or something stands
+behind the object, the square that covers the canvas.  What a browser sends may be anything: `read_*` make it safe.
+"""
+
+import dataclasses
+import tempfile
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path, PurePath
+from typing import Any, TypeVar
+
+import numpy as np
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from spnr_jax.errors import UserError
+from spnr_jax.formats import images
+from spnr_jax.formats.light_files import NAMES, read_light
+from spnr_jax.kernels.records import Camera, Light, PointCloud, Volume
+from spnr_jax.method.model import Model, Quality
+from spnr_jax.tools.chosen_light import before, light_of_options
+from spnr_jax.tools.light_options import Lighting
+
+SMALLEST = 256  # pixels along a side of the network's square while things move, at most
+MOVING_LONGEST, LONGEST = 960, 1600  # pixels of the canvas's longer side, while it moves and at rest
+OBJECT = 1.2  # radius of a ball in the box that holds all that is drawn of the object; its points lie within 1
+FARTHEST = 1e3  # boxes; beyond, float32 rays miss (README, "Numerical domain")
+MOST_PIXELS = 2**16  # along a side of a browser's canvas
+NARROWEST, WIDEST = 1e-3, np.deg2rad(150)
+OPENCV = np.diag([1.0, -1.0, -1.0])  # the browser's cameras look along +z with y down, ours along -z with y up
+SUN_ALONE = "sun alone"  # the choice of no map, where there is a sun
+LONGEST_NAME = 60  # characters of a file's name
+LIGHT_OF_PACKAGE = cache(read_light)
+Read = TypeVar("Read")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class View:
+    """A camera in the box: rotation columns are right, up and backward; the canvas is in pixels."""
+
+    position: np.ndarray
+    rotation: np.ndarray
+    field_of_view: float
+    width: int
+    height: int
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class State:
+    """All that decides a frame; `light` is made of `lighting` and `maps` when it is needed, `stale` until then."""
+
+    name: str
+    cloud: PointCloud
+    volume: Volume
+    view: View | None = None
+    quality: str = "best"
+    lighting: Lighting = Lighting()
+    maps: Mapping[str, Light] = field(default_factory=dict)
+    light: Light | None = None
+    stale: bool = False
+    splats: bool = False
+
+    @property
+    def lights(self) -> tuple[str, ...]:
+        """Names that can be chosen."""
+        return (*NAMES, *self.maps, *([SUN_ALONE] if self.lighting.sun else []))
+
+    @property
+    def chosen_light(self) -> str:
+        """The name of the light."""
+        return self.lighting.light or (SUN_ALONE if self.lighting.sun else NAMES[0])
+
+
+def open_state(model: Model, cloud: PointCloud, name: str, lighting: Lighting) -> State:
+    """What a browser sees first of a cloud that was just read; ValueError for what cannot be encoded or is no map."""
+    state = State(name=name, cloud=cloud, volume=model.encode(cloud), lighting=lighting, stale=bool(lighting.asked))
+    if lighting.light is None or lighting.light in NAMES:
+        return state
+    return add_map(state, display_name(Path(lighting.light).name), read_light(lighting.light))
+
+
+def qualities(model: Model) -> dict[str, tuple[Quality, int]]:
+    """What a picture at rest can be, by name: how it is drawn, and pixels along a side of the network's square."""
+    size = 2 * min(model.config.image_resolution, SMALLEST)
+    named: dict[str, tuple[Quality, int]] = {name: (name, size) for name in ("draft", "balanced", "best")}
+    return named | {"best, twice the pixels": ("best", 2 * size)}
+
+
+def add_map(state: State, name: str, light: Light) -> State:
+    """The state with one more map, which is chosen; one of the same name is replaced."""
+    lighting = dataclasses.replace(state.lighting, light=name)
+    return dataclasses.replace(state, lighting=lighting, maps={**state.maps, name: light}, stale=True)
+
+
+def read_lighting(state: State, choice: Any, yaw: Any, exposure: Any) -> Lighting:
+    """The light that the controls say, with the state's sun; ValueError for what they cannot say."""
+    values = read_numbers([yaw, exposure], 2)
+    if values is None or choice not in state.lights:
+        raise UserError("a light has a name of the list, and a turn and an exposure that are numbers")
+    turn, stops = (float(value) for value in values)
+    light = None if choice == SUN_ALONE else choice
+    return dataclasses.replace(state.lighting, light=light, light_yaw=turn, exposure=stops)
+
+
+def make_light(state: State) -> State:
+    """The state with the light of its options as they are now."""
+    if not state.stale:
+        return state
+    light = light_of_options(state.lighting, lambda name: state.maps.get(name) or LIGHT_OF_PACKAGE(name))
+    return dataclasses.replace(state, light=light, stale=False)
+
+
+def draw(model: Model, state: State, moving: bool) -> tuple[State, np.ndarray | None]:
+    """(the state with its light made, the canvas, uint8): none before the browser said its view.
+
+    Moving: `draft`, at the network's own size.  At rest: the chosen quality.
+    """
+    if state.view is None:
+        return state, None
+    state, named = make_light(state), qualities(model)
+    if state.splats:
+        return state, np.full((2, 2, 3), 255, np.uint8)
+    quality, size = ("draft", named["draft"][1] // 2) if moving else named[state.quality]
+    behind = state.lighting.background
+    reach = square_reach(state.view, whole=behind != "white")
+    camera = square_camera(state.view, state.volume, reach, size)
+    rendering = model.render(state.volume, camera, quality, state.light)
+    square = images.to_uint8(before(behind, rendering, camera, state.light).image)
+    return state, fill(square, state.view, reach, MOVING_LONGEST if moving else LONGEST)
+
+
+def read_view(wxyz: Any, position: Any, field_of_view: Any, width: Any, height: Any) -> View | None:
+    """The view of a browser's message of any values; None if nothing can be drawn from it (NaN, no pixels, far)."""
+    turn, place, canvas = (
+        read_numbers(wxyz, 4),
+        read_numbers(position, 3),
+        read_numbers([field_of_view, width, height], 3),
+    )
+    if turn is None or place is None or canvas is None:
+        return None
+    near = np.linalg.norm(turn) > 1e-6 and (np.abs(place) < FARTHEST).all()
+    pixels = (canvas[1:] >= 2).all() and (canvas[1:] <= MOST_PIXELS).all()
+    if not (near and pixels and NARROWEST <= canvas[0] <= WIDEST):
+        return None
+    rotation = Rotation.from_quat(turn, scalar_first=True).as_matrix() @ OPENCV
+    columns, rows = (int(count) for count in canvas[1:])
+    return View(position=place, rotation=rotation, field_of_view=float(canvas[0]), width=columns, height=rows)
+
+
+def square_reach(view: View, whole: bool) -> float:
+    """The reach of the square that holds the object or, if that is less or `whole` is wanted, covers the canvas."""
+    covering, distance = _covering(view), np.linalg.norm(view.position)
+    if whole or distance <= OBJECT:
+        return covering
+    aside = np.arccos(np.clip(view.position @ view.rotation[:, 2] / distance, -1, 1))  # of the object's middle
+    furthest = aside + np.arcsin(OBJECT / distance)
+    return covering if furthest >= np.pi / 2 else min(covering, float(np.tan(furthest)))
+
+
+def square_camera(view: View, volume: Volume, reach: float, size: int) -> Camera:
+    """Camera of `size` x `size` pixels in the middle of a view, in the cloud's units."""
+    focal = 0.5 * size / reach
+    intrinsics = np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]], np.float32)
+    position = view.position / float(volume.scale) + np.asarray(volume.centre, np.float64)
+    pose = np.concatenate([view.rotation, position[:, None]], axis=1).astype(np.float32)
+    return Camera(cam_to_world=pose, intrinsics=intrinsics, height=size, width=size)
+
+
+def fill(square: np.ndarray, view: View, reach: float, longest: int) -> np.ndarray:
+    """The canvas, at most `longest` pixels along its longer side, with a square picture in its middle, on white."""
+    shrink = min(1.0, longest / max(view.width, view.height))
+    width, height = (max(round(side * shrink), 1) for side in (view.width, view.height))
+    side = max(round(max(width, height) * reach / _covering(view)), 1)
+    canvas = Image.new("RGB", (width, height), "white")
+    scaled = Image.fromarray(square).resize((side, side), Image.Resampling.BICUBIC)
+    canvas.paste(scaled, ((width - side) // 2, (height - side) // 2))
+    return np.asarray(canvas)
+
+
+def _covering(view: View) -> float:
+    """The reach of the square that covers the canvas."""
+    return float(np.tan(view.field_of_view / 2) * max(view.width / view.height, 1.0))
+
+
+def read_numbers(values: Any, *shape: int) -> np.ndarray | None:
+    """What a browser sent as finite numbers of a shape, None if it is something else."""
+    try:
+        array = np.asarray(values, np.float64)
+    except (TypeError, ValueError, OverflowError):
+        return None
+    return array if array.shape == shape and np.isfinite(array).all() else None
+
+
+def display_name(name: str) -> str:
+    """The last part of a browser's file name, without what Markdown or a path could make of it."""
+    last = PurePath(name.replace("\\", "/")).name
+    return "".join(c if c.isalnum() or c in "._- " else "_" for c in last)[-LONGEST_NAME:].strip() or "file"
+
+
+def read_upload(name: str, content: bytes, read: Callable[[Path], Read]) -> Read:
+    """What `read` makes of a file's bytes; ValueError, with the name as shown, for what cannot be read."""
+    shown = display_name(name)
+    with tempfile.TemporaryDirectory(prefix="spnr-view-") as folder:
+        path = Path(folder) / f"upload{PurePath(shown).suffix.lower()}"
+        path.write_bytes(content)
+        try:
+            return read(path)
+        except ValueError as error:
+            raise UserError(str(error).replace(str(path), shown)) from None

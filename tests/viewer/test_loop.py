@@ -1,0 +1,50 @@
+"""The thread that draws: changes in order, at once and once more at rest."""
+
+import threading
+
+from spnr_jax.viewer.loop import Loop
+
+
+def test_changes_are_applied_in_order_drawn_at_once_and_once_more_at_rest():
+    drawn, rested = [], threading.Event()
+
+    def show(numbers, moving):
+        drawn.append((tuple(numbers), moving))
+        if numbers and not moving:
+            rested.set()
+        return numbers
+
+    loop = Loop([], show, rest=0.05)
+    for number in range(5):
+        loop.submit(lambda numbers, number=number: [*numbers, number])
+    loop.start()
+    assert rested.wait(10)
+    loop.stop()
+    loop.join(10.0)
+    assert drawn[0] == ((), True)
+    assert drawn[1:] == [((0, 1, 2, 3, 4), True), ((0, 1, 2, 3, 4), False)]
+    assert loop.stopped
+
+
+def test_changes_that_come_while_a_picture_is_drawn_wait_together_and_supersede_it():
+    drawn, begun, go, seen = [], threading.Event(), threading.Event(), []
+
+    def show(number, moving):
+        if number == 0:
+            begun.set()
+            go.wait(10)
+            seen.append(loop.superseded)
+        drawn.append(number)
+        if number == 3:
+            loop.stop()
+        return number
+
+    loop = Loop(0, show, rest=10.0)
+    loop.start()
+    assert begun.wait(10)
+    for _ in range(3):
+        loop.submit(lambda number: number + 1)
+    go.set()
+    loop.join(10.0)
+    assert drawn == [0, 3]
+    assert seen == [True]
