@@ -116,13 +116,14 @@ def test_an_orbit_turns_the_object_and_another_browser_keeps_its_own_camera(page
     other.tab.close()
 
 
-def test_light_exposure_and_quality_change_the_picture(page, monkeypatch):
-    seen, asked, render = [page.settled(drawn)], [], Model.render
+def test_light_exposure_and_quality_reach_the_picture(page, running, monkeypatch):
+    first, asked, render = page.settled(drawn), [], Model.render
+    loop = list(running._browsers.values())[-1].loop
     monkeypatch.setattr(Model, "render", lambda *of: asked.append(of[3]) or render(*of[:3], "draft", *of[4:]))
     page.choose("Light", "night")
-    seen.append(page.settled(lambda now: drawn(now) and difference(now, seen[-1]) > SAME))
-    page.enter(EXPOSURE, "2")
-    page.settled(lambda now: difference(now, seen[-1]) > SAME)
+    page.until(lambda: loop.state.lighting.light == "night")
+    page.enter(EXPOSURE, "-4")
+    page.settled(lambda now: difference(now, first) > 2 * SAME)
     assert "best" not in asked
     page.choose("Quality", "best")
     page.until(lambda: "best" in asked)
