@@ -1,9 +1,9 @@
 """Colours of splats from pictures: spherical harmonics by weighted least squares over the views that see each splat.
 
-A view sees a splat whose centre lies at its picture's depth there and that faces it, and is against one that lies
+A view sees a splat that faces it and whose centre lies at its picture's depth there, and is against one that lies
 before that depth or where the picture is empty: those that more than a few views are against stick out of the object,
-and are left out. The weight of a view is the cosine under which it sees the splat; harmonics of higher degree are
-held back (ridge), so few views give a plain colour.
+and are left out.  The weight of a view is the cosine under which it sees the splat; harmonics of higher degree are held
+back (ridge), so few views give a plain colour.
 """
 
 from collections.abc import Sequence
