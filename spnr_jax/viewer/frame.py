@@ -1,9 +1,8 @@
 """What one browser sees: its object and light, where it looks from, and the frame that the network draws of that.
 
-The browser lives in the network's box, (position - centre) * scale of the cloud.  `field_of_view` is vertical, in
-radians; `reach` is the tangent of half the angle that a square sees.  The network draws squares, one program for each
-size: the square in the middle of the canvas that holds the whole object or, where that is less or something stands
-behind the object, the square that covers the canvas.  What a browser sends may be anything: `read_*` make it safe.
+The browser lives in the network's box.  `field_of_view` is vertical, in radians; `reach` is the tangent of half of what
+a square sees.  The network draws squares, one program for each size: in the middle of the canvas, around the whole
+object or, where that is less or something stands behind it, the canvas.  `read_*` make safe what a browser sends.
 """
 
 import dataclasses

@@ -3,8 +3,7 @@
 A web page of any address that is open in the same browser can connect to a server on this machine, and viser asks
 nobody who he is.  So the path of the viewer's address begins with a token, made anew for every viewer, without which
 no page is served and no WebSocket is opened; the page's own connection takes the token from its address.  Where a
-browser names the origin of what asks, it has to be the server itself, also with the token: the address that was asked,
-or, behind a proxy that asks under a name of its own, the address at which the viewer is said to be reached.
+browser names the origin of what asks, it has to be the address that was asked or, behind a proxy, `reached_at`.
 """
 
 import contextlib

@@ -9,7 +9,6 @@ import dataclasses
 import threading
 from collections.abc import Callable
 from functools import partial
-from pathlib import PurePath
 from typing import Any
 
 import numpy as np
@@ -139,9 +138,7 @@ class Browser:
 
     def _add_files(self, gui: viser.GuiApi) -> None:
         gui.add_html(DROP)
-        upload = gui.add_upload_button(
-            "Open", hint="A cloud, a mesh or a map of light; or drop it anywhere on the page"
-        )
+        upload = gui.add_upload_button("Open", hint="A cloud, a mesh or a map of light; or drop it on the page")
         snapshot = gui.add_button("Snapshot", hint="The network's picture as a .png")
 
         @upload.on_upload
@@ -162,7 +159,7 @@ class Browser:
 
     def _open(self, file: viser.UploadedFile) -> None:
         name, notes = frame.display_name(file.name), list[str]()
-        if PurePath(name).suffix.lower() in light_files.ENDINGS:
+        if name.lower().endswith(tuple(light_files.ENDINGS)):
             if not self._light:
                 raise UserError(ONE_LIGHT)
             light = frame.read_upload(file.name, file.content, light_files.read_light)
@@ -174,7 +171,6 @@ class Browser:
         self._title.content = "; ".join([TITLE.format(name, len(cloud.positions)), *notes])
 
     def _show_choice(self, state: State) -> State:
-        """Has the list of lights show those there are; the state as it is."""
         self._light["choice"].options, self._light["choice"].value = state.lights, state.chosen_light
         return state
 

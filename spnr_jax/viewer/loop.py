@@ -1,7 +1,6 @@
 """A thread that draws for one browser: at once while things change, once more and better when they rest.
 
-Changes are functions from state to state, submitted from any thread and applied here in order, all that wait before the
-next picture: the state has one owner, and a slow picture never lets changes pile up.
+Changes are functions from state to state, of any thread; all that wait are applied, in order, before the next picture.
 """
 
 import threading
