@@ -1,5 +1,7 @@
 """Stratified samples, inverse-CDF samples, and the merge of two sorted lists."""
 
+import inspect
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -185,3 +187,14 @@ def test_samples_stay_float32_however_coarse_the_inputs_type_is():
     distances, _ = sampling.stratified(None, jnp.bfloat16(1.0), jnp.bfloat16(3.0), 64)
     assert distances.dtype == jnp.float32
     assert len(np.unique(np.array(distances))) == 64
+
+
+def test_keys_of_the_old_kind_draw_what_new_ones_do_and_other_numbers_of_weights_than_bins_are_refused():
+    near, far = jnp.zeros(3), jnp.ones(3)
+    old, new = (sampling.stratified(make(3), near, far, 4) for make in (jax.random.PRNGKey, jax.random.key))
+    same_bits(old, new)
+    both = zip(sampling.split(jax.random.PRNGKey(3)), sampling.split(jax.random.key(3)), strict=True)
+    assert all(np.array_equal(*map(jax.random.key_data, pair)) for pair in both)
+    unchecked = inspect.unwrap(sampling.importance)  # as without the annotations, which are executed here
+    with pytest.raises(ValueError, match="9 edges have one weight less"):
+        unchecked(None, jnp.arange(9.0), jnp.ones(9), 4)

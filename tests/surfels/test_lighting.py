@@ -151,3 +151,20 @@ def test_the_harmonics_are_orthonormal_and_project_light_in_the_axes_of_the_came
     tilted = lighting.projected(Light(tables=light_of(smooth(directions(HEIGHT)).astype(np.float32)).tables), ahead)
     close(tilted[2, 0], 4 / 3 * 0.488603, rtol=1e-2)  # red is 1 + x, and behind the camera is +x
     close(tilted[np.array([1, 3]), 0], np.zeros(2), atol=1e-2)
+
+
+def test_lamps_and_turned_lights_of_traced_angles_are_those_of_numbers_and_have_gradients():
+    def shone(azimuth, elevation, degrees):
+        return lighting.sun(azimuth, elevation, 30.0).turned(degrees).tables
+
+    angles = jnp.array([30.0, 40.0, 17.0])
+    close(jax.jit(lambda x: shone(*x))(angles), shone(30.0, 40.0, 17.0), rtol=1e-3, atol=1e-3)
+
+    def over(angles):  # what a surface has that faces +x
+        return shone(*angles)[0, HEIGHT // 2, 3 * WIDTH // 4, 0]
+
+    slopes = jax.jit(jax.grad(over))(angles)
+    assert np.isfinite(np.asarray(slopes)).all()
+    for i in range(3):
+        step = jnp.zeros(3).at[i].set(0.5)
+        close(slopes[i], over(angles + step) - over(angles - step), rtol=0.1, atol=2e-4)
