@@ -13,7 +13,6 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from jaxtyping import Array, Float, Int
-from spnr_jax.surfels.encoding import QUICK, fit_box
 
 import spnr_jax
 from experiments.comparison import clock
@@ -23,6 +22,7 @@ from spnr_jax.method import surfel_renderer
 from spnr_jax.method.surfel_renderer import Plan
 from spnr_jax.surfels import lighting
 from spnr_jax.surfels.envmaps import directions, solid_angles
+from spnr_jax.surfels.surfel_scenes import QUICK, fit_box
 
 FIELD_OF_VIEW, DISTANCE = np.deg2rad(40.0), 3.0
 SMOOTHEST = 0.05  # the least roughness

@@ -20,7 +20,7 @@ from spnr_jax.kernels.records import Camera, Light, PointCloud, Surfels, SurfelS
 from spnr_jax.method import surfel_renderer
 from spnr_jax.method.model import Model
 from spnr_jax.method.surfel_renderer import Plan
-from spnr_jax.surfels import encoding, lighting
+from spnr_jax.surfels import lighting, surfel_scenes
 from spnr_jax.surfels.rules import NEIGHBORS
 from spnr_jax.surfels.visibility import spiral
 
@@ -34,7 +34,7 @@ def encode(params: dict, cloud: Arrays) -> Arrays:
     """The scene of a cloud as a dict of arrays; pure."""
     points = PointCloud(**cloud)
     near = nearest(jnp.asarray(points.positions), jnp.asarray(points.mask))
-    return dict(to_state_dict(encoding.encode(params, points, near)))
+    return dict(to_state_dict(surfel_scenes.encode(params, points, near)))
 
 
 def render(params: dict | None, volume: Arrays, camera: Arrays, light: Arrays, *, size: int, plan: Plan) -> Arrays:
@@ -66,7 +66,7 @@ def make_plan(model: Model, num_points: int, size: int) -> Plan:
     grey = np.full(num_points, 0.5, np.float32)
     mask = np.ones(num_points, bool)
     cloud = PointCloud(positions=ball, base_color=grey[:, None].repeat(3, 1), roughness=grey, metallic=grey, mask=mask)
-    scene = encoding.encode_in_box(cloud)
+    scene = surfel_scenes.encode_in_box(cloud)
     volume = scene.replace(centre=jnp.zeros(3), scale=jnp.ones(()))
     camera = model.camera(volume, resolution=size)
     made = surfel_renderer.plan(volume, camera)
