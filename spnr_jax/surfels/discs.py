@@ -12,10 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from spnr_jax.kernels.numerics import clamp
+from spnr_jax.kernels.numerics import clamp, larger, root, smaller
 from spnr_jax.surfels.layers import Hood, along
 from spnr_jax.surfels.rules import Rules
-from spnr_jax.surfels.small_systems import dot, root, solve, sum_products, total, unit
+from spnr_jax.surfels.small_systems import dot, largest, smallest, solve, sum_products, total, unit
 
 RIM_DIRECTIONS = 16  # in which the end of a layer is looked for
 CHANGE, ROOTS, SPREAD = slice(6, 9), slice(9, 12), 12  # of the sums beside a border, after those over the plane
@@ -28,7 +28,7 @@ def first_spacing(hood: Hood, rules: Rules) -> Float[Array, " block"]:
     chosen = jnp.arange(len(hood.real), dtype=count.dtype)[:, None] == count[None]
     distance = root(jnp.sum(jnp.where(chosen, hood.squared, 0), axis=0))
     several = count > 0  # a single point stands for a tenth of the box
-    spacing = jnp.maximum(jnp.sqrt(jnp.pi / jnp.where(several, count, 1)) * distance, rules.least_spacing)
+    spacing = larger(jnp.sqrt(jnp.pi / jnp.where(several, count, 1)) * distance, rules.least_spacing)
     return jnp.where(several, spacing, rules.alone)
 
 
@@ -43,7 +43,7 @@ def own_spacing(
     last = jnp.minimum(total((held < wanted[None]).astype(count.dtype)), jnp.maximum(count - 1, 0))
     chosen = jnp.arange(others, dtype=count.dtype)[:, None] == last[None]
     weight, squared = total(jnp.where(chosen, held, 0)), total(jnp.where(chosen, hood.squared[1:], 0))
-    spacing = jnp.sqrt(jnp.pi / jnp.maximum(weight, 1)) * root(squared)
+    spacing = jnp.sqrt(jnp.pi / larger(weight, 1)) * root(squared)
     low, high = rules.bounds
     return jnp.where(count > 0, clamp(spacing, low * raw, high * raw), raw)
 
@@ -53,7 +53,7 @@ def smooth_spacing(
 ) -> Float[Array, " block"]:
     """Geometric mean over the nearest of the layer."""
     weight, near = layer[: rules.smoothed], spacings[: rules.smoothed]
-    return jnp.exp(total(weight * jnp.log(jnp.maximum(near, rules.least_spacing))) / total(weight))
+    return jnp.exp(total(weight * jnp.log(larger(near, rules.least_spacing))) / total(weight))
 
 
 def average(
@@ -84,7 +84,7 @@ def find_farthest(place: Float[Array, "k 2 block"]) -> Float[Array, "16 block"]:
 
     def look(way: tuple[Array, Array]) -> tuple[Array, Array]:
         ahead = one * way[0] + two * way[1]
-        return jnp.max(ahead, axis=0), -jnp.min(ahead, axis=0)
+        return largest(ahead), largest(-ahead)
 
     return jnp.concatenate(jax.lax.map(look, (jnp.cos(turn), jnp.sin(turn))))
 
@@ -105,8 +105,8 @@ def bridge_gaps(
     curved = find_farthest(place * inverse[:, None])
     vertex = (curved > 1 / rules.widest_gap) & (curved <= jnp.roll(curved, 1, axis=0))
     vertex = vertex & (curved <= jnp.roll(curved, -1, axis=0))
-    least = jnp.min(jnp.where(vertex, curved, 1 / rules.bridged), axis=0)
-    return jnp.maximum(1 / (least * rules.bridged), 1)
+    least = smallest(jnp.where(vertex, curved, 1 / rules.bridged))
+    return larger(1 / (least * rules.bridged), 1)
 
 
 class Cuts(NamedTuple):
@@ -145,9 +145,10 @@ def find_rims(
     It ends a little beyond its last point, or where another face cuts it.  Which neighbor or direction ends it is a
     constant.
     """
-    nearest, soonest = jnp.min(cuts.distance, axis=0), jnp.argmin(ends, axis=0)
-    cut = nearest < jnp.min(ends, axis=0) + rules.beyond
-    first = (cuts.distance == nearest[None]) & cut[None]
+    constant = jax.lax.stop_gradient((cuts.distance, ends))
+    nearest, soonest = jnp.min(constant[0], axis=0), jnp.argmin(constant[1], axis=0)
+    cut = nearest < jnp.min(constant[1], axis=0) + rules.beyond
+    first = (constant[0] <= nearest[None]) & cut[None]
     turn = jnp.asarray(TURN, ends.dtype)
     way = [
         jnp.where(cut, total(jnp.where(first, ways, 0)), of_turn[soonest])
@@ -158,14 +159,14 @@ def find_rims(
     def reach(way: tuple[Array, Array]) -> Array:
         right, high = way
         aligned = cuts.across * right[None] + cuts.up * high[None] > rules.aligned
-        line = jnp.min(jnp.where(aligned, cuts.distance, jnp.inf), axis=0)
+        line = smallest(jnp.where(aligned, cuts.distance, jnp.inf))
         angle = jnp.arctan2(*jax.lax.stop_gradient((high, right)))
         step = jnp.round(angle / (2 * jnp.pi) * RIM_DIRECTIONS).astype(jnp.int32) % RIM_DIRECTIONS
         end = jnp.take_along_axis(ends, step[None], axis=0)[0]
         return jnp.where(line < jnp.inf, jnp.where(line < jnp.inf, line, 0), end)
 
     quarters = jnp.stack([right, -right, -high, high]), jnp.stack([high, -high, right, -right])
-    return right[None] * axes[0] + high[None] * axes[1], jnp.minimum(jax.lax.map(reach, quarters), rules.far)
+    return right[None] * axes[0] + high[None] * axes[1], smaller(jax.lax.map(reach, quarters), rules.far)
 
 
 class Colors(NamedTuple):
@@ -228,9 +229,9 @@ def _trust(own: Float[Array, "sums block"], other: Float[Array, "sums block"], r
     """How sure it is that the colors are two, from the moments of square roots of linear colors."""
     apart = _mean(other, ROOTS) - _mean(own, ROOTS)
     whole = own + other
-    variance = jnp.maximum(whole[SPREAD] - dot(whole[ROOTS], whole[ROOTS]), 1e-9)
+    variance = larger(whole[SPREAD] - dot(whole[ROOTS], whole[ROOTS]), 1e-9)
     between = own[0] * other[0] * dot(apart, apart) / variance
-    contrast = jnp.max(jnp.abs(apart), axis=0)
+    contrast = largest(jnp.abs(apart))
     return _ramp(other[0], rules.far_share) * _ramp(contrast, rules.contrast) * _ramp(between, rules.parted)
 
 
@@ -247,7 +248,7 @@ def _find_line(
     The way is that of a linear regression of the side; the line lies midway between the last of the point's color and
     the first of the other.
     """
-    one, two = (0.5 / jnp.maximum(sums[:1], 1e-6) * sums[:6] for sums in (own, other))
+    one, two = (0.5 / larger(sums[:1], 1e-6) * sums[:6] for sums in (own, other))
     (n, x, y, xx, xy, yy), side = one + two, two - one
     normal = jnp.stack(
         [jnp.stack([n, x, y, side[0]]), jnp.stack([x, xx, xy, side[1]]), jnp.stack([y, xy, yy, side[2]])]
@@ -255,10 +256,10 @@ def _find_line(
     way = unit(_solve_plane(normal, rules.border_ridge)[:, 0])
     height = jax.lax.optimization_barrier(place[:, 0] * way[0][None] + place[:, 1] * way[1][None])
     there = weight > rules.border_least
-    last = jnp.max(jnp.where(there & ~beyond, height, 0), axis=0)  # the point itself lies at 0
-    first = jnp.min(jnp.where(there & beyond, height, jnp.inf), axis=0)
+    last = largest(jnp.where(there & ~beyond, height, 0))  # the point itself lies at 0
+    first = smallest(jnp.where(there & beyond, height, jnp.inf))
     some = first < jnp.inf
-    distance = jnp.maximum(jnp.where(some, last + jnp.where(some, first, 0), 0) / 2, 0)
+    distance = larger(jnp.where(some, last + jnp.where(some, first, 0), 0) / 2, 0)
     return way, distance, total(weight * (beyond != (height > distance[None])))
 
 
@@ -269,4 +270,4 @@ def _solve_plane(normal: Float[Array, "3 columns block"], ridge: float) -> Float
 
 
 def _mean(sums: Float[Array, "sums block"], columns: slice) -> Float[Array, "columns block"]:
-    return sums[columns] / jnp.maximum(sums[:1], 1e-6)
+    return sums[columns] / larger(sums[:1], 1e-6)

@@ -23,12 +23,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from spnr_jax.kernels.numerics import clamp
+from spnr_jax.kernels.numerics import clamp, root
 from spnr_jax.kernels.records import PointCloud, Surfels
 from spnr_jax.surfels import discs, layers, sides
 from spnr_jax.surfels.layers import Hood, Layer, along
 from spnr_jax.surfels.rules import RULES, Rules
-from spnr_jax.surfels.small_systems import frame, measure_shape, root
+from spnr_jax.surfels.small_systems import frame, measure_shape
 from spnr_jax.surfels.visibility import cell_of, grid_of, seen_from
 
 

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from spnr_jax.kernels.numerics import clamp
+from spnr_jax.kernels.numerics import clamp, larger
 from spnr_jax.surfels.rules import Rules
 from spnr_jax.surfels.small_systems import cross, dot, find_narrowest, frame, solve, sum_products, total, unit
 
@@ -102,7 +102,7 @@ def measure_covariance(
     offset = hood.offset / spacing[None, None]
     terms = jnp.concatenate([jnp.ones_like(offset[:, :1]), offset], axis=1)
     sums = sum_products(weight[:, None] * terms, terms)
-    sums = sums / jnp.maximum(sums[:1, :1], 1e-9)
+    sums = sums / larger(sums[:1, :1], 1e-9)
     return sums[1:, 1:] - sums[1:, :1] * sums[:1, 1:]
 
 
@@ -212,7 +212,7 @@ def _fit_quadric(
         if unlike is not None:
             rest = height - solution[5][None] * unlike
         normal = unit(axes[2] - slope[:1] * axes[0] - slope[1:] * axes[1])
-        away = total(own * jnp.abs(rest)) / jnp.maximum(total(own) - 1, 0.5)  # it is at 0 itself
+        away = total(own * jnp.abs(rest)) / larger(total(own) - 1, 0.5)  # it is at 0 itself
         scale = clamp(rules.spreads * away, least, rules.scales[1])
         return Fit(Layer(normal, scale, height), own, sums[:, :-1], solution[-1]), rest
 

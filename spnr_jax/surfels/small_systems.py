@@ -8,8 +8,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from spnr_jax.kernels.numerics import larger, root, smaller
+
 ROUND = 1e-4  # of the trace, added to variances before they are inverted
 SQUARINGS = 5  # after which a variance that is a tenth larger than another weighs twenty times as much
+SHORTEST = 1e-9  # vector that has a direction
 SMALLEST = 1e-7  # of the trace, below which a variance is rounding
 
 
@@ -54,16 +57,33 @@ def cross(one: Float[Array, "3 points"], two: Float[Array, "3 points"]) -> Float
     return jnp.stack([one[i - 2] * two[i - 1] - one[i - 1] * two[i - 2] for i in range(3)])
 
 
-def root(squared: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """Square roots; 0 with a gradient of 0 where there is none."""
-    valid = squared > 0
-    return jnp.where(valid, jnp.sqrt(jnp.where(valid, squared, 1)), 0)
+@jax.custom_jvp
+def largest(values: Float[Array, "k ..."]) -> Float[Array, "..."]:
+    """Largest along the first axis; its gradient is the mean of those that are as large but for rounding.
+
+    That of jnp.max asks which equal the result: a compiler that computes them twice finds none, and divides by 0.
+    """
+    return jnp.max(values, axis=0)
+
+
+@largest.defjvp
+def _largest_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    (values,), (change,) = primals, tangents
+    most = largest(values)
+    near = values >= (most - 8 * jnp.finfo(values.dtype).eps * jnp.abs(most))[None]
+    share = near / jnp.maximum(jnp.sum(near, axis=0, dtype=values.dtype), 1)[None]
+    return most, jnp.sum(share * change, axis=0)
+
+
+def smallest(values: Float[Array, "k ..."]) -> Float[Array, "..."]:
+    """Smallest along the first axis, likewise."""
+    return -largest(-values)
 
 
 def unit(vectors: Float[Array, "dimensions points"]) -> Float[Array, "dimensions points"]:
-    """Vectors of length 1; those that have no length stay 0."""
+    """Vectors of length 1; 0 where they are shorter than SHORTEST, whose gradient overflows."""
     squared = jnp.sum(vectors * vectors, axis=0, keepdims=True)
-    valid = squared > 0
+    valid = squared > SHORTEST**2
     return jnp.where(valid, vectors * jax.lax.rsqrt(jnp.where(valid, squared, 1)), 0)
 
 
@@ -115,5 +135,5 @@ def measure_shape(matrix: Float[Array, "3 3 points"]) -> Float[Array, "2 points"
     scaled, narrowest, widest = split_variances(matrix)
     least, most = (jnp.sum(jax.lax.stop_gradient(x) * scaled, axis=(0, 1)) for x in (narrowest, widest))
     middle = scaled[0, 0] + scaled[1, 1] + scaled[2, 2] - least - most
-    ratios = jnp.stack([least, middle]) / jnp.maximum(jnp.stack([middle, most]), SMALLEST)
-    return root(jnp.where(jnp.stack([least, middle]) > SMALLEST, jnp.minimum(ratios, 1), 0))
+    ratios = jnp.stack([least, middle]) / larger(jnp.stack([middle, most]), SMALLEST)
+    return root(jnp.where(jnp.stack([least, middle]) > SMALLEST, smaller(ratios, 1), 0))

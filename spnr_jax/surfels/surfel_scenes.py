@@ -14,6 +14,7 @@ from spnr_jax.kernels.records import AnyArray, PointCloud, SurfelScene
 from spnr_jax.surfels.geometry import estimate_surfels, median
 from spnr_jax.surfels.neighbors import order_in_space
 from spnr_jax.surfels.rules import NEIGHBORS, RULES, Rules
+from spnr_jax.surfels.small_systems import largest, smallest
 
 # of XLA: a third to a half off the compilation, and the program runs as long
 QUICK = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 1}
@@ -41,8 +42,8 @@ def fit_box(
     The scale of points without extent is 1.  Masked points do not count.
     """
     some = jnp.any(mask)
-    low = jnp.min(jnp.where(mask[:, None], positions, jnp.inf), axis=0)
-    high = jnp.max(jnp.where(mask[:, None], positions, -jnp.inf), axis=0)
+    low = smallest(jnp.where(mask[:, None], positions, jnp.inf))
+    high = largest(jnp.where(mask[:, None], positions, -jnp.inf))
     low, high = jnp.where(some, low, 0), jnp.where(some, high, 0)
     diagonal = length(high - low)
     scale = jnp.where(diagonal > 0, 2 / jnp.where(diagonal > 0, diagonal, 1), 1)
