@@ -1,5 +1,6 @@
 """Compiled programs are kept on the disk, for the next process that needs them."""
 
+import os
 from pathlib import Path
 
 SHORTEST = 0.1  # seconds of compilation from which on a program is kept
@@ -7,7 +8,7 @@ SHORTEST = 0.1  # seconds of compilation from which on a program is kept
 
 def folder() -> Path:
     """Where this package keeps what can be made again, of this user."""
-    return Path.home() / ".cache" / "spnr_jax"
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "spnr_jax"
 
 
 def keep_programs() -> None:

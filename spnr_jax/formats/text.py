@@ -26,6 +26,7 @@ Line = tuple[int, str]  # its number in the file, from 1, and its text
 
 POSITION, COLOR, NORMAL = ("x", "y", "z"), ("r", "g", "b"), ("nx", "ny", "nz")
 PLAIN_COLUMNS = {3: POSITION, 4: (*POSITION, "intensity"), 8: (*POSITION, *COLOR, "roughness", "metallic")}
+OPAQUE = (1, 255, 65535)  # what an alpha is where nobody thought of it
 NUMBERS = "fiu"  # kinds of types that hold real numbers
 UNIT_LENGTH = 0.02  # how far from 1 the length of a normal may be
 COMMENTS = ("#", "//")
@@ -136,7 +137,7 @@ def plain_names(table: np.ndarray) -> tuple[str, ...]:
         if count == 6:
             return (*POSITION, *(NORMAL if _are_normals(table[:, 3:]) else COLOR))
         if count == 7:
-            alpha_last = np.ptp(table[:, 6]) == 0 or (table[:, 3:].min() >= 0 and table[:, 3:].max() <= 1)
+            alpha_last = np.isin(table[:, 6], OPAQUE).all() or (table[:, 3:].min() >= 0 and table[:, 3:].max() <= 1)
             return (*POSITION, *((*COLOR, "alpha") if alpha_last else ("intensity", *COLOR)))
         if count == 9:
             rest = (*NORMAL, *COLOR) if _are_normals(table[:, 3:6]) else (*COLOR, *NORMAL)

@@ -26,8 +26,8 @@ class Render:
     Of a folder, or a pattern in quotation marks, every file is drawn, and a page shows them all."""
 
     cloud: tyro.conf.Positional[Path]
-    """.ply (also 3D Gaussian splats) .pcd .xyz .txt .csv .las .laz .npz .npy, or a mesh: .glb .gltf .obj .stl .off (its
-    surface is sampled).  Or a folder, with all folders in it, or a pattern such as 'scans/**/*.ply'."""
+    """.ply .spz (also 3D Gaussian splats) .pcd .xyz .txt .csv .asc .pts .las .laz .npz .npy, or a mesh: .glb .gltf .obj
+    .stl .off (its surface is sampled).  Or a folder, with all folders in it, or a pattern such as 'scans/**/*.ply'."""
     run: Path | None = None
     """Network that renders: `surfels`, `near_points` or `near_points_lite` of the package, a run folder, a file of
     weights (default: surfels, of fewer than 2,000 points near_points)."""
