@@ -1,6 +1,7 @@
 """The errors that a person can mend, the bugs that are ours, and when a call stack is shown."""
 
 import contextlib
+import io
 import os
 import sys
 import traceback
@@ -67,6 +68,9 @@ def guarded(work: Callable[[], None], name: str, debug: bool = False) -> int:
 
     For `debug` the line stands behind the call stack.
     """
+    for stream in (sys.stdout, sys.stderr):  # a name that the terminal cannot print stops no picture
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
     try:
         try:
             work()

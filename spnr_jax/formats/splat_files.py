@@ -19,7 +19,7 @@ from spnr_jax.formats.mesh.colors import SRGB
 
 MAGIC, VERSIONS = b"NGSP", (2, 3)  # of .spz
 PACKED = 9 + 1 + 3  # bytes of a splat up to its colour
-MOST_BYTES = 2**31  # when unpacked: a small file can announce any number
+MOST_BYTES = 2**30  # when unpacked: a small file can announce any number
 COLOR_STEP = 0.15  # 255 steps for 1 / COLOR_STEP of a coefficient
 CHUNK = 256  # splats
 CONVERT = "convert it to .ply, e.g. with SuperSplat (File > Export) or `splat-transform a.spz a.ply`"

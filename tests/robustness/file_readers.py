@@ -146,6 +146,7 @@ CLOUDS: dict[str, Callable[[], list[Files]]] = {
     "ply": valid_files.plys, "ply-mesh": valid_files.ply_meshes, "pcd": valid_files.pcds, "text": valid_files.texts,
     "npz": valid_files.npzs, "npy": valid_files.npys, "las": functools.partial(valid_files.scans, "las"),
     "laz": functools.partial(valid_files.scans, "laz"), "stl": valid_files.stls, "off": valid_files.offs,
+    "spz": valid_files.spzs,
 }  # fmt: skip
 MESHES: dict[str, Callable[[], list[Files]]] = {
     "obj": valid_files.objs,

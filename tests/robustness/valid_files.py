@@ -4,14 +4,17 @@ A seed is a dict from names to bytes, the file that is opened first, its compani
 literal seeds; damage to a few hundred bytes hits what matters.
 """
 
+import gzip
 import io
 import struct
 from collections.abc import Sequence
 
 import numpy as np
 from damage import Files
-from support import gltf_files, pcd_files
+from support import gltf_files, pcd_files, splat_balls
 from support.gltf_files import GltfBuilder
+
+from spnr_jax.formats import gaussian_files
 
 SIZE, VIEWS, POINTS = 8, 2, 12
 CORNERS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0.5, 0.5, 1]], np.float32)
@@ -142,6 +145,12 @@ def offs() -> list[Files]:
     colored = [f"{row} 255 0 0 255" for row in rows]
     return [{"cloud.off": "\n".join(["OFF", size, *rows, *faces, ""]).encode()},
             {"cloud.off": "\n".join(["COFF", size, *colored, *faces, ""]).encode()}]  # fmt: skip
+
+
+def spzs() -> list[Files]:
+    """Packed splats of both versions that are read."""
+    content = gzip.decompress(gaussian_files.spz_of(splat_balls.ball(POINTS)))
+    return [{"cloud.spz": gzip.compress(content[:4] + bytes([version]) + content[5:])} for version in (2, 3)]
 
 
 def objs() -> list[Files]:

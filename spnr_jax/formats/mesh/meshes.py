@@ -98,8 +98,10 @@ def _guarded(read: Callable[[], Result]) -> Result:
             # numpy only warns where the text of a file stops being numbers
             warnings.filterwarnings("error", "string or file could not be read", DeprecationWarning)
             return read()
-    except UserError:
+    except RejectedAsset:
         raise
+    except UserError as error:  # colours that are none, say
+        raise RejectedAsset(str(error)) from error
     except UNREADABLE as error:
         if is_bug(error):
             raise
@@ -127,7 +129,7 @@ def _finite(asset: Asset) -> Asset:
         parts.append(part)
     if not lost:
         return asset
-    note = f"{lost:,} faces left out: a vertex of theirs is NaN or infinity"
+    note = f"{lost:,} {'face' if lost == 1 else 'faces'} left out for a vertex that is NaN or infinity"
     return replace(asset, parts=tuple(parts), notes=(*asset.notes, note))
 
 
