@@ -193,8 +193,11 @@ def test_an_output_folder_that_is_a_file_is_refused(capsys, tmp_path, run):
     assert str(tmp_path / "taken") in line
 
 
-def test_a_cloud_of_one_point_renders(capsys, tmp_path, run):
-    (tmp_path / "one.xyz").write_text("1 2 3\n")
+def test_a_cloud_of_three_points_renders_and_one_of_one_point_is_refused(capsys, tmp_path, run):
+    (tmp_path / "point.xyz").write_text("1 2 3\n")
+    assert exit_code("render", tmp_path / "point.xyz", "--run", run, "--out", tmp_path / "none") == 2
+    assert "holds 1 points in 1 place: no object can be drawn" in capsys.readouterr().err
+    (tmp_path / "one.xyz").write_text("1 2 3\n2 2 3\n1 3 3\n")
     out = tmp_path / "out"
     arguments = ("--run", run, "--out", out, "--views", 1, "--frames", 2, "--resolution", 24)
     assert exit_code("render", tmp_path / "one.xyz", *arguments) == 0

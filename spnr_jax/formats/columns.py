@@ -3,7 +3,7 @@
 `useful` renames the columns that matter to
 
     x y z                           position
-    base_color_r ...                base colour, linear; red green blue: sRGB; rgb, rgba: packed (mesh/colors.py)
+    base_color_r ...                base colour, linear; red green blue: sRGB; rgb, rgba: packed (mesh/file_colors.py)
     roughness metallic              in [0, 1]
     nx ny nz                        normal, of any length
     intensity                       of a laser's echo, shown as grey where there is no colour
@@ -18,7 +18,7 @@ from collections.abc import Callable
 import numpy as np
 
 from spnr_jax.errors import UserError
-from spnr_jax.formats.mesh import colors
+from spnr_jax.formats.mesh import file_colors as colors
 from spnr_jax.formats.mesh.texels import srgb_to_linear
 
 Columns = dict[str, np.ndarray]

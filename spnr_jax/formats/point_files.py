@@ -79,7 +79,7 @@ def kind_of(path: Path) -> str:
         raise UserError(f"{path}: unknown kind of file {path.suffix!r}; expected one of {' '.join(known)}")
     with path.open("rb") as file:
         head = file.read(64)
-    if not head:
+    if not head and suffix in known:
         raise UserError(f"{path}: the file is empty")
     for magic, kinds in MAGIC:
         if head.startswith(magic):

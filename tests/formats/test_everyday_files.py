@@ -400,7 +400,7 @@ def test_spz_of_version_2_is_read_and_others_and_damaged_ones_are_named(tmp_path
 
 
 def test_compressed_splats_in_a_ply_are_unpacked(tmp_path):
-    head = "ply\nformat binary_little_endian 1.0\nelement chunk 1\n"
+    head = "ply\nformat binary_little_endian 1.0\nelement chunk 2\n"
     head += "".join(f"property float {end}_{axis}\n" for end in ("min", "max") for axis in "xyz")
     head += "element vertex 420\n"
     head += "".join(f"property uint packed_{name}\n" for name in ("position", "rotation", "scale", "color"))
@@ -408,7 +408,7 @@ def test_compressed_splats_in_a_ply_are_unpacked(tmp_path):
     rows = np.zeros((420, 4), "<u4")
     rows[:, 0] = share[:, 0] << 21 | share[:, 1] << 11 | share[:, 2]
     rows[:, 3] = PACKED << 8 | 255
-    content = (head + "end_header\n").encode() + np.array([-1] * 3 + [1] * 3, "<f4").tobytes() + rows.tobytes()
+    content = (head + "end_header\n").encode() + np.array(2 * ([-1] * 3 + [1] * 3), "<f4").tobytes() + rows.tobytes()
     cloud = read_cloud(write(tmp_path, "a.ply", content))
     np.testing.assert_allclose(cloud.positions, BALL, atol=1.1e-3)
     np.testing.assert_allclose(cloud.base_color, np.broadcast_to(LINEAR, (420, 3)), atol=2e-3)

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from support.pcd_files import COLORS, ENCODINGS, compress, content, points
 
 from spnr_jax.formats.clouds import read_cloud
-from spnr_jax.formats.mesh.colors import unpack
+from spnr_jax.formats.mesh.file_colors import unpack
 from spnr_jax.formats.pcd import decompress
 from spnr_jax.formats.point_files import read_columns
 from spnr_jax.kernels.colors import srgb_to_linear

@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 
 from spnr_jax.formats.mesh.assets import Asset, Part, RejectedAsset, TransparentParts
-from spnr_jax.formats.mesh.colors import LINEAR, SRGB
 from spnr_jax.formats.mesh.draco import DRACO, decode_mesh
+from spnr_jax.formats.mesh.file_colors import LINEAR, SRGB
 from spnr_jax.formats.mesh.gltf_container import MESHOPT, GltfFile, scaled
 from spnr_jax.formats.mesh.gltf_materials import GltfMaterial, read_material
 from spnr_jax.formats.mesh.gltf_nodes import INSTANCING, drawn_meshes

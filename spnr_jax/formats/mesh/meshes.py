@@ -1,7 +1,7 @@
 """Mesh files as assets: which files a folder holds, and one of them read.
 
 glTF and GLB carry principled materials (gltf.py), OBJ gets them from its MTL (obj.py); PLY, STL and
-OFF (plain.py) have vertex or face colours at most, read as those of points are (colors.py), grey 0.5 otherwise.
+OFF (plain.py) have vertex or face colours at most, read as those of points are (file_colors.py), grey 0.5 otherwise.
 Every reason not to use a file is a RejectedAsset with one line.
 """
 

@@ -1,6 +1,6 @@
 """Wavefront OBJ + MTL as raw assets: geometry through trimesh, materials from the MTL text.
 
-Vertex colours are sRGB, as those of points (colors.py).  Kd is linear (as Blender writes it) and counts only without
+Vertex colours are sRGB, as those of points (file_colors.py).  Kd is linear (as Blender writes it) and counts only without
 map_Kd (sRGB), for most exporters leave a placeholder beside a map; roughness is Pr, else sqrt(2 / (Ns + 2)), else 0.5;
 metallic is Pm, else 0. Transparent: d below 1, map_d, or Tr strictly between 0 and 1 (writers disagree which end of Tr
 is the opaque one); where a picture is wanted (tolerance.py) map_d is a cut-out at a half, and a library or an image
@@ -21,8 +21,8 @@ from trimesh.exchange.obj import load_obj as read_obj_text
 from trimesh.geometry import triangulate_quads
 
 from spnr_jax.formats.mesh.assets import Asset, Material, MissingFile, Part, RejectedAsset, TransparentParts, Wrap
-from spnr_jax.formats.mesh.colors import linear_colors
 from spnr_jax.formats.mesh.companions import read_companion
+from spnr_jax.formats.mesh.file_colors import linear_colors
 from spnr_jax.formats.mesh.polygons import MOST_CORNERS, ears, is_concave
 from spnr_jax.formats.mesh.texels import color_texels, read_image, value_texels
 from spnr_jax.formats.mesh.tolerance import MOSTLY_OPAQUE, Alpha, Opacity, Tolerance
@@ -110,7 +110,8 @@ def obj_points(path: Path) -> dict[str, np.ndarray] | None:
 
 def _text(path: Path) -> str:
     """The text of a file, without blanks before keywords, which trimesh looks for at the line's start."""
-    return re.sub(r"(?m)^ +", "", path.read_text("utf-8", errors="replace").replace("\t", " "))
+    text = path.read_text("utf-8", errors="replace").replace("\t", " ").replace("\\\n", " ")
+    return re.sub(r"(?m)^ +", "", text)
 
 
 def _vertices(text: str) -> np.ndarray:

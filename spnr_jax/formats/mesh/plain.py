@@ -16,7 +16,7 @@ from trimesh.exchange.stl import load_stl_ascii
 from trimesh.geometry import triangulate_quads
 
 from spnr_jax.formats.mesh.assets import Asset, Part, RejectedAsset
-from spnr_jax.formats.mesh.colors import PACKED, SRGB, colors_of
+from spnr_jax.formats.mesh.file_colors import PACKED, SRGB, colors_of
 from spnr_jax.formats.mesh.obj import principled
 from spnr_jax.formats.mesh.polygons import triangulate
 

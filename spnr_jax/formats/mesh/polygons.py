@@ -8,7 +8,7 @@ MOST_CORNERS = 4096  # of a polygon whose ears are looked for; a larger one beco
 Corners = Sequence[int] | np.ndarray
 
 
-def triangulate(positions: np.ndarray, polygons: Sequence[Corners]) -> tuple[np.ndarray, np.ndarray]:
+def triangulate(positions: np.ndarray, polygons: Sequence[Corners] | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Faces (f, 3) of polygons, vertex numbers each, in their order, and which polygon each face is of."""
     sizes = np.array([len(polygon) for polygon in polygons], np.int64)
     faces, owners = [], []

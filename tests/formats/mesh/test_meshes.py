@@ -86,12 +86,12 @@ class TestPlainFormats:
         header = f"ply\nformat ascii 1.0\nelement vertex {len(rows)}\n{properties}\n{faces[0]}\nend_header\n"
         return write(tmp_path / "a.ply", header + "\n".join([*rows, *faces[1:], ""]))
 
-    def test_eight_bit_vertex_colours_are_srgb_and_float_ones_linear(self, tmp_path):
+    def test_vertex_colours_are_srgb_whatever_their_type(self, tmp_path):
         faces = ["element face 1\nproperty list uchar int vertex_indices", "3 0 1 2"]
         corners = ["0 0 0", "1 0 0", "0 1 0"]
         for kind, color, expected in (
             ("uchar", "255 128 0", [1, srgb_to_linear(np.array(128 / 255)), 0]),
-            ("float", "1 0.5 0", [1, 0.5, 0]),
+            ("float", "1 0.5 0", [1, srgb_to_linear(np.array(0.5)), 0]),
         ):
             channels = "\n".join(f"property {kind} {name}" for name in ("red", "green", "blue"))
             properties = "property float x\nproperty float y\nproperty float z\n" + channels
