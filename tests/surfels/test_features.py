@@ -83,7 +83,7 @@ def test_the_last_number_says_whether_materials_are_guessed_and_no_other_does(sh
     known = estimate(positions, color, plain, plain)
     said = estimate(positions, color, plain, plain, materials_known=np.full(len(positions), 1 - share, np.float32))
     (buffer, one, _), (_, other, _) = (drawn(found, light_of(sky()), camera(24, VIEW)) for found in (known, said))
-    close(one[..., :-1], other[..., :-1])
+    close(one[..., :-1], other[..., :-1], rtol=1e-3, atol=1e-4)  # two programs round differently
     assert np.all(np.asarray(one)[..., -1] == 0)
     inside = np.asarray(buffer.opacity) > 0.9
     close(
