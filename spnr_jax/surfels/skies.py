@@ -51,7 +51,7 @@ def lamp(azimuth: Angle, elevation: Angle, size: Angle, irradiance: Color, heigh
     ramp = xp.clip((1.125 - angle / radius) * 4, 0, 1)
     disc = ramp * ramp * (3 - 2 * ramp)
     held = xp.sum(disc * xp.maximum(xp.cos(angle), 0) * solid_angles(height))
-    return (disc[..., None] * xp.asarray(irradiance) / held).astype(np.float32)
+    return (disc[..., None] * xp.asarray(irradiance)[None, None] / held).astype(np.float32)
 
 
 def studio(height: int = HEIGHT) -> Map:

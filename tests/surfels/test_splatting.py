@@ -148,7 +148,7 @@ class TestEntries:
         assert set(drawn) == set(np.flatnonzero(covered[:12]))
 
     def test_numbers_that_int32_does_not_hold_do_not_wrap(self):
-        found, view = layer(500), camera(2100, eye=(0.0, 0.0, 0.06))
+        found, view = layer(500), camera(16000, eye=(0.0, 0.0, 0.06))
         assert np.int64(projection.footprints(found, view).covered).sum() > 2**31
         assert int(make_entries(found, view, room=2**12)[1]) == projection.MOST
 
