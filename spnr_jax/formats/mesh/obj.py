@@ -1,11 +1,11 @@
 """Wavefront OBJ + MTL as raw assets: geometry through trimesh, materials from the MTL text.
 
-Vertex colours are sRGB, as those of points (file_colors.py).  Kd is linear (as Blender writes it) and counts only
+Vertex colours are sRGB, as those of points (file_colors.py). Kd is linear (as Blender writes it) and counts only
 without map_Kd (sRGB), for most exporters leave a placeholder beside a map; roughness is Pr, else sqrt(2 / (Ns + 2)),
-else 0.5; metallic is Pm, else 0. Transparent: d below 1, map_d, or Tr strictly between 0 and 1 (writers disagree which end of Tr
-is the opaque one); where a picture is wanted (tolerance.py) map_d is a cut-out at a half, and a library or an image
-that is missing leaves grey. Of faces with the same three corners, in either order, one is kept, that of the material
-used first: ShapeNet has many, one for each side, and a ray could not tell which it hits.
+else 0.5; metallic is Pm, else 0. Transparent: d below 1, map_d, or Tr strictly between 0 and 1 (writers disagree
+which end of Tr is the opaque one); where a picture is wanted (tolerance.py) map_d is a cut-out at a half, and a
+library or an image that is missing leaves grey. Of faces with the same three corners, in either order, one is kept,
+that of the material used first: ShapeNet has many, one for each side, and a ray could not tell which it hits.
 """
 
 import io
