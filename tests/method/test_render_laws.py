@@ -163,7 +163,11 @@ def moved(way, t, scene, seen, light):
             light,
         )
     if way == "light":
-        return scene, seen, dataclasses.replace(light, tables=light.tables * (1 + t * numbers(3, *light.tables.shape)))
+        return (
+            scene,
+            seen,
+            dataclasses.replace(light, tables=light.tables * (1 + t * np.float64(numbers(3, *light.tables.shape)))),
+        )
     if way == "all points together":
         return scene.replace(centre=scene.centre + t * along[0]), seen, light
     if way == "size":
