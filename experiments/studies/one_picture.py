@@ -26,6 +26,7 @@ from spnr_jax.surfels.surfel_scenes import QUICK, fit_box
 
 FIELD_OF_VIEW, DISTANCE = np.deg2rad(40.0), 3.0
 SMOOTHEST = 0.05  # the least roughness
+ROOM = 1.25  # of what the true pictures need, for what moves
 DIFFERENCE = 1e-6  # of central differences in float64
 ADAM = optax.scale_by_adam()
 
@@ -80,8 +81,8 @@ def make_plan(params: dict, truths: Sequence[Truth]) -> Plan:
     plan = spnr_jax.plan(scenes, stack([truth.camera for truth in truths]))
     most = -(-(truths[0].camera.width + surfel_renderer.MARGIN) // surfel_renderer.STEP) * surfel_renderer.STEP
     width, height = (min(n + surfel_renderer.STEP, max(n, most)) for n in (plan.width, plan.height))
-    slots = min(2 * plan.slots, width * height)
-    return plan._replace(width=width, height=height, entries=2 * plan.entries, slots=slots, solid=False)
+    entries, slots = int(ROOM * plan.entries), min(int(ROOM * plan.slots), width * height)
+    return plan._replace(width=width, height=height, entries=entries, slots=slots, solid=False)
 
 
 _encode = jax.jit(spnr_jax.encode, compiler_options=QUICK)

@@ -28,7 +28,7 @@ import sys
 from pathlib import Path
 class Blocked:
     def find_spec(self, name, path=None, target=None):
-        if name.split(".")[0] in {"spnr_jax", "flax", "optax", "orbax", "scipy"}:
+        if name.split(".")[0] in {"spnr_jax", "flax", "optax", "orbax"}:
             raise ImportError(name + " is not here")
 sys.meta_path.insert(0, Blocked())
 import jax, numpy as np
