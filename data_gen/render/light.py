@@ -41,7 +41,7 @@ class Lights:
             generator = np.random.default_rng((seed, view, DRAWN_HEIGHT))
             maps = self.kinds[generator.integers(len(self.kinds))]
             drawn = maps[generator.integers(len(maps))] if maps else skies.random_map(generator, DRAWN_HEIGHT)
-            yield skies.normalised(np.roll(drawn, generator.integers(drawn.shape[1]), axis=1), WHITE_SPHERE_RADIANCE)
+            yield skies.normalised(np.roll(drawn, generator.integers(drawn.shape[1]), axis=1), WHITE_SPHERE_RADIANCE)  # type: ignore[misc]
 
 
 def read_kinds(names: Sequence[str]) -> tuple[tuple[np.ndarray, ...], ...]:
@@ -54,7 +54,7 @@ def read_kinds(names: Sequence[str]) -> tuple[tuple[np.ndarray, ...], ...]:
             kinds.append((room.indoor_envmap(DRAWN_HEIGHT),))
         else:
             files = map_files(name)
-            kinds.append(tuple(envmaps.resampled(read_envmap(file), DRAWN_HEIGHT) for file in files))
+            kinds.append(tuple(envmaps.resampled(read_envmap(file), DRAWN_HEIGHT) for file in files))  # type: ignore[misc]
     return tuple(kinds)
 
 

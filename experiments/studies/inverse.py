@@ -81,7 +81,7 @@ def main(options: InverseStudy) -> None:
     truths = [one_picture.place(cloud, i, size) for i, cloud in enumerate(objects.values())]
     plan, tables, truth = one_picture.make_plan(params, truths), jnp.asarray(one_picture.basis()), stack(truths)
     found: dict[str, Any] = {}
-    sheet = []
+    sheet = []  # type: ignore[var-annotated]
     for task in RATES:
         pictures, found[task] = recover(params, truth, tables, plan, task, steps)
         sheet += pictures[1 if sheet else 0 :]
@@ -104,7 +104,7 @@ def read(options: InverseStudy) -> dict[str, PointCloud]:
     dataset = data_sets.open_dataset(options.data or Path())
     items = {name: data_sets.read_object(dataset, name) for name in dataset.splits["test"][: 2 if options.quick else 4]}
     count = 128 if options.quick else options.points
-    return {name: data_sets.first_points(item, count).replace(normals=None) for name, item in items.items()}
+    return {name: data_sets.first_points(item, count).replace(normals=None) for name, item in items.items()}  # type: ignore[attr-defined]
 
 
 def shapes(options: InverseStudy) -> dict[str, PointCloud]:
@@ -118,7 +118,7 @@ def shapes(options: InverseStudy) -> dict[str, PointCloud]:
         "vase": (0.4 + 0.25 * np.sin(2.5 * np.pi * v), height),
         "drop": (0.5 * np.sqrt(1 - height**2) * (1.2 - 0.8 * v), height),
     }
-    clouds = {}
+    clouds = {}  # type: ignore[var-annotated]
     for name, (radius, y) in list(outlines.items())[: 2 if options.quick else 4]:
         positions = np.stack([radius * np.sin(2 * np.pi * u), y, radius * np.cos(2 * np.pi * u)], -1).astype(np.float32)
         color = (0.5 + 0.35 * np.sin(5 * positions + len(clouds) + np.arange(3))).astype(np.float32)
@@ -138,7 +138,7 @@ def begin(task: str, truth: Truth) -> Unknowns:
         even = jnp.zeros((9, 3)).at[0].set(np.sqrt(4 * np.pi) * 0.6)  # a white ball is 0.6 in it
         return wrong._replace(light=even - truth.light)
     if task == "materials":
-        return wrong._replace(base_color=GREY - truth.cloud.base_color, roughness=GREY - truth.cloud.roughness)
+        return wrong._replace(base_color=GREY - truth.cloud.base_color, roughness=GREY - truth.cloud.roughness)  # type: ignore[arg-type]
     if task == "pose":
         turn, shift = (x / np.linalg.norm(x, axis=-1, keepdims=True) for x in random(size=(2, len(truth.light), 3)))
         pose = np.concatenate([2 * np.tan(TURN / 2) * turn, SHIFT * shift], axis=-1)
@@ -210,7 +210,7 @@ def make_tables(found: dict, checks: dict[str, list], costs: dict, names: list[s
     cost = [(name, (number(of["seconds"], 2), number(of["mb"], 0))) for name, of in costs.items()]
     return [
         Table(title="Recovered from one picture", heads=heads, rows=tuple(rows)),
-        Table(title="Gradients beside central differences, % apart", heads=tuple(names), rows=tuple(apart.items())),
+        Table(title="Gradients beside central differences, % apart", heads=tuple(names), rows=tuple(apart.items())),  # type: ignore[arg-type]
         Table(title="Cost of all objects", heads=("CPU seconds", "MB"), rows=tuple(cost)),
     ]
 

@@ -99,8 +99,8 @@ def stack(trees: Sequence[Any]) -> Any:
 def draw(wrong: Unknowns, params: dict, truth: Truth, tables: Array, plan: Plan) -> Rendering:
     """The picture of one object of which this much is wrong."""
     cloud, names = truth.cloud, ("base_color", "roughness", "metallic", "positions")
-    names += () if cloud.normals is None else ("normals",)
-    cloud = cloud.replace(**{name: getattr(cloud, name) + getattr(wrong, name) for name in names})
+    names += () if cloud.normals is None else ("normals",)  # type: ignore[assignment]
+    cloud = cloud.replace(**{name: getattr(cloud, name) + getattr(wrong, name) for name in names})  # type: ignore[attr-defined]
     scene = spnr_jax.encode(params, cloud, truth.neighbors)
     camera = move(truth.camera, wrong.pose, *fit_box(truth.cloud.positions, truth.cloud.mask))
     light = Light(tables=jnp.einsum("bc,bthw->thwc", truth.light + wrong.light, tables))
@@ -113,7 +113,7 @@ def move(camera: Camera, pose: Float[Array, "6"], centre: Float[Array, "3"], sca
     skew = jnp.stack([0 * x, -z, y, z, 0 * x, -x, -y, x, 0 * x]).reshape(3, 3)
     turn = jnp.eye(3) + 2 / (1 + x * x + y * y + z * z) * (skew + skew @ skew)
     eye = centre + turn @ (camera.cam_to_world[:, 3] - centre) + pose[3:] / scale
-    return camera.replace(cam_to_world=jnp.concatenate([turn @ camera.cam_to_world[:, :3], eye[:, None]], axis=1))
+    return camera.replace(cam_to_world=jnp.concatenate([turn @ camera.cam_to_world[:, :3], eye[:, None]], axis=1))  # type: ignore[attr-defined]
 
 
 def loss(
@@ -157,7 +157,7 @@ def compare_gradients(params: dict, truths: Sequence[Truth], tables: Array, plan
     with jax.enable_x64(True):
         for truth in truths:
             normals = _encode(params, truth.cloud, truth.neighbors).surfels.normal
-            given = widen((params, truth._replace(cloud=truth.cloud.replace(normals=normals)), tables))
+            given = widen((params, truth._replace(cloud=truth.cloud.replace(normals=normals)), tables))  # type: ignore[attr-defined]
             random = np.random.default_rng(0).normal
             weights, zero = jnp.asarray(random(size=(truth.camera.height, truth.camera.width, 3))), nothing(given[1])
             _, gradient = _sum_of_pixels(zero, *given, weights, plan)
@@ -186,7 +186,7 @@ def measure(params: dict, truth: Truth, tables: Array, plan: Plan) -> dict[str, 
     """CPU seconds and MB of all pictures, of a step, and of gradients with `jax.checkpoint`."""
     zero, target = nothing(truth), jnp.zeros((len(truth.light), truth.camera.height, truth.camera.width, 3))
     given = zero, ADAM.init(zero), zero, params, truth, target, tables
-    error = lambda *x: loss(*x, plan=plan)[0]  # noqa: E731
+    error = lambda *x: loss(*x, plan=plan)[0]  # type: ignore[misc]  # noqa: E731
 
     def compiled(one: Any) -> Any:
         every = jax.vmap(one, (0, None, 0, 0, None))

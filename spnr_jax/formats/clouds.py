@@ -354,9 +354,9 @@ def _believing(points: Points, report: Report) -> Points:
         return points
     tree = cKDTree(positions)
     black = ~values["base_color"].any(axis=1)
-    if 0.1 < black.mean() < 0.9 and _mixed(tree, black):
+    if 0.1 < black.mean() < 0.9 and _mixed(tree, black):  # type: ignore[arg-type]
         report(
-            f"{int(black.sum()):,} of {len(black):,} points have no colour (0 0 0): that of their neighbours is taken"
+            f"{int(black.sum()):,} of {len(black):,} points have no colour (0 0 0): that of their neighbours is taken"  # type: ignore[arg-type]
         )
         near = cKDTree(positions[~black]).query(positions[black], 3)[1]
         values["base_color"] = values["base_color"].copy()

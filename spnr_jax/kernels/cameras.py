@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from spnr_jax.kernels.numerics import length, normalize, safe_divide
-from spnr_jax.kernels.records import Camera, Rays, Rendering
+from spnr_jax.kernels.records import AnyArray, Camera, Rays, Rendering
 
 # A direction component below this moves a ray by less than a float32 spacing across 10^4 boxes, so it counts as 0; the
 # square of its inverse, which the gradient contains, stays far from overflow.
@@ -118,7 +118,7 @@ def orbit(
     return look_at(centre + distance * direction, centre, up)
 
 
-def in_box(camera: Camera, centre: Float[Array, "3"], scale: Float[Array, ""]) -> Camera:
+def in_box(camera: Camera, centre: Float[AnyArray, "3"], scale: Float[AnyArray, ""]) -> Camera:
     """The camera (any axes of views) in the coordinates of the box."""
     rotation, eye = camera.cam_to_world[..., :3], camera.cam_to_world[..., 3]
     eye = (eye - jnp.broadcast_to(centre, eye.shape)) * scale

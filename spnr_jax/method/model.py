@@ -120,7 +120,7 @@ class Model:
 def _orbit(azimuth, elevation, centre, scale, *, size: int) -> Camera:
     """Square camera of `size` pixels that looks at the centre; angles in degrees."""
     angles = (jnp.deg2rad(jnp.asarray(angle, jnp.float32)) for angle in (azimuth, elevation))
-    return cameras.pinhole(cameras.orbit(*angles, DISTANCE / scale, centre), FIELD_OF_VIEW, size, size)
+    return cameras.pinhole(cameras.orbit(*angles, DISTANCE / scale, centre), FIELD_OF_VIEW, size, size)  # type: ignore[call-arg]
 
 
 def _check_quality(quality: str) -> None:

@@ -43,7 +43,7 @@ def encode_volume(
     variables: dict | None, cloud: PointCloud, centre: np.ndarray, scale: np.floating, *, config: SurfelConfig
 ) -> Volume:
     """Volume of a cloud in the box (unbatched)."""
-    scene = encode_in_box(cloud).replace(centre=jnp.asarray(centre), scale=jnp.asarray(scale))
+    scene = encode_in_box(cloud).replace(centre=jnp.asarray(centre), scale=jnp.asarray(scale))  # type: ignore[attr-defined]
     return Volume(scene=scene, centre=scene.centre, scale=scene.scale, solid=encode_solid(variables, cloud, config))
 
 
@@ -82,7 +82,7 @@ def draw_views(
     volume = encode_volume(variables, cloud, np.zeros(3, np.float32), np.float32(1), config=config)
     views = _unstacked(camera)
     lights = [light] * len(views) if light is None or isinstance(light, Light) else light
-    drawn = draw_each(variables, volume, views, lights, config=config, quality=quality)
+    drawn = draw_each(variables, volume, views, lights, config=config, quality=quality)  # type: ignore[arg-type]
     return jax.tree.map(lambda *x: np.stack(x), *drawn)
 
 

@@ -24,7 +24,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from spnr_jax.kernels.numerics import clamp, root
-from spnr_jax.kernels.records import PointCloud, Surfels
+from spnr_jax.kernels.records import AnyArray, PointCloud, Surfels
 from spnr_jax.surfels import discs, layers, sides
 from spnr_jax.surfels.layers import Hood, Layer, along
 from spnr_jax.surfels.rules import RULES, Rules
@@ -49,7 +49,7 @@ def estimate_surfels(cloud: PointCloud, neighbors: Int[Array, "points 20"], rule
     """
     mask = jnp.asarray(cloud.mask)
 
-    def columns(values: Array) -> Array:
+    def columns(values: AnyArray) -> Array:
         return layers.select(mask, jnp.asarray(values).T, 0)
 
     points = Points(
@@ -244,9 +244,9 @@ def describe(
         ends = discs.find_farthest(jnp.where(there[:, None], place, 0)) + rules.beyond
         cuts = discs.find_cuts(hood, axes, spacing, sided, normals, sides[:, 0], rules)
         rim, reach = discs.find_rims(ends, cuts, axes, rules)
-        colors = discs.fit_colors(place, weight, spacing, axes, colors, rules)
+        colors = discs.fit_colors(place, weight, spacing, axes, colors, rules)  # type: ignore[assignment]
         own = layers.weigh_near(hood, raw, rules) * layers.weigh_height(layer)
-        fields = colors._asdict() | {
+        fields = colors._asdict() | {  # type: ignore[attr-defined]
             "spacing": spacing,
             "shape": measure_shape(layers.measure_covariance(hood, raw, own)),
             "rim": rim,

@@ -105,7 +105,7 @@ def look_up(tables: Float[Array, "rows 3"], towards: list[Array], first: Array |
     corners = [
         (rows[i] + texels[j], (down if i else 1 - down) * (right if j else 1 - right)) for i in (0, 1) for j in (0, 1)
     ]
-    return [sum(weight * channel[index] for index, weight in corners) for channel in columns(jnp.asarray(tables))]
+    return [sum(weight * channel[index] for index, weight in corners) for channel in columns(jnp.asarray(tables))]  # type: ignore[misc]
 
 
 def irradiance(light: Light, normal: list[Array]) -> list[Array]:

@@ -60,7 +60,7 @@ def outward_normals(
     number[:, : near.shape[1]] = near
     color = np.asarray(base_color[voters], np.float32)
     normal = np.asarray(planes(positions[voters], positions, noise), np.float32)
-    points = Points(columns(number, -1), np.arange(size) < len(order), columns(places[order]), columns(color[order]))
+    points = Points(columns(number, -1), np.arange(size) < len(order), columns(places[order]), columns(color[order]))  # type: ignore[arg-type]
     found = np.empty_like(places)
     found[order] = np.asarray(_turn(points, columns(normal[order])))[:, : len(order)].T
     return found[: len(kept)]

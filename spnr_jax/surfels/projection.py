@@ -110,7 +110,7 @@ def footprints(surfels: Surfels, camera: Camera | View) -> Footprints:
     row = -camera.intrinsics[1, 1] * y / ahead + camera.intrinsics[1, 2]
     radius = RADIUS * jnp.asarray(surfels.spacing)
     known = jax.lax.stop_gradient((camera.intrinsics, (x, y, z), normal, radius, (column, row)))
-    left, top, width, height = _rectangles(*known, (camera.width, camera.height))
+    left, top, width, height = _rectangles(*known, (camera.width, camera.height))  # type: ignore[arg-type]
     drawn = surfels.mask & (facing > 0) & (-z > NEAREST)
     return Footprints(
         centre=(x, y, z),

@@ -104,7 +104,7 @@ def project_largest(matrix: Float[Array, "3 3 points"]) -> Float[Array, "3 3 poi
     """
 
     def square(_: Array, power: Array) -> Array:
-        power = sum(power[:, i][:, None] * power[i][None] for i in range(3))
+        power = sum(power[:, i][:, None] * power[i][None] for i in range(3))  # type: ignore[assignment]
         return power / (power[0, 0] + power[1, 1] + power[2, 2])[None, None]
 
     scaled = matrix / (matrix[0, 0] + matrix[1, 1] + matrix[2, 2])[None, None]

@@ -31,11 +31,11 @@ def encode(params: Any, cloud: PointCloud, neighbors: Int[AnyArray, "points 20"]
     del params
     centre, scale = fit_box(jnp.asarray(cloud.positions), jnp.asarray(cloud.mask))
     inside = clamp((jnp.asarray(cloud.positions) - centre[None]) * scale, -1, 1)
-    return _make_scene(cloud.replace(positions=inside), neighbors, centre, scale, RULES)
+    return _make_scene(cloud.replace(positions=inside), neighbors, centre, scale, RULES)  # type: ignore[attr-defined]
 
 
 def fit_box(
-    positions: Float[Array, "points 3"], mask: Bool[Array, " points"]
+    positions: Float[AnyArray, "points 3"], mask: Bool[AnyArray, " points"]
 ) -> tuple[Float[Array, "3"], Float[Array, ""]]:
     """Centre and scale: (positions - centre) * scale has its bounding box around 0, with half diagonal 1.
 

@@ -67,7 +67,7 @@ def make_plan(model: Model, num_points: int, size: int) -> Plan:
     mask = np.ones(num_points, bool)
     cloud = PointCloud(positions=ball, base_color=grey[:, None].repeat(3, 1), roughness=grey, metallic=grey, mask=mask)
     scene = surfel_scenes.encode_in_box(cloud)
-    volume = scene.replace(centre=jnp.zeros(3), scale=jnp.ones(()))
+    volume = scene.replace(centre=jnp.zeros(3), scale=jnp.ones(()))  # type: ignore[attr-defined]
     camera = model.camera(volume, resolution=size)
     made = surfel_renderer.plan(volume, camera)
     whole = -(-size * made.side // 2**made.doublings) + surfel_renderer.MARGIN

@@ -126,11 +126,11 @@ def draw(model: Model, state: State, moving: bool) -> tuple[State, np.ndarray | 
         return state, np.full((2, 2, 3), 255, np.uint8)
     quality, size = ("draft", named["draft"][1] // 2) if moving else named[state.quality]
     behind = state.lighting.background
-    reach = square_reach(state.view, whole=behind != "white")
-    camera = square_camera(state.view, state.volume, reach, size)
-    rendering = model.render(state.volume, camera, quality, state.light)
+    reach = square_reach(state.view, whole=behind != "white")  # type: ignore[arg-type]
+    camera = square_camera(state.view, state.volume, reach, size)  # type: ignore[arg-type]
+    rendering = model.render(state.volume, camera, quality, state.light)  # type: ignore[arg-type]
     square = images.to_uint8(before(behind, rendering, camera, state.light).image)
-    return state, fill(square, state.view, reach, MOVING_LONGEST if moving else LONGEST)
+    return state, fill(square, state.view, reach, MOVING_LONGEST if moving else LONGEST)  # type: ignore[arg-type]
 
 
 def read_view(wxyz: Any, position: Any, field_of_view: Any, width: Any, height: Any) -> View | None:

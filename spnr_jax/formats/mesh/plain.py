@@ -88,7 +88,7 @@ def load_stl(data: bytes) -> Asset:
         raise RejectedAsset(f"is cut off: its header announces {announced} triangles, {held} are there")
     count = announced or held
     if count != announced:
-        notes = (f"the header announces {announced} triangles, {held} stand behind it: these are drawn",)
+        notes = (f"the header announces {announced} triangles, {held} stand behind it: these are drawn",)  # type: ignore[assignment]
     rows = np.frombuffer(data, STL_TRIANGLE, count, STL_HEAD)
     positions = rows["corners"].reshape(-1, 3).astype(np.float64)
     ignored = ("STL attribute bytes",) if rows["attribute"].any() else ()
