@@ -221,7 +221,7 @@ def test_train_evaluate_and_render_write_a_run_its_scores_and_a_picture_of_the_n
     for path in (run / "checkpoints" / "6").rglob("*"):
         if path.is_file():
             path.write_bytes(b"")
-    (tmp_path / "one.xyz").write_text("1 2 3\n")
+    (tmp_path / "one.xyz").write_text("0 0 0\n1 0 0\n0 1 0\n0 0 1\n")
     arguments = ("--run", run, "--out", tmp_path, "--views", 1, "--turntable", "none", "--resolution", 24)
     assert exit_code("render", tmp_path / "one.xyz", *arguments) == 0
     captured = capsys.readouterr()
