@@ -273,7 +273,7 @@ class TestConfig:
         ("changes", "message"),
         [
             ({"crop": 25}, "crop 25 needs .* at most its image_resolution \\(24\\)"),
-            ({"crop": -1}, "crop must be at least 0, got -1"),
+            ({"crop": -1}, "crop must be a whole number, at least 0, got -1"),
             ({"pixel_stride": 2, "crop": 0}, "pixel_stride 2 needs a network whose pixels do not depend"),
         ],
     )
