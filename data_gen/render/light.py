@@ -41,7 +41,8 @@ class Lights:
             generator = np.random.default_rng((seed, view, DRAWN_HEIGHT))
             maps = self.kinds[generator.integers(len(self.kinds))]
             drawn = maps[generator.integers(len(maps))] if maps else skies.random_map(generator, DRAWN_HEIGHT)
-            yield skies.normalised(np.roll(drawn, generator.integers(drawn.shape[1]), axis=1), WHITE_SPHERE_RADIANCE)  # type: ignore[misc]
+            turned = np.roll(drawn, generator.integers(drawn.shape[1]), axis=1)
+            yield np.asarray(skies.normalised(turned, WHITE_SPHERE_RADIANCE))
 
 
 def read_kinds(names: Sequence[str]) -> tuple[tuple[np.ndarray, ...], ...]:
@@ -54,7 +55,7 @@ def read_kinds(names: Sequence[str]) -> tuple[tuple[np.ndarray, ...], ...]:
             kinds.append((room.indoor_envmap(DRAWN_HEIGHT),))
         else:
             files = map_files(name)
-            kinds.append(tuple(envmaps.resampled(read_envmap(file), DRAWN_HEIGHT) for file in files))  # type: ignore[misc]
+            kinds.append(tuple(np.asarray(envmaps.resampled(read_envmap(file), DRAWN_HEIGHT)) for file in files))
     return tuple(kinds)
 
 

@@ -18,6 +18,7 @@ the points that the picture shows.  One compiled step does it all: what differs 
     OUT/losses.png              mean squared error over the steps
 """
 
+import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -81,7 +82,7 @@ def main(options: InverseStudy) -> None:
     truths = [one_picture.place(cloud, i, size) for i, cloud in enumerate(objects.values())]
     plan, tables, truth = one_picture.make_plan(params, truths), jnp.asarray(one_picture.basis()), stack(truths)
     found: dict[str, Any] = {}
-    sheet = []  # type: ignore[var-annotated]
+    sheet: list = []
     for task in RATES:
         pictures, found[task] = recover(params, truth, tables, plan, task, steps)
         sheet += pictures[1 if sheet else 0 :]
@@ -104,7 +105,8 @@ def read(options: InverseStudy) -> dict[str, PointCloud]:
     dataset = data_sets.open_dataset(options.data or Path())
     items = {name: data_sets.read_object(dataset, name) for name in dataset.splits["test"][: 2 if options.quick else 4]}
     count = 128 if options.quick else options.points
-    return {name: data_sets.first_points(item, count).replace(normals=None) for name, item in items.items()}  # type: ignore[attr-defined]
+    clouds = {name: data_sets.first_points(item, count) for name, item in items.items()}
+    return {name: dataclasses.replace(cloud, normals=None) for name, cloud in clouds.items()}
 
 
 def shapes(options: InverseStudy) -> dict[str, PointCloud]:
@@ -118,7 +120,7 @@ def shapes(options: InverseStudy) -> dict[str, PointCloud]:
         "vase": (0.4 + 0.25 * np.sin(2.5 * np.pi * v), height),
         "drop": (0.5 * np.sqrt(1 - height**2) * (1.2 - 0.8 * v), height),
     }
-    clouds = {}  # type: ignore[var-annotated]
+    clouds: dict[str, PointCloud] = {}
     for name, (radius, y) in list(outlines.items())[: 2 if options.quick else 4]:
         positions = np.stack([radius * np.sin(2 * np.pi * u), y, radius * np.cos(2 * np.pi * u)], -1).astype(np.float32)
         color = (0.5 + 0.35 * np.sin(5 * positions + len(clouds) + np.arange(3))).astype(np.float32)
@@ -138,7 +140,8 @@ def begin(task: str, truth: Truth) -> Unknowns:
         even = jnp.zeros((9, 3)).at[0].set(np.sqrt(4 * np.pi) * 0.6)  # a white ball is 0.6 in it
         return wrong._replace(light=even - truth.light)
     if task == "materials":
-        return wrong._replace(base_color=GREY - truth.cloud.base_color, roughness=GREY - truth.cloud.roughness)  # type: ignore[arg-type]
+        color, roughness = map(jnp.asarray, (truth.cloud.base_color, truth.cloud.roughness))
+        return wrong._replace(base_color=GREY - color, roughness=GREY - roughness)
     if task == "pose":
         turn, shift = (x / np.linalg.norm(x, axis=-1, keepdims=True) for x in random(size=(2, len(truth.light), 3)))
         pose = np.concatenate([2 * np.tan(TURN / 2) * turn, SHIFT * shift], axis=-1)
@@ -206,11 +209,11 @@ def make_tables(found: dict, checks: dict[str, list], costs: dict, names: list[s
             ends = [number(float(np.mean(errors[name])), 3) for errors in of["errors"]]
             rows.append((name, (*ends, *psnr, number(of["seconds"], 2))))
     heads = ("error before", "after", "PSNR before, dB", "after", "CPU seconds a step of all objects")
-    apart = {name: [number(100 * abs(g / d - 1), 4) for g, d in pairs] for name, pairs in checks.items()}
+    apart = {name: tuple(number(100 * abs(g / d - 1), 4) for g, d in pairs) for name, pairs in checks.items()}
     cost = [(name, (number(of["seconds"], 2), number(of["mb"], 0))) for name, of in costs.items()]
     return [
         Table(title="Recovered from one picture", heads=heads, rows=tuple(rows)),
-        Table(title="Gradients beside central differences, % apart", heads=tuple(names), rows=tuple(apart.items())),  # type: ignore[arg-type]
+        Table(title="Gradients beside central differences, % apart", heads=tuple(names), rows=tuple(apart.items())),
         Table(title="Cost of all objects", heads=("CPU seconds", "MB"), rows=tuple(cost)),
     ]
 

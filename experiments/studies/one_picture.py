@@ -4,6 +4,7 @@
 a target picture.  `compare_gradients` and `measure` say whether gradients are right, and what they cost.
 """
 
+import dataclasses
 from collections.abc import Sequence
 from functools import partial
 from typing import Any, NamedTuple
@@ -16,15 +17,16 @@ from jaxtyping import Array, Float, Int
 
 import spnr_jax
 from experiments.comparison import clock
+from spnr_jax.devices.compilation import QUICKEST
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.records import Camera, Light, PointCloud, Rendering
 from spnr_jax.method import surfel_renderer
+from spnr_jax.method.model import DISTANCE, FIELD_OF_VIEW
 from spnr_jax.method.surfel_renderer import Plan
 from spnr_jax.surfels import lighting
 from spnr_jax.surfels.envmaps import directions, solid_angles
-from spnr_jax.surfels.surfel_scenes import QUICK, fit_box
+from spnr_jax.surfels.surfel_scenes import fit_box
 
-FIELD_OF_VIEW, DISTANCE = np.deg2rad(40.0), 3.0
 SMOOTHEST = 0.05  # the least roughness
 ROOM = 1.25  # of what the true pictures need, for what moves
 DIFFERENCE = 1e-6  # of central differences in float64
@@ -79,13 +81,13 @@ def make_plan(params: dict, truths: Sequence[Truth]) -> Plan:
     """Sizes for all objects, with room for what moves."""
     scenes = stack([_encode(params, truth.cloud, truth.neighbors) for truth in truths])
     plan = spnr_jax.plan(scenes, stack([truth.camera for truth in truths]))
-    most = -(-(truths[0].camera.width + surfel_renderer.MARGIN) // surfel_renderer.STEP) * surfel_renderer.STEP
+    most = surfel_renderer.round_up(truths[0].camera.width + surfel_renderer.MARGIN)
     width, height = (min(n + surfel_renderer.STEP, max(n, most)) for n in (plan.width, plan.height))
     entries, slots = int(ROOM * plan.entries), min(int(ROOM * plan.slots), width * height)
     return plan._replace(width=width, height=height, entries=entries, slots=slots, solid=False)
 
 
-_encode = jax.jit(spnr_jax.encode, compiler_options=QUICK)
+_encode = jax.jit(spnr_jax.encode, compiler_options=QUICKEST)
 
 
 def stack(trees: Sequence[Any]) -> Any:
@@ -98,9 +100,9 @@ def stack(trees: Sequence[Any]) -> Any:
 
 def draw(wrong: Unknowns, params: dict, truth: Truth, tables: Array, plan: Plan) -> Rendering:
     """The picture of one object of which this much is wrong."""
-    cloud, names = truth.cloud, ("base_color", "roughness", "metallic", "positions")
-    names += () if cloud.normals is None else ("normals",)  # type: ignore[assignment]
-    cloud = cloud.replace(**{name: getattr(cloud, name) + getattr(wrong, name) for name in names})  # type: ignore[attr-defined]
+    cloud, names = truth.cloud, ["base_color", "roughness", "metallic", "positions"]
+    names += [] if cloud.normals is None else ["normals"]
+    cloud = dataclasses.replace(cloud, **{name: getattr(cloud, name) + getattr(wrong, name) for name in names})
     scene = spnr_jax.encode(params, cloud, truth.neighbors)
     camera = move(truth.camera, wrong.pose, *fit_box(truth.cloud.positions, truth.cloud.mask))
     light = Light(tables=jnp.einsum("bc,bthw->thwc", truth.light + wrong.light, tables))
@@ -113,7 +115,8 @@ def move(camera: Camera, pose: Float[Array, "6"], centre: Float[Array, "3"], sca
     skew = jnp.stack([0 * x, -z, y, z, 0 * x, -x, -y, x, 0 * x]).reshape(3, 3)
     turn = jnp.eye(3) + 2 / (1 + x * x + y * y + z * z) * (skew + skew @ skew)
     eye = centre + turn @ (camera.cam_to_world[:, 3] - centre) + pose[3:] / scale
-    return camera.replace(cam_to_world=jnp.concatenate([turn @ camera.cam_to_world[:, :3], eye[:, None]], axis=1))  # type: ignore[attr-defined]
+    pose = jnp.concatenate([turn @ camera.cam_to_world[:, :3], eye[:, None]], axis=1)
+    return dataclasses.replace(camera, cam_to_world=pose)
 
 
 def loss(
@@ -124,7 +127,7 @@ def loss(
     return jnp.mean((drawn.image - target) ** 2), drawn
 
 
-@partial(jax.jit, static_argnames="plan", compiler_options=QUICK)
+@partial(jax.jit, static_argnames="plan", compiler_options=QUICKEST)
 def step(
     wrong: Unknowns, state: Any, rates: Unknowns, params: dict, truth: Truth, target: Array, tables: Array, plan: Plan
 ) -> tuple[Unknowns, Any, Array, Rendering, Unknowns]:
@@ -157,7 +160,7 @@ def compare_gradients(params: dict, truths: Sequence[Truth], tables: Array, plan
     with jax.enable_x64(True):
         for truth in truths:
             normals = _encode(params, truth.cloud, truth.neighbors).surfels.normal
-            given = widen((params, truth._replace(cloud=truth.cloud.replace(normals=normals)), tables))  # type: ignore[attr-defined]
+            given = widen((params, truth._replace(cloud=dataclasses.replace(truth.cloud, normals=normals)), tables))
             random = np.random.default_rng(0).normal
             weights, zero = jnp.asarray(random(size=(truth.camera.height, truth.camera.width, 3))), nothing(given[1])
             _, gradient = _sum_of_pixels(zero, *given, weights, plan)
@@ -171,7 +174,7 @@ def compare_gradients(params: dict, truths: Sequence[Truth], tables: Array, plan
     return rows
 
 
-@partial(jax.jit, static_argnames="plan", compiler_options=QUICK)
+@partial(jax.jit, static_argnames="plan", compiler_options=QUICKEST)
 @jax.value_and_grad
 def _sum_of_pixels(wrong: Unknowns, params: dict, truth: Truth, tables: Array, weights: Array, plan: Plan) -> Array:
     return jnp.sum(weights * draw(wrong, params, truth, tables, plan).image)
@@ -186,11 +189,15 @@ def measure(params: dict, truth: Truth, tables: Array, plan: Plan) -> dict[str, 
     """CPU seconds and MB of all pictures, of a step, and of gradients with `jax.checkpoint`."""
     zero, target = nothing(truth), jnp.zeros((len(truth.light), truth.camera.height, truth.camera.width, 3))
     given = zero, ADAM.init(zero), zero, params, truth, target, tables
-    error = lambda *x: loss(*x, plan=plan)[0]  # type: ignore[misc]  # noqa: E731
+    planned = partial(loss, plan=plan)
+
+    def error(*given: Any) -> Array:
+        return planned(*given)[0]
 
     def compiled(one: Any) -> Any:
         every = jax.vmap(one, (0, None, 0, 0, None))
-        return jax.jit(lambda wrong, _state, _rates, *rest: every(wrong, *rest), compiler_options=QUICK).lower(*given)
+        whole = jax.jit(lambda wrong, _state, _rates, *rest: every(wrong, *rest), compiler_options=QUICKEST)
+        return whole.lower(*given)
 
     made = {"pictures": compiled(error), "a step": step.lower(*given, plan=plan)}
     made["gradients, checkpointed"] = compiled(jax.grad(jax.checkpoint(error)))

@@ -353,10 +353,10 @@ def _believing(points: Points, report: Report) -> Points:
     if len(positions) < LEAST_POINTS:
         return points
     tree = cKDTree(positions)
-    black = ~values["base_color"].any(axis=1)
-    if 0.1 < black.mean() < 0.9 and _mixed(tree, black):  # type: ignore[arg-type]
+    black = np.asarray(~values["base_color"].any(axis=1))
+    if 0.1 < black.mean() < 0.9 and _mixed(tree, black):
         report(
-            f"{int(black.sum()):,} of {len(black):,} points have no colour (0 0 0): that of their neighbours is taken"  # type: ignore[arg-type]
+            f"{int(black.sum()):,} of {len(black):,} points have no colour (0 0 0): that of their neighbours is taken"
         )
         near = cKDTree(positions[~black]).query(positions[black], 3)[1]
         values["base_color"] = values["base_color"].copy()

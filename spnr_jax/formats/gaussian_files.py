@@ -19,14 +19,14 @@ from jaxtyping import Float
 
 from spnr_jax.errors import UserError
 from spnr_jax.formats.images import check_place, write_whole
+from spnr_jax.formats.splat_files import COLOR_STEP, MAGIC
 from spnr_jax.gaussians.harmonics import degree_of, half_turn_signs
 from spnr_jax.kernels.records import Gaussians
 
 SUFFIXES = (".ply", ".spz")
 LEAST_OPACITY, MOST_OPACITY = 1e-4, 1 - 1e-4  # that the logistic function is inverted for
-MAGIC, VERSION, ANTIALIASED = 0x5053474E, 3, 1  # of .spz; the last is a flag
+VERSION, ANTIALIASED = 3, 1  # of .spz; the last is a flag
 RENDER_MODE = "SplatRenderMode: mip"  # comment of a .ply: what a viewer widens it makes fainter
-COLOR_STEP = 0.15  # of .spz: 255 steps for 1 / COLOR_STEP of a coefficient
 FRACTION_BITS = 24 - 2  # at most of a place in .spz; fewer where places lie further from the origin than 1
 SCALE_STEP, LEAST_SCALE = 16, -10  # of .spz: steps for each e-fold, logarithm of the smallest
 HARMONIC_BITS = (5, 4)  # of .spz: of the coefficients of degree 1, and above
@@ -91,7 +91,7 @@ def spz_of(gaussians: Gaussians) -> bytes:
     bits = int(np.clip(FRACTION_BITS - np.ceil(np.log2(max(np.abs(position).max(), 1e-6))), 0, 31))
     fixed = np.clip(np.round(position * 2.0**bits), -(2**23), 2**23 - 1).astype("<i4")
     places = fixed.view(np.uint8).reshape(len(position), 3, 4)[..., :3]
-    header = np.array([MAGIC, VERSION, len(position)], "<u4").tobytes()
+    header = MAGIC + np.array([VERSION, len(position)], "<u4").tobytes()
     header += bytes([degree_of(harmonics.shape[1]), bits, ANTIALIASED, 0])
     parts = [
         places,

@@ -47,9 +47,8 @@ MAGIC = (  # first bytes, and the kind that they tell; of kinds with several suf
 )
 BLENDER = "convert it to .glb, e.g. with Blender (File > Import, then File > Export > glTF 2.0)"
 CLOUDCOMPARE = "convert it to .las or .ply, e.g. with CloudCompare (File > Save)"
-FOREIGN: dict[
-    bytes | str, tuple
-] = {  # first bytes or suffix -> what it is, where its version stands (place, length), how to convert it
+# first bytes or suffix -> what it is, where its version stands (place, length), how to convert it
+FOREIGN: dict[bytes | str, tuple] = {
     b"PXR-USDC": ("USD (binary crate)", (8, 3), BLENDER),
     b"#usda": ("USD (text)", (6, 3), BLENDER),
     b"ASTM-E57": ("an E57 scan", (8, 8), CLOUDCOMPARE),

@@ -29,7 +29,7 @@ FEW, ALWAYS = 0.12, 0.5  # views against a splat that do not count: share of tho
 def color(gaussians: Gaussians, views: Sequence[View], *, side: float, degree: int) -> Gaussians:
     """The splats in the colours of the views, of a degree 0 to 3; without those that no view sees."""
     position = np.asarray(gaussians.position)
-    normal = rotations(gaussians.rotation)[:, :, 2]  # type: ignore[arg-type]
+    normal = rotations(np.asarray(gaussians.rotation))[:, :, 2]
     count = coefficients(degree)
     matrix = np.zeros((len(position), count, count), np.float32)
     right = np.zeros((len(position), count, 3), np.float32)

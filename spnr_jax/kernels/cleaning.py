@@ -27,6 +27,7 @@ from scipy.spatial import cKDTree
 
 from spnr_jax.errors import UserError
 from spnr_jax.kernels.records import PointCloud
+from spnr_jax.kernels.repeats import find_distinct
 from spnr_jax.kernels.thinning import voxel_keys
 
 Strength = Literal["auto", "strong"]
@@ -121,7 +122,7 @@ def cleaned(positions: Float[np.ndarray, "points 3"], values: Values, strength: 
 
 def outliers(positions: Float[np.ndarray, "points 3"], strength: Strength = "auto") -> Bool[np.ndarray, " points"]:
     """True for points that are much farther from their neighbours than these from theirs."""
-    distinct, copies = _distinct(positions)
+    distinct, copies = find_distinct(positions)
     left = np.arange(len(distinct))
     if len(left) >= LEAST_POINTS:
         tree = cKDTree(distinct)
@@ -137,17 +138,6 @@ def outliers(positions: Float[np.ndarray, "points 3"], strength: Strength = "aut
     removed = np.ones(len(distinct), bool)
     removed[left] = False
     return removed[copies]
-
-
-def _distinct(positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Positions (n, 3) without repetitions, sorted, which also keeps neighbours close in memory; the row of each."""
-    order = np.lexsort(positions.T)
-    ranked = positions[order]
-    new = np.ones(len(ranked), bool)
-    new[1:] = (ranked[1:] != ranked[:-1]).any(axis=1)
-    rows = np.empty(len(ranked), np.int64)
-    rows[order] = np.cumsum(new) - 1
-    return ranked[new], rows
 
 
 def _without(
@@ -196,7 +186,7 @@ def noise(positions: Float[np.ndarray, "points 3"]) -> tuple[float, float]:
 
     From LEAST_DENSE points on they can be told from curvature.  In the units of the positions.
     """
-    distinct, _ = _distinct(positions)
+    distinct, _ = find_distinct(positions)
     if len(distinct) < LEAST_DENSE:
         return 0.0, 0.0
     tree = cKDTree(distinct)

@@ -5,7 +5,7 @@ written out several times does not hide it.
 """
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
@@ -41,13 +41,7 @@ def merge_repeats(positions: Float[np.ndarray, "points 3"], values: Values) -> t
 
 def _labels(positions: np.ndarray) -> np.ndarray:
     """A number (points,) for each place; the same for points that are equal or nearly so."""
-    order = np.lexsort(positions.T)
-    ranked = positions[order]
-    new = np.ones(len(ranked), bool)
-    new[1:] = (ranked[1:] != ranked[:-1]).any(axis=1)
-    rows = np.empty(len(ranked), np.int64)
-    rows[order] = np.cumsum(new) - 1
-    distinct = ranked[new]
+    distinct, rows = find_distinct(positions)
     if len(distinct) < FEW:
         return rows
     tree = cKDTree(distinct)
@@ -56,6 +50,19 @@ def _labels(positions: np.ndarray) -> np.ndarray:
         return rows
     graph = coo_array((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(len(distinct),) * 2)
     return connected_components(graph, directed=False)[1][rows]
+
+
+def find_distinct(
+    positions: Float[np.ndarray, "points 3"],
+) -> tuple[Float[np.ndarray, "places 3"], Int[np.ndarray, " points"]]:
+    """Positions without repetitions, sorted, which also keeps neighbours close in memory; the row of each."""
+    order = np.lexsort(positions.T)
+    ranked = positions[order]
+    new = np.ones(len(ranked), bool)
+    new[1:] = (ranked[1:] != ranked[:-1]).any(axis=1)
+    rows = np.empty(len(ranked), np.int64)
+    rows[order] = np.cumsum(new) - 1
+    return ranked[new], rows
 
 
 def spacing(tree: cKDTree) -> float:

@@ -1,5 +1,7 @@
 """Pictures in other sizes: bilinear, and means over squares of pixels."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -59,7 +61,7 @@ def enlarged(rendering: Rendering, height: int, width: int) -> Rendering:
     """The rendering at a larger size: colours by cubics, depth and opacity between their neighbours."""
     color = jnp.clip(jax.image.resize(rendering.image, (height, width, 3), "cubic"), 0, 1)
     depth, acc = (jax.image.resize(x, (height, width), "linear") for x in (rendering.depth, rendering.acc))
-    return rendering.replace(image=color, image_lr=color, depth=depth, acc=acc)  # type: ignore[attr-defined]
+    return dataclasses.replace(rendering, image=color, image_lr=color, depth=depth, acc=acc)
 
 
 def averaged(rendering: Rendering, side: int) -> Rendering:

@@ -28,6 +28,7 @@ from spnr_jax.config import (
     SamplingConfig,
     SurfelConfig,
 )
+from spnr_jax.devices.compilation import QUICK
 from spnr_jax.errors import UserError
 from spnr_jax.kernels import cameras, cloud_arrays
 from spnr_jax.kernels.records import LARGEST_REACH, Camera, Key, Light, PointCloud, Rendering, Volume
@@ -167,7 +168,7 @@ def draw_each(
 
 
 # this option halves the compilation of the U-Net and costs it no time; rendering would take twice as long
-@partial(jax.jit, static_argnames="config", compiler_options={"xla_cpu_use_fusion_emitters": False})
+@partial(jax.jit, static_argnames="config", compiler_options=QUICK)
 def _encode(variables: dict, cloud: PointCloud, *, config: NetworkConfig) -> Any:
     """What the network makes of a cloud in the box (unbatched)."""
     scene = encode(variables, jax.tree.map(lambda x: x[None], cloud), config=config)

@@ -119,8 +119,8 @@ class Model:
 @partial(jax.jit, static_argnames="size")
 def _orbit(azimuth, elevation, centre, scale, *, size: int) -> Camera:
     """Square camera of `size` pixels that looks at the centre; angles in degrees."""
-    angles = (jnp.deg2rad(jnp.asarray(angle, jnp.float32)) for angle in (azimuth, elevation))
-    return cameras.pinhole(cameras.orbit(*angles, DISTANCE / scale, centre), FIELD_OF_VIEW, size, size)  # type: ignore[call-arg]
+    turn, rise = (jnp.deg2rad(jnp.asarray(angle, jnp.float32)) for angle in (azimuth, elevation))
+    return cameras.pinhole(cameras.orbit(turn, rise, DISTANCE / scale, centre), FIELD_OF_VIEW, size, size)
 
 
 def _check_quality(quality: str) -> None:

@@ -1,6 +1,6 @@
 """How the handle draws with the network over surfels: at a quality, in a light, several views of common sizes.
 
-`surfel_renderer.draw`, compiled as two programs: the first is compiled anew for other numbers of entries and pixels,
+`surfel_renderer.render`, compiled as two programs: the first is compiled anew for other numbers of entries and pixels,
 the second, with most of what takes XLA long, for other windows alone.
 """
 
@@ -15,19 +15,17 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from spnr_jax.config import SurfelConfig
+from spnr_jax.devices.compilation import QUICK, QUICKEST
 from spnr_jax.devices.side_by_side import two_at_a_time
 from spnr_jax.kernels import cameras, cloud_arrays
 from spnr_jax.kernels.records import Camera, Light, PointCloud, Rendering, Scene, SurfelScene, Volume
 from spnr_jax.kernels.resizing import enlarged
 from spnr_jax.method import solid, surfel_renderer
-from spnr_jax.method.surfel_renderer import Plan, Sizes
+from spnr_jax.method.surfel_renderer import Plan, Sizes, unstack
 from spnr_jax.surfels.lighting import room_light
 from spnr_jax.surfels.surfel_scenes import encode_in_box
 
 BALANCED = 0.75  # of the pixels along a side, which are drawn and enlarged: docs/performance.md
-# of XLA, that take a third to two thirds off the compilation; the U-Net and what follows it run as long
-QUICK = {"xla_cpu_use_fusion_emitters": False}
-QUICKEST = QUICK | {"xla_backend_optimization_level": 1}
 
 
 class Asked(NamedTuple):
@@ -43,7 +41,7 @@ def encode_volume(
     variables: dict | None, cloud: PointCloud, centre: np.ndarray, scale: np.floating, *, config: SurfelConfig
 ) -> Volume:
     """Volume of a cloud in the box (unbatched)."""
-    scene = encode_in_box(cloud).replace(centre=jnp.asarray(centre), scale=jnp.asarray(scale))  # type: ignore[attr-defined]
+    scene = dataclasses.replace(encode_in_box(cloud), centre=jnp.asarray(centre), scale=jnp.asarray(scale))
     return Volume(scene=scene, centre=scene.centre, scale=scene.scale, solid=encode_solid(variables, cloud, config))
 
 
@@ -64,9 +62,7 @@ def draw(
     """A view, or one axis of views."""
     if camera.cam_to_world.ndim == 2:
         return next(draw_each(variables, volume, [camera], [light], config=config, quality=quality))
-    views = _unstacked(camera)
-    drawn = draw_each(variables, volume, views, [light] * len(views), config=config, quality=quality)
-    return jax.tree.map(lambda *x: np.stack(x), *drawn)
+    return _draw_axis(variables, volume, camera, [light] * len(camera.cam_to_world), config, quality)
 
 
 def draw_views(
@@ -80,18 +76,25 @@ def draw_views(
 ) -> Rendering:
     """Views (one axis of cameras) of a cloud in the box, in one light or each in its own."""
     volume = encode_volume(variables, cloud, np.zeros(3, np.float32), np.float32(1), config=config)
-    views = _unstacked(camera)
-    lights = [light] * len(views) if light is None or isinstance(light, Light) else light
-    drawn = draw_each(variables, volume, views, lights, config=config, quality=quality)  # type: ignore[arg-type]
+    lights = [light] * len(camera.cam_to_world) if light is None or isinstance(light, Light) else light
+    return _draw_axis(variables, volume, camera, lights, config, quality)
+
+
+def _draw_axis(
+    variables: dict | None,
+    volume: Volume,
+    camera: Camera,
+    lights: Sequence[Light | None],
+    config: SurfelConfig,
+    quality: str,
+) -> Rendering:
+    """Views along one axis of cameras, each in its light."""
+    drawn = draw_each(variables, volume, unstack(camera), lights, config=config, quality=quality)
     return jax.tree.map(lambda *x: np.stack(x), *drawn)
 
 
-def _unstacked(camera: Camera) -> list[Camera]:
-    return [jax.tree.map(lambda x, i=i: x[i], camera) for i in range(len(camera.cam_to_world))]
-
-
 def draw_each(
-    variables: dict,
+    variables: dict | None,
     volume: Volume,
     views: Sequence[Camera],
     lights: Sequence[Light | None],

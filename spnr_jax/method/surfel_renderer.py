@@ -98,15 +98,18 @@ def plan(scene: SurfelScene, camera: Camera) -> Plan:
         camera = jax.tree.map(lambda x: jnp.broadcast_to(x, (*objects, *x.shape)), camera)
         batch = objects
     camera = jax.tree.map(lambda x: jnp.reshape(x, (-1, *x.shape[-2:])), camera)
-    views = [jax.tree.map(lambda x, i=i: x[i], camera) for i in range(len(camera.cam_to_world))]
     each = int(np.prod(batch[len(objects) :], dtype=int))
-    scenes = jax.tree.map(lambda x: x.reshape(-1, *x.shape[len(objects) :]), scene)
-    scenes = [jax.tree.map(lambda x, i=i: x[i], scenes) for i in range(int(np.prod(objects, dtype=int)))]
-    pairs = [(scenes[i // each], view) for i, view in enumerate(views)]
+    scenes = unstack(jax.tree.map(lambda x: x.reshape(-1, *x.shape[len(objects) :]), scene))
+    pairs = [(scenes[i // each], view) for i, view in enumerate(unstack(camera))]
     doublings, side = common_resolution([resolution(*pair) for pair in pairs])
     needed = jax.device_get([count_sizes(*pair, doublings=doublings, side=side) for pair in pairs])
     sparse = all(int(np.sum(of.surfels.mask)) <= solid.MOST_POINTS for of in scenes)
     return rounded(largest(needed), doublings, side, sparse)
+
+
+def unstack(tree: Any) -> list[Any]:
+    """What lies at each place of the first axis of a tree's arrays."""
+    return [jax.tree.map(lambda x, i=i: x[i], tree) for i in range(len(jax.tree.leaves(tree)[0]))]
 
 
 def resolution(scene: SurfelScene, camera: Camera, share: float = 1.0) -> tuple[int, int]:
@@ -182,9 +185,14 @@ def place_window(surfels: Surfels, camera: Camera) -> tuple[Int[Array, "2"], Int
     for first, size in ((foot.left, foot.width), (foot.top, rows)):
         low = jnp.min(jnp.where(drawn, first, 2**20)), jnp.max(jnp.where(drawn, first + size, 0))
         begin = jnp.where(jnp.any(drawn), jnp.maximum(low[0] - MARGIN, 0) // GRID * GRID, 0)
-        sides.append((begin, jnp.maximum(-(-(low[1] + MARGIN - begin) // STEP) * STEP, STEP)))
+        sides.append((begin, jnp.maximum(round_up(low[1] + MARGIN - begin), STEP)))
     (left, width), (top, height) = sides
     return jnp.stack([left, top]), width, height
+
+
+def round_up(pixels: Any) -> Any:
+    """The least multiple of STEP that holds so many pixels."""
+    return -(-pixels // STEP) * STEP
 
 
 def seen_through(camera: Camera, corner: Int[Array, "2"], width: Any, height: Any) -> Camera:

@@ -41,7 +41,7 @@ def attributes(surfels: Surfels, light: Light, camera: Camera) -> Float[Array, "
     cosines = larger(jnp.einsum("pi,di->pd", surfels.normal, DIRECTIONS, precision="highest"), 0)
     openness = jnp.sum(surfels.visible * cosines, axis=1) / larger(jnp.sum(cosines, axis=1), 1e-6)
     bent = 4 / len(DIRECTIONS) * jnp.einsum("pd,di->pi", surfels.visible, DIRECTIONS, precision="highest")
-    view = normalize(eye[None] - surfels.position)  # type: ignore[arg-type]
+    view = normalize(jnp.asarray(eye[None] - surfels.position))
     along = jnp.sum(view * surfels.normal, axis=1, keepdims=True)
     mirror = 2 * jnp.abs(along) * jnp.where(along < 0, -1.0, 1.0) * surfels.normal - view
     lobe = jnp.exp(lighting.LOBE * (jnp.einsum("pi,di->pd", mirror, DIRECTIONS, precision="highest") - 1))
@@ -66,15 +66,15 @@ def features(
     told = (buffer.centres / (buffer.centres + LEAST_CENTRES))[..., None]  # without discs near by the blended one
     color = clamp(blended + told * clamp(buffer.color - blended, -TRUST, TRUST), 0, 1)
     normal, view = _directions(buffer, camera)
-    cosine = -sum(n * v for n, v in zip(normal, view, strict=True))
+    cosine = -reduce(add, (n * v for n, v in zip(normal, view, strict=True)))
     mirror = [v + 2 * cosine * n for n, v in zip(normal, view, strict=True)]
     turned = [_to_world(camera, direction) for direction in (normal, mirror)]
-    factor, summand = lighting.reflectance(roughness, clamp(cosine, 0.05, 1))  # type: ignore[arg-type]
+    factor, summand = lighting.reflectance(roughness, clamp(cosine, 0.05, 1))
     spacing = jnp.exp(buffer.log_spacing)
     in_pixels = larger(spacing, 1e-6) * camera.intrinsics[0, 0] / larger(buffer.depth, 0.1)
     numbers = [buffer.opacity, jnp.log1p(buffer.coverage), roughness, metallic, openness, reflected]
     numbers += [smaller(buffer.spread / spacing, 4), *(_relief(buffer, spacing, reach) for reach in WINDOWS)]
-    numbers += [0.5 * jnp.log(in_pixels), planarity, linearity, sided, cosine]  # type: ignore[list-item]
+    numbers += [0.5 * jnp.log(in_pixels), planarity, linearity, sided, cosine]
     vectors = [buffer.normal, bent, linear_to_srgb(color), linear_to_srgb(blended)]
     drawn = (buffer.opacity / (buffer.opacity + FAINT))[..., None]
     pattern = [jnp.log1p(8 * buffer.centres)[..., None], clamp(buffer.beside / in_pixels[..., None], -2, 2)]

@@ -28,7 +28,7 @@ from spnr_jax.kernels.records import AnyArray, PointCloud, Surfels
 from spnr_jax.surfels import discs, layers, sides
 from spnr_jax.surfels.layers import Hood, Layer, along
 from spnr_jax.surfels.rules import RULES, Rules
-from spnr_jax.surfels.small_systems import frame, measure_shape
+from spnr_jax.surfels.small_systems import frame, measure_shape, unit
 from spnr_jax.surfels.visibility import cell_of, grid_of, seen_from
 
 
@@ -244,9 +244,9 @@ def describe(
         ends = discs.find_farthest(jnp.where(there[:, None], place, 0)) + rules.beyond
         cuts = discs.find_cuts(hood, axes, spacing, sided, normals, sides[:, 0], rules)
         rim, reach = discs.find_rims(ends, cuts, axes, rules)
-        colors = discs.fit_colors(place, weight, spacing, axes, colors, rules)  # type: ignore[assignment]
+        fitted = discs.fit_colors(place, weight, spacing, axes, colors, rules)
         own = layers.weigh_near(hood, raw, rules) * layers.weigh_height(layer)
-        fields = colors._asdict() | {  # type: ignore[attr-defined]
+        fields = fitted._asdict() | {
             "spacing": spacing,
             "shape": measure_shape(layers.measure_covariance(hood, raw, own)),
             "rim": rim,
@@ -295,7 +295,5 @@ def find_spacings(
 
 def normalize(normals: Float[Array, "3 points"]) -> Float[Array, "3 points"]:
     """The vectors at length 1; straight up where there is none."""
-    squared = jnp.sum(normals**2, axis=0)
-    some = squared > 0.25
     up = jnp.asarray([0, 1, 0], normals.dtype)[:, None]
-    return layers.select(some, normals * jax.lax.rsqrt(jnp.where(some, squared, 1))[None], up)
+    return layers.select(jnp.sum(normals**2, axis=0) > 0.25, unit(normals), up)

@@ -163,7 +163,7 @@ def fit_layers(
     if unlike is None:
         start = begin(normal, rules.start)
         return _fit_quadric(offset, weight, start, None, rules.scales[0], 0.0 if firm else 1.0, rules).layer, None
-    mixed = _fewer(weight, unlike) > rules.step_points[0]
+    mixed = _fewer(total(weight), total(weight * unlike)) > rules.step_points[0]
 
     def fit(normal: Array, again: Array) -> tuple[Array, Fit]:
         start = begin(normal, jnp.where(again, rules.scales[1], rules.start))
@@ -236,8 +236,7 @@ def _tell_apart(
     held, others, squares = total(own), total(own * unlike), total(own * unlike**2)
     alone = jnp.maximum(squares - others**2 / jnp.maximum(held, 1e-9), 1e-9)  # were nothing else unknown
     high = jnp.abs(step) / fit.layer.scale
-    fewer = jnp.minimum(others, held - others - 1)  # it is its own neighbor
-    measured = high, 1 / (alone * error), fewer, high * rules.spreads / jnp.sqrt(error)
+    measured = high, 1 / (alone * error), _fewer(held, others), high * rules.spreads / jnp.sqrt(error)
     limits = rules.step_high, rules.step_known, rules.step_points, rules.step_significant
     passed = [[value > limit[i] for value, limit in zip(measured, limits, strict=True)] for i in (0, 1)]
     return jnp.all(jnp.stack(passed[0]), axis=0), jnp.all(jnp.stack(passed[1]), axis=0)
@@ -263,10 +262,9 @@ def compare_colors(hood: Hood, roots: Float[Array, "k 3 block"], rules: Rules) -
     return -jnp.expm1(-0.5 / rules.like**2 * jnp.sum(change**2, axis=1)) * hood.real
 
 
-def _fewer(weight: Float[Array, "k block"], unlike: Float[Array, "k block"]) -> Float[Array, " block"]:
-    """Neighbors of the point's color or of another, by their weights, whichever are fewer."""
-    others = total(weight * unlike)
-    return jnp.minimum(others, total(weight) - others - 1)  # it is its own neighbor
+def _fewer(held: Float[Array, " block"], others: Float[Array, " block"]) -> Float[Array, " block"]:
+    """Weights of the neighbors of the point's color or of others, out of all that are held, whichever are fewer."""
+    return jnp.minimum(others, held - others - 1)  # it is its own neighbor
 
 
 def weigh_layer(

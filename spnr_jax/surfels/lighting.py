@@ -5,8 +5,9 @@ tables    irradiance by normal, and the map blurred by the GGX lobes of LEVELS b
 arriving  what each surfel receives of it: irradiance through the directions that see the surfel
 """
 
-from functools import cache
+from functools import cache, reduce
 from importlib import resources
+from operator import add
 
 import jax.numpy as jnp
 import numpy as np
@@ -105,7 +106,8 @@ def look_up(tables: Float[Array, "rows 3"], towards: list[Array], first: Array |
     corners = [
         (rows[i] + texels[j], (down if i else 1 - down) * (right if j else 1 - right)) for i in (0, 1) for j in (0, 1)
     ]
-    return [sum(weight * channel[index] for index, weight in corners) for channel in columns(jnp.asarray(tables))]  # type: ignore[misc]
+    channels = columns(jnp.asarray(tables))
+    return [reduce(add, (weight * channel[index] for index, weight in corners)) for channel in channels]
 
 
 def irradiance(light: Light, normal: list[Array]) -> list[Array]:

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from spnr_jax.devices.compilation import QUICKEST
 from spnr_jax.kernels import cloud_arrays
 from spnr_jax.kernels.cleaning import Cleaned
 from spnr_jax.kernels.facing import planes
@@ -14,7 +15,6 @@ from spnr_jax.kernels.records import PointCloud
 from spnr_jax.surfels import geometry
 from spnr_jax.surfels.geometry import Points
 from spnr_jax.surfels.neighbors import order_in_space
-from spnr_jax.surfels.rules import NEIGHBORS
 
 VOTERS = 2**15  # points that votes are taken of, those that are kept among them
 
@@ -51,25 +51,20 @@ def outward_normals(
     order, near = order_in_space(places)
     size = cloud_arrays.bucket(len(order))
 
-    def columns(values: np.ndarray, fill: int = 0) -> np.ndarray:
-        whole = np.full((values.shape[1], size), fill, values.dtype)
-        whole[:, : len(order)] = values.T
-        return whole
+    def columns(values: np.ndarray, fill: int = 0) -> Array:
+        return jnp.asarray(np.pad(values.T, [(0, 0), (0, size - len(order))], constant_values=fill))
 
-    number = np.full((len(order), NEIGHBORS), -1, np.int32)
-    number[:, : near.shape[1]] = near
     color = np.asarray(base_color[voters], np.float32)
     normal = np.asarray(planes(positions[voters], positions, noise), np.float32)
-    points = Points(columns(number, -1), np.arange(size) < len(order), columns(places[order]), columns(color[order]))  # type: ignore[arg-type]
+    points = Points(columns(near, -1), jnp.arange(size) < len(order), columns(places[order]), columns(color[order]))
     found = np.empty_like(places)
     found[order] = np.asarray(_turn(points, columns(normal[order])))[:, : len(order)].T
     return found[: len(kept)]
 
 
-@partial(jax.jit, compiler_options={"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 1})
+@partial(jax.jit, compiler_options=QUICKEST)
 def _turn(points: Points, normals: Float[Array, "3 points"]) -> Float[Array, "3 points"]:
     """The normals that are given, but for those of sheets, outward."""
-    points = jax.tree.map(jnp.asarray, points)
     raw, layer = geometry.find_layers(points, normals, firm=True, sided=False, sheets=True)
     seen = geometry.look(points, layer.normal, raw)
     return geometry.find_sides(points, raw, layer, seen, False)[0]

@@ -110,7 +110,7 @@ def footprints(surfels: Surfels, camera: Camera | View) -> Footprints:
     row = -camera.intrinsics[1, 1] * y / ahead + camera.intrinsics[1, 2]
     radius = RADIUS * jnp.asarray(surfels.spacing)
     known = jax.lax.stop_gradient((camera.intrinsics, (x, y, z), normal, radius, (column, row)))
-    left, top, width, height = _rectangles(*known, (camera.width, camera.height))  # type: ignore[arg-type]
+    left, top, width, height = _rectangles(*known, (camera.width, camera.height))
     drawn = surfels.mask & (facing > 0) & (-z > NEAREST)
     return Footprints(
         centre=(x, y, z),
@@ -132,7 +132,7 @@ def _rectangles(
     normal: tuple[Array, Array, Array],
     radius: Float[Array, " points"],
     place: tuple[Array, Array],
-    size: tuple[int | Array, int | Array],
+    size: tuple[int | AnyArray, int | AnyArray],
 ) -> tuple[Array, Array, Array, Array]:
     """First column and row, width and height of the pixels around each disc, inside the picture; width 0 beside it."""
     x, y, z = centre

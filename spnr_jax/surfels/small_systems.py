@@ -4,6 +4,9 @@ Every step is one pass over all points of a block, which a CPU does in vectors; 
 ten times as long.
 """
 
+from functools import reduce
+from operator import add
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -104,7 +107,7 @@ def project_largest(matrix: Float[Array, "3 3 points"]) -> Float[Array, "3 3 poi
     """
 
     def square(_: Array, power: Array) -> Array:
-        power = sum(power[:, i][:, None] * power[i][None] for i in range(3))  # type: ignore[assignment]
+        power = reduce(add, (power[:, i][:, None] * power[i][None] for i in range(3)))
         return power / (power[0, 0] + power[1, 1] + power[2, 2])[None, None]
 
     scaled = matrix / (matrix[0, 0] + matrix[1, 1] + matrix[2, 2])[None, None]

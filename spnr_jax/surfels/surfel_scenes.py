@@ -1,5 +1,6 @@
 """A cloud as the renderer takes it: its surfels in the box, with the way from the cloud's units to there."""
 
+import dataclasses
 from functools import partial
 from typing import Any
 
@@ -8,16 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from spnr_jax.devices.compilation import QUICKEST
 from spnr_jax.kernels import cloud_arrays
 from spnr_jax.kernels.numerics import clamp, length
 from spnr_jax.kernels.records import AnyArray, PointCloud, SurfelScene
 from spnr_jax.surfels.geometry import estimate_surfels, median
 from spnr_jax.surfels.neighbors import order_in_space
-from spnr_jax.surfels.rules import NEIGHBORS, RULES, Rules
+from spnr_jax.surfels.rules import RULES, Rules
 from spnr_jax.surfels.small_systems import largest, smallest
-
-# of XLA: a third to a half off the compilation, and the program runs as long
-QUICK = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 1}
 
 
 def encode(params: Any, cloud: PointCloud, neighbors: Int[AnyArray, "points 20"]) -> SurfelScene:
@@ -31,7 +30,7 @@ def encode(params: Any, cloud: PointCloud, neighbors: Int[AnyArray, "points 20"]
     del params
     centre, scale = fit_box(jnp.asarray(cloud.positions), jnp.asarray(cloud.mask))
     inside = clamp((jnp.asarray(cloud.positions) - centre[None]) * scale, -1, 1)
-    return _make_scene(cloud.replace(positions=inside), neighbors, centre, scale, RULES)  # type: ignore[attr-defined]
+    return _make_scene(dataclasses.replace(cloud, positions=inside), neighbors, centre, scale, RULES)
 
 
 def fit_box(
@@ -59,8 +58,7 @@ def encode_in_box(cloud: PointCloud) -> SurfelScene:
     real = jax.tree.map(lambda x: np.asarray(x, np.float32)[mask], cloud).replace(mask=mask[mask])
     order, near = order_in_space(real.positions)
     size = cloud_arrays.bucket(len(order))
-    neighbors = np.full((size, NEIGHBORS), -1, np.int32)
-    neighbors[: len(order), : near.shape[1]] = near
+    neighbors = np.pad(near, [(0, size - len(order)), (0, 0)], constant_values=-1)
     return _encode(cloud_arrays.pad(jax.tree.map(lambda x: x[order], real), size), neighbors)
 
 
@@ -72,6 +70,6 @@ def _make_scene(
     return SurfelScene(surfels=surfels, spacing=spacing, centre=centre, scale=scale)
 
 
-@partial(jax.jit, compiler_options=QUICK)
+@partial(jax.jit, compiler_options=QUICKEST)
 def _encode(cloud: PointCloud, neighbors: Int[Array, "points 20"]) -> SurfelScene:
     return _make_scene(cloud, neighbors, jnp.zeros(3), jnp.ones(()), RULES)

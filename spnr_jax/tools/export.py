@@ -101,7 +101,7 @@ def export_render(
 
 def room_light() -> bytes:
     """The package's room as the light that the `render` of the default network takes: an .npz of its tables."""
-    return packed({"tables": lighting.room_light().tables}, compressed=True)  # type: ignore[dict-item]
+    return packed({"tables": np.asarray(lighting.room_light().tables)}, compressed=True)
 
 
 def load_exported(content: bytes) -> Callable[..., Arrays]:

@@ -16,7 +16,8 @@ import numpy as np
 from flax.serialization import to_state_dict
 from jaxtyping import Array, Bool, Float, Int
 
-from spnr_jax.kernels.records import Camera, Light, PointCloud, Surfels, SurfelScene
+from spnr_jax.kernels.cloud_arrays import plain_cloud
+from spnr_jax.kernels.records import AnyArray, Camera, Light, PointCloud, Surfels, SurfelScene
 from spnr_jax.method import surfel_renderer
 from spnr_jax.method.model import Model
 from spnr_jax.method.surfel_renderer import Plan
@@ -33,7 +34,7 @@ Arrays = dict[str, Any]
 def encode(params: dict, cloud: Arrays) -> Arrays:
     """The scene of a cloud as a dict of arrays; pure."""
     points = PointCloud(**cloud)
-    near = nearest(jnp.asarray(points.positions), jnp.asarray(points.mask))
+    near = nearest(points.positions, points.mask)
     return dict(to_state_dict(surfel_scenes.encode(params, points, near)))
 
 
@@ -45,8 +46,9 @@ def render(params: dict | None, volume: Arrays, camera: Arrays, light: Arrays, *
     return {name: getattr(drawn, name) for name in ("image", "depth", "acc", "overflow")}
 
 
-def nearest(positions: Float[Array, "points 3"], mask: Bool[Array, " points"]) -> Int[Array, "points 20"]:
+def nearest(positions: Float[AnyArray, "points 3"], mask: Bool[AnyArray, " points"]) -> Int[Array, "points 20"]:
     """`spnr_jax.neighbors` in JAX: the nearest points of each, itself first, -1 for none, by all distances."""
+    positions, mask = jnp.asarray(positions), jnp.asarray(mask)
     numbers = jnp.arange(len(mask))
     count = min(NEIGHBORS, len(mask))
 
@@ -62,16 +64,10 @@ def nearest(positions: Float[Array, "points 3"], mask: Bool[Array, " points"]) -
 
 def make_plan(model: Model, num_points: int, size: int) -> Plan:
     """Sizes for pictures of any object of so many points from where `Model.camera` stands: with room to spare."""
-    ball = np.asarray(RADIUS * spiral(num_points), np.float32)
-    grey = np.full(num_points, 0.5, np.float32)
-    mask = np.ones(num_points, bool)
-    cloud = PointCloud(positions=ball, base_color=grey[:, None].repeat(3, 1), roughness=grey, metallic=grey, mask=mask)
-    scene = surfel_scenes.encode_in_box(cloud)
-    volume = scene.replace(centre=jnp.zeros(3), scale=jnp.ones(()))  # type: ignore[attr-defined]
-    camera = model.camera(volume, resolution=size)
-    made = surfel_renderer.plan(volume, camera)
-    whole = -(-size * made.side // 2**made.doublings) + surfel_renderer.MARGIN
-    side = -(-whole // surfel_renderer.STEP) * surfel_renderer.STEP
+    ball = plain_cloud(np.asarray(RADIUS * spiral(num_points), np.float32))
+    scene = surfel_scenes.encode_in_box(ball)
+    made = surfel_renderer.plan(scene, model.camera(scene, resolution=size))
+    side = surfel_renderer.round_up(-(-size * made.side // 2**made.doublings) + surfel_renderer.MARGIN)
     return made._replace(width=side, height=side, entries=2 * made.entries, slots=side * side)
 
 

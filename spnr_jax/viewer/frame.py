@@ -119,18 +119,19 @@ def draw(model: Model, state: State, moving: bool) -> tuple[State, np.ndarray | 
 
     Moving: `draft`, at the network's own size.  At rest: the chosen quality.
     """
-    if state.view is None:
+    if (view := state.view) is None:
         return state, None
     state, named = make_light(state), qualities(model)
     if state.splats:
         return state, np.full((2, 2, 3), 255, np.uint8)
+    quality: Quality
     quality, size = ("draft", named["draft"][1] // 2) if moving else named[state.quality]
     behind = state.lighting.background
-    reach = square_reach(state.view, whole=behind != "white")  # type: ignore[arg-type]
-    camera = square_camera(state.view, state.volume, reach, size)  # type: ignore[arg-type]
-    rendering = model.render(state.volume, camera, quality, state.light)  # type: ignore[arg-type]
+    reach = square_reach(view, whole=behind != "white")
+    camera = square_camera(view, state.volume, reach, size)
+    rendering = model.render(state.volume, camera, quality, state.light)
     square = images.to_uint8(before(behind, rendering, camera, state.light).image)
-    return state, fill(square, state.view, reach, MOVING_LONGEST if moving else LONGEST)  # type: ignore[arg-type]
+    return state, fill(square, view, reach, MOVING_LONGEST if moving else LONGEST)
 
 
 def read_view(wxyz: Any, position: Any, field_of_view: Any, width: Any, height: Any) -> View | None:

@@ -209,7 +209,7 @@ class Browser:
 
 def splats_for_browser(splats: Gaussians) -> dict[str, Any]:
     """Arguments of viser's `add_gaussian_splats`."""
-    axes = np.asarray(rotations(splats.rotation)) * (LARGER * np.asarray(splats.scale))[:, None, :]  # type: ignore[arg-type]
+    axes = rotations(np.asarray(splats.rotation)) * (LARGER * np.asarray(splats.scale))[:, None, :]
     return {
         "centers": LARGER * np.asarray(splats.position, np.float32),
         "covariances": np.einsum("nij,nkj->nik", axes, axes),

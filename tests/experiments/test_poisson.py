@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from experiments.studies.sharpness_methods import Poisson
+from experiments.studies.sharpness import Poisson
 from support.handmade import RED, ball, plain
 
 from data_gen.render import light, views

@@ -82,13 +82,14 @@ def load_stl(data: bytes) -> Asset:
         return Asset(parts=tuple(parts))
     if len(data) < STL_HEAD:
         raise RejectedAsset(f"is cut off: a binary STL file has {STL_HEAD} bytes before its triangles")
-    announced, notes = int.from_bytes(data[80:84], "little"), ()
+    announced = int.from_bytes(data[80:84], "little")
+    notes: tuple[str, ...] = ()
     held = (len(data) - STL_HEAD) // STL_TRIANGLE.itemsize
     if announced > held:
         raise RejectedAsset(f"is cut off: its header announces {announced} triangles, {held} are there")
     count = announced or held
     if count != announced:
-        notes = (f"the header announces {announced} triangles, {held} stand behind it: these are drawn",)  # type: ignore[assignment]
+        notes = (f"the header announces {announced} triangles, {held} stand behind it: these are drawn",)
     rows = np.frombuffer(data, STL_TRIANGLE, count, STL_HEAD)
     positions = rows["corners"].reshape(-1, 3).astype(np.float64)
     ignored = ("STL attribute bytes",) if rows["attribute"].any() else ()

@@ -14,7 +14,7 @@ def triangulate(positions: np.ndarray, polygons: Sequence[Corners] | np.ndarray)
     faces, owners = [], []
     for size in np.unique(sizes[sizes > 2]):
         rows = np.flatnonzero(sizes == size)
-        corners = np.array([polygons[row] for row in rows], np.int64)  # type: ignore[call-overload]
+        corners = np.array([polygons[int(row)] for row in rows], np.int64)
         fan = np.stack([np.broadcast_to(corners[:, :1], (len(rows), size - 2)), corners[:, 1:-1], corners[:, 2:]], -1)
         fan = fan.copy()
         if 3 < size <= MOST_CORNERS and (corners >= 0).all() and corners.max() < len(positions):
