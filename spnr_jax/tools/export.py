@@ -93,7 +93,8 @@ def export_render(
 
     def render(volume: Arrays, camera: Arrays) -> Arrays:
         encoded = Volume(**volume | {"scene": from_state_dict(scene, volume["scene"])}, reach=reach)
-        return to_state_dict(model.render(encoded, Camera(**camera, height=size, width=size), quality))
+        drawn = model.render(encoded, Camera(**camera, height=size, width=size), quality)
+        return {name: values for name, values in to_state_dict(drawn).items() if values is not None}
 
     volume = {"scene": to_state_dict(scene), "centre": centre, "scale": scale}
     return _serialised(render, platforms, volume, camera)
