@@ -4,7 +4,7 @@ import os
 from pathlib import Path
 
 SHORTEST = 0.1  # seconds of compilation from which on a program is kept
-# options of XLA for an outermost jax.jit: a third to two thirds off the compilation of long programs, which run as long
+# options of XLA for an outermost jit: a third to two thirds off the compilation of long programs, which run as long
 QUICK = {"xla_cpu_use_fusion_emitters": False}
 QUICKEST = QUICK | {"xla_backend_optimization_level": 1}
 
