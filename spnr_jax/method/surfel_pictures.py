@@ -17,11 +17,12 @@ from jaxtyping import Array, Float
 from spnr_jax.config import SurfelConfig
 from spnr_jax.devices.compilation import QUICK, QUICKEST
 from spnr_jax.devices.side_by_side import two_at_a_time
+from spnr_jax.devices.traces import Kept
 from spnr_jax.kernels import cameras, cloud_arrays
-from spnr_jax.kernels.records import Camera, Light, PointCloud, Rendering, Scene, SurfelScene, Volume
+from spnr_jax.kernels.records import Camera, GBuffer, Light, PointCloud, Rendering, Scene, SurfelScene, Volume
 from spnr_jax.kernels.resizing import enlarged
 from spnr_jax.method import solid, surfel_renderer
-from spnr_jax.method.surfel_renderer import Plan, Sizes, unstack
+from spnr_jax.method.surfel_renderer import Blended, Plan, Sizes, unstack
 from spnr_jax.surfels.lighting import room_light
 from spnr_jax.surfels.surfel_scenes import encode_in_box
 
@@ -141,17 +142,17 @@ def draw_planned(variables: dict | None, volume: Volume, asked: Asked, sizes: Si
     return _shade(variables, volume.scene, asked.camera, asked.light, blended, known, plan=plan)
 
 
-_encode_solid = jax.jit(solid.encode, compiler_options=QUICK)
+_encode_solid = Kept(solid.encode, returns=(Scene,), options=QUICK)
 
 
-@partial(jax.jit, static_argnames="plan")
+@partial(Kept, static="plan")
 def _solid_picture(variables: dict, volume: Volume, camera: Camera, *, plan: Plan) -> Float[Array, "h w 2"]:
     inside = cameras.in_box(camera, volume.centre, volume.scale)
     return surfel_renderer.solid_picture(variables, volume.solid, inside, plan)
 
 
-_blend = jax.jit(surfel_renderer.blend_window, static_argnames="plan")
-_shade = jax.jit(surfel_renderer.shade_window, static_argnames="plan", compiler_options=QUICKEST)
+_blend = Kept(surfel_renderer.blend_window, static="plan", returns=(Blended, GBuffer))
+_shade = Kept(surfel_renderer.shade_window, static="plan", returns=(Rendering,), options=QUICKEST)
 _enlarge = jax.jit(enlarged, static_argnums=(1, 2), compiler_options=QUICK)
 
 

@@ -21,6 +21,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from spnr_jax.config import SurfelConfig
+from spnr_jax.devices.traces import Kept
 from spnr_jax.errors import UserError
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.compositing import WHITE
@@ -134,7 +135,7 @@ def common_resolution(resolutions: Iterable[tuple[int, int]]) -> tuple[int, int]
     return min(resolutions, key=lambda of: (of[0], -of[1]))
 
 
-@partial(jax.jit, static_argnames=("doublings", "side"))
+@partial(Kept, static=("doublings", "side"), returns=(Sizes,))
 def count_sizes(scene: SurfelScene, camera: Camera, *, doublings: int, side: int) -> Sizes:
     """What a view needs; the covered pixels are at most those of the rectangles around its discs."""
     whole = scaled(cameras.in_box(camera, scene.centre, scene.scale), doublings, side)

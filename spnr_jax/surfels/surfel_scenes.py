@@ -10,9 +10,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from spnr_jax.devices.compilation import QUICKEST
+from spnr_jax.devices.traces import Kept
 from spnr_jax.kernels import cloud_arrays
 from spnr_jax.kernels.numerics import clamp, length
-from spnr_jax.kernels.records import AnyArray, PointCloud, SurfelScene
+from spnr_jax.kernels.records import AnyArray, PointCloud, Surfels, SurfelScene
 from spnr_jax.surfels.geometry import estimate_surfels, median
 from spnr_jax.surfels.neighbors import order_in_space
 from spnr_jax.surfels.rules import RULES, Rules
@@ -70,6 +71,6 @@ def _make_scene(
     return SurfelScene(surfels=surfels, spacing=spacing, centre=centre, scale=scale)
 
 
-@partial(jax.jit, compiler_options=QUICKEST)
+@partial(Kept, returns=(SurfelScene, Surfels), options=QUICKEST)
 def _encode(cloud: PointCloud, neighbors: Int[Array, "points 20"]) -> SurfelScene:
     return _make_scene(cloud, neighbors, jnp.zeros(3), jnp.ones(()), RULES)

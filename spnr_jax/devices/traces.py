@@ -1,0 +1,110 @@
+"""`jax.jit` whose traces are kept on the disk, beside XLA's programs: a new process neither traces nor compiles.
+
+Tracing and lowering take Python as long as the rest of a second run.  A trace is a function that `jax.export` has
+written, named by what it depends on: shapes, static arguments, the package's sources, JAX and the platform.
+"""
+
+import contextlib
+import functools
+import hashlib
+import json
+import os
+from collections.abc import Callable, Iterable
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from jax import export
+
+DIGEST = hashlib.sha256().digest_size
+_registered: set[type] = set()
+
+
+class Kept:
+    """A function under `jax.jit` whose traces are kept; for arrays of the host, calls in other traces pass it by."""
+
+    def __init__(
+        self,
+        function: Callable[..., Any],
+        *,
+        returns: Iterable[type] = (),
+        static: str | tuple[str, ...] = (),
+        options: dict[str, Any] | None = None,
+    ) -> None:
+        """`returns`: classes of the records that it gives; `static`: its static keyword arguments; `options`: XLA's."""
+        functools.update_wrapper(self, function)
+        for record in returns:
+            _register(record)
+        self.function, self.options = function, options
+        self.jitted = jax.jit(function, static_argnames=static, compiler_options=options)
+        self.programs: dict[Any, Callable[..., Any]] = {}
+
+    def __call__(self, *args: Any, **static: Any) -> Any:
+        """What the function gives."""
+        leaves, tree = jax.tree.flatten(args)
+        place = jax.config.values["jax_compilation_cache_dir"]
+        if place is None or not all(_is_plain(leaf) for leaf in leaves):
+            return self.jitted(*args, **static)
+        key = tree, tuple((leaf.shape, leaf.dtype) for leaf in leaves), tuple(sorted(static.items()))
+        if key not in self.programs:
+            trace = _load(Path(place), functools.partial(self.function, **static), tree, leaves, key)
+            self.programs[key] = jax.jit(trace.call, compiler_options=self.options)
+        return self.programs[key](*leaves)
+
+
+def _is_plain(leaf: Any) -> bool:
+    """Whether it is an array on the host or on one device."""
+    if isinstance(leaf, jax.core.Tracer):
+        return False
+    return isinstance(leaf, np.ndarray) or (isinstance(leaf, jax.Array) and len(leaf.devices()) == 1)
+
+
+def _load(place: Path, function: functools.partial, tree: Any, leaves: list, key: Any) -> export.Exported:
+    """The trace for such arguments: that on the disk, or a new one, which is written there."""
+    name = function.func.__name__
+    versions = jax.__version__, jax.default_backend(), jax.config.values["jax_enable_x64"]
+    depends = repr((function.func.__module__, name, versions, key)).encode() + _digest_sources()
+    file = place / f"trace-{name}-{hashlib.sha256(depends).hexdigest()}"
+    with contextlib.suppress(OSError):
+        written = file.read_bytes()
+        if hashlib.sha256(written[DIGEST:]).digest() == written[:DIGEST]:
+            return export.deserialize(bytearray(written[DIGEST:]))
+    shapes = [jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in leaves]
+    trace = export.export(jax.jit(lambda *flat: function(*jax.tree.unflatten(tree, flat))))(*shapes)
+    content = bytes(trace.serialize())
+    with contextlib.suppress(OSError):  # a full disk, a folder that cannot be written: it is traced again
+        place.mkdir(parents=True, exist_ok=True)
+        unfinished = file.with_name(f".unfinished-{os.getpid()}-{file.name}")
+        unfinished.write_bytes(hashlib.sha256(content).digest() + content)
+        os.replace(unfinished, file)
+    return trace
+
+
+@functools.cache
+def _digest_sources() -> bytes:
+    """A digest of the package's code."""
+    found = hashlib.sha256()
+    root = resources.files("spnr_jax")
+    assert isinstance(root, Path)
+    for path in sorted(root.rglob("*.py")):
+        found.update(path.read_bytes())
+    return found.digest()
+
+
+def _register(record: type) -> None:
+    """Tells `jax.export` of a record, once."""
+    if record in _registered:
+        return
+    _registered.add(record)
+    name = f"{record.__module__}.{record.__qualname__}"
+    if issubclass(record, tuple):
+        export.register_namedtuple_serialization(record, serialized_name=name)
+    else:
+        export.register_pytree_node_serialization(
+            record,
+            serialized_name=name,
+            serialize_auxdata=lambda fixed: json.dumps(fixed).encode(),
+            deserialize_auxdata=lambda written: tuple(json.loads(bytes(written))),
+        )
