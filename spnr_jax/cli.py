@@ -28,7 +28,7 @@ from spnr_jax.tools.splat_options import Share
 BOX = r"[╭╮╰╯│─•]+|__tyro-dummy-inner__\."  # what tyro draws around an error, and its name for the whole command
 DESCRIPTION = """Sparse-point neural rendering: train a network, evaluate one, render a cloud of points.
 --debug, or SPNR_DEBUG=1, shows the call stack of an error.
---methods FILE, a .py file or a module, adds methods and presets of your own to every command (docs/api.md)."""
+--methods FILE, a .py file or a module, adds methods and presets of your own to every command (docs/own_network.md)."""
 
 
 Command = Train | Evaluate | Render | View | Export | Share

@@ -149,7 +149,7 @@ def surfels() -> TrainConfig:
     """Our network over G-buffers of surfels, pictures of any size.  `spnr train --preset surfels DATA RUN`.
 
     DATA of `spnr-data generate` with --resolution 512 --points 65536.  Some hours on two CPU cores, the first of them
-    for the G-buffers, which take some 10 MB of disk a cloud.  Expected figures: docs/surfels.md.
+    for the G-buffers, which take some 10 MB of disk a cloud.  Expected figures: docs/lab/surfels.md.
     """
     return TrainConfig(
         preset="surfels",

@@ -1,6 +1,8 @@
 """What the documents show runs, every page has its place in the site, and the functions they name exist."""
 
+import ast
 import importlib
+import inspect
 import re
 import shutil
 import tomllib
@@ -13,6 +15,9 @@ import yaml
 from support import tiny_dataset, tiny_surfels, tiny_untrained
 
 import spnr_jax
+from spnr_jax import methods
+from spnr_jax.formats import data_sets
+from spnr_jax.presets import PRESETS
 from spnr_jax.tools import export
 from spnr_jax.training import weights
 
@@ -20,6 +25,8 @@ ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 CODE = re.compile(r"^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 IDENTIFIER = re.compile(r"^::: ([\w.]+)$", re.MULTILINE)
+SIGNATURE = re.compile(r"^(?:### |\| )`([\w.]+)\((.*)\)`", re.MULTILINE)  # of a heading, or of a table's first column
+PARAMETER = re.compile(r"(\w+)(?:=([^,()]*(?:\(\))?))?")
 PAGES = sorted(DOCS.rglob("*.md"))
 
 
@@ -48,8 +55,7 @@ def execute(path):
 def test_the_readmes_example_draws_pictures_and_has_a_gradient(workplace, monkeypatch):
     monkeypatch.setattr(weights, "shipped", lambda name: tiny_surfels.run())
     names = execute(ROOT / "README.md")
-    assert names["rendering"].image.shape[-1] == 3
-    pictures, by_color = np.asarray(names["pictures"]), np.asarray(names["by_color"])
+    pictures, by_color = np.asarray(names["images"]), np.asarray(names["by_color"])
     assert pictures.shape == (2, 128, 128, 3)
     assert np.abs(pictures[0] - pictures[1]).max() > 0.05, "two lights"
     assert np.isfinite(by_color).all()
@@ -57,8 +63,7 @@ def test_the_readmes_example_draws_pictures_and_has_a_gradient(workplace, monkey
 
 
 @pytest.mark.ci
-def test_the_examples_of_the_fourteen_functions_run_in_their_order(workplace, monkeypatch):
-    # the README's example draws with the package's network
+def test_the_examples_of_the_api_run_in_their_order(workplace, monkeypatch):
     runs = {"surfels": tiny_surfels.run()}
     monkeypatch.setattr(weights, "shipped", lambda name="surfels": runs.get(name, tiny_untrained.run()))
     names = execute(DOCS / "api.md")
@@ -75,7 +80,7 @@ def test_the_example_without_this_package_runs_on_what_the_command_writes(workpl
     (workplace / "exported" / "encode.jax").write_bytes(export.export_encode(model, num_points=1024))
     (workplace / "exported" / "render.jax").write_bytes(export.export_render(model, resolution=128))
     (workplace / "exported" / "light.npz").write_bytes(export.room_light())
-    names = execute(DOCS / "functions.md")
+    names = execute(DOCS / "exporting.md")
     assert "spnr_jax" not in names
     assert names["picture"]["acc"].max() > 0.5
 
@@ -99,11 +104,34 @@ def test_the_lights_of_the_page_about_them_are_made_as_it_says():
     assert float(names["light"].tables.min()) > 0.1, "the ambient light is everywhere"
 
 
-def test_there_are_fourteen_functions_each_with_an_example_below_it():
-    parts = IDENTIFIER.split((DOCS / "api.md").read_text())
-    assert len(parts[1::2]) == 14
-    for name, text in zip(parts[1::2], parts[2::2], strict=True):
-        assert any(name.rpartition(".")[2] in block for block in CODE.findall(text)), f"no example of {name}"
+@pytest.mark.ci
+def test_a_method_and_losses_of_ones_own_work_as_their_page_shows_them(workplace, monkeypatch):
+    monkeypatch.setattr(weights, "shipped", lambda name: tiny_surfels.run())
+    monkeypatch.setattr(data_sets, "check_resolution", lambda *_: None)  # the demo's pictures are larger than these
+    for registry in (methods.METHODS, PRESETS):
+        monkeypatch.setitem(registry, "mean_color", None)  # is put back as it was: absent
+        del registry["mean_color"]
+    names = execute(DOCS / "own_network.md")
+    assert np.isfinite(names["values"]).all()
+    assert np.all(np.asarray(names["params"]["weight"]) != 0.5), "three steps change the weights"
+    gradient = [np.asarray(leaf) for leaf in jax.tree.leaves(names["by_weights"])]
+    assert all(np.isfinite(leaf).all() for leaf in gradient)
+    assert any(np.any(leaf) for leaf in gradient)
+
+
+def test_the_signatures_that_the_api_shows_are_those_of_the_code():
+    shown = SIGNATURE.findall((DOCS / "api.md").read_text())
+    assert len(shown) > 30
+    for name, arguments in shown:
+        parameters = inspect.signature(resolve(f"spnr_jax.{name}")).parameters
+        wanted = {n: p for n, p in parameters.items() if n != "self"}
+        given = dict(PARAMETER.findall(arguments))
+        assert list(given) == list(wanted), name
+        for parameter, default in given.items():
+            optional = wanted[parameter].default is not inspect.Parameter.empty
+            assert optional == bool(default), f"{name}: {parameter}"
+            if default not in ("", "...", "print", "Cut()"):
+                assert wanted[parameter].default == ast.literal_eval(default), f"{name}: {parameter}"
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

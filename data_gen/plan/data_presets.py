@@ -10,7 +10,7 @@ from pathlib import Path
 
 from data_gen.plan.tasks import Category, GenerateConfig, Preset
 
-# 40 dB against 4096 samples over the object's own pixels (median; docs/lab/closed.md)
+# 40 dB against 4096 samples over the object's own pixels (median; docs/lab/making_data.md)
 SAMPLES = 128
 # (training objects with their colour variants, test objects) of the paper
 PAPER_COUNTS: dict[Preset, tuple[int, int]] = {

@@ -6,8 +6,9 @@
     OUT/metrics.json  report.html  both beside the trivial renderers
 
 Ours is the network near points: of 1024 points at 64 pixels it draws better pictures than the one of surfels, which is
-for denser ones (docs/results.md).  Both networks see the same evenly spread points, and train for as many steps.  What
-is there already is reused: finished objects, trained steps.  The seconds of each part are those of the run that did it.
+for denser ones (docs/lab/results.md).  Both networks see the same evenly spread points, and train for as many steps.
+What is there already is reused: finished objects, trained steps.  The seconds of each part are those of the run that
+did it.
 """
 
 import dataclasses

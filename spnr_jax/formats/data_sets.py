@@ -1,6 +1,6 @@
 """Data sets on disk, read: what they hold, and their objects as NumPy arrays.
 
-A data set is the folder that `spnr-data generate` writes (its form: README, "Data on disk").
+A data set is the folder that `spnr-data generate` writes (its form: docs/data.md).
 """
 
 import errno

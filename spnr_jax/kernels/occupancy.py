@@ -64,7 +64,7 @@ def open_path(
     )
     first = 0 if objects is None else objects[..., None] * resolution**3
     is_open = gather_rows(near_points.reshape(-1, 1).astype(near.dtype), first + row_at(x, y, z, resolution))[..., 0]
-    # equal cells are counted, in a product: a running sum takes a CPU longer, docs/cpu_forms.md
+    # equal cells are counted, in a product: a running sum takes a CPU longer, docs/lab/cpu_forms.md
     count = is_open @ jnp.triu(jnp.ones((num_cells, num_cells + 1), near.dtype), 1)
     return jax.lax.stop_gradient(Path(edges=edges, travelled=count * ((far - near) / num_cells)))
 

@@ -36,7 +36,7 @@ from spnr_jax.kernels.resizing import averaged
 from spnr_jax.methods import network
 
 SAMPLES = {"draft": 0.25, "balanced": 0.5, "best": 1.0}  # share of the samples a ray was trained with
-REACH_PER_SPACING = 1.6  # what loses nothing from 128 to 4096 points, docs/cpu_forms.md
+REACH_PER_SPACING = 1.6  # what loses nothing from 128 to 4096 points, docs/lab/cpu_forms.md
 WHOLE_BLOCK = 1024  # rays that are sampled through all the box at once: about 80 MB at 128 samples
 
 

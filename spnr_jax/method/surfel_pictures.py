@@ -26,7 +26,7 @@ from spnr_jax.method.surfel_renderer import Blended, Plan, Sizes, unstack
 from spnr_jax.surfels.lighting import room_light
 from spnr_jax.surfels.surfel_scenes import encode_in_box
 
-BALANCED = 0.75  # of the pixels along a side, which are drawn and enlarged: docs/performance.md
+BALANCED = 0.75  # of the pixels along a side, which are drawn and enlarged: docs/lab/performance.md
 
 
 class Asked(NamedTuple):

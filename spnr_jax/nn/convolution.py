@@ -2,7 +2,7 @@
 
 Layout is channels last: inputs (batch, *space, in), kernels (*window, in, out) with equal sides.  Strided convolutions
 pad one voxel on every side, like the stride-1 ones (a SAME rule would pad the far side only).  On a GPU the native
-convolutions of XLA are right; on a CPU (measurements: docs/cpu_forms.md)
+convolutions of XLA are right; on a CPU (measurements: docs/lab/cpu_forms.md)
   3D   a sum over depth taps of 2D convolutions, or one matrix product for tiny volumes
   2D   native, but as matrix products the gradients of 2-wide windows, the kernel's of 4-wide windows and of few output
        features; 128 input features or more in one matrix product

@@ -56,7 +56,7 @@ def solid_variables(config: NetworkConfig) -> dict:
 
 
 def suited_to(num_points: int) -> str:
-    """The package's network that draws so many points best (docs/surfels.md)."""
+    """The package's network that draws so many points best (docs/lab/surfels.md)."""
     return "surfels" if num_points >= MANY_POINTS else "near_points"
 
 

@@ -1,7 +1,7 @@
 """Files as people have them, of every kind that went wrong in reports about other tools: what becomes of each.
 
 The small files are made here.  `test_all_reported_files` reads those of `../shared/data/reports`, where they are at
-hand, prints what becomes of each, and keeps the table of docs/your_data.md true.
+hand, prints what becomes of each, and keeps the table of docs/lab/everyday_files.md true.
 """
 
 import gzip
@@ -23,7 +23,7 @@ from spnr_jax.surfels.visibility import spiral
 
 ROOT = Path(__file__).parents[2]
 REPORTS = ROOT.parent / "shared" / "data" / "reports"
-PAGE = ROOT / "docs" / "your_data.md"
+PAGE = ROOT / "docs" / "lab" / "everyday_files.md"
 BALL = np.round(spiral(420), 4)
 GREEN = (40, 170, 60)
 LINEAR = np.array([0.0212, 0.4020, 0.0452])  # of GREEN

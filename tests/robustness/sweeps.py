@@ -1,4 +1,4 @@
-"""Which kernel is swept along which axis, and the domain in which float32 keeps its budget (docs/stability.md).
+"""Which kernel is swept along which axis, and the domain in which float32 keeps its budget (docs/lab/stability.md).
 
 Inputs stay away from kinks (cell walls, equal pixels): there a gradient jumps, and no precision helps.  A twin is the
 kernel's value in float64 NumPy, mostly the plain loops of tests/support/reference.py.
