@@ -36,7 +36,7 @@ setup: .venv/complete
 	@begin=$$(date +%s); \
 	test -x $(PY) || $(PYTHON) -m venv .venv; \
 	echo "installing into .venv (about a minute)"; \
-	$(PY) -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[data,viewer,formats,meshes,export,baselines,dev]' && \
+	$(PY) -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[data,viewer,formats,meshes,baselines,dev]' && \
 	echo $$(( $$(date +%s) - begin )) > .venv/install_seconds && touch $@
 
 demo: setup

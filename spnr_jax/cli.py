@@ -112,7 +112,7 @@ def run(command: Command) -> None:
 
 
 def set_up_jax(*, repeats: bool = True) -> None:
-    """Lets a second run skip XLA's compilation, and arrays lie where others lay.
+    """Enables the compilation cache and the reuse of memory.
 
     Work that repeats itself on a CPU uses the memory of the time before; a first picture comes 0.1 s sooner without.
     """

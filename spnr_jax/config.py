@@ -1,6 +1,6 @@
 """Every number of a network and of its training, as frozen dataclasses; `presets.py` fills them in.
 
-    EncoderConfig      points to a volume, which both networks of rays begin with
+    EncoderConfig      points to a volume, with which both ray-marching networks begin
     PaperConfig        the paper's network             method/paper_network.py
     NearPointsConfig   the network near points         method/near_points.py
     SurfelConfig       the network over surfels        method/surfel_renderer.py
@@ -91,10 +91,10 @@ class SamplingConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class RenderOptions:
-    """How a network of rays is asked for pictures; its sizes and weights stay what they are."""
+    """Rendering options of the ray-marching networks; sizes and weights stay as they are."""
 
     sampling: SamplingConfig | None = None
-    """Samples of a ray; None: those of the training."""
+    """Samples per ray; None: as in training."""
     rays_per_side: int = 1
     """Rays along each side of a pixel, averaged."""
     refine: bool = True
@@ -149,7 +149,7 @@ class EncoderConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class NetworkConfig:
-    """What training and rendering ask of the sizes of any network."""
+    """Sizes that every network has."""
 
     method: ClassVar[str] = "none"
     """What the network is, for files and tables."""
@@ -178,7 +178,7 @@ class NetworkConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class RayNetworkConfig(NetworkConfig):
-    """What both networks of rays have: an encoder, samples along rays, a field."""
+    """Base config of the ray-marching networks: encoder, sampling, field."""
 
     encoder: EncoderConfig = field(default_factory=EncoderConfig)
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
@@ -287,7 +287,7 @@ class SurfelConfig(NetworkConfig):
     top: int = 24
     """Features of the blocks that double the resolution."""
     solid: bool = False
-    """Whether the network of rays `SOLID` tells where an object of few points is solid (`method/solid.py`)."""
+    """Whether near_points (`SOLID`) predicts opacity and depth of sparse clouds (`method/solid.py`)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -369,7 +369,7 @@ class TrainConfig:
     """A whole training run."""
 
     preset: str = "abo"
-    """Name of the preset this config began as; kept with the run."""
+    """Preset that this config started from; kept with the run."""
     model: NetworkConfig = field(default_factory=PaperConfig)
     loss: LossConfig = field(default_factory=LossConfig)
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
@@ -386,7 +386,7 @@ class TrainConfig:
     test_points: int = 1024
     """Points per object in evaluation."""
     trains: Literal["network", "refiner"] = "network"
-    """What steps change: all, or the refiner alone, on pictures of the network that the run begins with (`--init`)."""
+    """Trainable part: all weights, or the refiner alone, on pictures of the initial network (`--init`)."""
     seed: int = 0
     """Seed of weights, batches and jitter."""
     pixel_stride: int = 1

@@ -71,7 +71,7 @@ class GenerateConfig:
     points: int = 4096
     """Surface points per object."""
     spread: Spread = "random"
-    """How they lie: drawn by area, or by farthest-point sampling, as spnr render thins bigger clouds."""
+    """Distribution of the points: by area, or farthest-point sampling, as spnr render thins bigger clouds."""
     spp: int = 64
     """Samples per pixel; Mitsuba rounds it up to a product of two near-equal numbers."""
     max_depth: int = 6
@@ -81,7 +81,7 @@ class GenerateConfig:
     distance: float = 3.0
     """Distance of the cameras from the object's centre; the object fits into the unit sphere."""
     visibility: Visibility = "face"
-    """Points that a view sees: all on a face that a camera ray hits, or each point that nothing hides by itself."""
+    """Visible points: all on a face that a camera ray hits, or each point that is not occluded."""
     visibility_grid: int = 4
     """Rays per pixel side that look for visible faces."""
     envmap: Path | None = None

@@ -132,7 +132,7 @@ class Scene:
 class Volume:
     """An encoded object in the box [-1, 1]^3, which is (position - centre) * scale of the cloud.
 
-    `scene` is what the network encodes a cloud as: for networks of rays a `Scene`.
+    `scene` is what the network encodes a cloud as: for ray-marching networks a `Scene`.
     """
 
     scene: Any
@@ -141,7 +141,7 @@ class Volume:
     reach: int = struct.field(pytree_node=False, default=LARGEST_REACH)
     """Voxels around points that rays look at, from how far the points lie apart."""
     solid: Scene | None = None
-    """Of sparse surfels: what the network of rays makes of the points (`method/solid.py`)."""
+    """Of sparse surfels: what the ray-marching network makes of the points (`method/solid.py`)."""
 
 
 @no_type_check

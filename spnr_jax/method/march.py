@@ -1,4 +1,4 @@
-"""Rays through a field, whichever network it is: where their samples lie, and what of them is seen.
+"""Volume rendering of any field: sample along rays, query the field, composite.
 
     trace    all rays: those that meet nothing are left out, the others rendered in blocks on the device of their object
     march    rays of a block: coarse samples, fine samples where the coarse weights are large, compositing

@@ -1,4 +1,4 @@
-"""The handle for people who only want pictures: load a network, encode a cloud once, render it from anywhere.
+"""The model for people who only want pictures: load a network, encode a cloud once, render it from anywhere.
 
     model = spnr_jax.load()  # "surfels" of the package; or "near_points", a run folder, a file of weights
     volume = model.encode(spnr_jax.read_cloud("chair.ply"))
@@ -34,7 +34,8 @@ class Model:
     """A trained network.
 
     Its programs are compiled once for each bucket of points and size of pictures; `encode` and `render` themselves also
-    work on the host, so they are not for `jax.jit` (networks of rays: `inference.encode` and `inference.render` are).
+    work on the host, so they are not for `jax.jit` (`inference.encode` and `inference.render` of ray-marching networks
+    are).
     """
 
     config: NetworkConfig
@@ -61,7 +62,7 @@ class Model:
         """The object as the camera (unbatched, or with one axis of views) sees it; depth in the cloud's units.
 
         The network over surfels takes a light (default: the package's room), leaves its CNN out of `draft`, and draws
-        fewer pixels at `balanced`, which are enlarged; the networks of rays know the light that they were trained in
+        fewer pixels at `balanced`, which are enlarged; ray-marching networks know the light that they were trained in
         alone, and have these levels:
 
         `draft`, `balanced` and `best` look near the points alone, with a quarter, half and all of the samples of a ray,

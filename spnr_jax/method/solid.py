@@ -1,4 +1,4 @@
-"""Where an object is solid, as the network near points tells it: thin parts and outlines between points far apart.
+"""Opacity prior for sparse clouds, rendered by near_points: thin parts and outlines between points far apart.
 
     encode   the points of a sparse cloud            once per object
     seen     opacity and depth of a small picture    once per view

@@ -47,7 +47,7 @@ def encode_volume(
 
 
 def encode_solid(variables: dict | None, cloud: PointCloud, config: SurfelConfig) -> Scene | None:
-    """What the network of rays makes of a sparse cloud."""
+    """What the ray-marching network makes of a sparse cloud."""
     mask = np.asarray(cloud.mask)
     count = int(mask.sum())
     if variables is None or not config.solid or count > solid.MOST_POINTS:

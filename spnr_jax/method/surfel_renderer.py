@@ -55,7 +55,7 @@ class Plan(NamedTuple):
 
     `doublings` by the network, and `side` pixels averaged along each side of a pixel (1 or 2); `width` and `height` of
     the window of the G-buffer, in its pixels; `entries` pairs of disc and pixel and `slots` covered pixels that there
-    is room for; `solid` whether the network of rays is asked where a sparse cloud is solid (`method/solid.py`).
+    is room for; `solid` whether the ray-marching network is asked where a sparse cloud is solid (`method/solid.py`).
     """
 
     doublings: int
@@ -243,7 +243,7 @@ def _check(scene: SurfelScene, camera: Camera, light: Light | None, plan: Plan) 
 
 
 def solid_picture(params: dict, rays: Any, camera: Camera, plan: Plan) -> Float[Array, "height width 2"]:
-    """Opacity and depth of a view (camera in the box) as the network of rays sees it, at the network's resolution."""
+    """Opacity and depth of a view (camera in the box) as the ray-marching network sees it, at the plan's resolution."""
     return solid.seen(params["batch_stats"], rays, scaled(camera, plan.doublings, plan.side))
 
 

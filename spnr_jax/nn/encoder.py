@@ -57,7 +57,7 @@ def spread_out(material: Float[Array, "*batch channels"]) -> Float[Array, "*batc
 
 
 class Encoder(nn.Module):
-    """Both networks of rays begin with it; with bf16 the convolutions of the U-Net run in bfloat16."""
+    """Both ray-marching networks begin with it; with bf16 the convolutions of the U-Net run in bfloat16."""
 
     config: EncoderConfig
     bf16: bool = False

@@ -1,4 +1,4 @@
-"""What the shader network sees of a G-buffer, and the light that its outputs are factors of.
+"""Inputs of the shader network, and the lighting terms that its outputs scale.
 
 Everything is relative: vectors in the camera's axes, lengths in spacings or pixels.  So a picture does not depend on
 how the object, the camera and the light are turned together, nor on the unit of the cloud.
@@ -57,7 +57,7 @@ def features(
 ) -> tuple[Float[Array, "height width 34"], Float[Array, "height width 18"]]:
     """The network's input, which knows no light, and the maps of materials and light for `nn.shader.picture`.
 
-    `solid` is the opacity and the depth along the camera's axis that the network of rays sees; None is not known.
+    `solid` is the opacity and the depth along the camera's axis that the ray-marching network sees; None is not known.
     """
     first, bent, blended, last = jnp.split(buffer.attributes, (7, 10, 13), axis=-1)
     (roughness, metallic, *arriving, reflected, openness), (planarity, linearity, sided, guessed) = map(

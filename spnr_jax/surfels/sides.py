@@ -1,4 +1,4 @@
-"""Which side of each layer is outside: votes of the directions that see it, and of walls.
+"""Orientation of normals: votes of the directions that see a layer, and of opposite walls.
 
 Pure functions of a block of points, which are the last axis.  Votes are constants: they turn a normal or leave it, and
 have no gradient.

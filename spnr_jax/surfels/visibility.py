@@ -1,4 +1,4 @@
-"""Which directions see a point: orthographic depth buffers of the points themselves.
+"""Visibility of points from fixed directions, by orthographic depth buffers of the points themselves.
 
 From each of 64 directions the points are drawn into a grid whose cells are CELL spacings wide, every point into the
 four cells around it, at the depth that its plane has in the middle of the cell.  A point is seen where, lifted off the

@@ -32,7 +32,7 @@ def light_of_options(options: Lighting, read: Callable[[str], Light] = read_ligh
 
 
 def takes_light(model: Model) -> bool:
-    """Whether the network draws in any light; networks of rays know that of their training alone."""
+    """Whether the network accepts any light; ray-marching networks know that of their training alone."""
     return isinstance(model.config, SurfelConfig)
 
 

@@ -40,12 +40,12 @@ class Train:
     num_processes: int | None = None
     """Processes that train together."""
     process_id: int | None = None
-    """Which of them this is, from 0."""
+    """Rank of this process, from 0."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluate:
-    """Score a run's newest checkpoint beside the trivial renderers; write metrics.json and report.html."""
+    """Score a run's newest checkpoint beside trivial baselines; write metrics.json and report.html."""
 
     data: tyro.conf.Positional[Path]
     """Folder of the data set."""
@@ -73,9 +73,9 @@ class Export:
     network: Path | None = None
     """Network that draws the cloud for --splats and --mesh, as `spnr render --run` (default: surfels)."""
     lighting: tyro.conf.OmitArgPrefixes[Lighting] = field(default_factory=Lighting)
-    """The light of --splats, which is part of them."""
+    """Light baked into --splats."""
     making: tyro.conf.OmitArgPrefixes[SplatMaking] = field(default_factory=SplatMaking)
-    """How --splats are made."""
+    """Options of --splats."""
     up: Literal["auto", "x", "y", "z", "-x", "-y", "-z"] = "auto"
     """The upward axis of the file for --splats and --mesh; splats are written with y up."""
     clean: Literal["auto", "off", "strong"] = "auto"
@@ -93,7 +93,7 @@ class Export:
     reach: int = 4
     """Sampling radius around the points in voxels, 1 to 4: 1.6 times their median spacing, rounded up, is lossless."""
     platforms: tuple[Literal["cpu", "cuda", "rocm", "tpu"], ...] = ("cpu",)
-    """Where the functions are to run."""
+    """Target platforms."""
 
     def __post_init__(self) -> None:
         """ValueError names the option that makes no sense."""
@@ -134,7 +134,7 @@ class View:
     """Outliers of points are removed, and noisy ones averaged, before they are thinned; a clean cloud, and a mesh, stay
     as they are.  strong: at smaller deviations."""
     cut: tyro.conf.OmitArgPrefixes[Cut] = Cut()
-    """Which part of a scene is shown first; files that are dropped on the page are shown whole."""
+    """Object of a scene to show first; files dropped on the page are shown whole."""
     up: Literal["auto", "x", "y", "z", "-x", "-y", "-z"] = "auto"
     """The file's upward axis; auto looks for it, and says what it found."""
 

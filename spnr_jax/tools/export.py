@@ -36,7 +36,6 @@ from spnr_jax.surfels import lighting
 from spnr_jax.tools import surfel_export
 
 Arrays = dict[str, Any]
-MISSING = "exported functions need the package flatbuffers; pip install 'spnr-jax[export]'"
 
 
 def export_encode(model: Model, *, num_points: int = 1024, platforms: Sequence[str] | None = None) -> bytes:
@@ -156,17 +155,11 @@ def _described(array: jax.core.ShapedArray) -> dict[str, Any]:
 
 
 def _serialised(function: Callable[..., Arrays], platforms: Sequence[str] | None, *shapes: Arrays) -> bytes:
-    exported = export.export(jax.jit(function), platforms=platforms)(*shapes)
-    try:
-        return bytes(exported.serialize())
-    except ImportError:
-        raise UserError(MISSING) from None
+    return bytes(export.export(jax.jit(function), platforms=platforms)(*shapes).serialize())
 
 
 def _deserialised(content: bytes) -> export.Exported:
     try:
         return export.deserialize(bytearray(content))
-    except ImportError:
-        raise UserError(MISSING) from None
     except Exception as error:  # noqa: BLE001 - flatbuffers and JAX raise many kinds for bytes that are something else
         raise UserError(f"not a function that JAX exported ({type(error).__name__}); export it again") from None

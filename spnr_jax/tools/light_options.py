@@ -24,7 +24,7 @@ class Lighting:
     exposure: float = 0.0
     """Stops by which the light is brighter (negative: darker)."""
     background: Literal["white", "light"] = "white"
-    """What is behind the object: white, or the light's map, blurred."""
+    """Background: white, or the environment map, blurred."""
 
     @property
     def asked(self) -> tuple[str, ...]:

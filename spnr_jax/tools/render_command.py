@@ -32,7 +32,7 @@ class Render:
     """Network that renders: `surfels`, `near_points` or `near_points_lite` of the package, a run folder, a file of
     weights (default: surfels, of fewer than 2,000 points near_points)."""
     out: Path = Path("renders")
-    """Folder for what is written; what stands there of a folder's or pattern's files is not drawn again."""
+    """Output folder. Of a folder or pattern, files whose results are there are skipped."""
     workers: int | None = None
     """Processes that draw the files of a folder or pattern (default: this one; extra `cluster`)."""
     cluster: str | None = None
@@ -45,7 +45,7 @@ class Render:
     """Outliers of points are removed, and noisy ones averaged, before they are thinned; a clean cloud, and a mesh, stay
     as they are.  strong: at smaller deviations."""
     cut: tyro.conf.OmitArgPrefixes[Cut] = Cut()
-    """Which part of a scene is drawn, before it is cleaned."""
+    """Select one object of a scene, before it is cleaned."""
     transparent_parts: Literal["opaque", "skip"] = "opaque"
     """Glass and other parts of a mesh that light passes through: drawn in their colour, or left out.  What the alpha of
     a texture cuts out is left out either way."""
@@ -65,7 +65,7 @@ class Render:
     transparent: bool = False
     """Stills on a transparent background instead of white (straight alpha)."""
     lighting: tyro.conf.OmitArgPrefixes[Lighting] = Lighting()
-    """The light; of the networks of the package `surfels` alone takes another than that of its training."""
+    """Light; only `surfels` takes another than that of its training."""
     turntable: Literal["gif", "mp4", "none"] = "gif"
     """Format of the turntable."""
     turn: Literal["object", "light"] = "object"
@@ -81,7 +81,7 @@ class Render:
     splats: Literal["none", "ply", "spz"] = "none"
     """Also write Gaussian splats."""
     making: SplatMaking = field(default_factory=SplatMaking)
-    """How they are made."""
+    """Options of the Gaussian splats."""
 
     @property
     def asked_of_light(self) -> tuple[str, ...]:

@@ -45,9 +45,9 @@ class Share:
     out: Path = Path("page.html")
     """The .html to write."""
     title: str | None = None
-    """What stands above the object (default: the name of the file)."""
+    """Title (default: the file's name)."""
     credit: str = ""
-    """Whose object it is, and its licence: stands below it."""
+    """Credit and licence line."""
     run: Path | None = None
     """Network that draws it, as for `spnr render` (default: surfels)."""
     lighting: tyro.conf.OmitArgPrefixes[Lighting] = field(default_factory=Lighting)

@@ -157,7 +157,7 @@ def make_view(
 ) -> tuple[int, Arrays] | None:
     """Doublings and arrays of a view, `side` times smaller than its reference is kept; None if it teaches nothing.
 
-    `known` is what the network of rays, whose variables are `rays`, makes of the object.
+    `known` is what the ray-marching network, whose variables are `rays`, makes of the object.
     """
     small = cameras.resize(camera, camera.height // side, camera.width // side)
     doublings, finer = surfel_renderer.resolution(scene, small)

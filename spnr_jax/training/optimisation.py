@@ -292,7 +292,7 @@ def averaged_variables(state: TrainState) -> dict:
     return {"params": state.averaged, "batch_stats": state.averaged_stats}
 
 
-# runs once: a quick compilation, 2.7 s of the processor instead of 7.0 for `tiny`, is worth more than quick code
+# runs once: a quick compilation, 2.7 s of CPU time instead of 7.0 for `tiny`, is worth more than quick code
 ONCE = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
 jitted_create_state = jax.jit(create_state, static_argnames="config", compiler_options=ONCE)
 jitted_train_step = jax.jit(train_step, static_argnames=("config", "adversarial"), donate_argnames="state")

@@ -27,7 +27,7 @@ from spnr_jax.training.weights import Trained
 
 
 class Clock:
-    """Seconds since it was made, and those of the processor, by phase: each lap belongs to one."""
+    """Wall-clock and CPU seconds since it was made, by phase: each lap belongs to one."""
 
     def __init__(self) -> None:
         """Starts it."""

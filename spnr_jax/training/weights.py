@@ -50,7 +50,7 @@ def shipped(name: str = SHIPPED[0]) -> Path:
 
 
 def solid_variables(config: NetworkConfig) -> dict:
-    """Weights of the network of rays that one over surfels asks (`method/solid.py`): the package's, or none."""
+    """Weights of the ray-marching network that one over surfels asks (`method/solid.py`): the package's, or none."""
     asks = isinstance(config, SurfelConfig) and config.solid
     return read_weights(shipped("near_points")).variables if asks else {}
 

@@ -1,4 +1,4 @@
-"""What the training loop need not know of a network: its batches and its step.
+"""Training hooks of each method: its batches and its step.
 
 There are three kinds: networks that learn from whole views of clouds (`of_views`: the paper's, ours near points, the
 baselines), the shader network, which learns from crops of G-buffers (`of_gbuffers`), and a refiner alone, which learns
@@ -44,7 +44,7 @@ def work_of(
     light: Light | None,
     state: TrainState,
 ) -> Work:
-    """That of the config's network.
+    """Hooks of the config's method.
 
     The mesh and its share of a batch, the light, or the state's network are for one of the kinds each.
     """

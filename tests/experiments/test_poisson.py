@@ -7,7 +7,6 @@ from functools import partial
 
 import numpy as np
 import pytest
-from experiments.studies.sharpness import Poisson
 from support.handmade import RED, ball, plain
 
 from data_gen.render import light, views
@@ -16,6 +15,7 @@ from data_gen.store import layout
 from experiments.comparison import poisson
 from experiments.comparison.object_views import at, cut, on_white
 from experiments.studies import speed_accuracy
+from experiments.studies.sharpness import Poisson
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.mesh import surface_points
 from spnr_jax.formats.mesh.assets import Asset

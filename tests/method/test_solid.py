@@ -1,4 +1,4 @@
-"""What the network of rays tells of where an object is solid: its own pictures, in place, at any size."""
+"""What the ray-marching network tells of where an object is solid: its own pictures, in place, at any size."""
 
 import dataclasses
 
@@ -72,7 +72,7 @@ def volume_of(trained, count, params, config):
 
 @pytest.fixture(scope="module")
 def asking(trained):
-    """A config that asks the network of rays, and its variables."""
+    """A config that asks the ray-marching network, and its variables."""
     config = SurfelConfig(widths=(4, 4), top=4, solid=True)
     shader = jax.jit(surfel_renderer.init, static_argnums=1)(jax.random.key(0), config)
     return config, shader | {"batch_stats": trained.variables}

@@ -1,4 +1,4 @@
-"""An untrained network of rays and points; surfels of a ball and a view: what the tests of the viewer look at."""
+"""An untrained ray-marching network and points; surfels of a ball and a view: what the tests of the viewer look at."""
 
 import dataclasses
 import functools

@@ -1,6 +1,5 @@
 """An exported network draws the same pictures where there is nothing but JAX."""
 
-import importlib.util
 import json
 import subprocess
 import sys
@@ -15,9 +14,6 @@ from spnr_jax import cli
 from spnr_jax.kernels import cloud_arrays
 from spnr_jax.tools import export
 
-pytestmark = pytest.mark.skipif(
-    importlib.util.find_spec("flatbuffers") is None, reason="flatbuffers is not installed: pip install flatbuffers"
-)
 POINTS, SIZE = 256, 32
 # what a stranger does with the two files: no class of ours, no flax, no weights
 STRANGER = """

@@ -1,6 +1,5 @@
 """The default network exported: the pictures of the pure functions where there is nothing but JAX."""
 
-import importlib.util
 import json
 import subprocess
 import sys
@@ -18,9 +17,6 @@ from spnr_jax.kernels import cloud_arrays
 from spnr_jax.surfels.lighting import room_light, sun
 from spnr_jax.tools import export, surfel_export
 
-pytestmark = pytest.mark.skipif(
-    importlib.util.find_spec("flatbuffers") is None, reason="flatbuffers is not installed: pip install flatbuffers"
-)
 POINTS, SIZE = 128, 32
 # what a stranger does: imports of ours and of Flax fail
 STRANGER = """
