@@ -1,16 +1,23 @@
-"""The errors that a person can mend, the bugs that are ours, and when a call stack is shown."""
+"""The errors that a person can mend, the bugs that are ours, stops by Ctrl-C, and when a call stack is shown."""
 
+import _thread
 import contextlib
+import importlib
 import io
 import os
+import signal
 import sys
+import threading
+import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 JSON = (dict, list, str, int, float, bool, type(None))
 LONGEST_LINE = 800  # characters of an error
 PACKAGES = ("spnr_jax", "data_gen", "experiments")
+STOPPED = 130  # exit code after Ctrl-C
+AGAIN = 0.1  # seconds after which a stop that was swallowed is tried again
 
 
 class UserError(ValueError):
@@ -63,7 +70,19 @@ def one_line(error: Exception) -> str:
     return line if len(line) <= LONGEST_LINE else f"{line[: LONGEST_LINE // 2]} ... {line[-LONGEST_LINE // 2 :]}"
 
 
-def guarded(work: Callable[[], None], name: str, debug: bool = False) -> int:
+def start_command(module: str, name: str) -> None:
+    """Runs the `main` of a module; a stop while it is imported, which takes a second, is obeyed as any other."""
+    if code := guarded(lambda: importlib.import_module(module), name):
+        sys.exit(code)
+    importlib.import_module(module).main()
+
+
+def spnr() -> None:
+    """The command `spnr`."""
+    start_command("spnr_jax.cli", "spnr")
+
+
+def guarded(work: Callable[[], object], name: str, debug: bool = False) -> int:
     """Exit code of the work; an error that a person can mend is one line on stderr and code 2, a stop is code 130.
 
     For `debug` the line stands behind the call stack.
@@ -72,13 +91,14 @@ def guarded(work: Callable[[], None], name: str, debug: bool = False) -> int:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
     try:
-        try:
-            work()
-        finally:
-            sys.stdout.flush()
+        with _stops_obeyed():
+            try:
+                work()
+            finally:
+                sys.stdout.flush()
     except KeyboardInterrupt as stop:
         print(f"{name}: {str(stop) or 'stopped'}", file=sys.stderr)
-        return 130
+        return STOPPED
     except BrokenPipeError:
         with contextlib.suppress(OSError):  # Python flushes what is left at its end
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -90,3 +110,55 @@ def guarded(work: Callable[[], None], name: str, debug: bool = False) -> int:
         print(f"{name}: {one_line(error)}", file=sys.stderr)
         return 2
     return 0
+
+
+@contextlib.contextmanager
+def _stops_obeyed() -> Iterator[None]:
+    """KeyboardInterrupt after Ctrl-C, whatever becomes of the first one.
+
+    Where JAX calls Python, an exception is dropped, or becomes another (jax-ml/jax#18246, #9082).  So it is raised again
+    until it is on its way or arrives, and an error that follows a stop counts as one.
+    """
+    main = threading.current_thread() is threading.main_thread()
+    if not main or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        yield
+        return
+    asked, arrived, thread, report = [], [], threading.get_ident(), sys.unraisablehook
+
+    def stop(number: int, frame: object) -> None:
+        asked.append(number)
+        if len(asked) == 1:
+            _thread.start_new_thread(insist, ())  # takes no lock that the interrupted code may hold
+        raise KeyboardInterrupt
+
+    def insist() -> None:
+        while not arrived:
+            time.sleep(AGAIN)
+            if not arrived and not _stopping(thread):
+                signal.pthread_kill(thread, signal.SIGINT)
+
+    def notice(lost: "sys.UnraisableHookArgs") -> None:
+        if not issubclass(lost.exc_type, KeyboardInterrupt):
+            report(lost)
+
+    signal.signal(signal.SIGINT, stop)
+    sys.unraisablehook = notice
+    try:
+        yield
+    except Exception as error:
+        if asked:
+            raise KeyboardInterrupt from error
+        raise
+    finally:
+        arrived.append(True)
+        sys.unraisablehook = report
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def _stopping(thread: int) -> bool:
+    """Whether a thread handles a KeyboardInterrupt, in a `finally` say."""
+    error = sys._current_exceptions().get(thread)
+    error = error[1] if isinstance(error, tuple) else error  # Python 3.11: with type and call stack
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__context__
+    return error is not None
