@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from support import splat_balls
 from support.gltf_files import GltfBuilder
-from support.point_clouds import ply_bytes, read, write
+from support.point_clouds import packed_splats, ply_bytes, read, write
 
 from spnr_jax.formats import gaussian_files
 from spnr_jax.formats.clouds import place_cloud, read_cloud
@@ -400,15 +400,7 @@ def test_spz_of_version_2_is_read_and_others_and_damaged_ones_are_named(tmp_path
 
 
 def test_compressed_splats_in_a_ply_are_unpacked(tmp_path):
-    head = "ply\nformat binary_little_endian 1.0\nelement chunk 2\n"
-    head += "".join(f"property float {end}_{axis}\n" for end in ("min", "max") for axis in "xyz")
-    head += "element vertex 420\n"
-    head += "".join(f"property uint packed_{name}\n" for name in ("position", "rotation", "scale", "color"))
-    share = np.round((BALL + 1) / 2 * [2047, 1023, 2047]).astype(np.uint32)
-    rows = np.zeros((420, 4), "<u4")
-    rows[:, 0] = share[:, 0] << 21 | share[:, 1] << 11 | share[:, 2]
-    rows[:, 3] = PACKED << 8 | 255
-    content = (head + "end_header\n").encode() + np.array(2 * ([-1] * 3 + [1] * 3), "<f4").tobytes() + rows.tobytes()
+    content = packed_splats(BALL, PACKED << 8 | 255)
     cloud = read_cloud(write(tmp_path, "a.ply", content))
     np.testing.assert_allclose(cloud.positions, BALL, atol=1.1e-3)
     np.testing.assert_allclose(cloud.base_color, np.broadcast_to(LINEAR, (420, 3)), atol=2e-3)
