@@ -116,8 +116,8 @@ def guarded(work: Callable[[], object], name: str, debug: bool = False) -> int:
 def _stops_obeyed() -> Iterator[None]:
     """KeyboardInterrupt after Ctrl-C, whatever becomes of the first one.
 
-    Where JAX calls Python, an exception is dropped, or becomes another (jax-ml/jax#18246, #9082).  So it is raised again
-    until it is on its way or arrives, and an error that follows a stop counts as one.
+    Where JAX calls Python, an exception is dropped, or becomes another (jax-ml/jax#18246, #9082).  So it is raised
+    again until it is on its way or arrives, and an error that follows a stop counts as one.
     """
     main = threading.current_thread() is threading.main_thread()
     if not main or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:

@@ -120,6 +120,8 @@ def test_a_stop_is_obeyed_whatever_becomes_of_it_on_its_way(way):
 
 def test_a_stop_while_a_command_is_imported_is_one_line(tmp_path):
     (tmp_path / "slow.py").write_text("import os, signal\nos.kill(os.getpid(), signal.SIGINT)\nprint('imported')")
-    program = "import sys; from spnr_jax import errors; sys.path.append(sys.argv[1]); errors.start_command('slow', 'spnr')"
+    program = (
+        "import sys; from spnr_jax import errors; sys.path.append(sys.argv[1]); errors.start_command('slow', 'spnr')"
+    )
     done = subprocess.run([sys.executable, "-c", program, tmp_path], capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "spnr: stopped\n")

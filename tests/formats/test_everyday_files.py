@@ -101,6 +101,30 @@ def test_a_scene_of_points_alone_is_a_cloud(tmp_path):
     assert len(cloud.positions) == 4
 
 
+@pytest.mark.parametrize("space", ["srgb_rec709_display", "lin_rec709_display"])
+@pytest.mark.parametrize("name", ["COLOR_0", "KHR_gaussian_splatting:SH_DEGREE_0_COEF_0"])
+def test_splats_in_a_scene_are_points_of_their_colour_and_fog_is_left_out(tmp_path, space, name):
+    color = np.array(GREEN) / 255 if space.startswith("srgb") else LINEAR
+    values = color if name == "COLOR_0" else (color - 0.5) * 2 * np.sqrt(np.pi)
+    builder, extension = GltfBuilder(), "KHR_gaussian_splatting"
+    more = {name: np.tile(values, (420, 1)).astype("f4"), f"{extension}:OPACITY": np.where(PART, 0.1, 0.9).astype("f4")}
+    splats = builder.primitive(BALL.astype("f4"), None, mode=0, **more)
+    builder.mesh(splats | {"extensions": {extension: {"colorSpace": space}}}, scale=[2, 2, 2])
+    cloud, lines = read(builder.write(tmp_path / "a.glb"))
+    np.testing.assert_allclose(cloud.positions, 2 * BALL[~PART], atol=1e-6)
+    np.testing.assert_allclose(cloud.base_color, np.broadcast_to(LINEAR, (280, 3)), atol=2e-3)
+    assert any(line.startswith("140 of 420 points left out: opacity near 0") for line in lines)
+
+
+def test_colours_that_hold_light_are_said(tmp_path):
+    builder = GltfBuilder()
+    look = {"pbrMetallicRoughness": {"baseColorFactor": [*LINEAR, 1]}, "extensions": {"KHR_materials_unlit": {}}}
+    builder.mesh(builder.primitive(material=builder.material(name="sky", **look)))
+    cloud, lines = read(builder.write(tmp_path / "a.glb"), num_points=30)
+    np.testing.assert_allclose(cloud.base_color, np.broadcast_to(LINEAR, (30, 3)), atol=1e-5)
+    assert "colours that hold light already (KHR_materials_unlit) taken as base colours: 'sky'" in lines
+
+
 def with_lists(form: str) -> bytes:
     """A PLY file of three points, with a list before and one among their properties."""
     head = f"ply\nformat {form} 1.0\nelement edge 2\nproperty list uchar short ends\nelement vertex 3\n"
@@ -338,10 +362,10 @@ def test_an_l_of_one_face_keeps_its_notch_wherever_the_face_begins(tmp_path):
             assert (cloud.positions[:, 1] > 0.5).mean() == pytest.approx(0.75 / 1.75, abs=0.05)
 
 
-def stl(count: int, tail: bytes = b"") -> bytes:
+def stl(count: int, tail: bytes = b"", attribute: bytes = b"\0\0") -> bytes:
     """A binary STL file of two triangles."""
     triangles = [SQUARE[[0, 1, 2]], SQUARE[[0, 2, 3]]]
-    body = b"".join(np.append(np.zeros(3), corners).astype("<f4").tobytes() + b"\0\0" for corners in triangles)
+    body = b"".join(np.append(np.zeros(3), corners).astype("<f4").tobytes() + attribute for corners in triangles)
     return b"made by a scanner".ljust(80, b"\0") + struct.pack("<I", count) + body + tail
 
 
@@ -352,6 +376,12 @@ def test_a_binary_stl_with_a_tail_or_without_a_count_is_read_by_its_size(tmp_pat
     assert "the header announces 0 triangles, 2 stand behind it: these are drawn" in lines
     with pytest.raises(ValueError, match="announces 3 triangles, 2 are there"):
         read(write(tmp_path, "a.stl", stl(3)))
+
+
+def test_colours_of_an_stl_which_every_program_writes_in_its_own_way_are_named(tmp_path):
+    for attribute in (b"\0\0", b"\x9f\x02"):
+        _, lines = read(write(tmp_path, "a.stl", stl(2, attribute=attribute)), num_points=20)
+        assert ("ignored: STL attribute bytes" in lines) == (attribute != b"\0\0")
 
 
 def test_faces_with_a_vertex_that_is_no_number_are_left_out_and_counted(tmp_path):

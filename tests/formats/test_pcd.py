@@ -29,6 +29,13 @@ def test_every_encoding_of_a_pcd_gives_the_same_columns_and_packed_colours(tmp_p
     np.testing.assert_array_equal(unpack(columns["rgb"])[:, :3], COLORS)
 
 
+def test_points_that_are_called_compressed_and_stored_as_they_are_are_read(tmp_path):
+    rows = points()
+    columns = read_columns(write(tmp_path, content("binary_compressed", rows, stored=True)))
+    for name in ("x", "y", "z", "roughness", "rgb"):
+        np.testing.assert_array_equal(columns[name], rows[name])
+
+
 def test_a_cloud_of_a_pcd_has_its_colours_taken_as_srgb(tmp_path):
     cloud = read_cloud(write(tmp_path, content("binary", points())))
     np.testing.assert_allclose(cloud.base_color, srgb_to_linear(jnp.asarray(COLORS, jnp.float32) / 255), atol=1e-6)

@@ -46,8 +46,8 @@ def compress(data: bytes) -> bytes:
     return bytes(packed)
 
 
-def content(encoding: str, rows: np.ndarray, newline: str = "\n") -> bytes:
-    """A PCD file of the points in an encoding."""
+def content(encoding: str, rows: np.ndarray, newline: str = "\n", stored: bool = False) -> bytes:
+    """A PCD file of the points in an encoding; what should be compressed may be stored as it is."""
     header = ["# .PCD v0.7 - Point Cloud Data file format", "VERSION 0.7", "FIELDS x y _ z rgb roughness"]
     header += ["SIZE 4 4 1 4 4 8", "TYPE F F U F F F", "COUNT 1 1 3 1 1 1", f"WIDTH {len(rows)}", "HEIGHT 1"]
     header += ["VIEWPOINT 0 0 0 1 0 0 0", f"POINTS {len(rows)}", f"DATA {encoding}", ""]
@@ -58,5 +58,5 @@ def content(encoding: str, rows: np.ndarray, newline: str = "\n") -> bytes:
     if encoding == "binary":
         return head + rows.tobytes()
     plain = b"".join(np.ascontiguousarray(rows[name]).tobytes() for name in rows.dtype.names)
-    packed = compress(plain)
+    packed = plain if stored else compress(plain)
     return head + np.array([len(packed), len(plain)], "<u4").tobytes() + packed
