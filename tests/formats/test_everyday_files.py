@@ -61,13 +61,11 @@ TEXTS = {
     ".asc": ("a.asc", table(" "), True),
     ".pts with intensity": ("a.pts", "420\n" + table(" ", columns=[(*row[:3], -900, *GREEN) for row in ROWS]), True),
     "rows of red green blue alpha": ("a.txt", table(" ", columns=[(*row, 255) for row in ROWS]), True),
-    "OBJ of points": ("a.obj", "".join("v {:g} {:g} {:g} 0.157 0.667 0.235\n".format(*p) for p in BALL), True),
     "OBJ of v and p": (
         "a.obj",
         "".join("v {:g} {:g} {:g}\n".format(*p) for p in BALL) + "p " + " ".join(map(str, range(1, 421))),
         False,
     ),
-    "OFF of points": ("a.off", "OFF\n420 0 0\n" + table(" ", columns=BALL), False),
     "a PLY under another name": (
         "a.txt",
         ply_bytes("ascii", rows=[tuple(p) for p in BALL], properties=[(axis, "float") for axis in "xyz"]),
@@ -89,16 +87,6 @@ def test_arrays_of_pictures_and_of_colours_with_alpha_are_points(tmp_path):
     np.testing.assert_allclose(read_cloud(tmp_path / "a.npy").positions, BALL, atol=1e-6)
     np.save(tmp_path / "b.npy", np.column_stack([BALL, np.tile(np.array([*GREEN, 255]) / 255, (420, 1))]))
     np.testing.assert_allclose(read_cloud(tmp_path / "b.npy").base_color[0], LINEAR, atol=1e-3)
-
-
-def test_a_scene_of_points_alone_is_a_cloud(tmp_path):
-    builder = GltfBuilder()
-    square = builder.primitive(mode=0)
-    builder.mesh(square, translation=[0, 0, 2])
-    builder.write(tmp_path / "a.glb")
-    cloud = read_cloud(tmp_path / "a.glb")
-    np.testing.assert_allclose(cloud.positions[:, 2], 2)
-    assert len(cloud.positions) == 4
 
 
 @pytest.mark.parametrize("space", ["srgb_rec709_display", "lin_rec709_display"])

@@ -3,7 +3,9 @@
 import numpy as np
 
 from spnr_jax.formats.clouds import read_cloud
+from spnr_jax.formats.point_files import column_pieces, joined
 
+SRGB = np.where(np.arange(256) <= 10, np.arange(256) / 255 / 12.92, ((np.arange(256) / 255 + 0.055) / 1.055) ** 2.4)
 VERTEX = [("y", "double"), ("red", "uchar"), ("x", "float"), ("label", "short"), ("z", "float")]
 NUMPY = {"double": "f8", "uchar": "u1", "float": "f4", "short": "i2"}
 ROWS = [(0.125, 255, -1.5, -7, 3.0), (2.5, 0, 1e-3, 300, -4.25), (0.0, 7, 9.0, 0, 1.0)]
@@ -58,3 +60,8 @@ def read(path, **options):
     """The cloud and the lines that it reported."""
     lines: list[str] = []
     return read_cloud(path, report=lines.append, **options), lines
+
+
+def read_columns(path) -> dict[str, np.ndarray]:
+    """The columns of a whole file of points."""
+    return joined(column_pieces(path))
