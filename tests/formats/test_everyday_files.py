@@ -323,10 +323,11 @@ def test_a_file_that_rounds_an_axis_says_how_many_values_are_left(tmp_path):
 def test_repeats_are_merged_before_anything_looks_at_neighbours(tmp_path, jitter):
     rng = np.random.default_rng(0)
     repeated = np.repeat(BALL, 6, axis=0) + jitter * rng.uniform(-1, 1, (2520, 3))
-    np.savez(tmp_path / "a.npz", points=repeated, roughness=np.repeat(np.arange(420) / 420, 6))
+    rough = np.repeat(0.1 + np.arange(420) / 840, 6) + np.tile([-0.1, 0.1], 1260)
+    np.savez(tmp_path / "a.npz", points=repeated, roughness=rough)
     cloud, lines = read(tmp_path / "a.npz", clean="auto")
     np.testing.assert_allclose(cloud.positions, BALL, atol=1e-5)
-    np.testing.assert_allclose(cloud.roughness, np.arange(420) / 420, atol=1e-6)
+    np.testing.assert_allclose(cloud.roughness, 0.1 + np.arange(420) / 840, atol=1e-6)
     assert "2,100 of 2,520 points repeat others, and were merged with them" in lines
 
 
