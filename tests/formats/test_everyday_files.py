@@ -19,6 +19,7 @@ from support.point_clouds import packed_splats, ply_bytes, read, write
 from spnr_jax.formats import gaussian_files
 from spnr_jax.formats.clouds import place_cloud, read_cloud
 from spnr_jax.formats.cut import Cut
+from spnr_jax.formats.mesh.polygons import ears
 from spnr_jax.surfels.visibility import spiral
 
 ROOT = Path(__file__).parents[2]
@@ -349,6 +350,15 @@ def test_an_l_of_one_face_keeps_its_notch_wherever_the_face_begins(tmp_path):
             cloud = read_cloud(write(tmp_path, name, content), num_points=1000)
             assert not (cloud.positions[:, :2] > 0.501).all(axis=1).any()
             assert (cloud.positions[:, 1] > 0.5).mean() == pytest.approx(0.75 / 1.75, abs=0.05)
+
+
+def test_a_wavy_polygon_of_many_corners_keeps_its_area():
+    angle = np.linspace(0, 2 * np.pi, 900, endpoint=False)
+    corners = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1) * (1 + 0.3 * np.cos(40 * angle))[:, None]
+    a, b, c = np.moveaxis(corners[ears(corners)], 1, 0)
+    twice = np.cross(b - a, c - a)[:, 2]
+    assert (twice > 0).all()
+    assert twice.sum() == pytest.approx(np.cross(corners, np.roll(corners, -1, axis=0))[:, 2].sum())
 
 
 def stl(count: int, tail: bytes = b"", attribute: bytes = b"\0\0") -> bytes:
