@@ -8,7 +8,6 @@ import os
 import signal
 import sys
 import threading
-import time
 import traceback
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -123,7 +122,9 @@ def _stops_obeyed() -> Iterator[None]:
     if not main or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
         yield
         return
-    asked, arrived, thread, report = [], [], threading.get_ident(), sys.unraisablehook
+    asked: list[int] = []
+    arrived = threading.Event()
+    thread, report = threading.get_ident(), sys.unraisablehook
 
     def stop(number: int, frame: object) -> None:
         asked.append(number)
@@ -132,9 +133,8 @@ def _stops_obeyed() -> Iterator[None]:
         raise KeyboardInterrupt
 
     def insist() -> None:
-        while not arrived:
-            time.sleep(AGAIN)
-            if not arrived and not _stopping(thread):
+        while not arrived.wait(AGAIN):
+            if not _stopping(thread):
                 signal.pthread_kill(thread, signal.SIGINT)
 
     def notice(lost: "sys.UnraisableHookArgs") -> None:
@@ -150,15 +150,15 @@ def _stops_obeyed() -> Iterator[None]:
             raise KeyboardInterrupt from error
         raise
     finally:
-        arrived.append(True)
+        arrived.set()
         sys.unraisablehook = report
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def _stopping(thread: int) -> bool:
     """Whether a thread handles a KeyboardInterrupt, in a `finally` say."""
-    error = sys._current_exceptions().get(thread)
-    error = error[1] if isinstance(error, tuple) else error  # Python 3.11: with type and call stack
+    found: Any = sys._current_exceptions().get(thread)
+    error = found[1] if isinstance(found, tuple) else found  # Python 3.11: with type and call stack
     while error is not None and not isinstance(error, KeyboardInterrupt):
         error = error.__context__
     return error is not None

@@ -40,6 +40,7 @@ def table(separator: str, end: str = "", comma: bool = False, columns=ROWS) -> s
 # Points in text: (name, content, whether there are colours)
 TEXTS = {
     "count line": ("a.xyz", "420\n" + table(" "), True),
+    "count line, semicolons": ("a.xyz", "420\n" + table(";"), True),
     "CloudCompare, count": ("a.txt", "//X Y Z R G B\n420\n" + table(" "), True),
     "CloudCompare, names with blanks": (
         "a.txt",
