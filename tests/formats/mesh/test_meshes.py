@@ -1,6 +1,8 @@
 """Mesh folders and files: ids, the formats without materials, and real files where they are at hand."""
 
 import hashlib
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -106,6 +108,13 @@ class TestPlainFormats:
             with pytest.raises(RejectedAsset) as caught:
                 load_mesh(path)
             assert "\n" not in str(caught.value)
+
+    def test_no_call_stack_of_trimesh_reaches_a_person(self, tmp_path):
+        loop = "outer loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\n"
+        write(tmp_path / "a.stl", f"solid a\nfacet normal 0 0 x\n{loop}endsolid a\n")
+        program = "import sys; from spnr_jax.formats.clouds import read_cloud; read_cloud(sys.argv[1], num_points=9)"
+        done = subprocess.run([sys.executable, "-c", program, tmp_path / "a.stl"], capture_output=True, text=True)
+        assert (done.returncode, done.stdout + done.stderr) == (0, "")
 
     def test_a_suffix_that_is_not_read_is_refused(self, tmp_path):
         with pytest.raises(RejectedAsset, match="expected one of .glb"):
