@@ -23,7 +23,8 @@ def keep_programs() -> None:
     """Lets a second run skip XLA's compilation; JAX_COMPILATION_CACHE_DIR moves the cache.
 
     On some processors XLA logs two long errors for each program that it reads, though nothing is wrong with it
-    (openxla/xla#44565).  Where JAX is not imported yet they are kept off the terminal; TF_CPP_MIN_LOG_LEVEL=2 shows them.
+    (openxla/xla#44565).  Where JAX is not imported yet they are kept off the terminal; TF_CPP_MIN_LOG_LEVEL=2 shows
+    them.
     """
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     import jax
