@@ -20,7 +20,7 @@ import tyro
 
 from spnr_jax import methods, presets
 from spnr_jax.devices import allocator, compilation
-from spnr_jax.errors import STOPPED, UserError, guarded, split_debug
+from spnr_jax.errors import STOPPED, UserError, guarded, split_debug, stopped_at_once
 from spnr_jax.tools.commands import Evaluate, Export, Train, View
 from spnr_jax.tools.render_command import Render, is_catalogue
 from spnr_jax.tools.splat_options import Share
@@ -97,7 +97,8 @@ def _taken(arguments: list[str], name: str) -> tuple[str | None, list[str]]:
 
 def run(command: Command) -> None:
     """Carries a command out."""
-    set_up_jax(repeats=not isinstance(command, View) and not (isinstance(command, Render) and command.few))
+    with stopped_at_once("spnr"):
+        set_up_jax(repeats=not isinstance(command, View) and not (isinstance(command, Render) and command.few))
     match command:
         case Train():
             run_train(command)

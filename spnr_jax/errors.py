@@ -71,9 +71,27 @@ def one_line(error: Exception) -> str:
 
 def start_command(module: str, name: str) -> None:
     """Runs the `main` of a module; a stop while it is imported, which takes a second, is obeyed as any other."""
-    if code := guarded(lambda: importlib.import_module(module), name):
-        sys.exit(code)
-    importlib.import_module(module).main()
+    with stopped_at_once(name):
+        program = importlib.import_module(module)
+    program.main()
+
+
+@contextlib.contextmanager
+def stopped_at_once(name: str) -> Iterator[None]:
+    """Ctrl-C ends the process while libraries are loaded: nothing is lost, and exceptions crash some of them."""
+
+    def stop(number: int, frame: object) -> None:
+        os.write(2, f"{name}: stopped\n".encode())
+        os._exit(STOPPED)
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def spnr() -> None:
@@ -124,7 +142,7 @@ def _stops_obeyed() -> Iterator[None]:
         return
     asked: list[int] = []
     arrived = threading.Event()
-    thread, report = threading.get_ident(), sys.unraisablehook
+    thread, report, show = threading.get_ident(), sys.unraisablehook, sys.excepthook
 
     def stop(number: int, frame: object) -> None:
         asked.append(number)
@@ -141,8 +159,12 @@ def _stops_obeyed() -> Iterator[None]:
         if not issubclass(lost.exc_type, KeyboardInterrupt):
             report(lost)
 
+    def print_others(kind: type[BaseException], error: BaseException, trace: Any) -> None:  # for C code that prints
+        if not issubclass(kind, KeyboardInterrupt):
+            show(kind, error, trace)
+
     signal.signal(signal.SIGINT, stop)
-    sys.unraisablehook = notice
+    sys.unraisablehook, sys.excepthook = notice, print_others
     try:
         yield
     except Exception as error:
@@ -151,7 +173,7 @@ def _stops_obeyed() -> Iterator[None]:
         raise
     finally:
         arrived.set()
-        sys.unraisablehook = report
+        sys.unraisablehook, sys.excepthook = report, show
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
