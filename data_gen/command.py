@@ -3,6 +3,8 @@
 import importlib.util
 import sys
 
+from spnr_jax.errors import start_command
+
 PACKAGES = ("mitsuba", "dask", "distributed", "fsspec", "psutil")  # the extra `data`, as pyproject.toml names it
 
 
@@ -11,6 +13,4 @@ def main() -> None:
     if missing := [name for name in PACKAGES if importlib.util.find_spec(name) is None]:
         print(f"spnr-data: needs {', '.join(missing)}; pip install 'spnr-jax[data]'", file=sys.stderr)
         sys.exit(2)
-    from data_gen.__main__ import main as run
-
-    run()
+    start_command("data_gen.__main__", "spnr-data")

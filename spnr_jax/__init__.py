@@ -3,9 +3,10 @@
 `import spnr_jax` loads nothing of JAX: what stands here is imported when it is first asked for.
 """
 
-import importlib.metadata
 import warnings
 from importlib import import_module
+
+from jaxlib import version  # without JAX
 
 _PUBLIC = {"load": "training.weights", "Model": "method.model", "Volume": "method.model"}
 _PUBLIC |= dict.fromkeys(("Plan", "plan", "render"), "method.surfel_renderer")
@@ -25,9 +26,9 @@ __all__ = sorted(_PUBLIC)
 
 def warn_of_wrong_numbers() -> None:
     """Warns, in one line, of an installed jaxlib that is known to compute wrong numbers."""
-    version = importlib.metadata.version("jaxlib")
-    if version in WRONG:
-        line = f"jaxlib {version} computes wrong numbers on a CPU ({WRONG[version]}): pip install 'jax!={version}'"
+    found = version.__version__
+    if found in WRONG:
+        line = f"jaxlib {found} computes wrong numbers on a CPU ({WRONG[found]}): pip install 'jax!={found}'"
         warnings.warn(line, stacklevel=3)
 
 

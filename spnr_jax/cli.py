@@ -20,7 +20,7 @@ import tyro
 
 from spnr_jax import methods, presets
 from spnr_jax.devices import allocator, compilation
-from spnr_jax.errors import UserError, guarded, split_debug
+from spnr_jax.errors import STOPPED, UserError, guarded, split_debug, stopped_at_once
 from spnr_jax.tools.commands import Evaluate, Export, Train, View
 from spnr_jax.tools.render_command import Render, is_catalogue
 from spnr_jax.tools.splat_options import Share
@@ -36,12 +36,14 @@ Command = Train | Evaluate | Render | View | Export | Share
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line."""
+    whole = arguments is None  # process
     arguments, debug = split_debug(sys.argv[1:] if arguments is None else arguments)
     code = guarded(lambda: run(parse(arguments)), "spnr", debug)
-    if code == 2 and _one_of_several():
+    # JAX would wait for the other processes, which wait for this one; of what it still compiles Python's end crashes
+    if (code == 2) if _one_of_several() else (code == STOPPED and whole):
         sys.stdout.flush()
         sys.stderr.flush()
-        os._exit(code)  # JAX would wait for the other processes, which wait for this one
+        os._exit(code)
     sys.exit(code)
 
 
@@ -95,7 +97,8 @@ def _taken(arguments: list[str], name: str) -> tuple[str | None, list[str]]:
 
 def run(command: Command) -> None:
     """Carries a command out."""
-    set_up_jax(repeats=not isinstance(command, View) and not (isinstance(command, Render) and command.few))
+    with stopped_at_once("spnr"):
+        set_up_jax(repeats=not isinstance(command, View) and not (isinstance(command, Render) and command.few))
     match command:
         case Train():
             run_train(command)

@@ -1,16 +1,22 @@
-"""The errors that a person can mend, the bugs that are ours, and when a call stack is shown."""
+"""The errors that a person can mend, the bugs that are ours, stops by Ctrl-C, and when a call stack is shown."""
 
+import _thread
 import contextlib
+import importlib
 import io
 import os
+import signal
 import sys
+import threading
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 JSON = (dict, list, str, int, float, bool, type(None))
 LONGEST_LINE = 800  # characters of an error
 PACKAGES = ("spnr_jax", "data_gen", "experiments")
+STOPPED = 130  # exit code after Ctrl-C
+AGAIN = 0.1  # seconds after which a stop that was swallowed is tried again
 
 
 class UserError(ValueError):
@@ -63,7 +69,37 @@ def one_line(error: Exception) -> str:
     return line if len(line) <= LONGEST_LINE else f"{line[: LONGEST_LINE // 2]} ... {line[-LONGEST_LINE // 2 :]}"
 
 
-def guarded(work: Callable[[], None], name: str, debug: bool = False) -> int:
+def start_command(module: str, name: str) -> None:
+    """Runs the `main` of a module; a stop while it is imported, which takes a second, is obeyed as any other."""
+    with stopped_at_once(name):
+        program = importlib.import_module(module)
+    program.main()
+
+
+@contextlib.contextmanager
+def stopped_at_once(name: str) -> Iterator[None]:
+    """Ctrl-C ends the process while libraries are loaded: nothing is lost, and exceptions crash some of them."""
+
+    def stop(number: int, frame: object) -> None:
+        os.write(2, f"{name}: stopped\n".encode())
+        os._exit(STOPPED)
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def spnr() -> None:
+    """The command `spnr`."""
+    start_command("spnr_jax.cli", "spnr")
+
+
+def guarded(work: Callable[[], object], name: str, debug: bool = False) -> int:
     """Exit code of the work; an error that a person can mend is one line on stderr and code 2, a stop is code 130.
 
     For `debug` the line stands behind the call stack.
@@ -72,13 +108,14 @@ def guarded(work: Callable[[], None], name: str, debug: bool = False) -> int:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
     try:
-        try:
-            work()
-        finally:
-            sys.stdout.flush()
+        with _stops_obeyed():
+            try:
+                work()
+            finally:
+                sys.stdout.flush()
     except KeyboardInterrupt as stop:
         print(f"{name}: {str(stop) or 'stopped'}", file=sys.stderr)
-        return 130
+        return STOPPED
     except BrokenPipeError:
         with contextlib.suppress(OSError):  # Python flushes what is left at its end
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -90,3 +127,60 @@ def guarded(work: Callable[[], None], name: str, debug: bool = False) -> int:
         print(f"{name}: {one_line(error)}", file=sys.stderr)
         return 2
     return 0
+
+
+@contextlib.contextmanager
+def _stops_obeyed() -> Iterator[None]:
+    """KeyboardInterrupt after Ctrl-C, whatever becomes of the first one.
+
+    Where JAX calls Python, an exception is dropped, or becomes another (jax-ml/jax#18246, #9082).  So it is raised
+    again until it is on its way or arrives, and an error that follows a stop counts as one.
+    """
+    main = threading.current_thread() is threading.main_thread()
+    if not main or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        yield
+        return
+    asked: list[int] = []
+    arrived = threading.Event()
+    thread, report, show = threading.get_ident(), sys.unraisablehook, sys.excepthook
+
+    def stop(number: int, frame: object) -> None:
+        asked.append(number)
+        if len(asked) == 1:
+            _thread.start_new_thread(insist, ())  # takes no lock that the interrupted code may hold
+        raise KeyboardInterrupt
+
+    def insist() -> None:
+        while not arrived.wait(AGAIN):
+            if not _stopping(thread):
+                signal.pthread_kill(thread, signal.SIGINT)
+
+    def notice(lost: "sys.UnraisableHookArgs") -> None:
+        if not issubclass(lost.exc_type, KeyboardInterrupt):
+            report(lost)
+
+    def print_others(kind: type[BaseException], error: BaseException, trace: Any) -> None:  # for C code that prints
+        if not issubclass(kind, KeyboardInterrupt):
+            show(kind, error, trace)
+
+    signal.signal(signal.SIGINT, stop)
+    sys.unraisablehook, sys.excepthook = notice, print_others
+    try:
+        yield
+    except Exception as error:
+        if asked:
+            raise KeyboardInterrupt from error
+        raise
+    finally:
+        arrived.set()
+        sys.unraisablehook, sys.excepthook = report, show
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def _stopping(thread: int) -> bool:
+    """Whether a thread handles a KeyboardInterrupt, in a `finally` say."""
+    found: Any = sys._current_exceptions().get(thread)
+    error = found[1] if isinstance(found, tuple) else found  # Python 3.11: with type and call stack
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__context__
+    return error is not None

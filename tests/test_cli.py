@@ -36,15 +36,17 @@ for line in sys.argv[1:]:
 """
 
 
-def test_memory_is_kept_where_work_repeats_itself_and_compilations_always(tmp_path):
+@pytest.mark.parametrize(("variable", "below"), [("HOME", ".cache/spnr_jax"), ("XDG_CACHE_HOME", "spnr_jax")])
+def test_memory_is_kept_where_work_repeats_itself_and_compilations_always(tmp_path, variable, below):
+    others = ("JAX_COMPILATION_CACHE_DIR", "XDG_CACHE_HOME")
     done = subprocess.run(
         [sys.executable, "-c", SETTING_UP, "render x.ply --turntable none", "render x.ply", "evaluate a b"],
-        env={k: v for k, v in os.environ.items() if k != "JAX_COMPILATION_CACHE_DIR"} | {"HOME": str(tmp_path)},
+        env={k: v for k, v in os.environ.items() if k not in others} | {variable: str(tmp_path)},
         capture_output=True,
         text=True,
         check=True,
     )
-    cache = tmp_path / ".cache" / "spnr_jax"
+    cache = tmp_path / below
     assert done.stdout.splitlines() == [f"True {cache}", f"kept False {cache}", f"kept False {cache}"]
 
 

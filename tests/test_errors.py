@@ -1,6 +1,9 @@
 """A bug of ours is told apart from a broken file, and --debug is taken from any place of a command line."""
 
 import json
+import os
+import subprocess
+import sys
 
 import pytest
 
@@ -50,3 +53,75 @@ def test_debug_is_an_option_at_any_place_or_a_variable(monkeypatch):
     for value, shown in (("1", True), ("0", False), ("", False)):
         monkeypatch.setenv("SPNR_DEBUG", value)
         assert errors.split_debug([]) == ([], shown)
+
+
+ODD_NAME = """
+from spnr_jax import errors
+name = b"caf\\xe9-\\xff.ply".decode("utf-8", "surrogateescape") + "\\u732b"
+errors.guarded(lambda: print(name), "spnr")
+"""
+
+
+def test_a_name_that_the_terminal_cannot_print_stops_nothing():
+    ascii_only = os.environ | {"PYTHONIOENCODING": "ascii"}
+    done = subprocess.run([sys.executable, "-c", ODD_NAME], env=ascii_only, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout == "caf\\udce9-\\udcff.ply\\u732b\n"
+
+
+STOPPED = """
+import gc, os, signal, sys, threading, time
+from spnr_jax import errors
+
+def interrupt(*_):
+    os.kill(os.getpid(), signal.SIGINT)
+
+def dropped():  # as JAX's callback of the garbage collector does
+    gc.callbacks.append(interrupt)
+    gc.collect()
+    gc.callbacks.clear()
+    time.sleep(20)
+
+def caught():
+    for _ in range(3):
+        try:
+            interrupt()
+            time.sleep(20)
+        except KeyboardInterrupt:
+            pass
+    time.sleep(20)
+
+def changed():
+    try:
+        interrupt()
+    except KeyboardInterrupt as stop:
+        raise RuntimeError("INTERNAL: KeyboardInterrupt") from stop
+
+def tidied():
+    try:
+        interrupt()
+    finally:
+        time.sleep(5 * errors.AGAIN)
+        print("tidied")
+
+begin = time.monotonic()
+code = errors.guarded(globals()[sys.argv[1]], "spnr")
+assert time.monotonic() - begin < 15
+sys.exit(code)
+"""
+
+
+@pytest.mark.parametrize("way", ["dropped", "caught", "changed", "tidied"])
+def test_a_stop_is_obeyed_whatever_becomes_of_it_on_its_way(way):
+    done = subprocess.run([sys.executable, "-c", STOPPED, way], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stderr) == (130, "spnr: stopped\n")
+    assert done.stdout == ("tidied\n" if way == "tidied" else "")
+
+
+def test_a_stop_while_a_command_is_imported_is_one_line(tmp_path):
+    (tmp_path / "slow.py").write_text("import os, signal\nos.kill(os.getpid(), signal.SIGINT)\nprint('imported')")
+    program = (
+        "import sys; from spnr_jax import errors; sys.path.append(sys.argv[1]); errors.start_command('slow', 'spnr')"
+    )
+    done = subprocess.run([sys.executable, "-c", program, tmp_path], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "spnr: stopped\n")

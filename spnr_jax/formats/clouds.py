@@ -24,7 +24,7 @@ from spnr_jax.errors import UserError
 from spnr_jax.formats.columns import DEFAULTS, Columns, Report, believed, materials, normals, sound, useful
 from spnr_jax.formats.cut import Cut
 from spnr_jax.formats.mesh.assets import ShownParts
-from spnr_jax.formats.point_files import MESHES, column_pieces, is_mesh, kind_of, parse_ply
+from spnr_jax.formats.point_files import MESHES, column_pieces, kind_of, parse_ply
 from spnr_jax.formats.sensor import sensor_of
 from spnr_jax.formats.up_axis import ROTATIONS, find_up
 from spnr_jax.kernels import scenes
@@ -148,11 +148,12 @@ def _placed(
     report: Report,
 ) -> PlacedCloud:
     """The whole path, from a file of a known kind to a cloud."""
-    mesh = is_mesh(path, kind)
-    if mesh:
+    pieces = column_pieces(path, kind)
+    mesh = pieces is None
+    if pieces is None:
         points = _sampled_mesh(path, kind, num_points, seed, cut, transparent_parts, report)
     else:
-        points = _interpreted(_bounded_columns(path, kind, num_points, cut, report), cut, report)
+        points = _interpreted(_bounded_columns(pieces, num_points, cut, report), cut, report)
         points = _without_repeats(points, report)
     rows, lines = scenes.object_of(points.positions, points.origin, cut.remove_plane, cut.nth, seed)
     points, noise = points.chosen(rows), 0.0
@@ -269,14 +270,14 @@ def _sampled_mesh(
     return points.chosen(inside)
 
 
-def _bounded_columns(path: Path, kind: str, num_points: int | None, cut: Cut, report: Report) -> Columns:
+def _bounded_columns(pieces: Iterator[Columns], num_points: int | None, cut: Cut, report: Report) -> Columns:
     """The useful columns of a point file inside the box to be cut out, of very many points those of a random sample."""
     capacity, broken, outside = max(CAPACITY, THINNING * (num_points or 0)), 0, 0
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
 
     def sound_pieces() -> Iterator[Columns]:
         nonlocal broken, outside, low, high
-        for piece in column_pieces(path, kind):
+        for piece in pieces:
             columns = useful(piece)
             wanted = sound(columns)
             broken += int(np.count_nonzero(~wanted))

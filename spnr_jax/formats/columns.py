@@ -20,6 +20,7 @@ import numpy as np
 from spnr_jax.errors import UserError
 from spnr_jax.formats.mesh import file_colors as colors
 from spnr_jax.formats.mesh.texels import srgb_to_linear
+from spnr_jax.gaussians.harmonics import C0
 
 Columns = dict[str, np.ndarray]
 Report = Callable[[str], None]
@@ -27,7 +28,6 @@ Report = Callable[[str], None]
 POSITION = ("x", "y", "z")
 NORMAL = ("nx", "ny", "nz")
 SPLAT = ("f_dc_0", "f_dc_1", "f_dc_2")  # the constant spherical-harmonic coefficients: sRGB = 0.5 + C0 * f_dc
-C0 = 0.5 / np.sqrt(np.pi)
 PREFIX = "scalar_"  # CloudCompare's, for everything but positions and colours
 ALIASES = (  # groups that stand for each other: the first that is there counts
     (

@@ -106,31 +106,19 @@ def _version(head: bytes, place: tuple[int, int] | None) -> str:
     return f" of version {'.'.join(map(str, numbers))}"
 
 
-def is_mesh(path: Path, kind: str) -> bool:
-    """Whether a file of this kind has faces."""
+def column_pieces(path: Path, kind: str | None = None) -> Iterator[Columns] | None:
+    """The columns of a file of points, some points at a time; None where it has faces; `kind` as kind_of says."""
+    kind = kind or kind_of(path)
     if kind == ".ply":
         with path.open("rb") as file:
-            return read_ply_header(file).is_mesh
-    if kind not in MESHES:
-        return False
-    from spnr_jax.formats.mesh.meshes import points_of  # here: points are read without trimesh
-
-    return points_of(path, kind) is None
-
-
-def column_pieces(path: Path, kind: str | None = None) -> Iterator[Columns]:
-    """The columns of a file of points, some points at a time; `kind` as kind_of says."""
-    kind = kind or kind_of(path)
+            if read_ply_header(file).is_mesh:
+                return None
     if kind in READERS:
         return READERS[kind](path)
-    from spnr_jax.formats.mesh.meshes import points_of
+    from spnr_jax.formats.mesh.meshes import points_of  # here: points are read without trimesh
 
-    return iter([points_of(path, kind) or {}])
-
-
-def read_columns(path: Path) -> Columns:
-    """The columns of a whole point file."""
-    return joined(column_pieces(path))
+    columns = points_of(path, kind)
+    return None if columns is None else iter([columns])
 
 
 def parse_ply(content: bytes) -> Columns:

@@ -27,7 +27,7 @@ from scipy.spatial import cKDTree
 
 from spnr_jax.errors import UserError
 from spnr_jax.kernels.records import PointCloud
-from spnr_jax.kernels.repeats import find_distinct
+from spnr_jax.kernels.repeats import find_distinct, unit_means
 from spnr_jax.kernels.thinning import voxel_keys
 
 Strength = Literal["auto", "strong"]
@@ -68,7 +68,6 @@ CELL = 1.0, 3.0  # standard deviations of the noise, spacings: side of a voxel t
 CELLS = 27  # voxels that are compared
 THIN = 0.3  # of the points that those hold, for a point of theirs, below which a voxel is fringe
 MOST_MOVED = 2**17  # points that are moved; of more, a part
-CANCELLED = 0.5  # length of a mean of unit normals below which they contradict each other
 
 
 class Cleaned(NamedTuple):
@@ -238,9 +237,7 @@ def averaged(
     moved = np.concatenate([moved_of(slice(i, i + ROWS)) for i in range(0, len(start), ROWS)])
     means = _means(moved, {name: column[rows] for name, column in values.items()}, MEAN * max(sigma, spacing))
     if "normals" in means:
-        length = np.linalg.norm(means["normals"], axis=1, keepdims=True)
-        agreed = length > CANCELLED
-        means["normals"] = np.where(agreed, means["normals"] / np.where(agreed, length, 1), 0)
+        means["normals"] = unit_means(means["normals"])
     return moved, means
 
 

@@ -34,9 +34,14 @@ def merge_repeats(positions: Float[np.ndarray, "points 3"], values: Values) -> t
     kept = np.sort(first)
     values = {name: _means(column, group)[group[kept]] for name, column in values.items()}
     if "normals" in values:
-        length = np.linalg.norm(values["normals"], axis=1, keepdims=True)
-        values["normals"] = np.where(length > CANCELLED, values["normals"] / np.maximum(length, CANCELLED), 0)
+        values["normals"] = unit_means(values["normals"])
     return positions[kept], values, merged
+
+
+def unit_means(normals: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, "points 3"]:
+    """Means of unit normals at length 1, 0 where these contradict each other."""
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    return np.where(length > CANCELLED, normals / np.maximum(length, CANCELLED), 0)
 
 
 def _labels(positions: np.ndarray) -> np.ndarray:

@@ -192,8 +192,9 @@ def write_page(batch: Batch, items: Sequence[Item], faults: Mapping[str, str]) -
     for item in items:
         record = standing(batch, item) or {"files": [], "notes": []}
         fault = faults.get(item.name) or (None if record["files"] else "not drawn yet")
-        places = {name: quote(f"{item.name}/{name}") for name in record["files"]}
+        places = {name: quote(f"{item.name}/{name}", errors="surrogateescape") for name in record["files"]}
         entries.append({"name": item.name, "fault": fault, "places": places, "notes": record["notes"]})
     page, text = batch.options.out / "index.html", template(Path(__file__).with_suffix(".html"))
-    write_whole(page, text.render(entries=entries, faults=faults).encode())
+    # the bytes of a name may be no text
+    write_whole(page, text.render(entries=entries, faults=faults).encode(errors="replace"))
     return page

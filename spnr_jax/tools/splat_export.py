@@ -108,7 +108,7 @@ def page(
     }
     text = resources.files("spnr_jax.tools").joinpath("share_page.html").read_text("utf-8")
     first, *others = text.split("@")  # what stands between two is a name: the parts hold any characters
-    content = (first + "".join(parts.get(piece, piece) for piece in others)).encode()
+    content = (first + "".join(parts.get(piece, piece) for piece in others)).encode(errors="replace")
     if len(content) > MOST_BYTES:
         raise UserError(
             f"the page would be {len(content) / 1e6:.1f} MB, at most {MOST_BYTES / 1e6:.0f}; "

@@ -31,7 +31,6 @@ from spnr_jax.formats.clouds import read_cloud
         ("a.xyz", "1 2 3\n" * 5, "holds 5 points in 1 place: no object"),
         ("a.xyz", "1 2 3\n4 5 6\n" * 5, "holds 10 points in 2 places: no object"),
         ("a.xyz", "".join(f"{i} {2 * i} 0.1\n" for i in range(50)), "50 points on one straight line"),
-        ("a.txt", "1 2 3\n4 5 6\n7 8\n", "line 3: expected 3 numbers, found '7 8'"),
         ("a.txt", "1 2 3\n4 5 6\nend\n", "line 3: expected 3 numbers, found 'end'"),
         ("a.e57", b"ASTM-E57\1\0\0\0\0\0\0\0", "E57 scan of version 1.0, which is not read: convert it to .las"),
         ("a.usdc", b"PXR-USDC\0\x08\0", r"USD \(binary crate\) of version 0.8.0"),
@@ -73,49 +72,6 @@ def test_wrong_options_are_refused_before_the_file_is_touched():
         read_cloud("absent.ply", num_points=0)
 
 
-BROKEN_ROWS = np.array(
-    [
-        (0, 0, 0, 0.25),
-        (np.nan, 1, 1, 0.5),
-        (1, 2, 3, 1),
-        (0, -np.inf, 0, 0),
-        (4, 5, 6, np.nan),
-        (1e39, 0, 0, 0),
-        (0, 1, 0, 0),
-    ],
-    [("x", "f8"), ("y", "f8"), ("z", "f8"), ("roughness", "f8")],
-)
-
-
-def broken_file(folder, name: str):
-    """A file of BROKEN_ROWS, of which two can be used."""
-    path, table = folder / name, np.stack([BROKEN_ROWS[field] for field in BROKEN_ROWS.dtype.names], axis=-1)
-    text = "\n".join(" ".join(map(repr, map(float, row))) for row in table)
-    if name.endswith(".npz"):
-        np.savez(path, xyz=table[:, :3], roughness=table[:, 3])
-    elif name.endswith(".npy"):
-        np.save(path, BROKEN_ROWS)
-    elif name.endswith(".ply"):
-        properties = [(field, "double") for field in BROKEN_ROWS.dtype.names]
-        path.write_bytes(ply_bytes("binary_little_endian", rows=BROKEN_ROWS.tolist(), properties=properties))
-    elif name.endswith(".pcd"):
-        head = "VERSION 0.7\nFIELDS x y z roughness\nSIZE 8 8 8 8\nTYPE F F F F\nCOUNT 1 1 1 1\nWIDTH 7\nHEIGHT 1\n"
-        path.write_bytes((head + "POINTS 7\nDATA binary\n").encode() + BROKEN_ROWS.tobytes())
-    else:
-        path.write_text(("x y z roughness\n" if name.endswith(".csv") else "# x y z roughness\n") + text)
-    return path
-
-
-@pytest.mark.parametrize("name", ["a.pcd", "a.ply", "a.npz", "a.npy", "a.xyz", "a.csv"])
-def test_rows_without_finite_numbers_are_left_out_and_counted_in_one_line(tmp_path, name):
-    cloud, lines = read(broken_file(tmp_path, name))
-    np.testing.assert_array_equal(cloud.positions, [[0, 0, 0], [1, 2, 3], [0, 1, 0]])
-    np.testing.assert_array_equal(cloud.roughness, [0.25, 1, 0])
-    assert [line for line in lines if "left out" in line] == [
-        "4 of 7 points left out: NaN, infinity or too large a number"
-    ]
-
-
 def test_rows_without_finite_numbers_are_left_out_while_a_big_file_is_thinned(tmp_path, monkeypatch):
     monkeypatch.setattr(clouds, "CAPACITY", 16)
     monkeypatch.setattr("spnr_jax.formats.text.PIECE_LINES", 7)
@@ -128,11 +84,6 @@ def test_rows_without_finite_numbers_are_left_out_while_a_big_file_is_thinned(tm
 
 
 def test_a_data_set_with_a_broken_row_is_refused():
-    with pytest.raises(ValueError, match="holds 4 points with NaN, infinity .* first point 1"):
-        clouds.cloud_of_ply(
-            ply_bytes(
-                "binary_little_endian",
-                rows=BROKEN_ROWS.tolist(),
-                properties=[(field, "double") for field in BROKEN_ROWS.dtype.names],
-            )
-        )
+    rows = [(0.0, 1.0, 0.0), (0.0, np.nan, 0.0), (np.inf, 0.0, 0.0)]
+    with pytest.raises(ValueError, match="holds 2 points with NaN, infinity .* first point 1"):
+        clouds.cloud_of_ply(ply_bytes("binary_little_endian", rows=rows, properties=XYZRGB[:3]))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 from support.gltf_files import GltfBuilder
-from support.point_clouds import XYZRGB, ply_bytes, read, write
+from support.point_clouds import SRGB, read, write
 
 from data_gen.store.layout import POINT_TYPE, encode_points
 from spnr_jax.formats import clouds
@@ -13,7 +13,6 @@ from spnr_jax.formats.up_axis import ROTATIONS
 from spnr_jax.kernels.cloud_arrays import pad
 from spnr_jax.surfels.visibility import spiral
 
-SRGB = np.where(np.arange(256) <= 10, np.arange(256) / 255 / 12.92, ((np.arange(256) / 255 + 0.055) / 1.055) ** 2.4)
 SQUARE_OBJ = "v 0 0 2\nv 1 0 2\nv 1 1 2\nv 0 1 2\nf 1 2 3 4\n"
 SQUARE_OFF = "OFF\n4 1 0\n0 0 2\n1 0 2\n1 1 2\n0 1 2\n4 0 1 2 3\n"
 SQUARE_PLY = (
@@ -41,25 +40,6 @@ def test_the_points_of_a_data_set_come_back_as_they_are_and_nothing_is_assumed(t
     assert cloud.mask.all()
     assert {a.dtype for a in (cloud.positions, cloud.base_color, cloud.roughness)} == {np.dtype("float32")}
     assert lines == []
-
-
-def test_8_bit_unit_and_255_colours_are_the_same_linear_colour_and_the_report_says_how_they_were_read(tmp_path):
-    levels = np.array([[0, 5, 188], [255, 64, 11], [9, 9, 9]])
-    rows = [(0.0, float(i * i), float(i), *map(int, level)) for i, level in enumerate(levels)]
-    text = "\n".join(" ".join(map(str, (*row[:3], *(v / 255 for v in row[3:])))) for row in rows)
-    files = {
-        write(
-            tmp_path, "a.ply", ply_bytes("binary_big_endian", rows=rows, properties=XYZRGB)
-        ): "red green blue .* 0..255",
-        write(tmp_path, "b.xyz", "\n".join(" ".join(map(str, row)) for row in rows)): "red green blue .* 0..255",
-        write(tmp_path, "c.csv", "x y z diffuse_red diffuse_green diffuse_blue\n" + text): "red green blue .* 0..1$",
-        tmp_path / "d.npz": "red green blue .* 0..65535",
-    }
-    np.savez(tmp_path / "d.npz", points=np.array(rows)[:, :3], colors=(levels * 257).astype(np.uint16))
-    for path, how in files.items():
-        cloud, lines = read(path)
-        np.testing.assert_allclose(cloud.base_color, SRGB[levels], rtol=1e-5)
-        assert re.search(how, "\n".join(lines), re.MULTILINE), lines
 
 
 def test_linear_base_colours_win_over_srgb_ones_and_are_not_decoded(tmp_path):

@@ -51,12 +51,6 @@ def test_materials_are_known_where_the_file_has_one_of_them():
     np.testing.assert_array_equal(read(red=[1, 1], green=[0, 0], blue=[0, 0])[0]["materials_known"], [0, 0])
 
 
-def test_8_bit_colours_in_16_bit_fields_are_not_black():
-    values, lines = read(**dict.fromkeys(("red", "green", "blue"), np.array([0, 255], np.uint16)))
-    np.testing.assert_array_equal(values["base_color"], [[0] * 3, [1] * 3])
-    assert lines[0].endswith("0..255")
-
-
 INTENSITY_SHOWN = "no colour in the file: intensity 100..298 shown as grey"
 
 

@@ -14,11 +14,12 @@ import numpy as np
 import pytest
 from support import splat_balls
 from support.gltf_files import GltfBuilder
-from support.point_clouds import ply_bytes, read, write
+from support.point_clouds import packed_splats, ply_bytes, read, write
 
 from spnr_jax.formats import gaussian_files
 from spnr_jax.formats.clouds import place_cloud, read_cloud
 from spnr_jax.formats.cut import Cut
+from spnr_jax.formats.mesh.polygons import ears
 from spnr_jax.surfels.visibility import spiral
 
 ROOT = Path(__file__).parents[2]
@@ -39,6 +40,7 @@ def table(separator: str, end: str = "", comma: bool = False, columns=ROWS) -> s
 # Points in text: (name, content, whether there are colours)
 TEXTS = {
     "count line": ("a.xyz", "420\n" + table(" "), True),
+    "count line, semicolons": ("a.xyz", "420\n" + table(";"), True),
     "CloudCompare, count": ("a.txt", "//X Y Z R G B\n420\n" + table(" "), True),
     "CloudCompare, names with blanks": (
         "a.txt",
@@ -61,13 +63,11 @@ TEXTS = {
     ".asc": ("a.asc", table(" "), True),
     ".pts with intensity": ("a.pts", "420\n" + table(" ", columns=[(*row[:3], -900, *GREEN) for row in ROWS]), True),
     "rows of red green blue alpha": ("a.txt", table(" ", columns=[(*row, 255) for row in ROWS]), True),
-    "OBJ of points": ("a.obj", "".join("v {:g} {:g} {:g} 0.157 0.667 0.235\n".format(*p) for p in BALL), True),
     "OBJ of v and p": (
         "a.obj",
         "".join("v {:g} {:g} {:g}\n".format(*p) for p in BALL) + "p " + " ".join(map(str, range(1, 421))),
         False,
     ),
-    "OFF of points": ("a.off", "OFF\n420 0 0\n" + table(" ", columns=BALL), False),
     "a PLY under another name": (
         "a.txt",
         ply_bytes("ascii", rows=[tuple(p) for p in BALL], properties=[(axis, "float") for axis in "xyz"]),
@@ -91,14 +91,28 @@ def test_arrays_of_pictures_and_of_colours_with_alpha_are_points(tmp_path):
     np.testing.assert_allclose(read_cloud(tmp_path / "b.npy").base_color[0], LINEAR, atol=1e-3)
 
 
-def test_a_scene_of_points_alone_is_a_cloud(tmp_path):
+@pytest.mark.parametrize("space", ["srgb_rec709_display", "lin_rec709_display"])
+@pytest.mark.parametrize("name", ["COLOR_0", "KHR_gaussian_splatting:SH_DEGREE_0_COEF_0"])
+def test_splats_in_a_scene_are_points_of_their_colour_and_fog_is_left_out(tmp_path, space, name):
+    color = np.array(GREEN) / 255 if space.startswith("srgb") else LINEAR
+    values = color if name == "COLOR_0" else (color - 0.5) * 2 * np.sqrt(np.pi)
+    builder, extension = GltfBuilder(), "KHR_gaussian_splatting"
+    more = {name: np.tile(values, (420, 1)).astype("f4"), f"{extension}:OPACITY": np.where(PART, 0.1, 0.9).astype("f4")}
+    splats = builder.primitive(BALL.astype("f4"), None, mode=0, **more)
+    builder.mesh(splats | {"extensions": {extension: {"colorSpace": space}}}, scale=[2, 2, 2])
+    cloud, lines = read(builder.write(tmp_path / "a.glb"))
+    np.testing.assert_allclose(cloud.positions, 2 * BALL[~PART], atol=1e-6)
+    np.testing.assert_allclose(cloud.base_color, np.broadcast_to(LINEAR, (280, 3)), atol=2e-3)
+    assert any(line.startswith("140 of 420 points left out: opacity near 0") for line in lines)
+
+
+def test_colours_that_hold_light_are_said(tmp_path):
     builder = GltfBuilder()
-    square = builder.primitive(mode=0)
-    builder.mesh(square, translation=[0, 0, 2])
-    builder.write(tmp_path / "a.glb")
-    cloud = read_cloud(tmp_path / "a.glb")
-    np.testing.assert_allclose(cloud.positions[:, 2], 2)
-    assert len(cloud.positions) == 4
+    look = {"pbrMetallicRoughness": {"baseColorFactor": [*LINEAR, 1]}, "extensions": {"KHR_materials_unlit": {}}}
+    builder.mesh(builder.primitive(material=builder.material(name="sky", **look)))
+    cloud, lines = read(builder.write(tmp_path / "a.glb"), num_points=30)
+    np.testing.assert_allclose(cloud.base_color, np.broadcast_to(LINEAR, (30, 3)), atol=1e-5)
+    assert "colours that hold light already (KHR_materials_unlit) taken as base colours: 'sky'" in lines
 
 
 def with_lists(form: str) -> bytes:
@@ -311,10 +325,11 @@ def test_a_file_that_rounds_an_axis_says_how_many_values_are_left(tmp_path):
 def test_repeats_are_merged_before_anything_looks_at_neighbours(tmp_path, jitter):
     rng = np.random.default_rng(0)
     repeated = np.repeat(BALL, 6, axis=0) + jitter * rng.uniform(-1, 1, (2520, 3))
-    np.savez(tmp_path / "a.npz", points=repeated, roughness=np.repeat(np.arange(420) / 420, 6))
+    rough = np.repeat(0.1 + np.arange(420) / 840, 6) + np.tile([-0.1, 0.1], 1260)
+    np.savez(tmp_path / "a.npz", points=repeated, roughness=rough)
     cloud, lines = read(tmp_path / "a.npz", clean="auto")
     np.testing.assert_allclose(cloud.positions, BALL, atol=1e-5)
-    np.testing.assert_allclose(cloud.roughness, np.arange(420) / 420, atol=1e-6)
+    np.testing.assert_allclose(cloud.roughness, 0.1 + np.arange(420) / 840, atol=1e-6)
     assert "2,100 of 2,520 points repeat others, and were merged with them" in lines
 
 
@@ -338,10 +353,19 @@ def test_an_l_of_one_face_keeps_its_notch_wherever_the_face_begins(tmp_path):
             assert (cloud.positions[:, 1] > 0.5).mean() == pytest.approx(0.75 / 1.75, abs=0.05)
 
 
-def stl(count: int, tail: bytes = b"") -> bytes:
+def test_a_wavy_polygon_of_many_corners_keeps_its_area():
+    angle = np.linspace(0, 2 * np.pi, 900, endpoint=False)
+    corners = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1) * (1 + 0.3 * np.cos(40 * angle))[:, None]
+    a, b, c = np.moveaxis(corners[ears(corners)], 1, 0)
+    twice = np.cross(b - a, c - a)[:, 2]
+    assert (twice > 0).all()
+    assert twice.sum() == pytest.approx(np.cross(corners, np.roll(corners, -1, axis=0))[:, 2].sum())
+
+
+def stl(count: int, tail: bytes = b"", attribute: bytes = b"\0\0") -> bytes:
     """A binary STL file of two triangles."""
     triangles = [SQUARE[[0, 1, 2]], SQUARE[[0, 2, 3]]]
-    body = b"".join(np.append(np.zeros(3), corners).astype("<f4").tobytes() + b"\0\0" for corners in triangles)
+    body = b"".join(np.append(np.zeros(3), corners).astype("<f4").tobytes() + attribute for corners in triangles)
     return b"made by a scanner".ljust(80, b"\0") + struct.pack("<I", count) + body + tail
 
 
@@ -352,6 +376,12 @@ def test_a_binary_stl_with_a_tail_or_without_a_count_is_read_by_its_size(tmp_pat
     assert "the header announces 0 triangles, 2 stand behind it: these are drawn" in lines
     with pytest.raises(ValueError, match="announces 3 triangles, 2 are there"):
         read(write(tmp_path, "a.stl", stl(3)))
+
+
+def test_colours_of_an_stl_which_every_program_writes_in_its_own_way_are_named(tmp_path):
+    for attribute in (b"\0\0", b"\x9f\x02"):
+        _, lines = read(write(tmp_path, "a.stl", stl(2, attribute=attribute)), num_points=20)
+        assert ("ignored: STL attribute bytes" in lines) == (attribute != b"\0\0")
 
 
 def test_faces_with_a_vertex_that_is_no_number_are_left_out_and_counted(tmp_path):
@@ -400,15 +430,7 @@ def test_spz_of_version_2_is_read_and_others_and_damaged_ones_are_named(tmp_path
 
 
 def test_compressed_splats_in_a_ply_are_unpacked(tmp_path):
-    head = "ply\nformat binary_little_endian 1.0\nelement chunk 2\n"
-    head += "".join(f"property float {end}_{axis}\n" for end in ("min", "max") for axis in "xyz")
-    head += "element vertex 420\n"
-    head += "".join(f"property uint packed_{name}\n" for name in ("position", "rotation", "scale", "color"))
-    share = np.round((BALL + 1) / 2 * [2047, 1023, 2047]).astype(np.uint32)
-    rows = np.zeros((420, 4), "<u4")
-    rows[:, 0] = share[:, 0] << 21 | share[:, 1] << 11 | share[:, 2]
-    rows[:, 3] = PACKED << 8 | 255
-    content = (head + "end_header\n").encode() + np.array(2 * ([-1] * 3 + [1] * 3), "<f4").tobytes() + rows.tobytes()
+    content = packed_splats(BALL, PACKED << 8 | 255)
     cloud = read_cloud(write(tmp_path, "a.ply", content))
     np.testing.assert_allclose(cloud.positions, BALL, atol=1.1e-3)
     np.testing.assert_allclose(cloud.base_color, np.broadcast_to(LINEAR, (420, 3)), atol=2e-3)

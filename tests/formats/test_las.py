@@ -1,6 +1,7 @@
 """Laser scans keep their coordinates and colours; without laspy one line says what to install."""
 
 import builtins
+import io
 import struct
 
 import numpy as np
@@ -35,6 +36,37 @@ def test_a_scan_keeps_its_coordinates_colours_and_is_z_up(tmp_path, suffix):
     back = placed.cloud.positions @ placed.rotation + placed.origin
     np.testing.assert_allclose(back, positions, rtol=0, atol=1e-4)
     np.testing.assert_allclose(placed.cloud.base_color[0], [1, 0.2140, 0], atol=1e-4)
+
+
+def in_own_chunks(path, sizes, announced: int):
+    """The scan at a path packed in chunks of these sizes, whose record announces chunks of `announced` points."""
+    import lazrs
+
+    whole = bytearray(path.read_bytes())
+    (start,) = struct.unpack_from("<I", whole, 96)
+    vlr = lazrs.LazVlr.new_for_compression(whole[104], 0, True)
+    record = bytearray(vlr.record_data())
+    struct.pack_into("<I", record, 12, announced)
+    head = whole[:start] + struct.pack("<2x16sHH32x", b"laszip encoded", 22204, len(record)) + record
+    struct.pack_into("<II", head, 96, len(head), 1)
+    head[104] |= 0x80
+    packed = io.BytesIO()
+    packed.write(head)
+    compressor, points = lazrs.LasZipCompressor(packed, vlr), np.frombuffer(whole, np.uint8, offset=start)
+    for number, piece in enumerate(np.split(points, np.cumsum(sizes)[:-1] * vlr.item_size())):
+        if number:
+            compressor.finish_current_chunk()
+        compressor.compress_many(piece)
+    compressor.done()
+    path.with_suffix(".laz").write_bytes(packed.getvalue())
+
+
+@pytest.mark.parametrize("announced", [0, 2**32 - 1])
+def test_chunks_of_their_own_sizes_are_read_also_where_the_header_says_0(tmp_path, announced):
+    positions = scan(tmp_path / "a.las", 7)
+    in_own_chunks(tmp_path / "a.las", (120, 50, 130), announced)
+    placed = place_cloud(tmp_path / "a.laz")
+    np.testing.assert_allclose(placed.cloud.positions @ placed.rotation + placed.origin, positions, rtol=0, atol=1e-4)
 
 
 def test_a_scan_without_colours_shows_its_intensity(tmp_path):

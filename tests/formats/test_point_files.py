@@ -1,48 +1,11 @@
-import itertools
 import pickle
 import zipfile
 
 import numpy as np
 import pytest
-from support.point_clouds import NUMPY, ROWS, VERTEX, ply_bytes
+from support.point_clouds import read_columns, write
 
-from spnr_jax.formats import clouds, npz, ply, text
-from spnr_jax.formats.point_files import column_pieces, read_columns
-
-
-def write(folder, name: str, content: bytes | str):
-    path = folder / name
-    path.write_bytes(content if isinstance(content, bytes) else content.encode())
-    return path
-
-
-@pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
-@pytest.mark.parametrize("newline", ["\n", "\r\n"])
-def test_every_form_of_a_ply_gives_the_same_columns_with_their_types(tmp_path, form, newline):
-    columns = read_columns(write(tmp_path, "a.ply", ply_bytes(form, newline)))
-    assert list(columns) == [name for name, _ in VERTEX]
-    for (name, kind), expected in zip(VERTEX, zip(*ROWS, strict=True), strict=True):
-        np.testing.assert_array_equal(columns[name], np.array(expected, NUMPY[kind]))
-        assert columns[name].dtype == np.dtype(NUMPY[kind]).newbyteorder(columns[name].dtype.byteorder)
-
-
-@pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
-def test_the_order_of_properties_in_a_ply_does_not_matter(tmp_path, form):
-    for order in itertools.permutations(range(3)):
-        properties = [(("x", "float"), ("y", "double"), ("red", "uchar"))[i] for i in order]
-        rows = [tuple((1.5, 2.5, 200)[i] for i in order)]
-        columns = read_columns(write(tmp_path, "a.ply", ply_bytes(form, rows=rows, properties=properties)))
-        assert (columns["x"][0], columns["y"][0], columns["red"][0]) == (1.5, 2.5, 200)
-
-
-@pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])
-def test_a_ply_cut_anywhere_in_its_points_or_header_is_refused(tmp_path, form):
-    whole = ply_bytes(form)
-    body = whole.index(b"end_header") + len("end_header\n")
-    ends = whole.rindex(b"9.0") if form == "ascii" else len(whole) - 10
-    for length in (3, 60, body - 12, body, body + 13, ends):
-        with pytest.raises(ValueError, match=r"cut off|not understood|columns|no PLY element|expected"):
-            read_columns(write(tmp_path, "a.ply", whole[:length]))
+from spnr_jax.formats import clouds
 
 
 @pytest.mark.parametrize(
@@ -101,30 +64,6 @@ def test_columns_without_names_are_told_by_their_number_and_normals_by_their_len
     np.testing.assert_array_equal(np.stack(list(columns.values()), axis=-1), rows)
 
 
-@pytest.mark.parametrize("name", ["a.ply", "b.ply", "c.xyz", "d.npy", "e.pcd"])
-def test_pieces_are_small_and_together_the_whole_file(tmp_path, name, monkeypatch):
-    monkeypatch.setattr(ply, "PIECE_BYTES", 7 * 24)
-    monkeypatch.setattr(ply, "PIECE_LINES", 7)
-    monkeypatch.setattr(text, "PIECE_LINES", 7)
-    monkeypatch.setattr(npz, "PIECE_BYTES", 7 * 24)
-    table = np.arange(60.0).reshape(20, 3)
-    lines = "".join("{:g} {:g} {:g}\n".format(*row) for row in table)
-    double = [(axis, "double") for axis in "xyz"]
-    content = {
-        "a.ply": ply_bytes("binary_big_endian", rows=[tuple(row) for row in table], properties=double),
-        "b.ply": ply_bytes("ascii", rows=[tuple(row) for row in table], properties=double),
-        "c.xyz": lines,
-        "d.npy": b"",
-        "e.pcd": f"FIELDS x y z\nSIZE 8 8 8\nTYPE F F F\nPOINTS 20\nDATA ascii\n{lines}",
-    }[name]
-    path = write(tmp_path, name, content)
-    if name == "d.npy":
-        np.save(path, table)
-    pieces = list(column_pieces(path))
-    assert [len(piece["x"]) for piece in pieces] == [7, 7, 6]
-    np.testing.assert_array_equal(np.stack(list(read_columns(path).values()), axis=-1), table)
-
-
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
@@ -137,29 +76,6 @@ def test_pieces_are_small_and_together_the_whole_file(tmp_path, name, monkeypatc
 def test_text_whose_columns_are_not_certain_is_refused(tmp_path, text, reason):
     with pytest.raises(ValueError, match=reason):
         read_columns(write(tmp_path, "a.xyz", text))
-
-
-def test_arrays_and_records_of_numpy_give_the_same_columns(tmp_path):
-    rng = np.random.default_rng(0)
-    positions, color, roughness = rng.normal(size=(5, 3)), rng.uniform(size=(5, 3)), rng.uniform(size=5)
-    np.savez_compressed(
-        tmp_path / "a.npz",
-        xyz=positions,
-        rgb=color,
-        roughness=roughness[:, None],
-        metallic=roughness,
-        notes=np.array([{}]),
-    )
-    np.save(tmp_path / "b.npy", np.column_stack([positions, color, roughness, roughness]))
-    fields = [(name, "f8") for name in ("x", "y", "z", "r", "g", "b", "roughness", "metallic")]
-    record = np.array([tuple(row) for row in np.load(tmp_path / "b.npy")], fields)
-    np.save(tmp_path / "c.npy", record)
-    expected = {name: record[name] for name, _ in fields}
-    for name in ("a.npz", "b.npy", "c.npy"):
-        columns = read_columns(tmp_path / name)
-        assert columns.keys() == expected.keys()
-        for column in expected:
-            np.testing.assert_array_equal(columns[column], expected[column])
 
 
 def test_numpy_files_that_are_broken_pickled_or_of_another_layout_are_refused(tmp_path):

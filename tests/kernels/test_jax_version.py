@@ -3,13 +3,13 @@
 Both sides of the sizes from which the fault was seen; it shows with the compiler options of these tests, too.
 """
 
-import importlib.metadata
 import warnings
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jaxlib import version
 from support.surfel_clouds import camera, surfels
 
 import spnr_jax
@@ -67,13 +67,12 @@ def test_kernels_that_reduce_over_points_are_the_same_compiled(kind, rows):
 
 
 def test_a_jaxlib_that_is_known_to_compute_wrong_numbers_is_named_in_one_line(monkeypatch):
-    versions = {"jaxlib": "0.10.2"}
-    monkeypatch.setattr(importlib.metadata, "version", lambda name: versions[name])
+    monkeypatch.setattr(version, "__version__", "0.10.2")
     with pytest.warns(UserWarning, match=r"jaxlib 0\.10\.2 computes wrong numbers on a CPU.*pip install") as found:
         spnr_jax.warn_of_wrong_numbers()
     assert len(found) == 1
     assert "\n" not in str(found[0].message)
-    versions["jaxlib"] = "0.10.1"
+    monkeypatch.setattr(version, "__version__", "0.10.1")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         spnr_jax.warn_of_wrong_numbers()

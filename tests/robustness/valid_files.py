@@ -13,6 +13,7 @@ import numpy as np
 from damage import Files
 from support import gltf_files, pcd_files, splat_balls
 from support.gltf_files import GltfBuilder
+from support.point_clouds import packed_splats
 
 from spnr_jax.formats import gaussian_files
 
@@ -63,7 +64,8 @@ def plys() -> list[Files]:
     """PLY files of points: text, both byte orders, splats."""
     forms = ("ascii", "binary_little_endian", "binary_big_endian")
     found = [{"cloud.ply": ply(form, XYZ + more)} for form in forms for more in (RGB, PBR)]
-    return [*found, {"cloud.ply": ply("binary_little_endian", SPLAT)}, {"cloud.ply": ply("ascii", SPLAT)}]
+    found += [{"cloud.ply": ply(form, SPLAT)} for form in forms[:2]]
+    return [*found, {"cloud.ply": packed_splats(CORNERS, 0x28AA3CFF)}]
 
 
 def ply_meshes() -> list[Files]:
@@ -81,7 +83,8 @@ def texts() -> list[Files]:
     rows = numbers(POINTS, 9)
     found = {"cloud.xyz": ("", " ", 3), "b/cloud.xyz": ("", " ", 6), "cloud.txt": ("", " ", 9)}
     found |= {"cloud.csv": ("x,y,z,r,g,b\n", ",", 6), "b/cloud.csv": ("# x;y;z;intensity\n", ";", 4)}
-    files = []
+    found |= {"cloud.pts": (f"{POINTS}\n", " ", 7), "b/cloud.txt": ("//X;Y;Z;R;G;B\n", ";", 6)}
+    files = [{"cloud.csv": "\n".join(";".join(f"{v:g}".replace(".", ",") for v in row[:6]) for row in rows).encode()}]
     for name, (header, mark, width) in found.items():
         lines = "\n".join(mark.join(f"{v:g}" for v in row[:width]) for row in rows)
         files.append({name.removeprefix("b/"): f"{header}{lines}\n".encode()})
@@ -144,6 +147,7 @@ def offs() -> list[Files]:
     size = f"{len(CORNERS)} {len(FACES)} 0"
     colored = [f"{row} 255 0 0 255" for row in rows]
     return [{"cloud.off": "\n".join(["OFF", size, *rows, *faces, ""]).encode()},
+            {"cloud.off": "\n".join(["OFF", f"{len(CORNERS)} 0 0", *rows, ""]).encode()},
             {"cloud.off": "\n".join(["COFF", size, *colored, *faces, ""]).encode()}]  # fmt: skip
 
 
@@ -163,7 +167,9 @@ def objs() -> list[Files]:
     library = "newmtl red\nKd 1 1 1\nmap_Kd -s 1 1 1 -clamp on a.png\nd 1.0\n"
     library += "newmtl plain\nKd 0.1 0.2 0.3\nNs 90\nPm 0.5\nTr 0\n"
     holes = library.replace("Tr 0", "d 0.4").replace("d 1.0", "map_d b.png")
+    points = [*(f"{row} 0.1 0.5 1" for row in rows), "p 1 2 3", ""]
     return [{"cloud.obj": "\n".join(bare).encode()},
+            {"cloud.obj": "\n".join(points).encode()},
             {"cloud.obj": "\n".join(rich).encode(), "a.mtl": holes.encode(), "a.png": png(3), "b.png": png()},
             {"cloud.obj": "\n".join(rich).encode(), "a.mtl": library.encode(), "a.png": png(3)}]  # fmt: skip
 
@@ -188,5 +194,7 @@ def gltfs() -> list[Files]:
 
 
 def glbs() -> list[Files]:
-    """A GLB file with all inside."""
-    return [{"cloud.glb": _gltf(texels=255 * numbers(4, 4, 4)).glb()}]
+    """GLB files with all inside: a textured mesh, and points."""
+    points = GltfBuilder()
+    points.mesh(points.primitive(CORNERS, mode=0, COLOR_0=numbers(len(CORNERS), 4)), scale=[1, 2, 1])
+    return [{"cloud.glb": _gltf(texels=255 * numbers(4, 4, 4)).glb()}, {"cloud.glb": points.glb()}]

@@ -11,19 +11,24 @@ def points() -> np.ndarray:
     """Four points with colours packed into floats, and padding between their columns."""
     rows = np.zeros(4, LAYOUT)
     rows["x"], rows["y"], rows["z"] = [1.5, -2, 0, 3], [0.25, 1, 1, 1], [9, 8, 7, -6]
-    rows["rgb"] = (COLORS[:, 0] << 16 | COLORS[:, 1] << 8 | COLORS[:, 2]).astype(np.uint32).view(np.float32)
+    rows["rgb"] = packed(COLORS)
     rows["roughness"] = [0, 0.25, 0.5, 1]
     return rows
 
 
+def packed(colors: np.ndarray) -> np.ndarray:
+    """Colours (n, 3) of 8 bits in the bits of floats (n,)."""
+    return (colors[:, 0] << 16 | colors[:, 1] << 8 | colors[:, 2]).astype(np.uint32).view(np.float32)
+
+
 def compress(data: bytes) -> bytes:
     """LZF, the slow way: the longest earlier match of up to 264 bytes at each place, else plain bytes."""
-    packed, plain, place = bytearray(), bytearray(), 0
+    out, plain, place = bytearray(), bytearray(), 0
 
     def flush():
         for start in range(0, len(plain), 32):
             piece = plain[start : start + 32]
-            packed.extend(bytes([len(piece) - 1]) + piece)
+            out.extend(bytes([len(piece) - 1]) + piece)
         plain.clear()
 
     while place < len(data):
@@ -40,14 +45,14 @@ def compress(data: bytes) -> bytes:
             continue
         flush()
         high, low = divmod(distance - 1, 256)
-        packed.extend([best - 2 << 5 | high, low] if best < 9 else [7 << 5 | high, best - 9, low])
+        out.extend([best - 2 << 5 | high, low] if best < 9 else [7 << 5 | high, best - 9, low])
         place += best
     flush()
-    return bytes(packed)
+    return bytes(out)
 
 
-def content(encoding: str, rows: np.ndarray, newline: str = "\n") -> bytes:
-    """A PCD file of the points in an encoding."""
+def content(encoding: str, rows: np.ndarray, newline: str = "\n", stored: bool = False) -> bytes:
+    """A PCD file of the points in an encoding; what should be compressed may be stored as it is."""
     header = ["# .PCD v0.7 - Point Cloud Data file format", "VERSION 0.7", "FIELDS x y _ z rgb roughness"]
     header += ["SIZE 4 4 1 4 4 8", "TYPE F F U F F F", "COUNT 1 1 3 1 1 1", f"WIDTH {len(rows)}", "HEIGHT 1"]
     header += ["VIEWPOINT 0 0 0 1 0 0 0", f"POINTS {len(rows)}", f"DATA {encoding}", ""]
@@ -58,5 +63,5 @@ def content(encoding: str, rows: np.ndarray, newline: str = "\n") -> bytes:
     if encoding == "binary":
         return head + rows.tobytes()
     plain = b"".join(np.ascontiguousarray(rows[name]).tobytes() for name in rows.dtype.names)
-    packed = compress(plain)
-    return head + np.array([len(packed), len(plain)], "<u4").tobytes() + packed
+    body = plain if stored else compress(plain)
+    return head + np.array([len(body), len(plain)], "<u4").tobytes() + body

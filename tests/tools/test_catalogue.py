@@ -5,7 +5,7 @@ import json
 import os
 import re
 from html import unescape
-from urllib.parse import unquote
+from urllib.parse import unquote, unquote_to_bytes
 
 import numpy as np
 import pytest
@@ -187,6 +187,14 @@ def test_a_pattern_chooses_files_and_what_was_written_below_it_is_no_cloud(cloud
     assert headings(clouds / "out") == ["b/x.npy"]
     with pytest.raises(ValueError, match=r"\.\. behind a wildcard"):
         render(clouds / "*" / ".." / "*.npy", tmp_path / "out")
+
+
+def test_a_name_that_is_no_text_is_drawn_and_shown(tmp_path):
+    folder = tmp_path / "in"
+    write_cloud(folder / os.fsdecode(b"caf\xe9.xyz"), 0)
+    assert render(folder, tmp_path / "out")[0].startswith("drew 1 of 1 files")
+    (shown,) = re.findall(rb'src="(.*?)"', (tmp_path / "out" / "index.html").read_bytes())
+    assert os.path.isfile(os.path.join(os.fsencode(tmp_path / "out"), unquote_to_bytes(shown)))
 
 
 def test_a_file_is_no_pattern_whatever_its_name(tmp_path):

@@ -17,6 +17,7 @@ from spnr_jax.formats.mesh.gltf_materials import GltfMaterial, read_material
 from spnr_jax.formats.mesh.gltf_nodes import INSTANCING, drawn_meshes
 from spnr_jax.formats.mesh.gltf_textures import BASIS, MOVED, WEBP
 from spnr_jax.formats.mesh.tolerance import Tolerance
+from spnr_jax.gaussians.harmonics import C0
 
 MODES = {
     0: "POINTS",
@@ -113,10 +114,13 @@ def _point_columns(file: GltfFile, primitive: dict) -> dict[str, np.ndarray]:
     """The columns of a primitive of points in its own frame, without normals, which nodes turn."""
     attributes = primitive["attributes"]
     columns = dict(zip("xyz", file.accessor(attributes["POSITION"]).T, strict=True))
+    shown = primitive.get("extensions", {}).get(SPLATS, {}).get("colorSpace") == "srgb_rec709_display"
+    names = (*(SRGB if shown else LINEAR), "alpha")
     if "COLOR_0" in attributes:
-        colors = file.accessor(attributes["COLOR_0"]).T
-        shown = primitive.get("extensions", {}).get(SPLATS, {}).get("colorSpace") == "srgb_rec709_display"
-        columns |= dict(zip((*(SRGB if shown else LINEAR), "alpha"), colors, strict=False))
+        columns |= dict(zip(names, file.accessor(attributes["COLOR_0"]).T, strict=False))
+    elif f"{SPLATS}:SH_DEGREE_0_COEF_0" in attributes:
+        colors = 0.5 + C0 * file.accessor(attributes[f"{SPLATS}:SH_DEGREE_0_COEF_0"])
+        columns |= dict(zip(names, np.clip(colors, 0, 1).T, strict=False))
     if f"{SPLATS}:OPACITY" in attributes:
         columns.pop("alpha", None)
         columns["splat_opacity"] = file.accessor(attributes[f"{SPLATS}:OPACITY"])[:, 0]

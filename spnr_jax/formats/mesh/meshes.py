@@ -6,6 +6,7 @@ Every reason not to use a file is a RejectedAsset with one line.
 """
 
 import hashlib
+import logging
 import re
 import struct
 import warnings
@@ -32,6 +33,8 @@ UNREADABLE: tuple[type[Exception], ...]
 UNREADABLE = (ValueError, LookupError, TypeError, AttributeError, NameError, ArithmeticError, OSError, RuntimeError)
 UNREADABLE += (AssertionError, struct.error, DeprecationWarning)
 UNREADABLE += (ImportError,)  # trimesh looks for a package that guesses the encoding of text that is not UTF-8
+# it shows the call stacks of errors that it gets over, unless somebody takes care of them
+logging.getLogger("trimesh").addHandler(logging.NullHandler())
 
 
 def find_meshes(folder: Path) -> list[tuple[str, Path]]:

@@ -60,7 +60,7 @@ def load_obj(path: Path, root: Path | None = None, transparent_parts: Transparen
     text = _text(path)
     if not re.search(r"(?m)^f ", text):
         raise RejectedAsset("has no faces")
-    text = _without_notches(text)
+    text = _without_notches(_absolute(text))
     library: dict[str, dict[str, str]] = {}
     for names in re.findall(r"(?m)^mtllib +(.+?) *$", text):
         library |= parse_mtl(_read_library(read, path.parent, names, tolerance))
@@ -125,7 +125,6 @@ def _without_notches(text: str) -> str:
     polygon = re.compile(r"(?m)^f((?: +\S+){4,}) *$")
     if not polygon.search(text):
         return text
-    text = _absolute(text) if re.search(r"(?m)^f .*-", text) else text
     positions = _vertices(text)[:, :3]
 
     def cut(match: re.Match) -> str:
@@ -302,17 +301,16 @@ def _opacity(entry: dict[str, str], map_d: np.ndarray | None, name: str, toleran
 
 
 def _renamed(text: str, names: list[str]) -> str:
-    """The OBJ text with numbered material names and absolute vertex numbers, its library replaced by ours."""
+    """The OBJ text with numbered material names, its library replaced by ours."""
     numbers = {name: PLACE.format(number) for number, name in enumerate(names)}
     text = re.sub(r"(?m)^mtllib.*$", "", text)
-    text = re.sub(r"(?m)^usemtl +(.+?) *$", lambda match: f"usemtl {numbers[match[1]]}", text)
-    if re.search(r"(?m)^f .*-", text):
-        text = _absolute(text)
-    return f"mtllib names\n{text}"
+    return "mtllib names\n" + re.sub(r"(?m)^usemtl +(.+?) *$", lambda match: f"usemtl {numbers[match[1]]}", text)
 
 
 def _absolute(text: str) -> str:
     """The OBJ text with relative (negative) vertex numbers made absolute; trimesh counts them from the file's end."""
+    if not re.search(r"(?m)^f .*-", text):
+        return text
     counts = {"v": 0, "vt": 0, "vn": 0}
     lines = []
     for line in text.splitlines():

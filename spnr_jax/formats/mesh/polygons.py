@@ -52,17 +52,19 @@ def ears(corners: np.ndarray) -> np.ndarray:
     normal = np.cross(centred, np.roll(centred, -1, axis=0)).sum(axis=0)
     axis = int(np.abs(normal).argmax())
     flat = np.delete(centred, axis, axis=1) * [1, (1 if axis != 1 else -1) * np.sign(normal[axis] or 1)]
-    left, found = list(range(len(corners))), []
+    left, found, place = list(range(len(corners))), [], 0
     while len(left) > 3:
-        for i in range(len(left)):
+        for i in [*range(place, len(left)), *range(place)]:
             a, b, c = left[i - 1], left[i], left[(i + 1) % len(left)]
-            others = flat[[j for j in left if j not in (a, b, c)]]
-            if _turn(flat[a], flat[b], flat[c]) > 0 and not _inside(others, flat[a], flat[b], flat[c]).any():
-                break
+            if _turn(flat[a], flat[b], flat[c]) > 0:
+                others = flat[[j for j in left if j not in (a, b, c)]]
+                if not _inside(others, flat[a], flat[b], flat[c]).any():
+                    break
         else:
             break
         found.append((a, b, c))
         left.pop(i)
+        place = max(i - 1, 0)  # what lies before was no ear, and still is none
     return np.array(found + [(left[0], b, c) for b, c in zip(left[1:-1], left[2:], strict=True)])
 
 

@@ -1,6 +1,8 @@
 """Mesh folders and files: ids, the formats without materials, and real files where they are at hand."""
 
 import hashlib
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +14,6 @@ from support.handmade import ball, box
 from spnr_jax.formats.mesh.assets import Asset, RejectedAsset
 from spnr_jax.formats.mesh.meshes import find_meshes, load_mesh
 from spnr_jax.formats.mesh.surface_points import CANDIDATES, normalise, sample_surface
-from spnr_jax.formats.mesh.texels import srgb_to_linear
 
 DATA = Path(__file__).parents[4] / "shared" / "data"
 FACES = SQUARE.reshape(2, 3)
@@ -82,24 +83,6 @@ class TestPlainFormats:
         np.testing.assert_array_equal(part.material.base_color, [0.5, 0.5, 0.5])
         assert (part.material.roughness, part.material.metallic) == (0.5, 0)
 
-    def ply(self, tmp_path, properties, rows, faces):
-        header = f"ply\nformat ascii 1.0\nelement vertex {len(rows)}\n{properties}\n{faces[0]}\nend_header\n"
-        return write(tmp_path / "a.ply", header + "\n".join([*rows, *faces[1:], ""]))
-
-    def test_vertex_colours_are_srgb_whatever_their_type(self, tmp_path):
-        faces = ["element face 1\nproperty list uchar int vertex_indices", "3 0 1 2"]
-        corners = ["0 0 0", "1 0 0", "0 1 0"]
-        for kind, color, expected in (
-            ("uchar", "255 128 0", [1, srgb_to_linear(np.array(128 / 255)), 0]),
-            ("float", "1 0.5 0", [1, srgb_to_linear(np.array(0.5)), 0]),
-        ):
-            channels = "\n".join(f"property {kind} {name}" for name in ("red", "green", "blue"))
-            properties = "property float x\nproperty float y\nproperty float z\n" + channels
-            path = self.ply(tmp_path, properties, [f"{corner} {color}" for corner in corners], faces)
-            (part,) = load_mesh(path).parts
-            np.testing.assert_allclose(part.colors, [expected] * 3, atol=1e-6)
-            np.testing.assert_array_equal(part.material.base_color, [1, 1, 1])
-
     def test_face_colours_stay_on_their_faces(self, tmp_path):
         mesh = trimesh.Trimesh(CORNERS, FACES, process=False, face_colors=[[255, 0, 0, 255], [0, 0, 255, 255]])
         mesh.export(tmp_path / "a.ply")
@@ -125,6 +108,13 @@ class TestPlainFormats:
             with pytest.raises(RejectedAsset) as caught:
                 load_mesh(path)
             assert "\n" not in str(caught.value)
+
+    def test_no_call_stack_of_trimesh_reaches_a_person(self, tmp_path):
+        loop = "outer loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\n"
+        write(tmp_path / "a.stl", f"solid a\nfacet normal 0 0 x\n{loop}endsolid a\n")
+        program = "import sys; from spnr_jax.formats.clouds import read_cloud; read_cloud(sys.argv[1], num_points=9)"
+        done = subprocess.run([sys.executable, "-c", program, tmp_path / "a.stl"], capture_output=True, text=True)
+        assert (done.returncode, done.stdout + done.stderr) == (0, "")
 
     def test_a_suffix_that_is_not_read_is_refused(self, tmp_path):
         with pytest.raises(RejectedAsset, match="expected one of .glb"):
