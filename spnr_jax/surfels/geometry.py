@@ -1,7 +1,7 @@
 """Surfels from points: what each point knows of the surface around it, as one pure program over given neighbors.
 
 spacing     side of the square that a point stands for, from the neighbors on its own layer of the surface
-normal      given, or that of the layer (layers.py), outward by the votes of directions and walls (sides.py)
+normal      given, or that of the layer where none is (layers.py), outward by votes of directions and walls (sides.py)
 sided       1 where the votes say which side is outside, 0 where both are seen alike (a sheet)
 gradient    of the color along the surface, a ridge regression over the layer: colors are interpolated to first
             order, but for points beside the border of two colors
@@ -28,15 +28,19 @@ from spnr_jax.kernels.records import AnyArray, PointCloud, Surfels
 from spnr_jax.surfels import discs, layers, sides
 from spnr_jax.surfels.layers import Hood, Layer, along
 from spnr_jax.surfels.rules import RULES, Rules
-from spnr_jax.surfels.small_systems import frame, measure_shape, unit
+from spnr_jax.surfels.small_systems import dot, frame, measure_shape, unit
 from spnr_jax.surfels.visibility import cell_of, grid_of, seen_from
 
 
 class Points(NamedTuple):
-    """All points of a cloud as columns, zeros where they are padding, and the numbers of their neighbors."""
+    """All points of a cloud as columns, zeros where they are padding, and the numbers of their neighbors.
+
+    `given` says which came with a normal that has a side.
+    """
 
     number: Int[Array, "k points"]
     mask: Bool[Array, " points"]
+    given: Bool[Array, " points"]
     position: Float[Array, "3 points"]
     color: Float[Array, "3 points"]
 
@@ -45,23 +49,25 @@ def estimate_surfels(cloud: PointCloud, neighbors: Int[Array, "points 20"], rule
     """Surfels of the points of a cloud (unbatched) in the box [-1, 1]^3; pure, differentiable, one structure.
 
     As many as points and in their order.  `mask` is False for padding, and for what nothing outside sees.
-    `neighbors` are those of `spnr_jax.neighbors`: each point itself first, -1 for none.
+    `neighbors` are those of `spnr_jax.neighbors`: each point itself first, -1 for none.  A given normal may have any
+    length; one of length 0 is none.
     """
     mask = jnp.asarray(cloud.mask)
 
     def columns(values: AnyArray) -> Array:
         return layers.select(mask, jnp.asarray(values).T, 0)
 
+    normals = None if cloud.normals is None else unit(columns(cloud.normals))
     points = Points(
         number=layers.select(mask, jnp.asarray(neighbors).T, -1),
         mask=mask,
+        given=jnp.zeros_like(mask) if normals is None else dot(normals, normals) > 0.5,
         position=columns(cloud.positions),
         color=columns(cloud.base_color),
     )
-    given = None if cloud.normals is None else normalize(columns(cloud.normals))
-    raw, layer = find_layers(points, given, firm=given is not None, sided=True, sheets=given is None, rules=rules)
+    raw, layer = find_layers(points, normals, sided=True, sheets=normals is None, rules=rules)
     seen = look(points, layer.normal, raw, rules)
-    normal, sided, directions = find_sides(points, raw, layer, seen, given is not None, rules)
+    normal, sided, directions = find_sides(points, raw, layer, seen, rules)
     fields, covered = describe(points, raw, layer, normal, sided, seen, rules)
     known = jnp.ones_like(raw) if cloud.materials_known is None else columns(cloud.materials_known)
     fields |= {"roughness": columns(cloud.roughness), "metallic": columns(cloud.metallic), "guessed": 1 - known}
@@ -144,24 +150,23 @@ def find_layers(
     points: Points,
     normals: Float[Array, "3 points"] | None,
     *,
-    firm: bool,
     sided: bool,
     sheets: bool,
     rules: Rules = RULES,
 ) -> tuple[Float[Array, " points"], Layer]:
-    """First spacings, and the layers of given normals or of none.
+    """First spacings, and the layers of normals, which are unit vectors, or 0 where there is none.
 
-    Firm normals are kept; sided ones have a side, and tell the sides of a wall apart.  Of two sheets nearer than a
-    layer is thick a point gets its own, where linear colors tell them apart.
+    Normals are kept; sided ones have a side, and tell the sides of a wall apart.  Of two sheets nearer than a layer is
+    thick a point gets its own, where linear colors tell them apart.
     """
     roots = root(points.color)
 
     def fit(hood: Hood, number: Array, *own: Array) -> tuple[Array, Layer, layers.Sheets | None]:
         raw = discs.first_spacing(hood, rules)
         weight = layers.weigh_near(hood, raw, rules)
-        first = own[0] if own else layers.find_planes(hood, raw, rules)
+        first, firm = layers.begin_normals(hood, raw, *own, rules=rules)
         if sided and own:
-            weight = weight * clamp(0.5 + along(hood.columns[:, 3:], first), 0, 1)
+            weight = weight * jnp.where(firm[None], clamp(0.5 + along(hood.columns[:, 3:], first), 0, 1), 1)
         unlike = layers.compare_colors(hood, hood.columns[:, :3], rules) if sheets else None
         return raw, *layers.fit_layers(hood, raw, first, weight, firm, unlike, rules)
 
@@ -196,7 +201,6 @@ def find_sides(
     raw: Float[Array, " points"],
     layer: Layer,
     seen: Float[Array, "64 points"],
-    given: bool,
     rules: Rules = RULES,
 ) -> tuple[Float[Array, "3 points"], Float[Array, " points"], Float[Array, " points"]]:
     """Normals that point outward, how sure that is, and how many directions see each point, by their cosines."""
@@ -206,17 +210,17 @@ def find_sides(
     front, back = sides.count_facing(layer.normal, seen)
 
     def vote(votes: Array, first: Array) -> tuple[Array, None]:
-        def share(hood: Hood, number: Array, raw: Array, layer: Layer) -> Array:
+        def share(hood: Hood, number: Array, raw: Array, layer: Layer, given: Array) -> Array:
             normals, votes = hood.columns[:, :3], hood.columns[:, 3]
             walls = sides.vote_of_walls(hood, layer, raw, normals, given, rules)
             return sides.share_votes(hood, layer, raw, normals, votes, rules) + first * walls
 
         table = jnp.concatenate([layer.normal, votes[None]])
-        return jnp.clip(map_blocks(share, points, table, rules, raw, layer), -1, 1), None
+        return jnp.clip(map_blocks(share, points, table, rules, raw, layer, points.given), -1, 1), None
 
     leans = (front - back) / (front + back + rules.evidence)
     towards, _ = jax.lax.scan(vote, leans, jnp.asarray([1, 0], raw.dtype))
-    return *sides.turn_outward(turned, towards, front, back, given, rules), front + back
+    return *sides.turn_outward(turned, towards, front, back, points.given, rules), front + back
 
 
 def describe(
@@ -291,9 +295,3 @@ def find_spacings(
 
     rough, weight, evenness = map_blocks(weigh, points, normal, rules, raw, layer, normal, sided)
     return rough, weight, median(evenness, points.mask) < rules.even
-
-
-def normalize(normals: Float[Array, "3 points"]) -> Float[Array, "3 points"]:
-    """The vectors at length 1; straight up where there is none."""
-    up = jnp.asarray([0, 1, 0], normals.dtype)[:, None]
-    return layers.select(jnp.sum(normals**2, axis=0) > 0.25, unit(normals), up)

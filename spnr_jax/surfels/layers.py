@@ -136,12 +136,26 @@ def find_planes(hood: Hood, spacing: Float[Array, " block"], rules: Rules) -> Fl
     return jnp.where(chosen[:1] > 0, unit(cross(one / spacing[None], two / spacing[None])), narrowest)
 
 
+def begin_normals(
+    hood: Hood, spacing: Float[Array, " block"], given: Float[Array, "3 block"] | None = None, *, rules: Rules
+) -> tuple[Float[Array, "3 block"], Bool[Array, " block"]]:
+    """Given unit normals, which are firm; where there is none, or it is 0, those of planes, which are not."""
+    if given is None:
+        return find_planes(hood, spacing, rules), jnp.zeros(spacing.shape, bool)
+    firm = dot(given, given) > 0.5
+
+    def complete() -> Array:
+        return select(firm, given, find_planes(hood, spacing, rules))
+
+    return jax.lax.cond(jnp.all(firm | (hood.real[0] == 0)), lambda: given, complete), firm
+
+
 def fit_layers(
     hood: Hood,
     spacing: Float[Array, " block"],
     normal: Float[Array, "3 block"],
     weight: Float[Array, "k block"],
-    firm: bool,
+    firm: Bool[Array, " block"],
     unlike: Float[Array, "k block"] | None,
     rules: Rules,
 ) -> tuple[Layer, Sheets | None]:
@@ -152,7 +166,7 @@ def fit_layers(
     and curvature beyond it explain as much.  Blocks in which no two colors lie among each other are not fitted again.
     """
     offset = jax.lax.optimization_barrier(hood.offset / spacing[None, None])
-    weight = jax.lax.optimization_barrier(weight)
+    weight, free = jax.lax.optimization_barrier((weight, 1 - firm.astype(weight.dtype)))
 
     def begin(normal: Array, scale: Array | float) -> Fit:
         layer = Layer(normal, jnp.broadcast_to(jnp.asarray(scale, normal.dtype), spacing.shape), along(offset, normal))
@@ -162,13 +176,13 @@ def fit_layers(
 
     if unlike is None:
         start = begin(normal, rules.start)
-        return _fit_quadric(offset, weight, start, None, rules.scales[0], 0.0 if firm else 1.0, rules).layer, None
+        return _fit_quadric(offset, weight, start, None, rules.scales[0], free, rules).layer, None
     mixed = _fewer(total(weight), total(weight * unlike)) > rules.step_points[0]
 
     def fit(normal: Array, again: Array) -> tuple[Array, Fit]:
         start = begin(normal, jnp.where(again, rules.scales[1], rules.start))
         least = jnp.broadcast_to(jnp.where(again, rules.sheet_scale, rules.scales[0]), spacing.shape)
-        slopes = jnp.where(again, 1.0, 0.0 if firm else 1.0).astype(normal.dtype)
+        slopes = jnp.where(again, 1, free)
 
         def fit_quadric() -> Fit:
             return _fit_quadric(offset, weight, start, again * unlike, least, slopes, rules)
@@ -188,7 +202,7 @@ def _fit_quadric(
     start: Fit,
     unlike: Float[Array, "k block"] | None,
     least: Float[Array, " block"] | float,
-    slopes: Float[Array, ""] | float,
+    slopes: Float[Array, " block"],
     rules: Rules,
 ) -> Fit:
     """Fit in rounds to the neighbors that lie close to the layer before, with a least thickness.
@@ -206,7 +220,7 @@ def _fit_quadric(
         unknown = jnp.stack(terms, axis=1)
         sums = sum_products(own[:, None] * unknown, jnp.concatenate([unknown, up[:, None]], axis=1))
         solution = solve(sums[:, :-1] + ridge, sums[:, -1:])[:, 0]
-        slope = slopes * solution[:2]
+        slope = slopes[None] * solution[:2]
         bent = (solution[i][None] * terms[i] for i in (2, 3, 4))
         height = rest = up - slope[0][None] * one - slope[1][None] * two - sum(bent)
         if unlike is not None:

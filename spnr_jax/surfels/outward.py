@@ -56,7 +56,13 @@ def outward_normals(
 
     color = np.asarray(base_color[voters], np.float32)
     normal = np.asarray(planes(positions[voters], positions, noise), np.float32)
-    points = Points(columns(near, -1), jnp.arange(size) < len(order), columns(places[order]), columns(color[order]))
+    points = Points(
+        number=columns(near, -1),
+        mask=jnp.arange(size) < len(order),
+        given=jnp.zeros(size, bool),  # with a side
+        position=columns(places[order]),
+        color=columns(color[order]),
+    )
     found = np.empty_like(places)
     found[order] = np.asarray(_turn(points, columns(normal[order])))[:, : len(order)].T
     return found[: len(kept)]
@@ -65,6 +71,6 @@ def outward_normals(
 @partial(jax.jit, compiler_options=QUICKEST)
 def _turn(points: Points, normals: Float[Array, "3 points"]) -> Float[Array, "3 points"]:
     """The normals that are given, but for those of sheets, outward."""
-    raw, layer = geometry.find_layers(points, normals, firm=True, sided=False, sheets=True)
+    raw, layer = geometry.find_layers(points, normals, sided=False, sheets=True)
     seen = geometry.look(points, layer.normal, raw)
-    return geometry.find_sides(points, raw, layer, seen, False)[0]
+    return geometry.find_sides(points, raw, layer, seen)[0]

@@ -47,7 +47,7 @@ def vote_of_walls(
     layer: Layer,
     spacing: Float[Array, " block"],
     normals: Float[Array, "k 3 block"],
-    given: bool,
+    given: Bool[Array, " block"],
     rules: Rules,
 ) -> Float[Array, " block"]:
     """A lean from another layer, nearer than anything can be seen between: a wall's sides face away from each other.
@@ -56,10 +56,10 @@ def vote_of_walls(
     given normals tell the two apart.
     """
     cosine = along(normals, layer.normal)
-    other = (-cosine if given else jnp.abs(cosine)) > rules.parallel
+    other = jnp.where(given[None], -cosine, jnp.abs(cosine)) > rules.parallel
     wall = weigh_near(hood, spacing, rules) * other * (jnp.abs(layer.height) < rules.wall)
-    thick = layer.scale > rules.scales[0]
-    scale = jnp.where(thick, layer.scale, rules.sheet_scale) if given else layer.scale
+    thin = given & (layer.scale <= rules.scales[0])
+    scale = jnp.where(thin, rules.sheet_scale, layer.scale)
     outward = layer.height / scale[None]
     above, below = total(wall * (outward > rules.apart)), total(wall * (outward < -rules.apart))
     return rules.wall_vote * (below - above) / (above + below + rules.evidence)
@@ -70,7 +70,7 @@ def turn_outward(
     towards: Float[Array, " block"],
     front: Float[Array, " block"],
     back: Float[Array, " block"],
-    given: bool,
+    given: Bool[Array, " block"],
     rules: Rules,
 ) -> tuple[Float[Array, "3 block"], Float[Array, " block"]]:
     """Normals that point outward, and 1 where the votes say which side that is, 0 where they do not.
@@ -79,7 +79,7 @@ def turn_outward(
     """
     begin, end = rules.sure_side
     sided = clamp((jnp.abs(towards) - begin) / (end - begin), 0, 1)
-    wrong = towards < (-rules.turn if given else 0)
+    wrong = towards < jnp.where(given, -rules.turn, 0)
     sided = jnp.where(jnp.where(wrong, front, back) > rules.hidden, jnp.minimum(sided, 1 - rules.leak), sided)
     return jnp.where(wrong[None], -normal, normal), jax.lax.stop_gradient(sided)
 

@@ -16,6 +16,7 @@ from spnr_jax.kernels.numerics import larger, root, smaller
 ROUND = 1e-4  # of the trace, added to variances before they are inverted
 SQUARINGS = 5  # after which a variance that is a tenth larger than another weighs twenty times as much
 SHORTEST = 1e-9  # vector that has a direction
+POINT = 1e-9  # trace of a covariance without extent: the square of smaller ones, which a gradient divides by, vanishes
 SMALLEST = 1e-7  # of the trace, below which a variance is rounding
 
 
@@ -119,7 +120,8 @@ def split_variances(
 ) -> tuple[Float[Array, "3 3 points"], Float[Array, "3 3 points"], Float[Array, "3 3 points"]]:
     """Covariances at trace 1 (0 without extent), projections onto the narrowest axis and onto the widest."""
     trace = matrix[0, 0] + matrix[1, 1] + matrix[2, 2]
-    scaled = matrix / jnp.where(trace > 0, trace, 1)[None, None]
+    extended = trace > POINT
+    scaled = jnp.where(extended[None, None], matrix / jnp.where(extended, trace, 1)[None, None], 0)
     ones = jnp.broadcast_to(jnp.eye(3, dtype=matrix.dtype)[..., None], matrix.shape)
     both = jnp.concatenate([solve(scaled + ROUND * ones, ones), scaled + ROUND * ones], axis=2)
     narrowest, widest = jnp.split(project_largest(both), 2, axis=2)
@@ -136,7 +138,7 @@ def find_narrowest(matrix: Float[Array, "3 3 points"]) -> Float[Array, "3 points
 def measure_shape(matrix: Float[Array, "3 3 points"]) -> Float[Array, "2 points"]:
     """Ratios of the standard deviations along the axes: planarity, 0 in a plane, and linearity, 0 on a line."""
     scaled, narrowest, widest = split_variances(matrix)
-    least, most = (jnp.sum(jax.lax.stop_gradient(x) * scaled, axis=(0, 1)) for x in (narrowest, widest))
+    least, most = (jnp.sum(x * scaled, axis=(0, 1)) for x in (narrowest, widest))
     middle = scaled[0, 0] + scaled[1, 1] + scaled[2, 2] - least - most
     ratios = jnp.stack([least, middle]) / larger(jnp.stack([middle, most]), SMALLEST)
     return root(jnp.where(jnp.stack([least, middle]) > SMALLEST, smaller(ratios, 1), 0))

@@ -68,6 +68,15 @@ def test_what_passes_through_the_64_directions_is_the_same_within_their_number(t
         assert np.abs(a[inside].mean() - b[inside].mean()) < mean / 3, name
 
 
+def test_normals_of_discs_seen_from_behind_are_turned_to_the_camera_and_others_kept():
+    positions, normal, spacing = shape("sphere", 500)
+    found, view = surfels(positions, normal, spacing), camera(24)
+    turned = features.turned(found, view).normal
+    towards = np.asarray(view.cam_to_world)[:, 3] - positions
+    assert np.all(np.sum(towards * np.asarray(turned), axis=1) >= 0)
+    close(turned, normal * np.where(np.sum(towards * normal, axis=1) < 0, -1, 1)[:, None])
+
+
 def test_the_network_sees_no_light():
     positions, normal, spacing = shape("sphere", 500)
     found, view = surfels(positions, normal, spacing), camera(24)

@@ -62,6 +62,15 @@ def test_it_is_the_plain_loop_over_cells_but_for_rounding_at_their_borders():
     assert 0.2 < np.mean(expected) < 0.8
 
 
+def test_padding_neither_hides_nor_is_in_the_way():
+    rng = np.random.default_rng(0)
+    positions = rng.uniform(-0.6, 0.6, (60, 3))
+    mask = np.arange(60) < 40
+    one, other = (seen(np.where(mask[:, None], positions, x), [0, 0.6, 0.8], 0.15, mask) for x in (positions, 0.0))
+    np.testing.assert_array_equal(one[:40], other[:40])
+    assert one[:40].min() < 0.5
+
+
 def test_directions_outside_a_ball_see_the_side_turned_to_them_and_nothing_within():
     positions, normals, spacing = shape("sphere", 900)
     within = 0.3 * positions[::9]

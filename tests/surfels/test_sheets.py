@@ -28,7 +28,7 @@ def lined_ball(gap):
 
 @functools.partial(jax.jit, static_argnames="sheets")
 def _normals(points, sheets):
-    return geometry.find_layers(points, None, firm=False, sided=True, sheets=sheets)[1]
+    return geometry.find_layers(points, None, sided=True, sheets=sheets)[1]
 
 
 def layers_of(positions, colors):
@@ -37,7 +37,8 @@ def layers_of(positions, colors):
     size = next(size for size in PADDED if size >= count)
     padded = pad(cloud(positions, base_color=colors), size)
     number = np.ascontiguousarray(neighbors(padded).T)
-    points = geometry.Points(number, padded.mask, *(np.float32(x).T for x in (padded.positions, padded.base_color)))
+    columns = (np.float32(x).T for x in (padded.positions, padded.base_color))
+    points = geometry.Points(number, padded.mask, np.zeros(size, bool), *columns)
     return [jax.tree.map(lambda x: np.asarray(x)[..., :count], _normals(points, sheets)) for sheets in (False, True)]
 
 

@@ -57,6 +57,17 @@ def test_gradients_are_finite_without_extent_on_a_line_in_a_plane_and_in_a_ball(
         assert np.isfinite(gradient).all()
 
 
+def test_gradients_of_the_shape_are_central_differences_where_variances_are_nearly_alike_too():
+    rng = np.random.default_rng(3)
+    places = rng.normal(size=(40, 12, 3)) * np.array([1, 0.9, 0.8])
+    with jax.enable_x64(True):
+        matrix = jnp.asarray(np.moveaxis(places.swapaxes(1, 2) @ places, 0, -1))
+        way = jnp.asarray(rng.normal(size=(3, 40)))
+        way = 0.1 * way[:, None] * way[None]
+        slope = (measure_shape(matrix + 1e-5 * way) - measure_shape(matrix - 1e-5 * way)) / 2e-5
+        close(jax.jvp(measure_shape, (matrix,), (way,))[1], slope, rtol=1e-3, atol=1e-6)
+
+
 def test_sums_and_products_are_those_of_numpy():
     one, two = np.random.default_rng(1).normal(size=(2, 3, 20))
     close(cross(*map(jnp.asarray, np.float32([one, two]))), np.cross(one, two, axis=0), atol=1e-5)

@@ -4,7 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support.laws import close, numbers
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from support.laws import close, extremes, float64_law, hypotheses, numbers
 from support.surfel_clouds import camera, even_square, shape, surfels
 
 from spnr_jax.kernels import cameras
@@ -36,6 +38,38 @@ def layer(count=500, height=0.0, normal=(0.0, 0.0, 1.0), **columns):
     return surfels(position, normal, 2.2 / np.sqrt(count), **columns)
 
 
+def shares_twin(tau, depth, spacing):
+    """Of lists (entries, slots): every entry beside every other, in float64."""
+    tau, depth, spacing = map(np.float64, (tau, depth, spacing))
+    share, left = np.zeros_like(tau), np.zeros_like(tau)
+    for i in range(len(tau)):
+        band, hidden = tau[i].copy(), np.zeros_like(tau[i])
+        for j in range(len(tau)):
+            x = np.clip(np.abs(depth[i] - depth[j]) / (0.5 * (spacing[i] + spacing[j])) - 1, 0, 1)
+            apart = x * x * (3 - 2 * x) if abs(i - j) <= splatting.NEAR else 1.0
+            band += tau[j] * (1 - apart) if i != j else 0
+            hidden += tau[j] * apart if j < i else 0
+        left[i] = np.exp(-hidden)
+        share[i] = tau[i] * left[i] * np.where(band > 1e-6, -np.expm1(-band) / np.where(band > 1e-6, band, 1), 1)
+    return share, left
+
+
+def blend_twin(entries, found, view, pixel):
+    """Opacity, coverage, depth, spread, log spacing, normal and attributes of one pixel, in float64."""
+    order = np.asarray(entries.order)[np.asarray(entries.pixel) == pixel][: splatting.LIST]
+    point = np.asarray(entries.point)[order]
+    kernel, facing, depth = (np.float64(x)[order] for x in (entries.kernel, entries.facing, entries.depth))
+    spacing, weight = np.float64(found.spacing)[point], kernel**2 * facing
+    share, left = (x[:, 0] for x in shares_twin(*(x[:, None] for x in (splatting.OPACITY * weight, depth, spacing))))
+    opacity = share.sum()
+    divisor = max(opacity, splatting.LEAST_SHARE)
+    mean = share @ depth / divisor
+    spread = np.sqrt(share @ (depth - mean) ** 2 / divisor)
+    normal = np.float64(found.normal)[point] @ np.float64(view.cam_to_world)[:, :3]
+    wide = (share @ x / divisor for x in (np.log(spacing), normal, np.float64(found.base_color)[point]))
+    return min(opacity, 1), weight @ left, mean, spread, *wide
+
+
 def both(*layers):
     return jax.tree.map(lambda *x: jnp.concatenate(x), *layers)
 
@@ -47,24 +81,24 @@ class TestShares:
         tau = rng.uniform(0, 3, (24, 60)) * (rng.uniform(size=(24, 60)) < 0.8)
         return tuple(np.float32(x) for x in (tau, depth, rng.uniform(0.1, 0.6, (24, 60))))
 
-    def twin(self, tau, depth, spacing):
-        tau, depth, spacing = map(np.float64, (tau, depth, spacing))
-        share, left = np.zeros_like(tau), np.zeros_like(tau)
-        for i, s in np.ndindex(tau.shape):
-            band, hidden = tau[i, s], 0.0
-            for j in range(len(tau)):
-                x = np.clip(abs(depth[i, s] - depth[j, s]) / (0.5 * (spacing[i, s] + spacing[j, s])) - 1, 0, 1)
-                apart = x * x * (3 - 2 * x) if abs(i - j) <= splatting.NEAR else 1.0
-                band += tau[j, s] * (1 - apart) if i != j else 0
-                hidden += tau[j, s] * apart if j < i else 0
-            left[i, s] = np.exp(-hidden)
-            share[i, s] = tau[i, s] * left[i, s] * (-np.expm1(-band) / band if band > 1e-6 else 1)
-        return share, left
-
     def test_they_are_those_of_a_float64_loop(self):
         for seed in (0, 1):
             lists = self.lists(seed, high=(1.0, 6.0)[seed])
-            close(shares(*map(jnp.asarray, lists)), self.twin(*lists), rtol=2e-5, atol=2e-6)
+            close(shares(*map(jnp.asarray, lists)), shares_twin(*lists), rtol=2e-5, atol=2e-6)
+
+    @hypotheses
+    @given(extremes(24, 6, low=-30, high=3, signed=False), st.integers(0, 99), st.integers(-6, 3), st.integers(-3, 1))
+    def test_those_of_any_lists_are_the_loop_s_and_their_gradients_finite_and_those_of_float64(
+        self, tau, seed, high, size
+    ):
+        rng = np.random.default_rng(seed)
+        depth = np.float32(np.sort(1 + 10.0**high * rng.uniform(size=tau.shape), axis=0))
+        spacing = np.float32(10.0**size * rng.uniform(0.5, 1, tau.shape))
+        # by depth and spacing, what float32 knows of a gap in spacings
+        rounding = np.abs(depth).max() / spacing.min()
+        share, left = float64_law(shares, tau, depth, spacing, floors=(1.0, rounding, rounding))
+        expected = shares_twin(tau, depth, spacing)
+        close((share, left), expected, rtol=1e-4, atol=1e-6 * (1 + rounding * tau.max()))
 
     def test_they_lie_in_0_to_1_and_so_does_their_sum(self):
         for seed in range(4):
@@ -154,6 +188,27 @@ class TestEntries:
 
 
 class TestBlend:
+    @settings(hypotheses, max_examples=12)
+    @given(st.integers(0, 999), st.floats(-2, -0.6), st.floats(0, 1), st.floats(1, 4))
+    def test_every_pixel_is_that_of_a_float64_loop_over_its_list(self, seed, size, sided, away):
+        rng = np.random.default_rng(seed)
+        normal = rng.normal(size=(500, 3))
+        found = surfels(
+            *(rng.uniform(-0.6, 0.6, (500, 3)), normal / np.linalg.norm(normal, axis=1, keepdims=True)),
+            0.3 * 10.0**size * rng.uniform(0.5, 1, 500),
+            base_color=rng.uniform(size=(500, 3)),
+            sided=sided * rng.uniform(size=500),
+        )
+        view = camera(24, (0.0, 0.6 * away, 0.8 * away))
+        entries, lost = make_entries(found, view, room=TOTAL)
+        assume(int(lost) == 0 and int(splatting.covered_pixels(entries)) > 0)
+        buffer = blend(entries, found, found.base_color, view, slots=24**2)
+        names = ("opacity", "coverage", "depth", "spread", "log_spacing", "normal", "attributes")
+        entries, buffer = jax.tree.map(np.asarray, (entries, buffer))
+        for pixel in rng.choice(entries.pixel[entries.pixel < 24**2], 3):
+            ours = [getattr(buffer, name).reshape(24**2, -1)[pixel].squeeze() for name in names]
+            close(ours, blend_twin(entries, found, view, pixel), rtol=1e-4, atol=1e-4)
+
     def test_a_colour_that_is_linear_over_a_plane_is_drawn_at_each_pixel(self):
         slopes = np.array([[0.3, 0.1, 0], [0, -0.4, 0], [0.2, 0.2, 0]])
         found, view = layer(), camera()
