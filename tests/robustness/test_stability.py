@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from surfel_sweeps import SURFEL_SWEEPS
 from sweeps import SWEEPS, Sweep
 
 BUDGET = 1e-5
@@ -72,7 +73,7 @@ def measured(sweep: Sweep, value: float) -> tuple[float, float]:
 
 
 @pytest.mark.ci
-@pytest.mark.parametrize("sweep", SWEEPS, ids=str)
+@pytest.mark.parametrize("sweep", SWEEPS + SURFEL_SWEEPS, ids=str)
 def test_a_kernel_keeps_its_budget_in_its_domain(sweep):
     found = {value: measured(sweep, value) for value in values_of(sweep)}
     worst = {value: max(pair) for value, pair in found.items() if max(pair) > BUDGET}

@@ -165,3 +165,22 @@ def batch_norm(x, epsilon=1e-5):
     x = np.float64(x)
     mean, variance = (x.mean(axis=0), x.var(axis=0)) if len(x) else (np.zeros(x.shape[1]), np.zeros(x.shape[1]))
     return (x - mean) / np.sqrt(variance + epsilon), mean, variance
+
+
+def shares(tau, depth, spacing, near):
+    """Share of each entry of lists (entries, slots) in its pixel, and the transmittance before it (splatting.shares).
+
+    Entries less than a spacing apart in depth blend; those more than `near` places before another hide it.
+    """
+    tau, depth, spacing = map(np.float64, (tau, depth, spacing))
+    share, left = np.zeros_like(tau), np.zeros_like(tau)
+    for i in range(len(tau)):
+        band, hidden = tau[i].copy(), np.zeros_like(tau[i])
+        for j in range(len(tau)):
+            x = np.clip(np.abs(depth[i] - depth[j]) / (0.5 * (spacing[i] + spacing[j])) - 1, 0, 1)
+            apart = x * x * (3 - 2 * x) if abs(i - j) <= near else 1.0
+            band += tau[j] * (1 - apart) if i != j else 0
+            hidden += tau[j] * apart if j < i else 0
+        left[i] = np.exp(-hidden)
+        share[i] = tau[i] * left[i] * np.where(band > 0, -np.expm1(-band) / np.where(band > 0, band, 1), 1)
+    return share, left

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from support import reference
 from support.laws import close, extremes, float64_law, hypotheses, numbers
 from support.surfel_clouds import camera, even_square, shape, surfels
 
@@ -38,29 +39,14 @@ def layer(count=500, height=0.0, normal=(0.0, 0.0, 1.0), **columns):
     return surfels(position, normal, 2.2 / np.sqrt(count), **columns)
 
 
-def shares_twin(tau, depth, spacing):
-    """Of lists (entries, slots): every entry beside every other, in float64."""
-    tau, depth, spacing = map(np.float64, (tau, depth, spacing))
-    share, left = np.zeros_like(tau), np.zeros_like(tau)
-    for i in range(len(tau)):
-        band, hidden = tau[i].copy(), np.zeros_like(tau[i])
-        for j in range(len(tau)):
-            x = np.clip(np.abs(depth[i] - depth[j]) / (0.5 * (spacing[i] + spacing[j])) - 1, 0, 1)
-            apart = x * x * (3 - 2 * x) if abs(i - j) <= splatting.NEAR else 1.0
-            band += tau[j] * (1 - apart) if i != j else 0
-            hidden += tau[j] * apart if j < i else 0
-        left[i] = np.exp(-hidden)
-        share[i] = tau[i] * left[i] * np.where(band > 1e-6, -np.expm1(-band) / np.where(band > 1e-6, band, 1), 1)
-    return share, left
-
-
 def blend_twin(entries, found, view, pixel):
     """Opacity, coverage, depth, spread, log spacing, normal and attributes of one pixel, in float64."""
     order = np.asarray(entries.order)[np.asarray(entries.pixel) == pixel][: splatting.LIST]
     point = np.asarray(entries.point)[order]
     kernel, facing, depth = (np.float64(x)[order] for x in (entries.kernel, entries.facing, entries.depth))
     spacing, weight = np.float64(found.spacing)[point], kernel**2 * facing
-    share, left = (x[:, 0] for x in shares_twin(*(x[:, None] for x in (splatting.OPACITY * weight, depth, spacing))))
+    lists = (x[:, None] for x in (splatting.OPACITY * weight, depth, spacing))
+    share, left = (x[:, 0] for x in reference.shares(*lists, splatting.NEAR))
     opacity = share.sum()
     divisor = max(opacity, splatting.LEAST_SHARE)
     mean = share @ depth / divisor
@@ -84,7 +70,7 @@ class TestShares:
     def test_they_are_those_of_a_float64_loop(self):
         for seed in (0, 1):
             lists = self.lists(seed, high=(1.0, 6.0)[seed])
-            close(shares(*map(jnp.asarray, lists)), shares_twin(*lists), rtol=2e-5, atol=2e-6)
+            close(shares(*map(jnp.asarray, lists)), reference.shares(*lists, splatting.NEAR), rtol=2e-5, atol=2e-6)
 
     @hypotheses
     @given(extremes(24, 6, low=-30, high=3, signed=False), st.integers(0, 99), st.integers(-6, 3), st.integers(-3, 1))
@@ -97,7 +83,7 @@ class TestShares:
         # by depth and spacing, what float32 knows of a gap in spacings
         rounding = np.abs(depth).max() / spacing.min()
         share, left = float64_law(shares, tau, depth, spacing, floors=(1.0, rounding, rounding))
-        expected = shares_twin(tau, depth, spacing)
+        expected = reference.shares(tau, depth, spacing, splatting.NEAR)
         close((share, left), expected, rtol=1e-4, atol=1e-6 * (1 + rounding * tau.max()))
 
     def test_they_lie_in_0_to_1_and_so_does_their_sum(self):
