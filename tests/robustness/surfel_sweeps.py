@@ -17,7 +17,6 @@ from spnr_jax.nn import shader
 from spnr_jax.surfels import discs, layers, lighting, small_systems, splatting
 from spnr_jax.surfels.features import NUM_MAPS
 from spnr_jax.surfels.rules import NEIGHBORS, RULES
-from spnr_jax.surfels.visibility import DIRECTIONS
 
 POINTS = 16
 
@@ -112,11 +111,11 @@ def sorted_sheets(rng, size):
 
 
 def quadric(offset, spacing):
-    """Normal and heights of the layers that begin straight up."""
+    """Normal and heights of the layers that begin straight up, after a round."""
     up = jnp.stack([jnp.zeros_like(spacing), jnp.zeros_like(spacing), jnp.ones_like(spacing)])
     weight = jnp.exp(-0.2 * jnp.sum((offset / spacing[None, None]) ** 2, axis=1))
     free = jnp.zeros(spacing.shape, bool)
-    layer, _ = layers.fit_layers(hood_of(offset), spacing, up, weight, free, None, RULES)
+    layer, _ = layers.fit_layers(hood_of(offset), spacing, up, weight, free, None, dataclasses.replace(RULES, rounds=1))
     return layer.normal, layer.height
 
 
@@ -168,21 +167,6 @@ def arrives(light, visible, normal):
     return lighting.arriving(dataclasses.replace(found, visible=visible, normal=normal), Light(tables=light))
 
 
-def arrives_twin(light, visible, normal):
-    """Direction by direction, from the texels around each."""
-    x, y, z = np.float64(DIRECTIONS).T
-    table = light[1 + lighting.TOLD]
-    row = np.arctan2(np.hypot(x, z), y) / np.pi * lighting.HEIGHT - 0.5
-    column = np.arctan2(x, -z) / (2 * np.pi) % 1 * lighting.WIDTH - 0.5
-    radiance = np.zeros((len(x), 3))
-    for i, j in np.ndindex(2, 2):
-        weight = (1 - np.abs(np.floor(row) + i - row)) * (1 - np.abs(np.floor(column) + j - column))
-        rows = np.clip(np.floor(row) + i, 0, lighting.HEIGHT - 1).astype(int)
-        radiance += weight[:, None] * table[rows, (np.floor(column) + j).astype(int) % lighting.WIDTH]
-    cosines = np.maximum(normal @ np.float64(DIRECTIONS).T, 0)
-    return (4 / len(x) * (visible * cosines) @ radiance,)
-
-
 def shade(outputs, maps, ambient):
     """The shader's picture, not enlarged."""
     return shader.picture(outputs, maps, ambient, 0)
@@ -197,7 +181,7 @@ def lit(rng, light):
 
 
 ROWS = (  # kernel, axis, low, usual, high, function, inputs, twin, floors
-    ("shares", "optical depth of an entry", 1e-30, 1, 1e30, splatting.shares, lists, shares_twin, (0.0, 1.0)),
+    ("shares", "optical depth of an entry", 1e-30, 1, 1e15, splatting.shares, lists, None, (0.0, 1.0)),  # thin: a series, to 7e-9
     (
         *("shares", "distance in spacings", 1, 2, 1e4, splatting.shares),
         *(lambda rng, v: lists(rng, distance=v), shares_twin, (0.0, 1.0)),
@@ -208,7 +192,7 @@ ROWS = (  # kernel, axis, low, usual, high, function, inputs, twin, floors
     ("measure_shape", "thickness", 0.2, 0.3, 1, small_systems.measure_shape, covariances),
     ("measure_covariance", "spacing", 1e-12, 1, 1e12, covariance, sheets, covariance_twin),
     ("first_spacing", "spacing", 1e-4, 0.1, 1e12, spacings, sorted_sheets, spacings_twin),
-    ("fit_layers", "spacing", 1e-12, 1, 1e12, quadric, sheets),
+    ("fit_layers, a round", "spacing", 1e-12, 1, 1e12, quadric, sheets),
     ("find_farthest", "distance", 1e-30, 1, 1e30, discs.find_farthest, places, farthest_twin),
     ("fit_colors", "difference of colors", 0.1, 1, 10, slopes, tinted),
     (
@@ -218,7 +202,6 @@ ROWS = (  # kernel, axis, low, usual, high, function, inputs, twin, floors
     (
         *("arriving", "size of the light", 1e-30, 1, 1e30, arrives),
         lambda rng, v: (tables(rng, v), rng.uniform(size=(POINTS, 64)), unit(rng.normal(size=(POINTS, 3)))),
-        arrives_twin,
     ),
     (
         *("reflectance", "cosine", 1e-6, 0.5, 1, lighting.reflectance),
