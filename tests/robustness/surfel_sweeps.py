@@ -181,7 +181,17 @@ def lit(rng, light):
 
 
 ROWS = (  # kernel, axis, low, usual, high, function, inputs, twin, floors
-    ("shares", "optical depth of an entry", 1e-30, 1, 1e15, splatting.shares, lists, None, (0.0, 1.0)),  # thin: a series, to 7e-9
+    (
+        "shares",
+        "optical depth of an entry",
+        1e-30,
+        1,
+        1e15,
+        splatting.shares,
+        lists,
+        None,
+        (0.0, 1.0),
+    ),  # thin: a series, to 7e-9
     (
         *("shares", "distance in spacings", 1, 2, 1e4, splatting.shares),
         *(lambda rng, v: lists(rng, distance=v), shares_twin, (0.0, 1.0)),

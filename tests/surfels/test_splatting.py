@@ -68,9 +68,25 @@ class TestShares:
         return tuple(np.float32(x) for x in (tau, depth, rng.uniform(0.1, 0.6, (24, 60))))
 
     def test_they_are_those_of_a_float64_loop(self):
-        for seed in (0, 1):
-            lists = self.lists(seed, high=(1.0, 6.0)[seed])
-            close(shares(*map(jnp.asarray, lists)), reference.shares(*lists, splatting.NEAR), rtol=2e-5, atol=2e-6)
+        for seed, high, dense in ((0, 1.0, 1.0), (1, 6.0, 1.0), (0, 6.0, 0.005)):
+            tau, *others = self.lists(seed, high)
+            lists = dense * tau, *others
+            share, left = shares(*map(jnp.asarray, lists))
+            close((share / dense, left), self.expected(lists, dense), rtol=2e-5, atol=2e-6)
+
+    def expected(self, lists, dense=1.0):
+        share, left = reference.shares(*lists, splatting.NEAR)
+        return share / dense, left
+
+    def test_gradients_are_central_differences_of_the_float64_loop(self):
+        lists, rng = [np.float64(x[:, :6]) for x in self.lists(0)], np.random.default_rng(0)
+        weights = rng.normal(size=(2, 24, 6))
+        along = jax.jit(jax.grad(lambda *x: jnp.vdot(np.float32(weights), jnp.stack(shares(*x))), (0, 1, 2)))
+        for number, gradient in enumerate(along(*map(jnp.float32, lists))):
+            way = 1e-6 * rng.normal(size=(24, 6)) * (np.arange(3) == number)[:, None, None]
+            ends = (reference.shares(*np.add(lists, sign * way), splatting.NEAR) for sign in (1, -1))
+            slope = np.vdot(weights, np.subtract(*ends)) / 2
+            close(np.vdot(gradient, way[number]), slope, rtol=1e-3, atol=0)
 
     @hypotheses
     @given(extremes(24, 6, low=-30, high=3, signed=False), st.integers(0, 99), st.integers(-6, 3), st.integers(-3, 1))
