@@ -19,7 +19,7 @@ from spnr_jax.devices.compilation import QUICK, QUICKEST
 from spnr_jax.devices.side_by_side import two_at_a_time
 from spnr_jax.devices.traces import Kept
 from spnr_jax.kernels import cameras, cloud_arrays
-from spnr_jax.kernels.records import Camera, GBuffer, Light, PointCloud, Rendering, Scene, SurfelScene, Volume
+from spnr_jax.kernels.records import Camera, GBuffer, Light, PointCloud, Rendering, Scene, Surface, SurfelScene, Volume
 from spnr_jax.kernels.resizing import enlarged
 from spnr_jax.method import solid, surfel_renderer
 from spnr_jax.method.surfel_renderer import Blended, Plan, Sizes, unstack
@@ -142,7 +142,7 @@ def draw_planned(variables: dict | None, volume: Volume, asked: Asked, sizes: Si
     return _shade(variables, volume.scene, asked.camera, asked.light, blended, known, plan=plan)
 
 
-_encode_solid = Kept(solid.encode, returns=(Scene,), options=QUICK)
+_encode_solid = Kept(solid.encode, returns=(Scene, Surface), options=QUICK)
 
 
 @partial(Kept, static="plan")
