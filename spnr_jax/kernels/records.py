@@ -32,6 +32,8 @@ class PointCloud:
     """Of unit length, of either sign; None where none are known: then they are estimated from these points."""
     materials_known: Float[AnyArray, "*batch points"] | None = None
     """1 where roughness and metallic are known, 0 where they stand for any; None where all are known."""
+    invented: Float[AnyArray, "*batch points"] | None = None
+    """0 where a point was measured, else 1 - p / 2 of the probability p that it lies on the surface; None: all were."""
 
 
 @no_type_check

@@ -1,0 +1,334 @@
+"""Learned points between the points of a sparse cloud: a network over pairs of neighbors.
+
+    propose    pairs of neighbors without a point between them, and open places beside points: rims, legs, gaps
+    place      the middle of the curve through both ends at right angles to their normals (Vlachos et al. 2001, curved PN
+               triangles), and a frame there
+    predict    a PointNet over the points around each place, in its frame: how far the surface lies from there, its
+               normal, whether it exists, whose material it has
+    choose     likely children that are not too near to better ones
+
+All is relative: lengths in spacings, vectors in frames that turn with the cloud, so a turned cloud has turned children.
+Topology, the neighbors, comes from the host; which pairs, which points around them, and which children are kept are
+choices, whose gradient is none; places, normals and materials are differentiable.
+"""
+
+import dataclasses
+from typing import NamedTuple
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from spnr_jax.kernels.numerics import clamp, length, normalize, root
+from spnr_jax.kernels.records import AnyArray, PointCloud, Surfels
+from spnr_jax.surfels.geometry import estimate_surfels
+from spnr_jax.surfels.surfel_scenes import fit_box
+
+CHILDREN = 6  # of a point: in the middle of its pairs, each of which belongs to one of its ends, and at open places
+AROUND = 16  # points that tell a child
+BETWEEN = 0.1  # cosine: a point that sees both ends at an angle whose cosine is less than -BETWEEN lies between them
+ACROSS = 0.8  # sine of the slope of a pair over both tangent planes, from which on it goes through a wall
+LONGEST, SHORTEST = 4.0, 0.3  # spacings between the ends of a pair
+WAYS = 6  # in each tangent plane, that may be open: the first towards the nearest neighbor
+BESIDE, NEAR = 0.75, 1.7  # cosine, and spacings, within which a neighbor takes a way
+OPEN = 0.5  # spacings to an open place
+CLOSEST = 0.3  # spacings between a child and a better one, or a measured point; twice that if they face away
+LIKELY = 0.5  # probability from which on a child is kept
+
+
+class Nodes(NamedTuple):
+    """What is known of each point: colors are square roots of linear ones; traits are side, shape, and openness."""
+
+    position: Float[Array, "n 3"]
+    normal: Float[Array, "n 3"]
+    spacing: Float[Array, " n"]
+    color: Float[Array, "n 3"]
+    traits: Float[Array, "n 5"]
+
+
+class Places(NamedTuple):
+    """Where children are looked for: two points each, the same one twice at an open place, and who is around.
+
+    `exists` is False for what only fills the array; rows of `frame` are unit vectors from the first to the second
+    point, across, and along the normal; `scale` is the unit of length; `around` are numbers of points, -1 for none.
+    """
+
+    first: Int[Array, " m"]
+    second: Int[Array, " m"]
+    exists: Bool[Array, " m"]
+    middle: Float[Array, "m 3"]
+    frame: Float[Array, "m 3 3"]
+    scale: Float[Array, " m"]
+    around: Int[Array, "m 16"]
+
+
+class Children(NamedTuple):
+    """A child of each place: `offset` from its middle in its scale, log odds that it exists, shares of who is around."""
+
+    position: Float[Array, "m 3"]
+    offset: Float[Array, "m 3"]
+    normal: Float[Array, "m 3"]
+    odds: Float[Array, " m"]
+    shares: Float[Array, "m 16"]
+
+
+def describe(surfels: Surfels) -> Nodes:
+    """The nodes of a cloud's surfels."""
+    openness = 2 * jnp.mean(surfels.visible, axis=1)
+    shown = jnp.asarray(surfels.mask, surfels.spacing.dtype)
+    traits = jnp.concatenate([surfels.shape, jnp.stack([surfels.sided, openness, shown], axis=1)], axis=1)
+    return Nodes(surfels.position, surfels.normal, surfels.spacing, root(surfels.base_color), traits)
+
+
+def propose(
+    nodes: Nodes, neighbors: Int[Array, "n 20"]
+) -> tuple[Int[Array, "n c"], Bool[Array, "n c"], Float[Array, "n c 3"]]:
+    """The other end of the pairs of each point, which exist, and ways to open places, where the other end is itself.
+
+    A pair is one of a Gabriel graph: no other neighbor lies in the sphere around both.  The lower or the higher of two
+    numbers owns it, as their sum is even or odd, so that all points own about as many.
+    """
+    own = jnp.arange(len(neighbors), dtype=neighbors.dtype)
+    other = neighbors[:, 1:]
+    real, reach = other >= 0, nodes.spacing[:, None]
+    offset = jnp.where(real[..., None], nodes.position[other] - nodes.position[:, None], 0)
+    products = jnp.einsum("nai,nbi->nab", offset, offset, precision="highest")
+    squared = jnp.diagonal(products, axis1=1, axis2=2)
+    to_end = root(squared[:, :, None] + squared[:, None] - 2 * products)
+    size = root(squared)
+    height = jnp.einsum("nai,ni->na", offset, nodes.normal)
+    through = (jnp.abs(height) > ACROSS * size) & (
+        jnp.abs(jnp.sum(offset * nodes.normal[other], axis=-1)) > ACROSS * size
+    )
+    between = squared[:, None] - products < -BETWEEN * size[:, None] * to_end
+    blocked = jnp.any(between & (real & ~through)[:, None], axis=2)
+    listed = jnp.any(neighbors[other] == own[:, None, None], axis=-1)
+    owns = ((own[:, None] + other) % 2 == 0) == (own[:, None] < other)
+    fits = (size < LONGEST * reach) & (size > SHORTEST * (reach + nodes.spacing[other]))
+    pair = real & ~blocked & ~through & (owns | ~listed) & fits
+    flat = normalize((offset - height[..., None] * nodes.normal[:, None]) / reach[..., None])
+    nearest = jnp.argmin(jnp.where(real & ~through, size, jnp.inf), axis=1)[:, None, None]
+    first = complete(jnp.take_along_axis(flat, nearest, axis=1)[:, 0], nodes.normal)
+    second = jnp.cross(nodes.normal, first)
+    angle = 2 * np.pi / WAYS * np.arange(WAYS)
+    ways = first[:, None] * np.cos(angle)[:, None] + second[:, None] * np.sin(angle)[:, None]
+    along = jnp.einsum("nwi,nai->nwa", ways, flat)
+    taken = (along > BESIDE) & (real & ~through & (size < NEAR * reach))[:, None]
+    free = ~jnp.any(taken, axis=2) & real[:, :1]
+    rank = jnp.concatenate([jnp.where(pair, size / reach, jnp.inf), jnp.where(free, 1e3 + angle, jnp.inf)], axis=1)
+    order = jnp.argsort(rank, axis=1)[:, :CHILDREN]
+    exists = jnp.take_along_axis(rank, order, axis=1) < jnp.inf
+    ends = jnp.concatenate([other, jnp.broadcast_to(own[:, None], free.shape)], axis=1)
+    ends = jnp.where(exists, jnp.take_along_axis(ends, order, axis=1), own[:, None])
+    ways = jnp.concatenate([flat, ways], axis=1)
+    return ends, exists, jnp.take_along_axis(ways, order[..., None], axis=1)
+
+
+def complete(way: Float[Array, "m 3"], normal: Float[Array, "m 3"]) -> Float[Array, "m 3"]:
+    """Unit vectors along the ways in the planes of unit normals; any in the plane where a way is at right angles."""
+    axis = jnp.where(jnp.abs(normal[:, :1]) < 0.6, jnp.eye(3)[:1], jnp.eye(3)[1:2])
+    flat = way - jnp.sum(way * normal, axis=1, keepdims=True) * normal
+    other = axis - jnp.sum(axis * normal, axis=1, keepdims=True) * normal
+    return normalize(jnp.where(jnp.sum(flat**2, axis=1, keepdims=True) > 1e-6, flat, other))
+
+
+def place(nodes: Nodes, neighbors: Int[Array, "n 20"]) -> Places:
+    """Where children of all points are looked for, CHILDREN of each point side by side."""
+    ends, exists, ways = jax.lax.stop_gradient(propose(nodes, neighbors))
+    own = jnp.broadcast_to(jnp.arange(len(ends), dtype=ends.dtype)[:, None], ends.shape)
+    first, second, exists, ways = own.reshape(-1), ends.reshape(-1), exists.reshape(-1), ways.reshape(-1, 3)
+    turned = nodes.spacing[first] > nodes.spacing[second]  # not by number: points may come in any order
+    turned = turned | ((nodes.spacing[first] == nodes.spacing[second]) & (first > second))
+    first, second = jnp.where(turned, second, first), jnp.where(turned, first, second)
+    alone = (first == second)[:, None]
+    way, scale = nodes.position[second] - nodes.position[first], (nodes.spacing[first] + nodes.spacing[second]) / 2
+    one, two = nodes.normal[first], nodes.normal[second]
+    heights = jnp.sum(way * one, axis=1, keepdims=True), -jnp.sum(way * two, axis=1, keepdims=True)
+    curved = way / 2 - (heights[0] * one + heights[1] * two) / 8
+    middle = nodes.position[first] + jnp.where(alone, OPEN * scale[:, None] * ways, curved)
+    alike = jnp.sum(one * two, axis=1, keepdims=True) >= 0
+    up = normalize(one + jnp.where(alike, two, -two))
+    along = complete(jnp.where(alone, ways, normalize(way / scale[:, None])), up)
+    frame = jnp.stack([along, jnp.cross(up, along), up], axis=1)
+    around = find_around(nodes, neighbors, first, second, jax.lax.stop_gradient(middle))
+    return Places(first, second, exists, middle, frame, scale, around)
+
+
+def find_around(nodes: Nodes, neighbors: Array, first: Array, second: Array, middle: Array) -> Int[Array, "m 16"]:
+    """Numbers of the points nearest to each place, among the neighbors of both ends; -1 for none."""
+    one, two = neighbors[first], neighbors[second]
+    again = jnp.any(one[:, None] == two[:, :, None], axis=2)
+    number = jnp.concatenate([one, jnp.where(again, -1, two)], axis=1)
+    squared = jnp.sum((nodes.position[number] - middle[:, None]) ** 2, axis=-1)
+    nearest, chosen = jax.lax.top_k(-jnp.where(number >= 0, squared, jnp.inf), AROUND)
+    return jnp.where(nearest > -jnp.inf, jnp.take_along_axis(number, chosen, axis=1), -1)
+
+
+class Densifier(nn.Module):
+    """Children of places: two graph convolutions over the points, then a PointNet in each place's frame."""
+
+    features: int = 32
+    width: int = 64
+
+    @nn.compact
+    def __call__(self, nodes: Nodes, neighbors: Int[Array, "n 20"], places: Places) -> Children:
+        """Residuals on the middles of the places; untrained, the middles themselves."""
+        hidden = nn.Dense(self.features, name="point")(nodes.traits)
+        around, real = neighbors[:, 1:], neighbors[:, 1:] >= 0
+        edges = relate(nodes, around)
+        for number in (0, 1):
+            hidden = self.convolve(hidden, around, real, edges, f"graph{number}")
+        real = places.around >= 0
+        seen, offset = look(nodes, places)
+        told = compare_ends(nodes, places)
+        element = nn.Dense(self.width, name="element")(seen) + nn.Dense(self.width, name="told")(told)[:, None]
+        element += nn.Dense(self.width, use_bias=False, name="neighbor")(hidden)[places.around]
+        element = nn.relu(nn.Dense(self.width, name="element1")(nn.relu(element)))
+        pooled = nn.relu(nn.Dense(self.width, name="pool")(pool(element, real)))
+        element = nn.Dense(self.width, name="element2")(element) + nn.Dense(self.width, name="back")(pooled)[:, None]
+        element = nn.relu(nn.Dense(self.width, name="element3")(nn.relu(element)))
+        state = jnp.concatenate([pool(element, real), pooled, told], axis=1)
+        state = nn.relu(nn.Dense(96, name="head")(state))
+        state = nn.relu(nn.Dense(96, name="head1")(state))
+        out = nn.Dense(7, kernel_init=nn.initializers.normal(0.01), name="out")(state)
+        move = clamp(out[:, :3], -1.5, 1.5)
+        tilt = out[:, 3:6] + jnp.asarray([0, 0, 1], out.dtype)[None]
+        position = places.middle + places.scale[:, None] * turn(move, places.frame)
+        normal = normalize(turn(tilt, places.frame))
+        near = jnp.sum((offset - move[:, None]) ** 2, axis=-1)
+        facing = jnp.einsum("mki,mi->mk", nodes.normal[places.around], normal)
+        sharp = self.param("sharp", nn.initializers.constant(2.0), (2,))
+        preferred = nn.Dense(1, name="material")(element)[..., 0] - sharp[0] * near + sharp[1] * facing
+        shares = jax.nn.softmax(jnp.where(real, preferred, -1e9), axis=1)
+        return Children(position, move, normal, out[:, 6], shares)
+
+    def convolve(self, hidden: Array, around: Array, real: Array, edges: Array, name: str) -> Array:
+        """The points' features after one graph convolution (Wang et al. 2019, EdgeConv)."""
+        message = nn.Dense(self.features, name=f"{name}_own")(hidden)[:, None]
+        message += nn.Dense(self.features, use_bias=False, name=f"{name}_other")(hidden)[around]
+        message = nn.relu(message + nn.Dense(self.features, use_bias=False, name=f"{name}_edge")(edges))
+        message = nn.relu(nn.Dense(self.features, name=f"{name}_message")(message))
+        both = jnp.concatenate([hidden, pool(message, real)], axis=1)
+        change = nn.Dense(self.features, name=f"{name}_out")(nn.relu(nn.Dense(self.features, name=f"{name}_in")(both)))
+        return nn.LayerNorm(name=f"{name}_norm")(hidden + change)
+
+
+def pool(values: Float[Array, "m k f"], real: Bool[Array, "m k"]) -> Float[Array, "m 2f"]:
+    """Largest (of numbers above 0) and mean of what is real."""
+    values = values * real[..., None]
+    mean = jnp.sum(values, axis=1) / jnp.maximum(jnp.sum(real, axis=1, keepdims=True), 1)
+    return jnp.concatenate([jnp.max(values, axis=1), mean], axis=1)
+
+
+def turn(vectors: Float[Array, "m 3"], frame: Float[Array, "m 3 3"]) -> Float[Array, "m 3"]:
+    """Vectors in frames, in the axes of the cloud."""
+    return jnp.einsum("mj,mji->mi", vectors, frame, precision="highest")
+
+
+def relate(nodes: Nodes, around: Int[Array, "n k"]) -> Float[Array, "n k 9"]:
+    """Numbers of each point and neighbor that do not change when the cloud is turned."""
+    spacing = nodes.spacing[:, None]
+    offset = (nodes.position[around] - nodes.position[:, None]) / spacing[..., None]
+    normal, other = nodes.normal[:, None], nodes.normal[around]
+    height, from_there = jnp.sum(offset * normal, axis=-1), -jnp.sum(offset * other, axis=-1)
+    far = length(offset)
+    beside = root(far**2 - height**2)
+    unlike = length(nodes.color[around] - nodes.color[:, None])
+    coarse = jnp.log(nodes.spacing[around] / spacing)
+    parts = [height, from_there, far, jnp.exp(-far), beside, jnp.sum(normal * other, axis=-1), coarse]
+    return clamp(jnp.stack([*parts, unlike, jnp.exp(-8 * unlike)], axis=-1), -8, 8)
+
+
+def look(nodes: Nodes, places: Places) -> tuple[Float[Array, "m k 14"], Float[Array, "m k 3"]]:
+    """What is seen of the points around each place, and the way to them in its frame and scale."""
+    number, scale = places.around, places.scale[:, None]
+    way = (nodes.position[number] - places.middle[:, None]) / scale[..., None]
+    offset = clamp(jnp.einsum("mki,mji->mkj", way, places.frame), -8, 8)
+    normal = jnp.einsum("mki,mji->mkj", nodes.normal[number], places.frame)
+    far = length(offset)
+    color = (nodes.color[places.first] + nodes.color[places.second]) / 2
+    unlike = length(nodes.color[number] - color[:, None])
+    ends = [number == x[:, None] for x in (places.first, places.second)]
+    coarse = jnp.log(nodes.spacing[number] / scale)
+    height = -jnp.sum(offset * normal, axis=-1)
+    parts = [far, jnp.exp(-(far**2)), height, coarse, unlike, jnp.exp(-8 * unlike), *ends]
+    return jnp.concatenate([offset, normal, jnp.stack(parts, axis=-1)], axis=-1), offset
+
+
+def compare_ends(nodes: Nodes, places: Places) -> Float[Array, "m 7"]:
+    """Numbers of both ends of each place."""
+    one, two = places.first, places.second
+    way = (nodes.position[two] - nodes.position[one]) / places.scale[:, None]
+    heights = [jnp.sum(way * nodes.normal[x], axis=1) for x in (one, two)]
+    cosine = jnp.sum(nodes.normal[one] * nodes.normal[two], axis=1)
+    unlike = length(nodes.color[one] - nodes.color[two])
+    coarse = jnp.log(nodes.spacing[two] / nodes.spacing[one])
+    parts = [length(way), *heights, cosine, unlike, coarse, (one == two).astype(cosine.dtype)]
+    return clamp(jnp.stack(parts, axis=1), -8, 8)
+
+
+def blend(shares: Float[Array, "m k"], values: Float[Array, "m k ..."]) -> Float[Array, "m ..."]:
+    """Sums of the values times their shares."""
+    return jnp.einsum("mk,mk...->m...", shares, values, precision="highest")
+
+
+def choose(
+    nodes: Nodes, neighbors: Int[Array, "n 20"], places: Places, children: Children
+) -> Bool[Array, " m"]:
+    """Which children are kept: likely ones that are not too near to a measured point or to a more likely child."""
+    likely = jax.lax.stop_gradient(jnp.where(places.exists, children.odds, -jnp.inf))
+    count = len(neighbors)
+    odds = likely.reshape(count, CHILDREN)
+    position, normal = (x.reshape(count, CHILDREN, 3) for x in (children.position, children.normal))
+    near = neighbors[:, :12]
+    real = (near >= 0)[..., None]
+    rivals = jnp.where(real, odds[near], -jnp.inf).reshape(count, -1)
+    number = (near[..., None] * CHILDREN + jnp.arange(CHILDREN)).reshape(count, 1, -1)
+    own = jnp.arange(count * CHILDREN).reshape(count, CHILDREN, 1)
+    closest = CLOSEST * places.scale.reshape(count, CHILDREN, 1)
+
+    def compare(others: Array, facing: Array) -> Array:
+        far = jnp.sum((others[:, None] - position[:, :, None]) ** 2, axis=-1)
+        unlike = 1 - jnp.einsum("nki,nci->nck", facing, normal, precision="highest")
+        return far / closest**2 + 1.5 * unlike
+
+    far = compare(position[near].reshape(count, -1, 3), normal[near].reshape(count, -1, 3))
+    better = (rivals[:, None] > odds[..., None]) | ((rivals[:, None] == odds[..., None]) & (number < own))
+    beaten = jnp.any(better & (far < 1) & (number != own), axis=2)
+    measured = compare(nodes.position[near], nodes.normal[near])
+    beaten = beaten | jnp.any(real[:, None, :, 0] & (measured < 1), axis=2)
+    return ((odds > jnp.log(LIKELY / (1 - LIKELY))) & ~beaten).reshape(-1)
+
+
+def densify(params: dict, cloud: PointCloud, neighbors: Int[AnyArray, "points 20"]) -> PointCloud:
+    """The cloud (unbatched, any units) and CHILDREN more points for each, of which `mask` says which are kept.
+
+    Pure, of fixed size: jit, vmap over equally padded clouds, grad.  `neighbors` are `spnr_jax.neighbors(cloud)`.  All
+    points have normals then: measured ones those that are given or estimated.
+    """
+    mask = jnp.asarray(cloud.mask)
+    centre, scale = fit_box(jnp.asarray(cloud.positions), mask)
+    inside = clamp((jnp.asarray(cloud.positions) - centre[None]) * scale, -1, 1)
+    neighbors = jnp.asarray(neighbors)
+    nodes = describe(estimate_surfels(dataclasses.replace(cloud, positions=inside), neighbors))
+    places = place(nodes, neighbors)
+    children: Children = Densifier().apply({"params": params}, nodes, neighbors, places)
+    kept = choose(nodes, neighbors, places, children)
+
+    def mix(column: AnyArray) -> Array:
+        return jnp.concatenate([jnp.asarray(column), blend(children.shares, jnp.asarray(column)[places.around])])
+
+    color = blend(children.shares, nodes.color[places.around]) ** 2
+    doubt = 1 - jax.nn.sigmoid(children.odds) / 2
+    return PointCloud(
+        positions=jnp.concatenate([jnp.asarray(cloud.positions), children.position / scale + centre[None]]),
+        base_color=jnp.concatenate([jnp.asarray(cloud.base_color), color]),
+        roughness=mix(cloud.roughness),
+        metallic=mix(cloud.metallic),
+        mask=jnp.concatenate([mask, kept]),
+        normals=jnp.concatenate([nodes.normal, children.normal]),
+        materials_known=None if cloud.materials_known is None else mix(cloud.materials_known),
+        invented=jnp.concatenate([jnp.zeros_like(nodes.spacing), doubt]),
+    )
