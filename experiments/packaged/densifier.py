@@ -7,7 +7,6 @@ the truth of one object and several clouds of it, sparse, even or random or nois
 Both halves can be stopped and go on where they were.
 """
 
-import dataclasses
 import time
 from dataclasses import dataclass
 from functools import partial
@@ -36,7 +35,7 @@ from spnr_jax.formats.npz import packed
 from spnr_jax.kernels import cloud_arrays
 from spnr_jax.kernels.records import PointCloud
 from spnr_jax.kernels.thinning import farthest_points
-from spnr_jax.method.densifier import CHILDREN, Densifier, Nodes, Places, blend, describe, place, turn
+from spnr_jax.method.densifier import CHILDREN, Densifier, Nodes, Places, blend, describe, place, predict, turn
 from spnr_jax.surfels import geometry, sides
 from spnr_jax.surfels.geometry import Points, estimate_surfels
 from spnr_jax.surfels.neighbors import order_in_space
@@ -48,7 +47,10 @@ CORE, NODES, PLACES, QUERIES = 1024, 1920, 4864, 3072  # of a batch: points in i
 FEWEST = 300  # points of a cloud
 UNLIKE = 0.12  # squared spacings that a normal at right angles counts as
 HIDDEN = 0.1  # weight of what nothing outside sees
-EXACT, ROBUST = 0.08, 0.15  # spacings off the surface at which a child is half there, and from which on errors count less
+EXACT, ROBUST = (
+    0.08,
+    0.15,
+)  # spacings off the surface at which a child is half there, and from which on errors count less
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,8 +126,8 @@ def make_record(asset: Asset, seed: int) -> dict[str, np.ndarray]:
     position = truth.positions.astype(np.float32)
     flipped, visible = find_outside(position, truth.normals.astype(np.float32))
     color = np.sqrt(np.clip(truth.base_color, 0, 1))
-    record = {"position": position, "normal": flipped.astype(np.float16), "visible": visible}
-    record["color"] = np.uint8(255 * color + 0.5)
+    record: dict[str, np.ndarray] = {"position": position, "normal": flipped.astype(np.float16), "visible": visible}
+    record["color"] = (255 * color + 0.5).astype(np.uint8)
     even = farthest_points(position[: 2**16], EVEN, seed)
     fewer, more = (int(np.exp(rng.uniform(*np.log(x)))) for x in ((FEWEST, 1000), (1100, EVEN)))
     kinds = [(1024, True, 0.0), (fewer, True, 0.0), (4096, True, 0.0), (int(rng.choice([1024, 2048])), False, 0.0)]
@@ -190,7 +192,9 @@ def make_cloud(
     arrays["matched"] = cKDTree(dense).query(found.middle[kept], MATCHED)[1].astype(np.int32)
     arrays["nearest"] = cKDTree(found.middle[kept]).query(dense[asked], NEAREST)[1].astype(np.int32)
     arrays["parents"] = cKDTree(places[order]).query(dense[asked], 2)[1].astype(np.int32)
-    return {name: values.astype(np.float32) if values.dtype == np.float64 else values for name, values in arrays.items()}
+    return {
+        name: values.astype(np.float32) if values.dtype == np.float64 else values for name, values in arrays.items()
+    }
 
 
 # --- batches ----------------------------------------------------------------------------------------------------------
@@ -242,7 +246,9 @@ def cut(record: dict[str, np.ndarray], number: int, most: int, rng: np.random.Ge
     inside = np.zeros(len(position), bool)
     inside[core] = True
     chosen = np.flatnonzero(inside[get["place_first"]])
-    rows = {name.removeprefix("place_"): x[chosen] for name, x in get.items() if name.startswith("place_")}
+    rows: dict[str, Any] = {
+        name.removeprefix("place_"): x[chosen] for name, x in get.items() if name.startswith("place_")
+    }
     used = np.unique(np.concatenate([core, rows["second"], near[core].ravel(), rows["around"].ravel()]))
     used = used[used >= 0]
 
@@ -301,9 +307,10 @@ def join(parts: list[Batch]) -> Batch:
         def move(x: np.ndarray, by: int) -> np.ndarray:
             return np.where(x < 0, -1, x + by).astype(np.int32)
 
-        places = part.places._replace(
-            **{name: move(getattr(part.places, name), point) for name in ("first", "second", "around")}
-        )
+        moved: dict[str, Any] = {
+            name: move(getattr(part.places, name), point) for name in ("first", "second", "around")
+        }
+        places = part.places._replace(**moved)
         truth = part.truth._replace(nearest=move(part.truth.nearest, site), parents=move(part.truth.parents, point))
         shifted.append(Batch(part.nodes, move(part.neighbors, point), places, truth))
     joined = jax.tree.map(lambda *x: np.concatenate(x), *shifted)
@@ -313,7 +320,9 @@ def join(parts: list[Batch]) -> Batch:
 
     point = joined.nodes._replace(**{name: pad(x, NODES) for name, x in joined.nodes._asdict().items()})
     point = point._replace(spacing=pad(joined.nodes.spacing, NODES, 1))
-    place_ = {name: pad(x, PLACES, -1 if name == "around" else 0) for name, x in joined.places._asdict().items()}
+    place_: dict[str, Any] = {
+        name: pad(x, PLACES, -1 if name == "around" else 0) for name, x in joined.places._asdict().items()
+    }
     place_["scale"] = pad(joined.places.scale, PLACES, 1)
     at_place, asked = Truth._fields[:5], Truth._fields[5:8]
     true = {name: pad(getattr(joined.truth, name), PLACES) for name in at_place}
@@ -329,7 +338,7 @@ def join(parts: list[Batch]) -> Batch:
 def measure_loss(params: dict, batch: Batch) -> tuple[Array, dict[str, Array]]:
     """(loss, metrics): children on the surface, true points near a child, existence, normals, colors."""
     nodes, places, truth = batch.nodes, batch.places, batch.truth
-    children = Densifier().apply({"params": params}, nodes, batch.neighbors, places)
+    children = predict(params, nodes, batch.neighbors, places)
     shift = turn(children.offset, places.frame)
     weight = places.exists * (HIDDEN + (1 - HIDDEN) * jnp.mean(truth.visible[:, :4].astype(jnp.float32), axis=1))
     weight = weight / jnp.maximum(jnp.sum(weight), 1)
@@ -365,7 +374,7 @@ def measure_loss(params: dict, batch: Batch) -> tuple[Array, dict[str, Array]]:
     share = jnp.sum(kept)
     metrics = parts | {"off": jnp.sum(kept * off) / share, "kept": share, "cosine": jnp.sum(kept * cosine) / share}
     metrics["good"] = jnp.sum(kept * quality) / share
-    return sum(factors[name] * value for name, value in parts.items()), metrics
+    return sum((factors[name] * value for name, value in parts.items()), jnp.zeros(())), metrics
 
 
 def measure_cover(batch: Batch, children: Any, likely: Array) -> Array:
@@ -387,7 +396,9 @@ def measure_cover(batch: Batch, children: Any, likely: Array) -> Array:
 
 def optimizer(options: Options) -> optax.GradientTransformation:
     """Adam with a cosine schedule."""
-    rate = optax.warmup_cosine_decay_schedule(0.0, options.learning_rate, 100, options.steps, options.learning_rate / 100)
+    rate = optax.warmup_cosine_decay_schedule(
+        0.0, options.learning_rate, 100, options.steps, options.learning_rate / 100
+    )
     return optax.chain(optax.clip_by_global_norm(1.0), optax.adam(rate, b2=0.99))
 
 
@@ -420,7 +431,10 @@ def train(options: Options) -> None:
         sums.append(jax.device_get(metrics))
         if step % 100 == 99 or step == 9:
             mean = {name: np.mean([x[name] for x in sums]) for name in sums[0]}
-            print(f"{step + 1} {time.time() - begin:.0f} s " + " ".join(f"{k} {v:.4f}" for k, v in mean.items()), flush=True)
+            print(
+                f"{step + 1} {time.time() - begin:.0f} s " + " ".join(f"{k} {v:.4f}" for k, v in mean.items()),
+                flush=True,
+            )
             sums = []
         if step % 300 == 299 or step + 1 == options.steps:
             state["step"] = step + 1

@@ -1,8 +1,8 @@
 """Learned points between the points of a sparse cloud: a network over pairs of neighbors.
 
     propose    pairs of neighbors without a point between them, and open places beside points: rims, legs, gaps
-    place      the middle of the curve through both ends at right angles to their normals (Vlachos et al. 2001, curved PN
-               triangles), and a frame there
+    place      the middle of the curve through both ends at right angles to their normals (Vlachos et al. 2001), and
+               a frame there
     predict    a PointNet over the points around each place, in its frame: how far the surface lies from there, its
                normal, whether it exists, whose material it has
     choose     likely children that are not too near to better ones
@@ -13,7 +13,7 @@ choices, whose gradient is none; places, normals and materials are differentiabl
 """
 
 import dataclasses
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import flax.linen as nn
 import jax
@@ -26,16 +26,20 @@ from spnr_jax.kernels.records import AnyArray, PointCloud, Surfels
 from spnr_jax.surfels.geometry import estimate_surfels
 from spnr_jax.surfels.surfel_scenes import fit_box
 
+MOST_POINTS = 8192  # of a sparse cloud
 CHILDREN = 6  # of a point: in the middle of its pairs, each of which belongs to one of its ends, and at open places
 AROUND = 16  # points that tell a child
-BETWEEN = 0.1  # cosine: a point that sees both ends at an angle whose cosine is less than -BETWEEN lies between them
+BETWEEN = 0.4  # cosine: a point that sees both ends at an angle whose cosine is less than -BETWEEN lies between them
 ACROSS = 0.8  # sine of the slope of a pair over both tangent planes, from which on it goes through a wall
 LONGEST, SHORTEST = 4.0, 0.3  # spacings between the ends of a pair
 WAYS = 6  # in each tangent plane, that may be open: the first towards the nearest neighbor
 BESIDE, NEAR = 0.75, 1.7  # cosine, and spacings, within which a neighbor takes a way
 OPEN = 0.5  # spacings to an open place
-CLOSEST = 0.3  # spacings between a child and a better one, or a measured point; twice that if they face away
-LIKELY = 0.5  # probability from which on a child is kept
+CLOSEST = 0.2  # spacings between a child and a better one, or a measured point; twice that if they face away
+AWAY = 1.5  # squared multiple of that distance, that normals at right angles count as
+FARTHEST = 4.0  # squared multiple of that distance from measured points, from which on farther is no better
+ROUNDS = 8  # of choosing
+LIKELY = 0.35  # probability from which on a child is kept
 
 
 class Nodes(NamedTuple):
@@ -65,7 +69,8 @@ class Places(NamedTuple):
 
 
 class Children(NamedTuple):
-    """A child of each place: `offset` from its middle in its scale, log odds that it exists, shares of who is around."""
+    """A child of each place: `offset` from its middle in its frame and scale, log odds that it exists, and shares of
+    the points around it in its materials."""
 
     position: Float[Array, "m 3"]
     offset: Float[Array, "m 3"]
@@ -76,10 +81,12 @@ class Children(NamedTuple):
 
 def describe(surfels: Surfels) -> Nodes:
     """The nodes of a cloud's surfels."""
-    openness = 2 * jnp.mean(surfels.visible, axis=1)
-    shown = jnp.asarray(surfels.mask, surfels.spacing.dtype)
+    position, normal, spacing, color = map(
+        jnp.asarray, (surfels.position, surfels.normal, surfels.spacing, surfels.base_color)
+    )
+    openness, shown = 2 * jnp.mean(surfels.visible, axis=1), jnp.asarray(surfels.mask, spacing.dtype)
     traits = jnp.concatenate([surfels.shape, jnp.stack([surfels.sided, openness, shown], axis=1)], axis=1)
-    return Nodes(surfels.position, surfels.normal, surfels.spacing, root(surfels.base_color), traits)
+    return Nodes(position, normal, spacing, root(color), traits)
 
 
 def propose(
@@ -215,6 +222,12 @@ class Densifier(nn.Module):
         return nn.LayerNorm(name=f"{name}_norm")(hidden + change)
 
 
+def predict(params: dict, nodes: Nodes, neighbors: Int[Array, "n 20"], places: Places) -> Children:
+    """The children of places, by a network of these weights."""
+    children: Any = Densifier().apply({"params": params}, nodes, neighbors, places)
+    return children
+
+
 def pool(values: Float[Array, "m k f"], real: Bool[Array, "m k"]) -> Float[Array, "m 2f"]:
     """Largest (of numbers above 0) and mean of what is real."""
     values = values * real[..., None]
@@ -274,61 +287,78 @@ def blend(shares: Float[Array, "m k"], values: Float[Array, "m k ..."]) -> Float
     return jnp.einsum("mk,mk...->m...", shares, values, precision="highest")
 
 
-def choose(
-    nodes: Nodes, neighbors: Int[Array, "n 20"], places: Places, children: Children
-) -> Bool[Array, " m"]:
-    """Which children are kept: likely ones that are not too near to a measured point or to a more likely child."""
-    likely = jax.lax.stop_gradient(jnp.where(places.exists, children.odds, -jnp.inf))
+def choose(nodes: Nodes, neighbors: Int[Array, "n 20"], places: Places, children: Children) -> Bool[Array, " m"]:
+    """Which children are kept: likely ones, no two of them too near to each other or to a measured point.
+
+    The better of two is the one that is likelier and farther from measured points; in each round all go on that are
+    better than their rivals (a maximal independent set, Luby 1986), so the order of points does not matter.
+    """
     count = len(neighbors)
-    odds = likely.reshape(count, CHILDREN)
-    position, normal = (x.reshape(count, CHILDREN, 3) for x in (children.position, children.normal))
     near = neighbors[:, :12]
-    real = (near >= 0)[..., None]
-    rivals = jnp.where(real, odds[near], -jnp.inf).reshape(count, -1)
-    number = (near[..., None] * CHILDREN + jnp.arange(CHILDREN)).reshape(count, 1, -1)
-    own = jnp.arange(count * CHILDREN).reshape(count, CHILDREN, 1)
-    closest = CLOSEST * places.scale.reshape(count, CHILDREN, 1)
+    fixed = (nodes, children, places.scale, places.exists)
+    nodes, children, scale, exists = jax.lax.stop_gradient(fixed)
+    position, normal = (x.reshape(count, CHILDREN, 3) for x in (children.position, children.normal))
+    closest = CLOSEST * scale.reshape(count, CHILDREN, 1)
 
     def compare(others: Array, facing: Array) -> Array:
+        """Squared distances over those at which children begin to be too near; those that face away are farther."""
         far = jnp.sum((others[:, None] - position[:, :, None]) ** 2, axis=-1)
         unlike = 1 - jnp.einsum("nki,nci->nck", facing, normal, precision="highest")
-        return far / closest**2 + 1.5 * unlike
+        return far / closest**2 + AWAY * unlike
 
-    far = compare(position[near].reshape(count, -1, 3), normal[near].reshape(count, -1, 3))
-    better = (rivals[:, None] > odds[..., None]) | ((rivals[:, None] == odds[..., None]) & (number < own))
-    beaten = jnp.any(better & (far < 1) & (number != own), axis=2)
-    measured = compare(nodes.position[near], nodes.normal[near])
-    beaten = beaten | jnp.any(real[:, None, :, 0] & (measured < 1), axis=2)
-    return ((odds > jnp.log(LIKELY / (1 - LIKELY))) & ~beaten).reshape(-1)
+    measured = jnp.where((near >= 0)[:, None], compare(nodes.position[near], nodes.normal[near]), jnp.inf)
+    gap = jnp.min(measured, axis=2)
+    likely = jax.nn.sigmoid(children.odds).reshape(count, CHILDREN)
+    open_ = exists.reshape(count, CHILDREN) & (likely > LIKELY) & (gap > 1)
+    worth = jnp.where(open_, likely * jnp.minimum(gap, FARTHEST), 0)
+    number = (near[..., None] * CHILDREN + jnp.arange(CHILDREN)).reshape(count, 1, -1)
+    own = jnp.arange(count * CHILDREN).reshape(count, CHILDREN, 1)
+    rivals = compare(position[near].reshape(count, -1, 3), normal[near].reshape(count, -1, 3)) < 1
+    rivals = rivals & (number != own) & jnp.repeat(near >= 0, CHILDREN, axis=1)[:, None]
+    other = worth.reshape(-1)[number]
+    better = rivals & ((other > worth[..., None]) | ((other == worth[..., None]) & (number < own)))
+
+    def decide(_: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
+        kept, asked = state
+        best = asked & ~jnp.any(better & asked.reshape(-1)[number], axis=2)
+        lost = jnp.any(rivals & best.reshape(-1)[number], axis=2)
+        return kept | best, asked & ~best & ~lost
+
+    return jax.lax.fori_loop(0, ROUNDS, decide, (jnp.zeros_like(open_), open_))[0].reshape(-1)
 
 
 def densify(params: dict, cloud: PointCloud, neighbors: Int[AnyArray, "points 20"]) -> PointCloud:
-    """The cloud (unbatched, any units) and CHILDREN more points for each, of which `mask` says which are kept.
+    """The cloud (unbatched, any units), then CHILDREN more points for each, of which `mask` says which are kept.
 
     Pure, of fixed size: jit, vmap over equally padded clouds, grad.  `neighbors` are `spnr_jax.neighbors(cloud)`.  All
-    points have normals then: measured ones those that are given or estimated.
+    points have normals, measured ones those that are given or estimated; `invented` tells which are measured.
     """
-    mask = jnp.asarray(cloud.mask)
-    centre, scale = fit_box(jnp.asarray(cloud.positions), mask)
+    centre, scale = fit_box(jnp.asarray(cloud.positions), jnp.asarray(cloud.mask))
     inside = clamp((jnp.asarray(cloud.positions) - centre[None]) * scale, -1, 1)
+    dense = densify_in_box(params, dataclasses.replace(cloud, positions=inside), neighbors)
+    children = dense.positions[len(cloud.mask) :] / scale + centre[None]
+    return dataclasses.replace(dense, positions=jnp.concatenate([jnp.asarray(cloud.positions), children]))
+
+
+def densify_in_box(params: dict, cloud: PointCloud, neighbors: Int[AnyArray, "points 20"]) -> PointCloud:
+    """`densify` of a cloud in the box."""
     neighbors = jnp.asarray(neighbors)
-    nodes = describe(estimate_surfels(dataclasses.replace(cloud, positions=inside), neighbors))
+    nodes = describe(estimate_surfels(cloud, neighbors))
     places = place(nodes, neighbors)
-    children: Children = Densifier().apply({"params": params}, nodes, neighbors, places)
-    kept = choose(nodes, neighbors, places, children)
+    children = predict(params, nodes, neighbors, places)
 
-    def mix(column: AnyArray) -> Array:
-        return jnp.concatenate([jnp.asarray(column), blend(children.shares, jnp.asarray(column)[places.around])])
+    def extend(column: AnyArray, more: Array | None = None) -> Array:
+        values = jnp.asarray(column)
+        more = blend(children.shares, values[places.around]) if more is None else more
+        return jnp.concatenate([values, more])
 
-    color = blend(children.shares, nodes.color[places.around]) ** 2
-    doubt = 1 - jax.nn.sigmoid(children.odds) / 2
     return PointCloud(
-        positions=jnp.concatenate([jnp.asarray(cloud.positions), children.position / scale + centre[None]]),
-        base_color=jnp.concatenate([jnp.asarray(cloud.base_color), color]),
-        roughness=mix(cloud.roughness),
-        metallic=mix(cloud.metallic),
-        mask=jnp.concatenate([mask, kept]),
-        normals=jnp.concatenate([nodes.normal, children.normal]),
-        materials_known=None if cloud.materials_known is None else mix(cloud.materials_known),
-        invented=jnp.concatenate([jnp.zeros_like(nodes.spacing), doubt]),
+        positions=extend(cloud.positions, clamp(children.position, -1, 1)),
+        base_color=extend(cloud.base_color, blend(children.shares, nodes.color[places.around]) ** 2),
+        roughness=extend(cloud.roughness),
+        metallic=extend(cloud.metallic),
+        mask=extend(cloud.mask, choose(nodes, neighbors, places, children)),
+        normals=extend(nodes.normal, children.normal),
+        materials_known=None if cloud.materials_known is None else extend(cloud.materials_known),
+        invented=extend(jnp.zeros_like(nodes.spacing), 1 - jax.nn.sigmoid(children.odds) / 2),
     )

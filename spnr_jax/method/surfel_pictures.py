@@ -21,9 +21,10 @@ from spnr_jax.devices.traces import Kept
 from spnr_jax.kernels import cameras, cloud_arrays
 from spnr_jax.kernels.records import Camera, GBuffer, Light, PointCloud, Rendering, Scene, Surface, SurfelScene, Volume
 from spnr_jax.kernels.resizing import enlarged
-from spnr_jax.method import solid, surfel_renderer
+from spnr_jax.method import densifier, solid, surfel_renderer
 from spnr_jax.method.surfel_renderer import Blended, Plan, Sizes, unstack
 from spnr_jax.surfels.lighting import room_light
+from spnr_jax.surfels.neighbors import neighbors
 from spnr_jax.surfels.surfel_scenes import encode_in_box
 
 BALANCED = 0.75  # of the pixels along a side, which are drawn and enlarged: docs/lab/performance.md
@@ -41,9 +42,22 @@ class Asked(NamedTuple):
 def encode_volume(
     variables: dict | None, cloud: PointCloud, centre: np.ndarray, scale: np.floating, *, config: SurfelConfig
 ) -> Volume:
-    """Volume of a cloud in the box (unbatched)."""
-    scene = dataclasses.replace(encode_in_box(cloud), centre=jnp.asarray(centre), scale=jnp.asarray(scale))
+    """Volume of a cloud in the box (unbatched); what the network of rays sees are the measured points."""
+    scene = encode_in_box(densify_sparse(variables, cloud))
+    scene = dataclasses.replace(scene, centre=jnp.asarray(centre), scale=jnp.asarray(scale))
     return Volume(scene=scene, centre=scene.centre, scale=scene.scale, solid=encode_solid(variables, cloud, config))
+
+
+def densify_sparse(variables: dict | None, cloud: PointCloud) -> PointCloud:
+    """A sparse cloud in the box (unbatched) with learned points between its own, if there is a network for them."""
+    mask = np.asarray(cloud.mask)
+    count = int(mask.sum())
+    if variables is None or "densifier" not in variables or count > densifier.MOST_POINTS:
+        return cloud
+    real = jax.tree.map(lambda x: np.asarray(x)[mask], cloud)
+    padded = cloud_arrays.pad(real, cloud_arrays.bucket(count))
+    dense = jax.device_get(_densify(variables["densifier"], padded, neighbors(padded)))
+    return jax.tree.map(lambda x: x[dense.mask], dense)
 
 
 def encode_solid(variables: dict | None, cloud: PointCloud, config: SurfelConfig) -> Scene | None:
@@ -142,6 +156,7 @@ def draw_planned(variables: dict | None, volume: Volume, asked: Asked, sizes: Si
     return _shade(variables, volume.scene, asked.camera, asked.light, blended, known, plan=plan)
 
 
+_densify = Kept(densifier.densify_in_box, returns=(PointCloud,), options=QUICKEST)
 _encode_solid = Kept(solid.encode, returns=(Scene, Surface), options=QUICK)
 
 

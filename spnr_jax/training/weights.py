@@ -80,15 +80,24 @@ def read_trained(source: Path | str | None, say: Callable[[str], None] = print, 
     return Trained(config=config, variables=optimisation.averaged_variables(state), steps=int(state.step))
 
 
-def load(run: Path | str | None = None, methods: Path | str | None = None) -> Model:
+def read_densifier(path: Path | None = None) -> dict:
+    """Weights of the densifier of a file, float16 by name; None is the package's (`method/densifier.py`)."""
+    with (path or shipped("densifier")).open("rb") as file:
+        arrays = read_arrays(file)
+    return jax.device_put(unflatten_dict({name: x.astype(np.float32) for name, x in arrays.items()}, sep="/"))
+
+
+def load(run: Path | str | None = None, methods: Path | str | None = None, *, densify: bool = False) -> Model:
     """A network of the package (SHIPPED; None is the first), of a run folder's newest checkpoint, or of a file.
 
-    For a method of one's own, `methods` names the .py file or module that registers it: no file makes it be imported.
+    With `densify` one over surfels sees learned points between those of a sparse cloud (docs/surfels.md).  For a method
+    of one's own, `methods` names the .py file or module that registers it: no file makes it be imported.
     """
     if methods is not None:
         include(methods)
     trained = read_trained(run)
-    return Model(config=trained.config.model, variables=trained.variables)
+    more = {"densifier": read_densifier()} if densify and isinstance(trained.config.model, SurfelConfig) else {}
+    return Model(config=trained.config.model, variables=trained.variables | more)
 
 
 def write_weights(path: Path, trained: Trained) -> None:

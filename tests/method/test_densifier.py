@@ -1,0 +1,166 @@
+"""Laws of the densifier: where children may lie, batching, order, padding, turning, gradients, few and equal points."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+from support.laws import close
+from support.surfel_clouds import cloud, shape
+
+import spnr_jax
+from spnr_jax.kernels.cloud_arrays import pad
+from spnr_jax.method import densifier, surfel_pictures
+from spnr_jax.method.densifier import CHILDREN, Nodes, place
+from spnr_jax.surfels.geometry import estimate_surfels
+from spnr_jax.training import weights
+
+COUNT, SIZE = 150, 160  # real points, and with padding
+run = jax.jit(densifier.densify)
+estimate = jax.jit(estimate_surfels)
+
+
+@pytest.fixture(scope="module")
+def params():
+    return weights.read_densifier()
+
+
+@functools.cache
+def ball(seed=0):
+    """A lumpy ball of two colors in units of its own, padded."""
+    rng = np.random.default_rng(seed)
+    normals = shape("sphere", COUNT, "random")[1]
+    positions = 30 + 7 * normals * (1 + 0.2 * np.sin(3 * normals[:, :1])) * [1, 1.3, 0.8]
+    colors = np.where(normals[:, :1] > 0.2, [0.8, 0.3, 0.1], [0.1, 0.3, 0.6])
+    return pad(cloud(positions + 0.1 * rng.normal(size=(COUNT, 3)), base_color=colors), SIZE)
+
+
+def kept(dense):
+    """What is kept of a dense cloud, sorted by place, so that orders can be compared."""
+    columns = [dense.positions, dense.normals, dense.base_color, dense.invented[:, None]]
+    rows = np.concatenate([np.asarray(x) for x in columns], axis=1)[np.asarray(dense.mask)]
+    return rows[np.lexsort(np.round(rows[:, :3], 3).T)]
+
+
+def test_measured_points_are_kept_as_they_are_and_children_are_told(params):
+    points = ball()
+    dense = run(params, points, spnr_jax.neighbors(points))
+    assert dense.mask.shape == (SIZE * (1 + CHILDREN),)
+    for name in ("positions", "base_color", "roughness", "metallic", "mask"):
+        np.testing.assert_array_equal(getattr(dense, name)[:SIZE], getattr(points, name))
+    invented = np.asarray(dense.invented)[np.asarray(dense.mask)]
+    np.testing.assert_array_equal(invented[:COUNT], 0)
+    assert (invented[COUNT:] >= 0.5).all()
+    assert (invented <= 1).all()
+    assert COUNT < len(invented) - COUNT < 4 * COUNT
+    close(np.linalg.norm(np.asarray(dense.normals)[np.asarray(dense.mask)], axis=1), 1, atol=1e-5)
+
+
+def test_children_lie_on_a_ball_nearer_than_the_middles_of_pairs(params):
+    points = cloud(shape("sphere", 1000)[0])
+    dense = run(params, points, spnr_jax.neighbors(points))
+    children = np.asarray(dense.positions)[1000:][np.asarray(dense.mask)[1000:]]
+    off = np.abs(np.linalg.norm(children, axis=1) - 0.6)
+    chord = 0.6 * (1 - np.cos(np.sqrt(4 * np.pi / 1000) / 2))
+    assert len(children) > 2000
+    assert np.sqrt(np.mean(off**2)) < chord / 2
+    assert cKDTree(children).query(shape("sphere", 20_000)[0])[0].max() < 1.1 * 0.6 * np.sqrt(4 * np.pi / 1000)
+
+
+def test_places_of_pairs_lie_on_circles_that_their_ends_do():
+    normals = shape("sphere", 1000)[1]
+    nodes = Nodes(
+        *(jnp.asarray(x) for x in (0.6 * normals, normals)), jnp.full(1000, 0.067), jnp.zeros((1000, 3)), None
+    )
+    found = place(nodes, jnp.asarray(spnr_jax.neighbors(cloud(0.6 * normals))))
+    pairs = np.asarray(found.exists & (found.first != found.second))
+    assert pairs.sum() > 2500
+    close(np.linalg.norm(np.asarray(found.middle)[pairs], axis=1), 0.6, atol=1e-5)
+    both = np.sort(np.stack([found.first, found.second])[:, pairs], axis=0)
+    assert len(np.unique(both, axis=1).T) == pairs.sum()
+    frames = np.asarray(found.frame)[np.asarray(found.exists)]
+    close(np.einsum("mij,mkj->mik", frames, frames), np.broadcast_to(np.eye(3), frames.shape), atol=1e-5)
+    close(np.linalg.det(frames), 1, atol=1e-5)
+
+
+def test_no_two_children_are_nearer_than_the_closest(params):
+    points = cloud(shape("sphere", 400, "random")[0])
+    near = jnp.asarray(spnr_jax.neighbors(points))
+    nodes = densifier.describe(estimate(points, near))
+    places = place(nodes, near)
+    children = densifier.predict(params, nodes, near, places)
+    chosen = np.asarray(densifier.choose(nodes, near, places, children))
+    scale = np.asarray(places.scale)[chosen]
+    positions = np.asarray(children.position)[chosen]
+    distance, other = cKDTree(positions).query(positions, 2)
+    facing = np.sum(np.asarray(children.normal)[chosen] * np.asarray(children.normal)[chosen][other[:, 1]], axis=1)
+    measure = (distance[:, 1] / (densifier.CLOSEST * np.maximum(scale, scale[other[:, 1]]))) ** 2
+    assert (measure + densifier.AWAY * (1 - facing) >= 0.999).mean() > 0.99  # rivals are looked for among 12 neighbors
+
+
+def test_vmap_is_a_loop_and_a_program_is_the_plain_function(params):
+    clouds = [ball(0), ball(1)]
+    near = [spnr_jax.neighbors(x) for x in clouds]
+    stacked = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v) for v in x]), *clouds)
+    found = jax.jit(jax.vmap(densifier.densify, in_axes=(None, 0, 0)))(params, stacked, jnp.stack(near))
+    for i in (0, 1):
+        close(kept(jax.tree.map(lambda x, i=i: x[i], found)), kept(run(params, clouds[i], near[i])), atol=1e-3)
+
+
+def test_padding_and_the_order_of_points_do_not_matter(params):
+    points = ball()
+    real = jax.tree.map(lambda x: x[points.mask], points)
+    whole = kept(run(params, points, spnr_jax.neighbors(points)))
+    turned = jax.tree.map(lambda x: x[np.random.default_rng(3).permutation(COUNT)], real)
+    close(kept(run(params, real, spnr_jax.neighbors(real))), whole, atol=1e-3)
+    found = kept(run(params, turned, spnr_jax.neighbors(turned)))
+    distance = cKDTree(whole[:, :3]).query(found[:, :3])[0]
+    assert (distance < 1e-3).mean() > 0.97  # which end owns a pair follows the numbers, and some points own too many
+
+
+def test_a_turned_cloud_has_turned_children(params):
+    normals = shape("sphere", 300, "random")[1]
+    turn = np.float32([[0.36, 0.48, -0.8], [-0.8, 0.6, 0], [0.48, 0.64, 0.6]])
+    points = cloud(0.6 * normals, normals=normals)
+    other = dataclasses.replace(points, positions=points.positions @ turn.T, normals=points.normals @ turn.T)
+    one, two = (run(params, x, spnr_jax.neighbors(x)) for x in (points, other))
+    there = cKDTree(np.asarray(two.positions)[np.asarray(two.mask)])
+    distance = there.query(np.asarray(one.positions)[np.asarray(one.mask)] @ turn.T)[0]
+    assert (distance < 2e-3).mean() > 0.9  # openness is seen from directions that do not turn
+
+
+def test_gradients_are_finite_and_reach_positions_and_weights(params):
+    points = ball()
+    near = spnr_jax.neighbors(points)
+
+    def total(params, positions):
+        dense = densifier.densify(params, dataclasses.replace(points, positions=positions), near)
+        return jnp.sum(jnp.where(dense.mask[:, None], jnp.sin(dense.positions) * dense.normals + dense.base_color, 0))
+
+    by_params, by_positions = jax.jit(jax.grad(total, argnums=(0, 1)))(params, jnp.asarray(points.positions))
+    for gradient in jax.tree.leaves((by_params, by_positions)):
+        assert np.isfinite(gradient).all()
+    assert (np.abs(np.asarray(by_positions)[:COUNT]).sum(axis=1) > 0).all()
+
+
+@pytest.mark.parametrize("positions", [np.zeros((1, 3)), np.eye(3)[:2], np.eye(3), np.zeros((30, 3)), np.ones((2, 3))])
+def test_few_points_and_equal_ones_stay_finite(params, positions):
+    points = pad(cloud(positions), 40)
+    dense = run(params, points, spnr_jax.neighbors(points))
+    for values in jax.tree.leaves(dense):
+        assert np.isfinite(values).all()
+    assert int(dense.mask.sum()) <= len(positions) * (1 + CHILDREN)
+    np.testing.assert_array_equal(dense.mask[: len(positions)], True)
+
+
+def test_the_handle_densifies_sparse_clouds_alone(params):
+    sparse = cloud(shape("sphere", 300)[0])
+    dense = surfel_pictures.densify_sparse({"densifier": params}, sparse)
+    assert 2 * 300 < len(dense.mask) < 5 * 300
+    assert dense.mask.all()
+    assert surfel_pictures.densify_sparse({}, sparse) is sparse
+    many = cloud(shape("sphere", densifier.MOST_POINTS + 1)[0])
+    assert surfel_pictures.densify_sparse({"densifier": params}, many) is many
