@@ -42,8 +42,9 @@ class Asked(NamedTuple):
 def encode_volume(
     variables: dict | None, cloud: PointCloud, centre: np.ndarray, scale: np.floating, *, config: SurfelConfig
 ) -> Volume:
-    """Volume of a cloud in the box (unbatched); what the network of rays sees are the measured points."""
-    scene = encode_in_box(densify_sparse(variables, cloud))
+    """Volume of a cloud in the box (unbatched)."""
+    cloud = densify_sparse(variables, cloud)
+    scene = encode_in_box(cloud)
     scene = dataclasses.replace(scene, centre=jnp.asarray(centre), scale=jnp.asarray(scale))
     return Volume(scene=scene, centre=scene.centre, scale=scene.scale, solid=encode_solid(variables, cloud, config))
 
@@ -52,7 +53,7 @@ def densify_sparse(variables: dict | None, cloud: PointCloud) -> PointCloud:
     """A sparse cloud in the box (unbatched) with learned points between its own, if there is a network for them."""
     mask = np.asarray(cloud.mask)
     count = int(mask.sum())
-    if variables is None or "densifier" not in variables or count > densifier.MOST_POINTS:
+    if variables is None or "densifier" not in variables or count > densifier.MOST_POINTS or cloud.invented is not None:
         return cloud
     real = jax.tree.map(lambda x: np.asarray(x)[mask], cloud)
     padded = cloud_arrays.pad(real, cloud_arrays.bucket(count))
@@ -61,12 +62,12 @@ def densify_sparse(variables: dict | None, cloud: PointCloud) -> PointCloud:
 
 
 def encode_solid(variables: dict | None, cloud: PointCloud, config: SurfelConfig) -> Scene | None:
-    """What the ray-marching network makes of a sparse cloud."""
-    mask = np.asarray(cloud.mask)
+    """What the ray-marching network makes of the measured points of a sparse cloud."""
+    mask = np.asarray(cloud.mask) if cloud.invented is None else np.asarray(cloud.mask) & (cloud.invented == 0)
     count = int(mask.sum())
     if variables is None or not config.solid or count > solid.MOST_POINTS:
         return None
-    plain = dataclasses.replace(cloud, normals=None, materials_known=None)
+    plain = dataclasses.replace(cloud, normals=None, materials_known=None, invented=None)
     points = jax.tree.map(lambda x: np.asarray(x)[mask], plain)
     return _encode_solid(variables["batch_stats"], cloud_arrays.pad(points, cloud_arrays.bucket(count)))
 
