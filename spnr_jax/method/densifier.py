@@ -120,11 +120,11 @@ def propose(
     first = complete(jnp.take_along_axis(flat, nearest, axis=1)[:, 0], nodes.normal)
     second = jnp.cross(nodes.normal, first)
     angle = 2 * np.pi / WAYS * np.arange(WAYS)
-    ways = first[:, None] * np.cos(angle)[:, None] + second[:, None] * np.sin(angle)[:, None]
+    ways = first[:, None] * np.cos(angle)[None, :, None] + second[:, None] * np.sin(angle)[None, :, None]
     along = jnp.einsum("nwi,nai->nwa", ways, flat)
     taken = (along > BESIDE) & (real & ~through & (size < NEAR * reach))[:, None]
     free = ~jnp.any(taken, axis=2) & real[:, :1]
-    rank = jnp.concatenate([jnp.where(pair, size / reach, jnp.inf), jnp.where(free, 1e3 + angle, jnp.inf)], axis=1)
+    rank = jnp.concatenate([jnp.where(pair, size / reach, jnp.inf), jnp.where(free, 1e3 + angle[None], jnp.inf)], axis=1)
     order = jnp.argsort(rank, axis=1)[:, :CHILDREN]
     exists = jnp.take_along_axis(rank, order, axis=1) < jnp.inf
     ends = jnp.concatenate([other, jnp.broadcast_to(own[:, None], free.shape)], axis=1)
@@ -228,7 +228,7 @@ def predict(params: dict, nodes: Nodes, neighbors: Int[Array, "n 20"], places: P
     return children
 
 
-def pool(values: Float[Array, "m k f"], real: Bool[Array, "m k"]) -> Float[Array, "m 2f"]:
+def pool(values: Float[Array, "m k f"], real: Bool[Array, "m k"]) -> Float[Array, "m 2*f"]:
     """Largest (of numbers above 0) and mean of what is real."""
     values = values * real[..., None]
     mean = jnp.sum(values, axis=1) / jnp.maximum(jnp.sum(real, axis=1, keepdims=True), 1)
@@ -311,7 +311,7 @@ def choose(nodes: Nodes, neighbors: Int[Array, "n 20"], places: Places, children
     likely = jax.nn.sigmoid(children.odds).reshape(count, CHILDREN)
     open_ = exists.reshape(count, CHILDREN) & (likely > LIKELY) & (gap > 1)
     worth = jnp.where(open_, likely * jnp.minimum(gap, FARTHEST), 0)
-    number = (near[..., None] * CHILDREN + jnp.arange(CHILDREN)).reshape(count, 1, -1)
+    number = (near[..., None] * CHILDREN + jnp.arange(CHILDREN)[None, None]).reshape(count, 1, -1)
     own = jnp.arange(count * CHILDREN).reshape(count, CHILDREN, 1)
     rivals = compare(position[near].reshape(count, -1, 3), normal[near].reshape(count, -1, 3)) < 1
     rivals = rivals & (number != own) & jnp.repeat(near >= 0, CHILDREN, axis=1)[:, None]
