@@ -124,7 +124,8 @@ def propose(
     along = jnp.einsum("nwi,nai->nwa", ways, flat)
     taken = (along > BESIDE) & (real & ~through & (size < NEAR * reach))[:, None]
     free = ~jnp.any(taken, axis=2) & real[:, :1]
-    rank = jnp.concatenate([jnp.where(pair, size / reach, jnp.inf), jnp.where(free, 1e3 + angle[None], jnp.inf)], axis=1)
+    ranks = jnp.where(pair, size / reach, jnp.inf), jnp.where(free, 1e3 + angle[None], jnp.inf)
+    rank = jnp.concatenate(ranks, axis=1)
     order = jnp.argsort(rank, axis=1)[:, :CHILDREN]
     exists = jnp.take_along_axis(rank, order, axis=1) < jnp.inf
     ends = jnp.concatenate([other, jnp.broadcast_to(own[:, None], free.shape)], axis=1)

@@ -90,8 +90,8 @@ def read_densifier(path: Path | None = None) -> dict:
 def load(run: Path | str | None = None, methods: Path | str | None = None, *, densify: bool = False) -> Model:
     """A network of the package (SHIPPED; None is the first), of a run folder's newest checkpoint, or of a file.
 
-    With `densify` one over surfels sees learned points between those of a sparse cloud (docs/surfels.md).  For a method
-    of one's own, `methods` names the .py file or module that registers it: no file makes it be imported.
+    With `densify` one over surfels sees learned points between those of a sparse cloud (`method/densifier.py`).  For a
+    method of one's own, `methods` names the .py file or module that registers it: no file makes it be imported.
     """
     if methods is not None:
         include(methods)
