@@ -1,6 +1,6 @@
 """The densifier of the package made from scratch: data without pictures, training, weights.
 
-    python -m experiments.packaged.densifier --meshes MESHES --test-list TEST --out runs/densifier
+    python -m experiments.packaged.densifier_training --meshes MESHES --left-out TEST --out runs/densifier
 
 Truth are random points of training meshes and of procedural objects, with normals that point outward.  A record holds
 the truth of one object and several clouds of it, sparse, even or random or noisy, with what the network sees of them.
@@ -466,4 +466,4 @@ def restore(path: Path, like: Any) -> Any:
 
 
 if __name__ == "__main__":
-    entry_point.run(main, Options, "packaged.densifier")
+    entry_point.run(main, Options, "packaged.densifier_training")
