@@ -161,7 +161,7 @@ def find_outside(
 def count_sides(position: Array, normal: Array, spacing: Array) -> tuple[Array, Array]:
     """How many directions see each point from before and from behind."""
     mask = jnp.ones(position.shape[1], bool)
-    points = Points(jnp.zeros((1, len(mask)), jnp.int32), mask, position, position)
+    points = Points(jnp.zeros((1, len(mask)), jnp.int32), mask, mask, position, position)
     return sides.count_facing(normal, geometry.look(points, normal, spacing))
 
 
