@@ -39,7 +39,7 @@ CLOSEST = 0.2  # spacings between a child and a better one, or a measured point;
 AWAY = 1.5  # squared multiple of that distance, that normals at right angles count as
 FARTHEST = 4.0  # squared multiple of that distance from measured points, from which on farther is no better
 ROUNDS = 8  # of choosing
-LIKELY = 0.35  # probability from which on a child is kept
+LIKELY = 0.55  # probability from which on a child is kept
 
 
 class Nodes(NamedTuple):
