@@ -73,15 +73,17 @@ def render_file(options: Render, note: Callable[[str], None]) -> Iterator[str]:
             yield written.line
 
 
-def load_named(options: Render, loaded: Callable[[Path | str], Model]) -> Model | None:
+def load_named(options: Render, loaded: Callable[..., Model]) -> Model | None:
     """The network that the options name, if they do; ValueError if it cannot draw what they ask for."""
-    named = loaded(options.run) if options.run else None
+    named = loaded(options.run, densify=options.densify) if options.run else None
+    if named and options.densify and "densifier" not in named.variables:
+        raise UserError(f"{options.run}: --densify is for networks over surfels; leave it out, or --run")
     if named:
         check_takes_light(named, options.asked_of_light, options.run)
     return named
 
 
-def made_ready(options: Render, note: Callable[[str], None], loaded: Callable[[Path | str], Model]) -> Ready:
+def made_ready(options: Render, note: Callable[[str], None], loaded: Callable[..., Model]) -> Ready:
     """The cloud of the options read and encoded; `note` gets the assumptions about it, `loaded` gives a network."""
     named = load_named(options, loaded)
     light = light_of_options(options.lighting) if options.asked_of_light else None
@@ -95,8 +97,9 @@ def made_ready(options: Render, note: Callable[[str], None], loaded: Callable[[P
         transparent_parts=options.transparent_parts,
         report=note,
     )
-    network = str(options.run or ("surfels" if light else suited_to(len(placed.cloud.positions))))
-    model = named or loaded(network)
+    surfels = light or options.densify
+    network = str(options.run or ("surfels" if surfels else suited_to(len(placed.cloud.positions))))
+    model = named or loaded(network, densify=options.densify)
     return Ready(placed=placed, network=network, model=model, volume=model.encode(placed.cloud), light=light)
 
 

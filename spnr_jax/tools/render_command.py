@@ -41,6 +41,8 @@ class Render:
     """The file's upward axis; auto: by the format, else y or z, as the object would stand."""
     num_points: int = 16384
     """Points used of a bigger cloud, evenly spread, or sampled from a mesh; fewer work too."""
+    densify: bool = False
+    """Add learned points between those of a cloud of at most 8,192 points (`surfels`): sharper where points are few."""
     clean: Literal["auto", "off", "strong"] = "auto"
     """Outliers of points are removed, and noisy ones averaged, before they are thinned; a clean cloud, and a mesh, stay
     as they are.  strong: at smaller deviations."""

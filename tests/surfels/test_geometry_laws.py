@@ -192,7 +192,7 @@ def test_the_box_is_that_of_the_handle_and_clouds_of_one_bucket_share_a_program(
     centre, scale = normalization(points.positions[points.mask])
     scene, _ = run(points, spnr_jax.neighbors(points))
     close((scene.centre, scale), (centre, scene.scale), rtol=1e-6)
-    before = surfel_scenes._encode._cache_size()
+    before = len(surfel_scenes._encode.programs)
     for count in (300, 400):
         positions = shape("sphere", count)[0]
         found = surfel_scenes.encode_in_box(cloud(positions))
@@ -200,4 +200,4 @@ def test_the_box_is_that_of_the_handle_and_clouds_of_one_bucket_share_a_program(
         assert found.surfels.mask.sum() == count
         order = np.lexsort(np.asarray(found.surfels.position)[:count].T)
         close(np.asarray(found.surfels.position)[order], positions[np.lexsort(positions.T)])
-    assert surfel_scenes._encode._cache_size() == before + 1
+    assert len(surfel_scenes._encode.programs) == before + 1

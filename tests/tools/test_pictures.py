@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 from PIL import Image
-from support import tiny_untrained
+from support import tiny_surfels, tiny_untrained
 from support.gltf_files import CORNERS, GltfBuilder
 
 from spnr_jax.formats.up_axis import ROTATIONS
@@ -204,3 +204,16 @@ def test_a_turntable_of_the_light_differs_from_frame_to_frame_and_keeps_the_outl
     assert all(np.abs(frames[0] - other).max() > 8 for other in frames[1:])
     outlines = [(frame > 250).all(axis=-1) for frame in frames]
     assert all((outline == outlines[0]).mean() > 0.95 for outline in outlines)
+
+
+def test_learned_points_are_added_where_asked_for_and_only_over_surfels(tmp_path):
+    rng = np.random.default_rng(1).normal(size=(40, 3))
+    np.savetxt(tmp_path / "ball.xyz", rng / np.linalg.norm(rng, axis=1, keepdims=True))
+    asked = {"views": 1, "turntable": "none", "run": tiny_surfels.run()}
+    for name in ("plain", "dense"):
+        rendered(tmp_path / "ball.xyz", tmp_path / name, densify=name == "dense", **asked)
+    plain, dense = (shown(tmp_path / name / "ball_000.png") for name in ("plain", "dense"))
+    assert plain.shape == dense.shape
+    assert (plain != dense).any()
+    with pytest.raises(ValueError, match="--densify is for networks over surfels"):
+        rendered(tmp_path / "ball.xyz", tmp_path / "none", densify=True)
