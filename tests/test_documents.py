@@ -52,6 +52,7 @@ def execute(path):
     return names
 
 
+@pytest.mark.ci
 def test_the_readmes_example_draws_pictures_and_has_a_gradient(workplace, monkeypatch):
     monkeypatch.setattr(weights, "shipped", lambda name: tiny_surfels.run())
     names = execute(ROOT / "README.md")

@@ -132,6 +132,7 @@ def test_a_turned_cloud_has_turned_children(params):
     assert (distance < 2e-3).mean() > 0.75  # openness is seen from directions that do not turn
 
 
+@pytest.mark.ci
 def test_gradients_are_finite_and_reach_positions_and_weights(params):
     points = ball()
     near = spnr_jax.neighbors(points)

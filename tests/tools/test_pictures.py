@@ -206,6 +206,7 @@ def test_a_turntable_of_the_light_differs_from_frame_to_frame_and_keeps_the_outl
     assert all((outline == outlines[0]).mean() > 0.95 for outline in outlines)
 
 
+@pytest.mark.ci
 def test_learned_points_are_added_where_asked_for_and_only_over_surfels(tmp_path):
     rng = np.random.default_rng(1).normal(size=(40, 3))
     np.savetxt(tmp_path / "ball.xyz", rng / np.linalg.norm(rng, axis=1, keepdims=True))
