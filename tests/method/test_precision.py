@@ -80,7 +80,7 @@ def test_both_begin_with_the_same_weights():
 
 @pytest.mark.parametrize("start", [L1_ONLY, pytest.param(CONFIG, marks=pytest.mark.slow)], ids=["L1", "both networks"])
 def test_thirty_steps_lose_as_much_as_in_float32(start):
-    """The curves differ by a hundredth of the first loss at first, then, as rounding grows, on average by a fiftieth."""
+    """The curves differ by a hundredth of the first loss at first, and on average by a fiftieth."""
     single, half = (loss_curve(dataclasses.replace(start, model=model)) for model in (MODEL, BF16_MODEL))
     apart = np.abs(half - single) / single[0]
     assert apart.max() > 0
