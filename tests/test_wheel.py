@@ -117,7 +117,6 @@ def test_in_an_empty_environment_the_wheel_renders_clouds_and_meshes(environment
     ("arguments", "extra"),
     [
         (("spnr", "view", "cloud.ply"), "viewer"),
-        (("spnr", "export", "RUN", "--out", "out"), "export"),
         (("spnr-data", "generate", "out"), "data"),
     ],
 )
