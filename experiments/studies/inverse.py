@@ -138,7 +138,7 @@ def begin(task: str, truth: Truth) -> Unknowns:
     wrong, random = nothing(truth), np.random.default_rng(0).normal
     if task == "light":
         even = jnp.zeros((9, 3)).at[0].set(np.sqrt(4 * np.pi) * 0.6)  # a white ball is 0.6 in it
-        return wrong._replace(light=even - truth.light)
+        return wrong._replace(light=even[None] - truth.light)
     if task == "materials":
         color, roughness = map(jnp.asarray, (truth.cloud.base_color, truth.cloud.roughness))
         return wrong._replace(base_color=GREY - color, roughness=GREY - roughness)
