@@ -119,7 +119,7 @@ def set_up_jax(*, repeats: bool = True) -> None:
 
     Work that repeats itself on a CPU uses the memory of the time before; a first picture comes 0.1 s sooner without.
     """
-    compilation.keep_programs()
+    compilation.keep_programs()  # before JAX is imported
     if repeats:
         allocator.keep_arrays()
 

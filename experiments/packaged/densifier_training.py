@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from flax.traverse_util import flatten_dict, unflatten_dict
+from flax.traverse_util import flatten_dict
 from jaxtyping import Array, Float
 from scipy.spatial import cKDTree
 
@@ -31,14 +31,15 @@ from spnr_jax.formats.images import write_whole
 from spnr_jax.formats.mesh import meshes
 from spnr_jax.formats.mesh.assets import Asset
 from spnr_jax.formats.mesh.surface_points import normalise, sample_surface
-from spnr_jax.formats.npz import packed
+from spnr_jax.formats.npz import packed, read_arrays
 from spnr_jax.kernels import cloud_arrays
 from spnr_jax.kernels.records import PointCloud
 from spnr_jax.kernels.thinning import farthest_points
-from spnr_jax.method.densifier import CHILDREN, Densifier, Nodes, Places, blend, describe, place, predict, turn
+from spnr_jax.method.densifier import CHILDREN, Densifier, Nodes, Places, blend, predict, see, turn
 from spnr_jax.surfels import geometry, sides
-from spnr_jax.surfels.geometry import Points, estimate_surfels
+from spnr_jax.surfels.geometry import Points
 from spnr_jax.surfels.neighbors import order_in_space
+from spnr_jax.training.weights import read_densifier
 
 TRUTH, VOTERS, EVEN = 2**17, 2**15, 2**12  # points of a surface, those that look for its sides, and even ones at most
 DENSER, MATCHED = 48, 48  # true points for each of a cloud, and those that a child is compared with
@@ -47,10 +48,7 @@ CORE, NODES, PLACES, QUERIES = 1024, 1920, 4864, 3072  # of a batch: points in i
 FEWEST = 300  # points of a cloud
 UNLIKE = 0.12  # squared spacings that a normal at right angles counts as
 HIDDEN = 0.1  # weight of what nothing outside sees
-EXACT, ROBUST = (
-    0.08,
-    0.15,
-)  # spacings off the surface at which a child is half there, and from which on errors count less
+EXACT, ROBUST = 0.08, 0.15  # spacings off the surface at which a child is half there, and errors begin to count less
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -165,11 +163,7 @@ def count_sides(position: Array, normal: Array, spacing: Array) -> tuple[Array, 
     return sides.count_facing(normal, geometry.look(points, normal, spacing))
 
 
-@partial(jax.jit, compiler_options=QUICKEST)
-def see(cloud: PointCloud, neighbors: Array) -> tuple[Nodes, Places]:
-    """Nodes and places of a cloud in the box."""
-    nodes = describe(estimate_surfels(cloud, neighbors))
-    return nodes, place(nodes, neighbors)
+_see = jax.jit(see, compiler_options=QUICKEST)
 
 
 def make_cloud(
@@ -182,7 +176,7 @@ def make_cloud(
     columns = {name: getattr(truth, name)[chosen][order] for name in ("base_color", "roughness", "metallic")}
     cloud = PointCloud(positions=places[order], mask=np.ones(count, bool), **columns)
     neighbors = np.pad(near, [(0, size - count), (0, 0)], constant_values=-1)
-    nodes, found = jax.device_get(see(cloud_arrays.pad(cloud, size), neighbors))
+    nodes, found = jax.device_get(_see(cloud_arrays.pad(cloud, size), neighbors))
     kept = np.flatnonzero(found.exists[: CHILDREN * count])
     arrays = {name: values[:count] for name, values in nodes._asdict().items()}
     arrays |= {f"place_{name}": values[kept] for name, values in found._asdict().items()}
@@ -412,7 +406,7 @@ def train(options: Options) -> None:
     params = Densifier().init(jax.random.key(0), first.nodes, first.neighbors, first.places)["params"]
     print(f"{sum(x.size for x in jax.tree.leaves(params))} weights", flush=True)
     if options.start:
-        params = read_weights(options.start)
+        params = read_densifier(options.start)
     state = {"params": params, "rule": rule.init(params), "step": 0}
     checkpoint = options.out / "checkpoint.npz"
     if checkpoint.exists():
@@ -445,24 +439,16 @@ def train(options: Options) -> None:
 
 
 def read(path: Path) -> dict[str, np.ndarray]:
-    """A record."""
-    with np.load(path) as file:
-        return dict(file)
-
-
-def read_weights(path: Path) -> dict:
-    """Weights of a file."""
-    with np.load(path) as file:
-        flat = {name: jnp.asarray(file[name], jnp.float32) for name in file.files}
-    return unflatten_dict(flat, sep="/")
+    """The arrays of a record or a checkpoint."""
+    with path.open("rb") as file:
+        return read_arrays(file)
 
 
 def restore(path: Path, like: Any) -> Any:
     """A state of this structure from a checkpoint."""
     leaves, structure = jax.tree.flatten(like)
-    with np.load(path) as file:
-        found = [file[f"leaf{i}"] for i in range(len(leaves))]
-    return jax.tree.unflatten(structure, found)
+    found = read(path)
+    return jax.tree.unflatten(structure, [found[f"leaf{i}"] for i in range(len(leaves))])
 
 
 if __name__ == "__main__":

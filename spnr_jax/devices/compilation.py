@@ -10,7 +10,6 @@ SHORTEST = 0.1  # seconds of compilation from which on a program is kept
 QUICK = {"xla_cpu_use_fusion_emitters": False}
 QUICKEST = QUICK | {"xla_backend_optimization_level": 1}
 
-
 LOOKED_AT = "looked-at"  # file whose time says up to when entries are known to be whole
 
 

@@ -49,9 +49,30 @@ class Kept:
             return self.jitted(*args, **static)
         key = tree, tuple((leaf.shape, leaf.dtype) for leaf in leaves), tuple(sorted(static.items()))
         if key not in self.programs:
-            trace = _load(Path(place), functools.partial(self.function, **static), tree, leaves, key)
+            trace = self._load(Path(place), tree, leaves, static, key)
             self.programs[key] = jax.jit(trace.call, compiler_options=self.options)
         return self.programs[key](*leaves)
+
+    def _load(self, place: Path, tree: Any, leaves: list, static: dict[str, Any], key: Any) -> export.Exported:
+        """The trace for such arguments: that on the disk, or a new one, which is written there."""
+        name = self.function.__name__
+        versions = jax.__version__, jax.default_backend(), jax.config.values["jax_enable_x64"]
+        depends = repr((self.function.__module__, name, versions, key)).encode() + _digest_sources()
+        file = place / f"trace-{name}-{hashlib.sha256(depends).hexdigest()}"
+        with contextlib.suppress(OSError):
+            written = file.read_bytes()
+            if hashlib.sha256(written[DIGEST:]).digest() == written[:DIGEST]:
+                return export.deserialize(bytearray(written[DIGEST:]))
+        shapes = [jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in leaves]
+        flat = jax.jit(lambda *leaves: self.function(*jax.tree.unflatten(tree, leaves), **static))
+        trace = export.export(flat)(*shapes)
+        content = bytes(trace.serialize())
+        with contextlib.suppress(OSError):  # a full disk, a folder that cannot be written: it is traced again
+            place.mkdir(parents=True, exist_ok=True)
+            unfinished = file.with_name(f".unfinished-{os.getpid()}-{file.name}")
+            unfinished.write_bytes(hashlib.sha256(content).digest() + content)
+            os.replace(unfinished, file)
+        return trace
 
 
 def _is_plain(leaf: Any) -> bool:
@@ -59,27 +80,6 @@ def _is_plain(leaf: Any) -> bool:
     if isinstance(leaf, jax.core.Tracer):
         return False
     return isinstance(leaf, np.ndarray) or (isinstance(leaf, jax.Array) and len(leaf.devices()) == 1)
-
-
-def _load(place: Path, function: functools.partial, tree: Any, leaves: list, key: Any) -> export.Exported:
-    """The trace for such arguments: that on the disk, or a new one, which is written there."""
-    name = function.func.__name__
-    versions = jax.__version__, jax.default_backend(), jax.config.values["jax_enable_x64"]
-    depends = repr((function.func.__module__, name, versions, key)).encode() + _digest_sources()
-    file = place / f"trace-{name}-{hashlib.sha256(depends).hexdigest()}"
-    with contextlib.suppress(OSError):
-        written = file.read_bytes()
-        if hashlib.sha256(written[DIGEST:]).digest() == written[:DIGEST]:
-            return export.deserialize(bytearray(written[DIGEST:]))
-    shapes = [jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in leaves]
-    trace = export.export(jax.jit(lambda *flat: function(*jax.tree.unflatten(tree, flat))))(*shapes)
-    content = bytes(trace.serialize())
-    with contextlib.suppress(OSError):  # a full disk, a folder that cannot be written: it is traced again
-        place.mkdir(parents=True, exist_ok=True)
-        unfinished = file.with_name(f".unfinished-{os.getpid()}-{file.name}")
-        unfinished.write_bytes(hashlib.sha256(content).digest() + content)
-        os.replace(unfinished, file)
-    return trace
 
 
 @functools.cache

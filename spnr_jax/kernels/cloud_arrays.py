@@ -22,6 +22,12 @@ def pad(cloud: PointCloud, size: int) -> PointCloud:
     return jax.tree.map(extend, cloud)
 
 
+def strip(cloud: PointCloud) -> PointCloud:
+    """The cloud (points, ...) without its padding."""
+    mask = np.asarray(cloud.mask)
+    return jax.tree.map(lambda x: np.asarray(x)[mask], cloud)
+
+
 def bucket(count: int) -> int:
     """The smallest of 512, 1024, 2048, ... that holds `count` points: few sizes, so few compilations."""
     if count < 1:

@@ -24,7 +24,7 @@ from jaxtyping import Array, Bool, Float, Int
 from spnr_jax.kernels.numerics import clamp, length, normalize, root
 from spnr_jax.kernels.records import AnyArray, PointCloud, Surfels
 from spnr_jax.surfels.geometry import estimate_surfels
-from spnr_jax.surfels.surfel_scenes import fit_box
+from spnr_jax.surfels.surfel_scenes import move_into_box
 
 MOST_POINTS = 8192  # of a sparse cloud
 CHILDREN = 6  # of a point: in the middle of its pairs, each of which belongs to one of its ends, and at open places
@@ -77,6 +77,12 @@ class Children(NamedTuple):
     normal: Float[Array, "m 3"]
     odds: Float[Array, " m"]
     shares: Float[Array, "m 16"]
+
+
+def see(cloud: PointCloud, neighbors: Int[Array, "n 20"]) -> tuple[Nodes, Places]:
+    """What the network sees of a cloud in the box."""
+    nodes = describe(estimate_surfels(cloud, neighbors))
+    return nodes, place(nodes, neighbors)
 
 
 def describe(surfels: Surfels) -> Nodes:
@@ -334,9 +340,8 @@ def densify(params: dict, cloud: PointCloud, neighbors: Int[AnyArray, "points 20
     Pure, of fixed size: jit, vmap over equally padded clouds, grad.  `neighbors` are `spnr_jax.neighbors(cloud)`.  All
     points have normals, measured ones those that are given or estimated; `invented` tells which are measured.
     """
-    centre, scale = fit_box(jnp.asarray(cloud.positions), jnp.asarray(cloud.mask))
-    inside = clamp((jnp.asarray(cloud.positions) - centre[None]) * scale, -1, 1)
-    dense = densify_in_box(params, dataclasses.replace(cloud, positions=inside), neighbors)
+    inside, centre, scale = move_into_box(cloud)
+    dense = densify_in_box(params, inside, neighbors)
     children = dense.positions[len(cloud.mask) :] / scale + centre[None]
     return dataclasses.replace(dense, positions=jnp.concatenate([jnp.asarray(cloud.positions), children]))
 
@@ -344,8 +349,7 @@ def densify(params: dict, cloud: PointCloud, neighbors: Int[AnyArray, "points 20
 def densify_in_box(params: dict, cloud: PointCloud, neighbors: Int[AnyArray, "points 20"]) -> PointCloud:
     """`densify` of a cloud in the box."""
     neighbors = jnp.asarray(neighbors)
-    nodes = describe(estimate_surfels(cloud, neighbors))
-    places = place(nodes, neighbors)
+    nodes, places = see(cloud, neighbors)
     children = predict(params, nodes, neighbors, places)
 
     def extend(column: AnyArray, more: Array | None = None) -> Array:

@@ -51,14 +51,11 @@ def encode_volume(
 
 def densify_sparse(variables: dict | None, cloud: PointCloud) -> PointCloud:
     """A sparse cloud in the box (unbatched) with learned points between its own, if there is a network for them."""
-    mask = np.asarray(cloud.mask)
-    count = int(mask.sum())
+    count = int(np.sum(cloud.mask))
     if variables is None or "densifier" not in variables or count > densifier.MOST_POINTS or cloud.invented is not None:
         return cloud
-    real = jax.tree.map(lambda x: np.asarray(x)[mask], cloud)
-    padded = cloud_arrays.pad(real, cloud_arrays.bucket(count))
-    dense = jax.device_get(_densify(variables["densifier"], padded, neighbors(padded)))
-    return jax.tree.map(lambda x: x[dense.mask], dense)
+    padded = cloud_arrays.pad(cloud_arrays.strip(cloud), cloud_arrays.bucket(count))
+    return cloud_arrays.strip(_densify(variables["densifier"], padded, neighbors(padded)))
 
 
 def encode_solid(variables: dict | None, cloud: PointCloud, config: SurfelConfig) -> Scene | None:
@@ -67,9 +64,9 @@ def encode_solid(variables: dict | None, cloud: PointCloud, config: SurfelConfig
     count = int(mask.sum())
     if variables is None or not config.solid or count > solid.MOST_POINTS:
         return None
-    plain = dataclasses.replace(cloud, normals=None, materials_known=None, invented=None)
-    points = jax.tree.map(lambda x: np.asarray(x)[mask], plain)
-    return _encode_solid(variables["batch_stats"], cloud_arrays.pad(points, cloud_arrays.bucket(count)))
+    plain = dataclasses.replace(cloud, mask=mask, normals=None, materials_known=None, invented=None)
+    points = cloud_arrays.pad(cloud_arrays.strip(plain), cloud_arrays.bucket(count))
+    return _encode_solid(variables["batch_stats"], points)
 
 
 def draw(

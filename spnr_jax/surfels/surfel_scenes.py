@@ -29,9 +29,16 @@ def encode(params: Any, cloud: PointCloud, neighbors: Int[AnyArray, "points 20"]
     the scene's centre.  What is a constant to them is said in `geometry.py`.
     """
     del params
-    centre, scale = fit_box(jnp.asarray(cloud.positions), jnp.asarray(cloud.mask))
-    inside = clamp((jnp.asarray(cloud.positions) - centre[None]) * scale, -1, 1)
-    return _make_scene(dataclasses.replace(cloud, positions=inside), neighbors, centre, scale, RULES)
+    inside, centre, scale = move_into_box(cloud)
+    return _make_scene(inside, neighbors, centre, scale, RULES)
+
+
+def move_into_box(cloud: PointCloud) -> tuple[PointCloud, Float[Array, "3"], Float[Array, ""]]:
+    """The cloud in the box [-1, 1]^3, and the centre and scale of the way there."""
+    positions = jnp.asarray(cloud.positions)
+    centre, scale = fit_box(positions, jnp.asarray(cloud.mask))
+    inside = clamp((positions - centre[None]) * scale, -1, 1)
+    return dataclasses.replace(cloud, positions=inside), centre, scale
 
 
 def fit_box(
@@ -55,8 +62,8 @@ def encode_in_box(cloud: PointCloud) -> SurfelScene:
 
     Its surfels are those of the real points in an order in which close ones follow each other, padded.
     """
-    mask = np.asarray(cloud.mask)
-    real = jax.tree.map(lambda x: np.asarray(x, np.float32)[mask], cloud).replace(mask=mask[mask])
+    real = cloud_arrays.strip(cloud)
+    real = jax.tree.map(np.float32, real).replace(mask=real.mask)
     order, near = order_in_space(real.positions)
     size = cloud_arrays.bucket(len(order))
     neighbors = np.pad(near, [(0, size - len(order)), (0, 0)], constant_values=-1)

@@ -84,7 +84,7 @@ def read_densifier(path: Path | None = None) -> dict:
     """Weights of the densifier of a file, float16 by name; None is the package's (`method/densifier.py`)."""
     with (path or shipped("densifier")).open("rb") as file:
         arrays = read_arrays(file)
-    return jax.device_put(unflatten_dict({name: x.astype(np.float32) for name, x in arrays.items()}, sep="/"))
+    return _as_variables(arrays)
 
 
 def load(run: Path | str | None = None, methods: Path | str | None = None, *, densify: bool = False) -> Model:
@@ -133,8 +133,13 @@ def read_weights(path: Path) -> Trained:
         raise UserError(f"{path}: {error}") from None
     except UNREADABLE as error:
         raise UserError(f"{path}: not a file of weights of this version ({error}); {ADVICE}") from None
-    variables = unflatten_dict({name: x.astype(np.float32) for name, x in arrays.items()}, sep="/")
-    return Trained(config=config, variables=jax.device_put(variables), steps=steps)  # jnp.asarray would compile
+    return Trained(config=config, variables=_as_variables(arrays), steps=steps)
+
+
+def _as_variables(arrays: dict[str, np.ndarray]) -> dict:
+    """The tree of named arrays, in float32."""
+    tree = unflatten_dict({name: x.astype(np.float32) for name, x in arrays.items()}, sep="/")
+    return jax.device_put(tree)  # jnp.asarray would compile
 
 
 def _check_weights(arrays: dict[str, np.ndarray], shapes: dict[str, jax.ShapeDtypeStruct]) -> None:
