@@ -286,8 +286,6 @@ class SurfelConfig(NetworkConfig):
     """Features of the U-Net's levels, at the resolution of the points first."""
     top: int = 24
     """Features of the blocks that double the resolution."""
-    solid: bool = False
-    """Whether near_points (`SOLID`) predicts opacity and depth of sparse clouds (`method/solid.py`)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

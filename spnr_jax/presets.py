@@ -153,7 +153,7 @@ def surfels() -> TrainConfig:
     """
     return TrainConfig(
         preset="surfels",
-        model=SurfelConfig(solid=True),
+        model=SurfelConfig(),
         loss=LossConfig(
             l1_weight=1.0, mse_weight=5.0, adversarial_weight=0.0, opacity_weight=1.0, opacity_l1_weight=0.3
         ),

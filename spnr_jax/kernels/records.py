@@ -142,8 +142,6 @@ class Volume:
     scale: Float[AnyArray, ""]
     reach: int = struct.field(pytree_node=False, default=LARGEST_REACH)
     """Voxels around points that rays look at, from how far the points lie apart."""
-    solid: Scene | None = None
-    """Of sparse surfels: what the ray-marching network makes of the points (`method/solid.py`)."""
 
 
 @no_type_check
@@ -156,7 +154,8 @@ class Surfels:
     the disc's plane and how far from the point that lies (0 without one); `sided` 1 where one side is outside, 0 where
     both are; `visible` how much each of 64 directions sees; `shape` the planarity and linearity of the neighbourhood.
     A disc ends `reach` spacings from its point along `rim`, a unit vector in its plane, against it, and along and
-    against their cross product normal x rim.  `guessed` is 1 where roughness and metallic are not known.
+    against their cross product normal x rim.  `guessed` is 1 where roughness and metallic are not known,
+    `invented` 0 where the point was measured, and above 0 where it was learned (`method/densifier.py`).
     """
 
     position: Float[AnyArray, "*batch points 3"]
@@ -169,6 +168,7 @@ class Surfels:
     roughness: Float[AnyArray, "*batch points"]
     metallic: Float[AnyArray, "*batch points"]
     guessed: Float[AnyArray, "*batch points"]
+    invented: Float[AnyArray, "*batch points"]
     sided: Float[AnyArray, "*batch points"]
     visible: Float[AnyArray, "*batch points 64"]
     shape: Float[AnyArray, "*batch points 2"]

@@ -45,9 +45,7 @@ def init(key: Key, config: NetworkConfig) -> dict:
     if config.method == "surfels":
         from spnr_jax.method import surfel_renderer
 
-        sizes = cast(SurfelConfig, config)
-        variables = surfel_renderer.init(key, sizes)
-        return variables | ({"batch_stats": init(key, SOLID)} if sizes.solid else {})
+        return surfel_renderer.init(key, cast(SurfelConfig, config))
     return dict(network(config).init(key, *example_inputs(config)))
 
 

@@ -19,9 +19,9 @@ from spnr_jax.devices.compilation import QUICK, QUICKEST
 from spnr_jax.devices.side_by_side import two_at_a_time
 from spnr_jax.devices.traces import Kept
 from spnr_jax.kernels import cameras, cloud_arrays
-from spnr_jax.kernels.records import Camera, GBuffer, Light, PointCloud, Rendering, Scene, Surface, SurfelScene, Volume
+from spnr_jax.kernels.records import Camera, GBuffer, Light, PointCloud, Rendering, SurfelScene, Volume
 from spnr_jax.kernels.resizing import enlarged
-from spnr_jax.method import densifier, solid, surfel_renderer
+from spnr_jax.method import densifier, surfel_renderer
 from spnr_jax.method.surfel_renderer import Blended, Plan, Sizes, unstack
 from spnr_jax.surfels.lighting import room_light
 from spnr_jax.surfels.neighbors import neighbors
@@ -46,7 +46,7 @@ def encode_volume(
     cloud = densify_sparse(variables, cloud)
     scene = encode_in_box(cloud)
     scene = dataclasses.replace(scene, centre=jnp.asarray(centre), scale=jnp.asarray(scale))
-    return Volume(scene=scene, centre=scene.centre, scale=scene.scale, solid=encode_solid(variables, cloud, config))
+    return Volume(scene=scene, centre=scene.centre, scale=scene.scale)
 
 
 def densify_sparse(variables: dict | None, cloud: PointCloud) -> PointCloud:
@@ -56,17 +56,6 @@ def densify_sparse(variables: dict | None, cloud: PointCloud) -> PointCloud:
         return cloud
     padded = cloud_arrays.pad(cloud_arrays.strip(cloud), cloud_arrays.bucket(count))
     return cloud_arrays.strip(_densify(variables["densifier"], padded, neighbors(padded)))
-
-
-def encode_solid(variables: dict | None, cloud: PointCloud, config: SurfelConfig) -> Scene | None:
-    """What the ray-marching network makes of the measured points of a sparse cloud."""
-    mask = np.asarray(cloud.mask) if cloud.invented is None else np.asarray(cloud.mask) & (cloud.invented == 0)
-    count = int(mask.sum())
-    if variables is None or not config.solid or count > solid.MOST_POINTS:
-        return None
-    plain = dataclasses.replace(cloud, mask=mask, normals=None, materials_known=None, invented=None)
-    points = cloud_arrays.pad(cloud_arrays.strip(plain), cloud_arrays.bucket(count))
-    return _encode_solid(variables["batch_stats"], points)
 
 
 def draw(
@@ -146,24 +135,12 @@ def draw_planned(variables: dict | None, volume: Volume, asked: Asked, sizes: Si
     """A view with room for these sizes."""
     if not asked.needed.entries:
         return _leave_empty(volume.scene, asked.camera)
-    plan = surfel_renderer.rounded(sizes, *asked.resolution, sparse=volume.solid is not None)
-    known = None
-    if variables is not None and volume.solid is not None:
-        known = _solid_picture(variables, volume, asked.camera, plan=plan)
+    plan = surfel_renderer.rounded(sizes, *asked.resolution)
     blended = _blend(volume.scene, asked.camera, asked.light, plan=plan)
-    return _shade(variables, volume.scene, asked.camera, asked.light, blended, known, plan=plan)
+    return _shade(variables, volume.scene, asked.camera, asked.light, blended, plan=plan)
 
 
 _densify = Kept(densifier.densify_in_box, returns=(PointCloud,), options=QUICKEST)
-_encode_solid = Kept(solid.encode, returns=(Scene, Surface), options=QUICK)
-
-
-@partial(Kept, static="plan")
-def _solid_picture(variables: dict, volume: Volume, camera: Camera, *, plan: Plan) -> Float[Array, "h w 2"]:
-    inside = cameras.in_box(camera, volume.centre, volume.scale)
-    return surfel_renderer.solid_picture(variables, volume.solid, inside, plan)
-
-
 _blend = Kept(surfel_renderer.blend_window, static="plan", returns=(Blended, GBuffer))
 _shade = Kept(surfel_renderer.shade_window, static="plan", returns=(Rendering,), options=QUICKEST)
 _enlarge = jax.jit(enlarged, static_argnums=(1, 2), compiler_options=QUICK)

@@ -37,7 +37,6 @@ from spnr_jax.kernels.records import (
     SurfelScene,
 )
 from spnr_jax.kernels.resizing import doubled, mean_of_squares
-from spnr_jax.method import solid
 from spnr_jax.nn.shader import NUM_OUTPUTS, Shader, picture
 from spnr_jax.surfels import features, lighting, projection, splatting
 from spnr_jax.surfels.projection import MOST_ENTRIES, View
@@ -55,7 +54,7 @@ class Plan(NamedTuple):
 
     `doublings` by the network, and `side` pixels averaged along each side of a pixel (1 or 2); `width` and `height` of
     the window of the G-buffer, in its pixels; `entries` pairs of disc and pixel and `slots` covered pixels that there
-    is room for; `solid` whether the ray-marching network is asked where a sparse cloud is solid (`method/solid.py`).
+    is room for.
     """
 
     doublings: int
@@ -64,7 +63,6 @@ class Plan(NamedTuple):
     height: int
     entries: int
     slots: int
-    solid: bool = False
 
 
 class Sizes(NamedTuple):
@@ -104,8 +102,7 @@ def plan(scene: SurfelScene, camera: Camera) -> Plan:
     pairs = [(scenes[i // each], view) for i, view in enumerate(unstack(camera))]
     doublings, side = common_resolution([resolution(*pair) for pair in pairs])
     needed = jax.device_get([count_sizes(*pair, doublings=doublings, side=side) for pair in pairs])
-    sparse = all(int(np.sum(of.surfels.mask)) <= solid.MOST_POINTS for of in scenes)
-    return rounded(largest(needed), doublings, side, sparse)
+    return rounded(largest(needed), doublings, side)
 
 
 def unstack(tree: Any) -> list[Any]:
@@ -155,14 +152,12 @@ def largest(needed: Iterable[Sizes]) -> Sizes:
     return Sizes(*(max(map(int, sizes)) for sizes in zip(*needed, strict=True)))
 
 
-def rounded(sizes: Sizes, doublings: int, side: int, sparse: bool) -> Plan:
+def rounded(sizes: Sizes, doublings: int, side: int) -> Plan:
     """The plan that holds these sizes; powers of the root of two, so that few are compiled."""
     entries, slots = (
         _rounded(*x) for x in ((sizes.entries, LEAST_ENTRIES, MOST_ENTRIES), (sizes.slots, LEAST_SLOTS, MOST_ENTRIES))
     )
-    return Plan(
-        doublings, side, sizes.width, sizes.height, entries, min(slots, sizes.width * sizes.height), solid=sparse
-    )
+    return Plan(doublings, side, sizes.width, sizes.height, entries, min(slots, sizes.width * sizes.height))
 
 
 def _rounded(count: int, least: int, most: int) -> int:
@@ -219,12 +214,8 @@ def render(
     """
     _check(scene, camera, light, plan)
     light = lighting.room_light() if light is None else light
-    known = None
-    if plan.solid and params is not None and params.get("batch_stats"):
-        inside = cameras.in_box(camera, scene.centre, scene.scale)
-        known = solid_picture(params, solid.of_surfels(params["batch_stats"], scene.surfels), inside, plan)
     blended = blend_window(scene, camera, light, plan=plan)
-    return shade_window(params, scene, camera, light, blended, known, plan=plan)
+    return shade_window(params, scene, camera, light, blended, plan=plan)
 
 
 def _check(scene: SurfelScene, camera: Camera, light: Light | None, plan: Plan) -> None:
@@ -238,13 +229,8 @@ def _check(scene: SurfelScene, camera: Camera, light: Light | None, plan: Plan) 
     ):
         if np.shape(array) != wanted:
             raise UserError(f"render: {what} has the shape {np.shape(array)}, expected {wanted}; use jax.vmap for more")
-    if min(plan[:6]) < 0 or min(plan[1:6]) < 1 or plan.entries > MOST_ENTRIES:
+    if min(plan) < 0 or min(plan[1:]) < 1 or plan.entries > MOST_ENTRIES:
         raise UserError(f"render: {plan} has a size below 1, or more than {MOST_ENTRIES} entries; use spnr_jax.plan")
-
-
-def solid_picture(params: dict, rays: Any, camera: Camera, plan: Plan) -> Float[Array, "height width 2"]:
-    """Opacity and depth of a view (camera in the box) as the ray-marching network sees it, at the plan's resolution."""
-    return solid.seen(params["batch_stats"], rays, scaled(camera, plan.doublings, plan.side))
 
 
 class Blended(NamedTuple):
@@ -271,15 +257,13 @@ def shade_window(
     camera: Camera,
     light: Light,
     blended: Blended,
-    known: Float[Array, "h w 2"] | None,
     *,
     plan: Plan,
 ) -> Rendering:
-    """The second half: the network over the G-buffer, beside what that of rays knows of the view (`solid_picture`)."""
+    """The second half: the network over the G-buffer."""
     inside = cameras.in_box(camera, scene.centre, scene.scale)
     window = seen_through(scaled(inside, plan.doublings, plan.side), blended.corner, plan.width, plan.height)
-    known = None if known is None else cut_window(known, blended.corner, plan)
-    drawn = shade(params, *look(blended.buffer, light, window, known), doublings=plan.doublings)
+    drawn = shade(params, *look(blended.buffer, light, window), doublings=plan.doublings)
     image, depth, acc = paste(drawn, blended.corner * 2**plan.doublings, inside, plan.side)
     return Rendering(image=image, image_lr=image, depth=depth / scene.scale, acc=acc, overflow=blended.overflow)
 
@@ -300,19 +284,19 @@ def blend_entries(found: projection.Entries, surfels: Surfels, light: Light, cam
 
 
 def look(
-    buffer: GBuffer, light: Light, camera: Camera, known: Float[Array, "height width 2"] | None = None
+    buffer: GBuffer, light: Light, camera: Camera
 ) -> tuple[
-    Float[Array, "height width 34"], Float[Array, "height width 18"], Float[Array, "9 3"], Float[Array, "height width"]
+    Float[Array, "height width 33"], Float[Array, "height width 17"], Float[Array, "9 3"], Float[Array, "height width"]
 ]:
     """What the network sees of a G-buffer, the light maps, the light's harmonics in camera axes, the depth."""
-    told, maps = features.features(buffer, light, camera, known)
+    told, maps = features.features(buffer, light, camera)
     return told, maps, lighting.projected(light, jnp.asarray(camera.cam_to_world)[:, :3]), buffer.depth
 
 
 def shade(
     params: dict | None,
-    seen: Float[Array, "height width 34"],
-    maps: Float[Array, "height width 18"],
+    seen: Float[Array, "height width 33"],
+    maps: Float[Array, "height width 17"],
     ambient: Float[Array, "9 3"],
     depth: Float[Array, "height width"],
     *,
@@ -336,15 +320,6 @@ def shader_of(params: dict) -> Shader:
     levels = sum(name.startswith("down") for name in weights)
     widths = tuple(weights[f"in{level}"]["kernel"].shape[-1] for level in range(levels))
     return Shader(widths, weights["top"]["kernel"].shape[-1])
-
-
-def cut_window(
-    whole: Float[Array, "h w features"], corner: Int[Array, "2"], plan: Plan
-) -> Float[Array, "height width features"]:
-    """The window's part of a picture, which it may reach beyond."""
-    padded = jnp.pad(whole, ((0, plan.height), (0, plan.width), (0, 0)))
-    start = (corner[1], corner[0], jnp.zeros((), corner.dtype))
-    return jax.lax.dynamic_slice(padded, start, (plan.height, plan.width, whole.shape[-1]))
 
 
 def paste(

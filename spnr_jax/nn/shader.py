@@ -16,9 +16,9 @@ from spnr_jax.kernels.resizing import doubled, mean_of_squares, unfolded
 from spnr_jax.nn.convolution import Conv
 from spnr_jax.surfels.lighting import SPECULAR
 
-NUM_OUTPUTS = 22
+NUM_OUTPUTS = 21
 COLOR_STEP, ODDS_STEP = 0.3, 2.0  # what an output of 1 changes the base colour, and the log odds of the opacity by
-LEAST_ODDS = 1e-2  # keeps the odds of what is clear or solid finite
+LEAST_ODDS = 1e-2  # keeps the odds of what is clear or opaque finite
 NOTHING = 2e-4  # opacity below which a pixel stays clear, whatever the network says
 
 
@@ -54,7 +54,7 @@ class Shader(nn.Module):
     @nn.compact
     def __call__(
         self, seen: Float[Array, "batch height width features"], doublings: int, margin: int = 0
-    ) -> Float[Array, "batch h w 22"]:
+    ) -> Float[Array, "batch h w 21"]:
         """Outputs at 2^doublings times the resolution, but for a margin of pixels that only tell what is around."""
         height, width = seen.shape[1:3]
         square = 2 ** (len(self.widths) - 1)
@@ -80,8 +80,8 @@ def log_odds(opacity: Float[Array, "*pixels"]) -> Float[Array, "*pixels"]:
 
 
 def picture(
-    outputs: Float[Array, "batch h w 22"],
-    maps: Float[Array, "batch height width 18"],
+    outputs: Float[Array, "batch h w 21"],
+    maps: Float[Array, "batch height width 17"],
     ambient: Float[Array, "batch 9 3"],
     doublings: int,
 ) -> tuple[Float[Array, "batch h w 3"], Float[Array, "batch h w"]]:
@@ -91,16 +91,14 @@ def picture(
     """
     for _ in range(doublings):
         maps = doubled(maps)
-    color, metallic, opacity, factor, summand, arriving, unshadowed, mirrored, reflected, solid = jnp.split(
-        maps, (3, 4, 5, 6, 7, 10, 13, 16, 17), axis=-1
+    color, metallic, opacity, factor, summand, arriving, unshadowed, mirrored, reflected = jnp.split(
+        maps, (3, 4, 5, 6, 7, 10, 13, 16), axis=-1
     )
-    step, odds_step, shade, open_sky, shine, glow, bounce, bounces, trust, metal_step, rougher = jnp.split(
-        outputs, (3, 4, 5, 6, 7, 8, 11, 19, 20, 21), axis=-1
+    step, odds_step, shade, open_sky, shine, glow, bounce, bounces, metal_step, rougher = jnp.split(
+        outputs, (3, 4, 5, 6, 7, 8, 11, 19, 20), axis=-1
     )
     base = clamp(color + COLOR_STEP * step, 0, 1)
-    share = nn.sigmoid(trust)  # how far the rays are trusted beside the discs
-    odds = (1 - share) * log_odds(opacity) + share * log_odds(solid)
-    alpha = nn.sigmoid(odds + ODDS_STEP * odds_step) * one_minus_exp(opacity / NOTHING)
+    alpha = nn.sigmoid(log_odds(opacity) + ODDS_STEP * odds_step) * one_minus_exp(opacity / NOTHING)
     bounced = bounce * ambient[:, None, None, 0]
     bounced += jnp.einsum("bhwk,bkc->bhwc", bounces, ambient[:, 1:], precision="highest")
     metallic = clamp(metallic + COLOR_STEP * metal_step, 0, 1)

@@ -17,7 +17,7 @@ from spnr_jax.kernels.records import Camera, GBuffer, Light, Surfels
 from spnr_jax.surfels import lighting
 from spnr_jax.surfels.visibility import DIRECTIONS
 
-NUM_FEATURES, NUM_MAPS = 34, 18
+NUM_FEATURES, NUM_MAPS = 33, 17
 ODD = (14, 17, 28), (15, 18, 29)  # features that change their sign when the picture is mirrored along x, or along y
 FAINT = 0.02  # opacity from which on a pixel's numbers begin to count
 WINDOWS = 2, 6  # pixels to each side over which the depth is compared
@@ -35,7 +35,7 @@ def turned(surfels: Surfels, camera: Camera) -> Surfels:
     return dataclasses.replace(surfels, normal=jnp.where(behind, -surfels.normal, surfels.normal))
 
 
-def attributes(surfels: Surfels, light: Light, camera: Camera) -> Float[Array, "points 17"]:
+def attributes(surfels: Surfels, light: Light, camera: Camera) -> Float[Array, "points 19"]:
     """Numbers of each surfel that are blended over pixels; those of the light are linear in it."""
     rotation, eye = camera.cam_to_world[:, :3], camera.cam_to_world[:, 3]
     cosines = larger(jnp.einsum("pi,di->pd", surfels.normal, DIRECTIONS, precision="highest"), 0)
@@ -48,21 +48,19 @@ def attributes(surfels: Surfels, light: Light, camera: Camera) -> Float[Array, "
     reflected = jnp.sum(surfels.visible * lobe, axis=1) / jnp.sum(lobe, axis=1)
     parts = [surfels.roughness, surfels.metallic, lighting.arriving(surfels, light), reflected, openness]
     parts += [jnp.einsum("pi,ij->pj", bent, rotation, precision="highest"), surfels.base_color, surfels.shape]
-    parts += [surfels.sided, surfels.guessed]
+    parts += [surfels.sided, surfels.guessed, surfels.invented, jnp.mean(surfels.base_color, axis=1) ** 2]
     return jnp.concatenate([x[:, None] if x.ndim == 1 else x for x in map(jnp.asarray, parts)], axis=1)
 
 
 def features(
-    buffer: GBuffer, light: Light, camera: Camera, solid: Float[Array, "height width 2"] | None = None
-) -> tuple[Float[Array, "height width 34"], Float[Array, "height width 18"]]:
-    """The network's input, which knows no light, and the maps of materials and light for `nn.shader.picture`.
-
-    `solid` is the opacity and the depth along the camera's axis that the ray-marching network sees; None is not known.
-    """
+    buffer: GBuffer, light: Light, camera: Camera
+) -> tuple[Float[Array, "height width 33"], Float[Array, "height width 17"]]:
+    """The network's input, which knows no light, and the maps of materials and light for `nn.shader.picture`."""
     first, bent, blended, last = jnp.split(buffer.attributes, (7, 10, 13), axis=-1)
-    (roughness, metallic, *arriving, reflected, openness), (planarity, linearity, sided, guessed) = map(
+    (roughness, metallic, *arriving, reflected, openness), of_surface = map(
         columns, (first, last)
     )
+    planarity, linearity, sided, guessed, invented, squared = of_surface
     told = (buffer.centres / (buffer.centres + LEAST_CENTRES))[..., None]  # without discs near by the blended one
     color = clamp(blended + told * clamp(buffer.color - blended, -TRUST, TRUST), 0, 1)
     normal, view = _directions(buffer, camera)
@@ -80,16 +78,12 @@ def features(
     pattern = [jnp.log1p(8 * buffer.centres)[..., None], clamp(buffer.beside / in_pixels[..., None], -2, 2)]
     seen = jnp.concatenate([jnp.stack(numbers, axis=-1), *vectors], axis=-1)
     covered = buffer.opacity * larger(one_minus_exp((buffer.coverage / EDGE) ** 2), HAZE)
-    opacity = covered if solid is None else solid[..., 0]
-    known = jnp.zeros((*covered.shape, 3))
-    if solid is not None:
-        behind = jnp.tanh(opacity * (solid[..., 1] - buffer.depth) / spacing)
-        known = jnp.stack([jnp.ones_like(opacity), opacity, jnp.where(buffer.opacity > LEAST, behind, 0)], axis=-1)
-    pattern = [drawn * x for x in pattern]
-    seen = jnp.concatenate([drawn * seen, drawn, *pattern, known, drawn * guessed[..., None]], axis=-1)
+    contrast = root(squared - jnp.mean(blended, axis=-1) ** 2)  # of the colours that are blended: a texture
+    pattern += [guessed[..., None], invented[..., None], contrast[..., None]]
+    seen = jnp.concatenate([drawn * seen, drawn, *(drawn * x for x in pattern)], axis=-1)
     unshadowed = lighting.irradiance(light, turned[0]), lighting.mirrored(light, turned[1], roughness)
     maps = [*columns(color), metallic, covered, factor, summand, *arriving]
-    return seen, jnp.stack([*maps, *unshadowed[0], *unshadowed[1], reflected, opacity], axis=-1)
+    return seen, jnp.stack([*maps, *unshadowed[0], *unshadowed[1], reflected], axis=-1)
 
 
 def _directions(buffer: GBuffer, camera: Camera) -> tuple[list[Array], list[Array]]:

@@ -29,9 +29,9 @@ from spnr_jax.formats.images import to_uint8, write_whole
 from spnr_jax.formats.npz import packed, read_arrays
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.cleaning import Cleaned, cleaned
-from spnr_jax.kernels.records import Camera, Crops, Light, PointCloud, Scene, Surfels, SurfelScene
+from spnr_jax.kernels.records import Camera, Crops, Light, PointCloud, Surfels, SurfelScene
 from spnr_jax.kernels.thinning import farthest_points
-from spnr_jax.method import solid, surfel_pictures, surfel_renderer
+from spnr_jax.method import surfel_pictures, surfel_renderer
 from spnr_jax.surfels import features, lighting, outward
 from spnr_jax.surfels.surfel_scenes import encode_in_box
 from spnr_jax.training.batching import read_ahead
@@ -39,8 +39,7 @@ from spnr_jax.training.scan_faults import colours_alone, random_scan
 
 CLOUDS = 2  # of each object
 SCANNED = 0.3  # share of them that are scanned and cleaned
-UNKNOWN = 0.15  # share of the clouds of which it is not known where they are solid
-UNKNOWN_MATERIALS = 0.1  # share of the others whose roughness and metallic are not known
+UNKNOWN_MATERIALS = 0.1  # share of the clouds whose roughness and metallic are not known
 WITHOUT_NORMALS = 0.5  # share of the others whose normals are estimated
 ALONE = 0.5  # share of these whose normals are estimated from the points that are kept alone, as of a small file
 SIDES = (1, 1, 1, 1, 2, 4, 8)  # pixels of a reference averaged along a side, drawn from these
@@ -67,8 +66,8 @@ class View(NamedTuple):
     doublings: int
 
 
-def complete(dataset: Dataset, light: Light, config: TrainConfig, folder: Path, solid: dict) -> list[View]:
-    """The views of the data set's objects; files that are missing or broken are made; `solid` are variables."""
+def complete(dataset: Dataset, light: Light, config: TrainConfig, folder: Path, variables: dict) -> list[View]:
+    """The views of the data set's objects; files that are missing or broken are made; `variables` densify."""
     views = []
     for name in tqdm(dataset.splits["train"], "G-buffers", unit="object"):
         paths = [folder / f"{name}.{number}.npz" for number in range(CLOUDS)]
@@ -76,7 +75,7 @@ def complete(dataset: Dataset, light: Light, config: TrainConfig, folder: Path, 
         item = read_object(dataset, name) if None in found else None
         for number, path in enumerate(paths):
             if item is not None and found[number] is None:
-                arrays = make(item, number, light, config, solid)
+                arrays = make(item, number, light, config, variables)
                 write_whole(path, packed(arrays))  # not compressed: a view is read for each crop
                 found[number] = arrays["doublings"].tolist()
         views += [View(path, i, d) for path, of in zip(paths, found, strict=True) for i, d in enumerate(of or ())]
@@ -94,21 +93,19 @@ def _doublings(path: Path) -> list[int] | None:
         return None
 
 
-def make(item: ObjectData, number: int, light: Light, config: TrainConfig, rays: dict) -> Arrays:
+def make(item: ObjectData, number: int, light: Light, config: TrainConfig, variables: dict) -> Arrays:
     """The content of a file: views of the object's cloud of this number."""
     assert isinstance(config.model, SurfelConfig)
     generator = np.random.default_rng((config.seed, CLOUD, zlib.crc32(item.name.encode()), number))
     side = int(generator.choice(SIDES))
     cloud = random_cloud(item.cloud, side, config, generator)
-    variables = None if generator.random() < UNKNOWN else {"batch_stats": rays}
-    scene = encode_in_box(cloud)
-    known = surfel_pictures.encode_solid(variables, cloud, config.model)
+    scene = encode_in_box(surfel_pictures.densify_sparse(variables, cloud))
     arrays: Arrays = {}
     doublings: list[int] = []
     for index in generator.permutation(len(item.images))[: config.views_per_object]:
         camera = jax.tree.map(lambda x, i=index: np.asarray(x[i]), item.camera)
         own = light if item.lights is None else lighting.light_of(item.lights[index])
-        if view := make_view(scene, camera, item.images[index], side, own, rays, known):
+        if view := make_view(scene, camera, item.images[index], side, own):
             arrays |= {f"{name}{len(doublings)}": view[1][name] for name in NAMES}
             doublings.append(view[0])
     return arrays | {"doublings": np.array(doublings, np.int64)}
@@ -152,13 +149,8 @@ def make_view(
     image: UInt8[np.ndarray, "height width 4"],
     side: int,
     light: Light,
-    rays: dict | None = None,
-    known: Scene | None = None,
 ) -> tuple[int, Arrays] | None:
-    """Doublings and arrays of a view, `side` times smaller than its reference is kept; None if it teaches nothing.
-
-    `known` is what the ray-marching network, whose variables are `rays`, makes of the object.
-    """
+    """Doublings and arrays of a view, `side` times smaller than its reference is kept; None if it teaches nothing."""
     small = cameras.resize(camera, camera.height // side, camera.width // side)
     doublings, finer = surfel_renderer.resolution(scene, small)
     side, scale = side // finer, 2**doublings  # what is drawn at twice the size is compared at that size
@@ -170,7 +162,7 @@ def make_view(
         return None
     whole = drawn.height * drawn.width
     room, slots = _size(int(needed.entries), 2**16), min(_size(int(needed.slots), whole // 16), whole)
-    seen, maps, ambient = map(np.asarray, look_at(scene.surfels, drawn, light, rays, known, room=room, slots=slots))
+    seen, maps, ambient = map(np.asarray, look_at(scene.surfels, drawn, light, room=room, slots=slots))
     target = averaged(image, side)
     shown = target[..., 3].reshape(drawn.height, scale, drawn.width, scale).max(axis=(1, 3))
     inside = (seen[..., 0] > FAINT) | (shown > 0)
@@ -187,12 +179,11 @@ def make_view(
 
 @partial(jax.jit, static_argnames=("room", "slots"))
 def look_at(
-    surfels: Surfels, camera: Camera, light: Light, rays: dict | None, known: Scene | None, *, room: int, slots: int
-) -> tuple[Float[Array, "height width 34"], Float[Array, "height width 18"], Float[Array, "9 3"]]:
+    surfels: Surfels, camera: Camera, light: Light, *, room: int, slots: int
+) -> tuple[Float[Array, "height width 33"], Float[Array, "height width 17"], Float[Array, "9 3"]]:
     """What the network sees of a whole view, the light maps, and the light's harmonics."""
     buffer, _ = surfel_renderer.rasterize(surfels, camera, light, room=room, slots=slots)
-    picture = None if known is None or rays is None else solid.seen(rays, known, camera)
-    return surfel_renderer.look(buffer, light, camera, picture)[:3]
+    return surfel_renderer.look(buffer, light, camera)[:3]
 
 
 def _size(count: int, least: int) -> int:

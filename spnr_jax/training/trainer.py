@@ -35,7 +35,7 @@ from spnr_jax.method import inference
 from spnr_jax.training import adversary, checkpoint, optimisation, work
 from spnr_jax.training.metrics_log import MetricsLog, Unwritten
 from spnr_jax.training.run_record import Clock, RunRecord
-from spnr_jax.training.weights import Trained, solid_variables
+from spnr_jax.training.weights import Trained
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -228,8 +228,6 @@ def new_state(config: TrainConfig, init: Trained | None) -> optimisation.TrainSt
     if config.trains == "refiner" and init is None:
         raise UserError(f"preset {config.preset} trains a refiner behind a network that is trained: name it by --init")
     state = optimisation.jitted_create_state(config)
-    if solid := solid_variables(config.model):
-        state = dataclasses.replace(state, batch_stats=solid, averaged_stats=jax.tree.map(jnp.copy, solid))
     return state if init is None else optimisation.begun_with(state, init.variables)
 
 

@@ -10,7 +10,7 @@ the file of one.
 
 import json
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from importlib import resources
 from pathlib import Path
@@ -49,10 +49,9 @@ def shipped(name: str = SHIPPED[0]) -> Path:
     return Path(str(resources.files("spnr_jax") / "pretrained" / f"{name}.npz"))
 
 
-def solid_variables(config: NetworkConfig) -> dict:
-    """Weights of the ray-marching network that one over surfels asks (`method/solid.py`): the package's, or none."""
-    asks = isinstance(config, SurfelConfig) and config.solid
-    return read_weights(shipped("near_points")).variables if asks else {}
+def add_densifier(config: NetworkConfig, variables: dict) -> dict:
+    """The variables, with the package's densifier beside a network over surfels (`method/densifier.py`)."""
+    return variables | {"densifier": read_densifier()} if isinstance(config, SurfelConfig) else variables
 
 
 def suited_to(num_points: int) -> str:
@@ -73,11 +72,13 @@ def read_trained(source: Path | str | None, say: Callable[[str], None] = print, 
     """
     path = place(source)
     if path.suffix == ".npz":
-        return read_weights(path)
+        trained = read_weights(path)
+        return replace(trained, variables=add_densifier(trained.config.model, trained.variables))
     from spnr_jax.training import checkpoint, optimisation  # here: a file of weights is read without optimisers
 
     config, state = checkpoint.load_run(path, say, data)
-    return Trained(config=config, variables=optimisation.averaged_variables(state), steps=int(state.step))
+    variables = add_densifier(config.model, optimisation.averaged_variables(state))
+    return Trained(config=config, variables=variables, steps=int(state.step))
 
 
 def read_densifier(path: Path | None = None) -> dict:
@@ -87,22 +88,21 @@ def read_densifier(path: Path | None = None) -> dict:
     return _as_variables(arrays)
 
 
-def load(run: Path | str | None = None, methods: Path | str | None = None, *, densify: bool = False) -> Model:
+def load(run: Path | str | None = None, methods: Path | str | None = None) -> Model:
     """A network of the package (SHIPPED; None is the first), of a run folder's newest checkpoint, or of a file.
 
-    With `densify` one over surfels sees learned points between those of a sparse cloud (`method/densifier.py`).  For a
-    method of one's own, `methods` names the .py file or module that registers it: no file makes it be imported.
+    For a method of one's own, `methods` names the .py file or module that registers it: no file makes it be imported.
     """
     if methods is not None:
         include(methods)
     trained = read_trained(run)
-    more = {"densifier": read_densifier()} if densify and isinstance(trained.config.model, SurfelConfig) else {}
-    return Model(config=trained.config.model, variables=trained.variables | more)
+    return Model(config=trained.config.model, variables=trained.variables)
 
 
 def write_weights(path: Path, trained: Trained) -> None:
     """Writes the file; ValueError for weights that float16 cannot hold."""
-    arrays = {name: np.asarray(values) for name, values in flatten_dict(trained.variables, sep="/").items()}
+    own = {name: tree for name, tree in trained.variables.items() if name != "densifier"}
+    arrays = {name: np.asarray(values) for name, values in flatten_dict(own, sep="/").items()}
     for name, values in arrays.items():
         if not np.abs(values).max(initial=0) <= np.finfo(np.float16).max:
             raise UserError(f"{path}: {name} reaches {np.abs(values).max():.3g}, which float16 does not hold")

@@ -21,7 +21,7 @@ from spnr_jax.kernels.records import Crops, Light
 from spnr_jax.surfels import lighting
 from spnr_jax.training import adversary, batching, gbuffers, optimisation, refiner_training, shading
 from spnr_jax.training.optimisation import TrainState
-from spnr_jax.training.weights import Trained, solid_variables, write_weights
+from spnr_jax.training.weights import Trained, add_densifier, write_weights
 
 ROOM = "procedural room"  # as the generator of data sets calls it
 
@@ -82,7 +82,7 @@ def of_gbuffers(config: TrainConfig, dataset: Dataset, run: Path, light: Light) 
     The averaged weights are written to the run folder at the end.  All devices of a process do the same work.
     """
     check_one_process(config)
-    views = gbuffers.complete(dataset, light, config, run / "gbuffers", solid_variables(config.model))
+    views = gbuffers.complete(dataset, light, config, run / "gbuffers", add_densifier(config.model, {}))
 
     def step(state: TrainState, crops: Crops, number: int) -> tuple[TrainState, dict]:
         return shading.jitted_train_step(state, crops, config=config)
