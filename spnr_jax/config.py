@@ -1,11 +1,10 @@
 """Every number of a network and of its training, as frozen dataclasses; `presets.py` fills them in.
 
-    EncoderConfig      points to a volume, with which both ray-marching networks begin
-    PaperConfig        the paper's network             method/paper_network.py
-    NearPointsConfig   the network near points         method/near_points.py
-    SurfelConfig       the network over surfels        method/surfel_renderer.py
-    TrainConfig        a training: one of these, losses, optimiser, batches
-    RenderOptions      how a render is asked for
+    EncoderConfig   points to a volume, with which the paper's network begins
+    PaperConfig     the paper's network             method/paper_network.py
+    SurfelConfig    the network over surfels        method/surfel_renderer.py
+    TrainConfig     a training: one of these, losses, optimiser, batches
+    RenderOptions   how a render is asked for
 
 Configs are hashable, so they are static arguments of jit.  All numbers are finite and at least 0; a wrong value raises
 ValueError when the config is made, with the field and what came.  Marks: [paper] stands in the supplement, the rest is
@@ -22,8 +21,6 @@ from spnr_jax.errors import require
 
 Material = Literal["base_color", "roughness", "metallic"]
 MATERIAL_CHANNELS = {"base_color": 3, "roughness": 1, "metallic": 1}
-CELLS = 1.0  # of the grid of nearest points along an axis, per square root of the number of points; 0.75 lost 0.1 dB
-MOST_CELLS = 96
 MOST_LAYERS, MOST_STAGES = 32, 16  # of a network: a damaged file must not cost minutes of tracing
 LARGEST = 2**63  # of any number in a config
 
@@ -64,14 +61,6 @@ def mismatch(value: Any, kind: Any) -> str:
     return "" if isinstance(value, kind) else "true or false" if kind is bool else f"of the type {kind.__name__}"
 
 
-def surface_grid(num_points: int, least: int = 1) -> int:
-    """Cells along each axis of the grid of nearest points for so many; a surface's lie in the order of its square.
-
-    Padding counts as points: with the `least` of a training, smaller clouds see the grid that they saw there.
-    """
-    return min(max(round(CELLS * num_points**0.5), least, 1), MOST_CELLS)
-
-
 @dataclass(frozen=True, kw_only=True)
 class SamplingConfig:
     """Samples along each ray."""
@@ -91,14 +80,12 @@ class SamplingConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class RenderOptions:
-    """Rendering options of the ray-marching networks; sizes and weights stay as they are."""
+    """Rendering options of a ray-marching network; sizes and weights stay as they are."""
 
     sampling: SamplingConfig | None = None
     """Samples per ray; None: as in training."""
     rays_per_side: int = 1
     """Rays along each side of a pixel, averaged."""
-    refine: bool = True
-    """Whether a network that has a refiner uses it."""
     block: int | None = None
     """Rays rendered at once, which bounds the memory; None: as many as suit a picture of the network."""
 
@@ -118,8 +105,6 @@ class EncoderConfig:
     """Hidden layers of the PointNet [paper]."""
     point_features: int = 32
     """Features of a point after the PointNet."""
-    point_norm: Literal["batch", "layer"] = "batch"
-    """Normalisation in the PointNet: batch norm over the points [paper], or layer norm of each point."""
     volume_resolution: int = 64
     """Voxels along each axis of the box [-1, 1]^3; a multiple of 2 ** num_stages."""
     base_width: int = 16
@@ -177,8 +162,10 @@ class NetworkConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RayNetworkConfig(NetworkConfig):
-    """Base config of the ray-marching networks: encoder, sampling, field."""
+class PaperConfig(NetworkConfig):
+    """Sizes of the paper's network: encoder, sampling, field, upsampler."""
+
+    method: ClassVar[str] = "paper"
 
     encoder: EncoderConfig = field(default_factory=EncoderConfig)
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
@@ -189,24 +176,7 @@ class RayNetworkConfig(NetworkConfig):
     sees_direction: bool = True
     """Whether colour and features depend on the view direction."""
     precision: Literal["float32", "bfloat16"] = "float32"
-    """Format of the convolutions in U-Net, refiner, upsampler, discriminator; all else, parameters too, is float32."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check(self, positive=("field_width",))
-
-    @property
-    def bf16(self) -> bool:
-        """Whether the convolutions run in bfloat16."""
-        return self.precision == "bfloat16"
-
-
-@dataclass(frozen=True, kw_only=True)
-class PaperConfig(RayNetworkConfig):
-    """Sizes of the paper's network."""
-
-    method: ClassVar[str] = "paper"
-
+    """Format of the convolutions in U-Net, upsampler, discriminator; all else, parameters too, is float32."""
     num_features: int = 32
     """Channels of the rendered feature image; the first three are RGB."""
     render_resolution: int = 64
@@ -218,13 +188,18 @@ class PaperConfig(RayNetworkConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check(self, positive=("render_resolution", "resize_resolution", "upsampler_width"))
+        check(self, positive=("field_width", "render_resolution", "resize_resolution", "upsampler_width"))
         require(self.num_features >= 4, f"num_features must be 4 or more, RGB first, got {self.num_features}")
         require(
             self.image_resolution in (self.render_resolution, 2 * self.resize_resolution),
             f"image_resolution {self.image_resolution} must be render_resolution ({self.render_resolution}: no "
             f"upsampler) or twice resize_resolution ({2 * self.resize_resolution})",
         )
+
+    @property
+    def bf16(self) -> bool:
+        """Whether the convolutions run in bfloat16."""
+        return self.precision == "bfloat16"
 
     @property
     def upsamples(self) -> bool:
@@ -235,43 +210,6 @@ class PaperConfig(RayNetworkConfig):
     def per_pixel(self) -> bool:
         """The upsampler mixes pixels."""
         return not self.upsamples
-
-
-@dataclass(frozen=True, kw_only=True)
-class NearPointsConfig(RayNetworkConfig):
-    """Sizes of the network near points: a ray a pixel, samples near the points alone."""
-
-    method: ClassVar[str] = "near_points"
-
-    encoder: EncoderConfig = field(default_factory=lambda: EncoderConfig(point_norm="layer"))
-    sampling: SamplingConfig = field(default_factory=lambda: SamplingConfig(num_coarse=32, num_fine=0, reach=1))
-    num_neighbors: int = 6
-    """Nearest points whose planes and materials a sample sees (`kernels/surface.py`)."""
-    surface_cells: int = 0
-    """Lowest resolution of the grid of nearest points; presets set it so that small clouds get the grid of training."""
-    color: Literal["free", "lit"] = "lit"
-    """Radiance: free RGB, or predicted light on the materials of the nearest points (`nn/surface_field.py`)."""
-    refiner_width: int = 0
-    """Channels of the 2D CNN that refines the rendered picture (`nn/refiner.py`); 0: none."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check(self, positive=("num_neighbors",))
-        require(self.sampling.reach == 1, f"reach {self.sampling.reach}: nothing is known far from points; use reach 1")
-
-    @property
-    def per_pixel(self) -> bool:
-        """A refiner mixes pixels."""
-        return not self.refiner_width
-
-
-SOLID = NearPointsConfig(
-    encoder=EncoderConfig(volume_resolution=32, base_width=8, num_stages=3, num_groups=1, point_norm="layer"),
-    sampling=SamplingConfig(num_coarse=16, num_fine=0, reach=1),
-    surface_cells=surface_grid(2048),
-    refiner_width=32,
-)
-"""Sizes of the package's network `near_points`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -383,8 +321,6 @@ class TrainConfig:
     """Most points drawn per object and step; the padded size of the cloud."""
     test_points: int = 1024
     """Points per object in evaluation."""
-    trains: Literal["network", "refiner"] = "network"
-    """Trainable part: all weights, or the refiner alone, on pictures of the initial network (`--init`)."""
     seed: int = 0
     """Seed of weights, batches and jitter."""
     pixel_stride: int = 1
@@ -404,8 +340,8 @@ class TrainConfig:
             "least 24, or adversarial_weight 0",
         )
         require(
-            self.loss.adversarial_weight == 0 or isinstance(self.model, RayNetworkConfig),
-            f"adversarial_weight {self.loss.adversarial_weight}: the discriminator judges our network alone; use 0",
+            self.loss.adversarial_weight == 0 or isinstance(self.model, PaperConfig),
+            f"adversarial_weight {self.loss.adversarial_weight} is for the paper's network alone; use 0",
         )
         require(
             self.pixel_stride == 1 or (self.model.per_pixel and self.model.image_resolution % self.pixel_stride == 0),
@@ -424,15 +360,3 @@ class TrainConfig:
             self.min_points <= self.max_points,
             f"min_points {self.min_points} must not exceed max_points {self.max_points}",
         )
-        refines = isinstance(self.model, NearPointsConfig) and self.model.refiner_width > 0 and self.crop > 0
-        require(
-            self.trains == "network" or (refines and self.loss.adversarial_weight == 0),
-            "trains refiner needs a network near points with a refiner_width, a crop, and adversarial_weight 0",
-        )
-        if isinstance(self.model, NearPointsConfig):
-            cells = surface_grid(self.max_points)
-            require(
-                self.model.surface_cells >= cells,
-                f"model.surface_cells {self.model.surface_cells}: with max_points {self.max_points} the network would "
-                f"train on a finer grid than it renders smaller clouds with; use at least {cells}",
-            )

@@ -19,15 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from spnr_jax.config import (
-    NearPointsConfig,
-    NetworkConfig,
-    PaperConfig,
-    SurfelConfig,
-    TrainConfig,
-    mismatch,
-    types_of,
-)
+from spnr_jax.config import NetworkConfig, PaperConfig, SurfelConfig, TrainConfig, mismatch, types_of
 from spnr_jax.errors import UserError, first_line, require
 from spnr_jax.presets import PRESETS
 
@@ -52,16 +44,18 @@ class Method:
 
 METHODS: dict[str, Method] = {
     "surfels": Method(config=SurfelConfig, network=None, label="Surfels"),
-    "near_points": Method(
-        config=NearPointsConfig, network="spnr_jax.method.near_points:NearPointsNetwork", label="Near points"
-    ),
     "paper": Method(
         config=PaperConfig, network="spnr_jax.method.paper_network:PaperNetwork", label="The paper's network"
     ),
 }
 
 
-GONE = {"model.encoder.scatter": "mean", "model.encoder.skip": "add"}
+GONE = {
+    "model.encoder.scatter": "mean",
+    "model.encoder.skip": "add",
+    "model.encoder.point_norm": "batch",
+    "trains": "network",
+}
 """Fields of earlier versions, and the one value of each that is still computed."""
 
 

@@ -1,30 +1,25 @@
 """The presets: functions that return a TrainConfig, named as `spnr train --preset` takes them.
 
-The paper's network in its sizes and in smaller ones, then the network near points, and ours over surfels.  A trained
-network of the package has the name of its preset: `surfels`, `near_points`, `near_points_lite` (docs/model_card.md).
+The paper's network in its sizes and in smaller ones, then ours over surfels.  The network of the package was trained
+with the preset `surfels` (docs/model_card.md).
 """
 
 import dataclasses
 from collections.abc import Callable
 
 from spnr_jax.config import (
-    SOLID,
     EncoderConfig,
     LossConfig,
-    NearPointsConfig,
     OptimizerConfig,
     PaperConfig,
     SamplingConfig,
     SurfelConfig,
     TrainConfig,
-    surface_grid,
 )
 
 PAPER = EncoderConfig(inputs="spread", num_groups=1)  # of the paper's network, with what lets it learn hues
-NEAR = LossConfig(l1_weight=1.0, mse_weight=1.0, adversarial_weight=0.0, opacity_weight=1.0)
-EIGHT = SamplingConfig(num_coarse=8, num_fine=0, reach=1)  # a picture takes less time than the paper's network
+SHADED = LossConfig(l1_weight=1.0, mse_weight=5.0, adversarial_weight=0.0, opacity_weight=1.0, opacity_l1_weight=0.3)
 QUICK = OptimizerConfig(lr_generator=2e-3, warmup_steps=100, ema_decay=0.995)
-LONGER = OptimizerConfig(lr_generator=2e-3, warmup_steps=100, ema_decay=0.999)
 
 
 def abo() -> TrainConfig:
@@ -85,66 +80,6 @@ def tiny() -> TrainConfig:
     )
 
 
-def near_points_tiny() -> TrainConfig:
-    """Near points, 64 px, minutes on two CPU cores.  `spnr train --preset near_points_tiny DATA RUN`."""
-    return TrainConfig(
-        preset="near_points_tiny",
-        model=NearPointsConfig(
-            encoder=SOLID.encoder,
-            sampling=EIGHT,
-            surface_cells=surface_grid(1024),
-            sees_direction=False,
-            image_resolution=64,
-        ),
-        loss=NEAR,
-        optimizer=QUICK,
-        num_steps=1200,
-        batch_objects=4,
-        max_points=1024,
-        pixel_stride=2,
-    )
-
-
-def near_points_lite() -> TrainConfig:
-    """Half the sizes of near_points, no refiner.  `spnr train --preset near_points_lite DATA RUN`."""
-    return TrainConfig(
-        preset="near_points_lite",
-        model=NearPointsConfig(
-            encoder=dataclasses.replace(
-                SOLID.encoder, point_widths=(32, 64, 128), point_features=16, volume_resolution=16
-            ),
-            sampling=EIGHT,
-            surface_cells=surface_grid(2048),
-            field_width=32,
-        ),
-        loss=NEAR,
-        optimizer=LONGER,
-        num_steps=5000,
-        batch_objects=4,
-        min_points=128,
-        max_points=2048,
-        pixel_stride=4,
-    )
-
-
-def near_points() -> TrainConfig:
-    """Near points, 128 px, with a refiner.  `spnr train --preset near_points --init near_points DATA RUN`.
-
-    Without --init it learns slowly: `experiments.packaged.pretrain` begins with a lattice of rays and no refiner.
-    """
-    return TrainConfig(
-        preset="near_points",
-        model=SOLID,
-        loss=dataclasses.replace(NEAR, mse_weight=4.0, opacity_weight=2.0),
-        optimizer=LONGER,
-        num_steps=20_000,
-        batch_objects=4,
-        min_points=128,
-        max_points=2048,
-        crop=64,
-    )
-
-
 def surfels() -> TrainConfig:
     """Our network over G-buffers of surfels, pictures of any size.  `spnr train --preset surfels DATA RUN`.
 
@@ -154,9 +89,7 @@ def surfels() -> TrainConfig:
     return TrainConfig(
         preset="surfels",
         model=SurfelConfig(),
-        loss=LossConfig(
-            l1_weight=1.0, mse_weight=5.0, adversarial_weight=0.0, opacity_weight=1.0, opacity_l1_weight=0.3
-        ),
+        loss=SHADED,
         optimizer=OptimizerConfig(
             lr_generator=1.5e-3, beta2=0.99, warmup_steps=200, final_lr_scale=0.02, clip_norm=1.0
         ),
@@ -170,8 +103,21 @@ def surfels() -> TrainConfig:
     )
 
 
+def surfels_tiny() -> TrainConfig:
+    """Ours, narrower, 64 px, minutes on two CPU cores.  `spnr train --preset surfels_tiny DATA RUN`."""
+    return TrainConfig(
+        preset="surfels_tiny",
+        model=SurfelConfig(image_resolution=64, widths=(16, 32, 64), top=16),
+        loss=SHADED,
+        optimizer=QUICK,
+        num_steps=1200,
+        views_per_object=4,
+        min_points=256,
+        max_points=1024,
+        crop=32,
+    )
+
+
 PAPERS = (abo, shapenet_car, shapenet_plane, shapenet_chair, small, tiny)
-PRESETS: dict[str, Callable[[], TrainConfig]] = {
-    preset.__name__: preset for preset in (*PAPERS, near_points, near_points_lite, near_points_tiny, surfels)
-}
+PRESETS: dict[str, Callable[[], TrainConfig]] = {preset.__name__: preset for preset in (*PAPERS, surfels, surfels_tiny)}
 """By name; `methods.register` adds those of a method of one's own."""

@@ -27,7 +27,7 @@ from spnr_jax.presets import PRESETS
 from spnr_jax.training import adversary, batching, checkpoint, metrics_log, optimisation, trainer
 
 Budget = Literal["quick", "tiny", "paper"]
-NETWORKS = ("near_points", "paper", "npbg", "point_nerf", "points2nerf")
+NETWORKS = ("paper", "npbg", "point_nerf", "points2nerf")
 QUICK_STEPS = 4
 PAPER_SIZES = {128: "abo", 200: "shapenet"}
 PACE_SECONDS, PACE_STEPS = 5.0, 3  # a pace is measured over at least so long and so many steps
@@ -53,11 +53,7 @@ def configs(budget: Budget, size: int, category: str | None) -> dict[str, TrainC
             "with --resolution 128, or take --budget tiny"
         )
     paper = PAPER_SIZES[size] if size == 128 else f"shapenet_{category}"
-    near = PRESETS["near_points"]()
-    found = {
-        "near_points": dataclasses.replace(near, model=dataclasses.replace(near.model, image_resolution=size)),
-        "paper": PRESETS[paper if paper in PRESETS else "shapenet_car"](),
-    }
+    found = {"paper": PRESETS[paper if paper in PRESETS else "shapenet_car"]()}
     return found | {name: published(size) for name, published in PUBLISHED.items()}
 
 

@@ -31,7 +31,7 @@ class Sources:
     """Where the networks are."""
 
     runs: tuple[Path, ...] = ()
-    """Run folders, files of weights, or networks of the package: surfels, near_points, near_points_lite."""
+    """Run folders, files of weights, or `surfels`, the network of the package."""
     table1: Path | None = None
     """Folder of a table that experiments.paper.table1 made; its runs are taken too."""
 

@@ -32,8 +32,7 @@ from spnr_jax.scoring import evaluation
 from spnr_jax.scoring.summary import Scores
 from spnr_jax.training import checkpoint, metrics_log, optimisation
 
-PaperPreset = Literal["abo", "shapenet_car", "shapenet_plane", "shapenet_chair", "small", "tiny"]
-Preset = PaperPreset | Literal["near_points", "near_points_lite", "near_points_tiny"]
+Preset = Literal["abo", "shapenet_car", "shapenet_plane", "shapenet_chair", "small", "tiny"]
 QUICK_STEPS, QUICK_OBJECTS = 4, 2
 FEWEST_ROWS = 8  # of a log, two of which may hold a compilation
 

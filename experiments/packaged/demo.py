@@ -5,10 +5,8 @@
     OUT/data/  ours/  paper/       the data set, and the runs of our network and of the paper's
     OUT/metrics.json  report.html  both beside the trivial renderers
 
-Ours is the network near points: of 1024 points at 64 pixels it draws better pictures than the one of surfels, which is
-for denser ones (docs/lab/results.md).  Both networks see the same evenly spread points, and train for as many steps.
-What is there already is reused: finished objects, trained steps.  The seconds of each part are those of the run that
-did it.
+Both networks see the same evenly spread points, and train for as many steps.  What is there already is reused: finished
+objects, trained steps.  The seconds of each part are those of the run that did it.
 """
 
 import dataclasses
@@ -108,8 +106,8 @@ def generation_of(demo: Demo) -> GenerateConfig:
 
 
 def configs_of(demo: Demo) -> dict[str, TrainConfig]:
-    """The network near points and the paper's, ours first."""
-    presets_of = {"ours": presets.near_points_tiny(), "paper": presets.tiny()}
+    """The network over surfels and the paper's, ours first."""
+    presets_of = {"ours": presets.surfels_tiny(), "paper": presets.tiny()}
     return {
         name: dataclasses.replace(config, seed=demo.seed, num_steps=demo.steps, even_share=1.0)
         for name, config in presets_of.items()

@@ -31,7 +31,7 @@ from experiments.comparison import clock, results_folder
 from experiments.speed import bench
 from experiments.speed.speed_scenes import orbiting, random_crops, sphere
 from spnr_jax import cli
-from spnr_jax.config import RayNetworkConfig, SurfelConfig, TrainConfig
+from spnr_jax.config import PaperConfig, SurfelConfig, TrainConfig
 from spnr_jax.devices import machine
 from spnr_jax.kernels.records import Volume
 from spnr_jax.method import surfel_pictures, surfel_renderer
@@ -161,7 +161,7 @@ def at_once(options: OnGPU, name: str, step: Callable, config: TrainConfig, batc
 
 def small(config: TrainConfig) -> TrainConfig:
     """The config of a network that compiles in seconds, for whole views."""
-    assert isinstance(config.model, RayNetworkConfig)
+    assert isinstance(config.model, PaperConfig)
     encoder = dataclasses.replace(
         config.model.encoder, point_widths=(8,), point_features=8, volume_resolution=8, num_stages=1
     )

@@ -30,7 +30,7 @@ from experiments.comparison import clock, results_folder
 from experiments.speed import bench
 from experiments.speed.speed_scenes import orbiting, random_crops, sphere
 from spnr_jax import cli
-from spnr_jax.config import RayNetworkConfig, SurfelConfig, TrainConfig
+from spnr_jax.config import PaperConfig, SurfelConfig, TrainConfig
 from spnr_jax.devices import machine
 from spnr_jax.errors import at_least
 from spnr_jax.kernels import cameras
@@ -219,7 +219,7 @@ def with_pixels(config: TrainConfig, size: int) -> tuple[TrainConfig, Batch]:
 
 def with_volume(config: TrainConfig, resolution: int) -> tuple[TrainConfig, Batch]:
     """Volumes of so many voxels along each side."""
-    assert isinstance(config.model, RayNetworkConfig)
+    assert isinstance(config.model, PaperConfig)
     encoder = dataclasses.replace(config.model.encoder, volume_resolution=resolution)
     model = dataclasses.replace(config.model, encoder=encoder)
     return dataclasses.replace(config, model=model), bench.our_batch(config)
@@ -227,7 +227,7 @@ def with_volume(config: TrainConfig, resolution: int) -> tuple[TrainConfig, Batc
 
 def with_samples(config: TrainConfig, count: int) -> tuple[TrainConfig, Batch]:
     """So many samples on each ray, half of them coarse."""
-    assert isinstance(config.model, RayNetworkConfig)
+    assert isinstance(config.model, PaperConfig)
     sampling = dataclasses.replace(config.model.sampling, num_coarse=count // 2, num_fine=count // 2)
     model = dataclasses.replace(config.model, sampling=sampling)
     return dataclasses.replace(config, model=model), bench.our_batch(config)

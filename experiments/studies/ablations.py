@@ -11,9 +11,8 @@
 Every variant trains for as many steps, or with --minutes for as long.  With --folds each part of all objects is held
 out in turn, so that every one of them is scored by networks that never saw it.
 
-Rows that are the preset itself (its own depth; those of the nearest points for a preset without them) are left out, and
-that without colour variants where the training split has none: `spnr-data generate DIR --colour-variants 5` makes them.
-More rows and seeds can be asked for later.
+Rows that are the preset itself (its own depth) are left out, and that without colour variants where the training split
+has none: `spnr-data generate DIR --colour-variants 5` makes them.  More rows and seeds can be asked for later.
 Runs of one seed see the same batches and jitter, whatever the row.  The same command gives the same scores on a CPU.
 """
 
@@ -27,22 +26,13 @@ import tyro
 from experiments import entry_point
 from experiments.comparison import variants, variants_report
 from experiments.comparison.variants import Budget, Variant
-from spnr_jax import cli, presets
-from spnr_jax.config import (
-    EncoderConfig,
-    LossConfig,
-    NearPointsConfig,
-    PaperConfig,
-    RayNetworkConfig,
-    SamplingConfig,
-    TrainConfig,
-)
+from spnr_jax import cli
+from spnr_jax.config import EncoderConfig, PaperConfig, SamplingConfig, TrainConfig
 from spnr_jax.errors import UserError, at_least
 from spnr_jax.formats import data_sets
 
 REFERENCE = "reference"
 LABELS = {
-    "paper": "The paper's network and training",
     "no_condition": "No condition image",
     "no_colour_variants": "No colour variants",
     "depth_3": "U-Net of 3 stages",
@@ -50,20 +40,11 @@ LABELS = {
     "depth_5": "U-Net of 5 stages",
     "no_fine_samples": "No fine samples",
     "no_view_direction": "No view direction",
-    "view_direction": "Sees the view direction",
     "plain_inputs": "Materials as they are",
     "fewer_channels": "Two thirds of the volume's channels",
-    "free_colour": "Free colours, not light on materials",
-    "no_neighbours": "No nearest points",
-    "three_neighbours": "3 nearest points",
-    "twelve_neighbours": "12 nearest points",
-    "batch_norm": "PointNet: batch normalisation",
-    "no_opacity_loss": "No loss of opacity",
-    "no_squared_error": "L1 alone",
-    "adversarial": "With the discriminator at the end",
     "no_average": "Last weights, not their average",
     "one_count": "Clouds of one size",
-    "more_views": "4 views of an object a step, as many rays",
+    "more_views": "4 views of an object a step",
     "half_samples": "Half the samples",
     "twice_samples": "Twice the samples",
 }
@@ -141,85 +122,49 @@ def rows(wanted: tuple[Row, ...], config: TrainConfig, dataset: data_sets.Datase
     return found
 
 
-def paper_network(config: TrainConfig) -> TrainConfig:
-    """The paper's network and training of the sizes of near_points_tiny; any other config as it is."""
-    paper = presets.tiny() if config.preset == "near_points_tiny" else config
-    return dataclasses.replace(paper, num_steps=config.num_steps, even_share=config.even_share)
-
-
 def changed(row: Row, config: TrainConfig) -> TrainConfig:
     """The config with the one change of a row."""
-    if row == "paper":
-        return paper_network(config)
-    assert isinstance(config.model, RayNetworkConfig)
+    assert isinstance(config.model, PaperConfig)
+    condition = {"condition": False} if row == "no_condition" else {}
     return dataclasses.replace(
         config,
         model=changed_model(row, config.model),
-        loss=dataclasses.replace(config.loss, **loss_changes(config.loss).get(row, {})),
+        loss=dataclasses.replace(config.loss, **condition),
         **recipe_changes(config).get(row, {}),
     )
 
 
-def changed_model(row: Row, model: RayNetworkConfig) -> RayNetworkConfig:
-    """The network with the one change of a row; without neighbours it is the paper's, its samples near the points."""
-    if row == "no_neighbours" and isinstance(model, NearPointsConfig):
-        shared = {f.name: getattr(model, f.name) for f in dataclasses.fields(RayNetworkConfig)}
-        return PaperConfig(**shared, render_resolution=model.image_resolution)
+def changed_model(row: Row, model: PaperConfig) -> PaperConfig:
+    """The network with the one change of a row."""
     fields = model_changes(model).get(row, {})
     inner = {f.name: fields[f.name] for f in dataclasses.fields(EncoderConfig) if f.name in fields}
     outer = {name: value for name, value in fields.items() if name not in inner}
     return dataclasses.replace(model, **outer, encoder=dataclasses.replace(model.encoder, **inner))
 
 
-def model_changes(model: RayNetworkConfig) -> dict[str, dict]:
+def model_changes(model: PaperConfig) -> dict[str, dict]:
     """The fields of a network that rows change."""
     samples = model.sampling
-    changes: dict[str, dict] = {
+    return {
         **{f"depth_{stages}": {"num_stages": stages} for stages in (3, 4, 5)},
         "no_fine_samples": {
             "sampling": dataclasses.replace(samples, num_coarse=samples.num_coarse + samples.num_fine, num_fine=0)
         },
         "no_view_direction": {"sees_direction": False},
-        "view_direction": {"sees_direction": True},
         "plain_inputs": {"inputs": "plain"},
         "fewer_channels": {"base_width": 2 * model.encoder.base_width // 3 or 1},
-        "batch_norm": {"point_norm": "batch"},
         "half_samples": {"sampling": scaled(samples, 0.5)},
         "twice_samples": {"sampling": scaled(samples, 2)},
     }
-    if isinstance(model, NearPointsConfig):
-        changes |= {
-            "free_colour": {"color": "free"},
-            "three_neighbours": {"num_neighbors": 3},
-            "twelve_neighbours": {"num_neighbors": 12},
-        }
-    return changes
-
-
-def loss_changes(loss: LossConfig) -> dict[str, dict]:
-    """The fields of the losses that rows change."""
-    changes: dict[str, dict] = {
-        "no_condition": {"condition": False},
-        "no_opacity_loss": {"opacity_weight": 0.0},
-        "no_squared_error": {"mse_weight": 0.0},
-    }
-    if loss.adversarial_weight == 0:  # as tiny has it, beside an L1 of weight 1
-        changes["adversarial"] = {"adversarial_weight": 0.01, "adversarial_start": 0.85, "discriminator_width": 16}
-    return changes
 
 
 def recipe_changes(config: TrainConfig) -> dict[str, dict]:
     """The other fields of a training that rows change."""
-    changes: dict[str, dict] = {
+    return {
         "no_average": {"optimizer": dataclasses.replace(config.optimizer, ema_decay=0.0)},
         "one_count": {"min_points": config.max_points},
         "more_views": {"views_per_object": 4 * config.views_per_object},
     }
-    if config.model.per_pixel:
-        changes["more_views"] |= {"pixel_stride": 2 * config.pixel_stride}
-    if config.loss.adversarial_weight == 0:
-        changes["adversarial"] = {"pixel_stride": 1, "crop": 0}  # the discriminator sees whole pictures
-    return changes
 
 
 def scaled(sampling: SamplingConfig, factor: float) -> SamplingConfig:

@@ -84,7 +84,7 @@ def make_plan(params: dict, truths: Sequence[Truth]) -> Plan:
     most = surfel_renderer.round_up(truths[0].camera.width + surfel_renderer.MARGIN)
     width, height = (min(n + surfel_renderer.STEP, max(n, most)) for n in (plan.width, plan.height))
     entries, slots = int(ROOM * plan.entries), min(int(ROOM * plan.slots), width * height)
-    return plan._replace(width=width, height=height, entries=entries, slots=slots, solid=False)
+    return plan._replace(width=width, height=height, entries=entries, slots=slots)
 
 
 _encode = jax.jit(spnr_jax.encode, compiler_options=QUICKEST)

@@ -159,8 +159,8 @@ class SharpnessStudy:
     """Folder of a data set whose points are spread evenly."""
     out: Path
     """Folder of the results; the same command goes on there."""
-    runs: tuple[str, ...] = ("surfels", "near_points")
-    """Networks: of the package, run folders or files of weights."""
+    runs: tuple[str, ...] = ("surfels",)
+    """Networks: `surfels` of the package, run folders or files of weights."""
     counts: tuple[int, ...] = (1024, 4096, 16384, 65536)
     """Points of an object, the first of its file."""
     resolution: int | None = None

@@ -3,7 +3,7 @@
     python -m experiments.studies.speed_accuracy DATA [surfels small poisson_trimmed RUN ...] [--sizes 128 512]
 
 Each network draws test objects at every level of `--quality`, from other numbers of points, and in pictures of fewer
-pixels that are enlarged.  Networks of rays also draw with other samples, in all of the box and near the points, and in
+pixels that are enlarged.  The paper's network also draws with other samples, in all of the box and near the points, and in
 bfloat16.  `draft` of the network over surfels is discs and light alone.  What a network with an upsampler draws at the
 one size that it has learnt is enlarged (or averaged).  Screened Poisson surfaces are drawn by Mitsuba as the references
 were.  Keeps every setting in a file of its own (an interrupted call goes on); writes the tables and front.png.
@@ -37,7 +37,7 @@ from experiments.comparison import clock, figures, poisson, results_folder
 from experiments.comparison.object_views import few, on_white, told, view_of
 from experiments.comparison.trained_networks import test_objects
 from spnr_jax import cli
-from spnr_jax.config import NetworkConfig, RayNetworkConfig, SurfelConfig
+from spnr_jax.config import NetworkConfig, PaperConfig, SurfelConfig
 from spnr_jax.devices import machine
 from spnr_jax.formats import data_sets
 from spnr_jax.kernels import cameras, metrics
@@ -67,8 +67,8 @@ def settings(config: NetworkConfig, counts: Sequence[int]) -> list[Setting]:
     levels: tuple[Quality, ...] = ("best",)
     if isinstance(config, SurfelConfig):
         levels = ("best", "balanced", "draft")
-    elif isinstance(config, RayNetworkConfig):
-        levels = ("best", "balanced", "draft") if config.sampling.reach else ("best", "balanced", "draft", "trained")
+    elif isinstance(config, PaperConfig):
+        levels = ("best", "balanced", "draft", "trained")
     common: dict[str, Any] = {"config": config, "points": counts[0]}
     ways = [Setting(group="level", name=level, quality=level, **common) for level in levels]
     if config.any_size:
@@ -76,7 +76,7 @@ def settings(config: NetworkConfig, counts: Sequence[int]) -> list[Setting]:
         ways += [Setting(name=f"best, {share:g} of the size", share=share, **enlarged) for share in SHARES]
         if "draft" in levels:
             ways.append(Setting(name="draft, 0.5 of the size", quality="draft", share=0.5, **enlarged))
-    if isinstance(config, RayNetworkConfig):
+    if isinstance(config, PaperConfig):
         ways += _of_rays(config, counts[0])
     for count in counts[1:]:
         ways += [
@@ -87,15 +87,12 @@ def settings(config: NetworkConfig, counts: Sequence[int]) -> list[Setting]:
     return ways
 
 
-def _of_rays(config: RayNetworkConfig, points: int) -> list[Setting]:
+def _of_rays(config: PaperConfig, points: int) -> list[Setting]:
     """Other samples along a ray, each drawn as the network was trained but for these, and bfloat16."""
-    total, reach = config.sampling.num_coarse + config.sampling.num_fine, config.sampling.reach
+    total = config.sampling.num_coarse + config.sampling.num_fine
     halves = [max(total // k, 2) for k in (1, 2, 4)]
-    if reach:  # the levels have fewer
-        ways = [("near points", f"{2 * total} near points", (2 * total, 0, reach))]
-    else:
-        ways = [("samples", f"{n // 2} + {n // 2} in the box", (n // 2, n // 2, 0)) for n in (2 * total, *halves[1:])]
-        ways += [("near points", f"{n} within {r} voxels", (n, 0, r)) for r in (1, 2) for n in halves]
+    ways = [("samples", f"{n // 2} + {n // 2} in the box", (n // 2, n // 2, 0)) for n in (2 * total, *halves[1:])]
+    ways += [("near points", f"{n} within {r} voxels", (n, 0, r)) for r in (1, 2) for n in halves]
 
     def made(group: str, name: str, **changed: Any) -> Setting:
         other = dataclasses.replace(config, **changed)
@@ -223,9 +220,9 @@ class SpeedAccuracy:
 
     data: tyro.conf.Positional[Path]
     """Folder of the data set; its test objects are drawn."""
-    runs: tyro.conf.Positional[tuple[str, ...]] = ("surfels", "near_points")
-    """Networks: of the package, run folders (the paper's, published methods) or files of weights; also `poisson` and
-    `poisson_trimmed`."""
+    runs: tyro.conf.Positional[tuple[str, ...]] = ("surfels",)
+    """Networks: `surfels` of the package, run folders (the paper's, published methods) or files of weights; also
+    `poisson` and `poisson_trimmed`."""
     out: Path = Path("runs/speed_accuracy")
     """Folder of the results."""
     sizes: tuple[int, ...] = (512, 128)

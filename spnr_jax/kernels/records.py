@@ -74,59 +74,11 @@ class Rendering:
 
 @no_type_check
 @struct.dataclass
-class Surface:
-    """What is known of a surface from its points (`surface.py`).
-
-    A row of `points` is a point's position, normal, base colour, roughness, metallic, the way to the middle of its
-    neighbours, their flatness and narrowness, and its spacing; the last row, all 0, stands for no point.  `nearest` are
-    the rows of the points nearest to each cell of a grid.
-    """
-
-    points: Float[Array, "*batch points+1 17"]
-    nearest: Int[Array, "*batch g g g k"]
-
-
-@no_type_check
-@struct.dataclass
-class SurfaceSample:
-    """The surface as seen from a place: lengths in spacings of the points, `spacing` itself in units of the box.
-
-    `height` is the signed distance to the plane, positive before it, `beside` that to the blended position of the
-    points, `nearest` that to the nearest of them.  The ray meets the points' planes `ahead` of the place (behind it if
-    negative), and passes that one of them which it meets best at the distance `miss`.  `outside` grows beyond the rim
-    of the points: it is the offset from them against the way to the middle of their neighbours.  `flatness` and
-    `narrowness` are the ratios of the neighbours' least to middle and middle to largest extent: 0 in a plane, 0 on a
-    line.  `normal` is turned to the viewer, and shorter than 1 where the points disagree.  Where no point is near,
-    `exists` is False, `nearest` and `miss` are large, and all else 0.
-    """
-
-    exists: Bool[Array, "*batch"]
-    height: Float[Array, "*batch"]
-    beside: Float[Array, "*batch"]
-    nearest: Float[Array, "*batch"]
-    ahead: Float[Array, "*batch"]
-    miss: Float[Array, "*batch"]
-    outside: Float[Array, "*batch"]
-    flatness: Float[Array, "*batch"]
-    narrowness: Float[Array, "*batch"]
-    spacing: Float[Array, "*batch"]
-    normal: Float[Array, "*batch 3"]
-    base_color: Float[Array, "*batch 3"]
-    roughness: Float[Array, "*batch"]
-    metallic: Float[Array, "*batch"]
-
-
-@no_type_check
-@struct.dataclass
 class Scene:
-    """An encoded object: the feature volume, the cells that hold points, and the surface of networks that see one.
-
-    The cells are the volume's voxels, or those of the surface's grid.
-    """
+    """An encoded object of a ray-marching network: the feature volume, and which of its voxels hold points."""
 
     volume: Float[Array, "*batch d d d features"]
-    occupied: Bool[Array, "*batch g g g"]
-    surface: Surface | None = None
+    occupied: Bool[Array, "*batch d d d"]
 
 
 @no_type_check
@@ -134,7 +86,7 @@ class Scene:
 class Volume:
     """An encoded object in the box [-1, 1]^3, which is (position - centre) * scale of the cloud.
 
-    `scene` is what the network encodes a cloud as: for ray-marching networks a `Scene`.
+    `scene` is what the network encodes a cloud as: of the paper's network a `Scene`, of surfels a `SurfelScene`.
     """
 
     scene: Any
@@ -273,8 +225,8 @@ class Crops:
     `margin` pixels beyond it and the maps to each side.
     """
 
-    seen: Float[AnyArray, "crops rows columns 34"]
-    maps: Float[AnyArray, "crops height width 18"]
+    seen: Float[AnyArray, "crops rows columns 33"]
+    maps: Float[AnyArray, "crops height width 17"]
     ambient: Float[AnyArray, "crops 9 3"]
     target: UInt8[AnyArray, "crops h w 4"]
     doublings: int = struct.field(pytree_node=False)

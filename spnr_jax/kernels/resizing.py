@@ -38,14 +38,8 @@ def mean_of_squares(x: Float[Array, "*batch height width features"], side: int) 
     return jnp.mean(squares(x, side), axis=(-4, -2))
 
 
-def folded(x: Float[Array, "*batch height width features"], side: int) -> Float[Array, "*batch h w folded"]:
-    """The pixels of each square of side x side as features of one pixel."""
-    x = jnp.swapaxes(squares(x, side), -4, -3)
-    return x.reshape(*x.shape[:-3], -1)
-
-
 def unfolded(x: Float[Array, "*batch h w folded"], side: int) -> Float[Array, "*batch height width features"]:
-    """The inverse of `folded`."""
+    """A square of side x side pixels from the features of each pixel."""
     *batch, height, width, features = x.shape
     x = jnp.swapaxes(x.reshape(*batch, height, width, side, side, features // side**2), -4, -3)
     return x.reshape(*batch, side * height, side * width, features // side**2)

@@ -19,15 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.spatial import cKDTree
 
-from spnr_jax.config import (
-    SOLID,
-    NetworkConfig,
-    PaperConfig,
-    RayNetworkConfig,
-    RenderOptions,
-    SamplingConfig,
-    SurfelConfig,
-)
+from spnr_jax.config import NetworkConfig, PaperConfig, RenderOptions, SamplingConfig, SurfelConfig
 from spnr_jax.devices.compilation import QUICK
 from spnr_jax.errors import UserError
 from spnr_jax.kernels import cameras, cloud_arrays
@@ -194,19 +186,14 @@ def _render(
 
 
 def at_quality(config: NetworkConfig, quality: str, reach: int, width: int) -> RenderOptions:
-    """The options that render a picture so wide at a quality, with samples within `reach` voxels of points.
-
-    A network near points keeps its own reach: the cells of the surface's grid grow with the spacing.
-    """
-    needed = rays_per_side(config, width)
-    side = needed if quality == "best" else 1
-    # a refiner has learnt to see pictures of the training's size
-    options = dataclasses.replace(trained(config), rays_per_side=side, refine=quality != "draft" and side == needed)
-    if quality == "trained" or not isinstance(config, RayNetworkConfig):
+    """The options that render a picture so wide at a quality, with samples within `reach` voxels of points."""
+    side = rays_per_side(config, width) if quality == "best" else 1
+    options = dataclasses.replace(trained(config), rays_per_side=side)
+    if quality == "trained" or not isinstance(config, PaperConfig):
         return options
     counts = config.sampling
     samples = max(round(SAMPLES[quality] * (counts.num_coarse + counts.num_fine)), 1)
-    sampling = SamplingConfig(num_coarse=samples, num_fine=0, reach=reach if config.method == "paper" else counts.reach)
+    sampling = SamplingConfig(num_coarse=samples, num_fine=0, reach=reach)
     return dataclasses.replace(options, sampling=sampling, block=None)
 
 

@@ -29,18 +29,16 @@ LOOKED_AT = 2**14  # rays of which it is found out at once whether they meet any
 
 
 class Samples(NamedTuple):
-    """A field at samples: trees of numbers (*rays, samples, ...) that are composited, or of which the least counts."""
+    """A field at samples: density, and a tree of numbers (*rays, samples, ...) that are composited."""
 
     density: Array
     summed: Any
-    least: Any = ()
 
 
 class Seen(NamedTuple):
-    """Rays after compositing: `summed` and `least` of the samples, opacity, and the expected distance."""
+    """Rays after compositing: `summed` of the samples, opacity, and the expected distance."""
 
     summed: Any
-    least: Any
     acc: Array
     depth: Array
 
@@ -62,8 +60,8 @@ def trace(
 ) -> Traced:
     """The rays (objects, rays, ...) of a network; a key jitters the samples of each ray by the ray's number.
 
-    The network is a bound Linen module: `along(scene, rays, objects, options)` is its field along rays, and the
-    function that makes features of what is `Seen`; `num_features(options)` are the features of a ray.
+    The network is a bound Linen module: `along(scene, rays, objects)` is its field along rays, and the function that
+    makes features of what is `Seen`; `config.num_features` are the features of a ray.
     """
     shape = rays.origins.shape[:-1]
     number = jnp.arange(shape[0] * shape[1]).reshape(shape)
@@ -94,7 +92,7 @@ def _on_one_device(
     near_points = occupancy.dilate(scene.occupied, samples.reach) if samples.reach else None
 
     def block(objects, number, rays):
-        field, finish = bound().along(scene, rays, objects, options)
+        field, finish = bound().along(scene, rays, objects)
         keys = None if key is None else jax.vmap(jax.random.fold_in, (None, 0))(key, number)
         seen = march(field, _path(near_points, rays, objects), samples, keys)
         return Traced(finish(seen), seen.depth, seen.acc)
@@ -107,7 +105,7 @@ def _on_one_device(
     else:
         objects, _, rays = inputs
         _, far, _ = cameras.intersect_box(rays.origins, rays.directions)
-        white = jnp.zeros((far.size, bound().num_features(options))).at[:, :3].set(compositing.WHITE)
+        white = jnp.zeros((far.size, bound().config.num_features)).at[:, :3].set(compositing.WHITE)
         nothing = Traced(white, far, jnp.zeros_like(far))
         traced = occupancy.map_existing(block, _meets(near_points, rays, objects), inputs, nothing, size)
     return jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), traced)
@@ -162,10 +160,8 @@ def march(field: Field, path: Path, counts: SamplingConfig, key: Key | None) -> 
         jax.tree.map(partial(compositing.composite, share), samples.summed)
         for share, samples in zip(shares, passes, strict=True)
     ]
-    least = [jax.tree.map(partial(jnp.min, axis=-2), samples.least) for samples in passes]
     return Seen(
         summed=jax.tree.map(lambda *parts: reduce(operator.add, parts), *sums),
-        least=jax.tree.map(lambda *parts: reduce(jnp.minimum, parts), *least),
         acc=jnp.sum(weights, axis=-1),
         depth=compositing.expected_distance(weights, occupancy.distance_at(path, travelled), far),
     )

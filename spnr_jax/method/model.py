@@ -1,6 +1,6 @@
 """The model for people who only want pictures: load a network, encode a cloud once, render it from anywhere.
 
-    model = spnr_jax.load()  # "surfels" of the package; or "near_points", a run folder, a file of weights
+    model = spnr_jax.load()  # the network of the package; or a run folder, a file of weights
     volume = model.encode(spnr_jax.read_cloud("chair.ply"))
     rendering = model.render(volume, model.camera(volume, azimuth=30, elevation=20))
 
@@ -34,8 +34,8 @@ class Model:
     """A trained network.
 
     Its programs are compiled once for each bucket of points and size of pictures; `encode` and `render` themselves also
-    work on the host, so they are not for `jax.jit` (`inference.encode` and `inference.render` of ray-marching networks
-    are).
+    work on the host, so they are not for `jax.jit` (`inference.encode` and `inference.render` of networks
+    other than that over surfels are).
     """
 
     config: NetworkConfig
@@ -62,13 +62,11 @@ class Model:
         """The object as the camera (unbatched, or with one axis of views) sees it; depth in the cloud's units.
 
         The network over surfels takes a light (default: the package's room), leaves its CNN out of `draft`, and draws
-        fewer pixels at `balanced`, which are enlarged; ray-marching networks know the light that they were trained in
-        alone, and have these levels:
+        fewer pixels at `balanced`, which are enlarged.  Other networks know the light that they were trained in alone.
 
-        `draft`, `balanced` and `best` look near the points alone, with a quarter, half and all of the samples of a ray,
-        and `best` has several rays a pixel where pictures are smaller than those of the training; the network's
-        refiner, if it has one, is left out of `draft`, and of smaller pictures by any other than `best`; `trained`
-        renders as the network was trained.  Other networks than ours know one number of samples.
+        The paper's network looks near the points alone at `draft`, `balanced` and `best`, with a quarter, half and all
+        of the samples of a ray, and renders as it was trained at `trained`.  At `best` a network without an upsampler
+        has several rays a pixel where pictures are smaller than those of the training.
         """
         _check_quality(quality)
         return self._pictures.draw(self.variables, volume, camera, light, config=self.config, quality=quality)

@@ -59,13 +59,7 @@ class PaperNetwork(nn.Module):
         ratio = self.config.render_resolution / self.config.image_resolution
         return round(camera.height * ratio), round(camera.width * ratio)
 
-    def num_features(self, options: RenderOptions) -> int:
-        """Of a ray."""
-        return self.config.num_features
-
-    def along(
-        self, scene: Scene, rays: Rays, objects: Int[Array, "*rays"], options: RenderOptions
-    ) -> tuple[Field, Finish]:
+    def along(self, scene: Scene, rays: Rays, objects: Int[Array, "*rays"]) -> tuple[Field, Finish]:
         """Density, and what is emitted, at samples along rays; and the features of what is composited of it."""
         view = self.field.view(rays.directions)
 

@@ -6,13 +6,11 @@ the second, with most of what takes XLA long, for other windows alone.
 
 import dataclasses
 from collections.abc import Iterator, Sequence
-from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
 from spnr_jax.config import SurfelConfig
 from spnr_jax.devices.compilation import QUICK, QUICKEST
@@ -22,7 +20,7 @@ from spnr_jax.kernels import cameras, cloud_arrays
 from spnr_jax.kernels.records import Camera, GBuffer, Light, PointCloud, Rendering, SurfelScene, Volume
 from spnr_jax.kernels.resizing import enlarged
 from spnr_jax.method import densifier, surfel_renderer
-from spnr_jax.method.surfel_renderer import Blended, Plan, Sizes, unstack
+from spnr_jax.method.surfel_renderer import Blended, Sizes, unstack
 from spnr_jax.surfels.lighting import room_light
 from spnr_jax.surfels.neighbors import neighbors
 from spnr_jax.surfels.surfel_scenes import encode_in_box

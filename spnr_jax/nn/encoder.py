@@ -1,7 +1,6 @@
 """From points to a feature volume: PointNet on every point, mean per voxel, 3D U-Net [paper]."""
 
 from functools import partial
-from typing import Literal
 
 import flax.linen as nn
 import jax
@@ -23,14 +22,10 @@ BRIGHTNESS_AND_HUE = np.array(
 
 
 class PointNet(nn.Module):
-    """Shared MLP; each hidden layer is followed by normalisation and ReLU, the output is linear.
-
-    `norm` is "batch" [paper], or "layer", which knows no statistics of other points.
-    """
+    """Shared MLP; each hidden layer is followed by batch normalisation [paper] and ReLU, the output is linear."""
 
     widths: tuple[int, ...]
     num_features: int
-    norm: Literal["batch", "layer"] = "batch"
 
     @nn.compact
     def __call__(
@@ -41,8 +36,7 @@ class PointNet(nn.Module):
         shape, x, mask = mask.shape, x.reshape(-1, x.shape[-1]), mask.reshape(-1)
         for i, width in enumerate(self.widths):
             x = nn.Dense(width, use_bias=False, name=f"hidden_{i}")(x)
-            name = f"norm_{i}"
-            x = nn.relu(BatchNorm(name=name)(x, mask, train) if self.norm == "batch" else nn.LayerNorm(name=name)(x))
+            x = nn.relu(BatchNorm(name=f"norm_{i}")(x, mask, train))
         return nn.Dense(self.num_features, name="out")(x).reshape(*shape, self.num_features)
 
 
@@ -57,7 +51,7 @@ def spread_out(material: Float[Array, "*batch channels"]) -> Float[Array, "*batc
 
 
 class Encoder(nn.Module):
-    """Both ray-marching networks begin with it; with bf16 the convolutions of the U-Net run in bfloat16."""
+    """The paper's network begins with it; with bf16 the convolutions of the U-Net run in bfloat16."""
 
     config: EncoderConfig
     bf16: bool = False
@@ -65,7 +59,7 @@ class Encoder(nn.Module):
     def setup(self) -> None:
         """The two networks."""
         c = self.config
-        self.pointnet = PointNet(c.point_widths, c.point_features, c.point_norm)
+        self.pointnet = PointNet(c.point_widths, c.point_features)
         self.unet = UNet3D(c.volume_resolution, c.base_width, c.num_stages, c.num_groups, self.bf16)
 
     def __call__(self, cloud: PointCloud, train: bool = False) -> Float[Array, "objects d d d features"]:

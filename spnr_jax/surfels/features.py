@@ -57,9 +57,7 @@ def features(
 ) -> tuple[Float[Array, "height width 33"], Float[Array, "height width 17"]]:
     """The network's input, which knows no light, and the maps of materials and light for `nn.shader.picture`."""
     first, bent, blended, last = jnp.split(buffer.attributes, (7, 10, 13), axis=-1)
-    (roughness, metallic, *arriving, reflected, openness), of_surface = map(
-        columns, (first, last)
-    )
+    (roughness, metallic, *arriving, reflected, openness), of_surface = map(columns, (first, last))
     planarity, linearity, sided, guessed, invented, squared = of_surface
     told = (buffer.centres / (buffer.centres + LEAST_CENTRES))[..., None]  # without discs near by the blended one
     color = clamp(blended + told * clamp(buffer.color - blended, -TRUST, TRUST), 0, 1)

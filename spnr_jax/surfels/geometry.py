@@ -71,7 +71,8 @@ def estimate_surfels(cloud: PointCloud, neighbors: Int[Array, "points 20"], rule
     fields, covered = describe(points, raw, layer, normal, sided, seen, rules)
     known = jnp.ones_like(raw) if cloud.materials_known is None else columns(cloud.materials_known)
     learned = jnp.zeros_like(raw) if cloud.invented is None else columns(cloud.invented)
-    fields |= {"roughness": columns(cloud.roughness), "metallic": columns(cloud.metallic), "guessed": 1 - known, "invented": learned}
+    fields |= {"roughness": columns(cloud.roughness), "metallic": columns(cloud.metallic)}
+    fields |= {"guessed": 1 - known, "invented": learned}
     fields |= {"position": points.position, "normal": normal, "base_color": points.color, "sided": sided}
     fields = {name: jnp.moveaxis(layers.select(mask, values, 0), -1, 0) for name, values in fields.items()}
     fields["gradient"] = fields["gradient"].reshape(-1, 3, 3)

@@ -27,9 +27,9 @@ from spnr_jax.errors import UserError, one_line
 from spnr_jax.formats.images import write_whole
 from spnr_jax.formats.pages import template
 from spnr_jax.formats.point_files import MESHES, READERS
-from spnr_jax.tools.pictures import check_writable, drawn, load_named, made_ready
+from spnr_jax.tools.pictures import check_writable, drawn, load_network, made_ready
 from spnr_jax.tools.render_command import WILDCARDS, Render
-from spnr_jax.training.weights import SHIPPED, load, place
+from spnr_jax.training.weights import SHIPPED, load, place, shipped
 
 KINDS = tuple(dict.fromkeys((*READERS, *MESHES)))
 RECORD = "drawn.json"
@@ -55,7 +55,7 @@ def render_catalogue(options: Render) -> Iterator[str]:
     check_writable(options.out)
     options = _with_absolute_paths(options)
     items = find(options.cloud, options.out)
-    load_named(options, loaded)  # a run that is none is said before anything is read
+    load_network(options, loaded)  # a run that is none is said before anything is read
     batch = Batch(options=options, digest=digest(options))
     missing = [item for item in items if not standing(batch, item)]
     faults: dict[str, str] = {}
@@ -80,7 +80,7 @@ def render_catalogue(options: Render) -> Iterator[str]:
 def _with_absolute_paths(options: Render) -> Render:
     """The options as processes in other folders understand them."""
     run, light = options.run, options.lighting.light
-    run = run.absolute() if run and str(run) not in SHIPPED else run
+    run = run.absolute() if run and str(run) != SHIPPED else run
     light = str(Path(light).absolute()) if light and Path(light).suffix else light  # a file, not a name of the package
     lighting = dataclasses.replace(options.lighting, light=light)
     return dataclasses.replace(options, out=options.out.absolute(), run=run, lighting=lighting)
@@ -111,7 +111,7 @@ def digest(options: Render) -> str:
     asked = {k: v for k, v in dataclasses.asdict(options).items() if k not in ("cloud", "out", "workers", "cluster")}
     found = hashlib.sha256(json.dumps(asked, default=str, sort_keys=True).encode())
     light = options.lighting.light
-    networks = [place(options.run)] if options.run else [place(name) for name in SHIPPED]
+    networks = [place(options.run), shipped("densifier")]
     for path in networks + ([Path(light)] if light else []):
         if path.is_file():
             found.update(path.read_bytes())

@@ -32,7 +32,7 @@ def light_of_options(options: Lighting, read: Callable[[str], Light] = read_ligh
 
 
 def takes_light(model: Model) -> bool:
-    """Whether the network accepts any light; ray-marching networks know that of their training alone."""
+    """Whether the network accepts any light; only one over surfels does."""
     return isinstance(model.config, SurfelConfig)
 
 
@@ -41,7 +41,7 @@ def check_takes_light(model: Model, asked: Sequence[str], run: Path | None) -> N
     if asked and not takes_light(model):
         raise UserError(
             f"{', '.join(asked)}: the network of --run {run} knows the light of its training alone; "
-            f"leave {'it' if len(asked) == 1 else 'them'} out, or give --run surfels"
+            f"leave {'it' if len(asked) == 1 else 'them'} out, or --run"
         )
 
 

@@ -25,8 +25,8 @@ class Train:
     config: tyro.conf.AvoidSubcommands[tyro.conf.OmitArgPrefixes[TrainConfig]] = field(default_factory=presets.tiny)
     """Every number of the run; --preset chooses the defaults."""
     init: str | None = None
-    """Weights that a new run begins with: a run folder, a file of weights, or a network of the package, which has
-    the name of its preset: surfels, near_points, near_points_lite (default: random)."""
+    """Weights that a new run begins with: a run folder, a file of weights, or `surfels`, the network of the package
+    (default: random)."""
     log_every: int = 20
     """Steps between rows of metrics.jsonl and TensorBoard."""
     preview_every: int = 500
@@ -50,7 +50,7 @@ class Evaluate:
     data: tyro.conf.Positional[Path]
     """Folder of the data set."""
     run: tyro.conf.Positional[Path]
-    """Folder of the run, a file of weights, or a network of the package: surfels, near_points, near_points_lite."""
+    """Folder of the run, a file of weights, or `surfels`, the network of the package."""
     out: Path | None = None
     """Folder for metrics.json and report.html (default: the run, or the name of the file without its suffix)."""
     split: Literal["train", "val", "test"] = "test"
@@ -121,7 +121,7 @@ class View:
     run: Path | None = None
     """As for `spnr render`."""
     lighting: tyro.conf.OmitArgPrefixes[Lighting] = Lighting()
-    """The light at first; of the networks of the package `surfels` alone takes another than that of its training."""
+    """The light at first; the network of the package takes any, other networks that of their training alone."""
     host: str = "127.0.0.1"
     """Address to listen on; another than this machine's own opens the viewer to a network."""
     port: int = 8080

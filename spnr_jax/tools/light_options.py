@@ -12,7 +12,7 @@ MOST_STOPS = 20
 
 @dataclass(frozen=True, kw_only=True)
 class Lighting:
-    """The light of pictures by the network `surfels`; the others know that of their training alone."""
+    """The light of pictures by a network over surfels; others know that of their training alone."""
 
     light: str | None = None
     """Light: an environment map (.hdr .exr), or room, studio, sunset, overcast, night of the package (default: room, or

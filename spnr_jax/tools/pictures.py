@@ -35,7 +35,7 @@ from spnr_jax.method.model import Model
 from spnr_jax.tools import depth_maps
 from spnr_jax.tools.chosen_light import before, check_takes_light, light_of_options
 from spnr_jax.tools.render_command import Render
-from spnr_jax.training.weights import load, suited_to
+from spnr_jax.training.weights import SHIPPED, load
 
 FIRST_AZIMUTH = 30.0  # degrees of the first still: a view that shows front and side
 INVISIBLE = 1 / 255  # opacity below which a pixel has no colour of its own
@@ -65,7 +65,7 @@ def render_file(options: Render, note: Callable[[str], None]) -> Iterator[str]:
         raise UserError(f"{options.cloud}: a single file; --cluster and --workers draw those of a folder or pattern")
     check_writable(options.out)
     loaded = cache(load)
-    load_named(options, loaded)  # a run that is none is said before the cloud is read
+    load_network(options, loaded)  # a run that is none is said before the cloud is read
     ready = made_ready(options, note, loaded)
     yield f"encoded {len(ready.placed.cloud.positions)} points of {options.cloud}"
     for written in beside(drawn(ready, options, options.out / options.cloud.stem)):
@@ -73,19 +73,16 @@ def render_file(options: Render, note: Callable[[str], None]) -> Iterator[str]:
             yield written.line
 
 
-def load_named(options: Render, loaded: Callable[..., Model]) -> Model | None:
-    """The network that the options name, if they do; ValueError if it cannot draw what they ask for."""
-    named = loaded(options.run, densify=options.densify) if options.run else None
-    if named and options.densify and "densifier" not in named.variables:
-        raise UserError(f"{options.run}: --densify is for networks over surfels; leave it out, or --run")
-    if named:
-        check_takes_light(named, options.asked_of_light, options.run)
-    return named
+def load_network(options: Render, loaded: Callable[[Path | None], Model]) -> Model:
+    """The network of the options; ValueError if it cannot draw what they ask for."""
+    model = loaded(options.run)
+    check_takes_light(model, options.asked_of_light, options.run)
+    return model
 
 
-def made_ready(options: Render, note: Callable[[str], None], loaded: Callable[..., Model]) -> Ready:
+def made_ready(options: Render, note: Callable[[str], None], loaded: Callable[[Path | None], Model]) -> Ready:
     """The cloud of the options read and encoded; `note` gets the assumptions about it, `loaded` gives a network."""
-    named = load_named(options, loaded)
+    model = load_network(options, loaded)
     light = light_of_options(options.lighting) if options.asked_of_light else None
     placed = clouds.place_cloud(
         options.cloud,
@@ -97,9 +94,7 @@ def made_ready(options: Render, note: Callable[[str], None], loaded: Callable[..
         transparent_parts=options.transparent_parts,
         report=note,
     )
-    surfels = light or options.densify
-    network = str(options.run or ("surfels" if surfels else suited_to(len(placed.cloud.positions))))
-    model = named or loaded(network, densify=options.densify)
+    network = str(options.run or SHIPPED)
     return Ready(placed=placed, network=network, model=model, volume=model.encode(placed.cloud), light=light)
 
 

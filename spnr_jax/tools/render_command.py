@@ -29,8 +29,7 @@ class Render:
     """.ply .spz (also 3D Gaussian splats) .pcd .xyz .txt .csv .asc .pts .las .laz .npz .npy, or a mesh: .glb .gltf .obj
     .stl .off (its surface is sampled).  Or a folder, with all folders in it, or a pattern such as 'scans/**/*.ply'."""
     run: Path | None = None
-    """Network that renders: `surfels`, `near_points` or `near_points_lite` of the package, a run folder, a file of
-    weights (default: surfels, of fewer than 2,000 points near_points)."""
+    """Network that renders: a run folder or a file of weights (default: that of the package, `surfels`)."""
     out: Path = Path("renders")
     """Output folder. Of a folder or pattern, files whose results are there are skipped."""
     workers: int | None = None
@@ -41,8 +40,6 @@ class Render:
     """The file's upward axis; auto: by the format, else y or z, as the object would stand."""
     num_points: int = 16384
     """Points used of a bigger cloud, evenly spread, or sampled from a mesh; fewer work too."""
-    densify: bool = False
-    """Add learned points between those of a cloud of at most 8,192 points (`surfels`): sharper where points are few."""
     clean: Literal["auto", "off", "strong"] = "auto"
     """Outliers of points are removed, and noisy ones averaged, before they are thinned; a clean cloud, and a mesh, stay
     as they are.  strong: at smaller deviations."""
@@ -60,8 +57,8 @@ class Render:
     resolution: int | None = None
     """Pixels along each side (default: 512 of surfels, else what the network was trained for)."""
     quality: Literal["draft", "balanced", "best", "trained"] = "best"
-    """balanced: three quarters of the size, enlarged; draft: discs and light alone, without the CNN.  Of networks of
-    rays: a quarter, half or all of the samples that a ray was trained with, near the points; or just as trained."""
+    """balanced: three quarters of the size, enlarged; draft: discs and light alone, without the CNN.  Of the paper's
+    network: a quarter, half or all of the samples that a ray was trained with, near the points; or just as trained."""
     outputs: tuple[Output, ...] = ("image", "depth", "opacity")
     """What is written of each view; depth comes coloured, as .npy and as 16-bit .png."""
     transparent: bool = False

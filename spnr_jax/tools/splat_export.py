@@ -25,7 +25,7 @@ from spnr_jax.tools.pictures import Ready, made_ready
 from spnr_jax.tools.render_command import Render
 from spnr_jax.tools.splat_making import RESOLUTION, note_of, splats_of
 from spnr_jax.tools.splat_options import Share
-from spnr_jax.training.weights import SHIPPED, load
+from spnr_jax.training.weights import load
 
 MOST_BYTES = 6_000_000  # of a page
 POSTER_QUALITY = 88  # of its JPEG
@@ -35,7 +35,7 @@ def asked_of(options: Any, cloud: Path, run: Path | None) -> Render:
     """What the options of `spnr export` and `spnr share` ask of a cloud, as those of `spnr render`."""
     return Render(
         cloud=cloud,
-        run=run or Path(SHIPPED[0]),
+        run=run,
         num_points=options.num_points or Render.num_points,
         up=options.up,
         clean=options.clean,

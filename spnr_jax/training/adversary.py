@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from spnr_jax.config import RayNetworkConfig, TrainConfig
+from spnr_jax.config import PaperConfig, TrainConfig
 from spnr_jax.kernels import losses
 from spnr_jax.kernels.records import AnyArray, Batch
 from spnr_jax.nn.discriminator import Discriminator
@@ -18,7 +18,7 @@ def first_adversarial_step(config: TrainConfig) -> int:
 
 def discriminator_of(config: TrainConfig) -> Discriminator:
     """The discriminator's module."""
-    assert isinstance(config.model, RayNetworkConfig), "the config refuses an adversarial loss of other networks"
+    assert isinstance(config.model, PaperConfig), "the config refuses an adversarial loss of other networks"
     return Discriminator(config.loss.discriminator_width, config.model.encoder.num_groups, config.model.bf16)
 
 

@@ -80,11 +80,6 @@ def optimizers(config: TrainConfig) -> tuple[optax.GradientTransformation, optax
     )
 
 
-def changed(config: TrainConfig, generator: dict) -> dict:
-    """The part of a generator that steps change."""
-    return generator if config.trains == "network" else generator[config.trains]
-
-
 def create_state(config: TrainConfig, seed: int | Array | None = None) -> TrainState:
     """Fresh weights and optimisers from a seed, the config's by default."""
     key = jax.random.key(config.seed if seed is None else seed)
@@ -102,7 +97,7 @@ def create_state(config: TrainConfig, seed: int | Array | None = None) -> TrainS
         key=key,
         generator=generator,
         batch_stats=batch_stats,
-        generator_optimizer=generator_adam.init(changed(config, generator)),
+        generator_optimizer=generator_adam.init(generator),
         averaged=jax.tree.map(jnp.copy, generator),  # a donated state must not hold one buffer twice
         averaged_stats=jax.tree.map(jnp.copy, batch_stats),
         discriminator=discriminator,
@@ -111,12 +106,8 @@ def create_state(config: TrainConfig, seed: int | Array | None = None) -> TrainS
 
 
 def begun_with(state: TrainState, variables: dict) -> TrainState:
-    """A fresh state with the generator of another training; ValueError if its weights are of another network.
-
-    A refiner that the other one lacks stays fresh.
-    """
+    """A fresh state with the generator of another training; ValueError if its weights are of another network."""
     params, stats = variables["params"], variables.get("batch_stats", {})
-    params = {name: part for name, part in state.generator.items() if name == "refiner"} | params
     needed = {"params": state.generator, "batch_stats": state.batch_stats}
     own, other = (flatten_dict(weights, sep="/") for weights in (needed, {"params": params, "batch_stats": stats}))
     for name in own | other:
@@ -272,18 +263,16 @@ def moving_average(averaged: Any, newest: Any, step: Array, decay: float) -> Any
     return jax.tree.map(lambda old, new: share * old + (1 - share) * new, averaged, newest)
 
 
-def stepped(config: TrainConfig, state: TrainState, gradient: dict, part: str | None = None) -> TrainState:
-    """The state after a step of the generator by its gradient, or of one part of it."""
-    before, averaged = ((tree if part is None else tree[part]) for tree in (state.generator, state.averaged))
+def stepped(config: TrainConfig, state: TrainState, gradient: dict) -> TrainState:
+    """The state after a step of the generator by its gradient."""
     update, optimizer = optimizers(config)[0].update(gradient, state.generator_optimizer)
-    after = optax.apply_updates(before, update)
-    average = moving_average(averaged, after, state.step, config.optimizer.ema_decay)
+    generator = optax.apply_updates(state.generator, update)
     return dataclasses.replace(
         state,
         step=state.step + 1,
-        generator=after if part is None else state.generator | {part: after},
+        generator=generator,
         generator_optimizer=optimizer,
-        averaged=average if part is None else state.averaged | {part: average},
+        averaged=moving_average(state.averaged, generator, state.step, config.optimizer.ema_decay),
     )
 
 

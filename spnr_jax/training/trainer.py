@@ -9,7 +9,6 @@ Of several processes that train together (placement.py) the first writes all of 
 together.
 """
 
-import dataclasses
 import math
 import signal
 from collections.abc import Callable, Iterator
@@ -35,7 +34,7 @@ from spnr_jax.method import inference
 from spnr_jax.training import adversary, checkpoint, optimisation, work
 from spnr_jax.training.metrics_log import MetricsLog, Unwritten
 from spnr_jax.training.run_record import Clock, RunRecord
-from spnr_jax.training.weights import Trained
+from spnr_jax.training.weights import Trained, add_densifier
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,8 +85,7 @@ def train(
         state = begun(config, run, mesh, init)
         if (first := int(state.step)) >= config.num_steps:
             return state
-        task = work.work_of(config, dataset, run, mesh, own, light, state)
-        state = state if first else task.begin(state)
+        task = work.work_of(config, dataset, run, mesh, own, light)
         agreed, tell = placement.Agreement(mesh), on_event or (lambda *event: None)
         requests = stack.enter_context(stop_requests())
         progress = Progress(config, dataset, run, schedule, first, init, clock, tell, light)
@@ -224,9 +222,7 @@ class Progress:
 
 
 def new_state(config: TrainConfig, init: Trained | None) -> optimisation.TrainState:
-    """The state before the first step; ValueError for a refiner without the network before it."""
-    if config.trains == "refiner" and init is None:
-        raise UserError(f"preset {config.preset} trains a refiner behind a network that is trained: name it by --init")
+    """The state before the first step."""
     state = optimisation.jitted_create_state(config)
     return state if init is None else optimisation.begun_with(state, init.variables)
 
@@ -282,6 +278,7 @@ def preview(
     """Validation PSNR of the averaged network on a few objects, and references over renderings, kept in previews/."""
     names = (dataset.splits["val"] or dataset.splits["train"])[:num_objects]
     variables = placement.on_this_process(optimisation.averaged_variables(state))
+    variables = add_densifier(config.model, variables)
     columns, scores = [], []
     for name in names:
         item = data_sets.read_object(dataset, name)

@@ -4,8 +4,8 @@
     steps               of training
     params/.../kernel   one array each, as they lie in the Linen variables
 
-The package holds three networks (docs/model_card.md), of which `surfels` renders where no other is named: `shipped` is
-the file of one.
+The package holds the network that renders where no other is named (docs/model_card.md), and the densifier beside it
+(`method/densifier.py`), whose file holds weights alone.
 """
 
 import json
@@ -29,10 +29,8 @@ from spnr_jax.methods import UnknownMethod, from_dict, include, to_dict
 
 # what a header of any content makes its readers raise
 UNREADABLE = (ValueError, LookupError, TypeError, ArithmeticError, RecursionError)
-MANY_POINTS = 2000  # chosen between 1,024, where rays score better at 512 pixels, and 4,096, where surfels do
 ADVICE = "write one with `spnr export RUN`"
-# what the package holds, each named as its preset; the first renders where no other is named
-SHIPPED = ("surfels", "near_points", "near_points_lite")
+SHIPPED = "surfels"  # the network of the package, named as its preset
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,8 +42,8 @@ class Trained:
     steps: int
 
 
-def shipped(name: str = SHIPPED[0]) -> Path:
-    """The file of a network that the package holds."""
+def shipped(name: str = SHIPPED) -> Path:
+    """The file of weights that the package holds under a name: its network, or "densifier"."""
     return Path(str(resources.files("spnr_jax") / "pretrained" / f"{name}.npz"))
 
 
@@ -54,19 +52,13 @@ def add_densifier(config: NetworkConfig, variables: dict) -> dict:
     return variables | {"densifier": read_densifier()} if isinstance(config, SurfelConfig) else variables
 
 
-def suited_to(num_points: int) -> str:
-    """The package's network that draws so many points best (docs/lab/surfels.md)."""
-    return "surfels" if num_points >= MANY_POINTS else "near_points"
-
-
 def place(source: Path | str | None) -> Path:
     """The run folder or file that `read_trained` reads."""
-    name = SHIPPED[0] if source is None else str(source)
-    return shipped(name) if name in SHIPPED else Path(name)
+    return shipped() if source is None or str(source) == SHIPPED else Path(source)
 
 
 def read_trained(source: Path | str | None, say: Callable[[str], None] = print, data: Path | str = "DATA") -> Trained:
-    """The network of a run folder's newest checkpoint, of a file of weights, or of the package: one of SHIPPED.
+    """The network of a run folder's newest checkpoint, of a file of weights, or of the package (None, or its name).
 
     ValueError, with what to do, if there is none; `say` gets a line for each broken checkpoint, `data` is named.
     """
@@ -89,7 +81,7 @@ def read_densifier(path: Path | None = None) -> dict:
 
 
 def load(run: Path | str | None = None, methods: Path | str | None = None) -> Model:
-    """A network of the package (SHIPPED; None is the first), of a run folder's newest checkpoint, or of a file.
+    """The network of the package (None, or its name), of a run folder's newest checkpoint, or of a file.
 
     For a method of one's own, `methods` names the .py file or module that registers it: no file makes it be imported.
     """
@@ -116,7 +108,7 @@ def read_weights(path: Path) -> Trained:
     """The network of a file, in float32; ValueError that says what is wrong with it.
 
     That the weights are those of the config's network takes a second to find out, because the network is traced for
-    their shapes; the package's own files are not asked again.
+    their shapes; the package's own file is not asked again.
     """
     if not path.is_file():
         raise UserError(f"{path}: no such file of weights; {ADVICE}")
@@ -127,7 +119,7 @@ def read_weights(path: Path) -> Trained:
         if not isinstance(described, dict):
             raise UserError("its config is no JSON object")
         config = from_dict(described)
-        if path not in [shipped(name) for name in SHIPPED]:
+        if path != shipped():
             _check_weights(arrays, variable_shapes(config))
     except UnknownMethod as error:
         raise UserError(f"{path}: {error}") from None

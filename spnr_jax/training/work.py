@@ -1,8 +1,7 @@
 """Training hooks of each method: its batches and its step.
 
-There are three kinds: networks that learn from whole views of clouds (`of_views`: the paper's, ours near points, the
-baselines), the shader network, which learns from crops of G-buffers (`of_gbuffers`), and a refiner alone, which learns
-from crops of the pictures of the network before it (`of_pictures`).
+There are two kinds: networks that learn from whole views of clouds (`of_views`: the paper's, the baselines), and the
+shader network, which learns from crops of G-buffers (`of_gbuffers`).
 """
 
 from collections.abc import Callable, Generator
@@ -19,7 +18,7 @@ from spnr_jax.errors import UserError
 from spnr_jax.formats.data_sets import Dataset, has_lights
 from spnr_jax.kernels.records import Crops, Light
 from spnr_jax.surfels import lighting
-from spnr_jax.training import adversary, batching, gbuffers, optimisation, refiner_training, shading
+from spnr_jax.training import adversary, batching, gbuffers, optimisation, shading
 from spnr_jax.training.optimisation import TrainState
 from spnr_jax.training.weights import Trained, add_densifier, write_weights
 
@@ -31,7 +30,6 @@ class Work(NamedTuple):
 
     batches: Callable[[int], Generator[Any, None, None]]  # from a step on
     step: Callable[[TrainState, Any, int], tuple[TrainState, dict]]  # with the step's number
-    begin: Callable[[TrainState], TrainState] = lambda state: state  # called with the state before the first step
     finish: Callable[[TrainState], object] = lambda state: None  # called with the last state
 
 
@@ -42,14 +40,8 @@ def work_of(
     mesh: Mesh | None,
     own: range | None,
     light: Light | None,
-    state: TrainState,
 ) -> Work:
-    """Hooks of the config's method.
-
-    The mesh and its share of a batch, the light, or the state's network are for one of the kinds each.
-    """
-    if config.trains == "refiner":
-        return of_pictures(config, dataset, run, state)
+    """Hooks of the config's method; the mesh and its share of a batch, or the light, are for one of the kinds each."""
     if isinstance(config.model, SurfelConfig):
         return of_gbuffers(config, dataset, run, light or light_of(dataset))
     return of_views(config, dataset, mesh, own)
@@ -80,8 +72,10 @@ def of_gbuffers(config: TrainConfig, dataset: Dataset, run: Path, light: Light) 
     """Of the shader network: G-buffers that are missing in the run folder are made first, which takes a while.
 
     The averaged weights are written to the run folder at the end.  All devices of a process do the same work.
+    ValueError where several processes train together: each would do the same work.
     """
-    check_one_process(config)
+    if jax.process_count() > 1:
+        raise UserError(f"preset {config.preset} trains in one process; start it without --distributed")
     views = gbuffers.complete(dataset, light, config, run / "gbuffers", add_densifier(config.model, {}))
 
     def step(state: TrainState, crops: Crops, number: int) -> tuple[TrainState, dict]:
@@ -92,27 +86,6 @@ def of_gbuffers(config: TrainConfig, dataset: Dataset, run: Path, light: Light) 
         write_weights(run / "weights.npz", Trained(config=config, variables=variables, steps=int(state.step)))
 
     return Work(partial(gbuffers.batches, views, config), step, finish=finish)
-
-
-def of_pictures(config: TrainConfig, dataset: Dataset, run: Path, state: TrainState) -> Work:
-    """Of a refiner behind a network; its pictures that are missing in the run folder are made first."""
-    check_one_process(config)
-    params = {name: part for name, part in state.generator.items() if name != "refiner"}
-    variables = {"params": params, "batch_stats": state.batch_stats}
-    views = refiner_training.complete(dataset, variables, config, run / "pictures")
-
-    def step(state: TrainState, view: Any, number: int) -> tuple[TrainState, dict]:
-        return refiner_training.jitted_train_step(state, view, config=config)
-
-    return Work(
-        partial(refiner_training.batches, views, config), step, begin=partial(refiner_training.begun, views=views)
-    )
-
-
-def check_one_process(config: TrainConfig) -> None:
-    """ValueError where several processes train together: of these kinds each would do the same work."""
-    if jax.process_count() > 1:
-        raise UserError(f"preset {config.preset} trains in one process; start it without --distributed")
 
 
 def light_of(dataset: Dataset) -> Light:

@@ -20,7 +20,7 @@ from spnr_jax.formats import clouds
 from spnr_jax.method.model import FIELD_OF_VIEW, Model
 from spnr_jax.tools.chosen_light import check_takes_light
 from spnr_jax.tools.commands import View
-from spnr_jax.training.weights import load, suited_to
+from spnr_jax.training.weights import load
 from spnr_jax.viewer import frame, gate
 from spnr_jax.viewer.frame import State
 from spnr_jax.viewer.gui import Browser
@@ -107,13 +107,11 @@ class Viewer:
 def open_viewer(asked: View) -> tuple[Viewer, list[str]]:
     """The running viewer of a command, and what was assumed about its file, a line each; ValueError for a bad file."""
     _check_free(asked.host, asked.port)  # before the seconds that reading takes
-    named = load(asked.run) if asked.run else None
-    if named:
-        check_takes_light(named, asked.lighting.asked, asked.run)
+    model = load(asked.run)
+    check_takes_light(model, asked.lighting.asked, asked.run)
     notes: list[str] = []
     reading: dict[str, Any] = {"num_points": asked.num_points, "up": asked.up, "clean": asked.clean}
     points = clouds.read_cloud(asked.cloud, **reading, cut=asked.cut, report=notes.append)
-    model = named or load("surfels" if asked.lighting.asked else suited_to(len(points.positions)))
     first = frame.open_state(model, points, frame.display_name(asked.cloud.name), asked.lighting)
     return Viewer(model, first, reading, asked.host, asked.port, asked.reached_at), notes
 
