@@ -125,7 +125,7 @@ def notes(results: Mapping) -> list[str]:
 
 
 Row = Literal[
-    "near_points", "paper", "npbg", "point_nerf", "points2nerf",
+    "paper", "npbg", "point_nerf", "points2nerf",
     "poisson", "poisson_trimmed", "nearest", "splat", "white",
 ]  # fmt: skip
 ROWS: tuple[Row, ...] = Row.__args__  # type: ignore[attr-defined]

@@ -125,11 +125,10 @@ def rows(wanted: tuple[Row, ...], config: TrainConfig, dataset: data_sets.Datase
 def changed(row: Row, config: TrainConfig) -> TrainConfig:
     """The config with the one change of a row."""
     assert isinstance(config.model, PaperConfig)
-    condition = {"condition": False} if row == "no_condition" else {}
     return dataclasses.replace(
         config,
         model=changed_model(row, config.model),
-        loss=dataclasses.replace(config.loss, **condition),
+        loss=dataclasses.replace(config.loss, condition=config.loss.condition and row != "no_condition"),
         **recipe_changes(config).get(row, {}),
     )
 

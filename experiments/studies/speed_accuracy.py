@@ -3,10 +3,11 @@
     python -m experiments.studies.speed_accuracy DATA [surfels small poisson_trimmed RUN ...] [--sizes 128 512]
 
 Each network draws test objects at every level of `--quality`, from other numbers of points, and in pictures of fewer
-pixels that are enlarged.  The paper's network also draws with other samples, in all of the box and near the points, and in
-bfloat16.  `draft` of the network over surfels is discs and light alone.  What a network with an upsampler draws at the
-one size that it has learnt is enlarged (or averaged).  Screened Poisson surfaces are drawn by Mitsuba as the references
-were.  Keeps every setting in a file of its own (an interrupted call goes on); writes the tables and front.png.
+pixels that are enlarged.  The paper's network also draws with other samples, in all of the box and near the
+points, and in bfloat16.  `draft` of the network over surfels is discs and light alone.  What a network with an
+upsampler draws at the one size that it has learnt is enlarged (or averaged).  Screened Poisson surfaces are drawn by
+Mitsuba as the references were.  Keeps every setting in a file of its own (an interrupted call goes on); writes the
+tables and front.png.
 
 ms a view   median over objects of the fastest of several drawings of all views, as of a film, the cloud encoded before;
             on a CPU of the processor, all cores together: other work on the machine does not count

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+from spnr_jax.method.near_points import NearPointsNetwork
 from support.laws import close, numbers, same_bits
 from support.tiny_model import MODEL, PLUS, SIZE
 from support.tiny_training import BATCH, CONFIG, L1_ONLY, copied, create, near, run, step
@@ -18,7 +19,6 @@ from spnr_jax.config import LossConfig, NetworkConfig
 from spnr_jax.kernels import losses
 from spnr_jax.kernels.records import Rendering
 from spnr_jax.method import inference
-from spnr_jax.method.near_points import NearPointsNetwork
 from spnr_jax.method.paper_network import PaperNetwork
 from spnr_jax.training import adversary, optimisation
 
