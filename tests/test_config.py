@@ -99,7 +99,7 @@ class TestOfAFile:
             (None, {"image_resolution": -64}, "image_resolution"),
             (None, {"sampling": 3}, r"model\.sampling holds 3"),
             (None, {"radius": 0.1}, r"unknown config field model\.radius"),
-            (None, {"method": "nerf"}, r"model\.method nerf is not one of surfels, near_points, paper"),
+            (None, {"method": "nerf"}, r"model\.method nerf is not one of surfels, paper"),
             (None, {"method": ["paper"]}, r"model\.method .* is not one of"),
         ],
     )

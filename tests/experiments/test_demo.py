@@ -1,17 +1,21 @@
 """The demo trains two networks, reuses what is there, and reports the seconds of the run that did the work."""
 
+import dataclasses
 import html
 import json
 import shutil
 from types import SimpleNamespace
 
 import pytest
-from support import tiny_dataset
-from support.tiny_baselines import SHRUNKEN
+from support import tiny_dataset, tiny_surfels
 
 from data_gen.store import layout
 from experiments.packaged import demo
 from spnr_jax import cli, presets
+from spnr_jax.config import SurfelConfig
+
+SMALL = SurfelConfig(image_resolution=tiny_dataset.SIZE, widths=(4, 6), top=4)
+OURS = dataclasses.replace(tiny_surfels.CONFIG, preset="surfels_tiny", model=SMALL)
 
 
 @pytest.fixture
@@ -28,7 +32,7 @@ def asked(monkeypatch):
 
     monkeypatch.setattr(demo, "generate", generate)
     monkeypatch.setattr(presets, "tiny", lambda: tiny_dataset.CONFIG)
-    monkeypatch.setattr(presets, "near_points_tiny", lambda: SHRUNKEN["near_points_tiny"])
+    monkeypatch.setattr(presets, "surfels_tiny", lambda: OURS)
     monkeypatch.setattr(cli, "set_up_jax", lambda **_: None)
     return configs
 
@@ -40,7 +44,7 @@ def test_the_demo_writes_its_report_and_a_second_call_reuses_everything(asked, t
     assert list(first["methods"]) == ["ours", "paper", "white", "splat", "nearest"]
     assert set(first["ours_minus"]) == {"paper", "white", "splat", "nearest"}
     trained = first["settings"]["networks"]
-    assert (trained["ours"]["preset"], trained["paper"]["preset"]) == ("near_points_tiny", "tiny")
+    assert (trained["ours"]["preset"], trained["paper"]["preset"]) == ("surfels_tiny", "tiny")
     assert set(first["seconds"]) >= {"generate", "train", "train paper", "evaluate", "total"}
     parts = sum(seconds for name, seconds in first["seconds"].items() if name != "total")
     assert first["seconds"]["total"] == pytest.approx(parts, abs=0.3)

@@ -192,7 +192,7 @@ def test_weights_of_the_adversarial_loss_from_one_network(tmp_path):
     with pytest.raises(ValueError, match="another pretrain; choose another --out"):
         fig1.main(dataclasses.replace(options, pretrain=0))
     with pytest.raises(ValueError, match="are of another network"):
-        fig1.main(dataclasses.replace(options, out=tmp_path / "new", pretrain=0, init=Path("near_points")))
+        fig1.main(dataclasses.replace(options, out=tmp_path / "new", pretrain=0, init=Path("surfels")))
     assert not (tmp_path / "new").exists()
 
 

@@ -12,12 +12,8 @@ from experiments.studies import point_count, relighting
 from experiments.studies.ablations import LABELS, ROWS, changed, folds, rows
 from experiments.studies.speed_accuracy import front, knee
 from spnr_jax import config, presets
-from spnr_jax.config import RayNetworkConfig
 from spnr_jax.methods import to_dict
 from spnr_jax.training import adversary
-
-PLUS_ROWS = ("free_colour", "no_neighbours", "three_neighbours", "twelve_neighbours", "batch_norm")
-PLUS_ROWS += ("no_opacity_loss", "no_squared_error", "view_direction")
 
 
 def leaves(values, path=""):
@@ -30,7 +26,6 @@ class TestRows:
 
     def test_each_changes_what_it_says_and_nothing_else(self):
         expected = {
-            "paper": {},  # the preset itself
             "no_condition": {"loss.condition": False},
             "no_colour_variants": {},
             "depth_3": {},  # tiny's own
@@ -40,35 +35,14 @@ class TestRows:
             "no_view_direction": {"model.sees_direction": False},
             "plain_inputs": {"model.encoder.inputs": "plain"},
             "fewer_channels": {"model.encoder.base_width": 8},
-            "adversarial": {},  # tiny has it
             "no_average": {"optimizer.ema_decay": 0.0},
             "one_count": {"min_points": 1024},
             "more_views": {"views_per_object": 4},
             "half_samples": {"model.sampling.num_coarse": 8, "model.sampling.num_fine": 8},
             "twice_samples": {"model.sampling.num_coarse": 32, "model.sampling.num_fine": 32},
-        } | dict.fromkeys(PLUS_ROWS, {})
+        }
         assert {row: self.changes(row, self.tiny) for row in ROWS} == expected
         assert set(LABELS) == set(ROWS)
-
-    def test_what_makes_a_plus_network_is_taken_away_piece_by_piece(self):
-        expected = {
-            "free_colour": {"model.color": "free"},
-            "three_neighbours": {"model.num_neighbors": 3},
-            "twelve_neighbours": {"model.num_neighbors": 12},
-            "batch_norm": {"model.encoder.point_norm": "batch"},
-            "no_opacity_loss": {"loss.opacity_weight": 0.0},
-            "no_squared_error": {"loss.mse_weight": 0.0},
-            "view_direction": {"model.sees_direction": True},
-        }
-        wanted = [row for row in PLUS_ROWS if row != "no_neighbours"]
-        changed_rows = {row: self.changes(row, presets.near_points_tiny()) for row in wanted}
-        assert changed_rows == expected
-
-    def test_without_neighbours_it_is_the_paper_s_field_near_the_points(self):
-        near, paper = (changed(row, presets.near_points_tiny()).model for row in ("free_colour", "no_neighbours"))
-        assert (paper.method, paper.num_features, paper.upsamples) == ("paper", 32, False)
-        for field in dataclasses.fields(RayNetworkConfig):
-            assert getattr(paper, field.name) == getattr(near, field.name)
 
     @staticmethod
     def changes(row, config):

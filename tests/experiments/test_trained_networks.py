@@ -34,12 +34,11 @@ def test_networks_of_a_table_and_of_runs_are_named_after_their_methods_in_the_or
     assert found[f"{PAPER} (runs, paper)"].identity == found[f"{PAPER} (fresh, tiny)"].identity
 
 
-def test_the_networks_of_the_package_go_by_their_names():
-    found = networks(Sources(runs=(Path("near_points"), Path("near_points_lite"))), tiny_dataset.dataset())
-    assert [name.rsplit(" ", 1)[1] for name in found] == ["(near_points)", "(near_points_lite)"]
-    assert [network.identity["config"] for network in found.values()] == [
-        hashlib.sha256(weights.shipped(name).read_bytes()).hexdigest() for name in ("near_points", "near_points_lite")
-    ]
+def test_the_network_of_the_package_goes_by_its_name():
+    found = networks(Sources(runs=(Path("surfels"),)), tiny_dataset.dataset())
+    assert list(found) == [methods.LABELS["surfels"]]
+    checksum = hashlib.sha256(weights.shipped().read_bytes()).hexdigest()
+    assert [network.identity["config"] for network in found.values()] == [checksum]
 
 
 def test_what_cannot_be_compared_is_refused_by_name(table, tmp_path):

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from support.laws import close, numbers, same_bits
-from support.tiny_model import MODEL, PLUS, camera, cloud, wobbled
+from support.tiny_model import MODEL, camera, cloud, wobbled
 
 from experiments.baselines.npbg import NPBGConfig
 from spnr_jax.config import RenderOptions
@@ -19,6 +19,7 @@ from spnr_jax.method.inference import rays_per_side
 from spnr_jax.method.model import Model
 
 SIDE = 2
+WITHOUT_UPSAMPLER = dataclasses.replace(MODEL, render_resolution=16, image_resolution=16)
 
 
 def linear(encoded):
@@ -83,31 +84,33 @@ def test_squares_of_a_constant_are_that_constant():
 
 @pytest.mark.parametrize(("size", "side"), [(16, 1), (32, 1), (8, 2), (4, 4), (11, 1)])
 def test_rays_lie_as_close_as_in_the_training(size, side):
-    plus = dataclasses.replace(PLUS, image_resolution=16)
-    assert rays_per_side(plus, size) == side
+    assert rays_per_side(WITHOUT_UPSAMPLER, size) == side
     assert rays_per_side(NPBGConfig(image_resolution=32), size) == 1, "it sees all pixels at once"
 
 
 def test_a_small_picture_is_the_large_one_averaged():
-    config = dataclasses.replace(PLUS, image_resolution=16)
-    variables = wobbled(jax.jit(inference.network(config).init)(jax.random.key(0), cloud(), camera()), 4)
-    scene = inference.jitted_encode(variables, cloud(), config=config)
+    variables = wobbled(jax.jit(inference.network(WITHOUT_UPSAMPLER).init)(jax.random.key(0), cloud(), camera()), 4)
+    scene = inference.jitted_encode(variables, cloud(), config=WITHOUT_UPSAMPLER)
     small, large = camera(8, target=0.0171), cameras.resize(camera(8, target=0.0171), 16, 16)
-    whole = inference.jitted_render(variables, scene, large, config=config)
+    whole = inference.jitted_render(variables, scene, large, config=WITHOUT_UPSAMPLER)
     assert np.ptp(np.asarray(whole.acc)) > 0.5
-    several = inference.jitted_render(variables, scene, small, config=config, options=RenderOptions(rays_per_side=2))
+    several = inference.jitted_render(
+        variables, scene, small, config=WITHOUT_UPSAMPLER, options=RenderOptions(rays_per_side=2)
+    )
     apart = np.abs(np.asarray(several.image - averaged(whole, 2).image))
     assert np.mean(apart > 1e-4) < 0.01  # but for a ray that rounding moves over a face of a cell
 
 
 @pytest.mark.ci
 def test_the_handle_takes_several_rays_for_the_best_picture_alone():
-    config = dataclasses.replace(PLUS, image_resolution=16)
-    variables = wobbled(jax.jit(inference.network(config).init)(jax.random.key(0), cloud(), camera()), 4)
-    handle, single = Model(config=config, variables=variables), jax.tree.map(lambda x: np.asarray(x[0]), cloud())
+    variables = wobbled(jax.jit(inference.network(WITHOUT_UPSAMPLER).init)(jax.random.key(0), cloud(), camera()), 4)
+    handle, single = (
+        Model(config=WITHOUT_UPSAMPLER, variables=variables),
+        jax.tree.map(lambda x: np.asarray(x[0]), cloud()),
+    )
     volume = handle.encode(single)
     view, wide = (handle.camera(volume, azimuth=17.3, elevation=36.1, resolution=n) for n in (8, 16))
-    large = handle.render(volume, wide, "trained")
+    large = handle.render(volume, wide, "best")
     expected = averaged(jax.tree.map(lambda x: x[None], large), 2)
     apart = np.abs(np.asarray(handle.render(volume, view, "best").image - expected.image[0]))
     assert np.mean(apart > 1e-4) < 0.02  # one pixel: a ray that rounding moves over a face of a cell

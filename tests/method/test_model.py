@@ -136,8 +136,7 @@ class TestQuality:
     def test_a_quality_is_a_share_of_the_samples_near_the_points(self, quality, samples):
         config = dataclasses.replace(tiny_dataset.CONFIG.model, sampling=SamplingConfig(num_coarse=4, num_fine=4))
         expected = SamplingConfig(num_coarse=samples, num_fine=0, reach=3)
-        refine = quality != "draft"
-        assert inference.at_quality(config, quality, 3, 24) == RenderOptions(sampling=expected, refine=refine)
+        assert inference.at_quality(config, quality, 3, 24) == RenderOptions(sampling=expected)
 
     def test_trained_takes_the_samples_of_the_training_and_so_does_every_quality_of_other_networks(self):
         config = tiny_dataset.CONFIG.model

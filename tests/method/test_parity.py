@@ -55,7 +55,7 @@ def stages():
         objects = jnp.zeros(rays.origins.shape[:-1], jnp.int32)
         coarse, edges = sampling.stratified(None, near, far, counts.num_coarse)
         positions = rays.origins[..., None, :] + coarse[..., None] * rays.directions[..., None, :]
-        density, (rgb, _), _ = module.along(scene, rays, objects, AS_TRAINED)[0](coarse)
+        density, (rgb, _) = module.along(scene, rays, objects)[0](coarse)
         weights, _ = compositing.volume_weights(density, compositing.interval_lengths(coarse, far))
         features, depth, acc = trace(module, scene, rays, counts, AS_TRAINED, None)
         return {

@@ -81,7 +81,7 @@ def test_mapped_over_objects_cameras_and_lights_it_is_the_loop_over_them_by_one_
 
 def test_what_does_not_fit_into_a_plan_is_counted_and_what_fits_is_whole(params, scenes, views):
     scene, seen = scenes[0], views[0]
-    made = plan(scene, seen)._replace(solid=False)
+    made = plan(scene, seen)
     whole = drawn(params, scene, seen, plan=made)
     assert int(whole.overflow) == 0
     sizes = jax.device_get(surfel_renderer.count_sizes(scene, seen, doublings=made.doublings, side=made.side))

@@ -14,7 +14,7 @@ from support import reference, tiny_model
 from support.laws import close, same_bits
 from support.tiny_model import NUM_POINTS, camera, cloud, wobbled
 
-from spnr_jax.config import AS_TRAINED, MATERIAL_CHANNELS, RenderOptions
+from spnr_jax.config import MATERIAL_CHANNELS, RenderOptions
 from spnr_jax.kernels import sampling
 from spnr_jax.kernels.cameras import intersect_box, view_rays
 from spnr_jax.kernels.records import Rays, Scene
@@ -133,7 +133,7 @@ class TestViews:
         module = inference.network(CONFIG).bind(variables)
         distances = jnp.stack([near, 0.5 * (near + far), far], axis=-1)
         objects = jnp.broadcast_to(jnp.arange(2).reshape(2, *[1] * (near.ndim - 1)), near.shape)
-        density = module.along(scene(volume), rays, objects, AS_TRAINED)[0](distances).density
+        density = module.along(scene(volume), rays, objects)[0](distances).density
         assert hit.sum() > 500
         close(density[hit], jnp.broadcast_to(density[hit][:, 1:2], density[hit].shape))
 
@@ -179,7 +179,7 @@ class TestViews:
         def densities(rays, distances):
             module = inference.network(CONFIG).bind(variables)
             everywhere = scene(jnp.ones((1, 8, 8, 8, 4)))
-            field, _ = module.along(everywhere, rays, jnp.zeros(rays.origins.shape[:-1], jnp.int32), AS_TRAINED)
+            field, _ = module.along(everywhere, rays, jnp.zeros(rays.origins.shape[:-1], jnp.int32))
             return field(distances).density
 
         found = np.asarray(densities(rays, jnp.asarray((near + far) / 2)[..., None]))[..., 0][hit]

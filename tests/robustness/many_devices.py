@@ -29,14 +29,14 @@ from spnr_jax.method import inference
 from spnr_jax.method import march as marching
 from spnr_jax.training import batching, optimisation
 
-PLUS = dataclasses.replace(
-    tiny_model.PLUS,
-    image_resolution=24,
+NEAR_POINTS = dataclasses.replace(
+    tiny_model.MODEL,
+    render_resolution=24,
     sampling=SamplingConfig(num_coarse=4, num_fine=4, reach=1),
 )
 MODELS = {
     "plain": tiny_model.MODEL,
-    "near points": PLUS,
+    "near points": NEAR_POINTS,
     "Point-NeRF": dataclasses.replace(tiny_baselines.POINT_NERF, image_resolution=24),
 }
 OBJECTS = 8
@@ -78,7 +78,7 @@ def blocks() -> list[list[int]]:
     """How many blocks of four rays one device renders of eight objects like one another, and each of eight devices."""
     march, counts = marching.march, []
     one = jax.tree.map(lambda x: x[:1], (tiny_model.cloud(), tiny_model.camera(9, target=0.013)))
-    variables = tiny_model.wobbled(jax.jit(inference.network(PLUS).init)(jax.random.key(0), *one), 4)
+    variables = tiny_model.wobbled(jax.jit(inference.network(NEAR_POINTS).init)(jax.random.key(0), *one), 4)
     inputs = jax.tree.map(lambda x: jnp.concatenate([x] * OBJECTS), one)
     for mesh in (None, placement.device_mesh()):
         found: Counter[int] = Counter()
@@ -91,8 +91,8 @@ def blocks() -> list[list[int]]:
         with mock.patch.object(marching, "march", counted), mock.patch.object(marching, "CPU_BLOCK", 4):
             with placement.using(mesh):
                 cloud, camera = placement.place_batch(inputs, mesh, OBJECTS)
-                render = jax.jit(partial(inference.render, config=PLUS))
-                jax.block_until_ready(render(variables, inference.encode(variables, cloud, config=PLUS), camera))
+                render = jax.jit(partial(inference.render, config=NEAR_POINTS))
+                jax.block_until_ready(render(variables, inference.encode(variables, cloud, config=NEAR_POINTS), camera))
             jax.effects_barrier()
         counts.append([count for _, count in sorted(found.items())])
     return counts

@@ -75,14 +75,14 @@ def lists() -> list[Files]:
 
 
 def weights() -> list[Files]:
-    """Files of weights of very small networks, one of them near points."""
-    from spnr_jax.config import EncoderConfig, PaperConfig, SamplingConfig
+    """Files of weights of very small networks, one of them over surfels."""
+    from spnr_jax.config import EncoderConfig, PaperConfig, SamplingConfig, SurfelConfig
     from spnr_jax.training.weights import variable_shapes
 
-    ours = presets.tiny()
-    assert isinstance(ours.model, PaperConfig)
+    paper = presets.tiny()
+    assert isinstance(paper.model, PaperConfig)
     small = dataclasses.replace(
-        ours.model, field_width=4,
+        paper.model, field_width=4,
         encoder=EncoderConfig(
             point_widths=(4,), point_features=4, volume_resolution=8, base_width=4, num_stages=2, num_groups=1
         ),
@@ -90,7 +90,8 @@ def weights() -> list[Files]:
         image_resolution=32, upsampler_width=4,
     )  # fmt: skip
     files = []
-    for config in (dataclasses.replace(ours, model=small), presets.near_points_tiny()):
+    surfels = dataclasses.replace(presets.surfels_tiny(), model=SurfelConfig(widths=(4, 6), top=4))
+    for config in (dataclasses.replace(paper, model=small), surfels):
         described = np.frombuffer(json.dumps(to_dict(config)).encode(), np.uint8)
         halves = {name: np.zeros(x.shape, np.float16) for name, x in variable_shapes(config).items()}
         stream = io.BytesIO()

@@ -23,7 +23,7 @@ from spnr_jax.training import checkpoint, optimisation, run_record, weights
 NAMES = tiny_dataset.SPLITS["test"]
 ssim = jax.jit(metrics.ssim)
 FACTORS = {"splat": 1.5, "nearest": 0.75}
-KINDS = {"surfels": "surfels", "near_points": "near_points", "tiny": "paper"}
+KINDS = {"surfels": "surfels", "surfels_tiny": "surfels", "tiny": "paper"}
 
 
 def methods():

@@ -1,4 +1,4 @@
-"""Pictures that the networks of the package must go on drawing: tests/support/golden.npz holds them in 8 bits.
+"""Pictures that the network of the package must go on drawing: tests/support/golden.npz holds them in 8 bits.
 
     PYTHONPATH=.:tests python -m support.golden     draws them anew, where a change of the pictures is meant
 
@@ -12,7 +12,6 @@ import numpy as np
 import spnr_jax
 
 FILE = Path(__file__).with_name("golden.npz")
-NETWORKS = ("near_points", "near_points_lite", "surfels")
 SIZE, VIEW = 64, {"azimuth": 35.0, "elevation": 25.0}
 
 
@@ -63,14 +62,13 @@ def table(count: int = 1500) -> spnr_jax.PointCloud:
 CLOUDS = {"torus": torus, "table": table}
 
 
-def draw(network: str, cloud: str) -> np.ndarray:
-    """Colours and opacity (64, 64, 4) of the cloud as the network draws it, in [0, 1]."""
-    model = spnr_jax.load(network)
+def draw(cloud: str) -> np.ndarray:
+    """Colours and opacity (64, 64, 4) of the cloud as the network of the package draws it, in [0, 1]."""
+    model = spnr_jax.load()
     volume = model.encode(CLOUDS[cloud]())
     rendering = model.render(volume, model.camera(volume, **VIEW, resolution=SIZE), "best")
     return np.clip(np.concatenate([rendering.image, rendering.acc[..., None]], axis=-1), 0, 1)
 
 
 if __name__ == "__main__":
-    drawn = {f"{network}_{cloud}": draw(network, cloud) for network in NETWORKS for cloud in CLOUDS}
-    np.savez_compressed(FILE, **{name: np.round(255 * picture).astype(np.uint8) for name, picture in drawn.items()})
+    np.savez_compressed(FILE, **{cloud: np.round(255 * draw(cloud)).astype(np.uint8) for cloud in CLOUDS})

@@ -6,7 +6,7 @@ from experiments.baselines.npbg import NPBGConfig
 from experiments.baselines.point_nerf import PointNeRFConfig
 from experiments.baselines.points2nerf import Points2NeRFConfig
 from spnr_jax.config import LossConfig, NetworkConfig, OptimizerConfig
-from support import tiny_dataset, tiny_model
+from support import tiny_dataset
 
 SIZE = tiny_dataset.SIZE
 POINT_NERF = PointNeRFConfig(
@@ -28,9 +28,7 @@ BASELINE = dataclasses.replace(
     loss=LossConfig(l1_weight=1.0, adversarial_weight=0.0, pixel="mse"),
     optimizer=OptimizerConfig(lr_generator=1e-2, warmup_steps=2, ema_decay=0.9),
 )
-PLUS = dataclasses.replace(tiny_model.PLUS, surface_cells=32, image_resolution=SIZE)
 NETWORKS: dict[str, NetworkConfig] = {
-    "near_points_tiny": PLUS,
     "npbg_tiny": NPBGConfig(encoder_widths=(8, 9), decoder_widths=(5,), image_resolution=SIZE),
     "point_nerf_tiny": PointNeRFConfig(
         num_candidates=12,

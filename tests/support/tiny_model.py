@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from spnr_jax.config import EncoderConfig, NearPointsConfig, PaperConfig, SamplingConfig
+from spnr_jax.config import EncoderConfig, PaperConfig, SamplingConfig
 from spnr_jax.kernels.cameras import look_at, pinhole
 from spnr_jax.kernels.records import PointCloud
 from support.laws import numbers
@@ -27,15 +27,6 @@ MODEL = PaperConfig(
     upsampler_width=4,
 )
 WITHOUT_UPSAMPLER = dataclasses.replace(MODEL, image_resolution=8)
-PLUS = NearPointsConfig(
-    encoder=dataclasses.replace(ENCODER, point_norm="layer"),
-    field_width=8,
-    direction_frequencies=1,
-    num_neighbors=3,
-    surface_cells=6,  # of 40 points
-    sampling=SamplingConfig(num_coarse=6, num_fine=0, reach=1),
-    image_resolution=8,
-)
 NUM_POINTS = 40
 
 

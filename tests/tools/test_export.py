@@ -100,7 +100,6 @@ def test_quality_and_reach_are_part_of_what_is_exported(rendered, expected):
     draft = export.export_render(tiny_viewer.model(), resolution=SIZE, quality="draft", reach=volume.reach)
     handle = tiny_viewer.model().render(volume, camera, "draft")
     inputs = jax.tree.map(np.asarray, export.to_state_dict(volume)), arrays(camera)
-    del inputs[0]["solid"]
     del inputs[1]["height"], inputs[1]["width"]
     close(export.load_exported(draft)(*inputs)["image"], handle.image, atol=1e-5)
     close(export.load_exported(rendered)(*inputs)["image"], picture.image, atol=1e-5)

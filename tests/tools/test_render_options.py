@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from support import command_line
+from support import command_line, tiny_untrained
 
 from spnr_jax.formats.cut import Cut
 from spnr_jax.surfels.visibility import spiral
@@ -48,20 +48,22 @@ def test_a_part_that_is_not_there_is_refused_in_one_line(tmp_path, capsys, optio
         (["--light", "absent.hdr"], "absent.hdr: no such file"),
         (["--transparent", "--background", "light"], "--background light: not together with --transparent"),
         (
-            ["--run", "near_points", "--light", "studio"],
-            "--light: the network of --run near_points knows the light of its training",
+            ["--run", "RUN", "--light", "studio"],
+            "--light: the network of --run RUN knows the light of its training",
         ),
-        (["--run", "near_points", "--turn", "light"], "--turn light: the network of --run near_points knows the light"),
+        (["--run", "RUN", "--turn", "light"], "--turn light: the network of --run RUN knows the light"),
         (
-            ["--run", "near_points", "--exposure", "1", "--sun", "0", "9"],
-            "--sun, --exposure: the network of --run near_points",
+            ["--run", "RUN", "--exposure", "1", "--sun", "0", "9"],
+            "--sun, --exposure: the network of --run RUN",
         ),
     ],
 )
 def test_light_that_cannot_be_is_one_line_and_code_2_before_the_cloud_is_read(arguments, expected, tmp_path, capsys):
+    run = str(tiny_untrained.run())
+    arguments = [run if word == "RUN" else word for word in arguments]
     code = command_line.exit_code(cli, "render", tmp_path / "missing.ply", "--out", tmp_path / "out", *arguments)
     said = capsys.readouterr().err
     assert code == 2
-    assert expected in said
+    assert expected.replace("RUN", run) in said
     assert said.count("\n") == 1
     assert "missing.ply" not in said

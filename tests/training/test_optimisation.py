@@ -9,17 +9,15 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from spnr_jax.method.near_points import NearPointsNetwork
 from support.laws import close, numbers, same_bits
-from support.tiny_model import MODEL, PLUS, SIZE
+from support.tiny_model import MODEL, SIZE
 from support.tiny_training import BATCH, CONFIG, L1_ONLY, copied, create, near, run, step
 
 from spnr_jax import methods
-from spnr_jax.config import LossConfig, NetworkConfig
+from spnr_jax.config import LossConfig, NetworkConfig, OptimizerConfig
 from spnr_jax.kernels import losses
 from spnr_jax.kernels.records import Rendering
 from spnr_jax.method import inference
-from spnr_jax.method.paper_network import PaperNetwork
 from spnr_jax.training import adversary, optimisation
 
 
@@ -219,17 +217,28 @@ def test_a_method_is_a_network_and_a_loss(monkeypatch):
     assert after.averaged["grey"] != after.generator["grey"]
 
 
-def test_rays_through_all_the_box_are_shown_in_blocks_and_those_near_points_in_their_own():
-    assert (inference.trained(MODEL).block, inference.trained(PLUS).block) == (1024, None)
-    assert isinstance(inference.network(MODEL), PaperNetwork)
-    assert isinstance(inference.network(PLUS), NearPointsNetwork)
-
-
 class TestReproducibility:
     def test_every_step_draws_new_samples(self, fresh_l1):
         """The same weights and batch, one step later: another jitter, another loss."""
         (_, first), (_, later) = (step(dataclasses.replace(fresh_l1, step=jnp.int32(s)), L1_ONLY) for s in (0, 1))
         assert first["loss"] != later["loss"]
+
+
+@pytest.mark.ci
+def test_two_balls_and_their_opacity_are_learnt_from_a_lattice_of_rays():
+    config = dataclasses.replace(
+        L1_ONLY,
+        model=dataclasses.replace(MODEL, render_resolution=SIZE, image_resolution=SIZE),
+        loss=LossConfig(l1_weight=1.0, mse_weight=2.0, adversarial_weight=0.0, opacity_weight=0.5),
+        optimizer=OptimizerConfig(lr_generator=5e-3, warmup_steps=4),
+        pixel_stride=2,
+    )
+    first, metrics = run(create(config), 1, config)
+    _, later = run(first, 75, config)
+    squared = (metrics["loss"] - metrics["l1"] - metrics["opacity"]) / 2
+    assert metrics["l1"] ** 2 < squared < metrics["l1"]
+    assert later["opacity"] < 0.5 * metrics["opacity"]
+    assert later["psnr"] > metrics["psnr"] + 3
 
 
 @pytest.mark.ci

@@ -28,6 +28,12 @@ class TestLattice:
             same_bits(thin.cloud, BATCH.cloud)
         assert len(firsts) > 3, "another first pixel for another key"
 
+    def test_its_opacity_is_that_of_the_same_pixels(self):
+        thinned = pixels.lattice(jax.random.key(3), BATCH, 3)
+        # the balls are opaque where they are not white
+        same_bits(thinned.alpha > 0, (thinned.image != 1).any(axis=-1))
+        assert thinned.alpha.shape == thinned.image.shape[:-1]
+
 
 class TestCrop:
     def test_a_crop_is_a_square_of_picture_condition_and_rays(self):

@@ -11,14 +11,13 @@ import numpy as np
 import pytest
 from support import tiny_dataset, tiny_training
 from support.tiny_baselines import NETWORKS
-from support.tiny_baselines import PLUS as PLUS_MODEL
 
 from spnr_jax.config import LossConfig, OptimizerConfig, TrainConfig
 from spnr_jax.formats import data_sets
 from spnr_jax.kernels import losses
 from spnr_jax.method import inference
 from spnr_jax.methods import METHODS
-from spnr_jax.presets import PAPERS, near_points, near_points_lite, near_points_tiny, tiny
+from spnr_jax.presets import PAPERS, tiny
 from spnr_jax.training import adversary, batching, metrics_log, optimisation, trainer
 
 pytestmark = pytest.mark.ci  # it trains several networks
@@ -230,12 +229,6 @@ class TestNoNaN:
     def test_twenty_steps_of_each_shrunken_preset_make_none(self, preset, precision, tmp_path):
         config = shrunken(preset(), precision, 20)
         assert adversary.first_adversarial_step(config) in range(1, 20), "both phases are trained"
-        assert train_under_debug_nans(config, images_of(config, tmp_path)).step == 20
-
-    @pytest.mark.slow
-    @pytest.mark.parametrize("preset", [near_points, near_points_lite, near_points_tiny])
-    def test_twenty_steps_of_each_shrunken_network_that_sees_the_surface_make_none(self, preset, tmp_path):
-        config = dataclasses.replace(preset(), model=PLUS_MODEL, num_steps=20, min_points=40, max_points=80)
         assert train_under_debug_nans(config, images_of(config, tmp_path)).step == 20
 
     @pytest.mark.slow

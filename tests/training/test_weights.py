@@ -7,7 +7,7 @@ import zipfile
 import jax
 import numpy as np
 import pytest
-from support import tiny_untrained, tiny_viewer
+from support import tiny_surfels, tiny_untrained, tiny_viewer
 from support.laws import close
 
 from spnr_jax.config import TrainConfig
@@ -56,15 +56,23 @@ def test_every_weight_of_a_network_has_its_shape_by_name(trained):
     assert {name: x.shape for name, x in weights.variable_shapes(trained.config).items()} == found
 
 
-@pytest.mark.parametrize("name", ["near_points", "near_points_lite"])
-def test_the_networks_in_the_package_have_the_weights_and_the_name_of_their_presets(tmp_path, name):
-    copy = tmp_path / "copy.npz"  # the package's own files are not checked when they are read
-    copy.write_bytes(weights.shipped(name).read_bytes())
-    checked, trusted = weights.read_weights(copy), weights.read_trained(name)
+def test_the_network_in_the_package_has_the_weights_and_the_name_of_its_preset(tmp_path):
+    copy = tmp_path / "copy.npz"  # the package's own file is not checked when it is read
+    copy.write_bytes(weights.shipped().read_bytes())
+    checked, trusted = weights.read_weights(copy), weights.read_trained(None)
     assert checked.config == trusted.config
-    assert checked.config.preset == name
-    assert checked.config.model == PRESETS[name]().model
-    jax.tree.map(np.testing.assert_array_equal, checked.variables, trusted.variables)
+    assert checked.config.preset == "surfels"
+    assert checked.config.model == PRESETS["surfels"]().model
+    jax.tree.map(np.testing.assert_array_equal, checked.variables["params"], trusted.variables["params"])
+
+
+def test_the_densifier_stands_beside_every_network_over_surfels_and_in_no_file_of_weights(tmp_path):
+    trained = weights.read_trained(None)
+    weights.write_weights(tmp_path / "w.npz", trained)
+    assert "densifier" not in weights.read_weights(tmp_path / "w.npz").variables
+    for again in (weights.read_trained(tmp_path / "w.npz"), weights.read_trained(tiny_surfels.run())):
+        jax.tree.map(np.testing.assert_array_equal, again.variables["densifier"], weights.read_densifier())
+    assert "densifier" not in weights.read_trained(tiny_untrained.run()).variables
 
 
 def test_a_name_is_the_packages_network_and_a_path_is_not(monkeypatch, tmp_path):
