@@ -79,6 +79,7 @@ def surfels(position, normal, spacing, **columns) -> Surfels:
         "roughness": np.full(count, 0.5),
         "metallic": np.zeros(count),
         "guessed": np.zeros(count),
+        "invented": np.zeros(count),
         "sided": np.ones(count),
         "visible": np.ones((count, NUM_DIRECTIONS)),
         "shape": np.zeros((count, 2)),

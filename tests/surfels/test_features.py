@@ -85,19 +85,34 @@ def test_the_network_sees_no_light():
     close(one, other)
 
 
+@pytest.mark.parametrize(("name", "column"), [("guessed", 30), ("invented", 31)])
 @pytest.mark.parametrize("share", [0.0, 1.0])
-def test_the_last_number_says_whether_materials_are_guessed_and_no_other_does(share):
-    positions, color = ball_on_plate()
-    plain = np.full(len(positions), 0.5, np.float32)
-    known = estimate(positions, color, plain, plain)
-    said = estimate(positions, color, plain, plain, materials_known=np.full(len(positions), 1 - share, np.float32))
-    (buffer, one, _), (_, other, _) = (drawn(found, light_of(sky()), camera(24, VIEW)) for found in (known, said))
-    close(one[..., :-1], other[..., :-1], rtol=1e-3, atol=1e-4)  # two programs round differently
-    assert np.all(np.asarray(one)[..., -1] == 0)
+def test_one_number_says_whether_materials_are_guessed_and_one_whether_points_are_and_no_other_does(
+    name, column, share
+):
+    positions, normal, spacing = shape("sphere", 500)
+    plain = surfels(positions, normal, spacing)
+    said = dataclasses.replace(plain, **{name: jnp.full(500, share)})
+    (buffer, one, _), (_, other, _) = (drawn(found, light_of(sky()), camera(24, VIEW)) for found in (plain, said))
+    one, other = np.array(one), np.array(other)
+    assert np.all(one[..., column] == 0)
     inside = np.asarray(buffer.opacity) > 0.9
-    close(
-        np.asarray(other)[inside, -1], share * (buffer.opacity / (buffer.opacity + features.FAINT))[inside], atol=1e-5
+    expected = share * (buffer.opacity / (buffer.opacity + features.FAINT))[inside]
+    close(other[inside, column], expected, atol=1e-5)
+    close(np.delete(one, column, axis=-1), np.delete(other, column, axis=-1))
+
+
+def test_the_last_number_tells_a_texture_from_one_colour():
+    positions, normal, spacing = shape("sphere", 500)
+    grey = surfels(positions, normal, spacing)
+    patches = np.where(np.random.default_rng(0).random((500, 1)) < 0.5, 0.1, 0.9) * np.ones(3)
+    (buffer, one, _), (_, other, _) = (
+        drawn(found, light_of(sky()), camera(24, VIEW))
+        for found in (grey, surfels(positions, normal, spacing, base_color=patches))
     )
+    inside = np.asarray(buffer.opacity) > 0.9
+    assert np.asarray(one)[inside, -1].max() < 1e-2
+    assert 0.1 < np.asarray(other)[inside, -1].mean() <= 0.4 + 1e-3
 
 
 def test_maps_are_linear_in_the_light():
@@ -124,7 +139,7 @@ def test_a_pixel_in_a_dent_lies_behind_the_mean_around_it_and_one_on_a_bump_befo
     normal = jnp.broadcast_to(jnp.array([0.0, 0.0, 1.0]), (32, 32, 3))
     buffer = features.GBuffer(
         opacity=ones, coverage=ones, depth=depth, spread=zeros, log_spacing=jnp.log(0.1 * ones),
-        normal=normal, color=normal, attributes=jnp.full((32, 32, 17), 0.5),
+        normal=normal, color=normal, attributes=jnp.full((32, 32, 19), 0.5),
         centres=ones, beside=jnp.zeros((32, 32, 2)),
     )  # fmt: skip
     view = Camera(cam_to_world=jnp.eye(3, 4), intrinsics=camera(32).intrinsics, height=32, width=32)

@@ -168,6 +168,7 @@ def test_a_mirrored_object_is_seen_as_the_mirrored_view(axis):
             roughness=color[:, 0],
             metallic=color[:, 1],
             guessed=color[:, 2],
+            invented=color[:, 0],
             sided=np.ones(60, np.float32),
             visible=np.maximum((normal * sign) @ DIRECTIONS.T, 0),
             shape=color[:, :2],
