@@ -176,7 +176,7 @@ def test_a_mirrored_object_is_seen_as_the_mirrored_view(axis):
             reach=reach if sign.min() > 0 else reach[:, [0, 1, 3, 2]],  # normal x rim is not mirrored
             mask=np.ones(60, bool),
         )
-        seen.append(np.asarray(gbuffers.look_at(surfels, camera, LIGHT, None, None, room=2**14, slots=24 * 24)[0]))
+        seen.append(np.asarray(gbuffers.look_at(surfels, camera, LIGHT, room=2**14, slots=24 * 24)[0]))
     view = {"seen": seen[0], "maps": seen[0], "target": seen[0], "ambient": np.zeros((9, 3))}
     np.testing.assert_allclose(gbuffers.mirrored(view, axis)["seen"], seen[1], atol=0.05)
     assert np.abs(seen[1][..., features.ODD[axis]]).mean() > 0.1
