@@ -25,15 +25,9 @@ ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 CODE = re.compile(r"^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 IDENTIFIER = re.compile(r"^::: ([\w.]+)$", re.MULTILINE)
-SHIPPED = weights.shipped
 SIGNATURE = re.compile(r"^(?:### |\| )`([\w.]+)\((.*)\)`", re.MULTILINE)  # of a heading, or of a table's first column
 PARAMETER = re.compile(r"(\w+)(?:=([^,()]*(?:\(\))?))?")
 PAGES = sorted(DOCS.rglob("*.md"))
-
-
-def shipped_in_tests(name=weights.SHIPPED):
-    """The package's files of weights, and a run of seconds as its network."""
-    return tiny_surfels.run() if name == weights.SHIPPED else SHIPPED(name)
 
 
 @pytest.fixture
@@ -60,7 +54,7 @@ def execute(path):
 
 @pytest.mark.ci
 def test_the_readmes_example_draws_pictures_and_has_a_gradient(workplace, monkeypatch):
-    monkeypatch.setattr(weights, "shipped", shipped_in_tests)
+    monkeypatch.setattr(weights, "shipped", tiny_surfels.shipped)
     names = execute(ROOT / "README.md")
     pictures, by_color = np.asarray(names["images"]), np.asarray(names["by_color"])
     assert pictures.shape == (2, 128, 128, 3)
@@ -71,7 +65,7 @@ def test_the_readmes_example_draws_pictures_and_has_a_gradient(workplace, monkey
 
 @pytest.mark.ci
 def test_the_examples_of_the_api_run_in_their_order(workplace, monkeypatch):
-    monkeypatch.setattr(weights, "shipped", shipped_in_tests)
+    monkeypatch.setattr(weights, "shipped", tiny_surfels.shipped)
     names = execute(DOCS / "api.md")
     assert int(names["state"].step) == 1
     assert "paper" in names["outcome"].summary["methods"]
@@ -93,7 +87,7 @@ def test_the_example_without_this_package_runs_on_what_the_command_writes(workpl
 
 @pytest.mark.ci
 def test_the_examples_of_differentiable_rendering_give_gradients_and_pictures_that_differ(workplace, monkeypatch):
-    monkeypatch.setattr(weights, "shipped", shipped_in_tests)
+    monkeypatch.setattr(weights, "shipped", tiny_surfels.shipped)
     names = execute(DOCS / "differentiable.md")
     pictures = np.asarray(names["pictures"])
     assert pictures.shape == (2, 3, 64, 64, 3)
@@ -112,7 +106,7 @@ def test_the_lights_of_the_page_about_them_are_made_as_it_says():
 
 @pytest.mark.ci
 def test_a_method_and_losses_of_ones_own_work_as_their_page_shows_them(workplace, monkeypatch):
-    monkeypatch.setattr(weights, "shipped", shipped_in_tests)
+    monkeypatch.setattr(weights, "shipped", tiny_surfels.shipped)
     monkeypatch.setattr(data_sets, "check_resolution", lambda *_: None)  # the demo's pictures are larger than these
     for registry in (methods.METHODS, PRESETS):
         monkeypatch.setitem(registry, "mean_color", None)  # is put back as it was: absent

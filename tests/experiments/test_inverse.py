@@ -34,7 +34,7 @@ def test_a_pose_turns_about_the_middle_by_its_angle_and_shifts_in_radii():
 @pytest.mark.ci
 def test_each_task_comes_nearer_to_the_target_and_gradients_are_differences(tmp_path, monkeypatch):
     monkeypatch.setattr(cli, "set_up_jax", lambda **_: None)  # it would write to the home folder
-    monkeypatch.setattr(weights, "shipped", lambda name: tiny_surfels.run())
+    monkeypatch.setattr(weights, "shipped", tiny_surfels.shipped)
     inverse.main(inverse.InverseStudy(out=tmp_path, quick=True))
     found = json.loads((tmp_path / "results.json").read_text())
     assert set(found["tasks"]) == set(inverse.RATES)

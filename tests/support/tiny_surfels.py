@@ -8,7 +8,7 @@ import numpy as np
 from spnr_jax.config import LossConfig, OptimizerConfig, SurfelConfig, TrainConfig
 from spnr_jax.formats import data_sets
 from spnr_jax.surfels import lighting
-from spnr_jax.training import gbuffers, trainer
+from spnr_jax.training import gbuffers, trainer, weights
 from support import tiny_dataset
 
 SIZE = 48
@@ -26,6 +26,7 @@ CONFIG = TrainConfig(
     crop=12,
     even_share=0.5,
 )
+PACKAGED = weights.shipped
 SCHEDULE = trainer.Schedule(log_every=1, preview_every=100, checkpoint_every=2)
 NAME = "ball_000000"
 LIGHT = lighting.light_of(np.random.default_rng(0).random((4, 8, 3), np.float32))
@@ -49,3 +50,8 @@ def run() -> Path:
     """A finished run of CONFIG."""
     trainer.train(CONFIG, dataset(), tiny_dataset.folder() / "shaded", SCHEDULE, light=LIGHT)
     return tiny_dataset.folder() / "shaded"
+
+
+def shipped(name: str = weights.SHIPPED) -> Path:
+    """The package's files of weights, but for its network: that is `run`."""
+    return run() if name == weights.SHIPPED else PACKAGED(name)
