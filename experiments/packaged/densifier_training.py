@@ -46,6 +46,7 @@ DENSER, MATCHED = 48, 48  # true points for each of a cloud, and those that a ch
 ASKED, NEAREST = 6, 6  # true points for each of a cloud that ask for a child, and the places near each
 CORE, NODES, PLACES, QUERIES = 1024, 1920, 4864, 3072  # of a batch: points in its middle, sizes of its arrays
 FEWEST = 300  # points of a cloud
+OFTEN = 0.35, 0.25, 0.1, 0.2, 0.1  # how often each cloud of a record trains: sparse ones are harder
 UNLIKE = 0.12  # squared spacings that a normal at right angles counts as
 HIDDEN = 0.1  # weight of what nothing outside sees
 EXACT, ROBUST = 0.08, 0.15  # spacings off the surface at which a child is half there, and errors begin to count less
@@ -224,7 +225,7 @@ def make_batch(records: list[dict[str, np.ndarray]], rng: np.random.Generator) -
     count = 0
     while count < CORE - FEWEST:
         record = records[rng.integers(len(records))]
-        number = int(rng.integers(int(record["clouds"])))
+        number = int(rng.choice(int(record["clouds"]), p=OFTEN))
         part, core = cut(record, number, min(CORE - count, CORE), rng)
         parts.append(mirror(part) if rng.random() < 0.5 else part)
         count += core

@@ -29,6 +29,7 @@ from spnr_jax.surfels.surfel_scenes import fit_box
 
 SMOOTHEST = 0.05  # the least roughness
 ROOM = 1.25  # of what the true pictures need, for what moves
+HELD = ("visible", "sided", "mask")  # fields of surfels that have no gradient
 DIFFERENCE = 1e-8  # of central differences in float64: the smaller, the fewer of them cross an edge
 ADAM = optax.scale_by_adam()
 
@@ -98,12 +99,15 @@ def stack(trees: Sequence[Any]) -> Any:
 # --- the picture and its gradient -------------------------------------------------------------------------------------
 
 
-def draw(wrong: Unknowns, params: dict, truth: Truth, tables: Array, plan: Plan) -> Rendering:
-    """The picture of one object of which this much is wrong."""
+def draw(
+    wrong: Unknowns, params: dict, truth: Truth, tables: Array, plan: Plan, held: dict[str, Array] | None = None
+) -> Rendering:
+    """The picture of one object of which this much is wrong; `held` are fields of its surfels that do not change."""
     cloud, names = truth.cloud, ["base_color", "roughness", "metallic", "positions"]
     names += [] if cloud.normals is None else ["normals"]
     cloud = dataclasses.replace(cloud, **{name: getattr(cloud, name) + getattr(wrong, name) for name in names})
     scene = spnr_jax.encode(params, cloud, truth.neighbors)
+    scene = dataclasses.replace(scene, surfels=dataclasses.replace(scene.surfels, **(held or {})))
     camera = move(truth.camera, wrong.pose, *fit_box(truth.cloud.positions, truth.cloud.mask))
     light = Light(tables=jnp.einsum("bc,bthw->thwc", truth.light + wrong.light, tables))
     return spnr_jax.render(params, scene, camera, light, plan=plan)
@@ -154,7 +158,8 @@ def nothing(truth: Truth) -> Unknowns:
 def compare_gradients(params: dict, truths: Sequence[Truth], tables: Array, plan: Plan) -> dict[str, list]:
     """Of each object gradient and central difference, in float64, of a random sum of pixels along a random direction.
 
-    With the normals of its surfels given, so that there is a gradient by them.
+    With the normals of its surfels given, so that there is a gradient by them.  What has no gradient, visibility and
+    sides (HELD), is held in the differences, too.
     """
     rows: dict[str, list] = {name: [] for name in Unknowns._fields}
     with jax.enable_x64(True):
@@ -163,11 +168,13 @@ def compare_gradients(params: dict, truths: Sequence[Truth], tables: Array, plan
             given = widen((params, truth._replace(cloud=dataclasses.replace(truth.cloud, normals=normals)), tables))
             random = np.random.default_rng(0).normal
             weights, zero = jnp.asarray(random(size=(truth.camera.height, truth.camera.width, 3))), nothing(given[1])
-            _, gradient = _sum_of_pixels(zero, *given, weights, plan)
+            surfels = _encode(given[0], given[1].cloud, given[1].neighbors).surfels
+            given = *given, {name: getattr(surfels, name) for name in HELD}, weights
+            _, gradient = _sum_of_pixels(zero, *given, plan)
             for name, found in rows.items():
                 along = jnp.asarray(random(size=getattr(zero, name).shape))
                 ends = [zero._replace(**{name: t * along}) for t in (DIFFERENCE, -DIFFERENCE)]
-                ahead, behind = (_sum_of_pixels(end, *given, weights, plan)[0] for end in ends)
+                ahead, behind = (_sum_of_pixels(end, *given, plan)[0] for end in ends)
                 found.append(
                     [float(jnp.vdot(getattr(gradient, name), along)), float(ahead - behind) / (2 * DIFFERENCE)]
                 )
@@ -176,8 +183,10 @@ def compare_gradients(params: dict, truths: Sequence[Truth], tables: Array, plan
 
 @partial(jax.jit, static_argnames="plan", compiler_options=QUICKEST)
 @jax.value_and_grad
-def _sum_of_pixels(wrong: Unknowns, params: dict, truth: Truth, tables: Array, weights: Array, plan: Plan) -> Array:
-    return jnp.sum(weights * draw(wrong, params, truth, tables, plan).image)
+def _sum_of_pixels(
+    wrong: Unknowns, params: dict, truth: Truth, tables: Array, held: dict, weights: Array, plan: Plan
+) -> Array:
+    return jnp.sum(weights * draw(wrong, params, truth, tables, plan, held).image)
 
 
 def widen(tree: Any) -> Any:

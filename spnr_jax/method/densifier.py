@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from spnr_jax.errors import UserError
 from spnr_jax.kernels.numerics import clamp, length, normalize, root
 from spnr_jax.kernels.records import AnyArray, PointCloud, Surfels
 from spnr_jax.surfels.geometry import estimate_surfels
@@ -337,11 +338,14 @@ def choose(nodes: Nodes, neighbors: Int[Array, "n 20"], places: Places, children
 def densify(params: dict, cloud: PointCloud, neighbors: Int[AnyArray, "points 20"]) -> PointCloud:
     """The cloud (unbatched, any units), then CHILDREN more points for each, of which `mask` says which are kept.
 
-    Pure, of fixed size: jit, vmap over equally padded clouds, grad.  `neighbors` are `spnr_jax.neighbors(cloud)`.  All
-    points have normals, measured ones those that are given or estimated; `invented` tells which are measured.
+    Pure, of fixed size: jit, vmap over equally padded clouds, grad.  `params` are those of the model, `neighbors` are
+    `spnr_jax.neighbors(cloud)`; `encode` needs those of the result.  All points have normals, measured ones those that
+    are given or estimated; `invented` tells which are measured.  UserError for params without a densifier.
     """
+    if "densifier" not in params:
+        raise UserError("densify: these params have no densifier; use those of spnr_jax.load()")
     inside, centre, scale = move_into_box(cloud)
-    dense = densify_in_box(params, inside, neighbors)
+    dense = densify_in_box(params["densifier"], inside, neighbors)
     children = dense.positions[len(cloud.mask) :] / scale + centre[None]
     return dataclasses.replace(dense, positions=jnp.concatenate([jnp.asarray(cloud.positions), children]))
 

@@ -269,7 +269,7 @@ def average_seen(
     points: Points, weight: Float[Array, "k points"], seen: Float[Array, "64 points"], rules: Rules = RULES
 ) -> Float[Array, "64 points"]:
     """What directions see of each point, averaged over the nearest of its layer: a depth buffer of points is noisy."""
-    size, rows = min(rules.block, len(points.mask)), seen.T
+    size, rows, weight = min(rules.block, len(points.mask)), seen.T, jax.lax.stop_gradient(weight)
 
     def one(block: tuple[Array, Array]) -> Array:
         return discs.average(*block, rows)

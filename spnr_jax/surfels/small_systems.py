@@ -40,7 +40,20 @@ def sum_products(
 def solve(
     matrix: Float[Array, "unknowns unknowns points"], right: Float[Array, "unknowns sides points"]
 ) -> Float[Array, "unknowns sides points"]:
-    """The solution of positive definite systems: Gauss-Jordan elimination, which needs no pivots for these."""
+    """The solution of symmetric positive definite systems; its gradients are solutions of the same systems."""
+    fixed = jax.lax.stop_gradient(matrix)
+
+    def multiply(x: Array) -> Array:
+        return reduce(add, (matrix[:, i][:, None] * x[i][None] for i in range(len(matrix))))
+
+    def eliminate(_: object, right: Array) -> Array:
+        return _eliminate(fixed, right)
+
+    return jax.lax.custom_linear_solve(multiply, right, eliminate, symmetric=True)
+
+
+def _eliminate(matrix: Array, right: Array) -> Array:
+    """Gauss-Jordan elimination, which needs no pivots for positive definite systems."""
     places = jnp.arange(len(matrix))[:, None, None]
 
     def eliminate(pivot: Array, rows: Array) -> Array:

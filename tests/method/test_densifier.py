@@ -25,7 +25,7 @@ estimate = jax.jit(estimate_surfels)
 
 @pytest.fixture(scope="module")
 def params():
-    return weights.read_densifier()
+    return {"densifier": weights.read_densifier()}
 
 
 @functools.cache
@@ -91,7 +91,7 @@ def test_no_two_children_are_nearer_than_the_closest(params):
     near = jnp.asarray(spnr_jax.neighbors(points))
     nodes = densifier.describe(estimate(points, near))
     places = place(nodes, near)
-    children = densifier.predict(params, nodes, near, places)
+    children = densifier.predict(params["densifier"], nodes, near, places)
     chosen = np.asarray(densifier.choose(nodes, near, places, children))
     scale = np.asarray(places.scale)[chosen]
     positions = np.asarray(children.position)[chosen]
@@ -159,9 +159,9 @@ def test_few_points_and_equal_ones_stay_finite(params, positions):
 
 def test_the_handle_densifies_sparse_clouds_alone(params):
     sparse = cloud(shape("sphere", 300)[0])
-    dense = surfel_pictures.densify_sparse({"densifier": params}, sparse)
+    dense = surfel_pictures.densify_sparse(params, sparse)
     assert 2 * 300 < len(dense.mask) < 5 * 300
     assert dense.mask.all()
     assert surfel_pictures.densify_sparse({}, sparse) is sparse
     many = cloud(shape("sphere", densifier.MOST_POINTS + 1)[0])
-    assert surfel_pictures.densify_sparse({"densifier": params}, many) is many
+    assert surfel_pictures.densify_sparse(params, many) is many
