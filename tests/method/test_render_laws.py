@@ -16,7 +16,8 @@ from spnr_jax.kernels.records import Rendering
 from spnr_jax.method import surfel_renderer
 from spnr_jax.method.surfel_renderer import Plan, plan, render
 from spnr_jax.surfels.lighting import room_light, sun
-from spnr_jax.surfels.surfel_scenes import encode_in_box
+from spnr_jax.surfels.neighbors import neighbors
+from spnr_jax.surfels.surfel_scenes import encode, encode_in_box
 
 CONFIG = SurfelConfig(widths=(4, 6), top=4)
 EYES = (0.3, 0.4, 2.4), (1.5, 1.0, 1.5)
@@ -77,6 +78,21 @@ def test_mapped_over_objects_cameras_and_lights_it_is_the_loop_over_them_by_one_
     together = jax.jit(each)(params, stacked(scenes), stacked(views), stacked(lights))
     close(together, stacked([stacked([stacked(row) for row in rows]) for rows in loop]), rtol=1e-4, atol=1e-4)
     assert np.std(np.asarray(together.image), axis=(0, 1, 2)).max() > 0.05  # they differ
+
+
+@pytest.mark.ci
+def test_compiled_it_is_what_its_operations_give_one_by_one(params, views, lights):
+    """From the cloud to the picture."""
+    points = cloud(shape("sphere", 90, "random")[0], base_color=np.random.default_rng(3).random((90, 3)))
+    near = neighbors(points)
+
+    def draw(points):
+        return render(params, in_units(encode(params, points, near)), views[0], lights[1], plan=ROOM)
+
+    eager, compiled = draw(points), jax.jit(draw)(points)
+    assert int(eager.overflow) == 0
+    close(eager, compiled, rtol=1e-3, atol=1e-3)
+    assert np.std(np.asarray(eager.image)) > 0.05
 
 
 def test_what_does_not_fit_into_a_plan_is_counted_and_what_fits_is_whole(params, scenes, views):
