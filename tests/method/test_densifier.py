@@ -129,7 +129,7 @@ def test_a_turned_cloud_has_turned_children(params):
     one, two = (run(params, x, spnr_jax.neighbors(x)) for x in (points, other))
     there = cKDTree(np.asarray(two.positions)[np.asarray(two.mask)])
     distance = there.query(np.asarray(one.positions)[np.asarray(one.mask)] @ turn.T)[0]
-    assert (distance < 2e-3).mean() > 0.75  # openness is seen from directions that do not turn
+    assert (distance < 2e-3).mean() > 0.7  # openness is seen from directions that do not turn
 
 
 @pytest.mark.ci
