@@ -94,7 +94,8 @@ def map_blocks(
     """What the work gives for each block of points, end to end.
 
     It is called with the neighborhoods of the block, which hold these columns of the neighbors, with the neighbors'
-    numbers, and with the rows of `own` arrays (..., points).  All numbers of a block travel in one array.
+    numbers, and with the rows of `own` arrays (..., points).  All numbers of a block travel in one array.  A gradient
+    computes each block anew: what it keeps does not grow with the work.
     """
     count = points.mask.shape[0]
     size = min(rules.block, count)
@@ -116,9 +117,9 @@ def map_blocks(
         return jax.lax.cond(jnp.any(block[0] >= 0), compute, skip, *block)  # blocks of padding cost nothing
 
     if size == count:
-        return _unpack(compute(number, packed), forms[-1])
+        return _unpack(jax.checkpoint(compute)(number, packed), forms[-1])
 
-    found = jax.lax.map(one, (_split(number, size, -1), _split(packed, size, 0)))
+    found = jax.lax.map(jax.checkpoint(one), (_split(number, size, -1), _split(packed, size, 0)))
     return _unpack(jnp.moveaxis(found, 0, 1).reshape(found.shape[1], -1)[:, :count], forms[-1])
 
 
