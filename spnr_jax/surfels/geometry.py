@@ -95,7 +95,7 @@ def map_blocks(
 
     It is called with the neighborhoods of the block, which hold these columns of the neighbors, with the neighbors'
     numbers, and with the rows of `own` arrays (..., points).  All numbers of a block travel in one array.  A gradient
-    computes each block anew: what it keeps does not grow with the work.
+    keeps the inputs of a block alone and computes the block anew.
     """
     count = points.mask.shape[0]
     size = min(rules.block, count)
