@@ -159,7 +159,7 @@ def frame_programs(options: WhereTimeGoes) -> dict[str, Program]:
         "entries made and sorted": program(partial(projection.entries, room=plan.entries), scene.surfels, window),
         "blended, lit": program(blend, found, light),
         "network, light on materials": program(
-            partial(surfel_renderer.shade_window, plan=plan), variables, scene, camera, light, blended, None
+            partial(surfel_renderer.shade_window, plan=plan), variables, scene, camera, light, blended
         ),
         "product of matrices": peak(),
     }
