@@ -14,7 +14,7 @@ import io
 import json
 import re
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import numpy as np
 from PIL import Image
@@ -205,9 +205,3 @@ def write_text(location: Location, text: str) -> None:
 def json_text(content) -> str:
     """The content as indented JSON with sorted keys; a number that is not finite is an error."""
     return json.dumps(content, indent=1, sort_keys=True, allow_nan=False) + "\n"
-
-
-def file_of(folder: Path, name: str) -> Path | None:
-    """The file that a name in an object.json means, None where it leads out of the object's folder."""
-    parts = PurePosixPath(name).parts
-    return folder / name if parts and not {"..", "/"} & set(parts) and "\\" not in name else None

@@ -143,18 +143,6 @@ def linear(image: np.ndarray) -> np.ndarray:
     return np.asarray(srgb_to_linear(jnp.asarray(image)))
 
 
-def log_light(picture: np.ndarray, where: np.ndarray) -> np.ndarray:
-    """Logarithm of the linear light, mean of the colours, of some pixels of a picture."""
-    return np.log(np.maximum(linear(picture[..., :3])[where].mean(axis=-1), DARK))
-
-
-def correlation(ours: np.ndarray, theirs: np.ndarray) -> float:
-    """Of two changes of light; 0 where one of them is flat."""
-    if not ours.size or min(ours.std(), theirs.std()) < 1e-6:
-        return 0.0
-    return float(np.corrcoef(ours, theirs)[0, 1])
-
-
 def _write(out: Path, found: Found, shown: Sequence[Sequence]) -> None:
     """Tables, results.json and the gallery."""
     rows = {

@@ -4,7 +4,7 @@ Every step is one pass over all points of a block, which a CPU does in vectors; 
 ten times as long.
 """
 
-from functools import reduce
+from functools import partial, reduce
 from operator import add
 
 import jax
@@ -42,14 +42,16 @@ def solve(
 ) -> Float[Array, "unknowns sides points"]:
     """The solution of symmetric positive definite systems; its gradients are solutions of the same systems."""
     fixed = jax.lax.stop_gradient(matrix)
+    return jax.lax.custom_linear_solve(
+        partial(multiply, matrix), right, lambda _, right: _eliminate(fixed, right), symmetric=True
+    )
 
-    def multiply(x: Array) -> Array:
-        return reduce(add, (matrix[:, i][:, None] * x[i][None] for i in range(len(matrix))))
 
-    def eliminate(_: object, right: Array) -> Array:
-        return _eliminate(fixed, right)
-
-    return jax.lax.custom_linear_solve(multiply, right, eliminate, symmetric=True)
+def multiply(
+    left: Float[Array, "rows terms points"], right: Float[Array, "terms columns points"]
+) -> Float[Array, "rows columns points"]:
+    """Products of small matrices."""
+    return reduce(add, (left[:, i][:, None] * right[i][None] for i in range(len(right))))
 
 
 def _eliminate(matrix: Array, right: Array) -> Array:
@@ -121,7 +123,7 @@ def project_largest(matrix: Float[Array, "3 3 points"]) -> Float[Array, "3 3 poi
     """
 
     def square(_: Array, power: Array) -> Array:
-        power = reduce(add, (power[:, i][:, None] * power[i][None] for i in range(3)))
+        power = multiply(power, power)
         return power / (power[0, 0] + power[1, 1] + power[2, 2])[None, None]
 
     scaled = matrix / (matrix[0, 0] + matrix[1, 1] + matrix[2, 2])[None, None]

@@ -98,13 +98,6 @@ class GltfBuilder:
         return {name: json.dumps(self.document).encode(), "data.bin": self.binary}
 
 
-def parts_of(content: bytes) -> tuple[dict, bytes]:
-    """Document and binary chunk of a .glb file."""
-    assert content[:4] == b"glTF"
-    size = struct.unpack_from("<I", content, 12)[0]
-    return json.loads(content[20 : 20 + size]), content[20 + size + 8 :]
-
-
 UV = np.array([[0, 1], [1, 1], [1, 0], [0, 0]], np.float32)  # upright: v runs down the picture
 CHECKER = np.random.default_rng(0).integers(0, 256, (4, 6, 3))
 
