@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from spnr_jax.kernels.numerics import clamp, larger
+from spnr_jax.kernels.numerics import clamp, larger, with_gradient
 from spnr_jax.surfels.rules import Rules
 from spnr_jax.surfels.small_systems import cross, dot, find_narrowest, frame, solve, sum_products, total, unit
 
@@ -83,6 +83,21 @@ def select(chosen: Bool[Array, " block"], new: Array, old: Array | float | int) 
 def along(vectors: Float[Array, "k 3 block"], axis: Float[Array, "3 block"]) -> Float[Array, "k block"]:
     """Components of the vectors along one axis for each point."""
     return vectors[:, 0] * axis[0][None] + vectors[:, 1] * axis[1][None] + vectors[:, 2] * axis[2][None]
+
+
+def _components(vectors: Array, axes: Array) -> tuple[Array, Array, Array]:
+    """Components of vectors (k, 3, block) along three axes (3, 3, block), (k, block) each."""
+    return along(vectors, axes[0]), along(vectors, axes[1]), along(vectors, axes[2])
+
+
+def _pull_back_components(primals: tuple[Array, Array], cotangents: tuple[Array, Array, Array]) -> tuple[Array, Array]:
+    """By vectors and axes: sums over the neighbors as JAX derives them are computed one number at a time on a CPU."""
+    vectors, axes = primals
+    given = jnp.stack(cotangents, axis=1)
+    return jnp.stack([along(given, axes[:, i]) for i in range(3)], axis=1), sum_products(given, vectors)
+
+
+components = with_gradient(_components, _pull_back_components)
 
 
 def weigh_near(hood: Hood, spacing: Float[Array, " block"], rules: Rules) -> Float[Array, "k block"]:
@@ -214,7 +229,7 @@ def _fit_quadric(
     def improve(_: Array, last: tuple[Fit, Array]) -> tuple[Fit, Array]:
         (_, scale, _), rest = last[0].layer, last[1]
         axes = frame(last[0].layer.normal)
-        one, two, up = (along(offset, axis) for axis in axes)
+        one, two, up = components(offset, axes)
         own = weight * jnp.exp(-0.5 * (rest / scale[None]) ** 2)
         terms = [one, two, one * one, one * two, two * two, *([] if unlike is None else [unlike])]
         unknown = jnp.stack(terms, axis=1)
