@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Array, Float, UInt8
 from tqdm import tqdm
 
-from spnr_jax.config import SurfelConfig, TrainConfig
+from spnr_jax.config import TrainConfig
 from spnr_jax.errors import UserError
 from spnr_jax.formats.clouds import MOST_EVEN
 from spnr_jax.formats.data_sets import Dataset, ObjectData, read_object
@@ -31,11 +31,12 @@ from spnr_jax.kernels import cameras
 from spnr_jax.kernels.cleaning import Cleaned, cleaned
 from spnr_jax.kernels.records import Camera, Crops, Light, PointCloud, Surfels, SurfelScene
 from spnr_jax.kernels.thinning import farthest_points
-from spnr_jax.method import surfel_pictures, surfel_renderer
+from spnr_jax.method import surfel_method, surfel_renderer
 from spnr_jax.surfels import features, lighting, outward
 from spnr_jax.surfels.surfel_scenes import encode_in_box
 from spnr_jax.training.batching import read_ahead
 from spnr_jax.training.scan_faults import colours_alone, random_scan
+from spnr_jax.training.weights import add_companions
 
 CLOUDS = 2  # of each object
 SCANNED = 0.3  # share of them that are scanned and cleaned
@@ -54,6 +55,8 @@ TRIES, COVERED, DRAWN = 4, 0.15, 0.02  # places that are tried for a crop, until
 LARGEST = 6e4  # in float16; no light makes a picture brighter than white
 CLOUD, CROP = 3, 4  # streams of random numbers under one seed, beside those of `batching`
 
+ROOM = "procedural room"  # as the generator of data sets calls it
+
 Arrays = dict[str, np.ndarray]
 NAMES = ("seen", "maps", "ambient", "target")
 
@@ -64,6 +67,33 @@ class View(NamedTuple):
     path: Path
     number: int
     doublings: int
+
+
+def prepare(
+    config: TrainConfig, dataset: Dataset, run: Path, *, light: Light | None, own: range | None
+) -> Callable[[int], Generator[Crops, None, None]]:
+    """A function of a step: training batches from there on.  Missing G-buffers are made first, which takes a while.
+
+    ValueError where several processes train together: each would make them.
+    """
+    del own
+    if jax.process_count() > 1:
+        raise UserError(f"preset {config.preset} trains in one process; start it without --distributed")
+    variables = add_companions(config.model, {})
+    views = complete(dataset, light or light_of(dataset), config, run / "gbuffers", variables)
+    return lambda first_step: batches(views, config, first_step)
+
+
+def light_of(dataset: Dataset) -> Light:
+    """The light of pictures that have none of their own; ValueError if it is another than the room."""
+    described = dataset.settings.get("environment_map")
+    name = described.get("name", ROOM) if isinstance(described, dict) else ROOM
+    if name != ROOM:
+        raise UserError(
+            f"{dataset.folder}: lit by {name}, and the command trains in the {ROOM} alone; give the light of that map "
+            "to spnr_jax.training.trainer.train"
+        )
+    return lighting.room_light()
 
 
 def complete(dataset: Dataset, light: Light, config: TrainConfig, folder: Path, variables: dict) -> list[View]:
@@ -95,11 +125,10 @@ def _doublings(path: Path) -> list[int] | None:
 
 def make(item: ObjectData, number: int, light: Light, config: TrainConfig, variables: dict) -> Arrays:
     """The content of a file: views of the object's cloud of this number."""
-    assert isinstance(config.model, SurfelConfig)
     generator = np.random.default_rng((config.seed, CLOUD, zlib.crc32(item.name.encode()), number))
     side = int(generator.choice(SIDES))
     cloud = random_cloud(item.cloud, side, config, generator)
-    scene = encode_in_box(surfel_pictures.densify_sparse(variables, cloud))
+    scene = encode_in_box(surfel_method.densify_sparse(variables, cloud))
     arrays: Arrays = {}
     doublings: list[int] = []
     for index in generator.permutation(len(item.images))[: config.views_per_object]:
