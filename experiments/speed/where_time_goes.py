@@ -42,7 +42,7 @@ from spnr_jax.scoring.score_tables import Table, number, text
 from spnr_jax.surfels import projection
 from spnr_jax.surfels.lighting import room_light
 from spnr_jax.surfels.surfel_scenes import encode_in_box
-from spnr_jax.training import optimisation
+from spnr_jax.training import gbuffers, optimisation
 
 SIDE = 1024  # of the matrices whose product is the machine's pace
 
@@ -119,7 +119,7 @@ def step_programs(options: WhereTimeGoes) -> dict[str, Program]:
     shader = Shader(config.model.widths, config.model.top)
 
     def loss(params: dict, crops: Any) -> Any:
-        return surfel_method.loss({"params": params}, crops, config=config)
+        return gbuffers.loss({"params": params}, crops, config=config)
 
     def network(params: dict, seen: jax.Array) -> Any:
         return shader.apply({"params": params}, seen, options.doublings)

@@ -1,4 +1,4 @@
-"""Our method as training, the handle and the viewer use it: `surfel_renderer`, compiled, and its loss.
+"""Our method as the handle, scores and the viewer use it: `surfel_renderer`, compiled.
 
 Pictures are drawn at a quality, in a light, several views of common sizes, by two programs: the first is compiled anew
 for other numbers of entries and pixels, the second, with most of what takes XLA long, for other windows alone.
@@ -6,33 +6,28 @@ for other numbers of entries and pixels, the second, with most of what takes XLA
 
 import dataclasses
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
-from spnr_jax.config import SurfelConfig, TrainConfig
+from spnr_jax.config import SurfelConfig
 from spnr_jax.devices.compilation import QUICK, QUICKEST
 from spnr_jax.devices.side_by_side import two_at_a_time
 from spnr_jax.devices.traces import Kept
-from spnr_jax.kernels import cameras, cloud_arrays, losses
-from spnr_jax.kernels.metrics import psnr
-from spnr_jax.kernels.records import Camera, Crops, GBuffer, Key, Light, PointCloud, Rendering, SurfelScene, Volume
+from spnr_jax.kernels import cameras, cloud_arrays
+from spnr_jax.kernels.records import Camera, GBuffer, Key, Light, PointCloud, Rendering, SurfelScene, Volume
 from spnr_jax.kernels.resizing import enlarged
 from spnr_jax.method import densifier, surfel_renderer
-from spnr_jax.method.pixels import reconstruction_loss
 from spnr_jax.method.surfel_renderer import Blended, Sizes
-from spnr_jax.methods import Outcome
-from spnr_jax.nn.shader import Shader, picture
+from spnr_jax.nn.shader import Shader
 from spnr_jax.surfels import features
 from spnr_jax.surfels.lighting import room_light
 from spnr_jax.surfels.neighbors import neighbors
 from spnr_jax.surfels.surfel_scenes import encode_in_box
 
 BALANCED = 0.75  # of the pixels along a side, which are drawn and enlarged: docs/lab/performance.md
-LEAST_INSIDE = 1.0  # pixels; where nothing of the object is seen its error is 0
 
 
 class Asked(NamedTuple):
@@ -44,43 +39,10 @@ class Asked(NamedTuple):
     needed: Sizes
 
 
-# --- training ---------------------------------------------------------------------------------------------------------
-
-
 def init(key: Key, config: SurfelConfig) -> dict:
     """Fresh variables of the shader network."""
     side = 2 ** len(config.widths)
     return dict(Shader(config.widths, config.top).init(key, jnp.zeros((1, side, side, features.NUM_FEATURES)), 1))
-
-
-def loss(
-    variables: dict, crops: Crops, key: Key | None = None, *, config: TrainConfig
-) -> tuple[Float[Array, ""], Outcome]:
-    """(loss, outcome): errors of the picture on white and of the opacity, weighted as the config says."""
-    assert isinstance(config.model, SurfelConfig)
-    shader = Shader(config.model.widths, config.model.top)
-    params = {"params": variables["params"]}
-    outputs: Any = shader.apply(params, jnp.asarray(crops.seen), crops.doublings, crops.margin)
-    color, alpha = picture(outputs, jnp.asarray(crops.maps), jnp.asarray(crops.ambient), crops.doublings)
-    image = color * alpha[..., None] + 1 - alpha[..., None]  # on white, as the reference is
-    target = jnp.asarray(crops.target, jnp.float32) / 255
-    opacity = target[..., 3]
-    reference = target[..., :3] * opacity[..., None] + 1 - opacity[..., None]
-    value = reconstruction_loss(config, image, image, reference)
-    value += config.loss.opacity_weight * losses.mse(alpha, opacity)
-    value += config.loss.opacity_l1_weight * losses.l1(alpha, opacity)
-    squared = jnp.sum((image - reference) ** 2 * opacity[..., None])
-    return value, Outcome(
-        {
-            "psnr": jnp.mean(psnr(image, reference)),
-            "l1": losses.l1(image, reference),
-            "mse_inside": squared / (3 * jnp.maximum(jnp.sum(opacity), LEAST_INSIDE)),
-            "mse_opacity": losses.mse(alpha, opacity),
-        }
-    )
-
-
-# --- pictures ---------------------------------------------------------------------------------------------------------
 
 
 def encode(

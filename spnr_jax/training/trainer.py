@@ -74,9 +74,8 @@ def train(
 ) -> optimisation.TrainState:
     """The state after the config's last step; goes on where an earlier call left the run folder.
 
-    A new run begins with random weights, or with those of `init`.  On a mesh of devices (`placement.device_mesh`)
-    each of its processes calls this.  `on_event` is told what the loop is about to do; what was told before is done.
-    `light` is that of the data set's pictures, if the network sees the light and it is another than the room.
+    A new run begins with random weights, or those of `init`.  Each process of a mesh of devices calls this.  `on_event`
+    is told what the loop is about to do.  `light` is that of the data set's pictures, where it is not the room.
     """
     allocator.few_arenas()
     own = None if mesh is None else placement.own_objects(mesh, config.batch_objects)
@@ -97,9 +96,7 @@ def train(
             if first < step == joins and placement.leads():
                 tqdm.write(f"step {step}: the discriminator joins; the training step is compiled anew")
             tell("step", step, batch)
-            with placement.using(mesh):
-                batch = placement.place_batch(batch, mesh, config.batch_objects)
-                state, metrics = optimisation.jitted_train_step(state, batch, config=config, adversarial=step >= joins)
+            state, metrics = take_step(state, batch, config, mesh, adversarial=step >= joins)
             done = step + 1
             progress.step(done, metrics)
             last, stopping = done == config.num_steps, agreed(bool(requests))
@@ -112,10 +109,18 @@ def train(
             if last or stopping:
                 tell("end", done, None)
             if stopping and not last:
-                raise KeyboardInterrupt(
-                    f"stopped at step {done} of {config.num_steps}; the same command goes on from there"
-                )
+                words = f"stopped at step {done} of {config.num_steps}; the same command goes on from there"
+                raise KeyboardInterrupt(words)
     return state
+
+
+def take_step(
+    state: optimisation.TrainState, batch: Any, config: TrainConfig, mesh: Mesh | None, *, adversarial: bool
+) -> tuple[optimisation.TrainState, dict]:
+    """The state after a batch whose objects the devices share, and metrics."""
+    with placement.using(mesh):
+        batch = placement.place_batch(batch, mesh, config.batch_objects)
+        return optimisation.jitted_train_step(state, batch, config=config, adversarial=adversarial)
 
 
 @contextmanager

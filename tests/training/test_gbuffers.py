@@ -18,7 +18,6 @@ from spnr_jax.config import SurfelConfig
 from spnr_jax.formats import data_sets
 from spnr_jax.kernels.cameras import pinhole
 from spnr_jax.kernels.records import Crops, PointCloud, Surfels
-from spnr_jax.method import surfel_method
 from spnr_jax.surfels import features, lighting
 from spnr_jax.surfels.surfel_scenes import encode_in_box
 from spnr_jax.surfels.visibility import DIRECTIONS, spiral, tangents
@@ -29,7 +28,7 @@ AXES = pytest.mark.parametrize("axis", [0, 1])
 
 @partial(jax.jit, static_argnames="config")
 def loss(params, crops, config=CONFIG):
-    value, outcome = surfel_method.loss({"params": params}, crops, config=config)
+    value, outcome = gbuffers.loss({"params": params}, crops, config=config)
     return value, outcome.metrics
 
 
