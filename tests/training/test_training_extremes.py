@@ -10,14 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from support import tiny_dataset, tiny_training
-from support.tiny_baselines import NETWORKS
+from support.tiny_baselines import SHRUNKEN
 
 from spnr_jax.config import LossConfig, OptimizerConfig, TrainConfig
-from spnr_jax.formats import data_sets
 from spnr_jax.kernels import losses
 from spnr_jax.method import inference
-from spnr_jax.methods import METHODS
-from spnr_jax.presets import abo, shapenet_chair, small, tiny
 from spnr_jax.training import batching, optimisation, run_record, trainer
 
 pytestmark = pytest.mark.ci  # it trains several networks
@@ -127,61 +124,16 @@ def test_both_networks_stay_finite_in_twenty_steps_on(name):
     assert_finite(state)
 
 
-def shrunken(config: TrainConfig, precision: str, num_steps: int) -> TrainConfig:
-    """A preset with its own stages, passes, losses and schedule, at 16 rays a side and the narrowest layers."""
-    m, smaller = config.model, config.model.render_resolution // 16
-    encoder = dataclasses.replace(
-        m.encoder,
-        point_widths=tuple(width // 16 for width in m.encoder.point_widths),
-        point_features=4,
-        volume_resolution=2**m.encoder.num_stages,
-        base_width=2,
-        num_groups=min(m.encoder.num_groups, 2),
-    )
-    sizes = {f"{n}_resolution": getattr(m, f"{n}_resolution") // smaller for n in ("render", "resize", "image")}
-    model = dataclasses.replace(
-        m,
-        encoder=encoder,
-        field_width=8,
-        num_features=5,
-        sampling=dataclasses.replace(m.sampling, num_coarse=4, num_fine=4),
-        upsampler_width=4,
-        precision=precision,
-        **sizes,
-    )
-    loss = dataclasses.replace(config.loss, discriminator_width=4, r1_interval=2)
-    return shortened(dataclasses.replace(config, model=model, loss=loss), num_steps)
+BFLOAT16 = dataclasses.replace(TAME, model=dataclasses.replace(TAME.model, precision="bfloat16"))
+SLOW = {"paper, bfloat16": BFLOAT16, **SHRUNKEN}
 
 
-def shrunken_baseline(config: TrainConfig, num_steps: int) -> TrainConfig:
-    """A baseline's preset with its own units, losses and schedule, 8 pixels a side and the narrowest layers."""
-    small = next(model for model in NETWORKS.values() if isinstance(model, type(config.model)))
-    kept = ("near", "radius", "jitter", "density_scale", "kl_weight", "materials")
-    kept = {name: getattr(config.model, name) for name in kept if hasattr(config.model, name)}
-    model = dataclasses.replace(small, **kept, image_resolution=8 * config.pixel_stride)
-    return shortened(dataclasses.replace(config, model=model), num_steps)
-
-
-def shortened(config: TrainConfig, num_steps: int) -> TrainConfig:
-    """The config with few steps on few points of two objects."""
-    return dataclasses.replace(
-        config,
-        optimizer=dataclasses.replace(config.optimizer, warmup_steps=min(config.optimizer.warmup_steps, 2)),
-        num_steps=num_steps,
-        batch_objects=2,
-        min_points=8,
-        max_points=32,
-    )
-
-
-def images_of(config: TrainConfig, folder):
-    """The painted balls at the size that a config needs."""
-    return data_sets.open_dataset(tiny_dataset.write_dataset(folder, size=config.model.image_resolution))
-
-
-def train_under_debug_nans(config: TrainConfig, dataset):
-    """State after the config's steps while JAX looks for NaN in whatever a compiled function returns."""
-    with jax.debug_nans(True), closing(batching.batches(dataset, config, 0)) as batches:
+@pytest.mark.parametrize(
+    "config", [TAME, *(pytest.param(x, marks=pytest.mark.slow) for x in SLOW.values())], ids=["paper", *SLOW]
+)
+def test_no_step_of_a_training_makes_a_nan(config):
+    """While JAX looks for NaN in whatever a compiled function returns."""
+    with jax.debug_nans(True), closing(batching.batches(tiny_dataset.dataset(), config, 0)) as batches:
         state = optimisation.jitted_create_state(config)
         for step, batch in enumerate(batches):
             adversarial = step >= optimisation.first_adversarial_step(config)
@@ -190,28 +142,6 @@ def train_under_debug_nans(config: TrainConfig, dataset):
             )
             assert_finite(metrics)
     assert_finite(state)
-    return state
-
-
-class TestNoNaN:
-    def test_a_few_steps_of_shrunken_tiny_make_none(self, tmp_path):
-        config = with_losses(shrunken(tiny(), "float32", 4), adversarial_weight=0.0)
-        assert train_under_debug_nans(config, images_of(config, tmp_path)).step == 4
-
-    @pytest.mark.slow
-    @pytest.mark.parametrize(
-        ("preset", "precision"), [(abo, "bfloat16"), (shapenet_chair, "float32"), (small, "bfloat16")]
-    )
-    def test_twenty_steps_of_shrunken_presets_make_none(self, preset, precision, tmp_path):
-        config = shrunken(preset(), precision, 20)
-        assert optimisation.first_adversarial_step(config) in range(1, 20), "both phases are trained"
-        assert train_under_debug_nans(config, images_of(config, tmp_path)).step == 20
-
-    @pytest.mark.slow
-    @pytest.mark.parametrize("preset", [preset for method in METHODS.values() for preset in method.presets])
-    def test_twenty_steps_of_each_shrunken_baseline_make_none(self, preset, tmp_path):
-        config = shrunken_baseline(preset(), 20)
-        assert train_under_debug_nans(config, images_of(config, tmp_path)).step == 20
 
 
 @pytest.mark.slow
