@@ -205,6 +205,7 @@ def run_export(command: Export) -> None:
         return
     from spnr_jax.formats.images import write_whole
     from spnr_jax.method import model
+    from spnr_jax.methods import method_of
     from spnr_jax.tools import export
     from spnr_jax.training import weights
 
@@ -218,7 +219,7 @@ def run_export(command: Export) -> None:
             handle, resolution=size, quality=quality, reach=command.reach, num_points=points, platforms=where
         ),
     }
-    if handle.config.method == "surfels":
+    if method_of(handle.config).takes_light:
         write_whole(command.out / "light.npz", export.room_light())
     for name, content in functions.items():
         write_whole(command.out / f"{name}.jax", content)

@@ -1,8 +1,8 @@
 """Every number of a network and of its training, as frozen dataclasses; `presets.py` fills them in.
 
     EncoderConfig   points to a volume, with which the paper's network begins
-    PaperConfig     the paper's network             method/paper_network.py
-    SurfelConfig    the network over surfels        method/surfel_renderer.py
+    PaperConfig     the paper's network             method/paper_method.py
+    SurfelConfig    the network over surfels        method/surfel_method.py
     TrainConfig     a training: one of these, losses, optimiser, batches
     RenderOptions   how a render is asked for
 
@@ -19,6 +19,7 @@ from typing import Any, ClassVar, Literal, get_args, get_origin, get_type_hints
 
 from spnr_jax.errors import require
 
+Quality = Literal["draft", "balanced", "best", "trained"]
 Material = Literal["base_color", "roughness", "metallic"]
 MATERIAL_CHANNELS = {"base_color": 3, "roughness": 1, "metallic": 1}
 MOST_LAYERS, MOST_STAGES = 32, 16  # of a network: a damaged file must not cost minutes of tracing
@@ -138,6 +139,12 @@ class NetworkConfig:
 
     method: ClassVar[str] = "none"
     """What the network is, for files and tables."""
+    qualities: ClassVar[tuple[Quality, ...]] = ("best",)
+    """Levels of quality at which its pictures differ, the best first."""
+    has_discriminator: ClassVar[bool] = False
+    """Whether its loss may be adversarial."""
+    ray_block: ClassVar[int | None] = None
+    """Rays rendered at once where no other number is asked for; None: the network's own."""
 
     image_resolution: int = 128
     """Pixels along each side of the pictures of the training."""
@@ -166,6 +173,9 @@ class PaperConfig(NetworkConfig):
     """Sizes of the paper's network: encoder, sampling, field, upsampler."""
 
     method: ClassVar[str] = "paper"
+    qualities: ClassVar[tuple[Quality, ...]] = ("best", "balanced", "draft", "trained")
+    has_discriminator: ClassVar[bool] = True
+    ray_block: ClassVar[int | None] = 1024  # through all the box at once: about 80 MB at 128 samples
 
     encoder: EncoderConfig = field(default_factory=EncoderConfig)
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
@@ -214,9 +224,10 @@ class PaperConfig(NetworkConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class SurfelConfig(NetworkConfig):
-    """Our network over the G-buffer of surfels (`method/surfel_renderer.py`)."""
+    """Our network over the G-buffer of surfels (`method/surfel_method.py`)."""
 
     method: ClassVar[str] = "surfels"
+    qualities: ClassVar[tuple[Quality, ...]] = ("best", "balanced", "draft")
 
     image_resolution: int = 512
     """Pixels along each side of a picture where no other size is asked for."""
@@ -340,8 +351,8 @@ class TrainConfig:
             "least 24, or adversarial_weight 0",
         )
         require(
-            self.loss.adversarial_weight == 0 or isinstance(self.model, PaperConfig),
-            f"adversarial_weight {self.loss.adversarial_weight} is for the paper's network alone; use 0",
+            self.loss.adversarial_weight == 0 or self.model.has_discriminator,
+            f"adversarial_weight {self.loss.adversarial_weight}: {self.model.method} has no discriminator; use 0",
         )
         require(
             self.pixel_stride == 1 or (self.model.per_pixel and self.model.image_resolution % self.pixel_stride == 0),

@@ -17,23 +17,58 @@ from collections.abc import Callable
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from spnr_jax.config import NetworkConfig, PaperConfig, SurfelConfig, TrainConfig, mismatch, types_of
 from spnr_jax.errors import UserError, first_line, require
 from spnr_jax.presets import PRESETS
 
+Function = Callable[..., Any]
+
+
+def later(place: str) -> Function:
+    """The function at "package.module:name"; its module is imported when it is first called."""
+    module, _, name = place.partition(":")
+
+    def call(*arguments: Any, **named: Any) -> Any:
+        return getattr(importlib.import_module(module), name)(*arguments, **named)
+
+    return call
+
 
 @dataclass(frozen=True, kw_only=True)
 class Method:
-    """What the package asks of a method."""
+    """A record of functions: all that training, `load`, evaluation, the commands and the viewer know of a network.
+
+    Those that are not given are of a Linen module, `network` (`method/inference.py`).
+    """
 
     config: type[NetworkConfig]
     """Its sizes; their `method` is its name."""
-    network: str | Callable[[Any], Any] | None
+    network: str | Function | None = None
     """Of sizes a Linen module with `encode(cloud, train)`, `render(scene, camera, options)` and
     `__call__(cloud, camera, key, train)`, or its place as "package.module:Name"; what it sows into "losses" is added to
-    the loss of a training.  None: the network is no such module (surfels)."""
+    the loss of a training."""
+    init: Function = later("spnr_jax.method.inference:init")
+    """(key, config) -> fresh variables {"params", "batch_stats"}."""
+    encode: Function = later("spnr_jax.method.inference:encode_volume")
+    """(variables, cloud, centre, scale, *, config) -> `Volume` of a cloud in the box, unbatched."""
+    render: Function = later("spnr_jax.method.inference:draw_each")
+    """(variables, volume, views, lights, *, config, quality) -> iterator of `Rendering`s, one a view."""
+    prepare: Function = later("spnr_jax.training.batching:prepare")
+    """(config, dataset, run, *, light, own) -> function of a step that gives the batches from there on."""
+    loss: Function = later("spnr_jax.method.inference:loss")
+    """(variables, batch, key, *, config) -> (value, `Outcome`); pure, differentiated by the first argument's params."""
+    discriminator: Function | None = None
+    """(config) -> Linen module (image, condition, mask) -> logits, if its loss may have one."""
+    export_encode: Function = later("spnr_jax.tools.volume_export:export_encode")
+    """(model, *, num_points) -> pure function of dicts of arrays, and the shapes that it takes."""
+    export_render: Function = later("spnr_jax.tools.volume_export:export_render")
+    """(model, *, num_points, size, quality, reach, plan) -> the same of a picture."""
+    takes_light: bool = False
+    """Whether pictures are drawn in any light; the others know the light of their training alone."""
+    companions: tuple[str, ...] = ()
+    """Networks of the package whose weights lie beside its own in the variables, under their names."""
     presets: tuple[Callable[[], TrainConfig], ...] = ()
     """Trainings of it, each named as its function."""
     label: str = ""
@@ -42,10 +77,40 @@ class Method:
     """The file or module that brought it; empty for those of the package."""
 
 
+class Outcome(NamedTuple):
+    """What a loss gives beside its value.
+
+    The pictures (objects, views, ...) and the batch that they are compared with are for a discriminator alone.
+    """
+
+    metrics: dict[str, Any]
+    statistics: dict | None = None
+    """Running statistics with those of the batch; None leaves them as they are."""
+    image: Any = None
+    batch: Any = None
+
+
 METHODS: dict[str, Method] = {
-    "surfels": Method(config=SurfelConfig, network=None, label="Surfels"),
+    "surfels": Method(
+        config=SurfelConfig,
+        init=later("spnr_jax.method.surfel_method:init"),
+        encode=later("spnr_jax.method.surfel_method:encode"),
+        render=later("spnr_jax.method.surfel_method:render"),
+        prepare=later("spnr_jax.training.gbuffers:prepare"),
+        loss=later("spnr_jax.training.gbuffers:loss"),
+        export_encode=later("spnr_jax.tools.surfel_export:export_encode"),
+        export_render=later("spnr_jax.tools.surfel_export:export_render"),
+        takes_light=True,
+        companions=("densifier",),
+        label="Surfels",
+    ),
     "paper": Method(
-        config=PaperConfig, network="spnr_jax.method.paper_network:PaperNetwork", label="The paper's network"
+        config=PaperConfig,
+        network="spnr_jax.method.paper_method:PaperNetwork",
+        encode=later("spnr_jax.method.paper_method:encode"),
+        render=later("spnr_jax.method.paper_method:render"),
+        discriminator=later("spnr_jax.method.paper_method:discriminator"),
+        label="The paper's network",
     ),
 }
 
@@ -121,10 +186,7 @@ def network(config: NetworkConfig) -> Any:
     """The Linen module that a network's config describes; it is imported when it is first asked for."""
     made = method_of(config).network
     assert made is not None, f"{config.method} is no Linen module"
-    if isinstance(made, str):
-        module, _, name = made.partition(":")
-        made = getattr(importlib.import_module(module), name)
-    return made(config)
+    return (later(made) if isinstance(made, str) else made)(config)
 
 
 def method_of(config: NetworkConfig) -> Method:

@@ -6,6 +6,7 @@ import inspect
 import re
 import shutil
 import tomllib
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -19,7 +20,7 @@ from spnr_jax import methods
 from spnr_jax.formats import data_sets
 from spnr_jax.presets import PRESETS
 from spnr_jax.tools import export
-from spnr_jax.training import weights
+from spnr_jax.training import run_record, weights
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -112,8 +113,10 @@ def test_a_method_and_losses_of_ones_own_work_as_their_page_shows_them(workplace
         monkeypatch.setitem(registry, "mean_color", None)  # is put back as it was: absent
         del registry["mean_color"]
     names = execute(DOCS / "own_network.md")
-    assert np.isfinite(names["values"]).all()
-    assert np.all(np.asarray(names["params"]["weight"]) != 0.5), "three steps change the weights"
+    loaded, again = names["mean"], spnr_jax.load(workplace / "runs" / "mean")
+    assert (np.asarray(loaded.params["params"]["weight"]) != 0.5).all(), "the loss is the one that is trained"
+    jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-3), loaded.params["params"], again.params["params"])
+    assert {"loss", "psnr"} <= run_record.read_rows(workplace / "runs" / "mean")[0].keys()
     gradient = [np.asarray(leaf) for leaf in jax.tree.leaves(names["by_weights"])]
     assert all(np.isfinite(leaf).all() for leaf in gradient)
     assert any(np.any(leaf) for leaf in gradient)

@@ -202,7 +202,7 @@ def test_a_picture_is_drawn_without_the_paper_s_network_and_what_trains():
     )
     drawing = own_code(modules_after(code)) - {"spnr_jax.training.weights"}
     assert "spnr_jax.method.surfel_renderer" in drawing
-    others = {f"spnr_jax.{part}" for part in ("method.paper_network", "method.march", "nn.encoder", "nn.unet3d")}
+    others = {f"spnr_jax.{part}" for part in ("method.paper_method", "method.inference", "nn.encoder", "nn.unet3d")}
     assert not drawing & others
     assert not {part for part in drawing if part.split(".")[1] in ("training", "scoring", "tools")}
 

@@ -1,6 +1,7 @@
-"""A method of one's own is trained, scored, written and loaded like the package's, and no file imports it by itself."""
+"""The method that the documents show is trained, scored, written and loaded like ours; no file imports it by itself."""
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -15,16 +16,16 @@ from spnr_jax.scoring import evaluation
 from spnr_jax.training import weights
 
 cli = command_line.unchecked_cli()
-SOURCE = Path(__file__).parent / "support" / "grey_method.py"
+PAGE = (Path(__file__).parents[1] / "docs" / "own_network.md").read_text()
+SOURCE = re.search(r"^```python\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)[1]
 
 
 def forget(patch: pytest.MonkeyPatch) -> None:
     """What was registered before, and nothing of this file's."""
     patch.setattr(methods, "_included", dict(methods._included))
     for registry in (methods.METHODS, PRESETS):
-        for name in ("grey",):
-            patch.setitem(registry, name, None)  # is put back as it was: absent
-            del registry[name]
+        patch.setitem(registry, "mean_color", None)  # is put back as it was: absent
+        del registry["mean_color"]
 
 
 @pytest.fixture
@@ -37,31 +38,31 @@ def fresh(monkeypatch):
 def run(tmp_path_factory):
     """A run of a few steps by the command, which reads the file beside it."""
     folder = tmp_path_factory.mktemp("own")
-    shutil.copy(SOURCE, folder / "my_method.py")
+    (folder / "my_method.py").write_text(SOURCE)
     with pytest.MonkeyPatch.context() as patch:
         forget(patch)
         patch.setattr(cli, "set_up_jax", lambda **_: None)
         patch.chdir(folder)
         data = tiny_dataset.dataset().folder
-        asked = ("train", data, "run", "--methods", "my_method.py", "--preset", "grey", "--lr-generator", "0.05")
-        assert command_line.exit_code(cli, *asked, "--warmup-steps", "0") == 0
+        asked = ("train", data, "run", "--methods", "my_method.py", "--preset", "mean_color")
+        assert command_line.exit_code(cli, *asked, "--image-resolution", str(tiny_dataset.SIZE)) == 0
         described = json.loads((folder / "run" / "config.json").read_text())["model"]
-        assert (described["method"], described["source"]) == ("grey", "my_method.py")
+        assert (described["method"], described["source"]) == ("mean_color", "my_method.py")
         trained = weights.read_trained("run")
         assert (np.asarray(trained.variables["params"]["weight"]) != 0.5).all(), "it has learnt"
         outcome = evaluation.evaluate(folder / "run", tiny_dataset.dataset(), say=lambda line: None)
-        assert outcome.summary["methods"]["grey"]["psnr"] > 5
-        weights.write_weights(folder / "w.npz", trained)
+        assert outcome.summary["methods"]["mean_color"]["psnr"] > 5
+        shutil.copy(folder / "run" / "weights.npz", folder / "w.npz")
     return folder / "run"
 
 
 @pytest.mark.parametrize("name", ["run", "w.npz"])
 def test_it_is_loaded_with_its_file_and_refused_in_one_line_without(name, run, fresh, monkeypatch):
     source = run.parent / name
-    with pytest.raises(ValueError, match=r"model\.method grey is not one of .*--methods my_method\.py") as error:
+    with pytest.raises(ValueError, match=r"model\.method mean_color is not one of .*--methods my_method\.py") as error:
         spnr_jax.load(source)
     assert "\n" not in str(error.value)
-    assert "grey" not in methods.METHODS, "nothing was imported"
+    assert "mean_color" not in methods.METHODS, "nothing was imported"
     monkeypatch.chdir(run.parent)
     handle = spnr_jax.load(source, methods="my_method.py")
     cloud = spnr_jax.read_cloud(tiny_dataset.dataset().folder / "objects" / "chair" / "points.ply")
@@ -93,14 +94,14 @@ def test_a_file_that_brings_no_method_is_refused_in_one_line(
         methods.include(name)
 
 
-def test_no_two_methods_have_one_name(fresh):
-    methods.include(SOURCE)
-    own = methods.METHODS["grey"]
+def test_no_two_methods_have_one_name(fresh, run):
+    methods.include(run.parent / "my_method.py")
+    own = methods.METHODS["mean_color"]
     other = type("OtherConfig", (own.config,), {})
-    with pytest.raises(ValueError, match="there is a method grey already"):
+    with pytest.raises(ValueError, match="there is a method mean_color already"):
         methods.register(methods.Method(config=other, network=own.network))
     another = type("AnotherConfig", (own.config,), {"method": "another"})
-    with pytest.raises(ValueError, match="there is a preset grey already"):
+    with pytest.raises(ValueError, match="there is a preset mean_color already"):
         methods.register(methods.Method(config=another, network=own.network, presets=own.presets))
     with pytest.raises(ValueError, match="method another is not registered"):
         methods.network(another())

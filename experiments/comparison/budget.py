@@ -24,7 +24,7 @@ from spnr_jax.config import TrainConfig
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
 from spnr_jax.presets import PRESETS
-from spnr_jax.training import adversary, batching, checkpoint, metrics_log, optimisation, trainer
+from spnr_jax.training import batching, checkpoint, optimisation, run_record, trainer
 
 Budget = Literal["quick", "tiny", "paper"]
 NETWORKS = ("paper", "npbg", "point_nerf", "points2nerf")
@@ -81,7 +81,7 @@ def within(
 
 def steps_within(seconds: float, config: TrainConfig, dataset: data_sets.Dataset) -> int:
     """How many steps fit into so many seconds here, those with the discriminator at their share and pace."""
-    alone = adversary.first_adversarial_step(config) / config.num_steps
+    alone = optimisation.first_adversarial_step(config) / config.num_steps
     pace = sum(
         share * step_seconds(config, dataset, adversarial)
         for share, adversarial in ((alone, False), (1 - alone, True))
@@ -131,7 +131,7 @@ def train(config: TrainConfig, dataset: data_sets.Dataset, run: Path) -> Trained
 def training_seconds(run: Path) -> float:
     """Seconds that a run's steps took over all calls, from its log: not compilation, previews and saving."""
     seconds, before = 0.0, 0
-    for row in metrics_log.read_rows(run):
+    for row in run_record.read_rows(run):
         if "ms_per_step" in row:
             seconds += (row["step"] - before) * row["ms_per_step"] / 1000
             before = row["step"]

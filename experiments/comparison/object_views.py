@@ -8,11 +8,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from spnr_jax.config import Quality
 from spnr_jax.formats import data_sets
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.records import Camera, Light, PointCloud, Volume
 from spnr_jax.kernels.resizing import mean_of_squares
-from spnr_jax.method.model import Model, Quality
+from spnr_jax.method.model import Model
 from spnr_jax.scoring.perceptual import flip
 from spnr_jax.scoring.picture_scores import sharpness
 

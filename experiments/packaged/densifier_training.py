@@ -39,7 +39,7 @@ from spnr_jax.method.densifier import CHILDREN, Densifier, Nodes, Places, blend,
 from spnr_jax.surfels import geometry, sides
 from spnr_jax.surfels.geometry import Points
 from spnr_jax.surfels.neighbors import order_in_space
-from spnr_jax.training.weights import read_densifier
+from spnr_jax.training.weights import read_variables, shipped
 
 TRUTH, VOTERS, EVEN = 2**17, 2**15, 2**12  # points of a surface, those that look for its sides, and even ones at most
 DENSER, MATCHED = 48, 48  # true points for each of a cloud, and those that a child is compared with
@@ -407,7 +407,7 @@ def train(options: Options) -> None:
     params = Densifier().init(jax.random.key(0), first.nodes, first.neighbors, first.places)["params"]
     print(f"{sum(x.size for x in jax.tree.leaves(params))} weights", flush=True)
     if options.start:
-        params = read_densifier(options.start)
+        params = read_variables(options.start or shipped("densifier"))
     state = {"params": params, "rule": rule.init(params), "step": 0}
     checkpoint = options.out / "checkpoint.npz"
     if checkpoint.exists():

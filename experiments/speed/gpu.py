@@ -34,12 +34,12 @@ from spnr_jax import cli
 from spnr_jax.config import PaperConfig, SurfelConfig, TrainConfig
 from spnr_jax.devices import machine
 from spnr_jax.kernels.records import Volume
-from spnr_jax.method import surfel_pictures, surfel_renderer
+from spnr_jax.method import surfel_method
 from spnr_jax.presets import PRESETS
 from spnr_jax.scoring.score_tables import Table, number, text
 from spnr_jax.surfels.lighting import room_light
 from spnr_jax.surfels.surfel_scenes import encode_in_box
-from spnr_jax.training import many_runs, optimisation, shading
+from spnr_jax.training import optimisation
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,10 +92,10 @@ def main(options: OnGPU) -> None:
 def films(options: OnGPU) -> list[Found]:
     """Frames of an orbit, each of them brought to the host."""
     config = SurfelConfig(widths=(4, 6), top=4) if options.quick else SurfelConfig()
-    variables, light = surfel_renderer.init(jax.random.key(0), config), room_light()
+    variables, light = surfel_method.init(jax.random.key(0), config), room_light()
     scene, rows = encode_in_box(sphere(options.points)), []
     volume = Volume(scene=scene, centre=scene.centre, scale=scene.scale)
-    draw = partial(surfel_pictures.draw_each, variables, volume, config=config, quality="best")
+    draw = partial(surfel_method.render, variables, volume, config=config, quality="best")
     for size in (32, 64) if options.quick else (512, 1024):
         views = [orbiting(size, 0.1 * frame) for frame in range(options.frames)]
 
@@ -112,7 +112,9 @@ def surfel_steps(options: OnGPU) -> list[Found]:
     """Training steps of the preset `surfels`, on crops that are on the device."""
     config = surfel_config(options)
     crops = random_crops(config, doublings=1)
-    compiled = compile_of(partial(shading.train_step, config=config), optimisation.jitted_create_state(config), crops)
+    compiled = compile_of(
+        partial(optimisation.train_step, config=config), optimisation.jitted_create_state(config), crops
+    )
     seconds = least(compiled.run, options.rounds)
     what = f"training of `surfels`, {len(crops.seen)} crops of {crops.seen.shape[1]} px doubled once"
     return [Found(what=what, unit="steps", a_second=1 / seconds, megabytes=compiled.megabytes)]
@@ -132,7 +134,7 @@ def many_trainings(options: OnGPU) -> list[Found]:
     tiny = partial(optimisation.train_step, config=config, adversarial=False)
     surfels = dataclasses.replace(surfel_config(options), batch_objects=2)
     crops = random_crops(surfels, doublings=1)
-    over_crops = partial(shading.train_step, config=surfels)
+    over_crops = partial(optimisation.train_step, config=surfels)
     return [
         at_once(options, "`tiny`", tiny, config, bench.our_batch(config)),
         at_once(options, f"`surfels`, 2 crops of {crops.seen.shape[1]} px,", over_crops, surfels, crops),
@@ -145,9 +147,9 @@ def at_once(options: OnGPU, name: str, step: Callable, config: TrainConfig, batc
     states = [optimisation.jitted_create_state(config, jnp.uint32(seed)) for seed in range(runs)]
     batches = jax.tree.map(lambda x: jnp.stack([x] * runs), batch)
     one = compile_of(step, states[0], batch)
-    axes = many_runs.AXES
+    axes = optimisation.AXES
     mapped = jax.vmap(step, in_axes=(axes, 0), out_axes=(axes, 0))
-    together = compile_of(mapped, many_runs.stack(states), batches)
+    together = compile_of(mapped, optimisation.stack(states), batches)
 
     def loop() -> list:
         return [one.run() for _ in range(runs)]

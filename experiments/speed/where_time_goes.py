@@ -35,14 +35,14 @@ from spnr_jax.devices import machine
 from spnr_jax.errors import at_least
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.records import Batch, Light, Volume
-from spnr_jax.method import surfel_pictures, surfel_renderer
+from spnr_jax.method import surfel_method, surfel_renderer
 from spnr_jax.nn.shader import Shader
 from spnr_jax.presets import PRESETS
 from spnr_jax.scoring.score_tables import Table, number, text
 from spnr_jax.surfels import projection
 from spnr_jax.surfels.lighting import room_light
 from spnr_jax.surfels.surfel_scenes import encode_in_box
-from spnr_jax.training import optimisation, shading
+from spnr_jax.training import gbuffers, optimisation
 
 SIDE = 1024  # of the matrices whose product is the machine's pace
 
@@ -117,7 +117,9 @@ def step_programs(options: WhereTimeGoes) -> dict[str, Program]:
     crops = random_crops(config, options.doublings)
     assert isinstance(config.model, SurfelConfig)
     shader = Shader(config.model.widths, config.model.top)
-    loss = partial(shading.loss, config=config)
+
+    def loss(params: dict, crops: Any) -> Any:
+        return gbuffers.loss({"params": params}, crops, config=config)
 
     def network(params: dict, seen: jax.Array) -> Any:
         return shader.apply({"params": params}, seen, options.doublings)
@@ -126,7 +128,7 @@ def step_programs(options: WhereTimeGoes) -> dict[str, Program]:
         return jax.grad(lambda params: jnp.sum(network(params, seen)))(params)
 
     return {
-        "whole step": program(partial(shading.train_step, config=config), state, crops),
+        "whole step": program(partial(optimisation.train_step, config=config), state, crops),
         "loss and its gradient": program(lambda p, c: jax.grad(loss, has_aux=True)(p, c)[0], state.generator, crops),
         "loss alone": program(lambda p, c: loss(p, c)[0], state.generator, crops),
         "network and its gradient": program(network_gradient, state.generator, crops.seen),
@@ -138,7 +140,7 @@ def step_programs(options: WhereTimeGoes) -> dict[str, Program]:
 def frame_programs(options: WhereTimeGoes) -> dict[str, Program]:
     """A frame as the handle draws it, and its programs alone."""
     config = SurfelConfig(image_resolution=options.size)
-    variables, light = surfel_renderer.init(jax.random.key(0), config), room_light()
+    variables, light = surfel_method.init(jax.random.key(0), config), room_light()
     scene, camera = encode_in_box(sphere(options.points)), orbiting(options.size)
     volume = Volume(scene=scene, centre=scene.centre, scale=scene.scale)
     doublings, side = surfel_renderer.resolution(scene, camera)
@@ -148,13 +150,13 @@ def frame_programs(options: WhereTimeGoes) -> dict[str, Program]:
     found = jax.jit(projection.entries, static_argnames="room")(scene.surfels, window, room=plan.entries)[0]
     blended = jax.jit(surfel_renderer.blend_window, static_argnames="plan")(scene, camera, light, plan=plan)
 
+    draw = partial(surfel_method.render, config=config, quality="best")
+
     def blend(found: projection.Entries, light: Light) -> object:
         return surfel_renderer.blend_entries(found, scene.surfels, light, window, slots=plan.slots)
 
     return {
-        "whole frame": Program(
-            lambda: surfel_pictures.draw(variables, volume, camera, light, config=config, quality="best").image, None
-        ),
+        "whole frame": Program(lambda: next(draw(variables, volume, [camera], [light])).image, None),
         "sizes counted": program(count, scene, camera),
         "entries made and sorted": program(partial(projection.entries, room=plan.entries), scene.surfels, window),
         "blended, lit": program(blend, found, light),

@@ -22,12 +22,13 @@ from tqdm import tqdm
 from experiments import entry_point
 from experiments.comparison import figures, results_folder
 from experiments.comparison.object_views import Picture, drawn, on_white, told, view_of, view_scores
+from spnr_jax.config import Quality
 from spnr_jax.devices import machine
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets, images
 from spnr_jax.kernels.colors import srgb_to_linear
 from spnr_jax.kernels.records import Camera, Light, Volume
-from spnr_jax.method.model import Model, Quality
+from spnr_jax.method.model import Model
 from spnr_jax.scoring.score_tables import Table, mean_row
 from spnr_jax.training.weights import load
 

@@ -29,13 +29,14 @@ from experiments import entry_point
 from experiments.comparison import figures, results_folder
 from experiments.comparison.object_views import Picture, at, cut, drawn, on_white, told, view_of
 from experiments.comparison.poisson import Renderer, trimmed_surface
-from spnr_jax.config import SurfelConfig
+from spnr_jax.config import Quality
 from spnr_jax.devices import machine
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets, images
 from spnr_jax.kernels import metrics
 from spnr_jax.kernels.records import PointCloud
-from spnr_jax.method.model import Model, Quality
+from spnr_jax.method.model import Model
+from spnr_jax.methods import method_of
 from spnr_jax.scoring.perceptual import flip
 from spnr_jax.scoring.picture_scores import ball, ball_waves, blue_share, plate, sharpness, under_true_opacity
 from spnr_jax.scoring.score_tables import Cell, Table, mean_row, number
@@ -123,7 +124,7 @@ def methods(
     for run in runs:
         model = load(run)
         found.append(Network(run, model, "best"))
-        if isinstance(model.config, SurfelConfig):
+        if method_of(model.config).takes_light:
             found.append(Network(f"{run}, discs and light alone", model, "draft"))
     if poisson:
         found.append(Poisson("Poisson, trimmed", Renderer(dataset.settings)))

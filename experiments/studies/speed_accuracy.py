@@ -38,12 +38,12 @@ from experiments.comparison import clock, figures, poisson, results_folder
 from experiments.comparison.object_views import few, on_white, told, view_of
 from experiments.comparison.trained_networks import test_objects
 from spnr_jax import cli
-from spnr_jax.config import NetworkConfig, PaperConfig, SurfelConfig
+from spnr_jax.config import NetworkConfig, Quality
 from spnr_jax.devices import machine
 from spnr_jax.formats import data_sets
 from spnr_jax.kernels import cameras, metrics
 from spnr_jax.kernels.records import Camera, Rendering, Volume
-from spnr_jax.method.model import Model, Quality
+from spnr_jax.method.model import Model
 from spnr_jax.scoring.perceptual import flip
 from spnr_jax.scoring.score_tables import Table, number, text
 from spnr_jax.training.weights import load
@@ -65,11 +65,7 @@ class Setting:
 
 def settings(config: NetworkConfig, counts: Sequence[int]) -> list[Setting]:
     """Every way to ask a network, its best level first; of all but the first number of points the levels alone."""
-    levels: tuple[Quality, ...] = ("best",)
-    if isinstance(config, SurfelConfig):
-        levels = ("best", "balanced", "draft")
-    elif isinstance(config, PaperConfig):
-        levels = ("best", "balanced", "draft", "trained")
+    levels = config.qualities
     common: dict[str, Any] = {"config": config, "points": counts[0]}
     ways = [Setting(group="level", name=level, quality=level, **common) for level in levels]
     if config.any_size:
@@ -77,7 +73,7 @@ def settings(config: NetworkConfig, counts: Sequence[int]) -> list[Setting]:
         ways += [Setting(name=f"best, {share:g} of the size", share=share, **enlarged) for share in SHARES]
         if "draft" in levels:
             ways.append(Setting(name="draft, 0.5 of the size", quality="draft", share=0.5, **enlarged))
-    if isinstance(config, PaperConfig):
+    if "trained" in levels:
         ways += _of_rays(config, counts[0])
     for count in counts[1:]:
         ways += [
@@ -88,7 +84,7 @@ def settings(config: NetworkConfig, counts: Sequence[int]) -> list[Setting]:
     return ways
 
 
-def _of_rays(config: PaperConfig, points: int) -> list[Setting]:
+def _of_rays(config: Any, points: int) -> list[Setting]:
     """Other samples along a ray, each drawn as the network was trained but for these, and bfloat16."""
     total = config.sampling.num_coarse + config.sampling.num_fine
     halves = [max(total // k, 2) for k in (1, 2, 4)]

@@ -1,5 +1,7 @@
 """The few operations on the arrays of a cloud before a network sees it: NumPy in, NumPy out."""
 
+from typing import Any
+
 import jax
 import numpy as np
 from jaxtyping import Float
@@ -60,3 +62,8 @@ def plain_cloud(
         mask=np.ones(count, bool),
         normals=normals,
     )
+
+
+def unstack(tree: Any) -> list[Any]:
+    """What lies at each place of the first axis of a tree's arrays."""
+    return [jax.tree.map(lambda x, i=i: x[i], tree) for i in range(len(jax.tree.leaves(tree)[0]))]

@@ -1,43 +1,36 @@
-"""What a trained network is asked for: scenes of clouds, and views of scenes.
+"""The functions of a method whose network is a Linen module (`methods.network`), and its loss.
 
-The config of a network finds its module (`methods.network`): any Linen module with `encode(cloud, train)` and
-`render(scene, camera, options)`.  A network is imported when it is first asked for, and no other with it.  The network
-over surfels, whose sizes are counted before they are compiled, is a module of functions beside these.
+    encode, render               batches of objects, in the box; pure
+    loss                         of a training batch; pure
+    encode_volume, draw          one object, compiled: what the handle (model.py), scores and the viewer ask for
 
-    encode, render               batches of objects, in the box: for training and scores
-    encode_volume, draw          one object, for the handle (model.py), which finds the same in surfel_pictures.py
+The module has `encode(cloud, train)`, `render(scene, camera, options)` and `__call__(cloud, camera, key, train)`.  What
+it sows into the collection "losses" is added to the loss.
 """
 
 import dataclasses
 from collections.abc import Iterator, Sequence
 from functools import partial
-from typing import Any, cast
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.spatial import cKDTree
 
-from spnr_jax.config import NetworkConfig, PaperConfig, RenderOptions, SamplingConfig, SurfelConfig
+from spnr_jax.config import NetworkConfig, RenderOptions, TrainConfig
 from spnr_jax.devices.compilation import QUICK
 from spnr_jax.errors import UserError
-from spnr_jax.kernels import cameras, cloud_arrays
-from spnr_jax.kernels.records import LARGEST_REACH, Camera, Key, Light, PointCloud, Rendering, Volume
+from spnr_jax.kernels import cameras, cloud_arrays, losses
+from spnr_jax.kernels.metrics import psnr
+from spnr_jax.kernels.records import Batch, Camera, Key, Light, PointCloud, Rendering, Volume
 from spnr_jax.kernels.resizing import averaged
-from spnr_jax.methods import network
-
-SAMPLES = {"draft": 0.25, "balanced": 0.5, "best": 1.0}  # share of the samples a ray was trained with
-REACH_PER_SPACING = 1.6  # what loses nothing from 128 to 4096 points, docs/lab/cpu_forms.md
-WHOLE_BLOCK = 1024  # rays that are sampled through all the box at once: about 80 MB at 128 samples
+from spnr_jax.method import pixels
+from spnr_jax.methods import Outcome, network
 
 
 def init(key: Key, config: NetworkConfig) -> dict:
     """Fresh variables of a config's network."""
-    if config.method == "surfels":
-        from spnr_jax.method import surfel_renderer
-
-        return surfel_renderer.init(key, cast(SurfelConfig, config))
     return dict(network(config).init(key, *example_inputs(config)))
 
 
@@ -53,7 +46,7 @@ def example_inputs(config: NetworkConfig) -> tuple[PointCloud, Camera]:
 
 
 def encode(variables: dict, cloud: PointCloud, *, config: NetworkConfig) -> Any:
-    """Scenes of the clouds, objects first on every array: feature volumes (objects, d, d, d, features) for ours."""
+    """Scenes of the clouds, objects first on every array."""
     return network(config).bind(variables).encode(cloud)
 
 
@@ -65,7 +58,7 @@ def render(
     On a CPU a pixel of one object of the paper's network has the same bits for every block from 256 to 2048 rays: the
     matrix products then add up in one order.
     """
-    options = options or trained(config)
+    options = options or RenderOptions(block=config.ray_block)
     if (side := options.rays_per_side) > 1:
         wide = cameras.resize(camera, side * camera.height, side * camera.width)
         narrow = dataclasses.replace(options, rays_per_side=1)
@@ -73,71 +66,44 @@ def render(
     return network(config).bind(variables).render(scene, camera, options)
 
 
-def trained(config: NetworkConfig) -> RenderOptions:
-    """Pictures as the network was trained; where a ray is sampled through all the box, few rays at once."""
-    return RenderOptions(block=WHOLE_BLOCK if config.method == "paper" else None)
-
-
-def rays_per_side(config: NetworkConfig, size: int) -> int:
-    """Rays along each side of a pixel of a picture `size` pixels wide, so that they lie as close as in the training.
-
-    A network that renders pictures of any size has learnt what a ray of its training sees, a cone of one pixel there.
-    The pixels of a smaller picture are wider: each is the mean of the rays that it would have had in the training.
-    """
-    sees_rays = config.any_size and config.method != "surfels"
-    return max(round(config.image_resolution / size), 1) if sees_rays else 1
-
-
 jitted_encode = jax.jit(encode, static_argnames="config")
 jitted_render = jax.jit(render, static_argnames=("config", "options"))
 
 
-def render_views(
-    variables: dict,
-    config: NetworkConfig,
-    cloud: PointCloud,
-    camera: Camera,
-    light: Light | Sequence[Light] | None = None,
-) -> Rendering:
-    """All views of one object (clouds of data sets are normalised already), one compilation for each number of views.
+# --- training ---------------------------------------------------------------------------------------------------------
 
-    The light, or one for each view, is for a network that sees it; None is the package's room.
-    """
-    if config.method == "surfels":
-        from spnr_jax.method import surfel_pictures
 
-        return surfel_pictures.draw_views(variables, cloud, camera, light, config=cast(SurfelConfig, config))
-    cloud, camera = jax.tree.map(lambda x: jnp.asarray(x)[None], (cloud, camera))
-    volume = jitted_encode(variables, cloud, config=config)
-    options = dataclasses.replace(trained(config), rays_per_side=rays_per_side(config, camera.width))
-    rendering = jitted_render(variables, volume, camera, config=config, options=options)
-    return jax.tree.map(lambda x: x[0], rendering)
+def loss(
+    variables: dict, batch: Batch, key: Key | None = None, *, config: TrainConfig
+) -> tuple[Float[Array, ""], Outcome]:
+    """(loss, outcome): errors of the pixels that a step renders, and the losses of the network's own."""
+    if key is not None:
+        key, batch = pixels.chosen(key, batch, config)
+    rendering, updated = network(config.model).apply(
+        variables, batch.cloud, batch.camera, key, train=True, mutable=["batch_stats", "losses"]
+    )
+    terms = {name: value for name, (value,) in updated.get("losses", {}).items()}
+    if config.loss.opacity_weight:
+        opacity = losses.area_downsample(jnp.asarray(batch.alpha)[..., None], rendering.acc.shape[-1])[..., 0]
+        terms["opacity"] = config.loss.opacity_weight * losses.mse(rendering.acc, opacity)
+    seen = rendering.acc > 0 if config.loss.masked else None
+    reference = jnp.asarray(batch.image)
+    value = pixels.reconstruction_loss(config, rendering.image, rendering.image_lr, reference, seen)
+    metrics = {"psnr": jnp.mean(psnr(rendering.image, reference)), "l1": losses.l1(rendering.image, reference)}
+    return sum(terms.values(), value), Outcome(metrics | terms, updated.get("batch_stats", {}), rendering.image, batch)
+
+
+# --- pictures ---------------------------------------------------------------------------------------------------------
 
 
 def encode_volume(
     variables: dict, cloud: PointCloud, centre: np.ndarray, scale: np.floating, *, config: NetworkConfig
 ) -> Volume:
     """Volume of a cloud in the box (unbatched), one compilation per bucket of points."""
-    positions = np.asarray(cloud.positions)
-    reach = LARGEST_REACH
-    if isinstance(config, PaperConfig):
-        reach = reach_of(positions[np.asarray(cloud.mask)], config.encoder.volume_resolution)
     cloud = dataclasses.replace(cloud, normals=None, materials_known=None)
-    cloud = cloud_arrays.pad(cloud, cloud_arrays.bucket(len(positions)))
+    cloud = cloud_arrays.pad(cloud, cloud_arrays.bucket(len(np.asarray(cloud.positions))))
     scene = _encode(variables, cloud, config=config)
-    return Volume(scene=scene, centre=jnp.asarray(centre), scale=jnp.asarray(scale), reach=reach)
-
-
-def draw(
-    variables: dict, volume: Volume, camera: Camera, light: Light | None, *, config: NetworkConfig, quality: str
-) -> Rendering:
-    """A view, or one axis of views; UserError for a light, and for odd sizes of a network that doubles its pictures."""
-    if light is not None:
-        raise UserError("this network knows the light of its training alone; give no light")
-    if config.upsamples and (camera.height % 2 or camera.width % 2):
-        raise UserError(f"this network doubles its pictures: {camera.width} x {camera.height} pixels must be even")
-    options = at_quality(config, quality, volume.reach, camera.width)
-    return _render(variables, volume.scene, volume.centre, volume.scale, camera, config=config, options=options)
+    return Volume(scene=scene, centre=jnp.asarray(centre), scale=jnp.asarray(scale))
 
 
 def draw_each(
@@ -151,7 +117,39 @@ def draw_each(
 ) -> Iterator[Rendering]:
     """Views one after the other."""
     for view, light in zip(views, lights, strict=True):
-        yield draw(variables, volume, view, light, config=config, quality=quality)
+        yield draw(variables, volume, view, light, config=config, options=options_of(config, quality, view.width))
+
+
+def draw(
+    variables: dict,
+    volume: Volume,
+    camera: Camera,
+    light: Light | None = None,
+    *,
+    config: NetworkConfig,
+    options: RenderOptions,
+) -> Rendering:
+    """A view; UserError for a light, and for odd sizes of a network that doubles its pictures."""
+    if light is not None:
+        raise UserError("this network knows the light of its training alone; give no light")
+    if config.upsamples and (camera.height % 2 or camera.width % 2):
+        raise UserError(f"this network doubles its pictures: {camera.width} x {camera.height} pixels must be even")
+    return _render(variables, volume.scene, volume.centre, volume.scale, camera, config=config, options=options)
+
+
+def options_of(config: NetworkConfig, quality: str, width: int) -> RenderOptions:
+    """Pictures as the network was trained; at `best` and `trained` with as many rays."""
+    side = rays_per_side(config, width) if quality in ("best", "trained") else 1
+    return RenderOptions(block=config.ray_block, rays_per_side=side)
+
+
+def rays_per_side(config: NetworkConfig, size: int) -> int:
+    """Rays along each side of a pixel of a picture `size` pixels wide, so that they lie as close as in the training.
+
+    A network that renders pictures of any size has learnt what a ray of its training sees, a cone of one pixel there.
+    The pixels of a smaller picture are wider: each is the mean of the rays that it would have had in the training.
+    """
+    return max(round(config.image_resolution / size), 1) if config.any_size else 1
 
 
 # These are compiled whole: each operation outside of a jit would be compiled alone, 30 ms apiece at the first call.
@@ -176,38 +174,8 @@ def _render(
     config: NetworkConfig,
     options: RenderOptions,
 ) -> Rendering:
-    """A view, or one axis of views, with the options of a quality; depth in the cloud's units."""
-    single = camera.cam_to_world.ndim == 2
-    inside = jax.tree.map(lambda x: x.reshape(1, -1, *x.shape[-2:]), cameras.in_box(camera, centre, scale))
-    scene = jax.tree.map(lambda x: x[None], scene)
-    rendering = render(variables, scene, inside, config=config, options=options)
+    """A view; depth in the cloud's units."""
+    scene, inside = jax.tree.map(lambda x: x[None], (scene, cameras.in_box(camera, centre, scale)))
+    rendering = render(variables, scene, jax.tree.map(lambda x: x[None], inside), config=config, options=options)
     rendering = dataclasses.replace(rendering, depth=rendering.depth / scale)
-    return jax.tree.map(lambda x: x[0, 0] if single else x[0], rendering)
-
-
-def at_quality(config: NetworkConfig, quality: str, reach: int, width: int) -> RenderOptions:
-    """The options that render a picture so wide at a quality, with samples within `reach` voxels of points."""
-    side = rays_per_side(config, width) if quality == "best" else 1
-    options = dataclasses.replace(trained(config), rays_per_side=side)
-    if quality == "trained" or not isinstance(config, PaperConfig):
-        return options
-    counts = config.sampling
-    samples = max(round(SAMPLES[quality] * (counts.num_coarse + counts.num_fine)), 1)
-    sampling = SamplingConfig(num_coarse=samples, num_fine=0, reach=reach)
-    return dataclasses.replace(options, sampling=sampling, block=None)
-
-
-def reach_of(positions: np.ndarray, resolution: int, num_queries: int = 4096) -> int:
-    """Voxels around points in which their surface lies, from the median distance to the nearest other point.
-
-    Copies of a point, closer than a 1024th of the box, count once.
-    """
-    x, y, z = np.floor((positions.T + 1) * 512).astype(np.int64)
-    _, distinct = np.unique((x * 2048 + y) * 2048 + z, return_index=True)
-    positions = positions[distinct]
-    if len(positions) < 2:
-        return LARGEST_REACH
-    queries = positions[:: -(-len(positions) // num_queries)]
-    distances, _ = cKDTree(positions).query(queries, 2)
-    spacing = np.median(distances[:, 1]) * resolution / 2
-    return int(np.clip(np.ceil(REACH_PER_SPACING * spacing), 1, LARGEST_REACH))
+    return jax.tree.map(lambda x: x[0, 0], rendering)

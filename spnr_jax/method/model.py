@@ -11,31 +11,29 @@ import dataclasses
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from types import ModuleType
-from typing import Literal, get_args
+from typing import get_args
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from spnr_jax.config import NetworkConfig
+from spnr_jax.config import NetworkConfig, Quality
 from spnr_jax.errors import UserError
 from spnr_jax.kernels import cameras, cloud_arrays
 from spnr_jax.kernels.records import Camera, Light, PointCloud, Rendering, SurfelScene, Volume
-from spnr_jax.method import inference
+from spnr_jax.methods import method_of
 
 FIELD_OF_VIEW, DISTANCE = np.deg2rad(40.0), 3.0  # of the training cameras; the object fits into the unit sphere
 Angle = float | int | np.floating | jax.Array  # degrees
-Quality = Literal["draft", "balanced", "best", "trained"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Model:
-    """A trained network.
+    """A trained network: the functions of its method (`methods.Method`) with its weights.
 
     Its programs are compiled once for each bucket of points and size of pictures; `encode` and `render` themselves also
-    work on the host, so they are not for `jax.jit` (`inference.encode` and `inference.render` of networks
-    other than that over surfels are).
+    work on the host, so they are not for `jax.jit`: `spnr_jax.encode` and `spnr_jax.render`, and of Linen modules
+    `inference.encode` and `inference.render`, are.
     """
 
     config: NetworkConfig
@@ -54,7 +52,7 @@ class Model:
         # the ends of a thin stick lie on the faces of the box: rounding must not push them out of it
         inside = np.clip((positions - centre) * scale, -1, 1).astype(np.float32)
         cloud = dataclasses.replace(cloud, positions=inside)
-        return self._pictures.encode_volume(self.variables, cloud, centre, scale, config=self.config)
+        return method_of(self.config).encode(self.variables, cloud, centre, scale, config=self.config)
 
     def render(
         self, volume: Volume, camera: Camera, quality: Quality = "best", light: Light | None = None
@@ -69,7 +67,10 @@ class Model:
         has several rays a pixel where pictures are smaller than those of the training.
         """
         _check_quality(quality)
-        return self._pictures.draw(self.variables, volume, camera, light, config=self.config, quality=quality)
+        if camera.cam_to_world.ndim == 2:
+            return next(self.render_each(volume, [camera], quality, [light]))
+        drawn = self.render_each(volume, cloud_arrays.unstack(camera), quality, [light] * len(camera.cam_to_world))
+        return jax.tree.map(lambda *x: np.stack(x), *drawn)
 
     def render_each(
         self,
@@ -84,7 +85,8 @@ class Model:
         """
         _check_quality(quality)
         lights = lights or [None] * len(views)
-        return self._pictures.draw_each(self.variables, volume, views, lights, config=self.config, quality=quality)
+        draw = method_of(self.config).render
+        return draw(self.variables, volume, views, lights, config=self.config, quality=quality)
 
     def camera(
         self,
@@ -105,14 +107,25 @@ class Model:
         """The weights, a pytree of arrays: what `spnr_jax.encode` and `spnr_jax.render` take."""
         return self.variables
 
-    @property
-    def _pictures(self) -> ModuleType:
-        """The module that encodes clouds and draws volumes with this kind of network; no other is imported."""
-        if self.config.method == "surfels":
-            from spnr_jax.method import surfel_pictures
 
-            return surfel_pictures
-        return inference
+def render_views(
+    variables: dict,
+    config: NetworkConfig,
+    cloud: PointCloud,
+    camera: Camera,
+    light: Light | Sequence[Light] | None = None,
+) -> Rendering:
+    """All views of one object in the box (clouds of data sets are), as the network was trained.
+
+    The light, or one for each view, is for a network that sees it; None is the package's room.
+    """
+    method, views = method_of(config), cloud_arrays.unstack(camera)
+    volume = method.encode(variables, cloud, np.zeros(3, np.float32), np.float32(1), config=config)
+    lights: Sequence[Light | None] = [None] * len(views)
+    if light is not None and method.takes_light:
+        lights = [light] * len(views) if isinstance(light, Light) else light
+    drawn = method.render(variables, volume, views, lights, config=config, quality="trained")
+    return jax.tree.map(lambda *x: np.stack(x), *drawn)
 
 
 @partial(jax.jit, static_argnames="size")

@@ -20,17 +20,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from spnr_jax.config import SurfelConfig
 from spnr_jax.devices.traces import Kept
 from spnr_jax.errors import UserError
 from spnr_jax.kernels import cameras
+from spnr_jax.kernels.cloud_arrays import unstack
 from spnr_jax.kernels.compositing import WHITE
 from spnr_jax.kernels.numerics import larger
 from spnr_jax.kernels.records import (
     AnyArray,
     Camera,
     GBuffer,
-    Key,
     Light,
     Rendering,
     Surfels,
@@ -74,12 +73,6 @@ class Sizes(NamedTuple):
     slots: Any
 
 
-def init(key: Key, config: SurfelConfig) -> dict:
-    """Fresh variables of the shader network."""
-    side = 2 ** len(config.widths)
-    return dict(Shader(config.widths, config.top).init(key, jnp.zeros((1, side, side, features.NUM_FEATURES)), 1))
-
-
 # --- sizes ------------------------------------------------------------------------------------------------------------
 
 
@@ -103,11 +96,6 @@ def plan(scene: SurfelScene, camera: Camera) -> Plan:
     doublings, side = common_resolution([resolution(*pair) for pair in pairs])
     needed = jax.device_get([count_sizes(*pair, doublings=doublings, side=side) for pair in pairs])
     return rounded(largest(needed), doublings, side)
-
-
-def unstack(tree: Any) -> list[Any]:
-    """What lies at each place of the first axis of a tree's arrays."""
-    return [jax.tree.map(lambda x, i=i: x[i], tree) for i in range(len(jax.tree.leaves(tree)[0]))]
 
 
 def resolution(scene: SurfelScene, camera: Camera, share: float = 1.0) -> tuple[int, int]:

@@ -22,7 +22,7 @@ from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
 from spnr_jax.kernels import metrics
 from spnr_jax.kernels.records import Camera, PointCloud
-from spnr_jax.method import inference
+from spnr_jax.method.model import render_views
 from spnr_jax.scoring import floors
 from spnr_jax.scoring.perceptual import flip, lpips
 from spnr_jax.scoring.summary import Scores, differences, metric_settings, summarise
@@ -108,7 +108,7 @@ def network(variables: dict, config: TrainConfig) -> Method:
 
     def show(cloud: PointCloud, camera: Camera) -> Pictures:
         cloud = dataclasses.replace(cloud, normals=None)
-        rendering = inference.render_views(variables, config.model, cloud, camera)
+        rendering = render_views(variables, config.model, cloud, camera)
         return Pictures(image=rendering.image, acc=rendering.acc, depth=rendering.depth)
 
     return show

@@ -11,13 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from spnr_jax.config import SurfelConfig
 from spnr_jax.errors import UserError
 from spnr_jax.formats.light_files import read_light
 from spnr_jax.kernels.cameras import camera_rays
 from spnr_jax.kernels.colors import linear_to_srgb
 from spnr_jax.kernels.records import Camera, Light, Rendering
 from spnr_jax.method.model import Model
+from spnr_jax.methods import method_of
 from spnr_jax.surfels.lighting import background, sun
 from spnr_jax.tools.light_options import Lighting
 
@@ -32,8 +32,8 @@ def light_of_options(options: Lighting, read: Callable[[str], Light] = read_ligh
 
 
 def takes_light(model: Model) -> bool:
-    """Whether the network accepts any light; only one over surfels does."""
-    return isinstance(model.config, SurfelConfig)
+    """Whether the network draws in any light."""
+    return method_of(model.config).takes_light
 
 
 def check_takes_light(model: Model, asked: Sequence[str], run: Path | None) -> None:

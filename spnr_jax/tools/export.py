@@ -16,24 +16,20 @@ What differs for the default network, over surfels, stands in `surfel_export.py`
 """
 
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from flax.serialization import from_state_dict, to_state_dict
 from jax import export
-from jaxtyping import Array, Bool, Float
 
+from spnr_jax.config import Quality
 from spnr_jax.errors import UserError
 from spnr_jax.formats.npz import packed
-from spnr_jax.kernels.records import LARGEST_REACH, Camera, PointCloud, Volume
-from spnr_jax.method import inference
-from spnr_jax.method.model import Model, Quality
+from spnr_jax.kernels.records import LARGEST_REACH
+from spnr_jax.method.model import Model
 from spnr_jax.method.surfel_renderer import Plan
+from spnr_jax.methods import method_of
 from spnr_jax.surfels import lighting
-from spnr_jax.tools import surfel_export
 
 Arrays = dict[str, Any]
 
@@ -45,16 +41,8 @@ def export_encode(model: Model, *, num_points: int = 1024, platforms: Sequence[s
     """
     if num_points < 1:
         raise UserError(f"num_points must be at least 1, got {num_points}")
-    if model.config.method == "surfels":
-        return _serialised(
-            partial(surfel_export.encode, model.params), platforms, surfel_export.cloud_shapes(num_points)
-        )
-
-    def encode(cloud: Arrays) -> Arrays:
-        scene, centre, scale = _encode(model, cloud)
-        return {"scene": to_state_dict(scene), "centre": centre, "scale": scale}
-
-    return _serialised(encode, platforms, surfel_export.cloud_shapes(num_points))
+    encode, shapes = method_of(model.config).export_encode(model, num_points=num_points)
+    return _serialised(encode, platforms, *shapes)
 
 
 def export_render(
@@ -80,23 +68,9 @@ def export_render(
         raise UserError(f"resolution must be a multiple of 4 of at least 16, got {size}")
     if not 1 <= reach <= LARGEST_REACH:
         raise UserError(f"reach must be 1 to {LARGEST_REACH} voxels, got {reach}")
-    camera = {"cam_to_world": _floats(3, 4), "intrinsics": _floats(3, 3)}
-    if model.config.method == "surfels":
-        if quality == "balanced":
-            raise UserError("balanced draws fewer pixels and enlarges them; export a smaller resolution")
-        sizes = plan or surfel_export.make_plan(model, num_points, size)
-        draw = partial(surfel_export.render, None if quality == "draft" else model.params, size=size, plan=sizes)
-        made = jax.eval_shape(partial(surfel_export.encode, model.params), surfel_export.cloud_shapes(num_points))
-        return _serialised(draw, platforms, made, camera, surfel_export.light_shapes())
-    scene, centre, scale = jax.eval_shape(partial(_encode, model), surfel_export.cloud_shapes(num_points=2))
-
-    def render(volume: Arrays, camera: Arrays) -> Arrays:
-        encoded = Volume(**volume | {"scene": from_state_dict(scene, volume["scene"])}, reach=reach)
-        drawn = model.render(encoded, Camera(**camera, height=size, width=size), quality)
-        return {name: values for name, values in to_state_dict(drawn).items() if values is not None}
-
-    volume = {"scene": to_state_dict(scene), "centre": centre, "scale": scale}
-    return _serialised(render, platforms, volume, camera)
+    make = method_of(model.config).export_render
+    render, shapes = make(model, num_points=num_points, size=size, quality=quality, reach=reach, plan=plan)
+    return _serialised(render, platforms, *shapes)
 
 
 def room_light() -> bytes:
@@ -122,32 +96,6 @@ def signature(content: bytes) -> dict[str, Any]:
         for tree, shapes in ((exported.in_tree, exported.in_avals), (exported.out_tree, exported.out_avals))
     )
     return {"inputs": list(arguments), "outputs": outputs, "platforms": list(exported.platforms)}
-
-
-def box_around(
-    positions: Float[Array, "points 3"], mask: Bool[Array, " points"]
-) -> tuple[Float[Array, "3"], Float[Array, ""]]:
-    """Centre and scale of `cloud_arrays.normalization` for the points that are not masked.
-
-    In float32, so the scale may differ in its last bits from that of `Model.encode`, which is computed in float64.
-    """
-    low = jnp.min(jnp.where(mask[:, None], positions, jnp.inf), axis=0)
-    high = jnp.max(jnp.where(mask[:, None], positions, -jnp.inf), axis=0)
-    diagonal = jnp.sqrt(jnp.sum((high - low) ** 2))
-    return (low + high) / 2, jnp.where(diagonal > 0, 2 / jnp.where(diagonal > 0, diagonal, 1), 1)
-
-
-def _encode(model: Model, cloud: Arrays) -> tuple[Any, Array, Array]:
-    """Scene, centre and scale that `Model.encode` keeps of a padded cloud, as a pure function."""
-    centre, scale = box_around(cloud["positions"], cloud["mask"])
-    inside = jnp.clip((cloud["positions"] - centre[None]) * scale, -1, 1)
-    one_object = jax.tree.map(lambda x: x[None], PointCloud(**cloud | {"positions": inside}))
-    scene = inference.encode(model.variables, one_object, config=model.config)
-    return jax.tree.map(lambda x: x[0], scene), centre, scale
-
-
-def _floats(*shape: int) -> jax.ShapeDtypeStruct:
-    return jax.ShapeDtypeStruct(shape, np.float32)
 
 
 def _described(array: jax.core.ShapedArray) -> dict[str, Any]:

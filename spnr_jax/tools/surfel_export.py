@@ -8,6 +8,8 @@ Sizes are fixed when it is exported: the number of points, padding included, and
 are found in the exported function, by all distances, a block of points at a time.
 """
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -16,6 +18,8 @@ import numpy as np
 from flax.serialization import to_state_dict
 from jaxtyping import Array, Bool, Float, Int
 
+from spnr_jax.config import Quality
+from spnr_jax.errors import UserError
 from spnr_jax.kernels.cloud_arrays import plain_cloud
 from spnr_jax.kernels.records import AnyArray, Camera, Light, PointCloud, Surfels, SurfelScene
 from spnr_jax.method import surfel_renderer
@@ -29,6 +33,24 @@ RADIUS = 0.8  # of the ball in the box whose pictures the sizes are those of: as
 BLOCK = 256  # points whose distances to all are in memory at once
 
 Arrays = dict[str, Any]
+
+
+def export_encode(model: Model, *, num_points: int) -> tuple[Callable[..., Arrays], tuple[Arrays, ...]]:
+    """The function `cloud -> volume`, and what it takes."""
+    return partial(encode, model.params), (cloud_shapes(num_points),)
+
+
+def export_render(
+    model: Model, *, num_points: int, size: int, quality: Quality, reach: int, plan: Plan | None
+) -> tuple[Callable[..., Arrays], tuple[Arrays, ...]]:
+    """The function `(volume, camera, light) -> picture`, and what it takes."""
+    del reach
+    if quality == "balanced":
+        raise UserError("balanced draws fewer pixels and enlarges them; export a smaller resolution")
+    sizes = plan or make_plan(model, num_points, size)
+    draw = partial(render, None if quality == "draft" else model.params, size=size, plan=sizes)
+    volume = jax.eval_shape(partial(encode, model.params), cloud_shapes(num_points))
+    return draw, (volume, camera_shapes(), light_shapes())
 
 
 def encode(params: dict, cloud: Arrays) -> Arrays:
@@ -81,3 +103,9 @@ def cloud_shapes(num_points: int) -> Arrays:
 def light_shapes() -> Arrays:
     """What `render` takes as its light."""
     return {"tables": jax.ShapeDtypeStruct((7, lighting.HEIGHT, lighting.WIDTH, 3), np.float32)}
+
+
+def camera_shapes() -> Arrays:
+    """What `render` takes as its camera."""
+    sizes = {"cam_to_world": (3, 4), "intrinsics": (3, 3)}
+    return {name: jax.ShapeDtypeStruct(shape, np.float32) for name, shape in sizes.items()}

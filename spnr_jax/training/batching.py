@@ -8,6 +8,7 @@ import dataclasses
 import functools
 import threading
 from collections.abc import Callable, Generator
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -16,9 +17,9 @@ import numpy as np
 from spnr_jax.config import TrainConfig
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
-from spnr_jax.formats.data_sets import Dataset, ObjectData, on_white
+from spnr_jax.formats.data_sets import Dataset, ObjectData, has_lights, on_white
 from spnr_jax.kernels.cloud_arrays import pad
-from spnr_jax.kernels.records import Batch, Camera, PointCloud
+from spnr_jax.kernels.records import Batch, Camera, Light, PointCloud
 
 CACHE_BYTES = 2**31  # decoded objects kept in memory
 READERS, READ_AHEAD = 2, 4  # threads that assemble batches, and batches ready or in work
@@ -78,6 +79,22 @@ def object_names(names: tuple[str, ...], config: TrainConfig, step: int) -> list
 def epoch_order(seed: int, epoch: int, count: int) -> np.ndarray:
     """The permutation (count,) of all objects in an epoch."""
     return np.random.default_rng((seed, ORDER, epoch)).permutation(count)
+
+
+def prepare(
+    config: TrainConfig, dataset: Dataset, run: Path, *, light: Light | None, own: range | None
+) -> Callable[[int], Generator[Batch, None, None]]:
+    """A function of a step: training batches of whole views from there on.
+
+    ValueError where the views have lights of their own: networks that are trained on them cannot be told which.
+    """
+    del run, light
+    if has_lights(dataset):
+        raise UserError(
+            f"{dataset.folder}: each view has a light of its own, and preset {config.preset} learns one light alone; "
+            "train --preset surfels, or generate the data set without --lights"
+        )
+    return lambda first_step: batches(dataset, config, first_step, own=own)
 
 
 def batches(

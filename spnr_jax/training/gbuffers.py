@@ -1,4 +1,4 @@
-"""G-buffers of a data set's clouds: what the shader network learns from, made once and kept on disk.
+"""What the shader network learns from, and its loss: G-buffers of a data set's clouds, made once and kept on disk.
 
     FOLDER/OBJECT.CLOUD.npz    views of one random cloud of an object
         doublings              (views,): how often the network doubles each view's resolution
@@ -14,9 +14,10 @@ import zlib
 from collections.abc import Callable, Generator
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, UInt8
 from tqdm import tqdm
@@ -27,15 +28,20 @@ from spnr_jax.formats.clouds import MOST_EVEN
 from spnr_jax.formats.data_sets import Dataset, ObjectData, read_object
 from spnr_jax.formats.images import to_uint8, write_whole
 from spnr_jax.formats.npz import packed, read_arrays
-from spnr_jax.kernels import cameras
+from spnr_jax.kernels import cameras, losses
 from spnr_jax.kernels.cleaning import Cleaned, cleaned
-from spnr_jax.kernels.records import Camera, Crops, Light, PointCloud, Surfels, SurfelScene
+from spnr_jax.kernels.metrics import psnr
+from spnr_jax.kernels.records import Camera, Crops, Key, Light, PointCloud, Surfels, SurfelScene
 from spnr_jax.kernels.thinning import farthest_points
-from spnr_jax.method import surfel_pictures, surfel_renderer
+from spnr_jax.method import surfel_method, surfel_renderer
+from spnr_jax.method.pixels import reconstruction_loss
+from spnr_jax.methods import Outcome
+from spnr_jax.nn.shader import Shader, picture
 from spnr_jax.surfels import features, lighting, outward
 from spnr_jax.surfels.surfel_scenes import encode_in_box
 from spnr_jax.training.batching import read_ahead
 from spnr_jax.training.scan_faults import colours_alone, random_scan
+from spnr_jax.training.weights import add_companions
 
 CLOUDS = 2  # of each object
 SCANNED = 0.3  # share of them that are scanned and cleaned
@@ -52,7 +58,10 @@ MARGINS = (0, 4, 8, 14, 10)  # of these, to each side, that the network sees and
 SHARES = (0.3, 0.22, 0.22, 0.2, 0.06)  # of the steps, by doublings
 TRIES, COVERED, DRAWN = 4, 0.15, 0.02  # places that are tried for a crop, until this share of it has this opacity
 LARGEST = 6e4  # in float16; no light makes a picture brighter than white
+LEAST_INSIDE = 1.0  # pixels; where nothing of the object is seen its error is 0
 CLOUD, CROP = 3, 4  # streams of random numbers under one seed, beside those of `batching`
+
+ROOM = "procedural room"  # as the generator of data sets calls it
 
 Arrays = dict[str, np.ndarray]
 NAMES = ("seen", "maps", "ambient", "target")
@@ -64,6 +73,60 @@ class View(NamedTuple):
     path: Path
     number: int
     doublings: int
+
+
+def prepare(
+    config: TrainConfig, dataset: Dataset, run: Path, *, light: Light | None, own: range | None
+) -> Callable[[int], Generator[Crops, None, None]]:
+    """A function of a step: training batches from there on.  Missing G-buffers are made first, which takes a while.
+
+    ValueError where several processes train together: each would make them.
+    """
+    del own
+    if jax.process_count() > 1:
+        raise UserError(f"preset {config.preset} trains in one process; start it without --distributed")
+    variables = add_companions(config.model, {})
+    views = complete(dataset, light or light_of(dataset), config, run / "gbuffers", variables)
+    return lambda first_step: batches(views, config, first_step)
+
+
+def light_of(dataset: Dataset) -> Light:
+    """The light of pictures that have none of their own; ValueError if it is another than the room."""
+    described = dataset.settings.get("environment_map")
+    name = described.get("name", ROOM) if isinstance(described, dict) else ROOM
+    if name != ROOM:
+        raise UserError(
+            f"{dataset.folder}: lit by {name}, and the command trains in the {ROOM} alone; give the light of that map "
+            "to spnr_jax.training.trainer.train"
+        )
+    return lighting.room_light()
+
+
+def loss(
+    variables: dict, crops: Crops, key: Key | None = None, *, config: TrainConfig
+) -> tuple[Float[Array, ""], Outcome]:
+    """(loss, outcome): errors of the picture on white and of the opacity, weighted as the config says."""
+    assert isinstance(config.model, SurfelConfig)
+    shader = Shader(config.model.widths, config.model.top)
+    params = {"params": variables["params"]}
+    outputs: Any = shader.apply(params, jnp.asarray(crops.seen), crops.doublings, crops.margin)
+    color, alpha = picture(outputs, jnp.asarray(crops.maps), jnp.asarray(crops.ambient), crops.doublings)
+    image = color * alpha[..., None] + 1 - alpha[..., None]  # on white, as the reference is
+    target = jnp.asarray(crops.target, jnp.float32) / 255
+    opacity = target[..., 3]
+    reference = target[..., :3] * opacity[..., None] + 1 - opacity[..., None]
+    value = reconstruction_loss(config, image, image, reference)
+    value += config.loss.opacity_weight * losses.mse(alpha, opacity)
+    value += config.loss.opacity_l1_weight * losses.l1(alpha, opacity)
+    squared = jnp.sum((image - reference) ** 2 * opacity[..., None])
+    return value, Outcome(
+        {
+            "psnr": jnp.mean(psnr(image, reference)),
+            "l1": losses.l1(image, reference),
+            "mse_inside": squared / (3 * jnp.maximum(jnp.sum(opacity), LEAST_INSIDE)),
+            "mse_opacity": losses.mse(alpha, opacity),
+        }
+    )
 
 
 def complete(dataset: Dataset, light: Light, config: TrainConfig, folder: Path, variables: dict) -> list[View]:
@@ -95,11 +158,10 @@ def _doublings(path: Path) -> list[int] | None:
 
 def make(item: ObjectData, number: int, light: Light, config: TrainConfig, variables: dict) -> Arrays:
     """The content of a file: views of the object's cloud of this number."""
-    assert isinstance(config.model, SurfelConfig)
     generator = np.random.default_rng((config.seed, CLOUD, zlib.crc32(item.name.encode()), number))
     side = int(generator.choice(SIDES))
     cloud = random_cloud(item.cloud, side, config, generator)
-    scene = encode_in_box(surfel_pictures.densify_sparse(variables, cloud))
+    scene = encode_in_box(surfel_method.densify_sparse(variables, cloud))
     arrays: Arrays = {}
     doublings: list[int] = []
     for index in generator.permutation(len(item.images))[: config.views_per_object]:

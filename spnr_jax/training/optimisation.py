@@ -1,18 +1,14 @@
-"""Training as pure functions: state in, state out.  The networks that render whole views are trained by it.
+"""Training as pure functions: state in, state out.  Every method is trained by this step.
 
-    forward -> losses -> train_step -> jitted train_step
-
-A method is a network and a loss: the config of a network finds its module (`inference.network`), and any module with
-`encode`, `render` and `__call__` is trained by this step.  What it sows into the collection "losses" is added to the
-loss; a network without `render_rays` renders whole images.
-
-One step renders every view of the batch once.  The discriminator is updated on that rendering, the generator on the
-gradient that the updated discriminator and the L1 loss send back through it.  `adversarial` is static: without it the
-graph contains no discriminator.  All randomness of step s comes from fold_in(state.key, s), so a resumed run repeats
-the uninterrupted one bit for bit.
+One step evaluates the loss of the method (`methods.Method.loss`) once.  The discriminator, of methods that have one, is
+updated on the pictures of that forward, and the generator on the gradient that the updated discriminator and the
+method's loss send back through it.  `adversarial` is static: without it the graph contains no discriminator.  All
+randomness of step s comes from fold_in(state.key, s), so a resumed run repeats the uninterrupted one bit for bit.  On a
+CPU the losses of several runs under vmap are computed one after the other.
 """
 
 import dataclasses
+from collections.abc import Sequence
 from functools import partial
 from typing import Any, no_type_check
 
@@ -26,10 +22,11 @@ from jaxtyping import Array, Float
 from spnr_jax.config import TrainConfig
 from spnr_jax.errors import UserError
 from spnr_jax.kernels import losses
-from spnr_jax.kernels.metrics import psnr
 from spnr_jax.kernels.records import AnyArray, Batch, Key
-from spnr_jax.method.inference import init, network
-from spnr_jax.training import adversary, pixels
+from spnr_jax.methods import method_of
+from spnr_jax.nn.convolution import run_by_run
+
+Judge = tuple[dict, tuple]  # parameters and optimiser of the discriminator
 
 
 @no_type_check
@@ -84,13 +81,13 @@ def create_state(config: TrainConfig, seed: int | Array | None = None) -> TrainS
     """Fresh weights and optimisers from a seed, the config's by default."""
     key = jax.random.key(config.seed if seed is None else seed)
     key, generator_key, discriminator_key = jax.random.split(key, 3)
-    variables = init(generator_key, config.model)
+    variables = method_of(config.model).init(generator_key, config.model)
     generator_adam, discriminator_adam = optimizers(config)
     generator, batch_stats = variables["params"], variables.get("batch_stats", {})
     discriminator = None
-    if adversary.first_adversarial_step(config) < config.num_steps:
+    if first_adversarial_step(config) < config.num_steps:
         image = jnp.zeros((1, *[config.model.image_resolution] * 2, 3))
-        judge = adversary.discriminator_of(config)
+        judge = discriminator_of(config)
         discriminator = judge.init(discriminator_key, image, image, image[..., 0] > 0)["params"]
     return TrainState(
         step=jnp.zeros((), jnp.int32),
@@ -130,115 +127,112 @@ def begun_with(state: TrainState, variables: dict) -> TrainState:
     )
 
 
-def pixel_error(config: TrainConfig, image: Array, reference: Array, seen: Array | None = None) -> Float[Array, ""]:
-    """Mean error of all pixels, or of those that are `seen` (0 if there are none)."""
-    if seen is None:
-        return {"l1": losses.l1, "mse": losses.mse}[config.loss.pixel](image, reference)
-    error = {"l1": jnp.abs, "mse": jnp.square}[config.loss.pixel](image - reference)
-    return jnp.sum(jnp.where(seen[..., None], error, 0)) / jnp.maximum(3 * jnp.sum(seen), 1)
+# --- the discriminator ------------------------------------------------------------------------------------------------
 
 
-def reconstruction_loss(
-    config: TrainConfig,
-    image: Float[Array, "*batch"],
-    image_lr: Float[Array, "*batch_lr"],
-    reference: Array,
-    seen: Array | None = None,
-) -> Float[Array, ""]:
-    """Weighted errors of the image, and of a smaller volume rendering against the reference averaged to its size."""
-    error = pixel_error(config, image, reference, seen)
-    if config.model.upsamples:
-        low = losses.area_downsample(reference, image_lr.shape[-2])
-        error = error + config.loss.low_resolution_weight * pixel_error(config, image_lr, low)
-    error = config.loss.l1_weight * error
-    return error + config.loss.mse_weight * losses.mse(image, reference) if config.loss.mse_weight else error
+def first_adversarial_step(config: TrainConfig) -> int:
+    """Step from which the discriminator takes part; num_steps if it never does."""
+    share = config.loss.adversarial_start if config.loss.adversarial_weight else 1.0
+    return round(share * config.num_steps)
 
 
-def forward(
-    config: TrainConfig, state: TrainState, batch: Batch, key: Key, params: dict
-) -> tuple[tuple[Array, Array, dict], tuple[dict, Array | None]]:
-    """Image, low-resolution image, losses of the network's own; and, without gradient, statistics and pixels seen."""
-    rendering, updated = network(config.model).apply(
-        {"params": params, "batch_stats": state.batch_stats},
-        batch.cloud,
-        batch.camera,
-        key,
-        train=True,
-        mutable=["batch_stats", "losses"],
-    )
-    sown = {name: value for name, (value,) in updated.get("losses", {}).items()}
-    if config.loss.opacity_weight:
-        opacity = losses.area_downsample(jnp.asarray(batch.alpha)[..., None], rendering.acc.shape[-1])[..., 0]
-        sown["opacity"] = config.loss.opacity_weight * losses.mse(rendering.acc, opacity)
-    seen = rendering.acc > 0 if config.loss.masked else None
-    return (rendering.image, rendering.image_lr, sown), (updated.get("batch_stats", {}), seen)
+def discriminator_of(config: TrainConfig) -> Any:
+    """The discriminator's module."""
+    make = method_of(config.model).discriminator
+    assert make is not None, "the config refuses an adversarial loss"
+    return make(config)
+
+
+def logits(config: TrainConfig, params: dict, image: AnyArray, condition: AnyArray, mask: AnyArray) -> Array:
+    """What the discriminator says of the images under its parameters."""
+    if not config.loss.condition:
+        condition, mask = jnp.zeros_like(condition), jnp.zeros_like(mask)
+    return discriminator_of(config).bind({"params": params})(*map(jnp.asarray, (image, condition, mask)))
+
+
+def discriminator_loss(config: TrainConfig, params: dict, fake: AnyArray, batch: Batch, step: Array):
+    """(loss, metrics) of the discriminator on references and renderings; R1 every r1_interval steps."""
+    real, condition, mask = (flatten_views(x) for x in (batch.image, batch.condition, batch.condition_mask))
+    both = logits(config, params, *(jnp.concatenate(x) for x in ((real, fake), (condition,) * 2, (mask,) * 2)))
+    real_logits, fake_logits = jnp.split(both, 2)
+    loss = losses.discriminator_adversarial(real_logits, fake_logits)
+    metrics = {"discriminator": loss, "logit_real": jnp.mean(real_logits), "logit_fake": jnp.mean(fake_logits)}
+    if config.loss.r1_gamma:
+
+        def penalty():
+            return losses.r1(lambda image: logits(config, params, image, condition, mask), real)
+
+        due = step % config.loss.r1_interval == 0
+        loss = loss + config.loss.r1_interval * config.loss.r1_gamma * jax.lax.cond(due, penalty, lambda: 0.0)
+    return loss, metrics
+
+
+def flatten_views(x: AnyArray) -> AnyArray:
+    """(objects, views, ...) as (objects * views, ...)."""
+    return x.reshape(-1, *x.shape[2:])
 
 
 def discriminator_step(
-    config: TrainConfig, state: TrainState, fake: AnyArray, batch: Batch, lr_scale: Array | None
-) -> tuple[dict, tuple, dict[str, Array]]:
+    config: TrainConfig, judge: Judge, fake: AnyArray, batch: Batch, step: Array, lr_scale: Array | None
+) -> tuple[Judge, dict[str, Array]]:
     """The discriminator and its optimiser after one step on references and renderings, and its metrics."""
-    gradient, metrics = jax.grad(partial(adversary.discriminator_loss, config), has_aux=True)(
-        state.discriminator, fake, batch, state.step
-    )
-    update, optimizer = optimizers(config)[1].update(gradient, state.discriminator_optimizer)
-    return optax.apply_updates(state.discriminator, _scaled(update, lr_scale)), optimizer, metrics
+    params, optimizer = judge
+    gradient, metrics = jax.grad(partial(discriminator_loss, config), has_aux=True)(params, fake, batch, step)
+    update, optimizer = optimizers(config)[1].update(gradient, optimizer)
+    return (optax.apply_updates(params, _scaled(update, lr_scale)), optimizer), metrics
 
 
-def generator_loss(
+# --- steps ------------------------------------------------------------------------------------------------------------
+
+
+def total_loss(
     config: TrainConfig,
-    batch: Batch,
-    seen: Array | None,
-    discriminator: dict | None,
-    image: Array,
-    image_lr: Array,
-    sown: dict[str, Array],
-) -> Float[Array, ""]:
-    """Errors of a rendering, losses of the network's own, and the adversarial loss if there is a discriminator."""
-    loss = reconstruction_loss(config, image, image_lr, jnp.asarray(batch.image), seen)
-    for term in sown.values():
-        loss = loss + term
-    if discriminator is not None:
-        views = (adversary.flatten_views(x) for x in (image, batch.condition, batch.condition_mask))
-        fake_logits = adversary.logits(config, discriminator, *views)
-        loss = loss + config.loss.adversarial_weight * losses.generator_adversarial(fake_logits)
-    return loss
+    params: dict,
+    stats: dict,
+    judge: Judge | None,
+    batch: Any,
+    key: Key,
+    step: Array,
+    lr_scale: Array | None,
+) -> tuple[Float[Array, ""], tuple[dict[str, Array], dict, Judge | None]]:
+    """(loss, (metrics, statistics, judge)): the loss of the method, and that of a discriminator after its step."""
+    variables = {"params": params, "batch_stats": stats}
+    value, outcome = method_of(config.model).loss(variables, batch, key, config=config)
+    metrics = outcome.metrics
+    if judge is not None:
+        fake = flatten_views(outcome.image)
+        judge, more = discriminator_step(config, judge, jax.lax.stop_gradient(fake), outcome.batch, step, lr_scale)
+        condition = (flatten_views(x) for x in (outcome.batch.condition, outcome.batch.condition_mask))
+        fake_logits = logits(config, judge[0], fake, *condition)
+        value = value + config.loss.adversarial_weight * losses.generator_adversarial(fake_logits)
+        metrics = metrics | more
+    return value, (metrics, stats if outcome.statistics is None else outcome.statistics, judge)
 
 
 def train_step(
     state: TrainState,
-    batch: Batch,
+    batch: Any,
     *,
     config: TrainConfig,
-    adversarial: bool,
+    adversarial: bool = False,
     lr_scale: Float[Array, ""] | None = None,
 ) -> tuple[TrainState, dict[str, Array]]:
-    """State after one step of both networks from one generator forward, and scalar metrics.
+    """State after one step of the network, and of the discriminator from the same forward; and scalar metrics.
 
     `lr_scale` multiplies both learning rates, which are static: as an array it may be one for each run under vmap.
     """
     key = jax.random.fold_in(state.key, state.step)
-    key, batch = pixels.chosen(key, batch, config)
-    (image, image_lr, sown), pull_back, (batch_stats, seen) = jax.vjp(
-        partial(forward, config, state, batch, key), state.generator, has_aux=True
+    judge = (state.discriminator, state.discriminator_optimizer) if adversarial else None
+    gradient_of = run_by_run(jax.value_and_grad(partial(total_loss, config), has_aux=True))
+    (loss, (metrics, batch_stats, judge)), gradient = gradient_of(
+        state.generator, state.batch_stats, judge, batch, key, state.step, lr_scale
     )
-    reference = jnp.asarray(batch.image)
-    metrics = {"psnr": jnp.mean(psnr(image, reference)), "l1": losses.l1(image, reference)}
-    discriminator, discriminator_optimizer = state.discriminator, state.discriminator_optimizer
-    if adversarial:
-        fake = adversary.flatten_views(image)
-        discriminator, discriminator_optimizer, more = discriminator_step(config, state, fake, batch, lr_scale)
-        metrics |= more
-    loss, cotangents = jax.value_and_grad(
-        partial(generator_loss, config, batch, seen, discriminator if adversarial else None), argnums=(0, 1, 2)
-    )(image, image_lr, sown)
-    (gradient,) = pull_back(cotangents)
     update, generator_optimizer = optimizers(config)[0].update(gradient, state.generator_optimizer)
     generator = optax.apply_updates(state.generator, _scaled(update, lr_scale))
-    metrics |= {"loss": loss, "gradient_norm": optax.tree.norm(gradient)} | sown
     averaged, averaged_stats = moving_average(
         (state.averaged, state.averaged_stats), (generator, batch_stats), state.step, config.optimizer.ema_decay
     )
+    discriminator, discriminator_optimizer = judge or (state.discriminator, state.discriminator_optimizer)
     state = TrainState(
         step=state.step + 1,
         key=state.key,
@@ -250,7 +244,7 @@ def train_step(
         discriminator=discriminator,
         discriminator_optimizer=discriminator_optimizer,
     )
-    return state, metrics
+    return state, metrics | {"loss": loss, "gradient_norm": optax.tree.norm(gradient)}
 
 
 def _scaled(update: Any, factor: Array | None) -> Any:
@@ -263,22 +257,41 @@ def moving_average(averaged: Any, newest: Any, step: Array, decay: float) -> Any
     return jax.tree.map(lambda old, new: share * old + (1 - share) * new, averaged, newest)
 
 
-def stepped(config: TrainConfig, state: TrainState, gradient: dict) -> TrainState:
-    """The state after a step of the generator by its gradient."""
-    update, optimizer = optimizers(config)[0].update(gradient, state.generator_optimizer)
-    generator = optax.apply_updates(state.generator, update)
-    return dataclasses.replace(
-        state,
-        step=state.step + 1,
-        generator=generator,
-        generator_optimizer=optimizer,
-        averaged=moving_average(state.averaged, generator, state.step, config.optimizer.ema_decay),
-    )
-
-
 def averaged_variables(state: TrainState) -> dict:
     """The generator that evaluation uses, as Linen variables."""
     return {"params": state.averaged, "batch_stats": state.averaged_stats}
+
+
+# --- many runs --------------------------------------------------------------------------------------------------------
+# Whole trainings in one compiled program: states and batches of all runs are one tree with an axis of runs first.
+# `step` alone is shared, so that what depends on it (R1 every so many steps) stays a branch.  Runs may differ in seeds,
+# batches and a factor of the learning rates.
+
+OF_A_RUN = tuple(field.name for field in dataclasses.fields(TrainState) if field.name != "step")
+AXES: Any = TrainState(step=None, **dict.fromkeys(OF_A_RUN, 0))  # type: ignore[arg-type]
+
+
+def stack(states: Sequence[TrainState]) -> TrainState:
+    """States of one step as one tree; keys are stacked as plain numbers, which are not drawn from."""
+    plain = [dataclasses.replace(state, key=jax.random.key_data(state.key)) for state in states]
+    stacked = jax.tree.map(lambda *x: jnp.stack(x), *plain)
+    return dataclasses.replace(stacked, step=jnp.copy(states[0].step), key=jax.random.wrap_key_data(stacked.key))
+
+
+def train_runs(
+    states: TrainState,
+    batches: Any,
+    lr_scales: Float[Array, " runs"] | None = None,
+    *,
+    config: TrainConfig,
+    adversarial: bool,
+) -> tuple[TrainState, dict[str, Array]]:
+    """`train_step` of every run: stacked states after it, and the metrics of each run."""
+
+    def one(state: TrainState, batch: Any, lr_scale: Array | None) -> tuple[TrainState, dict[str, Array]]:
+        return train_step(state, batch, config=config, adversarial=adversarial, lr_scale=lr_scale)
+
+    return jax.vmap(one, in_axes=(AXES, 0, 0), out_axes=(AXES, 0))(states, batches, lr_scales)
 
 
 # runs once: a quick compilation, 2.7 s of CPU time instead of 7.0 for `tiny`, is worth more than quick code

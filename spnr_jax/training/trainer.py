@@ -30,11 +30,11 @@ from spnr_jax.formats import data_sets
 from spnr_jax.formats.images import png, write_whole
 from spnr_jax.kernels.metrics import psnr
 from spnr_jax.kernels.records import Light
-from spnr_jax.method import inference
-from spnr_jax.training import adversary, checkpoint, optimisation, work
-from spnr_jax.training.metrics_log import MetricsLog, Unwritten
-from spnr_jax.training.run_record import Clock, RunRecord
-from spnr_jax.training.weights import Trained, add_densifier
+from spnr_jax.method.model import render_views
+from spnr_jax.methods import method_of
+from spnr_jax.training import checkpoint, optimisation
+from spnr_jax.training.run_record import Clock, MetricsLog, RunRecord, Unwritten
+from spnr_jax.training.weights import Trained, add_companions, write_weights
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,9 +74,8 @@ def train(
 ) -> optimisation.TrainState:
     """The state after the config's last step; goes on where an earlier call left the run folder.
 
-    A new run begins with random weights, or with those of `init`.  On a mesh of devices (`placement.device_mesh`)
-    each of its processes calls this.  `on_event` is told what the loop is about to do; what was told before is done.
-    `light` is that of the data set's pictures, if the network sees the light and it is another than the room.
+    A new run begins with random weights, or those of `init`.  Each process of a mesh of devices calls this.  `on_event`
+    is told what the loop is about to do.  `light` is that of the data set's pictures, where it is not the room.
     """
     allocator.few_arenas()
     own = None if mesh is None else placement.own_objects(mesh, config.batch_objects)
@@ -85,35 +84,43 @@ def train(
         state = begun(config, run, mesh, init)
         if (first := int(state.step)) >= config.num_steps:
             return state
-        task = work.work_of(config, dataset, run, mesh, own, light)
+        batches_from = method_of(config.model).prepare(config, dataset, run, light=light, own=own)
         agreed, tell = placement.Agreement(mesh), on_event or (lambda *event: None)
         requests = stack.enter_context(stop_requests())
         progress = Progress(config, dataset, run, schedule, first, init, clock, tell, light)
         stack.callback(progress.close)
-        batches = stack.enter_context(closing(task.batches(first)))
+        batches = stack.enter_context(closing(batches_from(first)))
         clock.lap("restore")
-        joins = adversary.first_adversarial_step(config)
+        joins = optimisation.first_adversarial_step(config)
         for step, batch in enumerate(batches, start=first):
             if first < step == joins and placement.leads():
                 tqdm.write(f"step {step}: the discriminator joins; the training step is compiled anew")
             tell("step", step, batch)
-            state, metrics = task.step(state, batch, step)
+            state, metrics = take_step(state, batch, config, mesh, adversarial=step >= joins)
             done = step + 1
             progress.step(done, metrics)
             last, stopping = done == config.num_steps, agreed(bool(requests))
             save = last or stopping or done % schedule.checkpoint_every == 0
             progress.show(state, save, last)
-            if last:
-                task.finish(state)
+            if last and placement.leads():
+                write_network(run, config, state)
             if save:  # after the rows up to this step, which a run that goes on from here will not write again
                 progress.checkpoint(state)
             if last or stopping:
                 tell("end", done, None)
             if stopping and not last:
-                raise KeyboardInterrupt(
-                    f"stopped at step {done} of {config.num_steps}; the same command goes on from there"
-                )
+                words = f"stopped at step {done} of {config.num_steps}; the same command goes on from there"
+                raise KeyboardInterrupt(words)
     return state
+
+
+def take_step(
+    state: optimisation.TrainState, batch: Any, config: TrainConfig, mesh: Mesh | None, *, adversarial: bool
+) -> tuple[optimisation.TrainState, dict]:
+    """The state after a batch whose objects the devices share, and metrics."""
+    with placement.using(mesh):
+        batch = placement.place_batch(batch, mesh, config.batch_objects)
+        return optimisation.jitted_train_step(state, batch, config=config, adversarial=adversarial)
 
 
 @contextmanager
@@ -194,7 +201,7 @@ class Progress:
         row, (_, newest) = {"step": self._done, **mean_row(rows), "ms_per_step": round(pace, 2)}, rows[-1]
         self._tell("row", self._done, row)
         self._log.write(row)
-        self._bar.set_postfix(loss=f"{newest['loss']:.2f}", psnr=f"{newest['psnr']:.1f}", refresh=False)
+        self._bar.set_postfix({n: f"{newest[n]:.2f}" for n in ("loss", "psnr") if n in newest}, refresh=False)
         self._pending = []
 
     def _preview(self, state: optimisation.TrainState) -> None:
@@ -225,6 +232,15 @@ def new_state(config: TrainConfig, init: Trained | None) -> optimisation.TrainSt
     """The state before the first step."""
     state = optimisation.jitted_create_state(config)
     return state if init is None else optimisation.begun_with(state, init.variables)
+
+
+def write_network(run: Path, config: TrainConfig, state: optimisation.TrainState) -> None:
+    """The averaged weights as RUN/weights.npz; a line where float16 does not hold them."""
+    variables = placement.on_this_process(optimisation.averaged_variables(state))
+    try:
+        write_weights(run / "weights.npz", Trained(config=config, variables=variables, steps=int(state.step)))
+    except UserError as error:
+        tqdm.write(str(error))
 
 
 def check_finite(rows: list[tuple[int, dict]]) -> list[tuple[int, dict]]:
@@ -278,12 +294,12 @@ def preview(
     """Validation PSNR of the averaged network on a few objects, and references over renderings, kept in previews/."""
     names = (dataset.splits["val"] or dataset.splits["train"])[:num_objects]
     variables = placement.on_this_process(optimisation.averaged_variables(state))
-    variables = add_densifier(config.model, variables)
+    variables = add_companions(config.model, variables)
     columns, scores = [], []
     for name in names:
         item = data_sets.read_object(dataset, name)
         cloud = data_sets.test_cloud(item, config)
-        rendering = inference.render_views(variables, config.model, cloud, item.camera, item.own_lights or light)
+        rendering = render_views(variables, config.model, cloud, item.camera, item.own_lights or light)
         image, reference = np.clip(np.asarray(rendering.image), 0, 1), data_sets.on_white(item.images)
         scores.append(np.asarray(psnr(jnp.asarray(image), jnp.asarray(reference))))
         columns.append(np.concatenate([reference[0], image[0]]))

@@ -19,13 +19,12 @@ import jax
 import numpy as np
 from flax.traverse_util import flatten_dict, unflatten_dict
 
-from spnr_jax.config import NetworkConfig, SurfelConfig, TrainConfig
+from spnr_jax.config import NetworkConfig, TrainConfig
 from spnr_jax.errors import UserError
 from spnr_jax.formats.images import write_whole
 from spnr_jax.formats.npz import packed, read_arrays
-from spnr_jax.method.inference import init
 from spnr_jax.method.model import Model
-from spnr_jax.methods import UnknownMethod, from_dict, include, to_dict
+from spnr_jax.methods import UnknownMethod, from_dict, include, method_of, to_dict
 
 # what a header of any content makes its readers raise
 UNREADABLE = (ValueError, LookupError, TypeError, ArithmeticError, RecursionError)
@@ -47,9 +46,9 @@ def shipped(name: str = SHIPPED) -> Path:
     return Path(str(resources.files("spnr_jax") / "pretrained" / f"{name}.npz"))
 
 
-def add_densifier(config: NetworkConfig, variables: dict) -> dict:
-    """The variables, with the package's densifier beside a network over surfels (`method/densifier.py`)."""
-    return variables | {"densifier": read_densifier()} if isinstance(config, SurfelConfig) else variables
+def add_companions(config: NetworkConfig, variables: dict) -> dict:
+    """The variables, with those networks of the package beside them that the method asks for (its densifier)."""
+    return variables | {name: read_variables(shipped(name)) for name in method_of(config).companions}
 
 
 def place(source: Path | str | None) -> Path:
@@ -65,19 +64,18 @@ def read_trained(source: Path | str | None, say: Callable[[str], None] = print, 
     path = place(source)
     if path.suffix == ".npz":
         trained = read_weights(path)
-        return replace(trained, variables=add_densifier(trained.config.model, trained.variables))
+        return replace(trained, variables=add_companions(trained.config.model, trained.variables))
     from spnr_jax.training import checkpoint, optimisation  # here: a file of weights is read without optimisers
 
     config, state = checkpoint.load_run(path, say, data)
-    variables = add_densifier(config.model, optimisation.averaged_variables(state))
+    variables = add_companions(config.model, optimisation.averaged_variables(state))
     return Trained(config=config, variables=variables, steps=int(state.step))
 
 
-def read_densifier(path: Path | None = None) -> dict:
-    """Weights of the densifier of a file, float16 by name; None is the package's (`method/densifier.py`)."""
-    with (path or shipped("densifier")).open("rb") as file:
-        arrays = read_arrays(file)
-    return _as_variables(arrays)
+def read_variables(path: Path) -> dict:
+    """The tree of a file that holds weights alone, float16 by name."""
+    with path.open("rb") as file:
+        return _as_variables(read_arrays(file))
 
 
 def load(run: Path | str | None = None, methods: Path | str | None = None) -> Model:
@@ -93,7 +91,8 @@ def load(run: Path | str | None = None, methods: Path | str | None = None) -> Mo
 
 def write_weights(path: Path, trained: Trained) -> None:
     """Writes the file; ValueError for weights that float16 cannot hold."""
-    own = {name: tree for name, tree in trained.variables.items() if name != "densifier"}
+    companions = method_of(trained.config.model).companions
+    own = {name: tree for name, tree in trained.variables.items() if name not in companions}
     arrays = {name: np.asarray(values) for name, values in flatten_dict(own, sep="/").items()}
     for name, values in arrays.items():
         if not np.abs(values).max(initial=0) <= np.finfo(np.float16).max:
@@ -149,4 +148,5 @@ def _check_weights(arrays: dict[str, np.ndarray], shapes: dict[str, jax.ShapeDty
 @cache
 def variable_shapes(config: TrainConfig) -> dict[str, jax.ShapeDtypeStruct]:
     """Shape of every weight of the config's network, by name."""
-    return flatten_dict(jax.eval_shape(partial(init, config=config.model), jax.random.key(0)), sep="/")
+    init = partial(method_of(config.model).init, config=config.model)
+    return flatten_dict(jax.eval_shape(init, jax.random.key(0)), sep="/")

@@ -17,11 +17,12 @@ import numpy as np
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from spnr_jax.config import Quality
 from spnr_jax.errors import UserError
 from spnr_jax.formats import images
 from spnr_jax.formats.light_files import NAMES, read_light
 from spnr_jax.kernels.records import Camera, Light, PointCloud, Volume
-from spnr_jax.method.model import Model, Quality
+from spnr_jax.method.model import Model
 from spnr_jax.tools.chosen_light import before, light_of_options
 from spnr_jax.tools.light_options import Lighting
 

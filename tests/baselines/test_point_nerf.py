@@ -16,8 +16,8 @@ from experiments.baselines import point_nerf
 from experiments.baselines.point_nerf import PointNeRF, PointNeRFConfig, published
 from spnr_jax.config import LossConfig
 from spnr_jax.kernels import cameras
-from spnr_jax.method import inference
-from spnr_jax.training import optimisation, pixels
+from spnr_jax.method import inference, pixels
+from spnr_jax.training import optimisation
 
 pytestmark = pytest.mark.ci  # it trains a baseline
 

@@ -13,7 +13,7 @@ from experiments.studies.ablations import LABELS, ROWS, changed, folds, rows
 from experiments.studies.speed_accuracy import front, knee
 from spnr_jax import config, presets
 from spnr_jax.methods import to_dict
-from spnr_jax.training import adversary
+from spnr_jax.training import optimisation
 
 
 def leaves(values, path=""):
@@ -72,7 +72,7 @@ def test_the_adversarial_loss_takes_part_from_the_first_step_and_the_weights_alo
     made = [variant(options, weight, presets.tiny(), tiny_dataset.dataset()) for weight in options.l1_weights]
     assert [v.config.loss.l1_weight for v in made] == [0, 100, 5000]
     for v in made:
-        assert (v.config.loss.adversarial_weight, adversary.first_adversarial_step(v.config)) == (1, 0)
+        assert (v.config.loss.adversarial_weight, optimisation.first_adversarial_step(v.config)) == (1, 0)
         assert v.start is None
         assert dataclasses.replace(v.config, loss=config.LossConfig()) == dataclasses.replace(
             presets.tiny(), loss=config.LossConfig()

@@ -13,7 +13,7 @@ from support.surfel_clouds import cloud, shape
 
 import spnr_jax
 from spnr_jax.kernels.cloud_arrays import pad
-from spnr_jax.method import densifier, surfel_pictures
+from spnr_jax.method import densifier, surfel_method
 from spnr_jax.method.densifier import CHILDREN, Nodes, place
 from spnr_jax.surfels.geometry import estimate_surfels
 from spnr_jax.training import weights
@@ -25,7 +25,7 @@ estimate = jax.jit(estimate_surfels)
 
 @pytest.fixture(scope="module")
 def params():
-    return {"densifier": weights.read_densifier()}
+    return {"densifier": weights.read_variables(weights.shipped("densifier"))}
 
 
 @functools.cache
@@ -159,9 +159,9 @@ def test_few_points_and_equal_ones_stay_finite(params, positions):
 
 def test_the_handle_densifies_sparse_clouds_alone(params):
     sparse = cloud(shape("sphere", 300)[0])
-    dense = surfel_pictures.densify_sparse(params, sparse)
+    dense = surfel_method.densify_sparse(params, sparse)
     assert 2 * 300 < len(dense.mask) < 5 * 300
     assert dense.mask.all()
-    assert surfel_pictures.densify_sparse({}, sparse) is sparse
+    assert surfel_method.densify_sparse({}, sparse) is sparse
     many = cloud(shape("sphere", densifier.MOST_POINTS + 1)[0])
-    assert surfel_pictures.densify_sparse(params, many) is many
+    assert surfel_method.densify_sparse(params, many) is many

@@ -6,7 +6,7 @@ import numpy as np
 from support import reference
 from support.laws import batch_law, close, gradient_law, numbers
 
-from spnr_jax.method.march import union_weights
+from spnr_jax.method.paper_method import union_weights
 
 
 class TestUnionWeights:

@@ -16,7 +16,7 @@ from spnr_jax.config import RenderOptions, SamplingConfig
 from spnr_jax.formats import data_sets
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.records import LARGEST_REACH, Camera, Volume
-from spnr_jax.method import inference, model
+from spnr_jax.method import inference, model, paper_method
 
 
 @pytest.fixture(scope="module")
@@ -82,7 +82,7 @@ def test_an_axis_of_views_holds_what_each_camera_sees_alone(handle):
 
 def test_the_handle_shows_what_the_evaluation_shows(handle):
     item = data_sets.read_object(tiny_dataset.dataset(), "ball_000004")
-    expected = inference.render_views(handle.variables, tiny_dataset.CONFIG.model, item.cloud, item.camera)
+    expected = model.render_views(handle.variables, tiny_dataset.CONFIG.model, item.cloud, item.camera)
     encoded = inference.jitted_encode(
         handle.variables, jax.tree.map(lambda x: jax.numpy.asarray(x)[None], item.cloud), config=handle.config
     )
@@ -136,12 +136,12 @@ class TestQuality:
     def test_a_quality_is_a_share_of_the_samples_near_the_points(self, quality, samples):
         config = dataclasses.replace(tiny_dataset.CONFIG.model, sampling=SamplingConfig(num_coarse=4, num_fine=4))
         expected = SamplingConfig(num_coarse=samples, num_fine=0, reach=3)
-        assert inference.at_quality(config, quality, 3, 24) == RenderOptions(sampling=expected)
+        assert paper_method.at_quality(config, quality, 3, 24) == RenderOptions(sampling=expected)
 
     def test_trained_takes_the_samples_of_the_training_and_so_does_every_quality_of_other_networks(self):
         config = tiny_dataset.CONFIG.model
-        assert inference.at_quality(config, "trained", 3, 24) == inference.trained(config) == RenderOptions(block=1024)
-        assert inference.at_quality(NPBGConfig(), "draft", 3, 24).sampling is None
+        assert paper_method.at_quality(config, "trained", 3, 24) == RenderOptions(block=1024)
+        assert inference.options_of(NPBGConfig(), "draft", 24).sampling is None
 
     def test_another_word_is_refused(self, handle):
         volume = handle.encode(example_cloud())
@@ -158,5 +158,5 @@ class TestQuality:
 
     def test_reach_follows_the_distance_between_the_points(self):
         grid = np.stack(np.meshgrid(*[np.linspace(-1, 1, 9)] * 3), axis=-1).reshape(-1, 3)  # a quarter apart
-        assert [inference.reach_of(grid, resolution) for resolution in (4, 8, 16, 64)] == [1, 2, 4, 4]
-        assert inference.reach_of(grid[:1], 32) == LARGEST_REACH
+        assert [paper_method.reach_of(grid, resolution) for resolution in (4, 8, 16, 64)] == [1, 2, 4, 4]
+        assert paper_method.reach_of(grid[:1], 32) == LARGEST_REACH

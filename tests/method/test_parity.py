@@ -12,10 +12,10 @@ from support import twin
 from experiments.speed import twin_layout
 from spnr_jax.config import AS_TRAINED
 from spnr_jax.kernels import cameras, compositing, losses, sampling, voxels
-from spnr_jax.method import inference
-from spnr_jax.method.march import trace
+from spnr_jax.method import inference, pixels
+from spnr_jax.method.paper_method import trace
 from spnr_jax.nn.encoding import encode_direction
-from spnr_jax.training import adversary, optimisation
+from spnr_jax.training import optimisation
 
 TOLERANCE = 1e-4
 ARRAYS = twin.load()
@@ -130,14 +130,14 @@ class TestGeneratorStages:
     @pytest.mark.parametrize(("name", "source"), [("fake", "eval/image"), ("real", "in/target")])
     def test_logits(self, name, source):
         image = jnp.asarray(pictures(source))
-        logits = adversary.discriminator_of(CONFIG).apply(
+        logits = optimisation.discriminator_of(CONFIG).apply(
             {"params": DISCRIMINATOR}, image, BATCH.condition[0], BATCH.condition_mask[0]
         )
         agree(logits, pictures(f"eval/logits_{name}"))
 
 
 def judge(params, image):
-    logits = adversary.discriminator_of(CONFIG).apply(
+    logits = optimisation.discriminator_of(CONFIG).apply(
         {"params": params}, image[:, 0], BATCH.condition[0], BATCH.condition_mask[0]
     )
     return losses.generator_adversarial(logits)
@@ -154,7 +154,7 @@ def trained():
             rendering, updated = inference.network(CONFIG.model).apply(
                 variables, BATCH.cloud, BATCH.camera, train=True, mutable=["batch_stats"]
             )
-            l1 = optimisation.reconstruction_loss(CONFIG, rendering.image, rendering.image_lr, BATCH.image)
+            l1 = pixels.reconstruction_loss(CONFIG, rendering.image, rendering.image_lr, BATCH.image)
             adversarial = CONFIG.loss.adversarial_weight * judge(DISCRIMINATOR, rendering.image)
             parts = {"l1": l1, "adv": adversarial, "loss_g": l1 + adversarial}
             return l1 + adversarial, (rendering, updated["batch_stats"], parts)
@@ -244,10 +244,10 @@ def discriminated():
     """Loss and R1 penalty of the discriminator on the twin's training image, each with its gradients."""
     fake = jnp.asarray(pictures("train/image"))
     real, condition, mask = BATCH.image[0], BATCH.condition[0], BATCH.condition_mask[0]
-    module = adversary.discriminator_of(CONFIG)
+    module = optimisation.discriminator_of(CONFIG)
 
     def loss(params):  # step 1, where no R1 is due
-        return adversary.discriminator_loss(CONFIG, params, fake, BATCH, jnp.int32(1))[0]
+        return optimisation.discriminator_loss(CONFIG, params, fake, BATCH, jnp.int32(1))[0]
 
     def penalty(params):
         r1 = losses.r1(lambda image: module.apply({"params": params}, image, condition, mask), real)

@@ -15,7 +15,7 @@ from support.tiny_training import BATCH, CONFIG, L1_ONLY, create, step
 from spnr_jax.config import AS_TRAINED
 from spnr_jax.kernels.records import Rays, Scene
 from spnr_jax.method import inference
-from spnr_jax.method.march import trace
+from spnr_jax.method.paper_method import trace
 from spnr_jax.training import optimisation
 
 pytestmark = pytest.mark.ci  # it trains several networks

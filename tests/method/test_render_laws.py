@@ -13,7 +13,7 @@ from support.surfel_clouds import camera, cloud, shape
 
 from spnr_jax.config import SurfelConfig
 from spnr_jax.kernels.records import Rendering
-from spnr_jax.method import surfel_renderer
+from spnr_jax.method import surfel_method, surfel_renderer
 from spnr_jax.method.surfel_renderer import Plan, plan, render
 from spnr_jax.surfels.lighting import room_light, sun
 from spnr_jax.surfels.neighbors import neighbors
@@ -48,7 +48,7 @@ def body(name, count=90):
 
 @pytest.fixture(scope="module")
 def params():
-    fresh = jax.jit(surfel_renderer.init, static_argnums=1)(jax.random.key(0), CONFIG)
+    fresh = jax.jit(surfel_method.init, static_argnums=1)(jax.random.key(0), CONFIG)
     leaves, form = jax.tree.flatten(fresh)
     return jax.tree.unflatten(form, [x + 0.1 * numbers(i, *x.shape) for i, x in enumerate(leaves)])
 

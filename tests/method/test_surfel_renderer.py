@@ -12,7 +12,7 @@ from support.surfel_clouds import camera, cloud, shape
 from spnr_jax.config import SurfelConfig
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.records import Volume
-from spnr_jax.method import surfel_pictures, surfel_renderer
+from spnr_jax.method import surfel_method, surfel_renderer
 from spnr_jax.method.surfel_renderer import GRID, resolution
 from spnr_jax.nn.shader import Shader
 from spnr_jax.surfels.features import NUM_FEATURES
@@ -32,7 +32,7 @@ def render(variables, scene, view, quality="best"):
     """As the handle draws it, without its network for None."""
     volume = Volume(scene=scene, centre=scene.centre, scale=scene.scale)
     quality = "draft" if variables is None else quality
-    return surfel_pictures.draw(variables or {}, volume, view, LIGHT, config=CONFIG, quality=quality)
+    return next(surfel_method.render(variables or {}, volume, [view], [LIGHT], config=CONFIG, quality=quality))
 
 
 @pytest.fixture(scope="module")

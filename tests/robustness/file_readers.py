@@ -83,7 +83,7 @@ def read_config(folder: Path, main: str) -> None:
 
 def read_metrics(folder: Path, main: str) -> None:
     """The rows that a report draws."""
-    from spnr_jax.training.metrics_log import read_rows
+    from spnr_jax.training.run_record import read_rows
 
     for row in read_rows(folder):
         assert isinstance(row, dict), f"a row that is a {type(row).__name__}"

@@ -20,7 +20,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from spnr_jax.training import checkpoint, metrics_log, trainer
+from spnr_jax.training import checkpoint, run_record, trainer
 
 LIMIT = 300.0  # seconds without an event after which a process hangs
 SERVER = multiprocessing.get_context("forkserver")
@@ -149,7 +149,7 @@ def batches(*trials: Ended) -> dict[int, set[str | None]]:
 
 def rows(run: Path) -> list[dict]:
     """The metrics file without the time that a step took, the one entry that a clock decides."""
-    return [{k: v for k, v in row.items() if k != "ms_per_step"} for row in metrics_log.read_rows(run)]
+    return [{k: v for k, v in row.items() if k != "ms_per_step"} for row in run_record.read_rows(run)]
 
 
 def different(run: Path, whole: Path) -> list[str]:

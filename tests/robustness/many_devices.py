@@ -26,7 +26,7 @@ from support import tiny_baselines, tiny_dataset, tiny_model
 from spnr_jax.config import LossConfig, SamplingConfig
 from spnr_jax.devices import placement
 from spnr_jax.method import inference
-from spnr_jax.method import march as marching
+from spnr_jax.method import paper_method as marching
 from spnr_jax.training import batching, optimisation
 
 NEAR_POINTS = dataclasses.replace(

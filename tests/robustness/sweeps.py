@@ -17,7 +17,7 @@ from support import reference
 from spnr_jax.config import AS_TRAINED, PaperConfig, SamplingConfig
 from spnr_jax.kernels import cameras, compositing, losses, metrics, sampling, voxels
 from spnr_jax.kernels.records import Camera, Rays, Scene
-from spnr_jax.method import inference, march
+from spnr_jax.method import inference, paper_method
 from spnr_jax.nn.normalization import BatchNorm, GroupNorm
 
 RAYS = 16
@@ -181,7 +181,7 @@ def render(volume, origins, directions, bias):
     )
     module, rays = inference.network(config), Rays(origins=origins, directions=directions)
     encoded, rng = Scene(volume=volume, occupied=jnp.ones(volume.shape[:-1], bool)), np.random.default_rng(7)
-    traced = partial(march.trace, samples=config.sampling, options=AS_TRAINED, key=None)
+    traced = partial(paper_method.trace, samples=config.sampling, options=AS_TRAINED, key=None)
     shapes = jax.eval_shape(lambda: module.init(jax.random.key(0), encoded, rays, method=traced))
     draw = lambda x: np.float32(rng.normal(size=x.shape) / max(int(np.prod(x.shape[:-1])), 1) ** 0.5)  # noqa: E731
     variables = jax.tree.map(lambda x: jnp.asarray(draw(x), volume.dtype), shapes)

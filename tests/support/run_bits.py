@@ -15,7 +15,7 @@ import numpy as np
 
 from spnr_jax.config import LossConfig
 from spnr_jax.formats import data_sets
-from spnr_jax.method import inference
+from spnr_jax.method.model import render_views
 from spnr_jax.training import batching, optimisation
 from support import tiny_dataset
 
@@ -41,6 +41,6 @@ if __name__ == "__main__":
             state, _ = optimisation.jitted_train_step(state, jax.device_put(batch), config=CONFIG, adversarial=True)
     item = data_sets.read_object(dataset, dataset.splits["test"][0])
     cloud = data_sets.test_cloud(item, CONFIG)
-    picture = inference.render_views(optimisation.averaged_variables(state), CONFIG.model, cloud, item.camera)
+    picture = render_views(optimisation.averaged_variables(state), CONFIG.model, cloud, item.camera)
     for name, tree in (("batch", batch), ("state", state), ("picture", picture)):
         print(name, checksum(tree))

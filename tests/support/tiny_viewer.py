@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from spnr_jax.config import SurfelConfig
 from spnr_jax.kernels.records import PointCloud
-from spnr_jax.method import inference, surfel_renderer
+from spnr_jax.method import inference, surfel_method
 from spnr_jax.method.model import Model
 from spnr_jax.tools.light_options import Lighting
 from spnr_jax.viewer import frame
@@ -39,7 +39,7 @@ def cloud() -> PointCloud:
 def surfels() -> Model:
     """A network over surfels, whose drafts are drawn without its CNN, which is untrained."""
     config = SurfelConfig(image_resolution=24, widths=(4, 6), top=4)
-    return Model(config=config, variables=jax.jit(surfel_renderer.init, static_argnums=1)(jax.random.key(0), config))
+    return Model(config=config, variables=jax.jit(surfel_method.init, static_argnums=1)(jax.random.key(0), config))
 
 
 def ball(count: int = 400) -> PointCloud:

@@ -7,6 +7,7 @@ import sys
 import jax
 import numpy as np
 import pytest
+from flax.serialization import to_state_dict
 from support import tiny_untrained, tiny_viewer
 from support.laws import close
 
@@ -99,7 +100,7 @@ def test_quality_and_reach_are_part_of_what_is_exported(rendered, expected):
     volume, camera, picture = expected
     draft = export.export_render(tiny_viewer.model(), resolution=SIZE, quality="draft", reach=volume.reach)
     handle = tiny_viewer.model().render(volume, camera, "draft")
-    inputs = jax.tree.map(np.asarray, export.to_state_dict(volume)), arrays(camera)
+    inputs = jax.tree.map(np.asarray, to_state_dict(volume)), arrays(camera)
     del inputs[1]["height"], inputs[1]["width"]
     close(export.load_exported(draft)(*inputs)["image"], handle.image, atol=1e-5)
     close(export.load_exported(rendered)(*inputs)["image"], picture.image, atol=1e-5)

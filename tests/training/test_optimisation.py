@@ -9,16 +9,19 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+from support import tiny_surfels
 from support.laws import close, numbers, same_bits
 from support.tiny_model import MODEL, SIZE
 from support.tiny_training import BATCH, CONFIG, L1_ONLY, copied, create, near, run, step
 
+from experiments.speed.speed_scenes import random_crops
 from spnr_jax import methods
 from spnr_jax.config import LossConfig, NetworkConfig, OptimizerConfig
-from spnr_jax.kernels import losses
+from spnr_jax.kernels import cameras, losses
 from spnr_jax.kernels.records import Rendering
-from spnr_jax.method import inference
-from spnr_jax.training import adversary, optimisation
+from spnr_jax.method import inference, pixels
+from spnr_jax.nn.convolution import run_by_run
+from spnr_jax.training import optimisation
 
 
 @pytest.fixture(scope="module")
@@ -36,23 +39,17 @@ class TestState:
         same_bits(create(CONFIG), fresh)
         kernels = [state.generator["encoder"]["unet"]["stem"]["kernel"] for state in (fresh, fresh_l1)]
         assert (kernels[0] != kernels[1]).mean() > 0.99
+        same_bits((fresh.averaged, fresh.averaged_stats), (fresh.generator, fresh.batch_stats))
 
-    def test_the_average_starts_as_the_generator(self, fresh):
-        same_bits(fresh.averaged, fresh.generator)
-        same_bits(fresh.averaged_stats, fresh.batch_stats)
-
-    def test_there_is_no_discriminator_at_weight_zero_or_if_its_time_never_comes(self, fresh, fresh_l1):
-        assert fresh.discriminator is not None
-        assert fresh_l1.discriminator is None
-        assert fresh_l1.discriminator_optimizer is None
-        late = dataclasses.replace(CONFIG, loss=dataclasses.replace(CONFIG.loss, adversarial_start=1.0))
-        assert adversary.first_adversarial_step(late) == late.num_steps
-        assert jax.eval_shape(lambda: optimisation.create_state(late)).discriminator is None
-
-    @pytest.mark.parametrize(("share", "first"), [(0.0, 0), (0.25, 25), (1.0, 100)])
-    def test_the_discriminator_joins_after_its_share_of_the_steps(self, share, first):
-        loss = dataclasses.replace(CONFIG.loss, adversarial_start=share)
-        assert adversary.first_adversarial_step(dataclasses.replace(CONFIG, loss=loss)) == first
+    @pytest.mark.parametrize(
+        ("weight", "share", "first"), [(1.0, 0.0, 0), (1.0, 0.25, 25), (1.0, 1.0, 100), (0.0, 0.0, 100)]
+    )
+    def test_the_discriminator_joins_after_its_share_of_the_steps_or_is_left_out(self, weight, share, first):
+        loss = dataclasses.replace(CONFIG.loss, adversarial_weight=weight, adversarial_start=share)
+        config = dataclasses.replace(CONFIG, loss=loss)
+        assert optimisation.first_adversarial_step(config) == first
+        state = jax.eval_shape(lambda: optimisation.create_state(config))
+        assert (state.discriminator is None) == (state.discriminator_optimizer is None) == (first == config.num_steps)
 
 
 @pytest.mark.ci
@@ -112,7 +109,7 @@ class TestStep:
                 )
 
             def judge(params, image):
-                return adversary.discriminator_of(CONFIG).apply({"params": params}, image, condition, mask)
+                return optimisation.discriminator_of(CONFIG).apply({"params": params}, image, condition, mask)
 
             def discriminator_loss(params):
                 fake = jax.lax.stop_gradient(forward(start.generator)[0].image[:, 0])
@@ -173,10 +170,10 @@ class TestPixelError:
         image, reference = numbers(0, 2, 1, 4, 4, 3), numbers(1, 2, 1, 4, 4, 3)
         for pixel, expected in (("l1", np.abs(image - reference)), ("mse", (image - reference) ** 2)):
             config = dataclasses.replace(L1_ONLY, loss=dataclasses.replace(L1_ONLY.loss, pixel=pixel))
-            close(optimisation.pixel_error(config, image, reference), expected.mean())
+            close(pixels.pixel_error(config, image, reference), expected.mean())
             seen = jnp.arange(32).reshape(2, 1, 4, 4) % 5 == 0
-            close(optimisation.pixel_error(config, image, reference, seen), expected[np.asarray(seen)].mean())
-            assert optimisation.pixel_error(config, image, reference, jnp.zeros_like(seen)) == 0
+            close(pixels.pixel_error(config, image, reference, seen), expected[np.asarray(seen)].mean())
+            assert pixels.pixel_error(config, image, reference, jnp.zeros_like(seen)) == 0
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -217,11 +214,10 @@ def test_a_method_is_a_network_and_a_loss(monkeypatch):
     assert after.averaged["grey"] != after.generator["grey"]
 
 
-class TestReproducibility:
-    def test_every_step_draws_new_samples(self, fresh_l1):
-        """The same weights and batch, one step later: another jitter, another loss."""
-        (_, first), (_, later) = (step(dataclasses.replace(fresh_l1, step=jnp.int32(s)), L1_ONLY) for s in (0, 1))
-        assert first["loss"] != later["loss"]
+def test_every_step_draws_new_samples(fresh_l1):
+    """The same weights and batch, one step later: another jitter, another loss."""
+    (_, first), (_, later) = (step(dataclasses.replace(fresh_l1, step=jnp.int32(s)), L1_ONLY) for s in (0, 1))
+    assert first["loss"] != later["loss"]
 
 
 @pytest.mark.ci
@@ -242,16 +238,159 @@ def test_two_balls_and_their_opacity_are_learnt_from_a_lattice_of_rays():
 
 
 @pytest.mark.ci
-def test_one_batch_is_learnt_by_heart(fresh_l1):
-    """Two balls on white: sixty steps leave less than a third of the loss."""
-    _, start = step(fresh_l1, L1_ONLY)
-    _, end = run(fresh_l1, 60, L1_ONLY)
-    assert end["loss"] < start["loss"] / 3
+@pytest.mark.parametrize(
+    ("config", "steps", "left"), [(L1_ONLY, 60, 1 / 3), (CONFIG, 40, 1.0)], ids=["l1", "adversarial"]
+)
+def test_one_batch_is_learnt_by_heart(config, steps, left):
+    """Two balls on white, alone and against a discriminator."""
+    first, start = run(create(config), 1, config)
+    _, end = run(first, steps, config)
+    assert all(np.isfinite(value) for value in end.values())
+    assert end["l1"] < left * start["l1"]
+
+
+@pytest.fixture(scope="module")
+def judge(fresh):
+    return fresh.discriminator
+
+
+class TestDiscriminator:
+    def test_without_it_the_discriminator_sees_an_empty_image_and_mask(self, judge):
+        blind = dataclasses.replace(CONFIG, loss=dataclasses.replace(CONFIG.loss, condition=False))
+        image, condition, mask = (x[:, 0] for x in (BATCH.image, BATCH.condition, BATCH.condition_mask))
+        empty = jnp.zeros_like(condition), jnp.zeros_like(mask)
+        seen, unseen, expected = (
+            jax.jit(optimisation.logits, static_argnums=0)(config, judge, image, *inputs)
+            for config, inputs in ((CONFIG, (condition, mask)), (blind, (condition, mask)), (CONFIG, empty))
+        )
+        same_bits(unseen, expected)
+        assert (seen != unseen).any()
+
+    @pytest.mark.parametrize(("at", "due"), [(0, True), (1, False), (2, True), (3, False)])
+    def test_the_penalty_comes_every_interval_and_is_scaled_by_it(self, judge, at, due):
+        data, fake = BATCH, numbers(2, 2, SIZE, SIZE, 3)
+        real, condition, mask = data.image[:, 0], data.condition[:, 0], data.condition_mask[:, 0]
+
+        @jax.jit
+        def parts(params, step):
+            loss, metrics = optimisation.discriminator_loss(CONFIG, params, fake, data, step)
+            module = optimisation.discriminator_of(CONFIG)
+            penalty = losses.r1(lambda image: module.apply({"params": params}, image, condition, mask), real)
+            return loss - metrics["discriminator"], 2 * 10 * penalty
+
+        added, penalty = parts(judge, jnp.int32(at))
+        assert penalty > 0
+        close(added, penalty * due, rtol=1e-3, atol=1e-5)
+
+
+class TestLearningRate:
+    @pytest.mark.parametrize(("warmup", "steps"), [(10, 100), (0, 50), (500, 100), (1, 1)])
+    def test_rises_linearly_then_falls_by_a_cosine_to_its_last_share(self, warmup, steps):
+        o = OptimizerConfig(lr_generator=2e-3, warmup_steps=warmup, final_lr_scale=0.1)
+        rate = optimisation.learning_rate(dataclasses.replace(CONFIG, optimizer=o, num_steps=steps))
+        warmup = min(warmup, steps)
+        start = 2e-3 / max(warmup, 1)
+        for at in sorted({0, warmup // 2, warmup, (warmup + steps) // 2, steps - 1}):
+            if at <= warmup and warmup:
+                expected = start + (2e-3 - start) * at / warmup
+            else:
+                share = min((at - warmup) / (max(steps, warmup + 1) - warmup), 1)
+                expected = 2e-3 * (0.1 + 0.9 * 0.5 * (1 + np.cos(np.pi * share)))
+            assert float(rate(at)) == pytest.approx(expected, rel=1e-5)
+        assert float(rate(0)) > 0, "no step is lost"
+
+    def test_or_by_an_exponential(self):
+        """Point-NeRF's: a tenth after half a million of a million steps."""
+        o = OptimizerConfig(lr_generator=5e-4, warmup_steps=0, final_lr_scale=0.01, decay="exponential")
+        rate = optimisation.learning_rate(dataclasses.replace(CONFIG, optimizer=o, num_steps=1_000_000))
+        for at, expected in ((0, 5e-4), (500_000, 5e-5), (1_000_000, 5e-6)):
+            assert float(rate(at)) == pytest.approx(expected, rel=1e-4)
+
+    def test_the_algorithm_is_the_one_asked_for(self):
+        gradient, updates = jnp.array([0.5, -2.0]), {}
+        for name, algorithm in (("adam", optax.adam), ("radam", optax.radam)):
+            config = dataclasses.replace(CONFIG, optimizer=dataclasses.replace(CONFIG.optimizer, algorithm=name))
+            expected = algorithm(optimisation.learning_rate(config))
+            ours, _ = optimisation.optimizers(config)
+            updates[name], _ = ours.update(gradient, ours.init(gradient))
+            close(updates[name], expected.update(gradient, expected.init(gradient))[0])
+        assert (updates["adam"] != updates["radam"]).all()
+
+
+def test_a_gradient_longer_than_the_configs_norm_counts_as_one_of_that_norm():
+    clipped = dataclasses.replace(CONFIG, optimizer=dataclasses.replace(CONFIG.optimizer, clip_norm=1.0))
+    clipping, plain = (optimisation.optimizers(config)[0] for config in (clipped, CONFIG))
+    for length, counted in ((40.0, 1.0), (0.5, 0.5)):
+        (_, moments), (_, expected) = (
+            adam.update({"a": np.float32([0, size])}, adam.init({"a": np.zeros(2, np.float32)}))
+            for adam, size in ((clipping, length), (plain, counted))
+        )
+        close(moments, jax.tree.map(np.asarray, expected))
+
+
+@pytest.mark.parametrize(
+    ("choose", "size", "stride"), [(pixels.lattice, 4, 4), (pixels.lattice, 3, 3), (pixels.cropped, 10, 1)]
+)
+def test_some_pixels_of_a_batch_are_those_of_picture_opacity_condition_and_rays(choose, size, stride):
+    """`size` is the stride of a lattice and the side of a crop; another key gives another place."""
+    made, places = jax.jit(choose, static_argnums=2), set()
+    side, whole = SIZE // stride if stride > 1 else size, cameras.camera_rays(BATCH.camera).directions
+    for seed in range(6):
+        some = made(jax.random.key(seed), BATCH, size)
+        rays = cameras.camera_rays(some.camera).directions
+        distance = np.abs(np.asarray(whole[0, 0]) - np.asarray(rays[0, 0, 0, 0])).sum(-1)
+        row, column = np.unravel_index(distance.argmin(), distance.shape)
+        places.add((row, column))
+        kept = np.s_[:, :, row : row + side * stride : stride, column : column + side * stride : stride]
+        assert some.image.shape == (2, 1, side, side, 3)
+        close(rays, whole[kept], atol=1e-6)
+        for name in ("image", "alpha", "condition", "condition_mask"):
+            same_bits(getattr(some, name), getattr(BATCH, name)[kept])
+        same_bits(some.cloud, BATCH.cloud)
+    assert len(places) > 2
+
+
+def test_a_crop_as_large_as_the_view_is_the_view():
+    same_bits(pixels.cropped(jax.random.key(0), BATCH, BATCH.image.shape[2]), BATCH)
 
 
 @pytest.mark.ci
-def test_adversarial_training_stays_finite_and_still_learns(fresh):
-    _, start = step(fresh)
-    _, end = run(fresh, 40)
-    assert all(np.isfinite(value) for value in end.values())
-    assert end["l1"] < start["l1"]
+@pytest.mark.parametrize("kind", ["paper", "surfels"])
+def test_runs_in_one_compiled_step_are_the_loop_over_runs(kind):
+    """Seeds, and learning rates as factors: what a run moves by is the factor times what it would move by alone."""
+    config = {"paper": L1_ONLY, "surfels": tiny_surfels.CONFIG}[kind]
+    of_runs = [BATCH, BATCH] if kind == "paper" else [random_crops(config, 1, seed) for seed in (0, 1)]
+    states, scales = (
+        [optimisation.jitted_create_state(config, jnp.uint32(seed)) for seed in (3, 4)],
+        jnp.array([1, 0.25]),
+    )
+    batches = jax.tree.map(lambda *x: jnp.stack(x), *of_runs)
+    mapped = jax.jit(optimisation.train_runs, static_argnames=("config", "adversarial"))
+    after, metrics = mapped(optimisation.stack(states), batches, scales, config=config, adversarial=False)
+    together = metrics, after.batch_stats, optax.tree.get(after.generator_optimizer, "mu")
+    for i, (state, batch) in enumerate(zip(states, of_runs, strict=True)):
+        alone, alone_metrics = step(state, config, batch)  # Adam's first step hides sizes, mu shows them
+        expected = alone_metrics, alone.batch_stats, optax.tree.get(alone.generator_optimizer, "mu")
+        near(jax.tree.map(lambda x, i=i: x[i], together), expected)
+        moved, alone_moved = (
+            sum(float(jnp.sum(jnp.abs(x - y))) for x, y in zip(*map(jax.tree.leaves, pair), strict=True))
+            for pair in (
+                (jax.tree.map(lambda x, i=i: x[i], after.generator), state.generator),
+                (alone.generator, state.generator),
+            )
+        )
+        assert moved == pytest.approx(float(scales[i]) * alone_moved, rel=1e-2)
+
+
+@pytest.mark.ci
+@pytest.mark.parametrize("axes", [(0, None), (None, 1), (0, 1)])
+def test_what_is_computed_run_by_run_is_what_vmap_alone_computes(axes):
+    def function(tree, factor):
+        return {"sum": jnp.sum(tree["x"] * factor), "both": (tree["x"] + factor, factor)}
+
+    tree, factor = {"x": numbers(1, 3, 4)}, numbers(2, 4, 3)
+    of_runs = ({"x": tree["x"] if axes[0] == 0 else tree["x"][0]}, factor if axes[1] == 1 else factor[:, 0])
+    mapped = jax.jit(jax.vmap(run_by_run(function), in_axes=axes))
+    near(mapped(*of_runs), jax.vmap(function, in_axes=axes)(*of_runs))
+    twice = jax.vmap(jax.vmap(run_by_run(function), in_axes=(None, 0)), in_axes=(0, None))
+    near(twice(tree, factor.T), jax.vmap(jax.vmap(function, in_axes=(None, 0)), in_axes=(0, None))(tree, factor.T))

@@ -2,19 +2,24 @@
 
 import dataclasses
 import errno
+import io
 import os
 import re
 import shutil
 import signal
+import struct
+import subprocess
 from functools import partial
 
 import jax
 import numpy as np
 import pytest
+from PIL import Image
 from support import tiny_dataset, tiny_model, tiny_untrained
 from support.laws import close, same_bits
-from support.stopped_runs import interrupted, rows_without_time
+from support.stopped_runs import PICTURE, interrupted, rows_without_time, without_network
 from support.tiny_dataset import CONFIG, SCHEDULE
+from tensorboardX.proto.event_pb2 import Event
 
 import spnr_jax
 from experiments.baselines.npbg import NPBGConfig
@@ -22,8 +27,9 @@ from experiments.baselines.point_nerf import PointNeRFConfig
 from spnr_jax import cli
 from spnr_jax.config import LossConfig
 from spnr_jax.formats import data_sets
+from spnr_jax.formats.images import png
 from spnr_jax.scoring import evaluation
-from spnr_jax.training import batching, checkpoint, metrics_log, optimisation, run_record, trainer, weights
+from spnr_jax.training import batching, checkpoint, optimisation, run_record, trainer, weights
 
 KEPT_STEPS = {"2", "4", "6"}
 
@@ -72,27 +78,22 @@ class TestBeginningWithOtherWeights:
         assert "are of another network: shape of" in capsys.readouterr().err.splitlines()[-1]
 
 
-@pytest.mark.parametrize("end", ["", '{"step": 6, "lo'])
-def test_rows_after_the_checkpoint_and_half_rows_are_written_again(end, tmp_path):
+@pytest.mark.parametrize("end", [None, "", '{"step": 6, "lo'], ids=["damaged", "rows", "half a row"])
+def test_what_lies_after_the_newest_good_checkpoint_is_made_again(end, tmp_path, capsys):
+    """Rows, half rows, and a checkpoint that was emptied."""
     run = shutil.copytree(tiny_dataset.run(), tmp_path / "run")
-    shutil.rmtree(run / "checkpoints" / "6")
-    with (run / "metrics.jsonl").open("a") as file:
-        file.write(end)
-    trainer.train(CONFIG, tiny_dataset.dataset(), run, SCHEDULE)
-    assert rows_without_time(run) == rows_without_time(tiny_dataset.run())
-    same_bits(restored(run), restored(tiny_dataset.run()))
-
-
-def test_a_damaged_newest_checkpoint_is_replaced_on_the_way(tmp_path, capsys):
-    run = shutil.copytree(tiny_dataset.run(), tmp_path / "run")
-    (run / "checkpoints" / "6" / "state" / "_METADATA").unlink(missing_ok=True)
-    for path in (run / "checkpoints" / "6").rglob("*"):
-        if path.is_file():
+    if end is None:
+        for path in (path for path in (run / "checkpoints" / "6").rglob("*") if path.is_file()):
             path.write_bytes(b"")
+    else:
+        shutil.rmtree(run / "checkpoints" / "6")
+        with (run / "metrics.jsonl").open("a") as file:
+            file.write(end)
     trainer.train(CONFIG, tiny_dataset.dataset(), run, SCHEDULE)
-    assert "checkpoints/6" in capsys.readouterr().out
+    assert ("checkpoints/6" in capsys.readouterr().out) == (end is None)
     same_bits(restored(run), restored(tiny_dataset.run()))
     assert capsys.readouterr().out == "", "the checkpoint at step 6 is good again"
+    assert rows_without_time(run) == rows_without_time(tiny_dataset.run())
 
 
 def test_a_finished_run_is_left_alone():
@@ -103,7 +104,7 @@ def test_a_finished_run_is_left_alone():
 
 
 def test_previews_and_rows_come_when_the_schedule_says():
-    run, rows = tiny_dataset.run(), metrics_log.read_rows(tiny_dataset.run())
+    run, rows = tiny_dataset.run(), run_record.read_rows(tiny_dataset.run())
     assert [row["step"] for row in rows if "loss" in row] == [1, 2, 3, 4, 5, 6]
     assert [row["step"] for row in rows if "val_psnr" in row] == [3, 6]
     assert all(np.isfinite(value) for row in rows for value in row.values())
@@ -156,7 +157,7 @@ def test_a_full_disk_is_one_line_and_exit_code_2(monkeypatch, tmp_path, capsys):
     def full(log, row):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(tmp_path / "metrics.jsonl"))
 
-    monkeypatch.setattr(metrics_log.MetricsLog, "write", full)
+    monkeypatch.setattr(run_record.MetricsLog, "write", full)
     code = cli.guarded(lambda: trainer.train(CONFIG, tiny_dataset.dataset(), tmp_path, SCHEDULE), "spnr")
     assert code == 2
     line = capsys.readouterr().err.splitlines()[-1]
@@ -211,3 +212,120 @@ def test_a_baseline_is_trained_resumed_previewed_evaluated_and_loaded_like_ours(
     rendering = handle.render(volume, handle.camera(volume))
     assert rendering.image.shape == (tiny_dataset.SIZE, tiny_dataset.SIZE, 3)
     assert np.isfinite(np.asarray(rendering.image)).all()
+
+
+def events(run):
+    """(step, value) of everything in the event files of a run; a record is length, checksum, content, checksum."""
+    found = []
+    for path in sorted((run / "tensorboard").iterdir()):
+        content, place = path.read_bytes(), 0
+        while place < len(content):
+            (length,) = struct.unpack_from("<Q", content, place)
+            event = Event.FromString(content[place + 12 : place + 12 + length])
+            found += [(event.step, value) for value in event.summary.value]
+            place += 16 + length
+    return found
+
+
+def decoded(content):
+    return np.asarray(Image.open(io.BytesIO(content)))
+
+
+def test_a_row_with_a_picture_is_scalars_and_an_image_of_the_same_pixels_as_the_file(tmp_path):
+    log = run_record.MetricsLog(tmp_path, 0)
+    log.write({"step": 2, "loss": 3.0})
+    log.write({"step": 3, "val_psnr": 20.5}, PICTURE)
+    log.close()
+    (_, loss), (at, score), (shown, picture) = events(tmp_path)
+    assert (loss.tag, loss.simple_value) == ("loss", 3.0)
+    assert (at, score.tag, score.simple_value) == (3, "val_psnr", 20.5)
+    assert (shown, picture.tag) == (3, "preview")
+    np.testing.assert_array_equal(decoded(picture.image.encoded_image_string), decoded(png(PICTURE)))
+    assert run_record.read_rows(tmp_path) == [{"step": 2, "loss": 3.0}, {"step": 3, "val_psnr": 20.5}]
+
+
+def test_previews_are_images_at_their_steps_and_a_second_compilation_is_announced(monkeypatch, tmp_path, capsys):
+    without_network(monkeypatch)
+    seen = []
+    trainer.train(
+        CONFIG, tiny_dataset.dataset(), tmp_path, SCHEDULE,
+        on_event=lambda phase, step, _: seen.append((phase, step, "discriminator joins" in capsys.readouterr().out)),
+    )  # fmt: skip
+    assert [step for step, value in events(tmp_path) if value.HasField("image")] == [3, 6]
+    assert [step for phase, step, said in seen if said] == [3]
+    assert ("step", 3, True) in seen
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    """A finished run."""
+    folder = tmp_path_factory.mktemp("runs") / "a"
+    with pytest.MonkeyPatch.context() as patch:
+        without_network(patch)
+        patch.setattr(trainer, "preview", lambda *_: ({"val_psnr": 11.0}, np.ones((2, 2, 3))))
+        trainer.train(tiny_untrained.CONFIG, tiny_dataset.dataset(), folder, SCHEDULE)
+    return folder
+
+
+def test_a_start_says_where_and_with_what_it_trained_and_tells_its_objects_from_others(recorded):
+    (entry,), dataset = run_record.read_starts(recorded), tiny_dataset.dataset()
+    assert (entry["first_step"], entry["last_step"]) == (0, tiny_untrained.CONFIG.num_steps)
+    phases = {"restore", "compilation", "steps", "previews", "checkpoints", "listeners"}
+    for spent in (entry["seconds"], entry["processor_seconds"]):
+        assert set(spent) == phases
+        assert all(seconds >= 0 for seconds in spent.values())
+    assert entry["data_checksum"] == run_record.checksum(dataset)
+    assert "cores" in entry["hardware"]
+    assert run_record.seen_in_training(recorded, dataset, dataset.splits["train"]) is True
+    assert run_record.seen_in_training(recorded, dataset, dataset.splits["test"]) is False
+
+
+def test_a_run_that_goes_on_keeps_what_earlier_starts_said(tmp_path):
+    dataset = tiny_dataset.dataset()
+    clock = run_record.Clock()
+    clock.lap("steps")
+    for first in (0, 4):
+        run_record.RunRecord(tmp_path, dataset, first).write(first + 4, clock)
+    starts = run_record.read_starts(tmp_path)
+    assert [(entry["first_step"], entry["last_step"]) for entry in starts] == [(0, 4), (4, 8)]
+
+
+@pytest.mark.parametrize("content", ["", "[]", '{"starts": 3}', '{"starts": [1]}', "[" * 100_000])
+def test_a_damaged_record_stops_nothing(content, tmp_path):
+    (tmp_path / "run.json").write_text(content)
+    assert run_record.read_starts(tmp_path) == []
+
+
+def test_laps_of_one_phase_add_up_and_leave_nothing_out(monkeypatch):
+    times = iter([10.0, 11.0, 13.0, 17.0])
+    monkeypatch.setattr(run_record.time, "monotonic", lambda: next(times))
+    clock = run_record.Clock()
+    assert [clock.lap(phase) for phase in ("steps", "previews", "steps")] == [1.0, 2.0, 4.0]
+    assert clock.seconds == {"steps": 5.0, "previews": 2.0}
+
+
+def test_the_checksum_knows_settings_and_splits():
+    dataset = tiny_dataset.dataset()
+    others = [
+        data_sets.Dataset(folder=dataset.folder, settings=dataset.settings | {"views": 99}, splits=dataset.splits),
+        data_sets.Dataset(folder=dataset.folder, settings=dataset.settings, splits=dataset.splits | {"test": ()}),
+    ]
+    assert len({run_record.checksum(d) for d in (dataset, *others)}) == 3
+
+
+def test_a_changed_checkout_is_marked(tmp_path, monkeypatch):
+    def git(*arguments):
+        subprocess.run(["git", "-C", str(tmp_path), *arguments], check=True, capture_output=True)
+
+    package = tmp_path / "package"
+    package.mkdir()
+    monkeypatch.setattr(run_record, "__file__", str(package / "x.py"))
+    assert run_record.commit() is None
+    (package / "x.py").write_text("1")
+    git("init")
+    git("add", ".")
+    git("-c", "user.name=a", "-c", "user.email=a@b", "commit", "-m", "a")
+    clean = run_record.commit()
+    (package / "x.py").write_text("2")
+    assert len(clean) == 40
+    assert run_record.commit() == clean + "+"

@@ -10,15 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from support import tiny_dataset, tiny_training
-from support.tiny_baselines import NETWORKS
+from support.tiny_baselines import SHRUNKEN
 
 from spnr_jax.config import LossConfig, OptimizerConfig, TrainConfig
-from spnr_jax.formats import data_sets
 from spnr_jax.kernels import losses
 from spnr_jax.method import inference
-from spnr_jax.methods import METHODS
-from spnr_jax.presets import PAPERS, tiny
-from spnr_jax.training import adversary, batching, metrics_log, optimisation, trainer
+from spnr_jax.training import batching, optimisation, run_record, trainer
 
 pytestmark = pytest.mark.ci  # it trains several networks
 
@@ -46,7 +43,7 @@ def with_losses(config: TrainConfig, **weights: float) -> TrainConfig:
 
 WILD_WEIGHTS = {"l1_weight": 1e6, "adversarial_weight": 1e6}
 WILD = with_losses(with_rates(TAME, 100), **WILD_WEIGHTS)
-ADVERSARIAL = with_losses(TAME, adversarial_weight=1e3)
+HOPELESS = with_losses(with_rates(TAME, 1e30), adversarial_weight=0.0)
 
 
 def assert_finite(tree):
@@ -66,32 +63,19 @@ def train_to_the_end_or_a_name(config, dataset, run) -> str | None:
     else:
         assert_finite(state)
         updates = state.generator_optimizer[0].count, state.discriminator_optimizer[0].count
-        assert updates == (config.num_steps, config.num_steps - adversary.first_adversarial_step(config))
+        assert updates == (config.num_steps, config.num_steps - optimisation.first_adversarial_step(config))
         quantity, whole = None, config.num_steps
-    rows = [row for row in metrics_log.read_rows(run) if "loss" in row]
+    rows = [row for row in run_record.read_rows(run) if "loss" in row]
     assert [row["step"] for row in rows] == list(range(1, whole + 1))
     assert all(np.isfinite(value) for row in rows for value in row.values())
     return quantity
 
 
-class TestWildSettings:
-    """Learning rates a hundred times too high, both losses weighted with a million."""
-
-    @pytest.mark.ci
-    def test_training_is_finite_to_its_end_or_stops_by_name(self, tmp_path):
-        assert train_to_the_end_or_a_name(WILD, tiny_dataset.dataset(), tmp_path) is None
-
-    @pytest.mark.slow
-    def test_a_hopeless_learning_rate_stops_by_name(self, tmp_path):
-        hopeless = with_losses(with_rates(TAME, 1e30), adversarial_weight=0.0)
-        assert train_to_the_end_or_a_name(hopeless, tiny_dataset.dataset(), tmp_path) is not None
-
-    @pytest.mark.slow
-    @pytest.mark.parametrize("name", ["rates", "weights"])
-    def test_two_hundred_steps_of_tiny_are_finite_to_their_end_or_stop_by_name(self, name, tmp_path):
-        config = dataclasses.replace(tiny(), num_steps=200)
-        config = with_rates(config, 100) if name == "rates" else with_losses(config, **WILD_WEIGHTS)
-        train_to_the_end_or_a_name(config, images_of(config, tmp_path / "data"), tmp_path / "run")
+@pytest.mark.parametrize("config", [WILD, pytest.param(HOPELESS, marks=pytest.mark.slow)], ids=["wild", "hopeless"])
+def test_training_with_wild_settings_is_finite_to_its_end_or_stops_by_name(config, tmp_path):
+    """Learning rates a hundred times too high and both losses weighted with a million; rates beyond all hope."""
+    stopped = train_to_the_end_or_a_name(config, tiny_dataset.dataset(), tmp_path)
+    assert (stopped is None) == (config is WILD)
 
 
 def empty(batch):
@@ -131,111 +115,33 @@ def first_batch():
         return jax.tree.map(jnp.asarray, next(batches))
 
 
-class TestOddBatches:
-    """Twenty steps on one batch."""
-
-    @pytest.mark.parametrize("config", [WILD, pytest.param(ADVERSARIAL, marks=pytest.mark.slow)], ids=["wild", "1000"])
-    @pytest.mark.parametrize("name", BATCHES)
-    def test_both_networks_stay_finite_on(self, name, config):
-        state, batch = optimisation.jitted_create_state(config), BATCHES[name](first_batch())
-        for _ in range(20):
-            state, metrics = optimisation.jitted_train_step(state, batch, config=config, adversarial=True)
-            assert_finite(metrics)
-        assert_finite(state)
-
-    @pytest.mark.slow
-    def test_steps_on_empty_images_leave_the_way_back_open(self):
-        """A network that was asked for nothing but white has a gradient when it is asked for an object again."""
-        state, batch = optimisation.jitted_create_state(ADVERSARIAL), first_batch()
-        for odd in [empty(batch)] * 20 + [batch]:
-            state, metrics = optimisation.jitted_train_step(state, odd, config=ADVERSARIAL, adversarial=True)
-        assert metrics["gradient_norm"] > 1
+@pytest.mark.parametrize("name", BATCHES)
+def test_both_networks_stay_finite_in_twenty_steps_on(name):
+    state, batch = optimisation.jitted_create_state(WILD), BATCHES[name](first_batch())
+    for _ in range(20):
+        state, metrics = optimisation.jitted_train_step(state, batch, config=WILD, adversarial=True)
+        assert_finite(metrics)
+    assert_finite(state)
 
 
-def shrunken(config: TrainConfig, precision: str, num_steps: int) -> TrainConfig:
-    """A preset with its own stages, passes, losses and schedule, at 16 rays a side and the narrowest layers."""
-    m, smaller = config.model, config.model.render_resolution // 16
-    encoder = dataclasses.replace(
-        m.encoder,
-        point_widths=tuple(width // 16 for width in m.encoder.point_widths),
-        point_features=4,
-        volume_resolution=2**m.encoder.num_stages,
-        base_width=2,
-        num_groups=min(m.encoder.num_groups, 2),
-    )
-    sizes = {f"{n}_resolution": getattr(m, f"{n}_resolution") // smaller for n in ("render", "resize", "image")}
-    model = dataclasses.replace(
-        m,
-        encoder=encoder,
-        field_width=8,
-        num_features=5,
-        sampling=dataclasses.replace(m.sampling, num_coarse=4, num_fine=4),
-        upsampler_width=4,
-        precision=precision,
-        **sizes,
-    )
-    loss = dataclasses.replace(config.loss, discriminator_width=4, r1_interval=2)
-    return shortened(dataclasses.replace(config, model=model, loss=loss), num_steps)
+BFLOAT16 = dataclasses.replace(TAME, model=dataclasses.replace(TAME.model, precision="bfloat16"))
+SLOW = {"paper, bfloat16": BFLOAT16, **SHRUNKEN}
 
 
-def shrunken_baseline(config: TrainConfig, num_steps: int) -> TrainConfig:
-    """A baseline's preset with its own units, losses and schedule, 8 pixels a side and the narrowest layers."""
-    small = next(model for model in NETWORKS.values() if isinstance(model, type(config.model)))
-    kept = ("near", "radius", "jitter", "density_scale", "kl_weight", "materials")
-    kept = {name: getattr(config.model, name) for name in kept if hasattr(config.model, name)}
-    model = dataclasses.replace(small, **kept, image_resolution=8 * config.pixel_stride)
-    return shortened(dataclasses.replace(config, model=model), num_steps)
-
-
-def shortened(config: TrainConfig, num_steps: int) -> TrainConfig:
-    """The config with few steps on few points of two objects."""
-    return dataclasses.replace(
-        config,
-        optimizer=dataclasses.replace(config.optimizer, warmup_steps=min(config.optimizer.warmup_steps, 2)),
-        num_steps=num_steps,
-        batch_objects=2,
-        min_points=8,
-        max_points=32,
-    )
-
-
-def images_of(config: TrainConfig, folder):
-    """The painted balls at the size that a config needs."""
-    return data_sets.open_dataset(tiny_dataset.write_dataset(folder, size=config.model.image_resolution))
-
-
-def train_under_debug_nans(config: TrainConfig, dataset):
-    """State after the config's steps while JAX looks for NaN in whatever a compiled function returns."""
-    with jax.debug_nans(True), closing(batching.batches(dataset, config, 0)) as batches:
+@pytest.mark.parametrize(
+    "config", [TAME, *(pytest.param(x, marks=pytest.mark.slow) for x in SLOW.values())], ids=["paper", *SLOW]
+)
+def test_no_step_of_a_training_makes_a_nan(config):
+    """While JAX looks for NaN in whatever a compiled function returns."""
+    with jax.debug_nans(True), closing(batching.batches(tiny_dataset.dataset(), config, 0)) as batches:
         state = optimisation.jitted_create_state(config)
         for step, batch in enumerate(batches):
-            adversarial = step >= adversary.first_adversarial_step(config)
+            adversarial = step >= optimisation.first_adversarial_step(config)
             state, metrics = optimisation.jitted_train_step(
                 state, jax.device_put(batch), config=config, adversarial=adversarial
             )
             assert_finite(metrics)
     assert_finite(state)
-    return state
-
-
-class TestNoNaN:
-    def test_a_few_steps_of_shrunken_tiny_make_none(self, tmp_path):
-        config = with_losses(shrunken(tiny(), "float32", 4), adversarial_weight=0.0)
-        assert train_under_debug_nans(config, images_of(config, tmp_path)).step == 4
-
-    @pytest.mark.slow
-    @pytest.mark.parametrize("precision", ["float32", "bfloat16"])
-    @pytest.mark.parametrize("preset", PAPERS)
-    def test_twenty_steps_of_each_shrunken_preset_make_none(self, preset, precision, tmp_path):
-        config = shrunken(preset(), precision, 20)
-        assert adversary.first_adversarial_step(config) in range(1, 20), "both phases are trained"
-        assert train_under_debug_nans(config, images_of(config, tmp_path)).step == 20
-
-    @pytest.mark.slow
-    @pytest.mark.parametrize("preset", [preset for method in METHODS.values() for preset in method.presets])
-    def test_twenty_steps_of_each_shrunken_baseline_make_none(self, preset, tmp_path):
-        config = shrunken_baseline(preset(), 20)
-        assert train_under_debug_nans(config, images_of(config, tmp_path)).step == 20
 
 
 @pytest.mark.slow

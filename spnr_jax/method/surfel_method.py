@@ -1,7 +1,7 @@
-"""How the handle draws with the network over surfels: at a quality, in a light, several views of common sizes.
+"""Our method as the handle, scores and the viewer use it: `surfel_renderer`, compiled.
 
-`surfel_renderer.render`, compiled as two programs: the first is compiled anew for other numbers of entries and pixels,
-the second, with most of what takes XLA long, for other windows alone.
+Pictures are drawn at a quality, in a light, several views of common sizes, by two programs: the first is compiled anew
+for other numbers of entries and pixels, the second, with most of what takes XLA long, for other windows alone.
 """
 
 import dataclasses
@@ -17,10 +17,12 @@ from spnr_jax.devices.compilation import QUICK, QUICKEST
 from spnr_jax.devices.side_by_side import two_at_a_time
 from spnr_jax.devices.traces import Kept
 from spnr_jax.kernels import cameras, cloud_arrays
-from spnr_jax.kernels.records import Camera, GBuffer, Light, PointCloud, Rendering, SurfelScene, Volume
+from spnr_jax.kernels.records import Camera, GBuffer, Key, Light, PointCloud, Rendering, SurfelScene, Volume
 from spnr_jax.kernels.resizing import enlarged
 from spnr_jax.method import densifier, surfel_renderer
-from spnr_jax.method.surfel_renderer import Blended, Sizes, unstack
+from spnr_jax.method.surfel_renderer import Blended, Sizes
+from spnr_jax.nn.shader import Shader
+from spnr_jax.surfels import features
 from spnr_jax.surfels.lighting import room_light
 from spnr_jax.surfels.neighbors import neighbors
 from spnr_jax.surfels.surfel_scenes import encode_in_box
@@ -37,10 +39,16 @@ class Asked(NamedTuple):
     needed: Sizes
 
 
-def encode_volume(
+def init(key: Key, config: SurfelConfig) -> dict:
+    """Fresh variables of the shader network."""
+    side = 2 ** len(config.widths)
+    return dict(Shader(config.widths, config.top).init(key, jnp.zeros((1, side, side, features.NUM_FEATURES)), 1))
+
+
+def encode(
     variables: dict | None, cloud: PointCloud, centre: np.ndarray, scale: np.floating, *, config: SurfelConfig
 ) -> Volume:
-    """Volume of a cloud in the box (unbatched)."""
+    """Volume of a cloud in the box (unbatched); sparse ones get learned points between their own."""
     cloud = densify_sparse(variables, cloud)
     scene = encode_in_box(cloud)
     scene = dataclasses.replace(scene, centre=jnp.asarray(centre), scale=jnp.asarray(scale))
@@ -56,44 +64,7 @@ def densify_sparse(variables: dict | None, cloud: PointCloud) -> PointCloud:
     return cloud_arrays.strip(_densify(variables["densifier"], padded, neighbors(padded)))
 
 
-def draw(
-    variables: dict, volume: Volume, camera: Camera, light: Light | None, *, config: SurfelConfig, quality: str
-) -> Rendering:
-    """A view, or one axis of views."""
-    if camera.cam_to_world.ndim == 2:
-        return next(draw_each(variables, volume, [camera], [light], config=config, quality=quality))
-    return _draw_axis(variables, volume, camera, [light] * len(camera.cam_to_world), config, quality)
-
-
-def draw_views(
-    variables: dict | None,
-    cloud: PointCloud,
-    camera: Camera,
-    light: Light | Sequence[Light] | None,
-    *,
-    config: SurfelConfig,
-    quality: str = "best",
-) -> Rendering:
-    """Views (one axis of cameras) of a cloud in the box, in one light or each in its own."""
-    volume = encode_volume(variables, cloud, np.zeros(3, np.float32), np.float32(1), config=config)
-    lights = [light] * len(camera.cam_to_world) if light is None or isinstance(light, Light) else light
-    return _draw_axis(variables, volume, camera, lights, config, quality)
-
-
-def _draw_axis(
-    variables: dict | None,
-    volume: Volume,
-    camera: Camera,
-    lights: Sequence[Light | None],
-    config: SurfelConfig,
-    quality: str,
-) -> Rendering:
-    """Views along one axis of cameras, each in its light."""
-    drawn = draw_each(variables, volume, unstack(camera), lights, config=config, quality=quality)
-    return jax.tree.map(lambda *x: np.stack(x), *drawn)
-
-
-def draw_each(
+def render(
     variables: dict | None,
     volume: Volume,
     views: Sequence[Camera],
@@ -103,7 +74,6 @@ def draw_each(
     quality: str,
 ) -> Iterator[Rendering]:
     """Views one after the other; they share the sizes of the largest of them, so that few programs are compiled."""
-    del config
     shader, share = (None if quality == "draft" else variables), (BALANCED if quality == "balanced" else 1.0)
     asked = [look_at(volume.scene, view, light, share) for view, light in zip(views, lights, strict=True)]
     common = {

@@ -1,12 +1,13 @@
-"""Some of the pixels of a training batch: a lattice of them, or a square, at a place that a key draws."""
+"""The pixels that a training step renders of a batch, a lattice or a square at a random place, and their error."""
 
 from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from spnr_jax.config import TrainConfig
+from spnr_jax.kernels import losses
 from spnr_jax.kernels.records import Batch, Camera, Key
 
 
@@ -59,3 +60,27 @@ def _some_pixels(batch: Batch, some: Callable[[Array], Array], intrinsics: Array
         cam_to_world=batch.camera.cam_to_world, intrinsics=intrinsics, height=image.shape[2], width=image.shape[3]
     )
     return Batch(cloud=batch.cloud, camera=camera, image=image, alpha=alpha, condition=condition, condition_mask=mask)
+
+
+def pixel_error(config: TrainConfig, image: Array, reference: Array, seen: Array | None = None) -> Float[Array, ""]:
+    """Mean error of all pixels, or of those that are `seen` (0 if there are none)."""
+    if seen is None:
+        return {"l1": losses.l1, "mse": losses.mse}[config.loss.pixel](image, reference)
+    error = {"l1": jnp.abs, "mse": jnp.square}[config.loss.pixel](image - reference)
+    return jnp.sum(jnp.where(seen[..., None], error, 0)) / jnp.maximum(3 * jnp.sum(seen), 1)
+
+
+def reconstruction_loss(
+    config: TrainConfig,
+    image: Float[Array, "*batch"],
+    image_lr: Float[Array, "*batch_lr"],
+    reference: Array,
+    seen: Array | None = None,
+) -> Float[Array, ""]:
+    """Weighted errors of the image, and of a smaller volume rendering against the reference averaged to its size."""
+    error = pixel_error(config, image, reference, seen)
+    if config.model.upsamples:
+        low = losses.area_downsample(reference, image_lr.shape[-2])
+        error = error + config.loss.low_resolution_weight * pixel_error(config, image_lr, low)
+    error = config.loss.l1_weight * error
+    return error + config.loss.mse_weight * losses.mse(image, reference) if config.loss.mse_weight else error

@@ -1,27 +1,43 @@
-"""Volume rendering of any field: sample along rays, query the field, composite.
+"""The paper's method on one page: points -> volume -> features along rays -> image.
 
+    encode   PointNet on every point, mean per voxel, 3D U-Net (`nn/encoder.py`)             once per object
+    render   64 x 64 rays, 64 coarse and 64 fine samples, field, compositing, 2D upsampler   once per view
     trace    all rays: those that meet nothing are left out, the others rendered in blocks on the device of their object
     march    rays of a block: coarse samples, fine samples where the coarse weights are large, compositing
 
-What is marched through is a *field*: a function of distances (*rays, samples) that gives `Samples`.
+Its loss is that of every Linen module (`inference.loss`), with a discriminator.  Objects lead, views follow: clouds are
+(objects, points, ...), cameras (objects, views, ...).  What is marched through is a *field*: a function of distances
+(*rays, samples) that gives `Samples`.
 """
 
+import dataclasses
 import operator
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial, reduce
 from typing import Any, NamedTuple
 
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
+from scipy.spatial import cKDTree
 
-from spnr_jax.config import RenderOptions, SamplingConfig
+from spnr_jax.config import AS_TRAINED, PaperConfig, RenderOptions, SamplingConfig, TrainConfig
 from spnr_jax.devices.placement import split_objects
-from spnr_jax.kernels import cameras, compositing, occupancy, sampling
+from spnr_jax.kernels import cameras, compositing, occupancy, sampling, voxels
 from spnr_jax.kernels.numerics import clamp
 from spnr_jax.kernels.occupancy import Path
-from spnr_jax.kernels.records import Key, Rays, Scene
+from spnr_jax.kernels.records import LARGEST_REACH, Camera, Key, Light, PointCloud, Rays, Rendering, Scene, Volume
+from spnr_jax.kernels.resizing import bilinear
+from spnr_jax.method import inference
+from spnr_jax.nn.discriminator import Discriminator
+from spnr_jax.nn.encoder import Encoder
+from spnr_jax.nn.field import RadianceField
+from spnr_jax.nn.upsampler import Upsampler
 
+SAMPLES = {"draft": 0.25, "balanced": 0.5, "best": 1.0}  # share of the samples a ray was trained with
+REACH_PER_SPACING = 1.6  # what loses nothing from 128 to 4096 points, docs/lab/cpu_forms.md
 CELLS_PER_VOXEL = 1  # of a path through the box, counted along an axis
 RAY_BLOCK = 256  # rays near points that are rendered at once
 CPU_BLOCK = 64  # the same on a CPU without a training's key: what they read stays in its first cache
@@ -53,6 +69,76 @@ class Traced(NamedTuple):
 
 Field = Callable[[Float[Array, "*rays samples"]], Samples]
 Finish = Callable[[Seen], Float[Array, "*rays k"]]
+
+
+class PaperNetwork(nn.Module):
+    """The generator: a volume from a cloud, pictures from a volume."""
+
+    config: PaperConfig
+
+    def setup(self) -> None:
+        """Encoder, radiance field, and the upsampler unless pictures have the size of the volume rendering."""
+        c = self.config
+        self.encoder = Encoder(c.encoder, c.bf16)
+        self.field = RadianceField(c.field_width, c.num_features, c.direction_frequencies, c.sees_direction)
+        if c.upsamples:
+            self.upsampler = Upsampler(c.upsampler_width, c.bf16)
+
+    def encode(self, cloud: PointCloud, train: bool = False) -> Scene:
+        """Feature volume of each object from its points, and the voxels that hold them."""
+        volume = self.encoder(cloud, train)
+        occupied = jax.vmap(partial(voxels.occupied, resolution=self.config.encoder.volume_resolution))
+        return Scene(volume=volume, occupied=occupied(jnp.asarray(cloud.positions), jnp.asarray(cloud.mask)))
+
+    def render(
+        self, scene: Scene, camera: Camera, options: RenderOptions = AS_TRAINED, key: Key | None = None
+    ) -> Rendering:
+        """Views of encoded objects; the camera's size is that of the image.  A key jitters the samples (training)."""
+        samples = options.sampling or self.config.sampling
+        return self.developed(camera, trace(self, scene, self.rays(camera), samples, options, key))
+
+    def rays(self, camera: Camera) -> Rays:
+        """Rays of the volume rendering for all views of an object in one axis, (objects, views * height * width, 3)."""
+        return cameras.view_rays(cameras.resize(camera, *self.render_size(camera)))
+
+    def render_size(self, camera: Camera) -> tuple[int, int]:
+        """Height and width of the volume rendering behind the camera's image."""
+        ratio = self.config.render_resolution / self.config.image_resolution
+        return round(camera.height * ratio), round(camera.width * ratio)
+
+    def along(self, scene: Scene, rays: Rays, objects: Int[Array, "*rays"]) -> tuple[Field, Finish]:
+        """Density, and what is emitted, at samples along rays; and the features of what is composited of it."""
+        view = self.field.view(rays.directions)
+
+        def field(distances: Float[Array, "*rays samples"]) -> Samples:
+            owners = jnp.broadcast_to(objects[..., None], distances.shape)
+            return Samples(*self.field(voxels.trilinear(scene.volume, places(rays, distances), owners), view))
+
+        def finish(seen: Seen) -> Float[Array, "*rays features"]:
+            return self.field.finish(seen.summed, seen.acc, view)
+
+        return field, finish
+
+    def developed(self, camera: Camera, traced: Traced) -> Rendering:
+        """Images from the rays of `rays`: the feature image is resized, and the upsampler doubles it."""
+        views, (height, width) = camera.cam_to_world.shape[:-2], self.render_size(camera)
+        features = traced.features.reshape(-1, height, width, self.config.num_features)
+        image = features[..., :3]
+        if self.config.upsamples:
+            image = self.upsampler(bilinear(features, camera.height // 2, camera.width // 2))
+        return Rendering(
+            image=image.reshape(*views, camera.height, camera.width, 3),
+            image_lr=features[..., :3].reshape(*views, height, width, 3),
+            depth=traced.depth.reshape(*views, height, width),
+            acc=traced.acc.reshape(*views, height, width),
+        )
+
+    def __call__(self, cloud: PointCloud, camera: Camera, key: Key | None = None, train: bool = False) -> Rendering:
+        """Views of each cloud from its cameras."""
+        return self.render(self.encode(cloud, train), camera, key=key)
+
+
+# --- rays -------------------------------------------------------------------------------------------------------------
 
 
 def trace(
@@ -182,3 +268,63 @@ def union_weights(
     distances, density = (jnp.take_along_axis(x, order, axis=-1) for x in (distances, density))
     weights, _ = compositing.volume_weights(density, compositing.interval_lengths(distances, far))
     return jnp.take_along_axis(weights, rank, axis=-1)
+
+
+# --- the functions of the method --------------------------------------------------------------------------------------
+
+
+def encode(
+    variables: dict, cloud: PointCloud, centre: np.ndarray, scale: np.floating, *, config: PaperConfig
+) -> Volume:
+    """Volume of a cloud in the box (unbatched), and how far from its points there is something to see."""
+    reach = reach_of(np.asarray(cloud.positions)[np.asarray(cloud.mask)], config.encoder.volume_resolution)
+    volume = inference.encode_volume(variables, cloud, centre, scale, config=config)
+    return dataclasses.replace(volume, reach=reach)
+
+
+def render(
+    variables: dict,
+    volume: Volume,
+    views: Sequence[Camera],
+    lights: Sequence[Light | None],
+    *,
+    config: PaperConfig,
+    quality: str,
+) -> Iterator[Rendering]:
+    """Views one after the other, with the samples of a quality."""
+    draw = partial(inference.draw, variables, volume, config=config)
+    for view, light in zip(views, lights, strict=True):
+        yield draw(view, light, options=at_quality(config, quality, volume.reach, view.width))
+
+
+def at_quality(config: PaperConfig, quality: str, reach: int, width: int) -> RenderOptions:
+    """The options that render a picture so wide at a quality, with samples within `reach` voxels of points."""
+    options = inference.options_of(config, quality, width)
+    if quality == "trained":
+        return options
+    counts = config.sampling
+    samples = max(round(SAMPLES[quality] * (counts.num_coarse + counts.num_fine)), 1)
+    sampling = SamplingConfig(num_coarse=samples, num_fine=0, reach=reach)
+    return dataclasses.replace(options, sampling=sampling, block=None)
+
+
+def discriminator(config: TrainConfig) -> Discriminator:
+    """The judge of pictures and condition images."""
+    assert isinstance(config.model, PaperConfig)
+    return Discriminator(config.loss.discriminator_width, config.model.encoder.num_groups, config.model.bf16)
+
+
+def reach_of(positions: np.ndarray, resolution: int, num_queries: int = 4096) -> int:
+    """Voxels around points in which their surface lies, from the median distance to the nearest other point.
+
+    Copies of a point, closer than a 1024th of the box, count once.
+    """
+    x, y, z = np.floor((positions.T + 1) * 512).astype(np.int64)
+    _, distinct = np.unique((x * 2048 + y) * 2048 + z, return_index=True)
+    positions = positions[distinct]
+    if len(positions) < 2:
+        return LARGEST_REACH
+    queries = positions[:: -(-len(positions) // num_queries)]
+    distances, _ = cKDTree(positions).query(queries, 2)
+    spacing = np.median(distances[:, 1]) * resolution / 2
+    return int(np.clip(np.ceil(REACH_PER_SPACING * spacing), 1, LARGEST_REACH))
