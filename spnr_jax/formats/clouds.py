@@ -24,9 +24,8 @@ from spnr_jax.errors import UserError
 from spnr_jax.formats.columns import DEFAULTS, Columns, Report, believed, materials, normals, sound, useful
 from spnr_jax.formats.cut import Cut
 from spnr_jax.formats.mesh.assets import ShownParts
+from spnr_jax.formats.orientation import ROTATIONS, find_up, sensor_of
 from spnr_jax.formats.point_files import MESHES, column_pieces, kind_of, parse_ply
-from spnr_jax.formats.sensor import sensor_of
-from spnr_jax.formats.up_axis import ROTATIONS, find_up
 from spnr_jax.kernels import scenes
 from spnr_jax.kernels.cleaning import Clean, cleaned
 from spnr_jax.kernels.facing import facing, planes

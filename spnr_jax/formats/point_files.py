@@ -21,11 +21,11 @@ import numpy as np
 
 from spnr_jax.errors import UserError
 from spnr_jax.formats.columns import Columns
+from spnr_jax.formats.gaussian_files import compressed_columns, spz_columns
 from spnr_jax.formats.las import las_pieces
 from spnr_jax.formats.npz import numpy_pieces
 from spnr_jax.formats.pcd import pcd_pieces
 from spnr_jax.formats.ply import element_rows, ply_pieces, read_ply_header, vertex_pieces
-from spnr_jax.formats.splat_files import compressed_columns, spz_columns
 from spnr_jax.formats.text import text_pieces
 
 READERS = {

@@ -60,11 +60,6 @@ def test_every_bad_file_is_one_line_that_names_it_and_the_reason(tmp_path, name,
     assert "\n" not in str(caught.value)
 
 
-def test_a_folder_is_no_cloud(tmp_path):
-    with pytest.raises(ValueError, match=r"a folder; expected a file of one of .ply .pcd"):
-        read(tmp_path)
-
-
 def test_wrong_options_are_refused_before_the_file_is_touched():
     with pytest.raises(ValueError, match="up must be one of y, -y, z, -z, x, -x, auto, got 'w'"):
         read_cloud("absent.ply", up="w")

@@ -1,10 +1,8 @@
 """A drive that is away for a moment costs a pause; what stays broken ends the training with one line, and no thread."""
 
-import dataclasses
 import errno
 import os
 import re
-import shutil
 import threading
 from contextlib import closing
 from pathlib import Path
@@ -61,29 +59,12 @@ def test_a_drive_that_is_away_for_a_moment_changes_no_bit(number, monkeypatch):
     assert len(tries) > RETRIES
 
 
-def test_a_drive_that_stays_away_is_one_line_after_a_few_tries(monkeypatch):
-    tries = failing(monkeypatch, 99, errno.EIO)
-    with pytest.raises(ValueError, match=r"001\.png: cannot be read \(.*Input/output error.*spnr-data check") as error:
-        data_sets.read_object(tiny_dataset.dataset(), "chair")
-    assert tries.count(threading.current_thread()) == 1 + RETRIES
-    assert "\n" not in str(error.value)
-
-
 @pytest.mark.parametrize("number", [errno.ENOENT, errno.EACCES])
 def test_an_error_that_does_not_pass_is_not_tried_again(number, monkeypatch):
     tries = failing(monkeypatch, 99, number)
     with pytest.raises(ValueError, match="cannot be read"):
         data_sets.read_object(tiny_dataset.dataset(), "chair")
     assert tries.count(threading.current_thread()) == 1
-
-
-def test_each_pause_is_waited(monkeypatch):
-    waited = []
-    monkeypatch.setattr(data_sets, "PAUSES", (0.1, 0.5, 2.0))
-    monkeypatch.setattr(data_sets.time, "sleep", waited.append)
-    failing(monkeypatch, 2, errno.ESTALE)
-    data_sets.read_object(tiny_dataset.dataset(), "chair")
-    assert waited == [0.1, 0.5]
 
 
 @pytest.fixture
@@ -99,25 +80,6 @@ def test_an_error_in_a_reading_thread_ends_the_training_with_one_line(stepless, 
     assert re.match(r"spnr: .*001\.png: cannot be read \(.*Input/output error", last_line(capsys))
     assert tries
     assert threading.main_thread() not in tries, "the files were read in threads"
-
-
-def test_a_file_that_vanishes_while_training_is_one_line(stepless, monkeypatch, tmp_path, capsys):
-    dataset = data_sets.open_dataset(shutil.copytree(tiny_dataset.dataset().folder, tmp_path / "data"))
-    monkeypatch.setattr(batching, "READ_AHEAD", 1)
-    monkeypatch.setattr(batching, "CACHE_BYTES", 0)
-    real, uncached = batching.batches, []
-
-    def batches(dataset, config, first, **options):
-        for batch in real(dataset, config, first, cache_bytes=0, **options):
-            if not uncached:
-                uncached.append(shutil.rmtree(dataset.folder / "objects" / "ball_000000" / "images"))
-            yield batch
-
-    monkeypatch.setattr(batching, "batches", batches)
-    config = dataclasses.replace(CONFIG, num_steps=20)
-    code = cli.guarded(lambda: trainer.train(config, dataset, tmp_path / "run", RARELY), "spnr")
-    assert code == 2
-    assert re.match(r"spnr: .*ball_000000.images.00\d\.png: cannot be read \(.*No such file", last_line(capsys))
 
 
 @pytest.mark.parametrize("error", [MemoryError, SystemExit, RuntimeError])

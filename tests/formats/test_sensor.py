@@ -5,7 +5,7 @@ import pytest
 from support.point_clouds import ply_bytes
 
 from spnr_jax.formats.clouds import place_cloud, read_cloud
-from spnr_jax.formats.sensor import sensor_of
+from spnr_jax.formats.orientation import sensor_of
 from spnr_jax.surfels.visibility import spiral
 
 AXES = ["view_px", "view_py", "view_pz", "y_axisx", "y_axisy", "y_axisz"]
@@ -73,19 +73,3 @@ def test_the_camera_of_a_ply_file_gives_the_sides_of_the_points_and_the_way_up(t
     assert placed.up == "-y"
     normals = placed.cloud.normals @ placed.rotation
     np.testing.assert_allclose(normals, -spiral(300), atol=0.1)  # seen from within
-
-
-@pytest.mark.parametrize(
-    ("camera", "names"),
-    [([np.nan, 0, 0, 0, 1, 0], AXES), ([1, 2], AXES[:2]), ([1, 2, 3], ["f", "g", "h"])],
-)
-def test_a_camera_that_stands_nowhere_is_none(tmp_path, camera, names):
-    path = ply(tmp_path, "ascii", camera, names)
-    assert sensor(path) is None
-    assert read_cloud(path).normals is None
-
-
-def test_a_camera_that_cannot_be_read_costs_nothing(tmp_path):
-    path = ply(tmp_path, "ascii", [1, 2, 3])
-    assert sensor(path) is None
-    assert len(read_cloud(path).positions) == 300

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from spnr_jax.formats.up_axis import ROTATIONS, find_up, standing
+from spnr_jax.formats.orientation import ROTATIONS, find_up, standing
 
 
 def table() -> np.ndarray:

@@ -20,12 +20,20 @@ import numpy as np
 from trimesh.exchange.obj import load_obj as read_obj_text
 from trimesh.geometry import triangulate_quads
 
-from spnr_jax.formats.mesh.assets import Asset, Material, MissingFile, Part, RejectedAsset, TransparentParts, Wrap
-from spnr_jax.formats.mesh.companions import read_companion
+from spnr_jax.formats.mesh.assets import (
+    Asset,
+    Material,
+    MissingFile,
+    Part,
+    RejectedAsset,
+    TransparentParts,
+    Wrap,
+    principled,
+)
 from spnr_jax.formats.mesh.file_colors import linear_colors
 from spnr_jax.formats.mesh.polygons import MOST_CORNERS, ears, is_concave
 from spnr_jax.formats.mesh.texels import color_texels, read_image, value_texels
-from spnr_jax.formats.mesh.tolerance import MOSTLY_OPAQUE, Alpha, Opacity, Tolerance
+from spnr_jax.formats.mesh.tolerance import MOSTLY_OPAQUE, Alpha, Opacity, Tolerance, read_companion
 
 PLACE = "material-{}"  # name that trimesh sees for the n-th material, so that any name in the file is safe
 READ = {"newmtl", "kd", "map_kd", "pr", "map_pr", "pm", "map_pm", "ns", "d", "tr", "map_d"}
@@ -170,22 +178,6 @@ def _without_doubles(parts: list[Part], ignored: set[str]) -> list[Part]:
     ignored.add(f"{int((~kept).sum())} doubled faces (one of each is kept)")
     ends = np.cumsum([len(part.faces) for part in parts])[:-1]
     return [replace(part, faces=part.faces[here]) for part, here in zip(parts, np.split(kept, ends), strict=True)]
-
-
-def principled(
-    base_color: float | np.ndarray = 0.5,
-    roughness: float | np.ndarray = 0.5,
-    metallic: float | np.ndarray = 0.0,
-    wrap: Wrap = "repeat",
-) -> Material:
-    """A material of float32 channels; grey of roughness 0.5 where nothing is given."""
-    color = np.asarray(base_color, np.float32)
-    return Material(
-        base_color=np.clip(np.full(3, color, np.float32) if color.ndim == 0 else color, 0, 1),
-        roughness=np.clip(np.asarray(roughness, np.float32), 0, 1),
-        metallic=np.clip(np.asarray(metallic, np.float32), 0, 1),
-        wrap=wrap,
-    )
 
 
 def parse_mtl(text: str) -> dict[str, dict[str, str]]:

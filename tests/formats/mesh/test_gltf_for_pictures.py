@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from support.gltf_files import CORNERS, UV, GltfBuilder
 
-from spnr_jax.formats.clouds import place_cloud
 from spnr_jax.formats.mesh.assets import RejectedAsset
-from spnr_jax.formats.mesh.gltf_nodes import INSTANCING
-from spnr_jax.formats.mesh.meshes import find_meshes, load_mesh
+from spnr_jax.formats.mesh.gltf import INSTANCING
+from spnr_jax.formats.mesh.meshes import load_mesh
 from spnr_jax.formats.mesh.surface_points import sample_surface
 
 HARD = Path(__file__).parents[4] / "shared" / "data" / "hard"
@@ -54,11 +53,6 @@ class TestCoordinates:
         (x, _), roughness = (values.T for values in self.two_textures(tmp_path, moved, clamp))
         assert (roughness[x > 0.2] == 1).all()
 
-    def test_a_set_that_is_not_there_is_no_reason_to_refuse(self, tmp_path):
-        positions, roughness = self.two_textures(tmp_path, {"texCoord": 3})
-        assert len(positions) == 400
-        assert len(np.unique(roughness)) == 1
-
 
 class TestInstances:
     """EXT_mesh_gpu_instancing draws a mesh at every row of its attributes."""
@@ -97,38 +91,3 @@ class TestInstances:
             load_mesh(builder.write(tmp_path / "many.glb"))
         with pytest.raises(RejectedAsset, match="131073 instances"):
             load_mesh(self.instanced(tmp_path, TRANSLATION=np.zeros((2**17 + 1, 3), np.float32)))
-
-
-def test_what_a_material_has_beyond_the_three_channels_is_named_in_one_line(tmp_path):
-    builder = GltfBuilder()
-    extensions = {"KHR_materials_clearcoat": {"clearcoatFactor": 1}, "KHR_materials_sheen": {}}
-    material = builder.material(emissiveFactor=[1, 0, 0], extensions=extensions)
-    builder.mesh(builder.primitive(material=material))
-    lines: list[str] = []
-    place_cloud(builder.write(tmp_path / "a.glb"), num_points=8, report=lines.append)
-    assert lines[0] == "ignored: KHR_materials_clearcoat; KHR_materials_sheen; emissive"
-
-
-def test_what_is_transparent_is_said_and_may_be_left_out(tmp_path):
-    builder = GltfBuilder()
-    glass = builder.material(name="glass", alphaMode="BLEND", pbrMetallicRoughness={"baseColorFactor": [1, 0, 0, 0.1]})
-    builder.mesh(builder.primitive(material=glass))
-    builder.mesh(builder.primitive(), translation=[10, 0, 0])
-    path, lines = builder.write(tmp_path / "a.glb"), []
-    drawn = place_cloud(path, num_points=32, report=lines.append).cloud
-    left_out = place_cloud(path, num_points=32, transparent_parts="skip", report=lines.append).cloud
-    assert drawn.positions[:, 0].min() < 1
-    assert left_out.positions[:, 0].min() >= 10
-    assert [line for line in lines if "transparent" in line] == [
-        "transparent parts drawn as opaque (--transparent-parts skip leaves them out): 'glass'",
-        "transparent parts left out (--transparent-parts opaque draws them): 'glass'",
-    ]
-
-
-@pytest.mark.skipif(not HARD.is_dir(), reason="the folder of real mesh files is not beside this checkout")
-def test_every_hard_file_is_read_to_a_cloud():
-    for _, path in find_meshes(HARD):
-        cloud = place_cloud(path, num_points=64).cloud
-        assert np.isfinite(cloud.positions).all()
-        assert len(cloud.positions) == 64
-        assert np.linalg.norm(np.ptp(cloud.positions, axis=0)) > 0

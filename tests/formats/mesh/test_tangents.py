@@ -5,8 +5,7 @@ import pytest
 from support.gltf_files import CORNERS, UV, GltfBuilder
 
 from spnr_jax.formats.mesh.meshes import load_mesh
-from spnr_jax.formats.mesh.surface_points import sample_surface
-from spnr_jax.formats.mesh.tangents import tilted
+from spnr_jax.formats.mesh.surface_points import sample_surface, tilted
 
 RED, GREEN, FLAT = (0.6, 0.0, 0.8), (0.0, 0.6, 0.8), (0.0, 0.0, 1.0)
 X, Y = np.array([0.6, 0, 0.8]), np.array([0, 0.6, 0.8])
@@ -52,15 +51,6 @@ def test_the_transform_of_the_map_turns_the_tilt(tmp_path):
     np.testing.assert_allclose(found[:, :2], [0.6 * along_u / np.linalg.norm(along_u)] * 10, atol=0.01)
 
 
-def test_the_scale_makes_the_tilt_steeper(tmp_path):
-    found = sampled(tmp_path, RED, scale=2.0)
-    np.testing.assert_allclose(found[:, 0] / found[:, 2], 2 * 0.75, atol=0.03)
-
-
-def test_a_mirrored_node_mirrors_the_tilt(tmp_path):
-    np.testing.assert_allclose(sampled(tmp_path, RED, node={"scale": [-1, 1, 1]}), [X * [-1, 1, 1]] * 10, atol=0.01)
-
-
 def test_vertex_normals_are_what_is_tilted(tmp_path):
     leaning = np.tile(np.float32([0, 0.6, 0.8]), (4, 1))
     found = sampled(tmp_path, RED, NORMAL=leaning)
@@ -73,10 +63,3 @@ def test_where_the_coordinates_have_no_area_the_normal_stays():
     normals = np.tile([0.0, 0, 1], (3, 1))
     found = tilted(normals, np.array([RED, RED, (0, 0, 0)]), corners, texcoords)
     np.testing.assert_array_equal(found, normals)
-
-
-def test_references_do_without_the_map(tmp_path):
-    sampled(tmp_path, RED)
-    asset = load_mesh(tmp_path / "bumpy.glb")
-    assert asset.ignored == ("normalTexture",)
-    np.testing.assert_array_equal(sample_surface(asset, 10, 0).normals, [[0, 0, 1]] * 10)

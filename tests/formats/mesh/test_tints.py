@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from spnr_jax.formats.mesh.assets import Material, Part
-from spnr_jax.formats.mesh.tints import MAX_TINTS, split_by_tint
+from spnr_jax.formats.mesh.meshes import split_by_tint
 
 TEXTURE = np.random.default_rng(0).random((3, 4, 3), dtype=np.float32)
 
@@ -36,11 +36,3 @@ def test_a_face_of_several_colours_takes_their_mean_and_reports_the_difference()
     ((part,), error) = split_by_tint(triangles([np.array([[0, 0, 0], [0.3, 0, 0], [0.9, 0, 0]])]))
     np.testing.assert_allclose(part.material.base_color, TEXTURE * np.float32([0.4, 0, 0]), atol=1e-6)
     assert error == pytest.approx(0.5)
-
-
-def test_many_colours_are_gathered_into_few_copies_and_no_face_is_lost():
-    part = triangles(np.random.default_rng(1).random((300, 3)))
-    parts, error = split_by_tint(part)
-    assert len(parts) <= MAX_TINTS
-    assert 0.05 < error < 0.6
-    np.testing.assert_array_equal(np.sort(np.concatenate([p.faces for p in parts]), axis=0), part.faces)

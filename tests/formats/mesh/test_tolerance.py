@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from support.gltf_files import CORNERS, UV, GltfBuilder
+from support.gltf_files import UV, GltfBuilder
 
 from spnr_jax.formats.mesh.assets import RejectedAsset
 from spnr_jax.formats.mesh.meshes import load_mesh
@@ -49,15 +49,6 @@ def test_a_mask_has_points_where_its_alpha_reaches_the_cut_off_alone(tmp_path, p
     assert asset.notes == ("surface only where the alpha of the texture reaches its cut-off: 'leaf'",)
 
 
-@pytest.mark.parametrize("spread", ["random", "even"])
-def test_points_that_are_cut_out_are_replaced(tmp_path, spread):
-    asset = load_mesh(two_squares(tmp_path, half_transparent(), alphaMode="MASK"), transparent_parts="opaque")
-    points = sample_surface(asset, 50, 3, spread)
-    assert len(points.positions) == len(points.face) == 50
-    again = sample_surface(asset, 50, 3, spread)
-    np.testing.assert_array_equal(points.positions, again.positions)
-
-
 def test_a_mask_that_hides_nothing_changes_nothing_and_one_that_hides_all_leaves_the_part_out(tmp_path):
     path = two_squares(tmp_path, half_transparent(200, 200), alphaMode="MASK")
     asset = load_mesh(path, transparent_parts="opaque")
@@ -96,23 +87,6 @@ def test_empty_space_around_blended_leaves_is_no_surface(tmp_path):
         assert points.positions[points.positions[:, 0] < 5, 0].min() > 0.5 - 1 / 8
 
 
-def test_what_is_called_blended_and_is_opaque_is_opaque(tmp_path):
-    path = two_squares(tmp_path, half_transparent(255, 255), alphaMode="BLEND")
-    asset = load_mesh(path, transparent_parts="skip")
-    assert share_of_tested(asset)[1] == pytest.approx(0.5, abs=0.05)
-    assert asset.notes == ()
-
-
-def test_alpha_of_vertices_is_named_where_it_would_count(tmp_path):
-    builder = GltfBuilder()
-    colors = np.float32([[1, 1, 1, 0.5]] * 4)
-    for mode in ("OPAQUE", "BLEND"):
-        material = builder.material(alphaMode=mode)
-        builder.mesh(builder.primitive(material=material, COLOR_0=colors))
-        asset = load_mesh(builder.write(tmp_path / "a.glb"), transparent_parts="opaque")
-        assert asset.ignored == (("alpha of vertex colours",) if mode == "BLEND" else ())
-
-
 def test_an_object_of_which_nothing_is_left_says_why(tmp_path):
     builder = GltfBuilder()
     material = builder.material(name="glass", alphaMode="BLEND", pbrMetallicRoughness={"baseColorFactor": [1, 1, 1, 0]})
@@ -131,18 +105,6 @@ def test_an_object_of_which_nothing_is_left_says_why(tmp_path):
     asset = load_mesh(builder.write(tmp_path / "holes.glb"), transparent_parts="opaque")
     with pytest.raises(RejectedAsset, match="next to no surface"):
         sample_surface(asset, 20, 0)
-
-
-def test_many_names_are_cut_short_in_the_sentence(tmp_path):
-    builder = GltfBuilder()
-    for number in range(6):
-        material = builder.material(
-            name=f"{number}" * 60, alphaMode="BLEND", pbrMetallicRoughness={"baseColorFactor": [1, 1, 1, 0.5]}
-        )
-        builder.mesh(builder.primitive(positions=CORNERS + np.float32(number), material=material))
-    (note,) = load_mesh(builder.write(tmp_path / "many.glb"), transparent_parts="opaque").notes
-    assert note.endswith("and 3 more")
-    assert len(note) < 250
 
 
 def test_missing_images_leave_plain_values_and_are_named(tmp_path):
@@ -173,12 +135,6 @@ class TestObj:
         (tmp_path / "look.mtl").write_text(f"newmtl leaf\n{leaf}\nnewmtl plain\nKd 0 0 1\n")
         (tmp_path / "a.obj").write_text(f"mtllib look.mtl\n{self.SQUARES}{self.FACES}")
         return tmp_path / "a.obj"
-
-    @pytest.mark.parametrize("statement", ["d 0.3", "Tr 0.8"])
-    def test_glass_is_drawn_or_left_out(self, tmp_path, statement):
-        path = self.write(tmp_path, f"Kd 1 0 0\n{statement}")
-        assert share_of_tested(load_mesh(path, transparent_parts="opaque"))[1] == pytest.approx(0.5, abs=0.05)
-        assert share_of_tested(load_mesh(path, transparent_parts="skip"))[1] == 0
 
     @pytest.mark.parametrize("grey", [True, False])
     def test_map_d_is_a_cut_out_by_its_grey_or_its_alpha(self, tmp_path, grey):
