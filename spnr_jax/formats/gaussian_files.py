@@ -1,23 +1,15 @@
-"""Gaussian splats as files: .ply of Kerbl et al. 2023 and .spz of Niantic (version 3).
+"""Gaussian splats as files: .ply of Kerbl et al. 2023 and .spz of Niantic, written and read; compressed .ply, read.
 
     .ply    x y z, nx ny nz (0), f_dc_0..2, f_rest_* (all of red, then green, then blue), opacity before the logistic
             function, logarithms of the scales, rotation w x y z, all float32; axes right, down, forward
-    .spz    gzip; 24-bit fixed-point places, 8 bits of opacity, colour, logarithms of scales and harmonics, 32 of the
-            rotation; axes right, up, back
+    .spz    gzip; a header of 16 bytes, then all places (24-bit fixed point an axis), all opacities (8 bits), colours,
+            logarithms of scales, rotations (32 bits), harmonics; axes right, up, back.  Versions 2 and 3 are read
+    .ply    of PlayCanvas: an element `chunk` with the box of each 256 splats, which store their place in it as 11, 10
+            and 11 bits, and their colour and opacity as 8 bits each
 
-Both say that splats which a viewer widens to a pixel lose opacity for it (anti-aliasing, mip).
-
-Splats go in with y up and z towards the viewer, in any unit.  A note, which names the cloud, the network and the light,
-becomes a comment of the .ply; a .spz has no place for one.
-
-
-Packed Gaussian splats as named columns of coloured points: .spz of Niantic, compressed .ply of PlayCanvas.
-
-    .spz    gzip; a header of 16 bytes, then all places (24 bits an axis), all opacities, colours, ...: versions 2 and 3
-    .ply    an element `chunk` with the box of each 256 splats, which store their place in it as 11, 10 and 11 bits, and
-            their colour and opacity as 8 bits each
-
-What Kerbl et al. 2023 write as .ply is read as any other .ply.  `splat_opacity` is 0 to 1.
+The first two say that splats which a viewer widens to a pixel lose opacity for it (anti-aliasing, mip).  Splats go in
+with y up and z towards the viewer, in any unit.  A note, which names the cloud, the network and the light, becomes a
+comment of the .ply; a .spz has no place for one.  What is read are coloured points; `splat_opacity` is 0 to 1.
 """
 
 import gzip
@@ -42,6 +34,12 @@ RENDER_MODE = "SplatRenderMode: mip"  # comment of a .ply: what a viewer widens 
 FRACTION_BITS = 24 - 2  # at most of a place in .spz; fewer where places lie further from the origin than 1
 SCALE_STEP, LEAST_SCALE = 16, -10  # of .spz: steps for each e-fold, logarithm of the smallest
 HARMONIC_BITS = (5, 4)  # of .spz: of the coefficients of degree 1, and above
+MAGIC, VERSIONS = b"NGSP", (2, 3)  # of .spz
+PACKED = 9 + 1 + 3  # bytes of a splat up to its colour
+MOST_BYTES = 2**30  # when unpacked: a small file can announce any number
+COLOR_STEP = 0.15  # 255 steps for 1 / COLOR_STEP of a coefficient
+CHUNK = 256  # splats
+CONVERT = "convert it to .ply, e.g. with SuperSplat (File > Export) or `splat-transform a.spz a.ply`"
 
 
 def write_splats(path: Path, gaussians: Gaussians, note: str = "") -> int:
@@ -138,14 +136,6 @@ def _smallest_three(rotation: Float[np.ndarray, "splats 4"]) -> np.ndarray:
         size = np.minimum(np.floor(511 * np.abs(value) * np.sqrt(2) + 0.5), 511).astype(np.uint32)
         packed = np.where(largest == i, packed, packed << 10 | (value < 0).astype(np.uint32) << 9 | size)
     return packed.astype("<u4")
-
-
-MAGIC, VERSIONS = b"NGSP", (2, 3)  # of .spz
-PACKED = 9 + 1 + 3  # bytes of a splat up to its colour
-MOST_BYTES = 2**30  # when unpacked: a small file can announce any number
-COLOR_STEP = 0.15  # 255 steps for 1 / COLOR_STEP of a coefficient
-CHUNK = 256  # splats
-CONVERT = "convert it to .ply, e.g. with SuperSplat (File > Export) or `splat-transform a.spz a.ply`"
 
 
 def spz_columns(path: Path) -> Columns:

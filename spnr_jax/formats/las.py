@@ -1,18 +1,13 @@
-"""Whether a compressed laser scan (.laz) announces no more than its file holds: lazrs, which unpacks it, trusts it.
+"""Airborne and terrestrial laser scans (.las, compressed .laz) as named columns, piece by piece, through laspy.
 
-A size that is too large makes lazrs ask for as much memory, and where that fails it ends the whole process, which no
-`except` sees.  So the sizes are walked through before (LASzip specification, LAZ 1.4 R1):
+Coordinates come scaled and shifted as the header says, in float64; colours are 16 bit.  What the header announces is
+compared with the size of the file before laspy, which takes memory and time for whatever is announced, sees it; and
+lazrs, which unpacks .laz, ends the whole process where a size in the file is too large, which no `except` sees.  So the
+sizes are walked through before (LASzip specification, LAZ 1.4 R1):
     record 22204 of "laszip encoded"   ... chunk size u32 at 12, number of items u16 at 32, items (type, size, version)
     at the points' place   i64 place of the chunk table (-1: it stands in the last 8 bytes), then the chunks
     chunk of layers        first point as it is, u32 number of points, u32 size of each layer, the layers
     chunk table            u32 version, u32 number of chunks
-
-
-Airborne and terrestrial laser scans (.las, compressed .laz) as named columns, piece by piece, through laspy.
-
-Coordinates come scaled and shifted as the header says, in float64; colours are 16 bit.  What the header announces is
-compared with the size of the file before laspy, which takes memory and time for whatever is announced, sees it.  Every
-fault is a ValueError; the caller adds the file's name.
 """
 
 import struct
@@ -28,6 +23,57 @@ LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}  # of an item of this type; those of extra
 ITEMS_AT, CHUNK_SIZE_AT = 32, 12
 LARGEST_CHUNK = 2**24  # points; writers use 50,000
 VARIABLE = 2**32 - 1  # chunk size that says that every chunk has its own
+PIECE_BYTES = 2**23  # of points in memory at a time
+COLUMNS = ("red", "green", "blue", "intensity", "classification", "withheld")
+# places in the header (ASPRS LAS 1.4 R15, table 3): sizes and counts, the count of version 1.4
+SIZES, COUNT_14, SMALLEST_HEADER = 94, 247, 227
+COMPRESSED = 0xC0  # bits of the point format
+UNREADABLE: tuple[type[Exception], ...]
+UNREADABLE = (EOFError, RuntimeError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, struct.error)
+
+
+def las_pieces(path: Path) -> Iterator[dict[str, np.ndarray]]:
+    """The columns x y z, the colours and the intensity of a scan, some points at a time."""
+    try:
+        import laspy  # an extra: only here
+        import lazrs  # noqa: F401
+    except ImportError as error:
+        raise UserError(f"needs the package {error.name} to be read: pip install 'spnr-jax[formats]'") from None
+    backends = (laspy.LazBackend.Lazrs,)  # its parallel reader ends the whole process on a damaged file
+    _check_header(path)
+    try:
+        with laspy.open(path, laz_backend=backends, read_evlrs=False) as scan:
+            present = set(scan.header.point_format.dimension_names)
+            for points in scan.chunk_iterator(max(1, PIECE_BYTES // scan.header.point_format.size)):
+                columns = {axis: np.asarray(getattr(points, axis), np.float64) for axis in "xyz"}
+                yield columns | {name: np.asarray(points[name]) for name in COLUMNS if name in present}
+    except (laspy.errors.LaspyException, *UNREADABLE) as error:
+        if is_bug(error):
+            raise
+        raise UserError(f"is a broken or truncated LAS file ({error})") from None
+    except BaseException as error:  # lazrs, a library in Rust, panics, which is no Exception
+        if type(error).__name__ != "PanicException":
+            raise
+        raise UserError(f"is a broken LAZ file ({error})") from None
+
+
+def _check_header(path: Path) -> None:
+    """ValueError if the header announces more than the file can hold."""
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        head = file.read(COUNT_14 + 8)
+    if head[:4] != b"LASF" or len(head) < SMALLEST_HEADER:
+        raise UserError("is not a LAS file, or its header is cut off (expected 'LASF' and at least 227 bytes)")
+    minor = head[25]
+    header_size, data, records, kind, length, count = struct.unpack_from("<HIIBHI", head, SIZES)
+    if minor >= 4 and len(head) == COUNT_14 + 8:
+        (count,) = struct.unpack_from("<Q", head, COUNT_14)
+    if not header_size + records * RECORD_HEAD <= data <= size:
+        raise UserError(f"is broken: {records} records in its header, points from byte {data} on, in {size} bytes")
+    if kind & COMPRESSED:
+        check_laz(np.memmap(path, np.uint8, "r"), header_size, records, data, length, count)
+    elif not length or data + count * length > size:
+        raise UserError(f"is cut off: its header announces {count} points of {length} bytes, in {size} bytes")
 
 
 def check_laz(content: np.ndarray, first_record: int, records: int, data: int, length: int, points: int) -> None:
@@ -85,59 +131,3 @@ def _numbers(content: np.ndarray, place: int, form: str) -> tuple:
     if not 0 <= place <= len(content):
         raise struct.error
     return struct.unpack(form, content[place : place + struct.calcsize(form)].tobytes())
-
-
-PIECE_BYTES = 2**23  # of points in memory at a time
-COLUMNS = ("red", "green", "blue", "intensity", "classification", "withheld")
-MISSING = "needs the package {package} to be read: pip install 'spnr-jax[formats]'"
-# places in the header (ASPRS LAS 1.4 R15, table 3): sizes and counts, the count of version 1.4
-SIZES, COUNT_14, SMALLEST_HEADER = 94, 247, 227
-COMPRESSED = 0xC0  # bits of the point format
-UNREADABLE: tuple[type[Exception], ...]
-UNREADABLE = (EOFError, RuntimeError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, struct.error)
-
-
-def las_pieces(path: Path) -> Iterator[dict[str, np.ndarray]]:
-    """The columns x y z, the colours and the intensity of a scan, some points at a time."""
-    try:
-        import laspy  # an extra: only here
-    except ImportError:
-        raise UserError(MISSING.format(package="laspy")) from None
-    if path.suffix.lower() == ".laz" and laspy.LazBackend.Lazrs not in laspy.LazBackend.detect_available():
-        raise UserError(MISSING.format(package="lazrs"))
-    # the parallel reader of lazrs ends the whole process on a damaged file
-    backends = (laspy.LazBackend.Lazrs,)
-    _check_header(path)
-    try:
-        with laspy.open(path, laz_backend=backends, read_evlrs=False) as scan:
-            present = set(scan.header.point_format.dimension_names)
-            for points in scan.chunk_iterator(max(1, PIECE_BYTES // scan.header.point_format.size)):
-                columns = {axis: np.asarray(getattr(points, axis), np.float64) for axis in "xyz"}
-                yield columns | {name: np.asarray(points[name]) for name in COLUMNS if name in present}
-    except (laspy.errors.LaspyException, *UNREADABLE) as error:
-        if is_bug(error):
-            raise
-        raise UserError(f"is a broken or truncated LAS file ({error})") from None
-    except BaseException as error:  # lazrs, a library in Rust, panics, which is no Exception
-        if type(error).__name__ != "PanicException":
-            raise
-        raise UserError(f"is a broken LAZ file ({error})") from None
-
-
-def _check_header(path: Path) -> None:
-    """ValueError if the header announces more than the file can hold."""
-    size = path.stat().st_size
-    with path.open("rb") as file:
-        head = file.read(COUNT_14 + 8)
-    if head[:4] != b"LASF" or len(head) < SMALLEST_HEADER:
-        raise UserError("is not a LAS file, or its header is cut off (expected 'LASF' and at least 227 bytes)")
-    minor = head[25]
-    header_size, data, records, kind, length, count = struct.unpack_from("<HIIBHI", head, SIZES)
-    if minor >= 4 and len(head) == COUNT_14 + 8:
-        (count,) = struct.unpack_from("<Q", head, COUNT_14)
-    if not header_size + records * RECORD_HEAD <= data <= size:
-        raise UserError(f"is broken: {records} records in its header, points from byte {data} on, in {size} bytes")
-    if kind & COMPRESSED:
-        check_laz(np.memmap(path, np.uint8, "r"), header_size, records, data, length, count)
-    elif not length or data + count * length > size:
-        raise UserError(f"is cut off: its header announces {count} points of {length} bytes, in {size} bytes")

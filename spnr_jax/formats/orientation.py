@@ -1,17 +1,14 @@
-"""Which way is up in a file of points: what the format says, else how the object would stand.
+"""Which way is up in a file of points, and where the sensor stood that saw them.
 
 glTF is y up and laser scans (.las) are z up by definition.  Of other files y or z is chosen: an object stands on a
 broad base and ends differently above, so an axis counts by how much the bases at its two ends differ, and by the larger
 of them.  The base at an end is the convex hull of the points within BASE of it, as a share of the hull of all points
-seen along the axis.  Of 78 real objects 69 are found upright as
-they are (y up) and 61 turned to z up; where it fails, say which axis (`--up`).
+seen along the axis.  Of 78 real objects 69 are found upright as they are (y up) and 61 turned to z up; where it fails,
+say which axis (`--up`).
 
-
-Where the sensor stood that saw the points of a file, if the file says so: PCD headers and PLY camera elements do.
-
-Every point was seen from there, so that its normal points to it; and a camera's own axes say which way is up.  The
-place 0 0 0 that writers of PCD put there for want of a better one is believed if nothing hides the points from it,
-another place if it sees most of them.
+PCD headers and PLY camera elements name the place of a sensor.  Every point was seen from there, so that its normal
+points to it; and a camera's own axes say which way is up.  The place 0 0 0 that writers of PCD put there for want of a
+better one is believed if nothing hides the points from it, another place if it sees most of them.
 """
 
 from collections.abc import Callable
@@ -37,6 +34,12 @@ BY_FORMAT = {".glb": "y", ".gltf": "y", ".las": "z", ".laz": "z"}
 BASE = 0.02  # of the largest extent
 LARGER_BASE_WEIGHT = 0.5
 MARGIN = 0.02  # by which z must stand better: what stands equally is y up
+AHEAD = 0.5  # least cosine between the z axis of a depth camera and the way to what it sees
+MOST = 0.6  # share of the points that must be seen from a place that a file names
+OPEN = 0.9  # share of the points that is seen from where they were scanned; of a whole object it is a half
+BEHIND = 5.0  # spacings behind the first of a pixel that count as seen: noise, and surfaces seen at an angle
+FARTHEST = 1e30  # a place beyond it is none
+PLACE, UP = ("view_px", "view_py", "view_pz"), ("y_axisx", "y_axisy", "y_axisz")  # of VCGLIB's element `camera`
 
 
 def find_up(positions: np.ndarray, path: Path) -> tuple[str, str]:
@@ -66,14 +69,6 @@ def _area(points: np.ndarray) -> float:
         return ConvexHull(points).volume if len(points) > 2 else 0.0
     except QhullError:  # all on one line
         return 0.0
-
-
-AHEAD = 0.5  # least cosine between the z axis of a depth camera and the way to what it sees
-MOST = 0.6  # share of the points that must be seen from a place that a file names
-OPEN = 0.9  # share of the points that is seen from where they were scanned; of a whole object it is a half
-BEHIND = 5.0  # spacings behind the first of a pixel that count as seen: noise, and surfaces seen at an angle
-FARTHEST = 1e30  # a place beyond it is none
-PLACE, UP = ("view_px", "view_py", "view_pz"), ("y_axisx", "y_axisy", "y_axisz")  # of VCGLIB's element `camera`
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -5,7 +5,7 @@
     .pcd                        spnr_jax/formats/pcd.py
     .npz .npy                   spnr_jax/formats/npz.py
     .las .laz                   spnr_jax/formats/las.py
-    .spz                        spnr_jax/formats/splat_files.py
+    .spz                        spnr_jax/formats/gaussian_files.py
     .glb .gltf .obj .off        meshes (spnr_jax/formats/mesh), as points where they have no faces
 
 A reader yields pieces of at most some ten megabytes (archives, meshes and compressed files come whole), so that a file

@@ -1,18 +1,25 @@
 """Batches are a function of (seed, step), and agree with the files; what is broken on disk is named with its remedy."""
 
 import dataclasses
+import errno
 import json
+import os
 import shutil
+import threading
 import zlib
+from contextlib import closing
 from itertools import islice
+from pathlib import Path
 
 import numpy as np
 import pytest
 from support import tiny_dataset
+from support.laws import same_bits
+from support.stopped_runs import without_network
 from support.tiny_dataset import CONFIG, NAMES
 
 from spnr_jax.formats import data_sets
-from spnr_jax.training import batching
+from spnr_jax.training import batching, trainer
 
 
 @pytest.fixture
@@ -115,3 +122,55 @@ def test_a_picture_that_announces_billions_of_pixels_is_refused_before_memory_is
     path.write_bytes(content)
     with pytest.raises(ValueError, match="pixels"):
         data_sets.read_object(data_sets.open_dataset(copy), NAMES[0])
+
+
+def failing(monkeypatch, times, number):
+    """Makes reading 001.png fail so many times with an error of the system; the thread of each try.
+
+    Readers that an earlier test has left behind may still try: a test counts the tries of its own thread.
+    """
+    real, tries = Path.read_bytes, []
+
+    def read_bytes(path):
+        if path.name == "001.png":
+            tries.append(threading.current_thread())
+            if len(tries) <= times:
+                raise OSError(number, os.strerror(number), str(path))
+        return real(path)
+
+    monkeypatch.setattr(Path, "read_bytes", read_bytes)
+    monkeypatch.setattr(data_sets, "PAUSES", (0.0,) * len(data_sets.PAUSES))
+    return tries
+
+
+@pytest.mark.parametrize("number", data_sets.PASSING)
+def test_a_drive_that_is_away_for_a_moment_changes_no_bit(number, monkeypatch):
+    with closing(batching.batches(tiny_dataset.dataset(), CONFIG, 0)) as batches:
+        expected = next(batches)
+    tries = failing(monkeypatch, len(data_sets.PAUSES), number)
+    with closing(batching.batches(tiny_dataset.dataset(), CONFIG, 0)) as batches:
+        same_bits(next(batches), expected)
+    assert len(tries) > len(data_sets.PAUSES)
+
+
+@pytest.mark.parametrize(("number", "times"), [(errno.ENOENT, 1), (errno.EACCES, 1), (errno.EIO, 4)])
+def test_an_error_that_stays_is_one_line_after_as_many_tries_as_may_help(number, times, monkeypatch):
+    tries = failing(monkeypatch, 99, number)
+    with pytest.raises(ValueError, match=r"001\.png: cannot be read \(.*spnr-data check") as error:
+        data_sets.read_object(tiny_dataset.dataset(), "chair")
+    assert tries.count(threading.current_thread()) == times
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("error", [MemoryError, SystemExit, RuntimeError])
+def test_whatever_ends_a_reading_thread_ends_the_training(error, monkeypatch, tmp_path):
+    """Threads are part of the training's process: none can die and leave it waiting."""
+
+    def make_batch(*_):
+        raise error("the thread is over")
+
+    without_network(monkeypatch)
+    monkeypatch.setattr(batching, "make_batch", make_batch)
+    schedule = trainer.Schedule(log_every=99, preview_every=99, checkpoint_every=99)
+    with pytest.raises(error, match="the thread is over"):
+        trainer.train(CONFIG, tiny_dataset.dataset(), tmp_path, schedule)

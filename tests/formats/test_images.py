@@ -1,4 +1,5 @@
 import importlib.util
+import sys
 
 import numpy as np
 import pytest
@@ -77,7 +78,7 @@ def test_a_turntable_gif_loops_at_its_rate_and_shows_every_frame_with_a_pure_whi
 
 
 def test_an_mp4_without_its_encoder_becomes_a_gif_and_one_line_says_why(tmp_path, monkeypatch):
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     path, reason = write_turntable(tmp_path / "a.mp4", shaded_frames(3), fps=10)
     assert path == tmp_path / "a.gif"
     assert len(read_frames(path)) == 3

@@ -1,8 +1,8 @@
 """Laser scans keep their coordinates and colours; without laspy one line says what to install."""
 
-import builtins
 import io
 import struct
+import sys
 
 import numpy as np
 import pytest
@@ -77,17 +77,11 @@ def test_a_scan_without_colours_shows_its_intensity(tmp_path):
     assert any("intensity" in line for line in lines)
 
 
-def test_without_laspy_one_line_names_the_extra(tmp_path, monkeypatch):
+@pytest.mark.parametrize("package", ["laspy", "lazrs"])
+def test_without_its_packages_one_line_names_the_extra(tmp_path, monkeypatch, package):
     scan(tmp_path / "a.las", 7)
-    real = builtins.__import__
-
-    def missing(name, *arguments, **options):
-        if name == "laspy":
-            raise ImportError(name)
-        return real(name, *arguments, **options)
-
-    monkeypatch.setattr(builtins, "__import__", missing)
-    with pytest.raises(ValueError, match=r"a.las: needs the package laspy .* pip install 'spnr-jax\[formats\]'"):
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(ValueError, match=rf"a.las: needs the package {package} .* pip install 'spnr-jax\[formats\]'"):
         read_cloud(tmp_path / "a.las")
 
 

@@ -111,7 +111,9 @@ def load_gltf(path: Path, transparent_parts: TransparentParts = "refuse") -> Ass
             if index not in materials:
                 materials[index] = read_material(file, index, tolerance)
             look = materials[index]
-            ignored |= _left_out(primitive) | look.ignored
+            ignored |= look.ignored | {"KHR_materials_variants"}.intersection(primitive.get("extensions", {}))
+            if primitive.get("targets"):
+                ignored.add("morph targets")
             if look.nowhere:
                 continue
             again = (mesh, number) in shapes
@@ -169,12 +171,6 @@ def _point_columns(file: GltfFile, primitive: dict) -> dict[str, np.ndarray]:
         columns.pop("alpha", None)
         columns["splat_opacity"] = file.accessor(attributes[f"{SPLATS}:OPACITY"])[:, 0]
     return columns
-
-
-def _left_out(primitive: dict) -> set[str]:
-    """What of a primitive is not modelled."""
-    found = {name for name in primitive.get("extensions", {}) if name == "KHR_materials_variants"}
-    return found | {"morph targets"} if primitive.get("targets") else found
 
 
 def _shape(file: GltfFile, primitive: dict, mode: str, look: GltfMaterial) -> Shape:

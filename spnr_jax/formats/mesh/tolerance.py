@@ -108,7 +108,7 @@ class Tolerance:
             self._say("surface only where the alpha of the texture reaches its cut-off", name, found.texels is not None)
             self._say("left out, wholly below the alpha cut-off", name, found.nowhere)
             return found
-        if not _sees_through(alpha):
+        if not (alpha.transmits or alpha.factor < 1 or (alpha.texels is not None and alpha.texels.min() < 1)):
             return Opacity()
         if self.transparent_parts == "skip":
             found = Opacity(nowhere=True) if alpha.transmits else _cut(alpha.texels, alpha.factor, MOSTLY_OPAQUE)
@@ -139,10 +139,6 @@ class Tolerance:
     def _say(self, beginning: str, name: str, happened: bool | np.bool_ = True, quoted: bool = True) -> None:
         if happened:
             self.said.setdefault(beginning, {})[repr(name[:LONGEST_NAME]) if quoted else name[:200]] = None
-
-
-def _sees_through(alpha: Alpha) -> bool:
-    return alpha.transmits or alpha.factor < 1 or (alpha.texels is not None and bool(alpha.texels.min() < 1))
 
 
 def _cut(texels: np.ndarray | None, factor: float | int, cutoff: float | int) -> Opacity:
