@@ -74,8 +74,6 @@ def open_dataset(folder: Path | str) -> Dataset:
     description = folder / "dataset.json"
     if not description.is_file():
         raise UserError(f"{folder}: no finished data set (dataset.json is missing); run `spnr-data generate {folder}`")
-    if not (folder / "objects").is_dir() and (folder / "index.json").is_file():
-        raise UserError(f"{folder}: packed, a form that is no longer read; use the folder it was packed from")
     try:
         settings = json.loads(description.read_text())
     except (ValueError, RecursionError) as error:

@@ -1,4 +1,4 @@
-"""Files of splats: what they say is what was written, by our reader, by plain ones, and by npm's splat-transform."""
+"""Files of splats: what they say is what was written, by our reader and by plain ones."""
 
 import gzip
 

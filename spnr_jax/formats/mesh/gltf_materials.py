@@ -148,8 +148,8 @@ def read_material(file: GltfFile, index: int | None, tolerance: Tolerance) -> Gl
         tolerance.holds_light(name)
     ignored = {key for key in extensions if key != SPECULAR_GLOSSINESS}
     ignored |= {key for key in ("normalTexture", "occlusionTexture") if key in spec}
-    normal_map, bumps = None, spec.get("normalTexture")
-    if not tolerance.strict and (encoded := textures.read(bumps, FLAT, ("normal_map",))) is not None:
+    normal_map, bumps = None, None if tolerance.strict else spec.get("normalTexture")
+    if bumps is not None and (encoded := textures.read(bumps, FLAT, ("normal_map",))) is not None:
         scale = float(bumps.get("scale", 1.0))
         normal_map = direction_texels(encoded) * np.array([scale, scale, 1], np.float32)
         ignored.discard("normalTexture")

@@ -9,15 +9,14 @@ KTX2 images with a Basis Universal payload are read by opengl_basisu, an extra.
 import io
 
 import numpy as np
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
 from spnr_jax.errors import UserError
 from spnr_jax.formats.mesh.assets import RejectedAsset, Wrap, extra
 
 KTX2, KTX2_PACKAGE = b"\xabKTX 20\xbb\r\n\x1a\n", "opengl_basisu"
 # what readers of images raise on those that break their rules
-UNREADABLE = (UnidentifiedImageError, OSError, SyntaxError, ValueError, LookupError, RuntimeError)
-UNREADABLE += (Image.DecompressionBombError,)
+UNREADABLE = (OSError, SyntaxError, ValueError, LookupError, RuntimeError, Image.DecompressionBombError)
 MAX_SIZE = 1024
 MOST_PIXELS = 2**26  # of an image file: 8192 x 8192
 STRIP = 512  # rows that are converted at a time
