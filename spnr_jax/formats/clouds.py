@@ -92,14 +92,25 @@ class Reading:
             raise UserError(f"clean must be one of {', '.join(get_args(Clean))}, got {self.clean!r}")
 
 
-def read_cloud(path: str | Path, *, up: str = "y", **options: Any) -> PointCloud:
+def read_cloud(
+    path: str | Path,
+    *,
+    num_points: int | None = None,
+    up: str = "y",
+    seed: int = 0,
+    clean: Clean = "off",
+    cut: Cut = WHOLE,
+    transparent_parts: ShownParts = "opaque",
+    report: Report = lambda line: None,
+) -> PointCloud:
     """The cloud in a file of points or on a mesh file's surface: (points, ...) float32, `mask` all True.
 
-    The options are those of `Reading`: num_points, seed, clean, cut, transparent_parts, report.  Points that are
-    thinned out have normals, the file's or those that all of its points tell (surfels/outward.py).  Rows without finite
-    numbers are left out.  ValueError, one line that names the file, for whatever cannot be read.
+    The options are those of `Reading`.  Points that are thinned out have normals, the file's or those that all of its
+    points tell (surfels/outward.py).  Rows without finite numbers are left out.  ValueError, one line that names the
+    file, for whatever cannot be read.
     """
-    return place_cloud(path, up=up, **options).cloud
+    how = {"seed": seed, "clean": clean, "cut": cut, "transparent_parts": transparent_parts, "report": report}
+    return place_cloud(path, num_points=num_points, up=up, **how).cloud
 
 
 def place_cloud(path: str | Path, **options: Any) -> PlacedCloud:
