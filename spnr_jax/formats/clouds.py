@@ -12,10 +12,10 @@
 What a file does not say is grey 0.5, roughness 0.5, metallic 0; `report` gets a line about every assumption.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple, get_args
+from typing import Any, NamedTuple, get_args
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -24,9 +24,8 @@ from spnr_jax.errors import UserError
 from spnr_jax.formats.columns import DEFAULTS, Columns, Report, believed, materials, normals, sound, useful
 from spnr_jax.formats.cut import Cut
 from spnr_jax.formats.mesh.assets import ShownParts
+from spnr_jax.formats.orientation import ROTATIONS, find_up, sensor_of
 from spnr_jax.formats.point_files import MESHES, column_pieces, kind_of, parse_ply
-from spnr_jax.formats.sensor import sensor_of
-from spnr_jax.formats.up_axis import ROTATIONS, find_up
 from spnr_jax.kernels import scenes
 from spnr_jax.kernels.cleaning import Clean, cleaned
 from spnr_jax.kernels.facing import facing, planes
@@ -63,6 +62,36 @@ class PlacedCloud:
     origin: np.ndarray  # (3,) float64, 0 unless float32 is too coarse there
 
 
+@dataclass(frozen=True, kw_only=True)
+class Reading:
+    """How a file is read; ValueError for an option that there is not."""
+
+    num_points: int | None = None
+    """More points are thinned out evenly, fewer are kept; a mesh gives exactly so many, or 4096."""
+    up: str = "auto"
+    """The file's upward axis, or "auto"."""
+    seed: int = 0
+    clean: Clean = "off"
+    """How points, never those of meshes, are cleaned before they are thinned (spnr_jax/kernels/cleaning.py)."""
+    cut: Cut = WHOLE
+    """Which part of a scene is wanted."""
+    transparent_parts: ShownParts = "opaque"
+    """Transparent parts of a mesh are taken as opaque, or left out ("skip")."""
+    report: Report = lambda line: None
+    """Gets a line about every assumption."""
+
+    def __post_init__(self) -> None:
+        """ValueError names the option that makes no sense."""
+        if self.up not in (*ROTATIONS, "auto"):
+            raise UserError(f"up must be one of {', '.join(ROTATIONS)}, auto, got {self.up!r}")
+        if self.num_points is not None and self.num_points < 1:
+            raise UserError(f"num_points must be at least 1, got {self.num_points}")
+        if self.transparent_parts not in get_args(ShownParts):
+            raise UserError(f"transparent_parts must be opaque or skip, got {self.transparent_parts!r}")
+        if self.clean not in get_args(Clean):
+            raise UserError(f"clean must be one of {', '.join(get_args(Clean))}, got {self.clean!r}")
+
+
 def read_cloud(
     path: str | Path,
     *,
@@ -72,53 +101,26 @@ def read_cloud(
     clean: Clean = "off",
     cut: Cut = WHOLE,
     transparent_parts: ShownParts = "opaque",
-    report: Callable[[str], None] = lambda line: None,
+    report: Report = lambda line: None,
 ) -> PointCloud:
     """The cloud in a file of points or on a mesh file's surface: (points, ...) float32, `mask` all True.
 
-    More than `num_points` are thinned out evenly, fewer are kept; a mesh gives exactly `num_points` (4096 if None).
-    `up` is the file's upward axis, or "auto".  Unless `clean` is "off" points are cleaned before they are thinned
-    (spnr_jax/kernels/cleaning.py), those of meshes never; of a file of more than CAPACITY, a random sample of these.
-    Points that are thinned out have normals, the file's or those that all of its points tell (surfels/outward.py).
-    `cut` says which part of a scene is wanted.  Rows without finite numbers are left out.  Transparent parts of a mesh
-    are taken as opaque, or left out ("skip").  ValueError, one line that names the file, for whatever cannot be read.
+    The options are those of `Reading`.  Points that are thinned out have normals, the file's or those that all of its
+    points tell (surfels/outward.py).  Rows without finite numbers are left out.  ValueError, one line that names the
+    file, for whatever cannot be read.
     """
-    return place_cloud(
-        path,
-        num_points=num_points,
-        up=up,
-        seed=seed,
-        clean=clean,
-        cut=cut,
-        transparent_parts=transparent_parts,
-        report=report,
-    ).cloud
+    how = {"seed": seed, "clean": clean, "cut": cut, "transparent_parts": transparent_parts, "report": report}
+    return place_cloud(path, num_points=num_points, up=up, **how).cloud
 
 
-def place_cloud(
-    path: str | Path,
-    *,
-    num_points: int | None = None,
-    up: str = "auto",
-    seed: int = 0,
-    clean: Clean = "off",
-    cut: Cut = WHOLE,
-    transparent_parts: ShownParts = "opaque",
-    report: Callable[[str], None] = lambda line: None,
-) -> PlacedCloud:
+def place_cloud(path: str | Path, **options: Any) -> PlacedCloud:
     """The cloud of `read_cloud` with the way back into the file's frame."""
-    path = Path(path)
-    if up not in (*ROTATIONS, "auto"):
-        raise UserError(f"up must be one of {', '.join(ROTATIONS)}, auto, got {up!r}")
-    if num_points is not None and num_points < 1:
-        raise UserError(f"num_points must be at least 1, got {num_points}")
-    if transparent_parts not in get_args(ShownParts):
-        raise UserError(f"transparent_parts must be opaque or skip, got {transparent_parts!r}")
-    if clean not in get_args(Clean):
-        raise UserError(f"clean must be one of {', '.join(get_args(Clean))}, got {clean!r}")
+    path, how = Path(path), Reading(**options)
     kind = kind_of(path)
     try:
-        return _placed(path, kind, num_points, up, seed, clean, cut, transparent_parts, report)
+        with np.errstate(all="ignore"):  # of signalling NaN, and what leaves its type: both are looked for
+            points, noise = _points_of(path, kind, how)
+            return _placed(path, kind, points, noise, how)
     except (ValueError, OSError) as error:
         raise UserError(f"{path}: {str(error).splitlines()[0]}") from error
 
@@ -135,52 +137,43 @@ class Points(NamedTuple):
         return Points(self.positions[rows], {name: column[rows] for name, column in self.values.items()}, self.origin)
 
 
-@np.errstate(all="ignore")  # of signalling NaN, and what leaves its type: both are looked for
-def _placed(
-    path: Path,
-    kind: str,
-    num_points: int | None,
-    up: str,
-    seed: int,
-    clean: Clean,
-    cut: Cut,
-    transparent_parts: ShownParts,
-    report: Report,
-) -> PlacedCloud:
-    """The whole path, from a file of a known kind to a cloud."""
-    pieces = column_pieces(path, kind)
-    mesh = pieces is None
+def _points_of(path: Path, kind: str, how: Reading) -> tuple[Points, float]:
+    """The points of a file, read, cut out and cleaned, and how noisy they were."""
+    pieces, noise = column_pieces(path, kind), 0.0
     if pieces is None:
-        points = _sampled_mesh(path, kind, num_points, seed, cut, transparent_parts, report)
+        points = _sampled_mesh(path, kind, how)
     else:
-        points = _interpreted(_bounded_columns(pieces, num_points, cut, report), cut, report)
-        points = _without_repeats(points, report)
-    rows, lines = scenes.object_of(points.positions, points.origin, cut.remove_plane, cut.nth, seed)
-    points, noise = points.chosen(rows), 0.0
-    if not mesh and clean != "off":
-        positions, values, done, noise = cleaned(points.positions, points.values, clean)
+        points = _without_repeats(_interpreted(_bounded_columns(pieces, how), how), how.report)
+    rows, lines = scenes.object_of(points.positions, points.origin, how.cut.remove_plane, how.cut.nth, how.seed)
+    points = points.chosen(rows)
+    if pieces is not None and how.clean != "off":
+        positions, values, done, noise = cleaned(points.positions, points.values, how.clean)
         points, lines = Points(positions, values, points.origin), lines + done
     for line in lines:
-        report(line)
-    if not mesh:
-        points = _believing(points, report)
-    sensor = sensor_of(path, points.positions + points.origin, kind, report)
+        how.report(line)
+    return (points if pieces is None else _believing(points, how.report)), noise
+
+
+def _placed(path: Path, kind: str, points: Points, noise: float, how: Reading) -> PlacedCloud:
+    """The cloud of the points, thinned, with normals, upright, moved to its origin."""
+    up, count = how.up, how.num_points
+    sensor = sensor_of(path, points.positions + points.origin, kind, how.report)
     kept = np.arange(len(points.positions))
-    if num_points is not None and len(kept) > num_points:
-        report(f"{num_points} of {len(kept)} points kept, evenly spread")
-        kept = np.sort(farthest_points(points.positions, num_points, seed))
+    if count is not None and len(kept) > count:
+        how.report(f"{count} of {len(kept)} points kept, evenly spread")
+        kept = np.sort(farthest_points(points.positions, count, how.seed))
     fewer = points.chosen(kept)
     if "normals" not in points.values and sensor:
         fewer.values["normals"] = facing(fewer.positions, points.positions, sensor.place - points.origin, noise)
-        report("normals turned to the place of the sensor")
+        how.report("normals turned to the place of the sensor")
     elif "normals" not in points.values and len(kept) < len(points.positions):
         fewer.values["normals"] = outward_normals(points.positions, points.values["base_color"], kept, noise)
     if up == "auto":
         camera_up = sensor.up(fewer.positions + points.origin) if sensor else None
         up, reason = (camera_up, "that of its camera") if camera_up else find_up(fewer.positions, Path(f"a{kind}"))
-        report(f"{up} taken as up ({reason}); --up says otherwise")
+        how.report(f"{up} taken as up ({reason}); --up says otherwise")
     rotation = np.array(ROTATIONS[up], np.float64)
-    positions, origin = _moved(fewer.positions, points.origin, report)
+    positions, origin = _moved(fewer.positions, points.origin, how.report)
     values = fewer.values
     if "normals" in values:
         values["normals"] = values["normals"] @ rotation.T
@@ -227,25 +220,16 @@ def _moved(positions: np.ndarray, before: np.ndarray, report: Report) -> tuple[n
     return positions + (before - origin), origin
 
 
-def _sampled_mesh(
-    path: Path,
-    kind: str,
-    num_points: int | None,
-    seed: int,
-    cut: Cut,
-    transparent_parts: ShownParts,
-    report: Report,
-) -> Points:
+def _sampled_mesh(path: Path, kind: str, how: Reading) -> Points:
     """Points spread evenly over a mesh, those inside the box that is to be cut out."""
     from spnr_jax.formats.mesh.meshes import load_mesh  # here: points are read without trimesh
     from spnr_jax.formats.mesh.surface_points import bounding_box, sample_surface
 
-    count = max(CUT_MESH if cut.asked else 0, num_points or MESH_POINTS)
-    asset = load_mesh(path, transparent_parts=transparent_parts, kind=kind)
-    if asset.ignored:
-        report(f"ignored: {'; '.join(asset.ignored)}")
-    for note in asset.notes:
-        report(note)
+    cut, report = how.cut, how.report
+    count = max(CUT_MESH if cut.asked else 0, how.num_points or MESH_POINTS)
+    asset = load_mesh(path, transparent_parts=how.transparent_parts, kind=kind)
+    for line in ([f"ignored: {'; '.join(asset.ignored)}"] if asset.ignored else []) + list(asset.notes):
+        report(line)
     corners, origin = np.stack(bounding_box(asset)), np.zeros(3)
     if np.abs(corners).max() > np.finfo(np.float32).max:
         raise UserError(f"holds vertices too large for float32, more than {np.finfo(np.float32).max:.2g}")
@@ -253,7 +237,7 @@ def _sampled_mesh(
         origin = np.floor(corners[0])
         parts = tuple(replace(part, positions=part.positions - origin) for part in asset.parts)
         asset = replace(asset, parts=parts)
-    drawn = sample_surface(asset, count, seed, "even" if count <= MOST_EVEN else "random")
+    drawn = sample_surface(asset, count, how.seed, "even" if count <= MOST_EVEN else "random")
     if not np.isfinite(drawn.positions).all():
         raise UserError(f"holds vertices too large for float32, more than {np.finfo(np.float32).max:.2g}")
     report(f"{count} points spread over the surface of the mesh")
@@ -270,9 +254,10 @@ def _sampled_mesh(
     return points.chosen(inside)
 
 
-def _bounded_columns(pieces: Iterator[Columns], num_points: int | None, cut: Cut, report: Report) -> Columns:
+def _bounded_columns(pieces: Iterator[Columns], how: Reading) -> Columns:
     """The useful columns of a point file inside the box to be cut out, of very many points those of a random sample."""
-    capacity, broken, outside = max(CAPACITY, THINNING * (num_points or 0)), 0, 0
+    cut, report = how.cut, how.report
+    capacity, broken, outside = max(CAPACITY, THINNING * (how.num_points or 0)), 0, 0
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
 
     def sound_pieces() -> Iterator[Columns]:
@@ -302,15 +287,15 @@ def _bounded_columns(pieces: Iterator[Columns], num_points: int | None, cut: Cut
     return columns
 
 
-def _interpreted(columns: Columns, cut: Cut, report: Report) -> Points:
+def _interpreted(columns: Columns, how: Reading) -> Points:
     """What the columns of a file of points mean."""
     if not columns or len(columns["x"]) == 0:
         raise UserError("holds 0 points")
-    columns = believed(columns, cut.keep_noise, report)
+    columns = believed(columns, how.cut.keep_noise, how.report)
     positions = stacked(columns)
-    _check_steps(columns, positions, report)
+    _check_steps(columns, positions, how.report)
     origin = np.floor(positions.min(axis=0)) if _coarse(positions) else np.zeros(3)
-    values, directions = materials(columns, report), normals(columns)
+    values, directions = materials(columns, how.report), normals(columns)
     return Points(positions - origin, values if directions is None else values | {"normals": directions}, origin)
 
 

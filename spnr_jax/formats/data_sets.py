@@ -74,8 +74,6 @@ def open_dataset(folder: Path | str) -> Dataset:
     description = folder / "dataset.json"
     if not description.is_file():
         raise UserError(f"{folder}: no finished data set (dataset.json is missing); run `spnr-data generate {folder}`")
-    if not (folder / "objects").is_dir() and (folder / "index.json").is_file():
-        raise UserError(f"{folder}: packed, a form that is no longer read; use the folder it was packed from")
     try:
         settings = json.loads(description.read_text())
     except (ValueError, RecursionError) as error:
@@ -103,7 +101,11 @@ def is_plain_name(name: str) -> bool:
 def read_object(dataset: Dataset, name: str) -> ObjectData:
     """One object of the data set; ValueError names the file that is missing or broken."""
     folder = dataset.folder / "objects" / name
-    read, file = _reader_of(folder), "transforms.json"
+    file = "transforms.json"
+
+    def read(file: str) -> bytes:
+        return patiently((folder / file).read_bytes)
+
     try:
         meta = json.loads(read(file))
         with np.errstate(over="ignore"):  # what leaves float32 is infinite, and refused
@@ -140,10 +142,6 @@ def _lights(content: bytes, views: int) -> np.ndarray:
     if lights.shape != (views, HEIGHT, WIDTH, 3) or not np.isfinite(lights).all() or lights.min() < 0:
         raise UserError(f"expected {views} maps of {HEIGHT} x {WIDTH} texels of radiance, got {lights.shape}")
     return lights
-
-
-def _reader_of(folder: Path) -> Callable[[str], bytes]:
-    return lambda file: patiently((folder / file).read_bytes)
 
 
 def patiently(read: Callable[[], Any]) -> Any:

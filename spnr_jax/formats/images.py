@@ -6,7 +6,6 @@ place and renamed into it: a reader sees the old content or the new, never half 
 
 import base64
 import contextlib
-import importlib.util
 import io
 import os
 import warnings
@@ -104,39 +103,16 @@ def write_turntable(path: str | Path, frames: list[np.ndarray], fps: float | int
         raise UserError(f"{path}: a turntable is a .gif or .mp4 file, not {path.suffix!r}")
     if not frames or not fps > 0:
         raise UserError(f"{path}: a turntable needs frames and a positive rate, got {len(frames)} frames at {fps} fps")
-    pictures = [to_uint8(frame) for frame in frames]
-    if path.suffix.lower() == ".gif":
-        write_whole(path, _gif(pictures, fps))
-        return path, ""
-    reason = _missing_codec()
-    if reason:
-        path = path.with_suffix(".gif")
-        write_whole(path, _gif(pictures, fps))
-        return path, f"written as .gif: {reason}"
-    _write_mp4(path, pictures, fps)
-    return path, ""
-
-
-def _missing_codec() -> str:
-    """Why no .mp4 can be written; empty if one can."""
-    if importlib.util.find_spec("imageio_ffmpeg") is None:
-        return ".mp4 needs the package imageio-ffmpeg (pip install imageio-ffmpeg)"
-    import imageio_ffmpeg
-
-    try:
-        with _quiet_forks():
-            imageio_ffmpeg.get_ffmpeg_exe()
-    except RuntimeError:  # a platform that the package brings no program for
-        return ".mp4 needs the program ffmpeg"
-    return ""
-
-
-@contextlib.contextmanager
-def _quiet_forks() -> Iterator[None]:
-    """Without JAX's warning of forks: the child starts ffmpeg at once and touches nothing of JAX."""
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "os.fork", RuntimeWarning)
-        yield
+    pictures, reason = [to_uint8(frame) for frame in frames], ""
+    if path.suffix.lower() == ".mp4":
+        try:
+            _write_mp4(path, pictures, fps)
+            return path, ""
+        except (ImportError, RuntimeError):  # the latter on a platform that the package brings no program for
+            reason = "written as .gif: .mp4 needs ffmpeg (pip install imageio-ffmpeg)"
+    path = path.with_suffix(".gif")
+    write_whole(path, _gif(pictures, fps))
+    return path, reason
 
 
 def _gif(pictures: list[np.ndarray], fps: float | int) -> bytes:
@@ -163,7 +139,8 @@ def _write_mp4(path: Path, pictures: list[np.ndarray], fps: float | int) -> None
         writer = imageio_ffmpeg.write_frames(
             str(unfinished), (width, height), fps=fps, quality=8, macro_block_size=2, ffmpeg_log_level="error"
         )
-        with _quiet_forks():
+        with warnings.catch_warnings():  # of JAX: the child starts ffmpeg at once and touches nothing of it
+            warnings.filterwarnings("ignore", "os.fork", RuntimeWarning)
             writer.send(None)
         for picture in pictures:
             writer.send(np.ascontiguousarray(picture[:height, :width]))

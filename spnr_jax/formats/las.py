@@ -1,8 +1,13 @@
 """Airborne and terrestrial laser scans (.las, compressed .laz) as named columns, piece by piece, through laspy.
 
 Coordinates come scaled and shifted as the header says, in float64; colours are 16 bit.  What the header announces is
-compared with the size of the file before laspy, which takes memory and time for whatever is announced, sees it.  Every
-fault is a ValueError; the caller adds the file's name.
+compared with the size of the file before laspy, which takes memory and time for whatever is announced, sees it; and
+lazrs, which unpacks .laz, ends the whole process where a size in the file is too large, which no `except` sees.  So the
+sizes are walked through before (LASzip specification, LAZ 1.4 R1):
+    record 22204 of "laszip encoded"   ... chunk size u32 at 12, number of items u16 at 32, items (type, size, version)
+    at the points' place   i64 place of the chunk table (-1: it stands in the last 8 bytes), then the chunks
+    chunk of layers        first point as it is, u32 number of points, u32 size of each layer, the layers
+    chunk table            u32 version, u32 number of chunks
 """
 
 import struct
@@ -12,11 +17,14 @@ from pathlib import Path
 import numpy as np
 
 from spnr_jax.errors import UserError, is_bug
-from spnr_jax.formats.laz import RECORD_HEAD, check_laz
 
+RECORD_HEAD, NAME, NUMBER = 54, b"laszip encoded", 22204
+LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}  # of an item of this type; those of extra bytes (14) have one a byte
+ITEMS_AT, CHUNK_SIZE_AT = 32, 12
+LARGEST_CHUNK = 2**24  # points; writers use 50,000
+VARIABLE = 2**32 - 1  # chunk size that says that every chunk has its own
 PIECE_BYTES = 2**23  # of points in memory at a time
 COLUMNS = ("red", "green", "blue", "intensity", "classification", "withheld")
-MISSING = "needs the package {package} to be read: pip install 'spnr-jax[formats]'"
 # places in the header (ASPRS LAS 1.4 R15, table 3): sizes and counts, the count of version 1.4
 SIZES, COUNT_14, SMALLEST_HEADER = 94, 247, 227
 COMPRESSED = 0xC0  # bits of the point format
@@ -28,12 +36,10 @@ def las_pieces(path: Path) -> Iterator[dict[str, np.ndarray]]:
     """The columns x y z, the colours and the intensity of a scan, some points at a time."""
     try:
         import laspy  # an extra: only here
-    except ImportError:
-        raise UserError(MISSING.format(package="laspy")) from None
-    if path.suffix.lower() == ".laz" and laspy.LazBackend.Lazrs not in laspy.LazBackend.detect_available():
-        raise UserError(MISSING.format(package="lazrs"))
-    # the parallel reader of lazrs ends the whole process on a damaged file
-    backends = (laspy.LazBackend.Lazrs,)
+        import lazrs  # noqa: F401
+    except ImportError as error:
+        raise UserError(f"needs the package {error.name} to be read: pip install 'spnr-jax[formats]'") from None
+    backends = (laspy.LazBackend.Lazrs,)  # its parallel reader ends the whole process on a damaged file
     _check_header(path)
     try:
         with laspy.open(path, laz_backend=backends, read_evlrs=False) as scan:
@@ -68,3 +74,60 @@ def _check_header(path: Path) -> None:
         check_laz(np.memmap(path, np.uint8, "r"), header_size, records, data, length, count)
     elif not length or data + count * length > size:
         raise UserError(f"is cut off: its header announces {count} points of {length} bytes, in {size} bytes")
+
+
+def check_laz(content: np.ndarray, first_record: int, records: int, data: int, length: int, points: int) -> None:
+    """ValueError unless lazrs can be trusted with the bytes (n,) of a scan.
+
+    `records` stand from `first_record` on, `points`, of `length` bytes when unpacked, from `data` on.
+    """
+    try:
+        items, chunk_size = _items(content, first_record, records)
+        if sum(size for _, size in items) != length:
+            raise UserError(f"its points have {length} bytes, their items {[size for _, size in items]}")
+        if not chunk_size and any(kind in LAYERS for kind, _ in items):
+            chunk_size = VARIABLE  # as writers of COPC put it
+        if chunk_size != VARIABLE and not 0 < chunk_size <= LARGEST_CHUNK:
+            raise UserError(f"chunks of {chunk_size} points, expected 1 to {LARGEST_CHUNK}")
+        (table,) = _numbers(content, data, "<q")
+        if table == -1:
+            (table,) = _numbers(content, len(content) - 8, "<q")
+        _, chunks = _numbers(content, table, "<II")
+        if chunks * length > len(content):  # each begins with a point as it is
+            raise UserError(f"{chunks} chunks in {len(content)} bytes")
+        if chunks * (LARGEST_CHUNK if chunk_size == VARIABLE else chunk_size) < points:
+            raise UserError(f"{points} points in {chunks} chunks")
+        if any(kind in LAYERS for kind, _ in items):
+            _walk(content, data + 8, chunks, length, sum(LAYERS.get(kind, size) for kind, size in items))
+    except struct.error:
+        raise UserError("is cut off: its compressed data ends too early") from None
+
+
+def _items(content: np.ndarray, place: int, records: int) -> tuple[list[tuple[int, int]], int]:
+    """((type, size) of each item of a point, points in a chunk) as LASzip's record says."""
+    for _ in range(records):
+        name, number, size = _numbers(content, place + 2, "<16sHH")
+        if name.rstrip(b"\0") == NAME and number == NUMBER:
+            start = place + RECORD_HEAD
+            (count,) = _numbers(content, start + ITEMS_AT, "<H")
+            (chunk_size,) = _numbers(content, start + CHUNK_SIZE_AT, "<I")
+            found = [_numbers(content, start + ITEMS_AT + 2 + 6 * i, "<HH") for i in range(count)]
+            return [(int(kind), int(wide)) for kind, wide in found], int(chunk_size)
+        place += RECORD_HEAD + size
+    raise UserError("has no record that says how its points are compressed")
+
+
+def _walk(content: np.ndarray, place: int, chunks: int, length: int, layers: int) -> None:
+    """ValueError unless all layers of all chunks end inside the file."""
+    for _ in range(chunks):
+        count, *sizes = _numbers(content, place + length, f"<{1 + layers}I")
+        place += length + 4 + 4 * layers + sum(sizes)
+        if place > len(content) or count > LARGEST_CHUNK:
+            raise UserError(f"is cut off: a chunk of {count} points ends at byte {place} of {len(content)}")
+
+
+def _numbers(content: np.ndarray, place: int, form: str) -> tuple:
+    """Numbers of the bytes from a place on; struct.error where there are too few."""
+    if not 0 <= place <= len(content):
+        raise struct.error
+    return struct.unpack(form, content[place : place + struct.calcsize(form)].tobytes())

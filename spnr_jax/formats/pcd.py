@@ -5,6 +5,7 @@ They are read piece by piece, compressed ones whole.  A header of text lines nam
 ValueError that says what is wrong; the file's name is added by the caller.
 """
 
+import contextlib
 import math
 import re
 from collections.abc import Iterator
@@ -54,12 +55,8 @@ def pcd_pieces(path: Path) -> Iterator[dict[str, np.ndarray]]:
             pieces = binary_rows(file, header.num_points, header.layout)
         else:
             pieces = iter([_columns(file.read(), header)])
-        yield from map(_named, pieces)
-
-
-def _named(points: np.ndarray) -> dict[str, np.ndarray]:
-    """The fields of points that are one number, as columns."""
-    return {name.lower(): points[name] for name in points.dtype.names or () if points[name].ndim == 1}
+        for points in pieces:
+            yield {name.lower(): points[name] for name in points.dtype.names or () if points[name].ndim == 1}
 
 
 def _header(data: bytes) -> PcdHeader:
@@ -96,19 +93,13 @@ def _header(data: bytes) -> PcdHeader:
     if num_points < 0:
         raise UserError(f"has a PCD header that announces {num_points} points")
     organised = entries.get("HEIGHT", ["1"])[:1] not in (["0"], ["1"])
-    sensor = _sensor(entries.get("VIEWPOINT", []))
+    sensor = None
+    with contextlib.suppress(ValueError):
+        place = tuple(float(value) for value in entries.get("VIEWPOINT", [])[:3])
+        sensor = place if len(place) == 3 and all(map(math.isfinite, place)) else None
     return PcdHeader(
         layout=layout, num_points=num_points, encoding=encoding, size=end.end(), organised=organised, sensor=sensor
     )
-
-
-def _sensor(viewpoint: list[str]) -> tuple[float, ...] | None:
-    """The sensor's place (3,): x y z of VIEWPOINT."""
-    try:
-        place = tuple(float(value) for value in viewpoint[:3])
-    except ValueError:
-        return None
-    return place if len(place) == 3 and all(map(math.isfinite, place)) else None
 
 
 def _columns(body: bytes, header: PcdHeader) -> np.ndarray:
@@ -121,22 +112,18 @@ def _columns(body: bytes, header: PcdHeader) -> np.ndarray:
     if plain != header.num_points * header.layout.itemsize:
         raise UserError(f"announces {plain} bytes of points, its header {header.num_points * header.layout.itemsize}")
     packed = body[8 : 8 + compressed]
-    # some writers announce compressed data and store it as it is
-    unpacked = packed if compressed == plain and not _is_lzf(packed, plain) else decompress(packed, plain)
+    try:
+        unpacked = decompress(packed, plain)
+    except UserError:
+        if compressed != plain:
+            raise
+        unpacked = packed  # some writers announce compressed data and store it as it is
     points, start = np.empty(header.num_points, header.layout), 0
     for name in header.layout.names or ():
         column = points[name]
         points[name] = np.frombuffer(unpacked, column.dtype, column.size, start).reshape(column.shape)
         start += column.size * column.dtype.itemsize
     return points
-
-
-def _is_lzf(data: bytes, size: int) -> bool:
-    """Whether data can be unpacked to this size."""
-    try:
-        return bool(decompress(data, size))
-    except ValueError:
-        return False
 
 
 def decompress(data: bytes, size: int) -> bytes:

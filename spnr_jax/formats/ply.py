@@ -90,7 +90,12 @@ def vertex_pieces(file: BufferedIOBase) -> Iterator[Columns]:
             rows = element_rows(file, count, properties, header.byte_order)
             yield from ({field.lower(): piece[field] for field in piece.dtype.names or ()} for piece in rows)
             return
-        _skip(file, count, properties, header.byte_order)
+        if header.byte_order is None:
+            for _ in islice((line for line in iter(file.readline, b"") if line.strip()), count):
+                pass
+        else:
+            for _ in element_rows(file, count, properties, header.byte_order):
+                pass
     raise UserError(f"has no PLY element 'vertex', only {', '.join(name for name, _, _ in header.elements) or 'none'}")
 
 
@@ -110,18 +115,6 @@ def element_rows(
         yield from binary_rows(file, count, layout)
     else:
         yield from _rows_with_lists(file, count, properties, layout, order)
-
-
-def _skip(file: BufferedIOBase, count: int, properties: list[tuple[str, str | Lists]], order: str | None) -> None:
-    """Moves an open file behind an element."""
-    if order is None:
-        for _ in islice((line for line in iter(file.readline, b"") if line.strip()), count):
-            pass
-    elif all(isinstance(kind, str) for _, kind in properties):
-        file.seek(count * sum(np.dtype(kind).itemsize for _, kind in properties if isinstance(kind, str)), 1)
-    else:
-        for _ in element_rows(file, count, properties, order):
-            pass
 
 
 def _without_lists(words: list[str], properties: list[tuple[str, str | Lists]]) -> list[str]:

@@ -5,7 +5,7 @@
     .pcd                        spnr_jax/formats/pcd.py
     .npz .npy                   spnr_jax/formats/npz.py
     .las .laz                   spnr_jax/formats/las.py
-    .spz                        spnr_jax/formats/splat_files.py
+    .spz                        spnr_jax/formats/gaussian_files.py
     .glb .gltf .obj .off        meshes (spnr_jax/formats/mesh), as points where they have no faces
 
 A reader yields pieces of at most some ten megabytes (archives, meshes and compressed files come whole), so that a file
@@ -14,6 +14,7 @@ has them so; what they mean is the affair of spnr_jax/formats/columns.py.
 """
 
 import io
+import struct
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
@@ -21,11 +22,11 @@ import numpy as np
 
 from spnr_jax.errors import UserError
 from spnr_jax.formats.columns import Columns
+from spnr_jax.formats.gaussian_files import compressed_columns, spz_columns
 from spnr_jax.formats.las import las_pieces
 from spnr_jax.formats.npz import numpy_pieces
 from spnr_jax.formats.pcd import pcd_pieces
 from spnr_jax.formats.ply import element_rows, ply_pieces, read_ply_header, vertex_pieces
-from spnr_jax.formats.splat_files import compressed_columns, spz_columns
 from spnr_jax.formats.text import text_pieces
 
 READERS = {
@@ -47,13 +48,13 @@ MAGIC = (  # first bytes, and the kind that they tell; of kinds with several suf
 )
 BLENDER = "convert it to .glb, e.g. with Blender (File > Import, then File > Export > glTF 2.0)"
 CLOUDCOMPARE = "convert it to .las or .ply, e.g. with CloudCompare (File > Save)"
-# first bytes or suffix -> what it is, where its version stands (place, length), how to convert it
+# first bytes or suffix -> what it is, where its version stands (as struct has it), how to convert it
 FOREIGN: dict[bytes | str, tuple] = {
-    b"PXR-USDC": ("USD (binary crate)", (8, 3), BLENDER),
-    b"#usda": ("USD (text)", (6, 3), BLENDER),
-    b"ASTM-E57": ("an E57 scan", (8, 8), CLOUDCOMPARE),
-    b"Kaydara FBX Binary": ("an FBX scene", (23, 4), BLENDER),
-    b"BLENDER": ("a Blender scene", (9, 3), "export it as .glb: File > Export > glTF 2.0"),
+    b"PXR-USDC": ("USD (binary crate)", "8x3B", BLENDER),
+    b"#usda": ("USD (text)", "6x3s", BLENDER),
+    b"ASTM-E57": ("an E57 scan", "<8x2I", CLOUDCOMPARE),
+    b"Kaydara FBX Binary": ("an FBX scene", "<23xI", BLENDER),
+    b"BLENDER": ("a Blender scene", "9x3s", "export it as .glb: File > Export > glTF 2.0"),
     b"\x89HDF": ("an HDF5 file", None, "write its points as .npz: arrays points and colors"),
     ".usdz": ("USD (package)", None, BLENDER),
     **dict.fromkeys((".usd", ".usda", ".usdc"), ("USD", None, BLENDER)),
@@ -93,17 +94,13 @@ def kind_of(path: Path) -> str:
     return suffix
 
 
-def _version(head: bytes, place: tuple[int, int] | None) -> str:
-    """The version that stands in the first bytes of a file: text, numbers of one byte, or two numbers of four."""
-    if place is None:
+def _version(head: bytes, form: str | None) -> str:
+    """The version that stands in the first bytes of a file: text, or numbers."""
+    if form is None or len(head) < struct.calcsize(form):
         return ""
-    field = head[place[0] : sum(place)]
-    if field.isascii() and all(byte in b".0123456789" for byte in field):
-        return f" of version {field.decode()}"
-    if place[1] == 3:
-        return f" of version {'.'.join(map(str, field))}"
-    numbers = [int.from_bytes(field[i : i + 4], "little") for i in range(0, place[1], 4)]
-    return f" of version {'.'.join(map(str, numbers))}"
+    found = struct.unpack_from(form, head)
+    words = [value.decode("ascii", "replace") if isinstance(value, bytes) else str(value) for value in found]
+    return f" of version {'.'.join(words)}"
 
 
 def column_pieces(path: Path, kind: str | None = None) -> Iterator[Columns] | None:

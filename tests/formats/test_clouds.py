@@ -1,5 +1,3 @@
-import re
-
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
@@ -9,7 +7,7 @@ from support.point_clouds import SRGB, read, write
 from data_gen.store.layout import POINT_TYPE, encode_points
 from spnr_jax.formats import clouds
 from spnr_jax.formats.clouds import place_cloud, read_cloud
-from spnr_jax.formats.up_axis import ROTATIONS
+from spnr_jax.formats.orientation import ROTATIONS
 from spnr_jax.kernels.cloud_arrays import pad
 from spnr_jax.surfels.visibility import spiral
 
@@ -40,11 +38,6 @@ def test_the_points_of_a_data_set_come_back_as_they_are_and_nothing_is_assumed(t
     assert cloud.mask.all()
     assert {a.dtype for a in (cloud.positions, cloud.base_color, cloud.roughness)} == {np.dtype("float32")}
     assert lines == []
-
-
-def test_linear_base_colours_win_over_srgb_ones_and_are_not_decoded(tmp_path):
-    np.savez(tmp_path / "a.npz", xyz=np.eye(3), base_color=np.full((3, 3), 0.2), rgb=np.full((3, 3), 0.9))
-    np.testing.assert_allclose(read_cloud(tmp_path / "a.npz").base_color, 0.2)
 
 
 def test_what_a_file_does_not_say_is_grey_half_rough_no_metal_and_reported(tmp_path):
@@ -136,13 +129,6 @@ def test_a_cloud_without_a_usable_normal_has_none(tmp_path):
     assert pad(read_cloud(zeros), 4).normals is None
 
 
-def test_a_mesh_without_material_says_so(tmp_path):
-    _, lines = read(write(tmp_path, "a.obj", SQUARE_OBJ), num_points=10)
-    assert any(line.startswith("no material in the mesh: base_color 0.5, roughness 0.5, metallic 0") for line in lines)
-    _, lines = read(write(tmp_path, "a.ply", SQUARE_PLY), num_points=10)
-    assert not any("no material" in line for line in lines)
-
-
 def test_map_coordinates_keep_their_precision_and_the_way_back_is_kept(tmp_path):
     points = np.random.default_rng(0).uniform(0, 1, (50, 3)) + [500_000, 4_000_000, 100]
     np.save(tmp_path / "a.npy", points)
@@ -150,19 +136,6 @@ def test_map_coordinates_keep_their_precision_and_the_way_back_is_kept(tmp_path)
     back = placed.cloud.positions @ placed.rotation + placed.origin
     np.testing.assert_allclose(back, points, rtol=0, atol=1e-6)
     np.testing.assert_allclose(placed.cloud.positions[:, 1], points[:, 2] - placed.origin[2], atol=1e-6)
-
-
-def test_up_is_found_where_it_is_left_to_the_reader_and_said(tmp_path):
-    rng = np.random.default_rng(0)
-    cone = rng.uniform(-1, 1, (900, 3)) * [1, 1, 0.01]
-    cone[:300] *= np.linspace(1, 0, 300)[:, None]
-    cone[:300, 2] += np.linspace(0, 2, 300)
-    np.save(tmp_path / "a.npy", cone)
-    lines: list[str] = []
-    placed = place_cloud(tmp_path / "a.npy", report=lines.append)
-    assert placed.up == "z"
-    assert any(line.startswith("z taken as up") for line in lines)
-    assert place_cloud(tmp_path / "a.npy", up="-x").up == "-x"
 
 
 class TestCleaning:
@@ -176,30 +149,3 @@ class TestCleaning:
         cloud, lines = read(self.scan(tmp_path), num_points=50, clean="auto")
         assert np.abs(cloud.positions).max() <= 1
         assert lines[-2:] == ["removed 6 outliers of 606 points", "50 of 600 points kept, evenly spread"]
-
-    def test_is_off_unless_it_is_asked_for(self, tmp_path):
-        for options in ({}, {"clean": "off"}):
-            cloud, lines = read(self.scan(tmp_path), **options)
-            assert len(cloud.positions) == 606
-            assert not any("outliers" in line for line in lines)
-
-    def test_cleans_the_sample_of_a_noisy_file_that_is_kept_while_reading(self, tmp_path, monkeypatch):
-        monkeypatch.setattr(clouds, "CAPACITY", 8000)
-        rng = np.random.default_rng(0)
-        surface = rng.normal(size=(40_000, 3))
-        surface /= np.linalg.norm(surface, axis=1, keepdims=True)
-        noise = 0.05 * rng.normal(size=surface.shape)
-        positions = np.concatenate([surface + noise, 9 + 50 * rng.uniform(-1, 1, (400, 3))])
-        colors = np.concatenate([(1 + surface) / 2, np.full((400, 3), 0.5)])
-        np.savez(tmp_path / "a.npz", xyz=positions, base_color=colors)
-        cloud, lines = read(tmp_path / "a.npz", clean="auto")
-        assert re.fullmatch(r"\d{4} of 40400 points kept while reading, drawn at random", lines[0])
-        assert np.abs(np.linalg.norm(cloud.positions, axis=1) - 1).max() < 0.5, "outliers are left"
-        assert np.abs(np.linalg.norm(cloud.positions, axis=1) - 1).mean() < 0.4 * 0.05
-        assert np.abs(2 * cloud.base_color - 1 - cloud.positions).mean() < 0.03
-
-    def test_leaves_meshes_alone(self, tmp_path):
-        path = write(tmp_path, "a.obj", SQUARE_OBJ)
-        plain, lines = read(path, num_points=200, clean="strong")
-        np.testing.assert_array_equal(plain.positions, read_cloud(path, num_points=200).positions)
-        assert not any("outliers" in line or "averaged" in line for line in lines)

@@ -45,12 +45,6 @@ def test_roughness_and_metallic_have_many_names_and_whole_bytes(rough, metal):
     np.testing.assert_array_equal(values["metallic"], [0.25, 0.75])
 
 
-def test_materials_are_known_where_the_file_has_one_of_them():
-    assert "materials_known" not in read(roughness=[0.1, 0.2])[0]
-    assert "materials_known" not in read(metallic=[0.0, 1.0])[0]
-    np.testing.assert_array_equal(read(red=[1, 1], green=[0, 0], blue=[0, 0])[0]["materials_known"], [0, 0])
-
-
 INTENSITY_SHOWN = "no colour in the file: intensity 100..298 shown as grey"
 
 
@@ -63,18 +57,6 @@ def test_intensity_is_grey_where_there_is_no_colour_and_unused_where_there_is():
     assert read(intensity=[100, 300], red=[0, 0], green=[0, 0], blue=[0, 0])[1][0] == INTENSITY_SHOWN
     values, lines = read(intensity=[5, 5])
     assert lines[0].startswith("no base_color in the file")
-
-
-def test_only_what_is_used_is_kept():
-    columns = useful(POSITION | {"nx": np.zeros(2), "label": np.ones(2), "r": np.ones(2)})
-    assert list(columns) == ["x", "y", "z"]
-
-
-def test_an_unknown_layout_says_what_it_needs_and_what_was_found():
-    with pytest.raises(ValueError, match=r"needs the properties x y z .* found east north height$"):
-        useful({name: np.zeros(1) for name in ("east", "north", "height")})
-    with pytest.raises(ValueError, match="found none"):
-        useful({})
 
 
 def test_splats_become_points_of_their_constant_colour_and_fog_is_dropped():

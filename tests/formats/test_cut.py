@@ -74,7 +74,3 @@ def test_a_box_and_an_object_are_cut_out_of_a_mesh(tmp_path):
 def test_options_that_make_no_sense_are_refused(options, expected):
     with pytest.raises(ValueError, match=expected):
         Cut(**options)
-
-
-def test_the_largest_is_the_first():
-    assert (Cut(object="largest").nth, Cut(object="3").nth, Cut().nth) == (1, 3, None)

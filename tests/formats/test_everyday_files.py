@@ -106,15 +106,6 @@ def test_splats_in_a_scene_are_points_of_their_colour_and_fog_is_left_out(tmp_pa
     assert any(line.startswith("140 of 420 points left out: opacity near 0") for line in lines)
 
 
-def test_colours_that_hold_light_are_said(tmp_path):
-    builder = GltfBuilder()
-    look = {"pbrMetallicRoughness": {"baseColorFactor": [*LINEAR, 1]}, "extensions": {"KHR_materials_unlit": {}}}
-    builder.mesh(builder.primitive(material=builder.material(name="sky", **look)))
-    cloud, lines = read(builder.write(tmp_path / "a.glb"), num_points=30)
-    np.testing.assert_allclose(cloud.base_color, np.broadcast_to(LINEAR, (30, 3)), atol=1e-5)
-    assert "colours that hold light already (KHR_materials_unlit) taken as base colours: 'sky'" in lines
-
-
 def with_lists(form: str) -> bytes:
     """A PLY file of three points, with a list before and one among their properties."""
     head = f"ply\nformat {form} 1.0\nelement edge 2\nproperty list uchar short ends\nelement vertex 3\n"
@@ -183,11 +174,6 @@ def test_the_colours_of_a_mesh_are_read_as_those_of_points(tmp_path, case):
     cloud, lines = read(write(tmp_path, *COLORED_MESHES[case]), num_points=50)
     np.testing.assert_allclose(cloud.base_color, np.broadcast_to(LINEAR, (50, 3)), atol=2e-3)
     assert any("taken as sRGB in 0.." in line for line in lines)
-
-
-def test_white_is_white(tmp_path):
-    content = "".join(f"v {corner} 1 1 1\n" for corner in CORNERS) + OBJ_FACE
-    assert (read_cloud(write(tmp_path, "a.obj", content), num_points=9).base_color == 1).all()
 
 
 def colored_ball(folder, colors: np.ndarray, kind: str = "<u2", **more: np.ndarray):
@@ -376,12 +362,6 @@ def test_a_binary_stl_with_a_tail_or_without_a_count_is_read_by_its_size(tmp_pat
     assert "the header announces 0 triangles, 2 stand behind it: these are drawn" in lines
     with pytest.raises(ValueError, match="announces 3 triangles, 2 are there"):
         read(write(tmp_path, "a.stl", stl(3)))
-
-
-def test_colours_of_an_stl_which_every_program_writes_in_its_own_way_are_named(tmp_path):
-    for attribute in (b"\0\0", b"\x9f\x02"):
-        _, lines = read(write(tmp_path, "a.stl", stl(2, attribute=attribute)), num_points=20)
-        assert ("ignored: STL attribute bytes" in lines) == (attribute != b"\0\0")
 
 
 def test_faces_with_a_vertex_that_is_no_number_are_left_out_and_counted(tmp_path):

@@ -1,4 +1,5 @@
 import importlib.util
+import sys
 
 import numpy as np
 import pytest
@@ -32,12 +33,6 @@ def test_eight_bit_values_round_to_the_nearest_level_and_keep_eight_bit_images()
     assert to_uint8(levels) is levels
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_an_image_that_is_not_finite_is_refused(value):
-    with pytest.raises(ValueError, match="NaN or infinity"):
-        to_uint8(np.full((2, 2, 3), value))
-
-
 @pytest.mark.parametrize("shape", [(5, 7, 3), (5, 7)])
 def test_a_png_holds_the_exact_pixels(tmp_path, shape):
     image = np.random.default_rng(0).integers(0, 256, shape).astype(np.uint8)
@@ -46,26 +41,12 @@ def test_a_png_holds_the_exact_pixels(tmp_path, shape):
         np.testing.assert_array_equal(np.asarray(opened), image)
 
 
-def test_depth_is_brighter_where_it_is_nearer_and_white_where_nothing_is():
-    depth = np.array([[2.0, 2.5, 3.0, 9.0]])
-    shown = depth_image(depth, np.array([[1.0, 1, 1, 0]])).astype(int)
-    brightness = shown.sum(axis=-1)[0]
-    assert brightness[0] > brightness[1] > brightness[2]
-    np.testing.assert_array_equal(shown[0, 3], 255)
-
-
 def test_depth_colours_span_the_opaque_pixels_alone_so_unit_and_background_do_not_matter():
     rng = np.random.default_rng(1)
     depth, acc = rng.uniform(2, 3, (6, 6)), (rng.uniform(size=(6, 6)) < 0.7).astype(float)
     shown = depth_image(depth, acc)
     np.testing.assert_array_equal(depth_image(np.where(acc > 0, depth, 1e6), acc), shown)
     assert np.abs(depth_image(100 * depth, acc).astype(int) - shown).max() <= 1
-
-
-@pytest.mark.parametrize("acc", [0.0, 1.0])
-def test_depth_without_any_range_is_still_a_picture(acc):
-    shown = depth_image(np.full((3, 3), 2.0), np.full((3, 3), acc))
-    assert (shown == (255 if acc == 0 else shown[0, 0])).all()
 
 
 def test_a_file_that_cannot_be_finished_leaves_the_old_one_and_nothing_else(tmp_path, monkeypatch):
@@ -96,34 +77,13 @@ def test_a_turntable_gif_loops_at_its_rate_and_shows_every_frame_with_a_pure_whi
     assert error.max() <= 12
 
 
-def test_what_stands_still_in_a_turntable_does_not_flicker(tmp_path):
-    still = shaded_frames(1)[0]
-    moving = [np.concatenate([still, still * color], axis=1) for color in np.random.default_rng(2).uniform(size=(5, 3))]
-    path, _ = write_turntable(tmp_path / "a.gif", moving, fps=10)
-    shown = read_frames(path)[:, :, :64]
-    np.testing.assert_array_equal(shown, np.broadcast_to(shown[:1], shown.shape))
-
-
 def test_an_mp4_without_its_encoder_becomes_a_gif_and_one_line_says_why(tmp_path, monkeypatch):
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     path, reason = write_turntable(tmp_path / "a.mp4", shaded_frames(3), fps=10)
     assert path == tmp_path / "a.gif"
     assert len(read_frames(path)) == 3
     assert "imageio-ffmpeg" in reason
     assert "\n" not in reason
-
-
-@pytest.mark.skipif(importlib.util.find_spec("imageio_ffmpeg") is None, reason="needs imageio-ffmpeg")
-def test_an_encoder_without_its_program_counts_as_none(tmp_path, monkeypatch):
-    import imageio_ffmpeg
-
-    def none_found():
-        raise RuntimeError("No ffmpeg exe could be found")
-
-    monkeypatch.setattr(imageio_ffmpeg, "get_ffmpeg_exe", none_found)
-    path, reason = write_turntable(tmp_path / "a.mp4", shaded_frames(3), fps=10)
-    assert path == tmp_path / "a.gif"
-    assert reason == "written as .gif: .mp4 needs the program ffmpeg"
 
 
 @pytest.mark.skipif(importlib.util.find_spec("imageio_ffmpeg") is None, reason="needs imageio-ffmpeg")

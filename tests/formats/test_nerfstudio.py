@@ -64,9 +64,3 @@ def test_a_wrong_convention_would_be_seen(folder):
             column, row = np.floor((pixels - RESOLUTION / 2) * mirror + RESOLUTION / 2).astype(int).T
             hits.append((alpha[row, column] > 0).mean())
         assert np.mean(hits) < 0.9
-
-
-def test_angle_and_focal_length_of_the_camera_agree(folder):
-    meta = json.loads((folder / "transforms.json").read_text())
-    assert np.isclose(meta["fl_x"], meta["w"] / 2 / np.tan(meta["camera_angle_x"] / 2))
-    assert meta["fl_x"] == meta["fl_y"]

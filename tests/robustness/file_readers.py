@@ -1,33 +1,31 @@
-"""Every reader of other people's files, as a command calls it, with the law of what it may return.
+"""Every reader of other people's files, with small valid files, and the law of what it may return.
 
-`READERS` maps a name to a Reader: valid seeds, and `read`, which opens the files in a folder.  It returns when the
-file was read and what came is sound (finite, right shapes and types), raises ValueError, one line, when the file is
-refused, and AssertionError when something unsound was let through.
+`READERS` maps a name to (seeds, read): valid files as dicts from names to bytes, the one that is opened first, and what
+reads it in a folder.  That returns when the file was read and what came is sound (finite, right shapes and types),
+raises ValueError, one line, when the file is refused, and AssertionError when something unsound was let through.
 """
 
 import contextlib
+import dataclasses
 import functools
+import gzip
 import io
+import json
+import tempfile
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
-import browser_messages
 import numpy as np
-import packed_gltfs
-import valid_files
-import valid_runs
+import trimesh
 from damage import Files
+from support import splat_balls, tiny_dataset
+from support.gltf_files import UV, GltfBuilder, png
+from support.packed_meshes import ETC1S_ALPHA, MESHOPT, UASTC
+from support.point_clouds import packed_splats
+from support.point_tables import WHOLE, WRITERS, written
 
 MOST_POINTS = 32
-
-
-@dataclass(frozen=True, kw_only=True)
-class Reader:
-    """A kind of files: `seeds` makes valid ones, `read(folder, main)` reads the file `main` there."""
-
-    seeds: Callable[[], list[Files]]
-    read: Callable[[Path, str], None]
+TEXELS = np.random.default_rng(7).integers(0, 256, (4, 4, 4))
 
 
 def read_cloud(folder: Path, main: str) -> None:
@@ -48,25 +46,21 @@ def read_mesh(folder: Path, main: str) -> None:
     with contextlib.suppress(assets.RejectedAsset):  # more is refused for references than for pictures
         surface_points.sample_surface(meshes.load_mesh(folder / main), MOST_POINTS, 0)
     with contextlib.suppress(ValueError):
-        cloud = clouds.read_cloud(folder / main, num_points=MOST_POINTS, transparent_parts="skip")
-        check_cloud(cloud, MOST_POINTS)
+        check_cloud(clouds.read_cloud(folder / main, num_points=MOST_POINTS, transparent_parts="skip"), MOST_POINTS)
     read_cloud(folder, main)
 
 
 def check_cloud(cloud, most: int | None = None) -> None:
     """AssertionError unless the cloud is finite float32 with materials in [0, 1]."""
     count = len(cloud.positions)
-    assert count >= 1, "no points"
-    assert most is None or count <= most, f"{count} points"
+    assert 1 <= count <= (most or count), f"{count} points"
     shapes = {"positions": (count, 3), "base_color": (count, 3), "roughness": (count,), "metallic": (count,)}
     for name, shape in shapes.items():
         values = np.asarray(getattr(cloud, name))
         assert values.shape == shape, f"{name} {values.shape}"
         assert values.dtype == np.float32, f"{name} {values.dtype}"
         assert np.isfinite(values).all(), f"{name} not finite"
-        if name != "positions":
-            assert values.min() >= 0, f"{name} below 0"
-            assert values.max() <= 1, f"{name} above 1"
+        assert name == "positions" or 0 <= values.min() <= values.max() <= 1, f"{name} outside of 0 to 1"
     assert cloud.mask.dtype == bool
     assert cloud.mask.all()
 
@@ -86,37 +80,28 @@ def read_metrics(folder: Path, main: str) -> None:
     from spnr_jax.training.run_record import read_rows
 
     for row in read_rows(folder):
-        assert isinstance(row, dict), f"a row that is a {type(row).__name__}"
         assert all(isinstance(value, int | float) for value in row.values()), "a row with a value that is no number"
 
 
 def read_dataset(folder: Path, main: str) -> None:
-    """Every object of a data set, as training reads it."""
+    """What `spnr-data check` says, and every object of a data set, as training reads it."""
+    from data_gen.store import check
     from spnr_jax.formats import data_sets
 
+    with contextlib.suppress(ValueError), contextlib.redirect_stdout(io.StringIO()):
+        assert isinstance(check.check(folder), bool)
     dataset = data_sets.open_dataset(folder)
-    for name in dataset.splits["train"][:3]:
+    for name in dataset.splits["train"]:
         item = data_sets.read_object(dataset, name)
         check_cloud(item.cloud)
         views, height, width = len(item.camera.cam_to_world), item.camera.height, item.camera.width
-        for images in (item.images, item.conditions):
-            assert images.shape == (views, height, width, 4), f"images {images.shape}"
-            assert images.dtype == np.uint8
         assert views >= 1, "no views"
-        assert item.camera.cam_to_world.shape == (views, 3, 4), f"cameras {item.camera.cam_to_world.shape}"
-        assert item.camera.intrinsics.shape == (views, 3, 3)
+        for images in (item.images, item.conditions):
+            assert (images.shape, images.dtype) == ((views, height, width, 4), np.uint8)
+        assert item.camera.cam_to_world.shape == (views, 3, 4)
         assert np.isfinite(item.camera.cam_to_world).all()
         assert np.isfinite(item.camera.intrinsics).all()
         assert (np.asarray(item.camera.intrinsics)[:, (0, 1), (0, 1)] > 0).all(), "a focal length below 0"
-
-
-def check_dataset(folder: Path, main: str) -> None:
-    """What `spnr-data check` says."""
-    from data_gen.store import check
-
-    with contextlib.redirect_stdout(io.StringIO()):
-        sound = check.check(folder)
-    assert isinstance(sound, bool)
 
 
 def read_list(folder: Path, main: str) -> None:
@@ -142,28 +127,205 @@ def read_network(folder: Path, main: str) -> None:
     assert isinstance(read_weights(folder / main), Trained)
 
 
-CLOUDS: dict[str, Callable[[], list[Files]]] = {
-    "ply": valid_files.plys, "ply-mesh": valid_files.ply_meshes, "pcd": valid_files.pcds, "text": valid_files.texts,
-    "npz": valid_files.npzs, "npy": valid_files.npys, "las": functools.partial(valid_files.scans, "las"),
-    "laz": functools.partial(valid_files.scans, "laz"), "stl": valid_files.stls, "off": valid_files.offs,
-    "spz": valid_files.spzs,
-}  # fmt: skip
-MESHES: dict[str, Callable[[], list[Files]]] = {
-    "obj": valid_files.objs,
-    "gltf": valid_files.gltfs,
-    "glb": valid_files.glbs,
-    "gltf-packed": packed_gltfs.packed,
-    "gltf-looks": packed_gltfs.looks,
-}
-READERS = {
-    **{name: Reader(seeds=seeds, read=read_cloud) for name, seeds in CLOUDS.items()},
-    **{name: Reader(seeds=seeds, read=read_mesh) for name, seeds in MESHES.items()},
-    "config": Reader(seeds=valid_runs.configs, read=read_config),
-    "metrics": Reader(seeds=valid_runs.metric_rows, read=read_metrics),
-    "dataset": Reader(seeds=valid_runs.datasets, read=read_dataset),
-    "dataset-check": Reader(seeds=valid_runs.datasets, read=check_dataset),
-    "lists": Reader(seeds=valid_runs.lists, read=read_list),
-    "viewer-message": Reader(seeds=browser_messages.messages, read=browser_messages.read_message),
-    "viewer-upload": Reader(seeds=browser_messages.sent_files, read=browser_messages.read_upload),
-    "weights": Reader(seeds=valid_runs.weights, read=read_network),
+def read_upload(folder: Path, main: str) -> None:
+    """What a browser's file becomes; nothing of it stays on the disk."""
+    from spnr_jax.formats import clouds
+    from spnr_jax.viewer import frame
+
+    before, read = set(folder.iterdir()), functools.partial(clouds.read_cloud, num_points=MOST_POINTS, up="auto")
+    try:
+        name = (folder / "name.txt").read_text("utf-8", errors="replace")
+        check_cloud(frame.read_upload(name, (folder / main).read_bytes(), read), MOST_POINTS)
+    finally:
+        assert set(folder.iterdir()) == before, "a file that stays"
+
+
+def tables(*suffixes: str) -> list[Files]:
+    """One table of points in all the ways that files of these kinds are written."""
+    found = []
+    for name in (name for name in WRITERS if name.endswith(suffixes)):
+        with tempfile.TemporaryDirectory() as folder:
+            path = written(Path(folder), name, WHOLE)
+            beside = {p.name: p.read_bytes() for p in Path(folder).iterdir() if p != path}
+            found.append({name: path.read_bytes()} | beside)
+    return found
+
+
+def plain_meshes(suffix: str) -> list[Files]:
+    """A box as trimesh writes it."""
+    box = trimesh.creation.box()
+    if suffix == ".ply":
+        box.visual.face_colors = np.tile([40, 170, 60, 255], (len(box.faces), 1))
+    content = box.export(file_type=suffix[1:])
+    text = {".stl": box.export(file_type="stl_ascii")}.get(suffix)
+    contents = (content, text) if text else (content,)
+    return [{f"mesh{suffix}": data if isinstance(data, bytes) else data.encode()} for data in contents]
+
+
+def objs() -> list[Files]:
+    """A box with two materials, one of them textured and cut out."""
+    corners = "".join(f"v {x} {y} {z}\n" for x in (0, 1) for y in (0, 1) for z in (0, 1)) + "vt 0 0\nvt 1 0\nvt 1 1\n"
+    faces = "mtllib a.mtl\nvn 0 0 1\nusemtl red\nf 1/1/1 2/2/1 4/3/1\nusemtl plain\nf -1 -2 -4 -3\nf 1 2 6 5 3\n"
+    library = (
+        b"newmtl red\nKd 1 1 1\nmap_Kd -s 1 1 1 -clamp on a.png\nmap_d b.png\nnewmtl plain\nKd 0.1 0.2 0.3\nTr 0.4\n"
+    )
+    companions = {"a.mtl": library, "a.png": png(TEXELS[..., :3]), "b.png": png(TEXELS)}
+    return [{"mesh.obj": (corners + faces).encode()} | companions, *tables(".obj")]
+
+
+def scene(material: dict, *images: tuple[str, bytes], suffix: str = ".gltf", **node) -> Files:
+    """A square of a material under a node, beside an opaque one; the images lie beside the file."""
+    builder = GltfBuilder()
+    for number, (name, _) in enumerate(images):
+        builder.texture(uri=name, wrapS=33071 if number else 10497)
+    for name, extension in ((".ktx2", "KHR_texture_basisu"), (".webp", "EXT_texture_webp")):
+        if images and images[0][0].endswith(name):
+            builder.document["textures"][0] = {"extensions": {extension: {"source": 0}}}
+    square = builder.primitive(material=builder.material(**material), TEXCOORD_0=UV)
+    rows, values = builder.view(np.uint16([0, 3]).tobytes()), builder.view(np.float32([[5, 6, 7]] * 2).tobytes())
+    sparse = {"count": 2, "indices": {"bufferView": rows, "componentType": 5123}, "values": {"bufferView": values}}
+    builder.document["accessors"][0]["sparse"] = sparse
+    child = builder.mesh(square, root=False, translation=[1, 0, 0])
+    builder.node(children=[child], rotation=[0, 0, 0, 1], scale=[1, 2, 1])
+    moves = {"TRANSLATION": builder.accessor(np.float32([[0, 0, 0], [5, 0, 0]]))}
+    builder.mesh(builder.primitive(), extensions={"EXT_mesh_gpu_instancing": {"attributes": moves}})
+    files = {"mesh.glb": builder.glb()} if suffix == ".glb" else builder.files("mesh.gltf")
+    return files | dict(images)
+
+
+def scenes() -> list[Files]:
+    """Masks, glass, normal maps with coordinates of their own, the older specular workflow, packed images, points."""
+    webp = io.BytesIO()
+    from PIL import Image
+
+    Image.fromarray(TEXELS.astype(np.uint8)).save(webp, "webp", lossless=True)
+    pictures = ("a.png", png(TEXELS)), ("b.png", png(TEXELS[..., :3]))
+    base = {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}, "baseColorFactor": [1, 1, 1, 0.9]}}
+    moved = {"KHR_texture_transform": {"scale": [2, 3], "offset": [0.1, 0], "rotation": 0.3, "texCoord": 0}}
+    bumpy = {"normalTexture": {"index": 1, "scale": 0.7, "extensions": moved}}
+    shiny = {"KHR_materials_pbrSpecularGlossiness": {"diffuseTexture": {"index": 0}, "glossinessFactor": 0.4}}
+    glass = {"KHR_materials_transmission": {"transmissionFactor": 0.5}}
+    return [
+        scene(base | {"alphaMode": "MASK", "alphaCutoff": 0.3} | bumpy, *pictures),
+        scene({"extensions": glass} | bumpy, *pictures),
+        scene({"extensions": shiny, "emissiveFactor": [0, 0.1, 0], "alphaMode": "BLEND"}, *pictures),
+        *(scene(base, ("a.ktx2", data)) for data in (UASTC, ETC1S_ALPHA)),
+        scene(base, ("a.webp", webp.getvalue())),
+        scene({}, suffix=".glb"),
+        *tables(".gltf", ".glb"),
+    ]
+
+
+def packed_scenes() -> list[Files]:
+    """Meshes that Draco and meshopt packed."""
+    import DracoPy
+
+    box, name = trimesh.creation.box(), "KHR_draco_mesh_compression"
+    data = DracoPy.encode(box.vertices.astype(np.float32), box.faces.astype(np.uint32))
+    ids = {"POSITION": DracoPy.decode(data).attributes[0]["unique_id"]}
+    draco, meshopt = GltfBuilder(extensionsRequired=[name]), GltfBuilder()
+    extension = {name: {"bufferView": draco.view(data), "attributes": ids}}
+    draco.document["accessors"] = [
+        {"count": len(box.vertices), "type": "VEC3", "componentType": 5126},
+        {"count": box.faces.size, "type": "SCALAR", "componentType": 5123},
+    ]
+    draco.mesh({"attributes": {"POSITION": 0}, "indices": 1, "extensions": extension})
+    views = meshopt.document["bufferViews"]
+    for case in (MESHOPT["two blocks of steps, format 1"], MESHOPT["a grid"]):
+        described = {key: case[key] for key in ("count", "byteStride", "mode", "filter")}
+        extension = {"EXT_meshopt_compression": views[meshopt.view(case["packed"])] | described}
+        views[-1] = {"buffer": 0, "byteLength": case["count"] * case["byteStride"], "extensions": extension}
+    views[0]["byteStride"] = 8
+    meshopt.document["accessors"] = [
+        {"bufferView": 0, "count": 300, "type": "VEC3", "componentType": 5123, "normalized": True},
+        {"bufferView": 1, "count": 120, "type": "SCALAR", "componentType": 5125},
+    ]
+    meshopt.mesh({"attributes": {"POSITION": 0}, "indices": 1})
+    return [draco.files("mesh.gltf"), meshopt.files("mesh.gltf")]
+
+
+def splats() -> list[Files]:
+    """Packed splats of both versions of .spz, and a compressed .ply."""
+    from spnr_jax.formats import gaussian_files
+
+    content = gzip.decompress(gaussian_files.spz_of(splat_balls.ball(12)))
+    spz = [{"cloud.spz": gzip.compress(content[:4] + bytes([version]) + content[5:])} for version in (2, 3)]
+    return [*spz, {"cloud.ply": packed_splats(WHOLE.positions / 8, 255)}]
+
+
+def run_files(name: str) -> list[Files]:
+    """A config of each preset, or rows of metrics."""
+    from spnr_jax import presets
+    from spnr_jax.methods import to_dict
+
+    if name == "metrics":
+        row = json.dumps({"step": 1, "loss": 0.5, "steps_per_second": 2.0}) + "\n"
+        return [{"metrics.jsonl": 5 * row.encode()}]
+    return [{"config.json": json.dumps(to_dict(make()), indent=2).encode()} for make in presets.PRESETS.values()]
+
+
+def datasets() -> list[Files]:
+    """A data set of one object, with each of its files as the one that is hit most."""
+    with tempfile.TemporaryDirectory() as folder:
+        place = tiny_dataset.write_dataset(Path(folder), {"train": ("a",), "val": (), "test": ()}, size=16)
+        paths = sorted(path for path in place.rglob("*") if path.is_file())
+        files = {path.relative_to(place).as_posix(): path.read_bytes() for path in paths}
+    return [{name: files[name]} | files for name in files if "00" not in name or "000" in name]
+
+
+def lists() -> list[Files]:
+    """Split files, a test list, and the tables of ABO."""
+    table = b"3dmodel_id,path,meshes\na,A/a.glb,1\nb,B/b.glb,2\n"
+    return [
+        {"splits.json": json.dumps({"train": ["a"], "test": ["b"]}).encode()},
+        {"splits.csv": b"id,split\na,train\nb,test\n"},
+        {"splits.csv": b"id,synsetId,subSynsetId,modelId,split\n1,1,1,a,train\n2,1,1,b,test\n"},
+        {"list.txt": b"a\nb\n"},
+        {"3dmodels.csv.gz": gzip.compress(table, mtime=0)},
+        {"3dmodels.csv": table},
+    ]
+
+
+def weights() -> list[Files]:
+    """A file of weights of a very small network."""
+    from spnr_jax import presets
+    from spnr_jax.config import SurfelConfig
+    from spnr_jax.methods import to_dict
+    from spnr_jax.training.weights import variable_shapes
+
+    config = dataclasses.replace(presets.surfels_tiny(), model=SurfelConfig(widths=(4, 6), top=4))
+    described = np.frombuffer(json.dumps(to_dict(config)).encode(), np.uint8)
+    halves = {name: np.zeros(x.shape, np.float16) for name, x in variable_shapes(config).items()}
+    stream = io.BytesIO()
+    np.savez_compressed(stream, allow_pickle=False, config=described, steps=np.int64(3), **halves)
+    return [{"weights.npz": stream.getvalue()}]
+
+
+def uploads() -> list[Files]:
+    """Files that a browser sends, with the name that it gives them."""
+    return [{"content": next(iter(files.values())), "name.txt": next(iter(files)).encode()} for files in tables(".ply")]
+
+
+Reader = tuple[Callable[[], list[Files]], Callable[[Path, str], None]]
+READERS: dict[str, Reader] = {
+    **{
+        suffix[1:]: (functools.partial(tables, suffix), read_cloud)
+        for suffix in (".ply", ".pcd", ".npz", ".npy", ".las")
+    },
+    "laz": (functools.partial(tables, ".laz"), read_cloud),
+    "text": (functools.partial(tables, ".xyz", ".csv", ".txt"), read_cloud),
+    "splats": (splats, read_cloud),
+    **{f"mesh-{suffix[1:]}": (functools.partial(plain_meshes, suffix), read_cloud) for suffix in (".ply", ".stl")},
+    "off": (lambda: [*plain_meshes(".off"), *tables(".off")], read_cloud),
+    "obj": (objs, read_mesh),
+    "gltf": (scenes, read_mesh),
+    "gltf-packed": (packed_scenes, read_mesh),
+    **{
+        name: (functools.partial(run_files, name), read)
+        for name, read in (("config", read_config), ("metrics", read_metrics))
+    },
+    "dataset": (datasets, read_dataset),
+    "lists": (lists, read_list),
+    "viewer-upload": (uploads, read_upload),
+    "weights": (weights, read_network),
 }

@@ -3,7 +3,7 @@
 import numpy as np
 
 from spnr_jax.formats.clouds import PlacedCloud
-from spnr_jax.formats.up_axis import ROTATIONS
+from spnr_jax.formats.orientation import ROTATIONS
 from spnr_jax.tools.fused_surface import Grid
 from support.surfel_clouds import cloud
 

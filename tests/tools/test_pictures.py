@@ -10,7 +10,7 @@ from PIL import Image
 from support import tiny_surfels, tiny_untrained
 from support.gltf_files import CORNERS, GltfBuilder
 
-from spnr_jax.formats.up_axis import ROTATIONS
+from spnr_jax.formats.orientation import ROTATIONS
 from spnr_jax.tools import depth_maps, pictures, splat_making
 from spnr_jax.tools.light_options import Lighting
 from spnr_jax.tools.render_command import Render

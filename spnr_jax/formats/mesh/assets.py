@@ -11,9 +11,10 @@ cannot disagree about a material.  What only a picture of points needs (cut-outs
 coordinates of their own) is read where transparent parts are allowed, and never reaches the renderer.
 """
 
+import importlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -35,6 +36,14 @@ class RejectedAsset(UserError):
 
 class MissingFile(RejectedAsset):
     """A file that a mesh file names is not there, or lies where it must not be looked for."""
+
+
+def extra(package: str) -> Any:
+    """A package of the extra `meshes`; RejectedAsset where it is not installed."""
+    try:
+        return importlib.import_module(package)
+    except ImportError:
+        raise RejectedAsset(f"needs the package {package} to be read: pip install 'spnr-jax[meshes]'") from None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,3 +103,15 @@ class Asset:
     ignored: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     source: dict = field(default_factory=dict)
+
+
+def principled(
+    base_color: Values | float | int = 0.5,
+    roughness: Values | float | int = 0.5,
+    metallic: Values | float | int = 0.0,
+    wrap: Wrap = "repeat",
+) -> Material:
+    """A material of float32 channels in [0, 1]; grey of roughness 0.5 where nothing is given."""
+    color, *values = (np.clip(np.asarray(x, np.float32), 0, 1) for x in (base_color, roughness, metallic))
+    color = np.full(3, color) if color.ndim == 0 else color
+    return Material(base_color=color, roughness=values[0], metallic=values[1], wrap=wrap)

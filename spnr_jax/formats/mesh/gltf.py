@@ -1,33 +1,28 @@
-"""glTF 2.0 scenes as raw assets: one part per primitive of a node, node transforms applied.
+"""glTF 2.0 scenes as raw assets: one part per primitive of a node, node transforms applied from the root.
 
-Normals go through the inverse transpose; a transform that mirrors flips the winding. The rest pose is read. What is
-not modelled is named in `ignored`; an extension that the file requires and that is not known here rejects the object.
+Normals go through the inverse transpose; a transform that mirrors flips the winding. The rest pose is read.
+EXT_mesh_gpu_instancing draws a node's mesh once for each row of its attributes. What is not modelled is named in
+`ignored`; an extension that the file requires and that is not known here rejects the object.
 """
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from trimesh.transformations import quaternion_matrix
 
 from spnr_jax.formats.mesh.assets import Asset, Part, RejectedAsset, TransparentParts
-from spnr_jax.formats.mesh.draco import DRACO, decode_mesh
 from spnr_jax.formats.mesh.file_colors import LINEAR, SRGB
-from spnr_jax.formats.mesh.gltf_container import MESHOPT, GltfFile, scaled
-from spnr_jax.formats.mesh.gltf_materials import GltfMaterial, read_material
-from spnr_jax.formats.mesh.gltf_nodes import INSTANCING, drawn_meshes
-from spnr_jax.formats.mesh.gltf_textures import BASIS, MOVED, WEBP
+from spnr_jax.formats.mesh.gltf_container import DRACO, MESHOPT, GltfFile, decode_mesh, scaled
+from spnr_jax.formats.mesh.gltf_materials import BASIS, MOVED, WEBP, GltfMaterial, read_material
 from spnr_jax.formats.mesh.tolerance import Tolerance
 from spnr_jax.gaussians.harmonics import C0
 
-MODES = {
-    0: "POINTS",
-    1: "LINES",
-    2: "LINE_LOOP",
-    3: "LINE_STRIP",
-    4: "TRIANGLES",
-    5: "TRIANGLE_STRIP",
-    6: "TRIANGLE_FAN",
-}
+INSTANCING = "EXT_mesh_gpu_instancing"
+PLACED = {"TRANSLATION": 3, "ROTATION": 4, "SCALE": 3}  # attributes of instances, and their widths
+MOST_INSTANCES = 2**17  # of a node
+MODES = dict(enumerate(("POINTS", "LINES", "LINE_LOOP", "LINE_STRIP", "TRIANGLES", "TRIANGLE_STRIP", "TRIANGLE_FAN")))
 READABLE = {MOVED, WEBP, BASIS, DRACO, *MESHOPT, INSTANCING, "KHR_mesh_quantization", "KHR_lights_punctual"}
 SPLATS = "KHR_gaussian_splatting"
 NO_COLORS = np.ones((1, 3))
@@ -35,6 +30,55 @@ OTHERS = ("POSITION", "NORMAL", "COLOR_0")  # columns, beside texture coordinate
 # Faces that are drawn again, beside each mesh's first: a small file could ask for any number.  To draw a mesh again
 # costs as much as PLACING faces.
 MOST_REPEATED, PLACING = 2**23, 64
+
+
+def drawn_meshes(file: GltfFile) -> Iterator[tuple[int, list[np.ndarray]]]:
+    """(mesh, matrices to world (4, 4)) of every node of the default scene that draws a mesh, depth first."""
+    document = file.document
+    nodes = document.get("nodes", [])
+    if scenes := document.get("scenes"):
+        roots = scenes[document.get("scene", 0)].get("nodes", [])
+    else:
+        roots = sorted(set(range(len(nodes))) - {child for node in nodes for child in node.get("children", [])})
+    seen = set()
+    stack = [(root, np.eye(4)) for root in reversed(roots)]
+    while stack:
+        index, parent = stack.pop()
+        if index in seen:
+            raise RejectedAsset(f"its node {index} is reached twice: the scene is not a tree")
+        seen.add(index)
+        node = nodes[index]
+        matrix = parent @ _node_matrix(node)
+        if "mesh" in node:
+            yield node["mesh"], _instances(file, node, matrix)
+        stack += [(child, matrix) for child in reversed(node.get("children", []))]
+
+
+def _instances(file: GltfFile, node: dict, matrix: np.ndarray) -> list[np.ndarray]:
+    """The matrices to world of a node's instances, of which most nodes have one."""
+    attributes = node.get("extensions", {}).get(INSTANCING, {}).get("attributes")
+    if not attributes:
+        return [matrix]
+    columns = {name: file.accessor(index) for name, index in attributes.items() if name in PLACED}
+    counts = {len(column) for column in columns.values()}
+    if len(counts) != 1 or any(column.shape[1] != PLACED[name] for name, column in columns.items()):
+        raise RejectedAsset(f"has instances ({INSTANCING}) whose attributes do not agree: broken file")
+    (count,) = counts
+    if count > MOST_INSTANCES:
+        raise RejectedAsset(f"has {count} instances of a mesh; at most {MOST_INSTANCES} can be read")
+    each = [{name.lower(): columns[name][i] for name in columns} for i in range(count)]
+    return [matrix @ _node_matrix(values) for values in each]
+
+
+def _node_matrix(node: dict) -> np.ndarray:
+    """Matrix (4, 4) from the node's frame to its parent's."""
+    if "matrix" in node:
+        return np.array(node["matrix"], np.float64).reshape(4, 4).T
+    x, y, z, w = node.get("rotation", (0, 0, 0, 1))
+    matrix = quaternion_matrix([w, x, y, z])
+    matrix[:3, :3] *= node.get("scale", (1, 1, 1))
+    matrix[:3, 3] = node.get("translation", (0, 0, 0))
+    return matrix
 
 
 class Shape(NamedTuple):
@@ -67,7 +111,9 @@ def load_gltf(path: Path, transparent_parts: TransparentParts = "refuse") -> Ass
             if index not in materials:
                 materials[index] = read_material(file, index, tolerance)
             look = materials[index]
-            ignored |= _left_out(primitive) | look.ignored
+            ignored |= look.ignored | {"KHR_materials_variants"}.intersection(primitive.get("extensions", {}))
+            if primitive.get("targets"):
+                ignored.add("morph targets")
             if look.nowhere:
                 continue
             again = (mesh, number) in shapes
@@ -127,12 +173,6 @@ def _point_columns(file: GltfFile, primitive: dict) -> dict[str, np.ndarray]:
     return columns
 
 
-def _left_out(primitive: dict) -> set[str]:
-    """What of a primitive is not modelled."""
-    found = {name for name in primitive.get("extensions", {}) if name == "KHR_materials_variants"}
-    return found | {"morph targets"} if primitive.get("targets") else found
-
-
 def _shape(file: GltfFile, primitive: dict, mode: str, look: GltfMaterial) -> Shape:
     """The columns that a material needs, and the faces, of a primitive."""
     sets = [f"TEXCOORD_{place.texcoord_set}" for place in look.placements]
@@ -146,7 +186,7 @@ def _shape(file: GltfFile, primitive: dict, mode: str, look: GltfMaterial) -> Sh
     ids = {name: number for name, number in packed["attributes"].items() if name in wanted}
     if "POSITION" not in ids:
         raise RejectedAsset("has no POSITION in its Draco mesh: broken file")
-    unpacked, order = decode_mesh(file.view_bytes(packed["bufferView"]), ids)
+    unpacked, order = decode_mesh(file.view(packed["bufferView"]), ids)
     accessors = file.document["accessors"]
     columns = {name: scaled(values, accessors[wanted[name]]) for name, values in unpacked.items()}
     columns |= {name: file.accessor(wanted[name]) for name in wanted if name not in ids}

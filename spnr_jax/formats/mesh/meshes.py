@@ -1,33 +1,56 @@
-"""Mesh files as assets: which files a folder holds, and one of them read.
+"""Mesh files as assets: which files a folder holds, and one of them read, checked, cleaned and merged by material.
 
-glTF and GLB carry principled materials (gltf.py), OBJ gets them from its MTL (obj.py); PLY, STL and
-OFF (plain.py) have vertex or face colours at most, read as those of points are (file_colors.py), grey 0.5 otherwise.
+glTF and GLB carry principled materials (gltf.py), OBJ gets them from its MTL (obj.py); PLY, STL and OFF (plain.py) have
+vertex or face colours at most, read as those of points are (file_colors.py), grey 0.5 otherwise.
+
+checked   indices inside, coordinates finite, an extent above zero
+cleaned   faces without area and vertices without faces removed; normals unit; colours in [0, 1]; unused columns gone
+merged    parts with equal materials (by value) are one part: a renderer compiles per part. Smooth and flat parts stay
+          apart, so that neither takes on the other's normals.
+tinted    a renderer takes either a texture or colours at vertices: a textured part with vertex colours becomes one part
+          per tint, exact for faces of one colour (an exporter's constant, say); others take the mean of their corners,
+          and more than MAX_TINTS colours are gathered into fewer
 Every reason not to use a file is a RejectedAsset with one line.
 """
 
+import contextlib
 import hashlib
 import logging
 import re
 import struct
 import warnings
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import TypeVar
+from typing import Any
 
 import numpy as np
 
 from spnr_jax.errors import UserError, is_bug
-from spnr_jax.formats.mesh.assemble import assemble
-from spnr_jax.formats.mesh.assets import Asset, RejectedAsset, TransparentParts
+from spnr_jax.formats.mesh.assets import (
+    CHANNELS,
+    TEXTURES,
+    Asset,
+    Material,
+    Part,
+    RejectedAsset,
+    TransparentParts,
+    principled,
+)
 from spnr_jax.formats.mesh.gltf import gltf_points, load_gltf
 from spnr_jax.formats.mesh.obj import load_obj, obj_points
 from spnr_jax.formats.mesh.plain import PLAIN, off_points
+from spnr_jax.formats.mesh.surface_points import bounding_box, face_areas, unit, vertex_normals
 
+MAX_TINTS = 16  # tinted copies of a texture
+LEVELS = (255, 31, 15, 7, 3, 1)  # steps per channel that tell tints apart; the first that needs few enough copies
+# Faces below this share of the squared box diagonal are float32 rounding, not surface.
+DEGENERATE_AREA = 1e-14
+MAX_TEXCOORD = 1e6  # beyond it float32, in which the renderer computes, cannot tell neighbouring texels apart
+WIDTHS = {"positions": 3, "normals": 3, "texcoords": 2, "colors": 3}  # columns of a part, one row per vertex
 SUFFIXES = (".glb", ".gltf", ".obj", *PLAIN)
 NAMED_BY_FOLDER = (".gltf", ".obj")  # files that come with companions, so that the folder is the object
-Result = TypeVar("Result")
 # What readers raise on files that break their rules; not MemoryError and not an interrupt.
 UNREADABLE: tuple[type[Exception], ...]
 UNREADABLE = (ValueError, LookupError, TypeError, AttributeError, NameError, ArithmeticError, OSError, RuntimeError)
@@ -35,6 +58,145 @@ UNREADABLE += (AssertionError, struct.error, DeprecationWarning)
 UNREADABLE += (ImportError,)  # trimesh looks for a package that guesses the encoding of text that is not UTF-8
 # it shows the call stacks of errors that it gets over, unless somebody takes care of them
 logging.getLogger("trimesh").addHandler(logging.NullHandler())
+
+
+def assemble(asset: Asset) -> Asset:
+    """The asset with its parts checked, cleaned and merged; what was changed is added to `ignored`."""
+    for part in asset.parts:
+        _check_columns(part)
+        _check_material(part.material)
+    low, high = bounding_box(asset)
+    smallest = DEGENERATE_AREA * np.sum((high - low) ** 2)
+    notes: set[str] = set(asset.ignored)
+    degenerate = 0
+    groups: dict[tuple, list[Part]] = {}
+    identities: dict[int, str] = {}  # by id: `groups` and `asset` keep every material alive
+    for whole in asset.parts:
+        solid = face_areas(whole) > smallest
+        degenerate += int((~solid).sum())
+        for part in _cleaned(replace(whole, faces=whole.faces[solid]), notes) if solid.any() else ():
+            key = identities.setdefault(id(part.material), _identity(part.material)), part.normals is None
+            groups.setdefault(key, []).append(part)
+    if not groups:
+        raise RejectedAsset("has no face with an area")
+    if degenerate:
+        notes.add(f"{degenerate} degenerate faces")
+    return replace(asset, parts=tuple(map(_merge, groups.values())), ignored=tuple(sorted(notes)))
+
+
+def _check_columns(part: Part) -> None:
+    """Refuse a part whose columns do not have one row per vertex, or whose faces name vertices that are not there."""
+    count = len(part.positions)
+    for name, width in WIDTHS.items():
+        values = getattr(part, name)
+        if name == "texcoords" and values is not None and values.ndim == 2 and values.shape[1] > 0:
+            width = 2 * -(-values.shape[1] // 2)  # pairs, one or several
+        if values is not None and values.shape != (count, width):
+            raise RejectedAsset(f"has {name} of shape {values.shape} where ({count}, {width}) is needed: broken file")
+    if part.faces.size and not 0 <= part.faces.min() <= part.faces.max() < count:
+        raise RejectedAsset(
+            f"has faces that name vertices {part.faces.min()} to {part.faces.max()} of {count}: broken file"
+        )
+
+
+def _check_material(material: Material) -> None:
+    """Refuse a material whose channels are not finite values, one or a texture of them."""
+    present = [name for name in TEXTURES if getattr(material, name) is not None]
+    for name in (*CHANNELS, *present):
+        values, inner = getattr(material, name), (3,) * (CHANNELS | TEXTURES)[name]
+        rows = values.shape[: values.ndim - len(inner)]
+        if values.shape[len(rows) :] != inner or len(rows) not in (0, 2) or not values.size:
+            raise RejectedAsset(f"has a material with {name} of shape {values.shape}: broken file")
+        if not np.isfinite(values).all():
+            raise RejectedAsset(f"has a material whose {name} is not finite (NaN or infinity)")
+
+
+def _cleaned(part: Part, notes: set[str]) -> list[Part]:
+    """The part with just the columns that its material needs; several parts where vertex colours tint a texture."""
+    part = _settle_texture(_used_vertices(part), notes)
+    part = replace(part, normals=_unit_normals(part, notes), colors=_checked_colors(part, notes))
+    if part.colors is None or part.material.base_color.ndim == 1:
+        return [part]
+    parts, error = split_by_tint(part)
+    if error > 1 / 255:
+        notes.add("vertex colours that vary within textured faces (one tint per face is used)")
+    return [_used_vertices(piece) for piece in parts]
+
+
+def _used_vertices(part: Part) -> Part:
+    """The part with only the vertices that its faces use, in their old order."""
+    used, faces = np.unique(part.faces, return_inverse=True)
+    kept: dict[str, Any] = {name: getattr(part, name) for name in WIDTHS}
+    kept = {name: None if values is None else values[used] for name, values in kept.items()}
+    return replace(part, **kept, faces=faces.reshape(-1, 3).astype(np.int64))
+
+
+def _settle_texture(part: Part, notes: set[str]) -> Part:
+    """The part with texture coordinates exactly where its material needs them; a texture without any: its mean."""
+    if not part.material.textured:
+        return replace(part, texcoords=None)
+    if part.texcoords is None:
+        notes.add("texture on faces without texture coordinates (its mean is used)")
+        look = part.material
+        color = look.base_color.reshape(-1, 3).mean(axis=0)
+        return replace(part, material=principled(color, look.roughness.mean(), look.metallic.mean(), look.wrap))
+    if not (np.abs(part.texcoords) < MAX_TEXCOORD).all():
+        raise RejectedAsset(f"has texture coordinates that are not finite, or beyond {MAX_TEXCOORD:g}: broken file")
+    return part
+
+
+def _unit_normals(part: Part, notes: set[str]) -> np.ndarray | None:
+    """The part's normals (v, 3) at length 1; one that is zero or not finite becomes the mean of its faces' normals."""
+    if part.normals is None:
+        return None
+    length = np.linalg.norm(part.normals, axis=-1)
+    good = np.isfinite(length) & (length > 0)
+    if not good.any():
+        notes.add("normals without a direction (flat shading is used)")
+        return None
+    if good.all():
+        return part.normals / length[:, None]
+    notes.add("some normals without a direction (the faces' are used)")
+    own = unit(np.where(good[:, None], part.normals, 0))
+    return np.where(good[:, None], own, vertex_normals(part.positions, part.faces))
+
+
+def _checked_colors(part: Part, notes: set[str]) -> np.ndarray | None:
+    """The part's vertex colours in [0, 1]; None where they are all white."""
+    if part.colors is None or (part.colors == 1).all():
+        return None
+    if not np.isfinite(part.colors).all():
+        raise RejectedAsset("has vertex colours that are not finite (NaN or infinity)")
+    if part.colors.min() < 0 or part.colors.max() > 1:
+        notes.add("vertex colours outside [0, 1] (clipped)")
+    return np.clip(part.colors, 0, 1)
+
+
+def _identity(material: Material) -> str:
+    """A digest of everything that a material says."""
+    present = [name for name in (*CHANNELS, *TEXTURES) if getattr(material, name) is not None]
+    arrays = [np.asarray(getattr(material, name)) for name in present]
+    cutoff = material.cutoff if "opacity" in present or "normal_map" in present else None
+    forms = [(array.shape, array.dtype.str) for array in arrays]
+    described = repr((material.wrap, cutoff, sorted(material.coordinates.items()), present, forms))
+    return hashlib.sha256(described.encode() + b"".join(array.tobytes() for array in arrays)).hexdigest()
+
+
+def _merge(parts: list[Part]) -> Part:
+    """One part of several that agree in material and in having normals; missing colours are white."""
+    first = np.cumsum([0, *(len(part.positions) for part in parts)])
+    faces = [part.faces + start for part, start in zip(parts, first, strict=False)]
+    colors = None
+    if any(part.colors is not None for part in parts):
+        colors = np.concatenate([np.ones_like(p.positions) if p.colors is None else p.colors for p in parts])
+    return Part(
+        positions=np.concatenate([part.positions for part in parts]),
+        faces=np.concatenate(faces),
+        material=parts[0].material,
+        normals=None if parts[0].normals is None else np.concatenate([part.normals for part in parts]),
+        texcoords=None if parts[0].texcoords is None else np.concatenate([part.texcoords for part in parts]),
+        colors=colors,
+    )
 
 
 def find_meshes(folder: Path) -> list[tuple[str, Path]]:
@@ -51,7 +213,10 @@ def find_meshes(folder: Path) -> list[tuple[str, Path]]:
     if not visible:
         raise UserError(f"{folder} holds no mesh file: expected {' '.join(SUFFIXES)}, in it or in its subfolders")
     siblings = Counter(path.parent for path in visible)
-    names = [_short_name(path, alone=siblings[path.parent] == 1) for path in visible]
+    names = []
+    for path in visible:
+        alone = siblings[path.parent] == 1 and path.suffix.lower() in NAMED_BY_FOLDER and path.parent.name
+        names.append(_safe(path.parent.name if alone else path.stem))
     shared = Counter(name.casefold() for name in names)
     ids: dict[str, Path] = {}
     taken: set[str] = set()
@@ -79,28 +244,34 @@ def load_mesh(
     """
     path = Path(path)
     kind = kind or path.suffix.lower()
-
-    def read() -> Asset:
-        asset = _load(path, kind, root, transparent_parts)
-        return assemble(asset if transparent_parts == "refuse" else _finite(asset))
-
-    asset = _guarded(read)
+    with _refusing():
+        if kind in (".glb", ".gltf"):
+            asset = load_gltf(path, transparent_parts)
+        elif kind == ".obj":
+            asset = load_obj(path, root, transparent_parts)
+        elif kind in PLAIN:
+            asset = PLAIN[kind](path.read_bytes())
+        else:
+            raise RejectedAsset(f"has suffix {kind!r}; expected one of {' '.join(SUFFIXES)}")
+        asset = assemble(asset if transparent_parts == "refuse" else _finite(asset))
     return replace(asset, source={"file": path.name, "sha256": hashlib.sha256(path.read_bytes()).hexdigest()})
 
 
 def points_of(path: Path, kind: str) -> dict[str, np.ndarray] | None:
     """The columns of the points of a mesh file that has no faces, for pictures; None where it has some."""
     readers = {".obj": obj_points, ".off": off_points, ".glb": gltf_points, ".gltf": gltf_points}
-    return _guarded(lambda: readers[kind](path)) if kind in readers else None
+    with _refusing():
+        return readers[kind](path) if kind in readers else None
 
 
-def _guarded(read: Callable[[], Result]) -> Result:
-    """What `read` makes of a file; RejectedAsset where its libraries stumble over it."""
+@contextlib.contextmanager
+def _refusing() -> Iterator[None]:
+    """RejectedAsset, meanwhile, where libraries stumble over a file."""
     try:
         with warnings.catch_warnings(), np.errstate(all="ignore"):  # assemble looks for what is not finite
             # numpy only warns where the text of a file stops being numbers
             warnings.filterwarnings("error", "string or file could not be read", DeprecationWarning)
-            return read()
+            yield
     except RejectedAsset:
         raise
     except UserError as error:  # colours that are none, say
@@ -108,10 +279,8 @@ def _guarded(read: Callable[[], Result]) -> Result:
     except UNREADABLE as error:
         if is_bug(error):
             raise
-        text = str(error).strip().split("\n")[0]
-        raise RejectedAsset(
-            f"cannot be read, the file is broken or truncated ({type(error).__name__}: {text})"
-        ) from error
+        text = f"{type(error).__name__}: {str(error).strip().partition(chr(10))[0]}"
+        raise RejectedAsset(f"cannot be read, the file is broken or truncated ({text})") from error
 
 
 def _finite(asset: Asset) -> Asset:
@@ -119,13 +288,8 @@ def _finite(asset: Asset) -> Asset:
     parts, lost = [], 0
     for part in asset.parts:
         sound = np.isfinite(part.positions).all(axis=-1)
-        if (
-            part.faces.ndim == 2
-            and part.faces.size
-            and not sound.all()
-            and part.faces.min() >= 0
-            and (part.faces.max() < len(sound))
-        ):
+        whole = part.faces.ndim == 2 and part.faces.size and 0 <= part.faces.min() <= part.faces.max() < len(sound)
+        if whole and not sound.all():
             whole = sound[part.faces].all(axis=1)
             lost += int((~whole).sum())
             part = replace(part, faces=part.faces[whole], positions=np.where(sound[:, None], part.positions, 0))
@@ -136,23 +300,25 @@ def _finite(asset: Asset) -> Asset:
     return replace(asset, parts=tuple(parts), notes=(*asset.notes, note))
 
 
-def _load(path: Path, kind: str, root: Path | None, transparent_parts: TransparentParts) -> Asset:
-    """The raw asset of a file of a kind."""
-    if kind in (".glb", ".gltf"):
-        return load_gltf(path, transparent_parts)
-    if kind == ".obj":
-        return load_obj(path, root, transparent_parts)
-    if kind not in PLAIN:
-        raise RejectedAsset(f"has suffix {kind!r}; expected one of {' '.join(SUFFIXES)}")
-    return PLAIN[kind](path.read_bytes())
-
-
-def _short_name(path: Path, alone: bool) -> str:
-    """The id that a file gets if no other wants it."""
-    folder_names_it = alone and path.suffix.lower() in NAMED_BY_FOLDER and path.parent.name
-    return _safe(path.parent.name if folder_names_it else path.stem)
-
-
 def _safe(name: str) -> str:
     """A name of letters, digits, dot, dash and underscore that is no hidden folder."""
     return re.sub(r"[^A-Za-z0-9._-]+", "_", name).strip("._-") or "object"
+
+
+def split_by_tint(part: Part) -> tuple[list[Part], float]:
+    """Parts without vertex colours that look like this one, and the largest error of a colour at a face's corner."""
+    assert part.colors is not None, "only parts with vertex colours are split"
+    corners = part.colors[part.faces]
+    face_colors = corners.mean(axis=1)
+    for levels in LEVELS:
+        steps, group = np.unique(np.round(face_colors * levels), axis=0, return_inverse=True)
+        if len(steps) <= MAX_TINTS:
+            break
+    parts, error = [], 0.0
+    for number in range(len(steps)):
+        here = group.ravel() == number
+        tint = face_colors[here].mean(axis=0)
+        error = max(error, float(np.abs(corners[here] - tint).max()))
+        look = replace(part.material, base_color=part.material.base_color * tint.astype(np.float32))
+        parts.append(replace(part, faces=part.faces[here], material=look, colors=None))
+    return parts, error

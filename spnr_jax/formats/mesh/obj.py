@@ -20,18 +20,27 @@ import numpy as np
 from trimesh.exchange.obj import load_obj as read_obj_text
 from trimesh.geometry import triangulate_quads
 
-from spnr_jax.formats.mesh.assets import Asset, Material, MissingFile, Part, RejectedAsset, TransparentParts, Wrap
-from spnr_jax.formats.mesh.companions import read_companion
+from spnr_jax.formats.mesh.assets import (
+    Asset,
+    Material,
+    MissingFile,
+    Part,
+    RejectedAsset,
+    TransparentParts,
+    Wrap,
+    principled,
+)
 from spnr_jax.formats.mesh.file_colors import linear_colors
 from spnr_jax.formats.mesh.polygons import MOST_CORNERS, ears, is_concave
 from spnr_jax.formats.mesh.texels import color_texels, read_image, value_texels
-from spnr_jax.formats.mesh.tolerance import MOSTLY_OPAQUE, Alpha, Opacity, Tolerance
+from spnr_jax.formats.mesh.tolerance import MOSTLY_OPAQUE, Alpha, Opacity, Tolerance, read_companion
 
 PLACE = "material-{}"  # name that trimesh sees for the n-th material, so that any name in the file is safe
 READ = {"newmtl", "kd", "map_kd", "pr", "map_pr", "pm", "map_pm", "ns", "d", "tr", "map_d"}
 SILENT = {"ka", "ks", "ni", "illum", "tf", "sharpness"}  # the older lighting model: has no principled counterpart
 Read = Callable[[str], bytes]  # the bytes of a companion file, by its name in the text
 MAPS = ("map_kd", "map_pr", "map_pm", "map_d")
+DEFAULTS = ("s", (1.0, 1.0)), ("o", (0.0, 0.0))  # of options of maps: scale and offset of u and v
 OPTION = re.compile(r"-(\w+)((?:\s+(?:on|off|[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)(?=\s))*)\s+")
 
 
@@ -68,9 +77,10 @@ def load_obj(path: Path, root: Path | None = None, transparent_parts: Transparen
     ignored: set[str] = set()
     looks = {PLACE.format(i): _look(read, name, library, ignored, tolerance) for i, name in enumerate(names)}
     # an MTL text of names only makes trimesh keep the material of each face
-    loaded = read_obj_text(
-        io.StringIO(_renamed(text, names)), resolver={"names": "\n".join(f"newmtl {name}" for name in looks)}
-    )
+    numbers = dict(zip(names, looks, strict=True))
+    text = "mtllib names\n" + re.sub(r"(?m)^mtllib.*$", "", text)
+    text = re.sub(r"(?m)^usemtl +(.+?) *$", lambda match: f"usemtl {numbers[match[1]]}", text)
+    loaded = read_obj_text(io.StringIO(text), resolver={"names": "\n".join(f"newmtl {name}" for name in looks)})
     order = {name: number for number, name in enumerate(looks)}
     meshes = sorted(loaded["geometry"].values(), key=lambda mesh: order.get(_material_name(mesh), -1))
     notes = _color(meshes)
@@ -172,22 +182,6 @@ def _without_doubles(parts: list[Part], ignored: set[str]) -> list[Part]:
     return [replace(part, faces=part.faces[here]) for part, here in zip(parts, np.split(kept, ends), strict=True)]
 
 
-def principled(
-    base_color: float | np.ndarray = 0.5,
-    roughness: float | np.ndarray = 0.5,
-    metallic: float | np.ndarray = 0.0,
-    wrap: Wrap = "repeat",
-) -> Material:
-    """A material of float32 channels; grey of roughness 0.5 where nothing is given."""
-    color = np.asarray(base_color, np.float32)
-    return Material(
-        base_color=np.clip(np.full(3, color, np.float32) if color.ndim == 0 else color, 0, 1),
-        roughness=np.clip(np.asarray(roughness, np.float32), 0, 1),
-        metallic=np.clip(np.asarray(metallic, np.float32), 0, 1),
-        wrap=wrap,
-    )
-
-
 def parse_mtl(text: str) -> dict[str, dict[str, str]]:
     """Statements of an MTL file: {material name: {keyword in lower case: rest of the line}}."""
     library: dict[str, dict[str, str]] = {}
@@ -246,7 +240,8 @@ def _read_maps(read: Read, entry: dict[str, str], name: str, tolerance: Toleranc
     for key in MAPS:
         if key in entry:
             try:
-                maps[key] = _image(read, entry[key])
+                _, file = _options(entry[key])
+                maps[key] = read_image(read(file), file)
             except MissingFile as missing:
                 tolerance.goes_on_without(missing)
     return maps
@@ -258,8 +253,8 @@ def _placement(statements: list[str], ignored: set[str]) -> Placement:
     for options, _ in map(_options, statements):
         ignored |= {f"MTL map option -{name}" for name in options if name not in ("clamp", "s", "o")}
         wrap: Wrap = "clamp" if options.get("clamp") == ["on"] else "repeat"
-        scale, offset = (_pair(options.get(name, []), missing) for name, missing in (("s", 1.0), ("o", 0.0)))
-        places.append(Placement(wrap, scale, offset))
+        (u, v, *_), (x, y, *_) = ([*map(float, options.get(name, [])), *default] for name, default in DEFAULTS)
+        places.append(Placement(wrap, (u, v), (x, y)))
     if len(set(places)) > 1:
         ignored.add("MTL maps of one material that lie differently (the first one's options are used)")
     return places[0] if places else Placement()
@@ -274,18 +269,6 @@ def _options(statement: str) -> tuple[dict[str, list[str]], str]:
     return options, statement.strip().replace("\\", "/")
 
 
-def _pair(arguments: list[str], missing: float) -> tuple[float, float]:
-    """The numbers for u and v, of up to three arguments."""
-    u, v, *_ = [*map(float, arguments), missing, missing]
-    return u, v
-
-
-def _image(read: Read, statement: str) -> np.ndarray:
-    """Texels of the image that a map statement names."""
-    _, name = _options(statement)
-    return read_image(read(name), name)
-
-
 def _opacity(entry: dict[str, str], map_d: np.ndarray | None, name: str, tolerance: Tolerance) -> Opacity:
     """Where a material has surface."""
     if "map_d" in entry:
@@ -298,13 +281,6 @@ def _opacity(entry: dict[str, str], map_d: np.ndarray | None, name: str, toleran
     if "tr" in entry and 0 < (share := float(entry["tr"].split()[-1])) < 1:
         return tolerance.opacity(name, Alpha(f"Tr {share:g}", 1 - share))
     return Opacity()
-
-
-def _renamed(text: str, names: list[str]) -> str:
-    """The OBJ text with numbered material names, its library replaced by ours."""
-    numbers = {name: PLACE.format(number) for number, name in enumerate(names)}
-    text = re.sub(r"(?m)^mtllib.*$", "", text)
-    return "mtllib names\n" + re.sub(r"(?m)^usemtl +(.+?) *$", lambda match: f"usemtl {numbers[match[1]]}", text)
 
 
 def _absolute(text: str) -> str:

@@ -15,9 +15,8 @@ from trimesh.exchange.ply import load_ply
 from trimesh.exchange.stl import load_stl_ascii
 from trimesh.geometry import triangulate_quads
 
-from spnr_jax.formats.mesh.assets import Asset, Part, RejectedAsset
+from spnr_jax.formats.mesh.assets import Asset, Part, RejectedAsset, principled
 from spnr_jax.formats.mesh.file_colors import PACKED, SRGB, colors_of
-from spnr_jax.formats.mesh.obj import principled
 from spnr_jax.formats.mesh.polygons import triangulate
 
 STL_HEAD, STL_TRIANGLE = 84, np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])

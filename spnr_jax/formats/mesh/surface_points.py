@@ -4,6 +4,11 @@ Points are drawn uniformly by area over all parts, or spread evenly: each the fa
 those before.  The material of each is looked up with the interpolation of the renderer (texels.py) and multiplied by
 the interpolated vertex colour; those that it cuts out are replaced.  `face` counts through all parts, as the renderer
 reports its hits.
+
+A texel of a normal map says where the normal points along the directions in which u grows, in which v falls (v runs
+down the rows, and the map's green is up), and outwards.  On a triangle the position is linear in the texture
+coordinates, so that two of its edges give both directions; they are made perpendicular to the interpolated normal.
+Where the coordinates have no area the normal stays.
 """
 
 from dataclasses import dataclass, fields, replace
@@ -13,7 +18,6 @@ import numpy as np
 
 from spnr_jax.errors import UserError
 from spnr_jax.formats.mesh.assets import CHANNELS, TEXTURES, Asset, Material, Part, RejectedAsset
-from spnr_jax.formats.mesh.tangents import tilted
 from spnr_jax.formats.mesh.texels import lookup
 from spnr_jax.kernels.thinning import farthest_points
 
@@ -181,3 +185,18 @@ def unit(vectors: np.ndarray, fallback: np.ndarray | None = None) -> np.ndarray:
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     directed = vectors / np.where(length > 0, length, 1)
     return directed if fallback is None else np.where(length > 0, directed, fallback)
+
+
+def tilted(normals: np.ndarray, texels: np.ndarray, corners: np.ndarray, texcoords: np.ndarray) -> np.ndarray:
+    """Unit normals (n, 3) tilted by texels (n, 3), on triangles with corners (n, 3, 3) and texcoords (n, 3, 2)."""
+    edges, steps = corners[:, 1:] - corners[:, :1], texcoords[:, 1:] - texcoords[:, :1]
+    area = steps[:, 0, 0] * steps[:, 1, 1] - steps[:, 0, 1] * steps[:, 1, 0]
+    side = np.where(area < 0, -1.0, 1.0)[:, None]  # the length does not matter, so that nothing is divided by the area
+    along_u = side * (edges[:, 0] * steps[:, 1, 1, None] - edges[:, 1] * steps[:, 0, 1, None])
+    against_v = side * (edges[:, 0] * steps[:, 1, 0, None] - edges[:, 1] * steps[:, 0, 0, None])
+    tangent = unit(along_u - normals * np.sum(along_u * normals, axis=-1, keepdims=True))
+    across = np.cross(normals, tangent)
+    across *= np.where(np.sum(across * against_v, axis=-1, keepdims=True) < 0, -1, 1)
+    found = unit(texels[:, :1] * tangent + texels[:, 1:2] * across + texels[:, 2:] * normals)
+    sound = (area != 0) & np.isfinite(found).all(axis=-1) & tangent.any(axis=-1) & found.any(axis=-1)
+    return np.where(sound[:, None], found, normals)

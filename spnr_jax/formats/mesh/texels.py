@@ -3,17 +3,20 @@
 Conventions (assets.py): row 0 is v = 0, v runs down the rows, texel centres lie at half-integers / size.
 The lookup is mitsuba's `bitmap` with `filter_type: bilinear` and the same `wrap_mode`; a test compares the two.
 Images larger than MAX_SIZE texels in width or height are box-filtered (in linear values) to at most MAX_SIZE.
+KTX2 images with a Basis Universal payload are read by opengl_basisu, an extra.
 """
 
 import io
 
 import numpy as np
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
 from spnr_jax.errors import UserError
-from spnr_jax.formats.mesh import ktx2
-from spnr_jax.formats.mesh.assets import RejectedAsset, Wrap
+from spnr_jax.formats.mesh.assets import RejectedAsset, Wrap, extra
 
+KTX2, KTX2_PACKAGE = b"\xabKTX 20\xbb\r\n\x1a\n", "opengl_basisu"
+# what readers of images raise on those that break their rules
+UNREADABLE = (OSError, SyntaxError, ValueError, LookupError, RuntimeError, Image.DecompressionBombError)
 MAX_SIZE = 1024
 MOST_PIXELS = 2**26  # of an image file: 8192 x 8192
 STRIP = 512  # rows that are converted at a time
@@ -29,17 +32,24 @@ SRGB_TABLE = srgb_to_linear(np.arange(256) / 255).astype(np.float32)
 
 def read_image(data: bytes, name: str) -> np.ndarray:
     """Texels (height, width, 4) uint8 of an image file as they are encoded; alpha is 255 where it has none."""
-    if data.startswith(ktx2.IDENTIFIER):
-        return ktx2.decode(data, name, MOST_PIXELS)
     try:
+        if data.startswith(KTX2):
+            texture = extra(KTX2_PACKAGE).open(data)
+            _check_size(texture.width, texture.height)
+            return np.asarray(texture.transcode("rgba8").data, np.uint8)
         with Image.open(io.BytesIO(data)) as image:
-            if image.width * image.height > MOST_PIXELS:  # before memory is taken for them
-                raise UserError(f"{image.width} x {image.height} pixels, more than {MOST_PIXELS}")
+            _check_size(image.width, image.height)
             if image.mode.startswith("I"):  # PIL would clip 16-bit grey to 255 instead of scaling it
                 return _rgba(Image.fromarray((np.asarray(image) // 257).astype(np.uint8)))
             return _rgba(image)
-    except (UnidentifiedImageError, OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+    except UNREADABLE as error:
         raise RejectedAsset(f"names an image that cannot be read: {name} ({error})") from None
+
+
+def _check_size(width: int, height: int) -> None:
+    """ValueError for more pixels than memory is taken for."""
+    if width * height > MOST_PIXELS:
+        raise UserError(f"{width} x {height} pixels, more than {MOST_PIXELS}")
 
 
 def _rgba(image: Image.Image) -> np.ndarray:
@@ -53,7 +63,7 @@ def _rgba(image: Image.Image) -> np.ndarray:
 
 def color_texels(encoded: np.ndarray) -> np.ndarray:
     """Linear colours (h, w, 3) float32 of sRGB-encoded texels (h, w, 4) uint8, at most MAX_SIZE a side."""
-    return _shrunk_channels(SRGB_TABLE, encoded)
+    return np.stack([shrink(SRGB_TABLE[encoded[..., channel]]) for channel in range(3)], axis=-1)  # one by one: memory
 
 
 def value_texels(encoded: np.ndarray) -> np.ndarray:
@@ -63,11 +73,7 @@ def value_texels(encoded: np.ndarray) -> np.ndarray:
 
 def direction_texels(encoded: np.ndarray) -> np.ndarray:
     """Values (h, w, 3) float32 in [-1, 1] of encoded directions (h, w, 4) uint8, at most MAX_SIZE a side."""
-    return _shrunk_channels((np.arange(256) / 255 * 2 - 1).astype(np.float32), encoded)
-
-
-def _shrunk_channels(table: np.ndarray, encoded: np.ndarray) -> np.ndarray:
-    """Values (h, w, 3) by a table of encoded ones; channel by channel, for floats take four times the room."""
+    table = (np.arange(256) / 255 * 2 - 1).astype(np.float32)
     return np.stack([shrink(table[encoded[..., channel]]) for channel in range(3)], axis=-1)
 
 

@@ -1,16 +1,26 @@
-"""What a reader makes of transparent parts and of images that are missing, and the sentences about it.
+"""What a mesh file may leave open: parts that light passes through, and files that it names and that are missing.
 
-Where references are made (`refuse`) both are reasons to reject an object.  Where a picture is wanted:
+Where references are made (`refuse`) transparency and a missing file are reasons to reject an object.  For a picture:
   MASK            there is surface where alpha reaches the cut-off of the file, and none elsewhere
   BLEND and the like, transmission
       opaque      drawn in their colour; texels that are all but invisible beside the most visible one are no surface
       skip        there is surface where alpha is at least a half; a part that transmits light is left out
   missing images  plain values of a stand-in
 A part whose alpha is 1 everywhere is opaque, whatever its file calls it.
+
+A name in a mesh file is somebody else's text: data URIs are decoded, and a name that leaves the object's folder or
+points to the network is refused.  A path of another machine, or a name in other capitals, means the file of that name
+beside the mesh, if there is one.  The object's folder is the mesh's, unless its source says otherwise: a ShapeNet
+object keeps its images beside the folder of its mesh (`../images`).
 """
 
+import base64
+import binascii
+import os
 from collections.abc import Iterable
+from pathlib import Path
 from typing import NamedTuple
+from urllib.parse import unquote, unquote_to_bytes
 
 import numpy as np
 
@@ -19,6 +29,44 @@ from spnr_jax.formats.mesh.assets import MissingFile, RejectedAsset, Transparent
 BARELY_VISIBLE = 0.1  # alpha below it, as a share of the texture's largest, is empty space around what is drawn
 MOSTLY_OPAQUE = 0.5
 MOST_NAMES, LONGEST_NAME = 3, 40  # in a sentence
+
+
+def read_companion(folder: Path, uri: str, root: Path | None = None) -> bytes:
+    """Bytes of the file that `uri` names, relative to `folder` (percent escapes as in glTF), or of a data URI.
+
+    `root` is the object's folder, `folder` or one above it; MissingFile for a name that leads out of it or to nothing.
+    """
+    if uri.startswith("data:"):
+        head, _, payload = uri.partition(",")
+        try:
+            return base64.b64decode(payload, validate=True) if head.endswith(";base64") else unquote_to_bytes(payload)
+        except binascii.Error as error:
+            raise RejectedAsset(f"holds a data URI that is not base64: {error}") from None
+    plain, path = (_inside(root or folder, folder, name) for name in (uri, unquote(uri)))
+    for place in (plain, path, _beside(folder, uri)):
+        if place is not None and place.is_file():
+            return place.read_bytes()
+    if path is None:
+        raise MissingFile(f"names a file outside its own folder: {uri!r}")
+    raise MissingFile(f"names a file that is missing: {unquote(uri)!r}")
+
+
+def _beside(folder: Path, uri: str) -> Path | None:
+    """The file in the folder that a path of another machine means: its last name, in any letter case."""
+    name = unquote(uri).replace("\\", "/").rpartition("/")[2].casefold()
+    if not name or not folder.is_dir():
+        return None
+    return next((path for path in sorted(folder.iterdir()) if path.name.casefold() == name), None)
+
+
+def _inside(root: Path, folder: Path, name: str) -> Path | None:
+    """The file that a name, written with either kind of slash, means from `folder`; None where it leaves `root`.
+
+    Parent steps are resolved in the text, so that a link among the folders cannot lead them elsewhere.
+    """
+    name = name.replace("\\", "/")
+    first, *_ = place = os.path.normpath(os.path.join(*folder.relative_to(root).parts, name)).split("/")
+    return None if first in ("", ".", "..") or ":" in name.partition("/")[0] else root.joinpath(*place)
 
 
 class Alpha(NamedTuple):
@@ -60,7 +108,7 @@ class Tolerance:
             self._say("surface only where the alpha of the texture reaches its cut-off", name, found.texels is not None)
             self._say("left out, wholly below the alpha cut-off", name, found.nowhere)
             return found
-        if not _sees_through(alpha):
+        if not (alpha.transmits or alpha.factor < 1 or (alpha.texels is not None and alpha.texels.min() < 1)):
             return Opacity()
         if self.transparent_parts == "skip":
             found = Opacity(nowhere=True) if alpha.transmits else _cut(alpha.texels, alpha.factor, MOSTLY_OPAQUE)
@@ -91,10 +139,6 @@ class Tolerance:
     def _say(self, beginning: str, name: str, happened: bool | np.bool_ = True, quoted: bool = True) -> None:
         if happened:
             self.said.setdefault(beginning, {})[repr(name[:LONGEST_NAME]) if quoted else name[:200]] = None
-
-
-def _sees_through(alpha: Alpha) -> bool:
-    return alpha.transmits or alpha.factor < 1 or (alpha.texels is not None and bool(alpha.texels.min() < 1))
 
 
 def _cut(texels: np.ndarray | None, factor: float | int, cutoff: float | int) -> Opacity:

@@ -1,6 +1,5 @@
 """Mesh folders and files: ids, the formats without materials, and real files where they are at hand."""
 
-import hashlib
 import subprocess
 import sys
 from pathlib import Path
@@ -9,11 +8,10 @@ import numpy as np
 import pytest
 import trimesh
 from support.gltf_files import CORNERS, SQUARE, GltfBuilder
-from support.handmade import ball, box
 
-from spnr_jax.formats.mesh.assets import Asset, RejectedAsset
-from spnr_jax.formats.mesh.meshes import find_meshes, load_mesh
-from spnr_jax.formats.mesh.surface_points import CANDIDATES, normalise, sample_surface
+from spnr_jax.formats.mesh.assets import Material, Part, RejectedAsset
+from spnr_jax.formats.mesh.meshes import find_meshes, load_mesh, split_by_tint
+from spnr_jax.formats.mesh.surface_points import normalise, sample_surface
 
 DATA = Path(__file__).parents[4] / "shared" / "data"
 FACES = SQUARE.reshape(2, 3)
@@ -42,35 +40,12 @@ class TestFindMeshes:
         }
         assert list(found) == sorted(found)
 
-    def test_names_that_collide_become_paths(self, tmp_path):
-        found = self.ids(
-            tmp_path, "chair.glb", "Chair.obj", "1/m/scene.gltf", "2/m/scene.gltf", "two/a.stl", "two/b.stl"
-        )
-        assert found == {
-            "chair.glb": "chair.glb",
-            "Chair.obj": "Chair.obj",
-            "1_m_scene.gltf": "1/m/scene.gltf",
-            "2_m_scene.gltf": "2/m/scene.gltf",
-            "a": "two/a.stl",
-            "b": "two/b.stl",
-        }
-
     def test_ids_are_unique_even_where_letter_case_and_cleaning_collide(self, tmp_path):
         found = self.ids(tmp_path, "a b.glb", "a_b.glb", "a?b.glb", "A_B.GLB", "ä.off", "ö.off", "a_b.glb.ply")
         assert len(found) == 7
         assert len({name.casefold() for name in found}) == 7
         assert all(set(name) <= set("abcdefghijklmnopqrstuvwxyzABGLP._-0123456789") for name in found)
         assert all(name[0] not in "._-" for name in found)
-
-    def test_hidden_files_and_folders_are_skipped(self, tmp_path):
-        assert self.ids(tmp_path, "a.glb", ".b.glb", ".cache/c.glb") == {"a": "a.glb"}
-
-    def test_no_folder_and_no_mesh_are_said_in_one_line(self, tmp_path):
-        with pytest.raises(ValueError, match="absent is not a folder"):
-            find_meshes(tmp_path / "absent")
-        write(tmp_path / "readme.txt")
-        with pytest.raises(ValueError, match="holds no mesh file: expected .glb .gltf .obj"):
-            find_meshes(tmp_path)
 
 
 class TestPlainFormats:
@@ -89,16 +64,6 @@ class TestPlainFormats:
         (part,) = load_mesh(tmp_path / "a.ply").parts
         np.testing.assert_array_equal(part.colors[part.faces], [[[1, 0, 0]] * 3, [[0, 0, 1]] * 3])
 
-    def test_normals_in_a_ply_are_kept(self, tmp_path):
-        mesh = trimesh.Trimesh(CORNERS, FACES, process=False, vertex_normals=[[0, 0.6, 0.8]] * 4)
-        mesh.export(tmp_path / "a.ply", vertex_normal=True)
-        np.testing.assert_allclose(load_mesh(tmp_path / "a.ply").parts[0].normals, [[0, 0.6, 0.8]] * 4, atol=1e-6)
-
-    def test_a_cloud_of_points_has_no_faces(self, tmp_path):
-        trimesh.PointCloud(CORNERS).export(tmp_path / "a.ply")
-        with pytest.raises(RejectedAsset, match="no faces"):
-            load_mesh(tmp_path / "a.ply")
-
     @pytest.mark.parametrize("suffix", ["ply", "stl", "off", "obj", "gltf", "glb"])
     def test_noise_and_absent_files_are_refused_in_one_line(self, tmp_path, suffix):
         path = tmp_path / f"a.{suffix}"
@@ -116,10 +81,6 @@ class TestPlainFormats:
         done = subprocess.run([sys.executable, "-c", program, tmp_path / "a.stl"], capture_output=True, text=True)
         assert (done.returncode, done.stdout + done.stderr) == (0, "")
 
-    def test_a_suffix_that_is_not_read_is_refused(self, tmp_path):
-        with pytest.raises(RejectedAsset, match="expected one of .glb"):
-            load_mesh(write(tmp_path / "a.fbx"))
-
 
 class TestAssembly:
     def test_unused_vertices_go_and_normals_become_unit(self, tmp_path):
@@ -132,10 +93,6 @@ class TestAssembly:
         np.testing.assert_array_equal(asset.parts[0].positions, CORNERS)
         np.testing.assert_array_equal(asset.parts[0].normals, [[0, 0, 1]] * 4)
         assert asset.ignored == ("some normals without a direction (the faces' are used)",)
-
-    def test_the_source_names_the_file_and_its_checksum(self, tmp_path):
-        path = write(tmp_path / "a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
-        assert load_mesh(path).source == {"file": "a.obj", "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
 
 
 @pytest.mark.skipif(not DATA.is_dir(), reason="the folder of real mesh files is not beside this checkout")
@@ -174,35 +131,6 @@ class TestRealFiles:
         area = np.linalg.norm(np.cross(ours[:, 1] - ours[:, 0], ours[:, 2] - ours[:, 0]), axis=-1).sum() / 2
         assert area == pytest.approx(theirs.area, rel=1e-5)
 
-    @pytest.mark.slow
-    def test_every_training_object_is_read(self):
-        found = find_meshes(DATA / "real" / "train")
-        assert len(found) == 78
-        for _, path in found:
-            check(load_mesh(path))
-
-
-class TestEvenSpread:
-    shape = Asset(parts=(ball(radius=1.0), box(half=(0.5, 0.01, 0.01))))
-
-    def test_points_are_those_of_more_random_ones_with_their_materials(self):
-        even, drawn = sample_surface(self.shape, 40, 3, "even"), sample_surface(self.shape, CANDIDATES * 40, 3)
-        place = {tuple(position): i for i, position in enumerate(drawn.positions)}
-        chosen = [place[tuple(position)] for position in even.positions]
-        assert len(set(chosen)) == 40
-        for name, values in vars(even).items():
-            np.testing.assert_array_equal(values, getattr(drawn, name)[chosen])
-
-    @pytest.mark.parametrize("count", [16, 60, 240])
-    def test_any_first_ones_leave_smaller_gaps_than_random_ones(self, count):
-        def gap(points):
-            away = np.linalg.norm(surface.positions[:, None] - points.positions[:count], axis=-1)
-            return np.quantile(away.min(axis=1), 0.99)
-
-        surface = sample_surface(self.shape, 2000, 0)
-        spread = {kind: sample_surface(self.shape, 240, 1, kind) for kind in ("random", "even")}
-        assert gap(spread["even"]) < 0.75 * gap(spread["random"])
-
 
 def check(asset):
     """What the rest of data_gen relies on, for one object."""
@@ -221,3 +149,35 @@ def check(asset):
         for look in [part.material]
     }
     assert len(keys) == len(moved.parts)
+
+
+TEXTURE = np.random.default_rng(0).random((3, 4, 3), dtype=np.float32)
+
+
+def triangles(face_colors):
+    """Separate triangles, one colour (3,) or three (3, 3) each."""
+    count = len(face_colors)
+    look = Material(base_color=TEXTURE, roughness=np.float32(0.5), metallic=np.float32(0))
+    return Part(
+        positions=np.arange(9 * count, dtype=np.float64).reshape(-1, 3),
+        faces=np.arange(3 * count).reshape(-1, 3),
+        material=look,
+        texcoords=np.zeros((3 * count, 2)),
+        colors=np.concatenate([np.broadcast_to(color, (3, 3)) for color in face_colors]),
+    )
+
+
+def test_one_colour_a_face_is_exact_and_every_face_keeps_its_own():
+    colors = np.array([[1, 1, 1], [0.588, 0.588, 0.588], [0.1, 0.2, 0.3], [1, 1, 1]])
+    parts, error = split_by_tint(triangles(colors))
+    assert error == pytest.approx(0, abs=1e-12)
+    tint = {tuple(face): part.material.base_color for part in parts for face in part.faces}
+    for number, color in enumerate(colors):
+        corners = (3 * number, 3 * number + 1, 3 * number + 2)
+        np.testing.assert_allclose(tint[corners], TEXTURE * color, atol=1e-6)
+
+
+def test_a_face_of_several_colours_takes_their_mean_and_reports_the_difference():
+    ((part,), error) = split_by_tint(triangles([np.array([[0, 0, 0], [0.3, 0, 0], [0.9, 0, 0]])]))
+    np.testing.assert_allclose(part.material.base_color, TEXTURE * np.float32([0.4, 0, 0]), atol=1e-6)
+    assert error == pytest.approx(0.5)

@@ -26,13 +26,6 @@ def load_material(tmp_path, mtl, uv=""):
     return load(tmp_path, f"{SQUARE}{uv}usemtl paint\nf {corners}\n", f"newmtl paint\n{mtl}\n")
 
 
-def reason(tmp_path, *text):
-    with pytest.raises(RejectedAsset) as caught:
-        load(tmp_path, *text)
-    assert "\n" not in str(caught.value)
-    return str(caught.value)
-
-
 def areas_and_normals(part):
     a, b, c = np.moveaxis(part.positions[part.faces], 1, 0)
     cross = np.cross(b - a, c - a)
@@ -57,12 +50,6 @@ def test_every_way_to_write_a_square_gives_it(tmp_path, faces):
     assert part.normals is None
 
 
-def test_a_pentagon_beside_a_triangle_keeps_its_area(tmp_path):
-    pentagon = "v 0 0 0\nv 2 0 0\nv 2 1 0\nv 1 2 0\nv 0 1 0\nf 1 2 3 4 5\n"
-    assert areas_and_normals(load(tmp_path, pentagon).parts[0])[0] == pytest.approx(3)
-    assert areas_and_normals(load(tmp_path, pentagon + "f 1 3 5\n").parts[0])[0] == pytest.approx(4)
-
-
 def test_relative_numbers_count_from_where_they_stand(tmp_path):
     (part,) = load(tmp_path, SQUARE + "f -4 -3 -2 -1\n" + SQUARE.replace(" 0\n", " 5\n") + "f -4 -3 -2 -1\n").parts
     assert len(part.faces) == 4
@@ -75,17 +62,6 @@ def test_normals_are_kept_and_v_is_counted_from_above(tmp_path):
     (part,) = load(tmp_path, text, "newmtl paint\nmap_Kd wood.png\n").parts
     np.testing.assert_array_equal(part.normals, [[0, 0, 1]] * 4)
     np.testing.assert_allclose(part.texcoords, np.stack([part.positions[:, 0], 1 - part.positions[:, 1]], axis=-1))
-
-
-def test_factors_roughness_and_metallic_are_read(tmp_path):
-    (part,) = load_material(tmp_path, "Kd 0.1 0.2 0.3\nPr 0.25\nPm 0.75\nNs 10").parts
-    np.testing.assert_array_equal(part.material.base_color, np.float32([0.1, 0.2, 0.3]))
-    assert (part.material.roughness, part.material.metallic) == (0.25, 0.75)
-
-
-def test_roughness_comes_from_the_exponent_or_is_one_half(tmp_path):
-    assert load_material(tmp_path, "Ns 98").parts[0].material.roughness == pytest.approx(np.sqrt(2 / 100))
-    assert load_material(tmp_path, "Kd 1 1 1").parts[0].material.roughness == 0.5
 
 
 def test_a_texture_is_linearised_and_replaces_the_placeholder_beside_it(tmp_path):
@@ -105,58 +81,12 @@ def test_maps_are_scaled_and_shifted_and_a_name_may_begin_with_a_digit(tmp_path)
     assert asset.ignored == ()
 
 
-def test_maps_of_one_material_that_lie_differently_are_named(tmp_path):
-    (tmp_path / "wood.png").write_bytes(png(CHECKER))
-    asset = load_material(tmp_path, "map_Pr wood.png\nmap_Kd -s 2 wood.png", UV)
-    np.testing.assert_allclose(asset.parts[0].texcoords[:, 0], 2 * asset.parts[0].positions[:, 0])
-    assert asset.ignored == ("MTL maps of one material that lie differently (the first one's options are used)",)
-
-
 def test_two_materials_with_odd_names_make_two_parts(tmp_path):
     text = SQUARE + "usemtl dark wood #2\nf 1 2 3\nusemtl usemtl \nf 1 3 4\n"
     parts = load(tmp_path, text, "newmtl dark wood #2\nKd 0.25 0 0\nnewmtl usemtl\nKd 0 0 0.5\n").parts
     look = {tuple(part.material.base_color): part.positions.tolist() for part in parts}
     assert look[0.25, 0, 0] == [[0, 0, 0], [1, 0, 0], [1, 1, 0]]
     assert look[0, 0, 0.5] == [[0, 0, 0], [1, 1, 0], [0, 1, 0]]
-
-
-def test_statements_that_are_not_modelled_are_named(tmp_path):
-    assert load_material(tmp_path, "Ke 0 0 0\nmap_Bump bumps.png\nillum 2").ignored == ("MTL map_bump",)
-
-
-@pytest.mark.parametrize("statement", ["d 0.5", "d -halo 0.9", "Tr 0.3", "map_d mask.png", "d 0"])
-def test_transparent_materials_are_refused(tmp_path, statement):
-    with pytest.raises(RejectedAsset, match="transparent: material 'paint'"):
-        load_material(tmp_path, statement)
-
-
-@pytest.mark.parametrize("statement", ["d 1.0", "Tr 0", "Tr 1.000", "d 1\nTr 0"])
-def test_opaque_materials_are_accepted_whichever_way_tr_counts(tmp_path, statement):
-    assert len(load_material(tmp_path, statement).parts) == 1
-
-
-def test_what_is_missing_is_named(tmp_path):
-    assert "missing: 'gone.mtl'" in reason(tmp_path, f"mtllib gone.mtl\n{SQUARE}f 1 2 3\n")
-    assert "'other'" in reason(tmp_path, f"{SQUARE}usemtl other\nf 1 2 3\n", "newmtl paint\n")
-    texture = "newmtl paint\nmap_Kd gone.png\n"
-    assert "missing: 'gone.png'" in reason(tmp_path, f"{SQUARE}usemtl paint\nf 1 2 3\n", texture)
-    texture = "newmtl paint\nmap_Kd ..\\gone.png\n"
-    assert "outside its own folder" in reason(tmp_path, f"{SQUARE}usemtl paint\nf 1 2 3\n", texture)
-
-
-def test_broken_text_is_refused(tmp_path):
-    assert reason(tmp_path, SQUARE) == "has no faces"
-    assert reason(tmp_path, "") == "has no faces"
-    assert "not finite" in reason(tmp_path, SQUARE.replace("1 1 0", "1 nan 0") + "f 1 2 3\n")
-    assert "broken" in reason(tmp_path, SQUARE + "f 1 2 9\n")
-    assert "positions of shape (3, 2)" in reason(tmp_path, SQUARE.replace("1 1 0", "1 1") + "f 1 2 3\n")
-    assert "broken" in reason(tmp_path, SQUARE.replace("1 1 0", "1 x 0") + "f 1 2 3\n")
-
-
-def test_repeated_corners_are_removed_and_counted(tmp_path):
-    asset = load(tmp_path, SQUARE + "f 1 1 3\nf 1 2 3\n")
-    assert len(asset.parts[0].faces) == 1
-    assert asset.ignored == ("1 degenerate faces",)
 
 
 def test_of_faces_on_the_same_corners_that_of_the_first_material_is_kept_whatever_their_order(tmp_path):
@@ -168,9 +98,45 @@ def test_of_faces_on_the_same_corners_that_of_the_first_material_is_kept_whateve
     assert asset.ignored == ("1 doubled faces (one of each is kept)",)
 
 
-@pytest.mark.parametrize("line", ["Kd nan 0 0", "Pm nan", "Pr inf\nKd 1 nan 1"])
-def test_a_material_that_is_not_finite_is_refused(line, tmp_path):
-    (tmp_path / "a.mtl").write_text(f"newmtl a\n{line}\n")
-    (tmp_path / "a.obj").write_text("mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl a\nf 1 2 3\n")
-    with pytest.raises(RejectedAsset, match="not finite"):
-        load_mesh(tmp_path / "a.obj")
+@pytest.mark.parametrize(
+    ("mtl", "roughness", "metallic"),
+    [
+        ("Kd 0.1 0.2 0.3\nPr 0.25\nPm 0.75\nNs 10", 0.25, 0.75),
+        ("Kd 0.1 0.2 0.3\nNs 98\nd 1\nTr 0", np.sqrt(2 / 100), 0),
+        ("Kd 0.1 0.2 0.3\nTr 1.000\nd 1.0", 0.5, 0),
+    ],
+)
+def test_an_opaque_material_has_its_colour_and_the_roughness_of_pr_or_of_the_exponent(
+    tmp_path, mtl, roughness, metallic
+):
+    look = load_material(tmp_path, mtl).parts[0].material
+    np.testing.assert_array_equal(look.base_color, np.float32([0.1, 0.2, 0.3]))
+    np.testing.assert_allclose([look.roughness, look.metallic], [roughness, metallic], rtol=1e-6)
+
+
+TRANSPARENT = "d 0.5", "d -halo 0.9", "d 0", "Tr 0.3", "map_d mask.png"
+PAINTED = f"{SQUARE}usemtl paint\nf 1 2 3\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "mtl", "words"),
+    [
+        *((PAINTED, f"newmtl paint\n{line}\n", "is transparent: material 'paint'") for line in TRANSPARENT),
+        *((PAINTED, f"newmtl paint\n{line}\n", "not finite") for line in ("Kd nan 0 0", "Pm nan")),
+        (PAINTED, "newmtl paint\nmap_Kd gone.png\n", "missing: 'gone.png'"),
+        (PAINTED, "newmtl paint\nmap_Kd ..\\gone.png\n", "outside its own folder"),
+        (PAINTED, "newmtl other\n", "'paint'"),
+        (f"mtllib gone.mtl\n{SQUARE}f 1 2 3\n", None, "missing: 'gone.mtl'"),
+        (SQUARE, None, "has no faces"),
+        ("", None, "has no faces"),
+        (SQUARE.replace("1 1 0", "1 nan 0") + "f 1 2 3\n", None, "not finite"),
+        (SQUARE + "f 1 2 9\n", None, "broken"),
+        (SQUARE.replace("1 1 0", "1 1") + "f 1 2 3\n", None, r"positions of shape \(3, 2\)"),
+        (SQUARE.replace("1 1 0", "1 x 0") + "f 1 2 3\n", None, "broken"),
+        (SQUARE + "f 1 1 3\n", None, "no face with an area"),
+    ],
+)  # fmt: skip
+def test_what_is_transparent_missing_or_broken_is_refused_in_one_line(tmp_path, text, mtl, words):
+    with pytest.raises(RejectedAsset, match=words) as caught:
+        load(tmp_path, text, mtl)
+    assert "\n" not in str(caught.value)

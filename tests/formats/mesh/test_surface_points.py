@@ -4,9 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support import gltf_files
+from support.gltf_files import UV, GltfBuilder
 
 from spnr_jax.formats.mesh.assets import Asset, Material, Part, RejectedAsset
-from spnr_jax.formats.mesh.surface_points import normalise, sample_surface
+from spnr_jax.formats.mesh.meshes import load_mesh
+from spnr_jax.formats.mesh.surface_points import normalise, sample_surface, tilted
 
 CORNERS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float64)
 FACES = np.array([[0, 1, 2], [0, 2, 3]])
@@ -30,16 +33,6 @@ class TestNormalise:
         assert np.linalg.norm(np.ptp(corners, axis=0)) == pytest.approx(2)
         assert transform == {"centre": [11.5, 21.5, 32.0], "scale": pytest.approx(2 / np.sqrt(9 + 9 + 16))}
 
-    def test_the_transform_inverts(self):
-        asset = Asset(parts=(square(0.01, (365, -2, 7)),))
-        moved, transform = normalise(asset)
-        back = moved.parts[0].positions / transform["scale"] + transform["centre"]
-        np.testing.assert_allclose(back, asset.parts[0].positions, atol=1e-9)
-
-    def test_vertices_without_faces_do_not_count(self):
-        stray = replace(square(), positions=np.concatenate([CORNERS, [[99, np.nan, 99]]]))
-        assert normalise(Asset(parts=(stray,)))[1] == normalise(Asset(parts=(square(),)))[1]
-
     @pytest.mark.parametrize(
         ("part", "reason"),
         [
@@ -62,13 +55,6 @@ class TestSampleSurface:
         count = np.bincount(sample_surface(asset, 20_000, 0).face, minlength=6) / 20_000
         # four standard deviations of a share of 20000 draws
         np.testing.assert_allclose(count, [0.05, 0.05, 0.45, 0.45, 0, 0], atol=4 * 0.5 / np.sqrt(20_000))
-
-    def test_points_are_uniform_inside_a_triangle(self):
-        triangle = replace(square(), faces=FACES[:1])
-        points = sample_surface(Asset(parts=(triangle,)), 20_000, 1).positions
-        # moments of the uniform distribution on the triangle (0,0) (1,0) (1,1)
-        np.testing.assert_allclose(points.mean(axis=0), [2 / 3, 1 / 3, 0], atol=0.01)
-        np.testing.assert_allclose(np.cov(points.T)[:2, :2], [[1 / 18, 1 / 36], [1 / 36, 1 / 18]], atol=2e-3)
 
     def test_every_point_lies_on_the_face_that_it_names(self):
         parts = (square(2.0), square(1.0, (0, 0, 3)), square(1.5, (4, 1, -1)))
@@ -103,11 +89,6 @@ class TestSampleSurface:
         np.testing.assert_allclose(points.roughness, 1 - texel(v), atol=1e-5)
         np.testing.assert_array_equal(points.metallic, np.float32(0.25))
 
-    def test_vertex_colours_are_interpolated_linearly(self):
-        part = square(look=material((1, 1, 1)), colors=np.stack([CORNERS[:, 0]] * 3, axis=-1))
-        points = sample_surface(Asset(parts=(part,)), 200, 4)
-        np.testing.assert_allclose(points.base_color[:, 1], points.positions[:, 0], atol=1e-6)
-
     def test_normals_are_the_faces_or_the_interpolated_ones_and_always_unit(self):
         tilted = np.array([[-1, 0, 1], [1, 0, 1], [1, 0, 1], [-1, 0, 1]]) / np.sqrt(2)
         flat = sample_surface(Asset(parts=(square(),)), 200, 5)
@@ -117,15 +98,69 @@ class TestSampleSurface:
         expected /= np.linalg.norm(expected, axis=-1, keepdims=True)
         np.testing.assert_allclose(smooth.normals, expected, atol=1e-5)
 
-    def test_the_seed_decides_everything(self):
-        asset = Asset(parts=(square(),))
-        first, again, other = (sample_surface(asset, 50, seed) for seed in (7, 7, 8))
-        np.testing.assert_array_equal(first.positions, again.positions)
-        assert not np.array_equal(first.positions, other.positions)
+    def test_points_are_uniform_inside_a_triangle(self):
+        triangle = replace(square(), faces=FACES[:1])
+        points = sample_surface(Asset(parts=(triangle,)), 20_000, 1).positions
+        # moments of the uniform distribution on the triangle (0,0) (1,0) (1,1)
+        np.testing.assert_allclose(points.mean(axis=0), [2 / 3, 1 / 3, 0], atol=0.01)
+        np.testing.assert_allclose(np.cov(points.T)[:2, :2], [[1 / 18, 1 / 36], [1 / 36, 1 / 18]], atol=2e-3)
 
-    def test_impossible_requests_say_so(self):
-        with pytest.raises(ValueError, match="num_points must be at least 1, got 0"):
-            sample_surface(Asset(parts=(square(),)), 0, 0)
-        line = replace(square(), positions=CORNERS * [1, 0, 0])
-        with pytest.raises(RejectedAsset, match="area"):
-            sample_surface(Asset(parts=(line,)), 5, 0)
+
+# Normal maps
+
+RED, GREEN, FLAT = (0.6, 0.0, 0.8), (0.0, 0.6, 0.8), (0.0, 0.0, 1.0)
+X, Y = np.array([0.6, 0, 0.8]), np.array([0, 0.6, 0.8])
+
+
+def bumpy_normals(tmp_path, normal, uv=UV, node=None, scale=None, transform=None, **attributes):
+    """The normals at points of a square that faces +z with a map of one normal."""
+    builder = GltfBuilder()
+    texels = np.tile(np.rint((np.array(normal) + 1) / 2 * 255).astype(np.uint8), (2, 2, 1))
+    info = {"index": builder.texture(texels)} | ({"scale": scale} if scale is not None else {})
+    if transform:
+        info["extensions"] = {"KHR_texture_transform": transform}
+    material = builder.material(normalTexture=info)
+    builder.mesh(builder.primitive(material=material, TEXCOORD_0=uv, **attributes), **(node or {}))
+    asset = load_mesh(builder.write(tmp_path / "bumpy.glb"), transparent_parts="opaque")
+    assert asset.ignored == ()
+    return sample_surface(asset, 10, 0).normals
+
+
+@pytest.mark.parametrize(("normal", "expected"), [(RED, X), (GREEN, Y), (FLAT, [0, 0, 1])])
+def test_red_tilts_along_u_and_green_up_the_picture(tmp_path, normal, expected):
+    np.testing.assert_allclose(bumpy_normals(tmp_path, normal), [expected] * 10, atol=0.01)
+
+
+@pytest.mark.parametrize(
+    ("uv", "of_red", "of_green"),
+    [
+        (UV[:, ::-1], -Y, -X),  # transposed: a quarter turn and a mirror
+        (UV * [-1, 1], X * [-1, 1, 1], Y),  # mirrored in u alone
+        (1 - UV, X * [-1, 1, 1], Y * [1, -1, 1]),  # half a turn
+    ],
+)
+def test_mirrored_and_turned_coordinates_turn_the_tilt(tmp_path, uv, of_red, of_green):
+    for normal, expected in ((RED, of_red), (GREEN, of_green)):
+        expected = np.array([*expected[:2], 0.8])
+        np.testing.assert_allclose(bumpy_normals(tmp_path, normal, uv.astype(np.float32)), [expected] * 10, atol=0.01)
+
+
+def test_the_transform_of_the_map_turns_the_tilt(tmp_path):
+    found = bumpy_normals(tmp_path, RED, transform={"rotation": np.pi / 2})
+    steps = UV @ np.array([[0, 1], [-1, 0]]).T  # as the extension turns coordinates
+    along_u = np.linalg.lstsq(gltf_files.CORNERS[:, :2] - 0.5, steps[:, 0] - steps[:, 0].mean(), rcond=None)[0]
+    np.testing.assert_allclose(found[:, :2], [0.6 * along_u / np.linalg.norm(along_u)] * 10, atol=0.01)
+
+
+def test_vertex_normals_are_what_is_tilted(tmp_path):
+    leaning = np.tile(np.float32([0, 0.6, 0.8]), (4, 1))
+    found = bumpy_normals(tmp_path, RED, NORMAL=leaning)
+    np.testing.assert_allclose(found, [0.8 * leaning[0] + [0.6, 0, 0]] * 10, atol=0.01)
+
+
+def test_where_the_coordinates_have_no_area_the_normal_stays():
+    corners = np.array([[[0, 0, 0], [1, 0, 0], [0, 1, 0]]] * 3, float)
+    texcoords = np.array([[[0, 0], [0, 0], [0, 0]], [[0, 0], [1, 1], [2, 2]], [[0, 0], [1, 0], [0, 1]]], float)
+    normals = np.tile([0.0, 0, 1], (3, 1))
+    found = tilted(normals, np.array([RED, RED, (0, 0, 0)]), corners, texcoords)
+    np.testing.assert_array_equal(found, normals)

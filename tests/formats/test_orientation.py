@@ -1,11 +1,13 @@
-"""Files that say where the sensor stood: normals point to it, and a camera's picture comes upright."""
+"""An object is found upright, turned as it may be; where the sensor stood is believed, and a picture comes upright."""
+
+from pathlib import Path
 
 import numpy as np
 import pytest
 from support.point_clouds import ply_bytes
 
 from spnr_jax.formats.clouds import place_cloud, read_cloud
-from spnr_jax.formats.sensor import sensor_of
+from spnr_jax.formats.orientation import ROTATIONS, find_up, sensor_of, standing
 from spnr_jax.surfels.visibility import spiral
 
 AXES = ["view_px", "view_py", "view_pz", "y_axisx", "y_axisy", "y_axisz"]
@@ -75,17 +77,40 @@ def test_the_camera_of_a_ply_file_gives_the_sides_of_the_points_and_the_way_up(t
     np.testing.assert_allclose(normals, -spiral(300), atol=0.1)  # seen from within
 
 
-@pytest.mark.parametrize(
-    ("camera", "names"),
-    [([np.nan, 0, 0, 0, 1, 0], AXES), ([1, 2], AXES[:2]), ([1, 2, 3], ["f", "g", "h"])],
-)
-def test_a_camera_that_stands_nowhere_is_none(tmp_path, camera, names):
-    path = ply(tmp_path, "ascii", camera, names)
-    assert sensor(path) is None
-    assert read_cloud(path).normals is None
+def table() -> np.ndarray:
+    """Points of a table, y up: a plate on four legs."""
+    rng = np.random.default_rng(0)
+    plate = rng.uniform([-1, 0.98, -0.6], [1, 1, 0.6], (800, 3))
+    corners = np.array([[-0.9, 0, -0.5], [0.9, 0, -0.5], [-0.9, 0, 0.5], [0.9, 0, 0.5]])
+    legs = corners[np.arange(400) % 4] + rng.uniform([-0.05, 0, -0.05], [0.05, 1, 0.05], (400, 3))
+    return np.concatenate([plate, legs])
 
 
-def test_a_camera_that_cannot_be_read_costs_nothing(tmp_path):
-    path = ply(tmp_path, "ascii", [1, 2, 3])
-    assert sensor(path) is None
-    assert len(read_cloud(path).positions) == 300
+def cone() -> np.ndarray:
+    """Points of a cone that stands on its base, y up."""
+    rng = np.random.default_rng(1)
+    height, angle = 1 - np.sqrt(rng.uniform(size=900)), rng.uniform(0, 2 * np.pi, 900)
+    radius = np.where(np.arange(900) % 3, 1 - height, np.sqrt(rng.uniform(size=900)))
+    height = np.where(np.arange(900) % 3, height, 0)
+    return np.stack([radius * np.cos(angle), 2 * height, radius * np.sin(angle)], axis=-1)
+
+
+def test_what_stands_is_found_upright_whether_the_file_is_y_up_or_z_up():
+    for positions in (table(), cone()):
+        for up in "yz":
+            assert find_up(positions @ np.array(ROTATIONS[up]), Path("a.ply"))[0] == up
+
+
+def test_the_size_and_place_of_the_object_do_not_matter():
+    for axis in range(3):
+        np.testing.assert_allclose(standing(table() * 1e5 + [3e5, 0, 7e5], axis), standing(table(), axis), atol=1e-6)
+
+
+def test_formats_that_define_their_axes_are_believed():
+    lying = table() @ np.array(ROTATIONS["z"])
+    assert [find_up(lying, Path(name))[0] for name in ("a.glb", "A.GLTF", "a.las", "a.laz")] == ["y", "y", "z", "z"]
+
+
+def test_points_on_a_line_or_alone_are_y_up():
+    for positions in (np.zeros((1, 3)), np.linspace([0, 0, 0], [1, 2, 3], 50), np.ones((9, 3))):
+        assert find_up(positions, Path("a.xyz"))[0] == "y"
