@@ -88,8 +88,8 @@ def test_the_border_of_two_colours_on_a_bent_surface_and_at_an_edge_is_no_step()
     assert changed(fold, np.where(lying[:, None], WHITE, BLACK)) < 0.02
 
 
-def test_the_frame_around_the_faces_of_a_thin_box_is_no_step():
-    count, inner = 3000, 0.45
+@pytest.mark.parametrize(("count", "inner"), [(1000, 0.4), (3000, 0.45)])
+def test_the_frame_around_the_faces_of_a_thin_box_is_no_step(count, inner):
     rng = np.random.default_rng(1)
     place, face = rng.uniform(-0.5, 0.5, (count, 2)), rng.integers(0, 6, count)
     box = np.zeros((count, 3))
