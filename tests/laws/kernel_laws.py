@@ -363,7 +363,7 @@ masks = st.tuples(seeds, st.sampled_from([0, 0.5, 1])).map(
 VOLUMES = (
     Law("scatter_mean", scatter, each(scatter_twin, "(n,f),(n,p),(n),(d,d,d)->(d,d,d,f),(d,d,d)"),
         (Axis("size of the features", 1e-32, 1, 1e36, lambda rng, v: points(rng, 40, 4, v)),
-        Axis("points in one voxel", 1, 64, 32768, lambda rng, n: points(rng, int(n), 1))), (2, 2, 1, None),
+        Axis("points in one voxel", 1, 64, 512, lambda rng, n: points(rng, int(n), 1))), (2, 2, 1, None),
         Extremes((extremes(POINTS, 2), anywhere, masks,
             st.sampled_from([1, 4]).map(lambda n: np.zeros([n] * 3, np.float32))),
         atol=lambda features, *others: 1e-6 * max(np.abs(features).max(), 1) + TINY)),

@@ -108,7 +108,7 @@ SYSTEMS = (
         lambda a, b: (np.einsum("kip,kjp->ijp", a, b), np.einsum("ikp,kjp->ijp", a, b)),
         usual(lambda rng: tuple(rng.normal(size=(2, 3, 3, POINTS)))), shared=0),
     Law("unit", small_systems.unit, lambda v: v / np.linalg.norm(v, axis=0),
-        sizes("length", 1e-8, 1e15, lambda rng, v: (v * rng.uniform(0.5, 1, (3, POINTS)),)), shared=0),
+        sizes("length", 1e-8, 1e10, lambda rng, v: (v * rng.uniform(0.5, 1, (3, POINTS)),)), shared=0),
     Law("find_narrowest", small_systems.find_narrowest, None, (Axis("thickness", 0.1, 0.2, 0.3, covariances),),
         shared=0, extremes=Extremes((clouds,), floors=(FINITE,), check=least_variance, twin=False)),
     Law("measure_shape", small_systems.measure_shape, None, (Axis("thickness", 0.2, 0.3, 1, covariances),), shared=0,
