@@ -94,7 +94,7 @@ chaos: setup
 	CHAOS_KILLS=$(or $(CHAOS_KILLS),25) $(PY) -m pytest -q -s tests/robustness/test_chaos.py
 
 stability: setup
-	STABILITY=1 $(PY) -m pytest -q -s tests/robustness/test_stability.py
+	STABILITY=1 $(PY) -m pytest -q -s tests/laws/test_laws.py -k budget
 
 long-run: setup
 	LONG_RUN_STEPS=$(or $(LONG_RUN_STEPS),2000) $(PY) -m pytest -q -s tests/robustness/test_long_run.py

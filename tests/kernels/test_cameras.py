@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support import reference
-from support.laws import batch_law, close, gradient_law, numbers, same_bits
+from hypothesis import given
+from support.laws import close, extremes, hypotheses, numbers, same_bits
 
 from spnr_jax.kernels.cameras import (
     as_images,
@@ -18,6 +18,7 @@ from spnr_jax.kernels.cameras import (
     resize,
     view_rays,
 )
+from spnr_jax.kernels.numerics import normalize
 
 UP = jnp.array([0.0, 1.0, 0.0])
 EYES = 3 * numbers(0, 2, 3, 3) + 0.1
@@ -30,40 +31,7 @@ def camera():
     return pinhole(POSES, 0.8, 4, 6)
 
 
-class TestLookAt:
-    def test_obeys_the_batch_and_gradient_laws(self):
-        arguments = EYES, numbers(1, 2, 3, 3), UPS
-        batch_law(look_at, *arguments)
-        gradient_law(look_at, *arguments)
-
-    def test_axes_are_orthonormal_right_handed_and_look_along_minus_z(self):
-        pose = np.float64(look_at(EYES, numbers(1, 2, 3, 3), UPS))
-        rotation = pose[..., :3]
-        close(np.swapaxes(rotation, -1, -2) @ rotation, np.broadcast_to(np.eye(3), rotation.shape), atol=2e-6)
-        close(np.linalg.det(rotation), np.ones((2, 3)))
-        towards = np.float64(numbers(1, 2, 3, 3) - EYES)
-        close(-rotation[..., 2], towards / np.linalg.norm(towards, axis=-1, keepdims=True))
-        assert (rotation[..., 1, 1] > 0).all(), "the camera stands upright"
-        close(pose[..., 3], EYES)
-
-
 class TestRays:
-    def test_are_those_of_a_pixel_by_pixel_loop(self):
-        rays = jax.tree.map(np.asarray, jax.jit(camera_rays)(camera()))
-        focal = 3 / np.tan(0.4)
-        for i, j, row, column in np.ndindex(2, 3, 4, 6):
-            expected = reference.camera_ray(np.asarray(POSES)[i, j], focal, (3.0, 2.0), row, column)
-            close(rays.directions[i, j, row, column], expected)
-            close(rays.origins[i, j, row, column], np.asarray(EYES)[i, j])
-
-    def test_obey_the_batch_and_gradient_laws(self):
-        def kernel(pose):
-            rays = camera_rays(pinhole(pose, 0.8, 2, 3))
-            return rays.origins, rays.directions
-
-        batch_law(kernel, POSES)
-        gradient_law(kernel, POSES)
-
     def test_the_field_of_view_is_the_angle_between_the_left_and_right_border(self):
         rays = np.asarray(jax.jit(lambda pose: camera_rays(pinhole(pose, 0.8, 1, 1000)).directions[0])(POSES[0, 0]))
         assert np.arccos(rays[0] @ rays[-1]) == pytest.approx(0.8, rel=2e-3)
@@ -95,14 +63,6 @@ class TestRays:
 
 
 class TestProject:
-    def test_obeys_the_batch_and_gradient_laws(self):
-        def kernel(pose, positions):
-            return project(pinhole(pose, 0.8, 4, 6), positions)
-
-        positions = 0.1 * numbers(3, 2, 3, 5, 3)
-        batch_law(kernel, POSES, positions, rtol=1e-4)
-        gradient_law(kernel, POSES, positions)
-
     @pytest.mark.parametrize("depth", [0.0, 2.0], ids=["at the eye's plane", "behind it"])
     def test_a_point_not_in_front_has_no_pixel_and_no_gradient(self, depth):
         view = pinhole(jnp.concatenate([jnp.eye(3), jnp.zeros((3, 1))], axis=1), 0.8, 4, 4)
@@ -126,17 +86,6 @@ class TestProject:
 
 
 class TestBox:
-    def test_is_the_slab_loop_at_every_batch_rank(self):
-        origins, directions = 2 * numbers(4, 2, 3, 8, 3), numbers(5, 2, 3, 8, 3)
-        batch_law(lambda o, d: intersect_box(o, d)[:2], origins, directions)
-        near, far, hit = map(np.asarray, jax.jit(intersect_box)(origins, directions))
-        origins, directions = np.asarray(origins), np.asarray(directions)
-        assert 0 < hit.sum() < hit.size
-        for place in np.ndindex(2, 3, 8):
-            interval = reference.box_interval(origins[place], directions[place])
-            assert bool(hit[place]) == (interval is not None)
-            close((near[place], far[place]), interval or (0.0, 0.0))
-
     @pytest.mark.parametrize(
         ("origin", "direction", "expected"),
         [
@@ -162,16 +111,6 @@ class TestBox:
             assert not hit
             assert near == far == 0
 
-    def test_gradients_are_those_of_the_slabs_and_zero_for_a_miss(self):
-        origins = jnp.array([[0.1, -0.2, 3.0], [0.3, 0.2, 2.5]])
-        directions = jnp.array([[0.05, 0.1, -1.0], [-0.1, 0.2, -0.9]])
-        gradient_law(lambda o, d: intersect_box(o, d)[:2], origins, directions)
-        special = jnp.array([[0.0, 0.0, 3.0], [2.0, 0.0, 3.0], [1.0, 0.0, 3.0]])
-        along = jnp.broadcast_to(jnp.array([0.0, 0.0, -1.0]), (3, 3))
-        gradients = jax.grad(lambda o, d: sum(map(jnp.sum, intersect_box(o, d)[:2])), (0, 1))(special, along)
-        assert all(jnp.isfinite(g).all() for g in gradients)
-        close([g[1] for g in gradients], [jnp.zeros(3)] * 2)
-
     @pytest.mark.parametrize("slope", [0.0, 1e-30, 1e-20, 1e-19, 1e-12, 1e-11, 1e-7])
     def test_rays_that_are_nearly_parallel_to_a_face_have_a_finite_gradient(self, slope):
         origins = jnp.array([[0.1, 0.2, 3.0], [1e8, 0.2, 3.0]])
@@ -182,14 +121,14 @@ class TestBox:
         close(gradients[0], jnp.array([[0.0, 0.0, 2.0], [0.0, 0.0, 0.0]]))
         assert jnp.isfinite(gradients[1]).all()
 
-    def test_points_on_hit_rays_between_near_and_far_lie_in_the_box(self):
-        origins, directions = 2 * numbers(6, 50, 3), numbers(7, 50, 3)
-        near, far, hit, origins, directions = map(
-            np.asarray, (*jax.jit(intersect_box)(origins, directions), origins, directions)
-        )
-        for share in (0.0, 0.5, 1.0):
-            points = origins + ((1 - share) * near + share * far)[:, None] * directions
-            assert (np.abs(points[hit]) <= 1 + 1e-5).all()
+
+@hypotheses
+@given(extremes(5, 3), extremes(5, 3))
+def test_rays_from_anywhere_have_finite_intervals_and_a_miss_has_none(origins, directions):
+    near, far, hit = jax.jit(intersect_box)(origins, normalize(jnp.asarray(directions)))
+    assert (np.isfinite(near) & np.isfinite(far) & (near >= 0)).all()
+    assert ((near < far) == hit).all()
+    assert (far[~hit] == 0).all()
 
 
 class TestOrbit:

@@ -54,7 +54,7 @@ def with_outliers(points: np.ndarray, seed: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("spread", ["even", "random"])
-@pytest.mark.parametrize("count", [300, 2000, 20000])
+@pytest.mark.parametrize("count", [300, 20000])
 @pytest.mark.parametrize("shape", SHAPES)
 def test_a_clean_cloud_comes_back_itself(shape, count, spread):
     plain = cloud(SHAPES[shape](count, spread))

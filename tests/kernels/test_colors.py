@@ -8,16 +8,6 @@ from spnr_jax.kernels.colors import linear_to_srgb, over, srgb_to_linear, unweig
 LEVELS = np.arange(256) / 255
 
 
-def loop_srgb_to_linear(value: float) -> float:
-    """IEC 61966-2-1, one value, float64."""
-    return value / 12.92 if value <= 0.04045 else ((value + 0.055) / 1.055) ** 2.4
-
-
-def test_decoding_agrees_with_the_standard_at_every_8_bit_level():
-    expected = [loop_srgb_to_linear(level) for level in LEVELS]
-    np.testing.assert_allclose(srgb_to_linear(jnp.asarray(LEVELS, jnp.float32)), expected, rtol=2e-6)
-
-
 def test_encoding_inverts_decoding_to_far_below_an_8_bit_level():
     levels = jnp.asarray(LEVELS, jnp.float32)
     np.testing.assert_allclose(linear_to_srgb(srgb_to_linear(levels)), levels, atol=1e-6)
@@ -27,13 +17,6 @@ def test_black_white_and_middle_grey_are_where_the_standard_puts_them():
     np.testing.assert_allclose(
         linear_to_srgb(jnp.array([0.0, 0.0031308, 0.5, 1.0])), [0, 0.04045, 0.735357, 1], atol=1e-6
     )
-
-
-@pytest.mark.parametrize("transfer", [linear_to_srgb, srgb_to_linear])
-def test_values_and_gradients_are_finite_at_and_below_zero(transfer):
-    inputs = jnp.array([-1.0, -1e-8, 0.0, 1e-8, 1e10])
-    assert np.isfinite(transfer(inputs)).all()
-    assert np.isfinite(jax.vmap(jax.grad(transfer))(inputs)).all()
 
 
 @pytest.mark.parametrize("transfer", [linear_to_srgb, srgb_to_linear])

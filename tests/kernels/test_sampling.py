@@ -6,8 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hypothesis import given
 from support import reference
-from support.laws import batch_law, close, float64_law, gradient_law, numbers, same_bits
+from support.laws import batch_law, close, extremes, extremes_law, hypotheses, numbers, same_bits, sorted_distances
 
 from spnr_jax.kernels import sampling
 from spnr_jax.kernels.sampling import count_at_most, importance, merge, strata, stratified
@@ -27,21 +28,10 @@ def fresh(seed):
 
 
 class TestStratified:
-    def test_without_a_key_samples_are_the_middles_of_equal_parts(self):
-        distances, edges = map(np.asarray, stratified(None, NEAR, FAR, 4))
-        for place in np.ndindex(2, 3):
-            near, far = np.float64(NEAR)[place], np.float64(FAR)[place]
-            close(edges[place], np.array([near + (far - near) * k / 4 for k in range(5)]))
-            close(distances[place], np.array([near + (far - near) * (k + 0.5) / 4 for k in range(4)]))
-
-    def test_obeys_the_batch_and_gradient_laws(self):
-        batch_law(lambda near, far: stratified(None, near, far, 4), NEAR, FAR)
-        gradient_law(lambda near, far: stratified(None, near, far, 4), NEAR, FAR)
-
     def test_no_gradient_is_lost_where_the_compiler_computes_a_distance_twice(self):
         """Once with a fused multiply-add and once without: jnp.clip compares the two in its gradient."""
         near = np.float32([0.6369617, 0.26978672, 0.04097353])
-        float64_law(lambda near, far: stratified(None, near, far, 5), near, 2 * near, rtol=1e-5)
+        extremes_law(lambda near, far: stratified(None, near, far, 5), (near, 2 * near))
 
     @pytest.mark.parametrize(("near", "far"), [(0.0, 0.0), (1e10, 1.1e10), (1.0, 1 + 1e-7), (0.0, 1e-8)])
     @pytest.mark.parametrize("seed", KEYS)
@@ -100,25 +90,6 @@ class TestImportance:
     def test_obeys_the_batch_law(self):
         batch_law(lambda edges, weights: importance(None, edges, weights, 5), EDGES, WEIGHTS, atol=1e-5)
 
-    @pytest.mark.parametrize("scale", [0.0, 1e-8, 1.0, 1e10])
-    @pytest.mark.parametrize("seed", KEYS)
-    def test_samples_are_sorted_and_inside_the_edges(self, scale, seed):
-        distances = drawn(fresh(seed), EDGES, scale * WEIGHTS**8, 64)
-        assert jnp.isfinite(distances).all()
-        assert (jnp.diff(distances) >= 0).all()
-        assert (distances >= EDGES[..., :1]).all()
-        assert (distances <= EDGES[..., -1:]).all()
-
-    def test_all_zero_weights_give_the_even_spread(self):
-        edges = jnp.linspace(2.0, 4.0, 9)
-        close(importance(None, edges, jnp.zeros(8), 4), stratified(None, jnp.array(2.0), jnp.array(4.0), 4)[0])
-
-    @pytest.mark.parametrize("hot", [0, 1, 3, 7])
-    def test_a_single_heavy_bin_takes_all_samples(self, hot):
-        distances = drawn(None, EDGES[0, 0], jax.nn.one_hot(hot, 8), 64)
-        lo, hi = EDGES[0, 0, hot], EDGES[0, 0, hot + 1]
-        assert ((distances >= lo) & (distances <= hi)).mean() > 0.98
-
     def test_a_thin_part_keeps_most_samples(self):
         edges = jnp.linspace(0.0, 1.0, 63)
         distances = drawn(None, edges, 1e-3 * jax.nn.one_hot(20, 62), 64)
@@ -147,6 +118,37 @@ class TestImportance:
         assert (distances[1:] >= 3 - 1 / 127).all()
         assert (np.diff(distances) >= 0).all()
 
+    @hypotheses
+    @given(sorted_distances(3, 9), extremes(3, 8, signed=False))
+    def test_importance_samples_lie_where_the_mass_reaches_their_share(self, edges, weights):
+        distances = np.asarray(drawn(None, edges, weights, 5))
+        assert (
+            (distances >= edges[:, :1]) & (distances <= edges[:, -1:]) & (np.diff(distances, prepend=edges[:, :1]) >= 0)
+        ).all()
+        at = (np.arange(5) + 0.5) / 5
+        for i in range(3):
+            mass = np.float64(weights[i]) + 1e-5
+            cumulative = np.concatenate([[0], np.cumsum(mass) / mass.sum()])
+            around = np.spacing(distances[i]) * 2
+            below, above = (
+                np.interp(np.float64(distances[i]) + side * around, edges[i], cumulative, left=0, right=1)
+                for side in (-1, 1)
+            )
+            assert ((below <= at + 2e-6) & (above >= at - 2e-6)).all()
+
+    @pytest.mark.parametrize("bins", [1000, 100_000])
+    def test_a_flat_distribution_stays_flat_and_half_of_a_peak_stays_in_it(self, bins):
+        edges = np.linspace(0, 1, bins + 1, dtype=np.float32)
+        flat = np.ones(bins, np.float32)
+        peak = flat.copy()
+        peak[bins // 3] += bins
+        samples = np.asarray(jax.jit(sampling.importance, static_argnums=3)(None, edges[None], flat[None], 1000))[0]
+        assert np.abs(samples - (np.arange(1000) + 0.5) / 1000).max() < 1e-3
+        samples = np.asarray(jax.jit(sampling.importance, static_argnums=3)(None, edges[None], peak[None], 1000))[0]
+        width = 1 / bins
+        in_peak = (samples >= bins // 3 * width - 1e-6) & (samples <= (bins // 3 + 1) * width + 1e-6)
+        assert in_peak.mean() == pytest.approx(0.5, abs=0.01)
+
     def test_no_gradient_passes_through_where_the_samples_lie(self):
         gradients = jax.grad(lambda e, w: jnp.sum(importance(None, e, w, 5)), (0, 1))(EDGES, WEIGHTS)
         close(gradients, (jnp.zeros_like(EDGES), jnp.zeros_like(WEIGHTS)))
@@ -159,7 +161,7 @@ class TestMerge:
         draws = np.random.default_rng(8).integers(0, 6, (2, 3, n + m)).astype(np.float32)
         return tuple(jnp.asarray(np.sort(x, axis=-1)) for x in (draws[..., :n], draws[..., n:]))
 
-    @pytest.mark.parametrize(("n", "m"), [(1, 1), (5, 3), (4, 9), (2, 300), (270, 280)])
+    @pytest.mark.parametrize(("n", "m"), [(1, 1), (4, 9), (2, 300)])
     def test_is_the_stable_sort_with_ties(self, n, m):
         first, second = self.lists(n, m)
         order, rank = jax.jit(merge)(first, second)
@@ -167,13 +169,10 @@ class TestMerge:
         np.testing.assert_array_equal(order, expected)
         np.testing.assert_array_equal(rank, np.argsort(expected, axis=-1, kind="stable"))
 
-    def test_obeys_the_batch_law(self):
-        batch_law(merge, *self.lists(5, 3))
-
 
 class TestCount:
     @pytest.mark.parametrize("strictly", [False, True])
-    @pytest.mark.parametrize("n", [1, 7, 257, 511, 512])
+    @pytest.mark.parametrize("n", [1, 7, 511, 512])
     def test_is_bisection_of_the_sorted_list_with_ties_and_extremes(self, n, strictly):
         values = np.sort(np.random.default_rng(9).integers(0, n, n)).astype(np.float32)
         queries = np.concatenate([values[:5], values[-3:], [-1e10, 1e10, n / 2 + 0.25, -np.inf, np.inf]]).astype(

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from jax import lax
 from support import reference
-from support.laws import adjoint_law, batch_law, close, gradient_law, numbers, same_bits
+from support.laws import adjoint_law, close, numbers, same_bits
 
 from spnr_jax.kernels.voxels import (
     locate,
@@ -35,9 +35,6 @@ class TestLocate:
         cell, offset = locate(jnp.array([coordinate, 0.0, -0.75]), D)
         np.testing.assert_array_equal(cell, [voxel, 2, 0])
         close(offset, np.array([(np.float32(coordinate) + 1) * 2 - voxel - 0.5, -0.5, 0.0]))
-
-    def test_obeys_the_batch_law(self):
-        batch_law(lambda p: locate(p, D), POSITIONS)
 
     def test_rows_run_through_x_first_and_what_is_not_valid_goes_to_the_spare_row(self):
         cell = jnp.array([[1, 2, 3], [1, 2, 3]], jnp.int32)
@@ -82,26 +79,6 @@ class TestScatterMean:
         volume, occupancy = scatter(positions, jnp.full((count, 2), 0.7), jnp.ones(count, bool), D)
         assert (occupancy > 0).sum() == 1
         close((volume[3, 1, 2], occupancy[3, 1, 2]), (jnp.full(2, 0.7), 1.0), rtol=3e-5)
-
-    def test_is_the_loop_over_points(self):
-        volume, occupancy = map(np.asarray, scatter(POSITIONS, FEATURES, MASK, D))
-        positions, features = np.asarray(POSITIONS), np.asarray(FEATURES)
-        for place in np.ndindex(2, 3):
-            close(
-                (volume[place], occupancy[place]),
-                reference.scatter_mean(positions[place], features[place], MASK[place], D),
-            )
-
-    def test_obeys_the_batch_law(self):
-        batch_law(lambda p, f, m: scatter_mean(p, f, m > 0.5, D), POSITIONS, FEATURES, jnp.asarray(MASK, jnp.float32))
-
-    def test_its_gradient_is_right_also_where_points_share_voxels(self):
-        positions, _, mask = self.cloud
-        gradient_law(lambda f: scatter_mean(positions, f, mask, D), self.cloud[1])
-
-    def test_the_order_of_the_points_does_not_matter(self):
-        order = np.random.default_rng(4).permutation(12)
-        close(scatter_mean(*(x[order] for x in self.cloud), D), scatter_mean(*self.cloud, D))
 
     @pytest.mark.parametrize("fill", [0.0, 1e30, np.nan])
     def test_padding_does_not_matter_whatever_it_holds(self, fill):
@@ -180,22 +157,11 @@ class TestScatterConv:
 
 
 class TestTrilinear:
-    def test_is_the_loop_over_the_eight_corners(self):
-        looked, positions = np.asarray(lookup(VOLUME, POSITIONS)), np.asarray(POSITIONS)
-        for place in np.ndindex(2, 3, 12):
-            close(looked[place], reference.trilinear(VOLUME, positions[place]))
-
-    def test_obeys_the_batch_law(self):
-        batch_law(lambda p: trilinear(VOLUME, p), POSITIONS)
-
     def test_objects_are_looked_up_in_their_own_volumes(self):
         volumes = numbers(7, 2, D, D, D, 2)
         both = lookup(volumes, POSITIONS)
         for i in range(2):
             close(both[i], lookup(volumes[i], POSITIONS[i]))
-
-    def test_its_gradients_are_right(self):
-        gradient_law(trilinear, VOLUME, POSITIONS[0, 0])
 
     def test_the_gradient_by_the_volume_is_the_adjoint_splat(self):
         positions, cotangent = np.asarray(POSITIONS[0, 0]), np.asarray(FEATURES[0, 0])
@@ -233,6 +199,3 @@ class TestTrilinear:
     def test_a_single_voxel_fills_the_box(self):
         volume = jnp.full((1, 1, 1, 2), 0.3)
         close(lookup(volume, jnp.array([[-1.0, 0.2, 1.0], [0.0, 0.0, 0.0]])), jnp.full((2, 2), 0.3))
-
-    def test_no_position_looks_nothing_up(self):
-        assert lookup(VOLUME, jnp.zeros((0, 3))).shape == (0, 2)

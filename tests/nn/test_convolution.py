@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from jax import lax
 from support import reference
-from support.laws import close, gradient_law, numbers, same_bits
+from support.laws import close, numbers, same_bits
 
 from spnr_jax.nn.convolution import Conv, conv, upsample_conv
 
@@ -71,15 +71,6 @@ def test_upsample_conv_is_the_convolution_of_every_pixel_repeated(shape):
     close(value_and_gradients(upsample_conv, x, kernel), value_and_gradients(repeated, x, kernel), 1e-4, 2e-5)
     out = reference.convolution(reference.repeat_twice(np.asarray(x)[1]), kernel)
     close(upsample_conv(x, kernel)[1], out, atol=1e-5)
-
-
-@pytest.mark.parametrize("window", [2, 3])
-def test_vmap_is_the_loop_and_gradients_are_right_also_where_a_custom_rule_stands(window):
-    x, kernel = numbers(6, 3, 2, 5, 5, 2), numbers(7, 3, window, window, 2, 4)
-    mapped = jax.jit(jax.vmap(conv))(x, kernel)
-    for i in range(3):
-        close(mapped[i], native(x[i], kernel[i]), atol=1e-5)
-    gradient_law(conv, x[0], kernel[0])
 
 
 @pytest.mark.parametrize("window", [2, 3])

@@ -5,11 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from support import reference
-from support.laws import batch_law, close, gradient_law, numbers
+from support.laws import close, numbers
 
 from spnr_jax.kernels.compositing import composite, volume_weights
 from spnr_jax.kernels.numerics import normalize
-from spnr_jax.nn.encoding import encode_direction
 from spnr_jax.nn.field import RadianceField
 
 MODULE = RadianceField(width=6, num_features=7, direction_frequencies=2)
@@ -27,18 +26,6 @@ def everything(module, x, directions):
 VARIABLES = jax.jit(lambda key: MODULE.init(key, X, DIRECTIONS, method=everything))(jax.random.key(0))
 VARIABLES = jax.tree.map(lambda x: x + 0.3 * numbers(2, *x.shape), VARIABLES)
 apply = jax.jit(lambda x, directions: MODULE.apply(VARIABLES, x, directions, method=everything))
-
-
-class TestEncoding:
-    @pytest.mark.parametrize("frequencies", [0, 4])
-    def test_is_the_direction_and_its_sines_and_cosines(self, frequencies):
-        d = np.float64(DIRECTIONS)
-        expected = [d] + [f(d * 2**k) for k in range(frequencies) for f in (np.sin, np.cos)]
-        close(encode_direction(DIRECTIONS, frequencies), np.concatenate(expected, axis=-1))
-
-    def test_obeys_the_batch_and_gradient_laws(self):
-        batch_law(lambda d: encode_direction(d, 2), DIRECTIONS)
-        gradient_law(lambda d: encode_direction(d, 2), DIRECTIONS)
 
 
 def test_density_and_colour_are_those_of_the_layers_written_out():

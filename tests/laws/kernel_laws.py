@@ -1,0 +1,583 @@
+"""Laws of the kernels and of the paper's network: functions, domains in which float32 keeps its budget, twins.
+
+Inputs stay away from kinks (cell walls, equal pixels): there a gradient jumps, and no precision helps.  Twins are
+mostly the plain loops of tests/support/reference.py.  Sizes of `Extremes` run from 1e-30 to 1e30 wherever float32 can
+hold the answer.
+"""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from hypothesis import strategies as st
+from skimage.metrics import structural_similarity
+from support import reference
+from support.laws import TINY, Axis, Extremes, Law, close, extremes, sorted_distances
+
+from spnr_jax.config import AS_TRAINED, PaperConfig, SamplingConfig
+from spnr_jax.kernels import cameras, colors, compositing, losses, metrics, numerics, resizing, sampling, voxels
+from spnr_jax.kernels.records import Camera, Rays, Scene
+from spnr_jax.method import inference, paper_method
+from spnr_jax.nn.encoding import encode_direction
+from spnr_jax.nn.normalization import BatchNorm, GroupNorm
+
+FINITE = 1e30  # a floor under which gradients only have to be finite
+BINS, POINTS = 8, 12
+seeds = st.integers(0, 999)
+
+
+def each(twin, signature):
+    """The twin of one item for any batch of them."""
+    return np.vectorize(twin, signature=signature)
+
+
+def usual(inputs):
+    """The axis of a function that is looked at for arguments of size 1 alone."""
+    return (Axis("size", 1, 1, 1, lambda rng, v: inputs(rng)),)
+
+
+def sizes(name, low, high, inputs):
+    return (Axis(name, low, 1, high, inputs),)
+
+
+def around_zero(*shape):
+    return lambda rng: (rng.uniform(0.2, 3, shape) * rng.choice([-1, 1], shape),)
+
+
+def unit(x):
+    return x / np.linalg.norm(x, axis=-1, keepdims=True)
+
+
+# numbers and vectors
+
+
+def quotient(numerator, denominator):
+    """0 where float32 does not hold a denominator or a quotient."""
+    zero = np.abs(denominator) < TINY
+    found = numerator / np.where(zero, 1, denominator)
+    return np.where(zero | (np.abs(found) < TINY), 0, found)
+
+
+def direction(vectors):
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return vectors / np.where(length > 0, length, 1)
+
+
+def encode_srgb(x):
+    with np.errstate(under="ignore"):
+        return np.where(x > 0.0031308, 1.055 * np.maximum(x, 1e-9) ** (1 / 2.4) - 0.055, 12.92 * x)
+
+
+def decode_srgb(x):
+    return np.where(x > 0.04045, ((np.maximum(x, 0) + 0.055) / 1.055) ** 2.4, x / 12.92)
+
+
+def encoding(frequencies):
+    """Directions, and their sines and cosines."""
+    return lambda d: np.concatenate([d] + [f(d * 2**k) for k in range(frequencies) for f in (np.sin, np.cos)], axis=-1)
+
+
+def held(arguments, outputs):
+    """Quotients that float32 holds are those of the twin."""
+    expected = quotient(*map(np.float64, arguments))
+    close(outputs[0][np.abs(expected) < 3e38], expected[np.abs(expected) < 3e38], rtol=1e-6, atol=TINY)
+
+
+vectors = extremes(4, 3, low=-36, high=36).map(lambda v: np.where(np.abs(v) < TINY, 0, v))
+# fmt: off
+NUMBERS = (
+    Law("safe_divide", numerics.safe_divide, quotient,
+        usual(lambda rng: (rng.normal(size=(6, 4)), *around_zero(6, 4)(rng))), (1, 1),
+        Extremes((extremes(6), extremes(6, low=-17, high=17)), check=held, twin=False)),
+    Law("one_minus_exp", numerics.one_minus_exp, lambda x: -np.expm1(-x),
+        sizes("size", 1e-30, 15, lambda rng, v: (v * rng.uniform(0.5, 1, (6, 4)),)), (1,),
+        Extremes((extremes(6, signed=False),))),
+    Law("softplus", numerics.softplus, reference.softplus, usual(around_zero(6, 4)), (1,),
+        Extremes((extremes(6, high=36),)), agreement=1e-8),
+    Law("length", numerics.length, partial(np.linalg.norm, axis=-1), usual(around_zero(6, 3)), (1,),
+        Extremes((vectors,))),
+    Law("normalize", numerics.normalize, direction, usual(around_zero(6, 3)), (1,), Extremes((vectors,))),
+    Law("linear_to_srgb", colors.linear_to_srgb, encode_srgb, usual(lambda rng: (rng.uniform(-0.1, 1, (6, 4)),)), (1,),
+        Extremes((extremes(6, high=15),), rtol=2e-6)),
+    Law("srgb_to_linear", colors.srgb_to_linear, decode_srgb, usual(lambda rng: (rng.uniform(-0.1, 1, (6, 4)),)), (1,),
+        Extremes((extremes(6, high=15),), rtol=1e-5)),
+    Law("encode_direction", lambda d: encode_direction(d, 4), encoding(4), usual(around_zero(6, 3)), (1,)),
+    # ten frequencies of coordinates up to a thousand are off by less than a thousandth
+    Law("encode_direction, ten frequencies", lambda d: encode_direction(d, 10), encoding(10),
+        usual(lambda rng: (0.01 * rng.normal(size=(6, 3)),)),
+        extremes=Extremes((extremes(4, 3, high=3).map(lambda x: np.clip(x, -1e3, 1e3)),), atol=lambda x: 1e-3)),
+)
+# fmt: on
+
+# cameras and rays
+
+
+def view_rays(cam_to_world, intrinsics):
+    """Origins and directions of a picture of 4 x 6 pixels."""
+    rays = cameras.camera_rays(Camera(cam_to_world=cam_to_world, intrinsics=intrinsics, height=4, width=6))
+    return rays.origins, rays.directions
+
+
+def view_rays_twin(pose, intrinsics):
+    focal, centre = intrinsics[0, 0], intrinsics[:2, 2]
+    rays = [[reference.camera_ray(pose, focal, centre, row, column) for column in range(6)] for row in range(4)]
+    return np.broadcast_to(pose[:, 3], (4, 6, 3)), np.array(rays)
+
+
+def views(rng, field):
+    """Turned cameras of that field of view in radians."""
+    focal = 3 / np.tan(field / 2)
+    turn = np.stack([np.linalg.qr(rng.normal(size=(3, 3)))[0] for _ in range(6)])
+    return np.concatenate([turn, rng.normal(size=(6, 3, 1))], 2), np.tile(
+        [[focal, 0, 3], [0, focal, 2], [0, 0, 1.0]], (6, 1, 1)
+    )
+
+
+def look_at_twin(eye, target, up):
+    """The axes of a camera in columns, and where it stands."""
+    backward = unit(eye - target)
+    right = unit(np.cross(up, backward))
+    return np.stack([right, np.cross(backward, right), backward, eye], axis=-1)
+
+
+def project(pose, intrinsics, positions):
+    view = Camera(cam_to_world=pose, intrinsics=intrinsics, height=4, width=6)
+    return cameras.project(view, positions)
+
+
+def project_twin(pose, intrinsics, positions):
+    local = (positions - pose[:, 3]) @ pose[:, :3]
+    plane = local[:, :2] / -local[:, 2:] * [1, -1]
+    return intrinsics[0, 0] * plane + intrinsics[:2, 2], np.linalg.norm(local, axis=1)
+
+
+def before_eyes(rng, field):
+    pose, intrinsics = views(rng, field)
+    local = np.concatenate([rng.normal(size=(6, 5, 2)), -rng.uniform(2, 4, (6, 5, 1))], -1)
+    return pose, intrinsics, np.einsum("nij,nkj->nki", pose[..., :3], local) + pose[:, None, :, 3]
+
+
+def box(origins, directions):
+    near, far, _ = cameras.intersect_box(origins, directions)
+    return near, far - near
+
+
+def box_twin(origin, direction):
+    near, far = (direction.any() and reference.box_interval(origin, direction)) or (0.0, 0.0)
+    return near, far - near
+
+
+def towards_box(rng, distance):
+    """Rays from a sphere around the box towards its inner half."""
+    origins = unit(rng.normal(size=(6, 3))) * distance
+    return origins, unit(rng.uniform(-0.5, 0.5, (6, 3)) - origins)
+
+
+def touches_or_hits(arguments, outputs):
+    """A ray that touches the box may hit or miss it; others have the interval of the loop."""
+    for origin, towards, near, inside in zip(*arguments, *outputs, strict=True):
+        expected, rounding = box_twin(*np.float64([origin, towards])), 1e-6 * (1 + np.abs(origin).max())
+        assert near >= 0
+        assert inside >= 0
+        if expected[1] > rounding:
+            close((near, near + inside), (expected[0], sum(expected)), rtol=1e-5, atol=rounding)
+        else:
+            assert inside <= 2 * rounding
+
+
+unit_vectors = extremes(5, 3).map(lambda v: np.asarray(numerics.normalize(jnp.asarray(v))))
+# fmt: off
+CAMERAS = (
+    Law("look_at", cameras.look_at, look_at_twin,
+        usual(lambda rng: (rng.normal(size=(6, 3)), 3 + rng.normal(size=(6, 3)), np.eye(3)[[1] * 6])), (1, 1, 1)),
+    Law("camera_rays", view_rays, each(view_rays_twin, "(r,c),(k,k)->(h,w,r),(h,w,r)"),
+        (Axis("field of view", 1e-20, 0.7, 3.1415, views),), (2, 2)),
+    Law("project", project, each(project_twin, "(r,c),(k,k),(n,r)->(n,t),(n)"),
+        (Axis("field of view", 0.7, 0.7, 0.7, before_eyes),), (2, 2, 2), agreement=1e-7),
+    Law("intersect_box", box, each(box_twin, "(n),(n)->(),()"), sizes("distance of the camera", 1, 100, towards_box),
+        (1, 1), Extremes((extremes(5, 3, low=-30, high=4), unit_vectors), floors=(FINITE, FINITE),
+        check=touches_or_hits, twin=False)),
+)
+# fmt: on
+
+# along rays
+
+
+def middles(near, far):
+    """Samples without a key, and the edges of their parts."""
+    return sampling.stratified(None, near, far, 5)
+
+
+def middles_twin(near, far):
+    places = near + (far - near) * np.arange(11) / 10
+    return places[1::2], places[::2]
+
+
+def one_per_part(arguments, outputs):
+    distances, edges = outputs
+    assert ((edges[..., :-1] <= distances) & (distances <= edges[..., 1:])).all()
+
+
+def short(near, far):
+    """Shorter intervals round to either edge, and so do their gradients."""
+    return (0.0, 0.0) if (far - near > 1e-5 * near).all() else (FINITE, FINITE)
+
+
+@st.composite
+def near_and_far(draw):
+    near, length = draw(extremes(3, signed=False)), draw(extremes(3, signed=False))
+    return near, near + length
+
+
+def layers(rng, depth=3.0, n=128):
+    """Densities of about that optical depth in all, and lengths."""
+    return depth * rng.uniform(0.01, 2, (6, n)), rng.uniform(0.5, 1.5, (6, n)) / n
+
+
+def shares(rng, n=128):
+    weights = rng.uniform(0.1, 1, (6, n))
+    return 0.9 * weights / weights.sum(-1, keepdims=True)
+
+
+def along(rng, size):
+    """Weights, distances between 2 and 3 sizes, and the far side."""
+    return shares(rng), size * np.sort(rng.uniform(2, 3, (6, 128))), np.full(6, 3.0 * size)
+
+
+def add_up(arguments, outputs):
+    """Weights are no less than 0, and 1 with the residual transmittance."""
+    weights, residual = outputs
+    assert (weights >= 0).all()
+    close(weights.sum(-1) + residual, np.ones(len(residual)), rtol=0, atol=1e-6)
+
+
+@st.composite
+def marched(draw):
+    """Weights of any density along sorted distances, and the far side."""
+    distances = draw(sorted_distances(3, BINS + 2))
+    density, delta = draw(extremes(3, BINS, signed=False)), np.diff(distances[:, 1:])
+    return (
+        np.asarray(compositing.volume_weights(jnp.asarray(density), jnp.asarray(delta))[0]),
+        distances[:, 1:-1],
+        distances[:, -1],
+    )
+
+
+@st.composite
+def weighted(draw):
+    """Weights of any density, values and background of any size."""
+    density, values = draw(extremes(3, BINS, signed=False)), draw(extremes(3, BINS, 2))
+    background = draw(st.sampled_from([0, 1, -1e-30, 1e30]))
+    weights = compositing.volume_weights(jnp.asarray(density), jnp.ones((3, BINS)))[0]
+    return np.asarray(weights), values, np.full((3, 2), background, np.float32)
+
+
+def between(arguments, outputs):
+    """A distance lies between the first sample and the end."""
+    _, distances, far = arguments
+    slack = 2e-6 * far
+    assert ((outputs[0] >= distances[:, 0] - slack) & (outputs[0] <= far + slack)).all()
+
+
+def union_twin(coarse, fine, density, far):
+    """Of the sorted samples, put back in their places."""
+    distances = np.concatenate([coarse, fine])
+    order, weights = np.argsort(distances, kind="stable"), np.empty(len(distances))
+    weights[order], _ = reference.volume_weights(density[order], np.diff(np.append(distances[order], far)))
+    return weights
+
+
+def two_lists(rng):
+    """Coarse and fine distances, densities of both, the far side."""
+    return (*(np.sort(rng.uniform(-1, 1, (6, n))) for n in (5, 4)), rng.uniform(0, 3, (6, 9)), np.full(6, 1.5))
+
+
+# fmt: off
+RAYS = (
+    Law("stratified", middles, each(middles_twin, "(),()->(n),(m)"),
+        sizes("size of near and far", 1e-32, 1e36,
+        lambda rng, v: (v * rng.uniform(0.5, 1, 6), v * rng.uniform(1.5, 2, 6))), (0, 0),
+        Extremes((near_and_far(),), floors=short, rtol=2e-6, check=one_per_part)),
+    Law("interval_lengths", compositing.interval_lengths, lambda t, far: np.diff(t, append=far[:, None]),
+        usual(lambda rng: (np.sort(rng.uniform(0, 2, (6, 8))), np.full(6, 2.5))), (1, 0)),
+    Law("volume_weights", compositing.volume_weights, each(reference.volume_weights, "(n),(n)->(n),()"),
+        (Axis("optical depth of a ray", 1e-32, 1, 1e36, layers),
+        Axis("number of samples", 1, 64, 4096, lambda rng, n: layers(rng, n=int(n)))), (1, 1), floors=(0.0, 1.0),
+        extremes=Extremes((extremes(3, BINS, signed=False), extremes(3, BINS, signed=False)), rtol=1e-5,
+        atol=lambda *x: 1e-12, check=add_up)),
+    Law("composite", compositing.composite, each(reference.composite, "(n),(n,f),(f)->(f)"),
+        sizes("size of the colours", 1e-40, 1e36, lambda rng, v: (shares(rng), v * rng.uniform(0, 1, (6, 128, 3)),
+            np.ones((6, 3)))), (1, 2, 1), floors=(1.0,),
+        extremes=Extremes((weighted(),), floors=(0.0, 0.0, 1.0), rtol=0,
+        atol=lambda w, x, b: 2e-6 * max(np.abs(x).max(), np.abs(b).max()) + TINY)),
+    Law("expected_distance", compositing.expected_distance, lambda w, t, far: (w * t).sum(-1) + (1 - w.sum(-1)) * far,
+        sizes("size of the distances", 1e-32, 1e36, along), (1, 1, 0),
+        Extremes((marched(),), floors=lambda w, t, far: (float(far.max()), 1.0, 1.0), rtol=2e-6,
+        atol=lambda w, t, far: 2e-6 * far.max() + TINY, check=between)),
+    Law("union_weights", paper_method.union_weights, each(union_twin, "(c),(f),(n),()->(n)"), usual(two_lists), (1, 1, 1, 0)),
+)
+# fmt: on
+
+# volumes
+
+
+def cells(rng, n, resolution):
+    """Positions well inside voxels, away from their walls and centres' planes."""
+    cell = rng.integers(0, resolution, (*n, 3)) + rng.choice([0.25, 0.75], (*n, 3)) + rng.uniform(-0.2, 0.2, (*n, 3))
+    return cell * 2 / resolution - 1
+
+
+def scatter(features, positions, mask, like):
+    """Mean and occupancy in a volume of the size of another."""
+    return voxels.scatter_mean(jax.lax.stop_gradient(positions), features, mask > 0.5, len(like))
+
+
+def scatter_twin(features, positions, mask, like):
+    return reference.scatter_mean(positions, features, mask > 0.5, len(like))
+
+
+def points(rng, n, resolution, size=1.0):
+    """Features up to a size, positions, nine tenths of them real, and a volume that says the resolution."""
+    mask = np.tile(np.arange(n) % 10 != 9, (6, 1))
+    return size * rng.uniform(0, 1, (6, n, 1)), cells(rng, (6, n), resolution), mask, np.zeros([resolution] * 3)
+
+
+def lookup(rng, resolution, size=1.0):
+    return size * rng.normal(size=(*[resolution] * 3, 2)), cells(rng, (36,), resolution)
+
+
+def on_grid(positions):
+    """Positions whose place in a volume float32 computes without rounding, so that both precisions see one voxel."""
+    return np.where(np.abs(positions) < 8, np.round(positions * 2**20) / 2**20, positions).astype(np.float32)
+
+
+anywhere = st.one_of(
+    extremes(POINTS, 3), seeds.map(lambda seed: 1.3 * np.random.default_rng(seed).uniform(-1, 1, (POINTS, 3)))
+).map(on_grid)
+volumes = st.sampled_from([1, 4]).flatmap(lambda n: extremes(n, n, n, 2))
+masks = st.tuples(seeds, st.sampled_from([0, 0.5, 1])).map(
+    lambda drawn: np.float32(np.random.default_rng(drawn[0]).random(POINTS) < drawn[1])
+)
+# fmt: off
+VOLUMES = (
+    Law("scatter_mean", scatter, each(scatter_twin, "(n,f),(n,p),(n),(d,d,d)->(d,d,d,f),(d,d,d)"),
+        (Axis("size of the features", 1e-32, 1, 1e36, lambda rng, v: points(rng, 40, 4, v)),
+        Axis("points in one voxel", 1, 64, 512, lambda rng, n: points(rng, int(n), 1))), (2, 2, 1, None),
+        Extremes((extremes(POINTS, 2), anywhere, masks,
+            st.sampled_from([1, 4]).map(lambda n: np.zeros([n] * 3, np.float32))),
+        atol=lambda features, *others: 1e-6 * max(np.abs(features).max(), 1) + TINY)),
+    Law("trilinear", voxels.trilinear, each(reference.trilinear, "(d,d,d,f),(p)->(f)"),
+        (Axis("size of the features", 1e-32, 1, 1e36, lambda rng, v: lookup(rng, 8, v)),
+        Axis("voxels along an axis", 2, 32, 64, lambda rng, d: lookup(rng, int(d)))), (None, 1),
+        Extremes((volumes, anywhere), floors=lambda volume, at: (0.0, np.abs(volume).max()), rtol=0,
+        atol=lambda volume, at: 1e-6 * np.abs(volume).max() + TINY)),
+)
+# fmt: on
+
+# losses, metrics, pictures
+
+
+def r1(image, kernel):
+    """Penalty of the discriminator (image . kernel)^2 / 2."""
+    return losses.r1(lambda x: 0.5 * jnp.einsum("bhwc,hwc->b", x, kernel, precision="highest") ** 2, image)
+
+
+def images(rng, size, apart=1.0):
+    """Two images of that size, nowhere equal."""
+    image = rng.normal(size=(16, 16, 3))
+    return size * image, size * (image + apart * rng.uniform(0.1, 1, image.shape))
+
+
+def off_grey(rng, value):
+    """Images brighter than grey by about that much, and grey."""
+    grey = np.full((6, 16, 13, 3), 0.5)
+    return grey + value * rng.uniform(0.5, 1, grey.shape), grey
+
+
+def masked(rng):
+    """Two images, and about half of their pixels."""
+    return *off_grey(rng, 0.3), rng.uniform(size=(6, 16, 13))
+
+
+def decibel(image, other):
+    return -10 * np.log10(np.maximum(np.mean((image - other) ** 2, (-3, -2, -1)), 1e-10))
+
+
+def visible_decibel(image, other, mask):
+    return -10 * np.log10(np.maximum(np.mean((image - other)[mask > 0.5] ** 2), 1e-10))
+
+
+def ssim_twin(image, other):
+    options = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
+    return structural_similarity(other, image, data_range=1.0, channel_axis=-1, **options)
+
+
+def union_share(acc, alpha):
+    """Pixels that both hold among those that either does."""
+    ours, theirs = acc > 0.5, alpha > 0.5
+    return (ours & theirs).sum((-2, -1)) / (ours | theirs).sum((-2, -1))
+
+
+def sharpness_twin(image, other):
+    """The windowed spectrum beyond half of Nyquist, wave by wave."""
+    height, width = image.shape[:2]
+    window = np.outer(*(np.sin(np.pi * np.arange(n) / n) ** 2 for n in (height, width)))
+    rows, columns = (np.minimum(np.arange(n), n - np.arange(n)) / (n / 2) for n in (height, width))
+    high = np.hypot(rows[:, None], columns) >= 0.5
+    spectra = (np.fft.fft2((x - x.mean((0, 1))) * window[..., None], axes=(0, 1)) for x in (image, other))
+    ours, theirs = (np.sum(np.abs(spectrum[high]) ** 2) for spectrum in spectra)
+    return ours / theirs
+
+
+def quality(image, other, mask):
+    """All metrics; 0 where no pixel is visible."""
+    visible = metrics.conditional_psnr(image, other, mask > 0.5)
+    return metrics.psnr(image, other), jnp.where(jnp.isnan(visible), 0, visible), metrics.ssim(image, other)
+
+
+def quality_twin(image, other, mask):
+    """Where both images are bright and flat, float32 leaves three digits of their variances."""
+    visible = visible_decibel(image, other, mask) if (mask > 0.5).any() else 0.0
+    return decibel(image, other), visible, ssim_twin(image, other)
+
+
+@st.composite
+def pictures(draw):
+    """Two pictures in [0, 1], and a mask of none, some or all pixels."""
+    other, change = draw(extremes(12, 12, 3, high=0, signed=False)), draw(extremes(12, 12, 3, high=0))
+    mask = np.random.default_rng(draw(seeds)).random((12, 12)) < draw(st.sampled_from([0, 0.1, 1]))
+    return np.clip(other + change, 0, 1), other, np.float32(mask)
+
+
+# fmt: off
+LOSSES = (
+    Law("l1", losses.l1, lambda a, b: np.mean(np.abs(a - b)), sizes("difference", 1e-36, 1e32, images),
+        extremes=Extremes((extremes(2, 4, 3), extremes(2, 4, 3)))),
+    Law("mse", losses.mse, lambda a, b: np.mean((a - b) ** 2), sizes("difference", 1e-17, 1e17, images)),
+    Law("adversarial losses", lambda real, fake: (losses.generator_adversarial(fake),
+            losses.discriminator_adversarial(real, fake)),
+        lambda real, fake: (reference.softplus(-fake).mean(),
+        reference.softplus(-real).mean() + reference.softplus(fake).mean()),
+        usual(lambda rng: tuple(rng.normal(size=(2, 2, 5, 5, 1)))),
+        extremes=Extremes((extremes(2, 5), extremes(2, 5)))),
+    Law("r1", r1, lambda x, k: 0.5 * np.mean(np.einsum("bhwc,hwc->b", x, k) ** 2 * np.sum(k**2)),
+        sizes("size of the gradient", 1e-16, 1e16,
+        lambda rng, v: (rng.uniform(0.5, 1, (2, 8, 8, 3)), v**0.5 * rng.uniform(0.05, 0.1, (8, 8, 3))))),
+    Law("r1 of a square", lambda image: losses.r1(lambda x: jnp.sum(x**2, axis=(1, 2, 3)), image),
+        lambda image: 2 * (image**2).sum((1, 2, 3)).mean(), usual(around_zero(2, 4, 4, 3)),
+        extremes=Extremes((extremes(2, 4, 4, 3, low=-15, high=17),), rtol=1e-5)),
+    Law("area_downsample", lambda image: losses.area_downsample(image, 3),
+        each(partial(reference.area_downsample, size=3), "(h,w,c)->(s,s,c)"), usual(around_zero(6, 5, 7, 2)), (3,),
+        Extremes((extremes(5, 7, 3),), rtol=1e-5, atol=lambda image: 1e-6 * np.abs(image).max() + TINY),
+        agreement=1e-6),
+    Law("psnr", metrics.psnr, decibel, (Axis("difference", 0, 0.1, 1e17, off_grey),), (3, 3), floors=(1.0,)),
+    Law("conditional_psnr", lambda a, b, mask: metrics.conditional_psnr(a, b, mask > 0.5),
+        each(visible_decibel, "(h,w,c),(h,w,c),(h,w)->()"), usual(masked), (3, 3, 2)),
+    Law("ssim", metrics.ssim, each(ssim_twin, "(h,w,c),(h,w,c)->()"),
+        (Axis(*("contrast", 0.1, 0.1, 10), lambda rng, v: tuple(0.5 + v * rng.uniform(-1, 1, (2, 6, 16, 13, 3)))),),
+        (3, 3), floors=(1.0,)),
+    Law("opacity_iou", metrics.opacity_iou, union_share, usual(lambda rng: tuple(rng.uniform(size=(2, 6, 8, 8)))),
+        (2, 2)),
+    Law("high_frequency_ratio", metrics.high_frequency_ratio, each(sharpness_twin, "(h,w,c),(h,w,c)->()"),
+        usual(lambda rng: tuple(rng.uniform(size=(2, 6, 16, 13, 3)))), (3, 3)),
+    Law("metrics of pictures", quality, quality_twin,
+        usual(lambda rng: (*(0.5 + 0.4 * rng.uniform(-1, 1, (2, 12, 12, 3))), np.eye(12))),
+        extremes=Extremes((pictures(),), floors=(FINITE,) * 3, atol=lambda *x: 2e-3)),
+    Law("bilinear", lambda x: resizing.bilinear(x, 6, 9),
+        each(partial(reference.bilinear, height=6, width=9), "(h,w,c)->(a,b,c)"), usual(around_zero(2, 4, 6, 2))),
+    Law("doubled", resizing.doubled, lambda x: np.stack([reference.bilinear(one, 2 * x.shape[1],
+            2 * x.shape[2]) for one in x]), usual(around_zero(2, 3, 4, 2))),
+)
+# fmt: on
+
+# the paper's network
+
+
+def initial(module, x, *others):
+    """The ones and zeros that a normalisation starts with, in the format of x."""
+    return jax.tree.map(lambda leaf: leaf.astype(x.dtype), module.init(jax.random.key(0), x, *others))
+
+
+def batch_norm(x, mask):
+    """In training; and its running statistics, which have no gradient."""
+    inputs = (x, mask > 0.5, True)
+    out, updated = BatchNorm().apply(initial(BatchNorm(), *inputs), *inputs, mutable=["batch_stats"])
+    stats = jax.lax.stop_gradient(updated["batch_stats"])
+    return jnp.where(mask[:, None] > 0.5, out, 0), stats["mean"], stats["variance"]
+
+
+def batch_norm_twin(x, mask):
+    """A tenth of the way from 0 and 1 to the mean and the unbiased variance of what is real."""
+    real = mask > 0.5
+    normalised, mean, variance = reference.batch_norm(x[real])
+    out, count = np.zeros_like(x), max(real.sum(), 1)
+    out[real] = normalised
+    return out, 0.1 * mean, 0.9 + 0.1 * variance * count / max(count - 1, 1)
+
+
+def rounding_of_means(x, mask):
+    """A mean is rounded relative to its size, and the output counts in standard deviations."""
+    _, _, variance = reference.batch_norm(x[mask > 0.5])
+    size = np.abs(x).max()
+    return (
+        (1e-6 * size / np.sqrt(variance + 1e-5)).max() + 1e-6,
+        1e-6 * size + TINY,
+        1e-6 * np.float64(size) ** 2 + TINY,
+    )
+
+
+def moved_by(rng, value, shape, moved):
+    """Features of that spread, or of that mean and spread 1."""
+    return value + rng.normal(size=shape) if moved else value * rng.normal(size=shape)
+
+
+def spreads(shape, *others):
+    """How wide features are spread, and how far they lie from 0."""
+    return (
+        Axis("spread of the features", 1e-33, 1, 1e15, lambda rng, v: (moved_by(rng, v, shape, False), *others)),
+        Axis("mean over spread", 1, 1, 100, lambda rng, v: (moved_by(rng, v, shape, True), *others)),
+    )
+
+
+def render(volume, origins, directions, bias):
+    """Features, depth and opacity of rays through a volume by a small network; `bias` moves every density."""
+    config = PaperConfig(
+        field_width=8, num_features=4, direction_frequencies=1, sampling=SamplingConfig(num_coarse=16, num_fine=16)
+    )
+    module, rays = inference.network(config), Rays(origins=origins, directions=directions)
+    encoded, rng = Scene(volume=volume, occupied=jnp.ones(volume.shape[:-1], bool)), np.random.default_rng(7)
+    traced = partial(paper_method.trace, samples=config.sampling, options=AS_TRAINED, key=None)
+    shapes = jax.eval_shape(lambda: module.init(jax.random.key(0), encoded, rays, method=traced))
+
+    def draw(x):
+        weights = np.float32(rng.normal(size=x.shape) / max(int(np.prod(x.shape[:-1])), 1) ** 0.5)
+        return jnp.asarray(weights, volume.dtype)
+
+    variables = jax.tree.map(draw, shapes)
+    head = variables["params"]["field"]["head"]
+    # no gradient by the bias: one number for all rays, whose gradients would cancel
+    head["bias"] = head["bias"] + jnp.concatenate([jax.lax.stop_gradient(bias), jnp.zeros(3, bias.dtype)])
+    return tuple(traced(module.bind(variables), encoded, rays))
+
+
+def scene(rng, density=3.0, distance=3.0):
+    """A random volume of about that density, seen from that far away."""
+    origins, directions = towards_box(rng, distance)
+    bias = np.array([1 + (density if density > 30 else np.log(np.expm1(density)))])
+    return rng.normal(size=(1, 8, 8, 8, 16)), origins[None], directions[None], bias
+
+
+# fmt: off
+NETWORK = (
+    Law("BatchNorm", batch_norm, batch_norm_twin, spreads((256, 8), np.ones(256)),
+        extremes=Extremes((extremes(POINTS, 3, high=17), masks), rtol=1e-5, atol=rounding_of_means), smooth=False),
+    Law("GroupNorm", lambda x: GroupNorm(1).apply(initial(GroupNorm(1), x[None]), x[None])[0],
+        lambda x: reference.group_norm(x, 1, 1.0, 0.0), spreads((4, 4, 4, 4))),
+    Law("whole render", render, None, (Axis("density", 1e-30, 1, 1e30, scene),
+            Axis("distance of the camera", 1, 3, 10, lambda rng, v: scene(rng, distance=v))), floors=(1.0, 1.0, 1.0),
+        smooth=False),
+)
+# fmt: on
+
+LAWS = (*NUMBERS, *CAMERAS, *RAYS, *VOLUMES, *LOSSES, *NETWORK)
