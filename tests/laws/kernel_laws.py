@@ -315,7 +315,8 @@ RAYS = (
         sizes("size of the distances", 1e-32, 1e36, along), (1, 1, 0),
         Extremes((marched(),), floors=lambda w, t, far: (float(far.max()), 1.0, 1.0), rtol=2e-6,
         atol=lambda w, t, far: 2e-6 * far.max() + TINY, check=between)),
-    Law("union_weights", paper_method.union_weights, each(union_twin, "(c),(f),(n),()->(n)"), usual(two_lists), (1, 1, 1, 0)),
+    Law("union_weights", paper_method.union_weights, each(union_twin, "(c),(f),(n),()->(n)"), usual(two_lists),
+        (1, 1, 1, 0)),
 )
 # fmt: on
 
