@@ -26,7 +26,7 @@ def shrunken(monkeypatch):
 SETTING_UP = """
 import sys
 import jax
-from spnr_jax import cli; from spnr_jax.devices import allocator as memory
+from spnr_jax import cli; from spnr_jax.devices import runtime as memory
 memory.keep = lambda: print("kept", end=" ")
 cli.run_render = cli.run_evaluate = lambda command: None
 for line in sys.argv[1:]:

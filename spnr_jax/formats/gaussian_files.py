@@ -20,8 +20,8 @@ from jaxtyping import Float
 from spnr_jax.errors import UserError
 from spnr_jax.formats.images import check_place, write_whole
 from spnr_jax.formats.splat_files import COLOR_STEP, MAGIC
-from spnr_jax.gaussians.harmonics import degree_of, half_turn_signs
 from spnr_jax.kernels.records import Gaussians
+from spnr_jax.surfels.gaussians import degree_of, half_turn_signs
 
 SUFFIXES = (".ply", ".spz")
 LEAST_OPACITY, MOST_OPACITY = 1e-4, 1 - 1e-4  # that the logistic function is inverted for

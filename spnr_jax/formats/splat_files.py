@@ -16,7 +16,7 @@ import numpy as np
 from spnr_jax.errors import UserError
 from spnr_jax.formats.columns import Columns
 from spnr_jax.formats.mesh.file_colors import SRGB
-from spnr_jax.gaussians.harmonics import C0
+from spnr_jax.surfels.gaussians import C0
 
 MAGIC, VERSIONS = b"NGSP", (2, 3)  # of .spz
 PACKED = 9 + 1 + 3  # bytes of a splat up to its colour

@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 from scipy.spatial import cKDTree
 
 from spnr_jax.config import NetworkConfig, PaperConfig, RenderOptions, SamplingConfig, SurfelConfig
-from spnr_jax.devices.compilation import QUICK
+from spnr_jax.devices.runtime import QUICK
 from spnr_jax.errors import UserError
 from spnr_jax.kernels import cameras, cloud_arrays
 from spnr_jax.kernels.records import LARGEST_REACH, Camera, Key, Light, PointCloud, Rendering, Volume

@@ -12,7 +12,13 @@ Inputs and outputs are dicts of arrays, so no class of this package is needed wh
     camera      cam_to_world (3, 4) in the cloud's frame and unit, OpenGL axes; intrinsics (3, 3) in pixels
     picture     image (h, w, 3) sRGB on white; image_lr, depth, acc at the size of the volume rendering
 
-What differs for the default network, over surfels, stands in `surfel_export.py`.
+Of the default network (`encode_surfels`, `render_surfels`):
+
+    volume      the scene of `spnr_jax.encode`: surfels, spacing, centre, scale
+    light       tables (7, 32, 64, 3): those of `Light`, linear in the light, so sums and multiples are lights
+    picture     image (h, w, 3) sRGB on white; depth, acc (h, w); overflow (): above 0 the plan was too small
+
+The neighbors are found in the exported function, by all distances, a block of points at a time.
 """
 
 from collections.abc import Callable, Sequence
@@ -24,18 +30,77 @@ import jax.numpy as jnp
 import numpy as np
 from flax.serialization import from_state_dict, to_state_dict
 from jax import export
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from spnr_jax.errors import UserError
 from spnr_jax.formats.npz import packed
-from spnr_jax.kernels.records import LARGEST_REACH, Camera, PointCloud, Volume
-from spnr_jax.method import inference
+from spnr_jax.kernels.cloud_arrays import plain_cloud
+from spnr_jax.kernels.records import LARGEST_REACH, AnyArray, Camera, Light, PointCloud, Surfels, SurfelScene, Volume
+from spnr_jax.method import inference, surfel_renderer
 from spnr_jax.method.model import Model, Quality
 from spnr_jax.method.surfel_renderer import Plan
-from spnr_jax.surfels import lighting
-from spnr_jax.tools import surfel_export
+from spnr_jax.surfels import lighting, surfel_scenes
+from spnr_jax.surfels.rules import NEIGHBORS
+from spnr_jax.surfels.visibility import spiral
+
+RADIUS = 0.8  # of the ball in the box whose pictures the sizes are those of: as much surface as a cube has
+BLOCK = 256  # points whose distances to all are in memory at once
 
 Arrays = dict[str, Any]
+
+
+def encode_surfels(params: dict, cloud: Arrays) -> Arrays:
+    """The scene of a cloud as a dict of arrays; pure."""
+    points = PointCloud(**cloud)
+    near = nearest(points.positions, points.mask)
+    return dict(to_state_dict(surfel_scenes.encode(params, points, near)))
+
+
+def render_surfels(
+    params: dict | None, volume: Arrays, camera: Arrays, light: Arrays, *, size: int, plan: Plan
+) -> Arrays:
+    """The picture of a scene as a dict of arrays; pure."""
+    scene = SurfelScene(**volume | {"surfels": Surfels(**volume["surfels"])})
+    seen = Camera(**camera, height=size, width=size)
+    drawn = surfel_renderer.render(params, scene, seen, Light(**light), plan=plan)
+    return {name: getattr(drawn, name) for name in ("image", "depth", "acc", "overflow")}
+
+
+def nearest(positions: Float[AnyArray, "points 3"], mask: Bool[AnyArray, " points"]) -> Int[Array, "points 20"]:
+    """`spnr_jax.neighbors` in JAX: the nearest points of each, itself first, -1 for none, by all distances."""
+    positions, mask = jnp.asarray(positions), jnp.asarray(mask)
+    numbers = jnp.arange(len(mask))
+    count = min(NEIGHBORS, len(mask))
+
+    def of_one(number: Int[Array, ""]) -> Int[Array, " count"]:
+        apart = jnp.sum((positions - positions[number][None]) ** 2, axis=-1)
+        apart = jnp.where(mask, apart, jnp.inf).at[number].set(-1.0)
+        least, found = jax.lax.top_k(-apart, count)
+        return jnp.where(jnp.isfinite(least) & mask[number], found, -1).astype(jnp.int32)
+
+    found = jax.lax.map(of_one, numbers, batch_size=min(BLOCK, len(mask)))
+    return jnp.pad(found, ((0, 0), (0, NEIGHBORS - count)), constant_values=-1)
+
+
+def make_plan(model: Model, num_points: int, size: int) -> Plan:
+    """Sizes for pictures of any object of so many points from where `Model.camera` stands: with room to spare."""
+    ball = plain_cloud(np.asarray(RADIUS * spiral(num_points), np.float32))
+    scene = surfel_scenes.encode_in_box(ball)
+    made = surfel_renderer.plan(scene, model.camera(scene, resolution=size))
+    side = surfel_renderer.round_up(-(-size * made.side // 2**made.doublings) + surfel_renderer.MARGIN)
+    return made._replace(width=side, height=side, entries=2 * made.entries, slots=side * side)
+
+
+def cloud_shapes(num_points: int) -> Arrays:
+    """What `encode` takes."""
+    vectors, scalars = (jax.ShapeDtypeStruct((num_points, *axes), np.float32) for axes in ((3,), ()))
+    mask = jax.ShapeDtypeStruct((num_points,), np.bool_)
+    return {"positions": vectors, "base_color": vectors, "roughness": scalars, "metallic": scalars, "mask": mask}
+
+
+def light_shapes() -> Arrays:
+    """What `render` takes as its light."""
+    return {"tables": jax.ShapeDtypeStruct((7, lighting.HEIGHT, lighting.WIDTH, 3), np.float32)}
 
 
 def export_encode(model: Model, *, num_points: int = 1024, platforms: Sequence[str] | None = None) -> bytes:
@@ -46,15 +111,13 @@ def export_encode(model: Model, *, num_points: int = 1024, platforms: Sequence[s
     if num_points < 1:
         raise UserError(f"num_points must be at least 1, got {num_points}")
     if model.config.method == "surfels":
-        return _serialised(
-            partial(surfel_export.encode, model.params), platforms, surfel_export.cloud_shapes(num_points)
-        )
+        return _serialised(partial(encode_surfels, model.params), platforms, cloud_shapes(num_points))
 
     def encode(cloud: Arrays) -> Arrays:
         scene, centre, scale = _encode(model, cloud)
         return {"scene": to_state_dict(scene), "centre": centre, "scale": scale}
 
-    return _serialised(encode, platforms, surfel_export.cloud_shapes(num_points))
+    return _serialised(encode, platforms, cloud_shapes(num_points))
 
 
 def export_render(
@@ -84,11 +147,11 @@ def export_render(
     if model.config.method == "surfels":
         if quality == "balanced":
             raise UserError("balanced draws fewer pixels and enlarges them; export a smaller resolution")
-        sizes = plan or surfel_export.make_plan(model, num_points, size)
-        draw = partial(surfel_export.render, None if quality == "draft" else model.params, size=size, plan=sizes)
-        made = jax.eval_shape(partial(surfel_export.encode, model.params), surfel_export.cloud_shapes(num_points))
-        return _serialised(draw, platforms, made, camera, surfel_export.light_shapes())
-    scene, centre, scale = jax.eval_shape(partial(_encode, model), surfel_export.cloud_shapes(num_points=2))
+        sizes = plan or make_plan(model, num_points, size)
+        draw = partial(render_surfels, None if quality == "draft" else model.params, size=size, plan=sizes)
+        made = jax.eval_shape(partial(encode_surfels, model.params), cloud_shapes(num_points))
+        return _serialised(draw, platforms, made, camera, light_shapes())
+    scene, centre, scale = jax.eval_shape(partial(_encode, model), cloud_shapes(num_points=2))
 
     def render(volume: Arrays, camera: Arrays) -> Arrays:
         encoded = Volume(**volume | {"scene": from_state_dict(scene, volume["scene"])}, reach=reach)

@@ -20,7 +20,7 @@ from typing import Any
 
 import jax
 
-from spnr_jax.devices import machine
+from spnr_jax.devices import runtime
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.images import write_whole
 from spnr_jax.training.weights import Trained
@@ -57,7 +57,7 @@ class RunRecord:
             "version": version(),
             "commit": commit(),
             "jax": jax.__version__,
-            "hardware": machine.hardware(),
+            "hardware": runtime.hardware(),
             "data": str(dataset.folder),
             "data_checksum": checksum(dataset),
         }

@@ -8,14 +8,14 @@ from types import SimpleNamespace
 
 import pytest
 
-from spnr_jax.devices import allocator
+from spnr_jax.devices import runtime
 
 pytestmark = pytest.mark.ci  # it measures memory
 
 THREADS = 6
 CHILD = f"""
 import ctypes, os, sys, threading
-from spnr_jax.devices import allocator as memory
+from spnr_jax.devices import runtime as memory
 
 def arenas():
     libc = ctypes.CDLL("libc.so.6")
@@ -54,7 +54,7 @@ def test_threads_share_as_many_arenas_as_there_are_cores_when_they_are_asked_to(
 
 FAULTS = """
 import resource, sys
-from spnr_jax.devices import allocator as memory
+from spnr_jax.devices import runtime as memory
 
 if sys.argv[1] == "keep":
     memory.keep_arrays()
@@ -91,7 +91,7 @@ def test_freed_memory_goes_back(monkeypatch):
     monkeypatch.setattr(
         ctypes, "CDLL", lambda name: SimpleNamespace(malloc_trim=lambda keep: kept.append((name, keep)))
     )
-    allocator.give_back()
+    runtime.give_back()
     assert kept == [("libc.so.6", 0)]
 
 
@@ -101,6 +101,6 @@ def test_another_c_library_is_left_alone(monkeypatch):
 
     for library in (missing, lambda name: object()):
         monkeypatch.setattr(ctypes, "CDLL", library)
-        allocator.few_arenas()
-        allocator.keep()
-        allocator.give_back()
+        runtime.few_arenas()
+        runtime.keep()
+        runtime.give_back()

@@ -6,11 +6,11 @@ import sys
 
 PROGRAM = """
 import os, pathlib, sys
-from spnr_jax.devices import compilation
+from spnr_jax.devices import runtime
 os.environ["JAX_COMPILATION_CACHE_DIR"] = sys.argv[1]
 seen = []
 for cut in (True, False, False):
-    compilation.keep_programs()
+    runtime.keep_programs()
     import jax
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
     jax.clear_caches()

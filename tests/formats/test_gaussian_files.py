@@ -14,8 +14,7 @@ from support import splat_balls
 from spnr_jax.formats import gaussian_files
 from spnr_jax.formats.clouds import read_cloud
 from spnr_jax.formats.point_files import parse_ply
-from spnr_jax.gaussians.harmonics import C0
-from spnr_jax.gaussians.placing import rotations
+from spnr_jax.surfels.gaussians import C0, rotations
 
 NOTE = "ball.ply, drawn by spnr_jax (surfels), light: room"
 

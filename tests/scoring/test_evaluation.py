@@ -16,7 +16,7 @@ from spnr_jax.formats import data_sets
 from spnr_jax.kernels import metrics
 from spnr_jax.presets import PRESETS
 from spnr_jax.scoring import evaluation, floors
-from spnr_jax.scoring.perceptual import flip
+from spnr_jax.scoring.picture_scores import flip
 from spnr_jax.scoring.summary import METRICS
 from spnr_jax.training import checkpoint, optimisation, run_record, weights
 

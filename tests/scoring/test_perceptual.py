@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from support.laws import close, numbers
 
-from spnr_jax.scoring import perceptual
-from spnr_jax.scoring.perceptual import flip, lpips
+from spnr_jax.scoring import picture_scores
+from spnr_jax.scoring.picture_scores import flip, lpips
 
 IMAGE = np.asarray(numbers(0, 2, 3, 40, 36, 3, low=0.0))
 REFERENCE = np.clip(IMAGE + 0.3 * np.asarray(numbers(1, 2, 3, 40, 36, 3)), 0, 1)
@@ -35,9 +35,9 @@ def package(monkeypatch):
     found = types.SimpleNamespace(LPIPS=lambda net, verbose: Network())
     monkeypatch.setitem(sys.modules, "torch", torch)
     monkeypatch.setitem(sys.modules, "lpips", found)
-    perceptual.lpips_network.cache_clear()
+    picture_scores.lpips_network.cache_clear()
     yield found
-    perceptual.lpips_network.cache_clear()
+    picture_scores.lpips_network.cache_clear()
 
 
 def test_flip_is_a_number_a_picture_whatever_the_batch():
@@ -70,8 +70,8 @@ def test_lpips_is_missing_without_its_package_its_weights_or_enough_pixels(packa
         raise OSError("no way to the weights")
 
     monkeypatch.setattr(package, "LPIPS", offline)
-    perceptual.lpips_network.cache_clear()
+    picture_scores.lpips_network.cache_clear()
     assert lpips(IMAGE, REFERENCE) is None
     monkeypatch.setitem(sys.modules, "lpips", None)
-    perceptual.lpips_network.cache_clear()
+    picture_scores.lpips_network.cache_clear()
     assert lpips(IMAGE, REFERENCE) is None

@@ -12,8 +12,7 @@ from PIL import Image
 from support import tiny_dataset, tiny_untrained
 
 from spnr_jax.scoring import report
-from spnr_jax.scoring.report import GalleryRow, duration, psnr, write_report
-from spnr_jax.scoring.score_tables import label
+from spnr_jax.scoring.report import GalleryRow, duration, label, psnr, write_report
 from spnr_jax.scoring.summary import METRICS
 
 VOID = {"meta", "img", "br"}

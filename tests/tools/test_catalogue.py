@@ -13,7 +13,7 @@ from support import tiny_untrained
 from support.schedulers import in_this_process
 
 from spnr_jax.tools import catalogue, pictures
-from spnr_jax.tools.render_command import Render, is_catalogue
+from spnr_jax.tools.commands import Render, is_catalogue
 
 OPTIONS = {"views": 1, "resolution": 24, "num_points": 30, "up": "y", "turntable": "none", "outputs": ("image",)}
 NAMES = ("a/x.xyz", "b/x.npy", "b/x.xyz", "c d#.xyz")

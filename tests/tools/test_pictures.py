@@ -12,8 +12,7 @@ from support.gltf_files import CORNERS, GltfBuilder
 
 from spnr_jax.formats.up_axis import ROTATIONS
 from spnr_jax.tools import depth_maps, pictures, splat_making
-from spnr_jax.tools.light_options import Lighting
-from spnr_jax.tools.render_command import Render
+from spnr_jax.tools.commands import Lighting, Render
 from spnr_jax.training.weights import load
 
 OPTIONS = {"views": 2, "resolution": 24, "num_points": 30, "up": "y", "frames": 5}

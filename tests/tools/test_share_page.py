@@ -13,9 +13,9 @@ from PIL import Image
 from support import chromium as chromium_of
 from support import splat_balls, splat_twin
 
-from spnr_jax.gaussians.placing import rotations
+from spnr_jax.surfels.gaussians import rotations
 from spnr_jax.tools import splat_export
-from spnr_jax.tools.splat_options import Share, SplatMaking
+from spnr_jax.tools.commands import Share, SplatMaking
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install playwright")
 

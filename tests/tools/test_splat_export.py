@@ -8,10 +8,10 @@ from spnr_jax.formats import gaussian_files, images
 from spnr_jax.formats.clouds import read_cloud
 from spnr_jax.formats.mesh.meshes import load_mesh
 from spnr_jax.formats.point_files import parse_ply
-from spnr_jax.gaussians.placing import View
+from spnr_jax.surfels.gaussians import View
 from spnr_jax.surfels.visibility import spiral
 from spnr_jax.tools import mesh_export, splat_export, splat_making
-from spnr_jax.tools.light_options import Lighting
+from spnr_jax.tools.commands import Lighting
 
 pytestmark = pytest.mark.ci  # it makes splats with the network of the package
 

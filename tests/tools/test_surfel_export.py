@@ -15,7 +15,7 @@ import spnr_jax
 from spnr_jax import cli
 from spnr_jax.kernels import cloud_arrays
 from spnr_jax.surfels.lighting import room_light, sun
-from spnr_jax.tools import export, surfel_export
+from spnr_jax.tools import export
 
 POINTS, SIZE = 128, 32
 # what a stranger does: imports of ours and of Flax fail
@@ -69,7 +69,7 @@ def test_a_process_that_knows_jax_alone_draws_the_pictures_of_the_pure_functions
     np.savez(tmp_path / "camera.npz", **arrays(camera, "cam_to_world intrinsics"))
     np.savez(tmp_path / "sun.npz", tables=sun(40, 30).tables)
     subprocess.run([sys.executable, "-W", "error", "-c", STRANGER], cwd=tmp_path, capture_output=True, check=True)
-    plan = surfel_export.make_plan(model, POINTS, SIZE)
+    plan = export.make_plan(model, POINTS, SIZE)
     draw = jax.jit(spnr_jax.render, static_argnames="plan")
     pictures = []
     for name, light in (("light", room_light()), ("sun", sun(40, 30))):
@@ -85,7 +85,7 @@ def test_a_process_that_knows_jax_alone_draws_the_pictures_of_the_pure_functions
 @pytest.mark.parametrize("count", [1, 19, 110])
 def test_neighbors_found_in_jax_are_those_of_the_tree(count):
     points = cloud_arrays.pad(cloud(np.random.default_rng(count).normal(size=(count, 3))), POINTS)
-    found = np.asarray(surfel_export.nearest(points.positions, points.mask))
+    found = np.asarray(export.nearest(points.positions, points.mask))
     np.testing.assert_array_equal(found, spnr_jax.neighbors(points))
 
 

@@ -13,7 +13,7 @@ from spnr_jax.formats import clouds
 from spnr_jax.formats.light_files import NAMES, read_light
 from spnr_jax.kernels.records import Light
 from spnr_jax.method.model import Model
-from spnr_jax.tools.light_options import Lighting
+from spnr_jax.tools.commands import Lighting
 from spnr_jax.viewer import frame
 
 QUIET = {"choice": "room", "yaw": 0, "exposure": 0}

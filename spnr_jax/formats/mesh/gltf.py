@@ -17,7 +17,7 @@ from spnr_jax.formats.mesh.gltf_materials import GltfMaterial, read_material
 from spnr_jax.formats.mesh.gltf_nodes import INSTANCING, drawn_meshes
 from spnr_jax.formats.mesh.gltf_textures import BASIS, MOVED, WEBP
 from spnr_jax.formats.mesh.tolerance import Tolerance
-from spnr_jax.gaussians.harmonics import C0
+from spnr_jax.surfels.gaussians import C0
 
 MODES = {
     0: "POINTS",

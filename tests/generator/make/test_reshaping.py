@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.handmade import ball, box, checked_box_and_ball, plain
 
-from data_gen.make import reshaping
-from data_gen.make.reshaping import MOST_BEND, MOST_STRETCH, Reshaping, draw_reshaping, reshape
+from data_gen.make import augmentation
+from data_gen.make.augmentation import MOST_BEND, MOST_STRETCH, Reshaping, draw_reshaping, reshape
 from spnr_jax.formats.mesh.assets import Asset
 from spnr_jax.formats.mesh.surface_points import sample_surface
 
@@ -78,4 +78,4 @@ def test_the_draws_fill_their_ranges_and_the_seed_decides():
 def test_mirrors_stay_mirrors_and_the_roughest_stays(roughness):
     shape = reshape(Asset(parts=(box(material=plain(roughness=roughness)),)), draw_reshaping(3))
     assert shape.parts[0].material.roughness == roughness
-    assert reshaping.draw_reshaping(3).roughness_exponent != 1
+    assert augmentation.draw_reshaping(3).roughness_exponent != 1

@@ -8,7 +8,7 @@ import pytest
 from support.command_line import spnr_data
 from support.gltf_files import CORNERS, SQUARE, GltfBuilder
 
-from data_gen.plan.sources import abo
+from data_gen.plan import sources
 from data_gen.store import layout
 
 HEADER = "3dmodel_id,path,meshes,materials,textures,images,image_height_max,image_height_min,image_width_max,"
@@ -54,14 +54,14 @@ def download(tmp_path_factory):
 
 
 def test_the_metadata_say_what_a_product_is(download):
-    listed = abo.find_products(download)
+    listed = sources.find_products(download)
     assert [item.object_id for item in listed] == sorted([*PRODUCTS, "B00EXTRA01"])
     faults = {item.object_id: item.fault for item in listed if item.fault}
     assert faults == {
         "B00EXTRA01": "has no row in 3dmodels.csv.gz",
         PRODUCTS[-1]: f"3dmodels.csv.gz lists it, but there is no file 3dmodels/original/0/{PRODUCTS[-1]}.glb",
     }
-    inner = abo.find_products(download / "3dmodels")
+    inner = sources.find_products(download / "3dmodels")
     assert [item.path for item in inner] == [item.path for item in listed]
 
 
@@ -70,7 +70,7 @@ def test_a_table_that_is_not_compressed_reads_the_same(tmp_path):
     (tmp_path / "original" / "1").mkdir(parents=True)
     (tmp_path / "metadata" / "3dmodels.csv").write_text(rows(["B1"]))
     (tmp_path / "original" / "1" / "B1.glb").write_bytes(b"")
-    (only,) = abo.find_products(tmp_path)
+    (only,) = sources.find_products(tmp_path)
     assert (only.object_id, only.fault) == ("B1", "")
 
 
@@ -102,7 +102,7 @@ def test_a_damaged_table_is_one_line(tmp_path, content, expected):
     (tmp_path / "original").mkdir()
     (tmp_path / "metadata" / "3dmodels.csv.gz").write_bytes(content)
     with pytest.raises(ValueError, match=expected) as caught:
-        abo.find_products(tmp_path)
+        sources.find_products(tmp_path)
     assert "\n" not in str(caught.value)
 
 
@@ -155,4 +155,4 @@ def check_variant(out, details):
 def test_a_table_whose_paths_lead_elsewhere_is_refused(path, tmp_path):
     (tmp_path / "3dmodels.csv").write_text(f"3dmodel_id,path\na,{path}\n")
     with pytest.raises(ValueError, match="no file below"):
-        abo.read_table(tmp_path / "3dmodels.csv")
+        sources.read_table(tmp_path / "3dmodels.csv")

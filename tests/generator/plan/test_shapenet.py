@@ -8,8 +8,7 @@ from support.command_line import spnr_data
 from support.gltf_files import png
 
 from data_gen.__main__ import parse
-from data_gen.plan import tasks
-from data_gen.plan.sources import shapenet
+from data_gen.plan import sources, tasks
 from data_gen.store import layout
 from spnr_jax.formats.mesh.assets import RejectedAsset
 from spnr_jax.formats.mesh.meshes import load_mesh
@@ -67,7 +66,7 @@ PLACES = {2: ("models/model_normalized", "../images/texture 0.jpg"), 1: ("model"
 def add(root, category, name, version, opacity="1.000", texture=True, image=None):
     """Write one object in the layout of a version; its folder."""
     stem, named = PLACES[version]
-    folder = root / shapenet.SYNSETS[category] / name
+    folder = root / sources.SYNSETS[category] / name
     mesh = folder / f"{stem}.obj"
     mesh.parent.mkdir(parents=True)
     (folder / "images").mkdir()
@@ -84,12 +83,12 @@ def download(root, category, version, count=6):
         add(root, category, f"{number:032x}", version)
     add(root, category, "e" * 32, version, texture=False)
     add(root, category, "f" * 32, version, opacity="0.4")
-    (root / shapenet.SYNSETS[category] / "meshless" / "models").mkdir(parents=True)
+    (root / sources.SYNSETS[category] / "meshless" / "models").mkdir(parents=True)
     return root
 
 
 def load(folder):
-    (item,) = [item for item in shapenet.find_objects(folder.parent, "car") if item.folder == folder]
+    (item,) = [item for item in sources.find_objects(folder.parent, "car") if item.folder == folder]
     return load_mesh(item.path, item.folder)
 
 
@@ -143,8 +142,8 @@ def test_the_root_may_be_the_class_itself_and_other_classes_are_not_read(tmp_pat
     add(tmp_path, "plane", "a", 2)
     add(tmp_path, "chair", "b", 1)
     for root in (tmp_path, tmp_path / "02691156"):
-        assert [item.object_id for item in shapenet.find_objects(root, "plane")] == ["a"]
-    assert [item.object_id for item in shapenet.find_objects(tmp_path, "chair")] == ["b"]
+        assert [item.object_id for item in sources.find_objects(root, "plane")] == ["a"]
+    assert [item.object_id for item in sources.find_objects(tmp_path, "chair")] == ["b"]
 
 
 def test_another_folder_is_refused_with_what_was_expected_and_found(tmp_path, capsys):
@@ -173,7 +172,7 @@ def test_the_preset_makes_the_data_set(tmp_path, capsys, version, category):
     assert "neither models/model_normalized.obj" in reasons["meshless"]
     details = json.loads((out / "objects" / f"{3:032x}" / "object.json").read_text())
     assert details["category"] == category
-    assert details["source"]["file"] == f"{shapenet.SYNSETS[category]}/{3:032x}/{PLACES[version][0]}.obj"
+    assert details["source"]["file"] == f"{sources.SYNSETS[category]}/{3:032x}/{PLACES[version][0]}.obj"
     assert spnr_data("check", out) == 0
 
 

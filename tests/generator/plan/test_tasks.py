@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from data_gen.__main__ import parse
-from data_gen.make.description import describe
+from data_gen.make.generate import describe
 from data_gen.plan import data_presets, splits, tasks
 
 OUT = ["generate", "out"]

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from data_gen.procedural import aircraft_parts
+from data_gen.procedural import planes
 from data_gen.shapes import primitives
-from data_gen.shapes.outlines import circle, curve, rounded_rectangle, superellipse
+from data_gen.shapes.primitives import circle, curve, rounded_rectangle, superellipse
 
 BENT = np.column_stack([np.zeros(9), np.linspace(0, 1, 9), 0.2 * np.sin(np.linspace(0, 3, 9))])
 SHEET = np.stack([*np.meshgrid(np.linspace(-1, 1, 5), np.linspace(0, 1, 4)), np.zeros((4, 5))], axis=-1)
@@ -22,7 +22,7 @@ CLOSED = {
     "superellipsoid": lambda: primitives.superellipsoid((1, 2, 3), 0.4, 0.3),
     "shell": lambda: primitives.shell(SHEET + [0, 0, 0.1] * SHEET[..., :1] ** 2, 0.1),
     "moulding": lambda: primitives.moulding(1.0, 0.7, [(0, 0), (0.1, 0), (0.1, 0.02), (0, 0.05)]),
-    "wing": lambda: aircraft_parts.surface((0, 0, 0.1), (0.5, 0.05, 0), (0.2, 0.1), 0.13, sections=3),
+    "wing": lambda: planes.surface((0, 0, 0.1), (0.5, 0.05, 0), (0.2, 0.1), 0.13, sections=3),
     "turned and mirrored": lambda: primitives.mirror(primitives.turn(primitives.lathe([(0.2, 0), (0.1, 1)]), "x", 40)),
 }
 
