@@ -7,6 +7,8 @@ import tomllib
 from collections import Counter
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("spnr_jax", "data_gen", "experiments")
 SOURCES = [path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))]
@@ -60,6 +62,7 @@ def test_importing_the_package_is_light_and_its_kernels_are_one_module_under_bot
     modules_after("; ".join(same))
 
 
+@pytest.mark.ci  # it draws one in a process of its own
 def test_a_picture_needs_neither_the_paper_s_network_nor_what_trains_or_compares():
     code = (
         "import numpy as np, spnr_jax; spnr_jax.read_cloud; model = spnr_jax.load(); points = np.eye(3, dtype='f'); "
@@ -68,6 +71,7 @@ def test_a_picture_needs_neither_the_paper_s_network_nor_what_trains_or_compares
         "model.render(volume, model.camera(volume, resolution=16), 'draft')"
     )
     loaded = modules_after(code)
+    loaded |= modules_after("import spnr_jax.formats.clouds, spnr_jax.tools.pictures, spnr_jax.scoring.report") & HEAVY
     assert not {name.split(".")[0] for name in loaded} & (HEAVY | {"optax", "orbax", "data_gen", "experiments"})
     files = {".".join(path.relative_to(ROOT).with_suffix("").parts) for path in SOURCES}
     drawing = loaded & files - {"spnr_jax.training.weights"}

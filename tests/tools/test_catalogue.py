@@ -226,12 +226,6 @@ def test_a_worker_that_does_not_see_a_file_ends_the_run_with_its_name(tmp_path):
         catalogue.draw_item(catalogue.Batch(options=options, digest=""), item)
 
 
-def test_a_file_that_is_gone_when_its_turn_comes_is_left_out(tmp_path):
-    batch = catalogue.Batch(options=command(tmp_path, tmp_path / "out"), digest="")
-    item = catalogue.Item(name="x.xyz", cloud=tmp_path / "x.xyz")
-    assert "there is no such file" in catalogue.draw_item(batch, item)
-
-
 def test_the_digest_follows_options_and_networks_and_not_where_they_work(tmp_path):
     network = tmp_path / "network.npz"
     network.write_bytes(b"one")
@@ -241,15 +235,3 @@ def test_the_digest_follows_options_and_networks_and_not_where_they_work(tmp_pat
     assert catalogue.digest(dataclasses.replace(options, views=3)) != first
     network.write_bytes(b"two")
     assert catalogue.digest(options) != first
-
-
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [({"workers": 0}, "--workers must be at least 1"), ({"workers": 2, "cluster": "tcp://a:1"}, "without --cluster")],
-)
-def test_workers_that_make_no_sense_are_refused(options, words, tmp_path):
-    with pytest.raises(ValueError, match=words):
-        command(tmp_path, tmp_path / "out", **options)
-    (tmp_path / "x.xyz").write_text("0 0 0\n")
-    with pytest.raises(ValueError, match="a single file"):
-        list(pictures.render_file(command(tmp_path / "x.xyz", tmp_path / "out", workers=2), print))

@@ -96,11 +96,3 @@ def test_what_few_pictures_are_against_stays(axes):
     spoilt = [view._replace(depth=np.full_like(view.depth, np.nan)) for view in seen[: mesh_export.AGREE - 1]]
     grid = fused([*spoilt, *seen[mesh_export.AGREE - 1 :]])
     assert (grid.values[np.linalg.norm(axes, axis=-1) < RADIUS - DEEP] == 1).all()
-
-
-def test_what_leaves_every_picture_is_outside():
-    far = np.array([[0.0, 0.0, 2.9], [2.9, 0.0, 0.0], [0.0, 2.9, 0.0]], np.float32)
-    seen = views(ball)
-    cameras = jax.tree.map(lambda *x: jnp.stack(x), *(view.camera for view in seen))
-    depth = jnp.stack([jnp.nan_to_num(view.depth, nan=jnp.inf) for view in seen])
-    assert (np.asarray(mesh_export._solid(cameras, depth, jnp.float32(0.1), far)) == 0).all()

@@ -55,20 +55,6 @@ def test_stills_depth_opacity_and_a_turntable_of_the_asked_frames_are_written(tm
     ]
 
 
-def test_a_name_with_dots_keeps_every_view(tmp_path):
-    rendered(cloud_file(tmp_path, "chair.v2.xyz"), tmp_path / "out", turntable="none")
-    assert names(tmp_path / "out") == {name.replace("chair", "chair.v2") for name in STILLS}
-
-
-def test_the_views_are_different_and_the_same_again_at_the_second_time(tmp_path):
-    cloud = cloud_file(tmp_path)
-    for out in ("a", "b"):
-        rendered(cloud, tmp_path / out)
-    files = {name: (tmp_path / "a" / name).read_bytes() for name in names(tmp_path / "a")}
-    assert files == {name: (tmp_path / "b" / name).read_bytes() for name in names(tmp_path / "b")}
-    assert files["chair_000_depth.png"] != files["chair_001_depth.png"]
-
-
 def test_a_file_turned_and_moved_gives_the_same_pictures_and_cameras_that_moved_with_it(tmp_path):
     turn, shift = np.array(ROTATIONS["z"], float), np.array([16.0, -4.0, 2.0])
     points = np.round(np.random.default_rng(0).uniform(-1, 1, (30, 3)) * 64) / 64  # exact in float32, also moved
@@ -128,11 +114,6 @@ def test_the_mesh_is_written_in_the_frame_of_the_file(tmp_path, monkeypatch):
     np.testing.assert_allclose(bounds.mean(axis=0), [100, 200, 300], atol=1.5)
 
 
-def test_no_views_and_no_turntable_write_nothing(tmp_path):
-    rendered(cloud_file(tmp_path), tmp_path / "out", views=0, turntable="none")
-    assert not (tmp_path / "out").exists()
-
-
 @pytest.mark.parametrize(("choice", "words"), [("opaque", "drawn as opaque"), ("skip", "left out")])
 def test_transparent_parts_of_a_mesh_are_drawn_or_left_out_as_asked(tmp_path, choice, words):
     builder = GltfBuilder()
@@ -141,23 +122,6 @@ def test_transparent_parts_of_a_mesh_are_drawn_or_left_out_as_asked(tmp_path, ch
     path = builder.write(tmp_path / "a.glb")
     lines = rendered(path, tmp_path / "out", views=0, turntable="none", transparent_parts=choice)
     assert [words in line for line in lines if line.startswith("transparent parts")] == [True]
-
-
-@pytest.mark.parametrize(
-    ("option", "expected"),
-    [
-        ({"elevation": 91.0}, "--elevation must be -90 to 90 degrees, got 91"),
-        ({"grid_resolution": 4}, "--grid-resolution must be 8 to 512, got 4"),
-        ({"views": -1}, "--views must not be negative, got -1"),
-        ({"frames": 0}, "--frames must be at least 1, got 0"),
-        ({"num_points": 0}, "--num-points must be at least 1, got 0"),
-        ({"resolution": 18}, "--resolution must be a multiple of 4 of at least 16, got 18"),
-        ({"resolution": 8}, "--resolution must be a multiple of 4 of at least 16, got 8"),
-    ],
-)
-def test_options_without_sense_are_refused_by_their_name_before_anything_is_read(option, expected, tmp_path):
-    with pytest.raises(ValueError, match=expected):
-        rendered(tmp_path / "missing.xyz", tmp_path / "out", **option)
 
 
 # the light

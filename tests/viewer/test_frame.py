@@ -57,8 +57,7 @@ def test_a_camera_from_which_nothing_can_be_drawn_is_no_view(changed):
 
 def test_the_browsers_cameras_look_ahead_with_y_down():
     seen = frame.read_view([1, 0, 0, 0], [0, 0, -3], 0.7, 60, 40)
-    np.testing.assert_allclose(seen.rotation[:, 2], [0, 0, -1], atol=1e-12)
-    np.testing.assert_allclose(seen.rotation[:, 1], [0, -1, 0], atol=1e-12)
+    np.testing.assert_allclose(seen.rotation[:, 1:], [[0, 0], [-1, 0], [0, -1]], atol=1e-12)
     assert canvas(view=seen)[20, 30].min() < 200, "the object lies ahead"
 
 
@@ -189,14 +188,6 @@ def test_a_map_of_the_command_line_is_in_the_list_under_its_name(monkeypatch):
 )  # fmt: skip
 def test_of_a_browsers_file_name_only_its_last_part_is_shown(name, shown):
     assert frame.display_name(name) == shown
-
-
-def test_an_uploaded_file_is_read_in_a_temporary_folder_that_is_gone_afterwards(tmp_path, monkeypatch):
-    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    content = "\n".join(f"{x} {x * x} 0" for x in range(30)).encode()
-    cloud = frame.read_upload("../../up.xyz", content, clouds.read_cloud)
-    assert len(cloud.positions) == 30
-    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(

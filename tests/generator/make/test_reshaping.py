@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.handmade import ball, box, checked_box_and_ball, plain
+from support.handmade import ball, box
 
-from data_gen.make import augmentation
 from data_gen.make.augmentation import MOST_BEND, MOST_STRETCH, Reshaping, draw_reshaping, reshape
 from spnr_jax.formats.mesh.assets import Asset
 from spnr_jax.formats.mesh.surface_points import sample_surface
@@ -43,16 +42,6 @@ def test_the_points_of_the_new_shape_are_on_the_mapped_surface_with_its_normals(
     assert cosine.min() > 0.995
 
 
-def test_without_a_change_nothing_changes():
-    asset = checked_box_and_ball()
-    same = reshape(asset, Reshaping(stretch=np.ones(3), degrees=0.0, roughness_exponent=1.0))
-    for before, after in zip(asset.parts, same.parts, strict=True):
-        np.testing.assert_array_equal(after.positions, before.positions)
-        np.testing.assert_array_equal(after.faces, before.faces)
-        np.testing.assert_array_equal(after.material.base_color, before.material.base_color)
-        np.testing.assert_allclose(after.material.roughness, before.material.roughness, rtol=1e-6)
-
-
 def test_a_quarter_turn_takes_front_to_right_and_a_mirror_takes_right_to_left():
     turn = Reshaping(stretch=np.ones(3), degrees=90.0, roughness_exponent=1.0)
     np.testing.assert_allclose(turn.matrix() @ [0, 0, 1], [1, 0, 0], atol=1e-12)
@@ -72,10 +61,3 @@ def test_the_draws_fill_their_ranges_and_the_seed_decides():
     assert 1 / MOST_BEND <= exponents.min() < 0.6
     assert 1.6 < exponents.max() <= MOST_BEND
     assert drawn[7].describe() == draw_reshaping(7).describe()
-
-
-@pytest.mark.parametrize("roughness", [0.0, 1.0])
-def test_mirrors_stay_mirrors_and_the_roughest_stays(roughness):
-    shape = reshape(Asset(parts=(box(material=plain(roughness=roughness)),)), draw_reshaping(3))
-    assert shape.parts[0].material.roughness == roughness
-    assert augmentation.draw_reshaping(3).roughness_exponent != 1

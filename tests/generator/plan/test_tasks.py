@@ -182,14 +182,6 @@ def test_the_presets_hold_the_papers_numbers():
     assert data_presets.shapenet_chair(Path("x")).test_objects == 105
 
 
-def test_an_unknown_preset_or_class_is_refused_and_the_known_are_named(capsys):
-    for arguments, known in ((["--preset", "abc"], "shapenet_chair"), (["--category", "boat"], "plane")):
-        with pytest.raises(SystemExit) as stopped:
-            parse([*OUT, *arguments])
-        assert stopped.value.code == 2
-        assert known in capsys.readouterr().err
-
-
 def test_meshes_are_the_same_source_by_either_name_and_go_with_procedural_objects(tmp_path):
     for name in ("b.ply", "a.glb"):
         (tmp_path / name).write_bytes(b"")

@@ -78,14 +78,6 @@ def test_a_procedural_object_is_made_again_from_its_record(task):
         np.testing.assert_array_equal(part.material.base_color, expected.material.base_color)
 
 
-def test_points_spread_evenly_are_compared_with_such_points():
-    asset, details, drawn = made(PROCEDURAL[0])
-    even = surface_points.sample_surface(asset, len(drawn), details["seeds"]["points"], "even").positions
-    assert objects.original(details, SEED, even, spread="even").parts
-    with pytest.raises(ValueError, match="its points do not lie on the mesh"):
-        objects.original(details, SEED, even)
-
-
 def test_a_record_from_before_there_were_variants_is_understood():
     _, details, stored = made(PROCEDURAL[0])
     assert objects.original({k: v for k, v in details.items() if k not in ("product", "variant")}, SEED, stored)

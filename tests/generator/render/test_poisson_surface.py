@@ -117,21 +117,6 @@ def test_a_sphere_of_points_is_a_closed_sphere_that_faces_outwards_in_the_colour
     np.testing.assert_array_equal(part.material.base_color, 1)
 
 
-@needs_solver
-def test_the_same_points_give_the_same_surface():
-    first, again = (poisson_surface.reconstruct(SPHERE, QUICK).parts[0] for _ in range(2))
-    np.testing.assert_array_equal(first.positions, again.positions)
-    np.testing.assert_array_equal(first.faces, again.faces)
-
-
-@needs_solver
-def test_points_in_a_plane_give_a_flat_sheet():
-    positions = np.random.default_rng(4).uniform(-0.6, 0.6, (300, 3)) * [1, 1, 0]
-    (part,) = poisson_surface.reconstruct(cloud_of(positions), QUICK).parts
-    assert len(part.faces)
-    assert np.abs(part.positions[:, 2]).max() < 0.01
-
-
 def test_a_missing_solver_is_one_line_that_says_what_to_install(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "pymeshlab", None)
     with pytest.raises(ValueError, match=r"^Poisson[^\n]*pip install[^\n]*baselines[^\n]*$"):

@@ -74,12 +74,6 @@ def test_volumes_are_those_of_the_closed_forms():
     assert volume(fine) == pytest.approx(4 / 3 * np.pi * 6, rel=3e-3)
 
 
-def test_lathe_of_a_straight_line_has_the_area_of_a_cylinder():
-    mesh = primitives.cylinder(0.5, 2.0, segments=400)
-    area = np.linalg.norm(face_area_vectors(mesh.positions, mesh.faces), axis=1).sum()
-    assert area == pytest.approx(2 * np.pi * 0.5 * 2 + 2 * np.pi * 0.25, rel=1e-4)
-
-
 def test_bevels_take_away_volume_and_never_leave_the_box():
     plain, cut, rounded = (primitives.box((0.3, 0.2, 0.5), *edge) for edge in ((0.0,), (0.04, 1), (0.04, 3)))
     assert volume(cut) < volume(rounded) < volume(plain)
@@ -118,11 +112,6 @@ def test_turn_is_counter_clockwise_seen_from_the_positive_end_of_the_axis():
     mesh = primitives.Mesh(np.eye(3), np.array([[0, 1, 2]]), np.eye(3), np.zeros((3, 2)))
     np.testing.assert_allclose(primitives.turn(mesh, "y", 90).positions, [[0, 0, -1], [0, 1, 0], [1, 0, 0]], atol=1e-12)
     np.testing.assert_allclose(primitives.turn(mesh, "x", 90).normals, [[1, 0, 0], [0, 0, 1], [0, -1, 0]], atol=1e-12)
-
-
-def test_curve_passes_through_its_control_points():
-    points = np.array([(0, 0), (1, 2), (3, 1), (4, 4)], float)
-    np.testing.assert_allclose(curve(points, 3 * 5 + 1)[::5], points, atol=1e-12)
 
 
 def test_smooth_normals_do_not_reach_from_one_open_end_of_a_sheet_to_the_other():

@@ -119,13 +119,6 @@ def test_a_finished_object_is_not_written_again(place):
     assert not layout.has_object(place, "other")
 
 
-def test_of_two_writers_at_once_the_first_to_finish_is_kept(tmp_path):
-    layout.write_object(tmp_path, "made_up", made_up_record(seed=0))
-    before = content(tmp_path)
-    storage.write_and_rename(tmp_path / "objects/made_up", layout.object_files(made_up_record(seed=1)))
-    assert content(tmp_path) == before
-
-
 def test_a_folder_that_is_no_object_is_in_the_way_and_said_to_be(tmp_path):
     (tmp_path / "objects/made_up/notes").mkdir(parents=True)
     assert layout.completed_objects(tmp_path) == set()
