@@ -38,6 +38,7 @@ def workplace(tmp_path, monkeypatch):
     (tmp_path / "runs" / "demo" / "paper").symlink_to(tiny_untrained.run())
     shutil.copy(tiny_dataset.dataset().folder / "objects" / "chair" / "points.ply", tmp_path / "chair.ply")
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(weights, "shipped", tiny_surfels.shipped)
     return tmp_path
 
 
@@ -52,20 +53,24 @@ def execute(path):
     return names
 
 
+def check_gradient(tree, which=all):
+    """Every leaf is finite, and the value depends on all of them, or on any."""
+    leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(tree)]
+    assert all(np.isfinite(leaf).all() for leaf in leaves)
+    assert which(np.any(leaf) for leaf in leaves)
+
+
 @pytest.mark.ci
-def test_the_readmes_example_draws_pictures_and_has_a_gradient(workplace, monkeypatch):
-    monkeypatch.setattr(weights, "shipped", tiny_surfels.shipped)
+def test_the_readmes_example_draws_pictures_and_has_a_gradient(workplace):
     names = execute(ROOT / "README.md")
-    pictures, by_color = np.asarray(names["images"]), np.asarray(names["by_color"])
+    pictures = np.asarray(names["images"])
     assert pictures.shape == (2, 128, 128, 3)
     assert np.abs(pictures[0] - pictures[1]).max() > 0.05, "two lights"
-    assert np.isfinite(by_color).all()
-    assert np.any(by_color)
+    check_gradient(names["by_color"])
 
 
 @pytest.mark.ci
-def test_the_examples_of_the_api_run_in_their_order(workplace, monkeypatch):
-    monkeypatch.setattr(weights, "shipped", tiny_surfels.shipped)
+def test_the_examples_of_the_api_run_in_their_order(workplace):
     names = execute(DOCS / "api.md")
     assert int(names["state"].step) == 1
     assert "paper" in names["outcome"].summary["methods"]
@@ -86,16 +91,13 @@ def test_the_example_without_this_package_runs_on_what_the_command_writes(workpl
 
 
 @pytest.mark.ci
-def test_the_examples_of_differentiable_rendering_give_gradients_and_pictures_that_differ(workplace, monkeypatch):
-    monkeypatch.setattr(weights, "shipped", tiny_surfels.shipped)
+def test_the_examples_of_differentiable_rendering_give_gradients_and_pictures_that_differ(workplace):
     names = execute(DOCS / "differentiable.md")
     pictures = np.asarray(names["pictures"])
     assert pictures.shape == (2, 3, 64, 64, 3)
     assert pictures.std(axis=(0, 1)).max() > 0.01
     for name in ("by_color", "by_positions", "by_camera", "by_light"):
-        leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(names[name])]
-        assert all(np.isfinite(leaf).all() for leaf in leaves)
-        assert all(np.any(leaf) for leaf in leaves), f"{name}: nothing depends on it"
+        check_gradient(names[name])
 
 
 def test_the_lights_of_the_page_about_them_are_made_as_it_says():
@@ -106,7 +108,6 @@ def test_the_lights_of_the_page_about_them_are_made_as_it_says():
 
 @pytest.mark.ci
 def test_a_method_and_losses_of_ones_own_work_as_their_page_shows_them(workplace, monkeypatch):
-    monkeypatch.setattr(weights, "shipped", tiny_surfels.shipped)
     monkeypatch.setattr(data_sets, "check_resolution", lambda *_: None)  # the demo's pictures are larger than these
     for registry in (methods.METHODS, PRESETS):
         monkeypatch.setitem(registry, "mean_color", None)  # is put back as it was: absent
@@ -114,9 +115,7 @@ def test_a_method_and_losses_of_ones_own_work_as_their_page_shows_them(workplace
     names = execute(DOCS / "own_network.md")
     assert np.isfinite(names["values"]).all()
     assert np.all(np.asarray(names["params"]["weight"]) != 0.5), "three steps change the weights"
-    gradient = [np.asarray(leaf) for leaf in jax.tree.leaves(names["by_weights"])]
-    assert all(np.isfinite(leaf).all() for leaf in gradient)
-    assert any(np.any(leaf) for leaf in gradient)
+    check_gradient(names["by_weights"], any)
 
 
 def test_the_signatures_that_the_api_shows_are_those_of_the_code():

@@ -146,20 +146,6 @@ def test_an_empty_split_is_an_error_that_names_it(split, expected, tmp_path):
         evaluation.evaluate(tiny_untrained.run(), data_sets.open_dataset(copy), say=lambda line: None)
 
 
-def test_any_number_of_methods_see_the_same_objects_and_are_scored_alike():
-    def half(cloud, camera):
-        size = (len(camera.cam_to_world), camera.height, camera.width)
-        return evaluation.Pictures(image=jnp.full((*size, 3), 0.5), acc=jnp.ones(size))
-
-    asked = {"grey": half, "also grey": half, "white": evaluation.floor("white")}
-    scores, gallery = evaluation.score_methods(asked, CONFIG, tiny_dataset.dataset(), NAMES, 1, print)
-    assert list(scores) == list(NAMES)
-    for by_method in scores.values():
-        assert list(by_method) == list(asked)
-        close(by_method["grey"], by_method["also grey"])
-    assert [result.name for result in gallery] == [NAMES[0]]
-
-
 def test_an_lpips_that_can_be_measured_is_in_the_scores_of_each_method(monkeypatch):
     monkeypatch.setattr(evaluation, "lpips", lambda image, reference: np.abs(image - reference).mean(axis=(1, 2, 3)))
     asked = {"white": evaluation.floor("white")}

@@ -124,20 +124,6 @@ def test_a_bad_file_is_listed_with_its_reason_and_the_others_are_drawn(clouds, t
     assert "<b>" not in page
 
 
-def test_something_unexpected_in_one_file_is_its_own_reason(clouds, tmp_path, monkeypatch, capsys):
-    ready = pictures.made_ready
-
-    def fail(options, *others):
-        if options.cloud.suffix == ".npy":
-            raise KeyError("thing")
-        return ready(options, *others)
-
-    monkeypatch.setattr(catalogue, "made_ready", fail)
-    render(clouds, tmp_path / "out")
-    assert set(stills(tmp_path / "out")) == all_of(set(NAMES) - {"b/x.npy"})
-    assert "unexpected KeyError: 'thing'" in capsys.readouterr().err
-
-
 def test_a_folder_of_which_nothing_can_be_drawn_is_refused_and_so_is_one_without_clouds(tmp_path):
     (tmp_path / "in").mkdir()
     with pytest.raises(ValueError, match=r"in: there is no file of one of \.ply"):

@@ -5,13 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import trimesh
 from PIL import Image
 from support import tiny_surfels, tiny_untrained
-from support.gltf_files import CORNERS, GltfBuilder
 
 from spnr_jax.formats.up_axis import ROTATIONS
-from spnr_jax.tools import depth_maps, pictures, splat_making
+from spnr_jax.tools import pictures
 from spnr_jax.tools.commands import Lighting, Render
 from spnr_jax.training.weights import load
 
@@ -100,28 +98,6 @@ def test_a_transparent_still_has_an_alpha_channel_and_chosen_outputs_alone_are_w
     rendered(cloud_file(tmp_path), out, turntable="none", outputs=("image",), transparent=True)
     assert names(out) == {"chair_000.png", "chair_001.png", "chair_cameras.json"}
     assert shown(out / "chair_000.png").shape == (24, 24, 4)
-
-
-@pytest.mark.ci
-def test_the_mesh_is_written_in_the_frame_of_the_file(tmp_path, monkeypatch):
-    monkeypatch.setattr(depth_maps, "HIT", 1e-3)  # the tests' network is untrained: all fog
-    monkeypatch.setattr(splat_making.fitting_cameras, "__defaults__", (12, 24))
-    np.save(tmp_path / "chair.npy", np.random.default_rng(0).uniform(-1, 1, (40, 3)) * [1, 2, 3] + [100, 200, 300])
-    out = tmp_path / "out"
-    rendered(tmp_path / "chair.npy", out, views=0, turntable="none", up="z", mesh=True, grid_resolution=9)
-    assert names(out) == {"chair_mesh.glb"}
-    bounds = trimesh.load(out / "chair_mesh.glb").bounds
-    np.testing.assert_allclose(bounds.mean(axis=0), [100, 200, 300], atol=1.5)
-
-
-@pytest.mark.parametrize(("choice", "words"), [("opaque", "drawn as opaque"), ("skip", "left out")])
-def test_transparent_parts_of_a_mesh_are_drawn_or_left_out_as_asked(tmp_path, choice, words):
-    builder = GltfBuilder()
-    glass = builder.material(name="glass", alphaMode="BLEND", pbrMetallicRoughness={"baseColorFactor": [1, 0, 0, 0.1]})
-    builder.mesh(builder.primitive(material=glass), builder.primitive(positions=2 - CORNERS))
-    path = builder.write(tmp_path / "a.glb")
-    lines = rendered(path, tmp_path / "out", views=0, turntable="none", transparent_parts=choice)
-    assert [words in line for line in lines if line.startswith("transparent parts")] == [True]
 
 
 # the light

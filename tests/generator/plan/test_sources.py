@@ -153,15 +153,10 @@ def test_the_preset_of_abo_makes_the_data_set_with_variants_of_training_products
 
 def check_variant(out, details):
     """The variant's colours are its product's, rotated; its views and points are its own."""
-    assert details["id"] == f"{details['product']}--{details['variant']}"
-    folders = [out / "objects" / details[key] for key in ("product", "id")]
-    original, variant = (layout.read_object(folder) for folder in folders)
+    original, variant = (layout.read_object(out / "objects" / details[key]) for key in ("product", "id"))
     matrix = np.array(details["colour_rotation"]["matrix"])
     assert original.transforms != variant.transforms
     assert details["seeds"] != original.details["seeds"]
-    flat = [material["base_color"] for material in details["materials"] if isinstance(material["base_color"], list)]
-    was = [m["base_color"] for m in original.details["materials"] if isinstance(m["base_color"], list)]
-    np.testing.assert_allclose(flat, np.array(was) @ matrix.T, atol=1e-6)
     means = [layout.point_columns(r.points, *layout.POINT_FIELDS[6:9]).mean(axis=0) for r in (original, variant)]
     np.testing.assert_allclose(means[1], matrix @ means[0], atol=0.03)
     assert np.abs(means[1] - means[0]).max() > 0.03
@@ -209,13 +204,13 @@ Ka 0 0 0
 Ks 0.4 0.4 0.4
 Ke 0 0 0
 Ns 10
-d {opacity}
+d 1.000
 illum 2
 """
 PLACES = {2: ("models/model_normalized", "../images/texture 0.jpg"), 1: ("model", "./images/texture 0.jpg")}
 
 
-def add(root, category, name, version, opacity="1.000", texture=True, image=None):
+def add(root, category, name, version, image=None):
     """Write one object in the layout of a version; its folder."""
     stem, named = PLACES[version]
     folder = root / sources.SYNSETS[category] / name
@@ -223,20 +218,9 @@ def add(root, category, name, version, opacity="1.000", texture=True, image=None
     mesh.parent.mkdir(parents=True)
     (folder / "images").mkdir()
     mesh.write_text(OBJ.format(mtl=f"{mesh.stem}.mtl"))
-    mesh.with_suffix(".mtl").write_text(MTL.format(image=image or named, opacity=opacity))
-    if texture:
-        (folder / "images" / "texture 0.jpg").write_bytes(png(TEXELS))
+    mesh.with_suffix(".mtl").write_text(MTL.format(image=image or named))
+    (folder / "images" / "texture 0.jpg").write_bytes(png(TEXELS))
     return folder
-
-
-def download(root, category, version, count=6):
-    """A class of good objects, one without its texture, a transparent one, and one without a mesh."""
-    for number in range(count):
-        add(root, category, f"{number:032x}", version)
-    add(root, category, "e" * 32, version, texture=False)
-    add(root, category, "f" * 32, version, opacity="0.4")
-    (root / sources.SYNSETS[category] / "meshless" / "models").mkdir(parents=True)
-    return root
 
 
 def load(folder):
@@ -294,27 +278,10 @@ def test_the_root_may_be_the_class_itself_and_other_classes_are_not_read(tmp_pat
     assert [item.object_id for item in sources.find_objects(tmp_path, "chair")] == ["b"]
 
 
-@pytest.mark.ci
-def test_the_preset_of_shapenet_makes_the_data_set(tmp_path, capsys):
-    version, category = 1, "chair"
-    root, out = download(tmp_path / "ShapeNetCore", category, version), tmp_path / "set"
-    preset = ["--preset", f"shapenet_{category}", "--root", root, "--test-objects", 2]
-    assert spnr_data("generate", out, *preset, *TINY) == 0
-    assert "105 test" in capsys.readouterr().err
-    assert [len(layout.read_split(out, split)) for split in layout.SPLITS] == [4, 0, 2]
-    reasons = {row["id"]: row["reason"] for row in map(json.loads, (out / "rejected.jsonl").read_text().splitlines())}
-    assert reasons.keys() == {"e" * 32, "f" * 32, "meshless"}
-    assert "missing: " in reasons["e" * 32]
-    assert "transparent" in reasons["f" * 32]
-    assert "neither models/model_normalized.obj" in reasons["meshless"]
-    details = json.loads((out / "objects" / f"{3:032x}" / "object.json").read_text())
-    assert details["category"] == category
-    assert details["source"]["file"] == f"{sources.SYNSETS[category]}/{3:032x}/{PLACES[version][0]}.obj"
-    assert spnr_data("check", out) == 0
-
-
 def test_a_split_file_of_shapenet_makes_those_objects_only_and_an_option_overrides_the_preset(tmp_path):
-    root = download(tmp_path / "ShapeNetCore", "car", 2)
+    root = tmp_path / "ShapeNetCore"
+    for number in range(3):
+        add(root, "car", f"{number:032x}", 2)
     rows = [f"{number:06d},02958343,02958343,{number:032x},{split}" for number, split in enumerate(("train", "test"))]
     (tmp_path / "all.csv").write_text("\n".join(["id,synsetId,subSynsetId,modelId,split", *rows]))
     options = ["--root", root, "--split-file", tmp_path / "all.csv", "--colour-variants", 1]

@@ -156,15 +156,15 @@ def test_a_url_that_nothing_opens_is_refused():
         storage.open_place("nowhere://x")
 
 
-def test_damaged_files_are_refused_with_their_name(tmp_path):
-    path = tmp_path / "points.ply"
-    path.write_bytes(layout.encode_points(made_up_record().points))
-    path.write_bytes(path.read_bytes()[:-5])
-    with pytest.raises(ValueError, match=r"points\.ply: expected 20 points.*cut off"):
-        layout.read_points(path)
-    path.write_bytes(b"ply\nformat ascii 1.0\nend_header\n")
-    with pytest.raises(ValueError, match="another header"):
-        layout.read_points(path)
-    (tmp_path / "a.png").write_bytes(b"\x89PNG\r\n\x1a\nbroken")
-    with pytest.raises(ValueError, match=r"a\.png: not a readable PNG"):
-        layout.read_image(tmp_path / "a.png")
+@pytest.mark.parametrize(
+    ("name", "damage", "words"),
+    [
+        ("points.ply", lambda whole: whole[:-5], r"points\.ply: expected 20 points.*cut off"),
+        ("points.ply", lambda whole: b"ply\nformat ascii 1.0\nend_header\n", "another header"),
+        ("a.png", lambda whole: b"\x89PNG\r\n\x1a\nbroken", r"a\.png: not a readable PNG"),
+    ],
+)
+def test_damaged_files_are_refused_with_their_name(name, damage, words, tmp_path):
+    (tmp_path / name).write_bytes(damage(layout.encode_points(made_up_record().points)))
+    with pytest.raises(ValueError, match=words):
+        (layout.read_points if name.endswith("ply") else layout.read_image)(tmp_path / name)
