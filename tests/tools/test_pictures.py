@@ -118,6 +118,7 @@ def in_light(tmp_path_factory):
     return render
 
 
+@pytest.mark.ci
 def test_light_sun_exposure_and_background_change_the_still_and_not_its_opacity(in_light):
     asked = {
         "as_it_is": {}, "studio": {"light": "studio"}, "bright": {"exposure": 1.0}, "sun": {"sun": (30.0, 40.0)},
@@ -133,6 +134,7 @@ def test_light_sun_exposure_and_background_change_the_still_and_not_its_opacity(
     assert len(opacities) == 1
 
 
+@pytest.mark.ci
 def test_a_turntable_of_the_light_differs_from_frame_to_frame_and_keeps_the_outline(in_light):
     out = in_light("turning", turn="light", views=0, turntable="gif", frames=3, exposure=-1.0)
     with Image.open(out / "chair_turntable.gif") as film:
