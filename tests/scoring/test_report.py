@@ -143,15 +143,6 @@ def test_differences_have_a_sign_an_interval_and_a_test(tmp_path):
     assert "p < 0.001" in write(tmp_path, ours_minus={"splat": sure, "white": sure}).all("small")
 
 
-def test_every_setting_and_fact_of_the_run_is_named(tmp_path):
-    page = write(tmp_path)
-    entries = dict(zip(page.all("dt"), page.all("dd"), strict=True))
-    facts = {"preset": "tiny", "steps": "99", "seed": "7", "hardware": "2 cores"}
-    facts |= {"time to train": "6 min 12 s", "time in total": "2 h 13 min"}
-    settings = {"model.widths": "(64, 128)", "model.sampling.num_coarse": "16", "light": "<studio & sky>"}
-    assert entries == facts | settings | {"augment": "{}"}
-
-
 def test_the_page_says_everywhere_which_objects_it_scores_and_whether_they_were_seen(tmp_path):
     for split, objects in (("train", "seen in training"), ("test", "not known whether seen in training")):
         page = write(tmp_path, settings=METRICS_JSON["settings"] | {"split": split, "objects": objects})

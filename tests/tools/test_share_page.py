@@ -14,7 +14,6 @@ from PIL import Image
 from support import chromium as chromium_of
 from support import splat_balls, splat_twin
 
-from spnr_jax.surfels.gaussians import rotations
 from spnr_jax.tools import splat_export
 from spnr_jax.tools.commands import Share, SplatMaking
 
@@ -134,19 +133,6 @@ def test_a_coarse_picture_shows_the_same_object_and_rest_brings_the_whole_one(ch
         assert tab.evaluate("viewer.frames") == 4, "first, coarse, coarse again, whole"
         tab.evaluate("document.getElementById('canvas').blur()")  # without the ring around what has the keys
         assert decibels(shown(tab), splat_twin.draw(splat_balls.ball(), splat_balls.camera(38.0, 20.0, SIZE))[0]) > 28
-
-
-def test_a_coarse_picture_is_without_the_splats_that_face_away_and_a_whole_one_has_all(chromium, tmp_path):
-    path, _ = page(tmp_path, 0)
-    with opened(chromium, path) as tab:
-        splats = splat_balls.ball(degree=0)
-        outward = rotations(splats.rotation)[:, :, 2]
-        eye = np.asarray(splat_balls.camera(30.0, 20.0).cam_to_world)[:, 3]
-        facing = np.einsum("ni,ni->n", outward, splats.position - eye) < 0
-        for share, every, wanted in ((1, 1, np.ones_like(facing)), (0.5, 2, facing), (0.25, 4, facing)):
-            tab.evaluate(f"viewer.draw({share})")
-            count = wanted[::every].sum()
-            assert count <= tab.evaluate("viewer.drawn") <= 1.3 * count, "a few that are seen from their edge stay"
 
 
 def test_a_title_with_signs_of_html_is_only_text(chromium, tmp_path):

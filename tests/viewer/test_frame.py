@@ -5,7 +5,6 @@ import re
 
 import numpy as np
 import pytest
-from support import tiny_viewer
 from support.laws import close
 from support.tiny_viewer import canvas, opened, state, surfels, view
 
@@ -167,13 +166,6 @@ def test_a_new_map_is_chosen_stays_in_the_list_and_one_of_its_name_replaces_it()
     assert (one.chosen_light, one.lights) == ("a.hdr", (*NAMES, "a.hdr"))
     close(frame.make_light(one).light.tables, 2 * lopsided().tables)
     close(frame.make_light(frame.add_map(one, "a.hdr", lopsided(3.0))).light.tables, 6 * lopsided().tables)
-
-
-def test_a_map_of_the_command_line_is_in_the_list_under_its_name(monkeypatch):
-    monkeypatch.setattr(frame, "read_light", lambda path: lopsided())
-    found = frame.open_state(surfels(), tiny_viewer.ball(), "a", Lighting(light="/x/sky.hdr", exposure=1.0))
-    assert found.chosen_light == "sky.hdr"
-    close(frame.make_light(found).light.tables, 2 * lopsided().tables)
 
 
 # files

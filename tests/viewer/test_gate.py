@@ -1,14 +1,11 @@
-"""The viewer talks to its own page alone: by plain clients, and by another site's page in a headless Chromium."""
+"""The viewer talks to its own page alone, whatever a client says that it is."""
 
 import http.client
-import http.server
 import socket
-import threading
 from pathlib import Path
 from urllib.parse import urlsplit
 
 import pytest
-from support import chromium as chromium_of
 from support.tiny_viewer import viewer
 
 viser = pytest.importorskip("viser", reason="the viewer's extra is not installed: pip install 'spnr-jax[viewer]'")
@@ -164,52 +161,3 @@ def test_without_viser_the_command_says_what_to_install(monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(ValueError, match=r"pip install 'spnr-jax\[viewer\]'"):
         cli.run_view(commands.View(cloud=Path("a.ply"), run=Path("run")))
-
-
-# a page of another site, in the same browser
-
-FOREIGN = """<!doctype html><title>foreign</title><script>
-window.ask = (url) => new Promise((done) => {
-  const socket = new WebSocket(url, "PROTOCOL");
-  socket.binaryType = "arraybuffer";
-  socket.onmessage = (event) => { done("read " + event.data.byteLength); socket.close(); };
-  socket.onerror = () => done("refused");
-});
-</script>""".replace("PROTOCOL", PROTOCOL)
-
-
-class Site(http.server.BaseHTTPRequestHandler):
-    def do_GET(self):
-        self.send_response(200)
-        self.send_header("Content-Type", "text/html")
-        self.end_headers()
-        self.wfile.write(FOREIGN.encode())
-
-    def log_message(self, *words):
-        """Nothing."""
-
-
-@pytest.fixture
-def foreign():
-    """The address of another site on this machine."""
-    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Site) as site:
-        threading.Thread(target=site.serve_forever, daemon=True).start()
-        yield f"http://127.0.0.1:{site.server_port}/"
-        site.shutdown()
-
-
-@pytest.mark.ci
-@chromium_of.needed
-def test_a_page_of_another_site_reads_nothing_while_the_viewer_is_open_in_the_same_browser(running, foreign):
-    playwright = pytest.importorskip("playwright.sync_api", reason="pip install playwright")
-    address = Address(running.url)
-    with chromium_of.launched(playwright) as browser:
-        context = browser.new_context()
-        own = context.new_page()
-        own.goto(running.url)
-        own.get_by_text("ball.xyz: 400 points").wait_for(timeout=60_000)  # the viewer works here
-        tab = context.new_page()
-        tab.goto(foreign)
-        for path in ("", address.token):
-            for host in (address.host, f"localhost:{address.port}"):
-                assert tab.evaluate("url => ask(url)", f"ws://{host}/{path}") == "refused"

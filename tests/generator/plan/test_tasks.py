@@ -10,7 +10,6 @@ from data_gen.make.generate import describe
 from data_gen.plan import data_presets, splits, tasks
 
 OUT = ["generate", "out"]
-IDS = [f"object_{number}" for number in range(40)]
 
 
 def config(**options):
