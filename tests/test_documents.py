@@ -1,4 +1,4 @@
-"""What the documents show runs, and the signatures that they show are those of the code (`make docs` checks the rest)."""
+"""What the documents show runs, and the signatures that they show are the code's; `make docs` checks the rest."""
 
 import ast
 import importlib

@@ -26,10 +26,6 @@ def bluish(image):
     return reddish(image[..., ::-1])
 
 
-def light_of(lighting):
-    return frame.make_light(state(lighting=lighting, stale=True)).light
-
-
 def lopsided(brightness=1.0):
     """A map with light from one side."""
     tables = np.zeros((7, 32, 64, 3), np.float32)
