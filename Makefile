@@ -66,6 +66,7 @@ test-wheel: setup
 lint: setup
 	$(PY) -m ruff check .
 	$(PY) -m ruff format --check .
+	$(dir $(PY))lint-imports --no-cache
 
 format: setup
 	$(PY) -m ruff check --fix .

@@ -19,11 +19,9 @@ from typing import Annotated
 import tyro
 
 from spnr_jax import methods, presets
-from spnr_jax.devices import allocator, compilation
+from spnr_jax.devices import runtime
 from spnr_jax.errors import STOPPED, UserError, guarded, split_debug, stopped_at_once
-from spnr_jax.tools.commands import Evaluate, Export, Train, View
-from spnr_jax.tools.render_command import Render, is_catalogue
-from spnr_jax.tools.splat_options import Share
+from spnr_jax.tools.commands import Evaluate, Export, Render, Share, Train, View, is_catalogue
 
 BOX = r"[╭╮╰╯│─•]+|__tyro-dummy-inner__\."  # what tyro draws around an error, and its name for the whole command
 DESCRIPTION = """Sparse-point neural rendering: train a network, evaluate one, render a cloud of points.
@@ -119,9 +117,9 @@ def set_up_jax(*, repeats: bool = True) -> None:
 
     Work that repeats itself on a CPU uses the memory of the time before; a first picture comes 0.1 s sooner without.
     """
-    compilation.keep_programs()  # before JAX is imported
+    runtime.keep_programs()  # before JAX is imported
     if repeats:
-        allocator.keep_arrays()
+        runtime.keep_arrays()
 
 
 def _noted(cloud: Path) -> Callable[[str], None]:

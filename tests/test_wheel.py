@@ -70,15 +70,6 @@ def test_the_data_command_knows_the_packages_of_its_extra():
     assert sorted(command.PACKAGES) == sorted(re.match(r"[\w-]+", entry)[0] for entry in wanted)
 
 
-def test_no_dependency_of_an_extra_is_imported_before_it_is_needed():
-    code = "import sys, spnr_jax.method.model, spnr_jax.formats.clouds, spnr_jax.tools.pictures"
-    code += ", spnr_jax.scoring.report; print(*sys.modules)"
-    loaded = set(output_of(sys.executable, "-c", code, cwd=ROOT).split())
-    unneeded = {"mitsuba", "dask", "fsspec", "viser", "laspy", "imageio_ffmpeg", "pymeshlab", "torch"}
-    unneeded |= {"DracoPy", "meshoptimizer", "opengl_basisu"}
-    assert not loaded & (unneeded | {"trimesh", "skimage", "matplotlib", "grain", "orbax"})
-
-
 @pytest.mark.ci
 def test_the_wheel_holds_the_two_packages_of_the_commands_and_all_of_their_files(wheel):
     names = zipfile.ZipFile(wheel).namelist()

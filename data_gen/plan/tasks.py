@@ -16,9 +16,8 @@ from typing import Annotated, Literal
 import tyro
 
 from data_gen import procedural
-from data_gen.plan import splits
-from data_gen.plan.sources import abo, shapenet
-from data_gen.plan.sources.shapenet import Category
+from data_gen.plan import sources, splits
+from data_gen.plan.sources import Category
 from data_gen.render.views import Visibility
 from spnr_jax.errors import UserError, at_least
 from spnr_jax.formats.mesh import meshes
@@ -189,7 +188,7 @@ def check_source(config: GenerateConfig) -> None:
     if source != "procedural" and not mesh_root(config):
         raise UserError(f"--source {source}: give --root, the folder that holds it")
     if source == "shapenet" and not config.category:
-        raise UserError(f"--source shapenet: give --category, one of {', '.join(shapenet.SYNSETS)}")
+        raise UserError(f"--source shapenet: give --category, one of {', '.join(sources.SYNSETS)}")
     if source != "shapenet" and config.category:
         raise UserError(f"--category {config.category}: only with --source shapenet; --categories chooses procedural")
     if config.split_file and config.test_list:
@@ -231,7 +230,7 @@ def mesh_tasks(config: GenerateConfig, root: Path) -> list[Task]:
     if source_of(config) == "meshes":
         found = meshes.find_meshes(root)
         return [Task(object_id=name, path=path, shown_path=shown(path, root)) for name, path in found]
-    listed = shapenet.find_objects(root, config.category) if config.category else abo.find_products(root)
+    listed = sources.find_objects(root, config.category) if config.category else sources.find_products(root)
     return [
         Task(
             object_id=item.object_id,
@@ -280,5 +279,5 @@ def read_listed(config: GenerateConfig, known: set[str]) -> splits.Listed:
         return splits.read_test_list(config.test_list, known)
     if not config.split_file:
         return {}
-    synset = shapenet.SYNSETS[config.category] if config.category else None
+    synset = sources.SYNSETS[config.category] if config.category else None
     return splits.read_split_file(config.split_file, known, synset)

@@ -9,8 +9,8 @@ import numpy as np
 from data_gen.procedural.cars import car
 from data_gen.procedural.chairs import chair
 from data_gen.procedural.frames import frame
-from data_gen.procedural.joining import assemble
 from data_gen.procedural.lamps import lamp
+from data_gen.procedural.parts import assemble
 from data_gen.procedural.planes import plane
 from data_gen.procedural.shelves import shelf
 from data_gen.procedural.sofas import sofa

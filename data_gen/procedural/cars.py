@@ -6,10 +6,8 @@ height is the bonnet, belt and boot line. The cabin is a second, narrower loft o
 
 import numpy as np
 
-from data_gen.procedural.joining import Piece
-from data_gen.procedural.wheels import wheel
+from data_gen.procedural.parts import Piece, wheel
 from data_gen.shapes import finishes
-from data_gen.shapes.outlines import rounded_rectangle, superellipse
 from data_gen.shapes.primitives import (
     Mesh,
     both_sides,
@@ -19,6 +17,8 @@ from data_gen.shapes.primitives import (
     loft,
     merge,
     move,
+    rounded_rectangle,
+    superellipse,
     superellipsoid,
     tube,
     turn,

@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from data_gen.procedural.joining import Piece
-from data_gen.procedural.legs import four_legs, leg_style
+from data_gen.procedural.parts import Piece, four_legs, leg_style
 from data_gen.shapes import finishes
 from data_gen.shapes.primitives import (
     Mesh,

@@ -2,11 +2,23 @@
 
 import numpy as np
 
-from data_gen.procedural.joining import Piece
-from data_gen.procedural.legs import four_legs, leg_style, line, pedestal, post, turned_profile
+from data_gen.procedural.parts import Piece, four_legs, leg_style, line, pedestal, post, turned_profile
 from data_gen.shapes import finishes
-from data_gen.shapes.outlines import circle, curve, superellipse
-from data_gen.shapes.primitives import Mesh, box, cylinder, lathe, loft, merge, move, superellipsoid, tube, turn
+from data_gen.shapes.primitives import (
+    Mesh,
+    box,
+    circle,
+    curve,
+    cylinder,
+    lathe,
+    loft,
+    merge,
+    move,
+    superellipse,
+    superellipsoid,
+    tube,
+    turn,
+)
 
 
 def lamp(rng) -> list[Piece]:

@@ -2,11 +2,21 @@
 
 import numpy as np
 
-from data_gen.procedural.joining import Piece
-from data_gen.procedural.legs import four_legs, leg_style, round_legs
+from data_gen.procedural.parts import Piece, four_legs, leg_style, round_legs
 from data_gen.shapes import finishes
-from data_gen.shapes.outlines import circle
-from data_gen.shapes.primitives import Mesh, both_sides, box, cylinder, merge, move, prism, shell, superellipsoid, turn
+from data_gen.shapes.primitives import (
+    Mesh,
+    both_sides,
+    box,
+    circle,
+    cylinder,
+    merge,
+    move,
+    prism,
+    shell,
+    superellipsoid,
+    turn,
+)
 
 
 def sofa(rng) -> list[Piece]:

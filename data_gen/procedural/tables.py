@@ -2,12 +2,10 @@
 
 import numpy as np
 
-from data_gen.procedural.joining import Piece
-from data_gen.procedural.legs import four_legs, leg_style, pedestal, round_legs, stretchers
+from data_gen.procedural.parts import Piece, four_legs, leg_style, pedestal, round_legs, stretchers
 from data_gen.procedural.shelves import drawer_stack
 from data_gen.shapes import finishes
-from data_gen.shapes.outlines import superellipse
-from data_gen.shapes.primitives import Mesh, box, merge, move, prism, tube, turn
+from data_gen.shapes.primitives import Mesh, box, merge, move, prism, superellipse, tube, turn
 
 
 def table(rng) -> list[Piece]:

@@ -14,8 +14,7 @@ from spnr_jax.kernels import cameras
 from spnr_jax.kernels.records import Camera, Light, PointCloud, Volume
 from spnr_jax.kernels.resizing import mean_of_squares
 from spnr_jax.method.model import Model
-from spnr_jax.scoring.perceptual import flip
-from spnr_jax.scoring.picture_scores import sharpness
+from spnr_jax.scoring.picture_scores import flip, sharpness
 
 Picture = tuple[np.ndarray, np.ndarray]  # image (height, width, 3) on white and opacity (height, width)
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from experiments.comparison.object_scores import Shown
 from spnr_jax.formats.images import png_url
 from spnr_jax.formats.pages import template
-from spnr_jax.scoring.score_tables import Table
+from spnr_jax.scoring.report import Table
 
 
 def page(title: str, tables: Sequence[Table], notes: Sequence[str], shown: Sequence[Shown] = ()) -> str:

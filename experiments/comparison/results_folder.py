@@ -18,7 +18,7 @@ from PIL import Image
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets, images
 from spnr_jax.formats.npz import packed
-from spnr_jax.scoring.score_tables import Cell, Table
+from spnr_jax.scoring.report import Cell, Table
 from spnr_jax.training import run_record
 
 

@@ -6,8 +6,8 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from data_gen.make import originals
-from data_gen.render import depth
+from data_gen.make import objects
+from data_gen.render import views
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.mesh.assets import Asset
@@ -24,7 +24,7 @@ def mesh_of(dataset: data_sets.Dataset, item: data_sets.ObjectData, meshes: Path
     if seed is None:
         raise UserError(f"{dataset.folder / 'dataset.json'}: names no seed, so its meshes cannot be made again")
     positions = np.asarray(item.cloud.positions)
-    return originals.original(details(dataset, item.name), seed, positions, meshes, dataset.spread)
+    return objects.original(details(dataset, item.name), seed, positions, meshes, dataset.spread)
 
 
 def details(dataset: data_sets.Dataset, name: str) -> dict:
@@ -32,7 +32,7 @@ def details(dataset: data_sets.Dataset, name: str) -> dict:
     return json.loads((dataset.folder / "objects" / name / "object.json").read_bytes())
 
 
-def cast_views(cast: depth.Caster, camera: Camera) -> np.ndarray:
+def cast_views(cast: views.Caster, camera: Camera) -> np.ndarray:
     """Distances (views, h, w) along the camera's rays, inf where they miss."""
     rays = jax.tree.map(np.asarray, cameras.camera_rays(camera))
     return cast(rays.origins.reshape(-1, 3), rays.directions.reshape(-1, 3)).reshape(rays.origins.shape[:3])

@@ -14,7 +14,7 @@ from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
 from spnr_jax.methods import METHODS
 from spnr_jax.scoring import evaluation
-from spnr_jax.scoring.score_tables import label
+from spnr_jax.scoring.report import label
 from spnr_jax.training import weights
 
 FLOORS = tuple(reversed(evaluation.FLOORS))

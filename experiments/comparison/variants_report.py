@@ -14,10 +14,10 @@ from matplotlib.ticker import MaxNLocator
 from experiments.comparison import figures, results_folder, variants
 from experiments.comparison.object_scores import OPAQUE
 from experiments.comparison.variants import Budget, Compared, Variant
-from spnr_jax.devices import machine
+from spnr_jax.devices import runtime
 from spnr_jax.formats import data_sets, images
 from spnr_jax.scoring import evaluation
-from spnr_jax.scoring.score_tables import ARROWS, HIGHER, QUALITY, Cell, Table, number, text
+from spnr_jax.scoring.report import ARROWS, HIGHER, QUALITY, Cell, Table, number, text
 from spnr_jax.scoring.summary import difference, means, metric_settings
 
 METRICS = {  # head, decimals, what is better
@@ -99,7 +99,7 @@ def numbers(
         "minutes": budget.minutes,
         "even_share": budget.even_share,
         "seeds": list(budget.seeds),
-        "hardware": machine.hardware(),
+        "hardware": runtime.hardware(),
         "data": dataset.settings.get("settings", {}),
         "views": len(next(iter(compared.scores.values()))[0]["psnr"]) // len(budget.seeds),
         "points": config.test_points,

@@ -22,10 +22,10 @@ from jaxtyping import Array, Float
 from scipy.spatial import cKDTree
 
 from data_gen import procedural
-from data_gen.make.reshaping import draw_reshaping, reshape
+from data_gen.make.augmentation import draw_reshaping, reshape
 from experiments import entry_point
 from spnr_jax import cli
-from spnr_jax.devices.compilation import QUICKEST
+from spnr_jax.devices.runtime import QUICKEST
 from spnr_jax.errors import UserError
 from spnr_jax.formats.images import write_whole
 from spnr_jax.formats.mesh import meshes

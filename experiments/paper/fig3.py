@@ -23,7 +23,7 @@ import jax
 import numpy as np
 import tyro
 
-from data_gen.render import depth, poisson_surface
+from data_gen.render import poisson_surface, views
 from data_gen.render.variant import choose_variant, mitsuba_module
 from experiments import entry_point
 from experiments.comparison import figures, results_folder, trained_networks
@@ -34,14 +34,14 @@ from experiments.comparison.trained_networks import LABELS, Sources
 from experiments.paper import depth_scores
 from experiments.paper.depth_scores import METRICS, OPAQUE
 from spnr_jax import cli
-from spnr_jax.devices import machine
+from spnr_jax.devices import runtime
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.images import depth_image, png
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.records import Camera, PointCloud
 from spnr_jax.scoring import evaluation
-from spnr_jax.scoring.score_tables import Table, number, text
+from spnr_jax.scoring.report import Table, number, text
 
 FLOATER, MISSED = np.array([0.85, 0.1, 0.1]), np.array([0.15, 0.35, 0.85])
 WORST = 0.2  # error, in half diagonals, that the picture shows black
@@ -114,7 +114,7 @@ def main(options: Fig3) -> None:
         "objects": list(names),
         "views": len(next(iter(maps.values()))[2]),
         "pixels": {method: truth.shape[-1] for method, (_, _, truth) in maps.items()},
-        "hardware": machine.hardware(),
+        "hardware": runtime.hardware(),
         "data": dataset.settings.get("settings", {}),
         "seed": "nothing is drawn: samples lie at the middles of their strata",
     }
@@ -156,7 +156,7 @@ def of_surface(config: poisson_surface.PoissonConfig) -> Method:
             asset = poisson_surface.reconstruct(jax.tree.map(np.asarray, cloud), config)
         except poisson_surface.NoSurface:
             return (np.zeros(item.images.shape[:3], np.float32),) * 2
-        found = cast_views(depth.caster(asset), item.camera)
+        found = cast_views(views.caster(asset), item.camera)
         hit = np.isfinite(found)
         return np.where(hit, found, 0), hit.astype(np.float32)
 
@@ -181,7 +181,7 @@ def true_depth(
     dataset: data_sets.Dataset, item: data_sets.ObjectData, meshes: Path | None, size: tuple[int, ...]
 ) -> tuple[np.ndarray]:
     """Distances (views, *size) to the mesh that the object was made from."""
-    cast = depth.caster(mesh_of(dataset, item, meshes))
+    cast = views.caster(mesh_of(dataset, item, meshes))
     return (cast_views(cast, cameras.resize(item.camera, *size)),)
 
 

@@ -28,12 +28,11 @@ from experiments.comparison.object_scores import ObjectMethod, Scored, Shown, by
 from experiments.comparison.trained_networks import LABELS, test_objects
 from spnr_jax import cli
 from spnr_jax.config import TrainConfig
-from spnr_jax.devices import machine
+from spnr_jax.devices import runtime
 from spnr_jax.errors import UserError, at_least
 from spnr_jax.formats import data_sets
 from spnr_jax.scoring import evaluation
-from spnr_jax.scoring.report import duration
-from spnr_jax.scoring.score_tables import Cell, Table, difference, head, lowered, number, quality
+from spnr_jax.scoring.report import Cell, Table, difference, duration, head, lowered, number, quality
 from spnr_jax.scoring.summary import differences, metric_settings, summarise
 
 METRICS = ("psnr", "ssim", "lpips", "flip", "cpsnr", "iou")
@@ -205,7 +204,7 @@ def conditions(dataset: data_sets.Dataset, names: tuple[str, ...], config: Train
     """What the numbers stand on."""
     counts = {f"{split} objects": len(objects) for split, objects in dataset.splits.items()}
     return {
-        "hardware": machine.hardware(),
+        "hardware": runtime.hardware(),
         "data": dataset.settings.get("settings", {}) | counts,
         "test_objects": list(names),
         "points": config.test_points,

@@ -27,11 +27,11 @@ from experiments import entry_point
 from experiments.comparison import results_folder
 from experiments.speed import speed_scenes, twin_layout
 from spnr_jax.config import PaperConfig, TrainConfig
-from spnr_jax.devices import allocator, machine
+from spnr_jax.devices import runtime
 from spnr_jax.errors import at_least
 from spnr_jax.kernels.records import Batch
 from spnr_jax.method import inference
-from spnr_jax.scoring.score_tables import Table, number, text
+from spnr_jax.scoring.report import Table, number, text
 from spnr_jax.training import optimisation
 
 Mode = Literal["train", "train_l1", "encode", "render"]
@@ -77,16 +77,16 @@ def main(options: Options) -> None:
         out = options.out.with_name(f"{options.out.name}-quick")
         options = dataclasses.replace(options, out=out, presets=("tiny",), rounds=2, seconds=0.1)
     os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[: options.threads])
-    allocator.keep_arrays()
-    load, rows = machine.load(), rows_of(options)
-    note = f"{machine.hardware()}, load before {load}; {machine.processor()}; {time.strftime('%Y-%m-%d')}"
+    runtime.keep_arrays()
+    load, rows = runtime.load(), rows_of(options)
+    note = f"{runtime.hardware()}, load before {load}; {runtime.processor()}; {time.strftime('%Y-%m-%d')}"
     results_folder.write(options.out, {"rows": rows}, [table(rows)], [note])
 
 
 def rows_of(options: Options) -> list[Row]:
     """All rows of these options; those that were missing are measured now."""
     asked = {name: getattr(options, name) for name in ("rounds", "seconds", "threads", "bf16")}
-    results_folder.claim(options.out, "times beside the twin", asked | {"processor": machine.processor()})
+    results_folder.claim(options.out, "times beside the twin", asked | {"processor": runtime.processor()})
     variants: tuple[str | None, ...] = options.variants
     if importlib.util.find_spec("torch") is None:
         print("torch is not installed (pip install -c constraints.txt -e '.[bench]'): ours is timed alone")

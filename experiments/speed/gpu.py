@@ -32,11 +32,11 @@ from experiments.speed import bench
 from experiments.speed.speed_scenes import orbiting, random_crops, sphere
 from spnr_jax import cli
 from spnr_jax.config import PaperConfig, SurfelConfig, TrainConfig
-from spnr_jax.devices import machine
+from spnr_jax.devices import runtime
 from spnr_jax.kernels.records import Volume
 from spnr_jax.method import surfel_method
 from spnr_jax.presets import PRESETS
-from spnr_jax.scoring.score_tables import Table, number, text
+from spnr_jax.scoring.report import Table, number, text
 from spnr_jax.surfels.lighting import room_light
 from spnr_jax.surfels.surfel_scenes import encode_in_box
 from spnr_jax.training import optimisation
@@ -84,8 +84,8 @@ def main(options: OnGPU) -> None:
         for row in part(options):
             rows.append(row)
             print(f"{row.what}: {row.a_second:.1f} {row.unit} a second", flush=True)
-    notes = [f"{machine.hardware()}; {machine.processor()}; jax {jax.__version__}; {time.strftime('%Y-%m-%d')}."]
-    found = {"hardware": machine.hardware(), "rows": [dataclasses.asdict(row) for row in rows]}
+    notes = [f"{runtime.hardware()}; {runtime.processor()}; jax {jax.__version__}; {time.strftime('%Y-%m-%d')}."]
+    found = {"hardware": runtime.hardware(), "rows": [dataclasses.asdict(row) for row in rows]}
     results_folder.write(options.out, found, [table(rows)], notes)
 
 

@@ -31,14 +31,14 @@ from experiments.speed import bench
 from experiments.speed.speed_scenes import orbiting, random_crops, sphere
 from spnr_jax import cli
 from spnr_jax.config import PaperConfig, SurfelConfig, TrainConfig
-from spnr_jax.devices import machine
+from spnr_jax.devices import runtime
 from spnr_jax.errors import at_least
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.records import Batch, Light, Volume
 from spnr_jax.method import surfel_method, surfel_renderer
 from spnr_jax.nn.shader import Shader
 from spnr_jax.presets import PRESETS
-from spnr_jax.scoring.score_tables import Table, number, text
+from spnr_jax.scoring.report import Table, number, text
 from spnr_jax.surfels import projection
 from spnr_jax.surfels.lighting import room_light
 from spnr_jax.surfels.surfel_scenes import encode_in_box
@@ -83,7 +83,7 @@ def main(options: WhereTimeGoes) -> None:
     if options.quick:
         options = dataclasses.replace(options, points=256, size=64, rounds=2)
     parts = {"a training step": step_programs(options), f"a frame of {options.size} px": frame_programs(options)}
-    found: dict[str, Any] = {"hardware": machine.hardware(), "processor": machine.processor(), "load": machine.load()}
+    found: dict[str, Any] = {"hardware": runtime.hardware(), "processor": runtime.processor(), "load": runtime.load()}
     tables = []
     for name, programs in parts.items():
         found[name], shown = timed(programs, options.rounds), name[0].upper() + name[1:]

@@ -37,11 +37,11 @@ from experiments.comparison import clock, figures, results_folder
 from experiments.studies import one_picture
 from experiments.studies.one_picture import ADAM, Truth, Unknowns, nothing, stack
 from spnr_jax import cli
-from spnr_jax.devices import machine
+from spnr_jax.devices import runtime
 from spnr_jax.formats import data_sets, images
 from spnr_jax.kernels.records import PointCloud
 from spnr_jax.method.surfel_renderer import Plan
-from spnr_jax.scoring.score_tables import Table, number
+from spnr_jax.scoring.report import Table, number
 
 TURN, SHIFT, MOVED = np.deg2rad(8.0), 0.1, 0.5  # of a wrong pose, in radians and radii; of points, in spacings
 GREY = 0.5  # where materials begin
@@ -91,7 +91,7 @@ def main(options: InverseStudy) -> None:
     rows = ["target", *(f"{task}, {when}" for task in RATES for when in ("start", "end"))]
     files = {"inverse.png": images.png(figures.grid(sheet, list(objects), rows, 2 * size)), "losses.png": curves(found)}
     asked = {"points": truth.cloud.mask.shape[1], "size": size, "steps": steps, "plan": plan._asdict()}
-    asked |= {"hardware": machine.hardware(), "load": machine.load()}
+    asked |= {"hardware": runtime.hardware(), "load": runtime.load()}
     note = f"{asked['points']} points, {size} px, {steps} steps; {asked['hardware']}, load {asked['load']}."
     results = asked | {"objects": list(objects), "tasks": found, "gradients": checks, "costs": costs}
     results_folder.write(options.out, results, make_tables(found, checks, costs, list(objects)), [note], files)

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Int
 
 import spnr_jax
 from experiments.comparison import clock
-from spnr_jax.devices.compilation import QUICKEST
+from spnr_jax.devices.runtime import QUICKEST
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.records import Camera, Light, PointCloud, Rendering
 from spnr_jax.method import surfel_renderer

@@ -31,14 +31,14 @@ from experiments.comparison.source_meshes import details, mesh_of
 from experiments.comparison.trained_networks import LABELS, Network, Sources
 from spnr_jax import cli
 from spnr_jax.config import TrainConfig
-from spnr_jax.devices import machine
+from spnr_jax.devices import runtime
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.images import png
 from spnr_jax.formats.mesh import surface_points
 from spnr_jax.kernels.records import PointCloud
 from spnr_jax.scoring import evaluation, summary
-from spnr_jax.scoring.score_tables import QUALITY, Table, number, text
+from spnr_jax.scoring.report import QUALITY, Table, number, text
 
 METRICS = ("psnr", "flip", "iou")
 
@@ -174,7 +174,7 @@ def main(options: PointCount) -> None:
         "made of": {label: method.identity for label, method in found.items()},
         "trained on": [config.min_points, config.max_points],
         "class points": shown,
-        "hardware": machine.hardware(),
+        "hardware": runtime.hardware(),
         "data": dataset.settings.get("settings", {}),
         "seed": "that of the data set's points; nothing else is drawn",
     }

@@ -23,13 +23,13 @@ from experiments import entry_point
 from experiments.comparison import figures, results_folder
 from experiments.comparison.object_views import Picture, drawn, on_white, told, view_of, view_scores
 from spnr_jax.config import Quality
-from spnr_jax.devices import machine
+from spnr_jax.devices import runtime
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets, images
 from spnr_jax.kernels.colors import srgb_to_linear
 from spnr_jax.kernels.records import Camera, Light, Volume
 from spnr_jax.method.model import Model
-from spnr_jax.scoring.score_tables import Table, mean_row
+from spnr_jax.scoring.report import Table, mean_row
 from spnr_jax.training.weights import load
 
 HEADS = ("PSNR, dB", "inside, dB", "FLIP", "log error")
@@ -158,7 +158,7 @@ def _write(out: Path, found: Found, shown: Sequence[Sequence]) -> None:
         rows=tuple(mean_row(label, values, DECIMALS) for label, values in rows.items()),
         note=note,
     )
-    results = {"objects": rows, "hardware": machine.hardware()}
+    results = {"objects": rows, "hardware": runtime.hardware()}
     results_folder.write(out, results, [table, _margins(found)])
     columns = [text for light in dict.fromkeys(light for light, _ in found) for text in (f"{light}: reference", "ours")]
     grid = [[picture for of in shown for picture in of[2 * i : 2 * i + 2]] for i in range(min(map(len, shown)) // 2)]

@@ -25,14 +25,14 @@ from experiments import entry_point
 from experiments.comparison import figures, poisson, results_folder
 from experiments.comparison.object_views import Picture, drawn, few, on_white, view_of, view_scores
 from spnr_jax.config import Quality
-from spnr_jax.devices import machine
+from spnr_jax.devices import runtime
 from spnr_jax.formats import data_sets, images
 from spnr_jax.kernels.cleaning import Cleaned, Values, cleaned
 from spnr_jax.kernels.cloud_arrays import normalization
 from spnr_jax.kernels.records import Camera, PointCloud
 from spnr_jax.kernels.thinning import farthest_points
 from spnr_jax.method.model import Model
-from spnr_jax.scoring.score_tables import Cell, Table, mean_row, number
+from spnr_jax.scoring.report import Cell, Table, mean_row, number
 from spnr_jax.surfels import outward
 from spnr_jax.training.scan_faults import Fault, faults
 from spnr_jax.training.weights import load
@@ -102,7 +102,7 @@ def main(options: ScansStudy) -> None:
         ),
         note="Means over objects with 95 % intervals; points left: of the data set's, before cleaning.",
     )
-    hardware = machine.hardware()
+    hardware = runtime.hardware()
     results_folder.write(options.out, {"objects": rows, "hardware": hardware}, [table, _rivals(options, rows)])
     if options.shown:
         _gallery(options, dataset, names[: options.shown], model)

@@ -30,16 +30,15 @@ from experiments.comparison import figures, results_folder
 from experiments.comparison.object_views import Picture, at, cut, drawn, on_white, told, view_of
 from experiments.comparison.poisson import Renderer, trimmed_surface
 from spnr_jax.config import Quality
-from spnr_jax.devices import machine
+from spnr_jax.devices import runtime
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets, images
 from spnr_jax.kernels import metrics
 from spnr_jax.kernels.records import PointCloud
 from spnr_jax.method.model import Model
 from spnr_jax.methods import method_of
-from spnr_jax.scoring.perceptual import flip
-from spnr_jax.scoring.picture_scores import ball, ball_waves, blue_share, plate, sharpness, under_true_opacity
-from spnr_jax.scoring.score_tables import Cell, Table, mean_row, number
+from spnr_jax.scoring.picture_scores import ball, ball_waves, blue_share, flip, plate, sharpness, under_true_opacity
+from spnr_jax.scoring.report import Cell, Table, mean_row, number
 from spnr_jax.training.weights import load
 
 
@@ -204,7 +203,7 @@ def main(options: SharpnessStudy) -> None:
         rows=tuple(_row(name, found, known[name]) for name, found in rows.items()),
         note="Means over objects with 95 % intervals; a true plate shows a blue share of .077.",
     )
-    results_folder.write(options.out, {"objects": rows, "known": known, "hardware": machine.hardware()}, [table])
+    results_folder.write(options.out, {"objects": rows, "known": known, "hardware": runtime.hardware()}, [table])
 
 
 def _kept_scores(

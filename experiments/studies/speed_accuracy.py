@@ -39,13 +39,13 @@ from experiments.comparison.object_views import few, on_white, told, view_of
 from experiments.comparison.trained_networks import test_objects
 from spnr_jax import cli
 from spnr_jax.config import NetworkConfig, Quality
-from spnr_jax.devices import machine
+from spnr_jax.devices import runtime
 from spnr_jax.formats import data_sets
 from spnr_jax.kernels import cameras, metrics
 from spnr_jax.kernels.records import Camera, Rendering, Volume
 from spnr_jax.method.model import Model
-from spnr_jax.scoring.perceptual import flip
-from spnr_jax.scoring.score_tables import Table, number, text
+from spnr_jax.scoring.picture_scores import flip
+from spnr_jax.scoring.report import Table, number, text
 from spnr_jax.training.weights import load
 
 SHARES = (0.75, 0.5, 0.25)  # of the pixels along a side that are drawn; the picture is enlarged from there
@@ -292,7 +292,7 @@ def main(options: SpeedAccuracy) -> None:
         scores, what = job.kept(options.out), f"{job.run}, {job.size} px, {job.way.name}"
         print(f"{what}: {scores['psnr']:.2f} dB, {scores['ms_view']:.1f} ms", flush=True)
     rows = [job.row() | job.kept(options.out) for job in jobs]
-    found = {"hardware": machine.hardware(), "load": machine.load(), "date": time.strftime("%Y-%m-%d"), "rows": rows}
+    found = {"hardware": runtime.hardware(), "load": runtime.load(), "date": time.strftime("%Y-%m-%d"), "rows": rows}
     tables = [made for size in options.sizes if (of := [r for r in rows if r["size"] == size]) for made in both(of)]
     fronts = [[r for r in rows if r["size"] == size] for size in options.sizes]
     picture = plot([(of, front(of), knee(of, front(of))) for of in fronts if of])

@@ -1,1 +1,1 @@
-"""Where a program runs: the devices and what lies where on them, the allocator, the start of a process."""
+"""Where a program runs: the devices and what lies where on them, workers, memory, kept programs."""

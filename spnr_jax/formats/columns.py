@@ -20,7 +20,7 @@ import numpy as np
 from spnr_jax.errors import UserError
 from spnr_jax.formats.mesh import file_colors as colors
 from spnr_jax.formats.mesh.texels import srgb_to_linear
-from spnr_jax.gaussians.harmonics import C0
+from spnr_jax.surfels.gaussians import C0
 
 Columns = dict[str, np.ndarray]
 Report = Callable[[str], None]

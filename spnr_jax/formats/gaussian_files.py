@@ -24,8 +24,8 @@ from spnr_jax.errors import UserError
 from spnr_jax.formats.columns import Columns
 from spnr_jax.formats.images import check_place, write_whole
 from spnr_jax.formats.mesh.file_colors import SRGB
-from spnr_jax.gaussians.harmonics import C0, degree_of, half_turn_signs
 from spnr_jax.kernels.records import Gaussians
+from spnr_jax.surfels.gaussians import C0, degree_of, half_turn_signs
 
 SUFFIXES = (".ply", ".spz")
 LEAST_OPACITY, MOST_OPACITY = 1e-4, 1 - 1e-4  # that the logistic function is inverted for

@@ -236,11 +236,11 @@ class Crops:
 @no_type_check
 @struct.dataclass
 class Gaussians:
-    """Gaussian splats of one object, as `spnr_jax/gaussians` makes them and splat viewers draw them.
+    """Gaussian splats of one object, as `spnr_jax/surfels/gaussians.py` makes them and splat viewers draw them.
 
     Splat i is exp(-d^T C^-1 d / 2) times its opacity, with C = R S^2 R^T of its rotation (a unit quaternion, w x y z)
     and its scales, standard deviations along its own axes, the third along the normal.  Its colour from the direction
-    eye -> splat is sRGB, 0.5 plus the sum of `harmonics` times the real spherical harmonics of gaussians/harmonics.py.
+    eye -> splat is sRGB, 0.5 plus the sum of `harmonics` times the real spherical harmonics of surfels/gaussians.py.
     """
 
     position: Float[AnyArray, "splats 3"]

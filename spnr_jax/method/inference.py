@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from spnr_jax.config import NetworkConfig, RenderOptions, TrainConfig
-from spnr_jax.devices.compilation import QUICK
+from spnr_jax.devices.runtime import QUICK
 from spnr_jax.errors import UserError
 from spnr_jax.kernels import cameras, cloud_arrays, losses
 from spnr_jax.kernels.metrics import psnr

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from spnr_jax.config import SurfelConfig
-from spnr_jax.devices.compilation import QUICK, QUICKEST
+from spnr_jax.devices.runtime import QUICK, QUICKEST
 from spnr_jax.devices.side_by_side import two_at_a_time
 from spnr_jax.devices.traces import Kept
 from spnr_jax.kernels import cameras, cloud_arrays

@@ -17,14 +17,14 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from spnr_jax.config import TrainConfig
-from spnr_jax.devices import machine
+from spnr_jax.devices import runtime
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
 from spnr_jax.kernels import metrics
 from spnr_jax.kernels.records import Camera, PointCloud
 from spnr_jax.method.model import render_views
 from spnr_jax.scoring import floors
-from spnr_jax.scoring.perceptual import flip, lpips
+from spnr_jax.scoring.picture_scores import flip, lpips
 from spnr_jax.scoring.summary import Scores, differences, metric_settings, summarise
 from spnr_jax.training.run_record import seen_in_training
 from spnr_jax.training.weights import Trained, place, read_trained
@@ -251,7 +251,7 @@ def compare(
         "preset": config.preset,
         "steps": trained[first].steps,
         "seed": config.seed,
-        "hardware": machine.hardware(),
+        "hardware": runtime.hardware(),
         "settings": {
             "split": split,
             "objects": exposure(runs, dataset, names),

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from spnr_jax.scoring.perceptual import NO_LPIPS, PIXELS_PER_DEGREE, lpips_network
+from spnr_jax.scoring.picture_scores import NO_LPIPS, PIXELS_PER_DEGREE, lpips_network
 
 METRICS = ("psnr", "ssim", "cpsnr", "flip", "lpips", "iou")
 RESAMPLES, LEVEL, SEED = 10_000, 0.95, 0

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from spnr_jax.devices.compilation import QUICKEST
+from spnr_jax.devices.runtime import QUICKEST
 from spnr_jax.devices.traces import Kept
 from spnr_jax.kernels import cloud_arrays
 from spnr_jax.kernels.numerics import clamp, length

@@ -21,14 +21,14 @@ from urllib.parse import quote
 
 from tqdm import tqdm
 
-from spnr_jax.devices import allocator, compilation
+from spnr_jax.devices import runtime
 from spnr_jax.devices.side_by_side import beside
 from spnr_jax.errors import UserError, one_line
 from spnr_jax.formats.images import write_whole
 from spnr_jax.formats.pages import template
 from spnr_jax.formats.point_files import MESHES, READERS
+from spnr_jax.tools.commands import WILDCARDS, Render
 from spnr_jax.tools.pictures import check_writable, drawn, load_network, made_ready
-from spnr_jax.tools.render_command import WILDCARDS, Render
 from spnr_jax.training.weights import SHIPPED, load, place, shipped
 
 KINDS = tuple(dict.fromkeys((*READERS, *MESHES)))
@@ -165,8 +165,8 @@ def draw_item(batch: Batch, item: Item) -> str | None:
         raise UserError(f"{item.cloud}: worker {socket.gethostname()} does not see this file; mount it there")
     if standing(batch, item):  # another run was faster
         return None
-    allocator.keep_arrays()
-    compilation.keep_programs()
+    runtime.keep_arrays()
+    runtime.keep_programs()
     folder, state, notes = batch.options.out / item.name, _state(batch, item), list[str]()
     before = _read_record(batch, item).get("files", [])
     for name in (RECORD, *(name for name in before if Path(name).name == name)):

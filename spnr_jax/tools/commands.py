@@ -1,17 +1,220 @@
-"""The options of the commands of `spnr`, as records; of `spnr render` and `spnr share`, in files of their own."""
+"""The options of the commands of `spnr`, as records; nothing that takes time to import, for `--help` reads them."""
 
+import dataclasses
+import math
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import tyro
 
 from spnr_jax import presets
 from spnr_jax.config import TrainConfig
+from spnr_jax.errors import UserError
 from spnr_jax.formats.cut import Cut
-from spnr_jax.tools.light_options import Lighting
-from spnr_jax.tools.splat_options import SplatMaking
+
+MOST_STOPS = 20
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lighting:
+    """The light of pictures by a network over surfels; others know that of their training alone."""
+
+    light: str | None = None
+    """Light: an environment map (.hdr .exr), or room, studio, sunset, overcast, night of the package (default: room, or
+    none where there is a sun)."""
+    light_yaw: float = 0.0
+    """Degrees that the map is turned about the up axis."""
+    sun: tuple[float, float] | None = None
+    """Azimuth and elevation, in degrees, of a sun: added to the light."""
+    exposure: float = 0.0
+    """Stops by which the light is brighter (negative: darker)."""
+    background: Literal["white", "light"] = "white"
+    """Background: white, or the environment map, blurred."""
+
+    @property
+    def asked(self) -> tuple[str, ...]:
+        """Names of the options that are not as they are where nothing is asked of the light."""
+        given = (field.name for field in dataclasses.fields(self) if getattr(self, field.name) != field.default)
+        return tuple(f"--{name.replace('_', '-')}" for name in given)
+
+    def __post_init__(self) -> None:
+        """ValueError names the option that makes no sense."""
+        if not math.isfinite(self.light_yaw):
+            raise UserError(f"--light-yaw must be a number of degrees, got {self.light_yaw}")
+        if self.sun and not (math.isfinite(self.sun[0]) and -90 <= self.sun[1] <= 90):
+            raise UserError(f"--sun: expected an azimuth and an elevation of -90 to 90 degrees, got {self.sun}")
+        if not abs(self.exposure) <= MOST_STOPS:
+            raise UserError(f"--exposure must be -{MOST_STOPS} to {MOST_STOPS} stops, got {self.exposure:g}")
+
+
+MOST_SPLATS = 300_000  # that a file or page is asked for: more than viewers on telephones draw
+
+
+@dataclass(frozen=True, kw_only=True)
+class SplatMaking:
+    """How Gaussian splats are made of a cloud."""
+
+    most_splats: int = 150_000
+    """Splats at most."""
+    harmonics: Literal[0, 1, 2, 3] = 1
+    """Degree of the spherical harmonics by which a splat's colour follows the view; 0: it does not."""
+    fitting_views: int = 32
+    """Pictures of the network that splats are made from."""
+
+    @property
+    def asked(self) -> dict[str, Any]:
+        """What `splat_making.splats_of` is asked for."""
+        return {"degree": self.harmonics, "most": self.most_splats, "views": self.fitting_views}
+
+    def __post_init__(self) -> None:
+        """ValueError names the option that makes no sense."""
+        if not 1 <= self.most_splats <= MOST_SPLATS:
+            raise UserError(f"--most-splats must be 1 to {MOST_SPLATS:,}, got {self.most_splats:,}")
+        if self.fitting_views < 4:
+            raise UserError(f"--fitting-views must be at least 4, got {self.fitting_views}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Share:
+    """Write one .html file that shows a cloud's object in any browser: Gaussian splats to turn, a poster, a title."""
+
+    cloud: tyro.conf.Positional[Path]
+    """What `spnr render` reads."""
+    out: Path = Path("page.html")
+    """The .html to write."""
+    title: str | None = None
+    """Title (default: the file's name)."""
+    credit: str = ""
+    """Credit and licence line."""
+    run: Path | None = None
+    """Network that draws it, as for `spnr render` (default: surfels)."""
+    lighting: tyro.conf.OmitArgPrefixes[Lighting] = field(default_factory=Lighting)
+    """The light, which is part of the splats."""
+    making: tyro.conf.OmitArgPrefixes[SplatMaking] = field(default_factory=SplatMaking)
+    """How the splats are made."""
+    num_points: int = 16384
+    """Points used of a bigger cloud, evenly spread, or sampled from a mesh."""
+    up: Literal["auto", "x", "y", "z", "-x", "-y", "-z"] = "auto"
+    """The file's upward axis; auto looks for it, and says what it found."""
+    clean: Literal["auto", "off", "strong"] = "auto"
+    """As for `spnr render`."""
+    azimuth: float = 30.0
+    """Degrees around the object from which the page first shows it."""
+    elevation: float = 20.0
+    """Degrees above the horizon."""
+
+    def __post_init__(self) -> None:
+        """ValueError names the option that makes no sense."""
+        if self.out.suffix.lower() not in (".html", ".htm") or self.out.is_dir():
+            raise UserError(f"--out {self.out}: expected the name of an .html file")
+        if self.num_points < 1:
+            raise UserError(f"--num-points must be at least 1, got {self.num_points}")
+        if not -89 <= self.elevation <= 89:
+            raise UserError(f"--elevation must be -89 to 89 degrees, got {self.elevation:g}")
+        if self.lighting.background != "white":
+            raise UserError("--background light: a page shows its object on white; leave it out")
+
+
+Output = Literal["image", "depth", "opacity"]
+WILDCARDS = "*?["  # of a pattern of files
+
+
+def is_catalogue(cloud: Path) -> bool:
+    """Whether a folder or a pattern is meant, and not a file, whatever its name."""
+    return cloud.is_dir() or (not cloud.exists() and any(mark in str(cloud) for mark in WILDCARDS))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Render:
+    """Render a point cloud or mesh file: views as .png, a turntable, depth, opacity, a mesh, splats.
+    Of a folder, or a pattern in quotation marks, every file is drawn, and a page shows them all."""
+
+    cloud: tyro.conf.Positional[Path]
+    """.ply .spz (also 3D Gaussian splats) .pcd .xyz .txt .csv .asc .pts .las .laz .npz .npy, or a mesh: .glb .gltf .obj
+    .stl .off (its surface is sampled).  Or a folder, with all folders in it, or a pattern such as 'scans/**/*.ply'."""
+    run: Path | None = None
+    """Network that renders: a run folder or a file of weights (default: that of the package, `surfels`)."""
+    out: Path = Path("renders")
+    """Output folder. Of a folder or pattern, files whose results are there are skipped."""
+    workers: int | None = None
+    """Processes that draw the files of a folder or pattern (default: this one; extra `cluster`)."""
+    cluster: str | None = None
+    """Address of a Dask scheduler whose workers draw instead.  They see the files and OUT under the same names."""
+    up: Literal["auto", "x", "y", "z", "-x", "-y", "-z"] = "auto"
+    """The file's upward axis; auto: by the format, else y or z, as the object would stand."""
+    num_points: int = 16384
+    """Points used of a bigger cloud, evenly spread, or sampled from a mesh; fewer work too."""
+    clean: Literal["auto", "off", "strong"] = "auto"
+    """Outliers of points are removed, and noisy ones averaged, before they are thinned; a clean cloud, and a mesh, stay
+    as they are.  strong: at smaller deviations."""
+    cut: tyro.conf.OmitArgPrefixes[Cut] = Cut()
+    """Select one object of a scene, before it is cleaned."""
+    transparent_parts: Literal["opaque", "skip"] = "opaque"
+    """Glass and other parts of a mesh that light passes through: drawn in their colour, or left out.  What the alpha of
+    a texture cuts out is left out either way."""
+    seed: int = 0
+    """Seed of the points that are chosen, and of the planes that --remove-plane tries."""
+    views: int = 4
+    """Still pictures, evenly around the object."""
+    elevation: float = 20.0
+    """Degrees above the horizon."""
+    resolution: int | None = None
+    """Pixels along each side (default: 512 of surfels, else what the network was trained for)."""
+    quality: Literal["draft", "balanced", "best", "trained"] = "best"
+    """balanced: three quarters of the size, enlarged; draft: discs and light alone, without the CNN.  Of the paper's
+    network: a quarter, half or all of the samples that a ray was trained with, near the points; or just as trained."""
+    outputs: tuple[Output, ...] = ("image", "depth", "opacity")
+    """What is written of each view; depth comes coloured, as .npy and as 16-bit .png."""
+    transparent: bool = False
+    """Stills on a transparent background instead of white (straight alpha)."""
+    lighting: tyro.conf.OmitArgPrefixes[Lighting] = Lighting()
+    """Light; only `surfels` takes another than that of its training."""
+    turntable: Literal["gif", "mp4", "none"] = "gif"
+    """Format of the turntable."""
+    turn: Literal["object", "light"] = "object"
+    """What turns in it."""
+    frames: int = 48
+    """Frames of the turntable."""
+    fps: int = 16
+    """Frames a second of the turntable."""
+    mesh: bool = False
+    """Also write the surface as .glb, with the materials of the nearest points."""
+    grid_resolution: int | None = None
+    """Places along each side of the grid of --mesh (default: 192)."""
+    splats: Literal["none", "ply", "spz"] = "none"
+    """Also write Gaussian splats."""
+    making: SplatMaking = field(default_factory=SplatMaking)
+    """Options of the Gaussian splats."""
+
+    @property
+    def asked_of_light(self) -> tuple[str, ...]:
+        """Names of the options that need a network that takes a light."""
+        return (*self.lighting.asked, *(("--turn light",) if self.turn == "light" else ()))
+
+    @property
+    def few(self) -> bool:
+        """Whether so few pictures are drawn that the first one counts most."""
+        return self.turntable == "none" and self.splats == "none" and not is_catalogue(self.cloud)
+
+    def __post_init__(self) -> None:
+        """ValueError names the option that makes no sense."""
+        if self.views < 0:
+            raise UserError(f"--views must not be negative, got {self.views}")
+        for name in ("frames", "num_points", "fps"):
+            if getattr(self, name) < 1:
+                raise UserError(f"--{name.replace('_', '-')} must be at least 1, got {getattr(self, name)}")
+        if self.workers is not None and (self.workers < 1 or self.cluster is not None):
+            raise UserError(f"--workers must be at least 1, and without --cluster, got {self.workers}")
+        if self.resolution is not None and (self.resolution < 16 or self.resolution % 4):
+            raise UserError(f"--resolution must be a multiple of 4 of at least 16, got {self.resolution}")
+        if not -90 <= self.elevation <= 90:
+            raise UserError(f"--elevation must be -90 to 90 degrees, got {self.elevation:g}")
+        if self.transparent and self.lighting.background != "white":
+            raise UserError("--background light: not together with --transparent; give one of them")
+        if self.grid_resolution is not None and not 8 <= self.grid_resolution <= 512:
+            raise UserError(f"--grid-resolution must be 8 to 512, got {self.grid_resolution}")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,16 +13,21 @@
 Depth and opacity have the resolution of the volume rendering, which an upsampler doubles for the image.
 """
 
+import dataclasses
 import io
 import json
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache, partial, reduce
+from operator import add
 from pathlib import Path
 from typing import NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 from PIL import Image
 
 from spnr_jax.devices.side_by_side import beside
@@ -30,12 +35,56 @@ from spnr_jax.errors import UserError
 from spnr_jax.formats import clouds, images
 from spnr_jax.formats.clouds import PlacedCloud
 from spnr_jax.formats.gaussian_files import write_splats
+from spnr_jax.formats.light_files import read_light
+from spnr_jax.kernels.cameras import camera_rays
+from spnr_jax.kernels.colors import linear_to_srgb
 from spnr_jax.kernels.records import Camera, Light, Rendering, Volume
 from spnr_jax.method.model import Model
+from spnr_jax.methods import method_of
+from spnr_jax.surfels.lighting import background, sun
 from spnr_jax.tools import depth_maps
-from spnr_jax.tools.chosen_light import before, check_takes_light, light_of_options
-from spnr_jax.tools.render_command import Render
+from spnr_jax.tools.commands import Lighting, Render
 from spnr_jax.training.weights import SHIPPED, load
+
+SUN = (1.6, 1.5, 1.35)  # irradiance over pi of what faces the sun of --sun, slightly warm
+
+
+def light_of_options(options: Lighting, read: Callable[[str], Light] = read_light) -> Light:
+    """The light that the options ask for; `read` gives that of a map by its name."""
+    parts = [read(options.light or "room").turned(options.light_yaw)] if options.light or not options.sun else []
+    parts += [sun(*options.sun, color=SUN)] if options.sun else []
+    return 2.0**options.exposure * reduce(add, parts)
+
+
+def takes_light(model: Model) -> bool:
+    """Whether the network draws in any light."""
+    return method_of(model.config).takes_light
+
+
+def check_takes_light(model: Model, asked: Sequence[str], run: Path | None) -> None:
+    """ValueError, naming the options, where something is asked of the light and the network takes none."""
+    if asked and not takes_light(model):
+        raise UserError(
+            f"{', '.join(asked)}: the network of --run {run} knows the light of its training alone; "
+            f"leave {'it' if len(asked) == 1 else 'them'} out, or --run"
+        )
+
+
+def before(wanted: str, rendering: Rendering, camera: Camera, light: Light | None) -> Rendering:
+    """The picture before what is wanted behind it: white, as it is, or the map of the light."""
+    if wanted == "white" or light is None:
+        return rendering
+    behind = np.asarray(_behind(light, camera))
+    image = np.asarray(rendering.image) + (1 - np.asarray(rendering.acc))[..., None] * (behind - 1)
+    return dataclasses.replace(rendering, image=image)
+
+
+@jax.jit
+def _behind(light: Light, camera: Camera) -> Float[Array, "height width 3"]:
+    """The light's map as a camera sees it, sRGB."""
+    towards = list(jnp.moveaxis(camera_rays(camera).directions, -1, 0))
+    return linear_to_srgb(jnp.minimum(jnp.stack(background(light, towards), axis=-1), 1))
+
 
 FIRST_AZIMUTH = 30.0  # degrees of the first still: a view that shows front and side
 INVISIBLE = 1 / 255  # opacity below which a pixel has no colour of its own

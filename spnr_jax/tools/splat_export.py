@@ -21,10 +21,9 @@ from spnr_jax.formats.gaussian_files import check_suffix, spz_of, write_splats
 from spnr_jax.kernels.records import Camera, Gaussians
 from spnr_jax.method.model import FIELD_OF_VIEW
 from spnr_jax.tools import mesh_export
+from spnr_jax.tools.commands import Render, Share
 from spnr_jax.tools.pictures import Ready, made_ready
-from spnr_jax.tools.render_command import Render
 from spnr_jax.tools.splat_making import RESOLUTION, note_of, splats_of
-from spnr_jax.tools.splat_options import Share
 from spnr_jax.training.weights import load
 
 MOST_BYTES = 6_000_000  # of a page

@@ -1,7 +1,7 @@
 """Gaussian splats of a cloud: the network draws it from all around, and splats are placed and coloured from that.
 
 fitting cameras    even directions on the sphere, the same distance as `Model.camera`
-splats             gaussians/placing.py, coloring.py, in the box, then in the cloud's units
+splats             surfels/gaussians.py, in the box, then in the cloud's units
 """
 
 import dataclasses
@@ -11,14 +11,13 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from spnr_jax.gaussians import coloring, placing
-from spnr_jax.gaussians.placing import View
 from spnr_jax.kernels.records import Camera, Gaussians, Light, PointCloud, SurfelScene, Volume
 from spnr_jax.method.model import DISTANCE, Model
+from spnr_jax.surfels import gaussians
+from spnr_jax.surfels.gaussians import View
 from spnr_jax.surfels.surfel_scenes import encode_in_box
+from spnr_jax.tools.commands import Lighting, Render
 from spnr_jax.tools.depth_maps import surface_depth
-from spnr_jax.tools.light_options import Lighting
-from spnr_jax.tools.render_command import Render
 
 VIEWS, RESOLUTION = 32, 512  # pictures, and their pixels along each side
 GOLDEN_ANGLE = 180 * (3 - np.sqrt(5))  # degrees between the azimuths of one direction and the next
@@ -67,9 +66,9 @@ def splats_in_box(pictures: list[View], volume: Volume, cloud: PointCloud, degre
     """Splats in the box from pictures that the network has drawn."""
     scene = volume.scene if isinstance(volume.scene, SurfelScene) else _encode_in_box(cloud, volume)
     focal = float(np.asarray(pictures[0].camera.intrinsics)[0, 0])
-    seen = placing.seen_surface(pictures, scene.surfels)
-    grey, side = placing.place(seen, most=most, pixel=DISTANCE / focal)
-    return coloring.color(grey, pictures, side=side, degree=degree)
+    seen = gaussians.seen_surface(pictures, scene.surfels)
+    grey, side = gaussians.place(seen, most=most, pixel=DISTANCE / focal)
+    return gaussians.color(grey, pictures, side=side, degree=degree)
 
 
 def fitting_cameras(model: Model, volume: Volume, count: int = VIEWS, resolution: int = RESOLUTION) -> list[Camera]:

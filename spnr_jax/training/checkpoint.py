@@ -19,7 +19,7 @@ from typing import Any
 import jax
 
 from spnr_jax.config import TrainConfig
-from spnr_jax.devices import allocator
+from spnr_jax.devices import runtime
 from spnr_jax.errors import UserError, first_line
 from spnr_jax.formats.images import write_whole
 from spnr_jax.methods import UnknownMethod, from_dict, to_dict
@@ -108,7 +108,7 @@ def save(run: Path, state: optimisation.TrainState) -> None:
             f"checkpoint {run / 'checkpoints' / str(step)} cannot be written ({reason}); the one before is kept: mend "
             "this, and the same command goes on from there"
         ) from None
-    allocator.give_back()
+    runtime.give_back()
 
 
 def restore(

@@ -24,7 +24,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from spnr_jax.devices import machine
+from spnr_jax.devices import runtime
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.images import to_uint8, write_whole
 from spnr_jax.training.weights import Trained
@@ -116,7 +116,7 @@ class RunRecord:
             "version": version(),
             "commit": commit(),
             "jax": jax.__version__,
-            "hardware": machine.hardware(),
+            "hardware": runtime.hardware(),
             "data": str(dataset.folder),
             "data_checksum": checksum(dataset),
         }

@@ -24,7 +24,7 @@ from jax.sharding import Mesh
 from tqdm import tqdm
 
 from spnr_jax.config import TrainConfig
-from spnr_jax.devices import allocator, placement
+from spnr_jax.devices import placement, runtime
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.images import png, write_whole
@@ -77,7 +77,7 @@ def train(
     A new run begins with random weights, or those of `init`.  Each process of a mesh of devices calls this.  `on_event`
     is told what the loop is about to do.  `light` is that of the data set's pictures, where it is not the room.
     """
-    allocator.few_arenas()
+    runtime.few_arenas()
     own = None if mesh is None else placement.own_objects(mesh, config.batch_objects)
     with claimed(run, config), ExitStack() as stack:
         clock = Clock()
@@ -209,7 +209,7 @@ class Progress:
         self._tell("preview", self._done, None)
         scores, picture = preview(state, *self._of)
         self._log.write({"step": self._done, **scores}, picture)
-        allocator.give_back()
+        runtime.give_back()
         self._clock.lap("previews")
 
     def checkpoint(self, state: optimisation.TrainState) -> None:

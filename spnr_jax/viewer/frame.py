@@ -23,8 +23,8 @@ from spnr_jax.formats import images
 from spnr_jax.formats.light_files import NAMES, read_light
 from spnr_jax.kernels.records import Camera, Light, PointCloud, Volume
 from spnr_jax.method.model import Model
-from spnr_jax.tools.chosen_light import before, light_of_options
-from spnr_jax.tools.light_options import Lighting
+from spnr_jax.tools.commands import Lighting
+from spnr_jax.tools.pictures import before, light_of_options
 
 SMALLEST = 256  # pixels along a side of the network's square while things move, at most
 MOVING_LONGEST, LONGEST = 960, 1600  # pixels of the canvas's longer side, while it moves and at rest

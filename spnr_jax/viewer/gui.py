@@ -9,22 +9,64 @@ import dataclasses
 import threading
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 import viser
 
 from spnr_jax.errors import UserError
 from spnr_jax.formats import clouds, images, light_files
-from spnr_jax.gaussians.harmonics import C0
-from spnr_jax.gaussians.placing import rotations
 from spnr_jax.kernels.records import Gaussians
 from spnr_jax.method.model import Model
+from spnr_jax.surfels.gaussians import C0, rotations
 from spnr_jax.tools import splat_making
-from spnr_jax.tools.chosen_light import takes_light
+from spnr_jax.tools.pictures import takes_light
 from spnr_jax.viewer import frame
 from spnr_jax.viewer.frame import State
-from spnr_jax.viewer.loop import Loop
+
+Shown = TypeVar("Shown")
+REST = 0.2  # seconds without a change after which the better picture is drawn
+
+
+class Loop(Generic[Shown]):
+    """Draws `show(state, moving)` after changes (moving), and when none came for `rest` seconds (not moving)."""
+
+    def __init__(self, state: Shown, show: Callable[[Shown, bool], Shown], rest: float = REST) -> None:
+        self.state, self.stopped = state, False
+        self._show, self._rest = show, rest
+        self._changes: list[Callable[[Shown], Shown]] = []
+        self._wake = threading.Condition()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self.start, self.join = self._thread.start, self._thread.join
+
+    def submit(self, change: Callable[[Shown], Shown]) -> None:
+        """Have a change applied before the next picture."""
+        with self._wake:
+            self._changes.append(change)
+            self._wake.notify()
+
+    @property
+    def superseded(self) -> bool:
+        """Whether a change waits: a picture of the state as it is would be old before it is seen."""
+        return bool(self._changes) or self.stopped
+
+    def stop(self) -> None:
+        """End the thread after the picture that it draws, without waiting: that may be a browser's callback."""
+        with self._wake:
+            self.stopped = True
+            self._wake.notify()
+
+    def _run(self) -> None:
+        moving = True
+        while not self.stopped:
+            self.state = self._show(self.state, moving)
+            with self._wake:
+                self._wake.wait_for(lambda: self.superseded, self._rest if moving else None)
+                changes, self._changes = self._changes, []
+            moving = bool(changes)
+            for change in changes:
+                self.state = change(self.state)
+
 
 # A file dropped anywhere on the page goes into the file input of the upload button.
 DROP = """<img alt="" style="display:none" src="data:image/gif;base64,R0lGODlhAQABAAAAACwAAAAAAQABAAAC" onload="

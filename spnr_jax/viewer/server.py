@@ -1,29 +1,107 @@
 """The server behind `spnr view`: loads the network and a cloud, and gives every browser that comes its own controls.
 
-It listens on this machine alone unless `--host` says otherwise, and talks to its own page alone (gate.py): the address
-that is printed holds a token.  viser's tunnel to a public address, which any browser could ask for, is closed.
+It listens on this machine alone unless `--host` says otherwise, and talks to its own page alone.  A web page of any
+address that is open in the same browser can connect to a server on this machine, and viser asks nobody who he is.  So
+the path of the viewer's address begins with a token, made anew for every viewer, without which no page is served and no
+WebSocket is opened; the page's own connection takes the token from its address.  Where a browser names the origin of
+what asks, it has to be the address that was asked or, behind a proxy, `reached_at`.  viser's tunnel to a public
+address, which any browser could ask for, is closed.
 """
 
 import contextlib
 import dataclasses
+import hmac
 import io
+import secrets
 import socket
 import threading
 import warnings
+from collections.abc import Callable, Iterator
+from http import HTTPStatus
 from typing import Any
 
 import numpy as np
 import viser
+import websockets.asyncio.server
+from websockets.datastructures import Headers
+from websockets.http11 import Request, Response
 
 from spnr_jax.errors import UserError
 from spnr_jax.formats import clouds
 from spnr_jax.method.model import FIELD_OF_VIEW, Model
-from spnr_jax.tools.chosen_light import check_takes_light
 from spnr_jax.tools.commands import View
+from spnr_jax.tools.pictures import check_takes_light
 from spnr_jax.training.weights import load
-from spnr_jax.viewer import frame, gate
+from spnr_jax.viewer import frame
 from spnr_jax.viewer.frame import State
 from spnr_jax.viewer.gui import Browser
+
+LENGTH = 16  # bytes of a token
+CLOSED = "Open the address that `spnr view` printed, whole: it holds a token.\n"
+FOREIGN = "This page is not that of the viewer.\n"
+DEFAULT_PORTS = {"http": ":80", "https": ":443"}  # which a browser leaves out of an origin
+_guarding = threading.Lock()
+
+Asked = Callable[[Any, Request], Any]
+
+
+def new_token() -> str:
+    """A token of characters that an address may hold."""
+    return secrets.token_urlsafe(LENGTH)
+
+
+def admitted(request: Request, token: str, reached_at: str | None = None) -> Request | Response:
+    """The request with the path behind the token, or why it is refused."""
+    first, _, rest = request.path.removeprefix("/").partition("/")
+    if not hmac.compare_digest(first.partition("?")[0].encode(), token.encode()):
+        return _refusal(CLOSED)
+    origins, asked = request.headers.get_all("Origin"), request.headers.get_all("Host")
+    if not all(_is_own(origin, asked, reached_at) for origin in origins):
+        return _refusal(FOREIGN)
+    return dataclasses.replace(request, path="/" + rest)
+
+
+def _is_own(origin: str, asked: list[str], reached_at: str | None) -> bool:
+    """Whether an origin is the host that was asked, or reached_at; "null" (a file, a sandbox) is neither."""
+    scheme, _, place = origin.lower().partition("://")
+    if scheme not in DEFAULT_PORTS:
+        return False
+    known = (reached_at or "").lower().removesuffix(DEFAULT_PORTS[scheme])
+    return [place] == [host.lower() for host in asked] or (known != "" and place == known)
+
+
+def _refusal(why: str) -> Response:
+    content = why.encode()
+    headers = Headers({"Content-Type": "text/plain; charset=utf-8", "Content-Length": str(len(content))})
+    return Response(HTTPStatus.FORBIDDEN, HTTPStatus.FORBIDDEN.phrase, headers, content)
+
+
+@contextlib.contextmanager
+def guarded(token: str, reached_at: str | None = None) -> Iterator[list[Any]]:
+    """Servers of websockets that are opened meanwhile, in whatever thread, admit what knows the token; their list.
+
+    viser opens its server in its own thread and has no hook for who is let in, hence the replaced function.
+    """
+    original: Any = websockets.asyncio.server.serve
+    opened: list[Any] = []
+
+    def serve(*arguments: Any, process_request: Asked | None = None, **options: Any) -> Any:
+        def ask(connection: Any, request: Request) -> Any:
+            answer = admitted(request, token, reached_at)
+            if isinstance(answer, Response) or process_request is None:
+                return answer if isinstance(answer, Response) else None
+            return process_request(connection, answer)
+
+        opened.append(original(*arguments, process_request=ask, **options))
+        return opened[-1]
+
+    with _guarding:
+        websockets.asyncio.server.serve = serve  # type: ignore[assignment, misc]
+        try:
+            yield opened
+        finally:
+            websockets.asyncio.server.serve = original  # type: ignore[misc]
+
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 EYE = (1.7, 1.2, 2.9)  # in the box: where a browser looks from at first, at its middle
@@ -51,8 +129,8 @@ class Viewer:
         self._model, self._first, self._reading = model, first, reading
         self._network = threading.Lock()
         self._browsers: dict[int, Browser] = {}
-        token = gate.new_token()
-        with gate.guarded(token, reached_at) as opened, contextlib.redirect_stdout(io.StringIO()):  # no banner of viser
+        token = new_token()
+        with guarded(token, reached_at) as opened, contextlib.redirect_stdout(io.StringIO()):  # no banner of viser
             self._server = Server(host=host, port=port, label="spnr view", verbose=False)
         if not opened:
             self.stop()

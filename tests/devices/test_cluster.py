@@ -38,6 +38,7 @@ def test_a_killed_worker_costs_its_own_task_at_most(tmp_path):
     assert run(tmp_path, [1, 7, 13, 5], 2) == {1: 2, 7: 14, 13: cluster.Died(2), 5: 10}
 
 
+@pytest.mark.ci
 def test_an_error_in_a_worker_is_raised_in_the_parent_and_the_workers_end(tmp_path):
     before = set(psutil.Process().children(recursive=True))
     with pytest.raises(OSError, match="No space"):
@@ -45,6 +46,7 @@ def test_an_error_in_a_worker_is_raised_in_the_parent_and_the_workers_end(tmp_pa
     assert not [child for child in set(psutil.Process().children(recursive=True)) - before if is_worker(child)]
 
 
+@pytest.mark.ci
 def test_workers_that_a_busy_machine_takes_long_to_clear_away_cost_no_result(tmp_path, monkeypatch):
     monkeypatch.setattr(cluster, "GRACE", 1e-6)  # nothing ends so fast, not even when it is killed
     before = set(psutil.Process().children(recursive=True))
@@ -116,6 +118,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
 def test_no_worker_outlives_a_parent_that_is_interrupted_or_killed(how, tmp_path):
     script = tmp_path / "sleeper.py"

@@ -16,7 +16,7 @@ from experiments.comparison.object_scores import Shown, color_scores
 from experiments.comparison.variants import Compared
 from spnr_jax.formats import data_sets
 from spnr_jax.scoring import evaluation, summary
-from spnr_jax.scoring.score_tables import Table, number, text
+from spnr_jax.scoring.report import Table, number, text
 from spnr_jax.training import batching, checkpoint, optimisation
 
 ROWS = (

@@ -8,7 +8,7 @@ from support import twin
 
 from experiments.speed import bench, gpu, speed_scenes, twin_layout, where_time_goes
 from spnr_jax import cli
-from spnr_jax.devices import machine
+from spnr_jax.devices import runtime
 
 
 @pytest.fixture(autouse=True)
@@ -73,10 +73,10 @@ def test_slopes_of_a_power_law_and_of_a_cost_with_a_constant_part():
 
 def test_a_processor_is_named_with_the_sets_that_it_has(tmp_path, monkeypatch):
     told = tmp_path / "cpuinfo"
-    monkeypatch.setattr(machine, "CPUINFO", told)
-    assert machine.processor().endswith("(instruction sets unknown)")
+    monkeypatch.setattr(runtime, "CPUINFO", told)
+    assert runtime.processor().endswith("(instruction sets unknown)")
     told.write_text("processor\t: 0\nmodel name\t: Some CPU: 9\nflags\t\t: sse avx2 avx512f xavx512_bf16\n")
-    assert machine.processor() == "Some CPU: 9 (avx2, avx512f)"
+    assert runtime.processor() == "Some CPU: 9 (avx2, avx512f)"
 
 
 COUNTS = {

@@ -8,7 +8,7 @@ from support import splat_balls
 
 from spnr_jax.formats import gaussian_files
 from spnr_jax.formats.point_files import parse_ply
-from spnr_jax.gaussians.placing import rotations
+from spnr_jax.surfels.gaussians import rotations
 
 NOTE = "ball.ply, drawn by spnr_jax (surfels), light: room"
 

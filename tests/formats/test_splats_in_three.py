@@ -9,8 +9,7 @@ from support import chromium as chromium_of
 from support import splat_balls, three_js
 
 from spnr_jax.formats import gaussian_files
-from spnr_jax.gaussians.harmonics import C0
-from spnr_jax.gaussians.placing import rotations
+from spnr_jax.surfels.gaussians import C0, rotations
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install playwright")
 

@@ -8,10 +8,9 @@ import pytest
 from support import splat_balls, splat_twin
 from support.surfel_clouds import estimate
 
-from spnr_jax.gaussians import coloring, placing
-from spnr_jax.gaussians.harmonics import C0, basis, coefficients, degree_of, half_turn_signs
-from spnr_jax.gaussians.placing import rotations
 from spnr_jax.kernels.cameras import camera_rays
+from spnr_jax.surfels import gaussians
+from spnr_jax.surfels.gaussians import C0, basis, coefficients, degree_of, half_turn_signs, rotations
 
 RADIUS, SIZE, MOST = 0.8, 48, 500
 PIXEL = 3 / (0.5 * SIZE / np.tan(np.deg2rad(20)))
@@ -29,7 +28,7 @@ def view(azimuth, elevation):
     normal = (origin + np.where(hit, depth, 0)[..., None] * direction) / RADIUS
     image = np.where(hit[..., None], 0.5 + 0.3 * normal, 1).astype(np.float32)
     camera = jax.tree.map(np.asarray, camera)
-    return placing.View(camera, image, hit.astype(np.float32), depth.astype(np.float32))
+    return gaussians.View(camera, image, hit.astype(np.float32), depth.astype(np.float32))
 
 
 @functools.cache
@@ -50,35 +49,35 @@ def surfels():
 
 @functools.cache
 def placed():
-    return placing.place(placing.seen_surface(views(), surfels()), most=MOST, pixel=PIXEL)
+    return gaussians.place(gaussians.seen_surface(views(), surfels()), most=MOST, pixel=PIXEL)
 
 
 @functools.cache
 def colored():
-    return coloring.color(placed()[0], views(), side=placed()[1], degree=1)
+    return gaussians.color(placed()[0], views(), side=placed()[1], degree=1)
 
 
 def test_splats_lie_on_the_surface_and_along_it():
     splats, side = placed()
     distance = np.linalg.norm(splats.position, axis=1)
     assert 0.6 * MOST < len(distance) <= MOST
-    np.testing.assert_allclose(distance, RADIUS - placing.INSET * PIXEL, atol=0.03)
+    np.testing.assert_allclose(distance, RADIUS - gaussians.INSET * PIXEL, atol=0.03)
     normal = rotations(splats.rotation)[:, :, 2]
     assert (np.abs(np.sum(normal * splats.position, axis=1)) / distance).min() > 0.97
-    assert side >= placing.FINEST * PIXEL
+    assert side >= gaussians.FINEST * PIXEL
 
 
 def test_pixels_far_from_every_surfel_are_no_surface():
     outside = [seen._replace(depth=seen.depth - np.float32(0.5)) for seen in views()]
     with pytest.raises(ValueError, match="no surface"):
-        placing.seen_surface(outside, surfels())
+        gaussians.seen_surface(outside, surfels())
 
 
 def test_the_quaternions_turn_the_third_axis_to_the_normal():
     normal = np.random.default_rng(0).normal(size=(200, 3))
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     normal[:2] = [0, 0, 1], [0, 0, -1]
-    axis = rotations(placing.turn_to(normal))[:, :, 2]
+    axis = rotations(gaussians.turn_to(normal))[:, :, 2]
     np.testing.assert_allclose(axis, normal, atol=1e-6)
 
 
@@ -94,7 +93,7 @@ def test_colours_are_those_of_the_pictures():
 def test_splats_that_stick_out_of_the_silhouettes_are_left_out():
     splats, side = placed()
     out = splats.replace(position=splats.position * np.where(np.arange(len(splats.position)) < 20, 1.5, 1)[:, None])
-    kept = coloring.color(out, views(), side=side, degree=0)
+    kept = gaussians.color(out, views(), side=side, degree=0)
     assert np.linalg.norm(kept.position, axis=1).max() < 1.05 * RADIUS
 
 

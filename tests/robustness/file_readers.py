@@ -106,12 +106,11 @@ def read_dataset(folder: Path, main: str) -> None:
 
 def read_list(folder: Path, main: str) -> None:
     """Splits that a user names, and the tables of other data sets."""
-    from data_gen.plan import splits
-    from data_gen.plan.sources import abo
+    from data_gen.plan import sources, splits
 
     path, known = folder / main, {"a", "b"}
     if main.startswith("3dmodels"):
-        for name in abo.read_table(path).values():
+        for name in sources.read_table(path).values():
             place = (folder / "models" / name).resolve()
             assert place.is_relative_to((folder / "models").resolve()), "a product outside its folder"
         return

@@ -14,16 +14,14 @@ from support.tiny_untrained import CONFIG
 
 from spnr_jax.formats import data_sets
 from spnr_jax.kernels import metrics
-from spnr_jax.presets import PRESETS
 from spnr_jax.scoring import evaluation, floors
-from spnr_jax.scoring.perceptual import flip
+from spnr_jax.scoring.picture_scores import flip
 from spnr_jax.scoring.summary import METRICS
 from spnr_jax.training import checkpoint, optimisation, run_record, weights
 
 NAMES = tiny_dataset.SPLITS["test"]
 ssim = jax.jit(metrics.ssim)
 FACTORS = {"splat": 1.5, "nearest": 0.75}
-KINDS = {"surfels": "surfels", "surfels_tiny": "surfels", "tiny": "paper"}
 
 
 def methods():
@@ -99,10 +97,6 @@ def test_networks_are_compared_under_the_names_that_they_are_given(outcome):
     assert found.summary["settings"]["networks"] == dict.fromkeys(("ours", "paper"), {"preset": "tiny", "steps": 0})
 
 
-def test_a_network_is_named_by_what_it_is():
-    assert {name: preset().model.method for name, preset in PRESETS.items() if name in KINDS} == KINDS
-
-
 def test_categories_come_from_the_names_and_add_up(outcome):
     assert set(outcome.per_category) == {"ball", "cube", "meshes"}
     counts = [table["paper"]["objects"] for table in outcome.per_category.values()]
@@ -138,20 +132,6 @@ def test_the_test_points_are_always_the_first_ones():
     )
 
 
-def test_the_gallery_holds_as_many_objects_as_asked_first_and_last_among_them():
-    few = evaluation.evaluate(tiny_untrained.run(), tiny_dataset.dataset(), gallery_objects=2, say=lambda line: None)
-    assert [result.name for result in few.gallery] == [NAMES[0], NAMES[-1]]
-    assert few.summary["methods"]["paper"]["objects"] == len(NAMES)
-
-
-def test_objects_of_one_view_are_evaluated_although_training_draws_two(tmp_path):
-    copy = shutil.copytree(tiny_dataset.dataset().folder, tmp_path / "data")
-    item = data_sets.read_object(data_sets.open_dataset(copy), NAMES[0])
-    config = dataclasses.replace(CONFIG, views_per_object=len(item.images) + 1)
-    (result,) = evaluation.evaluate_objects(methods(), config, data_sets.open_dataset(copy), NAMES[:1])
-    assert len(result.scores["paper"]["psnr"]) == tiny_dataset.VIEWS
-
-
 @pytest.mark.parametrize(
     ("split", "expected"),
     [
@@ -166,20 +146,6 @@ def test_an_empty_split_is_an_error_that_names_it(split, expected, tmp_path):
         evaluation.evaluate(tiny_untrained.run(), data_sets.open_dataset(copy), say=lambda line: None)
 
 
-def test_any_number_of_methods_see_the_same_objects_and_are_scored_alike():
-    def half(cloud, camera):
-        size = (len(camera.cam_to_world), camera.height, camera.width)
-        return evaluation.Pictures(image=jnp.full((*size, 3), 0.5), acc=jnp.ones(size))
-
-    asked = {"grey": half, "also grey": half, "white": evaluation.floor("white")}
-    scores, gallery = evaluation.score_methods(asked, CONFIG, tiny_dataset.dataset(), NAMES, 1, print)
-    assert list(scores) == list(NAMES)
-    for by_method in scores.values():
-        assert list(by_method) == list(asked)
-        close(by_method["grey"], by_method["also grey"])
-    assert [result.name for result in gallery] == [NAMES[0]]
-
-
 def test_an_lpips_that_can_be_measured_is_in_the_scores_of_each_method(monkeypatch):
     monkeypatch.setattr(evaluation, "lpips", lambda image, reference: np.abs(image - reference).mean(axis=(1, 2, 3)))
     asked = {"white": evaluation.floor("white")}
@@ -187,40 +153,39 @@ def test_an_lpips_that_can_be_measured_is_in_the_scores_of_each_method(monkeypat
     close(result.scores["white"]["lpips"], (1 - result.reference).mean(axis=(1, 2, 3)), rtol=1e-4)
 
 
-class TestExposure:
-    """Whether a report may say that its objects are unseen: by the records of the run folders alone."""
+EXPOSURE = [  # starts that the record of a run names, split, what may be said
+    ([{}, {}], "test", "unseen in training"),
+    ([{}, {}], "val", "unseen in training"),
+    ([{}, {}], "train", "seen in training"),
+    ([], "test", "not known whether seen in training"),
+    ([{"data_checksum": "another"}], "test", "not known whether seen in training"),
+    ([{}, {"data_checksum": "another"}], "test", "not known whether seen in training"),
+    ([{"init": "small, 9 steps"}], "test", "not known whether seen in training"),
+    ([{"init": "small, 9 steps"}], "train", "seen in training"),
+]
 
-    def record(self, folder, *entries):
-        folder.mkdir()
-        here = {"data_checksum": run_record.checksum(tiny_dataset.dataset())}
-        (folder / "run.json").write_text(json.dumps({"starts": [here | entry for entry in entries]}))
-        return folder
 
-    def test_the_record_of_a_run_tells_its_training_objects_from_others(self, tmp_path):
-        dataset, run = tiny_dataset.dataset(), self.record(tmp_path / "run", {}, {})
-        names = [dataset.splits[split] for split in ("test", "val", "train")]
-        found = [evaluation.exposure((run,), dataset, some) for some in names]
-        assert found == ["unseen in training", "unseen in training", "seen in training"]
-        mixed = (*NAMES, dataset.splits["train"][0])
-        assert evaluation.exposure((run,), dataset, mixed) == "seen in training"
+def recorded(folder, *starts):
+    folder.mkdir()
+    here = {"data_checksum": run_record.checksum(tiny_dataset.dataset())}
+    (folder / "run.json").write_text(json.dumps({"starts": [here | start for start in starts]}))
+    return folder
 
-    @pytest.mark.parametrize("entries", [(), ({"data_checksum": "another"},), ({}, {"data_checksum": "another"})])
-    def test_nothing_is_known_of_a_run_without_a_record_or_with_that_of_other_data(self, entries, tmp_path):
-        run = self.record(tmp_path / "run", *entries)
-        found = evaluation.exposure((run,), tiny_dataset.dataset(), NAMES)
-        assert found == "not known whether seen in training"
 
-    def test_nothing_is_known_of_a_run_that_began_with_other_weights_but_of_its_own_training_objects(self, tmp_path):
-        dataset, run = tiny_dataset.dataset(), self.record(tmp_path / "run", {"init": "small, 9 steps"})
-        assert evaluation.exposure((run,), dataset, NAMES) == "not known whether seen in training"
-        assert evaluation.exposure((run,), dataset, dataset.splits["train"]) == "seen in training"
+@pytest.mark.parametrize(("starts", "split", "expected"), EXPOSURE)
+def test_a_report_says_that_objects_are_unseen_by_the_record_of_the_run_alone(starts, split, expected, tmp_path):
+    dataset, run = tiny_dataset.dataset(), recorded(tmp_path / "run", *starts)
+    assert evaluation.exposure((run,), dataset, dataset.splits[split]) == expected
 
-    def test_of_several_runs_the_least_favourable_counts(self, tmp_path):
-        dataset, run = tiny_dataset.dataset(), self.record(tmp_path / "run", {})
-        assert evaluation.exposure((run, run), dataset, NAMES) == "unseen in training"
-        assert evaluation.exposure((run, tmp_path), dataset, NAMES) == "not known whether seen in training"
-        assert evaluation.exposure((tmp_path, run), dataset, dataset.splits["train"]) == "seen in training"
-        assert evaluation.exposure((), dataset, NAMES) == "not known whether seen in training"
+
+def test_of_several_runs_and_objects_the_least_favourable_counts(tmp_path):
+    dataset, run = tiny_dataset.dataset(), recorded(tmp_path / "run", {})
+    train, unknown = dataset.splits["train"], "not known whether seen in training"
+    assert evaluation.exposure((run,), dataset, (*NAMES, train[0])) == "seen in training"
+    assert evaluation.exposure((run, run), dataset, NAMES) == "unseen in training"
+    assert evaluation.exposure((run, tmp_path), dataset, NAMES) == unknown
+    assert evaluation.exposure((tmp_path, run), dataset, train) == "seen in training"
+    assert evaluation.exposure((), dataset, NAMES) == unknown
 
 
 def test_objects_are_spread_from_the_first_to_the_last():

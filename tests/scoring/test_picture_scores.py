@@ -1,8 +1,80 @@
-"""Scores of pictures at the size that people look at, of pictures that are known."""
+"""FLIP is a number a picture, of any batch; LPIPS is asked for as its package wants it; colours without outlines."""
+
+import contextlib
+import sys
+import types
 
 import numpy as np
+import pytest
+from support.laws import close, numbers
 
-from spnr_jax.scoring.picture_scores import under_true_opacity
+from spnr_jax.scoring import picture_scores
+from spnr_jax.scoring.picture_scores import flip, lpips, under_true_opacity
+
+IMAGE = np.asarray(numbers(0, 2, 3, 40, 36, 3, low=0.0))
+REFERENCE = np.clip(IMAGE + 0.3 * np.asarray(numbers(1, 2, 3, 40, 36, 3)), 0, 1)
+
+
+@pytest.fixture
+def package(monkeypatch):
+    """Packages that stand in for `lpips` and `torch`: the distance is the mean of the absolute differences."""
+
+    class Network:
+        def eval(self):
+            return self
+
+        def __call__(self, shown, wanted):
+            assert shown.shape == wanted.shape == (6, 3, 40, 36)
+            assert shown.dtype == np.float32
+            assert shown.min() < -0.9
+            assert shown.max() > 0.9
+            distance = np.abs(shown - wanted).mean(axis=(1, 2, 3), keepdims=True)
+            return types.SimpleNamespace(numpy=lambda: distance)
+
+    torch = types.SimpleNamespace(from_numpy=lambda values: values, no_grad=contextlib.nullcontext)
+    found = types.SimpleNamespace(LPIPS=lambda net, verbose: Network())
+    monkeypatch.setitem(sys.modules, "torch", torch)
+    monkeypatch.setitem(sys.modules, "lpips", found)
+    picture_scores.lpips_network.cache_clear()
+    yield found
+    picture_scores.lpips_network.cache_clear()
+
+
+def test_flip_is_a_number_a_picture_whatever_the_batch():
+    found = flip(IMAGE, REFERENCE)
+    assert found.shape == (2, 3)
+    assert flip(IMAGE[1, 2], REFERENCE[1, 2]) == found[1, 2]
+    assert ((found > 0.01) & (found < 1)).all()
+    close(flip(REFERENCE, IMAGE), found, atol=1e-6)
+
+
+def test_flip_of_equal_pictures_is_0_and_greys_differ_by_their_lightness_alone():
+    black, white = np.zeros((20, 20, 3)), np.ones((20, 20, 3))
+    assert flip(IMAGE[0, 0], IMAGE[0, 0]) == 0
+    lab_green, lab_blue = (87.735, -86.183, 83.180), (32.297, 79.188, -107.860)  # published L*a*b* of sRGB, D65
+    chroma = np.hypot(*(lab_green[0] * lab_green[i] - lab_blue[0] * lab_blue[i] for i in (1, 2))) / 100
+    largest = (lab_green[0] - lab_blue[0] + chroma) ** 0.7
+    assert flip(black, white) == pytest.approx(0.95 + 0.05 * (100**0.7 / largest - 0.4) / 0.6, abs=1e-4)
+
+
+def test_lpips_sees_views_of_channels_first_from_minus_1_to_1_and_keeps_the_batch(package):
+    found = lpips(IMAGE, REFERENCE)
+    assert found.shape == (2, 3)
+    close(found, 2 * np.abs(IMAGE - REFERENCE).mean(axis=(2, 3, 4)), atol=1e-6)
+
+
+def test_lpips_is_missing_without_its_package_its_weights_or_enough_pixels(package, monkeypatch):
+    assert lpips(IMAGE[..., :31, :, :], REFERENCE[..., :31, :, :]) is None
+
+    def offline(net, verbose):
+        raise OSError("no way to the weights")
+
+    monkeypatch.setattr(package, "LPIPS", offline)
+    picture_scores.lpips_network.cache_clear()
+    assert lpips(IMAGE, REFERENCE) is None
+    monkeypatch.setitem(sys.modules, "lpips", None)
+    picture_scores.lpips_network.cache_clear()
+    assert lpips(IMAGE, REFERENCE) is None
 
 
 def test_colours_under_the_true_opacity_are_those_of_the_nearest_pixel_that_is_covered():

@@ -11,14 +11,14 @@ import data_gen.__main__
 
 
 def unchecked_cli() -> ModuleType:
-    """The module without executed annotations: tyro's mark of a missing value stands where a Path will be."""
+    """The module; of `spnr train` annotations are not executed: tyro's mark of a missing value stands for a Path."""
     name = "spnr_jax.tools.commands"
-    checked = importlib.import_module(name)
-    sys.modules[name] = _unchecked(name, "unchecked_commands")
+    commands, own = importlib.import_module(name), _unchecked(name, "unchecked_commands")
+    train, commands.Train = commands.Train, own.Train
     try:
         return _unchecked("spnr_jax.cli", "unchecked_cli")
     finally:
-        sys.modules[name] = checked
+        commands.Train = train
 
 
 def spnr_data(*arguments: object) -> int:

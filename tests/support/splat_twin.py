@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from spnr_jax.gaussians.harmonics import basis, degree_of
+from spnr_jax.surfels.gaussians import basis, degree_of
 
 DILATION = 0.1  # square pixels, as the page of `spnr share` has it
 

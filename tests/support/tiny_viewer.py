@@ -11,7 +11,7 @@ from spnr_jax.config import SurfelConfig
 from spnr_jax.kernels.records import PointCloud
 from spnr_jax.method import inference, surfel_method
 from spnr_jax.method.model import Model
-from spnr_jax.tools.light_options import Lighting
+from spnr_jax.tools.commands import Lighting
 from spnr_jax.viewer import frame
 from spnr_jax.viewer.frame import OPENCV, State, View
 from support import surfel_clouds, tiny_model

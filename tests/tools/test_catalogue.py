@@ -13,7 +13,7 @@ from support import tiny_untrained
 from support.schedulers import in_this_process
 
 from spnr_jax.tools import catalogue, pictures
-from spnr_jax.tools.render_command import Render, is_catalogue
+from spnr_jax.tools.commands import Render, is_catalogue
 
 OPTIONS = {"views": 1, "resolution": 24, "num_points": 30, "up": "y", "turntable": "none", "outputs": ("image",)}
 NAMES = ("a/x.xyz", "b/x.npy", "b/x.xyz", "c d#.xyz")
@@ -124,20 +124,6 @@ def test_a_bad_file_is_listed_with_its_reason_and_the_others_are_drawn(clouds, t
     assert "<b>" not in page
 
 
-def test_something_unexpected_in_one_file_is_its_own_reason(clouds, tmp_path, monkeypatch, capsys):
-    ready = pictures.made_ready
-
-    def fail(options, *others):
-        if options.cloud.suffix == ".npy":
-            raise KeyError("thing")
-        return ready(options, *others)
-
-    monkeypatch.setattr(catalogue, "made_ready", fail)
-    render(clouds, tmp_path / "out")
-    assert set(stills(tmp_path / "out")) == all_of(set(NAMES) - {"b/x.npy"})
-    assert "unexpected KeyError: 'thing'" in capsys.readouterr().err
-
-
 def test_a_folder_of_which_nothing_can_be_drawn_is_refused_and_so_is_one_without_clouds(tmp_path):
     (tmp_path / "in").mkdir()
     with pytest.raises(ValueError, match=r"in: there is no file of one of \.ply"):
@@ -226,12 +212,6 @@ def test_a_worker_that_does_not_see_a_file_ends_the_run_with_its_name(tmp_path):
         catalogue.draw_item(catalogue.Batch(options=options, digest=""), item)
 
 
-def test_a_file_that_is_gone_when_its_turn_comes_is_left_out(tmp_path):
-    batch = catalogue.Batch(options=command(tmp_path, tmp_path / "out"), digest="")
-    item = catalogue.Item(name="x.xyz", cloud=tmp_path / "x.xyz")
-    assert "there is no such file" in catalogue.draw_item(batch, item)
-
-
 def test_the_digest_follows_options_and_networks_and_not_where_they_work(tmp_path):
     network = tmp_path / "network.npz"
     network.write_bytes(b"one")
@@ -241,15 +221,3 @@ def test_the_digest_follows_options_and_networks_and_not_where_they_work(tmp_pat
     assert catalogue.digest(dataclasses.replace(options, views=3)) != first
     network.write_bytes(b"two")
     assert catalogue.digest(options) != first
-
-
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [({"workers": 0}, "--workers must be at least 1"), ({"workers": 2, "cluster": "tcp://a:1"}, "without --cluster")],
-)
-def test_workers_that_make_no_sense_are_refused(options, words, tmp_path):
-    with pytest.raises(ValueError, match=words):
-        command(tmp_path, tmp_path / "out", **options)
-    (tmp_path / "x.xyz").write_text("0 0 0\n")
-    with pytest.raises(ValueError, match="a single file"):
-        list(pictures.render_file(command(tmp_path / "x.xyz", tmp_path / "out", workers=2), print))

@@ -1,4 +1,4 @@
-"""An exported network draws the same pictures where there is nothing but JAX."""
+"""Exported networks, the paper's and the default one, draw the same pictures where there is nothing but JAX."""
 
 import json
 import subprocess
@@ -8,30 +8,46 @@ import jax
 import numpy as np
 import pytest
 from flax.serialization import to_state_dict
-from support import tiny_untrained, tiny_viewer
+from support import tiny_surfels, tiny_untrained, tiny_viewer
 from support.laws import close
+from support.surfel_clouds import cloud, shape
 
+import spnr_jax
 from spnr_jax import cli
 from spnr_jax.kernels import cloud_arrays
-from spnr_jax.tools import export
+from spnr_jax.surfels.lighting import room_light, sun
+from spnr_jax.tools import export, surfel_export
 
-POINTS, SIZE = 256, 32
-# what a stranger does with the two files: no class of ours, no flax, no weights
+POINTS, SIZE, SURFELS = 256, 32, 128
+# what a stranger does with the files: imports of ours and of Flax fail
 STRANGER = """
-import json, sys
-from pathlib import Path
+import sys
+class Blocked:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in {"spnr_jax", "flax", "optax", "orbax"}:
+            raise ImportError(name + " is not here")
+sys.meta_path.insert(0, Blocked())
 import jax, numpy as np
-encode, render = (jax.export.deserialize(bytearray(Path(name).read_bytes())).call for name in ("encode", "render"))
-cloud, camera = ({k: given[k] for k in keys.split()} for given, keys in (
-    (np.load("cloud.npz"), "positions base_color roughness metallic mask"),
-    (np.load("camera.npz"), "cam_to_world intrinsics")))
-np.savez("picture.npz", **render(encode(cloud), camera))
-print(json.dumps(sorted({name.split(".")[0] for name in sys.modules})))
+encode, render = (
+    jax.jit(jax.export.deserialize(bytearray(open(f"{name}.jax", "rb").read())).call) for name in ("encode", "render"))
+volume, camera = encode(dict(np.load("cloud.npz"))), dict(np.load("camera.npz"))
+for light in sys.argv[1:]:
+    given = [] if light == "none" else [dict(np.load(f"{light}.npz"))]
+    np.savez(f"{light}_picture.npz", **render(volume, camera, *given))
 """
 
 
-def arrays(record):
-    return {name: np.asarray(values) for name, values in vars(record).items() if values is not None}
+def arrays(record, names="positions base_color roughness metallic mask"):
+    return {name: np.asarray(getattr(record, name)) for name in names.split()}
+
+
+def pictures_of_a_stranger(folder, points, camera, *lights):
+    """What a process that knows JAX alone draws with the files of a folder."""
+    np.savez(folder / "cloud.npz", **arrays(points))
+    np.savez(folder / "camera.npz", **arrays(camera, "cam_to_world intrinsics"))
+    command = [sys.executable, "-W", "error", "-c", STRANGER, *lights]
+    subprocess.run(command, cwd=folder, capture_output=True, check=True)
+    return [dict(np.load(folder / f"{light}_picture.npz")) for light in lights]
 
 
 def given():
@@ -53,24 +69,14 @@ def expected():
     return volume, camera, handle.render(volume, camera)
 
 
-@pytest.fixture(scope="module")
-def rendered(expected):
-    return export.export_render(tiny_viewer.model(), resolution=SIZE, reach=expected[0].reach)
-
-
-def test_a_process_that_knows_jax_alone_draws_the_handles_picture(encoded, rendered, expected, tmp_path):
-    _, camera, picture = expected
-    (tmp_path / "encode").write_bytes(encoded)
-    (tmp_path / "render").write_bytes(rendered)
-    np.savez(tmp_path / "cloud.npz", **given())
-    np.savez(tmp_path / "camera.npz", cam_to_world=camera.cam_to_world, intrinsics=camera.intrinsics)
-    done = subprocess.run(
-        [sys.executable, "-W", "error", "-c", STRANGER], cwd=tmp_path, capture_output=True, text=True, check=True
-    )
-    assert not {"spnr_jax", "flax", "optax", "orbax"} & set(json.loads(done.stdout))
-    drawn = np.load(tmp_path / "picture.npz")
+def test_a_process_that_knows_jax_alone_draws_the_handles_picture(encoded, expected, tmp_path):
+    volume, camera, picture = expected
+    (tmp_path / "encode.jax").write_bytes(encoded)
+    rendered = export.export_render(tiny_viewer.model(), resolution=SIZE, reach=volume.reach)
+    (tmp_path / "render.jax").write_bytes(rendered)
+    (drawn,) = pictures_of_a_stranger(tmp_path, cloud_arrays.pad(tiny_viewer.cloud(), POINTS), camera, "none")
     assert np.asarray(picture.acc).mean() > 0.1, "a picture of nothing would agree with anything"
-    close(dict(drawn), {name: np.asarray(value) for name, value in arrays(picture).items()}, rtol=1e-5, atol=1e-5)
+    close(drawn, arrays(picture, " ".join(drawn)), rtol=1e-5, atol=1e-5)
 
 
 def test_the_exported_encode_finds_box_and_features_of_the_handle_and_leaves_the_padding_out(encoded, expected):
@@ -85,48 +91,23 @@ def test_the_exported_encode_finds_box_and_features_of_the_handle_and_leaves_the
     nonsense["positions"][200:] = np.inf
     nonsense["base_color"][200:] = 7
     close(encode(nonsense), made)
-
-
-def test_the_box_of_points_without_extent_has_scale_1(encoded):
     one = given()
     one["positions"][:] = [3, 4, 5]
-    made = export.load_exported(encoded)(one)
+    made = encode(one)
     np.testing.assert_array_equal(made["centre"], [3, 4, 5])
-    assert made["scale"] == 1
+    assert made["scale"] == 1, "the box of points without extent"
     assert np.isfinite(made["scene"]["volume"]).all()
+    with pytest.raises(ValueError, match="64"):
+        encode({name: value[:64] for name, value in given().items()})
 
 
-def test_quality_and_reach_are_part_of_what_is_exported(rendered, expected):
+def test_quality_is_part_of_what_is_exported(expected):
     volume, camera, picture = expected
     draft = export.export_render(tiny_viewer.model(), resolution=SIZE, quality="draft", reach=volume.reach)
     handle = tiny_viewer.model().render(volume, camera, "draft")
-    inputs = jax.tree.map(np.asarray, to_state_dict(volume)), arrays(camera)
-    del inputs[1]["height"], inputs[1]["width"]
+    inputs = jax.tree.map(np.asarray, to_state_dict(volume)), arrays(camera, "cam_to_world intrinsics")
     close(export.load_exported(draft)(*inputs)["image"], handle.image, atol=1e-5)
-    close(export.load_exported(rendered)(*inputs)["image"], picture.image, atol=1e-5)
     assert np.abs(np.asarray(handle.image) - np.asarray(picture.image)).max() > 1e-3
-
-
-def test_one_export_may_serve_several_platforms_and_says_which_and_what_it_takes():
-    both = export.export_encode(tiny_viewer.model(), num_points=64, platforms=("cpu", "cuda"))
-    said = export.signature(both)
-    assert said["platforms"] == ["cpu", "cuda"]
-    assert said["inputs"] == [
-        {
-            "positions": {"shape": [64, 3], "dtype": "float32"},
-            "base_color": {"shape": [64, 3], "dtype": "float32"},
-            "roughness": {"shape": [64], "dtype": "float32"},
-            "metallic": {"shape": [64], "dtype": "float32"},
-            "mask": {"shape": [64], "dtype": "bool"},
-        }
-    ]
-    assert said["outputs"]["scale"] == {"shape": [], "dtype": "float32"}
-    assert export.stablehlo(both).startswith(b"ML\xefR"), "MLIR's bytecode"
-
-
-def test_another_size_than_the_buckets_is_refused(encoded):
-    with pytest.raises(ValueError, match="64"):
-        export.load_exported(encoded)({name: value[:64] for name, value in given().items()})
 
 
 def test_the_command_writes_both_functions_their_stablehlo_and_what_they_take(tmp_path, monkeypatch, capsys):
@@ -135,7 +116,11 @@ def test_the_command_writes_both_functions_their_stablehlo_and_what_they_take(tm
     assert str(tmp_path) in capsys.readouterr().out
     names = {"weights.npz", "encode.jax", "encode.stablehlo", "render.jax", "render.stablehlo", "export.json"}
     assert {path.name for path in tmp_path.iterdir()} == names
+    assert (tmp_path / "encode.stablehlo").read_bytes().startswith(b"ML\xefR"), "MLIR's bytecode"
     said = json.loads((tmp_path / "export.json").read_text())
+    scalars, vectors = ({"shape": shape, "dtype": "float32"} for shape in ([64], [64, 3]))
+    columns = {"positions": vectors, "base_color": vectors, "roughness": scalars, "metallic": scalars}
+    assert said["encode"]["inputs"] == [columns | {"mask": {"shape": [64], "dtype": "bool"}}]
     assert said["encode"]["outputs"] == said["render"]["inputs"][0], "the volume goes from one to the other"
     assert said["render"]["outputs"]["image"]["shape"] == [SIZE, SIZE, 3]
     assert said["render"] == export.signature((tmp_path / "render.jax").read_bytes())
@@ -148,9 +133,47 @@ def test_the_command_writes_both_functions_their_stablehlo_and_what_they_take(tm
         (lambda model: export.export_render(model, resolution=18), "multiple of 4 of at least 16, got 18"),
         (lambda model: export.export_render(model, reach=0), "reach must be 1 to 4 voxels, got 0"),
         (lambda model: export.load_exported(b"PK\x03\x04 a zip"), "not a function that JAX exported"),
+        (lambda model: export.export_render(tiny_viewer.surfels(), quality="balanced"), "export a smaller resolution"),
     ],
 )
 def test_what_cannot_be_exported_or_loaded_is_refused_in_one_line(make, message):
     with pytest.raises(ValueError, match=message) as refused:
         make(tiny_viewer.model())
     assert "\n" not in str(refused.value)
+
+
+# the default network
+
+
+@pytest.mark.ci
+def test_a_process_that_knows_jax_alone_draws_the_pictures_of_the_pure_functions(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(cli, "set_up_jax", lambda **_: None)
+    options = {"num_points": SURFELS, "resolution": SIZE, "platforms": ("cpu", "cuda")}
+    cli.run(cli.Export(run=tiny_surfels.run(), out=tmp_path, **options))
+    capsys.readouterr()
+    said = json.loads((tmp_path / "export.json").read_text())
+    assert said["render"]["platforms"] == ["cpu", "cuda"]
+    assert said["encode"]["outputs"] == said["render"]["inputs"][0], "the volume goes from one to the other"
+    model = spnr_jax.load(tiny_surfels.run())
+    positions, normals, _ = shape("sphere", 110)
+    red = np.where(normals[:, :1] > 0, [0.8, 0.1, 0.1], [0.2, 0.4, 0.7])
+    points = cloud_arrays.pad(cloud(7 * positions + 3, base_color=red), SURFELS)  # far from the box's units
+    scene = jax.jit(spnr_jax.encode)(model.params, points, spnr_jax.neighbors(points))
+    camera = model.camera(scene, azimuth=50.0, resolution=SIZE)
+    np.savez(tmp_path / "sun.npz", tables=sun(40, 30).tables)
+    found = pictures_of_a_stranger(tmp_path, points, camera, "light", "sun")
+    plan = surfel_export.make_plan(model, SURFELS, SIZE)
+    draw = jax.jit(spnr_jax.render, static_argnames="plan")
+    for drawn, light in zip(found, (room_light(), sun(40, 30)), strict=True):
+        whole = draw(model.params, scene, camera, light, plan=plan)
+        assert drawn["overflow"] == 0
+        assert drawn["acc"].max() > 0.5, "a picture of nothing would agree with anything"
+        close(drawn, arrays(whole, "image depth acc overflow"), rtol=1e-4, atol=1e-4)
+    assert np.abs(found[0]["image"] - found[1]["image"]).max() > 0.05
+
+
+@pytest.mark.parametrize("count", [1, 19, 110])
+def test_neighbors_found_in_jax_are_those_of_the_tree(count):
+    points = cloud_arrays.pad(cloud(np.random.default_rng(count).normal(size=(count, 3))), SURFELS)
+    found = np.asarray(surfel_export.nearest(points.positions, points.mask))
+    np.testing.assert_array_equal(found, spnr_jax.neighbors(points))

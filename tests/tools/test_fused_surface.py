@@ -12,15 +12,15 @@ import trimesh
 from support import splat_balls
 from support.solid_ball import ball_cloud
 
-from spnr_jax.gaussians.placing import View
 from spnr_jax.kernels.cameras import camera_rays
 from spnr_jax.kernels.records import Volume
-from spnr_jax.tools import fused_surface
+from spnr_jax.surfels.gaussians import View
+from spnr_jax.tools import mesh_export
 from spnr_jax.tools.mesh_export import mesh_of
 
 SIZE, RESOLUTION = 160, 49
 STEP = 2 / (RESOLUTION - 1)
-DEEP = (fused_surface.BAND + 1) * STEP
+DEEP = (mesh_export.BAND + 1) * STEP
 RADIUS = 0.7
 HALF = np.array([0.6, 0.5, 0.5 * STEP])  # of the plate's sides; as thick as a step of the grid
 
@@ -58,7 +58,7 @@ def fused(seen):
     """The grid in a box around (1, 2, 3) that is half as large in the file."""
     volume = Volume(scene=None, centre=jnp.array([1.0, 2, 3]), scale=jnp.float32(2), reach=1)
     placed = dataclasses.replace(ball_cloud(), up="y", rotation=np.eye(3), origin=np.zeros(3))
-    return fused_surface.solidity(seen, volume, placed, RESOLUTION)
+    return mesh_export.solidity(seen, volume, placed, RESOLUTION)
 
 
 @pytest.fixture(scope="module")
@@ -93,14 +93,6 @@ def test_the_far_side_of_a_thin_plate_does_not_fill_what_lies_before_it(axes):
 
 def test_what_few_pictures_are_against_stays(axes):
     seen = views(ball)
-    spoilt = [view._replace(depth=np.full_like(view.depth, np.nan)) for view in seen[: fused_surface.AGREE - 1]]
-    grid = fused([*spoilt, *seen[fused_surface.AGREE - 1 :]])
+    spoilt = [view._replace(depth=np.full_like(view.depth, np.nan)) for view in seen[: mesh_export.AGREE - 1]]
+    grid = fused([*spoilt, *seen[mesh_export.AGREE - 1 :]])
     assert (grid.values[np.linalg.norm(axes, axis=-1) < RADIUS - DEEP] == 1).all()
-
-
-def test_what_leaves_every_picture_is_outside():
-    far = np.array([[0.0, 0.0, 2.9], [2.9, 0.0, 0.0], [0.0, 2.9, 0.0]], np.float32)
-    seen = views(ball)
-    cameras = jax.tree.map(lambda *x: jnp.stack(x), *(view.camera for view in seen))
-    depth = jnp.stack([jnp.nan_to_num(view.depth, nan=jnp.inf) for view in seen])
-    assert (np.asarray(fused_surface._solid(cameras, depth, jnp.float32(0.1), far)) == 0).all()

@@ -9,8 +9,7 @@ import trimesh
 from support.solid_ball import CENTRE, RADIUS, ball_cloud, ball_grid
 
 from spnr_jax.formats.mesh.meshes import load_mesh
-from spnr_jax.tools.fused_surface import Grid
-from spnr_jax.tools.mesh_export import is_closed, mesh_of
+from spnr_jax.tools.mesh_export import Grid, is_closed, mesh_of
 
 
 def loaded(content: bytes) -> trimesh.Trimesh:

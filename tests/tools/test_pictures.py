@@ -5,15 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import trimesh
 from PIL import Image
 from support import tiny_surfels, tiny_untrained
-from support.gltf_files import CORNERS, GltfBuilder
 
 from spnr_jax.formats.orientation import ROTATIONS
-from spnr_jax.tools import depth_maps, pictures, splat_making
-from spnr_jax.tools.light_options import Lighting
-from spnr_jax.tools.render_command import Render
+from spnr_jax.tools import pictures
+from spnr_jax.tools.commands import Lighting, Render
 from spnr_jax.training.weights import load
 
 OPTIONS = {"views": 2, "resolution": 24, "num_points": 30, "up": "y", "frames": 5}
@@ -54,20 +51,6 @@ def test_stills_depth_opacity_and_a_turntable_of_the_asked_frames_are_written(tm
     assert [line for line in lines if line.startswith("wrote")] == [
         f"wrote {out / name}" for name in ("chair_000.png", "chair_001.png", "chair_turntable.gif")
     ]
-
-
-def test_a_name_with_dots_keeps_every_view(tmp_path):
-    rendered(cloud_file(tmp_path, "chair.v2.xyz"), tmp_path / "out", turntable="none")
-    assert names(tmp_path / "out") == {name.replace("chair", "chair.v2") for name in STILLS}
-
-
-def test_the_views_are_different_and_the_same_again_at_the_second_time(tmp_path):
-    cloud = cloud_file(tmp_path)
-    for out in ("a", "b"):
-        rendered(cloud, tmp_path / out)
-    files = {name: (tmp_path / "a" / name).read_bytes() for name in names(tmp_path / "a")}
-    assert files == {name: (tmp_path / "b" / name).read_bytes() for name in names(tmp_path / "b")}
-    assert files["chair_000_depth.png"] != files["chair_001_depth.png"]
 
 
 def test_a_file_turned_and_moved_gives_the_same_pictures_and_cameras_that_moved_with_it(tmp_path):
@@ -117,50 +100,6 @@ def test_a_transparent_still_has_an_alpha_channel_and_chosen_outputs_alone_are_w
     assert shown(out / "chair_000.png").shape == (24, 24, 4)
 
 
-@pytest.mark.ci
-def test_the_mesh_is_written_in_the_frame_of_the_file(tmp_path, monkeypatch):
-    monkeypatch.setattr(depth_maps, "HIT", 1e-3)  # the tests' network is untrained: all fog
-    monkeypatch.setattr(splat_making.fitting_cameras, "__defaults__", (12, 24))
-    np.save(tmp_path / "chair.npy", np.random.default_rng(0).uniform(-1, 1, (40, 3)) * [1, 2, 3] + [100, 200, 300])
-    out = tmp_path / "out"
-    rendered(tmp_path / "chair.npy", out, views=0, turntable="none", up="z", mesh=True, grid_resolution=9)
-    assert names(out) == {"chair_mesh.glb"}
-    bounds = trimesh.load(out / "chair_mesh.glb").bounds
-    np.testing.assert_allclose(bounds.mean(axis=0), [100, 200, 300], atol=1.5)
-
-
-def test_no_views_and_no_turntable_write_nothing(tmp_path):
-    rendered(cloud_file(tmp_path), tmp_path / "out", views=0, turntable="none")
-    assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize(("choice", "words"), [("opaque", "drawn as opaque"), ("skip", "left out")])
-def test_transparent_parts_of_a_mesh_are_drawn_or_left_out_as_asked(tmp_path, choice, words):
-    builder = GltfBuilder()
-    glass = builder.material(name="glass", alphaMode="BLEND", pbrMetallicRoughness={"baseColorFactor": [1, 0, 0, 0.1]})
-    builder.mesh(builder.primitive(material=glass), builder.primitive(positions=2 - CORNERS))
-    path = builder.write(tmp_path / "a.glb")
-    lines = rendered(path, tmp_path / "out", views=0, turntable="none", transparent_parts=choice)
-    assert [words in line for line in lines if line.startswith("transparent parts")] == [True]
-
-
-@pytest.mark.parametrize(
-    ("option", "expected"),
-    [
-        ({"elevation": 91.0}, "--elevation must be -90 to 90 degrees, got 91"),
-        ({"grid_resolution": 4}, "--grid-resolution must be 8 to 512, got 4"),
-        ({"views": -1}, "--views must not be negative, got -1"),
-        ({"frames": 0}, "--frames must be at least 1, got 0"),
-        ({"num_points": 0}, "--num-points must be at least 1, got 0"),
-        ({"resolution": 18}, "--resolution must be a multiple of 4 of at least 16, got 18"),
-        ({"resolution": 8}, "--resolution must be a multiple of 4 of at least 16, got 8"),
-    ],
-)
-def test_options_without_sense_are_refused_by_their_name_before_anything_is_read(option, expected, tmp_path):
-    with pytest.raises(ValueError, match=expected):
-        rendered(tmp_path / "missing.xyz", tmp_path / "out", **option)
-
-
 # the light
 
 
@@ -179,6 +118,7 @@ def in_light(tmp_path_factory):
     return render
 
 
+@pytest.mark.ci
 def test_light_sun_exposure_and_background_change_the_still_and_not_its_opacity(in_light):
     asked = {
         "as_it_is": {}, "studio": {"light": "studio"}, "bright": {"exposure": 1.0}, "sun": {"sun": (30.0, 40.0)},
@@ -194,6 +134,7 @@ def test_light_sun_exposure_and_background_change_the_still_and_not_its_opacity(
     assert len(opacities) == 1
 
 
+@pytest.mark.ci
 def test_a_turntable_of_the_light_differs_from_frame_to_frame_and_keeps_the_outline(in_light):
     out = in_light("turning", turn="light", views=0, turntable="gif", frames=3, exposure=-1.0)
     with Image.open(out / "chair_turntable.gif") as film:

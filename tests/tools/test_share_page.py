@@ -4,6 +4,7 @@ Chromium is found on PATH, or named by SPNR_CHROMIUM; without one these tests ar
 """
 
 import base64
+import contextlib
 import io
 import re
 
@@ -13,9 +14,8 @@ from PIL import Image
 from support import chromium as chromium_of
 from support import splat_balls, splat_twin
 
-from spnr_jax.gaussians.placing import rotations
 from spnr_jax.tools import splat_export
-from spnr_jax.tools.splat_options import Share, SplatMaking
+from spnr_jax.tools.commands import Share, SplatMaking
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install playwright")
 
@@ -39,15 +39,18 @@ def until(tab, holds):
     raise AssertionError(f"{holds} does not hold after {WAIT} ms")
 
 
+@contextlib.contextmanager
 def opened(chromium, path):
-    """The page in a tab, ready, and what its console says."""
+    """The page in a tab, ready; its console says nothing, and it asks for nothing."""
     tab, said = chromium.new_page(viewport={"width": SIZE, "height": SIZE}), []
     tab.on("console", lambda line: said.append((line.type, line.text)))
     tab.on("pageerror", lambda error: said.append(("error", str(error))))
     tab.on("request", lambda request: said.append(("request", request.url)) if request.url[:4] == "http" else None)
     tab.goto(path.as_uri())
     until(tab, "window.viewer?.ready === true")
-    return tab, said
+    yield tab
+    assert not said
+    tab.close()
 
 
 def shown(tab):
@@ -74,11 +77,9 @@ def page(tmp_path, degree, title="A ball"):
 @pytest.mark.parametrize("degree", [0, 3])
 def test_the_page_draws_what_the_poster_shows(chromium, tmp_path, degree):
     path, poster = page(tmp_path, degree)
-    tab, said = opened(chromium, path)
-    assert decibels(shown(tab), poster) > 32
-    assert tab.locator("#poster").count() == 0, "the poster makes place"
-    assert not said
-    tab.close()
+    with opened(chromium, path) as tab:
+        assert decibels(shown(tab), poster) > 32
+        assert tab.locator("#poster").count() == 0, "the poster makes place"
 
 
 def test_the_page_of_a_cloud_shows_what_the_network_draws(chromium, tmp_path, monkeypatch):
@@ -94,72 +95,49 @@ def test_the_page_of_a_cloud_shows_what_the_network_draws(chromium, tmp_path, mo
     assert lines[-1].startswith(f"wrote {options.out} (")
     poster = re.search(r'src="data:image/jpeg;base64,([^"]+)"', options.out.read_text())
     network = np.asarray(Image.open(io.BytesIO(base64.b64decode(poster[1])))) / np.float32(255)
-    tab, said = opened(chromium, options.out)
-    assert decibels(shown(tab), network) > 24, "20 are asked for"
-    assert decibels(np.ones_like(network), network) < 15
-    assert not said
-    tab.close()
+    with opened(chromium, options.out) as tab:
+        assert decibels(shown(tab), network) > 24, "20 are asked for"
+        assert decibels(np.ones_like(network), network) < 15
 
 
 def test_dragging_turns_the_object_as_a_camera_would_go_around_it(chromium, tmp_path):
     path, poster = page(tmp_path, 1)
-    tab, said = opened(chromium, path)
-    tab.mouse.move(100, 100)
-    tab.mouse.down()
-    tab.mouse.move(150, 110, steps=3)
-    tab.mouse.up()
-    azimuth, elevation = tab.evaluate("[viewer.camera.azimuth, viewer.camera.elevation]")
-    assert (azimuth, elevation) == pytest.approx((10, 24))
-    turned, _ = splat_twin.draw(splat_balls.ball(), splat_balls.camera(azimuth, elevation, SIZE))
-    now = shown(tab)
-    assert decibels(now, turned) > 32
-    assert decibels(now, poster) < 28
-    tab.mouse.wheel(0, 200)
-    until(tab, "viewer.camera.distance > 3.3")
-    assert not said
-    tab.close()
+    with opened(chromium, path) as tab:
+        tab.mouse.move(100, 100)
+        tab.mouse.down()
+        tab.mouse.move(150, 110, steps=3)
+        tab.mouse.up()
+        azimuth, elevation = tab.evaluate("[viewer.camera.azimuth, viewer.camera.elevation]")
+        assert (azimuth, elevation) == pytest.approx((10, 24))
+        turned, _ = splat_twin.draw(splat_balls.ball(), splat_balls.camera(azimuth, elevation, SIZE))
+        now = shown(tab)
+        assert decibels(now, turned) > 32
+        assert decibels(now, poster) < 28
+        tab.mouse.wheel(0, 200)
+        until(tab, "viewer.camera.distance > 3.3")
 
 
 def test_a_coarse_picture_shows_the_same_object_and_rest_brings_the_whole_one(chromium, tmp_path):
     path, poster = page(tmp_path, 1)
-    tab, said = opened(chromium, path)
-    tab.evaluate("document.querySelectorAll('header, footer').forEach((part) => part.style.display = 'none')")
-    tab.evaluate("viewer.draw(0.5)")
-    assert tab.evaluate("document.getElementById('canvas').width") == SIZE // 2
-    content = tab.screenshot()
-    coarse = np.asarray(Image.open(io.BytesIO(content)).convert("RGB")).astype(np.float32) / 255
-    assert 18 < decibels(coarse, poster) < 40
-    tab.evaluate("viewer.share = 0.3")  # as after a picture that took long
-    tab.evaluate("document.getElementById('canvas').focus()")
-    tab.keyboard.press("ArrowLeft")
-    until(tab, f"document.getElementById('canvas').width === {SIZE} && viewer.frames >= 4")
-    assert tab.evaluate("viewer.frames") == 4, "first, coarse, coarse again, whole"
-    tab.evaluate("document.getElementById('canvas').blur()")  # without the ring around what has the keys
-    assert decibels(shown(tab), splat_twin.draw(splat_balls.ball(), splat_balls.camera(38.0, 20.0, SIZE))[0]) > 28
-    assert not said
-    tab.close()
-
-
-def test_a_coarse_picture_is_without_the_splats_that_face_away_and_a_whole_one_has_all(chromium, tmp_path):
-    path, _ = page(tmp_path, 0)
-    tab, said = opened(chromium, path)
-    splats = splat_balls.ball(degree=0)
-    outward = rotations(splats.rotation)[:, :, 2]
-    eye = np.asarray(splat_balls.camera(30.0, 20.0).cam_to_world)[:, 3]
-    facing = np.einsum("ni,ni->n", outward, splats.position - eye) < 0
-    for share, every, wanted in ((1, 1, np.ones_like(facing)), (0.5, 2, facing), (0.25, 4, facing)):
-        tab.evaluate(f"viewer.draw({share})")
-        count = wanted[::every].sum()
-        assert count <= tab.evaluate("viewer.drawn") <= 1.3 * count, "a few that are seen from their edge stay"
-    assert not said
-    tab.close()
+    with opened(chromium, path) as tab:
+        tab.evaluate("document.querySelectorAll('header, footer').forEach((part) => part.style.display = 'none')")
+        tab.evaluate("viewer.draw(0.5)")
+        assert tab.evaluate("document.getElementById('canvas').width") == SIZE // 2
+        content = tab.screenshot()
+        coarse = np.asarray(Image.open(io.BytesIO(content)).convert("RGB")).astype(np.float32) / 255
+        assert 18 < decibels(coarse, poster) < 40
+        tab.evaluate("viewer.share = 0.3")  # as after a picture that took long
+        tab.evaluate("document.getElementById('canvas').focus()")
+        tab.keyboard.press("ArrowLeft")
+        until(tab, f"document.getElementById('canvas').width === {SIZE} && viewer.frames >= 4")
+        assert tab.evaluate("viewer.frames") == 4, "first, coarse, coarse again, whole"
+        tab.evaluate("document.getElementById('canvas').blur()")  # without the ring around what has the keys
+        assert decibels(shown(tab), splat_twin.draw(splat_balls.ball(), splat_balls.camera(38.0, 20.0, SIZE))[0]) > 28
 
 
 def test_a_title_with_signs_of_html_is_only_text(chromium, tmp_path):
     title = '<b>"chair" & @DATA@</b>'
     path, _ = page(tmp_path, 0, title)
-    tab, said = opened(chromium, path)
-    assert tab.title() == title
-    assert tab.locator("h1").inner_text() == title
-    assert not said
-    tab.close()
+    with opened(chromium, path) as tab:
+        assert tab.title() == title
+        assert tab.locator("h1").inner_text() == title

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 from support import command_line, splat_balls, tiny_surfels
 
-from spnr_jax.formats import gaussian_files, images
+from spnr_jax.formats import images
 from spnr_jax.formats.clouds import read_cloud
 from spnr_jax.formats.mesh.meshes import load_mesh
 from spnr_jax.formats.point_files import parse_ply
-from spnr_jax.gaussians.placing import View
+from spnr_jax.surfels.gaussians import View
 from spnr_jax.surfels.visibility import spiral
 from spnr_jax.tools import mesh_export, splat_export, splat_making
-from spnr_jax.tools.light_options import Lighting
+from spnr_jax.tools.commands import Lighting
 
 pytestmark = pytest.mark.ci  # it makes splats with the network of the package
 
@@ -71,54 +71,6 @@ def test_the_mesh_of_a_file_lies_around_its_points_in_its_units(tmp_path, monkey
     for end in (np.min, np.max):
         np.testing.assert_allclose(end(vertices, axis=0), end(points, axis=0), atol=spare)
     assert [path.name for path in out.parent.iterdir()] == ["ball.glb"]
-
-
-def test_a_page_holds_title_credit_and_splats(cloud, tmp_path, capsys):
-    out = tmp_path / "page.html"
-    code = made_by("share", cloud, "--out", out, "--title", "A <ball>", "--credit", "by nobody")
-    assert code == 0, capsys.readouterr().err
-    text = out.read_text()
-    assert "<title>A &lt;ball&gt;</title>" in text
-    assert "by nobody" in text
-    assert not {"@TITLE@", "@DATA@", "@CAMERA@"} & set(text.split())
-    assert "http" not in text.replace("http-equiv", "").replace("application/octet", "")
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (("export", "CLOUD", "--splats", "out.obj"), "out.obj"),
-        (("export", "CLOUD", "--splats", "out.glb"), ".ply or .spz"),
-        (("export", "CLOUD", "--splats", "."), "splats"),
-        (("export", "CLOUD", "--splats", "out.ply", "--most-splats", "300001"), "--most-splats"),
-        (("export", "CLOUD", "--light", "studio"), "--splats"),
-        (("export", "CLOUD", "--mesh", "out.obj"), "out.obj"),
-        (("export", "CLOUD", "--mesh", "out.glb", "--sun", "40", "30"), "--splats"),
-        (("export", "CLOUD", "--mesh", "out.glb", "--splats", "out.ply"), "one at a time"),
-        (("export", "CLOUD", "--up", "z"), "--mesh"),
-        (("export", "nowhere.ply", "--mesh", "out.glb"), "nowhere.ply"),
-        (("export", "CLOUD", "--mesh", "ball.ply/out.glb"), "a file, not a folder"),
-        (("export", "nowhere.ply", "--splats", "out.ply"), "nowhere.ply"),
-        (("export", "CLOUD", "--splats", "ball.ply/out.ply"), "a file, not a folder"),
-        (("share", "CLOUD", "--out", "ball.ply/page.html"), "a file, not a folder"),
-        (("share", "CLOUD", "--out", "page.pdf"), "page.pdf"),
-        (("share", "CLOUD", "--background", "light"), "--background"),
-        (("share", "CLOUD", "--fitting-views", "1"), "--fitting-views"),
-    ],
-)
-def test_what_makes_no_sense_is_one_line_and_code_2(cloud, tmp_path, monkeypatch, capsys, arguments, words):
-    monkeypatch.chdir(tmp_path)
-    assert command_line.exit_code(cli, *(cloud if argument == "CLOUD" else argument for argument in arguments)) == 2
-    said = capsys.readouterr().err
-    assert words in said
-    assert said.count("\n") == 1
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["ball.ply"]
-
-
-def test_a_place_where_nothing_can_be_written_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(images.os, "access", lambda folder, mode: folder != tmp_path)  # root may write everywhere
-    with pytest.raises(ValueError, match="nothing can be written"):
-        gaussian_files.check_suffix(tmp_path / "new" / "out.spz")
 
 
 @pytest.mark.parametrize(("command", "option", "name"), [("export", "--splats", "a.ply"), ("share", "--out", "a.html")])

@@ -2,7 +2,7 @@
 
 import threading
 
-from spnr_jax.viewer.loop import Loop
+from spnr_jax.viewer.gui import Loop
 
 
 def test_changes_are_applied_in_order_drawn_at_once_and_once_more_at_rest():

@@ -17,7 +17,7 @@ from spnr_jax.formats.mesh.file_colors import LINEAR, SRGB
 from spnr_jax.formats.mesh.gltf_container import DRACO, MESHOPT, GltfFile, decode_mesh, scaled
 from spnr_jax.formats.mesh.gltf_materials import BASIS, MOVED, WEBP, GltfMaterial, read_material
 from spnr_jax.formats.mesh.tolerance import Tolerance
-from spnr_jax.gaussians.harmonics import C0
+from spnr_jax.surfels.gaussians import C0
 
 INSTANCING = "EXT_mesh_gpu_instancing"
 PLACED = {"TRANSLATION": 3, "ROTATION": 4, "SCALE": 3}  # attributes of instances, and their widths

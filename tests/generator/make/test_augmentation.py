@@ -1,13 +1,14 @@
-"""Laws of colour variants: a rotation of all base colours, inside the gamut, that nothing else depends on."""
+"""Laws of variants: a rotation of all base colours, inside the gamut; a linear map under which a surface stays one."""
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from support.handmade import ball, box, checked_box_and_ball, plain
+from support.handmade import ball, box, plain
 
 from data_gen.make import augmentation
+from data_gen.make.augmentation import MOST_BEND, MOST_STRETCH, Reshaping, draw_reshaping, reshape
 from spnr_jax.formats.mesh.assets import Asset, Material
 from spnr_jax.formats.mesh.surface_points import sample_surface
 
@@ -65,10 +66,6 @@ def test_it_is_a_rotation_that_keeps_greys(degrees):
     assert np.trace(matrix) == pytest.approx(1 + 2 * np.cos(np.radians(degrees)))
 
 
-def test_a_third_of_a_turn_takes_red_to_green():
-    np.testing.assert_allclose(augmentation.grey_rotation(120) @ [1, 0, 0], [0, 1, 0], atol=1e-12)
-
-
 def test_colours_that_leave_no_room_are_permuted_and_the_object_says_so():
     asset = Asset(parts=(ball(material=plain((1, 0, 0))), box(material=plain((0, 1, 1)))))
     rotated, rotation = augmentation.rotate_colours(asset, 0)
@@ -88,16 +85,6 @@ def test_muted_colours_turn_any_way_and_the_seed_decides_which():
     assert turns[7].describe() == augmentation.rotate_colours(asset, 7)[1].describe()
 
 
-def test_a_texture_and_a_flat_colour_turn_by_the_same_angle():
-    asset = checked_box_and_ball()
-    rotated, rotation = augmentation.rotate_colours(asset, 4)
-    for before, after in zip(asset.parts, rotated.parts, strict=True):
-        assert np.abs(after.material.base_color - before.material.base_color).max() > 0.05
-        expected = before.material.base_color @ rotation.matrix.T
-        np.testing.assert_allclose(after.material.base_color, expected, atol=1e-6)
-        np.testing.assert_array_equal(after.material.roughness, before.material.roughness)
-
-
 def test_a_rare_saturated_texel_is_not_overlooked():
     texels = np.full((64, 64, 3), 0.5, np.float32)
     texels[40, 13] = (1, 0, 0.2)
@@ -106,3 +93,56 @@ def test_a_rare_saturated_texel_is_not_overlooked():
         rotated = texels.reshape(-1, 3) @ matrix.T
         assert rotated.min() > -1e-5
         assert rotated.max() < 1 + 1e-5
+
+
+# shape
+
+
+def volume(part):
+    a, b, c = np.moveaxis(part.positions[part.faces], 1, 0)
+    return np.sum(a * np.cross(b, c)) / 6
+
+
+@given(SEEDS)
+def test_faces_still_look_outwards_and_the_volume_grows_by_the_stretch(seed):
+    shape = draw_reshaping(seed)
+    (part,) = reshape(Asset(parts=(box((0.3, 0.2, 0.1)),)), shape).parts
+    assert volume(part) == pytest.approx(volume(box()) * np.abs(shape.stretch).prod())
+
+
+@given(SEEDS)
+def test_up_stays_up(seed):
+    up = draw_reshaping(seed).matrix() @ [0, 1, 0]
+    np.testing.assert_allclose(up / np.linalg.norm(up), [0, 1, 0], atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2, 3])
+def test_the_points_of_the_new_shape_are_on_the_mapped_surface_with_its_normals(seed):
+    shape, sphere = draw_reshaping(seed), Asset(parts=(ball(rows=40),))
+    found = sample_surface(reshape(sphere, shape), 300, 5)
+    before = found.positions @ np.linalg.inv(shape.matrix()).T
+    np.testing.assert_allclose(np.linalg.norm(before, axis=1), 0.5, atol=5e-3)
+    gradient = before @ np.linalg.inv(shape.matrix())  # of |M^-1 x|^2 / 2: the ellipsoid's normal
+    cosine = np.sum(gradient * found.normals, axis=1) / np.linalg.norm(gradient, axis=1)
+    assert cosine.min() > 0.995
+
+
+def test_a_quarter_turn_takes_front_to_right_and_a_mirror_takes_right_to_left():
+    turn = Reshaping(stretch=np.ones(3), degrees=90.0, roughness_exponent=1.0)
+    np.testing.assert_allclose(turn.matrix() @ [0, 0, 1], [1, 0, 0], atol=1e-12)
+    mirror = Reshaping(stretch=np.array([-1.0, 1, 1]), degrees=0.0, roughness_exponent=1.0)
+    np.testing.assert_allclose(mirror.matrix() @ [1, 0, 0], [-1, 0, 0])
+
+
+def test_the_draws_fill_their_ranges_and_the_seed_decides():
+    drawn = [draw_reshaping(seed) for seed in range(200)]
+    stretch = np.array([shape.stretch for shape in drawn])
+    assert np.abs(stretch).min() >= 1 / MOST_STRETCH
+    assert np.abs(stretch).max() <= MOST_STRETCH
+    assert 60 < np.sum(stretch[:, 0] < 0) < 140
+    assert (stretch[:, 1:] > 0).all()
+    assert np.histogram([shape.degrees for shape in drawn], 6, (0, 360))[0].min() > 15
+    exponents = np.array([shape.roughness_exponent for shape in drawn])
+    assert 1 / MOST_BEND <= exponents.min() < 0.6
+    assert 1.6 < exponents.max() <= MOST_BEND
+    assert drawn[7].describe() == draw_reshaping(7).describe()

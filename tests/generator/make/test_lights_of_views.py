@@ -18,7 +18,14 @@ def test_a_view_is_brighter_where_its_light_is(tmp_path):
     trimesh.Trimesh(part.positions, part.faces, process=False).export(tmp_path / "meshes" / "ball.ply")
     options = [*SMALL, "--views", 6, "--workers", 1, "--lights", "random", "--test-fraction", 0, "--val-fraction", 0]
     assert spnr_data("generate", tmp_path / "set", "--meshes", tmp_path / "meshes", *options) == 0
-    item = data_sets.read_object(data_sets.open_dataset(tmp_path / "set"), "ball")
+    assert spnr_data("check", tmp_path / "set") == 0
+    dataset = data_sets.open_dataset(tmp_path / "set")
+    assert dataset.settings["environment_map"]["kinds"] == [{"name": "random"}]
+    item = data_sets.read_object(dataset, "ball")
+    assert len({light.tobytes() for light in item.lights}) == len(item.lights) == 6
+    area = np.sin(np.pi * (np.arange(32) + 0.5) / 32)[:, None, None]
+    np.testing.assert_allclose((item.lights * area).mean(axis=(1, 2, 3)) / area.mean(), 0.6, rtol=0.02)
+    assert item.own_lights[0].tables.shape == (7, 32, 64, 3)
     agreeing = []
     for view, light in enumerate(item.lights):
         weight = np.sin(np.pi * (np.arange(32) + 0.5) / 32)[:, None] * light.mean(axis=-1)

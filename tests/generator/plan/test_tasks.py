@@ -6,11 +6,10 @@ from pathlib import Path
 import pytest
 
 from data_gen.__main__ import parse
-from data_gen.make.description import describe
+from data_gen.make.generate import describe
 from data_gen.plan import data_presets, splits, tasks
 
 OUT = ["generate", "out"]
-IDS = [f"object_{number}" for number in range(40)]
 
 
 def config(**options):
@@ -180,14 +179,6 @@ def test_the_presets_hold_the_papers_numbers():
     assert (car.resolution, car.views, car.colour_variants, car.category, car.test_objects) == (200, 10, 0, "car", 128)
     assert data_presets.shapenet_plane(Path("x")).test_objects == 406
     assert data_presets.shapenet_chair(Path("x")).test_objects == 105
-
-
-def test_an_unknown_preset_or_class_is_refused_and_the_known_are_named(capsys):
-    for arguments, known in ((["--preset", "abc"], "shapenet_chair"), (["--category", "boat"], "plane")):
-        with pytest.raises(SystemExit) as stopped:
-            parse([*OUT, *arguments])
-        assert stopped.value.code == 2
-        assert known in capsys.readouterr().err
 
 
 def test_meshes_are_the_same_source_by_either_name_and_go_with_procedural_objects(tmp_path):

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from support.handmade import ball, box
 
-from data_gen.make import objects, originals
+from data_gen.make import objects
 from data_gen.plan.tasks import Task
-from data_gen.render import depth
+from data_gen.render import views
 from spnr_jax.formats.mesh import surface_points
 from spnr_jax.formats.mesh.assets import Asset
 from spnr_jax.kernels import cameras
@@ -27,7 +27,7 @@ def rays():
 
 
 def test_the_depth_of_a_box_is_the_distance_along_each_ray_to_its_nearest_side():
-    found = depth.caster(Asset(parts=(box(),)))(rays().origins, rays().directions)
+    found = views.caster(Asset(parts=(box(),)))(rays().origins, rays().directions)
     near, _, hit = map(
         np.asarray, cameras.intersect_box(*map(jnp.asarray, (rays().origins, rays().directions)), -0.5, 0.5)
     )
@@ -38,7 +38,7 @@ def test_the_depth_of_a_box_is_the_distance_along_each_ray_to_its_nearest_side()
 
 def test_the_depth_of_a_ball_is_that_of_the_sphere():
     radius = 0.6
-    found = depth.caster(Asset(parts=(ball(radius=radius, rows=128),)))(rays().origins, rays().directions)
+    found = views.caster(Asset(parts=(ball(radius=radius, rows=128),)))(rays().origins, rays().directions)
     along = -(rays().origins * rays().directions).sum(1)
     beside = (rays().origins ** 2).sum(1) - along**2
     hit = beside < (0.98 * radius) ** 2  # away from the outline, where a flat face is far from the sphere
@@ -50,7 +50,7 @@ def test_faces_are_met_from_inside_and_whichever_way_they_are_turned():
     turned = dataclasses.replace(box(), faces=box().faces[:, ::-1])
     ray = np.zeros((1, 3), np.float32), np.array([[0, 0, 1]], np.float32)
     for part in (box(), turned):
-        np.testing.assert_allclose(depth.caster(Asset(parts=(part,)))(*ray), [0.5], rtol=1e-6)
+        np.testing.assert_allclose(views.caster(Asset(parts=(part,)))(*ray), [0.5], rtol=1e-6)
 
 
 def made(task, count=50):
@@ -71,30 +71,22 @@ PROCEDURAL = (
 @pytest.mark.parametrize("task", PROCEDURAL, ids=["product", "colour variant", "reshaped"])
 def test_a_procedural_object_is_made_again_from_its_record(task):
     asset, details, stored = made(task)
-    again = originals.original(details, SEED, stored)
+    again = objects.original(details, SEED, stored)
     for part, expected in zip(again.parts, asset.parts, strict=True):
         np.testing.assert_array_equal(part.positions, expected.positions)
         np.testing.assert_array_equal(part.faces, expected.faces)
         np.testing.assert_array_equal(part.material.base_color, expected.material.base_color)
 
 
-def test_points_spread_evenly_are_compared_with_such_points():
-    asset, details, drawn = made(PROCEDURAL[0])
-    even = surface_points.sample_surface(asset, len(drawn), details["seeds"]["points"], "even").positions
-    assert originals.original(details, SEED, even, spread="even").parts
-    with pytest.raises(ValueError, match="its points do not lie on the mesh"):
-        originals.original(details, SEED, even)
-
-
 def test_a_record_from_before_there_were_variants_is_understood():
     _, details, stored = made(PROCEDURAL[0])
-    assert originals.original({k: v for k, v in details.items() if k not in ("product", "variant")}, SEED, stored)
+    assert objects.original({k: v for k, v in details.items() if k not in ("product", "variant")}, SEED, stored)
 
 
 def test_another_shape_under_the_same_name_is_refused():
     _, details, stored = made(PROCEDURAL[0])
     with pytest.raises(ValueError, match=r"^object lamp_000004: its points do not lie on the mesh[^\n]*generate"):
-        originals.original(details, SEED + 1, stored)
+        objects.original(details, SEED + 1, stored)
 
 
 class TestMeshFiles:
@@ -115,18 +107,18 @@ class TestMeshFiles:
 
     def test_a_mesh_is_read_again_from_the_folder_of_the_meshes(self, root):
         asset, details, stored = made(self.task(root))
-        again = originals.original(details, SEED, stored, root)
+        again = objects.original(details, SEED, stored, root)
         np.testing.assert_array_equal(again.parts[0].positions, asset.parts[0].positions)
 
     def test_without_the_folder_or_the_file_the_error_names_the_option(self, root, tmp_path):
         _, details, stored = made(self.task(root))
         with pytest.raises(ValueError, match=r"^object cube was made from toys/cube.obj: [^\n]*--meshes$"):
-            originals.original(details, SEED, stored)
+            objects.original(details, SEED, stored)
         with pytest.raises(ValueError, match=r"cube.obj: the mesh of object cube is not there; [^\n]*--meshes$"):
-            originals.original(details, SEED, stored, tmp_path / "elsewhere")
+            objects.original(details, SEED, stored, tmp_path / "elsewhere")
 
     def test_a_mesh_file_that_changed_is_refused(self, root):
         _, details, stored = made(self.task(root))
         self.write(root / "toys" / "cube.obj", 1.5)
         with pytest.raises(ValueError, match="do not lie on the mesh"):
-            originals.original(details, SEED, stored, root)
+            objects.original(details, SEED, stored, root)

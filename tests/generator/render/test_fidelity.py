@@ -86,6 +86,43 @@ def factors(color, roughness, metallic):
     }
 
 
+def own_sizes(builder):
+    """Both textures, of different sizes, and factors."""
+    material = textured(builder, baseColorFactor=[0.9, 0.5, 1, 1], roughnessFactor=0.8)
+    surface = builder.texture(np.random.default_rng(2).integers(0, 256, (9, 3, 3)))
+    material["pbrMetallicRoughness"]["metallicRoughnessTexture"] = {"index": surface}
+    return material
+
+
+def sized(*size):
+    return lambda builder: textured(builder, np.random.default_rng(1).integers(0, 256, (*size, 3)))
+
+
+def wrapped(code):
+    return lambda builder: textured(builder, sampler={"wrapS": code, "wrapT": code})
+
+
+MOVED = {"extensions": {"KHR_texture_transform": {"offset": [0.3, -0.2], "rotation": 0.7, "scale": [2.0, 0.5]}}}
+TEXTURE, FAR = {"TEXCOORD_0": UV}, {"TEXCOORD_0": UV * np.float32(4.3) - np.float32(1.7)}
+TINTS = {"COLOR_0": np.float32([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0]])}
+ONE_TINT = "vertex colours that vary within textured faces (one tint per face is used)"
+BASE = ("base_color",)
+SQUARES = {  # case: material, attributes of vertices, the channels that vary, what is said to be ignored
+    "a texture that is moved": (lambda builder: textured(builder, info=MOVED), TEXTURE, BASE),
+    **{f"a texture that wraps by {code}": (wrapped(code), FAR, BASE) for code in (10497, 33648, 33071)},
+    **{f"a texture of {size}": (sized(*size), TEXTURE, BASE) for size in ((1, 6), (6, 1), (2, 2), (33, 17))},
+    "a texture of one texel": (sized(1, 1), TEXTURE, ()),
+    "channels with textures of their own size": (own_sizes, TEXTURE, CHANNELS),
+    "vertex colours times a factor": (lambda builder: factors((0.5, 1, 0.8), 0.4, 0.2), TINTS, BASE),
+    "vertex colours over a surface texture": (
+        lambda builder: {"pbrMetallicRoughness": {"metallicRoughnessTexture": {"index": builder.texture(NOISE)}}},
+        TEXTURE | TINTS,
+        CHANNELS,
+    ),
+    "vertex colours over a texture": (textured, TEXTURE | TINTS, BASE, ONE_TINT),
+}
+
+
 class TestGltf:
     def test_each_primitive_keeps_its_own_flat_material(self, tmp_path):
         builder = GltfBuilder()
@@ -125,56 +162,13 @@ class TestGltf:
         asset = square(tmp_path, material, builder=builder, TEXCOORD_0=UV)
         assert assert_agreement(asset, varying=["base_color"], eye=EYE * [1, 1, -1])["normals"][:, 2].min() > 0.99
 
-    @pytest.mark.parametrize("code", [10497, 33648, 33071])
-    def test_texture_coordinates_beyond_the_texture_wrap_alike(self, tmp_path, code):
+    @pytest.mark.parametrize("case", SQUARES)
+    def test_what_a_square_of_a_material_is_told_to_be_it_shows(self, tmp_path, case):
+        material, attributes, varying, *ignored = SQUARES[case]
         builder = GltfBuilder()
-        material = textured(builder, sampler={"wrapS": code, "wrapT": code})
-        asset = square(tmp_path, material, builder=builder, TEXCOORD_0=UV * np.float32(4.3) - np.float32(1.7))
-        assert asset.ignored == ()
-        assert_agreement(asset, varying=["base_color"], count=1500)
-
-    def test_moved_textures_agree(self, tmp_path):
-        builder = GltfBuilder()
-        moved = {"KHR_texture_transform": {"offset": [0.3, -0.2], "rotation": 0.7, "scale": [2.0, 0.5]}}
-        assert_agreement(
-            square(tmp_path, textured(builder, info={"extensions": moved}), builder=builder, TEXCOORD_0=UV),
-            varying=["base_color"],
-        )
-
-    @pytest.mark.parametrize("size", [(1, 1), (1, 6), (6, 1), (2, 2), (33, 17)])
-    def test_textures_of_any_size_agree(self, tmp_path, size):
-        builder = GltfBuilder()
-        texels = np.random.default_rng(1).integers(0, 256, (*size, 3))
-        asset = square(tmp_path, textured(builder, texels), builder=builder, TEXCOORD_0=UV)
-        assert_agreement(asset, varying=["base_color"] if texels.size > 3 else [])
-
-    def test_channels_with_textures_of_their_own_size_agree(self, tmp_path):
-        builder = GltfBuilder()
-        material = textured(builder, baseColorFactor=[0.9, 0.5, 1, 1], roughnessFactor=0.8)
-        surface = builder.texture(np.random.default_rng(2).integers(0, 256, (9, 3, 3)))
-        material["pbrMetallicRoughness"]["metallicRoughnessTexture"] = {"index": surface}
-        assert_agreement(square(tmp_path, material, builder=builder, TEXCOORD_0=UV), varying=CHANNELS)
-
-    def test_specular_glossiness_agrees(self, tmp_path):
-        builder = GltfBuilder()
-        rgba = np.random.default_rng(3).integers(0, 256, (4, 4, 4))
-        glossy = {"diffuseTexture": {"index": builder.texture(NOISE)}}
-        glossy |= {"specularGlossinessTexture": {"index": builder.texture(rgba)}}
-        material = {"extensions": {"KHR_materials_pbrSpecularGlossiness": glossy}}
-        assert_agreement(square(tmp_path, material, builder=builder, TEXCOORD_0=UV), varying=CHANNELS)
-
-    def test_vertex_colours_times_a_factor_agree(self, tmp_path):
-        colors = np.float32([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0]])
-        asset = square(tmp_path, factors((0.5, 1, 0.8), 0.4, 0.2), COLOR_0=colors)
-        assert_agreement(asset, varying=["base_color"])
-
-    def test_vertex_colours_over_surface_textures_agree(self, tmp_path):
-        builder = GltfBuilder()
-        material = {"pbrMetallicRoughness": {"metallicRoughnessTexture": {"index": builder.texture(NOISE)}}}
-        colors = np.float32([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0]])
-        asset = square(tmp_path, material, builder=builder, TEXCOORD_0=UV, COLOR_0=colors)
-        assert asset.ignored == ()
-        assert_agreement(asset, varying=CHANNELS)
+        asset = square(tmp_path, material(builder), builder=builder, **attributes)
+        assert asset.ignored == tuple(ignored)
+        assert_agreement(asset, varying=varying, count=1500 if "wraps" in case else 400)
 
     def test_colours_of_whole_faces_times_a_texture_agree_and_are_exact(self, tmp_path):
         builder = GltfBuilder()
@@ -185,13 +179,6 @@ class TestGltf:
         builder.mesh(builder.primitive(corners, None, material=material, TEXCOORD_0=uv, COLOR_0=colors))
         asset = meshes.load_mesh(builder.write(tmp_path / "faces.glb"))
         assert asset.ignored == ()
-        assert_agreement(asset, varying=["base_color"])
-
-    def test_colours_that_vary_within_a_textured_face_are_named_and_still_agree(self, tmp_path):
-        builder = GltfBuilder()
-        colors = np.float32([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0]])
-        asset = square(tmp_path, textured(builder), builder=builder, TEXCOORD_0=UV, COLOR_0=colors)
-        assert asset.ignored == ("vertex colours that vary within textured faces (one tint per face is used)",)
         assert_agreement(asset, varying=["base_color"])
 
 

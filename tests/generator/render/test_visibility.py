@@ -76,18 +76,6 @@ def test_a_point_behind_another_part_is_seen_by_its_face_but_not_by_itself():
     assert not (by_point & ~by_face).any()
 
 
-def test_the_rule_decides_which_condition_pixels_there_are():
-    surface = surface_points.sample_surface(WALL_AND_BOX, 2000, 3)
-    pose = views.look_at(np.array([0.0, 0.0, 3.0]))[None]
-    by_face, by_point = (
-        views.render_views(WALL_AND_BOX, surface, pose, [LIGHT], replace(CONFIG, spp=4, visibility=rule), 0)[1]
-        for rule in ("face", "point")
-    )
-    face_pixels, point_pixels = by_face[..., 3] > 0, by_point[..., 3] > 0
-    assert not (point_pixels & ~face_pixels).any()
-    assert 20 < (face_pixels & ~point_pixels).sum() < 0.2 * face_pixels.sum()
-
-
 # Run in a process of its own: one process has one variant, and its numbers of shapes go on from scene to scene.
 COMPILED = f"""
 import sys

@@ -11,28 +11,16 @@ FAMILIES += ("rubber", "glow", "canvas")
 
 
 @pytest.mark.parametrize("name", TILES)
-def test_patterns_stay_in_range_and_are_not_flat(name):
+def test_patterns_stay_in_range_are_not_flat_and_join_their_own_other_edge(name):
     for seed in range(6):
         picture = getattr(patterns, name)(np.random.default_rng(seed)) + np.zeros((patterns.SIZE, patterns.SIZE))
         assert picture.min() >= 0
         assert picture.max() <= 1
         assert np.ptp(picture) > 0.2
-
-
-@pytest.mark.parametrize("name", TILES)
-def test_patterns_join_their_own_other_edge_no_worse_than_neighbouring_lines_inside(name):
-    for seed in range(6):
-        picture = getattr(patterns, name)(np.random.default_rng(seed)) + np.zeros((patterns.SIZE, patterns.SIZE))
         for axis in (0, 1):
             inside = np.abs(np.diff(picture, axis=axis)).mean(axis=1 - axis)
             seam = np.abs(np.take(picture, 0, axis) - np.take(picture, -1, axis)).mean()
-            assert seam <= inside.max() * 1.25 + 1e-9
-
-
-def test_noise_has_more_detail_along_the_axis_of_higher_frequency():
-    field = patterns.noise(np.random.default_rng(3), (40, 2))
-    across, along = (np.abs(np.diff(field, axis=axis)).mean() for axis in (1, 0))
-    assert across > 5 * along
+            assert seam <= inside.max() * 1.25 + 1e-9, "no worse than neighbouring lines inside"
 
 
 @pytest.mark.parametrize("name", FAMILIES)
@@ -46,13 +34,8 @@ def test_finishes_are_float32_of_real_albedo_and_the_same_for_the_same_seed(name
         assert 0.015 < first.base_color.min() <= first.base_color.max() < 0.96
         assert 0.045 < first.roughness.min() <= first.roughness.max() <= 1
         assert 0 <= first.metallic.min() <= first.metallic.max() <= 1
-
-
-def test_only_metals_and_metallic_coats_are_metallic():
-    rngs = [np.random.default_rng(seed) for seed in range(20)]
-    assert all(finishes.metal(rng).material.metallic == 1 for rng in rngs)
-    for family in (finishes.wood, finishes.fabric, finishes.stone, finishes.plastic, finishes.glass):
-        assert all(family(rng).material.metallic == 0 for rng in rngs)
+        assert first.metallic.max() == 0 or name not in ("wood", "fabric", "stone", "plastic", "glass")
+        assert first.metallic.min() == 1 or name != "metal"
 
 
 def test_colours_cover_every_hue_and_dark_and_light():
@@ -68,15 +51,3 @@ def test_linear_and_hsv_agree_with_the_srgb_definition():
     np.testing.assert_allclose(finishes.linear([0.0, 0.04, 0.5, 1.0]), [0, 0.04 / 12.92, 0.21404114, 1], rtol=1e-6)
     np.testing.assert_allclose(finishes.hsv(1 / 3, 1, 0.5), [0.02, 0.21404114, 0.02], rtol=1e-6)
     np.testing.assert_allclose(finishes.hsv(0.7, 0, 0.5), 0.21404114, rtol=1e-6)
-
-
-def test_each_swatch_shows_its_own_colour():
-    picture = finishes.swatches(np.random.default_rng(0), 12).material.base_color
-    centres = ((np.arange(12) + 0.5) / 12 * picture.shape[1]).astype(int)
-    shown = picture[picture.shape[0] // 2, centres]
-    assert len(np.unique(shown, axis=0)) == 12
-    for k, centre in enumerate(centres):
-        np.testing.assert_array_equal(
-            picture[:, centre - 2 : centre + 3], np.repeat(picture[:, centre : centre + 1], 5, 1)
-        )
-        assert np.ptp(picture[24:40, centres[k]], axis=0).max() == 0

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from data_gen.procedural import aircraft_parts
+from data_gen.procedural import planes
 from data_gen.shapes import primitives
-from data_gen.shapes.outlines import circle, curve, rounded_rectangle, superellipse
+from data_gen.shapes.primitives import circle, curve, rounded_rectangle, superellipse
 
 BENT = np.column_stack([np.zeros(9), np.linspace(0, 1, 9), 0.2 * np.sin(np.linspace(0, 3, 9))])
 SHEET = np.stack([*np.meshgrid(np.linspace(-1, 1, 5), np.linspace(0, 1, 4)), np.zeros((4, 5))], axis=-1)
@@ -22,7 +22,7 @@ CLOSED = {
     "superellipsoid": lambda: primitives.superellipsoid((1, 2, 3), 0.4, 0.3),
     "shell": lambda: primitives.shell(SHEET + [0, 0, 0.1] * SHEET[..., :1] ** 2, 0.1),
     "moulding": lambda: primitives.moulding(1.0, 0.7, [(0, 0), (0.1, 0), (0.1, 0.02), (0, 0.05)]),
-    "wing": lambda: aircraft_parts.surface((0, 0, 0.1), (0.5, 0.05, 0), (0.2, 0.1), 0.13, sections=3),
+    "wing": lambda: planes.surface((0, 0, 0.1), (0.5, 0.05, 0), (0.2, 0.1), 0.13, sections=3),
     "turned and mirrored": lambda: primitives.mirror(primitives.turn(primitives.lathe([(0.2, 0), (0.1, 1)]), "x", 40)),
 }
 
@@ -74,12 +74,6 @@ def test_volumes_are_those_of_the_closed_forms():
     assert volume(fine) == pytest.approx(4 / 3 * np.pi * 6, rel=3e-3)
 
 
-def test_lathe_of_a_straight_line_has_the_area_of_a_cylinder():
-    mesh = primitives.cylinder(0.5, 2.0, segments=400)
-    area = np.linalg.norm(face_area_vectors(mesh.positions, mesh.faces), axis=1).sum()
-    assert area == pytest.approx(2 * np.pi * 0.5 * 2 + 2 * np.pi * 0.25, rel=1e-4)
-
-
 def test_bevels_take_away_volume_and_never_leave_the_box():
     plain, cut, rounded = (primitives.box((0.3, 0.2, 0.5), *edge) for edge in ((0.0,), (0.04, 1), (0.04, 3)))
     assert volume(cut) < volume(rounded) < volume(plain)
@@ -118,11 +112,6 @@ def test_turn_is_counter_clockwise_seen_from_the_positive_end_of_the_axis():
     mesh = primitives.Mesh(np.eye(3), np.array([[0, 1, 2]]), np.eye(3), np.zeros((3, 2)))
     np.testing.assert_allclose(primitives.turn(mesh, "y", 90).positions, [[0, 0, -1], [0, 1, 0], [1, 0, 0]], atol=1e-12)
     np.testing.assert_allclose(primitives.turn(mesh, "x", 90).normals, [[1, 0, 0], [0, 0, 1], [0, -1, 0]], atol=1e-12)
-
-
-def test_curve_passes_through_its_control_points():
-    points = np.array([(0, 0), (1, 2), (3, 1), (4, 4)], float)
-    np.testing.assert_allclose(curve(points, 3 * 5 + 1)[::5], points, atol=1e-12)
 
 
 def test_smooth_normals_do_not_reach_from_one_open_end_of_a_sheet_to_the_other():

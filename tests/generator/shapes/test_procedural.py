@@ -49,7 +49,7 @@ def corner_agreement(part):
 
 
 @every_asset
-def test_geometry_is_finite_indexed_and_without_zero_area(asset):
+def test_geometry_and_materials_are_sound_and_objects_enclose_volume_and_stand_on_the_floor(asset):
     for part in asset.parts:
         for array in (part.positions, part.normals, part.texcoords):
             assert np.isfinite(array).all()
@@ -58,10 +58,10 @@ def test_geometry_is_finite_indexed_and_without_zero_area(asset):
         assert np.linalg.norm(np.cross(b - a, c - a), axis=1).min() > 1e-10
         np.testing.assert_allclose(np.linalg.norm(part.normals, axis=1), 1, atol=1e-5)
         assert (corner_agreement(part) > 0).mean() > 0.985
-
-
-@every_asset
-def test_objects_enclose_volume_stand_on_the_floor_and_have_few_parts(asset):
+        material = part.material
+        assert 0.015 < material.base_color.min() <= material.base_color.max() < 0.96
+        assert 0.045 < material.roughness.min() <= material.roughness.max() <= 1
+        assert max(material.base_color.size // 3, material.roughness.size) <= 256**2
     corners = triangles(asset)
     assert np.einsum("fk,fk->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) > 0
     assert corners[..., 1].min() == 0
@@ -85,15 +85,6 @@ def test_every_part_touches_the_rest(asset):
     filled[tuple(voxels.T)] = True
     _, components = ndimage.label(filled, np.ones((3, 3, 3)))
     assert components == 1
-
-
-@every_asset
-def test_materials_are_physical_and_textures_are_of_moderate_size(asset):
-    for part in asset.parts:
-        material = part.material
-        assert 0.015 < material.base_color.min() <= material.base_color.max() < 0.96
-        assert 0.045 < material.roughness.min() <= material.roughness.max() <= 1
-        assert max(material.base_color.size // 3, material.roughness.size) <= 256**2
 
 
 @pytest.mark.parametrize("category", CATEGORIES)

@@ -1,14 +1,101 @@
-"""Legs and bases that chairs, tables, sofas, shelves and lamps share.
+"""Parts that several families share, legs, bases and wheels, and how pieces become an object.
 
-A leg style is drawn once per object and gives a function (foot, top) -> Mesh, so that all legs of an object match.
+A piece is (finish, mesh) in metres or any other unit; families of objects return lists of them.  Meshes that share a
+finish become one part, and the object stands on y = 0.  A leg style is drawn once per object and gives a function
+(foot, top) -> Mesh, so that all legs of an object match.
 """
 
 from collections.abc import Callable
 
 import numpy as np
 
-from data_gen.shapes.outlines import circle, curve, rounded_rectangle, superellipse
-from data_gen.shapes.primitives import Mesh, box, cylinder, lathe, loft, merge, move, superellipsoid, tube, turn
+from data_gen.shapes.finishes import Finish
+from data_gen.shapes.primitives import (
+    Mesh,
+    box,
+    circle,
+    curve,
+    cylinder,
+    lathe,
+    loft,
+    merge,
+    move,
+    rounded_rectangle,
+    superellipse,
+    superellipsoid,
+    tube,
+    turn,
+)
+from spnr_jax.formats.mesh.assets import Asset, Part
+
+Piece = tuple[Finish, Mesh]
+DECIMALS = 6  # of positions and normals: hides the last bit, in which the sines of two processors may differ
+
+
+def assemble(pieces: list[Piece], category: str, source: dict) -> Asset:
+    """Asset with one part per finish, in order of first use, its lowest point at y = 0."""
+    floor = min(mesh.positions[:, 1].min() for _, mesh in pieces)
+    finishes = list({id(finish): finish for finish, _ in pieces}.values())
+    parts = []
+    for finish in finishes:
+        mesh = merge([mesh for other, mesh in pieces if other is finish])
+        parts.append(
+            Part(
+                positions=(mesh.positions - (0, floor, 0)).round(DECIMALS),
+                faces=mesh.faces,
+                material=finish.material,
+                normals=mesh.normals.round(DECIMALS),
+                texcoords=(mesh.texcoords / finish.tile).round(DECIMALS),
+            )
+        )
+    return Asset(parts=tuple(parts), category=category, source=source)
+
+
+def wheel(rng, radius: float, width: float) -> tuple[Mesh, Mesh]:
+    """(tyre, rim) about 0, the outside of the rim towards +x."""
+    inner = radius * rng.uniform(0.55, 0.75)
+    half, round_ = width / 2, width * rng.uniform(0.15, 0.3)
+    section = [
+        (inner, -half),
+        (radius - round_, -half),
+        (radius - round_ * 0.3, -half + round_ * 0.3),
+        (radius, -half + round_),
+        (radius, half - round_),
+        (radius - round_ * 0.3, half - round_ * 0.3),
+        (radius - round_, half),
+        (inner, half),
+        (inner * 0.97, half * 0.5),
+        (inner * 0.97, -half * 0.5),
+    ]
+    tyre = lathe(section, 24, closed=True)
+    dish = half * rng.uniform(0.1, 0.7)
+    lip = lathe(
+        [
+            (inner, -half * 0.4),
+            (inner, half * 0.95),
+            (inner * 0.92, half),
+            (inner * 0.88, dish),
+            (inner * 0.85, -half * 0.4),
+        ],
+        24,
+        closed=True,
+    )
+    hub = move(cylinder(inner * rng.uniform(0.2, 0.35), half * 0.5 + dish, 12, half * 0.1), y=-half * 0.3)
+    style = rng.choice(["spokes", "disc", "dish"])
+    parts = [lip, hub]
+    if style == "spokes":
+        count = int(rng.integers(3, 9))
+        thick = rng.uniform(0.1, 0.3) * inner
+        spoke = move(box((inner * 0.75, half * 0.4, thick), 0.002), x=inner * 0.53, y=dish * 0.8)
+        parts += [turn(spoke, "y", 360 / count * i) for i in range(count)]
+        parts.append(move(cylinder(inner * 0.9, half * 0.1, 20), y=-half * 0.3))
+    elif style == "disc":
+        parts.append(move(cylinder(inner * 0.92, dish + half * 0.3, 20, half * 0.08), y=-half * 0.3))
+    else:
+        at = np.linspace(1, 0, 6)
+        parts.append(lathe([(inner * 0.9, -half * 0.3), *zip(inner * 0.9 * at, dish * (1 - at**2), strict=True)], 20))
+    return turn(tyre, "z", -90), turn(merge(parts), "z", -90)
+
 
 Leg = Callable[[np.ndarray, np.ndarray], Mesh]
 

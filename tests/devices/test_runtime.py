@@ -1,6 +1,7 @@
-"""What glibc's allocator is asked: threads share arenas, freed memory goes back, another C library is left alone."""
+"""What a process asks of its machine: arenas that threads share, memory that stays or goes back, programs on disk."""
 
 import ctypes
+import os
 import platform
 import subprocess
 import sys
@@ -8,14 +9,20 @@ from types import SimpleNamespace
 
 import pytest
 
-from spnr_jax.devices import allocator
-
-pytestmark = pytest.mark.ci  # it measures memory
+from spnr_jax.devices import runtime
 
 THREADS = 6
+glibc = pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="the C library is not glibc")
+
+
+def measured(test):
+    """A test that measures memory, of glibc alone."""
+    return pytest.mark.ci(glibc(test))
+
+
 CHILD = f"""
 import ctypes, os, sys, threading
-from spnr_jax.devices import allocator as memory
+from spnr_jax.devices import runtime
 
 def arenas():
     libc = ctypes.CDLL("libc.so.6")
@@ -31,7 +38,7 @@ def allocate():
 
 os.cpu_count = lambda: 2
 if sys.argv[1] == "few":
-    memory.few_arenas()
+    runtime.few_arenas()
 before = arenas()
 meeting = threading.Barrier({THREADS})
 threads = [threading.Thread(target=allocate) for _ in range({THREADS})]
@@ -43,7 +50,7 @@ print(arenas() - before)
 """
 
 
-@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="the C library is not glibc")
+@measured
 @pytest.mark.parametrize(("asked", "more"), [("few", 1), ("none", THREADS)])
 def test_threads_share_as_many_arenas_as_there_are_cores_when_they_are_asked_to(tmp_path, asked, more):
     done = subprocess.run(
@@ -54,10 +61,10 @@ def test_threads_share_as_many_arenas_as_there_are_cores_when_they_are_asked_to(
 
 FAULTS = """
 import resource, sys
-from spnr_jax.devices import allocator as memory
+from spnr_jax.devices import runtime
 
 if sys.argv[1] == "keep":
-    memory.keep_arrays()
+    runtime.keep_arrays()
 import jax
 
 @jax.jit
@@ -75,7 +82,7 @@ print(min(faults))
 """
 
 
-@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="the C library is not glibc")
+@measured
 def test_a_step_uses_the_memory_of_the_one_before_when_it_is_kept():
     def faults(asked):
         done = subprocess.run([sys.executable, "-c", FAULTS, asked], capture_output=True, text=True, check=True)
@@ -91,7 +98,7 @@ def test_freed_memory_goes_back(monkeypatch):
     monkeypatch.setattr(
         ctypes, "CDLL", lambda name: SimpleNamespace(malloc_trim=lambda keep: kept.append((name, keep)))
     )
-    allocator.give_back()
+    runtime.give_back()
     assert kept == [("libc.so.6", 0)]
 
 
@@ -101,6 +108,33 @@ def test_another_c_library_is_left_alone(monkeypatch):
 
     for library in (missing, lambda name: object()):
         monkeypatch.setattr(ctypes, "CDLL", library)
-        allocator.few_arenas()
-        allocator.keep()
-        allocator.give_back()
+        runtime.few_arenas()
+        runtime.keep()
+        runtime.give_back()
+
+
+PROGRAM = """
+import os, pathlib, sys
+from spnr_jax.devices import runtime
+os.environ["JAX_COMPILATION_CACHE_DIR"] = sys.argv[1]
+seen = []
+for cut in (True, False, False):
+    runtime.keep_programs()
+    import jax
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
+    jax.clear_caches()
+    assert jax.jit(lambda x: 2 * x)(1.0) == 2
+    seen.append({entry.name: entry.read_bytes() for entry in pathlib.Path(sys.argv[1]).glob("*-cache")})
+    for name, content in seen[-1].items() if cut else ():
+        pathlib.Path(sys.argv[1], name).write_bytes(content[: len(content) // 2])
+whole, mended, kept = seen
+assert whole and whole.keys() == mended.keys() and mended == kept
+assert all(len(mended[name]) > 0.9 * len(whole[name]) for name in whole)
+"""
+
+
+def test_a_cut_off_entry_is_made_anew_once_and_without_a_word(tmp_path):
+    command = [sys.executable, "-W", "error", "-c", PROGRAM, tmp_path]
+    alone = {name: value for name, value in os.environ.items() if name != "TF_CPP_MIN_LOG_LEVEL"}  # JAX set it here
+    done = subprocess.run(command, env=alone, capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stdout + done.stderr) == (0, "")

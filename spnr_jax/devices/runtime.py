@@ -1,0 +1,139 @@
+"""What a process asks of its machine: memory that stays, compiled programs on the disk; and what the machine is.
+
+glibc's allocator is asked for speed and so that memory does not grow; other C libraries are left alone.  Nothing here
+imports JAX before it is called: `keep_programs` comes before that.
+"""
+
+import contextlib
+import ctypes
+import os
+import platform
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+TRIM_THRESHOLD, MMAP_MAX, ARENA_MAX = -1, -4, -8  # M_... of malloc.h
+
+
+def keep_arrays() -> None:
+    """Makes JAX on a CPU reuse the heap of the step before (mallopt), without page faults; call it before JAX computes.
+
+    Else the system fetches and clears a step's temporary memory each time, a fifth of the step.  JAX computes in the
+    thread that calls it then: other threads' arenas hold 64 MB at most, whatever glibc is asked.
+    """
+    import jax
+
+    jax.config.update("jax_cpu_enable_async_dispatch", False)
+    keep()
+
+
+def keep() -> None:
+    """Has memory that is freed stay in the process until it is given back."""
+    _ask(lambda libc: libc.mallopt(MMAP_MAX, 0))
+    _ask(lambda libc: libc.mallopt(TRIM_THRESHOLD, 2**31 - 1))
+
+
+def few_arenas() -> None:
+    """Has the threads that begin from now on share arenas, as many as there are cores.
+
+    Each batch, row and checkpoint is made by other threads than the one before; with an arena for each, what they free
+    stays scattered over all of them.  With fewer arenas than cores the threads of one step would wait for each other.
+    """
+    _ask(lambda libc: libc.mallopt(ARENA_MAX, os.cpu_count() or 1))
+
+
+def give_back() -> None:
+    """Has freed memory go back to the system: of Orbax's glibc keeps 130 MB, and 1 MB more after each save."""
+    _ask(lambda libc: libc.malloc_trim(0))
+
+
+def _ask(what: Callable[[ctypes.CDLL], int]) -> None:
+    try:
+        what(ctypes.CDLL("libc.so.6"))
+    except (OSError, AttributeError):
+        return  # another C library
+
+
+SHORTEST = 0.1  # seconds of compilation from which on a program is kept
+# options of XLA for an outermost jit: a third to two thirds off the compilation of long programs, which run as long
+QUICK = {"xla_cpu_use_fusion_emitters": False}
+QUICKEST = QUICK | {"xla_backend_optimization_level": 1}
+
+LOOKED_AT = "looked-at"  # file whose time says up to when entries are known to be whole
+
+
+def folder() -> Path:
+    """Where this package keeps what can be made again, of this user."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "spnr_jax"
+
+
+def keep_programs() -> None:
+    """Lets a second run skip XLA's compilation; JAX_COMPILATION_CACHE_DIR moves the cache.
+
+    On some processors XLA logs two long errors for each program that it reads, though nothing is wrong with it
+    (openxla/xla#44565).  Where JAX is not imported yet they stay off the terminal; TF_CPP_MIN_LOG_LEVEL=2 shows them.
+    """
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+    import jax
+
+    if jax.config.values["jax_compilation_cache_dir"] is None:
+        jax.config.update("jax_compilation_cache_dir", str(folder()))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", SHORTEST)
+    with contextlib.suppress(OSError):  # there is none yet, or it is not ours to mend
+        remove_broken(Path(jax.config.values["jax_compilation_cache_dir"]))
+
+
+def remove_broken(cache: Path) -> None:
+    """Removes entries that are cut off, as a process leaves them that was killed while it wrote.
+
+    JAX would warn of them and compile in every run, for it does not write over what is there.  Only what was written
+    since the last look is read.
+    """
+    from jax._src.compilation_cache import decompress_executable  # there is no public way to read an entry
+
+    begin, mark = time.time_ns(), cache / LOOKED_AT
+    last = mark.stat().st_mtime_ns if mark.exists() else 0
+    for entry in os.scandir(cache):
+        if entry.name.endswith("-cache") and entry.stat().st_mtime_ns >= last:
+            try:
+                decompress_executable(Path(entry.path).read_bytes())
+            except OSError:  # another process removed it, or it is another user's
+                continue
+            except Exception:  # of whichever library unpacks them
+                Path(entry.path).unlink(missing_ok=True)
+    mark.touch()
+    os.utime(mark, ns=(begin, begin))
+
+
+CPUINFO = Path("/proc/cpuinfo")
+INSTRUCTION_SETS = ("avx2", "fma", "avx512f", "avx512_vnni", "avx512_bf16", "amx_bf16", "asimd", "sve")
+
+
+def hardware() -> str:
+    """The device that JAX uses, in words."""
+    import jax
+
+    device = jax.devices()[0]
+    if device.platform != "cpu":
+        return f"{jax.device_count()} x {device.device_kind}"
+    names = _told("model name")
+    return f"{len(os.sched_getaffinity(0))} cores of {names[0] if names else platform.machine()}"
+
+
+def processor() -> str:
+    """The processor's name, and which of its instruction sets matter to products of matrices."""
+    names, flags = _told("model name"), _told("flags") or _told("Features")
+    known = flags[0].split() if flags else []
+    sets = [name for name in INSTRUCTION_SETS if name in known]
+    return f"{names[0] if names else platform.machine()} ({', '.join(sets) or 'instruction sets unknown'})"
+
+
+def load() -> float:
+    """Threads that ran or waited to run on this machine, mean of the last minute: those of others, too."""
+    return round(os.getloadavg()[0], 1)
+
+
+def _told(name: str) -> list[str]:
+    """What the kernel says of each core under this name; nothing where it says nothing."""
+    lines = CPUINFO.read_text().splitlines() if CPUINFO.is_file() else []
+    return [line.split(":", 1)[1].strip() for line in lines if line.split(":")[0].strip() == name]

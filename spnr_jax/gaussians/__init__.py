@@ -1,1 +1,0 @@
-"""Gaussian splats of an object: placed on its surface, coloured by its pictures; pure functions."""

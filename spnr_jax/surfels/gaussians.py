@@ -1,0 +1,246 @@
+"""Gaussian splats on the surface that pictures of an object show, in the colours of these pictures; pure functions.
+
+Harmonics: real spherical harmonics as splat viewers have them, degrees 0 to 3, with the Condon-Shortley phase, in the
+order of Kerbl et al. 2023 and of KHR_gaussian_splatting: by degree, then by order from -degree to degree.
+
+Places: pixels of all views are carried back to their depth, and the nearest surfel says what each lies on.  A pixel far
+from it is no surface (a depth between two of them); its normal is turned to the viewer.  Pixels that share a cube and
+face the same way, by the largest component of the normal, become a splat at their mean, so a thin sheet has one on each
+side.  The cubes are as small as the wanted number of splats allows, and no smaller than the pixels.
+
+Colours: spherical harmonics by weighted least squares over the views that see each splat.  A view sees a splat that
+faces it and whose centre lies at its picture's depth there, and is against one that lies before that depth or where the
+picture is empty.  Splats that more than a few views are against stick out of the object and are left out.  The weight
+of a view is the cosine under which it sees the splat; harmonics of higher degree are held back (ridge), so few views
+give a plain colour.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+from scipy.ndimage import minimum_filter
+from scipy.spatial import cKDTree
+
+from spnr_jax.errors import UserError
+from spnr_jax.kernels.cameras import camera_rays
+from spnr_jax.kernels.records import AnyArray, Camera, Gaussians, Surfels
+
+C0 = 0.28209479177387814  # sqrt(1 / 4 pi)
+C1 = 0.4886025119029199  # sqrt(3 / 4 pi)
+C2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
+C3 = (0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901154, 1.445305721320277)
+HIGHEST = 3  # degree
+
+
+def coefficients(degree: int) -> int:
+    """How many harmonics there are up to a degree."""
+    return (degree + 1) ** 2
+
+
+def degree_of(count: int) -> int:
+    """The degree of so many coefficients; ValueError if they are of none."""
+    for degree in range(HIGHEST + 1):
+        if coefficients(degree) == count:
+            return degree
+    raise UserError(f"spherical harmonics have 1, 4, 9 or 16 coefficients, got {count}")
+
+
+def basis(directions: Float[AnyArray, "*batch 3"], degree: int) -> Float[AnyArray, "*batch coefficients"]:
+    """All harmonics up to a degree, 0 to 3, of unit vectors; of NumPy arrays as NumPy arrays."""
+    x, y, z = (directions[..., i] for i in range(3))
+    xx, yy, zz = x * x, y * y, z * z
+    values = [C0 + 0 * x]
+    if degree > 0:
+        values += [-C1 * y, C1 * z, -C1 * x]
+    if degree > 1:
+        a, b, c = C2
+        values += [a * x * y, -a * y * z, b * (2 * zz - xx - yy), -a * x * z, c * (xx - yy)]
+    if degree > 2:
+        a, b, c, d, e = C3
+        values += [-a * y * (3 * xx - yy), b * x * y * z, -c * y * (4 * zz - xx - yy)]
+        values += [d * z * (2 * zz - 3 * xx - 3 * yy), -c * x * (4 * zz - xx - yy)]
+        values += [e * z * (xx - yy), -a * x * (xx - 3 * yy)]
+    return np.stack(values, axis=-1) if isinstance(directions, np.ndarray) else jnp.stack(values, axis=-1)
+
+
+def half_turn_signs(degree: int) -> Float[np.ndarray, " coefficients"]:
+    """Signs of the coefficients of a colour that is turned half around the x axis: (x, y, z) -> (x, -y, -z)."""
+    place = np.array([0.36, 0.48, 0.8])
+    return np.sign(basis(place * [1, -1, -1], degree) * basis(place, degree))
+
+
+STRIDE = 2  # of the pixels that are carried back
+WITHIN, OFF_PLANE = 1.2, 0.5  # spacings of a surfel from which and above whose plane a pixel belongs to it
+GRAZING = 0.1  # cosine between ray and normal below which a pixel's depth says little
+FINEST = 1.25  # pixels of the pictures that a cube is wide at least
+WIDTH, THICKNESS, OPACITY = 0.57, 0.03, 0.98  # of a splat: standard deviations in cubes, opacity
+INSET = 0.5  # pixels that a splat lies below the surface: at outlines many are seen from their edge, and all reach out
+TRIES, ENOUGH = 6, 0.85  # sizes of cubes that are tried, share of the wanted number that is good
+
+
+class View(NamedTuple):
+    """A picture on white, sRGB, with opacity and distance along the ray to the surface, NaN where none is."""
+
+    camera: Camera
+    image: Float[np.ndarray, "height width 3"]
+    opacity: Float[np.ndarray, "height width"]
+    depth: Float[np.ndarray, "height width"]
+
+
+class Seen(NamedTuple):
+    """Pixels carried back: places, and normals towards the viewer."""
+
+    position: Float[np.ndarray, "pixels 3"]
+    normal: Float[np.ndarray, "pixels 3"]
+
+
+def seen_surface(views: Sequence[View], surfels: Surfels, stride: int = STRIDE) -> Seen:
+    """The places of the surface that the views show; ValueError if they show none."""
+    found, rays = [], []
+    for i, view in enumerate(views):
+        row, column = i % stride, i // stride % stride  # another share of the pixels in each view
+        of = camera_rays(view.camera)
+        depth = view.depth[row::stride, column::stride]
+        hit = np.isfinite(depth)
+        direction = np.asarray(of.directions)[row::stride, column::stride][hit]
+        origin = np.asarray(of.origins)[row::stride, column::stride][hit]
+        found.append((origin + depth[hit][:, None] * direction).astype(np.float32))
+        rays.append(direction)
+    position, direction = np.concatenate(found), np.concatenate(rays)
+    live = np.asarray(surfels.mask)
+    centre, normal, spacing = (np.asarray(x)[live] for x in (surfels.position, surfels.normal, surfels.spacing))
+    distance, nearest = cKDTree(centre).query(position)
+    offset = position - centre[nearest]
+    normal, spacing = normal[nearest], spacing[nearest]
+    facing = -np.einsum("ni,ni->n", direction, normal)
+    above = np.abs(np.einsum("ni,ni->n", offset, normal))
+    kept = (distance < WITHIN * spacing) & (above < OFF_PLANE * spacing) & (np.abs(facing) > GRAZING)
+    if not kept.any():
+        raise UserError("the network's pictures show no surface to put splats on")
+    return Seen(position[kept], (normal * np.sign(facing)[:, None])[kept])
+
+
+def place(seen: Seen, *, most: int, pixel: float) -> tuple[Gaussians, float]:
+    """Grey splats, at most so many, and the side of the cubes; `pixel` is the width of a pixel on the surface."""
+    side = max(FINEST * pixel, 1e-9)
+    low = seen.position.min(axis=0)
+    for _ in range(TRIES):
+        number, group = _groups(seen, low, side)
+        if number <= most and (number >= ENOUGH * most or side <= FINEST * pixel):
+            break
+        side = max(side * np.sqrt(number / (0.5 * (1 + ENOUGH) * most)), FINEST * pixel)
+    while number > most:
+        side *= 1.1
+        number, group = _groups(seen, low, side)
+    count = np.bincount(group, minlength=number)[:, None]
+    position, normal = (
+        np.stack([np.bincount(group, x[:, i], number) for i in range(3)], axis=-1) / count for x in seen
+    )
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
+    scale = np.broadcast_to(np.array([WIDTH, WIDTH, THICKNESS], np.float32) * side, (number, 3))
+    placed = Gaussians(
+        position=(position - INSET * pixel * normal).astype(np.float32),
+        rotation=turn_to(normal).astype(np.float32),
+        scale=np.array(scale),
+        opacity=np.full(number, OPACITY, np.float32),
+        harmonics=np.zeros((number, 1, 3), np.float32),
+    )
+    return placed, float(side)
+
+
+def _groups(seen: Seen, low: np.ndarray, side: float) -> tuple[int, np.ndarray]:
+    """How many splats cubes of this side make, and which one each pixel belongs to."""
+    cube = ((seen.position - low) / side).astype(np.int64)
+    axis = np.abs(seen.normal).argmax(axis=1)
+    face = 2 * axis + (np.take_along_axis(seen.normal, axis[:, None], axis=1)[:, 0] > 0)
+    key = ((cube[:, 0] << 40 | cube[:, 1] << 20 | cube[:, 2]) << 3) | face
+    names, group = np.unique(key, return_inverse=True)
+    return len(names), group.ravel()
+
+
+def rotations(quaternion: Float[np.ndarray, "splats 4"]) -> Float[np.ndarray, "splats 3 3"]:
+    """Rotation matrices of unit quaternions w x y z."""
+    w, x, y, z = np.asarray(quaternion).T
+    rows = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def turn_to(normal: Float[np.ndarray, "splats 3"]) -> Float[np.ndarray, "splats 4"]:
+    """Quaternions w x y z that turn the third axis to a normal, some after half a turn around the first axis."""
+    below = normal[:, 2:] < 0
+    x, y, z = np.split(normal * np.where(below, -1, 1), 3, axis=-1)
+    w, nothing = 1 + z, np.zeros_like(z)
+    upright = np.concatenate([w, -y, x, nothing], axis=-1)
+    turned = np.concatenate([y, w, nothing, -x], axis=-1)  # the same rotation behind that half turn
+    quaternion = np.where(below, turned, upright)
+    return quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)
+
+
+BEHIND = 2.0  # sides of a cube that a splat may lie behind a picture's depth
+SOLID = 0.6  # opacity from which a pixel has a colour of its own
+LEAST_FACING = 0.05  # weight of a splat that is seen from its edge
+RIDGE = 0.4  # in views
+BEFORE = 2.5  # sides of a cube before a picture's depth from which a view is against a splat
+EMPTY = 0.5  # opacity below which a picture is empty
+FEW, ALWAYS = 0.12, 0.5  # views against a splat that do not count: share of those that see it, and number
+
+
+def color(gaussians: Gaussians, views: Sequence[View], *, side: float, degree: int) -> Gaussians:
+    """The splats in the colours of the views, of a degree 0 to 3; without those that no view sees."""
+    position = np.asarray(gaussians.position)
+    normal = rotations(np.asarray(gaussians.rotation))[:, :, 2]
+    count = coefficients(degree)
+    matrix = np.zeros((len(position), count, count), np.float32)
+    right = np.zeros((len(position), count, 3), np.float32)
+    seen, against = np.zeros((2, len(position)), np.int32)
+    for view in views:
+        towards = position - np.asarray(view.camera.cam_to_world)[:, 3]
+        distance = np.linalg.norm(towards, axis=1)
+        towards /= distance[:, None]
+        row, column, inside = _pixels(position, view.camera)
+        opacity, depth = view.opacity[row, column], view.depth[row, column]
+        with np.errstate(invalid="ignore"):
+            near = inside & (distance < depth + BEHIND * side)
+            before = near & (distance < nearest_around(view.depth)[row, column] - BEFORE * side)
+        against += before | (inside & (opacity < EMPTY))
+        cosine = -np.einsum("ni,ni->n", towards, normal)  # a thin sheet has splats on either side
+        visible = np.flatnonzero(near & ~before & (opacity > SOLID) & (cosine > 0))
+        facing = cosine[visible]
+        weight = np.maximum(facing, LEAST_FACING)[:, None].astype(np.float32)
+        opacity = opacity[visible, None]
+        seen_color = (view.image[row[visible], column[visible]] - (1 - opacity)) / opacity
+        harmonics = np.asarray(basis(towards[visible].astype(np.float32), degree))
+        matrix[visible] += (weight * harmonics)[:, :, None] * harmonics[:, None]
+        right[visible] += (weight * harmonics)[:, :, None] * (seen_color - 0.5)[:, None]
+        seen[visible] += 1
+    held = np.diag([1e-4] + [RIDGE / (4 * np.pi)] * (count - 1)).astype(np.float32)
+    shown = (seen > 0) & (against <= FEW * seen + ALWAYS)
+    if not shown.any():
+        raise UserError("the pictures agree on no surface; give more views")
+    harmonics = np.linalg.solve(matrix[shown] + held, right[shown])
+    kept = {name: np.asarray(x)[shown] for name, x in vars(gaussians).items()}
+    return Gaussians(**kept | {"harmonics": harmonics.astype(np.float32)})
+
+
+def nearest_around(depth: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "height width"]:
+    """The least depth of a pixel and those around it, infinite where none has one: depth is blurred where it jumps."""
+    return minimum_filter(np.where(np.isnan(depth), np.inf, depth), 3)
+
+
+def _pixels(position: Float[np.ndarray, "splats 3"], camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Row and column of the pixel that each place lies in, and whether it lies in one."""
+    pose, k = np.asarray(camera.cam_to_world), np.asarray(camera.intrinsics)
+    local = (position - pose[:, 3]) @ pose[:, :3]
+    ahead = -local[:, 2] > 1e-6
+    away = np.where(ahead, -local[:, 2], 1)
+    column = np.floor(k[0, 0] * local[:, 0] / away + k[0, 2])
+    row = np.floor(-k[1, 1] * local[:, 1] / away + k[1, 2])
+    inside = ahead & (row >= 0) & (row < camera.height) & (column >= 0) & (column < camera.width)
+    return tuple(np.where(inside, x, 0).astype(np.int32) for x in (row, column)) + (inside,)

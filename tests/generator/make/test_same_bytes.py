@@ -1,0 +1,142 @@
+"""A data set is the same whatever makes it, and whatever becomes of that meanwhile."""
+
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from fsspec.implementations.memory import MemoryFileSystem
+from support.schedulers import in_this_process, is_worker, scheduler_and_workers
+
+from data_gen.make import objects
+from data_gen.make.generate import generate
+from data_gen.plan import tasks
+from data_gen.render import views
+from data_gen.store import check, layout, storage
+from spnr_jax.devices import cluster
+
+pytestmark = pytest.mark.ci  # it renders several data sets
+
+ROOT = Path(__file__).parents[3]
+COUNT = 8
+SMALL = {"categories": ("frame", "lamp"), "resolution": 24, "views": 2, "points": 64, "spp": 4, "variant": "scalar_rgb"}
+
+
+def make(out, **options):
+    generate(tasks.GenerateConfig(out=out, objects=COUNT, **SMALL, **options))
+    return files(out)
+
+
+def start(out, *options):
+    """The same as `make` in a process of its own, as a user starts it."""
+    arguments = [str(out), "--objects", str(COUNT), *options]
+    for name, value in SMALL.items():
+        arguments += [f"--{name}", *(value if isinstance(value, tuple) else [str(value)])]
+    return subprocess.Popen(
+        [sys.executable, "-m", "data_gen", "generate", *arguments], cwd=ROOT, stderr=subprocess.PIPE
+    )
+
+
+def files(place):
+    """Every file below a place, with its bytes."""
+    filesystem, root = storage.open_place(place)
+    return {name.removeprefix(root): filesystem.cat_file(name) for name in filesystem.find(root)}
+
+
+def wait_for(out, number, process):
+    """The names of the objects that are done, once they are so many."""
+    while len(done := layout.completed_objects(out)) < number:
+        assert process.poll() is None
+        time.sleep(0.01)
+    return done
+
+
+def in_a_cluster_and_an_object_store(folder, address):
+    place = "memory://cluster/set"
+    try:
+        made = make(place, cluster=address)
+        last = sorted(name for name in made if name.endswith("object.json"))[-1]
+        MemoryFileSystem.store.pop(f"/cluster/set{last}")
+        assert make(place, cluster=address) == made, "an object without object.json is made again"
+        return made
+    finally:
+        MemoryFileSystem.store.clear()
+        MemoryFileSystem.pseudo_dirs[:] = [""]
+
+
+def with_two_workers_that_are_stopped_and_go_on(folder, _):
+    out = folder / "set"
+    process = start(out, "--workers", "2")
+    wait_for(out, 1, process)
+    process.send_signal(signal.SIGINT)
+    message = process.communicate(timeout=30)[1].decode()
+    assert process.returncode == 130, message
+    assert "Traceback" not in message
+    assert "stopped" in message.splitlines()[-1]
+    assert layout.completed_objects(out)
+    assert not list((out / "objects").glob(storage.UNFINISHED + "*"))
+    assert not (out / "splits").exists()
+    make(out, workers=2)
+    times = {path: path.stat().st_mtime_ns for path in (out / "objects").rglob("*")}
+    made = make(out)
+    assert {path: path.stat().st_mtime_ns for path in (out / "objects").rglob("*")} == times, "nothing is left to do"
+    return made
+
+
+def by_a_cluster_whose_workers_are_killed(folder, _):
+    out = folder / "set"
+    with scheduler_and_workers(folder, 2) as (address, nannies):
+        parent = start(out, "--cluster", address)
+        for number in (1, 3, 5):
+            done = wait_for(out, number, parent)
+            times = {name: (out / "objects" / name).stat().st_mtime_ns for name in done}
+            victims = [child for child in nannies.children(recursive=True) if is_worker(child)]
+            victims[number % len(victims)].kill()
+        message = parent.communicate(timeout=120)[1].decode()
+        assert parent.returncode == 0, message
+        assert nannies.is_running()
+    assert all((out / "objects" / name).stat().st_mtime_ns == written for name, written in times.items())
+    return files(out)
+
+
+def by_two_runs_at_once(folder, _):
+    both = [start(folder / "set", "--workers", "2") for _ in range(2)]
+    messages = [process.communicate(timeout=120)[1].decode() for process in both]
+    assert [process.returncode for process in both] == [0, 0], messages
+    assert check.check(folder / "set")
+    return files(folder / "set")
+
+
+@pytest.fixture(scope="module")
+def address():
+    with in_this_process() as found:
+        yield found
+
+
+@pytest.fixture(scope="module")
+def expected(tmp_path_factory):
+    """The data set of one undisturbed worker."""
+    return make(tmp_path_factory.mktemp("alone") / "set", workers=1)
+
+
+WAYS = (in_a_cluster_and_an_object_store, with_two_workers_that_are_stopped_and_go_on)
+SLOW_WAYS = (by_a_cluster_whose_workers_are_killed, by_two_runs_at_once)
+
+
+@pytest.mark.parametrize("way", [*WAYS, *(pytest.param(way, marks=pytest.mark.slow) for way in SLOW_WAYS)])
+def test_the_bytes_are_the_same(way, expected, address, tmp_path):
+    assert way(tmp_path, address) == expected
+
+
+def test_a_worker_that_does_not_see_a_mesh_file_ends_the_run_with_its_name(address, tmp_path):
+    unseen = tasks.Task(object_id="thing", path=tmp_path / "other.ply")
+    bench = objects.Workbench(
+        out=str(tmp_path / "set"), lights=None, view=views.ViewConfig(), num_points=4, seed=0, variant="scalar_rgb"
+    )
+    with (
+        cluster.connect(address, 1) as client,
+        pytest.raises(ValueError, match=r"other\.ply: worker .* does not see this file"),
+    ):
+        list(cluster.run_tasks(client, objects.make_and_write, bench, [unseen]))
