@@ -259,18 +259,11 @@ def cut(record: dict[str, np.ndarray], number: int, most: int, rng: np.random.Ge
     asked = rng.permutation(asked)[: int(QUERIES * count / CORE * 0.95)]
     true = get["asked"][asked]
     at = get["matched"][chosen]
-    truth = Truth(
-        record["position"][at],
-        record["normal"][at],
-        record["color"][at],
-        record["visible"][at],
-        np.full(len(chosen), get["floor"], np.float32),
-        record["position"][true],
-        record["normal"][true],
-        record["visible"][true],
-        site[get["nearest"][asked]],
-        point[get["parents"][asked]],
-    )
+    at_places = (record[name][at] for name in ("position", "normal", "color", "visible"))
+    floor = np.full(len(chosen), get["floor"], np.float32)
+    of_asked = (record[name][true] for name in ("position", "normal", "visible"))
+    compared = (*at_places, floor, *of_asked, site[get["nearest"][asked]], point[get["parents"][asked]])
+    truth = Truth(*compared)
     return Batch(nodes, point[near[used]], Places(**rows), truth), count
 
 
@@ -426,10 +419,8 @@ def train(options: Options) -> None:
         sums.append(jax.device_get(metrics))
         if step % 100 == 99 or step == 9:
             mean = {name: np.mean([x[name] for x in sums]) for name in sums[0]}
-            print(
-                f"{step + 1} {time.time() - begin:.0f} s " + " ".join(f"{k} {v:.4f}" for k, v in mean.items()),
-                flush=True,
-            )
+            shown = " ".join(f"{name} {value:.4f}" for name, value in mean.items())
+            print(f"{step + 1} {time.time() - begin:.0f} s {shown}", flush=True)
             sums = []
         if step % 300 == 299 or step + 1 == options.steps:
             state["step"] = step + 1
