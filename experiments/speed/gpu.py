@@ -118,7 +118,7 @@ def many_trainings(options: OnGPU) -> list[Found]:
     """Steps of a run, of all runs under one vmap, beside those of a loop over the same step."""
     config = bench.our_config("tiny", "train_l1", 2)
     if options.quick:
-        model = paper_training(grid=8, base=8, stages=1, samples=4, render=8).model
+        model = paper_training(grid=8, base=8, stages=1, samples=4, render=12).model
         config = dataclasses.replace(config, model=model, batch_objects=1, min_points=64, max_points=64)
     tiny = partial(optimisation.train_step, config=config, adversarial=False)
     surfels = dataclasses.replace(surfel_training(options.quick), batch_objects=2)
