@@ -22,7 +22,7 @@ from data_gen.render import light, poisson_surface, views
 from data_gen.render.poisson_surface import PoissonConfig
 from data_gen.render.variant import choose_variant, mitsuba_module
 from data_gen.store import layout
-from experiments.comparison.methods import Method, of_rgba
+from experiments.comparison.contenders import Method, of_rgba
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.images import write_whole

@@ -20,9 +20,9 @@ import numpy as np
 from tqdm import tqdm
 
 from experiments.comparison import figures
-from experiments.comparison.methods import Method
-from experiments.comparison.objects import cut
+from experiments.comparison.contenders import Method
 from experiments.comparison.results_folder import kept
+from experiments.comparison.study_objects import cut
 from spnr_jax.config import TrainConfig
 from spnr_jax.formats import data_sets, images
 from spnr_jax.formats.data_sets import Dataset, ObjectData

@@ -26,9 +26,9 @@ from matplotlib.ticker import MaxNLocator
 from experiments.comparison import budget as budgets
 from experiments.comparison import figures, results_folder
 from experiments.comparison.budget import Trained
-from experiments.comparison.methods import of_network
-from experiments.comparison.objects import test_objects
+from experiments.comparison.contenders import of_network
 from experiments.comparison.scores import OPAQUE, Shown, score_objects
+from experiments.comparison.study_objects import test_objects
 from spnr_jax.config import TrainConfig
 from spnr_jax.devices import machine
 from spnr_jax.errors import UserError, at_least

@@ -36,11 +36,11 @@ from scipy.ndimage import distance_transform_edt
 from data_gen.render import depth
 from data_gen.render.variant import choose_variant, mitsuba_module
 from experiments import entry_point
-from experiments.comparison import figures, methods, results_folder
-from experiments.comparison.methods import LABELS, Method, Sources
-from experiments.comparison.objects import cast_views, cut, mesh_of, test_objects
+from experiments.comparison import contenders, figures, results_folder
+from experiments.comparison.contenders import LABELS, Method, Sources
 from experiments.comparison.poisson import SURFACES, reconstruct
 from experiments.comparison.results_folder import kept
+from experiments.comparison.study_objects import cast_views, cut, mesh_of, test_objects
 from spnr_jax import cli
 from spnr_jax.devices import machine
 from spnr_jax.errors import UserError
@@ -142,7 +142,7 @@ def main(options: Fig3) -> None:
 
 def all_methods(options: Fig3, dataset: data_sets.Dataset) -> tuple[dict[str, Method], int]:
     """What shows depth: networks and surfaces, and the points that all are given."""
-    trained = methods.networks(options.sources, dataset)
+    trained = contenders.networks(options.sources, dataset)
     if left_out := [name for name, network in trained.items() if not network.has_depth]:
         print(f"left out, since they predict no depth: {', '.join(left_out)}")
     found = {name: network.as_method() for name, network in trained.items() if network.has_depth}

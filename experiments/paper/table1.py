@@ -21,11 +21,11 @@ from typing import Literal
 
 from data_gen.render.poisson_surface import pymeshlab
 from experiments import entry_point
-from experiments.comparison import budget, methods, poisson, results_folder
+from experiments.comparison import budget, contenders, poisson, results_folder
 from experiments.comparison.budget import NETWORKS, QUICK_STEPS, Budget, Trained
-from experiments.comparison.methods import LABELS, Method
-from experiments.comparison.objects import test_objects
+from experiments.comparison.contenders import LABELS, Method
 from experiments.comparison.scores import Scored, Shown, score_objects
+from experiments.comparison.study_objects import test_objects
 from spnr_jax import cli
 from spnr_jax.config import TrainConfig
 from spnr_jax.devices import machine
@@ -105,8 +105,8 @@ def main(options: Table1) -> None:
     results_folder.claim(options.out, "a table", asked, dataset)
     surfaces, missing = surface_methods(options, dataset, config)  # before hours of training: something may be amiss
     trained = train_networks(options, dataset, configs)
-    floors = methods.floors(options.methods, dataset, config)
-    compared = {name: methods.of_network(t.config, t.variables) for name, t in trained.items()} | surfaces | floors
+    floors = contenders.floors(options.methods, dataset, config)
+    compared = {name: contenders.of_network(t.config, t.variables) for name, t in trained.items()} | surfaces | floors
     if not compared:
         raise UserError(f"--methods {' '.join(options.methods)}: none can be made here, {' '.join(missing.values())}")
     scored = score_objects(compared, config, dataset, names, options.shown)

@@ -23,10 +23,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from experiments import entry_point
-from experiments.comparison import figures, methods, poisson, results_folder, scores
-from experiments.comparison.methods import LABELS, Method, Network, Sources
-from experiments.comparison.objects import details, mesh_of, test_objects
+from experiments.comparison import contenders, figures, poisson, results_folder, scores
+from experiments.comparison.contenders import LABELS, Method, Network, Sources
 from experiments.comparison.scores import Measured
+from experiments.comparison.study_objects import details, mesh_of, test_objects
 from spnr_jax import cli
 from spnr_jax.config import TrainConfig
 from spnr_jax.devices import machine
@@ -77,7 +77,7 @@ def main(options: PointCount) -> None:
     cli.set_up_jax()
     dataset = data_sets.open_dataset(options.data)
     names = test_objects(dataset, 2 if options.quick else options.objects)
-    trained = methods.networks(options.sources, dataset)
+    trained = contenders.networks(options.sources, dataset)
     config, counts = next(iter(trained.values())).config, available_counts(options, dataset, names[0])
     compared = all_methods(options, dataset, trained, config)
     made_of = {label: method.identity for label, method in compared.items()}
@@ -141,7 +141,7 @@ def all_methods(
         poisson.check_packages()
         renderer = poisson.Renderer(dataset.settings, options.envmap, options.variant)
         found |= {LABELS[name]: renderer.method(name) for name in options.surfaces}
-    floors = methods.floors(evaluation.FLOORS, dataset, config)
+    floors = contenders.floors(evaluation.FLOORS, dataset, config)
     return found | {LABELS[name]: floor for name, floor in floors.items()}
 
 

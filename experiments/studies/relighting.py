@@ -21,9 +21,9 @@ import numpy as np
 
 from experiments import entry_point
 from experiments.comparison import figures, results_folder, scores
-from experiments.comparison.methods import draw_volume
-from experiments.comparison.objects import cut
+from experiments.comparison.contenders import draw_volume
 from experiments.comparison.scores import Measured
+from experiments.comparison.study_objects import cut
 from spnr_jax.devices import machine
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets, images

@@ -21,9 +21,9 @@ from typing import Any
 import numpy as np
 
 from experiments import entry_point
-from experiments.comparison import methods, poisson, results_folder, scores
-from experiments.comparison.objects import cut
+from experiments.comparison import contenders, poisson, results_folder, scores
 from experiments.comparison.scores import Measured
+from experiments.comparison.study_objects import cut
 from spnr_jax.devices import machine
 from spnr_jax.formats import data_sets, images
 from spnr_jax.formats.data_sets import ObjectData
@@ -164,7 +164,7 @@ def measure(options: ScansStudy, model: Model, fault: Fault | None, count: int, 
     seen = cut(item, views=options.views, resolution=options.resolution)
 
     def draw(points: Cleaned, **quality: Any) -> Pictures:
-        return methods.of_model(model, **quality).show(dataclasses.replace(seen, cloud=thinned(points, count)))
+        return contenders.of_model(model, **quality).show(dataclasses.replace(seen, cloud=thinned(points, count)))
 
     best, draft = draw(clean), draw(clean, quality="draft")
     found = {"auto": scores.mean_of(seen, best, COLUMNS), "draft": scores.mean_of(seen, draft, COLUMNS)}

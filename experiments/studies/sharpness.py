@@ -25,11 +25,11 @@ import jax
 import numpy as np
 
 from experiments import entry_point
-from experiments.comparison import methods, results_folder, scores
-from experiments.comparison.methods import Method
-from experiments.comparison.objects import cut
+from experiments.comparison import contenders, results_folder, scores
+from experiments.comparison.contenders import Method
 from experiments.comparison.poisson import Renderer
 from experiments.comparison.scores import Measure, Measured
+from experiments.comparison.study_objects import cut
 from spnr_jax.devices import machine
 from spnr_jax.formats import data_sets, images
 from spnr_jax.formats.data_sets import Dataset, ObjectData
@@ -82,11 +82,11 @@ def main(options: SharpnessStudy) -> None:
     names = dataset.splits["test"][: options.objects]
     asked = {name: getattr(options, name) for name in ("runs", "counts", "views", "resolution", "normals")}
     results_folder.claim(options.out, "sharpness", asked | {"objects": names}, dataset)
-    models = methods.of_runs(options.runs)
-    compared = {label: methods.of_model(*model) for label, model in models.items()}
+    models = contenders.of_runs(options.runs)
+    compared = {label: contenders.of_model(*model) for label, model in models.items()}
     if options.poisson:
         compared["Poisson, trimmed"] = Renderer(dataset.settings).method("poisson_trimmed")
-    compared |= {folder.name: methods.elsewhere(folder) for folder in options.elsewhere}
+    compared |= {folder.name: contenders.elsewhere(folder) for folder in options.elsewhere}
     rows, known = {}, {}
     for label, method in compared.items():
         for count in options.counts:

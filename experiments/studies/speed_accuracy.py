@@ -33,9 +33,9 @@ from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 
 from experiments import entry_point
 from experiments.comparison import clock, figures, poisson, results_folder, scores
-from experiments.comparison.methods import draw_volume
-from experiments.comparison.objects import cut, test_objects
+from experiments.comparison.contenders import draw_volume
 from experiments.comparison.scores import Measured
+from experiments.comparison.study_objects import cut, test_objects
 from spnr_jax import cli
 from spnr_jax.config import NetworkConfig, PaperConfig, SurfelConfig
 from spnr_jax.devices import machine

@@ -20,7 +20,7 @@ from support.tiny_runs import L1_ONLY
 from data_gen.render import views
 from data_gen.store import layout
 from experiments import entry_point
-from experiments.comparison import methods, poisson
+from experiments.comparison import contenders, poisson
 from experiments.comparison.variants import Budget
 from experiments.packaged import demo
 from experiments.paper import fig1, fig2, fig3, table1
@@ -54,7 +54,7 @@ def _tiny(monkeypatch):
         monkeypatch.setitem(poisson.SURFACES, name, dataclasses.replace(surface, depth=5))
     monkeypatch.setattr(cli, "set_up_jax", lambda **_: None)
     monkeypatch.setattr(sharpness, "KNOWN_SIZE", 48)
-    monkeypatch.setattr(methods, "networks", lambda *_: stand_ins.stand_ins("Ours", "NPBG"))
+    monkeypatch.setattr(contenders, "networks", lambda *_: stand_ins.stand_ins("Ours", "NPBG"))
     monkeypatch.setattr(weights, "shipped", tiny_surfels.shipped)
     monkeypatch.setattr(evaluation, "choose_radius", lambda *_: 1.5)
     monkeypatch.setattr(point_count, "details", lambda *_: {"seeds": {"points": 5}})

@@ -13,7 +13,7 @@ from data_gen.render import light, views
 from data_gen.render.poisson_surface import PoissonConfig
 from data_gen.store import layout
 from experiments.comparison import poisson
-from experiments.comparison.objects import cut
+from experiments.comparison.study_objects import cut
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.mesh import surface_points
 from spnr_jax.formats.mesh.assets import Asset

@@ -14,8 +14,8 @@ from support import stand_ins, tiny_dataset
 from support.tiny_baselines import BASELINE, SHRUNKEN
 
 from experiments.comparison import budget as budgets
-from experiments.comparison import methods, objects, results_folder, scores, variants
-from experiments.comparison.methods import Sources, networks
+from experiments.comparison import contenders, results_folder, scores, study_objects, variants
+from experiments.comparison.contenders import Sources, networks
 from experiments.comparison.scores import Shown
 from experiments.comparison.variants import Compared
 from experiments.paper import table1
@@ -24,7 +24,7 @@ from spnr_jax.scoring import evaluation
 from spnr_jax.scoring.score_tables import Table, number, text
 from spnr_jax.training import batching, checkpoint, optimisation, weights
 
-PAPER = methods.LABELS["paper"]
+PAPER = contenders.LABELS["paper"]
 ROWS = (
     ("ours_1", (number(21.456, 2, (20.0, 22.5), best=True), number(0.25, 1, factor=100))),
     ("50 % & more", (number(None, 2), number(-1.0, 1, sign="+"))),
@@ -76,15 +76,15 @@ def test_a_picture_that_was_not_kept_is_drawn(tmp_path):
 
 def test_a_cut_object_has_its_first_points_and_views_in_averaged_pictures():
     item = tiny_dataset.one_object()
-    small = objects.cut(item, 7, 2, tiny_dataset.SIZE // 2)
+    small = study_objects.cut(item, 7, 2, tiny_dataset.SIZE // 2)
     assert (small.cloud.positions == item.cloud.positions[:7]).all()
     assert small.cloud.normals is None
     assert len(small.images) == len(small.camera.cam_to_world) == 2
     assert small.camera.height == tiny_dataset.SIZE // 2
     two = np.array([[[255, 0, 0, 255], [0, 255, 0, 0]]] * 2, np.uint8)  # what nothing covers has no colour
-    np.testing.assert_array_equal(objects.shrink(two[None], 2), [[[[255, 0, 0, 128]]]])
+    np.testing.assert_array_equal(study_objects.shrink(two[None], 2), [[[[255, 0, 0, 128]]]])
     with pytest.raises(ValueError, match="not a whole share"):
-        objects.cut(item, resolution=tiny_dataset.SIZE - 1)
+        study_objects.cut(item, resolution=tiny_dataset.SIZE - 1)
 
 
 def test_small_pictures_are_enlarged_and_the_reference_itself_is_right():
@@ -217,7 +217,7 @@ def test_networks_of_tables_runs_and_the_package_are_named_after_their_methods_i
     dataset = tiny_dataset.dataset()
     assert list(networks(Sources(table1=table), dataset)) == [PAPER, "NPBG"]
     found = networks(Sources(runs=(stand_ins.fresh("tiny"), Path("surfels")), table1=table), dataset)
-    surfels = methods.LABELS["surfels"]
+    surfels = contenders.LABELS["surfels"]
     assert set(found) == {f"{PAPER} (fresh, tiny)", f"{PAPER} (runs, paper)", "NPBG", surfels}
     assert [name for name, network in found.items() if not network.has_depth] == ["NPBG"]
     assert found[f"{PAPER} (runs, paper)"].as_method().identity == found[f"{PAPER} (fresh, tiny)"].as_method().identity
@@ -234,6 +234,6 @@ def test_what_cannot_be_compared_is_refused_by_name(table, tmp_path):
     with pytest.raises(ValueError, match=r"images of 48 x 48 pixels, [^\n]*needs 24 x 24"):
         networks(Sources(table1=table), larger)
     with pytest.raises(ValueError, match="--objects: expected 1 or more, got 0"):
-        objects.test_objects(dataset, 0)
+        study_objects.test_objects(dataset, 0)
     with pytest.raises(ValueError, match="the test split is empty"):
-        objects.test_objects(dataclasses.replace(dataset, splits={"test": ()}), None)
+        study_objects.test_objects(dataclasses.replace(dataset, splits={"test": ()}), None)

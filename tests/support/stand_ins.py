@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.comparison import methods
+from experiments.comparison import contenders
 from spnr_jax.scoring import evaluation
 from spnr_jax.training import checkpoint, optimisation
 from support import tiny_dataset
@@ -23,7 +23,7 @@ def fresh(preset: str) -> Path:
     return folder
 
 
-class StandIn(methods.Network):
+class StandIn(contenders.Network):
     """A grey disc with the depth of the ball behind OFFSET, darker the more points there are."""
 
     def as_method(self):
@@ -40,7 +40,7 @@ class StandIn(methods.Network):
                 depth=np.tile(depth, (views, 1, 1)),
             )
 
-        return methods.Method(draw=draw, identity={"steps": self.steps}, has_opacity=self.has_depth)
+        return contenders.Method(draw=draw, identity={"steps": self.steps}, has_opacity=self.has_depth)
 
 
 def disc(size: int) -> tuple[np.ndarray, np.ndarray]:
@@ -53,7 +53,7 @@ def disc(size: int) -> tuple[np.ndarray, np.ndarray]:
     return np.where(inner > 0, depth, 4).astype(np.float32), (inner > 0).astype(np.float32)
 
 
-def stand_ins(*labels: str, checksum: str = "0") -> dict[str, methods.Network]:
+def stand_ins(*labels: str, checksum: str = "0") -> dict[str, contenders.Network]:
     """Stand-ins by label; the first word of each names its method."""
     return {
         label: StandIn(

@@ -16,7 +16,7 @@ import numpy as np
 
 import experiments.baselines  # noqa: F401 - registers them
 from data_gen.store import layout
-from experiments.comparison.objects import each_view, shrink
+from experiments.comparison.study_objects import each_view, shrink
 from spnr_jax.config import SurfelConfig, TrainConfig
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
