@@ -40,7 +40,7 @@ class Trained:
 
     config: TrainConfig
     variables: dict
-    cost: dict[str, str | int | float]
+    cost: dict[str, str | int | float | None]
 
 
 def configs(budget: Budget, size: int, category: str | None) -> dict[str, TrainConfig]:

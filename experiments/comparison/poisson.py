@@ -7,6 +7,7 @@ surface is an empty picture.  Pictures are kept by object:
     FOLDER/NAME/made.json   seconds, number of views, and why the pictures are empty (""); there once they all are
 """
 
+import dataclasses
 import hashlib
 import importlib.util
 import json
@@ -21,6 +22,7 @@ from data_gen.render import light, poisson_surface, views
 from data_gen.render.poisson_surface import PoissonConfig
 from data_gen.render.variant import choose_variant, mitsuba_module
 from data_gen.store import layout
+from experiments.comparison.contenders import Method, of_rgba
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.images import write_whole
@@ -46,32 +48,32 @@ class Renderer:
         self._seed, self._view = seed, view_config(settings)
         self._light = light.scaled_to_white(unscaled_light(settings["environment_map"], envmap))
 
-    def pictures(self, item: data_sets.ObjectData, num_points: int, surface: PoissonConfig) -> tuple[np.ndarray, str]:
-        """Straight-alpha sRGB (views, height, width, 4) uint8 from the object's first points, and "".
-
-        Where they span no surface: empty pictures, and the reason.
-        """
-        try:
-            asset = poisson_surface.reconstruct(jax.tree.map(lambda x: np.asarray(x)[:num_points], item.cloud), surface)
-        except poisson_surface.NoSurface as error:
-            return np.zeros(item.images.shape, np.uint8), str(error)
-        return self.drawn(asset, item), ""
-
-    def drawn(self, asset: Asset, item: data_sets.ObjectData) -> np.ndarray:
-        """Straight-alpha sRGB (views, height, width, 4) uint8 of any asset from the object's cameras."""
+    def draw(self, asset: Asset | str, item: data_sets.ObjectData) -> np.ndarray:
+        """Straight-alpha sRGB (views, height, width, 4) uint8 from the object's cameras; empty without a surface."""
+        if isinstance(asset, str):
+            return np.zeros(item.images.shape, np.uint8)
         scene = views.build_scene(asset, self._light)
+        config = dataclasses.replace(self._view, resolution=item.camera.height)
         poses = np.tile(np.eye(4), (len(item.images), 1, 1))
         poses[:, :3] = item.camera.cam_to_world
-        radiance = [views.render_view(scene, p, self._view, self._seed + view) for view, p in enumerate(poses)]
+        radiance = [views.render_view(scene, p, config, self._seed + view) for view, p in enumerate(poses)]
         return np.stack([views.straight_srgb(r) for r in radiance])
 
+    def method(self, surface: str) -> Method:
+        """The surface of SURFACES as a method, through all points of an object."""
+        return Method(
+            encode=lambda item: reconstruct(item.cloud, SURFACES[surface]),
+            draw=lambda asset, item: of_rgba(self.draw(asset, item)),
+            identity=dataclasses.asdict(SURFACES[surface]),
+        )
 
-def trimmed_surface(cloud: PointCloud) -> Asset:
-    """The trimmed Poisson surface of a cloud; without parts where its points span none."""
+
+def reconstruct(cloud: PointCloud, surface: PoissonConfig) -> Asset | str:
+    """The surface of a cloud, or the reason why its points span none."""
     try:
-        return poisson_surface.reconstruct(cloud, SURFACES["poisson_trimmed"])
-    except poisson_surface.NoSurface:
-        return Asset(parts=())
+        return poisson_surface.reconstruct(jax.tree.map(np.asarray, cloud), surface)
+    except poisson_surface.NoSurface as error:
+        return str(error)
 
 
 def view_config(settings: dict) -> views.ViewConfig:
@@ -95,20 +97,23 @@ def unscaled_light(described: dict, envmap: Path | None) -> np.ndarray:
     return radiance
 
 
-def show(renderer: Renderer, points: int, surface: PoissonConfig, folder: Path, item: data_sets.ObjectData) -> Pictures:
-    """Image and opacity of the surface of an object's first points, in all its views; read where they are made."""
+def keep_pictures(
+    renderer: Renderer, surface: PoissonConfig, folder: Path, _: None, item: data_sets.ObjectData
+) -> Pictures:
+    """Image and opacity of the surface of an object's points, in all its views; read where they are made."""
     note = folder / item.name / "made.json"
     paths = [folder / item.name / f"{view:03d}.png" for view in range(len(item.images))]
     if not note.is_file():
         start = time.monotonic()
-        pictures, empty = renderer.pictures(item, points, surface)
+        asset = reconstruct(item.cloud, surface)
+        pictures = renderer.draw(asset, item)
         seconds = time.monotonic() - start
         for path, picture in zip(paths, pictures, strict=True):
             write_whole(path, layout.encode_image(picture))
+        empty = asset if isinstance(asset, str) else ""
         made = {"seconds": round(seconds, 4), "views": len(paths), "empty": empty}
         write_whole(note, layout.json_text(made).encode())
-    rgba = np.stack([layout.read_image(path) for path in paths])
-    return Pictures(image=data_sets.on_white(rgba), acc=rgba[..., 3].astype(np.float32) / 255)
+    return of_rgba(np.stack([layout.read_image(path) for path in paths]))
 
 
 def seconds_per_view(folder: Path, names: tuple[str, ...]) -> list[float]:

@@ -39,7 +39,7 @@ from spnr_jax.method.densifier import CHILDREN, Densifier, Nodes, Places, blend,
 from spnr_jax.surfels import geometry, sides
 from spnr_jax.surfels.geometry import Points
 from spnr_jax.surfels.neighbors import order_in_space
-from spnr_jax.training.weights import read_variables, shipped
+from spnr_jax.training.weights import read_variables
 
 TRUTH, VOTERS, EVEN = 2**17, 2**15, 2**12  # points of a surface, those that look for its sides, and even ones at most
 DENSER, MATCHED = 48, 48  # true points for each of a cloud, and those that a child is compared with
@@ -259,18 +259,11 @@ def cut(record: dict[str, np.ndarray], number: int, most: int, rng: np.random.Ge
     asked = rng.permutation(asked)[: int(QUERIES * count / CORE * 0.95)]
     true = get["asked"][asked]
     at = get["matched"][chosen]
-    truth = Truth(
-        record["position"][at],
-        record["normal"][at],
-        record["color"][at],
-        record["visible"][at],
-        np.full(len(chosen), get["floor"], np.float32),
-        record["position"][true],
-        record["normal"][true],
-        record["visible"][true],
-        site[get["nearest"][asked]],
-        point[get["parents"][asked]],
-    )
+    at_places = (record[name][at] for name in ("position", "normal", "color", "visible"))
+    floor = np.full(len(chosen), get["floor"], np.float32)
+    of_asked = (record[name][true] for name in ("position", "normal", "visible"))
+    compared = (*at_places, floor, *of_asked, site[get["nearest"][asked]], point[get["parents"][asked]])
+    truth = Truth(*compared)
     return Batch(nodes, point[near[used]], Places(**rows), truth), count
 
 
@@ -407,7 +400,7 @@ def train(options: Options) -> None:
     params = Densifier().init(jax.random.key(0), first.nodes, first.neighbors, first.places)["params"]
     print(f"{sum(x.size for x in jax.tree.leaves(params))} weights", flush=True)
     if options.start:
-        params = read_variables(options.start or shipped("densifier"))
+        params = read_variables(options.start)
     state = {"params": params, "rule": rule.init(params), "step": 0}
     checkpoint = options.out / "checkpoint.npz"
     if checkpoint.exists():
@@ -426,10 +419,8 @@ def train(options: Options) -> None:
         sums.append(jax.device_get(metrics))
         if step % 100 == 99 or step == 9:
             mean = {name: np.mean([x[name] for x in sums]) for name in sums[0]}
-            print(
-                f"{step + 1} {time.time() - begin:.0f} s " + " ".join(f"{k} {v:.4f}" for k, v in mean.items()),
-                flush=True,
-            )
+            shown = " ".join(f"{name} {value:.4f}" for name, value in mean.items())
+            print(f"{step + 1} {time.time() - begin:.0f} s {shown}", flush=True)
             sums = []
         if step % 300 == 299 or step + 1 == options.steps:
             state["step"] = step + 1

@@ -22,7 +22,7 @@ from pathlib import Path
 import tyro
 
 from experiments import entry_point
-from experiments.comparison import budget, variants_report
+from experiments.comparison import budget, variants
 from experiments.comparison.variants import Budget, Variant
 from spnr_jax import cli
 from spnr_jax.config import TrainConfig
@@ -68,7 +68,7 @@ def main(options: Fig1) -> None:
     init = str(options.init) if options.init else None
     start = init or (f"{options.pretrain} steps of L1 alone" if options.pretrain else "scratch")
     given = (options.out, "fig1", runs, reference, options.budget, dataset)
-    variants_report.study(*given, {"start": start}, pretrain=options.pretrain, init=init)
+    variants.study(*given, {"start": start}, pretrain=options.pretrain, init=init)
 
 
 def variant(options: Fig1, weight: float, config: TrainConfig, dataset: data_sets.Dataset) -> Variant:

@@ -22,7 +22,7 @@ import tyro
 from data_gen.make.generate import generate
 from data_gen.plan.tasks import GenerateConfig
 from experiments import entry_point
-from experiments.comparison import figures, variants, variants_report
+from experiments.comparison import figures, variants
 from experiments.comparison.variants import Budget, Variant
 from spnr_jax import cli
 from spnr_jax.errors import UserError, at_least
@@ -62,7 +62,7 @@ def main(options: Fig2) -> None:
         generate(generation(options, folder))
     dataset = data_sets.open_dataset(folder)
     runs = trainings(options, dataset)
-    variants_report.study(options.out, "fig2", runs, "without", options.budget, dataset)
+    variants.study(options.out, "fig2", runs, "without", options.budget, dataset)
     write_whole(options.out / "variants.png", variants_picture(dataset, options.budget.shown))
 
 

@@ -7,41 +7,64 @@ records, along the rays of each method: its own pixels, through its own pixel ce
 
     OUT/truth/SIZE/ID.npz      true distances of all views, inf beside the object
     OUT/depths/METHOD/ID.npz   a method's depth and opacity
-    OUT/results.json           every metric (experiments/paper/depth_scores.py), with intervals, and the conditions
+    OUT/results.json           every metric, with intervals, and the conditions
     OUT/table.md  OUT/fig3_depth.png
 
 What is there is kept, so the same command goes on where it was stopped.  It draws no random numbers.
+
+A pixel of a method is opaque where its opacity is above a half, and lies in the silhouette where the pixel's ray meets
+the object.  Distances are along the rays, in half diagonals of the object's box.
+
+error, median, bias   mean and median of |depth - truth|, and mean of depth - truth, where opaque in the silhouette
+surface               as error, of the depth without the share of what shines through (`without_background`)
+missed                share of the silhouette that is not opaque
+floaters              opaque pixels outside the silhouette, for each 1000 pixels outside
+far_floaters          the same, of those farther from it than 1/32 of the picture: not its blurred edge
 """
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Literal
 
-import jax
 import numpy as np
 import tyro
+from jaxtyping import Float
+from scipy.ndimage import distance_transform_edt
 
-from data_gen.render import poisson_surface, views
+from data_gen.render import views
 from data_gen.render.variant import choose_variant, mitsuba_module
 from experiments import entry_point
-from experiments.comparison import figures, results_folder, trained_networks
-from experiments.comparison.poisson import SURFACES
+from experiments.comparison import contenders, figures, results_folder
+from experiments.comparison.contenders import LABELS, Method, Sources
+from experiments.comparison.poisson import SURFACES, reconstruct
 from experiments.comparison.results_folder import kept
-from experiments.comparison.source_meshes import cast_views, mesh_of
-from experiments.comparison.trained_networks import LABELS, Sources
-from experiments.paper import depth_scores
-from experiments.paper.depth_scores import METRICS, OPAQUE
+from experiments.comparison.study_objects import cast_views, cut, mesh_of, test_objects
 from spnr_jax import cli
 from spnr_jax.devices import runtime
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.images import depth_image, png
+from spnr_jax.formats.mesh.assets import Asset
 from spnr_jax.kernels import cameras
-from spnr_jax.kernels.records import Camera, PointCloud
+from spnr_jax.kernels.records import Camera
 from spnr_jax.scoring import evaluation
+from spnr_jax.scoring.evaluation import Pictures
 from spnr_jax.scoring.report import Table, number, text
+from spnr_jax.scoring.summary import means
+
+OPAQUE = 0.5
+EDGE = 1 / 32  # of the picture's width
+METRICS = {  # head, decimals, and what the numbers are multiplied by
+    "error": ("Mean error", 4, 1),
+    "median": ("Median error", 4, 1),
+    "bias": ("Mean signed error", 4, 1),
+    "surface": ("Mean error of what is opaque", 4, 1),
+    "missed": ("Missed, %", 2, 100),
+    "floaters": ("Floaters, per 1000", 2, 1),
+    "far_floaters": ("of them far, per 1000", 2, 1),
+}
 
 FLOATER, MISSED = np.array([0.85, 0.1, 0.1]), np.array([0.15, 0.35, 0.85])
 WORST = 0.2  # error, in half diagonals, that the picture shows black
@@ -53,7 +76,7 @@ NOTE = (
 )
 PICTURE = f"In the picture: errors in grey, black from {WORST:g} on; floaters red, missed pixels blue."
 
-Shown = Callable[[data_sets.ObjectData, PointCloud], tuple[np.ndarray, np.ndarray]]
+Maps = Float[np.ndarray, "views height width"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,19 +102,11 @@ class Fig3:
     """A check that everything works: two objects."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Method:
-    """How a method shows depth and opacity of an object, and what tells it from another one."""
-
-    show: Shown
-    identity: dict
-
-
 def main(options: Fig3) -> None:
     """Makes what is missing of depths and truth, then scores, table and picture."""
     cli.set_up_jax()
     dataset = data_sets.open_dataset(options.data)
-    names = trained_networks.test_objects(dataset, 2 if options.quick else options.objects)
+    names = test_objects(dataset, 2 if options.quick else options.objects)
     results_folder.claim(options.out, "depths", {}, dataset)
     found, points = all_methods(options, dataset)
     mitsuba_module(choose_variant(options.variant)[0])
@@ -100,15 +115,15 @@ def main(options: Fig3) -> None:
     scores: dict[str, list] = {name: [] for name in found}
     rows, shown = [], evaluation.spread(names, options.shown)
     for count, name in enumerate(names, start=1):
-        item = data_sets.read_object(dataset, name)
-        maps = object_maps(options, dataset, item, found, points)
+        item = cut(data_sets.read_object(dataset, name), points, normals=True)
+        maps = object_maps(options, dataset, item, found)
         for label, (seen, acc, truth) in maps.items():
-            scores[label].append(depth_scores.scores(seen, acc, far_side(item.camera, truth.shape[1:]), truth))
+            scores[label].append(depth_scores(seen, acc, far_side(item.camera, truth.shape[1:]), truth))
         if name in shown:
             rows.append(picture_row(item, maps, scores))
         print(f"{count} of {len(names)}: {name}", flush=True)
     all_results = {
-        "methods": {name: depth_scores.summarise(rows) for name, rows in scores.items()},
+        "methods": {name: summarise(rows) for name, rows in scores.items()},
         "made of": {name: method.identity for name, method in found.items()},
         "points": points,
         "objects": list(names),
@@ -127,50 +142,44 @@ def main(options: Fig3) -> None:
 
 def all_methods(options: Fig3, dataset: data_sets.Dataset) -> tuple[dict[str, Method], int]:
     """What shows depth: networks and surfaces, and the points that all are given."""
-    trained = trained_networks.networks(options.sources, dataset)
+    trained = contenders.networks(options.sources, dataset)
     if left_out := [name for name, network in trained.items() if not network.has_depth]:
         print(f"left out, since they predict no depth: {', '.join(left_out)}")
-    found = {name: of_network(network) for name, network in trained.items() if network.has_depth}
-    found |= {LABELS[name]: of_surface(SURFACES[name]) for name in options.surfaces}
+    found = {name: network.as_method() for name, network in trained.items() if network.has_depth}
+    found |= {LABELS[name]: of_surface(name) for name in options.surfaces}
     if not found:
         raise UserError("--runs: none of these predicts depth; name a run of another method, or --surfaces")
     return found, next(iter(trained.values())).config.test_points
 
 
-def of_network(network: trained_networks.Network) -> Method:
-    """The depth that a network renders."""
-
-    def show(item: data_sets.ObjectData, cloud: PointCloud) -> tuple[np.ndarray, np.ndarray]:
-        pictures = evaluation.on_host(network.show()(cloud, item.camera))
-        assert pictures.depth is not None
-        return np.asarray(pictures.depth), np.asarray(pictures.acc)
-
-    return Method(show=show, identity=network.identity)
-
-
-def of_surface(config: poisson_surface.PoissonConfig) -> Method:
+def of_surface(name: str) -> Method:
     """The depth of a surface that is made of the points; nothing where they span none."""
 
-    def show(item: data_sets.ObjectData, cloud: PointCloud) -> tuple[np.ndarray, np.ndarray]:
-        try:
-            asset = poisson_surface.reconstruct(jax.tree.map(np.asarray, cloud), config)
-        except poisson_surface.NoSurface:
-            return (np.zeros(item.images.shape[:3], np.float32),) * 2
-        found = cast_views(views.caster(asset), item.camera)
+    def draw(asset: Asset | str, item: data_sets.ObjectData) -> Pictures:
+        shape = item.images.shape[:3]
+        found = np.full(shape, np.inf) if isinstance(asset, str) else cast_views(views.caster(asset), item.camera)
         hit = np.isfinite(found)
-        return np.where(hit, found, 0), hit.astype(np.float32)
+        return Pictures(image=np.ones((*shape, 3)), acc=hit.astype(np.float32), depth=np.where(hit, found, 0))
 
-    return Method(show=show, identity=asdict(config))
+    return Method(
+        encode=lambda item: reconstruct(item.cloud, SURFACES[name]), draw=draw, identity=asdict(SURFACES[name])
+    )
+
+
+def depths(method: Method, item: data_sets.ObjectData) -> tuple[np.ndarray, np.ndarray]:
+    """Depth and opacity (views, h, w) as a method shows them."""
+    pictures = method.show(item)
+    assert pictures.depth is not None
+    return np.asarray(pictures.depth), np.asarray(pictures.acc)
 
 
 def object_maps(
-    options: Fig3, dataset: data_sets.Dataset, item: data_sets.ObjectData, found: dict[str, Method], points: int
+    options: Fig3, dataset: data_sets.Dataset, item: data_sets.ObjectData, found: dict[str, Method]
 ) -> dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Depth, opacity and true depth (views, h, w) of an object by method; read where they are made."""
-    cloud = data_sets.first_points(item, points)
     maps = {}
     for name, method in found.items():
-        seen, acc = kept(options.out / "depths" / name / f"{item.name}.npz", partial(method.show, item, cloud))
+        seen, acc = kept(options.out / "depths" / name / f"{item.name}.npz", partial(depths, method, item))
         size, place = seen.shape[1:], options.out / "truth" / f"{seen.shape[-1]}" / f"{item.name}.npz"
         (truth,) = kept(place, partial(true_depth, dataset, item, options.meshes, size))
         maps[name] = (seen, acc, truth)
@@ -213,6 +222,49 @@ def error_image(seen: np.ndarray, acc: np.ndarray, truth: np.ndarray) -> np.ndar
     picture[inside & ~opaque] = MISSED
     picture[~inside & opaque] = FLOATER
     return picture
+
+
+def depth_scores(depth: Maps, acc: Maps, far: Maps, truth: Maps) -> dict[str, np.ndarray]:
+    """Each metric for each view (views,), NaN where there is nothing to measure; the truth is inf beside the object."""
+    views = [score(*maps) for maps in zip(depth, acc, far, truth, strict=True)]
+    return {name: np.array([view[name] for view in views]) for name in METRICS}
+
+
+def score(depth: np.ndarray, acc: np.ndarray, far: np.ndarray, truth: np.ndarray) -> dict[str, float]:
+    """The metrics of one view (height, width)."""
+    inside, opaque = np.isfinite(truth), acc > OPAQUE
+    both, outside = inside & opaque, np.sum(~inside)
+    off = depth[both].astype(np.float64) - truth[both]
+    surface = without_background(depth[both], acc[both], far[both])
+    distant = distance_transform_edt(~inside) > EDGE * truth.shape[1] if inside.any() else ~inside
+    return {
+        "error": mean(np.abs(off)),
+        "median": float(np.median(np.abs(off))) if off.size else np.nan,
+        "bias": mean(off),
+        "surface": mean(np.abs(surface - truth[both])),
+        "missed": mean(~opaque[inside]),
+        "floaters": 1000 * float(np.sum(opaque & ~inside) / outside) if outside else np.nan,
+        "far_floaters": 1000 * float(np.sum(opaque & distant) / outside) if outside else np.nan,
+    }
+
+
+def without_background(depth: np.ndarray, acc: np.ndarray, far: np.ndarray) -> np.ndarray:
+    """Mean distance of what stops the ray, where the opacity is above 0.
+
+    A rendered depth (`compositing.expected_distance`) counts the light that nothing stops at the far side of the box.
+    """
+    return (depth.astype(np.float64) - (1 - acc) * far) / acc
+
+
+def mean(values: np.ndarray) -> float:
+    """The mean, NaN of nothing."""
+    return float(np.mean(values)) if values.size else np.nan
+
+
+def summarise(objects: Sequence[dict[str, np.ndarray]]) -> dict[str, dict]:
+    """Mean of each metric over all views, with its bootstrap interval over objects; None where nothing was measured."""
+    found = means(objects, METRICS)
+    return {name: {"mean": found[name], "interval": found[f"{name}_interval"]} for name in METRICS}
 
 
 def table(found: dict) -> Table:

@@ -12,9 +12,8 @@ The same command goes on where it was stopped and trains nothing twice.  The sam
 times, and with --minutes the number of steps, are those of the machine.
 """
 
-import dataclasses
 import statistics
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -22,15 +21,18 @@ from typing import Literal
 
 from data_gen.render.poisson_surface import pymeshlab
 from experiments import entry_point
-from experiments.comparison import budget, page, poisson, results_folder
+from experiments.comparison import budget, contenders, poisson, results_folder
 from experiments.comparison.budget import NETWORKS, QUICK_STEPS, Budget, Trained
-from experiments.comparison.object_scores import ObjectMethod, Scored, Shown, by_category, of_cloud, score_objects
-from experiments.comparison.trained_networks import LABELS, test_objects
+from experiments.comparison.contenders import LABELS, Method
+from experiments.comparison.scores import Scored, Shown, score_objects
+from experiments.comparison.study_objects import test_objects
 from spnr_jax import cli
 from spnr_jax.config import TrainConfig
 from spnr_jax.devices import runtime
 from spnr_jax.errors import UserError, at_least
 from spnr_jax.formats import data_sets
+from spnr_jax.formats.images import png_url
+from spnr_jax.formats.pages import template
 from spnr_jax.scoring import evaluation
 from spnr_jax.scoring.report import Cell, Table, difference, duration, head, lowered, number, quality
 from spnr_jax.scoring.summary import differences, metric_settings, summarise
@@ -43,86 +45,6 @@ BUDGETS = {
     "tiny": "the tiny presets, 64 px",
     "paper": "the paper presets",
 }
-
-
-def tables_of(results: Mapping) -> list[Table]:
-    """The table of methods, the differences, and a table of each class of objects."""
-    made = [methods_table(results)]
-    if results["differences"]:
-        made.append(differences_table(results["compared"], results["differences"]))
-    for name, methods in results["per_category"].items():
-        count = next(iter(methods.values()))["objects"]
-        title = f"{name}, {count} object{'s' * (count != 1)}"
-        made.append(
-            Table(
-                title=title,
-                heads=HEADS,
-                rows=tuple((LABELS[name], cells) for name, cells in quality(methods, METRICS).items()),
-            )
-        )
-    return made
-
-
-def methods_table(results: Mapping) -> Table:
-    """Quality and cost of every method; rows that could not be made say why."""
-    methods, missing = results["methods"], results["missing"]
-    rows = {
-        LABELS[name]: (*cells, *(_cost(results["costs"][name], column) for column in COSTS))
-        for name, cells in quality(methods, METRICS).items()
-    }
-    rows |= {LABELS[name]: (Cell(text=reason),) for name, reason in missing.items()}
-    counts = next(iter(methods.values()))
-    return Table(
-        title=f"Methods, {counts['objects']} unseen objects, {counts['views']} views",
-        heads=(*HEADS, *COSTS.values()),
-        rows=tuple((label, rows[label]) for label in LABELS.values() if label in rows),
-        note="Means over images with 95 % bootstrap intervals over objects; the best of a column stands out.",
-    )
-
-
-def differences_table(first: str, differences: Mapping) -> Table:
-    """A network minus each other method, image by image."""
-    rows = tuple(
-        (f"{LABELS[first]} minus {lowered(name)}", tuple(difference(row.get(metric), metric) for metric in METRICS))
-        for name, row in differences.items()
-    )
-    note = "Image by image, with 95 % bootstrap intervals and the p-value of a sign-flip test, both over objects."
-    return Table(title="Paired differences", heads=HEADS, rows=rows, note=note)
-
-
-def _cost(cost: Mapping, column: str) -> Cell:
-    value = cost.get(column)
-    if column == "training_seconds" and value is not None:
-        return Cell(text=duration(value), value=value)
-    return number(value, 1 if column == "ms_per_view" else 0, missing="-")
-
-
-def notes(results: Mapping) -> list[str]:
-    """What a reader has to know of the numbers: budget, data, machine, seed, how they were measured."""
-    counts, costs = next(iter(results["methods"].values())), results["costs"]
-    presets = ", ".join(f"{LABELS[name]} {cost['preset']}" for name, cost in costs.items() if "preset" in cost)
-    minutes = results["minutes"]
-    rule = (
-        "every network trains the steps of its preset"
-        if minutes is None
-        else f"every network trains as many steps as fit into {minutes:g} minutes on this machine, its warm-up and "
-        "decay over exactly these; measured beforehand, compilation, checkpoints and previews not counted"
-    )
-    budget = f"Budget {results['budget']}: {BUDGETS[results['budget']]}"
-    factors = ", ".join(f"{LABELS[name]} {value:g}" for name, value in results["radius_factors"].items())
-    objects = results["data"]
-    lines = [
-        budget + ("." if results["budget"] == "quick" else f"; {rule}.") + (f" Presets: {presets}." if presets else ""),
-        f"All methods: the same {objects['train objects']} training objects, {counts['objects']} test objects of "
-        f"{objects['test objects']}, cameras, and first {results['points']} points; {results['resolution']} px.",
-        f"Hardware: {results['hardware']}; Poisson surfaces are made and rendered on its CPU. Seed {results['seed']}.",
-        "Training is the time of the steps, without compilation. ms per view: median over the objects but the first; "
-        "what is done once per object is shared by its views.",
-        *(f"{name}: {text}." for name, text in results["metrics"].items()),
-    ]
-    return lines + ([f"Radius of a point, in point spacings, best on training objects: {factors}."] if factors else [])
-
-
 Row = Literal[
     "paper", "npbg", "point_nerf", "points2nerf",
     "poisson", "poisson_trimmed", "nearest", "splat", "white",
@@ -182,22 +104,23 @@ def main(options: Table1) -> None:
     results_folder.claim(options.out, "a table", asked, dataset)
     surfaces, missing = surface_methods(options, dataset, config)  # before hours of training: something may be amiss
     trained = train_networks(options, dataset, configs)
-    floors, factors = floor_methods(options, dataset, config)
-    networks = {name: of_cloud(evaluation.network(t.variables, t.config), config) for name, t in trained.items()}
-    methods = networks | surfaces | floors
-    if not methods:
+    floors = contenders.floors(options.methods, dataset, config)
+    compared = {name: contenders.of_network(t.config, t.variables) for name, t in trained.items()} | surfaces | floors
+    if not compared:
         raise UserError(f"--methods {' '.join(options.methods)}: none can be made here, {' '.join(missing.values())}")
-    scored = score_objects(methods, config, dataset, names, options.shown)
+    scored = score_objects(compared, config, dataset, names, options.shown)
     found = {
         **asked,
         **conditions(dataset, names, config),
-        "radius_factors": factors,
+        "radius_factors": {name: of.identity["radius factor"] for name, of in floors.items() if name != "white"},
         "metrics": metric_settings(),
         "missing": missing,
         **numbers(scored),
         "costs": costs(options, trained, scored, config),
     }
-    write(options.out, found, scored.shown)
+    tables, how = tables_of(found), notes(found)
+    page = write_page("Table 1: every method on the same unseen objects", tables, how, scored.shown)
+    results_folder.write(options.out, found, tables, how, {"table1.html": page.encode()})
 
 
 def conditions(dataset: data_sets.Dataset, names: tuple[str, ...], config: TrainConfig) -> dict[str, object]:
@@ -220,23 +143,16 @@ def numbers(scored: Scored) -> dict[str, str | dict | None]:
         "methods": summarise(scores),
         "compared": first,
         "differences": {} if first is None else differences(scores, first),
-        "per_category": by_category(scored.scores),
+        "per_category": by_category(scored),
     }
 
 
-def write(out: Path, found: dict, shown: list[Shown]) -> None:
-    """Writes results, tables and page, and prints the tables."""
-    tables, how = tables_of(found), notes(found)
-    named = [
-        dataclasses.replace(
-            one,
-            images={LABELS[name]: image for name, image in one.images.items()},
-            psnr={LABELS[name]: value for name, value in one.psnr.items()},
-        )
-        for one in shown
-    ]
-    whole = page.page("Table 1: every method on the same unseen objects", tables, how, named)
-    results_folder.write(out, found, tables, how, {"table1.html": whole.encode()})
+def by_category(scored: Scored) -> dict[str, dict]:
+    """The summary of each class of objects, if there are several."""
+    classes = evaluation.classes_of(scored.scores)
+    if len(classes) < 2:
+        return {}
+    return {kind: summarise([scored.scores[name] for name in names]) for kind, names in classes.items()}
 
 
 def surface_folder(options: Table1, config: TrainConfig, row: str) -> Path:
@@ -246,7 +162,7 @@ def surface_folder(options: Table1, config: TrainConfig, row: str) -> Path:
 
 def surface_methods(
     options: Table1, dataset: data_sets.Dataset, config: TrainConfig
-) -> tuple[dict[str, ObjectMethod], dict[str, str]]:
+) -> tuple[dict[str, Method], dict[str, str]]:
     """The Poisson rows in the data set's light, and those that have to be left out, with the reason."""
     wanted = {name: surface for name, surface in poisson.SURFACES.items() if name in options.methods}
     if not wanted:
@@ -258,17 +174,11 @@ def surface_methods(
         print(f"Poisson not run: {error}", flush=True)
         return {}, dict.fromkeys(wanted, f"not run: {error}")
     renderer = poisson.Renderer(dataset.settings, options.envmap, options.variant, options.seed)
-    show = partial(poisson.show, renderer, config.test_points)
-    return {name: partial(show, s, surface_folder(options, config, name)) for name, s in wanted.items()}, {}
-
-
-def floor_methods(
-    options: Table1, dataset: data_sets.Dataset, config: TrainConfig
-) -> tuple[dict[str, ObjectMethod], dict[str, float]]:
-    """The trivial renderers, and the radius factors that are best for them on training objects."""
-    wanted: list[str] = [name for name in reversed(evaluation.FLOORS) if name in options.methods]
-    factors = {name: evaluation.choose_radius(dataset, config, name) for name in wanted if name != "white"}
-    return {name: of_cloud(evaluation.floor(name, factors.get(name, 1.0)), config) for name in wanted}, factors
+    found: dict[str, Method] = {}
+    for name, surface in wanted.items():
+        place = surface_folder(options, config, name)
+        found[name] = Method(draw=partial(poisson.keep_pictures, renderer, surface, place))
+    return found, {}
 
 
 def train_networks(options: Table1, dataset: data_sets.Dataset, configs: dict[str, TrainConfig]) -> dict[str, Trained]:
@@ -301,6 +211,111 @@ def costs(options: Table1, trained: dict[str, Trained], scored: Scored, config: 
         cost = trained[method].cost if method in trained else {}
         table[method] = cost | {"ms_per_view": round(1000 * statistics.median(warm), 2) if warm else None}
     return table
+
+
+# --- tables and page --------------------------------------------------------------------------------------------------
+
+
+def tables_of(results: Mapping) -> list[Table]:
+    """The table of methods, the differences, and a table of each class of objects."""
+    made = [methods_table(results)]
+    if results["differences"]:
+        made.append(differences_table(results["compared"], results["differences"]))
+    for name, own in results["per_category"].items():
+        count = next(iter(own.values()))["objects"]
+        title = f"{name}, {count} object{'s' * (count != 1)}"
+        made.append(
+            Table(
+                title=title,
+                heads=HEADS,
+                rows=tuple((LABELS[name], cells) for name, cells in quality(own, METRICS).items()),
+            )
+        )
+    return made
+
+
+def methods_table(results: Mapping) -> Table:
+    """Quality and cost of every method; rows that could not be made say why."""
+    scores, missing = results["methods"], results["missing"]
+    rows = {
+        LABELS[name]: (*cells, *(_cost(results["costs"][name], column) for column in COSTS))
+        for name, cells in quality(scores, METRICS).items()
+    }
+    rows |= {LABELS[name]: (Cell(text=reason),) for name, reason in missing.items()}
+    counts = next(iter(scores.values()))
+    return Table(
+        title=f"Methods, {counts['objects']} unseen objects, {counts['views']} views",
+        heads=(*HEADS, *COSTS.values()),
+        rows=tuple((label, rows[label]) for label in LABELS.values() if label in rows),
+        note="Means over images with 95 % bootstrap intervals over objects; the best of a column stands out.",
+    )
+
+
+def differences_table(first: str, differences: Mapping) -> Table:
+    """A network minus each other method, image by image."""
+    rows = tuple(
+        (f"{LABELS[first]} minus {lowered(name)}", tuple(difference(row.get(metric), metric) for metric in METRICS))
+        for name, row in differences.items()
+    )
+    note = "Image by image, with 95 % bootstrap intervals and the p-value of a sign-flip test, both over objects."
+    return Table(title="Paired differences", heads=HEADS, rows=rows, note=note)
+
+
+def _cost(cost: Mapping, column: str) -> Cell:
+    value = cost.get(column)
+    if column == "training_seconds" and value is not None:
+        return Cell(text=duration(value), value=value)
+    return number(value, 1 if column == "ms_per_view" else 0, missing="-")
+
+
+def notes(results: Mapping) -> list[str]:
+    """What a reader has to know of the numbers: budget, data, machine, seed, how they were measured."""
+    counts, costs = next(iter(results["methods"].values())), results["costs"]
+    presets = ", ".join(f"{LABELS[name]} {cost['preset']}" for name, cost in costs.items() if "preset" in cost)
+    minutes = results["minutes"]
+    rule = (
+        "every network trains the steps of its preset"
+        if minutes is None
+        else f"every network trains as many steps as fit into {minutes:g} minutes on this machine, its warm-up and "
+        "decay over exactly these; measured beforehand, compilation, checkpoints and previews not counted"
+    )
+    budget = f"Budget {results['budget']}: {BUDGETS[results['budget']]}"
+    factors = ", ".join(f"{LABELS[name]} {value:g}" for name, value in results["radius_factors"].items())
+    objects = results["data"]
+    lines = [
+        budget + ("." if results["budget"] == "quick" else f"; {rule}.") + (f" Presets: {presets}." if presets else ""),
+        f"All methods: the same {objects['train objects']} training objects, {counts['objects']} test objects of "
+        f"{objects['test objects']}, cameras, and first {results['points']} points; {results['resolution']} px.",
+        f"Hardware: {results['hardware']}; Poisson surfaces are made and rendered on its CPU. Seed {results['seed']}.",
+        "Training is the time of the steps, without compilation. ms per view: median over the objects but the first; "
+        "what is done once per object is shared by its views.",
+        *(f"{name}: {text}." for name, text in results["metrics"].items()),
+    ]
+    return lines + ([f"Radius of a point, in point spacings, best on training objects: {factors}."] if factors else [])
+
+
+def write_page(title: str, tables: Sequence[Table], notes: Sequence[str], shown: Sequence[Shown] = ()) -> str:
+    """One HTML file with tables, and unseen objects x methods to flip through beside the reference.
+
+    Nothing is loaded from elsewhere: pictures are PNGs inside the file, and so is the script.  Left and right change
+    the method, up and down the object; holding the space bar, or the mouse on the picture, shows the reference in its
+    place.  Without scripts the tables are still there.
+    """
+    pictures = {
+        "methods": [LABELS[method] for method in shown[0].images] if shown else [],
+        "objects": [
+            {
+                "name": row.name,
+                "view": row.view,
+                "reference": png_url(row.reference),
+                "images": {LABELS[method]: png_url(image) for method, image in row.images.items()},
+                "psnr": {LABELS[method]: round(value, 2) for method, value in row.psnr.items()},
+            }
+            for row in shown
+        ],
+    }
+    place = Path(__file__).with_name("table1_page.html")
+    return template(place).render(title=title, tables=tables, notes=notes, pictures=pictures)
 
 
 if __name__ == "__main__":

@@ -25,7 +25,7 @@ import numpy as np
 
 from experiments import entry_point
 from experiments.comparison import results_folder
-from experiments.speed import speed_scenes, twin_layout
+from experiments.speed import speed_scenes
 from spnr_jax.config import PaperConfig, TrainConfig
 from spnr_jax.devices import runtime
 from spnr_jax.errors import at_least
@@ -136,14 +136,15 @@ def turn(run: Run, seconds: float) -> list[float]:
 
 def our_config(preset: str, mode: Mode = "train", objects: int = 1) -> TrainConfig:
     """Our config of the twin's sizes, without R1; "train_l1" has no discriminator."""
-    sizes = twin_layout.PRESETS[preset]
-    return twin_layout.train_config(dataclasses.replace(sizes, adv_weight=float(mode != "train_l1")), objects)
+    config = speed_scenes.PAPER[preset]
+    loss = dataclasses.replace(config.loss, adversarial_weight=float(mode != "train_l1"))
+    return dataclasses.replace(config, loss=loss, batch_objects=objects)
 
 
 def our_batch(config: TrainConfig) -> Batch:
     """The benchmark's scene on the device."""
     found = speed_scenes.arrays(config.batch_objects, config.model.image_resolution, config.max_points)
-    return jax.device_put(twin_layout.batch(found))
+    return jax.device_put(speed_scenes.as_batch(found))
 
 
 def our_side(preset: str, mode: Mode, options: Options) -> tuple[Run, float]:
@@ -186,10 +187,10 @@ def twin_side(preset: str, mode: Mode, variant: str, options: Options) -> Run:
     device = "cpu" if jax.default_backend() == "cpu" else "cuda"  # where ours computes
     torch.set_num_threads(options.threads)
     torch.set_default_device(device)
-    sizes, (form, compiled) = twin_layout.PRESETS[preset], VARIANTS[variant]
-    inputs = speed_scenes.arrays(BATCHES[preset], 2 * sizes.render, sizes.points).items()
+    config, (form, compiled) = our_config(preset, mode), VARIANTS[variant]
+    inputs = speed_scenes.arrays(BATCHES[preset], config.model.image_resolution, config.max_points).items()
     batch = {name: torch.from_numpy(x).to(device) for name, x in inputs}
-    work = twin.function(sizes, batch, mode, form, compiled)
+    work = twin.function(config, batch, mode, form, compiled)
 
     def run() -> None:
         with torch.autocast(device, torch.bfloat16, enabled=options.bf16):

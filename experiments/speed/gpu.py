@@ -29,16 +29,13 @@ import numpy as np
 from experiments import entry_point
 from experiments.comparison import clock, results_folder
 from experiments.speed import bench
-from experiments.speed.speed_scenes import orbiting, random_crops, sphere
+from experiments.speed.speed_scenes import orbiting, paper_training, random_crops, surfel_training, surfel_volume
 from spnr_jax import cli
-from spnr_jax.config import PaperConfig, SurfelConfig, TrainConfig
+from spnr_jax.config import SurfelConfig, TrainConfig
 from spnr_jax.devices import runtime
-from spnr_jax.kernels.records import Volume
 from spnr_jax.method import surfel_method
-from spnr_jax.presets import PRESETS
 from spnr_jax.scoring.report import Table, number, text
 from spnr_jax.surfels.lighting import room_light
-from spnr_jax.surfels.surfel_scenes import encode_in_box
 from spnr_jax.training import optimisation
 
 
@@ -93,8 +90,7 @@ def films(options: OnGPU) -> list[Found]:
     """Frames of an orbit, each of them brought to the host."""
     config = SurfelConfig(widths=(4, 6), top=4) if options.quick else SurfelConfig()
     variables, light = surfel_method.init(jax.random.key(0), config), room_light()
-    scene, rows = encode_in_box(sphere(options.points)), []
-    volume = Volume(scene=scene, centre=scene.centre, scale=scene.scale)
+    volume, rows = surfel_volume(options.points), []
     draw = partial(surfel_method.render, variables, volume, config=config, quality="best")
     for size in (32, 64) if options.quick else (512, 1024):
         views = [orbiting(size, 0.1 * frame) for frame in range(options.frames)]
@@ -110,7 +106,7 @@ def films(options: OnGPU) -> list[Found]:
 
 def surfel_steps(options: OnGPU) -> list[Found]:
     """Training steps of the preset `surfels`, on crops that are on the device."""
-    config = surfel_config(options)
+    config = surfel_training(options.quick)
     crops = random_crops(config, doublings=1)
     compiled = compile_of(
         partial(optimisation.train_step, config=config), optimisation.jitted_create_state(config), crops
@@ -120,19 +116,14 @@ def surfel_steps(options: OnGPU) -> list[Found]:
     return [Found(what=what, unit="steps", a_second=1 / seconds, megabytes=compiled.megabytes)]
 
 
-def surfel_config(options: OnGPU) -> TrainConfig:
-    """The preset `surfels`, for a check with a small network."""
-    config = PRESETS["surfels"]()
-    if not options.quick:
-        return config
-    return dataclasses.replace(config, model=SurfelConfig(widths=(4, 6), top=4), crop=16, batch_objects=2)
-
-
 def many_trainings(options: OnGPU) -> list[Found]:
     """Steps of a run, of all runs under one vmap, beside those of a loop over the same step."""
-    config = small(PRESETS["tiny"]()) if options.quick else bench.our_config("tiny", "train_l1", 2)
+    config = bench.our_config("tiny", "train_l1", 2)
+    if options.quick:
+        model = paper_training(grid=8, base=8, stages=1, samples=4, render=12).model
+        config = dataclasses.replace(config, model=model, batch_objects=1, min_points=64, max_points=64)
     tiny = partial(optimisation.train_step, config=config, adversarial=False)
-    surfels = dataclasses.replace(surfel_config(options), batch_objects=2)
+    surfels = dataclasses.replace(surfel_training(options.quick), batch_objects=2)
     crops = random_crops(surfels, doublings=1)
     over_crops = partial(optimisation.train_step, config=surfels)
     return [
@@ -159,17 +150,6 @@ def at_once(options: OnGPU, name: str, step: Callable, config: TrainConfig, batc
     what = f"{runs} trainings of {name} at once"
     rates = {"a_second": runs / by_vmap, "beside": runs / by_loop}
     return Found(what=what, unit="steps of a run", megabytes=together.megabytes, **rates)
-
-
-def small(config: TrainConfig) -> TrainConfig:
-    """The config of a network that compiles in seconds, for whole views."""
-    assert isinstance(config.model, PaperConfig)
-    encoder = dataclasses.replace(
-        config.model.encoder, point_widths=(8,), point_features=8, volume_resolution=8, num_stages=1
-    )
-    model = dataclasses.replace(config.model, encoder=encoder, field_width=8)
-    loss = dataclasses.replace(config.loss, adversarial_weight=0.0)
-    return dataclasses.replace(config, model=model, loss=loss, batch_objects=1, min_points=64, max_points=64)
 
 
 def beside_twin(options: OnGPU) -> list[Found]:

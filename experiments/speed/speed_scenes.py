@@ -1,23 +1,63 @@
-"""Scenes of made-up objects, which the commands that measure speed draw: no time depends on what they show.
+"""What the commands that measure speed draw: sizes that ours and the twin share, and scenes of made-up objects.
 
 Surface points of spheres and boxes (how many voxels are occupied decides what empty space is worth), orbiting cameras,
-images and crops of random numbers.
+images and crops of random numbers: no time depends on what they show.
 """
+
+import dataclasses
+from collections.abc import Mapping
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from spnr_jax.config import TrainConfig
+from spnr_jax.config import (
+    EncoderConfig,
+    LossConfig,
+    OptimizerConfig,
+    PaperConfig,
+    SamplingConfig,
+    SurfelConfig,
+    TrainConfig,
+)
 from spnr_jax.kernels import cameras
-from spnr_jax.kernels.records import Camera, Crops, PointCloud
+from spnr_jax.kernels.records import Batch, Camera, Crops, PointCloud, Volume
+from spnr_jax.presets import PRESETS
 from spnr_jax.surfels import features
+from spnr_jax.surfels.surfel_scenes import encode_in_box
 from spnr_jax.training import gbuffers
 
 SPHERE, BOX = 0.7, 0.55  # radius and half side, in the box [-1, 1]^3
 DISTANCE, FOCAL = 3.2, 2.4  # of the cameras; 1 / tan of half the field of view
 FIELD_OF_VIEW = 2 * float(np.arctan(1 / FOCAL))
 CLOSE = 2.2  # distance at which the sphere nearly fills the picture
+
+
+def paper_training(grid: int = 64, base: int = 16, stages: int = 5, samples: int = 64, render: int = 64) -> TrainConfig:
+    """A training of the paper's network as the twin has it, without R1: the preset `abo` in group norms of 8."""
+    encoder = EncoderConfig(point_features=32, volume_resolution=grid, base_width=base, num_stages=stages, num_groups=8)
+    model = PaperConfig(
+        encoder=encoder,
+        field_width=64,
+        num_features=32,
+        direction_frequencies=4,
+        sampling=SamplingConfig(num_coarse=samples, num_fine=samples, padding=1e-5),
+        render_resolution=render,
+        resize_resolution=render,
+        image_resolution=2 * render,
+        upsampler_width=64,
+    )
+    loss = LossConfig(l1_weight=100.0, low_resolution_weight=0.5, r1_gamma=0.0, r1_interval=1, discriminator_width=64)
+    optimizer = OptimizerConfig(lr_generator=2e-4, lr_discriminator=2e-4)
+    config = TrainConfig(model=model, loss=loss, optimizer=optimizer, batch_objects=1)
+    return dataclasses.replace(config, min_points=1024, max_points=1024)
+
+
+PAPER = {
+    "abo": paper_training(),
+    "small": paper_training(grid=32, stages=4, samples=32),
+    "tiny": paper_training(grid=32, base=8, stages=3, samples=16, render=32),
+}
 
 
 def arrays(batch: int, size: int, num_points: int, seed: int = 0) -> dict[str, np.ndarray]:
@@ -37,6 +77,34 @@ def arrays(batch: int, size: int, num_points: int, seed: int = 0) -> dict[str, n
         "mask": rng.random((batch, 1, size, size)) < 0.5,
     }
     return {name: np.asarray(array, np.float32) for name, array in found.items()}
+
+
+def as_batch(arrays: Mapping[str, np.ndarray]) -> Batch:
+    """The batch of pos mat c2w focal target cond mask: one view of each object, every point real."""
+    positions, materials = arrays["pos"], arrays["mat"]
+    cloud = PointCloud(
+        positions=positions,
+        base_color=materials[..., :3],
+        roughness=materials[..., 3],
+        metallic=materials[..., 4],
+        mask=np.ones(positions.shape[:2], bool),
+    )
+    images = {k: np.moveaxis(arrays[k], 1, -1)[:, None] for k in ("target", "cond", "mask")}
+    size = images["target"].shape[-2]
+    focal = arrays["focal"][:, None] * size / 2
+    intrinsics = np.zeros((*focal.shape, 3, 3), np.float32)
+    intrinsics[..., 0, 0] = intrinsics[..., 1, 1] = focal
+    intrinsics[..., 0, 2] = intrinsics[..., 1, 2] = size / 2
+    intrinsics[..., 2, 2] = 1
+    camera = Camera(cam_to_world=arrays["c2w"][:, None], intrinsics=intrinsics, height=size, width=size)
+    return Batch(
+        cloud=cloud,
+        camera=camera,
+        image=images["target"],
+        alpha=np.ones_like(images["mask"][..., 0]),  # the twin has no loss of opacity
+        condition=images["cond"],
+        condition_mask=images["mask"][..., 0] > 0.5,
+    )
 
 
 def pose(azimuth: float, elevation: float) -> np.ndarray:
@@ -83,3 +151,16 @@ def random_crops(config: TrainConfig, doublings: int, seed: int = 0) -> Crops:
         margin=margin,
     )
     return jax.device_put(crops)
+
+
+def surfel_training(quick: bool) -> TrainConfig:
+    """The preset `surfels`, for a check with a small network."""
+    config = PRESETS["surfels"]()
+    small = SurfelConfig(widths=(4, 6), top=4)
+    return dataclasses.replace(config, model=small, crop=16, batch_objects=2) if quick else config
+
+
+def surfel_volume(points: int) -> Volume:
+    """The sphere, encoded for the network over surfels."""
+    scene = encode_in_box(sphere(points))
+    return Volume(scene=scene, centre=scene.centre, scale=scene.scale)

@@ -5,7 +5,7 @@
             an embedding bag, upsampling folded into transposed convolutions, the linear head after compositing
 
 Volumes are (batch, features, z, y, x), images (batch, features, row, column); focal = 1 / tan(half the field of view).
-float32, no R1; needs torch alone.
+float32, no R1.
 """
 
 from collections.abc import Callable
@@ -14,7 +14,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from experiments.speed.twin_layout import Config
+from spnr_jax.config import EncoderConfig, PaperConfig, TrainConfig
 
 Batch = dict[str, Tensor]  # a view of each object: pos mat c2w focal; target cond mask (batch, features, size, size)
 SLOPE = 0.2  # of the leaky ReLUs
@@ -64,12 +64,12 @@ def lookup(volume: Tensor, positions: Tensor, fast: bool) -> Tensor:
 class Field(nn.Module):
     """Density softplus(raw - 1), rgb and other features of samples."""
 
-    def __init__(self, c: Config, fast: bool):
+    def __init__(self, c: PaperConfig, fast: bool):
         super().__init__()
-        self.fast, self.freqs = fast, c.dir_freqs
-        self.hidden = nn.Linear(c.base, c.field_hidden)
-        self.density = nn.Linear(c.field_hidden, 1)
-        self.feature = nn.Linear(c.field_hidden + 3 + 6 * c.dir_freqs, c.features)
+        self.fast, self.freqs = fast, c.direction_frequencies
+        self.hidden = nn.Linear(c.encoder.base_width, c.field_width)
+        self.density = nn.Linear(c.field_width, 1)
+        self.feature = nn.Linear(c.field_width + 3 + 6 * c.direction_frequencies, c.num_features)
 
     def view(self, d: Tensor) -> Tensor:
         """The part of the features that the direction decides, once a ray."""
@@ -129,14 +129,14 @@ def importance(weights: Tensor, u: Tensor, pad: float) -> Tensor:
 class Renderer(nn.Module):
     """Rays through a volume: coarse samples, fine samples where their weights are large, the union composited."""
 
-    def __init__(self, c: Config, fast: bool):
+    def __init__(self, c: PaperConfig, fast: bool):
         super().__init__()
         self.c, self.fast, self.field = c, fast, Field(c, fast)
 
     def forward(self, volume: Tensor, c2w: Tensor, focal: Tensor) -> Tensor:
         """The feature image (batch, features, render, render); in training samples are jittered."""
         c, field = self.c, self.field
-        o, d = camera_rays(c2w, focal, c.render)
+        o, d = camera_rays(c2w, focal, c.render_resolution)
         near, far = ray_box(o, d)
         view = field.view(d)
 
@@ -148,18 +148,20 @@ class Renderer(nn.Module):
             places = o[:, :, None] + t[..., None] * d[:, :, None]
             return field.samples(lookup(volume, places, self.fast), view)
 
-        coarse = near + (far - near) * strata(c.coarse)
+        coarse = near + (far - near) * strata(c.sampling.num_coarse)
         density, values = seen(coarse)
         with torch.no_grad():
-            fine = near + (far - near) * importance(weights_of(density, coarse, far), strata(c.fine), c.pdf_pad)
+            fine = near + (far - near) * importance(
+                weights_of(density, coarse, far), strata(c.sampling.num_fine), c.sampling.padding
+            )
         more_density, more_values = seen(fine)
         t, order = torch.cat([coarse, fine], -1).sort(stable=True)
         sorted_weights = weights_of(torch.cat([density, more_density], -1).gather(-1, order), t, far)
         w = torch.zeros_like(t).scatter(-1, order, sorted_weights)  # values stay in the order of their sets
-        parts = ((w[..., : c.coarse], values), (w[..., c.coarse :], more_values))
+        parts = ((w[..., : c.sampling.num_coarse], values), (w[..., c.sampling.num_coarse :], more_values))
         total = sum(torch.matmul(x.unsqueeze(-2), y).squeeze(-2) for x, y in parts)
         image = field.finish(total, w.sum(-1, True), view)
-        return image.transpose(1, 2).unflatten(2, (c.render, c.render))
+        return image.transpose(1, 2).unflatten(2, (c.render_resolution, c.render_resolution))
 
 
 def folded(weight: Tensor) -> Tensor:
@@ -173,7 +175,7 @@ def folded(weight: Tensor) -> Tensor:
 class PointNet(nn.Module):
     """Points (p, 11) to features."""
 
-    def __init__(self, c: Config):
+    def __init__(self, c: EncoderConfig):
         super().__init__()
         widths = (11, *c.point_widths)
         self.linears = nn.ModuleList(nn.Linear(a, b, bias=False) for a, b in zip(widths, widths[1:], strict=False))
@@ -190,10 +192,10 @@ class PointNet(nn.Module):
 class Block(nn.Module):
     """Convolution of 3^3 taps, group norm, ReLU."""
 
-    def __init__(self, inputs: int, outputs: int, c: Config, kind: str, fast: bool):
+    def __init__(self, inputs: int, outputs: int, c: EncoderConfig, kind: str, fast: bool):
         super().__init__()
         self.conv = nn.Conv3d(inputs, outputs, 3, 2 if kind == "down" else 1, 1, bias=False)
-        self.norm = nn.GroupNorm(c.groups, outputs)
+        self.norm = nn.GroupNorm(c.num_groups, outputs)
         self.up, self.fast = kind == "up", fast
 
     def forward(self, x: Tensor) -> Tensor:
@@ -220,12 +222,12 @@ class Block(nn.Module):
 class UNet(nn.Module):
     """The 3D U-Net on the rows of occupied voxels; skip connections are sums."""
 
-    def __init__(self, c: Config, fast: bool):
+    def __init__(self, c: EncoderConfig, fast: bool):
         super().__init__()
-        widths = [c.base * 2**i for i in range(c.stages + 1)]
+        widths = [c.base_width * 2**i for i in range(c.num_stages + 1)]
         pairs = list(zip(widths, widths[1:], strict=False))
-        self.fast, self.grid = fast, c.grid
-        self.stem = Block(c.point_features + 1, c.base, c, "same", fast)
+        self.fast, self.grid = fast, c.volume_resolution
+        self.stem = Block(c.point_features + 1, c.base_width, c, "same", fast)
         self.down = nn.ModuleList(Block(a, b, c, "down", fast) for a, b in pairs)
         self.same = nn.ModuleList(Block(b, b, c, "same", fast) for _, b in pairs)
         self.up = nn.ModuleList(Block(b, a, c, "up", fast) for a, b in reversed(pairs))
@@ -250,10 +252,10 @@ class UNet(nn.Module):
 class Upsampler(nn.Module):
     """The feature image to a picture of twice the size."""
 
-    def __init__(self, c: Config, fast: bool):
+    def __init__(self, c: PaperConfig, fast: bool):
         super().__init__()
-        self.fast, width = fast, c.up_width
-        self.conv0 = nn.Conv2d(c.features, width, 3, 1, 1)
+        self.fast, width = fast, c.upsampler_width
+        self.conv0 = nn.Conv2d(c.num_features, width, 3, 1, 1)
         self.conv1 = nn.Conv2d(width, width, 3, 1, 1)
         self.conv2 = nn.Conv2d(width, 32, 3, 1, 1)  # after nearest x2
         self.conv3 = nn.Conv2d(32, 3, 3, 1, 1)
@@ -274,15 +276,15 @@ class Upsampler(nn.Module):
 class Generator(nn.Module):
     """Points and materials to a volume, a volume and a camera to a picture."""
 
-    def __init__(self, c: Config, implementation: str = "fast"):
+    def __init__(self, c: PaperConfig, implementation: str = "fast"):
         super().__init__()
         fast = implementation == "fast"
-        self.c, self.points, self.unet = c, PointNet(c), UNet(c, fast)
+        self.c, self.points, self.unet = c, PointNet(c.encoder), UNet(c.encoder, fast)
         self.renderer, self.upsampler = Renderer(c, fast), Upsampler(c, fast)
 
     def encode_volume(self, pos: Tensor, mat: Tensor) -> Tensor:
         """The volume of points (batch, n, 3) with materials (batch, n, 5)."""
-        batch, n = len(pos), self.c.grid
+        batch, n = len(pos), self.c.encoder.volume_resolution
         grid = (pos + 1) * (0.5 * n)
         cell = grid.floor().clamp(0, n - 1)
         features = self.points(torch.cat([pos, grid - cell - 0.5, mat], -1).flatten(0, 1))
@@ -308,16 +310,15 @@ class Generator(nn.Module):
 class Discriminator(nn.Module):
     """PatchGAN on picture, condition and mask."""
 
-    def __init__(self, c: Config):
+    def __init__(self, w: int, groups: int):
         super().__init__()
-        w = c.disc_width
         widths = (7, w, 2 * w, 4 * w, 8 * w, 1)
         normed = (False, True, True, True, False)
         self.convs = nn.ModuleList(
             nn.Conv2d(widths[i], widths[i + 1], 4, 2 if i < 3 else 1, 1, bias=not normed[i]) for i in range(5)
         )
         self.norms = nn.ModuleList(
-            nn.GroupNorm(c.groups, widths[i + 1]) if normed[i] else nn.Identity() for i in range(4)
+            nn.GroupNorm(groups, widths[i + 1]) if normed[i] else nn.Identity() for i in range(4)
         )
         self.to(memory_format=torch.channels_last)
 
@@ -336,19 +337,31 @@ def compiled(generator: Generator) -> Generator:
     return generator
 
 
-def trainer(c: Config, implementation: str, compile: bool, adversarial: bool) -> Callable[[Batch], None]:
+def paper_config(c: TrainConfig) -> PaperConfig:
+    """The sizes of the network."""
+    assert isinstance(c.model, PaperConfig)
+    return c.model
+
+
+def trainer(c: TrainConfig, implementation: str, compile: bool, adversarial: bool) -> Callable[[Batch], None]:
     """A training step: one forward of the generator, an update of the discriminator, an update of the generator."""
-    generator, judge = Generator(c, implementation).train(), Discriminator(c).train()
+    model, groups = paper_config(c), paper_config(c).encoder.num_groups
+    generator, judge = (
+        Generator(model, implementation).train(),
+        Discriminator(c.loss.discriminator_width, groups).train(),
+    )
     generator = compiled(generator) if compile else generator
     draw = torch.compile(judge, dynamic=False) if compile else judge
     betas = (0.5, 0.999)
-    adam_g = torch.optim.Adam(generator.parameters(), c.lr_g, betas, fused=True)
-    adam_d = torch.optim.Adam(judge.parameters(), c.lr_d, betas, fused=True)
+    adam_g = torch.optim.Adam(generator.parameters(), c.optimizer.lr_generator, betas, fused=True)
+    adam_d = torch.optim.Adam(judge.parameters(), c.optimizer.lr_discriminator, betas, fused=True)
 
     def step(batch: Batch) -> None:
         image, rgb = generator(batch["pos"], batch["mat"], batch["c2w"], batch["focal"])
-        low = F.avg_pool2d(batch["target"], batch["target"].shape[-1] // c.render)
-        loss = c.l1_weight * (F.l1_loss(image, batch["target"]) + c.lowres_weight * F.l1_loss(rgb, low))
+        low = F.avg_pool2d(batch["target"], batch["target"].shape[-1] // model.render_resolution)
+        loss = c.loss.l1_weight * (
+            F.l1_loss(image, batch["target"]) + c.loss.low_resolution_weight * F.l1_loss(rgb, low)
+        )
         if adversarial:
             adam_d.zero_grad()
             both = torch.cat([batch["target"], image.detach()])
@@ -356,7 +369,7 @@ def trainer(c: Config, implementation: str, compile: bool, adversarial: bool) ->
             (F.softplus(-real).mean() + F.softplus(fake).mean()).backward()
             adam_d.step()
             judge.requires_grad_(False)
-            loss = loss + c.adv_weight * F.softplus(-draw(image, batch["cond"], batch["mask"])).mean()
+            loss = loss + c.loss.adversarial_weight * F.softplus(-draw(image, batch["cond"], batch["mask"])).mean()
         adam_g.zero_grad()
         loss.backward()
         adam_g.step()
@@ -365,13 +378,13 @@ def trainer(c: Config, implementation: str, compile: bool, adversarial: bool) ->
     return step
 
 
-def function(c: Config, batch: Batch, mode: str, implementation: str, compile: bool) -> Callable[[], object]:
+def function(c: TrainConfig, batch: Batch, mode: str, implementation: str, compile: bool) -> Callable[[], object]:
     """One step, one encoding of the batch, or one view of each of its volumes."""
     torch.manual_seed(0)
     if mode.startswith("train"):
         step = trainer(c, implementation, compile, adversarial=mode == "train")
         return lambda: step(batch)
-    generator = Generator(c, implementation).eval()
+    generator = Generator(paper_config(c), implementation).eval()
     guard = torch.inference_mode
     if compile:
         generator, guard = compiled(generator), torch.no_grad

@@ -28,20 +28,18 @@ import numpy as np
 from experiments import entry_point
 from experiments.comparison import clock, results_folder
 from experiments.speed import bench
-from experiments.speed.speed_scenes import orbiting, random_crops, sphere
+from experiments.speed.speed_scenes import orbiting, random_crops, surfel_training, surfel_volume
 from spnr_jax import cli
 from spnr_jax.config import PaperConfig, SurfelConfig, TrainConfig
 from spnr_jax.devices import runtime
 from spnr_jax.errors import at_least
 from spnr_jax.kernels import cameras
-from spnr_jax.kernels.records import Batch, Light, Volume
+from spnr_jax.kernels.records import Batch, Camera, Light
 from spnr_jax.method import surfel_method, surfel_renderer
 from spnr_jax.nn.shader import Shader
-from spnr_jax.presets import PRESETS
 from spnr_jax.scoring.report import Table, number, text
 from spnr_jax.surfels import projection
 from spnr_jax.surfels.lighting import room_light
-from spnr_jax.surfels.surfel_scenes import encode_in_box
 from spnr_jax.training import gbuffers, optimisation
 
 SIDE = 1024  # of the matrices whose product is the machine's pace
@@ -110,9 +108,7 @@ def peak() -> Program:
 
 def step_programs(options: WhereTimeGoes) -> dict[str, Program]:
     """The training step of the preset `surfels` and what it is made of."""
-    config = PRESETS["surfels"]()
-    if options.quick:
-        config = dataclasses.replace(config, model=SurfelConfig(widths=(4, 6), top=4), crop=16, batch_objects=2)
+    config = surfel_training(options.quick)
     state = optimisation.jitted_create_state(config)
     crops = random_crops(config, options.doublings)
     assert isinstance(config.model, SurfelConfig)
@@ -141,16 +137,14 @@ def frame_programs(options: WhereTimeGoes) -> dict[str, Program]:
     """A frame as the handle draws it, and its programs alone."""
     config = SurfelConfig(image_resolution=options.size)
     variables, light = surfel_method.init(jax.random.key(0), config), room_light()
-    scene, camera = encode_in_box(sphere(options.points)), orbiting(options.size)
-    volume = Volume(scene=scene, centre=scene.centre, scale=scene.scale)
+    volume, camera = surfel_volume(options.points), orbiting(options.size)
+    scene, draw = volume.scene, partial(surfel_method.render, config=config, quality="best")
     doublings, side = surfel_renderer.resolution(scene, camera)
     plan = surfel_renderer.plan(scene, camera)
     count = partial(surfel_renderer.count_sizes, doublings=doublings, side=side)
     window = surfel_renderer.scaled(camera, doublings, side)
     found = jax.jit(projection.entries, static_argnames="room")(scene.surfels, window, room=plan.entries)[0]
     blended = jax.jit(surfel_renderer.blend_window, static_argnames="plan")(scene, camera, light, plan=plan)
-
-    draw = partial(surfel_method.render, config=config, quality="best")
 
     def blend(found: projection.Entries, light: Light) -> object:
         return surfel_renderer.blend_entries(found, scene.surfels, light, window, slots=plan.slots)
@@ -189,60 +183,59 @@ def table(title: str, programs: Mapping[str, Program], taken: Mapping[str, float
 
 
 class Axis(NamedTuple):
-    """`case` makes network and inputs of a value; the work grows with the value to this power."""
+    """`change` makes network and inputs of a value; the work grows with the value to this power."""
 
     mode: bench.Mode
     values: tuple[int, ...]
     power: int
-    case: Callable[[TrainConfig, int], tuple[TrainConfig, Batch]]
+    change: Callable[[TrainConfig, int], TrainConfig]
+    """The training with so much more of it."""
+    widen: Callable[[Camera, int], Camera] = lambda camera, _: camera
+    """The cameras with so many more views or pixels, by the same network."""
+
+    def case(self, config: TrainConfig, value: int) -> tuple[TrainConfig, Batch]:
+        """Network and inputs."""
+        config = self.change(config, value)
+        batch = bench.our_batch(config)
+        return config, dataclasses.replace(batch, camera=self.widen(batch.camera, value))
 
 
-def with_points(config: TrainConfig, count: int) -> tuple[TrainConfig, Batch]:
-    """Clouds of so many points."""
-    return config, bench.our_batch(dataclasses.replace(config, min_points=count, max_points=count))
+def with_model(config: TrainConfig, **changes: Any) -> TrainConfig:
+    """A training of another network."""
+    return dataclasses.replace(config, model=dataclasses.replace(config.model, **changes))
 
 
-def with_objects(config: TrainConfig, count: int) -> tuple[TrainConfig, Batch]:
-    """So many objects in a batch."""
-    return config, bench.our_batch(dataclasses.replace(config, batch_objects=count))
-
-
-def with_views(config: TrainConfig, count: int) -> tuple[TrainConfig, Batch]:
-    """So many cameras for each object."""
-    batch = bench.our_batch(config)
-    return config, dataclasses.replace(batch, camera=jax.tree.map(lambda x: jnp.repeat(x, count, 1), batch.camera))
-
-
-def with_pixels(config: TrainConfig, size: int) -> tuple[TrainConfig, Batch]:
-    """Images of so many pixels along each side, by the same network."""
-    batch = bench.our_batch(config)
-    return config, dataclasses.replace(batch, camera=cameras.resize(batch.camera, size, size))
-
-
-def with_volume(config: TrainConfig, resolution: int) -> tuple[TrainConfig, Batch]:
+def with_volume(config: TrainConfig, resolution: int) -> TrainConfig:
     """Volumes of so many voxels along each side."""
     assert isinstance(config.model, PaperConfig)
-    encoder = dataclasses.replace(config.model.encoder, volume_resolution=resolution)
-    model = dataclasses.replace(config.model, encoder=encoder)
-    return dataclasses.replace(config, model=model), bench.our_batch(config)
+    return with_model(config, encoder=dataclasses.replace(config.model.encoder, volume_resolution=resolution))
 
 
-def with_samples(config: TrainConfig, count: int) -> tuple[TrainConfig, Batch]:
+def with_samples(config: TrainConfig, count: int) -> TrainConfig:
     """So many samples on each ray, half of them coarse."""
     assert isinstance(config.model, PaperConfig)
-    sampling = dataclasses.replace(config.model.sampling, num_coarse=count // 2, num_fine=count // 2)
-    model = dataclasses.replace(config.model, sampling=sampling)
-    return dataclasses.replace(config, model=model), bench.our_batch(config)
+    half = {"num_coarse": count // 2, "num_fine": count // 2}
+    return with_model(config, sampling=dataclasses.replace(config.model.sampling, **half))
+
+
+def same(config: TrainConfig, _: int) -> TrainConfig:
+    """The training as it is."""
+    return config
+
+
+def repeat(camera: Camera, count: int) -> Camera:
+    """So many cameras for each object."""
+    return jax.tree.map(lambda x: jnp.repeat(x, count, 1), camera)
 
 
 POWERS = tuple(2**i for i in range(21))
 AXES = {
-    "points": Axis("encode", POWERS[9::3], 1, with_points),
+    "points": Axis("encode", POWERS[9::3], 1, lambda c, n: dataclasses.replace(c, min_points=n, max_points=n)),
     "volume": Axis("encode", POWERS[5:8], 3, with_volume),
-    "image": Axis("render", POWERS[6:11], 2, with_pixels),
+    "image": Axis("render", POWERS[6:11], 2, same, lambda camera, size: cameras.resize(camera, size, size)),
     "samples": Axis("render", POWERS[4:8], 1, with_samples),
-    "views": Axis("render", POWERS[:5], 1, with_views),
-    "objects": Axis("train_l1", POWERS[:5], 1, with_objects),
+    "views": Axis("render", POWERS[:5], 1, same, repeat),
+    "objects": Axis("train_l1", POWERS[:5], 1, lambda c, n: dataclasses.replace(c, batch_objects=n)),
 }
 
 

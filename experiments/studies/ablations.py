@@ -4,8 +4,7 @@
 
     OUT/runs/ROW_SEED/                            run folders; finished ones are only read
     OUT/fold_K/runs/ROW_SEED/                     those of a part of the objects, with --folds
-    OUT/results.json  table.md                    scores, costs, and differences to the reference with intervals: on all
-                                                  objects, on mesh files, and on procedural ones
+    OUT/results.json  table.md                    scores, costs, and differences to the reference with intervals
     OUT/differences.png  gallery.png              the differences, and pictures of unseen objects
 
 Every variant trains for as many steps, or with --minutes for as long.  With --folds each part of all objects is held
@@ -17,17 +16,18 @@ Runs of one seed see the same batches and jitter, whatever the row.  The same co
 """
 
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
 from experiments import entry_point
-from experiments.comparison import variants, variants_report
+from experiments.comparison import variants
 from experiments.comparison.variants import Budget, Variant
 from spnr_jax import cli
-from spnr_jax.config import EncoderConfig, PaperConfig, SamplingConfig, TrainConfig
+from spnr_jax.config import PaperConfig, TrainConfig
 from spnr_jax.errors import UserError, at_least
 from spnr_jax.formats import data_sets
 
@@ -88,9 +88,8 @@ def main(options: Ablations) -> None:
             print(f"fold {number + 1} of {len(parts)}", flush=True)
         runs = rows(options.rows, config, part)
         trained = variants.train(runs, budget, out)
-        shown = -(-budget.shown // len(parts))
-        compared.append(variants.score(trained, REFERENCE, part, budget.names(part), shown))
-    variants_report.write(options.out, runs, REFERENCE, variants.merged(compared), budget, dataset)
+        compared.append(variants.score(runs, trained, REFERENCE, budget, part, -(-budget.shown // len(parts))))
+    variants.write(options.out, runs, REFERENCE, variants.merge(compared), budget, dataset)
 
 
 def folds(dataset: data_sets.Dataset, count: int) -> list[data_sets.Dataset]:
@@ -124,52 +123,36 @@ def rows(wanted: tuple[Row, ...], config: TrainConfig, dataset: data_sets.Datase
 
 def changed(row: Row, config: TrainConfig) -> TrainConfig:
     """The config with the one change of a row."""
+    return put(config, changes(config).get(row, {}))
+
+
+def changes(config: TrainConfig) -> dict[str, dict[str, object]]:
+    """The fields that rows change, whichever record holds them."""
     assert isinstance(config.model, PaperConfig)
-    return dataclasses.replace(
-        config,
-        model=changed_model(row, config.model),
-        loss=dataclasses.replace(config.loss, condition=config.loss.condition and row != "no_condition"),
-        **recipe_changes(config).get(row, {}),
-    )
-
-
-def changed_model(row: Row, model: PaperConfig) -> PaperConfig:
-    """The network with the one change of a row."""
-    fields = model_changes(model).get(row, {})
-    inner = {f.name: fields[f.name] for f in dataclasses.fields(EncoderConfig) if f.name in fields}
-    outer = {name: value for name, value in fields.items() if name not in inner}
-    return dataclasses.replace(model, **outer, encoder=dataclasses.replace(model.encoder, **inner))
-
-
-def model_changes(model: PaperConfig) -> dict[str, dict]:
-    """The fields of a network that rows change."""
-    samples = model.sampling
+    samples, width = config.model.sampling, config.model.encoder.base_width
+    coarse, fine = samples.num_coarse, samples.num_fine
     return {
+        "no_condition": {"condition": False},
         **{f"depth_{stages}": {"num_stages": stages} for stages in (3, 4, 5)},
-        "no_fine_samples": {
-            "sampling": dataclasses.replace(samples, num_coarse=samples.num_coarse + samples.num_fine, num_fine=0)
-        },
+        "no_fine_samples": {"num_coarse": coarse + fine, "num_fine": 0},
         "no_view_direction": {"sees_direction": False},
         "plain_inputs": {"inputs": "plain"},
-        "fewer_channels": {"base_width": 2 * model.encoder.base_width // 3 or 1},
-        "half_samples": {"sampling": scaled(samples, 0.5)},
-        "twice_samples": {"sampling": scaled(samples, 2)},
-    }
-
-
-def recipe_changes(config: TrainConfig) -> dict[str, dict]:
-    """The other fields of a training that rows change."""
-    return {
-        "no_average": {"optimizer": dataclasses.replace(config.optimizer, ema_decay=0.0)},
+        "fewer_channels": {"base_width": 2 * width // 3 or 1},
+        "no_average": {"ema_decay": 0.0},
         "one_count": {"min_points": config.max_points},
         "more_views": {"views_per_object": 4 * config.views_per_object},
+        "half_samples": {"num_coarse": round(coarse / 2), "num_fine": round(fine / 2)},
+        "twice_samples": {"num_coarse": 2 * coarse, "num_fine": 2 * fine},
     }
 
 
-def scaled(sampling: SamplingConfig, factor: float) -> SamplingConfig:
-    """So many times as many samples, coarse and fine ones."""
-    coarse, fine = (round(factor * count) for count in (sampling.num_coarse, sampling.num_fine))
-    return dataclasses.replace(sampling, num_coarse=coarse, num_fine=fine)
+def put(record: Any, fields: Mapping[str, object]) -> Any:
+    """A record with these fields changed, in it and in the records that it holds."""
+    own = {}
+    for name in (one.name for one in dataclasses.fields(record)):
+        value = getattr(record, name)
+        own[name] = put(value, fields) if dataclasses.is_dataclass(value) else fields.get(name, value)
+    return dataclasses.replace(record, **own)
 
 
 if __name__ == "__main__":

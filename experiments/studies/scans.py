@@ -12,34 +12,35 @@ Rivals draw the same cleaned points: discs and light alone, and of --meshed obje
 """
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from experiments import entry_point
-from experiments.comparison import figures, poisson, results_folder
-from experiments.comparison.object_views import Picture, drawn, few, on_white, view_of, view_scores
-from spnr_jax.config import Quality
+from experiments.comparison import contenders, poisson, results_folder, scores
+from experiments.comparison.scores import Measured
+from experiments.comparison.study_objects import cut
 from spnr_jax.devices import runtime
 from spnr_jax.formats import data_sets, images
+from spnr_jax.formats.data_sets import ObjectData
 from spnr_jax.kernels.cleaning import Cleaned, Values, cleaned
 from spnr_jax.kernels.cloud_arrays import normalization
-from spnr_jax.kernels.records import Camera, PointCloud
+from spnr_jax.kernels.records import PointCloud
 from spnr_jax.kernels.thinning import farthest_points
 from spnr_jax.method.model import Model
+from spnr_jax.scoring.evaluation import Pictures
 from spnr_jax.scoring.report import Cell, Table, mean_row, number
 from spnr_jax.surfels import outward
 from spnr_jax.training.scan_faults import Fault, faults
 from spnr_jax.training.weights import load
 
 HEADS = ("PSNR, dB", "inside, dB", "FLIP", "cleaned: PSNR, dB", "inside, dB", "FLIP", "points left, %")
+COLUMNS = ("psnr", "psnr_inside", "flip")
 DECIMALS = (2, 2, 3)
-View = tuple[Camera, np.ndarray]  # and its reference
 RIVALS = {"auto": "network", "draft": "discs and light alone", "poisson": "trimmed Poisson"}
 
 
@@ -79,48 +80,58 @@ def main(options: ScansStudy) -> None:
     names = dataset.splits["test"][: options.objects]
     asked = {"run": options.run, "views": options.views, "resolution": options.resolution}
     results_folder.claim(options.out, "scans", asked, dataset)
-    model, meshed = load(options.run), names[: options.meshed]
-    surface = poisson.Renderer(dataset.settings) if meshed else None
-    rows: dict[str, list[dict]] = {}
-    for count in options.counts:
-        for label, fault in faults(options.noise, options.outliers, options.scanners).items():
-            row, place = f"{count:,}, {label}", options.out / "scores" / f"{count} {label}".replace(" ", "_")
-            rows[row] = [
-                _kept(place, dataset, name, partial(_scores, options, model, fault, count))
-                for name in tqdm(names, desc=row)
-            ]
-            if surface is not None:
-                for name, found in zip(meshed, rows[row], strict=False):
-                    scores = partial(_poisson_scores, options, surface, fault, count)
-                    found["poisson"] = _kept(place / "poisson", dataset, name, scores)
-    table = Table(
-        title=f"Scans, {len(names)} objects x {options.views} views",
-        heads=HEADS,
-        rows=tuple(
-            (row, (*_row(row, found, ("off", "auto"))[1], number(100 * np.mean([of["left"] for of in found]), 0)))
-            for row, found in rows.items()
-        ),
-        note="Means over objects with 95 % intervals; points left: of the data set's, before cleaning.",
-    )
-    hardware = runtime.hardware()
-    results_folder.write(options.out, {"objects": rows, "hardware": hardware}, [table, _rivals(options, rows)])
-    if options.shown:
-        _gallery(options, dataset, names[: options.shown], model)
+    model, meshed, shown = load(options.run), names[: options.meshed], names[: options.shown]
+    kinds = faults(options.noise, options.outliers, options.scanners)
+    rows = {
+        f"{count:,}, {label}": partial(measure, options, model, fault, count)
+        for count in options.counts
+        for label, fault in kinds.items()
+    }
+    found = scores.measure_rows(options.out, rows, dataset, names, shown)
+    if meshed:
+        surface = poisson.Renderer(dataset.settings)
+        solved = {
+            f"{count:,}, {label}, Poisson": partial(measure_surface, options, surface, fault, count)
+            for count in options.counts
+            for label, fault in kinds.items()
+        }
+        for row, objects in scores.measure_rows(options.out, solved, dataset, meshed).items():
+            for of, surfaces in zip(found[row.removesuffix(", Poisson")], objects, strict=False):
+                of["poisson"] = surfaces["poisson"]
+    tables = [_table(options, found), _rivals(options, found)]
+    results_folder.write(options.out, {"objects": found, "hardware": runtime.hardware()}, tables)
+    if shown:
+        largest = {row: rows[row] for row in (f"{max(options.counts):,}, {label}" for label in kinds)}
+        size = options.resolution or data_sets.read_object(dataset, names[0]).camera.height
+        sheet = scores.gallery(options.out, largest, dataset, shown, options.resolution, size)
+        images.write_whole(options.out / "gallery.png", sheet)
 
 
-def _rivals(options: ScansStudy, rows: dict[str, list[dict]]) -> Table:
+def _table(options: ScansStudy, found: Mapping[str, Sequence[dict]]) -> Table:
+    """Scores of each fault, without and with cleaning."""
+    rows = []
+    for row, objects in found.items():
+        _, cells = _row(row, objects, ("off", "auto"))
+        rows.append((row, (*cells, number(100 * np.mean([of["left"] for of in objects]), 0))))
+    count = len(next(iter(found.values())))
+    note = "Means over objects with 95 % intervals; points left: of the data set's, before cleaning."
+    return Table(title=f"Scans, {count} objects x {options.views} views", heads=HEADS, rows=tuple(rows), note=note)
+
+
+def _rivals(options: ScansStudy, found: Mapping[str, list[dict]]) -> Table:
     """Scores of all who draw the same cleaned points, over the objects that all of them drew."""
     ways = [way for way in RIVALS if way != "poisson" or options.meshed]
-    counted = {row: found[: options.meshed or len(found)] for row, found in rows.items()}
+    counted = {row: objects[: options.meshed or len(objects)] for row, objects in found.items()}
     return Table(
         title=f"The same cleaned points drawn otherwise, {len(next(iter(counted.values())))} objects",
         heads=tuple(head for way in ways for head in (f"{RIVALS[way]}: PSNR, dB", "inside, dB", "FLIP")),
-        rows=tuple(_row(row, found, ways) for row, found in counted.items()),
+        rows=tuple(_row(row, objects, ways) for row, objects in counted.items()),
     )
 
 
-def _kept(place: Path, dataset: data_sets.Dataset, name: str, scores: Callable[[data_sets.ObjectData], Any]) -> Any:
-    return results_folder.kept(place / f"{name}.json", lambda: scores(data_sets.read_object(dataset, name)))
+def _row(row: str, objects: Sequence[dict], ways: Sequence[str]) -> tuple[str, tuple[Cell, ...]]:
+    values = [[of[way][column] for way in ways for column in COLUMNS] for of in objects]
+    return mean_row(row, values, DECIMALS * len(ways))
 
 
 def spoiled(cloud: PointCloud, fault: Fault | None) -> tuple[np.ndarray, Values]:
@@ -146,71 +157,30 @@ def thinned(points: Cleaned, count: int) -> PointCloud:
     return outward.thinned(points, np.sort(farthest_points(points.positions, count, seed=0)))
 
 
-def _scores(
-    options: ScansStudy, model: Model, fault: Fault | None, count: int, item: data_sets.ObjectData
-) -> dict[str, Any]:
+def measure(options: ScansStudy, model: Model, fault: Fault | None, count: int, item: ObjectData) -> Measured:
     """Mean scores of an object's views without and with cleaning, and the share of its points that is left."""
     dirty = as_it_is(*spoiled(item.cloud, fault))
     clean = cleaned(dirty.positions, dirty.values)
-    cloud = thinned(clean, count)
-    views = views_of(item, options.views, options.resolution)
-    auto, draft = (mean_scores(drawn_of(model, cloud, views, quality), views) for quality in ("best", "draft"))
-    off = mean_scores(drawn_of(model, thinned(dirty, count), views), views) if clean.lines else auto
+    seen = cut(item, views=options.views, resolution=options.resolution)
+
+    def draw(points: Cleaned, **quality: Any) -> Pictures:
+        return contenders.of_model(model, **quality).show(dataclasses.replace(seen, cloud=thinned(points, count)))
+
+    best, draft = draw(clean), draw(clean, quality="draft")
+    found = {"auto": scores.mean_of(seen, best, COLUMNS), "draft": scores.mean_of(seen, draft, COLUMNS)}
+    found["off"] = scores.mean_of(seen, draw(dirty), COLUMNS) if clean.lines else found["auto"]
     left = len(dirty.positions) / len(item.cloud.positions)
-    return {"off": off, "auto": auto, "draft": draft, "said": clean.lines, "left": left}
+    return found | {"said": clean.lines, "left": left}, np.asarray(best.image[0])
 
 
-def _poisson_scores(
-    options: ScansStudy, renderer: poisson.Renderer, fault: Fault | None, count: int, item: data_sets.ObjectData
-) -> list[float]:
+def measure_surface(
+    options: ScansStudy, renderer: poisson.Renderer, fault: Fault | None, count: int, item: ObjectData
+) -> Measured:
     """Mean scores of the trimmed Poisson surface of the cleaned points."""
-    cloud = thinned(cleaned(*spoiled(item.cloud, fault)), count)
-    seen = dataclasses.replace(few(item, options.views), cloud=cloud)
-    pictures, _ = renderer.pictures(seen, count, poisson.SURFACES["poisson_trimmed"])
-    made, views = (
-        views_of(x, options.views, options.resolution) for x in (dataclasses.replace(seen, images=pictures), item)
-    )
-    return mean_scores([on_white(rgba) for _, rgba in made], views)
-
-
-def views_of(item: data_sets.ObjectData, views: int, resolution: int | None) -> list[View]:
-    """The first views of an object at a resolution, None for its own."""
-    return [view_of(item, view, resolution) for view in range(min(views, len(item.images)))]
-
-
-def drawn_of(model: Model, cloud: PointCloud, views: Sequence[View], quality: Quality = "best") -> list[Picture]:
-    """Pictures of a cloud from cameras."""
-    return drawn(model, model.encode(cloud), [camera for camera, _ in views], quality)
-
-
-def mean_scores(drawn: Sequence[Picture], views: Sequence[View]) -> list[float]:
-    """Mean PSNR, PSNR inside and FLIP of pictures."""
-    found = [view_scores(*picture, reference) for picture, (_, reference) in zip(drawn, views, strict=True)]
-    return np.nanmean(found, axis=0).tolist()
-
-
-def _row(row: str, found: Sequence[dict], ways: Sequence[str]) -> tuple[str, tuple[Cell, ...]]:
-    return mean_row(row, [[x for way in ways for x in scores[way]] for scores in found], DECIMALS * len(ways))
-
-
-def _gallery(options: ScansStudy, dataset: data_sets.Dataset, names: Sequence[str], model: Model) -> None:
-    """References, and pictures of the cleaned clouds of the largest count."""
-    kinds = faults(options.noise, options.outliers, options.scanners)
-    cells = []
-    for name in names:
-        item = data_sets.read_object(dataset, name)
-
-        def picture(label: str, name: str = name, item: data_sets.ObjectData = item) -> np.ndarray:
-            def make() -> np.ndarray:
-                cloud = thinned(cleaned(*spoiled(item.cloud, kinds[label])), max(options.counts))
-                return images.to_uint8(drawn_of(model, cloud, views_of(item, 1, options.resolution))[0][0])
-
-            return results_folder.kept(options.out / "pictures" / f"{name}_{label}.png".replace(" ", "_"), make)
-
-        reference = view_of(item, 0, options.resolution)[1]
-        cells.append([on_white(reference)[0], *map(picture, kinds)])
-    sheet = figures.grid(cells, ["reference", *kinds], names, size=cells[0][0].shape[0])
-    images.write_whole(options.out / "gallery.png", images.png(sheet))
+    seen = cut(item, views=options.views, resolution=options.resolution)
+    seen = dataclasses.replace(seen, cloud=thinned(cleaned(*spoiled(item.cloud, fault)), count))
+    pictures = renderer.method("poisson_trimmed").show(seen)
+    return {"poisson": scores.mean_of(seen, pictures, COLUMNS)}, np.asarray(pictures.image[0])
 
 
 if __name__ == "__main__":

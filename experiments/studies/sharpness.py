@@ -13,142 +13,40 @@ reference's opacity.
     OUT/gallery.png   OUT/ID.png                 references and pictures beside each other, at full size
 """
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from time import perf_counter
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from tqdm import tqdm
 
-from data_gen.store import layout
 from experiments import entry_point
-from experiments.comparison import figures, results_folder
-from experiments.comparison.object_views import Picture, at, cut, drawn, on_white, told, view_of
-from experiments.comparison.poisson import Renderer, trimmed_surface
+from experiments.comparison import contenders, results_folder, scores
+from experiments.comparison.contenders import Method
+from experiments.comparison.poisson import Renderer
+from experiments.comparison.scores import Measure, Measured
+from experiments.comparison.study_objects import cut
 from spnr_jax.config import Quality
 from spnr_jax.devices import runtime
-from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets, images
-from spnr_jax.kernels import metrics
+from spnr_jax.formats.data_sets import Dataset, ObjectData
 from spnr_jax.kernels.records import PointCloud
 from spnr_jax.method.model import Model
-from spnr_jax.methods import method_of
-from spnr_jax.scoring.picture_scores import ball, ball_waves, blue_share, flip, plate, sharpness, under_true_opacity
-from spnr_jax.scoring.report import Cell, Table, mean_row, number
-from spnr_jax.training.weights import load
+from spnr_jax.scoring.evaluation import Pictures
+from spnr_jax.scoring.picture_scores import ball, ball_waves, blue_share, plate, sharpness, under_true_opacity
+from spnr_jax.scoring.report import Cell, Table, number
 
-
-class Drawn(NamedTuple):
-    """Pictures of an object's views, and seconds: to encode it, and of a picture once all is compiled."""
-
-    pictures: list[Picture]
-    encode: float | None
-    render: float | None
-
-
-@dataclass(frozen=True)
-class Network:
-    """A trained network at a quality; `draft` of the one over surfels is discs and light alone."""
-
-    label: str
-    model: Model
-    quality: Quality
-
-    def draw(self, item: data_sets.ObjectData, resolution: int | None) -> Drawn:
-        """The pictures, drawn twice: the second time is measured."""
-        self.model.encode(item.cloud)
-        begin = perf_counter()
-        volume = self.model.encode(item.cloud)
-        jax.block_until_ready(jax.tree.leaves(volume.scene))
-        encode = perf_counter() - begin
-        views = [view_of(item, view, resolution)[0] for view in range(len(item.images))]
-        for _ in range(2):
-            begin = perf_counter()
-            found = drawn(self.model, volume, views, self.quality)
-            seconds = (perf_counter() - begin) / len(views)
-        size = views[0].height, views[0].width
-        return Drawn([(image, resized(opacity, size)) for image, opacity in found], encode, seconds)
-
-
-@dataclass(frozen=True)
-class Poisson:
-    """Trimmed Poisson surfaces, path-traced by Mitsuba in the light of the data set."""
-
-    label: str
-    renderer: Renderer
-
-    def draw(self, item: data_sets.ObjectData, resolution: int | None) -> Drawn:
-        """The pictures; empty ones where the points span no surface."""
-        begin = perf_counter()
-        asset = trimmed_surface(item.cloud)
-        middle = perf_counter()
-        rgba = self.renderer.drawn(asset, item) if asset.parts else np.zeros_like(item.images)
-        seconds = (perf_counter() - middle) / len(rgba)
-        return Drawn([on_white(at(picture, resolution)) for picture in rgba], middle - begin, seconds)
-
-
-@dataclass(frozen=True)
-class Elsewhere:
-    """Pictures that another program made of the same points and cameras: FOLDER/POINTS/ID/000.png, a view each."""
-
-    label: str
-    folder: Path
-
-    def draw(self, item: data_sets.ObjectData, resolution: int | None) -> Drawn:
-        """The pictures, read; UserError for one that is missing or of another size."""
-        place, found = self.folder / str(len(item.cloud.positions)) / item.name, []
-        for view in range(len(item.images)):
-            path = place / f"{view:03d}.png"
-            picture = layout.read_image(path)
-            if picture.shape != item.images[view].shape:
-                raise UserError(
-                    f"{path}: {picture.shape}, expected {item.images[view].shape}: RGBA like the references"
-                )
-            found.append(on_white(at(picture, resolution)))
-        return Drawn(found, None, None)
-
-
-Method = Network | Poisson | Elsewhere
-
-
-def methods(
-    runs: Sequence[str], poisson: bool, folders: Sequence[Path], dataset: data_sets.Dataset
-) -> tuple[Method, ...]:
-    """The methods of a study by their order in its tables."""
-    found: list[Method] = []
-    for run in runs:
-        model = load(run)
-        found.append(Network(run, model, "best"))
-        if method_of(model.config).takes_light:
-            found.append(Network(f"{run}, discs and light alone", model, "draft"))
-    if poisson:
-        found.append(Poisson("Poisson, trimmed", Renderer(dataset.settings)))
-    return (*found, *(Elsewhere(folder.name, folder) for folder in folders))
-
-
-def resized(opacity: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """An opacity at the size of its picture: the paper's network has it at half of that."""
-    return opacity if opacity.shape == size else np.asarray(jax.image.resize(jnp.asarray(opacity), size, "linear"))
-
-
-COLUMNS = {  # scores of a view: heads, decimals
-    "psnr": ("PSNR, dB", 2),
-    "psnr_inside": ("inside, dB", 2),
-    "outline_rmse": ("outline RMSE", 3),
-    "holes": ("holes, %", 2),
-    "detail": ("detail", 3),
-    "ssim": ("SSIM", 3),
-    "flip": ("FLIP", 4),
+COLUMNS = {
+    **{name: column for name, column in scores.COLUMNS.items() if name != "iou"},
     "psnr_true_opacity": ("PSNR, true opacity", 2),
     "inside_true_opacity": ("inside, true opacity", 2),
 }
-HEADS = (*(head for head, _ in COLUMNS.values()), "encode, s", "a picture, s")
 KNOWN_SIZE = 512  # pixels along each side of ball and plate
-KNOWN_HEADS = ("ball: waves", "plate: blue share")
+HEADS = (*(head for head, _ in COLUMNS.values()), "encode, s", "a picture, s", "ball: waves", "plate: blue share")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -183,115 +81,105 @@ def main(options: SharpnessStudy) -> None:
     """Draws, scores and writes."""
     dataset = data_sets.open_dataset(options.data)
     names = dataset.splits["test"][: options.objects]
-    asked = {"runs": list(options.runs), "counts": list(options.counts), "views": options.views, "objects": list(names)}
-    results_folder.claim(
-        options.out, "sharpness", asked | {"resolution": options.resolution, "normals": options.normals}, dataset
-    )
-    compared = methods(options.runs, options.poisson, options.elsewhere, dataset)
+    asked = {name: getattr(options, name) for name in ("runs", "counts", "views", "resolution", "normals")}
+    results_folder.claim(options.out, "sharpness", asked | {"objects": names}, dataset)
+    models = contenders.of_runs(options.runs)
+    compared = {label: contenders.of_model(*model) for label, model in models.items()}
+    if options.poisson:
+        compared["Poisson, trimmed"] = Renderer(dataset.settings).method("poisson_trimmed")
+    compared |= {folder.name: contenders.elsewhere(folder) for folder in options.elsewhere}
     rows, known = {}, {}
-    for method in compared:
+    for label, method in compared.items():
         for count in options.counts:
-            row = f"{method.label}, {count:,}"
-            rows[row] = [
-                _kept_scores(options, dataset, name, method, count) for name in tqdm(names, desc=f"{row} points")
-            ]
-            known[row] = _known(options, method, count)
-    _pictures(options, dataset, compared, options.shown or names[:4])
+            row = f"{label}, {count:,}"
+            rows[row] = partial(measure, options, method, count)
+            known[row] = _known(options, label, models[label], count) if label in models else {}
+    shown = options.shown or names[:4]
+    found = scores.measure_rows(options.out, rows, dataset, names, shown)
+    _pictures(options, dataset, rows, shown)
     table = Table(
         title=f"Sharpness, {len(names)} objects x {options.views} views",
-        heads=(*HEADS, *KNOWN_HEADS),
-        rows=tuple(_row(name, found, known[name]) for name, found in rows.items()),
+        heads=HEADS,
+        rows=tuple(_row(row, objects, known[row]) for row, objects in found.items()),
         note="Means over objects with 95 % intervals; a true plate shows a blue share of .077.",
     )
-    results_folder.write(options.out, {"objects": rows, "known": known, "hardware": runtime.hardware()}, [table])
+    results_folder.write(options.out, {"objects": found, "known": known, "hardware": runtime.hardware()}, [table])
 
 
-def _kept_scores(
-    options: SharpnessStudy, dataset: data_sets.Dataset, name: str, method: Method, count: int
-) -> dict[str, float | None]:
+def measure(options: SharpnessStudy, method: Method, count: int, item: ObjectData) -> Measured:
     """Mean scores of an object's views, seconds to encode it and to draw one."""
-
-    def make() -> dict[str, float | None]:
-        item = cut(data_sets.read_object(dataset, name), count, options.views, options.normals)
-        drawn = method.draw(item, options.resolution)
-        scores = [
-            all_scores(*picture, view_of(item, view, options.resolution)[1])
-            for view, picture in enumerate(drawn.pictures)
-        ]
-        means = {column: _mean(np.array([of[column] for of in scores])) for column in COLUMNS}
-        return means | {"encode": drawn.encode, "render": drawn.render}
-
-    return results_folder.kept(options.out / "scores" / _folder(method) / f"{name}_{count}.json", make)
+    item = cut(item, count, options.views, options.resolution, options.normals)
+    pictures, seconds = draw_timed(method, item)
+    found = scores.score_views(item, pictures) | oracle(item, pictures)
+    means = scores.mean_scores({name: found[name] for name in COLUMNS})
+    return means | seconds, np.asarray(pictures.image[0])
 
 
-def _folder(method: Method) -> str:
-    return method.label.replace("/", "_")
+def draw_timed(method: Method, item: ObjectData) -> tuple[Pictures, dict[str, float | None]]:
+    """The pictures, and seconds to encode and of a view, once all is compiled."""
+    for _ in range(1 + method.compiles):
+        begin = perf_counter()
+        scene = method.encode(item)
+        jax.block_until_ready(jax.tree.leaves(scene))
+        middle = perf_counter()
+    encode = middle - begin
+    for _ in range(1 + method.compiles):
+        begin = perf_counter()
+        pictures = method.draw(scene, item)
+        render = (perf_counter() - begin) / len(item.images)
+    encode_s, render_s = (encode, render) if method.timed else (None, None)
+    return scores.enlarge(pictures, item.images.shape[1:3]), {"encode": encode_s, "render": render_s}
 
 
-def _mean(values: np.ndarray) -> float | None:
-    """The mean of the numbers among them."""
-    numbers = values[~np.isnan(values)]
-    return float(numbers.mean()) if len(numbers) else None
-
-
-def all_scores(image: np.ndarray, opacity: np.ndarray, reference: np.ndarray) -> dict[str, float]:
-    """The scores of a picture by the names in COLUMNS."""
-    white = on_white(reference)[0]
-    oracle = sharpness(under_true_opacity(image, opacity, reference), reference[..., 3], reference)
-    return sharpness(image, opacity, reference)._asdict() | {
-        "ssim": float(metrics.ssim(jnp.asarray(image), jnp.asarray(white))),
-        "flip": float(flip(image, white)),
-        "psnr_true_opacity": oracle.psnr,
-        "inside_true_opacity": oracle.psnr_inside,
+def oracle(item: ObjectData, pictures: Pictures) -> dict[str, list[float]]:
+    """PSNR of the same colours under the true opacity."""
+    found = []
+    for image, opacity, rgba in zip(pictures.image, pictures.acc, item.images, strict=True):
+        reference = rgba.astype(np.float32) / 255
+        right = under_true_opacity(np.asarray(image), np.asarray(opacity), reference)
+        found.append(sharpness(right, reference[..., 3], reference))
+    return {
+        "psnr_true_opacity": [one.psnr for one in found],
+        "inside_true_opacity": [one.psnr_inside for one in found],
     }
 
 
-def _known(options: SharpnessStudy, method: Method, count: int) -> dict[str, float | None]:
-    """Scores of the ball and the plate, of networks."""
-    if not isinstance(method, Network):
-        return {}
+def _known(options: SharpnessStudy, label: str, model: tuple[Model, Quality], count: int) -> dict[str, float | None]:
+    """Scores of a network's ball and plate."""
+    network, quality = model
 
     def of(cloud: PointCloud, score: Any, **view: float) -> float | None:
-        model = method.model
-        volume = model.encode(told(cloud, options.normals))
-        rendering = model.render(volume, model.camera(volume, resolution=KNOWN_SIZE, **view), method.quality)
-        image = np.asarray(rendering.image)
-        return _mean(np.array([score(image, resized(np.asarray(rendering.acc), image.shape[:2]))]))
+        cloud = cloud if options.normals else dataclasses.replace(cloud, normals=None)
+        volume = network.encode(cloud)
+        rendering = network.render(volume, network.camera(volume, resolution=KNOWN_SIZE, **view), quality)
+        one = Pictures(image=np.asarray(rendering.image)[None], acc=np.asarray(rendering.acc)[None])
+        one = scores.enlarge(one, one.image.shape[1:3])
+        return scores.mean_scores({"": [score(one.image[0], one.acc[0])]})[""]
 
     def make() -> dict[str, float | None]:
         front = {"azimuth": 0.0, "elevation": 0.0}
         return {"ball": of(ball(count), ball_waves), "plate": of(plate(count), blue_share, **front)}
 
-    return results_folder.kept(options.out / "known" / _folder(method) / f"{count}.json", make)
+    place = scores.place_of(options.out, f"known/{label}", str(count), ".json")
+    return results_folder.kept(place, make)
 
 
 def _row(
-    name: str, found: Sequence[Mapping[str, float | None]], known: Mapping[str, float | None]
+    row: str, found: Sequence[Mapping[str, float | None]], known: Mapping[str, float | None]
 ) -> tuple[str, tuple[Cell, ...]]:
-    columns = COLUMNS.items()
-    _, cells = mean_row(name, [[of[column] for column, _ in columns] for of in found], [n for _, (_, n) in columns])
     seconds = ([x for of in found if (x := of[what]) is not None] for what in ("encode", "render"))
     times = (number(float(np.median(taken)) if taken else None, 2) for taken in seconds)
-    return name, (*cells, *times, number(known.get("ball"), 4), number(known.get("plate"), 3))
+    label, cells = scores.score_row(row, found, COLUMNS)
+    return label, (*cells, *times, number(known.get("ball"), 4), number(known.get("plate"), 3))
 
 
-def _pictures(
-    options: SharpnessStudy, dataset: data_sets.Dataset, compared: Sequence[Method], names: Sequence[str]
-) -> None:
+def _pictures(options: SharpnessStudy, dataset: Dataset, rows: Mapping[str, Measure], names: Sequence[str]) -> None:
     """A sheet of each shown object at full size, and one of all, smaller."""
-    cells = []
-    heads = ["reference", *(f"{method.label}, {count:,} points" for method in compared for count in options.counts)]
+    draw = partial(scores.gallery, options.out, rows, dataset)
     for name in names:
-        item = data_sets.read_object(dataset, name)
-        row = [
-            method.draw(cut(item, count, 1, options.normals), options.resolution).pictures[0][0]
-            for method in compared
-            for count in options.counts
-        ]
-        cells.append([on_white(view_of(item, 0, options.resolution)[1])[0], *row])
-        full = figures.grid([cells[-1]], heads, size=cells[-1][0].shape[0])
-        images.write_whole(options.out / f"{name}.png", images.png(full))
-    images.write_whole(options.out / "gallery.png", images.png(figures.grid(cells, heads, names, size=192)))
+        size = options.resolution or data_sets.read_object(dataset, name).camera.height
+        images.write_whole(options.out / f"{name}.png", draw([name], options.resolution, size))
+    images.write_whole(options.out / "gallery.png", draw(names, options.resolution, 192))
 
 
 if __name__ == "__main__":

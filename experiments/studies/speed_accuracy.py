@@ -19,35 +19,35 @@ front       settings of a size that no other beats in both PSNR and ms a view; i
 import dataclasses
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import tyro
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 
-from data_gen.render import poisson_surface
 from experiments import entry_point
-from experiments.comparison import clock, figures, poisson, results_folder
-from experiments.comparison.object_views import few, on_white, told, view_of
-from experiments.comparison.trained_networks import test_objects
+from experiments.comparison import clock, figures, poisson, results_folder, scores
+from experiments.comparison.contenders import draw_volume
+from experiments.comparison.scores import Measured
+from experiments.comparison.study_objects import cut, test_objects
 from spnr_jax import cli
 from spnr_jax.config import NetworkConfig, Quality
 from spnr_jax.devices import runtime
 from spnr_jax.formats import data_sets
-from spnr_jax.kernels import cameras, metrics
-from spnr_jax.kernels.records import Camera, Rendering, Volume
+from spnr_jax.formats.data_sets import Dataset, ObjectData
+from spnr_jax.kernels import cameras
+from spnr_jax.kernels.records import Volume
 from spnr_jax.method.model import Model
-from spnr_jax.scoring.picture_scores import flip
 from spnr_jax.scoring.report import Table, number, text
 from spnr_jax.training.weights import load
 
+COLUMNS = ("psnr", "ssim", "flip", "iou")
 SHARES = (0.75, 0.5, 0.25)  # of the pixels along a side that are drawn; the picture is enlarged from there
 
 
@@ -120,11 +120,6 @@ def knee(rows: Sequence[dict], chosen: Sequence[int]) -> int:
     y = np.array([rows[i]["psnr"] for i in chosen])
     x, y = ((v - v[0]) / (v[-1] - v[0]) if v[-1] != v[0] else np.zeros_like(v) for v in (x, y))
     return chosen[int(np.argmax(y - x))]
-
-
-def both(rows: Sequence[dict]) -> tuple[Table, Table]:
-    """All settings of a size, and the front alone."""
-    return table(rows, front(rows)), steps(rows, front(rows))
 
 
 def table(rows: Sequence[dict], chosen: Sequence[int]) -> Table:
@@ -204,8 +199,6 @@ def _scatter(axes: Axes, rows: Sequence[dict], y: str) -> None:
     axes.set_ylabel(LABELS[y])
 
 
-Result = TypeVar("Result")
-Scores = dict[str, float]
 Volumes = dict[tuple[str, int, str], tuple[Volume, float]]  # of object, points, precision: encoded, in so many ms
 REPEATS = 2
 TIMED_OBJECTS = 4
@@ -235,48 +228,29 @@ class SpeedAccuracy:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Surface:
-    """A surface through so many points (`comparison/poisson.py`)."""
-
-    kind: str
-    name: str
-    points: int
-    group: str = "surface"
-
-
-@dataclass(frozen=True, kw_only=True)
-class Job:
+class Row:
     """A setting at a size, and what measures it."""
 
-    number_of_run: int
+    number: int
     run: str
     size: int
-    way: Setting | Surface
-    make: Callable[[], Scores]
+    group: str
+    name: str
+    points: int
+    measure: scores.Measure
 
-    def row(self) -> dict[str, Any]:
-        """What tables and plots call it."""
-        return {"run": self.run, "size": self.size, "group": self.way.group, "name": self.way.name}
+    @property
+    def place(self) -> str:
+        """The name of its folder."""
+        return f"{self.number} {self.size} {self.points} {self.name}"
 
-    def kept(self, out: Path) -> Scores:
-        """What was measured; it is measured if it was not."""
-        name = f"{self.number_of_run} {self.size} {self.way.points} {self.way.name}.json"
-        return results_folder.kept(out / "settings" / name, self.make)
-
-
-@dataclass
-class Drawn:
-    """What was measured of one setting, object by object."""
-
-    scores: list[dict[str, float]] = field(default_factory=list)
-    view_ms: list[float] = field(default_factory=list)
-    encode_s: list[float] = field(default_factory=list)
-
-    def means(self) -> Scores:
+    def summary(self, objects: Sequence[dict]) -> dict[str, Any]:
         """Means of the scores, medians of the times."""
-        found = {name: float(np.mean([of[name] for of in self.scores])) for name in self.scores[0]}
-        found |= {"ms_view": float(np.median(self.view_ms)), "s_encode": float(np.median(self.encode_s))}
-        return {name: round(value, 4) for name, value in found.items()}
+        found = {name: float(np.mean([of[name] for of in objects])) for name in COLUMNS}
+        for name in ("ms_view", "s_encode"):
+            found[name] = float(np.median([of[name] for of in objects if of[name] is not None]))
+        described = {name: getattr(self, name) for name in ("run", "size", "group", "name")}
+        return described | {name: round(value, 4) for name, value in found.items()}
 
 
 def main(options: SpeedAccuracy) -> None:
@@ -284,122 +258,89 @@ def main(options: SpeedAccuracy) -> None:
     cli.set_up_jax()
     dataset = data_sets.open_dataset(options.data)
     names = test_objects(dataset, options.objects)
-    asked = {"objects": list(names), "views": options.views, "runs": list(options.runs)}
+    asked = {"objects": names, "views": options.views, "runs": options.runs}
     results_folder.claim(options.out, "speed_accuracy", asked, dataset)
-    numbers = range(len(options.runs))
-    jobs = [job for number_of_run in numbers for job in jobs_of(number_of_run, options, dataset, names)]
-    for job in sorted(jobs, key=lambda job: job.way.group not in ("level", "surface")):  # the most telling ones first
-        scores, what = job.kept(options.out), f"{job.run}, {job.size} px, {job.way.name}"
-        print(f"{what}: {scores['psnr']:.2f} dB, {scores['ms_view']:.1f} ms", flush=True)
-    rows = [job.row() | job.kept(options.out) for job in jobs]
-    found = {"hardware": runtime.hardware(), "load": runtime.load(), "date": time.strftime("%Y-%m-%d"), "rows": rows}
-    tables = [made for size in options.sizes if (of := [r for r in rows if r["size"] == size]) for made in both(of)]
-    fronts = [[r for r in rows if r["size"] == size] for size in options.sizes]
-    picture = plot([(of, front(of), knee(of, front(of))) for of in fronts if of])
+    rows = [row for number in range(len(options.runs)) for row in rows_of(number, options, dataset, names)]
+    telling = sorted(rows, key=lambda row: row.group not in ("level", "surface"))  # the most telling ones first
+    measured = scores.measure_rows(options.out, {row.place: row.measure for row in telling}, dataset, names)
+    found = [row.summary(measured[row.place]) for row in rows]
+    whole = {"hardware": runtime.hardware(), "load": runtime.load(), "date": time.strftime("%Y-%m-%d"), "rows": found}
+    sizes = [of for size in options.sizes if (of := [row for row in found if row["size"] == size])]
+    fronts = [(of, front(of), knee(of, front(of))) for of in sizes]
+    tables = [made for of, chosen, _ in fronts for made in (table(of, chosen), steps(of, chosen))]
     note = f"{len(names)} objects x {options.views} views, {options.counts[0]:,} points where nothing else is said."
-    notes = [note, f"{found['hardware']}, load {found['load']}, {found['date']}."]
-    results_folder.write(options.out, found, tables, notes, {"front.png": picture})
+    notes = [note, f"{whole['hardware']}, load {whole['load']}, {whole['date']}."]
+    results_folder.write(options.out, whole, tables, notes, {"front.png": plot(fronts)})
 
 
-def jobs_of(number_of_run: int, options: SpeedAccuracy, dataset: data_sets.Dataset, names: Sequence[str]) -> list[Job]:
+def rows_of(number: int, options: SpeedAccuracy, dataset: Dataset, names: Sequence[str]) -> list[Row]:
     """All settings of a network or a surface at all sizes."""
-    run = options.runs[number_of_run]
-    seen: dict[str, Any] = {"dataset": dataset, "names": names, "views": options.views}
-    counts = options.counts[:1] if options.quick else options.counts
-    made: list[tuple[Setting | Surface, Callable[..., Scores]]]
+    run = options.runs[number]
+    row: Callable[..., Row] = partial(Row, number=number, run=run)
     if run in poisson.SURFACES:
-        surfaces = [Surface(kind=run, points=count, name=f"{count:,} points") for count in counts]
-        made = [(surface, partial(measure_surface, surface, **seen)) for surface in surfaces]
-    else:
-        model, volumes = load(run), Volumes({})
-        ways = settings(model.config, options.counts)
-        ways = ways[:: max(len(ways) // 3, 1)] if options.quick else ways
-        made = [(way, partial(measure, model, way, volumes=volumes, **seen)) for way in ways]
+        counts = options.counts[:1] if options.quick else options.counts
+        renderer = poisson.Renderer(dataset.settings)
+        return [
+            row(
+                size=size,
+                group="surface",
+                name=f"{count:,} points",
+                points=count,
+                measure=partial(measure_surface, renderer, run, count, options.views, size),
+            )
+            for size in options.sizes
+            for count in counts
+        ]
+    model, volumes = load(run), Volumes({})
+    ways = settings(model.config, options.counts)
+    ways = ways[:: max(len(ways) // 3, 1)] if options.quick else ways
     return [
-        Job(number_of_run=number_of_run, run=run, size=size, way=way, make=partial(one, size=size))
+        row(
+            size=size,
+            group=way.group,
+            name=way.name,
+            points=way.points,
+            measure=partial(measure, model, way, volumes, names[:TIMED_OBJECTS], options.views, size),
+        )
         for size in options.sizes
-        for way, one in made
+        for way in ways
     ]
 
 
 def measure(
-    model: Model,
-    way: Setting,
-    dataset: data_sets.Dataset,
-    names: Sequence[str],
-    views: int,
-    volumes: Volumes,
-    size: int,
-) -> Scores:
-    """Mean scores over the objects' pictures and times of one setting at one size."""
-    model, found = dataclasses.replace(model, config=way.config), Drawn()
-    for number_of_object, name in enumerate(names):
-        item = data_sets.read_object(dataset, name)
-        cloud = told(data_sets.first_points(item, way.points), normals=False)
-        key = name, way.points, getattr(way.config, "precision", "")
-        if key not in volumes:  # samples and sizes share it
-            model.encode(cloud)
-            volumes[key] = timed(partial(model.encode, cloud))
-        volume, ms = volumes[key]
-        pairs = [view_of(item, view, size) for view in range(min(views, len(item.images)))]
-        drawn = max(round(way.share * size / 4) * 4, 16) if way.config.any_size else way.config.image_resolution
-        asked = [cameras.resize(camera, drawn, drawn) if drawn != size else camera for camera, _ in pairs]
-        film = partial(_film, model, volume, asked, way.quality)
-        for rendering, (_, reference) in zip(film(), pairs, strict=True):
-            found.scores.append(_scores(np.asarray(rendering.image), np.asarray(rendering.acc), reference))
-        found.encode_s.append(ms / 1e3)
-        if number_of_object < TIMED_OBJECTS:
-            _time_views(found, film)
-    return found.means()
+    model: Model, way: Setting, volumes: Volumes, timed: Sequence[str], views: int, size: int, item: ObjectData
+) -> Measured:
+    """Mean scores of an object's pictures and times of one setting at one size; `timed` are objects."""
+    model = dataclasses.replace(model, config=way.config)
+    item = cut(item, way.points, views, size)
+    key = item.name, way.points, getattr(way.config, "precision", "")
+    if key not in volumes:  # samples and sizes share it
+        model.encode(item.cloud)
+        volumes[key] = take_time(partial(model.encode, item.cloud))
+    volume, ms = volumes[key]
+    drawn = max(round(way.share * size / 4) * 4, 16) if way.config.any_size else way.config.image_resolution
+    small = item if drawn == size else dataclasses.replace(item, camera=cameras.resize(item.camera, drawn, drawn))
+    film = partial(draw_volume, model, volume, small, way.quality)
+    found = scores.mean_of(item, film(), COLUMNS) | {"s_encode": ms / 1e3, "ms_view": None}
+    if item.name in timed:
+        found["ms_view"] = min(take_time(film)[1] for _ in range(REPEATS)) / len(item.images)
+    return found, item.images[0]
 
 
 def measure_surface(
-    surface: Surface, dataset: data_sets.Dataset, names: Sequence[str], views: int, size: int
-) -> Scores:
+    renderer: poisson.Renderer, surface: str, points: int, views: int, size: int, item: ObjectData
+) -> Measured:
     """The same of a surface through the points, drawn by Mitsuba as the references were; loading it is in its time."""
-    described = dataset.settings | {"settings": dataset.settings["settings"] | {"resolution": size}}
-    renderer, found = poisson.Renderer(described), Drawn()
-    for name in names:
-        item = data_sets.read_object(dataset, name)
-        cloud = jax.tree.map(lambda x: np.asarray(x)[: surface.points], item.cloud)
-        pairs = [view_of(item, view, size) for view in range(min(views, len(item.images)))]
-        asset, ms = timed(partial(poisson_surface.reconstruct, cloud, poisson.SURFACES[surface.kind]))
-        found.encode_s.append(ms / 1e3)
-        pictures, ms = timed(partial(renderer.drawn, asset, few(item, views)))
-        found.view_ms.append(ms / len(pairs))
-        for picture, (_, reference) in zip(pictures, pairs, strict=True):
-            found.scores.append(_scores(data_sets.on_white(picture), picture[..., 3] / 255, reference))
-    return found.means()
+    item, method = cut(item, points, views, size), renderer.method(surface)
+    asset, encode = take_time(partial(method.encode, item))
+    pictures, ms = take_time(partial(method.draw, asset, item))
+    return scores.mean_of(item, pictures, COLUMNS) | {
+        "s_encode": encode / 1e3,
+        "ms_view": ms / len(item.images),
+    }, item.images[0]
 
 
-def _scores(image: np.ndarray, opacity: np.ndarray, reference: np.ndarray) -> dict[str, float]:
-    """Of a picture, enlarged to its reference (RGBA) where it is smaller."""
-    shape = reference.shape[:2]
-    image = np.clip(np.asarray(jax.image.resize(image, (*shape, 3), "cubic")), 0, 1)
-    opacity = np.asarray(jax.image.resize(opacity, shape, "linear"))
-    white = on_white(reference)[0]
-    return {
-        "psnr": float(metrics.psnr(jnp.asarray(image), jnp.asarray(white))),
-        "ssim": float(metrics.ssim(jnp.asarray(image), jnp.asarray(white))),
-        "flip": float(flip(image, white)),
-        "iou": float(metrics.opacity_iou(jnp.asarray(opacity), jnp.asarray(reference[..., 3]))),
-    }
-
-
-def _film(model: Model, volume: Volume, views: Sequence[Camera], quality: Quality) -> list[Rendering]:
-    return list(model.render_each(volume, views, quality))
-
-
-def _time_views(found: Drawn, draw: Callable[[], list[Rendering]]) -> None:
-    """Adds the time of a view of those that are drawn, which were drawn before."""
-    taken = []
-    for _ in range(REPEATS):
-        views, ms = timed(draw)
-        taken.append(ms / len(views))
-    found.view_ms.append(min(taken))
-
-
-def timed(work: Callable[[], Result]) -> tuple[Result, float]:
+def take_time(work: Callable[[], Any]) -> tuple[Any, float]:
     """What the work gives, and its milliseconds: of the processor, where that is what computes."""
     start = clock.now()
     result = jax.block_until_ready(work())

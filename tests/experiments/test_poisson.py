@@ -13,9 +13,7 @@ from data_gen.render import light, views
 from data_gen.render.poisson_surface import PoissonConfig
 from data_gen.store import layout
 from experiments.comparison import poisson
-from experiments.comparison.object_views import at, cut, on_white
-from experiments.studies import speed_accuracy
-from experiments.studies.sharpness import Poisson
+from experiments.comparison.study_objects import cut
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.mesh import surface_points
 from spnr_jax.formats.mesh.assets import Asset
@@ -66,51 +64,26 @@ def dataset(tmp_path_factory):
 @needs_solver
 def test_a_ball_is_rendered_as_its_reference_and_a_line_is_an_empty_picture_with_the_reason(dataset, tmp_path):
     found = data_sets.open_dataset(dataset)
-    items = {name: data_sets.read_object(found, name) for name in ("ball", "line")}
+    items = {name: cut(data_sets.read_object(found, name), 500) for name in ("ball", "line")}
     renderer = poisson.Renderer(found.settings, variant="scalar_rgb")
-    show = partial(poisson.show, renderer, 500, PoissonConfig(depth=6), tmp_path)
+    show = partial(poisson.keep_pictures, renderer, PoissonConfig(depth=6), tmp_path, None)
     shown = {name: show(item) for name, item in items.items()}
     error = shown["ball"].image - data_sets.on_white(items["ball"].images)
     assert -10 * np.log10(np.square(error).mean()) > 30
     assert (shown["line"].acc == 0).all()
+    assert (shown["line"].image == 1).all()
     reasons = {name: json.loads((tmp_path / name / "made.json").read_text())["empty"] for name in items}
     assert reasons["ball"] == ""
     assert "500 points on one line" in reasons["line"]
-    pictures = sorted(tmp_path.rglob("*.png"))
-    assert [path.relative_to(tmp_path).as_posix() for path in pictures] == [
-        *("ball/000.png", "ball/001.png", "line/000.png", "line/001.png")
-    ]
-    written = [path.stat().st_mtime_ns for path in pictures]
+    pictures = {path.relative_to(tmp_path).as_posix(): path.stat().st_mtime_ns for path in tmp_path.rglob("*.png")}
+    assert sorted(pictures) == ["ball/000.png", "ball/001.png", "line/000.png", "line/001.png"]
     show(items["ball"])  # nothing is left to do
-    assert [path.stat().st_mtime_ns for path in pictures] == written
-
-
-@needs_solver
-def test_the_sharpness_study_draws_the_same_surfaces_of_the_first_points_and_views(dataset, monkeypatch):
-    coarse = replace(poisson.SURFACES["poisson_trimmed"], depth=6)
-    monkeypatch.setitem(poisson.SURFACES, "poisson_trimmed", coarse)
-    found = data_sets.open_dataset(dataset)
-    renderer = poisson.Renderer(found.settings, variant="scalar_rgb")
-    surfaces, item = Poisson("Poisson", renderer), data_sets.read_object(found, "ball")
-    (image, opacity), *more = surfaces.draw(cut(item, 500, 1, normals=False), None).pictures
-    expected, _ = renderer.pictures(item, 500, poisson.SURFACES["poisson_trimmed"])
-    assert not more
-    np.testing.assert_array_equal(image, on_white(at(expected[0], None))[0])
-    assert opacity.max() == 1
-    half = surfaces.draw(cut(item, 500, 1, normals=False), VIEW.resolution // 2).pictures[0][1]
-    np.testing.assert_allclose(half.mean(), opacity.mean(), atol=1e-5)
-    (image, opacity), *_ = surfaces.draw(data_sets.read_object(found, "line"), None).pictures
-    assert (image == 1).all()
-    assert (opacity == 0).all()
-
-
-@needs_solver
-@pytest.mark.ci
-def test_a_surface_is_scored_beside_the_settings_of_networks(dataset):
-    surface = speed_accuracy.Surface(kind="poisson", name="500 points", points=500)
-    found = speed_accuracy.measure_surface(surface, data_sets.open_dataset(dataset), ["ball"], 1, 16)
-    assert found["psnr"] > 25
-    assert min(found["ms_view"], found["s_encode"]) > 0
+    assert {name: (tmp_path / name).stat().st_mtime_ns for name in pictures} == pictures
+    half = renderer.draw(
+        poisson.reconstruct(items["ball"].cloud, PoissonConfig(depth=6)), cut(items["ball"], None, 1, 16)
+    )
+    assert half.shape == (1, 16, 16, 4)
+    np.testing.assert_allclose(half[..., 3].mean() / 255, shown["ball"].acc[0].mean(), atol=0.02)
 
 
 def test_the_light_has_to_be_that_of_the_data_set(tmp_path):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from support import twin
 
-from experiments.speed import twin_layout
+from experiments.speed.speed_scenes import as_batch
 from spnr_jax.config import AS_TRAINED
 from spnr_jax.kernels import cameras, compositing, losses, sampling, voxels
 from spnr_jax.method import inference, pixels
@@ -19,8 +19,8 @@ from spnr_jax.training import optimisation
 
 TOLERANCE = 1e-4
 ARRAYS = twin.load()
-CONFIG = twin_layout.train_config(twin.config(ARRAYS))
-BATCH = jax.tree.map(jnp.asarray, twin_layout.batch(twin.inputs(ARRAYS)))
+CONFIG = twin.config(ARRAYS)
+BATCH = jax.tree.map(jnp.asarray, as_batch(twin.inputs(ARRAYS)))
 GENERATOR, STATISTICS = twin.generator(ARRAYS)
 DISCRIMINATOR = twin.discriminator(ARRAYS)
 VARIABLES = {"params": GENERATOR, "batch_stats": STATISTICS}

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.comparison import trained_networks as methods
+from experiments.comparison import contenders
 from spnr_jax.scoring import evaluation
 from spnr_jax.training import checkpoint, optimisation
 from support import tiny_dataset
@@ -23,16 +23,16 @@ def fresh(preset: str) -> Path:
     return folder
 
 
-class StandIn(methods.Network):
+class StandIn(contenders.Network):
     """A grey disc with the depth of the ball behind OFFSET, darker the more points there are."""
 
-    def show(self):
+    def as_method(self):
         """The disc."""
 
-        def show(cloud, camera):
-            views, size = len(camera.cam_to_world), camera.height
+        def draw(_, item):
+            views, size = len(item.images), item.camera.height
             depth, acc = disc(size)
-            grey = np.where(acc > 0, 1 / (1 + np.log2(len(cloud.mask)) / 10), 1)
+            grey = np.where(acc > 0, 1 / (1 + np.log2(len(item.cloud.mask)) / 10), 1)
             image = np.repeat(grey[..., None], 3, axis=-1).astype(np.float32)
             return evaluation.Pictures(
                 image=np.tile(image, (views, 1, 1, 1)),
@@ -40,7 +40,7 @@ class StandIn(methods.Network):
                 depth=np.tile(depth, (views, 1, 1)),
             )
 
-        return show
+        return contenders.Method(draw=draw, identity={"steps": self.steps}, has_opacity=self.has_depth)
 
 
 def disc(size: int) -> tuple[np.ndarray, np.ndarray]:
@@ -53,7 +53,7 @@ def disc(size: int) -> tuple[np.ndarray, np.ndarray]:
     return np.where(inner > 0, depth, 4).astype(np.float32), (inner > 0).astype(np.float32)
 
 
-def stand_ins(*labels: str, checksum: str = "0") -> dict[str, methods.Network]:
+def stand_ins(*labels: str, checksum: str = "0") -> dict[str, contenders.Network]:
     """Stand-ins by label; the first word of each names its method."""
     return {
         label: StandIn(

@@ -5,13 +5,16 @@
 
 import dataclasses
 import json
+from collections.abc import Mapping
 from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.speed.twin_layout import Arrays, Config
+from experiments.speed import bench
+from spnr_jax.config import TrainConfig
 
+Arrays = Mapping[str, np.ndarray]
 FIXTURE = Path(__file__).with_name("twin_fixture.npz")
 
 
@@ -21,10 +24,16 @@ def load():
         return dict(data.items())
 
 
-def config(arrays: Arrays) -> Config:
-    """The sizes that "meta" names."""
-    named = json.loads(str(arrays["meta"]))["config"]
-    return Config(**{field.name: named[field.name] for field in dataclasses.fields(Config)})
+def config(arrays: Arrays) -> TrainConfig:
+    """The sizes that are timed as `tiny`, with the discriminator and R1 of the fixture."""
+    named, ours = json.loads(str(arrays["meta"]))["config"], bench.our_config("tiny")
+    loss = dataclasses.replace(
+        ours.loss,
+        r1_gamma=named["r1_gamma"],
+        r1_interval=named["r1_every"],
+        discriminator_width=named["disc_width"],
+    )
+    return dataclasses.replace(ours, loss=loss)
 
 
 def inputs(arrays: Arrays) -> Arrays:

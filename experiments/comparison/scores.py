@@ -1,0 +1,242 @@
+"""The engine of the studies: rows of a table, each a way to draw the test objects, measured object by object.
+
+    OUT/scores/ROW/OBJECT.json    what was measured; what is there is kept, so a stopped call goes on
+    OUT/scores/ROW/OBJECT.png     the first picture, of the objects that are shown
+
+`score_objects` is the same for methods whose pictures are scored as `spnr evaluate` scores them, in memory.
+"""
+
+import dataclasses
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from tqdm import tqdm
+
+from experiments.comparison import figures
+from experiments.comparison.contenders import Method
+from experiments.comparison.results_folder import kept
+from experiments.comparison.study_objects import cut
+from spnr_jax.config import TrainConfig
+from spnr_jax.formats import data_sets, images
+from spnr_jax.formats.data_sets import Dataset, ObjectData
+from spnr_jax.kernels import metrics
+from spnr_jax.scoring import evaluation
+from spnr_jax.scoring.evaluation import Pictures
+from spnr_jax.scoring.picture_scores import flip, sharpness
+from spnr_jax.scoring.report import Cell, duration, mean_row
+from spnr_jax.scoring.summary import Scores
+
+Measured = tuple[dict[str, Any], np.ndarray]  # what is measured of an object, and its first picture
+Measure = Callable[[ObjectData], Measured]
+COLUMNS = {  # scores of a view: heads, decimals
+    "psnr": ("PSNR, dB", 2),
+    "psnr_inside": ("inside, dB", 2),
+    "outline_rmse": ("outline RMSE", 3),
+    "holes": ("holes, %", 2),
+    "detail": ("detail", 3),
+    "ssim": ("SSIM", 3),
+    "flip": ("FLIP", 4),
+    "iou": ("opacity IoU", 3),
+}
+PROGRESS_LINES = 20
+OPAQUE = 0.5  # opacity of the reference from which a pixel lies inside the silhouette
+
+
+# --- rows that are kept -----------------------------------------------------------------------------------------------
+
+
+def measure_rows(
+    out: Path, rows: Mapping[str, Measure], dataset: Dataset, names: Sequence[str], shown: Sequence[str] = ()
+) -> dict[str, list[dict[str, Any]]]:
+    """What is measured of each object, by row; the first pictures of the objects that are shown are kept."""
+    found = {}
+    for row, measure in rows.items():
+        measured = partial(_measure, out, row, measure, dataset, shown)
+        found[row] = [
+            kept(place_of(out, row, name, ".json"), partial(measured, name)) for name in tqdm(names, desc=row)
+        ]
+    return found
+
+
+def _measure(
+    out: Path, row: str, measure: Measure, dataset: Dataset, shown: Sequence[str], name: str
+) -> dict[str, Any]:
+    found, picture = measure(data_sets.read_object(dataset, name))
+    if name in shown:
+        images.write_whole(place_of(out, row, name, ".png"), images.png(picture))
+    return found
+
+
+def place_of(out: Path, row: str, name: str, suffix: str) -> Path:
+    """The file of an object in a row."""
+    return out / "scores" / row.replace("/", "_") / f"{name}{suffix}"
+
+
+def picture_of(out: Path, row: str, measure: Measure, dataset: Dataset, name: str) -> np.ndarray:
+    """The first picture of an object in a row; it is drawn where it was not kept."""
+    place = place_of(out, row, name, ".png")
+    return kept(place, lambda: images.to_uint8(measure(data_sets.read_object(dataset, name))[1]))
+
+
+def score_views(item: ObjectData, pictures: Pictures) -> dict[str, list[float]]:
+    """The scores of COLUMNS of each view; pictures that are smaller than their references are enlarged."""
+    pictures = enlarge(pictures, item.images.shape[1:3])
+    views = [
+        score_view(np.asarray(image), np.asarray(opacity), rgba.astype(np.float32) / 255)
+        for image, opacity, rgba in zip(pictures.image, pictures.acc, item.images, strict=True)
+    ]
+    return {name: [view[name] for view in views] for name in COLUMNS}
+
+
+def enlarge(pictures: Pictures, size: tuple[int, ...]) -> Pictures:
+    """Pictures of this size; the opacity of the paper's network has half of it."""
+    image, acc = np.clip(np.asarray(pictures.image), 0, 1), np.asarray(pictures.acc)
+    if image.shape[1:3] != size:
+        image = np.clip(np.asarray(jax.image.resize(image, (len(image), *size, 3), "cubic")), 0, 1)
+    if acc.shape[1:3] != size:
+        acc = np.asarray(jax.image.resize(acc, (len(acc), *size), "linear"))
+    return Pictures(image=image, acc=acc)
+
+
+def score_view(image: np.ndarray, opacity: np.ndarray, reference: np.ndarray) -> dict[str, float]:
+    """The scores of COLUMNS of a picture beside its reference (RGBA, straight alpha); NaN where nothing is measured."""
+    white = over_white(reference)
+    return sharpness(image, opacity, reference)._asdict() | {
+        "ssim": float(metrics.ssim(jnp.asarray(image), jnp.asarray(white))),
+        "flip": float(flip(image, white)),
+        "iou": float(metrics.opacity_iou(jnp.asarray(opacity), jnp.asarray(reference[..., 3]))),
+    }
+
+
+def over_white(reference: np.ndarray) -> np.ndarray:
+    """RGB of straight-alpha float RGBA over white."""
+    return reference[..., :3] * reference[..., 3:] + 1 - reference[..., 3:]
+
+
+def mean_of(item: ObjectData, pictures: Pictures, columns: Iterable[str]) -> dict[str, Any]:
+    """Means over the views of some of the scores."""
+    found = score_views(item, pictures)
+    return mean_scores({name: found[name] for name in columns})
+
+
+def mean_scores(scores: Mapping[str, Sequence[float]]) -> dict[str, float | None]:
+    """The mean of each score over the views that have one."""
+    found = {}
+    for name, values in scores.items():
+        known = [value for value in values if not np.isnan(value)]
+        found[name] = float(np.mean(known)) if known else None
+    return found
+
+
+def score_row(
+    label: str,
+    objects: Sequence[Mapping[str, Any]],
+    columns: Mapping[str, tuple[str, int]] = COLUMNS,
+    sign: str = "",
+) -> tuple[str, tuple[Cell, ...]]:
+    """Means over objects with intervals."""
+    values = [[of.get(name) for name in columns] for of in objects]
+    return mean_row(label, values, [decimals for _, decimals in columns.values()], sign)
+
+
+def gallery(
+    out: Path, rows: Mapping[str, Measure], dataset: Dataset, names: Sequence[str], resolution: int | None, size: int
+) -> bytes:
+    """PNG: an object a row, its first reference and the picture of each row of the table."""
+    cells = [
+        [reference(dataset, name, resolution), *(picture_of(out, row, rows[row], dataset, name) for row in rows)]
+        for name in names
+    ]
+    return images.png(figures.grid(cells, ["reference", *rows], names, size=size))
+
+
+def reference(dataset: Dataset, name: str, resolution: int | None = None) -> np.ndarray:
+    """The first reference of an object on white."""
+    return data_sets.on_white(cut(data_sets.read_object(dataset, name), views=1, resolution=resolution).images[0])
+
+
+# --- methods side by side, in memory ----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shown:
+    """One view of one object: reference and the picture of each method (height, width, 3), with its PSNR."""
+
+    name: str
+    view: int
+    reference: np.ndarray
+    images: dict[str, np.ndarray]
+    psnr: dict[str, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scored:
+    """Scores by object and method, the objects to look at, and each method's seconds per view by object."""
+
+    scores: dict[str, dict[str, Scores]]
+    shown: list[Shown]
+    seconds: dict[str, list[float]]
+
+
+def score_objects(
+    methods: Mapping[str, Method],
+    config: TrainConfig,
+    dataset: Dataset,
+    names: tuple[str, ...],
+    num_shown: int,
+    more: Callable[[ObjectData, Pictures], Scores] | None = None,
+) -> Scored:
+    """All methods on these objects, with a line now and then; points and image size are the config's.
+
+    `more` scores a method's pictures of an object in other ways, too.
+    """
+    seconds: dict[str, list[float]] = {method: [] for method in methods}
+    scores, shown, to_show, start = {}, [], evaluation.spread(names, num_shown), time.monotonic()
+    for number, name in enumerate(names, start=1):
+        item = data_sets.read_object(dataset, name)
+        item = dataclasses.replace(item, cloud=data_sets.test_cloud(item, config))
+        shows = {label: timed(method, item, seconds[label]) for label, method in methods.items()}
+        result = evaluation.evaluate_object(shows, config, item)
+        for label, pictures in result.pictures.items():
+            if not methods[label].has_opacity and label not in evaluation.FLOORS:
+                del result.scores[label]["iou"]  # it predicts colours alone
+            if more:
+                result.scores[label] |= more(item, pictures)
+        scores[name] = result.scores
+        if name in to_show:
+            shown.append(shown_view(result))
+        if number % max(1, len(names) // PROGRESS_LINES) == 0 or number == len(names):
+            left = duration((time.monotonic() - start) / number * (len(names) - number))
+            print(f"scored {number} of {len(names)} objects, about {left} left", flush=True)
+    return Scored(scores=scores, shown=shown, seconds=seconds)
+
+
+def timed(method: Method, item: ObjectData, seconds: list[float]) -> evaluation.Method:
+    """The method bound to an object, noting the seconds per view until the pictures lie on the host."""
+
+    def measured(*_: object) -> Pictures:
+        start = time.monotonic()
+        pictures = method.show(item)
+        seconds.append((time.monotonic() - start) / len(pictures.image))
+        return pictures
+
+    return measured
+
+
+def shown_view(result: evaluation.ObjectResult) -> Shown:
+    """The view whose PSNR is the median of the first method's."""
+    view = evaluation.median_view(next(iter(result.scores.values()))["psnr"])
+    return Shown(
+        name=result.name,
+        view=view,
+        reference=result.reference[view],
+        images={method: np.asarray(pictures.image[view]) for method, pictures in result.pictures.items()},
+        psnr={method: float(scores["psnr"][view]) for method, scores in result.scores.items()},
+    )

@@ -1,0 +1,92 @@
+"""An object of a data set as a study asks for it: so many points and views, at a resolution; and its mesh."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from data_gen.make import objects
+from data_gen.render import views
+from spnr_jax.errors import UserError
+from spnr_jax.formats import data_sets
+from spnr_jax.formats.data_sets import Dataset, ObjectData
+from spnr_jax.formats.images import to_uint8
+from spnr_jax.formats.mesh.assets import Asset
+from spnr_jax.kernels import cameras
+from spnr_jax.kernels.records import Camera
+from spnr_jax.kernels.resizing import mean_of_squares
+from spnr_jax.scoring import evaluation
+
+
+def test_objects(dataset: Dataset, count: int | None) -> tuple[str, ...]:
+    """Test objects, evenly out of the split, or all of them; ValueError if there is none."""
+    names = dataset.splits["test"]
+    if not names:
+        raise UserError(f"{dataset.folder}: the test split is empty; generate more objects")
+    if count is not None and count < 1:
+        raise UserError(f"--objects: expected 1 or more, got {count}")
+    return evaluation.spread(names, count or len(names))
+
+
+def cut(
+    item: ObjectData,
+    points: int | None = None,
+    views: int | None = None,
+    resolution: int | None = None,
+    normals: bool = False,
+) -> ObjectData:
+    """An object with its first points and views alone (None: all), in pictures that are a whole share of its own."""
+    cloud = item.cloud if points is None else data_sets.first_points(item, points)
+    camera, images = jax.tree.map(lambda x: x[:views], item.camera), item.images[:views]
+    if resolution and resolution != camera.height:
+        if camera.height % resolution:
+            raise UserError(f"--resolution {resolution}: not a whole share of the data set's {camera.height} pixels")
+        images = shrink(images, camera.height // resolution)
+        camera = cameras.resize(camera, resolution, resolution)
+    return dataclasses.replace(
+        item,
+        cloud=cloud if normals else dataclasses.replace(cloud, normals=None),
+        camera=camera,
+        images=images,
+        conditions=item.conditions[:views],
+        lights=None if item.lights is None else item.lights[:views],
+    )
+
+
+def shrink(rgba: np.ndarray, side: int) -> np.ndarray:
+    """8-bit pictures averaged over squares of `side` pixels, colours weighted by their opacity."""
+    pictures = rgba.astype(np.float32) / 255
+    weighted = np.concatenate([pictures[..., :3] * pictures[..., 3:], pictures[..., 3:]], axis=-1)
+    weighted = np.asarray(mean_of_squares(jnp.asarray(weighted), side))
+    return to_uint8(np.concatenate([weighted[..., :3] / np.maximum(weighted[..., 3:], 1e-4), weighted[..., 3:]], -1))
+
+
+def each_view(item: ObjectData) -> list[Camera]:
+    """The cameras of an object, one by one."""
+    return [jax.tree.map(lambda x, view=view: x[view], item.camera) for view in range(len(item.images))]
+
+
+def mesh_of(dataset: Dataset, item: ObjectData, meshes: Path | None) -> Asset:
+    """The normalised mesh of an object; ValueError if it cannot be made again, or is another one by now.
+
+    `meshes` is the folder of the mesh files, where the data set was made from such.
+    """
+    seed = dataset.settings.get("settings", {}).get("seed")
+    if seed is None:
+        raise UserError(f"{dataset.folder / 'dataset.json'}: names no seed, so its meshes cannot be made again")
+    positions = np.asarray(item.cloud.positions)
+    return objects.original(details(dataset, item.name), seed, positions, meshes, dataset.spread)
+
+
+def details(dataset: Dataset, name: str) -> dict:
+    """What object.json says of an object."""
+    return json.loads((dataset.folder / "objects" / name / "object.json").read_bytes())
+
+
+def cast_views(cast: views.Caster, camera: Camera) -> np.ndarray:
+    """Distances (views, h, w) along the camera's rays, inf where they miss."""
+    rays = jax.tree.map(np.asarray, cameras.camera_rays(camera))
+    return cast(rays.origins.reshape(-1, 3), rays.directions.reshape(-1, 3)).reshape(rays.origins.shape[:3])

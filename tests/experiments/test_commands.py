@@ -1,0 +1,386 @@
+"""Every experiment runs from its data to its tables in a tiny setting, and called again makes nothing anew."""
+
+import dataclasses
+import importlib
+import json
+import math
+import shutil
+import sys
+import typing
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from support import stand_ins, tiny_dataset, tiny_surfels
+from support.handmade import ball
+from support.tiny_baselines import SHRUNKEN, SIZE
+from support.tiny_runs import L1_ONLY
+
+from data_gen.render import views
+from data_gen.store import layout
+from experiments import entry_point
+from experiments.comparison import contenders, poisson
+from experiments.comparison.variants import Budget
+from experiments.packaged import demo
+from experiments.paper import fig1, fig2, fig3, table1
+from experiments.speed import bench, gpu, where_time_goes
+from experiments.studies import inverse, point_count, relighting, sharpness
+from spnr_jax import cli, presets
+from spnr_jax.config import SurfelConfig
+from spnr_jax.formats import data_sets
+from spnr_jax.formats.mesh.assets import Asset
+from spnr_jax.scoring import evaluation
+from spnr_jax.training import weights
+
+ROOT = Path(entry_point.__file__).parent
+COMMANDS = sorted(
+    ".".join(path.relative_to(ROOT).with_suffix("").parts)
+    for path in ROOT.rglob("*.py")
+    if "entry_point.run(" in path.read_text() and path.parent != ROOT
+)
+SPLITS = {"train": (), "val": (), "test": ("ball_000000",)}
+VARIANTS = {"train": ("ball_000000", "ball_000000--1", "ball_000001")}
+SOLVER = importlib.util.find_spec("pymeshlab") is not None
+CLOCKED = {"ms_per_step", "ms_per_view", "training_seconds", "load", "date", "seconds", "costs", "losses", "tasks"}
+
+
+@pytest.fixture(autouse=True)
+def _tiny(monkeypatch):
+    """Networks and surfaces shrunken, no cache on disk, the meshes that the tiny data set's pictures show."""
+    for name, shrunken in (SHRUNKEN | {"tiny": L1_ONLY}).items():
+        monkeypatch.setitem(presets.PRESETS, name, lambda shrunken=shrunken: shrunken)
+    for name, surface in poisson.SURFACES.items():  # depth 12 takes seconds for a ball of few points
+        monkeypatch.setitem(poisson.SURFACES, name, dataclasses.replace(surface, depth=5))
+    monkeypatch.setattr(cli, "set_up_jax", lambda **_: None)
+    monkeypatch.setattr(sharpness, "KNOWN_SIZE", 48)
+    monkeypatch.setattr(contenders, "networks", lambda *_: stand_ins.stand_ins("Ours", "NPBG"))
+    monkeypatch.setattr(weights, "shipped", tiny_surfels.shipped)
+    monkeypatch.setattr(evaluation, "choose_radius", lambda *_: 1.5)
+    monkeypatch.setattr(point_count, "details", lambda *_: {"seeds": {"points": 5}})
+    for module in (fig3, point_count):
+        monkeypatch.setattr(module, "mesh_of", lambda *_: Asset(parts=(ball(radius=tiny_dataset.RADIUS, rows=64),)))
+
+
+@pytest.fixture
+def data(tmp_path):
+    """A ball lit view by view as by `--lights`, balls with settings of the generator, and some with colour variants."""
+    lit = tiny_dataset.write_dataset(tmp_path / "lit", SPLITS, tiny_surfels.SIZE)
+    lights = np.random.default_rng(0).random((tiny_dataset.VIEWS, 32, 64, 3), np.float32)
+    (lit / "objects" / "ball_000000" / "lights.npz").write_bytes(layout.encode_lights(lights))
+    described = json.loads((lit / "dataset.json").read_text())
+    described["environment_map"] = {"kinds": [{"name": "maps", "sha256": {"sky_1k.hdr": "0"}}]}
+    (lit / "dataset.json").write_text(json.dumps(described))
+    painted = tmp_path / "painted"
+    shutil.copytree(tiny_dataset.dataset().folder, painted)
+    described = {
+        "schema_version": layout.SCHEMA_VERSION,
+        "settings": vars(views.ViewConfig(resolution=SIZE, spp=4, views=tiny_dataset.VIEWS, max_depth=2)),
+        "environment_map": {"name": "procedural room", "sha256": None},
+    }
+    layout.write_text(painted / "dataset.json", layout.json_text(described))
+    elsewhere = tmp_path / "right"  # pictures of another program that are the references
+    for count in (16, 32):
+        shutil.copytree(lit / "objects" / "ball_000000" / "images", elsewhere / str(count) / "ball_000000")
+    varied = tiny_dataset.write_dataset(tmp_path / "varied", tiny_dataset.SPLITS | VARIANTS)
+    return SimpleNamespace(
+        lit=lit, painted=painted, elsewhere=elsewhere, varied=varied, run=lambda: str(tiny_surfels.run())
+    )
+
+
+def check_sharpness(found):
+    assert len(found["objects"]) == 6  # network, discs and right, two numbers of points
+    right = found["objects"]["right, 32"][0]
+    assert (right["psnr"], right["outline_rmse"]) == pytest.approx((100, 0), abs=1e-3)
+
+
+def check_relighting(found):
+    assert list(found["objects"]) == [f"sky_1k, 32, {method}" for method in relighting.METHODS]
+
+
+def check_scans(found):
+    (clean,) = found["objects"]["32, clean"]
+    assert clean["auto"] == clean["off"] != clean["draft"]
+    assert (clean["left"], found["objects"]["32, outliers 10%"][0]["left"]) == (1, 1.1)
+
+
+def check_speed_accuracy(found):
+    assert {row["size"] for row in found["rows"]} == {24, 48}
+    assert all(5 < row["psnr"] < 60 and row["ms_view"] > 0 for row in found["rows"])
+
+
+def check_point_count(found):
+    assert [row["points"] for row in found["curves"]["Ours"]["psnr"]] == [8, 64]  # 64 are new ones of the mesh
+    assert set(found["curves"]["NPBG"]) == {"psnr", "flip"}, "it has no opacity"
+
+
+def check_fig3(found):
+    assert list(found["methods"]) == ["Ours"]  # the other one predicts no depth
+    ours = {name: of["mean"] for name, of in found["methods"]["Ours"].items()}
+    for name in ("error", "median", "bias", "surface"):
+        assert ours[name] == pytest.approx(stand_ins.OFFSET, abs=3e-3)
+    assert ours["missed"] == ours["far_floaters"] == 0
+
+
+def check_ablations(found):
+    assert sorted(found["test_objects"]) == sorted(n for names in tiny_dataset.SPLITS.values() for n in names)
+    means = [found["variants"][name]["psnr"] for name in ("no_view_direction", "reference")]
+    difference = found["minus_reference"]["no_view_direction"]["psnr"]
+    assert difference["mean"] == pytest.approx(means[0] - means[1], abs=1e-5)
+
+
+def check_fig1(found):
+    assert (found["reference"], found["start"]) == ("l1_100", "2 steps of L1 alone")
+
+
+def check_fig2(found):
+    assert {name: row["training_objects"] for name, row in found["variants"].items()} == {"without": 2, "with": 3}
+
+
+def check_inverse(found):
+    for task, of in found["tasks"].items():
+        assert of["overflow"] == 0, task
+        assert np.sum(of["losses"][-1]) < np.sum(of["losses"][0]), task
+    assert set(found["gradients"]) == set(inverse.Unknowns._fields)
+    for name, pairs in found["gradients"].items():
+        for gradient, difference in pairs:
+            assert abs(difference) > 1e-4
+            assert gradient == pytest.approx(difference, rel=1e-2), name
+
+
+RUNS = {  # name -> its options, the pictures that it writes, and what is known of its results
+    "studies.sharpness": (
+        lambda data: {"data": data.lit, "runs": (data.run(),), "counts": (16, 32), "elsewhere": (data.elsewhere,)},
+        ("gallery.png", "ball_000000.png"),
+        check_sharpness,
+    ),
+    "studies.relighting": (
+        lambda data: {"data": (data.lit,), "run": data.run(), "counts": (32,), "views": 2},
+        ("gallery.png",),
+        check_relighting,
+    ),
+    "studies.scans": (
+        lambda data: {
+            **{"data": data.lit, "run": data.run(), "counts": (32,), "views": 1},
+            **{"noise": (0.02,), "outliers": (0.1,), "scanners": (2,)},
+        },
+        ("gallery.png",),
+        check_scans,
+    ),
+    "studies.speed_accuracy": (
+        lambda data: {
+            **{"data": data.lit, "runs": (data.run(),), "sizes": (24, 48), "counts": (64, 32)},
+            **{"objects": 1, "views": 1, "quick": True},
+        },
+        ("front.png",),
+        check_speed_accuracy,
+    ),
+    "studies.point_count": (
+        lambda data: {"data": data.painted, "counts": (8, 16, 64), "quick": True},
+        ("point_count.png", "strip.png"),
+        check_point_count,
+    ),
+    "paper.fig3": (
+        lambda data: {"data": data.painted, "quick": True, "variant": "scalar_rgb"},
+        ("fig3_depth.png",),
+        check_fig3,
+    ),
+    "studies.ablations": (
+        lambda data: {
+            **{"data": data.painted, "rows": ("no_view_direction",), "folds": 2},
+            "budget": Budget(steps=2, shown=2),
+        },
+        ("differences.png", "gallery.png"),
+        check_ablations,
+    ),
+    "paper.fig1": (
+        lambda data: {
+            **{"data": data.painted, "l1_weights": (0.0, 100.0), "pretrain": 2},
+            "budget": Budget(quick=True, shown=1),
+        },
+        ("differences.png", "gallery.png"),
+        check_fig1,
+    ),
+    "paper.fig2": (
+        lambda data: {"data": data.varied, "budget": Budget(quick=True)},
+        ("variants.png", "differences.png", "gallery.png"),
+        check_fig2,
+    ),
+    "studies.inverse": (lambda data: {"quick": True}, ("inverse.png", "losses.png"), check_inverse),
+}
+
+
+@pytest.mark.ci
+@pytest.mark.parametrize("name", RUNS)
+def test_a_command_ends_with_finite_numbers_and_pictures_and_goes_on_where_it_was(name, data, tmp_path):
+    options, pictures, check = RUNS[name]
+    found, out = run_twice(name, tmp_path / "out", **options(data))
+    for picture in pictures:
+        assert (out / picture).read_bytes().startswith(b"\x89PNG")
+    check(found)
+
+
+def run_twice(name, out, **options):
+    """The results of an experiment; everything in them is a finite number, and the same when it is called again."""
+    main, kind = main_of(name)
+    main(kind(out=out, **options))
+    first, files = read(out), made(out)
+    assert (out / "table.md").read_text().count("|") > 10
+    assert all(math.isfinite(x) for x in numbers(first))
+    if name != "studies.inverse":  # it keeps nothing
+        main(kind(out=out, **options))
+        assert made(out) == files
+        assert without_clock(read(out)) == without_clock(first)
+    return first, out
+
+
+def main_of(name):
+    main = importlib.import_module(f"experiments.{name}").main
+    return main, next(iter(typing.get_type_hints(main).values()))
+
+
+def read(out):
+    return json.loads((out / "results.json").read_text())
+
+
+def made(out):
+    """What stands in the folders below, and when it was made; a run notes each of its starts."""
+    return {p: p.stat().st_mtime_ns for p in out.glob("*/**/*") if p.is_file() and p.name != "run.json"}
+
+
+def numbers(found):
+    if isinstance(found, dict | list):
+        for value in found.values() if isinstance(found, dict) else found:
+            yield from numbers(value)
+    elif isinstance(found, float | int):
+        yield found
+
+
+def without_clock(found):
+    if isinstance(found, dict):
+        return {name: without_clock(value) for name, value in found.items() if name not in CLOCKED}
+    return found
+
+
+@pytest.mark.ci
+@pytest.mark.parametrize("name", COMMANDS)
+def test_a_command_explains_its_options(name, monkeypatch, capsys):
+    main, options = main_of(name)
+    monkeypatch.setattr(sys, "argv", [name, "--help"])
+    with pytest.raises(SystemExit) as ended:
+        entry_point.run(main, options, name)
+    assert ended.value.code == 0
+    assert "--out" in capsys.readouterr().out
+
+
+@pytest.mark.ci
+def test_table_1_has_the_scores_of_the_evaluation_of_its_runs(data, tmp_path):
+    rows = tuple(name for name in table1.ROWS if SOLVER or not name.startswith("poisson"))
+    asked = {"data": data.painted, "budget": "quick", "methods": rows, "variant": "scalar_rgb"}
+    found, out = run_twice("paper.table1", tmp_path / "out", **asked)
+    assert set(found["methods"]) == set(rows)
+    first = found["compared"]
+    alone = evaluation.evaluate(out / "runs" / first, data_sets.open_dataset(data.painted)).summary
+    for method in (first, *evaluation.FLOORS):
+        assert found["methods"][method] == alone["methods"][method]
+        assert method == first or found["differences"][method] == alone[f"{first}_minus"][method]
+    page = (out / "table1.html").read_text()
+    assert "http" not in page
+    assert page.count("data:image/png;base64") >= len(rows)
+
+
+@pytest.mark.ci
+def test_what_a_command_cannot_do_is_refused_by_name(data, tmp_path, monkeypatch):
+    with pytest.raises(ValueError, match="no light of their own"):
+        relighting.name_of(tiny_surfels.dataset())
+    given = {"data": data.painted, "out": tmp_path / "new", "budget": Budget(quick=True)}
+    with pytest.raises(ValueError, match="are of another network"):
+        fig1.main(fig1.Fig1(**given, init=Path("surfels")))
+    with pytest.raises(ValueError, match="spnr-data generate DIR --colour-variants 5"):
+        fig2.main(fig2.Fig2(**given))
+    assert not (tmp_path / "new").exists()
+    monkeypatch.setitem(sys.modules, "pymeshlab", None)
+    asked = {"data": data.painted, "budget": "quick", "variant": "scalar_rgb"}
+    table1.main(table1.Table1(out=tmp_path / "out", methods=("poisson", "white"), **asked))
+    found = read(tmp_path / "out")
+    assert list(found["methods"]) == ["white"]
+    assert "pip install" in found["missing"]["poisson"]
+    with pytest.raises(ValueError, match="none can be made here, not run"):
+        table1.main(table1.Table1(out=tmp_path / "alone", methods=("poisson",), **asked))
+
+
+# --- the demo, and commands that measure speed ------------------------------------------------------------------------
+
+
+@pytest.mark.ci
+def test_the_demo_writes_its_report_and_a_second_call_reuses_everything(data, tmp_path, monkeypatch, capsys):
+    small = SurfelConfig(image_resolution=tiny_dataset.SIZE, widths=(4, 6), top=4)
+    ours = dataclasses.replace(tiny_surfels.CONFIG, preset="surfels_tiny", model=small)
+    monkeypatch.setattr(presets, "tiny", lambda: tiny_dataset.CONFIG)
+    monkeypatch.setattr(presets, "surfels_tiny", lambda: ours)
+    monkeypatch.setattr(demo, "generate", lambda asked: shutil.copytree(data.painted, asked.out, dirs_exist_ok=True))
+    out = tmp_path / "out"
+    found, checkpoints = [], []
+    for _ in range(2):
+        demo.main(demo.Demo(out=out, steps=3))
+        found.append(json.loads((out / "metrics.json").read_text()))
+        checkpoints.append({path: path.stat().st_mtime_ns for path in out.glob("*/checkpoints/**/*")})
+    first, second = found
+    assert list(first["methods"]) == ["ours", "paper", "white", "splat", "nearest"]
+    assert set(first["ours_minus"]) == {"paper", "white", "splat", "nearest"}
+    assert [first["settings"]["networks"][name]["steps"] for name in ("ours", "paper")] == [3, 3]
+    parts = sum(seconds for name, seconds in first["seconds"].items() if name != "total")
+    assert first["seconds"]["total"] == pytest.approx(parts, abs=0.3)
+    assert all(name in (out / "report.html").read_text() for name in tiny_dataset.SPLITS["test"])
+    assert str(out / "report.html") in capsys.readouterr().out
+    assert {path.relative_to(out).parts[0] for path in checkpoints[0]} == {"ours", "paper"}
+    assert checkpoints[0] == checkpoints[1]
+    assert second["methods"] == first["methods"]
+    assert second["seconds"]["train"] == first["seconds"]["train"]
+
+
+def test_seconds_add_up_over_calls_and_idle_ones_add_nothing(tmp_path, monkeypatch):
+    clock = iter([0.0, 30.0, 100.0, 112.0, 200.0, 203.0, 300.0, 320.0])
+    monkeypatch.setattr(demo, "time", SimpleNamespace(monotonic=lambda: next(clock)))
+    place = tmp_path / "seconds.json"
+    for expected in (30.0, 42.0, 42.0):
+        demo.Seconds(place).measure("train", lambda: None)
+        assert json.loads(place.read_text()) == {"train": expected}
+    with pytest.raises(KeyboardInterrupt):  # work that was stopped counts
+        demo.Seconds(place).measure("train", lambda: (_ for _ in ()).throw(KeyboardInterrupt))
+    assert json.loads(place.read_text()) == {"train": 62.0}
+
+
+@pytest.mark.ci
+def test_without_torch_one_line_says_so_and_ours_is_timed_alone(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(bench.importlib.util, "find_spec", lambda name: None)
+    options = bench.Options(out=tmp_path, presets=("tiny",), modes=("encode",), rounds=2, seconds=0.01)
+    (row,) = bench.rows_of(options)
+    assert row["ours_ms"] > 0
+    assert row["ratio"] is None
+    assert "ours is timed alone" in capsys.readouterr().out
+    assert bench.rows_of(options) == [row]  # nothing is measured again
+
+
+@pytest.mark.ci
+def test_a_profile_times_the_parts_of_a_step_and_of_a_frame(tmp_path):
+    where_time_goes.main(where_time_goes.WhereTimeGoes(out=tmp_path, quick=True, only=("points",)))
+    found = read(tmp_path)
+    step, frame = found["a training step"], found["a frame of 64 px"]
+    assert step["network alone"] < step["network and its gradient"] < 2 * step["whole step"]
+    assert min(frame.values()) > 0
+    assert list(found["growth"]["points"]["ms"]) == ["512", "4096"]
+
+
+@pytest.mark.ci
+def test_the_command_for_a_gpu_ends_with_one_table(tmp_path, monkeypatch):
+    row = {"preset": "tiny", "mode": "render", "batch": 2, "ours_ms": 4.0, "twin_ms": 8.0}
+    asked = []
+    monkeypatch.setattr(bench, "rows_of", lambda options: asked.append(options) or [row])
+    gpu.main(gpu.OnGPU(out=tmp_path, quick=True))
+    assert asked[0].bf16
+    rows = read(tmp_path)["rows"]
+    assert [row["unit"] for row in rows] == ["frames", "frames", "steps", *["steps of a run"] * 2, "objects"]
+    assert (rows[-1]["a_second"], rows[-1]["beside"]) == (500.0, 250.0)
+    assert all(row["beside"] > 0 for row in rows[3:5])
+    assert all(row["megabytes"] > 0 for row in rows[2:5])

@@ -1,0 +1,239 @@
+"""What every experiment stands on: networks, scores, differences, budgets, tables, a folder that goes on."""
+
+import dataclasses
+import hashlib
+import json
+import re
+import shutil
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support import stand_ins, tiny_dataset
+from support.tiny_baselines import BASELINE, SHRUNKEN
+
+from experiments.comparison import budget as budgets
+from experiments.comparison import contenders, results_folder, scores, study_objects, variants
+from experiments.comparison.contenders import Sources, networks
+from experiments.comparison.scores import Shown
+from experiments.comparison.variants import Compared
+from experiments.paper import table1
+from spnr_jax.formats import data_sets
+from spnr_jax.scoring import evaluation
+from spnr_jax.scoring.report import Table, number, text
+from spnr_jax.training import batching, checkpoint, optimisation, weights
+
+PAPER = contenders.LABELS["paper"]
+ROWS = (
+    ("ours_1", (number(21.456, 2, (20.0, 22.5), best=True), number(0.25, 1, factor=100))),
+    ("50 % & more", (number(None, 2), number(-1.0, 1, sign="+"))),
+    ("absent", (text("not run: no solver"),)),
+)
+TABLE = Table(title="A title", heads=("PSNR, dB\N{NO-BREAK SPACE}\N{UPWARDS ARROW}", "share, %"), rows=ROWS)
+
+
+def test_markdown_has_a_row_for_each_row_all_as_wide_as_the_head():
+    lines = [line for line in results_folder.markdown([TABLE], ["how"]).splitlines() if line.startswith("|")]
+    assert len(lines) == 2 + len(ROWS)
+    assert {line.count("|") for line in lines} == {4}
+    assert "**21.46** [20.00, 22.50]" in lines[2]
+    assert [cell.strip() for cell in lines[3].split("|")[2:4]] == ["n/a", "-1.0"]
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [("a.json", {"b": [1, 2.5]}), ("a.npz", (np.arange(3.0), np.eye(2))), ("a.png", np.zeros((2, 3, 3), np.uint8))],
+)
+def test_what_was_made_is_read_and_not_made_again(name, content, tmp_path):
+    calls = []
+    for _ in range(2):
+        found = results_folder.kept(tmp_path / "in" / name, lambda: calls.append(1) or content)
+        for a, b in zip(found, content, strict=True):
+            np.testing.assert_array_equal(a, b)
+    assert calls == [1]
+
+
+def test_a_folder_is_one_requests_of_one_data_set(tmp_path):
+    dataset = tiny_dataset.dataset()
+    for _ in range(2):
+        results_folder.claim(tmp_path, "scores", {"seed": 0, "objects": ("a", "b")}, dataset)
+    with pytest.raises(ValueError, match="holds scores with another seed; choose another --out"):
+        results_folder.claim(tmp_path, "scores", {"seed": 1, "objects": ["a", "b"]}, dataset)
+    with pytest.raises(ValueError, match="another of, data"):
+        results_folder.claim(tmp_path, "pictures", {"seed": 0, "data": "another"})
+
+
+def test_a_picture_that_was_not_kept_is_drawn(tmp_path):
+    dataset, names, calls = tiny_dataset.dataset(), tiny_dataset.SPLITS["test"][:2], []
+    rows = {"a/b": lambda item: calls.append(item.name) or ({"x": 1.0}, np.zeros((2, 2, 3), np.uint8))}
+    for _ in range(2):
+        assert scores.measure_rows(tmp_path, rows, dataset, names, names[:1]) == {"a/b": [{"x": 1.0}] * 2}
+    for name in (*names, *names):
+        scores.picture_of(tmp_path, "a/b", rows["a/b"], dataset, name)
+    assert calls == [*names, names[1]]
+
+
+def test_a_cut_object_has_its_first_points_and_views_in_averaged_pictures():
+    item = tiny_dataset.one_object()
+    small = study_objects.cut(item, 7, 2, tiny_dataset.SIZE // 2)
+    assert (small.cloud.positions == item.cloud.positions[:7]).all()
+    assert small.cloud.normals is None
+    assert len(small.images) == len(small.camera.cam_to_world) == 2
+    assert small.camera.height == tiny_dataset.SIZE // 2
+    two = np.array([[[255, 0, 0, 255], [0, 255, 0, 0]]] * 2, np.uint8)  # what nothing covers has no colour
+    np.testing.assert_array_equal(study_objects.shrink(two[None], 2), [[[[255, 0, 0, 128]]]])
+    with pytest.raises(ValueError, match="not a whole share"):
+        study_objects.cut(item, resolution=tiny_dataset.SIZE - 1)
+
+
+def test_small_pictures_are_enlarged_and_the_reference_itself_is_right():
+    item = tiny_dataset.one_object()
+    white, opacity = data_sets.on_white(item.images), item.images[..., 3] / np.float32(255)
+    found = scores.mean_scores(scores.score_views(item, evaluation.Pictures(image=white, acc=opacity[:, ::2, ::2])))
+    assert (found["psnr"], found["psnr_inside"], found["flip"]) == pytest.approx((100, 100, 0), abs=1e-3)
+    assert found["iou"] > 0.8
+    assert scores.mean_scores({"a": [1.0, np.nan], "b": [np.nan]}) == {"a": 1.0, "b": None}
+
+
+def test_no_name_ends_the_script():
+    name, grey = "</script><b>", np.full((4, 4, 3), 0.5)
+    shown = Shown(name=name, view=0, reference=grey, images={"ours": grey}, psnr={"ours": 9.0})
+    page = table1.write_page("t", [Table(title="t", heads=(), rows=())], [], [shown])
+    (content,) = re.findall(r'<script type="application/json" id="pictures">(.*?)</script>', page, re.DOTALL)
+    assert json.loads(content)["objects"][0]["name"] == name
+
+
+def test_a_difference_compares_equal_seeds_objects_and_views():
+    rng = np.random.default_rng(0)
+    found = {
+        variant: {
+            seed: {
+                name: {m: level + seed + rng.random(2) for m in variants.METRICS} for name in ("one", "two", "three")
+            }
+            for seed in range(2)
+        }
+        for variant, level in (("a", 10.0), ("b", 13.0))
+    }
+    halves = [
+        Compared(
+            scores={v: {s: {n: of[n] for n in names} for s, of in seeds.items()} for v, seeds in found.items()},
+            costs={},
+            shown=[],
+        )
+        for names in (("one",), ("two", "three"))
+    ]
+    change = variants.change(variants.merge(halves), "b", "a", "psnr")
+    means = [np.mean([found["b"][s][n]["psnr"] - found["a"][s][n]["psnr"] for n in found["a"][s]]) for s in range(2)]
+    assert change["by_seed"] == pytest.approx(means)
+    assert change["mean"] == pytest.approx(np.mean(means))
+    assert change["interval"][0] < change["mean"] < change["interval"][1]
+
+
+def write_log(run, rows):
+    (run / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+
+
+def test_the_pace_of_a_run_is_not_that_of_its_compilations(tmp_path):
+    paces = (900.0, 10.0, 30.0, 20.0, 20.0, 800.0, 10.0, 20.0, 30.0)
+    rows = [{"step": i, "ms_per_step": pace} for i, pace in enumerate(paces)] + [{"step": 9, "val_psnr": 1.0}]
+    write_log(tmp_path, rows)
+    assert variants.step_milliseconds(tmp_path) == 20.0
+    write_log(tmp_path, rows[:3])
+    assert variants.step_milliseconds(tmp_path) is None
+
+
+def test_training_seconds_are_those_of_the_steps_over_all_calls(tmp_path):
+    write_log(
+        tmp_path,
+        [{"step": 20, "ms_per_step": 100.0}, {"step": 20, "val_psnr": 9.0}, {"step": 25, "ms_per_step": 1000.0}],
+    )
+    assert budgets.training_seconds(tmp_path) == 7.0
+
+
+def test_scores_inside_the_silhouette_do_not_see_the_rest():
+    item = tiny_dataset.one_object("chair")
+    reference = data_sets.on_white(item.images)
+    spoilt = np.where(item.images[..., 3:] <= 127, np.float32(0.5), reference)
+    found = variants.more_scores(item, evaluation.Pictures(image=spoilt, acc=spoilt[..., 0]))
+    np.testing.assert_allclose(found["inside"], 100.0)
+    equal = variants.more_scores(item, evaluation.Pictures(image=reference, acc=reference[..., 0]))
+    np.testing.assert_allclose(equal["detail"], 1.0, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("budget", "size", "category", "paper"),
+    [("tiny", 64, "chair", "tiny"), ("paper", 128, None, "abo"), ("paper", 200, "chair", "shapenet_chair")],
+)
+def test_a_budget_has_a_training_of_every_network(budget, size, category, paper):
+    found = budgets.configs(budget, size, category)
+    assert found["paper"].preset == paper
+    assert {name: config.model.method for name, config in found.items()} == {name: name for name in budgets.NETWORKS}
+    assert {config.model.image_resolution for config in found.values()} == {size}
+
+
+def test_minutes_become_steps_at_the_pace_of_both_kinds_of_step(monkeypatch):
+    monkeypatch.setattr(budgets, "step_seconds", lambda config, dataset, adversarial: 0.3 if adversarial else 0.1)
+    half = dataclasses.replace(tiny_dataset.CONFIG, num_steps=10)  # the discriminator joins after half of the steps
+    assert budgets.steps_within(60, half, None) == 300
+    assert budgets.steps_within(60, BASELINE, None) == 600
+    assert budgets.steps_within(0.01, BASELINE, None) == 1
+
+
+def test_the_pace_leaves_out_the_step_that_compiles(monkeypatch):
+    ticks = chain([100.0, 101.0, 103.0, 106.0], iter(lambda: 106.0, None))
+    monkeypatch.setattr(budgets, "PACE_SECONDS", 5.0)
+    monkeypatch.setattr(optimisation, "jitted_create_state", lambda config: "state")
+    monkeypatch.setattr(optimisation, "jitted_train_step", lambda state, batch, **_: (state, 1.0))
+    monkeypatch.setattr(batching, "batches", lambda *_: (i for i in range(9)))
+    # asked at the third, fourth... step after the first: 101 and 103 are too early
+    pace = budgets.step_seconds(BASELINE, None, adversarial=False, clock=lambda: next(ticks))
+    assert pace == pytest.approx(6.0 / 5)
+
+
+def test_a_run_that_was_begun_keeps_its_number_of_steps(tmp_path, monkeypatch):
+    tiny = SHRUNKEN["npbg_tiny"]
+    monkeypatch.setattr(budgets, "steps_within", lambda seconds, config, dataset: round(seconds))
+    first = budgets.config_of(tiny, "tiny", 3, 2.0, None, tmp_path)
+    assert (first.num_steps, first.seed, first.preset) == (120, 3, "npbg_tiny")
+    checkpoint.write_config(tmp_path, first)
+    monkeypatch.setattr(budgets, "steps_within", lambda *_: 7)
+    assert budgets.config_of(tiny, "tiny", 3, 2.0, None, tmp_path) == first
+
+
+# --- networks that are compared ---------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def table(tmp_path_factory):
+    """What a table with two networks leaves behind."""
+    folder = tmp_path_factory.mktemp("table")
+    for name, preset in (("npbg", "npbg_tiny"), ("paper", "tiny")):
+        shutil.copytree(stand_ins.fresh(preset), folder / "runs" / name)
+    return folder
+
+
+def test_networks_of_tables_runs_and_the_package_are_named_after_their_methods_in_the_order_of_table_1(table):
+    dataset = tiny_dataset.dataset()
+    assert list(networks(Sources(table1=table), dataset)) == [PAPER, "NPBG"]
+    found = networks(Sources(runs=(stand_ins.fresh("tiny"), Path("surfels")), table1=table), dataset)
+    surfels = contenders.LABELS["surfels"]
+    assert set(found) == {f"{PAPER} (fresh, tiny)", f"{PAPER} (runs, paper)", "NPBG", surfels}
+    assert [name for name, network in found.items() if not network.has_depth] == ["NPBG"]
+    assert found[f"{PAPER} (runs, paper)"].as_method().identity == found[f"{PAPER} (fresh, tiny)"].as_method().identity
+    assert found[surfels].checksum == hashlib.sha256(weights.shipped().read_bytes()).hexdigest()
+
+
+def test_what_cannot_be_compared_is_refused_by_name(table, tmp_path):
+    dataset = tiny_dataset.dataset()
+    with pytest.raises(ValueError, match="--runs: name at least one"):
+        networks(Sources(table1=tmp_path), dataset)
+    with pytest.raises(ValueError, match="--runs: a run folder is named twice"):
+        networks(Sources(runs=(stand_ins.fresh("tiny"),) * 2), dataset)
+    larger = data_sets.open_dataset(tiny_dataset.write_dataset(tmp_path / "data", size=2 * tiny_dataset.SIZE))
+    with pytest.raises(ValueError, match=r"images of 48 x 48 pixels, [^\n]*needs 24 x 24"):
+        networks(Sources(table1=table), larger)
+    with pytest.raises(ValueError, match="--objects: expected 1 or more, got 0"):
+        study_objects.test_objects(dataset, 0)
+    with pytest.raises(ValueError, match="the test split is empty"):
+        study_objects.test_objects(dataclasses.replace(dataset, splits={"test": ()}), None)
