@@ -16,7 +16,7 @@ from data_gen.plan.data_presets import PRESETS
 from data_gen.plan.tasks import GenerateConfig
 from data_gen.store.check import check
 from data_gen.store.show import ShowConfig, show
-from spnr_jax.errors import UserError, guarded, split_debug
+from spnr_jax.errors import UserError, guard, split_debug
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,7 +34,7 @@ def main(arguments: list[str] | None = None) -> None:
     """Run the command line."""
     arguments, debug = split_debug(sys.argv[1:] if arguments is None else arguments)
     codes: list[int] = []
-    code = guarded(lambda: codes.append(run(parse(arguments))), "spnr-data", debug)
+    code = guard(lambda: codes.append(run(parse(arguments))), "spnr-data", debug)
     sys.exit(code or codes[0])
 
 

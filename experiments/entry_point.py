@@ -20,4 +20,4 @@ def run(main: Callable[[Any], object], options: type, name: str) -> NoReturn:
     def work() -> None:
         main(tyro.cli(options, prog=f"python -m experiments.{name}", args=arguments))
 
-    sys.exit(errors.guarded(work, name.rpartition(".")[2], debug))
+    sys.exit(errors.guard(work, name.rpartition(".")[2], debug))

@@ -10,7 +10,7 @@ from jaxlib import version  # without JAX
 
 _PUBLIC = {"load": "training.weights", "Model": "method.model", "Volume": "method.model"}
 _PUBLIC |= dict.fromkeys(("Plan", "plan", "render"), "method.surfel_renderer")
-_PUBLIC |= {"neighbors": "surfels.neighbors", "encode": "surfels.surfel_scenes", "densify": "method.densifier"}
+_PUBLIC |= {"neighbors": "surfels.geometry", "encode": "surfels.geometry", "densify": "method.densifier"}
 _PUBLIC |= {"read_cloud": "formats.clouds", "clean": "kernels.cleaning"}
 _PUBLIC |= {"splats": "tools.splat_making", "write_splats": "formats.gaussian_files"}
 _PUBLIC |= {"read_light": "formats.light_files"} | dict.fromkeys(("light_of", "sun", "ambient"), "surfels.lighting")

@@ -20,7 +20,7 @@ import tyro
 
 from spnr_jax import methods, presets
 from spnr_jax.devices import runtime
-from spnr_jax.errors import STOPPED, UserError, guarded, split_debug, stopped_at_once
+from spnr_jax.errors import STOPPED, UserError, guard, split_debug, stop_at_once
 from spnr_jax.tools.commands import Evaluate, Export, Render, Share, Train, View, is_catalogue
 
 BOX = r"[╭╮╰╯│─•]+|__tyro-dummy-inner__\."  # what tyro draws around an error, and its name for the whole command
@@ -36,7 +36,7 @@ def main(arguments: list[str] | None = None) -> None:
     """Run the command line."""
     whole = arguments is None  # process
     arguments, debug = split_debug(sys.argv[1:] if arguments is None else arguments)
-    code = guarded(lambda: run(parse(arguments)), "spnr", debug)
+    code = guard(lambda: run(parse(arguments)), "spnr", debug)
     # JAX would wait for the other processes, which wait for this one; of what it still compiles Python's end crashes
     if (code == 2) if _one_of_several() else (code == STOPPED and whole):
         sys.stdout.flush()
@@ -55,7 +55,7 @@ def parse(arguments: list[str]) -> Command:
 
     Two are read before the others: --methods, which adds methods and presets, and --preset, which gives the defaults.
     """
-    source, arguments = _taken(arguments, "--methods")
+    source, arguments = _take_option(arguments, "--methods")
     if source is not None:
         methods.include(source)
     train = Annotated[Train, tyro.conf.subcommand("train", default=_train_defaults(arguments))]
@@ -76,14 +76,14 @@ def parse(arguments: list[str]) -> Command:
 
 def _train_defaults(arguments: list[str]) -> Train:
     """Those of the preset, whose network decides which options there are."""
-    preset, _ = _taken(arguments, "--preset")
+    preset, _ = _take_option(arguments, "--preset")
     preset = "tiny" if preset is None else preset
     if preset not in presets.PRESETS:
         raise UserError(f"--preset {preset}: there are {', '.join(presets.PRESETS)}")
     return Train(data=tyro.MISSING, run=tyro.MISSING, config=presets.PRESETS[preset]())
 
 
-def _taken(arguments: list[str], name: str) -> tuple[str | None, list[str]]:
+def _take_option(arguments: list[str], name: str) -> tuple[str | None, list[str]]:
     """The value of an option, None where it is not given, and the arguments without it."""
     for i, argument in enumerate(arguments):
         if argument == name:
@@ -95,7 +95,7 @@ def _taken(arguments: list[str], name: str) -> tuple[str | None, list[str]]:
 
 def run(command: Command) -> None:
     """Carries a command out."""
-    with stopped_at_once("spnr"):
+    with stop_at_once("spnr"):
         set_up_jax(repeats=not isinstance(command, View) and not (isinstance(command, Render) and command.few))
     match command:
         case Train():
@@ -122,7 +122,7 @@ def set_up_jax(*, repeats: bool = True) -> None:
         runtime.keep_arrays()
 
 
-def _noted(cloud: Path) -> Callable[[str], None]:
+def _make_note(cloud: Path) -> Callable[[str], None]:
     """What tells a person the assumptions about a cloud."""
     return lambda line: print(f"{cloud}: {line}", file=sys.stderr)
 
@@ -151,7 +151,7 @@ def run_evaluate(command: Evaluate) -> None:
     """`spnr evaluate`."""
     from spnr_jax.formats import data_sets
     from spnr_jax.scoring import evaluation
-    from spnr_jax.scoring.report import scored, text_table, write_results
+    from spnr_jax.scoring.report import describe_split, text_table, write_results
 
     start = time.monotonic()
     dataset = data_sets.open_dataset(command.data)
@@ -159,7 +159,7 @@ def run_evaluate(command: Evaluate) -> None:
     out = command.out or (command.run.with_suffix("") if command.run.suffix == ".npz" else command.run)
     seconds = dict.fromkeys(("evaluate", "total"), round(time.monotonic() - start, 1))
     write_results(out, outcome, dataset.settings, seconds)
-    print(f"{len(dataset.splits[command.split])} {scored(outcome.summary)}")
+    print(f"{len(dataset.splits[command.split])} {describe_split(outcome.summary)}")
     print("\n".join(text_table(outcome.summary["methods"])))
     print(f"wrote {out / 'metrics.json'} and {out / 'report.html'}")
 
@@ -173,7 +173,7 @@ def run_render(command: Render) -> None:
     else:
         from spnr_jax.tools.pictures import render_file
 
-        lines = render_file(command, _noted(command.cloud))
+        lines = render_file(command, _make_note(command.cloud))
     for line in lines:
         print(line, flush=True)
 
@@ -195,7 +195,7 @@ def run_export(command: Export) -> None:
     if command.splats is not None or command.mesh is not None:
         from spnr_jax.tools import splat_export
 
-        asked, said = splat_export.asked_of(command, command.run, command.network), _noted(command.run)
+        asked, said = splat_export.splat_options(command, command.run, command.network), _make_note(command.run)
         if command.mesh is not None:
             splat_export.export_mesh(asked, command.mesh, said, partial(print, flush=True))
         if command.splats is not None:
@@ -231,7 +231,7 @@ def run_share(command: Share) -> None:
     """`spnr share`."""
     from spnr_jax.tools.splat_export import share
 
-    share(command, _noted(command.cloud), partial(print, flush=True))
+    share(command, _make_note(command.cloud), partial(print, flush=True))
 
 
 if __name__ == "__main__":

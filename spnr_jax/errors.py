@@ -71,13 +71,13 @@ def one_line(error: Exception) -> str:
 
 def start_command(module: str, name: str) -> None:
     """Runs the `main` of a module; a stop while it is imported, which takes a second, is obeyed as any other."""
-    with stopped_at_once(name):
+    with stop_at_once(name):
         program = importlib.import_module(module)
     program.main()
 
 
 @contextlib.contextmanager
-def stopped_at_once(name: str) -> Iterator[None]:
+def stop_at_once(name: str) -> Iterator[None]:
     """Ctrl-C ends the process while libraries are loaded: nothing is lost, and exceptions crash some of them."""
 
     def stop(number: int, frame: object) -> None:
@@ -99,7 +99,7 @@ def spnr() -> None:
     start_command("spnr_jax.cli", "spnr")
 
 
-def guarded(work: Callable[[], object], name: str, debug: bool = False) -> int:
+def guard(work: Callable[[], object], name: str, debug: bool = False) -> int:
     """Exit code of the work; an error that a person can mend is one line on stderr and code 2, a stop is code 130.
 
     For `debug` the line stands behind the call stack.

@@ -14,7 +14,7 @@ from support import command_line, tiny_dataset, tiny_untrained
 
 from spnr_jax import errors, presets
 from spnr_jax.formats.cut import Cut
-from spnr_jax.surfels.visibility import spiral
+from spnr_jax.surfels.sides import spiral
 
 cli = command_line.unchecked_cli()
 exit_code = partial(command_line.exit_code, cli)

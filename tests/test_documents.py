@@ -37,7 +37,7 @@ def workplace(tmp_path, monkeypatch):
     (tmp_path / "runs" / "demo" / "paper").symlink_to(tiny_untrained.run())
     shutil.copy(tiny_dataset.dataset().folder / "objects" / "chair" / "points.ply", tmp_path / "chair.ply")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(weights, "shipped", tiny_surfels.shipped)
+    monkeypatch.setattr(weights, "packaged_file", tiny_surfels.shipped)
     return tmp_path
 
 

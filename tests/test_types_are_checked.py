@@ -7,7 +7,7 @@ import pytest
 from jaxtyping import TypeCheckError
 
 from spnr_jax.kernels import compositing, sampling
-from spnr_jax.nn.normalization import GroupNorm
+from spnr_jax.nn.convolution import GroupNorm
 
 
 def test_two_arguments_that_must_share_an_axis_may_not_differ():

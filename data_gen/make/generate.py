@@ -27,7 +27,7 @@ from data_gen.store.storage import Location
 from spnr_jax.devices.cluster import Died, connect, run_tasks
 from spnr_jax.errors import UserError
 from spnr_jax.formats.light_files import read_envmap
-from spnr_jax.surfels.room import indoor_envmap
+from spnr_jax.surfels.skies import indoor_envmap
 
 # options that say where or how fast, or whose content is described instead
 PLACES = ("out", "workers", "cluster", "root", "meshes", "objects", "envmap", "lights", "test_list", "split_file")
@@ -112,7 +112,7 @@ def generate(config: GenerateConfig) -> None:
 
 def make_missing(config: GenerateConfig, tasks: Sequence[Task], settings: dict) -> dict[str, str]:
     """Make the objects that are not there yet; return the reason for each that was left out, by id."""
-    done = layout.completed_objects(config.out)
+    done = layout.list_completed(config.out)
     missing = [task for task in tasks if task.object_id not in done]
     if not missing:
         return {}
@@ -131,7 +131,7 @@ def make_lights(config: GenerateConfig, variant: str) -> light.Lights:
     mitsuba_module(variant)
     if config.lights:
         return light.Lights(kinds=light.read_kinds(config.lights))
-    return light.Lights(light.scaled_to_white(read_envmap(config.envmap) if config.envmap else indoor_envmap()))
+    return light.Lights(light.scale_to_white(read_envmap(config.envmap) if config.envmap else indoor_envmap()))
 
 
 def refuse_other_content(out: Location, settings: dict) -> None:

@@ -25,8 +25,8 @@ from spnr_jax.errors import UserError
 from spnr_jax.formats.mesh import meshes, surface_points
 from spnr_jax.formats.mesh.assets import Asset, Material, RejectedAsset
 from spnr_jax.formats.mesh.surface_points import Spread, sample_surface
-from spnr_jax.surfels.envmaps import resampled
 from spnr_jax.surfels.lighting import HEIGHT
+from spnr_jax.surfels.skies import resample
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,7 +84,7 @@ def make_record(bench: Workbench, task: Task) -> layout.ObjectRecord:
         transforms=layout.nerf_transforms(cam_to_world, bench.view.resolution, bench.view.fov, bench.view.focal_length),
         images=images,
         conditions=conditions,
-        lights=None if bench.lights.shared is not None else np.stack([resampled(x, HEIGHT) for x in maps]),
+        lights=None if bench.lights.shared is not None else np.stack([resample(x, HEIGHT) for x in maps]),
         details=object_details(task, asset, seeds) | details,
     )
 

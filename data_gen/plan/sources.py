@@ -39,7 +39,7 @@ class Listed:
     fault: str = ""
 
 
-def described(folder: Path, most: int = 5) -> str:
+def describe_folder(folder: Path, most: int = 5) -> str:
     """What a folder holds, for a message to somebody who expected something else."""
     if not folder.is_dir():
         return "there is no such folder"
@@ -67,7 +67,7 @@ def find_objects(root: Path, category: str) -> list[Listed]:
     if all(found.fault for found in objects):
         raise UserError(
             f"--root {root}: expected {synset}/*/{MESHES[0]} or {synset}/*/{MESHES[1]}, as in ShapeNetCore v2 or v1 "
-            f"({category} is {synset}); {described(root)}"
+            f"({category} is {synset}); {describe_folder(root)}"
         )
     return objects
 
@@ -86,7 +86,7 @@ def find_products(root: Path) -> list[Listed]:
     if table is None or not models.is_dir():
         raise UserError(
             f"--root {root}: expected {FOLDER}/original/*/*.glb and {FOLDER}/{TABLES[0]}, as in the ABO 3D download; "
-            f"{described(root)}"
+            f"{describe_folder(root)}"
         )
     products = []
     for object_id, name in read_table(table).items():

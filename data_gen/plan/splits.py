@@ -19,7 +19,7 @@ from spnr_jax.errors import UserError
 Listed = Mapping[str, Sequence[str]]  # ids of the splits that the user names
 
 
-def ranked(ids: Sequence[str], seed: int, purpose: str) -> list[str]:
+def rank(ids: Sequence[str], seed: int, purpose: str) -> list[str]:
     """The ids in an order that depends on nothing but (purpose, seed, id)."""
     return sorted(ids, key=lambda name: hashlib.sha256(f"{purpose}/{seed}/{name}".encode()).digest())
 
@@ -29,7 +29,7 @@ def split_products(ids: Sequence[str], listed: Listed, seed: int, num_test: int,
     usable = set(ids)
     if "train" in listed:
         return {split: sorted(usable & set(listed.get(split, ()))) for split in SPLITS}
-    order = ranked(ids, seed, "split")
+    order = rank(ids, seed, "split")
     test = usable & set(listed["test"] if "test" in listed else order[:num_test])
     rest = [name for name in order if name not in test]
     val = usable & set(listed["val"] if "val" in listed else rest[:num_val])
@@ -42,7 +42,7 @@ def chosen_variants(products: Sequence[str], each: int, most: int | None, seed: 
     Where there are more than `most`, they are drawn by a hash of (seed, product, number).
     """
     names = {f"{product}/{number}": (product, number) for product in products for number in range(1, each + 1)}
-    return sorted(names[name] for name in ranked(list(names), seed, "variants")[:most])
+    return sorted(names[name] for name in rank(list(names), seed, "variants")[:most])
 
 
 def read_test_list(path: Path, known: set[str]) -> Listed:

@@ -229,14 +229,14 @@ def mesh_tasks(config: GenerateConfig, root: Path) -> list[Task]:
     """The objects of the source that are files, in any order."""
     if source_of(config) == "meshes":
         found = meshes.find_meshes(root)
-        return [Task(object_id=name, path=path, shown_path=shown(path, root)) for name, path in found]
+        return [Task(object_id=name, path=path, shown_path=show_path(path, root)) for name, path in found]
     listed = sources.find_objects(root, config.category) if config.category else sources.find_products(root)
     return [
         Task(
             object_id=item.object_id,
             category=config.category or "",
             path=item.path,
-            shown_path=shown(item.path, root),
+            shown_path=show_path(item.path, root),
             folder=item.folder,
             fault=item.fault,
         )
@@ -244,7 +244,7 @@ def mesh_tasks(config: GenerateConfig, root: Path) -> list[Task]:
     ]
 
 
-def shown(path: Path, root: Path) -> str:
+def show_path(path: Path, root: Path) -> str:
     """A file's path as it is reported: from the source's root, for where that lies is nobody's business."""
     return path.relative_to(root).as_posix()
 
@@ -269,7 +269,7 @@ def plan_data_set(config: GenerateConfig) -> Plan:
     if config.train_objects is None:
         return plan
     split_ids = plan.split([task.object_id for task in tasks])
-    surplus = set(splits.ranked(split_ids["train"], config.seed, "split")[config.train_objects :])
+    surplus = set(splits.rank(split_ids["train"], config.seed, "split")[config.train_objects :])
     return replace(plan, tasks=tuple(task for task in tasks if task.object_id not in surplus))
 
 

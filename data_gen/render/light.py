@@ -5,7 +5,7 @@ One map lights a whole data set, or each view draws a map of its own and turns i
 Conventions: a map is (height, 2 * height, 3) float32, linear radiance, latitude-longitude as Mitsuba reads it.
 Row 0 is straight up (+y); column c of w looks along azimuth phi = 2 pi (c + 0.5) / w, where the direction is
 (sin phi, 0, -cos phi) on the horizon: phi = 0 is -z, phi = 90 degrees is +x.
-The default map is the package's room (`spnr_jax.surfels.room`).
+The default map is the package's room (`spnr_jax.surfels.skies`).
 """
 
 from collections.abc import Iterator, Sequence
@@ -18,7 +18,7 @@ from data_gen.render.variant import mitsuba_module
 from data_gen.render.views import ViewConfig, make_sensor, spread_viewpoints
 from spnr_jax.errors import UserError
 from spnr_jax.formats.light_files import ENDINGS, read_envmap
-from spnr_jax.surfels import envmaps, room, skies
+from spnr_jax.surfels import skies
 
 WHITE_SPHERE_RADIANCE = 0.6  # far enough below 1 that white objects keep their shading against the white background
 
@@ -42,7 +42,7 @@ class Lights:
             maps = self.kinds[generator.integers(len(self.kinds))]
             drawn = maps[generator.integers(len(maps))] if maps else skies.random_map(generator, DRAWN_HEIGHT)
             turned = np.roll(drawn, generator.integers(drawn.shape[1]), axis=1)
-            yield np.asarray(skies.normalised(turned, WHITE_SPHERE_RADIANCE))
+            yield np.asarray(skies.normalise(turned, WHITE_SPHERE_RADIANCE))
 
 
 def read_kinds(names: Sequence[str]) -> tuple[tuple[np.ndarray, ...], ...]:
@@ -52,10 +52,10 @@ def read_kinds(names: Sequence[str]) -> tuple[tuple[np.ndarray, ...], ...]:
         if name == "random":
             kinds.append(())
         elif name == "room":
-            kinds.append((room.indoor_envmap(DRAWN_HEIGHT),))
+            kinds.append((skies.indoor_envmap(DRAWN_HEIGHT),))
         else:
             files = map_files(name)
-            kinds.append(tuple(np.asarray(envmaps.resampled(read_envmap(file), DRAWN_HEIGHT)) for file in files))
+            kinds.append(tuple(np.asarray(skies.resample(read_envmap(file), DRAWN_HEIGHT)) for file in files))
     return tuple(kinds)
 
 
@@ -67,7 +67,7 @@ def map_files(folder: str) -> list[Path]:
     return files
 
 
-def scaled_to_white(envmap: np.ndarray, target: float = WHITE_SPHERE_RADIANCE) -> np.ndarray:
+def scale_to_white(envmap: np.ndarray, target: float = WHITE_SPHERE_RADIANCE) -> np.ndarray:
     """The map times the factor that makes a white diffuse sphere average `target`, measured by rendering it."""
     return (envmap * (target / white_sphere_radiance(envmap))).astype(np.float32)
 

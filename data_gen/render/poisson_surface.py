@@ -32,7 +32,7 @@ NEIGHBOURS = 30
 SMALLEST_EDGE = 1e-6  # added to every edge: a sparse matrix takes 0 for no edge
 
 
-def oriented_normals(positions: np.ndarray, neighbours: int = NEIGHBOURS) -> np.ndarray:
+def orient_normals(positions: np.ndarray, neighbours: int = NEIGHBOURS) -> np.ndarray:
     """Unit normals (points, 3) of positions (points, 3) that point outwards, float64."""
     positions = np.asarray(positions, np.float64)
     around = nearest_points(positions, neighbours)
@@ -109,8 +109,8 @@ def reconstruct(cloud: PointCloud, config: PoissonConfig) -> Asset:
     present = np.asarray(cloud.mask)
     positions = np.asarray(cloud.positions, np.float64)[present]
     check_extent(positions)
-    vertices, faces, density = screened_poisson(positions, oriented_normals(positions, config.neighbours), config.depth)
-    vertices, faces = trimmed(vertices, faces, density, config.trim)
+    vertices, faces, density = screened_poisson(positions, orient_normals(positions, config.neighbours), config.depth)
+    vertices, faces = trim(vertices, faces, density, config.trim)
     if not len(faces):
         raise NoSurface(f"{len(positions)} points: the Poisson solver found no surface; give more points")
     nearest = cKDTree(positions).query(vertices)[1]
@@ -150,9 +150,7 @@ def screened_poisson(
     return mesh.vertex_matrix(), mesh.face_matrix().astype(np.int64), mesh.vertex_scalar_array()
 
 
-def trimmed(
-    vertices: np.ndarray, faces: np.ndarray, density: np.ndarray, share: float
-) -> tuple[np.ndarray, np.ndarray]:
+def trim(vertices: np.ndarray, faces: np.ndarray, density: np.ndarray, share: float) -> tuple[np.ndarray, np.ndarray]:
     """Vertices and faces without the share of the vertices that has the lowest density, and their faces."""
     if not share or not len(faces):
         return vertices, faces

@@ -22,7 +22,7 @@ def check(dataset: Path) -> bool:
         raise UserError(f"{dataset / 'dataset.json'}: expected settings {', '.join(COUNTS)}; generate it again")
     described = description.get("environment_map")
     own_lights = isinstance(described, dict) and "kinds" in described
-    object_ids = sorted(layout.completed_objects(dataset))
+    object_ids = sorted(layout.list_completed(dataset))
     faults = split_faults(dataset, set(object_ids))
     agreements, covered, num_views = [], [], 0
     details = {}

@@ -22,7 +22,7 @@ from PIL import Image
 from data_gen.store import storage
 from data_gen.store.storage import Location
 from spnr_jax.errors import UserError
-from spnr_jax.formats.npz import packed
+from spnr_jax.formats.npz import pack_arrays
 
 SCHEMA_VERSION = 1
 MOST_PIXELS = 2**26  # of a view
@@ -162,7 +162,7 @@ def encode_image(pixels: np.ndarray) -> bytes:
 def encode_lights(lights: np.ndarray) -> bytes:
     """Environment maps (views, height, width, 3) as an .npz of halves, cut where they are too bright."""
     halves = np.minimum(lights, np.finfo(np.float16).max).astype(np.float16)
-    return packed({"lights": halves}, compressed=True)
+    return pack_arrays({"lights": halves}, compressed=True)
 
 
 def read_image(path: Path) -> np.ndarray:
@@ -182,7 +182,7 @@ def has_object(dataset: Location, object_id: str) -> bool:
     return storage.has_object(f"{dataset}/objects", object_id)
 
 
-def completed_objects(dataset: Location) -> set[str]:
+def list_completed(dataset: Location) -> set[str]:
     """The ids of the objects whose folders are complete."""
     return storage.complete_objects(f"{dataset}/objects")
 

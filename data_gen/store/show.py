@@ -37,7 +37,7 @@ def show(config: ShowConfig) -> Path:
     """Write the contact sheet; return its path."""
     check.read_description(config.dataset)
     at_least(config, 1, "objects")
-    object_ids = sorted(layout.completed_objects(config.dataset))
+    object_ids = sorted(layout.list_completed(config.dataset))
     if not object_ids:
         raise UserError(f"{config.dataset} holds no finished object yet; run spnr-data generate again")
     chosen = np.unique(np.linspace(0, len(object_ids) - 1, min(config.objects, len(object_ids))).round().astype(int))

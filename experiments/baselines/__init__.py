@@ -20,4 +20,8 @@ for method in (
 ):
     register(method)
 
-PUBLISHED = {"npbg": npbg.published, "point_nerf": point_nerf.published, "points2nerf": points2nerf.published}
+PUBLISHED = {
+    "npbg": npbg.published_config,
+    "point_nerf": point_nerf.published_config,
+    "points2nerf": points2nerf.published_config,
+}

@@ -30,9 +30,9 @@ from spnr_jax.config import (
 )
 from spnr_jax.errors import require
 from spnr_jax.kernels import cameras
+from spnr_jax.kernels.imaging import bilinear
 from spnr_jax.kernels.numerics import per_feature
 from spnr_jax.kernels.records import Camera, Key, PointCloud, Rendering
-from spnr_jax.kernels.resizing import bilinear
 from spnr_jax.nn.convolution import conv
 
 
@@ -72,7 +72,7 @@ class NPBGConfig(NetworkConfig):
         return False
 
 
-def published(size: int) -> TrainConfig:
+def published_config(size: int) -> TrainConfig:
     """The published training, for pictures of 128 (ABO) or 200 pixels (ShapeNet); meant for one GPU."""
     return TrainConfig(
         preset=f"npbg, {size} px, as published",

@@ -37,8 +37,8 @@ from spnr_jax.devices.placement import split_objects
 from spnr_jax.errors import require
 from spnr_jax.kernels import cameras, compositing, sampling
 from spnr_jax.kernels.numerics import length, per_feature, softplus
-from spnr_jax.kernels.occupancy import map_existing
 from spnr_jax.kernels.records import Camera, Key, PointCloud, Rays, Rendering
+from spnr_jax.kernels.voxels import map_existing
 
 BLOCK = 1024  # shading points at once: 8 MB for a layer of 256 with 8 neighbours
 SLOPE, GAIN = 0.01, math.sqrt(2 / (1 + 0.01**2))  # of the leaky ReLU, and what it asks of the weights before it
@@ -97,7 +97,7 @@ class PointNeRFConfig(NetworkConfig):
 MASKED = LossConfig(l1_weight=1.0, adversarial_weight=0.0, pixel="mse", masked=True)
 
 
-def published(size: int) -> TrainConfig:
+def published_config(size: int) -> TrainConfig:
     """The published training at 128 (ABO) or 200 pixels (ShapeNet), 1024 or 1600 rays a step; meant for one GPU."""
     return TrainConfig(
         preset=f"point_nerf, {size} px, as published",

@@ -30,7 +30,7 @@ from spnr_jax.errors import UserError, require
 from spnr_jax.kernels import cameras, compositing, sampling
 from spnr_jax.kernels.numerics import per_feature, softplus
 from spnr_jax.kernels.records import Camera, Key, PointCloud, Rays, Rendering
-from spnr_jax.nn.encoding import encode_direction
+from spnr_jax.nn.paper import encode_direction
 
 QUIET = -6.0  # log variance that the encoder begins with: codes are told apart from the first step on
 
@@ -87,7 +87,7 @@ class Points2NeRFConfig(NetworkConfig):
 SQUARES = LossConfig(l1_weight=1.0, adversarial_weight=0.0, pixel="mse")
 
 
-def published(size: int) -> TrainConfig:
+def published_config(size: int) -> TrainConfig:
     """The published training at 128 (ABO) or 200 pixels (ShapeNet), 1024 or 1600 rays a step; meant for one GPU.
 
     190 million parameters; the authors report two weeks and more per class.

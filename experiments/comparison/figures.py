@@ -73,13 +73,13 @@ def grid(
             draw.text((2, top + j * high + size // 3), text, INK, font, spacing=3)
         for i, picture in enumerate(row):
             place = (left + i * (size + GAP), top + j * high)
-            canvas.paste(scaled(picture, size), place)
+            canvas.paste(scale(picture, size), place)
             if below:
                 draw.text((place[0], place[1] + size), below[j][i], INK, font)
     return np.asarray(canvas)
 
 
-def scaled(picture: np.ndarray, size: int) -> Image.Image:
+def scale(picture: np.ndarray, size: int) -> Image.Image:
     """The picture with so many pixels along each side."""
     image = Image.fromarray(to_uint8(picture))
     exact = size % image.width == 0

@@ -30,7 +30,7 @@ from spnr_jax.formats.light_files import read_envmap
 from spnr_jax.formats.mesh.assets import Asset
 from spnr_jax.kernels.records import PointCloud
 from spnr_jax.scoring.evaluation import Pictures
-from spnr_jax.surfels.room import indoor_envmap
+from spnr_jax.surfels.skies import indoor_envmap
 
 RENDERING = ("resolution", "fov", "spp", "max_depth")  # settings that decide a picture, given the pose of its camera
 SURFACES = {"poisson": PoissonConfig(), "poisson_trimmed": PoissonConfig(trim=0.3)}
@@ -46,7 +46,7 @@ class Renderer:
             print(notice, file=sys.stderr)
         mitsuba_module(chosen)
         self._seed, self._view = seed, view_config(settings)
-        self._light = light.scaled_to_white(unscaled_light(settings["environment_map"], envmap))
+        self._light = light.scale_to_white(unscaled_light(settings["environment_map"], envmap))
 
     def draw(self, asset: Asset | str, item: data_sets.ObjectData) -> np.ndarray:
         """Straight-alpha sRGB (views, height, width, 4) uint8 from the object's cameras; empty without a surface."""

@@ -17,7 +17,7 @@ from PIL import Image
 
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets, images
-from spnr_jax.formats.npz import packed
+from spnr_jax.formats.npz import pack_arrays
 from spnr_jax.scoring.report import Cell, Table
 from spnr_jax.training import run_record
 
@@ -39,7 +39,7 @@ def as_json(content: object) -> bytes:
     return (json.dumps(content, indent=1, allow_nan=False) + "\n").encode()
 
 
-def kept(place: Path, make: Callable[[], Any]) -> Any:
+def load_or_make(place: Path, make: Callable[[], Any]) -> Any:
     """What a file holds: JSON, arrays (.npz) or a picture (.png); it is made if it is not there."""
     if not place.is_file():
         images.write_whole(place, WRITERS[place.suffix](make()))
@@ -58,7 +58,7 @@ def _picture(place: Path) -> np.ndarray:
 
 WRITERS: dict[str, Callable[[Any], bytes]] = {
     ".json": lambda content: (json.dumps(content, indent=1) + "\n").encode(),  # scores may be NaN
-    ".npz": lambda arrays: packed({str(number): array for number, array in enumerate(arrays)}, compressed=True),
+    ".npz": lambda arrays: pack_arrays({str(number): array for number, array in enumerate(arrays)}, compressed=True),
     ".png": images.png,
 }
 READERS: dict[str, Callable[[Path], Any]] = {

@@ -21,7 +21,7 @@ from tqdm import tqdm
 
 from experiments.comparison import figures
 from experiments.comparison.contenders import Method
-from experiments.comparison.results_folder import kept
+from experiments.comparison.results_folder import load_or_make
 from experiments.comparison.study_objects import cut
 from spnr_jax.config import TrainConfig
 from spnr_jax.formats import data_sets, images
@@ -60,7 +60,7 @@ def measure_rows(
     for row, measure in rows.items():
         measured = partial(_measure, out, row, measure, dataset, shown)
         found[row] = [
-            kept(place_of(out, row, name, ".json"), partial(measured, name)) for name in tqdm(names, desc=row)
+            load_or_make(place_of(out, row, name, ".json"), partial(measured, name)) for name in tqdm(names, desc=row)
         ]
     return found
 
@@ -82,7 +82,7 @@ def place_of(out: Path, row: str, name: str, suffix: str) -> Path:
 def picture_of(out: Path, row: str, measure: Measure, dataset: Dataset, name: str) -> np.ndarray:
     """The first picture of an object in a row; it is drawn where it was not kept."""
     place = place_of(out, row, name, ".png")
-    return kept(place, lambda: images.to_uint8(measure(data_sets.read_object(dataset, name))[1]))
+    return load_or_make(place, lambda: images.to_uint8(measure(data_sets.read_object(dataset, name))[1]))
 
 
 def score_views(item: ObjectData, pictures: Pictures) -> dict[str, list[float]]:
@@ -202,7 +202,7 @@ def score_objects(
     for number, name in enumerate(names, start=1):
         item = data_sets.read_object(dataset, name)
         item = dataclasses.replace(item, cloud=data_sets.test_cloud(item, config))
-        shows = {label: timed(method, item, seconds[label]) for label, method in methods.items()}
+        shows = {label: time_views(method, item, seconds[label]) for label, method in methods.items()}
         result = evaluation.evaluate_object(shows, config, item)
         for label, pictures in result.pictures.items():
             if not methods[label].has_opacity and label not in evaluation.FLOORS:
@@ -218,7 +218,7 @@ def score_objects(
     return Scored(scores=scores, shown=shown, seconds=seconds)
 
 
-def timed(method: Method, item: ObjectData, seconds: list[float]) -> evaluation.Method:
+def time_views(method: Method, item: ObjectData, seconds: list[float]) -> evaluation.Method:
     """The method bound to an object, noting the seconds per view until the pictures lie on the host."""
 
     def measured(*_: object) -> Pictures:

@@ -16,8 +16,8 @@ from spnr_jax.formats.data_sets import Dataset, ObjectData
 from spnr_jax.formats.images import to_uint8
 from spnr_jax.formats.mesh.assets import Asset
 from spnr_jax.kernels import cameras
+from spnr_jax.kernels.imaging import mean_of_squares
 from spnr_jax.kernels.records import Camera
-from spnr_jax.kernels.resizing import mean_of_squares
 from spnr_jax.scoring import evaluation
 
 

@@ -27,7 +27,7 @@ from spnr_jax.config import TrainConfig
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.images import write_whole
 from spnr_jax.scoring import evaluation
-from spnr_jax.scoring.report import scored, text_table, write_results
+from spnr_jax.scoring.report import describe_split, text_table, write_results
 from spnr_jax.training import trainer
 from spnr_jax.training.weights import read_trained
 
@@ -80,7 +80,7 @@ def main(demo: Demo) -> None:
     parts["total"] = sum(parts.values())
     parts = {name: round(value, 1) for name, value in parts.items()}
     write_results(demo.out, outcome, dataset.settings, parts)
-    print(f"{len(dataset.splits['test'])} {scored(outcome.summary)}")
+    print(f"{len(dataset.splits['test'])} {describe_split(outcome.summary)}")
     print("\n".join(text_table(outcome.summary["methods"])))
     print(f"metrics: {demo.out / 'metrics.json'}\nreport:  {demo.out / 'report.html'}")
 

@@ -31,14 +31,13 @@ from spnr_jax.formats.images import write_whole
 from spnr_jax.formats.mesh import meshes
 from spnr_jax.formats.mesh.assets import Asset
 from spnr_jax.formats.mesh.surface_points import normalise, sample_surface
-from spnr_jax.formats.npz import packed, read_arrays
+from spnr_jax.formats.npz import pack_arrays, read_arrays
 from spnr_jax.kernels import cloud_arrays
+from spnr_jax.kernels.cloud_arrays import farthest_points
 from spnr_jax.kernels.records import PointCloud
-from spnr_jax.kernels.thinning import farthest_points
 from spnr_jax.method.densifier import CHILDREN, Densifier, Nodes, Places, blend, predict, see, turn
 from spnr_jax.surfels import geometry, sides
-from spnr_jax.surfels.geometry import Points
-from spnr_jax.surfels.neighbors import order_in_space
+from spnr_jax.surfels.geometry import Points, order_in_space
 from spnr_jax.training.weights import read_variables
 
 TRUTH, VOTERS, EVEN = 2**17, 2**15, 2**12  # points of a surface, those that look for its sides, and even ones at most
@@ -106,7 +105,7 @@ def make_records(options: Options) -> None:
         except UserError as error:
             print(f"{name} is left out: {error}", flush=True)
             continue
-        write_whole(file, packed(record))
+        write_whole(file, pack_arrays(record))
         print(f"{name}: {time.time() - begin:.1f} s", flush=True)
 
 
@@ -425,9 +424,9 @@ def train(options: Options) -> None:
         if step % 300 == 299 or step + 1 == options.steps:
             state["step"] = step + 1
             leaves = {f"leaf{i}": np.asarray(x) for i, x in enumerate(jax.tree.leaves(state))}
-            write_whole(checkpoint, packed(leaves))
+            write_whole(checkpoint, pack_arrays(leaves))
             flat = {name: np.asarray(x, np.float16) for name, x in flatten_dict(state["params"], sep="/").items()}
-            write_whole(options.out / "densifier.npz", packed(flat, compressed=True))
+            write_whole(options.out / "densifier.npz", pack_arrays(flat, compressed=True))
 
 
 def read(path: Path) -> dict[str, np.ndarray]:

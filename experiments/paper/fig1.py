@@ -79,11 +79,11 @@ def variant(options: Fig1, weight: float, config: TrainConfig, dataset: data_set
         label=f"L1 weight {weight:g}",
         config=dataclasses.replace(config, loss=loss),
         dataset=dataset,
-        start=partial(pretrained, options, dataset) if options.pretrain or options.init else None,
+        start=partial(pretrain, options, dataset) if options.pretrain or options.init else None,
     )
 
 
-def pretrained(options: Fig1, dataset: data_sets.Dataset, config: TrainConfig) -> optimisation.TrainState:
+def pretrain(options: Fig1, dataset: data_sets.Dataset, config: TrainConfig) -> optimisation.TrainState:
     """A fresh state whose generator is the one of --init, or was trained with the L1 loss alone."""
     if options.init:
         return trainer.new_state(config, read_trained(options.init))

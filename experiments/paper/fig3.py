@@ -39,7 +39,7 @@ from experiments import entry_point
 from experiments.comparison import contenders, figures, results_folder
 from experiments.comparison.contenders import LABELS, Method, Sources
 from experiments.comparison.poisson import SURFACES, reconstruct
-from experiments.comparison.results_folder import kept
+from experiments.comparison.results_folder import load_or_make
 from experiments.comparison.study_objects import cast_views, cut, mesh_of, test_objects
 from spnr_jax import cli
 from spnr_jax.devices import runtime
@@ -179,9 +179,9 @@ def object_maps(
     """Depth, opacity and true depth (views, h, w) of an object by method; read where they are made."""
     maps = {}
     for name, method in found.items():
-        seen, acc = kept(options.out / "depths" / name / f"{item.name}.npz", partial(depths, method, item))
+        seen, acc = load_or_make(options.out / "depths" / name / f"{item.name}.npz", partial(depths, method, item))
         size, place = seen.shape[1:], options.out / "truth" / f"{seen.shape[-1]}" / f"{item.name}.npz"
-        (truth,) = kept(place, partial(true_depth, dataset, item, options.meshes, size))
+        (truth,) = load_or_make(place, partial(true_depth, dataset, item, options.meshes, size))
         maps[name] = (seen, acc, truth)
     return maps
 

@@ -34,7 +34,7 @@ from spnr_jax.formats import data_sets
 from spnr_jax.formats.images import png_url
 from spnr_jax.formats.pages import template
 from spnr_jax.scoring import evaluation
-from spnr_jax.scoring.report import Cell, Table, difference, duration, head, lowered, number, quality
+from spnr_jax.scoring.report import Cell, Table, difference, duration, head, lower_first, number, quality
 from spnr_jax.scoring.summary import differences, metric_settings, summarise
 
 METRICS = ("psnr", "ssim", "lpips", "flip", "cpsnr", "iou")
@@ -254,7 +254,7 @@ def methods_table(results: Mapping) -> Table:
 def differences_table(first: str, differences: Mapping) -> Table:
     """A network minus each other method, image by image."""
     rows = tuple(
-        (f"{LABELS[first]} minus {lowered(name)}", tuple(difference(row.get(metric), metric) for metric in METRICS))
+        (f"{LABELS[first]} minus {lower_first(name)}", tuple(difference(row.get(metric), metric) for metric in METRICS))
         for name, row in differences.items()
     )
     note = "Image by image, with 95 % bootstrap intervals and the p-value of a sign-flip test, both over objects."

@@ -97,13 +97,13 @@ def rows_of(options: Options) -> list[Row]:
             ours = cache(partial(our_side, preset, mode, options))
             for variant in variants:
                 place = options.out / "rows" / f"{preset}_{mode}_{variant}.json"
-                rows.append(results_folder.kept(place, partial(measured, preset, mode, variant, ours, options)))
+                rows.append(results_folder.load_or_make(place, partial(measure, preset, mode, variant, ours, options)))
                 print({name: rows[-1][name] for name in ("preset", "mode", "twin_variant", "ours_ms", "twin_ms")})
             jax.clear_caches()
     return rows
 
 
-def measured(preset: str, mode: Mode, variant: str | None, ours: Callable, options: Options) -> Row:
+def measure(preset: str, mode: Mode, variant: str | None, ours: Callable, options: Options) -> Row:
     """A row: both sides in turns, ours alone without a variant of the twin."""
     run, compile_s = ours()
     theirs = None if variant is None else twin_side(preset, mode, variant, options)

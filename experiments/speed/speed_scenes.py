@@ -22,9 +22,9 @@ from spnr_jax.config import (
 )
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.records import Batch, Camera, Crops, PointCloud, Volume
+from spnr_jax.nn import shader
 from spnr_jax.presets import PRESETS
-from spnr_jax.surfels import features
-from spnr_jax.surfels.surfel_scenes import encode_in_box
+from spnr_jax.surfels.geometry import encode_in_box
 from spnr_jax.training import gbuffers
 
 SPHERE, BOX = 0.7, 0.55  # radius and half side, in the box [-1, 1]^3
@@ -143,8 +143,8 @@ def random_crops(config: TrainConfig, doublings: int, seed: int = 0) -> Crops:
     inner = size - 2 * margin
     large = inner << doublings
     crops = Crops(
-        seen=rng.random((count, size, size, features.NUM_FEATURES), np.float32),
-        maps=rng.random((count, inner, inner, features.NUM_MAPS), np.float32),
+        seen=rng.random((count, size, size, shader.NUM_FEATURES), np.float32),
+        maps=rng.random((count, inner, inner, shader.NUM_MAPS), np.float32),
         ambient=rng.random((count, 9, 3), np.float32),
         target=rng.integers(0, 256, (count, large, large, 4), np.uint8),
         doublings=doublings,

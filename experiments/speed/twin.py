@@ -164,7 +164,7 @@ class Renderer(nn.Module):
         return image.transpose(1, 2).unflatten(2, (c.render_resolution, c.render_resolution))
 
 
-def folded(weight: Tensor) -> Tensor:
+def fold_kernel(weight: Tensor) -> Tensor:
     """The weight of the transposed convolution, 4 taps, stride 2, that is nearest x2 and a convolution of 3 taps."""
     one = torch.tensor([[0.0, 0, 1, 1], [0, 1, 1, 0], [1, 1, 0, 0]])
     for _ in range(2, weight.ndim):
@@ -204,7 +204,7 @@ class Block(nn.Module):
             large = x.shape[2] > 4
             x = x.contiguous(memory_format=torch.channels_last_3d if large else torch.contiguous_format)
         if self.up and self.fast and x.shape[2] >= 4:
-            return F.relu(self.norm(F.conv_transpose3d(x, folded(self.conv.weight), stride=2, padding=1)))
+            return F.relu(self.norm(F.conv_transpose3d(x, fold_kernel(self.conv.weight), stride=2, padding=1)))
         return F.relu(self.norm(self.conv(F.interpolate(x, scale_factor=2) if self.up else x)))
 
     def of_rows(self, rows: Tensor, cell: Tensor, index: Tensor, shape: tuple[int, ...]) -> Tensor:
@@ -266,7 +266,7 @@ class Upsampler(nn.Module):
         """What the convolutions add to the enlarged rgb."""
         y = F.leaky_relu(self.conv1(F.leaky_relu(self.conv0(x), SLOPE)), SLOPE)
         if self.fast:
-            y = F.conv_transpose2d(y, folded(self.conv2.weight), self.conv2.bias, stride=2, padding=1)
+            y = F.conv_transpose2d(y, fold_kernel(self.conv2.weight), self.conv2.bias, stride=2, padding=1)
         else:
             y = self.conv2(F.interpolate(y, scale_factor=2))
         rgb = F.interpolate(x[:, :3], scale_factor=2, mode="bilinear", align_corners=False)
@@ -330,7 +330,7 @@ class Discriminator(nn.Module):
         return self.convs[-1](x)
 
 
-def compiled(generator: Generator) -> Generator:
+def compile_generator(generator: Generator) -> Generator:
     """The generator with torch.compile on all but the U-Net: on a CPU oneDNN's convolutions beat generated code."""
     for module in (generator.points, generator.renderer, generator.upsampler):
         module.compile(dynamic=False)
@@ -350,7 +350,7 @@ def trainer(c: TrainConfig, implementation: str, compile: bool, adversarial: boo
         Generator(model, implementation).train(),
         Discriminator(c.loss.discriminator_width, groups).train(),
     )
-    generator = compiled(generator) if compile else generator
+    generator = compile_generator(generator) if compile else generator
     draw = torch.compile(judge, dynamic=False) if compile else judge
     betas = (0.5, 0.999)
     adam_g = torch.optim.Adam(generator.parameters(), c.optimizer.lr_generator, betas, fused=True)
@@ -387,7 +387,7 @@ def function(c: TrainConfig, batch: Batch, mode: str, implementation: str, compi
     generator = Generator(paper_config(c), implementation).eval()
     guard = torch.inference_mode
     if compile:
-        generator, guard = compiled(generator), torch.no_grad
+        generator, guard = compile_generator(generator), torch.no_grad
     encode = guard()(lambda: generator.encode_volume(batch["pos"], batch["mat"]))
     volume = encode()
     draw = guard()(lambda: generator.render_volume(volume, batch["c2w"], batch["focal"]))

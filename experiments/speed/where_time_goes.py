@@ -84,9 +84,9 @@ def main(options: WhereTimeGoes) -> None:
     found: dict[str, Any] = {"hardware": runtime.hardware(), "processor": runtime.processor(), "load": runtime.load()}
     tables = []
     for name, programs in parts.items():
-        found[name], shown = timed(programs, options.rounds), name[0].upper() + name[1:]
+        found[name], shown = time_views(programs, options.rounds), name[0].upper() + name[1:]
         tables.append(table(shown, programs, found[name]))
-    found["growth"] = {name: grown(name, options) for name in options.only or AXES}
+    found["growth"] = {name: measure_growth(name, options) for name in options.only or AXES}
     tables.append(growth_table(found["growth"]))
     sizes = f"{options.points} points, {options.size} px, crops of {options.doublings} doublings"
     results_folder.write(options.out, found, tables, [f"{sizes}; {found['processor']}, load {found['load']}."])
@@ -142,7 +142,7 @@ def frame_programs(options: WhereTimeGoes) -> dict[str, Program]:
     doublings, side = surfel_renderer.resolution(scene, camera)
     plan = surfel_renderer.plan(scene, camera)
     count = partial(surfel_renderer.count_sizes, doublings=doublings, side=side)
-    window = surfel_renderer.scaled(camera, doublings, side)
+    window = surfel_renderer.scale_camera(camera, doublings, side)
     found = jax.jit(projection.entries, static_argnames="room")(scene.surfels, window, room=plan.entries)[0]
     blended = jax.jit(surfel_renderer.blend_window, static_argnames="plan")(scene, camera, light, plan=plan)
 
@@ -161,7 +161,7 @@ def frame_programs(options: WhereTimeGoes) -> dict[str, Program]:
     }
 
 
-def timed(programs: Mapping[str, Program], rounds: int) -> dict[str, float]:
+def time_views(programs: Mapping[str, Program], rounds: int) -> dict[str, float]:
     """Milliseconds of each, the median of turns; those of the processor on a CPU."""
     taken = clock.in_turns({name: one.run for name, one in programs.items()}, rounds)
     return {name: 1e3 * float(np.median(seconds)) for name, seconds in taken.items()}
@@ -239,7 +239,7 @@ AXES = {
 }
 
 
-def grown(name: str, options: WhereTimeGoes) -> dict[str, Any]:
+def measure_growth(name: str, options: WhereTimeGoes) -> dict[str, Any]:
     """Least milliseconds at each value of an axis, and the slopes that follow."""
     axis = AXES[name]
     values = axis.values[:2] if options.quick else axis.values

@@ -113,7 +113,7 @@ def rows(wanted: tuple[Row, ...], config: TrainConfig, dataset: data_sets.Datase
     found = [Variant(name=REFERENCE, label=f"Unchanged ({config.preset})", config=config, dataset=dataset)]
     for name in (name for name in ROWS if name in wanted):
         plain = variants.without_colour_variants(dataset) if name == "no_colour_variants" else dataset
-        variant = Variant(name=name, label=LABELS[name], config=changed(name, config), dataset=plain)
+        variant = Variant(name=name, label=LABELS[name], config=change(name, config), dataset=plain)
         if (variant.config, variant.dataset.splits) == (config, dataset.splits):
             print(f"{LABELS[name]}: left out, {config.preset} is the same or has no such form")
         else:
@@ -121,7 +121,7 @@ def rows(wanted: tuple[Row, ...], config: TrainConfig, dataset: data_sets.Datase
     return found
 
 
-def changed(row: Row, config: TrainConfig) -> TrainConfig:
+def change(row: Row, config: TrainConfig) -> TrainConfig:
     """The config with the one change of a row."""
     return put(config, changes(config).get(row, {}))
 

@@ -29,7 +29,7 @@ from spnr_jax.devices import runtime
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets, images
 from spnr_jax.formats.data_sets import ObjectData
-from spnr_jax.kernels.colors import srgb_to_linear
+from spnr_jax.kernels.imaging import srgb_to_linear
 from spnr_jax.kernels.records import Volume
 from spnr_jax.method.model import Model
 from spnr_jax.scoring.evaluation import Pictures
@@ -107,14 +107,14 @@ def measure(options: RelightingStudy, model: Model, count: int, item: ObjectData
     found: dict[str, dict] = {}
     drawn: dict[str, Pictures] = {}
     for method, quality in METHODS.items():
-        scene = unshadowed(volume) if method == UNSHADOWED else volume
+        scene = remove_shadows(volume) if method == UNSHADOWED else volume
         pictures = drawn[method] = draw_volume(model, scene, item, quality)
         of_views = scores.score_views(item, pictures) | {"log_error": log_errors(item, pictures)}
         found[method] = scores.mean_scores({name: of_views[name] for name in COLUMNS})
     return found, np.asarray(drawn[NETWORK].image[0])
 
 
-def unshadowed(volume: Volume) -> Volume:
+def remove_shadows(volume: Volume) -> Volume:
     """The volume as if every direction saw every point."""
     surfels = volume.scene.surfels
     surfels = dataclasses.replace(surfels, visible=jnp.ones_like(surfels.visible))

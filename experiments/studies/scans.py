@@ -27,14 +27,13 @@ from experiments.comparison.study_objects import cut
 from spnr_jax.devices import runtime
 from spnr_jax.formats import data_sets, images
 from spnr_jax.formats.data_sets import ObjectData
-from spnr_jax.kernels.cleaning import Cleaned, Values, cleaned
-from spnr_jax.kernels.cloud_arrays import normalization
+from spnr_jax.kernels.cleaning import Cleaned, Values, clean_columns
+from spnr_jax.kernels.cloud_arrays import farthest_points, normalization
 from spnr_jax.kernels.records import PointCloud
-from spnr_jax.kernels.thinning import farthest_points
 from spnr_jax.method.model import Model
 from spnr_jax.scoring.evaluation import Pictures
 from spnr_jax.scoring.report import Cell, Table, mean_row, number
-from spnr_jax.surfels import outward
+from spnr_jax.surfels import normals
 from spnr_jax.training.scan_faults import Fault, faults
 from spnr_jax.training.weights import load
 
@@ -134,7 +133,7 @@ def _row(row: str, objects: Sequence[dict], ways: Sequence[str]) -> tuple[str, t
     return mean_row(row, values, DECIMALS * len(ways))
 
 
-def spoiled(cloud: PointCloud, fault: Fault | None) -> tuple[np.ndarray, Values]:
+def add_fault(cloud: PointCloud, fault: Fault | None) -> tuple[np.ndarray, Values]:
     """Positions in the cloud's units and materials after a fault, the same at every call; normals are dropped."""
     positions = np.asarray(cloud.positions, np.float64)
     values = {name: np.asarray(getattr(cloud, name)) for name in ("base_color", "roughness", "metallic")}
@@ -150,21 +149,21 @@ def as_it_is(positions: np.ndarray, values: Values) -> Cleaned:
     return Cleaned(positions, values, [], 0.0)
 
 
-def thinned(points: Cleaned, count: int) -> PointCloud:
+def thin(points: Cleaned, count: int) -> PointCloud:
     """At most so many points, evenly spread, with normals from all, as `read_cloud` keeps them."""
     if len(points.positions) <= count:
-        return outward.thinned(points, np.arange(len(points.positions)))
-    return outward.thinned(points, np.sort(farthest_points(points.positions, count, seed=0)))
+        return normals.thin_cloud(points, np.arange(len(points.positions)))
+    return normals.thin_cloud(points, np.sort(farthest_points(points.positions, count, seed=0)))
 
 
 def measure(options: ScansStudy, model: Model, fault: Fault | None, count: int, item: ObjectData) -> Measured:
     """Mean scores of an object's views without and with cleaning, and the share of its points that is left."""
-    dirty = as_it_is(*spoiled(item.cloud, fault))
-    clean = cleaned(dirty.positions, dirty.values)
+    dirty = as_it_is(*add_fault(item.cloud, fault))
+    clean = clean_columns(dirty.positions, dirty.values)
     seen = cut(item, views=options.views, resolution=options.resolution)
 
     def draw(points: Cleaned, **quality: Any) -> Pictures:
-        return contenders.of_model(model, **quality).show(dataclasses.replace(seen, cloud=thinned(points, count)))
+        return contenders.of_model(model, **quality).show(dataclasses.replace(seen, cloud=thin(points, count)))
 
     best, draft = draw(clean), draw(clean, quality="draft")
     found = {"auto": scores.mean_of(seen, best, COLUMNS), "draft": scores.mean_of(seen, draft, COLUMNS)}
@@ -178,7 +177,7 @@ def measure_surface(
 ) -> Measured:
     """Mean scores of the trimmed Poisson surface of the cleaned points."""
     seen = cut(item, views=options.views, resolution=options.resolution)
-    seen = dataclasses.replace(seen, cloud=thinned(cleaned(*spoiled(item.cloud, fault)), count))
+    seen = dataclasses.replace(seen, cloud=thin(clean_columns(*add_fault(item.cloud, fault)), count))
     pictures = renderer.method("poisson_trimmed").show(seen)
     return {"poisson": scores.mean_of(seen, pictures, COLUMNS)}, np.asarray(pictures.image[0])
 

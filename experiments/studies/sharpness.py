@@ -93,7 +93,7 @@ def main(options: SharpnessStudy) -> None:
         for count in options.counts:
             row = f"{label}, {count:,}"
             rows[row] = partial(measure, options, method, count)
-            known[row] = _known(options, label, models[label], count) if label in models else {}
+            known[row] = _score_known(options, label, models[label], count) if label in models else {}
     shown = options.shown or names[:4]
     found = scores.measure_rows(options.out, rows, dataset, names, shown)
     _pictures(options, dataset, rows, shown)
@@ -144,7 +144,9 @@ def oracle(item: ObjectData, pictures: Pictures) -> dict[str, list[float]]:
     }
 
 
-def _known(options: SharpnessStudy, label: str, model: tuple[Model, Quality], count: int) -> dict[str, float | None]:
+def _score_known(
+    options: SharpnessStudy, label: str, model: tuple[Model, Quality], count: int
+) -> dict[str, float | None]:
     """Scores of a network's ball and plate."""
     network, quality = model
 
@@ -161,7 +163,7 @@ def _known(options: SharpnessStudy, label: str, model: tuple[Model, Quality], co
         return {"ball": of(ball(count), ball_waves), "plate": of(plate(count), blue_share, **front)}
 
     place = scores.place_of(options.out, f"known/{label}", str(count), ".json")
-    return results_folder.kept(place, make)
+    return results_folder.load_or_make(place, make)
 
 
 def _row(

@@ -62,7 +62,7 @@ def leads() -> bool:
     return jax.process_index() == 0
 
 
-def replicated(mesh: Mesh) -> NamedSharding:
+def sharding_of_all(mesh: Mesh) -> NamedSharding:
     """The sharding of what every device holds whole."""
     return NamedSharding(mesh, PartitionSpec())
 
@@ -132,7 +132,7 @@ class Agreement:
         return earlier is not None and bool(earlier)
 
 
-def lost(error: jax.errors.JaxRuntimeError, run: object) -> Exception:
+def explain_lost_process(error: jax.errors.JaxRuntimeError, run: object) -> Exception:
     """What to raise of an error of the runtime: of several processes, that another one is gone."""
     if jax.process_count() == 1:
         return error

@@ -21,18 +21,24 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from spnr_jax.errors import UserError
-from spnr_jax.formats.columns import DEFAULTS, Columns, Report, believed, materials, normals, sound, useful
+from spnr_jax.formats.columns import DEFAULTS, Columns, Report, keep_visible, materials, normals, sound, useful
 from spnr_jax.formats.cut import Cut
 from spnr_jax.formats.mesh.assets import ShownParts
 from spnr_jax.formats.orientation import ROTATIONS, find_up, sensor_of
 from spnr_jax.formats.point_files import MESHES, column_pieces, kind_of, parse_ply
 from spnr_jax.kernels import scenes
-from spnr_jax.kernels.cleaning import Clean, cleaned
-from spnr_jax.kernels.facing import facing, planes
+from spnr_jax.kernels.cleaning import Clean, clean_columns
+from spnr_jax.kernels.cloud_arrays import (
+    THINNING,
+    farthest_points,
+    merge_repeats,
+    require_surface,
+    sample_stream,
+    spacing,
+    stack_columns,
+)
 from spnr_jax.kernels.records import PointCloud
-from spnr_jax.kernels.repeats import merge_repeats, require_surface, spacing
-from spnr_jax.kernels.thinning import THINNING, farthest_points, sample_stream, stacked
-from spnr_jax.surfels.outward import outward_normals
+from spnr_jax.surfels.normals import facing, outward_normals, planes
 
 __all__ = ("MESHES", "PlacedCloud", "cloud_of_ply", "place_cloud", "read_cloud")
 
@@ -106,7 +112,7 @@ def read_cloud(
     """The cloud in a file of points or on a mesh file's surface: (points, ...) float32, `mask` all True.
 
     The options are those of `Reading`.  Points that are thinned out have normals, the file's or those that all of its
-    points tell (surfels/outward.py).  Rows without finite numbers are left out.  ValueError, one line that names the
+    points tell (surfels/normals.py).  Rows without finite numbers are left out.  ValueError, one line that names the
     file, for whatever cannot be read.
     """
     how = {"seed": seed, "clean": clean, "cut": cut, "transparent_parts": transparent_parts, "report": report}
@@ -120,7 +126,7 @@ def place_cloud(path: str | Path, **options: Any) -> PlacedCloud:
     try:
         with np.errstate(all="ignore"):  # of signalling NaN, and what leaves its type: both are looked for
             points, noise = _points_of(path, kind, how)
-            return _placed(path, kind, points, noise, how)
+            return _place(path, kind, points, noise, how)
     except (ValueError, OSError) as error:
         raise UserError(f"{path}: {str(error).splitlines()[0]}") from error
 
@@ -132,7 +138,7 @@ class Points(NamedTuple):
     values: dict[str, np.ndarray]
     origin: np.ndarray
 
-    def chosen(self, rows: np.ndarray) -> "Points":
+    def take(self, rows: np.ndarray) -> "Points":
         """The points of these rows."""
         return Points(self.positions[rows], {name: column[rows] for name, column in self.values.items()}, self.origin)
 
@@ -141,20 +147,20 @@ def _points_of(path: Path, kind: str, how: Reading) -> tuple[Points, float]:
     """The points of a file, read, cut out and cleaned, and how noisy they were."""
     pieces, noise = column_pieces(path, kind), 0.0
     if pieces is None:
-        points = _sampled_mesh(path, kind, how)
+        points = _sample_mesh(path, kind, how)
     else:
-        points = _without_repeats(_interpreted(_bounded_columns(pieces, how), how), how.report)
+        points = _without_repeats(_interpret(_read_columns(pieces, how), how), how.report)
     rows, lines = scenes.object_of(points.positions, points.origin, how.cut.remove_plane, how.cut.nth, how.seed)
-    points = points.chosen(rows)
+    points = points.take(rows)
     if pieces is not None and how.clean != "off":
-        positions, values, done, noise = cleaned(points.positions, points.values, how.clean)
+        positions, values, done, noise = clean_columns(points.positions, points.values, how.clean)
         points, lines = Points(positions, values, points.origin), lines + done
     for line in lines:
         how.report(line)
     return (points if pieces is None else _believing(points, how.report)), noise
 
 
-def _placed(path: Path, kind: str, points: Points, noise: float, how: Reading) -> PlacedCloud:
+def _place(path: Path, kind: str, points: Points, noise: float, how: Reading) -> PlacedCloud:
     """The cloud of the points, thinned, with normals, upright, moved to its origin."""
     up, count = how.up, how.num_points
     sensor = sensor_of(path, points.positions + points.origin, kind, how.report)
@@ -162,7 +168,7 @@ def _placed(path: Path, kind: str, points: Points, noise: float, how: Reading) -
     if count is not None and len(kept) > count:
         how.report(f"{count} of {len(kept)} points kept, evenly spread")
         kept = np.sort(farthest_points(points.positions, count, how.seed))
-    fewer = points.chosen(kept)
+    fewer = points.take(kept)
     if "normals" not in points.values and sensor:
         fewer.values["normals"] = facing(fewer.positions, points.positions, sensor.place - points.origin, noise)
         how.report("normals turned to the place of the sensor")
@@ -173,7 +179,7 @@ def _placed(path: Path, kind: str, points: Points, noise: float, how: Reading) -
         up, reason = (camera_up, "that of its camera") if camera_up else find_up(fewer.positions, Path(f"a{kind}"))
         how.report(f"{up} taken as up ({reason}); --up says otherwise")
     rotation = np.array(ROTATIONS[up], np.float64)
-    positions, origin = _moved(fewer.positions, points.origin, how.report)
+    positions, origin = _shift(fewer.positions, points.origin, how.report)
     values = fewer.values
     if "normals" in values:
         values["normals"] = values["normals"] @ rotation.T
@@ -193,7 +199,7 @@ def cloud_of_ply(content: bytes) -> PointCloud:
     if not len(columns["x"]):
         raise UserError("holds 0 points")
     values, directions = materials(columns, lambda line: None), normals(columns)
-    return _float32(stacked(columns), values if directions is None else values | {"normals": directions})
+    return _float32(stack_columns(columns), values if directions is None else values | {"normals": directions})
 
 
 def _float32(positions: np.ndarray, values: dict[str, np.ndarray]) -> PointCloud:
@@ -210,7 +216,7 @@ def _coarse(positions: np.ndarray) -> bool:
     return bool(step > COARSEST_STEP * np.ptp(positions, axis=0).max() > 0)
 
 
-def _moved(positions: np.ndarray, before: np.ndarray, report: Report) -> tuple[np.ndarray, np.ndarray]:
+def _shift(positions: np.ndarray, before: np.ndarray, report: Report) -> tuple[np.ndarray, np.ndarray]:
     """Positions (n, 3) from which `before` was subtracted, and the origin that is subtracted in the end."""
     whole = positions + before
     if not _coarse(whole):
@@ -220,13 +226,13 @@ def _moved(positions: np.ndarray, before: np.ndarray, report: Report) -> tuple[n
     return positions + (before - origin), origin
 
 
-def _sampled_mesh(path: Path, kind: str, how: Reading) -> Points:
+def _sample_mesh(path: Path, kind: str, how: Reading) -> Points:
     """Points spread evenly over a mesh, those inside the box that is to be cut out."""
     from spnr_jax.formats.mesh.meshes import load_mesh  # here: points are read without trimesh
     from spnr_jax.formats.mesh.surface_points import bounding_box, sample_surface
 
     cut, report = how.cut, how.report
-    count = max(CUT_MESH if cut.asked else 0, how.num_points or MESH_POINTS)
+    count = max(CUT_MESH if cut.is_given else 0, how.num_points or MESH_POINTS)
     asset = load_mesh(path, transparent_parts=how.transparent_parts, kind=kind)
     for line in ([f"ignored: {'; '.join(asset.ignored)}"] if asset.ignored else []) + list(asset.notes):
         report(line)
@@ -250,11 +256,11 @@ def _sampled_mesh(path: Path, kind: str, how: Reading) -> Points:
         return points
     whole = points.positions + origin
     inside = scenes.in_box(whole, cut.crop)
-    report(scenes.cropped(int(inside.sum()), count, cut.crop, whole.min(axis=0), whole.max(axis=0)))
-    return points.chosen(inside)
+    report(scenes.crop_box(int(inside.sum()), count, cut.crop, whole.min(axis=0), whole.max(axis=0)))
+    return points.take(inside)
 
 
-def _bounded_columns(pieces: Iterator[Columns], how: Reading) -> Columns:
+def _read_columns(pieces: Iterator[Columns], how: Reading) -> Columns:
     """The useful columns of a point file inside the box to be cut out, of very many points those of a random sample."""
     cut, report = how.cut, how.report
     capacity, broken, outside = max(CAPACITY, THINNING * (how.num_points or 0)), 0, 0
@@ -267,7 +273,7 @@ def _bounded_columns(pieces: Iterator[Columns], how: Reading) -> Columns:
             wanted = sound(columns)
             broken += int(np.count_nonzero(~wanted))
             if cut.crop:
-                positions = stacked(columns)
+                positions = stack_columns(columns)
                 low = np.minimum(low, positions[wanted].min(axis=0, initial=np.inf))
                 high = np.maximum(high, positions[wanted].max(axis=0, initial=-np.inf))
                 inside = scenes.in_box(positions, cut.crop)
@@ -281,18 +287,18 @@ def _bounded_columns(pieces: Iterator[Columns], how: Reading) -> Columns:
     if broken:
         report(f"{broken:,} of {seen + outside + broken:,} points left out: {BROKEN}")
     if cut.crop and seen + outside:
-        report(scenes.cropped(seen, seen + outside, cut.crop, low, high))
+        report(scenes.crop_box(seen, seen + outside, cut.crop, low, high))
     if seen > capacity:
         report(f"{len(columns['x'])} of {seen} points kept while reading, drawn at random")
     return columns
 
 
-def _interpreted(columns: Columns, how: Reading) -> Points:
+def _interpret(columns: Columns, how: Reading) -> Points:
     """What the columns of a file of points mean."""
     if not columns or len(columns["x"]) == 0:
         raise UserError("holds 0 points")
-    columns = believed(columns, how.cut.keep_noise, how.report)
-    positions = stacked(columns)
+    columns = keep_visible(columns, how.cut.keep_noise, how.report)
+    positions = stack_columns(columns)
     _check_steps(columns, positions, how.report)
     origin = np.floor(positions.min(axis=0)) if _coarse(positions) else np.zeros(3)
     values, directions = materials(columns, how.report), normals(columns)
@@ -340,7 +346,7 @@ def _believing(points: Points, report: Report) -> Points:
         return points
     tree = cKDTree(positions)
     black = np.asarray(~values["base_color"].any(axis=1))
-    if 0.1 < black.mean() < 0.9 and _mixed(tree, black):
+    if 0.1 < black.mean() < 0.9 and _is_mixed(tree, black):
         report(
             f"{int(black.sum()):,} of {len(black):,} points have no colour (0 0 0): that of their neighbours is taken"
         )
@@ -357,7 +363,7 @@ def _believing(points: Points, report: Report) -> Points:
     return Points(positions, values, points.origin)
 
 
-def _mixed(tree: cKDTree, black: np.ndarray) -> bool:
+def _is_mixed(tree: cKDTree, black: np.ndarray) -> bool:
     """Whether black points lie among the others as if chosen by chance, and not in parts of their own."""
     rows = np.flatnonzero(black)
     near = tree.query(tree.data[rows[:: -(-len(rows) // SAMPLE)]], range(2, 10))[1]

@@ -92,7 +92,7 @@ def sound(columns: Columns) -> np.ndarray:
     return mask
 
 
-def believed(columns: Columns, keep_noise: bool, report: Report) -> Columns:
+def keep_visible(columns: Columns, keep_noise: bool, report: Report) -> Columns:
     """The rows that are to be seen: without noise and withheld points of scanners, fog, and what is transparent.
 
     With `keep_noise` all of them; a line about each kind that is left out.

@@ -21,7 +21,7 @@ class Cut:
     """Also points that a scan's classification calls noise (7, 18), withheld ones, and those of next to no opacity."""
 
     @property
-    def asked(self) -> bool:
+    def is_given(self) -> bool:
         """Whether anything is cut."""
         return bool(self.crop or self.remove_plane or self.object)
 

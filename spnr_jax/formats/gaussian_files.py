@@ -164,7 +164,7 @@ def spz_columns(path: Path) -> Columns:
     return columns | {"splat_opacity": octets[9 * count : 10 * count] / 255}
 
 
-def compressed_columns(chunks: Columns, packed: Columns) -> Columns:
+def decompress_columns(chunks: Columns, packed: Columns) -> Columns:
     """The columns of a compressed .ply from its elements `chunk` and `vertex`."""
     try:
         place, color = (np.asarray(packed[name], np.uint32) for name in ("packed_position", "packed_color"))

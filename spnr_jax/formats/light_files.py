@@ -27,7 +27,7 @@ def read_light(source: Path | str, normalise: bool = True) -> Light:
     """
     named = skies.NAMED.get(str(source))
     envmap = named(skies.HEIGHT) if named else read_envmap(Path(source))
-    return light_of(skies.normalised(envmap) if normalise else envmap)
+    return light_of(skies.normalise(envmap) if normalise else envmap)
 
 
 def read_envmap(path: Path) -> Float[np.ndarray, "height width 3"]:

@@ -43,7 +43,7 @@ def numpy_pieces(path: Path) -> Iterator[Columns]:
         magic = file.read(6)
         file.seek(0)
         if magic.startswith(b"PK"):
-            yield _named_arrays(read_arrays(file, ARRAY_COLUMNS))
+            yield _name_columns(read_arrays(file, ARRAY_COLUMNS))
             return
     if not magic.startswith(b"\x93NUMPY"):
         raise UserError("is not a NumPy file")
@@ -62,7 +62,7 @@ def numpy_pieces(path: Path) -> Iterator[Columns]:
         yield {name.lower(): column for name, column in zip(names, values, strict=True)}
 
 
-def packed(arrays: dict[str, np.ndarray], *, compressed: bool = False) -> bytes:
+def pack_arrays(arrays: dict[str, np.ndarray], *, compressed: bool = False) -> bytes:
     """An .npz archive of arrays by their names."""
     stream = io.BytesIO()
     save = np.savez_compressed if compressed else np.savez
@@ -108,7 +108,7 @@ def _member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
         return np.lib.format.read_array(stream, allow_pickle=False)
 
 
-def _named_arrays(archive: dict[str, np.ndarray]) -> Columns:
+def _name_columns(archive: dict[str, np.ndarray]) -> Columns:
     """The columns of arrays (points, c), or (points,) for scalars, under the names of ARRAY_COLUMNS."""
     columns: Columns = {}
     for name, array in archive.items():

@@ -20,7 +20,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from spnr_jax.formats.pcd import read_pcd_header
 from spnr_jax.formats.ply import camera_row
-from spnr_jax.kernels.facing import seen_from, spacing_of
+from spnr_jax.surfels.normals import find_visible, spacing_of
 
 ROTATIONS = {  # axis of the file that points up -> rotation (rows) that makes it y
     "y": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
@@ -125,4 +125,4 @@ def _from_there(positions: np.ndarray, place: np.ndarray, share: float, within: 
     """Whether that share of the points is seen from a place; `within` if one inside of their bounding box counts."""
     if np.all((place > positions.min(axis=0)) & (place < positions.max(axis=0))):
         return within
-    return bool(seen_from(positions, place, spacing_of(positions), BEHIND).mean() > share)
+    return bool(find_visible(positions, place, spacing_of(positions), BEHIND).mean() > share)

@@ -22,7 +22,7 @@ import numpy as np
 
 from spnr_jax.errors import UserError
 from spnr_jax.formats.columns import Columns
-from spnr_jax.formats.gaussian_files import compressed_columns, spz_columns
+from spnr_jax.formats.gaussian_files import decompress_columns, spz_columns
 from spnr_jax.formats.las import las_pieces
 from spnr_jax.formats.npz import numpy_pieces
 from spnr_jax.formats.pcd import pcd_pieces
@@ -120,7 +120,7 @@ def column_pieces(path: Path, kind: str | None = None) -> Iterator[Columns] | No
 
 def parse_ply(content: bytes) -> Columns:
     """The columns of the vertices in the bytes of a PLY file."""
-    return joined(vertex_pieces(io.BytesIO(content)))
+    return join_pieces(vertex_pieces(io.BytesIO(content)))
 
 
 def _ply(path: Path) -> Iterator[Columns]:
@@ -133,12 +133,12 @@ def _ply(path: Path) -> Iterator[Columns]:
             _, count, properties = header.elements[0]
             rows = np.concatenate(list(element_rows(file, count, properties, header.byte_order)))
             chunks = {name: rows[name] for name in rows.dtype.names or ()}
-            yield compressed_columns(chunks, joined(ply_pieces(path)))
+            yield decompress_columns(chunks, join_pieces(ply_pieces(path)))
             return
     yield from ply_pieces(path)
 
 
-def joined(pieces: Iterable[Columns]) -> Columns:
+def join_pieces(pieces: Iterable[Columns]) -> Columns:
     """The columns of all pieces in one; none if there are no pieces."""
     pieces = list(pieces)
     if len(pieces) < 2:

@@ -26,9 +26,8 @@ from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 
 from spnr_jax.errors import UserError
+from spnr_jax.kernels.cloud_arrays import find_distinct, unit_means, voxel_keys
 from spnr_jax.kernels.records import PointCloud
-from spnr_jax.kernels.repeats import find_distinct, unit_means
-from spnr_jax.kernels.thinning import voxel_keys
 
 Strength = Literal["auto", "strong"]
 Clean = Literal["auto", "off", "strong"]
@@ -94,14 +93,14 @@ def clean(cloud: PointCloud, strength: Strength = "auto") -> tuple[PointCloud, l
         raise UserError(f"clean takes one cloud, positions (points, 3); got shape {np.shape(cloud.positions)}")
     real = np.asarray(cloud.mask)
     columns = {name: np.asarray(x)[real] for name, x in vars(cloud).items() if x is not None and name != "mask"}
-    positions, values, lines, _ = cleaned(columns.pop("positions"), columns, strength)
+    positions, values, lines, _ = clean_columns(columns.pop("positions"), columns, strength)
     if not lines:
         return cloud, []
     values = {name: np.asarray(x, np.float32) for name, x in (values | {"positions": positions}).items()}
     return dataclasses.replace(cloud, mask=np.ones(len(positions), bool), **values), lines
 
 
-def cleaned(positions: Float[np.ndarray, "points 3"], values: Values, strength: Strength = "auto") -> Cleaned:
+def clean_columns(positions: Float[np.ndarray, "points 3"], values: Values, strength: Strength = "auto") -> Cleaned:
     """The points and other columns (points, ...) without outliers, and averaged; what is sound is not copied."""
     lines = []
     apart = outliers(positions, strength)
@@ -112,7 +111,7 @@ def cleaned(positions: Float[np.ndarray, "points 3"], values: Values, strength: 
     averages = bool(sigma > NOISY[strength] * spacing > 0)
     if averages:
         before = len(positions)
-        positions, values = averaged(positions, values, sigma, spacing)
+        positions, values = denoise(positions, values, sigma, spacing)
         kept = ~fringe(positions, fringe_cell(sigma, spacing))
         positions, values = positions[kept], {name: x[kept] for name, x in values.items()}
         lines.append(f"averaged {before:,} points to {len(positions):,}: noise of {sigma / spacing:.1f} spacings")
@@ -214,7 +213,7 @@ def _heights(near: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(best), best, 0)  # three neighbours in a line span no plane: nothing is known
 
 
-def averaged(
+def denoise(
     positions: Float[np.ndarray, "points 3"], values: Values, sigma: float, spacing: float, deviations: float = RADIUS
 ) -> tuple[Float[np.ndarray, "moved 3"], Values]:
     """Points moved against noise of this standard deviation, at most MOST_MOVED, and the means of their values.
@@ -232,7 +231,7 @@ def averaged(
     alike = _alike(tree, others)
 
     def moved_of(piece: slice) -> np.ndarray:
-        return _moved(start[piece], own[piece], tree, others, sigma, radius, alike)
+        return _denoise_step(start[piece], own[piece], tree, others, sigma, radius, alike)
 
     moved = np.concatenate([moved_of(slice(i, i + ROWS)) for i in range(0, len(start), ROWS)])
     means = _means(moved, {name: column[rows] for name, column in values.items()}, MEAN * max(sigma, spacing))
@@ -249,7 +248,7 @@ def _alike(tree: cKDTree, color: np.ndarray) -> float:
     return max(ALIKE, COLOUR_NOISE * float(np.median(np.quantile(apart, 0.25, axis=1))))
 
 
-def _moved(
+def _denoise_step(
     start: np.ndarray,
     own: np.ndarray,
     tree: cKDTree,

@@ -152,7 +152,7 @@ def per_feature(vector: Shaped[Array, " features"], like: Array) -> Shaped[Array
     return vector.reshape(*[1] * (like.ndim - 1), -1)
 
 
-def computed_once(x: Float[Array, "*batch n"]) -> Float[Array, "*batch n"]:
+def compute_once(x: Float[Array, "*batch n"]) -> Float[Array, "*batch n"]:
     """x, through a product with the identity matrix; for few and finite numbers that much else is computed from.
 
     XLA's CPU compiler computes elementwise results anew in every loop that reads them, and drops optimization_barrier.

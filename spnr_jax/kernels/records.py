@@ -219,7 +219,7 @@ class Batch:
 @no_type_check
 @struct.dataclass
 class Crops:
-    """One training batch of the shader network: squares of G-buffers as it sees them (`surfels/features.py`).
+    """One training batch of the shader network: squares of G-buffers as it sees them (`nn/shader.py`).
 
     `target` is the reference, 8-bit RGBA with straight alpha, at 2^doublings times the resolution; `seen` reaches
     `margin` pixels beyond it and the maps to each side.

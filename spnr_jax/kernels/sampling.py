@@ -24,20 +24,20 @@ def strata(key: Key | None, shape: tuple[int, ...], num_samples: int) -> Float[A
 
 def split(key: Key) -> tuple[Key, Key]:
     """Two new keys of each key."""
-    key = typed(key)
+    key = as_typed_key(key)
     if key.ndim:
         return jax.vmap(split)(key)
     first, second = jax.random.split(key)
     return first, second
 
 
-def typed(key: Key) -> Key:
+def as_typed_key(key: Key) -> Key:
     """The key, or keys; those of `jax.random.PRNGKey`, pairs of numbers, as ones of `jax.random.key`."""
     return key if jnp.issubdtype(key.dtype, jax.dtypes.prng_key) else jax.random.wrap_key_data(key)
 
 
 def _uniform(key, shape):
-    key = typed(key)
+    key = as_typed_key(key)
     return jax.random.uniform(key, shape) if key.ndim == 0 else jax.vmap(_uniform, (0, None))(key, shape[1:])
 
 

@@ -18,8 +18,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from spnr_jax.errors import UserError
+from spnr_jax.kernels.cloud_arrays import first_in_voxels, frame
 from spnr_jax.kernels.records import PointCloud
-from spnr_jax.kernels.thinning import first_in_voxels, frame
 
 Values = dict[str, np.ndarray]
 Box = Sequence[float | int]
@@ -68,7 +68,7 @@ def cut_out(
     if crop is not None:
         inside = in_box(positions[left], crop)
         low, high = positions[left].min(axis=0), positions[left].max(axis=0)
-        lines.append(cropped(int(inside.sum()), len(left), crop, low, high))
+        lines.append(crop_box(int(inside.sum()), len(left), crop, low, high))
         left = left[inside]
     chosen, said = object_of(positions[left], np.zeros(3), remove_plane, nth, seed)
     columns = {name: np.asarray(x)[left[chosen]] for name, x in vars(cloud).items() if x is not None}
@@ -80,15 +80,15 @@ def in_box(positions: Float[np.ndarray, "points 3"], box: Box) -> Bool[np.ndarra
     return np.all((positions >= np.asarray(box[:3])) & (positions <= np.asarray(box[3:])), axis=-1)
 
 
-def cropped(kept: int, seen: int, box: Box, low: np.ndarray, high: np.ndarray) -> str:
+def crop_box(kept: int, seen: int, box: Box, low: np.ndarray, high: np.ndarray) -> str:
     """The line about a box, of points that lie from low (3,) to high (3,); ValueError if it holds none of them."""
     if not kept:
         asked = " ".join(f"{value:g}" for value in box)
-        raise UserError(f"--crop {asked}: none of the {seen:,} points, they lie in the box {_written(low, high)}")
+        raise UserError(f"--crop {asked}: none of the {seen:,} points, they lie in the box {_format_box(low, high)}")
     return f"--crop: {kept:,} of {seen:,} points lie inside"
 
 
-def _written(low: np.ndarray, high: np.ndarray) -> str:
+def _format_box(low: np.ndarray, high: np.ndarray) -> str:
     """A box as --crop takes it, to a thousandth of its size."""
     size = float(np.max(high - low, initial=np.finfo(np.float64).tiny))
     decimals = int(np.clip(3 - np.floor(np.log10(size)), 0, 12))
@@ -126,7 +126,7 @@ def object_of(
             there = f"are {count} clusters" if count > 1 else "is 1 cluster"
             raise UserError(f"--object {nth}: there {there} of points; choose one from 1 to {count}")
         chosen = rows[labels == nth - 1]
-        box = _written(positions[chosen].min(axis=0) + origin, positions[chosen].max(axis=0) + origin)
+        box = _format_box(positions[chosen].min(axis=0) + origin, positions[chosen].max(axis=0) + origin)
         lines.append(f"--object: cluster {nth} of {count:,}, {len(chosen):,} of {len(rows):,} points, in the box {box}")
         rows = chosen
     return rows, lines

@@ -1,19 +1,29 @@
-"""Points to volume and back: scatter by voxel, trilinear lookup.
+"""Points to volume and back (scatter by voxel, trilinear lookup), and the empty space where nothing is evaluated.
 
 A scatter is a sum: each point adds 1 / (points in its voxel) of its features to the voxel's mean (`spread`).
 
 A volume covers the box [-1, 1]^3 with D voxels along each axis and is indexed (z, y, x, features); voxel i of an axis
 covers [-1 + 2 i / D, -1 + 2 (i + 1) / D].  Positions are (x, y, z).  In grid coordinates, (position + 1) * D / 2, voxel
 centres lie at i + 0.5.  Leading batch axes pair a volume with its positions.
+
+A ray is cut into equal cells; those whose middle lies in a voxel near points are `open` (occupied segments).
+`travelled` is the length of the open cells up to a place: samples lie in the concatenated segments, so that none falls
+into a gap, and a gap adds no interval length.  Density is 0 outside, by definition.
 """
 
 import itertools
+from collections.abc import Callable
+from functools import partial
+from typing import Any, no_type_check
 
 import jax
 import jax.numpy as jnp
+from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from spnr_jax.kernels.numerics import blend_rows, clamp, computed_once, gather_rows, scatter_rows
+from spnr_jax.kernels import sampling
+from spnr_jax.kernels.numerics import blend_rows, clamp, compute_once, gather_rows, scatter_rows
+from spnr_jax.kernels.records import Rays
 
 NEIGHBOURS = tuple((z, y, x) for z in (-1, 0, 1) for y in (-1, 0, 1) for x in (-1, 0, 1))
 
@@ -63,7 +73,7 @@ def share_voxels(
     return rows, ones / jnp.maximum(count, 1)
 
 
-def occupied(
+def mark_occupied(
     positions: Float[Array, "points 3"], mask: Bool[Array, " points"], resolution: int
 ) -> Bool[Array, "d d d"]:
     """Whether each voxel holds a point; masked points and points outside the box do not count."""
@@ -137,7 +147,7 @@ def trilinear(
     lowest, weights, steps = corners(positions, resolution)
     if objects is not None:
         lowest = lowest + objects.reshape(-1) * resolution**3
-    out = blend_rows(volume.reshape(-1, volume.shape[-1]), lowest, computed_once(weights), steps)
+    out = blend_rows(volume.reshape(-1, volume.shape[-1]), lowest, compute_once(weights), steps)
     return out.reshape(*positions.shape[:-1], volume.shape[-1])
 
 
@@ -161,3 +171,101 @@ def corners(
     next_voxel = min(resolution - 1, 1)  # a volume of one voxel has no next one
     steps = tuple(next_voxel * (i + resolution * (j + resolution * k)) for i, j, k in places)
     return lowest, weights.reshape(-1, 8), steps
+
+
+# --- empty space ------------------------------------------------------------------------------------------------------
+
+
+@no_type_check  # pytree transformations rebuild records with leaves that are no arrays
+@struct.dataclass
+class Path:
+    """Cells along rays: their sorted `edges`, distances along the ray, and the open length up to each edge."""
+
+    edges: Float[Array, "*batch cells+1"]
+    travelled: Float[Array, "*batch cells+1"]
+
+
+def dilate(occupied: Bool[Array, "*batch d d d"], reach: int) -> Bool[Array, "*batch d d d"]:
+    """Voxels within `reach` voxels, along every axis, of an occupied one."""
+    for axis in (-3, -2, -1):
+        window, padding = [1] * occupied.ndim, [(0, 0)] * occupied.ndim
+        window[axis], padding[axis] = 2 * reach + 1, (reach, reach)
+        occupied = jax.lax.reduce_window(occupied, False, jax.lax.bitwise_or, window, [1] * occupied.ndim, padding)
+    return occupied
+
+
+def open_path(
+    near_points: Bool[Array, "*objects d d d"],
+    rays: Rays,
+    near: Float[Array, "*batch"],
+    far: Float[Array, "*batch"],
+    num_cells: int,
+    objects: Int[Array, "*batch"] | None = None,
+) -> Path:
+    """Cells between near and far; the first axes of the rays are the objects of `near_points`.  No gradient.
+
+    With `objects`, which says to which object each ray belongs, the rays have any axes.  A cell is as open as the voxel
+    of its middle; on a face between two voxels, rounding decides which.
+    """
+    if near_points.ndim > 3 and objects is None:
+        return jax.vmap(partial(open_path, num_cells=num_cells))(near_points, rays, near, far)
+    near, far = near[..., None], far[..., None]
+    fractions = jnp.arange(num_cells + 1, dtype=near.dtype).reshape(*[1] * (near.ndim - 1), -1) / num_cells
+    edges = near + (far - near) * fractions
+    middles = 0.5 * (edges[..., 1:] + edges[..., :-1])
+    resolution = near_points.shape[-1]
+    # an axis at a time: the voxels of all cells are then found in one loop
+    x, y, z = (
+        voxel_of(rays.origins[..., i, None] + middles * rays.directions[..., i, None], resolution) for i in range(3)
+    )
+    first = 0 if objects is None else objects[..., None] * resolution**3
+    is_open = gather_rows(near_points.reshape(-1, 1).astype(near.dtype), first + row_at(x, y, z, resolution))[..., 0]
+    # equal cells are counted, in a product: a running sum takes a CPU longer, docs/lab/cpu_forms.md
+    count = is_open @ jnp.triu(jnp.ones((num_cells, num_cells + 1), near.dtype), 1)
+    return jax.lax.stop_gradient(Path(edges=edges, travelled=count * ((far - near) / num_cells)))
+
+
+def whole_path(near: Float[Array, "*batch"], far: Float[Array, "*batch"]) -> Path:
+    """All of the ray between near and far, as one open cell."""
+    return Path(edges=jnp.stack([near, far], axis=-1), travelled=jnp.stack([jnp.zeros_like(near), far - near], axis=-1))
+
+
+def distance_at(path: Path, travelled: Float[Array, "*batch samples"]) -> Float[Array, "*batch samples"]:
+    """Distance along the ray with so much open length behind it; the end of a cell, not the start of the next.
+
+    What exceeds the open length of the ray ends at the last edge.
+    """
+    ends = path.travelled[..., 1:]
+    if ends.shape[-1] == 1:
+        return jnp.clip(path.edges[..., :1] + travelled, path.edges[..., :1], path.edges[..., 1:])
+    index = jnp.minimum(sampling.count_at_most(ends, travelled, strictly=True), ends.shape[-1] - 1)
+    start, behind = (jnp.take_along_axis(x[..., :-1], index, axis=-1) for x in (path.edges, path.travelled))
+    end = jnp.take_along_axis(path.edges[..., 1:], index, axis=-1)
+    return jnp.clip(start + travelled - behind, start, end)
+
+
+def map_existing(function: Callable, exists: Bool[Array, " rows"], inputs: Any, empty: Any, block: int) -> Any:
+    """`function` of the rows of the inputs that exist, `empty`'s rows for the others, `block` rows at a time.
+
+    Blocks beyond the last existing row are skipped: time follows what there is, memory is that of a block.  The
+    gradient computes a block again rather than keep what it computed.
+    """
+    total = exists.shape[0]
+    block = min(block, total)
+    size = total + -total % block
+    (order,) = jnp.nonzero(exists, size=size, fill_value=total)  # what exists comes first; `total` is no row
+    count = jnp.sum(exists)
+
+    @jax.checkpoint
+    def one_block(start: Array, rows: Int[Array, " block"]) -> Any:
+        taken = jnp.minimum(rows, total - 1)
+        return jax.lax.cond(
+            start < count,
+            lambda: function(*jax.tree.map(lambda x: x[taken], inputs)),
+            lambda: jax.tree.map(lambda x: jnp.zeros_like(x[taken]), empty),
+        )
+
+    blocks = jax.lax.map(lambda x: one_block(*x), (jnp.arange(0, size, block), order.reshape(-1, block)))
+    return jax.tree.map(
+        lambda background, x: background.at[order].set(x.reshape(size, *x.shape[2:]), mode="drop"), empty, blocks
+    )

@@ -24,8 +24,7 @@ from jaxtyping import Array, Bool, Float, Int
 from spnr_jax.errors import UserError
 from spnr_jax.kernels.numerics import clamp, length, normalize, root
 from spnr_jax.kernels.records import AnyArray, PointCloud, Surfels
-from spnr_jax.surfels.geometry import estimate_surfels
-from spnr_jax.surfels.surfel_scenes import move_into_box
+from spnr_jax.surfels.geometry import estimate_surfels, move_into_box
 
 MOST_POINTS = 8192  # of a sparse cloud
 CHILDREN = 6  # of a point: in the middle of its pairs, each of which belongs to one of its ends, and at open places

@@ -22,9 +22,9 @@ from spnr_jax.config import NetworkConfig, RenderOptions, TrainConfig
 from spnr_jax.devices.runtime import QUICK
 from spnr_jax.errors import UserError
 from spnr_jax.kernels import cameras, cloud_arrays, losses
+from spnr_jax.kernels.imaging import average
 from spnr_jax.kernels.metrics import psnr
 from spnr_jax.kernels.records import Batch, Camera, Key, Light, PointCloud, Rendering, Volume
-from spnr_jax.kernels.resizing import averaged
 from spnr_jax.method import pixels
 from spnr_jax.methods import Outcome, network
 
@@ -62,7 +62,7 @@ def render(
     if (side := options.rays_per_side) > 1:
         wide = cameras.resize(camera, side * camera.height, side * camera.width)
         narrow = dataclasses.replace(options, rays_per_side=1)
-        return averaged(render(variables, scene, wide, config=config, options=narrow), side)
+        return average(render(variables, scene, wide, config=config, options=narrow), side)
     return network(config).bind(variables).render(scene, camera, options)
 
 
@@ -78,7 +78,7 @@ def loss(
 ) -> tuple[Float[Array, ""], Outcome]:
     """(loss, outcome): errors of the pixels that a step renders, and the losses of the network's own."""
     if key is not None:
-        key, batch = pixels.chosen(key, batch, config)
+        key, batch = pixels.choose_pixels(key, batch, config)
     rendering, updated = network(config.model).apply(
         variables, batch.cloud, batch.camera, key, train=True, mutable=["batch_stats", "losses"]
     )

@@ -1,6 +1,6 @@
 """The paper's method on one page: points -> volume -> features along rays -> image.
 
-    encode   PointNet on every point, mean per voxel, 3D U-Net (`nn/encoder.py`)             once per object
+    encode   PointNet on every point, mean per voxel, 3D U-Net (`nn/paper.py`)             once per object
     render   64 x 64 rays, 64 coarse and 64 fine samples, field, compositing, 2D upsampler   once per view
     trace    all rays: those that meet nothing are left out, the others rendered in blocks on the device of their object
     march    rays of a block: coarse samples, fine samples where the coarse weights are large, compositing
@@ -25,16 +25,13 @@ from scipy.spatial import cKDTree
 
 from spnr_jax.config import AS_TRAINED, PaperConfig, RenderOptions, SamplingConfig, TrainConfig
 from spnr_jax.devices.placement import split_objects
-from spnr_jax.kernels import cameras, compositing, occupancy, sampling, voxels
+from spnr_jax.kernels import cameras, compositing, sampling, voxels
+from spnr_jax.kernels.imaging import bilinear
 from spnr_jax.kernels.numerics import clamp
-from spnr_jax.kernels.occupancy import Path
 from spnr_jax.kernels.records import LARGEST_REACH, Camera, Key, Light, PointCloud, Rays, Rendering, Scene, Volume
-from spnr_jax.kernels.resizing import bilinear
+from spnr_jax.kernels.voxels import Path
 from spnr_jax.method import inference
-from spnr_jax.nn.discriminator import Discriminator
-from spnr_jax.nn.encoder import Encoder
-from spnr_jax.nn.field import RadianceField
-from spnr_jax.nn.upsampler import Upsampler
+from spnr_jax.nn.paper import Discriminator, Encoder, RadianceField, Upsampler
 
 SAMPLES = {"draft": 0.25, "balanced": 0.5, "best": 1.0}  # share of the samples a ray was trained with
 REACH_PER_SPACING = 1.6  # what loses nothing from 128 to 4096 points, docs/lab/cpu_forms.md
@@ -87,7 +84,7 @@ class PaperNetwork(nn.Module):
     def encode(self, cloud: PointCloud, train: bool = False) -> Scene:
         """Feature volume of each object from its points, and the voxels that hold them."""
         volume = self.encoder(cloud, train)
-        occupied = jax.vmap(partial(voxels.occupied, resolution=self.config.encoder.volume_resolution))
+        occupied = jax.vmap(partial(voxels.mark_occupied, resolution=self.config.encoder.volume_resolution))
         return Scene(volume=volume, occupied=occupied(jnp.asarray(cloud.positions), jnp.asarray(cloud.mask)))
 
     def render(
@@ -95,7 +92,7 @@ class PaperNetwork(nn.Module):
     ) -> Rendering:
         """Views of encoded objects; the camera's size is that of the image.  A key jitters the samples (training)."""
         samples = options.sampling or self.config.sampling
-        return self.developed(camera, trace(self, scene, self.rays(camera), samples, options, key))
+        return self.develop(camera, trace(self, scene, self.rays(camera), samples, options, key))
 
     def rays(self, camera: Camera) -> Rays:
         """Rays of the volume rendering for all views of an object in one axis, (objects, views * height * width, 3)."""
@@ -119,7 +116,7 @@ class PaperNetwork(nn.Module):
 
         return field, finish
 
-    def developed(self, camera: Camera, traced: Traced) -> Rendering:
+    def develop(self, camera: Camera, traced: Traced) -> Rendering:
         """Images from the rays of `rays`: the feature image is resized, and the upsampler doubles it."""
         views, (height, width) = camera.cam_to_world.shape[:-2], self.render_size(camera)
         features = traced.features.reshape(-1, height, width, self.config.num_features)
@@ -175,7 +172,7 @@ def _on_one_device(
     shape = number.shape
     objects = jnp.broadcast_to(jnp.arange(shape[0])[:, None], shape)
     inputs = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), (objects, number, rays))
-    near_points = occupancy.dilate(scene.occupied, samples.reach) if samples.reach else None
+    near_points = voxels.dilate(scene.occupied, samples.reach) if samples.reach else None
 
     def block(objects, number, rays):
         field, finish = bound().along(scene, rays, objects)
@@ -193,7 +190,7 @@ def _on_one_device(
         _, far, _ = cameras.intersect_box(rays.origins, rays.directions)
         white = jnp.zeros((far.size, bound().config.num_features)).at[:, :3].set(compositing.WHITE)
         nothing = Traced(white, far, jnp.zeros_like(far))
-        traced = occupancy.map_existing(block, _meets(near_points, rays, objects), inputs, nothing, size)
+        traced = voxels.map_existing(block, _meets(near_points, rays, objects), inputs, nothing, size)
     return jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), traced)
 
 
@@ -201,8 +198,8 @@ def _path(near_points: Bool[Array, "objects g g g"] | None, rays: Rays, objects:
     """The part of each ray that is sampled: what lies near points, or all that lies in the box."""
     near, far, _ = cameras.intersect_box(rays.origins, rays.directions)
     if near_points is None:
-        return occupancy.whole_path(near, far)
-    return occupancy.open_path(near_points, rays, near, far, CELLS_PER_VOXEL * near_points.shape[-1], objects)
+        return voxels.whole_path(near, far)
+    return voxels.open_path(near_points, rays, near, far, CELLS_PER_VOXEL * near_points.shape[-1], objects)
 
 
 def _meets(
@@ -229,13 +226,13 @@ def march(field: Field, path: Path, counts: SamplingConfig, key: Key | None) -> 
     coarse_key, fine_key = (None, None) if key is None else sampling.split(key)
     length, far = path.travelled[..., -1], path.edges[..., -1]
     coarse, edges = sampling.stratified(coarse_key, jnp.zeros_like(length), length, counts.num_coarse)
-    passes = [field(occupancy.distance_at(path, coarse))]
+    passes = [field(voxels.distance_at(path, coarse))]
     weights, _ = compositing.volume_weights(passes[0].density, compositing.interval_lengths(coarse, length))
     travelled, shares = coarse, [weights]
     if counts.num_fine:
         # 64 fine samples where the coarse weights are large [paper]; the union of both is composited
         fine = sampling.importance(fine_key, edges, weights, counts.num_fine, counts.padding)
-        passes.append(field(occupancy.distance_at(path, fine)))
+        passes.append(field(voxels.distance_at(path, fine)))
         density = jnp.concatenate([samples.density for samples in passes], axis=-1)
         weights = union_weights(coarse, fine, density, length)
         travelled = jnp.concatenate([coarse, fine], axis=-1)
@@ -249,7 +246,7 @@ def march(field: Field, path: Path, counts: SamplingConfig, key: Key | None) -> 
     return Seen(
         summed=jax.tree.map(lambda *parts: reduce(operator.add, parts), *sums),
         acc=jnp.sum(weights, axis=-1),
-        depth=compositing.expected_distance(weights, occupancy.distance_at(path, travelled), far),
+        depth=compositing.expected_distance(weights, voxels.distance_at(path, travelled), far),
     )
 
 

@@ -11,14 +11,14 @@ from spnr_jax.kernels import losses
 from spnr_jax.kernels.records import Batch, Camera, Key
 
 
-def chosen(key: Key, batch: Batch, config: TrainConfig) -> tuple[Key, Batch]:
+def choose_pixels(key: Key, batch: Batch, config: TrainConfig) -> tuple[Key, Batch]:
     """The key of what else a step draws, and the batch with the pixels that it renders."""
     if config.pixel_stride > 1:
         key, lattice_key = jax.random.split(key)
         batch = lattice(lattice_key, batch, config.pixel_stride)
     if config.crop:
         key, crop_key = jax.random.split(key)
-        batch = cropped(crop_key, batch, config.crop)
+        batch = crop_square(crop_key, batch, config.crop)
     return key, batch
 
 
@@ -39,7 +39,7 @@ def lattice(key: Key, batch: Batch, stride: int) -> Batch:
     return _some_pixels(batch, thinned, intrinsics)
 
 
-def cropped(key: Key, batch: Batch, size: int) -> Batch:
+def crop_square(key: Key, batch: Batch, size: int) -> Batch:
     """The batch with a square of `size` pixels of each view, at one random place for all: images still."""
     height, width = batch.image.shape[2:4]
     first = jax.random.randint(key, (2,), 0, jnp.array([height, width]) - size + 1)

@@ -17,15 +17,14 @@ from spnr_jax.devices.runtime import QUICK, QUICKEST
 from spnr_jax.devices.side_by_side import two_at_a_time
 from spnr_jax.devices.traces import Kept
 from spnr_jax.kernels import cameras, cloud_arrays
+from spnr_jax.kernels.imaging import enlarge
 from spnr_jax.kernels.records import Camera, GBuffer, Key, Light, PointCloud, Rendering, SurfelScene, Volume
-from spnr_jax.kernels.resizing import enlarged
 from spnr_jax.method import densifier, surfel_renderer
 from spnr_jax.method.surfel_renderer import Blended, Sizes
+from spnr_jax.nn import shader
 from spnr_jax.nn.shader import Shader
-from spnr_jax.surfels import features
+from spnr_jax.surfels.geometry import encode_in_box, neighbors
 from spnr_jax.surfels.lighting import room_light
-from spnr_jax.surfels.neighbors import neighbors
-from spnr_jax.surfels.surfel_scenes import encode_in_box
 
 BALANCED = 0.75  # of the pixels along a side, which are drawn and enlarged: docs/lab/performance.md
 
@@ -42,7 +41,7 @@ class Asked(NamedTuple):
 def init(key: Key, config: SurfelConfig) -> dict:
     """Fresh variables of the shader network."""
     side = 2 ** len(config.widths)
-    return dict(Shader(config.widths, config.top).init(key, jnp.zeros((1, side, side, features.NUM_FEATURES)), 1))
+    return dict(Shader(config.widths, config.top).init(key, jnp.zeros((1, side, side, shader.NUM_FEATURES)), 1))
 
 
 def encode(
@@ -103,7 +102,7 @@ def draw_planned(variables: dict | None, volume: Volume, asked: Asked, sizes: Si
     """A view with room for these sizes."""
     if not asked.needed.entries:
         return _leave_empty(volume.scene, asked.camera)
-    plan = surfel_renderer.rounded(sizes, *asked.resolution)
+    plan = surfel_renderer.round_sizes(sizes, *asked.resolution)
     blended = _blend(volume.scene, asked.camera, asked.light, plan=plan)
     return _shade(variables, volume.scene, asked.camera, asked.light, blended, plan=plan)
 
@@ -111,7 +110,7 @@ def draw_planned(variables: dict | None, volume: Volume, asked: Asked, sizes: Si
 _densify = Kept(densifier.densify_in_box, returns=(PointCloud,), options=QUICKEST)
 _blend = Kept(surfel_renderer.blend_window, static="plan", returns=(Blended, GBuffer))
 _shade = Kept(surfel_renderer.shade_window, static="plan", returns=(Rendering,), options=QUICKEST)
-_enlarge = jax.jit(enlarged, static_argnums=(1, 2), compiler_options=QUICK)
+_enlarge = jax.jit(enlarge, static_argnums=(1, 2), compiler_options=QUICK)
 
 
 @jax.jit

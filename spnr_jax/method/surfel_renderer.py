@@ -25,6 +25,7 @@ from spnr_jax.errors import UserError
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.cloud_arrays import unstack
 from spnr_jax.kernels.compositing import WHITE
+from spnr_jax.kernels.imaging import double_size, mean_of_squares
 from spnr_jax.kernels.numerics import larger
 from spnr_jax.kernels.records import (
     AnyArray,
@@ -35,9 +36,9 @@ from spnr_jax.kernels.records import (
     Surfels,
     SurfelScene,
 )
-from spnr_jax.kernels.resizing import doubled, mean_of_squares
+from spnr_jax.nn import shader
 from spnr_jax.nn.shader import NUM_OUTPUTS, Shader, picture
-from spnr_jax.surfels import features, lighting, projection, splatting
+from spnr_jax.surfels import lighting, projection, splatting
 from spnr_jax.surfels.projection import MOST_ENTRIES, View
 
 COARSEST = 3.5  # pixels between points from which on a picture is drawn at half the size
@@ -95,7 +96,7 @@ def plan(scene: SurfelScene, camera: Camera) -> Plan:
     pairs = [(scenes[i // each], view) for i, view in enumerate(unstack(camera))]
     doublings, side = common_resolution([resolution(*pair) for pair in pairs])
     needed = jax.device_get([count_sizes(*pair, doublings=doublings, side=side) for pair in pairs])
-    return rounded(largest(needed), doublings, side)
+    return round_sizes(largest(needed), doublings, side)
 
 
 def resolution(scene: SurfelScene, camera: Camera, share: float = 1.0) -> tuple[int, int]:
@@ -123,11 +124,11 @@ def common_resolution(resolutions: Iterable[tuple[int, int]]) -> tuple[int, int]
 @partial(Kept, static=("doublings", "side"), returns=(Sizes,))
 def count_sizes(scene: SurfelScene, camera: Camera, *, doublings: int, side: int) -> Sizes:
     """What a view needs; the covered pixels are at most those of the rectangles around its discs."""
-    whole = scaled(cameras.in_box(camera, scene.centre, scene.scale), doublings, side)
+    whole = scale_camera(cameras.in_box(camera, scene.centre, scene.scale), doublings, side)
     corner, width, height = place_window(scene.surfels, whole)
-    window = seen_through(whole, corner, width, height)
+    window = crop_camera(whole, corner, width, height)
     foot = projection.footprints(scene.surfels, View(window.cam_to_world, window.intrinsics, height, width))
-    return Sizes(width, height, projection.total(foot.covered), projection.covered_by(foot, _most(whole)))
+    return Sizes(width, height, projection.total(foot.covered), projection.count_covered(foot, _most(whole)))
 
 
 def _most(camera: Camera) -> tuple[int, int]:
@@ -140,21 +141,22 @@ def largest(needed: Iterable[Sizes]) -> Sizes:
     return Sizes(*(max(map(int, sizes)) for sizes in zip(*needed, strict=True)))
 
 
-def rounded(sizes: Sizes, doublings: int, side: int) -> Plan:
+def round_sizes(sizes: Sizes, doublings: int, side: int) -> Plan:
     """The plan that holds these sizes; powers of the root of two, so that few are compiled."""
     entries, slots = (
-        _rounded(*x) for x in ((sizes.entries, LEAST_ENTRIES, MOST_ENTRIES), (sizes.slots, LEAST_SLOTS, MOST_ENTRIES))
+        _round_count(*x)
+        for x in ((sizes.entries, LEAST_ENTRIES, MOST_ENTRIES), (sizes.slots, LEAST_SLOTS, MOST_ENTRIES))
     )
     return Plan(doublings, side, sizes.width, sizes.height, entries, min(slots, sizes.width * sizes.height))
 
 
-def _rounded(count: int, least: int, most: int) -> int:
+def _round_count(count: int, least: int, most: int) -> int:
     if count > most:
         raise UserError(f"the picture needs {count} entries of discs, at most {most} are drawn; ask for a smaller one")
     return min(int(2 ** (np.ceil(2 * np.log2(max(count, least))) / 2)), most)
 
 
-def scaled(camera: Camera, doublings: int, side: int) -> Camera:
+def scale_camera(camera: Camera, doublings: int, side: int) -> Camera:
     """The camera at the network's resolution; doubled, its picture may be larger than asked for, and is cut."""
     height, width = (-(-n * side // 2**doublings) for n in (camera.height, camera.width))
     scale = jnp.array([[side / 2**doublings], [side / 2**doublings], [1.0]], jnp.float32)
@@ -179,7 +181,7 @@ def round_up(pixels: Any) -> Any:
     return -(-pixels // STEP) * STEP
 
 
-def seen_through(camera: Camera, corner: Int[Array, "2"], width: Any, height: Any) -> Camera:
+def crop_camera(camera: Camera, corner: Int[Array, "2"], width: Any, height: Any) -> Camera:
     """The camera whose picture is the window."""
     moved = jnp.asarray(camera.intrinsics).at[:2, 2].add(-corner.astype(camera.intrinsics.dtype))
     return dataclasses.replace(camera, intrinsics=moved, height=height, width=width)
@@ -231,9 +233,9 @@ class Blended(NamedTuple):
 
 def blend_window(scene: SurfelScene, camera: Camera, light: Light, *, plan: Plan) -> Blended:
     """The first half of `render`: discs, and what of the light arrives at them."""
-    whole = scaled(cameras.in_box(camera, scene.centre, scene.scale), plan.doublings, plan.side)
+    whole = scale_camera(cameras.in_box(camera, scene.centre, scene.scale), plan.doublings, plan.side)
     corner, width, height = jax.lax.stop_gradient(place_window(scene.surfels, whole))
-    window = seen_through(whole, corner, plan.width, plan.height)
+    window = crop_camera(whole, corner, plan.width, plan.height)
     buffer, lost = rasterize(scene.surfels, window, light, room=plan.entries, slots=plan.slots)
     beyond = jnp.maximum(width - plan.width, 0) + jnp.maximum(height - plan.height, 0)
     return Blended(buffer, corner, jnp.minimum(lost, projection.MOST) + beyond)
@@ -250,7 +252,7 @@ def shade_window(
 ) -> Rendering:
     """The second half: the network over the G-buffer."""
     inside = cameras.in_box(camera, scene.centre, scene.scale)
-    window = seen_through(scaled(inside, plan.doublings, plan.side), blended.corner, plan.width, plan.height)
+    window = crop_camera(scale_camera(inside, plan.doublings, plan.side), blended.corner, plan.width, plan.height)
     drawn = shade(params, *look(blended.buffer, light, window), doublings=plan.doublings)
     image, depth, acc = paste(drawn, blended.corner * 2**plan.doublings, inside, plan.side)
     return Rendering(image=image, image_lr=image, depth=depth / scene.scale, acc=acc, overflow=blended.overflow)
@@ -262,13 +264,13 @@ def rasterize(
     """The G-buffer of a view, with what of the light arrives at each surfel; entries and pixels that did not fit."""
     found, lost = projection.entries(surfels, camera, room=room)
     buffer = blend_entries(found, surfels, light, camera, slots=slots)
-    return buffer, lost + jnp.maximum(splatting.covered_pixels(found) - slots, 0)
+    return buffer, lost + jnp.maximum(splatting.count_covered_pixels(found) - slots, 0)
 
 
 def blend_entries(found: projection.Entries, surfels: Surfels, light: Light, camera: Camera, *, slots: int) -> GBuffer:
     """The G-buffer of a view's entries."""
-    surfels = features.turned(surfels, camera)
-    return splatting.blend(found, surfels, features.attributes(surfels, light, camera), camera, slots=slots)
+    surfels = shader.turn_to_camera(surfels, camera)
+    return splatting.blend(found, surfels, shader.attributes(surfels, light, camera), camera, slots=slots)
 
 
 def look(
@@ -277,8 +279,8 @@ def look(
     Float[Array, "height width 33"], Float[Array, "height width 17"], Float[Array, "9 3"], Float[Array, "height width"]
 ]:
     """What the network sees of a G-buffer, the light maps, the light's harmonics in camera axes, the depth."""
-    told, maps = features.features(buffer, light, camera)
-    return told, maps, lighting.projected(light, jnp.asarray(camera.cam_to_world)[:, :3]), buffer.depth
+    told, maps = shader.features(buffer, light, camera)
+    return told, maps, lighting.project_harmonics(light, jnp.asarray(camera.cam_to_world)[:, :3]), buffer.depth
 
 
 def shade(
@@ -298,7 +300,7 @@ def shade(
     color, alpha = picture(outputs, maps[None], ambient[None], doublings)
     depth = depth[None, ..., None]
     for _ in range(doublings):
-        depth = doubled(depth)
+        depth = double_size(depth)
     return jnp.concatenate([color, alpha[..., None], depth], axis=-1)[0]
 
 

@@ -1,20 +1,141 @@
 """CNN that shades a G-buffer: opacity, a change of the base colour, and how light is passed on, for each pixel.
 
+Its inputs are relative: vectors in the camera's axes, lengths in spacings or pixels.  So a picture does not depend on
+how the object, the camera and the light are turned together, nor on the unit of the cloud.
+
 A U-Net over what the front-most surfels say, at the resolution at which points lie two to four pixels apart, so that it
 sees points as it has learnt to whatever their number; then one block that doubles the resolution, as often as the
 picture needs.  Its outputs are factors of light maps that are linear in the light (`picture`): the network sees no
 light, and a picture is linear in it up to the sRGB curve.
 """
 
+import dataclasses
+from functools import partial, reduce
+from operator import add
+
 import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from spnr_jax.kernels.colors import linear_to_srgb
-from spnr_jax.kernels.numerics import clamp, larger, one_minus_exp, smaller
-from spnr_jax.kernels.resizing import doubled, mean_of_squares, unfolded
+from spnr_jax.kernels.imaging import double_size, linear_to_srgb, mean_of_squares, unfold
+from spnr_jax.kernels.numerics import clamp, columns, larger, normalize, one_minus_exp, root, smaller, with_gradient
+from spnr_jax.kernels.records import Camera, GBuffer, Light, Surfels
 from spnr_jax.nn.convolution import Conv
+from spnr_jax.surfels import lighting
 from spnr_jax.surfels.lighting import SPECULAR
+from spnr_jax.surfels.sides import DIRECTIONS
+
+# --- inputs -----------------------------------------------------------------------------------------------------------
+
+
+NUM_FEATURES, NUM_MAPS = 33, 17
+ODD = (14, 17, 28), (15, 18, 29)  # features that change their sign when the picture is mirrored along x, or along y
+FAINT = 0.02  # opacity from which on a pixel's numbers begin to count
+WINDOWS = 2, 6  # pixels to each side over which the depth is compared
+EDGE = 0.6  # coverage at the outline: discs reach beyond the surface, half of their weight
+LEAST = 0.01  # opacity from which on a pixel's depth says something
+HAZE = 0.05  # of the opacity that is left where discs hardly cover a pixel: the network may make it solid
+LEAST_CENTRES = 1e-6  # summed narrow weights from which on the colour to first order counts
+TRUST = 0.25  # most that a colour to first order leaves the blended one
+
+
+def turn_to_camera(surfels: Surfels, camera: Camera) -> Surfels:
+    """The surfels as seen from a camera: all normals point to it, of what is seen from behind too."""
+    view = camera.cam_to_world[:, 3][None] - surfels.position
+    behind = jnp.sum(view * surfels.normal, axis=1, keepdims=True) < 0
+    return dataclasses.replace(surfels, normal=jnp.where(behind, -surfels.normal, surfels.normal))
+
+
+def attributes(surfels: Surfels, light: Light, camera: Camera) -> Float[Array, "points 19"]:
+    """Numbers of each surfel that are blended over pixels; those of the light are linear in it."""
+    rotation, eye = camera.cam_to_world[:, :3], camera.cam_to_world[:, 3]
+    cosines = larger(jnp.einsum("pi,di->pd", surfels.normal, DIRECTIONS, precision="highest"), 0)
+    openness = jnp.sum(surfels.visible * cosines, axis=1) / larger(jnp.sum(cosines, axis=1), 1e-6)
+    bent = 4 / len(DIRECTIONS) * jnp.einsum("pd,di->pi", surfels.visible, DIRECTIONS, precision="highest")
+    view = normalize(jnp.asarray(eye[None] - surfels.position))
+    along = jnp.sum(view * surfels.normal, axis=1, keepdims=True)
+    mirror = 2 * jnp.abs(along) * jnp.where(along < 0, -1.0, 1.0) * surfels.normal - view
+    lobe = jnp.exp(lighting.LOBE * (jnp.einsum("pi,di->pd", mirror, DIRECTIONS, precision="highest") - 1))
+    reflected = jnp.sum(surfels.visible * lobe, axis=1) / jnp.sum(lobe, axis=1)
+    parts = [surfels.roughness, surfels.metallic, lighting.arriving(surfels, light), reflected, openness]
+    parts += [jnp.einsum("pi,ij->pj", bent, rotation, precision="highest"), surfels.base_color, surfels.shape]
+    parts += [surfels.sided, surfels.guessed, surfels.invented, jnp.mean(surfels.base_color, axis=1) ** 2]
+    return jnp.concatenate([x[:, None] if x.ndim == 1 else x for x in map(jnp.asarray, parts)], axis=1)
+
+
+def features(
+    buffer: GBuffer, light: Light, camera: Camera
+) -> tuple[Float[Array, "height width 33"], Float[Array, "height width 17"]]:
+    """The network's input, which knows no light, and the maps of materials and light for `nn.shader.picture`."""
+    first, bent, blended, last = jnp.split(buffer.attributes, (7, 10, 13), axis=-1)
+    (roughness, metallic, *arriving, reflected, openness), of_surface = map(columns, (first, last))
+    planarity, linearity, sided, guessed, invented, squared = of_surface
+    told = (buffer.centres / (buffer.centres + LEAST_CENTRES))[..., None]  # without discs near by the blended one
+    color = clamp(blended + told * clamp(buffer.color - blended, -TRUST, TRUST), 0, 1)
+    normal, view = _directions(buffer, camera)
+    cosine = -reduce(add, (n * v for n, v in zip(normal, view, strict=True)))
+    mirror = [v + 2 * cosine * n for n, v in zip(normal, view, strict=True)]
+    turned = [_to_world(camera, direction) for direction in (normal, mirror)]
+    factor, summand = lighting.reflectance(roughness, clamp(cosine, 0.05, 1))
+    spacing = jnp.exp(buffer.log_spacing)
+    in_pixels = larger(spacing, 1e-6) * camera.intrinsics[0, 0] / larger(buffer.depth, 0.1)
+    numbers = [buffer.opacity, jnp.log1p(buffer.coverage), roughness, metallic, openness, reflected]
+    numbers += [smaller(buffer.spread / spacing, 4), *(_relief(buffer, spacing, reach) for reach in WINDOWS)]
+    numbers += [0.5 * jnp.log(in_pixels), planarity, linearity, sided, cosine]
+    vectors = [buffer.normal, bent, linear_to_srgb(color), linear_to_srgb(blended)]
+    drawn = (buffer.opacity / (buffer.opacity + FAINT))[..., None]
+    pattern = [jnp.log1p(8 * buffer.centres)[..., None], clamp(buffer.beside / in_pixels[..., None], -2, 2)]
+    seen = jnp.concatenate([jnp.stack(numbers, axis=-1), *vectors], axis=-1)
+    covered = buffer.opacity * larger(one_minus_exp((buffer.coverage / EDGE) ** 2), HAZE)
+    contrast = root(squared - jnp.mean(blended, axis=-1) ** 2)  # of the colours that are blended: a texture
+    pattern += [guessed[..., None], invented[..., None], contrast[..., None]]
+    seen = jnp.concatenate([drawn * seen, drawn, *(drawn * x for x in pattern)], axis=-1)
+    unshadowed = lighting.irradiance(light, turned[0]), lighting.reflect(light, turned[1], roughness)
+    maps = [*columns(color), metallic, covered, factor, summand, *arriving]
+    return seen, jnp.stack([*maps, *unshadowed[0], *unshadowed[1], reflected], axis=-1)
+
+
+def _directions(buffer: GBuffer, camera: Camera) -> tuple[list[Array], list[Array]]:
+    """Unit normals and rays' directions, camera axes, as columns; the camera's axis where there is no normal."""
+    size = root(jnp.sum(buffer.normal**2, axis=-1))
+    known = size > 1e-3
+    normal = [n / larger(size, 1e-4) for n in columns(buffer.normal)]
+    normal = [jnp.where(known, n, c) for n, c in zip(normal, (0.0, 0.0, 1.0), strict=True)]
+    across, down = jnp.arange(camera.width) + 0.5, jnp.arange(camera.height) + 0.5
+    right = jnp.broadcast_to(((across - camera.intrinsics[0, 2]) / camera.intrinsics[0, 0])[None], size.shape)
+    up = jnp.broadcast_to(-((down - camera.intrinsics[1, 2]) / camera.intrinsics[1, 1])[:, None], size.shape)
+    length = jnp.sqrt(right**2 + up**2 + 1)
+    return normal, [right / length, up / length, -1 / length]
+
+
+def _to_world(camera: Camera, direction: list[Array]) -> list[Array]:
+    pose = camera.cam_to_world
+    x, y, z = direction
+    return [pose[i, 0] * x + pose[i, 1] * y + pose[i, 2] * z for i in range(3)]
+
+
+def _relief(buffer: GBuffer, spacing: Float[Array, "height width"], reach: int) -> Float[Array, "height width"]:
+    """How far each pixel lies behind the mean around it, in spacings, squeezed into (-1, 1)."""
+    mean = _box(buffer.opacity * buffer.depth, reach) / larger(_box(buffer.opacity, reach), 1e-3)
+    return jnp.where(buffer.opacity > LEAST, jnp.tanh((buffer.depth - mean) / (4 * spacing)), 0)
+
+
+def _plain_box(values: Float[Array, "height width"], reach: int) -> Float[Array, "height width"]:
+    height, width = values.shape
+    padded = jnp.pad(values, reach)
+    down = reduce(add, [padded[i : i + height] for i in range(2 * reach + 1)])
+    return reduce(add, [down[:, i : i + width] for i in range(2 * reach + 1)])
+
+
+def _box(values: Float[Array, "height width"], reach: int) -> Float[Array, "height width"]:
+    """Sums over squares of pixels; there is nothing beyond the picture.  It is its own transpose."""
+    plain = partial(_plain_box, reach=reach)
+    summed = with_gradient(lambda x: (plain(x),), lambda primals, given: (plain(*given),))
+    return summed(values)[0]
+
+
+# --- network ----------------------------------------------------------------------------------------------------------
+
 
 NUM_OUTPUTS = 21
 COLOR_STEP, ODDS_STEP = 0.3, 2.0  # what an output of 1 changes the base colour, and the log odds of the opacity by
@@ -40,7 +161,7 @@ class Double(nn.Module):
     def __call__(self, x: Float[Array, "batch height width features"]) -> Float[Array, "batch h w features"]:
         """Bilinear, plus four new pixels from each, plus two convolutions."""
         features = x.shape[-1]
-        x = doubled(x) + unfolded(nn.Dense(4 * features, name="expand")(x), 2)
+        x = double_size(x) + unfold(nn.Dense(4 * features, name="expand")(x), 2)
         y = nn.relu(Conv(features, name="a")(x))
         return x + Conv(features, name="b")(y)
 
@@ -65,7 +186,7 @@ class Shader(nn.Module):
             x = Block(name=f"down{level}")(x)
             skips.append(x)
         for level in reversed(range(len(self.widths) - 1)):
-            x = skips[level] + doubled(nn.Dense(self.widths[level], name=f"up{level}")(x))
+            x = skips[level] + double_size(nn.Dense(self.widths[level], name=f"up{level}")(x))
             x = Block(name=f"dec{level}")(x)
         x = nn.Dense(self.top, name="top")(x[:, margin : height - margin, margin : width - margin])
         double = Double(name="double")
@@ -90,7 +211,7 @@ def picture(
     `maps` are those of `surfels.features`, `ambient` the light's spherical harmonics in camera axes.
     """
     for _ in range(doublings):
-        maps = doubled(maps)
+        maps = double_size(maps)
     color, metallic, opacity, factor, summand, arriving, unshadowed, mirrored, reflected = jnp.split(
         maps, (3, 4, 5, 6, 7, 10, 13, 16), axis=-1
     )

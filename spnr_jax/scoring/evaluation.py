@@ -26,7 +26,7 @@ from spnr_jax.method.model import render_views
 from spnr_jax.scoring import floors
 from spnr_jax.scoring.picture_scores import flip, lpips
 from spnr_jax.scoring.summary import Scores, differences, metric_settings, summarise
-from spnr_jax.training.run_record import seen_in_training
+from spnr_jax.training.run_record import trained_on
 from spnr_jax.training.weights import Trained, place, read_trained
 
 RADIUS_FACTORS = (0.5, 0.75, 1.0, 1.5, 2.0)
@@ -268,7 +268,7 @@ def compare(
 
 def exposure(runs: Sequence[Path], dataset: data_sets.Dataset, names: Sequence[str]) -> str:
     """Whether networks saw objects of a data set in training, as the records of their run folders have it."""
-    seen = [seen_in_training(run, dataset, names) for run in runs]
+    seen = [trained_on(run, dataset, names) for run in runs]
     unseen = bool(seen) and not any(seen) and None not in seen
     return EXPOSURE[True if any(seen) else False if unseen else None]
 

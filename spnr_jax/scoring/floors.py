@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from spnr_jax.kernels.cameras import camera_rays
-from spnr_jax.kernels.colors import linear_to_srgb
+from spnr_jax.kernels.imaging import linear_to_srgb
 from spnr_jax.kernels.records import Camera, PointCloud
 
 BLOCK = 2**19  # pairs of a ray (or point) and a point in memory at once, per view: 6 MB

@@ -134,7 +134,7 @@ def label(method: str) -> str:
     return OTHERS.get(method) or label_of(method)
 
 
-def lowered(method: str) -> str:
+def lower_first(method: str) -> str:
     """A method's name inside a sentence."""
     name = label(method)
     return name if name[:2].isupper() else name[:1].lower() + name[1:]
@@ -192,10 +192,10 @@ def write_report(path: Path, settings: Mapping, metrics: Mapping, gallery: Seque
     tables += [_category_table(per_category)] if per_category else []
     shown = gallery[0].images if gallery else {}
     page = template(Path(__file__).with_name("report.html")).render(
-        title=f"Sparse-point neural rendering: {scored(metrics)}",
+        title=f"Sparse-point neural rendering: {describe_split(metrics)}",
         summary=_summary(metrics),
         tiles=_key_numbers(metrics),
-        gallery_heading=scored(metrics),
+        gallery_heading=describe_split(metrics),
         gallery_note=GALLERY_NOTE,
         heads=["Reference", *(label(method) for method in shown), "Depth", "Opacity"],
         gallery=[(row.name, _pictures(row)) for row in gallery],
@@ -206,7 +206,7 @@ def write_report(path: Path, settings: Mapping, metrics: Mapping, gallery: Seque
     write_whole(path, f"{page}\n".encode())
 
 
-def scored(metrics: Mapping) -> str:
+def describe_split(metrics: Mapping) -> str:
     """Which objects are scored, and whether the networks trained on them."""
     settings = metrics["settings"]
     return f"objects of the {settings['split']} split, {settings['objects']}"
@@ -217,14 +217,14 @@ def _summary(metrics: Mapping) -> str:
     methods, settings = metrics["methods"], metrics["settings"]
     best = max((name for name in FLOORS if name in methods), key=lambda name: methods[name]["psnr"])
     network, *others = settings["networks"]
-    compared = [(lowered(name), name) for name in others] + [("the white image", "white")]
+    compared = [(lower_first(name), name) for name in others] + [("the white image", "white")]
     compared += [(f"the best trivial renderer ({best})", best)]
     above = ", ".join(f"{_above(metrics, name)} against {words}" for words, name in compared)
     row = methods[network]
     return (
         f"{label(network)}: preset {metrics['preset']}, {metrics['steps']} steps. "
         f"{settings['points']} points per object. "
-        f"{row['psnr']:.2f} dB PSNR on {row['views']} views of {row['objects']} {scored(metrics)}: {above}."
+        f"{row['psnr']:.2f} dB PSNR on {row['views']} views of {row['objects']} {describe_split(metrics)}: {above}."
     )
 
 
@@ -289,7 +289,7 @@ def _key_numbers(metrics: Mapping) -> list[tuple[str, str]]:
     """The numbers that a reader looks for first, as tiles."""
     methods, seconds = metrics["methods"], metrics.get("seconds", {})
     psnr = next(iter(methods.values()))["psnr"]
-    tiles = [(f"PSNR on {scored(metrics)}", f"{psnr:.1f} dB")]
+    tiles = [(f"PSNR on {describe_split(metrics)}", f"{psnr:.1f} dB")]
     for name, words in (
         ("paper", "over the paper's network"),
         ("white", "over the white image"),
@@ -325,7 +325,7 @@ def _difference_table(first: str, minus: Mapping[str, Mapping]) -> Table:
     """Other methods against the difference in each metric."""
     names = [name for name in QUALITY if any(name in row for row in minus.values())]
     rows = tuple(
-        (f"{label(first)} minus {lowered(method)}", tuple(difference(row.get(m), m) for m in names))
+        (f"{label(first)} minus {lower_first(method)}", tuple(difference(row.get(m), m) for m in names))
         for method, row in minus.items()
     )
     return Table(title="Differences", note=DIFFERENCES_NOTE, heads=tuple(map(head, names)), rows=rows)

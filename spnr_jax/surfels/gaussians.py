@@ -97,7 +97,7 @@ class Seen(NamedTuple):
     normal: Float[np.ndarray, "pixels 3"]
 
 
-def seen_surface(views: Sequence[View], surfels: Surfels, stride: int = STRIDE) -> Seen:
+def collect_surface(views: Sequence[View], surfels: Surfels, stride: int = STRIDE) -> Seen:
     """The places of the surface that the views show; ValueError if they show none."""
     found, rays = [], []
     for i, view in enumerate(views):

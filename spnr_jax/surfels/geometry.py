@@ -1,5 +1,6 @@
 """Surfels from points: what each point knows of the surface around it, as one pure program over given neighbors.
 
+neighbors   the nearest points of each point: topology, found once on the host by a k-d tree; data without a gradient
 spacing     side of the square that a point stands for, from the neighbors on its own layer of the surface
 normal      given, or that of the layer where none is (layers.py), outward by votes of directions and walls (sides.py)
 sided       1 where the votes say which side is outside, 0 where both are seen alike (a sheet)
@@ -7,6 +8,7 @@ gradient    of the color along the surface, a ridge regression over the layer: c
             order, but for points beside the border of two colors
 rim, reach  where the disc ends: at the rim of the layer or where another face cuts it (discs.py)
 shape       planarity and linearity: ratios of the neighbors' extents, 0 in a plane, 0 on a line
+scene       surfels in the box, with the way from the cloud's units to there: what the renderer takes
 
 Points are worked on in blocks, one after the other, so that a million fit into memory; a block reads its neighbors from
 arrays of all points, which are (columns, points) here.
@@ -16,20 +18,84 @@ gradient is none, are choices: the neighbors, the plane that a layer is fitted f
 another color, sides and what turns a normal, what is shown, and what each direction sees.
 """
 
+import dataclasses
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
+from scipy.spatial import cKDTree
 
-from spnr_jax.kernels.numerics import clamp, root
-from spnr_jax.kernels.records import AnyArray, PointCloud, Surfels
+from spnr_jax.devices.runtime import QUICKEST
+from spnr_jax.devices.traces import Kept
+from spnr_jax.kernels import cloud_arrays
+from spnr_jax.kernels.numerics import clamp, length, root
+from spnr_jax.kernels.records import AnyArray, PointCloud, Surfels, SurfelScene
 from spnr_jax.surfels import discs, layers, sides
 from spnr_jax.surfels.layers import Hood, Layer, along
-from spnr_jax.surfels.rules import RULES, Rules
-from spnr_jax.surfels.small_systems import dot, frame, measure_shape, unit
-from spnr_jax.surfels.visibility import cell_of, grid_of, seen_from
+from spnr_jax.surfels.rules import NEIGHBORS, RULES, Rules
+from spnr_jax.surfels.sides import cell_of, grid_of, see_directions
+from spnr_jax.surfels.small_systems import dot, frame, largest, measure_shape, smallest, unit
+
+# --- neighbors, on the host -------------------------------------------------------------------------------------------
+
+
+BLOCK = 2**14  # points that are asked for at once
+
+
+def neighbors(cloud: PointCloud) -> Int[np.ndarray, "*batch points 20"]:
+    """Numbers of the 20 nearest points of each point, itself first; -1 where there are fewer, and of padding.
+
+    NumPy on the host: cannot be traced.  Clouds may have leading batch axes.
+    """
+    positions, mask = np.asarray(cloud.positions), np.asarray(cloud.mask)
+    found = np.full((*mask.shape, NEIGHBORS), -1, np.int32)
+    for cloud_index in np.ndindex(mask.shape[:-1]):
+        real = np.flatnonzero(mask[cloud_index])
+        if len(real):
+            near = nearest(positions[cloud_index][real])
+            found[cloud_index][real] = np.where(near < 0, -1, real[near])
+    return found
+
+
+def nearest(positions: Float[np.ndarray, "points 3"]) -> Int[np.ndarray, "points 20"]:
+    """Numbers of the nearest of real points, -1 where there are fewer; each point is its own first neighbor."""
+    return _ask(cKDTree(positions), np.arange(len(positions)))
+
+
+def order_in_space(
+    positions: Float[np.ndarray, "points 3"],
+) -> tuple[Int[np.ndarray, " points"], Int[np.ndarray, "points 20"]]:
+    """An order of the points in which close ones follow each other, and the neighbors of the points so ordered.
+
+    Caches hold what a block of points that are so ordered gathers.
+    """
+    tree = cKDTree(positions)
+    order = tree.indices
+    place = np.empty(len(order), np.int32)
+    place[order] = np.arange(len(order), dtype=np.int32)
+    near = _ask(tree, order)
+    return order, np.where(near < 0, np.int32(-1), place[near])
+
+
+def _ask(tree: cKDTree, asked: Int[np.ndarray, " some"]) -> Int[np.ndarray, "some 20"]:
+    """Neighbors of the tree's points of these numbers, -1 for none; a point comes first among those at its place."""
+    ranks = list(range(1, min(NEIGHBORS, tree.n) + 1))
+    blocks = [asked[i : i + BLOCK] for i in range(0, len(asked), BLOCK)]
+    found = np.concatenate([tree.query(tree.data[rows], ranks, workers=-1)[1].astype(np.int32) for rows in blocks])
+    wrong = np.flatnonzero(found[:, 0] != asked)
+    if len(wrong):
+        own = found[wrong] == asked[wrong, None]
+        lost = ~own.any(axis=1)  # among too many at its place
+        own[lost, -1], found[wrong[lost], -1] = True, asked[wrong[lost]]
+        found[wrong] = np.take_along_axis(found[wrong], np.argsort(~own, axis=1, kind="stable"), axis=1)
+    return np.pad(found, [(0, 0), (0, NEIGHBORS - found.shape[1])], constant_values=-1)
+
+
+# --- surfels ----------------------------------------------------------------------------------------------------------
 
 
 class Points(NamedTuple):
@@ -196,7 +262,7 @@ def look(
     middle, grid = median(spacing, points.mask), grid_of(points.mask.shape[0])
     low, high = rules.bounds_seen
     bounded = jnp.clip(spacing, low * middle, high * middle)
-    return seen_from(points.position, normal, bounded, points.mask, cell_of(middle, grid), grid=grid)
+    return see_directions(points.position, normal, bounded, points.mask, cell_of(middle, grid), grid=grid)
 
 
 def find_sides(
@@ -298,3 +364,69 @@ def find_spacings(
 
     rough, weight, evenness = map_blocks(weigh, points, normal, rules, raw, layer, normal, sided)
     return rough, weight, median(evenness, points.mask) < rules.even
+
+
+# --- scenes -----------------------------------------------------------------------------------------------------------
+
+
+def encode(params: Any, cloud: PointCloud, neighbors: Int[AnyArray, "points 20"]) -> SurfelScene:
+    """The surfels of a cloud (unbatched, any units, y up); pure: jit, vmap over equally padded clouds, grad, float64.
+
+    `neighbors` are `spnr_jax.neighbors(cloud)`.  Positions, normals and colors must be finite, those of padding too.
+    The network's `params` are not needed by surfels; they stand here for networks that encode.  All clouds have one
+    structure, whether or not they have normals.  Gradients flow through the box as well: a shift of all points moves
+    the scene's centre.  What is a constant to them is said in `geometry.py`.
+    """
+    del params
+    inside, centre, scale = move_into_box(cloud)
+    return _make_scene(inside, neighbors, centre, scale, RULES)
+
+
+def move_into_box(cloud: PointCloud) -> tuple[PointCloud, Float[Array, "3"], Float[Array, ""]]:
+    """The cloud in the box [-1, 1]^3, and the centre and scale of the way there."""
+    positions = jnp.asarray(cloud.positions)
+    centre, scale = fit_box(positions, jnp.asarray(cloud.mask))
+    inside = clamp((positions - centre[None]) * scale, -1, 1)
+    return dataclasses.replace(cloud, positions=inside), centre, scale
+
+
+def fit_box(
+    positions: Float[AnyArray, "points 3"], mask: Bool[AnyArray, " points"]
+) -> tuple[Float[Array, "3"], Float[Array, ""]]:
+    """Centre and scale: (positions - centre) * scale has its bounding box around 0, with half diagonal 1.
+
+    The scale of points without extent is 1.  Masked points do not count.
+    """
+    some = jnp.any(mask)
+    low = smallest(jnp.where(mask[:, None], positions, jnp.inf))
+    high = largest(jnp.where(mask[:, None], positions, -jnp.inf))
+    low, high = jnp.where(some, low, 0), jnp.where(some, high, 0)
+    diagonal = length(high - low)
+    scale = jnp.where(diagonal > 0, 2 / jnp.where(diagonal > 0, diagonal, 1), 1)
+    return low / 2 + high / 2, scale
+
+
+def encode_in_box(cloud: PointCloud) -> SurfelScene:
+    """Scene of a cloud in the box (unbatched), of centre 0 and scale 1; on the host, compiled once for a bucket.
+
+    Its surfels are those of the real points in an order in which close ones follow each other, padded.
+    """
+    real = cloud_arrays.strip(cloud)
+    real = jax.tree.map(np.float32, real).replace(mask=real.mask)
+    order, near = order_in_space(real.positions)
+    size = cloud_arrays.bucket(len(order))
+    neighbors = np.pad(near, [(0, size - len(order)), (0, 0)], constant_values=-1)
+    return _encode(cloud_arrays.pad(jax.tree.map(lambda x: x[order], real), size), neighbors)
+
+
+def _make_scene(
+    cloud: PointCloud, neighbors: Int[AnyArray, "points 20"], centre: Array, scale: Array, rules: Rules
+) -> SurfelScene:
+    surfels = estimate_surfels(cloud, jnp.asarray(neighbors), rules)
+    spacing = median(jnp.asarray(surfels.spacing), jnp.asarray(surfels.mask))
+    return SurfelScene(surfels=surfels, spacing=spacing, centre=centre, scale=scale)
+
+
+@partial(Kept, returns=(SurfelScene, Surfels), options=QUICKEST)
+def _encode(cloud: PointCloud, neighbors: Int[Array, "points 20"]) -> SurfelScene:
+    return _make_scene(cloud, neighbors, jnp.zeros(3), jnp.ones(()), RULES)

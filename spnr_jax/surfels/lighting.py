@@ -16,9 +16,8 @@ from jaxtyping import Array, Float
 from spnr_jax.kernels.numerics import clamp, columns, larger, namespace, root, smaller
 from spnr_jax.kernels.records import AnyArray, Light, Surfels
 from spnr_jax.surfels import skies
-from spnr_jax.surfels.envmaps import directions, resampled, solid_angles
-from spnr_jax.surfels.room import SCALE, indoor_envmap
-from spnr_jax.surfels.visibility import DIRECTIONS
+from spnr_jax.surfels.sides import DIRECTIONS
+from spnr_jax.surfels.skies import SCALE, directions, indoor_envmap, resample, solid_angles
 
 HEIGHT, WIDTH = 32, 64  # of a table
 ROOM = "room_light.npz"
@@ -48,7 +47,7 @@ def _lobes() -> Float[np.ndarray, "tables texels texels"]:
 def light_of(envmap: Float[AnyArray, "height width 3"]) -> Light:
     """The light of a map of any size whose width is twice its height; energy is kept.  Of a traced map a traced one."""
     xp = namespace(envmap)
-    small = resampled(envmap if xp is jnp else np.asarray(envmap, np.float32), HEIGHT)
+    small = resample(envmap if xp is jnp else np.asarray(envmap, np.float32), HEIGHT)
     tables = xp.matmul(_lobes(), small.reshape(-1, 3)).reshape(-1, HEIGHT, WIDTH, 3)
     return Light(tables=xp.concatenate([tables[:1], small[None], tables[1:]]))
 
@@ -63,7 +62,7 @@ def room_light() -> Light:
         return Light(tables=np.load(file, allow_pickle=False)["tables"])
 
 
-def made_room_light() -> Light:
+def make_room_light() -> Light:
     """What the file of `room_light` holds, made anew."""
     return light_of(SCALE * indoor_envmap())
 
@@ -115,7 +114,7 @@ def irradiance(light: Light, normal: list[Array]) -> list[Array]:
     return look_up(jnp.asarray(light.tables[0]).reshape(-1, 3), normal)
 
 
-def mirrored(light: Light, towards: list[Array], roughness: Array) -> list[Array]:
+def reflect(light: Light, towards: list[Array], roughness: Array) -> list[Array]:
     """Radiance that unshadowed surfaces mirror: between the tables of the two nearest roughnesses."""
     level = clamp(roughness, 0, 1) * (len(LEVELS) - 1)
     below = jnp.clip(jnp.floor(level), 0, len(LEVELS) - 2)
@@ -150,7 +149,7 @@ def harmonics(x: Array, y: Array, z: Array) -> list[Array]:
     ]
 
 
-def projected(light: Light, rotation: Float[AnyArray, "3 3"]) -> Float[Array, "9 3"]:
+def project_harmonics(light: Light, rotation: Float[AnyArray, "3 3"]) -> Float[Array, "9 3"]:
     """Spherical harmonics of the map over pi in the axes of a camera, columns of cam_to_world."""
     towards = jnp.asarray(directions(HEIGHT).reshape(-1, 3), jnp.float32) @ rotation
     basis = jnp.stack(harmonics(*towards.T)) * jnp.asarray(solid_angles(HEIGHT).reshape(1, -1))

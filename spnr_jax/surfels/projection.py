@@ -83,7 +83,7 @@ def smoothstep(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
     return x * x * (3 - 2 * x)
 
 
-def turned(matrix: Float[AnyArray, "3 3"], vectors: Float[AnyArray, "points 3"]) -> tuple[Array, Array, Array]:
+def rotate_columns(matrix: Float[AnyArray, "3 3"], vectors: Float[AnyArray, "points 3"]) -> tuple[Array, Array, Array]:
     """Columns of vectors @ matrix."""
     x, y, z = columns(jnp.asarray(vectors))
     one, two, three = (x * matrix[0, i] + y * matrix[1, i] + z * matrix[2, i] for i in range(3))
@@ -101,8 +101,11 @@ def _dot(a: Sequence[Array], b: Sequence[Array]) -> Array:
 def footprints(surfels: Surfels, camera: Camera | View) -> Footprints:
     """Discs before a camera; those turned away, behind it or beside the picture cover no pixel."""
     rotation, eye = camera.cam_to_world[:, :3], camera.cam_to_world[:, 3]
-    x, y, z = (a - b for a, b in zip(turned(rotation, surfels.position), turned(rotation, eye[None]), strict=True))
-    normal = turned(rotation, surfels.normal)
+    x, y, z = (
+        a - b
+        for a, b in zip(rotate_columns(rotation, surfels.position), rotate_columns(rotation, eye[None]), strict=True)
+    )
+    normal = rotate_columns(rotation, surfels.normal)
     cosine = -(normal[0] * x + normal[1] * y + normal[2] * z) / larger(root(x * x + y * y + z * z), NEAREST)
     facing = 1 - jnp.asarray(surfels.sided) * (1 - smoothstep((cosine + 0.1) / 0.3))
     ahead = larger(-z, NEAREST)
@@ -157,7 +160,7 @@ def total(covered: Int[Array, " points"]) -> Int[Array, ""]:
     return jnp.minimum(jnp.sum(covered.astype(jnp.float32)), MOST).astype(jnp.int32)
 
 
-def covered_by(foot: Footprints, most: tuple[int, int]) -> Int[Array, ""]:
+def count_covered(foot: Footprints, most: tuple[int, int]) -> Int[Array, ""]:
     """Number of the pixels in the rectangles around discs, of a picture of so many rows and columns at most."""
     rows, columns = (n + 1 for n in most)
     across = (foot.left, 1), (foot.left + foot.width, -1)
@@ -182,7 +185,7 @@ def entries(surfels: Surfels, camera: Camera, *, room: int) -> tuple[Entries, In
     point = jnp.repeat(jnp.arange(len(covered), dtype=jnp.int32), covered, total_repeat_length=room)
     # whole columns are gathered one by one, and not computed anew at every use: twenty times faster on a CPU
     rotation = camera.cam_to_world[:, :3]
-    rim = turned(rotation, surfels.rim)
+    rim = rotate_columns(rotation, surfels.rim)
     side = _cross(foot.normal, rim)
     reach = tuple(columns(jnp.asarray(surfels.reach)))
     foot, begin, point, rim, side, reach = jax.lax.optimization_barrier((foot, end - covered, point, rim, side, reach))
@@ -209,14 +212,14 @@ def entries(surfels: Surfels, camera: Camera, *, room: int) -> tuple[Entries, In
     depth = clamp(met, -z - radius, -z + radius)
     pixels = camera.height * camera.width
     pixel = jnp.where((place < end[-1]) & (kernel > 0), row * camera.width + column, pixels)
-    order, pixel = _sorted(pixel, jax.lax.stop_gradient(depth), place, max(PIXEL_BITS, pixels.bit_length()))
+    order, pixel = _sort_entries(pixel, jax.lax.stop_gradient(depth), place, max(PIXEL_BITS, pixels.bit_length()))
     first = jnp.concatenate([jnp.ones(1, bool), pixel[1:] != pixel[:-1]]) & (pixel < pixels)
     slot = jnp.cumsum(first.astype(jnp.int32)) - 1
     rank = place - jax.lax.cummax(jnp.where(first, place, 0))
     return Entries(point, kernel, depth, foot.facing[point], order, pixel, slot, rank), lost
 
 
-def _sorted(
+def _sort_entries(
     pixel: Int[Array, " entries"], depth: Float[Array, " entries"], place: Int[Array, " entries"], pixel_bits: int
 ) -> tuple[Int[Array, " entries"], Int[Array, " entries"]]:
     """Places and pixels in the order of pixel and depth: one number of 64 bits sorts nine times faster than three."""

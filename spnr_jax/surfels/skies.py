@@ -1,6 +1,12 @@
-"""Environment maps that are computed: skies, studios, lamps, and random ones to learn from.
+"""Environment maps that are computed: skies, studios, lamps, random ones to learn from, and the package's room.
 
-Conventions of maps: `envmaps.py`.  Maps add up and scale; none is normalised.
+A map is (height, 2 * height, 3), linear radiance, latitude-longitude: row 0 is straight up (+y), column c of w looks
+along the azimuth phi = 2 pi (c + 0.5) / w, where the direction is (sin phi, 0, -cos phi) on the horizon.  Maps add up
+and scale; none is normalised.
+
+The room is furnished and has a window and lamps; it is computed, not stored: one ray per texel from its middle to the
+walls, floor and ceiling, each of which shows its own colour under a diffuse estimate of what lamps and window throw on
+it.
 """
 
 from collections.abc import Callable, Sequence
@@ -11,8 +17,133 @@ from jaxtyping import Float
 
 from spnr_jax.kernels.numerics import namespace
 from spnr_jax.kernels.records import AnyArray
-from spnr_jax.surfels.envmaps import directions, solid_angles
-from spnr_jax.surfels.room import indoor_envmap
+
+# --- maps as arrays ---------------------------------------------------------------------------------------------------
+
+
+def directions(height: int) -> Float[np.ndarray, "height width 3"]:
+    """Unit directions through the middles of a map's texels."""
+    theta = np.pi * (np.arange(height) + 0.5) / height
+    phi = np.pi * (np.arange(2 * height) + 0.5) / height
+    across = np.sin(theta)[:, None]
+    up = np.broadcast_to(np.cos(theta)[:, None], (height, 2 * height))
+    return np.stack([across * np.sin(phi), up, -across * np.cos(phi)], axis=-1)
+
+
+def solid_angles(height: int) -> Float[np.ndarray, "height width"]:
+    """Of the texels of a map, in steradian."""
+    edges = np.cos(np.pi * np.arange(height + 1) / height)
+    rows = (edges[:-1] - edges[1:]) * np.pi / height
+    return np.repeat(rows[:, None], 2 * height, axis=1).astype(np.float32)
+
+
+def resample(envmap: Float[AnyArray, "h w 3"], height: int) -> Float[AnyArray, "height width 3"]:
+    """A map of another size: each texel is the mean over its solid angle of those that it overlaps; energy is kept."""
+    rows = _shares(
+        -np.cos(np.pi * np.arange(envmap.shape[0] + 1) / envmap.shape[0]),
+        -np.cos(np.pi * np.arange(height + 1) / height),
+    )
+    columns = _shares(np.linspace(0, 1, envmap.shape[1] + 1), np.linspace(0, 1, 2 * height + 1))
+    xp = namespace(envmap)
+    narrow = xp.tensordot(rows, envmap, axes=(1, 0))
+    return xp.tensordot(narrow, columns, axes=(1, 1)).swapaxes(1, 2)
+
+
+def _shares(old: np.ndarray, new: np.ndarray) -> np.ndarray:
+    """Share of each old interval in each new one (new, old), from rising edges."""
+    overlap = np.minimum(old[1:], new[1:, None]) - np.maximum(old[:-1], new[:-1, None])
+    return (np.maximum(overlap, 0) / (new[1:] - new[:-1])[:, None]).astype(np.float32)
+
+
+# --- the room ---------------------------------------------------------------------------------------------------------
+
+
+SCALE = 0.5917323  # by which a white diffuse sphere averages 0.6 linear, measured by `data_gen.render.light`
+
+ROOM_MIN = np.array([-3.2, -1.3, -2.7])  # metres; the object floats at the origin
+ROOM_MAX = np.array([3.2, 1.6, 2.7])
+AMBIENT = 1.1  # light that has bounced more than once, the same everywhere
+
+# centre, normal, half extents along (x, y, z), emitted radiance: a window, two ceiling panels, a floor lamp's shade
+LIGHTS = (
+    ((3.2, 0.35, 0.2), (-1, 0, 0), (0.0, 0.85, 1.25), (11.0, 12.0, 13.5)),
+    ((-0.9, 1.6, -0.9), (0, -1, 0), (0.55, 0.0, 0.55), (15.0, 13.6, 11.4)),
+    ((-0.6, 1.6, 1.3), (0, -1, 0), (0.45, 0.0, 0.45), (13.0, 11.6, 9.4)),
+    ((-3.2, 0.1, -1.7), (1, 0, 0), (0.0, 0.35, 0.3), (7.0, 5.2, 3.2)),
+)
+# centre, half extents, linear colour: things that stand before the walls, seen as soft patches of colour
+FURNITURE = (
+    ((-3.2, -0.8, 0.6), (0.3, 0.5, 1.2), (0.30, 0.06, 0.04)),  # a red sofa
+    ((0.6, -0.2, -2.7), (0.7, 1.0, 0.3), (0.16, 0.09, 0.05)),  # a dark bookcase
+    ((2.0, -0.75, -2.7), (0.45, 0.5, 0.3), (0.05, 0.17, 0.07)),  # a plant
+    ((-1.4, 0.3, 2.7), (0.9, 0.45, 0.3), (0.06, 0.14, 0.30)),  # a blue picture
+    ((1.7, -0.6, 2.7), (0.6, 0.65, 0.3), (0.45, 0.36, 0.12)),  # a yellow cabinet
+)
+
+
+def indoor_envmap(height: int = 128) -> np.ndarray:
+    """Return the default map (height, 2 * height, 3): a furnished room with a window and lamps, unscaled."""
+    fine = room_radiance(directions(2 * height))
+    return fine.reshape(height, 2, 2 * height, 2, 3).mean(axis=(1, 3)).astype(np.float32)
+
+
+def room_radiance(directions: np.ndarray) -> np.ndarray:
+    """Return the radiance (*batch, 3) that arrives at the origin of the room from the directions (*batch, 3)."""
+    safe = np.where(np.abs(directions) < 1e-9, 1e-9, directions)
+    distances = np.where(safe > 0, ROOM_MAX / safe, ROOM_MIN / safe)
+    axis = distances.argmin(axis=-1)
+    positions = directions * distances.min(axis=-1, keepdims=True)
+    normals = -np.sign(directions) * (np.arange(3) == axis[..., None])
+    radiance = surface_color(positions, axis) * (AMBIENT + irradiance(positions, normals)) / np.pi
+    for centre, normal, half, emitted in LIGHTS:
+        on_wall = np.abs(np.asarray(normal)) > 0
+        inside = soft_box(positions, centre, np.where(on_wall, 0.02, half), softness=0.06)[..., None]
+        radiance = radiance * (1 - inside) + np.asarray(emitted) * inside
+    return radiance
+
+
+def surface_color(positions: np.ndarray, axis: np.ndarray) -> np.ndarray:
+    """Return the linear diffuse colour (*batch, 3) of the room at positions (*batch, 3) on the walls of `axis`."""
+    planks = 0.85 + 0.15 * np.sin(14.0 * positions[..., 2:]) ** 2
+    floor = np.array([0.40, 0.27, 0.17]) * planks
+    rug = soft_box(positions, (0.0, ROOM_MIN[1], 0.0), (1.5, 0.1, 1.1), softness=0.1)[..., None]
+    floor = floor * (1 - rug) + np.array([0.42, 0.40, 0.38]) * rug
+    colors = np.where((positions[..., 1:2] < 0), floor, np.array([0.82, 0.81, 0.78]))
+    colors = np.where((axis == 0)[..., None], np.array([0.62, 0.55, 0.45]), colors)
+    colors = np.where((axis == 2)[..., None], np.array([0.48, 0.53, 0.55]), colors)
+    for centre, half, color in FURNITURE:
+        patch = soft_box(positions, centre, half, softness=0.08)[..., None]
+        colors = colors * (1 - patch) + np.asarray(color) * patch
+    return colors
+
+
+def irradiance(positions: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """Return the light (*batch, 3) that the lamps throw on surface points, each lamp taken as 2 x 2 spots."""
+    total = np.zeros(positions.shape)
+    steps = (-0.5, 0.5)
+    for centre, normal, half, emitted in LIGHTS:
+        sides = [axis for axis in range(3) if half[axis] > 0]
+        area = 4 * half[sides[0]] * half[sides[1]]
+        for a in steps:
+            for b in steps:
+                spot = np.array(centre, float)
+                spot[sides] += a * half[sides[0]], b * half[sides[1]]
+                towards = spot - positions
+                squared = (towards**2).sum(-1) + 0.05  # softened: a wall may touch the lamp
+                cosines = np.maximum((towards * normals).sum(-1), 0) * np.maximum(-(towards @ np.asarray(normal)), 0)
+                total += (cosines / squared**2 * area / 4)[..., None] * np.asarray(emitted)
+    return total
+
+
+def soft_box(positions: np.ndarray, centre, half, softness: float) -> np.ndarray:
+    """Return 1 inside the box, 0 outside, (*batch,), passing smoothly over `softness` metres at its faces."""
+    depth = (np.asarray(half) - np.abs(positions - np.asarray(centre))) / softness
+    ramp = np.clip(0.5 + 0.5 * depth, 0, 1)
+    return (ramp * ramp * (3 - 2 * ramp)).prod(-1)
+
+
+# --- skies and lamps --------------------------------------------------------------------------------------------------
+
 
 HEIGHT = 128
 HORIZON = 0.08  # sine of the elevation over which ground and sky pass into each other
@@ -104,7 +235,7 @@ def random_map(generator: np.random.Generator, height: int = HEIGHT) -> Map:
     return whole
 
 
-def normalised(envmap: Map, white: float | int = 0.6) -> Map:
+def normalise(envmap: Map, white: float | int = 0.6) -> Map:
     """The map scaled so that a white diffuse sphere, seen from all around, averages `white`: its mean radiance."""
     mean = np.sum(envmap.mean(axis=-1) * solid_angles(len(envmap))) / (4 * np.pi)
     return (envmap * (white / max(mean, 1e-12))).astype(np.float32)

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Int
 
 from spnr_jax.kernels.numerics import clamp, columns, larger, one_minus_exp, root, smaller, with_gradient
 from spnr_jax.kernels.records import Camera, GBuffer, Surfels
-from spnr_jax.surfels.projection import Entries, footprints, smoothstep, turned
+from spnr_jax.surfels.projection import Entries, footprints, rotate_columns, smoothstep
 
 OPACITY = 3.0  # optical depth at the middle of a disc
 LIST = 24  # entries of a pixel at most
@@ -46,32 +46,32 @@ def blend(
     sharp = share * kernel**SHARP * found.facing[table]
     share, sharp = jax.lax.optimization_barrier((share, sharp))
     rotation = camera.cam_to_world[:, :3]
-    normal = jnp.stack(turned(rotation, surfels.normal), axis=-1)
+    normal = jnp.stack(rotate_columns(rotation, surfels.normal), axis=-1)
     wide = jnp.concatenate([attributes, normal, jnp.log(surfels.spacing)[:, None]], axis=1)
     foot = footprints(surfels, camera)
     narrow = jnp.concatenate([_colors(surfels), jnp.stack([foot.column, foot.row], axis=-1)], axis=1)
     wide, narrow = jax.lax.optimization_barrier((wide, narrow))
-    sums = [_summed(share, point, wide)]
+    sums = [_sum_rows(share, point, wide)]
     drawn, deep = jnp.sum(share, axis=0), jnp.sum(share * depth, axis=0)
     mean = deep / larger(drawn, LEAST_SHARE)
     squared = jnp.sum(share * (depth - mean[None]) ** 2, axis=0)  # about the mean: of squares no digit would be left
     sums += [x[:, None] for x in (drawn, jnp.sum(weight * left, axis=0), mean, squared)]
     total, deep = (jnp.sum(x, axis=0) for x in (sharp, sharp * depth))
     ahead = deep / jnp.where(total > TOLD, total, 1)
-    sums += [_colored(sharp, point, narrow, pixel_of, ahead, camera), total[:, None]]
+    sums += [_sum_colors(sharp, point, narrow, pixel_of, ahead, camera), total[:, None]]
     slot = jnp.arange(slots, dtype=jnp.int32)
     slot_of = jnp.full(height * width, slots, jnp.int32).at[pixel_of].set(slot, mode="drop")
     of_slot = jax.lax.optimization_barrier(jnp.pad(jnp.concatenate(sums, axis=1), ((0, 1), (0, 0))))
     of_pixel = of_slot[slot_of].reshape(height, width, -1)
-    return _gathered(columns(of_pixel), attributes.shape[1], camera)
+    return _gather(columns(of_pixel), attributes.shape[1], camera)
 
 
-def covered_pixels(found: Entries) -> Int[Array, ""]:
+def count_covered_pixels(found: Entries) -> Int[Array, ""]:
     """Number of pixels that hold an entry."""
     return found.slot[-1] + 1
 
 
-def _summed(
+def _sum_rows(
     weights: Float[Array, "list slots"], point: Int[Array, "list slots"], rows: Float[Array, "points features"]
 ) -> Float[Array, "slots features"]:
     """Weighted sums over each list, whole rows at a time: ten times as fast on a CPU as column by column."""
@@ -88,7 +88,7 @@ def _colors(surfels: Surfels) -> Float[Array, "points 19"]:
     return jnp.concatenate(parts, axis=1)
 
 
-def _colored(
+def _sum_colors(
     sharp: Float[Array, "list slots"],
     point: Int[Array, "list slots"],
     rows: Float[Array, "points 21"],
@@ -142,7 +142,9 @@ def _plain_shares(tau: Array, depth: Array, spacing: Array) -> tuple[Array, Arra
     return tau * left * _mean_transmittance(band)[0], left
 
 
-def _pulled_back(primals: tuple[Array, Array, Array], cotangents: tuple[Array, Array]) -> tuple[Array, Array, Array]:
+def _pull_back_shares(
+    primals: tuple[Array, Array, Array], cotangents: tuple[Array, Array]
+) -> tuple[Array, Array, Array]:
     """Gradients by tau, depth and spacing from those by share and transmittance; every pair is seen from both ends.
 
     That of the plain shares, as JAX derives it, takes twenty times as long as they do.
@@ -169,7 +171,7 @@ def _pulled_back(primals: tuple[Array, Array, Array], cotangents: tuple[Array, A
     return by_tau, by_depth, by_spacing
 
 
-_shares = with_gradient(_plain_shares, _pulled_back)
+_shares = with_gradient(_plain_shares, _pull_back_shares)
 
 
 def _optical_depths(tau: Array, depth: Array, spacing: Array) -> tuple[Array, Array]:
@@ -215,7 +217,7 @@ def _mean_transmittance(tau: Array) -> tuple[Array, Array]:
     return mean, slope
 
 
-def _gathered(sums: list[Array], features: int, camera: Camera) -> GBuffer:
+def _gather(sums: list[Array], features: int, camera: Camera) -> GBuffer:
     """Means from the sums of `blend`."""
     wide, rest, narrow = sums[: features + 4], sums[features + 4 : features + 8], sums[features + 8 :]
     share, coverage, depth, squared = rest

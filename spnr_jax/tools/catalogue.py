@@ -28,8 +28,8 @@ from spnr_jax.formats.images import write_whole
 from spnr_jax.formats.pages import template
 from spnr_jax.formats.point_files import MESHES, READERS
 from spnr_jax.tools.commands import WILDCARDS, Render
-from spnr_jax.tools.pictures import check_writable, drawn, load_network, made_ready
-from spnr_jax.training.weights import SHIPPED, load, place, shipped
+from spnr_jax.tools.pictures import check_writable, draw_all, load_network, prepare_cloud
+from spnr_jax.training.weights import SHIPPED, load, packaged_file, place
 
 KINDS = tuple(dict.fromkeys((*READERS, *MESHES)))
 RECORD = "drawn.json"
@@ -111,7 +111,7 @@ def digest(options: Render) -> str:
     asked = {k: v for k, v in dataclasses.asdict(options).items() if k not in ("cloud", "out", "workers", "cluster")}
     found = hashlib.sha256(json.dumps(asked, default=str, sort_keys=True).encode())
     light = options.lighting.light
-    networks = [place(options.run), shipped("densifier")]
+    networks = [place(options.run), packaged_file("densifier")]
     for path in networks + ([Path(light)] if light else []):
         if path.is_file():
             found.update(path.read_bytes())
@@ -174,8 +174,10 @@ def draw_item(batch: Batch, item: Item) -> str | None:
     options = dataclasses.replace(batch.options, cloud=item.cloud)
     ready = None
     try:
-        ready = made_ready(options, notes.append, loaded)
-        written = [path.name for one in beside(drawn(ready, options, folder / item.cloud.stem)) for path in one.paths]
+        ready = prepare_cloud(options, notes.append, loaded)
+        written = [
+            path.name for one in beside(draw_all(ready, options, folder / item.cloud.stem)) for path in one.paths
+        ]
     except ValueError as error:
         return one_line(error)
     except Exception as error:

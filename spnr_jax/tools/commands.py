@@ -34,7 +34,7 @@ class Lighting:
     """Background: white, or the environment map, blurred."""
 
     @property
-    def asked(self) -> tuple[str, ...]:
+    def is_given(self) -> tuple[str, ...]:
         """Names of the options that are not as they are where nothing is asked of the light."""
         given = (field.name for field in dataclasses.fields(self) if getattr(self, field.name) != field.default)
         return tuple(f"--{name.replace('_', '-')}" for name in given)
@@ -64,7 +64,7 @@ class SplatMaking:
     """Pictures of the network that splats are made from."""
 
     @property
-    def asked(self) -> dict[str, Any]:
+    def is_given(self) -> dict[str, Any]:
         """What `splat_making.splats_of` is asked for."""
         return {"degree": self.harmonics, "most": self.most_splats, "views": self.fitting_views}
 
@@ -189,9 +189,9 @@ class Render:
     """Options of the Gaussian splats."""
 
     @property
-    def asked_of_light(self) -> tuple[str, ...]:
+    def light_options_given(self) -> tuple[str, ...]:
         """Names of the options that need a network that takes a light."""
-        return (*self.lighting.asked, *(("--turn light",) if self.turn == "light" else ()))
+        return (*self.lighting.is_given, *(("--turn light",) if self.turn == "light" else ()))
 
     @property
     def few(self) -> bool:
@@ -304,7 +304,7 @@ class Export:
             raise ValueError(f"--num-points must be at least 1, got {self.num_points}")
         if self.splats is not None and self.mesh is not None:
             raise ValueError("--splats and --mesh are written one at a time")
-        given = ["light"] if self.lighting.asked else []
+        given = ["light"] if self.lighting.is_given else []
         given += ["most-splats"] if self.making != SplatMaking() else []
         if self.splats is None and given:
             raise ValueError(f"--{given[0]} is for --splats FILE, which is not given")

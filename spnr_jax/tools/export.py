@@ -24,7 +24,7 @@ from jax import export
 
 from spnr_jax.config import Quality
 from spnr_jax.errors import UserError
-from spnr_jax.formats.npz import packed
+from spnr_jax.formats.npz import pack_arrays
 from spnr_jax.kernels.records import LARGEST_REACH
 from spnr_jax.method.model import Model
 from spnr_jax.method.surfel_renderer import Plan
@@ -42,7 +42,7 @@ def export_encode(model: Model, *, num_points: int = 1024, platforms: Sequence[s
     if num_points < 1:
         raise UserError(f"num_points must be at least 1, got {num_points}")
     encode, shapes = method_of(model.config).export_encode(model, num_points=num_points)
-    return _serialised(encode, platforms, *shapes)
+    return _serialise(encode, platforms, *shapes)
 
 
 def export_render(
@@ -70,43 +70,43 @@ def export_render(
         raise UserError(f"reach must be 1 to {LARGEST_REACH} voxels, got {reach}")
     make = method_of(model.config).export_render
     render, shapes = make(model, num_points=num_points, size=size, quality=quality, reach=reach, plan=plan)
-    return _serialised(render, platforms, *shapes)
+    return _serialise(render, platforms, *shapes)
 
 
 def room_light() -> bytes:
     """The package's room as the light that the `render` of the default network takes: an .npz of its tables."""
-    return packed({"tables": np.asarray(lighting.room_light().tables)}, compressed=True)
+    return pack_arrays({"tables": np.asarray(lighting.room_light().tables)}, compressed=True)
 
 
 def load_exported(content: bytes) -> Callable[..., Arrays]:
     """The function in the bytes of `export_encode` or `export_render`; it compiles at its first call."""
-    return jax.jit(_deserialised(content).call)
+    return jax.jit(_deserialise(content).call)
 
 
 def stablehlo(content: bytes) -> bytes:
     """The StableHLO module in exported bytes, as a portable artefact for other compilers than JAX's."""
-    return _deserialised(content).mlir_module_serialized
+    return _deserialise(content).mlir_module_serialized
 
 
 def signature(content: bytes) -> dict[str, Any]:
     """Shapes and types of what an exported function takes (a list, for its arguments) and gives, and its platforms."""
-    exported = _deserialised(content)
+    exported = _deserialise(content)
     (arguments, _), outputs = (
-        jax.tree.map(_described, jax.tree.unflatten(tree, shapes))
+        jax.tree.map(_describe, jax.tree.unflatten(tree, shapes))
         for tree, shapes in ((exported.in_tree, exported.in_avals), (exported.out_tree, exported.out_avals))
     )
     return {"inputs": list(arguments), "outputs": outputs, "platforms": list(exported.platforms)}
 
 
-def _described(array: jax.core.ShapedArray) -> dict[str, Any]:
+def _describe(array: jax.core.ShapedArray) -> dict[str, Any]:
     return {"shape": list(array.shape), "dtype": str(array.dtype)}
 
 
-def _serialised(function: Callable[..., Arrays], platforms: Sequence[str] | None, *shapes: Arrays) -> bytes:
+def _serialise(function: Callable[..., Arrays], platforms: Sequence[str] | None, *shapes: Arrays) -> bytes:
     return bytes(export.export(jax.jit(function), platforms=platforms)(*shapes).serialize())
 
 
-def _deserialised(content: bytes) -> export.Exported:
+def _deserialise(content: bytes) -> export.Exported:
     try:
         return export.deserialize(bytearray(content))
     except Exception as error:  # noqa: BLE001 - flatbuffers and JAX raise many kinds for bytes that are something else

@@ -121,7 +121,7 @@ class Solid(NamedTuple):
 
 def mesh_of_volume(model: Model, volume: Volume, placed: PlacedCloud, resolution: int = GRID) -> Solid:
     """The mesh of a cloud that is encoded, from a grid of so many places along each side of the box."""
-    views = splat_making.drawn_views(model, volume, splat_making.fitting_cameras(model, volume))
+    views = splat_making.draw_views(model, volume, splat_making.fitting_cameras(model, volume))
     return mesh_of(solidity(views, volume, placed, resolution), placed)
 
 

@@ -37,7 +37,7 @@ from spnr_jax.formats.clouds import PlacedCloud
 from spnr_jax.formats.gaussian_files import write_splats
 from spnr_jax.formats.light_files import read_light
 from spnr_jax.kernels.cameras import camera_rays
-from spnr_jax.kernels.colors import linear_to_srgb
+from spnr_jax.kernels.imaging import linear_to_srgb
 from spnr_jax.kernels.records import Camera, Light, Rendering, Volume
 from spnr_jax.method.model import Model
 from spnr_jax.methods import method_of
@@ -115,9 +115,9 @@ def render_file(options: Render, note: Callable[[str], None]) -> Iterator[str]:
     check_writable(options.out)
     loaded = cache(load)
     load_network(options, loaded)  # a run that is none is said before the cloud is read
-    ready = made_ready(options, note, loaded)
+    ready = prepare_cloud(options, note, loaded)
     yield f"encoded {len(ready.placed.cloud.positions)} points of {options.cloud}"
-    for written in beside(drawn(ready, options, options.out / options.cloud.stem)):
+    for written in beside(draw_all(ready, options, options.out / options.cloud.stem)):
         if written.line:
             yield written.line
 
@@ -125,14 +125,14 @@ def render_file(options: Render, note: Callable[[str], None]) -> Iterator[str]:
 def load_network(options: Render, loaded: Callable[[Path | None], Model]) -> Model:
     """The network of the options; ValueError if it cannot draw what they ask for."""
     model = loaded(options.run)
-    check_takes_light(model, options.asked_of_light, options.run)
+    check_takes_light(model, options.light_options_given, options.run)
     return model
 
 
-def made_ready(options: Render, note: Callable[[str], None], loaded: Callable[[Path | None], Model]) -> Ready:
+def prepare_cloud(options: Render, note: Callable[[str], None], loaded: Callable[[Path | None], Model]) -> Ready:
     """The cloud of the options read and encoded; `note` gets the assumptions about it, `loaded` gives a network."""
     model = load_network(options, loaded)
-    light = light_of_options(options.lighting) if options.asked_of_light else None
+    light = light_of_options(options.lighting) if options.light_options_given else None
     placed = clouds.place_cloud(
         options.cloud,
         num_points=options.num_points,
@@ -147,7 +147,7 @@ def made_ready(options: Render, note: Callable[[str], None], loaded: Callable[[P
     return Ready(placed=placed, network=network, model=model, volume=model.encode(placed.cloud), light=light)
 
 
-def drawn(ready: Ready, options: Render, name: Path) -> Iterator[Callable[[], Written]]:
+def draw_all(ready: Ready, options: Render, name: Path) -> Iterator[Callable[[], Written]]:
     """Draws what the options ask for; yields what writes it, under the name and its endings, in any thread.
 
     Stills and film are drawn in one go: views that share their sizes share their programs.
@@ -224,9 +224,9 @@ def still_files(rendering: Rendering, camera: Camera, volume: Volume, options: R
     if "depth" in options.outputs:
         yield "_depth.png", images.png(images.depth_image(rendering.depth, acc))
         depth = depth_maps.surface_depth(rendering, camera, volume)
-        yield "_depth.npy", _saved(np.save, depth)
+        yield "_depth.npy", _save(np.save, depth)
         steps = Image.fromarray(depth_maps.in_16bit(depth, depth_maps.step_16bit(volume)))
-        yield "_depth_16bit.png", _saved(lambda file, picture: picture.save(file, "png"), steps)
+        yield "_depth_16bit.png", _save(lambda file, picture: picture.save(file, "png"), steps)
     if "opacity" in options.outputs:
         yield "_opacity.png", images.png(np.repeat(acc[..., None], 3, axis=-1))
 
@@ -291,12 +291,12 @@ def _splats(ready: Ready, options: Render, path: Path) -> Iterator[Callable[[], 
     from spnr_jax.tools import splat_making  # here: pictures alone do without
 
     given = (ready.model, ready.volume, ready.placed.cloud, ready.light)
-    made = splat_making.splats_of(*given, lambda line: None, **options.making.asked)
+    made = splat_making.splats_of(*given, lambda line: None, **options.making.is_given)
     note = splat_making.note_of(options, ready.network)
     yield lambda: Written(f"wrote {path} ({write_splats(path, made, note) / 1e6:.1f} MB)", (path,))
 
 
-def _saved(write: Callable, content) -> bytes:
+def _save(write: Callable, content) -> bytes:
     """What `write(file, content)` writes."""
     stream = io.BytesIO()
     write(stream, content)

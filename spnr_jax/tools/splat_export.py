@@ -22,7 +22,7 @@ from spnr_jax.kernels.records import Camera, Gaussians
 from spnr_jax.method.model import FIELD_OF_VIEW
 from spnr_jax.tools import mesh_export
 from spnr_jax.tools.commands import Render, Share
-from spnr_jax.tools.pictures import Ready, made_ready
+from spnr_jax.tools.pictures import Ready, prepare_cloud
 from spnr_jax.tools.splat_making import RESOLUTION, note_of, splats_of
 from spnr_jax.training.weights import load
 
@@ -30,7 +30,7 @@ MOST_BYTES = 6_000_000  # of a page
 POSTER_QUALITY = 88  # of its JPEG
 
 
-def asked_of(options: Any, cloud: Path, run: Path | None) -> Render:
+def splat_options(options: Any, cloud: Path, run: Path | None) -> Render:
     """What the options of `spnr export` and `spnr share` ask of a cloud, as those of `spnr render`."""
     return Render(
         cloud=cloud,
@@ -48,7 +48,7 @@ def export_mesh(asked: Render, out: Path, note: Callable[[str], None], report: C
     if out.suffix.lower() != ".glb":
         raise UserError(f"{out}: a mesh is written as .glb, not {out.suffix or 'a folder'}")
     images.check_place(out)
-    ready = made_ready(asked, note, load)
+    ready = prepare_cloud(asked, note, load)
     solid = mesh_export.mesh_of_volume(ready.model, ready.volume, ready.placed)
     images.write_whole(out, solid.content)
     report(f"wrote {out} ({mesh_export.describe(solid)}, {len(solid.content) / 1e6:.1f} MB)")
@@ -57,7 +57,7 @@ def export_mesh(asked: Render, out: Path, note: Callable[[str], None], report: C
 def export_splats(asked: Render, out: Path, note: Callable[[str], None], report: Callable[[str], None]) -> None:
     """Writes a cloud's splats; `note` gets the assumptions about the cloud, `report` a line after each step."""
     check_suffix(out)
-    ready = made_ready(asked, note, load)
+    ready = prepare_cloud(asked, note, load)
     gaussians = _splats(ready, asked, note, report)
     size = write_splats(out, gaussians, note_of(asked))
     report(f"wrote {out} ({len(gaussians.opacity):,} splats, {size / 1e6:.1f} MB)")
@@ -66,8 +66,8 @@ def export_splats(asked: Render, out: Path, note: Callable[[str], None], report:
 def share(options: Share, note: Callable[[str], None], report: Callable[[str], None]) -> None:
     """Writes the page of a cloud; `note` gets the assumptions about the cloud, `report` a line after each step."""
     images.check_place(options.out)
-    asked = asked_of(options, options.cloud, options.run)
-    ready = made_ready(asked, note, load)
+    asked = splat_options(options, options.cloud, options.run)
+    ready = prepare_cloud(asked, note, load)
     gaussians = _splats(ready, asked, note, report)
     camera = ready.model.camera(ready.volume, options.azimuth, options.elevation, RESOLUTION)
     poster = np.asarray(ready.model.render(ready.volume, camera, light=ready.light).image)
@@ -80,7 +80,7 @@ def share(options: Share, note: Callable[[str], None], report: Callable[[str], N
 
 def _splats(ready: Ready, asked: Render, note: Callable[[str], None], report: Callable[[str], None]) -> Gaussians:
     given = ready.model, ready.volume, ready.placed.cloud, ready.light
-    gaussians = splats_of(*given, report, **asked.making.asked)
+    gaussians = splats_of(*given, report, **asked.making.is_given)
     if (origin := ready.placed.origin).any():
         note(f"splats lie around the origin; it is at {' '.join(f'{x:.0f}' for x in origin)} in the file")
     return gaussians

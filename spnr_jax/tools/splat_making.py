@@ -15,7 +15,7 @@ from spnr_jax.kernels.records import Camera, Gaussians, Light, PointCloud, Surfe
 from spnr_jax.method.model import DISTANCE, Model
 from spnr_jax.surfels import gaussians
 from spnr_jax.surfels.gaussians import View
-from spnr_jax.surfels.surfel_scenes import encode_in_box
+from spnr_jax.surfels.geometry import encode_in_box
 from spnr_jax.tools.commands import Lighting, Render
 from spnr_jax.tools.depth_maps import surface_depth
 
@@ -57,7 +57,7 @@ def splats_of(
     resolution: int = RESOLUTION,
 ) -> Gaussians:
     """`splats` of a cloud that is encoded already."""
-    pictures = drawn_views(model, volume, fitting_cameras(model, volume, views, resolution), light)
+    pictures = draw_views(model, volume, fitting_cameras(model, volume, views, resolution), light)
     report(f"the network drew {views} pictures of {resolution} x {resolution}")
     return in_units(splats_in_box(pictures, volume, cloud, degree, most), volume)
 
@@ -66,7 +66,7 @@ def splats_in_box(pictures: list[View], volume: Volume, cloud: PointCloud, degre
     """Splats in the box from pictures that the network has drawn."""
     scene = volume.scene if isinstance(volume.scene, SurfelScene) else _encode_in_box(cloud, volume)
     focal = float(np.asarray(pictures[0].camera.intrinsics)[0, 0])
-    seen = gaussians.seen_surface(pictures, scene.surfels)
+    seen = gaussians.collect_surface(pictures, scene.surfels)
     grey, side = gaussians.place(seen, most=most, pixel=DISTANCE / focal)
     return gaussians.color(grey, pictures, side=side, degree=degree)
 
@@ -81,7 +81,7 @@ def fitting_cameras(model: Model, volume: Volume, count: int = VIEWS, resolution
     ]
 
 
-def drawn_views(model: Model, volume: Volume, cameras: list[Camera], light: Light | None = None) -> list[View]:
+def draw_views(model: Model, volume: Volume, cameras: list[Camera], light: Light | None = None) -> list[View]:
     """The network's pictures from cameras, with these in the box."""
     found = []
     for camera, drawn in zip(cameras, model.render_each(volume, cameras, lights=[light] * len(cameras)), strict=True):

@@ -27,18 +27,19 @@ from spnr_jax.errors import UserError
 from spnr_jax.formats.clouds import MOST_EVEN
 from spnr_jax.formats.data_sets import Dataset, ObjectData, read_object
 from spnr_jax.formats.images import to_uint8, write_whole
-from spnr_jax.formats.npz import packed, read_arrays
+from spnr_jax.formats.npz import pack_arrays, read_arrays
 from spnr_jax.kernels import cameras, losses
-from spnr_jax.kernels.cleaning import Cleaned, cleaned
+from spnr_jax.kernels.cleaning import Cleaned, clean_columns
+from spnr_jax.kernels.cloud_arrays import farthest_points
 from spnr_jax.kernels.metrics import psnr
 from spnr_jax.kernels.records import Camera, Crops, Key, Light, PointCloud, Surfels, SurfelScene
-from spnr_jax.kernels.thinning import farthest_points
 from spnr_jax.method import surfel_method, surfel_renderer
 from spnr_jax.method.pixels import reconstruction_loss
 from spnr_jax.methods import Outcome
+from spnr_jax.nn import shader
 from spnr_jax.nn.shader import Shader, picture
-from spnr_jax.surfels import features, lighting, outward
-from spnr_jax.surfels.surfel_scenes import encode_in_box
+from spnr_jax.surfels import lighting, normals
+from spnr_jax.surfels.geometry import encode_in_box
 from spnr_jax.training.batching import read_ahead
 from spnr_jax.training.scan_faults import colours_alone, random_scan
 from spnr_jax.training.weights import add_companions
@@ -139,7 +140,7 @@ def complete(dataset: Dataset, light: Light, config: TrainConfig, folder: Path, 
         for number, path in enumerate(paths):
             if item is not None and found[number] is None:
                 arrays = make(item, number, light, config, variables)
-                write_whole(path, packed(arrays))  # not compressed: a view is read for each crop
+                write_whole(path, pack_arrays(arrays))  # not compressed: a view is read for each crop
                 found[number] = arrays["doublings"].tolist()
         views += [View(path, i, d) for path, of in zip(paths, found, strict=True) for i, d in enumerate(of or ())]
     if not views:
@@ -182,7 +183,7 @@ def random_cloud(cloud: PointCloud, side: int, config: TrainConfig, generator: n
     points = Cleaned(columns.pop("positions"), columns, [], 0.0)
     alone = False
     if generator.random() < SCANNED:
-        points, count = scanned(points, generator), min(count, MOST_EVEN)
+        points, count = scan(points, generator), min(count, MOST_EVEN)
     else:
         if generator.random() < UNKNOWN_MATERIALS:
             points = points._replace(values=colours_alone(*points[:2], generator)[1])
@@ -193,15 +194,15 @@ def random_cloud(cloud: PointCloud, side: int, config: TrainConfig, generator: n
     chosen = generator.permutation(len(points.positions))[:count]
     if even:
         chosen = farthest_points(points.positions, len(chosen), int(chosen[0]))
-    cloud = outward.thinned(points, chosen)
+    cloud = normals.thin_cloud(points, chosen)
     return dataclasses.replace(cloud, normals=None) if alone else cloud
 
 
-def scanned(points: Cleaned, generator: np.random.Generator) -> Cleaned:
+def scan(points: Cleaned, generator: np.random.Generator) -> Cleaned:
     """The cloud as a scanner and cleaning leave it: without normals, in the box of the one that was scanned."""
     positions, values = random_scan(*points[:2], generator)
     values.pop("normals", None)
-    left = cleaned(positions, values)
+    left = clean_columns(positions, values)
     return left._replace(positions=np.clip(left.positions, -1, 1))
 
 
@@ -225,7 +226,7 @@ def make_view(
     whole = drawn.height * drawn.width
     room, slots = _size(int(needed.entries), 2**16), min(_size(int(needed.slots), whole // 16), whole)
     seen, maps, ambient = map(np.asarray, look_at(scene.surfels, drawn, light, room=room, slots=slots))
-    target = averaged(image, side)
+    target = average_squares(image, side)
     shown = target[..., 3].reshape(drawn.height, scale, drawn.width, scale).max(axis=(1, 3))
     inside = (seen[..., 0] > FAINT) | (shown > 0)
     if not inside.any():
@@ -253,7 +254,7 @@ def _size(count: int, least: int) -> int:
     return least * 4 ** max(-(-((count - 1) // least).bit_length() // 2), 0)
 
 
-def averaged(image: UInt8[np.ndarray, "height width 4"], side: int) -> UInt8[np.ndarray, "h w 4"]:
+def average_squares(image: UInt8[np.ndarray, "height width 4"], side: int) -> UInt8[np.ndarray, "h w 4"]:
     """The picture `side` times smaller: each square's opacity, and its colour weighted by it."""
     alpha = image[..., 3:].astype(np.float32) / 255
     layers = np.concatenate([image[..., :3] / np.float32(255) * alpha, alpha], axis=-1)
@@ -286,9 +287,9 @@ def make_batch(views: dict[int, list[View]], config: TrainConfig, step: int) -> 
     crops = []
     for _ in range(config.batch_objects):
         view = views[doublings][generator.integers(len(views[doublings]))]
-        crop = cropped(read_view(view), size, margin, 2**doublings, generator)
+        crop = crop_square(read_view(view), size, margin, 2**doublings, generator)
         for axis in (0, 1):
-            crop = mirrored(crop, axis) if generator.random() < 0.5 else crop
+            crop = mirror(crop, axis) if generator.random() < 0.5 else crop
         crops.append(crop)
     stacked = {name: np.stack([crop[name] for crop in crops]) for name in NAMES}
     return Crops(**stacked, doublings=doublings, margin=margin)
@@ -304,7 +305,7 @@ def read_view(view: View) -> Arrays:
     return {name: arrays[f"{name}{view.number}"] for name in NAMES}
 
 
-def cropped(view: Arrays, size: int, margin: int, scale: int, generator: np.random.Generator) -> Arrays:
+def crop_square(view: Arrays, size: int, margin: int, scale: int, generator: np.random.Generator) -> Arrays:
     """A square of a view that shows something of the object; empty beyond the view's ends."""
     seen, inner = view["seen"], size - 2 * margin
     for _ in range(TRIES):
@@ -327,12 +328,12 @@ def cropped(view: Arrays, size: int, margin: int, scale: int, generator: np.rand
     }
 
 
-def mirrored(view: Arrays, axis: int) -> Arrays:
+def mirror(view: Arrays, axis: int) -> Arrays:
     """The view of object, camera and light mirrored along x (axis 0) or y (axis 1) of the camera."""
     flipped = {name: np.flip(view[name], 1 - axis) for name in ("seen", "maps", "target")}
     return {
         **flipped,
-        "seen": flipped["seen"] * _signs(features.NUM_FEATURES, features.ODD[axis]),
+        "seen": flipped["seen"] * _signs(shader.NUM_FEATURES, shader.ODD[axis]),
         "ambient": view["ambient"] * _signs(lighting.SH_BANDS, lighting.ODD[axis])[:, None],
     }
 

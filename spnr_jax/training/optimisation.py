@@ -102,7 +102,7 @@ def create_state(config: TrainConfig, seed: int | Array | None = None) -> TrainS
     )
 
 
-def begun_with(state: TrainState, variables: dict) -> TrainState:
+def init_from(state: TrainState, variables: dict) -> TrainState:
     """A fresh state with the generator of another training; ValueError if its weights are of another network."""
     params, stats = variables["params"], variables.get("batch_stats", {})
     needed = {"params": state.generator, "batch_stats": state.batch_stats}
@@ -179,7 +179,7 @@ def discriminator_step(
     params, optimizer = judge
     gradient, metrics = jax.grad(partial(discriminator_loss, config), has_aux=True)(params, fake, batch, step)
     update, optimizer = optimizers(config)[1].update(gradient, optimizer)
-    return (optax.apply_updates(params, _scaled(update, lr_scale)), optimizer), metrics
+    return (optax.apply_updates(params, _scale_update(update, lr_scale)), optimizer), metrics
 
 
 # --- steps ------------------------------------------------------------------------------------------------------------
@@ -228,7 +228,7 @@ def train_step(
         state.generator, state.batch_stats, judge, batch, key, state.step, lr_scale
     )
     update, generator_optimizer = optimizers(config)[0].update(gradient, state.generator_optimizer)
-    generator = optax.apply_updates(state.generator, _scaled(update, lr_scale))
+    generator = optax.apply_updates(state.generator, _scale_update(update, lr_scale))
     averaged, averaged_stats = moving_average(
         (state.averaged, state.averaged_stats), (generator, batch_stats), state.step, config.optimizer.ema_decay
     )
@@ -247,7 +247,7 @@ def train_step(
     return state, metrics | {"loss": loss, "gradient_norm": optax.tree.norm(gradient)}
 
 
-def _scaled(update: Any, factor: Array | None) -> Any:
+def _scale_update(update: Any, factor: Array | None) -> Any:
     return update if factor is None else jax.tree.map(lambda x: factor * x, update)
 
 

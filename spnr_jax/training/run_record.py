@@ -140,7 +140,7 @@ def read_starts(run: Path) -> list[dict]:
     return [entry for entry in starts if isinstance(entry, dict)] if isinstance(starts, list) else []
 
 
-def seen_in_training(run: Path, dataset: data_sets.Dataset, names: Sequence[str]) -> bool | None:
+def trained_on(run: Path, dataset: data_sets.Dataset, names: Sequence[str]) -> bool | None:
     """Whether a run trained on some of the objects of a data set, by its record; None where that does not say.
 
     It does not if the run trained on another data set, which may hold the same objects, or began with weights of

@@ -10,7 +10,7 @@ from functools import partial
 
 import numpy as np
 
-from spnr_jax.kernels.facing import seen_from, spacing_of
+from spnr_jax.surfels.normals import find_visible, spacing_of
 
 Points = tuple[np.ndarray, dict[str, np.ndarray]]
 Fault = Callable[[np.ndarray, dict[str, np.ndarray], np.random.Generator], Points]
@@ -40,21 +40,21 @@ def with_outliers(positions, values, rng, *, share: float) -> Points:
     )
 
 
-def scanned(positions, values, rng, *, scanners: int) -> Points:
+def scan(positions, values, rng, *, scanners: int) -> Points:
     """What scanners in random directions from the middle see."""
     spacing, seen = spacing_of(positions), np.zeros(len(positions), bool)
     for direction in rng.normal(size=(scanners, 3)):
-        seen |= seen_from(positions, SCANNER * direction / np.linalg.norm(direction), spacing, BEHIND)
+        seen |= find_visible(positions, SCANNER * direction / np.linalg.norm(direction), spacing, BEHIND)
     return positions[seen], {name: column[seen] for name, column in values.items()}
 
 
-def misregistered(positions, values, rng, *, sigma: float) -> Points:
+def misregister(positions, values, rng, *, sigma: float) -> Points:
     """Two scans that do not quite meet: the points on one side of a random plane are moved together."""
     apart = positions @ rng.normal(size=3) > 0
     return positions + apart[:, None] * sigma * rng.normal(size=3), values
 
 
-def dropped(positions, values, rng, *, balls: int) -> Points:
+def drop_balls(positions, values, rng, *, balls: int) -> Points:
     """Nothing is left in balls around random points."""
     middles, radii = positions[rng.integers(len(positions), size=balls)], rng.uniform(*BALLS, balls)
     kept = (((positions[:, None] - middles) ** 2).sum(axis=-1) > radii**2).all(axis=1)
@@ -96,10 +96,10 @@ def uneven(positions, values, rng) -> Points:
 SCANS: tuple[tuple[float, Callable[[np.random.Generator], Fault]], ...] = (
     # of a random scan: the chance of each fault, and how it is drawn
     (0.15, lambda rng: colours_in_light),
-    (0.4, lambda rng: partial(scanned, scanners=int(rng.integers(3, 9)))),
+    (0.4, lambda rng: partial(scan, scanners=int(rng.integers(3, 9)))),
     (0.2, lambda rng: uneven),
-    (0.15, lambda rng: partial(dropped, balls=int(rng.integers(1, 5)))),
-    (0.15, lambda rng: partial(misregistered, sigma=rng.uniform(0, MISREGISTERED))),
+    (0.15, lambda rng: partial(drop_balls, balls=int(rng.integers(1, 5)))),
+    (0.15, lambda rng: partial(misregister, sigma=rng.uniform(0, MISREGISTERED))),
     (0.75, lambda rng: partial(noisy, sigma=float(np.exp(rng.uniform(*np.log(NOISE)))))),
     (0.35, lambda rng: partial(with_outliers, share=float(np.exp(rng.uniform(*np.log(OUTLIERS)))))),
     (0.5, lambda rng: partial(colour_noise, sigma=rng.uniform(0, COLOUR_NOISE))),
@@ -120,5 +120,5 @@ def faults(noise: tuple[float, ...], outliers: tuple[float, ...], scanners: tupl
     named: dict[str, Fault | None] = {"clean": None}
     named |= {f"noise {sigma:.1%}": partial(noisy, sigma=sigma) for sigma in noise}
     named |= {f"outliers {share:.0%}": partial(with_outliers, share=share) for share in outliers}
-    named |= {f"{n} scanner{'s' * (n > 1)}": partial(scanned, scanners=n) for n in scanners}
+    named |= {f"{n} scanner{'s' * (n > 1)}": partial(scan, scanners=n) for n in scanners}
     return named | {"colours alone": colours_alone, "uneven density": uneven}

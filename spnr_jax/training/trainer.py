@@ -79,9 +79,9 @@ def train(
     """
     runtime.few_arenas()
     own = None if mesh is None else placement.own_objects(mesh, config.batch_objects)
-    with claimed(run, config), ExitStack() as stack:
+    with claim(run, config), ExitStack() as stack:
         clock = Clock()
-        state = begun(config, run, mesh, init)
+        state = restore_or_init(config, run, mesh, init)
         if (first := int(state.step)) >= config.num_steps:
             return state
         batches_from = method_of(config.model).prepare(config, dataset, run, light=light, own=own)
@@ -124,7 +124,7 @@ def take_step(
 
 
 @contextmanager
-def claimed(run: Path, config: TrainConfig) -> Iterator[None]:
+def claim(run: Path, config: TrainConfig) -> Iterator[None]:
     """The run folder is this training's alone; errors of the disk and of other processes name it."""
     try:
         with ExitStack() as stack:
@@ -135,14 +135,14 @@ def claimed(run: Path, config: TrainConfig) -> Iterator[None]:
         error.filename = error.filename or str(run)  # writing to a full disk does not say where
         raise
     except jax.errors.JaxRuntimeError as error:
-        raise placement.lost(error, run) from None
+        raise placement.explain_lost_process(error, run) from None
 
 
-def begun(config: TrainConfig, run: Path, mesh: Mesh | None, init: Trained | None) -> optimisation.TrainState:
+def restore_or_init(config: TrainConfig, run: Path, mesh: Mesh | None, init: Trained | None) -> optimisation.TrainState:
     """The state to go on with, and a line about it: of the newest checkpoint, or before the first step."""
     say: Callable[[str], object] = tqdm.write if placement.leads() else lambda line: None
     with placement.using(mesh):
-        sharding = None if mesh is None else placement.replicated(mesh)
+        sharding = None if mesh is None else placement.sharding_of_all(mesh)
         state = checkpoint.restore(run, config, say, sharding) or new_state(config, init)
     if (step := int(state.step)) >= config.num_steps:
         say(f"{run} is finished: {step} steps")
@@ -231,7 +231,7 @@ class Progress:
 def new_state(config: TrainConfig, init: Trained | None) -> optimisation.TrainState:
     """The state before the first step."""
     state = optimisation.jitted_create_state(config)
-    return state if init is None else optimisation.begun_with(state, init.variables)
+    return state if init is None else optimisation.init_from(state, init.variables)
 
 
 def write_network(run: Path, config: TrainConfig, state: optimisation.TrainState) -> None:

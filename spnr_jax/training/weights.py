@@ -22,7 +22,7 @@ from flax.traverse_util import flatten_dict, unflatten_dict
 from spnr_jax.config import NetworkConfig, TrainConfig
 from spnr_jax.errors import UserError
 from spnr_jax.formats.images import write_whole
-from spnr_jax.formats.npz import packed, read_arrays
+from spnr_jax.formats.npz import pack_arrays, read_arrays
 from spnr_jax.method.model import Model
 from spnr_jax.methods import UnknownMethod, from_dict, include, method_of, to_dict
 
@@ -41,19 +41,19 @@ class Trained:
     steps: int
 
 
-def shipped(name: str = SHIPPED) -> Path:
+def packaged_file(name: str = SHIPPED) -> Path:
     """The file of weights that the package holds under a name: its network, or "densifier"."""
     return Path(str(resources.files("spnr_jax") / "pretrained" / f"{name}.npz"))
 
 
 def add_companions(config: NetworkConfig, variables: dict) -> dict:
     """The variables, with those networks of the package beside them that the method asks for (its densifier)."""
-    return variables | {name: read_variables(shipped(name)) for name in method_of(config).companions}
+    return variables | {name: read_variables(packaged_file(name)) for name in method_of(config).companions}
 
 
 def place(source: Path | str | None) -> Path:
     """The run folder or file that `read_trained` reads."""
-    return shipped() if source is None or str(source) == SHIPPED else Path(source)
+    return packaged_file() if source is None or str(source) == SHIPPED else Path(source)
 
 
 def read_trained(source: Path | str | None, say: Callable[[str], None] = print, data: Path | str = "DATA") -> Trained:
@@ -100,7 +100,7 @@ def write_weights(path: Path, trained: Trained) -> None:
     halves = {name: values.astype(np.float16) for name, values in arrays.items()}
     described = np.frombuffer(json.dumps(to_dict(trained.config)).encode(), np.uint8)
     content: dict[str, np.ndarray] = {"config": described, "steps": np.array(trained.steps, np.int64)}
-    write_whole(path, packed(content | halves, compressed=True))
+    write_whole(path, pack_arrays(content | halves, compressed=True))
 
 
 def read_weights(path: Path) -> Trained:
@@ -118,7 +118,7 @@ def read_weights(path: Path) -> Trained:
         if not isinstance(described, dict):
             raise UserError("its config is no JSON object")
         config = from_dict(described)
-        if path != shipped():
+        if path != packaged_file():
             _check_weights(arrays, variable_shapes(config))
     except UnknownMethod as error:
         raise UserError(f"{path}: {error}") from None

@@ -71,14 +71,14 @@ class State:
         return (*NAMES, *self.maps, *([SUN_ALONE] if self.lighting.sun else []))
 
     @property
-    def chosen_light(self) -> str:
+    def light_name(self) -> str:
         """The name of the light."""
         return self.lighting.light or (SUN_ALONE if self.lighting.sun else NAMES[0])
 
 
 def open_state(model: Model, cloud: PointCloud, name: str, lighting: Lighting) -> State:
     """What a browser sees first of a cloud that was just read; ValueError for what cannot be encoded or is no map."""
-    state = State(name=name, cloud=cloud, volume=model.encode(cloud), lighting=lighting, stale=bool(lighting.asked))
+    state = State(name=name, cloud=cloud, volume=model.encode(cloud), lighting=lighting, stale=bool(lighting.is_given))
     if lighting.light is None or lighting.light in NAMES:
         return state
     return add_map(state, display_name(Path(lighting.light).name), read_light(lighting.light))

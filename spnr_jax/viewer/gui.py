@@ -46,7 +46,7 @@ class Loop(Generic[Shown]):
             self._wake.notify()
 
     @property
-    def superseded(self) -> bool:
+    def is_superseded(self) -> bool:
         """Whether a change waits: a picture of the state as it is would be old before it is seen."""
         return bool(self._changes) or self.stopped
 
@@ -61,7 +61,7 @@ class Loop(Generic[Shown]):
         while not self.stopped:
             self.state = self._show(self.state, moving)
             with self._wake:
-                self._wake.wait_for(lambda: self.superseded, self._rest if moving else None)
+                self._wake.wait_for(lambda: self.is_superseded, self._rest if moving else None)
                 changes, self._changes = self._changes, []
             moving = bool(changes)
             for change in changes:
@@ -126,7 +126,7 @@ class Browser:
             state = self._drop_splats(state)
         with self._network:
             state, canvas = frame.draw(self._model, state, moving)
-        if canvas is not None and not self.loop.stopped and (moving or not self.loop.superseded):
+        if canvas is not None and not self.loop.stopped and (moving or not self.loop.is_superseded):
             quality = MOVING_JPEG if moving else RESTING_JPEG
             self._client.scene.set_background_image(canvas, format="jpeg", jpeg_quality=quality)
             self._said.content = self._said.content.replace(PREPARING, "")
@@ -165,7 +165,7 @@ class Browser:
         state, options = self.loop.state, self.loop.state.lighting
         widest = max(WIDEST_EXPOSURE, abs(options.exposure))
         self._light = {
-            "choice": gui.add_dropdown("Light", state.lights, initial_value=state.chosen_light),
+            "choice": gui.add_dropdown("Light", state.lights, initial_value=state.light_name),
             "yaw": gui.add_slider("Turned", 0.0, 360.0, 1.0, options.light_yaw % 360),
             "exposure": gui.add_slider("Exposure", -widest, widest, 0.25, options.exposure),
         }
@@ -213,7 +213,7 @@ class Browser:
         self._title.content = "; ".join([TITLE.format(name, len(cloud.positions)), *notes])
 
     def _show_choice(self, state: State) -> State:
-        self._light["choice"].options, self._light["choice"].value = state.lights, state.chosen_light
+        self._light["choice"].options, self._light["choice"].value = state.lights, state.light_name
         return state
 
     def _show_splats(self) -> None:
@@ -235,7 +235,7 @@ class Browser:
                 return
             self._said.content = f"picture {i + 1} of {VIEWS}"
             with self._network:
-                views += splat_making.drawn_views(self._model, state.volume, [camera], state.light)
+                views += splat_making.draw_views(self._model, state.volume, [camera], state.light)
         made = splat_making.splats_in_box(views, state.volume, state.cloud, DEGREE, MOST)
         self._said.content = f"{len(made.opacity):,} splats"
         self._splats = self._client.scene.add_gaussian_splats("/splats", **splats_for_browser(made))

@@ -50,7 +50,7 @@ def new_token() -> str:
     return secrets.token_urlsafe(LENGTH)
 
 
-def admitted(request: Request, token: str, reached_at: str | None = None) -> Request | Response:
+def admit(request: Request, token: str, reached_at: str | None = None) -> Request | Response:
     """The request with the path behind the token, or why it is refused."""
     first, _, rest = request.path.removeprefix("/").partition("/")
     if not hmac.compare_digest(first.partition("?")[0].encode(), token.encode()):
@@ -77,7 +77,7 @@ def _refusal(why: str) -> Response:
 
 
 @contextlib.contextmanager
-def guarded(token: str, reached_at: str | None = None) -> Iterator[list[Any]]:
+def guard(token: str, reached_at: str | None = None) -> Iterator[list[Any]]:
     """Servers of websockets that are opened meanwhile, in whatever thread, admit what knows the token; their list.
 
     viser opens its server in its own thread and has no hook for who is let in, hence the replaced function.
@@ -87,7 +87,7 @@ def guarded(token: str, reached_at: str | None = None) -> Iterator[list[Any]]:
 
     def serve(*arguments: Any, process_request: Asked | None = None, **options: Any) -> Any:
         def ask(connection: Any, request: Request) -> Any:
-            answer = admitted(request, token, reached_at)
+            answer = admit(request, token, reached_at)
             if isinstance(answer, Response) or process_request is None:
                 return answer if isinstance(answer, Response) else None
             return process_request(connection, answer)
@@ -130,7 +130,7 @@ class Viewer:
         self._network = threading.Lock()
         self._browsers: dict[int, Browser] = {}
         token = new_token()
-        with guarded(token, reached_at) as opened, contextlib.redirect_stdout(io.StringIO()):  # no banner of viser
+        with guard(token, reached_at) as opened, contextlib.redirect_stdout(io.StringIO()):  # no banner of viser
             self._server = Server(host=host, port=port, label="spnr view", verbose=False)
         if not opened:
             self.stop()
@@ -186,7 +186,7 @@ def open_viewer(asked: View) -> tuple[Viewer, list[str]]:
     """The running viewer of a command, and what was assumed about its file, a line each; ValueError for a bad file."""
     _check_free(asked.host, asked.port)  # before the seconds that reading takes
     model = load(asked.run)
-    check_takes_light(model, asked.lighting.asked, asked.run)
+    check_takes_light(model, asked.lighting.is_given, asked.run)
     notes: list[str] = []
     reading: dict[str, Any] = {"num_points": asked.num_points, "up": asked.up, "clean": asked.clean}
     points = clouds.read_cloud(asked.cloud, **reading, cut=asked.cut, report=notes.append)

@@ -20,8 +20,8 @@ from experiments.baselines.points2nerf import Hypernetwork, Points2NeRF, Points2
 from spnr_jax.config import LossConfig, OptimizerConfig
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.records import Camera
-from spnr_jax.method import inference
-from spnr_jax.training import optimisation, pixels
+from spnr_jax.method import inference, pixels
+from spnr_jax.training import optimisation
 
 pytestmark = pytest.mark.ci  # it trains baselines
 
@@ -63,11 +63,11 @@ def count(tree):
 @pytest.mark.parametrize(
     ("config", "part", "expected"),
     [
-        (npbg.published(128), "network", 465_769),
-        (npbg.published(128), "background", 5),
-        (point_nerf.published(128), None, 292_356),
-        (points2nerf.published(128), "encoder", 4_901_184),
-        (points2nerf.published(128), "hypernetwork", 184_611_128),
+        (npbg.published_config(128), "network", 465_769),
+        (npbg.published_config(128), "background", 5),
+        (point_nerf.published_config(128), None, 292_356),
+        (points2nerf.published_config(128), "encoder", 4_901_184),
+        (points2nerf.published_config(128), "hypernetwork", 184_611_128),
     ],
 )
 def test_the_published_sizes_have_the_published_number_of_weights(config, part, expected):
@@ -120,7 +120,7 @@ def test_a_training_that_the_network_cannot_have_is_refused():
     with pytest.raises(ValueError, match="pixel_stride 4 needs"):
         dataclasses.replace(npbg.npbg_tiny(), pixel_stride=4)
     with pytest.raises(ValueError, match="pixel_stride 4 needs"):
-        dataclasses.replace(point_nerf.published(128), model=PointNeRFConfig(image_resolution=126))
+        dataclasses.replace(point_nerf.published_config(128), model=PointNeRFConfig(image_resolution=126))
 
 
 # --- NPBG -------------------------------------------------------------------------------------------------------------

@@ -55,7 +55,7 @@ def _tiny(monkeypatch):
     monkeypatch.setattr(cli, "set_up_jax", lambda **_: None)
     monkeypatch.setattr(sharpness, "KNOWN_SIZE", 48)
     monkeypatch.setattr(contenders, "networks", lambda *_: stand_ins.stand_ins("Ours", "NPBG"))
-    monkeypatch.setattr(weights, "shipped", tiny_surfels.shipped)
+    monkeypatch.setattr(weights, "packaged_file", tiny_surfels.shipped)
     monkeypatch.setattr(evaluation, "choose_radius", lambda *_: 1.5)
     monkeypatch.setattr(point_count, "details", lambda *_: {"seeds": {"points": 5}})
     for module in (fig3, point_count):

@@ -13,7 +13,7 @@ from experiments.paper import fig3
 from experiments.paper.fig1 import Fig1, variant
 from experiments.paper.fig2 import nearest_views
 from experiments.studies import inverse, point_count, relighting
-from experiments.studies.ablations import LABELS, ROWS, changed, folds, rows
+from experiments.studies.ablations import LABELS, ROWS, change, folds, rows
 from experiments.studies.speed_accuracy import front, knee
 from spnr_jax import config, presets
 from spnr_jax.formats import data_sets
@@ -48,7 +48,7 @@ def test_each_ablation_changes_what_it_says_and_nothing_else():
         "twice_samples": {"model.sampling.num_coarse": 32, "model.sampling.num_fine": 32},
     }
     before = dict(leaves(to_dict(TINY)))
-    after = {row: dict(leaves(to_dict(changed(row, TINY)))) for row in ROWS}
+    after = {row: dict(leaves(to_dict(change(row, TINY)))) for row in ROWS}
     found = {row: {name: x for name, x in of.items() if before[name] != x} for row, of in after.items()}
     assert found == expected
     assert set(LABELS) == set(ROWS)

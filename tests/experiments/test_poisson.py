@@ -17,7 +17,7 @@ from experiments.comparison.study_objects import cut
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.mesh import surface_points
 from spnr_jax.formats.mesh.assets import Asset
-from spnr_jax.surfels.room import indoor_envmap
+from spnr_jax.surfels.skies import indoor_envmap
 
 needs_solver = pytest.mark.skipif(importlib.util.find_spec("pymeshlab") is None, reason="pymeshlab is not installed")
 RADIUS, COUNT = 0.7, 600
@@ -33,7 +33,7 @@ def dataset(tmp_path_factory):
     asset = Asset(parts=(ball(radius=RADIUS, material=plain(RED)),))
     surface = surface_points.sample_surface(asset, COUNT, 0)
     poses = views.random_viewpoints(VIEW.views, VIEW.distance, np.random.default_rng(5))
-    lamp = light.scaled_to_white(indoor_envmap())
+    lamp = light.scale_to_white(indoor_envmap())
     images, conditions = views.render_views(asset, surface, poses, [lamp], VIEW, 6)
     packed = layout.pack_points(surface)
     line = packed.copy()

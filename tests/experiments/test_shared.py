@@ -48,7 +48,7 @@ def test_markdown_has_a_row_for_each_row_all_as_wide_as_the_head():
 def test_what_was_made_is_read_and_not_made_again(name, content, tmp_path):
     calls = []
     for _ in range(2):
-        found = results_folder.kept(tmp_path / "in" / name, lambda: calls.append(1) or content)
+        found = results_folder.load_or_make(tmp_path / "in" / name, lambda: calls.append(1) or content)
         for a, b in zip(found, content, strict=True):
             np.testing.assert_array_equal(a, b)
     assert calls == [1]
@@ -221,7 +221,7 @@ def test_networks_of_tables_runs_and_the_package_are_named_after_their_methods_i
     assert set(found) == {f"{PAPER} (fresh, tiny)", f"{PAPER} (runs, paper)", "NPBG", surfels}
     assert [name for name, network in found.items() if not network.has_depth] == ["NPBG"]
     assert found[f"{PAPER} (runs, paper)"].as_method().identity == found[f"{PAPER} (fresh, tiny)"].as_method().identity
-    assert found[surfels].checksum == hashlib.sha256(weights.shipped().read_bytes()).hexdigest()
+    assert found[surfels].checksum == hashlib.sha256(weights.packaged_file().read_bytes()).hexdigest()
 
 
 def test_what_cannot_be_compared_is_refused_by_name(table, tmp_path):

@@ -30,7 +30,7 @@ LITTLE_MEMORY = """
 import resource, sys
 import numpy as np
 from spnr_jax.formats.clouds import read_cloud
-from spnr_jax.surfels.outward import VOTERS, outward_normals
+from spnr_jax.surfels.normals import VOTERS, outward_normals
 outward_normals(*np.random.default_rng(0).random((2, 2 * VOTERS, 3)), np.arange(256))  # threads and programs of XLA
 before = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
 resource.setrlimit(resource.RLIMIT_AS, (before + int(sys.argv[2]),) * 2)

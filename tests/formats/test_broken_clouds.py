@@ -12,7 +12,7 @@ from support.point_clouds import XYZRGB, ply_bytes, read, sphere_points, write
 
 from spnr_jax.formats import clouds
 from spnr_jax.formats.clouds import read_cloud
-from spnr_jax.formats.npz import packed
+from spnr_jax.formats.npz import pack_arrays
 
 PLY = b"ply\nformat ascii 1.0\n"
 PCD = pcd_files.content("binary", pcd_files.points())
@@ -89,12 +89,20 @@ def archive(content: bytes) -> bytes:
         ("a.npy", pickle.dumps([1, 2]), "not a NumPy file"),
         ("a.npy", as_npy(np.zeros((50, 3)))[:400], "truncated"),
         ("a.npy", as_npy(np.zeros((5, 3))).replace(b"'shape'", b"'shape("), "broken"),
-        ("a.npz", packed({"points": np.zeros((50, 3))})[:400], "truncated"),
-        ("a.npz", packed({"points": np.zeros((50, 3))}).replace(bytes(80), bytes(79) + b"1", 1), "truncated .*CRC"),
-        ("a.npz", packed({"points": np.zeros((5, 4))}), r"'points' of shape \(5, 4\)"),
-        ("a.npz", packed({"points": np.array([["1", "2", "3"]])}), "type <U1"),
-        ("a.npz", packed({"points": np.zeros((5, 3)), "rgb": np.zeros((4, 3))}), "different lengths.*'x': 5.*'r': 4"),
-        ("a.npz", packed({"corners": np.zeros((5, 3))}), "none of the arrays positions, .*; found corners"),
+        ("a.npz", pack_arrays({"points": np.zeros((50, 3))})[:400], "truncated"),
+        (
+            "a.npz",
+            pack_arrays({"points": np.zeros((50, 3))}).replace(bytes(80), bytes(79) + b"1", 1),
+            "truncated .*CRC",
+        ),
+        ("a.npz", pack_arrays({"points": np.zeros((5, 4))}), r"'points' of shape \(5, 4\)"),
+        ("a.npz", pack_arrays({"points": np.array([["1", "2", "3"]])}), "type <U1"),
+        (
+            "a.npz",
+            pack_arrays({"points": np.zeros((5, 3)), "rgb": np.zeros((4, 3))}),
+            "different lengths.*'x': 5.*'r': 4",
+        ),
+        ("a.npz", pack_arrays({"corners": np.zeros((5, 3))}), "none of the arrays positions, .*; found corners"),
         ("a.npz", archive(as_npy(np.zeros((5, 3))).replace(b"(5, 3), }" + b" " * 6, b"(5000000, 3), }")), "cut off"),
         ("a.npz", archive(as_npy(np.array([{}, None], object), pickled=True)), "holds objects"),
         ("a.npz", archive(b"no array at all"), "broken"),

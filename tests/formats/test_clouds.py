@@ -9,7 +9,7 @@ from spnr_jax.formats import clouds
 from spnr_jax.formats.clouds import place_cloud, read_cloud
 from spnr_jax.formats.orientation import ROTATIONS
 from spnr_jax.kernels.cloud_arrays import pad
-from spnr_jax.surfels.visibility import spiral
+from spnr_jax.surfels.sides import spiral
 
 SQUARE_OBJ = "v 0 0 2\nv 1 0 2\nv 1 1 2\nv 0 1 2\nf 1 2 3 4\n"
 SQUARE_OFF = "OFF\n4 1 0\n0 0 2\n1 0 2\n1 1 2\n0 1 2\n4 0 1 2 3\n"

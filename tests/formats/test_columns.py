@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from spnr_jax.formats.columns import believed, materials, useful
+from spnr_jax.formats.columns import keep_visible, materials, useful
 
 POSITION = {axis: np.zeros(2) for axis in "xyz"}
 LEVEL = 0.2140411  # linear value of sRGB 0.5
@@ -64,7 +64,7 @@ def test_splats_become_points_of_their_constant_colour_and_fog_is_dropped():
     extra = {f"f_rest_{i}": np.ones(2) for i in range(45)} | {f"rot_{i}": np.ones(2) for i in range(4)}
     columns = useful(POSITION | {"x": np.array([5.0, 6.0])} | splats | extra)
     lines: list[str] = []
-    columns = believed(columns, keep_noise=False, report=lines.append)
+    columns = keep_visible(columns, keep_noise=False, report=lines.append)
     np.testing.assert_array_equal(columns["x"], [5.0])
     assert lines == ["1 of 2 points left out: opacity near 0 (--keep-noise keeps them)"]
     np.testing.assert_allclose(materials(columns, lambda line: None)["base_color"], [[LEVEL] * 3], rtol=1e-5)

@@ -6,7 +6,7 @@ import pytest
 from spnr_jax.formats import clouds
 from spnr_jax.formats.clouds import place_cloud, read_cloud
 from spnr_jax.formats.cut import Cut
-from spnr_jax.surfels.visibility import spiral
+from spnr_jax.surfels.sides import spiral
 
 FAR = np.array([5e6, 2e6, 0.0])  # where float32 knows half metres at best
 

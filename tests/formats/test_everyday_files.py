@@ -20,7 +20,7 @@ from spnr_jax.formats import gaussian_files
 from spnr_jax.formats.clouds import place_cloud, read_cloud
 from spnr_jax.formats.cut import Cut
 from spnr_jax.formats.mesh.polygons import ears
-from spnr_jax.surfels.visibility import spiral
+from spnr_jax.surfels.sides import spiral
 
 ROOT = Path(__file__).parents[2]
 REPORTS = ROOT.parent / "shared" / "data" / "reports"

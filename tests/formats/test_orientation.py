@@ -8,7 +8,7 @@ from support.point_clouds import ply_bytes
 
 from spnr_jax.formats.clouds import place_cloud, read_cloud
 from spnr_jax.formats.orientation import ROTATIONS, find_up, sensor_of, standing
-from spnr_jax.surfels.visibility import spiral
+from spnr_jax.surfels.sides import spiral
 
 AXES = ["view_px", "view_py", "view_pz", "y_axisx", "y_axisy", "y_axisz"]
 

@@ -49,7 +49,7 @@ def surfels():
 
 @functools.cache
 def placed():
-    return gaussians.place(gaussians.seen_surface(views(), surfels()), most=MOST, pixel=PIXEL)
+    return gaussians.place(gaussians.collect_surface(views(), surfels()), most=MOST, pixel=PIXEL)
 
 
 @functools.cache
@@ -70,7 +70,7 @@ def test_splats_lie_on_the_surface_and_along_it():
 def test_pixels_far_from_every_surfel_are_no_surface():
     outside = [seen._replace(depth=seen.depth - np.float32(0.5)) for seen in views()]
     with pytest.raises(ValueError, match="no surface"):
-        gaussians.seen_surface(outside, surfels())
+        gaussians.collect_surface(outside, surfels())
 
 
 def test_the_quaternions_turn_the_third_axis_to_the_normal():

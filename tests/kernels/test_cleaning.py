@@ -3,8 +3,8 @@ import pytest
 from support.surfel_clouds import cloud, even_square
 
 import spnr_jax
-from spnr_jax.kernels.cleaning import averaged, noise, outliers
-from spnr_jax.surfels.visibility import spiral
+from spnr_jax.kernels.cleaning import denoise, noise, outliers
+from spnr_jax.surfels.sides import spiral
 
 SIZE = np.array([1.0, 0.7, 0.5])
 SEAT, BACK, LEG = (1, 0.08, 1), (1, 1, 0.08), (0.06, 1, 0.06)
@@ -99,13 +99,13 @@ def test_materials_are_averaged_with_the_points_and_normals_stay_of_unit_length(
     points = sphere(4000, "even")
     rng = np.random.default_rng(0)
     values = {"normals": points, "base_color": np.repeat(points[:, :1], 3, axis=1) + rng.normal(size=(4000, 3)) * 0.1}
-    means, values = averaged(points, values, 0.1, 0.056)
+    means, values = denoise(points, values, 0.1, 0.056)
     assert len(means) == len(points)
     np.testing.assert_allclose(np.linalg.norm(values["normals"], axis=1), 1, atol=1e-6)
     np.testing.assert_allclose(values["normals"], means, atol=0.1)
     assert np.abs(values["base_color"] - means[:, :1]).mean() < 0.06
     against = np.where(rng.uniform(size=(4000, 1)) < 0.5, points, -points)
-    lengths = np.linalg.norm(averaged(points, {"normals": against}, 0.25, 0.056)[1]["normals"], axis=1)
+    lengths = np.linalg.norm(denoise(points, {"normals": against}, 0.25, 0.056)[1]["normals"], axis=1)
     assert np.all((np.abs(lengths - 1) < 1e-6) | (lengths == 0))
     assert (lengths == 0).any()
 
@@ -122,11 +122,11 @@ def layers(sigma, apart):
 def test_two_layers_of_different_colours_nearer_than_the_noise_are_told_apart():
     points, height, color = layers(sigma=0.02, apart=0.02)
     order = np.lexsort(points.T)
-    moved, values = averaged(points, {"base_color": color}, 0.02, 0.01)
+    moved, values = denoise(points, {"base_color": color}, 0.02, 0.01)
     for layer in (height[order] > 0, height[order] == 0):
         inner = layer & (np.abs(moved[:, :2]).max(axis=1) < 0.4)
         assert np.abs(moved[inner, 2] - height[order][inner]).mean() < 0.4 * 0.016
-    plain, mixed = averaged(points, {"roughness": color[:, 0]}, 0.02, 0.01)
+    plain, mixed = denoise(points, {"roughness": color[:, 0]}, 0.02, 0.01)
     assert np.abs(plain[:, 2] - height[order]).mean() > 0.5 * 0.016
     upper = np.argsort(moved[:, 2])[-1000:]
     assert values["base_color"][upper, 2].mean() > 0.6 > 0.5 > mixed["roughness"].mean()
@@ -138,7 +138,7 @@ def test_a_pattern_stays_where_it_is_and_keeps_its_colours():
     white = (np.floor(flat[:, 0] / 0.05) % 2)[:, None] * np.ones(3)
     noisy = flat + rng.normal(size=flat.shape) * 0.01
     order = np.lexsort(noisy.T)
-    moved, values = averaged(noisy, {"base_color": white}, 0.01, 0.008)
+    moved, values = denoise(noisy, {"base_color": white}, 0.01, 0.008)
     along = np.abs(moved[:, 0] - flat[order, 0]).mean()
     assert along < np.abs(noisy[order, 0] - flat[order, 0]).mean()
     assert np.abs(values["base_color"] - white[order]).mean() < 0.1
@@ -149,7 +149,7 @@ def test_noise_of_colours_hardly_keeps_points_from_being_averaged():
     flat = np.concatenate([rng.uniform(-0.5, 0.5, (2, 10_000)), np.zeros((1, 10_000))]).T
     noisy = flat + rng.normal(size=flat.shape) * 0.02
     left = [
-        averaged(noisy, {"base_color": 0.5 + rng.normal(size=(10_000, 3)) * spread}, 0.02, 0.01)[0][:, 2].std()
+        denoise(noisy, {"base_color": 0.5 + rng.normal(size=(10_000, 3)) * spread}, 0.02, 0.01)[0][:, 2].std()
         for spread in (0, 0.05, 0.15)
     ]
     assert max(left) < 1.35 * left[0] < 0.5 * 0.02
@@ -185,7 +185,7 @@ def test_a_point_far_away_is_removed_and_the_rest_averaged():
     cleaned, lines = spnr_jax.clean(cloud(np.concatenate([noisy, [[1e30, 0, 0]]])))
     assert np.abs(cleaned.positions).max() < 2
     assert len(lines) == 2
-    assert np.isfinite(averaged(np.concatenate([noisy, [[1e30, 0, 0]]]), {}, 0.05, 0.025)[0]).all()
+    assert np.isfinite(denoise(np.concatenate([noisy, [[1e30, 0, 0]]]), {}, 0.05, 0.025)[0]).all()
 
 
 def test_masked_points_neither_count_nor_stay_where_something_is_done():

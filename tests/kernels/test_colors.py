@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from spnr_jax.kernels.colors import linear_to_srgb, over, srgb_to_linear, unweighted
+from spnr_jax.kernels.imaging import linear_to_srgb, over, srgb_to_linear, unpremultiply
 
 LEVELS = np.arange(256) / 255
 
@@ -36,7 +36,7 @@ def test_an_object_is_encoded_and_then_laid_over_the_background_by_its_opacity()
     np.testing.assert_allclose(
         over(jnp.asarray(opacity * light), jnp.asarray(opacity), BACKGROUND), expected, atol=1e-6
     )
-    np.testing.assert_allclose(unweighted(jnp.asarray(opacity * light), jnp.asarray(opacity)), light, atol=1e-6)
+    np.testing.assert_allclose(unpremultiply(jnp.asarray(opacity * light), jnp.asarray(opacity)), light, atol=1e-6)
 
 
 @pytest.mark.parametrize("light", [0.0, 1e-30, 1e-7, 1e10])

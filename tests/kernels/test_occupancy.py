@@ -12,9 +12,9 @@ from support.laws import close, same_bits
 from support.tiny_model import camera, cloud, wobbled
 
 from spnr_jax.config import RenderOptions
-from spnr_jax.kernels import cameras, occupancy, voxels
-from spnr_jax.kernels.occupancy import distance_at, map_existing, open_path
+from spnr_jax.kernels import cameras, voxels
 from spnr_jax.kernels.records import Rays, Scene
+from spnr_jax.kernels.voxels import distance_at, map_existing, open_path
 from spnr_jax.method import inference
 
 CONFIG = tiny_model.WITHOUT_UPSAMPLER
@@ -43,7 +43,7 @@ class TestDilate:
         for where, z, y, x in np.argwhere(occupied):
             lowest = np.maximum([z - reach, y - reach, x - reach], 0)
             expected[where, *(slice(lo, at + reach + 1) for lo, at in zip(lowest, (z, y, x), strict=True))] = True
-        same_bits(occupancy.dilate(jnp.array(occupied), reach), jnp.array(expected))
+        same_bits(voxels.dilate(jnp.array(occupied), reach), jnp.array(expected))
 
 
 class TestPath:
@@ -170,7 +170,7 @@ class TestRendering:
         rays = inference.network(CONFIG).bind(variables).rays(camera())
         near, far, _ = cameras.intersect_box(rays.origins, rays.directions)
         cells = 2 * CONFIG.encoder.volume_resolution
-        path = open_path(occupancy.dilate(scene.occupied, 1), rays, near, far, cells)
+        path = open_path(voxels.dilate(scene.occupied, 1), rays, near, far, cells)
         missed = np.asarray(path.travelled[..., -1] == 0).reshape(rendering.acc.shape)
         assert missed.any()
         assert not missed.all()

@@ -3,7 +3,7 @@ import pytest
 from support.surfel_clouds import cloud, even_square
 
 from spnr_jax.kernels import scenes
-from spnr_jax.surfels.visibility import spiral
+from spnr_jax.surfels.sides import spiral
 
 BALLS = {0: ((-1.0, 0.5, 0.0), 4000), 1: ((0.6, 0.5, 0.9), 3000), 2: ((0.9, 0.5, -1.0), 2000)}  # on a table
 TABLE = 20000

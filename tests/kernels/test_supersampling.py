@@ -12,8 +12,8 @@ from support.tiny_model import MODEL, camera, cloud, wobbled
 from experiments.baselines.npbg import NPBGConfig
 from spnr_jax.config import RenderOptions
 from spnr_jax.kernels import cameras
+from spnr_jax.kernels.imaging import average
 from spnr_jax.kernels.records import Rendering
-from spnr_jax.kernels.resizing import averaged
 from spnr_jax.method import inference
 from spnr_jax.method.inference import rays_per_side
 from spnr_jax.method.model import Model
@@ -42,7 +42,7 @@ def rendering(seed=0, size=6):
 
 def test_light_opacity_and_depth_are_those_of_a_loop_over_pixels():
     wide, straight = rendering()
-    narrow = averaged(wide, SIDE)
+    narrow = average(wide, SIDE)
     for v, y, x in np.ndindex(2, 3, 3):
         square = v, slice(2 * y, 2 * y + 2), slice(2 * x, 2 * x + 2)
         acc = np.float64(wide.acc[square])
@@ -57,7 +57,7 @@ def test_nothing_is_white_and_its_gradient_finite():
     image = jnp.ones((1, 4, 4, 3))
 
     def mean(image, acc):
-        return jnp.mean(averaged(Rendering(image=image, image_lr=image, depth=acc, acc=acc), SIDE).image)
+        return jnp.mean(average(Rendering(image=image, image_lr=image, depth=acc, acc=acc), SIDE).image)
 
     value, gradient = jax.value_and_grad(mean, argnums=(0, 1))(image, acc)
     assert value == 1
@@ -80,7 +80,7 @@ def test_a_small_picture_is_the_large_one_averaged():
     several = inference.jitted_render(
         variables, scene, small, config=WITHOUT_UPSAMPLER, options=RenderOptions(rays_per_side=2)
     )
-    apart = np.abs(np.asarray(several.image - averaged(whole, 2).image))
+    apart = np.abs(np.asarray(several.image - average(whole, 2).image))
     assert np.mean(apart > 1e-4) < 0.01  # but for a ray that rounding moves over a face of a cell
 
 
@@ -94,7 +94,7 @@ def test_the_handle_takes_several_rays_for_the_best_picture_alone():
     volume = handle.encode(single)
     view, wide = (handle.camera(volume, azimuth=17.3, elevation=36.1, resolution=n) for n in (8, 16))
     large = handle.render(volume, wide, "best")
-    expected = averaged(jax.tree.map(lambda x: x[None], large), 2)
+    expected = average(jax.tree.map(lambda x: x[None], large), 2)
     apart = np.abs(np.asarray(handle.render(volume, view, "best").image - expected.image[0]))
     assert np.mean(apart > 1e-4) < 0.02  # one pixel: a ray that rounding moves over a face of a cell
     assert np.abs(np.asarray(handle.render(volume, view, "trained").image - expected.image[0])).max() > 0.01

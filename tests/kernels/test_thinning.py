@@ -4,7 +4,14 @@ import numpy as np
 import pytest
 from support.point_clouds import sphere_points
 
-from spnr_jax.kernels.thinning import THINNING, candidates, farthest_points, first_in_voxels, sample_stream, stacked
+from spnr_jax.kernels.cloud_arrays import (
+    THINNING,
+    candidates,
+    farthest_points,
+    first_in_voxels,
+    sample_stream,
+    stack_columns,
+)
 
 
 @pytest.mark.parametrize("num_points", [500, 6000])  # 6000 is thinned at random before
@@ -80,7 +87,7 @@ def test_the_sample_of_a_longer_stream_is_as_dense_as_the_stream_whatever_its_pi
     rows = sample["tag"].astype(int)
     assert seen == 20_000
     np.testing.assert_array_equal(rows, whole["tag"])
-    np.testing.assert_array_equal(stacked(sample), positions[rows])
+    np.testing.assert_array_equal(stack_columns(sample), positions[rows])
     assert 500 <= len(rows) <= 1000
     np.testing.assert_allclose(np.mean(rows < 15_000), 0.75, atol=0.02)
 

@@ -8,15 +8,7 @@ from jax import lax
 from support import reference
 from support.laws import adjoint_law, close, numbers, same_bits
 
-from spnr_jax.kernels.voxels import (
-    locate,
-    row_of,
-    scatter_conv,
-    scatter_mean,
-    share_voxels,
-    spread,
-    trilinear,
-)
+from spnr_jax.kernels.voxels import locate, row_of, scatter_conv, scatter_mean, share_voxels, spread, trilinear
 
 D = 4
 POSITIONS = 1.2 * numbers(0, 2, 3, 12, 3)  # some lie outside the box, and several share a voxel

@@ -16,11 +16,11 @@ from support import reference
 from support.laws import TINY, Axis, Extremes, Law, close, extremes, sorted_distances
 
 from spnr_jax.config import AS_TRAINED, PaperConfig, SamplingConfig
-from spnr_jax.kernels import cameras, colors, compositing, losses, metrics, numerics, resizing, sampling, voxels
+from spnr_jax.kernels import cameras, compositing, imaging, losses, metrics, numerics, sampling, voxels
 from spnr_jax.kernels.records import Camera, Rays, Scene
 from spnr_jax.method import inference, paper_method
-from spnr_jax.nn.encoding import encode_direction
-from spnr_jax.nn.normalization import BatchNorm, GroupNorm
+from spnr_jax.nn.convolution import BatchNorm, GroupNorm
+from spnr_jax.nn.paper import encode_direction
 
 FINITE = 1e30  # a floor under which gradients only have to be finite
 BINS, POINTS = 8, 12
@@ -98,9 +98,9 @@ NUMBERS = (
     Law("length", numerics.length, partial(np.linalg.norm, axis=-1), usual(around_zero(6, 3)), (1,),
         Extremes((vectors,))),
     Law("normalize", numerics.normalize, direction, usual(around_zero(6, 3)), (1,), Extremes((vectors,))),
-    Law("linear_to_srgb", colors.linear_to_srgb, encode_srgb, usual(lambda rng: (rng.uniform(-0.1, 1, (6, 4)),)), (1,),
+    Law("linear_to_srgb", imaging.linear_to_srgb, encode_srgb, usual(lambda rng: (rng.uniform(-0.1, 1, (6, 4)),)), (1,),
         Extremes((extremes(6, high=15),), rtol=2e-6)),
-    Law("srgb_to_linear", colors.srgb_to_linear, decode_srgb, usual(lambda rng: (rng.uniform(-0.1, 1, (6, 4)),)), (1,),
+    Law("srgb_to_linear", imaging.srgb_to_linear, decode_srgb, usual(lambda rng: (rng.uniform(-0.1, 1, (6, 4)),)), (1,),
         Extremes((extremes(6, high=15),), rtol=1e-5)),
     Law("encode_direction", lambda d: encode_direction(d, 4), encoding(4), usual(around_zero(6, 3)), (1,)),
     # ten frequencies of coordinates up to a thousand are off by less than a thousandth
@@ -485,9 +485,9 @@ LOSSES = (
     Law("metrics of pictures", quality, quality_twin,
         usual(lambda rng: (*(0.5 + 0.4 * rng.uniform(-1, 1, (2, 12, 12, 3))), np.eye(12))),
         extremes=Extremes((pictures(),), floors=(FINITE,) * 3, atol=lambda *x: 2e-3)),
-    Law("bilinear", lambda x: resizing.bilinear(x, 6, 9),
+    Law("bilinear", lambda x: imaging.bilinear(x, 6, 9),
         each(partial(reference.bilinear, height=6, width=9), "(h,w,c)->(a,b,c)"), usual(around_zero(2, 4, 6, 2))),
-    Law("doubled", resizing.doubled, lambda x: np.stack([reference.bilinear(one, 2 * x.shape[1],
+    Law("double_size", imaging.double_size, lambda x: np.stack([reference.bilinear(one, 2 * x.shape[1],
             2 * x.shape[2]) for one in x]), usual(around_zero(2, 3, 4, 2))),
 )
 # fmt: on

@@ -17,8 +17,8 @@ from support.surfel_clouds import surfels
 
 from spnr_jax.kernels.records import Light
 from spnr_jax.nn import shader
+from spnr_jax.nn.shader import NUM_MAPS
 from spnr_jax.surfels import discs, layers, lighting, small_systems, splatting
-from spnr_jax.surfels.features import NUM_MAPS
 from spnr_jax.surfels.rules import NEIGHBORS, RULES
 
 POINTS = 16
@@ -262,7 +262,7 @@ def tables(rng, size):
 
 
 def mirrors(light, directions, roughness):
-    return jnp.stack(lighting.mirrored(Light(tables=light), list(directions), roughness))
+    return jnp.stack(lighting.reflect(Light(tables=light), list(directions), roughness))
 
 
 def arrives(light, visible, normal):
@@ -305,7 +305,7 @@ def is_a_picture(arguments, outputs):
 
 # fmt: off
 LIGHT = (
-    Law("mirrored", mirrors, None, sizes("size of the light", 1e-30, 1e30,
+    Law("reflect", mirrors, None, sizes("size of the light", 1e-30, 1e30,
             lambda rng, v: (tables(rng, v), towards(rng), rng.choice(lighting.LEVELS[:-1], POINTS) + 0.1)), shared=1),
     Law("arriving", arrives, None, sizes("size of the light", 1e-30, 1e30,
             lambda rng, v: (tables(rng, v), rng.uniform(size=(64, POINTS)), unit(rng.normal(size=(POINTS, 3))).T)),

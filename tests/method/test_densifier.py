@@ -25,7 +25,7 @@ estimate = jax.jit(estimate_surfels)
 
 @pytest.fixture(scope="module")
 def params():
-    return {"densifier": weights.read_variables(weights.shipped("densifier"))}
+    return {"densifier": weights.read_variables(weights.packaged_file("densifier"))}
 
 
 @functools.cache

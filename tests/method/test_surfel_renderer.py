@@ -14,10 +14,9 @@ from spnr_jax.kernels import cameras
 from spnr_jax.kernels.records import Volume
 from spnr_jax.method import surfel_method, surfel_renderer
 from spnr_jax.method.surfel_renderer import GRID, resolution
-from spnr_jax.nn.shader import Shader
-from spnr_jax.surfels.features import NUM_FEATURES
+from spnr_jax.nn.shader import NUM_FEATURES, Shader
+from spnr_jax.surfels.geometry import encode_in_box
 from spnr_jax.surfels.lighting import light_of
-from spnr_jax.surfels.surfel_scenes import encode_in_box
 
 CONFIG = SurfelConfig(widths=(8, 8), top=8)
 LIGHT = jax.tree.map(jnp.asarray, light_of(np.full((32, 64, 3), 0.8, np.float32)))

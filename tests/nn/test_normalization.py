@@ -8,7 +8,7 @@ from support import reference
 from support.laws import close, gradient_law, numbers
 
 from spnr_jax.kernels.numerics import per_feature
-from spnr_jax.nn.normalization import BatchNorm, GroupNorm, group_norm
+from spnr_jax.nn.convolution import BatchNorm, GroupNorm, group_norm
 
 X = 3 * numbers(0, 2, 6, 4) + 1
 ALL = jnp.ones((2, 6), bool)

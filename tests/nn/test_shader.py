@@ -4,9 +4,8 @@ import jax.numpy as jnp
 import numpy as np
 from support.laws import close, numbers
 
-from spnr_jax.kernels.colors import srgb_to_linear
-from spnr_jax.nn.shader import COLOR_STEP, LEAST_ODDS, NOTHING, NUM_OUTPUTS, ODDS_STEP, Shader, picture
-from spnr_jax.surfels.features import NUM_MAPS
+from spnr_jax.kernels.imaging import srgb_to_linear
+from spnr_jax.nn.shader import COLOR_STEP, LEAST_ODDS, NOTHING, NUM_MAPS, NUM_OUTPUTS, ODDS_STEP, Shader, picture
 from spnr_jax.surfels.lighting import SPECULAR
 
 SMALL = Shader(widths=(8, 8), top=8)

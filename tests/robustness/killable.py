@@ -127,7 +127,7 @@ def _child(arguments: list[str], cache: Path, output: Path, events: Connection) 
         print("trained")
 
     tell("start", 0, None)
-    sys.exit(cli.guarded(train, "spnr"))
+    sys.exit(cli.guard(train, "spnr"))
 
 
 def checksum(tree: object) -> str:

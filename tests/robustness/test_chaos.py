@@ -111,9 +111,7 @@ def test_another_batch_another_row_and_another_state_are_seen(alone, tmp_path):
 
 def test_a_second_training_in_one_folder_is_refused_until_the_first_is_over(tmp_path, capsys):
     with checkpoint.alone(tmp_path):
-        code = cli.guarded(
-            lambda: trainer.train(CONFIG, tiny_dataset.dataset(), tmp_path, tiny_dataset.SCHEDULE), "spnr"
-        )
+        code = cli.guard(lambda: trainer.train(CONFIG, tiny_dataset.dataset(), tmp_path, tiny_dataset.SCHEDULE), "spnr")
     assert code == 2
     assert capsys.readouterr().err.startswith(f"spnr: {tmp_path}: another process trains in this folder")
     assert not (tmp_path / "config.json").exists()
@@ -134,7 +132,7 @@ def test_a_write_that_does_not_say_where_is_given_the_run_folder(tmp_path, monke
     def full(*arguments):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(trainer, "begun", full)
+    monkeypatch.setattr(trainer, "restore_or_init", full)
     work = lambda: trainer.train(CONFIG, tiny_dataset.dataset(), tmp_path, tiny_dataset.SCHEDULE)  # noqa: E731
-    assert cli.guarded(work, "spnr") == 2
+    assert cli.guard(work, "spnr") == 2
     assert capsys.readouterr().err == f"spnr: {tmp_path}: No space left on device\n"

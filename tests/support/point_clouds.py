@@ -3,7 +3,7 @@
 import numpy as np
 
 from spnr_jax.formats.clouds import read_cloud
-from spnr_jax.formats.point_files import column_pieces, joined
+from spnr_jax.formats.point_files import column_pieces, join_pieces
 
 SRGB = np.where(np.arange(256) <= 10, np.arange(256) / 255 / 12.92, ((np.arange(256) / 255 + 0.055) / 1.055) ** 2.4)
 VERTEX = [("y", "double"), ("red", "uchar"), ("x", "float"), ("label", "short"), ("z", "float")]
@@ -64,4 +64,4 @@ def read(path, **options):
 
 def read_columns(path) -> dict[str, np.ndarray]:
     """The columns of a whole file of points."""
-    return joined(column_pieces(path))
+    return join_pieces(column_pieces(path))

@@ -26,7 +26,7 @@ CONFIG = TrainConfig(
     crop=12,
     even_share=0.5,
 )
-PACKAGED = weights.shipped
+PACKAGED = weights.packaged_file
 SCHEDULE = trainer.Schedule(log_every=1, preview_every=100, checkpoint_every=2)
 NAME = "ball_000000"
 LIGHT = lighting.light_of(np.random.default_rng(0).random((4, 8, 3), np.float32))

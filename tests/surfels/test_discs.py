@@ -8,7 +8,7 @@ from scipy.spatial import Delaunay
 from support.surfel_clouds import estimate, even_square, shape
 
 from spnr_jax.surfels import discs
-from spnr_jax.surfels.neighbors import nearest
+from spnr_jax.surfels.geometry import nearest
 from spnr_jax.surfels.rules import RULES
 
 ACROSS, AT = np.array([0.8, 0.6]), 0.1

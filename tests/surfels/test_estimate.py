@@ -10,10 +10,10 @@ from support.surfel_clouds import cloud, even_square, shape
 from support.surfel_clouds import estimate as surfels_of
 
 from spnr_jax.surfels import discs
-from spnr_jax.surfels.neighbors import neighbors
+from spnr_jax.surfels.geometry import neighbors
 from spnr_jax.surfels.projection import RADIUS
 from spnr_jax.surfels.rules import RULES
-from spnr_jax.surfels.visibility import tangents
+from spnr_jax.surfels.sides import tangents
 
 FIELDS = ("normal", "spacing", "gradient", "sided", "visible", "shape")
 

@@ -10,7 +10,8 @@ from support.laws import close
 from support.surfel_clouds import camera, estimate, even_square, shape, surfels
 
 from spnr_jax.kernels.records import Camera
-from spnr_jax.surfels import features, projection, splatting
+from spnr_jax.nn import shader
+from spnr_jax.surfels import projection, splatting
 from spnr_jax.surfels.lighting import WIDTH, light_of
 
 QUARTER = np.float32([[0, 0, -1], [0, 1, 0], [1, 0, 0]])  # x to z: from azimuth phi of a map to phi + a quarter turn
@@ -44,10 +45,10 @@ def told(turn, visible=None):
 
 @jax.jit
 def drawn(found, light, view):
-    found = features.turned(found, view)
+    found = shader.turn_to_camera(found, view)
     entries, _ = projection.entries(found, view, room=2**15)
-    buffer = splatting.blend(entries, found, features.attributes(found, light, view), view, slots=24**2)
-    return buffer, *features.features(buffer, light, view)
+    buffer = splatting.blend(entries, found, shader.attributes(found, light, view), view, slots=24**2)
+    return buffer, *shader.features(buffer, light, view)
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +72,7 @@ def test_what_passes_through_the_64_directions_is_the_same_within_their_number(t
 def test_normals_of_discs_seen_from_behind_are_turned_to_the_camera_and_others_kept():
     positions, normal, spacing = shape("sphere", 500)
     found, view = surfels(positions, normal, spacing), camera(24)
-    turned = features.turned(found, view).normal
+    turned = shader.turn_to_camera(found, view).normal
     towards = np.asarray(view.cam_to_world)[:, 3] - positions
     assert np.all(np.sum(towards * np.asarray(turned), axis=1) >= 0)
     close(turned, normal * np.where(np.sum(towards * normal, axis=1) < 0, -1, 1)[:, None])
@@ -81,7 +82,7 @@ def test_the_network_sees_no_light():
     positions, normal, spacing = shape("sphere", 500)
     found, view = surfels(positions, normal, spacing), camera(24)
     (_, one, _), (_, other, _) = (drawn(found, light_of(scale * sky()), view) for scale in (0.0, 3.0))
-    assert one.shape == (24, 24, features.NUM_FEATURES)
+    assert one.shape == (24, 24, shader.NUM_FEATURES)
     close(one, other)
 
 
@@ -97,7 +98,7 @@ def test_one_number_says_whether_materials_are_guessed_and_one_whether_points_ar
     one, other = np.array(one), np.array(other)
     assert np.all(one[..., column] == 0)
     inside = np.asarray(buffer.opacity) > 0.9
-    expected = share * (buffer.opacity / (buffer.opacity + features.FAINT))[inside]
+    expected = share * (buffer.opacity / (buffer.opacity + shader.FAINT))[inside]
     close(other[inside, column], expected, atol=1e-5)
     close(np.delete(one, column, axis=-1), np.delete(other, column, axis=-1))
 
@@ -120,7 +121,7 @@ def test_maps_are_linear_in_the_light():
     found, view = surfels(positions, normal, spacing), camera(24)
     lights = sky(), sky()[::-1].copy()
     one, other, both = (drawn(found, light_of(x), view)[2] for x in (*lights, 2 * lights[0] + 3 * lights[1]))
-    assert one.shape == (24, 24, features.NUM_MAPS)
+    assert one.shape == (24, 24, shader.NUM_MAPS)
     close(both[..., 7:16], 2 * one[..., 7:16] + 3 * other[..., 7:16], rtol=1e-3, atol=1e-4)
     close(both[..., :7], one[..., :7])
 
@@ -137,13 +138,13 @@ def test_a_pixel_in_a_dent_lies_behind_the_mean_around_it_and_one_on_a_bump_befo
     depth = jnp.full((32, 32), 2.0).at[8, 8].set(2.2).at[24, 24].set(1.8)
     zeros, ones = jnp.zeros((32, 32)), jnp.ones((32, 32))
     normal = jnp.broadcast_to(jnp.array([0.0, 0.0, 1.0]), (32, 32, 3))
-    buffer = features.GBuffer(
+    buffer = shader.GBuffer(
         opacity=ones, coverage=ones, depth=depth, spread=zeros, log_spacing=jnp.log(0.1 * ones),
         normal=normal, color=normal, attributes=jnp.full((32, 32, 19), 0.5),
         centres=ones, beside=jnp.zeros((32, 32, 2)),
     )  # fmt: skip
     view = Camera(cam_to_world=jnp.eye(3, 4), intrinsics=camera(32).intrinsics, height=32, width=32)
-    seen, _ = features.features(buffer, light_of(sky()), view)
+    seen, _ = shader.features(buffer, light_of(sky()), view)
     for column in (7, 8):
         assert seen[8, 8, column] > 0.3
         assert seen[24, 24, column] < -0.3

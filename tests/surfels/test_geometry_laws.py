@@ -12,7 +12,7 @@ from support.surfel_clouds import cloud, shape
 
 import spnr_jax
 from spnr_jax.kernels.cloud_arrays import normalization, pad
-from spnr_jax.surfels import surfel_scenes
+from spnr_jax.surfels import geometry
 from spnr_jax.surfels.rules import NEIGHBORS
 
 COUNT, SIZE = 150, 160  # real points, and with padding
@@ -38,7 +38,7 @@ def with_normals(points):
 
 def projection(columns, points, near):
     """A number that all of a scene's fields with a gradient take part in, and the scene."""
-    scene = surfel_scenes.encode(None, dataclasses.replace(points, **columns), near)
+    scene = geometry.encode(None, dataclasses.replace(points, **columns), near)
     fields = {name: values for name, values in vars(scene.surfels).items() if name not in CONSTANT}
     fields |= {name: getattr(scene, name) for name in ("spacing", "centre", "scale")}
     rng = np.random.default_rng(5)
@@ -98,7 +98,7 @@ def test_clouds_of_equal_padding_are_mapped_as_they_are_encoded_one_by_one_and_s
     near = [spnr_jax.neighbors(points) for points in clouds]
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *clouds)
     np.testing.assert_array_equal(spnr_jax.neighbors(stacked), np.stack(near))
-    mapped = jax.jit(jax.vmap(lambda points, near: surfel_scenes.encode(None, points, near)))(stacked, jnp.stack(near))
+    mapped = jax.jit(jax.vmap(lambda points, near: geometry.encode(None, points, near)))(stacked, jnp.stack(near))
     each = [run(points, of)[0] for points, of in zip(clouds, near, strict=True)]
     close(mapped, jax.tree.map(lambda *x: np.stack(x), *each), rtol=1e-3, atol=2e-3)
 
@@ -192,12 +192,12 @@ def test_the_box_is_that_of_the_handle_and_clouds_of_one_bucket_share_a_program(
     centre, scale = normalization(points.positions[points.mask])
     scene, _ = run(points, spnr_jax.neighbors(points))
     close((scene.centre, scale), (centre, scene.scale), rtol=1e-6)
-    before = len(surfel_scenes._encode.programs)
+    before = len(geometry._encode.programs)
     for count in (300, 400):
         positions = shape("sphere", count)[0]
-        found = surfel_scenes.encode_in_box(cloud(positions))
+        found = geometry.encode_in_box(cloud(positions))
         assert found.surfels.mask.shape == (512,)
         assert found.surfels.mask.sum() == count
         order = np.lexsort(np.asarray(found.surfels.position)[:count].T)
         close(np.asarray(found.surfels.position)[order], positions[np.lexsort(positions.T)])
-    assert len(surfel_scenes._encode.programs) == before + 1
+    assert len(geometry._encode.programs) == before + 1

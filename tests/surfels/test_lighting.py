@@ -9,9 +9,9 @@ from support.surfel_clouds import surfels
 
 from spnr_jax.kernels.records import Light
 from spnr_jax.surfels import lighting, skies
-from spnr_jax.surfels.envmaps import directions, resampled, solid_angles
 from spnr_jax.surfels.lighting import HEIGHT, LEVELS, WIDTH, light_of
-from spnr_jax.surfels.visibility import DIRECTIONS
+from spnr_jax.surfels.sides import DIRECTIONS
+from spnr_jax.surfels.skies import directions, resample, solid_angles
 
 COLOR = np.array([0.3, 1.0, 2.0])
 
@@ -31,14 +31,14 @@ def columns(towards):
 
 
 def test_the_room_of_the_package_is_what_its_map_gives():
-    close(lighting.room_light().tables, lighting.made_room_light().tables, rtol=1e-5, atol=1e-6)
+    close(lighting.room_light().tables, lighting.make_room_light().tables, rtol=1e-5, atol=1e-6)
 
 
 def test_all_tables_of_constant_light_are_that_light():
     light = light_of(np.broadcast_to(COLOR, (20, 40, 3)))
     close(light.tables, np.broadcast_to(COLOR, light.tables.shape), rtol=1e-4)
     towards = columns(numbers(0, 50, 3))
-    for found in (lighting.irradiance(light, towards), lighting.mirrored(light, towards, numbers(1, 50, low=0.0))):
+    for found in (lighting.irradiance(light, towards), lighting.reflect(light, towards, numbers(1, 50, low=0.0))):
         close(jnp.stack(found, axis=-1), np.broadcast_to(COLOR, (50, 3)), rtol=1e-4)
 
 
@@ -48,7 +48,7 @@ def test_roughness_passes_through_the_levels_without_jumps():
     for level, roughness in enumerate(LEVELS):
         expected = light.tables[1 + level, 5, 7]
         for off in (-1e-6, 0, 1e-6):
-            found = lighting.mirrored(light, columns(towards), jnp.full(1, roughness + off))
+            found = lighting.reflect(light, columns(towards), jnp.full(1, roughness + off))
             close(jnp.stack(found, axis=-1)[0], expected, rtol=1e-4)
 
 
@@ -60,8 +60,8 @@ def test_everything_is_linear_in_the_map():
 
     def told(radiance):
         light = light_of(radiance)
-        seen = lighting.irradiance(light, towards) + lighting.mirrored(light, towards, roughness)
-        return light.tables, seen, lighting.arriving(found, light), lighting.projected(light, turn)
+        seen = lighting.irradiance(light, towards) + lighting.reflect(light, towards, roughness)
+        return light.tables, seen, lighting.arriving(found, light), lighting.project_harmonics(light, turn)
 
     sums = jax.tree.map(lambda a, b: 2 * a + 3 * b, told(one), told(other))
     close(told(2 * one + 3 * other), sums, rtol=1e-4, atol=1e-4)
@@ -78,7 +78,7 @@ def test_another_size_keeps_the_energy_and_loses_no_lamp(size, height):
         edges = np.cos(np.pi * np.arange(len(values) + 1) / len(values))
         return np.einsum("hwc,h->c", np.float64(values), edges[:-1] - edges[1:]) * 2 * np.pi / values.shape[1]
 
-    small = resampled(radiance, height)
+    small = resample(radiance, height)
     assert small.shape == (height, 2 * height, 3)
     close(energy(small), energy(radiance), rtol=1e-4)
     assert small.min() >= 0
@@ -86,13 +86,13 @@ def test_another_size_keeps_the_energy_and_loses_no_lamp(size, height):
 
 def test_another_size_is_the_mean_over_whole_texels_and_the_same_size_the_map_itself():
     radiance = envmap(3, 8)
-    close(resampled(radiance, 8), radiance, rtol=1e-5)
+    close(resample(radiance, 8), radiance, rtol=1e-5)
     close(
-        resampled(np.repeat(np.repeat(radiance, 3, axis=0), 3, axis=1), 24), np.repeat(np.repeat(radiance, 3, 0), 3, 1)
+        resample(np.repeat(np.repeat(radiance, 3, axis=0), 3, axis=1), 24), np.repeat(np.repeat(radiance, 3, 0), 3, 1)
     )
     area = solid_angles(8)[..., None].reshape(4, 2, 8, 2, 1)
     means = (radiance.reshape(4, 2, 8, 2, 3) * area).sum(axis=(1, 3)) / area.sum(axis=(1, 3))
-    close(resampled(radiance, 4), means, rtol=1e-5)
+    close(resample(radiance, 4), means, rtol=1e-5)
 
 
 class TestLookUp:
@@ -145,10 +145,12 @@ def test_what_arrives_at_a_surfel_that_all_directions_see_is_nearly_its_irradian
 def test_the_harmonics_are_orthonormal_and_project_light_in_the_axes_of_the_camera():
     basis = np.stack(lighting.harmonics(*columns(directions(HEIGHT))))
     close(basis * solid_angles(HEIGHT).reshape(-1) @ basis.T, np.eye(9), atol=5e-3)
-    constant = lighting.projected(light_of(np.ones((32, 64, 3), np.float32)), np.eye(3, dtype=np.float32))
+    constant = lighting.project_harmonics(light_of(np.ones((32, 64, 3), np.float32)), np.eye(3, dtype=np.float32))
     close(constant, np.eye(9)[:, :1] * 4 * 0.282095 * np.ones(3), atol=5e-3)
     ahead = np.float32([[0, 0, 1], [0, 1, 0], [-1, 0, 0]])  # a camera that looks along -x, where z is x
-    tilted = lighting.projected(Light(tables=light_of(smooth(directions(HEIGHT)).astype(np.float32)).tables), ahead)
+    tilted = lighting.project_harmonics(
+        Light(tables=light_of(smooth(directions(HEIGHT)).astype(np.float32)).tables), ahead
+    )
     close(tilted[2, 0], 4 / 3 * 0.488603, rtol=1e-2)  # red is 1 + x, and behind the camera is +x
     close(tilted[np.array([1, 3]), 0], np.zeros(2), atol=1e-2)
 
@@ -193,7 +195,7 @@ def test_lights_of_the_package_are_radiance_of_any_size_that_normalises_to_a_mea
         assert envmap.shape == (height, 2 * height, 3)
         assert np.isfinite(envmap).all()
         assert envmap.min() >= 0
-        mean = (skies.normalised(envmap, 0.6) * solid_angles(height)[..., None]).sum() / (4 * np.pi * 3)
+        mean = (skies.normalise(envmap, 0.6) * solid_angles(height)[..., None]).sum() / (4 * np.pi * 3)
         assert mean == pytest.approx(0.6, rel=1e-3)
 
 
@@ -205,4 +207,4 @@ def test_random_maps_follow_from_their_generator_and_differ():
 
 
 def test_black_stays_black_when_it_is_normalised():
-    np.testing.assert_array_equal(skies.normalised(np.zeros((4, 8, 3), np.float32)), 0)
+    np.testing.assert_array_equal(skies.normalise(np.zeros((4, 8, 3), np.float32)), 0)

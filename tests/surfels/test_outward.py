@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from spnr_jax.kernels.cleaning import Cleaned
-from spnr_jax.kernels.facing import facing, planes, seen_from, spacing_of
-from spnr_jax.surfels.outward import VOTERS, outward_normals, thinned
-from spnr_jax.surfels.visibility import spiral
+from spnr_jax.surfels.normals import VOTERS, facing, find_visible, outward_normals, planes, spacing_of, thin_cloud
+from spnr_jax.surfels.sides import spiral
 
 
 def test_normals_of_a_ball_point_to_a_sensor_in_its_middle_or_far_from_it():
@@ -28,10 +27,10 @@ def test_a_sensor_sees_the_near_cap_of_a_ball_and_nothing_from_the_place_of_the_
     points, place = spiral(5000), np.array([0, 3.0, 0])
     spacing = spacing_of(points)
     np.testing.assert_allclose(spacing, np.sqrt(4 * np.pi / 5000), rtol=0.1)
-    seen, height = seen_from(points, place, spacing, 4), points[:, 1]
+    seen, height = find_visible(points, place, spacing, 4), points[:, 1]
     assert seen[height > 0.5].all()
     assert not seen[height < 0].any()
-    assert not seen_from(np.ones((5, 3)), np.ones(3), 0.1, 2.0).any()
+    assert not find_visible(np.ones((5, 3)), np.ones(3), 0.1, 2.0).any()
     assert spacing_of(np.zeros((1, 3))) == 0
 
 
@@ -109,8 +108,8 @@ def test_thinned_points_keep_the_normals_of_their_file_and_else_get_those_of_all
     normals = np.roll(ball, 1, axis=0)
     flat = {name: np.full(3000, 0.5) for name in ("roughness", "metallic")} | {"base_color": np.abs(ball)}
     for values, expected in (({"normals": normals}, normals[kept]), ({}, normals_of(ball, kept))):
-        cloud = thinned(Cleaned(ball, flat | values, [], 0.0), kept)
+        cloud = thin_cloud(Cleaned(ball, flat | values, [], 0.0), kept)
         np.testing.assert_array_equal(cloud.positions, ball[kept])
         np.testing.assert_array_equal(cloud.base_color, np.abs(ball[kept]))
         np.testing.assert_allclose(cloud.normals, expected, atol=1e-6)
-    assert thinned(Cleaned(ball, flat, [], 0.0), np.arange(3000)).normals is None
+    assert thin_cloud(Cleaned(ball, flat, [], 0.0), np.arange(3000)).normals is None

@@ -6,11 +6,11 @@ import numpy as np
 from support.laws import close
 from support.surfel_clouds import shape
 
-from spnr_jax.surfels import visibility
-from spnr_jax.surfels.visibility import DIRECTIONS, cell_of, grid_of, seen_from, tangents
+from spnr_jax.surfels import sides
+from spnr_jax.surfels.sides import DIRECTIONS, cell_of, grid_of, see_directions, tangents
 
 GRID = 64
-_seen_from = jax.jit(seen_from, static_argnames="grid")
+_seen_from = jax.jit(see_directions, static_argnames="grid")
 
 
 def seen(positions, normals, spacing, mask=None):
@@ -32,14 +32,14 @@ def loop(positions, normals, spacing):
         def in_the_middle(p, n, column, row, right=right, up=up, towards=towards):
             """How much nearer the plane through a point is in the middle of a cell."""
             slopes = np.array([-(n @ right), -(n @ up)]) / (np.sign(n @ towards) * max(abs(n @ towards), 1e-3))
-            slopes *= min(1, visibility.STEEPEST / max(np.hypot(*slopes), 1e-3))
+            slopes *= min(1, sides.STEEPEST / max(np.hypot(*slopes), 1e-3))
             middle = cell * (np.array([column, row]) + 0.5 - grid / 2)
             return slopes @ (middle - [p @ right, p @ up])
 
         buffer = {}
         for p, n in zip(positions, normals, strict=True):
             column, row = (int(np.floor(p @ axis / cell + grid / 2 - 0.5)) for axis in (right, up))
-            most = visibility.REACH * spacing * np.sqrt(1 - (n @ towards) ** 2)
+            most = sides.REACH * spacing * np.sqrt(1 - (n @ towards) ** 2)
             for place in ((row + i, column + j) for i in (0, 1) for j in (0, 1)):
                 nearer = in_the_middle(p, n, *place[::-1])
                 depth = p @ towards + (nearer if nearer < most else 0)
@@ -101,11 +101,11 @@ def test_tangents_and_normal_are_three_unit_vectors_at_right_angles_also_at_the_
 def test_the_grid_covers_the_box_with_few_sizes_and_never_more_than_1024_cells():
     for count in 2 ** np.arange(25):
         grid = grid_of(int(count))
-        assert visibility.COARSEST <= grid <= visibility.FINEST
+        assert sides.COARSEST <= grid <= sides.FINEST
         assert grid % 16 == 0
         for spacing in np.geomspace(1e-7, 3.0, 20):
             cell = float(cell_of(jnp.float32(spacing), grid))
-            assert cell * grid >= visibility.BOX * (1 - 1e-6)
-            assert cell >= visibility.CELL * spacing * (1 - 1e-6)
+            assert cell * grid >= sides.BOX * (1 - 1e-6)
+            assert cell >= sides.CELL * spacing * (1 - 1e-6)
     assert grid_of(16384) == 512
-    assert grid_of(2**24) == visibility.FINEST
+    assert grid_of(2**24) == sides.FINEST

@@ -8,9 +8,9 @@ import pytest
 from support.surfel_clouds import PADDED, cloud, estimate
 
 from spnr_jax.kernels.cloud_arrays import pad
-from spnr_jax.surfels import geometry, outward
-from spnr_jax.surfels.neighbors import neighbors
-from spnr_jax.surfels.visibility import spiral
+from spnr_jax.surfels import geometry, normals
+from spnr_jax.surfels.geometry import neighbors
+from spnr_jax.surfels.sides import spiral
 
 COUNT = 2000  # points of a skin
 SPACING = np.float32(0.6 * np.sqrt(2 * np.pi / COUNT))  # of the points of two skins of a ball of radius .6 together
@@ -73,10 +73,10 @@ def test_true_normals_of_skin_and_lining_are_kept(gap):
 
 
 def test_thinned_points_get_normals_away_from_the_other_skin():
-    positions, colors, normals = lined_ball(0.15)
+    positions, colors, true = lined_ball(0.15)
     kept = np.arange(0, 2 * COUNT, 3)
-    found = outward.outward_normals(positions.astype(np.float64), colors, kept)
-    assert np.mean(np.sum(found * normals[kept], axis=1) > 0.9) > 0.97
+    found = normals.outward_normals(positions.astype(np.float64), colors, kept)
+    assert np.mean(np.sum(found * true[kept], axis=1) > 0.9) > 0.97
 
 
 def test_the_border_of_two_colours_on_a_bent_surface_and_at_an_edge_is_no_step():

@@ -26,7 +26,7 @@ def draw(found, view, attributes=None):
     entries, lost = make_entries(found, view, room=TOTAL)
     assert int(np.sum(np.asarray(entries.pixel) < view.height * view.width)) <= int(count(found, view)) <= TOTAL
     assert int(lost) == 0
-    assert int(splatting.covered_pixels(entries)) <= view.height * view.width
+    assert int(splatting.count_covered_pixels(entries)) <= view.height * view.width
     buffer = blend(entries, found, jnp.asarray(attributes), view, slots=view.height * view.width)
     return jax.tree.map(np.asarray, buffer), entries
 
@@ -121,7 +121,7 @@ class TestEntries:
         for size in (24, 2100):  # the second has more pixels than 21 bits count
             view = camera(size, field_of_view=2.9 if size > 24 else 0.7)
             entries, lost = make_entries(found, view, room=int(count(found, view)))
-            slots = splatting.covered_pixels(entries)
+            slots = splatting.count_covered_pixels(entries)
             assert int(lost) == 0
             order, pixel = np.asarray(entries.order), np.asarray(entries.pixel)
             live = pixel < size**2
@@ -163,7 +163,7 @@ class TestBlend:
         )
         view = camera(24, (0.0, 0.6 * away, 0.8 * away))
         entries, lost = make_entries(found, view, room=TOTAL)
-        assume(int(lost) == 0 and int(splatting.covered_pixels(entries)) > 0)
+        assume(int(lost) == 0 and int(splatting.count_covered_pixels(entries)) > 0)
         buffer = blend(entries, found, found.base_color, view, slots=24**2)
         names = ("opacity", "coverage", "depth", "spread", "log_spacing", "normal", "attributes")
         entries, buffer = jax.tree.map(np.asarray, (entries, buffer))

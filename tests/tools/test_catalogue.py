@@ -141,10 +141,10 @@ def test_a_stop_leaves_whole_pictures_and_a_page_and_the_same_command_goes_on(cl
         begun.append(name)
         if len(begun) == 3:
             raise KeyboardInterrupt
-        return pictures.drawn(ready, options, name)
+        return pictures.draw_all(ready, options, name)
 
     with monkeypatch.context() as patch:
-        patch.setattr(catalogue, "drawn", stop_at_the_third)
+        patch.setattr(catalogue, "draw_all", stop_at_the_third)
         with pytest.raises(KeyboardInterrupt, match="the same command goes on"):
             render(clouds, out)
     first = stills(out)

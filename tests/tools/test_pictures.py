@@ -153,7 +153,7 @@ def test_learned_points_are_added_to_a_sparse_cloud_over_surfels(tmp_path):
     rng = np.random.default_rng(1).normal(size=(40, 3))
     np.savetxt(tmp_path / "ball.xyz", rng / np.linalg.norm(rng, axis=1, keepdims=True))
     asked = Render(cloud=tmp_path / "ball.xyz", run=tiny_surfels.run(), up="y")
-    surfels = pictures.made_ready(asked, lambda line: None, load).volume.scene.surfels
+    surfels = pictures.prepare_cloud(asked, lambda line: None, load).volume.scene.surfels
     mask, invented = np.asarray(surfels.mask), np.asarray(surfels.invented)
     assert 30 < np.sum(mask & (invented == 0)) <= 40
     assert np.sum(mask & (invented > 0)) > 20

@@ -9,7 +9,7 @@ from spnr_jax.formats.clouds import read_cloud
 from spnr_jax.formats.mesh.meshes import load_mesh
 from spnr_jax.formats.point_files import parse_ply
 from spnr_jax.surfels.gaussians import View
-from spnr_jax.surfels.visibility import spiral
+from spnr_jax.surfels.sides import spiral
 from spnr_jax.tools import mesh_export, splat_export, splat_making
 from spnr_jax.tools.commands import Lighting
 
@@ -80,7 +80,7 @@ def test_pictures_without_a_surface_are_one_line(cloud, tmp_path, monkeypatch, c
         nothing = np.ones((*size, 3), np.float32), np.zeros(size, np.float32), np.full(size, np.nan, np.float32)
         return [View(splat_making.in_box(camera, volume), *nothing) for camera in cameras]
 
-    monkeypatch.setattr(splat_making, "drawn_views", empty)
+    monkeypatch.setattr(splat_making, "draw_views", empty)
     assert made_by(command, cloud, option, tmp_path / name) == 2
     said = capsys.readouterr().err
     assert "no surface" in said.splitlines()[-1]

@@ -18,9 +18,10 @@ from spnr_jax.config import SurfelConfig
 from spnr_jax.formats import data_sets
 from spnr_jax.kernels.cameras import pinhole
 from spnr_jax.kernels.records import Crops, PointCloud, Surfels
-from spnr_jax.surfels import features, lighting
-from spnr_jax.surfels.surfel_scenes import encode_in_box
-from spnr_jax.surfels.visibility import DIRECTIONS, spiral, tangents
+from spnr_jax.nn import shader
+from spnr_jax.surfels import lighting
+from spnr_jax.surfels.geometry import encode_in_box
+from spnr_jax.surfels.sides import DIRECTIONS, spiral, tangents
 from spnr_jax.training import batching, checkpoint, gbuffers, optimisation, run_record, trainer
 
 AXES = pytest.mark.parametrize("axis", [0, 1])
@@ -105,7 +106,7 @@ def test_steps_meet_every_resolution_in_its_share_with_crops_of_its_size(monkeyp
     kept, config, steps = tiny_surfels.views()[0], dataclasses.replace(CONFIG, crop=48), []
     view = gbuffers.read_view(kept)
     monkeypatch.setattr(gbuffers, "read_view", lambda _: view)
-    monkeypatch.setattr(gbuffers, "cropped", lambda view, *sizes: steps[-1].append(sizes[:3]) or view)
+    monkeypatch.setattr(gbuffers, "crop_square", lambda view, *sizes: steps[-1].append(sizes[:3]) or view)
     for step in range(400):
         steps.append([])
         gbuffers.make_batch({doublings: [kept] for doublings in range(5)}, config, step)
@@ -122,7 +123,7 @@ def test_a_crop_shows_the_same_place_in_what_is_seen_and_in_the_reference(margin
     fine = np.repeat(np.repeat(place, 4, axis=0), 4, axis=1)
     view = {"seen": place / 100, "maps": place, "ambient": np.zeros((9, 3)), "target": fine.astype(np.uint8)}
     for seed in range(8):
-        crop = gbuffers.cropped(view, 8 + 2 * margin, margin, 4, np.random.default_rng(seed))
+        crop = gbuffers.crop_square(view, 8 + 2 * margin, margin, 4, np.random.default_rng(seed))
         inner = slice(margin, margin + 8)
         assert crop["seen"].shape == (8 + 2 * margin, 8 + 2 * margin, 1)
         np.testing.assert_allclose(100 * crop["seen"][inner, inner], crop["target"][::4, ::4], atol=1e-4)
@@ -134,8 +135,8 @@ def test_a_crop_shows_the_same_place_in_what_is_seen_and_in_the_reference(margin
 def test_a_smaller_reference_is_the_mean_of_what_is_seen_on_white():
     image = np.random.default_rng(3).integers(0, 256, (8, 12, 4), np.uint8)
     means = data_sets.on_white(image).reshape(2, 4, 3, 4, 3).mean(axis=(1, 3))
-    np.testing.assert_allclose(data_sets.on_white(gbuffers.averaged(image, 4)), means, atol=1.1 / 255)
-    np.testing.assert_array_equal(gbuffers.averaged(image, 1)[image[..., 3] > 0], image[image[..., 3] > 0])
+    np.testing.assert_allclose(data_sets.on_white(gbuffers.average_squares(image, 4)), means, atol=1.1 / 255)
+    np.testing.assert_array_equal(gbuffers.average_squares(image, 1)[image[..., 3] > 0], image[image[..., 3] > 0])
 
 
 @pytest.fixture(scope="module")
@@ -152,8 +153,8 @@ def params():
 def test_mirroring_leaves_the_loss_of_the_untrained_network_as_it_is(axis, params):
     kept = tiny_surfels.views()[0]
     view = gbuffers.read_view(kept)
-    whole = gbuffers.cropped(view, max(view["seen"].shape[:2]), 0, 2**kept.doublings, np.random.default_rng(0))
-    turned = gbuffers.mirrored(whole, axis)
+    whole = gbuffers.crop_square(view, max(view["seen"].shape[:2]), 0, 2**kept.doublings, np.random.default_rng(0))
+    turned = gbuffers.mirror(whole, axis)
     losses = [
         loss(params, Crops(**{name: x[None] for name, x in one.items()}, doublings=kept.doublings))[0]
         for one in (whole, turned)
@@ -161,7 +162,7 @@ def test_mirroring_leaves_the_loss_of_the_untrained_network_as_it_is(axis, param
     np.testing.assert_allclose(*losses, rtol=1e-5)
     assert not np.array_equal(whole["target"], turned["target"])
     assert not np.array_equal(whole["seen"], turned["seen"])
-    same_bits(gbuffers.mirrored(turned, axis), whole)
+    same_bits(gbuffers.mirror(turned, axis), whole)
 
 
 @AXES
@@ -196,8 +197,8 @@ def test_a_mirrored_object_is_seen_as_the_mirrored_view(axis):
         )
         seen.append(np.asarray(gbuffers.look_at(surfels, camera, LIGHT, room=2**14, slots=24 * 24)[0]))
     view = {"seen": seen[0], "maps": seen[0], "target": seen[0], "ambient": np.zeros((9, 3))}
-    np.testing.assert_allclose(gbuffers.mirrored(view, axis)["seen"], seen[1], atol=0.05)
-    assert np.abs(seen[1][..., features.ODD[axis]]).mean() > 0.1
+    np.testing.assert_allclose(gbuffers.mirror(view, axis)["seen"], seen[1], atol=0.05)
+    assert np.abs(seen[1][..., shader.ODD[axis]]).mean() > 0.1
 
 
 @AXES
@@ -205,9 +206,9 @@ def test_harmonics_of_the_mirrored_light_are_the_mirrored_ones(axis):
     towards = np.random.default_rng(2).normal(size=(3, 50)).astype(np.float32)
     towards /= np.linalg.norm(towards, axis=0)
     turned = towards * np.where(np.arange(3) == axis, -1, 1)[:, None].astype(np.float32)
-    view = {name: np.zeros((2, 2, features.NUM_FEATURES)) for name in ("seen", "maps", "target")}
+    view = {name: np.zeros((2, 2, shader.NUM_FEATURES)) for name in ("seen", "maps", "target")}
     basis = np.stack(lighting.harmonics(*jnp.asarray(towards)))
-    expected = gbuffers.mirrored(view | {"ambient": basis}, axis)["ambient"]
+    expected = gbuffers.mirror(view | {"ambient": basis}, axis)["ambient"]
     close(np.stack(lighting.harmonics(*jnp.asarray(turned))), expected, atol=1e-6)
 
 

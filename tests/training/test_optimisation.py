@@ -329,7 +329,7 @@ def test_a_gradient_longer_than_the_configs_norm_counts_as_one_of_that_norm():
 
 
 @pytest.mark.parametrize(
-    ("choose", "size", "stride"), [(pixels.lattice, 4, 4), (pixels.lattice, 3, 3), (pixels.cropped, 10, 1)]
+    ("choose", "size", "stride"), [(pixels.lattice, 4, 4), (pixels.lattice, 3, 3), (pixels.crop_square, 10, 1)]
 )
 def test_some_pixels_of_a_batch_are_those_of_picture_opacity_condition_and_rays(choose, size, stride):
     """`size` is the stride of a lattice and the side of a crop; another key gives another place."""
@@ -351,7 +351,7 @@ def test_some_pixels_of_a_batch_are_those_of_picture_opacity_condition_and_rays(
 
 
 def test_a_crop_as_large_as_the_view_is_the_view():
-    same_bits(pixels.cropped(jax.random.key(0), BATCH, BATCH.image.shape[2]), BATCH)
+    same_bits(pixels.crop_square(jax.random.key(0), BATCH, BATCH.image.shape[2]), BATCH)
 
 
 @pytest.mark.ci

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from spnr_jax.surfels.visibility import spiral
+from spnr_jax.surfels.sides import spiral
 from spnr_jax.training import scan_faults
 
 
@@ -26,11 +26,11 @@ def test_faults_change_what_their_names_say_and_nothing_else():
 
 def test_scans_that_do_not_meet_are_moved_as_one_and_balls_leave_holes():
     points, values = spiral(4000), {"roughness": np.arange(4000.0)}
-    moved = scan_faults.misregistered(points, values, rng(), sigma=0.01)[0] - points
+    moved = scan_faults.misregister(points, values, rng(), sigma=0.01)[0] - points
     apart = np.linalg.norm(moved, axis=1) > 1e-9
     assert 0.3 < apart.mean() < 0.7
     np.testing.assert_allclose(moved[apart], np.broadcast_to(moved[apart][0], moved[apart].shape), atol=1e-12)
-    left, columns = scan_faults.dropped(points, values, rng(), balls=3)
+    left, columns = scan_faults.drop_balls(points, values, rng(), balls=3)
     rows = columns["roughness"].astype(int)
     np.testing.assert_array_equal(points[rows], left)
     gone = np.setdiff1d(np.arange(4000), rows)
@@ -66,7 +66,7 @@ def test_a_random_scan_is_a_function_of_its_generator_and_keeps_columns_beside_p
 def test_scanners_see_less_the_fewer_they_are_and_only_the_outside():
     points = np.concatenate([spiral(4000), 0.5 * spiral(1000)])
     values = {"roughness": np.arange(5000.0)}
-    seen = [scan_faults.scanned(points, values, rng(), scanners=n) for n in (1, 3, 20)]
+    seen = [scan_faults.scan(points, values, rng(), scanners=n) for n in (1, 3, 20)]
     counts = [len(positions) for positions, _ in seen]
     assert 1000 < counts[0] < 2000
     assert counts == sorted(counts)

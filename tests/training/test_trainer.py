@@ -74,7 +74,7 @@ class TestBeginningWithOtherWeights:
         small = tiny_model.with_encoder(CONFIG.model, base_width=2 * CONFIG.model.encoder.base_width)
         config, init = dataclasses.replace(CONFIG, model=small), weights.read_trained(tiny_dataset.run())
         work = partial(trainer.train, config, tiny_dataset.dataset(), tmp_path, SCHEDULE, init=init)
-        assert cli.guarded(work, "spnr") == 2
+        assert cli.guard(work, "spnr") == 2
         assert "are of another network: shape of" in capsys.readouterr().err.splitlines()[-1]
 
 
@@ -133,7 +133,7 @@ def poisoned(monkeypatch, step):
 def test_nan_stops_with_step_and_quantity_and_the_last_checkpoint_is_usable(monkeypatch, tmp_path, capsys):
     poisoned(monkeypatch, 4)
     sparse = trainer.Schedule(log_every=100, preview_every=100, checkpoint_every=2)  # step 4 is never due to be logged
-    code = cli.guarded(lambda: trainer.train(CONFIG, tiny_dataset.dataset(), tmp_path, sparse), "spnr")
+    code = cli.guard(lambda: trainer.train(CONFIG, tiny_dataset.dataset(), tmp_path, sparse), "spnr")
     line = capsys.readouterr().err.splitlines()[-1]
     assert code == 2
     assert re.match(r"spnr: \w+ is nan at step 4; the last checkpoint is kept", line)
@@ -158,7 +158,7 @@ def test_a_full_disk_is_one_line_and_exit_code_2(monkeypatch, tmp_path, capsys):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(tmp_path / "metrics.jsonl"))
 
     monkeypatch.setattr(run_record.MetricsLog, "write", full)
-    code = cli.guarded(lambda: trainer.train(CONFIG, tiny_dataset.dataset(), tmp_path, SCHEDULE), "spnr")
+    code = cli.guard(lambda: trainer.train(CONFIG, tiny_dataset.dataset(), tmp_path, SCHEDULE), "spnr")
     assert code == 2
     line = capsys.readouterr().err.splitlines()[-1]
     assert line == f"spnr: {tmp_path / 'metrics.jsonl'}: No space left on device"
@@ -166,7 +166,7 @@ def test_a_full_disk_is_one_line_and_exit_code_2(monkeypatch, tmp_path, capsys):
 
 def test_ctrl_c_is_exit_code_130_and_says_how_to_go_on(monkeypatch, tmp_path, capsys):
     interrupted(monkeypatch, batching, 1, signal.SIGINT)
-    code = cli.guarded(lambda: trainer.train(CONFIG, tiny_dataset.dataset(), tmp_path, SCHEDULE), "spnr")
+    code = cli.guard(lambda: trainer.train(CONFIG, tiny_dataset.dataset(), tmp_path, SCHEDULE), "spnr")
     assert code == 130
     expected = "spnr: stopped at step 1 of 6; the same command goes on from there"
     assert capsys.readouterr().err.splitlines()[-1] == expected
@@ -276,8 +276,8 @@ def test_a_start_says_where_and_with_what_it_trained_and_tells_its_objects_from_
         assert all(seconds >= 0 for seconds in spent.values())
     assert entry["data_checksum"] == run_record.checksum(dataset)
     assert "cores" in entry["hardware"]
-    assert run_record.seen_in_training(recorded, dataset, dataset.splits["train"]) is True
-    assert run_record.seen_in_training(recorded, dataset, dataset.splits["test"]) is False
+    assert run_record.trained_on(recorded, dataset, dataset.splits["train"]) is True
+    assert run_record.trained_on(recorded, dataset, dataset.splits["test"]) is False
 
 
 def test_a_run_that_goes_on_keeps_what_earlier_starts_said(tmp_path):

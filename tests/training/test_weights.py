@@ -58,7 +58,7 @@ def test_every_weight_of_a_network_has_its_shape_by_name(trained):
 
 def test_the_network_in_the_package_has_the_weights_and_the_name_of_its_preset(tmp_path):
     copy = tmp_path / "copy.npz"  # the package's own file is not checked when it is read
-    copy.write_bytes(weights.shipped().read_bytes())
+    copy.write_bytes(weights.packaged_file().read_bytes())
     checked, trusted = weights.read_weights(copy), weights.read_trained(None)
     assert checked.config == trusted.config
     assert checked.config.preset == "surfels"
@@ -74,7 +74,7 @@ def test_the_densifier_stands_beside_every_network_over_surfels_and_in_no_file_o
         jax.tree.map(
             np.testing.assert_array_equal,
             again.variables["densifier"],
-            weights.read_variables(weights.shipped("densifier")),
+            weights.read_variables(weights.packaged_file("densifier")),
         )
     assert "densifier" not in weights.read_trained(tiny_untrained.run()).variables
 

@@ -136,7 +136,7 @@ def test_every_control_reaches_the_options_and_leaves_the_sun(control, value, fi
     asked = frame.read_lighting(sunny, **QUIET | {control: value})
     assert getattr(asked, field) == expected != getattr(frame.read_lighting(sunny, **QUIET), field)
     assert asked.sun == (1.0, 2.0)
-    assert frame.read_lighting(sunny, **QUIET | {"choice": sunny.chosen_light}).light is None
+    assert frame.read_lighting(sunny, **QUIET | {"choice": sunny.light_name}).light is None
 
 
 @pytest.mark.parametrize(
@@ -159,7 +159,7 @@ def test_a_light_is_made_once_and_nothing_asked_is_the_networks_own(monkeypatch)
 
 def test_a_new_map_is_chosen_stays_in_the_list_and_one_of_its_name_replaces_it():
     one = frame.add_map(state(lighting=Lighting(exposure=1.0)), "a.hdr", lopsided())
-    assert (one.chosen_light, one.lights) == ("a.hdr", (*NAMES, "a.hdr"))
+    assert (one.light_name, one.lights) == ("a.hdr", (*NAMES, "a.hdr"))
     close(frame.make_light(one).light.tables, 2 * lopsided().tables)
     close(frame.make_light(frame.add_map(one, "a.hdr", lopsided(3.0))).light.tables, 6 * lopsided().tables)
 

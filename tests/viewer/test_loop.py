@@ -33,7 +33,7 @@ def test_changes_that_come_while_a_picture_is_drawn_wait_together_and_supersede_
         if number == 0:
             begun.set()
             go.wait(10)
-            seen.append(loop.superseded)
+            seen.append(loop.is_superseded)
         drawn.append(number)
         if number == 3:
             loop.stop()

@@ -105,7 +105,7 @@ class Asset:
     source: dict = field(default_factory=dict)
 
 
-def principled(
+def make_material(
     base_color: Values | float | int = 0.5,
     roughness: Values | float | int = 0.5,
     metallic: Values | float | int = 0.0,

@@ -14,7 +14,7 @@ from trimesh.transformations import quaternion_matrix
 
 from spnr_jax.formats.mesh.assets import Asset, Part, RejectedAsset, TransparentParts
 from spnr_jax.formats.mesh.file_colors import LINEAR, SRGB
-from spnr_jax.formats.mesh.gltf_container import DRACO, MESHOPT, GltfFile, decode_mesh, scaled
+from spnr_jax.formats.mesh.gltf_container import DRACO, MESHOPT, GltfFile, decode_accessor, decode_mesh
 from spnr_jax.formats.mesh.gltf_materials import BASIS, MOVED, WEBP, GltfMaterial, read_material
 from spnr_jax.formats.mesh.tolerance import Tolerance
 from spnr_jax.surfels.gaussians import C0
@@ -32,7 +32,7 @@ OTHERS = ("POSITION", "NORMAL", "COLOR_0")  # columns, beside texture coordinate
 MOST_REPEATED, PLACING = 2**23, 64
 
 
-def drawn_meshes(file: GltfFile) -> Iterator[tuple[int, list[np.ndarray]]]:
+def list_meshes(file: GltfFile) -> Iterator[tuple[int, list[np.ndarray]]]:
     """(mesh, matrices to world (4, 4)) of every node of the default scene that draws a mesh, depth first."""
     document = file.document
     nodes = document.get("nodes", [])
@@ -101,7 +101,7 @@ def load_gltf(path: Path, transparent_parts: TransparentParts = "refuse") -> Ass
     materials: dict[int | None, GltfMaterial] = {}
     shapes: dict[tuple[int, int], Shape] = {}
     parts, repeated = [], 0
-    for mesh, matrices in drawn_meshes(file):
+    for mesh, matrices in list_meshes(file):
         for number, primitive in enumerate(document["meshes"][mesh]["primitives"]):
             mode = MODES[primitive.get("mode", 4)]
             if not mode.startswith("TRIANGLE"):
@@ -126,7 +126,7 @@ def load_gltf(path: Path, transparent_parts: TransparentParts = "refuse") -> Ass
                 raise RejectedAsset(
                     f"repeats its meshes more than can be read ({MOST_REPEATED} faces): fewer instances can"
                 )
-            parts += [_placed(shape, look, matrix) for matrix in matrices]
+            parts += [_place(shape, look, matrix) for matrix in matrices]
     if not parts and any(look.nowhere for look in materials.values()):
         raise RejectedAsset(f"has nothing to draw: {'; '.join(tolerance.notes())}")
     return Asset(parts=tuple(parts), ignored=tuple(sorted(ignored)), notes=tuple(tolerance.notes()))
@@ -139,7 +139,7 @@ def gltf_points(path: Path) -> dict[str, np.ndarray] | None:
     """
     file = GltfFile(path)
     meshes = file.document.get("meshes", [])
-    drawn = [(primitive, matrices) for mesh, matrices in drawn_meshes(file) for primitive in meshes[mesh]["primitives"]]
+    drawn = [(primitive, matrices) for mesh, matrices in list_meshes(file) for primitive in meshes[mesh]["primitives"]]
     modes = {MODES[primitive.get("mode", 4)] for primitive, _ in drawn}
     if "POINTS" not in modes or any(mode.startswith("TRIANGLE") for mode in modes):
         return None
@@ -188,12 +188,12 @@ def _shape(file: GltfFile, primitive: dict, mode: str, look: GltfMaterial) -> Sh
         raise RejectedAsset("has no POSITION in its Draco mesh: broken file")
     unpacked, order = decode_mesh(file.view(packed["bufferView"]), ids)
     accessors = file.document["accessors"]
-    columns = {name: scaled(values, accessors[wanted[name]]) for name, values in unpacked.items()}
+    columns = {name: decode_accessor(values, accessors[wanted[name]]) for name, values in unpacked.items()}
     columns |= {name: file.accessor(wanted[name]) for name in wanted if name not in ids}
     return Shape(columns, _triangles(order, "TRIANGLES"))  # whatever the mode: Draco keeps triangles
 
 
-def _placed(shape: Shape, look: GltfMaterial, matrix: np.ndarray) -> Part:
+def _place(shape: Shape, look: GltfMaterial, matrix: np.ndarray) -> Part:
     """One primitive in world space."""
     linear = matrix[:3, :3]
     mirrored = np.linalg.det(linear) < 0

@@ -59,7 +59,7 @@ class GltfFile:
             rows = self._rows(sparse["indices"], index_type, 1, sparse["count"])[:, 0]
             values = values.copy()
             values[rows] = self._rows(sparse["values"], dtype, width, sparse["count"])
-        return scaled(values, accessor)
+        return decode_accessor(values, accessor)
 
     def image_bytes(self, index: int) -> bytes:
         """The encoded file of an image."""
@@ -102,7 +102,7 @@ class GltfFile:
         return memoryview(buffer)[start : start + length]
 
 
-def scaled(values: np.ndarray, accessor: dict) -> np.ndarray:
+def decode_accessor(values: np.ndarray, accessor: dict) -> np.ndarray:
     """Values as their accessor means them: float64 for floats and normalised integers, int64 for other ones."""
     if accessor.get("normalized") and values.dtype.kind in "iu":
         return np.maximum(values.astype(np.float64) / np.iinfo(values.dtype).max, -1)

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from spnr_jax.formats.mesh.assets import Material, MissingFile, RejectedAsset, Wrap, principled
+from spnr_jax.formats.mesh.assets import Material, MissingFile, RejectedAsset, Wrap, make_material
 from spnr_jax.formats.mesh.gltf_container import GltfFile
 from spnr_jax.formats.mesh.texels import KTX2_PACKAGE, color_texels, direction_texels, read_image, resize, value_texels
 from spnr_jax.formats.mesh.tolerance import Alpha, Opacity, Tolerance
@@ -175,7 +175,7 @@ def read_material(file: GltfFile, index: int | None, tolerance: Tolerance) -> Gl
 def metallic_roughness(diffuse: np.ndarray, specular: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """base_color (*n, 3) and metallic (*n,) of linear diffuse and specular colours (*n, 3)."""
     strength = 1 - specular.max(axis=-1)
-    bright_diffuse, bright_specular = _perceived_brightness(diffuse), _perceived_brightness(specular)
+    bright_diffuse, bright_specular = _perceive_brightness(diffuse), _perceive_brightness(specular)
     b = bright_diffuse * strength / (1 - DIELECTRIC) + bright_specular - 2 * DIELECTRIC
     discriminant = np.maximum(b * b - 4 * DIELECTRIC * (DIELECTRIC - bright_specular), 0)
     metallic = np.clip((-b + np.sqrt(discriminant)) / (2 * DIELECTRIC), 0, 1)
@@ -195,7 +195,7 @@ def _metallic_roughness(textures: Textures, spec: dict) -> Look:
         roughness = value_texels(surface[..., 1]) * roughness
         metallic = metallic if metallic == 0 else value_texels(surface[..., 2]) * metallic
     base_color = factor[:3] if color is None else color_texels(color) * factor[:3]
-    return principled(base_color, roughness, metallic), factor, color
+    return make_material(base_color, roughness, metallic), factor, color
 
 
 def _specular_glossiness(textures: Textures, spec: dict) -> Look:
@@ -214,7 +214,7 @@ def _specular_glossiness(textures: Textures, spec: dict) -> Look:
         height, width = np.maximum(diffuse.shape[:2], specular.shape[:2])
         diffuse, specular = resize(diffuse, height, width), resize(specular, height, width)
     base_color, metallic = metallic_roughness(diffuse, np.broadcast_to(specular, np.broadcast(diffuse, specular).shape))
-    return principled(base_color, 1 - glossiness, metallic), factor, color
+    return make_material(base_color, 1 - glossiness, metallic), factor, color
 
 
 def _opacity(spec: dict, name: str, factor: np.ndarray, color: np.ndarray | None, tolerance: Tolerance) -> Opacity:
@@ -232,5 +232,5 @@ def _opacity(spec: dict, name: str, factor: np.ndarray, color: np.ndarray | None
     )
 
 
-def _perceived_brightness(color: np.ndarray) -> np.ndarray | np.floating:
+def _perceive_brightness(color: np.ndarray) -> np.ndarray | np.floating:
     return np.sqrt((color * color) @ np.array([0.299, 0.587, 0.114]))

@@ -36,7 +36,7 @@ from spnr_jax.formats.mesh.assets import (
     Part,
     RejectedAsset,
     TransparentParts,
-    principled,
+    make_material,
 )
 from spnr_jax.formats.mesh.gltf import gltf_points, load_gltf
 from spnr_jax.formats.mesh.obj import load_obj, obj_points
@@ -74,7 +74,7 @@ def assemble(asset: Asset) -> Asset:
     for whole in asset.parts:
         solid = face_areas(whole) > smallest
         degenerate += int((~solid).sum())
-        for part in _cleaned(replace(whole, faces=whole.faces[solid]), notes) if solid.any() else ():
+        for part in _clean_part(replace(whole, faces=whole.faces[solid]), notes) if solid.any() else ():
             key = identities.setdefault(id(part.material), _identity(part.material)), part.normals is None
             groups.setdefault(key, []).append(part)
     if not groups:
@@ -111,19 +111,19 @@ def _check_material(material: Material) -> None:
             raise RejectedAsset(f"has a material whose {name} is not finite (NaN or infinity)")
 
 
-def _cleaned(part: Part, notes: set[str]) -> list[Part]:
+def _clean_part(part: Part, notes: set[str]) -> list[Part]:
     """The part with just the columns that its material needs; several parts where vertex colours tint a texture."""
-    part = _settle_texture(_used_vertices(part), notes)
-    part = replace(part, normals=_unit_normals(part, notes), colors=_checked_colors(part, notes))
+    part = _settle_texture(_drop_unused_vertices(part), notes)
+    part = replace(part, normals=_unit_normals(part, notes), colors=_check_colors(part, notes))
     if part.colors is None or part.material.base_color.ndim == 1:
         return [part]
     parts, error = split_by_tint(part)
     if error > 1 / 255:
         notes.add("vertex colours that vary within textured faces (one tint per face is used)")
-    return [_used_vertices(piece) for piece in parts]
+    return [_drop_unused_vertices(piece) for piece in parts]
 
 
-def _used_vertices(part: Part) -> Part:
+def _drop_unused_vertices(part: Part) -> Part:
     """The part with only the vertices that its faces use, in their old order."""
     used, faces = np.unique(part.faces, return_inverse=True)
     kept: dict[str, Any] = {name: getattr(part, name) for name in WIDTHS}
@@ -139,7 +139,7 @@ def _settle_texture(part: Part, notes: set[str]) -> Part:
         notes.add("texture on faces without texture coordinates (its mean is used)")
         look = part.material
         color = look.base_color.reshape(-1, 3).mean(axis=0)
-        return replace(part, material=principled(color, look.roughness.mean(), look.metallic.mean(), look.wrap))
+        return replace(part, material=make_material(color, look.roughness.mean(), look.metallic.mean(), look.wrap))
     if not (np.abs(part.texcoords) < MAX_TEXCOORD).all():
         raise RejectedAsset(f"has texture coordinates that are not finite, or beyond {MAX_TEXCOORD:g}: broken file")
     return part
@@ -161,7 +161,7 @@ def _unit_normals(part: Part, notes: set[str]) -> np.ndarray | None:
     return np.where(good[:, None], own, vertex_normals(part.positions, part.faces))
 
 
-def _checked_colors(part: Part, notes: set[str]) -> np.ndarray | None:
+def _check_colors(part: Part, notes: set[str]) -> np.ndarray | None:
     """The part's vertex colours in [0, 1]; None where they are all white."""
     if part.colors is None or (part.colors == 1).all():
         return None

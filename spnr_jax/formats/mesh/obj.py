@@ -28,7 +28,7 @@ from spnr_jax.formats.mesh.assets import (
     RejectedAsset,
     TransparentParts,
     Wrap,
-    principled,
+    make_material,
 )
 from spnr_jax.formats.mesh.file_colors import linear_colors
 from spnr_jax.formats.mesh.polygons import MOST_CORNERS, ears, is_concave
@@ -90,7 +90,7 @@ def load_obj(path: Path, root: Path | None = None, transparent_parts: Transparen
     for mesh in meshes:
         name = _material_name(mesh)
         white = mesh.get("vertex_colors") is not None and (name in plain or name not in looks)
-        dressed.append((mesh, Look(principled(1.0)) if white else looks.get(name, Look(principled()))))
+        dressed.append((mesh, Look(make_material(1.0)) if white else looks.get(name, Look(make_material()))))
     parts = [_part(mesh, look.material, look.placement) for mesh, look in dressed if not look.nowhere]
     if not parts and meshes:
         raise RejectedAsset(f"has nothing to draw: {'; '.join(tolerance.notes())}")
@@ -211,7 +211,7 @@ def _look(read: Read, name: str, library: dict[str, dict[str, str]], ignored: se
     """The principled material of an MTL entry, how its maps lie, and where it has surface."""
     if name not in library:
         tolerance.goes_on_without(MissingFile(f"uses a material that no library defines: {name!r}"))
-        return Look(principled())
+        return Look(make_material())
     entry = library[name]
     maps = _read_maps(read, entry, name, tolerance)
     opacity = _opacity(entry, maps.get("map_d"), name, tolerance)
@@ -228,7 +228,7 @@ def _look(read: Read, name: str, library: dict[str, dict[str, str]], ignored: se
     for channel, key in (("roughness", "map_pr"), ("metallic", "map_pm")):
         if key in maps:
             channels[channel] = value_texels(maps[key][..., 0])
-    material = principled(color, **channels, wrap=placement.wrap)
+    material = make_material(color, **channels, wrap=placement.wrap)
     return Look(replace(material, opacity=opacity.texels, cutoff=opacity.cutoff), placement, opacity.nowhere)
 
 

@@ -15,7 +15,7 @@ from trimesh.exchange.ply import load_ply
 from trimesh.exchange.stl import load_stl_ascii
 from trimesh.geometry import triangulate_quads
 
-from spnr_jax.formats.mesh.assets import Asset, Part, RejectedAsset, principled
+from spnr_jax.formats.mesh.assets import Asset, Part, RejectedAsset, make_material
 from spnr_jax.formats.mesh.file_colors import PACKED, SRGB, colors_of
 from spnr_jax.formats.mesh.polygons import triangulate
 
@@ -23,15 +23,15 @@ STL_HEAD, STL_TRIANGLE = 84, np.dtype([("normal", "<f4", 3), ("corners", "<f4", 
 OFF_HEAD = re.compile(r"(ST)?(C?)(N?)(4?)(n?)OFF\b")
 
 
-def colored(part: Part, colors: np.ndarray | None, owner: np.ndarray | None = None) -> Part:
+def color_part(part: Part, colors: np.ndarray | None, owner: np.ndarray | None = None) -> Part:
     """The part with linear colours (n, 3) of its vertices or, with the `owner` of each face, of polygons."""
     if colors is None:
         return part
     if owner is None:
-        return replace(part, colors=colors, material=principled(1.0))
+        return replace(part, colors=colors, material=make_material(1.0))
     corners = np.arange(part.faces.size).reshape(-1, 3)
     own = part.positions[part.faces.ravel()], np.repeat(colors[owner], 3, axis=0)
-    return Part(positions=own[0], faces=corners, material=principled(1.0), colors=own[1])
+    return Part(positions=own[0], faces=corners, material=make_material(1.0), colors=own[1])
 
 
 def load_ply_mesh(data: bytes) -> Asset:
@@ -46,12 +46,12 @@ def load_ply_mesh(data: bytes) -> Asset:
     positions, polygons = np.asarray(loaded["vertices"], np.float64), loaded["faces"]
     whole = isinstance(polygons, np.ndarray) and polygons.ndim == 2 and polygons.shape[1] == 3
     faces, owner = (polygons.astype(np.int64), np.arange(len(polygons))) if whole else triangulate(positions, polygons)
-    part = Part(positions=positions, faces=faces, material=principled(), normals=loaded.get("vertex_normals"))
+    part = Part(positions=positions, faces=faces, material=make_material(), normals=loaded.get("vertex_normals"))
     ignored = ("texture coordinates (of formats other than glTF and OBJ)",) if "visual" in loaded else ()
     for element, owners in (("vertex", None), ("face", owner)):
         found = colors_of(_columns(raw[element]["data"]))
         if found is not None:
-            return Asset(parts=(colored(part, found[0], owners),), ignored=ignored, notes=tuple(found[1]))
+            return Asset(parts=(color_part(part, found[0], owners),), ignored=ignored, notes=tuple(found[1]))
     return Asset(parts=(part,), ignored=ignored)
 
 
@@ -73,7 +73,7 @@ def load_stl(data: bytes) -> Asset:
             Part(
                 positions=np.asarray(m["vertices"], np.float64),
                 faces=triangulate_quads(m["faces"]),
-                material=principled(),
+                material=make_material(),
             )
             for m in meshes
             if m.get("faces") is not None
@@ -92,7 +92,7 @@ def load_stl(data: bytes) -> Asset:
     rows = np.frombuffer(data, STL_TRIANGLE, count, STL_HEAD)
     positions = rows["corners"].reshape(-1, 3).astype(np.float64)
     ignored = ("STL attribute bytes",) if rows["attribute"].any() else ()
-    part = Part(positions=positions, faces=np.arange(3 * count).reshape(-1, 3), material=principled())
+    part = Part(positions=positions, faces=np.arange(3 * count).reshape(-1, 3), material=make_material())
     return Asset(parts=(part,), ignored=ignored, notes=notes)
 
 
@@ -104,7 +104,7 @@ def load_off(data: bytes) -> Asset:
     if any(len(polygon) != int(row[0]) for polygon, row in zip(corners, rows, strict=True)):
         raise RejectedAsset("is cut off: a face names fewer corners than it announces")
     faces, owner = triangulate(positions, corners)
-    part = Part(positions=positions, faces=faces, material=principled())
+    part = Part(positions=positions, faces=faces, material=make_material())
     found, owners = colors_of(columns), None
     behind = [row[1 + int(row[0]) :] for row in rows]
     if found is None and behind and all(len(values) in (3, 4) for values in behind):
@@ -113,7 +113,7 @@ def load_off(data: bytes) -> Asset:
     ignored = ("colours of some faces alone",) if found is None and any(behind) else ()
     if found is None:
         return Asset(parts=(part,), ignored=ignored)
-    return Asset(parts=(colored(part, found[0], owners),), notes=tuple(found[1]))
+    return Asset(parts=(color_part(part, found[0], owners),), notes=tuple(found[1]))
 
 
 def off_points(path) -> dict[str, np.ndarray] | None:

@@ -19,7 +19,7 @@ import numpy as np
 from spnr_jax.errors import UserError
 from spnr_jax.formats.mesh.assets import CHANNELS, TEXTURES, Asset, Material, Part, RejectedAsset
 from spnr_jax.formats.mesh.texels import lookup
-from spnr_jax.kernels.thinning import farthest_points
+from spnr_jax.kernels.cloud_arrays import farthest_points
 
 Spread = Literal["random", "even"]
 MOST_ROUNDS = 64  # of drawing points on a surface that is cut out, before it counts as nowhere
@@ -90,14 +90,16 @@ def _random_points(asset: Asset, num_points: int, seed: int) -> SurfacePoints:
     while found < num_points:
         if len(rounds) == MOST_ROUNDS:
             raise RejectedAsset("has next to no surface that its textures do not cut out")
-        columns = _drawn(asset, cumulative, num_points, rng)
+        columns = _draw_points(asset, cumulative, num_points, rng)
         solid = columns.pop("solid")
         found += int(np.count_nonzero(solid))
         rounds.append({name: values[solid] for name, values in columns.items()})
     return SurfacePoints(**{name: np.concatenate([r[name] for r in rounds])[:num_points] for name in rounds[0]})
 
 
-def _drawn(asset: Asset, cumulative: np.ndarray, num_points: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
+def _draw_points(
+    asset: Asset, cumulative: np.ndarray, num_points: int, rng: np.random.Generator
+) -> dict[str, np.ndarray]:
     """The columns of SurfacePoints of random points on all faces, and whether there is surface at them: `solid`."""
     face = np.searchsorted(cumulative, rng.random(num_points) * cumulative[-1], side="right")
     face = np.minimum(face, np.searchsorted(cumulative, cumulative[-1]))  # the product can round up to the total
@@ -155,7 +157,7 @@ def _sample_part(part: Part, face: np.ndarray, barycentric: np.ndarray) -> dict[
         pair, _ = part.material.coordinates.get("normal_map", (0, part.material.wrap))
         corners = part.faces[face]
         own = part.texcoords[:, 2 * pair : 2 * pair + 2]
-        normals = tilted(normals, normal_map, part.positions[corners], own[corners])
+        normals = tilt_normals(normals, normal_map, part.positions[corners], own[corners])
     solid = np.ones(len(face), bool) if opacity is None else opacity >= part.material.cutoff
     return {"positions": interpolate(part.positions), "normals": normals, "solid": solid, **channels}
 
@@ -187,7 +189,7 @@ def unit(vectors: np.ndarray, fallback: np.ndarray | None = None) -> np.ndarray:
     return directed if fallback is None else np.where(length > 0, directed, fallback)
 
 
-def tilted(normals: np.ndarray, texels: np.ndarray, corners: np.ndarray, texcoords: np.ndarray) -> np.ndarray:
+def tilt_normals(normals: np.ndarray, texels: np.ndarray, corners: np.ndarray, texcoords: np.ndarray) -> np.ndarray:
     """Unit normals (n, 3) tilted by texels (n, 3), on triangles with corners (n, 3, 3) and texcoords (n, 3, 2)."""
     edges, steps = corners[:, 1:] - corners[:, :1], texcoords[:, 1:] - texcoords[:, :1]
     area = steps[:, 0, 0] * steps[:, 1, 1] - steps[:, 0, 1] * steps[:, 1, 0]

@@ -9,7 +9,7 @@ from support.gltf_files import UV, GltfBuilder
 
 from spnr_jax.formats.mesh.assets import Asset, Material, Part, RejectedAsset
 from spnr_jax.formats.mesh.meshes import load_mesh
-from spnr_jax.formats.mesh.surface_points import normalise, sample_surface, tilted
+from spnr_jax.formats.mesh.surface_points import normalise, sample_surface, tilt_normals
 
 CORNERS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float64)
 FACES = np.array([[0, 1, 2], [0, 2, 3]])
@@ -162,5 +162,5 @@ def test_where_the_coordinates_have_no_area_the_normal_stays():
     corners = np.array([[[0, 0, 0], [1, 0, 0], [0, 1, 0]]] * 3, float)
     texcoords = np.array([[[0, 0], [0, 0], [0, 0]], [[0, 0], [1, 1], [2, 2]], [[0, 0], [1, 0], [0, 1]]], float)
     normals = np.tile([0.0, 0, 1], (3, 1))
-    found = tilted(normals, np.array([RED, RED, (0, 0, 0)]), corners, texcoords)
+    found = tilt_normals(normals, np.array([RED, RED, (0, 0, 0)]), corners, texcoords)
     np.testing.assert_array_equal(found, normals)

@@ -47,7 +47,7 @@ def test_a_bad_mesh_is_left_out_with_its_reason_and_the_others_are_made(finished
     rows = [json.loads(line) for line in (finished / "rejected.jsonl").read_text().splitlines()]
     assert [(row["id"], row["path"]) for row in rows] == [("empty", "empty.ply")]
     assert rows[0]["reason"]
-    assert layout.completed_objects(finished) == {f"thing_{number}" for number in range(4)}
+    assert layout.list_completed(finished) == {f"thing_{number}" for number in range(4)}
     assert len(layout.read_split(finished, "test")) == 1
 
 

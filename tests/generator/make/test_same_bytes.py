@@ -47,7 +47,7 @@ def files(place):
 
 def wait_for(out, number, process):
     """The names of the objects that are done, once they are so many."""
-    while len(done := layout.completed_objects(out)) < number:
+    while len(done := layout.list_completed(out)) < number:
         assert process.poll() is None
         time.sleep(0.01)
     return done
@@ -75,7 +75,7 @@ def with_two_workers_that_are_stopped_and_go_on(folder, _):
     assert process.returncode == 130, message
     assert "Traceback" not in message
     assert "stopped" in message.splitlines()[-1]
-    assert layout.completed_objects(out)
+    assert layout.list_completed(out)
     assert not list((out / "objects").glob(storage.UNFINISHED + "*"))
     assert not (out / "splits").exists()
     make(out, workers=2)

@@ -6,8 +6,7 @@ from support.handmade import ball, plain
 
 from data_gen.render import light, views
 from spnr_jax.formats.mesh.assets import Asset
-from spnr_jax.surfels.envmaps import directions
-from spnr_jax.surfels.room import indoor_envmap
+from spnr_jax.surfels.skies import directions, indoor_envmap
 
 
 def solid_angle_mean(envmap):
@@ -23,13 +22,13 @@ def room():
 
 
 def test_a_white_diffuse_sphere_averages_0_6_under_the_scaled_map(room):
-    scaled = light.scaled_to_white(room)
+    scaled = light.scale_to_white(room)
     assert light.white_sphere_radiance(scaled, num_views=24, seed=5) == pytest.approx(0.6, rel=0.01)
     assert solid_angle_mean(scaled) == pytest.approx(0.6, rel=0.01)
 
 
 def test_scaling_leaves_the_colours_and_contrasts_of_the_map_alone(room):
-    scaled = light.scaled_to_white(3.7 * room)
+    scaled = light.scale_to_white(3.7 * room)
     np.testing.assert_allclose(scaled / scaled.mean(), room / room.mean(), rtol=1e-4)
 
 

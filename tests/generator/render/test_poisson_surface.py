@@ -32,7 +32,7 @@ SPHERE = cloud_of(RADIUS * directions())
 
 def test_the_normals_of_a_sphere_point_outwards_wherever_it_stands():
     for centre in ([0, 0, 0], [5.0, -3, 2]):
-        found = poisson_surface.oriented_normals(RADIUS * directions() + centre)
+        found = poisson_surface.orient_normals(RADIUS * directions() + centre)
         assert (found * directions()).sum(1).min() > 0.97
 
 
@@ -42,7 +42,7 @@ def test_the_normals_of_two_separate_boxes_point_out_of_their_own_box():
     axis, side = rng.integers(0, 3, (2, 400)), rng.choice([-1.0, 1.0], (2, 400))
     np.put_along_axis(faces, axis[..., None], side[..., None], axis=-1)
     outwards = side.ravel()[:, None] * np.eye(3)[axis.ravel()]
-    found = poisson_surface.oriented_normals((faces + [[[0, 0, 0]], [[9, 0, 0]]]).reshape(-1, 3), 10)
+    found = poisson_surface.orient_normals((faces + [[[0, 0, 0]], [[9, 0, 0]]]).reshape(-1, 3), 10)
     middle = (np.sort(np.abs(faces), axis=-1)[..., 1] < 0.7).ravel()  # away from the edges, where planes are mixed
     assert (found * outwards).sum(1)[middle].min() > 0.9
 
@@ -50,14 +50,14 @@ def test_the_normals_of_two_separate_boxes_point_out_of_their_own_box():
 def test_the_normals_of_an_open_dome_point_away_from_its_middle_wherever_it_stands():
     dome = directions()[directions()[:, 2] > 0.3]
     for centre in ([0, 0, 0], [0, 0, -9]):
-        assert (poisson_surface.oriented_normals(RADIUS * dome + centre) * dome).sum(1).min() > 0.8
+        assert (poisson_surface.orient_normals(RADIUS * dome + centre) * dome).sum(1).min() > 0.8
 
 
 def test_the_order_of_the_points_does_not_matter_to_their_normals():
     positions, order = RADIUS * directions(), np.random.default_rng(2).permutation(COUNT)
     np.testing.assert_allclose(
-        poisson_surface.oriented_normals(positions[order]),
-        poisson_surface.oriented_normals(positions)[order],
+        poisson_surface.orient_normals(positions[order]),
+        poisson_surface.orient_normals(positions)[order],
         atol=1e-9,
     )
 
@@ -85,10 +85,10 @@ def test_masked_points_are_no_points():
 def test_trimming_cuts_off_the_least_supported_vertices_and_the_faces_on_them():
     square = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [9, 9, 0]], float)
     faces = np.array([[0, 1, 2], [0, 2, 3], [2, 4, 3]])
-    vertices, kept = poisson_surface.trimmed(square, faces, np.array([4.0, 5, 6, 7, 1]), 0.2)
+    vertices, kept = poisson_surface.trim(square, faces, np.array([4.0, 5, 6, 7, 1]), 0.2)
     np.testing.assert_array_equal(vertices, square[:4])
     np.testing.assert_array_equal(kept, faces[:2])
-    np.testing.assert_array_equal(poisson_surface.trimmed(square, faces, np.zeros(5), 0.0)[1], faces)
+    np.testing.assert_array_equal(poisson_surface.trim(square, faces, np.zeros(5), 0.0)[1], faces)
 
 
 def test_the_normal_of_a_vertex_is_the_mean_of_its_faces_by_area_and_no_face_gives_the_y_axis():

@@ -1,4 +1,9 @@
-"""Pictures in other sizes: bilinear, and means over squares of pixels."""
+"""Pictures as arrays: the sRGB curve (IEC 61966-2-1), and other sizes, bilinear or means over squares of pixels.
+
+Materials and light are linear, images are sRGB, and so is the mixture of object and background in a pixel.  The curve
+and its inverse are a line near 0 and a power above; the power sees a harmless input where the line is taken, so values
+and gradients are finite at 0 and below.
+"""
 
 import dataclasses
 
@@ -6,9 +11,47 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from spnr_jax.kernels.colors import over, srgb_to_linear, unweighted
 from spnr_jax.kernels.compositing import WHITE
+from spnr_jax.kernels.numerics import clamp
 from spnr_jax.kernels.records import Rendering
+
+# --- colours ----------------------------------------------------------------------------------------------------------
+
+
+LINEAR_LIMIT, ENCODED_LIMIT = 0.0031308, 0.04045  # where line and power meet
+SLOPE, SCALE, OFFSET, EXPONENT = 12.92, 1.055, 0.055, 2.4
+LEAST_OPACITY = 1e-6  # below it a pixel shows the background, whatever its colour
+
+
+def linear_to_srgb(linear: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+    """sRGB values of linear ones: [0, 1] onto [0, 1]; nothing is clipped."""
+    power = linear > LINEAR_LIMIT
+    encoded = SCALE * jnp.where(power, linear, 1.0) ** (1 / EXPONENT) - OFFSET
+    return jnp.where(power, encoded, SLOPE * linear)
+
+
+def srgb_to_linear(encoded: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+    """Linear values of sRGB ones: [0, 1] onto [0, 1]; nothing is clipped."""
+    power = encoded > ENCODED_LIMIT
+    linear = ((jnp.where(power, encoded, 1.0) + OFFSET) / SCALE) ** EXPONENT
+    return jnp.where(power, linear, encoded / SLOPE)
+
+
+def over(
+    light: Float[Array, "*batch channels"], opacity: Float[Array, "*batch 1"], background: float
+) -> Float[Array, "*batch channels"]:
+    """sRGB of an object on a background (sRGB), from its opacity and its linear light, weighted by that opacity."""
+    return opacity * linear_to_srgb(unpremultiply(light, opacity)) + (1 - opacity) * background
+
+
+def unpremultiply(
+    color: Float[Array, "*batch channels"], opacity: Float[Array, "*batch 1"]
+) -> Float[Array, "*batch channels"]:
+    """The colour in [0, 1] of what has this opacity, from the colour weighted by it."""
+    return clamp(color / jnp.maximum(opacity, LEAST_OPACITY), 0.0, 1.0)
+
+
+# --- sizes ------------------------------------------------------------------------------------------------------------
 
 
 def bilinear(
@@ -18,7 +61,7 @@ def bilinear(
     return jax.image.resize(x, (x.shape[0], height, width, x.shape[-1]), "bilinear", antialias=False)
 
 
-def doubled(x: Float[Array, "batch height width features"]) -> Float[Array, "batch h w features"]:
+def double_size(x: Float[Array, "batch height width features"]) -> Float[Array, "batch h w features"]:
     """Twice the size, bilinear; the border repeats."""
     for axis in (1, 2):
         size = x.shape[axis]
@@ -38,7 +81,7 @@ def mean_of_squares(x: Float[Array, "*batch height width features"], side: int) 
     return jnp.mean(squares(x, side), axis=(-4, -2))
 
 
-def unfolded(x: Float[Array, "*batch h w folded"], side: int) -> Float[Array, "*batch height width features"]:
+def unfold(x: Float[Array, "*batch h w folded"], side: int) -> Float[Array, "*batch height width features"]:
     """A square of side x side pixels from the features of each pixel."""
     *batch, height, width, features = x.shape
     x = jnp.swapaxes(x.reshape(*batch, height, width, side, side, features // side**2), -4, -3)
@@ -51,20 +94,20 @@ def squares(x: Float[Array, "*batch height width features"], side: int) -> Array
     return x.reshape(*batch, height // side, side, width // side, side, features)
 
 
-def enlarged(rendering: Rendering, height: int, width: int) -> Rendering:
+def enlarge(rendering: Rendering, height: int, width: int) -> Rendering:
     """The rendering at a larger size: colours by cubics, depth and opacity between their neighbours."""
     color = jnp.clip(jax.image.resize(rendering.image, (height, width, 3), "cubic"), 0, 1)
     depth, acc = (jax.image.resize(x, (height, width), "linear") for x in (rendering.depth, rendering.acc))
     return dataclasses.replace(rendering, image=color, image_lr=color, depth=depth, acc=acc)
 
 
-def averaged(rendering: Rendering, side: int) -> Rendering:
+def average(rendering: Rendering, side: int) -> Rendering:
     """The rendering with every square of side x side pixels averaged: the light of the object, its opacity, the depth.
 
     Colours are averaged as linear light of the object alone and laid on white as sRGB, as the references are.
     """
     opacity, depth = rendering.acc[..., None], rendering.depth[..., None]
-    straight = unweighted(rendering.image - (1 - opacity) * WHITE, opacity)
+    straight = unpremultiply(rendering.image - (1 - opacity) * WHITE, opacity)
     light, depth, acc = (mean_of_squares(x, side) for x in (opacity * srgb_to_linear(straight), depth, opacity))
     image = over(light, acc, WHITE)
     return Rendering(image=image, image_lr=image, depth=depth[..., 0], acc=acc[..., 0])
