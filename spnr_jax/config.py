@@ -96,7 +96,7 @@ AS_TRAINED = RenderOptions()
 
 @dataclass(frozen=True, kw_only=True)
 class EncoderConfig:
-    """Sizes of PointNet and 3D U-Net, which make a volume of points (`nn/paper.py`)."""
+    """Sizes of PointNet and 3D U-Net, which make a volume of points (`nn/paper_layers.py`)."""
 
     materials: tuple[Material, ...] = ("base_color", "roughness", "metallic")
     """Material channels that the points carry into the network."""

@@ -247,7 +247,7 @@ def test_a_stop_is_exit_code_130_and_says_so(capsys):
     def stopped():
         raise KeyboardInterrupt
 
-    assert cli.guarded(stopped, "spnr") == 130
+    assert cli.guard(stopped, "spnr") == 130
     assert capsys.readouterr().err == "spnr: stopped\n"
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
@@ -257,7 +257,7 @@ def test_an_error_of_the_program_keeps_its_traceback():
         raise AssertionError("a bug")
 
     with pytest.raises(AssertionError, match="a bug"):
-        cli.guarded(broken, "spnr")
+        cli.guard(broken, "spnr")
 
 
 def test_an_error_shows_its_call_stack_for_debug_alone_and_its_line_in_any_case(capsys, monkeypatch):

@@ -58,7 +58,7 @@ def test_debug_is_an_option_at_any_place_or_a_variable(monkeypatch):
 ODD_NAME = """
 from spnr_jax import errors
 name = b"caf\\xe9-\\xff.ply".decode("utf-8", "surrogateescape") + "\\u732b"
-errors.guarded(lambda: print(name), "spnr")
+errors.guard(lambda: print(name), "spnr")
 """
 
 
@@ -105,7 +105,7 @@ def tidied():
         print("tidied")
 
 begin = time.monotonic()
-code = errors.guarded(globals()[sys.argv[1]], "spnr")
+code = errors.guard(globals()[sys.argv[1]], "spnr")
 assert time.monotonic() - begin < 15
 sys.exit(code)
 """

@@ -225,7 +225,7 @@ def render_view(scene: Scene, cam_to_world: np.ndarray, config: ViewConfig, seed
 def visible_points(scene: Scene, surface, cam_to_world: np.ndarray, config: ViewConfig, seed: int) -> np.ndarray:
     """Which `SurfacePoints` the camera sees, (points,) bool, by the config's rule; see the header."""
     if config.visibility == "point":
-        return test_visibility(scene, surface.positions, cam_to_world[:3, 3])
+        return find_unoccluded(scene, surface.positions, cam_to_world[:3, 3])
     return np.isin(surface.face, visible_faces(scene, cam_to_world, config, seed))
 
 
@@ -239,7 +239,7 @@ def visible_faces(scene: Scene, cam_to_world: np.ndarray, config: ViewConfig, se
     return np.unique(np.concatenate([first + face[shape == number] for number, first in scene.first_face.items()]))
 
 
-def test_visibility(scene: Scene, positions: np.ndarray, eye: np.ndarray) -> np.ndarray:
+def find_unoccluded(scene: Scene, positions: np.ndarray, eye: np.ndarray) -> np.ndarray:
     """Which surface points (points, 3) nothing hides from the eye (3,), (points,) bool; one ray for each."""
     mi = mitsuba_module()
     towards = np.asarray(eye, np.float64) - positions

@@ -30,7 +30,7 @@ from spnr_jax.errors import UserError, require
 from spnr_jax.kernels import cameras, compositing, sampling
 from spnr_jax.kernels.numerics import per_feature, softplus
 from spnr_jax.kernels.records import Camera, Key, PointCloud, Rays, Rendering
-from spnr_jax.nn.paper import encode_direction
+from spnr_jax.nn.paper_layers import encode_direction
 
 QUIET = -6.0  # log variance that the encoder begins with: codes are told apart from the first step on
 

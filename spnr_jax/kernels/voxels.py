@@ -162,7 +162,7 @@ def corners(
     grid = clamp((positions + 1) * (0.5 * resolution) - 0.5, 0, resolution - 1)
     cell = jnp.clip(jnp.floor(grid), 0, max(resolution - 2, 0))
     upper = grid - jax.lax.stop_gradient(cell)
-    # rows as a matrix product, for the reason that `computed_once` gives; exact in float32 up to 256^3 voxels
+    # rows as a matrix product, for the reason that `compute_once` gives; exact in float32 up to 256^3 voxels
     strides = jnp.array([[1.0], [resolution], [resolution**2]])
     lowest = jnp.matmul(cell.reshape(-1, 3), strides, precision="highest").astype(jnp.int32)[:, 0]
     places = list(itertools.product((0, 1), repeat=3))

@@ -1,6 +1,6 @@
 """The paper's method on one page: points -> volume -> features along rays -> image.
 
-    encode   PointNet on every point, mean per voxel, 3D U-Net (`nn/paper.py`)             once per object
+    encode   PointNet on every point, mean per voxel, 3D U-Net (`nn/paper_layers.py`)             once per object
     render   64 x 64 rays, 64 coarse and 64 fine samples, field, compositing, 2D upsampler   once per view
     trace    all rays: those that meet nothing are left out, the others rendered in blocks on the device of their object
     march    rays of a block: coarse samples, fine samples where the coarse weights are large, compositing
@@ -31,7 +31,7 @@ from spnr_jax.kernels.numerics import clamp
 from spnr_jax.kernels.records import LARGEST_REACH, Camera, Key, Light, PointCloud, Rays, Rendering, Scene, Volume
 from spnr_jax.kernels.voxels import Path
 from spnr_jax.method import inference
-from spnr_jax.nn.paper import Discriminator, Encoder, RadianceField, Upsampler
+from spnr_jax.nn.paper_layers import Discriminator, Encoder, RadianceField, Upsampler
 
 SAMPLES = {"draft": 0.25, "balanced": 0.5, "best": 1.0}  # share of the samples a ray was trained with
 REACH_PER_SPACING = 1.6  # what loses nothing from 128 to 4096 points, docs/lab/cpu_forms.md

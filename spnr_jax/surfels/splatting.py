@@ -32,7 +32,7 @@ FAR = 1e-4  # summed narrow weights that the centres' distances pass to 0 at
 def blend(
     found: Entries, surfels: Surfels, attributes: Float[Array, "points features"], camera: Camera, *, slots: int
 ) -> GBuffer:
-    """The G-buffer from the entries of a picture, of its first `slots` covered pixels (`covered_pixels`)."""
+    """The G-buffer from the entries of a picture, of its first `slots` covered pixels (`count_covered_pixels`)."""
     height, width = camera.height, camera.width
     table, pixel_of = _lists(found, slots, height * width)
     listed = table >= 0

@@ -20,7 +20,7 @@ from spnr_jax.kernels import cameras, compositing, imaging, losses, metrics, num
 from spnr_jax.kernels.records import Camera, Rays, Scene
 from spnr_jax.method import inference, paper_method
 from spnr_jax.nn.convolution import BatchNorm, GroupNorm
-from spnr_jax.nn.paper import encode_direction
+from spnr_jax.nn.paper_layers import encode_direction
 
 FINITE = 1e30  # a floor under which gradients only have to be finite
 BINS, POINTS = 8, 12

@@ -14,7 +14,7 @@ from spnr_jax.config import AS_TRAINED
 from spnr_jax.kernels import cameras, compositing, losses, sampling, voxels
 from spnr_jax.method import inference, pixels
 from spnr_jax.method.paper_method import trace
-from spnr_jax.nn.paper import encode_direction
+from spnr_jax.nn.paper_layers import encode_direction
 from spnr_jax.training import optimisation
 
 TOLERANCE = 1e-4

@@ -19,7 +19,7 @@ from spnr_jax.kernels import sampling
 from spnr_jax.kernels.cameras import intersect_box, view_rays
 from spnr_jax.kernels.records import Rays, Scene
 from spnr_jax.method import inference
-from spnr_jax.nn.paper import Encoder
+from spnr_jax.nn.paper_layers import Encoder
 
 SUPPORT = Path(__file__).parents[1] / "support"
 CONFIG = tiny_model.WITHOUT_UPSAMPLER

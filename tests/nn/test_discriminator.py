@@ -6,7 +6,7 @@ import numpy as np
 from support import reference
 from support.laws import close, numbers
 
-from spnr_jax.nn.paper import Discriminator
+from spnr_jax.nn.paper_layers import Discriminator
 
 IMAGE, CONDITION = numbers(0, 2, 24, 24, 3), numbers(1, 2, 24, 24, 3)
 MASK = numbers(2, 2, 24, 24) > 0

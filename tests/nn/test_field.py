@@ -9,7 +9,7 @@ from support.laws import close, numbers
 
 from spnr_jax.kernels.compositing import composite, volume_weights
 from spnr_jax.kernels.numerics import normalize
-from spnr_jax.nn.paper import RadianceField
+from spnr_jax.nn.paper_layers import RadianceField
 
 MODULE = RadianceField(width=6, num_features=7, direction_frequencies=2)
 X, DIRECTIONS = numbers(0, 2, 3, 5, 4), normalize(numbers(1, 2, 3, 3))

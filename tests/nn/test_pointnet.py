@@ -6,7 +6,7 @@ import numpy as np
 from support.laws import close, numbers
 
 from spnr_jax.kernels.imaging import srgb_to_linear
-from spnr_jax.nn.paper import BRIGHTNESS_AND_HUE, PointNet, spread_out
+from spnr_jax.nn.paper_layers import BRIGHTNESS_AND_HUE, PointNet, spread_out
 
 X, MASK = numbers(0, 2, 6, 5), jnp.ones((2, 6), bool).at[1, 4:].set(False)
 MODULE = PointNet(widths=(8, 4), num_features=3)

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from support.laws import close, numbers
 
-from spnr_jax.nn.paper import UNet3D
+from spnr_jax.nn.paper_layers import UNet3D
 
 ROWS = jnp.asarray(np.random.default_rng(0).integers(0, 513, (2, 20)), jnp.int32)
 VALUES = numbers(1, 2, 20, 3)

@@ -8,7 +8,7 @@ from support import reference
 from support.laws import close, numbers
 
 from spnr_jax.kernels.imaging import bilinear
-from spnr_jax.nn.paper import Upsampler
+from spnr_jax.nn.paper_layers import Upsampler
 
 X = numbers(0, 2, 4, 6, 5)
 MODULE = Upsampler(width=4)

@@ -14,7 +14,7 @@ _seen_from = jax.jit(see_directions, static_argnames="grid")
 
 
 def seen(positions, normals, spacing, mask=None):
-    """`seen_from` of NumPy arrays with points equally far apart."""
+    """`see_directions` of NumPy arrays with points equally far apart."""
     count = len(positions)
     arrays = (jnp.asarray(np.asarray(x, np.float32).T) for x in (positions, np.broadcast_to(normals, (count, 3))))
     mask = jnp.asarray(np.ones(count, bool) if mask is None else mask)

@@ -140,7 +140,7 @@ def evaluate_material(material: Material, texcoords: np.ndarray | None, count: i
 
 
 def _sample_part(part: Part, face: np.ndarray, barycentric: np.ndarray) -> dict[str, np.ndarray]:
-    """Every column but `face` that `_drawn` gives, at barycentric coordinates (n, 3) of local faces (n,)."""
+    """Every column but `face` that `_draw_points` gives, at barycentric coordinates (n, 3) of local faces (n,)."""
 
     def interpolate(values: np.ndarray) -> np.ndarray:
         return np.einsum("nk,nkc->nc", barycentric, values[part.faces[face]])

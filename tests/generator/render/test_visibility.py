@@ -42,7 +42,7 @@ def hidden(asset, positions, eye):
 @pytest.mark.parametrize("eye", EYES)
 def test_a_point_is_seen_where_no_triangle_crosses_its_way_to_the_camera(eye):
     surface = surface_points.sample_surface(CROWD, 2000, 0)
-    seen = views.test_visibility(views.build_scene(CROWD, LIGHT), surface.positions, eye)
+    seen = views.find_unoccluded(views.build_scene(CROWD, LIGHT), surface.positions, eye)
     expected = ~hidden(CROWD, surface.positions.astype(np.float64), eye)
     assert 0.2 < expected.mean() < 0.8
     assert (seen != expected).sum() <= 2  # at an edge, float32 may decide otherwise
@@ -90,7 +90,7 @@ kept = [views.build_scene(WALL_AND_BOX, LIGHT), views.build_scene(CROWD, LIGHT)]
 scene, surface = views.build_scene(CROWD, LIGHT), surface_points.sample_surface(CROWD, 500, 0)
 for eye in EYES:
     print(*views.visible_faces(scene, views.look_at(eye), CONFIG, 0))
-    print(*np.flatnonzero(views.unoccluded(scene, surface.positions, eye)))
+    print(*np.flatnonzero(views.find_unoccluded(scene, surface.positions, eye)))
 image = views.render_view(scene, views.look_at(EYES[0]), CONFIG, 0)
 print(*image.mean(axis=(0, 1)))
 """
