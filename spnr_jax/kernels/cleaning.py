@@ -1,21 +1,23 @@
-"""Cleaning of scans: points that lie apart are removed, noisy ones are averaged; clean clouds stay as they are.
+"""Cleaning of scans: outliers are removed, noisy points are averaged; clean clouds are unchanged.
 
-    outliers    the mean distance of a point to its neighbours, against the median of theirs: the idea of the local
-                outlier factor (Breunig et al. 2000), so that a density that varies smoothly removes nothing.  The limit
-                is robust: a multiple of the median absolute deviation (MAD), and never below a fixed ratio
+    outliers    the mean distance of a point to its neighbours over the median of its neighbours' mean distances: the
+                idea of the local outlier factor (Breunig et al. 2000), so that smoothly varying density removes
+                nothing.  The limit is robust: a multiple of the median absolute deviation (MAD), and never below a
+                fixed ratio
     noise       distance of the neighbours from the plane that most of them lie close to (least quantile of squares,
-                Rousseeuw 1984): at an edge or a thin wall that is one of the faces, so that neither counts as noise.
-                A plane with that noise would have these heights; around thick noise the neighbourhood grows
-    averaging   each point is moved to where it most likely was, and then along the normal onto the plane of those
-                around it, as moving least squares do (Alexa et al. 2001), within a radius that the noise gives; points
-                of like colour count (Tomasi & Manduchi 1998), so that letters stay and two layers do not become one.
-                Materials become the mean of those that then lie close.  Where a point was is Tweedie's formula (Efron
-                2011), x + sigma^2 times the gradient of the logarithm of the density, which mean m and covariance C of
-                the points around it tell in a window (Hjort & Jones 1996): C^-1 (m - x).  A plane becomes flat, a thin
-                bar keeps its thickness
-    fringe      what noise left in places that few points share, beside those that many do, is removed
+                Rousseeuw 1984): at an edge or a thin wall, that is one of the faces, so that neither counts as noise.
+                The noise is that of a plane whose points would have these distances; in thick noise the neighbourhood
+                grows
+    averaging   each point is moved to its most likely true position, and then along the normal onto the plane of the
+                points around it (moving least squares, Alexa et al. 2001), within a radius that depends on the noise.
+                Points of similar colour count (Tomasi & Manduchi 1998), so that letters stay and two layers do not
+                merge.  Materials become the mean of those that then lie close.  The true position is given by Tweedie's
+                formula (Efron 2011), x + sigma^2 times the gradient of the logarithm of the density.  That gradient is
+                C^-1 (m - x), with mean m and covariance C of the points in a window around x (Hjort & Jones 1996).  A
+                plane becomes flat, a thin bar keeps its thickness
+    fringe      noise that remains in places with few points, beside places with many, is removed
 
-NumPy in, NumPy out, near linear in the points; the order of the points does not matter.
+NumPy in, NumPy out, nearly linear in the number of points; the order of the points does not matter.
 """
 
 import dataclasses

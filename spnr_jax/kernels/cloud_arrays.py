@@ -1,10 +1,10 @@
 """Arrays of a cloud before a network sees it: padding, repeated points, thinning.  NumPy in, NumPy out.
 
-repeats     points within NEAR of the median spacing are merged, and what then is no surface is refused; the spacing is
-            told by many neighbours, so that a scan written out several times does not hide it
+repeats     points within NEAR of the median spacing are merged; a cloud that then is no surface is refused.  The
+            spacing is estimated from many neighbours, so that a scan that was written several times does not hide it
 thinning    a random sample while reading, voxels, then farthest points.  A voxel keeps the first of its points in the
             order of the file; voxels are halved around a fixed corner, so that the result depends on the points and
-            their order alone.  Thinning with voxels first bounds memory and time of the farthest points.
+            their order alone.  Thinning with voxels first bounds the memory and time of farthest-point sampling.
 """
 
 from collections.abc import Iterable

@@ -1,8 +1,8 @@
-"""Emission-absorption along a ray: from densities at samples to what the camera sees.
+"""Emission-absorption along a ray: from densities at samples to a pixel.
 
-Vocabulary (NeRF, eq. 3): `density` >= 0 per unit length, `delta` the length of the interval that a sample owns, optical
-depth `tau = density * delta`, `transmittance` the share of light that reaches a point, `weights` the share that stops
-in each interval, `acc` their sum (opacity), residual transmittance 1 - acc.  Intervals are finite: what passes the last
+Vocabulary (NeRF, eq. 3): `density` >= 0 per unit length, `delta` the length of a sample's interval, optical depth
+`tau = density * delta`, `transmittance` the share of light that reaches a point, `weights` the share that stops in each
+interval, `acc` their sum (opacity), residual transmittance 1 - acc.  Intervals are finite: light that passes the last
 one meets the background.  All of it is float32.
 """
 

@@ -1,7 +1,7 @@
-"""Pictures as arrays: the sRGB curve (IEC 61966-2-1), and other sizes, bilinear or means over squares of pixels.
+"""Pictures as arrays: the sRGB curve (IEC 61966-2-1), and resizing, bilinear or by means over squares of pixels.
 
 Materials and light are linear, images are sRGB, and so is the mixture of object and background in a pixel.  The curve
-and its inverse are a line near 0 and a power above; the power sees a harmless input where the line is taken, so values
+and its inverse are a line near 0 and a power above.  Where the line is used, the power gets a harmless input, so values
 and gradients are finite at 0 and below.
 """
 

@@ -1,4 +1,4 @@
-"""What training minimises; each function returns a mean over all elements of its input."""
+"""Losses of the training; each function returns a mean over all elements of its input."""
 
 from collections.abc import Callable
 

@@ -1,8 +1,8 @@
 """Where along a ray the volume is evaluated: stratified samples, and samples drawn from a step function.
 
 Vocabulary: `edges` (*batch, n+1) are the sorted ends of n bins along a ray, `distances` (*batch, m) are samples,
-`weights` (*batch, n) is the mass of each bin.  A key draws one number per sample of every ray, keys of the rays
-(*batch) each those of its own; key=None takes the middle of each stratum.  All of it is float32: one bf16 spacing is
+`weights` (*batch, n) is the mass of each bin.  One key draws a number per sample of every ray; an array of keys
+(*batch) has one key per ray; key=None takes the middle of each stratum.  All of it is float32: one bf16 spacing is
 wider than a coarse bin.
 """
 

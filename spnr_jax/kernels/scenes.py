@@ -1,12 +1,11 @@
 """Parts of a scene: points inside a box, the dominant plane, clusters.
 
-    voxel       side of the cubes in which CROWD points lie on average: some three spacings, whatever the pattern
-    clusters    components of voxels that touch by a face, an edge or a corner: things that lie farther apart are
-                several
-    plane       RANSAC (Fischler and Bolles 1981) over one point of each voxel, so that areas count, not how densely the
-                sensor sees them; fitted again to what lies close
+    voxel       side of the cubes that hold CROWD points on average: about three spacings, for any pattern of points
+    clusters    connected components of voxels that share a face, an edge or a corner
+    plane       RANSAC (Fischler and Bolles 1981) over one point of each voxel, so that area counts, not the density of
+                the scan; fitted again to the points close to it
 
-NumPy in, NumPy out, near linear in the points; the seed chooses the planes that are tried.
+NumPy in, NumPy out, nearly linear in the number of points; the seed chooses the planes that are tried.
 """
 
 import dataclasses

@@ -1,4 +1,4 @@
-"""Points to volume and back (scatter by voxel, trilinear lookup), and the empty space where nothing is evaluated.
+"""Points to volume and back (scatter by voxel, trilinear lookup), and empty-space skipping.
 
 A scatter is a sum: each point adds 1 / (points in its voxel) of its features to the voxel's mean (`spread`).
 
@@ -6,7 +6,7 @@ A volume covers the box [-1, 1]^3 with D voxels along each axis and is indexed (
 covers [-1 + 2 i / D, -1 + 2 (i + 1) / D].  Positions are (x, y, z).  In grid coordinates, (position + 1) * D / 2, voxel
 centres lie at i + 0.5.  Leading batch axes pair a volume with its positions.
 
-A ray is cut into equal cells; those whose middle lies in a voxel near points are `open` (occupied segments).
+A ray is cut into equal cells; those with their middle in a voxel near points are `open` (occupied segments).
 `travelled` is the length of the open cells up to a place: samples lie in the concatenated segments, so that none falls
 into a gap, and a gap adds no interval length.  Density is 0 outside, by definition.
 """

@@ -1,1 +1,1 @@
-"""The method: a network that renders rays of an encoded cloud, and the handle that people use."""
+"""The two methods, ours and the paper's, and the handle to load, encode and render with."""

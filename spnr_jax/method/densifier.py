@@ -3,13 +3,13 @@
     propose    pairs of neighbors without a point between them, and open places beside points: rims, legs, gaps
     place      the middle of the curve through both ends at right angles to their normals (Vlachos et al. 2001), and
                a frame there
-    predict    a PointNet over the points around each place, in its frame: how far the surface lies from there, its
-               normal, whether it exists, whose material it has
-    choose     likely children that are not too near to better ones
+    predict    a PointNet over the points around each place, in its frame: offset of the surface from there, its normal,
+               whether it exists, whose material it has
+    choose     likely children that are not too close to better ones
 
-All is relative: lengths in spacings, vectors in frames that turn with the cloud, so a turned cloud has turned children.
-Topology, the neighbors, comes from the host; which pairs, which points around them, and which children are kept are
-choices, whose gradient is none; places, normals and materials are differentiable.
+All inputs are relative: lengths in spacings, vectors in frames that rotate with the cloud, so the children rotate with
+the cloud, too.  The neighbors come from the host.  The choices of pairs, of points around them, and of children have no
+gradient; places, normals and materials are differentiable.
 """
 
 import dataclasses

@@ -1,11 +1,11 @@
 """The functions of a method whose network is a Linen module (`methods.network`), and its loss.
 
     encode, render               batches of objects, in the box; pure
-    loss                         of a training batch; pure
-    encode_volume, draw          one object, compiled: what the handle (model.py), scores and the viewer ask for
+    loss                         loss of a training batch; pure
+    encode_volume, draw          one object, compiled: for the handle (model.py), scores and the viewer
 
-The module has `encode(cloud, train)`, `render(scene, camera, options)` and `__call__(cloud, camera, key, train)`.  What
-it sows into the collection "losses" is added to the loss.
+The module has `encode(cloud, train)`, `render(scene, camera, options)` and `__call__(cloud, camera, key, train)`.
+Values sown into the collection "losses" are added to the loss.
 """
 
 import dataclasses

@@ -1,10 +1,10 @@
-"""The model for people who only want pictures: load a network, encode a cloud once, render it from anywhere.
+"""The handle for pictures: load a network, encode a cloud once, render it from anywhere.
 
     model = spnr_jax.load()  # the network of the package; or a run folder, a file of weights
     volume = model.encode(spnr_jax.read_cloud("chair.ply"))
     rendering = model.render(volume, model.camera(volume, azimuth=30, elevation=20))
 
-Clouds, cameras and depths are in the cloud's own units; the transform into the network's box is kept with the volume.
+Clouds, cameras and depths are in the cloud's own units; the volume stores the transform into the network's box.
 """
 
 import dataclasses

@@ -2,12 +2,12 @@
 
     encode   PointNet on every point, mean per voxel, 3D U-Net (`nn/paper_layers.py`)             once per object
     render   64 x 64 rays, 64 coarse and 64 fine samples, field, compositing, 2D upsampler   once per view
-    trace    all rays: those that meet nothing are left out, the others rendered in blocks on the device of their object
+    trace    all rays: empty ones are skipped, the others rendered in blocks on the device of their object
     march    rays of a block: coarse samples, fine samples where the coarse weights are large, compositing
 
 Its loss is that of every Linen module (`inference.loss`), with a discriminator.  Objects lead, views follow: clouds are
-(objects, points, ...), cameras (objects, views, ...).  What is marched through is a *field*: a function of distances
-(*rays, samples) that gives `Samples`.
+(objects, points, ...), cameras (objects, views, ...).  Rays march through a *field*: a function from distances (*rays,
+samples) to `Samples`.
 """
 
 import dataclasses

@@ -1,4 +1,4 @@
-"""The pixels that a training step renders of a batch, a lattice or a square at a random place, and their error."""
+"""The pixels of a batch that a training step renders (a lattice or a square at a random place), and their error."""
 
 from collections.abc import Callable
 

@@ -1,7 +1,7 @@
-"""Our method as the handle, scores and the viewer use it: `surfel_renderer`, compiled.
+"""Our method for the handle, scores and the viewer: `surfel_renderer`, compiled.
 
-Pictures are drawn at a quality, in a light, several views of common sizes, by two programs: the first is compiled anew
-for other numbers of entries and pixels, the second, with most of what takes XLA long, for other windows alone.
+Several views share their sizes.  Two programs draw them at a quality and in a light: the first is compiled anew for
+other numbers of entries and pixels; the second, which XLA compiles slowly, only for other windows.
 """
 
 import dataclasses

@@ -1,13 +1,13 @@
 """Our method on one page: points -> surfels -> G-buffer -> shader network -> light on materials -> picture.
 
     encode   neighbors, layers, sides, visibility by direction (surfels/)     once per object; pure
-    plan     the sizes of a picture, counted on the host: sizes shape arrays  once per view, or for many of them
+    plan     the sizes of a picture, counted on the host: sizes shape arrays  once per view, or for many views
     render   discs splatted to a G-buffer, a CNN over it, light               once per view; pure
 
 A picture is drawn at the resolution at which the points lie FINEST to COARSEST pixels apart and doubled from there by
-the network, so its work follows the points and the pixels that they cover.  Only a window around the object is drawn;
-where it lies is a number like others, how large it is belongs to the plan.  Sizes are rounded up to few values: each
-new one is compiled once.
+the network, so its work follows the points and the pixels that they cover.  Only a window around the object is drawn.
+Its position is traced, its size belongs to the plan.  Sizes are rounded up to a few values: each new one is compiled
+once.
 """
 
 import dataclasses

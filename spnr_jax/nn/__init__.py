@@ -1,1 +1,1 @@
-"""Networks: one Linen module a file, no sampling and no loss inside."""
+"""Networks as Linen modules, without sampling and losses."""

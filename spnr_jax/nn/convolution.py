@@ -1,12 +1,12 @@
-"""Convolutions in the form that each platform computes fastest (the map never depends on the form), normalisations.
+"""Normalisations, and convolutions in the form that each platform computes fastest (the result is the same).
 
 Layout is channels last: inputs (batch, *space, in), kernels (*window, in, out) with equal sides.  Strided convolutions
-pad one voxel on every side, like the stride-1 ones (a SAME rule would pad the far side only).  On a GPU the native
-convolutions of XLA are right; on a CPU (measurements: docs/lab/cpu_forms.md)
+pad one voxel on every side, like the stride-1 ones (a SAME rule would pad the far side only).  On a GPU these are XLA's
+native convolutions.  On a CPU (measurements: docs/lab/cpu_forms.md):
   3D   a sum over depth taps of 2D convolutions, or one matrix product for tiny volumes
-  2D   native, but as matrix products the gradients of 2-wide windows, the kernel's of 4-wide windows and of few output
-       features; 128 input features or more in one matrix product
-  vmap over kernels   one run after the other, where XLA's grouped convolution takes two to eight times
+  2D   native, except for matrix products for the gradients of 2-wide windows and the kernel gradients of 4-wide windows
+       and of few output features; one matrix product for 128 input features or more
+  vmap over kernels   one run after the other; XLA's grouped convolution takes two to eight times as long
 
 Normalisations are batch statistics over the real points of padded clouds, and groups of channels of one volume.
 """

@@ -3,14 +3,14 @@
 encoder         PointNet on every point, mean per voxel, 3D U-Net
 U-Net           each encoder stage (a stride-2 convolution and one at stride 1) halves the resolution and doubles the
                 channels, a decoder stage is nearest x2 and a convolution; skip connections are additions [paper].
-                GroupNorm and ReLU after each convolution, no transposed one.  With bf16 the convolutions after the stem
-                run in bfloat16; the stem's scattered sums, normalisation and parameters stay float32
+                GroupNorm and ReLU follow each convolution; none is transposed.  With bf16 the convolutions after the
+                stem run in bfloat16; the stem's scattered sums, normalisation and parameters stay float32
 field           density and colour at a place from the volume's feature there: one hidden layer with softplus, density =
-                softplus(raw - 1) (a ReLU can die before it has seen the object); features see the view direction.  All
+                softplus(raw - 1) (a ReLU can die early in training); features depend on the view direction.  All
                 features but RGB are linear in the hidden layer, and so is compositing: the hidden layer is composited,
                 and `finish` applies the linear part once per ray instead of once per sample
 upsampler       feature image to an image of twice the size; it learns what to add to the bilinear RGB
-discriminator   PatchGAN that judges patches of an image beside the true colours at the visible input points
+discriminator   PatchGAN on image patches and the true colours at the visible input points
 """
 
 from functools import partial

@@ -1,12 +1,12 @@
-"""CNN that shades a G-buffer: opacity, a change of the base colour, and how light is passed on, for each pixel.
+"""CNN that shades a G-buffer: for each pixel, opacity, a change of the base colour, and factors of the light.
 
-Its inputs are relative: vectors in the camera's axes, lengths in spacings or pixels.  So a picture does not depend on
-how the object, the camera and the light are turned together, nor on the unit of the cloud.
+Its inputs are relative: vectors in the camera's axes, lengths in spacings or pixels.  So a picture does not depend on a
+common rotation of object, camera and light, nor on the unit of the cloud.
 
-A U-Net over what the front-most surfels say, at the resolution at which points lie two to four pixels apart, so that it
-sees points as it has learnt to whatever their number; then one block that doubles the resolution, as often as the
-picture needs.  Its outputs are factors of light maps that are linear in the light (`picture`): the network sees no
-light, and a picture is linear in it up to the sRGB curve.
+A U-Net runs on the attributes of the front-most surfels, at the resolution at which points lie two to four pixels
+apart, so that its input looks alike for any number of points.  One block then doubles the resolution, as often as the
+picture needs.  Its outputs are factors of light maps that are linear in the light (`picture`).  The light is no input
+of the network, so a picture is linear in it up to the sRGB curve.
 """
 
 import dataclasses

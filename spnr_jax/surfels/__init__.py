@@ -1,1 +1,1 @@
-"""Surface elements: discs estimated from points, their pictures, and the light that meets them."""
+"""Surface elements: discs estimated from points, their pictures, and the light that reaches them."""

@@ -1,8 +1,8 @@
-"""What a disc shows and where it ends: spacings, rims of layers, edges, gaps between random points, colors.
+"""Extent and colors of discs: spacings, rims of layers, edges, gaps between random points, colors.
 
-Pure functions of a block of points, which are the last axis.  `layer` (k, block) are the neighbors' weights as points
-of the same layer, `place` (k, 2, block) their places in the tangent plane.  Lengths are spacings unless they are said
-not to be.
+Pure functions of a block of points, which is the last axis.  `layer` (k, block) are the neighbors' weights as points of
+the same layer, `place` (k, 2, block) their places in the tangent plane.  Lengths are in spacings unless stated
+otherwise.
 """
 
 from typing import NamedTuple

@@ -1,18 +1,18 @@
-"""Gaussian splats on the surface that pictures of an object show, in the colours of these pictures; pure functions.
+"""Gaussian splats on the surface in pictures of an object, with the colours of these pictures; pure functions.
 
-Harmonics: real spherical harmonics as splat viewers have them, degrees 0 to 3, with the Condon-Shortley phase, in the
-order of Kerbl et al. 2023 and of KHR_gaussian_splatting: by degree, then by order from -degree to degree.
+Harmonics: real spherical harmonics as in splat viewers, degrees 0 to 3, with the Condon-Shortley phase, in the order of
+Kerbl et al. 2023 and of KHR_gaussian_splatting: by degree, then by order from -degree to degree.
 
-Places: pixels of all views are carried back to their depth, and the nearest surfel says what each lies on.  A pixel far
-from it is no surface (a depth between two of them); its normal is turned to the viewer.  Pixels that share a cube and
-face the same way, by the largest component of the normal, become a splat at their mean, so a thin sheet has one on each
-side.  The cubes are as small as the wanted number of splats allows, and no smaller than the pixels.
+Places: pixels of all views are unprojected to their depth, and the nearest surfel gives the normal of each, turned to
+the viewer.  A pixel far from it is no surface (a depth between two surfaces).  Pixels that share a cube and face the
+same way, by the largest component of the normal, become a splat at their mean, so a thin sheet has one on each side.
+The cubes are as small as the wanted number of splats allows, and no smaller than the pixels.
 
 Colours: spherical harmonics by weighted least squares over the views that see each splat.  A view sees a splat that
-faces it and whose centre lies at its picture's depth there, and is against one that lies before that depth or where the
-picture is empty.  Splats that more than a few views are against stick out of the object and are left out.  The weight
-of a view is the cosine under which it sees the splat; harmonics of higher degree are held back (ridge), so few views
-give a plain colour.
+faces it and whose centre lies at the picture's depth there.  It contradicts a splat that lies before that depth or
+where the picture is empty.  Splats that more than a few views contradict stick out of the object and are left out.  The
+weight of a view is the cosine of its angle to the normal; a ridge penalty on higher degrees gives a plain colour where
+few views see the splat.
 """
 
 from collections.abc import Sequence

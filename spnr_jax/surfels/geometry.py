@@ -1,21 +1,21 @@
-"""Surfels from points: what each point knows of the surface around it, as one pure program over given neighbors.
+"""Surfels from points: the surface around each point, estimated by one pure program over given neighbors.
 
 neighbors   the nearest points of each point: topology, found once on the host by a k-d tree; data without a gradient
-spacing     side of the square that a point stands for, from the neighbors on its own layer of the surface
+spacing     side of the square that a point represents, from the neighbors on its own layer of the surface
 normal      given, or that of the layer where none is (layers.py), outward by votes of directions and walls (sides.py)
-sided       1 where the votes say which side is outside, 0 where both are seen alike (a sheet)
-gradient    of the color along the surface, a ridge regression over the layer: colors are interpolated to first
-            order, but for points beside the border of two colors
+sided       1 where the votes decide which side is outside, 0 where both are equally visible (a sheet)
+gradient    of the color along the surface, a ridge regression over the layer: colors are interpolated to first order,
+            except for points beside the border of two colors
 rim, reach  where the disc ends: at the rim of the layer or where another face cuts it (discs.py)
 shape       planarity and linearity: ratios of the neighbors' extents, 0 in a plane, 0 on a line
-scene       surfels in the box, with the way from the cloud's units to there: what the renderer takes
+scene       surfels in the box, with the transform from the cloud's units: the renderer's input
 
-Points are worked on in blocks, one after the other, so that a million fit into memory; a block reads its neighbors from
+Points are processed in blocks, one after the other, so that a million fit into memory; a block reads its neighbors from
 arrays of all points, which are (columns, points) here.
 
-Gradients flow from positions, normals and colors through normals, spacings, ends of discs and colors.  Constants, whose
-gradient is none, are choices: the neighbors, the plane that a layer is fitted from, which neighbor ends a disc or is of
-another color, sides and what turns a normal, what is shown, and what each direction sees.
+Gradients flow from positions, normals and colors through normals, spacings, ends of discs and colors.  Discrete choices
+are constants without a gradient: the neighbors, the plane that a layer is fitted from, which neighbor ends a disc or
+has another color, sides and flips of normals, which points are shown, and visibility from each direction.
 """
 
 import dataclasses

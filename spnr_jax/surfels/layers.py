@@ -1,9 +1,9 @@
 """The layer of the surface that each point lies on: a plane that its neighbors support, then a quadric through it.
 
-Walls thinner than what anything sees between, stickers and edges put points of several layers side by side; colors,
-spacings and normals of one must not mix with those of another.  Two skins nearer to each other than a layer is thick
-are told apart by their colors.  Pure functions of a block of points, which are the last axis; k are the neighbors of a
-point, itself the first.  Lengths are spacings unless they are said not to be.
+At thin walls, stickers and edges, points of several layers lie side by side; colors, spacings and normals of different
+layers must not mix.  Two sheets that are closer than the thickness of a layer are separated by their colors.  Pure
+functions of a block of points, which is the last axis; k are the neighbors of a point, itself the first.  Lengths are
+in spacings unless stated otherwise.
 """
 
 from itertools import combinations

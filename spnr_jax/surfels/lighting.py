@@ -1,8 +1,8 @@
-"""Light from all around, and what of it meets a surface: every function here is linear in the environment map.
+"""Distant light and the part of it that reaches a surface: every function here is linear in the environment map.
 
 tables    irradiance by normal, and the map blurred by the GGX lobes of LEVELS by mirrored direction (split-sum
           approximation, Karis 2013), 32 x 64 texels each
-arriving  what each surfel receives of it: irradiance through the directions that see the surfel
+arriving  light that each surfel receives: irradiance from the directions that the surfel is visible from
 """
 
 from functools import cache, reduce

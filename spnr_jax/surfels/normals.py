@@ -1,6 +1,6 @@
-"""Normals of points from all the points around them, and what one sensor saw: what nothing hides from its place.
+"""Normals of points from all the points around them, and the points that are visible to one sensor.
 
-Points that are kept of a dense cloud have the normals of all of it: they alone know them worse.
+A thinned cloud gets its normals from all points of the dense one: the kept points alone give worse normals.
 """
 
 from functools import partial

@@ -3,13 +3,13 @@
 An entry is a pair of a disc and a pixel that it covers.  Entries are counted, made, and sorted by pixel and depth;
 their weight is the square of a kernel:
 
-    kernel      1 - r^2, r the distance from the disc's centre in its plane over RADIUS spacings; a disc seen from its
-                edge, or smaller than a pixel, is as wide as FLOOR pixels (the low-pass of EWA splatting, Zwicker et al.
-                2001)
+    kernel      1 - r^2, r the distance from the disc's centre in its plane over RADIUS spacings; a disc viewed edge-on,
+                or smaller than a pixel, is as wide as FLOOR pixels (the low-pass filter of EWA splatting, Zwicker et
+                al. 2001)
 
-Everything passes to 0 at the border of a disc, so a picture is continuous in the camera and in the points.  Which
-pixels a disc covers, and the order of the entries, are integers: constants to every gradient.  Sizes are static; what
-does not fit into them is counted.
+Weights fall to 0 at the rim of a disc, so a picture is continuous in the camera and in the points.  The pixels that a
+disc covers, and the order of the entries, are integers without a gradient.  Sizes are static; entries that do not fit
+are counted.
 """
 
 from collections.abc import Sequence

@@ -1,7 +1,7 @@
 """The numbers of the surfels' geometry, in one record.
 
 Lengths are in spacings of the points, weights count neighbors (a neighbor at its point's own place weighs 1), cosines
-and shares have no unit; what is in units of the box, whose half diagonal is 1, says so.
+and shares have no unit.  Lengths in units of the box, whose half diagonal is 1, are marked.
 """
 
 from dataclasses import dataclass

@@ -1,13 +1,13 @@
-"""Which side of a surface is outside: visibility from fixed directions, votes of those and of opposite walls.
+"""Which side of a surface is outside: visibility from fixed directions, votes of these and of opposite walls.
 
 From each of 64 directions the points are drawn into a grid whose cells are CELL spacings wide, every point into the
-four cells around it, at the depth that its plane has in the middle of the cell.  A point is seen where, lifted off the
-surface by a spacing, it lies before what the grid holds, both where its plane meets the middle of its cell.  So no
-plane hides itself at whatever angle, and one pass over the points gives the side that a surface shows, ambient
-occlusion, and the share of any light that arrives.
+four cells around it, at the depth of its plane in the middle of the cell.  A point is visible if, lifted off the
+surface by a spacing, it lies before the depth in the grid; both depths are taken in the middle of its cell.  So no
+plane hides itself at any angle.  One pass over the points gives the outer side of a surface, ambient occlusion, and the
+share of any light that arrives.
 
-Votes are pure functions of a block of points, which are the last axis.  They are constants: they turn a normal or leave
-it, and have no gradient.
+Votes are pure functions of a block of points, which is the last axis.  They flip a normal or leave it, and have no
+gradient.
 """
 
 import jax

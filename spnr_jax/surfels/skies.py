@@ -1,12 +1,11 @@
-"""Environment maps that are computed: skies, studios, lamps, random ones to learn from, and the package's room.
+"""Environment maps that are computed: skies, studios, lamps, random maps for training, and the package's room.
 
 A map is (height, 2 * height, 3), linear radiance, latitude-longitude: row 0 is straight up (+y), column c of w looks
 along the azimuth phi = 2 pi (c + 0.5) / w, where the direction is (sin phi, 0, -cos phi) on the horizon.  Maps add up
 and scale; none is normalised.
 
 The room is furnished and has a window and lamps; it is computed, not stored: one ray per texel from its middle to the
-walls, floor and ceiling, each of which shows its own colour under a diffuse estimate of what lamps and window throw on
-it.
+walls, floor and ceiling, each of which has its own colour under a diffuse estimate of the light of lamps and window.
 """
 
 from collections.abc import Callable, Sequence

@@ -1,7 +1,7 @@
-"""Sums, systems and eigenvectors of a few unknowns, one for each point; the points are the last axis.
+"""Sums, linear systems and eigenvectors with a few unknowns, one for each point; the points are the last axis.
 
-Every step is one pass over all points of a block, which a CPU does in vectors; LAPACK and batched matrix products take
-ten times as long.
+Every step is one pass over all points of a block, which a CPU vectorises; LAPACK and batched matrix products take ten
+times as long.
 """
 
 from functools import partial, reduce

@@ -2,10 +2,10 @@
 
 Each covered pixel has the list of its LIST front-most entries (`projection.py`):
 
-    layers      entries less than a spacing apart in depth blend and do not hide each other; from two spacings on what
-                is in front hides what is behind
-    share       of an entry in its pixel: those of a layer add up to 1 - exp(-optical depth), times what is left by the
-                layers before it; over all layers they add up to the opacity
+    layers      entries less than a spacing apart in depth blend and do not hide each other; from two spacings on, the
+                front entry hides the one behind
+    share       blend weight of an entry in its pixel: the shares of a layer add up to 1 - exp(-optical depth), times
+                the transmittance of the layers before it; over all layers they add up to the opacity
 """
 
 from collections.abc import Iterator

@@ -1,7 +1,7 @@
 """Training batches that are a pure function of (seed, step), read ahead.
 
-Because a batch depends on nothing but the step, the state of the reader is the number of the step: a resumed run sees
-the same data, whatever was read ahead.  grain does the reading ahead, in threads.
+A batch depends only on the step, so the step number is the state of the reader: a resumed run gets the same data,
+whatever was read ahead.  grain reads ahead in threads.
 """
 
 import dataclasses

@@ -4,7 +4,7 @@
     RUN/checkpoints/STEP/    one state; appears complete or not at all
     RUN/training.lock        empty; locked while a process trains there
 
-The newest readable checkpoint counts: a broken one is named and the one before it is taken.
+The newest readable checkpoint counts: if one is damaged, a message names it and the previous one is used.
 """
 
 import json

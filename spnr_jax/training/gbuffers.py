@@ -1,12 +1,12 @@
-"""What the shader network learns from, and its loss: G-buffers of a data set's clouds, made once and kept on disk.
+"""Training data of the shader, and its loss: G-buffers of a data set's clouds, made once and kept on disk.
 
     FOLDER/OBJECT.CLOUD.npz    views of one random cloud of an object
         doublings              (views,): how often the network doubles each view's resolution
-        seen0, seen1, ...      what it sees of the view, in the window around the object, float16
+        seen0, seen1, ...      its input for the view, in the window around the object, float16
         maps, ambient, target  likewise: light maps in float16, the light's harmonics, the reference in 8 bits
 
-A file is a pure function of (seed, object, cloud); it appears whole or not at all, and one that cannot be read is made
-again.  A batch is a pure function of (seed, step) and the list of files: squares of views of equal doublings.
+A file is a pure function of (seed, object, cloud); it appears whole or not at all; an unreadable one is made again.  A
+batch is a pure function of (seed, step) and the list of files: squares of views of equal doublings.
 """
 
 import dataclasses

@@ -1,7 +1,7 @@
 """Training as pure functions: state in, state out.  Every method is trained by this step.
 
 One step evaluates the loss of the method (`methods.Method.loss`) once.  The discriminator, of methods that have one, is
-updated on the pictures of that forward, and the generator on the gradient that the updated discriminator and the
+updated on the pictures of that forward pass, and the generator on the gradient that the updated discriminator and the
 method's loss send back through it.  `adversarial` is static: without it the graph contains no discriminator.  All
 randomness of step s comes from fold_in(state.key, s), so a resumed run repeats the uninterrupted one bit for bit.  On a
 CPU the losses of several runs under vmap are computed one after the other.

@@ -1,13 +1,13 @@
-"""What a run folder says of its making: rows of metrics.jsonl and TensorBoard, and RUN/run.json.
+"""The record of a run: rows of metrics.jsonl and TensorBoard, and RUN/run.json.
 
 run.json has an entry for every start of the trainer:
 
-began, first_step, last_step    when, and from where to where it trained
+began, first_step, last_step    when it began, and the steps that it trained
 seconds                         by phase: restore, compilation (the first step), steps, previews, checkpoints, listeners
-processor_seconds               the same, of all threads: what other work on the machine does not stretch
-version, commit, jax, hardware  of the code ("+" behind a commit: the checkout was changed), of JAX, of the machine
+processor_seconds               CPU time of all threads, by phase; other work on the machine does not change it
+version, commit, jax, hardware  of the code ("+" after a commit: the checkout was changed), of JAX, of the machine
 data, data_checksum             the folder, and a number that tells data sets apart
-init                            the training whose weights a new run began with, where it was not random ones
+init                            the training whose weights a new run began with, if they were not random
 """
 
 import hashlib

@@ -1,8 +1,8 @@
-"""What scanners do to a clean cloud: noise, outliers, unseen surface, uneven density, colours without materials.
+"""Simulated faults of scans: noise, outliers, unseen surface, uneven density, colours without materials.
 
-All take and return (positions (n, 3), other columns by name) with a generator of random numbers; lengths are units of
-the box whose half diagonal is 1, in which the points have to lie.  `faults` are those that are measured one by one,
-`random_scan` draws several for a cloud of the training.
+All functions take and return (positions (n, 3), other columns by name) with a generator of random numbers.  Lengths are
+in units of the box whose half diagonal is 1; the points must lie in it.  `faults` are measured one by one;
+`random_scan` draws several for a training cloud.
 """
 
 from collections.abc import Callable

@@ -1,12 +1,11 @@
-"""The training loop: batches in, steps, and everything that a person or a later run wants to see of it.
+"""The training loop: reads batches, takes steps, and writes metrics, previews and checkpoints.
 
     RUN/config.json  run.json  metrics.jsonl  tensorboard/  previews/STEP.png  checkpoints/STEP/
 
-A run goes on by itself from its newest readable checkpoint; the rows of metrics.jsonl after it are dropped, because
-they will be written again.  A loss that is not finite stops the run and names the step; the last checkpoint stays.
+A run continues from its newest readable checkpoint; the rows of metrics.jsonl after it are dropped, because they will
+be written again.  A loss that is not finite stops the run and names the step; the last checkpoint stays.
 
-Of several processes that train together (placement.py) the first writes all of this; the checkpoints they write
-together.
+If several processes train together (placement.py), the first writes these files; all of them write the checkpoints.
 """
 
 import math

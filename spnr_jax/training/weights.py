@@ -1,11 +1,11 @@
-"""Trained networks, and their file: one .npz of a config and the averaged weights as float16, a few megabytes at most.
+"""Trained networks and their file: one .npz with a config and the averaged weights as float16, a few megabytes at most.
 
     config              the TrainConfig as JSON, in bytes
     steps               of training
-    params/.../kernel   one array each, as they lie in the Linen variables
+    params/.../kernel   one array each, named as in the Linen variables
 
-The package holds the network that renders where no other is named (docs/model_card.md), and the densifier beside it
-(`method/densifier.py`), whose file holds weights alone.
+The package includes the default network (docs/model_card.md) and its densifier (`method/densifier.py`), whose file
+contains only weights.
 """
 
 import json
