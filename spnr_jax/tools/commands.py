@@ -19,15 +19,15 @@ MOST_STOPS = 20
 
 @dataclass(frozen=True, kw_only=True)
 class Lighting:
-    """The light of pictures by a network over surfels; others know that of their training alone."""
+    """The light of pictures.  `surfels` takes any; other networks only that of their training."""
 
     light: str | None = None
-    """Light: an environment map (.hdr .exr), or room, studio, sunset, overcast, night of the package (default: room, or
-    none where there is a sun)."""
+    """Environment map (.hdr .exr), or room, studio, sunset, overcast, night (default: room, or none if there is a
+    sun)."""
     light_yaw: float = 0.0
-    """Degrees that the map is turned about the up axis."""
+    """Degrees by which the map is rotated about the up axis."""
     sun: tuple[float, float] | None = None
-    """Azimuth and elevation, in degrees, of a sun: added to the light."""
+    """Azimuth and elevation, in degrees, of a sun that is added to the light."""
     exposure: float = 0.0
     """Stops by which the light is brighter (negative: darker)."""
     background: Literal["white", "light"] = "white"
@@ -54,14 +54,14 @@ MOST_SPLATS = 300_000  # that a file or page is asked for: more than viewers on 
 
 @dataclass(frozen=True, kw_only=True)
 class SplatMaking:
-    """How Gaussian splats are made of a cloud."""
+    """How Gaussian splats are made from a cloud."""
 
     most_splats: int = 150_000
-    """Splats at most."""
+    """Maximum number of splats."""
     harmonics: Literal[0, 1, 2, 3] = 1
-    """Degree of the spherical harmonics by which a splat's colour follows the view; 0: it does not."""
+    """Degree of the spherical harmonics of a splat's colour; 0: it does not depend on the view."""
     fitting_views: int = 32
-    """Pictures of the network that splats are made from."""
+    """Pictures of the network that the splats are made from."""
 
     @property
     def is_given(self) -> dict[str, Any]:
@@ -89,19 +89,19 @@ class Share:
     credit: str = ""
     """Credit and licence line."""
     run: Path | None = None
-    """Network that draws it, as for `spnr render` (default: surfels)."""
+    """Network that renders it, as for `spnr render` (default: surfels)."""
     lighting: tyro.conf.OmitArgPrefixes[Lighting] = field(default_factory=Lighting)
-    """The light, which is part of the splats."""
+    """Light baked into the splats."""
     making: tyro.conf.OmitArgPrefixes[SplatMaking] = field(default_factory=SplatMaking)
     """How the splats are made."""
     num_points: int = 16384
-    """Points used of a bigger cloud, evenly spread, or sampled from a mesh."""
+    """Points kept of a larger cloud, evenly spread, or sampled from a mesh."""
     up: Literal["auto", "x", "y", "z", "-x", "-y", "-z"] = "auto"
     """The file's upward axis; auto looks for it, and says what it found."""
     clean: Literal["auto", "off", "strong"] = "auto"
     """As for `spnr render`."""
     azimuth: float = 30.0
-    """Degrees around the object from which the page first shows it."""
+    """Azimuth, in degrees, of the page's first view."""
     elevation: float = 20.0
     """Degrees above the horizon."""
 
@@ -129,60 +129,61 @@ def is_catalogue(cloud: Path) -> bool:
 @dataclass(frozen=True, kw_only=True)
 class Render:
     """Render a point cloud or mesh file: views as .png, a turntable, depth, opacity, a mesh, splats.
-    Of a folder, or a pattern in quotation marks, every file is drawn, and a page shows them all."""
+    For a folder, or a pattern in quotation marks, every file is rendered, and a page shows them all."""
 
     cloud: tyro.conf.Positional[Path]
     """.ply .spz (also 3D Gaussian splats) .pcd .xyz .txt .csv .asc .pts .las .laz .npz .npy, or a mesh: .glb .gltf .obj
-    .stl .off (its surface is sampled).  Or a folder, with all folders in it, or a pattern such as 'scans/**/*.ply'."""
+    .stl .off (its surface is sampled).  Or a folder, with its subfolders, or a pattern such as 'scans/**/*.ply'."""
     run: Path | None = None
-    """Network that renders: a run folder or a file of weights (default: that of the package, `surfels`)."""
+    """Network that renders: a run folder or a weights file (default: `surfels`, which the package includes)."""
     out: Path = Path("renders")
-    """Output folder. Of a folder or pattern, files whose results are there are skipped."""
+    """Output folder.  For a folder or pattern, files that have results there are skipped."""
     workers: int | None = None
-    """Processes that draw the files of a folder or pattern (default: this one; extra `cluster`)."""
+    """Processes that render the files of a folder or pattern (default: this one; needs the extra `cluster`)."""
     cluster: str | None = None
-    """Address of a Dask scheduler whose workers draw instead.  They see the files and OUT under the same names."""
+    """Address of a Dask scheduler whose workers render instead.  They must find the files and OUT under the same
+    names."""
     up: Literal["auto", "x", "y", "z", "-x", "-y", "-z"] = "auto"
-    """The file's upward axis; auto: by the format, else y or z, as the object would stand."""
+    """The file's upward axis; auto: by the format, else y or z, whichever lets the object stand."""
     num_points: int = 16384
-    """Points used of a bigger cloud, evenly spread, or sampled from a mesh; fewer work too."""
+    """Points kept of a larger cloud, evenly spread, or sampled from a mesh; fewer work too."""
     clean: Literal["auto", "off", "strong"] = "auto"
-    """Outliers of points are removed, and noisy ones averaged, before they are thinned; a clean cloud, and a mesh, stay
-    as they are.  strong: at smaller deviations."""
+    """Remove outliers and average noisy points before thinning; clean clouds and meshes are unchanged.  strong: at
+    smaller deviations."""
     cut: tyro.conf.OmitArgPrefixes[Cut] = Cut()
-    """Select one object of a scene, before it is cleaned."""
+    """Select one object of a scene before cleaning."""
     transparent_parts: Literal["opaque", "skip"] = "opaque"
-    """Glass and other parts of a mesh that light passes through: drawn in their colour, or left out.  What the alpha of
-    a texture cuts out is left out either way."""
+    """Glass and other transparent parts of a mesh: drawn in their colour, or left out.  Parts that a texture's alpha
+    cuts out are always left out."""
     seed: int = 0
-    """Seed of the points that are chosen, and of the planes that --remove-plane tries."""
+    """Seed of the chosen points, and of the planes that --remove-plane tries."""
     views: int = 4
-    """Still pictures, evenly around the object."""
+    """Stills, at even angles around the object."""
     elevation: float = 20.0
     """Degrees above the horizon."""
     resolution: int | None = None
-    """Pixels along each side (default: 512 of surfels, else what the network was trained for)."""
+    """Pixels along each side (default: 512 for surfels, else the size of the training)."""
     quality: Literal["draft", "balanced", "best", "trained"] = "best"
-    """balanced: three quarters of the size, enlarged; draft: discs and light alone, without the CNN.  Of the paper's
-    network: a quarter, half or all of the samples that a ray was trained with, near the points; or just as trained."""
+    """balanced: three quarters of the size, enlarged; draft: discs and light without the CNN.  The paper's network
+    takes a quarter, half or all of its training samples per ray, near the points; trained: exactly as in training."""
     outputs: tuple[Output, ...] = ("image", "depth", "opacity")
-    """What is written of each view; depth comes coloured, as .npy and as 16-bit .png."""
+    """Files to write for each view; depth comes coloured, as .npy and as 16-bit .png."""
     transparent: bool = False
     """Stills on a transparent background instead of white (straight alpha)."""
     lighting: tyro.conf.OmitArgPrefixes[Lighting] = Lighting()
-    """Light; only `surfels` takes another than that of its training."""
+    """Light; only `surfels` takes one other than its training light."""
     turntable: Literal["gif", "mp4", "none"] = "gif"
     """Format of the turntable."""
     turn: Literal["object", "light"] = "object"
-    """What turns in it."""
+    """What rotates in the turntable."""
     frames: int = 48
     """Frames of the turntable."""
     fps: int = 16
-    """Frames a second of the turntable."""
+    """Frames per second of the turntable."""
     mesh: bool = False
     """Also write the surface as .glb, with the materials of the nearest points."""
     grid_resolution: int | None = None
-    """Places along each side of the grid of --mesh (default: 192)."""
+    """Grid points along each side for --mesh (default: 192)."""
     splats: Literal["none", "ply", "spz"] = "none"
     """Also write Gaussian splats."""
     making: SplatMaking = field(default_factory=SplatMaking)
@@ -219,7 +220,7 @@ class Render:
 
 @dataclass(frozen=True, kw_only=True)
 class Train:
-    """Train a network on a data set.  A run folder that holds an unfinished run of the same config is continued."""
+    """Train a network on a data set.  If the run folder holds an unfinished run of the same config, it is continued."""
 
     data: tyro.conf.Positional[Path]
     """Folder of the data set."""
@@ -228,8 +229,8 @@ class Train:
     config: tyro.conf.AvoidSubcommands[tyro.conf.OmitArgPrefixes[TrainConfig]] = field(default_factory=presets.tiny)
     """Every number of the run; --preset chooses the defaults."""
     init: str | None = None
-    """Weights that a new run begins with: a run folder, a file of weights, or `surfels`, the network of the package
-    (default: random)."""
+    """Initial weights of a new run: a run folder, a weights file, or `surfels`, the package's network (default:
+    random)."""
     log_every: int = 20
     """Steps between rows of metrics.jsonl and TensorBoard."""
     preview_every: int = 500
@@ -237,11 +238,12 @@ class Train:
     checkpoint_every: int = 500
     """Steps between checkpoints."""
     distributed: bool = False
-    """One of several processes that a launcher started (SLURM, Open MPI, Kubernetes) and that train together."""
+    """This is one of several processes that a launcher started (SLURM, Open MPI, Kubernetes) and that train
+    together."""
     coordinator: str | None = None
-    """Without a launcher: HOST:PORT at which process 0 is found by all; with --num-processes and --process-id."""
+    """Without a launcher: HOST:PORT of process 0; with --num-processes and --process-id."""
     num_processes: int | None = None
-    """Processes that train together."""
+    """Number of processes that train together."""
     process_id: int | None = None
     """Rank of this process, from 0."""
 
@@ -253,9 +255,9 @@ class Evaluate:
     data: tyro.conf.Positional[Path]
     """Folder of the data set."""
     run: tyro.conf.Positional[Path]
-    """Folder of the run, a file of weights, or `surfels`, the network of the package."""
+    """Folder of the run, a weights file, or `surfels`, the package's network."""
     out: Path | None = None
-    """Folder for metrics.json and report.html (default: the run, or the name of the file without its suffix)."""
+    """Folder for metrics.json and report.html (default: the run, or the weights file's name without its suffix)."""
     split: Literal["train", "val", "test"] = "test"
     """Objects to score."""
     gallery: int = 16
@@ -264,17 +266,17 @@ class Evaluate:
 
 @dataclass(frozen=True, kw_only=True)
 class Export:
-    """Write a network as a file of weights, as functions for JAX without this package, and as StableHLO; or a cloud's
-    object, with --splats as Gaussian splats, with --mesh as its surface."""
+    """Write a network as a weights file, as functions for JAX without this package, and as StableHLO.  Or write a
+    cloud's object: with --splats as Gaussian splats, with --mesh as its surface."""
 
     run: tyro.conf.Positional[Path]
-    """Run folder whose network is exported; with --splats or --mesh a cloud, what `spnr render` reads."""
+    """Run folder of the network to export; with --splats or --mesh, a cloud that `spnr render` reads."""
     splats: Path | None = None
     """Write Gaussian splats: .ply or .spz."""
     mesh: Path | None = None
     """Write the surface with its materials: .glb, in the frame and units of the cloud's file."""
     network: Path | None = None
-    """Network that draws the cloud for --splats and --mesh, as `spnr render --run` (default: surfels)."""
+    """Network that renders the cloud for --splats and --mesh, as `spnr render --run` (default: surfels)."""
     lighting: tyro.conf.OmitArgPrefixes[Lighting] = field(default_factory=Lighting)
     """Light baked into --splats."""
     making: tyro.conf.OmitArgPrefixes[SplatMaking] = field(default_factory=SplatMaking)
@@ -284,13 +286,13 @@ class Export:
     clean: Literal["auto", "off", "strong"] = "auto"
     """As for `spnr render`, for --splats and --mesh."""
     out: Path = Path("exported")
-    """Folder for weights.npz, encode.jax, render.jax, both as .stablehlo, and export.json: what they take and give;
-    of a network over surfels also light.npz, the room."""
+    """Folder for weights.npz, encode.jax, render.jax, both as .stablehlo, and export.json with their inputs and
+    outputs; for `surfels` also light.npz, the room."""
     num_points: int | None = None
-    """Points of a cloud, padding included; exactly so many (default: 1,024).  With --splats and --mesh, points used
-    of a bigger cloud (default: 16,384)."""
+    """Exact number of points of a cloud, padding included (default: 1,024).  With --splats and --mesh, points kept of a
+    larger cloud (default: 16,384)."""
     resolution: int | None = None
-    """Pixels along each side (default: what the network was trained for)."""
+    """Pixels along each side (default: the size of the training)."""
     quality: Literal["draft", "balanced", "best", "trained"] = "best"
     """As for `spnr render`."""
     reach: int = 4
@@ -317,27 +319,27 @@ class Export:
 
 @dataclass(frozen=True, kw_only=True)
 class View:
-    """Look at the network's picture of a point cloud or mesh file in the browser: turn it, light it, save it."""
+    """View the network's picture of a point cloud or mesh file in the browser: turn it, light it, save it."""
 
     cloud: tyro.conf.Positional[Path]
     """What `spnr render` reads."""
     run: Path | None = None
     """As for `spnr render`."""
     lighting: tyro.conf.OmitArgPrefixes[Lighting] = Lighting()
-    """The light at first; the network of the package takes any, other networks that of their training alone."""
+    """Initial light; `surfels` takes any, other networks only that of their training."""
     host: str = "127.0.0.1"
-    """Address to listen on; another than this machine's own opens the viewer to a network."""
+    """Address to listen on; one other than this machine's own opens the viewer to a network."""
     port: int = 8080
     """Port to listen on; 0 takes any free one."""
     reached_at: str | None = None
-    """HOST or HOST:PORT by which browsers reach the viewer, where a proxy before it asks under another name."""
+    """HOST or HOST:PORT by which browsers reach the viewer, if a proxy before it uses another name."""
     num_points: int = 16384
-    """Points used of a bigger cloud or sampled from a mesh; fewer work too."""
+    """Points kept of a larger cloud, or sampled from a mesh; fewer work too."""
     clean: Literal["auto", "off", "strong"] = "auto"
-    """Outliers of points are removed, and noisy ones averaged, before they are thinned; a clean cloud, and a mesh, stay
-    as they are.  strong: at smaller deviations."""
+    """Remove outliers and average noisy points before thinning; clean clouds and meshes are unchanged.  strong: at
+    smaller deviations."""
     cut: tyro.conf.OmitArgPrefixes[Cut] = Cut()
-    """Object of a scene to show first; files dropped on the page are shown whole."""
+    """Object of a scene to show first; files that are dropped on the page are shown whole."""
     up: Literal["auto", "x", "y", "z", "-x", "-y", "-z"] = "auto"
     """The file's upward axis; auto looks for it, and says what it found."""
 
