@@ -453,7 +453,7 @@ def pictures(draw):
 
 # fmt: off
 LOSSES = (
-    Law("l1", losses.l1, lambda a, b: np.mean(np.abs(a - b)), sizes("difference", 1e-36, 1e32, images),
+    Law("l1", losses.l1, lambda a, b: np.mean(np.abs(a - b)), sizes("difference", 1e-34, 1e32, images),
         extremes=Extremes((extremes(2, 4, 3), extremes(2, 4, 3)))),
     Law("mse", losses.mse, lambda a, b: np.mean((a - b) ** 2), sizes("difference", 1e-17, 1e17, images)),
     Law("adversarial losses", lambda real, fake: (losses.generator_adversarial(fake),
