@@ -318,7 +318,15 @@ def test_the_demo_writes_its_report_and_a_second_call_reuses_everything(data, tm
     ours = dataclasses.replace(tiny_surfels.CONFIG, preset="surfels_tiny", model=small)
     monkeypatch.setattr(presets, "tiny", lambda: tiny_dataset.CONFIG)
     monkeypatch.setattr(presets, "surfels_tiny", lambda: ours)
-    monkeypatch.setattr(demo, "generate", lambda asked: shutil.copytree(data.painted, asked.out, dirs_exist_ok=True))
+
+    def generate(asked):
+        if not asked.out.exists():
+            shutil.copytree(data.painted, asked.out)
+            described = json.loads((asked.out / "dataset.json").read_text())
+            described["settings"]["spread"] = asked.spread
+            (asked.out / "dataset.json").write_text(json.dumps(described))
+
+    monkeypatch.setattr(demo, "generate", generate)
     out = tmp_path / "out"
     found, checkpoints = [], []
     for _ in range(2):
