@@ -17,6 +17,8 @@
 #   make mutants             break the kernels on purpose; every fault has to be caught by the tests
 
 PYTHON ?= python3.11
+# XLA's false alarms about kept programs, as in spnr_jax/devices/runtime.py
+export TF_CPP_MIN_LOG_LEVEL ?= 3
 PY := .venv/bin/python
 MESHES ?=
 TEST_LIST ?=
