@@ -3,7 +3,7 @@
     propose    pairs of neighbors without a point between them, and open places beside points: rims, legs, gaps
     place      the middle of the curve through both ends at right angles to their normals (Vlachos et al. 2001), and
                a frame there
-    predict    a PointNet over the points around each place, in its frame: offset of the surface from there, its normal,
+    predict    graph convolutions over the points, then a PointNet over those around each place, in its frame: offset of the surface from there, its normal,
                whether it exists, whose material it has
     choose     likely children that are not too close to better ones
 
@@ -13,6 +13,7 @@ gradient; places, normals and materials are differentiable.
 """
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import flax.linen as nn
@@ -23,10 +24,12 @@ from jaxtyping import Array, Bool, Float, Int
 
 from spnr_jax.errors import UserError
 from spnr_jax.kernels.numerics import clamp, length, normalize, root
-from spnr_jax.kernels.records import AnyArray, PointCloud, Surfels
+from spnr_jax.kernels.records import AnyArray, Key, PointCloud, Surfels
 from spnr_jax.surfels.geometry import estimate_surfels, move_into_box
 
-MOST_POINTS = 8192  # of a sparse cloud
+MOST_POINTS = 65536  # of a cloud that gets children
+SPARSE = 8192  # points, up to which it gets them everywhere, from there on where it ends or bends alone
+BENT = 0.3  # spacings that both ends of a pair lie off each other's planes, and what the cosine lacks of 1
 CHILDREN = 6  # of a point: in the middle of its pairs, each of which belongs to one of its ends, and at open places
 AROUND = 16  # points that tell a child
 BETWEEN = 0.4  # cosine: a point that sees both ends at an angle whose cosine is less than -BETWEEN lies between them
@@ -39,6 +42,9 @@ CLOSEST = 0.2  # spacings between a child and a better one, or a measured point;
 AWAY = 1.5  # squared multiple of that distance, that normals at right angles count as
 FARTHEST = 4.0  # squared multiple of that distance from measured points, from which on farther is no better
 ROUNDS = 8  # of choosing
+FEATURES, CONVOLUTIONS = 64, 3  # of points, and graph convolutions over them
+EDGE, WIDTH, HEAD = 9, 64, 128  # numbers of an edge, features of a point around a place and of a place
+BLOCK = 256  # points or places that are worked on at once: they stay in a core's cache
 LIKELY = 0.55  # probability from which on a child is kept
 
 
@@ -112,15 +118,17 @@ def propose(
     to_end = root(squared[:, :, None] + squared[:, None] - 2 * products)
     size = root(squared)
     height = jnp.einsum("nai,ni->na", offset, nodes.normal)
-    through = (jnp.abs(height) > ACROSS * size) & (
-        jnp.abs(jnp.sum(offset * nodes.normal[other], axis=-1)) > ACROSS * size
-    )
+    there = jnp.sum(offset * nodes.normal[other], axis=-1)
+    through = (jnp.abs(height) > ACROSS * size) & (jnp.abs(there) > ACROSS * size)
+    cosine = jnp.sum(nodes.normal[:, None] * nodes.normal[other], axis=-1)
+    bent = (jnp.abs(height) + jnp.abs(there)) / reach + 1 - cosine > BENT
+    sparse = jnp.sum(neighbors[:, 0] >= 0) <= SPARSE
     between = squared[:, None] - products < -BETWEEN * size[:, None] * to_end
     blocked = jnp.any(between & (real & ~through)[:, None], axis=2)
     listed = jnp.any(neighbors[other] == own[:, None, None], axis=-1)
     owns = ((own[:, None] + other) % 2 == 0) == (own[:, None] < other)
     fits = (size < LONGEST * reach) & (size > SHORTEST * (reach + nodes.spacing[other]))
-    pair = real & ~blocked & ~through & (owns | ~listed) & fits
+    pair = real & ~blocked & ~through & (owns | ~listed) & fits & (sparse | bent)
     flat = normalize((offset - height[..., None] * nodes.normal[:, None]) / reach[..., None])
     nearest = jnp.argmin(jnp.where(real & ~through, size, jnp.inf), axis=1)[:, None, None]
     first = complete(jnp.take_along_axis(flat, nearest, axis=1)[:, 0], nodes.normal)
@@ -180,32 +188,48 @@ def find_around(nodes: Nodes, neighbors: Array, first: Array, second: Array, mid
     return jnp.where(nearest > -jnp.inf, jnp.take_along_axis(number, chosen, axis=1), -1)
 
 
-class Densifier(nn.Module):
-    """Children of places: two graph convolutions over the points, then a PointNet in each place's frame."""
+class Convolution(nn.Module):
+    """Features of points after one graph convolution over their neighbors (Wang et al. 2019, EdgeConv)."""
 
-    features: int = 32
-    width: int = 64
+    def setup(self) -> None:
+        """Layers."""
+        self.own, self.message, self.into, self.out = (nn.Dense(FEATURES) for _ in range(4))
+        self.other, self.edge = (nn.Dense(FEATURES, use_bias=False) for _ in range(2))
+        self.norm = nn.LayerNorm()
+
+    def __call__(self, hidden: Array, sent: Array, edges: Array, real: Array) -> Float[Array, "n 64"]:
+        """New features of points, from what their neighbors send along these edges."""
+        message = nn.relu(self.own(hidden)[:, None] + sent + self.edge(edges))
+        message = pool(nn.relu(self.message(message)), real)
+        return self.norm(hidden + self.out(nn.relu(self.into(jnp.concatenate([hidden, message], axis=1)))))
+
+    def send(self, hidden: Float[Array, "n 64"]) -> Float[Array, "n 64"]:
+        """What each point tells its neighbors."""
+        return self.other(hidden)
+
+    def first(self, hidden: Array, edges: Array, real: Array) -> Array:
+        """One round among points that neighbor none but themselves: for the shapes of the weights."""
+        return self(hidden, self.send(hidden)[:, None], edges, real)
+
+
+class Proposal(nn.Module):
+    """Children of places: a PointNet in each place's frame over the points around it."""
 
     @nn.compact
-    def __call__(self, nodes: Nodes, neighbors: Int[Array, "n 20"], places: Places) -> Children:
+    def __call__(self, nodes: Nodes, hidden: Float[Array, "n 64"], places: Places) -> Children:
         """Residuals on the middles of the places; untrained, the middles themselves."""
-        hidden = nn.Dense(self.features, name="point")(nodes.traits)
-        around, real = neighbors[:, 1:], neighbors[:, 1:] >= 0
-        edges = relate(nodes, around)
-        for number in (0, 1):
-            hidden = self.convolve(hidden, around, real, edges, f"graph{number}")
         real = places.around >= 0
         seen, offset = look(nodes, places)
         told = compare_ends(nodes, places)
-        element = nn.Dense(self.width, name="element")(seen) + nn.Dense(self.width, name="told")(told)[:, None]
-        element += nn.Dense(self.width, use_bias=False, name="neighbor")(hidden)[places.around]
-        element = nn.relu(nn.Dense(self.width, name="element1")(nn.relu(element)))
-        pooled = nn.relu(nn.Dense(self.width, name="pool")(pool(element, real)))
-        element = nn.Dense(self.width, name="element2")(element) + nn.Dense(self.width, name="back")(pooled)[:, None]
-        element = nn.relu(nn.Dense(self.width, name="element3")(nn.relu(element)))
+        element = nn.Dense(WIDTH, name="element")(seen) + nn.Dense(WIDTH, name="told")(told)[:, None]
+        element += nn.Dense(WIDTH, use_bias=False, name="neighbor")(hidden)[places.around]
+        element = nn.relu(nn.Dense(WIDTH, name="element1")(nn.relu(element)))
+        pooled = nn.relu(nn.Dense(WIDTH, name="pool")(pool(element, real)))
+        element = nn.Dense(WIDTH, name="element2")(element) + nn.Dense(WIDTH, name="back")(pooled)[:, None]
+        element = nn.relu(nn.Dense(WIDTH, name="element3")(nn.relu(element)))
         state = jnp.concatenate([pool(element, real), pooled, told], axis=1)
-        state = nn.relu(nn.Dense(96, name="head")(state))
-        state = nn.relu(nn.Dense(96, name="head1")(state))
+        state = nn.relu(nn.Dense(HEAD, name="head")(state))
+        state = nn.relu(nn.Dense(HEAD, name="head1")(state))
         out = nn.Dense(7, kernel_init=nn.initializers.normal(0.01), name="out")(state)
         move = clamp(out[:, :3], -1.5, 1.5)
         tilt = out[:, 3:6] + jnp.asarray([0, 0, 1], out.dtype)[None]
@@ -218,21 +242,57 @@ class Densifier(nn.Module):
         shares = jax.nn.softmax(jnp.where(real, preferred, -1e9), axis=1)
         return Children(position, move, normal, out[:, 6], shares)
 
-    def convolve(self, hidden: Array, around: Array, real: Array, edges: Array, name: str) -> Array:
-        """The points' features after one graph convolution (Wang et al. 2019, EdgeConv)."""
-        message = nn.Dense(self.features, name=f"{name}_own")(hidden)[:, None]
-        message += nn.Dense(self.features, use_bias=False, name=f"{name}_other")(hidden)[around]
-        message = nn.relu(message + nn.Dense(self.features, use_bias=False, name=f"{name}_edge")(edges))
-        message = nn.relu(nn.Dense(self.features, name=f"{name}_message")(message))
-        both = jnp.concatenate([hidden, pool(message, real)], axis=1)
-        change = nn.Dense(self.features, name=f"{name}_out")(nn.relu(nn.Dense(self.features, name=f"{name}_in")(both)))
-        return nn.LayerNorm(name=f"{name}_norm")(hidden + change)
+
+def init(key: Key, nodes: Nodes, places: Places) -> dict:
+    """Fresh weights of the network."""
+    keys = jax.random.split(key, CONVOLUTIONS + 2)
+    hidden, point = nn.Dense(FEATURES).init_with_output(keys[0], nodes.traits)
+    edges, real = jnp.zeros((len(hidden), 1, EDGE)), jnp.ones((len(hidden), 1), bool)
+    params = {"point": point["params"]}
+    for number in range(CONVOLUTIONS):
+        params[f"graph{number}"] = Convolution().init(keys[1 + number], hidden, edges, real, method="first")["params"]
+    return params | {"proposal": Proposal().init(keys[-1], nodes, hidden, places)["params"]}
 
 
 def predict(params: dict, nodes: Nodes, neighbors: Int[Array, "n 20"], places: Places) -> Children:
-    """The children of places, by a network of these weights."""
-    children: Any = Densifier().apply({"params": params}, nodes, neighbors, places)
-    return children
+    """The children of places: graph convolutions over the points, then a PointNet around each place, block by block."""
+    hidden: Any = nn.Dense(FEATURES).apply({"params": params["point"]}, nodes.traits)
+    rows = jnp.arange(len(neighbors)), neighbors[:, 1:]
+    for number in range(CONVOLUTIONS):
+        hidden = convolve(params[f"graph{number}"], hidden, nodes, *rows)
+
+    def propose_in(block: Places) -> Any:
+        return Proposal().apply({"params": params["proposal"]}, nodes, hidden, block)
+
+    return in_blocks(propose_in, places)
+
+
+def convolve(params: dict, hidden: Array, nodes: Nodes, own: Array, around: Array) -> Any:
+    """Features of the points after a round, block by block."""
+    sent: Any = Convolution().apply({"params": params}, hidden, method="send")
+
+    def one(block: tuple[Array, Array]) -> Any:
+        own, around = block
+        edges = relate(nodes, own, around)
+        return Convolution().apply({"params": params}, hidden[own], sent[around], edges, around >= 0)
+
+    return in_blocks(one, (own, around))
+
+
+def in_blocks(work: Callable[[Any], Any], rows: Any) -> Any:
+    """What the work gives for all rows, BLOCK of them at once; a gradient keeps the inputs of a block alone.
+
+    The last row is repeated until the blocks are full: zeros would have no finite gradient.
+    """
+    count = len(jax.tree.leaves(rows)[0])
+    blocks = -(-count // BLOCK)
+
+    def split(x: Array) -> Array:
+        filled = jnp.pad(x, [(0, blocks * BLOCK - count)] + [(0, 0)] * (x.ndim - 1), mode="edge")
+        return filled.reshape(blocks, BLOCK, *x.shape[1:])
+
+    found = jax.lax.map(jax.checkpoint(work), jax.tree.map(split, rows))
+    return jax.tree.map(lambda x: x.reshape(blocks * BLOCK, *x.shape[2:])[:count], found)
 
 
 def pool(values: Float[Array, "m k f"], real: Bool[Array, "m k"]) -> Float[Array, "m 2*f"]:
@@ -247,15 +307,15 @@ def turn(vectors: Float[Array, "m 3"], frame: Float[Array, "m 3 3"]) -> Float[Ar
     return jnp.einsum("mj,mji->mi", vectors, frame, precision="highest")
 
 
-def relate(nodes: Nodes, around: Int[Array, "n k"]) -> Float[Array, "n k 9"]:
-    """Numbers of each point and neighbor that do not change when the cloud is turned."""
-    spacing = nodes.spacing[:, None]
-    offset = (nodes.position[around] - nodes.position[:, None]) / spacing[..., None]
-    normal, other = nodes.normal[:, None], nodes.normal[around]
+def relate(nodes: Nodes, own: Int[Array, " n"], around: Int[Array, "n k"]) -> Float[Array, "n k 9"]:
+    """Numbers of points and neighbors that do not change when the cloud is turned."""
+    spacing = nodes.spacing[own][:, None]
+    offset = (nodes.position[around] - nodes.position[own][:, None]) / spacing[..., None]
+    normal, other = nodes.normal[own][:, None], nodes.normal[around]
     height, from_there = jnp.sum(offset * normal, axis=-1), -jnp.sum(offset * other, axis=-1)
     far = length(offset)
     beside = root(far**2 - height**2)
-    unlike = length(nodes.color[around] - nodes.color[:, None])
+    unlike = length(nodes.color[around] - nodes.color[own][:, None])
     coarse = jnp.log(nodes.spacing[around] / spacing)
     parts = [height, from_there, far, jnp.exp(-far), beside, jnp.sum(normal * other, axis=-1), coarse]
     return clamp(jnp.stack([*parts, unlike, jnp.exp(-8 * unlike)], axis=-1), -8, 8)

@@ -110,6 +110,38 @@ def test_vmap_is_a_loop_and_a_program_is_the_plain_function(params):
         close(kept(jax.tree.map(lambda x, i=i: x[i], found)), kept(run(params, clouds[i], near[i])), atol=1e-3)
 
 
+@pytest.mark.ci
+def test_blocks_are_the_whole_at_once(params, monkeypatch):
+    points = ball()
+    near = jnp.asarray(spnr_jax.neighbors(points))
+    nodes = densifier.describe(estimate(points, near))
+    places = place(nodes, near)
+    found = []
+    for block in (SIZE * CHILDREN, 37):
+        monkeypatch.setattr(densifier, "BLOCK", block)
+        found.append(jax.jit(lambda *x: densifier.predict(*x))(params["densifier"], nodes, near, places))
+    jax.tree.map(lambda *x: close(*(y[np.asarray(places.exists)] for y in x), atol=1e-5), *found)
+
+
+def test_a_dense_cloud_gets_children_where_it_ends_or_bends_alone(monkeypatch):
+    grid = np.stack(np.meshgrid(np.arange(20), np.arange(20)), axis=-1).reshape(-1, 2)
+    edge = np.concatenate([np.insert(grid, 2, 0, axis=1), np.insert(grid[20:], 0, 0, axis=1)[:, [0, 1, 2]]])
+    points = cloud(edge * 0.05)
+    near = jnp.asarray(spnr_jax.neighbors(points))
+    nodes = densifier.describe(estimate(points, near))
+    everywhere = place(nodes, near)
+    monkeypatch.setattr(densifier, "SPARSE", len(edge) - 1)
+    some = place(nodes, near)
+    pairs = [np.asarray(x.exists & (x.first != x.second)) for x in (everywhere, some)]
+    middle = [np.asarray(x.middle)[y] for x, y in zip((everywhere, some), pairs, strict=True)]
+    flat = [np.sum((x > 0.1).sum(axis=1) == 2) for x in middle]  # well inside one of the two squares
+    assert flat[0] > 300
+    assert flat[1] == 0
+    assert len(middle[1]) > 0
+    ways = [np.asarray(x.exists & (x.first == x.second)).sum() for x in (everywhere, some)]
+    assert ways[1] >= ways[0] > 20
+
+
 def test_padding_and_the_order_of_points_do_not_matter(params):
     points = ball()
     real = jax.tree.map(lambda x: x[points.mask], points)
