@@ -101,20 +101,19 @@ class Volume:
 class Surfels:
     """Surface elements of one object (`surfels/geometry.py`): discs with materials, padded; zeros where mask is False.
 
-    `spacing` is the side of the square that a point stands for, in units of the box; `gradient` the change of each
-    colour along x, y, z; `jump` what is added to the colour beyond `border`, which is the unit vector across a line in
-    the disc's plane and how far from the point that lies (0 without one); `sided` 1 where one side is outside, 0 where
-    both are; `visible` how much each of 64 directions sees; `shape` the planarity and linearity of the neighbourhood.
-    A disc ends `reach` spacings from its point along `rim`, a unit vector in its plane, against it, and along and
-    against their cross product normal x rim.  `guessed` is 1 where roughness and metallic are not known,
-    `invented` 0 where the point was measured, and above 0 where it was learned (`method/densifier.py`).
+    `spacing` is the side of the square that a point stands for, in units of the box; `jump` what is added to the
+    colour beyond `border`, which is the unit vector across a line in the disc's plane and how far from the point that
+    lies (0 without one); `sided` is close to 1 where one side is outside, 0 where both are; `visible` how much each of
+    64 directions sees; `shape` the planarity and linearity of the neighbourhood.  A disc ends `reach` spacings from its
+    point along `rim`, a unit vector in its plane, against it, and along and against their cross product normal x rim.
+    `guessed` is 1 where roughness and metallic are not known, `invented` 0 where the point was measured, and above 0
+    where it was learned (`method/densifier.py`).
     """
 
     position: Float[AnyArray, "*batch points 3"]
     normal: Float[AnyArray, "*batch points 3"]
     spacing: Float[AnyArray, "*batch points"]
     base_color: Float[AnyArray, "*batch points 3"]
-    gradient: Float[AnyArray, "*batch points 3 3"]
     border: Float[AnyArray, "*batch points 4"]
     jump: Float[AnyArray, "*batch points 3"]
     roughness: Float[AnyArray, "*batch points"]

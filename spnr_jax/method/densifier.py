@@ -3,8 +3,8 @@
     propose    pairs of neighbors without a point between them, and open places beside points: rims, legs, gaps
     place      the middle of the curve through both ends at right angles to their normals (Vlachos et al. 2001), and
                a frame there
-    predict    graph convolutions over the points, then a PointNet over those around each place, in its frame: offset of the surface from there, its normal,
-               whether it exists, whose material it has
+    predict    graph convolutions over the points, then a PointNet over those around each place, in its frame: offset
+               of the surface from there, its normal, whether it exists, whose material it has
     choose     likely children that are not too close to better ones
 
 All inputs are relative: lengths in spacings, vectors in frames that rotate with the cloud, so the children rotate with

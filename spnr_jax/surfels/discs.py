@@ -169,26 +169,24 @@ def find_rims(
     return right[None] * axes[0] + high[None] * axes[1], smaller(jax.lax.map(reach, quarters), rules.far)
 
 
-class Colors(NamedTuple):
-    """How colors change within discs, as `Surfels` has it: along the surface, and beyond the border of two colors."""
+class Border(NamedTuple):
+    """Where another color begins within discs, and what it has more, as `Surfels` has it."""
 
-    gradient: Float[Array, "9 block"]
     border: Float[Array, "4 block"]
     jump: Float[Array, "3 block"]
 
 
-def fit_colors(
+def find_border(
     place: Float[Array, "k 2 block"],
     layer: Float[Array, "k block"],
     spacing: Float[Array, " block"],
     axes: Float[Array, "3 3 block"],
     colors: Float[Array, "k 3 block"],
     rules: Rules,
-) -> Colors:
-    """Colors to first order by weighted least squares, or of two kinds beside each other with a straight border.
+) -> Border:
+    """The straight border of two colors, where there is one: discs of one color would fray it at the spacing.
 
-    Colors to first order would fray such a border at the spacing.  All of it fades in; which neighbors are of the other
-    color is a constant.
+    All of it fades in; which neighbors are of the other color is a constant.
     """
     squared = place[:, 0] ** 2 + place[:, 1] ** 2
     weight = layer * jnp.exp(-0.5 / rules.border_within**2 * squared)
@@ -197,19 +195,15 @@ def fit_colors(
     roots = roots - roots[:1]
     beyond = _part(weight, jax.lax.stop_gradient(roots))
     plane = jnp.concatenate([jnp.ones_like(place[:, :1]), place], axis=1)
-    smooth = (layer * jnp.exp(-0.5 * squared))[:, None] * plane
-    slopes = _solve_plane(sum_products(smooth, jnp.concatenate([plane, change], axis=1)), rules.color_ridge)
     products = jnp.stack([place[:, 0] ** 2, place[:, 0] * place[:, 1], place[:, 1] ** 2], axis=1)
     sides = jnp.stack([weight * ~beyond, weight * beyond], axis=1)
     spread = jnp.sum(roots**2, axis=1)[:, None]
     own, other = sum_products(sides, jnp.concatenate([plane, products, change, roots, spread], axis=1))
     way, distance, wrong = _find_line(place, weight, beyond, own, other, rules)
     sure = _trust(own, other, rules) * _ramp(wrong, rules.wrong_side)
-    slopes = ((1 - sure) / spacing)[None, None] * slopes
-    gradient = slopes[0][:, None] * axes[0][None] + slopes[1][:, None] * axes[1][None]
     border = [way[0][None] * axes[0] + way[1][None] * axes[1], (distance * spacing)[None]]
     jump = sure[None] * (_mean(other, CHANGE) - _mean(own, CHANGE))
-    return Colors(gradient.reshape(9, -1), jnp.concatenate(border), jump)
+    return Border(jnp.concatenate(border), jump)
 
 
 def _ramp(values: Float[Array, " block"], ends: tuple[float, float]) -> Float[Array, " block"]:

@@ -4,8 +4,7 @@ neighbors   the nearest points of each point: topology, found once on the host b
 spacing     side of the square that a point represents, from the neighbors on its own layer of the surface
 normal      given, or that of the layer where none is (layers.py), outward by votes of directions and walls (sides.py)
 sided       1 where the votes decide which side is outside, 0 where both are equally visible (a sheet)
-gradient    of the color along the surface, a ridge regression over the layer: colors are interpolated to first order,
-            except for points beside the border of two colors
+border      of two colors, where one lies within a disc, and the jump beyond it (discs.py)
 rim, reach  where the disc ends: at the rim of the layer or where another face cuts it (discs.py)
 shape       planarity and linearity: ratios of the neighbors' extents, 0 in a plane, 0 on a line
 scene       surfels in the box, with the transform from the cloud's units: the renderer's input
@@ -15,7 +14,7 @@ arrays of all points, which are (columns, points) here.
 
 Gradients flow from positions, normals and colors through normals, spacings, ends of discs and colors.  Discrete choices
 are constants without a gradient: the neighbors, the plane that a layer is fitted from, which neighbor ends a disc or
-has another color, sides and flips of normals, which points are shown, and visibility from each direction.
+has another color, sides and flips of normals, and visibility from each direction.
 """
 
 import dataclasses
@@ -114,7 +113,7 @@ class Points(NamedTuple):
 def estimate_surfels(cloud: PointCloud, neighbors: Int[Array, "points 20"], rules: Rules = RULES) -> Surfels:
     """Surfels of the points of a cloud (unbatched) in the box [-1, 1]^3; pure, differentiable, one structure.
 
-    As many as points and in their order.  `mask` is False for padding, and for what nothing outside sees.
+    As many as points and in their order.  `mask` is False for padding.
     `neighbors` are those of `spnr_jax.neighbors`: each point itself first, -1 for none.  A given normal may have any
     length; one of length 0 is none.
     """
@@ -133,17 +132,16 @@ def estimate_surfels(cloud: PointCloud, neighbors: Int[Array, "points 20"], rule
     )
     raw, layer = find_layers(points, normals, sided=True, sheets=normals is None, rules=rules)
     seen = look(points, layer.normal, raw, rules)
-    normal, sided, directions = find_sides(points, raw, layer, seen, rules)
-    fields, covered = describe(points, raw, layer, normal, sided, seen, rules)
+    normal, sided = find_sides(points, raw, layer, seen, rules)
+    fields = describe(points, raw, layer, normal, sided, seen, rules)
     known = jnp.ones_like(raw) if cloud.materials_known is None else columns(cloud.materials_known)
     learned = jnp.zeros_like(raw) if cloud.invented is None else columns(cloud.invented)
     fields |= {"roughness": columns(cloud.roughness), "metallic": columns(cloud.metallic)}
     fields |= {"guessed": 1 - known, "invented": learned}
     fields |= {"position": points.position, "normal": normal, "base_color": points.color, "sided": sided}
     fields = {name: jnp.moveaxis(layers.select(mask, values, 0), -1, 0) for name, values in fields.items()}
-    fields["gradient"] = fields["gradient"].reshape(-1, 3, 3)
     fields["spacing"] = jnp.where(mask, fields["spacing"], 1)  # its logarithm is taken
-    return Surfels(**fields, mask=sides.find_shown(directions, covered, mask, rules))
+    return Surfels(**fields, mask=mask)
 
 
 def median(values: Float[Array, " points"], mask: Bool[Array, " points"]) -> Float[Array, ""]:
@@ -271,8 +269,8 @@ def find_sides(
     layer: Layer,
     seen: Float[Array, "64 points"],
     rules: Rules = RULES,
-) -> tuple[Float[Array, "3 points"], Float[Array, " points"], Float[Array, " points"]]:
-    """Normals that point outward, how sure that is, and how many directions see each point, by their cosines."""
+) -> tuple[Float[Array, "3 points"], Float[Array, " points"]]:
+    """Normals that point outward, and how sure that is."""
     turned, fixed = layer.normal, jax.lax.stop_gradient((points.position, raw, layer))
     position, raw, layer = fixed
     points = points._replace(position=position)
@@ -289,7 +287,7 @@ def find_sides(
 
     leans = (front - back) / (front + back + rules.evidence)
     towards, _ = jax.lax.scan(vote, leans, jnp.asarray([1, 0], raw.dtype))
-    return *sides.turn_outward(turned, towards, front, back, points.given, rules), front + back
+    return sides.turn_outward(turned, towards, points.given, rules)
 
 
 def describe(
@@ -300,13 +298,13 @@ def describe(
     sided: Float[Array, " points"],
     seen: Float[Array, "64 points"],
     rules: Rules = RULES,
-) -> tuple[dict[str, Array], Bool[Array, " points"]]:
-    """The fields that follow from layers and sides (..., points), and which points another layer covers."""
+) -> dict[str, Array]:
+    """The fields that follow from layers and sides (..., points)."""
     rough, weight, random = find_spacings(points, raw, layer, normal, sided, rules)
 
     def work(
         hood: Hood, number: Array, raw: Array, layer: Layer, weight: Array, normal: Array, sided: Array
-    ) -> tuple[dict[str, Array], Array]:
+    ) -> dict[str, Array]:
         normals, colors, sides, spacings = jnp.split(hood.columns, [3, 6, 7], axis=1)
         axes, spacing = frame(normal), discs.smooth_spacing(weight, spacings[:, 0], rules)
         flat = jnp.stack([along(hood.offset, axis) for axis in axes[:2]], axis=1)
@@ -317,19 +315,18 @@ def describe(
         ends = discs.find_farthest(jnp.where(there[:, None], place, 0)) + rules.beyond
         cuts = discs.find_cuts(hood, axes, spacing, sided, normals, sides[:, 0], rules)
         rim, reach = discs.find_rims(ends, cuts, axes, rules)
-        fitted = discs.fit_colors(place, weight, spacing, axes, colors, rules)
+        fitted = discs.find_border(place, weight, spacing, axes, colors, rules)
         own = layers.weigh_near(hood, raw, rules) * layers.weigh_height(layer)
-        fields = fitted._asdict() | {
+        return fitted._asdict() | {
             "spacing": spacing,
             "shape": measure_shape(layers.measure_covariance(hood, raw, own)),
             "rim": rim,
             "reach": reach,
         }
-        return fields, layers.find_covered(hood, layer, normal, normals, rules)
 
     table = jnp.concatenate([normal, points.color, sided[None], rough[None]])
-    fields, covered = map_blocks(work, points, table, rules, raw, layer, weight, normal, sided)
-    return fields | {"visible": average_seen(points, weight, seen, rules)}, covered
+    fields = map_blocks(work, points, table, rules, raw, layer, weight, normal, sided)
+    return fields | {"visible": average_seen(points, weight, seen, rules)}
 
 
 def average_seen(

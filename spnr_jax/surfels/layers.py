@@ -308,15 +308,3 @@ def weigh_layer(
     weight = hood.real * weigh_height(layer, rules.loose)
     weight = weight * jnp.where((sided > 0.5)[None], clamp(0.5 + along(normals, normal), 0, 1), 1)
     return jax.lax.optimization_barrier(jnp.concatenate([jnp.ones_like(weight[:1]), weight[1:]]))
-
-
-def find_covered(
-    hood: Hood, layer: Layer, normal: Float[Array, "3 block"], normals: Float[Array, "k 3 block"], rules: Rules
-) -> Bool[Array, " block"]:
-    """Whether another layer that faces the same way lies right above a point, as a sticker does."""
-    outward = jnp.sign(dot(normal, layer.normal))[None] * layer.height / layer.scale[None]
-    farthest = jnp.maximum(jnp.max(hood.squared, axis=0), rules.least_spacing**2)
-    other = hood.real * jnp.exp(-0.5 * hood.squared / farthest[None]) * (along(normals, normal) > rules.parallel)
-    other = other * (jnp.abs(layer.height) < rules.sticker)
-    above, below = total(other * (outward > rules.apart)), total(other * (outward < -rules.apart))
-    return above > jnp.maximum(rules.covering, 2 * below)

@@ -40,8 +40,6 @@ class Rules:
     loose: float = 2.0  # deviation of the layer that colors and spacings come from, over that of the fit
     apart: float = 3.0  # deviations from which on a neighbor is of another layer
     parallel: float = 0.8  # cosine between normals of layers that lie above each other
-    sticker: float = 0.8  # most height of a layer that covers a point
-    covering: float = 2.0  # weight of the neighbors above from which on a layer covers a point
 
     # sheets: of two skins nearer than a layer is thick, that of the point's color
     like: float = 0.1  # between square roots of linear colors, standard deviation of the weight as of one color
@@ -58,12 +56,10 @@ class Rules:
     wall: float = 1.5  # height within which another layer is the other side of a wall
     wall_vote: float = 3.0  # weight of the wall's vote
     turn: float = 0.5  # lean against a given normal from which it is turned
-    hidden: float = 0.4  # directions, by their cosines, that see a point at most which lies inside and is not drawn
-    least_shown: float = 0.3  # share of the points that has to be left
     evidence: float = 1.0  # votes that a lean is measured against: few of them are none
     sure_side: Pair = (0.15, 0.45)  # lean of the votes from which a side begins to count, and counts whole
     bounds_seen: Pair = (0.5, 2.0)  # of a point's spacing over the median one, where directions look at it
-    leak: float = 0.02  # weight of a one-sided disc from behind, where its back can be seen: better than a hole
+    leak: float = 0.02  # weight of a one-sided disc from behind: better than a hole
 
     # ends of discs
     rim_within: float = 2.2  # distance of the neighbors that tell where a layer ends
@@ -81,7 +77,6 @@ class Rules:
     bridged: float = 0.95  # from a disc to the middle of a gap, at most
 
     # colors
-    color_ridge: float = 0.15  # of the color's regression over the layer
     border_within: float = 1.6  # standard deviation of the weight of a neighbor beside a border
     border_least: float = 0.01  # weight from which on a neighbor's place bounds the line
     contrast: Pair = (0.06, 0.16)  # between the two colors, in square roots of linear ones

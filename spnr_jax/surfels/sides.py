@@ -159,8 +159,7 @@ def vote_of_walls(
 ) -> Float[Array, " block"]:
     """A lean from another layer, nearer than anything can be seen between: a wall's sides face away from each other.
 
-    A layer right under another, as under a sticker, is taken for a wall's inner side, and not seen from outside either;
-    given normals tell the two apart.
+    A layer right under another, as under a sticker, is taken for a wall's inner side; given normals tell the two apart.
     """
     cosine = along(normals, layer.normal)
     other = jnp.where(given[None], -cosine, jnp.abs(cosine)) > rules.parallel
@@ -175,25 +174,14 @@ def vote_of_walls(
 def turn_outward(
     normal: Float[Array, "3 block"],
     towards: Float[Array, " block"],
-    front: Float[Array, " block"],
-    back: Float[Array, " block"],
     given: Bool[Array, " block"],
     rules: Rules,
 ) -> tuple[Float[Array, "3 block"], Float[Array, " block"]]:
-    """Normals that point outward, and 1 where the votes say which side that is, 0 where they do not.
+    """Normals that point outward, and close to 1 where the votes say which side that is, 0 where they do not.
 
     Given normals have a side; they are turned only where the votes are clear.
     """
     begin, end = rules.sure_side
-    sided = clamp((jnp.abs(towards) - begin) / (end - begin), 0, 1)
+    sided = clamp((jnp.abs(towards) - begin) / (end - begin), 0, 1 - rules.leak)
     wrong = towards < jnp.where(given, -rules.turn, 0)
-    sided = jnp.where(jnp.where(wrong, front, back) > rules.hidden, jnp.minimum(sided, 1 - rules.leak), sided)
     return jnp.where(wrong[None], -normal, normal), jax.lax.stop_gradient(sided)
-
-
-def find_shown(
-    seen: Float[Array, " all"], covered: Bool[Array, " all"], mask: Bool[Array, " all"], rules: Rules
-) -> Bool[Array, " all"]:
-    """Which real points something outside sees; all, where that would leave too few."""
-    shown = mask & ~covered & (seen > rules.hidden)
-    return jnp.where(jnp.sum(shown) > rules.least_shown * jnp.sum(mask), shown, mask)

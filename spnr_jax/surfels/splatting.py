@@ -80,18 +80,17 @@ def _sum_rows(
     return jax.lax.scan(lambda sums, at: (sums + at[0][:, None] * rows[at[1]], None), empty, places, unroll=8)[0]
 
 
-def _colors(surfels: Surfels) -> Float[Array, "points 19"]:
-    """Of each disc: its colour at the origin and the change along x, y, z, the plane of its border, the jump there."""
-    offset = surfels.base_color - jnp.sum(surfels.gradient * surfels.position[:, None], axis=-1)
+def _colors(surfels: Surfels) -> Float[Array, "points 10"]:
+    """Of each disc: its colour, the plane of its border, the jump there."""
     border = surfels.border[:, 3] + jnp.sum(surfels.border[:, :3] * surfels.position, axis=-1)
-    parts = offset, surfels.gradient.reshape(-1, 9), surfels.border[:, :3], border[:, None], surfels.jump
+    parts = surfels.base_color, surfels.border[:, :3], border[:, None], surfels.jump
     return jnp.concatenate(parts, axis=1)
 
 
 def _sum_colors(
     sharp: Float[Array, "list slots"],
     point: Int[Array, "list slots"],
-    rows: Float[Array, "points 21"],
+    rows: Float[Array, "points 12"],
     pixel_of: Int[Array, " slots"],
     ahead: Float[Array, " slots"],
     camera: Camera,
@@ -106,10 +105,9 @@ def _sum_colors(
     where = [pose[i, 0] * right + pose[i, 1] * up - pose[i, 2] * ahead + pose[i, 3] for i in range(3)]
 
     def add(sums: Array, at: tuple[Array, Array]) -> tuple[Array, None]:
-        color, change, across, border, jump, centre = jnp.split(rows[at[1]], (3, 12, 15, 16, 19), axis=1)
+        color, across, border, jump, centre = jnp.split(rows[at[1]], (3, 6, 7, 10), axis=1)
         beyond = sum(across[:, i] * where[i] for i in range(3)) - border[:, 0]
         color += clamp(0.5 + beyond / pixel, 0, 1)[:, None] * jump
-        color += sum(change[:, i::3] * where[i][:, None] for i in range(3))
         return sums + at[0][:, None] * jnp.concatenate([color, centre], axis=1), None
 
     return jax.lax.scan(add, jnp.zeros((point.shape[1], 5), rows.dtype), (sharp, point), unroll=8)[0]

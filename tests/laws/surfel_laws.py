@@ -175,18 +175,18 @@ def farthest_twin(place):
     return np.stack([(place[:, 0] * np.cos(t) + place[:, 1] * np.sin(t)).max(axis=0) for t in discs.TURN])
 
 
-def slopes(place, colors):
-    """Of colours over tangent planes, where there are no two."""
+def borders(place, colors):
+    """Of two colours in tangent planes, where there are two."""
     one, up = jnp.ones_like(place[0, 0]), jnp.zeros_like(place[0, 0])
     axes = jnp.stack([jnp.stack([one, up, up]), jnp.stack([up, one, up]), jnp.stack([up, up, one])])
-    return discs.fit_colors(place, jnp.ones_like(place[:, 0]), one, axes, colors, RULES).gradient
+    return tuple(discs.find_border(place, jnp.ones_like(place[:, 0]), one, axes, colors, RULES))
 
 
-def tinted(rng, size):
-    """Places, and colours whose square roots differ by less than two colours do."""
+def parted(rng, size):
+    """Places, and colours of two kinds on the sides of a line."""
     (place,) = places(rng, 1.0)
-    slope = rng.uniform(-1, 1, (3, 2, POINTS))
-    return place, 0.5 + 0.01 * size * np.einsum("cip,kip->kcp", slope, place)
+    side = np.sign(place[:, 0] + 0.5 * place[:, 1] - 0.4)[:, None]
+    return place, 0.5 + 0.2 * size * side * np.array([1, -0.5, 0.3])[None, :, None]
 
 
 # fmt: off
@@ -195,7 +195,7 @@ NEIGHBORHOODS = (
     Law("first_spacing", spacings, spacings_twin, (Axis("spacing", 1e-4, 0.1, 1e12, sorted_sheets),), shared=0),
     Law("fit_layers, a round", quadric, None, sizes("spacing", 1e-12, 1e12, sheets), shared=0),
     Law("find_farthest", discs.find_farthest, farthest_twin, sizes("distance", 1e-30, 1e30, places), shared=0),
-    Law("fit_colors", slopes, None, sizes("difference of colors", 0.1, 10, tinted), shared=0),
+    Law("find_border", borders, None, sizes("difference of colors", 0.1, 2, parted), shared=0),
 )
 # fmt: on
 

@@ -72,7 +72,6 @@ def surfels(position, normal, spacing, **columns) -> Surfels:
     normal = np.broadcast_to(normal, (count, 3))
     columns = {
         "base_color": np.full((count, 3), 0.5),
-        "gradient": np.zeros((count, 3, 3)),
         "border": np.zeros((count, 4)),
         "jump": np.zeros((count, 3)),
         "roughness": np.full(count, 0.5),

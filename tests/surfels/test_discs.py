@@ -37,7 +37,6 @@ def test_the_line_between_two_colours_is_found_beside_it_and_nowhere_else(spread
     assert np.median(np.abs(border[near, 3] - np.abs(beyond[near]))) < 0.2 * spacing
     np.testing.assert_allclose(jump[near], np.where(beyond[near, None] > 0, RED - BLUE, BLUE - RED), atol=0.06)
     alone = estimate(positions, np.tile(RED, (len(positions), 1)))
-    assert np.abs(found.gradient[near]).max() * spacing < 0.2
     assert not alone.jump.any()
 
 

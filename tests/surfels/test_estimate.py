@@ -2,20 +2,17 @@
 
 import dataclasses
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from support.laws import close
-from support.surfel_clouds import cloud, even_square, shape
 from support.surfel_clouds import estimate as surfels_of
+from support.surfel_clouds import even_square, shape
 
-from spnr_jax.surfels import discs
-from spnr_jax.surfels.geometry import neighbors
 from spnr_jax.surfels.projection import RADIUS
 from spnr_jax.surfels.rules import RULES
 from spnr_jax.surfels.sides import tangents
 
-FIELDS = ("normal", "spacing", "gradient", "sided", "visible", "shape")
+FIELDS = ("normal", "spacing", "jump", "sided", "visible", "shape")
 
 
 def estimate(positions, color=None, normals=None):
@@ -56,26 +53,6 @@ def test_the_shape_is_0_in_a_plane_and_on_a_line():
     assert np.quantile(linearity, 0.1) > 0.5
     line = np.linspace(-0.9, 0.9, 300)[:, None] * [0.6, 0, 0.8]
     assert estimate(line)["shape"][:, 1].max() < 0.01
-
-
-@pytest.mark.parametrize(("ridge", "off"), [(0.0, 2e-3), (RULES.color_ridge, 0.05)])
-def test_the_gradient_of_a_colour_that_is_linear_is_exact_but_for_the_ridge(ridge, off):
-    positions, normals, spacing = shape("plane", 700)
-    axes = np.stack([*tangents(normals[:1]), normals[:1]], axis=1)[0]
-    slopes = np.array([[0.3, -0.2, 0.1], [0.0, 0.5, 0.2], [-0.1, 0.1, -0.4]])
-    colors = np.float32(0.5 + positions @ slopes.T)
-    near = neighbors(cloud(positions)).T
-    place = ((positions[near] - positions) @ axes[:2].T / spacing).transpose(0, 2, 1)
-    found = discs.fit_colors(
-        *map(jnp.asarray, (place, np.ones(near.shape, np.float32), np.full(700, spacing, np.float32))),
-        *map(jnp.asarray, (np.broadcast_to(axes[..., None], (3, 3, 700)), colors[near].transpose(0, 2, 1))),
-        dataclasses.replace(RULES, color_ridge=ridge),
-    )
-    expected = slopes @ axes[:2].T @ axes[:2]  # a plane shows nothing of how the colour changes off it
-    gradient = np.asarray(found.gradient).T.reshape(-1, 3, 3)
-    inner = np.abs(positions).max(axis=1) < 0.4
-    assert np.abs(gradient[inner] - expected).max() < off * np.abs(expected).max()
-    assert np.abs(estimate(positions)["gradient"]).max() == 0
 
 
 def test_blocks_of_points_and_their_order_change_nothing():
@@ -164,7 +141,7 @@ def test_the_sides_of_a_thin_wall_face_away_from_each_other_and_keep_their_colou
     found = estimate(positions, color)
     inner = np.hypot(u, v) < 0.5
     assert np.mean(found["normal"][inner, 1] * sign[inner] > 0.9) > 0.97
-    assert np.mean(np.abs(found["gradient"][inner]).max(axis=(1, 2)) < 0.1 / spacing) > 0.97
+    assert np.mean(np.abs(found["jump"][inner]).max(axis=1) < 0.1) > 0.97
 
 
 def box_with_a_back(count):

@@ -171,21 +171,6 @@ class TestBlend:
             ours = [getattr(buffer, name).reshape(24**2, -1)[pixel].squeeze() for name in names]
             close(ours, blend_twin(entries, found, view, pixel), rtol=1e-4, atol=1e-4)
 
-    def test_a_colour_that_is_linear_over_a_plane_is_drawn_at_each_pixel(self):
-        slopes = np.array([[0.3, 0.1, 0], [0, -0.4, 0], [0.2, 0.2, 0]])
-        found, view = layer(), camera()
-        color = 0.5 + np.asarray(found.position) @ slopes.T
-        found = surfels(
-            found.position, (0, 0, 1.0), found.spacing, base_color=color, gradient=np.tile(slopes, (500, 1, 1))
-        )
-        buffer, _ = draw(found, view)
-        rays = np.asarray(cameras.camera_rays(view).directions)
-        hit = [0, 0, 2.5] - 2.5 * rays / rays[..., 2:]
-        inner = buffer.opacity > 0.9
-        assert inner.mean() > 0.9
-        close(buffer.color[inner], (0.5 + hit @ slopes.T)[inner], atol=1e-4)
-        assert np.abs(buffer.attributes[inner] - (0.5 + hit @ slopes.T)[inner]).max() > 1e-3  # to order zero only
-
     def test_a_border_of_two_colours_is_a_line_a_pixel_wide_on_a_plane(self):
         across, at, jump = np.array([0.6, 0.8, 0.0]), 0.15, np.array([0.3, -0.2, 0.1])
         found, view = layer(), camera()
