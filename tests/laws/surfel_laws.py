@@ -176,7 +176,8 @@ def farthest_twin(place):
 
 
 def borders(place, colors):
-    """Of two colours in tangent planes, where there are two."""
+    """Of two colours in tangent planes, where there are two; the point itself lies at 0."""
+    place = jnp.concatenate([0 * place[:1], place[1:]])
     one, up = jnp.ones_like(place[0, 0]), jnp.zeros_like(place[0, 0])
     axes = jnp.stack([jnp.stack([one, up, up]), jnp.stack([up, one, up]), jnp.stack([up, up, one])])
     return tuple(discs.find_border(place, jnp.ones_like(place[:, 0]), one, axes, colors, RULES))
@@ -186,7 +187,8 @@ def parted(rng, size):
     """Places, and colours of two kinds on the sides of a line."""
     (place,) = places(rng, 1.0)
     side = np.sign(place[:, 0] + 0.5 * place[:, 1] - 0.4)[:, None]
-    return place, 0.5 + 0.2 * size * side * np.array([1, -0.5, 0.3])[None, :, None]
+    speckled = side * np.array([1, -0.5, 0.3])[None, :, None] + rng.uniform(-0.1, 0.1, (len(place), 3, place.shape[2]))
+    return place, 0.5 + 0.2 * size * speckled
 
 
 # fmt: off

