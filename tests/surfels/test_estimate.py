@@ -11,9 +11,9 @@ from support.surfel_clouds import estimate as surfels_of
 
 from spnr_jax.surfels import discs
 from spnr_jax.surfels.geometry import neighbors
-from spnr_jax.surfels.projection import RADIUS
-from spnr_jax.surfels.rules import RULES
+from spnr_jax.surfels.layers import RULES
 from spnr_jax.surfels.sides import tangents
+from spnr_jax.surfels.splatting import RADIUS
 
 FIELDS = ("normal", "spacing", "gradient", "sided", "visible", "shape")
 
