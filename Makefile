@@ -38,7 +38,7 @@ setup: .venv/complete
 	@begin=$$(date +%s); \
 	test -x $(PY) || $(PYTHON) -m venv .venv; \
 	echo "installing into .venv (about a minute)"; \
-	$(PY) -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[data,viewer,formats,meshes,baselines,dev]' && \
+	$(PY) -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[train,data,viewer,formats,meshes,baselines,dev]' && \
 	echo $$(( $$(date +%s) - begin )) > .venv/install_seconds && touch $@
 
 demo: setup

@@ -127,8 +127,16 @@ def _make_note(cloud: Path) -> Callable[[str], None]:
     return lambda line: print(f"{cloud}: {line}", file=sys.stderr)
 
 
+def check_installed(command: str, package: str, extra: str) -> None:
+    """UserError if a package that the command needs is missing; the extra brings it."""
+    if importlib.util.find_spec(package) is None:
+        name = package.replace("_", "-")
+        raise UserError(f"spnr {command} needs the package {name}; pip install 'spnr-jax[{extra}]'")
+
+
 def run_train(command: Train) -> None:
     """`spnr train`."""
+    check_installed("train", "tensorboardX", "train")
     from spnr_jax.devices import placement
     from spnr_jax.formats import data_sets
     from spnr_jax.training import trainer, weights
@@ -149,6 +157,7 @@ def run_train(command: Train) -> None:
 
 def run_evaluate(command: Evaluate) -> None:
     """`spnr evaluate`."""
+    check_installed("evaluate", "flip_evaluator", "train")
     from spnr_jax.formats import data_sets
     from spnr_jax.scoring import evaluation
     from spnr_jax.scoring.report import describe_split, text_table, write_results
@@ -180,8 +189,7 @@ def run_render(command: Render) -> None:
 
 def run_view(command: View) -> None:
     """`spnr view`."""
-    if importlib.util.find_spec("viser") is None:
-        raise UserError("spnr view needs the package viser; pip install 'spnr-jax[viewer]'")
+    check_installed("view", "viser", "viewer")
     from spnr_jax.viewer.server import open_viewer
 
     viewer, notes = open_viewer(command)

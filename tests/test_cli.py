@@ -204,6 +204,21 @@ def test_help_explains_the_fields_of_a_config_and_loads_nothing_heavy():
     assert "--volume-resolution" in done.stdout
 
 
+@pytest.mark.parametrize(
+    ("line", "package", "extra"),
+    [
+        ("view a.ply", "viser", "viewer"),
+        ("train data run", "tensorboardX", "train"),
+        ("evaluate data run", "flip_evaluator", "train"),
+    ],
+)
+def test_a_command_without_its_package_says_in_one_line_what_to_install(capsys, monkeypatch, line, package, extra):
+    monkeypatch.setitem(sys.modules, package, None)
+    assert exit_code(*line.split()) == 2
+    needs = f"needs the package {package.replace('_', '-')}; pip install 'spnr-jax[{extra}]'"
+    assert capsys.readouterr().err == f"spnr: spnr {line.split()[0]} {needs}\n"
+
+
 def test_a_cloud_of_three_points_renders(capsys, tmp_path, run):
     (tmp_path / "one.xyz").write_bytes(FILES["three.xyz"])
     out = tmp_path / "out"

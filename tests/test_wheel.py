@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from support import tiny_dataset, tiny_untrained
+from support import tiny_dataset
 
 from data_gen import command
 
@@ -86,9 +86,9 @@ def test_the_wheel_holds_the_two_packages_of_the_commands_and_all_of_their_files
 
 
 @pytest.mark.ci
-def test_in_an_empty_environment_the_wheel_renders_clouds_and_meshes(environment, tmp_path):
+def test_in_an_empty_environment_the_wheel_renders_clouds_and_meshes_and_exports_splats(environment, tmp_path):
     listed = output_of(environment / "python", "-m", "pip", "list", "--disable-pip-version-check")
-    for package in ("mitsuba", "viser", "pymeshlab", "torch", "dask"):
+    for package in ("mitsuba", "viser", "pymeshlab", "torch", "dask", "matplotlib", "tensorboardX", "flip-evaluator"):
         assert package not in listed.split(), "an extra's package came along"
     shutil.copy(tiny_dataset.dataset().folder / "objects" / "chair" / "points.ply", tmp_path / "cloud.ply")
     (tmp_path / "mesh.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n")
@@ -101,6 +101,9 @@ def test_in_an_empty_environment_the_wheel_renders_clouds_and_meshes(environment
         assert pixels.shape == (32, 32, 3)
         assert pixels.min() < 250, "all white"
         assert (tmp_path / "pictures" / f"{Path(name).stem}_turntable.gif").is_file()
+    few = ["--splats", "splats.ply", "--fitting-views", "4", "--most-splats", "100"]
+    output_of(environment / "spnr", "export", "cloud.ply", *few, cwd=tmp_path, env=variables)
+    assert (tmp_path / "splats.ply").is_file()
 
 
 @pytest.mark.ci
@@ -108,11 +111,13 @@ def test_in_an_empty_environment_the_wheel_renders_clouds_and_meshes(environment
     ("arguments", "extra"),
     [
         (("spnr", "view", "cloud.ply"), "viewer"),
+        (("spnr", "train", "data", "run"), "train"),
+        (("spnr", "evaluate", "data", "run"), "train"),
         (("spnr-data", "generate", "out"), "data"),
     ],
 )
 def test_what_needs_an_extra_says_so_in_one_line(environment, tmp_path, arguments, extra):
-    program, *words = [str(tiny_untrained.run()) if word == "RUN" else word for word in arguments]
+    program, *words = arguments
     done = subprocess.run(
         [environment / program, *words], capture_output=True, text=True, cwd=tmp_path,
         env=clean_environment(JAX_COMPILATION_CACHE_DIR=str(tmp_path / "cache")),

@@ -25,8 +25,7 @@ from spnr_jax.errors import UserError
 from spnr_jax.formats.mesh import meshes, surface_points
 from spnr_jax.formats.mesh.assets import Asset, Material, RejectedAsset
 from spnr_jax.formats.mesh.surface_points import Spread, sample_surface
-from spnr_jax.surfels.lighting import HEIGHT
-from spnr_jax.surfels.skies import resample
+from spnr_jax.surfels.lighting import HEIGHT, resample
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,7 +18,7 @@ from data_gen.render.variant import mitsuba_module
 from data_gen.render.views import ViewConfig, make_sensor, spread_viewpoints
 from spnr_jax.errors import UserError
 from spnr_jax.formats.light_files import ENDINGS, read_envmap
-from spnr_jax.surfels import skies
+from spnr_jax.surfels import lighting, skies
 
 WHITE_SPHERE_RADIANCE = 0.6  # far enough below 1 that white objects keep their shading against the white background
 
@@ -55,7 +55,7 @@ def read_kinds(names: Sequence[str]) -> tuple[tuple[np.ndarray, ...], ...]:
             kinds.append((skies.indoor_envmap(DRAWN_HEIGHT),))
         else:
             files = map_files(name)
-            kinds.append(tuple(np.asarray(skies.resample(read_envmap(file), DRAWN_HEIGHT)) for file in files))
+            kinds.append(tuple(np.asarray(lighting.resample(read_envmap(file), DRAWN_HEIGHT)) for file in files))
     return tuple(kinds)
 
 

@@ -36,6 +36,7 @@ from spnr_jax.config import (
 from spnr_jax.devices.placement import split_objects
 from spnr_jax.errors import require
 from spnr_jax.kernels import cameras, compositing, sampling
+from spnr_jax.kernels.imaging import WHITE
 from spnr_jax.kernels.numerics import length, per_feature, softplus
 from spnr_jax.kernels.records import Camera, Key, PointCloud, Rays, Rendering
 from spnr_jax.kernels.voxels import map_existing
@@ -354,5 +355,5 @@ def render_object(
     )
     density, rgb = density.reshape(points.exists.shape), rgb.reshape(*points.exists.shape, 3)
     shares, _ = compositing.volume_weights(density, points.delta)
-    image = compositing.composite(shares, rgb, jnp.full((1, 3), compositing.WHITE))
+    image = compositing.composite(shares, rgb, jnp.full((1, 3), WHITE))
     return image, compositing.expected_distance(shares, points.distances, far), jnp.sum(shares, axis=-1)

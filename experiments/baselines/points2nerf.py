@@ -28,6 +28,7 @@ from experiments.baselines import ray_chunks
 from spnr_jax.config import LossConfig, Material, NetworkConfig, OptimizerConfig, RenderOptions, TrainConfig, check
 from spnr_jax.errors import UserError, require
 from spnr_jax.kernels import cameras, compositing, sampling
+from spnr_jax.kernels.imaging import WHITE
 from spnr_jax.kernels.numerics import per_feature, softplus
 from spnr_jax.kernels.records import Camera, Key, PointCloud, Rays, Rendering
 from spnr_jax.nn.paper_layers import encode_direction
@@ -293,7 +294,7 @@ class Points2NeRF(nn.Module):
         delta = compositing.interval_lengths(distances, far)
         shares, _ = compositing.volume_weights(density, delta)
         depth = compositing.expected_distance(shares, distances, far)
-        return compositing.composite(shares, rgb, compositing.WHITE), depth, jnp.sum(shares, axis=-1)
+        return compositing.composite(shares, rgb, WHITE), depth, jnp.sum(shares, axis=-1)
 
     def __call__(self, cloud: PointCloud, camera: Camera, key: Key | None = None, train: bool = False) -> Rendering:
         """Views of each cloud from its cameras; training draws the codes with the key and adds the KL term."""

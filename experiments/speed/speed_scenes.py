@@ -22,9 +22,9 @@ from spnr_jax.config import (
 )
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.records import Batch, Camera, Crops, PointCloud, Volume
+from spnr_jax.method.surfel_method import encode_in_box
 from spnr_jax.nn import shader
 from spnr_jax.presets import PRESETS
-from spnr_jax.surfels.geometry import encode_in_box
 from spnr_jax.training import gbuffers
 
 SPHERE, BOX = 0.7, 0.55  # radius and half side, in the box [-1, 1]^3

@@ -38,7 +38,7 @@ from spnr_jax.kernels.records import Batch, Camera, Light
 from spnr_jax.method import surfel_method, surfel_renderer
 from spnr_jax.nn.shader import Shader
 from spnr_jax.scoring.report import Table, number, text
-from spnr_jax.surfels import projection
+from spnr_jax.surfels import splatting
 from spnr_jax.surfels.lighting import room_light
 from spnr_jax.training import gbuffers, optimisation
 
@@ -143,16 +143,16 @@ def frame_programs(options: WhereTimeGoes) -> dict[str, Program]:
     plan = surfel_renderer.plan(scene, camera)
     count = partial(surfel_renderer.count_sizes, doublings=doublings, side=side)
     window = surfel_renderer.scale_camera(camera, doublings, side)
-    found = jax.jit(projection.entries, static_argnames="room")(scene.surfels, window, room=plan.entries)[0]
+    found = jax.jit(splatting.entries, static_argnames="room")(scene.surfels, window, room=plan.entries)[0]
     blended = jax.jit(surfel_renderer.blend_window, static_argnames="plan")(scene, camera, light, plan=plan)
 
-    def blend(found: projection.Entries, light: Light) -> object:
+    def blend(found: splatting.Entries, light: Light) -> object:
         return surfel_renderer.blend_entries(found, scene.surfels, light, window, slots=plan.slots)
 
     return {
         "whole frame": Program(lambda: next(draw(variables, volume, [camera], [light])).image, None),
         "sizes counted": program(count, scene, camera),
-        "entries made and sorted": program(partial(projection.entries, room=plan.entries), scene.surfels, window),
+        "entries made and sorted": program(partial(splatting.entries, room=plan.entries), scene.surfels, window),
         "blended, lit": program(blend, found, light),
         "network, light on materials": program(
             partial(surfel_renderer.shade_window, plan=plan), variables, scene, camera, light, blended

@@ -48,7 +48,7 @@ from spnr_jax.method.surfel_renderer import Plan
 from spnr_jax.scoring.report import Table, number
 from spnr_jax.surfels import lighting
 from spnr_jax.surfels.geometry import fit_box
-from spnr_jax.surfels.skies import directions, solid_angles
+from spnr_jax.surfels.lighting import directions, solid_angles
 
 TURN, SHIFT, MOVED = np.deg2rad(8.0), 0.1, 0.5  # of a wrong pose, in radians and radii; of points, in spacings
 GREY = 0.5  # where materials begin

@@ -22,6 +22,11 @@ OPAQUE = 0.5  # opacity from which a pixel's depth counts for the range of the c
 PALETTE_PIXELS = 128  # along a side of a frame that the palette is chosen from, at least
 PALETTE_FRAMES = 24  # frames, spread over the film, that choose the colours of a GIF
 CENTISECOND = 0.01  # the clock of a GIF
+# viridis (Smith, van der Walt 2015) at 20 even places, dark to bright; lines between are off by at most 4 / 255
+VIRIDIS = (
+    "440154 481467 482576 453781 404688 39558c 33638d 2d718e 287d8e 238a8d "
+    "1f968b 20a386 29af7f 3dbc74 56c667 75d054 95d840 bade28 dde318 fde725"
+)
 
 
 def to_uint8(image: np.ndarray | Array) -> np.ndarray:
@@ -39,17 +44,18 @@ def depth_image(
 ) -> np.ndarray:
     """Colours (h, w, 3) uint8 of distances (h, w), near bright and far dark, fading to white with the opacity (h, w).
 
-    The colours (matplotlib's viridis, perceptually uniform) go from the nearest to the farthest distance of the span,
-    or of the opaque pixels of this one image.
+    The colours (viridis, perceptually uniform) go from the nearest to the farthest distance of the span, or of the
+    opaque pixels of this one image.
     """
-    from matplotlib import colormaps  # here, so that importing the package stays light
-
     depth, acc = np.asarray(depth, np.float64), np.asarray(acc, np.float64)
     opaque = depth[acc > OPAQUE]
     near, far = span or ((opaque.min(), opaque.max()) if opaque.size else (0.0, 1.0))
     nearness = np.clip((far - depth) / max(far - near, np.finfo(np.float32).tiny), 0, 1)
     opacity = np.clip(acc, 0, 1)[..., None]
-    return to_uint8(opacity * colormaps["viridis"](nearness)[..., :3] + 1 - opacity)
+    colors = np.frombuffer(bytes.fromhex(VIRIDIS), np.uint8).reshape(-1, 3) / 255
+    places = np.linspace(0, 1, len(colors))
+    shown = np.stack([np.interp(nearness, places, channel) for channel in colors.T], axis=-1)
+    return to_uint8(opacity * shown + 1 - opacity)
 
 
 def png(image: np.ndarray | Array) -> bytes:

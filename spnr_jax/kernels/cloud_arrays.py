@@ -8,7 +8,6 @@ thinning    a random sample while reading, voxels, then farthest points.  A voxe
 """
 
 from collections.abc import Iterable
-from typing import Any
 
 import jax
 import numpy as np
@@ -73,11 +72,6 @@ def plain_cloud(
         mask=np.ones(count, bool),
         normals=normals,
     )
-
-
-def unstack(tree: Any) -> list[Any]:
-    """What lies at each place of the first axis of a tree's arrays."""
-    return [jax.tree.map(lambda x, i=i: x[i], tree) for i in range(len(jax.tree.leaves(tree)[0]))]
 
 
 # --- repeated points --------------------------------------------------------------------------------------------------

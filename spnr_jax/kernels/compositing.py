@@ -11,8 +11,6 @@ from jaxtyping import Array, Float
 
 from spnr_jax.kernels.numerics import one_minus_exp
 
-WHITE = 1.0  # background of every picture
-
 
 def interval_lengths(
     distances: Float[Array, "*batch samples"], far: Float[Array, "*batch"]

@@ -11,9 +11,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from spnr_jax.kernels.compositing import WHITE
 from spnr_jax.kernels.numerics import clamp
 from spnr_jax.kernels.records import Rendering
+
+WHITE = 1.0  # background of every picture
 
 # --- colours ----------------------------------------------------------------------------------------------------------
 

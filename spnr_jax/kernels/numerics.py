@@ -1,22 +1,23 @@
-"""The few delicate primitives that the other kernels share.
+"""The few delicate primitives that the other kernels share: functions of numbers and vectors, small linear systems.
 
-`gather_rows` and `scatter_rows` are each other's transpose.  Both flatten mapped axes into one longer table under vmap:
-XLA lowers a batched scatter on CPU to a loop about four times slower than a flat one (32^3 voxels, 2 objects).  On a
-mesh there is one table for each group of objects: in a common one XLA would not know that rows stay on their device.
-Subnormal numbers (below 1.2e-38) are zeros to XLA.
+Vectors are the last axis.  Sums, systems and eigenvectors with a few unknowns, one for each point, have the points as
+the last axis instead: every step is one pass over all points of a block, which a CPU vectorises; LAPACK and batched
+matrix products take ten times as long.  Subnormal numbers (below 1.2e-38) are zeros to XLA.
 """
 
 from collections.abc import Callable
-from functools import partial
+from functools import partial, reduce
+from operator import add
 from types import ModuleType
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, Shaped
+from jaxtyping import Array, Float, Shaped
 
-from spnr_jax.devices.placement import object_groups
+# --- numbers and vectors ----------------------------------------------------------------------------------------------
+
 
 # log1p(e) / e on [0, 1], highest power first: Chebyshev interpolation of degree 8, relative error 3e-8
 LOG1P = (
@@ -106,6 +107,15 @@ def columns(x: Float[Array, "*batch features"]) -> list[Float[Array, "*batch"]]:
     return [part[..., 0] for part in jnp.split(x, x.shape[-1], axis=-1)]
 
 
+def rotate_columns(
+    matrix: Float[Array | np.ndarray, "3 3"], vectors: Float[Array | np.ndarray, "points 3"]
+) -> tuple[Array, Array, Array]:
+    """Columns of vectors @ matrix."""
+    x, y, z = columns(jnp.asarray(vectors))
+    one, two, three = (x * matrix[0, i] + y * matrix[1, i] + z * matrix[2, i] for i in range(3))
+    return one, two, three
+
+
 def with_gradient(function: Callable, pull_back: Callable) -> Callable:
     """The function of arrays with the gradient `pull_back(primals, cotangents)`, for both modes of differentiation.
 
@@ -120,6 +130,12 @@ def with_gradient(function: Callable, pull_back: Callable) -> Callable:
 
     differentiable.defjvp(pushed_forward)
     return differentiable
+
+
+def smoothstep(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """0 below 0, 1 above 1, a cubic without a kink between."""
+    x = clamp(x, 0, 1)
+    return x * x * (3 - 2 * x)
 
 
 def normalize(vectors: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3"]:
@@ -160,115 +176,150 @@ def compute_once(x: Float[Array, "*batch n"]) -> Float[Array, "*batch n"]:
     return jnp.matmul(x, jnp.eye(x.shape[-1], dtype=x.dtype), precision="highest")
 
 
-def _end_to_end(function, table, index, *values):
-    """`function` of mapped tables (b, rows, c) as one table (b * rows, c), and of indices (b, *shape) into that."""
-    offsets = table.shape[1] * jnp.arange(len(table), dtype=index.dtype).reshape(-1, *[1] * (index.ndim - 1))
-    return function(table.reshape(-1, *table.shape[2:]), index + offsets, *values)
+# --- small systems, points last ---------------------------------------------------------------------------------------
 
 
-def _by_group(function, plain, *arguments):
-    """`function` of the tables of all objects end to end; on a mesh `plain` of those of each group of objects."""
-    groups = object_groups(len(arguments[0]))
-    if groups == 1:
-        return _end_to_end(function, *arguments)
-    return jax.vmap(partial(_end_to_end, plain))(*(x.reshape(groups, -1, *x.shape[1:]) for x in arguments))
+ROUND = 1e-4  # of the trace, added to variances before they are inverted
+SQUARINGS = 5  # after which a variance that is a tenth larger than another weighs twenty times as much
+SHORTEST = 1e-9  # vector that has a direction
+POINT = 1e-9  # trace of a covariance without extent: the square of smaller ones, which a gradient divides by, vanishes
+SMALLEST = 1e-7  # of the trace, below which a variance is rounding
 
 
-def _plain_gather(table, index):
-    return table.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
+def total(values: Float[Array, "k ..."]) -> Float[Array, "..."]:
+    """Sum over the first axis.  The barrier keeps XLA's CPU compiler from computing the terms one number at a time."""
+    return jnp.sum(jax.lax.optimization_barrier(values), axis=0)
 
 
-def _plain_scatter(table, index, values):
-    return table.at[index].add(values, mode="promise_in_bounds", wrap_negative_indices=False)
+def sum_products(
+    left: Float[Array, "k rows points"], right: Float[Array, "k columns points"]
+) -> Float[Array, "rows columns points"]:
+    """Sums over the first axis of the products of all pairs: normal equations, moments."""
+
+    def add(sums: Array, terms: tuple[Array, Array]) -> tuple[Array, None]:
+        return sums + terms[0][:, None] * terms[1][None], None
+
+    empty = jnp.zeros((left.shape[1], right.shape[1], left.shape[2]), left.dtype)
+    return jax.lax.scan(add, empty, (left, right))[0]
 
 
-_gather = jax.custom_batching.custom_vmap(_plain_gather)
-_scatter = jax.custom_batching.custom_vmap(_plain_scatter)
+def solve(
+    matrix: Float[Array, "unknowns unknowns points"], right: Float[Array, "unknowns sides points"]
+) -> Float[Array, "unknowns sides points"]:
+    """The solution of symmetric positive definite systems; its gradients are solutions of the same systems."""
+    fixed = jax.lax.stop_gradient(matrix)
+    return jax.lax.custom_linear_solve(
+        partial(multiply, matrix), right, lambda _, right: _eliminate(fixed, right), symmetric=True
+    )
 
 
-@_gather.def_vmap
-def _gather_vmap(axis_size, in_batched, table, index):
-    if not in_batched[0]:
-        return _gather(table, index), True
-    if not in_batched[1]:
-        index = jnp.broadcast_to(index, (axis_size, *index.shape))
-    rows = _by_group(_gather, _plain_gather, table, index)
-    return rows.reshape(*index.shape, *table.shape[2:]), True
+def multiply(
+    left: Float[Array, "rows terms points"], right: Float[Array, "terms columns points"]
+) -> Float[Array, "rows columns points"]:
+    """Products of small matrices."""
+    return reduce(add, (left[:, i][:, None] * right[i][None] for i in range(len(right))))
 
 
-@_scatter.def_vmap
-def _scatter_vmap(axis_size, in_batched, *arguments):
-    def spread(x, batched):
-        return x if batched else jnp.broadcast_to(x, (axis_size, *x.shape))
+def _eliminate(matrix: Array, right: Array) -> Array:
+    """Gauss-Jordan elimination, which needs no pivots for positive definite systems."""
+    places = jnp.arange(len(matrix))[:, None, None]
 
-    arguments = tuple(map(spread, arguments, in_batched))
-    return _by_group(_scatter, _plain_scatter, *arguments).reshape(arguments[0].shape), True
+    def eliminate(pivot: Array, rows: Array) -> Array:
+        row = rows[pivot] / rows[pivot, pivot][None]
+        return jnp.where(places == pivot, row[None], rows - rows[:, pivot][:, None] * row[None])
 
-
-@jax.custom_vjp
-def gather_rows(table: Float[Array, "rows features"], index: Int[Array, "*batch"]) -> Float[Array, "*batch features"]:
-    """table[index]; every index must be in [0, rows)."""
-    return _gather(table, index)
+    rows = jnp.concatenate([matrix, right], axis=1)
+    return jax.lax.fori_loop(0, len(matrix), eliminate, rows)[:, len(matrix) :]
 
 
-def _gather_fwd(table, index):
-    return gather_rows(table, index), (index, table.shape[0])
+def dot(one: Float[Array, "3 ..."], two: Float[Array, "3 ..."]) -> Float[Array, "..."]:
+    """Scalar products."""
+    return one[0] * two[0] + one[1] * two[1] + one[2] * two[2]
 
 
-def _gather_bwd(residuals, cotangent):
-    index, rows = residuals
-    return scatter_rows(index, cotangent, rows), np.zeros(index.shape, jax.dtypes.float0)
+def cross(one: Float[Array, "3 points"], two: Float[Array, "3 points"]) -> Float[Array, "3 points"]:
+    """Vector products."""
+    return jnp.stack([one[i - 2] * two[i - 1] - one[i - 1] * two[i - 2] for i in range(3)])
 
 
-gather_rows.defvjp(_gather_fwd, _gather_bwd)
+@jax.custom_jvp
+def largest(values: Float[Array, "k ..."]) -> Float[Array, "..."]:
+    """Largest along the first axis; its gradient is the mean of those that are as large but for rounding.
 
-
-def scatter_rows(
-    index: Int[Array, "*batch"], values: Float[Array, "*batch features"], rows: int
-) -> Float[Array, "rows features"]:
-    """Table whose row r is the sum of the values with index r; every index must be in [0, rows)."""
-    return _scatter_rows(rows, index, values)
-
-
-def _scatter_zeros(rows, index, values):
-    return _scatter(jnp.zeros((rows, values.shape[-1]), values.dtype), index, values)
-
-
-_scatter_rows = jax.custom_vjp(_scatter_zeros, nondiff_argnums=(0,))
-_scatter_rows.defvjp(
-    lambda rows, index, values: (_scatter_rows(rows, index, values), index),
-    lambda rows, index, cotangent: (np.zeros(index.shape, jax.dtypes.float0), gather_rows(cotangent, index)),
-)
-
-
-@partial(jax.custom_vjp, nondiff_argnums=(3,))
-def blend_rows(
-    table: Float[Array, "rows features"],
-    lowest: Int[Array, " batch"],
-    weights: Float[Array, "batch k"],
-    steps: tuple[int, ...],
-) -> Float[Array, "batch features"]:
-    """Sum over k of weights[:, k] * table[lowest + steps[k]]; every row must be in the table.
-
-    The gradient adds all k shares to one table, where the gradient of k gathers would add up k tables.
+    That of jnp.max asks which equal the result: a compiler that computes them twice finds none, and divides by 0.
     """
-    out = jnp.zeros((lowest.shape[0], table.shape[1]), table.dtype)
-    for k, step in enumerate(steps):
-        out = out + weights[:, k, None] * _gather(table, lowest + step)
-    return out
+    return jnp.max(values, axis=0)
 
 
-def _blend_fwd(table, lowest, weights, steps):
-    return blend_rows(table, lowest, weights, steps), (table, lowest, weights)
+@largest.defjvp
+def _largest_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    (values,), (change,) = primals, tangents
+    most = largest(values)
+    near = values >= (most - 8 * jnp.finfo(values.dtype).eps * jnp.abs(most))[None]
+    share = near / jnp.maximum(jnp.sum(near, axis=0, dtype=values.dtype), 1)[None]
+    return most, jnp.sum(share * change, axis=0)
 
 
-def _blend_bwd(steps, residuals, cotangent):
-    table, lowest, weights = residuals
-    sums, shares = jnp.zeros_like(table), []
-    for k, step in enumerate(steps):
-        sums = _scatter(sums, lowest + step, weights[:, k, None] * cotangent)
-        shares.append(jnp.sum(cotangent * _gather(table, lowest + step), axis=-1))
-    return sums, np.zeros(lowest.shape, jax.dtypes.float0), jnp.stack(shares, axis=-1)
+def smallest(values: Float[Array, "k ..."]) -> Float[Array, "..."]:
+    """Smallest along the first axis, likewise."""
+    return -largest(-values)
 
 
-blend_rows.defvjp(_blend_fwd, _blend_bwd)
+def unit(vectors: Float[Array, "dimensions points"]) -> Float[Array, "dimensions points"]:
+    """Vectors of length 1; 0 where they are shorter than SHORTEST, whose gradient overflows."""
+    squared = jnp.sum(vectors * vectors, axis=0, keepdims=True)
+    valid = squared > SHORTEST**2
+    return jnp.where(valid, vectors * jax.lax.rsqrt(jnp.where(valid, squared, 1)), 0)
+
+
+def frame(normal: Float[Array, "3 points"]) -> Float[Array, "3 3 points"]:
+    """Two tangents and the unit normal (Duff et al. 2017)."""
+    x, y, z = normal
+    sign = jnp.where(z >= 0, 1.0, -1.0).astype(normal.dtype)
+    a = -1 / (sign + z)
+    b = x * y * a
+    first = jnp.stack([1 + sign * x**2 * a, sign * b, -sign * x])
+    return jnp.stack([first, jnp.stack([b, sign + y**2 * a, -y]), normal])
+
+
+def project_largest(matrix: Float[Array, "3 3 points"]) -> Float[Array, "3 3 points"]:
+    """Onto the eigenvector of the largest eigenvalue of positive matrices: their powers, of trace 1.
+
+    Where two are alike it is a mean of both projections, so it is smooth, as its gradient is.
+    """
+
+    def square(_: Array, power: Array) -> Array:
+        power = multiply(power, power)
+        return power / (power[0, 0] + power[1, 1] + power[2, 2])[None, None]
+
+    scaled = matrix / (matrix[0, 0] + matrix[1, 1] + matrix[2, 2])[None, None]
+    return jax.lax.fori_loop(0, SQUARINGS, square, scaled)
+
+
+def split_variances(
+    matrix: Float[Array, "3 3 points"],
+) -> tuple[Float[Array, "3 3 points"], Float[Array, "3 3 points"], Float[Array, "3 3 points"]]:
+    """Covariances at trace 1 (0 without extent), projections onto the narrowest axis and onto the widest."""
+    trace = matrix[0, 0] + matrix[1, 1] + matrix[2, 2]
+    extended = trace > POINT
+    scaled = jnp.where(extended[None, None], matrix / jnp.where(extended, trace, 1)[None, None], 0)
+    ones = jnp.broadcast_to(jnp.eye(3, dtype=matrix.dtype)[..., None], matrix.shape)
+    both = jnp.concatenate([solve(scaled + ROUND * ones, ones), scaled + ROUND * ones], axis=2)
+    narrowest, widest = jnp.split(project_largest(both), 2, axis=2)
+    return scaled, narrowest, widest
+
+
+def find_narrowest(matrix: Float[Array, "3 3 points"]) -> Float[Array, "3 points"]:
+    """Unit vectors, of either sign, along which points with these covariances spread least."""
+    _, (x, y, z), _ = split_variances(matrix)
+    last = jnp.where(y[1] > z[2], y, z)
+    return unit(jnp.where((x[0] > y[1]) & (x[0] > z[2]), x, last))
+
+
+def measure_shape(matrix: Float[Array, "3 3 points"]) -> Float[Array, "2 points"]:
+    """Ratios of the standard deviations along the axes: planarity, 0 in a plane, and linearity, 0 on a line."""
+    scaled, narrowest, widest = split_variances(matrix)
+    least, most = (jnp.sum(x * scaled, axis=(0, 1)) for x in (narrowest, widest))
+    middle = scaled[0, 0] + scaled[1, 1] + scaled[2, 2] - least - most
+    ratios = jnp.stack([least, middle]) / larger(jnp.stack([middle, most]), SMALLEST)
+    return root(jnp.where(jnp.stack([least, middle]) > SMALLEST, smaller(ratios, 1), 0))

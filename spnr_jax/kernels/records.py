@@ -5,7 +5,7 @@ batch objects views points rays samples height width features.  Colours of mater
 in [0, 1].  Image sizes are static fields because they shape arrays.
 """
 
-from typing import Any, no_type_check
+from typing import Any, NamedTuple, no_type_check
 
 import jax
 import numpy as np
@@ -45,6 +45,15 @@ class Camera:
     intrinsics: Float[AnyArray, "*batch 3 3"]
     height: int = struct.field(pytree_node=False)
     width: int = struct.field(pytree_node=False)
+
+
+class View(NamedTuple):
+    """A camera whose picture's size is a number like others, not one that programs are compiled for."""
+
+    cam_to_world: Float[AnyArray, "3 4"]
+    intrinsics: Float[AnyArray, "3 3"]
+    height: Int[AnyArray, ""]
+    width: Int[AnyArray, ""]
 
 
 @no_type_check
@@ -250,3 +259,8 @@ class Gaussians:
 
 
 Key = jax.Array
+
+
+def unstack(tree: Any) -> list[Any]:
+    """What lies at each place of the first axis of a tree's arrays."""
+    return [jax.tree.map(lambda x, i=i: x[i], tree) for i in range(len(jax.tree.leaves(tree)[0]))]

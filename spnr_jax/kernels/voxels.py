@@ -22,8 +22,9 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from spnr_jax.kernels import sampling
-from spnr_jax.kernels.numerics import blend_rows, clamp, compute_once, gather_rows, scatter_rows
+from spnr_jax.kernels.numerics import clamp, compute_once
 from spnr_jax.kernels.records import Rays
+from spnr_jax.kernels.rows import blend_rows, gather_rows, scatter_rows
 
 NEIGHBOURS = tuple((z, y, x) for z in (-1, 0, 1) for y in (-1, 0, 1) for x in (-1, 0, 1))
 

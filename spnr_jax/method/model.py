@@ -20,7 +20,7 @@ import numpy as np
 from spnr_jax.config import NetworkConfig, Quality
 from spnr_jax.errors import UserError
 from spnr_jax.kernels import cameras, cloud_arrays
-from spnr_jax.kernels.records import Camera, Light, PointCloud, Rendering, SurfelScene, Volume
+from spnr_jax.kernels.records import Camera, Light, PointCloud, Rendering, SurfelScene, Volume, unstack
 from spnr_jax.methods import method_of
 
 FIELD_OF_VIEW, DISTANCE = np.deg2rad(40.0), 3.0  # of the training cameras; the object fits into the unit sphere
@@ -69,7 +69,7 @@ class Model:
         _check_quality(quality)
         if camera.cam_to_world.ndim == 2:
             return next(self.render_each(volume, [camera], quality, [light]))
-        drawn = self.render_each(volume, cloud_arrays.unstack(camera), quality, [light] * len(camera.cam_to_world))
+        drawn = self.render_each(volume, unstack(camera), quality, [light] * len(camera.cam_to_world))
         return jax.tree.map(lambda *x: np.stack(x), *drawn)
 
     def render_each(
@@ -119,7 +119,7 @@ def render_views(
 
     The light, or one for each view, is for a network that sees it; None is the package's room.
     """
-    method, views = method_of(config), cloud_arrays.unstack(camera)
+    method, views = method_of(config), unstack(camera)
     volume = method.encode(variables, cloud, np.zeros(3, np.float32), np.float32(1), config=config)
     lights: Sequence[Light | None] = [None] * len(views)
     if light is not None and method.takes_light:

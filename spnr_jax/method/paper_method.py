@@ -26,7 +26,7 @@ from scipy.spatial import cKDTree
 from spnr_jax.config import AS_TRAINED, PaperConfig, RenderOptions, SamplingConfig, TrainConfig
 from spnr_jax.devices.placement import split_objects
 from spnr_jax.kernels import cameras, compositing, sampling, voxels
-from spnr_jax.kernels.imaging import bilinear
+from spnr_jax.kernels.imaging import WHITE, bilinear
 from spnr_jax.kernels.numerics import clamp
 from spnr_jax.kernels.records import LARGEST_REACH, Camera, Key, Light, PointCloud, Rays, Rendering, Scene, Volume
 from spnr_jax.kernels.voxels import Path
@@ -188,7 +188,7 @@ def _on_one_device(
     else:
         objects, _, rays = inputs
         _, far, _ = cameras.intersect_box(rays.origins, rays.directions)
-        white = jnp.zeros((far.size, bound().config.num_features)).at[:, :3].set(compositing.WHITE)
+        white = jnp.zeros((far.size, bound().config.num_features)).at[:, :3].set(WHITE)
         nothing = Traced(white, far, jnp.zeros_like(far))
         traced = voxels.map_existing(block, _meets(near_points, rays, objects), inputs, nothing, size)
     return jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), traced)

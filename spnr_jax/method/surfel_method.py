@@ -6,11 +6,13 @@ other numbers of entries and pixels; the second, which XLA compiles slowly, only
 
 import dataclasses
 from collections.abc import Iterator, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Int
 
 from spnr_jax.config import SurfelConfig
 from spnr_jax.devices.runtime import QUICK, QUICKEST
@@ -18,12 +20,13 @@ from spnr_jax.devices.side_by_side import two_at_a_time
 from spnr_jax.devices.traces import Kept
 from spnr_jax.kernels import cameras, cloud_arrays
 from spnr_jax.kernels.imaging import enlarge
-from spnr_jax.kernels.records import Camera, GBuffer, Key, Light, PointCloud, Rendering, SurfelScene, Volume
+from spnr_jax.kernels.records import Camera, GBuffer, Key, Light, PointCloud, Rendering, Surfels, SurfelScene, Volume
 from spnr_jax.method import densifier, surfel_renderer
 from spnr_jax.method.surfel_renderer import Blended, Sizes
 from spnr_jax.nn import shader
 from spnr_jax.nn.shader import Shader
-from spnr_jax.surfels.geometry import encode_in_box, neighbors
+from spnr_jax.surfels.geometry import make_scene, neighbors, order_in_space
+from spnr_jax.surfels.layers import RULES
 from spnr_jax.surfels.lighting import room_light
 
 BALANCED = 0.75  # of the pixels along a side, which are drawn and enlarged: docs/lab/performance.md
@@ -52,6 +55,19 @@ def encode(
     scene = encode_in_box(cloud)
     scene = dataclasses.replace(scene, centre=jnp.asarray(centre), scale=jnp.asarray(scale))
     return Volume(scene=scene, centre=scene.centre, scale=scene.scale)
+
+
+def encode_in_box(cloud: PointCloud) -> SurfelScene:
+    """Scene of a cloud in the box (unbatched), of centre 0 and scale 1; on the host, compiled once for a bucket.
+
+    Its surfels are those of the real points in an order in which close ones follow each other, padded.
+    """
+    real = cloud_arrays.strip(cloud)
+    real = jax.tree.map(np.float32, real).replace(mask=real.mask)
+    order, near = order_in_space(real.positions)
+    size = cloud_arrays.bucket(len(order))
+    neighbors = np.pad(near, [(0, size - len(order)), (0, 0)], constant_values=-1)
+    return _encode(cloud_arrays.pad(jax.tree.map(lambda x: x[order], real), size), neighbors)
 
 
 def densify_sparse(variables: dict | None, cloud: PointCloud) -> PointCloud:
@@ -105,6 +121,11 @@ def draw_planned(variables: dict | None, volume: Volume, asked: Asked, sizes: Si
     plan = surfel_renderer.round_sizes(sizes, *asked.resolution)
     blended = _blend(volume.scene, asked.camera, asked.light, plan=plan)
     return _shade(variables, volume.scene, asked.camera, asked.light, blended, plan=plan)
+
+
+@partial(Kept, returns=(SurfelScene, Surfels), options=QUICKEST)
+def _encode(cloud: PointCloud, neighbors: Int[Array, "points 20"]) -> SurfelScene:
+    return make_scene(cloud, neighbors, jnp.zeros(3), jnp.ones(()), RULES)
 
 
 _densify = Kept(densifier.densify_in_box, returns=(PointCloud,), options=QUICKEST)

@@ -23,9 +23,7 @@ from jaxtyping import Array, Float, Int
 from spnr_jax.devices.traces import Kept
 from spnr_jax.errors import UserError
 from spnr_jax.kernels import cameras
-from spnr_jax.kernels.cloud_arrays import unstack
-from spnr_jax.kernels.compositing import WHITE
-from spnr_jax.kernels.imaging import double_size, mean_of_squares
+from spnr_jax.kernels.imaging import WHITE, double_size, mean_of_squares
 from spnr_jax.kernels.numerics import larger
 from spnr_jax.kernels.records import (
     AnyArray,
@@ -35,11 +33,13 @@ from spnr_jax.kernels.records import (
     Rendering,
     Surfels,
     SurfelScene,
+    View,
+    unstack,
 )
 from spnr_jax.nn import shader
 from spnr_jax.nn.shader import NUM_OUTPUTS, Shader, picture
-from spnr_jax.surfels import lighting, projection, splatting
-from spnr_jax.surfels.projection import MOST_ENTRIES, View
+from spnr_jax.surfels import lighting, splatting
+from spnr_jax.surfels.splatting import MOST_ENTRIES
 
 COARSEST = 3.5  # pixels between points from which on a picture is drawn at half the size
 FINEST = 0.8  # below which it is drawn at twice the size and averaged
@@ -127,8 +127,8 @@ def count_sizes(scene: SurfelScene, camera: Camera, *, doublings: int, side: int
     whole = scale_camera(cameras.in_box(camera, scene.centre, scene.scale), doublings, side)
     corner, width, height = place_window(scene.surfels, whole)
     window = crop_camera(whole, corner, width, height)
-    foot = projection.footprints(scene.surfels, View(window.cam_to_world, window.intrinsics, height, width))
-    return Sizes(width, height, projection.total(foot.covered), projection.count_covered(foot, _most(whole)))
+    foot = splatting.footprints(scene.surfels, View(window.cam_to_world, window.intrinsics, height, width))
+    return Sizes(width, height, splatting.count_entries(foot.covered), splatting.count_covered(foot, _most(whole)))
 
 
 def _most(camera: Camera) -> tuple[int, int]:
@@ -165,7 +165,7 @@ def scale_camera(camera: Camera, doublings: int, side: int) -> Camera:
 
 def place_window(surfels: Surfels, camera: Camera) -> tuple[Int[Array, "2"], Int[Array, ""], Int[Array, ""]]:
     """Corner (column, row), width and height of the window around what is drawn of the surfels."""
-    foot = projection.footprints(surfels, camera)
+    foot = splatting.footprints(surfels, camera)
     drawn, rows = foot.covered > 0, foot.covered // foot.width
     sides = []
     for first, size in ((foot.left, foot.width), (foot.top, rows)):
@@ -238,7 +238,7 @@ def blend_window(scene: SurfelScene, camera: Camera, light: Light, *, plan: Plan
     window = crop_camera(whole, corner, plan.width, plan.height)
     buffer, lost = rasterize(scene.surfels, window, light, room=plan.entries, slots=plan.slots)
     beyond = jnp.maximum(width - plan.width, 0) + jnp.maximum(height - plan.height, 0)
-    return Blended(buffer, corner, jnp.minimum(lost, projection.MOST) + beyond)
+    return Blended(buffer, corner, jnp.minimum(lost, splatting.MOST) + beyond)
 
 
 def shade_window(
@@ -262,12 +262,12 @@ def rasterize(
     surfels: Surfels, camera: Camera, light: Light, *, room: int, slots: int
 ) -> tuple[GBuffer, Int[Array, ""]]:
     """The G-buffer of a view, with what of the light arrives at each surfel; entries and pixels that did not fit."""
-    found, lost = projection.entries(surfels, camera, room=room)
+    found, lost = splatting.entries(surfels, camera, room=room)
     buffer = blend_entries(found, surfels, light, camera, slots=slots)
     return buffer, lost + jnp.maximum(splatting.count_covered_pixels(found) - slots, 0)
 
 
-def blend_entries(found: projection.Entries, surfels: Surfels, light: Light, camera: Camera, *, slots: int) -> GBuffer:
+def blend_entries(found: splatting.Entries, surfels: Surfels, light: Light, camera: Camera, *, slots: int) -> GBuffer:
     """The G-buffer of a view's entries."""
     surfels = shader.turn_to_camera(surfels, camera)
     return splatting.blend(found, surfels, shader.attributes(surfels, light, camera), camera, slots=slots)

@@ -24,8 +24,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from spnr_jax.config import EncoderConfig
 from spnr_jax.kernels import voxels
-from spnr_jax.kernels.compositing import WHITE
-from spnr_jax.kernels.imaging import bilinear, linear_to_srgb
+from spnr_jax.kernels.imaging import WHITE, bilinear, linear_to_srgb
 from spnr_jax.kernels.numerics import per_feature, softplus
 from spnr_jax.kernels.records import PointCloud
 from spnr_jax.kernels.voxels import scatter_conv

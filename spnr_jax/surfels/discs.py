@@ -12,10 +12,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from spnr_jax.kernels.numerics import clamp, larger, root, smaller
-from spnr_jax.surfels.layers import Hood, along
-from spnr_jax.surfels.rules import Rules
-from spnr_jax.surfels.small_systems import dot, largest, smallest, solve, sum_products, total, unit
+from spnr_jax.kernels.numerics import (
+    clamp,
+    dot,
+    larger,
+    largest,
+    root,
+    smaller,
+    smallest,
+    solve,
+    sum_products,
+    total,
+    unit,
+)
+from spnr_jax.surfels.layers import Hood, Rules, along
 
 RIM_DIRECTIONS = 16  # in which the end of a layer is looked for
 CHANGE, ROOTS, SPREAD = slice(6, 9), slice(9, 12), 12  # of the sums beside a border, after those over the plane

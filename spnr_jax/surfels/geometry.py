@@ -19,7 +19,6 @@ has another color, sides and flips of normals, and visibility from each directio
 
 import dataclasses
 from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -28,16 +27,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial import cKDTree
 
-from spnr_jax.devices.runtime import QUICKEST
-from spnr_jax.devices.traces import Kept
-from spnr_jax.kernels import cloud_arrays
-from spnr_jax.kernels.numerics import clamp, length, root
+from spnr_jax.kernels.numerics import clamp, dot, frame, largest, length, measure_shape, root, smallest, unit
 from spnr_jax.kernels.records import AnyArray, PointCloud, Surfels, SurfelScene
 from spnr_jax.surfels import discs, layers, sides
-from spnr_jax.surfels.layers import Hood, Layer, along
-from spnr_jax.surfels.rules import NEIGHBORS, RULES, Rules
+from spnr_jax.surfels.layers import NEIGHBORS, RULES, Hood, Layer, Rules, along
 from spnr_jax.surfels.sides import cell_of, grid_of, see_directions
-from spnr_jax.surfels.small_systems import dot, frame, largest, measure_shape, smallest, unit
 
 # --- neighbors, on the host -------------------------------------------------------------------------------------------
 
@@ -376,7 +370,7 @@ def encode(params: Any, cloud: PointCloud, neighbors: Int[AnyArray, "points 20"]
     """
     del params
     inside, centre, scale = move_into_box(cloud)
-    return _make_scene(inside, neighbors, centre, scale, RULES)
+    return make_scene(inside, neighbors, centre, scale, RULES)
 
 
 def move_into_box(cloud: PointCloud) -> tuple[PointCloud, Float[Array, "3"], Float[Array, ""]]:
@@ -403,27 +397,10 @@ def fit_box(
     return low / 2 + high / 2, scale
 
 
-def encode_in_box(cloud: PointCloud) -> SurfelScene:
-    """Scene of a cloud in the box (unbatched), of centre 0 and scale 1; on the host, compiled once for a bucket.
-
-    Its surfels are those of the real points in an order in which close ones follow each other, padded.
-    """
-    real = cloud_arrays.strip(cloud)
-    real = jax.tree.map(np.float32, real).replace(mask=real.mask)
-    order, near = order_in_space(real.positions)
-    size = cloud_arrays.bucket(len(order))
-    neighbors = np.pad(near, [(0, size - len(order)), (0, 0)], constant_values=-1)
-    return _encode(cloud_arrays.pad(jax.tree.map(lambda x: x[order], real), size), neighbors)
-
-
-def _make_scene(
+def make_scene(
     cloud: PointCloud, neighbors: Int[AnyArray, "points 20"], centre: Array, scale: Array, rules: Rules
 ) -> SurfelScene:
+    """Scene of a cloud in the box, of this centre and scale."""
     surfels = estimate_surfels(cloud, jnp.asarray(neighbors), rules)
     spacing = median(jnp.asarray(surfels.spacing), jnp.asarray(surfels.mask))
     return SurfelScene(surfels=surfels, spacing=spacing, centre=centre, scale=scale)
-
-
-@partial(Kept, returns=(SurfelScene, Surfels), options=QUICKEST)
-def _encode(cloud: PointCloud, neighbors: Int[Array, "points 20"]) -> SurfelScene:
-    return _make_scene(cloud, neighbors, jnp.zeros(3), jnp.ones(()), RULES)

@@ -1,23 +1,65 @@
 """Distant light and the part of it that reaches a surface: every function here is linear in the environment map.
 
+map       (height, 2 * height, 3), linear radiance, latitude-longitude: row 0 is straight up (+y), column c of w looks
+          along the azimuth phi = 2 pi (c + 0.5) / w, where the direction is (sin phi, 0, -cos phi) on the horizon
 tables    irradiance by normal, and the map blurred by the GGX lobes of LEVELS by mirrored direction (split-sum
           approximation, Karis 2013), 32 x 64 texels each
 arriving  light that each surfel receives: irradiance from the directions that the surfel is visible from
 """
 
+from collections.abc import Sequence
 from functools import cache, reduce
 from importlib import resources
 from operator import add
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from spnr_jax.kernels.numerics import clamp, columns, larger, namespace, root, smaller
 from spnr_jax.kernels.records import AnyArray, Light, Surfels
-from spnr_jax.surfels import skies
 from spnr_jax.surfels.sides import DIRECTIONS
-from spnr_jax.surfels.skies import SCALE, directions, indoor_envmap, resample, solid_angles
+
+# --- maps as arrays ---------------------------------------------------------------------------------------------------
+
+
+def directions(height: int) -> Float[np.ndarray, "height width 3"]:
+    """Unit directions through the middles of a map's texels."""
+    theta = np.pi * (np.arange(height) + 0.5) / height
+    phi = np.pi * (np.arange(2 * height) + 0.5) / height
+    across = np.sin(theta)[:, None]
+    up = np.broadcast_to(np.cos(theta)[:, None], (height, 2 * height))
+    return np.stack([across * np.sin(phi), up, -across * np.cos(phi)], axis=-1)
+
+
+def solid_angles(height: int) -> Float[np.ndarray, "height width"]:
+    """Of the texels of a map, in steradian."""
+    edges = np.cos(np.pi * np.arange(height + 1) / height)
+    rows = (edges[:-1] - edges[1:]) * np.pi / height
+    return np.repeat(rows[:, None], 2 * height, axis=1).astype(np.float32)
+
+
+def resample(envmap: Float[AnyArray, "h w 3"], height: int) -> Float[AnyArray, "height width 3"]:
+    """A map of another size: each texel is the mean over its solid angle of those that it overlaps; energy is kept."""
+    rows = _shares(
+        -np.cos(np.pi * np.arange(envmap.shape[0] + 1) / envmap.shape[0]),
+        -np.cos(np.pi * np.arange(height + 1) / height),
+    )
+    columns = _shares(np.linspace(0, 1, envmap.shape[1] + 1), np.linspace(0, 1, 2 * height + 1))
+    xp = namespace(envmap)
+    narrow = xp.tensordot(rows, envmap, axes=(1, 0))
+    return xp.tensordot(narrow, columns, axes=(1, 1)).swapaxes(1, 2)
+
+
+def _shares(old: np.ndarray, new: np.ndarray) -> np.ndarray:
+    """Share of each old interval in each new one (new, old), from rising edges."""
+    overlap = np.minimum(old[1:], new[1:, None]) - np.maximum(old[:-1], new[:-1, None])
+    return (np.maximum(overlap, 0) / (new[1:] - new[:-1])[:, None]).astype(np.float32)
+
+
+# --- light ------------------------------------------------------------------------------------------------------------
+
 
 HEIGHT, WIDTH = 32, 64  # of a table
 ROOM = "room_light.npz"
@@ -26,6 +68,7 @@ TOLD = 2  # the level whose values at the directions of the visibility stand for
 SPECULAR = 0.04  # reflectance of what is not metal, seen from straight above
 LOBE = 8.0  # of the directions around the mirrored one whose visibility counts
 POLE = 1e-6  # sine of the angle to straight up or down within which a direction has no azimuth
+Color = Sequence[float | int] | np.ndarray | jax.Array
 SH_BANDS = 9  # spherical harmonics up to degree 2
 ODD = (3, 4, 7), (1, 4, 5)  # of them, those that change their sign when the light is mirrored along x, or along y
 
@@ -62,20 +105,7 @@ def room_light() -> Light:
         return Light(tables=np.load(file, allow_pickle=False)["tables"])
 
 
-def make_room_light() -> Light:
-    """What the file of `room_light` holds, made anew."""
-    return light_of(SCALE * indoor_envmap())
-
-
-def sun(azimuth: skies.Angle, elevation: skies.Angle, size: skies.Angle = 3.0, color: skies.Color = (1, 1, 1)) -> Light:
-    """A round lamp far away: degrees as `Model.camera` counts them, `size` across, irradiance of what faces it.
-
-    Each of these may be traced.  Shadows come from 64 directions, so they are never sharper than some ten degrees.
-    """
-    return light_of(skies.lamp(azimuth, elevation, size, color))
-
-
-def ambient(color: skies.Color = (1, 1, 1)) -> Light:
+def ambient(color: Color = (1, 1, 1)) -> Light:
     """The same radiance from everywhere."""
     xp = namespace(color)
     return light_of(xp.broadcast_to(xp.asarray(color, np.float32), (HEIGHT, WIDTH, 3)))

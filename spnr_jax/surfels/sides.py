@@ -15,10 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from spnr_jax.kernels.numerics import clamp
-from spnr_jax.surfels.layers import Hood, Layer, along, weigh_height, weigh_near
-from spnr_jax.surfels.rules import Rules
-from spnr_jax.surfels.small_systems import dot, total
+from spnr_jax.kernels.numerics import clamp, dot, total
+from spnr_jax.surfels.layers import Hood, Layer, Rules, along, weigh_height, weigh_near
 
 # --- visibility -------------------------------------------------------------------------------------------------------
 

@@ -1,58 +1,20 @@
 """Environment maps that are computed: skies, studios, lamps, random maps for training, and the package's room.
 
-A map is (height, 2 * height, 3), linear radiance, latitude-longitude: row 0 is straight up (+y), column c of w looks
-along the azimuth phi = 2 pi (c + 0.5) / w, where the direction is (sin phi, 0, -cos phi) on the horizon.  Maps add up
-and scale; none is normalised.
+A map is as `lighting.py` has it.  Maps add up and scale; none is normalised.
 
 The room is furnished and has a window and lamps; it is computed, not stored: one ray per texel from its middle to the
 walls, floor and ceiling, each of which has its own colour under a diffuse estimate of the light of lamps and window.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import jax
 import numpy as np
 from jaxtyping import Float
 
 from spnr_jax.kernels.numerics import namespace
-from spnr_jax.kernels.records import AnyArray
-
-# --- maps as arrays ---------------------------------------------------------------------------------------------------
-
-
-def directions(height: int) -> Float[np.ndarray, "height width 3"]:
-    """Unit directions through the middles of a map's texels."""
-    theta = np.pi * (np.arange(height) + 0.5) / height
-    phi = np.pi * (np.arange(2 * height) + 0.5) / height
-    across = np.sin(theta)[:, None]
-    up = np.broadcast_to(np.cos(theta)[:, None], (height, 2 * height))
-    return np.stack([across * np.sin(phi), up, -across * np.cos(phi)], axis=-1)
-
-
-def solid_angles(height: int) -> Float[np.ndarray, "height width"]:
-    """Of the texels of a map, in steradian."""
-    edges = np.cos(np.pi * np.arange(height + 1) / height)
-    rows = (edges[:-1] - edges[1:]) * np.pi / height
-    return np.repeat(rows[:, None], 2 * height, axis=1).astype(np.float32)
-
-
-def resample(envmap: Float[AnyArray, "h w 3"], height: int) -> Float[AnyArray, "height width 3"]:
-    """A map of another size: each texel is the mean over its solid angle of those that it overlaps; energy is kept."""
-    rows = _shares(
-        -np.cos(np.pi * np.arange(envmap.shape[0] + 1) / envmap.shape[0]),
-        -np.cos(np.pi * np.arange(height + 1) / height),
-    )
-    columns = _shares(np.linspace(0, 1, envmap.shape[1] + 1), np.linspace(0, 1, 2 * height + 1))
-    xp = namespace(envmap)
-    narrow = xp.tensordot(rows, envmap, axes=(1, 0))
-    return xp.tensordot(narrow, columns, axes=(1, 1)).swapaxes(1, 2)
-
-
-def _shares(old: np.ndarray, new: np.ndarray) -> np.ndarray:
-    """Share of each old interval in each new one (new, old), from rising edges."""
-    overlap = np.minimum(old[1:], new[1:, None]) - np.maximum(old[:-1], new[:-1, None])
-    return (np.maximum(overlap, 0) / (new[1:] - new[:-1])[:, None]).astype(np.float32)
-
+from spnr_jax.kernels.records import AnyArray, Light
+from spnr_jax.surfels.lighting import Color, directions, light_of, solid_angles
 
 # --- the room ---------------------------------------------------------------------------------------------------------
 
@@ -84,6 +46,11 @@ def indoor_envmap(height: int = 128) -> np.ndarray:
     """Return the default map (height, 2 * height, 3): a furnished room with a window and lamps, unscaled."""
     fine = room_radiance(directions(2 * height))
     return fine.reshape(height, 2, 2 * height, 2, 3).mean(axis=(1, 3)).astype(np.float32)
+
+
+def make_room_light() -> Light:
+    """What the file of `lighting.room_light` holds, made anew."""
+    return light_of(SCALE * indoor_envmap())
 
 
 def room_radiance(directions: np.ndarray) -> np.ndarray:
@@ -149,7 +116,6 @@ HORIZON = 0.08  # sine of the elevation over which ground and sky pass into each
 MIDDLE = 1 - 1e-7  # cosine of the angle from a lamp's middle, at most
 MOST_LAMPS = 4  # of a random map
 
-Color = Sequence[float | int] | np.ndarray | jax.Array
 Angle = float | int | np.floating | jax.Array  # degrees
 Map = Float[AnyArray, "height width 3"]
 
@@ -182,6 +148,14 @@ def lamp(azimuth: Angle, elevation: Angle, size: Angle, irradiance: Color, heigh
     disc = ramp * ramp * (3 - 2 * ramp)
     held = xp.sum(disc * xp.maximum(xp.cos(angle), 0) * solid_angles(height))
     return (disc[..., None] * xp.asarray(irradiance)[None, None] / held).astype(np.float32)
+
+
+def sun(azimuth: Angle, elevation: Angle, size: Angle = 3.0, color: Color = (1, 1, 1)) -> Light:
+    """A round lamp far away: degrees as `Model.camera` counts them, `size` across, irradiance of what faces it.
+
+    Each of these may be traced.  Shadows come from 64 directions, so they are never sharper than some ten degrees.
+    """
+    return light_of(lamp(azimuth, elevation, size, color))
 
 
 def studio(height: int = HEIGHT) -> Map:

@@ -41,7 +41,8 @@ from spnr_jax.kernels.imaging import linear_to_srgb
 from spnr_jax.kernels.records import Camera, Light, Rendering, Volume
 from spnr_jax.method.model import Model
 from spnr_jax.methods import method_of
-from spnr_jax.surfels.lighting import background, sun
+from spnr_jax.surfels.lighting import background
+from spnr_jax.surfels.skies import sun
 from spnr_jax.tools import depth_maps
 from spnr_jax.tools.commands import Lighting, Render
 from spnr_jax.training.weights import SHIPPED, load

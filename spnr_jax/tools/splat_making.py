@@ -13,9 +13,9 @@ import numpy as np
 
 from spnr_jax.kernels.records import Camera, Gaussians, Light, PointCloud, SurfelScene, Volume
 from spnr_jax.method.model import DISTANCE, Model
+from spnr_jax.method.surfel_method import encode_in_box
 from spnr_jax.surfels import gaussians
 from spnr_jax.surfels.gaussians import View
-from spnr_jax.surfels.geometry import encode_in_box
 from spnr_jax.tools.commands import Lighting, Render
 from spnr_jax.tools.depth_maps import surface_depth
 

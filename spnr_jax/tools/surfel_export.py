@@ -22,11 +22,11 @@ from spnr_jax.config import Quality
 from spnr_jax.errors import UserError
 from spnr_jax.kernels.cloud_arrays import plain_cloud
 from spnr_jax.kernels.records import AnyArray, Camera, Light, PointCloud, Surfels, SurfelScene
-from spnr_jax.method import surfel_renderer
+from spnr_jax.method import surfel_method, surfel_renderer
 from spnr_jax.method.model import Model
 from spnr_jax.method.surfel_renderer import Plan
 from spnr_jax.surfels import geometry, lighting
-from spnr_jax.surfels.rules import NEIGHBORS
+from spnr_jax.surfels.layers import NEIGHBORS
 from spnr_jax.surfels.sides import spiral
 
 RADIUS = 0.8  # of the ball in the box whose pictures the sizes are those of: as much surface as a cube has
@@ -87,7 +87,7 @@ def nearest(positions: Float[AnyArray, "points 3"], mask: Bool[AnyArray, " point
 def make_plan(model: Model, num_points: int, size: int) -> Plan:
     """Sizes for pictures of any object of so many points from where `Model.camera` stands: with room to spare."""
     ball = plain_cloud(np.asarray(RADIUS * spiral(num_points), np.float32))
-    scene = geometry.encode_in_box(ball)
+    scene = surfel_method.encode_in_box(ball)
     made = surfel_renderer.plan(scene, model.camera(scene, resolution=size))
     side = surfel_renderer.round_up(-(-size * made.side // 2**made.doublings) + surfel_renderer.MARGIN)
     return made._replace(width=side, height=side, entries=2 * made.entries, slots=side * side)

@@ -1,13 +1,15 @@
 """Training batches that are a pure function of (seed, step), read ahead.
 
 A batch depends only on the step, so the step number is the state of the reader: a resumed run gets the same data,
-whatever was read ahead.  grain reads ahead in threads.
+whatever was read ahead.
 """
 
 import dataclasses
 import functools
 import threading
+from collections import deque
 from collections.abc import Callable, Generator
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -119,10 +121,16 @@ def batches(
 
 def read_ahead(assemble: Callable[[int], Any], first_step: int, num_steps: int) -> Generator[Any, None, None]:
     """What `assemble` makes of each step, some steps ahead in threads, which end with this generator."""
-    import grain
-
-    steps = grain.MapDataset.range(first_step, num_steps).map(assemble)
-    yield from iter(steps.to_iter_dataset(grain.ReadOptions(num_threads=READERS, prefetch_buffer_size=READ_AHEAD)))
+    threads, ahead = ThreadPoolExecutor(READERS), deque[Future]()
+    try:
+        for step in range(first_step, num_steps):
+            ahead.append(threads.submit(assemble, step))
+            if len(ahead) > READ_AHEAD:
+                yield ahead.popleft().result()
+        while ahead:
+            yield ahead.popleft().result()
+    finally:
+        threads.shutdown(cancel_futures=True)
 
 
 def cached_reader(dataset: Dataset, config: TrainConfig, cache_bytes: int) -> Callable[[str], ObjectData]:

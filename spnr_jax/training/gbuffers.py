@@ -35,11 +35,11 @@ from spnr_jax.kernels.metrics import psnr
 from spnr_jax.kernels.records import Camera, Crops, Key, Light, PointCloud, Surfels, SurfelScene
 from spnr_jax.method import surfel_method, surfel_renderer
 from spnr_jax.method.pixels import reconstruction_loss
+from spnr_jax.method.surfel_method import encode_in_box
 from spnr_jax.methods import Outcome
 from spnr_jax.nn import shader
 from spnr_jax.nn.shader import Shader, picture
 from spnr_jax.surfels import lighting, normals
-from spnr_jax.surfels.geometry import encode_in_box
 from spnr_jax.training.batching import read_ahead
 from spnr_jax.training.scan_faults import colours_alone, random_scan
 from spnr_jax.training.weights import add_companions

@@ -3,6 +3,7 @@ import sys
 
 import numpy as np
 import pytest
+from matplotlib import colormaps
 from PIL import Image
 
 from spnr_jax.formats.images import depth_image, png, to_uint8, write_turntable, write_whole
@@ -47,6 +48,12 @@ def test_depth_colours_span_the_opaque_pixels_alone_so_unit_and_background_do_no
     shown = depth_image(depth, acc)
     np.testing.assert_array_equal(depth_image(np.where(acc > 0, depth, 1e6), acc), shown)
     assert np.abs(depth_image(100 * depth, acc).astype(int) - shown).max() <= 1
+
+
+def test_near_is_bright_in_the_colours_of_viridis():
+    depth = np.linspace(3, 2, 500)[None]
+    shown = depth_image(depth, np.ones_like(depth)).astype(int)
+    assert np.abs(shown - colormaps["viridis"](3 - depth, bytes=True)[..., :3]).max() <= 4
 
 
 def test_a_file_that_cannot_be_finished_leaves_the_old_one_and_nothing_else(tmp_path, monkeypatch):

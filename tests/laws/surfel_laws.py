@@ -15,11 +15,12 @@ from support import reference
 from support.laws import TINY, Axis, Extremes, Law, close, extremes
 from support.surfel_clouds import surfels
 
+from spnr_jax.kernels import numerics
 from spnr_jax.kernels.records import Light
 from spnr_jax.nn import shader
 from spnr_jax.nn.shader import NUM_MAPS
-from spnr_jax.surfels import discs, layers, lighting, small_systems, splatting
-from spnr_jax.surfels.rules import NEIGHBORS, RULES
+from spnr_jax.surfels import discs, layers, lighting, splatting
+from spnr_jax.surfels.layers import NEIGHBORS, RULES
 
 POINTS = 16
 
@@ -75,7 +76,7 @@ def least_variance(arguments, outputs):
     """Along a unit vector that is nearly the narrowest axis; 0 where there is no extent."""
     matrix, axis = rows(np.float64(arguments[0])), rows(np.float64(outputs[0]))
     size = np.trace(matrix, axis1=1, axis2=2)
-    clear = size > 2 * small_systems.POINT
+    clear = size > 2 * numerics.POINT
     close(np.linalg.norm(axis[clear], axis=1), np.ones(clear.sum()), atol=1e-5)
     found = np.einsum("ni,nij,nj->n", axis, matrix, axis)
     assert np.all(found <= 1.01 * np.linalg.eigvalsh(matrix)[:, 0] + 1e-5 * size + TINY)
@@ -95,25 +96,25 @@ def ratios(arguments, outputs):
 clouds = extremes(POINTS, 8, 3, low=-4, high=4).map(lambda x: np.float32(columns(x.swapaxes(1, 2) @ x)))
 # fmt: off
 SYSTEMS = (
-    Law("solve", small_systems.solve, lambda matrix, right: columns(np.linalg.solve(rows(matrix), rows(right))),
+    Law("solve", numerics.solve, lambda matrix, right: columns(np.linalg.solve(rows(matrix), rows(right))),
         (Axis("ridge of unknowns", 1, 10, 1e6, systems),), shared=0),
-    Law("solve, one unknown", small_systems.solve, lambda matrix, right: right / matrix[:1],
+    Law("solve, one unknown", numerics.solve, lambda matrix, right: right / matrix[:1],
         usual(lambda rng: (rng.uniform(1, 2, (1, 1, POINTS)), rng.normal(size=(1, 3, POINTS))))),
-    Law("frame", small_systems.frame, frame_twin, (Axis("angle from straight down", 1e-6, 1, 1.5, normals),), shared=0,
+    Law("frame", numerics.frame, frame_twin, (Axis("angle from straight down", 1e-6, 1, 1.5, normals),), shared=0,
         extremes=Extremes((extremes(9, 3).map(some_normals),), floors=(FINITE,), check=are_frames, twin=False)),
-    Law("cross and dot", lambda a, b: (small_systems.cross(a, b), small_systems.dot(a, b)),
+    Law("cross and dot", lambda a, b: (numerics.cross(a, b), numerics.dot(a, b)),
         lambda a, b: (np.cross(a, b, axis=0), np.sum(a * b, axis=0)),
         usual(lambda rng: tuple(rng.normal(size=(2, 3, POINTS)))), shared=0),
-    Law("sum_products and multiply", lambda a, b: (small_systems.sum_products(a, b), small_systems.multiply(a, b)),
+    Law("sum_products and multiply", lambda a, b: (numerics.sum_products(a, b), numerics.multiply(a, b)),
         lambda a, b: (np.einsum("kip,kjp->ijp", a, b), np.einsum("ikp,kjp->ijp", a, b)),
         usual(lambda rng: tuple(rng.normal(size=(2, 3, 3, POINTS)))), shared=0),
-    Law("unit", small_systems.unit, lambda v: v / np.linalg.norm(v, axis=0),
+    Law("unit", numerics.unit, lambda v: v / np.linalg.norm(v, axis=0),
         sizes("length", 1e-8, 1e10, lambda rng, v: (v * rng.uniform(0.5, 1, (3, POINTS)),)), shared=0),
-    Law("find_narrowest", small_systems.find_narrowest, None, (Axis("thickness", 0.1, 0.2, 0.3, covariances),),
+    Law("find_narrowest", numerics.find_narrowest, None, (Axis("thickness", 0.1, 0.2, 0.3, covariances),),
         shared=0, extremes=Extremes((clouds,), floors=(FINITE,), check=least_variance, twin=False)),
-    Law("measure_shape", small_systems.measure_shape, None, (Axis("thickness", 0.2, 0.3, 1, covariances),), shared=0,
+    Law("measure_shape", numerics.measure_shape, None, (Axis("thickness", 0.2, 0.3, 1, covariances),), shared=0,
         extremes=Extremes((clouds,), floors=(FINITE,), check=ratios, twin=False)),
-    Law("measure_shape, variances nearly alike", small_systems.measure_shape, None,
+    Law("measure_shape, variances nearly alike", numerics.measure_shape, None,
         usual(lambda rng: covariances(rng, 0.55)), budget=1e-3),
 )
 # fmt: on

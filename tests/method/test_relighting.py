@@ -10,7 +10,7 @@ from support.surfel_clouds import cloud, shape
 import spnr_jax
 from spnr_jax.formats.light_files import read_light
 from spnr_jax.kernels.imaging import srgb_to_linear
-from spnr_jax.surfels.skies import directions
+from spnr_jax.surfels.lighting import directions
 
 SIZE = 96
 

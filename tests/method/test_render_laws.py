@@ -14,9 +14,11 @@ from support.surfel_clouds import camera, cloud, shape
 from spnr_jax.config import SurfelConfig
 from spnr_jax.kernels.records import Rendering
 from spnr_jax.method import surfel_method, surfel_renderer
+from spnr_jax.method.surfel_method import encode_in_box
 from spnr_jax.method.surfel_renderer import Plan, plan, render
-from spnr_jax.surfels.geometry import encode, encode_in_box, neighbors
-from spnr_jax.surfels.lighting import room_light, sun
+from spnr_jax.surfels.geometry import encode, neighbors
+from spnr_jax.surfels.lighting import room_light
+from spnr_jax.surfels.skies import sun
 
 CONFIG = SurfelConfig(widths=(4, 6), top=4)
 EYES = (0.3, 0.4, 2.4), (1.5, 1.0, 1.5)

@@ -13,9 +13,9 @@ from spnr_jax.config import SurfelConfig
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.records import Volume
 from spnr_jax.method import surfel_method, surfel_renderer
+from spnr_jax.method.surfel_method import encode_in_box
 from spnr_jax.method.surfel_renderer import GRID, resolution
 from spnr_jax.nn.shader import NUM_FEATURES, Shader
-from spnr_jax.surfels.geometry import encode_in_box
 from spnr_jax.surfels.lighting import light_of
 
 CONFIG = SurfelConfig(widths=(8, 8), top=8)

@@ -24,9 +24,7 @@ from spnr_jax.training import checkpoint, run_record, trainer
 
 LIMIT = 300.0  # seconds without an event after which a process hangs
 SERVER = multiprocessing.get_context("forkserver")
-SERVER.set_forkserver_preload(
-    ["spnr_jax.training.trainer", "spnr_jax.cli", "orbax.checkpoint.v1", "grain", "tensorboardX"]
-)
+SERVER.set_forkserver_preload(["spnr_jax.training.trainer", "spnr_jax.cli", "orbax.checkpoint.v1", "tensorboardX"])
 QUICK_COMPILATION = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
 CHECKPOINT_EVERY = 8
 OPTIONS = (  # few weights; the discriminator takes part from the first step, so that its state counts too

@@ -8,7 +8,7 @@ from spnr_jax.kernels import cameras
 from spnr_jax.kernels.cloud_arrays import pad
 from spnr_jax.kernels.records import Camera, PointCloud, Surfels
 from spnr_jax.surfels.geometry import estimate_surfels, neighbors
-from spnr_jax.surfels.rules import RULES, Rules
+from spnr_jax.surfels.layers import RULES, Rules
 from spnr_jax.surfels.sides import NUM_DIRECTIONS, spiral, tangents
 
 PADDED = (1024, 4096, 32768)  # sizes that clouds are padded to: each is compiled once

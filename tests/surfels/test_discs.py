@@ -9,7 +9,7 @@ from support.surfel_clouds import estimate, even_square, shape
 
 from spnr_jax.surfels import discs
 from spnr_jax.surfels.geometry import nearest
-from spnr_jax.surfels.rules import RULES
+from spnr_jax.surfels.layers import RULES
 
 ACROSS, AT = np.array([0.8, 0.6]), 0.1
 RED, BLUE = np.array([0.7, 0.1, 0.1]), np.array([0.1, 0.2, 0.6])

@@ -8,9 +8,9 @@ from support.laws import close
 from support.surfel_clouds import estimate as surfels_of
 from support.surfel_clouds import even_square, shape
 
-from spnr_jax.surfels.projection import RADIUS
-from spnr_jax.surfels.rules import RULES
+from spnr_jax.surfels.layers import RULES
 from spnr_jax.surfels.sides import tangents
+from spnr_jax.surfels.splatting import RADIUS
 
 FIELDS = ("normal", "spacing", "jump", "sided", "visible", "shape")
 

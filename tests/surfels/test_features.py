@@ -11,7 +11,7 @@ from support.surfel_clouds import camera, estimate, even_square, shape, surfels
 
 from spnr_jax.kernels.records import Camera
 from spnr_jax.nn import shader
-from spnr_jax.surfels import projection, splatting
+from spnr_jax.surfels import splatting
 from spnr_jax.surfels.lighting import WIDTH, light_of
 
 QUARTER = np.float32([[0, 0, -1], [0, 1, 0], [1, 0, 0]])  # x to z: from azimuth phi of a map to phi + a quarter turn
@@ -46,7 +46,7 @@ def told(turn, visible=None):
 @jax.jit
 def drawn(found, light, view):
     found = shader.turn_to_camera(found, view)
-    entries, _ = projection.entries(found, view, room=2**15)
+    entries, _ = splatting.entries(found, view, room=2**15)
     buffer = splatting.blend(entries, found, shader.attributes(found, light, view), view, slots=24**2)
     return buffer, *shader.features(buffer, light, view)
 

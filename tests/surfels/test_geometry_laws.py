@@ -12,8 +12,9 @@ from support.surfel_clouds import cloud, shape
 
 import spnr_jax
 from spnr_jax.kernels.cloud_arrays import normalization, pad
+from spnr_jax.method import surfel_method
 from spnr_jax.surfels import geometry
-from spnr_jax.surfels.rules import NEIGHBORS
+from spnr_jax.surfels.layers import NEIGHBORS
 
 COUNT, SIZE = 150, 160  # real points, and with padding
 CONSTANT = ("visible", "sided", "mask")  # to gradients
@@ -200,7 +201,7 @@ def test_the_box_is_that_of_the_handle_and_clouds_of_one_bucket_share_a_program(
     before = count_programs()
     for count in (300, 400):
         positions = shape("sphere", count)[0]
-        found = geometry.encode_in_box(cloud(positions))
+        found = surfel_method.encode_in_box(cloud(positions))
         assert found.surfels.mask.shape == (512,)
         assert found.surfels.mask.sum() == count
         order = np.lexsort(np.asarray(found.surfels.position)[:count].T)

@@ -9,9 +9,8 @@ from support.surfel_clouds import surfels
 
 from spnr_jax.kernels.records import Light
 from spnr_jax.surfels import lighting, skies
-from spnr_jax.surfels.lighting import HEIGHT, LEVELS, WIDTH, light_of
+from spnr_jax.surfels.lighting import HEIGHT, LEVELS, WIDTH, directions, light_of, resample, solid_angles
 from spnr_jax.surfels.sides import DIRECTIONS
-from spnr_jax.surfels.skies import directions, resample, solid_angles
 
 COLOR = np.array([0.3, 1.0, 2.0])
 
@@ -31,7 +30,7 @@ def columns(towards):
 
 
 def test_the_room_of_the_package_is_what_its_map_gives():
-    close(lighting.room_light().tables, lighting.make_room_light().tables, rtol=1e-5, atol=1e-6)
+    close(lighting.room_light().tables, skies.make_room_light().tables, rtol=1e-5, atol=1e-6)
 
 
 def test_all_tables_of_constant_light_are_that_light():
@@ -157,7 +156,7 @@ def test_the_harmonics_are_orthonormal_and_project_light_in_the_axes_of_the_came
 
 def test_lamps_and_turned_lights_of_traced_angles_are_those_of_numbers_and_have_gradients():
     def shone(azimuth, elevation, degrees):
-        return lighting.sun(azimuth, elevation, 30.0).turned(degrees).tables
+        return skies.sun(azimuth, elevation, 30.0).turned(degrees).tables
 
     angles = jnp.array([30.0, 40.0, 17.0])
     close(jax.jit(lambda x: shone(*x))(angles), shone(30.0, 40.0, 17.0), rtol=1e-3, atol=1e-3)

@@ -11,13 +11,13 @@ from support.laws import close, hypotheses, numbers
 from support.surfel_clouds import camera, even_square, shape, surfels
 
 from spnr_jax.kernels import cameras
-from spnr_jax.surfels import projection, splatting
+from spnr_jax.surfels import splatting
 from spnr_jax.surfels.splatting import shares
 
 TOTAL = 2**15  # entries, and 500 points in most scenes: few programs are compiled
 blend = jax.jit(splatting.blend, static_argnames="slots")
-make_entries = jax.jit(projection.entries, static_argnames="room")
-count = jax.jit(lambda found, view: projection.total(projection.footprints(found, view).covered))
+make_entries = jax.jit(splatting.entries, static_argnames="room")
+count = jax.jit(lambda found, view: splatting.count_entries(splatting.footprints(found, view).covered))
 
 
 def draw(found, view, attributes=None):
@@ -101,17 +101,17 @@ class TestEntries:
         directions, eye = np.float64(rays.directions).reshape(-1, 3), np.float64(view.cam_to_world[:, 3])
         pixels, _ = cameras.project(view, found.position)
         places = np.stack(np.meshgrid(*[np.arange(20) + 0.5] * 2), axis=-1).reshape(-1, 2)
-        facing = np.asarray(projection.footprints(found, view).facing) > 0
+        facing = np.asarray(splatting.footprints(found, view).facing) > 0
         for i, (p, n) in enumerate(zip(np.float64(position), np.float64(normal), strict=True)):
             slope = directions @ n
             hit = eye + directions * ((n @ (p - eye)) / np.where(abs(slope) < 0.05, np.nan, slope))[:, None]
             rim = np.float64(found.rim[i])
             side = np.cross(n, rim)
             ends = [e + (p - hit) @ way / 0.25 for e, way in zip(reach[i], (rim, -rim, side, -side), strict=True)]
-            kept = np.prod([np.clip(0.5 + e / projection.RIM_WIDTH, 0, 1) for e in ends], axis=0)
-            within = ((hit - p) ** 2).sum(axis=1) / (projection.RADIUS * 0.25) ** 2
-            on_picture = 1 - ((places - np.asarray(pixels)[i]) ** 2).sum(axis=1) / projection.FLOOR**2
-            drawn = np.max([kept - within, projection.SKIRT * (1 - within), on_picture], axis=0)
+            kept = np.prod([np.clip(0.5 + e / splatting.RIM_WIDTH, 0, 1) for e in ends], axis=0)
+            within = ((hit - p) ** 2).sum(axis=1) / (splatting.RADIUS * 0.25) ** 2
+            on_picture = 1 - ((places - np.asarray(pixels)[i]) ** 2).sum(axis=1) / splatting.FLOOR**2
+            drawn = np.max([kept - within, splatting.SKIRT * (1 - within), on_picture], axis=0)
             clear = np.isfinite(drawn) & (directions @ (hit - eye).T[:, 0] > -9)
             expected = facing[i] * np.clip(drawn, 0, 1)
             close(table[i][clear], expected[clear], atol=2e-3)
@@ -135,7 +135,7 @@ class TestEntries:
 
     def test_discs_that_do_not_fit_are_left_out_whole_and_counted(self):
         found, view = layer(20, normal=(0, 1, 1)), camera(20)
-        covered = np.asarray(projection.footprints(found, view).covered)
+        covered = np.asarray(splatting.footprints(found, view).covered)
         room = int(covered[:12].sum()) + 1
         entries, lost = make_entries(found, view, room=room)
         assert int(lost) == covered[12:].sum() > 0
@@ -145,8 +145,8 @@ class TestEntries:
 
     def test_numbers_that_int32_does_not_hold_do_not_wrap(self):
         found, view = layer(500), camera(16000, eye=(0.0, 0.0, 0.06))
-        assert np.int64(projection.footprints(found, view).covered).sum() > 2**31
-        assert int(make_entries(found, view, room=2**12)[1]) == projection.MOST
+        assert np.int64(splatting.footprints(found, view).covered).sum() > 2**31
+        assert int(make_entries(found, view, room=2**12)[1]) == splatting.MOST
 
 
 class TestBlend:

@@ -15,7 +15,8 @@ from support.surfel_clouds import cloud, shape
 import spnr_jax
 from spnr_jax import cli
 from spnr_jax.kernels import cloud_arrays
-from spnr_jax.surfels.lighting import room_light, sun
+from spnr_jax.surfels.lighting import room_light
+from spnr_jax.surfels.skies import sun
 from spnr_jax.tools import export, surfel_export
 
 POINTS, SIZE, SURFELS = 256, 32, 128

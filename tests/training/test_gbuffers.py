@@ -18,9 +18,9 @@ from spnr_jax.config import SurfelConfig
 from spnr_jax.formats import data_sets
 from spnr_jax.kernels.cameras import pinhole
 from spnr_jax.kernels.records import Crops, PointCloud, Surfels
+from spnr_jax.method.surfel_method import encode_in_box
 from spnr_jax.nn import shader
 from spnr_jax.surfels import lighting
-from spnr_jax.surfels.geometry import encode_in_box
 from spnr_jax.surfels.sides import DIRECTIONS, spiral, tangents
 from spnr_jax.training import batching, checkpoint, gbuffers, optimisation, run_record, trainer
 

@@ -14,7 +14,6 @@ import websockets.asyncio.server  # noqa: E402
 from websockets.exceptions import InvalidStatus  # noqa: E402
 from websockets.sync.client import connect  # noqa: E402
 
-from spnr_jax import cli  # noqa: E402
 from spnr_jax.tools import commands  # noqa: E402
 from spnr_jax.viewer import server  # noqa: E402
 
@@ -155,9 +154,3 @@ def test_an_address_that_cannot_be_listened_on_is_refused_in_one_line_before_any
             server.open_viewer(commands.View(cloud=Path("no.ply"), run=Path("none"), host=host, port=port))
     assert words in str(refusal.value)
     assert "\n" not in str(refusal.value)
-
-
-def test_without_viser_the_command_says_what_to_install(monkeypatch):
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with pytest.raises(ValueError, match=r"pip install 'spnr-jax\[viewer\]'"):
-        cli.run_view(commands.View(cloud=Path("a.ply"), run=Path("run")))

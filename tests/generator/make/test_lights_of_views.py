@@ -6,7 +6,7 @@ from support.command_line import spnr_data
 from support.handmade import ball
 
 from spnr_jax.formats import data_sets
-from spnr_jax.surfels.skies import directions
+from spnr_jax.surfels.lighting import directions
 
 SMALL = ["--resolution", 32, "--points", 64, "--spp", 16, "--visibility-grid", 2]
 

@@ -6,7 +6,8 @@ from support.handmade import ball, plain
 
 from data_gen.render import light, views
 from spnr_jax.formats.mesh.assets import Asset
-from spnr_jax.surfels.skies import directions, indoor_envmap
+from spnr_jax.surfels.lighting import directions
+from spnr_jax.surfels.skies import indoor_envmap
 
 
 def solid_angle_mean(envmap):
