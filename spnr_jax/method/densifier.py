@@ -264,7 +264,13 @@ def predict(params: dict, nodes: Nodes, neighbors: Int[Array, "n 20"], places: P
     def propose_in(block: Places) -> Any:
         return Proposal().apply({"params": params["proposal"]}, nodes, hidden, block)
 
-    return in_blocks(propose_in, places)
+    def skip_empty(block: Places) -> Any:
+        empty = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(propose_in, block))
+        return jax.lax.cond(jnp.any(block.exists), propose_in, lambda block: empty, block)
+
+    order = jnp.argsort(~places.exists)  # places first: blocks of what only fills the array cost nothing
+    found = in_blocks(skip_empty, jax.tree.map(lambda x: x[order], places))
+    return jax.tree.map(lambda x: jnp.zeros_like(x).at[order].set(x, unique_indices=True), found)
 
 
 def convolve(params: dict, hidden: Array, nodes: Nodes, own: Array, around: Array) -> Any:
