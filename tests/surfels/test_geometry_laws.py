@@ -190,7 +190,7 @@ def test_neighbors_are_the_nearest_of_the_real_points_and_each_is_its_own_first(
 
 def count_programs():
     """Of `encode`: with a cache of compiled programs, and without one."""
-    return len(geometry._encode.programs) + geometry._encode.jitted._cache_size()
+    return len(surfel_method._encode.programs) + surfel_method._encode.jitted._cache_size()
 
 
 def test_the_box_is_that_of_the_handle_and_clouds_of_one_bucket_share_a_program():

@@ -181,7 +181,6 @@ def test_a_mirrored_object_is_seen_as_the_mirrored_view(axis):
             normal=normal * sign,
             spacing=np.full(60, 0.4, np.float32),
             base_color=color,
-            gradient=np.zeros((60, 3, 3), np.float32),
             border=np.concatenate([rim * sign, np.full((60, 1), 0.1, np.float32)], axis=1),
             jump=color[:, ::-1] - color,
             roughness=color[:, 0],
