@@ -27,7 +27,7 @@ from spnr_jax.kernels.numerics import clamp, length, normalize, root
 from spnr_jax.kernels.records import AnyArray, Key, PointCloud, Surfels
 from spnr_jax.surfels.geometry import estimate_surfels, move_into_box
 
-MOST_POINTS = 65536  # of a cloud that gets children
+MOST_POINTS = 32768  # of a cloud that gets children
 SPARSE = 8192  # points, up to which it gets them everywhere, from there on where it ends or bends alone
 BENT = 0.3  # spacings that both ends of a pair lie off each other's planes, and what the cosine lacks of 1
 CHILDREN = 6  # of a point: in the middle of its pairs, each of which belongs to one of its ends, and at open places
