@@ -13,7 +13,6 @@ gradient; places, normals and materials are differentiable.
 """
 
 import dataclasses
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import flax.linen as nn
@@ -25,6 +24,7 @@ from jaxtyping import Array, Bool, Float, Int
 from spnr_jax.errors import UserError
 from spnr_jax.kernels.numerics import clamp, length, normalize, root
 from spnr_jax.kernels.records import AnyArray, Key, PointCloud, Surfels
+from spnr_jax.kernels.voxels import map_existing
 from spnr_jax.surfels.geometry import estimate_surfels, move_into_box
 
 MOST_POINTS = 32768  # of a cloud that gets children
@@ -257,48 +257,26 @@ def init(key: Key, nodes: Nodes, places: Places) -> dict:
 def predict(params: dict, nodes: Nodes, neighbors: Int[Array, "n 20"], places: Places) -> Children:
     """The children of places: graph convolutions over the points, then a PointNet around each place, block by block."""
     hidden: Any = nn.Dense(FEATURES).apply({"params": params["point"]}, nodes.traits)
-    rows = jnp.arange(len(neighbors)), neighbors[:, 1:]
+    around = neighbors[:, 1:]
+    edges = relate(nodes, around)
     for number in range(CONVOLUTIONS):
-        hidden = convolve(params[f"graph{number}"], hidden, nodes, *rows)
+        hidden = convolve(params[f"graph{number}"], hidden, edges, around, neighbors[:, 0] >= 0)
 
     def propose_in(block: Places) -> Any:
         return Proposal().apply({"params": params["proposal"]}, nodes, hidden, block)
 
-    def skip_empty(block: Places) -> Any:
-        empty = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(propose_in, block))
-        return jax.lax.cond(jnp.any(block.exists), propose_in, lambda block: empty, block)
-
-    order = jnp.argsort(~places.exists)  # places first: blocks of what only fills the array cost nothing
-    found = in_blocks(skip_empty, jax.tree.map(lambda x: x[order], places))
-    return jax.tree.map(lambda x: jnp.zeros_like(x).at[order].set(x, unique_indices=True), found)
+    empty = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(propose_in, places))
+    return map_existing(propose_in, places.exists, (places,), empty, BLOCK)
 
 
-def convolve(params: dict, hidden: Array, nodes: Nodes, own: Array, around: Array) -> Any:
+def convolve(params: dict, hidden: Array, edges: Array, around: Array, exists: Array) -> Any:
     """Features of the points after a round, block by block."""
     sent: Any = Convolution().apply({"params": params}, hidden, method="send")
 
-    def one(block: tuple[Array, Array]) -> Any:
-        own, around = block
-        edges = relate(nodes, own, around)
-        return Convolution().apply({"params": params}, hidden[own], sent[around], edges, around >= 0)
+    def one(hidden: Array, edges: Array, around: Array) -> Any:
+        return Convolution().apply({"params": params}, hidden, sent[around], edges, around >= 0)
 
-    return in_blocks(one, (own, around))
-
-
-def in_blocks(work: Callable[[Any], Any], rows: Any) -> Any:
-    """What the work gives for all rows, BLOCK of them at once; a gradient keeps the inputs of a block alone.
-
-    The last row is repeated until the blocks are full: zeros would have no finite gradient.
-    """
-    count = len(jax.tree.leaves(rows)[0])
-    blocks = -(-count // BLOCK)
-
-    def split(x: Array) -> Array:
-        filled = jnp.pad(x, [(0, blocks * BLOCK - count)] + [(0, 0)] * (x.ndim - 1), mode="edge")
-        return filled.reshape(blocks, BLOCK, *x.shape[1:])
-
-    found = jax.lax.map(jax.checkpoint(work), jax.tree.map(split, rows))
-    return jax.tree.map(lambda x: x.reshape(blocks * BLOCK, *x.shape[2:])[:count], found)
+    return map_existing(one, exists, (hidden, edges, around), jnp.zeros_like(hidden), BLOCK)
 
 
 def pool(values: Float[Array, "m k f"], real: Bool[Array, "m k"]) -> Float[Array, "m 2*f"]:
@@ -313,15 +291,15 @@ def turn(vectors: Float[Array, "m 3"], frame: Float[Array, "m 3 3"]) -> Float[Ar
     return jnp.einsum("mj,mji->mi", vectors, frame, precision="highest")
 
 
-def relate(nodes: Nodes, own: Int[Array, " n"], around: Int[Array, "n k"]) -> Float[Array, "n k 9"]:
-    """Numbers of points and neighbors that do not change when the cloud is turned."""
-    spacing = nodes.spacing[own][:, None]
-    offset = (nodes.position[around] - nodes.position[own][:, None]) / spacing[..., None]
-    normal, other = nodes.normal[own][:, None], nodes.normal[around]
+def relate(nodes: Nodes, around: Int[Array, "n k"]) -> Float[Array, "n k 9"]:
+    """Numbers of each point and neighbor that do not change when the cloud is turned."""
+    spacing = nodes.spacing[:, None]
+    offset = (nodes.position[around] - nodes.position[:, None]) / spacing[..., None]
+    normal, other = nodes.normal[:, None], nodes.normal[around]
     height, from_there = jnp.sum(offset * normal, axis=-1), -jnp.sum(offset * other, axis=-1)
     far = length(offset)
     beside = root(far**2 - height**2)
-    unlike = length(nodes.color[around] - nodes.color[own][:, None])
+    unlike = length(nodes.color[around] - nodes.color[:, None])
     coarse = jnp.log(nodes.spacing[around] / spacing)
     parts = [height, from_there, far, jnp.exp(-far), beside, jnp.sum(normal * other, axis=-1), coarse]
     return clamp(jnp.stack([*parts, unlike, jnp.exp(-8 * unlike)], axis=-1), -8, 8)
