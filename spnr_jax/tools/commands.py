@@ -166,6 +166,8 @@ class Render:
     quality: Literal["draft", "balanced", "best", "trained"] = "best"
     """balanced: three quarters of the size, enlarged; draft: discs and light without the CNN.  The paper's network
     takes a quarter, half or all of its training samples per ray, near the points; trained: exactly as in training."""
+    densify: bool = True
+    """Add learned points to clouds of at most 32,768 points: sharper; films take up to three times as long."""
     outputs: tuple[Output, ...] = ("image", "depth", "opacity")
     """Files to write for each view; depth comes coloured, as .npy and as 16-bit .png."""
     transparent: bool = False

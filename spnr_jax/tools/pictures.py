@@ -145,7 +145,9 @@ def prepare_cloud(options: Render, note: Callable[[str], None], loaded: Callable
         report=note,
     )
     network = str(options.run or SHIPPED)
-    return Ready(placed=placed, network=network, model=model, volume=model.encode(placed.cloud), light=light)
+    return Ready(
+        placed=placed, network=network, model=model, volume=model.encode(placed.cloud, options.densify), light=light
+    )
 
 
 def draw_all(ready: Ready, options: Render, name: Path) -> Iterator[Callable[[], Written]]:

@@ -195,5 +195,12 @@ def test_the_handle_densifies_sparse_clouds_alone(params):
     assert 2 * 300 < len(dense.mask) < 5 * 300
     assert dense.mask.all()
     assert surfel_method.densify_sparse({}, sparse) is sparse
+    assert surfel_method.densify_sparse(params, dense) is dense
     many = cloud(shape("sphere", densifier.MOST_POINTS + 1)[0])
     assert surfel_method.densify_sparse(params, many) is many
+
+
+def test_the_handle_encodes_the_points_alone_where_it_is_asked_to():
+    surfels = spnr_jax.load().encode(cloud(shape("sphere", 300)[0]), densify=False).scene.surfels
+    assert int(np.sum(surfels.mask)) == 300
+    np.testing.assert_array_equal(surfels.invented, 0)
