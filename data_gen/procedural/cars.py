@@ -99,11 +99,9 @@ def road_car(rng, style) -> list[Piece]:
     z = stations(axles, arch)
     low = np.maximum(arch_line(z, axles, arch, sill), sill)
     deck = deck_line(rng, style, z, foot, sill, belt)
-    width = half * (
-        1
-        - rng.uniform(0.05, 0.18) * np.abs(2 * z) ** 4
-        - rng.uniform(0.02, 0.08) * np.maximum(np.abs(2 * z) - 0.93, 0) / 0.07
-    )
+    ends = np.abs(2 * z)
+    width = 1 - rng.uniform(0.05, 0.18) * ends**4 - rng.uniform(0.02, 0.08) * np.maximum(ends - 0.93, 0) / 0.07
+    width = half * width
     pieces = [(paint, body_shell(z, low, deck, width, sill, sill + (belt - sill) * 0.5))]
     under = box((2 * half * 0.72, (belt - sill) * 0.55, 0.94))
     pieces.append((rubber, move(under, y=sill + (belt - sill) * 0.3)))
@@ -269,11 +267,8 @@ def load(rng, style, paint, trim, half, sill, belt, high, foot) -> list[Piece]:
 
 def racer(rng) -> list[Piece]:
     """An open racing car: slim body, four free wheels, wings front and rear."""
-    paint, trim, rubber = (
-        finishes.car_paint(rng),
-        finishes.choose(rng, finishes.metal, finishes.plastic),
-        finishes.rubber(rng),
-    )
+    paint, trim = finishes.car_paint(rng), finishes.choose(rng, finishes.metal, finishes.plastic)
+    rubber = finishes.rubber(rng)
     second = finishes.car_paint(rng)
     radius, half, clear = rng.uniform(0.07, 0.1), rng.uniform(0.18, 0.22), rng.uniform(0.03, 0.05)
     z = np.linspace(-0.46, 0.5, 22)

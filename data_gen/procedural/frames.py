@@ -152,13 +152,10 @@ def clock(rng) -> list[Piece]:
         pieces.append((case, merge(turn(spike, "z", 360 / count * i) for i in range(count))))
     pieces.append((dark, hands_and_marks(rng, radius, depth * 0.6)))
     if rng.random() < 0.35 and style != "rays":
-        feet = [
-            tube(
-                [(s * radius * 0.7, -radius * 1.25, depth * 0.5), (s * radius * 0.5, -radius * 0.75, depth * 0.5)],
-                radius * 0.07,
-            )
-            for s in (1, -1)
-        ]
+        feet = []
+        for s in (1, -1):
+            foot, top = (s * radius * 0.7, -radius * 1.25), (s * radius * 0.5, -radius * 0.75)
+            feet.append(tube([(*foot, depth * 0.5), (*top, depth * 0.5)], radius * 0.07))
         pieces.append((case, merge(feet)))
         if style == "round":
             pieces.append((dark, bells(radius, depth)))
@@ -169,14 +166,10 @@ def hands_and_marks(rng, radius: float, face: float) -> Mesh:
     """Twelve marks, two hands at any time, and their pin, on a dial whose face lies at z."""
     mark = move(box((radius * 0.04, radius * 0.14, 0.006)), y=radius * 0.82, z=face)
     marks = [turn(mark, "z", 30 * i) for i in range(12)]
-    hands = [
-        turn(
-            move(box((radius * w, radius * long, 0.005)), y=radius * long * 0.4, z=face + 0.004),
-            "z",
-            rng.uniform(0, 360),
-        )
-        for w, long in ((0.06, 0.55), (0.04, 0.8))
-    ]
+    hands = []
+    for w, long in ((0.06, 0.55), (0.04, 0.8)):
+        hand = move(box((radius * w, radius * long, 0.005)), y=radius * long * 0.4, z=face + 0.004)
+        hands.append(turn(hand, "z", rng.uniform(0, 360)))
     pin = move(turn(cylinder(radius * 0.05, 0.02, 12), "x", 90), z=face - 0.005)
     return merge([*marks, *hands, pin])
 

@@ -105,12 +105,8 @@ def stem(rng, height: float, radius: float, thick=0.01) -> Mesh:
 
 def bulb(radius=0.028) -> Mesh:
     """A bulb about 0 with its screw below."""
-    return merge(
-        [
-            superellipsoid((2 * radius, 2.3 * radius, 2 * radius), 1, 1, 8, 12),
-            move(cylinder(radius * 0.5, radius, 10), y=-1.8 * radius),
-        ]
-    )
+    ball = superellipsoid((2 * radius, 2.3 * radius, 2 * radius), 1, 1, 8, 12)
+    return merge([ball, move(cylinder(radius * 0.5, radius, 10), y=-1.8 * radius)])
 
 
 def table_lamp(rng) -> list[Piece]:
@@ -170,16 +166,8 @@ def arc_lamp(rng) -> list[Piece]:
     metal, cover = finishes.choose(rng, finishes.metal, finishes.paint), shade_finish(rng)
     height, reach = rng.uniform(1.2, 1.8), rng.uniform(0.4, 0.9)
     drop = height * rng.uniform(0.68, 0.9)
-    path = curve(
-        [
-            (0, 0.02, 0),
-            (0, height * 0.55, 0),
-            (reach * 0.25, height * 0.93, 0),
-            (reach * 0.65, height, 0),
-            (reach, drop, 0),
-        ],
-        26,
-    )
+    path = [(0, 0.02, 0), (0, height * 0.55, 0), (reach * 0.25, height * 0.93, 0), (reach * 0.65, height, 0)]
+    path = curve([*path, (reach, drop, 0)], 26)
     block = box((0.3, 0.05, 0.24), 0.01, 3) if rng.random() < 0.5 else move(cylinder(0.16, 0.05, 28, 0.01), y=-0.025)
     screen, spokes = shade(rng, rng.uniform(0.12, 0.22), rng.uniform(0.1, 0.2))
     foot = finishes.choose(rng, finishes.stone, finishes.metal)
@@ -223,14 +211,8 @@ def desk_lamp(rng) -> list[Piece]:
     head = merge([head, move(cylinder(outline[-1] * 1.05, 0.03, 16, 0.004), y=tall - 0.015)])
     tilt = rng.uniform(-50, 10)
     head = turn(move(head, y=-tall - 0.005), "x", tilt)
-    glow = turn(
-        move(
-            merge([bulb(min(wide * 0.45, 0.03)), tube([(0, 0, 0), (0, tall * 0.6, 0)], 0.008, segments=8)]),
-            y=-tall * 0.65,
-        ),
-        "x",
-        tilt,
-    )
+    lit = merge([bulb(min(wide * 0.45, 0.03)), tube([(0, 0, 0), (0, tall * 0.6, 0)], 0.008, segments=8)])
+    glow = turn(move(lit, y=-tall * 0.65), "x", tilt)
     foot = cylinder(rng.uniform(0.07, 0.11), 0.03, 28, 0.008)
     if rng.random() < 0.3:
         foot = move(box((0.16, 0.03, 0.13), 0.01, 3), y=0.015)

@@ -29,14 +29,8 @@ def fuselage(z, width, height, middle, segments=28) -> Mesh:
     Texture coordinates: u around from the belly, v from 0 at the nose to 1 at the tail.
     """
     around = np.roll(circle(segments), segments // 4, axis=0)
-    rings = np.stack(
-        [
-            width[:, None] / 2 * around[:, 0],
-            middle[:, None] + height[:, None] / 2 * around[:, 1],
-            np.broadcast_to(z[:, None], (len(z), segments)),
-        ],
-        axis=-1,
-    )
+    x, y = width[:, None] / 2 * around[:, 0], middle[:, None] + height[:, None] / 2 * around[:, 1]
+    rings = np.stack([x, y, np.broadcast_to(z[:, None], (len(z), segments))], axis=-1)
     u = np.broadcast_to(np.arange(segments + 1) / segments, (len(z), segments + 1))
     v = np.broadcast_to(((z.max() - z) / np.ptp(z))[:, None], u.shape)
     return patch(rings, wrap_columns=True, texcoords=np.stack([u, v], axis=-1), crease=60)
@@ -99,27 +93,12 @@ def tail(rng, z, y, size, style) -> Mesh:
     level = {"low": 0.1, "cross": 0.45, "t": 0.97, "twin": 0.1}[style]
     out = size * (rng.uniform(0.35, 0.55) if style == "twin" else rng.uniform(0.8, 1.2))
     front = lead - back * (level if style != "twin" else 0.1)
-    flat = surface(
-        (0, y + high * level, front),
-        (out, y + high * level + 0.01, front - back * 0.6),
-        (chord * 0.75, chord * 0.4),
-        0.09,
-    )
-    meshes = [both_sides(flat)]
-    if style == "twin":
-        meshes.append(
-            both_sides(
-                surface(
-                    (out * 0.9, y - high * 0.2, front - 0.03),
-                    (out * 0.9, y + high * 0.8, front - back),
-                    (chord * 0.7, chord * 0.4),
-                    0.09,
-                )
-            )
-        )
-    else:
-        meshes.append(fin)
-    return merge(meshes)
+    top = y + high * level
+    flat = surface((0, top, front), (out, top + 0.01, front - back * 0.6), (chord * 0.75, chord * 0.4), 0.09)
+    if style != "twin":
+        return merge([both_sides(flat), fin])
+    low, tip = (out * 0.9, y - high * 0.2, front - 0.03), (out * 0.9, y + high * 0.8, front - back)
+    return merge([both_sides(flat), both_sides(surface(low, tip, (chord * 0.7, chord * 0.4), 0.09))])
 
 
 def propeller(rng, radius, blades) -> tuple[Mesh, Mesh]:
@@ -138,11 +117,8 @@ def jet(radius, long) -> tuple[Mesh, Mesh]:
         [(0.55, 0.0), (0.72, 0.12), (0.9, 0.4), (1.0, 0.7), (0.97, 0.92), (0.88, 1.0), (0.8, 0.95), (0.78, 0.85)]
     )
     pod = turn(lathe(outside * (radius, long), 24), "x", 90)
-    fan = turn(
-        lathe(np.array([(0.5, -0.1), (0.5, 0.02), (0.76, 0.86), (0.2, 0.865), (0.0, 0.93)]) * (radius, long), 20),
-        "x",
-        90,
-    )
+    inside = np.array([(0.5, -0.1), (0.5, 0.02), (0.76, 0.86), (0.2, 0.865), (0.0, 0.93)])
+    fan = turn(lathe(inside * (radius, long), 20), "x", 90)
     return move(pod, z=-long), move(fan, z=-long)
 
 
@@ -177,12 +153,8 @@ def cockpit(z, size, rise) -> Mesh:
     half = np.interp(places, z, size) / 2 * 1.015
     middle = np.interp(places, z, rise)
     angle = np.radians(np.linspace(28, 152, 15))
-    grid = np.stack(
-        np.broadcast_arrays(
-            half[:, None] * np.cos(angle), middle[:, None] + half[:, None] * np.sin(angle) * 1.02, places[:, None]
-        ),
-        axis=-1,
-    )
+    x, y = half[:, None] * np.cos(angle), middle[:, None] + half[:, None] * np.sin(angle) * 1.02
+    grid = np.stack(np.broadcast_arrays(x, y, places[:, None]), axis=-1)
     return patch(grid, crease=60)
 
 
@@ -308,26 +280,16 @@ def biplane(rng) -> list[Piece]:
     chord, span, front = rng.uniform(0.15, 0.2), rng.uniform(0.45, 0.6), rng.uniform(0.26, 0.32)
     stagger, count = rng.uniform(-0.02, 0.06), 3 if rng.random() < 0.2 else 2
     levels = np.linspace(-width * 0.45, -width * 0.45 + gap * (count - 1) * (0.7 if count == 3 else 1), count)
-    wings = [
-        surface(
-            (0, y, front + stagger * i),
-            (span * (0.92 + 0.08 * i), y + 0.015, front + stagger * i),
-            (chord, chord * 0.9),
-            0.1,
-        )
-        for i, y in enumerate(levels)
-    ]
+    wings = []
+    for i, y in enumerate(levels):
+        lead = front + stagger * i
+        wings.append(surface((0, y, lead), (span * (0.92 + 0.08 * i), y + 0.015, lead), (chord, chord * 0.9), 0.1))
     pieces.append((wing_finish, both_sides(merge(wings))))
     struts = []
     for share, dz in ((0.75, 0.03), (0.75, 0.1), (0.1, 0.03), (0.1, 0.1)):
         y0 = levels[0] if share > 0.5 else 0.0
-        struts.append(
-            tube(
-                [(span * share, y0, front - dz), (span * share, levels[-1] + 0.005, front + stagger - dz)],
-                0.006,
-                segments=8,
-            )
-        )
+        ends = [(span * share, y0, front - dz), (span * share, levels[-1] + 0.005, front + stagger - dz)]
+        struts.append(tube(ends, 0.006, segments=8))
     pieces.append((trim, both_sides(merge(struts))))
     engine = [turn(cylinder(width * 0.52, 0.09, 24, 0.02), "x", 90)]
     pistons = int(rng.integers(5, 10))

@@ -181,14 +181,9 @@ def rack(rng) -> list[Piece]:
     beams = [move(box((width, post * 2.2, post)), y=y - post, z=s * depth / 2) for y in levels for s in (1, -1)]
     braces = []
     if rng.random() < 0.6:
-        braces = [
-            tube(
-                [(s * width / 2, levels[0], -depth / 2), (-s * width / 2, levels[-1], -depth / 2)],
-                post * 0.35,
-                segments=6,
-            )
-            for s in (1, -1)
-        ]
+        for s in (1, -1):
+            ends = [(s * width / 2, levels[0], -depth / 2), (-s * width / 2, levels[-1], -depth / 2)]
+            braces.append(tube(ends, post * 0.35, segments=6))
     pieces = [(body, merge([*posts, *beams, *braces]))]
     pieces += [(top, move(box((width, 0.018, depth)), y=y)) for y in levels]
     boxes, books = finishes.choose(rng, finishes.paint, finishes.print_, finishes.rattan), finishes.swatches(rng, 12)

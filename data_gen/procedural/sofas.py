@@ -160,12 +160,8 @@ def curved(rng) -> list[Piece]:
 def bench(rng) -> list[Piece]:
     """A day bed, ottoman or waiting bench: one long pad, perhaps a bolster or separate backs."""
     cover, body = upholstery(rng), finishes.choose(rng, finishes.wood, finishes.metal)
-    width, depth, seat, thick = (
-        rng.uniform(0.9, 2.0),
-        rng.uniform(0.45, 0.8),
-        rng.uniform(0.36, 0.46),
-        rng.uniform(0.08, 0.18),
-    )
+    width, depth = rng.uniform(0.9, 2.0), rng.uniform(0.45, 0.8)
+    seat, thick = rng.uniform(0.36, 0.46), rng.uniform(0.08, 0.18)
     parts = int(rng.integers(1, 5))
     pad = cushions(rng, parts, width, thick, depth, rng.uniform(0.2, 0.5))
     frame = move(box((width * 0.99, 0.06, depth * 0.95), 0.01, 3), y=seat - thick - 0.02)

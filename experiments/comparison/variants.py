@@ -2,11 +2,11 @@
 
     OUT/runs/VARIANT_SEED/   the run folders; a stopped run goes on, a finished one is only read
     OUT/asked.json           whose folder it is: another data set, preset or number of steps is refused
-    OUT/results.json  OUT/table.md  OUT/differences.png  OUT/gallery.png
+    OUT/results.json  OUT/table.md  OUT/gallery.png
 
 Every variant trains with every seed.  Its scores are those of all its seeds: object by object, their views one after
 another.  Differences are taken to one variant, the reference, view by view on equal seeds; intervals are bootstraps
-over objects.  In the plot a bar is an interval, the large dot the mean, and small dots are the means of single seeds.
+over objects.
 """
 
 import dataclasses
@@ -19,9 +19,6 @@ from typing import Any, Literal
 
 import jax
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
 
 from experiments.comparison import budget as budgets
 from experiments.comparison import figures, results_folder
@@ -51,7 +48,6 @@ METRICS = {  # head, decimals, what is better
 }
 HEADS = tuple(f"{head} {ARROWS[better]}" if better else head for head, _, better in METRICS.values())
 COSTS = {"parameters": "Parameters", "ms_per_step": "ms per step", "ms_per_view": "ms per view"}
-BETTER, WORSE, OPEN = figures.GREEN, figures.RED, figures.COLORS[6]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -142,19 +138,19 @@ def study(
 ) -> None:
     """Trains what is not trained in a folder that is this experiment's, scores all variants, writes the files."""
     data_sets.check_resolution(data_sets.read_object(dataset, budget.names(dataset)[0]), trainings[0].config)
-    claim(out, what, budget, dataset, **asked)
-    compared = score(trainings, train(trainings, budget, out), reference, budget, dataset, budget.shown)
-    write(out, trainings, reference, compared, budget, dataset, more)
-
-
-def claim(out: Path, what: str, budget: Budget, dataset: data_sets.Dataset, **more: object) -> None:
-    """Makes the folder that of this experiment; ValueError if it is another's."""
-    asked = {"preset": budget.preset, "steps": budget.config().num_steps, **more}
+    asked = {"preset": budget.preset, "steps": budget.config().num_steps, **asked}
     if budget.minutes is not None:
         asked |= {"steps": None, "minutes": budget.minutes}
     if budget.even_share:
         asked |= {"even_share": budget.even_share}
     results_folder.claim(out, what, asked, dataset)
+    compared = score(trainings, train(trainings, budget, out), reference, budget, dataset)
+    found = numbers(trainings, reference, compared, budget, dataset) | dict(more or {})
+    tables = [quality_table(found)]
+    if len(trainings) > 1:
+        tables.append(differences_table(found))
+    picture = gallery({one.name: one.label for one in trainings}, compared)
+    results_folder.write(out, found, tables, notes(found), {"gallery.png": picture})
 
 
 def train(variants: Sequence[Variant], budget: Budget, out: Path) -> dict[str, dict[int, Trained]]:
@@ -206,7 +202,6 @@ def score(
     reference: str,
     budget: Budget,
     dataset: data_sets.Dataset,
-    num_shown: int,
 ) -> Compared:
     """All networks on the same objects; those of the reference choose the view of an object that is shown."""
     names = [variant.name for variant in variants]
@@ -215,7 +210,7 @@ def score(
     methods = {
         f"{name}/{seed}": of_network(trained[name][seed].config, trained[name][seed].variables) for name, seed in runs
     }
-    scored = score_objects(methods, config, dataset, budget.names(dataset), num_shown, more_scores)
+    scored = score_objects(methods, config, dataset, budget.names(dataset), budget.shown, more_scores)
     costs: dict[str, list[dict]] = {name: [] for name in names}
     for name, seed in runs:
         warm = scored.seconds[f"{name}/{seed}"][1:]
@@ -226,19 +221,6 @@ def score(
         for name in names
     }
     return Compared(scores=scores, costs=costs, shown=scored.shown)
-
-
-def merge(parts: Sequence[Compared]) -> Compared:
-    """Comparisons of the same variants on different objects as one."""
-    first = parts[0]
-    return Compared(
-        scores={
-            name: {seed: {k: v for part in parts for k, v in part.scores[name][seed].items()} for seed in seeds}
-            for name, seeds in first.scores.items()
-        },
-        costs={name: [cost for part in parts for cost in part.costs[name]] for name in first.costs},
-        shown=[one for part in parts for one in part.shown],
-    )
 
 
 def more_scores(item: data_sets.ObjectData, pictures: evaluation.Pictures) -> Scores:
@@ -277,26 +259,7 @@ def total_cost(runs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     return whole
 
 
-# --- files ------------------------------------------------------------------------------------------------------------
-
-
-def write(
-    out: Path,
-    trained: Sequence[Variant],
-    reference: str,
-    compared: Compared,
-    budget: Budget,
-    dataset: data_sets.Dataset,
-    more: Mapping[str, object] | None = None,
-) -> None:
-    """Writes the files and prints the tables; what is in `more` is written with the results."""
-    found = numbers(trained, reference, compared, budget, dataset) | dict(more or {})
-    files = {"gallery.png": gallery({variant.name: variant.label for variant in trained}, compared)}
-    tables = [quality_table(found)]
-    if len(trained) > 1:
-        tables.append(differences_table(found))
-        files["differences.png"] = differences_plot(found)
-    results_folder.write(out, found, tables, notes(found), files)
+# --- tables and picture -----------------------------------------------------------------------------------------------
 
 
 def numbers(
@@ -390,37 +353,6 @@ def notes(results: Mapping) -> list[str]:
         "less is smoother, more is noise or a sharpness that is not there.",
         *(f"{name}: {text}." for name, text in results["metrics"].items() if name != "LPIPS"),
     ]
-
-
-@figures.drawing
-def differences_plot(results: Mapping) -> Figure:
-    """The differences, a panel a metric, a line a variant."""
-    changes = results["minus_reference"]
-    figure = Figure(figsize=(2 + 2.3 * len(METRICS), 1.2 + 0.36 * len(changes)))
-    panels = figure.subplots(1, len(METRICS), sharey=True)
-    for axes, head, (metric, (_, _, better)) in zip(panels, HEADS, METRICS.items(), strict=True):
-        axes.axvline(0, color="#adb5bd", linewidth=1)
-        for place, found in enumerate(change[metric] for change in changes.values()):
-            if found is not None:
-                difference_line(axes, place, found, better)
-        axes.set_title(head)
-        axes.xaxis.set_major_locator(MaxNLocator(4))
-    panels[0].set_yticks(range(len(changes)), [results["variants"][name]["label"] for name in changes])
-    panels[0].set_ylim(len(changes) - 0.5, -0.5)
-    figure.supxlabel(f"minus {results['variants'][results['reference']]['label']}", fontsize=9)
-    return figure
-
-
-def difference_line(axes: Axes, place: int, found: Mapping, better: int) -> None:
-    """The interval of one difference as a bar, its mean as a large dot, the means of its seeds as small ones."""
-    low, high = found["interval"] or (found["mean"],) * 2
-    certain = low > 0 or high < 0
-    color = OPEN if not certain else figures.INK_COLOR if not better else BETTER if better * low > 0 else WORSE
-    axes.plot([low, high], [place, place], color=color, linewidth=2.5, alpha=0.6, solid_capstyle="butt")
-    axes.plot(found["mean"], place, "o", color=color, markersize=6)
-    seeds = [value for value in found["by_seed"] if value is not None]
-    if len(seeds) > 1:
-        axes.plot(seeds, [place] * len(seeds), ".", color=figures.INK_COLOR, markersize=3)
 
 
 def gallery(labels: Mapping[str, str], compared: Compared) -> bytes:

@@ -3,12 +3,10 @@
     python -m experiments.studies.ablations --data DIR --out DIR [--steps N | --minutes M] [--seeds 0 1 2] [--rows ...]
 
     OUT/runs/ROW_SEED/                            run folders; finished ones are only read
-    OUT/fold_K/runs/ROW_SEED/                     those of a part of the objects, with --folds
     OUT/results.json  table.md                    scores, costs, and differences to the reference with intervals
-    OUT/differences.png  gallery.png              the differences, and pictures of unseen objects
+    OUT/gallery.png                               pictures of unseen objects
 
-Every variant trains for as many steps, or with --minutes for as long.  With --folds each part of all objects is held
-out in turn, so that every one of them is scored by networks that never saw it.
+Every variant trains for as many steps, or with --minutes for as long.
 
 Rows that are the preset itself (its own depth) are left out, and that without colour variants where the training split
 has none: `spnr-data generate DIR --colour-variants 5` makes them.  More rows and seeds can be asked for later.
@@ -28,7 +26,6 @@ from experiments.comparison import variants
 from experiments.comparison.variants import Budget, Variant
 from spnr_jax import cli
 from spnr_jax.config import PaperConfig, TrainConfig
-from spnr_jax.errors import UserError, at_least
 from spnr_jax.formats import data_sets
 
 REFERENCE = "reference"
@@ -65,47 +62,15 @@ class Ablations:
     """Folder of runs and results; the same command goes on there."""
     rows: tuple[Row, ...] = ROWS
     """What is changed, one thing a row."""
-    folds: int = 1
-    """Parts of all objects, each held out in turn (1: the data set's own test split alone)."""
     budget: tyro.conf.OmitArgPrefixes[Budget] = field(default_factory=Budget)
-
-    def __post_init__(self) -> None:
-        at_least(self, 1, "folds")
 
 
 def main(options: Ablations) -> None:
     """Trains what is not trained, scores all rows, writes tables and pictures."""
     cli.set_up_jax()
     dataset = data_sets.open_dataset(options.data)
-    budget, config = options.budget, options.budget.config()
-    parts, compared = folds(dataset, options.folds), []
-    data_sets.check_resolution(data_sets.read_object(dataset, budget.names(parts[0])[0]), config)
-    held_out = {"folds": options.folds} if options.folds > 1 else {}
-    variants.claim(options.out, "ablations", budget, dataset, **held_out)
-    for number, part in enumerate(parts):
-        out = options.out if len(parts) == 1 else options.out / f"fold_{number}"
-        if len(parts) > 1:
-            print(f"fold {number + 1} of {len(parts)}", flush=True)
-        runs = rows(options.rows, config, part)
-        trained = variants.train(runs, budget, out)
-        compared.append(variants.score(runs, trained, REFERENCE, budget, part, -(-budget.shown // len(parts))))
-    variants.write(options.out, runs, REFERENCE, variants.merge(compared), budget, dataset)
-
-
-def folds(dataset: data_sets.Dataset, count: int) -> list[data_sets.Dataset]:
-    """The data set with each part of its objects as the test split, or as it is; variants train beside their object."""
-    if count == 1:
-        return [dataset]
-    everything = sorted(name for names in dataset.splits.values() for name in names)
-    objects = [name for name in everything if name == variants.original(name)]
-    if len(objects) < 2 * count:
-        raise UserError(f"--folds {count}: {dataset.folder} holds {len(objects)} objects, too few")
-    found = []
-    for first in range(count):
-        test = tuple(objects[first::count])
-        train = tuple(name for name in everything if variants.original(name) not in test)
-        found.append(dataclasses.replace(dataset, splits={"train": train, "val": (), "test": test}))
-    return found
+    runs = rows(options.rows, options.budget.config(), dataset)
+    variants.study(options.out, "ablations", runs, REFERENCE, options.budget, dataset)
 
 
 def rows(wanted: tuple[Row, ...], config: TrainConfig, dataset: data_sets.Dataset) -> list[Variant]:

@@ -115,15 +115,8 @@ def test_a_difference_compares_equal_seeds_objects_and_views():
         }
         for variant, level in (("a", 10.0), ("b", 13.0))
     }
-    halves = [
-        Compared(
-            scores={v: {s: {n: of[n] for n in names} for s, of in seeds.items()} for v, seeds in found.items()},
-            costs={},
-            shown=[],
-        )
-        for names in (("one",), ("two", "three"))
-    ]
-    change = variants.change(variants.merge(halves), "b", "a", "psnr")
+    compared = Compared(scores=found, costs={}, shown=[])
+    change = variants.change(compared, "b", "a", "psnr")
     means = [np.mean([found["b"][s][n]["psnr"] - found["a"][s][n]["psnr"] for n in found["a"][s]]) for s in range(2)]
     assert change["by_seed"] == pytest.approx(means)
     assert change["mean"] == pytest.approx(np.mean(means))
