@@ -56,10 +56,8 @@ def armchair(rng) -> list[Piece]:
     arm = superellipsoid((rng.uniform(0.1, 0.18), level - seat * 0.35, depth), squareness, 0.3, 10)
     base = move(box((width, seat * 0.5, depth * 0.9), 0.02, 3), y=seat * 0.55)
     pieces += [(soft, both_sides(move(arm, side + 0.02, (level + seat * 0.35) / 2))), (soft, base)]
-    return [
-        *pieces,
-        (body, four_legs(leg_style(rng, 0.025), width * 0.8, depth * 0.75, seat * 0.35, rng.uniform(0, 0.03))),
-    ]
+    legs = four_legs(leg_style(rng, 0.025), width * 0.8, depth * 0.75, seat * 0.35, rng.uniform(0, 0.03))
+    return [*pieces, (body, legs)]
 
 
 def tub_chair(rng) -> list[Piece]:
@@ -99,9 +97,8 @@ def backrest(rng, width, low, high, lean, bow, thickness) -> dict[str, Mesh]:
     span = high - low
 
     def surface(x, y):  # x and y fractions, of the half width and the height
-        return np.stack(
-            [x * width / 2, low + y * span, -lean * np.sign(y) * np.abs(y) ** 1.3 - bow * (1 - x**2)], axis=-1
-        )
+        z = -lean * np.sign(y) * np.abs(y) ** 1.3 - bow * (1 - x**2)
+        return np.stack([x * width / 2, low + y * span, z], axis=-1)
 
     def panel(left, right, bottom, top, thick, columns=9, rows=7, arch=0.0):
         x, y = np.meshgrid(np.linspace(left, right, columns), np.linspace(bottom, top, rows))
@@ -158,9 +155,8 @@ def side_chair(rng) -> list[Piece]:
     if rng.random() < 0.45:
         level = rng.uniform(0.25, 0.6)
         reach = 2 * splay * (1 - level)
-        rails = stretchers(
-            inner[0] + reach, inner[1] + reach, seat * level, radius * 0.5, rng.choice(["ring", "h", "cross"])
-        )
+        kind = rng.choice(["ring", "h", "cross"])
+        rails = stretchers(inner[0] + reach, inner[1] + reach, seat * level, radius * 0.5, kind)
         pieces.append((body, rails))
     if rng.random() < 0.4:
         pieces.append((soft, move(superellipsoid((width * 0.93, 0.07, depth * 0.9), 0.5, 0.3, 8), y=seat + 0.015)))
@@ -203,22 +199,12 @@ def stool(rng) -> list[Piece]:
         ring = lathe(rod + (radius * 0.75 + splay * (1 - level), seat * level), 28, closed=True)
         pieces.append((body, ring))
     else:
-        pieces.append(
-            (body, pedestal(rng, seat - thick * 0.5, rng.uniform(0.02, 0.04), radius * rng.uniform(0.95, 1.3)))
-        )
+        column = pedestal(rng, seat - thick * 0.5, rng.uniform(0.02, 0.04), radius * rng.uniform(0.95, 1.3))
+        pieces.append((body, column))
     if rng.random() < 0.3:
         back = backrest(rng, 1.5 * radius, seat - thick * 0.5, seat + rng.uniform(0.15, 0.35), 0.04, 0.03, 0.018)
         pieces += [(body, move(back["frame"], z=-radius * 0.62)), (top, move(back["fill"], z=-radius * 0.62))]
     return pieces
-
-
-def chair(rng) -> list[Piece]:
-    """Pieces of one chair."""
-    style = rng.choice(
-        [side_chair, shell_chair, cantilever, office_chair, stool, armchair, tub_chair],
-        p=[0.32, 0.18, 0.08, 0.14, 0.1, 0.1, 0.08],
-    )
-    return style(rng)
 
 
 def bucket(rng, width, depth, high) -> tuple[Mesh, float]:
@@ -319,12 +305,21 @@ def office_chair(rng) -> list[Piece]:
         level, side = seat + rng.uniform(0.18, 0.25), width / 2 + 0.03
         loop = curve([(0.1, seat - 0.04, 0), (side, seat - 0.03, 0), (side, level, -0.02)], 10)
         pad = move(box((0.06, 0.03, 0.26), 0.012, 3), side, level)
-        pieces += [
-            (hard, both_sides(tube(loop, 0.014, segments=8))),
-            (soft if rng.random() < 0.3 else hard, both_sides(pad)),
-        ]
+        pieces += [(hard, both_sides(tube(loop, 0.014, segments=8)))]
+        pieces.append((soft if rng.random() < 0.3 else hard, both_sides(pad)))
     if rng.random() < 0.25:
         rest = superellipsoid((width * 0.55, 0.14, 0.07), 0.5, 0.5, 8)
         pole = tube([(0, seat + high - 0.08, rear - lean - 0.01), (0, seat + high + 0.1, rear - lean - 0.01)], 0.012)
         pieces += [(soft, move(rest, y=seat + high + 0.11, z=rear - lean)), (hard, pole)]
     return pieces
+
+
+STYLES = {
+    side_chair: 0.32,
+    shell_chair: 0.18,
+    cantilever: 0.08,
+    office_chair: 0.14,
+    stool: 0.1,
+    armchair: 0.1,
+    tub_chair: 0.08,
+}

@@ -20,12 +20,6 @@ from data_gen.shapes.primitives import (
 )
 
 
-def frame(rng) -> list[Piece]:
-    """Pieces of one frame."""
-    style = rng.choice([picture, round_frame, clock, screen, collage, easel], p=[0.4, 0.14, 0.14, 0.12, 0.1, 0.1])
-    return style(rng)
-
-
 def profile(rng, width: float, depth: float) -> np.ndarray:
     """(k, 2) section (outward, z) of a moulding: a straight back and outside, a shaped front."""
     style = rng.choice(["flat", "bevel", "scoop", "round", "carved"])
@@ -121,10 +115,8 @@ def round_frame(rng) -> list[Piece]:
     pieces = [(border, oval(ring)), (image, oval(face))]
     if rng.random() < 0.3:  # a stand mirror
         high = (radius + rim) * squash[1]
-        post = [
-            tube([(0, -high - 0.12, -0.01), (0, -high * 0.9, depth * 0.4)], 0.012),
-            move(cylinder(radius * 0.6, 0.02, 28, 0.004), y=-high - 0.13, z=-0.01),
-        ]
+        foot = move(cylinder(radius * 0.6, 0.02, 28, 0.004), y=-high - 0.13, z=-0.01)
+        post = [tube([(0, -high - 0.12, -0.01), (0, -high * 0.9, depth * 0.4)], 0.012), foot]
         pieces.append((border, merge(post)))
     return pieces
 
@@ -146,9 +138,8 @@ def clock(rng) -> list[Piece]:
         pieces.append((case, turn(lathe(section, 48, closed=True), "x", 90)))
     if style == "rays":
         count = int(rng.integers(8, 25))
-        spike = tube(
-            [(0, radius, depth * 0.4), (0, radius * rng.uniform(1.4, 2.0), depth * 0.4)], [radius * 0.07, 0.004]
-        )
+        tip = radius * rng.uniform(1.4, 2.0)
+        spike = tube([(0, radius, depth * 0.4), (0, tip, depth * 0.4)], [radius * 0.07, 0.004])
         pieces.append((case, merge(turn(spike, "z", 360 / count * i) for i in range(count))))
     pieces.append((dark, hands_and_marks(rng, radius, depth * 0.6)))
     if rng.random() < 0.35 and style != "rays":
@@ -263,3 +254,6 @@ def easel(rng) -> list[Piece]:
     feet = [move(box((0.04, 0.03, 0.3), 0.008), s * (wide + 0.01), 0.11) for s in (1, -1)]
     raised = [(f, move(mesh, y=-low + 0.14)) for f, mesh in pieces]
     return [*raised, (wood, merge([stand, *posts, *feet]))]
+
+
+STYLES = {picture: 0.4, round_frame: 0.14, clock: 0.14, screen: 0.12, collage: 0.1, easel: 0.1}

@@ -61,8 +61,8 @@ def wheel(rng, radius: float, width: float) -> tuple[Mesh, Mesh]:
     section += [(inner * 0.97, half * 0.5), (inner * 0.97, -half * 0.5)]
     tyre = lathe(section, 24, closed=True)
     dish = half * rng.uniform(0.1, 0.7)
-    lip = [(inner, -half * 0.4), (inner, half * 0.95), (inner * 0.92, half), (inner * 0.88, dish)]
-    lip = lathe([*lip, (inner * 0.85, -half * 0.4)], 24, closed=True)
+    profile = [(inner, -half * 0.4), (inner, half * 0.95), (inner * 0.92, half), (inner * 0.88, dish)]
+    lip = lathe([*profile, (inner * 0.85, -half * 0.4)], 24, closed=True)
     hub = move(cylinder(inner * rng.uniform(0.2, 0.35), half * 0.5 + dish, 12, half * 0.1), y=-half * 0.3)
     style = rng.choice(["spokes", "disc", "dish"])
     parts = [lip, hub]

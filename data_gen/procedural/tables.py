@@ -10,9 +10,8 @@ from data_gen.shapes.primitives import Mesh, box, merge, move, prism, superellip
 
 def table(rng) -> list[Piece]:
     """Pieces of one table."""
-    top = finishes.choose(
-        rng, finishes.wood, finishes.wood, finishes.stone, finishes.paint, finishes.glass, finishes.print_
-    )
+    stiff = (finishes.wood, finishes.wood, finishes.stone, finishes.paint, finishes.glass, finishes.print_)
+    top = finishes.choose(rng, *stiff)
     body = top if rng.random() < 0.4 else finishes.choose(rng, finishes.wood, finishes.metal, finishes.paint)
     base = rng.choice(
         [legs_base, column_base, trestle_base, panel_base, hairpin_base, desk_base],
