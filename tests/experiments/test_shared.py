@@ -15,7 +15,7 @@ from support.tiny_baselines import BASELINE, SHRUNKEN
 
 from experiments.comparison import budget as budgets
 from experiments.comparison import contenders, results_folder, scores, study_objects, variants
-from experiments.comparison.contenders import Sources, networks
+from experiments.comparison.contenders import networks
 from experiments.comparison.scores import Shown
 from experiments.comparison.variants import Compared
 from experiments.paper import table1
@@ -197,35 +197,27 @@ def test_a_run_that_was_begun_keeps_its_number_of_steps(tmp_path, monkeypatch):
 # --- networks that are compared ---------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def table(tmp_path_factory):
-    """What a table with two networks leaves behind."""
-    folder = tmp_path_factory.mktemp("table")
-    for name, preset in (("npbg", "npbg_tiny"), ("paper", "tiny")):
-        shutil.copytree(stand_ins.fresh(preset), folder / "runs" / name)
-    return folder
-
-
-def test_networks_of_tables_runs_and_the_package_are_named_after_their_methods_in_the_order_of_table_1(table):
-    dataset = tiny_dataset.dataset()
-    assert list(networks(Sources(table1=table), dataset)) == [PAPER, "NPBG"]
-    found = networks(Sources(runs=(stand_ins.fresh("tiny"), Path("surfels")), table1=table), dataset)
-    surfels = contenders.LABELS["surfels"]
+def test_networks_are_named_after_their_methods_in_the_order_of_table_1(tmp_path):
+    dataset, paper, npbg = tiny_dataset.dataset(), stand_ins.fresh("tiny"), stand_ins.fresh("npbg_tiny")
+    again, surfels = tmp_path / "runs" / "paper", contenders.LABELS["surfels"]
+    shutil.copytree(paper, again)
+    assert list(networks((npbg, paper), dataset)) == [PAPER, "NPBG"]
+    found = networks((paper, Path("surfels"), again, npbg), dataset)
     assert set(found) == {f"{PAPER} (fresh, tiny)", f"{PAPER} (runs, paper)", "NPBG", surfels}
     assert [name for name, network in found.items() if not network.has_depth] == ["NPBG"]
     assert found[f"{PAPER} (runs, paper)"].as_method().identity == found[f"{PAPER} (fresh, tiny)"].as_method().identity
     assert found[surfels].checksum == hashlib.sha256(weights.packaged_file().read_bytes()).hexdigest()
 
 
-def test_what_cannot_be_compared_is_refused_by_name(table, tmp_path):
+def test_what_cannot_be_compared_is_refused_by_name(tmp_path):
     dataset = tiny_dataset.dataset()
     with pytest.raises(ValueError, match="--runs: name at least one"):
-        networks(Sources(table1=tmp_path), dataset)
+        networks((), dataset)
     with pytest.raises(ValueError, match="--runs: a run folder is named twice"):
-        networks(Sources(runs=(stand_ins.fresh("tiny"),) * 2), dataset)
+        networks((stand_ins.fresh("tiny"),) * 2, dataset)
     larger = data_sets.open_dataset(tiny_dataset.write_dataset(tmp_path / "data", size=2 * tiny_dataset.SIZE))
     with pytest.raises(ValueError, match=r"images of 48 x 48 pixels, [^\n]*needs 24 x 24"):
-        networks(Sources(table1=table), larger)
+        networks((stand_ins.fresh("tiny"),), larger)
     with pytest.raises(ValueError, match="--objects: expected 1 or more, got 0"):
         study_objects.test_objects(dataset, 0)
     with pytest.raises(ValueError, match="the test split is empty"):
