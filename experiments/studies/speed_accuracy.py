@@ -9,7 +9,7 @@ Mitsuba as the references were.  Keeps every setting in a file of its own (an in
 tables and front.png.
 
 ms a view   median over objects of the fastest of several drawings of all views, as of a film, the cloud encoded before;
-            on a CPU of the processor, all cores together: other work on the machine does not count
+            CPU time of all cores where that is what computes, so that other work on the machine does not count
 s to encode the same for a cloud, once, all compiled
 front       settings of a size that no other beats in both PSNR and ms a view; its knee lies farthest above the line
             from its cheapest to its best, PSNR against the logarithm of the time
@@ -267,7 +267,7 @@ def measure_surface(method: Method, way: Setting, views: int, size: int, item: O
 
 
 def take_time(work: Callable[[], Any]) -> tuple[Any, float]:
-    """What the work gives, and its milliseconds: of the processor, where that is what computes."""
+    """What the work gives, and its milliseconds (`clock.now`)."""
     start = clock.now()
     result = jax.block_until_ready(work())
     return result, 1000 * (clock.now() - start)

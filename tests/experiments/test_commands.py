@@ -169,7 +169,7 @@ RUNS = {  # name -> its options, the pictures that it writes, and what is known 
     ),
     "paper.fig1": (
         lambda data: {
-            **{"data": data.painted, "l1_weights": (0.0, 100.0), "pretrain": 2},
+            **{"data": data.painted, "l1_weights": (100.0,), "pretrain": 2},
             "budget": Budget(quick=True, shown=1),
         },
         ("gallery.png",),
