@@ -237,18 +237,6 @@ def _more_scores(image, reference, inside):
     }
 
 
-def change(compared: Compared, variant: str, reference: str, metric: str) -> dict | None:
-    """The variant minus the reference: mean, interval, p-value, and the mean of each seed alone."""
-    found = difference(compared.by_object(variant), compared.by_object(reference), metric)
-    if found is None:
-        return None
-    seeds = []
-    for seed, scores in compared.scores[variant].items():
-        own, others = (list(of.values()) for of in (scores, compared.scores[reference][seed]))
-        seeds.append(difference(own, others, metric))
-    return found | {"by_seed": [None if one is None else one["mean"] for one in seeds]}
-
-
 def total_cost(runs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """What the runs of a variant took: lists of steps and seconds, means of paces."""
     whole: dict[str, Any] = {"parameters": runs[0]["parameters"]}
@@ -275,19 +263,12 @@ def numbers(
             for variant in trained
         },
         "minus_reference": {
-            name: {metric: change(compared, name, reference, metric) for metric in METRICS}
-            for name in scores
+            name: {metric: difference(of, scores[reference], metric) for metric in METRICS}
+            for name, of in scores.items()
             if name != reference
         },
         "test_objects": compared.names,
         "reference": reference,
-        "by_object": {
-            item: {
-                name: {metric: round(float(found[i][metric].mean()), 4) for metric in ("psnr", "flip")}
-                for name, found in scores.items()
-            }
-            for i, item in enumerate(compared.names)
-        },
         "preset": budget.preset,
         "minutes": budget.minutes,
         "even_share": budget.even_share,
