@@ -12,6 +12,7 @@ import tyro
 from data_gen.render import views
 from data_gen.store import check, layout
 from spnr_jax.errors import UserError, at_least
+from spnr_jax.formats.data_sets import on_white
 from spnr_jax.formats.images import png_url
 from spnr_jax.formats.pages import template
 
@@ -69,7 +70,7 @@ def shown(dataset: Path, object_id: str) -> dict:
 
 def white_bytes(image: np.ndarray) -> np.ndarray:
     """An RGBA picture on white as (height, width, 3) uint8."""
-    return np.round(255 * views.on_white(image)).astype(np.uint8)
+    return np.round(255 * on_white(image)).astype(np.uint8)
 
 
 def point_image(points: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
