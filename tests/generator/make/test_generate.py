@@ -14,7 +14,7 @@ from data_gen.make import objects
 from data_gen.plan import tasks
 from data_gen.render import views
 from data_gen.render.light import Lights
-from data_gen.store import check, layout, show
+from data_gen.store import check, layout, show, storage
 from spnr_jax.formats import data_sets
 from spnr_jax.surfels.lighting import directions
 
@@ -50,7 +50,7 @@ def test_a_bad_mesh_is_left_out_with_its_reason_and_the_others_are_made(finished
     rows = [json.loads(line) for line in (finished / "rejected.jsonl").read_text().splitlines()]
     assert [(row["id"], row["path"]) for row in rows] == [("empty", "empty.ply")]
     assert rows[0]["reason"]
-    assert layout.list_completed(finished) == {f"thing_{number}" for number in range(4)}
+    assert storage.list_completed(finished) == {f"thing_{number}" for number in range(4)}
     assert len(layout.read_split(finished, "test")) == 1
     assert spnr_data("check", finished) == 0
 

@@ -14,7 +14,7 @@ from support.schedulers import in_this_process
 from data_gen.make import objects
 from data_gen.plan import tasks
 from data_gen.render import views
-from data_gen.store import check, layout, storage
+from data_gen.store import check, storage
 from spnr_jax.devices import cluster
 
 pytestmark = pytest.mark.ci  # it renders several data sets
@@ -46,7 +46,7 @@ def files(place):
 
 def wait_for(out, number, process):
     """The names of the objects that are done, once they are so many."""
-    while len(done := layout.list_completed(out)) < number:
+    while len(done := storage.list_completed(out)) < number:
         assert process.poll() is None
         time.sleep(0.01)
     return done
@@ -74,7 +74,7 @@ def with_two_workers_that_are_stopped_and_go_on(folder, _):
     assert process.returncode == 130, message
     assert "Traceback" not in message
     assert "stopped" in message.splitlines()[-1]
-    assert layout.list_completed(out)
+    assert storage.list_completed(out)
     assert not list((out / "objects").glob(storage.UNFINISHED + "*"))
     assert not (out / "splits").exists()
     make(out, "--workers", 2)
