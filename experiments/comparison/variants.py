@@ -58,10 +58,6 @@ class Budget:
     """What every variant changes one thing of."""
     steps: int | None = None
     """Training steps of every variant (default: the preset's)."""
-    minutes: float | None = None
-    """Minutes of training steps that each gets on this machine instead, as many steps as fit."""
-    even_share: float = 0.0
-    """Share of the training clouds that are first points of an object, in a data set of `--spread even`."""
     seeds: tuple[int, ...] = (0,)
     """Seeds of weights, batches and jitter; every variant trains with each of them."""
     objects: int | None = None
@@ -76,17 +72,13 @@ class Budget:
             raise UserError(f"--seeds: expected one or more numbers, none of them twice, got {list(self.seeds)}")
         if self.steps is not None and (self.quick or self.steps < 1):
             raise UserError(f"--steps: expected 1 or more, and not together with --quick, got {self.steps}")
-        if self.minutes is not None and (self.quick or self.steps is not None or not self.minutes > 0):
-            raise UserError(
-                f"--minutes: expected more than 0, and neither with --steps nor --quick, got {self.minutes:g}"
-            )
         at_least(self, 1, "shown")
 
     def config(self) -> TrainConfig:
-        """The preset with the steps and the clouds of this budget."""
+        """The preset with the steps of this budget."""
         config = PRESETS[self.preset]()
         steps = QUICK_STEPS if self.quick else self.steps or config.num_steps
-        return dataclasses.replace(config, num_steps=steps, even_share=self.even_share)
+        return dataclasses.replace(config, num_steps=steps)
 
     def names(self, dataset: data_sets.Dataset) -> tuple[str, ...]:
         """The objects to be scored."""
@@ -139,10 +131,6 @@ def study(
     """Trains what is not trained in a folder that is this experiment's, scores all variants, writes the files."""
     data_sets.check_resolution(data_sets.read_object(dataset, budget.names(dataset)[0]), trainings[0].config)
     asked = {"preset": budget.preset, "steps": budget.config().num_steps, **asked}
-    if budget.minutes is not None:
-        asked |= {"steps": None, "minutes": budget.minutes}
-    if budget.even_share:
-        asked |= {"even_share": budget.even_share}
     results_folder.claim(out, what, asked, dataset)
     compared = score(trainings, train(trainings, budget, out), reference, budget, dataset)
     found = numbers(trainings, reference, compared, budget, dataset) | dict(more or {})
@@ -157,12 +145,8 @@ def train(variants: Sequence[Variant], budget: Budget, out: Path) -> dict[str, d
     """The network of every variant and seed, trained one after another."""
     found: dict[str, dict[int, Trained]] = {variant.name: {} for variant in variants}
     todo = list(itertools.product(budget.seeds, variants))
-    steps: dict[str, int] = {}
     for place, (seed, variant) in enumerate(todo, start=1):
         run, config = out / "runs" / f"{variant.name}_{seed}", dataclasses.replace(variant.config, seed=seed)
-        if budget.minutes is not None:
-            config = budgets.within(budget.minutes, config, variant.dataset, run, steps.get(variant.name))
-            steps[variant.name] = config.num_steps  # its other seeds train for as many
         what = f"run {place} of {len(todo)}: {variant.label}, seed {seed}"
         print(f"{what}: {config.num_steps} steps in {run}", flush=True)
         if variant.start and not (run / "checkpoints").is_dir():
@@ -270,8 +254,6 @@ def numbers(
         "test_objects": compared.names,
         "reference": reference,
         "preset": budget.preset,
-        "minutes": budget.minutes,
-        "even_share": budget.even_share,
         "seeds": list(budget.seeds),
         "hardware": runtime.hardware(),
         "data": dataset.settings.get("settings", {}),
@@ -315,15 +297,10 @@ def differences_table(results: Mapping) -> Table:
 def notes(results: Mapping) -> list[str]:
     """What a reader has to know of the numbers."""
     counts = sorted({row["training_objects"] for row in results["variants"].values()})
-    steps = [count for row in results["variants"].values() for count in row["steps"]]
-    budget = f"{steps[0]:,} steps each"
-    if results["minutes"] is not None:
-        budget = f"{results['minutes']:g} minutes of training steps each, {min(steps):,} to {max(steps):,}"
-    share = results["even_share"]
-    clouds = f" Share of the training clouds that are evenly spread: {share:g}." if share else ""
+    steps = next(iter(results["variants"].values()))["steps"][0]
     return [
-        f"Budget: preset {results['preset']}, {budget}, {' or '.join(map(str, counts))} training objects. "
-        f"Seeds: {', '.join(map(str, results['seeds']))}.{clouds}",
+        f"Budget: preset {results['preset']}, {steps:,} steps each, {' or '.join(map(str, counts))} training objects. "
+        f"Seeds: {', '.join(map(str, results['seeds']))}.",
         f"Hardware: {results['hardware']}.",
         f"Every variant: the same test objects, cameras and first {results['points']} points; "
         f"{results['resolution']} px.",

@@ -13,52 +13,14 @@ from experiments.paper import fig3
 from experiments.paper.fig1 import Fig1, variant
 from experiments.paper.fig2 import nearest_views
 from experiments.studies import inverse, relighting
-from experiments.studies.ablations import LABELS, ROWS, change, rows
 from experiments.studies.speed_accuracy import front, knee
 from spnr_jax import config, presets
 from spnr_jax.formats import data_sets
-from spnr_jax.methods import to_dict
 from spnr_jax.scoring.evaluation import Pictures
 from spnr_jax.surfels import lighting
 from spnr_jax.training import optimisation
 
 TINY = presets.tiny()
-
-
-def leaves(values, path=""):
-    for name, value in values.items():
-        yield from leaves(value, f"{path}{name}.") if isinstance(value, dict) else [(f"{path}{name}", value)]
-
-
-def test_each_ablation_changes_what_it_says_and_nothing_else():
-    expected = {
-        "no_condition": {"loss.condition": False},
-        "no_colour_variants": {},
-        "depth_3": {},  # tiny's own
-        "depth_4": {"model.encoder.num_stages": 4},
-        "depth_5": {"model.encoder.num_stages": 5},
-        "no_fine_samples": {"model.sampling.num_coarse": 32, "model.sampling.num_fine": 0},
-        "no_view_direction": {"model.sees_direction": False},
-        "plain_inputs": {"model.encoder.inputs": "plain"},
-        "fewer_channels": {"model.encoder.base_width": 8},
-        "no_average": {"optimizer.ema_decay": 0.0},
-        "one_count": {"min_points": 1024},
-        "more_views": {"views_per_object": 4},
-        "half_samples": {"model.sampling.num_coarse": 8, "model.sampling.num_fine": 8},
-        "twice_samples": {"model.sampling.num_coarse": 32, "model.sampling.num_fine": 32},
-    }
-    before = dict(leaves(to_dict(TINY)))
-    after = {row: dict(leaves(to_dict(change(row, TINY)))) for row in ROWS}
-    found = {row: {name: x for name, x in of.items() if before[name] != x} for row, of in after.items()}
-    assert found == expected
-    assert set(LABELS) == set(ROWS)
-
-
-def test_without_colour_variants_the_training_split_alone_shrinks():
-    splits = tiny_dataset.SPLITS | {"train": ("a", "a--1", "a--2", "b")}
-    (_, variant) = rows(("no_colour_variants",), TINY, dataclasses.replace(tiny_dataset.dataset(), splits=splits))
-    assert variant.dataset.splits == tiny_dataset.SPLITS | {"train": ("a", "b")}
-    assert variant.config == TINY
 
 
 def test_the_adversarial_loss_takes_part_from_the_first_step_and_the_weights_alone_differ():
