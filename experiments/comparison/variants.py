@@ -11,11 +11,10 @@ over objects.
 
 import dataclasses
 import itertools
-import statistics
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import jax
 import numpy as np
@@ -35,11 +34,10 @@ from spnr_jax.presets import PRESETS
 from spnr_jax.scoring import evaluation
 from spnr_jax.scoring.report import ARROWS, HIGHER, QUALITY, Cell, Table, number, text
 from spnr_jax.scoring.summary import Scores, difference, means, metric_settings
-from spnr_jax.training import checkpoint, optimisation, run_record
+from spnr_jax.training import checkpoint, optimisation
 
 Preset = Literal["abo", "shapenet_car", "shapenet_plane", "shapenet_chair", "small", "tiny"]
 QUICK_STEPS, QUICK_OBJECTS = 4, 2
-FEWEST_ROWS = 8  # of a log, two of which may hold a compilation
 METRICS = {  # head, decimals, what is better
     "psnr": QUALITY["psnr"],
     "inside": ("PSNR inside, dB", 2, HIGHER),
@@ -47,7 +45,6 @@ METRICS = {  # head, decimals, what is better
     "detail": ("HF energy", 2, 0),
 }
 HEADS = tuple(f"{head} {ARROWS[better]}" if better else head for head, _, better in METRICS.values())
-COSTS = {"parameters": "Parameters", "ms_per_step": "ms per step", "ms_per_view": "ms per view"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,10 +95,9 @@ class Variant:
 
 @dataclass(frozen=True, kw_only=True)
 class Compared:
-    """Scores by variant, seed and object; what each run took, by variant; pictures of a few objects."""
+    """Scores by variant, seed and object; pictures of a few objects."""
 
     scores: dict[str, dict[int, dict[str, Scores]]]
-    costs: dict[str, list[dict[str, Any]]]
     shown: list[Shown]
 
     @property
@@ -153,17 +149,9 @@ def train(variants: Sequence[Variant], budget: Budget, out: Path) -> dict[str, d
             state = variant.start(config)
             checkpoint.write_config(run, config)
             checkpoint.save(run, state)
-        trained = budgets.train(config, variant.dataset, run)
-        cost = {**trained.cost, "ms_per_step": step_milliseconds(run)}
-        found[variant.name][seed] = dataclasses.replace(trained, cost=cost)
+        found[variant.name][seed] = budgets.train(config, variant.dataset, run)
         jax.clear_caches()  # two dozen trainings' programs are more pieces of memory than Linux maps for a process
     return found
-
-
-def step_milliseconds(run: Path) -> float | None:
-    """Median milliseconds of a run's steps over the rows of its log; None of a few, which are mostly compilation."""
-    found = [row["ms_per_step"] for row in run_record.read_rows(run) if "ms_per_step" in row]
-    return round(statistics.median(found), 2) if len(found) >= FEWEST_ROWS else None
 
 
 def without_colour_variants(dataset: data_sets.Dataset) -> data_sets.Dataset:
@@ -195,16 +183,11 @@ def score(
         f"{name}/{seed}": of_network(trained[name][seed].config, trained[name][seed].variables) for name, seed in runs
     }
     scored = score_objects(methods, config, dataset, budget.names(dataset), budget.shown, more_scores)
-    costs: dict[str, list[dict]] = {name: [] for name in names}
-    for name, seed in runs:
-        warm = scored.seconds[f"{name}/{seed}"][1:]
-        pace = {"ms_per_view": 1000 * statistics.median(warm) if warm else None}
-        costs[name].append(trained[name][seed].cost | pace)
     scores = {
         name: {seed: {item: found[f"{name}/{seed}"] for item, found in scored.scores.items()} for seed in budget.seeds}
         for name in names
     }
-    return Compared(scores=scores, costs=costs, shown=scored.shown)
+    return Compared(scores=scores, shown=scored.shown)
 
 
 def more_scores(item: data_sets.ObjectData, pictures: evaluation.Pictures) -> Scores:
@@ -221,16 +204,6 @@ def _more_scores(image, reference, inside):
     }
 
 
-def total_cost(runs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """What the runs of a variant took: lists of steps and seconds, means of paces."""
-    whole: dict[str, Any] = {"parameters": runs[0]["parameters"]}
-    whole |= {name: [run[name] for run in runs] for name in ("steps", "training_seconds")}
-    for name in ("ms_per_step", "ms_per_view"):
-        known = [run[name] for run in runs if run[name] is not None]
-        whole[name] = round(statistics.fmean(known), 2) if known else None
-    return whole
-
-
 # --- tables and picture -----------------------------------------------------------------------------------------------
 
 
@@ -242,7 +215,6 @@ def numbers(
     return {
         "variants": {
             variant.name: {"label": variant.label, "training_objects": len(variant.dataset.splits["train"])}
-            | total_cost(compared.costs[variant.name])
             | means(scores[variant.name], METRICS)
             for variant in trained
         },
@@ -254,6 +226,7 @@ def numbers(
         "test_objects": compared.names,
         "reference": reference,
         "preset": budget.preset,
+        "steps": config.num_steps,
         "seeds": list(budget.seeds),
         "hardware": runtime.hardware(),
         "data": dataset.settings.get("settings", {}),
@@ -265,14 +238,13 @@ def numbers(
 
 
 def quality_table(results: Mapping) -> Table:
-    """Quality and cost of every variant."""
+    """Quality of every variant."""
     rows = []
     for row in results["variants"].values():
         cells = [number(row[m], decimals, row[f"{m}_interval"]) for m, (_, decimals, _) in METRICS.items()]
-        costs = [number(row[c], 0 if c == "parameters" else 1, missing="-") for c in COSTS]
-        rows.append((row["label"], (*cells, *costs)))
+        rows.append((row["label"], tuple(cells)))
     title = f"{len(results['test_objects'])} unseen objects, {results['views']} views each"
-    return Table(title=title, heads=(*HEADS, *COSTS.values()), rows=tuple(rows))
+    return Table(title=title, heads=HEADS, rows=tuple(rows))
 
 
 def differences_table(results: Mapping) -> Table:
@@ -297,15 +269,12 @@ def differences_table(results: Mapping) -> Table:
 def notes(results: Mapping) -> list[str]:
     """What a reader has to know of the numbers."""
     counts = sorted({row["training_objects"] for row in results["variants"].values()})
-    steps = next(iter(results["variants"].values()))["steps"][0]
     return [
-        f"Budget: preset {results['preset']}, {steps:,} steps each, {' or '.join(map(str, counts))} training objects. "
-        f"Seeds: {', '.join(map(str, results['seeds']))}.",
+        f"Budget: preset {results['preset']}, {results['steps']:,} steps each, "
+        f"{' or '.join(map(str, counts))} training objects. Seeds: {', '.join(map(str, results['seeds']))}.",
         f"Hardware: {results['hardware']}.",
         f"Every variant: the same test objects, cameras and first {results['points']} points; "
         f"{results['resolution']} px.",
-        "ms per step: median over the rows of a run's log; ms per view: median over the objects but the first; "
-        "encoding is shared by the views of an object.",
         f"PSNR inside: over the pixels whose opacity in the reference exceeds {OPAQUE:g}.",
         "HF energy: above half of the Nyquist frequency in a Hann window, over the reference's; 1 is equally sharp, "
         "less is smoother, more is noise or a sharpness that is not there.",

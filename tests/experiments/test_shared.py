@@ -116,7 +116,7 @@ def test_a_difference_compares_equal_seeds_objects_and_views():
         }
         for variant, level in (("a", 10.0), ("b", 13.0))
     }
-    compared = Compared(scores=found, costs={}, shown=[])
+    compared = Compared(scores=found, shown=[])
     change = difference(compared.by_object("b"), compared.by_object("a"), "psnr")
     pairs = [found["b"][s][n]["psnr"] - found["a"][s][n]["psnr"] for s in range(2) for n in found["a"][s]]
     assert change["mean"] == pytest.approx(np.mean(pairs))
@@ -125,15 +125,6 @@ def test_a_difference_compares_equal_seeds_objects_and_views():
 
 def write_log(run, rows):
     (run / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
-
-
-def test_the_pace_of_a_run_is_not_that_of_its_compilations(tmp_path):
-    paces = (900.0, 10.0, 30.0, 20.0, 20.0, 800.0, 10.0, 20.0, 30.0)
-    rows = [{"step": i, "ms_per_step": pace} for i, pace in enumerate(paces)] + [{"step": 9, "val_psnr": 1.0}]
-    write_log(tmp_path, rows)
-    assert variants.step_milliseconds(tmp_path) == 20.0
-    write_log(tmp_path, rows[:3])
-    assert variants.step_milliseconds(tmp_path) is None
 
 
 def test_training_seconds_are_those_of_the_steps_over_all_calls(tmp_path):
