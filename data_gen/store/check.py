@@ -126,7 +126,7 @@ def checksum_of(path: Path) -> str | None:
 
 def camera_faults(transforms: dict) -> list[str]:
     """What is wrong with the cameras of one object."""
-    poses = cam_to_world(transforms)
+    poses = np.array([frame["transform_matrix"] for frame in transforms["frames"]], np.float64)
     rotations = poses[:, :3, :3]
     products = rotations @ rotations.transpose(0, 2, 1)
     if not np.allclose(products, np.eye(3), atol=1e-6) or not np.allclose(np.linalg.det(rotations), 1, atol=1e-6):
@@ -175,11 +175,6 @@ def points_on_object(record: layout.ObjectRecord) -> float:
     """The share of condition pixels (visible points) that are opaque or partly so in their pictures."""
     seen = record.conditions[..., 3] > 0
     return float((record.images[..., 3][seen] > 0).mean()) if seen.any() else 1.0
-
-
-def cam_to_world(transforms: dict) -> np.ndarray:
-    """The cameras (views, 4, 4) of a transforms.json."""
-    return np.array([frame["transform_matrix"] for frame in transforms["frames"]], np.float64)
 
 
 def print_table(dataset: Path, object_ids, splits, num_views: int, agreements, covered, faults) -> None:

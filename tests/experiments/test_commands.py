@@ -42,7 +42,7 @@ COMMANDS = sorted(
 SPLITS = {"train": (), "val": (), "test": ("ball_000000",)}
 VARIANTS = {"train": ("ball_000000", "ball_000000--1", "ball_000001")}
 SOLVER = importlib.util.find_spec("pymeshlab") is not None
-CLOCKED = {"ms_per_step", "ms_per_view", "training_seconds", "load", "date", "seconds", "costs", "losses", "tasks"}
+CLOCKED = {"ms_per_view", "training_seconds", "load", "date", "seconds", "costs", "losses", "tasks"}
 
 
 @pytest.fixture(autouse=True)
