@@ -112,7 +112,7 @@ def generate(config: GenerateConfig) -> None:
 
 def make_missing(config: GenerateConfig, tasks: Sequence[Task], settings: dict) -> dict[str, str]:
     """Make the objects that are not there yet; return the reason for each that was left out, by id."""
-    done = layout.list_completed(config.out)
+    done = storage.list_completed(config.out)
     missing = [task for task in tasks if task.object_id not in done]
     if not missing:
         return {}
@@ -120,10 +120,10 @@ def make_missing(config: GenerateConfig, tasks: Sequence[Task], settings: dict) 
     lights = make_lights(config, variant)
     refuse_other_content(config.out, settings)  # another run may have begun there meanwhile
     layout.write_text(f"{config.out}/dataset.json", layout.json_text(settings))
-    layout.remove_unfinished(config.out)
+    storage.remove_unfinished(config.out)
     rejected = make_objects(config, missing, lights, variant)
     # the process of one that is there died here, but another run has made it
-    return {name: reason for name, reason in rejected.items() if not layout.has_object(config.out, name)}
+    return {name: reason for name, reason in rejected.items() if not storage.has_object(config.out, name)}
 
 
 def make_lights(config: GenerateConfig, variant: str) -> light.Lights:
@@ -178,7 +178,7 @@ def make_objects(config: GenerateConfig, tasks: Sequence[Task], lights: light.Li
                     tqdm.write(f"left out {task.shown_path or task.object_id}: {reason}", file=sys.stderr)
                 bar.update()
     finally:
-        layout.remove_unfinished(config.out)
+        storage.remove_unfinished(config.out)
     return rejected
 
 

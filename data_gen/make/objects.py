@@ -20,7 +20,7 @@ from data_gen.plan.tasks import Task
 from data_gen.render import views
 from data_gen.render.light import Lights
 from data_gen.render.variant import LLVM, choose_variant, mitsuba_module
-from data_gen.store import layout
+from data_gen.store import layout, storage
 from spnr_jax.errors import UserError
 from spnr_jax.formats.mesh import meshes, surface_points
 from spnr_jax.formats.mesh.assets import Asset, Material, RejectedAsset
@@ -46,7 +46,7 @@ def make_and_write(bench: Workbench, task: Task) -> str | None:
 
     What is wrong with the worker and not with the object is raised: errors of the disk, a mesh file it does not see.
     """
-    if layout.has_object(bench.out, task.object_id):  # another run on the same data set was faster
+    if storage.has_object(bench.out, task.object_id):  # another run on the same data set was faster
         return None
     if task.path and not task.path.exists():
         raise UserError(f"{task.path}: worker {socket.gethostname()} does not see this file; mount it there")

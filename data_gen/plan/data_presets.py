@@ -6,6 +6,7 @@ split keeps its size and the rest train; `--train-objects` caps them.
 """
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from data_gen.plan.tasks import Category, GenerateConfig, Preset
@@ -19,6 +20,7 @@ PAPER_COUNTS: dict[Preset, tuple[int, int]] = {
     "shapenet_plane": (3627, 406),
     "shapenet_chair": (4882, 105),
 }
+SHAPENET: dict[Category, Preset] = {"car": "shapenet_car", "plane": "shapenet_plane", "chair": "shapenet_chair"}
 
 
 def abo(out: Path) -> GenerateConfig:
@@ -42,14 +44,17 @@ def abo(out: Path) -> GenerateConfig:
     )
 
 
-def shapenet(out: Path, preset: Preset, category: Category) -> GenerateConfig:
-    """A class of ShapeNet at 200 x 200, without colour variants."""
+def shapenet(out: Path, category: Category) -> GenerateConfig:
+    """A class of ShapeNetCore at 200 x 200, without colour variants.
+
+    `spnr-data generate OUT --preset shapenet_car --root DIR`, or shapenet_plane, or shapenet_chair.
+    """
     return GenerateConfig(
         out=out,
-        preset=preset,
+        preset=SHAPENET[category],
         source="shapenet",
         category=category,
-        test_objects=PAPER_COUNTS[preset][1],
+        test_objects=PAPER_COUNTS[SHAPENET[category]][1],
         val_fraction=0.0,
         resolution=200,
         views=10,
@@ -57,24 +62,7 @@ def shapenet(out: Path, preset: Preset, category: Category) -> GenerateConfig:
     )
 
 
-def shapenet_car(out: Path) -> GenerateConfig:
-    """The cars of ShapeNetCore: `spnr-data generate OUT --preset shapenet_car --root DIR`."""
-    return shapenet(out, "shapenet_car", "car")
-
-
-def shapenet_plane(out: Path) -> GenerateConfig:
-    """The planes of ShapeNetCore: `spnr-data generate OUT --preset shapenet_plane --root DIR`."""
-    return shapenet(out, "shapenet_plane", "plane")
-
-
-def shapenet_chair(out: Path) -> GenerateConfig:
-    """The chairs of ShapeNetCore: `spnr-data generate OUT --preset shapenet_chair --root DIR`."""
-    return shapenet(out, "shapenet_chair", "chair")
-
-
 PRESETS: dict[str, Callable[[Path], GenerateConfig]] = {
     "abo": abo,
-    "shapenet_car": shapenet_car,
-    "shapenet_plane": shapenet_plane,
-    "shapenet_chair": shapenet_chair,
+    **{preset: partial(shapenet, category=category) for category, preset in SHAPENET.items()},
 }

@@ -144,16 +144,10 @@ class Plan:
         products = {task.object_id: task for task in self.tasks}
         total = self.config.train_objects
         most = None if total is None else max(total - len(train_ids), 0)
-        chosen = splits.chosen_variants(train_ids, self.config.colour_variants, most, self.config.seed)
+        reshaped = self.config.reshape_variants
         return [
-            replace(
-                products[name],
-                object_id=f"{name}--{number}",
-                variant_of=name,
-                colour_variant=number,
-                reshaped=self.config.reshape_variants,
-            )
-            for name, number in chosen
+            replace(products[name], object_id=f"{name}--{k}", variant_of=name, colour_variant=k, reshaped=reshaped)
+            for name, k in splits.chosen_variants(train_ids, self.config.colour_variants, most, self.config.seed)
         ]
 
 
@@ -231,17 +225,8 @@ def mesh_tasks(config: GenerateConfig, root: Path) -> list[Task]:
         found = meshes.find_meshes(root)
         return [Task(object_id=name, path=path, shown_path=show_path(path, root)) for name, path in found]
     listed = sources.find_objects(root, config.category) if config.category else sources.find_products(root)
-    return [
-        Task(
-            object_id=item.object_id,
-            category=config.category or "",
-            path=item.path,
-            shown_path=show_path(item.path, root),
-            folder=item.folder,
-            fault=item.fault,
-        )
-        for item in listed
-    ]
+    category = config.category or ""
+    return [Task(**vars(x), category=category, shown_path=show_path(x.path, root)) for x in listed]
 
 
 def show_path(path: Path, root: Path) -> str:
@@ -259,13 +244,8 @@ def plan_data_set(config: GenerateConfig) -> Plan:
     num_test = round(config.test_fraction * len(tasks)) if config.test_objects is None else config.test_objects
     if not listed and num_test >= len(tasks):
         raise UserError(f"--test-objects {num_test}: leaves none of the {len(tasks)} objects to train on")
-    plan = Plan(
-        tasks=tuple(tasks),
-        listed=listed,
-        num_test=num_test,
-        num_val=round(config.val_fraction * num_free),
-        config=config,
-    )
+    num_val = round(config.val_fraction * num_free)
+    plan = Plan(config=config, tasks=tuple(tasks), listed=listed, num_test=num_test, num_val=num_val)
     if config.train_objects is None:
         return plan
     split_ids = plan.split([task.object_id for task in tasks])

@@ -4,29 +4,32 @@ A family (one file each) draws a sub-style and then all its proportions, parts a
 given. Objects stand on y = 0 with y up and face +z; lengths are of the order of 1.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 
+from data_gen.procedural import chairs, frames, lamps, planes, shelves, sofas
 from data_gen.procedural.cars import car
-from data_gen.procedural.chairs import chair
-from data_gen.procedural.frames import frame
-from data_gen.procedural.lamps import lamp
-from data_gen.procedural.parts import assemble
-from data_gen.procedural.planes import plane
-from data_gen.procedural.shelves import shelf
-from data_gen.procedural.sofas import sofa
+from data_gen.procedural.parts import Piece, assemble
 from data_gen.procedural.tables import table
 from spnr_jax.errors import UserError
 from spnr_jax.formats.mesh.assets import Asset
 
-FAMILIES = {
-    "chair": chair,
+
+def draw_style(styles: dict[Callable, float]) -> Callable[..., list[Piece]]:
+    """A family that draws one of its builders, each as often as its number says."""
+    return lambda rng: rng.choice(list(styles), p=list(styles.values()))(rng)
+
+
+FAMILIES: dict[str, Callable[..., list[Piece]]] = {
+    "chair": draw_style(chairs.STYLES),
     "table": table,
-    "sofa": sofa,
-    "shelf": shelf,
-    "lamp": lamp,
-    "frame": frame,
+    "sofa": draw_style(sofas.STYLES),
+    "shelf": draw_style(shelves.STYLES),
+    "lamp": draw_style(lamps.STYLES),
+    "frame": draw_style(frames.STYLES),
     "car": car,
-    "plane": plane,
+    "plane": draw_style(planes.STYLES),
 }
 CATEGORIES = tuple(FAMILIES)
 

@@ -48,9 +48,8 @@ def arch_line(z, axles, radius, low):
     line = np.full_like(z, low)
     for axle in axles:
         inside = np.abs(z - axle) < radius
-        line = np.where(
-            inside, np.maximum(line, np.sqrt(np.maximum(radius**2 - (z - axle) ** 2, 0)) + radius * 0.85), line
-        )
+        arch = np.sqrt(np.maximum(radius**2 - (z - axle) ** 2, 0)) + radius * 0.85
+        line = np.where(inside, np.maximum(line, arch), line)
     return line
 
 
@@ -99,11 +98,9 @@ def road_car(rng, style) -> list[Piece]:
     z = stations(axles, arch)
     low = np.maximum(arch_line(z, axles, arch, sill), sill)
     deck = deck_line(rng, style, z, foot, sill, belt)
-    width = half * (
-        1
-        - rng.uniform(0.05, 0.18) * np.abs(2 * z) ** 4
-        - rng.uniform(0.02, 0.08) * np.maximum(np.abs(2 * z) - 0.93, 0) / 0.07
-    )
+    ends = np.abs(2 * z)
+    width = 1 - rng.uniform(0.05, 0.18) * ends**4 - rng.uniform(0.02, 0.08) * np.maximum(ends - 0.93, 0) / 0.07
+    width = half * width
     pieces = [(paint, body_shell(z, low, deck, width, sill, sill + (belt - sill) * 0.5))]
     under = box((2 * half * 0.72, (belt - sill) * 0.55, 0.94))
     pieces.append((rubber, move(under, y=sill + (belt - sill) * 0.3)))
@@ -182,9 +179,8 @@ def cabin(rng, paint, glass, half, belt, high, foot, style) -> list[Piece]:
 def fittings(rng, trim, half, sill, belt, axles) -> list[Piece]:
     """Bumpers, lamps, a grille, mirrors and side strips."""
     tall = belt - sill
-    bumper = [
-        move(box((2 * half * 0.9, tall * 0.2, 0.04), 0.006, 3), y=sill + tall * 0.16, z=s * 0.488) for s in (1, -1)
-    ]
+    bar = box((2 * half * 0.9, tall * 0.2, 0.04), 0.006, 3)
+    bumper = [move(bar, y=sill + tall * 0.16, z=s * 0.488) for s in (1, -1)]
     level, place = sill + tall * rng.uniform(0.42, 0.58), half * rng.uniform(0.55, 0.66)
     size = rng.uniform(0.02, 0.035)
     if rng.random() < 0.5:
@@ -193,15 +189,12 @@ def fittings(rng, trim, half, sill, belt, axles) -> list[Piece]:
         lights = superellipsoid((1.5 * size, 1.5 * size, 0.05), 1, 1, 8, 14)
     head = move(lights._replace(texcoords=np.full_like(lights.texcoords, 0.25)), place, level, 0.47)
     tail = move(lights._replace(texcoords=np.full_like(lights.texcoords, 0.75)), place, level + 0.005, -0.475)
-    grille = move(
-        box((half * rng.uniform(0.6, 1.1), tall * rng.uniform(0.12, 0.3), 0.03), 0.004), y=level - 0.005, z=0.485
-    )
+    grille = box((half * rng.uniform(0.6, 1.1), tall * rng.uniform(0.12, 0.3), 0.03), 0.004)
+    grille = move(grille, y=level - 0.005, z=0.485)
     mirror_ = move(box((0.03, 0.02, 0.014), 0.005), half * 0.98, belt + 0.008, axles[1] - 0.1)
     stalk = move(box((0.05, 0.008, 0.01)), half * 0.93, belt, axles[1] - 0.1)
-    return [
-        (trim, merge([*bumper, grille, both_sides(merge([mirror_, stalk]))])),
-        (lamp_glass(), both_sides(merge([head, tail]))),
-    ]
+    metal = merge([*bumper, grille, both_sides(merge([mirror_, stalk]))])
+    return [(trim, metal), (lamp_glass(), both_sides(merge([head, tail])))]
 
 
 def lamp_glass() -> finishes.Finish:
@@ -217,9 +210,8 @@ def wheels(rng, rubber, trim, radius, half, axles, thick) -> list[Piece]:
     shafts = [move(turn(cylinder(radius * 0.2, 2 * out, 10), "z", 90), x=out, y=radius, z=axle) for axle in axles]
     pieces = [(trim, merge(shafts))]
     for axle in axles:
-        pieces += [
-            (finish, both_sides(move(mesh, out, radius, axle))) for finish, mesh in ((rubber, tyre), (trim, rim))
-        ]
+        place = (out, radius, axle)
+        pieces += [(rubber, both_sides(move(tyre, *place))), (trim, both_sides(move(rim, *place)))]
     return pieces
 
 
@@ -241,21 +233,16 @@ def load(rng, style, paint, trim, half, sill, belt, high, foot) -> list[Piece]:
     deck = move(box((2 * half, 0.02, long), 0.004), y=floor + 0.005, z=middle)
     if kind == "box":
         tall = rng.uniform(0.2, 0.34)
-        return [
-            (trim, deck),
-            (goods, move(box((2 * half * 1.02, tall, long * 0.97), 0.008), y=floor + 0.01 + tall / 2, z=middle)),
-        ]
+        cargo = box((2 * half * 1.02, tall, long * 0.97), 0.008)
+        return [(trim, deck), (goods, move(cargo, y=floor + 0.01 + tall / 2, z=middle))]
     if kind == "tank":
-        tank = lathe(
-            np.array([(0.5, 0), (0.9, 0.03), (1, 0.1), (1, 0.9), (0.9, 0.97), (0.5, 1.0)]) * (half * 0.85, long * 0.95),
-            28,
-        )
+        profile = np.array([(0.5, 0), (0.9, 0.03), (1, 0.1), (1, 0.9), (0.9, 0.97), (0.5, 1.0)])
+        tank = lathe(profile * (half * 0.85, long * 0.95), 28)
         return [(trim, deck), (goods, move(turn(tank, "x", 90), y=floor + half * 0.84, z=rear + 0.01))]
     if kind == "tipper":
         sides = [move(box((0.015, 0.12, long * 0.95)), s * half * 0.95, floor + 0.07, middle) for s in (1, -1)]
-        sides += [
-            move(box((2 * half * 0.95, 0.12, 0.015)), y=floor + 0.07, z=middle + s * long * 0.47) for s in (1, -1)
-        ]
+        board = box((2 * half * 0.95, 0.12, 0.015))
+        sides += [move(board, y=floor + 0.07, z=middle + s * long * 0.47) for s in (1, -1)]
         heap = superellipsoid((2 * half * 0.9, 0.16, long * 0.9), 1, 0.5, 8)
         heap = move(heap, y=floor + 0.08, z=middle)
         return [(trim, merge([deck, *sides])), (finishes.choose(rng, finishes.stone), heap)]
@@ -269,11 +256,8 @@ def load(rng, style, paint, trim, half, sill, belt, high, foot) -> list[Piece]:
 
 def racer(rng) -> list[Piece]:
     """An open racing car: slim body, four free wheels, wings front and rear."""
-    paint, trim, rubber = (
-        finishes.car_paint(rng),
-        finishes.choose(rng, finishes.metal, finishes.plastic),
-        finishes.rubber(rng),
-    )
+    paint, trim = finishes.car_paint(rng), finishes.choose(rng, finishes.metal, finishes.plastic)
+    rubber = finishes.rubber(rng)
     second = finishes.car_paint(rng)
     radius, half, clear = rng.uniform(0.07, 0.1), rng.uniform(0.18, 0.22), rng.uniform(0.03, 0.05)
     z = np.linspace(-0.46, 0.5, 22)

@@ -56,10 +56,8 @@ def armchair(rng) -> list[Piece]:
     arm = superellipsoid((rng.uniform(0.1, 0.18), level - seat * 0.35, depth), squareness, 0.3, 10)
     base = move(box((width, seat * 0.5, depth * 0.9), 0.02, 3), y=seat * 0.55)
     pieces += [(soft, both_sides(move(arm, side + 0.02, (level + seat * 0.35) / 2))), (soft, base)]
-    return [
-        *pieces,
-        (body, four_legs(leg_style(rng, 0.025), width * 0.8, depth * 0.75, seat * 0.35, rng.uniform(0, 0.03))),
-    ]
+    legs = four_legs(leg_style(rng, 0.025), width * 0.8, depth * 0.75, seat * 0.35, rng.uniform(0, 0.03))
+    return [*pieces, (body, legs)]
 
 
 def tub_chair(rng) -> list[Piece]:
@@ -81,11 +79,8 @@ def tub_chair(rng) -> list[Piece]:
     if rng.random() < 0.6:
         leg = leg_style(rng, 0.022)
         return [*pieces, (body, round_legs(leg, 4, radius * 0.7, foot + 0.01, rng.uniform(0, 0.05), 45))]
-    column = post(
-        [(0, 0, 0), (0, 0.02, 0), (0, 0.03, 0), (0, foot + 0.01, 0)],
-        [0.9, 0.9, 0.2, 0.2],
-        superellipse(28, 1.0, (radius * 0.8, radius * 0.8)),
-    )
+    disc = superellipse(28, 1.0, (radius * 0.8, radius * 0.8))
+    column = post([(0, 0, 0), (0, 0.02, 0), (0, 0.03, 0), (0, foot + 0.01, 0)], [0.9, 0.9, 0.2, 0.2], disc)
     return [*pieces, (body, column)]
 
 
@@ -102,9 +97,8 @@ def backrest(rng, width, low, high, lean, bow, thickness) -> dict[str, Mesh]:
     span = high - low
 
     def surface(x, y):  # x and y fractions, of the half width and the height
-        return np.stack(
-            [x * width / 2, low + y * span, -lean * np.sign(y) * np.abs(y) ** 1.3 - bow * (1 - x**2)], axis=-1
-        )
+        z = -lean * np.sign(y) * np.abs(y) ** 1.3 - bow * (1 - x**2)
+        return np.stack([x * width / 2, low + y * span, z], axis=-1)
 
     def panel(left, right, bottom, top, thick, columns=9, rows=7, arch=0.0):
         x, y = np.meshgrid(np.linspace(left, right, columns), np.linspace(bottom, top, rows))
@@ -161,9 +155,8 @@ def side_chair(rng) -> list[Piece]:
     if rng.random() < 0.45:
         level = rng.uniform(0.25, 0.6)
         reach = 2 * splay * (1 - level)
-        rails = stretchers(
-            inner[0] + reach, inner[1] + reach, seat * level, radius * 0.5, rng.choice(["ring", "h", "cross"])
-        )
+        kind = rng.choice(["ring", "h", "cross"])
+        rails = stretchers(inner[0] + reach, inner[1] + reach, seat * level, radius * 0.5, kind)
         pieces.append((body, rails))
     if rng.random() < 0.4:
         pieces.append((soft, move(superellipsoid((width * 0.93, 0.07, depth * 0.9), 0.5, 0.3, 8), y=seat + 0.015)))
@@ -180,14 +173,9 @@ def arms(rng, width, seat, rear, depth, radius) -> Mesh:
     """Arm rests from the back posts forward, on a post each."""
     level, front = seat + rng.uniform(0.17, 0.26), rear + depth * rng.uniform(0.6, 0.85)
     flare = rng.uniform(0, 0.05)
-    top = curve(
-        [
-            (width / 2, level, rear - 0.03),
-            (width / 2 + flare, level + 0.015, (rear + front) / 2),
-            (width / 2 + flare * 0.5, level - rng.uniform(0, 0.03), front),
-        ],
-        9,
-    )
+    side, middle = width / 2, (rear + front) / 2
+    path = [(side, level, rear - 0.03), (side + flare, level + 0.015, middle)]
+    top = curve([*path, (side + flare * 0.5, level - rng.uniform(0, 0.03), front)], 9)
     section = rounded_rectangle(2 * rng.uniform(0.4, 1.0), 2, 0.35, 2)
     rest = tube(top, radius * rng.uniform(0.7, 1.0), section=section)
     foot = np.array([width / 2 * 0.98, seat - 0.02, front - 0.04])
@@ -207,45 +195,23 @@ def stool(rng) -> list[Piece]:
         leg = leg_style(rng, rng.uniform(0.014, 0.026))
         pieces.append((body, round_legs(leg, count, radius * 0.75, seat - thick * 0.7, splay, 45)))
         level = rng.uniform(0.25, 0.5)
-        ring = lathe(
-            np.array([[0, -1], [1, 0], [0, 1], [-1, 0]]) * 0.01 + (radius * 0.75 + splay * (1 - level), seat * level),
-            28,
-            closed=True,
-        )
+        rod = np.array([[0, -1], [1, 0], [0, 1], [-1, 0]]) * 0.01
+        ring = lathe(rod + (radius * 0.75 + splay * (1 - level), seat * level), 28, closed=True)
         pieces.append((body, ring))
     else:
-        pieces.append(
-            (body, pedestal(rng, seat - thick * 0.5, rng.uniform(0.02, 0.04), radius * rng.uniform(0.95, 1.3)))
-        )
+        column = pedestal(rng, seat - thick * 0.5, rng.uniform(0.02, 0.04), radius * rng.uniform(0.95, 1.3))
+        pieces.append((body, column))
     if rng.random() < 0.3:
         back = backrest(rng, 1.5 * radius, seat - thick * 0.5, seat + rng.uniform(0.15, 0.35), 0.04, 0.03, 0.018)
         pieces += [(body, move(back["frame"], z=-radius * 0.62)), (top, move(back["fill"], z=-radius * 0.62))]
     return pieces
 
 
-def chair(rng) -> list[Piece]:
-    """Pieces of one chair."""
-    style = rng.choice(
-        [side_chair, shell_chair, cantilever, office_chair, stool, armchair, tub_chair],
-        p=[0.32, 0.18, 0.08, 0.14, 0.1, 0.1, 0.08],
-    )
-    return style(rng)
-
-
 def bucket(rng, width, depth, high) -> tuple[Mesh, float]:
     """(moulded seat and back in one sheet, thickness), its seat at y = 0, front at z = depth / 2."""
     rear, roll, lean = -depth / 2, rng.uniform(0.05, 0.12), rng.uniform(0.04, 0.18)
-    spine = curve(
-        [
-            (depth / 2 + 0.01, -rng.uniform(0.02, 0.05)),
-            (depth * 0.3, 0.0),
-            (-depth * 0.2, -0.015),
-            (rear + 0.02, roll),
-            (rear - lean * 0.5, high * 0.55),
-            (rear - lean, high),
-        ],
-        22,
-    )
+    path = [(depth / 2 + 0.01, -rng.uniform(0.02, 0.05)), (depth * 0.3, 0.0), (-depth * 0.2, -0.015)]
+    spine = curve([*path, (rear + 0.02, roll), (rear - lean * 0.5, high * 0.55), (rear - lean, high)], 22)
     across = np.linspace(-1, 1, 15)
     along = np.linspace(0, 1, 22)
     taper = 1 - rng.uniform(0, 0.35) * along**3 - rng.uniform(0, 0.3) * np.clip(along - 0.8, 0, 1) / 0.2
@@ -298,16 +264,10 @@ def sled(width, depth, top) -> Mesh:
 
 def cantilever(rng) -> list[Piece]:
     """One bent tube for runners, front legs and back; two pads hang in it."""
-    frame, soft = (
-        finishes.choose(rng, finishes.metal, finishes.paint),
-        finishes.choose(rng, finishes.leather, finishes.fabric, finishes.rattan, finishes.wood),
-    )
-    width, depth, seat, high = (
-        rng.uniform(0.4, 0.52),
-        rng.uniform(0.42, 0.5),
-        rng.uniform(0.42, 0.47),
-        rng.uniform(0.8, 0.95),
-    )
+    frame = finishes.choose(rng, finishes.metal, finishes.paint)
+    soft = finishes.choose(rng, finishes.leather, finishes.fabric, finishes.rattan, finishes.wood)
+    width, depth = rng.uniform(0.4, 0.52), rng.uniform(0.42, 0.5)
+    seat, high = rng.uniform(0.42, 0.47), rng.uniform(0.8, 0.95)
     x, z, r, lean = width / 2, depth / 2, rng.uniform(0.01, 0.016), rng.uniform(0.04, 0.12)
     corners = [(0, r, -z), (x, r, -z), (x, r, z), (x, seat, z), (x, seat, -z), (x, high, -z - lean)]
     loop = bent_line(corners, rng.uniform(0.04, 0.08))
@@ -338,26 +298,28 @@ def office_chair(rng) -> list[Piece]:
     z = bow * x**2 - lean * y + 0.03 * np.sin(np.pi * y * 1.3)
     points = np.stack([x * width * 0.48 * narrow, start + y * (high - start), z], axis=-1)
     pieces.append((soft, move(shell(points, rng.uniform(0.02, 0.07), 50), y=seat, z=rear)))
-    spine = curve(
-        [
-            (0, seat - 0.05, 0),
-            (0, seat - 0.06, rear * 0.7),
-            (0, seat + 0.02, rear - 0.06),
-            (0, seat + start + 0.15, rear - 0.05),
-        ],
-        12,
-    )
+    path = [(0, seat - 0.05, 0), (0, seat - 0.06, rear * 0.7), (0, seat + 0.02, rear - 0.06)]
+    spine = curve([*path, (0, seat + start + 0.15, rear - 0.05)], 12)
     pieces.append((hard, tube(spine, 1, section=rounded_rectangle(rng.uniform(0.05, 0.1), 0.025, 0.01, 2))))
     if rng.random() < 0.65:
         level, side = seat + rng.uniform(0.18, 0.25), width / 2 + 0.03
         loop = curve([(0.1, seat - 0.04, 0), (side, seat - 0.03, 0), (side, level, -0.02)], 10)
         pad = move(box((0.06, 0.03, 0.26), 0.012, 3), side, level)
-        pieces += [
-            (hard, both_sides(tube(loop, 0.014, segments=8))),
-            (soft if rng.random() < 0.3 else hard, both_sides(pad)),
-        ]
+        pieces += [(hard, both_sides(tube(loop, 0.014, segments=8)))]
+        pieces.append((soft if rng.random() < 0.3 else hard, both_sides(pad)))
     if rng.random() < 0.25:
         rest = superellipsoid((width * 0.55, 0.14, 0.07), 0.5, 0.5, 8)
         pole = tube([(0, seat + high - 0.08, rear - lean - 0.01), (0, seat + high + 0.1, rear - lean - 0.01)], 0.012)
         pieces += [(soft, move(rest, y=seat + high + 0.11, z=rear - lean)), (hard, pole)]
     return pieces
+
+
+STYLES = {
+    side_chair: 0.32,
+    shell_chair: 0.18,
+    cantilever: 0.08,
+    office_chair: 0.14,
+    stool: 0.1,
+    armchair: 0.1,
+    tub_chair: 0.08,
+}

@@ -20,12 +20,6 @@ from data_gen.shapes.primitives import (
 )
 
 
-def frame(rng) -> list[Piece]:
-    """Pieces of one frame."""
-    style = rng.choice([picture, round_frame, clock, screen, collage, easel], p=[0.4, 0.14, 0.14, 0.12, 0.1, 0.1])
-    return style(rng)
-
-
 def profile(rng, width: float, depth: float) -> np.ndarray:
     """(k, 2) section (outward, z) of a moulding: a straight back and outside, a shaped front."""
     style = rng.choice(["flat", "bevel", "scoop", "round", "carved"])
@@ -121,10 +115,8 @@ def round_frame(rng) -> list[Piece]:
     pieces = [(border, oval(ring)), (image, oval(face))]
     if rng.random() < 0.3:  # a stand mirror
         high = (radius + rim) * squash[1]
-        post = [
-            tube([(0, -high - 0.12, -0.01), (0, -high * 0.9, depth * 0.4)], 0.012),
-            move(cylinder(radius * 0.6, 0.02, 28, 0.004), y=-high - 0.13, z=-0.01),
-        ]
+        foot = move(cylinder(radius * 0.6, 0.02, 28, 0.004), y=-high - 0.13, z=-0.01)
+        post = [tube([(0, -high - 0.12, -0.01), (0, -high * 0.9, depth * 0.4)], 0.012), foot]
         pieces.append((border, merge(post)))
     return pieces
 
@@ -146,19 +138,15 @@ def clock(rng) -> list[Piece]:
         pieces.append((case, turn(lathe(section, 48, closed=True), "x", 90)))
     if style == "rays":
         count = int(rng.integers(8, 25))
-        spike = tube(
-            [(0, radius, depth * 0.4), (0, radius * rng.uniform(1.4, 2.0), depth * 0.4)], [radius * 0.07, 0.004]
-        )
+        tip = radius * rng.uniform(1.4, 2.0)
+        spike = tube([(0, radius, depth * 0.4), (0, tip, depth * 0.4)], [radius * 0.07, 0.004])
         pieces.append((case, merge(turn(spike, "z", 360 / count * i) for i in range(count))))
     pieces.append((dark, hands_and_marks(rng, radius, depth * 0.6)))
     if rng.random() < 0.35 and style != "rays":
-        feet = [
-            tube(
-                [(s * radius * 0.7, -radius * 1.25, depth * 0.5), (s * radius * 0.5, -radius * 0.75, depth * 0.5)],
-                radius * 0.07,
-            )
-            for s in (1, -1)
-        ]
+        feet = []
+        for s in (1, -1):
+            foot, top = (s * radius * 0.7, -radius * 1.25), (s * radius * 0.5, -radius * 0.75)
+            feet.append(tube([(*foot, depth * 0.5), (*top, depth * 0.5)], radius * 0.07))
         pieces.append((case, merge(feet)))
         if style == "round":
             pieces.append((dark, bells(radius, depth)))
@@ -169,14 +157,10 @@ def hands_and_marks(rng, radius: float, face: float) -> Mesh:
     """Twelve marks, two hands at any time, and their pin, on a dial whose face lies at z."""
     mark = move(box((radius * 0.04, radius * 0.14, 0.006)), y=radius * 0.82, z=face)
     marks = [turn(mark, "z", 30 * i) for i in range(12)]
-    hands = [
-        turn(
-            move(box((radius * w, radius * long, 0.005)), y=radius * long * 0.4, z=face + 0.004),
-            "z",
-            rng.uniform(0, 360),
-        )
-        for w, long in ((0.06, 0.55), (0.04, 0.8))
-    ]
+    hands = []
+    for w, long in ((0.06, 0.55), (0.04, 0.8)):
+        hand = move(box((radius * w, radius * long, 0.005)), y=radius * long * 0.4, z=face + 0.004)
+        hands.append(turn(hand, "z", rng.uniform(0, 360)))
     pin = move(turn(cylinder(radius * 0.05, 0.02, 12), "x", 90), z=face - 0.005)
     return merge([*marks, *hands, pin])
 
@@ -270,3 +254,6 @@ def easel(rng) -> list[Piece]:
     feet = [move(box((0.04, 0.03, 0.3), 0.008), s * (wide + 0.01), 0.11) for s in (1, -1)]
     raised = [(f, move(mesh, y=-low + 0.14)) for f, mesh in pieces]
     return [*raised, (wood, merge([stand, *posts, *feet]))]
+
+
+STYLES = {picture: 0.4, round_frame: 0.14, clock: 0.14, screen: 0.12, collage: 0.1, easel: 0.1}

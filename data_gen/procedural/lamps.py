@@ -21,15 +21,6 @@ from data_gen.shapes.primitives import (
 )
 
 
-def lamp(rng) -> list[Piece]:
-    """Pieces of one lamp."""
-    style = rng.choice(
-        [table_lamp, floor_lamp, tripod_lamp, arc_lamp, desk_lamp, paper_lamp, mushroom_lamp],
-        p=[0.28, 0.16, 0.12, 0.1, 0.16, 0.09, 0.09],
-    )
-    return style(rng)
-
-
 def shade_finish(rng) -> finishes.Finish:
     """A finish that shades have."""
     return finishes.choose(rng, finishes.glow, finishes.glow, finishes.fabric, finishes.metal, finishes.paint)
@@ -52,15 +43,12 @@ def shade(rng, radius: float, height: float) -> tuple[Mesh, Mesh]:
         around = superellipse(32, 0.12) * 0.85
     if style == "pleated":
         around = circle(96) * (1 + 0.02 * np.cos(np.arange(96) * np.pi))[:, None]
-    rings = np.stack(
-        np.broadcast_arrays(profile[:, :1] * around[:, 0], profile[:, 1:], -profile[:, :1] * around[:, 1]), -1
-    )
+    radii, y = profile[:, :1], profile[:, 1:]
+    rings = np.stack(np.broadcast_arrays(radii * around[:, 0], y, -radii * around[:, 1]), -1)
     reach = 0.98 * radius * outline[-2]
     level = height * at[-2]
-    spokes = [
-        tube([(-reach, level, 0), (reach, level, 0)], 0.003, segments=6),
-        tube([(0, level, -reach), (0, level, reach)], 0.003, segments=6),
-    ]
+    ends = ((-reach, level, 0), (reach, level, 0)), ((0, level, -reach), (0, level, reach))
+    spokes = [tube(pair, 0.003, segments=6) for pair in ends]
     return loft(rings, closed=True), merge(spokes)
 
 
@@ -74,9 +62,8 @@ def stem(rng, height: float, radius: float, thick=0.01) -> Mesh:
         if style == "turned":
             body = turned_profile(rng, 26)[1] * rng.uniform(0.4, 0.9)
         profile = np.column_stack([radius * body, np.linspace(0, height * neck, 26)])
-        return merge(
-            [lathe(profile, 28), move(cylinder(thick, height * (1 - neck) + 0.01, 10), y=height * neck - 0.01)]
-        )
+        top = move(cylinder(thick, height * (1 - neck) + 0.01, 10), y=height * neck - 0.01)
+        return merge([lathe(profile, 28), top])
     if style == "stack":
         count, balls, y = int(rng.integers(2, 5)), [], 0.0
         size = height * neck / count
@@ -91,9 +78,8 @@ def stem(rng, height: float, radius: float, thick=0.01) -> Mesh:
     section = superellipse(24, rng.uniform(0.1, 0.5), (radius * 0.8, radius * rng.uniform(0.4, 0.8)))
     if style == "block":
         scale = np.array([1.0, rng.uniform(0.5, 1.2)])
-        return merge(
-            [post(line((0, 0, 0), (0, height * neck, 0), [0, 1]), scale, section), cylinder(thick, height, 10)]
-        )
+        block = post(line((0, 0, 0), (0, height * neck, 0), [0, 1]), scale, section)
+        return merge([block, cylinder(thick, height, 10)])
     rings = []
     for at in np.linspace(0, 1, 16):
         angle = at * rng.uniform(2.4, 2.401)
@@ -105,12 +91,8 @@ def stem(rng, height: float, radius: float, thick=0.01) -> Mesh:
 
 def bulb(radius=0.028) -> Mesh:
     """A bulb about 0 with its screw below."""
-    return merge(
-        [
-            superellipsoid((2 * radius, 2.3 * radius, 2 * radius), 1, 1, 8, 12),
-            move(cylinder(radius * 0.5, radius, 10), y=-1.8 * radius),
-        ]
-    )
+    ball = superellipsoid((2 * radius, 2.3 * radius, 2 * radius), 1, 1, 8, 12)
+    return merge([ball, move(cylinder(radius * 0.5, radius, 10), y=-1.8 * radius)])
 
 
 def table_lamp(rng) -> list[Piece]:
@@ -154,10 +136,8 @@ def tripod_lamp(rng) -> list[Piece]:
     reach *= 0.4 + 0.6 * height
     wide, tall, count = rng.uniform(0.15, 0.28), rng.uniform(0.16, 0.3), int(rng.integers(3, 5))
     radius = rng.uniform(0.01, 0.02)
-    legs = [
-        turn(tube([(reach, 0, 0), (0.02, height, 0)], [radius * 0.7, radius], segments=10), "y", 360 / count * i + 90)
-        for i in range(count)
-    ]
+    leg = tube([(reach, 0, 0), (0.02, height, 0)], [radius * 0.7, radius], segments=10)
+    legs = [turn(leg, "y", 360 / count * i + 90) for i in range(count)]
     hub = move(cylinder(0.04, 0.05, 16, 0.008), y=height - 0.02)
     screen, spokes = shade(rng, wide, tall)
     link = tube([(0, height, 0), (0, height + 0.05 + tall * 0.9, 0)], 0.007, segments=8)
@@ -170,16 +150,8 @@ def arc_lamp(rng) -> list[Piece]:
     metal, cover = finishes.choose(rng, finishes.metal, finishes.paint), shade_finish(rng)
     height, reach = rng.uniform(1.2, 1.8), rng.uniform(0.4, 0.9)
     drop = height * rng.uniform(0.68, 0.9)
-    path = curve(
-        [
-            (0, 0.02, 0),
-            (0, height * 0.55, 0),
-            (reach * 0.25, height * 0.93, 0),
-            (reach * 0.65, height, 0),
-            (reach, drop, 0),
-        ],
-        26,
-    )
+    points = [(0, 0.02, 0), (0, height * 0.55, 0), (reach * 0.25, height * 0.93, 0), (reach * 0.65, height, 0)]
+    path = curve([*points, (reach, drop, 0)], 26)
     block = box((0.3, 0.05, 0.24), 0.01, 3) if rng.random() < 0.5 else move(cylinder(0.16, 0.05, 28, 0.01), y=-0.025)
     screen, spokes = shade(rng, rng.uniform(0.12, 0.22), rng.uniform(0.1, 0.2))
     foot = finishes.choose(rng, finishes.stone, finishes.metal)
@@ -195,10 +167,8 @@ def arc_lamp(rng) -> list[Piece]:
 
 def desk_lamp(rng) -> list[Piece]:
     """A jointed or curved arm from a heavy foot to a tilted head."""
-    body, metal = (
-        finishes.choose(rng, finishes.paint, finishes.plastic, finishes.metal),
-        finishes.choose(rng, finishes.metal),
-    )
+    body = finishes.choose(rng, finishes.paint, finishes.plastic, finishes.metal)
+    metal = finishes.choose(rng, finishes.metal)
     first, second = rng.uniform(0.18, 0.32), rng.uniform(0.15, 0.28)
     elbow = np.array([0, 0.03 + first * 0.95, -first * rng.uniform(0.1, 0.5)])
     wrist = elbow + (0, second * rng.uniform(0.2, 0.7), second * rng.uniform(0.6, 1.0))
@@ -223,14 +193,8 @@ def desk_lamp(rng) -> list[Piece]:
     head = merge([head, move(cylinder(outline[-1] * 1.05, 0.03, 16, 0.004), y=tall - 0.015)])
     tilt = rng.uniform(-50, 10)
     head = turn(move(head, y=-tall - 0.005), "x", tilt)
-    glow = turn(
-        move(
-            merge([bulb(min(wide * 0.45, 0.03)), tube([(0, 0, 0), (0, tall * 0.6, 0)], 0.008, segments=8)]),
-            y=-tall * 0.65,
-        ),
-        "x",
-        tilt,
-    )
+    lit = merge([bulb(min(wide * 0.45, 0.03)), tube([(0, 0, 0), (0, tall * 0.6, 0)], 0.008, segments=8)])
+    glow = turn(move(lit, y=-tall * 0.65), "x", tilt)
     foot = cylinder(rng.uniform(0.07, 0.11), 0.03, 28, 0.008)
     if rng.random() < 0.3:
         foot = move(box((0.16, 0.03, 0.13), 0.01, 3), y=0.015)
@@ -244,14 +208,10 @@ def paper_lamp(rng) -> list[Piece]:
     if rng.random() < 0.4:
         wide = 2 * radius
         leg = leg_style(rng, 0.012)
-        bars = [
-            move(box((wide, 0.014, 0.014)), y=y, z=s * radius)
-            for y in np.linspace(0.08, 0.98, 5) * height
-            for s in (1, -1)
-        ]
-        bars += [
-            move(box((0.014, 0.014, wide)), s * radius, y) for y in np.linspace(0.08, 0.98, 5) * height for s in (1, -1)
-        ]
+        levels = np.linspace(0.08, 0.98, 5) * height
+        across, along = box((wide, 0.014, 0.014)), box((0.014, 0.014, wide))
+        bars = [move(across, y=y, z=s * radius) for y in levels for s in (1, -1)]
+        bars += [move(along, s * radius, y) for y in levels for s in (1, -1)]
         bars += [move(box((0.012, height * 0.92, 0.012)), 0, height * 0.53, s * radius) for s in (1, -1)]
         core = move(box((wide * 0.98, height * 0.9, wide * 0.98)), y=height * 0.53)
         return [(paper, core), (frame, merge([four_legs(leg, wide, wide, height), *bars]))]
@@ -262,14 +222,10 @@ def paper_lamp(rng) -> list[Piece]:
     foot = rng.uniform(0.03, 0.15)
     ball = lathe(np.column_stack([radius * body * scallop, foot + at * height]), 28, crease=60)
     if rng.random() < 0.5:
-        return [
-            (paper, ball),
-            (frame, merge([cylinder(radius * 0.7, 0.02, 24, 0.004), cylinder(0.02, foot + 0.01, 12)])),
-        ]
-    legs = [
-        turn(tube([(radius * 0.7, 0, 0), (radius * body[0] * 0.8, foot + 0.02, 0)], 0.008), "y", 120 * i)
-        for i in range(3)
-    ]
+        stand = merge([cylinder(radius * 0.7, 0.02, 24, 0.004), cylinder(0.02, foot + 0.01, 12)])
+        return [(paper, ball), (frame, stand)]
+    strut = tube([(radius * 0.7, 0, 0), (radius * body[0] * 0.8, foot + 0.02, 0)], 0.008)
+    legs = [turn(strut, "y", 120 * i) for i in range(3)]
     return [(paper, ball), (frame, merge([*legs, move(cylinder(radius * body[0] * 0.95, 0.01, 20), y=foot)]))]
 
 
@@ -287,3 +243,14 @@ def mushroom_lamp(rng) -> list[Piece]:
     inside = (dome * 0.96)[::-1]
     profile = np.concatenate([inside[:1] * (0, 1), inside[1:], dome])  # the under side first, from the axis outward
     return [(body, column), (cap_finish, move(lathe(profile, 32), y=height - rise * 0.9))]
+
+
+STYLES = {
+    table_lamp: 0.28,
+    floor_lamp: 0.16,
+    tripod_lamp: 0.12,
+    arc_lamp: 0.1,
+    desk_lamp: 0.16,
+    paper_lamp: 0.09,
+    mushroom_lamp: 0.09,
+}

@@ -55,31 +55,14 @@ def wheel(rng, radius: float, width: float) -> tuple[Mesh, Mesh]:
     """(tyre, rim) about 0, the outside of the rim towards +x."""
     inner = radius * rng.uniform(0.55, 0.75)
     half, round_ = width / 2, width * rng.uniform(0.15, 0.3)
-    section = [
-        (inner, -half),
-        (radius - round_, -half),
-        (radius - round_ * 0.3, -half + round_ * 0.3),
-        (radius, -half + round_),
-        (radius, half - round_),
-        (radius - round_ * 0.3, half - round_ * 0.3),
-        (radius - round_, half),
-        (inner, half),
-        (inner * 0.97, half * 0.5),
-        (inner * 0.97, -half * 0.5),
-    ]
+    edge = round_ * 0.3
+    section = [(inner, -half), (radius - round_, -half), (radius - edge, -half + edge), (radius, -half + round_)]
+    section += [(radius, half - round_), (radius - edge, half - edge), (radius - round_, half), (inner, half)]
+    section += [(inner * 0.97, half * 0.5), (inner * 0.97, -half * 0.5)]
     tyre = lathe(section, 24, closed=True)
     dish = half * rng.uniform(0.1, 0.7)
-    lip = lathe(
-        [
-            (inner, -half * 0.4),
-            (inner, half * 0.95),
-            (inner * 0.92, half),
-            (inner * 0.88, dish),
-            (inner * 0.85, -half * 0.4),
-        ],
-        24,
-        closed=True,
-    )
+    profile = [(inner, -half * 0.4), (inner, half * 0.95), (inner * 0.92, half), (inner * 0.88, dish)]
+    lip = lathe([*profile, (inner * 0.85, -half * 0.4)], 24, closed=True)
     hub = move(cylinder(inner * rng.uniform(0.2, 0.35), half * 0.5 + dish, 12, half * 0.1), y=-half * 0.3)
     style = rng.choice(["spokes", "disc", "dish"])
     parts = [lip, hub]
@@ -222,29 +205,14 @@ def star_base(rng, height: float, reach: float) -> tuple[Mesh, Mesh]:
     rise = 2 * wheel
     arms, feet = [], []
     for i in range(count):
-        arms.append(
-            turn(move(loft_arm(reach, rng.uniform(0.05, 0.051) + 0.02, 0.045), y=rise - 0.008), "y", 360 / count * i)
-        )
-        castor = merge(
-            [
-                move(superellipsoid((2 * wheel, 2 * wheel, 0.03), 1, 1, 8, 12), x=0, y=wheel),
-                move(box((0.02, wheel + 0.01, 0.02)), y=1.5 * wheel),
-            ]
-        )
+        arm = move(loft_arm(reach, rng.uniform(0.05, 0.051) + 0.02, 0.045), y=rise - 0.008)
+        arms.append(turn(arm, "y", 360 / count * i))
+        ball = move(superellipsoid((2 * wheel, 2 * wheel, 0.03), 1, 1, 8, 12), x=0, y=wheel)
+        castor = merge([ball, move(box((0.02, wheel + 0.01, 0.02)), y=1.5 * wheel)])
         feet.append(turn(move(castor, x=reach - 0.02), "y", 360 / count * i))
-    low, high = rise, height
+    low, middle = rise, (rise + height) / 2
     width = rng.uniform(0.022, 0.04)
-    column = lathe(
-        [
-            (0.05, low - 0.005),
-            (0.05, low + 0.06),
-            (width, low + 0.08),
-            (width, (low + high) / 2),
-            (0.6 * width, (low + high) / 2 + 0.01),
-            (0.6 * width, high - 0.04),
-            (0.08, high - 0.03),
-            (0.08, high),
-        ],
-        16,
-    )
+    profile = [(0.05, low - 0.005), (0.05, low + 0.06), (width, low + 0.08), (width, middle)]
+    profile += [(0.6 * width, middle + 0.01), (0.6 * width, height - 0.04), (0.08, height - 0.03), (0.08, height)]
+    column = lathe(profile, 16)
     return merge([*arms, column]), merge(feet)

@@ -29,14 +29,8 @@ def fuselage(z, width, height, middle, segments=28) -> Mesh:
     Texture coordinates: u around from the belly, v from 0 at the nose to 1 at the tail.
     """
     around = np.roll(circle(segments), segments // 4, axis=0)
-    rings = np.stack(
-        [
-            width[:, None] / 2 * around[:, 0],
-            middle[:, None] + height[:, None] / 2 * around[:, 1],
-            np.broadcast_to(z[:, None], (len(z), segments)),
-        ],
-        axis=-1,
-    )
+    x, y = width[:, None] / 2 * around[:, 0], middle[:, None] + height[:, None] / 2 * around[:, 1]
+    rings = np.stack([x, y, np.broadcast_to(z[:, None], (len(z), segments))], axis=-1)
     u = np.broadcast_to(np.arange(segments + 1) / segments, (len(z), segments + 1))
     v = np.broadcast_to(((z.max() - z) / np.ptp(z))[:, None], u.shape)
     return patch(rings, wrap_columns=True, texcoords=np.stack([u, v], axis=-1), crease=60)
@@ -99,36 +93,20 @@ def tail(rng, z, y, size, style) -> Mesh:
     level = {"low": 0.1, "cross": 0.45, "t": 0.97, "twin": 0.1}[style]
     out = size * (rng.uniform(0.35, 0.55) if style == "twin" else rng.uniform(0.8, 1.2))
     front = lead - back * (level if style != "twin" else 0.1)
-    flat = surface(
-        (0, y + high * level, front),
-        (out, y + high * level + 0.01, front - back * 0.6),
-        (chord * 0.75, chord * 0.4),
-        0.09,
-    )
-    meshes = [both_sides(flat)]
-    if style == "twin":
-        meshes.append(
-            both_sides(
-                surface(
-                    (out * 0.9, y - high * 0.2, front - 0.03),
-                    (out * 0.9, y + high * 0.8, front - back),
-                    (chord * 0.7, chord * 0.4),
-                    0.09,
-                )
-            )
-        )
-    else:
-        meshes.append(fin)
-    return merge(meshes)
+    top = y + high * level
+    flat = surface((0, top, front), (out, top + 0.01, front - back * 0.6), (chord * 0.75, chord * 0.4), 0.09)
+    if style != "twin":
+        return merge([both_sides(flat), fin])
+    low, tip = (out * 0.9, y - high * 0.2, front - 0.03), (out * 0.9, y + high * 0.8, front - back)
+    return merge([both_sides(flat), both_sides(surface(low, tip, (chord * 0.7, chord * 0.4), 0.09))])
 
 
 def propeller(rng, radius, blades) -> tuple[Mesh, Mesh]:
     """(blades, spinner) about the z axis, the tip of the spinner towards +z."""
     width = rng.uniform(0.12, 0.2) * radius
     blade = turn(move(superellipsoid((width, radius, 0.014), 0.6, 1, 8, 14), y=radius / 2), "y", 25)
-    spinner = turn(
-        lathe([(0.16, 0), (0.155, 0.1), (0.11, 0.22), (0.0, 0.34)] * np.array([radius, radius]), 16), "x", 90
-    )
+    profile = [(0.16, 0), (0.155, 0.1), (0.11, 0.22), (0.0, 0.34)] * np.array([radius, radius])
+    spinner = turn(lathe(profile, 16), "x", 90)
     return merge(turn(blade, "z", 360 / blades * i) for i in range(blades)), move(spinner, z=-0.008)
 
 
@@ -138,11 +116,8 @@ def jet(radius, long) -> tuple[Mesh, Mesh]:
         [(0.55, 0.0), (0.72, 0.12), (0.9, 0.4), (1.0, 0.7), (0.97, 0.92), (0.88, 1.0), (0.8, 0.95), (0.78, 0.85)]
     )
     pod = turn(lathe(outside * (radius, long), 24), "x", 90)
-    fan = turn(
-        lathe(np.array([(0.5, -0.1), (0.5, 0.02), (0.76, 0.86), (0.2, 0.865), (0.0, 0.93)]) * (radius, long), 20),
-        "x",
-        90,
-    )
+    inside = np.array([(0.5, -0.1), (0.5, 0.02), (0.76, 0.86), (0.2, 0.865), (0.0, 0.93)])
+    fan = turn(lathe(inside * (radius, long), 20), "x", 90)
     return move(pod, z=-long), move(fan, z=-long)
 
 
@@ -177,12 +152,8 @@ def cockpit(z, size, rise) -> Mesh:
     half = np.interp(places, z, size) / 2 * 1.015
     middle = np.interp(places, z, rise)
     angle = np.radians(np.linspace(28, 152, 15))
-    grid = np.stack(
-        np.broadcast_arrays(
-            half[:, None] * np.cos(angle), middle[:, None] + half[:, None] * np.sin(angle) * 1.02, places[:, None]
-        ),
-        axis=-1,
-    )
+    x, y = half[:, None] * np.cos(angle), middle[:, None] + half[:, None] * np.sin(angle) * 1.02
+    grid = np.stack(np.broadcast_arrays(x, y, places[:, None]), axis=-1)
     return patch(grid, crease=60)
 
 
@@ -196,19 +167,10 @@ def landing(rng, trim, width, front) -> list[Piece]:
         ]
         return [(trim, both_sides(merge([move(hull, x, down, place), *bars])))]
     legs = [((s * width * 0.25, -width * 0.35, place), (s * x, down, place)) for s in (1, -1)]
-    legs.append(
-        ((0, -width * 0.3, 0.4), (0, down, 0.4)) if rng.random() < 0.6 else ((0, 0.0, -0.42), (0, -width * 0.5, -0.44))
-    )
+    nose, rear = ((0, -width * 0.3, 0.4), (0, down, 0.4)), ((0, 0.0, -0.42), (0, -width * 0.5, -0.44))
+    legs.append(nose if rng.random() < 0.6 else rear)
     tyres, struts = gear(rng, legs, rng.uniform(0.022, 0.032))
     return [(finishes.rubber(rng), tyres), (trim, struts)]
-
-
-def plane(rng) -> list[Piece]:
-    """Pieces of one aircraft."""
-    style = rng.choice(
-        [airliner, light_plane, biplane, fighter, glider, helicopter], p=[0.34, 0.22, 0.14, 0.12, 0.07, 0.11]
-    )
-    return style(rng)
 
 
 def airliner(rng) -> list[Piece]:
@@ -250,9 +212,8 @@ def airliner(rng) -> list[Piece]:
     if rng.random() < 0.5:
         down = low - radius * 3.2
         legs = [((0, -width * 0.4, 0.35), (0, down, 0.35))]
-        legs += [
-            ((s * width * 0.5, low, front - root * 0.7), (s * width * 0.55, down, front - root * 0.7)) for s in (1, -1)
-        ]
+        place = front - root * 0.7
+        legs += [((s * width * 0.5, low, place), (s * width * 0.55, down, place)) for s in (1, -1)]
         tyres, struts = gear(rng, legs, 0.018)
         pieces += [(finishes.rubber(rng), tyres), (white, struts)]
     return pieces
@@ -276,9 +237,8 @@ def light_plane(rng) -> list[Piece]:
         pieces.append((trim, both_sides(strut)))
     canopy = superellipsoid((width * 0.82, width * 0.9, rng.uniform(0.22, 0.36)), 0.7, 0.7, 12)
     pieces.append((dark, move(canopy, y=width * 0.32, z=front - 0.07)))
-    pieces.append(
-        (wing_finish, tail(rng, -0.49, width * 0.2, rng.uniform(0.15, 0.2), rng.choice(["low", "cross", "t"])))
-    )
+    size_of = rng.uniform(0.15, 0.2)
+    pieces.append((wing_finish, tail(rng, -0.49, width * 0.2, size_of, rng.choice(["low", "cross", "t"]))))
     reach, blades = rng.uniform(0.12, 0.16), int(rng.integers(2, 5))
     blade, spinner = propeller(rng, reach, blades)
     if rng.random() < 0.7:
@@ -301,39 +261,27 @@ def biplane(rng) -> list[Piece]:
     trim = finishes.choose(rng, finishes.metal, finishes.wood)
     width, gap = rng.uniform(0.13, 0.18), rng.uniform(0.18, 0.26)
     z = np.concatenate([[-0.5], np.linspace(-0.495, 0.4, 10), [0.41, 0.41]])
-    size = width * np.concatenate(
-        [[0], np.interp(np.linspace(-0.495, 0.4, 10), [-0.5, 0.1, 0.4], [0.2, 1, 0.95]), [0.9, 0]]
-    )
+    swell = np.interp(np.linspace(-0.495, 0.4, 10), [-0.5, 0.1, 0.4], [0.2, 1, 0.95])
+    size = width * np.concatenate([[0], swell, [0.9, 0]])
     pieces = [(skin, fuselage(z, size, size * 1.1, np.zeros_like(z)))]
     chord, span, front = rng.uniform(0.15, 0.2), rng.uniform(0.45, 0.6), rng.uniform(0.26, 0.32)
     stagger, count = rng.uniform(-0.02, 0.06), 3 if rng.random() < 0.2 else 2
     levels = np.linspace(-width * 0.45, -width * 0.45 + gap * (count - 1) * (0.7 if count == 3 else 1), count)
-    wings = [
-        surface(
-            (0, y, front + stagger * i),
-            (span * (0.92 + 0.08 * i), y + 0.015, front + stagger * i),
-            (chord, chord * 0.9),
-            0.1,
-        )
-        for i, y in enumerate(levels)
-    ]
+    wings = []
+    for i, y in enumerate(levels):
+        lead = front + stagger * i
+        wings.append(surface((0, y, lead), (span * (0.92 + 0.08 * i), y + 0.015, lead), (chord, chord * 0.9), 0.1))
     pieces.append((wing_finish, both_sides(merge(wings))))
     struts = []
     for share, dz in ((0.75, 0.03), (0.75, 0.1), (0.1, 0.03), (0.1, 0.1)):
         y0 = levels[0] if share > 0.5 else 0.0
-        struts.append(
-            tube(
-                [(span * share, y0, front - dz), (span * share, levels[-1] + 0.005, front + stagger - dz)],
-                0.006,
-                segments=8,
-            )
-        )
+        ends = [(span * share, y0, front - dz), (span * share, levels[-1] + 0.005, front + stagger - dz)]
+        struts.append(tube(ends, 0.006, segments=8))
     pieces.append((trim, both_sides(merge(struts))))
     engine = [turn(cylinder(width * 0.52, 0.09, 24, 0.02), "x", 90)]
     pistons = int(rng.integers(5, 10))
-    engine += [
-        turn(move(cylinder(0.014, 0.03, 8), y=width * 0.5, z=0.05), "z", 360 / pistons * i) for i in range(pistons)
-    ]
+    piston = move(cylinder(0.014, 0.03, 8), y=width * 0.5, z=0.05)
+    engine += [turn(piston, "z", 360 / pistons * i) for i in range(pistons)]
     blade, spinner = propeller(rng, rng.uniform(0.14, 0.18), int(rng.integers(2, 4)))
     pieces.append((trim, merge([move(merge(engine), z=0.4), move(blade, z=0.515), move(spinner, z=0.48)])))
     pit = [move(superellipsoid((width * 0.6, 0.03, 0.12), 0.5, 1, 8), y=width * 0.48, z=zz) for zz in (0.05, -0.08)]
@@ -349,9 +297,8 @@ def fighter(rng) -> list[Piece]:
     paint = paint if rng.random() < 0.5 else finishes.car_paint(rng)
     dark, width = finishes.glass(rng), rng.uniform(0.09, 0.15)
     z = np.concatenate([[-0.46], np.linspace(-0.46, 0.48, 16), [0.5]])
-    size = width * np.concatenate(
-        [[0], np.interp(np.linspace(-0.46, 0.48, 16), [-0.46, -0.3, 0.1, 0.5], [0.75, 1, 0.9, 0.06]), [0]]
-    )
+    swell = np.interp(np.linspace(-0.46, 0.48, 16), [-0.46, -0.3, 0.1, 0.5], [0.75, 1, 0.9, 0.06])
+    size = width * np.concatenate([[0], swell, [0]])
     pieces = [(skin, fuselage(z, size * rng.uniform(1, 1.4), size, np.zeros_like(z)))]
     root, span, front = rng.uniform(0.3, 0.5), rng.uniform(0.25, 0.38), rng.uniform(0.05, 0.15)
     tip_chord = root * rng.uniform(0.08, 0.45)
@@ -366,9 +313,8 @@ def fighter(rng) -> list[Piece]:
         intake = both_sides(move(box((width * 0.4, width * 0.6, 0.3), 0.015, 3), width * 0.5, -width * 0.1, 0.0))
         pieces.append((paint, intake))
     if rng.random() < 0.6:
-        store = turn(
-            lathe(np.array([(0, 0), (0.7, 0.15), (1, 0.4), (1, 0.6), (0.6, 0.85), (0, 1)]) * (0.016, 0.22), 14), "x", 90
-        )
+        profile = np.array([(0, 0), (0.7, 0.15), (1, 0.4), (1, 0.6), (0.6, 0.85), (0, 1)])
+        store = turn(lathe(profile * (0.016, 0.22), 14), "x", 90)
         out = span * 0.55
         level, place = tip[1] * 0.55 - 0.03, front + (tip[2] - front) * 0.55 - tip_chord * 0.5
         racks = [move(store, out, level, place - 0.12), move(box((0.006, 0.035, 0.06)), out, level + 0.018, place)]
@@ -384,9 +330,8 @@ def glider(rng) -> list[Piece]:
     span, root, front = rng.uniform(0.7, 1.0), rng.uniform(0.1, 0.14), rng.uniform(0.1, 0.18)
     tip = (span, width * 0.3 + rng.uniform(0.03, 0.1), front - 0.04)
     pieces = [(skin, fuselage(z, size, size * 1.15, rise))]
-    pieces.append(
-        (wing_finish, both_sides(surface((0, width * 0.3, front), tip, (root, root * 0.4), 0.13, sections=5)))
-    )
+    wing = surface((0, width * 0.3, front), tip, (root, root * 0.4), 0.13, sections=5)
+    pieces.append((wing_finish, both_sides(wing)))
     pieces.append((wing_finish, tail(rng, -0.495, width * 0.22, rng.uniform(0.12, 0.16), rng.choice(["t", "low"]))))
     canopy = superellipsoid((width * 0.8, width * 0.8, 0.24), 1, 1, 12)
     return [*pieces, (finishes.glass(rng), move(canopy, y=width * 0.25, z=0.26))]
@@ -419,11 +364,11 @@ def helicopter(rng) -> list[Piece]:
     rotor.append(move(merge(small), y=tall * 0.2 + 0.1, z=-0.47))
     pieces += [(metal, merge([mast, *rotor])), (skin, hood)]
     down, x = -tall * 0.5 - 0.06, width * 0.5
-    runner = tube(
-        [(x, down + 0.02, centre + long * 0.5), (x, down, centre + long * 0.4), (x, down, centre - long * 0.4)], 0.008
-    )
-    bars = [
-        tube([(x, down, centre + dz), (width * 0.2, -tall * 0.35, centre + dz)], 0.007)
-        for dz in (long * 0.2, -long * 0.2)
-    ]
+    front, rear = (x, down, centre + long * 0.4), (x, down, centre - long * 0.4)
+    runner = tube([(x, down + 0.02, centre + long * 0.5), front, rear], 0.008)
+    places = (centre + long * 0.2, centre + -long * 0.2)
+    bars = [tube([(x, down, place), (width * 0.2, -tall * 0.35, place)], 0.007) for place in places]
     return [*pieces, (metal, both_sides(merge([runner, *bars])))]
+
+
+STYLES = {airliner: 0.34, light_plane: 0.22, biplane: 0.14, fighter: 0.12, glider: 0.07, helicopter: 0.11}

@@ -9,12 +9,6 @@ from data_gen.shapes.primitives import Mesh, box, cylinder, lathe, merge, move, 
 BOARD = (0.012, 0.035)
 
 
-def shelf(rng) -> list[Piece]:
-    """Pieces of one shelf."""
-    style = rng.choice([bookcase, cube_grid, ladder, rack, cabinet, chest], p=[0.3, 0.16, 0.12, 0.14, 0.16, 0.12])
-    return style(rng)
-
-
 def carcass(width, height, depth, board) -> Mesh:
     """Two sides, a top and a bottom about x = z = 0, standing on y = 0."""
     sides = [move(box((board, height, depth), board * 0.1), s * (width - board) / 2, height / 2) for s in (1, -1)]
@@ -104,9 +98,8 @@ def row_of_books(rng, room, height, depth) -> Mesh:
         book = on_swatch(rng, box((thick * 0.97, high, deep)))
         meshes.append(move(book, x + thick / 2, high / 2, (depth - deep) * 0.3 - depth * 0.05))
         x += thick
-    return (
-        merge(meshes) if meshes else on_swatch(rng, move(box((room * 0.5, height * 0.3, depth * 0.5)), y=height * 0.15))
-    )
+    alone = move(box((room * 0.5, height * 0.3, depth * 0.5)), y=height * 0.15)
+    return merge(meshes) if meshes else on_swatch(rng, alone)
 
 
 def cube_grid(rng) -> list[Piece]:
@@ -118,10 +111,8 @@ def cube_grid(rng) -> list[Piece]:
         rows = 3
     cell, depth, board = rng.uniform(0.26, 0.38), rng.uniform(0.26, 0.38), rng.uniform(*BOARD)
     width, height = columns * cell + board, rows * cell + board
-    uprights = [
-        move(box((board, height, depth * 0.98)), (i / columns - 0.5) * (width - board), height / 2)
-        for i in range(1, columns)
-    ]
+    upright = box((board, height, depth * 0.98))
+    uprights = [move(upright, (i / columns - 0.5) * (width - board), height / 2) for i in range(1, columns)]
     boards = [move(box((width, board, depth * 0.97)), y=i * cell + board / 2) for i in range(1, rows)]
     pieces = [(body, merge([carcass(width, height, depth, board), *uprights, *boards]))]
     pieces.append((body, move(box((width - board, height - board, 0.008)), y=height / 2, z=-depth / 2 + 0.006)))
@@ -165,10 +156,8 @@ def ladder(rng) -> list[Piece]:
 
 def rack(rng) -> list[Piece]:
     """Posts and open boards, with braces: a store-room rack or a light etagere, loaded with boxes."""
-    body, top = (
-        finishes.choose(rng, finishes.metal, finishes.paint),
-        finishes.choose(rng, finishes.wood, finishes.metal, finishes.glass, finishes.paint),
-    )
+    body = finishes.choose(rng, finishes.metal, finishes.paint)
+    top = finishes.choose(rng, finishes.wood, finishes.metal, finishes.glass, finishes.paint)
     width, height, depth = rng.uniform(0.5, 1.6), rng.uniform(0.7, 2.0), rng.uniform(0.3, 0.6)
     post, count = rng.uniform(0.01, 0.035), int(rng.integers(2, 6))
     levels = np.linspace(rng.uniform(0.04, 0.15), 0.98, count) * height
@@ -181,14 +170,9 @@ def rack(rng) -> list[Piece]:
     beams = [move(box((width, post * 2.2, post)), y=y - post, z=s * depth / 2) for y in levels for s in (1, -1)]
     braces = []
     if rng.random() < 0.6:
-        braces = [
-            tube(
-                [(s * width / 2, levels[0], -depth / 2), (-s * width / 2, levels[-1], -depth / 2)],
-                post * 0.35,
-                segments=6,
-            )
-            for s in (1, -1)
-        ]
+        for s in (1, -1):
+            ends = [(s * width / 2, levels[0], -depth / 2), (-s * width / 2, levels[-1], -depth / 2)]
+            braces.append(tube(ends, post * 0.35, segments=6))
     pieces = [(body, merge([*posts, *beams, *braces]))]
     pieces += [(top, move(box((width, 0.018, depth)), y=y)) for y in levels]
     boxes, books = finishes.choose(rng, finishes.paint, finishes.print_, finishes.rattan), finishes.swatches(rng, 12)
@@ -269,10 +253,8 @@ def cabinet(rng) -> list[Piece]:
             pieces.append((panel if i % 2 else body, move(box((w, h, 0.02), 0.004), x, y, depth / 2 + 0.008)))
         else:
             rails = [move(box((stile, h, 0.024), 0.003), x + s * (w - stile) / 2, y, depth / 2 + 0.01) for s in (1, -1)]
-            rails += [
-                move(box((w - stile, stile, 0.0235), 0.003), x, y + s * (h - stile) / 2, depth / 2 + 0.01)
-                for s in (1, -1)
-            ]
+            cross = box((w - stile, stile, 0.0235), 0.003)
+            rails += [move(cross, x, y + s * (h - stile) / 2, depth / 2 + 0.01) for s in (1, -1)]
             fill = move(box((w - stile, h - stile, 0.012)), x, y, depth / 2 + 0.004)
             pieces += [(body, merge(rails)), (panel, fill)]
         hinge = 1 if i % 2 == 0 else -1
@@ -281,3 +263,6 @@ def cabinet(rng) -> list[Piece]:
         crown = move(box((width * 1.05, 0.05, depth * 1.08), 0.02, 3), y=height + 0.02)
         pieces.append((body, crown))
     return on_base(rng, pieces, body, width, depth, 0.02)
+
+
+STYLES = {bookcase: 0.3, cube_grid: 0.16, ladder: 0.12, rack: 0.14, cabinet: 0.16, chest: 0.12}

@@ -19,12 +19,6 @@ from data_gen.shapes.primitives import (
 )
 
 
-def sofa(rng) -> list[Piece]:
-    """Pieces of one sofa."""
-    style = rng.choice([classic, framed, curved, bench], p=[0.55, 0.17, 0.13, 0.15])
-    return style(rng)
-
-
 def upholstery(rng) -> finishes.Finish:
     """A finish that sofas are covered with."""
     return finishes.choose(rng, finishes.fabric, finishes.fabric, finishes.leather)
@@ -78,9 +72,8 @@ def classic(rng) -> list[Piece]:
 
     pieces = [(cover, move(box((whole, base, depth + deep), 0.03, 3), y=foot + base / 2, z=-deep / 2))]
     count = seats if rng.random() < 0.75 else 1
-    pieces.append(
-        (second, move(cushions(rng, count, inner, thick, depth * 1.02, roundness), y=foot + base - 0.01, z=0.01))
-    )
+    pad = cushions(rng, count, inner, thick, depth * 1.02, roundness)
+    pieces.append((second, move(pad, y=foot + base - 0.01, z=0.01)))
     tilt = rng.uniform(0, 12)
     rest = box((whole if rng.random() < 0.6 else inner, back + thick, deep * 0.8), deep * rng.uniform(0.1, 0.38), 3)
     rest = turn(move(rest, y=(back + thick) / 2), "x", -tilt)
@@ -107,9 +100,8 @@ def long_seat(rng, cover, second, width, corner, foot, base, thick, roundness) -
     side, reach = int(rng.choice([1, -1])), rng.uniform(0.35, 0.8)
     x, z = side * (corner[0] - width / 2), corner[1] + reach / 2
     block = move(box((width, base + foot, reach + 0.04), 0.03, 3), x, (base + foot) / 2, z)
-    pad = move(
-        superellipsoid((width, thick, reach + 0.06), roundness, 0.22, 10, 28), x, foot + base - 0.01 + thick / 2, z
-    )
+    pad = superellipsoid((width, thick, reach + 0.06), roundness, 0.22, 10, 28)
+    pad = move(pad, x, foot + base - 0.01 + thick / 2, z)
     return [(cover, block), (second, pad)]
 
 
@@ -125,9 +117,8 @@ def framed(rng) -> list[Piece]:
     rails = [move(box((inner + 2 * radius, 0.06, 0.03)), y=seat - 0.03, z=s * (depth / 2 - radius)) for s in (1, -1)]
     slats = [move(box((inner / 8, 0.02, depth - radius)), (i / 6 - 0.5) * inner * 0.95, seat) for i in range(7)]
     ladder = [move(box((inner + 2 * radius, 0.06, 0.025), 0.005), y=y) for y in np.linspace(0.08, back, 4)]
-    ladder += [
-        move(box((0.04, back + 0.1, 0.025)), x, (back - 0.06) / 2) for x in np.linspace(-0.48, 0.48, seats + 1) * inner
-    ]
+    bar = box((0.04, back + 0.1, 0.025))
+    ladder += [move(bar, x, (back - 0.06) / 2) for x in np.linspace(-0.48, 0.48, seats + 1) * inner]
     rest = move(turn(merge(ladder), "x", -lean), y=seat, z=-depth / 2 + radius)
     pad = cushions(rng, seats, inner, thick, depth * 0.9, rng.uniform(0.25, 0.45))
     upright = turn(cushions(rng, seats, inner, back, thick, 0.4), "x", -lean)
@@ -160,34 +151,29 @@ def curved(rng) -> list[Piece]:
 def bench(rng) -> list[Piece]:
     """A day bed, ottoman or waiting bench: one long pad, perhaps a bolster or separate backs."""
     cover, body = upholstery(rng), finishes.choose(rng, finishes.wood, finishes.metal)
-    width, depth, seat, thick = (
-        rng.uniform(0.9, 2.0),
-        rng.uniform(0.45, 0.8),
-        rng.uniform(0.36, 0.46),
-        rng.uniform(0.08, 0.18),
-    )
+    width, depth = rng.uniform(0.9, 2.0), rng.uniform(0.45, 0.8)
+    seat, thick = rng.uniform(0.36, 0.46), rng.uniform(0.08, 0.18)
     parts = int(rng.integers(1, 5))
     pad = cushions(rng, parts, width, thick, depth, rng.uniform(0.2, 0.5))
     frame = move(box((width * 0.99, 0.06, depth * 0.95), 0.01, 3), y=seat - thick - 0.02)
-    legs = four_legs(
-        leg_style(rng, rng.uniform(0.018, 0.035)), width * 0.88, depth * 0.8, seat - thick, rng.uniform(0, 0.06)
-    )
+    leg = leg_style(rng, rng.uniform(0.018, 0.035))
+    legs = four_legs(leg, width * 0.88, depth * 0.8, seat - thick, rng.uniform(0, 0.06))
     pieces = [(cover, move(pad, y=seat - thick)), (body, merge([frame, legs]))]
     kind = rng.choice(["plain", "bolster", "backs"])
     if kind == "bolster":
         radius = rng.uniform(0.08, 0.13)
-        roll = move(
-            turn(move(cylinder(radius, depth * 0.95, 24, 0.02), y=-depth * 0.475), "x", 90), y=seat + radius * 0.9
-        )
+        roll = turn(move(cylinder(radius, depth * 0.95, 24, 0.02), y=-depth * 0.475), "x", 90)
+        roll = move(roll, y=seat + radius * 0.9)
         ends = (1, -1) if rng.random() < 0.5 else (1,)
         pieces += [(cover, move(roll, s * (width / 2 - radius - 0.02))) for s in ends]
     if kind == "backs":
         high = rng.uniform(0.3, 0.45)
         upright = turn(cushions(rng, parts, width, high, thick * 0.8, 0.35), "x", -rng.uniform(4, 14))
         pieces.append((cover, move(upright, y=seat - 0.03, z=-depth / 2 + thick * 0.3)))
-        posts = [
-            move(box((0.03, high, 0.02)), x, seat + high * 0.3, -depth / 2 - 0.02)
-            for x in (-width * 0.35, width * 0.35)
-        ]
+        post = box((0.03, high, 0.02))
+        posts = [move(post, x, seat + high * 0.3, -depth / 2 - 0.02) for x in (-width * 0.35, width * 0.35)]
         pieces.append((body, merge(posts)))
     return pieces
+
+
+STYLES = {classic: 0.55, framed: 0.17, curved: 0.13, bench: 0.15}

@@ -10,9 +10,8 @@ from data_gen.shapes.primitives import Mesh, box, merge, move, prism, superellip
 
 def table(rng) -> list[Piece]:
     """Pieces of one table."""
-    top = finishes.choose(
-        rng, finishes.wood, finishes.wood, finishes.stone, finishes.paint, finishes.glass, finishes.print_
-    )
+    stiff = (finishes.wood, finishes.wood, finishes.stone, finishes.paint, finishes.glass, finishes.print_)
+    top = finishes.choose(rng, *stiff)
     body = top if rng.random() < 0.4 else finishes.choose(rng, finishes.wood, finishes.metal, finishes.paint)
     base = rng.choice(
         [legs_base, column_base, trestle_base, panel_base, hairpin_base, desk_base],
@@ -55,16 +54,9 @@ def legs_base(rng, top, body, width, depth, height) -> list[Piece]:
         pieces.append((body, merge(sides + ends)))
         if tall > 0.08 and rng.random() < 0.6:
             count = max(1, round(x / 0.5))
-            fronts = [
-                move(
-                    box((x / count * 0.85, tall * 0.75, 0.02), 0.004),
-                    x * ((i + 0.5) / count - 0.5),
-                    height - tall / 2,
-                    z / 2 + 0.012,
-                )
-                for i in range(count)
-            ]
-            pieces.append((top, merge(fronts)))
+            front = box((x / count * 0.85, tall * 0.75, 0.02), 0.004)
+            places = [x * ((i + 0.5) / count - 0.5) for i in range(count)]
+            pieces.append((top, merge(move(front, place, height - tall / 2, z / 2 + 0.012) for place in places)))
     if rng.random() < 0.35:
         level = rng.uniform(0.15, 0.4)
         reach = 2 * splay * (1 - level)
@@ -90,11 +82,8 @@ def trestle_base(rng, top, body, width, depth, height) -> list[Piece]:
         return tube([(0, *start), (0, *end)], thick / 2, section=[(1, 1), (-1, 1), (-1, -1), (1, -1)])
 
     if style == "t":
-        parts = [
-            beam((0.02, 0), (height, 0)),
-            move(box((thick, 0.05, 2 * half), 0.012), y=0.025),
-            move(box((thick, 0.05, 2 * half), 0.012), y=height - 0.025),
-        ]
+        foot = box((thick, 0.05, 2 * half), 0.012)
+        parts = [beam((0.02, 0), (height, 0)), move(foot, y=0.025), move(foot, y=height - 0.025)]
     else:
         inner = 0.1 * half if style == "a" else -half
         parts = [beam((0.0, s * half), (height - 0.01, s * inner)) for s in (1, -1)]

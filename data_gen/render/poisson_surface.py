@@ -92,14 +92,6 @@ class PoissonConfig:
     trim: float = 0.0
     """Share of the vertices, those with the fewest points around them, that is cut off; 0 keeps all."""
 
-    def __post_init__(self) -> None:
-        if self.depth < 1:
-            raise UserError(f"depth: expected 1 or more, got {self.depth}")
-        if self.neighbours < 3:
-            raise UserError(f"neighbours: expected 3 or more, which span a plane, got {self.neighbours}")
-        if not 0 <= self.trim < 1:
-            raise UserError(f"trim: expected a share of the vertices, at least 0 and below 1, got {self.trim}")
-
 
 def reconstruct(cloud: PointCloud, config: PoissonConfig) -> Asset:
     """The surface of one cloud (points, ...), smooth, with the materials of the nearest point at each vertex.

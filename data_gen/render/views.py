@@ -25,6 +25,7 @@ from typing import Any, Literal
 import numpy as np
 
 from data_gen.render.variant import mitsuba_module
+from spnr_jax.formats.data_sets import on_white
 from spnr_jax.formats.mesh.assets import Asset, Material, Part, RejectedAsset
 
 POLE_COSINE = 0.999  # nearer to the y axis than this, z takes the part of "up"
@@ -264,12 +265,6 @@ def straight_srgb(radiance: np.ndarray) -> np.ndarray:
 def srgb_from_linear(linear: np.ndarray) -> np.ndarray:
     """The sRGB encoding (IEC 61966-2-1) of linear values in [0, 1]."""
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055)
-
-
-def on_white(image: np.ndarray) -> np.ndarray:
-    """(height, width, 3) in [0, 1]: an RGBA uint8 image composited on white, as readers of the set do."""
-    alpha = image[..., 3:] / 255
-    return image[..., :3] / 255 * alpha + 1 - alpha
 
 
 def condition_image(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:

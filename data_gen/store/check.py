@@ -1,11 +1,12 @@
 """Whether a data set is sound: every file readable and as it was written, its parts in agreement with each other."""
 
 import hashlib
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
-from data_gen.store import layout
+from data_gen.store import layout, storage
 from spnr_jax.errors import UserError
 from spnr_jax.formats.npz import read_arrays
 from spnr_jax.surfels.lighting import HEIGHT, WIDTH
@@ -22,8 +23,9 @@ def check(dataset: Path) -> bool:
         raise UserError(f"{dataset / 'dataset.json'}: expected settings {', '.join(COUNTS)}; generate it again")
     described = description.get("environment_map")
     own_lights = isinstance(described, dict) and "kinds" in described
-    object_ids = sorted(layout.list_completed(dataset))
-    faults = split_faults(dataset, set(object_ids))
+    object_ids = sorted(storage.list_completed(dataset))
+    splits, faults = read_splits(dataset)
+    faults += split_faults(splits, set(object_ids)) if not faults else []
     agreements, covered, num_views = [], [], 0
     details = {}
     for object_id in object_ids:
@@ -42,8 +44,8 @@ def check(dataset: Path) -> bool:
         covered.append((record.images[..., 3] > 0).mean())
         num_views += len(record.images)
         details[object_id] = record.details
-    faults += variant_faults(dataset, details)
-    print_table(dataset, object_ids, num_views, agreements, covered, faults)
+    faults += variant_faults(splits, details)
+    print_table(dataset, object_ids, splits, num_views, agreements, covered, faults)
     return not faults
 
 
@@ -59,12 +61,21 @@ def read_description(dataset: Path) -> dict:
     return description
 
 
-def split_faults(dataset: Path, object_ids: set[str]) -> list[str]:
+def read_splits(dataset: Path) -> tuple[dict[str, list[str]], list[str]]:
+    """The ids of the splits whose lists are there, and what is wrong where one is not."""
+    splits, faults = {}, []
+    for split in layout.SPLITS:
+        try:
+            splits[split] = layout.read_split(dataset, split)
+        except OSError as error:
+            missing = f"{error.filename}: {error.strerror}"
+            faults = [f"{missing}; the run has not finished: repeat the command that began it"]
+    return splits, faults
+
+
+def split_faults(splits: Mapping[str, list[str]], object_ids: set[str]) -> list[str]:
     """What is wrong with the splits: each object has to be in exactly one."""
-    try:
-        listed = [object_id for split in layout.SPLITS for object_id in layout.read_split(dataset, split)]
-    except OSError as error:
-        return [f"{error.filename}: {error.strerror}; the run has not finished: repeat the command that began it"]
+    listed = [object_id for ids in splits.values() for object_id in ids]
     faults = []
     if twice := sorted({object_id for object_id in listed if listed.count(object_id) > 1}):
         faults.append(f"splits: {twice[0]} is listed more than once ({len(twice)} such objects)")
@@ -75,26 +86,21 @@ def split_faults(dataset: Path, object_ids: set[str]) -> list[str]:
     return faults
 
 
-def variant_faults(dataset: Path, details: dict[str, dict]) -> list[str]:
+def variant_faults(splits: Mapping[str, list[str]], details: dict[str, dict]) -> list[str]:
     """What is wrong with colour variants: all of a product are in one split, and only train has any."""
-    split_of = {
-        object_id: split
-        for split in layout.SPLITS
-        if has_split(dataset, split)
-        for object_id in layout.read_split(dataset, split)
-    }
+    split_of = {object_id: split for split, ids in splits.items() for object_id in ids}
     faults: list[str] = []
-    splits_of_product: dict[str, set[str]] = {}
+    of_product: dict[str, set[str]] = {}
     for object_id, detail in details.items():
         split = split_of.get(object_id)
         if split is None:
             continue
-        splits_of_product.setdefault(str(detail.get("product")), set()).add(split)
+        of_product.setdefault(str(detail.get("product")), set()).add(split)
         if detail.get("variant") and split != "train":
             faults.append(f"splits: {object_id} is a colour variant, but in {split}; only training objects have any")
-    for product, splits in sorted(splits_of_product.items()):
-        if len(splits) > 1:
-            faults.append(f"splits: variants of {product} are in {' and '.join(sorted(splits))}")
+    for product, found in sorted(of_product.items()):
+        if len(found) > 1:
+            faults.append(f"splits: variants of {product} are in {' and '.join(sorted(found))}")
     return faults
 
 
@@ -120,7 +126,7 @@ def checksum_of(path: Path) -> str | None:
 
 def camera_faults(transforms: dict) -> list[str]:
     """What is wrong with the cameras of one object."""
-    poses = cam_to_world(transforms)
+    poses = np.array([frame["transform_matrix"] for frame in transforms["frames"]], np.float64)
     rotations = poses[:, :3, :3]
     products = rotations @ rotations.transpose(0, 2, 1)
     if not np.allclose(products, np.eye(3), atol=1e-6) or not np.allclose(np.linalg.det(rotations), 1, atol=1e-6):
@@ -171,15 +177,10 @@ def points_on_object(record: layout.ObjectRecord) -> float:
     return float((record.images[..., 3][seen] > 0).mean()) if seen.any() else 1.0
 
 
-def cam_to_world(transforms: dict) -> np.ndarray:
-    """The cameras (views, 4, 4) of a transforms.json."""
-    return np.array([frame["transform_matrix"] for frame in transforms["frames"]], np.float64)
-
-
-def print_table(dataset: Path, object_ids, num_views: int, agreements, covered, faults) -> None:
+def print_table(dataset: Path, object_ids, splits, num_views: int, agreements, covered, faults) -> None:
     """Print the figures of a data set and its faults."""
     rows: list[tuple[str, object]] = [("objects", len(object_ids)), ("views", num_views)]
-    rows += [(split, len(layout.read_split(dataset, split))) for split in layout.SPLITS if has_split(dataset, split)]
+    rows += [(split, len(ids)) for split, ids in splits.items()]
     if (dataset / "rejected.jsonl").is_file():
         rows.append(("left out", len((dataset / "rejected.jsonl").read_text().splitlines())))
     if agreements:
@@ -191,8 +192,3 @@ def print_table(dataset: Path, object_ids, num_views: int, agreements, covered, 
         print(f"  {name:<32}{value}")
     for fault in faults:
         print(f"  FAULT {fault}")
-
-
-def has_split(dataset: Path, split: str) -> bool:
-    """Whether the list of a split is there."""
-    return (dataset / "splits" / f"{split}.txt").is_file()

@@ -177,21 +177,6 @@ def read_image(path: Path) -> np.ndarray:
         raise UserError(f"{path}: not a readable PNG ({error})") from None
 
 
-def has_object(dataset: Location, object_id: str) -> bool:
-    """Whether an object of the data set is complete."""
-    return storage.has_object(f"{dataset}/objects", object_id)
-
-
-def list_completed(dataset: Location) -> set[str]:
-    """The ids of the objects whose folders are complete."""
-    return storage.complete_objects(f"{dataset}/objects")
-
-
-def remove_unfinished(dataset: Location) -> None:
-    """Remove the folders that an earlier, interrupted run left half written; those of a living one stay."""
-    storage.remove_unfinished(f"{dataset}/objects")
-
-
 def read_split(dataset: Path, split: str) -> list[str]:
     """The object ids of one split."""
     return (dataset / "splits" / f"{split}.txt").read_text().split()

@@ -10,8 +10,9 @@ import numpy as np
 import tyro
 
 from data_gen.render import views
-from data_gen.store import check, layout
+from data_gen.store import check, layout, storage
 from spnr_jax.errors import UserError, at_least
+from spnr_jax.formats.data_sets import on_white
 from spnr_jax.formats.images import png_url
 from spnr_jax.formats.pages import template
 
@@ -37,7 +38,7 @@ def show(config: ShowConfig) -> Path:
     """Write the contact sheet; return its path."""
     check.read_description(config.dataset)
     at_least(config, 1, "objects")
-    object_ids = sorted(layout.list_completed(config.dataset))
+    object_ids = sorted(storage.list_completed(config.dataset))
     if not object_ids:
         raise UserError(f"{config.dataset} holds no finished object yet; run spnr-data generate again")
     chosen = np.unique(np.linspace(0, len(object_ids) - 1, min(config.objects, len(object_ids))).round().astype(int))
@@ -69,7 +70,7 @@ def shown(dataset: Path, object_id: str) -> dict:
 
 def white_bytes(image: np.ndarray) -> np.ndarray:
     """An RGBA picture on white as (height, width, 3) uint8."""
-    return np.round(255 * views.on_white(image)).astype(np.uint8)
+    return np.round(255 * on_white(image)).astype(np.uint8)
 
 
 def point_image(points: np.ndarray, names: tuple[str, ...]) -> np.ndarray:

@@ -67,15 +67,15 @@ def write_file(location: Location, content: bytes) -> None:
         Path(beside).unlink(missing_ok=True)
 
 
-def has_object(objects: Location, object_id: str) -> bool:
-    """Whether an object in a folder of objects is complete."""
-    filesystem, path = open_place(objects)
-    return filesystem.exists(f"{path}/{object_id}/{LAST_FILE}")
+def has_object(dataset: Location, object_id: str) -> bool:
+    """Whether an object of the data set is complete."""
+    filesystem, path = open_place(dataset)
+    return filesystem.exists(f"{path}/objects/{object_id}/{LAST_FILE}")
 
 
-def complete_objects(objects: Location) -> set[str]:
-    """The ids of the complete objects in a folder of objects."""
-    filesystem, path = open_place(objects)
+def list_completed(dataset: Location) -> set[str]:
+    """The ids of the objects whose folders are complete."""
+    filesystem, path = open_place(f"{dataset}/objects")
     if isinstance(filesystem, LocalFileSystem):  # looking into each folder beats listing all their files, as stores do
         folders = Path(path).iterdir() if Path(path).is_dir() else ()
         found = {folder.name for folder in folders if (folder / LAST_FILE).is_file()}
@@ -131,9 +131,9 @@ def unfinished_prefix() -> str:
     return f"{UNFINISHED}{socket.gethostname()}-{os.getpid()}-"
 
 
-def remove_unfinished(folder: Location) -> None:
-    """Remove from a local folder what dead processes of this host, or any process a day ago, left half written."""
-    filesystem, name = open_place(folder)
+def remove_unfinished(dataset: Location) -> None:
+    """Remove the objects that dead processes of this host, or any process a day ago, left half written on a disk."""
+    filesystem, name = open_place(f"{dataset}/objects")
     if not isinstance(filesystem, LocalFileSystem):
         return
     for path in Path(name).glob(UNFINISHED + "*"):

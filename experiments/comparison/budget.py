@@ -64,18 +64,10 @@ def config_of(
     config = dataclasses.replace(config, seed=seed)
     if budget == "quick":
         return dataclasses.replace(config, num_steps=QUICK_STEPS)
-    return config if minutes is None else within(minutes, config, dataset, run)
-
-
-def within(
-    minutes: float, config: TrainConfig, dataset: data_sets.Dataset, run: Path, measured: int | None = None
-) -> TrainConfig:
-    """The config with as many steps as fit into so many minutes here; a run that was begun keeps its steps.
-
-    Where it was `measured` how many fit, it is not measured again.
-    """
+    if minutes is None:
+        return config
     begun = (run / "config.json").is_file()
-    steps = checkpoint.read_config(run).num_steps if begun else measured or steps_within(60 * minutes, config, dataset)
+    steps = checkpoint.read_config(run).num_steps if begun else steps_within(60 * minutes, config, dataset)
     return dataclasses.replace(config, num_steps=steps)
 
 

@@ -1,5 +1,4 @@
-"""Seconds of work: of the processor where that is what computes, all cores together, so that other work on the machine
-does not count; else of the clock."""
+"""Seconds of work: CPU time of all cores where JAX computes on a CPU, other work does not count; else wall time."""
 
 import time
 from collections.abc import Callable, Mapping

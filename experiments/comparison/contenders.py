@@ -1,12 +1,11 @@
 """Who draws objects in a comparison: trained networks, trivial renderers, and pictures that other programs made.
 
-Networks come from run folders, or are all that a Table 1 left behind.  One is called after its method; where two have
-the same one, the folder is added.
+A network is called after its method; where two have the same one, the folder is added.
 """
 
 import hashlib
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -59,16 +58,6 @@ class Method:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sources:
-    """Where the networks are."""
-
-    runs: tuple[Path, ...] = ()
-    """Run folders, files of weights, or `surfels`, the network of the package."""
-    table1: Path | None = None
-    """Folder of a table that experiments.paper.table1 made; its runs are taken too."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class Network:
     """A trained network, ready to be shown, and what tells it from another one."""
 
@@ -88,13 +77,13 @@ class Network:
         return of_network(self.config, self.variables, steps=self.steps, config=self.checksum)
 
 
-def networks(sources: Sources, dataset: Dataset) -> dict[str, Network]:
-    """The networks by their names, in the order of Table 1; ValueError if there is none, or of another image size."""
-    runs = list(sources.runs)
-    if sources.table1 is not None:
-        runs += sorted(path.parent for path in sources.table1.glob("runs/*/config.json"))
+def networks(runs: Sequence[Path], dataset: Dataset) -> dict[str, Network]:
+    """The networks by their names, in the order of Table 1; ValueError if there is none, or of another image size.
+
+    Runs are folders, files of weights, or `surfels`, the network of the package.
+    """
     if not runs:
-        raise UserError("--runs: name at least one run folder, or --table1 with the folder of a table that has some")
+        raise UserError("--runs: name at least one run folder")
     found = [(run, read_network(run, dataset)) for run in runs]
     found.sort(key=lambda pair: list(LABELS).index(pair[1].method))
     times = Counter(network.method for _, network in found)

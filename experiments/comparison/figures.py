@@ -14,8 +14,6 @@ from PIL import Image, ImageDraw, ImageFont
 from spnr_jax.formats.images import to_uint8
 
 COLORS = ("#2457d6", "#d9480f", "#2f9e44", "#9c36b5", "#0b7285", "#e8a700", "#868e96", "#495057", "#adb5bd")
-BLUE, RED, GREEN, *_ = COLORS
-INK_COLOR, GREY = "#1d2330", "#a8b3c7"
 STYLE: dict[Any, Any] = {
     "font.size": 9,
     "axes.spines.top": False,

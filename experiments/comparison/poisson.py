@@ -1,18 +1,14 @@
 """Poisson reconstruction beside the references: a surface from each object's points, rendered as they were.
 
 Light, cameras, samples per pixel and integrator are those that dataset.json names.  An object whose points span no
-surface is an empty picture.  Pictures are kept by object:
-
-    FOLDER/NAME/000.png     RGBA, sRGB, straight alpha, one for each view
-    FOLDER/NAME/made.json   seconds, number of views, and why the pictures are empty (""); there once they all are
+surface is an empty picture.  `keep_pictures` keeps them by object, as FOLDER/NAME.npz.
 """
 
 import dataclasses
 import hashlib
-import importlib.util
-import json
 import sys
 import time
+from collections.abc import Iterable
 from pathlib import Path
 
 import jax
@@ -21,11 +17,10 @@ import numpy as np
 from data_gen.render import light, poisson_surface, views
 from data_gen.render.poisson_surface import PoissonConfig
 from data_gen.render.variant import choose_variant, mitsuba_module
-from data_gen.store import layout
 from experiments.comparison.contenders import Method, of_rgba
+from experiments.comparison.results_folder import load_or_make
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
-from spnr_jax.formats.images import write_whole
 from spnr_jax.formats.light_files import read_envmap
 from spnr_jax.formats.mesh.assets import Asset
 from spnr_jax.kernels.records import PointCloud
@@ -97,33 +92,20 @@ def unscaled_light(described: dict, envmap: Path | None) -> np.ndarray:
     return radiance
 
 
-def keep_pictures(
-    renderer: Renderer, surface: PoissonConfig, folder: Path, _: None, item: data_sets.ObjectData
-) -> Pictures:
-    """Image and opacity of the surface of an object's points, in all its views; read where they are made."""
-    note = folder / item.name / "made.json"
-    paths = [folder / item.name / f"{view:03d}.png" for view in range(len(item.images))]
-    if not note.is_file():
+def keep_pictures(renderer: Renderer, surface: PoissonConfig, folder: Path) -> Method:
+    """The surface as a method whose pictures and seconds a view are kept by object: made once, then read."""
+
+    def make(item: data_sets.ObjectData) -> tuple[np.ndarray, np.ndarray]:
         start = time.monotonic()
-        asset = reconstruct(item.cloud, surface)
-        pictures = renderer.draw(asset, item)
-        seconds = time.monotonic() - start
-        for path, picture in zip(paths, pictures, strict=True):
-            write_whole(path, layout.encode_image(picture))
-        empty = asset if isinstance(asset, str) else ""
-        made = {"seconds": round(seconds, 4), "views": len(paths), "empty": empty}
-        write_whole(note, layout.json_text(made).encode())
-    return of_rgba(np.stack([layout.read_image(path) for path in paths]))
+        pictures = renderer.draw(reconstruct(item.cloud, surface), item)
+        return pictures, np.array((time.monotonic() - start) / len(pictures))
+
+    def draw(_: None, item: data_sets.ObjectData) -> Pictures:
+        return of_rgba(load_or_make(folder / f"{item.name}.npz", lambda: make(item))[0])
+
+    return Method(draw=draw)
 
 
-def seconds_per_view(folder: Path, names: tuple[str, ...]) -> list[float]:
+def seconds_per_view(folder: Path, names: Iterable[str]) -> list[float]:
     """Seconds of solver and renderer by object, shared by its views."""
-    notes = [json.loads((folder / name / "made.json").read_text()) for name in names]
-    return [note["seconds"] / note["views"] for note in notes]
-
-
-def check_packages() -> None:
-    """Raise ValueError, with what to install, where one of the two optional packages is absent."""
-    for package in ("pymeshlab", "mitsuba"):
-        if importlib.util.find_spec(package) is None:
-            raise UserError(f"this needs {package}: pip install 'spnr-jax[data,baselines]'")
+    return [float(np.load(folder / f"{name}.npz")["1"]) for name in names]

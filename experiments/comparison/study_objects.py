@@ -78,12 +78,8 @@ def mesh_of(dataset: Dataset, item: ObjectData, meshes: Path | None) -> Asset:
     if seed is None:
         raise UserError(f"{dataset.folder / 'dataset.json'}: names no seed, so its meshes cannot be made again")
     positions = np.asarray(item.cloud.positions)
-    return objects.original(details(dataset, item.name), seed, positions, meshes, dataset.spread)
-
-
-def details(dataset: Dataset, name: str) -> dict:
-    """What object.json says of an object."""
-    return json.loads((dataset.folder / "objects" / name / "object.json").read_bytes())
+    details = json.loads((dataset.folder / "objects" / item.name / "object.json").read_bytes())
+    return objects.original(details, seed, positions, meshes, dataset.spread)
 
 
 def cast_views(cast: views.Caster, camera: Camera) -> np.ndarray:

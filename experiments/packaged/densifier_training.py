@@ -73,17 +73,13 @@ class Options:
     """The highest, after which it falls along a cosine."""
     start: Path | None = None
     """Weights that the training starts from (default: random ones)."""
-    only: str = ""
-    """`data` or `train`: half of the work."""
 
 
 def main(options: Options) -> None:
     """Records, then training."""
     cli.set_up_jax()
-    if options.only != "train":
-        make_records(options)
-    if options.only != "data":
-        train(options)
+    make_records(options)
+    train(options)
 
 
 # --- records ----------------------------------------------------------------------------------------------------------
@@ -293,32 +289,26 @@ def join(parts: list[Batch]) -> Batch:
     shifted = []
     for part, point, site in zip(parts, nodes, sites, strict=False):
 
-        def move(x: np.ndarray, by: int) -> np.ndarray:
+        def move(x: Any, by: int) -> Any:
             return np.where(x < 0, -1, x + by).astype(np.int32)
 
-        moved: dict[str, Any] = {
-            name: move(getattr(part.places, name), point) for name in ("first", "second", "around")
-        }
+        moved = {name: move(getattr(part.places, name), point) for name in ("first", "second", "around")}
         places = part.places._replace(**moved)
         truth = part.truth._replace(nearest=move(part.truth.nearest, site), parents=move(part.truth.parents, point))
         shifted.append(Batch(part.nodes, move(part.neighbors, point), places, truth))
     joined = jax.tree.map(lambda *x: np.concatenate(x), *shifted)
 
-    def pad(x: np.ndarray, size: int, fill: float = 0) -> np.ndarray:
+    def pad(x: Any, size: int, fill: float = 0) -> Any:
         return np.concatenate([x[:size], np.full((max(size - len(x), 0), *x.shape[1:]), fill, x.dtype)])
 
-    point = joined.nodes._replace(**{name: pad(x, NODES) for name, x in joined.nodes._asdict().items()})
-    point = point._replace(spacing=pad(joined.nodes.spacing, NODES, 1))
-    place_: dict[str, Any] = {
-        name: pad(x, PLACES, -1 if name == "around" else 0) for name, x in joined.places._asdict().items()
-    }
-    place_["scale"] = pad(joined.places.scale, PLACES, 1)
-    at_place, asked = Truth._fields[:5], Truth._fields[5:8]
-    true = {name: pad(getattr(joined.truth, name), PLACES) for name in at_place}
-    true |= {name: pad(getattr(joined.truth, name), QUERIES) for name in asked}
-    true |= {name: pad(getattr(joined.truth, name), QUERIES, -1) for name in ("nearest", "parents")}
-    true["nearest"] = np.where(true["nearest"] < PLACES, true["nearest"], -1)
-    return Batch(point, pad(joined.neighbors, NODES, -1), Places(**place_), Truth(**true))
+    given, places, truth = joined.nodes, joined.places, joined.truth
+    points = Nodes(*(pad(x, NODES) for x in given))._replace(spacing=pad(given.spacing, NODES, 1))
+    padded = Places(*(pad(x, PLACES) for x in places))
+    padded = padded._replace(scale=pad(places.scale, PLACES, 1), around=pad(places.around, PLACES, -1))
+    nearest = pad(truth.nearest, QUERIES, -1)
+    true: tuple[Any, ...] = (*(pad(x, PLACES) for x in truth[:5]), *(pad(x, QUERIES) for x in truth[5:8]))
+    truth = Truth._make((*true, np.where(nearest < PLACES, nearest, -1), pad(truth.parents, QUERIES, -1)))
+    return Batch(points, pad(joined.neighbors, NODES, -1), padded, truth)
 
 
 # --- training ---------------------------------------------------------------------------------------------------------

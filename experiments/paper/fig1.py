@@ -1,17 +1,17 @@
 """Figure 1 of the supplement: the adversarial loss with weight 1 beside L1 losses of weight 0, 100 and 5000.
 
-    python -m experiments.paper.fig1 --data DIR --out DIR [--steps N] [--pretrain N] [--init RUN] [--l1-weights 0 100]
+    python -m experiments.paper.fig1 --data DIR --out DIR [--steps N] [--pretrain N] [--l1-weights 0 100]
 
     OUT/runs/l1_WEIGHT_SEED/           run folders; finished ones are only read.  OUT/runs/pretrained_SEED/
     OUT/results.json  table.md         scores, high-frequency energy over the reference's, differences to weight 100
-    OUT/gallery.png  differences.png   the figure, with that number below each picture, and the differences
+    OUT/gallery.png                    the figure, with that number below each picture
 
 The runs differ in the L1 weight alone: same first weights, batches and steps, and the discriminator takes part from the
 first step on, whatever the preset does.  By default they start from scratch: so the picture of weight 0 owes nothing to
 an L1 loss.  From scratch the adversarial loss alone needs far more steps than a CPU has patience for, and its pictures
 then show that it has not converged, not what it converges to.  With --pretrain N all of them start from one network
 that was trained for N steps with the L1 loss alone (weight 100): the fair comparison of a small budget, in which the
-weights decide where each goes from there.  --init RUN starts from a network that is trained already.
+weights decide where each goes from there.
 """
 
 import dataclasses
@@ -44,8 +44,6 @@ class Fig1:
     """Weights of the L1 loss; differences are to 100, or to the first of them."""
     pretrain: int = 0
     """Steps with the L1 loss alone that all runs start after; 0 starts from scratch."""
-    init: Path | None = None
-    """Run folder or file of weights that all runs start from instead."""
     budget: tyro.conf.OmitArgPrefixes[Budget] = field(default_factory=Budget)
 
     def __post_init__(self) -> None:
@@ -53,22 +51,17 @@ class Fig1:
             raise UserError(f"--l1-weights: expected distinct numbers from 0 on, got {list(self.l1_weights)}")
         if self.pretrain < 0:
             raise UserError(f"--pretrain: expected 0 or more steps, got {self.pretrain}")
-        if self.pretrain and self.init:
-            raise UserError("--init: leave --pretrain out; the runs start from a network that is trained")
 
 
 def main(options: Fig1) -> None:
     """Trains what is not trained, scores all weights, writes tables and pictures."""
     cli.set_up_jax()
     dataset = data_sets.open_dataset(options.data)
-    if options.init:  # what does not fit is said before the folder is made
-        trainer.new_state(options.budget.config(), read_trained(options.init))
     runs = [variant(options, weight, options.budget.config(), dataset) for weight in options.l1_weights]
     reference = runs[options.l1_weights.index(100.0) if 100.0 in options.l1_weights else 0].name
-    init = str(options.init) if options.init else None
-    start = init or (f"{options.pretrain} steps of L1 alone" if options.pretrain else "scratch")
+    start = f"{options.pretrain} steps of L1 alone" if options.pretrain else "scratch"
     given = (options.out, "fig1", runs, reference, options.budget, dataset)
-    variants.study(*given, {"start": start}, pretrain=options.pretrain, init=init)
+    variants.study(*given, {"start": start}, pretrain=options.pretrain)
 
 
 def variant(options: Fig1, weight: float, config: TrainConfig, dataset: data_sets.Dataset) -> Variant:
@@ -79,14 +72,12 @@ def variant(options: Fig1, weight: float, config: TrainConfig, dataset: data_set
         label=f"L1 weight {weight:g}",
         config=dataclasses.replace(config, loss=loss),
         dataset=dataset,
-        start=partial(pretrain, options, dataset) if options.pretrain or options.init else None,
+        start=partial(pretrain, options, dataset) if options.pretrain else None,
     )
 
 
 def pretrain(options: Fig1, dataset: data_sets.Dataset, config: TrainConfig) -> optimisation.TrainState:
-    """A fresh state whose generator is the one of --init, or was trained with the L1 loss alone."""
-    if options.init:
-        return trainer.new_state(config, read_trained(options.init))
+    """A fresh state whose generator was trained with the L1 loss alone."""
     loss = dataclasses.replace(config.loss, l1_weight=100.0, adversarial_weight=0.0)
     before = dataclasses.replace(config, loss=loss, num_steps=options.pretrain)
     run = options.out / "runs" / f"pretrained_{config.seed}"

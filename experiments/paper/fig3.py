@@ -1,6 +1,6 @@
 """Figure 3, and beyond: depth maps of unseen objects beside the true depth, their errors, and floaters.
 
-    python -m experiments.paper.fig3 --data DIR --out DIR --runs RUN ... [--table1 DIR] [--surfaces poisson ...]
+    python -m experiments.paper.fig3 --data DIR --out DIR --runs RUN ... [--surfaces poisson ...]
 
 The truth is ray casting of the very meshes that the references were rendered from, made again from the data set's
 records, along the rays of each method: its own pixels, through its own pixel centres.
@@ -23,13 +23,12 @@ far_floaters          the same, of those farther from it than 1/32 of the pictur
 """
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
-import tyro
 from jaxtyping import Float
 from scipy.ndimage import distance_transform_edt
 
@@ -37,7 +36,7 @@ from data_gen.render import views
 from data_gen.render.variant import choose_variant, mitsuba_module
 from experiments import entry_point
 from experiments.comparison import contenders, figures, results_folder
-from experiments.comparison.contenders import LABELS, Method, Sources
+from experiments.comparison.contenders import LABELS, Method
 from experiments.comparison.poisson import SURFACES, reconstruct
 from experiments.comparison.results_folder import load_or_make
 from experiments.comparison.study_objects import cast_views, cut, mesh_of, test_objects
@@ -87,7 +86,8 @@ class Fig3:
     """Folder of the data set."""
     out: Path
     """Folder of the results; the same command goes on there."""
-    sources: tyro.conf.OmitArgPrefixes[Sources] = field(default_factory=Sources)
+    runs: tuple[Path, ...]
+    """Networks: run folders, files of weights, or `surfels`, the network of the package."""
     surfaces: tuple[Literal["poisson", "poisson_trimmed"], ...] = ()
     """Poisson surfaces to compare with: made of the same points."""
     meshes: Path | None = None
@@ -142,7 +142,7 @@ def main(options: Fig3) -> None:
 
 def all_methods(options: Fig3, dataset: data_sets.Dataset) -> tuple[dict[str, Method], int]:
     """What shows depth: networks and surfaces, and the points that all are given."""
-    trained = contenders.networks(options.sources, dataset)
+    trained = contenders.networks(options.runs, dataset)
     if left_out := [name for name, network in trained.items() if not network.has_depth]:
         print(f"left out, since they predict no depth: {', '.join(left_out)}")
     found = {name: network.as_method() for name, network in trained.items() if network.has_depth}

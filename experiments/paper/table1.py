@@ -3,7 +3,7 @@
     python -m experiments.paper.table1 --data DIR --out DIR [--budget quick|tiny|paper] [--minutes M] [--methods ...]
 
     OUT/runs/METHOD/          the run folders of the networks (experiments/comparison/budget.py says what a budget is)
-    OUT/poisson_1024/         pictures of the reconstructions from so many points; OUT/poisson_trimmed_1024/
+    OUT/poisson_1024/         pictures of the reconstructions from so many points (.npz); OUT/poisson_trimmed_1024/
     OUT/results.json          everything below as numbers: scores, costs, settings, hardware, seed
     OUT/table.md    the tables
     OUT/table1.html           the tables, and pictures of unseen objects to flip through
@@ -12,14 +12,13 @@ The same command goes on where it was stopped and trains nothing twice.  The sam
 times, and with --minutes the number of steps, are those of the machine.
 """
 
+import importlib
 import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Literal
 
-from data_gen.render.poisson_surface import pymeshlab
 from experiments import entry_point
 from experiments.comparison import budget, contenders, poisson, results_folder
 from experiments.comparison.budget import NETWORKS, QUICK_STEPS, Budget, Trained
@@ -168,35 +167,29 @@ def surface_methods(
     if not wanted:
         return {}, {}
     try:
-        poisson.check_packages()
-        pymeshlab()
-    except ValueError as error:
+        for package in ("pymeshlab", "mitsuba"):
+            importlib.import_module(package)
+    except ImportError as error:
         print(f"Poisson not run: {error}", flush=True)
-        return {}, dict.fromkeys(wanted, f"not run: {error}")
+        return {}, dict.fromkeys(wanted, f"not run: {error}; pip install 'spnr-jax[data,baselines]'")
     renderer = poisson.Renderer(dataset.settings, options.envmap, options.variant, options.seed)
-    found: dict[str, Method] = {}
-    for name, surface in wanted.items():
-        place = surface_folder(options, config, name)
-        found[name] = Method(draw=partial(poisson.keep_pictures, renderer, surface, place))
-    return found, {}
+    return {
+        name: poisson.keep_pictures(renderer, surface, surface_folder(options, config, name))
+        for name, surface in wanted.items()
+    }, {}
 
 
 def train_networks(options: Table1, dataset: data_sets.Dataset, configs: dict[str, TrainConfig]) -> dict[str, Trained]:
     """The networks of the table, one after another; finished ones are only read."""
     wanted: list[str] = [name for name in NETWORKS if name in options.methods]
     trained = {}
-    for place_of, name in enumerate(wanted):
+    for number_of, name in enumerate(wanted, start=1):
         run = options.out / "runs" / name
         if options.minutes and not (run / "config.json").is_file():
             print(f"{LABELS[name]}: measuring the pace of a step", flush=True)
         config = budget.config_of(configs[name], options.budget, options.seed, options.minutes, dataset, run)
-        left = (
-            ""
-            if options.minutes is None
-            else f", {options.minutes * (len(wanted) - place_of):g} min of steps left in all"
-        )
-        place = f"network {place_of + 1} of {len(wanted)}, {LABELS[name]}"
-        print(f"{place}: preset {config.preset}, {config.num_steps} steps in {run}{left}", flush=True)
+        place = f"network {number_of} of {len(wanted)}, {LABELS[name]}"
+        print(f"{place}: preset {config.preset}, {config.num_steps} steps in {run}", flush=True)
         trained[name] = budget.train(config, dataset, run)
     return trained
 
@@ -206,7 +199,7 @@ def costs(options: Table1, trained: dict[str, Trained], scored: Scored, config: 
     table: dict[str, dict] = {}
     for method, seconds in scored.seconds.items():
         if method in poisson.SURFACES:  # the pictures may have been there already
-            seconds = poisson.seconds_per_view(surface_folder(options, config, method), tuple(scored.scores))
+            seconds = poisson.seconds_per_view(surface_folder(options, config, method), scored.scores)
         warm = seconds[1:]
         cost = trained[method].cost if method in trained else {}
         table[method] = cost | {"ms_per_view": round(1000 * statistics.median(warm), 2) if warm else None}

@@ -1,1 +1,1 @@
-"""How fast: beside a PyTorch twin, with growing work, and where data is made and read."""
+"""How fast the paper's network is, beside a PyTorch twin."""

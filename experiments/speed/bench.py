@@ -14,7 +14,7 @@ import importlib.util
 import os
 import statistics
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
@@ -25,11 +25,10 @@ import numpy as np
 
 from experiments import entry_point
 from experiments.comparison import results_folder
-from experiments.speed import speed_scenes
-from spnr_jax.config import PaperConfig, TrainConfig
+from spnr_jax.config import EncoderConfig, LossConfig, OptimizerConfig, PaperConfig, SamplingConfig, TrainConfig
 from spnr_jax.devices import runtime
 from spnr_jax.errors import at_least
-from spnr_jax.kernels.records import Batch
+from spnr_jax.kernels.records import Batch, Camera, PointCloud
 from spnr_jax.method import inference
 from spnr_jax.scoring.report import Table, number, text
 from spnr_jax.training import optimisation
@@ -136,15 +135,15 @@ def turn(run: Run, seconds: float) -> list[float]:
 
 def our_config(preset: str, mode: Mode = "train", objects: int = 1) -> TrainConfig:
     """Our config of the twin's sizes, without R1; "train_l1" has no discriminator."""
-    config = speed_scenes.PAPER[preset]
+    config = PAPER[preset]
     loss = dataclasses.replace(config.loss, adversarial_weight=float(mode != "train_l1"))
     return dataclasses.replace(config, loss=loss, batch_objects=objects)
 
 
 def our_batch(config: TrainConfig) -> Batch:
     """The benchmark's scene on the device."""
-    found = speed_scenes.arrays(config.batch_objects, config.model.image_resolution, config.max_points)
-    return jax.device_put(speed_scenes.as_batch(found))
+    found = make_arrays(config.batch_objects, config.model.image_resolution, config.max_points)
+    return jax.device_put(make_batch(found))
 
 
 def our_side(preset: str, mode: Mode, options: Options) -> tuple[Run, float]:
@@ -188,7 +187,7 @@ def twin_side(preset: str, mode: Mode, variant: str, options: Options) -> Run:
     torch.set_num_threads(options.threads)
     torch.set_default_device(device)
     config, (form, compiled) = our_config(preset, mode), VARIANTS[variant]
-    inputs = speed_scenes.arrays(BATCHES[preset], config.model.image_resolution, config.max_points).items()
+    inputs = make_arrays(BATCHES[preset], config.model.image_resolution, config.max_points).items()
     batch = {name: torch.from_numpy(x).to(device) for name, x in inputs}
     work = twin.function(config, batch, mode, form, compiled)
 
@@ -218,6 +217,93 @@ def table(rows: Sequence[Row]) -> Table:
         made.append((f"{row['preset']}, batch {row['batch']}", cells))
     heads = ("mode", "twin", "ours, ms", "twin, ms", "ours / twin", "compile, s")
     return Table(title="One step, one encoding, one view", heads=heads, rows=tuple(made))
+
+
+# --- what both sides draw ---------------------------------------------------------------------------------------------
+
+SPHERE, BOX = 0.7, 0.55  # radius and half side, in the box [-1, 1]^3
+DISTANCE, FOCAL = 3.2, 2.4  # of the cameras; 1 / tan of half the field of view
+
+
+def paper_training(grid: int = 64, base: int = 16, stages: int = 5, samples: int = 64, render: int = 64) -> TrainConfig:
+    """A training of the paper's network as the twin has it, without R1: the preset `abo` in group norms of 8."""
+    encoder = EncoderConfig(point_features=32, volume_resolution=grid, base_width=base, num_stages=stages, num_groups=8)
+    model = PaperConfig(
+        encoder=encoder,
+        field_width=64,
+        num_features=32,
+        direction_frequencies=4,
+        sampling=SamplingConfig(num_coarse=samples, num_fine=samples, padding=1e-5),
+        render_resolution=render,
+        resize_resolution=render,
+        image_resolution=2 * render,
+        upsampler_width=64,
+    )
+    loss = LossConfig(l1_weight=100.0, low_resolution_weight=0.5, r1_gamma=0.0, r1_interval=1, discriminator_width=64)
+    optimizer = OptimizerConfig(lr_generator=2e-4, lr_discriminator=2e-4)
+    config = TrainConfig(model=model, loss=loss, optimizer=optimizer, batch_objects=1)
+    return dataclasses.replace(config, min_points=1024, max_points=1024)
+
+
+PAPER = {
+    "abo": paper_training(),
+    "small": paper_training(grid=32, stages=4, samples=32),
+    "tiny": paper_training(grid=32, base=8, stages=3, samples=16, render=32),
+}
+
+
+def make_arrays(batch: int, size: int, num_points: int, seed: int = 0) -> dict[str, np.ndarray]:
+    """A batch by the names of the PyTorch twin: spheres and boxes by turns, images (batch, channels, size, size)."""
+    rng = np.random.default_rng(seed)
+    sphere = rng.normal(size=(batch, num_points, 3))
+    sphere /= np.linalg.norm(sphere, axis=-1, keepdims=True)
+    box = sphere / np.abs(sphere).max(axis=-1, keepdims=True)
+    is_sphere = np.arange(batch)[:, None, None] % 2 == 0
+    found = {
+        "pos": np.where(is_sphere, SPHERE * sphere, BOX * box),
+        "mat": rng.random((batch, num_points, 5)),
+        "c2w": np.stack([make_pose(*rng.uniform((0, -0.36), (2 * np.pi, 0.84))) for _ in range(batch)]),
+        "focal": np.full(batch, FOCAL),
+        "target": rng.random((batch, 3, size, size)),
+        "cond": rng.random((batch, 3, size, size)),
+        "mask": rng.random((batch, 1, size, size)) < 0.5,
+    }
+    return {name: np.asarray(array, np.float32) for name, array in found.items()}
+
+
+def make_batch(arrays: Mapping[str, np.ndarray]) -> Batch:
+    """The batch of pos mat c2w focal target cond mask: one view of each object, every point real."""
+    positions, materials = arrays["pos"], arrays["mat"]
+    cloud = PointCloud(
+        positions=positions,
+        base_color=materials[..., :3],
+        roughness=materials[..., 3],
+        metallic=materials[..., 4],
+        mask=np.ones(positions.shape[:2], bool),
+    )
+    images = {k: np.moveaxis(arrays[k], 1, -1)[:, None] for k in ("target", "cond", "mask")}
+    size = images["target"].shape[-2]
+    focal = arrays["focal"][:, None] * size / 2
+    intrinsics = np.zeros((*focal.shape, 3, 3), np.float32)
+    intrinsics[..., 0, 0] = intrinsics[..., 1, 1] = focal
+    intrinsics[..., 0, 2] = intrinsics[..., 1, 2] = size / 2
+    intrinsics[..., 2, 2] = 1
+    camera = Camera(cam_to_world=arrays["c2w"][:, None], intrinsics=intrinsics, height=size, width=size)
+    return Batch(
+        cloud=cloud,
+        camera=camera,
+        image=images["target"],
+        alpha=np.ones_like(images["mask"][..., 0]),  # the twin has no loss of opacity
+        condition=images["cond"],
+        condition_mask=images["mask"][..., 0] > 0.5,
+    )
+
+
+def make_pose(azimuth: float, elevation: float) -> np.ndarray:
+    """Camera-to-world matrix (3, 4) that looks at the origin, y up, angles in radians."""
+    backward = np.array([np.sin(azimuth) * np.cos(elevation), np.sin(elevation), np.cos(azimuth) * np.cos(elevation)])
+    right = np.array([np.cos(azimuth), 0.0, -np.sin(azimuth)])
+    return np.stack([right, np.cross(backward, right), backward, DISTANCE * backward], axis=-1)
 
 
 if __name__ == "__main__":

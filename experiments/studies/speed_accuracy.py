@@ -3,14 +3,13 @@
     python -m experiments.studies.speed_accuracy DATA [surfels small poisson_trimmed RUN ...] [--sizes 128 512]
 
 Each network draws test objects at every level of `--quality`, from other numbers of points, and in pictures of fewer
-pixels that are enlarged.  The paper's network also draws with other samples, in all of the box and near the
-points, and in bfloat16.  `draft` of the network over surfels is discs and light alone.  What a network with an
+pixels that are enlarged.  `draft` of the network over surfels is discs and light alone.  What a network with an
 upsampler draws at the one size that it has learnt is enlarged (or averaged).  Screened Poisson surfaces are drawn by
 Mitsuba as the references were.  Keeps every setting in a file of its own (an interrupted call goes on); writes the
 tables and front.png.
 
 ms a view   median over objects of the fastest of several drawings of all views, as of a film, the cloud encoded before;
-            on a CPU of the processor, all cores together: other work on the machine does not count
+            CPU time of all cores where that is what computes, so that other work on the machine does not count
 s to encode the same for a cloud, once, all compiled
 front       settings of a size that no other beats in both PSNR and ms a view; its knee lies farthest above the line
             from its cheapest to its best, PSNR against the logarithm of the time
@@ -22,7 +21,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -33,7 +32,7 @@ from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 
 from experiments import entry_point
 from experiments.comparison import clock, figures, poisson, results_folder, scores
-from experiments.comparison.contenders import draw_volume
+from experiments.comparison.contenders import Method, draw_volume
 from experiments.comparison.scores import Measured
 from experiments.comparison.study_objects import cut, test_objects
 from spnr_jax import cli
@@ -51,57 +50,25 @@ COLUMNS = ("psnr", "ssim", "flip", "iou")
 SHARES = (0.75, 0.5, 0.25)  # of the pixels along a side that are drawn; the picture is enlarged from there
 
 
-@dataclass(frozen=True, kw_only=True)
-class Setting:
+class Setting(NamedTuple):
     """A way to ask a network for a picture; `share` of its pixels along a side are drawn."""
 
     group: str
     name: str
-    config: NetworkConfig
     points: int
     quality: Quality = "best"
-    share: float | int = 1
+    share: float = 1.0
 
 
 def settings(config: NetworkConfig, counts: Sequence[int]) -> list[Setting]:
     """Every way to ask a network, its best level first; of all but the first number of points the levels alone."""
-    levels = config.qualities
-    common: dict[str, Any] = {"config": config, "points": counts[0]}
-    ways = [Setting(group="level", name=level, quality=level, **common) for level in levels]
+    levels, (first, *others) = config.qualities, counts
+    ways = [Setting("level", level, first, level) for level in levels]
     if config.any_size:
-        enlarged: dict[str, Any] = {"group": "fewer pixels", **common}
-        ways += [Setting(name=f"best, {share:g} of the size", share=share, **enlarged) for share in SHARES]
-        if "draft" in levels:
-            ways.append(Setting(name="draft, 0.5 of the size", quality="draft", share=0.5, **enlarged))
-    if "trained" in levels:
-        ways += _of_rays(config, counts[0])
-    for count in counts[1:]:
-        ways += [
-            Setting(group="points", name=f"{level}, {count:,} points", config=config, points=count, quality=level)
-            for level in ("best", "draft")
-            if level in levels
-        ]
-    return ways
-
-
-def _of_rays(config: Any, points: int) -> list[Setting]:
-    """Other samples along a ray, each drawn as the network was trained but for these, and bfloat16."""
-    total = config.sampling.num_coarse + config.sampling.num_fine
-    halves = [max(total // k, 2) for k in (1, 2, 4)]
-    ways = [("samples", f"{n // 2} + {n // 2} in the box", (n // 2, n // 2, 0)) for n in (2 * total, *halves[1:])]
-    ways += [("near points", f"{n} within {r} voxels", (n, 0, r)) for r in (1, 2) for n in halves]
-
-    def made(group: str, name: str, **changed: Any) -> Setting:
-        other = dataclasses.replace(config, **changed)
-        return Setting(group=group, name=name, config=other, points=points, quality="trained")
-
-    names = ("num_coarse", "num_fine", "reach")
-    found = [
-        made(group, name, sampling=dataclasses.replace(config.sampling, **dict(zip(names, values, strict=True))))
-        for group, name, values in ways
-    ]
-    found.append(made("bfloat16", "bfloat16", precision="bfloat16"))
-    return list({way.name: way for way in found}.values())  # small counts give one setting twice
+        ways += [Setting("fewer pixels", f"best, {share:g} of the size", first, share=share) for share in SHARES]
+        ways += [Setting("fewer pixels", "draft, 0.5 of the size", first, "draft", 0.5)] * ("draft" in levels)
+    drawn: list[Quality] = [level for level in levels if level in ("best", "draft")]
+    return ways + [Setting("points", f"{way}, {count:,} points", count, way) for count in others for way in drawn]
 
 
 def front(rows: Sequence[dict]) -> list[int]:
@@ -136,30 +103,11 @@ def table(rows: Sequence[dict], chosen: Sequence[int]) -> Table:
     return Table(title=f"Quality and cost at {rows[0]['size']} px", heads=heads, rows=tuple(made))
 
 
-def steps(rows: Sequence[dict], chosen: Sequence[int]) -> Table:
-    """The front from its cheapest on: what each step costs and gives."""
-    made = []
-    for before, i in zip((None, *chosen), chosen, strict=False):
-        row = rows[i]
-        cells = [text(row["name"]), number(row["psnr"], 2), number(row["ms_view"], 1)]
-        if before is not None:
-            last = rows[before]
-            cells.append(number(row["ms_view"] / last["ms_view"], 2))
-            differences = {"psnr": 2, "flip": 3, "iou": 3}
-            cells += [number(row[name] - last[name], n, sign="+") for name, n in differences.items()]
-        made.append((Path(row["run"]).name, tuple(cells)))
-    heads = ("setting", "PSNR, dB", "ms a view", "times as long as the row before", "PSNR", "FLIP", "IoU")
-    return Table(title=f"The front at {rows[0]['size']} px, step by step", heads=heads, rows=tuple(made))
-
-
 MARKERS = "osD^v<>P"  # of networks
 GROUPS = {  # of settings, as the plot colours them
     "level": "#1d2330",
     "fewer pixels": "#d9480f",
     "points": "#868e96",
-    "samples": "#2457d6",
-    "near points": "#2f9e44",
-    "bfloat16": "#9c36b5",
     "surface": "#e8a200",
 }
 LABELS = {"psnr": "PSNR, dB", "flip": "FLIP (lower is better)", "iou": "opacity IoU"}
@@ -199,7 +147,7 @@ def _scatter(axes: Axes, rows: Sequence[dict], y: str) -> None:
     axes.set_ylabel(LABELS[y])
 
 
-Volumes = dict[tuple[str, int, str], tuple[Volume, float]]  # of object, points, precision: encoded, in so many ms
+Volumes = dict[tuple[str, int], tuple[Volume, float]]  # of object, points: encoded, in so many ms
 REPEATS = 2
 TIMED_OBJECTS = 4
 
@@ -227,29 +175,26 @@ class SpeedAccuracy:
     """A few settings of each network, for a test."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Row:
-    """A setting at a size, and what measures it."""
+class Row(NamedTuple):
+    """A setting of a run at a size, and what measures it."""
 
     number: int
     run: str
     size: int
-    group: str
-    name: str
-    points: int
+    setting: Setting
     measure: scores.Measure
 
     @property
     def place(self) -> str:
         """The name of its folder."""
-        return f"{self.number} {self.size} {self.points} {self.name}"
+        return f"{self.number} {self.size} {self.setting.points} {self.setting.name}"
 
     def summary(self, objects: Sequence[dict]) -> dict[str, Any]:
         """Means of the scores, medians of the times."""
         found = {name: float(np.mean([of[name] for of in objects])) for name in COLUMNS}
         for name in ("ms_view", "s_encode"):
             found[name] = float(np.median([of[name] for of in objects if of[name] is not None]))
-        described = {name: getattr(self, name) for name in ("run", "size", "group", "name")}
+        described = {"run": self.run, "size": self.size, "group": self.setting.group, "name": self.setting.name}
         return described | {name: round(value, 4) for name, value in found.items()}
 
 
@@ -261,13 +206,13 @@ def main(options: SpeedAccuracy) -> None:
     asked = {"objects": names, "views": options.views, "runs": options.runs}
     results_folder.claim(options.out, "speed_accuracy", asked, dataset)
     rows = [row for number in range(len(options.runs)) for row in rows_of(number, options, dataset, names)]
-    telling = sorted(rows, key=lambda row: row.group not in ("level", "surface"))  # the most telling ones first
+    telling = sorted(rows, key=lambda row: row.setting.group not in ("level", "surface"))  # the most telling ones first
     measured = scores.measure_rows(options.out, {row.place: row.measure for row in telling}, dataset, names)
     found = [row.summary(measured[row.place]) for row in rows]
     whole = {"hardware": runtime.hardware(), "load": runtime.load(), "date": time.strftime("%Y-%m-%d"), "rows": found}
     sizes = [of for size in options.sizes if (of := [row for row in found if row["size"] == size])]
     fronts = [(of, front(of), knee(of, front(of))) for of in sizes]
-    tables = [made for of, chosen, _ in fronts for made in (table(of, chosen), steps(of, chosen))]
+    tables = [table(of, chosen) for of, chosen, _ in fronts]
     note = f"{len(names)} objects x {options.views} views, {options.counts[0]:,} points where nothing else is said."
     notes = [note, f"{whole['hardware']}, load {whole['load']}, {whole['date']}."]
     results_folder.write(options.out, whole, tables, notes, {"front.png": plot(fronts)})
@@ -276,49 +221,34 @@ def main(options: SpeedAccuracy) -> None:
 def rows_of(number: int, options: SpeedAccuracy, dataset: Dataset, names: Sequence[str]) -> list[Row]:
     """All settings of a network or a surface at all sizes."""
     run = options.runs[number]
-    row: Callable[..., Row] = partial(Row, number=number, run=run)
+    measure_one: Callable[..., Measured]
     if run in poisson.SURFACES:
         counts = options.counts[:1] if options.quick else options.counts
-        renderer = poisson.Renderer(dataset.settings)
-        return [
-            row(
-                size=size,
-                group="surface",
-                name=f"{count:,} points",
-                points=count,
-                measure=partial(measure_surface, renderer, run, count, options.views, size),
-            )
-            for size in options.sizes
-            for count in counts
-        ]
-    model, volumes = load(run), Volumes({})
-    ways = settings(model.config, options.counts)
-    ways = ways[:: max(len(ways) // 3, 1)] if options.quick else ways
+        ways = [Setting("surface", f"{count:,} points", count) for count in counts]
+        measure_one = partial(measure_surface, poisson.Renderer(dataset.settings).method(run))
+    else:
+        model = load(run)
+        ways = settings(model.config, options.counts)
+        ways = ways[:: max(len(ways) // 3, 1)] if options.quick else ways
+        measure_one = partial(measure, model, Volumes({}), names[:TIMED_OBJECTS])
     return [
-        row(
-            size=size,
-            group=way.group,
-            name=way.name,
-            points=way.points,
-            measure=partial(measure, model, way, volumes, names[:TIMED_OBJECTS], options.views, size),
-        )
+        Row(number, run, size, way, partial(measure_one, way, options.views, size))
         for size in options.sizes
         for way in ways
     ]
 
 
 def measure(
-    model: Model, way: Setting, volumes: Volumes, timed: Sequence[str], views: int, size: int, item: ObjectData
+    model: Model, volumes: Volumes, timed: Sequence[str], way: Setting, views: int, size: int, item: ObjectData
 ) -> Measured:
     """Mean scores of an object's pictures and times of one setting at one size; `timed` are objects."""
-    model = dataclasses.replace(model, config=way.config)
     item = cut(item, way.points, views, size)
-    key = item.name, way.points, getattr(way.config, "precision", "")
-    if key not in volumes:  # samples and sizes share it
+    key = item.name, way.points
+    if key not in volumes:  # levels and sizes share it
         model.encode(item.cloud)
         volumes[key] = take_time(partial(model.encode, item.cloud))
     volume, ms = volumes[key]
-    drawn = max(round(way.share * size / 4) * 4, 16) if way.config.any_size else way.config.image_resolution
+    drawn = max(round(way.share * size / 4) * 4, 16) if model.config.any_size else model.config.image_resolution
     small = item if drawn == size else dataclasses.replace(item, camera=cameras.resize(item.camera, drawn, drawn))
     film = partial(draw_volume, model, volume, small, way.quality)
     found = scores.mean_of(item, film(), COLUMNS) | {"s_encode": ms / 1e3, "ms_view": None}
@@ -327,21 +257,17 @@ def measure(
     return found, item.images[0]
 
 
-def measure_surface(
-    renderer: poisson.Renderer, surface: str, points: int, views: int, size: int, item: ObjectData
-) -> Measured:
+def measure_surface(method: Method, way: Setting, views: int, size: int, item: ObjectData) -> Measured:
     """The same of a surface through the points, drawn by Mitsuba as the references were; loading it is in its time."""
-    item, method = cut(item, points, views, size), renderer.method(surface)
+    item = cut(item, way.points, views, size)
     asset, encode = take_time(partial(method.encode, item))
     pictures, ms = take_time(partial(method.draw, asset, item))
-    return scores.mean_of(item, pictures, COLUMNS) | {
-        "s_encode": encode / 1e3,
-        "ms_view": ms / len(item.images),
-    }, item.images[0]
+    times = {"s_encode": encode / 1e3, "ms_view": ms / len(item.images)}
+    return scores.mean_of(item, pictures, COLUMNS) | times, item.images[0]
 
 
 def take_time(work: Callable[[], Any]) -> tuple[Any, float]:
-    """What the work gives, and its milliseconds: of the processor, where that is what computes."""
+    """What the work gives, and its milliseconds (`clock.now`)."""
     start = clock.now()
     result = jax.block_until_ready(work())
     return result, 1000 * (clock.now() - start)

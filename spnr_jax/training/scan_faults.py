@@ -1,8 +1,7 @@
 """Simulated faults of scans: noise, outliers, unseen surface, uneven density, colours without materials.
 
 All functions take and return (positions (n, 3), other columns by name) with a generator of random numbers.  Lengths are
-in units of the box whose half diagonal is 1; the points must lie in it.  `faults` are measured one by one;
-`random_scan` draws several for a training cloud.
+in units of the box whose half diagonal is 1; the points must lie in it.  `random_scan` draws several.
 """
 
 from collections.abc import Callable
@@ -113,12 +112,3 @@ def random_scan(positions, values, rng) -> Points:
     for fault in [draw(rng) for draw in chosen]:
         positions, values = fault(positions, values, rng)
     return positions, values
-
-
-def faults(noise: tuple[float, ...], outliers: tuple[float, ...], scanners: tuple[int, ...]) -> dict[str, Fault | None]:
-    """Every fault by a name for the row of a table; None leaves the cloud clean."""
-    named: dict[str, Fault | None] = {"clean": None}
-    named |= {f"noise {sigma:.1%}": partial(noisy, sigma=sigma) for sigma in noise}
-    named |= {f"outliers {share:.0%}": partial(with_outliers, share=share) for share in outliers}
-    named |= {f"{n} scanner{'s' * (n > 1)}": partial(scan, scanners=n) for n in scanners}
-    return named | {"colours alone": colours_alone, "uneven density": uneven}

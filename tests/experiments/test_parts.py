@@ -12,63 +12,15 @@ from support.surfel_clouds import camera
 from experiments.paper import fig3
 from experiments.paper.fig1 import Fig1, variant
 from experiments.paper.fig2 import nearest_views
-from experiments.studies import inverse, point_count, relighting
-from experiments.studies.ablations import LABELS, ROWS, change, folds, rows
+from experiments.studies import inverse, relighting
 from experiments.studies.speed_accuracy import front, knee
 from spnr_jax import config, presets
 from spnr_jax.formats import data_sets
-from spnr_jax.methods import to_dict
 from spnr_jax.scoring.evaluation import Pictures
 from spnr_jax.surfels import lighting
 from spnr_jax.training import optimisation
 
 TINY = presets.tiny()
-
-
-def leaves(values, path=""):
-    for name, value in values.items():
-        yield from leaves(value, f"{path}{name}.") if isinstance(value, dict) else [(f"{path}{name}", value)]
-
-
-def test_each_ablation_changes_what_it_says_and_nothing_else():
-    expected = {
-        "no_condition": {"loss.condition": False},
-        "no_colour_variants": {},
-        "depth_3": {},  # tiny's own
-        "depth_4": {"model.encoder.num_stages": 4},
-        "depth_5": {"model.encoder.num_stages": 5},
-        "no_fine_samples": {"model.sampling.num_coarse": 32, "model.sampling.num_fine": 0},
-        "no_view_direction": {"model.sees_direction": False},
-        "plain_inputs": {"model.encoder.inputs": "plain"},
-        "fewer_channels": {"model.encoder.base_width": 8},
-        "no_average": {"optimizer.ema_decay": 0.0},
-        "one_count": {"min_points": 1024},
-        "more_views": {"views_per_object": 4},
-        "half_samples": {"model.sampling.num_coarse": 8, "model.sampling.num_fine": 8},
-        "twice_samples": {"model.sampling.num_coarse": 32, "model.sampling.num_fine": 32},
-    }
-    before = dict(leaves(to_dict(TINY)))
-    after = {row: dict(leaves(to_dict(change(row, TINY)))) for row in ROWS}
-    found = {row: {name: x for name, x in of.items() if before[name] != x} for row, of in after.items()}
-    assert found == expected
-    assert set(LABELS) == set(ROWS)
-
-
-def test_without_colour_variants_the_training_split_alone_shrinks():
-    splits = tiny_dataset.SPLITS | {"train": ("a", "a--1", "a--2", "b")}
-    (_, variant) = rows(("no_colour_variants",), TINY, dataclasses.replace(tiny_dataset.dataset(), splits=splits))
-    assert variant.dataset.splits == tiny_dataset.SPLITS | {"train": ("a", "b")}
-    assert variant.config == TINY
-
-
-def test_variants_are_held_out_with_their_object():
-    splits = {"train": ("a", "a--1", "b", "c"), "val": (), "test": ("d",)}
-    dataset = dataclasses.replace(tiny_dataset.dataset(), splits=splits)
-    first, second = folds(dataset, 2)
-    assert first.splits == {"train": ("b", "d"), "val": (), "test": ("a", "c")}
-    assert second.splits == {"train": ("a", "a--1", "c"), "val": (), "test": ("b", "d")}
-    with pytest.raises(ValueError, match="--folds 3.*holds 4 objects, too few"):
-        folds(dataset, 3)
 
 
 def test_the_adversarial_loss_takes_part_from_the_first_step_and_the_weights_alone_differ():
@@ -92,15 +44,6 @@ def test_the_front_holds_what_no_other_setting_beats_and_its_knee_lies_farthest_
     assert front(rows) == [1, 4, 2]
     assert knee(rows, front(rows)) == 4
     assert knee(rows[:1], front(rows[:1])) == 0
-
-
-def test_classes_have_the_means_of_their_objects_and_the_best_method_is_counted():
-    objects = {"chair_000001": (20.0, 10.0), "chair_000002": (24.0, 30.0), "sofa_000003": (15.0, 25.0)}
-    scores = {x: {name: {"psnr": psnr[i]} for name, psnr in objects.items()} for i, x in enumerate("ab")}
-    assert point_count.by_class(scores) == {
-        "chair": {"objects": 2, "psnr": {"a": 22.0, "b": 20.0}, "best on": {"a": 1, "b": 1}},
-        "sofa": {"objects": 1, "psnr": {"a": 15.0, "b": 25.0}, "best on": {"a": 0, "b": 1}},
-    }
 
 
 def test_the_log_error_of_a_picture_that_is_right_and_of_one_half_as_bright():

@@ -1,89 +1,58 @@
-"""Poisson surfaces beside the networks: in the light of the data set, or empty with the reason where there is none."""
+"""Poisson surfaces beside the networks: in the light of the data set, or empty where there is none."""
 
 import importlib.util
-import json
 from dataclasses import replace
-from functools import partial
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from support.handmade import RED, ball, plain
+from support.surfel_clouds import cloud
 
 from data_gen.render import light, views
 from data_gen.render.poisson_surface import PoissonConfig
-from data_gen.store import layout
 from experiments.comparison import poisson
 from experiments.comparison.study_objects import cut
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.mesh import surface_points
 from spnr_jax.formats.mesh.assets import Asset
+from spnr_jax.kernels import cameras
 from spnr_jax.surfels.skies import indoor_envmap
 
-needs_solver = pytest.mark.skipif(importlib.util.find_spec("pymeshlab") is None, reason="pymeshlab is not installed")
-RADIUS, COUNT = 0.7, 600
-
-
+COUNT, QUICK = 500, PoissonConfig(depth=6)
 VIEW = views.ViewConfig(resolution=32, spp=16, views=2)
+SETTINGS = {"settings": vars(VIEW), "environment_map": {"name": "procedural room", "sha256": None}}
 
 
-@pytest.fixture(scope="module")
-def dataset(tmp_path_factory):
-    """A data set of one red ball and one line of points, lit by the procedural room."""
-    folder = tmp_path_factory.mktemp("poisson") / "data"
-    asset = Asset(parts=(ball(radius=RADIUS, material=plain(RED)),))
+def red_ball():
+    """A red ball in the procedural room, as a data set holds it."""
+    asset = Asset(parts=(ball(radius=0.7, material=plain(RED)),))
     surface = surface_points.sample_surface(asset, COUNT, 0)
     poses = views.random_viewpoints(VIEW.views, VIEW.distance, np.random.default_rng(5))
-    lamp = light.scale_to_white(indoor_envmap())
-    images, conditions = views.render_views(asset, surface, poses, [lamp], VIEW, 6)
-    packed = layout.pack_points(surface)
-    line = packed.copy()
-    line["x"], line["y"], line["z"] = 0, np.linspace(-0.9, 0.9, COUNT), 0
-    for name, content in (("ball", packed), ("line", line)):
-        layout.write_object(
-            folder,
-            name,
-            layout.ObjectRecord(
-                points=content,
-                transforms=layout.nerf_transforms(poses, VIEW.resolution, VIEW.fov, VIEW.focal_length),
-                images=images,
-                conditions=conditions,
-                details={},
-            ),
-        )
-    for split, names in (("train", ""), ("val", ""), ("test", "ball\nline\n")):
-        layout.write_text(folder / "splits" / f"{split}.txt", names)
-    description = {
-        "schema_version": layout.SCHEMA_VERSION,
-        "settings": vars(VIEW),
-        "environment_map": {"name": "procedural room", "sha256": None},
-    }
-    layout.write_text(folder / "dataset.json", layout.json_text(description))
-    return folder
+    images, conditions = views.render_views(asset, surface, poses, [light.scale_to_white(indoor_envmap())], VIEW, 6)
+    camera = cameras.pinhole(jnp.asarray(poses[:, :3], jnp.float32), np.radians(VIEW.fov), 32, 32)
+    points = cloud(surface.positions, base_color=surface.base_color, roughness=surface.roughness)
+    return data_sets.ObjectData(name="ball", cloud=points, camera=camera, images=images, conditions=conditions)
 
 
-@needs_solver
-def test_a_ball_is_rendered_as_its_reference_and_a_line_is_an_empty_picture_with_the_reason(dataset, tmp_path):
-    found = data_sets.open_dataset(dataset)
-    items = {name: cut(data_sets.read_object(found, name), 500) for name in ("ball", "line")}
-    renderer = poisson.Renderer(found.settings, variant="scalar_rgb")
-    show = partial(poisson.keep_pictures, renderer, PoissonConfig(depth=6), tmp_path, None)
-    shown = {name: show(item) for name, item in items.items()}
-    error = shown["ball"].image - data_sets.on_white(items["ball"].images)
-    assert -10 * np.log10(np.square(error).mean()) > 30
-    assert (shown["line"].acc == 0).all()
-    assert (shown["line"].image == 1).all()
-    reasons = {name: json.loads((tmp_path / name / "made.json").read_text())["empty"] for name in items}
-    assert reasons["ball"] == ""
-    assert "500 points on one line" in reasons["line"]
-    pictures = {path.relative_to(tmp_path).as_posix(): path.stat().st_mtime_ns for path in tmp_path.rglob("*.png")}
-    assert sorted(pictures) == ["ball/000.png", "ball/001.png", "line/000.png", "line/001.png"]
-    show(items["ball"])  # nothing is left to do
-    assert {name: (tmp_path / name).stat().st_mtime_ns for name in pictures} == pictures
-    half = renderer.draw(
-        poisson.reconstruct(items["ball"].cloud, PoissonConfig(depth=6)), cut(items["ball"], None, 1, 16)
-    )
+@pytest.mark.skipif(importlib.util.find_spec("pymeshlab") is None, reason="pymeshlab is not installed")
+def test_a_ball_is_rendered_as_its_reference_and_a_line_is_an_empty_picture(tmp_path):
+    item, along = red_ball(), np.linspace(-0.9, 0.9, COUNT)
+    line = replace(item, name="line", cloud=cloud(np.stack([0 * along, along, 0 * along], -1)))
+    renderer = poisson.Renderer(SETTINGS, variant="scalar_rgb")
+    method = poisson.keep_pictures(renderer, QUICK, tmp_path)
+    shown, empty = method.show(item), method.show(line)
+    assert -10 * np.log10(np.square(shown.image - data_sets.on_white(item.images)).mean()) > 30
+    assert (empty.acc == 0).all()
+    assert (empty.image == 1).all()
+    assert "500 points on one line" in poisson.reconstruct(line.cloud, QUICK)
+    assert min(poisson.seconds_per_view(tmp_path, ("ball", "line"))) > 0
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
+    method.show(item)  # nothing is left to do
+    assert {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()} == before
+    half = renderer.draw(poisson.reconstruct(item.cloud, QUICK), cut(item, None, 1, 16))
     assert half.shape == (1, 16, 16, 4)
-    np.testing.assert_allclose(half[..., 3].mean() / 255, shown["ball"].acc[0].mean(), atol=0.02)
+    np.testing.assert_allclose(half[..., 3].mean() / 255, shown.acc[0].mean(), atol=0.02)
 
 
 def test_the_light_has_to_be_that_of_the_data_set(tmp_path):

@@ -15,13 +15,14 @@ from support.tiny_baselines import BASELINE, SHRUNKEN
 
 from experiments.comparison import budget as budgets
 from experiments.comparison import contenders, results_folder, scores, study_objects, variants
-from experiments.comparison.contenders import Sources, networks
+from experiments.comparison.contenders import networks
 from experiments.comparison.scores import Shown
 from experiments.comparison.variants import Compared
 from experiments.paper import table1
 from spnr_jax.formats import data_sets
 from spnr_jax.scoring import evaluation
 from spnr_jax.scoring.report import Table, number, text
+from spnr_jax.scoring.summary import difference
 from spnr_jax.training import batching, checkpoint, optimisation, weights
 
 PAPER = contenders.LABELS["paper"]
@@ -115,32 +116,15 @@ def test_a_difference_compares_equal_seeds_objects_and_views():
         }
         for variant, level in (("a", 10.0), ("b", 13.0))
     }
-    halves = [
-        Compared(
-            scores={v: {s: {n: of[n] for n in names} for s, of in seeds.items()} for v, seeds in found.items()},
-            costs={},
-            shown=[],
-        )
-        for names in (("one",), ("two", "three"))
-    ]
-    change = variants.change(variants.merge(halves), "b", "a", "psnr")
-    means = [np.mean([found["b"][s][n]["psnr"] - found["a"][s][n]["psnr"] for n in found["a"][s]]) for s in range(2)]
-    assert change["by_seed"] == pytest.approx(means)
-    assert change["mean"] == pytest.approx(np.mean(means))
+    compared = Compared(scores=found, shown=[])
+    change = difference(compared.by_object("b"), compared.by_object("a"), "psnr")
+    pairs = [found["b"][s][n]["psnr"] - found["a"][s][n]["psnr"] for s in range(2) for n in found["a"][s]]
+    assert change["mean"] == pytest.approx(np.mean(pairs))
     assert change["interval"][0] < change["mean"] < change["interval"][1]
 
 
 def write_log(run, rows):
     (run / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
-
-
-def test_the_pace_of_a_run_is_not_that_of_its_compilations(tmp_path):
-    paces = (900.0, 10.0, 30.0, 20.0, 20.0, 800.0, 10.0, 20.0, 30.0)
-    rows = [{"step": i, "ms_per_step": pace} for i, pace in enumerate(paces)] + [{"step": 9, "val_psnr": 1.0}]
-    write_log(tmp_path, rows)
-    assert variants.step_milliseconds(tmp_path) == 20.0
-    write_log(tmp_path, rows[:3])
-    assert variants.step_milliseconds(tmp_path) is None
 
 
 def test_training_seconds_are_those_of_the_steps_over_all_calls(tmp_path):
@@ -204,35 +188,27 @@ def test_a_run_that_was_begun_keeps_its_number_of_steps(tmp_path, monkeypatch):
 # --- networks that are compared ---------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def table(tmp_path_factory):
-    """What a table with two networks leaves behind."""
-    folder = tmp_path_factory.mktemp("table")
-    for name, preset in (("npbg", "npbg_tiny"), ("paper", "tiny")):
-        shutil.copytree(stand_ins.fresh(preset), folder / "runs" / name)
-    return folder
-
-
-def test_networks_of_tables_runs_and_the_package_are_named_after_their_methods_in_the_order_of_table_1(table):
-    dataset = tiny_dataset.dataset()
-    assert list(networks(Sources(table1=table), dataset)) == [PAPER, "NPBG"]
-    found = networks(Sources(runs=(stand_ins.fresh("tiny"), Path("surfels")), table1=table), dataset)
-    surfels = contenders.LABELS["surfels"]
+def test_networks_are_named_after_their_methods_in_the_order_of_table_1(tmp_path):
+    dataset, paper, npbg = tiny_dataset.dataset(), stand_ins.fresh("tiny"), stand_ins.fresh("npbg_tiny")
+    again, surfels = tmp_path / "runs" / "paper", contenders.LABELS["surfels"]
+    shutil.copytree(paper, again)
+    assert list(networks((npbg, paper), dataset)) == [PAPER, "NPBG"]
+    found = networks((paper, Path("surfels"), again, npbg), dataset)
     assert set(found) == {f"{PAPER} (fresh, tiny)", f"{PAPER} (runs, paper)", "NPBG", surfels}
     assert [name for name, network in found.items() if not network.has_depth] == ["NPBG"]
     assert found[f"{PAPER} (runs, paper)"].as_method().identity == found[f"{PAPER} (fresh, tiny)"].as_method().identity
     assert found[surfels].checksum == hashlib.sha256(weights.packaged_file().read_bytes()).hexdigest()
 
 
-def test_what_cannot_be_compared_is_refused_by_name(table, tmp_path):
+def test_what_cannot_be_compared_is_refused_by_name(tmp_path):
     dataset = tiny_dataset.dataset()
     with pytest.raises(ValueError, match="--runs: name at least one"):
-        networks(Sources(table1=tmp_path), dataset)
+        networks((), dataset)
     with pytest.raises(ValueError, match="--runs: a run folder is named twice"):
-        networks(Sources(runs=(stand_ins.fresh("tiny"),) * 2), dataset)
+        networks((stand_ins.fresh("tiny"),) * 2, dataset)
     larger = data_sets.open_dataset(tiny_dataset.write_dataset(tmp_path / "data", size=2 * tiny_dataset.SIZE))
     with pytest.raises(ValueError, match=r"images of 48 x 48 pixels, [^\n]*needs 24 x 24"):
-        networks(Sources(table1=table), larger)
+        networks((stand_ins.fresh("tiny"),), larger)
     with pytest.raises(ValueError, match="--objects: expected 1 or more, got 0"):
         study_objects.test_objects(dataset, 0)
     with pytest.raises(ValueError, match="the test split is empty"):

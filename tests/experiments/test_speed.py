@@ -1,10 +1,10 @@
-"""What the measured times stand on: the twin is the same network, ratios are paired, axes change what they say."""
+"""What the measured times stand on: the twin is the same network, and ratios are paired."""
 
 import numpy as np
 import pytest
 from support import twin
 
-from experiments.speed import bench, where_time_goes
+from experiments.speed import bench
 from spnr_jax.devices import runtime
 
 
@@ -35,35 +35,9 @@ def test_our_pytorch_twin_is_the_network_of_the_fixture(implementation):
         assert (found - theirs).norm() <= 1e-5 * theirs.norm()
 
 
-def test_slopes_of_a_power_law_and_of_a_cost_with_a_constant_part():
-    work = np.array([1.0, 2.0, 4.0, 8.0])
-    np.testing.assert_allclose(where_time_goes.slopes(work, 3 * work**1.5), (1.5, 1.5), rtol=1e-6)
-    slope, last = where_time_goes.slopes(work, 10 + work)
-    assert 0 < slope < last < 1
-
-
 def test_a_processor_is_named_with_the_sets_that_it_has(tmp_path, monkeypatch):
     told = tmp_path / "cpuinfo"
     monkeypatch.setattr(runtime, "CPUINFO", told)
     assert runtime.processor().endswith("(instruction sets unknown)")
     told.write_text("processor\t: 0\nmodel name\t: Some CPU: 9\nflags\t\t: sse avx2 avx512f xavx512_bf16\n")
     assert runtime.processor() == "Some CPU: 9 (avx2, avx512f)"
-
-
-COUNTS = {
-    "points": lambda config, batch: batch.cloud.mask.shape[1],
-    "objects": lambda config, batch: batch.image.shape[0],
-    "views": lambda config, batch: batch.camera.cam_to_world.shape[1],
-    "image": lambda config, batch: batch.camera.height,
-    "volume": lambda config, batch: config.model.encoder.volume_resolution,
-    "samples": lambda config, batch: config.model.sampling.num_coarse + config.model.sampling.num_fine,
-}
-
-
-@pytest.mark.parametrize("name", where_time_goes.AXES)
-def test_an_axis_changes_what_it_says_and_nothing_else(name):
-    axis, base = where_time_goes.AXES[name], bench.our_config("tiny", "train_l1")
-    cases = [axis.case(base, value) for value in axis.values[:2]]
-    for other, count in COUNTS.items():
-        before, after = (count(*case) for case in cases)
-        assert (before, after) == axis.values[:2] if other == name else before == after

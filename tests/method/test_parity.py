@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from support import twin
 
-from experiments.speed.speed_scenes import as_batch
+from experiments.speed.bench import make_batch
 from spnr_jax.config import AS_TRAINED
 from spnr_jax.kernels import cameras, compositing, losses, sampling, voxels
 from spnr_jax.method import inference, pixels
@@ -20,7 +20,7 @@ from spnr_jax.training import optimisation
 TOLERANCE = 1e-4
 ARRAYS = twin.load()
 CONFIG = twin.config(ARRAYS)
-BATCH = jax.tree.map(jnp.asarray, as_batch(twin.inputs(ARRAYS)))
+BATCH = jax.tree.map(jnp.asarray, make_batch(twin.inputs(ARRAYS)))
 GENERATOR, STATISTICS = twin.generator(ARRAYS)
 DISCRIMINATOR = twin.discriminator(ARRAYS)
 VARIABLES = {"params": GENERATOR, "batch_stats": STATISTICS}

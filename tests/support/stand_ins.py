@@ -53,7 +53,7 @@ def disc(size: int) -> tuple[np.ndarray, np.ndarray]:
     return np.where(inner > 0, depth, 4).astype(np.float32), (inner > 0).astype(np.float32)
 
 
-def stand_ins(*labels: str, checksum: str = "0") -> dict[str, contenders.Network]:
+def stand_ins(*labels: str) -> dict[str, contenders.Network]:
     """Stand-ins by label; the first word of each names its method."""
     return {
         label: StandIn(
@@ -61,7 +61,7 @@ def stand_ins(*labels: str, checksum: str = "0") -> dict[str, contenders.Network
             config=tiny_dataset.CONFIG,
             variables={},
             steps=6,
-            checksum=checksum,
+            checksum="0",
         )
         for label in labels
     }

@@ -28,32 +28,24 @@ BASELINE = dataclasses.replace(
     loss=LossConfig(l1_weight=1.0, adversarial_weight=0.0, pixel="mse"),
     optimizer=OptimizerConfig(lr_generator=1e-2, warmup_steps=2, ema_decay=0.9),
 )
+RASTERS = NPBGConfig(encoder_widths=(8, 9, 10), decoder_widths=(5, 4), image_resolution=16)
+HYPER = Points2NeRFConfig(
+    kl_weight=0.01,
+    materials=("base_color", "metallic"),
+    point_widths=(8, 6),
+    hidden_width=7,
+    code_size=5,
+    hypernetwork_widths=(6, 9),
+    chunk_size=48,
+    chunk_embedding=3,
+    frequencies=2,
+    nerf_width=8,
+    nerf_depth=2,
+    num_samples=4,
+    image_resolution=8,
+)
 NETWORKS: dict[str, NetworkConfig] = {
-    "npbg_tiny": NPBGConfig(encoder_widths=(8, 9), decoder_widths=(5,), image_resolution=SIZE),
-    "point_nerf_tiny": PointNeRFConfig(
-        num_candidates=12,
-        num_samples=4,
-        num_neighbors=2,
-        width=4,
-        color_width=4,
-        feature_frequencies=1,
-        offset_frequencies=1,
-        direction_frequencies=1,
-        image_resolution=SIZE,
-    ),
-    "points2nerf_tiny": Points2NeRFConfig(
-        point_widths=(8,),
-        hidden_width=4,
-        code_size=4,
-        hypernetwork_widths=(4,),
-        chunk_size=64,
-        chunk_embedding=2,
-        frequencies=1,
-        nerf_width=4,
-        nerf_depth=2,
-        num_samples=4,
-        image_resolution=SIZE,
-    ),
+    f"{model.method}_tiny": dataclasses.replace(model, image_resolution=SIZE) for model in (RASTERS, POINT_NERF, HYPER)
 }
 SHRUNKEN = {"tiny": dataclasses.replace(BASELINE, model=tiny_dataset.CONFIG.model)} | {
     name: dataclasses.replace(BASELINE, preset=name, model=model) for name, model in NETWORKS.items()

@@ -11,10 +11,10 @@ import optax
 import pytest
 from support import tiny_surfels
 from support.laws import close, numbers, same_bits
+from support.random_crops import random_crops
 from support.tiny_model import MODEL, SIZE
 from support.tiny_training import BATCH, CONFIG, L1_ONLY, copied, create, near, run, step
 
-from experiments.speed.speed_scenes import random_crops
 from spnr_jax import methods
 from spnr_jax.config import LossConfig, NetworkConfig, OptimizerConfig
 from spnr_jax.kernels import cameras, losses

@@ -14,7 +14,7 @@ from spnr_jax.formats.mesh.surface_points import sample_surface
 
 UNIT = st.floats(0, 1, width=32)
 SEEDS = st.integers(0, 2**32 - 1)
-SLOW = settings(deadline=None, max_examples=60)
+SLOW = settings(deadline=None, max_examples=25)
 
 
 def distances(colours):
@@ -39,18 +39,11 @@ ASSETS = st.builds(
 
 @SLOW
 @given(ASSETS, SEEDS)
-def test_distances_between_base_colours_stay_and_all_stay_in_gamut(asset, seed):
-    rotated, _ = augmentation.rotate_colours(asset, seed)
-    before, after = augmentation.base_colours(asset), augmentation.base_colours(rotated)
-    assert after.min() >= 0
-    assert after.max() <= 1
-    np.testing.assert_allclose(distances(after), distances(before), atol=1e-5)
-
-
-@SLOW
-@given(ASSETS, SEEDS)
-def test_the_colour_at_a_point_is_the_rotation_of_the_originals(asset, seed):
+def test_colours_are_rotated_within_the_gamut_everywhere_and_nothing_else_changes(asset, seed):
     rotated, rotation = augmentation.rotate_colours(asset, seed)
+    before, after = augmentation.base_colours(asset), augmentation.base_colours(rotated)
+    assert 0 <= after.min() <= after.max() <= 1
+    np.testing.assert_allclose(distances(after), distances(before), atol=1e-5)
     before, after = (sample_surface(shape, 200, 3) for shape in (asset, rotated))
     np.testing.assert_allclose(after.base_color, before.base_color @ rotation.matrix.T, atol=1e-5)
     for name in ("positions", "normals", "roughness", "metallic", "face"):
@@ -86,13 +79,11 @@ def test_muted_colours_turn_any_way_and_the_seed_decides_which():
 
 
 def test_a_rare_saturated_texel_is_not_overlooked():
-    texels = np.full((64, 64, 3), 0.5, np.float32)
-    texels[40, 13] = (1, 0, 0.2)
+    texels = np.full((4096, 3), 0.5, np.float32)
+    texels[2573] = (1, 0, 0.2)
     for seed in range(20):
-        matrix = augmentation.draw_rotation(texels.reshape(-1, 3), seed).matrix
-        rotated = texels.reshape(-1, 3) @ matrix.T
-        assert rotated.min() > -1e-5
-        assert rotated.max() < 1 + 1e-5
+        rotated = texels @ augmentation.draw_rotation(texels, seed).matrix.T
+        assert -1e-5 < rotated.min() <= rotated.max() < 1 + 1e-5
 
 
 # shape
@@ -104,15 +95,11 @@ def volume(part):
 
 
 @given(SEEDS)
-def test_faces_still_look_outwards_and_the_volume_grows_by_the_stretch(seed):
+def test_faces_still_look_outwards_the_volume_grows_by_the_stretch_and_up_stays_up(seed):
     shape = draw_reshaping(seed)
     (part,) = reshape(Asset(parts=(box((0.3, 0.2, 0.1)),)), shape).parts
     assert volume(part) == pytest.approx(volume(box()) * np.abs(shape.stretch).prod())
-
-
-@given(SEEDS)
-def test_up_stays_up(seed):
-    up = draw_reshaping(seed).matrix() @ [0, 1, 0]
+    up = shape.matrix() @ [0, 1, 0]
     np.testing.assert_allclose(up / np.linalg.norm(up), [0, 1, 0], atol=1e-12)
 
 

@@ -1,4 +1,4 @@
-"""Laws of whole runs: the same bytes whatever happens on the way, and one clear line for what goes wrong."""
+"""Laws of whole runs: what is made, checked and shown, and one clear line for what goes wrong."""
 
 import json
 import shutil
@@ -14,9 +14,13 @@ from data_gen.make import objects
 from data_gen.plan import tasks
 from data_gen.render import views
 from data_gen.render.light import Lights
-from data_gen.store import check, layout, show
+from data_gen.store import check, layout, show, storage
+from spnr_jax.formats import data_sets
+from spnr_jax.surfels.lighting import directions
 
-SMALL = ["--resolution", "32", "--views", "2", "--points", "64", "--spp", "16", "--visibility-grid", "2"]
+VIEWS = 6
+SMALL = ["--resolution", 32, "--views", VIEWS, "--points", 64, "--spp", 16, "--visibility-grid", 2]
+SMALL += ["--lights", "random", "--test-fraction", 0.25]
 
 
 def tree(folder):
@@ -26,20 +30,19 @@ def tree(folder):
 
 @pytest.fixture(scope="module")
 def meshes(tmp_path_factory):
-    """A folder of five good mesh files and one bad one."""
+    """A folder of four good mesh files and a bad one."""
     folder = tmp_path_factory.mktemp("meshes")
-    for number in range(4):
-        part = box(half=(0.2 + 0.1 * number, 0.5, 0.4)) if number % 2 else ball(radius=0.3)
+    for number, part in enumerate((ball(radius=0.3), box(half=(0.3, 0.5, 0.4)), ball(radius=0.5), box())):
         trimesh.Trimesh(part.positions, part.faces, process=False).export(folder / f"thing_{number}.ply")
     (folder / "empty.ply").write_text("ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nend_header\n")
     return folder
 
 
 @pytest.fixture(scope="module")
-def finished(meshes, tmp_path_factory):
-    """An undisturbed run with one worker."""
+def finished(meshes, tmp_path_factory, generate_here):
+    """An undisturbed run, each view in a light of its own."""
     out = tmp_path_factory.mktemp("finished") / "set"
-    assert spnr_data("generate", out, "--meshes", meshes, *SMALL, "--workers", 1, "--test-fraction", 0.25) == 0
+    assert generate_here(out, "--meshes", meshes, *SMALL) == 0
     return out
 
 
@@ -47,18 +50,43 @@ def test_a_bad_mesh_is_left_out_with_its_reason_and_the_others_are_made(finished
     rows = [json.loads(line) for line in (finished / "rejected.jsonl").read_text().splitlines()]
     assert [(row["id"], row["path"]) for row in rows] == [("empty", "empty.ply")]
     assert rows[0]["reason"]
-    assert layout.list_completed(finished) == {f"thing_{number}" for number in range(4)}
+    assert storage.list_completed(finished) == {f"thing_{number}" for number in range(4)}
     assert len(layout.read_split(finished, "test")) == 1
+    assert spnr_data("check", finished) == 0
 
 
-def test_a_run_with_another_setting_is_refused_in_one_line_and_changes_nothing(meshes, finished, capsys):
+def test_a_view_is_brighter_where_the_map_that_is_kept_says_that_its_light_comes_from(finished):
+    dataset = data_sets.open_dataset(finished)
+    assert dataset.settings["environment_map"]["kinds"] == [{"name": "random"}]
+    item = data_sets.read_object(dataset, "thing_2")
+    assert len({light.tobytes() for light in item.lights}) == len(item.lights) == VIEWS
+    area = np.sin(np.pi * (np.arange(32) + 0.5) / 32)[:, None, None]
+    np.testing.assert_allclose((item.lights * area).mean(axis=(1, 2, 3)) / area.mean(), 0.6, rtol=0.02)
+    agreeing = []
+    for view, light in enumerate(item.lights):
+        weight = area[..., 0] * light.mean(axis=-1)
+        across = (weight[..., None] * directions(32)).sum(axis=(0, 1)) @ item.camera.cam_to_world[view][:, :3]
+        image, inside = item.images[view, ..., :3].mean(axis=-1), item.images[view, ..., 3] > 250
+        grid = np.stack(np.meshgrid(np.arange(32) - 15.5, 15.5 - np.arange(32)), axis=-1)
+        gradient = np.linalg.lstsq(grid[inside], image[inside] - image[inside].mean(), rcond=None)[0]
+        agreeing.append(gradient @ across[:2] > 0)
+    assert np.mean(agreeing) > 0.8
+
+
+def test_a_run_with_another_setting_is_refused_in_one_line_and_changes_nothing(
+    meshes, finished, generate_here, tmp_path, capsys
+):
     before = tree(finished)
-    for change in (["--seed", 1], ["--spp", 8], ["--fov", 30], ["--objects", 1]):
-        assert spnr_data("generate", finished, "--meshes", meshes, *SMALL, "--test-fraction", 0.25, *change) == 2
+    for option, value in (("seed", 1), ("spp", 8), ("fov", 30), ("objects", 1)):
+        assert generate_here(finished, "--meshes", meshes, *SMALL, f"--{option}", value) == 2
         message = capsys.readouterr().err
         assert message.count("\n") == 1
-        assert f"{change[0][2:]} " in message
+        assert f"{option} " in message
     assert tree(finished) == before
+    (tmp_path / "thesis.txt").write_text("years of work")
+    assert generate_here(tmp_path, "--objects", 1, *SMALL) == 2
+    assert "holds no data set" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
 
 
 def test_an_object_does_not_depend_on_which_others_are_made():
@@ -71,27 +99,20 @@ def test_an_object_does_not_depend_on_which_others_are_made():
 
 
 def test_an_unexpected_error_leaves_out_that_object_only_but_a_full_disk_stops_the_run(tmp_path, monkeypatch):
-    task = tasks.Task(object_id="a", category="chair")
-    bench = objects.Workbench(
-        out=str(tmp_path),
-        lights=Lights(np.ones((4, 8, 3))),
-        view=views.ViewConfig(),
-        num_points=4,
-        seed=0,
-        variant="scalar_rgb",
-    )
+    task, lights = tasks.Task(object_id="a", category="chair"), Lights(np.ones((4, 8, 3)))
+    given = {"lights": lights, "view": views.ViewConfig(), "num_points": 4, "seed": 0, "variant": "scalar_rgb"}
+    bench = objects.Workbench(out=str(tmp_path), **given)
 
-    def broken(category, seed):
-        raise ZeroDivisionError("no legs\nto stand on")
+    def fail(error):
+        def failing(*_):
+            raise error
 
-    monkeypatch.setattr(objects.procedural, "make", broken)
+        return failing
+
+    monkeypatch.setattr(objects.procedural, "make", fail(ZeroDivisionError("no legs\nto stand on")))
     assert objects.make_and_write(bench, task) == "unexpected ZeroDivisionError: no legs"
-
-    def full(out, object_id, record):
-        raise OSError(28, "No space left on device")
-
     monkeypatch.setattr(objects, "make_record", lambda bench, task: None)
-    monkeypatch.setattr(objects.layout, "write_object", full)
+    monkeypatch.setattr(objects.layout, "write_object", fail(OSError(28, "No space left on device")))
     with pytest.raises(OSError, match="No space"):
         objects.make_and_write(bench, task)
 
@@ -114,60 +135,42 @@ def test_an_unexpected_error_leaves_out_that_object_only_but_a_full_disk_stops_t
 )
 def test_a_bad_option_is_one_line_and_exit_code_2(arguments, expected, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    assert spnr_data("generate", "out", "--objects", 1, *arguments) == 2
+    assert spnr_data("generate", "out", "--objects", 1, "--variant", "scalar_rgb", *arguments) == 2
     message = capsys.readouterr().err
     assert expected in message
     assert message.count("\n") == 1
     assert not Path("out").exists()
 
 
-def test_a_folder_with_other_things_in_it_is_left_alone(tmp_path, capsys):
-    (tmp_path / "thesis.txt").write_text("years of work")
-    assert spnr_data("generate", tmp_path, "--objects", 1, *SMALL) == 2
-    assert "holds no data set" in capsys.readouterr().err
-    assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
-
-
-def damage_picture(folder):
-    (folder / "objects/thing_0/images/000.png").write_bytes(b"not a picture")
-
-
-def damage_points(folder):
-    path = folder / "objects/thing_1/points.ply"
-    points = layout.read_points(path)
+def damage_points(whole):
+    points = np.frombuffer(whole.partition(b"end_header\n")[2], layout.POINT_TYPE).copy()
     points["x"][0] = np.nan
-    path.write_bytes(layout.encode_points(points))
+    return layout.encode_points(points)
 
 
-def damage_camera(folder):
-    path = folder / "objects/thing_2/transforms.json"
-    transforms = json.loads(path.read_text())
+def turn_camera(whole):
+    transforms = json.loads(whole)
     transforms["frames"][0]["transform_matrix"][0][0] += 0.1
-    path.write_text(json.dumps(transforms))
-
-
-def damage_splits(folder):
-    (folder / "splits/val.txt").write_text((folder / "splits/train.txt").read_text())
+    return json.dumps(transforms).encode()
 
 
 @pytest.mark.parametrize(
-    ("damage", "expected"),
+    ("name", "damage", "expected"),
     [
-        (damage_picture, "000.png: not a readable PNG"),
-        (damage_points, "not finite"),
-        (damage_camera, "orthonormal"),
-        (damage_splits, "listed more than once"),
+        ("objects/thing_0/images/000.png", lambda _: b"not a picture", "000.png: not a readable PNG"),
+        ("objects/thing_1/points.ply", damage_points, "not finite"),
+        ("objects/thing_2/transforms.json", turn_camera, "orthonormal"),
+        ("splits/val.txt", lambda _: b"thing_0\nthing_1\nthing_2\nthing_3\n", "listed more than once"),
     ],
 )
-def test_check_names_what_is_damaged_and_exits_with_1(damage, expected, finished, tmp_path, capsys):
+def test_check_names_what_is_damaged_and_exits_with_1(name, damage, expected, finished, tmp_path, capsys):
     folder = shutil.copytree(finished, tmp_path / "copy")
-    damage(folder)
-    assert not check.check(folder)
-    assert expected in capsys.readouterr().out
+    (folder / name).write_bytes(damage((folder / name).read_bytes()))
     assert spnr_data("check", folder) == 1
+    assert expected in capsys.readouterr().out
 
 
-def test_check_notices_points_that_miss_the_object(finished, tmp_path):
+def test_check_notices_points_that_miss_the_object(finished):
     record = layout.read_object(finished / "objects" / "thing_0")
     assert check.points_on_object(record) > 0.9
     blank = layout.ObjectRecord(**{**vars(record), "images": np.zeros_like(record.images)})
@@ -176,5 +179,5 @@ def test_check_notices_points_that_miss_the_object(finished, tmp_path):
 
 def test_the_contact_sheet_is_one_file_that_shows_every_picture(finished, tmp_path):
     page = show.show(show.ShowConfig(dataset=finished, to=tmp_path / "sheet.html")).read_text()
-    assert page.count("data:image/png;base64,") == 4 * (2 + 2 + 3)
+    assert page.count("data:image/png;base64,") == 4 * (2 * VIEWS + 3)
     assert "http" not in page

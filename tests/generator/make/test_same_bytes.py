@@ -8,35 +8,34 @@ from pathlib import Path
 
 import pytest
 from fsspec.implementations.memory import MemoryFileSystem
-from support.schedulers import in_this_process, is_worker, scheduler_and_workers
+from support.command_line import spnr_data
+from support.schedulers import in_this_process
 
 from data_gen.make import objects
-from data_gen.make.generate import generate
 from data_gen.plan import tasks
 from data_gen.render import views
-from data_gen.store import check, layout, storage
+from data_gen.store import check, storage
 from spnr_jax.devices import cluster
 
 pytestmark = pytest.mark.ci  # it renders several data sets
 
 ROOT = Path(__file__).parents[3]
-COUNT = 8
-SMALL = {"categories": ("frame", "lamp"), "resolution": 24, "views": 2, "points": 64, "spp": 4, "variant": "scalar_rgb"}
+SMALL = "--objects 8 --categories frame lamp --resolution 24 --views 2 --points 64 --spp 4"
 
 
-def make(out, **options):
-    generate(tasks.GenerateConfig(out=out, objects=COUNT, **SMALL, **options))
+def options(out):
+    return [str(out), *SMALL.split()]
+
+
+def make(out, *more):
+    assert spnr_data("generate", *options(out), "--variant", "scalar_rgb", *more) == 0
     return files(out)
 
 
-def start(out, *options):
+def start(out, *more):
     """The same as `make` in a process of its own, as a user starts it."""
-    arguments = [str(out), "--objects", str(COUNT), *options]
-    for name, value in SMALL.items():
-        arguments += [f"--{name}", *(value if isinstance(value, tuple) else [str(value)])]
-    return subprocess.Popen(
-        [sys.executable, "-m", "data_gen", "generate", *arguments], cwd=ROOT, stderr=subprocess.PIPE
-    )
+    command = [sys.executable, "-m", "data_gen", "generate", *options(out), "--variant", "scalar_rgb", *more]
+    return subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE)
 
 
 def files(place):
@@ -47,7 +46,7 @@ def files(place):
 
 def wait_for(out, number, process):
     """The names of the objects that are done, once they are so many."""
-    while len(done := layout.list_completed(out)) < number:
+    while len(done := storage.list_completed(out)) < number:
         assert process.poll() is None
         time.sleep(0.01)
     return done
@@ -56,10 +55,10 @@ def wait_for(out, number, process):
 def in_a_cluster_and_an_object_store(folder, address):
     place = "memory://cluster/set"
     try:
-        made = make(place, cluster=address)
+        made = make(place, "--cluster", address)
         last = sorted(name for name in made if name.endswith("object.json"))[-1]
         MemoryFileSystem.store.pop(f"/cluster/set{last}")
-        assert make(place, cluster=address) == made, "an object without object.json is made again"
+        assert make(place, "--cluster", address) == made, "an object without object.json is made again"
         return made
     finally:
         MemoryFileSystem.store.clear()
@@ -75,30 +74,14 @@ def with_two_workers_that_are_stopped_and_go_on(folder, _):
     assert process.returncode == 130, message
     assert "Traceback" not in message
     assert "stopped" in message.splitlines()[-1]
-    assert layout.list_completed(out)
+    assert storage.list_completed(out)
     assert not list((out / "objects").glob(storage.UNFINISHED + "*"))
     assert not (out / "splits").exists()
-    make(out, workers=2)
+    make(out, "--workers", 2)
     times = {path: path.stat().st_mtime_ns for path in (out / "objects").rglob("*")}
     made = make(out)
     assert {path: path.stat().st_mtime_ns for path in (out / "objects").rglob("*")} == times, "nothing is left to do"
     return made
-
-
-def by_a_cluster_whose_workers_are_killed(folder, _):
-    out = folder / "set"
-    with scheduler_and_workers(folder, 2) as (address, nannies):
-        parent = start(out, "--cluster", address)
-        for number in (1, 3, 5):
-            done = wait_for(out, number, parent)
-            times = {name: (out / "objects" / name).stat().st_mtime_ns for name in done}
-            victims = [child for child in nannies.children(recursive=True) if is_worker(child)]
-            victims[number % len(victims)].kill()
-        message = parent.communicate(timeout=120)[1].decode()
-        assert parent.returncode == 0, message
-        assert nannies.is_running()
-    assert all((out / "objects" / name).stat().st_mtime_ns == written for name, written in times.items())
-    return files(out)
 
 
 def by_two_runs_at_once(folder, _):
@@ -116,16 +99,21 @@ def address():
 
 
 @pytest.fixture(scope="module")
-def expected(tmp_path_factory):
-    """The data set of one undisturbed worker."""
-    return make(tmp_path_factory.mktemp("alone") / "set", workers=1)
+def expected(tmp_path_factory, generate_here):
+    """The data set of one undisturbed process."""
+    out = tmp_path_factory.mktemp("alone") / "set"
+    assert generate_here(*options(out)) == 0
+    return files(out)
 
 
-WAYS = (in_a_cluster_and_an_object_store, with_two_workers_that_are_stopped_and_go_on)
-SLOW_WAYS = (by_a_cluster_whose_workers_are_killed, by_two_runs_at_once)
-
-
-@pytest.mark.parametrize("way", [*WAYS, *(pytest.param(way, marks=pytest.mark.slow) for way in SLOW_WAYS)])
+@pytest.mark.parametrize(
+    "way",
+    [
+        in_a_cluster_and_an_object_store,
+        with_two_workers_that_are_stopped_and_go_on,
+        pytest.param(by_two_runs_at_once, marks=pytest.mark.slow),
+    ],
+)
 def test_the_bytes_are_the_same(way, expected, address, tmp_path):
     assert way(tmp_path, address) == expected
 

@@ -64,21 +64,16 @@ def test_a_test_list_is_the_test_split(tmp_path):
 
 
 def test_originals_come_first_and_variants_fill_up_to_the_number_asked_for():
-    made = planned(test_objects=10, val_fraction=0.1, colour_variants=5, train_objects=67)
+    asked = {"test_objects": 10, "val_fraction": 0.1, "colour_variants": 5, "train_objects": 67}
+    made = planned(**asked)
     train = made.split(ids(made.tasks))["train"]
     variants = made.variants(train)
     assert len(train) + len(variants) == 67
     assert {variant.product for variant in variants} <= set(train)
     assert all(variant.object_id == f"{variant.product}--{variant.colour_variant}" for variant in variants)
-    assert len({variant.object_id for variant in variants}) == len(variants)
-    assert variants == made.variants(train)
-    assert variants != planned(test_objects=10, val_fraction=0.1, colour_variants=5, train_objects=67, seed=1).variants(
-        train
-    )
-
-
-def test_without_a_number_every_training_product_has_all_its_variants():
-    made = planned(test_objects=10, val_fraction=0, colour_variants=3)
+    assert len(set(ids(variants))) == len(variants)
+    assert variants == made.variants(train) != planned(**asked, seed=1).variants(train)
+    made = planned(test_objects=10, val_fraction=0, colour_variants=3)  # without a number all of each product
     assert len(made.variants(made.split(ids(made.tasks))["train"])) == 90
     assert planned().variants(["chair_000000"]) == []
 
@@ -142,19 +137,28 @@ def test_a_split_file_that_cannot_be_meant_is_one_line(tmp_path, name, text, exp
     assert f"--split-file {tmp_path / name}" in message
 
 
-def test_options_that_do_not_go_together_are_one_line(tmp_path):
-    assert "give --source meshes, abo or shapenet" in error(root=tmp_path)
-    assert "give --source meshes, abo or shapenet" in error(root=tmp_path, source="procedural")
-    assert "--source abo: give --root" in error(source="abo")
-    assert "give --category, one of car, plane, chair" in error(source="shapenet", root=tmp_path)
-    assert "only with --source shapenet" in error(category="car")
-    assert "only with --source shapenet" in error(source="abo", root=tmp_path, category="car")
-    assert "not together" in error(source="abo", meshes=tmp_path)
-    assert "not together" in error(meshes=tmp_path, root=tmp_path)
-    assert "not together" in error(objects=1, test_list=Path("a"), split_file=Path("b"))
-    assert "--test-objects 8: leaves none of the 8" in error(objects=8, test_objects=8)
-    assert "--colour-variants: expected 0 or more" in error(colour_variants=-1)
-    assert "--train-objects: expected 1 or more" in error(train_objects=0)
+HERE = Path(__file__).parent
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ({"root": HERE}, "give --source meshes, abo or shapenet"),
+        ({"root": HERE, "source": "procedural"}, "give --source meshes, abo or shapenet"),
+        ({"source": "abo"}, "--source abo: give --root"),
+        ({"source": "shapenet", "root": HERE}, "give --category, one of car, plane, chair"),
+        ({"category": "car"}, "only with --source shapenet"),
+        ({"source": "abo", "root": HERE, "category": "car"}, "only with --source shapenet"),
+        ({"source": "abo", "meshes": HERE}, "not together"),
+        ({"meshes": HERE, "root": HERE}, "not together"),
+        ({"objects": 1, "test_list": HERE, "split_file": HERE}, "not together"),
+        ({"objects": 8, "test_objects": 8}, "--test-objects 8: leaves none of the 8"),
+        ({"colour_variants": -1}, "--colour-variants: expected 0 or more"),
+        ({"train_objects": 0}, "--train-objects: expected 1 or more"),
+    ],
+)
+def test_options_that_do_not_go_together_are_one_line(options, expected):
+    assert expected in error(**options)
 
 
 def test_a_preset_is_the_default_of_the_options_and_they_override_it():
@@ -168,17 +172,14 @@ def test_a_preset_is_the_default_of_the_options_and_they_override_it():
 
 
 def test_the_presets_hold_the_papers_numbers():
-    abo, car = data_presets.abo(Path("x")), data_presets.shapenet_car(Path("x"))
-    assert (abo.resolution, abo.views, abo.colour_variants, abo.train_objects, abo.test_objects) == (
-        128,
-        10,
-        5,
-        16161,
-        200,
-    )
-    assert (car.resolution, car.views, car.colour_variants, car.category, car.test_objects) == (200, 10, 0, "car", 128)
-    assert data_presets.shapenet_plane(Path("x")).test_objects == 406
-    assert data_presets.shapenet_chair(Path("x")).test_objects == 105
+    numbers = ("resolution", "views", "colour_variants", "train_objects", "test_objects", "category")
+    found = {name: preset(Path("x")) for name, preset in data_presets.PRESETS.items()}
+    assert {name: tuple(getattr(one, number) for number in numbers) for name, one in found.items()} == {
+        "abo": (128, 10, 5, 16161, 200, None),
+        "shapenet_car": (200, 10, 0, None, 128, "car"),
+        "shapenet_plane": (200, 10, 0, None, 406, "plane"),
+        "shapenet_chair": (200, 10, 0, None, 105, "chair"),
+    }
 
 
 def test_meshes_are_the_same_source_by_either_name_and_go_with_procedural_objects(tmp_path):
@@ -188,9 +189,5 @@ def test_meshes_are_the_same_source_by_either_name_and_go_with_procedural_object
     assert tasks.plan_objects(short) == tasks.plan_objects(long)
     assert ids(tasks.plan_objects(short)) == ["a", "b"]
     mixed = tasks.plan_objects(config(meshes=tmp_path, objects=1))
-    assert [(task.object_id, task.shown_path) for task in mixed] == [
-        ("a", "a.glb"),
-        ("b", "b.ply"),
-        ("chair_000000", ""),
-    ]
+    assert [task.shown_path for task in mixed] == ["a.glb", "b.ply", ""]
     assert len(tasks.plan_objects(config())) == 200

@@ -61,17 +61,33 @@ def made(task, count=50):
     return asset, details, surface_points.sample_surface(asset, count, seeds["points"]).positions
 
 
-PROCEDURAL = (
-    Task(object_id="lamp_000004", category="lamp"),
-    Task(object_id="lamp_000004--2", category="lamp", variant_of="lamp_000004", colour_variant=2),
-    Task(object_id="lamp_000004--2", category="lamp", variant_of="lamp_000004", colour_variant=2, reshaped=True),
+def write_cube(path, height):
+    """A mesh file of a box of this height."""
+    path.parent.mkdir(exist_ok=True)
+    corners = [(x, height * y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)]
+    faces = [(1, 2, 4), (1, 4, 3), (5, 7, 8), (5, 8, 6), (1, 5, 6), (1, 6, 2)]
+    lines = [f"v {x} {y} {z}" for x, y, z in corners] + [f"f {a} {b} {c}" for a, b, c in faces]
+    path.write_text("\n".join(lines) + "\n")
+
+
+LAMP = Task(object_id="lamp_000004", category="lamp")
+VARIANT = Task(object_id="lamp_000004--2", category="lamp", variant_of="lamp_000004", colour_variant=2)
+
+
+def cube(root):
+    """The task of a mesh file."""
+    write_cube(root / "toys" / "cube.obj", 1.0)
+    return Task(object_id="cube", path=root / "toys" / "cube.obj", shown_path="toys/cube.obj")
+
+
+@pytest.mark.parametrize(
+    "task_in",
+    [lambda _: LAMP, lambda _: VARIANT, lambda _: dataclasses.replace(VARIANT, reshaped=True), cube],
+    ids=["product", "colour variant", "reshaped", "mesh file"],
 )
-
-
-@pytest.mark.parametrize("task", PROCEDURAL, ids=["product", "colour variant", "reshaped"])
-def test_a_procedural_object_is_made_again_from_its_record(task):
-    asset, details, stored = made(task)
-    again = objects.original(details, SEED, stored)
+def test_an_object_is_made_again_from_its_record(task_in, tmp_path):
+    asset, details, stored = made(task_in(tmp_path))
+    again = objects.original(details, SEED, stored, tmp_path)
     for part, expected in zip(again.parts, asset.parts, strict=True):
         np.testing.assert_array_equal(part.positions, expected.positions)
         np.testing.assert_array_equal(part.faces, expected.faces)
@@ -79,46 +95,19 @@ def test_a_procedural_object_is_made_again_from_its_record(task):
 
 
 def test_a_record_from_before_there_were_variants_is_understood():
-    _, details, stored = made(PROCEDURAL[0])
+    _, details, stored = made(LAMP)
     assert objects.original({k: v for k, v in details.items() if k not in ("product", "variant")}, SEED, stored)
 
 
-def test_another_shape_under_the_same_name_is_refused():
-    _, details, stored = made(PROCEDURAL[0])
+def test_another_shape_under_the_same_name_and_a_mesh_that_is_not_there_are_refused(tmp_path):
+    _, details, stored = made(LAMP)
     with pytest.raises(ValueError, match=r"^object lamp_000004: its points do not lie on the mesh[^\n]*generate"):
         objects.original(details, SEED + 1, stored)
-
-
-class TestMeshFiles:
-    @pytest.fixture
-    def root(self, tmp_path):
-        self.write(tmp_path / "toys" / "cube.obj", 1.0)
-        return tmp_path
-
-    def write(self, path, height):
-        path.parent.mkdir(exist_ok=True)
-        corners = [(x, height * y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)]
-        faces = [(1, 2, 4), (1, 4, 3), (5, 7, 8), (5, 8, 6), (1, 5, 6), (1, 6, 2)]
-        lines = [f"v {x} {y} {z}" for x, y, z in corners] + [f"f {a} {b} {c}" for a, b, c in faces]
-        path.write_text("\n".join(lines) + "\n")
-
-    def task(self, root):
-        return Task(object_id="cube", path=root / "toys" / "cube.obj", shown_path="toys/cube.obj")
-
-    def test_a_mesh_is_read_again_from_the_folder_of_the_meshes(self, root):
-        asset, details, stored = made(self.task(root))
-        again = objects.original(details, SEED, stored, root)
-        np.testing.assert_array_equal(again.parts[0].positions, asset.parts[0].positions)
-
-    def test_without_the_folder_or_the_file_the_error_names_the_option(self, root, tmp_path):
-        _, details, stored = made(self.task(root))
-        with pytest.raises(ValueError, match=r"^object cube was made from toys/cube.obj: [^\n]*--meshes$"):
-            objects.original(details, SEED, stored)
-        with pytest.raises(ValueError, match=r"cube.obj: the mesh of object cube is not there; [^\n]*--meshes$"):
-            objects.original(details, SEED, stored, tmp_path / "elsewhere")
-
-    def test_a_mesh_file_that_changed_is_refused(self, root):
-        _, details, stored = made(self.task(root))
-        self.write(root / "toys" / "cube.obj", 1.5)
-        with pytest.raises(ValueError, match="do not lie on the mesh"):
-            objects.original(details, SEED, stored, root)
+    _, details, stored = made(cube(tmp_path))
+    with pytest.raises(ValueError, match=r"^object cube was made from toys/cube.obj: [^\n]*--meshes$"):
+        objects.original(details, SEED, stored)
+    with pytest.raises(ValueError, match=r"cube.obj: the mesh of object cube is not there; [^\n]*--meshes$"):
+        objects.original(details, SEED, stored, tmp_path / "elsewhere")
+    write_cube(tmp_path / "toys" / "cube.obj", 1.5)
+    with pytest.raises(ValueError, match="do not lie on the mesh"):
+        objects.original(details, SEED, stored, tmp_path)

@@ -5,6 +5,7 @@ import pytest
 from support.handmade import BLUE, GREEN, GREY, RED, ball, box, checked_box_and_ball, plain
 
 from data_gen.render import views
+from spnr_jax.formats import data_sets
 from spnr_jax.formats.mesh import surface_points
 from spnr_jax.formats.mesh.assets import Asset, RejectedAsset
 
@@ -88,7 +89,7 @@ def test_condition_pixels_carry_the_reference_colour_and_hidden_points_leave_non
         for column, row in np.floor(views.project(pose, surface.positions[seen], CONFIG)).astype(int):
             expected[row, column] = True
         np.testing.assert_array_equal(conditions[view, ..., 3], 255 * expected)
-        reference = np.round(255 * views.on_white(images[view]))
+        reference = np.round(255 * data_sets.on_white(images[view]))
         np.testing.assert_array_equal(conditions[view, expected, :3], reference[expected])
         assert (conditions[view, ~expected] == 0).all()
         assert (images[view, expected, 3] > 0).mean() > 0.95

@@ -96,6 +96,7 @@ print(*image.mean(axis=(0, 1)))
 """
 
 
+@pytest.mark.ci
 def test_the_compiled_variant_sees_and_draws_what_the_scalar_one_does_with_other_scenes_alive():
     if choose_variant()[0] != LLVM:
         pytest.skip("needs an LLVM library that Mitsuba's compiled variant works with")

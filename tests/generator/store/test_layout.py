@@ -101,11 +101,11 @@ def test_an_object_that_fails_half_way_does_not_count_and_is_made_again(place, m
         storage.write_object_folder(
             f"{place}/objects", "made_up", {**files, "conditions/001.png": FullDisk(), "object.json": b""}
         )
-    assert layout.list_completed(place) == set()
+    assert storage.list_completed(place) == set()
     if not place.startswith("memory"):
         assert list(Path(place).rglob("*")) == [Path(place) / "objects"]
     layout.write_object(place, "made_up", made_up_record())
-    assert layout.list_completed(place) == {"made_up"}
+    assert storage.list_completed(place) == {"made_up"}
     assert {name.removeprefix("/objects/made_up/"): made for name, made in content(place).items()} == files
 
 
@@ -114,14 +114,14 @@ def test_a_finished_object_is_not_written_again(place):
     before = content(place)
     layout.write_object(place, "made_up", made_up_record(seed=1))
     assert content(place) == before
-    assert layout.list_completed(place) == {"made_up"}
-    assert layout.has_object(place, "made_up")
-    assert not layout.has_object(place, "other")
+    assert storage.list_completed(place) == {"made_up"}
+    assert storage.has_object(place, "made_up")
+    assert not storage.has_object(place, "other")
 
 
 def test_a_folder_that_is_no_object_is_in_the_way_and_said_to_be(tmp_path):
     (tmp_path / "objects/made_up/notes").mkdir(parents=True)
-    assert layout.list_completed(tmp_path) == set()
+    assert storage.list_completed(tmp_path) == set()
     with pytest.raises(ValueError, match="made_up is in the way"):
         layout.write_object(tmp_path, "made_up", made_up_record())
 
@@ -137,8 +137,8 @@ def test_unfinished_folders_of_the_dead_are_removed_and_those_of_the_living_stay
     long_ago = time.time() - 2 * storage.STALE
     for name in ("other-host-1-old", "odd"):
         os.utime(tmp_path / "objects" / f"{storage.UNFINISHED}{name}", (long_ago, long_ago))
-    assert layout.list_completed(tmp_path) == {"made_up"}
-    layout.remove_unfinished(tmp_path)
+    assert storage.list_completed(tmp_path) == {"made_up"}
+    storage.remove_unfinished(tmp_path)
     left = {path.name.removeprefix(storage.UNFINISHED) for path in (tmp_path / "objects").iterdir()}
     assert left == {"made_up", names[1], "other-host-1-new"}
 
