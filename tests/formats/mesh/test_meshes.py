@@ -58,12 +58,6 @@ class TestPlainFormats:
         np.testing.assert_array_equal(part.material.base_color, [0.5, 0.5, 0.5])
         assert (part.material.roughness, part.material.metallic) == (0.5, 0)
 
-    def test_face_colours_stay_on_their_faces(self, tmp_path):
-        mesh = trimesh.Trimesh(CORNERS, FACES, process=False, face_colors=[[255, 0, 0, 255], [0, 0, 255, 255]])
-        mesh.export(tmp_path / "a.ply")
-        (part,) = load_mesh(tmp_path / "a.ply").parts
-        np.testing.assert_array_equal(part.colors[part.faces], [[[1, 0, 0]] * 3, [[0, 0, 1]] * 3])
-
     @pytest.mark.parametrize("suffix", ["ply", "stl", "off", "obj", "gltf", "glb"])
     def test_noise_and_absent_files_are_refused_in_one_line(self, tmp_path, suffix):
         path = tmp_path / f"a.{suffix}"
