@@ -1,6 +1,5 @@
 """glTF files: geometry, transforms and materials against values that the tests write down themselves."""
 
-import base64
 
 import numpy as np
 import pytest
@@ -90,18 +89,6 @@ class TestGeometry:
         builder.mesh(primitive)
         (part,) = load_mesh(builder.write(tmp_path / "sparse.glb")).parts
         np.testing.assert_array_equal(part.positions, [*CORNERS[:2], [5, 6, 7], CORNERS[3]])
-
-    def test_gltf_with_files_beside_it_equals_the_packed_file(self, tmp_path):
-        builder = GltfBuilder()
-        texture = builder.texture(uri="my%20texture.png")
-        (tmp_path / "my texture.png").write_bytes(png(CHECKER))
-        material = builder.material(pbrMetallicRoughness={"baseColorTexture": {"index": texture}})
-        builder.mesh(builder.primitive(material=material, TEXCOORD_0=UV))
-        beside = load_mesh(builder.write(tmp_path / "beside.gltf"))
-        builder.document["images"][0] = {"uri": "data:image/png;base64," + base64.b64encode(png(CHECKER)).decode()}
-        packed = load_mesh(builder.write(tmp_path / "packed.glb"))
-        np.testing.assert_array_equal(beside.parts[0].positions, packed.parts[0].positions)
-        np.testing.assert_array_equal(beside.parts[0].material.base_color, packed.parts[0].material.base_color)
 
 
 def textured(uri):

@@ -7,7 +7,7 @@ import pytest
 from support import gltf_files
 from support.gltf_files import UV, GltfBuilder
 
-from spnr_jax.formats.mesh.assets import Asset, Material, Part, RejectedAsset
+from spnr_jax.formats.mesh.assets import Asset, Material, Part
 from spnr_jax.formats.mesh.meshes import load_mesh
 from spnr_jax.formats.mesh.surface_points import normalise, sample_surface, tilt_normals
 
@@ -32,21 +32,6 @@ class TestNormalise:
         np.testing.assert_allclose(corners.min(axis=0), -corners.max(axis=0), atol=1e-12)
         assert np.linalg.norm(np.ptp(corners, axis=0)) == pytest.approx(2)
         assert transform == {"centre": [11.5, 21.5, 32.0], "scale": pytest.approx(2 / np.sqrt(9 + 9 + 16))}
-
-    @pytest.mark.parametrize(
-        ("part", "reason"),
-        [
-            (replace(square(), faces=np.zeros((0, 3), np.int64)), "no faces"),
-            (square(0.0, (1, 2, 3)), "zero extent"),
-            (square(1.0, (0, np.inf, 0)), "not finite"),
-            (square(1.0, (np.nan, 0, 0)), "not finite"),
-        ],
-    )
-    def test_objects_without_a_box_are_refused(self, part, reason):
-        with pytest.raises(RejectedAsset, match=reason):
-            normalise(Asset(parts=(part,)))
-        with pytest.raises(RejectedAsset, match="no faces"):
-            normalise(Asset(parts=()))
 
 
 class TestSampleSurface:
