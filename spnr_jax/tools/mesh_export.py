@@ -13,6 +13,8 @@ ramp, so the surface stays one mesh whose faces share their vertices, with one m
 Coordinates are those of the file that the points came from, whatever its upward axis.
 """
 
+import json
+import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -27,7 +29,6 @@ from scipy.spatial import cKDTree
 from spnr_jax.errors import UserError
 from spnr_jax.formats import images
 from spnr_jax.formats.clouds import PlacedCloud
-from spnr_jax.formats.glb import Buffer
 from spnr_jax.kernels.records import AnyArray, Camera, Volume
 from spnr_jax.method.model import Model
 from spnr_jax.surfels.gaussians import View, nearest_around
@@ -108,7 +109,8 @@ def _solid(
 SURFACE = 0.5  # solidity
 NEAREST = 4  # points whose materials a vertex takes the mean of
 RAMP = 52  # texels along each side of the ramp: steps of 5 in 8 bits, so what lies between them is exact
-ARRAY_BUFFER, INDEX_BUFFER, LINEAR, CLAMPED = 34962, 34963, 9729, 33071  # numbers of the glTF specification
+ARRAY_BUFFER, INDEX_BUFFER, FLOAT, UNSIGNED = 34962, 34963, 5126, 5125  # numbers of the glTF specification
+LINEAR, CLAMPED = 9729, 33071
 
 
 class Solid(NamedTuple):
@@ -182,23 +184,42 @@ def ramp() -> Float[np.ndarray, "metallic roughness 3"]:
 
 
 def glb(arrays: dict[str, np.ndarray], indices: np.ndarray, translation: np.ndarray) -> bytes:
-    """A binary glTF 2.0 file of one mesh; vertex colours are linear, as glTF has them."""
-    buffer = Buffer()
-    primitive = {
-        "attributes": buffer.attributes(arrays, target=ARRAY_BUFFER),
-        "indices": buffer.accessor(indices, target=INDEX_BUFFER),
-        "material": 0,
-    }
+    """A binary glTF 2.0 file of one mesh of float32 columns and uint32 indices; vertex colours are linear, as in glTF.
+
+    Its only buffer holds the columns, the indices and the picture of the ramp, in this order.
+    """
+    stored = [*arrays.values(), indices]
+    pieces = [array.tobytes() for array in stored] + [images.png(ramp())]
+    views, content = [], b""
+    for number, piece in enumerate(pieces):
+        views.append({"buffer": 0, "byteOffset": len(content), "byteLength": len(piece)})
+        if number < len(stored):
+            views[-1]["target"] = ARRAY_BUFFER if number < len(arrays) else INDEX_BUFFER
+        content += piece + bytes(-len(piece) % 4)
+    accessors: list[dict] = [
+        {"bufferView": number, "componentType": FLOAT, "count": len(array), "type": f"VEC{array.shape[1]}"}
+        for number, array in enumerate(arrays.values())
+    ]
+    position = arrays["POSITION"]
+    accessors[0] |= {"min": position.min(axis=0).tolist(), "max": position.max(axis=0).tolist()}
+    accessors += [{"bufferView": len(arrays), "componentType": UNSIGNED, "count": len(indices), "type": "SCALAR"}]
+    numbers = {name: number for number, name in enumerate(arrays)}
     shine = {"metallicRoughnessTexture": {"index": 0}, "metallicFactor": 1, "roughnessFactor": 1}
     document = {
         "asset": {"version": "2.0", "generator": "spnr_jax"},
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0} | ({"translation": translation.tolist()} if translation.any() else {})],
-        "meshes": [{"primitives": [primitive]}],
+        "meshes": [{"primitives": [{"attributes": numbers, "indices": len(arrays), "material": 0}]}],
         "materials": [{"pbrMetallicRoughness": shine}],
         "textures": [{"source": 0, "sampler": 0}],
-        "images": [{"bufferView": buffer.view(images.png(ramp())), "mimeType": "image/png"}],
+        "images": [{"bufferView": len(views) - 1, "mimeType": "image/png"}],
         "samplers": [{"magFilter": LINEAR, "minFilter": LINEAR, "wrapS": CLAMPED, "wrapT": CLAMPED}],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": len(content)}],
     }
-    return buffer.glb(document)
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(content), b"BIN\0") + content
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
