@@ -2,6 +2,7 @@
 
 import io
 import pickle
+import time
 import zipfile
 
 import numpy as np
@@ -216,6 +217,22 @@ def test_every_bad_file_is_one_line_that_names_it_and_the_reason(tmp_path, name,
         read_cloud(path)
     assert str(caught.value).startswith(f"{path}: ")
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "data"),
+    [
+        ("a.txt", "1;2;3\n" + "9" * 200_000 + "x;2;3\n"),
+        ("a.txt", "x;y;z;" + "(" * 200_000 + "\n1;2;3\n"),
+        ("a.obj", "\n" * 200_000 + "v 1 2 3\n"),
+    ],
+    ids=["digits", "brackets", "empty lines"],
+)
+def test_a_line_of_any_length_is_refused_in_seconds(tmp_path, name, data):
+    begin = time.process_time()
+    with pytest.raises(ValueError, match="line 2|above 3 columns|1 place"):
+        read_cloud(write(tmp_path, name, data))
+    assert time.process_time() - begin < 10
 
 
 def test_a_data_set_with_a_broken_row_is_refused():

@@ -44,7 +44,7 @@ Read = Callable[[str], bytes]  # the bytes of a companion file, by its name in t
 Library = dict[str, dict[str, str]]  # material name -> keyword in lower case -> rest of the line
 MAPS = ("map_kd", "map_pr", "map_pm", "map_d")
 DEFAULTS = ("s", (1.0, 1.0)), ("o", (0.0, 0.0))  # of options of maps: scale and offset of u and v
-OPTION = re.compile(r"-(\w+)((?:\s+(?:on|off|[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)(?=\s))*)\s+")
+OPTION = re.compile(r"-(\w+)((?:\s+(?:on|off|[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?)(?=\s))*)\s+")
 
 
 class Text(NamedTuple):
@@ -105,7 +105,7 @@ def load_obj(path: Path, root: Path | None = None, transparent_parts: Transparen
 
 def obj_points(path: Path) -> Columns | None:
     """The columns of the vertices of a file without faces; None if it has some."""
-    if re.search(rb"(?m)^\s*f\s", path.read_bytes()):
+    if re.search(rb"(?m)^[ \t]*f[ \t]", path.read_bytes()):
         return None
     text = _parse(path)
     if not text.rows["v"]:

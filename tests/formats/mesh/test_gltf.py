@@ -1,6 +1,5 @@
 """glTF files: geometry, transforms and materials against values that the tests write down themselves."""
 
-
 import numpy as np
 import pytest
 from support.gltf_files import CHECKER, CORNERS, SQUARE, UV, GltfBuilder, one_square, png
