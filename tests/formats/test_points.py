@@ -119,6 +119,8 @@ def test_points_that_are_called_compressed_and_stored_as_they_are_are_read(tmp_p
 def test_decompress_inverts_lzf(pieces):
     data = b"".join(pieces)
     assert decompress(compress(data), len(data)) == data
+    for size in range(3, 9):  # copies of the last three bytes, which may reach into themselves
+        assert decompress(b"\2abc" + bytes([size - 2 << 5, 2]), 3 + size) == (b"abc" * 4)[: 3 + size]
 
 
 @settings(max_examples=200, deadline=None)
