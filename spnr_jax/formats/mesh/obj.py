@@ -48,8 +48,9 @@ OPTION = re.compile(r"-(\w+)((?:\s+(?:on|off|[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE]
 
 
 class Text(NamedTuple):
-    """An OBJ file: what stands behind v, vt and vn; words for the corners of faces, which count from 1, and for each
-    face its number of corners and its material; libraries.
+    """An OBJ file: rows behind v, vt and vn; the corners of all faces; size and material of each face; libraries.
+
+    A corner is a word like 1/2/3: numbers of rows, from 1.
     """
 
     rows: dict[str, list[str]]
@@ -162,27 +163,26 @@ def _parts(text: Text, columns: Columns, colors: np.ndarray | None, looks: dict[
     corners = np.array([[int(n or 0) for n in f"{word}//".split("/")[:3]] for word in numbers])  # of vertices
     if corners.min() < 0 or corners[:, 0].min() < 1:
         raise RejectedAsset("has faces that name vertices before the first: broken file")
-    of_v, of_vt, of_vn = corners.T - 1
-    positions = stack_columns(columns)[of_v]
+    positions = stack_columns(columns)[corners[:, 0] - 1]
     faces, owner = triangulate(positions, np.array([numbers[word] for word in text.corners]), text.sizes)
     number = {name: i for i, name in enumerate(looks)}
     _, has_texcoords, has_normals = (corners[faces] > 0).all(axis=1).T
     kind = 4 * np.array([number[name] for name in text.used])[owner] + 2 * has_texcoords + has_normals
+    texcoords, normals = _table(text.rows["vt"], 2), _table(text.rows["vn"], 3)
     parts = []
     for code in np.unique(kind):
         look = list(looks.values())[code // 4]
         if look.nowhere:
             continue
-        texcoords = None
-        if code & 2:
-            u, v = (_table(text.rows["vt"], 2)[of_vt] * look.placement.scale + look.placement.offset).T
-            texcoords = np.stack([u, 1 - v], axis=-1)  # OBJ counts v from the lower edge
+        used, own = np.unique(faces[kind == code], return_inverse=True)
+        of_v, of_vt, of_vn = corners[used].T - 1
+        uv = texcoords[of_vt] * look.placement.scale + look.placement.offset if code & 2 else None
         part = Part(
-            positions=positions,
-            faces=faces[kind == code],
+            positions=positions[used],
+            faces=own.reshape(-1, 3),
             material=look.material,
-            normals=_table(text.rows["vn"], 3)[of_vn] if code & 1 else None,
-            texcoords=texcoords,
+            normals=normals[of_vn] if code & 1 else None,
+            texcoords=None if uv is None else np.stack([uv[:, 0], 1 - uv[:, 1]], axis=-1),  # v is from the lower edge
             colors=None if colors is None else colors[of_v],
         )
         parts.append(part)
