@@ -7,10 +7,10 @@ import pytest
 from PIL import Image, features
 from support.gltf_files import CHECKER, CORNERS, SQUARE, UV, GltfBuilder, one_square, textured_square
 
+from spnr_jax.formats.columns import srgb_to_linear
 from spnr_jax.formats.mesh.gltf_materials import metallic_roughness
 from spnr_jax.formats.mesh.meshes import load_mesh
 from spnr_jax.formats.mesh.surface_points import sample_surface
-from spnr_jax.formats.mesh.texels import srgb_to_linear
 
 LINEAR = srgb_to_linear(CHECKER / 255)
 

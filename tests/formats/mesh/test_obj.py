@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from support.gltf_files import png
 
+from spnr_jax.formats.columns import srgb_to_linear
 from spnr_jax.formats.mesh.assets import RejectedAsset
 from spnr_jax.formats.mesh.meshes import load_mesh
-from spnr_jax.formats.mesh.texels import srgb_to_linear
 
 SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
 UV = "vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"

@@ -7,11 +7,12 @@ import pytest
 from support.gltf_files import CORNERS, SQUARE, UV, GltfBuilder
 from support.packed_meshes import ETC1S_ALPHA, MESHOPT, UASTC
 
+from spnr_jax.formats.columns import srgb_to_linear
 from spnr_jax.formats.mesh import gltf_materials
 from spnr_jax.formats.mesh.assets import RejectedAsset
 from spnr_jax.formats.mesh.gltf_container import DRACO, unpack
 from spnr_jax.formats.mesh.meshes import load_mesh
-from spnr_jax.formats.mesh.texels import KTX2_PACKAGE, read_image, srgb_to_linear
+from spnr_jax.formats.mesh.texels import KTX2_PACKAGE, read_image
 
 ROUNDED = {"directions in 8 bytes": "<i2"}  # the only one in which the last bit is a matter of rounding
 COLORS = np.array([[255, 0, 51], [255, 0, 51], [0, 255, 0], [0, 0, 255]], np.uint8)
