@@ -15,9 +15,8 @@ Coordinates are those of the file that the points came from, whatever its upward
 
 import json
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -29,7 +28,7 @@ from scipy.spatial import cKDTree
 from spnr_jax.errors import UserError
 from spnr_jax.formats import images
 from spnr_jax.formats.clouds import PlacedCloud
-from spnr_jax.kernels.records import AnyArray, Camera, Volume
+from spnr_jax.kernels.records import Camera, Volume
 from spnr_jax.method.model import Model
 from spnr_jax.surfels.gaussians import View, nearest_around
 from spnr_jax.tools import splat_making
@@ -52,34 +51,24 @@ class Grid:
     origin: np.ndarray
 
 
-def over_box(
-    value: Callable[[Float[np.ndarray, "places 3"]], Float[AnyArray, " places"]],
-    volume: Volume,
-    placed: PlacedCloud,
-    resolution: int,
-) -> Grid:
-    """The values of a function of places in the box, `resolution` along each side; it gets a plane at a time."""
+def solidity(views: Sequence[View], volume: Volume, placed: PlacedCloud, resolution: int = GRID) -> Grid:
+    """0 outside, 1 inside, 1/2 on the surface, with `resolution` places along each side of the box."""
+    cameras = jax.tree.map(lambda *x: jnp.stack(x), *(view.camera for view in views))
+    depth = jnp.stack([nearest_around(view.depth).astype(np.float32) for view in views])
+    band = jnp.float32(BAND * 2 / (resolution - 1))
     steps = np.linspace(-1, 1, resolution, dtype=np.float32)
     plane = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2)
     rotation, scale = placed.rotation.astype(np.float32), float(volume.scale)
     values = np.empty((resolution,) * 3, np.float32)
-    for i, x in enumerate(steps):
+    for i, x in enumerate(steps):  # a plane at a time
         places = np.concatenate([np.full_like(plane[:, :1], x), plane], axis=-1) @ rotation.T
-        values[i] = np.asarray(value(places)).reshape(resolution, resolution)
+        values[i] = np.asarray(_solid(cameras, depth, band, places)).reshape(resolution, resolution)
     return Grid(
         values=values,
         lowest=placed.rotation.T @ np.asarray(volume.centre, np.float64) - 1 / scale,
         spacing=2 / (resolution - 1) / scale,
         origin=placed.origin,
     )
-
-
-def solidity(views: Sequence[View], volume: Volume, placed: PlacedCloud, resolution: int = GRID) -> Grid:
-    """0 outside, 1 inside, 1/2 on the surface, with `resolution` places along each side of the box."""
-    cameras = jax.tree.map(lambda *x: jnp.stack(x), *(view.camera for view in views))
-    depth = jnp.stack([nearest_around(view.depth).astype(np.float32) for view in views])
-    band = jnp.float32(BAND * 2 / (resolution - 1))
-    return over_box(partial(_solid, cameras, depth, band), volume, placed, resolution)
 
 
 @jax.jit
@@ -136,6 +125,8 @@ def mesh_of(grid: Grid, placed: PlacedCloud) -> Solid:
     """The surface of a grid of solidity, 0 outside to 1 inside; ValueError if there is none."""
     from skimage.measure import marching_cubes  # here, so that rendering alone stays quick
 
+    from spnr_jax.formats.mesh.surface_points import vertex_normals
+
     if not grid.values.max() > SURFACE:
         raise UserError("no surface to write as a mesh: the network's pictures show nothing solid")
     closed = np.pad(grid.values, 1)  # the surface is closed also where it meets the box
@@ -149,25 +140,12 @@ def mesh_of(grid: Grid, placed: PlacedCloud) -> Solid:
     color, roughness, metallic = (m[nearest].mean(axis=1) for m in (cloud.base_color, cloud.roughness, cloud.metallic))
     columns = {
         "POSITION": vertices,
-        "NORMAL": normals_of(vertices, faces),
+        "NORMAL": vertex_normals(vertices, faces),
         "COLOR_0": color,
         "TEXCOORD_0": (np.stack([roughness, metallic], axis=-1) * (RAMP - 1) + 0.5) / RAMP,
     }
     arrays = {name: np.asarray(values, np.float32) for name, values in columns.items()}
     return Solid(glb(arrays, faces.astype(np.uint32).ravel(), grid.origin), len(faces), is_closed(faces))
-
-
-def normals_of(
-    vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
-) -> Float[np.ndarray, "vertices 3"]:
-    """Unit normals of vertices, the mean of those of the faces around them by area; where that is nothing, up."""
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    of_face = np.cross(b - a, c - a)
-    normals = np.zeros(vertices.shape)
-    for corner in faces.T:
-        normals += np.stack([np.bincount(corner, x, len(vertices)) for x in of_face.T], axis=-1)
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
-    return np.where(length > 0, normals / np.where(length > 0, length, 1), [0.0, 1.0, 0.0])
 
 
 def is_closed(faces: Int[np.ndarray, "faces 3"]) -> bool:
