@@ -25,7 +25,6 @@ import pytest
 from killable import (
     CHECKPOINT_EVERY,
     QUICK_COMPILATION,
-    Ended,
     Training,
     batches,
     checkpoint_steps,
@@ -37,7 +36,6 @@ from support import tiny_dataset
 from support.tiny_dataset import CONFIG
 
 from spnr_jax import cli
-from spnr_jax.formats import data_sets
 from spnr_jax.training import checkpoint, trainer
 
 KILLS = int(os.environ.get("CHAOS_KILLS", "1"))  # of each phase
@@ -154,32 +152,11 @@ def on_disk(script: str, room: int) -> Inject:
     return inject
 
 
-def damaged(change: Callable[[bytes], bytes]) -> Inject:
-    """The newest checkpoint, each of its files changed."""
-
-    def inject(training: Training, run: Path) -> Seen:
-        for path in (run / "checkpoints" / str(checkpoint_steps(run)[0])).rglob("*"):
-            if path.is_file():
-                path.write_bytes(change(path.read_bytes()))
-        return called(training, run)
-
-    return inject
-
-
 def cut_log(training: Training, run: Path) -> Seen:
     """A metrics file that ends in the middle of a row, as a power cut leaves it."""
     path = run / "metrics.jsonl"
     path.write_bytes(path.read_bytes()[:-40])
     return called(training, run)
-
-
-def lost_picture(training: Training, run: Path) -> Seen:
-    """A picture of each object that was deleted from the data set."""
-    folder = run.with_name(f"{run.name}-data")
-    shutil.copytree(training.data, folder)
-    for name in data_sets.open_dataset(folder).splits["train"]:
-        (folder / "objects" / name / "images" / "001.png").unlink()
-    return called(replace(training, data=folder), run)
 
 
 def other_version(training: Training, run: Path) -> Seen:
@@ -193,28 +170,6 @@ def other_version(training: Training, run: Path) -> Seen:
     return seen if kept else replace(seen, code=-1)
 
 
-def other_config(training: Training, run: Path) -> Seen:
-    """A config with an entry that this version does not know."""
-    path = run / "config.json"
-    mine = path.read_text()
-    path.write_text(mine.replace("{", '{"from_the_future": 1, ', 1))
-    seen = called(training, run)
-    path.write_text(mine)
-    return seen
-
-
-def two_trainers(training: Training, run: Path) -> Seen:
-    """A second process that trains in the same folder while the first is in its steps."""
-    second: list[Ended] = []
-
-    def start_second(event) -> None:
-        if event.phase == "step" and not second:
-            second.append(training.run(run))
-
-    first = training.run(run, aim=start_second)
-    return Seen(code=second[0].code if first.code == 0 else -1, output=second[0].output)
-
-
 STOPPED = r"spnr: stopped at step \d+ of \d+; the same command goes on"
 FAULTS: dict[str, tuple[Inject, int, str]] = {  # exit code and line to be seen
     "SIGTERM in a step": (stopped_by(signal.SIGTERM, "step"), 130, STOPPED),
@@ -223,13 +178,8 @@ FAULTS: dict[str, tuple[Inject, int, str]] = {  # exit code and line to be seen
     "disk full from the start": (on_disk(FULL, 0), 2, "spnr: .*No space left on device"),
     "disk full at a checkpoint": (on_disk(FULL, 200), 2, "spnr: checkpoint .* cannot be written .No space left"),
     "read-only folder": (on_disk(READ_ONLY, 0), 2, "spnr: .*Read-only file system"),
-    "newest checkpoint half written": (damaged(lambda b: b[: len(b) // 2]), 0, "is damaged .*trying the one before"),
-    "newest checkpoint overwritten": (damaged(lambda b: b"\xff" * len(b)), 0, "is damaged .*trying the one before"),
     "metrics file cut off in a row": (cut_log, 0, "trained"),
-    "picture deleted from the data": (lost_picture, 2, r"spnr: .*001\.png: cannot be read"),
     "checkpoint of another version": (other_version, 2, "spnr: checkpoint .* is of another version"),
-    "config of another version": (other_config, 2, "spnr: .*config.json: not a config of this version"),
-    "two trainers in one folder": (two_trainers, 2, "spnr: .*another process trains in this folder"),
 }
 
 
