@@ -221,17 +221,17 @@ def test_rows_without_finite_numbers_are_left_out_while_a_big_file_is_thinned(tm
 
 def scene(folder, origin=(0.0, 0.0, 0.0)):
     """A file of a large and a small ball, and one point far from both."""
-    points = [spiral(3000), 0.3 * spiral(1500) + [2, 0, 0], [[0, 4, 0]]]
+    points = [spiral(900), 0.3 * spiral(450) + [2, 0, 0], [[0, 4, 0]]]
     np.save(folder / "a.npy", np.concatenate(points) + origin)
     return folder / "a.npy"
 
 
 def test_a_box_is_in_the_units_and_axes_of_the_file_however_far_it_lies(tmp_path, monkeypatch):
-    monkeypatch.setattr(clouds, "CAPACITY", 1600)  # it is cut before the file is thinned while reading
+    monkeypatch.setattr(clouds, "CAPACITY", 480)  # it is cut before the file is thinned while reading
     box = tuple(map(float, (*(FAR + [1.001, -1, -1]), *(FAR + [3, 1, 1]))))
     lines: list[str] = []
     placed = place_cloud(scene(tmp_path, FAR), up="z", cut=Cut(crop=box), report=lines.append)
-    assert "--crop: 1,500 of 4,501 points lie inside" in lines
+    assert "--crop: 450 of 1,351 points lie inside" in lines
     assert not any("while reading" in line for line in lines)
     back = placed.cloud.positions @ placed.rotation + placed.origin
     assert np.all((back > box[:3]) & (back < box[3:]))
@@ -241,13 +241,14 @@ def test_objects_are_cut_out_before_they_are_cleaned_and_thinned(tmp_path):
     cloud, lines = read(scene(tmp_path), cut=Cut(object="2"), clean="auto", num_points=200)
     assert np.linalg.norm(cloud.positions - [2, 0, 0], axis=1).max() < 0.31
     assert [line.split()[0] for line in lines if not line.startswith("no ")] == ["--object:", "200"]
-    assert len(read_cloud(scene(tmp_path), cut=Cut(object="largest")).positions) == 3000
+    assert len(read_cloud(scene(tmp_path), cut=Cut(object="largest")).positions) == 900
     whole, lines = read(scene(tmp_path), clean="auto", num_points=50)
     assert np.abs(whole.positions).max() <= 2.31
-    assert lines[-2:] == ["removed 1 outliers of 4,501 points", "50 of 4500 points kept, evenly spread"]
+    assert lines[-2:] == ["removed 1 outliers of 1,351 points", "50 of 1350 points kept, evenly spread"]
 
 
-def test_a_box_and_an_object_are_cut_out_of_a_mesh(tmp_path):
+def test_a_box_and_an_object_are_cut_out_of_a_mesh(tmp_path, monkeypatch):
+    monkeypatch.setattr(clouds, "CUT_MESH", 2**12)
     triangle = "v {0} 0 0\nv {1} 0 0\nv {0} 1 0\n"
     (tmp_path / "a.obj").write_text(triangle.format(0, 1) + triangle.format(5, 7) + "f 1 2 3\nf 4 5 6\n")
     for cut in (Cut(crop=(-1.0, -1.0, -1.0, 2.0, 2.0, 2.0)), Cut(object="2")):
