@@ -1,7 +1,7 @@
 """Point clouds from files: one path, for points and for meshes.
 
     open        raw columns by the names that the file gives, positions in float64 (point_files.py, mesh/)
-    interpret   colours, materials, normals, opacity, classes (columns.py, mesh/file_colors.py, sensor.py)
+    interpret   colours, materials, normals, opacity, classes (columns.py, orientation.py)
     cut         a box, without the dominant plane, one cluster
     merge       equal and nearly equal points; what then is no surface is refused
     clean, thin outliers and noise; evenly spread points

@@ -1,16 +1,19 @@
-"""What the columns of a file mean: names in common use, and defaults for what is missing.
+"""What the columns of a file mean, of points and of meshes alike: names in common use, ranges, and defaults.
 
 `useful` renames the columns that matter to
 
     x y z                           position
-    base_color_r ...                base colour, linear; red green blue: sRGB; rgb, rgba: packed (mesh/file_colors.py)
+    base_color_r ...                base colour, linear; red green blue: sRGB; rgb, rgba: packed
     roughness metallic              in [0, 1]
     nx ny nz                        normal, of any length
     intensity                       of a laser's echo, shown as grey where there is no colour
     alpha opacity splat_opacity     how much a point hides; the last of Gaussian splats
     classification withheld         of laser scans
 
-and drops the others.
+and drops the others.  Colours are sRGB unless the name says that they are linear.  Their range is that of the type for
+8-bit integers; of other numbers it is the first of 1, 255, 1023, 4095 and 65535 that nearly all of them keep to: some
+writers put 8-bit or 12-bit colours into 16-bit fields, or 0 to 255 into floats, and a single stray value must not turn
+the rest black.
 """
 
 from collections.abc import Callable
@@ -18,77 +21,80 @@ from collections.abc import Callable
 import numpy as np
 
 from spnr_jax.errors import UserError
-from spnr_jax.formats.mesh import file_colors as colors
-from spnr_jax.formats.mesh.texels import srgb_to_linear
+from spnr_jax.kernels.cloud_arrays import stack_columns
 from spnr_jax.surfels.gaussians import C0
 
 Columns = dict[str, np.ndarray]
 Report = Callable[[str], None]
 
-POSITION = ("x", "y", "z")
-NORMAL = ("nx", "ny", "nz")
+POSITION, NORMAL = ("x", "y", "z"), ("nx", "ny", "nz")
+LINEAR, SRGB = ("base_color_r", "base_color_g", "base_color_b"), ("red", "green", "blue")
 SPLAT = ("f_dc_0", "f_dc_1", "f_dc_2")  # the constant spherical-harmonic coefficients: sRGB = 0.5 + C0 * f_dc
 PREFIX = "scalar_"  # CloudCompare's, for everything but positions and colours
-ALIASES = (  # groups that stand for each other: the first that is there counts
+ALIASES = (  # ours first, then what stands for it: the first group that is there counts
     (
-        POSITION,
-        (
-            POSITION,
-            ("points:0", "points:1", "points:2"),
-            ("points_0", "points_1", "points_2"),
-            ("pos_x", "pos_y", "pos_z"),
-            ("easting", "northing", "elevation"),
-            ("easting", "northing", "height"),
-        ),
+        *("x y z", "points:0 points:1 points:2", "points_0 points_1 points_2", "pos_x pos_y pos_z"),
+        *("easting northing elevation", "easting northing height"),
     ),
-    (colors.LINEAR, colors.LINEAR_NAMES),
-    (colors.SRGB, colors.SRGB_NAMES),
-    (("rgb",), (("rgb",),)),
-    (("rgba",), (("rgba",),)),
-    (NORMAL, (NORMAL, ("normal_x", "normal_y", "normal_z"), ("normalx", "normaly", "normalz"))),
-    (("roughness",), (("roughness",), ("rough",), ("roughness_factor",), ("pbr_roughness",))),
-    (("metallic",), (("metallic",), ("metalness",), ("metallic_factor",), ("metal",), ("pbr_metallic",))),
-    (("intensity",), (("intensity",), ("reflectance",))),
-    (("alpha",), (("alpha",), ("a",), ("diffuse_alpha",), ("color_a",))),
-    *(((name,), ((name,),)) for name in ("opacity", "splat_opacity", "classification", "withheld")),
+    (
+        *("base_color_r base_color_g base_color_b", "base_color_red base_color_green base_color_blue"),
+        *("basecolor_r basecolor_g basecolor_b", "albedo_r albedo_g albedo_b"),
+    ),
+    (
+        *("red green blue", "r g b", "diffuse_red diffuse_green diffuse_blue", "diffuse_r diffuse_g diffuse_b"),
+        *("rf gf bf", "color_r color_g color_b", "color_red color_green color_blue"),
+    ),
+    ("nx ny nz", "normal_x normal_y normal_z", "normalx normaly normalz"),
+    ("roughness", "rough", "roughness_factor", "pbr_roughness"),
+    ("metallic", "metalness", "metallic_factor", "metal", "pbr_metallic"),
+    ("intensity", "reflectance"),
+    ("alpha", "a", "diffuse_alpha", "color_a"),
+    *((name,) for name in ("rgb", "rgba", "opacity", "splat_opacity", "classification", "withheld")),
 )
 DEFAULTS = {"base_color": 0.5, "roughness": 0.5, "metallic": 0.0}
+SCALES = (255.0, 1023.0, 4095.0, 65535.0)
+ROUNDING = 1e-4  # values this far outside [0, 1] are taken for rounded ones
+STRAYS, LEAST = 1000, 100  # one value of so many may leave the range, of so many at least
+DARK, MOSTLY = 0.03, 0.98  # sRGB that looks black; share of the colours that is worth a line
 BRIGHTEST = 0.99  # quantile of the intensities that is shown white
 SHORTEST = 1e-30  # normal that still has a direction
 FOG, INVISIBLE = 0.2, 0.02  # least opacity of splats, below which they are fog, and of other points
 NOISE_CLASSES = (7, 18)  # low and high noise (ASPRS LAS 1.4 R15, table 17)
 
 
-def useful(columns: Columns) -> Columns:
-    """The columns that matter, under their one name; ValueError if there are no positions."""
+def rename(columns: Columns) -> Columns:
+    """The columns that matter, under their one name; packed colours are numbers of at least four bytes."""
     plain = {name.strip().removeprefix(PREFIX): values for name, values in columns.items()} | columns
     found: Columns = {}
-    for names, groups in ALIASES:
-        group = colors.find(plain, groups)
-        found |= {name: plain[alias] for name, alias in zip(names, group, strict=bool(group))}
+    for group in ALIASES:
+        names = next((names.split() for names in group if set(names.split()) <= plain.keys()), [])
+        found |= dict(zip(group[0].split(), (plain[name] for name in names), strict=False))
+    if set(SPLAT) <= plain.keys():
+        for name, constant in zip(SRGB, SPLAT, strict=True):
+            found[name] = np.clip(0.5 + C0 * np.asarray(plain[constant], np.float64), 0, 1)
+        if "opacity" in found:
+            found["splat_opacity"] = found.pop("opacity")
+    return {name: x for name, x in found.items() if name not in ("rgb", "rgba") or x.dtype.itemsize >= 4}
+
+
+def useful(columns: Columns) -> Columns:
+    """The columns of points that matter, under their one name; ValueError if there are no positions."""
+    found = rename(columns)
     if not set(POSITION) <= found.keys():
         raise UserError(
             "needs the properties x y z (and may have red green blue, roughness, metallic); "
             f"found {' '.join(columns) or 'none'}"
         )
-    if set(SPLAT) <= plain.keys():
-        sharp = {
-            name: 0.5 + C0 * np.asarray(plain[dc], np.float64) for name, dc in zip(colors.SRGB, SPLAT, strict=True)
-        }
-        found |= {name: np.clip(values, 0, 1) for name, values in sharp.items()}
-        if "opacity" in found:
-            found["splat_opacity"] = found.pop("opacity")
     return found
 
 
 def sound(columns: Columns) -> np.ndarray:
     """Mask (points,) of rows whose position, colour, opacity and materials are numbers that float32 holds."""
-    names = (*POSITION, *colors.LINEAR, *colors.SRGB, "roughness", "metallic", "alpha", "opacity", "splat_opacity")
+    names = (*POSITION, *LINEAR, *SRGB, "roughness", "metallic", "alpha", "opacity", "splat_opacity")
     largest = np.finfo(np.float32).max
     mask = np.ones(len(columns["x"]), bool)
-    for name in names:
-        if name in columns:
-            mask &= np.abs(np.asarray(columns[name], np.float64)) < largest
+    for name in columns.keys() & set(names):
+        mask &= np.abs(np.asarray(columns[name], np.float64)) < largest
     return mask
 
 
@@ -97,16 +103,14 @@ def keep_visible(columns: Columns, keep_noise: bool, report: Report) -> Columns:
 
     With `keep_noise` all of them; a line about each kind that is left out.
     """
-    left_out = {
-        "opacity near 0": _invisible(columns, report),
-        "noise in their classification (7, 18)": np.isin(columns["classification"], NOISE_CLASSES)
-        if "classification" in columns
-        else None,
-        "withheld by the scanner's software": columns["withheld"] != 0 if "withheld" in columns else None,
-    }
+    left_out = {"opacity near 0": _invisible(columns)}
+    if "classification" in columns:
+        left_out["noise in their classification (7, 18)"] = np.isin(columns["classification"], NOISE_CLASSES)
+    if "withheld" in columns:
+        left_out["withheld by the scanner's software"] = columns["withheld"] != 0
     wanted = np.ones(len(columns["x"]), bool)
     for reason, mask in left_out.items():
-        if mask is None or keep_noise or not mask.any():
+        if keep_noise or not mask.any():
             continue
         if mask.all():
             report(f"all points are {reason}: kept")
@@ -116,22 +120,20 @@ def keep_visible(columns: Columns, keep_noise: bool, report: Report) -> Columns:
     return columns if wanted.all() else {name: column[wanted] for name, column in columns.items()}
 
 
-def _invisible(columns: Columns, report: Report) -> np.ndarray | None:
-    """True for points that hide next to nothing; None where the file does not say so, or says it of all."""
+def _invisible(columns: Columns) -> np.ndarray:
+    """True for points that hide next to nothing; for none where the file does not say so, or says it of all."""
     if "splat_opacity" in columns:
         values = np.asarray(columns["splat_opacity"], np.float64)
         if values.min(initial=0) >= 0 and values.max(initial=0) <= 1:
             return values < FOG
         return values < np.log(FOG / (1 - FOG))  # as Kerbl et al. write it, before the logistic function
     if "alpha" not in columns and "rgba" in columns:
-        columns["alpha"] = colors.unpack(columns["rgba"])[:, 3]
-    name = next((name for name in ("alpha", "opacity") if name in columns), None)
-    if name is None or not len(columns[name]):
-        return None
-    highest = float(columns[name].max())
+        columns["alpha"] = _unpack(columns["rgba"])[:, 3]
+    values = columns.get("alpha", columns.get("opacity", np.zeros(len(columns["x"]))))
+    highest = float(values.max(initial=0))
     if not highest > 0:  # as packed colours have it where nobody wrote one
-        return None
-    return columns[name] < INVISIBLE * colors.full_scale(columns[name].dtype, max(1.0, highest), highest < 2)
+        return np.zeros(len(values), bool)
+    return values < INVISIBLE * full_scale(values.dtype, max(1.0, highest), highest < 2)
 
 
 def materials(columns: Columns, report: Report) -> dict[str, np.ndarray]:
@@ -158,7 +160,7 @@ def normals(columns: Columns) -> np.ndarray | None:
     """Normals (points, 3) of unit length, 0 where a row has none that can be used; None if no row has one."""
     if not set(NORMAL) <= columns.keys() or any(columns[name].dtype.kind == "u" for name in NORMAL):
         return None  # numbers without a sign encode a normal in some way of their own
-    vectors = np.stack([np.asarray(columns[name], np.float64) for name in NORMAL], axis=-1)
+    vectors = stack_columns(columns, NORMAL)
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     usable = np.isfinite(length) & (length > SHORTEST)
     return np.where(usable, vectors / np.where(usable, length, 1), 0) if usable.any() else None
@@ -166,10 +168,10 @@ def normals(columns: Columns) -> np.ndarray | None:
 
 def _base_color(columns: Columns, report: Report) -> np.ndarray | None:
     """Linear base colours (points, 3) from the columns that hold some, None if there are none."""
-    group = colors.find(columns, (colors.LINEAR, colors.SRGB))
     # a lidar's record has colours whether or not it saw them
-    unseen = group == colors.SRGB and "intensity" in columns and not any(columns[name].any() for name in group)
-    if not unseen and (found := colors.colors_of(columns)) is not None:
+    sharp = set(SRGB) <= columns.keys() and not set(LINEAR) <= columns.keys()
+    unseen = sharp and "intensity" in columns and not any(columns[name].any() for name in SRGB)
+    if not unseen and (found := colors_of(columns)) is not None:
         for line in found[1]:
             report(line)
         return found[0]
@@ -187,8 +189,79 @@ def _base_color(columns: Columns, report: Report) -> np.ndarray | None:
 
 def _unit_interval(values: np.ndarray, name: str) -> np.ndarray:
     """Roughness or metallic in [0, 1], rounding errors removed; ValueError if they are not."""
-    scaled = values / colors.full_scale(values.dtype, float(values.max(initial=0)), linear=True)
+    scaled = values / full_scale(values.dtype, float(values.max(initial=0)), linear=True)
     low, high = scaled.min(), scaled.max()
-    if not (low >= -colors.ROUNDING and high <= 1 + colors.ROUNDING):
+    if not (low >= -ROUNDING and high <= 1 + ROUNDING):
         raise UserError(f"has {name} from {low:g} to {high:g}; expected 0 to 1")
     return np.clip(scaled, 0, 1)
+
+
+# --- colours ----------------------------------------------------------------------------------------------------------
+
+
+def colors_of(columns: Columns) -> tuple[np.ndarray, list[str]] | None:
+    """Linear colours (n, 3) of renamed columns and lines about how they were read; None if none are those of colours.
+
+    ValueError for values that are no colours.
+    """
+    for names in (LINEAR, SRGB):
+        if set(names) <= columns.keys():
+            channels = np.stack([columns[name] for name in names], axis=-1)
+            return linear_colors(channels, " ".join(names), linear=names == LINEAR)
+    packed = next((name for name in ("rgb", "rgba") if name in columns), None)
+    return linear_colors(_unpack(columns[packed])[:, :3], packed) if packed else None
+
+
+def _unpack(packed: np.ndarray) -> np.ndarray:
+    """Red, green, blue and alpha (n, 4) uint8 of numbers (n,) 0xAARRGGBB, or of floats that have their bits."""
+    known = packed[np.isfinite(packed)]
+    whole = packed.itemsize == 8 and len(known) == len(packed) and bool(((known % 1 == 0) & (known >= 0)).all())
+    if packed.dtype.kind != "f" or whole:
+        bits = packed.astype(np.int64).astype(np.uint32)
+    else:
+        bits = packed.astype(np.float32).view(np.uint32)
+    return np.stack([(bits >> shift & 255).astype(np.uint8) for shift in (16, 8, 0, 24)], axis=-1)
+
+
+def linear_colors(channels: np.ndarray, name: str, *, linear: bool = False) -> tuple[np.ndarray, list[str]]:
+    """Linear colours (n, 3) in [0, 1] of what a file holds (n, 3), and lines that say how they were read."""
+    if not len(channels):
+        return np.zeros(channels.shape), []
+    brightest, darkest = channels.max(axis=-1), channels.min(axis=-1)
+    strays = max(1, len(channels) // STRAYS) if len(channels) >= LEAST else 0
+    highest = np.partition(brightest, -1 - strays)[-1 - strays]
+    lowest = np.partition(darkest, strays)[strays]
+    white = full_scale(channels.dtype, float(highest), linear)
+    values = channels / white
+    if not (lowest / white >= -ROUNDING and highest / white <= 1 + max(ROUNDING, 1.5 / 255 if white == 255 else 0)):
+        raise UserError(
+            f"has {name} from {lowest / white:g} to {highest / white:g}; expected 0 to 1 (colours: or 0 to 255)"
+        )
+    lines = [] if linear else [f"{name} taken as sRGB in 0..{white:g}"]
+    if outside := int(np.count_nonzero((values > 1 + ROUNDING).any(axis=-1) | (values < -ROUNDING).any(axis=-1))):
+        lines.append(f"{outside:,} of {len(values):,} colours lie outside of 0..{white:g} and are cut off there")
+    values = np.clip(values, 0, 1)
+    brightness = values.max(axis=-1)
+    for word, share in (("0", np.mean(brightness == 0)), ("nearly black", np.mean(brightness < DARK))):
+        if len(values) >= LEAST and share > MOSTLY:
+            lines.append(f"{share:.0%} of {name} are {word}: the picture will be black")
+            break
+    return values if linear else srgb_to_linear(values), lines
+
+
+def srgb_to_linear(encoded: np.ndarray) -> np.ndarray:
+    """Linear values of sRGB-encoded ones in [0, 1] (IEC 61966-2-1)."""
+    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+
+
+def full_scale(kind: np.dtype, highest: float, linear: bool = False) -> float:
+    """The value that means full, of colours of this type and up to this value."""
+    if kind.kind == "u" and kind.itemsize == 1:
+        return 255.0
+    whole = kind.kind == "u" and kind.itemsize == 2
+    if not whole and (linear or highest <= 1 + ROUNDING):
+        return 1.0
+    if kind.kind == "f" and highest < 2:
+        raise UserError(f"has colours up to {highest:g}: neither 0 to 1 nor 0 to 255")
+    # 256 where colours were multiplied by it, not by 255
+    return next((scale for scale in SCALES if highest <= scale + 1), SCALES[-1])

@@ -3,15 +3,12 @@
 A data set is the folder that `spnr-data generate` writes (its form: docs/data.md).
 """
 
-import errno
 import io
 import json
-import time
 import warnings
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import jax
 import numpy as np
@@ -26,9 +23,6 @@ from spnr_jax.surfels.lighting import HEIGHT, WIDTH, light_of
 
 # what a file that breaks its rules makes its reader raise
 UNREADABLE = (OSError, ValueError, LookupError, TypeError, ArithmeticError, RecursionError)
-# errors of a network drive that is away for a moment, and the seconds after which its file is read again
-PASSING = (errno.EIO, errno.ESTALE, errno.ETIMEDOUT, errno.EAGAIN, errno.ENOTCONN)
-PAUSES = (0.1, 0.5, 2.0)
 LONGEST_NAME = 200  # of an object, in bytes: file systems allow 255
 
 
@@ -104,7 +98,7 @@ def read_object(dataset: Dataset, name: str) -> ObjectData:
     file = "transforms.json"
 
     def read(file: str) -> bytes:
-        return patiently((folder / file).read_bytes)
+        return (folder / file).read_bytes()
 
     try:
         meta = json.loads(read(file))
@@ -142,18 +136,6 @@ def _lights(content: bytes, views: int) -> np.ndarray:
     if lights.shape != (views, HEIGHT, WIDTH, 3) or not np.isfinite(lights).all() or lights.min() < 0:
         raise UserError(f"expected {views} maps of {HEIGHT} x {WIDTH} texels of radiance, got {lights.shape}")
     return lights
-
-
-def patiently(read: Callable[[], Any]) -> Any:
-    """What `read` returns; it is called again after each of PAUSES while it fails with one of the errors PASSING."""
-    for pause in PAUSES:
-        try:
-            return read()
-        except OSError as error:
-            if error.errno not in PASSING:
-                raise
-        time.sleep(pause)
-    return read()
 
 
 def _rgba(content: bytes, height: int, width: int) -> np.ndarray:

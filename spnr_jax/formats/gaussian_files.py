@@ -21,9 +21,8 @@ import numpy as np
 from jaxtyping import Float
 
 from spnr_jax.errors import UserError
-from spnr_jax.formats.columns import Columns
+from spnr_jax.formats.columns import SRGB, Columns
 from spnr_jax.formats.images import check_place, write_whole
-from spnr_jax.formats.mesh.file_colors import SRGB
 from spnr_jax.kernels.records import Gaussians
 from spnr_jax.surfels.gaussians import C0, degree_of, half_turn_signs
 

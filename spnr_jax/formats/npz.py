@@ -6,10 +6,12 @@
 Pickled objects, which could run code, are refused.  Every fault is a ValueError; the caller adds the file's name.
 """
 
+import contextlib
 import io
 import math
 import threading
 import tokenize
+import warnings
 import zipfile
 import zlib
 from collections.abc import Collection, Iterator
@@ -48,7 +50,8 @@ def numpy_pieces(path: Path) -> Iterator[Columns]:
     if not magic.startswith(b"\x93NUMPY"):
         raise UserError("is not a NumPy file")
     try:
-        loaded = np.lib.format.open_memmap(path, mode="r")
+        with _parsing():
+            loaded = np.lib.format.open_memmap(path, mode="r")
     except UNREADABLE as error:
         raise UserError(f"is a broken, truncated or pickled NumPy file ({error})") from None
     rows = np.atleast_1d(loaded)
@@ -94,9 +97,17 @@ def read_arrays(file: io.BufferedIOBase, wanted: Collection[str] | None = None) 
     return arrays
 
 
+@contextlib.contextmanager
+def _parsing() -> Iterator[None]:
+    """Headers are read by one thread at a time; NumPy warns of those of Python 2, which it reads well."""
+    with HEADERS, warnings.catch_warnings():
+        warnings.filterwarnings("ignore", ".*required additional header parsing", UserWarning)
+        yield
+
+
 def _member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
     """One array of an archive."""
-    with HEADERS, archive.open(info) as stream:
+    with _parsing(), archive.open(info) as stream:
         version = np.lib.format.read_magic(stream)
         read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
         shape, _, dtype = read_header(stream)
@@ -104,7 +115,7 @@ def _member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
             raise UserError(f"{info.filename} holds objects or a negative size, shape {shape} and type {dtype}")
         if math.prod(shape) * dtype.itemsize > info.file_size:
             raise UserError(f"{info.filename} is cut off: shape {shape} of {dtype} in {info.file_size} bytes")
-    with HEADERS, archive.open(info) as stream:
+    with _parsing(), archive.open(info) as stream:
         return np.lib.format.read_array(stream, allow_pickle=False)
 
 

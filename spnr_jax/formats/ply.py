@@ -10,7 +10,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from io import BufferedIOBase
 from itertools import islice
-from pathlib import Path
 
 import numpy as np
 
@@ -76,30 +75,25 @@ def read_ply_header(file: BufferedIOBase) -> PlyHeader:
     return PlyHeader(byte_order=byte_order, elements=elements)
 
 
-def ply_pieces(path: Path) -> Iterator[Columns]:
-    """The columns of the vertices of a PLY file, some points at a time."""
-    with path.open("rb") as file:
-        yield from vertex_pieces(file)
-
-
-def vertex_pieces(file: BufferedIOBase) -> Iterator[Columns]:
-    """The columns of the vertices of an open PLY file, some points at a time; elements before them are skipped."""
+def element_pieces(file: BufferedIOBase, wanted: str = "vertex") -> Iterator[Columns]:
+    """The columns of an element of an open PLY file, some rows at a time; elements before it are skipped."""
     header = read_ply_header(file)
     for name, count, properties in header.elements:
-        if name == "vertex":
-            rows = element_rows(file, count, properties, header.byte_order)
+        if name == wanted:
+            rows = _element_rows(file, count, properties, header.byte_order)
             yield from ({field.lower(): piece[field] for field in piece.dtype.names or ()} for piece in rows)
             return
         if header.byte_order is None:
             for _ in islice((line for line in iter(file.readline, b"") if line.strip()), count):
                 pass
         else:
-            for _ in element_rows(file, count, properties, header.byte_order):
+            for _ in _element_rows(file, count, properties, header.byte_order):
                 pass
-    raise UserError(f"has no PLY element 'vertex', only {', '.join(name for name, _, _ in header.elements) or 'none'}")
+    names = ", ".join(name for name, _, _ in header.elements)
+    raise UserError(f"has no PLY element {wanted!r}, only {names or 'none'}")
 
 
-def element_rows(
+def _element_rows(
     file: BufferedIOBase, count: int, properties: list[tuple[str, str | Lists]], order: str | None
 ) -> Iterator[np.ndarray]:
     """The records of an element, some at a time, without their lists; the file is left behind them."""
@@ -155,12 +149,10 @@ def _rows_with_lists(
 
 def camera_row(file: BufferedIOBase) -> dict[str, float]:
     """The numbers of the camera that an open PLY file begins with, by their names; none if it begins with another."""
-    header = read_ply_header(file)
-    name, count, properties = header.elements[0] if header.elements else ("", 0, [])
-    if name != "camera" or not count or not all(isinstance(kind, str) for _, kind in properties):
+    if [name for name, _, _ in read_ply_header(file).elements][:1] != ["camera"]:
         return {}
-    row = next(element_rows(file, 1, properties, header.byte_order))[0]
-    return {field: float(row[field]) for field in row.dtype.names or ()}
+    file.seek(0)
+    return {name: float(column[0]) for name, column in next(element_pieces(file, "camera")).items() if len(column)}
 
 
 def text_rows(lines: Iterator[str], count: int, layout: np.dtype) -> Iterator[np.ndarray]:

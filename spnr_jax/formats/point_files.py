@@ -26,7 +26,7 @@ from spnr_jax.formats.gaussian_files import decompress_columns, spz_columns
 from spnr_jax.formats.las import las_pieces
 from spnr_jax.formats.npz import numpy_pieces
 from spnr_jax.formats.pcd import pcd_pieces
-from spnr_jax.formats.ply import element_rows, ply_pieces, read_ply_header, vertex_pieces
+from spnr_jax.formats.ply import element_pieces, read_ply_header
 from spnr_jax.formats.text import text_pieces
 
 READERS = {
@@ -120,22 +120,20 @@ def column_pieces(path: Path, kind: str | None = None) -> Iterator[Columns] | No
 
 def parse_ply(content: bytes) -> Columns:
     """The columns of the vertices in the bytes of a PLY file."""
-    return join_pieces(vertex_pieces(io.BytesIO(content)))
+    return join_pieces(element_pieces(io.BytesIO(content)))
 
 
 def _ply(path: Path) -> Iterator[Columns]:
     """The columns of a .ply file, unpacked where it is one of compressed splats."""
     with path.open("rb") as file:
-        header = read_ply_header(file)
-        names = [name for name, _, _ in header.elements]
-        fields = [name for element, _, fields in header.elements if element == "vertex" for name, _ in fields]
-        if names[:2] == ["chunk", "vertex"] and "packed_position" in fields:
-            _, count, properties = header.elements[0]
-            rows = np.concatenate(list(element_rows(file, count, properties, header.byte_order)))
-            chunks = {name: rows[name] for name in rows.dtype.names or ()}
-            yield decompress_columns(chunks, join_pieces(ply_pieces(path)))
+        elements = {name: [field for field, _ in fields] for name, _, fields in read_ply_header(file).elements}
+        file.seek(0)
+        if list(elements)[:2] != ["chunk", "vertex"] or "packed_position" not in elements["vertex"]:
+            yield from element_pieces(file)
             return
-    yield from ply_pieces(path)
+        chunks = join_pieces(element_pieces(file, "chunk"))
+        file.seek(0)
+        yield decompress_columns(chunks, join_pieces(element_pieces(file)))
 
 
 def join_pieces(pieces: Iterable[Columns]) -> Columns:

@@ -32,7 +32,8 @@ UNIT_LENGTH = 0.02  # how far from 1 the length of a normal may be
 COMMENTS = ("#", "//")
 PIECE_LINES = 2**17  # in memory at a time
 SHOWN = 60  # characters of a line that an error shows
-NUMBER = r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(nan|inf(inity)?)"
+LONGEST_HEADER = 4096  # characters in which names are looked for
+NUMBER = r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?|[+-]?(nan|inf(inity)?)"
 WITH_COMMA = r"[+-]?\d+(,\d+)?([eE][+-]?\d+)?"
 INDEX = "index"  # the name of a column that only counts
 
@@ -77,7 +78,7 @@ def _header(lines: Iterator[Line]) -> tuple[str, bool, Line]:
         text = re.sub(r"^(#|//)\s*", "", line)
         first = re.split(r"[\s;]+", text)[0]
         if text and not re.fullmatch(NUMBER, first.split(",")[0], re.IGNORECASE):
-            header, is_comment = text, text != line
+            header, is_comment = text[:LONGEST_HEADER], text != line
         elif text and text == line and not text.isdecimal():
             return header, is_comment, (number, line)
     return header, is_comment, (0, "")

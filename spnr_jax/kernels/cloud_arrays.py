@@ -208,9 +208,9 @@ def _rows_below(columns: Columns, keys: np.ndarray, halvings: int) -> tuple[Colu
     return {name: values[taken] for name, values in columns.items()}, keys[taken]
 
 
-def stack_columns(columns: Columns) -> np.ndarray:
-    """Positions (points, 3) float64 of columns x, y, z."""
-    return np.stack([np.asarray(columns[axis], np.float64) for axis in "xyz"], axis=-1)
+def stack_columns(columns: Columns, names: Iterable[str] = "xyz") -> np.ndarray:
+    """Columns (points, names) float64 side by side; those of positions unless others are named."""
+    return np.stack([np.asarray(columns[name], np.float64) for name in names], axis=-1)
 
 
 def first_in_voxels(positions: np.ndarray, voxel: float) -> np.ndarray:

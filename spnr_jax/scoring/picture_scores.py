@@ -16,7 +16,7 @@ from flip_evaluator import evaluate
 from jaxtyping import Float
 from scipy.ndimage import binary_dilation, binary_erosion, distance_transform_edt, gaussian_filter
 
-from spnr_jax.formats.mesh.texels import srgb_to_linear
+from spnr_jax.formats.columns import srgb_to_linear
 from spnr_jax.kernels.cloud_arrays import plain_cloud
 from spnr_jax.kernels.records import AnyArray, PointCloud
 

@@ -13,9 +13,10 @@ ramp, so the surface stays one mesh whose faces share their vertices, with one m
 Coordinates are those of the file that the points came from, whatever its upward axis.
 """
 
-from collections.abc import Callable, Sequence
+import json
+import struct
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -27,8 +28,7 @@ from scipy.spatial import cKDTree
 from spnr_jax.errors import UserError
 from spnr_jax.formats import images
 from spnr_jax.formats.clouds import PlacedCloud
-from spnr_jax.formats.glb import Buffer
-from spnr_jax.kernels.records import AnyArray, Camera, Volume
+from spnr_jax.kernels.records import Camera, Volume
 from spnr_jax.method.model import Model
 from spnr_jax.surfels.gaussians import View, nearest_around
 from spnr_jax.tools import splat_making
@@ -51,34 +51,24 @@ class Grid:
     origin: np.ndarray
 
 
-def over_box(
-    value: Callable[[Float[np.ndarray, "places 3"]], Float[AnyArray, " places"]],
-    volume: Volume,
-    placed: PlacedCloud,
-    resolution: int,
-) -> Grid:
-    """The values of a function of places in the box, `resolution` along each side; it gets a plane at a time."""
+def solidity(views: Sequence[View], volume: Volume, placed: PlacedCloud, resolution: int = GRID) -> Grid:
+    """0 outside, 1 inside, 1/2 on the surface, with `resolution` places along each side of the box."""
+    cameras = jax.tree.map(lambda *x: jnp.stack(x), *(view.camera for view in views))
+    depth = jnp.stack([nearest_around(view.depth).astype(np.float32) for view in views])
+    band = jnp.float32(BAND * 2 / (resolution - 1))
     steps = np.linspace(-1, 1, resolution, dtype=np.float32)
     plane = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2)
     rotation, scale = placed.rotation.astype(np.float32), float(volume.scale)
     values = np.empty((resolution,) * 3, np.float32)
-    for i, x in enumerate(steps):
+    for i, x in enumerate(steps):  # a plane at a time
         places = np.concatenate([np.full_like(plane[:, :1], x), plane], axis=-1) @ rotation.T
-        values[i] = np.asarray(value(places)).reshape(resolution, resolution)
+        values[i] = np.asarray(_solid(cameras, depth, band, places)).reshape(resolution, resolution)
     return Grid(
         values=values,
         lowest=placed.rotation.T @ np.asarray(volume.centre, np.float64) - 1 / scale,
         spacing=2 / (resolution - 1) / scale,
         origin=placed.origin,
     )
-
-
-def solidity(views: Sequence[View], volume: Volume, placed: PlacedCloud, resolution: int = GRID) -> Grid:
-    """0 outside, 1 inside, 1/2 on the surface, with `resolution` places along each side of the box."""
-    cameras = jax.tree.map(lambda *x: jnp.stack(x), *(view.camera for view in views))
-    depth = jnp.stack([nearest_around(view.depth).astype(np.float32) for view in views])
-    band = jnp.float32(BAND * 2 / (resolution - 1))
-    return over_box(partial(_solid, cameras, depth, band), volume, placed, resolution)
 
 
 @jax.jit
@@ -108,7 +98,8 @@ def _solid(
 SURFACE = 0.5  # solidity
 NEAREST = 4  # points whose materials a vertex takes the mean of
 RAMP = 52  # texels along each side of the ramp: steps of 5 in 8 bits, so what lies between them is exact
-ARRAY_BUFFER, INDEX_BUFFER, LINEAR, CLAMPED = 34962, 34963, 9729, 33071  # numbers of the glTF specification
+ARRAY_BUFFER, INDEX_BUFFER, FLOAT, UNSIGNED = 34962, 34963, 5126, 5125  # numbers of the glTF specification
+LINEAR, CLAMPED = 9729, 33071
 
 
 class Solid(NamedTuple):
@@ -134,6 +125,8 @@ def mesh_of(grid: Grid, placed: PlacedCloud) -> Solid:
     """The surface of a grid of solidity, 0 outside to 1 inside; ValueError if there is none."""
     from skimage.measure import marching_cubes  # here, so that rendering alone stays quick
 
+    from spnr_jax.formats.mesh.surface_points import vertex_normals
+
     if not grid.values.max() > SURFACE:
         raise UserError("no surface to write as a mesh: the network's pictures show nothing solid")
     closed = np.pad(grid.values, 1)  # the surface is closed also where it meets the box
@@ -147,25 +140,12 @@ def mesh_of(grid: Grid, placed: PlacedCloud) -> Solid:
     color, roughness, metallic = (m[nearest].mean(axis=1) for m in (cloud.base_color, cloud.roughness, cloud.metallic))
     columns = {
         "POSITION": vertices,
-        "NORMAL": normals_of(vertices, faces),
+        "NORMAL": vertex_normals(vertices, faces),
         "COLOR_0": color,
         "TEXCOORD_0": (np.stack([roughness, metallic], axis=-1) * (RAMP - 1) + 0.5) / RAMP,
     }
     arrays = {name: np.asarray(values, np.float32) for name, values in columns.items()}
     return Solid(glb(arrays, faces.astype(np.uint32).ravel(), grid.origin), len(faces), is_closed(faces))
-
-
-def normals_of(
-    vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
-) -> Float[np.ndarray, "vertices 3"]:
-    """Unit normals of vertices, the mean of those of the faces around them by area; where that is nothing, up."""
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    of_face = np.cross(b - a, c - a)
-    normals = np.zeros(vertices.shape)
-    for corner in faces.T:
-        normals += np.stack([np.bincount(corner, x, len(vertices)) for x in of_face.T], axis=-1)
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
-    return np.where(length > 0, normals / np.where(length > 0, length, 1), [0.0, 1.0, 0.0])
 
 
 def is_closed(faces: Int[np.ndarray, "faces 3"]) -> bool:
@@ -182,23 +162,42 @@ def ramp() -> Float[np.ndarray, "metallic roughness 3"]:
 
 
 def glb(arrays: dict[str, np.ndarray], indices: np.ndarray, translation: np.ndarray) -> bytes:
-    """A binary glTF 2.0 file of one mesh; vertex colours are linear, as glTF has them."""
-    buffer = Buffer()
-    primitive = {
-        "attributes": buffer.attributes(arrays, target=ARRAY_BUFFER),
-        "indices": buffer.accessor(indices, target=INDEX_BUFFER),
-        "material": 0,
-    }
+    """A binary glTF 2.0 file of one mesh of float32 columns and uint32 indices; vertex colours are linear, as in glTF.
+
+    Its only buffer holds the columns, the indices and the picture of the ramp, in this order.
+    """
+    stored = [*arrays.values(), indices]
+    pieces = [array.tobytes() for array in stored] + [images.png(ramp())]
+    views, content = [], b""
+    for number, piece in enumerate(pieces):
+        views.append({"buffer": 0, "byteOffset": len(content), "byteLength": len(piece)})
+        if number < len(stored):
+            views[-1]["target"] = ARRAY_BUFFER if number < len(arrays) else INDEX_BUFFER
+        content += piece + bytes(-len(piece) % 4)
+    accessors: list[dict] = [
+        {"bufferView": number, "componentType": FLOAT, "count": len(array), "type": f"VEC{array.shape[1]}"}
+        for number, array in enumerate(arrays.values())
+    ]
+    position = arrays["POSITION"]
+    accessors[0] |= {"min": position.min(axis=0).tolist(), "max": position.max(axis=0).tolist()}
+    accessors += [{"bufferView": len(arrays), "componentType": UNSIGNED, "count": len(indices), "type": "SCALAR"}]
+    numbers = {name: number for number, name in enumerate(arrays)}
     shine = {"metallicRoughnessTexture": {"index": 0}, "metallicFactor": 1, "roughnessFactor": 1}
     document = {
         "asset": {"version": "2.0", "generator": "spnr_jax"},
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0} | ({"translation": translation.tolist()} if translation.any() else {})],
-        "meshes": [{"primitives": [primitive]}],
+        "meshes": [{"primitives": [{"attributes": numbers, "indices": len(arrays), "material": 0}]}],
         "materials": [{"pbrMetallicRoughness": shine}],
         "textures": [{"source": 0, "sampler": 0}],
-        "images": [{"bufferView": buffer.view(images.png(ramp())), "mimeType": "image/png"}],
+        "images": [{"bufferView": len(views) - 1, "mimeType": "image/png"}],
         "samplers": [{"magFilter": LINEAR, "minFilter": LINEAR, "wrapS": CLAMPED, "wrapT": CLAMPED}],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": len(content)}],
     }
-    return buffer.glb(document)
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(content), b"BIN\0") + content
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks

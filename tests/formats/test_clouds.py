@@ -1,31 +1,30 @@
+"""Clouds out of files: what is assumed, cut out, thinned and turned, in the file's own frame."""
+
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
-from support.gltf_files import GltfBuilder
-from support.point_clouds import SRGB, read, write
+from support.point_clouds import read, sphere_points, write
 
 from data_gen.store.layout import POINT_TYPE, encode_points
 from spnr_jax.formats import clouds
 from spnr_jax.formats.clouds import place_cloud, read_cloud
+from spnr_jax.formats.cut import Cut
 from spnr_jax.formats.orientation import ROTATIONS
 from spnr_jax.kernels.cloud_arrays import pad
 from spnr_jax.surfels.sides import spiral
 
-SQUARE_OBJ = "v 0 0 2\nv 1 0 2\nv 1 1 2\nv 0 1 2\nf 1 2 3 4\n"
-SQUARE_OFF = "OFF\n4 1 0\n0 0 2\n1 0 2\n1 1 2\n0 1 2\n4 0 1 2 3\n"
-SQUARE_PLY = (
-    "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
-    "property uchar red\nproperty uchar green\nproperty uchar blue\nelement face 2\n"
-    "property list uchar int vertex_indices\nend_header\n"
-    "0 0 2 188 0 255\n1 0 2 188 0 255\n1 1 2 188 0 255\n0 1 2 188 0 255\n3 0 1 2\n3 0 2 3\n"
-)
+FAR = np.array([5e6, 2e6, 0.0])  # where float32 knows half metres at best
+LEVEL = 0.2140411  # linear value of sRGB 0.5
+INTENSITY_SHOWN = "no colour in the file: intensity 100..298 shown as grey"
 
 
 def test_the_points_of_a_data_set_come_back_as_they_are_and_nothing_is_assumed(tmp_path):
-    rng = np.random.default_rng(0)
     points = np.zeros(700, POINT_TYPE)
     for name in POINT_TYPE.names:
-        points[name] = rng.uniform(size=700)
+        points[name] = np.random.default_rng(0).uniform(size=700)
     for names in (("x", "y", "z"), ("nx", "ny", "nz")):
         for name, column in zip(names, spiral(700).T, strict=True):
             points[name] = column
@@ -35,64 +34,91 @@ def test_the_points_of_a_data_set_come_back_as_they_are_and_nothing_is_assumed(t
     np.testing.assert_array_equal(cloud.base_color[:, 1], points["base_color_g"])
     np.testing.assert_array_equal(cloud.roughness, points["roughness"])
     np.testing.assert_array_equal(cloud.metallic, points["metallic"])
-    assert cloud.mask.all()
     assert {a.dtype for a in (cloud.positions, cloud.base_color, cloud.roughness)} == {np.dtype("float32")}
     assert lines == []
 
 
-def test_what_a_file_does_not_say_is_grey_half_rough_no_metal_and_reported(tmp_path):
-    cloud, lines = read(write(tmp_path, "a.xyz", "0 0 0\n1 2 3\n0 1 0\n"))
-    assert (cloud.base_color == 0.5).all()
-    assert (cloud.roughness == 0.5).all()
-    assert (cloud.metallic == 0).all()
+# Columns
+
+
+def materials(folder, **columns):
+    """Base colours, roughness and metallic of three points with the columns, and what was reported."""
+    rows = np.zeros(3, [*((axis, "f8") for axis in "xyz"), *((n, np.asarray(v).dtype) for n, v in columns.items())])
+    rows["x"], rows["y"] = [0, 1, 0], [0, 0, 1]
+    for name, values in columns.items():
+        rows[name] = values
+    np.save(folder / "a.npy", rows)
+    cloud, lines = read(folder / "a.npy")
+    return cloud.base_color, cloud.roughness, cloud.metallic, lines
+
+
+NAMES = {  # of channels, and the linear value of 0.5 in them
+    **dict.fromkeys(("red green blue", "r g b", "diffuse_red diffuse_green diffuse_blue", "rf gf bf"), LEVEL),
+    **dict.fromkeys(("color_red color_green color_blue", "scalar_r scalar_g scalar_b"), LEVEL),
+    **dict.fromkeys(("base_color_r base_color_g base_color_b", "albedo_r albedo_g albedo_b"), 0.5),
+}
+
+
+@pytest.mark.parametrize("names", NAMES)
+def test_colours_have_many_names_and_are_srgb_unless_these_say_that_they_are_linear(tmp_path, names):
+    base_color, *_, lines = materials(tmp_path, **dict.fromkeys(names.split(), [0.5, 1.0, 0.0]))
+    np.testing.assert_allclose(base_color, np.outer([NAMES[names], 1, 0], [1, 1, 1]), rtol=1e-5)
+    assert ("red green blue taken as sRGB in 0..1" in lines) == (NAMES[names] == LEVEL)
+
+
+@pytest.mark.parametrize(
+    ("rough", "metal"),
+    [("roughness", "scalar_metallic"), ("scalar_roughness", "metalness"), ("pbr_roughness", "metal")],
+)
+def test_roughness_and_metallic_have_many_names_and_whole_bytes(tmp_path, rough, metal):
+    _, roughness, metallic, lines = materials(
+        tmp_path, **{rough: np.array([0, 255, 0], np.uint8), metal: [0.25, 0.75, 0]}
+    )
+    np.testing.assert_array_equal(roughness, [0, 1, 0])
+    np.testing.assert_array_equal(metallic, [0.25, 0.75, 0])
+    assert lines == ["no base_color in the file: 0.5 taken for all points"]
+
+
+def test_intensity_is_grey_where_there_is_no_colour_and_unused_where_there_is(tmp_path):
+    base_color, *_, lines = materials(tmp_path, scalar_intensity=[100, 300, 300])
+    np.testing.assert_allclose(base_color[:, 0], [0, 1, 1], atol=0.01)
+    assert lines[0].startswith("no colour in the file: intensity 100..")
+    base_color, *_ = materials(tmp_path, intensity=[100, 300, 200], red=[1.0] * 3, green=[0.0] * 3, blue=[0.0] * 3)
+    np.testing.assert_array_equal(base_color, [[1, 0, 0]] * 3)
+    none_seen = materials(tmp_path, intensity=[100, 300, 200], red=[0] * 3, green=[0] * 3, blue=[0] * 3)
+    assert none_seen[-1][0].startswith("no colour in the file: intensity")
+    *_, lines = materials(tmp_path, intensity=[5, 5, 5])
     assert [line.split()[:2] for line in lines] == [["no", name] for name in ("base_color", "roughness", "metallic")]
-    cloud, lines = read(write(tmp_path, "b.csv", "x,y,z,metalness\n0,0,0,0.25\n1,0,0,0.25\n0,1,0,0.25\n"))
-    assert (cloud.metallic == 0.25).all()
-    assert not any("metallic" in line for line in lines)
 
 
-def test_points_are_spread_evenly_over_a_mesh_unless_there_are_very_many(tmp_path, monkeypatch):
-    def nearest(count):
-        positions = read_cloud(write(tmp_path, "a.obj", SQUARE_OBJ), num_points=count, seed=1).positions
-        return cKDTree(positions).query(positions, k=2)[0][:, 1].min() * np.sqrt(count)
+@pytest.mark.parametrize("names", ["nx ny nz", "normal_x normal_y normal_z", "scalar_nx scalar_ny scalar_nz"])
+def test_normals_have_unit_length_and_turn_with_the_cloud_and_a_row_without_one_gets_zero(tmp_path, names):
+    rows = ["0 0 1 0 0 2", "0 1 0 0 -3e-9 0", "1 0 0 0 0 0", "2 0 0 nan 0 1", "3 0 0 inf 0 0", "4 0 0 3 4 0"]
+    path = write(tmp_path, "a.csv", "\n".join([f"x y z {names}", *rows]))
+    normals = [[0, 0, 1], [0, -1, 0], [0] * 3, [0] * 3, [0] * 3, [0.6, 0.8, 0]]
+    cloud = read_cloud(path)
+    np.testing.assert_allclose(cloud.normals, normals, atol=1e-7)
+    np.testing.assert_allclose(read_cloud(path, up="z").normals, normals @ np.array(ROTATIONS["z"]).T, atol=1e-7)
+    np.testing.assert_allclose(pad(cloud, 8).normals, [*normals, [0] * 3, [0] * 3], atol=1e-7)
 
-    monkeypatch.setattr(clouds, "MOST_EVEN", 300)
-    assert nearest(300) > 0.5  # of the distance on a square lattice
-    assert nearest(301) < 0.2
+
+def test_a_cloud_without_a_usable_normal_has_none(tmp_path):
+    zeros = write(tmp_path, "zeros.csv", "x y z nx ny nz\n0 0 1 0 0 0\n0 1 0 nan 0 0\n1 0 0 0 0 0")
+    part = write(tmp_path, "part.csv", "x y z nx ny\n0 0 1 0 1\n0 1 0 0 1\n1 0 0 0 1")
+    materials(tmp_path, **dict.fromkeys(("nx", "ny", "nz"), np.array([255, 0, 0], np.uint8)))  # an encoding of its own
+    for path in (zeros, part, tmp_path / "a.npy"):
+        assert read_cloud(path).normals is None
 
 
-@pytest.mark.parametrize("name", ["a.obj", "a.off", "a.ply", "a.stl", "a.glb", "a.gltf"])
-def test_the_surface_of_a_mesh_is_sampled_with_its_material(tmp_path, name):
-    path = tmp_path / name
-    color, (roughness, metallic) = (0.5, 0.5, 0.5), (0.5, 0.0)
-    if name.endswith(("glb", "gltf")):
-        builder, color, (roughness, metallic) = GltfBuilder(), (0.5, 0.25, 1.0), (0.75, 0.125)
-        factors = {"baseColorFactor": [*color, 1], "roughnessFactor": roughness, "metallicFactor": metallic}
-        square = builder.primitive(material=builder.material(pbrMetallicRoughness=factors))
-        builder.mesh(square, translation=[0, 0, 2])
-        builder.write(path)
-    elif name == "a.ply":
-        write(tmp_path, name, SQUARE_PLY)
-        color = SRGB[[188, 0, 255]]
-    elif name == "a.stl":
-        corner = "vertex 0 0 2\n", "vertex 1 0 2\n", "vertex 1 1 2\n", "vertex 0 1 2\n"
-        facets = "".join(
-            f"facet normal 0 0 1\nouter loop\n{a}{b}{c}endloop\nendfacet\n"
-            for a, b, c in (corner[:3], (corner[0], *corner[2:]))
-        )
-        write(tmp_path, name, f"solid a\n{facets}endsolid a\n")
-    else:
-        write(tmp_path, name, SQUARE_OBJ if name == "a.obj" else SQUARE_OFF)
-    cloud = read_cloud(path, num_points=400, seed=3)
-    np.testing.assert_allclose(cloud.positions[:, 2], 2, atol=1e-6)
-    np.testing.assert_allclose(cloud.positions[:, :2].mean(axis=0), 0.5, atol=0.06)
-    np.testing.assert_allclose(np.ptp(cloud.positions[:, :2], axis=0), 1, atol=0.03)
-    np.testing.assert_allclose(cloud.base_color, np.broadcast_to(color, (400, 3)), atol=2e-3)
-    np.testing.assert_allclose(cloud.roughness, roughness, atol=1e-6)
-    np.testing.assert_allclose(cloud.metallic, metallic, atol=1e-6)
-    np.testing.assert_allclose(cloud.normals, np.broadcast_to([0, 0, 1], (400, 3)), atol=1e-6)
-    np.testing.assert_array_equal(read_cloud(path, num_points=400, seed=3).positions, cloud.positions)
-    assert len(read_cloud(path).mask) == 4096
+@pytest.mark.parametrize(("kind", "bits"), [("<f4", 0x7FA00000), ("<f8", 0x7FF4000000000000)])
+@pytest.mark.parametrize("column", [0, 4, 7])
+def test_a_signalling_nan_costs_its_row_or_its_normal_and_no_warning(tmp_path, kind, bits, column):
+    table = np.random.default_rng(0).random((50, 9)).astype(kind)
+    table.view(kind.replace("f", "u"))[3, column] = bits
+    np.save(tmp_path / "cloud.npy", table)
+    cloud = read_cloud(tmp_path / "cloud.npy")  # warnings are errors in the tests
+    assert len(cloud.positions) in (49, 50)
+    assert np.isfinite(cloud.positions).all()
 
 
 @pytest.mark.parametrize("up", ROTATIONS)
@@ -105,47 +131,145 @@ def test_up_is_a_rotation_that_takes_the_named_axis_to_y(tmp_path, up):
     np.testing.assert_array_equal(images @ images.T, np.eye(3))
 
 
-@pytest.mark.parametrize("names", ["nx ny nz", "normal_x normal_y normal_z", "scalar_nx scalar_ny scalar_nz"])
-def test_normals_have_unit_length_and_turn_with_the_cloud_and_a_row_without_one_gets_zero(tmp_path, names):
-    rows = ["0 0 1 0 0 2", "0 1 0 0 -3e-9 0", "1 0 0 0 0 0", "2 0 0 nan 0 1", "3 0 0 inf 0 0", "4 0 0 3 4 0"]
-    path = write(tmp_path, "a.csv", "\n".join([f"x y z {names}", *rows]))
-    normals = [[0, 0, 1], [0, -1, 0], [0] * 3, [0] * 3, [0] * 3, [0.6, 0.8, 0]]
-    cloud = read_cloud(path)
-    np.testing.assert_allclose(cloud.normals, normals, atol=1e-7)
-    assert cloud.normals.dtype == np.float32
-    np.testing.assert_allclose(read_cloud(path, up="z").normals, normals @ np.array(ROTATIONS["z"]).T, atol=1e-7)
-    np.testing.assert_allclose(pad(cloud, 8).normals, [*normals, [0] * 3, [0] * 3], atol=1e-7)
+# Many points
 
 
-def test_a_cloud_without_a_usable_normal_has_none(tmp_path):
-    zeros = write(tmp_path, "zeros.csv", "x y z nx ny nz\n0 0 1 0 0 0\n0 1 0 nan 0 0\n1 0 0 0 0 0")
-    part = write(tmp_path, "part.csv", "x y z nx ny\n0 0 1 0 1\n0 1 0 0 1\n1 0 0 0 1")
-    packed = np.zeros(3, [(name, "f4") for name in "xyz"] + [(name, "u1") for name in ("nx", "ny", "nz")])
-    packed["nx"] = 255
-    packed["x"], packed["y"] = [0, 1, 0], [0, 0, 1]
-    np.save(tmp_path / "packed.npy", packed)
-    for path in (zeros, part, tmp_path / "packed.npy"):
-        assert read_cloud(path).normals is None
-    assert pad(read_cloud(zeros), 4).normals is None
+def test_points_are_spread_evenly_over_a_mesh_unless_there_are_very_many(tmp_path, monkeypatch):
+    path = write(tmp_path, "a.obj", "v 0 0 2\nv 1 0 2\nv 1 1 2\nv 0 1 2\nf 1 2 3 4\n")
+
+    def nearest(count):
+        positions = read_cloud(path, num_points=count, seed=1).positions
+        return cKDTree(positions).query(positions, k=2)[0][:, 1].min() * np.sqrt(count)
+
+    monkeypatch.setattr(clouds, "MOST_EVEN", 300)
+    assert nearest(300) > 0.5  # of the distance on a square lattice
+    assert nearest(301) < 0.2
 
 
-def test_map_coordinates_keep_their_precision_and_the_way_back_is_kept(tmp_path):
-    points = np.random.default_rng(0).uniform(0, 1, (50, 3)) + [500_000, 4_000_000, 100]
-    np.save(tmp_path / "a.npy", points)
-    placed = place_cloud(tmp_path / "a.npy", up="z")
+def test_thinning_keeps_points_of_the_file_with_their_materials_and_depends_on_the_seed_alone(tmp_path):
+    positions = sphere_points(1, 900)
+    np.savez(tmp_path / "a.npz", xyz=positions, roughness=np.arange(900) / 900)
+    cloud, lines = read(tmp_path / "a.npz", num_points=100, seed=5)
+    source = np.round(cloud.roughness * 900).astype(int)
+    assert len(set(source)) == 100
+    np.testing.assert_array_equal(cloud.positions, positions[source].astype(np.float32))
+    assert lines[-1] == "100 of 900 points kept, evenly spread"
+    np.testing.assert_array_equal(read_cloud(tmp_path / "a.npz", num_points=100, seed=5).roughness, cloud.roughness)
+    assert (read_cloud(tmp_path / "a.npz", num_points=100, seed=6).roughness != cloud.roughness).any()
+    assert len(read_cloud(tmp_path / "a.npz", num_points=2000).mask) == 900
+
+
+LITTLE_MEMORY = """
+import resource, sys
+import numpy as np
+from spnr_jax.formats.clouds import read_cloud
+from spnr_jax.surfels.normals import VOTERS, outward_normals
+outward_normals(*np.random.default_rng(0).random((2, 2 * VOTERS, 3)), np.arange(256))  # threads and programs of XLA
+before = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
+resource.setrlimit(resource.RLIMIT_AS, (before + int(sys.argv[2]),) * 2)
+cloud = read_cloud(sys.argv[1], num_points=256)
+print(len(cloud.mask), *cloud.positions.min(axis=0), *cloud.positions.max(axis=0))
+"""
+
+
+@pytest.mark.slow
+def test_a_cloud_larger_than_the_memory_is_read(tmp_path):
+    corners, path = np.random.default_rng(0).choice([-1, 1], (40_000, 3)), tmp_path / "big.ply"
+    rows = np.zeros(40_000, [*((axis, "<f4") for axis in "xyz"), *((f"p{i}", "<f8") for i in range(20))])
+    for axis, column in zip("xyz", corners.T, strict=True):
+        rows[axis] = column * np.random.default_rng(1).uniform(0.99, 1, 40_000)
+    head = "ply\nformat binary_little_endian 1.0\nelement vertex 4000000\n"
+    head += "".join(f"property {'float' if name in 'xyz' else 'double'} {name}\n" for name in rows.dtype.names)
+    with path.open("wb") as file:
+        file.write(f"{head}end_header\n".encode())
+        for _ in range(100):
+            file.write(rows.tobytes())
+    done = subprocess.run([sys.executable, "-c", LITTLE_MEMORY, path, "400000000"], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert path.stat().st_size > 1.7 * 400e6
+    count, *bounds = done.stdout.split()
+    assert int(count) == 256
+    np.testing.assert_allclose(np.float64(bounds), [-1, -1, -1, 1, 1, 1], atol=0.01)
+
+
+def test_of_a_cloud_beyond_the_capacity_a_sample_is_kept_while_reading_which_is_said(tmp_path, monkeypatch):
+    monkeypatch.setattr(clouds, "CAPACITY", 500)
+    positions = sphere_points(1, 4000)
+    np.savez(tmp_path / "a.npz", xyz=positions, normals=2 * positions, roughness=np.arange(4000) / 4000)
+    cloud, lines = read(tmp_path / "a.npz", clean="auto")
+    assert 250 <= len(cloud.mask) <= 500
+    assert lines[0] == f"{len(cloud.mask)} of 4000 points kept while reading, drawn at random"
+    assert not any("outliers" in line for line in lines)  # where there are none
+    source = np.round(cloud.roughness * 4000).astype(int)
+    np.testing.assert_array_equal(cloud.positions, positions[source].astype(np.float32))
+    np.testing.assert_allclose(cloud.normals, cloud.positions, atol=1e-6)
+
+
+def test_rows_without_finite_numbers_are_left_out_while_a_big_file_is_thinned(tmp_path, monkeypatch):
+    monkeypatch.setattr(clouds, "CAPACITY", 16)
+    monkeypatch.setattr("spnr_jax.formats.text.PIECE_LINES", 7)
+    positions = np.concatenate([np.full((20, 3), np.nan), sphere_points(3, 300), np.full((9, 3), np.inf)])
+    np.savetxt(tmp_path / "a.xyz", positions)
+    cloud, lines = read(tmp_path / "a.xyz", num_points=1)
+    assert np.isfinite(cloud.positions).all()
+    assert lines[0] == "29 of 329 points left out: NaN, infinity or too large a number"
+    assert "of 300 points kept while reading" in lines[1]
+
+
+# One object of a scene
+
+
+def scene(folder, origin=(0.0, 0.0, 0.0)):
+    """A file of a large and a small ball, and one point far from both."""
+    points = [spiral(900), 0.3 * spiral(450) + [2, 0, 0], [[0, 4, 0]]]
+    np.save(folder / "a.npy", np.concatenate(points) + origin)
+    return folder / "a.npy"
+
+
+def test_a_box_is_in_the_units_and_axes_of_the_file_however_far_it_lies(tmp_path, monkeypatch):
+    monkeypatch.setattr(clouds, "CAPACITY", 480)  # it is cut before the file is thinned while reading
+    box = tuple(map(float, (*(FAR + [1.001, -1, -1]), *(FAR + [3, 1, 1]))))
+    lines: list[str] = []
+    placed = place_cloud(scene(tmp_path, FAR), up="z", cut=Cut(crop=box), report=lines.append)
+    assert "--crop: 450 of 1,351 points lie inside" in lines
+    assert not any("while reading" in line for line in lines)
     back = placed.cloud.positions @ placed.rotation + placed.origin
-    np.testing.assert_allclose(back, points, rtol=0, atol=1e-6)
-    np.testing.assert_allclose(placed.cloud.positions[:, 1], points[:, 2] - placed.origin[2], atol=1e-6)
+    assert np.all((back > box[:3]) & (back < box[3:]))
 
 
-class TestCleaning:
-    def scan(self, folder):
-        """A ball of 600 points and 6 far from it."""
-        far = 4 * np.array([[1, 1, 1], [-1, 1, 1], [1, -1, 1], [1, 1, -1], [-1, -1, 1], [1, -1, -1]])
-        np.save(folder / "a.npy", np.concatenate([spiral(600), far]))
-        return folder / "a.npy"
+def test_objects_are_cut_out_before_they_are_cleaned_and_thinned(tmp_path):
+    cloud, lines = read(scene(tmp_path), cut=Cut(object="2"), clean="auto", num_points=200)
+    assert np.linalg.norm(cloud.positions - [2, 0, 0], axis=1).max() < 0.31
+    assert [line.split()[0] for line in lines if not line.startswith("no ")] == ["--object:", "200"]
+    assert len(read_cloud(scene(tmp_path), cut=Cut(object="largest")).positions) == 900
+    whole, lines = read(scene(tmp_path), clean="auto", num_points=50)
+    assert np.abs(whole.positions).max() <= 2.31
+    assert lines[-2:] == ["removed 1 outliers of 1,351 points", "50 of 1350 points kept, evenly spread"]
 
-    def test_comes_before_thinning_and_says_what_it_did(self, tmp_path):
-        cloud, lines = read(self.scan(tmp_path), num_points=50, clean="auto")
-        assert np.abs(cloud.positions).max() <= 1
-        assert lines[-2:] == ["removed 6 outliers of 606 points", "50 of 600 points kept, evenly spread"]
+
+def test_a_box_and_an_object_are_cut_out_of_a_mesh(tmp_path, monkeypatch):
+    monkeypatch.setattr(clouds, "CUT_MESH", 2**12)
+    triangle = "v {0} 0 0\nv {1} 0 0\nv {0} 1 0\n"
+    (tmp_path / "a.obj").write_text(triangle.format(0, 1) + triangle.format(5, 7) + "f 1 2 3\nf 4 5 6\n")
+    for cut in (Cut(crop=(-1.0, -1.0, -1.0, 2.0, 2.0, 2.0)), Cut(object="2")):
+        cloud = read_cloud(tmp_path / "a.obj", cut=cut, num_points=300)
+        assert len(cloud.positions) == 300
+        assert cloud.positions[:, 0].max() <= 1
+    with pytest.raises(ValueError, match=r"a\.obj: --crop 8 8 8 9 9 9: none of the"):
+        read_cloud(tmp_path / "a.obj", cut=Cut(crop=(8.0, 8.0, 8.0, 9.0, 9.0, 9.0)))
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ({"object": "smallest"}, "--object must be largest or a number from 1, got 'smallest'"),
+        ({"object": "0"}, "--object must be largest or a number from 1, got '0'"),
+        ({"crop": (1.0, 0.0, 0.0, 0.0, 1.0, 1.0)}, "--crop takes xmin .* zmax, each min up to its max"),
+        ({"crop": (np.nan, 0.0, 0.0, 1.0, 1.0, 1.0)}, "--crop takes xmin ymin zmin xmax ymax zmax"),
+        ({"up": "w"}, "up must be one of y, -y, z, -z, x, -x, auto, got 'w'"),
+        ({"num_points": 0}, "num_points must be at least 1, got 0"),
+    ],
+)
+def test_options_that_make_no_sense_are_refused_before_the_file_is_touched(options, expected):
+    with pytest.raises(ValueError, match=expected):
+        read_cloud("absent.ply", **options) if options.keys() & {"up", "num_points"} else Cut(**options)

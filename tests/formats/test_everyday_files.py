@@ -19,7 +19,7 @@ from support.point_clouds import packed_splats, ply_bytes, read, write
 from spnr_jax.formats import gaussian_files
 from spnr_jax.formats.clouds import place_cloud, read_cloud
 from spnr_jax.formats.cut import Cut
-from spnr_jax.formats.mesh.polygons import ears
+from spnr_jax.formats.mesh.plain import ears
 from spnr_jax.surfels.sides import spiral
 
 ROOT = Path(__file__).parents[2]
@@ -37,51 +37,38 @@ def table(separator: str, end: str = "", comma: bool = False, columns=ROWS) -> s
     return text.replace(".", ",") if comma else text
 
 
-# Points in text: (name, content, whether there are colours)
+INDEXED, PCV = [(i, *row) for i, row in enumerate(ROWS)], [(*row, 0.5) for row in ROWS]
+WITH_INTENSITY, WITH_ALPHA = [(*row[:3], -900, *GREEN) for row in ROWS], [(*row, 255) for row in ROWS]
+DOUBLES, POINTS = [(axis, "double") for axis in "xyz"], [tuple(point) for point in BALL.tolist()]
+POINT_LINES = "".join("v {:g} {:g} {:g}\n".format(*point) for point in POINTS)
 TEXTS = {
-    "count line": ("a.xyz", "420\n" + table(" "), True),
-    "count line, semicolons": ("a.xyz", "420\n" + table(";"), True),
-    "CloudCompare, count": ("a.txt", "//X Y Z R G B\n420\n" + table(" "), True),
-    "CloudCompare, names with blanks": (
-        "a.txt",
-        "//X;Y;Z;R;G;B;Illuminance (PCV)\n" + table(";", columns=[(*row, 0.5) for row in ROWS]),
-        True,
-    ),
-    "units in brackets": ("a.csv", "X [m],Y [m],Z [m],R,G,B\n" + table(","), True),
-    "units, blanks between": ("a.txt", "X[m] Y[m] Z[m] R G B\n" + table(" "), True),
-    "pandas' index": (
-        "a.csv",
-        ",x,y,z,red,green,blue\n" + table(",", columns=[(i, *row) for i, row in enumerate(ROWS)]),
-        True,
-    ),
-    "R's index": ("a.txt", "x y z r g b\n" + table(" ", columns=[(i + 1, *row) for i, row in enumerate(ROWS)]), True),
-    "trailing commas": ("a.csv", "x,y,z,r,g,b\n" + table(",", ","), True),
-    "trailing commas, names as well": ("a.csv", "x,y,z,r,g,b,\n" + table(",", ","), True),
-    "trailing semicolons": ("a.txt", table(";", ";"), True),
-    "decimal commas": ("a.csv", "x;y;z;r;g;b\n" + table(";", comma=True), True),
-    "decimal commas between blanks": ("a.txt", table(" ", comma=True), True),
-    ".asc": ("a.asc", table(" "), True),
-    ".pts with intensity": ("a.pts", "420\n" + table(" ", columns=[(*row[:3], -900, *GREEN) for row in ROWS]), True),
-    "rows of red green blue alpha": ("a.txt", table(" ", columns=[(*row, 255) for row in ROWS]), True),
-    "OBJ of v and p": (
-        "a.obj",
-        "".join("v {:g} {:g} {:g}\n".format(*p) for p in BALL) + "p " + " ".join(map(str, range(1, 421))),
-        False,
-    ),
-    "a PLY under another name": (
-        "a.txt",
-        ply_bytes("ascii", rows=[tuple(p) for p in BALL], properties=[(axis, "float") for axis in "xyz"]),
-        False,
-    ),
+    "count line": ("a.xyz", "420\n" + table(" ")),
+    "count line, semicolons": ("a.xyz", "420\n" + table(";")),
+    "CloudCompare, count": ("a.txt", "//X Y Z R G B\n420\n" + table(" ")),
+    "CloudCompare, names with blanks": ("a.txt", "//X;Y;Z;R;G;B;Illuminance (PCV)\n" + table(";", columns=PCV)),
+    "units in brackets": ("a.csv", "X [m],Y [m],Z [m],R,G,B\n" + table(",")),
+    "units, blanks between": ("a.txt", "X[m] Y[m] Z[m] R G B\n" + table(" ")),
+    "pandas' index": ("a.csv", ",x,y,z,red,green,blue\n" + table(",", columns=INDEXED)),
+    "R's index": ("a.txt", "x y z r g b\n" + table(" ", columns=INDEXED)),
+    "trailing commas": ("a.csv", "x,y,z,r,g,b\n" + table(",", ",")),
+    "trailing commas, names as well": ("a.csv", "x,y,z,r,g,b,\n" + table(",", ",")),
+    "trailing semicolons": ("a.txt", table(";", ";")),
+    "decimal commas": ("a.csv", "x;y;z;r;g;b\n" + table(";", comma=True)),
+    "decimal commas between blanks": ("a.txt", table(" ", comma=True)),
+    ".asc": ("a.asc", table(" ")),
+    ".pts with intensity": ("a.pts", "420\n" + table(" ", columns=WITH_INTENSITY)),
+    "rows of red green blue alpha": ("a.txt", table(" ", columns=WITH_ALPHA)),
+    "grey: OBJ of v and p": ("a.obj", POINT_LINES + "p " + " ".join(map(str, range(1, 421)))),
+    "grey: a PLY under another name": ("a.txt", ply_bytes("ascii", rows=POINTS, properties=DOUBLES)),
 }
 
 
 @pytest.mark.parametrize("case", TEXTS)
 def test_files_of_points_are_read_whatever_stands_around_the_numbers(tmp_path, case):
-    name, content, colored = TEXTS[case]
-    cloud, _ = read(write(tmp_path, name, content))
+    cloud, _ = read(write(tmp_path, *TEXTS[case]))
+    color = 0.5 if case.startswith("grey") else LINEAR
     np.testing.assert_allclose(cloud.positions, BALL, atol=1e-5)
-    np.testing.assert_allclose(cloud.base_color, np.broadcast_to(LINEAR if colored else 0.5, (420, 3)), atol=2e-3)
+    np.testing.assert_allclose(cloud.base_color, np.broadcast_to(color, (420, 3)), atol=2e-3)
 
 
 def test_arrays_of_pictures_and_of_colours_with_alpha_are_points(tmp_path):
@@ -176,8 +163,9 @@ def test_the_colours_of_a_mesh_are_read_as_those_of_points(tmp_path, case):
     assert any("taken as sRGB in 0.." in line for line in lines)
 
 
-def colored_ball(folder, colors: np.ndarray, kind: str = "<u2", **more: np.ndarray):
-    """A structured array of the ball with colours (420, 3) and other columns."""
+def colored_ball(folder, colors=GREEN, kind: str = "<u2", **more: np.ndarray):
+    """A structured array of the ball with colours, one or (420, 3), and other columns."""
+    colors = np.broadcast_to(colors, (420, 3))
     fields = [(axis, "<f8") for axis in "xyz"] + [(name, kind) for name in RGB]
     rows = np.zeros(420, fields + [(name, column.dtype.str) for name, column in more.items()])
     for names, values in (("xyz", BALL), (RGB, colors)):
@@ -203,7 +191,7 @@ def test_the_range_of_colours_is_that_of_nearly_all_of_them(tmp_path, factor, st
 
 
 def test_a_picture_that_will_be_black_is_said(tmp_path):
-    _, lines = read(colored_ball(tmp_path, np.full((420, 3), 3), "u1"))
+    _, lines = read(colored_ball(tmp_path, 3, "u1"))
     assert any("nearly black" in line for line in lines)
 
 
@@ -235,7 +223,7 @@ PART = np.arange(420) % 3 == 0
     ],
 )
 def test_what_is_not_to_be_seen_is_left_out_with_a_line_and_kept_on_demand(tmp_path, name, column):
-    path = colored_ball(tmp_path, np.tile(GREEN, (420, 1)), **{name: column})
+    path = colored_ball(tmp_path, **{name: column})
     cloud, lines = read(path)
     np.testing.assert_allclose(cloud.positions, BALL[~PART], atol=1e-6)
     assert any(re.match(r"140 of 420 points left out: .* \(--keep-noise keeps them\)", line) for line in lines)
@@ -244,18 +232,15 @@ def test_what_is_not_to_be_seen_is_left_out_with_a_line_and_kept_on_demand(tmp_p
 
 def test_an_alpha_of_0_everywhere_and_noise_everywhere_are_not_believed(tmp_path):
     for column in ({"alpha": np.zeros(420, np.uint8)}, {"classification": np.full(420, 7, np.uint8)}):
-        assert len(read_cloud(colored_ball(tmp_path, np.tile(GREEN, (420, 1)), **column)).positions) == 420
+        assert len(read_cloud(colored_ball(tmp_path, **column)).positions) == 420
 
 
 def test_splats_whose_opacity_is_not_a_number_or_is_activated_already_are_told(tmp_path):
     names = [*"xyz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
-    for opacity, left in (
-        (np.where(PART, np.nan, 3.0), 280),
-        (np.where(PART, 0.1, 0.9), 280),
-        (np.full(420, 0.5), 420),
-    ):
+    properties = [(name, "float") for name in names]
+    opacities = (np.where(PART, np.nan, 3.0), 280), (np.where(PART, 0.1, 0.9), 280), (np.full(420, 0.5), 420)
+    for opacity, left in opacities:
         rows = [tuple(row) for row in np.column_stack([BALL, np.zeros((420, 3)), opacity])]
-        properties = [(name, "float") for name in names]
         content = ply_bytes("binary_little_endian", rows=rows, properties=properties)
         assert len(read_cloud(write(tmp_path, "a.ply", content)).positions) == left
 
@@ -271,7 +256,7 @@ def test_splats_whose_opacity_is_not_a_number_or_is_activated_already_are_told(t
 )
 def test_normals_are_left_out_where_the_points_speak_against_them(tmp_path, normals, reason):
     columns = dict(zip(("nx", "ny", "nz"), normals.T, strict=True))
-    cloud, lines = read(colored_ball(tmp_path, np.tile(GREEN, (420, 1)), **columns))
+    cloud, lines = read(colored_ball(tmp_path, **columns))
     assert (cloud.normals is None) == (reason is not None)
     assert reason is None or any(line.startswith("normals of the file left out") and reason in line for line in lines)
 

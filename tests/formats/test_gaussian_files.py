@@ -1,14 +1,16 @@
-"""Files of splats: what they say is what was written, by our reader and by plain ones."""
+"""Files of splats: what they say is what was written, by our reader and by three.js in a headless Chromium.
 
-import gzip
+Without a Chromium and npm's three (support/three_js.py) the latter tests are skipped.
+"""
 
 import numpy as np
 import pytest
-from support import splat_balls
+from support import chromium as chromium_of
+from support import splat_balls, three_js
 
 from spnr_jax.formats import gaussian_files
 from spnr_jax.formats.point_files import parse_ply
-from spnr_jax.surfels.gaussians import rotations
+from spnr_jax.surfels.gaussians import C0, rotations
 
 NOTE = "ball.ply, drawn by spnr_jax (surfels), light: room"
 
@@ -35,23 +37,6 @@ def test_a_ply_holds_each_number_of_the_splats_turned_half_around(tmp_path, degr
     assert f"comment {NOTE}".encode() in path.read_bytes()[:300]
 
 
-def spz_places(content, count):
-    """Positions: three numbers of 24 bits each, in fixed point."""
-    low, middle, high = np.frombuffer(content, np.uint8, 9 * count, 16).reshape(-1, 3).T.astype(int)
-    fixed = (low | middle << 8 | high << 16).reshape(count, 3)
-    return np.where(fixed >= 2**23, fixed - 2**24, fixed) * 2.0 ** -content[13]
-
-
-def test_an_spz_holds_what_its_format_says():
-    splats = splat_balls.ball(50, 1)
-    content = gzip.decompress(gaussian_files.spz_of(splats))
-    magic, version, count = np.frombuffer(content, "<u4", 3)
-    degree, bits = content[12:14]
-    assert (magic, version, count, degree) == (0x5053474E, 3, 50, 1)
-    assert len(content) == 16 + 50 * (9 + 1 + 3 + 3 + 4 + 9)
-    np.testing.assert_allclose(spz_places(content, 50), splats.position, atol=2.0**-bits)
-
-
 @pytest.mark.parametrize("name", ["out.obj", "out.glb", "out", "folder.ply"])
 def test_another_suffix_or_a_folder_is_refused_in_one_line(tmp_path, name):
     (tmp_path / "folder.ply").mkdir()
@@ -59,3 +44,53 @@ def test_another_suffix_or_a_folder_is_refused_in_one_line(tmp_path, name):
         gaussian_files.write_splats(tmp_path / name, splat_balls.ball(10))
     assert "\n" not in str(refused.value)
     assert name in str(refused.value)
+
+
+# In three.js
+
+SCRIPT = """
+import { SPZLoader } from "add/loaders/SPZLoader.js";
+import { GaussianSplatPLYLoader } from "add/loaders/GaussianSplatPLYLoader.js";
+const read = { spz: await new SPZLoader().loadAsync("/ball.spz"),
+               ply: await new GaussianSplatPLYLoader().loadAsync("/ball.ply") };
+for (const [name, { attributes }] of Object.entries(read))
+  read[name] = Object.fromEntries(Object.entries(attributes).map(([key, values]) => [key, Array.from(values.array)]));
+window.shown = read;
+"""
+
+
+SPLATS = splat_balls.ball(500)
+
+
+@pytest.fixture(scope="module")
+def read_in_three():
+    """What three.js reads in both files, its console being silent."""
+    playwright = pytest.importorskip("playwright.sync_api", reason="pip install playwright")
+    files = {"/ball.spz": gaussian_files.spz_of(SPLATS), "/ball.ply": gaussian_files.ply_of(SPLATS, "a ball")}
+    with three_js.run(playwright, SCRIPT, files, 64) as (tab, said):
+        found = tab.evaluate("window.shown")
+    assert not said
+    return found
+
+
+@chromium_of.needed
+@three_js.needed_with_splats
+@pytest.mark.ci  # it opens a browser
+@pytest.mark.parametrize(("kind", "coarser"), [("spz", 1), ("ply", 0)])
+def test_three_reads_places_shapes_colours_and_opacities_as_they_were_written(read_in_three, kind, coarser):
+    found = {name: np.array(values) for name, values in read_in_three[kind].items()}
+    wanted = SPLATS if kind == "spz" else gaussian_files.turn_half(SPLATS)
+    axes = rotations(wanted.rotation) * wanted.scale[:, None, :]
+    shape = np.einsum("nij,nkj->nik", axes, axes)[:, *np.triu_indices(3)]
+    color = np.concatenate([0.5 + C0 * wanted.harmonics[:, 0], wanted.opacity[:, None]], axis=1)
+    np.testing.assert_allclose(found["position"].reshape(-1, 3), wanted.position, atol=1e-6 + 1e-6 * coarser)
+    largest = np.abs(shape).max()
+    np.testing.assert_allclose(found["covariance"].reshape(-1, 6), shape, atol=(1e-5 + 0.07 * coarser) * largest)
+    np.testing.assert_allclose(
+        found["color"].reshape(-1, 4) / 255, np.clip(color, 0, 1), atol=(1 + 0.6 * coarser) / 255
+    )
+    words = found["sphericalHarmonics1"].astype(np.uint32)[:, None] >> np.array([0, 8, 16, 24]) & 255
+    rest = (words.reshape(len(color), -1)[:, :9].astype(float) - 128) / 128
+    np.testing.assert_allclose(
+        rest, np.clip(wanted.harmonics[:, 1:].reshape(-1, 9), -1, 1), atol=(1 + 4 * coarser) / 128
+    )

@@ -13,7 +13,7 @@ laspy = pytest.importorskip("laspy")
 ORIGIN = np.array([500_000.0, 4_000_000.0, 120.0])
 
 
-def scan(path, point_format: int, count=300):
+def scan(path, point_format: int = 7, count=300):
     """A scan of random points in a cube of ten metres; its positions, as a LAS file rounds them to millimetres."""
     rng = np.random.default_rng(0)
     header = laspy.LasHeader(point_format=point_format, version="1.4")
@@ -26,16 +26,6 @@ def scan(path, point_format: int, count=300):
         las.red, las.green, las.blue = (np.full(count, level, np.uint16) for level in (65535, 32768, 0))
     las.write(path)
     return positions
-
-
-@pytest.mark.parametrize("suffix", [".las", ".laz"])
-def test_a_scan_keeps_its_coordinates_colours_and_is_z_up(tmp_path, suffix):
-    positions = scan(tmp_path / f"a{suffix}", 7)
-    placed = place_cloud(tmp_path / f"a{suffix}")
-    assert placed.up == "z"
-    back = placed.cloud.positions @ placed.rotation + placed.origin
-    np.testing.assert_allclose(back, positions, rtol=0, atol=1e-4)
-    np.testing.assert_allclose(placed.cloud.base_color[0], [1, 0.2140, 0], atol=1e-4)
 
 
 def in_own_chunks(path, sizes, announced: int):
@@ -61,51 +51,49 @@ def in_own_chunks(path, sizes, announced: int):
     path.with_suffix(".laz").write_bytes(packed.getvalue())
 
 
-@pytest.mark.parametrize("announced", [0, 2**32 - 1])
-def test_chunks_of_their_own_sizes_are_read_also_where_the_header_says_0(tmp_path, announced):
-    positions = scan(tmp_path / "a.las", 7)
-    in_own_chunks(tmp_path / "a.las", (120, 50, 130), announced)
-    placed = place_cloud(tmp_path / "a.laz")
-    np.testing.assert_allclose(placed.cloud.positions @ placed.rotation + placed.origin, positions, rtol=0, atol=1e-4)
+@pytest.mark.parametrize(("suffix", "announced"), [(".las", None), (".laz", None), (".laz", 0), (".laz", 2**32 - 1)])
+def test_a_scan_keeps_its_coordinates_and_colours_in_chunks_of_any_size_and_is_z_up(tmp_path, suffix, announced):
+    positions = scan(tmp_path / f"a{suffix if announced is None else '.las'}")
+    if announced is not None:
+        in_own_chunks(tmp_path / "a.las", (120, 50, 130), announced)
+    placed = place_cloud(tmp_path / f"a{suffix}")
+    assert placed.up == "z"
+    back = placed.cloud.positions @ placed.rotation + placed.origin
+    np.testing.assert_allclose(back, positions, rtol=0, atol=1e-4)
+    np.testing.assert_allclose(placed.cloud.base_color[0], [1, 0.2140, 0], atol=1e-4)
 
 
 def test_a_scan_without_colours_shows_its_intensity(tmp_path):
     scan(tmp_path / "a.las", 6)
-    lines: list[str] = []
-    cloud = read_cloud(tmp_path / "a.las", report=lines.append)
-    assert np.ptp(cloud.base_color) > 0.9
-    assert any("intensity" in line for line in lines)
+    assert np.ptp(read_cloud(tmp_path / "a.las").base_color) > 0.9
 
 
 @pytest.mark.parametrize("package", ["laspy", "lazrs"])
 def test_without_its_packages_one_line_names_the_extra(tmp_path, monkeypatch, package):
-    scan(tmp_path / "a.las", 7)
+    scan(tmp_path / "a.las")
     monkeypatch.setitem(sys.modules, package, None)
     with pytest.raises(ValueError, match=rf"a.las: needs the package {package} .* pip install 'spnr-jax\[formats\]'"):
         read_cloud(tmp_path / "a.las")
 
 
 @pytest.mark.parametrize(
-    ("place", "value", "reason"),
-    [(100, 2**32 - 1, "records in its header"), (96, 2**32 - 1, "points from byte"), (0, 0, "not a LAS file")],
+    ("suffix", "place", "value", "reason"),
+    [
+        (".las", 100, 2**32 - 1, "records in its header"),
+        (".las", 96, 2**32 - 1, "points from byte"),
+        (".las", 0, 0, "not a LAS file"),
+        (".laz", "table", 2**31, "chunks in"),
+        (".laz", "table", 0, "points in 0 chunks"),
+    ],
 )
-def test_a_header_that_announces_more_than_the_file_holds_is_refused_at_once(place, value, reason, tmp_path):
-    scan(tmp_path / "a.las", 7)
-    content = bytearray((tmp_path / "a.las").read_bytes())
+def test_what_announces_more_than_the_file_holds_never_reaches_the_library(suffix, place, value, reason, tmp_path):
+    scan(tmp_path / f"a{suffix}")
+    content = bytearray((tmp_path / f"a{suffix}").read_bytes())
+    if place == "table":  # of chunks, which the library trusts
+        (data,) = struct.unpack_from("<I", content, 96)
+        (table,) = struct.unpack_from("<q", content, data)
+        place = table + 4
     content[place : place + 4] = value.to_bytes(4, "little")
-    (tmp_path / "a.las").write_bytes(content)
+    (tmp_path / f"a{suffix}").write_bytes(content)
     with pytest.raises(ValueError, match=reason):
-        read_cloud(tmp_path / "a.las")
-
-
-def test_a_chunk_table_that_is_too_long_or_too_short_never_reaches_the_library_that_trusts_it(tmp_path):
-    scan(tmp_path / "a.laz", 7)
-    whole = (tmp_path / "a.laz").read_bytes()
-    (data,) = struct.unpack_from("<I", whole, 96)
-    (table,) = struct.unpack_from("<q", whole, data)
-    for chunks, reason in ((2**31, "chunks in"), (0, "points in 0 chunks")):
-        content = bytearray(whole)
-        content[table + 4 : table + 8] = chunks.to_bytes(4, "little")
-        (tmp_path / "a.laz").write_bytes(content)
-        with pytest.raises(ValueError, match=reason):
-            read_cloud(tmp_path / "a.laz")
+        read_cloud(tmp_path / f"a{suffix}")

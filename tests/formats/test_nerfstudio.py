@@ -55,12 +55,3 @@ def test_the_points_reproject_onto_the_object_and_cover_it(folder):
         drawn = np.zeros_like(alpha, bool)
         drawn[row, column] = True
         assert drawn[alpha == 255].mean() > 0.97
-
-
-def test_a_wrong_convention_would_be_seen(folder):
-    for mirror in ((-1, 1), (1, -1), (-1, -1)):
-        hits = []
-        for pixels, alpha in read(folder)[1]:
-            column, row = np.floor((pixels - RESOLUTION / 2) * mirror + RESOLUTION / 2).astype(int).T
-            hits.append((alpha[row, column] > 0).mean())
-        assert np.mean(hits) < 0.9

@@ -7,9 +7,7 @@ Anything else fails: another exception, a warning, more than 10 seconds, more th
 folder, a program, a connection, a pickle.  Hypothesis draws the damage and shrinks what fails.
 """
 
-import ast
 import contextlib
-import json
 import os
 import pickle
 import shutil
@@ -31,21 +29,12 @@ from hypothesis import strategies as st
 from watched import limited_memory, watched
 
 from spnr_jax.errors import one_line
-from spnr_jax.methods import from_dict, to_dict
-from spnr_jax.presets import tiny
-from spnr_jax.viewer import frame
 
 ROOT = Path(__file__).parents[2]
 INPUTS = int(os.environ.get("FUZZ_INPUTS", "16"))  # of each reader
 SECONDS = 10.0  # of the processor that an input may take
 LONGEST_REASON = 1000  # characters of a line that a person should read
 IN_CHILD = "FUZZ_CHILD" in os.environ
-SOURCES = sorted(path for folder in ("spnr_jax", "data_gen", "experiments") for path in (ROOT / folder).rglob("*.py"))
-json_values = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
-    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
-    max_leaves=6,
-)
 
 
 @pytest.fixture(scope="module")
@@ -152,56 +141,3 @@ def test_whatever_a_reader_does_that_it_must_not_is_seen(name, folder):
     misdeed, words = MISDEEDS[name]
     with pytest.raises(AssertionError, match=words):
         attempt(lambda place, main: misdeed(place), folder, "a")
-
-
-def test_a_reader_that_keeps_to_its_folder_is_not_accused(folder):
-    (folder / "a.txt").write_text("1")
-    assert (
-        attempt(lambda place, main: (place / "b.txt").write_text((place / main).read_text()), folder, "a.txt") == "read"
-    )
-
-
-# Code in files
-
-
-def keyword(call: ast.Call, name: str):
-    return next((ast.literal_eval(k.value) for k in call.keywords if k.arg == name), None)
-
-
-@pytest.mark.parametrize("path", SOURCES, ids=lambda path: "/".join(path.relative_to(ROOT).parts))
-def test_no_source_runs_code_that_a_file_may_hold(path):
-    for call in (node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call)):
-        name = ast.unparse(call.func)
-        last, where = name.rsplit(".", 1)[-1], f"{path.name}:{call.lineno} {name}"
-        assert name not in ("eval", "exec", "__import__"), where
-        assert last not in ("Unpickler", "loads") or name == "json.loads", where
-        assert not name.startswith(("pickle.", "cloudpickle.", "dill.", "shelve.", "marshal.")), where
-        assert not (last == "load" and name.startswith("yaml")), where
-        assert keyword(call, "allow_pickle") in (None, False), where
-        if name in ("np.load", "numpy.load", "np.lib.format.read_array"):
-            assert keyword(call, "allow_pickle") is False, where
-        if name == "torch.load":
-            assert keyword(call, "weights_only") is True, where
-
-
-# Values of any kind
-
-
-@settings(max_examples=150, deadline=None, derandomize=True)
-@given(st.sampled_from(sorted(to_dict(tiny())["model"])), json_values)
-def test_any_value_of_a_config_makes_a_config_of_right_types_or_a_valueerror(name, value):
-    values = json.loads(json.dumps(to_dict(tiny())))
-    before, values["model"][name] = values["model"][name], value
-    try:
-        hash(from_dict(values))
-    except (ValueError, TypeError, AttributeError):  # what read_config turns into one line
-        return
-    assert not isinstance(before, int) or isinstance(before, bool) or isinstance(value, int)
-
-
-@settings(max_examples=150, deadline=None, derandomize=True)
-@given(json_values, json_values, json_values)
-def test_a_camera_message_of_any_values_is_a_view_or_none(wxyz, position, number):
-    assert frame.read_view(wxyz, position, number, number, number) is None or np.isfinite(position).all()
-    assert frame.read_view([1, 0, 0, 0], position, 0.5, 10, 10) is None or np.isfinite(position).all()
-    assert frame.read_numbers(wxyz, 2) is None or np.isfinite(wxyz).all()

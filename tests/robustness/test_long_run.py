@@ -89,15 +89,6 @@ def test_each_kind_of_work_compiles_when_it_is_done_for_the_first_time_and_never
     assert seen.phases[-6:] == ["step", "row", "preview", "checkpoint", "saved", "end"]
 
 
-def test_what_compiles_at_every_preview_is_seen():
-    seen = Witness()
-    for step in range(1, 4):
-        seen.event("step", step, None)
-        seen.event("preview", step, None)
-        seen.note(COMPILED, 0.1)
-    assert again(seen) == [("preview", 2, 2), ("preview", 3, 3)]
-
-
 @pytest.mark.skipif(not STEPS, reason="`make long-run`: minutes on an idle machine")
 def test_memory_handles_and_pace_of_a_long_run(tmp_path):
     """Memory grows by less than 1 %, a step's time by less than 5 %, threads and files by fewer than ten."""

@@ -1,5 +1,7 @@
 """PCD files made by hand, in every encoding."""
 
+import itertools
+
 import numpy as np
 
 ENCODINGS = "ascii", "binary", "binary_compressed"
@@ -22,33 +24,17 @@ def packed(colors: np.ndarray) -> np.ndarray:
 
 
 def compress(data: bytes) -> bytes:
-    """LZF, the slow way: the longest earlier match of up to 264 bytes at each place, else plain bytes."""
-    out, plain, place = bytearray(), bytearray(), 0
-
-    def flush():
-        for start in range(0, len(plain), 32):
-            piece = plain[start : start + 32]
-            out.extend(bytes([len(piece) - 1]) + piece)
-        plain.clear()
-
-    while place < len(data):
-        best, distance = 0, 0
-        for start in range(max(0, place - 8191), place):
-            length = 0
-            while length < 264 and place + length < len(data) and data[start + length] == data[place + length]:
-                length += 1
-            if length > best:
-                best, distance = length, place - start
-        if best < 3:
-            plain.append(data[place])
-            place += 1
-            continue
-        flush()
-        high, low = divmod(distance - 1, 256)
-        out.extend([best - 2 << 5 | high, low] if best < 9 else [7 << 5 | high, best - 9, low])
-        place += best
-    flush()
-    return bytes(out)
+    """LZF whose only copies are of runs of one byte."""
+    out = b""
+    for byte, run in itertools.groupby(data):
+        left = len(list(run)) - 1
+        out += bytes([0, byte])
+        while left >= 3:
+            size = min(left, 264)
+            out += bytes([size - 2 << 5, 0]) if size < 9 else bytes([7 << 5, size - 9, 0])
+            left -= size
+        out += bytes([0, byte]) * left
+    return out
 
 
 def content(encoding: str, rows: np.ndarray, newline: str = "\n", stored: bool = False) -> bytes:

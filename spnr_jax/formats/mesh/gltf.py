@@ -12,11 +12,10 @@ from typing import NamedTuple
 import numpy as np
 from trimesh.transformations import quaternion_matrix
 
-from spnr_jax.formats.mesh.assets import Asset, Part, RejectedAsset, TransparentParts
-from spnr_jax.formats.mesh.file_colors import LINEAR, SRGB
+from spnr_jax.formats.columns import LINEAR, SRGB
+from spnr_jax.formats.mesh.assets import Asset, Part, RejectedAsset, Tolerance, TransparentParts
 from spnr_jax.formats.mesh.gltf_container import DRACO, MESHOPT, GltfFile, decode_accessor, decode_mesh
 from spnr_jax.formats.mesh.gltf_materials import BASIS, MOVED, WEBP, GltfMaterial, read_material
-from spnr_jax.formats.mesh.tolerance import Tolerance
 from spnr_jax.surfels.gaussians import C0
 
 INSTANCING = "EXT_mesh_gpu_instancing"

@@ -11,8 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from spnr_jax.formats.mesh.assets import RejectedAsset, extra
-from spnr_jax.formats.mesh.tolerance import read_companion
+from spnr_jax.formats.mesh.assets import RejectedAsset, extra, read_companion
 
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}

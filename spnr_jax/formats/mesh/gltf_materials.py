@@ -2,7 +2,7 @@
 
 base colour = factor x texture (sRGB -> linear); roughness = factor x G, metallic = factor x B of the metallic-roughness
 texture; defaults white, 1, 1. KHR_materials_pbrSpecularGlossiness is converted with the formulas of the extension's
-reference converter. Where a picture is wanted and no reference (tolerance.py), alpha says where there is surface, and
+reference converter. Where a picture is wanted and no reference (assets.py), alpha says where there is surface, and
 the normal map is kept. Everything else that a material has is named as ignored.
 
 The first texture that is read leads.  For references a material has one set of coordinates, and a second texture that
@@ -16,10 +16,18 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from spnr_jax.formats.mesh.assets import Material, MissingFile, RejectedAsset, Wrap, make_material
+from spnr_jax.formats.mesh.assets import (
+    Alpha,
+    Material,
+    MissingFile,
+    Opacity,
+    RejectedAsset,
+    Tolerance,
+    Wrap,
+    make_material,
+)
 from spnr_jax.formats.mesh.gltf_container import GltfFile
 from spnr_jax.formats.mesh.texels import KTX2_PACKAGE, color_texels, direction_texels, read_image, resize, value_texels
-from spnr_jax.formats.mesh.tolerance import Alpha, Opacity, Tolerance
 
 WRAPS: dict[int, Wrap] = {10497: "repeat", 33648: "mirror", 33071: "clamp"}
 NEAREST = 9728

@@ -1,15 +1,13 @@
 """Mesh files as assets: which files a folder holds, and one of them read, checked, cleaned and merged by material.
 
 glTF and GLB carry principled materials (gltf.py), OBJ gets them from its MTL (obj.py); PLY, STL and OFF (plain.py) have
-vertex or face colours at most, read as those of points are (file_colors.py), grey 0.5 otherwise.
+vertex or face colours at most, read as those of points are (columns.py), grey 0.5 otherwise.
 
 checked   indices inside, coordinates finite, an extent above zero
 cleaned   faces without area and vertices without faces removed; normals unit; colours in [0, 1]; unused columns gone
 merged    parts with equal materials (by value) are one part: a renderer compiles per part. Smooth and flat parts stay
           apart, so that neither takes on the other's normals.
-tinted    a renderer takes either a texture or colours at vertices: a textured part with vertex colours becomes one part
-          per tint, exact for faces of one colour (an exporter's constant, say); others take the mean of their corners,
-          and more than MAX_TINTS colours are gathered into fewer
+tinted    a renderer of references takes either a texture or colours at vertices: of colours on a texture their mean
 Every reason not to use a file is a RejectedAsset with one line.
 """
 
@@ -43,8 +41,6 @@ from spnr_jax.formats.mesh.obj import load_obj, obj_points
 from spnr_jax.formats.mesh.plain import PLAIN, off_points
 from spnr_jax.formats.mesh.surface_points import bounding_box, face_areas, unit, vertex_normals
 
-MAX_TINTS = 16  # tinted copies of a texture
-LEVELS = (255, 31, 15, 7, 3, 1)  # steps per channel that tell tints apart; the first that needs few enough copies
 # Faces below this share of the squared box diagonal are float32 rounding, not surface.
 DEGENERATE_AREA = 1e-14
 MAX_TEXCOORD = 1e6  # beyond it float32, in which the renderer computes, cannot tell neighbouring texels apart
@@ -60,8 +56,8 @@ UNREADABLE += (ImportError,)  # trimesh looks for a package that guesses the enc
 logging.getLogger("trimesh").addHandler(logging.NullHandler())
 
 
-def assemble(asset: Asset) -> Asset:
-    """The asset with its parts checked, cleaned and merged; what was changed is added to `ignored`."""
+def assemble(asset: Asset, strict: bool) -> Asset:
+    """The asset with its parts checked, cleaned, merged and, for references, tinted; changes are named in `ignored`."""
     for part in asset.parts:
         _check_columns(part)
         _check_material(part.material)
@@ -74,9 +70,11 @@ def assemble(asset: Asset) -> Asset:
     for whole in asset.parts:
         solid = face_areas(whole) > smallest
         degenerate += int((~solid).sum())
-        for part in _clean_part(replace(whole, faces=whole.faces[solid]), notes) if solid.any() else ():
-            key = identities.setdefault(id(part.material), _identity(part.material)), part.normals is None
-            groups.setdefault(key, []).append(part)
+        if not solid.any():
+            continue
+        part = _clean_part(replace(whole, faces=whole.faces[solid]), notes, strict)
+        key = identities.setdefault(id(part.material), _identity(part.material)), part.normals is None
+        groups.setdefault(key, []).append(part)
     if not groups:
         raise RejectedAsset("has no face with an area")
     if degenerate:
@@ -111,16 +109,17 @@ def _check_material(material: Material) -> None:
             raise RejectedAsset(f"has a material whose {name} is not finite (NaN or infinity)")
 
 
-def _clean_part(part: Part, notes: set[str]) -> list[Part]:
-    """The part with just the columns that its material needs; several parts where vertex colours tint a texture."""
+def _clean_part(part: Part, notes: set[str], strict: bool) -> Part:
+    """The part with just the columns that its material needs."""
     part = _settle_texture(_drop_unused_vertices(part), notes)
     part = replace(part, normals=_unit_normals(part, notes), colors=_check_colors(part, notes))
-    if part.colors is None or part.material.base_color.ndim == 1:
-        return [part]
-    parts, error = split_by_tint(part)
-    if error > 1 / 255:
-        notes.add("vertex colours that vary within textured faces (one tint per face is used)")
-    return [_drop_unused_vertices(piece) for piece in parts]
+    if part.colors is None or part.material.base_color.ndim == 1 or not strict:
+        return part
+    tint = part.colors[part.faces].mean(axis=(0, 1))
+    if np.abs(part.colors - tint).max() > 1 / 255:
+        notes.add("vertex colours that vary over a texture (their mean is used)")
+    look = replace(part.material, base_color=part.material.base_color * tint.astype(np.float32))
+    return replace(part, material=look, colors=None)
 
 
 def _drop_unused_vertices(part: Part) -> Part:
@@ -240,7 +239,7 @@ def load_mesh(
     with buffers missing or outside its folder.  "refuse", for references, also refuses what is transparent and images
     and libraries that are missing; "opaque" and "skip", for pictures, say in `notes` what was made of them, leave out
     faces whose vertices are not finite, and read what the renderer of references does not know: cut-outs, normal maps,
-    several texture coordinates (tolerance.py).  `kind` is a suffix to go by instead of the file's.
+    several texture coordinates (assets.py).  `kind` is a suffix to go by instead of the file's.
     """
     path = Path(path)
     kind = kind or path.suffix.lower()
@@ -253,7 +252,8 @@ def load_mesh(
             asset = PLAIN[kind](path.read_bytes())
         else:
             raise RejectedAsset(f"has suffix {kind!r}; expected one of {' '.join(SUFFIXES)}")
-        asset = assemble(asset if transparent_parts == "refuse" else _finite(asset))
+        strict = transparent_parts == "refuse"
+        asset = assemble(asset if strict else _finite(asset), strict)
     return replace(asset, source={"file": path.name, "sha256": hashlib.sha256(path.read_bytes()).hexdigest()})
 
 
@@ -303,22 +303,3 @@ def _finite(asset: Asset) -> Asset:
 def _safe(name: str) -> str:
     """A name of letters, digits, dot, dash and underscore that is no hidden folder."""
     return re.sub(r"[^A-Za-z0-9._-]+", "_", name).strip("._-") or "object"
-
-
-def split_by_tint(part: Part) -> tuple[list[Part], float]:
-    """Parts without vertex colours that look like this one, and the largest error of a colour at a face's corner."""
-    assert part.colors is not None, "only parts with vertex colours are split"
-    corners = part.colors[part.faces]
-    face_colors = corners.mean(axis=1)
-    for levels in LEVELS:
-        steps, group = np.unique(np.round(face_colors * levels), axis=0, return_inverse=True)
-        if len(steps) <= MAX_TINTS:
-            break
-    parts, error = [], 0.0
-    for number in range(len(steps)):
-        here = group.ravel() == number
-        tint = face_colors[here].mean(axis=0)
-        error = max(error, float(np.abs(corners[here] - tint).max()))
-        look = replace(part.material, base_color=part.material.base_color * tint.astype(np.float32))
-        parts.append(replace(part, faces=part.faces[here], material=look, colors=None))
-    return parts, error

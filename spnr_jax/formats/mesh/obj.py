@@ -1,47 +1,63 @@
-"""Wavefront OBJ + MTL as raw assets: geometry through trimesh, materials from the MTL text.
+"""Wavefront OBJ + MTL as raw assets.
 
-Vertex colours are sRGB, as those of points (file_colors.py). Kd is linear (as Blender writes it) and counts only
-without map_Kd (sRGB), for most exporters leave a placeholder beside a map; roughness is Pr, else sqrt(2 / (Ns + 2)),
-else 0.5; metallic is Pm, else 0. Transparent: d below 1, map_d, or Tr strictly between 0 and 1 (writers disagree
-which end of Tr is the opaque one); where a picture is wanted (tolerance.py) map_d is a cut-out at a half, and a
-library or an image that is missing leaves grey. Of faces with the same three corners, in either order, one is kept,
-that of the material used first: ShapeNet has many, one for each side, and a ray could not tell which it hits.
+Vertices with the same position, texture coordinates and normal are one.  Vertex colours are read as those of points are
+(columns.py). Kd is linear (as Blender writes it) and counts only without map_Kd (sRGB), for most exporters leave a
+placeholder beside a map; roughness is Pr, else sqrt(2 / (Ns + 2)), else 0.5; metallic is Pm, else 0. Transparent: d
+below 1, map_d, or Tr strictly between 0 and 1 (writers disagree which end of Tr is the opaque one); where a picture is
+wanted (assets.py) map_d is a cut-out at a half, and a library or an image that is missing leaves grey. Of faces with
+the same three corners, in either order, one is kept, that of the material used first: ShapeNet has many, one for each
+side, and a ray could not tell which it hits.
 """
 
-import io
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from trimesh.exchange.obj import load_obj as read_obj_text
-from trimesh.geometry import triangulate_quads
 
+from spnr_jax.formats.columns import NORMAL, SRGB, Columns, colors_of
 from spnr_jax.formats.mesh.assets import (
+    MOSTLY_OPAQUE,
+    Alpha,
     Asset,
     Material,
     MissingFile,
+    Opacity,
     Part,
     RejectedAsset,
+    Tolerance,
     TransparentParts,
     Wrap,
     make_material,
+    read_companion,
 )
-from spnr_jax.formats.mesh.file_colors import linear_colors
-from spnr_jax.formats.mesh.polygons import MOST_CORNERS, ears, is_concave
+from spnr_jax.formats.mesh.plain import triangulate
 from spnr_jax.formats.mesh.texels import color_texels, read_image, value_texels
-from spnr_jax.formats.mesh.tolerance import MOSTLY_OPAQUE, Alpha, Opacity, Tolerance, read_companion
+from spnr_jax.kernels.cloud_arrays import stack_columns
 
-PLACE = "material-{}"  # name that trimesh sees for the n-th material, so that any name in the file is safe
 READ = {"newmtl", "kd", "map_kd", "pr", "map_pr", "pm", "map_pm", "ns", "d", "tr", "map_d"}
 SILENT = {"ka", "ks", "ni", "illum", "tf", "sharpness"}  # the older lighting model: has no principled counterpart
 Read = Callable[[str], bytes]  # the bytes of a companion file, by its name in the text
+Library = dict[str, dict[str, str]]  # material name -> keyword in lower case -> rest of the line
 MAPS = ("map_kd", "map_pr", "map_pm", "map_d")
 DEFAULTS = ("s", (1.0, 1.0)), ("o", (0.0, 0.0))  # of options of maps: scale and offset of u and v
-OPTION = re.compile(r"-(\w+)((?:\s+(?:on|off|[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)(?=\s))*)\s+")
+OPTION = re.compile(r"-(\w+)((?:\s+(?:on|off|[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?)(?=\s))*)\s+")
+
+
+class Text(NamedTuple):
+    """An OBJ file: rows behind v, vt and vn; the corners of all faces; size and material of each face; libraries.
+
+    A corner is a word like 1/2/3: numbers of rows, from 1.
+    """
+
+    rows: dict[str, list[str]]
+    corners: list[str]
+    sizes: list[int]
+    used: list[str]
+    libraries: list[str]
 
 
 class Placement(NamedTuple):
@@ -66,110 +82,116 @@ def load_obj(path: Path, root: Path | None = None, transparent_parts: Transparen
     `root` is the folder that libraries and images must not lead out of (default: the file's own).
     """
     read, tolerance = partial(read_companion, path.parent, root=root), Tolerance(transparent_parts)
-    text = _text(path)
-    if not re.search(r"(?m)^f ", text):
+    text = _parse(path)
+    if not text.sizes:
         raise RejectedAsset("has no faces")
-    text = _without_notches(_absolute(text))
-    library: dict[str, dict[str, str]] = {}
-    for names in re.findall(r"(?m)^mtllib +(.+?) *$", text):
+    library: Library = {}
+    for names in text.libraries:
         library |= parse_mtl(_read_library(read, path.parent, names, tolerance))
-    names = list(dict.fromkeys(re.findall(r"(?m)^usemtl +(.+?) *$", text)))
-    ignored: set[str] = set()
-    looks = {PLACE.format(i): _look(read, name, library, ignored, tolerance) for i, name in enumerate(names)}
-    # an MTL text of names only makes trimesh keep the material of each face
-    numbers = dict(zip(names, looks, strict=True))
-    text = "mtllib names\n" + re.sub(r"(?m)^mtllib.*$", "", text)
-    text = re.sub(r"(?m)^usemtl +(.+?) *$", lambda match: f"usemtl {numbers[match[1]]}", text)
-    loaded = read_obj_text(io.StringIO(text), resolver={"names": "\n".join(f"newmtl {name}" for name in looks)})
-    order = {name: number for number, name in enumerate(looks)}
-    meshes = sorted(loaded["geometry"].values(), key=lambda mesh: order.get(_material_name(mesh), -1))
-    notes = _color(meshes)
-    # what has colours of its own and no material is not multiplied with grey
-    plain = {name for name, number in order.items() if names[number] not in library} | {""}
-    dressed = []
-    for mesh in meshes:
-        name = _material_name(mesh)
-        white = mesh.get("vertex_colors") is not None and (name in plain or name not in looks)
-        dressed.append((mesh, Look(make_material(1.0)) if white else looks.get(name, Look(make_material()))))
-    parts = [_part(mesh, look.material, look.placement) for mesh, look in dressed if not look.nowhere]
-    if not parts and meshes:
-        raise RejectedAsset(f"has nothing to draw: {'; '.join(tolerance.notes())}")
-    if re.search(r"(?m)^vn ", text) and any(part.normals is None for part in parts):
+    columns, ignored = _columns(text), set[str]()
+    colors, notes = colors_of(columns) or (None, [])
+    looks = {}
+    for name in dict.fromkeys(text.used):
+        looks[name] = _look(read, name, library, ignored, tolerance) if name else Look(make_material())
+        if colors is not None and name not in library:  # what has colours of its own is not multiplied with grey
+            looks[name] = Look(make_material(1.0))
+    parts = _parts(text, columns, colors, looks)
+    if not parts:
+        raise RejectedAsset(f"has nothing to draw: {'; '.join(tolerance.notes()) or 'no triangles'}")
+    if text.rows["vn"] and any(part.normals is None for part in parts):
         ignored.add("normals that only some faces have (flat shading is used)")
     parts = _without_doubles(parts, ignored)
     return Asset(parts=tuple(parts), ignored=tuple(sorted(ignored)), notes=(*tolerance.notes(), *notes))
 
 
-def obj_points(path: Path) -> dict[str, np.ndarray] | None:
+def obj_points(path: Path) -> Columns | None:
     """The columns of the vertices of a file without faces; None if it has some."""
-    text = _text(path)
-    if re.search(r"(?m)^f ", text):
+    if re.search(rb"(?m)^[ \t]*f[ \t]", path.read_bytes()):
         return None
-    rows = _vertices(text)
-    if not rows.size:
+    text = _parse(path)
+    if not text.rows["v"]:
         raise RejectedAsset("has no faces, and no vertices")
-    names = {3: "x y z", 4: "x y z w", 6: "x y z red green blue", 7: "x y z red green blue alpha"}.get(rows.shape[1])
-    if names is None:
-        raise RejectedAsset(f"has vertices of {rows.shape[1]} numbers; expected x y z, or x y z red green blue")
-    columns = dict(zip(names.split(), rows.T, strict=True))
-    normals = re.findall(r"(?m)^vn +(.+)$", text)
-    if len(normals) == len(rows):
-        columns |= dict(zip(("nx", "ny", "nz"), np.loadtxt(normals, ndmin=2).T, strict=True))
+    columns, normals = _columns(text), text.rows["vn"]
+    if len(normals) == len(columns["x"]):
+        columns |= dict(zip(NORMAL, _table(normals, 3).T, strict=True))
     return columns
 
 
-def _text(path: Path) -> str:
-    """The text of a file, without blanks before keywords, which trimesh looks for at the line's start."""
-    text = path.read_text("utf-8", errors="replace").replace("\t", " ").replace("\\\n", " ")
-    return re.sub(r"(?m)^ +", "", text)
+def _parse(path: Path) -> Text:
+    """What stands in the lines of a file that matter."""
+    found, material = Text({"v": [], "vt": [], "vn": []}, [], [], [], []), ""
+    for line in path.read_text("utf-8", errors="replace").replace("\\\n", " ").splitlines():
+        keyword, rest = (*line.split(None, 1), "", "")[:2]
+        if keyword == "f":
+            words = rest.partition("#")[0].split()
+            found.corners.extend(_count_from_start(words, found.rows) if "-" in rest else words)
+            found.sizes.append(len(words))
+            found.used.append(material)
+        elif keyword in found.rows:
+            found.rows[keyword].append(rest)
+        elif keyword == "usemtl":
+            material = rest.strip()
+        elif keyword == "mtllib":
+            found.libraries.append(rest.strip())
+    return found
 
 
-def _vertices(text: str) -> np.ndarray:
-    """What stands behind the `v` of each line (n, columns)."""
-    found = re.findall(r"(?m)^v +(.+)$", text)
-    return np.loadtxt(found, ndmin=2, comments="#") if found else np.zeros((0, 3))
+def _count_from_start(words: list[str], rows: dict[str, list[str]]) -> list[str]:
+    """The corners of a face with numbers that count from the start, where they counted back from here."""
+    counts = [len(x) + 1 for x in rows.values()]
+    corners = [zip(word.split("/"), counts, strict=False) for word in words]
+    return ["/".join(str(int(n) + count) if n.startswith("-") else n for n, count in corner) for corner in corners]
 
 
-def _without_notches(text: str) -> str:
-    """The text with triangles instead of polygons that are not convex; trimesh makes fans of all."""
-    polygon = re.compile(r"(?m)^f((?: +\S+){4,}) *$")
-    if not polygon.search(text):
-        return text
-    positions = _vertices(text)[:, :3]
-
-    def cut(match: re.Match) -> str:
-        words = match[1].split()
-        rows = np.array([int(word.partition("/")[0]) - 1 for word in words])
-        if (
-            rows.min() < 0
-            or rows.max() >= len(positions)
-            or len(rows) > MOST_CORNERS
-            or not is_concave(positions[rows])
-        ):
-            return match[0]
-        return "\n".join(" ".join(["f", *(words[i] for i in face)]) for face in ears(positions[rows]))
-
-    return polygon.sub(cut, text)
+def _table(rows: list[str], width: int) -> np.ndarray:
+    """The first numbers (rows, width) of each row."""
+    return np.loadtxt(rows, usecols=range(width), ndmin=2, comments="#") if rows else np.zeros((0, width))
 
 
-def _color(meshes: list[dict]) -> list[str]:
-    """Makes the vertex colours of groups of faces linear; lines about how they were read."""
-    own = [mesh for mesh in meshes if mesh.get("vertex_colors") is not None]
-    if not own:
-        return []
-    channels = np.concatenate([np.asarray(mesh["vertex_colors"])[:, :3] for mesh in own])
-    colors, lines = linear_colors(channels, "vertex colours")
-    ends = np.cumsum([len(mesh["vertex_colors"]) for mesh in own])[:-1]
-    for mesh, part in zip(own, np.split(colors, ends), strict=True):
-        mesh["vertex_colors"] = part
-    return lines
+def _columns(text: Text) -> Columns:
+    """The columns of the vertices: positions, and colours where every row has them."""
+    try:
+        table = np.loadtxt(text.rows["v"] or ["0 0 0"], ndmin=2, comments="#")
+    except ValueError:  # rows of different lengths
+        table = _table(text.rows["v"], 3)
+    return dict(zip((*"xyz", *SRGB, "alpha"), table.T if table.shape[1] >= 6 else table.T[:3], strict=False))
+
+
+def _parts(text: Text, columns: Columns, colors: np.ndarray | None, looks: dict[str, Look]) -> list[Part]:
+    """The faces of each material that is to be seen, apart also by whether they have texture coordinates or normals."""
+    numbers = {word: i for i, word in enumerate(dict.fromkeys(text.corners))}
+    corners = np.array([[int(n or 0) for n in f"{word}//".split("/")[:3]] for word in numbers])  # of vertices
+    if corners.min() < 0 or corners[:, 0].min() < 1:
+        raise RejectedAsset("has faces that name vertices before the first: broken file")
+    positions = stack_columns(columns)[corners[:, 0] - 1]
+    faces, owner = triangulate(positions, np.array([numbers[word] for word in text.corners]), text.sizes)
+    number = {name: i for i, name in enumerate(looks)}
+    _, has_texcoords, has_normals = (corners[faces] > 0).all(axis=1).T
+    kind = 4 * np.array([number[name] for name in text.used])[owner] + 2 * has_texcoords + has_normals
+    texcoords, normals = _table(text.rows["vt"], 2), _table(text.rows["vn"], 3)
+    parts = []
+    for code in np.unique(kind):
+        look = list(looks.values())[code // 4]
+        if look.nowhere:
+            continue
+        used, own = np.unique(faces[kind == code], return_inverse=True)
+        of_v, of_vt, of_vn = corners[used].T - 1
+        uv = texcoords[of_vt] * look.placement.scale + look.placement.offset if code & 2 else None
+        part = Part(
+            positions=positions[used],
+            faces=own.reshape(-1, 3),
+            material=look.material,
+            normals=normals[of_vn] if code & 1 else None,
+            texcoords=None if uv is None else np.stack([uv[:, 0], 1 - uv[:, 1]], axis=-1),  # v is from the lower edge
+            colors=None if colors is None else colors[of_v],
+        )
+        parts.append(part)
+    return parts
 
 
 def _without_doubles(parts: list[Part], ignored: set[str]) -> list[Part]:
     """The parts without the faces whose three corners an earlier face, of any part, has in some order."""
     corners = np.concatenate([part.positions[part.faces] for part in parts])
-    if corners.shape[1:] != (3, 3):
-        return parts  # broken: assemble says what is wrong
     order = np.lexsort(np.moveaxis(corners, -1, 0)[::-1], axis=-1)
     sorted_corners = np.take_along_axis(corners, order[..., None], axis=1)
     first = np.unique(sorted_corners.reshape(-1, 9), axis=0, return_index=True)[1]
@@ -182,9 +204,9 @@ def _without_doubles(parts: list[Part], ignored: set[str]) -> list[Part]:
     return [replace(part, faces=part.faces[here]) for part, here in zip(parts, np.split(kept, ends), strict=True)]
 
 
-def parse_mtl(text: str) -> dict[str, dict[str, str]]:
-    """Statements of an MTL file: {material name: {keyword in lower case: rest of the line}}."""
-    library: dict[str, dict[str, str]] = {}
+def parse_mtl(text: str) -> Library:
+    """Statements of an MTL file."""
+    library: Library = {}
     current: dict[str, str] = {}
     for line in text.splitlines():
         keyword, _, rest = line.strip().partition(" ")
@@ -207,7 +229,7 @@ def _read_library(read: Read, folder: Path, names: str, tolerance: Tolerance) ->
     return "\n".join(data.decode("utf-8", errors="replace") for data in found)
 
 
-def _look(read: Read, name: str, library: dict[str, dict[str, str]], ignored: set[str], tolerance: Tolerance) -> Look:
+def _look(read: Read, name: str, library: Library, ignored: set[str], tolerance: Tolerance) -> Look:
     """The principled material of an MTL entry, how its maps lie, and where it has surface."""
     if name not in library:
         tolerance.goes_on_without(MissingFile(f"uses a material that no library defines: {name!r}"))
@@ -247,7 +269,7 @@ def _read_maps(read: Read, entry: dict[str, str], name: str, tolerance: Toleranc
     return maps
 
 
-def _placement(statements: list[str], ignored: set[str]) -> Placement:
+def _placement(statements: Sequence[str], ignored: set[str]) -> Placement:
     """How the maps of a material's statements lie: as the first says; others that disagree are named as ignored."""
     places = []
     for options, _ in map(_options, statements):
@@ -281,44 +303,3 @@ def _opacity(entry: dict[str, str], map_d: np.ndarray | None, name: str, toleran
     if "tr" in entry and 0 < (share := float(entry["tr"].split()[-1])) < 1:
         return tolerance.opacity(name, Alpha(f"Tr {share:g}", 1 - share))
     return Opacity()
-
-
-def _absolute(text: str) -> str:
-    """The OBJ text with relative (negative) vertex numbers made absolute; trimesh counts them from the file's end."""
-    if not re.search(r"(?m)^f .*-", text):
-        return text
-    counts = {"v": 0, "vt": 0, "vn": 0}
-    lines = []
-    for line in text.splitlines():
-        keyword, *words = line.split() or [""]
-        if keyword in counts:
-            counts[keyword] += 1
-        elif keyword == "f":
-            corners = [zip(word.split("/"), counts.values(), strict=False) for word in words]
-            absolute = [
-                "/".join(str(int(n) + c + 1) if n.startswith("-") else n for n, c in corner) for corner in corners
-            ]
-            line = " ".join(["f", *absolute])
-        lines.append(line)
-    return "\n".join(lines)
-
-
-def _material_name(mesh: dict) -> str:
-    """The material name of one group of faces that trimesh read, or an empty one."""
-    return getattr(getattr(mesh["visual"], "material", None), "name", "")
-
-
-def _part(mesh: dict, material: Material, placement: Placement) -> Part:
-    """One group of faces that trimesh read."""
-    texcoords = getattr(mesh["visual"], "uv", None)
-    if texcoords is not None:
-        u, v = (texcoords[:, :2] * placement.scale + placement.offset).T
-        texcoords = np.stack([u, 1 - v], axis=-1)  # OBJ counts v from the lower edge
-    return Part(
-        positions=np.asarray(mesh["vertices"], np.float64),
-        faces=triangulate_quads(mesh["faces"]),
-        material=material,
-        normals=mesh.get("vertex_normals"),
-        texcoords=texcoords,
-        colors=mesh.get("vertex_colors"),
-    )

@@ -1,5 +1,7 @@
 """PLY, STL and OFF files of triangles and polygons as raw assets: no materials, colours of vertices or faces at most.
 
+Polygons become fans of triangles, or ears where they are not convex (Meisters 1975), so that a notch stays empty.
+
 .ply    elements vertex and face through trimesh; colours by any of the names that those of points may have
 .stl    text through trimesh; binary: 80 bytes, a count u32, 50 bytes a triangle.  Where the count and the size of
         the file disagree the size counts
@@ -8,30 +10,22 @@
 
 import io
 import re
+from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from trimesh.exchange.ply import load_ply
 from trimesh.exchange.stl import load_stl_ascii
 from trimesh.geometry import triangulate_quads
 
+from spnr_jax.formats.columns import SRGB, Columns, colors_of, rename
 from spnr_jax.formats.mesh.assets import Asset, Part, RejectedAsset, make_material
-from spnr_jax.formats.mesh.file_colors import PACKED, SRGB, colors_of
-from spnr_jax.formats.mesh.polygons import triangulate
+from spnr_jax.kernels.cloud_arrays import stack_columns
 
+MOST_CORNERS = 4096  # of a polygon whose ears are looked for; a larger one becomes a fan
 STL_HEAD, STL_TRIANGLE = 84, np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 OFF_HEAD = re.compile(r"(ST)?(C?)(N?)(4?)(n?)OFF\b")
-
-
-def color_part(part: Part, colors: np.ndarray | None, owner: np.ndarray | None = None) -> Part:
-    """The part with linear colours (n, 3) of its vertices or, with the `owner` of each face, of polygons."""
-    if colors is None:
-        return part
-    if owner is None:
-        return replace(part, colors=colors, material=make_material(1.0))
-    corners = np.arange(part.faces.size).reshape(-1, 3)
-    own = part.positions[part.faces.ravel()], np.repeat(colors[owner], 3, axis=0)
-    return Part(positions=own[0], faces=corners, material=make_material(1.0), colors=own[1])
 
 
 def load_ply_mesh(data: bytes) -> Asset:
@@ -42,26 +36,38 @@ def load_ply_mesh(data: bytes) -> Asset:
     loaded = load_ply(io.BytesIO(data), fix_texture=False, skip_materials=True)
     if loaded.get("faces") is None:
         return Asset(parts=())
-    raw = loaded["metadata"]["_ply_raw"]
-    positions, polygons = np.asarray(loaded["vertices"], np.float64), loaded["faces"]
-    whole = isinstance(polygons, np.ndarray) and polygons.ndim == 2 and polygons.shape[1] == 3
-    faces, owner = (polygons.astype(np.int64), np.arange(len(polygons))) if whole else triangulate(positions, polygons)
-    part = Part(positions=positions, faces=faces, material=make_material(), normals=loaded.get("vertex_normals"))
+    raw, positions = loaded["metadata"]["_ply_raw"], np.asarray(loaded["vertices"], np.float64)
     ignored = ("texture coordinates (of formats other than glTF and OBJ)",) if "visual" in loaded else ()
-    for element, owners in (("vertex", None), ("face", owner)):
-        found = colors_of(_columns(raw[element]["data"]))
-        if found is not None:
-            return Asset(parts=(color_part(part, found[0], owners),), ignored=ignored, notes=tuple(found[1]))
-    return Asset(parts=(part,), ignored=ignored)
+    vertices, of_faces = (_columns(raw[element]["data"]) for element in ("vertex", "face"))
+    return _colored(positions, loaded["faces"], vertices, of_faces, ignored, loaded.get("vertex_normals"))
 
 
-def _columns(data: dict | np.ndarray) -> dict[str, np.ndarray]:
+def _columns(data: dict | np.ndarray) -> Columns:
     """The columns of numbers among what trimesh read of an element."""
     names = data if isinstance(data, dict) else data.dtype.names or ()
     columns = {name.lower(): np.asarray(data[name]) for name in names}
     columns = {name: x[:, 0] if x.ndim == 2 and x.shape[1] == 1 else x for name, x in columns.items()}
-    kinds = {name: column for name, column in columns.items() if column.ndim == 1 and column.dtype.kind in "fiu"}
-    return {name: column for name, column in kinds.items() if name not in PACKED or column.dtype.itemsize >= 4}
+    return {name: column for name, column in columns.items() if column.ndim == 1 and column.dtype.kind in "fiu"}
+
+
+def _colored(
+    positions: np.ndarray,
+    polygons: Sequence[np.ndarray] | np.ndarray,
+    vertices: Columns,
+    polygon_columns: Columns,
+    ignored: tuple[str, ...] = (),
+    normals: np.ndarray | None = None,
+) -> Asset:
+    """The asset of polygons with the colours among the columns of their vertices, else of the polygons."""
+    corners = polygons.ravel() if isinstance(polygons, np.ndarray) else np.concatenate([np.zeros(0), *polygons])
+    faces, owner = triangulate(positions, corners, [len(polygon) for polygon in polygons])
+    part = Part(positions=positions, faces=faces, material=make_material(), normals=normals)
+    if (found := colors_of(rename(vertices))) is not None:
+        part = replace(part, colors=found[0], material=make_material(1.0))
+    elif (found := colors_of(rename(polygon_columns))) is not None:
+        corners, colors = np.arange(faces.size).reshape(-1, 3), np.repeat(found[0][owner], 3, axis=0)
+        part = Part(positions=positions[faces.ravel()], faces=corners, material=make_material(1.0), colors=colors)
+    return Asset(parts=(part,), ignored=ignored, notes=tuple(found[1]) if found else ())
 
 
 def load_stl(data: bytes) -> Asset:
@@ -99,30 +105,25 @@ def load_stl(data: bytes) -> Asset:
 def load_off(data: bytes) -> Asset:
     """The raw asset of an OFF file with faces."""
     columns, rows = _off(data)
-    positions = np.stack([columns[axis] for axis in "xyz"], axis=-1)
     corners = [np.array(row[1 : 1 + int(row[0])], np.int64) for row in rows]
     if any(len(polygon) != int(row[0]) for polygon, row in zip(corners, rows, strict=True)):
         raise RejectedAsset("is cut off: a face names fewer corners than it announces")
-    faces, owner = triangulate(positions, corners)
-    part = Part(positions=positions, faces=faces, material=make_material())
-    found, owners = colors_of(columns), None
     behind = [row[1 + int(row[0]) :] for row in rows]
-    if found is None and behind and all(len(values) in (3, 4) for values in behind):
-        colors = np.array([values[:3] for values in behind], np.float64)
-        found, owners = colors_of(dict(zip(SRGB, colors.T, strict=True))), owner
-    ignored = ("colours of some faces alone",) if found is None and any(behind) else ()
-    if found is None:
-        return Asset(parts=(part,), ignored=ignored)
-    return Asset(parts=(color_part(part, found[0], owners),), notes=tuple(found[1]))
+    colored = bool(behind) and all(len(values) in (3, 4) for values in behind)
+    of_faces = (
+        dict(zip(SRGB, np.array([values[:3] for values in behind], np.float64).T, strict=True)) if colored else {}
+    )
+    ignored = ("colours of some faces alone",) if any(behind) and not colored and SRGB[0] not in columns else ()
+    return _colored(stack_columns(columns), corners, columns, of_faces, ignored)
 
 
-def off_points(path) -> dict[str, np.ndarray] | None:
+def off_points(path: Path) -> Columns | None:
     """The columns of an OFF file without faces; None if it has some."""
     columns, rows = _off(path.read_bytes())
     return None if rows else columns
 
 
-def _off(data: bytes) -> tuple[dict[str, np.ndarray], list[list[float]]]:
+def _off(data: bytes) -> tuple[Columns, list[list[float]]]:
     """The columns of the vertices of an OFF file, and the rows of its faces."""
     text = re.sub(r"#.*", "", data.decode("utf-8", "replace"))
     lines = [line for line in (line.strip() for line in text.splitlines()) if line]
@@ -144,3 +145,69 @@ def _off(data: bytes) -> tuple[dict[str, np.ndarray], list[list[float]]]:
 
 
 PLAIN = {".ply": load_ply_mesh, ".stl": load_stl, ".off": load_off}
+
+
+def triangulate(positions: np.ndarray, corners: np.ndarray, sizes: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+    """Faces (f, 3) of polygons of so many corners, vertex numbers, in their order, and the polygon that each is of."""
+    count, corners = np.array(sizes, np.int64), corners.astype(np.int64)
+    begin = np.cumsum(count) - count
+    faces, owners = [np.zeros((0, 3), np.int64)], [np.zeros(0, np.int64)]
+    for size in np.unique(count[count > 2]):
+        rows = np.flatnonzero(count == size)
+        own = corners[begin[rows, None] + np.arange(size)]
+        fan = np.stack([np.broadcast_to(own[:, :1], (len(rows), size - 2)), own[:, 1:-1], own[:, 2:]], axis=-1)
+        if 3 < size <= MOST_CORNERS and (own >= 0).all() and own.max() < len(positions):
+            for row in np.flatnonzero(~_convex(positions[own])):
+                fan[row] = own[row][ears(positions[own[row]])]
+        faces.append(fan.reshape(-1, 3))
+        owners.append(np.repeat(rows, size - 2))
+    owner = np.concatenate(owners)
+    order = np.argsort(owner, kind="stable")
+    return np.concatenate(faces)[order], owner[order]
+
+
+def _convex(corners: np.ndarray) -> np.ndarray:
+    """Whether no corner of polygons (m, n, 3) turns against the sense of the whole."""
+    edges = np.roll(corners, -1, axis=1) - corners
+    turns = np.cross(np.roll(edges, 1, axis=1), edges)
+    centred = corners - corners.mean(axis=1, keepdims=True)
+    whole = np.cross(centred, np.roll(centred, -1, axis=1)).sum(axis=1)
+    share = np.einsum("mnc,mc->mn", turns, whole)
+    return (share >= -1e-9 * np.abs(share).max(axis=1, initial=0)[:, None]).all(axis=1) | ~np.isfinite(share).all(
+        axis=1
+    )
+
+
+def ears(corners: np.ndarray) -> np.ndarray:
+    """Triangles (n - 2, 3) of a simple polygon (n, 3), as numbers of its corners; a fan of what is not simple."""
+    centred = corners - corners.mean(axis=0)
+    normal = np.cross(centred, np.roll(centred, -1, axis=0)).sum(axis=0)
+    axis = int(np.abs(normal).argmax())
+    flat = np.delete(centred, axis, axis=1) * [1, (1 if axis != 1 else -1) * np.sign(normal[axis] or 1)]
+    left, found, place = list(range(len(corners))), [], 0
+    while len(left) > 3:
+        for i in [*range(place, len(left)), *range(place)]:
+            a, b, c = left[i - 1], left[i], left[(i + 1) % len(left)]
+            if _turn(flat[a], flat[b], flat[c]) > 0:
+                others = flat[[j for j in left if j not in (a, b, c)]]
+                if not _inside(others, flat[a], flat[b], flat[c]).any():
+                    break
+        else:
+            break
+        found.append((a, b, c))
+        left.pop(i)
+        place = max(i - 1, 0)  # what lies before was no ear, and still is none
+    return np.array(found + [(left[0], b, c) for b, c in zip(left[1:-1], left[2:], strict=True)])
+
+
+def _turn(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> float:
+    return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
+
+
+def _inside(points: np.ndarray, *triangle: np.ndarray) -> np.ndarray:
+    """Whether points (n, 2) lie in a triangle that turns left, or on its border."""
+    sides = []
+    for a, b in zip(triangle, (*triangle[1:], triangle[0]), strict=True):
+        edge, way = b - a, points - a
+        sides.append(edge[0] * way[:, 1] - edge[1] * way[:, 0])
+    return np.min(sides, axis=0) >= 0

@@ -12,6 +12,7 @@ import numpy as np
 from PIL import Image
 
 from spnr_jax.errors import UserError
+from spnr_jax.formats.columns import srgb_to_linear
 from spnr_jax.formats.mesh.assets import RejectedAsset, Wrap, extra
 
 KTX2, KTX2_PACKAGE = b"\xabKTX 20\xbb\r\n\x1a\n", "opengl_basisu"
@@ -20,11 +21,6 @@ UNREADABLE = (OSError, SyntaxError, ValueError, LookupError, RuntimeError, Image
 MAX_SIZE = 1024
 MOST_PIXELS = 2**26  # of an image file: 8192 x 8192
 STRIP = 512  # rows that are converted at a time
-
-
-def srgb_to_linear(encoded: np.ndarray) -> np.ndarray:
-    """Linear values of sRGB-encoded ones in [0, 1] (IEC 61966-2-1)."""
-    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
 
 
 SRGB_TABLE = srgb_to_linear(np.arange(256) / 255).astype(np.float32)

@@ -1,7 +1,5 @@
 """glTF files: geometry, transforms and materials against values that the tests write down themselves."""
 
-import base64
-
 import numpy as np
 import pytest
 from support.gltf_files import CHECKER, CORNERS, SQUARE, UV, GltfBuilder, one_square, png
@@ -90,18 +88,6 @@ class TestGeometry:
         builder.mesh(primitive)
         (part,) = load_mesh(builder.write(tmp_path / "sparse.glb")).parts
         np.testing.assert_array_equal(part.positions, [*CORNERS[:2], [5, 6, 7], CORNERS[3]])
-
-    def test_gltf_with_files_beside_it_equals_the_packed_file(self, tmp_path):
-        builder = GltfBuilder()
-        texture = builder.texture(uri="my%20texture.png")
-        (tmp_path / "my texture.png").write_bytes(png(CHECKER))
-        material = builder.material(pbrMetallicRoughness={"baseColorTexture": {"index": texture}})
-        builder.mesh(builder.primitive(material=material, TEXCOORD_0=UV))
-        beside = load_mesh(builder.write(tmp_path / "beside.gltf"))
-        builder.document["images"][0] = {"uri": "data:image/png;base64," + base64.b64encode(png(CHECKER)).decode()}
-        packed = load_mesh(builder.write(tmp_path / "packed.glb"))
-        np.testing.assert_array_equal(beside.parts[0].positions, packed.parts[0].positions)
-        np.testing.assert_array_equal(beside.parts[0].material.base_color, packed.parts[0].material.base_color)
 
 
 def textured(uri):
@@ -192,12 +178,6 @@ class TestRejections:
         (tmp_path / "data.bin").unlink()
         assert "missing: 'data.bin'" in self.reason(path)
 
-    def test_files_cut_anywhere(self, tmp_path):
-        whole, path = plain().glb(), tmp_path / "cut.glb"
-        for length in [0, 3, 11, 13, 30, len(whole) // 2, len(whole) - 1]:
-            path.write_bytes(whole[:length])
-            assert "truncated" in self.reason(path)
-
 
 class TestCoordinates:
     """Each texture is looked up where its own coordinates say."""
@@ -217,22 +197,16 @@ class TestCoordinates:
         points = sample_surface(asset, 400, 0)
         return points.positions[:, :2], points.roughness
 
-    def test_a_transform_of_one_texture_moves_it_alone(self, tmp_path):
+    def test_a_transform_a_set_and_a_wrap_mode_of_one_texture_count_for_it_alone(self, tmp_path):
         moved = {"extensions": {"KHR_texture_transform": {"scale": [2, 1], "offset": [0.5, 0]}}}
         (x, _), roughness = (values.T for values in self.two_textures(tmp_path, moved))
         phase = (2 * x + 0.5) % 1
         clear = np.abs(phase % 0.5 - 0.25) < 0.15
         np.testing.assert_allclose(roughness[clear], phase[clear] > 0.5, atol=1e-6)
-
-    def test_a_set_of_its_own_is_read(self, tmp_path):
-        (_, y), roughness = (
-            values.T for values in self.two_textures(tmp_path, {"texCoord": 1}, TEXCOORD_1=CORNERS[:, 1::-1].copy())
-        )
-        clear = np.abs(y - 0.5) > 0.1
-        inside = clear & (y > 0.05) & (y < 0.95)
+        turned = CORNERS[:, 1::-1].copy()
+        (_, y), roughness = (values.T for values in self.two_textures(tmp_path, {"texCoord": 1}, TEXCOORD_1=turned))
+        inside = (np.abs(y - 0.5) > 0.1) & (y > 0.05) & (y < 0.95)
         np.testing.assert_allclose(roughness[inside], y[inside] > 0.5, atol=1e-6)
-
-    def test_a_wrap_mode_of_its_own_is_kept(self, tmp_path):
         clamp = {"wrapS": 33071, "wrapT": 33071}
         moved = {"extensions": {"KHR_texture_transform": {"scale": [4, 1]}}}
         (x, _), roughness = (values.T for values in self.two_textures(tmp_path, moved, clamp))

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from support.gltf_files import png
 
+from spnr_jax.formats.columns import srgb_to_linear
 from spnr_jax.formats.mesh.assets import RejectedAsset
 from spnr_jax.formats.mesh.meshes import load_mesh
-from spnr_jax.formats.mesh.texels import srgb_to_linear
 
 SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
 UV = "vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"
@@ -131,7 +131,8 @@ PAINTED = f"{SQUARE}usemtl paint\nf 1 2 3\n"
         ("", None, "has no faces"),
         (SQUARE.replace("1 1 0", "1 nan 0") + "f 1 2 3\n", None, "not finite"),
         (SQUARE + "f 1 2 9\n", None, "broken"),
-        (SQUARE.replace("1 1 0", "1 1") + "f 1 2 3\n", None, r"positions of shape \(3, 2\)"),
+        (SQUARE.replace("1 1 0", "1 1") + "f 1 2 3\n", None, "broken"),
+        (SQUARE + "f -5 2 3\n", None, "before the first"),
         (SQUARE.replace("1 1 0", "1 x 0") + "f 1 2 3\n", None, "broken"),
         (SQUARE + "f 1 1 3\n", None, "no face with an area"),
     ],

@@ -1,15 +1,20 @@
-"""Surface points: uniform by area, materials as the renderer sees them, normalisation that can be undone."""
+"""Surface points: uniform by area, materials as the renderer sees them, and the textures that these come from."""
 
+import io
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from PIL import Image
 from support import gltf_files
-from support.gltf_files import UV, GltfBuilder
+from support.gltf_files import UV, GltfBuilder, png
 
-from spnr_jax.formats.mesh.assets import Asset, Material, Part, RejectedAsset
+from data_gen.render.variant import mitsuba_module
+from spnr_jax.formats.mesh import texels
+from spnr_jax.formats.mesh.assets import Asset, Material, Part
 from spnr_jax.formats.mesh.meshes import load_mesh
 from spnr_jax.formats.mesh.surface_points import normalise, sample_surface, tilt_normals
+from spnr_jax.formats.mesh.texels import lookup, read_image, shrink, value_texels
 
 CORNERS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float64)
 FACES = np.array([[0, 1, 2], [0, 2, 3]])
@@ -32,21 +37,6 @@ class TestNormalise:
         np.testing.assert_allclose(corners.min(axis=0), -corners.max(axis=0), atol=1e-12)
         assert np.linalg.norm(np.ptp(corners, axis=0)) == pytest.approx(2)
         assert transform == {"centre": [11.5, 21.5, 32.0], "scale": pytest.approx(2 / np.sqrt(9 + 9 + 16))}
-
-    @pytest.mark.parametrize(
-        ("part", "reason"),
-        [
-            (replace(square(), faces=np.zeros((0, 3), np.int64)), "no faces"),
-            (square(0.0, (1, 2, 3)), "zero extent"),
-            (square(1.0, (0, np.inf, 0)), "not finite"),
-            (square(1.0, (np.nan, 0, 0)), "not finite"),
-        ],
-    )
-    def test_objects_without_a_box_are_refused(self, part, reason):
-        with pytest.raises(RejectedAsset, match=reason):
-            normalise(Asset(parts=(part,)))
-        with pytest.raises(RejectedAsset, match="no faces"):
-            normalise(Asset(parts=()))
 
 
 class TestSampleSurface:
@@ -164,3 +154,60 @@ def test_where_the_coordinates_have_no_area_the_normal_stays():
     normals = np.tile([0.0, 0, 1], (3, 1))
     found = tilt_normals(normals, np.array([RED, RED, (0, 0, 0)]), corners, texcoords)
     np.testing.assert_array_equal(found, normals)
+
+
+# Texels
+
+MODES = ("repeat", "mirror", "clamp")
+
+
+@pytest.fixture
+def mi():
+    """Mitsuba in its scalar variant, which other tests do not depend on."""
+    mitsuba = pytest.importorskip("mitsuba")
+    before = mitsuba.variant()
+    yield mitsuba_module("scalar_rgb")  # on one thread, which whoever renders next relies on
+    if before:
+        mitsuba_module(before)
+
+
+@pytest.mark.parametrize("wrap", MODES)
+@pytest.mark.parametrize("shape", [(5, 3, 3), (4, 7), (1, 1, 3), (1, 6)])
+def test_lookup_is_what_mitsuba_evaluates(mi, wrap, shape):
+    rng = np.random.default_rng(3)
+    texels = rng.random(shape, dtype=np.float32)
+    texcoords = rng.uniform(-2.5, 3.5, (200, 2)).astype(np.float32)
+    bitmap = mi.Bitmap(texels if len(shape) == 3 else texels[..., None])
+    texture = mi.load_dict(
+        {"type": "bitmap", "bitmap": bitmap, "raw": True, "filter_type": "bilinear", "wrap_mode": wrap}
+    )
+    hit = mi.SurfaceInteraction3f()
+    expected = []
+    for u, v in texcoords.tolist():
+        hit.uv = mi.Point2f(u, v)
+        expected.append(np.array(texture.eval(hit)) if len(shape) == 3 else texture.eval_1(hit))
+    np.testing.assert_allclose(lookup(texels, texcoords, wrap), expected, atol=2e-5)
+
+
+def test_shrinking_by_a_whole_factor_takes_the_mean_of_each_block():
+    texels = np.random.default_rng(0).random((2048, 6, 3), dtype=np.float32)
+    expected = texels.reshape(1024, 2, 3, 2, 3).mean(axis=(1, 3))
+    np.testing.assert_allclose(shrink(texels), expected, atol=1e-6)
+
+
+def test_sixteen_bit_grey_images_are_scaled_not_clipped():
+    stream = png(np.zeros((1, 1, 3)))
+    assert read_image(stream, "black").tolist() == [[[0, 0, 0, 255]]]
+    stream = io.BytesIO()
+    Image.fromarray(np.array([[0, 32896, 65535]], np.uint16)).save(stream, "png")
+    assert value_texels(read_image(stream.getvalue(), "grey")[..., 1]).tolist() == [[0, np.float32(128 / 255), 1]]
+
+
+@pytest.mark.parametrize("mode", ["RGB", "RGBA", "P", "LA", "1"])
+def test_an_image_read_in_strips_is_the_whole_converted(mode, monkeypatch):
+    monkeypatch.setattr(texels, "STRIP", 4)
+    pixels = np.random.default_rng(0).integers(0, 256, (9, 7, 4), dtype=np.uint8)
+    stream = io.BytesIO()
+    Image.fromarray(pixels).convert(mode).save(stream, "png", **({"transparency": 3} if mode == "P" else {}))
+    whole = np.asarray(Image.open(io.BytesIO(stream.getvalue())).convert("RGBA"))
+    np.testing.assert_array_equal(read_image(stream.getvalue(), "a.png"), whole)

@@ -105,7 +105,7 @@ def wrapped(code):
 MOVED = {"extensions": {"KHR_texture_transform": {"offset": [0.3, -0.2], "rotation": 0.7, "scale": [2.0, 0.5]}}}
 TEXTURE, FAR = {"TEXCOORD_0": UV}, {"TEXCOORD_0": UV * np.float32(4.3) - np.float32(1.7)}
 TINTS = {"COLOR_0": np.float32([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0]])}
-ONE_TINT = "vertex colours that vary within textured faces (one tint per face is used)"
+ONE_TINT = "vertex colours that vary over a texture (their mean is used)"
 BASE = ("base_color",)
 SQUARES = {  # case: material, attributes of vertices, the channels that vary, what is said to be ignored
     "a texture that is moved": (lambda builder: textured(builder, info=MOVED), TEXTURE, BASE),
@@ -169,17 +169,6 @@ class TestGltf:
         asset = square(tmp_path, material(builder), builder=builder, **attributes)
         assert asset.ignored == tuple(ignored)
         assert_agreement(asset, varying=varying, count=1500 if "wraps" in case else 400)
-
-    def test_colours_of_whole_faces_times_a_texture_agree_and_are_exact(self, tmp_path):
-        builder = GltfBuilder()
-        corners = CORNERS[[0, 1, 2, 0, 2, 3]]
-        colors = np.repeat(np.float32([[1, 0.2, 0.2], [0.2, 0.2, 1]]), 3, axis=0)
-        material = builder.material(**textured(builder))
-        uv = UV[[0, 1, 2, 0, 2, 3]]
-        builder.mesh(builder.primitive(corners, None, material=material, TEXCOORD_0=uv, COLOR_0=colors))
-        asset = meshes.load_mesh(builder.write(tmp_path / "faces.glb"))
-        assert asset.ignored == ()
-        assert_agreement(asset, varying=["base_color"])
 
 
 class TestOtherFormats:

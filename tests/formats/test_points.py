@@ -1,0 +1,249 @@
+"""Files of points: one table through a writer of each format, text told by its look, and what is refused, in a line."""
+
+import io
+import pickle
+import time
+import zipfile
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support.pcd_files import compress, content, points
+from support.point_clouds import SRGB, XYZRGB, ply_bytes, read, read_columns, write
+from support.point_tables import BROKEN, SOUND, WHOLE, WRITERS, written
+
+from spnr_jax.formats import clouds, las, npz, ply, text
+from spnr_jax.formats.clouds import read_cloud
+from spnr_jax.formats.npz import pack_arrays
+from spnr_jax.formats.pcd import decompress
+from spnr_jax.formats.point_files import column_pieces
+
+PIECED = ("ascii.ply", "little.ply", "big.ply", "ascii.pcd", "binary.pcd", "a.xyz", "a.csv", "a.npy", "a.las")
+ANNOUNCED = [name for name in WRITERS if name.rpartition(".")[2] in "ply pcd npy npz las laz off glb"]
+ROUGH = [name for name in WRITERS if name.rpartition(".")[2] in "ply pcd xyz csv npy npz"]
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_table_comes_back_with_its_colours_linear_without_broken_rows_and_not_where_it_is_cut(tmp_path, name):
+    cloud, lines = read(written(tmp_path, name, WHOLE))
+    np.testing.assert_array_equal(cloud.positions, WHOLE.positions)
+    np.testing.assert_allclose(cloud.base_color, SRGB[WHOLE.levels], atol=1e-5)
+    np.testing.assert_allclose(cloud.roughness, WHOLE.roughness if name in ROUGH else 0.5)
+    assert any(line.startswith("no roughness") for line in lines) == (name not in ROUGH)
+    if not name.startswith("a.la"):
+        cloud, lines = read(written(tmp_path, name, BROKEN))
+        np.testing.assert_array_equal(cloud.positions, WHOLE.positions[SOUND])
+        np.testing.assert_allclose(cloud.base_color, SRGB[WHOLE.levels[SOUND]], atol=1e-5)
+        left_out = [line for line in lines if "left out" in line]
+        assert left_out == ["3 of 12 points left out: NaN, infinity or too large a number"]
+
+
+@pytest.mark.parametrize("name", PIECED)
+def test_pieces_are_small_and_together_the_whole_file(tmp_path, name, monkeypatch):
+    path = written(tmp_path, name, WHOLE)
+    for module, limit, size in ((ply, "PIECE_LINES", 5), (text, "PIECE_LINES", 5), (npz, "PIECE_BYTES", 5 * 35)):
+        monkeypatch.setattr(module, limit, size)
+    monkeypatch.setattr(ply, "PIECE_BYTES", 5 * 31)
+    monkeypatch.setattr(las, "PIECE_BYTES", 5 * 36)
+    sizes = [len(next(iter(piece.values()))) for piece in column_pieces(path)]
+    assert len(sizes) > 2
+    assert sum(sizes) == 12
+    np.testing.assert_array_equal(read(path)[0].positions, WHOLE.positions)
+
+
+@pytest.mark.parametrize("name", ANNOUNCED)
+def test_what_says_how_much_it_holds_is_refused_wherever_it_is_cut(tmp_path, name):
+    path = written(tmp_path, name, WHOLE)
+    whole = path.read_bytes()
+    for length in np.linspace(0, 0.8 * len(whole), 12, dtype=int):
+        path.write_bytes(whole[:length])
+        with pytest.raises(ValueError, match=r"empty|cut off|broken|truncated|not an? |annou|expec") as refused:
+            read(path)
+        assert str(refused.value).startswith(f"{path}: ")
+        assert "\n" not in str(refused.value)
+
+
+def test_arrays_of_python_2_are_read_without_a_warning(tmp_path):
+    old = as_npy(WHOLE.positions).replace(b"(12, 3), } ", b"(12L, 3), }")
+    for name, data in (("a.npy", old), ("a.npz", archive(old))):
+        np.testing.assert_array_equal(read_cloud(write(tmp_path, name, data)).positions, WHOLE.positions)
+
+
+# Text
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "1 2 3 0.1 0.2 0.3\n4 5 6 0.4 0.5 0.6\n",
+        "1,2,3,0.1,0.2,0.3\r\n4,5,6,0.4,0.5,0.6",
+        "1\t2\t3\t0.1\t0.2\t0.3\n\n4\t5\t6\t0.4\t0.5\t0.6\n",
+        "\ufeffX;Y;Z;R;G;B\n1;2;3;0.1;0.2;0.3\n4;5;6;0.4;0.5;0.6\n",
+        '"x", "y", "z", "r", "g", "b"\n1, 2, 3, 0.1, 0.2, 0.3\n4, 5, 6, 0.4, 0.5, 0.6\n',
+        "# scanned on Monday\n# x y z r g b\n1 2 3 .1 .2 .3\n# a remark\n4 5 6 .4 .5 .6\n",
+        "// the x axis points to the right\n1 2 3 1e-1 2e-1 3e-1\n4 5 6 4e-1 5e-1 6e-1\n",
+        "//2 points\nb g r z y x\n0.3 0.2 0.1 3 2 1\n0.6 0.5 0.4 6 5 4\n",
+    ],
+)
+def test_text_is_read_whatever_its_separator_header_and_comments(tmp_path, text):
+    columns = read_columns(write(tmp_path, "a.csv", text))
+    table = np.stack([columns[name] for name in "xyzrgb"], axis=-1)
+    np.testing.assert_array_equal(table, [[1, 2, 3, 0.1, 0.2, 0.3], [4, 5, 6, 0.4, 0.5, 0.6]])
+
+
+NORMALS = [(0.6, 0.8, 0.0), (0.0, -0.6, 0.8)]
+
+
+@pytest.mark.parametrize(
+    ("rows", "names"),
+    [
+        ([(1, 2, 3, 90), (4, 5, 6, 80)], "x y z intensity"),
+        ([(1, 2, 3, *NORMALS[0]), (4, 5, 6, *NORMALS[1])], "x y z nx ny nz"),
+        ([(1, 2, 3, 0.6, 0.8, 0.0), (4, 5, 6, 0.0, 0.6, 0.8)], "x y z r g b"),
+        ([(1, 2, 3, 9, 8, 7, *NORMALS[0]), (4, 5, 6, 6, 5, 4, *NORMALS[1])], "x y z r g b nx ny nz"),
+        ([(1, 2, 3, *NORMALS[0], 9, 8, 7), (4, 5, 6, *NORMALS[1], 6, 5, 4)], "x y z nx ny nz r g b"),
+    ],
+)
+def test_columns_without_names_are_told_by_their_number_and_normals_by_their_length(tmp_path, rows, names):
+    columns = read_columns(write(tmp_path, "a.xyz", "\n".join(" ".join(map(str, row)) for row in rows)))
+    assert list(columns) == names.split()
+    np.testing.assert_array_equal(np.stack(list(columns.values()), axis=-1), rows)
+
+
+# Packed PCD
+
+
+def test_points_that_are_called_compressed_and_stored_as_they_are_are_read(tmp_path):
+    columns = read_columns(write(tmp_path, "a.pcd", content("binary_compressed", points(), stored=True)))
+    for name in ("x", "y", "z", "roughness", "rgb"):
+        np.testing.assert_array_equal(columns[name], points()[name])
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.sampled_from([b"a", b"b", b"abc", b"abcabcabc", b"\0" * 300, b"xyz" * 20]), max_size=12))
+def test_decompress_inverts_lzf(pieces):
+    data = b"".join(pieces)
+    assert decompress(compress(data), len(data)) == data
+    for size in range(3, 9):  # copies of the last three bytes, which may reach into themselves
+        assert decompress(b"\2abc" + bytes([size - 2 << 5, 2]), 3 + size) == (b"abc" * 4)[: 3 + size]
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.binary(min_size=1, max_size=60))
+def test_lzf_that_gives_another_size_or_reaches_before_its_start_is_refused(data):
+    try:
+        assert len(decompress(data, 20)) == 20
+    except ValueError as error:
+        assert "damaged" in str(error)  # noqa: PT017 - some inputs are sound
+
+
+# What is refused
+
+
+def as_npy(array: np.ndarray, pickled: bool = False) -> bytes:
+    stream = io.BytesIO()
+    np.save(stream, array, allow_pickle=pickled)
+    return stream.getvalue()
+
+
+def archive(member: bytes) -> bytes:
+    """An .npz archive that holds these bytes as its points."""
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w") as file:
+        file.writestr("points.npy", member)
+    return stream.getvalue()
+
+
+PLY, PCD = b"ply\nformat ascii 1.0\n", content("binary", points())
+POINTS = pack_arrays({"points": np.zeros((50, 3))})
+LITTLE, DEEP = "binary_little_endian", [(0.0, 0.0, 5e6), (0.0, 0.0, 5e6 + 1)]
+LENGTHS = pack_arrays({"points": np.zeros((5, 3)), "rgb": np.zeros((4, 3))})
+KNOWN = "expected one of .ply .pcd .xyz .txt .csv .asc .pts .npz .npy .las .laz"
+REFUSED = [
+    ("a.ply", None, "no such file"),
+    ("a.xyz", "", "the file is empty"),
+    ("a.jpeg", "1 2 3", f"unknown kind of file '.jpeg'; {KNOWN}"),
+    ("a.xyz", "# nothing yet\n", "holds 0 points"),
+    ("a.ply", ply_bytes(LITTLE, rows=[]), "holds 0 points"),
+    ("a.xyz", "nan 0 0\n1 nan 0\n", "no point that can be used: NaN, infinity .* in all of its 2 rows"),
+    ("a.xyz", "0 0 1e39\n", "too large a number"),
+    ("a.csv", "px,py,pz\n0,0,0\n", r"needs the properties x y z \(and may have .*\); found px py pz"),
+    ("a.xyz", "0 0 0 0.5 0.5 -0.2\n", "has red green blue from -0.2 to 0.5; expected 0 to 1"),
+    ("a.xyz", "0 0 0 0.5 1.3 0.2\n", "colours up to 1.3: neither 0 to 1 nor 0 to 255"),
+    ("a.xyz", "0 0 0 3 4 66000\n", "from .* to 1.0"),
+    ("a.xyz", "1 2 3\n" * 5, "holds 5 points in 1 place: no object"),
+    ("a.xyz", "1 2 3\n4 5 6\n" * 5, "holds 10 points in 2 places: no object"),
+    ("a.xyz", "".join(f"{i} {2 * i} 0.1\n" for i in range(50)), "50 points on one straight line"),
+    ("a.txt", "1 2 3\n4 5 6\nend\n", "line 3: expected 3 numbers, found 'end'"),
+    ("a.e57", b"ASTM-E57\1\0\0\0\0\0\0\0", "E57 scan of version 1.0, which is not read: convert it to .las"),
+    ("a.usdc", b"PXR-USDC\0\x08\0", r"USD \(binary crate\) of version 0.8.0"),
+    ("a.usda", "#usda 1.0\n", r"USD \(text\) of version 1.0, .* Blender"),
+    ("a.usdz", b"PK\3\4", "USD .package., which is not read: convert it to .glb"),
+    ("a.spz", b"NGSP\4\0\0\0" + bytes(30), ".spz file of version 4; versions 2 and 3 can be read: convert"),
+    ("a.csv", "x y z base_color_r base_color_g base_color_b\n0 0 0 0 0 9\n", "from 0 to 9"),
+    ("a.csv", "x y z roughness\n0 0 0 nan\n", "no point that can be used"),
+    ("a.ply", ply_bytes(LITTLE, rows=DEEP, properties=XYZRGB[:3]), "0.5 apart at best .* extent of 1; move them"),
+    ("a.ply", ply_bytes(LITTLE)[:-20], "announces 3 points, the data ends after 2"),
+    ("a.obj", "v 0 0 0\n", "holds 1 points in 1 place"),
+    ("b.obj", "# nothing\n", "no faces, and no vertices"),
+    ("a.ply", b"solid of something", "not a PLY"),
+    ("a.ply", PLY + b"element vertex 1\nproperty quad x\nend_header\n1\n", "property quad x"),
+    ("a.ply", b"ply\nformat binary_middle_endian 1.0\nelement vertex 0\nend_header\n", "known format"),
+    ("a.ply", PLY + b"element vertex -1\nproperty float x\nend_header\n", "element vertex -1"),
+    ("a.ply", PLY + b"element edge 0\nend_header\n", "no PLY element 'vertex', only edge"),
+    ("a.ply", PLY + b"element vertex 1\nproperty uchar x\nend_header\n300\n", "300"),
+    ("a.ply", PLY + b"element vertex 1\nproperty list uchar int x\nend_header\n1 1\n", "lists"),
+    ("a.xyz", "1 2 3\n4 5\n", "line 2: expected 3 numbers, found '4 5'"),
+    ("a.xyz", "1 2 3 4 5\n", r"shape \(1, 5\)"),
+    ("a.xyz", "x y z\n1 2 3 4\n", "names 3 columns .* above 4"),
+    ("a.pcd", PCD.replace(b"TYPE F F U F F F", b"TYPE F F U F F"), "disagree"),
+    ("a.pcd", PCD.replace(b"TYPE F F U F F F", b"TYPE F F U F F Q"), "disagree"),
+    ("a.pcd", PCD.replace(b"COUNT 1 1 3 1 1 1", b"COUNT 1 1 2147483647 1 1 1"), "bytes; expected at most"),
+    ("a.pcd", PCD.replace(b"POINTS 4", b"POINTS -4"), "-4"),
+    ("a.pcd", PCD.replace(b"DATA binary", b"DATA packed"), "packed"),
+    ("a.pcd", PCD.replace(b"HEIGHT 1", b"SHAPE 1"), "SHAPE"),
+    ("a.npy", pickle.dumps([1, 2]), "not a NumPy file"),
+    ("a.npy", as_npy(np.zeros((5, 3))).replace(b"'shape'", b"'shape("), "broken"),
+    ("a.npz", POINTS.replace(bytes(80), bytes(79) + b"1", 1), "truncated .*CRC"),
+    ("a.npz", pack_arrays({"points": np.zeros((5, 4))}), r"'points' of shape \(5, 4\)"),
+    ("a.npz", pack_arrays({"points": np.array([["1", "2", "3"]])}), "type <U1"),
+    ("a.npz", LENGTHS, "different lengths.*'x': 5.*'r': 4"),
+    ("a.npz", pack_arrays({"corners": np.zeros((5, 3))}), "none of the arrays positions, .*; found corners"),
+    ("a.npz", archive(as_npy(np.zeros((5, 3))).replace(b"(5, 3), }" + b" " * 6, b"(5000000, 3), }")), "cut off"),
+    ("a.npz", archive(as_npy(np.array([{}, None], object), pickled=True)), "holds objects"),
+    ("a.npz", archive(b"no array at all"), "broken"),
+]
+
+
+@pytest.mark.parametrize(("name", "data", "reason"), REFUSED)
+def test_every_bad_file_is_one_line_that_names_it_and_the_reason(tmp_path, name, data, reason):
+    path = tmp_path / name
+    if data is not None:
+        write(tmp_path, name, data)
+    with pytest.raises(ValueError, match=reason) as caught:
+        read_cloud(path)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "data"),
+    [
+        ("a.txt", "1;2;3\n" + "9" * 200_000 + "x;2;3\n"),
+        ("a.txt", "x;y;z;" + "(" * 200_000 + "\n1;2;3\n"),
+        ("a.obj", "\n" * 200_000 + "v 1 2 3\n"),
+    ],
+    ids=["digits", "brackets", "empty lines"],
+)
+def test_a_line_of_any_length_is_refused_in_seconds(tmp_path, name, data):
+    begin = time.process_time()
+    with pytest.raises(ValueError, match="line 2|above 3 columns|1 place"):
+        read_cloud(write(tmp_path, name, data))
+    assert time.process_time() - begin < 10
+
+
+def test_a_data_set_with_a_broken_row_is_refused():
+    rows = [(0.0, 1.0, 0.0), (0.0, np.nan, 0.0), (np.inf, 0.0, 0.0)]
+    with pytest.raises(ValueError, match="holds 2 points with NaN, infinity .* first point 1"):
+        clouds.cloud_of_ply(ply_bytes(LITTLE, rows=rows, properties=XYZRGB[:3]))
