@@ -110,16 +110,6 @@ class TestOfAFile:
         with pytest.raises(ValueError, match=reason):
             from_dict(values)
 
-    @pytest.mark.parametrize(("field", "kept", "gone"), [("scatter", "mean", "max"), ("skip", "add", "concat")])
-    def test_an_option_that_is_gone_is_read_where_it_said_what_is_still_computed(self, field, kept, gone):
-        values = to_dict(TrainConfig())
-        values["model"]["encoder"][field] = kept
-        assert from_dict(values) == TrainConfig()
-        values["model"]["encoder"][field] = gone
-        line = rf"model\.encoder\.{field} '{gone}': this version knows '{kept}' alone; train the network again"
-        with pytest.raises(ValueError, match=line):
-            from_dict(values)
-
     def test_what_is_missing_is_named_with_its_path(self):
         values = to_dict(TrainConfig())
         del values["loss"]["r1_gamma"]

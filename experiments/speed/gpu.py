@@ -138,9 +138,7 @@ def at_once(options: OnGPU, name: str, step: Callable, config: TrainConfig, batc
     states = [optimisation.jitted_create_state(config, jnp.uint32(seed)) for seed in range(runs)]
     batches = jax.tree.map(lambda x: jnp.stack([x] * runs), batch)
     one = compile_of(step, states[0], batch)
-    axes = optimisation.AXES
-    mapped = jax.vmap(step, in_axes=(axes, 0), out_axes=(axes, 0))
-    together = compile_of(mapped, optimisation.stack(states), batches)
+    together = compile_of(jax.vmap(step), jax.tree.map(lambda *x: jnp.stack(x), *states), batches)
 
     def loop() -> list:
         return [one.run() for _ in range(runs)]

@@ -4,17 +4,14 @@ run.json has an entry for every start of the trainer:
 
 began, first_step, last_step    when it began, and the steps that it trained
 seconds                         by phase: restore, compilation (the first step), steps, previews, checkpoints, listeners
-processor_seconds               CPU time of all threads, by phase; other work on the machine does not change it
-version, commit, jax, hardware  of the code ("+" after a commit: the checkout was changed), of JAX, of the machine
+jax, hardware                   version of JAX, and the machine
 data, data_checksum             the folder, and a number that tells data sets apart
 init                            the training whose weights a new run began with, if they were not random
 """
 
 import hashlib
-import importlib.metadata
 import json
 import os
-import subprocess
 import time
 from collections.abc import Sequence
 from datetime import UTC, datetime
@@ -60,16 +57,6 @@ class MetricsLog:
         self._board.close()
 
 
-class Unwritten:
-    """The log and the record of a process that does not write them."""
-
-    def write(self, *what: object) -> None:
-        """Writes nothing."""
-
-    def close(self) -> None:
-        """Closes nothing."""
-
-
 def read_rows(run: Path) -> list[dict]:
     """Rows of a run's metrics.jsonl; a last line that a crash cut off is left out, and what follows a broken one."""
     path = run / "metrics.jsonl"
@@ -86,21 +73,18 @@ def read_rows(run: Path) -> list[dict]:
 
 
 class Clock:
-    """Wall-clock and CPU seconds since it was made, by phase: each lap belongs to one."""
+    """Seconds since it was made, by phase: each lap belongs to one."""
 
     def __init__(self) -> None:
         """Starts it."""
         self.seconds: dict[str, float] = {}
-        self.processor_seconds: dict[str, float] = {}
-        self._since = time.monotonic(), time.process_time()
+        self._since = time.monotonic()
 
     def lap(self, phase: str) -> float:
         """Seconds since the lap before, counted towards the phase."""
-        now = time.monotonic(), time.process_time()
-        elapsed, worked = (new - old for new, old in zip(now, self._since, strict=True))
-        self._since = now
+        now = time.monotonic()
+        elapsed, self._since = now - self._since, now
         self.seconds[phase] = self.seconds.get(phase, 0.0) + elapsed
-        self.processor_seconds[phase] = self.processor_seconds.get(phase, 0.0) + worked
         return elapsed
 
 
@@ -113,8 +97,6 @@ class RunRecord:
         self._entry: dict[str, Any] = {
             "began": datetime.now(UTC).isoformat(timespec="seconds"),
             "first_step": first_step,
-            "version": version(),
-            "commit": commit(),
             "jax": jax.__version__,
             "hardware": runtime.hardware(),
             "data": str(dataset.folder),
@@ -125,9 +107,8 @@ class RunRecord:
 
     def write(self, last_step: int, clock: Clock) -> None:
         """Writes what is known by now."""
-        spent = {"seconds": clock.seconds, "processor_seconds": clock.processor_seconds}
-        rounded = {name: {phase: round(value, 2) for phase, value in by.items()} for name, by in spent.items()}
-        starts = [*self._earlier, self._entry | {"last_step": last_step} | rounded]
+        seconds = {phase: round(spent, 2) for phase, spent in clock.seconds.items()}
+        starts = [*self._earlier, self._entry | {"last_step": last_step, "seconds": seconds}]
         write_whole(self._path, (json.dumps({"starts": starts}, indent=1) + "\n").encode())
 
 
@@ -157,22 +138,3 @@ def checksum(dataset: data_sets.Dataset) -> str:
     """A number that tells data sets apart: of their settings and the names of their objects."""
     content = json.dumps([dataset.settings, dataset.splits], sort_keys=True)
     return hashlib.sha256(content.encode()).hexdigest()
-
-
-def version() -> str:
-    """The installed version of the package."""
-    try:
-        return importlib.metadata.version("spnr-jax")
-    except importlib.metadata.PackageNotFoundError:
-        return "not installed"  # only on the path
-
-
-def commit() -> str | None:
-    """The commit that the code was checked out at, with a "+" if files differ from it; None outside of a checkout."""
-    git = ("git", "-C", str(Path(__file__).parent))
-    try:
-        head = subprocess.run([*git, "rev-parse", "HEAD"], capture_output=True, text=True, check=True, timeout=10)
-        changed = subprocess.run([*git, "status", "--porcelain", "."], capture_output=True, text=True, timeout=10)
-    except (OSError, subprocess.SubprocessError):
-        return None
-    return head.stdout.strip() + ("+" if changed.stdout.strip() else "")

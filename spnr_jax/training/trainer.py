@@ -32,7 +32,7 @@ from spnr_jax.kernels.records import Light
 from spnr_jax.method.model import render_views
 from spnr_jax.methods import method_of
 from spnr_jax.training import checkpoint, optimisation
-from spnr_jax.training.run_record import Clock, MetricsLog, RunRecord, Unwritten
+from spnr_jax.training.run_record import Clock, MetricsLog, RunRecord
 from spnr_jax.training.weights import Trained, add_companions, write_weights
 
 
@@ -169,8 +169,8 @@ class Progress:
         leads = placement.leads()
         self._of, self._schedule = (config, dataset, run, light), schedule
         self._first, self._done, self._clock, self._tell = first, first, clock, tell
-        self._record = RunRecord(run, dataset, first, init) if leads else Unwritten()
-        self._log = MetricsLog(run, first) if leads else Unwritten()
+        self._record = RunRecord(run, dataset, first, init) if leads else None
+        self._log = MetricsLog(run, first) if leads else None
         self._bar = tqdm(total=config.num_steps, initial=first, unit="step", mininterval=1, disable=not leads)
         self._pending: list[tuple[int, dict]] = []
 
@@ -187,8 +187,12 @@ class Progress:
         """A row and a preview, where they are due."""
         if save or self._done % self._schedule.log_every == 0:
             self._row(state, save)
-        if placement.leads() and (last or self._done % self._schedule.preview_every == 0):
-            self._preview(state)
+        if self._log and (last or self._done % self._schedule.preview_every == 0):
+            self._tell("preview", self._done, None)
+            scores, picture = preview(state, *self._of)
+            self._log.write({"step": self._done, **scores}, picture)
+            runtime.give_back()
+            self._clock.lap("previews")
 
     def _row(self, state: optimisation.TrainState, save: bool) -> None:
         """The mean of the steps since the last row; NotFinite for one that is not, or for a state to be saved."""
@@ -199,17 +203,10 @@ class Progress:
         pace = 1000 * (seconds / len(timed) if timed else self._clock.seconds["compilation"])
         row, (_, newest) = {"step": self._done, **mean_row(rows), "ms_per_step": round(pace, 2)}, rows[-1]
         self._tell("row", self._done, row)
-        self._log.write(row)
+        if self._log:
+            self._log.write(row)
         self._bar.set_postfix({n: f"{newest[n]:.2f}" for n in ("loss", "psnr") if n in newest}, refresh=False)
         self._pending = []
-
-    def _preview(self, state: optimisation.TrainState) -> None:
-        """Pictures of a few objects, and their scores."""
-        self._tell("preview", self._done, None)
-        scores, picture = preview(state, *self._of)
-        self._log.write({"step": self._done, **scores}, picture)
-        runtime.give_back()
-        self._clock.lap("previews")
 
     def checkpoint(self, state: optimisation.TrainState) -> None:
         """The whole state, and how the time was spent."""
@@ -217,14 +214,16 @@ class Progress:
         self._tell("checkpoint", self._done, None)
         checkpoint.save(run, state)
         self._clock.lap("checkpoints")
-        self._record.write(self._done, self._clock)
+        if self._record:
+            self._record.write(self._done, self._clock)
         self._tell("saved", self._done, state)
         self._clock.lap("listeners")
 
     def close(self) -> None:
         """Closes bar and log."""
         self._bar.close()
-        self._log.close()
+        if self._log:
+            self._log.close()
 
 
 def new_state(config: TrainConfig, init: Trained | None) -> optimisation.TrainState:

@@ -1,8 +1,7 @@
 """The controls of one browser, bound to what it sees: every control submits a change to the loop that draws.
 
 Quick callbacks are coroutines, which viser runs in the order of the browser's messages, so the last value of a slider
-wins; slow ones (reading a file, making splats) are plain functions, which it runs in threads.  Splats are drawn by the
-browser, each in one colour for all directions, the mean of what an export has.
+wins; slow ones (reading a file) are plain functions, which it runs in threads.
 """
 
 import dataclasses
@@ -11,15 +10,11 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, Generic, TypeVar
 
-import numpy as np
 import viser
 
 from spnr_jax.errors import UserError
 from spnr_jax.formats import clouds, images, light_files
-from spnr_jax.kernels.records import Gaussians
 from spnr_jax.method.model import Model
-from spnr_jax.surfels.gaussians import C0, rotations
-from spnr_jax.tools import splat_making
 from spnr_jax.tools.pictures import takes_light
 from spnr_jax.viewer import frame
 from spnr_jax.viewer.frame import State
@@ -81,9 +76,7 @@ TITLE = "{}: {:,} points"
 LONGEST_NOTE = 500  # characters
 MOVING_JPEG, RESTING_JPEG = 75, 92  # qualities of the pictures sent
 WIDEST_EXPOSURE = 4.0  # stops
-VIEWS, RESOLUTION, MOST, DEGREE = 24, 384, 100_000, 1  # of splats: fewer than an export's, since a person waits
 PREPARING = "The network is being prepared."
-LARGER = 100.0  # times, before numbers of 16 bits hold the squares of the splats' widths
 ONE_LIGHT = "This network knows the light of its training alone; `--run surfels` draws in any."
 
 
@@ -94,8 +87,6 @@ class Browser:
         self, client: viser.ClientHandle, model: Model, first: State, reading: dict[str, Any], network: threading.Lock
     ) -> None:
         self._client, self._model, self._reading, self._network = client, model, reading, network
-        self._splats: Any = None
-        self._splats_of: State | None = None
         self._light: dict[str, Any] = {}
         self.loop = Loop(first, self._draw)
         gui = client.gui
@@ -121,9 +112,6 @@ class Browser:
             self._replace(view=seen)
 
     def _draw(self, state: State, moving: bool) -> State:
-        of = self._splats_of
-        if of and (of.volume is not state.volume or of.lighting != state.lighting):
-            state = self._drop_splats(state)
         with self._network:
             state, canvas = frame.draw(self._model, state, moving)
         if canvas is not None and not self.loop.stopped and (moving or not self.loop.is_superseded):
@@ -146,17 +134,11 @@ class Browser:
     def _add_picture(self, gui: viser.GuiApi) -> None:
         names, hint = tuple(frame.qualities(self._model)), "While things move: draft, half the pixels"
         quality = gui.add_dropdown("Quality", names, initial_value=self.loop.state.quality, hint=hint)
-        self._shown: Any = gui.add_checkbox("Splats", False)
 
         @quality.on_update
         async def _(_: Any) -> None:
             if quality.value in names:
                 self._replace(quality=quality.value)
-
-        @self._shown.on_update
-        def _(event: viser.GuiEvent) -> None:
-            if event.client is not None:  # not when the program itself takes them away
-                self._try(self._show_splats)
 
     def _add_light(self, gui: viser.GuiApi) -> None:
         if not takes_light(self._model):
@@ -192,7 +174,7 @@ class Browser:
             self._try(self._save)
 
     def _save(self) -> None:
-        state = dataclasses.replace(self.loop.state, splats=False)
+        state = self.loop.state
         with self._network:
             canvas = frame.draw(self._model, state, moving=False)[1]
         if canvas is not None:
@@ -215,47 +197,3 @@ class Browser:
     def _show_choice(self, state: State) -> State:
         self._light["choice"].options, self._light["choice"].value = state.lights, state.light_name
         return state
-
-    def _show_splats(self) -> None:
-        if self._shown.value and self._splats is None:
-            self._shown.disabled = True
-            try:
-                self._make_splats()
-            finally:
-                self._shown.disabled, self._shown.value = False, self._splats is not None
-        if self._splats is not None:
-            self._splats.visible = self._shown.value
-            self._replace(splats=self._shown.value)
-
-    def _make_splats(self) -> None:
-        """Splats of the object as it is now; the network is free between the pictures."""
-        state, views = frame.make_light(self.loop.state), []
-        for i, camera in enumerate(splat_making.fitting_cameras(self._model, state.volume, VIEWS, RESOLUTION)):
-            if self.loop.stopped:
-                return
-            self._said.content = f"picture {i + 1} of {VIEWS}"
-            with self._network:
-                views += splat_making.draw_views(self._model, state.volume, [camera], state.light)
-        made = splat_making.splats_in_box(views, state.volume, state.cloud, DEGREE, MOST)
-        self._said.content = f"{len(made.opacity):,} splats"
-        self._splats = self._client.scene.add_gaussian_splats("/splats", **splats_for_browser(made))
-        self._splats_of = state
-
-    def _drop_splats(self, state: State) -> State:
-        """Takes the splats away: they show the object or the light as it was before a change."""
-        self._splats.remove()
-        self._splats, self._splats_of = None, None
-        self._shown.value, self._said.content = False, ""
-        return dataclasses.replace(state, splats=False)
-
-
-def splats_for_browser(splats: Gaussians) -> dict[str, Any]:
-    """Arguments of viser's `add_gaussian_splats`."""
-    axes = rotations(np.asarray(splats.rotation)) * (LARGER * np.asarray(splats.scale))[:, None, :]
-    return {
-        "centers": LARGER * np.asarray(splats.position, np.float32),
-        "covariances": np.einsum("nij,nkj->nik", axes, axes),
-        "rgbs": np.clip(0.5 + C0 * np.asarray(splats.harmonics)[:, 0], 0, 1),
-        "opacities": np.asarray(splats.opacity)[:, None],
-        "scale": 1 / LARGER,
-    }

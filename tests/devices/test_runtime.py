@@ -1,15 +1,61 @@
-"""What a process asks of its machine: arenas that threads share, memory that stays or goes back, programs on disk."""
+"""What a process asks of its machine: threads, arenas that they share, memory that stays or goes back, programs."""
 
 import ctypes
 import os
 import platform
 import subprocess
 import sys
+import threading
+from functools import partial
 from types import SimpleNamespace
 
 import pytest
 
 from spnr_jax.devices import runtime
+from spnr_jax.devices.runtime import run_ahead, two_at_a_time
+
+
+def test_jobs_are_done_by_another_thread_in_their_order_few_ahead_of_the_caller():
+    caller, made = threading.get_ident(), []
+
+    def jobs():
+        for i in range(20):
+            made.append(i)
+            yield partial(lambda i: (i, threading.get_ident() == caller), i)
+
+    results = run_ahead(jobs(), most=3)
+    assert next(results) == (0, False)
+    assert made == [0, 1, 2, 3]
+    assert list(results) == [(i, False) for i in range(1, 20)]
+
+
+def test_an_error_of_a_job_or_of_their_maker_is_raised():
+    def broken():
+        yield int
+        raise ValueError("this one")
+
+    with pytest.raises(ValueError, match="this one"):
+        list(run_ahead(broken()))
+    with pytest.raises(ValueError, match="invalid literal"):
+        list(run_ahead(iter([int, partial(int, "word"), int])))
+
+
+def test_of_work_for_two_threads_the_first_is_done_alone_and_two_meet_at_most():
+    both, running, most = threading.Barrier(2, timeout=10), [], []
+
+    def work(i):
+        running.append(i)
+        most.append((i, len(running)))
+        if i in (1, 2):
+            both.wait()
+        running.remove(i)
+        return i
+
+    assert list(two_at_a_time(work, range(6))) == list(range(6))
+    assert most[0] == (0, 1)
+    assert max(count for _, count in most) == 2
+    assert list(two_at_a_time(int, [])) == []
+
 
 THREADS = 6
 glibc = pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="the C library is not glibc")
@@ -69,12 +115,12 @@ import jax
 
 @jax.jit
 def step(x, w):
-    y = x @ w  # 128 MB
+    y = x @ w  # 64 MB
     return y.T @ y
 
-x, w = jax.numpy.ones((128 << 10, 256)), jax.numpy.ones((256, 256))
+x, w = jax.numpy.ones((64 << 10, 256)), jax.numpy.ones((256, 256))
 faults = []
-for _ in range(10):  # the first ones find no memory, or one piece where two are in use
+for _ in range(6):  # the first ones find no memory, or one piece where two are in use
     before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
     step(x, w).block_until_ready()
     faults.append(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
@@ -89,7 +135,7 @@ def test_a_step_uses_the_memory_of_the_one_before_when_it_is_kept():
         return int(done.stdout)
 
     fresh = faults("let go")
-    assert fresh >= 64, "128 MB in pages of 2 MB at most"
+    assert fresh >= 32, "64 MB in pages of 2 MB at most"
     assert faults("keep") < fresh / 4
 
 

@@ -102,9 +102,8 @@ def test_while_things_move_the_draft_is_drawn_and_at_rest_what_was_chosen(monkey
     assert asked[1::2] == [("draft", 48), ("balanced", 48), ("best", 48), ("best", 96)]
 
 
-def test_nothing_is_drawn_before_the_browser_said_where_it_looks_from_and_splats_stand_before_white():
+def test_nothing_is_drawn_before_the_browser_said_where_it_looks_from():
     assert frame.draw(surfels(), state(view=None), moving=False)[1] is None
-    assert (canvas(splats=True) == 255).all()
 
 
 # light
