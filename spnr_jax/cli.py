@@ -146,11 +146,8 @@ def run_train(command: Train) -> None:
         placement.join(*address)
     mesh = placement.device_mesh()
     dataset = data_sets.open_dataset(command.data)
-    schedule = trainer.Schedule(
-        log_every=command.log_every, preview_every=command.preview_every, checkpoint_every=command.checkpoint_every
-    )
     init = None if command.init is None else weights.read_trained(command.init)
-    trainer.train(command.config, dataset, command.run, schedule, mesh, init)
+    trainer.train(command.config, dataset, command.run, command.schedule, mesh, init)
     if placement.leads():
         print(f"trained: {command.run} (score it with `spnr evaluate {command.data} {command.run}`)")
 

@@ -4,6 +4,7 @@
     PaperConfig     the paper's network             method/paper_method.py
     SurfelConfig    the network over surfels        method/surfel_method.py
     TrainConfig     a training: one of these, losses, optimiser, batches
+    Schedule        what the training loop does beside training
     RenderOptions   how a render is asked for
 
 Configs are hashable, so they are static arguments of jit.  All numbers are finite and at least 0; a wrong value raises
@@ -371,3 +372,18 @@ class TrainConfig:
             self.min_points <= self.max_points,
             f"min_points {self.min_points} must not exceed max_points {self.max_points}",
         )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Schedule:
+    """How often the loop does what is not training, in steps."""
+
+    log_every: int = 20
+    """Steps between rows of metrics.jsonl and TensorBoard."""
+    preview_every: int = 500
+    """Steps between preview images with validation scores."""
+    checkpoint_every: int = 500
+    """Steps between checkpoints."""
+
+    def __post_init__(self) -> None:
+        check(self, positive=("log_every", "preview_every", "checkpoint_every"))

@@ -19,7 +19,7 @@ from spnr_jax import methods
 from spnr_jax.formats import data_sets
 from spnr_jax.presets import PRESETS
 from spnr_jax.tools import export
-from spnr_jax.training import run_record, weights
+from spnr_jax.training import trainer, weights
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -116,7 +116,7 @@ def test_a_method_and_losses_of_ones_own_work_as_their_page_shows_them(workplace
     loaded, again = names["mean"], spnr_jax.load(workplace / "runs" / "mean")
     assert (np.asarray(loaded.params["params"]["weight"]) != 0.5).all(), "the loss is the one that is trained"
     jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-3), loaded.params["params"], again.params["params"])
-    assert {"loss", "psnr"} <= run_record.read_rows(workplace / "runs" / "mean")[0].keys()
+    assert {"loss", "psnr"} <= trainer.read_rows(workplace / "runs" / "mean")[0].keys()
     check_gradient(names["by_weights"], any)
 
 

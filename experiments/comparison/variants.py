@@ -38,7 +38,7 @@ from spnr_jax.presets import PRESETS
 from spnr_jax.scoring import evaluation
 from spnr_jax.scoring.report import ARROWS, HIGHER, QUALITY, Cell, Table, number, text
 from spnr_jax.scoring.summary import Scores, difference, means, metric_settings
-from spnr_jax.training import checkpoint, optimisation, run_record
+from spnr_jax.training import checkpoint, optimisation, trainer
 
 Preset = Literal["abo", "shapenet_car", "shapenet_plane", "shapenet_chair", "small", "tiny"]
 QUICK_STEPS, QUICK_OBJECTS = 4, 2
@@ -182,7 +182,7 @@ def train(variants: Sequence[Variant], budget: Budget, out: Path) -> dict[str, d
 
 def step_milliseconds(run: Path) -> float | None:
     """Median milliseconds of a run's steps over the rows of its log; None of a few, which are mostly compilation."""
-    found = [row["ms_per_step"] for row in run_record.read_rows(run) if "ms_per_step" in row]
+    found = [row["ms_per_step"] for row in trainer.read_rows(run) if "ms_per_step" in row]
     return round(statistics.median(found), 2) if len(found) >= FEWEST_ROWS else None
 
 

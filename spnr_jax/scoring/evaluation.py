@@ -26,7 +26,7 @@ from spnr_jax.method.model import render_views
 from spnr_jax.scoring import floors
 from spnr_jax.scoring.picture_scores import flip, lpips
 from spnr_jax.scoring.summary import Scores, differences, metric_settings, summarise
-from spnr_jax.training.run_record import trained_on
+from spnr_jax.training.trainer import trained_on
 from spnr_jax.training.weights import Trained, place, read_trained
 
 RADIUS_FACTORS = (0.5, 0.75, 1.0, 1.5, 2.0)

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import tyro
 
 from spnr_jax import presets
-from spnr_jax.config import TrainConfig
+from spnr_jax.config import Schedule, TrainConfig
 from spnr_jax.errors import UserError, at_least, require, within
 from spnr_jax.formats.cut import Cut
 
@@ -224,12 +224,8 @@ class Train:
     init: str | None = None
     """Initial weights of a new run: a run folder, a weights file, or `surfels`, the package's network (default:
     random)."""
-    log_every: int = 20
-    """Steps between rows of metrics.jsonl and TensorBoard."""
-    preview_every: int = 500
-    """Steps between preview images with validation scores."""
-    checkpoint_every: int = 500
-    """Steps between checkpoints."""
+    schedule: tyro.conf.OmitArgPrefixes[Schedule] = Schedule()
+    """What the run writes beside its weights."""
     distributed: bool = False
     """This is one of several processes that a launcher started (SLURM, Open MPI, Kubernetes) and that train
     together."""

@@ -17,7 +17,7 @@ from typing import Literal
 import jax
 import numpy as np
 
-from spnr_jax.training import checkpoint, optimisation, run_record
+from spnr_jax.training import checkpoint, optimisation, trainer
 
 ROOT = Path(__file__).parents[2]
 LIMIT = 3600.0  # seconds that a run may take
@@ -97,7 +97,7 @@ def free_port() -> int:
 
 def compared(run: Path, one: Path) -> dict[str, float]:
     """How far a run lies from that on one device, relative: all metrics of all steps, statistics, parameters."""
-    rows, expected = ([row for row in run_record.read_rows(x) if "loss" in row] for x in (run, one))
+    rows, expected = ([row for row in trainer.read_rows(x) if "loss" in row] for x in (run, one))
     assert [row.keys() for row in rows] == [row.keys() for row in expected]
     apart = [
         abs(a[name] - b[name]) / max(abs(b[name]), 1)

@@ -17,7 +17,7 @@ from spnr_jax.kernels import metrics
 from spnr_jax.scoring import evaluation, floors
 from spnr_jax.scoring.picture_scores import flip
 from spnr_jax.scoring.summary import METRICS
-from spnr_jax.training import checkpoint, optimisation, run_record, weights
+from spnr_jax.training import checkpoint, optimisation, trainer, weights
 
 NAMES = tiny_dataset.SPLITS["test"]
 ssim = jax.jit(metrics.ssim)
@@ -153,7 +153,7 @@ EXPOSURE = [  # starts that the record of a run names, split, what may be said
 
 def recorded(folder, *starts):
     folder.mkdir()
-    here = {"data_checksum": run_record.checksum(tiny_dataset.dataset())}
+    here = {"data_checksum": trainer.checksum(tiny_dataset.dataset())}
     (folder / "run.json").write_text(json.dumps({"starts": [here | start for start in starts]}))
     return folder
 

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support import tiny_dataset, tiny_surfels
+from support import surfel_clouds, tiny_dataset, tiny_surfels
 from support.laws import close, same_bits
 from support.stopped_runs import interrupted, rows_without_time
 from support.tiny_surfels import CONFIG, LIGHT, NAME, SCHEDULE
@@ -16,7 +16,7 @@ from support.tiny_surfels import CONFIG, LIGHT, NAME, SCHEDULE
 import spnr_jax
 from spnr_jax.formats import data_sets
 from spnr_jax.kernels.cameras import pinhole
-from spnr_jax.kernels.records import Crops, PointCloud, Surfels
+from spnr_jax.kernels.records import Crops, PointCloud
 from spnr_jax.method import surfel_method
 from spnr_jax.method.surfel_method import encode_in_box
 from spnr_jax.nn import shader
@@ -174,24 +174,14 @@ def test_a_mirrored_object_is_seen_as_the_mirrored_view(axis):
     pose = jnp.concatenate([jnp.eye(3), jnp.array([[0.0], [0.0], [3.0]])], axis=1)
     camera, seen = pinhole(pose, 0.7, 24, 24), []
     for sign in (np.ones(3, np.float32), mirror):
-        surfels = Surfels(
-            position=0.8 * normal * sign,
-            normal=normal * sign,
-            spacing=np.full(60, 0.4, np.float32),
-            base_color=color,
+        columns = {"base_color": color, "jump": color[:, ::-1] - color, "roughness": color[:, 0], "shape": color[:, :2]}
+        columns |= {"metallic": color[:, 1], "guessed": color[:, 2], "invented": color[:, 0], "rim": rim * sign}
+        surfels = surfel_clouds.surfels(
+            0.8 * normal * sign, normal * sign, 0.4, **columns,
             border=np.concatenate([rim * sign, np.full((60, 1), 0.1, np.float32)], axis=1),
-            jump=color[:, ::-1] - color,
-            roughness=color[:, 0],
-            metallic=color[:, 1],
-            guessed=color[:, 2],
-            invented=color[:, 0],
-            sided=np.ones(60, np.float32),
             visible=np.maximum((normal * sign) @ DIRECTIONS.T, 0),
-            shape=color[:, :2],
-            rim=rim * sign,
             reach=reach if sign.min() > 0 else reach[:, [0, 1, 3, 2]],  # normal x rim is not mirrored
-            mask=np.ones(60, bool),
-        )
+        )  # fmt: skip
         seen.append(np.asarray(gbuffers.look_at(surfels, camera, LIGHT, room=2**14, slots=24 * 24)[0]))
     view = {"seen": seen[0], "maps": seen[0], "target": seen[0], "ambient": np.zeros((9, 3))}
     np.testing.assert_allclose(gbuffers.mirror(view, axis)["seen"], seen[1], atol=0.05)

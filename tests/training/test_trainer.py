@@ -26,7 +26,7 @@ from spnr_jax import cli
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.images import png
 from spnr_jax.scoring import evaluation
-from spnr_jax.training import batching, checkpoint, optimisation, run_record, trainer, weights
+from spnr_jax.training import batching, checkpoint, optimisation, trainer, weights
 
 KEPT_STEPS = {"2", "4", "6"}
 
@@ -57,7 +57,7 @@ class TestBeginningWithOtherWeights:
         state = trainer.train(config, tiny_dataset.dataset(), tmp_path, SCHEDULE, init=init)
         close(state.generator, init.variables["params"], atol=1e-9)
         close(state.averaged, init.variables["params"], atol=1e-9)
-        (start,) = run_record.read_starts(tmp_path)
+        (start,) = trainer.read_starts(tmp_path)
         assert start["init"] == f"{CONFIG.preset}, {CONFIG.num_steps} steps"
 
     def test_weights_of_another_network_are_refused_in_one_line(self, tmp_path, capsys):
@@ -96,7 +96,7 @@ def test_a_finished_run_is_left_alone():
 
 
 def test_previews_and_rows_come_when_the_schedule_says():
-    run, rows = tiny_dataset.run(), run_record.read_rows(tiny_dataset.run())
+    run, rows = tiny_dataset.run(), trainer.read_rows(tiny_dataset.run())
     assert [row["step"] for row in rows if "loss" in row] == [1, 2, 3, 4, 5, 6]
     assert [row["step"] for row in rows if "val_psnr" in row] == [3, 6]
     assert all(np.isfinite(value) for row in rows for value in row.values())
@@ -146,7 +146,7 @@ def test_a_full_disk_is_one_line_and_exit_code_2(monkeypatch, tmp_path, capsys):
     def full(log, row):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(tmp_path / "metrics.jsonl"))
 
-    monkeypatch.setattr(run_record.MetricsLog, "write", full)
+    monkeypatch.setattr(trainer.MetricsLog, "write", full)
     code = cli.guard(lambda: trainer.train(CONFIG, tiny_dataset.dataset(), tmp_path, SCHEDULE), "spnr")
     assert code == 2
     line = capsys.readouterr().err.splitlines()[-1]
@@ -205,7 +205,7 @@ def decoded(content):
 
 
 def test_a_row_with_a_picture_is_scalars_and_an_image_of_the_same_pixels_as_the_file(tmp_path):
-    log = run_record.MetricsLog(tmp_path, 0)
+    log = trainer.MetricsLog(tmp_path, 0)
     log.write({"step": 2, "loss": 3.0})
     log.write({"step": 3, "val_psnr": 20.5}, PICTURE)
     log.close()
@@ -214,7 +214,7 @@ def test_a_row_with_a_picture_is_scalars_and_an_image_of_the_same_pixels_as_the_
     assert (at, score.tag, score.simple_value) == (3, "val_psnr", 20.5)
     assert (shown, picture.tag) == (3, "preview")
     np.testing.assert_array_equal(decoded(picture.image.encoded_image_string), decoded(png(PICTURE)))
-    assert run_record.read_rows(tmp_path) == [{"step": 2, "loss": 3.0}, {"step": 3, "val_psnr": 20.5}]
+    assert trainer.read_rows(tmp_path) == [{"step": 2, "loss": 3.0}, {"step": 3, "val_psnr": 20.5}]
 
 
 def test_previews_are_images_at_their_steps_and_a_second_compilation_is_announced(monkeypatch, tmp_path, capsys):
@@ -241,36 +241,36 @@ def recorded(tmp_path_factory):
 
 
 def test_a_start_says_where_and_with_what_it_trained_and_tells_its_objects_from_others(recorded):
-    (entry,), dataset = run_record.read_starts(recorded), tiny_dataset.dataset()
+    (entry,), dataset = trainer.read_starts(recorded), tiny_dataset.dataset()
     assert (entry["first_step"], entry["last_step"]) == (0, tiny_untrained.CONFIG.num_steps)
     assert set(entry["seconds"]) == {"restore", "compilation", "steps", "previews", "checkpoints", "listeners"}
     assert all(seconds >= 0 for seconds in entry["seconds"].values())
-    assert entry["data_checksum"] == run_record.checksum(dataset)
+    assert entry["data_checksum"] == trainer.checksum(dataset)
     assert "cores" in entry["hardware"]
-    assert run_record.trained_on(recorded, dataset, dataset.splits["train"]) is True
-    assert run_record.trained_on(recorded, dataset, dataset.splits["test"]) is False
+    assert trainer.trained_on(recorded, dataset, dataset.splits["train"]) is True
+    assert trainer.trained_on(recorded, dataset, dataset.splits["test"]) is False
 
 
 def test_a_run_that_goes_on_keeps_what_earlier_starts_said(tmp_path):
     dataset = tiny_dataset.dataset()
-    clock = run_record.Clock()
+    clock = trainer.Clock()
     clock.lap("steps")
     for first in (0, 4):
-        run_record.RunRecord(tmp_path, dataset, first).write(first + 4, clock)
-    starts = run_record.read_starts(tmp_path)
+        trainer.RunRecord(tmp_path, dataset, first).write(first + 4, clock)
+    starts = trainer.read_starts(tmp_path)
     assert [(entry["first_step"], entry["last_step"]) for entry in starts] == [(0, 4), (4, 8)]
 
 
 @pytest.mark.parametrize("content", ["", "[]", '{"starts": 3}', '{"starts": [1]}', "[" * 100_000])
 def test_a_damaged_record_stops_nothing(content, tmp_path):
     (tmp_path / "run.json").write_text(content)
-    assert run_record.read_starts(tmp_path) == []
+    assert trainer.read_starts(tmp_path) == []
 
 
 def test_laps_of_one_phase_add_up_and_leave_nothing_out(monkeypatch):
     times = iter([10.0, 11.0, 13.0, 17.0])
-    monkeypatch.setattr(run_record.time, "monotonic", lambda: next(times))
-    clock = run_record.Clock()
+    monkeypatch.setattr(trainer.time, "monotonic", lambda: next(times))
+    clock = trainer.Clock()
     assert [clock.lap(phase) for phase in ("steps", "previews", "steps")] == [1.0, 2.0, 4.0]
     assert clock.seconds == {"steps": 5.0, "previews": 2.0}
 
@@ -279,4 +279,4 @@ def test_the_checksum_knows_settings_and_splits():
     dataset = tiny_dataset.dataset()
     changes = {"settings": dataset.settings | {"views": 99}}, {"splits": dataset.splits | {"test": ()}}
     others = [dataclasses.replace(dataset, **change) for change in changes]
-    assert len({run_record.checksum(d) for d in (dataset, *others)}) == 3
+    assert len({trainer.checksum(d) for d in (dataset, *others)}) == 3

@@ -15,7 +15,7 @@ from support.tiny_baselines import SHRUNKEN
 from spnr_jax.config import LossConfig, OptimizerConfig, TrainConfig
 from spnr_jax.kernels import losses
 from spnr_jax.method import inference
-from spnr_jax.training import batching, optimisation, run_record, trainer
+from spnr_jax.training import batching, optimisation, trainer
 
 pytestmark = pytest.mark.ci  # it trains several networks
 
@@ -59,7 +59,7 @@ def train_to_the_end_or_a_name(config, dataset, run) -> str | None:
         updates = state.generator_optimizer[0].count, state.discriminator_optimizer[0].count
         assert updates == (config.num_steps, config.num_steps - optimisation.first_adversarial_step(config))
         quantity, whole = None, config.num_steps
-    rows = [row for row in run_record.read_rows(run) if "loss" in row]
+    rows = [row for row in trainer.read_rows(run) if "loss" in row]
     assert [row["step"] for row in rows] == list(range(1, whole + 1))
     assert all(np.isfinite(value) for row in rows for value in row.values())
     return quantity
