@@ -144,6 +144,8 @@ class NetworkConfig:
     """Levels of quality at which its pictures differ, the best first."""
     has_discriminator: ClassVar[bool] = False
     """Whether its loss may be adversarial."""
+    crops: ClassVar[bool] = False
+    """Whether it is trained on squares of views."""
     ray_block: ClassVar[int | None] = None
     """Rays rendered at once where no other number is asked for; None: the network's own."""
 
@@ -229,6 +231,7 @@ class SurfelConfig(NetworkConfig):
 
     method: ClassVar[str] = "surfels"
     qualities: ClassVar[tuple[Quality, ...]] = ("best", "balanced", "draft")
+    crops: ClassVar[bool] = True
 
     image_resolution: int = 512
     """Pixels along each side of a picture where no other size is asked for."""
@@ -361,12 +364,9 @@ class TrainConfig:
             f"image_resolution that it divides ({self.model.image_resolution}); use 1",
         )
         require(
-            self.crop == 0 or (self.model.any_size and 1 <= self.crop <= self.model.image_resolution),
-            f"crop {self.crop} needs a network that renders pictures of any size, and at most its image_resolution "
-            f"({self.model.image_resolution}) pixels; use 0",
-        )
-        require(
-            self.crop == 0 or self.pixel_stride == 1, f"pixel_stride {self.pixel_stride} and crop {self.crop}: use one"
+            self.crop == 0 or (self.model.crops and self.crop <= self.model.image_resolution),
+            f"crop {self.crop} needs a network that is trained on squares of its views, and at most its "
+            f"image_resolution ({self.model.image_resolution}) pixels; use 0",
         )
         require(
             self.min_points <= self.max_points,

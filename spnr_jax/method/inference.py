@@ -9,7 +9,7 @@ Values sown into the collection "losses" are added to the loss.
 """
 
 import dataclasses
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from typing import Any
 
@@ -76,8 +76,9 @@ def loss(
     variables: dict, batch: Batch, key: Key | None = None, *, config: TrainConfig
 ) -> tuple[Float[Array, ""], Outcome]:
     """(loss, outcome): errors of the pixels that a step renders, and the losses of the network's own."""
-    if key is not None:
-        key, batch = choose_pixels(key, batch, config)
+    if key is not None and config.pixel_stride > 1:
+        key, lattice_key = jax.random.split(key)
+        batch = lattice(lattice_key, batch, config.pixel_stride)
     rendering, updated = network(config.model).apply(
         variables, batch.cloud, batch.camera, key, train=True, mutable=["batch_stats", "losses"]
     )
@@ -90,17 +91,6 @@ def loss(
     value = reconstruction_loss(config, rendering.image, rendering.image_lr, reference, seen)
     metrics = {"psnr": jnp.mean(psnr(rendering.image, reference)), "l1": losses.l1(rendering.image, reference)}
     return sum(terms.values(), value), Outcome(metrics | terms, updated.get("batch_stats", {}), rendering.image, batch)
-
-
-def choose_pixels(key: Key, batch: Batch, config: TrainConfig) -> tuple[Key, Batch]:
-    """The key of what else a step draws, and the batch with the pixels that it renders."""
-    if config.pixel_stride > 1:
-        key, lattice_key = jax.random.split(key)
-        batch = lattice(lattice_key, batch, config.pixel_stride)
-    if config.crop:
-        key, crop_key = jax.random.split(key)
-        batch = crop_square(crop_key, batch, config.crop)
-    return key, batch
 
 
 def lattice(key: Key, batch: Batch, stride: int) -> Batch:
@@ -117,29 +107,10 @@ def lattice(key: Key, batch: Batch, stride: int) -> Batch:
     shift = 0.5 - (first[::-1] + 0.5) / stride
     zoom = jnp.diag(jnp.array([1 / stride, 1 / stride, 1.0])).at[:2, 2].set(shift)
     intrinsics = jnp.einsum("ij,...jk->...ik", zoom, batch.camera.intrinsics, precision="highest")
-    return _some_pixels(batch, thinned, intrinsics)
-
-
-def crop_square(key: Key, batch: Batch, size: int) -> Batch:
-    """The batch with a square of `size` pixels of each view, at one random place for all: images still."""
-    height, width = batch.image.shape[2:4]
-    first = jax.random.randint(key, (2,), 0, jnp.array([height, width]) - size + 1)
-
-    def cut(x):
-        for axis, start in zip((2, 3), first, strict=True):
-            x = jax.lax.dynamic_slice_in_dim(x, start, size, axis)
-        return x
-
-    return _some_pixels(batch, cut, jnp.asarray(batch.camera.intrinsics).at[..., :2, 2].add(-first[::-1]))
-
-
-def _some_pixels(batch: Batch, some: Callable[[Array], Array], intrinsics: Array) -> Batch:
-    """The batch with some of the pixels of its images, which cameras of these intrinsics see."""
     images = (batch.image, batch.alpha, batch.condition, batch.condition_mask)
-    image, alpha, condition, mask = (some(jnp.asarray(x)) for x in images)
-    camera = Camera(
-        cam_to_world=batch.camera.cam_to_world, intrinsics=intrinsics, height=image.shape[2], width=image.shape[3]
-    )
+    image, alpha, condition, mask = (thinned(jnp.asarray(x)) for x in images)
+    pose, (height, width) = batch.camera.cam_to_world, image.shape[2:4]
+    camera = Camera(cam_to_world=pose, intrinsics=intrinsics, height=height, width=width)
     return Batch(cloud=batch.cloud, camera=camera, image=image, alpha=alpha, condition=condition, condition_mask=mask)
 
 

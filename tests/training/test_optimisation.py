@@ -19,7 +19,6 @@ from spnr_jax.config import LossConfig, NetworkConfig, OptimizerConfig
 from spnr_jax.kernels import cameras, losses
 from spnr_jax.kernels.records import Rendering
 from spnr_jax.method import inference
-from spnr_jax.nn.convolution import run_by_run
 from spnr_jax.training import optimisation
 
 
@@ -222,14 +221,6 @@ def test_two_balls_and_their_opacity_are_learnt_from_a_lattice_of_rays():
     assert later["psnr"] > metrics["psnr"] + 3
 
 
-@pytest.mark.ci
-def test_one_batch_is_learnt_by_heart_against_a_discriminator():
-    first, start = run(create(CONFIG), 1)
-    _, end = run(first, 40)
-    assert all(np.isfinite(value) for value in end.values())
-    assert end["l1"] < start["l1"]
-
-
 @pytest.fixture(scope="module")
 def judge(fresh):
     return fresh.discriminator
@@ -281,7 +272,7 @@ class TestLearningRate:
         assert float(rate(0)) > 0, "no step is lost"
 
     def test_or_by_an_exponential(self):
-        """Point-NeRF's: a tenth after half a million of a million steps."""
+        """Point-NeRF's: a tenth after half of the steps."""
         o = OptimizerConfig(lr_generator=5e-4, warmup_steps=0, final_lr_scale=0.01, decay="exponential")
         rate = optimisation.learning_rate(dataclasses.replace(CONFIG, optimizer=o, num_steps=1_000_000))
         for at, expected in ((0, 5e-4), (500_000, 5e-5), (1_000_000, 5e-6)):
@@ -310,27 +301,23 @@ def test_a_gradient_longer_than_the_configs_norm_counts_as_one_of_that_norm():
         close(moments, jax.tree.map(np.asarray, expected))
 
 
-@pytest.mark.parametrize(
-    ("choose", "size", "stride"), [(inference.lattice, 4, 4), (inference.lattice, 3, 3), (inference.crop_square, 10, 1)]
-)
-def test_some_pixels_of_a_batch_are_those_of_picture_opacity_condition_and_rays(choose, size, stride):
-    """`size` is the stride of a lattice and the side of a crop; another key gives another place."""
+@pytest.mark.parametrize("stride", [4, 3])
+def test_a_lattice_of_a_batch_is_that_of_picture_opacity_condition_and_rays(stride):
+    """Another key gives another place."""
 
     @jax.jit
     def made(key):
-        some = choose(key, BATCH, size)
+        some = inference.lattice(key, BATCH, stride)
         return some, cameras.camera_rays(some.camera).directions
 
-    side, places = SIZE // stride if stride > 1 else size, set()
-    whole = jax.jit(cameras.camera_rays)(BATCH.camera).directions
+    places, whole = set(), np.asarray(jax.jit(cameras.camera_rays)(BATCH.camera).directions)
     for seed in range(4):
         some, rays = made(jax.random.key(seed))
-        distance = np.abs(np.asarray(whole[0, 0]) - np.asarray(rays[0, 0, 0, 0])).sum(-1)
+        distance = np.abs(whole[0, 0] - np.asarray(rays[0, 0, 0, 0])).sum(-1)
         row, column = np.unravel_index(distance.argmin(), distance.shape)
         places.add((row, column))
-        kept = np.s_[:, :, row : row + side * stride : stride, column : column + side * stride : stride]
-        assert some.image.shape == (2, 1, side, side, 3)
-        close(rays, np.asarray(whole)[kept], atol=1e-6)
+        kept = np.s_[:, :, row::stride, column::stride]
+        close(rays, whole[kept], atol=1e-6)
         for name in ("image", "alpha", "condition", "condition_mask"):
             np.testing.assert_array_equal(getattr(some, name), np.asarray(getattr(BATCH, name))[kept])
         same_bits(some.cloud, BATCH.cloud)
@@ -347,17 +334,3 @@ def test_runs_under_vmap_are_the_loop_over_runs():
         alone, alone_metrics = step(state, L1_ONLY)  # Adam's first step hides sizes, mu shows them
         expected = alone_metrics, alone.batch_stats, optax.tree.get(alone.generator_optimizer, "mu")
         near(jax.tree.map(lambda x, i=i: x[i], together), expected)
-
-
-@pytest.mark.ci
-@pytest.mark.parametrize("axes", [(0, None), (None, 1), (0, 1)])
-def test_what_is_computed_run_by_run_is_what_vmap_alone_computes(axes):
-    def function(tree, factor):
-        return {"sum": jnp.sum(tree["x"] * factor), "both": (tree["x"] + factor, factor)}
-
-    tree, factor = {"x": numbers(1, 3, 4)}, numbers(2, 4, 3)
-    of_runs = ({"x": tree["x"] if axes[0] == 0 else tree["x"][0]}, factor if axes[1] == 1 else factor[:, 0])
-    mapped = jax.jit(jax.vmap(run_by_run(function), in_axes=axes))
-    near(mapped(*of_runs), jax.vmap(function, in_axes=axes)(*of_runs))
-    twice = jax.vmap(jax.vmap(run_by_run(function), in_axes=(None, 0)), in_axes=(0, None))
-    near(twice(tree, factor.T), jax.vmap(jax.vmap(function, in_axes=(None, 0)), in_axes=(0, None))(tree, factor.T))
