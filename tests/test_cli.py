@@ -127,7 +127,7 @@ import sys
 import jax
 from spnr_jax import cli; from spnr_jax.devices import runtime
 runtime.keep = lambda: print("kept", end=" ")
-cli.run_render = cli.run_evaluate = lambda command: None
+cli.RUN = dict.fromkeys(cli.RUN, lambda command: None)
 for line in sys.argv[1:]:
     jax.config.update("jax_cpu_enable_async_dispatch", True)
     cli.run(cli.parse(line.split()))

@@ -57,54 +57,7 @@ def test_of_work_for_two_threads_the_first_is_done_alone_and_two_meet_at_most():
     assert list(two_at_a_time(int, [])) == []
 
 
-THREADS = 6
 glibc = pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="the C library is not glibc")
-
-
-def measured(test):
-    """A test that measures memory, of glibc alone."""
-    return pytest.mark.ci(glibc(test))
-
-
-CHILD = f"""
-import ctypes, os, sys, threading
-from spnr_jax.devices import runtime
-
-def arenas():
-    libc = ctypes.CDLL("libc.so.6")
-    libc.fopen.restype = ctypes.c_void_p
-    file = ctypes.c_void_p(libc.fopen(sys.argv[2].encode(), b"w"))
-    libc.malloc_info(0, file)
-    libc.fclose(file)
-    return open(sys.argv[2]).read().count("<heap nr=")
-
-def allocate():
-    kept = [bytes(2000) for _ in range(50)]  # too large for Python's own pools
-    meeting.wait()
-
-os.cpu_count = lambda: 2
-if sys.argv[1] == "few":
-    runtime.few_arenas()
-before = arenas()
-meeting = threading.Barrier({THREADS})
-threads = [threading.Thread(target=allocate) for _ in range({THREADS})]
-for thread in threads:
-    thread.start()
-for thread in threads:
-    thread.join()
-print(arenas() - before)
-"""
-
-
-@measured
-@pytest.mark.parametrize(("asked", "more"), [("few", 1), ("none", THREADS)])
-def test_threads_share_as_many_arenas_as_there_are_cores_when_they_are_asked_to(tmp_path, asked, more):
-    done = subprocess.run(
-        [sys.executable, "-c", CHILD, asked, str(tmp_path / "info")], capture_output=True, text=True, check=True
-    )
-    assert int(done.stdout) == more
-
-
 FAULTS = """
 import resource, sys
 from spnr_jax.devices import runtime
@@ -128,7 +81,8 @@ print(min(faults))
 """
 
 
-@measured
+@pytest.mark.ci
+@glibc
 def test_a_step_uses_the_memory_of_the_one_before_when_it_is_kept():
     def faults(asked):
         done = subprocess.run([sys.executable, "-c", FAULTS, asked], capture_output=True, text=True, check=True)
@@ -139,13 +93,16 @@ def test_a_step_uses_the_memory_of_the_one_before_when_it_is_kept():
     assert faults("keep") < fresh / 4
 
 
-def test_freed_memory_goes_back(monkeypatch):
-    kept = []
-    monkeypatch.setattr(
-        ctypes, "CDLL", lambda name: SimpleNamespace(malloc_trim=lambda keep: kept.append((name, keep)))
+def test_the_c_library_is_asked_for_as_many_arenas_as_cores_and_to_give_freed_memory_back(monkeypatch):
+    asked = []
+    glibc = SimpleNamespace(
+        malloc_trim=lambda *of: asked.append(("malloc_trim", *of)), mallopt=lambda *of: asked.append(("mallopt", *of))
     )
+    monkeypatch.setattr(ctypes, "CDLL", lambda name: glibc if name == "libc.so.6" else None)
+    monkeypatch.setattr(os, "cpu_count", lambda: 3)
+    runtime.few_arenas()
     runtime.give_back()
-    assert kept == [("libc.so.6", 0)]
+    assert asked == [("mallopt", runtime.ARENA_MAX, 3), ("malloc_trim", 0)]
 
 
 def test_another_c_library_is_left_alone(monkeypatch):

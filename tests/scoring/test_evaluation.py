@@ -37,7 +37,8 @@ def outcome():
 
 @pytest.fixture(scope="module")
 def results():
-    return list(evaluation.evaluate_objects(methods(), CONFIG, tiny_dataset.dataset(), NAMES))
+    shown, dataset = methods(), tiny_dataset.dataset()
+    return [evaluation.evaluate_object(shown, CONFIG, data_sets.read_object(dataset, name)) for name in NAMES]
 
 
 def test_scores_are_those_of_the_metrics_called_by_hand(results):
@@ -136,7 +137,7 @@ def test_an_empty_split_is_an_error_that_names_it(split, expected, tmp_path):
 def test_an_lpips_that_can_be_measured_is_in_the_scores_of_each_method(monkeypatch):
     monkeypatch.setattr(evaluation, "lpips", lambda image, reference: np.abs(image - reference).mean(axis=(1, 2, 3)))
     asked = {"white": evaluation.floor("white")}
-    (result,) = evaluation.evaluate_objects(asked, CONFIG, tiny_dataset.dataset(), NAMES[:1])
+    result = evaluation.evaluate_object(asked, CONFIG, data_sets.read_object(tiny_dataset.dataset(), NAMES[0]))
     close(result.scores["white"]["lpips"], (1 - result.reference).mean(axis=(1, 2, 3)), rtol=1e-4)
 
 
