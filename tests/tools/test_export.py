@@ -56,18 +56,20 @@ def given():
 
 
 @pytest.fixture(scope="module")
-def encoded():
-    return export.export_encode(tiny_viewer.model(), num_points=POINTS)
+def exported(tmp_path_factory):
+    """The folder that the command writes, the handle, and its volume of the cloud."""
+    folder, handle = tmp_path_factory.mktemp("exported"), spnr_jax.load(tiny_untrained.run())
+    volume = handle.encode(tiny_viewer.cloud())
+    options = {"num_points": POINTS, "resolution": SIZE, "reach": volume.reach}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cli, "set_up_jax", lambda **_: None)  # it would write to the home folder
+        cli.run(cli.Export(run=tiny_untrained.run(), out=folder, **options))
+    return folder, handle, volume
 
 
-@pytest.fixture(scope="module")
-def volume():
-    """That of the handle."""
-    return tiny_viewer.model().encode(tiny_viewer.cloud())
-
-
-def test_the_exported_encode_finds_box_and_features_of_the_handle_and_leaves_the_padding_out(encoded, volume):
-    encode = export.load_exported(encoded)
+def test_the_exported_encode_finds_box_and_features_of_the_handle_and_leaves_the_padding_out(exported):
+    folder, _, volume = exported
+    encode = export.load_exported((folder / "encode.jax").read_bytes())
     made = encode(given())
     close(made["centre"], volume.centre)
     close(made["scale"], volume.scale)
@@ -87,28 +89,21 @@ def test_the_exported_encode_finds_box_and_features_of_the_handle_and_leaves_the
         encode({name: value[:64] for name, value in given().items()})
 
 
-def test_the_command_writes_functions_with_which_a_process_that_knows_jax_alone_draws_the_handles_picture(
-    tmp_path, monkeypatch, capsys
-):
-    monkeypatch.setattr(cli, "set_up_jax", lambda **_: None)  # it would write to the home folder
-    handle = spnr_jax.load(tiny_untrained.run())
-    volume = handle.encode(tiny_viewer.cloud())
-    options = {"num_points": POINTS, "resolution": SIZE, "reach": volume.reach}
-    cli.run(cli.Export(run=tiny_untrained.run(), out=tmp_path, **options))
-    assert str(tmp_path) in capsys.readouterr().out
+def test_what_the_command_writes_draws_the_handles_picture_where_there_is_jax_alone(exported):
+    folder, handle, volume = exported
     names = {"weights.npz", "encode.jax", "encode.stablehlo", "render.jax", "render.stablehlo", "export.json"}
-    assert {path.name for path in tmp_path.iterdir()} == names
-    assert (tmp_path / "encode.stablehlo").read_bytes().startswith(b"ML\xefR"), "MLIR's bytecode"
-    said = json.loads((tmp_path / "export.json").read_text())
+    assert {path.name for path in folder.iterdir()} == names
+    assert (folder / "encode.stablehlo").read_bytes().startswith(b"ML\xefR"), "MLIR's bytecode"
+    said = json.loads((folder / "export.json").read_text())
     scalars, vectors = ({"shape": shape, "dtype": "float32"} for shape in ([POINTS], [POINTS, 3]))
     columns = {"positions": vectors, "base_color": vectors, "roughness": scalars, "metallic": scalars}
     assert said["encode"]["inputs"] == [columns | {"mask": {"shape": [POINTS], "dtype": "bool"}}]
     assert said["encode"]["outputs"] == said["render"]["inputs"][0], "the volume goes from one to the other"
     assert said["render"]["outputs"]["image"]["shape"] == [SIZE, SIZE, 3]
-    assert said["render"] == export.signature((tmp_path / "render.jax").read_bytes())
+    assert said["render"] == export.signature((folder / "render.jax").read_bytes())
     camera = handle.camera(volume, azimuth=50.0, resolution=SIZE)
     picture = handle.render(volume, camera)
-    (drawn,) = pictures_of_a_stranger(tmp_path, cloud_arrays.pad(tiny_viewer.cloud(), POINTS), camera, "none")
+    (drawn,) = pictures_of_a_stranger(folder, cloud_arrays.pad(tiny_viewer.cloud(), POINTS), camera, "none")
     assert np.asarray(picture.image).std() > 0.01, "a picture of nothing would agree with anything"
     close(drawn, arrays(picture, " ".join(drawn)), rtol=1e-5, atol=1e-5)
 
