@@ -279,12 +279,12 @@ def _mesh(ready: Ready, options: Render, path: Path) -> Callable[[], Written]:
 
     resolution = options.grid_resolution or mesh_export.GRID
     solid = mesh_export.mesh_of_volume(ready.model, ready.volume, ready.placed, resolution)
-    return partial(_write_solid, path, solid.content, f" ({mesh_export.describe(solid)})")
 
+    def write() -> Written:
+        images.write_whole(path, solid.content)
+        return Written(f"wrote {path} ({mesh_export.describe(solid)})", (path,))
 
-def _write_solid(path: Path, content: bytes, details: str = "") -> Written:
-    images.write_whole(path, content)
-    return Written(f"wrote {path}{details}", (path,))
+    return write
 
 
 def _splats(ready: Ready, options: Render, path: Path) -> Iterator[Callable[[], Written]]:
