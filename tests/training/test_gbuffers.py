@@ -53,7 +53,7 @@ def test_a_file_is_what_its_seed_object_and_cloud_make_of_it():
 
 
 def test_clouds_have_normals_of_their_file_or_of_all_its_points_or_none():
-    ball = spiral(1500).astype(np.float32)
+    ball = spiral(800).astype(np.float32)
     flat = {name: np.full(len(ball), 0.5, np.float32) for name in ("roughness", "metallic")}
     whole = PointCloud(positions=ball, mask=np.ones(len(ball), bool), base_color=np.abs(ball), normals=ball, **flat)
     clouds = [
@@ -218,10 +218,10 @@ def test_a_clear_pixel_costs_nothing_whatever_colour_lies_under_it(crops, params
 def test_steps_lower_the_loss_on_one_object(crops):
     config = dataclasses.replace(CONFIG, num_steps=100)
     state, losses = optimisation.jitted_create_state(config), []
-    for _ in range(90):
+    for _ in range(60):
         state, metrics = optimisation.jitted_train_step(state, crops, config=config)
         losses.append(float(metrics["loss"]))
-    assert losses[-1] < 0.6 * losses[0]
+    assert losses[-1] < 0.7 * losses[0]
     assert float(loss(state.averaged, crops, config=config)[0]) < losses[0]
 
 
