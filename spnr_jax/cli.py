@@ -97,19 +97,7 @@ def run(command: Command) -> None:
     """Carries a command out."""
     with stop_at_once("spnr"):
         set_up_jax(repeats=not isinstance(command, View) and not (isinstance(command, Render) and command.few))
-    match command:
-        case Train():
-            run_train(command)
-        case Evaluate():
-            run_evaluate(command)
-        case Render():
-            run_render(command)
-        case View():
-            run_view(command)
-        case Export():
-            run_export(command)
-        case Share():
-            run_share(command)
+    RUN[type(command)](command)
 
 
 def set_up_jax(*, repeats: bool = True) -> None:
@@ -146,11 +134,8 @@ def run_train(command: Train) -> None:
         placement.join(*address)
     mesh = placement.device_mesh()
     dataset = data_sets.open_dataset(command.data)
-    schedule = trainer.Schedule(
-        log_every=command.log_every, preview_every=command.preview_every, checkpoint_every=command.checkpoint_every
-    )
     init = None if command.init is None else weights.read_trained(command.init)
-    trainer.train(command.config, dataset, command.run, schedule, mesh, init)
+    trainer.train(command.config, dataset, command.run, command.schedule, mesh, init)
     if placement.leads():
         print(f"trained: {command.run} (score it with `spnr evaluate {command.data} {command.run}`)")
 
@@ -240,6 +225,16 @@ def run_share(command: Share) -> None:
     from spnr_jax.tools.splat_export import share
 
     share(command, _make_note(command.cloud), partial(print, flush=True))
+
+
+RUN: dict[type, Callable] = {
+    Train: run_train,
+    Evaluate: run_evaluate,
+    Render: run_render,
+    View: run_view,
+    Export: run_export,
+    Share: run_share,
+}
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@
     PaperConfig     the paper's network             method/paper_method.py
     SurfelConfig    the network over surfels        method/surfel_method.py
     TrainConfig     a training: one of these, losses, optimiser, batches
+    Schedule        what the training loop does beside training
     RenderOptions   how a render is asked for
 
 Configs are hashable, so they are static arguments of jit.  All numbers are finite and at least 0; a wrong value raises
@@ -143,6 +144,8 @@ class NetworkConfig:
     """Levels of quality at which its pictures differ, the best first."""
     has_discriminator: ClassVar[bool] = False
     """Whether its loss may be adversarial."""
+    crops: ClassVar[bool] = False
+    """Whether it is trained on squares of views."""
     ray_block: ClassVar[int | None] = None
     """Rays rendered at once where no other number is asked for; None: the network's own."""
 
@@ -228,6 +231,7 @@ class SurfelConfig(NetworkConfig):
 
     method: ClassVar[str] = "surfels"
     qualities: ClassVar[tuple[Quality, ...]] = ("best", "balanced", "draft")
+    crops: ClassVar[bool] = True
 
     image_resolution: int = 512
     """Pixels along each side of a picture where no other size is asked for."""
@@ -360,14 +364,26 @@ class TrainConfig:
             f"image_resolution that it divides ({self.model.image_resolution}); use 1",
         )
         require(
-            self.crop == 0 or (self.model.any_size and 1 <= self.crop <= self.model.image_resolution),
-            f"crop {self.crop} needs a network that renders pictures of any size, and at most its image_resolution "
-            f"({self.model.image_resolution}) pixels; use 0",
-        )
-        require(
-            self.crop == 0 or self.pixel_stride == 1, f"pixel_stride {self.pixel_stride} and crop {self.crop}: use one"
+            self.crop == 0 or (self.model.crops and self.crop <= self.model.image_resolution),
+            f"crop {self.crop} needs a network that is trained on squares of its views, and at most its "
+            f"image_resolution ({self.model.image_resolution}) pixels; use 0",
         )
         require(
             self.min_points <= self.max_points,
             f"min_points {self.min_points} must not exceed max_points {self.max_points}",
         )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Schedule:
+    """How often the loop does what is not training, in steps."""
+
+    log_every: int = 20
+    """Steps between rows of metrics.jsonl and TensorBoard."""
+    preview_every: int = 500
+    """Steps between preview images with validation scores."""
+    checkpoint_every: int = 500
+    """Steps between checkpoints."""
+
+    def __post_init__(self) -> None:
+        check(self, positive=("log_every", "preview_every", "checkpoint_every"))

@@ -4,6 +4,7 @@ import _thread
 import contextlib
 import importlib
 import io
+import math
 import os
 import signal
 import sys
@@ -29,12 +30,17 @@ def require(condition: bool, message: str) -> None:
         raise UserError(message)
 
 
-def at_least(options: Any, least: int, *names: str) -> None:
-    """UserError for the first of these options that is given and smaller."""
+def within(options: Any, low: float | int, high: float | int, *names: str) -> None:
+    """UserError for the first of these options that is given and smaller or larger."""
     for name in names:
-        value = getattr(options, name)
-        if value is not None and value < least:
-            raise UserError(f"--{name.replace('_', '-')}: expected {least} or more, got {value}")
+        value, wanted = getattr(options, name), f"{low} or more" if high == math.inf else f"{low} to {high}"
+        if value is not None and not low <= value <= high:
+            raise UserError(f"--{name.replace('_', '-')}: expected {wanted}, got {value}")
+
+
+def at_least(options: Any, least: float | int, *names: str) -> None:
+    """UserError for the first of these options that is given and smaller."""
+    within(options, least, math.inf, *names)
 
 
 def split_debug(arguments: list[str]) -> tuple[list[str], bool]:

@@ -115,13 +115,7 @@ METHODS: dict[str, Method] = {
 }
 
 
-GONE = {
-    "model.encoder.scatter": "mean",
-    "model.encoder.skip": "add",
-    "model.encoder.point_norm": "batch",
-    "trains": "network",
-}
-"""Fields of earlier versions, and the one value of each that is still computed."""
+GONE = "trains"  # a field of earlier versions, which files of weights still hold
 
 
 class UnknownMethod(UserError):
@@ -212,13 +206,7 @@ def to_dict(config: TrainConfig) -> dict:
 def from_dict(values: dict, kind: type = TrainConfig, path: str = "") -> Any:
     """Training from `to_dict`'s form; a field unknown, missing or of another type raises ValueError with its path."""
     kinds = types_of(kind)
-    for name in [name for name in values if f"{path}{name}" in GONE]:
-        kept = GONE[f"{path}{name}"]
-        require(
-            values[name] == kept,
-            f"config field {path}{name} {values[name]!r}: this version knows {kept!r} alone; train the network again",
-        )
-    values = {name: value for name, value in values.items() if f"{path}{name}" not in GONE}
+    values = {name: value for name, value in values.items() if f"{path}{name}" != GONE}
     for name in values:
         require(name in kinds, f"unknown config field {path}{name}; known: {', '.join(kinds)}")
     arguments = {}

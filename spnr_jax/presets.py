@@ -35,14 +35,13 @@ def shapenet_car() -> TrainConfig:
 
 def shapenet_plane() -> TrainConfig:
     """Paper sizes for ShapeNet planes, 200 px.  `spnr train --preset shapenet_plane DATA RUN`; meant for one GPU."""
-    model = PaperConfig(encoder=PAPER, resize_resolution=100, image_resolution=200)
-    return TrainConfig(preset="shapenet_plane", model=model, loss=LossConfig(adversarial_start=0.1))
+    return dataclasses.replace(shapenet_car(), preset="shapenet_plane")
 
 
 def shapenet_chair() -> TrainConfig:
     """Paper sizes for ShapeNet chairs, 200 px, L1 weight 5000.  `spnr train --preset shapenet_chair DATA RUN`."""
-    model = PaperConfig(encoder=PAPER, resize_resolution=100, image_resolution=200)
-    return TrainConfig(preset="shapenet_chair", model=model, loss=LossConfig(l1_weight=5000.0, adversarial_start=0.1))
+    loss = LossConfig(l1_weight=5000.0, adversarial_start=0.1)
+    return dataclasses.replace(shapenet_car(), preset="shapenet_chair", loss=loss)
 
 
 def small() -> TrainConfig:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from support import command_line, tiny_dataset, tiny_untrained
 
-from spnr_jax import errors, presets
+from spnr_jax import presets
 from spnr_jax.formats.cut import Cut
 from spnr_jax.surfels.sides import spiral
 
@@ -39,12 +39,7 @@ def run():
 
 FILES = {
     "empty.ply": b"",
-    "no_points.ply": b"ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nproperty float y\n"
-    b"property float z\nend_header\n",
-    "nan.xyz": b"nan 0 0\nnan 1 1\n",
-    "noise.glb": b"\x00\x01\x02",
     "noise.npz": b"PK\x03\x04 no zip",
-    "words.xyz": b"a cloud\nof words\n",
     "cloud.doc": b"0 0 0\n",
     "point.xyz": b"1 2 3\n",
     "three.xyz": b"1 2 3\n2 2 3\n1 3 3\n",
@@ -58,67 +53,51 @@ REFUSED = [  # command, what its line says
     ("fly", "train, evaluate, render"),
     ("render a.ply --run r --views many", "--views"),
     (f"{TRAIN} --preset tny", "--preset tny: there are abo, "),
-    (f"{TRAIN} --preset=tny", "--preset tny: there are abo, "),
     (f"{TRAIN} --preset", "--preset : there are abo, "),
     (f"{TRAIN} {BASELINES} npbg_tiny --radius 0.2", "--radius"),
     (f"{TRAIN} --volume-resolution 9", "volume_resolution 9 cannot be halved 1 times; use a multiple of 2"),
     ("train missing new", "run `spnr-data generate missing`"),
     ("evaluate missing RUN", "spnr-data generate"),
     ("evaluate UNTESTED RUN", "the test split is empty; score --split train, or generate"),
-    ("evaluate UNTESTED RUN", "--test-objects"),
     ("evaluate DATA .", "not a run folder"),
     ("render three.xyz --run .", "not a run folder"),
     ("render empty.ply --run RUN", "empty.ply: the file is empty"),
-    ("render no_points.ply --run RUN", "0 points"),
-    ("render nan.xyz --run RUN", "NaN"),
-    ("render noise.glb --run RUN", "noise.glb"),
     ("render noise.npz --run RUN", "noise.npz"),
-    ("render words.xyz --run RUN", "words.xyz"),
     ("render cloud.doc --run RUN", "cloud.doc: unknown kind"),
     ("render point.xyz --run RUN", "holds 1 points in 1 place: no object can be drawn"),
     ("render three.xyz --run RUN --out point.xyz", "point.xyz: Not a directory"),
     ("render three.xyz --run RUN --workers 2", "a single file"),
-    ("render . --workers 0", "--workers must be at least 1"),
-    ("render . --workers 2 --cluster tcp://a:1", "without --cluster"),
-    (f"{LIT} --elevation 91", "--elevation must be -90 to 90 degrees, got 91"),
-    (f"{LIT} --grid-resolution 4", "--grid-resolution must be 8 to 512, got 4"),
-    (f"{LIT} --views -1", "--views must not be negative, got -1"),
-    (f"{LIT} --frames 0", "--frames must be at least 1, got 0"),
-    (f"{LIT} --num-points 0", "--num-points must be at least 1, got 0"),
+    ("render . --workers 0", "--workers: expected 1 or more, got 0"),
+    ("render . --workers 2 --cluster tcp://a:1", "--workers and --cluster: give one of them"),
+    (f"{LIT} --elevation 91", "--elevation: expected -90 to 90, got 91"),
+    (f"{LIT} --views -1", "--views: expected 0 or more, got -1"),
+    (f"{LIT} --num-points 0", "--num-points: expected 1 or more, got 0"),
     (f"{LIT} --resolution 18", "--resolution must be a multiple of 4 of at least 16, got 18"),
-    (f"{LIT} --resolution 8", "--resolution must be a multiple of 4 of at least 16, got 8"),
     (f"{LIT} --clean very", "--clean"),
-    ("view a.ply --clean very", "--clean"),
     ("render ball.xyz --crop 7 7 7 8 8 8", "--crop 7 7 7 8 8 8: none of the 2,000 points, they lie in the box"),
     ("render ball.xyz --object 2", "--object 2: there is 1 cluster"),
     ("render ball.xyz --crop 0 1", "--crop"),
     (f"{LIT} --sun 30 95", "--sun: expected an azimuth and an elevation of -90 to 90 degrees"),
-    (f"{LIT} --sun nan 5", "--sun: expected an azimuth"),
     (f"{LIT} --light-yaw inf", "--light-yaw must be a number of degrees"),
-    (f"{LIT} --exposure 21", "--exposure must be -20 to 20 stops"),
+    (f"{LIT} --exposure 21", "--exposure: expected -20 to 20, got 21"),
     (f"{LIT} --light absent.hdr", "absent.hdr: no such file"),
     (f"{LIT} --transparent --background light", "--background light: not together with --transparent"),
     (f"{UNLIT} --light studio", "--light: the network of --run RUN knows the light of its training"),
     (f"{UNLIT} --turn light", "--turn light: the network of --run RUN knows the light"),
     (f"{UNLIT} --exposure 1 --sun 0 9", "--sun, --exposure: the network of --run RUN"),
     ("export ball.xyz --splats out.obj", "out.obj"),
-    ("export ball.xyz --splats out.glb", ".ply or .spz"),
-    ("export ball.xyz --splats .", "splats"),
     ("export ball.xyz --splats out.ply --most-splats 300001", "--most-splats"),
     ("export ball.xyz --light studio", "--splats"),
-    ("export ball.xyz --mesh out.obj", "out.obj"),
     ("export ball.xyz --mesh out.glb --sun 40 30", "--splats"),
     ("export ball.xyz --mesh out.glb --splats out.ply", "one at a time"),
     ("export ball.xyz --up z", "--mesh"),
-    ("export nowhere.ply --mesh out.glb", "nowhere.ply"),
     ("export ball.xyz --mesh ball.xyz/out.glb", "a file, not a folder"),
     ("export nowhere.ply --splats out.ply", "nowhere.ply"),
-    ("export ball.xyz --splats ball.xyz/out.ply", "a file, not a folder"),
     ("share ball.xyz --out ball.xyz/page.html", "a file, not a folder"),
     ("share ball.xyz --out page.pdf", "page.pdf"),
     ("share ball.xyz --background light", "--background"),
     ("share ball.xyz --fitting-views 1", "--fitting-views"),
-    *((f"view a.ply --reached-at {place}", "--reached-at") for place in ("http://a.b", "a.b/c", "''", "a:b", "u@a")),
+    *((f"view a.ply --reached-at {place}", "--reached-at") for place in ("http://a.b", "''", "u@a")),
 ]
 
 
@@ -148,7 +127,7 @@ import sys
 import jax
 from spnr_jax import cli; from spnr_jax.devices import runtime
 runtime.keep = lambda: print("kept", end=" ")
-cli.run_render = cli.run_evaluate = lambda command: None
+cli.RUN = dict.fromkeys(cli.RUN, lambda command: None)
 for line in sys.argv[1:]:
     jax.config.update("jax_cpu_enable_async_dispatch", True)
     cli.run(cli.parse(line.split()))
@@ -184,11 +163,10 @@ def test_the_preset_chooses_the_network_whose_options_there_are():
 
 @pytest.mark.parametrize("command", ["render", "view"])
 def test_scans_are_cleaned_and_cut_as_it_is_said(command):
-    assert cli.parse([command, "a.ply"]).clean == "auto"
-    assert cli.parse([command, "a.ply", "--clean", "strong"]).clean == "strong"
-    cut = cli.parse([command, "a.ply", "--crop", "-1", "-1e-3", "-.5", "1", "2", "3", "--object", "largest"]).cut
-    assert cut == Cut(crop=(-1.0, -1e-3, -0.5, 1.0, 2.0, 3.0), object="largest")
-    assert cli.parse([command, "a.ply", "--remove-plane"]).cut == Cut(remove_plane=True)
+    said = ["--crop", "-1", "-1e-3", "-.5", "1", "2", "3", "--object", "largest", "--clean", "strong"]
+    parsed = cli.parse([command, "a.ply", *said])
+    assert parsed.cut == Cut(crop=(-1.0, -1e-3, -0.5, 1.0, 2.0, 3.0), object="largest")
+    assert parsed.clean == "strong"
 
 
 def test_help_explains_the_fields_of_a_config_and_loads_nothing_heavy():
@@ -285,21 +263,14 @@ def test_an_error_shows_its_call_stack_for_debug_alone_and_its_line_in_any_case(
         assert said[-1].startswith("spnr: absent.ply")
 
 
-@pytest.mark.parametrize("command", ["spnr_jax.cli train --help", "data_gen generate --help"])
-def test_output_that_nothing_reads_is_one_line_and_no_call_stack(command):
+def test_output_that_nothing_reads_is_one_line_and_no_call_stack():
     read, write = os.pipe()
     os.close(read)
     try:
-        program = [sys.executable, "-m", *command.split()]
+        program = [sys.executable, "-m", "spnr_jax.cli", "train", "--help"]
         ended = subprocess.run(program, stdout=write, stderr=subprocess.PIPE, text=True, check=False)
     finally:
         os.close(write)
     assert ended.returncode == 2
     assert ended.stderr.endswith("stopped, as what read the output was closed\n")
     assert len(ended.stderr.splitlines()) == 1
-
-
-def test_errors_of_many_lines_become_one():
-    assert errors.one_line(ValueError("this\n  and\nthat")) == "this and that"
-    assert errors.one_line(OSError(28, "No space left on device")) == "disk: No space left on device"
-    assert errors.one_line(OSError(13, "Permission denied", "a/b")) == "a/b: Permission denied"

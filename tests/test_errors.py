@@ -46,6 +46,12 @@ def test_a_bug_in_a_reader_of_meshes_is_not_called_a_broken_file(tmp_path, monke
         meshes.load_mesh(tmp_path / "a.glb")
 
 
+def test_errors_of_many_lines_become_one():
+    assert errors.one_line(ValueError("this\n  and\nthat")) == "this and that"
+    assert errors.one_line(OSError(28, "No space left on device")) == "disk: No space left on device"
+    assert errors.one_line(OSError(13, "Permission denied", "a/b")) == "a/b: Permission denied"
+
+
 def test_debug_is_an_option_at_any_place_or_a_variable(monkeypatch):
     monkeypatch.delenv("SPNR_DEBUG", raising=False)
     assert errors.split_debug(["render", "a.ply"]) == (["render", "a.ply"], False)

@@ -21,11 +21,6 @@ def test_a_kernel_that_wants_one_more_edge_than_bins_says_so():
         sampling.importance(None, jnp.linspace(0.0, 1.0, 5), jnp.ones(5), 8)
 
 
-def test_the_type_of_the_elements_is_checked():
-    with pytest.raises(TypeCheckError, match="density"):
-        compositing.volume_weights(jnp.ones(4, jnp.int32), jnp.ones(4))
-
-
 def test_the_fields_and_calls_of_linen_modules_are_checked():
     with pytest.raises(TypeCheckError, match="num_groups"):
         GroupNorm("8")

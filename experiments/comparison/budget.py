@@ -24,7 +24,7 @@ from spnr_jax.config import TrainConfig
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
 from spnr_jax.presets import PRESETS
-from spnr_jax.training import batching, checkpoint, optimisation, run_record, trainer
+from spnr_jax.training import batching, checkpoint, optimisation, trainer
 
 Budget = Literal["quick", "tiny", "paper"]
 NETWORKS = ("paper", "npbg", "point_nerf", "points2nerf")
@@ -123,7 +123,7 @@ def train(config: TrainConfig, dataset: data_sets.Dataset, run: Path) -> Trained
 def training_seconds(run: Path) -> float:
     """Seconds that a run's steps took over all calls, from its log: not compilation, previews and saving."""
     seconds, before = 0.0, 0
-    for row in run_record.read_rows(run):
+    for row in trainer.read_rows(run):
         if "ms_per_step" in row:
             seconds += (row["step"] - before) * row["ms_per_step"] / 1000
             before = row["step"]

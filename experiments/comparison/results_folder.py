@@ -19,12 +19,12 @@ from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets, images
 from spnr_jax.formats.npz import pack_arrays
 from spnr_jax.scoring.report import Cell, Table
-from spnr_jax.training import run_record
+from spnr_jax.training import trainer
 
 
 def claim(folder: Path, what: str, asked: Mapping, dataset: data_sets.Dataset | None = None) -> None:
     """Makes a folder that of a request (on a data set); ValueError if it is another's."""
-    asked = {"of": what, **asked} | ({} if dataset is None else {"data": run_record.checksum(dataset)})
+    asked = {"of": what, **asked} | ({} if dataset is None else {"data": trainer.checksum(dataset)})
     path = folder / "asked.json"
     if path.is_file():
         there = json.loads(path.read_text())

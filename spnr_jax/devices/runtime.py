@@ -1,4 +1,4 @@
-"""What a process asks of its machine: memory that stays, compiled programs on the disk; and what the machine is.
+"""What a process asks of its machine: threads, memory that stays, compiled programs on the disk; what the machine is.
 
 glibc's allocator is asked for speed and so that memory does not grow; other C libraries are left alone.  Nothing here
 imports JAX before it is called: `keep_programs` comes before that.
@@ -9,8 +9,41 @@ import ctypes
 import os
 import platform
 import time
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
+from itertools import islice
 from pathlib import Path
+from typing import TypeVar
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+
+def run_ahead(jobs: Iterable[Callable[[], Result]], threads: int = 1, most: int = 1) -> Iterator[Result]:
+    """Results of the jobs in their order; threads do `most` of them ahead, while others are made or used here.
+
+    What is raised by a job, or while one is made, is raised here; jobs that have not begun are dropped then.
+    """
+    pool, waiting = ThreadPoolExecutor(threads), deque[Future]()
+    try:
+        for job in jobs:
+            waiting.append(pool.submit(job))
+            if len(waiting) > most:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def two_at_a_time(work: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
+    """Results of the work on each item, in their order; the first is computed alone: what it compiles serves others."""
+    jobs = (partial(work, item) for item in items)
+    yield from (job() for job in islice(jobs, 1))
+    yield from run_ahead(jobs, threads=2)
+
 
 TRIM_THRESHOLD, MMAP_MAX, ARENA_MAX = -1, -4, -8  # M_... of malloc.h
 

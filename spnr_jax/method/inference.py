@@ -25,7 +25,6 @@ from spnr_jax.kernels import cameras, cloud_arrays, losses
 from spnr_jax.kernels.imaging import average
 from spnr_jax.kernels.metrics import psnr
 from spnr_jax.kernels.records import Batch, Camera, Key, Light, PointCloud, Rendering, Volume
-from spnr_jax.method import pixels
 from spnr_jax.methods import Outcome, network
 
 
@@ -77,8 +76,9 @@ def loss(
     variables: dict, batch: Batch, key: Key | None = None, *, config: TrainConfig
 ) -> tuple[Float[Array, ""], Outcome]:
     """(loss, outcome): errors of the pixels that a step renders, and the losses of the network's own."""
-    if key is not None:
-        key, batch = pixels.choose_pixels(key, batch, config)
+    if key is not None and config.pixel_stride > 1:
+        key, lattice_key = jax.random.split(key)
+        batch = lattice(lattice_key, batch, config.pixel_stride)
     rendering, updated = network(config.model).apply(
         variables, batch.cloud, batch.camera, key, train=True, mutable=["batch_stats", "losses"]
     )
@@ -88,9 +88,54 @@ def loss(
         terms["opacity"] = config.loss.opacity_weight * losses.mse(rendering.acc, opacity)
     seen = rendering.acc > 0 if config.loss.masked else None
     reference = jnp.asarray(batch.image)
-    value = pixels.reconstruction_loss(config, rendering.image, rendering.image_lr, reference, seen)
+    value = reconstruction_loss(config, rendering.image, rendering.image_lr, reference, seen)
     metrics = {"psnr": jnp.mean(psnr(rendering.image, reference)), "l1": losses.l1(rendering.image, reference)}
     return sum(terms.values(), value), Outcome(metrics | terms, updated.get("batch_stats", {}), rendering.image, batch)
+
+
+def lattice(key: Key, batch: Batch, stride: int) -> Batch:
+    """The batch with every `stride`-th row and column of its views, from a random first one on: images still."""
+    first = jax.random.randint(key, (2,), 0, stride)
+
+    def thinned(x):
+        for axis, start in zip((2, 3), first, strict=True):
+            x = x.reshape(*x.shape[:axis], x.shape[axis] // stride, stride, *x.shape[axis + 1 :])
+            x = jax.lax.dynamic_index_in_dim(x, start, axis + 1, keepdims=False)
+        return x
+
+    # pixel i of the lattice has its centre at first + stride * i + 0.5 of the view
+    shift = 0.5 - (first[::-1] + 0.5) / stride
+    zoom = jnp.diag(jnp.array([1 / stride, 1 / stride, 1.0])).at[:2, 2].set(shift)
+    intrinsics = jnp.einsum("ij,...jk->...ik", zoom, batch.camera.intrinsics, precision="highest")
+    images = (batch.image, batch.alpha, batch.condition, batch.condition_mask)
+    image, alpha, condition, mask = (thinned(jnp.asarray(x)) for x in images)
+    pose, (height, width) = batch.camera.cam_to_world, image.shape[2:4]
+    camera = Camera(cam_to_world=pose, intrinsics=intrinsics, height=height, width=width)
+    return Batch(cloud=batch.cloud, camera=camera, image=image, alpha=alpha, condition=condition, condition_mask=mask)
+
+
+def pixel_error(config: TrainConfig, image: Array, reference: Array, seen: Array | None = None) -> Float[Array, ""]:
+    """Mean error of all pixels, or of those that are `seen` (0 if there are none)."""
+    if seen is None:
+        return {"l1": losses.l1, "mse": losses.mse}[config.loss.pixel](image, reference)
+    error = {"l1": jnp.abs, "mse": jnp.square}[config.loss.pixel](image - reference)
+    return jnp.sum(jnp.where(seen[..., None], error, 0)) / jnp.maximum(3 * jnp.sum(seen), 1)
+
+
+def reconstruction_loss(
+    config: TrainConfig,
+    image: Float[Array, "*batch"],
+    image_lr: Float[Array, "*batch_lr"],
+    reference: Array,
+    seen: Array | None = None,
+) -> Float[Array, ""]:
+    """Weighted errors of the image, and of a smaller volume rendering against the reference averaged to its size."""
+    error = pixel_error(config, image, reference, seen)
+    if config.model.upsamples:
+        low = losses.area_downsample(reference, image_lr.shape[-2])
+        error = error + config.loss.low_resolution_weight * pixel_error(config, image_lr, low)
+    error = config.loss.l1_weight * error
+    return error + config.loss.mse_weight * losses.mse(image, reference) if config.loss.mse_weight else error
 
 
 # --- pictures ---------------------------------------------------------------------------------------------------------

@@ -15,8 +15,7 @@ import numpy as np
 from jaxtyping import Array, Int
 
 from spnr_jax.config import SurfelConfig
-from spnr_jax.devices.runtime import QUICK, QUICKEST
-from spnr_jax.devices.side_by_side import two_at_a_time
+from spnr_jax.devices.runtime import QUICK, QUICKEST, two_at_a_time
 from spnr_jax.devices.traces import Kept
 from spnr_jax.kernels import cameras, cloud_arrays
 from spnr_jax.kernels.imaging import enlarge

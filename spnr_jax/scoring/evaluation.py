@@ -6,7 +6,7 @@ spacing with the best PSNR.
 """
 
 import dataclasses
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -26,7 +26,7 @@ from spnr_jax.method.model import render_views
 from spnr_jax.scoring import floors
 from spnr_jax.scoring.picture_scores import flip, lpips
 from spnr_jax.scoring.summary import Scores, differences, metric_settings, summarise
-from spnr_jax.training.run_record import trained_on
+from spnr_jax.training.trainer import trained_on
 from spnr_jax.training.weights import Trained, place, read_trained
 
 RADIUS_FACTORS = (0.5, 0.75, 1.0, 1.5, 2.0)
@@ -124,17 +124,6 @@ def floor(name: str, factor: float = 1.0) -> Method:
     return show
 
 
-def evaluate_objects(
-    methods: dict[str, Method],
-    config: TrainConfig,
-    dataset: data_sets.Dataset,
-    names: tuple[str, ...],
-) -> Iterator[ObjectResult]:
-    """Pictures and scores of each object of a data set; points and image size are the config's."""
-    for name in names:
-        yield evaluate_object(methods, config, data_sets.read_object(dataset, name))
-
-
 def evaluate_object(methods: dict[str, Method], config: TrainConfig, item: data_sets.ObjectData) -> ObjectResult:
     """Pictures and scores of one object."""
     data_sets.check_renders(item, config)
@@ -199,9 +188,10 @@ def score_methods(
     scores: dict[str, dict[str, Scores]] = {}
     gallery = []
     shown = spread(names, gallery_objects)
-    for i, result in enumerate(evaluate_objects(methods, config, dataset, names)):
-        scores[result.name] = result.scores
-        if result.name in shown:
+    for i, name in enumerate(names):
+        result = evaluate_object(methods, config, data_sets.read_object(dataset, name))
+        scores[name] = result.scores
+        if name in shown:
             gallery.append(result)
         if (i + 1) % 8 == 0 or i + 1 == len(names):
             say(f"evaluated {i + 1} of {len(names)} objects")
@@ -261,8 +251,9 @@ def compare(
             "metrics": metric_settings(),
         },
     }
-    classes = classes_of(scores)
-    per_category = {category: summarise([scores[name] for name in classes[category]]) for category in sorted(classes)}
+    per_category = {
+        category: summarise([scores[name] for name in members]) for category, members in classes_of(scores).items()
+    }
     return Evaluation(config=config, summary=summary, per_category=per_category, gallery=gallery)
 
 
@@ -278,7 +269,7 @@ def classes_of(names: Iterable[str]) -> dict[str, list[str]]:
     classes: dict[str, list[str]] = {}
     for name in sorted(names):
         classes.setdefault(category_of(name), []).append(name)
-    return classes
+    return dict(sorted(classes.items()))
 
 
 def category_of(name: str) -> str:

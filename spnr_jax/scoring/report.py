@@ -194,14 +194,12 @@ def write_report(path: Path, settings: Mapping, metrics: Mapping, gallery: Seque
     page = template(Path(__file__).with_name("report.html")).render(
         title=f"Sparse-point neural rendering: {describe_split(metrics)}",
         summary=_summary(metrics),
-        tiles=_key_numbers(metrics),
         gallery_heading=describe_split(metrics),
         gallery_note=GALLERY_NOTE,
         heads=["Reference", *(label(method) for method in shown), "Depth", "Opacity"],
         gallery=[(row.name, _pictures(row)) for row in gallery],
         tables=tables,
-        facts=_run_facts(metrics),
-        settings=flatten(settings),
+        facts=_run_facts(metrics) | flatten(settings),
     )
     write_whole(path, f"{page}\n".encode())
 
@@ -283,22 +281,6 @@ def duration(seconds: float | int) -> str:
         return f"{seconds:.1f} s"
     whole = round(seconds)
     return f"{whole // 60} min {whole % 60} s" if whole < 3600 else f"{whole // 3600} h {whole % 3600 // 60} min"
-
-
-def _key_numbers(metrics: Mapping) -> list[tuple[str, str]]:
-    """The numbers that a reader looks for first, as tiles."""
-    methods, seconds = metrics["methods"], metrics.get("seconds", {})
-    psnr = next(iter(methods.values()))["psnr"]
-    tiles = [(f"PSNR on {describe_split(metrics)}", f"{psnr:.1f} dB")]
-    for name, words in (
-        ("paper", "over the paper's network"),
-        ("white", "over the white image"),
-        ("splat", "over the splat"),
-        ("nearest", "over nearest point"),
-    ):
-        if name in list(methods)[1:]:
-            tiles.append((words, f"{psnr - methods[name]['psnr']:+.1f} dB"))
-    return tiles + [(f"to {stage}", duration(seconds[stage])) for stage in ("train", "train paper") if stage in seconds]
 
 
 def _pictures(row: GalleryRow) -> list[tuple[str, str]]:

@@ -22,7 +22,7 @@ from urllib.parse import quote
 from tqdm import tqdm
 
 from spnr_jax.devices import runtime
-from spnr_jax.devices.side_by_side import beside
+from spnr_jax.devices.runtime import run_ahead
 from spnr_jax.errors import UserError, one_line
 from spnr_jax.formats.images import write_whole
 from spnr_jax.formats.pages import template
@@ -176,7 +176,7 @@ def draw_item(batch: Batch, item: Item) -> str | None:
     try:
         ready = prepare_cloud(options, notes.append, loaded)
         written = [
-            path.name for one in beside(draw_all(ready, options, folder / item.cloud.stem)) for path in one.paths
+            path.name for one in run_ahead(draw_all(ready, options, folder / item.cloud.stem)) for path in one.paths
         ]
     except ValueError as error:
         return one_line(error)

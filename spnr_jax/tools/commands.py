@@ -10,8 +10,8 @@ from typing import Any, Literal
 import tyro
 
 from spnr_jax import presets
-from spnr_jax.config import TrainConfig
-from spnr_jax.errors import UserError
+from spnr_jax.config import Schedule, TrainConfig
+from spnr_jax.errors import UserError, at_least, require, within
 from spnr_jax.formats.cut import Cut
 
 MOST_STOPS = 20
@@ -41,12 +41,10 @@ class Lighting:
 
     def __post_init__(self) -> None:
         """ValueError names the option that makes no sense."""
-        if not math.isfinite(self.light_yaw):
-            raise UserError(f"--light-yaw must be a number of degrees, got {self.light_yaw}")
+        require(math.isfinite(self.light_yaw), f"--light-yaw must be a number of degrees, got {self.light_yaw}")
         if self.sun and not (math.isfinite(self.sun[0]) and -90 <= self.sun[1] <= 90):
             raise UserError(f"--sun: expected an azimuth and an elevation of -90 to 90 degrees, got {self.sun}")
-        if not abs(self.exposure) <= MOST_STOPS:
-            raise UserError(f"--exposure must be -{MOST_STOPS} to {MOST_STOPS} stops, got {self.exposure:g}")
+        within(self, -MOST_STOPS, MOST_STOPS, "exposure")
 
 
 MOST_SPLATS = 300_000  # that a file or page is asked for: more than viewers on telephones draw
@@ -70,14 +68,29 @@ class SplatMaking:
 
     def __post_init__(self) -> None:
         """ValueError names the option that makes no sense."""
-        if not 1 <= self.most_splats <= MOST_SPLATS:
-            raise UserError(f"--most-splats must be 1 to {MOST_SPLATS:,}, got {self.most_splats:,}")
-        if self.fitting_views < 4:
-            raise UserError(f"--fitting-views must be at least 4, got {self.fitting_views}")
+        within(self, 1, MOST_SPLATS, "most_splats")
+        at_least(self, 4, "fitting_views")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Share:
+class Reading:
+    """How a file of points or a mesh is read."""
+
+    num_points: int = 16384
+    """Points kept of a larger cloud, evenly spread, or sampled from a mesh; fewer work too."""
+    up: Literal["auto", "x", "y", "z", "-x", "-y", "-z"] = "auto"
+    """The file's upward axis; auto: by the format, else y or z, whichever lets the object stand."""
+    clean: Literal["auto", "off", "strong"] = "auto"
+    """Remove outliers and average noisy points before thinning; clean clouds and meshes are unchanged.  strong: at
+    smaller deviations."""
+
+    def __post_init__(self) -> None:
+        """ValueError names the option that makes no sense."""
+        at_least(self, 1, "num_points")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Share(Reading):
     """Write one .html file that shows a cloud's object in any browser: Gaussian splats to turn, a poster, a title."""
 
     cloud: tyro.conf.Positional[Path]
@@ -94,12 +107,6 @@ class Share:
     """Light baked into the splats."""
     making: tyro.conf.OmitArgPrefixes[SplatMaking] = field(default_factory=SplatMaking)
     """How the splats are made."""
-    num_points: int = 16384
-    """Points kept of a larger cloud, evenly spread, or sampled from a mesh."""
-    up: Literal["auto", "x", "y", "z", "-x", "-y", "-z"] = "auto"
-    """The file's upward axis; auto looks for it, and says what it found."""
-    clean: Literal["auto", "off", "strong"] = "auto"
-    """As for `spnr render`."""
     azimuth: float = 30.0
     """Azimuth, in degrees, of the page's first view."""
     elevation: float = 20.0
@@ -107,14 +114,12 @@ class Share:
 
     def __post_init__(self) -> None:
         """ValueError names the option that makes no sense."""
+        super().__post_init__()
         if self.out.suffix.lower() not in (".html", ".htm") or self.out.is_dir():
             raise UserError(f"--out {self.out}: expected the name of an .html file")
-        if self.num_points < 1:
-            raise UserError(f"--num-points must be at least 1, got {self.num_points}")
-        if not -89 <= self.elevation <= 89:
-            raise UserError(f"--elevation must be -89 to 89 degrees, got {self.elevation:g}")
-        if self.lighting.background != "white":
-            raise UserError("--background light: a page shows its object on white; leave it out")
+        within(self, -89, 89, "elevation")
+        at_white = self.lighting.background == "white"
+        require(at_white, "--background light: a page shows its object on white; leave it out")
 
 
 Output = Literal["image", "depth", "opacity"]
@@ -127,7 +132,7 @@ def is_catalogue(cloud: Path) -> bool:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Render:
+class Render(Reading):
     """Render a point cloud or mesh file: views as .png, a turntable, depth, opacity, a mesh, splats.
     For a folder, or a pattern in quotation marks, every file is rendered, and a page shows them all."""
 
@@ -143,13 +148,6 @@ class Render:
     cluster: str | None = None
     """Address of a Dask scheduler whose workers render instead.  They must find the files and OUT under the same
     names."""
-    up: Literal["auto", "x", "y", "z", "-x", "-y", "-z"] = "auto"
-    """The file's upward axis; auto: by the format, else y or z, whichever lets the object stand."""
-    num_points: int = 16384
-    """Points kept of a larger cloud, evenly spread, or sampled from a mesh; fewer work too."""
-    clean: Literal["auto", "off", "strong"] = "auto"
-    """Remove outliers and average noisy points before thinning; clean clouds and meshes are unchanged.  strong: at
-    smaller deviations."""
     cut: tyro.conf.OmitArgPrefixes[Cut] = Cut()
     """Select one object of a scene before cleaning."""
     transparent_parts: Literal["opaque", "skip"] = "opaque"
@@ -203,21 +201,16 @@ class Render:
 
     def __post_init__(self) -> None:
         """ValueError names the option that makes no sense."""
-        if self.views < 0:
-            raise UserError(f"--views must not be negative, got {self.views}")
-        for name in ("frames", "num_points", "fps"):
-            if getattr(self, name) < 1:
-                raise UserError(f"--{name.replace('_', '-')} must be at least 1, got {getattr(self, name)}")
-        if self.workers is not None and (self.workers < 1 or self.cluster is not None):
-            raise UserError(f"--workers must be at least 1, and without --cluster, got {self.workers}")
+        super().__post_init__()
+        at_least(self, 0, "views")
+        at_least(self, 1, "frames", "fps", "workers")
+        within(self, -90, 90, "elevation")
+        within(self, 8, 512, "grid_resolution")
+        require(None in (self.workers, self.cluster), "--workers and --cluster: give one of them")
         if self.resolution is not None and (self.resolution < 16 or self.resolution % 4):
             raise UserError(f"--resolution must be a multiple of 4 of at least 16, got {self.resolution}")
-        if not -90 <= self.elevation <= 90:
-            raise UserError(f"--elevation must be -90 to 90 degrees, got {self.elevation:g}")
         if self.transparent and self.lighting.background != "white":
             raise UserError("--background light: not together with --transparent; give one of them")
-        if self.grid_resolution is not None and not 8 <= self.grid_resolution <= 512:
-            raise UserError(f"--grid-resolution must be 8 to 512, got {self.grid_resolution}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -233,12 +226,8 @@ class Train:
     init: str | None = None
     """Initial weights of a new run: a run folder, a weights file, or `surfels`, the package's network (default:
     random)."""
-    log_every: int = 20
-    """Steps between rows of metrics.jsonl and TensorBoard."""
-    preview_every: int = 500
-    """Steps between preview images with validation scores."""
-    checkpoint_every: int = 500
-    """Steps between checkpoints."""
+    schedule: tyro.conf.OmitArgPrefixes[Schedule] = Schedule()
+    """What the run writes beside its weights."""
     distributed: bool = False
     """This is one of several processes that a launcher started (SLURM, Open MPI, Kubernetes) and that train
     together."""
@@ -304,10 +293,8 @@ class Export:
 
     def __post_init__(self) -> None:
         """ValueError names the option that makes no sense."""
-        if self.num_points is not None and self.num_points < 1:
-            raise ValueError(f"--num-points must be at least 1, got {self.num_points}")
-        if self.splats is not None and self.mesh is not None:
-            raise ValueError("--splats and --mesh are written one at a time")
+        at_least(self, 1, "num_points")
+        require(None in (self.splats, self.mesh), "--splats and --mesh are written one at a time")
         given = ["light"] if self.lighting.is_given else []
         given += ["most-splats"] if self.making != SplatMaking() else []
         if self.splats is None and given:
@@ -315,12 +302,12 @@ class Export:
         given = [name for name in ("network", "up", "clean") if getattr(self, name) != getattr(type(self), name)]
         if self.splats is None and self.mesh is None and given:
             raise ValueError(f"--{given[0]} is for --splats FILE or --mesh FILE, which is not given")
-        if self.lighting.background != "white":
-            raise ValueError("--background light: splats have no background; leave it out")
+        at_white = self.lighting.background == "white"
+        require(at_white, "--background light: splats have no background; leave it out")
 
 
 @dataclass(frozen=True, kw_only=True)
-class View:
+class View(Reading):
     """View the network's picture of a point cloud or mesh file in the browser: turn it, light it, save it."""
 
     cloud: tyro.conf.Positional[Path]
@@ -335,17 +322,11 @@ class View:
     """Port to listen on; 0 takes any free one."""
     reached_at: str | None = None
     """HOST or HOST:PORT by which browsers reach the viewer, if a proxy before it uses another name."""
-    num_points: int = 16384
-    """Points kept of a larger cloud, or sampled from a mesh; fewer work too."""
-    clean: Literal["auto", "off", "strong"] = "auto"
-    """Remove outliers and average noisy points before thinning; clean clouds and meshes are unchanged.  strong: at
-    smaller deviations."""
     cut: tyro.conf.OmitArgPrefixes[Cut] = Cut()
     """Object of a scene to show first; files that are dropped on the page are shown whole."""
-    up: Literal["auto", "x", "y", "z", "-x", "-y", "-z"] = "auto"
-    """The file's upward axis; auto looks for it, and says what it found."""
 
     def __post_init__(self) -> None:
         """ValueError names the option that makes no sense."""
+        super().__post_init__()
         if self.reached_at is not None and not re.fullmatch(r"([\w.-]+|\[[\da-fA-F:.]+\])(:\d+)?", self.reached_at):
             raise ValueError(f"--reached-at {self.reached_at}: expected HOST or HOST:PORT, without http:// and path")

@@ -30,7 +30,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from PIL import Image
 
-from spnr_jax.devices.side_by_side import beside
+from spnr_jax.devices.runtime import run_ahead
 from spnr_jax.errors import UserError
 from spnr_jax.formats import clouds, images
 from spnr_jax.formats.clouds import PlacedCloud
@@ -118,7 +118,7 @@ def render_file(options: Render, note: Callable[[str], None]) -> Iterator[str]:
     load_network(options, loaded)  # a run that is none is said before the cloud is read
     ready = prepare_cloud(options, note, loaded)
     yield f"encoded {len(ready.placed.cloud.positions)} points of {options.cloud}"
-    for written in beside(draw_all(ready, options, options.out / options.cloud.stem)):
+    for written in run_ahead(draw_all(ready, options, options.out / options.cloud.stem)):
         if written.line:
             yield written.line
 
@@ -281,12 +281,12 @@ def _mesh(ready: Ready, options: Render, path: Path) -> Callable[[], Written]:
 
     resolution = options.grid_resolution or mesh_export.GRID
     solid = mesh_export.mesh_of_volume(ready.model, ready.volume, ready.placed, resolution)
-    return partial(_write_solid, path, solid.content, f" ({mesh_export.describe(solid)})")
 
+    def write() -> Written:
+        images.write_whole(path, solid.content)
+        return Written(f"wrote {path} ({mesh_export.describe(solid)})", (path,))
 
-def _write_solid(path: Path, content: bytes, details: str = "") -> Written:
-    images.write_whole(path, content)
-    return Written(f"wrote {path}{details}", (path,))
+    return write
 
 
 def _splats(ready: Ready, options: Render, path: Path) -> Iterator[Callable[[], Written]]:

@@ -7,9 +7,7 @@ whatever was read ahead.
 import dataclasses
 import functools
 import threading
-from collections import deque
 from collections.abc import Callable, Generator
-from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +15,7 @@ import jax
 import numpy as np
 
 from spnr_jax.config import TrainConfig
+from spnr_jax.devices.runtime import run_ahead
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.data_sets import Dataset, ObjectData, has_lights, on_white
@@ -53,12 +52,11 @@ def make_batch(objects: list[ObjectData], config: TrainConfig, step: int, place:
         count = round(2 ** generator.uniform(low, high))
         cloud = dataclasses.replace(item.cloud, normals=None)  # networks of whole views estimate them, if they need any
         clouds_of.append(choose_points(cloud, count, config.max_points, generator, config.even_share))
-        views_of.append(generator.permutation(len(item.images))[: config.views_per_object])
-    images = np.stack([item.images[v] for item, v in zip(objects, views_of, strict=True)])
-    conditions = np.stack([item.conditions[v] for item, v in zip(objects, views_of, strict=True)])
+        chosen = generator.permutation(len(item.images))[: config.views_per_object]
+        camera = item.camera.cam_to_world, item.camera.intrinsics
+        views_of.append([values[chosen] for values in (item.images, item.conditions, *camera)])
+    images, conditions, poses, intrinsics = map(np.stack, zip(*views_of, strict=True))
     mask = conditions[..., 3] > 0
-    poses = np.stack([item.camera.cam_to_world[v] for item, v in zip(objects, views_of, strict=True)])
-    intrinsics = np.stack([item.camera.intrinsics[v] for item, v in zip(objects, views_of, strict=True)])
     first = objects[0].camera
     return Batch(
         cloud=jax.tree.map(lambda *columns: np.stack(columns), *clouds_of),
@@ -109,28 +107,24 @@ def batches(
     names = dataset.splits["train"]
     if not names:
         raise UserError(f"{dataset.folder}: the train split is empty; generate more objects")
-    check_spread(dataset, config)
+    if config.even_share and dataset.spread != "even":
+        raise UserError(
+            f"{dataset.folder}: its points are drawn at random, even_share is {config.even_share}; generate with "
+            "--spread even, or use even_share 0"
+        )
     read, own = cached_reader(dataset, config, cache_bytes), own or range(config.batch_objects)
 
     def assemble(step: int) -> Batch:
         chosen = object_names(names, config, step)[own.start : own.stop]
         return make_batch([read(name) for name in chosen], config, step, own.start)
 
-    yield from read_ahead(assemble, first_step, config.num_steps)
+    yield from read_ahead(assemble, first_step, config)
 
 
-def read_ahead(assemble: Callable[[int], Any], first_step: int, num_steps: int) -> Generator[Any, None, None]:
+def read_ahead(assemble: Callable[[int], Any], first_step: int, config: TrainConfig) -> Generator[Any, None, None]:
     """What `assemble` makes of each step, some steps ahead in threads, which end with this generator."""
-    threads, ahead = ThreadPoolExecutor(READERS), deque[Future]()
-    try:
-        for step in range(first_step, num_steps):
-            ahead.append(threads.submit(assemble, step))
-            if len(ahead) > READ_AHEAD:
-                yield ahead.popleft().result()
-        while ahead:
-            yield ahead.popleft().result()
-    finally:
-        threads.shutdown(cancel_futures=True)
+    steps = range(first_step, config.num_steps)
+    yield from run_ahead((functools.partial(assemble, step) for step in steps), READERS, READ_AHEAD)
 
 
 def cached_reader(dataset: Dataset, config: TrainConfig, cache_bytes: int) -> Callable[[str], ObjectData]:
@@ -159,12 +153,3 @@ def cached_reader(dataset: Dataset, config: TrainConfig, cache_bytes: int) -> Ca
         return item
 
     return read
-
-
-def check_spread(dataset: Dataset, config: TrainConfig) -> None:
-    """ValueError if the config asks for evenly spread clouds where an object's points are random ones."""
-    if config.even_share and dataset.spread != "even":
-        raise UserError(
-            f"{dataset.folder}: its points are drawn at random, even_share is {config.even_share}; generate with "
-            "--spread even, or use even_share 0"
-        )

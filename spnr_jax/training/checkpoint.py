@@ -165,14 +165,10 @@ def _refuse_other_version(checkpointer: Any, path: Path, like: optimisation.Trai
 
 
 def _shapes(tree: Any) -> dict[str, tuple[int, ...]]:
-    """Shape of each array of a tree by its path; of a random key, that of the numbers which it is stored as."""
-
-    def shape(leaf: Any) -> tuple[int, ...]:
-        is_key = jax.numpy.issubdtype(leaf.dtype, jax.dtypes.prng_key)
-        return tuple(jax.eval_shape(jax.random.key_data, leaf).shape if is_key else leaf.shape)
-
+    """Shape of each array of a tree by its path, but for the random key, which is stored as plain numbers."""
     leaves = jax.tree_util.tree_leaves_with_path(tree)
-    return {jax.tree_util.keystr(path, simple=True, separator="."): shape(leaf) for path, leaf in leaves}
+    named = {jax.tree_util.keystr(path, simple=True, separator="."): tuple(leaf.shape) for path, leaf in leaves}
+    return {name: shape for name, shape in named.items() if name != "key"}
 
 
 def load_run(

@@ -34,7 +34,7 @@ from spnr_jax.kernels.cloud_arrays import farthest_points
 from spnr_jax.kernels.metrics import psnr
 from spnr_jax.kernels.records import Camera, Crops, Key, Light, PointCloud, Surfels, SurfelScene
 from spnr_jax.method import surfel_method, surfel_renderer
-from spnr_jax.method.pixels import reconstruction_loss
+from spnr_jax.method.inference import reconstruction_loss
 from spnr_jax.method.surfel_method import encode_in_box
 from spnr_jax.methods import Outcome
 from spnr_jax.nn import shader
@@ -275,7 +275,7 @@ def batches(views: list[View], config: TrainConfig, first_step: int) -> Generato
     for view in views:
         by_doublings.setdefault(view.doublings, []).append(view)
     assemble: Callable[[int], Crops] = partial(make_batch, by_doublings, config)
-    yield from read_ahead(assemble, first_step, config.num_steps)
+    yield from read_ahead(assemble, first_step, config)
 
 
 def make_batch(views: dict[int, list[View]], config: TrainConfig, step: int) -> Crops:

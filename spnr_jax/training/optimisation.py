@@ -8,7 +8,6 @@ CPU the losses of several runs under vmap are computed one after the other.
 """
 
 import dataclasses
-from collections.abc import Sequence
 from functools import partial
 from typing import Any, no_type_check
 
@@ -49,21 +48,12 @@ def learning_rate(config: TrainConfig) -> optax.Schedule:
     """Generator's learning rate: linear warm-up, then a cosine or an exponential down to final_lr_scale."""
     o = config.optimizer
     warmup = min(o.warmup_steps, config.num_steps)
+    first, peak = o.lr_generator / max(warmup, 1), o.lr_generator
     if o.decay == "exponential":
-        return optax.warmup_exponential_decay_schedule(
-            init_value=o.lr_generator / max(warmup, 1),
-            peak_value=o.lr_generator,
-            warmup_steps=warmup,
-            transition_steps=max(config.num_steps - warmup, 1),
-            decay_rate=o.final_lr_scale,
-        )
-    return optax.warmup_cosine_decay_schedule(
-        init_value=o.lr_generator / max(warmup, 1),
-        peak_value=o.lr_generator,
-        warmup_steps=warmup,
-        decay_steps=max(config.num_steps, warmup + 1),
-        end_value=o.lr_generator * o.final_lr_scale,
-    )
+        steps = max(config.num_steps - warmup, 1)
+        return optax.warmup_exponential_decay_schedule(first, peak, warmup, steps, o.final_lr_scale)
+    steps = max(config.num_steps, warmup + 1)
+    return optax.warmup_cosine_decay_schedule(first, peak, warmup, steps, peak * o.final_lr_scale)
 
 
 def optimizers(config: TrainConfig) -> tuple[optax.GradientTransformation, optax.GradientTransformation]:
@@ -173,27 +163,20 @@ def flatten_views(x: AnyArray) -> AnyArray:
 
 
 def discriminator_step(
-    config: TrainConfig, judge: Judge, fake: AnyArray, batch: Batch, step: Array, lr_scale: Array | None
+    config: TrainConfig, judge: Judge, fake: AnyArray, batch: Batch, step: Array
 ) -> tuple[Judge, dict[str, Array]]:
     """The discriminator and its optimiser after one step on references and renderings, and its metrics."""
     params, optimizer = judge
     gradient, metrics = jax.grad(partial(discriminator_loss, config), has_aux=True)(params, fake, batch, step)
     update, optimizer = optimizers(config)[1].update(gradient, optimizer)
-    return (optax.apply_updates(params, _scale_update(update, lr_scale)), optimizer), metrics
+    return (optax.apply_updates(params, update), optimizer), metrics
 
 
 # --- steps ------------------------------------------------------------------------------------------------------------
 
 
 def total_loss(
-    config: TrainConfig,
-    params: dict,
-    stats: dict,
-    judge: Judge | None,
-    batch: Any,
-    key: Key,
-    step: Array,
-    lr_scale: Array | None,
+    config: TrainConfig, params: dict, stats: dict, judge: Judge | None, batch: Any, key: Key, step: Array
 ) -> tuple[Float[Array, ""], tuple[dict[str, Array], dict, Judge | None]]:
     """(loss, (metrics, statistics, judge)): the loss of the method, and that of a discriminator after its step."""
     variables = {"params": params, "batch_stats": stats}
@@ -201,7 +184,7 @@ def total_loss(
     metrics = outcome.metrics
     if judge is not None:
         fake = flatten_views(outcome.image)
-        judge, more = discriminator_step(config, judge, jax.lax.stop_gradient(fake), outcome.batch, step, lr_scale)
+        judge, more = discriminator_step(config, judge, jax.lax.stop_gradient(fake), outcome.batch, step)
         condition = (flatten_views(x) for x in (outcome.batch.condition, outcome.batch.condition_mask))
         fake_logits = logits(config, judge[0], fake, *condition)
         value = value + config.loss.adversarial_weight * losses.generator_adversarial(fake_logits)
@@ -210,25 +193,17 @@ def total_loss(
 
 
 def train_step(
-    state: TrainState,
-    batch: Any,
-    *,
-    config: TrainConfig,
-    adversarial: bool = False,
-    lr_scale: Float[Array, ""] | None = None,
+    state: TrainState, batch: Any, *, config: TrainConfig, adversarial: bool = False
 ) -> tuple[TrainState, dict[str, Array]]:
-    """State after one step of the network, and of the discriminator from the same forward; and scalar metrics.
-
-    `lr_scale` multiplies both learning rates, which are static: as an array it may be one for each run under vmap.
-    """
+    """State after one step of the network, and of the discriminator from the same forward; and scalar metrics."""
     key = jax.random.fold_in(state.key, state.step)
     judge = (state.discriminator, state.discriminator_optimizer) if adversarial else None
     gradient_of = run_by_run(jax.value_and_grad(partial(total_loss, config), has_aux=True))
     (loss, (metrics, batch_stats, judge)), gradient = gradient_of(
-        state.generator, state.batch_stats, judge, batch, key, state.step, lr_scale
+        state.generator, state.batch_stats, judge, batch, key, state.step
     )
     update, generator_optimizer = optimizers(config)[0].update(gradient, state.generator_optimizer)
-    generator = optax.apply_updates(state.generator, _scale_update(update, lr_scale))
+    generator = optax.apply_updates(state.generator, update)
     averaged, averaged_stats = moving_average(
         (state.averaged, state.averaged_stats), (generator, batch_stats), state.step, config.optimizer.ema_decay
     )
@@ -247,10 +222,6 @@ def train_step(
     return state, metrics | {"loss": loss, "gradient_norm": optax.tree.norm(gradient)}
 
 
-def _scale_update(update: Any, factor: Array | None) -> Any:
-    return update if factor is None else jax.tree.map(lambda x: factor * x, update)
-
-
 def moving_average(averaged: Any, newest: Any, step: Array, decay: float) -> Any:
     """The average with the newest weights in it, over a growing share of the past: early ones are far from the last."""
     share = jnp.minimum(decay, (1.0 + step) / (10.0 + step))
@@ -260,38 +231,6 @@ def moving_average(averaged: Any, newest: Any, step: Array, decay: float) -> Any
 def averaged_variables(state: TrainState) -> dict:
     """The generator that evaluation uses, as Linen variables."""
     return {"params": state.averaged, "batch_stats": state.averaged_stats}
-
-
-# --- many runs --------------------------------------------------------------------------------------------------------
-# Whole trainings in one compiled program: states and batches of all runs are one tree with an axis of runs first.
-# `step` alone is shared, so that what depends on it (R1 every so many steps) stays a branch.  Runs may differ in seeds,
-# batches and a factor of the learning rates.
-
-OF_A_RUN = tuple(field.name for field in dataclasses.fields(TrainState) if field.name != "step")
-AXES: Any = TrainState(step=None, **dict.fromkeys(OF_A_RUN, 0))  # type: ignore[arg-type]
-
-
-def stack(states: Sequence[TrainState]) -> TrainState:
-    """States of one step as one tree; keys are stacked as plain numbers, which are not drawn from."""
-    plain = [dataclasses.replace(state, key=jax.random.key_data(state.key)) for state in states]
-    stacked = jax.tree.map(lambda *x: jnp.stack(x), *plain)
-    return dataclasses.replace(stacked, step=jnp.copy(states[0].step), key=jax.random.wrap_key_data(stacked.key))
-
-
-def train_runs(
-    states: TrainState,
-    batches: Any,
-    lr_scales: Float[Array, " runs"] | None = None,
-    *,
-    config: TrainConfig,
-    adversarial: bool,
-) -> tuple[TrainState, dict[str, Array]]:
-    """`train_step` of every run: stacked states after it, and the metrics of each run."""
-
-    def one(state: TrainState, batch: Any, lr_scale: Array | None) -> tuple[TrainState, dict[str, Array]]:
-        return train_step(state, batch, config=config, adversarial=adversarial, lr_scale=lr_scale)
-
-    return jax.vmap(one, in_axes=(AXES, 0, 0), out_axes=(AXES, 0))(states, batches, lr_scales)
 
 
 # runs once: a quick compilation, 2.7 s of CPU time instead of 7.0 for `tiny`, is worth more than quick code

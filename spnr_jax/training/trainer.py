@@ -5,14 +5,26 @@
 A run continues from its newest readable checkpoint; the rows of metrics.jsonl after it are dropped, because they will
 be written again.  A loss that is not finite stops the run and names the step; the last checkpoint stays.
 
+run.json has an entry for every start:
+
+began, first_step, last_step    when it began, and the steps that it trained
+seconds                         by phase: restore, compilation (the first step), steps, previews, checkpoints, listeners
+jax, hardware                   version of JAX, and the machine
+data, data_checksum             the folder, and a number that tells data sets apart
+init                            the training whose weights a new run began with, if they were not random
+
 If several processes train together (placement.py), the first writes these files; all of them write the checkpoints.
 """
 
+import hashlib
+import json
 import math
+import os
 import signal
-from collections.abc import Callable, Iterator
+import time
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
-from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,36 +34,17 @@ import numpy as np
 from jax.sharding import Mesh
 from tqdm import tqdm
 
-from spnr_jax.config import TrainConfig
+from spnr_jax.config import Schedule, TrainConfig
 from spnr_jax.devices import placement, runtime
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
-from spnr_jax.formats.images import png, write_whole
+from spnr_jax.formats.images import png, to_uint8, write_whole
 from spnr_jax.kernels.metrics import psnr
 from spnr_jax.kernels.records import Light
 from spnr_jax.method.model import render_views
 from spnr_jax.methods import method_of
 from spnr_jax.training import checkpoint, optimisation
-from spnr_jax.training.run_record import Clock, MetricsLog, RunRecord, Unwritten
 from spnr_jax.training.weights import Trained, add_companions, write_weights
-
-
-@dataclass(frozen=True, kw_only=True)
-class Schedule:
-    """How often the loop does what is not training, in steps."""
-
-    log_every: int = 20
-    """Steps between rows of metrics.jsonl and TensorBoard."""
-    preview_every: int = 500
-    """Steps between preview images and validation scores."""
-    checkpoint_every: int = 500
-    """Steps between checkpoints."""
-
-    def __post_init__(self) -> None:
-        for name, steps in vars(self).items():
-            if steps < 1:
-                raise UserError(f"{name} must be at least 1 step, got {steps}")
-
 
 Phase = Literal["step", "row", "preview", "checkpoint", "saved", "end"]
 OnEvent = Callable[[Phase, int, Any], object]  # phase that begins, steps done, its batch, row or state
@@ -161,7 +154,7 @@ class Progress:
         schedule: Schedule,
         first: int,
         init: Trained | None,
-        clock: Clock,
+        clock: "Clock",
         tell: OnEvent,
         light: Light | None,
     ) -> None:
@@ -169,8 +162,8 @@ class Progress:
         leads = placement.leads()
         self._of, self._schedule = (config, dataset, run, light), schedule
         self._first, self._done, self._clock, self._tell = first, first, clock, tell
-        self._record = RunRecord(run, dataset, first, init) if leads else Unwritten()
-        self._log = MetricsLog(run, first) if leads else Unwritten()
+        self._record = RunRecord(run, dataset, first, init) if leads else None
+        self._log = MetricsLog(run, first) if leads else None
         self._bar = tqdm(total=config.num_steps, initial=first, unit="step", mininterval=1, disable=not leads)
         self._pending: list[tuple[int, dict]] = []
 
@@ -187,8 +180,12 @@ class Progress:
         """A row and a preview, where they are due."""
         if save or self._done % self._schedule.log_every == 0:
             self._row(state, save)
-        if placement.leads() and (last or self._done % self._schedule.preview_every == 0):
-            self._preview(state)
+        if self._log and (last or self._done % self._schedule.preview_every == 0):
+            self._tell("preview", self._done, None)
+            scores, picture = preview(state, *self._of)
+            self._log.write({"step": self._done, **scores}, picture)
+            runtime.give_back()
+            self._clock.lap("previews")
 
     def _row(self, state: optimisation.TrainState, save: bool) -> None:
         """The mean of the steps since the last row; NotFinite for one that is not, or for a state to be saved."""
@@ -199,17 +196,10 @@ class Progress:
         pace = 1000 * (seconds / len(timed) if timed else self._clock.seconds["compilation"])
         row, (_, newest) = {"step": self._done, **mean_row(rows), "ms_per_step": round(pace, 2)}, rows[-1]
         self._tell("row", self._done, row)
-        self._log.write(row)
+        if self._log:
+            self._log.write(row)
         self._bar.set_postfix({n: f"{newest[n]:.2f}" for n in ("loss", "psnr") if n in newest}, refresh=False)
         self._pending = []
-
-    def _preview(self, state: optimisation.TrainState) -> None:
-        """Pictures of a few objects, and their scores."""
-        self._tell("preview", self._done, None)
-        scores, picture = preview(state, *self._of)
-        self._log.write({"step": self._done, **scores}, picture)
-        runtime.give_back()
-        self._clock.lap("previews")
 
     def checkpoint(self, state: optimisation.TrainState) -> None:
         """The whole state, and how the time was spent."""
@@ -217,14 +207,16 @@ class Progress:
         self._tell("checkpoint", self._done, None)
         checkpoint.save(run, state)
         self._clock.lap("checkpoints")
-        self._record.write(self._done, self._clock)
+        if self._record:
+            self._record.write(self._done, self._clock)
         self._tell("saved", self._done, state)
         self._clock.lap("listeners")
 
     def close(self) -> None:
         """Closes bar and log."""
         self._bar.close()
-        self._log.close()
+        if self._log:
+            self._log.close()
 
 
 def new_state(config: TrainConfig, init: Trained | None) -> optimisation.TrainState:
@@ -305,3 +297,119 @@ def preview(
     picture = np.concatenate(columns, axis=1)
     write_whole(run / "previews" / f"{int(state.step):07d}.png", png(picture))
     return {"val_psnr": float(np.mean(np.concatenate(scores)))}, picture
+
+
+# --- the record of a run ----------------------------------------------------------------------------------------------
+
+
+class MetricsLog:
+    """metrics.jsonl and TensorBoard of a run; rows after `first_step` of an earlier run are dropped."""
+
+    def __init__(self, run: Path, first_step: int) -> None:
+        """Opens both for appending."""
+        from tensorboardX import SummaryWriter
+
+        path = run / "metrics.jsonl"
+        kept = [row for row in read_rows(run) if row["step"] <= first_step]
+        write_whole(path, "".join(json.dumps(row) + "\n" for row in kept).encode())
+        self._file = path.open("a")
+        self._board = SummaryWriter(str(run / "tensorboard"), purge_step=first_step + 1)
+
+    def write(self, row: dict[str, int | float], picture: np.ndarray | None = None) -> None:
+        """Appends one row, to the disk itself; in TensorBoard its entries are scalars, and the picture is an image."""
+        self._file.write(json.dumps(row) + "\n")
+        self._file.flush()
+        os.fsync(self._file.fileno())  # a checkpoint that outlives a power cut needs the rows before it
+        for name, value in row.items():
+            if name != "step":
+                self._board.add_scalar(name, value, row["step"])
+        if picture is not None:
+            self._board.add_image("preview", to_uint8(picture), row["step"], dataformats="HWC")
+
+    def close(self) -> None:
+        """Closes both."""
+        self._file.close()
+        self._board.close()
+
+
+def read_rows(run: Path) -> list[dict]:
+    """Rows of a run's metrics.jsonl; a last line that a crash cut off is left out, and what follows a broken one."""
+    path = run / "metrics.jsonl"
+    rows: list[dict] = []
+    for line in path.read_text(errors="replace").splitlines() if path.exists() else []:
+        try:
+            row = json.loads(line)
+        except (ValueError, RecursionError):
+            break
+        if not isinstance(row, dict) or not all(isinstance(value, int | float) for value in row.values()):
+            break
+        rows.append(row)
+    return rows
+
+
+class Clock:
+    """Seconds since it was made, by phase: each lap belongs to one."""
+
+    def __init__(self) -> None:
+        """Starts it."""
+        self.seconds: dict[str, float] = {}
+        self._since = time.monotonic()
+
+    def lap(self, phase: str) -> float:
+        """Seconds since the lap before, counted towards the phase."""
+        now = time.monotonic()
+        elapsed, self._since = now - self._since, now
+        self.seconds[phase] = self.seconds.get(phase, 0.0) + elapsed
+        return elapsed
+
+
+class RunRecord:
+    """The entry of this start, written anew whenever the run saves."""
+
+    def __init__(self, run: Path, dataset: data_sets.Dataset, first_step: int, init: Trained | None = None) -> None:
+        """Keeps the entries of earlier starts."""
+        self._path, self._earlier = run / "run.json", read_starts(run)
+        self._entry: dict[str, Any] = {
+            "began": datetime.now(UTC).isoformat(timespec="seconds"),
+            "first_step": first_step,
+            "jax": jax.__version__,
+            "hardware": runtime.hardware(),
+            "data": str(dataset.folder),
+            "data_checksum": checksum(dataset),
+        }
+        if init is not None:
+            self._entry["init"] = f"{init.config.preset}, {init.steps} steps"
+
+    def write(self, last_step: int, clock: Clock) -> None:
+        """Writes what is known by now."""
+        seconds = {phase: round(spent, 2) for phase, spent in clock.seconds.items()}
+        starts = [*self._earlier, self._entry | {"last_step": last_step, "seconds": seconds}]
+        write_whole(self._path, (json.dumps({"starts": starts}, indent=1) + "\n").encode())
+
+
+def read_starts(run: Path) -> list[dict]:
+    """Entries of a run's run.json; none if there is no such file or it cannot be read."""
+    try:
+        starts = json.loads((run / "run.json").read_text(errors="replace"))["starts"]
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return []
+    return [entry for entry in starts if isinstance(entry, dict)] if isinstance(starts, list) else []
+
+
+def trained_on(run: Path, dataset: data_sets.Dataset, names: Sequence[str]) -> bool | None:
+    """Whether a run trained on some of the objects of a data set, by its record; None where that does not say.
+
+    It does not if the run trained on another data set, which may hold the same objects, or began with weights of
+    another training.
+    """
+    starts, wanted = read_starts(run), checksum(dataset)
+    here = [entry.get("data_checksum") == wanted for entry in starts]
+    if any(here) and not set(names).isdisjoint(dataset.splits["train"]):
+        return True
+    return False if here and all(here) and not any("init" in entry for entry in starts) else None
+
+
+def checksum(dataset: data_sets.Dataset) -> str:
+    """A number that tells data sets apart: of their settings and the names of their objects."""
+    content = json.dumps([dataset.settings, dataset.splits], sort_keys=True)
+    return hashlib.sha256(content.encode()).hexdigest()

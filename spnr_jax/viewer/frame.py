@@ -63,7 +63,6 @@ class State:
     maps: Mapping[str, Light] = field(default_factory=dict)
     light: Light | None = None
     stale: bool = False
-    splats: bool = False
 
     @property
     def lights(self) -> tuple[str, ...]:
@@ -123,8 +122,6 @@ def draw(model: Model, state: State, moving: bool) -> tuple[State, np.ndarray | 
     if (view := state.view) is None:
         return state, None
     state, named = make_light(state), qualities(model)
-    if state.splats:
-        return state, np.full((2, 2, 3), 255, np.uint8)
     quality: Quality
     quality, size = ("draft", named["draft"][1] // 2) if moving else named[state.quality]
     behind = state.lighting.background

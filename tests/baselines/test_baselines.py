@@ -20,7 +20,7 @@ from experiments.baselines.points2nerf import Hypernetwork, Points2NeRF
 from spnr_jax.config import LossConfig, OptimizerConfig
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.records import Camera
-from spnr_jax.method import inference, pixels
+from spnr_jax.method import inference
 from spnr_jax.training import optimisation
 
 pytestmark = pytest.mark.ci  # it trains baselines
@@ -73,7 +73,7 @@ def test_the_training_step_moves_every_weight(name):
         assert 0 < float(metrics["loss"] - metrics["kl"]) < 1
     if name == "point_nerf":  # rays without a point in reach are left out of the loss
         key, lattice_key = jax.random.split(jax.random.fold_in(fresh.key, 0))
-        seen = pixels.lattice(lattice_key, BATCH, 3)
+        seen = inference.lattice(lattice_key, BATCH, 3)
         variables = {"params": fresh.generator}
         rendering = jax.jit(PointNeRF(TRAININGS[name].model).apply)(variables, seen.cloud, seen.camera, key)
         hit = np.asarray(rendering.acc > 0)

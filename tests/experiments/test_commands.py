@@ -15,7 +15,7 @@ import pytest
 from support import stand_ins, tiny_dataset, tiny_surfels
 from support.handmade import ball
 from support.tiny_baselines import SHRUNKEN, SIZE
-from support.tiny_runs import L1_ONLY
+from support.tiny_untrained import CONFIG as L1_ONLY
 
 from data_gen.render import views
 from data_gen.store import layout

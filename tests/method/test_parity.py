@@ -12,7 +12,7 @@ from support import twin
 from experiments.speed.bench import make_batch
 from spnr_jax.config import AS_TRAINED
 from spnr_jax.kernels import cameras, compositing, losses, sampling, voxels
-from spnr_jax.method import inference, pixels
+from spnr_jax.method import inference
 from spnr_jax.method.paper_method import trace
 from spnr_jax.nn.paper_layers import encode_direction
 from spnr_jax.training import optimisation
@@ -154,7 +154,7 @@ def trained():
             rendering, updated = inference.network(CONFIG.model).apply(
                 variables, BATCH.cloud, BATCH.camera, train=True, mutable=["batch_stats"]
             )
-            l1 = pixels.reconstruction_loss(CONFIG, rendering.image, rendering.image_lr, BATCH.image)
+            l1 = inference.reconstruction_loss(CONFIG, rendering.image, rendering.image_lr, BATCH.image)
             adversarial = CONFIG.loss.adversarial_weight * judge(DISCRIMINATOR, rendering.image)
             parts = {"l1": l1, "adv": adversarial, "loss_g": l1 + adversarial}
             return l1 + adversarial, (rendering, updated["batch_stats"], parts)

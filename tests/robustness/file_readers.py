@@ -77,7 +77,7 @@ def read_config(folder: Path, main: str) -> None:
 
 def read_metrics(folder: Path, main: str) -> None:
     """The rows that a report draws."""
-    from spnr_jax.training.run_record import read_rows
+    from spnr_jax.training.trainer import read_rows
 
     for row in read_rows(folder):
         assert all(isinstance(value, int | float) for value in row.values()), "a row with a value that is no number"

@@ -20,7 +20,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from spnr_jax.training import checkpoint, run_record, trainer
+from spnr_jax.training import checkpoint, trainer
 
 LIMIT = 300.0  # seconds without an event after which a process hangs
 SERVER = multiprocessing.get_context("forkserver")
@@ -119,9 +119,8 @@ def _child(arguments: list[str], cache: Path, output: Path, events: Connection) 
 
     def train() -> None:
         command = cli.parse(arguments)
-        every = {name: getattr(command, name) for name in ("log_every", "preview_every", "checkpoint_every")}
-        dataset, schedule = data_sets.open_dataset(command.data), trainer.Schedule(**every)
-        trainer.train(command.config, dataset, command.run, schedule, on_event=tell)
+        dataset = data_sets.open_dataset(command.data)
+        trainer.train(command.config, dataset, command.run, command.schedule, on_event=tell)
         print("trained")
 
     tell("start", 0, None)
@@ -147,7 +146,7 @@ def batches(*trials: Ended) -> dict[int, set[str | None]]:
 
 def rows(run: Path) -> list[dict]:
     """The metrics file without the time that a step took, the one entry that a clock decides."""
-    return [{k: v for k, v in row.items() if k != "ms_per_step"} for row in run_record.read_rows(run)]
+    return [{k: v for k, v in row.items() if k != "ms_per_step"} for row in trainer.read_rows(run)]
 
 
 def different(run: Path, whole: Path) -> list[str]:

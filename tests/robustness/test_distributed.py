@@ -24,7 +24,7 @@ from support.laws import same_bits
 from support.tiny_dataset import CONFIG
 
 from spnr_jax.devices import placement
-from spnr_jax.training import batching, checkpoint, optimisation, run_record
+from spnr_jax.training import batching, checkpoint, optimisation, trainer
 
 ROOT = Path(__file__).parents[2]
 LIMIT = 3600.0  # seconds that a run may take
@@ -104,7 +104,7 @@ def free_port() -> int:
 
 def compared(run: Path, one: Path) -> dict[str, float]:
     """How far a run lies from that on one device, relative: all metrics of all steps, statistics, parameters."""
-    rows, expected = ([row for row in run_record.read_rows(x) if "loss" in row] for x in (run, one))
+    rows, expected = ([row for row in trainer.read_rows(x) if "loss" in row] for x in (run, one))
     assert [row.keys() for row in rows] == [row.keys() for row in expected]
     apart = [
         abs(a[name] - b[name]) / max(abs(b[name]), 1)

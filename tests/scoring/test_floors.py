@@ -26,10 +26,6 @@ def random_cloud(seed: int, num_points: int = 60) -> PointCloud:
     return make_cloud(positions, rng.uniform(size=num_points) < 0.67, base_color=color)
 
 
-def front_camera(distance: float = 4.0, size: int = 32) -> Camera:
-    return pinhole(look_at(jnp.array([0, 0, distance]), jnp.zeros(3), jnp.array([0.0, 1, 0])), 0.6, size, size)
-
-
 def skewed_camera() -> Camera:
     """Not square, focal lengths that differ, the principal point off the middle."""
     pose = look_at(jnp.array([0.4, 0.5, 2.0]), jnp.array([0.1, 0, 0]), jnp.array([0.0, 1, 0]))
@@ -115,17 +111,13 @@ def test_the_order_of_points_and_padding_do_not_matter(renderer):
 
 
 @pytest.mark.parametrize("renderer", [splat, nearest])
-def test_a_cloud_without_real_points_is_the_white_image(renderer):
-    camera = front_camera()
-    image, acc = renderer(make_cloud(np.zeros((5, 3)), mask=np.zeros(5, bool)), camera, 1.0)
-    np.testing.assert_array_equal(image, white(camera))
-    np.testing.assert_array_equal(acc, 0)
-
-
-@pytest.mark.parametrize("renderer", [splat, nearest])
-def test_what_lies_behind_the_eye_is_not_seen(renderer):
+def test_of_no_points_and_of_what_lies_behind_the_eye_nothing_is_seen(renderer):
+    camera = pinhole(look_at(jnp.array([0, 0, 4.0]), jnp.zeros(3), jnp.array([0.0, 1, 0])), 0.6, 32, 32)
     behind = make_cloud([[0, 0, 6.0], [0.1, 0, 5.0]])
-    assert renderer(behind, front_camera(distance=4.0), 0.3)[1].sum() == 0
+    for cloud, radius in ((make_cloud(np.zeros((2, 3)), mask=np.zeros(2, bool)), 1.0), (behind, 0.3)):
+        image, acc = renderer(cloud, camera, radius)
+        np.testing.assert_array_equal(image, white(camera))
+        np.testing.assert_array_equal(acc, 0)
 
 
 def test_blocks_of_rays_give_the_image_of_all_rays_at_once(monkeypatch):
@@ -140,8 +132,5 @@ def test_spacing_is_the_median_distance_to_the_nearest_other_real_point():
     real = np.asarray(cloud.positions, np.float64)[cloud.mask]
     distances = [min(np.linalg.norm(p - q) for j, q in enumerate(real) if j != i) for i, p in enumerate(real)]
     np.testing.assert_allclose(spacing(cloud), np.median(distances), rtol=1e-5)
-
-
-@pytest.mark.parametrize("real", [0, 1])
-def test_spacing_without_a_second_point_is_zero(real):
-    assert spacing(make_cloud(np.zeros((4, 3)), mask=np.arange(4) < real)) == 0
+    for real in (0, 1):
+        assert spacing(make_cloud(np.zeros((4, 3)), mask=np.arange(4) < real)) == 0

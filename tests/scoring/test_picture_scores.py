@@ -57,24 +57,18 @@ def test_flip_of_equal_pictures_is_0_and_greys_differ_by_their_lightness_alone()
     assert flip(black, white) == pytest.approx(0.95 + 0.05 * (100**0.7 / largest - 0.4) / 0.6, abs=1e-4)
 
 
-def test_lpips_sees_views_of_channels_first_from_minus_1_to_1_and_keeps_the_batch(package):
-    found = lpips(IMAGE, REFERENCE)
-    assert found.shape == (2, 3)
-    close(found, 2 * np.abs(IMAGE - REFERENCE).mean(axis=(2, 3, 4)), atol=1e-6)
-
-
-def test_lpips_is_missing_without_its_package_its_weights_or_enough_pixels(package, monkeypatch):
-    assert lpips(IMAGE[..., :31, :, :], REFERENCE[..., :31, :, :]) is None
+def test_lpips_sees_views_of_channels_first_from_minus_1_to_1_and_is_missing_without_its_package(package, monkeypatch):
+    close(lpips(IMAGE, REFERENCE), 2 * np.abs(IMAGE - REFERENCE).mean(axis=(2, 3, 4)), atol=1e-6)
+    assert lpips(IMAGE[..., :31, :, :], REFERENCE[..., :31, :, :]) is None, "too few pixels"
 
     def offline(net, verbose):
         raise OSError("no way to the weights")
 
     monkeypatch.setattr(package, "LPIPS", offline)
-    picture_scores.lpips_network.cache_clear()
-    assert lpips(IMAGE, REFERENCE) is None
-    monkeypatch.setitem(sys.modules, "lpips", None)
-    picture_scores.lpips_network.cache_clear()
-    assert lpips(IMAGE, REFERENCE) is None
+    for _ in ("without its weights", "without the package"):
+        picture_scores.lpips_network.cache_clear()
+        assert lpips(IMAGE, REFERENCE) is None
+        monkeypatch.setitem(sys.modules, "lpips", None)
 
 
 def test_colours_under_the_true_opacity_are_those_of_the_nearest_pixel_that_is_covered():

@@ -5,7 +5,7 @@ import signal
 import jax
 import numpy as np
 
-from spnr_jax.training import checkpoint, optimisation, run_record, trainer
+from spnr_jax.training import checkpoint, optimisation, trainer
 
 PICTURE = np.random.default_rng(0).random((8, 6, 3)).astype(np.float32)
 
@@ -37,4 +37,4 @@ def interrupted(monkeypatch, module, step, number=signal.SIGTERM):
 
 def rows_without_time(run):
     """The rows of a run's log without what a clock decides."""
-    return [{k: v for k, v in row.items() if k != "ms_per_step"} for row in run_record.read_rows(run)]
+    return [{k: v for k, v in row.items() if k != "ms_per_step"} for row in trainer.read_rows(run)]

@@ -75,9 +75,11 @@ def page(tmp_path, degree, title="A ball"):
 
 
 @pytest.mark.parametrize("degree", [0, 3])
-def test_the_page_draws_what_the_poster_shows(chromium, tmp_path, degree):
-    path, poster = page(tmp_path, degree)
+def test_the_page_draws_what_the_poster_shows_and_its_title_is_only_text(chromium, tmp_path, degree):
+    title = '<b>"chair" & @DATA@</b>'
+    path, poster = page(tmp_path, degree, title)
     with opened(chromium, path) as tab:
+        assert tab.title() == tab.locator("h1").inner_text() == title
         assert decibels(shown(tab), poster) > 32
         assert tab.locator("#poster").count() == 0, "the poster makes place"
 
@@ -133,11 +135,3 @@ def test_a_coarse_picture_shows_the_same_object_and_rest_brings_the_whole_one(ch
         assert tab.evaluate("viewer.frames") == 4, "first, coarse, coarse again, whole"
         tab.evaluate("document.getElementById('canvas').blur()")  # without the ring around what has the keys
         assert decibels(shown(tab), splat_twin.draw(splat_balls.ball(), splat_balls.camera(38.0, 20.0, SIZE))[0]) > 28
-
-
-def test_a_title_with_signs_of_html_is_only_text(chromium, tmp_path):
-    title = '<b>"chair" & @DATA@</b>'
-    path, _ = page(tmp_path, 0, title)
-    with opened(chromium, path) as tab:
-        assert tab.title() == title
-        assert tab.locator("h1").inner_text() == title

@@ -104,13 +104,8 @@ def test_ctrl_c_while_a_file_is_written_leaves_what_was_there(cloud, tmp_path, m
 
 def test_a_page_that_is_too_large_is_refused(monkeypatch):
     monkeypatch.setattr(splat_export, "MOST_BYTES", 1000)
+    poster = np.ones((8, 8, 3), np.float32)
     with pytest.raises(ValueError, match="--most-splats"):
-        splat_export.page(
-            splat_balls.ball(50), np.ones((8, 8, 3), np.float32), splat_balls.camera(size=8), (30.0, 20.0), "t", "n"
-        )
-
-
-def test_the_light_is_named_without_its_folder():
-    assert splat_making.light_name(Lighting()) == "room"
+        splat_export.page(splat_balls.ball(50), poster, splat_balls.camera(size=8), (30.0, 20.0), "t", "n")
     lighting = Lighting(light="/home/me/sky.hdr", sun=(40.0, 30.0), exposure=-1.0)
-    assert splat_making.light_name(lighting) == "sky.hdr + sun 40 30, exposure -1"
+    assert splat_making.light_name(lighting) == "sky.hdr + sun 40 30, exposure -1", "without its folder"

@@ -59,30 +59,23 @@ def run(whole_run, tmp_path):
     return shutil.copytree(whole_run, tmp_path / "run")
 
 
-def test_a_state_comes_back_bit_by_bit(tmp_path):
-    state = optimisation.jitted_create_state(CONFIG)
+@pytest.mark.parametrize("config", [CONFIG, SHRUNKEN["npbg_tiny"]], ids=["paper", "without statistics"])
+def test_a_state_comes_back_bit_by_bit(config, tmp_path):
+    state = optimisation.jitted_create_state(config)
+    assert (state.batch_stats == {}) == (config is not CONFIG)
+    checkpoint.write_config(tmp_path, config)
+    assert checkpoint.restore(tmp_path, config) is None
     checkpoint.save(tmp_path, state)
-    same_bits(checkpoint.restore(tmp_path, CONFIG), state)
-
-
-def test_a_state_without_statistics_comes_back_too(tmp_path):
-    tiny = SHRUNKEN["npbg_tiny"]
-    state = optimisation.jitted_create_state(tiny)
-    checkpoint.write_config(tmp_path, tiny)
-    checkpoint.save(tmp_path, state)
-    assert state.batch_stats == {}
     same_bits(checkpoint.load_run(tmp_path)[1], state)
 
 
 def test_a_run_of_another_method_is_refused_with_its_name(tmp_path):
     checkpoint.write_config(tmp_path, presets.tiny())
+    checkpoint.write_config(tmp_path, CONFIG)  # without a checkpoint there is nothing to protect
+    assert checkpoint.read_config(tmp_path) == CONFIG
     (tmp_path / "checkpoints").mkdir()
     with pytest.raises(ValueError, match=r"model\.method paper there, npbg asked"):
         checkpoint.write_config(tmp_path, SHRUNKEN["npbg_tiny"])
-
-
-def test_a_folder_without_checkpoints_holds_no_state(tmp_path):
-    assert checkpoint.restore(tmp_path, CONFIG) is None
 
 
 @pytest.mark.parametrize("damage", DAMAGES.values(), ids=DAMAGES)
@@ -99,9 +92,8 @@ def test_a_damaged_newest_checkpoint_is_named_and_the_one_before_is_taken(damage
 
 @pytest.mark.ci
 def test_damage_to_a_single_file_costs_the_checkpoint_or_nothing(run):
-    whole = checkpoint.restore(run, CONFIG)
-    taken = []
-    for path, damage in zip(newest_files(run, 6), itertools.cycle(DAMAGES.values()), strict=False):
+    whole, taken = checkpoint.restore(run, CONFIG), []
+    for path, damage in zip(newest_files(run, 6)[::2], itertools.cycle(DAMAGES.values()), strict=False):
         content = path.read_bytes()
         damage(path)
         state = checkpoint.restore(run, CONFIG, lambda line: None)
@@ -154,13 +146,6 @@ def test_a_run_of_another_preset_is_refused_with_the_fields_that_differ(run):
     checkpoint.write_config(run, CONFIG)
 
 
-def test_a_run_that_never_got_to_a_checkpoint_may_begin_again_with_another_config(tmp_path):
-    checkpoint.write_config(tmp_path, presets.small())
-    assert checkpoint.read_config(tmp_path) == presets.small()
-    checkpoint.write_config(tmp_path, CONFIG)
-    assert checkpoint.read_config(tmp_path) == CONFIG
-
-
 @pytest.mark.parametrize(
     "text", ["", "{", "[]", "3", '{"preset": "tiny"}', json.dumps(to_dict(CONFIG) | {"num_steps": "many"})]
 )
@@ -168,8 +153,5 @@ def test_a_config_that_is_none_is_an_error_with_its_path(text, tmp_path):
     (tmp_path / "config.json").write_text(text)
     with pytest.raises(ValueError, match="config.json: not a config of this version"):
         checkpoint.read_config(tmp_path)
-
-
-def test_a_folder_that_is_no_run_says_how_to_train_one(tmp_path):
     with pytest.raises(ValueError, match="not a run folder .*spnr train DATA"):
         checkpoint.read_config(tmp_path / "nowhere")

@@ -8,21 +8,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support import tiny_dataset, tiny_surfels
+from support import surfel_clouds, tiny_dataset, tiny_surfels
 from support.laws import close, same_bits
 from support.stopped_runs import interrupted, rows_without_time
 from support.tiny_surfels import CONFIG, LIGHT, NAME, SCHEDULE
 
 import spnr_jax
-from spnr_jax.config import SurfelConfig
 from spnr_jax.formats import data_sets
 from spnr_jax.kernels.cameras import pinhole
-from spnr_jax.kernels.records import Crops, PointCloud, Surfels
+from spnr_jax.kernels.records import Crops, PointCloud
+from spnr_jax.method import surfel_method
 from spnr_jax.method.surfel_method import encode_in_box
 from spnr_jax.nn import shader
 from spnr_jax.surfels import lighting
 from spnr_jax.surfels.sides import DIRECTIONS, spiral, tangents
-from spnr_jax.training import batching, checkpoint, gbuffers, optimisation, run_record, trainer
+from spnr_jax.training import batching, checkpoint, gbuffers, optimisation, trainer
 
 AXES = pytest.mark.parametrize("axis", [0, 1])
 
@@ -43,23 +43,22 @@ def made(seed, number):
 
 
 def test_a_file_is_what_its_seed_object_and_cloud_make_of_it():
-    path = next(view.path for view in tiny_surfels.views())
-    number = int(path.name.split(".")[1])
-    with np.load(path) as file:
-        again = made(CONFIG.seed, number)
+    one, two = sorted({view.path for view in tiny_surfels.views()})
+    with np.load(one) as file, np.load(two) as other:
+        again = made(CONFIG.seed, 0)
         assert set(again) == set(file)
         assert all(np.array_equal(again[name], file[name]) for name in file)
-        others = made(CONFIG.seed, number + 1), made(CONFIG.seed + 1, number)
-        assert all(not np.array_equal(other.get("seen0"), file["seen0"]) for other in others)
+        for different in (other, made(CONFIG.seed + 1, 0)):
+            assert not np.array_equal(different.get("seen0"), file["seen0"])
 
 
 def test_clouds_have_normals_of_their_file_or_of_all_its_points_or_none():
-    ball = spiral(1500).astype(np.float32)
+    ball = spiral(800).astype(np.float32)
     flat = {name: np.full(len(ball), 0.5, np.float32) for name in ("roughness", "metallic")}
     whole = PointCloud(positions=ball, mask=np.ones(len(ball), bool), base_color=np.abs(ball), normals=ball, **flat)
     clouds = [
         gbuffers.random_cloud(whole, 1, dataclasses.replace(CONFIG, max_points=200), np.random.default_rng(seed))
-        for seed in range(80)
+        for seed in range(50)
     ]
     told = [cloud for cloud in clouds if cloud.normals is not None]
     agree = np.array([np.median(np.sum(cloud.normals * cloud.positions, axis=1)) for cloud in told])
@@ -150,7 +149,7 @@ def params():
 
 
 @AXES
-def test_mirroring_leaves_the_loss_of_the_untrained_network_as_it_is(axis, params):
+def test_mirroring_leaves_the_loss_of_the_untrained_network_as_it_is_and_is_its_own_inverse(axis, params):
     kept = tiny_surfels.views()[0]
     view = gbuffers.read_view(kept)
     whole = gbuffers.crop_square(view, max(view["seen"].shape[:2]), 0, 2**kept.doublings, np.random.default_rng(0))
@@ -160,7 +159,6 @@ def test_mirroring_leaves_the_loss_of_the_untrained_network_as_it_is(axis, param
         for one in (whole, turned)
     ]
     np.testing.assert_allclose(*losses, rtol=1e-5)
-    assert not np.array_equal(whole["target"], turned["target"])
     assert not np.array_equal(whole["seen"], turned["seen"])
     same_bits(gbuffers.mirror(turned, axis), whole)
 
@@ -176,24 +174,14 @@ def test_a_mirrored_object_is_seen_as_the_mirrored_view(axis):
     pose = jnp.concatenate([jnp.eye(3), jnp.array([[0.0], [0.0], [3.0]])], axis=1)
     camera, seen = pinhole(pose, 0.7, 24, 24), []
     for sign in (np.ones(3, np.float32), mirror):
-        surfels = Surfels(
-            position=0.8 * normal * sign,
-            normal=normal * sign,
-            spacing=np.full(60, 0.4, np.float32),
-            base_color=color,
+        columns = {"base_color": color, "jump": color[:, ::-1] - color, "roughness": color[:, 0], "shape": color[:, :2]}
+        columns |= {"metallic": color[:, 1], "guessed": color[:, 2], "invented": color[:, 0], "rim": rim * sign}
+        surfels = surfel_clouds.surfels(
+            0.8 * normal * sign, normal * sign, 0.4, **columns,
             border=np.concatenate([rim * sign, np.full((60, 1), 0.1, np.float32)], axis=1),
-            jump=color[:, ::-1] - color,
-            roughness=color[:, 0],
-            metallic=color[:, 1],
-            guessed=color[:, 2],
-            invented=color[:, 0],
-            sided=np.ones(60, np.float32),
             visible=np.maximum((normal * sign) @ DIRECTIONS.T, 0),
-            shape=color[:, :2],
-            rim=rim * sign,
             reach=reach if sign.min() > 0 else reach[:, [0, 1, 3, 2]],  # normal x rim is not mirrored
-            mask=np.ones(60, bool),
-        )
+        )  # fmt: skip
         seen.append(np.asarray(gbuffers.look_at(surfels, camera, LIGHT, room=2**14, slots=24 * 24)[0]))
     view = {"seen": seen[0], "maps": seen[0], "target": seen[0], "ambient": np.zeros((9, 3))}
     np.testing.assert_allclose(gbuffers.mirror(view, axis)["seen"], seen[1], atol=0.05)
@@ -230,10 +218,10 @@ def test_a_clear_pixel_costs_nothing_whatever_colour_lies_under_it(crops, params
 def test_steps_lower_the_loss_on_one_object(crops):
     config = dataclasses.replace(CONFIG, num_steps=100)
     state, losses = optimisation.jitted_create_state(config), []
-    for _ in range(90):
+    for _ in range(60):
         state, metrics = optimisation.jitted_train_step(state, crops, config=config)
         losses.append(float(metrics["loss"]))
-    assert losses[-1] < 0.6 * losses[0]
+    assert losses[-1] < 0.7 * losses[0]
     assert float(loss(state.averaged, crops, config=config)[0]) < losses[0]
 
 
@@ -250,13 +238,19 @@ def test_the_loss_is_the_sum_of_its_weighted_errors(crops, params):
     assert terms["opacity_weight"] == pytest.approx(float(metrics["mse_opacity"]))
 
 
-def test_a_stopped_run_goes_on_to_the_same_bits_and_rows(monkeypatch, tmp_path):
+def test_a_stopped_run_goes_on_to_the_same_bits_and_rows_from_densified_clouds(monkeypatch, tmp_path):
+    densified = []
+    monkeypatch.setattr(
+        surfel_method, "densify_sparse", lambda variables, cloud: densified.append(variables.keys()) or cloud
+    )
     with monkeypatch.context() as patch:
         interrupted(patch, gbuffers, 3)
         with pytest.raises(KeyboardInterrupt, match="stopped at step 3 of 4"):
             trainer.train(CONFIG, tiny_surfels.dataset(), tmp_path, SCHEDULE, light=LIGHT)
     assert not (tmp_path / "weights.npz").exists()
     trainer.train(CONFIG, tiny_surfels.dataset(), tmp_path, SCHEDULE, light=LIGHT)
+    assert all("densifier" in names for names in densified)
+    assert len(densified) > gbuffers.CLOUDS
     same_bits(checkpoint.restore(tmp_path, CONFIG), checkpoint.restore(tiny_surfels.run(), CONFIG))
     assert rows_without_time(tmp_path) == rows_without_time(tiny_surfels.run())
     assert (tmp_path / "weights.npz").read_bytes() == (tiny_surfels.run() / "weights.npz").read_bytes()
@@ -264,10 +258,8 @@ def test_a_stopped_run_goes_on_to_the_same_bits_and_rows(monkeypatch, tmp_path):
 
 def test_the_run_and_the_file_that_it_ends_with_are_one_network():
     of_run, of_file = spnr_jax.load(tiny_surfels.run()), spnr_jax.load(tiny_surfels.run() / "weights.npz")
-    assert isinstance(of_file.config, SurfelConfig)
     assert of_run.config == of_file.config == CONFIG.model
     close(of_file.variables, jax.tree.map(np.asarray, of_run.variables), rtol=1e-3, atol=1e-4)
-    assert "val_psnr" in run_record.read_rows(tiny_surfels.run())[-1]
 
 
 def test_the_room_is_the_light_where_a_data_set_names_no_other_one():

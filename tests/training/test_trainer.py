@@ -8,7 +8,6 @@ import re
 import shutil
 import signal
 import struct
-import subprocess
 from functools import partial
 
 import jax
@@ -18,18 +17,16 @@ from PIL import Image
 from support import tiny_dataset, tiny_model, tiny_untrained
 from support.laws import close, same_bits
 from support.stopped_runs import PICTURE, interrupted, rows_without_time, without_network
+from support.tiny_baselines import SHRUNKEN
 from support.tiny_dataset import CONFIG, SCHEDULE
 from tensorboardX.proto.event_pb2 import Event
 
 import spnr_jax
-from experiments.baselines.npbg import NPBGConfig
-from experiments.baselines.point_nerf import PointNeRFConfig
 from spnr_jax import cli
-from spnr_jax.config import LossConfig
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.images import png
 from spnr_jax.scoring import evaluation
-from spnr_jax.training import batching, checkpoint, optimisation, run_record, trainer, weights
+from spnr_jax.training import batching, checkpoint, optimisation, trainer, weights
 
 KEPT_STEPS = {"2", "4", "6"}
 
@@ -60,15 +57,8 @@ class TestBeginningWithOtherWeights:
         state = trainer.train(config, tiny_dataset.dataset(), tmp_path, SCHEDULE, init=init)
         close(state.generator, init.variables["params"], atol=1e-9)
         close(state.averaged, init.variables["params"], atol=1e-9)
-        (start,) = run_record.read_starts(tmp_path)
+        (start,) = trainer.read_starts(tmp_path)
         assert start["init"] == f"{CONFIG.preset}, {CONFIG.num_steps} steps"
-
-    def test_a_run_that_goes_on_keeps_its_own(self, tmp_path):
-        run = shutil.copytree(tiny_dataset.run(), tmp_path / "run")
-        shutil.rmtree(run / "checkpoints" / "6")
-        init = weights.read_trained(tiny_dataset.run())
-        zero = dataclasses.replace(init, variables=jax.tree.map(np.zeros_like, init.variables))
-        same_bits(trainer.train(CONFIG, tiny_dataset.dataset(), run, SCHEDULE, init=zero), restored(tiny_dataset.run()))
 
     def test_weights_of_another_network_are_refused_in_one_line(self, tmp_path, capsys):
         small = tiny_model.with_encoder(CONFIG.model, base_width=2 * CONFIG.model.encoder.base_width)
@@ -80,7 +70,7 @@ class TestBeginningWithOtherWeights:
 
 @pytest.mark.parametrize("end", [None, "", '{"step": 6, "lo'], ids=["damaged", "rows", "half a row"])
 def test_what_lies_after_the_newest_good_checkpoint_is_made_again(end, tmp_path, capsys):
-    """Rows, half rows, and a checkpoint that was emptied."""
+    """Rows, half rows, and a checkpoint that was emptied; weights to begin with do not count any more."""
     run = shutil.copytree(tiny_dataset.run(), tmp_path / "run")
     if end is None:
         for path in (path for path in (run / "checkpoints" / "6").rglob("*") if path.is_file()):
@@ -89,7 +79,9 @@ def test_what_lies_after_the_newest_good_checkpoint_is_made_again(end, tmp_path,
         shutil.rmtree(run / "checkpoints" / "6")
         with (run / "metrics.jsonl").open("a") as file:
             file.write(end)
-    trainer.train(CONFIG, tiny_dataset.dataset(), run, SCHEDULE)
+    init = weights.read_trained(tiny_dataset.run())
+    zero = dataclasses.replace(init, variables=jax.tree.map(np.zeros_like, init.variables))
+    trainer.train(CONFIG, tiny_dataset.dataset(), run, SCHEDULE, init=zero)
     assert ("checkpoints/6" in capsys.readouterr().out) == (end is None)
     same_bits(restored(run), restored(tiny_dataset.run()))
     assert capsys.readouterr().out == "", "the checkpoint at step 6 is good again"
@@ -104,7 +96,7 @@ def test_a_finished_run_is_left_alone():
 
 
 def test_previews_and_rows_come_when_the_schedule_says():
-    run, rows = tiny_dataset.run(), run_record.read_rows(tiny_dataset.run())
+    run, rows = tiny_dataset.run(), trainer.read_rows(tiny_dataset.run())
     assert [row["step"] for row in rows if "loss" in row] == [1, 2, 3, 4, 5, 6]
     assert [row["step"] for row in rows if "val_psnr" in row] == [3, 6]
     assert all(np.isfinite(value) for row in rows for value in row.values())
@@ -142,13 +134,10 @@ def test_nan_stops_with_step_and_quantity_and_the_last_checkpoint_is_usable(monk
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(state.generator))
 
 
-def test_the_first_number_that_is_not_finite_is_named():
+def test_the_first_number_that_is_not_finite_is_named_and_means_are_of_the_steps_that_have_a_metric():
     rows = [(1, {"loss": 1.0, "psnr": 2.0}), (2, {"loss": 1.0, "psnr": np.inf}), (3, {"loss": np.nan, "psnr": 1.0})]
     with pytest.raises(trainer.NotFinite, match="psnr is inf at step 2"):
         trainer.check_finite(rows)
-
-
-def test_a_row_over_the_start_of_the_discriminator_is_the_mean_over_the_steps_that_have_it():
     rows = [(1, {"loss": 1.0}), (2, {"loss": 3.0, "discriminator": 5.0})]
     assert trainer.mean_row(rows) == {"loss": 2.0, "discriminator": 5.0}
 
@@ -157,7 +146,7 @@ def test_a_full_disk_is_one_line_and_exit_code_2(monkeypatch, tmp_path, capsys):
     def full(log, row):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(tmp_path / "metrics.jsonl"))
 
-    monkeypatch.setattr(run_record.MetricsLog, "write", full)
+    monkeypatch.setattr(trainer.MetricsLog, "write", full)
     code = cli.guard(lambda: trainer.train(CONFIG, tiny_dataset.dataset(), tmp_path, SCHEDULE), "spnr")
     assert code == 2
     line = capsys.readouterr().err.splitlines()[-1]
@@ -183,32 +172,16 @@ def test_a_state_that_is_not_finite_is_named_though_every_loss_is(monkeypatch, t
     assert not (tmp_path / "checkpoints").exists()
 
 
-@pytest.mark.ci
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["npbg", "point_nerf"])
-def test_a_baseline_is_trained_resumed_previewed_evaluated_and_loaded_like_ours(name, monkeypatch, tmp_path):
-    model = {
-        "npbg": NPBGConfig(encoder_widths=(8, 9), decoder_widths=(4,), image_resolution=tiny_dataset.SIZE),
-        "point_nerf": PointNeRFConfig(
-            num_candidates=8, num_samples=4, width=8, color_width=8, image_resolution=tiny_dataset.SIZE
-        ),
-    }[name]
-    loss = LossConfig(l1_weight=1.0, adversarial_weight=0.0, pixel="mse", masked=name == "point_nerf")
-    config = dataclasses.replace(CONFIG, model=model, loss=loss, pixel_stride=4 if name == "point_nerf" else 1)
-    dataset, whole, broken = tiny_dataset.dataset(), tmp_path / "whole", tmp_path / "broken"
-    trainer.train(config, dataset, whole, SCHEDULE)
-    with monkeypatch.context() as patch:
-        interrupted(patch, batching, 3)
-        with pytest.raises(KeyboardInterrupt):
-            trainer.train(config, dataset, broken, SCHEDULE)
-    trainer.train(config, dataset, broken, SCHEDULE)
-    same_bits(checkpoint.restore(broken, config), checkpoint.restore(whole, config))
-    assert (whole / "previews" / "0000006.png").is_file()
-    outcome = evaluation.evaluate(whole, dataset, say=lambda line: None)
+@pytest.mark.parametrize("name", ["npbg_tiny", "point_nerf_tiny"])
+def test_a_baseline_is_trained_previewed_evaluated_and_loaded_like_ours(name, tmp_path):
+    config, dataset = dataclasses.replace(SHRUNKEN[name], num_steps=CONFIG.num_steps), tiny_dataset.dataset()
+    trainer.train(config, dataset, tmp_path, SCHEDULE)
+    assert (tmp_path / "previews" / "0000006.png").is_file()
+    outcome = evaluation.evaluate(tmp_path, dataset, say=lambda line: None)
     assert np.isfinite(next(iter(outcome.summary["methods"].values()))["psnr"])
-    handle = spnr_jax.load(whole)
-    item = data_sets.read_object(dataset, "ball_000004")
-    volume = handle.encode(item.cloud)
+    handle = spnr_jax.load(tmp_path)
+    volume = handle.encode(data_sets.read_object(dataset, "ball_000004").cloud)
     rendering = handle.render(volume, handle.camera(volume))
     assert rendering.image.shape == (tiny_dataset.SIZE, tiny_dataset.SIZE, 3)
     assert np.isfinite(np.asarray(rendering.image)).all()
@@ -232,7 +205,7 @@ def decoded(content):
 
 
 def test_a_row_with_a_picture_is_scalars_and_an_image_of_the_same_pixels_as_the_file(tmp_path):
-    log = run_record.MetricsLog(tmp_path, 0)
+    log = trainer.MetricsLog(tmp_path, 0)
     log.write({"step": 2, "loss": 3.0})
     log.write({"step": 3, "val_psnr": 20.5}, PICTURE)
     log.close()
@@ -241,7 +214,7 @@ def test_a_row_with_a_picture_is_scalars_and_an_image_of_the_same_pixels_as_the_
     assert (at, score.tag, score.simple_value) == (3, "val_psnr", 20.5)
     assert (shown, picture.tag) == (3, "preview")
     np.testing.assert_array_equal(decoded(picture.image.encoded_image_string), decoded(png(PICTURE)))
-    assert run_record.read_rows(tmp_path) == [{"step": 2, "loss": 3.0}, {"step": 3, "val_psnr": 20.5}]
+    assert trainer.read_rows(tmp_path) == [{"step": 2, "loss": 3.0}, {"step": 3, "val_psnr": 20.5}]
 
 
 def test_previews_are_images_at_their_steps_and_a_second_compilation_is_announced(monkeypatch, tmp_path, capsys):
@@ -268,64 +241,42 @@ def recorded(tmp_path_factory):
 
 
 def test_a_start_says_where_and_with_what_it_trained_and_tells_its_objects_from_others(recorded):
-    (entry,), dataset = run_record.read_starts(recorded), tiny_dataset.dataset()
+    (entry,), dataset = trainer.read_starts(recorded), tiny_dataset.dataset()
     assert (entry["first_step"], entry["last_step"]) == (0, tiny_untrained.CONFIG.num_steps)
-    phases = {"restore", "compilation", "steps", "previews", "checkpoints", "listeners"}
-    for spent in (entry["seconds"], entry["processor_seconds"]):
-        assert set(spent) == phases
-        assert all(seconds >= 0 for seconds in spent.values())
-    assert entry["data_checksum"] == run_record.checksum(dataset)
+    assert set(entry["seconds"]) == {"restore", "compilation", "steps", "previews", "checkpoints", "listeners"}
+    assert all(seconds >= 0 for seconds in entry["seconds"].values())
+    assert entry["data_checksum"] == trainer.checksum(dataset)
     assert "cores" in entry["hardware"]
-    assert run_record.trained_on(recorded, dataset, dataset.splits["train"]) is True
-    assert run_record.trained_on(recorded, dataset, dataset.splits["test"]) is False
+    assert trainer.trained_on(recorded, dataset, dataset.splits["train"]) is True
+    assert trainer.trained_on(recorded, dataset, dataset.splits["test"]) is False
 
 
 def test_a_run_that_goes_on_keeps_what_earlier_starts_said(tmp_path):
     dataset = tiny_dataset.dataset()
-    clock = run_record.Clock()
+    clock = trainer.Clock()
     clock.lap("steps")
     for first in (0, 4):
-        run_record.RunRecord(tmp_path, dataset, first).write(first + 4, clock)
-    starts = run_record.read_starts(tmp_path)
+        trainer.RunRecord(tmp_path, dataset, first).write(first + 4, clock)
+    starts = trainer.read_starts(tmp_path)
     assert [(entry["first_step"], entry["last_step"]) for entry in starts] == [(0, 4), (4, 8)]
 
 
 @pytest.mark.parametrize("content", ["", "[]", '{"starts": 3}', '{"starts": [1]}', "[" * 100_000])
 def test_a_damaged_record_stops_nothing(content, tmp_path):
     (tmp_path / "run.json").write_text(content)
-    assert run_record.read_starts(tmp_path) == []
+    assert trainer.read_starts(tmp_path) == []
 
 
 def test_laps_of_one_phase_add_up_and_leave_nothing_out(monkeypatch):
     times = iter([10.0, 11.0, 13.0, 17.0])
-    monkeypatch.setattr(run_record.time, "monotonic", lambda: next(times))
-    clock = run_record.Clock()
+    monkeypatch.setattr(trainer.time, "monotonic", lambda: next(times))
+    clock = trainer.Clock()
     assert [clock.lap(phase) for phase in ("steps", "previews", "steps")] == [1.0, 2.0, 4.0]
     assert clock.seconds == {"steps": 5.0, "previews": 2.0}
 
 
 def test_the_checksum_knows_settings_and_splits():
     dataset = tiny_dataset.dataset()
-    others = [
-        data_sets.Dataset(folder=dataset.folder, settings=dataset.settings | {"views": 99}, splits=dataset.splits),
-        data_sets.Dataset(folder=dataset.folder, settings=dataset.settings, splits=dataset.splits | {"test": ()}),
-    ]
-    assert len({run_record.checksum(d) for d in (dataset, *others)}) == 3
-
-
-def test_a_changed_checkout_is_marked(tmp_path, monkeypatch):
-    def git(*arguments):
-        subprocess.run(["git", "-C", str(tmp_path), *arguments], check=True, capture_output=True)
-
-    package = tmp_path / "package"
-    package.mkdir()
-    monkeypatch.setattr(run_record, "__file__", str(package / "x.py"))
-    assert run_record.commit() is None
-    (package / "x.py").write_text("1")
-    git("init")
-    git("add", ".")
-    git("-c", "user.name=a", "-c", "user.email=a@b", "commit", "-m", "a")
-    clean = run_record.commit()
-    (package / "x.py").write_text("2")
-    assert len(clean) == 40
-    assert run_record.commit() == clean + "+"
+    changes = {"settings": dataset.settings | {"views": 99}}, {"splits": dataset.splits | {"test": ()}}
+    others = [dataclasses.replace(dataset, **change) for change in changes]
+    assert len({trainer.checksum(d) for d in (dataset, *others)}) == 3

@@ -1,10 +1,9 @@
-"""The viewer in a real browser: a headless Chromium turns, lights, opens files, makes splats, saves.
+"""The viewer in a real browser: a headless Chromium turns, lights, opens files, saves.
 
 Chromium is found on PATH, or named by SPNR_CHROMIUM; without one these tests are skipped.
 """
 
 import io
-import re
 import time
 
 import numpy as np
@@ -17,15 +16,12 @@ pytest.importorskip("viser", reason="the viewer's extra is not installed: pip in
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install playwright")
 
 from spnr_jax.method.model import Model  # noqa: E402
-from spnr_jax.viewer import gui  # noqa: E402
 
 pytestmark = [pytest.mark.ci, chromium_of.needed]  # it opens a browser
 
 WAIT = 180  # seconds, for a machine that does much else
-# viser gives the corners of a splat two coordinates, of which three.js computes bounds when a pointer passes
-TURNED, EXPOSURE = 0, 1  # sliders
+EXPOSURE = 1  # second slider
 SAME = 4.0  # difference of a picture while things move from the same at rest
-NO_BOUNDS = "computeBoundingSphere(): Computed radius is NaN"
 
 
 @pytest.fixture(scope="module")
@@ -95,7 +91,7 @@ def page(chromium, running):
     opened = Page(chromium, running.url)
     yield opened
     opened.tab.close()
-    assert not [line for line in opened.said if NO_BOUNDS not in line]
+    assert not opened.said
 
 
 def difference(one, other):
@@ -165,27 +161,3 @@ def test_a_snapshot_is_the_picture(page, tmp_path):
     download.value.save_as(tmp_path / "ball.png")
     saved = np.asarray(Image.open(tmp_path / "ball.png").convert("RGB")).astype(int)
     assert difference(saved[100:400, :560], shown) < SAME
-
-
-def test_splats_stand_where_the_picture_stood_can_be_hidden_and_go_with_a_change_of_the_light(
-    page, running, monkeypatch
-):
-    for name, value in (("VIEWS", 6), ("RESOLUTION", 48), ("MOST", 400)):
-        monkeypatch.setattr(gui, name, value)
-    first = page.settled(drawn)
-    loop = list(running._browsers.values())[-1].loop
-    box = page.tab.get_by_label("Splats", exact=True)
-    box.click()
-    page.tab.get_by_text(re.compile(r"^[\d,]+ splats$")).wait_for(timeout=1000 * WAIT)
-    page.until(lambda: loop.state.splats)
-    splats = page.settled(lambda now: drawn(now) and difference(now, first) > 0.5)
-    both = [(canvas < 200).any(axis=-1) for canvas in (first, splats)]
-    assert (both[0] & both[1]).sum() > 0.7 * (both[0] | both[1]).sum()
-    box.click()
-    page.until(lambda: not loop.state.splats)
-    page.settled(lambda now: difference(now, first) < SAME)
-    box.click()
-    page.settled(lambda now: difference(now, splats) < 0.5)
-    page.enter(TURNED, "90")
-    page.until(lambda: not box.is_checked() and not loop.state.splats)
-    page.settled(lambda now: drawn(now) and difference(now, splats) > 0.5)
