@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from support.laws import close, numbers
 
-from spnr_jax.kernels.compositing import composite, expected_distance, interval_lengths, volume_weights
+from spnr_jax.kernels.compositing import composite, expected_distance, volume_weights
 from spnr_jax.kernels.numerics import softplus
 from spnr_jax.method.paper_method import union_weights
 
@@ -39,36 +39,10 @@ class TestWeights:
         close(gradient[:2], 0.3 * np.array([passed[0] * 1.0 - after_first, passed[1] * -2.0 - after_second]), atol=1e-5)
         assert (gradient[2:] == 0).all()
 
-    def test_thin_intervals_are_not_lost(self):
-        weights, _ = volume_weights(jnp.full(64, 1e-6 / 64), jnp.ones(64))
-        assert weights.sum() == pytest.approx(1e-6, rel=1e-3)
-
     def test_a_thousand_thin_intervals_dim_what_lies_behind_them(self):
         """The transmittance of each rounds to 1 in float32, so their product would be 1."""
         weights, _ = volume_weights(jnp.full(4096, 2e-8), jnp.ones(4096))
         close(weights[-1] / weights[0], np.exp(-4095 * 2e-8), rtol=1e-6)
-
-    def test_a_single_thin_interval_keeps_its_digits_and_its_gradient(self):
-        value, gradient = jax.value_and_grad(lambda d: volume_weights(d, jnp.ones(1))[0][0])(jnp.array([1e-8]))
-        assert value == pytest.approx(1e-8, rel=1e-6)
-        assert gradient[0] == pytest.approx(1, rel=1e-6)
-
-    def test_splitting_every_interval_changes_nothing(self):
-        weights, residual = volume_weights(DENSITY, DELTA)
-        halves, same = volume_weights(jnp.repeat(DENSITY, 2, axis=-1), jnp.repeat(DELTA / 2, 2, axis=-1))
-        close(halves.reshape(2, 3, 8, 2).sum(-1), weights)
-        close(same, residual)
-
-    def test_an_interval_without_length_changes_nothing(self):
-        with_empty = np.insert(DENSITY, 3, 1e10, axis=-1), np.insert(DELTA, 3, 0.0, axis=-1)
-        weights, residual = map(np.asarray, volume_weights(*map(jnp.asarray, with_empty)))
-        assert (weights[..., 3] == 0).all()
-        close((np.delete(weights, 3, axis=-1), residual), volume_weights(DENSITY, DELTA))
-
-
-class TestIntervals:
-    def test_each_sample_owns_the_way_to_the_next_and_the_last_the_way_to_far(self):
-        close(interval_lengths(jnp.array([1.0, 1.5, 3.0]), jnp.array(3.25)), np.array([0.5, 1.5, 0.25]))
 
 
 class TestComposite:
@@ -104,9 +78,6 @@ class TestExpectedDistance:
 
         assert (distance(jnp.zeros((2, 3, 8))) == self.far).all()
         assert jnp.isfinite(jax.grad(lambda d: jnp.sum(distance(d)))(jnp.zeros((2, 3, 8)))).all()
-
-    def test_an_opaque_sample_is_where_it_is_seen(self):
-        close(expected_distance(jax.nn.one_hot(2, 4), jnp.array([1.0, 2.0, 3.0, 4.0]), jnp.array(9.0)), 3.0)
 
 
 class TestUnionWeights:

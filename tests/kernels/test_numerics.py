@@ -1,4 +1,4 @@
-"""Guarded division, clamping, softplus; the others are in the tables of laws."""
+"""Clamping, softplus; the others are in the tables of laws."""
 
 import jax
 import jax.numpy as jnp
@@ -8,18 +8,8 @@ from support.laws import close
 from spnr_jax.kernels.numerics import (
     clamp,
     per_feature,
-    safe_divide,
     softplus,
 )
-
-
-class TestSafeDivide:
-    def test_a_zero_denominator_gives_zero_in_value_and_gradient(self):
-        value, gradient = jax.value_and_grad(lambda a, b: jnp.sum(safe_divide(a, b)), (0, 1))(
-            jnp.array([1.0, 0.0, -1e10]), jnp.zeros(3)
-        )
-        assert value == 0
-        close(gradient, (jnp.zeros(3), jnp.zeros(3)))
 
 
 class TestClamp:

@@ -95,18 +95,6 @@ class TestImportance:
         distances = drawn(None, edges, 1e-3 * jax.nn.one_hot(20, 62), 64)
         assert ((distances >= edges[20]) & (distances <= edges[21])).mean() == pytest.approx(0.62, abs=0.03)
 
-    @pytest.mark.parametrize("bins", [16, 300], ids=["few bins", "many bins"])
-    def test_samples_are_distributed_as_the_step_function(self, bins):
-        rays = 3000
-        edges = jnp.sort(numbers(4, bins + 1))
-        weights = jnp.abs(numbers(5, bins)) ** 3
-        many = (jnp.broadcast_to(x, (rays, *x.shape)) for x in (edges, weights))
-        samples = np.sort(np.array(drawn(fresh(6), *many, 1, padding=1e-8))[:, 0])
-        mass = np.concatenate([[0], np.cumsum(np.float64(weights))])
-        expected = np.interp(samples, np.float64(edges), mass / mass[-1])
-        deviation = np.abs(expected - (np.arange(rays) + 0.5) / rays).max()
-        assert deviation < 1.95 / np.sqrt(rays), "Kolmogorov-Smirnov, 0.1 %"
-
     @pytest.mark.parametrize("seed", range(5))
     def test_a_share_of_one_or_more_stays_at_the_end_of_the_last_bin(self, seed, monkeypatch):
         """The cumulative mass of 127 bins ends a rounding above or below 1."""

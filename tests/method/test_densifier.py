@@ -15,12 +15,11 @@ import spnr_jax
 from spnr_jax.kernels.cloud_arrays import pad
 from spnr_jax.method import densifier, surfel_method
 from spnr_jax.method.densifier import CHILDREN, Nodes, place
-from spnr_jax.surfels.geometry import estimate_surfels
 from spnr_jax.training import weights
 
-COUNT, SIZE = 150, 160  # real points, and with padding
+COUNT, SIZE = 150, 1000  # real points, and with padding; whole clouds have as many, so that they share programs
 run = jax.jit(densifier.densify)
-estimate = jax.jit(estimate_surfels)
+see = jax.jit(densifier.see)
 
 
 @pytest.fixture(scope="module")
@@ -71,11 +70,9 @@ def test_children_lie_on_a_ball_nearer_than_the_middles_of_pairs(params):
 
 
 def test_places_of_pairs_lie_on_circles_that_their_ends_do():
-    normals = shape("sphere", 1000)[1]
-    nodes = Nodes(
-        *(jnp.asarray(x) for x in (0.6 * normals, normals)), jnp.full(1000, 0.067), jnp.zeros((1000, 3)), None
-    )
-    found = place(nodes, jnp.asarray(spnr_jax.neighbors(cloud(0.6 * normals))))
+    normals = jnp.asarray(shape("sphere", 1000)[1])
+    nodes = Nodes(0.6 * normals, normals, jnp.full(1000, 0.067), jnp.zeros((1000, 3)), None)
+    found = jax.jit(place)(nodes, spnr_jax.neighbors(cloud(0.6 * normals)))
     pairs = np.asarray(found.exists & (found.first != found.second))
     assert pairs.sum() > 2500
     close(np.linalg.norm(np.asarray(found.middle)[pairs], axis=1), 0.6, atol=1e-4)  # a cubic, to fourth order
@@ -87,16 +84,13 @@ def test_places_of_pairs_lie_on_circles_that_their_ends_do():
 
 
 def test_no_two_children_are_nearer_than_the_closest(params):
-    points = cloud(shape("sphere", 400, "random")[0])
-    near = jnp.asarray(spnr_jax.neighbors(points))
-    nodes = densifier.describe(estimate(points, near))
-    places = place(nodes, near)
-    children = densifier.predict(params["densifier"], nodes, near, places)
-    chosen = np.asarray(densifier.choose(nodes, near, places, children))
-    scale = np.asarray(places.scale)[chosen]
-    positions = np.asarray(children.position)[chosen]
+    points = cloud(shape("sphere", 1000, "random")[0])
+    near = spnr_jax.neighbors(points)
+    dense = jax.tree.map(lambda x: np.asarray(x)[SIZE:], run(params, points, near))
+    scale = np.asarray(see(points, near)[1].scale)[dense.mask]
+    positions, normals = dense.positions[dense.mask], dense.normals[dense.mask]
     distance, other = cKDTree(positions).query(positions, 2)
-    facing = np.sum(np.asarray(children.normal)[chosen] * np.asarray(children.normal)[chosen][other[:, 1]], axis=1)
+    facing = np.sum(normals * normals[other[:, 1]], axis=1)
     measure = (distance[:, 1] / (densifier.CLOSEST * np.minimum(scale, scale[other[:, 1]]))) ** 2
     assert (measure + densifier.AWAY * (1 - facing) >= 0.999).mean() > 0.95  # rivals are looked for at 12 neighbors
 
@@ -114,8 +108,7 @@ def test_vmap_is_a_loop_and_a_program_is_the_plain_function(params):
 def test_blocks_are_the_whole_at_once(params, monkeypatch):
     points = ball()
     near = jnp.asarray(spnr_jax.neighbors(points))
-    nodes = densifier.describe(estimate(points, near))
-    places = place(nodes, near)
+    nodes, places = see(points, near)
     found = []
     for block in (SIZE * CHILDREN, 37):
         monkeypatch.setattr(densifier, "BLOCK", block)
@@ -124,14 +117,13 @@ def test_blocks_are_the_whole_at_once(params, monkeypatch):
 
 
 def test_a_dense_cloud_gets_children_where_it_ends_or_bends_alone(monkeypatch):
-    grid = np.stack(np.meshgrid(np.arange(20), np.arange(20)), axis=-1).reshape(-1, 2)
-    edge = np.concatenate([np.insert(grid, 2, 0, axis=1), np.insert(grid[20:], 0, 0, axis=1)[:, [0, 1, 2]]])
+    grid = np.stack(np.meshgrid(np.arange(20), np.arange(31)), axis=-1).reshape(-1, 2)
+    edge = np.concatenate([np.insert(grid[:400], 2, 0, axis=1), np.insert(grid[20:], 0, 0, axis=1)])
     points = cloud(edge * 0.05)
-    near = jnp.asarray(spnr_jax.neighbors(points))
-    nodes = densifier.describe(estimate(points, near))
-    everywhere = place(nodes, near)
+    near = spnr_jax.neighbors(points)
+    nodes, everywhere = see(points, near)
     monkeypatch.setattr(densifier, "SPARSE", len(edge) - 1)
-    some = place(nodes, near)
+    some = jax.jit(lambda *x: place(*x))(nodes, near)
     pairs = [np.asarray(x.exists & (x.first != x.second)) for x in (everywhere, some)]
     middle = [np.asarray(x.middle)[y] for x, y in zip((everywhere, some), pairs, strict=True)]
     flat = [np.sum((x > 0.1).sum(axis=1) == 2) for x in middle]  # well inside one of the two squares
@@ -143,18 +135,19 @@ def test_a_dense_cloud_gets_children_where_it_ends_or_bends_alone(monkeypatch):
 
 
 def test_padding_and_the_order_of_points_do_not_matter(params):
-    points = ball()
-    real = jax.tree.map(lambda x: x[points.mask], points)
+    points, order = ball(), np.random.default_rng(3).permutation(SIZE)
     whole = kept(run(params, points, spnr_jax.neighbors(points)))
-    turned = jax.tree.map(lambda x: x[np.random.default_rng(3).permutation(COUNT)], real)
-    close(kept(run(params, real, spnr_jax.neighbors(real))), whole, atol=1e-3)
+    filled = jax.tree.map(lambda x: np.where(points.mask.reshape(-1, *[1] * (x.ndim - 1)), x, 0.5), points)
+    filled = jax.tree.map(np.float32, filled).replace(mask=points.mask)
+    close(kept(run(params, filled, spnr_jax.neighbors(filled))), whole, atol=1e-3)
+    turned = jax.tree.map(lambda x: x[order], points)
     found = kept(run(params, turned, spnr_jax.neighbors(turned)))
     distance = cKDTree(whole[:, :3]).query(found[:, :3])[0]
     assert (distance < 1e-3).mean() > 0.97  # which end owns a pair follows the numbers, and some points own too many
 
 
 def test_a_turned_cloud_has_turned_children(params):
-    normals = shape("sphere", 300, "random")[1]
+    normals = shape("sphere", SIZE, "random")[1]
     turn = np.float32([[0.36, 0.48, -0.8], [-0.8, 0.6, 0], [0.48, 0.64, 0.6]])
     points = cloud(0.6 * normals, normals=normals)
     other = dataclasses.replace(points, positions=points.positions @ turn.T, normals=points.normals @ turn.T)
@@ -181,7 +174,7 @@ def test_gradients_are_finite_and_reach_positions_and_weights(params):
 
 @pytest.mark.parametrize("positions", [np.zeros((1, 3)), np.eye(3)[:2], np.eye(3), np.zeros((30, 3)), np.ones((2, 3))])
 def test_few_points_and_equal_ones_stay_finite(params, positions):
-    points = pad(cloud(positions), 40)
+    points = pad(cloud(positions), SIZE)
     dense = run(params, points, spnr_jax.neighbors(points))
     for values in jax.tree.leaves(dense):
         assert np.isfinite(values).all()

@@ -79,10 +79,8 @@ def test_a_ball_is_drawn_where_it_is_on_white(scene, fresh):
     close(render(None, scene, view).image, found.image, atol=1e-5)  # fresh weights change nothing
 
 
-@pytest.mark.parametrize("size", [(33, 47), (16, 16)])
-def test_pictures_of_any_size_show_the_ball_at_its_place(scene, size):
-    height, width = size
-    view = dataclasses.replace(cameras.pinhole(camera(8).cam_to_world, 0.9, height, width))
+def test_a_picture_of_an_odd_size_shows_the_ball_at_its_place(scene):
+    view = cameras.pinhole(camera(8).cam_to_world, 0.9, 33, 47)
     check_ball(render(None, scene, view), view, scene.spacing + 2.0 * 2.5 / view.intrinsics[0, 0])
 
 
@@ -94,13 +92,12 @@ def test_a_small_ball_in_the_corner_of_a_picture_is_drawn_there(scene):
 @pytest.mark.parametrize("target", [(0.0, 0.0, 9.0), (9.0, 0.0, 2.5)])
 def test_a_camera_that_looks_away_sees_white(scene, fresh, target):
     found = render(fresh, scene, camera(64, target=target))
-    assert found.image.shape == (64, 64, 3)
     assert np.all(np.asarray(found.image) == 1)
     assert np.all(np.asarray(found.acc) == 0)
 
 
-def test_the_picture_moves_with_the_principal_point(wobbled):
-    scene, view = ball(3000), camera(96, eye=(0.6, 0.4, 3.6))
+def test_the_picture_moves_with_the_principal_point(scene, wobbled):
+    view = camera(96, eye=(1.2, 0.8, 7.2))
     doublings, side = resolution(scene, view)
     assert side == 1
     step = GRID * 2**doublings

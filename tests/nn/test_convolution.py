@@ -38,15 +38,13 @@ def value_and_gradients(form, x, kernel):
     return jax.jit(jax.value_and_grad(projected, (0, 1), has_aux=True))(x, kernel)
 
 
-# 2D: (5 x 6) and 3D above and at the size where the CPU turns to one matrix product
-SHAPES = [(5, 6), (4, 4, 4), (6, 5, 7), (2, 2, 3)]
+WINDOWS = [(3, 1, 1, 8), (3, 2, 1, 3), (2, 1, 1, 8), (4, 2, 1, 5), (4, 1, 1, 1), (1, 1, 0, 3)]
+# 2D, and 3D above and at the size where the CPU turns to one matrix product
+CASES = [((5, 6), *window) for window in WINDOWS] + [((6, 5, 7), *window) for window in WINDOWS]
+CASES += [(shape, *window) for shape in ((4, 4, 4), (2, 2, 3)) for window in WINDOWS[:2]]
 
 
-@pytest.mark.parametrize("shape", SHAPES, ids=str)
-@pytest.mark.parametrize(
-    ("window", "stride", "padding", "features"),
-    [(3, 1, 1, 8), (3, 2, 1, 3), (2, 1, 1, 8), (4, 2, 1, 5), (4, 1, 1, 1), (1, 1, 0, 3)],
-)
+@pytest.mark.parametrize(("shape", "window", "stride", "padding", "features"), CASES)
 def test_is_the_native_convolution_in_value_and_gradients(shape, window, stride, padding, features):
     x, kernel = numbers(0, 2, *shape, 3), numbers(1, *[window] * len(shape), 3, features)
 

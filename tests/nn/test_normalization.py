@@ -74,8 +74,7 @@ class TestGroupNorm:
     def apply(self, x, groups=4):
         return GroupNorm(groups).apply({"params": self.params}, x)
 
-    @pytest.mark.parametrize("shape", [(5,), (3, 4), (2, 3, 2)], ids=["1D", "2D", "3D"])
-    @pytest.mark.parametrize("groups", [1, 4, 8])
+    @pytest.mark.parametrize(("shape", "groups"), [((5,), 1), ((3, 4), 8), ((2, 3, 2), 4)])
     def test_is_the_loop_over_groups_for_each_entry_alone(self, shape, groups):
         x = 3 * numbers(7, 2, *shape, 8) + 1
         out = np.asarray(self.apply(x, groups))
@@ -85,7 +84,7 @@ class TestGroupNorm:
             )
             close(out[i], expected, atol=1e-5)
 
-    @pytest.mark.parametrize(("batch", "places"), [(2, 6), (1, 6), (1, 5)])
+    @pytest.mark.parametrize(("batch", "places"), [(2, 6), (1, 5)])
     def test_its_gradients_and_theirs_are_those_of_the_plain_form(self, batch, places):
         def plain(x, scale, bias):
             groups = x.reshape(batch, places, 4, 2)

@@ -26,13 +26,6 @@ def test_in_evaluation_it_is_the_plain_perceptron():
     close(evaluate(X, MASK), y @ np.float64(params["out"]["kernel"]) + np.float64(params["out"]["bias"]), atol=1e-5)
 
 
-def test_the_order_of_the_points_does_not_matter_in_training():
-    order = np.random.default_rng(2).permutation(6)
-    (out, stats), (shuffled, shuffled_stats) = train(X, MASK), train(X[:, order], MASK[:, order])
-    close(shuffled, out[:, order], atol=1e-5)
-    close(shuffled_stats, stats)
-
-
 def test_padding_touches_neither_real_points_nor_statistics():
     other = jnp.where(MASK[..., None], X, 1e3)
     (out, stats), (changed, changed_stats) = train(X, MASK), train(other, MASK)

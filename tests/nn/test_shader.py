@@ -1,14 +1,16 @@
 """The shader: what its outputs do to light and materials, linear in the light, at every number of doublings."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from support.laws import close, numbers
 
 from spnr_jax.kernels.imaging import srgb_to_linear
-from spnr_jax.nn.shader import COLOR_STEP, LEAST_ODDS, NOTHING, NUM_MAPS, NUM_OUTPUTS, ODDS_STEP, Shader, picture
+from spnr_jax.nn import shader
+from spnr_jax.nn.shader import COLOR_STEP, LEAST_ODDS, NOTHING, NUM_MAPS, NUM_OUTPUTS, ODDS_STEP
 from spnr_jax.surfels.lighting import SPECULAR
 
-SMALL = Shader(widths=(8, 8), top=8)
+picture = jax.jit(shader.picture, static_argnums=3)
 LIT = slice(7, 16)  # maps that are linear in the light
 
 

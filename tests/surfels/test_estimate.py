@@ -24,7 +24,7 @@ def estimate(positions, color=None, normals=None):
 
 CASES = [
     ("plane", 1024, "random", 1), ("sphere", 256, "even", 2), ("sphere", 256, "random", 10),
-    ("sphere", 20_000, "even", 1), ("sphere", 4096, "random", 3), ("rod", 1024, "random", 10),
+    ("sphere", 4096, "even", 1), ("sphere", 4096, "random", 3), ("rod", 1024, "random", 10),
 ]  # fmt: skip
 
 
