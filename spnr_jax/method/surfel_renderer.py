@@ -43,6 +43,7 @@ from spnr_jax.surfels.splatting import MOST_ENTRIES
 
 COARSEST = 3.5  # pixels between points from which on a picture is drawn at half the size
 FINEST = 0.8  # below which it is drawn at twice the size and averaged
+SMALL, FINEST_OF_SMALL = 128, 1.6  # pixels along a picture, up to which that costs little and begins sooner
 MOST_DOUBLINGS = 4
 STEP, MARGIN = 32, 8  # pixels of which a window is a multiple, and around the object in it
 GRID = 8  # of which a window's corner is a multiple: the network's levels see the same squares from every camera
@@ -107,13 +108,9 @@ def resolution(scene: SurfelScene, camera: Camera, share: float = 1.0) -> tuple[
     eye = np.asarray(camera.cam_to_world, np.float64)[:, 3]
     distance = float(np.linalg.norm((eye - np.asarray(scene.centre)) * np.asarray(scene.scale)))
     pixels = float(scene.spacing) * float(np.asarray(camera.intrinsics)[0, 0]) / share / max(distance, 1e-3)
-    return resolution_of(pixels)
-
-
-def resolution_of(pixels: float) -> tuple[int, int]:
-    """Doublings, and pixels averaged along each side, for points that lie so many pixels apart."""
     doublings = int(np.clip(np.floor(np.log2(max(pixels / COARSEST, 1e-9))) + 1, 0, MOST_DOUBLINGS))
-    return doublings, 2 if pixels < FINEST else 1
+    finest = FINEST_OF_SMALL if max(camera.height, camera.width) <= SMALL else FINEST
+    return doublings, 2 if pixels < finest else 1
 
 
 def common_resolution(resolutions: Iterable[tuple[int, int]]) -> tuple[int, int]:

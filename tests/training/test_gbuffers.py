@@ -199,13 +199,15 @@ def test_harmonics_of_the_mirrored_light_are_the_mirrored_ones(axis):
     close(np.stack(lighting.harmonics(*jnp.asarray(turned))), expected, atol=1e-6)
 
 
-def test_points_too_far_apart_or_too_near_for_the_reference_teach_nothing():
+def test_points_too_far_apart_for_the_reference_teach_nothing_and_too_near_ones_are_drawn_at_its_size():
     item = data_sets.read_object(tiny_surfels.dataset(), NAME)
     camera = jax.tree.map(lambda x: x[0], item.camera)
     scene = encode_in_box(item.cloud)
-    for spacing in (3.0, 0.01):  # G-buffers of three pixels, and pictures of twice the reference's size
-        other = dataclasses.replace(scene, spacing=spacing)
-        assert gbuffers.make_view(other, camera, item.images[0], 1, LIGHT) is None
+    far, near = (dataclasses.replace(scene, spacing=spacing) for spacing in (3.0, 0.01))
+    assert gbuffers.make_view(far, camera, item.images[0], 1, LIGHT) is None  # G-buffers of three pixels
+    doublings, view = gbuffers.make_view(near, camera, item.images[0], 1, LIGHT)
+    assert doublings == 0
+    assert view["seen"].shape[:2] == view["target"].shape[:2]
 
 
 def test_a_clear_pixel_costs_nothing_whatever_colour_lies_under_it(crops, params):
