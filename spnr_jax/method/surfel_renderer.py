@@ -109,7 +109,7 @@ def resolution(scene: SurfelScene, camera: Camera, share: float = 1.0) -> tuple[
     distance = float(np.linalg.norm((eye - np.asarray(scene.centre)) * np.asarray(scene.scale)))
     pixels = float(scene.spacing) * float(np.asarray(camera.intrinsics)[0, 0]) / share / max(distance, 1e-3)
     doublings = int(np.clip(np.floor(np.log2(max(pixels / COARSEST, 1e-9))) + 1, 0, MOST_DOUBLINGS))
-    finest = FINEST_OF_SMALL if max(camera.height, camera.width) <= SMALL else FINEST
+    finest = FINEST_OF_SMALL if max(camera.height, camera.width) / share <= SMALL else FINEST
     return doublings, 2 if pixels < finest else 1
 
 
