@@ -97,6 +97,13 @@ def test_a_camera_that_looks_away_sees_white(scene, fresh, target):
     assert np.all(np.asarray(found.acc) == 0)
 
 
+def test_a_cloud_of_twice_the_size_from_twice_as_far_has_the_same_picture_and_depths_twice_as_large(scene, fresh):
+    one = render(fresh, scene, camera(60, (0.6, 0.4, 2.6)))
+    other = render(fresh, scene.replace(scale=jnp.float32(0.5)), camera(60, (1.2, 0.8, 5.2)))
+    close(other.image, one.image, atol=1e-5)
+    close(other.depth, 2 * np.asarray(one.depth), rtol=1e-5)
+
+
 def test_the_picture_moves_with_the_principal_point(scene, wobbled):
     size = surfel_renderer.SMALL + 4
     view = camera(size, eye=(1.2, 0.8, 7.2))
