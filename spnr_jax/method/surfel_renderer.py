@@ -43,7 +43,7 @@ from spnr_jax.surfels.splatting import MOST_ENTRIES
 
 COARSEST = 3.5  # pixels between points from which on a picture is drawn at half the size
 FINEST = 0.8  # below which it is drawn at twice the size and averaged
-SMALL, FINEST_OF_SMALL = 128, 1.6  # pixels along a picture, up to which that costs little and begins sooner
+SMALL, FINEST_OF_SMALL = 128, 1.6  # pixels along a side of pictures where that costs little, and their limit
 MOST_DOUBLINGS = 4
 STEP, MARGIN = 32, 8  # pixels of which a window is a multiple, and around the object in it
 GRID = 8  # of which a window's corner is a multiple: the network's levels see the same squares from every camera

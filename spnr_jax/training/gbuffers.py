@@ -216,7 +216,8 @@ def make_view(
     """Doublings and arrays of a view, `side` times smaller than its reference is kept; None if it teaches nothing."""
     small = cameras.resize(camera, camera.height // side, camera.width // side)
     doublings, finer = surfel_renderer.resolution(scene, small)
-    side, scale = max(side // finer, 1), 2**doublings  # what is drawn at twice the size is compared at that size
+    # what is drawn at twice the size is compared at that size, or at the reference's where that has no more pixels
+    side, scale = max(side // finer, 1), 2**doublings
     if any(n % (side * scale) or n // (side * scale) < LEAST for n in image.shape[:2]):
         return None
     drawn = cameras.resize(camera, *(n // (side * scale) for n in image.shape[:2]))
