@@ -111,7 +111,8 @@ def digest(options: Render) -> str:
     asked = {k: v for k, v in dataclasses.asdict(options).items() if k not in ("cloud", "out", "workers", "cluster")}
     found = hashlib.sha256(json.dumps(asked, default=str, sort_keys=True).encode())
     light = options.lighting.light
-    networks = [place(options.run), packaged_file("densifier")]
+    run = place(options.run)
+    networks = [run, packaged_file("densifier"), (run if run.is_dir() else run.parent) / "densifier.npz"]
     for path in networks + ([Path(light)] if light else []):
         if path.is_file():
             found.update(path.read_bytes())

@@ -86,7 +86,7 @@ def prepare(
     del own
     if jax.process_count() > 1:
         raise UserError(f"preset {config.preset} trains in one process; start it without --distributed")
-    variables = add_companions(config.model, {})
+    variables = add_companions(config.model, {}, run)
     views = complete(dataset, light or light_of(dataset), config, run / "gbuffers", variables)
     return lambda first_step: batches(views, config, first_step)
 

@@ -285,7 +285,7 @@ def preview(
     """Validation PSNR of the averaged network on a few objects, and references over renderings, kept in previews/."""
     names = (dataset.splits["val"] or dataset.splits["train"])[:num_objects]
     variables = placement.on_this_process(optimisation.averaged_variables(state))
-    variables = add_companions(config.model, variables)
+    variables = add_companions(config.model, variables, run)
     columns, scores = [], []
     for name in names:
         item = data_sets.read_object(dataset, name)

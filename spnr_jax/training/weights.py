@@ -46,9 +46,15 @@ def packaged_file(name: str = SHIPPED) -> Path:
     return Path(str(resources.files("spnr_jax") / "pretrained" / f"{name}.npz"))
 
 
-def add_companions(config: NetworkConfig, variables: dict) -> dict:
-    """The variables, with those networks of the package beside them that the method asks for (its densifier)."""
-    return variables | {name: read_variables(packaged_file(name)) for name in method_of(config).companions}
+def companion_files(config: NetworkConfig, folder: Path) -> dict[str, Path]:
+    """The files of weights that a method asks for beside its own (its densifier): a folder's own, or the package's."""
+    own = {name: folder / f"{name}.npz" for name in method_of(config).companions}
+    return {name: path if path.is_file() else packaged_file(name) for name, path in own.items()}
+
+
+def add_companions(config: NetworkConfig, variables: dict, folder: Path) -> dict:
+    """The variables, and those of its companions: of the folder that the weights lie in, or of the package."""
+    return variables | {name: read_variables(path) for name, path in companion_files(config, folder).items()}
 
 
 def place(source: Path | str | None) -> Path:
@@ -64,11 +70,11 @@ def read_trained(source: Path | str | None, say: Callable[[str], None] = print, 
     path = place(source)
     if path.suffix == ".npz":
         trained = read_weights(path)
-        return replace(trained, variables=add_companions(trained.config.model, trained.variables))
+        return replace(trained, variables=add_companions(trained.config.model, trained.variables, path.parent))
     from spnr_jax.training import checkpoint, optimisation  # here: a file of weights is read without optimisers
 
     config, state = checkpoint.load_run(path, say, data)
-    variables = add_companions(config.model, optimisation.averaged_variables(state))
+    variables = add_companions(config.model, optimisation.averaged_variables(state), path)
     return Trained(config=config, variables=variables, steps=int(state.step))
 
 

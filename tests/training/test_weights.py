@@ -2,15 +2,18 @@
 
 import dataclasses
 import io
+import shutil
 import zipfile
 
 import jax
 import numpy as np
 import pytest
+from flax.traverse_util import flatten_dict
 from support import tiny_surfels, tiny_untrained, tiny_viewer
 from support.laws import close
 
 from spnr_jax.config import TrainConfig
+from spnr_jax.formats.npz import pack_arrays
 from spnr_jax.presets import PRESETS
 from spnr_jax.training import checkpoint, optimisation, weights
 
@@ -72,6 +75,17 @@ def test_the_densifier_stands_beside_every_network_over_surfels_and_in_no_file_o
             weights.read_variables(weights.packaged_file("densifier")),
         )
     assert "densifier" not in weights.read_trained(tiny_untrained.run()).variables
+
+
+def test_a_densifier_beside_the_weights_or_in_the_run_comes_before_that_of_the_package(tmp_path):
+    own = jax.tree.map(lambda x: x + 1, weights.read_variables(weights.packaged_file("densifier")))
+    flat = {name: np.asarray(x, np.float16) for name, x in flatten_dict(own, sep="/").items()}
+    shutil.copytree(tiny_surfels.run(), tmp_path / "run")
+    for folder in (tmp_path, tmp_path / "run"):
+        (folder / "densifier.npz").write_bytes(pack_arrays(flat))
+    weights.write_weights(tmp_path / "w.npz", weights.read_trained(None))
+    for source in (tmp_path / "w.npz", tmp_path / "run"):
+        jax.tree.map(lambda x, y: close(x, y, rtol=1e-3), weights.read_trained(source).variables["densifier"], own)
 
 
 def test_a_name_is_the_packages_network_and_a_path_is_not(monkeypatch, tmp_path):

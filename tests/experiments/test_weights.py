@@ -1,0 +1,48 @@
+"""The recipe of the package's weights, all parts of it, shrunken: what it writes, and that it goes on."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from support import tiny_surfels
+
+from experiments.packaged import weights
+from spnr_jax import cli, presets
+from spnr_jax.training.weights import load, packaged_file, read_trained, read_variables
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(autouse=True)
+def _tiny(monkeypatch):
+    monkeypatch.setattr(cli, "set_up_jax", lambda **_: None)
+    monkeypatch.setattr(presets, "surfels", lambda: tiny_surfels.CONFIG)
+    monkeypatch.setattr(weights, "STEPS", 2)
+    monkeypatch.setattr(weights, "DENSIFIER_STEPS", 2)
+    monkeypatch.setattr(weights, "COUNTS", (256,))
+    large = weights.generation_of
+    monkeypatch.setattr(
+        weights,
+        "generation_of",
+        lambda recipe: dataclasses.replace(
+            large(recipe), resolution=48, views=2, points=1024, spp=1, objects=3, test_objects=1, variant="scalar_rgb"
+        ),
+    )
+
+
+def test_one_command_makes_data_both_networks_and_scores_and_then_has_nothing_left_to_do(tmp_path, capsys):
+    recipe = weights.Recipe(out=tmp_path / "w", share=0.004, workers=1)
+    weights.main(recipe)
+    run = recipe.out / "run"
+    own, packaged = read_trained(run).variables["densifier"], read_variables(packaged_file("densifier"))
+    assert not np.array_equal(own["point"]["kernel"], packaged["point"]["kernel"])
+    rows = json.loads((recipe.out / "scores.json").read_text())
+    assert len(rows) == len(weights.PARTS)
+    assert all(np.isfinite(row["psnr"]) and row["psnr"] > 3 for row in rows.values())
+    assert load(run).config == tiny_surfels.CONFIG.model
+    made = {path: path.stat().st_mtime_ns for path in (recipe.out / "densifier" / "records").iterdir()}
+    capsys.readouterr()
+    weights.main(recipe)
+    assert made == {path: path.stat().st_mtime_ns for path in made}
+    assert "is finished: 2 steps" in capsys.readouterr().out
