@@ -1,6 +1,6 @@
 """Point clouds from files: one path, for points and for meshes.
 
-    open        raw columns by the names that the file gives, positions in float64 (point_files.py, mesh/)
+    open        raw columns by the names that the file gives, positions in float64 (point_files.py, meshes.py)
     interpret   colours, materials, normals, opacity, classes (columns.py, orientation.py)
     cut         a box, without the dominant plane, one cluster
     merge       equal and nearly equal points; what then is no surface is refused
@@ -21,9 +21,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from spnr_jax.errors import UserError
+from spnr_jax.formats.assets import ShownParts
 from spnr_jax.formats.columns import DEFAULTS, Columns, Report, keep_visible, materials, normals, sound, useful
 from spnr_jax.formats.cut import Cut
-from spnr_jax.formats.mesh.assets import ShownParts
 from spnr_jax.formats.orientation import ROTATIONS, find_up, sensor_of
 from spnr_jax.formats.point_files import MESHES, column_pieces, kind_of, parse_ply
 from spnr_jax.kernels import scenes
@@ -163,7 +163,7 @@ def _points_of(path: Path, kind: str, how: Reading) -> tuple[Points, float]:
 def _place(path: Path, kind: str, points: Points, noise: float, how: Reading) -> PlacedCloud:
     """The cloud of the points, thinned, with normals, upright, moved to its origin."""
     up, count = how.up, how.num_points
-    sensor = sensor_of(path, points.positions + points.origin, kind, how.report)
+    sensor = sensor_of(path, kind, points.positions + points.origin, how.report)
     kept = np.arange(len(points.positions))
     if count is not None and len(kept) > count:
         how.report(f"{count} of {len(kept)} points kept, evenly spread")
@@ -175,8 +175,8 @@ def _place(path: Path, kind: str, points: Points, noise: float, how: Reading) ->
     elif "normals" not in points.values and len(kept) < len(points.positions):
         fewer.values["normals"] = outward_normals(points.positions, points.values["base_color"], kept, noise)
     if up == "auto":
-        camera_up = sensor.up(fewer.positions + points.origin) if sensor else None
-        up, reason = (camera_up, "that of its camera") if camera_up else find_up(fewer.positions, Path(f"a{kind}"))
+        of_camera = sensor and sensor.up
+        up, reason = (of_camera, "that of its camera") if of_camera else find_up(fewer.positions, kind)
         how.report(f"{up} taken as up ({reason}); --up says otherwise")
     rotation = np.array(ROTATIONS[up], np.float64)
     positions, origin = _shift(fewer.positions, points.origin, how.report)
@@ -228,8 +228,8 @@ def _shift(positions: np.ndarray, before: np.ndarray, report: Report) -> tuple[n
 
 def _sample_mesh(path: Path, kind: str, how: Reading) -> Points:
     """Points spread evenly over a mesh, those inside the box that is to be cut out."""
-    from spnr_jax.formats.mesh.meshes import load_mesh  # here: points are read without trimesh
-    from spnr_jax.formats.mesh.surface_points import bounding_box, sample_surface
+    from spnr_jax.formats.meshes import load_mesh  # here: points are read without trimesh
+    from spnr_jax.formats.surface_points import bounding_box, sample_surface
 
     cut, report = how.cut, how.report
     count = max(CUT_MESH if cut.is_given else 0, how.num_points or MESH_POINTS)

@@ -6,7 +6,7 @@
     .npz .npy                   spnr_jax/formats/npz.py
     .las .laz                   spnr_jax/formats/las.py
     .spz                        spnr_jax/formats/gaussian_files.py
-    .glb .gltf .obj .off        meshes (spnr_jax/formats/mesh), as points where they have no faces
+    .glb .gltf .obj .off        meshes (spnr_jax/formats/meshes.py), as points where they have no faces
 
 A reader yields pieces of at most some ten megabytes (archives, meshes and compressed files come whole), so that a file
 may be larger than the memory.  Columns are raw: names and types are those of the file, positions float64 where the file
@@ -112,7 +112,7 @@ def column_pieces(path: Path, kind: str | None = None) -> Iterator[Columns] | No
                 return None
     if kind in READERS:
         return READERS[kind](path)
-    from spnr_jax.formats.mesh.meshes import points_of  # here: points are read without trimesh
+    from spnr_jax.formats.meshes import points_of  # here: points are read without trimesh
 
     columns = points_of(path, kind)
     return None if columns is None else iter([columns])

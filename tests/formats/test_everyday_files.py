@@ -19,7 +19,7 @@ from support.point_clouds import packed_splats, ply_bytes, read, write
 from spnr_jax.formats import gaussian_files
 from spnr_jax.formats.clouds import place_cloud, read_cloud
 from spnr_jax.formats.cut import Cut
-from spnr_jax.formats.mesh.plain import ears
+from spnr_jax.formats.polygons import ears
 from spnr_jax.surfels.sides import spiral
 
 ROOT = Path(__file__).parents[2]

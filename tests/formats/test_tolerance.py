@@ -5,9 +5,9 @@ import pytest
 from PIL import Image
 from support.gltf_files import UV, GltfBuilder
 
-from spnr_jax.formats.mesh.assets import RejectedAsset
-from spnr_jax.formats.mesh.meshes import load_mesh
-from spnr_jax.formats.mesh.surface_points import sample_surface
+from spnr_jax.formats.assets import RejectedAsset
+from spnr_jax.formats.meshes import load_mesh
+from spnr_jax.formats.surface_points import sample_surface
 
 CUT = "surface only where the alpha of the texture reaches its cut-off: 'leaf'"
 BELOW = "left out, wholly below the alpha cut-off: 'leaf'"

@@ -17,8 +17,7 @@ from typing import Literal
 import numpy as np
 
 from spnr_jax.errors import UserError
-from spnr_jax.formats.mesh.assets import CHANNELS, TEXTURES, Asset, Material, Part, RejectedAsset
-from spnr_jax.formats.mesh.texels import lookup
+from spnr_jax.formats.assets import CHANNELS, TEXTURES, Asset, Material, Part, RejectedAsset, lookup
 from spnr_jax.kernels.cloud_arrays import farthest_points
 
 Spread = Literal["random", "even"]
@@ -122,7 +121,7 @@ def face_areas(part: Part) -> np.ndarray:
 
 
 def evaluate_material(material: Material, texcoords: np.ndarray | None, count: int) -> dict[str, np.ndarray]:
-    """The channels of a material at texture coordinates (count, 2 n), and its opacity and normal map if it has them.
+    """The channels of a material at texture coordinates (count, 2), and its opacity and normal map if it has them.
 
     base_color, normal_map (count, 3); roughness, metallic, opacity (count,).
     """
@@ -132,8 +131,7 @@ def evaluate_material(material: Material, texcoords: np.ndarray | None, count: i
         if values.ndim == value_ndim:
             return np.broadcast_to(values, (count, *values.shape))
         assert texcoords is not None, "a texture needs texture coordinates"
-        pair, wrap = material.coordinates.get(name, (0, material.wrap))
-        return lookup(values, texcoords[:, 2 * pair : 2 * pair + 2], wrap)
+        return lookup(values, texcoords, material.wrap)
 
     present = {name: axes for name, axes in TEXTURES.items() if getattr(material, name) is not None}
     return {name: channel(name, axes) for name, axes in (CHANNELS | present).items()}
@@ -154,10 +152,8 @@ def _sample_part(part: Part, face: np.ndarray, barycentric: np.ndarray) -> dict[
     normals = geometric if part.normals is None else unit(interpolate(part.normals), geometric)
     if normal_map is not None:
         assert part.texcoords is not None, "a normal map needs texture coordinates"
-        pair, _ = part.material.coordinates.get("normal_map", (0, part.material.wrap))
         corners = part.faces[face]
-        own = part.texcoords[:, 2 * pair : 2 * pair + 2]
-        normals = tilt_normals(normals, normal_map, part.positions[corners], own[corners])
+        normals = tilt_normals(normals, normal_map, part.positions[corners], part.texcoords[corners])
     solid = np.ones(len(face), bool) if opacity is None else opacity >= part.material.cutoff
     return {"positions": interpolate(part.positions), "normals": normals, "solid": solid, **channels}
 

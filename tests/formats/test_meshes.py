@@ -9,11 +9,11 @@ import pytest
 import trimesh
 from support.gltf_files import CORNERS, SQUARE, GltfBuilder
 
-from spnr_jax.formats.mesh.assets import RejectedAsset
-from spnr_jax.formats.mesh.meshes import find_meshes, load_mesh
-from spnr_jax.formats.mesh.surface_points import normalise, sample_surface
+from spnr_jax.formats.assets import RejectedAsset
+from spnr_jax.formats.meshes import find_meshes, load_mesh
+from spnr_jax.formats.surface_points import normalise, sample_surface
 
-DATA = Path(__file__).parents[4] / "shared" / "data"
+DATA = Path(__file__).parents[3] / "shared" / "data"
 FACES = SQUARE.reshape(2, 3)
 
 

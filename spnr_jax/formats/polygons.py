@@ -19,8 +19,8 @@ from trimesh.exchange.ply import load_ply
 from trimesh.exchange.stl import load_stl_ascii
 from trimesh.geometry import triangulate_quads
 
+from spnr_jax.formats.assets import Asset, Part, RejectedAsset, make_material
 from spnr_jax.formats.columns import SRGB, Columns, colors_of, rename
-from spnr_jax.formats.mesh.assets import Asset, Part, RejectedAsset, make_material
 from spnr_jax.kernels.cloud_arrays import stack_columns
 
 MOST_CORNERS = 4096  # of a polygon whose ears are looked for; a larger one becomes a fan

@@ -1,7 +1,7 @@
 """Mesh files as assets: which files a folder holds, and one of them read, checked, cleaned and merged by material.
 
-glTF and GLB carry principled materials (gltf.py), OBJ gets them from its MTL (obj.py); PLY, STL and OFF (plain.py) have
-vertex or face colours at most, read as those of points are (columns.py), grey 0.5 otherwise.
+glTF and GLB carry principled materials (gltf.py), OBJ gets them from its MTL (obj.py); PLY, STL and OFF (polygons.py)
+have vertex or face colours at most, read as those of points are (columns.py), grey 0.5 otherwise.
 
 checked   indices inside, coordinates finite, an extent above zero
 cleaned   faces without area and vertices without faces removed; normals unit; colours in [0, 1]; unused columns gone
@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 
 from spnr_jax.errors import UserError, is_bug
-from spnr_jax.formats.mesh.assets import (
+from spnr_jax.formats.assets import (
     CHANNELS,
     TEXTURES,
     Asset,
@@ -36,10 +36,10 @@ from spnr_jax.formats.mesh.assets import (
     TransparentParts,
     make_material,
 )
-from spnr_jax.formats.mesh.gltf import gltf_points, load_gltf
-from spnr_jax.formats.mesh.obj import load_obj, obj_points
-from spnr_jax.formats.mesh.plain import PLAIN, off_points
-from spnr_jax.formats.mesh.surface_points import bounding_box, face_areas, unit, vertex_normals
+from spnr_jax.formats.gltf import gltf_points, load_gltf
+from spnr_jax.formats.obj import load_obj, obj_points
+from spnr_jax.formats.polygons import PLAIN, off_points
+from spnr_jax.formats.surface_points import bounding_box, face_areas, unit, vertex_normals
 
 # Faces below this share of the squared box diagonal are float32 rounding, not surface.
 DEGENERATE_AREA = 1e-14
@@ -87,8 +87,6 @@ def _check_columns(part: Part) -> None:
     count = len(part.positions)
     for name, width in WIDTHS.items():
         values = getattr(part, name)
-        if name == "texcoords" and values is not None and values.ndim == 2 and values.shape[1] > 0:
-            width = 2 * -(-values.shape[1] // 2)  # pairs, one or several
         if values is not None and values.shape != (count, width):
             raise RejectedAsset(f"has {name} of shape {values.shape} where ({count}, {width}) is needed: broken file")
     if part.faces.size and not 0 <= part.faces.min() <= part.faces.max() < count:
@@ -173,12 +171,12 @@ def _check_colors(part: Part, notes: set[str]) -> np.ndarray | None:
 
 def _identity(material: Material) -> str:
     """A digest of everything that a material says."""
-    present = [name for name in (*CHANNELS, *TEXTURES) if getattr(material, name) is not None]
-    arrays = [np.asarray(getattr(material, name)) for name in present]
-    cutoff = material.cutoff if "opacity" in present or "normal_map" in present else None
-    forms = [(array.shape, array.dtype.str) for array in arrays]
-    described = repr((material.wrap, cutoff, sorted(material.coordinates.items()), present, forms))
-    return hashlib.sha256(described.encode() + b"".join(array.tobytes() for array in arrays)).hexdigest()
+    digest = hashlib.sha256()
+    for value in vars(material).values():
+        array = isinstance(value, np.ndarray | np.floating)
+        digest.update(repr((value.shape, value.dtype) if array else value).encode())
+        digest.update(value.tobytes() if array else b"")
+    return digest.hexdigest()
 
 
 def _merge(parts: list[Part]) -> Part:
@@ -238,8 +236,8 @@ def load_mesh(
     RejectedAsset, with one line, for a file that cannot be used: unreadable or truncated, without faces or extent,
     with buffers missing or outside its folder.  "refuse", for references, also refuses what is transparent and images
     and libraries that are missing; "opaque" and "skip", for pictures, say in `notes` what was made of them, leave out
-    faces whose vertices are not finite, and read what the renderer of references does not know: cut-outs, normal maps,
-    several texture coordinates (assets.py).  `kind` is a suffix to go by instead of the file's.
+    faces whose vertices are not finite, and read what the renderer of references does not know: cut-outs, normal maps.
+    `kind` is a suffix to go by instead of the file's.
     """
     path = Path(path)
     kind = kind or path.suffix.lower()

@@ -10,11 +10,9 @@ from support import gltf_files
 from support.gltf_files import UV, GltfBuilder, png
 
 from data_gen.render.variant import mitsuba_module
-from spnr_jax.formats.mesh import texels
-from spnr_jax.formats.mesh.assets import Asset, Material, Part
-from spnr_jax.formats.mesh.meshes import load_mesh
-from spnr_jax.formats.mesh.surface_points import normalise, sample_surface, tilt_normals
-from spnr_jax.formats.mesh.texels import lookup, read_image, shrink, value_texels
+from spnr_jax.formats.assets import Asset, Material, Part, lookup, read_image, shrink, value_texels
+from spnr_jax.formats.meshes import load_mesh
+from spnr_jax.formats.surface_points import normalise, sample_surface, tilt_normals
 
 CORNERS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float64)
 FACES = np.array([[0, 1, 2], [0, 2, 3]])
@@ -201,13 +199,3 @@ def test_sixteen_bit_grey_images_are_scaled_not_clipped():
     stream = io.BytesIO()
     Image.fromarray(np.array([[0, 32896, 65535]], np.uint16)).save(stream, "png")
     assert value_texels(read_image(stream.getvalue(), "grey")[..., 1]).tolist() == [[0, np.float32(128 / 255), 1]]
-
-
-@pytest.mark.parametrize("mode", ["RGB", "RGBA", "P", "LA", "1"])
-def test_an_image_read_in_strips_is_the_whole_converted(mode, monkeypatch):
-    monkeypatch.setattr(texels, "STRIP", 4)
-    pixels = np.random.default_rng(0).integers(0, 256, (9, 7, 4), dtype=np.uint8)
-    stream = io.BytesIO()
-    Image.fromarray(pixels).convert(mode).save(stream, "png", **({"transparency": 3} if mode == "P" else {}))
-    whole = np.asarray(Image.open(io.BytesIO(stream.getvalue())).convert("RGBA"))
-    np.testing.assert_array_equal(read_image(stream.getvalue(), "a.png"), whole)
