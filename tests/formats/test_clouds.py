@@ -148,7 +148,7 @@ def test_points_are_spread_evenly_over_a_mesh_unless_there_are_very_many(tmp_pat
 
 def test_thinning_keeps_points_of_the_file_with_their_materials_and_depends_on_the_seed_alone(tmp_path):
     positions = sphere_points(1, 900)
-    np.savez(tmp_path / "a.npz", xyz=positions, roughness=np.arange(900) / 900)
+    np.savez(tmp_path / "a.npz", xyz=positions, normals=positions, roughness=np.arange(900) / 900)
     cloud, lines = read(tmp_path / "a.npz", num_points=100, seed=5)
     source = np.round(cloud.roughness * 900).astype(int)
     assert len(set(source)) == 100
@@ -209,7 +209,7 @@ def test_rows_without_finite_numbers_are_left_out_while_a_big_file_is_thinned(tm
     monkeypatch.setattr(clouds, "CAPACITY", 16)
     monkeypatch.setattr("spnr_jax.formats.text.PIECE_LINES", 7)
     positions = np.concatenate([np.full((20, 3), np.nan), sphere_points(3, 300), np.full((9, 3), np.inf)])
-    np.savetxt(tmp_path / "a.xyz", positions)
+    np.savetxt(tmp_path / "a.xyz", np.tile(positions, 2), header="x y z nx ny nz")
     cloud, lines = read(tmp_path / "a.xyz", num_points=1)
     assert np.isfinite(cloud.positions).all()
     assert lines[0] == "29 of 329 points left out: NaN, infinity or too large a number"
@@ -222,8 +222,9 @@ def test_rows_without_finite_numbers_are_left_out_while_a_big_file_is_thinned(tm
 def scene(folder, origin=(0.0, 0.0, 0.0)):
     """A file of a large and a small ball, and one point far from both."""
     points = [spiral(900), 0.3 * spiral(450) + [2, 0, 0], [[0, 4, 0]]]
-    np.save(folder / "a.npy", np.concatenate(points) + origin)
-    return folder / "a.npy"
+    normals = np.concatenate([spiral(900), spiral(450), [[0, 1, 0]]])
+    np.savez(folder / "a.npz", points=np.concatenate(points) + origin, normals=normals)
+    return folder / "a.npz"
 
 
 def test_a_box_is_in_the_units_and_axes_of_the_file_however_far_it_lies(tmp_path, monkeypatch):

@@ -24,7 +24,7 @@ def write(path, envmap):
 
 def test_a_light_by_name_is_its_map_normalised_or_as_it_is():
     close(read_light("room").tables, room_light().tables, rtol=2e-3)
-    for name in images.NAMES:
+    for name in ("studio", "night"):
         bright = read_light(name, normalise=False).tables
         close(bright, spnr_jax.light_of(skies.NAMED[name](skies.HEIGHT)).tables, rtol=1e-5)
 
