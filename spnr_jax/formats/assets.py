@@ -140,9 +140,16 @@ def make_material(
     wrap: Wrap = "repeat",
 ) -> Material:
     """A material of float32 channels in [0, 1]; grey of roughness 0.5 where nothing is given."""
-    color, *values = (np.clip(np.asarray(x, np.float32), 0, 1) for x in (base_color, roughness, metallic))
-    color = np.full(3, color) if color.ndim == 0 else color
-    return Material(base_color=color, roughness=values[0], metallic=values[1], wrap=wrap)
+    color = np.asarray(base_color, np.float32)
+    channels: dict[str, Any] = {"base_color": np.full(3, color) if color.ndim == 0 else color}
+    channels |= {"roughness": np.asarray(roughness, np.float32), "metallic": np.asarray(metallic, np.float32)}
+    for name, axes in CHANNELS.items():
+        shape = channels[name].shape
+        if shape[len(shape) - axes :] != (3,) * axes or len(shape) - axes not in (0, 2) or 0 in shape:
+            raise RejectedAsset(f"has a material with {name} of shape {shape}: broken file")
+        if not np.isfinite(channels[name]).all():
+            raise RejectedAsset(f"has a material whose {name} is not finite (NaN or infinity)")
+    return Material(**{name: np.clip(values, 0, 1) for name, values in channels.items()}, wrap=wrap)
 
 
 def read_companion(folder: Path, uri: str, root: Path | None = None) -> bytes:

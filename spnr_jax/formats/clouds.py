@@ -146,10 +146,7 @@ class Points(NamedTuple):
 def _points_of(path: Path, kind: str, how: Reading) -> tuple[Points, float]:
     """The points of a file, read, cut out and cleaned, and how noisy they were."""
     pieces, noise = column_pieces(path, kind), 0.0
-    if pieces is None:
-        points = _sample_mesh(path, kind, how)
-    else:
-        points = _without_repeats(_interpret(_read_columns(pieces, how), how), how.report)
+    points = _sample_mesh(path, kind, how) if pieces is None else _interpret(_read_columns(pieces, how), how)
     rows, lines = scenes.object_of(points.positions, points.origin, how.cut.remove_plane, how.cut.nth, how.seed)
     points = points.take(rows)
     if pieces is not None and how.clean != "off":
@@ -244,8 +241,6 @@ def _sample_mesh(path: Path, kind: str, how: Reading) -> Points:
         parts = tuple(replace(part, positions=part.positions - origin) for part in asset.parts)
         asset = replace(asset, parts=parts)
     drawn = sample_surface(asset, count, how.seed, "even" if count <= MOST_EVEN else "random")
-    if not np.isfinite(drawn.positions).all():
-        raise UserError(f"holds vertices too large for float32, more than {np.finfo(np.float32).max:.2g}")
     report(f"{count} points spread over the surface of the mesh")
     values = {name: getattr(drawn, name) for name in DEFAULTS}
     if all((values[name] == default).all() for name, default in DEFAULTS.items()):
@@ -294,7 +289,7 @@ def _read_columns(pieces: Iterator[Columns], how: Reading) -> Columns:
 
 
 def _interpret(columns: Columns, how: Reading) -> Points:
-    """What the columns of a file of points mean."""
+    """What the columns of a file of points mean, equal and nearly equal points as one."""
     if not columns or len(columns["x"]) == 0:
         raise UserError("holds 0 points")
     columns = keep_visible(columns, how.cut.keep_noise, how.report)
@@ -302,7 +297,12 @@ def _interpret(columns: Columns, how: Reading) -> Points:
     _check_steps(columns, positions, how.report)
     origin = np.floor(positions.min(axis=0)) if _coarse(positions) else np.zeros(3)
     values, directions = materials(columns, how.report), normals(columns)
-    return Points(positions - origin, values if directions is None else values | {"normals": directions}, origin)
+    values |= {} if directions is None else {"normals": directions}
+    places, values, merged = merge_repeats(positions - origin, values)
+    if merged:
+        how.report(f"{merged:,} of {len(positions):,} points repeat others, and were merged with them")
+    require_surface(places, len(positions))
+    return Points(places, values, origin)
 
 
 def _check_steps(columns: Columns, positions: np.ndarray, report: Report) -> None:
@@ -328,15 +328,6 @@ def _check_steps(columns: Columns, positions: np.ndarray, report: Report) -> Non
             f"x and y look like degrees of longitude and latitude: {max(x, y):.2g} wide and {z:.3g} high; "
             "project them to metres first"
         )
-
-
-def _without_repeats(points: Points, report: Report) -> Points:
-    """The points, equal and nearly equal ones as one; ValueError where that is no surface."""
-    positions, values, merged = merge_repeats(points.positions, points.values)
-    if merged:
-        report(f"{merged:,} of {len(points.positions):,} points repeat others, and were merged with them")
-    require_surface(positions, len(points.positions))
-    return Points(positions, values, points.origin)
 
 
 def _believing(points: Points, report: Report) -> Points:

@@ -98,11 +98,6 @@ class GltfFile:
             values[rows] = self._rows(sparse["values"], dtype, width, sparse["count"])
         return decode_accessor(values, accessor)
 
-    def image_bytes(self, index: int) -> bytes:
-        """The encoded file of an image."""
-        image = self.document["images"][index]
-        return read_companion(self.folder, image["uri"]) if "uri" in image else bytes(self.view(image["bufferView"]))
-
     def view(self, index: int) -> memoryview:
         """What a buffer view holds."""
         view = self.document["bufferViews"][index]
@@ -259,8 +254,10 @@ class Textures:
         if source is None:
             formats = ", ".join(extensions) or "no image"
             raise RejectedAsset(f"material {self.name!r} has a texture that cannot be read: {formats}")
-        label = self.file.document["images"][source].get("uri", f"image {source}")
-        return read_image(self.file.image_bytes(source), label[:80])
+        image = self.file.document["images"][source]
+        if "uri" in image:
+            return read_image(read_companion(self.file.folder, image["uri"]), image["uri"][:80])
+        return read_image(bytes(self.file.view(image["bufferView"])), f"image {source}")
 
     def _wrap(self, texture: dict) -> Wrap:
         sampler = self.file.document["samplers"][texture["sampler"]] if "sampler" in texture else {}

@@ -27,8 +27,6 @@ import numpy as np
 
 from spnr_jax.errors import UserError, is_bug
 from spnr_jax.formats.assets import (
-    CHANNELS,
-    TEXTURES,
     Asset,
     Material,
     Part,
@@ -60,21 +58,18 @@ def assemble(asset: Asset, strict: bool) -> Asset:
     """The asset with its parts checked, cleaned, merged and, for references, tinted; changes are named in `ignored`."""
     for part in asset.parts:
         _check_columns(part)
-        _check_material(part.material)
     low, high = bounding_box(asset)
     smallest = DEGENERATE_AREA * np.sum((high - low) ** 2)
     notes: set[str] = set(asset.ignored)
     degenerate = 0
     groups: dict[tuple, list[Part]] = {}
-    identities: dict[int, str] = {}  # by id: `groups` and `asset` keep every material alive
     for whole in asset.parts:
         solid = face_areas(whole) > smallest
         degenerate += int((~solid).sum())
         if not solid.any():
             continue
         part = _clean_part(replace(whole, faces=whole.faces[solid]), notes, strict)
-        key = identities.setdefault(id(part.material), _identity(part.material)), part.normals is None
-        groups.setdefault(key, []).append(part)
+        groups.setdefault((_identity(part.material), part.normals is None), []).append(part)
     if not groups:
         raise RejectedAsset("has no face with an area")
     if degenerate:
@@ -95,21 +90,12 @@ def _check_columns(part: Part) -> None:
         )
 
 
-def _check_material(material: Material) -> None:
-    """Refuse a material whose channels are not finite values, one or a texture of them."""
-    present = [name for name in TEXTURES if getattr(material, name) is not None]
-    for name in (*CHANNELS, *present):
-        values, inner = getattr(material, name), (3,) * (CHANNELS | TEXTURES)[name]
-        rows = values.shape[: values.ndim - len(inner)]
-        if values.shape[len(rows) :] != inner or len(rows) not in (0, 2) or not values.size:
-            raise RejectedAsset(f"has a material with {name} of shape {values.shape}: broken file")
-        if not np.isfinite(values).all():
-            raise RejectedAsset(f"has a material whose {name} is not finite (NaN or infinity)")
-
-
 def _clean_part(part: Part, notes: set[str], strict: bool) -> Part:
-    """The part with just the columns that its material needs."""
-    part = _settle_texture(_drop_unused_vertices(part), notes)
+    """The part with just the vertices that its faces use, in their order, and the columns that its material needs."""
+    used, faces = np.unique(part.faces, return_inverse=True)
+    kept: dict[str, Any] = {name: getattr(part, name) for name in WIDTHS}
+    kept = {name: None if values is None else values[used] for name, values in kept.items()}
+    part = _settle_texture(replace(part, **kept, faces=faces.reshape(-1, 3).astype(np.int64)), notes)
     part = replace(part, normals=_unit_normals(part, notes), colors=_check_colors(part, notes))
     if part.colors is None or part.material.base_color.ndim == 1 or not strict:
         return part
@@ -118,14 +104,6 @@ def _clean_part(part: Part, notes: set[str], strict: bool) -> Part:
         notes.add("vertex colours that vary over a texture (their mean is used)")
     look = replace(part.material, base_color=part.material.base_color * tint.astype(np.float32))
     return replace(part, material=look, colors=None)
-
-
-def _drop_unused_vertices(part: Part) -> Part:
-    """The part with only the vertices that its faces use, in their old order."""
-    used, faces = np.unique(part.faces, return_inverse=True)
-    kept: dict[str, Any] = {name: getattr(part, name) for name in WIDTHS}
-    kept = {name: None if values is None else values[used] for name, values in kept.items()}
-    return replace(part, **kept, faces=faces.reshape(-1, 3).astype(np.int64))
 
 
 def _settle_texture(part: Part, notes: set[str]) -> Part:

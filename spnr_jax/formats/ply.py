@@ -14,9 +14,9 @@ from itertools import islice
 import numpy as np
 
 from spnr_jax.errors import UserError
+from spnr_jax.formats.columns import Columns
 from spnr_jax.formats.text import SHOWN
 
-Columns = dict[str, np.ndarray]
 Lists = tuple[str, str]  # types of a list's length and of its items
 Element = tuple[str, int, list[tuple[str, str | Lists]]]  # name, count, [(property, type)]
 
@@ -167,19 +167,14 @@ def text_rows(lines: Iterator[str], count: int, layout: np.dtype) -> Iterator[np
             yield np.loadtxt(rows, dtype=layout, comments=None, ndmin=1)
         except ValueError:
             wanted = len(layout.names or ())
-            broken = next((i for i, row in enumerate(rows) if not _fits(row, layout)), 0)
-            place = found - len(rows) + broken
-            raise UserError(f"point {place}: expected {wanted} numbers, found {rows[broken][:SHOWN]!r}") from None
+            for place, row in enumerate(rows, found - len(rows)):
+                try:
+                    np.loadtxt([row], dtype=layout, comments=None, ndmin=1)
+                except ValueError:
+                    raise UserError(f"point {place}: expected {wanted} numbers, found {row[:SHOWN]!r}") from None
+            raise
     if not count:
         yield np.empty(0, layout)
-
-
-def _fits(row: str, layout: np.dtype) -> bool:
-    """Whether a line of text is one record."""
-    try:
-        return np.loadtxt([row], dtype=layout, comments=None, ndmin=1).size == 1
-    except ValueError:
-        return False
 
 
 def binary_rows(file: BufferedIOBase, count: int, layout: np.dtype) -> Iterator[np.ndarray]:
