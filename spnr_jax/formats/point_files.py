@@ -54,14 +54,11 @@ FOREIGN: dict[bytes | str, tuple] = {
     b"#usda": ("USD (text)", "6x3s", BLENDER),
     b"ASTM-E57": ("an E57 scan", "<8x2I", CLOUDCOMPARE),
     b"Kaydara FBX Binary": ("an FBX scene", "<23xI", BLENDER),
-    b"BLENDER": ("a Blender scene", "9x3s", "export it as .glb: File > Export > glTF 2.0"),
-    b"\x89HDF": ("an HDF5 file", None, "write its points as .npz: arrays points and colors"),
     ".usdz": ("USD (package)", None, BLENDER),
     **dict.fromkeys((".usd", ".usda", ".usdc"), ("USD", None, BLENDER)),
     ".e57": ("an E57 scan", None, CLOUDCOMPARE),
     **dict.fromkeys((".ptx", ".rcp", ".rcs", ".fls", ".bin"), ("a scan of its maker's own kind", None, CLOUDCOMPARE)),
     **dict.fromkeys((".fbx", ".dae", ".3ds", ".3mf", ".blend", ".x3d", ".wrl"), ("a scene", None, BLENDER)),
-    **dict.fromkeys((".stp", ".step", ".iges", ".igs"), ("a CAD model", None, "export a mesh, .stl or .glb")),
     **dict.fromkeys((".splat", ".ksplat", ".sog"), ("a file of splats", None, "convert it to .ply with SuperSplat")),
 }
 
