@@ -196,7 +196,7 @@ def ears(corners: np.ndarray) -> np.ndarray:
 
 
 def _is_ear(flat: np.ndarray, ear: list[int], left: list[int]) -> bool:
-    """Whether three of the points (n, 2) turn left and no other of those left lies in their triangle or on its border."""
+    """Whether three of the points (n, 2) turn left and no other of those left lies in their triangle or on it."""
     edges = flat[[ear[1], ear[2], ear[0]]] - flat[ear]
     if edges[0, 0] * edges[1, 1] <= edges[0, 1] * edges[1, 0]:
         return False
