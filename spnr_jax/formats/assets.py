@@ -29,7 +29,7 @@ import binascii
 import importlib
 import io
 import os
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -204,10 +204,11 @@ class Alpha(NamedTuple):
 
 
 class Tolerance:
-    """The policy of one reading, and what came of it."""
+    """The policy of one reading, and what came of it; `ignored` names what a file holds that is not modelled."""
 
     def __init__(self, transparent_parts: TransparentParts):
         self.transparent_parts = transparent_parts
+        self.ignored: set[str] = set()
         self.said: dict[str, dict[str, None]] = {}  # beginning of a sentence -> names, in their order
 
     @property
@@ -252,11 +253,15 @@ class Tolerance:
         """Keeps for the notes that a material's colours are what is to be seen, light and all."""
         self._say("colours that hold light already (KHR_materials_unlit) taken as base colours", name)
 
-    def notes(self) -> Iterable[str]:
-        """One sentence for each thing that was decided."""
+    def asset(self, parts: Sequence[Part], *more_notes: str) -> Asset:
+        """The asset of the parts, with a sentence for each thing that was decided; RejectedAsset if there are none."""
+        notes = []
         for beginning, names in self.said.items():
             more = f" and {len(names) - MOST_NAMES} more" if len(names) > MOST_NAMES else ""
-            yield f"{beginning}: {', '.join(list(names)[:MOST_NAMES])}{more}"
+            notes.append(f"{beginning}: {', '.join(list(names)[:MOST_NAMES])}{more}")
+        if not parts:
+            raise RejectedAsset(f"has nothing to draw: {'; '.join(notes)}" if notes else "has no faces")
+        return Asset(parts=tuple(parts), ignored=tuple(sorted(self.ignored)), notes=(*notes, *more_notes))
 
     def _say(self, beginning: str, name: str, quoted: bool = True) -> None:
         self.said.setdefault(beginning, {})[repr(name[:LONGEST_NAME]) if quoted else name[:200]] = None

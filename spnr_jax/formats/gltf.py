@@ -86,7 +86,8 @@ def load_gltf(path: Path, transparent_parts: TransparentParts = "refuse") -> Ass
     for extension in document.get("extensionsRequired", []):
         if extension not in READABLE and not extension.startswith("KHR_materials_"):
             raise RejectedAsset(f"needs {extension}, which cannot be read: export it without that extension")
-    ignored = {key for key in ("animations", "skins") if document.get(key)}
+    ignored = tolerance.ignored
+    ignored |= {key for key in ("animations", "skins") if document.get(key)}
     ignored |= DROPPED.intersection(document.get("extensionsUsed", []))
     materials: dict[int | None, GltfMaterial] = {}
     shapes: dict[int, Shape] = {}  # by id: the document keeps every primitive alive
@@ -100,7 +101,7 @@ def load_gltf(path: Path, transparent_parts: TransparentParts = "refuse") -> Ass
         if index not in materials:
             materials[index] = read_material(file, index, tolerance)
         look, again = materials[index], id(primitive) in shapes
-        ignored |= look.ignored | {"KHR_materials_variants"}.intersection(primitive.get("extensions", {}))
+        ignored |= {"KHR_materials_variants"}.intersection(primitive.get("extensions", {}))
         if primitive.get("targets"):
             ignored.add("morph targets")
         if look.material is None:
@@ -113,9 +114,7 @@ def load_gltf(path: Path, transparent_parts: TransparentParts = "refuse") -> Ass
         if repeated > MOST_REPEATED:
             raise RejectedAsset(f"repeats its meshes more than can be read ({MOST_REPEATED} faces)")
         parts.append(_place(shape, look, look.material, matrix))
-    if not parts and any(look.material is None for look in materials.values()):
-        raise RejectedAsset(f"has nothing to draw: {'; '.join(tolerance.notes())}")
-    return Asset(parts=tuple(parts), ignored=tuple(sorted(ignored)), notes=tuple(tolerance.notes()))
+    return tolerance.asset(parts)
 
 
 def gltf_points(path: Path) -> dict[str, np.ndarray] | None:

@@ -220,12 +220,11 @@ class Placement(NamedTuple):
 
 
 class Textures:
-    """Reads a material's textures; `place` says where the first lies, `ignored` what was dropped."""
+    """Reads a material's textures; `place` says where the first lies."""
 
     def __init__(self, file: GltfFile, name: str, tolerance: Tolerance):
         self.file, self.name, self.tolerance = file, name, tolerance
         self.place: Placement | None = None
-        self.ignored: set[str] = set()
 
     def read(self, info: dict | None, stand_in: tuple[int, ...]) -> np.ndarray | None:
         """Encoded texels (h, w, 4) of a textureInfo, or of the stand-in (4,) where its image may be missing.
@@ -244,7 +243,7 @@ class Textures:
         self.place = self.place or place
         if place == self.place:
             return texels
-        self.ignored.add("second texture with its own coordinates (its mean is used)")
+        self.tolerance.ignored.add("second texture with its own coordinates (its mean is used)")
         return texels.mean(axis=(0, 1), keepdims=True).round().astype(np.uint8)
 
     def _image(self, texture: dict) -> np.ndarray:
@@ -263,9 +262,9 @@ class Textures:
         sampler = self.file.document["samplers"][texture["sampler"]] if "sampler" in texture else {}
         wrap_s, wrap_t = WRAPS[sampler.get("wrapS", 10497)], WRAPS[sampler.get("wrapT", 10497)]
         if wrap_s != wrap_t:
-            self.ignored.add(f"wrapT {wrap_t} (wrapS {wrap_s} is used for both)")
+            self.tolerance.ignored.add(f"wrapT {wrap_t} (wrapS {wrap_s} is used for both)")
         if sampler.get("magFilter") == NEAREST:
-            self.ignored.add("nearest-texel filter (bilinear is used)")
+            self.tolerance.ignored.add("nearest-texel filter (bilinear is used)")
         return wrap_s
 
 
@@ -290,7 +289,6 @@ class GltfMaterial(NamedTuple):
     material: Material | None
     placement: Placement
     has_alpha: bool
-    ignored: set[str]
 
 
 def read_material(file: GltfFile, index: int | None, tolerance: Tolerance) -> GltfMaterial:
@@ -308,22 +306,18 @@ def read_material(file: GltfFile, index: int | None, tolerance: Tolerance) -> Gl
     shown = tolerance.cut_out(name, material, _alpha(spec, factor, color, tolerance.strict))
     if "KHR_materials_unlit" in extensions:
         tolerance.holds_light(name)
-    ignored = {key for key in extensions if key != SPECULAR_GLOSSINESS}
-    ignored |= {key for key in ("normalTexture", "occlusionTexture") if key in spec}
-    normal_map, bumps = None, None if tolerance.strict else spec.get("normalTexture")
-    if bumps is not None and (encoded := textures.read(bumps, FLAT)) is not None:
-        scale = float(bumps.get("scale", 1.0))
-        normal_map = color_texels(encoded, DIRECTION_TABLE) * np.array([scale, scale, 1], np.float32)
-        ignored.discard("normalTexture")
+    dropped = {"occlusionTexture", "normalTexture"} if tolerance.strict else {"occlusionTexture"}
+    tolerance.ignored |= (extensions.keys() - {SPECULAR_GLOSSINESS}) | (spec.keys() & dropped)
     if any(spec.get("emissiveFactor", ())):
-        ignored.add("emissive")
+        tolerance.ignored.add("emissive")
+    bumps = None if tolerance.strict else textures.read(spec.get("normalTexture"), FLAT)
+    if shown is not None and bumps is not None:
+        scale = float(spec["normalTexture"].get("scale", 1.0))
+        normal_map = color_texels(bumps, DIRECTION_TABLE) * np.array([scale, scale, 1], np.float32)
+        shown = replace(shown, normal_map=normal_map)
     placement = textures.place or Placement()
-    return GltfMaterial(
-        material=None if shown is None else replace(shown, wrap=placement.wrap, normal_map=normal_map),
-        placement=placement,
-        has_alpha=spec.get("alphaMode", "OPAQUE") != "OPAQUE",
-        ignored=ignored | textures.ignored,
-    )
+    shown = shown and replace(shown, wrap=placement.wrap)
+    return GltfMaterial(shown, placement, spec.get("alphaMode", "OPAQUE") != "OPAQUE")
 
 
 def metallic_roughness(diffuse: np.ndarray, specular: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

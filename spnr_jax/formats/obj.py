@@ -72,20 +72,17 @@ def load_obj(path: Path, root: Path | None = None, transparent_parts: Transparen
     library: Library = {}
     for names in text.libraries:
         library |= parse_mtl(_read_library(read, path.parent, names, tolerance))
-    columns, ignored = _columns(text), set[str]()
+    columns = _columns(text)
     colors, notes = colors_of(columns) or (None, [])
     looks: dict[str, Material | None] = {}
     for name in dict.fromkeys(text.used):
-        looks[name] = _look(read, name, library, ignored, tolerance) if name else make_material()
+        looks[name] = _look(read, name, library, tolerance) if name else make_material()
         if colors is not None and name not in library:  # what has colours of its own is not multiplied with grey
             looks[name] = make_material(1.0)
     parts = _parts(text, columns, colors, looks)
-    if not parts:
-        raise RejectedAsset(f"has nothing to draw: {'; '.join(tolerance.notes()) or 'no triangles'}")
     if text.rows["vn"] and any(part.normals is None for part in parts):
-        ignored.add("normals that only some faces have (flat shading is used)")
-    parts = _without_doubles(parts, ignored)
-    return Asset(parts=tuple(parts), ignored=tuple(sorted(ignored)), notes=(*tolerance.notes(), *notes))
+        tolerance.ignored.add("normals that only some faces have (flat shading is used)")
+    return tolerance.asset(_without_doubles(parts, tolerance) if parts else [], *notes)
 
 
 def obj_points(path: Path) -> Columns | None:
@@ -172,7 +169,7 @@ def _parts(text: Text, columns: Columns, colors: np.ndarray | None, looks: dict[
     return parts
 
 
-def _without_doubles(parts: list[Part], ignored: set[str]) -> list[Part]:
+def _without_doubles(parts: list[Part], tolerance: Tolerance) -> list[Part]:
     """The parts without the faces whose three corners an earlier face, of any part, has in some order."""
     corners = np.concatenate([part.positions[part.faces] for part in parts])
     order = np.lexsort(np.moveaxis(corners, -1, 0)[::-1], axis=-1)
@@ -182,7 +179,7 @@ def _without_doubles(parts: list[Part], ignored: set[str]) -> list[Part]:
     kept[first] = True
     if kept.all():
         return parts
-    ignored.add(f"{int((~kept).sum())} doubled faces (one of each is kept)")
+    tolerance.ignored.add(f"{int((~kept).sum())} doubled faces (one of each is kept)")
     ends = np.cumsum([len(part.faces) for part in parts])[:-1]
     return [replace(part, faces=part.faces[here]) for part, here in zip(parts, np.split(kept, ends), strict=True)]
 
@@ -212,7 +209,7 @@ def _read_library(read: Read, folder: Path, names: str, tolerance: Tolerance) ->
     return "\n".join(data.decode("utf-8", errors="replace") for data in found)
 
 
-def _look(read: Read, name: str, library: Library, ignored: set[str], tolerance: Tolerance) -> Material | None:
+def _look(read: Read, name: str, library: Library, tolerance: Tolerance) -> Material | None:
     """The principled material of an MTL entry; None where it is nowhere to be seen."""
     if name not in library:
         tolerance.goes_on_without(MissingFile(f"uses a material that no library defines: {name!r}"))
@@ -226,17 +223,17 @@ def _look(read: Read, name: str, library: Library, ignored: set[str], tolerance:
         if key not in entry:
             continue
         options, file = _options(entry[key])
-        ignored |= {f"MTL map option -{option}" for option in options if option != "clamp"}
+        tolerance.ignored |= {f"MTL map option -{option}" for option in options if option != "clamp"}
         try:
             maps[key] = read_image(read(file), file)
             wrap = "clamp" if options.get("clamp") == ["on"] else wrap
         except MissingFile as missing:
             tolerance.goes_on_without(missing)
-    ignored |= {f"MTL {key}" for key in entry if key not in READ | SILENT and entry[key].strip("0. ")}
+    tolerance.ignored |= {f"MTL {key}" for key in entry if key not in READ | SILENT and entry[key].strip("0. ")}
     color = np.array([float(x) for x in entry.get("kd", "0.5 0.5 0.5").split()[:3]])
     if "map_kd" in maps:
         if "kd" in entry and not np.all(color == 1):
-            ignored.add("MTL Kd beside map_Kd")
+            tolerance.ignored.add("MTL Kd beside map_Kd")
         color = color_texels(maps["map_kd"])
     roughness = np.sqrt(2 / (max(float(entry["ns"]), 0) + 2)) if "ns" in entry else 0.5
     channels: dict[str, float | np.ndarray]
