@@ -29,6 +29,7 @@ import binascii
 import importlib
 import io
 import os
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -36,9 +37,9 @@ from typing import Any, Literal, NamedTuple
 from urllib.parse import unquote, unquote_to_bytes
 
 import numpy as np
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 
-from spnr_jax.errors import UserError
+from spnr_jax.errors import UserError, is_bug
 from spnr_jax.formats.columns import srgb_to_linear
 
 Wrap = Literal["repeat", "mirror", "clamp"]
@@ -56,7 +57,9 @@ MAX_SIZE = 1024
 MOST_PIXELS = 2**26  # of an image file: 8192 x 8192
 KTX2 = b"\xabKTX 20\xbb\r\n\x1a\n"
 # what readers of images raise on those that break their rules
-UNREADABLE = (OSError, SyntaxError, ValueError, LookupError, RuntimeError, Image.DecompressionBombError)
+UNREADABLE: tuple[type[Exception], ...]
+UNREADABLE = (OSError, SyntaxError, ValueError, LookupError, RuntimeError, AttributeError)
+UNREADABLE += (Image.DecompressionBombError, Image.DecompressionBombWarning)
 LEVELS = np.arange(256) / 255  # of 8 bits
 SRGB_TABLE, DIRECTION_TABLE = srgb_to_linear(LEVELS).astype(np.float32), (2 * LEVELS - 1).astype(np.float32)
 
@@ -268,18 +271,31 @@ class Tolerance:
 
 
 def read_image(data: bytes, name: str) -> np.ndarray:
-    """Texels (height, width, 4) uint8 of an image file as they are encoded; alpha is 255 where it has none."""
+    """The texels of `decode_image`; RejectedAsset, which names it, for an image that cannot be read."""
     try:
-        if data.startswith(KTX2):
-            raise UserError("KTX2, which is not read: convert it to PNG, e.g. with `ktx extract`")
-        with Image.open(io.BytesIO(data)) as image:
-            if image.width * image.height > MOST_PIXELS:
-                raise UserError(f"{image.width} x {image.height} pixels, more than {MOST_PIXELS}")
-            if image.mode.startswith("I"):  # PIL would clip 16-bit grey to 255 instead of scaling it
-                return np.asarray(Image.fromarray((np.asarray(image) // 257).astype(np.uint8)).convert("RGBA"))
-            return np.asarray(image.convert("RGBA"))
-    except UNREADABLE as error:
+        return decode_image(data)
+    except UserError as error:
         raise RejectedAsset(f"names an image that cannot be read: {name} ({error})") from None
+
+
+def decode_image(data: bytes) -> np.ndarray:
+    """Texels (height, width, 4) uint8 of an image file as they are encoded; alpha is 255 where it has none."""
+    if data.startswith(KTX2):
+        raise UserError("KTX2, which is not read: convert it to PNG, e.g. with `ktx extract`")
+    try:
+        with warnings.catch_warnings(action="error", category=Image.DecompressionBombWarning):
+            image: Image.Image = Image.open(io.BytesIO(data))
+        if image.width * image.height > MOST_PIXELS:  # before memory is taken for them
+            raise UserError(f"{image.width} x {image.height} pixels, more than {MOST_PIXELS}")
+        if image.mode.startswith("I"):  # PIL would clip 16-bit grey to 255 instead of scaling it
+            image = Image.fromarray((np.asarray(image) // 257).astype(np.uint8))
+        return np.asarray(image.convert("RGBA"))
+    except UnidentifiedImageError:
+        raise UserError("is not an image") from None
+    except UNREADABLE as error:
+        if is_bug(error):
+            raise
+        raise UserError(str(error)) from None
 
 
 def color_texels(encoded: np.ndarray, table: np.ndarray = SRGB_TABLE) -> np.ndarray:
