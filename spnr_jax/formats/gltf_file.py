@@ -1,8 +1,8 @@
 """A glTF 2.0 file, .gltf or .glb: its JSON document, its accessors decoded, its materials as principled ones.
 
-Read here and not through trimesh 5.2, whose reader leaves normalised integers unscaled, sparse accessors zero, drops
-triangle fans, and shows a compressed file as vertices at the origin; tests compare the rest with trimesh.  DracoPy
-(KHR_draco_mesh_compression) and meshoptimizer (EXT_, KHR_meshopt_compression) are extras.
+Read here and not through trimesh 5.2, whose reader leaves normalised integers unscaled, drops triangle fans, and shows
+a compressed file as vertices at the origin; tests compare the rest with trimesh.  DracoPy (KHR_draco_mesh_compression)
+and meshoptimizer (EXT_, KHR_meshopt_compression) are extras.
 
 base colour = factor x texture (sRGB -> linear); roughness = factor x G, metallic = factor x B of the metallic-roughness
 texture; defaults white, 1, 1. KHR_materials_pbrSpecularGlossiness is converted with the formulas of the extension's
@@ -40,7 +40,6 @@ from spnr_jax.formats.assets import (
 
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
-MOST_ZEROS = 2**22  # rows that an accessor without a buffer may announce: nothing in the file stands for them
 DRACO, MESHOPT = "KHR_draco_mesh_compression", ("EXT_meshopt_compression", "KHR_meshopt_compression")
 FILTERS = {  # of meshopt: the library's function, and the widths of a vertex
     "OCTAHEDRAL": ("decode_filter_oct", (4, 8)),
@@ -83,20 +82,15 @@ class GltfFile:
     def accessor(self, index: int) -> np.ndarray:
         """Values (count, width) of an accessor: float64 for floats and normalised integers, int64 for other ones."""
         accessor = self.document["accessors"][index]
+        if "sparse" in accessor or "bufferView" not in accessor:
+            raise RejectedAsset(f"accessor {index} is sparse or holds no data, which is not read: export it plain")
         dtype, width = np.dtype(COMPONENTS[accessor["componentType"]]), WIDTHS[accessor["type"]]
-        count, sparse = accessor["count"], accessor.get("sparse")
-        if "bufferView" in accessor:
-            values = self._rows(accessor, dtype, width, count)
-        elif sparse and 0 <= count <= MOST_ZEROS:
-            values = np.zeros((count, width), dtype)
-        else:
-            raise RejectedAsset(f"accessor {index} holds no data: the file is compressed by an extension")
-        if sparse:
-            index_type = np.dtype(COMPONENTS[sparse["indices"]["componentType"]])
-            rows = self._rows(sparse["indices"], index_type, 1, sparse["count"])[:, 0]
-            values = values.copy()
-            values[rows] = self._rows(sparse["values"], dtype, width, sparse["count"])
-        return decode_accessor(values, accessor)
+        number, count, start = accessor["bufferView"], accessor["count"], accessor.get("byteOffset", 0)
+        stride, view = self.document["bufferViews"][number].get("byteStride", dtype.itemsize * width), self.view(number)
+        if count and start + (count - 1) * stride + width * dtype.itemsize > len(view):
+            raise RejectedAsset(f"buffer view {number} is shorter than its accessor says: truncated or broken file")
+        rows = np.ndarray((count, width), dtype, buffer=view, offset=start, strides=(stride, dtype.itemsize))
+        return decode_accessor(rows, accessor)
 
     def view(self, index: int) -> memoryview:
         """What a buffer view holds."""
@@ -108,15 +102,6 @@ class GltfFile:
         if index not in self._unpacked:
             self._unpacked[index] = unpack(self._slice(packed), packed)
         return memoryview(self._unpacked[index])
-
-    def _rows(self, place: dict, dtype: np.dtype, width: int, count: int) -> np.ndarray:
-        """Rows (count, width) from a place in a buffer view on, read with the view's stride."""
-        index, start = place["bufferView"], place.get("byteOffset", 0)
-        stride = self.document["bufferViews"][index].get("byteStride", dtype.itemsize * width)
-        view = self.view(index)
-        if count and start + (count - 1) * stride + width * dtype.itemsize > len(view):
-            raise RejectedAsset(f"buffer view {index} is shorter than its accessor says: truncated or broken file")
-        return np.ndarray((count, width), dtype, buffer=view, offset=start, strides=(stride, dtype.itemsize))
 
     def _slice(self, view: dict) -> memoryview:
         start, length, number = view.get("byteOffset", 0), view["byteLength"], view["buffer"]

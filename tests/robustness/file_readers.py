@@ -179,9 +179,6 @@ def scene(material: dict, *images: tuple[str, bytes], suffix: str = ".gltf", **n
     if images and images[0][0].endswith(".webp"):
         builder.document["textures"][0] = {"extensions": {"EXT_texture_webp": {"source": 0}}}
     square = builder.primitive(material=builder.material(**material), TEXCOORD_0=UV)
-    rows, values = builder.view(np.uint16([0, 3]).tobytes()), builder.view(np.float32([[5, 6, 7]] * 2).tobytes())
-    sparse = {"count": 2, "indices": {"bufferView": rows, "componentType": 5123}, "values": {"bufferView": values}}
-    builder.document["accessors"][0]["sparse"] = sparse
     child = builder.mesh(square, root=False, translation=[1, 0, 0])
     builder.node(children=[child], rotation=[0, 0, 0, 1], scale=[1, 2, 1])
     builder.mesh(builder.primitive(), translation=[5, 0, 0])
