@@ -17,12 +17,13 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
-from damage import Files
 from support import splat_balls, tiny_dataset
 from support.gltf_files import UV, GltfBuilder, png
 from support.packed_meshes import MESHOPT
 from support.point_clouds import packed_splats
 from support.point_tables import WHOLE, WRITERS, written
+
+Files = dict[str, bytes]
 
 MOST_POINTS = 32
 TEXELS = np.random.default_rng(7).integers(0, 256, (4, 4, 4))
