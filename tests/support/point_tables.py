@@ -29,11 +29,6 @@ SOUND = np.delete(np.arange(12), [1, 3, 5])
 PCD_FIELDS = [("x", "<f4"), ("y", "<f4"), ("pad", "u1", (3,)), ("z", "<f4"), ("rgb", "<f4"), ("roughness", "<f8")]
 
 
-def packed(colors: np.ndarray) -> np.ndarray:
-    """Colours (n, 3) of 8 bits in the bits of floats (n,)."""
-    return (colors[:, 0] << 16 | colors[:, 1] << 8 | colors[:, 2]).astype(np.uint32).view(np.float32)
-
-
 def compress_lzf(data: bytes) -> bytes:
     """LZF whose only copies are of runs of one byte."""
     out = b""
@@ -82,7 +77,7 @@ def as_pcd(encoding: str, newline: str = "\n", stored: bool = False):
         rows = np.zeros(12, PCD_FIELDS)
         with np.errstate(over="ignore"):
             rows["x"], rows["y"], rows["z"] = table.positions.T
-        rows["rgb"] = packed(table.levels)
+        rows["rgb"] = (table.levels @ [1 << 16, 1 << 8, 1]).astype(np.uint32).view(np.float32)
         rows["roughness"] = table.roughness
         return pcd_content(encoding, rows, newline, stored)
 
