@@ -17,9 +17,10 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
+from PIL import Image
 from support import splat_balls, tiny_dataset
 from support.gltf_files import UV, GltfBuilder, png
-from support.packed_meshes import MESHOPT
+from support.packed_meshes import draco_square, meshopt_files
 from support.point_clouds import packed_splats
 from support.point_tables import WHOLE, WRITERS, written
 
@@ -172,7 +173,7 @@ def objs() -> list[Files]:
     return [{"mesh.obj": (corners + faces).encode()} | companions, *tables(".obj")]
 
 
-def scene(material: dict, *images: tuple[str, bytes], suffix: str = ".gltf", **node) -> Files:
+def scene(material: dict, *images: tuple[str, bytes], suffix: str = ".gltf") -> Files:
     """A square of a material under a node, beside an opaque one; the images lie beside the file."""
     builder = GltfBuilder()
     for number, (name, _) in enumerate(images):
@@ -189,10 +190,8 @@ def scene(material: dict, *images: tuple[str, bytes], suffix: str = ".gltf", **n
 
 
 def scenes() -> list[Files]:
-    """Masks, glass, normal maps with coordinates of their own, the older specular workflow, packed images, points."""
+    """Masks, glass, normal maps, textures that lie differently, the older specular workflow, WebP, points."""
     webp = io.BytesIO()
-    from PIL import Image
-
     Image.fromarray(TEXELS.astype(np.uint8)).save(webp, "webp", lossless=True)
     pictures = ("a.png", png(TEXELS)), ("b.png", png(TEXELS[..., :3]))
     base = {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}, "baseColorFactor": [1, 1, 1, 0.9]}}
@@ -208,34 +207,6 @@ def scenes() -> list[Files]:
         scene({}, suffix=".glb"),
         *tables(".gltf", ".glb"),
     ]
-
-
-def packed_scenes() -> list[Files]:
-    """Meshes that Draco and meshopt packed."""
-    import DracoPy
-
-    box, name = trimesh.creation.box(), "KHR_draco_mesh_compression"
-    data = DracoPy.encode(box.vertices.astype(np.float32), box.faces.astype(np.uint32))
-    ids = {"POSITION": DracoPy.decode(data).attributes[0]["unique_id"]}
-    draco, meshopt = GltfBuilder(extensionsRequired=[name]), GltfBuilder()
-    extension = {name: {"bufferView": draco.view(data), "attributes": ids}}
-    draco.document["accessors"] = [
-        {"count": len(box.vertices), "type": "VEC3", "componentType": 5126},
-        {"count": box.faces.size, "type": "SCALAR", "componentType": 5123},
-    ]
-    draco.mesh({"attributes": {"POSITION": 0}, "indices": 1, "extensions": extension})
-    views = meshopt.document["bufferViews"]
-    for case in (MESHOPT["two blocks of steps, format 1"], MESHOPT["a grid"]):
-        described = {key: case[key] for key in ("count", "byteStride", "mode", "filter")}
-        extension = {"EXT_meshopt_compression": views[meshopt.view(case["packed"])] | described}
-        views[-1] = {"buffer": 0, "byteLength": case["count"] * case["byteStride"], "extensions": extension}
-    views[0]["byteStride"] = 8
-    meshopt.document["accessors"] = [
-        {"bufferView": 0, "count": 300, "type": "VEC3", "componentType": 5123, "normalized": True},
-        {"bufferView": 1, "count": 120, "type": "SCALAR", "componentType": 5125},
-    ]
-    meshopt.mesh({"attributes": {"POSITION": 0}, "indices": 1})
-    return [draco.files("mesh.gltf"), meshopt.files("mesh.gltf")]
 
 
 def splats() -> list[Files]:
@@ -313,7 +284,7 @@ READERS: dict[str, Reader] = {
     "off": (lambda: [*plain_meshes(".off"), *tables(".off")], read_cloud),
     "obj": (objs, read_mesh),
     "gltf": (scenes, read_mesh),
-    "gltf-packed": (packed_scenes, read_mesh),
+    "gltf-packed": (lambda: [draco_square().files("mesh.gltf"), meshopt_files()], read_mesh),
     **{
         name: (functools.partial(run_files, name), read)
         for name, read in (("config", read_config), ("metrics", read_metrics))
