@@ -3,8 +3,8 @@
 Polygons become fans of triangles, or ears where they are not convex (Meisters 1975), so that a notch stays empty.
 
 .ply    elements vertex and face through trimesh; colours by any of the names that those of points may have
-.stl    text through trimesh; binary: 80 bytes, a count u32, 50 bytes a triangle.  Where the count and the size of
-        the file disagree the size counts
+.stl    text: three lines `vertex x y z` a triangle; binary: 80 bytes, a count u32, 50 bytes a triangle.  The size of
+        the file counts where the count is 0
 .off    [C][N]OFF, counts, vertices x y z [normal] [colour], faces n i j k ... [colour]
 """
 
@@ -16,8 +16,6 @@ from pathlib import Path
 
 import numpy as np
 from trimesh.exchange.ply import load_ply
-from trimesh.exchange.stl import load_stl_ascii
-from trimesh.geometry import triangulate_quads
 
 from spnr_jax.formats.assets import Asset, Part, RejectedAsset, make_material
 from spnr_jax.formats.columns import SRGB, Columns, colors_of, rename
@@ -72,33 +70,25 @@ def _colored(
 
 def load_stl(data: bytes) -> Asset:
     """The raw asset of an STL file."""
-    if data[:5].lower() == b"solid" and b"facet" in data[:1024]:
-        loaded = load_stl_ascii(io.BytesIO(data))
-        meshes = loaded["geometry"].values() if "geometry" in loaded else [loaded]
-        parts = [
-            Part(
-                positions=np.asarray(m["vertices"], np.float64),
-                faces=triangulate_quads(m["faces"]),
-                material=make_material(),
-            )
-            for m in meshes
-            if m.get("faces") is not None
-        ]
-        return Asset(parts=tuple(parts))
-    if len(data) < STL_HEAD:
-        raise RejectedAsset(f"is cut off: a binary STL file has {STL_HEAD} bytes before its triangles")
-    announced = int.from_bytes(data[80:84], "little")
+    ignored: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
-    held = (len(data) - STL_HEAD) // STL_TRIANGLE.itemsize
-    if announced > held:
-        raise RejectedAsset(f"is cut off: its header announces {announced} triangles, {held} are there")
-    count = announced or held
-    if count != announced:
-        notes = (f"the header announces {announced} triangles, {held} stand behind it: these are drawn",)
-    rows = np.frombuffer(data, STL_TRIANGLE, count, STL_HEAD)
-    positions = rows["corners"].reshape(-1, 3).astype(np.float64)
-    ignored = ("STL attribute bytes",) if rows["attribute"].any() else ()
-    part = Part(positions=positions, faces=np.arange(3 * count).reshape(-1, 3), material=make_material())
+    if data[:5].lower() == b"solid" and b"facet" in data[:1024]:
+        text = b" ".join(re.findall(rb"(?i)\bvertex[ \t]+([^\r\n]*)", data))
+        positions = np.fromstring(text, sep=" ").reshape(-1, 3, 3)
+    else:
+        if len(data) < STL_HEAD:
+            raise RejectedAsset(f"is cut off: a binary STL file has {STL_HEAD} bytes before its triangles")
+        announced = int.from_bytes(data[80:84], "little")
+        held = (len(data) - STL_HEAD) // STL_TRIANGLE.itemsize
+        if announced > held:
+            raise RejectedAsset(f"is cut off: its header announces {announced} triangles, {held} are there")
+        if not announced:
+            notes = (f"the header announces 0 triangles, {held} stand behind it: these are drawn",)
+        rows = np.frombuffer(data, STL_TRIANGLE, announced or held, STL_HEAD)
+        positions = rows["corners"].astype(np.float64)
+        ignored = ("STL attribute bytes",) if rows["attribute"].any() else ()
+    faces = np.arange(3 * len(positions)).reshape(-1, 3)
+    part = Part(positions=positions.reshape(-1, 3), faces=faces, material=make_material())
     return Asset(parts=(part,), ignored=ignored, notes=notes)
 
 

@@ -34,11 +34,7 @@ def draco_square(**extension) -> GltfBuilder:
         {"componentType": 5123, "count": 6, "type": "SCALAR"},
     ]
     packed = {"bufferView": view, "attributes": {"POSITION": ids[0], "COLOR_0": ids[2]}} | extension
-    primitive = {
-        "attributes": {"POSITION": 0, "COLOR_0": 1},
-        "indices": 2,
-        "extensions": {"KHR_draco_mesh_compression": packed},
-    }
+    primitive = {"attributes": {"POSITION": 0, "COLOR_0": 1}, "indices": 2, "extensions": {name: packed}}
     builder.mesh(primitive, translation=[1, 0, 0])
     return builder
 
