@@ -6,7 +6,7 @@ import sys
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
-from support.point_clouds import read, sphere_points, write
+from support.point_clouds import read, sphere_points, write, write_rows
 
 from data_gen.store.layout import POINT_TYPE, encode_points
 from spnr_jax.formats import clouds
@@ -43,12 +43,7 @@ def test_the_points_of_a_data_set_come_back_as_they_are_and_nothing_is_assumed(t
 
 def materials(folder, **columns):
     """Base colours, roughness and metallic of three points with the columns, and what was reported."""
-    rows = np.zeros(3, [*((axis, "f8") for axis in "xyz"), *((n, np.asarray(v).dtype) for n, v in columns.items())])
-    rows["x"], rows["y"] = [0, 1, 0], [0, 0, 1]
-    for name, values in columns.items():
-        rows[name] = values
-    np.save(folder / "a.npy", rows)
-    cloud, lines = read(folder / "a.npy")
+    cloud, lines = read(write_rows(folder, [[0, 0, 0], [1, 0, 0], [0, 1, 0]], **columns))
     return cloud.base_color, cloud.roughness, cloud.metallic, lines
 
 

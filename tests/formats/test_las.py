@@ -6,26 +6,13 @@ import sys
 
 import numpy as np
 import pytest
+from support.point_clouds import SRGB
+from support.point_tables import WHOLE, as_scan
 
 from spnr_jax.formats.clouds import place_cloud, read_cloud
 
-laspy = pytest.importorskip("laspy")
-ORIGIN = np.array([500_000.0, 4_000_000.0, 120.0])
-
-
-def scan(path, point_format: int = 7, count=300):
-    """A scan of random points in a cube of ten metres; its positions, as a LAS file rounds them to millimetres."""
-    rng = np.random.default_rng(0)
-    header = laspy.LasHeader(point_format=point_format, version="1.4")
-    header.offsets, header.scales = ORIGIN, [0.001] * 3
-    las = laspy.LasData(header)
-    positions = np.round(rng.uniform(0, 10, (count, 3)), 3) + ORIGIN
-    las.x, las.y, las.z = positions.T
-    las.intensity = rng.integers(0, 2000, count)
-    if point_format == 7:
-        las.red, las.green, las.blue = (np.full(count, level, np.uint16) for level in (65535, 32768, 0))
-    las.write(path)
-    return positions
+pytest.importorskip("laspy")
+FAR = WHOLE._replace(positions=WHOLE.positions + [500_000.0, 4_000_000.0, 120.0])
 
 
 def in_own_chunks(path, sizes, announced: int):
@@ -53,24 +40,24 @@ def in_own_chunks(path, sizes, announced: int):
 
 @pytest.mark.parametrize(("suffix", "announced"), [(".las", None), (".laz", None), (".laz", 0), (".laz", 2**32 - 1)])
 def test_a_scan_keeps_its_coordinates_and_colours_in_chunks_of_any_size_and_is_z_up(tmp_path, suffix, announced):
-    positions = scan(tmp_path / f"a{suffix if announced is None else '.las'}")
+    as_scan(tmp_path / f"a{suffix if announced is None else '.las'}", FAR)
     if announced is not None:
-        in_own_chunks(tmp_path / "a.las", (120, 50, 130), announced)
+        in_own_chunks(tmp_path / "a.las", (5, 3, 4), announced)
     placed = place_cloud(tmp_path / f"a{suffix}")
     assert placed.up == "z"
     back = placed.cloud.positions @ placed.rotation + placed.origin
-    np.testing.assert_allclose(back, positions, rtol=0, atol=1e-4)
-    np.testing.assert_allclose(placed.cloud.base_color[0], [1, 0.2140, 0], atol=1e-4)
+    np.testing.assert_allclose(back, FAR.positions, rtol=0, atol=1e-4)
+    np.testing.assert_allclose(placed.cloud.base_color, SRGB[WHOLE.levels], atol=1e-4)
 
 
 def test_a_scan_without_colours_shows_its_intensity(tmp_path):
-    scan(tmp_path / "a.las", 6)
+    as_scan(tmp_path / "a.las", WHOLE, 6)
     assert np.ptp(read_cloud(tmp_path / "a.las").base_color) > 0.9
 
 
 @pytest.mark.parametrize("package", ["laspy", "lazrs"])
 def test_without_its_packages_one_line_names_the_extra(tmp_path, monkeypatch, package):
-    scan(tmp_path / "a.las")
+    as_scan(tmp_path / "a.las", WHOLE)
     monkeypatch.setitem(sys.modules, package, None)
     with pytest.raises(ValueError, match=rf"a.las: needs the package {package} .* pip install 'spnr-jax\[formats\]'"):
         read_cloud(tmp_path / "a.las")
@@ -87,7 +74,7 @@ def test_without_its_packages_one_line_names_the_extra(tmp_path, monkeypatch, pa
     ],
 )
 def test_what_announces_more_than_the_file_holds_never_reaches_the_library(suffix, place, value, reason, tmp_path):
-    scan(tmp_path / f"a{suffix}")
+    as_scan(tmp_path / f"a{suffix}", WHOLE)
     content = bytearray((tmp_path / f"a{suffix}").read_bytes())
     if place == "table":  # of chunks, which the library trusts
         (data,) = struct.unpack_from("<I", content, 96)

@@ -103,12 +103,14 @@ def as_numpy(path, table):
         np.save(path, rows)
 
 
-def as_scan(path, table):
+def as_scan(path, table, point_format: int = 7):
     laspy = pytest.importorskip("laspy")
-    scan = laspy.LasData(laspy.LasHeader(point_format=7, version="1.4"))
+    scan = laspy.LasData(laspy.LasHeader(point_format=point_format, version="1.4"))
     scan.header.scales = [0.125] * 3
     scan.x, scan.y, scan.z = table.positions.T
-    scan.red, scan.green, scan.blue = (257 * table.levels.T).astype(np.uint16)
+    scan.intensity = 100 * np.arange(12)
+    if point_format == 7:
+        scan.red, scan.green, scan.blue = (257 * table.levels.T).astype(np.uint16)
     scan.write(path)
 
 
