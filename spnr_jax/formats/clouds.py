@@ -217,7 +217,7 @@ def _shift(positions: np.ndarray, before: np.ndarray, report: Report) -> tuple[n
     """Positions (n, 3) from which `before` was subtracted, and the origin that is subtracted in the end."""
     whole = positions + before
     if not _coarse(whole):
-        return whole if before.any() else positions, np.zeros(3)
+        return whole, np.zeros(3)
     origin = np.floor(whole.min(axis=0))
     report(f"moved by {' '.join(f'{0 - value:.0f}' for value in origin)} to keep precision")
     return positions + (before - origin), origin
