@@ -224,7 +224,7 @@ class Textures:
         except MissingFile as missing:
             self.tolerance.goes_on_without(missing)
             texels = np.array(stand_in, np.uint8).reshape(1, 1, 4)
-        place = _placement(info, self._wrap(texture))
+        place = self._placement(info, texture)
         self.place = self.place or place
         if place == self.place:
             return texels
@@ -243,29 +243,24 @@ class Textures:
             return read_image(read_companion(self.file.folder, image["uri"]), image["uri"][:80])
         return read_image(bytes(self.file.view(image["bufferView"])), f"image {source}")
 
-    def _wrap(self, texture: dict) -> Wrap:
+    def _placement(self, info: dict[str, Any], texture: dict) -> Placement:
+        """Where a texture lies.
+
+        Rotations are counter-clockwise in a frame whose v runs down, as the extension's words and examples say (its
+        GLSL snippet turns the other way).
+        """
         sampler = self.file.document["samplers"][texture["sampler"]] if "sampler" in texture else {}
-        wrap_s, wrap_t = WRAPS[sampler.get("wrapS", 10497)], WRAPS[sampler.get("wrapT", 10497)]
-        if wrap_s != wrap_t:
-            self.tolerance.ignored.add(f"wrapT {wrap_t} (wrapS {wrap_s} is used for both)")
+        wrap, wrap_t = WRAPS[sampler.get("wrapS", 10497)], WRAPS[sampler.get("wrapT", 10497)]
+        if wrap != wrap_t:
+            self.tolerance.ignored.add(f"wrapT {wrap_t} (wrapS {wrap} is used for both)")
         if sampler.get("magFilter") == NEAREST:
             self.tolerance.ignored.add("nearest-texel filter (bilinear is used)")
-        return wrap_s
-
-
-def _placement(info: dict[str, Any], wrap: Wrap) -> Placement:
-    """Where a texture lies.
-
-    Rotations are counter-clockwise in a frame whose v runs down, as the extension's words and examples say (its GLSL
-    snippet turns the other way).
-    """
-    moved = info.get("extensions", {}).get(MOVED, {})
-    cos, sin = np.cos(moved.get("rotation", 0.0)), np.sin(moved.get("rotation", 0.0))
-    scale = np.asarray(moved.get("scale", (1, 1)), np.float64)
-    (a, b), (c, d) = np.array([[cos, sin], [-sin, cos]]) * scale
-    x, y = np.asarray(moved.get("offset", (0, 0)), np.float64)
-    matrix = (float(a), float(b)), (float(c), float(d))
-    return Placement(wrap, moved.get("texCoord", info.get("texCoord", 0)), matrix, (float(x), float(y)))
+        moved = info.get("extensions", {}).get(MOVED, {})
+        cos, sin = np.cos(moved.get("rotation", 0.0)), np.sin(moved.get("rotation", 0.0))
+        matrix = np.array([[cos, sin], [-sin, cos]]) * np.asarray(moved.get("scale", (1, 1)), np.float64)
+        (a, b), (c, d) = matrix.tolist()
+        x, y = moved.get("offset", (0, 0))
+        return Placement(wrap, moved.get("texCoord", info.get("texCoord", 0)), ((a, b), (c, d)), (float(x), float(y)))
 
 
 class GltfMaterial(NamedTuple):
