@@ -72,12 +72,12 @@ class MissingFile(RejectedAsset):
     """A file that a mesh file names is not there, or lies where it must not be looked for."""
 
 
-def extra(package: str) -> Any:
-    """A package of the extra `meshes`; RejectedAsset where it is not installed."""
+def extra(package: str, name: str = "meshes") -> Any:
+    """A package of an extra; RejectedAsset where it is not installed."""
     try:
         return importlib.import_module(package)
     except ImportError:
-        raise RejectedAsset(f"needs the package {package} to be read: pip install 'spnr-jax[meshes]'") from None
+        raise RejectedAsset(f"needs the package {package} to be read: pip install 'spnr-jax[{name}]'") from None
 
 
 @dataclass(frozen=True, kw_only=True)
