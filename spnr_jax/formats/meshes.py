@@ -58,6 +58,7 @@ def assemble(asset: Asset, strict: bool) -> Asset:
     """The asset with its parts checked, cleaned, merged and, for references, tinted; changes are named in `ignored`."""
     for part in asset.parts:
         _check_columns(part)
+    asset = asset if strict else _finite(asset)
     low, high = bounding_box(asset)
     smallest = DEGENERATE_AREA * np.sum((high - low) ** 2)
     notes: set[str] = set(asset.ignored)
@@ -75,6 +76,17 @@ def assemble(asset: Asset, strict: bool) -> Asset:
     if degenerate:
         notes.add(f"{degenerate} degenerate faces")
     return replace(asset, parts=tuple(map(_merge, groups.values())), ignored=tuple(sorted(notes)))
+
+
+def _finite(asset: Asset) -> Asset:
+    """The asset without faces that have a vertex which is not finite, and a note about how many these are."""
+    sound = [np.isfinite(part.positions[part.faces]).all(axis=(1, 2)) for part in asset.parts]
+    lost = sum(int((~faces).sum()) for faces in sound)
+    if not lost:
+        return asset
+    parts = tuple(replace(part, faces=part.faces[faces]) for part, faces in zip(asset.parts, sound, strict=True))
+    note = f"{lost:,} {'face' if lost == 1 else 'faces'} left out for a vertex that is NaN or infinity"
+    return replace(asset, parts=parts, notes=(*asset.notes, note))
 
 
 def _check_columns(part: Part) -> None:
@@ -228,8 +240,7 @@ def load_mesh(
             asset = PLAIN[kind](path.read_bytes())
         else:
             raise RejectedAsset(f"has suffix {kind!r}; expected one of {' '.join(SUFFIXES)}")
-        strict = transparent_parts == "refuse"
-        asset = assemble(asset if strict else _finite(asset), strict)
+        asset = assemble(asset, transparent_parts == "refuse")
     return replace(asset, source={"file": path.name, "sha256": hashlib.sha256(path.read_bytes()).hexdigest()})
 
 
@@ -257,23 +268,6 @@ def _refusing() -> Iterator[None]:
             raise
         text = f"{type(error).__name__}: {str(error).strip().partition(chr(10))[0]}"
         raise RejectedAsset(f"cannot be read, the file is broken or truncated ({text})") from error
-
-
-def _finite(asset: Asset) -> Asset:
-    """The asset without faces that name a vertex which is not finite, and a note about how many these are."""
-    parts, lost = [], 0
-    for part in asset.parts:
-        sound = np.isfinite(part.positions).all(axis=-1)
-        whole = part.faces.ndim == 2 and part.faces.size and 0 <= part.faces.min() <= part.faces.max() < len(sound)
-        if whole and not sound.all():
-            whole = sound[part.faces].all(axis=1)
-            lost += int((~whole).sum())
-            part = replace(part, faces=part.faces[whole], positions=np.where(sound[:, None], part.positions, 0))
-        parts.append(part)
-    if not lost:
-        return asset
-    note = f"{lost:,} {'face' if lost == 1 else 'faces'} left out for a vertex that is NaN or infinity"
-    return replace(asset, parts=tuple(parts), notes=(*asset.notes, note))
 
 
 def _safe(name: str) -> str:
