@@ -205,16 +205,14 @@ def find_meshes(folder: Path) -> list[tuple[str, Path]]:
         alone = siblings[path.parent] == 1 and path.suffix.lower() in NAMED_BY_FOLDER and path.parent.name
         names.append(_safe(path.parent.name if alone else path.stem))
     shared = Counter(name.casefold() for name in names)
-    ids: dict[str, Path] = {}
-    taken: set[str] = set()
+    ids: dict[str, tuple[str, Path]] = {}
     for name, path in zip(names, visible, strict=True):
         unique = wanted = name if shared[name.casefold()] == 1 else _safe("_".join(path.parts))
         number = 2
-        while unique.casefold() in taken or (unique != name and unique.casefold() in shared):
+        while unique.casefold() in ids or (unique != name and unique.casefold() in shared):
             unique, number = f"{wanted}-{number}", number + 1
-        taken.add(unique.casefold())
-        ids[unique] = folder / path
-    return sorted(ids.items())
+        ids[unique.casefold()] = unique, folder / path
+    return sorted(ids.values())
 
 
 def load_mesh(

@@ -7,9 +7,9 @@ fault is a ValueError that says what is wrong; the file's name is added by the c
 
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
 from io import BufferedIOBase
 from itertools import islice
+from typing import NamedTuple
 
 import numpy as np
 
@@ -32,8 +32,7 @@ LONGEST_LIST = 2**20  # items
 PIECE_BYTES, PIECE_LINES = 2**25, 2**17  # of the vertices that are in memory at a time
 
 
-@dataclass(frozen=True, kw_only=True)
-class PlyHeader:
+class PlyHeader(NamedTuple):
     """What a PLY file announces; byte_order is None in a text file."""
 
     byte_order: str | None
@@ -72,7 +71,7 @@ def read_ply_header(file: BufferedIOBase) -> PlyHeader:
     if byte_order == "unknown":
         raise UserError(f"has a PLY header without a known format; expected one of {', '.join(BYTE_ORDERS)}")
     file.seek(end.end())
-    return PlyHeader(byte_order=byte_order, elements=elements)
+    return PlyHeader(byte_order, elements)
 
 
 def element_pieces(file: BufferedIOBase, wanted: str = "vertex") -> Iterator[Columns]:
