@@ -26,7 +26,7 @@ from data_gen.store.check import checksum_of
 from data_gen.store.storage import Location
 from spnr_jax.devices.cluster import Died, connect, run_tasks
 from spnr_jax.errors import UserError
-from spnr_jax.formats.light_files import read_envmap
+from spnr_jax.formats.images import read_envmap
 from spnr_jax.surfels.skies import indoor_envmap
 
 # options that say where or how fast, or whose content is described instead

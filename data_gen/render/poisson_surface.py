@@ -24,8 +24,8 @@ from scipy.sparse.csgraph import breadth_first_order, connected_components, mini
 from scipy.spatial import cKDTree
 
 from spnr_jax.errors import UserError
-from spnr_jax.formats.mesh.assets import Asset, Material, Part
-from spnr_jax.formats.mesh.surface_points import vertex_normals
+from spnr_jax.formats.assets import Asset, Material, Part
+from spnr_jax.formats.surface_points import vertex_normals
 from spnr_jax.kernels.records import PointCloud
 
 NEIGHBOURS = 30

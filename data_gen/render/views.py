@@ -25,8 +25,8 @@ from typing import Any, Literal
 import numpy as np
 
 from data_gen.render.variant import mitsuba_module
+from spnr_jax.formats.assets import Asset, Material, Part, RejectedAsset
 from spnr_jax.formats.data_sets import on_white
-from spnr_jax.formats.mesh.assets import Asset, Material, Part, RejectedAsset
 
 POLE_COSINE = 0.999  # nearer to the y axis than this, z takes the part of "up"
 SURFACE_MARGIN = 1e-4  # a ray to the camera starts this far from its point: float32 places a point to about 1e-7

@@ -13,8 +13,7 @@ from data_gen.render import views
 from data_gen.store import check, layout, storage
 from spnr_jax.errors import UserError, at_least
 from spnr_jax.formats.data_sets import on_white
-from spnr_jax.formats.images import png_url
-from spnr_jax.formats.pages import template
+from spnr_jax.formats.images import png_url, template
 
 # point fields that are shown: three for a colour, one for grey
 CHANNELS = (("base_color_r", "base_color_g", "base_color_b"), ("roughness",), ("metallic",))

@@ -44,8 +44,8 @@ from spnr_jax import cli
 from spnr_jax.devices import runtime
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
+from spnr_jax.formats.assets import Asset
 from spnr_jax.formats.images import depth_image, png
-from spnr_jax.formats.mesh.assets import Asset
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.records import Camera
 from spnr_jax.scoring import evaluation

@@ -30,8 +30,7 @@ from spnr_jax.config import TrainConfig
 from spnr_jax.devices import runtime
 from spnr_jax.errors import UserError, at_least
 from spnr_jax.formats import data_sets
-from spnr_jax.formats.images import png_url
-from spnr_jax.formats.pages import template
+from spnr_jax.formats.images import png_url, template
 from spnr_jax.scoring import evaluation
 from spnr_jax.scoring.report import Cell, Table, difference, duration, head, lower_first, number, quality
 from spnr_jax.scoring.summary import differences, metric_settings, summarise

@@ -14,8 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from spnr_jax.formats.images import depth_image, png_url, to_uint8, write_whole
-from spnr_jax.formats.pages import template
+from spnr_jax.formats.images import depth_image, png_url, template, to_uint8, write_whole
 from spnr_jax.methods import label_of, to_dict
 from spnr_jax.scoring.evaluation import FLOORS, Evaluation, ObjectResult, median_view
 from spnr_jax.scoring.picture_scores import NO_LPIPS

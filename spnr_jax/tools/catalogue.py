@@ -24,8 +24,7 @@ from tqdm import tqdm
 from spnr_jax.devices import runtime
 from spnr_jax.devices.runtime import run_ahead
 from spnr_jax.errors import UserError, one_line
-from spnr_jax.formats.images import write_whole
-from spnr_jax.formats.pages import template
+from spnr_jax.formats.images import template, write_whole
 from spnr_jax.formats.point_files import MESHES, READERS
 from spnr_jax.tools.commands import WILDCARDS, Render
 from spnr_jax.tools.pictures import check_writable, draw_all, load_network, prepare_cloud

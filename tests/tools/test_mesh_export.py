@@ -8,7 +8,7 @@ import pytest
 import trimesh
 from support.solid_ball import CENTRE, RADIUS, ball_cloud, ball_grid
 
-from spnr_jax.formats.mesh.meshes import load_mesh
+from spnr_jax.formats.meshes import load_mesh
 from spnr_jax.tools.mesh_export import Grid, is_closed, mesh_of
 
 

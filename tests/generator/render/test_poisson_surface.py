@@ -9,7 +9,7 @@ from support.surfel_clouds import cloud
 
 from data_gen.render import poisson_surface, views
 from data_gen.render.poisson_surface import NoSurface, PoissonConfig
-from spnr_jax.formats.mesh.assets import Asset
+from spnr_jax.formats.assets import Asset
 
 needs_solver = pytest.mark.skipif(importlib.util.find_spec("pymeshlab") is None, reason="pymeshlab is not installed")
 RADIUS, COUNT = 0.7, 600

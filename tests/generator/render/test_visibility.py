@@ -11,8 +11,8 @@ from support.handmade import ball, box
 
 from data_gen.render import views
 from data_gen.render.variant import LLVM, choose_variant
-from spnr_jax.formats.mesh import surface_points
-from spnr_jax.formats.mesh.assets import Asset
+from spnr_jax.formats import surface_points
+from spnr_jax.formats.assets import Asset
 
 LIGHT = np.ones((8, 16, 3), np.float32)
 CONFIG = views.ViewConfig(resolution=64, views=1)
@@ -83,7 +83,7 @@ sys.path[:0] = {[str(Path(__file__).parent), str(Path(__file__).parents[2])]!r}
 import numpy as np
 from data_gen.render import views
 from data_gen.render.variant import mitsuba_module
-from spnr_jax.formats.mesh import surface_points
+from spnr_jax.formats import surface_points
 mitsuba_module(sys.argv[1])
 from test_visibility import CONFIG, CROWD, EYES, LIGHT, WALL_AND_BOX
 kept = [views.build_scene(WALL_AND_BOX, LIGHT), views.build_scene(CROWD, LIGHT)]
