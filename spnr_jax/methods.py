@@ -56,15 +56,11 @@ class Method:
     render: Function = later("spnr_jax.method.inference:draw_each")
     """(variables, volume, views, lights, *, config, quality) -> iterator of `Rendering`s, one a view."""
     prepare: Function = later("spnr_jax.training.batching:prepare")
-    """(config, dataset, run, *, light, own) -> function of a step that gives the batches from there on."""
+    """(config, dataset, run, *, light) -> function of a step that gives the batches from there on."""
     loss: Function = later("spnr_jax.method.inference:loss")
     """(variables, batch, key, *, config) -> (value, `Outcome`); pure, differentiated by the first argument's params."""
     discriminator: Function | None = None
     """(config) -> Linen module (image, condition, mask) -> logits, if its loss may have one."""
-    export_encode: Function = later("spnr_jax.tools.volume_export:export_encode")
-    """(model, *, num_points) -> pure function of dicts of arrays, and the shapes that it takes."""
-    export_render: Function = later("spnr_jax.tools.volume_export:export_render")
-    """(model, *, num_points, size, quality, reach, plan) -> the same of a picture."""
     takes_light: bool = False
     """Whether pictures are drawn in any light; the others know the light of their training alone."""
     companions: tuple[str, ...] = ()
@@ -98,8 +94,6 @@ METHODS: dict[str, Method] = {
         render=later("spnr_jax.method.surfel_method:render"),
         prepare=later("spnr_jax.training.gbuffers:prepare"),
         loss=later("spnr_jax.training.gbuffers:loss"),
-        export_encode=later("spnr_jax.tools.surfel_export:export_encode"),
-        export_render=later("spnr_jax.tools.surfel_export:export_render"),
         takes_light=True,
         companions=("densifier",),
         label="Surfels",

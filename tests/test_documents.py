@@ -151,7 +151,7 @@ def resolve(name):
 
 def test_the_extras_that_the_documents_name_exist():
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
-    assert {"data", "viewer", "baselines", "cluster", "bench", "cuda"} <= extras.keys()
+    assert {"data", "viewer", "baselines", "bench", "cuda"} <= extras.keys()
     for page in (*PAGES, ROOT / "README.md", *(ROOT / "spnr_jax").rglob("*.py"), *(ROOT / "data_gen").rglob("*.py")):
         for names in re.findall(r"spnr-jax\[([\w,]+)\]", page.read_text()):
             assert set(names.split(",")) <= extras.keys(), page

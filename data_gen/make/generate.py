@@ -1,4 +1,4 @@
-"""A data set from its plan: what is missing is made by workers (devices/cluster.py), then the lists are written.
+"""A data set from its plan: what is missing is made by workers (devices/workers.py), then the lists are written.
 
 Products are made first, split, and then the colour variants of those that train (plan/splits.py). A run may stop
 anywhere: finished objects stay, and the same command makes the others, to the same bytes. dataset.json
@@ -11,6 +11,7 @@ import json
 import os
 import sys
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import asdict, fields, replace
 
 from tqdm import tqdm
@@ -24,13 +25,13 @@ from data_gen.render.variant import choose_variant, mitsuba_module
 from data_gen.store import layout, storage
 from data_gen.store.check import checksum_of
 from data_gen.store.storage import Location
-from spnr_jax.devices.cluster import Died, connect, run_tasks
+from spnr_jax.devices.workers import run_tasks
 from spnr_jax.errors import UserError
 from spnr_jax.formats.light_files import read_envmap
 from spnr_jax.surfels.skies import indoor_envmap
 
 # options that say where or how fast, or whose content is described instead
-PLACES = ("out", "workers", "cluster", "root", "meshes", "objects", "envmap", "lights", "test_list", "split_file")
+PLACES = ("out", "workers", "root", "meshes", "objects", "envmap", "lights", "test_list", "split_file")
 
 
 def describe(plan: Plan, variant: str) -> dict:
@@ -164,15 +165,13 @@ def make_objects(config: GenerateConfig, tasks: Sequence[Task], lights: light.Li
         replace(task, path=task.path and task.path.absolute(), folder=task.folder and task.folder.absolute())
         for task in tasks
     )
-    rejected = {}
+    rejected, workers = {}, config.workers or os.cpu_count() or 1
     try:
         with (
-            connect(config.cluster, min(config.workers or os.cpu_count() or 1, len(tasks))) as client,
+            closing(run_tasks(make_and_write, bench, anywhere, workers)) as results,
             tqdm(total=len(tasks), unit="object", dynamic_ncols=True) as bar,
         ):
-            for task, reason in run_tasks(client, make_and_write, bench, anywhere):
-                if isinstance(reason, Died):
-                    reason = f"the process that made it died {reason.times} times; out of memory?"
+            for task, reason in results:
                 if reason is not None:
                     rejected[task.object_id] = reason
                     tqdm.write(f"left out {task.shown_path or task.object_id}: {reason}", file=sys.stderr)

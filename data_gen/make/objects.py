@@ -8,7 +8,6 @@ once more and compared: a file or generator that changed is refused, since its d
 
 import hashlib
 import os
-import socket
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -44,12 +43,12 @@ class Workbench:
 def make_and_write(bench: Workbench, task: Task) -> str | None:
     """Make one object's folder; return None, or the reason why it is left out.
 
-    What is wrong with the worker and not with the object is raised: errors of the disk, a mesh file it does not see.
+    What is wrong with the worker and not with the object is raised: errors of the disk, a mesh file that is gone.
     """
     if storage.has_object(bench.out, task.object_id):  # another run on the same data set was faster
         return None
     if task.path and not task.path.exists():
-        raise UserError(f"{task.path}: worker {socket.gethostname()} does not see this file; mount it there")
+        raise UserError(f"{task.path}: this file is not there any more; the same command goes on when it is")
     prepare_renderer(bench.variant)
     try:
         record = make_record(bench, task)

@@ -91,8 +91,6 @@ class GenerateConfig:
     """Seed of shapes, points, viewpoints, noise and splits."""
     workers: int | None = None
     """Local processes that render (default: one per CPU core)."""
-    cluster: str | None = None
-    """Address of a Dask scheduler whose workers render; they must see the mesh files and OUT under the same paths."""
     val_fraction: float = 0.05
     """Share of the objects that goes to the validation split."""
     test_fraction: float = 0.1

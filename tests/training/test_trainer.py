@@ -115,8 +115,8 @@ def test_handlers_of_signals_come_back_after_training():
 def poisoned(monkeypatch, step):
     real = batching.make_batch
 
-    def make_batch(objects, config, at, first):
-        batch = real(objects, config, at, first)
+    def make_batch(objects, config, at):
+        batch = real(objects, config, at)
         return jax.tree.map(lambda x: x * np.nan if x.dtype == np.float32 else x, batch) if at + 1 == step else batch
 
     monkeypatch.setattr(batching, "make_batch", make_batch)

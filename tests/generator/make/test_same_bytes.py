@@ -9,13 +9,8 @@ from pathlib import Path
 import pytest
 from fsspec.implementations.memory import MemoryFileSystem
 from support.command_line import spnr_data
-from support.schedulers import in_this_process
 
-from data_gen.make import objects
-from data_gen.plan import tasks
-from data_gen.render import views
 from data_gen.store import check, storage
-from spnr_jax.devices import cluster
 
 pytestmark = pytest.mark.ci  # it renders several data sets
 
@@ -52,13 +47,15 @@ def wait_for(out, number, process):
     return done
 
 
-def in_a_cluster_and_an_object_store(folder, address):
-    place = "memory://cluster/set"
+def in_an_object_store(folder, generate_here):
+    place = "memory://store/set"
     try:
-        made = make(place, "--cluster", address)
+        assert generate_here(*options(place)) == 0
+        made = files(place)
         last = sorted(name for name in made if name.endswith("object.json"))[-1]
-        MemoryFileSystem.store.pop(f"/cluster/set{last}")
-        assert make(place, "--cluster", address) == made, "an object without object.json is made again"
+        MemoryFileSystem.store.pop(f"/store/set{last}")
+        assert generate_here(*options(place)) == 0
+        assert files(place) == made, "an object without object.json is made again"
         return made
     finally:
         MemoryFileSystem.store.clear()
@@ -93,12 +90,6 @@ def by_two_runs_at_once(folder, _):
 
 
 @pytest.fixture(scope="module")
-def address():
-    with in_this_process() as found:
-        yield found
-
-
-@pytest.fixture(scope="module")
 def expected(tmp_path_factory, generate_here):
     """The data set of one undisturbed process."""
     out = tmp_path_factory.mktemp("alone") / "set"
@@ -109,22 +100,10 @@ def expected(tmp_path_factory, generate_here):
 @pytest.mark.parametrize(
     "way",
     [
-        in_a_cluster_and_an_object_store,
+        in_an_object_store,
         with_two_workers_that_are_stopped_and_go_on,
         pytest.param(by_two_runs_at_once, marks=pytest.mark.slow),
     ],
 )
-def test_the_bytes_are_the_same(way, expected, address, tmp_path):
-    assert way(tmp_path, address) == expected
-
-
-def test_a_worker_that_does_not_see_a_mesh_file_ends_the_run_with_its_name(address, tmp_path):
-    unseen = tasks.Task(object_id="thing", path=tmp_path / "other.ply")
-    bench = objects.Workbench(
-        out=str(tmp_path / "set"), lights=None, view=views.ViewConfig(), num_points=4, seed=0, variant="scalar_rgb"
-    )
-    with (
-        cluster.connect(address, 1) as client,
-        pytest.raises(ValueError, match=r"other\.ply: worker .* does not see this file"),
-    ):
-        list(cluster.run_tasks(client, objects.make_and_write, bench, [unseen]))
+def test_the_bytes_are_the_same(way, expected, generate_here, tmp_path):
+    assert way(tmp_path, generate_here) == expected
