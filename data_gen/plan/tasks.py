@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import count, islice
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import tyro
 
@@ -34,8 +34,8 @@ Preset = Literal["abo", "shapenet_car", "shapenet_plane", "shapenet_chair"]
 class GenerateConfig:
     """Generate a data set of rendered objects: procedural ones, mesh files, or a data set of others."""
 
-    out: Annotated[str | Path, tyro.conf.Positional, tyro.conf.arg(metavar="PATH|URL")]
-    """Folder of the data set, or its URL (s3://..., as fsspec opens it). An unfinished run there is completed."""
+    out: tyro.conf.Positional[Path]
+    """Folder of the data set. An unfinished run there is completed."""
     preset: Preset | None = None
     """Settings of the paper for one of its data sets: defaults of the other options, which --help then shows."""
     source: Source | None = None

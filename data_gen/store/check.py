@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from data_gen.store import layout, storage
+from data_gen.store import layout
 from spnr_jax.errors import UserError
 from spnr_jax.formats.npz import read_arrays
 from spnr_jax.surfels.lighting import HEIGHT, WIDTH
@@ -23,7 +23,7 @@ def check(dataset: Path) -> bool:
         raise UserError(f"{dataset / 'dataset.json'}: expected settings {', '.join(COUNTS)}; generate it again")
     described = description.get("environment_map")
     own_lights = isinstance(described, dict) and "kinds" in described
-    object_ids = sorted(storage.list_completed(dataset))
+    object_ids = sorted(layout.list_completed(dataset))
     splits, faults = read_splits(dataset)
     faults += split_faults(splits, set(object_ids)) if not faults else []
     agreements, covered, num_views = [], [], 0

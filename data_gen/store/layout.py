@@ -5,26 +5,32 @@
     DATASET/objects/ID/lights.npz where each view has its own light: `lights` (views, 32, 64, 3) linear radiance
 
 Everything written is a function of its content alone (no clock, no host, no absolute path), so equal objects are equal
-bytes, and two runs in one place do no harm. An object is complete when its object.json is there, which is written
-last; on a local disk the folder also appears as a whole (data_gen/store/storage.py). DATASET is a path or a URL.
+bytes. An object is complete when its object.json is there: its folder is written beside its place and renamed into it.
+So two runs in one place do no harm: the first complete folder stays, unfinished ones carry the name of their process.
 """
 
 import hashlib
 import io
 import json
+import os
 import re
+import shutil
+import socket
+import tempfile
+import time
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
-from data_gen.store import storage
-from data_gen.store.storage import Location
 from spnr_jax.errors import UserError
 from spnr_jax.formats.npz import pack_arrays
 
 SCHEMA_VERSION = 1
+LAST_FILE = "object.json"  # its presence makes an object complete
+UNFINISHED = ".unfinished-"  # prefix of what is still being written: .unfinished-HOST-PROCESS-SUFFIX
+STALE = 24 * 3600  # seconds after which unfinished work of another host is taken for abandoned
 MOST_PIXELS = 2**26  # of a view
 SPLITS = ("train", "val", "test")
 POINT_FIELDS = (*"xyz", "nx", "ny", "nz", "base_color_r", "base_color_g", "base_color_b", "roughness", "metallic")
@@ -81,9 +87,62 @@ def nerf_transforms(cam_to_world: np.ndarray, resolution: int, fov: float, focal
     }
 
 
-def write_object(dataset: Location, object_id: str, record: ObjectRecord) -> None:
-    """Write an object's folder, complete or not at all; a complete one that is already there is left as it is."""
-    storage.write_object_folder(f"{dataset}/objects", object_id, object_files(record))
+def has_object(dataset: Path, object_id: str) -> bool:
+    """Whether an object of the data set is complete."""
+    return (dataset / "objects" / object_id / LAST_FILE).is_file()
+
+
+def list_completed(dataset: Path) -> set[str]:
+    """The ids of the objects whose folders are complete."""
+    places = (dataset / "objects").glob(f"*/{LAST_FILE}")
+    return {place.parent.name for place in places if not place.parent.name.startswith(UNFINISHED)}
+
+
+def write_object(dataset: Path, object_id: str, record: ObjectRecord) -> None:
+    """Write an object's folder, complete or not at all; if another writer was faster, its folder stays."""
+    write_folder(dataset / "objects" / object_id, object_files(record))
+
+
+def write_folder(place: Path, files: dict[str, bytes]) -> None:
+    """Write a folder beside its place and rename it."""
+    place.parent.mkdir(parents=True, exist_ok=True)
+    owner = f"{UNFINISHED}{socket.gethostname()}-{os.getpid()}-"
+    beside = Path(tempfile.mkdtemp(prefix=owner, dir=place.parent))
+    try:
+        for name, content in files.items():
+            (beside / name).parent.mkdir(exist_ok=True)
+            (beside / name).write_bytes(content)
+        beside.chmod(0o755)
+        try:
+            beside.rename(place)
+        except OSError:  # a folder that is not empty is never replaced
+            if not place.is_dir():
+                raise
+            if not (place / LAST_FILE).is_file():
+                raise UserError(f"{place} is in the way: a folder without {LAST_FILE}; remove it") from None
+    finally:
+        shutil.rmtree(beside, ignore_errors=True)
+
+
+def remove_unfinished(dataset: Path) -> None:
+    """Remove the objects that dead processes of this host, or any process a day ago, left half written."""
+    for path in (dataset / "objects").glob(UNFINISHED + "*"):
+        if is_abandoned(path):
+            shutil.rmtree(path, ignore_errors=True)
+
+
+def is_abandoned(path: Path) -> bool:
+    """Whether nobody writes an unfinished folder any more."""
+    owner = re.fullmatch(re.escape(UNFINISHED) + r"(.+)-(\d+)-\w+", path.name)
+    try:
+        if owner and owner[1] == socket.gethostname():
+            os.kill(int(owner[2]), 0)  # asks whether the process lives
+            return False
+        return time.time() - path.stat().st_mtime > STALE
+    except ProcessLookupError:
+        return True
+    except (PermissionError, FileNotFoundError):  # somebody else's process; its writer has just finished it
+        return False
 
 
 def object_files(record: ObjectRecord) -> dict[str, bytes]:
@@ -97,7 +156,7 @@ def object_files(record: ObjectRecord) -> dict[str, bytes]:
     if record.lights is not None:
         files["lights.npz"] = encode_lights(record.lights)
     checksums = {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
-    return {**files, storage.LAST_FILE: json_text({**record.details, "files": checksums}).encode()}
+    return {**files, LAST_FILE: json_text({**record.details, "files": checksums}).encode()}
 
 
 def read_object(folder: Path) -> ObjectRecord:
@@ -180,11 +239,6 @@ def read_image(path: Path) -> np.ndarray:
 def read_split(dataset: Path, split: str) -> list[str]:
     """The object ids of one split."""
     return (dataset / "splits" / f"{split}.txt").read_text().split()
-
-
-def write_text(location: Location, text: str) -> None:
-    """Write a text file in one piece: a reader sees the old content or the new, never half of it."""
-    storage.write_file(location, text.encode())
 
 
 def json_text(content) -> str:

@@ -10,10 +10,10 @@ import numpy as np
 import tyro
 
 from data_gen.render import views
-from data_gen.store import check, layout, storage
+from data_gen.store import check, layout
 from spnr_jax.errors import UserError, at_least
 from spnr_jax.formats.data_sets import on_white
-from spnr_jax.formats.images import png_url
+from spnr_jax.formats.images import png_url, write_whole
 from spnr_jax.formats.pages import template
 
 # point fields that are shown: three for a colour, one for grey
@@ -38,7 +38,7 @@ def show(config: ShowConfig) -> Path:
     """Write the contact sheet; return its path."""
     check.read_description(config.dataset)
     at_least(config, 1, "objects")
-    object_ids = sorted(storage.list_completed(config.dataset))
+    object_ids = sorted(layout.list_completed(config.dataset))
     if not object_ids:
         raise UserError(f"{config.dataset} holds no finished object yet; run spnr-data generate again")
     chosen = np.unique(np.linspace(0, len(object_ids) - 1, min(config.objects, len(object_ids))).round().astype(int))
@@ -47,7 +47,7 @@ def show(config: ShowConfig) -> Path:
         objects=(shown(config.dataset, object_ids[index]) for index in chosen),
     )
     path = config.to or config.dataset / "contact_sheet.html"
-    layout.write_text(path, page)
+    write_whole(path, page.encode())
     print(path)
     return path
 

@@ -77,7 +77,7 @@ def data(tmp_path_factory):
         "settings": vars(views.ViewConfig(resolution=SIZE, spp=4, views=tiny_dataset.VIEWS, max_depth=2)),
         "environment_map": {"name": "procedural room", "sha256": None},
     }
-    layout.write_text(painted / "dataset.json", layout.json_text(described))
+    (painted / "dataset.json").write_text(layout.json_text(described))
     elsewhere = folder / "right"  # pictures of another program that are the references
     shutil.copytree(lit / "objects" / "ball_000000" / "images", elsewhere / "32" / "ball_000000")
     varied = tiny_dataset.write_dataset(folder / "varied", tiny_dataset.SPLITS | VARIANTS)

@@ -14,7 +14,7 @@ from data_gen.make import objects
 from data_gen.plan import tasks
 from data_gen.render import views
 from data_gen.render.light import Lights
-from data_gen.store import check, layout, show, storage
+from data_gen.store import check, layout, show
 from spnr_jax.formats import data_sets
 from spnr_jax.surfels.lighting import directions
 
@@ -50,7 +50,7 @@ def test_a_bad_mesh_is_left_out_with_its_reason_and_the_others_are_made(finished
     rows = [json.loads(line) for line in (finished / "rejected.jsonl").read_text().splitlines()]
     assert [(row["id"], row["path"]) for row in rows] == [("empty", "empty.ply")]
     assert rows[0]["reason"]
-    assert storage.list_completed(finished) == {f"thing_{number}" for number in range(4)}
+    assert layout.list_completed(finished) == {f"thing_{number}" for number in range(4)}
     assert len(layout.read_split(finished, "test")) == 1
     assert spnr_data("check", finished) == 0
 
@@ -101,7 +101,7 @@ def test_an_object_does_not_depend_on_which_others_are_made():
 def test_an_unexpected_error_leaves_out_that_object_only_but_a_full_disk_stops_the_run(tmp_path, monkeypatch):
     task, lights = tasks.Task(object_id="a", category="chair"), Lights(np.ones((4, 8, 3)))
     given = {"lights": lights, "view": views.ViewConfig(), "num_points": 4, "seed": 0, "variant": "scalar_rgb"}
-    bench = objects.Workbench(out=str(tmp_path), **given)
+    bench = objects.Workbench(out=tmp_path, **given)
 
     def fail(error):
         def failing(*_):
