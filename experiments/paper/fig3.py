@@ -155,9 +155,9 @@ def all_methods(options: Fig3, dataset: data_sets.Dataset) -> tuple[dict[str, Me
 def of_surface(name: str) -> Method:
     """The depth of a surface that is made of the points; nothing where they span none."""
 
-    def draw(asset: Asset | str, item: data_sets.ObjectData) -> Pictures:
+    def draw(asset: Asset | None, item: data_sets.ObjectData) -> Pictures:
         shape = item.images.shape[:3]
-        found = np.full(shape, np.inf) if isinstance(asset, str) else cast_views(views.caster(asset), item.camera)
+        found = np.full(shape, np.inf) if asset is None else cast_views(views.caster(asset), item.camera)
         hit = np.isfinite(found)
         return Pictures(image=np.ones((*shape, 3)), acc=hit.astype(np.float32), depth=np.where(hit, found, 0))
 
