@@ -1,4 +1,4 @@
-"""The files of a data set: how each is written, and how it is read back.
+"""The files of a data set, written; spnr_jax/formats/data_sets.py reads them.
 
     DATASET/dataset.json, splits/{train,val,test}.txt, rejected.jsonl
     DATASET/objects/ID/{points.ply, transforms.json, images/000.png, conditions/000.png, object.json}
@@ -31,7 +31,6 @@ SCHEMA_VERSION = 1
 LAST_FILE = "object.json"  # its presence makes an object complete
 UNFINISHED = ".unfinished-"  # prefix of what is still being written: .unfinished-HOST-PROCESS-SUFFIX
 STALE = 24 * 3600  # seconds after which unfinished work of another host is taken for abandoned
-MOST_PIXELS = 2**26  # of a view
 SPLITS = ("train", "val", "test")
 POINT_FIELDS = (*"xyz", "nx", "ny", "nz", "base_color_r", "base_color_g", "base_color_b", "roughness", "metallic")
 POINT_TYPE = np.dtype([(name, "<f4") for name in POINT_FIELDS] + [("face", "<i4")])
@@ -62,11 +61,6 @@ def pack_points(surface) -> np.ndarray:
         packed[name] = column
     packed["face"] = surface.face
     return packed
-
-
-def point_columns(points: np.ndarray, *names: str) -> np.ndarray:
-    """The named fields of a POINT_TYPE array as (points, len(names)) float64."""
-    return np.stack([points[name] for name in names], axis=-1).astype(np.float64)
 
 
 def nerf_transforms(cam_to_world: np.ndarray, resolution: int, fov: float, focal_length: float) -> dict:
@@ -159,56 +153,11 @@ def object_files(record: ObjectRecord) -> dict[str, bytes]:
     return {**files, LAST_FILE: json_text({**record.details, "files": checksums}).encode()}
 
 
-def read_object(folder: Path) -> ObjectRecord:
-    """The object in a folder; ValueError or OSError if a file is missing or damaged."""
-    transforms = read_document(folder / "transforms.json")
-    try:
-        names = [Path(frame["file_path"]).name for frame in transforms["frames"]]
-        poses = np.array([frame["transform_matrix"] for frame in transforms["frames"]], np.float64)
-    except (ValueError, LookupError, TypeError, ArithmeticError) as error:
-        raise UserError(
-            f"{folder / 'transforms.json'}: holds no frames ({error!r}); generate the object again"
-        ) from None
-    if poses.shape[1:] != (4, 4) or not np.isfinite(poses).all():
-        raise UserError(f"{folder / 'transforms.json'}: a camera is no 4 x 4 matrix of finite numbers")
-    return ObjectRecord(
-        points=read_points(folder / "points.ply"),
-        transforms=transforms,
-        images=np.stack([read_image(folder / "images" / name) for name in names]),
-        conditions=np.stack([read_image(folder / "conditions" / name) for name in names]),
-        details=read_document(folder / "object.json"),
-    )
-
-
-def read_document(path: Path) -> dict:
-    """The dict of a JSON file; ValueError or OSError if there is none."""
-    try:
-        document = json.loads(path.read_text())
-    except (ValueError, RecursionError) as error:
-        raise UserError(f"{path}: not readable ({error}); generate it again") from None
-    if not isinstance(document, dict):
-        raise UserError(f"{path}: expected named entries, found {type(document).__name__}; generate it again")
-    return document
-
-
 def encode_points(points: np.ndarray) -> bytes:
     """A POINT_TYPE array as a binary little-endian PLY of vertices."""
     size = f"element vertex {len(points)}"
     header = ["ply", "format binary_little_endian 1.0", size, *POINT_PROPERTIES, "end_header"]
     return ("\n".join(header) + "\n").encode("ascii") + points.tobytes()
-
-
-def read_points(path: Path) -> np.ndarray:
-    """The POINT_TYPE array (points,) of a file that `encode_points` made; ValueError for any other file."""
-    header, separator, body = path.read_bytes().partition(b"end_header\n")
-    lines = header.decode("ascii", "replace").splitlines()
-    if not separator or lines[1:2] != ["format binary_little_endian 1.0"] or lines[3:] != POINT_PROPERTIES:
-        raise UserError(f"{path}: not a points.ply of this data set (another header); generate the object again")
-    announced = re.fullmatch(r"element vertex (\d{1,15})", lines[2])
-    count = int(announced[1]) if announced else -1
-    if len(body) != count * POINT_TYPE.itemsize:
-        raise UserError(f"{path}: expected {count} points, found {len(body) / POINT_TYPE.itemsize:g}; file is cut off")
-    return np.frombuffer(body, POINT_TYPE).copy()
 
 
 def encode_image(pixels: np.ndarray) -> bytes:
@@ -222,23 +171,6 @@ def encode_lights(lights: np.ndarray) -> bytes:
     """Environment maps (views, height, width, 3) as an .npz of halves, cut where they are too bright."""
     halves = np.minimum(lights, np.finfo(np.float16).max).astype(np.float16)
     return pack_arrays({"lights": halves}, compressed=True)
-
-
-def read_image(path: Path) -> np.ndarray:
-    """An RGBA PNG as (height, width, 4) uint8; ValueError if it is damaged or of another kind."""
-    try:
-        with Image.open(path) as image:
-            if image.mode != "RGBA" or image.width * image.height > MOST_PIXELS:
-                raise UserError(f"{path}: expected an RGBA image of a view, got {image.mode} of {image.size} pixels")
-            image.load()
-            return np.array(image)
-    except (OSError, SyntaxError, Image.DecompressionBombError) as error:  # Pillow reports a damaged PNG as these
-        raise UserError(f"{path}: not a readable PNG ({error})") from None
-
-
-def read_split(dataset: Path, split: str) -> list[str]:
-    """The object ids of one split."""
-    return (dataset / "splits" / f"{split}.txt").read_text().split()
 
 
 def json_text(content) -> str:

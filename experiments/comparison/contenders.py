@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
 import experiments.baselines  # noqa: F401 - registers them
-from data_gen.store import layout
 from experiments.comparison.study_objects import each_view, shrink
 from spnr_jax.config import Quality, TrainConfig
 from spnr_jax.errors import UserError
@@ -185,7 +185,7 @@ def _read_pictures(folder: Path, _: None, item: ObjectData) -> Pictures:
     place, found = folder / str(len(item.cloud.positions)) / item.name, []
     for view in range(len(item.images)):
         path = place / f"{view:03d}.png"
-        picture, (height, width, _) = layout.read_image(path), item.images[view].shape
+        picture, (height, width, _) = np.asarray(Image.open(path)), item.images[view].shape
         side = len(picture) // height
         if not side or picture.shape != (side * height, side * width, 4):
             raise UserError(f"{path}: {picture.shape}, expected {item.images[view].shape}: RGBA like the references")

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -51,7 +52,7 @@ def test_a_bad_mesh_is_left_out_with_its_reason_and_the_others_are_made(finished
     assert [(row["id"], row["path"]) for row in rows] == [("empty", "empty.ply")]
     assert rows[0]["reason"]
     assert layout.list_completed(finished) == {f"thing_{number}" for number in range(4)}
-    assert len(layout.read_split(finished, "test")) == 1
+    assert len((finished / "splits" / "test.txt").read_text().split()) == 1
     assert spnr_data("check", finished) == 0
 
 
@@ -157,8 +158,8 @@ def turn_camera(whole):
 @pytest.mark.parametrize(
     ("name", "damage", "expected"),
     [
-        ("objects/thing_0/images/000.png", lambda _: b"not a picture", "000.png: not a readable PNG"),
-        ("objects/thing_1/points.ply", damage_points, "not finite"),
+        ("objects/thing_0/images/000.png", lambda _: b"not a picture", "000.png: cannot be read (is not an image)"),
+        ("objects/thing_1/points.ply", damage_points, "thing_1/points.ply: cannot be read (holds 1 points"),
         ("objects/thing_2/transforms.json", turn_camera, "orthonormal"),
         ("splits/val.txt", lambda _: b"thing_0\nthing_1\nthing_2\nthing_3\n", "listed more than once"),
     ],
@@ -171,10 +172,9 @@ def test_check_names_what_is_damaged_and_exits_with_1(name, damage, expected, fi
 
 
 def test_check_notices_points_that_miss_the_object(finished):
-    record = layout.read_object(finished / "objects" / "thing_0")
-    assert check.points_on_object(record) > 0.9
-    blank = layout.ObjectRecord(**{**vars(record), "images": np.zeros_like(record.images)})
-    assert check.points_on_object(blank) == 0
+    item = data_sets.read_object(data_sets.open_dataset(finished), "thing_0")
+    assert check.points_on_object(item) > 0.9
+    assert check.points_on_object(replace(item, images=np.zeros_like(item.images))) == 0
 
 
 def test_the_contact_sheet_is_one_file_that_shows_every_picture(finished, tmp_path):
