@@ -36,7 +36,7 @@ PLACES = ("out", "workers", "cluster", "root", "meshes", "objects", "envmap", "l
 
 def describe(plan: Plan, variant: str) -> dict:
     """The content of dataset.json: all that decides the bytes, nothing of where or how fast."""
-    config = plan.config
+    config, (source, category) = plan.config, source_of(plan.config)
     settings = {name: value for name, value in asdict(config).items() if name not in PLACES}
     for name, first in (("reshape_variants", False), ("spread", "random")):
         if settings[name] == first:  # as data sets have it that were described before there was the choice
@@ -48,7 +48,8 @@ def describe(plan: Plan, variant: str) -> dict:
         "settings": {
             **settings,
             "categories": sorted(set(config.categories or procedural.CATEGORIES)),
-            "source": source_of(config),
+            "source": source,
+            "category": category,
             "objects": len(plan.tasks) - len(mesh_ids),
             "mesh_files": {"count": len(mesh_ids), "ids_sha256": text_checksum(mesh_ids)},
             "listed_splits": listed,

@@ -23,14 +23,14 @@ TINY = ["--resolution", 16, "--views", 2, "--points", 64, "--spp", 4, "--visibil
     ("options", "expected"),
     [
         (["abo"], "expected 3dmodels/original/*/*.glb and 3dmodels/metadata/3dmodels.csv.gz"),
-        (["shapenet", "--category", "car"], "expected 02958343/*/models/model_normalized.obj or 02958343/*/model.obj"),
+        (["shapenet_car"], "expected 02958343/*/models/model_normalized.obj or 02958343/*/model.obj"),
     ],
 )
 def test_another_folder_is_refused_with_what_was_expected_and_found(options, expected, tmp_path, capsys):
     add(tmp_path, "plane", "a", 2)
     (tmp_path / "03001627" / "empty").mkdir(parents=True)
     for root, found in ((tmp_path, "it holds 02691156, 03001627"), (tmp_path / "absent", "there is no such folder")):
-        assert spnr_data("generate", tmp_path / "set", "--source", *options, "--root", root) == 2
+        assert spnr_data("generate", tmp_path / "set", "--preset", *options, "--root", root) == 2
         message = capsys.readouterr().err
         assert expected in message
         assert found in message
