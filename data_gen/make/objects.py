@@ -7,7 +7,6 @@ once more and compared: a file or generator that changed is refused, since its d
 """
 
 import hashlib
-import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -18,8 +17,8 @@ from data_gen.make import augmentation
 from data_gen.plan.tasks import Task
 from data_gen.render import views
 from data_gen.render.light import Lights
-from data_gen.render.variant import LLVM, choose_variant, mitsuba_module
-from data_gen.store import layout, storage
+from data_gen.render.variant import mitsuba_module
+from data_gen.store import layout
 from spnr_jax.errors import UserError
 from spnr_jax.formats.mesh import meshes, surface_points
 from spnr_jax.formats.mesh.assets import Asset, Material, RejectedAsset
@@ -29,9 +28,9 @@ from spnr_jax.surfels.lighting import HEIGHT, resample
 
 @dataclass(frozen=True, kw_only=True)
 class Workbench:
-    """What a worker needs for any object of the data set; `out` is a URL or an absolute path."""
+    """What a worker needs for any object of the data set."""
 
-    out: str
+    out: Path
     lights: Lights
     view: views.ViewConfig
     num_points: int
@@ -43,13 +42,11 @@ class Workbench:
 def make_and_write(bench: Workbench, task: Task) -> str | None:
     """Make one object's folder; return None, or the reason why it is left out.
 
-    What is wrong with the worker and not with the object is raised: errors of the disk, a mesh file that is gone.
+    What is wrong with the disk and not with the object is raised.
     """
-    if storage.has_object(bench.out, task.object_id):  # another run on the same data set was faster
+    if layout.has_object(bench.out, task.object_id):  # another run on the same data set was faster
         return None
-    if task.path and not task.path.exists():
-        raise UserError(f"{task.path}: this file is not there any more; the same command goes on when it is")
-    prepare_renderer(bench.variant)
+    mitsuba_module(bench.variant)
     try:
         record = make_record(bench, task)
     except RejectedAsset as error:
@@ -58,13 +55,6 @@ def make_and_write(bench: Workbench, task: Task) -> str | None:
         return f"unexpected {type(error).__name__}: {error}".splitlines()[0]
     layout.write_object(bench.out, task.object_id, record)
     return None
-
-
-def prepare_renderer(variant: str) -> None:
-    """Load Mitsuba for this thread; ValueError if the variant that the run chose does not work on this machine."""
-    if variant == LLVM and "DRJIT_LIBLLVM_PATH" not in os.environ:  # a machine other than the one that chose
-        choose_variant(variant)
-    mitsuba_module(variant)
 
 
 def make_record(bench: Workbench, task: Task) -> layout.ObjectRecord:

@@ -11,14 +11,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import count, islice
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import tyro
 
 from data_gen import procedural
 from data_gen.plan import sources, splits
 from data_gen.plan.sources import Category
-from data_gen.render.views import Visibility
 from spnr_jax.errors import UserError, at_least
 from spnr_jax.formats.mesh import meshes
 from spnr_jax.formats.mesh.surface_points import Spread
@@ -28,28 +27,25 @@ SAFE_ID = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]*")
 
 Source = Literal["procedural", "meshes", "abo", "shapenet"]
 Preset = Literal["abo", "shapenet_car", "shapenet_plane", "shapenet_chair"]
+CATEGORY_OF: dict[str, Category] = {"shapenet_car": "car", "shapenet_plane": "plane", "shapenet_chair": "chair"}
 
 
 @dataclass(frozen=True, kw_only=True)
 class GenerateConfig:
     """Generate a data set of rendered objects: procedural ones, mesh files, or a data set of others."""
 
-    out: Annotated[str | Path, tyro.conf.Positional, tyro.conf.arg(metavar="PATH|URL")]
-    """Folder of the data set, or its URL (s3://..., as fsspec opens it). An unfinished run there is completed."""
+    out: tyro.conf.Positional[Path]
+    """Folder of the data set. An unfinished run there is completed."""
     preset: Preset | None = None
     """Settings of the paper for one of its data sets: defaults of the other options, which --help then shows."""
-    source: Source | None = None
-    """Where the objects come from (default: meshes if --meshes is given, else procedural)."""
     root: Path | None = None
-    """Folder of the source: of mesh files, of the ABO 3D download (holds 3dmodels), of ShapeNetCore v2 or v1."""
-    category: Category | None = None
-    """Class of ShapeNet objects."""
+    """Folder of the preset's meshes: the ABO 3D download (holds 3dmodels), or ShapeNetCore v2 or v1."""
     objects: int | None = None
     """Number of procedural objects (default: 200, or 0 if there are others)."""
     categories: tuple[str, ...] = ()
     """Categories of procedural objects (default: all)."""
     meshes: Path | None = None
-    """Folder of .glb, .gltf, .obj and .ply files: short for --source meshes --root."""
+    """Folder of .glb, .gltf, .obj and .ply files."""
     colour_variants: int = 0
     """Variants of each training object with its base colours rotated in RGB space; test objects have none."""
     reshape_variants: bool = False
@@ -79,8 +75,6 @@ class GenerateConfig:
     """Field of view in degrees."""
     distance: float = 3.0
     """Distance of the cameras from the object's centre; the object fits into the unit sphere."""
-    visibility: Visibility = "face"
-    """Visible points: all on a face that a camera ray hits, or each point that is not occluded."""
     visibility_grid: int = 4
     """Rays per pixel side that look for visible faces."""
     envmap: Path | None = None
@@ -172,24 +166,23 @@ def check_options(config: GenerateConfig) -> None:
 
 def check_source(config: GenerateConfig) -> None:
     """ValueError, naming the option, for options that do not say which objects are meant."""
-    source = source_of(config)
-    if config.meshes and (config.root or source != "meshes"):
-        raise UserError(f"--meshes {config.meshes}: not together with --root or --source {source}; give one of them")
-    if source == "procedural" and config.root:
-        raise UserError(f"--root {config.root}: give --source meshes, abo or shapenet with it")
-    if source != "procedural" and not mesh_root(config):
-        raise UserError(f"--source {source}: give --root, the folder that holds it")
-    if source == "shapenet" and not config.category:
-        raise UserError(f"--source shapenet: give --category, one of {', '.join(sources.SYNSETS)}")
-    if source != "shapenet" and config.category:
-        raise UserError(f"--category {config.category}: only with --source shapenet; --categories chooses procedural")
+    if config.meshes and config.preset:
+        raise UserError(f"--meshes {config.meshes}: not together with --preset {config.preset}; give one of them")
+    if config.root and not config.preset:
+        raise UserError(f"--root {config.root}: only with --preset; --meshes takes a folder of mesh files")
+    if config.preset and not config.root:
+        raise UserError(f"--preset {config.preset}: give --root, the folder that holds its meshes")
     if config.split_file and config.test_list:
         raise UserError(f"--test-list {config.test_list}: not together with --split-file; give one of them")
 
 
-def source_of(config: GenerateConfig) -> Source:
-    """Where the objects come from."""
-    return config.source or ("meshes" if config.meshes else "procedural")
+def source_of(config: GenerateConfig) -> tuple[Source, Category | None]:
+    """Where the objects come from, and the class of ShapeNet."""
+    if config.preset == "abo":
+        return "abo", None
+    if config.preset:
+        return "shapenet", CATEGORY_OF[config.preset]
+    return "meshes" if config.meshes else "procedural", None
 
 
 def mesh_root(config: GenerateConfig) -> Path | None:
@@ -219,12 +212,12 @@ def plan_objects(config: GenerateConfig) -> list[Task]:
 
 def mesh_tasks(config: GenerateConfig, root: Path) -> list[Task]:
     """The objects of the source that are files, in any order."""
-    if source_of(config) == "meshes":
+    source, category = source_of(config)
+    if source == "meshes":
         found = meshes.find_meshes(root)
         return [Task(object_id=name, path=path, shown_path=show_path(path, root)) for name, path in found]
-    listed = sources.find_objects(root, config.category) if config.category else sources.find_products(root)
-    category = config.category or ""
-    return [Task(**vars(x), category=category, shown_path=show_path(x.path, root)) for x in listed]
+    listed = sources.find_objects(root, category) if category else sources.find_products(root)
+    return [Task(**vars(x), category=category or "", shown_path=show_path(x.path, root)) for x in listed]
 
 
 def show_path(path: Path, root: Path) -> str:
@@ -257,5 +250,5 @@ def read_listed(config: GenerateConfig, known: set[str]) -> splits.Listed:
         return splits.read_test_list(config.test_list, known)
     if not config.split_file:
         return {}
-    synset = sources.SYNSETS[config.category] if config.category else None
-    return splits.read_split_file(config.split_file, known, synset)
+    category = source_of(config)[1]
+    return splits.read_split_file(config.split_file, known, sources.SYNSETS[category] if category else None)

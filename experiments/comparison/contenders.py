@@ -1,4 +1,4 @@
-"""Who draws objects in a comparison: trained networks, trivial renderers, and pictures that other programs made.
+"""Who draws objects in a comparison: trained networks and trivial renderers.
 
 A network is called after its method; where two have the same one, the folder is added.
 """
@@ -7,15 +7,13 @@ import hashlib
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 import experiments.baselines  # noqa: F401 - registers them
-from data_gen.store import layout
-from experiments.comparison.study_objects import each_view, shrink
+from experiments.comparison.study_objects import each_view
 from spnr_jax.config import Quality, TrainConfig
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
@@ -49,7 +47,6 @@ class Method:
     identity: dict[str, Any] = field(default_factory=dict)
     compiles: bool = False
     """Whether its first call is slower than those after it."""
-    timed: bool = True
     has_opacity: bool = True
 
     def show(self, item: ObjectData) -> Pictures:
@@ -174,23 +171,6 @@ def floors(names: tuple[str, ...], dataset: Dataset, config: TrainConfig) -> dic
         name: of_floor(name, 1.0 if name == "white" else evaluation.choose_radius(dataset, config, name))
         for name in wanted
     }
-
-
-def elsewhere(folder: Path) -> Method:
-    """Pictures that another program made of the same points and cameras: FOLDER/POINTS/ID/000.png, a view each."""
-    return Method(draw=partial(_read_pictures, folder), timed=False)
-
-
-def _read_pictures(folder: Path, _: None, item: ObjectData) -> Pictures:
-    place, found = folder / str(len(item.cloud.positions)) / item.name, []
-    for view in range(len(item.images)):
-        path = place / f"{view:03d}.png"
-        picture, (height, width, _) = layout.read_image(path), item.images[view].shape
-        side = len(picture) // height
-        if not side or picture.shape != (side * height, side * width, 4):
-            raise UserError(f"{path}: {picture.shape}, expected {item.images[view].shape}: RGBA like the references")
-        found.append(shrink(picture, side))
-    return of_rgba(np.stack(found))
 
 
 def of_rgba(rgba: np.ndarray) -> Pictures:

@@ -1,6 +1,6 @@
 """Figure 3, and beyond: depth maps of unseen objects beside the true depth, their errors, and floaters.
 
-    python -m experiments.paper.fig3 --data DIR --out DIR --runs RUN ... [--surfaces poisson ...]
+    python -m experiments.paper.fig3 --data DIR --out DIR --runs RUN ...
 
 The truth is ray casting of the very meshes that the references were rendered from, made again from the data set's
 records, along the rays of each method: its own pixels, through its own pixel centres.
@@ -23,10 +23,9 @@ far_floaters          the same, of those farther from it than 1/32 of the pictur
 """
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -36,8 +35,7 @@ from data_gen.render import views
 from data_gen.render.variant import choose_variant, mitsuba_module
 from experiments import entry_point
 from experiments.comparison import contenders, figures, results_folder
-from experiments.comparison.contenders import LABELS, Method
-from experiments.comparison.poisson import SURFACES, reconstruct
+from experiments.comparison.contenders import Method
 from experiments.comparison.results_folder import load_or_make
 from experiments.comparison.study_objects import cast_views, cut, mesh_of, test_objects
 from spnr_jax import cli
@@ -45,11 +43,9 @@ from spnr_jax.devices import runtime
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.images import depth_image, png
-from spnr_jax.formats.mesh.assets import Asset
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.records import Camera
 from spnr_jax.scoring import evaluation
-from spnr_jax.scoring.evaluation import Pictures
 from spnr_jax.scoring.report import Table, number, text
 from spnr_jax.scoring.summary import means
 
@@ -88,8 +84,6 @@ class Fig3:
     """Folder of the results; the same command goes on there."""
     runs: tuple[Path, ...]
     """Networks: run folders, files of weights, or `surfels`, the network of the package."""
-    surfaces: tuple[Literal["poisson", "poisson_trimmed"], ...] = ()
-    """Poisson surfaces to compare with: made of the same points."""
     meshes: Path | None = None
     """Folder of the mesh files that the data set was made from, if it was."""
     objects: int | None = None
@@ -141,29 +135,14 @@ def main(options: Fig3) -> None:
 
 
 def all_methods(options: Fig3, dataset: data_sets.Dataset) -> tuple[dict[str, Method], int]:
-    """What shows depth: networks and surfaces, and the points that all are given."""
+    """The networks that show depth, and the points that all are given."""
     trained = contenders.networks(options.runs, dataset)
     if left_out := [name for name, network in trained.items() if not network.has_depth]:
         print(f"left out, since they predict no depth: {', '.join(left_out)}")
     found = {name: network.as_method() for name, network in trained.items() if network.has_depth}
-    found |= {LABELS[name]: of_surface(name) for name in options.surfaces}
     if not found:
-        raise UserError("--runs: none of these predicts depth; name a run of another method, or --surfaces")
+        raise UserError("--runs: none of these predicts depth; name a run of another method")
     return found, next(iter(trained.values())).config.test_points
-
-
-def of_surface(name: str) -> Method:
-    """The depth of a surface that is made of the points; nothing where they span none."""
-
-    def draw(asset: Asset | str, item: data_sets.ObjectData) -> Pictures:
-        shape = item.images.shape[:3]
-        found = np.full(shape, np.inf) if isinstance(asset, str) else cast_views(views.caster(asset), item.camera)
-        hit = np.isfinite(found)
-        return Pictures(image=np.ones((*shape, 3)), acc=hit.astype(np.float32), depth=np.where(hit, found, 0))
-
-    return Method(
-        encode=lambda item: reconstruct(item.cloud, SURFACES[name]), draw=draw, identity=asdict(SURFACES[name])
-    )
 
 
 def depths(method: Method, item: data_sets.ObjectData) -> tuple[np.ndarray, np.ndarray]:

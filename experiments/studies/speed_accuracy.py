@@ -1,12 +1,11 @@
 """What speed costs in quality: networks asked for pictures in many ways, and which of these nothing beats.
 
-    python -m experiments.studies.speed_accuracy DATA [surfels small poisson_trimmed RUN ...] [--sizes 128 512]
+    python -m experiments.studies.speed_accuracy DATA [surfels RUN ...] [--sizes 128 512]
 
 Each network draws test objects at every level of `--quality`, from other numbers of points, and in pictures of fewer
 pixels that are enlarged.  `draft` of the network over surfels is discs and light alone.  What a network with an
-upsampler draws at the one size that it has learnt is enlarged (or averaged).  Screened Poisson surfaces are drawn by
-Mitsuba as the references were.  Keeps every setting in a file of its own (an interrupted call goes on); writes the
-tables and front.png.
+upsampler draws at the one size that it has learnt is enlarged (or averaged).  Keeps
+every setting in a file of its own (an interrupted call goes on); writes the tables and front.png.
 
 ms a view   median over objects of the fastest of several drawings of all views, as of a film, the cloud encoded before;
             CPU time of all cores where that is what computes, so that other work on the machine does not count
@@ -31,15 +30,15 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 
 from experiments import entry_point
-from experiments.comparison import clock, figures, poisson, results_folder, scores
-from experiments.comparison.contenders import Method, draw_volume
+from experiments.comparison import clock, figures, results_folder, scores
+from experiments.comparison.contenders import draw_volume
 from experiments.comparison.scores import Measured
 from experiments.comparison.study_objects import cut, test_objects
 from spnr_jax import cli
 from spnr_jax.config import NetworkConfig, Quality
 from spnr_jax.devices import runtime
 from spnr_jax.formats import data_sets
-from spnr_jax.formats.data_sets import Dataset, ObjectData
+from spnr_jax.formats.data_sets import ObjectData
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.records import Volume
 from spnr_jax.method.model import Model
@@ -108,7 +107,6 @@ GROUPS = {  # of settings, as the plot colours them
     "level": "#1d2330",
     "fewer pixels": "#d9480f",
     "points": "#868e96",
-    "surface": "#e8a200",
 }
 LABELS = {"psnr": "PSNR, dB", "flip": "FLIP (lower is better)", "iou": "opacity IoU"}
 
@@ -159,8 +157,7 @@ class SpeedAccuracy:
     data: tyro.conf.Positional[Path]
     """Folder of the data set; its test objects are drawn."""
     runs: tyro.conf.Positional[tuple[str, ...]] = ("surfels",)
-    """Networks: `surfels` of the package, run folders (the paper's, published methods) or files of weights; also
-    `poisson` and `poisson_trimmed`."""
+    """Networks: `surfels` of the package, run folders (the paper's, published methods) or files of weights."""
     out: Path = Path("runs/speed_accuracy")
     """Folder of the results."""
     sizes: tuple[int, ...] = (512, 128)
@@ -205,8 +202,8 @@ def main(options: SpeedAccuracy) -> None:
     names = test_objects(dataset, options.objects)
     asked = {"objects": names, "views": options.views, "runs": options.runs}
     results_folder.claim(options.out, "speed_accuracy", asked, dataset)
-    rows = [row for number in range(len(options.runs)) for row in rows_of(number, options, dataset, names)]
-    telling = sorted(rows, key=lambda row: row.setting.group not in ("level", "surface"))  # the most telling ones first
+    rows = [row for number in range(len(options.runs)) for row in rows_of(number, options, names)]
+    telling = sorted(rows, key=lambda row: row.setting.group != "level")  # the most telling ones first
     measured = scores.measure_rows(options.out, {row.place: row.measure for row in telling}, dataset, names)
     found = [row.summary(measured[row.place]) for row in rows]
     whole = {"hardware": runtime.hardware(), "load": runtime.load(), "date": time.strftime("%Y-%m-%d"), "rows": found}
@@ -218,19 +215,13 @@ def main(options: SpeedAccuracy) -> None:
     results_folder.write(options.out, whole, tables, notes, {"front.png": plot(fronts)})
 
 
-def rows_of(number: int, options: SpeedAccuracy, dataset: Dataset, names: Sequence[str]) -> list[Row]:
-    """All settings of a network or a surface at all sizes."""
+def rows_of(number: int, options: SpeedAccuracy, names: Sequence[str]) -> list[Row]:
+    """All settings of a network at all sizes."""
     run = options.runs[number]
-    measure_one: Callable[..., Measured]
-    if run in poisson.SURFACES:
-        counts = options.counts[:1] if options.quick else options.counts
-        ways = [Setting("surface", f"{count:,} points", count) for count in counts]
-        measure_one = partial(measure_surface, poisson.Renderer(dataset.settings).method(run))
-    else:
-        model = load(run)
-        ways = settings(model.config, options.counts)
-        ways = ways[:: max(len(ways) // 3, 1)] if options.quick else ways
-        measure_one = partial(measure, model, Volumes({}), names[:TIMED_OBJECTS])
+    model = load(run)
+    ways = settings(model.config, options.counts)
+    ways = ways[:: max(len(ways) // 3, 1)] if options.quick else ways
+    measure_one = partial(measure, model, Volumes({}), names[:TIMED_OBJECTS])
     return [
         Row(number, run, size, way, partial(measure_one, way, options.views, size))
         for size in options.sizes
@@ -255,15 +246,6 @@ def measure(
     if item.name in timed:
         found["ms_view"] = min(take_time(film)[1] for _ in range(REPEATS)) / len(item.images)
     return found, item.images[0]
-
-
-def measure_surface(method: Method, way: Setting, views: int, size: int, item: ObjectData) -> Measured:
-    """The same of a surface through the points, drawn by Mitsuba as the references were; loading it is in its time."""
-    item = cut(item, way.points, views, size)
-    asset, encode = take_time(partial(method.encode, item))
-    pictures, ms = take_time(partial(method.draw, asset, item))
-    times = {"s_encode": encode / 1e3, "ms_view": ms / len(item.images)}
-    return scores.mean_of(item, pictures, COLUMNS) | times, item.images[0]
 
 
 def take_time(work: Callable[[], Any]) -> tuple[Any, float]:

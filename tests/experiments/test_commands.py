@@ -77,19 +77,14 @@ def data(tmp_path_factory):
         "settings": vars(views.ViewConfig(resolution=SIZE, spp=4, views=tiny_dataset.VIEWS, max_depth=2)),
         "environment_map": {"name": "procedural room", "sha256": None},
     }
-    layout.write_text(painted / "dataset.json", layout.json_text(described))
-    elsewhere = folder / "right"  # pictures of another program that are the references
-    shutil.copytree(lit / "objects" / "ball_000000" / "images", elsewhere / "32" / "ball_000000")
+    (painted / "dataset.json").write_text(layout.json_text(described))
     varied = tiny_dataset.write_dataset(folder / "varied", tiny_dataset.SPLITS | VARIANTS)
-    return SimpleNamespace(
-        lit=lit, painted=painted, elsewhere=elsewhere, varied=varied, run=lambda: str(tiny_surfels.run())
-    )
+    return SimpleNamespace(lit=lit, painted=painted, varied=varied, run=lambda: str(tiny_surfels.run()))
 
 
 def check_sharpness(found):
-    assert len(found["objects"]) == 3  # network, discs and right
-    right = found["objects"]["right, 32"][0]
-    assert (right["psnr"], right["outline_rmse"]) == pytest.approx((100, 0), abs=1e-3)
+    assert len(found["objects"]) == 2  # network and discs
+    assert all(scores["encode"] > 0 for (scores,) in found["objects"].values())
 
 
 def check_relighting(found):
@@ -132,7 +127,7 @@ def check_inverse(found):
 
 RUNS = {  # name -> its options, the pictures that it writes, and what is known of its results
     "studies.sharpness": (
-        lambda data: {"data": data.lit, "runs": (data.run(),), "counts": (32,), "elsewhere": (data.elsewhere,)},
+        lambda data: {"data": data.lit, "runs": (data.run(),), "counts": (32,)},
         ("gallery.png", "ball_000000.png"),
         check_sharpness,
     ),
@@ -248,9 +243,7 @@ def test_table_1_has_the_scores_of_the_evaluation_of_its_runs(data, tmp_path):
     for method in (first, *evaluation.FLOORS):
         assert found["methods"][method] == alone["methods"][method]
         assert method == first or found["differences"][method] == alone[f"{first}_minus"][method]
-    page = (out / "table1.html").read_text()
-    assert "http" not in page
-    assert page.count("data:image/png;base64") >= len(rows)
+    assert (out / "gallery.png").read_bytes().startswith(b"\x89PNG")
 
 
 @pytest.mark.ci

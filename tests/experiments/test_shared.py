@@ -3,7 +3,6 @@
 import dataclasses
 import hashlib
 import json
-import re
 import shutil
 from itertools import chain
 from pathlib import Path
@@ -16,13 +15,9 @@ from support.tiny_baselines import BASELINE, SHRUNKEN
 from experiments.comparison import budget as budgets
 from experiments.comparison import contenders, results_folder, scores, study_objects, variants
 from experiments.comparison.contenders import networks
-from experiments.comparison.scores import Shown
-from experiments.comparison.variants import Compared
-from experiments.paper import table1
 from spnr_jax.formats import data_sets
 from spnr_jax.scoring import evaluation
 from spnr_jax.scoring.report import Table, number, text
-from spnr_jax.scoring.summary import difference
 from spnr_jax.training import batching, checkpoint, optimisation, weights
 
 PAPER = contenders.LABELS["paper"]
@@ -95,32 +90,6 @@ def test_small_pictures_are_enlarged_and_the_reference_itself_is_right():
     assert (found["psnr"], found["psnr_inside"], found["flip"]) == pytest.approx((100, 100, 0), abs=1e-3)
     assert found["iou"] > 0.8
     assert scores.mean_scores({"a": [1.0, np.nan], "b": [np.nan]}) == {"a": 1.0, "b": None}
-
-
-def test_no_name_ends_the_script():
-    name, grey = "</script><b>", np.full((4, 4, 3), 0.5)
-    shown = Shown(name=name, view=0, reference=grey, images={"ours": grey}, psnr={"ours": 9.0})
-    page = table1.write_page("t", [Table(title="t", heads=(), rows=())], [], [shown])
-    (content,) = re.findall(r'<script type="application/json" id="pictures">(.*?)</script>', page, re.DOTALL)
-    assert json.loads(content)["objects"][0]["name"] == name
-
-
-def test_a_difference_compares_equal_seeds_objects_and_views():
-    rng = np.random.default_rng(0)
-    found = {
-        variant: {
-            seed: {
-                name: {m: level + seed + rng.random(2) for m in variants.METRICS} for name in ("one", "two", "three")
-            }
-            for seed in range(2)
-        }
-        for variant, level in (("a", 10.0), ("b", 13.0))
-    }
-    compared = Compared(scores=found, shown=[])
-    change = difference(compared.by_object("b"), compared.by_object("a"), "psnr")
-    pairs = [found["b"][s][n]["psnr"] - found["a"][s][n]["psnr"] for s in range(2) for n in found["a"][s]]
-    assert change["mean"] == pytest.approx(np.mean(pairs))
-    assert change["interval"][0] < change["mean"] < change["interval"][1]
 
 
 def write_log(run, rows):

@@ -11,6 +11,7 @@ import numpy as np
 from data_gen.store import layout
 from spnr_jax.config import LossConfig, OptimizerConfig, TrainConfig
 from spnr_jax.formats import data_sets
+from spnr_jax.formats.images import write_whole
 from spnr_jax.training import trainer
 from support import tiny_model
 
@@ -44,8 +45,8 @@ def write_dataset(folder: Path, splits: dict[str, tuple[str, ...]] = SPLITS, siz
     for seed, name in enumerate(name for names in splits.values() for name in names):
         layout.write_object(folder, name, ball(seed, size))
     for split, names in splits.items():
-        layout.write_text(folder / "splits" / f"{split}.txt", "".join(f"{name}\n" for name in names))
-    layout.write_text(folder / "dataset.json", layout.json_text({"schema": layout.SCHEMA_VERSION, "seed": 0}))
+        write_whole(folder / "splits" / f"{split}.txt", "".join(f"{name}\n" for name in names).encode())
+    write_whole(folder / "dataset.json", layout.json_text({"schema": layout.SCHEMA_VERSION, "seed": 0}).encode())
     return folder
 
 

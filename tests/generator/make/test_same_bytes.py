@@ -7,10 +7,9 @@ import time
 from pathlib import Path
 
 import pytest
-from fsspec.implementations.memory import MemoryFileSystem
 from support.command_line import spnr_data
 
-from data_gen.store import check, storage
+from data_gen.store import check, layout
 
 pytestmark = pytest.mark.ci  # it renders several data sets
 
@@ -33,36 +32,20 @@ def start(out, *more):
     return subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE)
 
 
-def files(place):
-    """Every file below a place, with its bytes."""
-    filesystem, root = storage.open_place(place)
-    return {name.removeprefix(root): filesystem.cat_file(name) for name in filesystem.find(root)}
+def files(folder):
+    """Every file below a folder, with its bytes."""
+    return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 def wait_for(out, number, process):
     """The names of the objects that are done, once they are so many."""
-    while len(done := storage.list_completed(out)) < number:
+    while len(done := layout.list_completed(out)) < number:
         assert process.poll() is None
         time.sleep(0.01)
     return done
 
 
-def in_an_object_store(folder, generate_here):
-    place = "memory://store/set"
-    try:
-        assert generate_here(*options(place)) == 0
-        made = files(place)
-        last = sorted(name for name in made if name.endswith("object.json"))[-1]
-        MemoryFileSystem.store.pop(f"/store/set{last}")
-        assert generate_here(*options(place)) == 0
-        assert files(place) == made, "an object without object.json is made again"
-        return made
-    finally:
-        MemoryFileSystem.store.clear()
-        MemoryFileSystem.pseudo_dirs[:] = [""]
-
-
-def with_two_workers_that_are_stopped_and_go_on(folder, _):
+def with_two_workers_that_are_stopped_and_go_on(folder):
     out = folder / "set"
     process = start(out, "--workers", "2")
     wait_for(out, 1, process)
@@ -71,8 +54,8 @@ def with_two_workers_that_are_stopped_and_go_on(folder, _):
     assert process.returncode == 130, message
     assert "Traceback" not in message
     assert "stopped" in message.splitlines()[-1]
-    assert storage.list_completed(out)
-    assert not list((out / "objects").glob(storage.UNFINISHED + "*"))
+    assert layout.list_completed(out)
+    assert not list((out / "objects").glob(layout.UNFINISHED + "*"))
     assert not (out / "splits").exists()
     make(out, "--workers", 2)
     times = {path: path.stat().st_mtime_ns for path in (out / "objects").rglob("*")}
@@ -81,7 +64,7 @@ def with_two_workers_that_are_stopped_and_go_on(folder, _):
     return made
 
 
-def by_two_runs_at_once(folder, _):
+def by_two_runs_at_once(folder):
     both = [start(folder / "set", "--workers", "2") for _ in range(2)]
     messages = [process.communicate(timeout=120)[1].decode() for process in both]
     assert [process.returncode for process in both] == [0, 0], messages
@@ -99,11 +82,7 @@ def expected(tmp_path_factory, generate_here):
 
 @pytest.mark.parametrize(
     "way",
-    [
-        in_an_object_store,
-        with_two_workers_that_are_stopped_and_go_on,
-        pytest.param(by_two_runs_at_once, marks=pytest.mark.slow),
-    ],
+    [with_two_workers_that_are_stopped_and_go_on, pytest.param(by_two_runs_at_once, marks=pytest.mark.slow)],
 )
-def test_the_bytes_are_the_same(way, expected, generate_here, tmp_path):
-    assert way(tmp_path, generate_here) == expected
+def test_the_bytes_are_the_same(way, expected, tmp_path):
+    assert way(tmp_path) == expected
