@@ -47,7 +47,7 @@ from spnr_jax.kernels import cameras
 from spnr_jax.kernels.records import Camera
 from spnr_jax.scoring import evaluation
 from spnr_jax.scoring.report import Table, number, text
-from spnr_jax.scoring.summary import means
+from spnr_jax.scoring.scores import means
 
 OPAQUE = 0.5
 EDGE = 1 / 32  # of the picture's width

@@ -33,7 +33,7 @@ from spnr_jax.errors import UserError, at_least
 from spnr_jax.formats import data_sets
 from spnr_jax.scoring import evaluation
 from spnr_jax.scoring.report import Cell, Table, difference, duration, head, lower_first, number, quality
-from spnr_jax.scoring.summary import differences, metric_settings, summarise
+from spnr_jax.scoring.scores import differences, metric_settings, summarise
 
 METRICS = ("psnr", "ssim", "lpips", "flip", "cpsnr", "iou")
 COSTS = {"parameters": "Parameters", "steps": "Steps", "training_seconds": "Training", "ms_per_view": "ms per view"}
@@ -256,7 +256,7 @@ def differences_table(first: str, differences: Mapping) -> Table:
 def _cost(cost: Mapping, column: str) -> Cell:
     value = cost.get(column)
     if column == "training_seconds" and value is not None:
-        return Cell(text=duration(value), value=value)
+        return Cell(text=duration(value))
     return number(value, 1 if column == "ms_per_view" else 0, missing="-")
 
 
