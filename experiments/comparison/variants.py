@@ -29,8 +29,8 @@ from spnr_jax.formats import data_sets, images
 from spnr_jax.kernels import metrics
 from spnr_jax.presets import PRESETS
 from spnr_jax.scoring import evaluation
+from spnr_jax.scoring.picture_scores import Scores, difference, means, metric_settings
 from spnr_jax.scoring.report import ARROWS, HIGHER, QUALITY, Cell, Table, number, text
-from spnr_jax.scoring.scores import Scores, difference, means, metric_settings
 from spnr_jax.training import checkpoint, optimisation
 
 Preset = Literal["abo", "shapenet_car", "shapenet_plane", "shapenet_chair", "small", "tiny"]

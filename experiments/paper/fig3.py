@@ -46,8 +46,8 @@ from spnr_jax.formats.images import depth_image, png
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.records import Camera
 from spnr_jax.scoring import evaluation
+from spnr_jax.scoring.picture_scores import means
 from spnr_jax.scoring.report import Table, number, text
-from spnr_jax.scoring.scores import means
 
 OPAQUE = 0.5
 EDGE = 1 / 32  # of the picture's width

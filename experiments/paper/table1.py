@@ -32,8 +32,8 @@ from spnr_jax.devices import runtime
 from spnr_jax.errors import UserError, at_least
 from spnr_jax.formats import data_sets
 from spnr_jax.scoring import evaluation
+from spnr_jax.scoring.picture_scores import differences, metric_settings, summarise
 from spnr_jax.scoring.report import Cell, Table, difference, duration, head, lower_first, number, quality
-from spnr_jax.scoring.scores import differences, metric_settings, summarise
 
 METRICS = ("psnr", "ssim", "lpips", "flip", "cpsnr", "iou")
 COSTS = {"parameters": "Parameters", "steps": "Steps", "training_seconds": "Training", "ms_per_view": "ms per view"}

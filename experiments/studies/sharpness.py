@@ -7,7 +7,7 @@ from so many of each object's first points, beside the same discs and light with
 for, trimmed Poisson surfaces in Mitsuba (`--poisson`).  A ball of one grey should be smooth, a plate red in front
 should show no blue.  Two columns are an oracle: the same colours under the reference's opacity.
 
-    OUT/results.json  OUT/table.md     `scoring/scores.py`, of each network and number of points
+    OUT/results.json  OUT/table.md     `scoring/picture_scores.py`, of each network and number of points
     OUT/gallery.png   OUT/ID.png                 references and pictures beside each other, at full size
 """
 
@@ -35,8 +35,8 @@ from spnr_jax.formats.data_sets import Dataset, ObjectData
 from spnr_jax.kernels.records import PointCloud
 from spnr_jax.method.model import Model
 from spnr_jax.scoring.evaluation import Pictures
+from spnr_jax.scoring.picture_scores import ball, ball_waves, blue_share, plate, sharpness, under_true_opacity
 from spnr_jax.scoring.report import Cell, Table, number
-from spnr_jax.scoring.scores import ball, ball_waves, blue_share, plate, sharpness, under_true_opacity
 
 COLUMNS = {
     **{name: column for name, column in scores.COLUMNS.items() if name != "iou"},

@@ -32,7 +32,7 @@ from spnr_jax.kernels.cameras import camera_rays
 from spnr_jax.kernels.imaging import linear_to_srgb
 from spnr_jax.kernels.records import Camera, PointCloud
 from spnr_jax.method.model import render_views
-from spnr_jax.scoring.scores import Scores, differences, flip, lpips, metric_settings, summarise
+from spnr_jax.scoring.picture_scores import Scores, differences, flip, lpips, metric_settings, summarise
 from spnr_jax.training.trainer import trained_on
 from spnr_jax.training.weights import Trained, place, read_trained
 

@@ -17,7 +17,7 @@ from spnr_jax.formats.images import depth_image, png_url, write_whole
 from spnr_jax.formats.pages import template
 from spnr_jax.methods import label_of, to_dict
 from spnr_jax.scoring.evaluation import FLOORS, Evaluation, ObjectResult, Pictures, median_view
-from spnr_jax.scoring.scores import NO_LPIPS, interval
+from spnr_jax.scoring.picture_scores import NO_LPIPS, interval
 
 OTHERS = {  # what is shown beside the methods that are trained -> its name in tables and pictures
     "ours": "Ours",
@@ -113,7 +113,7 @@ def quality(methods: Mapping[str, Mapping], metrics: Iterable[str]) -> dict[str,
 
 
 def difference(found: Mapping | None, metric: str) -> Cell:
-    """The cell of a paired difference (`scores.differences`), with its interval and p-value."""
+    """The cell of a paired difference (`picture_scores.differences`), with its interval and p-value."""
     if found is None:
         return text(MISSING.get(metric, "n/a"))
     p_value = found["p_value"]

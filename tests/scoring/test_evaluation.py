@@ -17,7 +17,7 @@ from spnr_jax.kernels import metrics
 from spnr_jax.kernels.cameras import look_at, pinhole
 from spnr_jax.kernels.records import Camera, PointCloud
 from spnr_jax.scoring import evaluation
-from spnr_jax.scoring.scores import METRICS, flip
+from spnr_jax.scoring.picture_scores import METRICS, flip
 from spnr_jax.training import checkpoint, optimisation, trainer, weights
 
 NAMES = tiny_dataset.SPLITS["test"]

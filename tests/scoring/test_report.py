@@ -13,8 +13,8 @@ from support import tiny_dataset, tiny_untrained
 
 from spnr_jax.scoring import report
 from spnr_jax.scoring.evaluation import ObjectResult, Pictures
+from spnr_jax.scoring.picture_scores import METRICS
 from spnr_jax.scoring.report import duration, write_report
-from spnr_jax.scoring.scores import METRICS
 
 VOID = {"meta", "img", "br"}
 SETTINGS = {"model": {"widths": (64, 128), "sampling": {"num_coarse": 16}}, "light": "<studio & sky>", "augment": {}}

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from support.laws import close, numbers
 
-from spnr_jax.scoring import scores
-from spnr_jax.scoring.scores import (
+from spnr_jax.scoring import picture_scores
+from spnr_jax.scoring.picture_scores import (
     METRICS,
     difference,
     differences,
@@ -46,9 +46,9 @@ def package(monkeypatch):
     found = types.SimpleNamespace(LPIPS=lambda net, verbose: Network())
     monkeypatch.setitem(sys.modules, "torch", torch)
     monkeypatch.setitem(sys.modules, "lpips", found)
-    scores.lpips_network.cache_clear()
+    picture_scores.lpips_network.cache_clear()
     yield found
-    scores.lpips_network.cache_clear()
+    picture_scores.lpips_network.cache_clear()
 
 
 def test_flip_is_a_number_a_picture_whatever_the_batch():
@@ -77,7 +77,7 @@ def test_lpips_sees_views_of_channels_first_from_minus_1_to_1_and_is_missing_wit
 
     monkeypatch.setattr(package, "LPIPS", offline)
     for _ in ("without its weights", "without the package"):
-        scores.lpips_network.cache_clear()
+        picture_scores.lpips_network.cache_clear()
         assert lpips(IMAGE, REFERENCE) is None
         monkeypatch.setitem(sys.modules, "lpips", None)
 
@@ -149,7 +149,7 @@ class TestTables:
 class TestIntervals:
     @pytest.mark.parametrize(("count", "kind"), [(8, "normal"), (16, "normal"), (24, "skewed")])
     def test_the_interval_holds_the_true_mean_19_times_in_20(self, count, kind, monkeypatch):
-        monkeypatch.setattr(scores, "RESAMPLES", 1000)
+        monkeypatch.setattr(picture_scores, "RESAMPLES", 1000)
         found = [interval(objects(seed, count, kind=kind)) for seed in range(300)]
         assert 0.91 <= np.mean([low <= 0 <= high for low, high in found]) <= 0.98
 
@@ -162,7 +162,7 @@ class TestIntervals:
         pools = [np.array([1.0]), np.array([2.0, 4.0]), np.array([9.0])]
         means = [np.concatenate(drawn).mean() for drawn in itertools.product(pools, repeat=3)]
         assert interval(found) == pytest.approx([min(means), max(means)]), "so few: the whole range of the resamples"
-        monkeypatch.setattr(scores, "confidence_level", lambda count: 0.6)
+        monkeypatch.setattr(picture_scores, "confidence_level", lambda count: 0.6)
         exact = [float(np.quantile(means, level, method="inverted_cdf")) for level in (0.2, 0.8)]
         assert interval(found) == pytest.approx(exact)
 
