@@ -117,18 +117,17 @@ class UnknownMethod(UserError):
 
 
 _included: dict[str, Path | str] = {}  # what `include` imported -> where that is
-_including: list[str] = []  # what it imports now
 
 
 def register(method: Method) -> None:
     """Adds a method and its presets; ValueError if another one has its name, or the name of a preset."""
-    name, source = method.config.method, _including[-1] if _including else method.config.__module__
+    name = method.config.method
     if name in METHODS:
         require(METHODS[name].config is method.config, f"there is a method {name} already; choose another name")
         return
     for preset in method.presets:
         require(preset.__name__ not in PRESETS, f"there is a preset {preset.__name__} already; choose another name")
-    METHODS[name] = dataclasses.replace(method, source=source)
+    METHODS[name] = dataclasses.replace(method, source=method.config.__module__)
     PRESETS.update({preset.__name__: preset for preset in method.presets})
 
 
@@ -138,17 +137,16 @@ def include(source: Path | str) -> None:
     place = Path(name).resolve() if name.endswith(".py") else name
     if place in _included.values():
         return
-    before = len(METHODS)
-    _including.append(name)
+    before = set(METHODS)
     try:
         with _working_folder():
             _import_file(place) if isinstance(place, Path) else importlib.import_module(place)
     except (ImportError, SyntaxError, OSError) as error:
         raise UserError(f"--methods {name}: it cannot be imported ({first_line(error)})") from None
-    finally:
-        _including.pop()
-    known = len(METHODS) > before or any(m.source.startswith(name) for m in METHODS.values())
-    require(known, f"--methods {name}: it registers no method; call spnr_jax.methods.register there")
+    known = METHODS.keys() - before or any(m.source.startswith(name) for m in METHODS.values())
+    require(bool(known), f"--methods {name}: it registers no method; call spnr_jax.methods.register there")
+    for method in METHODS.keys() - before:
+        METHODS[method] = dataclasses.replace(METHODS[method], source=name)
     _included[name] = place
 
 

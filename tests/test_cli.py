@@ -13,7 +13,6 @@ import pytest
 from support import command_line, tiny_dataset, tiny_surfels, tiny_untrained
 
 from spnr_jax import presets
-from spnr_jax.formats.cut import Cut
 from spnr_jax.surfels.sides import spiral
 from spnr_jax.tools import pictures
 
@@ -74,7 +73,7 @@ REFUSED = [  # command, what its line says
     (f"{LIT} --num-points 0", "--num-points: expected 1 or more, got 0"),
     (f"{LIT} --resolution 18", "--resolution must be a multiple of 4 of at least 16, got 18"),
     (f"{LIT} --clean very", "--clean"),
-    ("render ball.xyz --crop 7 7 7 8 8 8", "--crop 7 7 7 8 8 8: none of the 2,000 points, they lie in the box"),
+    ("render ball.xyz --crop -7 -7e-1 -.5 -6 8 8", "none of the 2,000 points, they lie in the box"),
     ("render ball.xyz --object 2", "--object 2: there is 1 cluster"),
     ("render ball.xyz --crop 0 1", "--crop"),
     (f"{LIT} --sun 30 95", "--sun: expected an azimuth and an elevation of -90 to 90 degrees"),
@@ -160,14 +159,6 @@ def test_the_preset_chooses_the_network_whose_options_there_are():
     command = cli.parse([*f"{TRAIN} {BASELINES} point_nerf_tiny".split(), "--radius", "0.2"])
     tiny = presets.PRESETS["point_nerf_tiny"]()
     assert command.config == dataclasses.replace(tiny, model=dataclasses.replace(tiny.model, radius=0.2))
-
-
-@pytest.mark.parametrize("command", ["render", "view"])
-def test_scans_are_cleaned_and_cut_as_it_is_said(command):
-    said = ["--crop", "-1", "-1e-3", "-.5", "1", "2", "3", "--object", "largest", "--clean", "strong"]
-    parsed = cli.parse([command, "a.ply", *said])
-    assert parsed.cut == Cut(crop=(-1.0, -1e-3, -0.5, 1.0, 2.0, 3.0), object="largest")
-    assert parsed.clean == "strong"
 
 
 def test_help_explains_the_fields_of_a_config_and_loads_nothing_heavy():

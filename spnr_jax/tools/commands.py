@@ -179,8 +179,6 @@ class Render(Reading):
     """Frames per second of the turntable."""
     mesh: bool = False
     """Also write the surface as .glb, with the materials of the nearest points."""
-    grid_resolution: int | None = None
-    """Grid points along each side for --mesh (default: 192)."""
     splats: Literal["none", "ply", "spz"] = "none"
     """Also write Gaussian splats."""
     making: SplatMaking = field(default_factory=SplatMaking)
@@ -202,7 +200,6 @@ class Render(Reading):
         at_least(self, 0, "views")
         at_least(self, 1, "frames", "fps", "workers")
         within(self, -90, 90, "elevation")
-        within(self, 8, 512, "grid_resolution")
         if self.resolution is not None and (self.resolution < 16 or self.resolution % 4):
             raise UserError(f"--resolution must be a multiple of 4 of at least 16, got {self.resolution}")
         if self.transparent and self.lighting.background != "white":

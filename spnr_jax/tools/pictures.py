@@ -16,7 +16,7 @@ Depth and opacity have the resolution of the volume rendering, which an upsample
 import dataclasses
 import io
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial, reduce
 from operator import add
@@ -149,14 +149,18 @@ def draw_all(ready: Ready, options: Render, name: Path) -> Iterator[Callable[[],
     film = turntable_views(ready, options) if options.turntable != "none" else []
     views, cameras = _draw(ready, [*stills, *film], options), [camera for camera, _ in stills]
     for i, (camera, rendering) in enumerate(zip(cameras, views, strict=False)):  # the film's are left for below
-        yield partial(_write_still, rendering, camera, ready.volume, options, f"{name}_{i:03d}")
+        still = f"{name}_{i:03d}"
+        yield partial(_write, f"wrote {still}.png", still, still_files(rendering, camera, ready.volume, options))
     if cameras:
-        yield partial(_write_cameras, cameras, ready, name)
+        document = cameras_document(cameras, name.name, ready.placed, ready.volume)
+        yield partial(_write, "", str(name), [("_cameras.json", f"{json.dumps(document, indent=1)}\n".encode())])
     if film:
         pictures = [np.asarray(rendering.image) for rendering in views]
         yield partial(_write_film, Path(f"{name}_turntable.{options.turntable}"), pictures, options)
     if options.mesh:
-        yield _mesh(ready, options, Path(f"{name}_mesh.glb"))
+        solid = surfaces.mesh_of_volume(ready.model, ready.volume, ready.placed)
+        line = f"wrote {name}_mesh.glb ({surfaces.describe(solid)})"
+        yield partial(_write, line, str(name), [("_mesh.glb", solid.content)])
     if options.splats != "none":
         yield _splats(ready, options, Path(f"{name}_splats.{options.splats}"))
 
@@ -190,19 +194,13 @@ def _draw(ready: Ready, views: list[View], options: Render) -> Iterator[Renderin
         yield before(options.lighting.background, rendering, camera, light)
 
 
-def _write_still(rendering: Rendering, camera: Camera, volume: Volume, options: Render, stem: str) -> Written:
+def _write(line: str, stem: str, files: Iterable[tuple[str, bytes]]) -> Written:
+    """Writes files, each of what follows the stem in its name and its content."""
     paths = []
-    for suffix, data in still_files(rendering, camera, volume, options):
+    for suffix, data in files:
         paths.append(Path(stem + suffix))
         images.write_whole(paths[-1], data)
-    return Written(f"wrote {stem}.png", tuple(paths))
-
-
-def _write_cameras(cameras: list[Camera], ready: Ready, name: Path) -> Written:
-    path = Path(f"{name}_cameras.json")
-    document = cameras_document(cameras, name.name, ready.placed, ready.volume)
-    images.write_whole(path, (json.dumps(document, indent=1) + "\n").encode())
-    return Written("", (path,))
+    return Written(line, tuple(paths))
 
 
 def _write_film(path: Path, film: list[np.ndarray], options: Render) -> Written:
@@ -277,17 +275,6 @@ def _pose_in_file(camera: Camera, placed: PlacedCloud) -> np.ndarray:
     pose[:3] = placed.rotation.T @ np.asarray(camera.cam_to_world, np.float64)
     pose[:3, 3] += placed.origin
     return pose
-
-
-def _mesh(ready: Ready, options: Render, path: Path) -> Callable[[], Written]:
-    resolution = options.grid_resolution or surfaces.GRID
-    solid = surfaces.mesh_of_volume(ready.model, ready.volume, ready.placed, resolution)
-
-    def write() -> Written:
-        images.write_whole(path, solid.content)
-        return Written(f"wrote {path} ({surfaces.describe(solid)})", (path,))
-
-    return write
 
 
 def _splats(ready: Ready, options: Render, path: Path) -> Callable[[], Written]:
