@@ -99,3 +99,7 @@ def test_neighbors_found_in_jax_are_those_of_the_tree(count):
     points = cloud_arrays.pad(cloud(np.random.default_rng(count).normal(size=(count, 3))), POINTS)
     found = np.asarray(export.nearest(points.positions, points.mask))
     np.testing.assert_array_equal(found, spnr_jax.neighbors(points))
+    repeated = np.asarray(points.positions).copy()
+    repeated[1:count] = repeated[0]
+    own = np.asarray(export.nearest(repeated, points.mask))[:count, 0]
+    np.testing.assert_array_equal(own, np.arange(count), err_msg="each point is its own first neighbor")
