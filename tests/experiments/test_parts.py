@@ -122,12 +122,3 @@ def test_an_empty_view_has_floaters_and_a_full_one_has_errors_and_what_has_no_nu
     assert (nothing["floaters"], full["error"]) == (1000, 0.5)
     views = [{name: np.array([1.0, np.nan]) for name in fig3.METRICS} for _ in range(2)]
     assert fig3.summarise(views)["error"] == {"mean": 1.0, "interval": [1.0, 1.0]}
-
-
-def test_errors_are_grey_floaters_red_and_what_is_missed_blue():
-    acc = changed_at(changed_at(INSIDE * 1.0, (0, 0), 1), (20, 20), -1)
-    picture = fig3.error_image(changed_at(SEEN, (30, 30), fig3.WORST / 2), acc, TRUTH)
-    np.testing.assert_array_equal(picture[0, 0], fig3.FLOATER)
-    np.testing.assert_array_equal(picture[20, 20], fig3.MISSED)
-    np.testing.assert_allclose(picture[30, 30], 0.5)
-    np.testing.assert_array_equal(picture[[5, 25], [5, 25]], 1)

@@ -2,7 +2,6 @@
 
 import dataclasses
 import hashlib
-import json
 import shutil
 from itertools import chain
 from pathlib import Path
@@ -92,18 +91,6 @@ def test_small_pictures_are_enlarged_and_the_reference_itself_is_right():
     assert scores.mean_scores({"a": [1.0, np.nan], "b": [np.nan]}) == {"a": 1.0, "b": None}
 
 
-def write_log(run, rows):
-    (run / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
-
-
-def test_training_seconds_are_those_of_the_steps_over_all_calls(tmp_path):
-    write_log(
-        tmp_path,
-        [{"step": 20, "ms_per_step": 100.0}, {"step": 20, "val_psnr": 9.0}, {"step": 25, "ms_per_step": 1000.0}],
-    )
-    assert budgets.training_seconds(tmp_path) == 7.0
-
-
 def test_scores_inside_the_silhouette_do_not_see_the_rest():
     item = tiny_dataset.one_object("chair")
     reference = data_sets.on_white(item.images)
@@ -112,17 +99,6 @@ def test_scores_inside_the_silhouette_do_not_see_the_rest():
     np.testing.assert_allclose(found["inside"], 100.0)
     equal = variants.more_scores(item, evaluation.Pictures(image=reference, acc=reference[..., 0]))
     np.testing.assert_allclose(equal["detail"], 1.0, rtol=1e-5)
-
-
-@pytest.mark.parametrize(
-    ("budget", "size", "category", "paper"),
-    [("tiny", 64, "chair", "tiny"), ("paper", 128, None, "abo"), ("paper", 200, "chair", "shapenet_chair")],
-)
-def test_a_budget_has_a_training_of_every_network(budget, size, category, paper):
-    found = budgets.configs(budget, size, category)
-    assert found["paper"].preset == paper
-    assert {name: config.model.method for name, config in found.items()} == {name: name for name in budgets.NETWORKS}
-    assert {config.model.image_resolution for config in found.values()} == {size}
 
 
 def test_minutes_become_steps_at_the_pace_of_both_kinds_of_step(monkeypatch):
