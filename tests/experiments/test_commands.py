@@ -100,11 +100,11 @@ def check_speed_accuracy(found):
 
 
 def check_fig3(found):
-    assert list(found["methods"]) == ["Ours"]  # the other one predicts no depth
-    ours = {name: of["mean"] for name, of in found["methods"]["Ours"].items()}
-    for name in ("error", "median", "bias", "surface"):
-        assert ours[name] == pytest.approx(stand_ins.OFFSET, abs=3e-3)
-    assert ours["missed"] == ours["far_floaters"] == 0
+    assert list(found["scores"]) == ["Ours"]  # the other one predicts no depth
+    for ours in found["scores"]["Ours"]:
+        for name in ("error", "median", "bias", "surface"):
+            assert ours[name] == pytest.approx(stand_ins.OFFSET, abs=3e-3)
+        assert ours["missed"] == ours["far_floaters"] == 0
 
 
 def check_fig1(found):
