@@ -31,8 +31,8 @@ from scipy.ndimage import distance_transform_edt
 from data_gen.render import views
 from data_gen.render.variant import choose_variant, mitsuba_module
 from experiments import entry_point
-from experiments.comparison import contenders, figures, results_folder, scores
-from experiments.comparison.contenders import Method
+from experiments.comparison import figures, results_folder, scores
+from experiments.comparison.contenders import Method, of_model
 from experiments.comparison.scores import Measured
 from experiments.comparison.study_objects import cast_views, cut, mesh_of, test_objects
 from spnr_jax import cli
@@ -45,6 +45,7 @@ from spnr_jax.kernels import cameras
 from spnr_jax.kernels.records import Camera
 from spnr_jax.scoring import evaluation
 from spnr_jax.scoring.report import Table
+from spnr_jax.training import weights
 
 OPAQUE = 0.5
 EDGE = 1 / 32  # of the picture's width
@@ -77,10 +78,12 @@ class Fig3:
     """Folder of the data set."""
     out: Path
     """Folder of the results; the same command goes on there."""
-    runs: tuple[Path, ...]
+    runs: tuple[str, ...]
     """Networks: run folders, files of weights, or `surfels`, the network of the package."""
     meshes: Path | None = None
     """Folder of the mesh files that the data set was made from, if it was."""
+    points: int = 1024
+    """Points of an object, the first of its file."""
     objects: int | None = None
     """Test objects, spread over the split (default: all)."""
     shown: int = 8
@@ -96,16 +99,15 @@ def main(options: Fig3) -> None:
     cli.set_up_jax()
     dataset = data_sets.open_dataset(options.data)
     names = test_objects(dataset, 2 if options.quick else options.objects)
-    found, points = all_methods(options, dataset)
-    made_of = {name: method.identity for name, method in found.items()}
-    asked = {"methods": made_of, "points": points, "objects": names}
+    found = all_methods(options.runs)
+    asked = {"runs": list(found), "points": options.points, "objects": names}
     results_folder.claim(options.out, "depths", asked, dataset)
     mitsuba_module(choose_variant(options.variant)[0])
-    rows = {name: partial(measure, options, dataset, method, points) for name, method in found.items()}
+    rows = {name: partial(measure, options, dataset, method) for name, method in found.items()}
     shown = evaluation.spread(names, options.shown)
     measured = scores.measure_rows(options.out, rows, dataset, names, shown)
     table = Table(
-        title=f"{len(names)} unseen objects, {points} points; {runtime.hardware()}",
+        title=f"{len(names)} unseen objects, {options.points} points; {runtime.hardware()}",
         heads=tuple(head for head, _ in COLUMNS.values()),
         rows=tuple(scores.score_row(name, objects, COLUMNS) for name, objects in measured.items()),
     )
@@ -122,20 +124,20 @@ def main(options: Fig3) -> None:
     results_folder.write(options.out, results, [table], [NOTE, PICTURE], {"fig3_depth.png": picture})
 
 
-def all_methods(options: Fig3, dataset: data_sets.Dataset) -> tuple[dict[str, Method], int]:
-    """The networks that show depth, and the points that all are given."""
-    trained = contenders.networks(options.runs, dataset)
-    if left_out := [name for name, network in trained.items() if not network.has_depth]:
-        print(f"left out, since they predict no depth: {', '.join(left_out)}")
-    found = {name: network.as_method() for name, network in trained.items() if network.has_depth}
+def all_methods(runs: tuple[str, ...]) -> dict[str, Method]:
+    """The networks that show depth."""
+    models = {run: weights.load(run) for run in runs}
+    found = {run: of_model(model) for run, model in models.items() if model.config.method != "npbg"}
+    if left_out := models.keys() - found:
+        print(f"left out, since they predict no depth: {', '.join(sorted(left_out))}")
     if not found:
         raise UserError("--runs: none of these predicts depth; name a run of another method")
-    return found, next(iter(trained.values())).config.test_points
+    return found
 
 
-def measure(options: Fig3, dataset: Dataset, method: Method, points: int, item: ObjectData) -> Measured:
+def measure(options: Fig3, dataset: Dataset, method: Method, item: ObjectData) -> Measured:
     """Mean metrics of an object's views; of the first one true depth, depth and error beside each other."""
-    item = cut(item, points, normals=True)
+    item = cut(item, options.points, normals=True)
     pictures = method.show(item)
     assert pictures.depth is not None
     seen, acc = np.asarray(pictures.depth), np.asarray(pictures.acc)
