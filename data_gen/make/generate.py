@@ -49,6 +49,7 @@ def describe(plan: Plan, variant: str) -> dict:
             "categories": sorted(set(config.categories or procedural.CATEGORIES)),
             "source": source,
             "category": category,
+            "visibility": "face",
             "objects": len(plan.tasks) - len(mesh_ids),
             "mesh_files": {"count": len(mesh_ids), "ids_sha256": text_checksum(mesh_ids)},
             "listed_splits": listed,
