@@ -13,7 +13,7 @@ from experiments.paper import fig3
 from experiments.paper.fig1 import Fig1, variant
 from experiments.paper.fig2 import nearest_views
 from experiments.studies import inverse, relighting
-from experiments.studies.speed_accuracy import front, knee
+from experiments.studies.speed_accuracy import front
 from spnr_jax import config, presets
 from spnr_jax.formats import data_sets
 from spnr_jax.scoring.evaluation import Pictures
@@ -38,12 +38,10 @@ def test_the_nearest_views_look_from_the_same_side():
     assert nearest_views(eyes) == [1, 0, 2]
 
 
-def test_the_front_holds_what_no_other_setting_beats_and_its_knee_lies_farthest_above_the_line():
+def test_the_front_holds_what_no_other_setting_beats():
     pairs = ((4, 20.0), (2, 18.0), (8, 21.0), (5, 19.0), (3, 20.5), (3, 20.4), (16, 21.0))
     rows = [{"ms_view": ms, "psnr": psnr} for ms, psnr in pairs]
     assert front(rows) == [1, 4, 2]
-    assert knee(rows, front(rows)) == 4
-    assert knee(rows[:1], front(rows[:1])) == 0
 
 
 def test_the_log_error_of_a_picture_that_is_right_and_of_one_half_as_bright():
