@@ -1,7 +1,7 @@
 """Who draws objects in a comparison: trained networks and trivial renderers."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -33,14 +33,15 @@ def nothing(_: ObjectData) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class Method:
-    """Draws all views of an object from what `encode` makes of it once; `identity` tells it from another one."""
+    """Draws all views of an object from what `encode` makes of it once."""
 
     draw: Callable[[Any, ObjectData], Pictures]
     encode: Callable[[ObjectData], Any] = nothing
-    identity: dict[str, Any] = field(default_factory=dict)
     compiles: bool = False
     """Whether its first call is slower than those after it."""
     has_opacity: bool = True
+    radius: float | None = None
+    """Of the points of a trivial renderer, in point spacings."""
 
     def show(self, item: ObjectData) -> Pictures:
         """The pictures."""
@@ -91,9 +92,9 @@ def of_floor(name: str, factor: float = 1.0) -> Method:
     show = evaluation.floor(name, factor)
     return Method(
         draw=lambda _, item: show(item.cloud, item.camera),
-        identity={"radius factor": factor},
         compiles=True,
         has_opacity=name != "white",
+        radius=None if name == "white" else factor,
     )
 
 

@@ -109,7 +109,7 @@ def main(options: Table1) -> None:
     found = {
         **asked,
         **conditions(dataset, names, config),
-        "radius_factors": {name: of.identity["radius factor"] for name, of in floors.items() if name != "white"},
+        "radius_factors": {name: of.radius for name, of in floors.items() if of.radius is not None},
         "metrics": metric_settings(),
         "missing": missing,
         **numbers(scored),

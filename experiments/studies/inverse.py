@@ -297,7 +297,7 @@ def _sum_of_pixels(
 
 def widen(tree: Any) -> Any:
     """The arrays in float64."""
-    return jax.tree.map(lambda x: jnp.asarray(x, jnp.float64) if x.dtype == jnp.float32 else x, tree)
+    return jax.tree.map(lambda x: jax.device_put(np.float64(x)) if x.dtype == jnp.float32 else x, tree)
 
 
 def measure(params: dict, truth: Truth, tables: Array, plan: Plan, quick: bool) -> dict[str, dict[str, float]]:
