@@ -12,16 +12,15 @@ import os
 import sys
 from collections.abc import Sequence
 from contextlib import closing
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from pathlib import Path
 
 from tqdm import tqdm
 
 from data_gen import procedural
 from data_gen.make.objects import Workbench, make_and_write
-from data_gen.plan.data_presets import PAPER_COUNTS
-from data_gen.plan.tasks import GenerateConfig, Plan, Task, check_options, plan_data_set, source_of
-from data_gen.render import light, views
+from data_gen.plan.tasks import PAPER_COUNTS, GenerateConfig, Plan, Task, check_options, plan_data_set, source_of
+from data_gen.render import light
 from data_gen.render.variant import choose_variant, mitsuba_module
 from data_gen.store import layout
 from data_gen.store.check import checksum_of
@@ -51,6 +50,7 @@ def describe(plan: Plan, variant: str) -> dict:
             "categories": sorted(set(config.categories or procedural.CATEGORIES)),
             "source": source,
             "category": category,
+            "visibility": "face",
             "objects": len(plan.tasks) - len(mesh_ids),
             "mesh_files": {"count": len(mesh_ids), "ids_sha256": text_checksum(mesh_ids)},
             "listed_splits": listed,
@@ -153,15 +153,7 @@ def refuse_other_content(out: Path, settings: dict) -> None:
 
 def make_objects(config: GenerateConfig, tasks: Sequence[Task], lights: light.Lights, variant: str) -> dict[str, str]:
     """Make the objects on the workers; return the reason for each that was left out, by id."""
-    bench = Workbench(
-        out=config.out,
-        lights=lights,
-        view=views.ViewConfig(**{field.name: getattr(config, field.name) for field in fields(views.ViewConfig)}),
-        num_points=config.points,
-        seed=config.seed,
-        variant=variant,
-        spread=config.spread,
-    )
+    bench = Workbench(config=config, lights=lights, variant=variant)
     rejected, workers = {}, config.workers or os.cpu_count() or 1
     try:
         with (

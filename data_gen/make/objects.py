@@ -7,14 +7,14 @@ once more and compared: a file or generator that changed is refused, since its d
 """
 
 import hashlib
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
 
 from data_gen import procedural
 from data_gen.make import augmentation
-from data_gen.plan.tasks import Task
+from data_gen.plan.tasks import GenerateConfig, Task
 from data_gen.render import views
 from data_gen.render.light import Lights
 from data_gen.render.variant import mitsuba_module
@@ -30,13 +30,9 @@ from spnr_jax.surfels.lighting import HEIGHT, resample
 class Workbench:
     """What a worker needs for any object of the data set."""
 
-    out: Path
+    config: GenerateConfig
     lights: Lights
-    view: views.ViewConfig
-    num_points: int
-    seed: int
     variant: str
-    spread: surface_points.Spread = "random"
 
 
 def make_and_write(bench: Workbench, task: Task) -> str | None:
@@ -44,7 +40,7 @@ def make_and_write(bench: Workbench, task: Task) -> str | None:
 
     What is wrong with the disk and not with the object is raised.
     """
-    if layout.has_object(bench.out, task.object_id):  # another run on the same data set was faster
+    if layout.has_object(bench.config.out, task.object_id):  # another run on the same data set was faster
         return None
     mitsuba_module(bench.variant)
     try:
@@ -53,23 +49,22 @@ def make_and_write(bench: Workbench, task: Task) -> str | None:
         return str(error)
     except Exception as error:  # whatever is wrong with one object must not stop the others; its row says what it was
         return f"unexpected {type(error).__name__}: {error}".splitlines()[0]
-    layout.write_object(bench.out, task.object_id, record)
+    layout.write_object(bench.config.out, task.object_id, record)
     return None
 
 
 def make_record(bench: Workbench, task: Task) -> layout.ObjectRecord:
     """One object, rendered: asset, points, views, condition images."""
-    seeds = object_seeds(bench.seed, task.object_id)
-    asset, details = make_asset(task, bench.seed)
-    surface = surface_points.sample_surface(asset, bench.num_points, seeds["points"], bench.spread)
-    cam_to_world = views.random_viewpoints(
-        bench.view.views, bench.view.distance, np.random.default_rng(seeds["viewpoints"])
-    )
-    maps = list(bench.lights.of_views(bench.view.views, seeds["noise"]))
-    images, conditions = views.render_views(asset, surface, cam_to_world, maps, bench.view, seeds["noise"])
+    config, seeds = bench.config, object_seeds(bench.config.seed, task.object_id)
+    view = views.ViewConfig(**{field.name: getattr(config, field.name) for field in fields(views.ViewConfig)})
+    asset, details = make_asset(task, config.seed)
+    surface = surface_points.sample_surface(asset, config.points, seeds["points"], config.spread)
+    cam_to_world = views.random_viewpoints(view.views, view.distance, np.random.default_rng(seeds["viewpoints"]))
+    maps = list(bench.lights.of_views(view.views, seeds["noise"]))
+    images, conditions = views.render_views(asset, surface, cam_to_world, maps, view, seeds["noise"])
     return layout.ObjectRecord(
         points=layout.pack_points(surface),
-        transforms=layout.nerf_transforms(cam_to_world, bench.view.resolution, bench.view.fov, bench.view.focal_length),
+        transforms=layout.nerf_transforms(cam_to_world, view.resolution, view.fov, view.focal_length),
         images=images,
         conditions=conditions,
         lights=None if bench.lights.shared is not None else np.stack([resample(x, HEIGHT) for x in maps]),

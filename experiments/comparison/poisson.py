@@ -143,7 +143,6 @@ class Renderer:
         return Method(
             encode=lambda item: reconstruct(item.cloud, SURFACES[surface]),
             draw=lambda asset, item: of_rgba(self.draw(asset, item)),
-            identity=dataclasses.asdict(SURFACES[surface]),
         )
 
 

@@ -31,7 +31,6 @@ from spnr_jax.config import TrainConfig
 from spnr_jax.devices import runtime
 from spnr_jax.errors import UserError, at_least
 from spnr_jax.formats import data_sets
-from spnr_jax.scoring import evaluation
 from spnr_jax.scoring.picture_scores import differences, metric_settings, summarise
 from spnr_jax.scoring.report import Cell, Table, difference, duration, head, lower_first, number, quality
 
@@ -110,13 +109,15 @@ def main(options: Table1) -> None:
     found = {
         **asked,
         **conditions(dataset, names, config),
-        "radius_factors": {name: of.identity["radius factor"] for name, of in floors.items() if name != "white"},
+        "radius_factors": {name: of.radius for name, of in floors.items() if of.radius is not None},
         "metrics": metric_settings(),
         "missing": missing,
         **numbers(scored),
         "costs": costs(options, trained, scored, config),
     }
-    tables, how = tables_of(found), notes(found)
+    how, tables = notes(found), [methods_table(found)]
+    if found["differences"]:
+        tables.append(differences_table(found["compared"], found["differences"]))
     picture = gallery({name: LABELS[name] for name in compared}, scored, ("psnr",))
     results_folder.write(options.out, found, tables, how, {"gallery.png": picture})
 
@@ -134,23 +135,14 @@ def conditions(dataset: data_sets.Dataset, names: tuple[str, ...], config: Train
 
 
 def numbers(scored: Scored) -> dict[str, str | dict | None]:
-    """The scores as tables: of every method, the first network minus the others, and of each class of objects."""
+    """The scores as tables: of every method, and the first network minus the others."""
     scores = list(scored.scores.values())
     first = next((name for name in NETWORKS if name in scores[0]), None)
     return {
         "methods": summarise(scores),
         "compared": first,
         "differences": {} if first is None else differences(scores, first),
-        "per_category": by_category(scored),
     }
-
-
-def by_category(scored: Scored) -> dict[str, dict]:
-    """The summary of each class of objects, if there are several."""
-    classes = evaluation.classes_of(scored.scores)
-    if len(classes) < 2:
-        return {}
-    return {kind: summarise([scored.scores[name] for name in names]) for kind, names in classes.items()}
 
 
 def surface_folder(options: Table1, config: TrainConfig, row: str) -> Path:
@@ -206,24 +198,6 @@ def costs(options: Table1, trained: dict[str, Trained], scored: Scored, config: 
 
 
 # --- tables ---------------------------------------------------------------------------------------------------------
-
-
-def tables_of(results: Mapping) -> list[Table]:
-    """The table of methods, the differences, and a table of each class of objects."""
-    made = [methods_table(results)]
-    if results["differences"]:
-        made.append(differences_table(results["compared"], results["differences"]))
-    for name, own in results["per_category"].items():
-        count = next(iter(own.values()))["objects"]
-        title = f"{name}, {count} object{'s' * (count != 1)}"
-        made.append(
-            Table(
-                title=title,
-                heads=HEADS,
-                rows=tuple((LABELS[name], cells) for name, cells in quality(own, METRICS).items()),
-            )
-        )
-    return made
 
 
 def methods_table(results: Mapping) -> Table:

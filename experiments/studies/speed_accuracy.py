@@ -10,8 +10,7 @@ every setting in a file of its own (an interrupted call goes on); writes the tab
 ms a view   median over objects of the fastest of several drawings of all views, as of a film, the cloud encoded before;
             CPU time of all cores where that is what computes, so that other work on the machine does not count
 s to encode the same for a cloud, once, all compiled
-front       settings of a size that no other beats in both PSNR and ms a view; its knee lies farthest above the line
-            from its cheapest to its best, PSNR against the logarithm of the time
+front       settings of a size that no other beats in both PSNR and ms a view
 """
 
 import dataclasses
@@ -80,14 +79,6 @@ def front(rows: Sequence[dict]) -> list[int]:
     return chosen
 
 
-def knee(rows: Sequence[dict], chosen: Sequence[int]) -> int:
-    """The row of the front that lies farthest above the line from its cheapest to its best."""
-    x = np.log([rows[i]["ms_view"] for i in chosen])
-    y = np.array([rows[i]["psnr"] for i in chosen])
-    x, y = ((v - v[0]) / (v[-1] - v[0]) if v[-1] != v[0] else np.zeros_like(v) for v in (x, y))
-    return chosen[int(np.argmax(y - x))]
-
-
 def table(rows: Sequence[dict], chosen: Sequence[int]) -> Table:
     """Settings of one size; those of the front are marked, and differences are to the network's best level."""
     heads = ("setting", "PSNR, dB", "SSIM", "FLIP", "IoU", "ms a view", "s to encode")
@@ -95,7 +86,7 @@ def table(rows: Sequence[dict], chosen: Sequence[int]) -> Table:
     made = []
     for i, row in enumerate(rows):
         base = next(r for r in rows if r["run"] == row["run"])
-        mark = " (front, knee)" if i == knee(rows, chosen) else " (front)" if i in chosen else ""
+        mark = " (front)" if i in chosen else ""
         change = () if row is base else (f"({row['psnr'] - base['psnr']:+.2f})",)
         cells = [text(row["name"] + mark), number(row["psnr"], 2, more=change)]
         made.append((Path(row["run"]).name, (*cells, *(number(row[name], n) for name, n in decimals.items()))))
@@ -112,17 +103,15 @@ LABELS = {"psnr": "PSNR, dB", "flip": "FLIP (lower is better)", "iou": "opacity 
 
 
 @figures.drawing
-def plot(sizes: Sequence[tuple[Sequence[dict], Sequence[int], int]]) -> Figure:
-    """Quality against cost: of each size its rows, which of them make the front, and its knee."""
+def plot(sizes: Sequence[tuple[Sequence[dict], Sequence[int]]]) -> Figure:
+    """Quality against cost: of each size its rows, and which of them make the front."""
     figure = Figure(figsize=(14, 0.6 + 3.3 * len(sizes)))
-    for line, (rows, chosen, knee) in zip(figure.subplots(len(sizes), 3, squeeze=False), sizes, strict=True):
+    for line, (rows, chosen) in zip(figure.subplots(len(sizes), 3, squeeze=False), sizes, strict=True):
         for axes, y in zip(line, LABELS, strict=True):
             _scatter(axes, rows, y)
         first = line[0]
         first.set_title(f"{rows[0]['size']} x {rows[0]['size']}")
         first.plot([rows[i]["ms_view"] for i in chosen], [rows[i]["psnr"] for i in chosen], color="#adb5bd", zorder=2)
-        place = (rows[knee]["ms_view"], rows[knee]["psnr"])
-        first.annotate(f"knee: {rows[knee]['name']}", place, xytext=(8, -24), textcoords="offset points")
     handles = {label: h for axes in figure.axes for h, label in zip(*axes.get_legend_handles_labels(), strict=True)}
     figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=6)
     return figure
@@ -208,8 +197,8 @@ def main(options: SpeedAccuracy) -> None:
     found = [row.summary(measured[row.place]) for row in rows]
     whole = {"hardware": runtime.hardware(), "load": runtime.load(), "date": time.strftime("%Y-%m-%d"), "rows": found}
     sizes = [of for size in options.sizes if (of := [row for row in found if row["size"] == size])]
-    fronts = [(of, front(of), knee(of, front(of))) for of in sizes]
-    tables = [table(of, chosen) for of, chosen, _ in fronts]
+    fronts = [(of, front(of)) for of in sizes]
+    tables = [table(of, chosen) for of, chosen in fronts]
     note = f"{len(names)} objects x {options.views} views, {options.counts[0]:,} points where nothing else is said."
     notes = [note, f"{whole['hardware']}, load {whole['load']}, {whole['date']}."]
     results_folder.write(options.out, whole, tables, notes, {"front.png": plot(fronts)})

@@ -13,7 +13,6 @@ from support.handmade import ball, box
 
 from data_gen.make import objects
 from data_gen.plan import tasks
-from data_gen.render import views
 from data_gen.render.light import Lights
 from data_gen.store import check, layout, show
 from spnr_jax.formats import data_sets
@@ -101,8 +100,8 @@ def test_an_object_does_not_depend_on_which_others_are_made():
 
 def test_an_unexpected_error_leaves_out_that_object_only_but_a_full_disk_stops_the_run(tmp_path, monkeypatch):
     task, lights = tasks.Task(object_id="a", category="chair"), Lights(np.ones((4, 8, 3)))
-    given = {"lights": lights, "view": views.ViewConfig(), "num_points": 4, "seed": 0, "variant": "scalar_rgb"}
-    bench = objects.Workbench(out=tmp_path, **given)
+    config = tasks.GenerateConfig(out=tmp_path)
+    bench = objects.Workbench(config=config, lights=lights, variant="scalar_rgb")
 
     def fail(error):
         def failing(*_):

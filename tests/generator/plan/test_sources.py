@@ -261,14 +261,6 @@ def test_the_folder_is_wider_for_objects_of_shapenet_only_and_a_link_does_not_le
     np.testing.assert_allclose(colours[0], srgb_to_linear(TEXELS / 255), atol=1e-6)
 
 
-def test_the_root_may_be_the_class_itself_and_other_classes_are_not_read(tmp_path):
-    add(tmp_path, "plane", "a", 2)
-    add(tmp_path, "chair", "b", 1)
-    for root in (tmp_path, tmp_path / "02691156"):
-        assert [item.object_id for item in sources.find_objects(root, "plane")] == ["a"]
-    assert [item.object_id for item in sources.find_objects(tmp_path, "chair")] == ["b"]
-
-
 def test_a_split_file_of_shapenet_makes_those_objects_only_and_an_option_overrides_the_preset(tmp_path):
     root = tmp_path / "ShapeNetCore"
     for number in range(3):

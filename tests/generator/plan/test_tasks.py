@@ -7,7 +7,7 @@ import pytest
 
 from data_gen.__main__ import parse
 from data_gen.make.generate import describe
-from data_gen.plan import data_presets, splits, tasks
+from data_gen.plan import splits, tasks
 
 OUT = ["generate", "out"]
 
@@ -157,24 +157,13 @@ def test_options_that_do_not_go_together_are_one_line(options, expected):
 
 
 def test_a_preset_is_the_default_of_the_options_and_they_override_it():
-    for name, preset in data_presets.PRESETS.items():
+    for name, preset in tasks.PRESETS.items():
         made = parse([*OUT, "--preset", name, "--root", "data", "--spp", "16"])
         assert vars(made) == {**vars(preset("out")), "root": Path("data"), "spp": 16, "out": made.out}
         assert made.preset == name
         tasks.check_options(made)
     assert parse([*OUT, f"--preset={name}", "--colour-variants", "2"]).colour_variants == 2
     assert parse(OUT) == tasks.GenerateConfig(out=parse(OUT).out)
-
-
-def test_the_presets_hold_the_papers_numbers():
-    numbers = ("resolution", "views", "colour_variants", "train_objects", "test_objects")
-    found = {name: preset(Path("x")) for name, preset in data_presets.PRESETS.items()}
-    assert {name: tuple(getattr(one, number) for number in numbers) for name, one in found.items()} == {
-        "abo": (128, 10, 5, 16161, 200),
-        "shapenet_car": (200, 10, 0, None, 128),
-        "shapenet_plane": (200, 10, 0, None, 406),
-        "shapenet_chair": (200, 10, 0, None, 105),
-    }
 
 
 def test_meshes_are_named_after_their_files_and_go_with_procedural_objects(tmp_path):
@@ -184,3 +173,14 @@ def test_meshes_are_named_after_their_files_and_go_with_procedural_objects(tmp_p
     mixed = tasks.plan_objects(config(meshes=tmp_path, objects=1))
     assert [task.shown_path for task in mixed] == ["a.glb", "b.ply", ""]
     assert len(tasks.plan_objects(config())) == 200
+
+
+def test_the_presets_hold_the_papers_numbers():
+    numbers = ("resolution", "views", "colour_variants", "train_objects", "test_objects")
+    found = {name: preset(Path("x")) for name, preset in tasks.PRESETS.items()}
+    assert {name: tuple(getattr(one, number) for number in numbers) for name, one in found.items()} == {
+        "abo": (128, 10, 5, 16161, 200),
+        "shapenet_car": (200, 10, 0, None, 128),
+        "shapenet_plane": (200, 10, 0, None, 406),
+        "shapenet_chair": (200, 10, 0, None, 105),
+    }
