@@ -13,7 +13,7 @@ _PUBLIC |= dict.fromkeys(("Plan", "plan", "render"), "method.surfel_renderer")
 _PUBLIC |= {"neighbors": "surfels.geometry", "encode": "surfels.geometry", "densify": "method.densifier"}
 _PUBLIC |= {"read_cloud": "formats.clouds", "clean": "kernels.cleaning"}
 _PUBLIC |= {"splats": "tools.surfaces", "write_splats": "formats.gaussian_files"}
-_PUBLIC |= {"read_light": "formats.light_files", "sun": "surfels.skies"}
+_PUBLIC |= {"read_light": "formats.images", "sun": "surfels.skies"}
 _PUBLIC |= dict.fromkeys(("light_of", "ambient"), "surfels.lighting")
 _PUBLIC |= dict.fromkeys(
     ("PointCloud", "Camera", "Light", "Gaussians", "Rays", "Rendering", "Batch"), "kernels.records"

@@ -8,8 +8,8 @@ import sys
 import pytest
 
 from spnr_jax import errors
-from spnr_jax.formats.mesh import meshes
-from spnr_jax.formats.mesh.assets import RejectedAsset
+from spnr_jax.formats import meshes
+from spnr_jax.formats.assets import RejectedAsset
 
 
 def raised_in(module, code):

@@ -26,8 +26,7 @@ from data_gen.store import layout
 from data_gen.store.check import checksum_of
 from spnr_jax.devices.workers import run_tasks
 from spnr_jax.errors import UserError
-from spnr_jax.formats.images import write_whole
-from spnr_jax.formats.light_files import read_envmap
+from spnr_jax.formats.images import read_envmap, write_whole
 from spnr_jax.surfels.skies import indoor_envmap
 
 # options that say where or how fast, or whose content is described instead

@@ -20,9 +20,9 @@ from data_gen.render.light import Lights
 from data_gen.render.variant import mitsuba_module
 from data_gen.store import layout
 from spnr_jax.errors import UserError
-from spnr_jax.formats.mesh import meshes, surface_points
-from spnr_jax.formats.mesh.assets import Asset, Material, RejectedAsset
-from spnr_jax.formats.mesh.surface_points import Spread, sample_surface
+from spnr_jax.formats import meshes, surface_points
+from spnr_jax.formats.assets import Asset, Material, RejectedAsset
+from spnr_jax.formats.surface_points import Spread, sample_surface
 from spnr_jax.surfels.lighting import HEIGHT, resample
 
 

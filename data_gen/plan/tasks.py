@@ -20,8 +20,8 @@ from data_gen import procedural
 from data_gen.plan import sources, splits
 from data_gen.plan.sources import Category
 from spnr_jax.errors import UserError, at_least
-from spnr_jax.formats.mesh import meshes
-from spnr_jax.formats.mesh.surface_points import Spread
+from spnr_jax.formats import meshes
+from spnr_jax.formats.surface_points import Spread
 
 DEFAULT_OBJECTS = 200
 SAFE_ID = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]*")

@@ -13,7 +13,7 @@ from data_gen.procedural.cars import car
 from data_gen.procedural.parts import Piece, assemble
 from data_gen.procedural.tables import table
 from spnr_jax.errors import UserError
-from spnr_jax.formats.mesh.assets import Asset
+from spnr_jax.formats.assets import Asset
 
 
 def draw_style(styles: dict[Callable, float]) -> Callable[..., list[Piece]]:

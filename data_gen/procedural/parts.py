@@ -26,7 +26,7 @@ from data_gen.shapes.primitives import (
     tube,
     turn,
 )
-from spnr_jax.formats.mesh.assets import Asset, Part
+from spnr_jax.formats.assets import Asset, Part
 
 Piece = tuple[Finish, Mesh]
 DECIMALS = 6  # of positions and normals: hides the last bit, in which the sines of two processors may differ

@@ -17,7 +17,7 @@ import numpy as np
 from data_gen.render.variant import mitsuba_module
 from data_gen.render.views import ViewConfig, make_sensor, spread_viewpoints
 from spnr_jax.errors import UserError
-from spnr_jax.formats.light_files import ENDINGS, read_envmap
+from spnr_jax.formats.images import ENDINGS, read_envmap
 from spnr_jax.surfels import lighting, skies
 
 WHITE_SPHERE_RADIANCE = 0.6  # far enough below 1 that white objects keep their shading against the white background

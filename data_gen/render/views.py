@@ -24,8 +24,8 @@ from typing import Any
 import numpy as np
 
 from data_gen.render.variant import mitsuba_module
+from spnr_jax.formats.assets import Asset, Material, Part, RejectedAsset
 from spnr_jax.formats.data_sets import on_white
-from spnr_jax.formats.mesh.assets import Asset, Material, Part, RejectedAsset
 
 POLE_COSINE = 0.999  # nearer to the y axis than this, z takes the part of "up"
 

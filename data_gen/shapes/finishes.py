@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 
 from data_gen.shapes import patterns
+from spnr_jax.formats.assets import Material
 from spnr_jax.formats.columns import srgb_to_linear
-from spnr_jax.formats.mesh.assets import Material
 
 METALS = {
     "steel": (0.56, 0.57, 0.58),

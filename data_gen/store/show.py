@@ -14,8 +14,7 @@ from data_gen.store import check, layout
 from spnr_jax.errors import UserError, at_least
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.data_sets import Dataset, on_white
-from spnr_jax.formats.images import png_url, write_whole
-from spnr_jax.formats.pages import template
+from spnr_jax.formats.images import png_url, template, write_whole
 from spnr_jax.kernels.records import PointCloud
 
 CHANNELS = ("base_color", "roughness", "metallic")  # that are shown of points

@@ -26,9 +26,9 @@ from experiments.comparison.contenders import Method, of_rgba
 from experiments.comparison.results_folder import load_or_make
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
-from spnr_jax.formats.light_files import read_envmap
-from spnr_jax.formats.mesh.assets import Asset, Material, Part
-from spnr_jax.formats.mesh.surface_points import vertex_normals
+from spnr_jax.formats.assets import Asset, Material, Part
+from spnr_jax.formats.images import read_envmap
+from spnr_jax.formats.surface_points import vertex_normals
 from spnr_jax.kernels.records import PointCloud
 from spnr_jax.scoring.evaluation import Pictures
 from spnr_jax.surfels.normals import outward_normals

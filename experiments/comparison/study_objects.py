@@ -12,9 +12,9 @@ from data_gen.make import objects
 from data_gen.render import views
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
+from spnr_jax.formats.assets import Asset
 from spnr_jax.formats.data_sets import Dataset, ObjectData
 from spnr_jax.formats.images import to_uint8
-from spnr_jax.formats.mesh.assets import Asset
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.imaging import mean_of_squares
 from spnr_jax.kernels.records import Camera

@@ -27,11 +27,11 @@ from experiments import entry_point
 from spnr_jax import cli
 from spnr_jax.devices.runtime import QUICKEST
 from spnr_jax.errors import UserError
+from spnr_jax.formats import meshes
+from spnr_jax.formats.assets import Asset
 from spnr_jax.formats.images import write_whole
-from spnr_jax.formats.mesh import meshes
-from spnr_jax.formats.mesh.assets import Asset
-from spnr_jax.formats.mesh.surface_points import normalise, sample_surface
 from spnr_jax.formats.npz import pack_arrays, read_arrays
+from spnr_jax.formats.surface_points import normalise, sample_surface
 from spnr_jax.kernels import cloud_arrays
 from spnr_jax.kernels.cloud_arrays import farthest_points
 from spnr_jax.kernels.records import PointCloud

@@ -1,6 +1,6 @@
 """Point clouds from files: one path, for points and for meshes.
 
-    open        raw columns by the names that the file gives, positions in float64 (point_files.py, mesh/)
+    open        raw columns by the names that the file gives, positions in float64 (point_files.py, meshes.py)
     interpret   colours, materials, normals, opacity, classes (columns.py, orientation.py)
     cut         a box, without the dominant plane, one cluster
     merge       equal and nearly equal points; what then is no surface is refused
@@ -21,9 +21,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from spnr_jax.errors import UserError
+from spnr_jax.formats.assets import ShownParts
 from spnr_jax.formats.columns import DEFAULTS, Columns, Report, keep_visible, materials, normals, sound, useful
 from spnr_jax.formats.cut import Cut
-from spnr_jax.formats.mesh.assets import ShownParts
 from spnr_jax.formats.orientation import ROTATIONS, find_up, sensor_of
 from spnr_jax.formats.point_files import MESHES, column_pieces, kind_of, parse_ply
 from spnr_jax.kernels import scenes
@@ -146,10 +146,7 @@ class Points(NamedTuple):
 def _points_of(path: Path, kind: str, how: Reading) -> tuple[Points, float]:
     """The points of a file, read, cut out and cleaned, and how noisy they were."""
     pieces, noise = column_pieces(path, kind), 0.0
-    if pieces is None:
-        points = _sample_mesh(path, kind, how)
-    else:
-        points = _without_repeats(_interpret(_read_columns(pieces, how), how), how.report)
+    points = _sample_mesh(path, kind, how) if pieces is None else _interpret(_read_columns(pieces, how), how)
     rows, lines = scenes.object_of(points.positions, points.origin, how.cut.remove_plane, how.cut.nth, how.seed)
     points = points.take(rows)
     if pieces is not None and how.clean != "off":
@@ -163,7 +160,7 @@ def _points_of(path: Path, kind: str, how: Reading) -> tuple[Points, float]:
 def _place(path: Path, kind: str, points: Points, noise: float, how: Reading) -> PlacedCloud:
     """The cloud of the points, thinned, with normals, upright, moved to its origin."""
     up, count = how.up, how.num_points
-    sensor = sensor_of(path, points.positions + points.origin, kind, how.report)
+    sensor = sensor_of(path, kind, points.positions + points.origin, how.report)
     kept = np.arange(len(points.positions))
     if count is not None and len(kept) > count:
         how.report(f"{count} of {len(kept)} points kept, evenly spread")
@@ -175,8 +172,8 @@ def _place(path: Path, kind: str, points: Points, noise: float, how: Reading) ->
     elif "normals" not in points.values and len(kept) < len(points.positions):
         fewer.values["normals"] = outward_normals(points.positions, points.values["base_color"], kept, noise)
     if up == "auto":
-        camera_up = sensor.up(fewer.positions + points.origin) if sensor else None
-        up, reason = (camera_up, "that of its camera") if camera_up else find_up(fewer.positions, Path(f"a{kind}"))
+        of_camera = sensor and sensor.up
+        up, reason = (of_camera, "that of its camera") if of_camera else find_up(fewer.positions, kind)
         how.report(f"{up} taken as up ({reason}); --up says otherwise")
     rotation = np.array(ROTATIONS[up], np.float64)
     positions, origin = _shift(fewer.positions, points.origin, how.report)
@@ -220,7 +217,7 @@ def _shift(positions: np.ndarray, before: np.ndarray, report: Report) -> tuple[n
     """Positions (n, 3) from which `before` was subtracted, and the origin that is subtracted in the end."""
     whole = positions + before
     if not _coarse(whole):
-        return whole if before.any() else positions, np.zeros(3)
+        return whole, np.zeros(3)
     origin = np.floor(whole.min(axis=0))
     report(f"moved by {' '.join(f'{0 - value:.0f}' for value in origin)} to keep precision")
     return positions + (before - origin), origin
@@ -228,8 +225,8 @@ def _shift(positions: np.ndarray, before: np.ndarray, report: Report) -> tuple[n
 
 def _sample_mesh(path: Path, kind: str, how: Reading) -> Points:
     """Points spread evenly over a mesh, those inside the box that is to be cut out."""
-    from spnr_jax.formats.mesh.meshes import load_mesh  # here: points are read without trimesh
-    from spnr_jax.formats.mesh.surface_points import bounding_box, sample_surface
+    from spnr_jax.formats.meshes import load_mesh  # here: points are read without trimesh
+    from spnr_jax.formats.surface_points import bounding_box, sample_surface
 
     cut, report = how.cut, how.report
     count = max(CUT_MESH if cut.is_given else 0, how.num_points or MESH_POINTS)
@@ -244,8 +241,6 @@ def _sample_mesh(path: Path, kind: str, how: Reading) -> Points:
         parts = tuple(replace(part, positions=part.positions - origin) for part in asset.parts)
         asset = replace(asset, parts=parts)
     drawn = sample_surface(asset, count, how.seed, "even" if count <= MOST_EVEN else "random")
-    if not np.isfinite(drawn.positions).all():
-        raise UserError(f"holds vertices too large for float32, more than {np.finfo(np.float32).max:.2g}")
     report(f"{count} points spread over the surface of the mesh")
     values = {name: getattr(drawn, name) for name in DEFAULTS}
     if all((values[name] == default).all() for name, default in DEFAULTS.items()):
@@ -294,7 +289,7 @@ def _read_columns(pieces: Iterator[Columns], how: Reading) -> Columns:
 
 
 def _interpret(columns: Columns, how: Reading) -> Points:
-    """What the columns of a file of points mean."""
+    """What the columns of a file of points mean, equal and nearly equal points as one."""
     if not columns or len(columns["x"]) == 0:
         raise UserError("holds 0 points")
     columns = keep_visible(columns, how.cut.keep_noise, how.report)
@@ -302,7 +297,12 @@ def _interpret(columns: Columns, how: Reading) -> Points:
     _check_steps(columns, positions, how.report)
     origin = np.floor(positions.min(axis=0)) if _coarse(positions) else np.zeros(3)
     values, directions = materials(columns, how.report), normals(columns)
-    return Points(positions - origin, values if directions is None else values | {"normals": directions}, origin)
+    values |= {} if directions is None else {"normals": directions}
+    places, values, merged = merge_repeats(positions - origin, values)
+    if merged:
+        how.report(f"{merged:,} of {len(positions):,} points repeat others, and were merged with them")
+    require_surface(places, len(positions))
+    return Points(places, values, origin)
 
 
 def _check_steps(columns: Columns, positions: np.ndarray, report: Report) -> None:
@@ -328,15 +328,6 @@ def _check_steps(columns: Columns, positions: np.ndarray, report: Report) -> Non
             f"x and y look like degrees of longitude and latitude: {max(x, y):.2g} wide and {z:.3g} high; "
             "project them to metres first"
         )
-
-
-def _without_repeats(points: Points, report: Report) -> Points:
-    """The points, equal and nearly equal ones as one; ValueError where that is no surface."""
-    positions, values, merged = merge_repeats(points.positions, points.values)
-    if merged:
-        report(f"{merged:,} of {len(points.positions):,} points repeat others, and were merged with them")
-    require_surface(positions, len(points.positions))
-    return Points(positions, values, points.origin)
 
 
 def _believing(points: Points, report: Report) -> Points:

@@ -5,18 +5,17 @@ A data set is the folder that `spnr-data generate` writes (its form: docs/data.m
 
 import io
 import json
-import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 import jax
 import numpy as np
-from PIL import Image, UnidentifiedImageError
 
 from spnr_jax.config import TrainConfig
-from spnr_jax.errors import UserError, is_bug
+from spnr_jax.errors import UserError
 from spnr_jax.formats import clouds
+from spnr_jax.formats.assets import decode_image
 from spnr_jax.formats.npz import read_arrays
 from spnr_jax.kernels.records import Camera, Light, PointCloud
 from spnr_jax.surfels.lighting import HEIGHT, WIDTH, light_of
@@ -139,18 +138,10 @@ def _lights(content: bytes, views: int) -> np.ndarray:
 
 
 def _rgba(content: bytes, height: int, width: int) -> np.ndarray:
-    try:
-        with warnings.catch_warnings(action="error", category=Image.DecompressionBombWarning):
-            image = Image.open(io.BytesIO(content))
-        if image.size != (width, height):  # before memory is taken for them
-            raise UserError(f"{image.width} x {image.height} pixels, transforms.json says {width} x {height}")
-        return np.asarray(image.convert("RGBA"))
-    except UnidentifiedImageError:
-        raise UserError("is not an image") from None
-    except (Image.DecompressionBombError, Image.DecompressionBombWarning, SyntaxError, AttributeError) as error:
-        if is_bug(error):
-            raise
-        raise UserError(str(error)) from None  # the last two are Pillow's for chunks that break their rules
+    image = decode_image(content)
+    if image.shape[:2] != (height, width):
+        raise UserError(f"{image.shape[1]} x {image.shape[0]} pixels, transforms.json says {width} x {height}")
+    return image
 
 
 def on_white(rgba: np.ndarray) -> np.ndarray:

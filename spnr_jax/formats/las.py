@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from spnr_jax.errors import UserError, is_bug
+from spnr_jax.formats.assets import extra
 
 RECORD_HEAD, NAME, NUMBER = 54, b"laszip encoded", 22204
 LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}  # of an item of this type; those of extra bytes (14) have one a byte
@@ -34,11 +35,7 @@ UNREADABLE = (EOFError, RuntimeError, ValueError, LookupError, TypeError, Attrib
 
 def las_pieces(path: Path) -> Iterator[dict[str, np.ndarray]]:
     """The columns x y z, the colours and the intensity of a scan, some points at a time."""
-    try:
-        import laspy  # an extra: only here
-        import lazrs  # noqa: F401
-    except ImportError as error:
-        raise UserError(f"needs the package {error.name} to be read: pip install 'spnr-jax[formats]'") from None
+    laspy, _ = extra("laspy", "formats"), extra("lazrs", "formats")
     backends = (laspy.LazBackend.Lazrs,)  # its parallel reader ends the whole process on a damaged file
     _check_header(path)
     try:

@@ -12,8 +12,8 @@ better one is believed if nothing hides the points from it, another place if it 
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
@@ -42,11 +42,10 @@ FARTHEST = 1e30  # a place beyond it is none
 PLACE, UP = ("view_px", "view_py", "view_pz"), ("y_axisx", "y_axisy", "y_axisz")  # of VCGLIB's element `camera`
 
 
-def find_up(positions: np.ndarray, path: Path) -> tuple[str, str]:
-    """(up axis, how it was found) of points (n, 3) from a file."""
-    suffix = path.suffix.lower()
-    if suffix in BY_FORMAT:
-        return BY_FORMAT[suffix], f"by the format {suffix}"
+def find_up(positions: np.ndarray, kind: str) -> tuple[str, str]:
+    """(up axis, how it was found) of points (n, 3) from a file of a kind."""
+    if kind in BY_FORMAT:
+        return BY_FORMAT[kind], f"by the format {kind}"
     scores = {axis: standing(positions, "xyz".index(axis)) for axis in "yz"}
     up = "z" if scores["z"] > scores["y"] + MARGIN else "y"
     return up, f"y stands {scores['y']:.2f}, z {scores['z']:.2f}"
@@ -71,43 +70,27 @@ def _area(points: np.ndarray) -> float:
         return 0.0
 
 
-@dataclass(frozen=True, kw_only=True)
-class Sensor:
-    """A place (3,) in the file's frame; `image` where the points are the pixels of one depth image, `above` (3,)."""
+class Sensor(NamedTuple):
+    """The place (3,) of a sensor in the file's frame, and the axis that is up for its camera, where it is known."""
 
     place: np.ndarray
-    image: bool = False
-    above: np.ndarray | None = None
-
-    def up(self, positions: np.ndarray) -> str | None:
-        """The upward axis of what a camera saw at these points (n, 3), None if this was none.
-
-        Depth images are in the camera's axes, which are y down looking along z or y up looking against it.
-        """
-        if self.above is not None:
-            return max(ROTATIONS, key=lambda axis: float(np.array(ROTATIONS[axis][1]) @ self.above))
-        if not self.image:
-            return None
-        way = np.median(positions - self.place, axis=0)
-        ahead = way[2] / max(float(np.linalg.norm(way)), np.finfo(np.float64).tiny)
-        return None if abs(ahead) < AHEAD else "-y" if ahead > 0 else "y"
+    up: str | None = None
 
 
-def sensor_of(
-    path: Path, positions: np.ndarray, kind: str | None = None, report: Callable[[str], None] = lambda line: None
-) -> Sensor | None:
+def sensor_of(path: Path, kind: str, positions: np.ndarray, report: Callable[[str], None]) -> Sensor | None:
     """The sensor of a file of these points (n, 3) or faces; ValueError for a header that cannot be read."""
-    kind = kind or path.suffix.lower()
     if kind == ".pcd":
         header = read_pcd_header(path)
         if header.sensor is None or max(map(abs, header.sensor)) > FARTHEST:
             return None
         place = np.array(header.sensor)
-        image = header.organised or _from_there(positions, place, OPEN)
-        if not image and place.any() and not _from_there(positions, place, MOST, within=True):
+        if header.organised or _from_there(positions, place, OPEN):
+            return Sensor(place, _up_of_image(positions - place))
+        if place.any() and _from_there(positions, place, MOST, within=True):
+            return Sensor(place)
+        if place.any():
             report(f"the place of the sensor left out: from {' '.join(f'{x:g}' for x in place)} few points are seen")
-            return None
-        return Sensor(place=place, image=image) if image or place.any() else None
+        return None
     if kind != ".ply":
         return None
     with path.open("rb") as file:
@@ -118,7 +101,19 @@ def sensor_of(
     place, above = (np.array([row.get(name, np.nan) for name in names]) for names in (PLACE, UP))
     if not (np.abs(place) < FARTHEST).all():
         return None
-    return Sensor(place=place, above=above if np.isfinite(above).all() and above.any() else None)
+    if not (np.isfinite(above).all() and above.any()):
+        return Sensor(place)
+    return Sensor(place, max(ROTATIONS, key=lambda axis: float(np.array(ROTATIONS[axis][1]) @ above)))
+
+
+def _up_of_image(ways: np.ndarray) -> str | None:
+    """The upward axis of a depth image of points that lie these ways (n, 3) from its camera, None if it was none.
+
+    It is in the camera's axes, which are y down looking along z or y up looking against it.
+    """
+    way = np.median(ways, axis=0)
+    ahead = way[2] / max(float(np.linalg.norm(way)), np.finfo(np.float64).tiny)
+    return None if abs(ahead) < AHEAD else "-y" if ahead > 0 else "y"
 
 
 def _from_there(positions: np.ndarray, place: np.ndarray, share: float, within: bool = False) -> bool:

@@ -7,16 +7,16 @@ fault is a ValueError that says what is wrong; the file's name is added by the c
 
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
 from io import BufferedIOBase
 from itertools import islice
+from typing import NamedTuple
 
 import numpy as np
 
 from spnr_jax.errors import UserError
+from spnr_jax.formats.columns import Columns
 from spnr_jax.formats.text import SHOWN
 
-Columns = dict[str, np.ndarray]
 Lists = tuple[str, str]  # types of a list's length and of its items
 Element = tuple[str, int, list[tuple[str, str | Lists]]]  # name, count, [(property, type)]
 
@@ -32,8 +32,7 @@ LONGEST_LIST = 2**20  # items
 PIECE_BYTES, PIECE_LINES = 2**25, 2**17  # of the vertices that are in memory at a time
 
 
-@dataclass(frozen=True, kw_only=True)
-class PlyHeader:
+class PlyHeader(NamedTuple):
     """What a PLY file announces; byte_order is None in a text file."""
 
     byte_order: str | None
@@ -72,7 +71,7 @@ def read_ply_header(file: BufferedIOBase) -> PlyHeader:
     if byte_order == "unknown":
         raise UserError(f"has a PLY header without a known format; expected one of {', '.join(BYTE_ORDERS)}")
     file.seek(end.end())
-    return PlyHeader(byte_order=byte_order, elements=elements)
+    return PlyHeader(byte_order, elements)
 
 
 def element_pieces(file: BufferedIOBase, wanted: str = "vertex") -> Iterator[Columns]:
@@ -167,19 +166,14 @@ def text_rows(lines: Iterator[str], count: int, layout: np.dtype) -> Iterator[np
             yield np.loadtxt(rows, dtype=layout, comments=None, ndmin=1)
         except ValueError:
             wanted = len(layout.names or ())
-            broken = next((i for i, row in enumerate(rows) if not _fits(row, layout)), 0)
-            place = found - len(rows) + broken
-            raise UserError(f"point {place}: expected {wanted} numbers, found {rows[broken][:SHOWN]!r}") from None
+            for place, row in enumerate(rows, found - len(rows)):
+                try:
+                    np.loadtxt([row], dtype=layout, comments=None, ndmin=1)
+                except ValueError:
+                    raise UserError(f"point {place}: expected {wanted} numbers, found {row[:SHOWN]!r}") from None
+            raise
     if not count:
         yield np.empty(0, layout)
-
-
-def _fits(row: str, layout: np.dtype) -> bool:
-    """Whether a line of text is one record."""
-    try:
-        return np.loadtxt([row], dtype=layout, comments=None, ndmin=1).size == 1
-    except ValueError:
-        return False
 
 
 def binary_rows(file: BufferedIOBase, count: int, layout: np.dtype) -> Iterator[np.ndarray]:

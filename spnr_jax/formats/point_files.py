@@ -6,7 +6,7 @@
     .npz .npy                   spnr_jax/formats/npz.py
     .las .laz                   spnr_jax/formats/las.py
     .spz                        spnr_jax/formats/gaussian_files.py
-    .glb .gltf .obj .off        meshes (spnr_jax/formats/mesh), as points where they have no faces
+    .glb .gltf .obj .off        meshes (spnr_jax/formats/meshes.py), as points where they have no faces
 
 A reader yields pieces of at most some ten megabytes (archives, meshes and compressed files come whole), so that a file
 may be larger than the memory.  Columns are raw: names and types are those of the file, positions float64 where the file
@@ -54,14 +54,11 @@ FOREIGN: dict[bytes | str, tuple] = {
     b"#usda": ("USD (text)", "6x3s", BLENDER),
     b"ASTM-E57": ("an E57 scan", "<8x2I", CLOUDCOMPARE),
     b"Kaydara FBX Binary": ("an FBX scene", "<23xI", BLENDER),
-    b"BLENDER": ("a Blender scene", "9x3s", "export it as .glb: File > Export > glTF 2.0"),
-    b"\x89HDF": ("an HDF5 file", None, "write its points as .npz: arrays points and colors"),
     ".usdz": ("USD (package)", None, BLENDER),
     **dict.fromkeys((".usd", ".usda", ".usdc"), ("USD", None, BLENDER)),
     ".e57": ("an E57 scan", None, CLOUDCOMPARE),
     **dict.fromkeys((".ptx", ".rcp", ".rcs", ".fls", ".bin"), ("a scan of its maker's own kind", None, CLOUDCOMPARE)),
     **dict.fromkeys((".fbx", ".dae", ".3ds", ".3mf", ".blend", ".x3d", ".wrl"), ("a scene", None, BLENDER)),
-    **dict.fromkeys((".stp", ".step", ".iges", ".igs"), ("a CAD model", None, "export a mesh, .stl or .glb")),
     **dict.fromkeys((".splat", ".ksplat", ".sog"), ("a file of splats", None, "convert it to .ply with SuperSplat")),
 }
 
@@ -112,7 +109,7 @@ def column_pieces(path: Path, kind: str | None = None) -> Iterator[Columns] | No
                 return None
     if kind in READERS:
         return READERS[kind](path)
-    from spnr_jax.formats.mesh.meshes import points_of  # here: points are read without trimesh
+    from spnr_jax.formats.meshes import points_of  # here: points are read without trimesh
 
     columns = points_of(path, kind)
     return None if columns is None else iter([columns])

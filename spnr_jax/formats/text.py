@@ -20,8 +20,8 @@ from typing import NamedTuple
 import numpy as np
 
 from spnr_jax.errors import UserError
+from spnr_jax.formats.columns import Columns
 
-Columns = dict[str, np.ndarray]
 Line = tuple[int, str]  # its number in the file, from 1, and its text
 
 POSITION, COLOR, NORMAL = ("x", "y", "z"), ("r", "g", "b"), ("nx", "ny", "nz")
@@ -114,7 +114,7 @@ def _names(header: str, is_comment: bool, table: np.ndarray, layout: Layout) -> 
     for names in found:
         while len(names) > count and not names[-1]:
             names.pop()
-        if len(names) == count - 1 and "x" in names and _counts(table[:, 0]):
+        if len(names) == count - 1 and "x" in names and len(table) > 1 and np.all(np.diff(table[:, 0]) == 1):
             names.insert(0, "")  # as R writes a table
     names = next((names for names in found if len(names) == count), found[-1])
     if is_comment and ("x" not in names or len(names) != count):
@@ -122,11 +122,6 @@ def _names(header: str, is_comment: bool, table: np.ndarray, layout: Layout) -> 
     if len(names) != count:
         raise UserError(f"names {len(names)} columns ({' '.join(names)}) above {count} columns of numbers")
     return tuple(name or INDEX for name in names)
-
-
-def _counts(column: np.ndarray) -> bool:
-    """Whether a column only numbers the rows."""
-    return len(column) > 1 and bool(np.all(np.diff(column) == 1))
 
 
 def plain_names(table: np.ndarray) -> tuple[str, ...]:

@@ -13,8 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from spnr_jax.formats.images import depth_image, png_url, write_whole
-from spnr_jax.formats.pages import template
+from spnr_jax.formats.images import depth_image, png_url, template, write_whole
 from spnr_jax.methods import label_of, to_dict
 from spnr_jax.scoring.evaluation import FLOORS, Evaluation, ObjectResult, Pictures, median_view
 from spnr_jax.scoring.picture_scores import NO_LPIPS, interval

@@ -25,8 +25,7 @@ from spnr_jax.devices import runtime
 from spnr_jax.devices.runtime import run_ahead
 from spnr_jax.devices.workers import run_tasks
 from spnr_jax.errors import UserError, one_line
-from spnr_jax.formats.images import check_place, write_whole
-from spnr_jax.formats.pages import template
+from spnr_jax.formats.images import check_place, template, write_whole
 from spnr_jax.formats.point_files import MESHES, READERS
 from spnr_jax.tools.commands import WILDCARDS, Render
 from spnr_jax.tools.pictures import draw_all, load_network, prepare_cloud

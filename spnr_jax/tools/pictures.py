@@ -34,7 +34,7 @@ from spnr_jax.errors import UserError
 from spnr_jax.formats import clouds, images
 from spnr_jax.formats.clouds import PlacedCloud
 from spnr_jax.formats.gaussian_files import write_splats
-from spnr_jax.formats.light_files import read_light
+from spnr_jax.formats.images import read_light
 from spnr_jax.kernels.cameras import camera_rays
 from spnr_jax.kernels.imaging import linear_to_srgb
 from spnr_jax.kernels.records import Camera, Light, Rendering, Volume

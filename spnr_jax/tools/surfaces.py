@@ -228,7 +228,7 @@ def mesh_of(grid: Grid, placed: PlacedCloud) -> Solid:
     """The surface of a grid of solidity, 0 outside to 1 inside; ValueError if there is none."""
     from skimage.measure import marching_cubes  # here, so that rendering alone stays quick
 
-    from spnr_jax.formats.mesh.surface_points import vertex_normals
+    from spnr_jax.formats.surface_points import vertex_normals
 
     if not grid.values.max() > SURFACE:
         raise UserError("no surface to write as a mesh: the network's pictures show nothing solid")

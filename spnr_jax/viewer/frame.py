@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from spnr_jax.config import Quality
 from spnr_jax.errors import UserError
 from spnr_jax.formats import images
-from spnr_jax.formats.light_files import NAMES, read_light
+from spnr_jax.formats.images import NAMES, read_light
 from spnr_jax.kernels.records import Camera, Light, PointCloud, Volume
 from spnr_jax.method.model import Model
 from spnr_jax.tools.commands import Lighting

@@ -32,7 +32,7 @@ from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
 from spnr_jax.errors import UserError
-from spnr_jax.formats import clouds, images, light_files
+from spnr_jax.formats import clouds, images
 from spnr_jax.method.model import FIELD_OF_VIEW, Model
 from spnr_jax.methods import method_of
 from spnr_jax.tools.commands import View
@@ -275,10 +275,10 @@ class Browser:
 
     def _open(self, file: viser.UploadedFile) -> None:
         name, notes = frame.display_name(file.name), list[str]()
-        if name.lower().endswith(tuple(light_files.ENDINGS)):
+        if name.lower().endswith(tuple(images.ENDINGS)):
             if not self._light:
                 raise UserError(ONE_LIGHT)
-            light = frame.read_upload(file.name, file.content, light_files.read_light)
+            light = frame.read_upload(file.name, file.content, images.read_light)
             self.loop.submit(lambda state: self._show_choice(frame.add_map(state, name, light)))
             return
         read = partial(clouds.read_cloud, **self._reading, report=notes.append)

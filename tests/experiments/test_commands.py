@@ -29,7 +29,7 @@ from experiments.studies import inverse, relighting, sharpness
 from spnr_jax import cli, presets
 from spnr_jax.config import SurfelConfig
 from spnr_jax.formats import data_sets
-from spnr_jax.formats.mesh.assets import Asset
+from spnr_jax.formats.assets import Asset
 from spnr_jax.scoring import evaluation
 from spnr_jax.training import weights
 

@@ -12,9 +12,8 @@ from support.surfel_clouds import cloud
 from data_gen.render import light, views
 from experiments.comparison import poisson
 from experiments.comparison.study_objects import cut
-from spnr_jax.formats import data_sets
-from spnr_jax.formats.mesh import surface_points
-from spnr_jax.formats.mesh.assets import Asset
+from spnr_jax.formats import data_sets, surface_points
+from spnr_jax.formats.assets import Asset
 from spnr_jax.kernels import cameras
 from spnr_jax.surfels.sides import spiral
 from spnr_jax.surfels.skies import indoor_envmap

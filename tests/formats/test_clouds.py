@@ -6,7 +6,7 @@ import sys
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
-from support.point_clouds import read, sphere_points, write
+from support.point_clouds import read, sphere_points, write, write_rows
 
 from data_gen.store.layout import POINT_TYPE, encode_points
 from spnr_jax.formats import clouds
@@ -43,12 +43,7 @@ def test_the_points_of_a_data_set_come_back_as_they_are_and_nothing_is_assumed(t
 
 def materials(folder, **columns):
     """Base colours, roughness and metallic of three points with the columns, and what was reported."""
-    rows = np.zeros(3, [*((axis, "f8") for axis in "xyz"), *((n, np.asarray(v).dtype) for n, v in columns.items())])
-    rows["x"], rows["y"] = [0, 1, 0], [0, 0, 1]
-    for name, values in columns.items():
-        rows[name] = values
-    np.save(folder / "a.npy", rows)
-    cloud, lines = read(folder / "a.npy")
+    cloud, lines = read(write_rows(folder, [[0, 0, 0], [1, 0, 0], [0, 1, 0]], **columns))
     return cloud.base_color, cloud.roughness, cloud.metallic, lines
 
 
@@ -148,7 +143,7 @@ def test_points_are_spread_evenly_over_a_mesh_unless_there_are_very_many(tmp_pat
 
 def test_thinning_keeps_points_of_the_file_with_their_materials_and_depends_on_the_seed_alone(tmp_path):
     positions = sphere_points(1, 900)
-    np.savez(tmp_path / "a.npz", xyz=positions, roughness=np.arange(900) / 900)
+    np.savez(tmp_path / "a.npz", xyz=positions, normals=positions, roughness=np.arange(900) / 900)
     cloud, lines = read(tmp_path / "a.npz", num_points=100, seed=5)
     source = np.round(cloud.roughness * 900).astype(int)
     assert len(set(source)) == 100
@@ -209,7 +204,7 @@ def test_rows_without_finite_numbers_are_left_out_while_a_big_file_is_thinned(tm
     monkeypatch.setattr(clouds, "CAPACITY", 16)
     monkeypatch.setattr("spnr_jax.formats.text.PIECE_LINES", 7)
     positions = np.concatenate([np.full((20, 3), np.nan), sphere_points(3, 300), np.full((9, 3), np.inf)])
-    np.savetxt(tmp_path / "a.xyz", positions)
+    np.savetxt(tmp_path / "a.xyz", np.tile(positions, 2), header="x y z nx ny nz")
     cloud, lines = read(tmp_path / "a.xyz", num_points=1)
     assert np.isfinite(cloud.positions).all()
     assert lines[0] == "29 of 329 points left out: NaN, infinity or too large a number"
@@ -222,8 +217,9 @@ def test_rows_without_finite_numbers_are_left_out_while_a_big_file_is_thinned(tm
 def scene(folder, origin=(0.0, 0.0, 0.0)):
     """A file of a large and a small ball, and one point far from both."""
     points = [spiral(900), 0.3 * spiral(450) + [2, 0, 0], [[0, 4, 0]]]
-    np.save(folder / "a.npy", np.concatenate(points) + origin)
-    return folder / "a.npy"
+    normals = np.concatenate([spiral(900), spiral(450), [[0, 1, 0]]])
+    np.savez(folder / "a.npz", points=np.concatenate(points) + origin, normals=normals)
+    return folder / "a.npz"
 
 
 def test_a_box_is_in_the_units_and_axes_of_the_file_however_far_it_lies(tmp_path, monkeypatch):

@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 from support import splat_balls
 from support.gltf_files import GltfBuilder
-from support.point_clouds import packed_splats, ply_bytes, read, write
+from support.point_clouds import packed_splats, ply_bytes, read, write, write_rows
 
 from spnr_jax.formats import gaussian_files
 from spnr_jax.formats.clouds import place_cloud, read_cloud
 from spnr_jax.formats.cut import Cut
-from spnr_jax.formats.mesh.plain import ears
+from spnr_jax.formats.polygons import ears
 from spnr_jax.surfels.sides import spiral
 
 ROOT = Path(__file__).parents[2]
@@ -164,17 +164,9 @@ def test_the_colours_of_a_mesh_are_read_as_those_of_points(tmp_path, case):
 
 
 def colored_ball(folder, colors=GREEN, kind: str = "<u2", **more: np.ndarray):
-    """A structured array of the ball with colours, one or (420, 3), and other columns."""
-    colors = np.broadcast_to(colors, (420, 3))
-    fields = [(axis, "<f8") for axis in "xyz"] + [(name, kind) for name in RGB]
-    rows = np.zeros(420, fields + [(name, column.dtype.str) for name, column in more.items()])
-    for names, values in (("xyz", BALL), (RGB, colors)):
-        for name, column in zip(names, values.T, strict=True):
-            rows[name] = column
-    for name, column in more.items():
-        rows[name] = column
-    np.save(folder / "a.npy", rows)
-    return folder / "a.npy"
+    """A file of the ball with colours, one or (420, 3), and other columns."""
+    colors = np.broadcast_to(colors, (420, 3)).astype(kind)
+    return write_rows(folder, BALL, **dict(zip(RGB, colors.T, strict=True)), **more)
 
 
 @pytest.mark.parametrize(

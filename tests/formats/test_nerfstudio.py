@@ -47,6 +47,7 @@ def read(folder):
     return points, frames
 
 
+@pytest.mark.ci  # it starts workers
 def test_the_points_reproject_onto_the_object_and_cover_it(folder):
     _, frames = read(folder)
     for pixels, alpha in frames:

@@ -2,6 +2,8 @@
 
 import io
 import pickle
+import struct
+import sys
 import time
 import zipfile
 
@@ -9,12 +11,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.pcd_files import compress, content, points
 from support.point_clouds import SRGB, XYZRGB, ply_bytes, read, read_columns, write
-from support.point_tables import BROKEN, SOUND, WHOLE, WRITERS, written
+from support.point_tables import BROKEN, SOUND, WHOLE, WRITERS, as_scan, compress_lzf, written
 
 from spnr_jax.formats import clouds, las, npz, ply, text
-from spnr_jax.formats.clouds import read_cloud
+from spnr_jax.formats.clouds import place_cloud, read_cloud
 from spnr_jax.formats.npz import pack_arrays
 from spnr_jax.formats.pcd import decompress
 from spnr_jax.formats.point_files import column_pieces
@@ -114,28 +115,89 @@ def test_columns_without_names_are_told_by_their_number_and_normals_by_their_len
 # Packed PCD
 
 
-def test_points_that_are_called_compressed_and_stored_as_they_are_are_read(tmp_path):
-    columns = read_columns(write(tmp_path, "a.pcd", content("binary_compressed", points(), stored=True)))
-    for name in ("x", "y", "z", "roughness", "rgb"):
-        np.testing.assert_array_equal(columns[name], points()[name])
-
-
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.sampled_from([b"a", b"b", b"abc", b"abcabcabc", b"\0" * 300, b"xyz" * 20]), max_size=12))
 def test_decompress_inverts_lzf(pieces):
     data = b"".join(pieces)
-    assert decompress(compress(data), len(data)) == data
+    assert decompress(compress_lzf(data), len(data)) == data
     for size in range(3, 9):  # copies of the last three bytes, which may reach into themselves
         assert decompress(b"\2abc" + bytes([size - 2 << 5, 2]), 3 + size) == (b"abc" * 4)[: 3 + size]
 
 
-@settings(max_examples=200, deadline=None)
-@given(st.binary(min_size=1, max_size=60))
-def test_lzf_that_gives_another_size_or_reaches_before_its_start_is_refused(data):
-    try:
-        assert len(decompress(data, 20)) == 20
-    except ValueError as error:
-        assert "damaged" in str(error)  # noqa: PT017 - some inputs are sound
+# Laser scans
+
+FAR = WHOLE._replace(positions=WHOLE.positions + [500_000.0, 4_000_000.0, 120.0])
+
+
+def in_own_chunks(path, sizes, announced: int):
+    """The scan at a path packed in chunks of these sizes, whose record announces chunks of `announced` points."""
+    import lazrs
+
+    whole = bytearray(path.read_bytes())
+    (start,) = struct.unpack_from("<I", whole, 96)
+    vlr = lazrs.LazVlr.new_for_compression(whole[104], 0, True)
+    record = bytearray(vlr.record_data())
+    struct.pack_into("<I", record, 12, announced)
+    head = whole[:start] + struct.pack("<2x16sHH32x", b"laszip encoded", 22204, len(record)) + record
+    struct.pack_into("<II", head, 96, len(head), 1)
+    head[104] |= 0x80
+    packed = io.BytesIO()
+    packed.write(head)
+    compressor, points = lazrs.LasZipCompressor(packed, vlr), np.frombuffer(whole, np.uint8, offset=start)
+    for number, piece in enumerate(np.split(points, np.cumsum(sizes)[:-1] * vlr.item_size())):
+        if number:
+            compressor.finish_current_chunk()
+        compressor.compress_many(piece)
+    compressor.done()
+    path.with_suffix(".laz").write_bytes(packed.getvalue())
+
+
+@pytest.mark.parametrize(("suffix", "announced"), [(".las", None), (".laz", None), (".laz", 0), (".laz", 2**32 - 1)])
+def test_a_scan_keeps_its_coordinates_and_colours_in_chunks_of_any_size_and_is_z_up(tmp_path, suffix, announced):
+    as_scan(tmp_path / f"a{suffix if announced is None else '.las'}", FAR)
+    if announced is not None:
+        in_own_chunks(tmp_path / "a.las", (5, 3, 4), announced)
+    placed = place_cloud(tmp_path / f"a{suffix}")
+    assert placed.up == "z"
+    back = placed.cloud.positions @ placed.rotation + placed.origin
+    np.testing.assert_allclose(back, FAR.positions, rtol=0, atol=1e-4)
+    np.testing.assert_allclose(placed.cloud.base_color, SRGB[WHOLE.levels], atol=1e-4)
+
+
+def test_a_scan_without_colours_shows_its_intensity(tmp_path):
+    as_scan(tmp_path / "a.las", WHOLE, 6)
+    assert np.ptp(read_cloud(tmp_path / "a.las").base_color) > 0.9
+
+
+@pytest.mark.parametrize("package", ["laspy", "lazrs"])
+def test_without_its_packages_one_line_names_the_extra(tmp_path, monkeypatch, package):
+    as_scan(tmp_path / "a.las", WHOLE)
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(ValueError, match=rf"a.las: needs the package {package} .* pip install 'spnr-jax\[formats\]'"):
+        read_cloud(tmp_path / "a.las")
+
+
+@pytest.mark.parametrize(
+    ("suffix", "place", "value", "reason"),
+    [
+        (".las", 100, 2**32 - 1, "records in its header"),
+        (".las", 96, 2**32 - 1, "points from byte"),
+        (".las", 0, 0, "not a LAS file"),
+        (".laz", "table", 2**31, "chunks in"),
+        (".laz", "table", 0, "points in 0 chunks"),
+    ],
+)
+def test_what_announces_more_than_the_file_holds_never_reaches_the_library(suffix, place, value, reason, tmp_path):
+    as_scan(tmp_path / f"a{suffix}", WHOLE)
+    content = bytearray((tmp_path / f"a{suffix}").read_bytes())
+    if place == "table":  # of chunks, which the library trusts
+        (data,) = struct.unpack_from("<I", content, 96)
+        (table,) = struct.unpack_from("<q", content, data)
+        place = table + 4
+    content[place : place + 4] = value.to_bytes(4, "little")
+    (tmp_path / f"a{suffix}").write_bytes(content)
+    with pytest.raises(ValueError, match=reason):
+        read_cloud(tmp_path / f"a{suffix}")
 
 
 # What is refused
@@ -155,7 +217,7 @@ def archive(member: bytes) -> bytes:
     return stream.getvalue()
 
 
-PLY, PCD = b"ply\nformat ascii 1.0\n", content("binary", points())
+PLY, PCD = b"ply\nformat ascii 1.0\n", WRITERS["binary.pcd"](WHOLE)
 POINTS = pack_arrays({"points": np.zeros((50, 3))})
 LITTLE, DEEP = "binary_little_endian", [(0.0, 0.0, 5e6), (0.0, 0.0, 5e6 + 1)]
 LENGTHS = pack_arrays({"points": np.zeros((5, 3)), "rgb": np.zeros((4, 3))})
@@ -200,7 +262,7 @@ REFUSED = [
     ("a.pcd", PCD.replace(b"TYPE F F U F F F", b"TYPE F F U F F"), "disagree"),
     ("a.pcd", PCD.replace(b"TYPE F F U F F F", b"TYPE F F U F F Q"), "disagree"),
     ("a.pcd", PCD.replace(b"COUNT 1 1 3 1 1 1", b"COUNT 1 1 2147483647 1 1 1"), "bytes; expected at most"),
-    ("a.pcd", PCD.replace(b"POINTS 4", b"POINTS -4"), "-4"),
+    ("a.pcd", PCD.replace(b"POINTS 12", b"POINTS -4"), "-4"),
     ("a.pcd", PCD.replace(b"DATA binary", b"DATA packed"), "packed"),
     ("a.pcd", PCD.replace(b"HEIGHT 1", b"SHAPE 1"), "SHAPE"),
     ("a.npy", pickle.dumps([1, 2]), "not a NumPy file"),

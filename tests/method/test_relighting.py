@@ -8,7 +8,7 @@ import pytest
 from support.surfel_clouds import cloud, shape
 
 import spnr_jax
-from spnr_jax.formats.light_files import read_light
+from spnr_jax.formats.images import read_light
 from spnr_jax.kernels.imaging import srgb_to_linear
 from spnr_jax.surfels.lighting import directions
 

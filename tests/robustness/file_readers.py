@@ -17,12 +17,14 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
-from damage import Files
+from PIL import Image
 from support import splat_balls, tiny_dataset
 from support.gltf_files import UV, GltfBuilder, png
-from support.packed_meshes import ETC1S_ALPHA, MESHOPT, UASTC
+from support.packed_meshes import draco_square, meshopt_files
 from support.point_clouds import packed_splats
 from support.point_tables import WHOLE, WRITERS, written
+
+Files = dict[str, bytes]
 
 MOST_POINTS = 32
 TEXELS = np.random.default_rng(7).integers(0, 256, (4, 4, 4))
@@ -40,8 +42,7 @@ def read_cloud(folder: Path, main: str) -> None:
 
 def read_mesh(folder: Path, main: str) -> None:
     """What the generator of data makes of a mesh file, and `spnr render` with either choice of transparent parts."""
-    from spnr_jax.formats import clouds
-    from spnr_jax.formats.mesh import assets, meshes, surface_points
+    from spnr_jax.formats import assets, clouds, meshes, surface_points
 
     with contextlib.suppress(assets.RejectedAsset):  # more is refused for references than for pictures
         surface_points.sample_surface(meshes.load_mesh(folder / main), MOST_POINTS, 0)
@@ -172,31 +173,25 @@ def objs() -> list[Files]:
     return [{"mesh.obj": (corners + faces).encode()} | companions, *tables(".obj")]
 
 
-def scene(material: dict, *images: tuple[str, bytes], suffix: str = ".gltf", **node) -> Files:
+def scene(material: dict, *images: tuple[str, bytes], suffix: str = ".gltf") -> Files:
     """A square of a material under a node, beside an opaque one; the images lie beside the file."""
     builder = GltfBuilder()
     for number, (name, _) in enumerate(images):
         builder.texture(uri=name, wrapS=33071 if number else 10497)
-    for name, extension in ((".ktx2", "KHR_texture_basisu"), (".webp", "EXT_texture_webp")):
-        if images and images[0][0].endswith(name):
-            builder.document["textures"][0] = {"extensions": {extension: {"source": 0}}}
+    if images and images[0][0].endswith(".webp"):
+        builder.document["textures"][0] = {"extensions": {"EXT_texture_webp": {"source": 0}}}
     square = builder.primitive(material=builder.material(**material), TEXCOORD_0=UV)
-    rows, values = builder.view(np.uint16([0, 3]).tobytes()), builder.view(np.float32([[5, 6, 7]] * 2).tobytes())
-    sparse = {"count": 2, "indices": {"bufferView": rows, "componentType": 5123}, "values": {"bufferView": values}}
-    builder.document["accessors"][0]["sparse"] = sparse
     child = builder.mesh(square, root=False, translation=[1, 0, 0])
     builder.node(children=[child], rotation=[0, 0, 0, 1], scale=[1, 2, 1])
-    moves = {"TRANSLATION": builder.accessor(np.float32([[0, 0, 0], [5, 0, 0]]))}
-    builder.mesh(builder.primitive(), extensions={"EXT_mesh_gpu_instancing": {"attributes": moves}})
+    builder.mesh(builder.primitive(), translation=[5, 0, 0])
+    builder.node(mesh=0)
     files = {"mesh.glb": builder.glb()} if suffix == ".glb" else builder.files("mesh.gltf")
     return files | dict(images)
 
 
 def scenes() -> list[Files]:
-    """Masks, glass, normal maps with coordinates of their own, the older specular workflow, packed images, points."""
+    """Masks, glass, normal maps, textures that lie differently, the older specular workflow, WebP, points."""
     webp = io.BytesIO()
-    from PIL import Image
-
     Image.fromarray(TEXELS.astype(np.uint8)).save(webp, "webp", lossless=True)
     pictures = ("a.png", png(TEXELS)), ("b.png", png(TEXELS[..., :3]))
     base = {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}, "baseColorFactor": [1, 1, 1, 0.9]}}
@@ -208,39 +203,10 @@ def scenes() -> list[Files]:
         scene(base | {"alphaMode": "MASK", "alphaCutoff": 0.3} | bumpy, *pictures),
         scene({"extensions": glass} | bumpy, *pictures),
         scene({"extensions": shiny, "emissiveFactor": [0, 0.1, 0], "alphaMode": "BLEND"}, *pictures),
-        *(scene(base, ("a.ktx2", data)) for data in (UASTC, ETC1S_ALPHA)),
         scene(base, ("a.webp", webp.getvalue())),
         scene({}, suffix=".glb"),
         *tables(".gltf", ".glb"),
     ]
-
-
-def packed_scenes() -> list[Files]:
-    """Meshes that Draco and meshopt packed."""
-    import DracoPy
-
-    box, name = trimesh.creation.box(), "KHR_draco_mesh_compression"
-    data = DracoPy.encode(box.vertices.astype(np.float32), box.faces.astype(np.uint32))
-    ids = {"POSITION": DracoPy.decode(data).attributes[0]["unique_id"]}
-    draco, meshopt = GltfBuilder(extensionsRequired=[name]), GltfBuilder()
-    extension = {name: {"bufferView": draco.view(data), "attributes": ids}}
-    draco.document["accessors"] = [
-        {"count": len(box.vertices), "type": "VEC3", "componentType": 5126},
-        {"count": box.faces.size, "type": "SCALAR", "componentType": 5123},
-    ]
-    draco.mesh({"attributes": {"POSITION": 0}, "indices": 1, "extensions": extension})
-    views = meshopt.document["bufferViews"]
-    for case in (MESHOPT["two blocks of steps, format 1"], MESHOPT["a grid"]):
-        described = {key: case[key] for key in ("count", "byteStride", "mode", "filter")}
-        extension = {"EXT_meshopt_compression": views[meshopt.view(case["packed"])] | described}
-        views[-1] = {"buffer": 0, "byteLength": case["count"] * case["byteStride"], "extensions": extension}
-    views[0]["byteStride"] = 8
-    meshopt.document["accessors"] = [
-        {"bufferView": 0, "count": 300, "type": "VEC3", "componentType": 5123, "normalized": True},
-        {"bufferView": 1, "count": 120, "type": "SCALAR", "componentType": 5125},
-    ]
-    meshopt.mesh({"attributes": {"POSITION": 0}, "indices": 1})
-    return [draco.files("mesh.gltf"), meshopt.files("mesh.gltf")]
 
 
 def splats() -> list[Files]:
@@ -318,7 +284,7 @@ READERS: dict[str, Reader] = {
     "off": (lambda: [*plain_meshes(".off"), *tables(".off")], read_cloud),
     "obj": (objs, read_mesh),
     "gltf": (scenes, read_mesh),
-    "gltf-packed": (packed_scenes, read_mesh),
+    "gltf-packed": (lambda: [draco_square().files("mesh.gltf"), meshopt_files()], read_mesh),
     **{
         name: (functools.partial(run_files, name), read)
         for name, read in (("config", read_config), ("metrics", read_metrics))

@@ -7,7 +7,7 @@ import struct
 import numpy as np
 from PIL import Image
 
-from spnr_jax.formats.mesh.meshes import load_mesh
+from spnr_jax.formats.meshes import load_mesh
 
 COMPONENT = {"i1": 5120, "u1": 5121, "i2": 5122, "u2": 5123, "u4": 5125, "f4": 5126}
 KIND = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}

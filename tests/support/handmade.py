@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from spnr_jax.formats.mesh.assets import Asset, Material, Part
+from spnr_jax.formats.assets import Asset, Material, Part
 
 RED, GREEN, BLUE, GREY = (0.7, 0.05, 0.05), (0.05, 0.6, 0.05), (0.05, 0.05, 0.7), (0.5, 0.5, 0.5)
 

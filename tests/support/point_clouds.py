@@ -56,6 +56,16 @@ def write(folder, name: str, content: bytes | str):
     return path
 
 
+def write_rows(folder, positions, **columns):
+    """A structured .npy file of positions (n, 3) and other columns by their names."""
+    columns = dict(zip("xyz", np.asarray(positions, float).T, strict=True)) | columns
+    rows = np.zeros(len(positions), [(name, np.asarray(column).dtype) for name, column in columns.items()])
+    for name, column in columns.items():
+        rows[name] = column
+    np.save(folder / "a.npy", rows)
+    return folder / "a.npy"
+
+
 def read(path, **options):
     """The cloud and the lines that it reported."""
     lines: list[str] = []

@@ -1,11 +1,11 @@
 """One table of points, and a writer of it for each format that holds points."""
 
+import itertools
 from typing import NamedTuple
 
 import numpy as np
 import pytest
 
-from support import pcd_files
 from support.gltf_files import GltfBuilder
 from support.point_clouds import SRGB, ply_bytes, write
 
@@ -26,6 +26,39 @@ BROKEN.positions[[1, 3, 5], [0, 1, 2]] = np.nan, -np.inf, 1e39
 SOUND = np.delete(np.arange(12), [1, 3, 5])
 
 
+PCD_FIELDS = [("x", "<f4"), ("y", "<f4"), ("pad", "u1", (3,)), ("z", "<f4"), ("rgb", "<f4"), ("roughness", "<f8")]
+
+
+def compress_lzf(data: bytes) -> bytes:
+    """LZF whose only copies are of runs of one byte."""
+    out = b""
+    for byte, run in itertools.groupby(data):
+        left = len(list(run)) - 1
+        out += bytes([0, byte])
+        while left >= 3:
+            size = min(left, 264)
+            out += bytes([size - 2 << 5, 0]) if size < 9 else bytes([7 << 5, size - 9, 0])
+            left -= size
+        out += bytes([0, byte]) * left
+    return out
+
+
+def pcd_content(encoding: str, rows: np.ndarray, newline: str = "\n", stored: bool = False) -> bytes:
+    """A PCD file of the points in an encoding; what should be compressed may be stored as it is."""
+    header = ["# .PCD v0.7 - Point Cloud Data file format", "VERSION 0.7", "FIELDS x y _ z rgb roughness"]
+    header += ["SIZE 4 4 1 4 4 8", "TYPE F F U F F F", "COUNT 1 1 3 1 1 1", f"WIDTH {len(rows)}", "HEIGHT 1"]
+    header += ["VIEWPOINT 0 0 0 1 0 0 0", f"POINTS {len(rows)}", f"DATA {encoding}", ""]
+    head = newline.join(header).encode()
+    if encoding == "ascii":
+        lines = [" ".join(repr(float(value)) for value in np.hstack([np.ravel(cell) for cell in row])) for row in rows]
+        return head + newline.join([line.replace(".0 ", " ") for line in lines] + [""]).encode()
+    if encoding == "binary":
+        return head + rows.tobytes()
+    plain = b"".join(np.ascontiguousarray(rows[name]).tobytes() for name in rows.dtype.names)
+    body = plain if stored else compress_lzf(plain)
+    return head + np.array([len(body), len(plain)], "<u4").tobytes() + body
+
+
 def as_ply(form: str, newline: str = "\n"):
     names = ["z", "red", "x", "label", "green", "y", "blue", "roughness"]
     kinds = {"red": "uchar", "green": "uchar", "blue": "uchar", "label": "short"}
@@ -39,14 +72,14 @@ def as_ply(form: str, newline: str = "\n"):
     return content
 
 
-def as_pcd(encoding: str, newline: str = "\n"):
+def as_pcd(encoding: str, newline: str = "\n", stored: bool = False):
     def content(table):
-        rows = np.zeros(12, pcd_files.LAYOUT)
+        rows = np.zeros(12, PCD_FIELDS)
         with np.errstate(over="ignore"):
             rows["x"], rows["y"], rows["z"] = table.positions.T
-        rows["rgb"] = pcd_files.packed(table.levels)
+        rows["rgb"] = (table.levels @ [1 << 16, 1 << 8, 1]).astype(np.uint32).view(np.float32)
         rows["roughness"] = table.roughness
-        return pcd_files.content(encoding, rows, newline)
+        return pcd_content(encoding, rows, newline, stored)
 
     return content
 
@@ -70,12 +103,14 @@ def as_numpy(path, table):
         np.save(path, rows)
 
 
-def as_scan(path, table):
+def as_scan(path, table, point_format: int = 7):
     laspy = pytest.importorskip("laspy")
-    scan = laspy.LasData(laspy.LasHeader(point_format=7, version="1.4"))
+    scan = laspy.LasData(laspy.LasHeader(point_format=point_format, version="1.4"))
     scan.header.scales = [0.125] * 3
     scan.x, scan.y, scan.z = table.positions.T
-    scan.red, scan.green, scan.blue = (257 * table.levels.T).astype(np.uint16)
+    scan.intensity = 100 * np.arange(12)
+    if point_format == 7:
+        scan.red, scan.green, scan.blue = (257 * table.levels.T).astype(np.uint16)
     scan.write(path)
 
 
@@ -98,6 +133,7 @@ WRITERS = {
     "binary.pcd": as_pcd("binary"),
     "carriage.pcd": as_pcd("binary", "\r\n"),
     "packed.pcd": as_pcd("binary_compressed"),
+    "stored.pcd": as_pcd("binary_compressed", stored=True),
     "a.xyz": as_text(" "),
     "a.csv": as_text(",", "x,y,z,r,g,b,rough,metal\n"),
     "unit.txt": as_text(";", "//X;Y;Z;diffuse_red;diffuse_green;diffuse_blue\n", 1 / 255, columns=6),

@@ -6,7 +6,7 @@ from support import command_line, splat_balls, tiny_surfels
 
 from spnr_jax.formats import images
 from spnr_jax.formats.clouds import read_cloud
-from spnr_jax.formats.mesh.meshes import load_mesh
+from spnr_jax.formats.meshes import load_mesh
 from spnr_jax.formats.point_files import parse_ply
 from spnr_jax.method import surfel_method
 from spnr_jax.surfels.gaussians import View

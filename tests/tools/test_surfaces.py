@@ -15,7 +15,7 @@ from support.solid_ball import CENTRE, RADIUS, ball_cloud, ball_grid
 from support.surfel_clouds import cloud
 
 import spnr_jax
-from spnr_jax.formats.mesh.meshes import load_mesh
+from spnr_jax.formats.meshes import load_mesh
 from spnr_jax.kernels.cameras import camera_rays
 from spnr_jax.kernels.records import Rendering, Volume
 from spnr_jax.surfels.gaussians import View

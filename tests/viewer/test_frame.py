@@ -9,7 +9,7 @@ from support.laws import close
 from support.tiny_viewer import canvas, opened, state, surfels, view
 
 from spnr_jax.formats import clouds
-from spnr_jax.formats.light_files import NAMES, read_light
+from spnr_jax.formats.images import NAMES, read_light
 from spnr_jax.kernels.records import Light, Rendering
 from spnr_jax.method.model import Model
 from spnr_jax.tools.commands import Lighting

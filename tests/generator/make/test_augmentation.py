@@ -9,8 +9,8 @@ from support.handmade import ball, box, plain
 
 from data_gen.make import augmentation
 from data_gen.make.augmentation import Reshaping, draw_reshaping, reshape
-from spnr_jax.formats.mesh.assets import Asset, Material
-from spnr_jax.formats.mesh.surface_points import sample_surface
+from spnr_jax.formats.assets import Asset, Material
+from spnr_jax.formats.surface_points import sample_surface
 
 UNIT = st.floats(0, 1, width=32)
 SEEDS = st.integers(0, 2**32 - 1)

@@ -12,9 +12,9 @@ from data_gen.__main__ import parse
 from data_gen.plan import sources, tasks
 from data_gen.store import layout
 from spnr_jax.formats import data_sets
+from spnr_jax.formats.assets import RejectedAsset
 from spnr_jax.formats.columns import srgb_to_linear
-from spnr_jax.formats.mesh.assets import RejectedAsset
-from spnr_jax.formats.mesh.meshes import load_mesh
+from spnr_jax.formats.meshes import load_mesh
 
 TINY = ["--resolution", 16, "--views", 2, "--points", 64, "--spp", 4, "--visibility-grid", 1]
 

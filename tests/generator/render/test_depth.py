@@ -12,8 +12,8 @@ from support.handmade import ball, box
 from data_gen.make import objects
 from data_gen.plan.tasks import Task
 from data_gen.render import views
-from spnr_jax.formats.mesh import surface_points
-from spnr_jax.formats.mesh.assets import Asset
+from spnr_jax.formats import surface_points
+from spnr_jax.formats.assets import Asset
 from spnr_jax.kernels import cameras
 
 EYE, SIZE = jnp.array([1.3, 0.8, 2.5]), 24

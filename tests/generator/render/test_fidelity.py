@@ -16,8 +16,8 @@ from support.handmade import ball, box, plain
 
 from data_gen.render import views
 from data_gen.render.variant import mitsuba_module
-from spnr_jax.formats.mesh import meshes, surface_points
-from spnr_jax.formats.mesh.assets import Asset
+from spnr_jax.formats import meshes, surface_points
+from spnr_jax.formats.assets import Asset
 
 WHITE_LIGHT = np.ones((8, 16, 3), np.float32)
 REAL = Path(__file__).parents[4] / "shared" / "data" / "real" / "train"

@@ -5,7 +5,7 @@ import pytest
 from support.handmade import ball, plain
 
 from data_gen.render import light, views
-from spnr_jax.formats.mesh.assets import Asset
+from spnr_jax.formats.assets import Asset
 from spnr_jax.surfels.lighting import directions
 from spnr_jax.surfels.skies import indoor_envmap
 

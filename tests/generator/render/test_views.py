@@ -5,9 +5,8 @@ import pytest
 from support.handmade import BLUE, GREEN, GREY, RED, ball, box, checked_box_and_ball, plain
 
 from data_gen.render import views
-from spnr_jax.formats import data_sets
-from spnr_jax.formats.mesh import surface_points
-from spnr_jax.formats.mesh.assets import Asset, RejectedAsset
+from spnr_jax.formats import data_sets, surface_points
+from spnr_jax.formats.assets import Asset, RejectedAsset
 
 WHITE_LIGHT = np.ones((8, 16, 3), np.float32)
 CONFIG = views.ViewConfig(resolution=32, spp=16, views=2)

@@ -10,8 +10,8 @@ from support.handmade import ball, box
 
 from data_gen.render import views
 from data_gen.render.variant import LLVM, choose_variant
-from spnr_jax.formats.mesh import surface_points
-from spnr_jax.formats.mesh.assets import Asset
+from spnr_jax.formats import surface_points
+from spnr_jax.formats.assets import Asset
 
 LIGHT = np.ones((8, 16, 3), np.float32)
 CONFIG = views.ViewConfig(resolution=64, views=1)

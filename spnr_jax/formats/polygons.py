@@ -3,8 +3,8 @@
 Polygons become fans of triangles, or ears where they are not convex (Meisters 1975), so that a notch stays empty.
 
 .ply    elements vertex and face through trimesh; colours by any of the names that those of points may have
-.stl    text through trimesh; binary: 80 bytes, a count u32, 50 bytes a triangle.  Where the count and the size of
-        the file disagree the size counts
+.stl    text: three lines `vertex x y z` a triangle; binary: 80 bytes, a count u32, 50 bytes a triangle.  The size of
+        the file counts where the count is 0
 .off    [C][N]OFF, counts, vertices x y z [normal] [colour], faces n i j k ... [colour]
 """
 
@@ -16,14 +16,12 @@ from pathlib import Path
 
 import numpy as np
 from trimesh.exchange.ply import load_ply
-from trimesh.exchange.stl import load_stl_ascii
-from trimesh.geometry import triangulate_quads
 
+from spnr_jax.formats.assets import Asset, Part, RejectedAsset, make_material
 from spnr_jax.formats.columns import SRGB, Columns, colors_of, rename
-from spnr_jax.formats.mesh.assets import Asset, Part, RejectedAsset, make_material
 from spnr_jax.kernels.cloud_arrays import stack_columns
 
-MOST_CORNERS = 4096  # of a polygon whose ears are looked for; a larger one becomes a fan
+MOST_CORNERS = 2048  # of a polygon whose ears are looked for; a larger one becomes a fan
 STL_HEAD, STL_TRIANGLE = 84, np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 OFF_HEAD = re.compile(r"(ST)?(C?)(N?)(4?)(n?)OFF\b")
 
@@ -72,33 +70,25 @@ def _colored(
 
 def load_stl(data: bytes) -> Asset:
     """The raw asset of an STL file."""
-    if data[:5].lower() == b"solid" and b"facet" in data[:1024]:
-        loaded = load_stl_ascii(io.BytesIO(data))
-        meshes = loaded["geometry"].values() if "geometry" in loaded else [loaded]
-        parts = [
-            Part(
-                positions=np.asarray(m["vertices"], np.float64),
-                faces=triangulate_quads(m["faces"]),
-                material=make_material(),
-            )
-            for m in meshes
-            if m.get("faces") is not None
-        ]
-        return Asset(parts=tuple(parts))
-    if len(data) < STL_HEAD:
-        raise RejectedAsset(f"is cut off: a binary STL file has {STL_HEAD} bytes before its triangles")
-    announced = int.from_bytes(data[80:84], "little")
+    ignored: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
-    held = (len(data) - STL_HEAD) // STL_TRIANGLE.itemsize
-    if announced > held:
-        raise RejectedAsset(f"is cut off: its header announces {announced} triangles, {held} are there")
-    count = announced or held
-    if count != announced:
-        notes = (f"the header announces {announced} triangles, {held} stand behind it: these are drawn",)
-    rows = np.frombuffer(data, STL_TRIANGLE, count, STL_HEAD)
-    positions = rows["corners"].reshape(-1, 3).astype(np.float64)
-    ignored = ("STL attribute bytes",) if rows["attribute"].any() else ()
-    part = Part(positions=positions, faces=np.arange(3 * count).reshape(-1, 3), material=make_material())
+    if data[:5].lower() == b"solid" and b"facet" in data[:1024]:
+        text = b" ".join(re.findall(rb"(?i)\bvertex[ \t]+([^\r\n]*)", data))
+        positions = np.fromstring(text, sep=" ").reshape(-1, 3, 3)
+    else:
+        if len(data) < STL_HEAD:
+            raise RejectedAsset(f"is cut off: a binary STL file has {STL_HEAD} bytes before its triangles")
+        announced = int.from_bytes(data[80:84], "little")
+        held = (len(data) - STL_HEAD) // STL_TRIANGLE.itemsize
+        if announced > held:
+            raise RejectedAsset(f"is cut off: its header announces {announced} triangles, {held} are there")
+        if not announced:
+            notes = (f"the header announces 0 triangles, {held} stand behind it: these are drawn",)
+        rows = np.frombuffer(data, STL_TRIANGLE, announced or held, STL_HEAD)
+        positions = rows["corners"].astype(np.float64)
+        ignored = ("STL attribute bytes",) if rows["attribute"].any() else ()
+    faces = np.arange(3 * len(positions)).reshape(-1, 3)
+    part = Part(positions=positions.reshape(-1, 3), faces=faces, material=make_material())
     return Asset(parts=(part,), ignored=ignored, notes=notes)
 
 
@@ -173,9 +163,8 @@ def _convex(corners: np.ndarray) -> np.ndarray:
     centred = corners - corners.mean(axis=1, keepdims=True)
     whole = np.cross(centred, np.roll(centred, -1, axis=1)).sum(axis=1)
     share = np.einsum("mnc,mc->mn", turns, whole)
-    return (share >= -1e-9 * np.abs(share).max(axis=1, initial=0)[:, None]).all(axis=1) | ~np.isfinite(share).all(
-        axis=1
-    )
+    against = share < -1e-9 * np.abs(share).max(axis=1, initial=0)[:, None]
+    return ~against.any(axis=1) | ~np.isfinite(share).all(axis=1)
 
 
 def ears(corners: np.ndarray) -> np.ndarray:
@@ -184,30 +173,22 @@ def ears(corners: np.ndarray) -> np.ndarray:
     normal = np.cross(centred, np.roll(centred, -1, axis=0)).sum(axis=0)
     axis = int(np.abs(normal).argmax())
     flat = np.delete(centred, axis, axis=1) * [1, (1 if axis != 1 else -1) * np.sign(normal[axis] or 1)]
-    left, found, place = list(range(len(corners))), [], 0
-    while len(left) > 3:
-        for i in [*range(place, len(left)), *range(place)]:
-            a, b, c = left[i - 1], left[i], left[(i + 1) % len(left)]
-            if _turn(flat[a], flat[b], flat[c]) > 0:
-                others = flat[[j for j in left if j not in (a, b, c)]]
-                if not _inside(others, flat[a], flat[b], flat[c]).any():
-                    break
+    left, found, i, failed = list(range(len(corners))), [], 0, 0
+    while len(left) > 3 and failed < len(left):
+        ear = [left[i - 1], left[i], left[(i + 1) % len(left)]]
+        if _is_ear(flat, ear, left):
+            found.append(tuple(ear))
+            left.pop(i)
+            i, failed = max(i - 1, 0), 0  # what lies before was no ear, and still is none
         else:
-            break
-        found.append((a, b, c))
-        left.pop(i)
-        place = max(i - 1, 0)  # what lies before was no ear, and still is none
+            i, failed = (i + 1) % len(left), failed + 1
     return np.array(found + [(left[0], b, c) for b, c in zip(left[1:-1], left[2:], strict=True)])
 
 
-def _turn(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> float:
-    return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
-
-
-def _inside(points: np.ndarray, *triangle: np.ndarray) -> np.ndarray:
-    """Whether points (n, 2) lie in a triangle that turns left, or on its border."""
-    sides = []
-    for a, b in zip(triangle, (*triangle[1:], triangle[0]), strict=True):
-        edge, way = b - a, points - a
-        sides.append(edge[0] * way[:, 1] - edge[1] * way[:, 0])
-    return np.min(sides, axis=0) >= 0
+def _is_ear(flat: np.ndarray, ear: list[int], left: list[int]) -> bool:
+    """Whether three of the points (n, 2) turn left and no other of those left lies in their triangle or on it."""
+    edges = flat[[ear[1], ear[2], ear[0]]] - flat[ear]
+    if edges[0, 0] * edges[1, 1] <= edges[0, 1] * edges[1, 0]:
+        return False
+    x, y = np.moveaxis(flat[[j for j in left if j not in ear]][:, None] - flat[ear], -1, 0)
+    return not (edges[:, 0] * y - edges[:, 1] * x >= 0).all(axis=1).any()

@@ -1,7 +1,7 @@
 """Mesh files as assets: which files a folder holds, and one of them read, checked, cleaned and merged by material.
 
-glTF and GLB carry principled materials (gltf.py), OBJ gets them from its MTL (obj.py); PLY, STL and OFF (plain.py) have
-vertex or face colours at most, read as those of points are (columns.py), grey 0.5 otherwise.
+glTF and GLB carry principled materials (gltf.py), OBJ gets them from its MTL (obj.py); PLY, STL and OFF (polygons.py)
+have vertex or face colours at most, read as those of points are (columns.py), grey 0.5 otherwise.
 
 checked   indices inside, coordinates finite, an extent above zero
 cleaned   faces without area and vertices without faces removed; normals unit; colours in [0, 1]; unused columns gone
@@ -26,9 +26,7 @@ from typing import Any
 import numpy as np
 
 from spnr_jax.errors import UserError, is_bug
-from spnr_jax.formats.mesh.assets import (
-    CHANNELS,
-    TEXTURES,
+from spnr_jax.formats.assets import (
     Asset,
     Material,
     Part,
@@ -36,10 +34,10 @@ from spnr_jax.formats.mesh.assets import (
     TransparentParts,
     make_material,
 )
-from spnr_jax.formats.mesh.gltf import gltf_points, load_gltf
-from spnr_jax.formats.mesh.obj import load_obj, obj_points
-from spnr_jax.formats.mesh.plain import PLAIN, off_points
-from spnr_jax.formats.mesh.surface_points import bounding_box, face_areas, unit, vertex_normals
+from spnr_jax.formats.gltf import gltf_points, load_gltf
+from spnr_jax.formats.obj import load_obj, obj_points
+from spnr_jax.formats.polygons import PLAIN, off_points
+from spnr_jax.formats.surface_points import bounding_box, face_areas, unit, vertex_normals
 
 # Faces below this share of the squared box diagonal are float32 rounding, not surface.
 DEGENERATE_AREA = 1e-14
@@ -60,21 +58,19 @@ def assemble(asset: Asset, strict: bool) -> Asset:
     """The asset with its parts checked, cleaned, merged and, for references, tinted; changes are named in `ignored`."""
     for part in asset.parts:
         _check_columns(part)
-        _check_material(part.material)
+    asset = asset if strict else _finite(asset)
     low, high = bounding_box(asset)
     smallest = DEGENERATE_AREA * np.sum((high - low) ** 2)
     notes: set[str] = set(asset.ignored)
     degenerate = 0
     groups: dict[tuple, list[Part]] = {}
-    identities: dict[int, str] = {}  # by id: `groups` and `asset` keep every material alive
     for whole in asset.parts:
         solid = face_areas(whole) > smallest
         degenerate += int((~solid).sum())
         if not solid.any():
             continue
         part = _clean_part(replace(whole, faces=whole.faces[solid]), notes, strict)
-        key = identities.setdefault(id(part.material), _identity(part.material)), part.normals is None
-        groups.setdefault(key, []).append(part)
+        groups.setdefault((_identity(part.material), part.normals is None), []).append(part)
     if not groups:
         raise RejectedAsset("has no face with an area")
     if degenerate:
@@ -82,13 +78,22 @@ def assemble(asset: Asset, strict: bool) -> Asset:
     return replace(asset, parts=tuple(map(_merge, groups.values())), ignored=tuple(sorted(notes)))
 
 
+def _finite(asset: Asset) -> Asset:
+    """The asset without faces that have a vertex which is not finite, and a note about how many these are."""
+    sound = [np.isfinite(part.positions[part.faces]).all(axis=(1, 2)) for part in asset.parts]
+    lost = sum(int((~faces).sum()) for faces in sound)
+    if not lost:
+        return asset
+    parts = tuple(replace(part, faces=part.faces[faces]) for part, faces in zip(asset.parts, sound, strict=True))
+    note = f"{lost:,} {'face' if lost == 1 else 'faces'} left out for a vertex that is NaN or infinity"
+    return replace(asset, parts=parts, notes=(*asset.notes, note))
+
+
 def _check_columns(part: Part) -> None:
     """Refuse a part whose columns do not have one row per vertex, or whose faces name vertices that are not there."""
     count = len(part.positions)
     for name, width in WIDTHS.items():
         values = getattr(part, name)
-        if name == "texcoords" and values is not None and values.ndim == 2 and values.shape[1] > 0:
-            width = 2 * -(-values.shape[1] // 2)  # pairs, one or several
         if values is not None and values.shape != (count, width):
             raise RejectedAsset(f"has {name} of shape {values.shape} where ({count}, {width}) is needed: broken file")
     if part.faces.size and not 0 <= part.faces.min() <= part.faces.max() < count:
@@ -97,21 +102,12 @@ def _check_columns(part: Part) -> None:
         )
 
 
-def _check_material(material: Material) -> None:
-    """Refuse a material whose channels are not finite values, one or a texture of them."""
-    present = [name for name in TEXTURES if getattr(material, name) is not None]
-    for name in (*CHANNELS, *present):
-        values, inner = getattr(material, name), (3,) * (CHANNELS | TEXTURES)[name]
-        rows = values.shape[: values.ndim - len(inner)]
-        if values.shape[len(rows) :] != inner or len(rows) not in (0, 2) or not values.size:
-            raise RejectedAsset(f"has a material with {name} of shape {values.shape}: broken file")
-        if not np.isfinite(values).all():
-            raise RejectedAsset(f"has a material whose {name} is not finite (NaN or infinity)")
-
-
 def _clean_part(part: Part, notes: set[str], strict: bool) -> Part:
-    """The part with just the columns that its material needs."""
-    part = _settle_texture(_drop_unused_vertices(part), notes)
+    """The part with just the vertices that its faces use, in their order, and the columns that its material needs."""
+    used, faces = np.unique(part.faces, return_inverse=True)
+    kept: dict[str, Any] = {name: getattr(part, name) for name in WIDTHS}
+    kept = {name: None if values is None else values[used] for name, values in kept.items()}
+    part = _settle_texture(replace(part, **kept, faces=faces.reshape(-1, 3).astype(np.int64)), notes)
     part = replace(part, normals=_unit_normals(part, notes), colors=_check_colors(part, notes))
     if part.colors is None or part.material.base_color.ndim == 1 or not strict:
         return part
@@ -120,14 +116,6 @@ def _clean_part(part: Part, notes: set[str], strict: bool) -> Part:
         notes.add("vertex colours that vary over a texture (their mean is used)")
     look = replace(part.material, base_color=part.material.base_color * tint.astype(np.float32))
     return replace(part, material=look, colors=None)
-
-
-def _drop_unused_vertices(part: Part) -> Part:
-    """The part with only the vertices that its faces use, in their old order."""
-    used, faces = np.unique(part.faces, return_inverse=True)
-    kept: dict[str, Any] = {name: getattr(part, name) for name in WIDTHS}
-    kept = {name: None if values is None else values[used] for name, values in kept.items()}
-    return replace(part, **kept, faces=faces.reshape(-1, 3).astype(np.int64))
 
 
 def _settle_texture(part: Part, notes: set[str]) -> Part:
@@ -173,12 +161,12 @@ def _check_colors(part: Part, notes: set[str]) -> np.ndarray | None:
 
 def _identity(material: Material) -> str:
     """A digest of everything that a material says."""
-    present = [name for name in (*CHANNELS, *TEXTURES) if getattr(material, name) is not None]
-    arrays = [np.asarray(getattr(material, name)) for name in present]
-    cutoff = material.cutoff if "opacity" in present or "normal_map" in present else None
-    forms = [(array.shape, array.dtype.str) for array in arrays]
-    described = repr((material.wrap, cutoff, sorted(material.coordinates.items()), present, forms))
-    return hashlib.sha256(described.encode() + b"".join(array.tobytes() for array in arrays)).hexdigest()
+    digest = hashlib.sha256()
+    for value in vars(material).values():
+        array = isinstance(value, np.ndarray | np.floating)
+        digest.update(repr((value.shape, value.dtype) if array else value).encode())
+        digest.update(value.tobytes() if array else b"")
+    return digest.hexdigest()
 
 
 def _merge(parts: list[Part]) -> Part:
@@ -217,16 +205,14 @@ def find_meshes(folder: Path) -> list[tuple[str, Path]]:
         alone = siblings[path.parent] == 1 and path.suffix.lower() in NAMED_BY_FOLDER and path.parent.name
         names.append(_safe(path.parent.name if alone else path.stem))
     shared = Counter(name.casefold() for name in names)
-    ids: dict[str, Path] = {}
-    taken: set[str] = set()
+    ids: dict[str, tuple[str, Path]] = {}
     for name, path in zip(names, visible, strict=True):
         unique = wanted = name if shared[name.casefold()] == 1 else _safe("_".join(path.parts))
         number = 2
-        while unique.casefold() in taken or (unique != name and unique.casefold() in shared):
+        while unique.casefold() in ids or (unique != name and unique.casefold() in shared):
             unique, number = f"{wanted}-{number}", number + 1
-        taken.add(unique.casefold())
-        ids[unique] = folder / path
-    return sorted(ids.items())
+        ids[unique.casefold()] = unique, folder / path
+    return sorted(ids.values())
 
 
 def load_mesh(
@@ -238,8 +224,8 @@ def load_mesh(
     RejectedAsset, with one line, for a file that cannot be used: unreadable or truncated, without faces or extent,
     with buffers missing or outside its folder.  "refuse", for references, also refuses what is transparent and images
     and libraries that are missing; "opaque" and "skip", for pictures, say in `notes` what was made of them, leave out
-    faces whose vertices are not finite, and read what the renderer of references does not know: cut-outs, normal maps,
-    several texture coordinates (assets.py).  `kind` is a suffix to go by instead of the file's.
+    faces whose vertices are not finite, and read what the renderer of references does not know: cut-outs, normal maps.
+    `kind` is a suffix to go by instead of the file's.
     """
     path = Path(path)
     kind = kind or path.suffix.lower()
@@ -252,8 +238,7 @@ def load_mesh(
             asset = PLAIN[kind](path.read_bytes())
         else:
             raise RejectedAsset(f"has suffix {kind!r}; expected one of {' '.join(SUFFIXES)}")
-        strict = transparent_parts == "refuse"
-        asset = assemble(asset if strict else _finite(asset), strict)
+        asset = assemble(asset, transparent_parts == "refuse")
     return replace(asset, source={"file": path.name, "sha256": hashlib.sha256(path.read_bytes()).hexdigest()})
 
 
@@ -281,23 +266,6 @@ def _refusing() -> Iterator[None]:
             raise
         text = f"{type(error).__name__}: {str(error).strip().partition(chr(10))[0]}"
         raise RejectedAsset(f"cannot be read, the file is broken or truncated ({text})") from error
-
-
-def _finite(asset: Asset) -> Asset:
-    """The asset without faces that name a vertex which is not finite, and a note about how many these are."""
-    parts, lost = [], 0
-    for part in asset.parts:
-        sound = np.isfinite(part.positions).all(axis=-1)
-        whole = part.faces.ndim == 2 and part.faces.size and 0 <= part.faces.min() <= part.faces.max() < len(sound)
-        if whole and not sound.all():
-            whole = sound[part.faces].all(axis=1)
-            lost += int((~whole).sum())
-            part = replace(part, faces=part.faces[whole], positions=np.where(sound[:, None], part.positions, 0))
-        parts.append(part)
-    if not lost:
-        return asset
-    note = f"{lost:,} {'face' if lost == 1 else 'faces'} left out for a vertex that is NaN or infinity"
-    return replace(asset, parts=tuple(parts), notes=(*asset.notes, note))
 
 
 def _safe(name: str) -> str:

@@ -1,8 +1,8 @@
 """glTF 2.0 scenes as raw assets: one part per primitive of a node, node transforms applied from the root.
 
 Normals go through the inverse transpose; a transform that mirrors flips the winding. The rest pose is read.
-EXT_mesh_gpu_instancing draws a node's mesh once for each row of its attributes. What is not modelled is named in
-`ignored`; an extension that the file requires and that is not known here rejects the object.
+What is not modelled is named in `ignored`; an extension that the file requires and that is not known here rejects the
+object.
 """
 
 from collections.abc import Iterator
@@ -12,17 +12,25 @@ from typing import NamedTuple
 import numpy as np
 from trimesh.transformations import quaternion_matrix
 
+from spnr_jax.formats.assets import Asset, Material, Part, RejectedAsset, Tolerance, TransparentParts
 from spnr_jax.formats.columns import LINEAR, SRGB
-from spnr_jax.formats.mesh.assets import Asset, Part, RejectedAsset, Tolerance, TransparentParts
-from spnr_jax.formats.mesh.gltf_container import DRACO, MESHOPT, GltfFile, decode_accessor, decode_mesh
-from spnr_jax.formats.mesh.gltf_materials import BASIS, MOVED, WEBP, GltfMaterial, read_material
+from spnr_jax.formats.gltf_file import (
+    BASIS,
+    DRACO,
+    MESHOPT,
+    MOVED,
+    WEBP,
+    GltfFile,
+    GltfMaterial,
+    decode_accessor,
+    decode_mesh,
+    read_material,
+)
 from spnr_jax.surfels.gaussians import C0
 
-INSTANCING = "EXT_mesh_gpu_instancing"
-PLACED = {"TRANSLATION": 3, "ROTATION": 4, "SCALE": 3}  # attributes of instances, and their widths
-MOST_INSTANCES = 2**17  # of a node
 MODES = dict(enumerate(("POINTS", "LINES", "LINE_LOOP", "LINE_STRIP", "TRIANGLES", "TRIANGLE_STRIP", "TRIANGLE_FAN")))
-READABLE = {MOVED, WEBP, BASIS, DRACO, *MESHOPT, INSTANCING, "KHR_mesh_quantization", "KHR_lights_punctual"}
+READABLE = {MOVED, WEBP, BASIS, DRACO, *MESHOPT, "KHR_mesh_quantization", "KHR_lights_punctual"}
+DROPPED = {"KHR_lights_punctual", "EXT_mesh_gpu_instancing"}  # of what a scene may use
 SPLATS = "KHR_gaussian_splatting"
 NO_COLORS = np.ones((1, 3))
 OTHERS = ("POSITION", "NORMAL", "COLOR_0")  # columns, beside texture coordinates, that are read
@@ -31,8 +39,8 @@ OTHERS = ("POSITION", "NORMAL", "COLOR_0")  # columns, beside texture coordinate
 MOST_REPEATED, PLACING = 2**23, 64
 
 
-def list_meshes(file: GltfFile) -> Iterator[tuple[int, list[np.ndarray]]]:
-    """(mesh, matrices to world (4, 4)) of every node of the default scene that draws a mesh, depth first."""
+def list_primitives(file: GltfFile) -> Iterator[tuple[dict, np.ndarray]]:
+    """(primitive, matrix to world (4, 4)) of every node of the default scene that draws a mesh, depth first."""
     document = file.document
     nodes = document.get("nodes", [])
     if scenes := document.get("scenes"):
@@ -49,24 +57,8 @@ def list_meshes(file: GltfFile) -> Iterator[tuple[int, list[np.ndarray]]]:
         node = nodes[index]
         matrix = parent @ _node_matrix(node)
         if "mesh" in node:
-            yield node["mesh"], _instances(file, node, matrix)
+            yield from ((primitive, matrix) for primitive in document["meshes"][node["mesh"]]["primitives"])
         stack += [(child, matrix) for child in reversed(node.get("children", []))]
-
-
-def _instances(file: GltfFile, node: dict, matrix: np.ndarray) -> list[np.ndarray]:
-    """The matrices to world of a node's instances, of which most nodes have one."""
-    attributes = node.get("extensions", {}).get(INSTANCING, {}).get("attributes")
-    if not attributes:
-        return [matrix]
-    columns = {name: file.accessor(index) for name, index in attributes.items() if name in PLACED}
-    counts = {len(column) for column in columns.values()}
-    if len(counts) != 1 or any(column.shape[1] != PLACED[name] for name, column in columns.items()):
-        raise RejectedAsset(f"has instances ({INSTANCING}) whose attributes do not agree: broken file")
-    (count,) = counts
-    if count > MOST_INSTANCES:
-        raise RejectedAsset(f"has {count} instances of a mesh; at most {MOST_INSTANCES} can be read")
-    each = [{name.lower(): columns[name][i] for name in columns} for i in range(count)]
-    return [matrix @ _node_matrix(values) for values in each]
 
 
 def _node_matrix(node: dict) -> np.ndarray:
@@ -94,41 +86,35 @@ def load_gltf(path: Path, transparent_parts: TransparentParts = "refuse") -> Ass
     for extension in document.get("extensionsRequired", []):
         if extension not in READABLE and not extension.startswith("KHR_materials_"):
             raise RejectedAsset(f"needs {extension}, which cannot be read: export it without that extension")
-    ignored = {key for key in ("animations", "skins") if document.get(key)}
-    if "KHR_lights_punctual" in document.get("extensions", {}):
-        ignored.add("KHR_lights_punctual")
+    ignored = tolerance.ignored
+    ignored |= {key for key in ("animations", "skins") if document.get(key)}
+    ignored |= DROPPED.intersection(document.get("extensionsUsed", []))
     materials: dict[int | None, GltfMaterial] = {}
-    shapes: dict[tuple[int, int], Shape] = {}
+    shapes: dict[int, Shape] = {}  # by id: the document keeps every primitive alive
     parts, repeated = [], 0
-    for mesh, matrices in list_meshes(file):
-        for number, primitive in enumerate(document["meshes"][mesh]["primitives"]):
-            mode = MODES[primitive.get("mode", 4)]
-            if not mode.startswith("TRIANGLE"):
-                ignored.add(f"{mode} primitives")
-                continue
-            index = primitive.get("material")
-            if index not in materials:
-                materials[index] = read_material(file, index, tolerance)
-            look = materials[index]
-            ignored |= look.ignored | {"KHR_materials_variants"}.intersection(primitive.get("extensions", {}))
-            if primitive.get("targets"):
-                ignored.add("morph targets")
-            if look.nowhere:
-                continue
-            again = (mesh, number) in shapes
-            shape = shapes[mesh, number] if again else _shape(file, primitive, mode, look)
-            shapes[mesh, number] = shape
-            if look.has_alpha and shape.columns.get("COLOR_0", NO_COLORS)[:, 3:].min(initial=1) < 1:
-                ignored.add("alpha of vertex colours")
-            repeated += (len(shape.faces) + PLACING) * max(0, len(matrices) - 1 + again)
-            if repeated > MOST_REPEATED:
-                raise RejectedAsset(
-                    f"repeats its meshes more than can be read ({MOST_REPEATED} faces): fewer instances can"
-                )
-            parts += [_place(shape, look, matrix) for matrix in matrices]
-    if not parts and any(look.nowhere for look in materials.values()):
-        raise RejectedAsset(f"has nothing to draw: {'; '.join(tolerance.notes())}")
-    return Asset(parts=tuple(parts), ignored=tuple(sorted(ignored)), notes=tuple(tolerance.notes()))
+    for primitive, matrix in list_primitives(file):
+        mode = MODES[primitive.get("mode", 4)]
+        if not mode.startswith("TRIANGLE"):
+            ignored.add(f"{mode} primitives")
+            continue
+        index = primitive.get("material")
+        if index not in materials:
+            materials[index] = read_material(file, index, tolerance)
+        look, again = materials[index], id(primitive) in shapes
+        ignored |= {"KHR_materials_variants"}.intersection(primitive.get("extensions", {}))
+        if primitive.get("targets"):
+            ignored.add("morph targets")
+        if look.material is None:
+            continue
+        shape = shapes[id(primitive)] if again else _shape(file, primitive, mode, look)
+        shapes[id(primitive)] = shape
+        if look.has_alpha and shape.columns.get("COLOR_0", NO_COLORS)[:, 3:].min(initial=1) < 1:
+            ignored.add("alpha of vertex colours")
+        repeated += again * (len(shape.faces) + PLACING)
+        if repeated > MOST_REPEATED:
+            raise RejectedAsset(f"repeats its meshes more than can be read ({MOST_REPEATED} faces)")
+        parts.append(_place(shape, look, look.material, matrix))
+    return tolerance.asset(parts)
 
 
 def gltf_points(path: Path) -> dict[str, np.ndarray] | None:
@@ -137,19 +123,15 @@ def gltf_points(path: Path) -> dict[str, np.ndarray] | None:
     Colours are linear, as the specification has them, or display-referred sRGB where a splat says so.
     """
     file = GltfFile(path)
-    meshes = file.document.get("meshes", [])
-    drawn = [(primitive, matrices) for mesh, matrices in list_meshes(file) for primitive in meshes[mesh]["primitives"]]
+    drawn = list(list_primitives(file))
     modes = {MODES[primitive.get("mode", 4)] for primitive, _ in drawn}
     if "POINTS" not in modes or any(mode.startswith("TRIANGLE") for mode in modes):
         return None
     pieces = []
-    for primitive, matrices in drawn:
-        if primitive.get("mode") != 0:
-            continue
-        columns = _point_columns(file, primitive)
-        positions = np.stack([columns[axis] for axis in "xyz"], axis=-1)
-        for matrix in matrices[: max(1, MOST_REPEATED // max(1, len(positions)))]:
-            placed = positions @ matrix[:3, :3].T + matrix[:3, 3]
+    for primitive, matrix in drawn:
+        if primitive.get("mode") == 0:
+            columns = _point_columns(file, primitive)
+            placed = np.stack([columns[axis] for axis in "xyz"], axis=-1) @ matrix[:3, :3].T + matrix[:3, 3]
             pieces.append(columns | dict(zip("xyz", placed.T, strict=True)))
     shared = set(pieces[0]).intersection(*pieces[1:])
     return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0] if name in shared}
@@ -174,8 +156,8 @@ def _point_columns(file: GltfFile, primitive: dict) -> dict[str, np.ndarray]:
 
 def _shape(file: GltfFile, primitive: dict, mode: str, look: GltfMaterial) -> Shape:
     """The columns that a material needs, and the faces, of a primitive."""
-    sets = [f"TEXCOORD_{place.texcoord_set}" for place in look.placements]
-    wanted = {name: index for name, index in primitive["attributes"].items() if name in (*OTHERS, *sets)}
+    names = *OTHERS, f"TEXCOORD_{look.placement.texcoord_set}"
+    wanted = {name: index for name, index in primitive["attributes"].items() if name in names}
     packed = primitive.get("extensions", {}).get(DRACO)
     if packed is None:
         columns = {name: file.accessor(index) for name, index in wanted.items()}
@@ -192,31 +174,21 @@ def _shape(file: GltfFile, primitive: dict, mode: str, look: GltfMaterial) -> Sh
     return Shape(columns, _triangles(order, "TRIANGLES"))  # whatever the mode: Draco keeps triangles
 
 
-def _place(shape: Shape, look: GltfMaterial, matrix: np.ndarray) -> Part:
+def _place(shape: Shape, look: GltfMaterial, material: Material, matrix: np.ndarray) -> Part:
     """One primitive in world space."""
     linear = matrix[:3, :3]
     mirrored = np.linalg.det(linear) < 0
     normals, colors = shape.columns.get("NORMAL"), shape.columns.get("COLOR_0")
+    texcoords = shape.columns.get(f"TEXCOORD_{look.placement.texcoord_set}")
     return Part(
         positions=shape.columns["POSITION"] @ linear.T + matrix[:3, 3],
         faces=shape.faces[:, ::-1] if mirrored else shape.faces,
-        material=look.material,
+        material=material,
         # the adjugate's transpose: a multiple of the inverse transpose, defined for a singular matrix too
         normals=None if normals is None else normals @ _cofactors(linear).T * (-1 if mirrored else 1),
-        texcoords=_texcoords(shape, look),
+        texcoords=None if texcoords is None else look.placement.transform(texcoords),
         colors=None if colors is None else colors[:, :3],
     )
-
-
-def _texcoords(shape: Shape, look: GltfMaterial) -> np.ndarray | None:
-    """Texture coordinates (v, 2 n), pair after pair as the material counts them; None without the first pair."""
-    found: list[np.ndarray] = []
-    for place in look.placements:
-        texcoords = shape.columns.get(f"TEXCOORD_{place.texcoord_set}")
-        if texcoords is None and not found:
-            return None
-        found.append(np.zeros_like(found[0]) if texcoords is None else place.transform(texcoords))
-    return found[0] if len(found) == 1 else np.concatenate(found, axis=1)
 
 
 def _cofactors(matrix: np.ndarray) -> np.ndarray:

@@ -7,8 +7,8 @@ Conventions, fixed here and nowhere else:
               rows (as in glTF; mitsuba's `bitmap` reads the same way)
   faces       counted through all parts of an object in order: global face = faces of the parts before + local face
 The renderer (what the network is shown) and the point sampler (what it is told) both read these records, so the two
-cannot disagree about a material.  What only a picture of points needs (cut-outs, normal maps, textures with
-coordinates of their own) is read where transparent parts are allowed, and never reaches the renderer.
+cannot disagree about a material.  What only a picture of points needs (cut-outs, normal maps) is read where
+transparent parts are allowed, and never reaches the renderer.
 
 A file may leave open what is to be seen: parts that light passes through, and files that it names and that are missing.
 Where references are made (`refuse`) both are reasons to reject an object.  For a picture:
@@ -18,21 +18,29 @@ Where references are made (`refuse`) both are reasons to reject an object.  For 
       skip        there is surface where alpha is at least a half; a part that transmits light is left out
   missing images  plain values of a stand-in
 A part whose alpha is 1 everywhere is opaque, whatever its file calls it.
+
+Texel centres lie at half-integers / size.  The lookup is mitsuba's `bitmap` with `filter_type: bilinear` and the same
+`wrap_mode`; a test compares the two.  Images of more than MAX_SIZE texels in width or height are box-filtered to that,
+in linear values.
 """
 
 import base64
 import binascii
 import importlib
+import io
 import os
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 from urllib.parse import unquote, unquote_to_bytes
 
 import numpy as np
+from PIL import Image, UnidentifiedImageError
 
-from spnr_jax.errors import UserError
+from spnr_jax.errors import UserError, is_bug
+from spnr_jax.formats.columns import srgb_to_linear
 
 Wrap = Literal["repeat", "mirror", "clamp"]
 Values = np.ndarray | np.floating  # NumPy makes numbers of arrays without axes
@@ -45,6 +53,15 @@ TEXTURES = {"opacity": 0, "normal_map": 1}  # of a material that may be absent, 
 BARELY_VISIBLE = 0.1  # alpha below it, as a share of the texture's largest, is empty space around what is drawn
 MOSTLY_OPAQUE = 0.5
 MOST_NAMES, LONGEST_NAME = 3, 40  # in a sentence
+MAX_SIZE = 1024
+MOST_PIXELS = 2**26  # of an image file: 8192 x 8192
+KTX2 = b"\xabKTX 20\xbb\r\n\x1a\n"
+# what readers of images raise on those that break their rules
+UNREADABLE: tuple[type[Exception], ...]
+UNREADABLE = (OSError, SyntaxError, ValueError, LookupError, RuntimeError, AttributeError)
+UNREADABLE += (Image.DecompressionBombError, Image.DecompressionBombWarning)
+LEVELS = np.arange(256) / 255  # of 8 bits
+SRGB_TABLE, DIRECTION_TABLE = srgb_to_linear(LEVELS).astype(np.float32), (2 * LEVELS - 1).astype(np.float32)
 
 
 class RejectedAsset(UserError):
@@ -55,12 +72,12 @@ class MissingFile(RejectedAsset):
     """A file that a mesh file names is not there, or lies where it must not be looked for."""
 
 
-def extra(package: str) -> Any:
-    """A package of the extra `meshes`; RejectedAsset where it is not installed."""
+def extra(package: str, name: str = "meshes") -> Any:
+    """A package of an extra; RejectedAsset where it is not installed."""
     try:
         return importlib.import_module(package)
     except ImportError:
-        raise RejectedAsset(f"needs the package {package} to be read: pip install 'spnr-jax[meshes]'") from None
+        raise RejectedAsset(f"needs the package {package} to be read: pip install 'spnr-jax[{name}]'") from None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,7 +88,6 @@ class Material:
     opacity (height, width) or None: there is surface where it is at least `cutoff`.
     normal_map (height, width, 3) or None: normals along the directions in which u grows, in which v falls, and
     outwards, of any length.
-    `coordinates` names the channels that lie by other texture coordinates than the first: their number, their wrap.
     """
 
     base_color: np.ndarray
@@ -81,7 +97,6 @@ class Material:
     opacity: np.ndarray | None = None
     cutoff: float | int = 0.5
     normal_map: np.ndarray | None = None
-    coordinates: Mapping[str, tuple[int, Wrap]] = field(default_factory=dict)
 
     @property
     def textured(self) -> bool:
@@ -95,8 +110,7 @@ class Part:
     """Triangles that share one material.
 
     positions (v, 3) float64; faces (f, 3) int64, counter-clockwise seen from outside where the source knows;
-    normals (v, 3) unit, or None for flat shading; texcoords (v, 2), needed only if the material has a texture, or
-    (v, 2 n) for n pairs of coordinates, of which `Material.coordinates` counts from 0;
+    normals (v, 3) unit, or None for flat shading; texcoords (v, 2), needed only if the material has a texture;
     colors (v, 3) linear, multiplies the material's base colour, or None.
     """
 
@@ -129,9 +143,16 @@ def make_material(
     wrap: Wrap = "repeat",
 ) -> Material:
     """A material of float32 channels in [0, 1]; grey of roughness 0.5 where nothing is given."""
-    color, *values = (np.clip(np.asarray(x, np.float32), 0, 1) for x in (base_color, roughness, metallic))
-    color = np.full(3, color) if color.ndim == 0 else color
-    return Material(base_color=color, roughness=values[0], metallic=values[1], wrap=wrap)
+    color = np.asarray(base_color, np.float32)
+    channels: dict[str, Any] = {"base_color": np.full(3, color) if color.ndim == 0 else color}
+    channels |= {"roughness": np.asarray(roughness, np.float32), "metallic": np.asarray(metallic, np.float32)}
+    for name, axes in CHANNELS.items():
+        shape = channels[name].shape
+        if shape[len(shape) - axes :] != (3,) * axes or len(shape) - axes not in (0, 2) or 0 in shape:
+            raise RejectedAsset(f"has a material with {name} of shape {shape}: broken file")
+        if not np.isfinite(channels[name]).all():
+            raise RejectedAsset(f"has a material whose {name} is not finite (NaN or infinity)")
+    return Material(**{name: np.clip(values, 0, 1) for name, values in channels.items()}, wrap=wrap)
 
 
 def read_companion(folder: Path, uri: str, root: Path | None = None) -> bytes:
@@ -185,19 +206,12 @@ class Alpha(NamedTuple):
     transmits: bool = False
 
 
-class Opacity(NamedTuple):
-    """Where a material has surface: everywhere without `texels`, else where they reach the cut-off; or `nowhere`."""
-
-    texels: np.ndarray | None = None
-    cutoff: float | int = MOSTLY_OPAQUE
-    nowhere: bool = False
-
-
 class Tolerance:
-    """The policy of one reading, and what came of it."""
+    """The policy of one reading, and what came of it; `ignored` names what a file holds that is not modelled."""
 
     def __init__(self, transparent_parts: TransparentParts):
         self.transparent_parts = transparent_parts
+        self.ignored: set[str] = set()
         self.said: dict[str, dict[str, None]] = {}  # beginning of a sentence -> names, in their order
 
     @property
@@ -205,25 +219,31 @@ class Tolerance:
         """Whether the object is wanted as it is, or not at all."""
         return self.transparent_parts == "refuse"
 
-    def opacity(self, name: str, alpha: Alpha) -> Opacity:
-        """Where a material that may be transparent has surface; RejectedAsset where that is not to be decided."""
+    def cut_out(self, name: str, material: Material, alpha: Alpha | None) -> Material | None:
+        """The material with surface where its alpha says so, None if that is nowhere; RejectedAsset if it may not."""
+        if alpha is None:
+            return material
         if self.strict:
             raise RejectedAsset(f"is transparent: material {name!r} has {alpha.why}")
-        if alpha.cutoff is not None:
-            found = _cut(alpha.texels, alpha.factor, alpha.cutoff)
-            self._say("surface only where the alpha of the texture reaches its cut-off", name, found.texels is not None)
-            self._say("left out, wholly below the alpha cut-off", name, found.nowhere)
-            return found
-        if not (alpha.transmits or alpha.factor < 1 or (alpha.texels is not None and alpha.texels.min() < 1)):
-            return Opacity()
-        if self.transparent_parts == "skip":
-            found = Opacity(nowhere=True) if alpha.transmits else _cut(alpha.texels, alpha.factor, MOSTLY_OPAQUE)
-            self._say("transparent parts left out (--transparent-parts opaque draws them)", name)
-            return found
-        self._say("transparent parts drawn as opaque (--transparent-parts skip leaves them out)", name)
-        if alpha.texels is None or not alpha.texels.max() > 0:
-            return Opacity()
-        return _cut(alpha.texels, 1.0, BARELY_VISIBLE * float(alpha.texels.max()))
+        values, cutoff = np.asarray(alpha.factor if alpha.texels is None else alpha.texels * alpha.factor), alpha.cutoff
+        if cutoff is None:
+            if not alpha.transmits and values.min() >= 1:
+                return material
+            cutoff = np.inf if alpha.transmits else MOSTLY_OPAQUE
+            if self.transparent_parts == "skip":
+                self._say("transparent parts left out (--transparent-parts opaque draws them)", name)
+            else:
+                self._say("transparent parts drawn as opaque (--transparent-parts skip leaves them out)", name)
+                values = np.ones(()) if alpha.texels is None else alpha.texels
+                cutoff = BARELY_VISIBLE * float(values.max())
+        surface = values >= cutoff
+        if surface.all():
+            return material
+        if alpha.cutoff is not None and surface.any():
+            self._say("surface only where the alpha of the texture reaches its cut-off", name)
+        elif alpha.cutoff is not None:
+            self._say("left out, wholly below the alpha cut-off", name)
+        return replace(material, opacity=values.astype(np.float32), cutoff=cutoff) if surface.any() else None
 
     def goes_on_without(self, error: MissingFile) -> None:
         """Keeps the reason for the notes; raises it again where everything has to be there."""
@@ -236,22 +256,95 @@ class Tolerance:
         """Keeps for the notes that a material's colours are what is to be seen, light and all."""
         self._say("colours that hold light already (KHR_materials_unlit) taken as base colours", name)
 
-    def notes(self) -> Iterable[str]:
-        """One sentence for each thing that was decided."""
+    def asset(self, parts: Sequence[Part], *more_notes: str) -> Asset:
+        """The asset of the parts, with a sentence for each thing that was decided; RejectedAsset if there are none."""
+        notes = []
         for beginning, names in self.said.items():
             more = f" and {len(names) - MOST_NAMES} more" if len(names) > MOST_NAMES else ""
-            yield f"{beginning}: {', '.join(list(names)[:MOST_NAMES])}{more}"
+            notes.append(f"{beginning}: {', '.join(list(names)[:MOST_NAMES])}{more}")
+        if not parts:
+            raise RejectedAsset(f"has nothing to draw: {'; '.join(notes)}" if notes else "has no faces")
+        return Asset(parts=tuple(parts), ignored=tuple(sorted(self.ignored)), notes=(*notes, *more_notes))
 
-    def _say(self, beginning: str, name: str, happened: bool | np.bool_ = True, quoted: bool = True) -> None:
-        if happened:
-            self.said.setdefault(beginning, {})[repr(name[:LONGEST_NAME]) if quoted else name[:200]] = None
+    def _say(self, beginning: str, name: str, quoted: bool = True) -> None:
+        self.said.setdefault(beginning, {})[repr(name[:LONGEST_NAME]) if quoted else name[:200]] = None
 
 
-def _cut(texels: np.ndarray | None, factor: float | int, cutoff: float | int) -> Opacity:
-    """Surface where texels * factor reach the cut-off; without texels everywhere or nowhere."""
-    values = np.asarray(factor if texels is None else texels * factor)
-    if values.min() >= cutoff:
-        return Opacity()
-    if not values.max() >= cutoff:
-        return Opacity(nowhere=True)
-    return Opacity(values.astype(np.float32), cutoff)
+def read_image(data: bytes, name: str) -> np.ndarray:
+    """The texels of `decode_image`; RejectedAsset, which names it, for an image that cannot be read."""
+    try:
+        return decode_image(data)
+    except UserError as error:
+        raise RejectedAsset(f"names an image that cannot be read: {name} ({error})") from None
+
+
+def decode_image(data: bytes) -> np.ndarray:
+    """Texels (height, width, 4) uint8 of an image file as they are encoded; alpha is 255 where it has none."""
+    if data.startswith(KTX2):
+        raise UserError("KTX2, which is not read: convert it to PNG, e.g. with `ktx extract`")
+    try:
+        with warnings.catch_warnings(action="error", category=Image.DecompressionBombWarning):
+            image: Image.Image = Image.open(io.BytesIO(data))
+        if image.width * image.height > MOST_PIXELS:  # before memory is taken for them
+            raise UserError(f"{image.width} x {image.height} pixels, more than {MOST_PIXELS}")
+        if image.mode.startswith("I"):  # PIL would clip 16-bit grey to 255 instead of scaling it
+            image = Image.fromarray((np.asarray(image) // 257).astype(np.uint8))
+        return np.asarray(image.convert("RGBA"))
+    except UnidentifiedImageError:
+        raise UserError("is not an image") from None
+    except UNREADABLE as error:
+        if is_bug(error):
+            raise
+        raise UserError(str(error)) from None
+
+
+def color_texels(encoded: np.ndarray, table: np.ndarray = SRGB_TABLE) -> np.ndarray:
+    """Linear colours (h, w, 3) float32 of texels (h, w, 4) uint8 that are sRGB, or what a table (256,) says."""
+    return np.stack([shrink(table[encoded[..., channel]]) for channel in range(3)], axis=-1)  # one by one: memory
+
+
+def value_texels(encoded: np.ndarray) -> np.ndarray:
+    """Values (h, w) float32 in [0, 1] of linearly encoded texels (h, w) uint8, at most MAX_SIZE a side."""
+    return shrink(encoded.astype(np.float32) / 255)
+
+
+def shrink(texels: np.ndarray) -> np.ndarray:
+    """The texture (height, width) or (height, width, c), float32, box-filtered to at most MAX_SIZE texels a side."""
+    height, width = texels.shape[:2]
+    ratio = MAX_SIZE / max(height, width)
+    if ratio >= 1:
+        return texels.astype(np.float32)
+    return resize(texels, max(1, round(height * ratio)), max(1, round(width * ratio)))
+
+
+def resize(texels: np.ndarray, height: int | np.integer, width: int | np.integer) -> np.ndarray:
+    """The texture resampled with a box filter, float32."""
+    channels, size = texels.reshape(*texels.shape[:2], -1), (int(width), int(height))
+    resized = [
+        np.asarray(Image.fromarray(np.ascontiguousarray(channel)).resize(size, Image.Resampling.BOX))
+        for channel in np.moveaxis(channels.astype(np.float32), -1, 0)
+    ]
+    return np.stack(resized, axis=-1).reshape(height, width, *texels.shape[2:])
+
+
+def lookup(texels: np.ndarray, texcoords: np.ndarray, wrap: Wrap) -> np.ndarray:
+    """Bilinear values (n,) or (n, c) of a texture (height, width) or (height, width, c) at texcoords (n, 2)."""
+    size = np.array([texels.shape[1], texels.shape[0]])
+    position = np.asarray(texcoords, np.float64) * size - 0.5
+    corner = np.floor(position).astype(np.int64)
+    weight = position - corner
+    (left, top), (right, bottom) = _wrap(corner, size, wrap).T, _wrap(corner + 1, size, wrap).T
+    x, y = (weight[:, axis].reshape(-1, *[1] * (texels.ndim - 2)) for axis in (0, 1))
+    upper = (1 - x) * texels[top, left] + x * texels[top, right]
+    lower = (1 - x) * texels[bottom, left] + x * texels[bottom, right]
+    return (1 - y) * upper + y * lower
+
+
+def _wrap(index: np.ndarray, size: np.ndarray, wrap: Wrap) -> np.ndarray:
+    """Texel indices inside [0, size) for any integer indices."""
+    if wrap == "clamp":
+        return np.clip(index, 0, size - 1)
+    if wrap == "repeat":
+        return index % size
+    folded = index % (2 * size)
+    return np.minimum(folded, 2 * size - 1 - folded)

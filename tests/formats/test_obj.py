@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from support.gltf_files import png
 
+from spnr_jax.formats.assets import RejectedAsset
 from spnr_jax.formats.columns import srgb_to_linear
-from spnr_jax.formats.mesh.assets import RejectedAsset
-from spnr_jax.formats.mesh.meshes import load_mesh
+from spnr_jax.formats.meshes import load_mesh
 
 SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
 UV = "vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"
@@ -65,20 +65,11 @@ def test_normals_are_kept_and_v_is_counted_from_above(tmp_path):
 
 
 def test_a_texture_is_linearised_and_replaces_the_placeholder_beside_it(tmp_path):
-    (tmp_path / "my wood.png").write_bytes(png(CHECKER))
-    asset = load_material(tmp_path, "Kd 0.8 0.8 0.8\nmap_Kd -mm 0 1 -clamp on my wood.png", UV)
+    (tmp_path / "3d wood.png").write_bytes(png(CHECKER))
+    asset = load_material(tmp_path, "Kd 0.8 0.8 0.8\nmap_Kd -s 2 -.5 1e-1 -clamp on 3d wood.png", UV)
     np.testing.assert_allclose(asset.parts[0].material.base_color, srgb_to_linear(CHECKER / 255), atol=1e-6)
     assert asset.parts[0].material.wrap == "clamp"
-    assert asset.ignored == ("MTL Kd beside map_Kd", "MTL map option -mm")
-
-
-def test_maps_are_scaled_and_shifted_and_a_name_may_begin_with_a_digit(tmp_path):
-    (tmp_path / "3d wood.png").write_bytes(png(CHECKER))
-    asset = load_material(tmp_path, "map_Kd -s 2 0.5 1 -o -.25 1e-1 3d wood.png", UV)
-    u, v, _ = asset.parts[0].positions.T  # as the file has them, v from below
-    expected = np.stack([2 * u - 0.25, 1 - (0.5 * v + 0.1)], axis=-1)
-    np.testing.assert_allclose(asset.parts[0].texcoords, expected, atol=1e-12)
-    assert asset.ignored == ()
+    assert asset.ignored == ("MTL Kd beside map_Kd", "MTL map option -s")
 
 
 def test_two_materials_with_odd_names_make_two_parts(tmp_path):

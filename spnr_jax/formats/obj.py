@@ -10,7 +10,7 @@ side, and a ray could not tell which it hits.
 """
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -18,24 +18,25 @@ from typing import NamedTuple
 
 import numpy as np
 
-from spnr_jax.formats.columns import NORMAL, SRGB, Columns, colors_of
-from spnr_jax.formats.mesh.assets import (
+from spnr_jax.formats.assets import (
     MOSTLY_OPAQUE,
     Alpha,
     Asset,
     Material,
     MissingFile,
-    Opacity,
     Part,
     RejectedAsset,
     Tolerance,
     TransparentParts,
     Wrap,
+    color_texels,
     make_material,
     read_companion,
+    read_image,
+    value_texels,
 )
-from spnr_jax.formats.mesh.plain import triangulate
-from spnr_jax.formats.mesh.texels import color_texels, read_image, value_texels
+from spnr_jax.formats.columns import NORMAL, SRGB, Columns, colors_of
+from spnr_jax.formats.polygons import triangulate
 from spnr_jax.kernels.cloud_arrays import stack_columns
 
 READ = {"newmtl", "kd", "map_kd", "pr", "map_pr", "pm", "map_pm", "ns", "d", "tr", "map_d"}
@@ -43,7 +44,6 @@ SILENT = {"ka", "ks", "ni", "illum", "tf", "sharpness"}  # the older lighting mo
 Read = Callable[[str], bytes]  # the bytes of a companion file, by its name in the text
 Library = dict[str, dict[str, str]]  # material name -> keyword in lower case -> rest of the line
 MAPS = ("map_kd", "map_pr", "map_pm", "map_d")
-DEFAULTS = ("s", (1.0, 1.0)), ("o", (0.0, 0.0))  # of options of maps: scale and offset of u and v
 OPTION = re.compile(r"-(\w+)((?:\s+(?:on|off|[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?)(?=\s))*)\s+")
 
 
@@ -60,22 +60,6 @@ class Text(NamedTuple):
     libraries: list[str]
 
 
-class Placement(NamedTuple):
-    """How a material's maps lie on the surface: texture coordinates (u, v from the lower edge) * scale + offset."""
-
-    wrap: Wrap = "repeat"
-    scale: tuple[float, float] = (1.0, 1.0)
-    offset: tuple[float, float] = (0.0, 0.0)
-
-
-class Look(NamedTuple):
-    """A material, how its maps lie, and whether it is nowhere to be seen."""
-
-    material: Material
-    placement: Placement = Placement()
-    nowhere: bool = False
-
-
 def load_obj(path: Path, root: Path | None = None, transparent_parts: TransparentParts = "refuse") -> Asset:
     """The file's faces grouped by material, as they lie in the file; RejectedAsset if it cannot be used.
 
@@ -88,20 +72,17 @@ def load_obj(path: Path, root: Path | None = None, transparent_parts: Transparen
     library: Library = {}
     for names in text.libraries:
         library |= parse_mtl(_read_library(read, path.parent, names, tolerance))
-    columns, ignored = _columns(text), set[str]()
+    columns = _columns(text)
     colors, notes = colors_of(columns) or (None, [])
-    looks = {}
+    looks: dict[str, Material | None] = {}
     for name in dict.fromkeys(text.used):
-        looks[name] = _look(read, name, library, ignored, tolerance) if name else Look(make_material())
+        looks[name] = _look(read, name, library, tolerance) if name else make_material()
         if colors is not None and name not in library:  # what has colours of its own is not multiplied with grey
-            looks[name] = Look(make_material(1.0))
+            looks[name] = make_material(1.0)
     parts = _parts(text, columns, colors, looks)
-    if not parts:
-        raise RejectedAsset(f"has nothing to draw: {'; '.join(tolerance.notes()) or 'no triangles'}")
     if text.rows["vn"] and any(part.normals is None for part in parts):
-        ignored.add("normals that only some faces have (flat shading is used)")
-    parts = _without_doubles(parts, ignored)
-    return Asset(parts=tuple(parts), ignored=tuple(sorted(ignored)), notes=(*tolerance.notes(), *notes))
+        tolerance.ignored.add("normals that only some faces have (flat shading is used)")
+    return tolerance.asset(_without_doubles(parts, tolerance) if parts else [], *notes)
 
 
 def obj_points(path: Path) -> Columns | None:
@@ -157,7 +138,7 @@ def _columns(text: Text) -> Columns:
     return dict(zip((*"xyz", *SRGB, "alpha"), table.T if table.shape[1] >= 6 else table.T[:3], strict=False))
 
 
-def _parts(text: Text, columns: Columns, colors: np.ndarray | None, looks: dict[str, Look]) -> list[Part]:
+def _parts(text: Text, columns: Columns, colors: np.ndarray | None, looks: dict[str, Material | None]) -> list[Part]:
     """The faces of each material that is to be seen, apart also by whether they have texture coordinates or normals."""
     numbers = {word: i for i, word in enumerate(dict.fromkeys(text.corners))}
     corners = np.array([[int(n or 0) for n in f"{word}//".split("/")[:3]] for word in numbers])  # of vertices
@@ -171,25 +152,24 @@ def _parts(text: Text, columns: Columns, colors: np.ndarray | None, looks: dict[
     texcoords, normals = _table(text.rows["vt"], 2), _table(text.rows["vn"], 3)
     parts = []
     for code in np.unique(kind):
-        look = list(looks.values())[code // 4]
-        if look.nowhere:
+        material = list(looks.values())[code // 4]
+        if material is None:
             continue
         used, own = np.unique(faces[kind == code], return_inverse=True)
         of_v, of_vt, of_vn = corners[used].T - 1
-        uv = texcoords[of_vt] * look.placement.scale + look.placement.offset if code & 2 else None
         part = Part(
             positions=positions[used],
             faces=own.reshape(-1, 3),
-            material=look.material,
+            material=material,
             normals=normals[of_vn] if code & 1 else None,
-            texcoords=None if uv is None else np.stack([uv[:, 0], 1 - uv[:, 1]], axis=-1),  # v is from the lower edge
+            texcoords=texcoords[of_vt] * [1, -1] + [0, 1] if code & 2 else None,  # v is from the lower edge
             colors=None if colors is None else colors[of_v],
         )
         parts.append(part)
     return parts
 
 
-def _without_doubles(parts: list[Part], ignored: set[str]) -> list[Part]:
+def _without_doubles(parts: list[Part], tolerance: Tolerance) -> list[Part]:
     """The parts without the faces whose three corners an earlier face, of any part, has in some order."""
     corners = np.concatenate([part.positions[part.faces] for part in parts])
     order = np.lexsort(np.moveaxis(corners, -1, 0)[::-1], axis=-1)
@@ -199,7 +179,7 @@ def _without_doubles(parts: list[Part], ignored: set[str]) -> list[Part]:
     kept[first] = True
     if kept.all():
         return parts
-    ignored.add(f"{int((~kept).sum())} doubled faces (one of each is kept)")
+    tolerance.ignored.add(f"{int((~kept).sum())} doubled faces (one of each is kept)")
     ends = np.cumsum([len(part.faces) for part in parts])[:-1]
     return [replace(part, faces=part.faces[here]) for part, here in zip(parts, np.split(kept, ends), strict=True)]
 
@@ -229,20 +209,31 @@ def _read_library(read: Read, folder: Path, names: str, tolerance: Tolerance) ->
     return "\n".join(data.decode("utf-8", errors="replace") for data in found)
 
 
-def _look(read: Read, name: str, library: Library, ignored: set[str], tolerance: Tolerance) -> Look:
-    """The principled material of an MTL entry, how its maps lie, and where it has surface."""
+def _look(read: Read, name: str, library: Library, tolerance: Tolerance) -> Material | None:
+    """The principled material of an MTL entry; None where it is nowhere to be seen."""
     if name not in library:
         tolerance.goes_on_without(MissingFile(f"uses a material that no library defines: {name!r}"))
-        return Look(make_material())
+        return make_material()
     entry = library[name]
-    maps = _read_maps(read, entry, name, tolerance)
-    opacity = _opacity(entry, maps.get("map_d"), name, tolerance)
-    ignored |= {f"MTL {key}" for key in entry if key not in READ | SILENT and entry[key].strip("0. ")}
-    placement = _placement([entry[key] for key in MAPS if key in maps], ignored)
+    if tolerance.strict:  # that it is transparent is a plainer reason than a missing file
+        tolerance.cut_out(name, make_material(), _alpha(entry, None))
+    maps: dict[str, np.ndarray] = {}
+    wrap: Wrap = "repeat"
+    for key in MAPS:
+        if key not in entry:
+            continue
+        options, file = _options(entry[key])
+        tolerance.ignored |= {f"MTL map option -{option}" for option in options if option != "clamp"}
+        try:
+            maps[key] = read_image(read(file), file)
+            wrap = "clamp" if options.get("clamp") == ["on"] else wrap
+        except MissingFile as missing:
+            tolerance.goes_on_without(missing)
+    tolerance.ignored |= {f"MTL {key}" for key in entry if key not in READ | SILENT and entry[key].strip("0. ")}
     color = np.array([float(x) for x in entry.get("kd", "0.5 0.5 0.5").split()[:3]])
     if "map_kd" in maps:
         if "kd" in entry and not np.all(color == 1):
-            ignored.add("MTL Kd beside map_Kd")
+            tolerance.ignored.add("MTL Kd beside map_Kd")
         color = color_texels(maps["map_kd"])
     roughness = np.sqrt(2 / (max(float(entry["ns"]), 0) + 2)) if "ns" in entry else 0.5
     channels: dict[str, float | np.ndarray]
@@ -250,36 +241,7 @@ def _look(read: Read, name: str, library: Library, ignored: set[str], tolerance:
     for channel, key in (("roughness", "map_pr"), ("metallic", "map_pm")):
         if key in maps:
             channels[channel] = value_texels(maps[key][..., 0])
-    material = make_material(color, **channels, wrap=placement.wrap)
-    return Look(replace(material, opacity=opacity.texels, cutoff=opacity.cutoff), placement, opacity.nowhere)
-
-
-def _read_maps(read: Read, entry: dict[str, str], name: str, tolerance: Tolerance) -> dict[str, np.ndarray]:
-    """Texels of the images that an entry names; without those that may be missing and are."""
-    if tolerance.strict:
-        _opacity(entry, None, name, tolerance)  # a transparent material is the plainer reason
-    maps = {}
-    for key in MAPS:
-        if key in entry:
-            try:
-                _, file = _options(entry[key])
-                maps[key] = read_image(read(file), file)
-            except MissingFile as missing:
-                tolerance.goes_on_without(missing)
-    return maps
-
-
-def _placement(statements: Sequence[str], ignored: set[str]) -> Placement:
-    """How the maps of a material's statements lie: as the first says; others that disagree are named as ignored."""
-    places = []
-    for options, _ in map(_options, statements):
-        ignored |= {f"MTL map option -{name}" for name in options if name not in ("clamp", "s", "o")}
-        wrap: Wrap = "clamp" if options.get("clamp") == ["on"] else "repeat"
-        (u, v, *_), (x, y, *_) = ([*map(float, options.get(name, [])), *default] for name, default in DEFAULTS)
-        places.append(Placement(wrap, (u, v), (x, y)))
-    if len(set(places)) > 1:
-        ignored.add("MTL maps of one material that lie differently (the first one's options are used)")
-    return places[0] if places else Placement()
+    return tolerance.cut_out(name, make_material(color, **channels, wrap=wrap), _alpha(entry, maps.get("map_d")))
 
 
 def _options(statement: str) -> tuple[dict[str, list[str]], str]:
@@ -291,15 +253,15 @@ def _options(statement: str) -> tuple[dict[str, list[str]], str]:
     return options, statement.strip().replace("\\", "/")
 
 
-def _opacity(entry: dict[str, str], map_d: np.ndarray | None, name: str, tolerance: Tolerance) -> Opacity:
-    """Where a material has surface."""
+def _alpha(entry: dict[str, str], map_d: np.ndarray | None) -> Alpha | None:
+    """The alpha of an MTL entry, with the texels of its mask."""
     if "map_d" in entry:
         texels = None
         if map_d is not None:  # grey, or the alpha of a picture that has one
             texels = value_texels(map_d[..., 3 if map_d[..., 3].min() < 255 else 0])
-        return tolerance.opacity(name, Alpha("map_d", texels=texels, cutoff=MOSTLY_OPAQUE))
+        return Alpha("map_d", texels=texels, cutoff=MOSTLY_OPAQUE)
     if "d" in entry and (opacity := float(entry["d"].split()[-1])) < 1:
-        return tolerance.opacity(name, Alpha(f"d {opacity:g}", opacity))
+        return Alpha(f"d {opacity:g}", opacity)
     if "tr" in entry and 0 < (share := float(entry["tr"].split()[-1])) < 1:
-        return tolerance.opacity(name, Alpha(f"Tr {share:g}", 1 - share))
-    return Opacity()
+        return Alpha(f"Tr {share:g}", 1 - share)
+    return None

@@ -17,8 +17,7 @@ from typing import Literal
 import numpy as np
 
 from spnr_jax.errors import UserError
-from spnr_jax.formats.mesh.assets import CHANNELS, TEXTURES, Asset, Material, Part, RejectedAsset
-from spnr_jax.formats.mesh.texels import lookup
+from spnr_jax.formats.assets import CHANNELS, TEXTURES, Asset, Part, RejectedAsset, lookup
 from spnr_jax.kernels.cloud_arrays import farthest_points
 
 Spread = Literal["random", "even"]
@@ -121,24 +120,6 @@ def face_areas(part: Part) -> np.ndarray:
     return np.linalg.norm(_face_cross(part), axis=-1) / 2
 
 
-def evaluate_material(material: Material, texcoords: np.ndarray | None, count: int) -> dict[str, np.ndarray]:
-    """The channels of a material at texture coordinates (count, 2 n), and its opacity and normal map if it has them.
-
-    base_color, normal_map (count, 3); roughness, metallic, opacity (count,).
-    """
-
-    def channel(name: str, value_ndim: int) -> np.ndarray:
-        values = np.asarray(getattr(material, name))
-        if values.ndim == value_ndim:
-            return np.broadcast_to(values, (count, *values.shape))
-        assert texcoords is not None, "a texture needs texture coordinates"
-        pair, wrap = material.coordinates.get(name, (0, material.wrap))
-        return lookup(values, texcoords[:, 2 * pair : 2 * pair + 2], wrap)
-
-    present = {name: axes for name, axes in TEXTURES.items() if getattr(material, name) is not None}
-    return {name: channel(name, axes) for name, axes in (CHANNELS | present).items()}
-
-
 def _sample_part(part: Part, face: np.ndarray, barycentric: np.ndarray) -> dict[str, np.ndarray]:
     """Every column but `face` that `_draw_points` gives, at barycentric coordinates (n, 3) of local faces (n,)."""
 
@@ -146,18 +127,22 @@ def _sample_part(part: Part, face: np.ndarray, barycentric: np.ndarray) -> dict[
         return np.einsum("nk,nkc->nc", barycentric, values[part.faces[face]])
 
     texcoords = None if part.texcoords is None else interpolate(part.texcoords)
-    channels = evaluate_material(part.material, texcoords, len(face))
+    channels = {}
+    for name, axes in (CHANNELS | TEXTURES).items():
+        values = getattr(part.material, name)
+        if np.ndim(values) > axes:
+            assert texcoords is not None, "a texture needs texture coordinates"
+            channels[name] = lookup(values, texcoords, part.material.wrap)
+        elif values is not None:
+            channels[name] = np.broadcast_to(values, (len(face), *np.shape(values)))
     opacity, normal_map = (channels.pop(name, None) for name in TEXTURES)
     if part.colors is not None:
         channels["base_color"] = channels["base_color"] * interpolate(part.colors)
     geometric = unit(_face_cross(part)[face])
     normals = geometric if part.normals is None else unit(interpolate(part.normals), geometric)
-    if normal_map is not None:
-        assert part.texcoords is not None, "a normal map needs texture coordinates"
-        pair, _ = part.material.coordinates.get("normal_map", (0, part.material.wrap))
+    if normal_map is not None and part.texcoords is not None:
         corners = part.faces[face]
-        own = part.texcoords[:, 2 * pair : 2 * pair + 2]
-        normals = tilt_normals(normals, normal_map, part.positions[corners], own[corners])
+        normals = tilt_normals(normals, normal_map, part.positions[corners], part.texcoords[corners])
     solid = np.ones(len(face), bool) if opacity is None else opacity >= part.material.cutoff
     return {"positions": interpolate(part.positions), "normals": normals, "solid": solid, **channels}
 

@@ -1,1 +1,0 @@
-"""Mesh files read with their materials, and points on their surfaces."""
