@@ -62,13 +62,6 @@ class TestScatterMean:
         assert volume.sum() == 2 * kept
         assert occupancy.sum() == kept
 
-    @pytest.mark.parametrize("count", [1, 1000])
-    def test_identical_points_are_one_point(self, count):
-        positions = jnp.broadcast_to(jnp.array([0.3, -0.2, 0.9]), (count, 3))
-        volume, occupancy = scatter(positions, jnp.full((count, 2), 0.7), jnp.ones(count, bool), D)
-        assert (occupancy > 0).sum() == 1
-        close((volume[3, 1, 2], occupancy[3, 1, 2]), (jnp.full(2, 0.7), 1.0), rtol=3e-5)
-
     @pytest.mark.parametrize("fill", [0.0, 1e30, np.nan])
     def test_padding_does_not_matter_whatever_it_holds(self, fill):
         extra = jnp.full((5, 3), fill, jnp.float32)

@@ -1,7 +1,5 @@
 """Surfels of bodies whose normals, spacing and colours are known."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 from support.laws import close
@@ -55,14 +53,13 @@ def test_the_shape_is_0_in_a_plane_and_on_a_line():
     assert estimate(line)["shape"][:, 1].max() < 0.01
 
 
-def test_blocks_of_points_and_their_order_change_nothing():
+def test_the_block_of_a_point_and_its_order_among_others_change_nothing():
     positions, _, _ = shape("sphere", 700, "random")
     color = 0.5 + 0.5 * positions
     whole = estimate(positions, color)
-    order = np.random.default_rng(3).permutation(len(positions))
-    shuffled = vars(surfels_of(positions[order], color[order], rules=dataclasses.replace(RULES, block=97)))
+    shuffled = vars(surfels_of(positions, color, order=np.random.default_rng(3).permutation(4096)[:700]))
     for name in FIELDS:
-        off = np.abs(shuffled[name] - whole[name][order]).reshape(len(positions), -1).max(axis=1)
+        off = np.abs(shuffled[name] - whole[name]).reshape(len(positions), -1).max(axis=1)
         # a visible cell's border is a border: rounding of a normal may move a lifted point over it
         assert np.mean(off > 1e-3 * max(np.abs(whole[name]).max(), 1)) < 0.01, name
 
@@ -74,7 +71,7 @@ def test_normals_that_are_given_are_kept_and_those_of_the_wrong_sign_turned():
     wrong = np.random.default_rng(1).uniform(size=(800, 1)) < 0.3
     found = estimate(positions, normals=np.where(wrong, -3 * tilted, 3 * tilted))
     close(found["normal"], tilted, atol=1e-5)
-    assert found["sided"].min() >= 1 - RULES.leak
+    close(found["sided"], 1 - RULES.leak, atol=1e-6)  # a little weight from behind
 
 
 def test_a_normal_given_on_a_sheet_keeps_its_sign():
@@ -170,8 +167,3 @@ def test_normals_given_within_a_box_that_is_dark_inside_are_kept_and_its_back_dr
     found = estimate(positions, normals=normals)
     assert np.mean(np.sum(found["normal"] * normals, axis=1) > 0.9) > 0.99
     assert np.mean(found["sided"] > 0.9) > 0.95
-
-
-def test_a_disc_of_one_side_keeps_a_little_weight_from_behind():
-    positions, normals, _ = shape("sphere", 800)
-    close(estimate(positions, normals=normals)["sided"], 1 - RULES.leak, atol=1e-6)

@@ -144,7 +144,7 @@ def test_a_pixel_in_a_dent_lies_behind_the_mean_around_it_and_one_on_a_bump_befo
         centres=ones, beside=jnp.zeros((32, 32, 2)),
     )  # fmt: skip
     view = Camera(cam_to_world=jnp.eye(3, 4), intrinsics=camera(32).intrinsics, height=32, width=32)
-    seen, _ = shader.features(buffer, light_of(sky()), view)
+    seen, _ = jax.jit(shader.features)(buffer, light_of(sky()), view)
     for column in (7, 8):
         assert seen[8, 8, column] > 0.3
         assert seen[24, 24, column] < -0.3

@@ -83,17 +83,6 @@ def test_another_size_keeps_the_energy_and_loses_no_lamp(size, height):
     assert small.min() >= 0
 
 
-def test_another_size_is_the_mean_over_whole_texels_and_the_same_size_the_map_itself():
-    radiance = envmap(3, 8)
-    close(resample(radiance, 8), radiance, rtol=1e-5)
-    close(
-        resample(np.repeat(np.repeat(radiance, 3, axis=0), 3, axis=1), 24), np.repeat(np.repeat(radiance, 3, 0), 3, 1)
-    )
-    area = solid_angles(8)[..., None].reshape(4, 2, 8, 2, 1)
-    means = (radiance.reshape(4, 2, 8, 2, 3) * area).sum(axis=(1, 3)) / area.sum(axis=(1, 3))
-    close(resample(radiance, 4), means, rtol=1e-5)
-
-
 class TestLookUp:
     def table(self):
         return jnp.asarray(envmap(4).reshape(-1, 3))
@@ -121,15 +110,6 @@ class TestLookUp:
         close(found[0], texels[15:17, [0, -1]].mean(axis=(0, 1)), rtol=1e-4)
         poles = [jnp.zeros(4), jnp.asarray([1.0, -1.0, 1.0000001, -1.0000001]), jnp.asarray([0.0, 0.0, -0.0, 1e-30])]
         assert np.isfinite(np.stack(lighting.look_up(self.table(), poles))).all()
-
-
-@pytest.mark.parametrize("scale", [1e-6, 1e6])
-def test_faint_and_glaring_light_is_a_multiple_of_light(scale):
-    radiance = envmap(5) ** 8
-    light = light_of(np.float32(scale) * radiance)
-    assert np.isfinite(light.tables).all()
-    assert light.tables.min() >= 0
-    close(light.tables / scale, light_of(radiance).tables, rtol=1e-4)
 
 
 def test_what_arrives_at_a_surfel_that_all_directions_see_is_nearly_its_irradiance():
@@ -179,12 +159,9 @@ def test_a_lamp_throws_what_it_is_said_to_and_shines_from_where_it_is_said_to(az
     facing = np.maximum(directions(skies.HEIGHT) @ skies.towards(azimuth, elevation), 0)[..., None]
     close((envmap * facing * area).sum(axis=(0, 1)), np.array([1.0, 0.5, 2.0]), rtol=1e-4)
     middle = (envmap[..., :1] * directions(skies.HEIGHT) * area).sum(axis=(0, 1))
-    close(middle / np.linalg.norm(middle), skies.towards(azimuth, elevation), atol=0.02)
-
-
-def test_azimuth_0_is_in_front_90_to_the_right_and_elevation_90_above():
-    found = [skies.towards(*angles) for angles in ((0, 0), (90, 0), (0, 90))]
-    close(np.stack(found), np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0]]), atol=1e-6)
+    turn, rise = np.deg2rad([azimuth, elevation])  # from +z towards +x, and up
+    place = np.array([np.cos(rise) * np.sin(turn), np.sin(rise), np.cos(rise) * np.cos(turn)])
+    close(middle / np.linalg.norm(middle), place, atol=0.02)
 
 
 @pytest.mark.parametrize("name", skies.NAMED)
@@ -203,7 +180,3 @@ def test_random_maps_follow_from_their_generator_and_differ():
     np.testing.assert_array_equal(maps[0], maps[1])
     assert all(np.isfinite(x).all() and x.min() >= 0 and x.max() > 0 for x in maps)
     assert len({x.tobytes() for x in maps}) == 4
-
-
-def test_black_stays_black_when_it_is_normalised():
-    np.testing.assert_array_equal(skies.normalise(np.zeros((4, 8, 3), np.float32)), 0)
