@@ -63,7 +63,8 @@ def _part(x: Array, axis: int, first: int, end: int) -> Array:
 
 def mean_of_squares(x: Float[Array, "*batch height width features"], side: int) -> Float[Array, "*batch h w features"]:
     """The mean of each square of side x side pixels."""
-    return jnp.mean(squares(x, side), axis=(-4, -2))
+    *batch, height, width, features = x.shape
+    return jnp.mean(x.reshape(*batch, height // side, side, width // side, side, features), axis=(-4, -2))
 
 
 def unfold(x: Float[Array, "*batch h w folded"], side: int) -> Float[Array, "*batch height width features"]:
@@ -71,12 +72,6 @@ def unfold(x: Float[Array, "*batch h w folded"], side: int) -> Float[Array, "*ba
     *batch, height, width, features = x.shape
     x = jnp.swapaxes(x.reshape(*batch, height, width, side, side, features // side**2), -4, -3)
     return x.reshape(*batch, side * height, side * width, features // side**2)
-
-
-def squares(x: Float[Array, "*batch height width features"], side: int) -> Array:
-    """The picture cut into squares of side x side pixels, (*batch, h, side, w, side, features)."""
-    *batch, height, width, features = x.shape
-    return x.reshape(*batch, height // side, side, width // side, side, features)
 
 
 def enlarge(rendering: Rendering, height: int, width: int) -> Rendering:

@@ -187,16 +187,6 @@ def voxel_rows(
     return row_of(locate(positions, resolution)[0], valid, resolution), valid
 
 
-def share_voxels(
-    positions: Float[Array, "points 3"], mask: Bool[Array, " points"], resolution: int
-) -> tuple[Int[Array, " points"], Float[Array, " points"]]:
-    """Row of each point in the flattened volume, and 1 / (points in its voxel); 0 if masked or outside the box."""
-    rows, valid = voxel_rows(positions, mask, resolution)
-    ones = valid.astype(positions.dtype)
-    count = gather_rows(scatter_rows(rows, ones[:, None], resolution**3 + 1), rows)[:, 0]
-    return rows, ones / jnp.maximum(count, 1)
-
-
 def mark_occupied(
     positions: Float[Array, "points 3"], mask: Bool[Array, " points"], resolution: int
 ) -> Bool[Array, "d d d"]:
@@ -212,7 +202,10 @@ def spread(
     resolution: int,
 ) -> tuple[Int[Array, " points"], Float[Array, "points features+1"]]:
     """Rows of the flattened volume, and what each point adds there to the means of features and to occupancy."""
-    rows, share = share_voxels(positions, mask, resolution)
+    rows, valid = voxel_rows(positions, mask, resolution)
+    ones = valid.astype(positions.dtype)
+    count = gather_rows(scatter_rows(rows, ones[:, None], resolution**3 + 1), rows)[:, 0]
+    share = ones / jnp.maximum(count, 1)
     return rows, jnp.concatenate([features, jnp.ones_like(features[..., :1])], axis=-1) * share[:, None]
 
 

@@ -5,9 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 from support.laws import close, numbers
 
-from spnr_jax.kernels.compositing import composite, expected_distance, volume_weights
-from spnr_jax.method.paper_method import union_weights
+from spnr_jax.kernels import compositing
+from spnr_jax.method import paper_method
 
+volume_weights, composite = jax.jit(compositing.volume_weights), jax.jit(compositing.composite)
+expected_distance, union_weights = jax.jit(compositing.expected_distance), jax.jit(paper_method.union_weights)
 DENSITY = 5 * jnp.abs(numbers(0, 2, 3, 8))
 DELTA = jnp.abs(numbers(1, 2, 3, 8))
 VALUES = numbers(2, 2, 3, 8, 4)

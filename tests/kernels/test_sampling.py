@@ -11,7 +11,7 @@ from support import reference
 from support.laws import close, extremes, extremes_law, hypotheses, numbers, same_bits, sorted_distances
 
 from spnr_jax.kernels import sampling
-from spnr_jax.kernels.sampling import count_at_most, importance, merge, strata, stratified
+from spnr_jax.kernels.sampling import count_at_most, importance, merge
 
 NEAR = 1 + numbers(0, 2, 3)
 FAR = NEAR + 0.5 + jnp.abs(numbers(1, 2, 3))
@@ -21,6 +21,8 @@ KEYS = [None, 11]
 
 
 drawn = jax.jit(importance, static_argnames=("num_samples", "padding"))
+stratified = jax.jit(sampling.stratified, static_argnums=3)
+strata = jax.jit(sampling.strata, static_argnums=(1, 2))
 
 
 def fresh(seed):
@@ -60,13 +62,6 @@ class TestStratified:
         jitter = np.array(strata(fresh(2), (2000, 2), 1))[..., 0]
         assert abs(np.corrcoef(jitter.T)[0, 1]) < 0.07
         assert len(np.unique(jitter)) > 3990
-
-    def test_rays_mapped_over_split_keys_are_independent(self):
-        keys = jax.random.split(fresh(3), 2000)
-        jitter = np.array(jax.vmap(lambda key: strata(key, (), 2))(keys)) * 2 % 1
-        assert len(np.unique(jitter)) > 3990
-        assert abs(np.corrcoef(jitter.T)[0, 1]) < 0.07
-        assert abs(np.corrcoef(jitter[:-1, 0], jitter[1:, 0])[0, 1]) < 0.07
 
     def test_keys_of_rays_draw_for_each_what_they_draw_for_it_alone(self):
         together = [strata(keys, (3,), 5) for keys in sampling.split(jax.random.split(fresh(4), 3))]

@@ -75,7 +75,7 @@ def object_of(positions, nth=None):
 
 
 def test_a_box_holds_what_lies_on_its_borders_and_one_without_points_is_named():
-    positions = np.array([[0, 0, 0], [1, 1, 1], [2, 0, 0]])
+    positions = np.array([[0.0, 0, 0], [1, 1, 1], [2, 0, 0]])
     inside = scenes.in_box(positions, (0, 0, 0, 1, 1, 1))
     assert same(inside, np.array([True, True, False]))
     assert scenes.crop_box(2, 3, (0, 0, 0, 1, 1, 1), *positions[[0, 1]]) == "--crop: 2 of 3 points lie inside"

@@ -152,8 +152,8 @@ def test_padding_and_the_order_of_points_do_not_matter(params):
 def test_a_turned_cloud_has_turned_children(params):
     normals = shape("sphere", SIZE, "random")[1]
     turn = np.float32([[0.36, 0.48, -0.8], [-0.8, 0.6, 0], [0.48, 0.64, 0.6]])
-    points = cloud(0.6 * normals, normals=normals)
-    other = dataclasses.replace(points, positions=points.positions @ turn.T, normals=points.normals @ turn.T)
+    points = cloud(0.6 * normals)
+    other = dataclasses.replace(points, positions=points.positions @ turn.T)
     one, two = (run(params, x, spnr_jax.neighbors(x)) for x in (points, other))
     there = cKDTree(np.asarray(two.positions)[np.asarray(two.mask)])
     distance = there.query(np.asarray(one.positions)[np.asarray(one.mask)] @ turn.T)[0]

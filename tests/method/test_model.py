@@ -29,18 +29,14 @@ def example_cloud(count=40, seed=0):
     return cloud(rng.uniform(-0.5, 0.5, (count, 3)), **columns)
 
 
-def test_moving_and_scaling_cloud_and_camera_together_changes_only_the_unit_of_depth(handle):
-    cloud, factor, shift = example_cloud(), 8.0, np.float32([16.0, -4.0, 2.0])
-    volume = handle.encode(cloud)
-    camera = handle.camera(volume, 40.0, 25.0)
-    moved = handle.encode(dataclasses.replace(cloud, positions=cloud.positions * np.float32(factor) + shift))
-    pose = np.array(camera.cam_to_world)
-    pose[:, 3] = pose[:, 3] * factor + shift
-    far_away = handle.render(moved, dataclasses.replace(camera, cam_to_world=jax.numpy.asarray(pose)))
-    rendering = handle.render(volume, camera)
-    close(far_away.image, rendering.image, rtol=0, atol=2e-4)
-    close(far_away.acc, rendering.acc, rtol=0, atol=2e-4)
-    close(far_away.depth, factor * rendering.depth, rtol=2e-4)
+@pytest.mark.parametrize(("factor", "shift"), [(8.0, (16, -4, 2)), (1e-30, (0, 0, 0)), (1e30, (0, 0, 0))])
+def test_moving_and_scaling_the_cloud_changes_only_the_unit_of_depth(handle, factor, shift):
+    cloud = example_cloud()
+    moved = dataclasses.replace(cloud, positions=np.float32(factor * np.float64(cloud.positions) + shift))
+    volumes = [handle.encode(points) for points in (cloud, moved)]
+    one, other = (handle.render(volume, handle.camera(volume, 40.0, 25.0)) for volume in volumes)
+    close((other.image, other.acc), (one.image, one.acc), rtol=0, atol=2e-4)
+    close(other.depth / np.float32(factor), one.depth, rtol=2e-4)
 
 
 def test_the_cameras_of_the_handle_look_at_the_middle_of_the_cloud(handle):

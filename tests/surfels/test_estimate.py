@@ -146,24 +146,3 @@ def test_the_sides_of_a_thin_wall_face_away_from_each_other_and_keep_their_colou
     inner = np.hypot(u, v) < 0.5
     assert np.mean(found["normal"][inner, 1] * sign[inner] > 0.9) > 0.97
     assert np.mean(np.abs(found["jump"][inner]).max(axis=1) < 0.1) > 0.97
-
-
-def box_with_a_back(count):
-    """Points, normals and spacing of an open box, deep and dark within, whose walls are a quarter spacing thick."""
-    rng = np.random.default_rng(3)
-    u, v = 0.5 * even_square(count).T
-    spacing, positions, normals = count**-0.5, [], []
-    for axis, sign in ((0, -1), (0, 1), (1, -1), (1, 1), (2, -1)):
-        for side in (-1, 1):  # the inner face, the outer one
-            moved = rng.uniform(-0.2, 0.2, (2, count)) * spacing
-            across = sign * (0.5 + 0.125 * side * spacing)
-            positions.append(np.insert(np.stack([u + moved[0], v + moved[1]], axis=1), axis, across, axis=1))
-            normals.append(np.broadcast_to(side * sign * np.eye(3)[axis], (count, 3)))
-    return np.float32(np.concatenate(positions)), np.float32(np.concatenate(normals)), spacing
-
-
-def test_normals_given_within_a_box_that_is_dark_inside_are_kept_and_its_back_drawn():
-    positions, normals, _ = box_with_a_back(300)
-    found = estimate(positions, normals=normals)
-    assert np.mean(np.sum(found["normal"] * normals, axis=1) > 0.9) > 0.99
-    assert np.mean(found["sided"] > 0.9) > 0.95
