@@ -8,7 +8,7 @@ from support.laws import close, numbers
 from spnr_jax.kernels import compositing
 from spnr_jax.method import paper_method
 
-volume_weights, composite = jax.jit(compositing.volume_weights), jax.jit(compositing.composite)
+volume_weights, composite = jax.jit(compositing.volume_weights), jax.jit(compositing.composite, static_argnums=2)
 expected_distance, union_weights = jax.jit(compositing.expected_distance), jax.jit(paper_method.union_weights)
 DENSITY = 5 * jnp.abs(numbers(0, 2, 3, 8))
 DELTA = jnp.abs(numbers(1, 2, 3, 8))

@@ -1,6 +1,5 @@
 """Laws of the pure `render`: jit, vmap, grad, jvp, remat, map; plans and overflow; finite at the extremes."""
 
-import dataclasses
 from functools import partial
 
 import jax
@@ -185,37 +184,26 @@ POSE = jnp.array([[0.0, -0.4, -0.5], [0.4, 0.0, 0.3], [0.5, -0.3, 0.0]])
 
 def moved(way, t, scene, seen, light):
     """Scene, camera and light, changed by t along a way."""
-    surfels = scene.surfels
+    surfels, pose = scene.surfels, seen.cam_to_world
     along = np.random.default_rng(7).normal(size=surfels.position.shape)
-    if way == "eye":
-        return scene, dataclasses.replace(seen, cam_to_world=seen.cam_to_world.at[:, 3].add(t * along[0])), light
-    if way == "turn":
-        turn = jnp.eye(3) + t * POSE
-        pose = seen.cam_to_world
-        return (
-            scene,
-            dataclasses.replace(seen, cam_to_world=jnp.concatenate([turn @ pose[:, :3], pose[:, 3:]], 1)),
-            light,
-        )
-    if way == "light":
-        return (
-            scene,
-            seen,
-            dataclasses.replace(light, tables=light.tables * (1 + t * np.float64(numbers(3, *light.tables.shape)))),
-        )
-    if way == "all points together":
-        return scene.replace(centre=scene.centre + t * along[0]), seen, light
-    if way == "size":
-        return scene.replace(scale=scene.scale * (1 + t)), seen, light
-    changed = {
-        "positions": lambda: {"position": surfels.position + 0.1 * t * along},
-        "normals": lambda: {"normal": surfels.normal + t * along * surfels.mask[:, None]},
-        "spacing": lambda: {"spacing": surfels.spacing * (1 + t)},
+    changes = {
         "base colour": lambda: {"base_color": surfels.base_color + 0.1 * t * along},
         "roughness": lambda: {"roughness": surfels.roughness + 0.1 * t * along[:, 0]},
         "metallic": lambda: {"metallic": surfels.metallic + 0.1 * t * along[:, 1]},
+        "positions": lambda: {"position": surfels.position + 0.1 * t * along},
+        "normals": lambda: {"normal": surfels.normal + t * along * surfels.mask[:, None]},
+        "spacing": lambda: {"spacing": surfels.spacing * (1 + t)},
+        "all points together": lambda: {"centre": scene.centre + t * along[0]},
+        "size": lambda: {"scale": scene.scale * (1 + t)},
+        "eye": lambda: {"cam_to_world": pose.at[:, 3].add(t * along[0])},
+        "turn": lambda: {"cam_to_world": jnp.concatenate([(jnp.eye(3) + t * POSE) @ pose[:, :3], pose[:, 3:]], 1)},
+        "light": lambda: {"tables": light.tables * (1 + t * np.float64(numbers(3, *light.tables.shape)))},
     }[way]()
-    return scene.replace(surfels=surfels.replace(**changed)), seen, light
+    (field,) = changes
+    if hasattr(surfels, field):
+        return scene.replace(surfels=surfels.replace(**changes)), seen, light
+    parts = [x.replace(**changes) if hasattr(x, field) else x for x in (scene, seen, light)]
+    return tuple(parts)
 
 
 WAYS = (

@@ -44,14 +44,10 @@ def projection(columns, points, near):
     fields |= {name: getattr(scene, name) for name in ("spacing", "centre", "scale")}
     rng = np.random.default_rng(5)
     weights = {name: rng.normal(size=values.shape) for name, values in sorted(fields.items())}
-    real = scene.surfels.mask
     total = jnp.zeros((), points.positions.dtype)
     for name, values in sorted(fields.items()):
-        kept = (
-            jnp.where(real.reshape(-1, *[1] * (values.ndim - 1)), values, 0)
-            if len(values.shape) and len(values) == SIZE
-            else values
-        )
+        of_points = values.shape[:1] == (SIZE,)
+        kept = jnp.where(scene.surfels.mask.reshape(-1, *[1] * (values.ndim - 1)), values, 0) if of_points else values
         total += jnp.sum(jnp.asarray(weights[name], values.dtype) * kept)
     return total, scene
 
