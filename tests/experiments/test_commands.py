@@ -30,6 +30,7 @@ from spnr_jax import cli, presets
 from spnr_jax.config import SurfelConfig
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.assets import Asset
+from spnr_jax.method import surfel_method
 from spnr_jax.scoring import evaluation
 from spnr_jax.training import weights
 
@@ -59,6 +60,7 @@ def _tiny(monkeypatch):
     monkeypatch.setattr(
         weights, "packaged_file", lambda name=weights.SHIPPED: fresh.get(name) or tiny_surfels.PACKAGED(name)
     )
+    monkeypatch.setattr(surfel_method, "densify_sparse", lambda variables, cloud: cloud)  # it takes long to trace
     monkeypatch.setattr(evaluation, "choose_radius", lambda *_: 1.5)
     monkeypatch.setattr(fig3, "mesh_of", lambda *_: Asset(parts=(ball(radius=tiny_dataset.RADIUS, rows=64),)))
 
