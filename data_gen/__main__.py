@@ -12,8 +12,7 @@ from typing import Annotated
 import tyro
 
 from data_gen.make.generate import generate
-from data_gen.plan.data_presets import PRESETS
-from data_gen.plan.tasks import GenerateConfig
+from data_gen.plan.tasks import PRESETS, GenerateConfig
 from data_gen.store.check import check
 from data_gen.store.show import ShowConfig, show
 from spnr_jax.errors import UserError, guard, split_debug

@@ -5,7 +5,7 @@ import sys
 
 from spnr_jax.errors import start_command
 
-PACKAGES = ("mitsuba", "dask", "distributed", "fsspec", "psutil")  # the extra `data`, as pyproject.toml names it
+PACKAGES = ("mitsuba",)  # the extra `data`, as pyproject.toml names it
 
 
 def main() -> None:

@@ -6,7 +6,6 @@ Errors of the user and of the disk are one line on stderr and exit code 2; Ctrl-
 import contextlib
 import importlib.util
 import io
-import json
 import os
 import re
 import sys
@@ -37,17 +36,11 @@ def main(arguments: list[str] | None = None) -> None:
     whole = arguments is None  # process
     arguments, debug = split_debug(sys.argv[1:] if arguments is None else arguments)
     code = guard(lambda: run(parse(arguments)), "spnr", debug)
-    # JAX would wait for the other processes, which wait for this one; of what it still compiles Python's end crashes
-    if (code == 2) if _one_of_several() else (code == STOPPED and whole):
+    if code == STOPPED and whole:  # Python's end crashes of what JAX still compiles
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(code)
     sys.exit(code)
-
-
-def _one_of_several() -> bool:
-    jax = sys.modules.get("jax")  # a mistyped option need not wait until it is imported
-    return jax is not None and jax.distributed.is_initialized() and jax.process_count() > 1
 
 
 def parse(arguments: list[str]) -> Command:
@@ -129,15 +122,10 @@ def run_train(command: Train) -> None:
     from spnr_jax.formats import data_sets
     from spnr_jax.training import trainer, weights
 
-    address = command.coordinator, command.num_processes, command.process_id
-    if command.distributed or address != (None, None, None):
-        placement.join(*address)
-    mesh = placement.device_mesh()
     dataset = data_sets.open_dataset(command.data)
     init = None if command.init is None else weights.read_trained(command.init)
-    trainer.train(command.config, dataset, command.run, command.schedule, mesh, init)
-    if placement.leads():
-        print(f"trained: {command.run} (score it with `spnr evaluate {command.data} {command.run}`)")
+    trainer.train(command.config, dataset, command.run, command.schedule, placement.device_mesh(), init)
+    print(f"trained: {command.run} (score it with `spnr evaluate {command.data} {command.run}`)")
 
 
 def run_evaluate(command: Evaluate) -> None:
@@ -185,44 +173,19 @@ def run_view(command: View) -> None:
 
 def run_export(command: Export) -> None:
     """`spnr export`."""
-    if command.splats is not None or command.mesh is not None:
-        from spnr_jax.tools import splat_export
+    if command.splats is None and command.mesh is None:
+        from spnr_jax.tools.export import export_network
 
-        asked, said = splat_export.splat_options(command, command.run, command.network), _make_note(command.run)
-        if command.mesh is not None:
-            splat_export.export_mesh(asked, command.mesh, said, partial(print, flush=True))
-        if command.splats is not None:
-            splat_export.export_splats(asked, command.splats, said, partial(print, flush=True))
-        return
-    from spnr_jax.formats.images import write_whole
-    from spnr_jax.method import model
-    from spnr_jax.methods import method_of
-    from spnr_jax.tools import export
-    from spnr_jax.training import weights
+        print(export_network(command))
+    else:
+        from spnr_jax.tools.share import export_object
 
-    trained, where = weights.read_trained(command.run), command.platforms
-    handle = model.Model(config=trained.config.model, variables=trained.variables)
-    weights.write_weights(command.out / "weights.npz", trained)
-    points, size, quality = command.num_points or 1024, command.resolution, command.quality
-    functions = {
-        "encode": export.export_encode(handle, num_points=points, platforms=where),
-        "render": export.export_render(
-            handle, resolution=size, quality=quality, reach=command.reach, num_points=points, platforms=where
-        ),
-    }
-    if method_of(handle.config).takes_light:
-        write_whole(command.out / "light.npz", export.room_light())
-    for name, content in functions.items():
-        write_whole(command.out / f"{name}.jax", content)
-        write_whole(command.out / f"{name}.stablehlo", export.stablehlo(content))
-    signatures = {name: export.signature(content) for name, content in functions.items()}
-    write_whole(command.out / "export.json", (json.dumps(signatures, indent=1) + "\n").encode())
-    print(f"wrote the weights, encode and render to {command.out} (export.json says what they take and give)")
+        export_object(command, _make_note(command.run), partial(print, flush=True))
 
 
 def run_share(command: Share) -> None:
     """`spnr share`."""
-    from spnr_jax.tools.splat_export import share
+    from spnr_jax.tools.share import share
 
     share(command, _make_note(command.cloud), partial(print, flush=True))
 

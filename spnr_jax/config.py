@@ -86,8 +86,6 @@ class RenderOptions:
 
     sampling: SamplingConfig | None = None
     """Samples per ray; None: as in training."""
-    rays_per_side: int = 1
-    """Rays along each side of a pixel, averaged."""
     block: int | None = None
     """Rays rendered at once, which bounds the memory; None: as many as suit a picture of the network."""
 

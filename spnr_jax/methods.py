@@ -56,15 +56,11 @@ class Method:
     render: Function = later("spnr_jax.method.inference:draw_each")
     """(variables, volume, views, lights, *, config, quality) -> iterator of `Rendering`s, one a view."""
     prepare: Function = later("spnr_jax.training.batching:prepare")
-    """(config, dataset, run, *, light, own) -> function of a step that gives the batches from there on."""
+    """(config, dataset, run, *, light) -> function of a step that gives the batches from there on."""
     loss: Function = later("spnr_jax.method.inference:loss")
     """(variables, batch, key, *, config) -> (value, `Outcome`); pure, differentiated by the first argument's params."""
     discriminator: Function | None = None
     """(config) -> Linen module (image, condition, mask) -> logits, if its loss may have one."""
-    export_encode: Function = later("spnr_jax.tools.volume_export:export_encode")
-    """(model, *, num_points) -> pure function of dicts of arrays, and the shapes that it takes."""
-    export_render: Function = later("spnr_jax.tools.volume_export:export_render")
-    """(model, *, num_points, size, quality, reach, plan) -> the same of a picture."""
     takes_light: bool = False
     """Whether pictures are drawn in any light; the others know the light of their training alone."""
     companions: tuple[str, ...] = ()
@@ -98,8 +94,6 @@ METHODS: dict[str, Method] = {
         render=later("spnr_jax.method.surfel_method:render"),
         prepare=later("spnr_jax.training.gbuffers:prepare"),
         loss=later("spnr_jax.training.gbuffers:loss"),
-        export_encode=later("spnr_jax.tools.surfel_export:export_encode"),
-        export_render=later("spnr_jax.tools.surfel_export:export_render"),
         takes_light=True,
         companions=("densifier",),
         label="Surfels",
@@ -123,18 +117,17 @@ class UnknownMethod(UserError):
 
 
 _included: dict[str, Path | str] = {}  # what `include` imported -> where that is
-_including: list[str] = []  # what it imports now
 
 
 def register(method: Method) -> None:
     """Adds a method and its presets; ValueError if another one has its name, or the name of a preset."""
-    name, source = method.config.method, _including[-1] if _including else method.config.__module__
+    name = method.config.method
     if name in METHODS:
         require(METHODS[name].config is method.config, f"there is a method {name} already; choose another name")
         return
     for preset in method.presets:
         require(preset.__name__ not in PRESETS, f"there is a preset {preset.__name__} already; choose another name")
-    METHODS[name] = dataclasses.replace(method, source=source)
+    METHODS[name] = dataclasses.replace(method, source=method.config.__module__)
     PRESETS.update({preset.__name__: preset for preset in method.presets})
 
 
@@ -144,17 +137,16 @@ def include(source: Path | str) -> None:
     place = Path(name).resolve() if name.endswith(".py") else name
     if place in _included.values():
         return
-    before = len(METHODS)
-    _including.append(name)
+    before = set(METHODS)
     try:
         with _working_folder():
             _import_file(place) if isinstance(place, Path) else importlib.import_module(place)
     except (ImportError, SyntaxError, OSError) as error:
         raise UserError(f"--methods {name}: it cannot be imported ({first_line(error)})") from None
-    finally:
-        _including.pop()
-    known = len(METHODS) > before or any(m.source.startswith(name) for m in METHODS.values())
-    require(known, f"--methods {name}: it registers no method; call spnr_jax.methods.register there")
+    known = METHODS.keys() - before or any(m.source.startswith(name) for m in METHODS.values())
+    require(bool(known), f"--methods {name}: it registers no method; call spnr_jax.methods.register there")
+    for method in METHODS.keys() - before:
+        METHODS[method] = dataclasses.replace(METHODS[method], source=name)
     _included[name] = place
 
 

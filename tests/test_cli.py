@@ -10,11 +10,11 @@ from functools import partial
 
 import numpy as np
 import pytest
-from support import command_line, tiny_dataset, tiny_untrained
+from support import command_line, tiny_dataset, tiny_surfels, tiny_untrained
 
 from spnr_jax import presets
-from spnr_jax.formats.cut import Cut
 from spnr_jax.surfels.sides import spiral
+from spnr_jax.tools import pictures
 
 cli = command_line.unchecked_cli()
 exit_code = partial(command_line.exit_code, cli)
@@ -65,16 +65,15 @@ REFUSED = [  # command, what its line says
     ("render noise.npz --run RUN", "noise.npz"),
     ("render cloud.doc --run RUN", "cloud.doc: unknown kind"),
     ("render point.xyz --run RUN", "holds 1 points in 1 place: no object can be drawn"),
-    ("render three.xyz --run RUN --out point.xyz", "point.xyz: Not a directory"),
+    ("render three.xyz --run RUN --out point.xyz", "point.xyz is a file, not a folder"),
     ("render three.xyz --run RUN --workers 2", "a single file"),
     ("render . --workers 0", "--workers: expected 1 or more, got 0"),
-    ("render . --workers 2 --cluster tcp://a:1", "--workers and --cluster: give one of them"),
     (f"{LIT} --elevation 91", "--elevation: expected -90 to 90, got 91"),
     (f"{LIT} --views -1", "--views: expected 0 or more, got -1"),
     (f"{LIT} --num-points 0", "--num-points: expected 1 or more, got 0"),
     (f"{LIT} --resolution 18", "--resolution must be a multiple of 4 of at least 16, got 18"),
     (f"{LIT} --clean very", "--clean"),
-    ("render ball.xyz --crop 7 7 7 8 8 8", "--crop 7 7 7 8 8 8: none of the 2,000 points, they lie in the box"),
+    ("render ball.xyz --crop -7 -7e-1 -.5 -6 8 8", "none of the 2,000 points, they lie in the box"),
     ("render ball.xyz --object 2", "--object 2: there is 1 cluster"),
     ("render ball.xyz --crop 0 1", "--crop"),
     (f"{LIT} --sun 30 95", "--sun: expected an azimuth and an elevation of -90 to 90 degrees"),
@@ -93,6 +92,7 @@ REFUSED = [  # command, what its line says
     ("export ball.xyz --up z", "--mesh"),
     ("export ball.xyz --mesh ball.xyz/out.glb", "a file, not a folder"),
     ("export nowhere.ply --splats out.ply", "nowhere.ply"),
+    ("export RUN", "a network of method paper cannot be exported; only surfels can"),
     ("share ball.xyz --out ball.xyz/page.html", "a file, not a folder"),
     ("share ball.xyz --out page.pdf", "page.pdf"),
     ("share ball.xyz --background light", "--background"),
@@ -161,14 +161,6 @@ def test_the_preset_chooses_the_network_whose_options_there_are():
     assert command.config == dataclasses.replace(tiny, model=dataclasses.replace(tiny.model, radius=0.2))
 
 
-@pytest.mark.parametrize("command", ["render", "view"])
-def test_scans_are_cleaned_and_cut_as_it_is_said(command):
-    said = ["--crop", "-1", "-1e-3", "-.5", "1", "2", "3", "--object", "largest", "--clean", "strong"]
-    parsed = cli.parse([command, "a.ply", *said])
-    assert parsed.cut == Cut(crop=(-1.0, -1e-3, -0.5, 1.0, 2.0, 3.0), object="largest")
-    assert parsed.clean == "strong"
-
-
 def test_help_explains_the_fields_of_a_config_and_loads_nothing_heavy():
     program = (
         "import sys; from spnr_jax.cli import main\n"
@@ -210,6 +202,20 @@ def test_a_cloud_of_three_points_renders(capsys, tmp_path, run):
     assert f"wrote {out / 'one_turntable.gif'}" in captured.out
     for name in ("base_color", "roughness", "metallic"):
         assert f"one.xyz: no {name} in the file" in captured.err
+
+
+@pytest.mark.ci
+def test_a_sparse_cloud_is_drawn_with_learned_points_unless_they_are_declined(tmp_path, monkeypatch, capsys):
+    drawn = []
+    monkeypatch.setattr(pictures, "draw_all", lambda ready, *_: drawn.append(ready.volume.scene.surfels) or iter([]))
+    np.savetxt(tmp_path / "ball.xyz", spiral(40))
+    for option in ((), ("--no-densify",)):
+        arguments = ("render", tmp_path / "ball.xyz", "--run", tiny_surfels.run(), "--out", tmp_path, "--up", "y")
+        assert exit_code(*arguments, *option) == 0, capsys.readouterr().err
+    counts = [[int(np.sum(np.asarray(s.mask & (s.invented > low)))) for low in (-1, 0)] for s in drawn]
+    assert counts[0][0] == counts[0][1] + 40
+    assert counts[0][1] > 20
+    assert counts[1] == [40, 0]
 
 
 @pytest.mark.ci

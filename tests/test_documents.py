@@ -19,6 +19,7 @@ from spnr_jax import methods
 from spnr_jax.formats import data_sets
 from spnr_jax.presets import PRESETS
 from spnr_jax.tools import export
+from spnr_jax.tools.commands import Export
 from spnr_jax.training import trainer, weights
 
 ROOT = Path(__file__).parents[1]
@@ -80,11 +81,7 @@ def test_the_examples_of_the_api_run_in_their_order(workplace):
 
 @pytest.mark.ci
 def test_the_example_without_this_package_runs_on_what_the_command_writes(workplace):
-    model = spnr_jax.load(tiny_surfels.run())
-    (workplace / "exported").mkdir()
-    (workplace / "exported" / "encode.jax").write_bytes(export.export_encode(model, num_points=1024))
-    (workplace / "exported" / "render.jax").write_bytes(export.export_render(model, resolution=128))
-    (workplace / "exported" / "light.npz").write_bytes(export.room_light())
+    export.export_network(Export(run=tiny_surfels.run(), num_points=1024, resolution=128))
     names = execute(DOCS / "exporting.md")
     assert "spnr_jax" not in names
     assert names["picture"]["acc"].max() > 0.5
@@ -151,7 +148,7 @@ def resolve(name):
 
 def test_the_extras_that_the_documents_name_exist():
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
-    assert {"data", "viewer", "baselines", "cluster", "bench", "cuda"} <= extras.keys()
+    assert {"data", "viewer", "baselines", "bench", "cuda"} <= extras.keys()
     for page in (*PAGES, ROOT / "README.md", *(ROOT / "spnr_jax").rglob("*.py"), *(ROOT / "data_gen").rglob("*.py")):
         for names in re.findall(r"spnr-jax\[([\w,]+)\]", page.read_text()):
             assert set(names.split(",")) <= extras.keys(), page

@@ -1,4 +1,4 @@
-"""A bug of ours is told apart from a broken file, and --debug is taken from any place of a command line."""
+"""A bug of ours is told apart from a broken file, and a stop is obeyed whatever becomes of it."""
 
 import json
 import os
@@ -50,15 +50,6 @@ def test_errors_of_many_lines_become_one():
     assert errors.one_line(ValueError("this\n  and\nthat")) == "this and that"
     assert errors.one_line(OSError(28, "No space left on device")) == "disk: No space left on device"
     assert errors.one_line(OSError(13, "Permission denied", "a/b")) == "a/b: Permission denied"
-
-
-def test_debug_is_an_option_at_any_place_or_a_variable(monkeypatch):
-    monkeypatch.delenv("SPNR_DEBUG", raising=False)
-    assert errors.split_debug(["render", "a.ply"]) == (["render", "a.ply"], False)
-    assert errors.split_debug(["--debug", "render", "a.ply"]) == (["render", "a.ply"], True)
-    for value, shown in (("1", True), ("0", False), ("", False)):
-        monkeypatch.setenv("SPNR_DEBUG", value)
-        assert errors.split_debug([]) == ([], shown)
 
 
 ODD_NAME = """

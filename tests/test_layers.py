@@ -12,8 +12,8 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("spnr_jax", "data_gen", "experiments")
 SOURCES = [path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))]
-HEAVY = {"mitsuba", "pymeshlab", "trimesh", "viser", "torch", "matplotlib", "skimage", "dask", "distributed"}
-HEAVY |= {"fsspec", "tensorboardX", "laspy", "imageio_ffmpeg", "DracoPy", "meshoptimizer"}
+HEAVY = {"mitsuba", "pymeshlab", "trimesh", "viser", "torch", "matplotlib", "skimage"}
+HEAVY |= {"tensorboardX", "laspy", "imageio_ffmpeg", "DracoPy", "meshoptimizer"}
 PURE = ("kernels", "surfels", "nn", "method")
 KERNELS = ("cameras", "sampling", "compositing", "voxels", "losses", "metrics")  # of the specification
 

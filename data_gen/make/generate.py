@@ -1,4 +1,4 @@
-"""A data set from its plan: what is missing is made by workers (devices/cluster.py), then the lists are written.
+"""A data set from its plan: what is missing is made by workers (devices/workers.py), then the lists are written.
 
 Products are made first, split, and then the colour variants of those that train (plan/splits.py). A run may stop
 anywhere: finished objects stay, and the same command makes the others, to the same bytes. dataset.json
@@ -11,31 +11,31 @@ import json
 import os
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict, fields, replace
+from contextlib import closing
+from dataclasses import asdict
+from pathlib import Path
 
 from tqdm import tqdm
 
 from data_gen import procedural
 from data_gen.make.objects import Workbench, make_and_write
-from data_gen.plan.data_presets import PAPER_COUNTS
-from data_gen.plan.tasks import GenerateConfig, Plan, Task, check_options, plan_data_set, source_of
-from data_gen.render import light, views
+from data_gen.plan.tasks import PAPER_COUNTS, GenerateConfig, Plan, Task, check_options, plan_data_set, source_of
+from data_gen.render import light
 from data_gen.render.variant import choose_variant, mitsuba_module
-from data_gen.store import layout, storage
+from data_gen.store import layout
 from data_gen.store.check import checksum_of
-from data_gen.store.storage import Location
-from spnr_jax.devices.cluster import Died, connect, run_tasks
+from spnr_jax.devices.workers import run_tasks
 from spnr_jax.errors import UserError
-from spnr_jax.formats.images import read_envmap
+from spnr_jax.formats.images import read_envmap, write_whole
 from spnr_jax.surfels.skies import indoor_envmap
 
 # options that say where or how fast, or whose content is described instead
-PLACES = ("out", "workers", "cluster", "root", "meshes", "objects", "envmap", "lights", "test_list", "split_file")
+PLACES = ("out", "workers", "root", "meshes", "objects", "envmap", "lights", "test_list", "split_file")
 
 
 def describe(plan: Plan, variant: str) -> dict:
     """The content of dataset.json: all that decides the bytes, nothing of where or how fast."""
-    config = plan.config
+    config, (source, category) = plan.config, source_of(plan.config)
     settings = {name: value for name, value in asdict(config).items() if name not in PLACES}
     for name, first in (("reshape_variants", False), ("spread", "random")):
         if settings[name] == first:  # as data sets have it that were described before there was the choice
@@ -47,7 +47,9 @@ def describe(plan: Plan, variant: str) -> dict:
         "settings": {
             **settings,
             "categories": sorted(set(config.categories or procedural.CATEGORIES)),
-            "source": source_of(config),
+            "source": source,
+            "category": category,
+            "visibility": "face",
             "objects": len(plan.tasks) - len(mesh_ids),
             "mesh_files": {"count": len(mesh_ids), "ids_sha256": text_checksum(mesh_ids)},
             "listed_splits": listed,
@@ -112,18 +114,18 @@ def generate(config: GenerateConfig) -> None:
 
 def make_missing(config: GenerateConfig, tasks: Sequence[Task], settings: dict) -> dict[str, str]:
     """Make the objects that are not there yet; return the reason for each that was left out, by id."""
-    done = storage.list_completed(config.out)
+    done = layout.list_completed(config.out)
     missing = [task for task in tasks if task.object_id not in done]
     if not missing:
         return {}
     variant = settings["settings"]["variant"]
     lights = make_lights(config, variant)
     refuse_other_content(config.out, settings)  # another run may have begun there meanwhile
-    layout.write_text(f"{config.out}/dataset.json", layout.json_text(settings))
-    storage.remove_unfinished(config.out)
+    write_whole(config.out / "dataset.json", layout.json_text(settings).encode())
+    layout.remove_unfinished(config.out)
     rejected = make_objects(config, missing, lights, variant)
     # the process of one that is there died here, but another run has made it
-    return {name: reason for name, reason in rejected.items() if not storage.has_object(config.out, name)}
+    return {name: reason for name, reason in rejected.items() if not layout.has_object(config.out, name)}
 
 
 def make_lights(config: GenerateConfig, variant: str) -> light.Lights:
@@ -134,51 +136,36 @@ def make_lights(config: GenerateConfig, variant: str) -> light.Lights:
     return light.Lights(light.scale_to_white(read_envmap(config.envmap) if config.envmap else indoor_envmap()))
 
 
-def refuse_other_content(out: Location, settings: dict) -> None:
+def refuse_other_content(out: Path, settings: dict) -> None:
     """ValueError if the place holds another data set, or anything else."""
-    described = storage.read_file(f"{out}/dataset.json")
-    if described is not None:
+    if (out / "dataset.json").is_file():
         try:
-            before = json.loads(described)
+            before = json.loads((out / "dataset.json").read_bytes())
         except ValueError:
             raise UserError(f"{out}/dataset.json is damaged: remove {out}, or choose another folder") from None
         if before != settings:
             changed = ", ".join(differences(before, settings))
             raise UserError(f"{out} holds a data set with other settings ({changed}): choose another folder")
-    elif not storage.is_empty(out):
+    elif out.is_dir() and not all(path.name.startswith(layout.UNFINISHED) for path in out.iterdir()):
         raise UserError(f"{out} is not empty and holds no data set: choose another folder")
 
 
 def make_objects(config: GenerateConfig, tasks: Sequence[Task], lights: light.Lights, variant: str) -> dict[str, str]:
     """Make the objects on the workers; return the reason for each that was left out, by id."""
-    bench = Workbench(
-        out=storage.absolute(config.out),
-        lights=lights,
-        view=views.ViewConfig(**{field.name: getattr(config, field.name) for field in fields(views.ViewConfig)}),
-        num_points=config.points,
-        seed=config.seed,
-        variant=variant,
-        spread=config.spread,
-    )
-    anywhere = (
-        replace(task, path=task.path and task.path.absolute(), folder=task.folder and task.folder.absolute())
-        for task in tasks
-    )
-    rejected = {}
+    bench = Workbench(config=config, lights=lights, variant=variant)
+    rejected, workers = {}, config.workers or os.cpu_count() or 1
     try:
         with (
-            connect(config.cluster, min(config.workers or os.cpu_count() or 1, len(tasks))) as client,
+            closing(run_tasks(make_and_write, bench, tasks, workers)) as results,
             tqdm(total=len(tasks), unit="object", dynamic_ncols=True) as bar,
         ):
-            for task, reason in run_tasks(client, make_and_write, bench, anywhere):
-                if isinstance(reason, Died):
-                    reason = f"the process that made it died {reason.times} times; out of memory?"
+            for task, reason in results:
                 if reason is not None:
                     rejected[task.object_id] = reason
                     tqdm.write(f"left out {task.shown_path or task.object_id}: {reason}", file=sys.stderr)
                 bar.update()
     finally:
-        storage.remove_unfinished(config.out)
+        layout.remove_unfinished(config.out)
     return rejected
 
 
@@ -191,11 +178,10 @@ def finish(
         for task in tasks
         if task.object_id in rejected
     ]
-    layout.write_text(f"{config.out}/rejected.jsonl", "".join(row + "\n" for row in rows))
+    write_whole(config.out / "rejected.jsonl", "".join(row + "\n" for row in rows).encode())
     for split in layout.SPLITS:
-        layout.write_text(
-            f"{config.out}/splits/{split}.txt", "".join(f"{object_id}\n" for object_id in split_ids[split])
-        )
+        lines = "".join(f"{object_id}\n" for object_id in split_ids[split])
+        write_whole(config.out / "splits" / f"{split}.txt", lines.encode())
     counts = ", ".join(f"{len(split_ids[split])} {split}" for split in layout.SPLITS)
     made = len(tasks) - len(rows)
     paper = "; the paper has {} train, {} test".format(*PAPER_COUNTS[config.preset]) if config.preset else ""

@@ -7,20 +7,18 @@ once more and compared: a file or generator that changed is refused, since its d
 """
 
 import hashlib
-import os
-import socket
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
 
 from data_gen import procedural
 from data_gen.make import augmentation
-from data_gen.plan.tasks import Task
+from data_gen.plan.tasks import GenerateConfig, Task
 from data_gen.render import views
 from data_gen.render.light import Lights
-from data_gen.render.variant import LLVM, choose_variant, mitsuba_module
-from data_gen.store import layout, storage
+from data_gen.render.variant import mitsuba_module
+from data_gen.store import layout
 from spnr_jax.errors import UserError
 from spnr_jax.formats import meshes, surface_points
 from spnr_jax.formats.assets import Asset, Material, RejectedAsset
@@ -30,57 +28,43 @@ from spnr_jax.surfels.lighting import HEIGHT, resample
 
 @dataclass(frozen=True, kw_only=True)
 class Workbench:
-    """What a worker needs for any object of the data set; `out` is a URL or an absolute path."""
+    """What a worker needs for any object of the data set."""
 
-    out: str
+    config: GenerateConfig
     lights: Lights
-    view: views.ViewConfig
-    num_points: int
-    seed: int
     variant: str
-    spread: surface_points.Spread = "random"
 
 
 def make_and_write(bench: Workbench, task: Task) -> str | None:
     """Make one object's folder; return None, or the reason why it is left out.
 
-    What is wrong with the worker and not with the object is raised: errors of the disk, a mesh file it does not see.
+    What is wrong with the disk and not with the object is raised.
     """
-    if storage.has_object(bench.out, task.object_id):  # another run on the same data set was faster
+    if layout.has_object(bench.config.out, task.object_id):  # another run on the same data set was faster
         return None
-    if task.path and not task.path.exists():
-        raise UserError(f"{task.path}: worker {socket.gethostname()} does not see this file; mount it there")
-    prepare_renderer(bench.variant)
+    mitsuba_module(bench.variant)
     try:
         record = make_record(bench, task)
     except RejectedAsset as error:
         return str(error)
     except Exception as error:  # whatever is wrong with one object must not stop the others; its row says what it was
         return f"unexpected {type(error).__name__}: {error}".splitlines()[0]
-    layout.write_object(bench.out, task.object_id, record)
+    layout.write_object(bench.config.out, task.object_id, record)
     return None
-
-
-def prepare_renderer(variant: str) -> None:
-    """Load Mitsuba for this thread; ValueError if the variant that the run chose does not work on this machine."""
-    if variant == LLVM and "DRJIT_LIBLLVM_PATH" not in os.environ:  # a machine other than the one that chose
-        choose_variant(variant)
-    mitsuba_module(variant)
 
 
 def make_record(bench: Workbench, task: Task) -> layout.ObjectRecord:
     """One object, rendered: asset, points, views, condition images."""
-    seeds = object_seeds(bench.seed, task.object_id)
-    asset, details = make_asset(task, bench.seed)
-    surface = surface_points.sample_surface(asset, bench.num_points, seeds["points"], bench.spread)
-    cam_to_world = views.random_viewpoints(
-        bench.view.views, bench.view.distance, np.random.default_rng(seeds["viewpoints"])
-    )
-    maps = list(bench.lights.of_views(bench.view.views, seeds["noise"]))
-    images, conditions = views.render_views(asset, surface, cam_to_world, maps, bench.view, seeds["noise"])
+    config, seeds = bench.config, object_seeds(bench.config.seed, task.object_id)
+    view = views.ViewConfig(**{field.name: getattr(config, field.name) for field in fields(views.ViewConfig)})
+    asset, details = make_asset(task, config.seed)
+    surface = surface_points.sample_surface(asset, config.points, seeds["points"], config.spread)
+    cam_to_world = views.random_viewpoints(view.views, view.distance, np.random.default_rng(seeds["viewpoints"]))
+    maps = list(bench.lights.of_views(view.views, seeds["noise"]))
+    images, conditions = views.render_views(asset, surface, cam_to_world, maps, view, seeds["noise"])
     return layout.ObjectRecord(
         points=layout.pack_points(surface),
-        transforms=layout.nerf_transforms(cam_to_world, bench.view.resolution, bench.view.fov, bench.view.focal_length),
+        transforms=layout.nerf_transforms(cam_to_world, view.resolution, view.fov, view.focal_length),
         images=images,
         conditions=conditions,
         lights=None if bench.lights.shared is not None else np.stack([resample(x, HEIGHT) for x in maps]),

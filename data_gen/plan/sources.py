@@ -24,7 +24,7 @@ import re
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal
 
 from spnr_jax.errors import UserError
 
@@ -49,14 +49,12 @@ def describe_folder(folder: Path, most: int = 5) -> str:
 
 
 Category = Literal["car", "plane", "chair"]
-SYNSETS: dict[str, str] = {"car": "02958343", "plane": "02691156", "chair": "03001627"}  # WordNet 3.0
+SYNSETS: dict[Category, str] = {"car": "02958343", "plane": "02691156", "chair": "03001627"}  # WordNet 3.0
 MESHES = ("models/model_normalized.obj", "model.obj")  # v2, v1
 
 
-def find_objects(root: Path, category: str) -> list[Listed]:
+def find_objects(root: Path, category: Category) -> list[Listed]:
     """Every object of a class below a root (the folder that holds the synsets, or the synset), sorted by id."""
-    if category not in SYNSETS:
-        raise UserError(f"--category {category}: expected one of {', '.join(get_args(Category))}")
     synset = SYNSETS[category]
     folder = root if root.resolve().name == synset and root.is_dir() else root / synset
     objects = []

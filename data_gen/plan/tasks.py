@@ -7,18 +7,18 @@ when it is known which can be rendered at all.
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import count, islice
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import tyro
 
 from data_gen import procedural
 from data_gen.plan import sources, splits
 from data_gen.plan.sources import Category
-from data_gen.render.views import Visibility
 from spnr_jax.errors import UserError, at_least
 from spnr_jax.formats import meshes
 from spnr_jax.formats.surface_points import Spread
@@ -28,28 +28,25 @@ SAFE_ID = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]*")
 
 Source = Literal["procedural", "meshes", "abo", "shapenet"]
 Preset = Literal["abo", "shapenet_car", "shapenet_plane", "shapenet_chair"]
+CATEGORY_OF: dict[str, Category] = {"shapenet_car": "car", "shapenet_plane": "plane", "shapenet_chair": "chair"}
 
 
 @dataclass(frozen=True, kw_only=True)
 class GenerateConfig:
     """Generate a data set of rendered objects: procedural ones, mesh files, or a data set of others."""
 
-    out: Annotated[str | Path, tyro.conf.Positional, tyro.conf.arg(metavar="PATH|URL")]
-    """Folder of the data set, or its URL (s3://..., as fsspec opens it). An unfinished run there is completed."""
+    out: tyro.conf.Positional[Path]
+    """Folder of the data set. An unfinished run there is completed."""
     preset: Preset | None = None
     """Settings of the paper for one of its data sets: defaults of the other options, which --help then shows."""
-    source: Source | None = None
-    """Where the objects come from (default: meshes if --meshes is given, else procedural)."""
     root: Path | None = None
-    """Folder of the source: of mesh files, of the ABO 3D download (holds 3dmodels), of ShapeNetCore v2 or v1."""
-    category: Category | None = None
-    """Class of ShapeNet objects."""
+    """Folder of the preset's meshes: the ABO 3D download (holds 3dmodels), or ShapeNetCore v2 or v1."""
     objects: int | None = None
     """Number of procedural objects (default: 200, or 0 if there are others)."""
     categories: tuple[str, ...] = ()
     """Categories of procedural objects (default: all)."""
     meshes: Path | None = None
-    """Folder of .glb, .gltf, .obj and .ply files: short for --source meshes --root."""
+    """Folder of .glb, .gltf, .obj and .ply files."""
     colour_variants: int = 0
     """Variants of each training object with its base colours rotated in RGB space; test objects have none."""
     reshape_variants: bool = False
@@ -79,8 +76,6 @@ class GenerateConfig:
     """Field of view in degrees."""
     distance: float = 3.0
     """Distance of the cameras from the object's centre; the object fits into the unit sphere."""
-    visibility: Visibility = "face"
-    """Visible points: all on a face that a camera ray hits, or each point that is not occluded."""
     visibility_grid: int = 4
     """Rays per pixel side that look for visible faces."""
     envmap: Path | None = None
@@ -91,8 +86,6 @@ class GenerateConfig:
     """Seed of shapes, points, viewpoints, noise and splits."""
     workers: int | None = None
     """Local processes that render (default: one per CPU core)."""
-    cluster: str | None = None
-    """Address of a Dask scheduler whose workers render; they must see the mesh files and OUT under the same paths."""
     val_fraction: float = 0.05
     """Share of the objects that goes to the validation split."""
     test_fraction: float = 0.1
@@ -174,24 +167,23 @@ def check_options(config: GenerateConfig) -> None:
 
 def check_source(config: GenerateConfig) -> None:
     """ValueError, naming the option, for options that do not say which objects are meant."""
-    source = source_of(config)
-    if config.meshes and (config.root or source != "meshes"):
-        raise UserError(f"--meshes {config.meshes}: not together with --root or --source {source}; give one of them")
-    if source == "procedural" and config.root:
-        raise UserError(f"--root {config.root}: give --source meshes, abo or shapenet with it")
-    if source != "procedural" and not mesh_root(config):
-        raise UserError(f"--source {source}: give --root, the folder that holds it")
-    if source == "shapenet" and not config.category:
-        raise UserError(f"--source shapenet: give --category, one of {', '.join(sources.SYNSETS)}")
-    if source != "shapenet" and config.category:
-        raise UserError(f"--category {config.category}: only with --source shapenet; --categories chooses procedural")
+    if config.meshes and config.preset:
+        raise UserError(f"--meshes {config.meshes}: not together with --preset {config.preset}; give one of them")
+    if config.root and not config.preset:
+        raise UserError(f"--root {config.root}: only with --preset; --meshes takes a folder of mesh files")
+    if config.preset and not config.root:
+        raise UserError(f"--preset {config.preset}: give --root, the folder that holds its meshes")
     if config.split_file and config.test_list:
         raise UserError(f"--test-list {config.test_list}: not together with --split-file; give one of them")
 
 
-def source_of(config: GenerateConfig) -> Source:
-    """Where the objects come from."""
-    return config.source or ("meshes" if config.meshes else "procedural")
+def source_of(config: GenerateConfig) -> tuple[Source, Category | None]:
+    """Where the objects come from, and the class of ShapeNet."""
+    if config.preset == "abo":
+        return "abo", None
+    if config.preset:
+        return "shapenet", CATEGORY_OF[config.preset]
+    return "meshes" if config.meshes else "procedural", None
 
 
 def mesh_root(config: GenerateConfig) -> Path | None:
@@ -221,12 +213,12 @@ def plan_objects(config: GenerateConfig) -> list[Task]:
 
 def mesh_tasks(config: GenerateConfig, root: Path) -> list[Task]:
     """The objects of the source that are files, in any order."""
-    if source_of(config) == "meshes":
+    source, category = source_of(config)
+    if source == "meshes":
         found = meshes.find_meshes(root)
         return [Task(object_id=name, path=path, shown_path=show_path(path, root)) for name, path in found]
-    listed = sources.find_objects(root, config.category) if config.category else sources.find_products(root)
-    category = config.category or ""
-    return [Task(**vars(x), category=category, shown_path=show_path(x.path, root)) for x in listed]
+    listed = sources.find_objects(root, category) if category else sources.find_products(root)
+    return [Task(**vars(x), category=category or "", shown_path=show_path(x.path, root)) for x in listed]
 
 
 def show_path(path: Path, root: Path) -> str:
@@ -259,5 +251,44 @@ def read_listed(config: GenerateConfig, known: set[str]) -> splits.Listed:
         return splits.read_test_list(config.test_list, known)
     if not config.split_file:
         return {}
-    synset = sources.SYNSETS[config.category] if config.category else None
-    return splits.read_split_file(config.split_file, known, synset)
+    category = source_of(config)[1]
+    return splits.read_split_file(config.split_file, known, sources.SYNSETS[category] if category else None)
+
+
+# --- the paper's data sets --------------------------------------------------------------------------------------------
+
+# Image size, views and test objects are the paper's; samples per pixel and the number of validation objects (none: the
+# paper names none) are choices. Where a folder holds another number of usable objects than the paper used, the test
+# split keeps its size and the rest train; `--train-objects` caps them.
+
+# (training objects with their colour variants, test objects) of the paper
+PAPER_COUNTS: dict[Preset, tuple[int, int]] = {
+    "abo": (16161, 200),
+    "shapenet_car": (1127, 128),
+    "shapenet_plane": (3627, 406),
+    "shapenet_chair": (4882, 105),
+}
+# 128 samples: 40 dB against 4096 over the object's own pixels (median; docs/lab/making_data.md)
+COMMON = GenerateConfig(out=tyro.MISSING, val_fraction=0.0, views=10, spp=128)
+
+
+def abo(out: Path) -> GenerateConfig:
+    """Amazon Berkeley Objects at 128 x 128.
+
+    Of 7,953 products 200 test and the others train, with as many colour variants of theirs, drawn by the seed from
+    five each, as make 16,161. (All five of each would be 46,518; how the paper came to 16,161 it does not say.)
+    """
+    train, test = PAPER_COUNTS["abo"]
+    made = replace(COMMON, out=out, preset="abo", colour_variants=5, resolution=128)
+    return replace(made, train_objects=train, test_objects=test)
+
+
+def shapenet(out: Path, preset: Preset) -> GenerateConfig:
+    """A class of ShapeNetCore at 200 x 200, without colour variants."""
+    return replace(COMMON, out=out, preset=preset, test_objects=PAPER_COUNTS[preset][1], resolution=200)
+
+
+PRESETS: dict[str, Callable[[Path], GenerateConfig]] = {
+    "abo": abo,
+    **{name: partial(shapenet, preset=name) for name in PAPER_COUNTS if name != "abo"},
+}

@@ -8,9 +8,8 @@ the point sampler reads, so the picture and the points cannot disagree about a c
 sides, whatever its file says, and keeps its one normal. Roughness and metallic may also be one value for each vertex of
 their part, (vertices,), as a reconstructed surface has them; base colours of vertices are the part's `colors`.
 
-Which points a picture sees (`visibility`): "face" is the paper's rule, all points on a face that any primary ray of the
-camera hits; a point on such a face counts even where another part hides it. "point" tests each point by itself, with
-one ray to the camera.
+Which points a picture sees is the paper's rule: all points on a face that any primary ray of the camera hits; a point
+on such a face counts even where another part hides it.
 
 True depth (`caster`) is how far rays go until they meet the mesh. Distances are along the rays, whose directions
 have unit length (not the camera's z), in the units of the asset: those of a normalised object are the units of
@@ -20,7 +19,7 @@ have unit length (not the camera's z), in the units of the asset: those of a nor
 import importlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -29,9 +28,6 @@ from spnr_jax.formats.assets import Asset, Material, Part, RejectedAsset
 from spnr_jax.formats.data_sets import on_white
 
 POLE_COSINE = 0.999  # nearer to the y axis than this, z takes the part of "up"
-SURFACE_MARGIN = 1e-4  # a ray to the camera starts this far from its point: float32 places a point to about 1e-7
-
-Visibility = Literal["face", "point"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,7 +40,6 @@ class ViewConfig:
     distance: float = 3.0  # from the origin, in units of the normalised object
     spp: int = 64  # samples per pixel
     max_depth: int = 6  # path segments: light - object - object - camera is 3
-    visibility: Visibility = "face"
     visibility_grid: int = 4  # rays per pixel side that look for visible faces
 
     @property
@@ -223,13 +218,6 @@ def render_view(scene: Scene, cam_to_world: np.ndarray, config: ViewConfig, seed
     return np.array(image, dtype=np.float32)
 
 
-def visible_points(scene: Scene, surface, cam_to_world: np.ndarray, config: ViewConfig, seed: int) -> np.ndarray:
-    """Which `SurfacePoints` the camera sees, (points,) bool, by the config's rule; see the header."""
-    if config.visibility == "point":
-        return find_unoccluded(scene, surface.positions, cam_to_world[:3, 3])
-    return np.isin(surface.face, visible_faces(scene, cam_to_world, config, seed))
-
-
 def visible_faces(scene: Scene, cam_to_world: np.ndarray, config: ViewConfig, seed: int) -> np.ndarray:
     """The sorted global numbers of the faces that the camera's primary rays hit, one ray per cell of a grid."""
     mi = mitsuba_module()
@@ -238,21 +226,6 @@ def visible_faces(scene: Scene, cam_to_world: np.ndarray, config: ViewConfig, se
     cells = np.array(mi.render(scene.handle, sensor=sensor, integrator=integrator, spp=1, seed=seed))
     face, shape = cells.reshape(-1, cells.shape[-1]).astype(np.int64)[:, :2].T  # shape 0 is a miss
     return np.unique(np.concatenate([first + face[shape == number] for number, first in scene.first_face.items()]))
-
-
-def find_unoccluded(scene: Scene, positions: np.ndarray, eye: np.ndarray) -> np.ndarray:
-    """Which surface points (points, 3) nothing hides from the eye (3,), (points,) bool; one ray for each."""
-    mi = mitsuba_module()
-    towards = np.asarray(eye, np.float64) - positions
-    distance = np.linalg.norm(towards, axis=-1)
-    directions = towards / distance[:, None]
-    rays = zip(positions + SURFACE_MARGIN * directions, directions, distance - SURFACE_MARGIN, strict=True)
-    if mi.variant().startswith("scalar"):
-        hidden = [scene.handle.ray_test(mi.Ray3f(o=o, d=d, maxt=t, time=0, wavelengths=[])) for o, d, t in rays]
-    else:
-        o, d, t = (np.array(column, np.float32).T for column in zip(*rays, strict=True))
-        hidden = scene.handle.ray_test(mi.Ray3f(o=o, d=d, maxt=t, time=0, wavelengths=[]))
-    return ~np.array(hidden, dtype=bool)
 
 
 def straight_srgb(radiance: np.ndarray) -> np.ndarray:
@@ -292,7 +265,7 @@ def render_views(
     for view, pose in enumerate(cam_to_world):
         view_seed = (seed + view) % 2**32
         image = straight_srgb(render_view(scene, pose, config, view_seed))
-        seen = visible_points(scene, surface, pose, config, view_seed)
+        seen = np.isin(surface.face, visible_faces(scene, pose, config, view_seed))
         images.append(image)
         conditions.append(condition_image(image, project(pose, surface.positions[seen].astype(np.float64), config)))
         scene = next(scenes, scene)

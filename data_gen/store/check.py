@@ -1,15 +1,17 @@
 """Whether a data set is sound: every file readable and as it was written, its parts in agreement with each other."""
 
 import hashlib
+import json
 from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
-from data_gen.store import layout, storage
+from data_gen.store import layout
 from spnr_jax.errors import UserError
-from spnr_jax.formats.npz import read_arrays
-from spnr_jax.surfels.lighting import HEIGHT, WIDTH
+from spnr_jax.formats import data_sets
+from spnr_jax.formats.data_sets import Dataset, ObjectData
+from spnr_jax.kernels.records import Camera, PointCloud
 
 COUNTS = ("views", "resolution", "points")  # settings that the files of every object are compared with
 LEAST_AGREEMENT = 0.9  # of the visible points, on opaque pixels; the rest sit on silhouettes, where pixels are cut
@@ -21,29 +23,26 @@ def check(dataset: Path) -> bool:
     settings = description.get("settings")
     if not isinstance(settings, dict) or not all(isinstance(settings.get(name), int) for name in COUNTS):
         raise UserError(f"{dataset / 'dataset.json'}: expected settings {', '.join(COUNTS)}; generate it again")
-    described = description.get("environment_map")
-    own_lights = isinstance(described, dict) and "kinds" in described
-    object_ids = sorted(storage.list_completed(dataset))
+    data = Dataset(folder=dataset, settings=description, splits={})
+    object_ids = sorted(layout.list_completed(dataset))
     splits, faults = read_splits(dataset)
     faults += split_faults(splits, set(object_ids)) if not faults else []
     agreements, covered, num_views = [], [], 0
-    details = {}
+    details: dict[str, dict] = {}
     for object_id in object_ids:
-        folder = dataset / "objects" / object_id
         try:
-            record = layout.read_object(folder)
-            found = object_faults(folder, record, settings, own_lights)
+            item, details[object_id] = data_sets.read_object(data, object_id), read_details(dataset, object_id)
+            found = object_faults(data, item, details[object_id])
         except (ValueError, OSError) as error:
             faults.append(f"{object_id}: {type(error).__name__}: {error}")
             continue
-        agreement = points_on_object(record)
+        agreement = points_on_object(item)
         if agreement < LEAST_AGREEMENT:
             found.append(f"only {agreement:.0%} of the visible points fall on opaque pixels")
         faults += [f"{object_id}: {fault}" for fault in found]
         agreements.append(agreement)
-        covered.append((record.images[..., 3] > 0).mean())
-        num_views += len(record.images)
-        details[object_id] = record.details
+        covered.append((item.images[..., 3] > 0).mean())
+        num_views += len(item.images)
     faults += variant_faults(splits, details)
     print_table(dataset, object_ids, splits, num_views, agreements, covered, faults)
     return not faults
@@ -54,11 +53,27 @@ def read_description(dataset: Path) -> dict:
     path = dataset / "dataset.json"
     if not path.is_file():
         raise UserError(f"{dataset} holds no data set: {path.name} is missing; make one with spnr-data generate")
-    description = layout.read_document(path)
+    description = read_document(path)
     if description.get("schema_version") != layout.SCHEMA_VERSION:
         found = description.get("schema_version")
         raise UserError(f"{path}: expected schema version {layout.SCHEMA_VERSION}, got {found}; generate it again")
     return description
+
+
+def read_details(dataset: Path, object_id: str) -> dict:
+    """The dict of an object.json."""
+    return read_document(dataset / "objects" / object_id / layout.LAST_FILE)
+
+
+def read_document(path: Path) -> dict:
+    """The dict of a JSON file; ValueError or OSError if there is none."""
+    try:
+        document = json.loads(path.read_text())
+    except (ValueError, RecursionError) as error:
+        raise UserError(f"{path}: not readable ({error}); generate it again") from None
+    if not isinstance(document, dict):
+        raise UserError(f"{path}: expected named entries, found {type(document).__name__}; generate it again")
+    return document
 
 
 def read_splits(dataset: Path) -> tuple[dict[str, list[str]], list[str]]:
@@ -66,7 +81,7 @@ def read_splits(dataset: Path) -> tuple[dict[str, list[str]], list[str]]:
     splits, faults = {}, []
     for split in layout.SPLITS:
         try:
-            splits[split] = layout.read_split(dataset, split)
+            splits[split] = (dataset / "splits" / f"{split}.txt").read_text().split()
         except OSError as error:
             missing = f"{error.filename}: {error.strerror}"
             faults = [f"{missing}; the run has not finished: repeat the command that began it"]
@@ -104,19 +119,22 @@ def variant_faults(splits: Mapping[str, list[str]], details: dict[str, dict]) ->
     return faults
 
 
-def object_faults(folder: Path, record: layout.ObjectRecord, settings: dict, own_lights: bool) -> list[str]:
+def object_faults(data: Dataset, item: ObjectData, details: dict) -> list[str]:
     """What is wrong with one object."""
-    files = record.details.get("files", {})
-    if not isinstance(files, dict) or not {"product", "variant"} <= record.details.keys():
+    files, settings = details.get("files", {}), data.settings["settings"]
+    if not isinstance(files, dict) or not {"product", "variant"} <= details.keys():
         return ["object.json: expected files, product and variant"]
+    folder = data.folder / "objects" / item.name
     damaged = [name for name, checksum in files.items() if checksum_of(folder / name) != checksum]
     faults = [f"{name} has another checksum than when it was written" for name in damaged]
-    size = (settings["views"], settings["resolution"], settings["resolution"], 4)
-    for name in ("images", "conditions"):
-        if getattr(record, name).shape != size:
-            faults.append(f"{name}: expected {size}, got {getattr(record, name).shape}")
-    faults += camera_faults(record.transforms) + point_faults(record.points, settings["points"])
-    return faults + light_faults(folder, "lights.npz" in files, len(record.images), own_lights)
+    size, found = (settings["views"], settings["resolution"]), (len(item.images), item.camera.height)
+    if size != found:
+        faults.append(f"expected (views, resolution) {size}, got {found}")
+    if ("lights.npz" in files) != (item.lights is not None):
+        faults.append("lights.npz is there, but dataset.json says one light for all")
+    for view in np.flatnonzero(~np.any(item.lights, axis=(1, 2, 3))) if item.lights is not None else ():
+        faults.append(f"lights.npz: view {view} is lit by a black map")
+    return faults + camera_faults(item.camera) + point_faults(item.cloud, settings["points"])
 
 
 def checksum_of(path: Path) -> str | None:
@@ -124,57 +142,32 @@ def checksum_of(path: Path) -> str | None:
     return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else None
 
 
-def camera_faults(transforms: dict) -> list[str]:
+def camera_faults(camera: Camera) -> list[str]:
     """What is wrong with the cameras of one object."""
-    poses = np.array([frame["transform_matrix"] for frame in transforms["frames"]], np.float64)
-    rotations = poses[:, :3, :3]
+    rotations = np.asarray(camera.cam_to_world, np.float64)[:, :, :3]
     products = rotations @ rotations.transpose(0, 2, 1)
-    if not np.allclose(products, np.eye(3), atol=1e-6) or not np.allclose(np.linalg.det(rotations), 1, atol=1e-6):
+    if not np.allclose(products, np.eye(3), atol=1e-5) or not np.allclose(np.linalg.det(rotations), 1, atol=1e-5):
         return ["a camera's axes are not a right-handed orthonormal frame"]
     return []
 
 
-def point_faults(points: np.ndarray, count: int) -> list[str]:
+def point_faults(cloud: PointCloud, count: int) -> list[str]:
     """What is wrong with the points of one object."""
-    faults = [] if len(points) == count else [f"expected {count} points, got {len(points)}"]
-    values = layout.point_columns(points, *layout.POINT_FIELDS)
-    if not np.isfinite(values).all():
-        return [*faults, "points hold values that are not finite"]
-    if np.linalg.norm(values[:, :3], axis=1).max(initial=0) > 1 + 1e-5:
+    faults = [] if len(cloud.positions) == count else [f"expected {count} points, got {len(cloud.positions)}"]
+    if np.linalg.norm(cloud.positions, axis=1).max() > 1 + 1e-5:
         faults.append("points lie outside the unit sphere")
-    if np.abs(np.linalg.norm(values[:, 3:6], axis=1) - 1).max(initial=0) > 1e-3:
+    if cloud.normals is None or np.abs(np.linalg.norm(cloud.normals, axis=1) - 1).max() > 1e-3:
         faults.append("normals are not of length 1")
-    if values[:, 6:].min(initial=0) < 0 or values[:, 6:].max(initial=0) > 1:
+    values = np.column_stack([cloud.base_color, cloud.roughness, cloud.metallic])
+    if values.min() < 0 or values.max() > 1:
         faults.append("colours or materials lie outside [0, 1]")
     return faults
 
 
-def light_faults(folder: Path, listed: bool, views: int, own_lights: bool) -> list[str]:
-    """What is wrong with the lights of one object's views, which its files list where each view has its own."""
-    if listed != own_lights:
-        said = "a light of its own for each view" if own_lights else "one light for all"
-        return [f"lights.npz is {'there' if listed else 'missing'}, but dataset.json says {said}"]
-    if not own_lights:
-        return []
-    try:
-        with (folder / "lights.npz").open("rb") as file:
-            lights = read_arrays(file, ("lights",))["lights"]
-    except OSError:
-        return []  # a missing file has another checksum, which is told already
-    except UserError as error:
-        return [f"lights.npz {error}"]
-    if lights.shape != (views, HEIGHT, WIDTH, 3) or lights.dtype.kind != "f":
-        return [f"lights.npz: expected floats {(views, HEIGHT, WIDTH, 3)}, got {lights.dtype} {lights.shape}"]
-    if not np.isfinite(lights).all() or lights.min() < 0:
-        return ["lights.npz holds radiance that is negative or not finite"]
-    dark = [view for view, light in enumerate(lights) if not light.any()]
-    return [f"lights.npz: view {dark[0]} is lit by a black map"] if dark else []
-
-
-def points_on_object(record: layout.ObjectRecord) -> float:
+def points_on_object(item: ObjectData) -> float:
     """The share of condition pixels (visible points) that are opaque or partly so in their pictures."""
-    seen = record.conditions[..., 3] > 0
-    return float((record.images[..., 3][seen] > 0).mean()) if seen.any() else 1.0
+    seen = item.conditions[..., 3] > 0
+    return float((item.images[..., 3][seen] > 0).mean()) if seen.any() else 1.0
 
 
 def print_table(dataset: Path, object_ids, splits, num_views: int, agreements, covered, faults) -> None:

@@ -1,31 +1,36 @@
-"""The files of a data set: how each is written, and how it is read back.
+"""The files of a data set, written; spnr_jax/formats/data_sets.py reads them.
 
     DATASET/dataset.json, splits/{train,val,test}.txt, rejected.jsonl
     DATASET/objects/ID/{points.ply, transforms.json, images/000.png, conditions/000.png, object.json}
     DATASET/objects/ID/lights.npz where each view has its own light: `lights` (views, 32, 64, 3) linear radiance
 
 Everything written is a function of its content alone (no clock, no host, no absolute path), so equal objects are equal
-bytes, and two runs in one place do no harm. An object is complete when its object.json is there, which is written
-last; on a local disk the folder also appears as a whole (data_gen/store/storage.py). DATASET is a path or a URL.
+bytes. An object is complete when its object.json is there: its folder is written beside its place and renamed into it.
+So two runs in one place do no harm: the first complete folder stays, unfinished ones carry the name of their process.
 """
 
 import hashlib
 import io
 import json
+import os
 import re
+import shutil
+import socket
+import tempfile
+import time
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
-from data_gen.store import storage
-from data_gen.store.storage import Location
 from spnr_jax.errors import UserError
 from spnr_jax.formats.npz import pack_arrays
 
 SCHEMA_VERSION = 1
-MOST_PIXELS = 2**26  # of a view
+LAST_FILE = "object.json"  # its presence makes an object complete
+UNFINISHED = ".unfinished-"  # prefix of what is still being written: .unfinished-HOST-PROCESS-SUFFIX
+STALE = 24 * 3600  # seconds after which unfinished work of another host is taken for abandoned
 SPLITS = ("train", "val", "test")
 POINT_FIELDS = (*"xyz", "nx", "ny", "nz", "base_color_r", "base_color_g", "base_color_b", "roughness", "metallic")
 POINT_TYPE = np.dtype([(name, "<f4") for name in POINT_FIELDS] + [("face", "<i4")])
@@ -58,11 +63,6 @@ def pack_points(surface) -> np.ndarray:
     return packed
 
 
-def point_columns(points: np.ndarray, *names: str) -> np.ndarray:
-    """The named fields of a POINT_TYPE array as (points, len(names)) float64."""
-    return np.stack([points[name] for name in names], axis=-1).astype(np.float64)
-
-
 def nerf_transforms(cam_to_world: np.ndarray, resolution: int, fov: float, focal_length: float) -> dict:
     """Transforms.json for cameras (views, 4, 4): NeRF's convention, with nerfstudio's intrinsics."""
     return {
@@ -81,9 +81,62 @@ def nerf_transforms(cam_to_world: np.ndarray, resolution: int, fov: float, focal
     }
 
 
-def write_object(dataset: Location, object_id: str, record: ObjectRecord) -> None:
-    """Write an object's folder, complete or not at all; a complete one that is already there is left as it is."""
-    storage.write_object_folder(f"{dataset}/objects", object_id, object_files(record))
+def has_object(dataset: Path, object_id: str) -> bool:
+    """Whether an object of the data set is complete."""
+    return (dataset / "objects" / object_id / LAST_FILE).is_file()
+
+
+def list_completed(dataset: Path) -> set[str]:
+    """The ids of the objects whose folders are complete."""
+    places = (dataset / "objects").glob(f"*/{LAST_FILE}")
+    return {place.parent.name for place in places if not place.parent.name.startswith(UNFINISHED)}
+
+
+def write_object(dataset: Path, object_id: str, record: ObjectRecord) -> None:
+    """Write an object's folder, complete or not at all; if another writer was faster, its folder stays."""
+    write_folder(dataset / "objects" / object_id, object_files(record))
+
+
+def write_folder(place: Path, files: dict[str, bytes]) -> None:
+    """Write a folder beside its place and rename it."""
+    place.parent.mkdir(parents=True, exist_ok=True)
+    owner = f"{UNFINISHED}{socket.gethostname()}-{os.getpid()}-"
+    beside = Path(tempfile.mkdtemp(prefix=owner, dir=place.parent))
+    try:
+        for name, content in files.items():
+            (beside / name).parent.mkdir(exist_ok=True)
+            (beside / name).write_bytes(content)
+        beside.chmod(0o755)
+        try:
+            beside.rename(place)
+        except OSError:  # a folder that is not empty is never replaced
+            if not place.is_dir():
+                raise
+            if not (place / LAST_FILE).is_file():
+                raise UserError(f"{place} is in the way: a folder without {LAST_FILE}; remove it") from None
+    finally:
+        shutil.rmtree(beside, ignore_errors=True)
+
+
+def remove_unfinished(dataset: Path) -> None:
+    """Remove the objects that dead processes of this host, or any process a day ago, left half written."""
+    for path in (dataset / "objects").glob(UNFINISHED + "*"):
+        if is_abandoned(path):
+            shutil.rmtree(path, ignore_errors=True)
+
+
+def is_abandoned(path: Path) -> bool:
+    """Whether nobody writes an unfinished folder any more."""
+    owner = re.fullmatch(re.escape(UNFINISHED) + r"(.+)-(\d+)-\w+", path.name)
+    try:
+        if owner and owner[1] == socket.gethostname():
+            os.kill(int(owner[2]), 0)  # asks whether the process lives
+            return False
+        return time.time() - path.stat().st_mtime > STALE
+    except ProcessLookupError:
+        return True
+    except (PermissionError, FileNotFoundError):  # somebody else's process; its writer has just finished it
+        return False
 
 
 def object_files(record: ObjectRecord) -> dict[str, bytes]:
@@ -97,39 +150,7 @@ def object_files(record: ObjectRecord) -> dict[str, bytes]:
     if record.lights is not None:
         files["lights.npz"] = encode_lights(record.lights)
     checksums = {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
-    return {**files, storage.LAST_FILE: json_text({**record.details, "files": checksums}).encode()}
-
-
-def read_object(folder: Path) -> ObjectRecord:
-    """The object in a folder; ValueError or OSError if a file is missing or damaged."""
-    transforms = read_document(folder / "transforms.json")
-    try:
-        names = [Path(frame["file_path"]).name for frame in transforms["frames"]]
-        poses = np.array([frame["transform_matrix"] for frame in transforms["frames"]], np.float64)
-    except (ValueError, LookupError, TypeError, ArithmeticError) as error:
-        raise UserError(
-            f"{folder / 'transforms.json'}: holds no frames ({error!r}); generate the object again"
-        ) from None
-    if poses.shape[1:] != (4, 4) or not np.isfinite(poses).all():
-        raise UserError(f"{folder / 'transforms.json'}: a camera is no 4 x 4 matrix of finite numbers")
-    return ObjectRecord(
-        points=read_points(folder / "points.ply"),
-        transforms=transforms,
-        images=np.stack([read_image(folder / "images" / name) for name in names]),
-        conditions=np.stack([read_image(folder / "conditions" / name) for name in names]),
-        details=read_document(folder / "object.json"),
-    )
-
-
-def read_document(path: Path) -> dict:
-    """The dict of a JSON file; ValueError or OSError if there is none."""
-    try:
-        document = json.loads(path.read_text())
-    except (ValueError, RecursionError) as error:
-        raise UserError(f"{path}: not readable ({error}); generate it again") from None
-    if not isinstance(document, dict):
-        raise UserError(f"{path}: expected named entries, found {type(document).__name__}; generate it again")
-    return document
+    return {**files, LAST_FILE: json_text({**record.details, "files": checksums}).encode()}
 
 
 def encode_points(points: np.ndarray) -> bytes:
@@ -137,19 +158,6 @@ def encode_points(points: np.ndarray) -> bytes:
     size = f"element vertex {len(points)}"
     header = ["ply", "format binary_little_endian 1.0", size, *POINT_PROPERTIES, "end_header"]
     return ("\n".join(header) + "\n").encode("ascii") + points.tobytes()
-
-
-def read_points(path: Path) -> np.ndarray:
-    """The POINT_TYPE array (points,) of a file that `encode_points` made; ValueError for any other file."""
-    header, separator, body = path.read_bytes().partition(b"end_header\n")
-    lines = header.decode("ascii", "replace").splitlines()
-    if not separator or lines[1:2] != ["format binary_little_endian 1.0"] or lines[3:] != POINT_PROPERTIES:
-        raise UserError(f"{path}: not a points.ply of this data set (another header); generate the object again")
-    announced = re.fullmatch(r"element vertex (\d{1,15})", lines[2])
-    count = int(announced[1]) if announced else -1
-    if len(body) != count * POINT_TYPE.itemsize:
-        raise UserError(f"{path}: expected {count} points, found {len(body) / POINT_TYPE.itemsize:g}; file is cut off")
-    return np.frombuffer(body, POINT_TYPE).copy()
 
 
 def encode_image(pixels: np.ndarray) -> bytes:
@@ -163,28 +171,6 @@ def encode_lights(lights: np.ndarray) -> bytes:
     """Environment maps (views, height, width, 3) as an .npz of halves, cut where they are too bright."""
     halves = np.minimum(lights, np.finfo(np.float16).max).astype(np.float16)
     return pack_arrays({"lights": halves}, compressed=True)
-
-
-def read_image(path: Path) -> np.ndarray:
-    """An RGBA PNG as (height, width, 4) uint8; ValueError if it is damaged or of another kind."""
-    try:
-        with Image.open(path) as image:
-            if image.mode != "RGBA" or image.width * image.height > MOST_PIXELS:
-                raise UserError(f"{path}: expected an RGBA image of a view, got {image.mode} of {image.size} pixels")
-            image.load()
-            return np.array(image)
-    except (OSError, SyntaxError, Image.DecompressionBombError) as error:  # Pillow reports a damaged PNG as these
-        raise UserError(f"{path}: not a readable PNG ({error})") from None
-
-
-def read_split(dataset: Path, split: str) -> list[str]:
-    """The object ids of one split."""
-    return (dataset / "splits" / f"{split}.txt").read_text().split()
-
-
-def write_text(location: Location, text: str) -> None:
-    """Write a text file in one piece: a reader sees the old content or the new, never half of it."""
-    storage.write_file(location, text.encode())
 
 
 def json_text(content) -> str:

@@ -10,13 +10,14 @@ import numpy as np
 import tyro
 
 from data_gen.render import views
-from data_gen.store import check, layout, storage
+from data_gen.store import check, layout
 from spnr_jax.errors import UserError, at_least
-from spnr_jax.formats.data_sets import on_white
-from spnr_jax.formats.images import png_url, template
+from spnr_jax.formats import data_sets
+from spnr_jax.formats.data_sets import Dataset, on_white
+from spnr_jax.formats.images import png_url, template, write_whole
+from spnr_jax.kernels.records import PointCloud
 
-# point fields that are shown: three for a colour, one for grey
-CHANNELS = (("base_color_r", "base_color_g", "base_color_b"), ("roughness",), ("metallic",))
+CHANNELS = ("base_color", "roughness", "metallic")  # that are shown of points
 POINT_IMAGE = 128  # pixels
 BACKDROP = np.array([186, 202, 222], np.uint8)  # neither black nor white, which roughness and metallic often are
 
@@ -37,7 +38,7 @@ def show(config: ShowConfig) -> Path:
     """Write the contact sheet; return its path."""
     check.read_description(config.dataset)
     at_least(config, 1, "objects")
-    object_ids = sorted(storage.list_completed(config.dataset))
+    object_ids = sorted(layout.list_completed(config.dataset))
     if not object_ids:
         raise UserError(f"{config.dataset} holds no finished object yet; run spnr-data generate again")
     chosen = np.unique(np.linspace(0, len(object_ids) - 1, min(config.objects, len(object_ids))).round().astype(int))
@@ -46,23 +47,24 @@ def show(config: ShowConfig) -> Path:
         objects=(shown(config.dataset, object_ids[index]) for index in chosen),
     )
     path = config.to or config.dataset / "contact_sheet.html"
-    layout.write_text(path, page)
+    write_whole(path, page.encode())
     print(path)
     return path
 
 
 def shown(dataset: Path, object_id: str) -> dict:
     """An object as the page shows it: its name, what it is, and rows of pictures, each a width and an address."""
-    record = layout.read_object(dataset / "objects" / object_id)
-    ignored = "; ".join(record.details["ignored"])
+    item = data_sets.read_object(Dataset(folder=dataset, settings={}, splits={}), object_id)
+    details = check.read_details(dataset, object_id)
+    ignored = "; ".join(details["ignored"])
     rows = {
-        "pictures": [white_bytes(image) for image in record.images],
-        "visible": [white_bytes(condition) for condition in record.conditions],
-        "points": [point_image(record.points, names) for names in CHANNELS],
+        "pictures": [white_bytes(image) for image in item.images],
+        "visible": [white_bytes(condition) for condition in item.conditions],
+        "points": [point_image(item.cloud, name) for name in CHANNELS],
     }
     return {
         "name": object_id,
-        "note": f"{record.details['category']}{', ignored: ' + ignored if ignored else ''}",
+        "note": f"{details['category']}{', ignored: ' + ignored if ignored else ''}",
         "rows": {label: [(max(96, x.shape[1]), png_url(x)) for x in pictures] for label, pictures in rows.items()},
     }
 
@@ -72,13 +74,13 @@ def white_bytes(image: np.ndarray) -> np.ndarray:
     return np.round(255 * on_white(image)).astype(np.uint8)
 
 
-def point_image(points: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
+def point_image(cloud: PointCloud, channel: str) -> np.ndarray:
     """The points seen obliquely from the front as (128, 128, 3) uint8, near ones over far ones."""
     camera = views.ViewConfig(resolution=POINT_IMAGE)
     pose = views.look_at(camera.distance * np.array([0.5, 0.4, 0.77]))
-    positions = layout.point_columns(points, "x", "y", "z")
-    values = np.broadcast_to(layout.point_columns(points, *names), (len(points), 3))
-    colors = np.round(255 * (views.srgb_from_linear(values) if len(names) == 3 else values)).astype(np.uint8)
+    positions, values = np.asarray(cloud.positions, np.float64), np.asarray(getattr(cloud, channel))
+    values = views.srgb_from_linear(values) if values.ndim == 2 else np.repeat(values[:, None], 3, axis=1)
+    colors = np.round(255 * values).astype(np.uint8)
     far_first = np.argsort((positions - pose[:3, 3]) @ pose[:3, 2])
     columns, rows = np.floor(views.project(pose, positions, camera)).astype(int).clip(0, POINT_IMAGE - 2)[far_first].T
     canvas = np.tile(BACKDROP, (POINT_IMAGE, POINT_IMAGE, 1))

@@ -1,23 +1,14 @@
-"""Who draws objects in a comparison: trained networks, trivial renderers, and pictures that other programs made.
+"""Who draws objects in a comparison: trained networks and trivial renderers."""
 
-A network is called after its method; where two have the same one, the folder is added.
-"""
-
-import hashlib
-from collections import Counter
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from functools import partial
-from pathlib import Path
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 import experiments.baselines  # noqa: F401 - registers them
-from data_gen.store import layout
-from experiments.comparison.study_objects import each_view, shrink
+from experiments.comparison.study_objects import each_view
 from spnr_jax.config import Quality, TrainConfig
-from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.data_sets import Dataset, ObjectData
 from spnr_jax.kernels.records import Light, Volume
@@ -42,85 +33,26 @@ def nothing(_: ObjectData) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class Method:
-    """Draws all views of an object from what `encode` makes of it once; `identity` tells it from another one."""
+    """Draws all views of an object from what `encode` makes of it once."""
 
     draw: Callable[[Any, ObjectData], Pictures]
     encode: Callable[[ObjectData], Any] = nothing
-    identity: dict[str, Any] = field(default_factory=dict)
     compiles: bool = False
     """Whether its first call is slower than those after it."""
-    timed: bool = True
     has_opacity: bool = True
+    radius: float | None = None
+    """Of the points of a trivial renderer, in point spacings."""
 
     def show(self, item: ObjectData) -> Pictures:
         """The pictures."""
         return evaluation.on_host(self.draw(self.encode(item), item))
 
 
-@dataclass(frozen=True, kw_only=True)
-class Network:
-    """A trained network, ready to be shown, and what tells it from another one."""
-
-    method: str
-    config: TrainConfig
-    variables: dict
-    steps: int
-    checksum: str
-
-    @property
-    def has_depth(self) -> bool:
-        """Whether it predicts opacity and depth; NPBG predicts colours alone."""
-        return self.method != "npbg"
-
-    def as_method(self) -> Method:
-        """The network as it was trained, with steps and a checksum of the run's config."""
-        return of_network(self.config, self.variables, steps=self.steps, config=self.checksum)
-
-
-def networks(runs: Sequence[Path], dataset: Dataset) -> dict[str, Network]:
-    """The networks by their names, in the order of Table 1; ValueError if there is none, or of another image size.
-
-    Runs are folders, files of weights, or `surfels`, the network of the package.
-    """
-    if not runs:
-        raise UserError("--runs: name at least one run folder")
-    found = [(run, read_network(run, dataset)) for run in runs]
-    found.sort(key=lambda pair: list(LABELS).index(pair[1].method))
-    times = Counter(network.method for _, network in found)
-    named = {name_of(network.method, run, times[network.method] > 1): network for run, network in found}
-    if len(named) < len(runs):
-        raise UserError(f"--runs: a run folder is named twice in {', '.join(map(str, runs))}")
-    return named
-
-
-def name_of(method: str, run: Path, shared: bool) -> str:
-    """What tables and pictures call a network."""
-    whose = ", ".join(part for part in (run.parent.name, run.name) if part)  # results lie in folders of this name
-    return f"{LABELS[method]} ({whose})" if shared else LABELS[method]
-
-
-def read_network(run: Path, dataset: Dataset) -> Network:
-    """The averaged network of a run's newest checkpoint or a file of weights, fit for the size of the pictures."""
-    trained = weights.read_trained(run, data=dataset.folder)
-    config = trained.config
-    data_sets.check_renders(data_sets.read_object(dataset, dataset.splits["test"][0]), config)
-    place = weights.place(run)
-    described = place if place.is_file() else place / "config.json"
-    return Network(
-        method=config.model.method,
-        config=config,
-        variables=trained.variables,
-        steps=trained.steps,
-        checksum=hashlib.sha256(described.read_bytes()).hexdigest(),
-    )
-
-
-def of_network(training: TrainConfig, variables: dict, **identity: Any) -> Method:
+def of_network(training: TrainConfig, variables: dict) -> Method:
     """A network as it was trained; NPBG predicts colours alone."""
     show = evaluation.network(variables, training)
     return Method(
         draw=lambda _, item: show(item.cloud, item.camera),
-        identity=identity,
         compiles=True,
         has_opacity=training.model.method != "npbg",
     )
@@ -140,9 +72,8 @@ def draw_volume(
 ) -> Pictures:
     """The views of an object whose volume there is, in its own lights where none are given."""
     found = list(model.render_each(volume, each_view(item), quality, lights or item.own_lights))
-    return Pictures(
-        image=np.stack([np.asarray(one.image) for one in found]), acc=np.stack([np.asarray(one.acc) for one in found])
-    )
+    image, acc, depth = (np.stack([np.asarray(getattr(one, x)) for one in found]) for x in ("image", "acc", "depth"))
+    return Pictures(image=image, acc=acc, depth=depth)
 
 
 def of_runs(runs: tuple[str, ...]) -> dict[str, tuple[Model, Quality]]:
@@ -161,9 +92,9 @@ def of_floor(name: str, factor: float = 1.0) -> Method:
     show = evaluation.floor(name, factor)
     return Method(
         draw=lambda _, item: show(item.cloud, item.camera),
-        identity={"radius factor": factor},
         compiles=True,
         has_opacity=name != "white",
+        radius=None if name == "white" else factor,
     )
 
 
@@ -174,23 +105,6 @@ def floors(names: tuple[str, ...], dataset: Dataset, config: TrainConfig) -> dic
         name: of_floor(name, 1.0 if name == "white" else evaluation.choose_radius(dataset, config, name))
         for name in wanted
     }
-
-
-def elsewhere(folder: Path) -> Method:
-    """Pictures that another program made of the same points and cameras: FOLDER/POINTS/ID/000.png, a view each."""
-    return Method(draw=partial(_read_pictures, folder), timed=False)
-
-
-def _read_pictures(folder: Path, _: None, item: ObjectData) -> Pictures:
-    place, found = folder / str(len(item.cloud.positions)) / item.name, []
-    for view in range(len(item.images)):
-        path = place / f"{view:03d}.png"
-        picture, (height, width, _) = layout.read_image(path), item.images[view].shape
-        side = len(picture) // height
-        if not side or picture.shape != (side * height, side * width, 4):
-            raise UserError(f"{path}: {picture.shape}, expected {item.images[view].shape}: RGBA like the references")
-        found.append(shrink(picture, side))
-    return of_rgba(np.stack(found))
 
 
 def of_rgba(rgba: np.ndarray) -> Pictures:

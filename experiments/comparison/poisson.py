@@ -1,34 +1,118 @@
 """Poisson reconstruction beside the references: a surface from each object's points, rendered as they were.
 
+    points -> outward normals -> pymeshlab's screened Poisson solver (Kazhdan 2013) -> mesh with the nearest's materials
+
 Light, cameras, samples per pixel and integrator are those that dataset.json names.  An object whose points span no
-surface is an empty picture.  `keep_pictures` keeps them by object, as FOLDER/NAME.npz.
+surface is an empty picture.  The solver closes what is open, bridges what is near, and extrapolates; `trim` removes its
+least supported vertices.  It runs in one thread: equal points, equal surface.  `keep_pictures` keeps pictures by
+object, as FOLDER/NAME.npz.
 """
 
 import dataclasses
 import hashlib
+import importlib
 import sys
 import time
 from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 
-import jax
 import numpy as np
+from scipy.spatial import cKDTree
 
-from data_gen.render import light, poisson_surface, views
-from data_gen.render.poisson_surface import PoissonConfig
+from data_gen.render import light, views
 from data_gen.render.variant import choose_variant, mitsuba_module
 from experiments.comparison.contenders import Method, of_rgba
 from experiments.comparison.results_folder import load_or_make
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
-from spnr_jax.formats.assets import Asset
+from spnr_jax.formats.assets import Asset, Material, Part
 from spnr_jax.formats.images import read_envmap
+from spnr_jax.formats.surface_points import vertex_normals
 from spnr_jax.kernels.records import PointCloud
 from spnr_jax.scoring.evaluation import Pictures
+from spnr_jax.surfels.normals import outward_normals
 from spnr_jax.surfels.skies import indoor_envmap
 
 RENDERING = ("resolution", "fov", "spp", "max_depth")  # settings that decide a picture, given the pose of its camera
-SURFACES = {"poisson": PoissonConfig(), "poisson_trimmed": PoissonConfig(trim=0.3)}
+STRAIGHT = 1e-5  # points spread less than this share of their extent beside a line have no surface
+
+
+@dataclass(frozen=True, kw_only=True)
+class Surface:
+    """How a surface is made of points."""
+
+    depth: int = 12
+    """Depth of the solver's octree: the finest cell is the extent / 2^depth; 12 is the paper's."""
+    trim: float = 0.0
+    """Share of the vertices, those with the fewest points around them, that is cut off; 0 keeps all."""
+
+
+SURFACES = {"poisson": Surface(), "poisson_trimmed": Surface(trim=0.3)}
+
+
+# --- the surface of points --------------------------------------------------------------------------------------------
+
+
+def reconstruct(cloud: PointCloud, surface: Surface) -> Asset | None:
+    """The surface of one cloud (points, ...), smooth; None of points on one line, or if the solver finds none."""
+    present = np.asarray(cloud.mask)
+    positions = np.asarray(cloud.positions, np.float64)[present]
+    base_color, roughness, metallic = (
+        np.asarray(channel, np.float32)[present] for channel in (cloud.base_color, cloud.roughness, cloud.metallic)
+    )
+    if len(positions) < 3:
+        return None
+    spread = np.linalg.svd(positions - positions.mean(axis=0), compute_uv=False)
+    if not spread[1] > STRAIGHT * spread[0]:
+        return None
+    normals = outward_normals(positions, base_color, np.arange(len(positions)))
+    vertices, faces = trim(*screened_poisson(positions, normals, surface.depth), surface.trim)
+    if not len(faces):
+        return None
+    nearest = cKDTree(positions).query(vertices)[1]
+    part = Part(
+        positions=vertices,
+        faces=faces,
+        material=Material(base_color=np.ones(3, np.float32), roughness=roughness[nearest], metallic=metallic[nearest]),
+        normals=vertex_normals(vertices, faces),
+        colors=base_color[nearest],
+    )
+    return Asset(parts=(part,))
+
+
+def screened_poisson(
+    positions: np.ndarray, normals: np.ndarray, depth: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Vertices (v, 3), faces (f, 3) and the density of points around each vertex (v,)."""
+    solver = pymeshlab().MeshSet()
+    solver.add_mesh(pymeshlab().Mesh(vertex_matrix=positions, v_normals_matrix=normals.astype(np.float64)))
+    solver.generate_surface_reconstruction_screened_poisson(depth=depth, threads=1)
+    mesh = solver.current_mesh()
+    if not mesh.face_number():
+        return np.zeros((0, 3)), np.zeros((0, 3), np.int64), np.zeros(0)
+    return mesh.vertex_matrix(), mesh.face_matrix().astype(np.int64), mesh.vertex_scalar_array()
+
+
+def trim(vertices: np.ndarray, faces: np.ndarray, density: np.ndarray, share: float) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and faces without the share of the vertices that has the lowest density, and their faces."""
+    if not share or not len(faces):
+        return vertices, faces
+    kept = density >= np.quantile(density, share)
+    number = np.cumsum(kept) - 1
+    return vertices[kept], number[faces[kept[faces].all(axis=1)]]
+
+
+def pymeshlab():
+    """The solver's module; ValueError, with what to install, if it is absent."""
+    try:
+        return importlib.import_module("pymeshlab")
+    except ImportError as error:
+        needed = "Poisson reconstruction needs pymeshlab: pip install 'spnr-jax[baselines]'"
+        raise UserError(f"{needed} ({error})") from None
+
+
+# --- its pictures -----------------------------------------------------------------------------------------------------
 
 
 class Renderer:
@@ -43,9 +127,9 @@ class Renderer:
         self._seed, self._view = seed, view_config(settings)
         self._light = light.scale_to_white(unscaled_light(settings["environment_map"], envmap))
 
-    def draw(self, asset: Asset | str, item: data_sets.ObjectData) -> np.ndarray:
+    def draw(self, asset: Asset | None, item: data_sets.ObjectData) -> np.ndarray:
         """Straight-alpha sRGB (views, height, width, 4) uint8 from the object's cameras; empty without a surface."""
-        if isinstance(asset, str):
+        if asset is None:
             return np.zeros(item.images.shape, np.uint8)
         scene = views.build_scene(asset, self._light)
         config = dataclasses.replace(self._view, resolution=item.camera.height)
@@ -59,16 +143,7 @@ class Renderer:
         return Method(
             encode=lambda item: reconstruct(item.cloud, SURFACES[surface]),
             draw=lambda asset, item: of_rgba(self.draw(asset, item)),
-            identity=dataclasses.asdict(SURFACES[surface]),
         )
-
-
-def reconstruct(cloud: PointCloud, surface: PoissonConfig) -> Asset | str:
-    """The surface of a cloud, or the reason why its points span none."""
-    try:
-        return poisson_surface.reconstruct(jax.tree.map(np.asarray, cloud), surface)
-    except poisson_surface.NoSurface as error:
-        return str(error)
 
 
 def view_config(settings: dict) -> views.ViewConfig:
@@ -92,7 +167,7 @@ def unscaled_light(described: dict, envmap: Path | None) -> np.ndarray:
     return radiance
 
 
-def keep_pictures(renderer: Renderer, surface: PoissonConfig, folder: Path) -> Method:
+def keep_pictures(renderer: Renderer, surface: Surface, folder: Path) -> Method:
     """The surface as a method whose pictures and seconds a view are kept by object: made once, then read."""
 
     def make(item: data_sets.ObjectData) -> tuple[np.ndarray, np.ndarray]:

@@ -29,9 +29,8 @@ from spnr_jax.formats.data_sets import Dataset, ObjectData
 from spnr_jax.kernels import metrics
 from spnr_jax.scoring import evaluation
 from spnr_jax.scoring.evaluation import Pictures
-from spnr_jax.scoring.picture_scores import flip, sharpness
+from spnr_jax.scoring.picture_scores import Scores, flip, sharpness
 from spnr_jax.scoring.report import Cell, duration, mean_row
-from spnr_jax.scoring.summary import Scores
 
 Measured = tuple[dict[str, Any], np.ndarray]  # what is measured of an object, and its first picture
 Measure = Callable[[ObjectData], Measured]

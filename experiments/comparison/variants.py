@@ -1,16 +1,13 @@
 """Variants of one training, each in its run folder, scored on the same unseen objects, points and cameras.
 
-    OUT/runs/VARIANT_SEED/   the run folders; a stopped run goes on, a finished one is only read
-    OUT/asked.json           whose folder it is: another data set, preset or number of steps is refused
+    OUT/runs/VARIANT/        the run folders; a stopped run goes on, a finished one is only read
+    OUT/asked.json           whose folder it is: another data set, preset, seed or number of steps is refused
     OUT/results.json  OUT/table.md  OUT/gallery.png
 
-Every variant trains with every seed.  Its scores are those of all its seeds: object by object, their views one after
-another.  Differences are taken to one variant, the reference, view by view on equal seeds; intervals are bootstraps
-over objects.
+Differences are taken to one variant, the reference, view by view; intervals are bootstraps over objects.
 """
 
 import dataclasses
-import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,7 +20,7 @@ from experiments.comparison import budget as budgets
 from experiments.comparison import figures, results_folder
 from experiments.comparison.budget import Trained
 from experiments.comparison.contenders import of_network
-from experiments.comparison.scores import OPAQUE, Shown, score_objects
+from experiments.comparison.scores import OPAQUE, Scored, score_objects
 from experiments.comparison.study_objects import test_objects
 from spnr_jax.config import TrainConfig
 from spnr_jax.devices import runtime
@@ -32,8 +29,8 @@ from spnr_jax.formats import data_sets, images
 from spnr_jax.kernels import metrics
 from spnr_jax.presets import PRESETS
 from spnr_jax.scoring import evaluation
+from spnr_jax.scoring.picture_scores import Scores, difference, means, metric_settings
 from spnr_jax.scoring.report import ARROWS, HIGHER, QUALITY, Cell, Table, number, text
-from spnr_jax.scoring.summary import Scores, difference, means, metric_settings
 from spnr_jax.training import checkpoint, optimisation
 
 Preset = Literal["abo", "shapenet_car", "shapenet_plane", "shapenet_chair", "small", "tiny"]
@@ -55,8 +52,8 @@ class Budget:
     """What every variant changes one thing of."""
     steps: int | None = None
     """Training steps of every variant (default: the preset's)."""
-    seeds: tuple[int, ...] = (0,)
-    """Seeds of weights, batches and jitter; every variant trains with each of them."""
+    seed: int = 0
+    """Seed of weights, batches and jitter of every variant."""
     objects: int | None = None
     """Test objects, spread over the split (default: all)."""
     shown: int = 6
@@ -65,17 +62,15 @@ class Budget:
     """A check that everything works: a few steps, two objects."""
 
     def __post_init__(self) -> None:
-        if not self.seeds or len(set(self.seeds)) < len(self.seeds):
-            raise UserError(f"--seeds: expected one or more numbers, none of them twice, got {list(self.seeds)}")
         if self.steps is not None and (self.quick or self.steps < 1):
             raise UserError(f"--steps: expected 1 or more, and not together with --quick, got {self.steps}")
         at_least(self, 1, "shown")
 
     def config(self) -> TrainConfig:
-        """The preset with the steps of this budget."""
+        """The preset with the steps and the seed of this budget."""
         config = PRESETS[self.preset]()
         steps = QUICK_STEPS if self.quick else self.steps or config.num_steps
-        return dataclasses.replace(config, num_steps=steps)
+        return dataclasses.replace(config, num_steps=steps, seed=self.seed)
 
     def names(self, dataset: data_sets.Dataset) -> tuple[str, ...]:
         """The objects to be scored."""
@@ -93,31 +88,10 @@ class Variant:
     start: Callable[[TrainConfig], optimisation.TrainState] | None = None
 
 
-@dataclass(frozen=True, kw_only=True)
-class Compared:
-    """Scores by variant, seed and object; pictures of a few objects."""
-
-    scores: dict[str, dict[int, dict[str, Scores]]]
-    shown: list[Shown]
-
-    @property
-    def names(self) -> list[str]:
-        """The objects."""
-        return list(next(iter(next(iter(self.scores.values())).values())))
-
-    def by_object(self, variant: str) -> list[Scores]:
-        """The scores of each object's views with one seed after another."""
-        seeds = self.scores[variant].values()
-        return [
-            {metric: np.concatenate([scores[name][metric] for scores in seeds]) for metric in METRICS}
-            for name in self.names
-        ]
-
-
 def study(
     out: Path,
     what: str,
-    trainings: Sequence[Variant],
+    variants: Sequence[Variant],
     reference: str,
     budget: Budget,
     dataset: data_sets.Dataset,
@@ -125,32 +99,34 @@ def study(
     **asked: object,
 ) -> None:
     """Trains what is not trained in a folder that is this experiment's, scores all variants, writes the files."""
-    data_sets.check_resolution(data_sets.read_object(dataset, budget.names(dataset)[0]), trainings[0].config)
-    asked = {"preset": budget.preset, "steps": budget.config().num_steps, **asked}
+    names = budget.names(dataset)
+    config = variants[0].config  # its points and pixels are given to every variant
+    data_sets.check_resolution(data_sets.read_object(dataset, names[0]), config)
+    asked = {"preset": budget.preset, "steps": config.num_steps, "seed": budget.seed, **asked}
     results_folder.claim(out, what, asked, dataset)
-    compared = score(trainings, train(trainings, budget, out), reference, budget, dataset)
-    found = numbers(trainings, reference, compared, budget, dataset) | dict(more or {})
+    trained = train(variants, out)
+    order = sorted(trained, key=lambda name: name != reference)  # the first chooses the view of an object that is shown
+    methods = {name: of_network(trained[name].config, trained[name].variables) for name in order}
+    scored = score_objects(methods, config, dataset, names, budget.shown, more_scores)
+    found = numbers(variants, reference, scored, budget, dataset) | dict(more or {})
     tables = [quality_table(found)]
-    if len(trainings) > 1:
+    if len(variants) > 1:
         tables.append(differences_table(found))
-    picture = gallery({one.name: one.label for one in trainings}, compared)
+    picture = gallery({one.name: one.label for one in variants}, scored, ("psnr", "detail"))
     results_folder.write(out, found, tables, notes(found), {"gallery.png": picture})
 
 
-def train(variants: Sequence[Variant], budget: Budget, out: Path) -> dict[str, dict[int, Trained]]:
-    """The network of every variant and seed, trained one after another."""
-    found: dict[str, dict[int, Trained]] = {variant.name: {} for variant in variants}
-    todo = list(itertools.product(budget.seeds, variants))
-    for place, (seed, variant) in enumerate(todo, start=1):
-        run, config = out / "runs" / f"{variant.name}_{seed}", dataclasses.replace(variant.config, seed=seed)
-        what = f"run {place} of {len(todo)}: {variant.label}, seed {seed}"
-        print(f"{what}: {config.num_steps} steps in {run}", flush=True)
+def train(variants: Sequence[Variant], out: Path) -> dict[str, Trained]:
+    """The network of every variant, trained one after another."""
+    found: dict[str, Trained] = {}
+    for place, variant in enumerate(variants, start=1):
+        run, config = out / "runs" / variant.name, variant.config
+        print(f"run {place} of {len(variants)}: {variant.label}, {config.num_steps} steps in {run}", flush=True)
         if variant.start and not (run / "checkpoints").is_dir():
             state = variant.start(config)
             checkpoint.write_config(run, config)
             checkpoint.save(run, state)
-        found[variant.name][seed] = budgets.train(config, variant.dataset, run)
-        jax.clear_caches()  # two dozen trainings' programs are more pieces of memory than Linux maps for a process
+        found[variant.name] = budgets.train(config, variant.dataset, run)
     return found
 
 
@@ -166,28 +142,6 @@ def original(name: str) -> str:
 
 
 # --- scores and differences -------------------------------------------------------------------------------------------
-
-
-def score(
-    variants: Sequence[Variant],
-    trained: Mapping[str, Mapping[int, Trained]],
-    reference: str,
-    budget: Budget,
-    dataset: data_sets.Dataset,
-) -> Compared:
-    """All networks on the same objects; those of the reference choose the view of an object that is shown."""
-    names = [variant.name for variant in variants]
-    runs = [(name, seed) for name in sorted(names, key=lambda name: name != reference) for seed in budget.seeds]
-    config = trained[reference][budget.seeds[0]].config  # its points and pixels are given to every variant
-    methods = {
-        f"{name}/{seed}": of_network(trained[name][seed].config, trained[name][seed].variables) for name, seed in runs
-    }
-    scored = score_objects(methods, config, dataset, budget.names(dataset), budget.shown, more_scores)
-    scores = {
-        name: {seed: {item: found[f"{name}/{seed}"] for item, found in scored.scores.items()} for seed in budget.seeds}
-        for name in names
-    }
-    return Compared(scores=scores, shown=scored.shown)
 
 
 def more_scores(item: data_sets.ObjectData, pictures: evaluation.Pictures) -> Scores:
@@ -208,29 +162,30 @@ def _more_scores(image, reference, inside):
 
 
 def numbers(
-    trained: Sequence[Variant], reference: str, compared: Compared, budget: Budget, dataset: data_sets.Dataset
+    variants: Sequence[Variant], reference: str, scored: Scored, budget: Budget, dataset: data_sets.Dataset
 ) -> dict:
     """Everything that is written, and the conditions that it stands on."""
-    config, scores = trained[0].config, {variant.name: compared.by_object(variant.name) for variant in trained}
+    config = variants[0].config
+    scores = {variant.name: [of[variant.name] for of in scored.scores.values()] for variant in variants}
     return {
         "variants": {
             variant.name: {"label": variant.label, "training_objects": len(variant.dataset.splits["train"])}
             | means(scores[variant.name], METRICS)
-            for variant in trained
+            for variant in variants
         },
         "minus_reference": {
             name: {metric: difference(of, scores[reference], metric) for metric in METRICS}
             for name, of in scores.items()
             if name != reference
         },
-        "test_objects": compared.names,
+        "test_objects": list(scored.scores),
         "reference": reference,
         "preset": budget.preset,
         "steps": config.num_steps,
-        "seeds": list(budget.seeds),
+        "seed": budget.seed,
         "hardware": runtime.hardware(),
         "data": dataset.settings.get("settings", {}),
-        "views": len(scores[reference][0]["psnr"]) // len(budget.seeds),
+        "views": len(scores[reference][0]["psnr"]),
         "points": config.test_points,
         "resolution": config.model.image_resolution,
         "metrics": metric_settings(),
@@ -262,7 +217,7 @@ def differences_table(results: Mapping) -> Table:
         (labels[name], tuple(cell(changes[metric], decimals) for metric, (_, decimals, _) in METRICS.items()))
         for name, changes in results["minus_reference"].items()
     )
-    note = "View by view on equal seeds; 95 % bootstrap intervals over objects. Bold: the interval leaves out 0."
+    note = "View by view; 95 % bootstrap intervals over objects. Bold: the interval leaves out 0."
     return Table(title=f"Minus {labels[results['reference']]}", heads=HEADS, rows=rows, note=note)
 
 
@@ -271,7 +226,7 @@ def notes(results: Mapping) -> list[str]:
     counts = sorted({row["training_objects"] for row in results["variants"].values()})
     return [
         f"Budget: preset {results['preset']}, {results['steps']:,} steps each, "
-        f"{' or '.join(map(str, counts))} training objects. Seeds: {', '.join(map(str, results['seeds']))}.",
+        f"{' or '.join(map(str, counts))} training objects. Seed {results['seed']}.",
         f"Hardware: {results['hardware']}.",
         f"Every variant: the same test objects, cameras and first {results['points']} points; "
         f"{results['resolution']} px.",
@@ -282,13 +237,12 @@ def notes(results: Mapping) -> list[str]:
     ]
 
 
-def gallery(labels: Mapping[str, str], compared: Compared) -> bytes:
-    """PNG: a row an object, the reference image and every variant's picture with PSNR and HF energy below."""
-    first = {name: next(iter(seeds.items())) for name, seeds in compared.scores.items()}
-    cells, below = [], []
-    for shown in compared.shown:
-        cells.append([shown.reference, *(shown.images[f"{name}/{first[name][0]}"] for name in labels)])
-        scores = {name: {m: float(x[shown.view]) for m, x in of[shown.name].items()} for name, (_, of) in first.items()}
-        below.append(["", *(f"{scores[name]['psnr']:.1f} dB, {scores[name]['detail']:.2f}" for name in labels)])
-    rows = [f"{shown.name} view {shown.view}" for shown in compared.shown]
-    return images.png(figures.grid(cells, ["Reference", *labels.values()], rows, 128, below))
+def gallery(labels: Mapping[str, str], scored: Scored, below: Sequence[str]) -> bytes:
+    """PNG: a row an object, the reference image and every method's picture, with some of its scores below."""
+    cells, lines = [], []
+    for shown in scored.shown:
+        cells.append([shown.reference, *(shown.images[name] for name in labels)])
+        scores = [[scored.scores[shown.name][name][metric][shown.view] for metric in below] for name in labels]
+        lines.append(["", *(", ".join(f"{value:.2f}" for value in values) for values in scores)])
+    rows = [f"{shown.name} view {shown.view}" for shown in scored.shown]
+    return images.png(figures.grid(cells, ["Reference", *labels.values()], rows, 128, lines))

@@ -2,7 +2,7 @@
 
     python -m experiments.paper.fig1 --data DIR --out DIR [--steps N] [--pretrain N] [--l1-weights 0 100]
 
-    OUT/runs/l1_WEIGHT_SEED/           run folders; finished ones are only read.  OUT/runs/pretrained_SEED/
+    OUT/runs/l1_WEIGHT/                run folders; finished ones are only read.  OUT/runs/pretrained/
     OUT/results.json  table.md         scores, high-frequency energy over the reference's, differences to weight 100
     OUT/gallery.png                    the figure, with that number below each picture
 
@@ -80,7 +80,7 @@ def pretrain(options: Fig1, dataset: data_sets.Dataset, config: TrainConfig) -> 
     """A fresh state whose generator was trained with the L1 loss alone."""
     loss = dataclasses.replace(config.loss, l1_weight=100.0, adversarial_weight=0.0)
     before = dataclasses.replace(config, loss=loss, num_steps=options.pretrain)
-    run = options.out / "runs" / f"pretrained_{config.seed}"
+    run = options.out / "runs" / "pretrained"
     print(f"before it, {options.pretrain} steps of the L1 loss alone in {run}", flush=True)
     budget.train(before, dataset, run)
     return trainer.new_state(config, read_trained(run))

@@ -1,8 +1,8 @@
 """Figure 2 of the supplement, colour variants of objects, and what training with them changes.
 
-    python -m experiments.paper.fig2 --data DIR --out DIR [--steps N] [--seeds 0 1 2]
+    python -m experiments.paper.fig2 --data DIR --out DIR [--steps N] [--seed 0]
 
-    OUT/runs/with_SEED/  OUT/runs/without_SEED/  run folders; finished ones are only read
+    OUT/runs/with/  OUT/runs/without/            run folders; finished ones are only read
     OUT/variants.png                             training objects beside their colour variants
     OUT/results.json  table.md                   scores of both trainings, and their differences with intervals
     OUT/gallery.png                              pictures of unseen objects

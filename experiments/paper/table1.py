@@ -5,8 +5,8 @@
     OUT/runs/METHOD/          the run folders of the networks (experiments/comparison/budget.py says what a budget is)
     OUT/poisson_1024/         pictures of the reconstructions from so many points (.npz); OUT/poisson_trimmed_1024/
     OUT/results.json          everything below as numbers: scores, costs, settings, hardware, seed
-    OUT/table.md    the tables
-    OUT/table1.html           the tables, and pictures of unseen objects to flip through
+    OUT/table.md              the tables
+    OUT/gallery.png           pictures of unseen objects by every method
 
 The same command goes on where it was stopped and trains nothing twice.  The same seed gives the same scores on a CPU;
 times, and with --minutes the number of steps, are those of the machine.
@@ -14,7 +14,7 @@ times, and with --minutes the number of steps, are those of the machine.
 
 import importlib
 import statistics
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -23,17 +23,16 @@ from experiments import entry_point
 from experiments.comparison import budget, contenders, poisson, results_folder
 from experiments.comparison.budget import NETWORKS, QUICK_STEPS, Budget, Trained
 from experiments.comparison.contenders import LABELS, Method
-from experiments.comparison.scores import Scored, Shown, score_objects
+from experiments.comparison.scores import Scored, score_objects
 from experiments.comparison.study_objects import test_objects
+from experiments.comparison.variants import gallery
 from spnr_jax import cli
 from spnr_jax.config import TrainConfig
 from spnr_jax.devices import runtime
 from spnr_jax.errors import UserError, at_least
 from spnr_jax.formats import data_sets
-from spnr_jax.formats.images import png_url, template
-from spnr_jax.scoring import evaluation
+from spnr_jax.scoring.picture_scores import differences, metric_settings, summarise
 from spnr_jax.scoring.report import Cell, Table, difference, duration, head, lower_first, number, quality
-from spnr_jax.scoring.summary import differences, metric_settings, summarise
 
 METRICS = ("psnr", "ssim", "lpips", "flip", "cpsnr", "iou")
 COSTS = {"parameters": "Parameters", "steps": "Steps", "training_seconds": "Training", "ms_per_view": "ms per view"}
@@ -67,8 +66,8 @@ class Table1:
     """Rows of the table."""
     objects: int | None = None
     """Test objects, spread over the split (default: all; 3 with --budget quick)."""
-    shown: int = 24
-    """Objects whose pictures are in the page."""
+    shown: int = 12
+    """Objects in the gallery."""
     envmap: Path | None = None
     """The environment map of the data set, where that is a file: Poisson surfaces are rendered in it."""
     variant: str = "auto"
@@ -85,11 +84,11 @@ class Table1:
         if not self.methods:
             raise UserError(f"--methods: name at least one of {', '.join(ROWS)}")
         at_least(self, 1, "objects")
-        at_least(self, 0, "shown")
+        at_least(self, 1, "shown")
 
 
 def main(options: Table1) -> None:
-    """Trains what is not trained, scores all methods, writes the tables and the page."""
+    """Trains what is not trained, scores all methods, writes tables and pictures."""
     cli.set_up_jax()
     dataset = data_sets.open_dataset(options.data)
     names = test_objects(dataset, options.objects or (QUICK_OBJECTS if options.budget == "quick" else None))
@@ -110,15 +109,17 @@ def main(options: Table1) -> None:
     found = {
         **asked,
         **conditions(dataset, names, config),
-        "radius_factors": {name: of.identity["radius factor"] for name, of in floors.items() if name != "white"},
+        "radius_factors": {name: of.radius for name, of in floors.items() if of.radius is not None},
         "metrics": metric_settings(),
         "missing": missing,
         **numbers(scored),
         "costs": costs(options, trained, scored, config),
     }
-    tables, how = tables_of(found), notes(found)
-    page = write_page("Table 1: every method on the same unseen objects", tables, how, scored.shown)
-    results_folder.write(options.out, found, tables, how, {"table1.html": page.encode()})
+    how, tables = notes(found), [methods_table(found)]
+    if found["differences"]:
+        tables.append(differences_table(found["compared"], found["differences"]))
+    picture = gallery({name: LABELS[name] for name in compared}, scored, ("psnr",))
+    results_folder.write(options.out, found, tables, how, {"gallery.png": picture})
 
 
 def conditions(dataset: data_sets.Dataset, names: tuple[str, ...], config: TrainConfig) -> dict[str, object]:
@@ -134,23 +135,14 @@ def conditions(dataset: data_sets.Dataset, names: tuple[str, ...], config: Train
 
 
 def numbers(scored: Scored) -> dict[str, str | dict | None]:
-    """The scores as tables: of every method, the first network minus the others, and of each class of objects."""
+    """The scores as tables: of every method, and the first network minus the others."""
     scores = list(scored.scores.values())
     first = next((name for name in NETWORKS if name in scores[0]), None)
     return {
         "methods": summarise(scores),
         "compared": first,
         "differences": {} if first is None else differences(scores, first),
-        "per_category": by_category(scored),
     }
-
-
-def by_category(scored: Scored) -> dict[str, dict]:
-    """The summary of each class of objects, if there are several."""
-    classes = evaluation.classes_of(scored.scores)
-    if len(classes) < 2:
-        return {}
-    return {kind: summarise([scored.scores[name] for name in names]) for kind, names in classes.items()}
 
 
 def surface_folder(options: Table1, config: TrainConfig, row: str) -> Path:
@@ -205,25 +197,7 @@ def costs(options: Table1, trained: dict[str, Trained], scored: Scored, config: 
     return table
 
 
-# --- tables and page --------------------------------------------------------------------------------------------------
-
-
-def tables_of(results: Mapping) -> list[Table]:
-    """The table of methods, the differences, and a table of each class of objects."""
-    made = [methods_table(results)]
-    if results["differences"]:
-        made.append(differences_table(results["compared"], results["differences"]))
-    for name, own in results["per_category"].items():
-        count = next(iter(own.values()))["objects"]
-        title = f"{name}, {count} object{'s' * (count != 1)}"
-        made.append(
-            Table(
-                title=title,
-                heads=HEADS,
-                rows=tuple((LABELS[name], cells) for name, cells in quality(own, METRICS).items()),
-            )
-        )
-    return made
+# --- tables ---------------------------------------------------------------------------------------------------------
 
 
 def methods_table(results: Mapping) -> Table:
@@ -256,7 +230,7 @@ def differences_table(first: str, differences: Mapping) -> Table:
 def _cost(cost: Mapping, column: str) -> Cell:
     value = cost.get(column)
     if column == "training_seconds" and value is not None:
-        return Cell(text=duration(value), value=value)
+        return Cell(text=duration(value))
     return number(value, 1 if column == "ms_per_view" else 0, missing="-")
 
 
@@ -284,30 +258,6 @@ def notes(results: Mapping) -> list[str]:
         *(f"{name}: {text}." for name, text in results["metrics"].items()),
     ]
     return lines + ([f"Radius of a point, in point spacings, best on training objects: {factors}."] if factors else [])
-
-
-def write_page(title: str, tables: Sequence[Table], notes: Sequence[str], shown: Sequence[Shown] = ()) -> str:
-    """One HTML file with tables, and unseen objects x methods to flip through beside the reference.
-
-    Nothing is loaded from elsewhere: pictures are PNGs inside the file, and so is the script.  Left and right change
-    the method, up and down the object; holding the space bar, or the mouse on the picture, shows the reference in its
-    place.  Without scripts the tables are still there.
-    """
-    pictures = {
-        "methods": [LABELS[method] for method in shown[0].images] if shown else [],
-        "objects": [
-            {
-                "name": row.name,
-                "view": row.view,
-                "reference": png_url(row.reference),
-                "images": {LABELS[method]: png_url(image) for method, image in row.images.items()},
-                "psnr": {LABELS[method]: round(value, 2) for method, value in row.psnr.items()},
-            }
-            for row in shown
-        ],
-    }
-    place = Path(__file__).with_name("table1_page.html")
-    return template(place).render(title=title, tables=tables, notes=notes, pictures=pictures)
 
 
 if __name__ == "__main__":

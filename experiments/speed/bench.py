@@ -38,7 +38,6 @@ Run = Callable[[], object]
 Row = dict[str, Any]
 
 BATCHES = {"tiny": 2, "small": 2, "abo": 1}  # objects of a batch, one view of each
-VARIANTS = {"plain": ("plain", False), "fast": ("fast", False), "compiled": ("fast", True)}  # form, torch.compile
 FEWEST = 3  # timed runs of a turn
 WARM_UP = 8  # torch.compile and oneDNN settle later
 
@@ -53,8 +52,8 @@ class Options:
     """Sizes."""
     modes: tuple[Mode, ...] = ("train", "train_l1", "encode", "render")
     """One step with and without the discriminator, points to volume, volume to image."""
-    variants: tuple[Literal["plain", "fast", "compiled"], ...] = ("plain", "fast", "compiled")
-    """Of the twin: as a user writes it, tuned, tuned and compiled."""
+    variants: tuple[Literal["plain", "compiled"], ...] = ("plain", "compiled")
+    """Of the twin: as a user writes it, and that under torch.compile."""
     rounds: int = 12
     """Turns of each side in a row."""
     seconds: float = 0.5
@@ -186,10 +185,10 @@ def twin_side(preset: str, mode: Mode, variant: str, options: Options) -> Run:
     device = "cpu" if jax.default_backend() == "cpu" else "cuda"  # where ours computes
     torch.set_num_threads(options.threads)
     torch.set_default_device(device)
-    config, (form, compiled) = our_config(preset, mode), VARIANTS[variant]
+    config = our_config(preset, mode)
     inputs = make_arrays(BATCHES[preset], config.model.image_resolution, config.max_points).items()
     batch = {name: torch.from_numpy(x).to(device) for name, x in inputs}
-    work = twin.function(config, batch, mode, form, compiled)
+    work = twin.function(config, batch, mode, compile=variant == "compiled")
 
     def run() -> None:
         with torch.autocast(device, torch.bfloat16, enabled=options.bf16):

@@ -1,11 +1,8 @@
 """The paper's network once more, in PyTorch: what the benchmark times ours against.
 
-    plain   as a PyTorch user writes it: dense convolutions, `grid_sample`, nearest upsampling before a convolution
-    fast    the same map with what helps on a CPU: the stem as a product of occupied voxels with all taps, the lookup as
-            an embedding bag, upsampling folded into transposed convolutions, the linear head after compositing
-
-Volumes are (batch, features, z, y, x), images (batch, features, row, column); focal = 1 / tan(half the field of view).
-float32, no R1.
+As a PyTorch user writes it: dense convolutions, `grid_sample`, nearest upsampling before a convolution.  Volumes are
+(batch, features, z, y, x), images (batch, features, row, column); focal = 1 / tan(half the field of view).  float32, no
+R1.
 """
 
 from collections.abc import Callable
@@ -18,55 +15,20 @@ from spnr_jax.config import EncoderConfig, PaperConfig, TrainConfig
 
 Batch = dict[str, Tensor]  # a view of each object: pos mat c2w focal; target cond mask (batch, features, size, size)
 SLOPE = 0.2  # of the leaky ReLUs
-BLOCK = 8192  # samples whose products stay in the cache
 
 
-class LerpRows(torch.autograd.Function):
-    """sum_k w[p, k] rows[idx[p, k]]; its gradient by the rows goes block by block."""
-
-    @staticmethod
-    def forward(ctx, rows: Tensor, idx: Tensor, w: Tensor) -> Tensor:
-        """The sums (p, features)."""
-        ctx.save_for_backward(idx, w)
-        ctx.count = len(rows)
-        return F.embedding_bag(idx, rows, per_sample_weights=w, mode="sum")
-
-    @staticmethod
-    def backward(ctx, *grads: Tensor):
-        """The transposed map."""
-        (grad,), (idx, w) = grads, ctx.saved_tensors
-        out = grad.new_zeros(ctx.count, grad.shape[1])
-        for s in range(0, len(idx), BLOCK):
-            piece = slice(s, s + BLOCK)
-            products = grad[piece, None] * w[piece, :, None]
-            out.index_add_(0, idx[piece].reshape(-1), products.flatten(0, 1))
-        return out, None, None
-
-
-def lookup(volume: Tensor, positions: Tensor, fast: bool) -> Tensor:
+def lookup(volume: Tensor, positions: Tensor) -> Tensor:
     """Trilinear lookup (batch, rays, samples, features) inside the box, clamped to the outermost centres."""
-    if not fast:
-        out = F.grid_sample(volume, positions[:, None], padding_mode="border", align_corners=False)
-        return out[:, :, 0].permute(0, 2, 3, 1)
-    batch, features, n = volume.shape[:3]
-    grid = ((positions + 1) * (0.5 * n) - 0.5).clamp(0, n - 1).flatten(1, 2)
-    low = grid.floor().clamp(max=n - 2)
-    part = torch.stack([1 - (grid - low), grid - low])  # (2, batch, p, 3)
-    x, y, z = low.long().unbind(-1)
-    first = ((torch.arange(batch)[:, None] * n + z) * n + y) * n + x
-    corners = [(k, j, i) for k in (0, 1) for j in (0, 1) for i in (0, 1)]
-    idx = first[..., None] + torch.tensor([(k * n + j) * n + i for k, j, i in corners])
-    w = torch.stack([part[k, ..., 2] * part[j, ..., 1] * part[i, ..., 0] for k, j, i in corners], -1)
-    rows = volume.permute(0, 2, 3, 4, 1).reshape(-1, features)
-    return LerpRows.apply(rows, idx.view(-1, 8), w.view(-1, 8)).view(*positions.shape[:3], features)
+    out = F.grid_sample(volume, positions[:, None], padding_mode="border", align_corners=False)
+    return out[:, :, 0].permute(0, 2, 3, 1)
 
 
 class Field(nn.Module):
     """Density softplus(raw - 1), rgb and other features of samples."""
 
-    def __init__(self, c: PaperConfig, fast: bool):
+    def __init__(self, c: PaperConfig):
         super().__init__()
-        self.fast, self.freqs = fast, c.direction_frequencies
+        self.freqs = c.direction_frequencies
         self.hidden = nn.Linear(c.encoder.base_width, c.field_width)
         self.density = nn.Linear(c.field_width, 1)
         self.feature = nn.Linear(c.field_width + 3 + 6 * c.direction_frequencies, c.num_features)
@@ -77,21 +39,12 @@ class Field(nn.Module):
         weight = self.feature.weight[:, self.hidden.out_features :]
         return F.linear(torch.cat([d, *waves], -1), weight, self.feature.bias)
 
-    def samples(self, x: Tensor, view: Tensor) -> tuple[Tensor, Tensor]:
-        """Density, and what is composited: rgb and features, or rgb and the hidden layer that they are linear in."""
+    def forward(self, x: Tensor, view: Tensor) -> tuple[Tensor, Tensor]:
+        """Density, and what is composited: rgb and features."""
         h = F.softplus(self.hidden(x))
-        weight = self.feature.weight[: 3 if self.fast else None, : self.hidden.out_features]
-        out = F.linear(h, torch.cat([self.density.weight, weight]))
-        rgb = torch.sigmoid(out[..., 1:4] + view[:, :, None, :3])
-        rest = h if self.fast else out[..., 4:] + view[:, :, None, 3:]
-        return F.softplus(out[..., 0] + self.density.bias - 1), torch.cat([rgb, rest], -1)
-
-    def finish(self, total: Tensor, acc: Tensor, view: Tensor) -> Tensor:
-        """Composited features (batch, rays, features), rgb on white."""
-        rest = total[..., 3:]
-        if self.fast:
-            rest = F.linear(rest, self.feature.weight[3:, : self.hidden.out_features]) + acc * view[..., 3:]
-        return torch.cat([total[..., :3] + 1 - acc, rest], -1)
+        out = F.linear(h, self.feature.weight[:, : self.hidden.out_features]) + view[:, :, None]
+        density = F.softplus(self.density(h)[..., 0] - 1)
+        return density, torch.cat([torch.sigmoid(out[..., :3]), out[..., 3:]], -1)
 
 
 def camera_rays(c2w: Tensor, focal: Tensor, size: int) -> tuple[Tensor, Tensor]:
@@ -129,9 +82,9 @@ def importance(weights: Tensor, u: Tensor, pad: float) -> Tensor:
 class Renderer(nn.Module):
     """Rays through a volume: coarse samples, fine samples where their weights are large, the union composited."""
 
-    def __init__(self, c: PaperConfig, fast: bool):
+    def __init__(self, c: PaperConfig):
         super().__init__()
-        self.c, self.fast, self.field = c, fast, Field(c, fast)
+        self.c, self.field = c, Field(c)
 
     def forward(self, volume: Tensor, c2w: Tensor, focal: Tensor) -> Tensor:
         """The feature image (batch, features, render, render); in training samples are jittered."""
@@ -146,7 +99,7 @@ class Renderer(nn.Module):
 
         def seen(t: Tensor) -> tuple[Tensor, Tensor]:
             places = o[:, :, None] + t[..., None] * d[:, :, None]
-            return field.samples(lookup(volume, places, self.fast), view)
+            return field(lookup(volume, places), view)
 
         coarse = near + (far - near) * strata(c.sampling.num_coarse)
         density, values = seen(coarse)
@@ -160,16 +113,8 @@ class Renderer(nn.Module):
         w = torch.zeros_like(t).scatter(-1, order, sorted_weights)  # values stay in the order of their sets
         parts = ((w[..., : c.sampling.num_coarse], values), (w[..., c.sampling.num_coarse :], more_values))
         total = sum(torch.matmul(x.unsqueeze(-2), y).squeeze(-2) for x, y in parts)
-        image = field.finish(total, w.sum(-1, True), view)
+        image = torch.cat([total[..., :3] + 1 - w.sum(-1, True), total[..., 3:]], -1)  # on white
         return image.transpose(1, 2).unflatten(2, (c.render_resolution, c.render_resolution))
-
-
-def fold_kernel(weight: Tensor) -> Tensor:
-    """The weight of the transposed convolution, 4 taps, stride 2, that is nearest x2 and a convolution of 3 taps."""
-    one = torch.tensor([[0.0, 0, 1, 1], [0, 1, 1, 0], [1, 1, 0, 0]])
-    for _ in range(2, weight.ndim):
-        weight = torch.tensordot(weight, one, dims=([2], [0]))  # the new taps go last: after all axes in their order
-    return weight.transpose(0, 1)
 
 
 class PointNet(nn.Module):
@@ -192,54 +137,31 @@ class PointNet(nn.Module):
 class Block(nn.Module):
     """Convolution of 3^3 taps, group norm, ReLU."""
 
-    def __init__(self, inputs: int, outputs: int, c: EncoderConfig, kind: str, fast: bool):
+    def __init__(self, inputs: int, outputs: int, c: EncoderConfig, kind: str):
         super().__init__()
         self.conv = nn.Conv3d(inputs, outputs, 3, 2 if kind == "down" else 1, 1, bias=False)
-        self.norm = nn.GroupNorm(c.num_groups, outputs)
-        self.up, self.fast = kind == "up", fast
+        self.norm, self.up = nn.GroupNorm(c.num_groups, outputs), kind == "up"
 
     def forward(self, x: Tensor) -> Tensor:
-        """Channels are last where the grid is large enough for it to help."""
-        if self.fast:
-            large = x.shape[2] > 4
-            x = x.contiguous(memory_format=torch.channels_last_3d if large else torch.contiguous_format)
-        if self.up and self.fast and x.shape[2] >= 4:
-            return F.relu(self.norm(F.conv_transpose3d(x, fold_kernel(self.conv.weight), stride=2, padding=1)))
+        """Nearest x2 before the convolution where it goes up."""
         return F.relu(self.norm(self.conv(F.interpolate(x, scale_factor=2) if self.up else x)))
-
-    def of_rows(self, rows: Tensor, cell: Tensor, index: Tensor, shape: tuple[int, ...]) -> Tensor:
-        """The block of a volume that holds `rows` in some voxels and zeros elsewhere."""
-        weight, n = self.conv.weight, shape[1]
-        taps = (rows @ weight.permute(1, 2, 3, 4, 0).flatten(1)).view(len(rows), 27, -1)
-        step = 1 - torch.cartesian_prod(*[torch.arange(3)] * 3)  # z, y, x
-        there = cell[:, None].flip(-1) + step
-        flat = index[:, None] + (step * torch.tensor([n * n, n, 1])).sum(-1)
-        flat = torch.where(((there >= 0) & (there < n)).all(-1), flat, shape[0] * n**3)  # a spare row
-        out = taps.new_zeros(shape[0] * n**3 + 1, weight.shape[0]).index_add(0, flat.view(-1), taps.flatten(0, 1))
-        return F.relu(self.norm(out[:-1].view(*shape, -1).permute(0, 4, 1, 2, 3)))
 
 
 class UNet(nn.Module):
-    """The 3D U-Net on the rows of occupied voxels; skip connections are sums."""
+    """The 3D U-Net; skip connections are sums."""
 
-    def __init__(self, c: EncoderConfig, fast: bool):
+    def __init__(self, c: EncoderConfig):
         super().__init__()
         widths = [c.base_width * 2**i for i in range(c.num_stages + 1)]
         pairs = list(zip(widths, widths[1:], strict=False))
-        self.fast, self.grid = fast, c.volume_resolution
-        self.stem = Block(c.point_features + 1, c.base_width, c, "same", fast)
-        self.down = nn.ModuleList(Block(a, b, c, "down", fast) for a, b in pairs)
-        self.same = nn.ModuleList(Block(b, b, c, "same", fast) for _, b in pairs)
-        self.up = nn.ModuleList(Block(b, a, c, "up", fast) for a, b in reversed(pairs))
+        self.stem = Block(c.point_features + 1, c.base_width, c, "same")
+        self.down = nn.ModuleList(Block(a, b, c, "down") for a, b in pairs)
+        self.same = nn.ModuleList(Block(b, b, c, "same") for _, b in pairs)
+        self.up = nn.ModuleList(Block(b, a, c, "up") for a, b in reversed(pairs))
 
-    def forward(self, rows: Tensor, cell: Tensor, index: Tensor, batch: int) -> Tensor:
+    def forward(self, x: Tensor) -> Tensor:
         """(batch, features, z, y, x)."""
-        shape = (batch, *[self.grid] * 3)
-        if self.fast:
-            x = self.stem.of_rows(rows, cell, index, shape)
-        else:
-            volume = rows.new_zeros(batch * self.grid**3, rows.shape[1]).index_add(0, index, rows)
-            x = self.stem(volume.view(*shape, -1).permute(0, 4, 1, 2, 3))
+        x = self.stem(x)
         skips = []
         for down, same in zip(self.down, self.same, strict=True):
             skips.append(x)
@@ -252,23 +174,18 @@ class UNet(nn.Module):
 class Upsampler(nn.Module):
     """The feature image to a picture of twice the size."""
 
-    def __init__(self, c: PaperConfig, fast: bool):
+    def __init__(self, c: PaperConfig):
         super().__init__()
-        self.fast, width = fast, c.upsampler_width
+        width = c.upsampler_width
         self.conv0 = nn.Conv2d(c.num_features, width, 3, 1, 1)
         self.conv1 = nn.Conv2d(width, width, 3, 1, 1)
         self.conv2 = nn.Conv2d(width, 32, 3, 1, 1)  # after nearest x2
         self.conv3 = nn.Conv2d(32, 3, 3, 1, 1)
-        if fast:
-            self.to(memory_format=torch.channels_last)
 
     def forward(self, x: Tensor) -> Tensor:
         """What the convolutions add to the enlarged rgb."""
         y = F.leaky_relu(self.conv1(F.leaky_relu(self.conv0(x), SLOPE)), SLOPE)
-        if self.fast:
-            y = F.conv_transpose2d(y, fold_kernel(self.conv2.weight), self.conv2.bias, stride=2, padding=1)
-        else:
-            y = self.conv2(F.interpolate(y, scale_factor=2))
+        y = self.conv2(F.interpolate(y, scale_factor=2))
         rgb = F.interpolate(x[:, :3], scale_factor=2, mode="bilinear", align_corners=False)
         return self.conv3(F.leaky_relu(y, SLOPE)) + rgb
 
@@ -276,11 +193,10 @@ class Upsampler(nn.Module):
 class Generator(nn.Module):
     """Points and materials to a volume, a volume and a camera to a picture."""
 
-    def __init__(self, c: PaperConfig, implementation: str = "fast"):
+    def __init__(self, c: PaperConfig):
         super().__init__()
-        fast = implementation == "fast"
-        self.c, self.points, self.unet = c, PointNet(c.encoder), UNet(c.encoder, fast)
-        self.renderer, self.upsampler = Renderer(c, fast), Upsampler(c, fast)
+        self.c, self.points, self.unet = c, PointNet(c.encoder), UNet(c.encoder)
+        self.renderer, self.upsampler = Renderer(c), Upsampler(c)
 
     def encode_volume(self, pos: Tensor, mat: Tensor) -> Tensor:
         """The volume of points (batch, n, 3) with materials (batch, n, 5)."""
@@ -295,7 +211,8 @@ class Generator(nn.Module):
         count = pos.new_zeros(batch * n**3).index_add_(0, index, inside)
         share = (inside / count[index].clamp_min(1))[:, None]
         rows = torch.cat([features, torch.ones_like(share)], 1) * share  # add up to [mean, occupancy] in a voxel
-        return self.unet(rows, cell.flatten(0, 1), index, batch)
+        volume = rows.new_zeros(batch * n**3, rows.shape[1]).index_add(0, index, rows)
+        return self.unet(volume.view(batch, n, n, n, -1).permute(0, 4, 1, 2, 3))
 
     def render_volume(self, volume: Tensor, c2w: Tensor, focal: Tensor) -> tuple[Tensor, Tensor]:
         """(picture, rgb at the resolution of the rays) of one view of each volume."""
@@ -343,11 +260,11 @@ def paper_config(c: TrainConfig) -> PaperConfig:
     return c.model
 
 
-def trainer(c: TrainConfig, implementation: str, compile: bool, adversarial: bool) -> Callable[[Batch], None]:
+def trainer(c: TrainConfig, compile: bool, adversarial: bool) -> Callable[[Batch], None]:
     """A training step: one forward of the generator, an update of the discriminator, an update of the generator."""
     model, groups = paper_config(c), paper_config(c).encoder.num_groups
     generator, judge = (
-        Generator(model, implementation).train(),
+        Generator(model).train(),
         Discriminator(c.loss.discriminator_width, groups).train(),
     )
     generator = compile_generator(generator) if compile else generator
@@ -378,13 +295,13 @@ def trainer(c: TrainConfig, implementation: str, compile: bool, adversarial: boo
     return step
 
 
-def function(c: TrainConfig, batch: Batch, mode: str, implementation: str, compile: bool) -> Callable[[], object]:
+def function(c: TrainConfig, batch: Batch, mode: str, compile: bool) -> Callable[[], object]:
     """One step, one encoding of the batch, or one view of each of its volumes."""
     torch.manual_seed(0)
     if mode.startswith("train"):
-        step = trainer(c, implementation, compile, adversarial=mode == "train")
+        step = trainer(c, compile, adversarial=mode == "train")
         return lambda: step(batch)
-    generator = Generator(paper_config(c), implementation).eval()
+    generator = Generator(paper_config(c)).eval()
     guard = torch.inference_mode
     if compile:
         generator, guard = compile_generator(generator), torch.no_grad

@@ -6,7 +6,7 @@ Each data set holds the same objects under one kind of light (`spnr-data generat
 `--lights room`), turned for every view and kept beside it.  Beside the network: the same discs and light alone, with
 and without the visibility of the points (split-sum shading, Karis 2013).  Nothing is rescaled to the reference.
 
-    OUT/results.json  OUT/table.md     dB, dB inside, FLIP, log error of linear light, of each light; margins
+    OUT/results.json  OUT/table.md     dB, dB inside, FLIP, log error of linear light, of each light
     OUT/gallery.png                    reference and picture of each light side by side, an object a row
 """
 
@@ -14,7 +14,6 @@ import dataclasses
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -33,7 +32,7 @@ from spnr_jax.kernels.imaging import srgb_to_linear
 from spnr_jax.kernels.records import Volume
 from spnr_jax.method.model import Model
 from spnr_jax.scoring.evaluation import Pictures
-from spnr_jax.scoring.report import Table, mean_row
+from spnr_jax.scoring.report import Table
 from spnr_jax.training.weights import load
 
 COLUMNS = {
@@ -46,7 +45,6 @@ DARK = 1e-3  # linear light below which the logarithm is not taken
 GALLERY = 8  # objects in the gallery
 NETWORK, DISCS, UNSHADOWED = "network", "discs and light", "discs and light, nothing hides anything"
 METHODS: dict[str, Quality] = {NETWORK: "best", DISCS: "draft", UNSHADOWED: "draft"}
-ROOM = "room"
 Found = dict[tuple[str, int], list[dict[str, dict[str, float]]]]  # light, points -> objects: method -> scores
 
 
@@ -149,27 +147,7 @@ def _write(out: Path, found: Found) -> None:
         rows=tuple(scores.score_row(label, objects, COLUMNS) for label, objects in rows.items()),
         note="Means over objects with 95 % intervals; pictures are never rescaled.",
     )
-    results_folder.write(out, {"objects": rows, "hardware": runtime.hardware()}, [table, _margins(found)])
-
-
-def _margins(found: Found) -> Table:
-    """The network beside split-sum shading, discs and light, and itself in the room; objects are paired."""
-
-    def decibels(objects: list[dict[str, Any]], method: str) -> np.ndarray:
-        return np.array([[of[method]["psnr"], of[method]["psnr_inside"]] for of in objects], float)
-
-    rows = []
-    for (light, count), objects in found.items():
-        own, room = decibels(objects, NETWORK), found.get((ROOM, count))
-        others = [decibels(objects, UNSHADOWED), decibels(objects, DISCS)]
-        others.append(decibels(room, NETWORK) if room else np.full_like(own, np.nan))
-        rows.append(mean_row(f"{light}, {count:,}", np.hstack([own - x for x in others]), (2,) * 6, "+"))
-    heads = tuple(
-        f"{what}, {than}"
-        for than in ("above split-sum", "above discs", "above the room")
-        for what in ("PSNR", "inside")
-    )
-    return Table(title="The network's margins, dB", heads=heads, rows=tuple(rows), note="Of the same objects.")
+    results_folder.write(out, {"objects": rows, "hardware": runtime.hardware()}, [table])
 
 
 if __name__ == "__main__":

@@ -4,10 +4,8 @@
 
 The networks draw the test objects of a data set (`spnr-data generate --spread even --points 65536 --resolution 512`)
 from so many of each object's first points, beside the same discs and light without a network (`draft`), and, if asked
-for, trimmed Poisson surfaces in Mitsuba (`--poisson`) and pictures that other programs, Pointersect for one, made of
-the same points and cameras (`--elsewhere FOLDER`, its FOLDER/POINTS/ID/000.png, RGBA, a view each).  A ball of one grey
-should be smooth, a plate red in front should show no blue.  Two columns are an oracle: the same colours under the
-reference's opacity.
+for, trimmed Poisson surfaces in Mitsuba (`--poisson`).  A ball of one grey should be smooth, a plate red in front
+should show no blue.  Two columns are an oracle: the same colours under the reference's opacity.
 
     OUT/results.json  OUT/table.md     `scoring/picture_scores.py`, of each network and number of points
     OUT/gallery.png   OUT/ID.png                 references and pictures beside each other, at full size
@@ -69,12 +67,8 @@ class SharpnessStudy:
     """Test objects (default: all)."""
     poisson: bool = False
     """Trimmed Poisson surfaces of the same points, path-traced by Mitsuba, too."""
-    elsewhere: tuple[Path, ...] = ()
-    """Folders of pictures that other programs made."""
     normals: bool = False
     """Give the networks the normals of the data set, too; without them they are estimated."""
-    shown: tuple[str, ...] = ()
-    """Objects whose pictures are written at full size (default: the first four)."""
 
 
 def main(options: SharpnessStudy) -> None:
@@ -87,14 +81,13 @@ def main(options: SharpnessStudy) -> None:
     compared = {label: contenders.of_model(*model) for label, model in models.items()}
     if options.poisson:
         compared["Poisson, trimmed"] = Renderer(dataset.settings).method("poisson_trimmed")
-    compared |= {folder.name: contenders.elsewhere(folder) for folder in options.elsewhere}
     rows, known = {}, {}
     for label, method in compared.items():
         for count in options.counts:
             row = f"{label}, {count:,}"
             rows[row] = partial(measure, options, method, count)
             known[row] = _score_known(options, label, models[label], count) if label in models else {}
-    shown = options.shown or names[:4]
+    shown = names[:4]  # at full size
     found = scores.measure_rows(options.out, rows, dataset, names, shown)
     _pictures(options, dataset, rows, shown)
     table = Table(
@@ -115,7 +108,7 @@ def measure(options: SharpnessStudy, method: Method, count: int, item: ObjectDat
     return means | seconds, np.asarray(pictures.image[0])
 
 
-def draw_timed(method: Method, item: ObjectData) -> tuple[Pictures, dict[str, float | None]]:
+def draw_timed(method: Method, item: ObjectData) -> tuple[Pictures, dict[str, float]]:
     """The pictures, and seconds to encode and of a view, once all is compiled."""
     for _ in range(1 + method.compiles):
         begin = perf_counter()
@@ -127,8 +120,7 @@ def draw_timed(method: Method, item: ObjectData) -> tuple[Pictures, dict[str, fl
         begin = perf_counter()
         pictures = method.draw(scene, item)
         render = (perf_counter() - begin) / len(item.images)
-    encode_s, render_s = (encode, render) if method.timed else (None, None)
-    return scores.enlarge(pictures, item.images.shape[1:3]), {"encode": encode_s, "render": render_s}
+    return scores.enlarge(pictures, item.images.shape[1:3]), {"encode": encode, "render": render}
 
 
 def oracle(item: ObjectData, pictures: Pictures) -> dict[str, list[float]]:
@@ -169,8 +161,7 @@ def _score_known(
 def _row(
     row: str, found: Sequence[Mapping[str, float | None]], known: Mapping[str, float | None]
 ) -> tuple[str, tuple[Cell, ...]]:
-    seconds = ([x for of in found if (x := of[what]) is not None] for what in ("encode", "render"))
-    times = (number(float(np.median(taken)) if taken else None, 2) for taken in seconds)
+    times = (number(float(np.median([of[what] for of in found])), 2) for what in ("encode", "render"))
     label, cells = scores.score_row(row, found, COLUMNS)
     return label, (*cells, *times, number(known.get("ball"), 4), number(known.get("plate"), 3))
 

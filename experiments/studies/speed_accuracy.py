@@ -1,18 +1,16 @@
 """What speed costs in quality: networks asked for pictures in many ways, and which of these nothing beats.
 
-    python -m experiments.studies.speed_accuracy DATA [surfels small poisson_trimmed RUN ...] [--sizes 128 512]
+    python -m experiments.studies.speed_accuracy DATA [surfels RUN ...] [--sizes 128 512]
 
 Each network draws test objects at every level of `--quality`, from other numbers of points, and in pictures of fewer
 pixels that are enlarged.  `draft` of the network over surfels is discs and light alone.  What a network with an
-upsampler draws at the one size that it has learnt is enlarged (or averaged).  Screened Poisson surfaces are drawn by
-Mitsuba as the references were.  Keeps every setting in a file of its own (an interrupted call goes on); writes the
-tables and front.png.
+upsampler draws at the one size that it has learnt is enlarged (or averaged).  Keeps
+every setting in a file of its own (an interrupted call goes on); writes the tables and front.png.
 
 ms a view   median over objects of the fastest of several drawings of all views, as of a film, the cloud encoded before;
             CPU time of all cores where that is what computes, so that other work on the machine does not count
 s to encode the same for a cloud, once, all compiled
-front       settings of a size that no other beats in both PSNR and ms a view; its knee lies farthest above the line
-            from its cheapest to its best, PSNR against the logarithm of the time
+front       settings of a size that no other beats in both PSNR and ms a view
 """
 
 import dataclasses
@@ -31,15 +29,15 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 
 from experiments import entry_point
-from experiments.comparison import clock, figures, poisson, results_folder, scores
-from experiments.comparison.contenders import Method, draw_volume
+from experiments.comparison import clock, figures, results_folder, scores
+from experiments.comparison.contenders import draw_volume
 from experiments.comparison.scores import Measured
 from experiments.comparison.study_objects import cut, test_objects
 from spnr_jax import cli
 from spnr_jax.config import NetworkConfig, Quality
 from spnr_jax.devices import runtime
 from spnr_jax.formats import data_sets
-from spnr_jax.formats.data_sets import Dataset, ObjectData
+from spnr_jax.formats.data_sets import ObjectData
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.records import Volume
 from spnr_jax.method.model import Model
@@ -81,14 +79,6 @@ def front(rows: Sequence[dict]) -> list[int]:
     return chosen
 
 
-def knee(rows: Sequence[dict], chosen: Sequence[int]) -> int:
-    """The row of the front that lies farthest above the line from its cheapest to its best."""
-    x = np.log([rows[i]["ms_view"] for i in chosen])
-    y = np.array([rows[i]["psnr"] for i in chosen])
-    x, y = ((v - v[0]) / (v[-1] - v[0]) if v[-1] != v[0] else np.zeros_like(v) for v in (x, y))
-    return chosen[int(np.argmax(y - x))]
-
-
 def table(rows: Sequence[dict], chosen: Sequence[int]) -> Table:
     """Settings of one size; those of the front are marked, and differences are to the network's best level."""
     heads = ("setting", "PSNR, dB", "SSIM", "FLIP", "IoU", "ms a view", "s to encode")
@@ -96,7 +86,7 @@ def table(rows: Sequence[dict], chosen: Sequence[int]) -> Table:
     made = []
     for i, row in enumerate(rows):
         base = next(r for r in rows if r["run"] == row["run"])
-        mark = " (front, knee)" if i == knee(rows, chosen) else " (front)" if i in chosen else ""
+        mark = " (front)" if i in chosen else ""
         change = () if row is base else (f"({row['psnr'] - base['psnr']:+.2f})",)
         cells = [text(row["name"] + mark), number(row["psnr"], 2, more=change)]
         made.append((Path(row["run"]).name, (*cells, *(number(row[name], n) for name, n in decimals.items()))))
@@ -108,23 +98,20 @@ GROUPS = {  # of settings, as the plot colours them
     "level": "#1d2330",
     "fewer pixels": "#d9480f",
     "points": "#868e96",
-    "surface": "#e8a200",
 }
 LABELS = {"psnr": "PSNR, dB", "flip": "FLIP (lower is better)", "iou": "opacity IoU"}
 
 
 @figures.drawing
-def plot(sizes: Sequence[tuple[Sequence[dict], Sequence[int], int]]) -> Figure:
-    """Quality against cost: of each size its rows, which of them make the front, and its knee."""
+def plot(sizes: Sequence[tuple[Sequence[dict], Sequence[int]]]) -> Figure:
+    """Quality against cost: of each size its rows, and which of them make the front."""
     figure = Figure(figsize=(14, 0.6 + 3.3 * len(sizes)))
-    for line, (rows, chosen, knee) in zip(figure.subplots(len(sizes), 3, squeeze=False), sizes, strict=True):
+    for line, (rows, chosen) in zip(figure.subplots(len(sizes), 3, squeeze=False), sizes, strict=True):
         for axes, y in zip(line, LABELS, strict=True):
             _scatter(axes, rows, y)
         first = line[0]
         first.set_title(f"{rows[0]['size']} x {rows[0]['size']}")
         first.plot([rows[i]["ms_view"] for i in chosen], [rows[i]["psnr"] for i in chosen], color="#adb5bd", zorder=2)
-        place = (rows[knee]["ms_view"], rows[knee]["psnr"])
-        first.annotate(f"knee: {rows[knee]['name']}", place, xytext=(8, -24), textcoords="offset points")
     handles = {label: h for axes in figure.axes for h, label in zip(*axes.get_legend_handles_labels(), strict=True)}
     figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=6)
     return figure
@@ -159,8 +146,7 @@ class SpeedAccuracy:
     data: tyro.conf.Positional[Path]
     """Folder of the data set; its test objects are drawn."""
     runs: tyro.conf.Positional[tuple[str, ...]] = ("surfels",)
-    """Networks: `surfels` of the package, run folders (the paper's, published methods) or files of weights; also
-    `poisson` and `poisson_trimmed`."""
+    """Networks: `surfels` of the package, run folders (the paper's, published methods) or files of weights."""
     out: Path = Path("runs/speed_accuracy")
     """Folder of the results."""
     sizes: tuple[int, ...] = (512, 128)
@@ -205,32 +191,26 @@ def main(options: SpeedAccuracy) -> None:
     names = test_objects(dataset, options.objects)
     asked = {"objects": names, "views": options.views, "runs": options.runs}
     results_folder.claim(options.out, "speed_accuracy", asked, dataset)
-    rows = [row for number in range(len(options.runs)) for row in rows_of(number, options, dataset, names)]
-    telling = sorted(rows, key=lambda row: row.setting.group not in ("level", "surface"))  # the most telling ones first
+    rows = [row for number in range(len(options.runs)) for row in rows_of(number, options, names)]
+    telling = sorted(rows, key=lambda row: row.setting.group != "level")  # the most telling ones first
     measured = scores.measure_rows(options.out, {row.place: row.measure for row in telling}, dataset, names)
     found = [row.summary(measured[row.place]) for row in rows]
     whole = {"hardware": runtime.hardware(), "load": runtime.load(), "date": time.strftime("%Y-%m-%d"), "rows": found}
     sizes = [of for size in options.sizes if (of := [row for row in found if row["size"] == size])]
-    fronts = [(of, front(of), knee(of, front(of))) for of in sizes]
-    tables = [table(of, chosen) for of, chosen, _ in fronts]
+    fronts = [(of, front(of)) for of in sizes]
+    tables = [table(of, chosen) for of, chosen in fronts]
     note = f"{len(names)} objects x {options.views} views, {options.counts[0]:,} points where nothing else is said."
     notes = [note, f"{whole['hardware']}, load {whole['load']}, {whole['date']}."]
     results_folder.write(options.out, whole, tables, notes, {"front.png": plot(fronts)})
 
 
-def rows_of(number: int, options: SpeedAccuracy, dataset: Dataset, names: Sequence[str]) -> list[Row]:
-    """All settings of a network or a surface at all sizes."""
+def rows_of(number: int, options: SpeedAccuracy, names: Sequence[str]) -> list[Row]:
+    """All settings of a network at all sizes."""
     run = options.runs[number]
-    measure_one: Callable[..., Measured]
-    if run in poisson.SURFACES:
-        counts = options.counts[:1] if options.quick else options.counts
-        ways = [Setting("surface", f"{count:,} points", count) for count in counts]
-        measure_one = partial(measure_surface, poisson.Renderer(dataset.settings).method(run))
-    else:
-        model = load(run)
-        ways = settings(model.config, options.counts)
-        ways = ways[:: max(len(ways) // 3, 1)] if options.quick else ways
-        measure_one = partial(measure, model, Volumes({}), names[:TIMED_OBJECTS])
+    model = load(run)
+    ways = settings(model.config, options.counts)
+    ways = ways[:: max(len(ways) // 3, 1)] if options.quick else ways
+    measure_one = partial(measure, model, Volumes({}), names[:TIMED_OBJECTS])
     return [
         Row(number, run, size, way, partial(measure_one, way, options.views, size))
         for size in options.sizes
@@ -255,15 +235,6 @@ def measure(
     if item.name in timed:
         found["ms_view"] = min(take_time(film)[1] for _ in range(REPEATS)) / len(item.images)
     return found, item.images[0]
-
-
-def measure_surface(method: Method, way: Setting, views: int, size: int, item: ObjectData) -> Measured:
-    """The same of a surface through the points, drawn by Mitsuba as the references were; loading it is in its time."""
-    item = cut(item, way.points, views, size)
-    asset, encode = take_time(partial(method.encode, item))
-    pictures, ms = take_time(partial(method.draw, asset, item))
-    times = {"s_encode": encode / 1e3, "ms_view": ms / len(item.images)}
-    return scores.mean_of(item, pictures, COLUMNS) | times, item.images[0]
 
 
 def take_time(work: Callable[[], Any]) -> tuple[Any, float]:

@@ -102,7 +102,7 @@ def write_whole(path: Path, data: bytes) -> None:
 def _in_its_place(path: Path) -> Iterator[Path]:
     """The path beside it where a file is written, which is renamed when that is done, or removed."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(f".unfinished-{path.name}")
+    unfinished = path.with_name(f".unfinished-{os.getpid()}-{path.name}")
     try:
         yield unfinished
         os.replace(unfinished, path)

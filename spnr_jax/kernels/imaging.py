@@ -11,7 +11,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from spnr_jax.kernels.numerics import clamp
 from spnr_jax.kernels.records import Rendering
 
 WHITE = 1.0  # background of every picture
@@ -21,7 +20,6 @@ WHITE = 1.0  # background of every picture
 
 LINEAR_LIMIT, ENCODED_LIMIT = 0.0031308, 0.04045  # where line and power meet
 SLOPE, SCALE, OFFSET, EXPONENT = 12.92, 1.055, 0.055, 2.4
-LEAST_OPACITY = 1e-6  # below it a pixel shows the background, whatever its colour
 
 
 def linear_to_srgb(linear: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
@@ -36,20 +34,6 @@ def srgb_to_linear(encoded: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
     power = encoded > ENCODED_LIMIT
     linear = ((jnp.where(power, encoded, 1.0) + OFFSET) / SCALE) ** EXPONENT
     return jnp.where(power, linear, encoded / SLOPE)
-
-
-def over(
-    light: Float[Array, "*batch channels"], opacity: Float[Array, "*batch 1"], background: float
-) -> Float[Array, "*batch channels"]:
-    """sRGB of an object on a background (sRGB), from its opacity and its linear light, weighted by that opacity."""
-    return opacity * linear_to_srgb(unpremultiply(light, opacity)) + (1 - opacity) * background
-
-
-def unpremultiply(
-    color: Float[Array, "*batch channels"], opacity: Float[Array, "*batch 1"]
-) -> Float[Array, "*batch channels"]:
-    """The colour in [0, 1] of what has this opacity, from the colour weighted by it."""
-    return clamp(color / jnp.maximum(opacity, LEAST_OPACITY), 0.0, 1.0)
 
 
 # --- sizes ------------------------------------------------------------------------------------------------------------
@@ -79,7 +63,8 @@ def _part(x: Array, axis: int, first: int, end: int) -> Array:
 
 def mean_of_squares(x: Float[Array, "*batch height width features"], side: int) -> Float[Array, "*batch h w features"]:
     """The mean of each square of side x side pixels."""
-    return jnp.mean(squares(x, side), axis=(-4, -2))
+    *batch, height, width, features = x.shape
+    return jnp.mean(x.reshape(*batch, height // side, side, width // side, side, features), axis=(-4, -2))
 
 
 def unfold(x: Float[Array, "*batch h w folded"], side: int) -> Float[Array, "*batch height width features"]:
@@ -89,26 +74,8 @@ def unfold(x: Float[Array, "*batch h w folded"], side: int) -> Float[Array, "*ba
     return x.reshape(*batch, side * height, side * width, features // side**2)
 
 
-def squares(x: Float[Array, "*batch height width features"], side: int) -> Array:
-    """The picture cut into squares of side x side pixels, (*batch, h, side, w, side, features)."""
-    *batch, height, width, features = x.shape
-    return x.reshape(*batch, height // side, side, width // side, side, features)
-
-
 def enlarge(rendering: Rendering, height: int, width: int) -> Rendering:
     """The rendering at a larger size: colours by cubics, depth and opacity between their neighbours."""
     color = jnp.clip(jax.image.resize(rendering.image, (height, width, 3), "cubic"), 0, 1)
     depth, acc = (jax.image.resize(x, (height, width), "linear") for x in (rendering.depth, rendering.acc))
     return dataclasses.replace(rendering, image=color, image_lr=color, depth=depth, acc=acc)
-
-
-def average(rendering: Rendering, side: int) -> Rendering:
-    """The rendering with every square of side x side pixels averaged: the light of the object, its opacity, the depth.
-
-    Colours are averaged as linear light of the object alone and laid on white as sRGB, as the references are.
-    """
-    opacity, depth = rendering.acc[..., None], rendering.depth[..., None]
-    straight = unpremultiply(rendering.image - (1 - opacity) * WHITE, opacity)
-    light, depth, acc = (mean_of_squares(x, side) for x in (opacity * srgb_to_linear(straight), depth, opacity))
-    image = over(light, acc, WHITE)
-    return Rendering(image=image, image_lr=image, depth=depth[..., 0], acc=acc[..., 0])

@@ -5,7 +5,7 @@ batch objects views points rays samples height width features.  Colours of mater
 in [0, 1].  Image sizes are static fields because they shape arrays.
 """
 
-from typing import Any, NamedTuple, no_type_check
+from typing import Any, no_type_check
 
 import jax
 import numpy as np
@@ -39,21 +39,15 @@ class PointCloud:
 @no_type_check
 @struct.dataclass
 class Camera:
-    """A pinhole camera: pose with OpenGL axes (x right, y up, looking along -z) and intrinsics in pixels."""
+    """A pinhole camera: pose with OpenGL axes (x right, y up, looking along -z) and intrinsics in pixels.
+
+    The size is static: arrays have it.  Only inside a program may it be traced.
+    """
 
     cam_to_world: Float[AnyArray, "*batch 3 4"]
     intrinsics: Float[AnyArray, "*batch 3 3"]
     height: int = struct.field(pytree_node=False)
     width: int = struct.field(pytree_node=False)
-
-
-class View(NamedTuple):
-    """A camera whose picture's size is a number like others, not one that programs are compiled for."""
-
-    cam_to_world: Float[AnyArray, "3 4"]
-    intrinsics: Float[AnyArray, "3 3"]
-    height: Int[AnyArray, ""]
-    width: Int[AnyArray, ""]
 
 
 @no_type_check

@@ -18,7 +18,6 @@ from scipy.sparse.csgraph import connected_components
 
 from spnr_jax.errors import UserError
 from spnr_jax.kernels.cloud_arrays import first_in_voxels, frame
-from spnr_jax.kernels.records import PointCloud
 
 Values = dict[str, np.ndarray]
 Box = Sequence[float | int]
@@ -44,34 +43,6 @@ class Plane:
     def holds(self, positions: Float[np.ndarray, "points 3"]) -> Bool[np.ndarray, " points"]:
         """True for points that belong to it."""
         return np.abs(positions @ self.normal - self.offset) <= self.thickness
-
-
-def cut_out(
-    cloud: PointCloud,
-    *,
-    crop: Box | None = None,
-    remove_plane: bool = False,
-    nth: int | None = None,
-    seed: int = 0,
-) -> tuple[PointCloud, list[str]]:
-    """The part of a cloud that is one object, and a line about each step: box, plane, nth largest cluster from 1.
-
-    `crop` is xmin ymin zmin xmax ymax zmax.  ValueError, which names the step, where nothing is left.
-    """
-    if np.ndim(cloud.positions) != 2:
-        raise UserError(f"cut_out takes one cloud, positions (points, 3); got shape {np.shape(cloud.positions)}")
-    left, lines = np.flatnonzero(np.asarray(cloud.mask)), []
-    positions = np.asarray(cloud.positions, np.float64)
-    if not len(left) or not (crop or remove_plane or nth):
-        return cloud, []
-    if crop is not None:
-        inside = in_box(positions[left], crop)
-        low, high = positions[left].min(axis=0), positions[left].max(axis=0)
-        lines.append(crop_box(int(inside.sum()), len(left), crop, low, high))
-        left = left[inside]
-    chosen, said = object_of(positions[left], np.zeros(3), remove_plane, nth, seed)
-    columns = {name: np.asarray(x)[left[chosen]] for name, x in vars(cloud).items() if x is not None}
-    return dataclasses.replace(cloud, **columns), lines + said
 
 
 def in_box(positions: Float[np.ndarray, "points 3"], box: Box) -> Bool[np.ndarray, " points"]:

@@ -22,7 +22,6 @@ from spnr_jax.config import NetworkConfig, RenderOptions, TrainConfig
 from spnr_jax.devices.runtime import QUICK
 from spnr_jax.errors import UserError
 from spnr_jax.kernels import cameras, cloud_arrays, losses
-from spnr_jax.kernels.imaging import average
 from spnr_jax.kernels.metrics import psnr
 from spnr_jax.kernels.records import Batch, Camera, Key, Light, PointCloud, Rendering, Volume
 from spnr_jax.methods import Outcome, network
@@ -52,16 +51,8 @@ def encode(variables: dict, cloud: PointCloud, *, config: NetworkConfig) -> Any:
 def render(
     variables: dict, scene: Any, camera: Camera, *, config: NetworkConfig, options: RenderOptions | None = None
 ) -> Rendering:
-    """Views of encoded scenes, samples at the middles of their strata, rays_per_side^2 rays a pixel averaged.
-
-    On a CPU a pixel of one object of the paper's network has the same bits for every block from 256 to 2048 rays: the
-    matrix products then add up in one order.
-    """
+    """Views of encoded scenes, samples at the middles of their strata."""
     options = options or RenderOptions(block=config.ray_block)
-    if (side := options.rays_per_side) > 1:
-        wide = cameras.resize(camera, side * camera.height, side * camera.width)
-        narrow = dataclasses.replace(options, rays_per_side=1)
-        return average(render(variables, scene, wide, config=config, options=narrow), side)
     return network(config).bind(variables).render(scene, camera, options)
 
 
@@ -161,8 +152,9 @@ def draw_each(
     quality: str,
 ) -> Iterator[Rendering]:
     """Views one after the other."""
+    del quality  # these networks have one
     for view, light in zip(views, lights, strict=True):
-        yield draw(variables, volume, view, light, config=config, options=options_of(config, quality, view.width))
+        yield draw(variables, volume, view, light, config=config)
 
 
 def draw(
@@ -172,7 +164,7 @@ def draw(
     light: Light | None = None,
     *,
     config: NetworkConfig,
-    options: RenderOptions,
+    options: RenderOptions | None = None,
 ) -> Rendering:
     """A view; UserError for a light, and for odd sizes of a network that doubles its pictures."""
     if light is not None:
@@ -180,21 +172,6 @@ def draw(
     if config.upsamples and (camera.height % 2 or camera.width % 2):
         raise UserError(f"this network doubles its pictures: {camera.width} x {camera.height} pixels must be even")
     return _render(variables, volume.scene, volume.centre, volume.scale, camera, config=config, options=options)
-
-
-def options_of(config: NetworkConfig, quality: str, width: int) -> RenderOptions:
-    """Pictures as the network was trained; at `best` and `trained` with as many rays."""
-    side = rays_per_side(config, width) if quality in ("best", "trained") else 1
-    return RenderOptions(block=config.ray_block, rays_per_side=side)
-
-
-def rays_per_side(config: NetworkConfig, size: int) -> int:
-    """Rays along each side of a pixel of a picture `size` pixels wide, so that they lie as close as in the training.
-
-    A network that renders pictures of any size has learnt what a ray of its training sees, a cone of one pixel there.
-    The pixels of a smaller picture are wider: each is the mean of the rays that it would have had in the training.
-    """
-    return max(round(config.image_resolution / size), 1) if config.any_size else 1
 
 
 # These are compiled whole: each operation outside of a jit would be compiled alone, 30 ms apiece at the first call.
@@ -217,7 +194,7 @@ def _render(
     camera: Camera,
     *,
     config: NetworkConfig,
-    options: RenderOptions,
+    options: RenderOptions | None,
 ) -> Rendering:
     """A view; depth in the cloud's units."""
     scene, inside = jax.tree.map(lambda x: x[None], (scene, cameras.in_box(camera, centre, scale)))

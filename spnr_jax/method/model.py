@@ -69,8 +69,7 @@ class Model:
         fewer pixels at `balanced`, which are enlarged.  Other networks know the light that they were trained in alone.
 
         The paper's network looks near the points alone at `draft`, `balanced` and `best`, with a quarter, half and all
-        of the samples of a ray, and renders as it was trained at `trained`.  At `best` a network without an upsampler
-        has several rays a pixel where pictures are smaller than those of the training.
+        of the samples of a ray, and renders as it was trained at `trained`.
         """
         _check_quality(quality)
         if camera.cam_to_world.ndim == 2:

@@ -291,18 +291,16 @@ def render(
     """Views one after the other, with the samples of a quality."""
     draw = partial(inference.draw, variables, volume, config=config)
     for view, light in zip(views, lights, strict=True):
-        yield draw(view, light, options=at_quality(config, quality, volume.reach, view.width))
+        yield draw(view, light, options=at_quality(config, quality, volume.reach))
 
 
-def at_quality(config: PaperConfig, quality: str, reach: int, width: int) -> RenderOptions:
-    """The options that render a picture so wide at a quality, with samples within `reach` voxels of points."""
-    options = inference.options_of(config, quality, width)
+def at_quality(config: PaperConfig, quality: str, reach: int) -> RenderOptions | None:
+    """The options that render a picture at a quality, with samples within `reach` voxels of points."""
     if quality == "trained":
-        return options
+        return None
     counts = config.sampling
     samples = max(round(SAMPLES[quality] * (counts.num_coarse + counts.num_fine)), 1)
-    sampling = SamplingConfig(num_coarse=samples, num_fine=0, reach=reach)
-    return dataclasses.replace(options, sampling=sampling, block=None)
+    return RenderOptions(sampling=SamplingConfig(num_coarse=samples, num_fine=0, reach=reach))
 
 
 def discriminator(config: TrainConfig) -> Discriminator:

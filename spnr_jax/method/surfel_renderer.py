@@ -33,7 +33,6 @@ from spnr_jax.kernels.records import (
     Rendering,
     Surfels,
     SurfelScene,
-    View,
     unstack,
 )
 from spnr_jax.nn import shader
@@ -95,7 +94,7 @@ def plan(scene: SurfelScene, camera: Camera) -> Plan:
     each = int(np.prod(batch[len(objects) :], dtype=int))
     scenes = unstack(jax.tree.map(lambda x: x.reshape(-1, *x.shape[len(objects) :]), scene))
     pairs = [(scenes[i // each], view) for i, view in enumerate(unstack(camera))]
-    doublings, side = common_resolution([resolution(*pair) for pair in pairs])
+    doublings, side = min((resolution(*pair) for pair in pairs), key=lambda of: (of[0], -of[1]))  # the finest
     needed = jax.device_get([count_sizes(*pair, doublings=doublings, side=side) for pair in pairs])
     return round_sizes(largest(needed), doublings, side)
 
@@ -113,18 +112,13 @@ def resolution(scene: SurfelScene, camera: Camera, share: float = 1.0) -> tuple[
     return doublings, 2 if pixels < finest else 1
 
 
-def common_resolution(resolutions: Iterable[tuple[int, int]]) -> tuple[int, int]:
-    """The finest of several."""
-    return min(resolutions, key=lambda of: (of[0], -of[1]))
-
-
 @partial(Kept, static=("doublings", "side"), returns=(Sizes,))
 def count_sizes(scene: SurfelScene, camera: Camera, *, doublings: int, side: int) -> Sizes:
     """What a view needs; the covered pixels are at most those of the rectangles around its discs."""
     whole = scale_camera(cameras.in_box(camera, scene.centre, scene.scale), doublings, side)
     corner, width, height = place_window(scene.surfels, whole)
     window = crop_camera(whole, corner, width, height)
-    foot = splatting.footprints(scene.surfels, View(window.cam_to_world, window.intrinsics, height, width))
+    foot = splatting.footprints(scene.surfels, window)
     return Sizes(width, height, splatting.count_entries(foot.covered), splatting.count_covered(foot, _most(whole)))
 
 
@@ -260,14 +254,9 @@ def rasterize(
 ) -> tuple[GBuffer, Int[Array, ""]]:
     """The G-buffer of a view, with what of the light arrives at each surfel; entries and pixels that did not fit."""
     found, lost = splatting.entries(surfels, camera, room=room)
-    buffer = blend_entries(found, surfels, light, camera, slots=slots)
-    return buffer, lost + jnp.maximum(splatting.count_covered_pixels(found) - slots, 0)
-
-
-def blend_entries(found: splatting.Entries, surfels: Surfels, light: Light, camera: Camera, *, slots: int) -> GBuffer:
-    """The G-buffer of a view's entries."""
     surfels = shader.turn_to_camera(surfels, camera)
-    return splatting.blend(found, surfels, shader.attributes(surfels, light, camera), camera, slots=slots)
+    buffer = splatting.blend(found, surfels, shader.attributes(surfels, light, camera), camera, slots=slots)
+    return buffer, lost + jnp.maximum(splatting.count_covered_pixels(found) - slots, 0)
 
 
 def look(

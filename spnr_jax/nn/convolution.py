@@ -6,14 +6,13 @@ native convolutions.  On a CPU (measurements: docs/lab/cpu_forms.md):
   3D   a sum over depth taps of 2D convolutions, or one matrix product for tiny volumes
   2D   native, except for matrix products for the gradients of 2-wide windows and the kernel gradients of 4-wide windows
        and of few output features; one matrix product for 128 input features or more
-  vmap over kernels   one run after the other; XLA's grouped convolution takes two to eight times as long
 
 Normalisations are batch statistics over the real points of padded clouds, and groups of channels of one volume.
 """
 
 import itertools
 from collections.abc import Callable
-from functools import cache, partial
+from functools import partial
 from typing import Any
 
 import flax.linen as nn
@@ -39,17 +38,17 @@ def conv(
     padding: int = 1,
     bf16: bool = False,
 ) -> Float[Array, "batch *out_space out"]:
-    """Convolution (correlation) in 2D or 3D with equal stride and padding on every axis.
+    """Convolution (correlation) in 2D or 3D with equal stride and padding on every axis; derivatives of both modes.
 
     With bf16 the convolution and its gradients run in bfloat16; what goes in and comes out keeps its own format.
     """
     result = x.dtype
     if bf16:
         x, kernel = x.astype(jnp.bfloat16), kernel.astype(jnp.bfloat16)
-    out = lax.platform_dependent(
-        x, kernel, cpu=_on_cpu(x.ndim, stride, padding), default=lambda x, k: _native(x, k, stride, padding)
+    on_cpu, native = (
+        partial(form, stride=stride, padding=padding) for form in (_conv2d_cpu if x.ndim == 4 else _conv3d_cpu, _native)
     )
-    return out.astype(result)
+    return lax.platform_dependent(x, kernel, cpu=on_cpu, default=native).astype(result)
 
 
 class Conv(nn.Module):
@@ -61,14 +60,14 @@ class Conv(nn.Module):
     def __call__(self, x: Float[Array, "batch height width in"]) -> Float[Array, "batch height width features"]:
         """A picture of the same size."""
         kernel = self.param("kernel", nn.initializers.lecun_normal(), (3, 3, x.shape[-1], self.features))
-        y = _of_pictures(x, jnp.asarray(kernel))
+        y = conv(x, jnp.asarray(kernel))
         return y + per_feature(self.param("bias", nn.initializers.zeros, (self.features,)), y)
 
 
 def run_by_run(function: Callable) -> Callable:
     """The function of trees of arrays, without a gradient; under vmap a loop on a CPU, elsewhere vmap as it is.
 
-    Runs that are computed one after the other keep their arrays in a CPU's caches.
+    A loss under vmap would have a kernel for each run: XLA's grouped convolutions take two to eight times as long.
     """
     single = jax.custom_batching.custom_vmap(function)
 
@@ -95,84 +94,6 @@ def run_by_run(function: Callable) -> Callable:
     return single
 
 
-def _of_pictures(x: Float[Array, "batch height width in"], kernel: Float[Array, "3 3 in out"]) -> Array:
-    """`conv` of pictures with derivatives of both modes; vmap over pictures is one convolution."""
-
-    def on_cpu(x: Array, kernel: Array) -> Array:
-        return _columns(x, kernel, 1, 1) if x.shape[-1] >= MANY_FEATURES else _conv_of_pictures(x, kernel)
-
-    return lax.platform_dependent(x, kernel, cpu=on_cpu, default=lambda x, kernel: _native(x, kernel, 1, 1))
-
-
-@jax.custom_jvp
-def _conv_of_pictures(x, kernel):
-    return _native(x, kernel, 1, 1)
-
-
-def _conv_of_pictures_jvp(primals, tangents):
-    """Written as the transposes of the gradients that are fast on a CPU: transposed again they are these gradients."""
-    out = _conv_of_pictures(*primals)
-    changes = [
-        jax.linear_transpose(lambda cotangent, of=of: of(*primals, cotangent, 1, 1), out)(tangent)[0]
-        for of, tangent in zip((_input_gradient, _kernel_gradient), tangents, strict=True)
-        if not isinstance(tangent, SymbolicZero)
-    ]
-    return out, sum(changes[1:], changes[0])
-
-
-_conv_of_pictures.defjvp(_conv_of_pictures_jvp, symbolic_zeros=True)
-
-
-@cache
-def _on_cpu(rank: int, stride: int, padding: int) -> Callable[[Array, Array], Array]:
-    """The CPU's form for inputs of so many axes."""
-    form = _conv2d_cpu if rank == 4 else _conv3d_cpu
-    return _with_gradients(lambda x, kernel: form(x, kernel, stride, padding))
-
-
-def _with_gradients(form: Callable[[Array, Array], Array]) -> Callable[[Array, Array], Array]:
-    """A convolution `form(x, kernel)` of which vmap computes one run after the other, in its gradients, too.
-
-    With its two gradients it is one of three maps, each linear in two out of input, kernel and what is given for the
-    output, and the gradients of each of the three are the other two: so there are gradients of any order.
-    """
-
-    @cache
-    def of_input(shape: tuple[int, ...]) -> Callable:
-        return _bilinear(
-            lambda kernel, cotangent: _transpose(lambda x: form(x, kernel), shape, cotangent),
-            lambda kernel, given, cotangent: (of_kernel(kernel.shape)(cotangent, given), convolved(cotangent, kernel)),
-        )
-
-    @cache
-    def of_kernel(shape: tuple[int, ...]) -> Callable:
-        return _bilinear(
-            lambda x, cotangent: _transpose(lambda kernel: form(x, kernel), shape, cotangent),
-            lambda x, given, cotangent: (of_input(x.shape)(cotangent, given), convolved(x, cotangent)),
-        )
-
-    convolved = _bilinear(
-        form, lambda x, kernel, cotangent: (of_input(x.shape)(kernel, cotangent), of_kernel(kernel.shape)(x, cotangent))
-    )
-    return convolved
-
-
-def _transpose(linear: Callable[[Array], Array], shape: tuple[int, ...], cotangent: Array) -> Array:
-    """The transpose of a linear function of an array of this shape, applied to the cotangent."""
-    _, pull_back = jax.vjp(linear, jnp.zeros(shape, cotangent.dtype))
-    return pull_back(cotangent)[0]
-
-
-def _bilinear(function: Callable[[Array, Array], Array], transposed: Callable[..., Any]) -> Callable:
-    """`function(a, b)` with the gradients `transposed(a, b, cotangent)`; under vmap a loop over what is mapped."""
-    single = run_by_run(function)
-    differentiable = jax.custom_vjp(lambda a, b: single(a, b))
-    differentiable.defvjp(
-        lambda a, b: (differentiable(a, b), (a, b)), lambda inputs, cotangent: transposed(*inputs, cotangent)
-    )
-    return differentiable
-
-
 def _native(x, kernel, stride, padding):
     n = x.ndim - 2
     return _plain(x, kernel, (stride,) * n, [(padding, padding)] * n)
@@ -197,33 +118,23 @@ def _pad(x, padding: int):
     return jnp.pad(x, ((0, 0), *[(padding, padding)] * (x.ndim - 2), (0, 0)))
 
 
-@partial(jax.custom_vjp, nondiff_argnums=(2, 3))
+@partial(jax.custom_jvp, nondiff_argnums=(2, 3))
 def _conv2d(x, kernel, stride, padding):
     return _native(x, kernel, stride, padding)
 
 
-def _conv2d_backward(stride, padding, inputs, cotangent):
-    """XLA's gradient for the input, or one matrix product; for the kernel XLA's, one per place, or one for all.
+def _conv2d_jvp(stride, padding, primals, tangents):
+    """Written as the transposes of the gradients that are fast on a CPU: transposed again they are these gradients."""
+    out = _conv2d(*primals, stride, padding)
+    changes = [
+        jax.linear_transpose(lambda cotangent, of=of: of(*primals, cotangent, stride, padding), out)(tangent)[0]
+        for of, tangent in zip((_input_gradient, _kernel_gradient), tangents, strict=True)
+        if not isinstance(tangent, SymbolicZero)
+    ]
+    return out, sum(changes[1:], changes[0])
 
-    With few output features the cotangents that every input pixel meets in the window are put side by side.
-    """
-    x, kernel = inputs
-    window, (features_in, features_out) = kernel.shape[0], kernel.shape[2:]
-    if window == 2 and (stride, padding) == (1, 1):
-        dx = _input_gradient_of_pairs(x, kernel, cotangent)
-    else:
-        dx = _input_gradient(x, kernel, cotangent, stride, padding)
-    if stride == 1 and features_out <= FEW_FEATURES:
-        met = list(_windows(_pad(cotangent, window - 1 - padding), window, 1))
-        columns = jnp.concatenate(met[::-1], axis=-1)
-        dk = x.reshape(-1, features_in).T @ columns.reshape(-1, window**2 * features_out)
-        return dx, dk.reshape(features_in, window, window, features_out).transpose(1, 2, 0, 3)
-    if window == 3 and features_out > FEW_FEATURES:
-        return dx, _kernel_gradient(x, kernel, cotangent, stride, padding)
-    flat = cotangent.reshape(-1, features_out)
-    seen = _windows(_pad(x, padding), window, stride)
-    dk = jnp.stack([s.reshape(flat.shape[0], -1).T @ flat for s in seen])
-    return dx, dk.reshape(kernel.shape)
+
+_conv2d.defjvp(_conv2d_jvp, symbolic_zeros=True)
 
 
 def _input_gradient(x, kernel, cotangent, stride, padding):
@@ -234,6 +145,8 @@ def _input_gradient(x, kernel, cotangent, stride, padding):
     `_kernel_gradient` 46 to 97.
     """
     window = kernel.shape[0]
+    if window == 2 and (stride, padding) == (1, 1):
+        return _input_gradient_of_pairs(x, kernel, cotangent)
     first = window - 1 - padding
     last = [n + padding - (m - 1) * stride - 1 for n, m in zip(x.shape[1:3], cotangent.shape[1:3], strict=True)]
     turned = jnp.swapaxes(jnp.flip(kernel, (0, 1)), 2, 3)
@@ -241,9 +154,23 @@ def _input_gradient(x, kernel, cotangent, stride, padding):
 
 
 def _kernel_gradient(x, kernel, cotangent, stride, padding):
-    """The convolution of the input, features as pictures, with the cotangents as one large window."""
+    """The convolution of the input, features as pictures, with the cotangents as one large window; or products.
+
+    With few output features the cotangents that every input pixel meets in the window are put side by side; for other
+    windows than of 3 there is one product per place in them.
+    """
+    window, (features_in, features_out) = kernel.shape[0], kernel.shape[2:]
+    if stride == 1 and features_out <= FEW_FEATURES:
+        met = list(_windows(_pad(cotangent, window - 1 - padding), window, 1))
+        columns = jnp.concatenate(met[::-1], axis=-1)
+        dk = x.reshape(-1, features_in).T @ columns.reshape(-1, window**2 * features_out)
+        return dk.reshape(features_in, window, window, features_out).transpose(1, 2, 0, 3)
+    if window != 3 or features_out <= FEW_FEATURES:
+        flat = cotangent.reshape(-1, features_out)
+        seen = _windows(_pad(x, padding), window, stride)
+        return jnp.stack([s.reshape(flat.shape[0], -1).T @ flat for s in seen]).reshape(kernel.shape)
     sizes = zip(x.shape[1:3], cotangent.shape[1:3], strict=True)
-    pads = [(padding, (m - 1) * stride + kernel.shape[0] - n - padding) for n, m in sizes]
+    pads = [(padding, (m - 1) * stride + window - n - padding) for n, m in sizes]
     large = jnp.transpose(cotangent, (1, 2, 0, 3))
     dk = _plain(jnp.transpose(x, (3, 1, 2, 0)), large, (1, 1), pads, kernel_dilation=(stride,) * 2)
     return jnp.transpose(dk, (1, 2, 0, 3))
@@ -255,9 +182,6 @@ def _input_gradient_of_pairs(x, kernel, cotangent):
     given = cotangent @ jnp.moveaxis(kernel, -1, 0).reshape(kernel.shape[-1], -1)
     given = given.reshape(*cotangent.shape[:3], 2, 2, features_in)
     return sum(given[:, 1 - i : 1 - i + height, 1 - j : 1 - j + width, i, j] for i in (0, 1) for j in (0, 1))
-
-
-_conv2d.defvjp(lambda x, k, stride, padding: (_native(x, k, stride, padding), (x, k)), _conv2d_backward)
 
 
 def _conv2d_cpu(x, kernel, stride, padding):

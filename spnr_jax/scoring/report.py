@@ -8,17 +8,15 @@ Images are PNGs inside the page (report.html is its template); nothing is loaded
 import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from spnr_jax.formats.images import depth_image, png_url, template, to_uint8, write_whole
+from spnr_jax.formats.images import depth_image, png_url, template, write_whole
 from spnr_jax.methods import label_of, to_dict
-from spnr_jax.scoring.evaluation import FLOORS, Evaluation, ObjectResult, median_view
-from spnr_jax.scoring.picture_scores import NO_LPIPS
-from spnr_jax.scoring.summary import interval
+from spnr_jax.scoring.evaluation import FLOORS, Evaluation, ObjectResult, Pictures, median_view
+from spnr_jax.scoring.picture_scores import NO_LPIPS, interval
 
 OTHERS = {  # what is shown beside the methods that are trained -> its name in tables and pictures
     "ours": "Ours",
@@ -39,19 +37,15 @@ ARROWS = {HIGHER: "\N{UPWARDS ARROW}", LOWER: "\N{DOWNWARDS ARROW}"}
 MISSING = {"lpips": NO_LPIPS, "iou": "n/a (no opacity)"}  # metric -> what stands where there is no number
 
 
-@dataclass(frozen=True, kw_only=True)
-class Cell:
-    """A text, smaller ones behind it, whether it is to stand out; and the number and interval that it shows."""
+class Cell(NamedTuple):
+    """A text, smaller ones behind it, and whether it is to stand out."""
 
     text: str
     small: tuple[str, ...] = ()
     best: bool = False
-    value: Any = None
-    interval: tuple[Any, Any] | None = None
 
 
-@dataclass(frozen=True, kw_only=True)
-class Table:
+class Table(NamedTuple):
     """Heads (with units), rows of a name and cells, and a line that says how to read them."""
 
     title: str
@@ -62,7 +56,7 @@ class Table:
 
 def text(value: object) -> Cell:
     """A cell that is no measurement."""
-    return Cell(text=str(value))
+    return Cell(str(value))
 
 
 def number(
@@ -78,12 +72,10 @@ def number(
 ) -> Cell:
     """A number (times a factor) and its interval; `sign` is "+" for differences, `more` stands behind the interval."""
     if value is None or not math.isfinite(value):
-        return Cell(text=missing)
-    form, small, ends = f"{sign},.{decimals}f", more, None
-    if interval is not None:
-        low, high = (factor * end for end in interval)
-        small, ends = (f"[{low:{form}}, {high:{form}}]", *more), (low, high)
-    return Cell(text=f"{factor * value:{form}}", small=small, best=best, value=factor * value, interval=ends)
+        return Cell(missing)
+    form = f"{sign},.{decimals}f"
+    ends = [f"[{', '.join(f'{factor * end:{form}}' for end in interval)}]"] if interval else []
+    return Cell(f"{factor * value:{form}}", (*ends, *more), best)
 
 
 def mean_row(
@@ -120,7 +112,7 @@ def quality(methods: Mapping[str, Mapping], metrics: Iterable[str]) -> dict[str,
 
 
 def difference(found: Mapping | None, metric: str) -> Cell:
-    """The cell of a paired difference (`summary.differences`), with its interval and p-value."""
+    """The cell of a paired difference (`picture_scores.differences`), with its interval and p-value."""
     if found is None:
         return text(MISSING.get(metric, "n/a"))
     p_value = found["p_value"]
@@ -156,29 +148,15 @@ DIFFERENCES_NOTE = (
 )
 
 
-@dataclass(frozen=True, kw_only=True)
-class GalleryRow:
-    """One view of one object, as the reference and as each method shows it, the networks first.
-
-    Pictures are (h, w, 3), uint8 or float sRGB in [0, 1]; depth and acc (h', w') float are the first network's.
-    """
-
-    name: str
-    reference: np.ndarray
-    images: Mapping[str, np.ndarray]
-    depth: np.ndarray
-    acc: np.ndarray
-
-
 def write_results(out: Path, evaluation: Evaluation, dataset_settings: dict, seconds: dict[str, float]) -> None:
     """Writes metrics.json and report.html into a folder."""
     metrics = {**evaluation.summary, "seconds": seconds, "per_category": evaluation.per_category}
     write_whole(out / "metrics.json", (json.dumps(metrics, indent=2, allow_nan=False) + "\n").encode())
     settings = {"training": to_dict(evaluation.config), "data": dataset_settings, **metrics["settings"]}
-    write_report(out / "report.html", settings, metrics, [gallery_row(result) for result in evaluation.gallery])
+    write_report(out / "report.html", settings, metrics, evaluation.gallery)
 
 
-def write_report(path: Path, settings: Mapping, metrics: Mapping, gallery: Sequence[GalleryRow]) -> None:
+def write_report(path: Path, settings: Mapping, metrics: Mapping, gallery: Sequence[ObjectResult]) -> None:
     """Write the page in one piece: of the content of metrics.json, and any nested mapping of settings.
 
     The first of the methods is the network that "NAME_minus" subtracts from.
@@ -189,14 +167,14 @@ def write_report(path: Path, settings: Mapping, metrics: Mapping, gallery: Seque
     tables = [_quality_table(methods)]
     tables += [_difference_table(first, minus)] if minus else []
     tables += [_category_table(per_category)] if per_category else []
-    shown = gallery[0].images if gallery else {}
+    shown = _shown(gallery[0]) if gallery else {}
     page = template(Path(__file__).with_name("report.html")).render(
         title=f"Sparse-point neural rendering: {describe_split(metrics)}",
         summary=_summary(metrics),
         gallery_heading=describe_split(metrics),
         gallery_note=GALLERY_NOTE,
         heads=["Reference", *(label(method) for method in shown), "Depth", "Opacity"],
-        gallery=[(row.name, _pictures(row)) for row in gallery],
+        gallery=[(result.name, _pictures(result)) for result in gallery],
         tables=tables,
         facts=_run_facts(metrics) | flatten(settings),
     )
@@ -210,26 +188,22 @@ def describe_split(metrics: Mapping) -> str:
 
 
 def _summary(metrics: Mapping) -> str:
-    """What the first network is, and how many dB it is above the others, in two sentences."""
+    """What the first network is, and how many dB it is above the trivial renderers."""
     methods, settings = metrics["methods"], metrics["settings"]
+    network, row = next(iter(methods.items()))
     best = max((name for name in FLOORS if name in methods), key=lambda name: methods[name]["psnr"])
-    network, *others = settings["networks"]
-    compared = [(lower_first(name), name) for name in others] + [("the white image", "white")]
-    compared += [(f"the best trivial renderer ({best})", best)]
-    above = ", ".join(f"{_above(metrics, name)} against {words}" for words, name in compared)
-    row = methods[network]
+    above = [(other, metrics[f"{network}_minus"][other]["psnr"]) for other in dict.fromkeys(("white", best))]
+    texts = [
+        " ".join([f"{found['mean']:+.2f} dB", *number(found["mean"], 2, found["interval"], sign="+").small])
+        + (" against the white image" if other == "white" else f" against the best trivial renderer ({other})")
+        for other, found in above
+    ]
     return (
         f"{label(network)}: preset {metrics['preset']}, {metrics['steps']} steps. "
         f"{settings['points']} points per object. "
-        f"{row['psnr']:.2f} dB PSNR on {row['views']} views of {row['objects']} {describe_split(metrics)}: {above}."
+        f"{row['psnr']:.2f} dB PSNR on {row['views']} views of {row['objects']} {describe_split(metrics)}: "
+        f"{', '.join(texts)}."
     )
-
-
-def _above(metrics: Mapping, other: str) -> str:
-    """How many dB the first network is above another method, with its interval."""
-    found = metrics[f"{next(iter(metrics['methods']))}_minus"][other]["psnr"]
-    ends = found["interval"]
-    return f"{found['mean']:+.2f} dB" + (f" [{ends[0]:+.2f}, {ends[1]:+.2f}]" if ends else "")
 
 
 def text_table(methods: Mapping[str, Mapping]) -> list[str]:
@@ -244,21 +218,6 @@ def text_table(methods: Mapping[str, Mapping]) -> list[str]:
     return lines
 
 
-def gallery_row(result: ObjectResult) -> GalleryRow:
-    """The view of an object whose PSNR is the median, of the first network."""
-    first = next(iter(result.pictures))
-    view = median_view(result.scores[first]["psnr"])
-    shown = result.pictures[first]
-    assert shown.depth is not None
-    return GalleryRow(
-        name=result.name,
-        reference=result.reference[view],
-        images={m: np.asarray(p.image[view]) for m, p in result.pictures.items() if m != "white"},
-        depth=np.asarray(shown.depth[view]),
-        acc=np.asarray(shown.acc[view]),
-    )
-
-
 def flatten(settings: Mapping, prefix: str = "") -> dict[str, object]:
     """The entries of a nested mapping under dotted names."""
     flat: dict[str, object] = {}
@@ -266,12 +225,6 @@ def flatten(settings: Mapping, prefix: str = "") -> dict[str, object]:
         inner = isinstance(value, Mapping) and value
         flat |= flatten(value, f"{prefix}{name}.") if inner else {f"{prefix}{name}": value}
     return flat
-
-
-def psnr(image: np.ndarray, reference: np.ndarray) -> float:
-    """PSNR in dB, at most 100, of two pictures as the page shows them (8 bit)."""
-    squared = float(np.mean((to_uint8(image) / 255 - to_uint8(reference) / 255) ** 2))
-    return -10 * math.log10(max(squared, 1e-10))
 
 
 def duration(seconds: float | int) -> str:
@@ -282,12 +235,21 @@ def duration(seconds: float | int) -> str:
     return f"{whole // 60} min {whole % 60} s" if whole < 3600 else f"{whole // 3600} h {whole % 3600 // 60} min"
 
 
-def _pictures(row: GalleryRow) -> list[tuple[str, str]]:
-    """Address and caption of each picture of a row of the gallery."""
-    pictures = [(row.reference, "")]
-    pictures += [(image, f"{psnr(image, row.reference):.1f}") for image in row.images.values()]
-    pictures += [(depth_image(row.depth, row.acc), ""), (row.acc, "")]
-    return [(png_url(image), caption) for image, caption in pictures]
+def _shown(result: ObjectResult) -> dict[str, Pictures]:
+    """The pictures of the gallery: of all methods but the white image, the networks first."""
+    return {method: pictures for method, pictures in result.pictures.items() if method != "white"}
+
+
+def _pictures(result: ObjectResult) -> list[tuple[str, str]]:
+    """Address and caption of each picture of an object: the view whose PSNR is the median, of the first network."""
+    first = next(iter(result.pictures))
+    view, own = median_view(result.scores[first]["psnr"]), result.pictures[first]
+    assert own.depth is not None
+    pictures = [(result.reference[view], "")]
+    for method, shown in _shown(result).items():
+        pictures.append((shown.image[view], f"{result.scores[method]['psnr'][view]:.1f}"))
+    pictures += [(depth_image(own.depth[view], own.acc[view]), ""), (own.acc[view], "")]
+    return [(png_url(np.asarray(image)), caption) for image, caption in pictures]
 
 
 def _quality_table(methods: Mapping[str, Mapping]) -> Table:
@@ -326,9 +288,5 @@ def _category_table(per_category: Mapping[str, Mapping]) -> Table:
 
 def _run_facts(metrics: Mapping) -> dict[str, object]:
     """What made the scores, and how long that took; the rest of metrics.json has tables of its own."""
-    shown = ("methods", f"{next(iter(metrics['methods']))}_minus", "per_category", "settings", "seconds")
-    facts = {name: value for name, value in metrics.items() if name not in shown}
-    times = {f"time to {stage}": duration(seconds) for stage, seconds in metrics.get("seconds", {}).items()}
-    if "time to total" in times:
-        times["time in total"] = times.pop("time to total")
-    return flatten(facts) | times
+    tables = ("methods", f"{next(iter(metrics['methods']))}_minus", "per_category", "settings")
+    return flatten({name: value for name, value in metrics.items() if name not in tables})

@@ -179,13 +179,6 @@ def find_rims(
     return right[None] * axes[0] + high[None] * axes[1], smaller(jax.lax.map(reach, quarters), rules.far)
 
 
-class Border(NamedTuple):
-    """Where another color begins within discs, and what it has more, as `Surfels` has it."""
-
-    border: Float[Array, "4 block"]
-    jump: Float[Array, "3 block"]
-
-
 def find_border(
     place: Float[Array, "k 2 block"],
     layer: Float[Array, "k block"],
@@ -193,10 +186,11 @@ def find_border(
     axes: Float[Array, "3 3 block"],
     colors: Float[Array, "k 3 block"],
     rules: Rules,
-) -> Border:
-    """The straight border of two colors, where there is one: discs of one color would fray it at the spacing.
+) -> dict[str, Array]:
+    """The fields `border` (4, block) and `jump` (3, block) of a straight border of two colors, where there is one.
 
-    All of it fades in; which neighbors are of the other color is a constant.
+    Discs of one color would fray it at the spacing.  All of it fades in; which neighbors are of the other color is a
+    constant.
     """
     squared = place[:, 0] ** 2 + place[:, 1] ** 2
     weight = layer * jnp.exp(-0.5 / rules.border_within**2 * squared)
@@ -213,7 +207,7 @@ def find_border(
     sure = _trust(own, other, rules) * _ramp(wrong, rules.wrong_side)
     border = [way[0][None] * axes[0] + way[1][None] * axes[1], (distance * spacing)[None]]
     jump = sure[None] * (_mean(other, CHANGE) - _mean(own, CHANGE))
-    return Border(jnp.concatenate(border), jump)
+    return {"border": jnp.concatenate(border), "jump": jump}
 
 
 def _ramp(values: Float[Array, " block"], ends: tuple[float, float]) -> Float[Array, " block"]:

@@ -311,7 +311,7 @@ def describe(
         rim, reach = discs.find_rims(ends, cuts, axes, rules)
         fitted = discs.find_border(place, weight, spacing, axes, colors, rules)
         own = layers.weigh_near(hood, raw, rules) * layers.weigh_height(layer)
-        return fitted._asdict() | {
+        return fitted | {
             "spacing": spacing,
             "shape": measure_shape(layers.measure_covariance(hood, raw, own)),
             "rim": rim,

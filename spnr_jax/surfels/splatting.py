@@ -27,7 +27,7 @@ from jaxtyping import Array, Float, Int
 
 from spnr_jax.kernels import numerics
 from spnr_jax.kernels.numerics import clamp, columns, larger, one_minus_exp, root, smaller, smoothstep
-from spnr_jax.kernels.records import AnyArray, Camera, GBuffer, Surfels, View
+from spnr_jax.kernels.records import AnyArray, Camera, GBuffer, Surfels
 
 # --- entries ----------------------------------------------------------------------------------------------------------
 
@@ -83,7 +83,7 @@ def _dot(a: Sequence[Array], b: Sequence[Array]) -> Array:
     return reduce(add, (x * y for x, y in zip(a, b, strict=True)))
 
 
-def footprints(surfels: Surfels, camera: Camera | View) -> Footprints:
+def footprints(surfels: Surfels, camera: Camera) -> Footprints:
     """Discs before a camera; those turned away, behind it or beside the picture cover no pixel."""
     rotation, eye = camera.cam_to_world[:, :3], camera.cam_to_world[:, 3]
     x, y, z = (

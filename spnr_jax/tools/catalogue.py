@@ -1,4 +1,4 @@
-"""Every file of a folder or pattern drawn in one go: `spnr render FOLDER`, here or by a Dask cluster's workers.
+"""Every file of a folder or pattern drawn in one go: `spnr render FOLDER`, here or by worker processes.
 
     OUT/a/x.ply/            what is drawn of a/x.ply below the folder, or of a pattern, below its first wildcard
     OUT/a/x.ply/drawn.json  written last: the file's size and time, a digest of options and networks, what was written
@@ -11,9 +11,9 @@ A file that cannot be drawn is listed with its reason; errors of the disk that i
 import dataclasses
 import hashlib
 import json
-import socket
 import sys
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
@@ -23,15 +23,16 @@ from tqdm import tqdm
 
 from spnr_jax.devices import runtime
 from spnr_jax.devices.runtime import run_ahead
+from spnr_jax.devices.workers import run_tasks
 from spnr_jax.errors import UserError, one_line
-from spnr_jax.formats.images import template, write_whole
+from spnr_jax.formats.images import check_place, template, write_whole
 from spnr_jax.formats.point_files import MESHES, READERS
 from spnr_jax.tools.commands import WILDCARDS, Render
-from spnr_jax.tools.pictures import check_writable, draw_all, load_network, prepare_cloud
-from spnr_jax.training.weights import SHIPPED, load, packaged_file, place
+from spnr_jax.tools.pictures import draw_all, load_network, prepare_cloud
+from spnr_jax.training.weights import load, packaged_file, place
 
 KINDS = tuple(dict.fromkeys((*READERS, *MESHES)))
-RECORD = "drawn.json"
+RECORD, PAGE = "drawn.json", "index.html"
 loaded = cache(load)  # of a process that draws many clouds
 
 
@@ -43,7 +44,7 @@ class Item(NamedTuple):
 
 
 class Batch(NamedTuple):
-    """What is needed for any file: the options, with absolute paths, and their digest."""
+    """What is needed for any file: the options and their digest."""
 
     options: Render
     digest: str
@@ -51,16 +52,18 @@ class Batch(NamedTuple):
 
 def render_catalogue(options: Render) -> Iterator[str]:
     """Draws what does not stand yet; yields what became of it.  ValueError if there is nothing that can be drawn."""
-    check_writable(options.out)
-    options = _with_absolute_paths(options)
+    check_place(options.out / PAGE)
     items = find(options.cloud, options.out)
     load_network(options, loaded)  # a run that is none is said before anything is read
     batch = Batch(options=options, digest=digest(options))
     missing = [item for item in items if not standing(batch, item)]
     faults: dict[str, str] = {}
+    here = ((item, draw_item(batch, item)) for item in missing)
+    outcomes = run_tasks(draw_item, batch, missing, options.workers) if options.workers else here
+    bar = tqdm(total=len(items), initial=len(items) - len(missing), unit="file", dynamic_ncols=True)
     try:
-        with tqdm(total=len(items), initial=len(items) - len(missing), unit="file", dynamic_ncols=True) as bar:
-            for item, fault in _outcomes(batch, missing):
+        with bar, closing(outcomes) as results:
+            for item, fault in results:
                 if fault is not None:
                     faults[item.name] = fault
                     tqdm.write(f"left out {item.cloud}: {fault}", file=sys.stderr)
@@ -74,15 +77,6 @@ def render_catalogue(options: Render) -> Iterator[str]:
     made = len(missing) - len(faults)
     yield f"drew {made} of {len(items)} files, {len(items) - len(missing)} stood, {len(faults)} left out"
     yield f"wrote {page}"
-
-
-def _with_absolute_paths(options: Render) -> Render:
-    """The options as processes in other folders understand them."""
-    run, light = options.run, options.lighting.light
-    run = run.absolute() if run and str(run) != SHIPPED else run
-    light = str(Path(light).absolute()) if light and Path(light).suffix else light  # a file, not a name of the package
-    lighting = dataclasses.replace(options.lighting, light=light)
-    return dataclasses.replace(options, out=options.out.absolute(), run=run, lighting=lighting)
 
 
 def find(pattern: Path, out: Path) -> list[Item]:
@@ -107,7 +101,7 @@ def find(pattern: Path, out: Path) -> list[Item]:
 
 def digest(options: Render) -> str:
     """What pictures depend on but for the file: the options, and the bytes of networks and of a map of light."""
-    asked = {k: v for k, v in dataclasses.asdict(options).items() if k not in ("cloud", "out", "workers", "cluster")}
+    asked = {k: v for k, v in dataclasses.asdict(options).items() if k not in ("cloud", "out", "workers")}
     found = hashlib.sha256(json.dumps(asked, default=str, sort_keys=True).encode())
     light = options.lighting.light
     run = place(options.run)
@@ -143,26 +137,8 @@ def _state(batch: Batch, item: Item) -> dict:
     return {"file": [status.st_size, status.st_mtime_ns] if status else [], "options": batch.digest}
 
 
-def _outcomes(batch: Batch, items: Sequence[Item]) -> Iterator[tuple[Item, str | None]]:
-    """Each file and, if it could not be drawn, why: as they are finished."""
-    cluster, workers = batch.options.cluster, batch.options.workers
-    if not items or (cluster is None and workers is None):
-        yield from ((item, draw_item(batch, item)) for item in items)
-        return
-    try:
-        from spnr_jax.devices.cluster import Died, connect, run_tasks
-    except ModuleNotFoundError as error:
-        raise UserError(f"--cluster and --workers need {error.name}; pip install 'spnr-jax[cluster]'") from None
-    with connect(cluster, min(workers or 1, len(items))) as client:
-        for item, fault in run_tasks(client, draw_item, batch, items):
-            died = isinstance(fault, Died)
-            yield item, f"the process that drew it died {fault.times} times; out of memory?" if died else fault
-
-
 def draw_item(batch: Batch, item: Item) -> str | None:
     """Draws a file, in any process; None, or why it cannot be drawn.  What is wrong with the process is raised."""
-    if batch.options.cluster and not item.cloud.exists():
-        raise UserError(f"{item.cloud}: worker {socket.gethostname()} does not see this file; mount it there")
     if standing(batch, item):  # another run was faster
         return None
     runtime.keep_arrays()
@@ -174,7 +150,7 @@ def draw_item(batch: Batch, item: Item) -> str | None:
     options = dataclasses.replace(batch.options, cloud=item.cloud)
     ready = None
     try:
-        ready = prepare_cloud(options, notes.append, loaded)
+        ready = prepare_cloud(options, notes.append, load_network(options, loaded))
         written = [
             path.name for one in run_ahead(draw_all(ready, options, folder / item.cloud.stem)) for path in one.paths
         ]
@@ -196,7 +172,7 @@ def write_page(batch: Batch, items: Sequence[Item], faults: Mapping[str, str]) -
         fault = faults.get(item.name) or (None if record["files"] else "not drawn yet")
         places = {name: quote(f"{item.name}/{name}", errors="surrogateescape") for name in record["files"]}
         entries.append({"name": item.name, "fault": fault, "places": places, "notes": record["notes"]})
-    page, text = batch.options.out / "index.html", template(Path(__file__).with_suffix(".html"))
+    page, text = batch.options.out / PAGE, template(Path(__file__).with_suffix(".html"))
     # the bytes of a name may be no text
     write_whole(page, text.render(entries=entries, faults=faults).encode(errors="replace"))
     return page

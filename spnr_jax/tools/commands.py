@@ -62,8 +62,8 @@ class SplatMaking:
     """Pictures of the network that the splats are made from."""
 
     @property
-    def is_given(self) -> dict[str, Any]:
-        """What `splat_making.splats_of` is asked for."""
+    def asked(self) -> dict[str, Any]:
+        """What `surfaces.splats_of` is asked for."""
         return {"degree": self.harmonics, "most": self.most_splats, "views": self.fitting_views}
 
     def __post_init__(self) -> None:
@@ -144,10 +144,7 @@ class Render(Reading):
     out: Path = Path("renders")
     """Output folder.  For a folder or pattern, files that have results there are skipped."""
     workers: int | None = None
-    """Processes that render the files of a folder or pattern (default: this one; needs the extra `cluster`)."""
-    cluster: str | None = None
-    """Address of a Dask scheduler whose workers render instead.  They must find the files and OUT under the same
-    names."""
+    """Processes that render the files of a folder or pattern (default: this one)."""
     cut: tyro.conf.OmitArgPrefixes[Cut] = Cut()
     """Select one object of a scene before cleaning."""
     transparent_parts: Literal["opaque", "skip"] = "opaque"
@@ -182,8 +179,6 @@ class Render(Reading):
     """Frames per second of the turntable."""
     mesh: bool = False
     """Also write the surface as .glb, with the materials of the nearest points."""
-    grid_resolution: int | None = None
-    """Grid points along each side for --mesh (default: 192)."""
     splats: Literal["none", "ply", "spz"] = "none"
     """Also write Gaussian splats."""
     making: SplatMaking = field(default_factory=SplatMaking)
@@ -205,8 +200,6 @@ class Render(Reading):
         at_least(self, 0, "views")
         at_least(self, 1, "frames", "fps", "workers")
         within(self, -90, 90, "elevation")
-        within(self, 8, 512, "grid_resolution")
-        require(None in (self.workers, self.cluster), "--workers and --cluster: give one of them")
         if self.resolution is not None and (self.resolution < 16 or self.resolution % 4):
             raise UserError(f"--resolution must be a multiple of 4 of at least 16, got {self.resolution}")
         if self.transparent and self.lighting.background != "white":
@@ -228,15 +221,6 @@ class Train:
     random)."""
     schedule: tyro.conf.OmitArgPrefixes[Schedule] = Schedule()
     """What the run writes beside its weights."""
-    distributed: bool = False
-    """This is one of several processes that a launcher started (SLURM, Open MPI, Kubernetes) and that train
-    together."""
-    coordinator: str | None = None
-    """Without a launcher: HOST:PORT of process 0; with --num-processes and --process-id."""
-    num_processes: int | None = None
-    """Number of processes that train together."""
-    process_id: int | None = None
-    """Rank of this process, from 0."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -257,8 +241,8 @@ class Evaluate:
 
 @dataclass(frozen=True, kw_only=True)
 class Export:
-    """Write a network as a weights file, as functions for JAX without this package, and as StableHLO.  Or write a
-    cloud's object: with --splats as Gaussian splats, with --mesh as its surface."""
+    """Write a surfel network as a weights file, as functions for JAX without this package, and as StableHLO.  Or write
+    a cloud's object: with --splats as Gaussian splats, with --mesh as its surface."""
 
     run: tyro.conf.Positional[Path]
     """Run folder of the network to export; with --splats or --mesh, a cloud that `spnr render` reads."""
@@ -277,8 +261,8 @@ class Export:
     clean: Literal["auto", "off", "strong"] = "auto"
     """As for `spnr render`, for --splats and --mesh."""
     out: Path = Path("exported")
-    """Folder for weights.npz, encode.jax, render.jax, both as .stablehlo, and export.json with their inputs and
-    outputs; for `surfels` also light.npz, the room."""
+    """Folder for weights.npz, encode.jax, render.jax, both as .stablehlo, export.json with their inputs and outputs,
+    and light.npz, the room."""
     num_points: int | None = None
     """Exact number of points of a cloud, padding included (default: 1,024).  With --splats and --mesh, points kept of a
     larger cloud (default: 16,384)."""
@@ -286,8 +270,6 @@ class Export:
     """Pixels along each side (default: the size of the training)."""
     quality: Literal["draft", "balanced", "best", "trained"] = "best"
     """As for `spnr render`."""
-    reach: int = 4
-    """Sampling radius around the points in voxels, 1 to 4: 1.6 times their median spacing, rounded up, is lossless."""
     platforms: tuple[Literal["cpu", "cuda", "rocm", "tpu"], ...] = ("cpu",)
     """Target platforms."""
 

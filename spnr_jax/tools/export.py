@@ -1,37 +1,74 @@
-"""A trained network as bytes that need JAX alone: `encode` and `render` as serialised StableHLO, weights included.
+"""The default network as bytes that need JAX alone: `encode` and `render` as serialised StableHLO, weights included.
 
     encode, render = (load_exported(content) for content in (export_encode(model), export_render(model)))
-    picture = render(encode(cloud), camera, light)  # without the light of a ray-marching network
+    picture = render(encode(cloud), camera, light)
 
-Inputs and outputs are dicts of arrays, so no class of this package is needed where they are used; there
-`jax.export.deserialize(content).call` does what `load_exported` does.  All sizes are fixed, those of one bucket:
+They are `spnr_jax.encode` and `spnr_jax.render` over dicts of arrays, so no class of this package is needed where they
+are used; there `jax.export.deserialize(content).call` does what `load_exported` does.
 
     cloud       positions (points, 3) in any unit, y up; base_color (points, 3) linear; roughness, metallic (points,);
                 mask (points,) bool, False for padding.  At least one point is real, and all real ones are finite
-    volume      what the network makes of a cloud, to be passed on: scene, and the box around it, centre (3,), scale ()
+    volume      the scene of `spnr_jax.encode`, to be passed on: surfels, spacing, centre, scale
     camera      cam_to_world (3, 4) in the cloud's frame and unit, OpenGL axes; intrinsics (3, 3) in pixels
-    picture     image (h, w, 3) sRGB on white; image_lr, depth, acc at the size of the volume rendering
+    light       tables (7, 32, 64, 3): those of `Light`, linear in the light, so sums and multiples are lights
+    picture     image (h, w, 3) sRGB on white; depth, acc (h, w); overflow (): above 0 the plan was too small
 
-What differs for the default network, over surfels, stands in `surfel_export.py`.
+Sizes are fixed when it is exported: the number of points, padding included, and the plan of the picture.  The neighbors
+are found in the exported function, by all distances, a block of points at a time.
 """
 
+import json
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from flax.serialization import to_state_dict
 from jax import export
+from jaxtyping import Array, Bool, Float, Int
 
-from spnr_jax.config import Quality
-from spnr_jax.errors import UserError
+from spnr_jax.config import Quality, SurfelConfig
+from spnr_jax.errors import UserError, require
+from spnr_jax.formats.images import write_whole
 from spnr_jax.formats.npz import pack_arrays
-from spnr_jax.kernels.records import LARGEST_REACH
+from spnr_jax.kernels.cloud_arrays import plain_cloud
+from spnr_jax.kernels.records import AnyArray, Camera, Light, PointCloud, Surfels, SurfelScene
+from spnr_jax.method import surfel_method, surfel_renderer
 from spnr_jax.method.model import Model
 from spnr_jax.method.surfel_renderer import Plan
-from spnr_jax.methods import method_of
-from spnr_jax.surfels import lighting
+from spnr_jax.surfels import geometry, lighting
+from spnr_jax.surfels.layers import NEIGHBORS
+from spnr_jax.surfels.sides import spiral
+from spnr_jax.tools.commands import Export
+from spnr_jax.training import weights
+
+RADIUS = 0.8  # of the ball in the box whose pictures the sizes are those of: as much surface as a cube has
+BLOCK = 256  # points whose distances to all are in memory at once
 
 Arrays = dict[str, Any]
+
+
+def export_network(options: Export) -> str:
+    """Writes what `spnr export RUN` does; a line about it."""
+    trained, where, out = weights.read_trained(options.run), options.platforms, options.out
+    model = Model(config=trained.config.model, variables=trained.variables)
+    _check_exportable(model)
+    points, size = options.num_points or 1024, options.resolution
+    functions = {
+        "encode": export_encode(model, num_points=points, platforms=where),
+        "render": export_render(model, resolution=size, quality=options.quality, num_points=points, platforms=where),
+    }
+    weights.write_weights(out / "weights.npz", trained)
+    room = {"tables": np.asarray(lighting.room_light().tables)}
+    write_whole(out / "light.npz", pack_arrays(room, compressed=True))
+    for name, content in functions.items():
+        write_whole(out / f"{name}.jax", content)
+        write_whole(out / f"{name}.stablehlo", _deserialise(content).mlir_module_serialized)
+    signatures = {name: signature(content) for name, content in functions.items()}
+    write_whole(out / "export.json", (json.dumps(signatures, indent=1) + "\n").encode())
+    return f"wrote the weights, encode and render to {out} (export.json says what they take and give)"
 
 
 def export_encode(model: Model, *, num_points: int = 1024, platforms: Sequence[str] | None = None) -> bytes:
@@ -39,10 +76,9 @@ def export_encode(model: Model, *, num_points: int = 1024, platforms: Sequence[s
 
     `platforms` are those that may run it, out of cpu, cuda, rocm, tpu; None is the one that JAX uses here.
     """
-    if num_points < 1:
-        raise UserError(f"num_points must be at least 1, got {num_points}")
-    encode, shapes = method_of(model.config).export_encode(model, num_points=num_points)
-    return _serialise(encode, platforms, *shapes)
+    _check_exportable(model)
+    require(num_points >= 1, f"num_points must be at least 1, got {num_points}")
+    return _serialise(partial(encode, model.params), platforms, cloud_shapes(num_points))
 
 
 def export_render(
@@ -50,32 +86,27 @@ def export_render(
     *,
     resolution: int | None = None,
     quality: Quality = "best",
-    reach: int = LARGEST_REACH,
     num_points: int = 1024,
     plan: Plan | None = None,
     platforms: Sequence[str] | None = None,
 ) -> bytes:
-    """The serialised function `(volume, camera) -> picture` for square pictures, by default of the network's size.
+    """The serialised function `(volume, camera, light) -> picture` for square pictures, by default of the network's
+    size, for scenes of `num_points` points.
 
-    Of the default network `(volume, camera, light) -> picture`, for scenes of `num_points` points and with a plan's
-    sizes: by default those of a ball of so many points, with room to spare.  The others:
-
-    `reach` is how far from points it looks, in voxels: `Model.encode` finds `volume.reach` from how densely the points
-    lie, here it is fixed; less is quicker, and too little leaves holes.  `platforms` as for `export_encode`.
+    The sizes are those of a plan: by default of a ball of so many points, with room to spare.  `platforms` as for
+    `export_encode`.
     """
+    _check_exportable(model)
     size = model.config.image_resolution if resolution is None else resolution
-    if size < 16 or size % 4:
-        raise UserError(f"resolution must be a multiple of 4 of at least 16, got {size}")
-    if not 1 <= reach <= LARGEST_REACH:
-        raise UserError(f"reach must be 1 to {LARGEST_REACH} voxels, got {reach}")
-    make = method_of(model.config).export_render
-    render, shapes = make(model, num_points=num_points, size=size, quality=quality, reach=reach, plan=plan)
-    return _serialise(render, platforms, *shapes)
-
-
-def room_light() -> bytes:
-    """The package's room as the light that the `render` of the default network takes: an .npz of its tables."""
-    return pack_arrays({"tables": np.asarray(lighting.room_light().tables)}, compressed=True)
+    require(size >= 16 and size % 4 == 0, f"resolution must be a multiple of 4 of at least 16, got {size}")
+    if quality == "balanced":
+        raise UserError("balanced draws fewer pixels and enlarges them; export a smaller resolution")
+    params = None if quality == "draft" else model.params
+    draw = partial(render, params, size=size, plan=plan or make_plan(model, num_points, size))
+    volume = jax.eval_shape(partial(encode, model.params), cloud_shapes(num_points))
+    camera = {"cam_to_world": _floats(3, 4), "intrinsics": _floats(3, 3)}
+    light = {"tables": _floats(7, lighting.HEIGHT, lighting.WIDTH, 3)}
+    return _serialise(draw, platforms, volume, camera, light)
 
 
 def load_exported(content: bytes) -> Callable[..., Arrays]:
@@ -83,23 +114,19 @@ def load_exported(content: bytes) -> Callable[..., Arrays]:
     return jax.jit(_deserialise(content).call)
 
 
-def stablehlo(content: bytes) -> bytes:
-    """The StableHLO module in exported bytes, as a portable artefact for other compilers than JAX's."""
-    return _deserialise(content).mlir_module_serialized
-
-
 def signature(content: bytes) -> dict[str, Any]:
     """Shapes and types of what an exported function takes (a list, for its arguments) and gives, and its platforms."""
     exported = _deserialise(content)
     (arguments, _), outputs = (
-        jax.tree.map(_describe, jax.tree.unflatten(tree, shapes))
+        jax.tree.map(lambda x: {"shape": list(x.shape), "dtype": str(x.dtype)}, jax.tree.unflatten(tree, shapes))
         for tree, shapes in ((exported.in_tree, exported.in_avals), (exported.out_tree, exported.out_avals))
     )
     return {"inputs": list(arguments), "outputs": outputs, "platforms": list(exported.platforms)}
 
 
-def _describe(array: jax.core.ShapedArray) -> dict[str, Any]:
-    return {"shape": list(array.shape), "dtype": str(array.dtype)}
+def _check_exportable(model: Model) -> None:
+    name = model.config.method
+    require(isinstance(model.config, SurfelConfig), f"a network of method {name} cannot be exported; only surfels can")
 
 
 def _serialise(function: Callable[..., Arrays], platforms: Sequence[str] | None, *shapes: Arrays) -> bytes:
@@ -111,3 +138,52 @@ def _deserialise(content: bytes) -> export.Exported:
         return export.deserialize(bytearray(content))
     except Exception as error:  # noqa: BLE001 - flatbuffers and JAX raise many kinds for bytes that are something else
         raise UserError(f"not a function that JAX exported ({type(error).__name__}); export it again") from None
+
+
+def encode(params: dict, cloud: Arrays) -> Arrays:
+    """The scene of a cloud as a dict of arrays; pure."""
+    points = PointCloud(**cloud)
+    near = nearest(points.positions, points.mask)
+    return dict(to_state_dict(geometry.encode(params, points, near)))
+
+
+def render(params: dict | None, volume: Arrays, camera: Arrays, light: Arrays, *, size: int, plan: Plan) -> Arrays:
+    """The picture of a scene as a dict of arrays; pure."""
+    scene = SurfelScene(**volume | {"surfels": Surfels(**volume["surfels"])})
+    seen = Camera(**camera, height=size, width=size)
+    drawn = surfel_renderer.render(params, scene, seen, Light(**light), plan=plan)
+    return {name: getattr(drawn, name) for name in ("image", "depth", "acc", "overflow")}
+
+
+def nearest(positions: Float[AnyArray, "points 3"], mask: Bool[AnyArray, " points"]) -> Int[Array, "points 20"]:
+    """`spnr_jax.neighbors` in JAX: the nearest points of each, itself first, -1 for none, by all distances."""
+    positions, mask = jnp.asarray(positions), jnp.asarray(mask)
+    count = min(NEIGHBORS, len(mask))
+
+    def of_one(number: Int[Array, ""]) -> Int[Array, " count"]:
+        apart = jnp.sum((positions - positions[number][None]) ** 2, axis=-1)
+        apart = jnp.where(mask, apart, jnp.inf).at[number].set(-1.0)
+        least, found = jax.lax.top_k(-apart, count)
+        return jnp.where(jnp.isfinite(least) & mask[number], found, -1).astype(jnp.int32)
+
+    found = jax.lax.map(of_one, jnp.arange(len(mask)), batch_size=min(BLOCK, len(mask)))
+    return jnp.pad(found, ((0, 0), (0, NEIGHBORS - count)), constant_values=-1)
+
+
+def make_plan(model: Model, num_points: int, size: int) -> Plan:
+    """Sizes for pictures of any object of so many points from where `Model.camera` stands: with room to spare."""
+    ball = plain_cloud(np.asarray(RADIUS * spiral(num_points), np.float32))
+    scene = surfel_method.encode_in_box(ball)
+    made = surfel_renderer.plan(scene, model.camera(scene, resolution=size))
+    side = surfel_renderer.round_up(-(-size * made.side // 2**made.doublings) + surfel_renderer.MARGIN)
+    return made._replace(width=side, height=side, entries=2 * made.entries, slots=side * side)
+
+
+def cloud_shapes(num_points: int) -> Arrays:
+    """What `encode` takes."""
+    vectors, scalars, mask = _floats(num_points, 3), _floats(num_points), jax.ShapeDtypeStruct((num_points,), np.bool_)
+    return {"positions": vectors, "base_color": vectors, "roughness": scalars, "metallic": scalars, "mask": mask}
+
+
+def _floats(*shape: int) -> jax.ShapeDtypeStruct:
+    return jax.ShapeDtypeStruct(shape, np.float32)

@@ -16,10 +16,9 @@ Depth and opacity have the resolution of the volume rendering, which an upsample
 import dataclasses
 import io
 import json
-import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cache, partial, reduce
+from functools import partial, reduce
 from operator import add
 from pathlib import Path
 from typing import NamedTuple
@@ -39,12 +38,13 @@ from spnr_jax.formats.images import read_light
 from spnr_jax.kernels.cameras import camera_rays
 from spnr_jax.kernels.imaging import linear_to_srgb
 from spnr_jax.kernels.records import Camera, Light, Rendering, Volume
-from spnr_jax.method.model import Model
+from spnr_jax.method.model import DISTANCE, Model
 from spnr_jax.methods import method_of
 from spnr_jax.surfels.lighting import background
 from spnr_jax.surfels.skies import sun
-from spnr_jax.tools import depth_maps
+from spnr_jax.tools import surfaces
 from spnr_jax.tools.commands import Lighting, Render
+from spnr_jax.tools.surfaces import surface_depth
 from spnr_jax.training.weights import SHIPPED, load
 
 SUN = (1.6, 1.5, 1.35)  # irradiance over pi of what faces the sun of --sun, slightly warm
@@ -57,14 +57,9 @@ def light_of_options(options: Lighting, read: Callable[[str], Light] = read_ligh
     return 2.0**options.exposure * reduce(add, parts)
 
 
-def takes_light(model: Model) -> bool:
-    """Whether the network draws in any light."""
-    return method_of(model.config).takes_light
-
-
 def check_takes_light(model: Model, asked: Sequence[str], run: Path | None) -> None:
     """ValueError, naming the options, where something is asked of the light and the network takes none."""
-    if asked and not takes_light(model):
+    if asked and not method_of(model.config).takes_light:
         raise UserError(
             f"{', '.join(asked)}: the network of --run {run} knows the light of its training alone; "
             f"leave {'it' if len(asked) == 1 else 'them'} out, or --run"
@@ -89,6 +84,8 @@ def _behind(light: Light, camera: Camera) -> Float[Array, "height width 3"]:
 
 FIRST_AZIMUTH = 30.0  # degrees of the first still: a view that shows front and side
 INVISIBLE = 1 / 255  # opacity below which a pixel has no colour of its own
+FARTHEST = DISTANCE + np.sqrt(3)  # of the box from a camera of `Model.camera`, in units of the box
+DEEPEST = 2**16 - 1  # of 16 bits; 0 is nothing
 
 
 class Written(NamedTuple):
@@ -103,7 +100,6 @@ class Ready:
     """A cloud that is read and encoded, and what draws it."""
 
     placed: PlacedCloud
-    network: str
     model: Model
     volume: Volume
     light: Light | None
@@ -111,28 +107,25 @@ class Ready:
 
 def render_file(options: Render, note: Callable[[str], None]) -> Iterator[str]:
     """Writes what the options ask for; yields a line about each file, `note` gets the assumptions about the cloud."""
-    if options.cluster or options.workers:
-        raise UserError(f"{options.cloud}: a single file; --cluster and --workers draw those of a folder or pattern")
-    check_writable(options.out)
-    loaded = cache(load)
-    load_network(options, loaded)  # a run that is none is said before the cloud is read
-    ready = prepare_cloud(options, note, loaded)
+    if options.workers:
+        raise UserError(f"{options.cloud}: a single file; --workers draw those of a folder or pattern")
+    images.check_place(options.out / options.cloud.stem)
+    ready = prepare_cloud(options, note, load_network(options))  # a run that is none is said before the cloud is read
     yield f"encoded {len(ready.placed.cloud.positions)} points of {options.cloud}"
     for written in run_ahead(draw_all(ready, options, options.out / options.cloud.stem)):
         if written.line:
             yield written.line
 
 
-def load_network(options: Render, loaded: Callable[[Path | None], Model]) -> Model:
-    """The network of the options; ValueError if it cannot draw what they ask for."""
+def load_network(options: Render, loaded: Callable[[Path | None], Model] = load) -> Model:
+    """The network of the options, which `loaded` gives; ValueError if it cannot draw what they ask for."""
     model = loaded(options.run)
     check_takes_light(model, options.light_options_given, options.run)
     return model
 
 
-def prepare_cloud(options: Render, note: Callable[[str], None], loaded: Callable[[Path | None], Model]) -> Ready:
-    """The cloud of the options read and encoded; `note` gets the assumptions about it, `loaded` gives a network."""
-    model = load_network(options, loaded)
+def prepare_cloud(options: Render, note: Callable[[str], None], model: Model) -> Ready:
+    """The cloud of the options read and encoded; `note` gets the assumptions about it."""
     light = light_of_options(options.lighting) if options.light_options_given else None
     placed = clouds.place_cloud(
         options.cloud,
@@ -144,10 +137,7 @@ def prepare_cloud(options: Render, note: Callable[[str], None], loaded: Callable
         transparent_parts=options.transparent_parts,
         report=note,
     )
-    network = str(options.run or SHIPPED)
-    return Ready(
-        placed=placed, network=network, model=model, volume=model.encode(placed.cloud, options.densify), light=light
-    )
+    return Ready(placed=placed, model=model, volume=model.encode(placed.cloud, options.densify), light=light)
 
 
 def draw_all(ready: Ready, options: Render, name: Path) -> Iterator[Callable[[], Written]]:
@@ -155,42 +145,48 @@ def draw_all(ready: Ready, options: Render, name: Path) -> Iterator[Callable[[],
 
     Stills and film are drawn in one go: views that share their sizes share their programs.
     """
-    stills = [(camera, ready.light) for camera in still_cameras(ready, options)]
+    stills = still_views(ready, options)
     film = turntable_views(ready, options) if options.turntable != "none" else []
-    views = _views(ready, [*stills, *film], options)
-    cameras = [camera for camera, _ in stills]
+    views, cameras = _draw(ready, [*stills, *film], options), [camera for camera, _ in stills]
     for i, (camera, rendering) in enumerate(zip(cameras, views, strict=False)):  # the film's are left for below
-        yield partial(_write_still, rendering, camera, ready.volume, options, f"{name}_{i:03d}")
+        still = f"{name}_{i:03d}"
+        yield partial(_write, f"wrote {still}.png", still, still_files(rendering, camera, ready.volume, options))
     if cameras:
-        yield partial(_write_cameras, cameras, ready, name)
+        document = cameras_document(cameras, name.name, ready.placed, ready.volume)
+        yield partial(_write, "", str(name), [("_cameras.json", f"{json.dumps(document, indent=1)}\n".encode())])
     if film:
         pictures = [np.asarray(rendering.image) for rendering in views]
         yield partial(_write_film, Path(f"{name}_turntable.{options.turntable}"), pictures, options)
     if options.mesh:
-        yield _mesh(ready, options, Path(f"{name}_mesh.glb"))
+        solid = surfaces.mesh_of_volume(ready.model, ready.volume, ready.placed)
+        line = f"wrote {name}_mesh.glb ({surfaces.describe(solid)})"
+        yield partial(_write, line, str(name), [("_mesh.glb", solid.content)])
     if options.splats != "none":
-        yield from _splats(ready, options, Path(f"{name}_splats.{options.splats}"))
+        yield _splats(ready, options, Path(f"{name}_splats.{options.splats}"))
 
 
-def still_cameras(ready: Ready, options: Render) -> list[Camera]:
-    """Cameras evenly around the object."""
+View = tuple[Camera, Light | None]
+
+
+def still_views(ready: Ready, options: Render) -> list[View]:
+    """Cameras evenly around the object, and its light."""
     turns = np.arange(options.views) * 360 / max(options.views, 1)
-    return [_camera(ready, float(FIRST_AZIMUTH + turn), options) for turn in turns]
+    return [(_camera(ready, FIRST_AZIMUTH + turn, options), ready.light) for turn in turns]
 
 
-def turntable_views(ready: Ready, options: Render) -> list[tuple[Camera, Light | None]]:
+def turntable_views(ready: Ready, options: Render) -> list[View]:
     """Camera and light of each image of one turn around the object, or of its light."""
     turns, light = np.arange(options.frames) * 360.0 / options.frames, ready.light
-    azimuths = np.full(options.frames, FIRST_AZIMUTH) if options.turn == "light" else turns
-    lights = [light.turned(turn) if light and options.turn == "light" else light for turn in turns]
-    return [(_camera(ready, float(azimuth), options), shone) for azimuth, shone in zip(azimuths, lights, strict=True)]
+    if options.turn == "object" or light is None:
+        return [(_camera(ready, turn, options), light) for turn in turns]
+    return [(_camera(ready, FIRST_AZIMUTH, options), light.turned(turn)) for turn in turns]
 
 
 def _camera(ready: Ready, azimuth: float, options: Render) -> Camera:
-    return ready.model.camera(ready.volume, azimuth, options.elevation, options.resolution)
+    return ready.model.camera(ready.volume, float(azimuth), options.elevation, options.resolution)
 
 
-def _views(ready: Ready, views: list[tuple[Camera, Light | None]], options: Render) -> Iterator[Rendering]:
+def _draw(ready: Ready, views: list[View], options: Render) -> Iterator[Rendering]:
     """The pictures of cameras in lights, one after the other, before what is wanted behind them."""
     cameras, lights = [camera for camera, _ in views], [light for _, light in views]
     renderings = ready.model.render_each(ready.volume, cameras, options.quality, lights)
@@ -198,19 +194,13 @@ def _views(ready: Ready, views: list[tuple[Camera, Light | None]], options: Rend
         yield before(options.lighting.background, rendering, camera, light)
 
 
-def _write_still(rendering: Rendering, camera: Camera, volume: Volume, options: Render, stem: str) -> Written:
+def _write(line: str, stem: str, files: Iterable[tuple[str, bytes]]) -> Written:
+    """Writes files, each of what follows the stem in its name and its content."""
     paths = []
-    for suffix, data in still_files(rendering, camera, volume, options):
+    for suffix, data in files:
         paths.append(Path(stem + suffix))
         images.write_whole(paths[-1], data)
-    return Written(f"wrote {stem}.png", tuple(paths))
-
-
-def _write_cameras(cameras: list[Camera], ready: Ready, name: Path) -> Written:
-    path = Path(f"{name}_cameras.json")
-    document = cameras_document(cameras, name.name, ready.placed, ready.volume)
-    images.write_whole(path, (json.dumps(document, indent=1) + "\n").encode())
-    return Written("", (path,))
+    return Written(line, tuple(paths))
 
 
 def _write_film(path: Path, film: list[np.ndarray], options: Render) -> Written:
@@ -226,12 +216,23 @@ def still_files(rendering: Rendering, camera: Camera, volume: Volume, options: R
         yield ".png", images.png(straight_alpha(image, acc) if options.transparent else image)
     if "depth" in options.outputs:
         yield "_depth.png", images.png(images.depth_image(rendering.depth, acc))
-        depth = depth_maps.surface_depth(rendering, camera, volume)
+        depth = surface_depth(rendering, camera, volume)
         yield "_depth.npy", _save(np.save, depth)
-        steps = Image.fromarray(depth_maps.in_16bit(depth, depth_maps.step_16bit(volume)))
+        steps = Image.fromarray(in_16bit(depth, step_16bit(volume)))
         yield "_depth_16bit.png", _save(lambda file, picture: picture.save(file, "png"), steps)
     if "opacity" in options.outputs:
         yield "_opacity.png", images.png(np.repeat(acc[..., None], 3, axis=-1))
+
+
+def step_16bit(volume: Volume) -> float:
+    """Depth of one step of a 16-bit picture, the same for all views of `Model.camera`."""
+    return float(FARTHEST) / float(volume.scale) / DEEPEST
+
+
+def in_16bit(depth: np.ndarray, step: float) -> np.ndarray:
+    """The depth (h, w) in steps, uint16; 0 where it is NaN."""
+    steps = np.round(np.where(np.isnan(depth), 0, depth) / step)
+    return np.clip(steps, 0, DEEPEST).astype(np.uint16)
 
 
 def straight_alpha(image: np.ndarray, acc: np.ndarray) -> np.ndarray:
@@ -264,7 +265,7 @@ def cameras_document(cameras: list[Camera], name: str, placed: PlacedCloud, volu
             "centre": (np.asarray(volume.centre, np.float64) + placed.rotation @ placed.origin).tolist(),
             "scale": scale,
         },
-        "depth": {"kind": "distance along the ray", "scale_16bit": depth_maps.step_16bit(volume), "nothing_16bit": 0},
+        "depth": {"kind": "distance along the ray", "scale_16bit": step_16bit(volume), "nothing_16bit": 0},
     }
 
 
@@ -276,27 +277,25 @@ def _pose_in_file(camera: Camera, placed: PlacedCloud) -> np.ndarray:
     return pose
 
 
-def _mesh(ready: Ready, options: Render, path: Path) -> Callable[[], Written]:
-    from spnr_jax.tools import mesh_export  # here: pictures alone do without
-
-    resolution = options.grid_resolution or mesh_export.GRID
-    solid = mesh_export.mesh_of_volume(ready.model, ready.volume, ready.placed, resolution)
-
-    def write() -> Written:
-        images.write_whole(path, solid.content)
-        return Written(f"wrote {path} ({mesh_export.describe(solid)})", (path,))
-
-    return write
-
-
-def _splats(ready: Ready, options: Render, path: Path) -> Iterator[Callable[[], Written]]:
+def _splats(ready: Ready, options: Render, path: Path) -> Callable[[], Written]:
     """Gaussian splats of the cloud as the network draws it."""
-    from spnr_jax.tools import splat_making  # here: pictures alone do without
-
     given = (ready.model, ready.volume, ready.placed.cloud, ready.light)
-    made = splat_making.splats_of(*given, lambda line: None, **options.making.is_given)
-    note = splat_making.note_of(options, ready.network)
-    yield lambda: Written(f"wrote {path} ({write_splats(path, made, note) / 1e6:.1f} MB)", (path,))
+    made = surfaces.splats_of(*given, lambda line: None, **options.making.asked, resolution=surfaces.RESOLUTION)
+    return lambda: Written(f"wrote {path} ({write_splats(path, made, make_note(options)) / 1e6:.1f} MB)", (path,))
+
+
+def make_note(asked: Render) -> str:
+    """The line that names cloud, network and light."""
+    network = Path(asked.run or SHIPPED).name
+    return f"{asked.cloud.name}, drawn by spnr_jax ({network}), light: {light_name(asked.lighting)}"
+
+
+def light_name(lighting: Lighting) -> str:
+    """The light in words, without folders."""
+    parts = [Path(lighting.light).name] if lighting.light else ([] if lighting.sun else ["room"])
+    parts += [f"sun {lighting.sun[0]:g} {lighting.sun[1]:g}"] if lighting.sun else []
+    options = {"yaw": lighting.light_yaw, "exposure": lighting.exposure}
+    return " + ".join(parts) + "".join(f", {name} {value:g}" for name, value in options.items() if value)
 
 
 def _save(write: Callable, content) -> bytes:
@@ -304,12 +303,3 @@ def _save(write: Callable, content) -> bytes:
     stream = io.BytesIO()
     write(stream, content)
     return stream.getvalue()
-
-
-def check_writable(out: Path) -> None:
-    """OSError if the folder can neither be written to nor be made."""
-    existing = next(path for path in (out, *out.absolute().parents) if path.exists())
-    if not existing.is_dir():
-        raise NotADirectoryError(20, "Not a directory", str(existing))
-    if not os.access(existing, os.W_OK):
-        raise PermissionError(13, "Permission denied", str(existing))

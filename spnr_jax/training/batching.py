@@ -40,13 +40,10 @@ def choose_points(
     return pad(jax.tree.map(lambda values: values[chosen], cloud), size)
 
 
-def make_batch(objects: list[ObjectData], config: TrainConfig, step: int, place: int = 0) -> Batch:
-    """The training batch of these objects at this step: random points and random views of each.
-
-    They are those from `place` on in the global batch; what is drawn for an object depends on its place there.
-    """
+def make_batch(objects: list[ObjectData], config: TrainConfig, step: int) -> Batch:
+    """The training batch of these objects at this step: random points and random views of each."""
     clouds_of, views_of = [], []
-    for i, item in enumerate(objects, start=place):
+    for i, item in enumerate(objects):
         generator = np.random.default_rng((config.seed, POINTS_AND_VIEWS, step, i))
         low, high = np.log2(config.min_points), np.log2(config.max_points)
         count = round(2 ** generator.uniform(low, high))
@@ -82,7 +79,7 @@ def epoch_order(seed: int, epoch: int, count: int) -> np.ndarray:
 
 
 def prepare(
-    config: TrainConfig, dataset: Dataset, run: Path, *, light: Light | None, own: range | None
+    config: TrainConfig, dataset: Dataset, run: Path, *, light: Light | None
 ) -> Callable[[int], Generator[Batch, None, None]]:
     """A function of a step: training batches of whole views from there on.
 
@@ -94,16 +91,13 @@ def prepare(
             f"{dataset.folder}: each view has a light of its own, and preset {config.preset} learns one light alone; "
             "train --preset surfels, or generate the data set without --lights"
         )
-    return lambda first_step: batches(dataset, config, first_step, own=own)
+    return lambda first_step: batches(dataset, config, first_step)
 
 
 def batches(
-    dataset: Dataset, config: TrainConfig, first_step: int, cache_bytes: int = CACHE_BYTES, own: range | None = None
+    dataset: Dataset, config: TrainConfig, first_step: int, cache_bytes: int = CACHE_BYTES
 ) -> Generator[Batch, None, None]:
-    """Training batches from `first_step` on, read and assembled ahead; an error is raised where its batch would be.
-
-    With `own` only these places of each batch: the same objects, points and views as in the whole one.
-    """
+    """Training batches from `first_step` on, read and assembled ahead; an error is raised where its batch would be."""
     names = dataset.splits["train"]
     if not names:
         raise UserError(f"{dataset.folder}: the train split is empty; generate more objects")
@@ -112,11 +106,10 @@ def batches(
             f"{dataset.folder}: its points are drawn at random, even_share is {config.even_share}; generate with "
             "--spread even, or use even_share 0"
         )
-    read, own = cached_reader(dataset, config, cache_bytes), own or range(config.batch_objects)
+    read = cached_reader(dataset, config, cache_bytes)
 
     def assemble(step: int) -> Batch:
-        chosen = object_names(names, config, step)[own.start : own.stop]
-        return make_batch([read(name) for name in chosen], config, step, own.start)
+        return make_batch([read(name) for name in object_names(names, config, step)], config, step)
 
     yield from read_ahead(assemble, first_step, config)
 

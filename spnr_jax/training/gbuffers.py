@@ -77,15 +77,9 @@ class View(NamedTuple):
 
 
 def prepare(
-    config: TrainConfig, dataset: Dataset, run: Path, *, light: Light | None, own: range | None
+    config: TrainConfig, dataset: Dataset, run: Path, *, light: Light | None
 ) -> Callable[[int], Generator[Crops, None, None]]:
-    """A function of a step: training batches from there on.  Missing G-buffers are made first, which takes a while.
-
-    ValueError where several processes train together: each would make them.
-    """
-    del own
-    if jax.process_count() > 1:
-        raise UserError(f"preset {config.preset} trains in one process; start it without --distributed")
+    """A function of a step: training batches from there on.  Missing G-buffers are made first, which takes a while."""
     variables = add_companions(config.model, {}, run)
     views = complete(dataset, light or light_of(dataset), config, run / "gbuffers", variables)
     return lambda first_step: batches(views, config, first_step)

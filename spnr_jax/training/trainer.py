@@ -12,8 +12,6 @@ seconds                         by phase: restore, compilation (the first step),
 jax, hardware                   version of JAX, and the machine
 data, data_checksum             the folder, and a number that tells data sets apart
 init                            the training whose weights a new run began with, if they were not random
-
-If several processes train together (placement.py), the first writes these files; all of them write the checkpoints.
 """
 
 import hashlib
@@ -66,18 +64,18 @@ def train(
 ) -> optimisation.TrainState:
     """The state after the config's last step; goes on where an earlier call left the run folder.
 
-    A new run begins with random weights, or those of `init`.  Each process of a mesh of devices calls this.  `on_event`
-    is told what the loop is about to do.  `light` is that of the data set's pictures, where it is not the room.
+    A new run begins with random weights, or those of `init`.  `mesh` divides batches among devices.  `on_event` is
+    told what the loop is about to do.  `light` is that of the data set's pictures, where it is not the room.
     """
     runtime.few_arenas()
-    own = None if mesh is None else placement.own_objects(mesh, config.batch_objects)
+    placement.check_divides(mesh, config.batch_objects)
     with claim(run, config), ExitStack() as stack:
         clock = Clock()
         state = restore_or_init(config, run, mesh, init)
         if (first := int(state.step)) >= config.num_steps:
             return state
-        batches_from = method_of(config.model).prepare(config, dataset, run, light=light, own=own)
-        agreed, tell = placement.Agreement(mesh), on_event or (lambda *event: None)
+        batches_from = method_of(config.model).prepare(config, dataset, run, light=light)
+        tell = on_event or (lambda *event: None)
         requests = stack.enter_context(stop_requests())
         progress = Progress(config, dataset, run, schedule, first, init, clock, tell, light)
         stack.callback(progress.close)
@@ -85,16 +83,16 @@ def train(
         clock.lap("restore")
         joins = optimisation.first_adversarial_step(config)
         for step, batch in enumerate(batches, start=first):
-            if first < step == joins and placement.leads():
+            if first < step == joins:
                 tqdm.write(f"step {step}: the discriminator joins; the training step is compiled anew")
             tell("step", step, batch)
             state, metrics = take_step(state, batch, config, mesh, adversarial=step >= joins)
             done = step + 1
             progress.step(done, metrics)
-            last, stopping = done == config.num_steps, agreed(bool(requests))
+            last, stopping = done == config.num_steps, bool(requests)
             save = last or stopping or done % schedule.checkpoint_every == 0
             progress.show(state, save, last)
-            if last and placement.leads():
+            if last:
                 write_network(run, config, state)
             if save:  # after the rows up to this step, which a run that goes on from here will not write again
                 progress.checkpoint(state)
@@ -111,35 +109,31 @@ def take_step(
 ) -> tuple[optimisation.TrainState, dict]:
     """The state after a batch whose objects the devices share, and metrics."""
     with placement.using(mesh):
-        batch = placement.place_batch(batch, mesh, config.batch_objects)
+        batch = placement.place_batch(batch, mesh)
         return optimisation.jitted_train_step(state, batch, config=config, adversarial=adversarial)
 
 
 @contextmanager
 def claim(run: Path, config: TrainConfig) -> Iterator[None]:
-    """The run folder is this training's alone; errors of the disk and of other processes name it."""
+    """The run folder is this training's alone; errors of the disk name it."""
     try:
-        with ExitStack() as stack:
-            placement.first_alone(lambda: stack.enter_context(checkpoint.alone(run)))
-            placement.first_alone(lambda: checkpoint.write_config(run, config))
+        with checkpoint.alone(run):
+            checkpoint.write_config(run, config)
             yield
     except OSError as error:
         error.filename = error.filename or str(run)  # writing to a full disk does not say where
         raise
-    except jax.errors.JaxRuntimeError as error:
-        raise placement.explain_lost_process(error, run) from None
 
 
 def restore_or_init(config: TrainConfig, run: Path, mesh: Mesh | None, init: Trained | None) -> optimisation.TrainState:
     """The state to go on with, and a line about it: of the newest checkpoint, or before the first step."""
-    say: Callable[[str], object] = tqdm.write if placement.leads() else lambda line: None
     with placement.using(mesh):
         sharding = None if mesh is None else placement.sharding_of_all(mesh)
-        state = checkpoint.restore(run, config, say, sharding) or new_state(config, init)
+        state = checkpoint.restore(run, config, tqdm.write, sharding) or new_state(config, init)
     if (step := int(state.step)) >= config.num_steps:
-        say(f"{run} is finished: {step} steps")
+        tqdm.write(f"{run} is finished: {step} steps")
     elif step:
-        say(f"resuming {run} at step {step} of {config.num_steps}")
+        tqdm.write(f"resuming {run} at step {step} of {config.num_steps}")
     return state
 
 
@@ -158,13 +152,12 @@ class Progress:
         tell: OnEvent,
         light: Light | None,
     ) -> None:
-        """Opens the log, and the bar of the process that shows one."""
-        leads = placement.leads()
+        """Opens the log and the bar."""
         self._of, self._schedule = (config, dataset, run, light), schedule
         self._first, self._done, self._clock, self._tell = first, first, clock, tell
-        self._record = RunRecord(run, dataset, first, init) if leads else None
-        self._log = MetricsLog(run, first) if leads else None
-        self._bar = tqdm(total=config.num_steps, initial=first, unit="step", mininterval=1, disable=not leads)
+        self._record = RunRecord(run, dataset, first, init)
+        self._log = MetricsLog(run, first)
+        self._bar = tqdm(total=config.num_steps, initial=first, unit="step", mininterval=1)
         self._pending: list[tuple[int, dict]] = []
 
     def step(self, done: int, metrics: dict) -> None:
@@ -180,7 +173,7 @@ class Progress:
         """A row and a preview, where they are due."""
         if save or self._done % self._schedule.log_every == 0:
             self._row(state, save)
-        if self._log and (last or self._done % self._schedule.preview_every == 0):
+        if last or self._done % self._schedule.preview_every == 0:
             self._tell("preview", self._done, None)
             scores, picture = preview(state, *self._of)
             self._log.write({"step": self._done, **scores}, picture)
@@ -196,8 +189,7 @@ class Progress:
         pace = 1000 * (seconds / len(timed) if timed else self._clock.seconds["compilation"])
         row, (_, newest) = {"step": self._done, **mean_row(rows), "ms_per_step": round(pace, 2)}, rows[-1]
         self._tell("row", self._done, row)
-        if self._log:
-            self._log.write(row)
+        self._log.write(row)
         self._bar.set_postfix({n: f"{newest[n]:.2f}" for n in ("loss", "psnr") if n in newest}, refresh=False)
         self._pending = []
 
@@ -207,16 +199,14 @@ class Progress:
         self._tell("checkpoint", self._done, None)
         checkpoint.save(run, state)
         self._clock.lap("checkpoints")
-        if self._record:
-            self._record.write(self._done, self._clock)
+        self._record.write(self._done, self._clock)
         self._tell("saved", self._done, state)
         self._clock.lap("listeners")
 
     def close(self) -> None:
         """Closes bar and log."""
         self._bar.close()
-        if self._log:
-            self._log.close()
+        self._log.close()
 
 
 def new_state(config: TrainConfig, init: Trained | None) -> optimisation.TrainState:
@@ -227,7 +217,7 @@ def new_state(config: TrainConfig, init: Trained | None) -> optimisation.TrainSt
 
 def write_network(run: Path, config: TrainConfig, state: optimisation.TrainState) -> None:
     """The averaged weights as RUN/weights.npz; a line where float16 does not hold them."""
-    variables = placement.on_this_process(optimisation.averaged_variables(state))
+    variables = placement.on_first_device(optimisation.averaged_variables(state))
     try:
         write_weights(run / "weights.npz", Trained(config=config, variables=variables, steps=int(state.step)))
     except UserError as error:
@@ -284,7 +274,7 @@ def preview(
 ) -> tuple[dict[str, float], np.ndarray]:
     """Validation PSNR of the averaged network on a few objects, and references over renderings, kept in previews/."""
     names = (dataset.splits["val"] or dataset.splits["train"])[:num_objects]
-    variables = placement.on_this_process(optimisation.averaged_variables(state))
+    variables = placement.on_first_device(optimisation.averaged_variables(state))
     variables = add_companions(config.model, variables, run)
     columns, scores = [], []
     for name in names:

@@ -34,8 +34,9 @@ from websockets.http11 import Request, Response
 from spnr_jax.errors import UserError
 from spnr_jax.formats import clouds, images
 from spnr_jax.method.model import FIELD_OF_VIEW, Model
+from spnr_jax.methods import method_of
 from spnr_jax.tools.commands import View
-from spnr_jax.tools.pictures import check_takes_light, takes_light
+from spnr_jax.tools.pictures import check_takes_light
 from spnr_jax.training.weights import load
 from spnr_jax.viewer import frame
 from spnr_jax.viewer.frame import State
@@ -232,7 +233,7 @@ class Browser:
                 self._replace(quality=quality.value)
 
     def _add_light(self, gui: viser.GuiApi) -> None:
-        if not takes_light(self._model):
+        if not method_of(self._model.config).takes_light:
             gui.add_markdown(ONE_LIGHT)
             return
         state, options = self.loop.state, self.loop.state.lighting

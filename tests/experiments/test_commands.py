@@ -20,7 +20,7 @@ from support.tiny_untrained import CONFIG as L1_ONLY
 from data_gen.render import views
 from data_gen.store import layout
 from experiments import entry_point
-from experiments.comparison import contenders, poisson
+from experiments.comparison import poisson
 from experiments.comparison.variants import Budget
 from experiments.packaged import demo
 from experiments.paper import fig2, fig3, table1
@@ -30,6 +30,7 @@ from spnr_jax import cli, presets
 from spnr_jax.config import SurfelConfig
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.assets import Asset
+from spnr_jax.method import surfel_method
 from spnr_jax.scoring import evaluation
 from spnr_jax.training import weights
 
@@ -54,8 +55,12 @@ def _tiny(monkeypatch):
         monkeypatch.setitem(poisson.SURFACES, name, dataclasses.replace(surface, depth=5))
     monkeypatch.setattr(cli, "set_up_jax", lambda **_: None)
     monkeypatch.setattr(sharpness, "KNOWN_SIZE", 48)
-    monkeypatch.setattr(contenders, "networks", lambda *_: stand_ins.stand_ins("Ours", "NPBG"))
-    monkeypatch.setattr(weights, "packaged_file", tiny_surfels.shipped)
+    monkeypatch.setattr(fig3, "all_methods", lambda _: {"Ours": stand_ins.stand_in()})
+    fresh = {weights.SHIPPED: tiny_surfels.untrained()}
+    monkeypatch.setattr(
+        weights, "packaged_file", lambda name=weights.SHIPPED: fresh.get(name) or tiny_surfels.PACKAGED(name)
+    )
+    monkeypatch.setattr(surfel_method, "densify_sparse", lambda variables, cloud: cloud)  # it takes long to trace
     monkeypatch.setattr(evaluation, "choose_radius", lambda *_: 1.5)
     monkeypatch.setattr(fig3, "mesh_of", lambda *_: Asset(parts=(ball(radius=tiny_dataset.RADIUS, rows=64),)))
 
@@ -77,19 +82,14 @@ def data(tmp_path_factory):
         "settings": vars(views.ViewConfig(resolution=SIZE, spp=4, views=tiny_dataset.VIEWS, max_depth=2)),
         "environment_map": {"name": "procedural room", "sha256": None},
     }
-    layout.write_text(painted / "dataset.json", layout.json_text(described))
-    elsewhere = folder / "right"  # pictures of another program that are the references
-    shutil.copytree(lit / "objects" / "ball_000000" / "images", elsewhere / "32" / "ball_000000")
+    (painted / "dataset.json").write_text(layout.json_text(described))
     varied = tiny_dataset.write_dataset(folder / "varied", tiny_dataset.SPLITS | VARIANTS)
-    return SimpleNamespace(
-        lit=lit, painted=painted, elsewhere=elsewhere, varied=varied, run=lambda: str(tiny_surfels.run())
-    )
+    return SimpleNamespace(lit=lit, painted=painted, varied=varied, run=lambda: str(tiny_surfels.untrained()))
 
 
 def check_sharpness(found):
-    assert len(found["objects"]) == 3  # network, discs and right
-    right = found["objects"]["right, 32"][0]
-    assert (right["psnr"], right["outline_rmse"]) == pytest.approx((100, 0), abs=1e-3)
+    assert len(found["objects"]) == 2  # network and discs
+    assert all(scores["encode"] > 0 for (scores,) in found["objects"].values())
 
 
 def check_relighting(found):
@@ -102,15 +102,14 @@ def check_speed_accuracy(found):
 
 
 def check_fig3(found):
-    assert list(found["methods"]) == ["Ours"]  # the other one predicts no depth
-    ours = {name: of["mean"] for name, of in found["methods"]["Ours"].items()}
-    for name in ("error", "median", "bias", "surface"):
-        assert ours[name] == pytest.approx(stand_ins.OFFSET, abs=3e-3)
-    assert ours["missed"] == ours["far_floaters"] == 0
+    for ours in found["scores"]["Ours"]:
+        for name in ("error", "median", "bias", "surface"):
+            assert ours[name] == pytest.approx(stand_ins.OFFSET, abs=3e-3)
+        assert ours["missed"] == ours["far_floaters"] == 0
 
 
 def check_fig1(found):
-    assert (found["reference"], found["start"]) == ("l1_100", "2 steps of L1 alone")
+    assert (found["reference"], found["start"]) == ("l1_100", "4 steps of L1 alone")
 
 
 def check_fig2(found):
@@ -132,7 +131,7 @@ def check_inverse(found):
 
 RUNS = {  # name -> its options, the pictures that it writes, and what is known of its results
     "studies.sharpness": (
-        lambda data: {"data": data.lit, "runs": (data.run(),), "counts": (32,), "elsewhere": (data.elsewhere,)},
+        lambda data: {"data": data.lit, "runs": (data.run(),), "counts": (32,)},
         ("gallery.png", "ball_000000.png"),
         check_sharpness,
     ),
@@ -156,7 +155,7 @@ RUNS = {  # name -> its options, the pictures that it writes, and what is known 
     ),
     "paper.fig1": (
         lambda data: {
-            **{"data": data.painted, "l1_weights": (100.0,), "pretrain": 2},
+            **{"data": data.painted, "l1_weights": (100.0,), "pretrain": 4},
             "budget": Budget(quick=True, shown=1),
         },
         ("gallery.png",),
@@ -238,8 +237,10 @@ def test_a_command_explains_its_options(name, monkeypatch, capsys):
 
 
 @pytest.mark.ci
-def test_table_1_has_the_scores_of_the_evaluation_of_its_runs(data, tmp_path):
-    rows = tuple(name for name in table1.ROWS if SOLVER or not name.startswith("poisson"))
+@pytest.mark.parametrize("left_out", [("point_nerf", "points2nerf"), pytest.param((), marks=pytest.mark.slow)])
+def test_table_1_has_the_scores_of_the_evaluation_of_its_runs(left_out, data, tmp_path):
+    possible = (name for name in table1.ROWS if SOLVER or not name.startswith("poisson"))
+    rows = tuple(name for name in possible if name not in left_out)
     asked = {"data": data.painted, "budget": "quick", "methods": rows, "variant": "scalar_rgb"}
     found, out = run_twice("paper.table1", tmp_path / "out", **asked)
     assert set(found["methods"]) == set(rows)
@@ -248,9 +249,7 @@ def test_table_1_has_the_scores_of_the_evaluation_of_its_runs(data, tmp_path):
     for method in (first, *evaluation.FLOORS):
         assert found["methods"][method] == alone["methods"][method]
         assert method == first or found["differences"][method] == alone[f"{first}_minus"][method]
-    page = (out / "table1.html").read_text()
-    assert "http" not in page
-    assert page.count("data:image/png;base64") >= len(rows)
+    assert (out / "gallery.png").read_bytes().startswith(b"\x89PNG")
 
 
 @pytest.mark.ci
@@ -278,7 +277,7 @@ def test_what_a_command_cannot_do_is_refused_by_name(data, tmp_path, monkeypatch
 def test_the_demo_writes_its_report_and_a_second_call_reuses_everything(data, tmp_path, monkeypatch, capsys):
     small = SurfelConfig(image_resolution=tiny_dataset.SIZE, widths=(4, 6), top=4)
     ours = dataclasses.replace(tiny_surfels.CONFIG, preset="surfels_tiny", model=small)
-    monkeypatch.setattr(presets, "tiny", lambda: tiny_dataset.CONFIG)
+    monkeypatch.setattr(presets, "tiny", lambda: L1_ONLY)
     monkeypatch.setattr(presets, "surfels_tiny", lambda: ours)
 
     def generate(asked):

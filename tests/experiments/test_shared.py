@@ -1,12 +1,7 @@
 """What every experiment stands on: networks, scores, differences, budgets, tables, a folder that goes on."""
 
 import dataclasses
-import hashlib
-import json
-import re
-import shutil
 from itertools import chain
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,18 +9,13 @@ from support import stand_ins, tiny_dataset
 from support.tiny_baselines import BASELINE, SHRUNKEN
 
 from experiments.comparison import budget as budgets
-from experiments.comparison import contenders, results_folder, scores, study_objects, variants
-from experiments.comparison.contenders import networks
-from experiments.comparison.scores import Shown
-from experiments.comparison.variants import Compared
-from experiments.paper import table1
+from experiments.comparison import results_folder, scores, study_objects, variants
+from experiments.paper import fig3
 from spnr_jax.formats import data_sets
 from spnr_jax.scoring import evaluation
 from spnr_jax.scoring.report import Table, number, text
-from spnr_jax.scoring.summary import difference
-from spnr_jax.training import batching, checkpoint, optimisation, weights
+from spnr_jax.training import batching, checkpoint, optimisation
 
-PAPER = contenders.LABELS["paper"]
 ROWS = (
     ("ours_1", (number(21.456, 2, (20.0, 22.5), best=True), number(0.25, 1, factor=100))),
     ("50 % & more", (number(None, 2), number(-1.0, 1, sign="+"))),
@@ -97,44 +87,6 @@ def test_small_pictures_are_enlarged_and_the_reference_itself_is_right():
     assert scores.mean_scores({"a": [1.0, np.nan], "b": [np.nan]}) == {"a": 1.0, "b": None}
 
 
-def test_no_name_ends_the_script():
-    name, grey = "</script><b>", np.full((4, 4, 3), 0.5)
-    shown = Shown(name=name, view=0, reference=grey, images={"ours": grey}, psnr={"ours": 9.0})
-    page = table1.write_page("t", [Table(title="t", heads=(), rows=())], [], [shown])
-    (content,) = re.findall(r'<script type="application/json" id="pictures">(.*?)</script>', page, re.DOTALL)
-    assert json.loads(content)["objects"][0]["name"] == name
-
-
-def test_a_difference_compares_equal_seeds_objects_and_views():
-    rng = np.random.default_rng(0)
-    found = {
-        variant: {
-            seed: {
-                name: {m: level + seed + rng.random(2) for m in variants.METRICS} for name in ("one", "two", "three")
-            }
-            for seed in range(2)
-        }
-        for variant, level in (("a", 10.0), ("b", 13.0))
-    }
-    compared = Compared(scores=found, shown=[])
-    change = difference(compared.by_object("b"), compared.by_object("a"), "psnr")
-    pairs = [found["b"][s][n]["psnr"] - found["a"][s][n]["psnr"] for s in range(2) for n in found["a"][s]]
-    assert change["mean"] == pytest.approx(np.mean(pairs))
-    assert change["interval"][0] < change["mean"] < change["interval"][1]
-
-
-def write_log(run, rows):
-    (run / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
-
-
-def test_training_seconds_are_those_of_the_steps_over_all_calls(tmp_path):
-    write_log(
-        tmp_path,
-        [{"step": 20, "ms_per_step": 100.0}, {"step": 20, "val_psnr": 9.0}, {"step": 25, "ms_per_step": 1000.0}],
-    )
-    assert budgets.training_seconds(tmp_path) == 7.0
-
-
 def test_scores_inside_the_silhouette_do_not_see_the_rest():
     item = tiny_dataset.one_object("chair")
     reference = data_sets.on_white(item.images)
@@ -143,17 +95,6 @@ def test_scores_inside_the_silhouette_do_not_see_the_rest():
     np.testing.assert_allclose(found["inside"], 100.0)
     equal = variants.more_scores(item, evaluation.Pictures(image=reference, acc=reference[..., 0]))
     np.testing.assert_allclose(equal["detail"], 1.0, rtol=1e-5)
-
-
-@pytest.mark.parametrize(
-    ("budget", "size", "category", "paper"),
-    [("tiny", 64, "chair", "tiny"), ("paper", 128, None, "abo"), ("paper", 200, "chair", "shapenet_chair")],
-)
-def test_a_budget_has_a_training_of_every_network(budget, size, category, paper):
-    found = budgets.configs(budget, size, category)
-    assert found["paper"].preset == paper
-    assert {name: config.model.method for name, config in found.items()} == {name: name for name in budgets.NETWORKS}
-    assert {config.model.image_resolution for config in found.values()} == {size}
 
 
 def test_minutes_become_steps_at_the_pace_of_both_kinds_of_step(monkeypatch):
@@ -185,30 +126,13 @@ def test_a_run_that_was_begun_keeps_its_number_of_steps(tmp_path, monkeypatch):
     assert budgets.config_of(tiny, "tiny", 3, 2.0, None, tmp_path) == first
 
 
-# --- networks that are compared ---------------------------------------------------------------------------------------
-
-
-def test_networks_are_named_after_their_methods_in_the_order_of_table_1(tmp_path):
-    dataset, paper, npbg = tiny_dataset.dataset(), stand_ins.fresh("tiny"), stand_ins.fresh("npbg_tiny")
-    again, surfels = tmp_path / "runs" / "paper", contenders.LABELS["surfels"]
-    shutil.copytree(paper, again)
-    assert list(networks((npbg, paper), dataset)) == [PAPER, "NPBG"]
-    found = networks((paper, Path("surfels"), again, npbg), dataset)
-    assert set(found) == {f"{PAPER} (fresh, tiny)", f"{PAPER} (runs, paper)", "NPBG", surfels}
-    assert [name for name, network in found.items() if not network.has_depth] == ["NPBG"]
-    assert found[f"{PAPER} (runs, paper)"].as_method().identity == found[f"{PAPER} (fresh, tiny)"].as_method().identity
-    assert found[surfels].checksum == hashlib.sha256(weights.packaged_file().read_bytes()).hexdigest()
-
-
-def test_what_cannot_be_compared_is_refused_by_name(tmp_path):
+def test_what_cannot_be_compared_is_refused_by_name():
+    assert list(fig3.all_methods((str(stand_ins.fresh("tiny")), str(stand_ins.fresh("npbg_tiny"))))) == [
+        str(stand_ins.fresh("tiny"))
+    ]
+    with pytest.raises(ValueError, match="--runs: none of these predicts depth"):
+        fig3.all_methods((str(stand_ins.fresh("npbg_tiny")),))
     dataset = tiny_dataset.dataset()
-    with pytest.raises(ValueError, match="--runs: name at least one"):
-        networks((), dataset)
-    with pytest.raises(ValueError, match="--runs: a run folder is named twice"):
-        networks((stand_ins.fresh("tiny"),) * 2, dataset)
-    larger = data_sets.open_dataset(tiny_dataset.write_dataset(tmp_path / "data", size=2 * tiny_dataset.SIZE))
-    with pytest.raises(ValueError, match=r"images of 48 x 48 pixels, [^\n]*needs 24 x 24"):
-        networks((stand_ins.fresh("tiny"),), larger)
     with pytest.raises(ValueError, match="--objects: expected 1 or more, got 0"):
         study_objects.test_objects(dataset, 0)
     with pytest.raises(ValueError, match="the test split is empty"):

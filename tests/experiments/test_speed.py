@@ -19,13 +19,12 @@ def test_a_turn_leaves_its_first_run_out():
     assert len(runs) == bench.FEWEST + 1
 
 
-@pytest.mark.parametrize("implementation", ["plain", "fast"])
-def test_our_pytorch_twin_is_the_network_of_the_fixture(implementation):
+def test_our_pytorch_twin_is_the_network_of_the_fixture():
     torch = pytest.importorskip("torch", reason="the extra `bench` is not installed")
     from experiments.speed import twin as torch_twin
 
     arrays = {name: torch.from_numpy(x) for name, x in twin.load().items() if x.dtype == np.float32}
-    generator = torch_twin.Generator(twin.config(twin.load()).model, implementation).eval()
+    generator = torch_twin.Generator(twin.config(twin.load()).model).eval()
     named = {name.removeprefix("param/gen."): x for name, x in arrays.items() if name.startswith("param/gen.")}
     generator.load_state_dict(named, strict=False)
     with torch.inference_mode():

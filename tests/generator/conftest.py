@@ -1,7 +1,5 @@
 """Data sets that are made in the process of the tests: worker processes take seconds to start (test_same_bytes.py)."""
 
-import contextlib
-
 import pytest
 from support.command_line import spnr_data
 
@@ -14,8 +12,7 @@ def generate_here():
 
     def run(*arguments):
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(generate, "connect", lambda *_: contextlib.nullcontext())
-            patch.setattr(generate, "run_tasks", lambda _, make, bench, tasks: ((t, make(bench, t)) for t in tasks))
+            patch.setattr(generate, "run_tasks", lambda make, bench, tasks, _: ((t, make(bench, t)) for t in tasks))
             return spnr_data("generate", *arguments, "--variant", "scalar_rgb")
 
     return run

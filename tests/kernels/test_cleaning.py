@@ -132,18 +132,6 @@ def test_two_layers_of_different_colours_nearer_than_the_noise_are_told_apart():
     assert values["base_color"][upper, 2].mean() > 0.6 > 0.5 > mixed["roughness"].mean()
 
 
-def test_a_pattern_stays_where_it_is_and_keeps_its_colours():
-    rng = np.random.default_rng(0)
-    flat = np.concatenate([rng.uniform(-0.5, 0.5, (2, 15_000)), np.zeros((1, 15_000))]).T
-    white = (np.floor(flat[:, 0] / 0.05) % 2)[:, None] * np.ones(3)
-    noisy = flat + rng.normal(size=flat.shape) * 0.01
-    order = np.lexsort(noisy.T)
-    moved, values = denoise(noisy, {"base_color": white}, 0.01, 0.008)
-    along = np.abs(moved[:, 0] - flat[order, 0]).mean()
-    assert along < np.abs(noisy[order, 0] - flat[order, 0]).mean()
-    assert np.abs(values["base_color"] - white[order]).mean() < 0.1
-
-
 def test_noise_of_colours_hardly_keeps_points_from_being_averaged():
     rng = np.random.default_rng(0)
     flat = np.concatenate([rng.uniform(-0.5, 0.5, (2, 10_000)), np.zeros((1, 10_000))]).T

@@ -46,27 +46,11 @@ class TestSsim:
 
 
 class TestOpacityIou:
-    def test_counts_pixels_that_are_more_than_half_opaque(self):
-        acc, alpha = jnp.array([[0.9, 0.51], [0.5, 0.1]]), jnp.array([[1.0, 0.0], [0.0, 1.0]])
-        assert opacity_iou(acc, alpha) == pytest.approx(1 / 3)
-
     def test_two_empty_pictures_agree(self):
         assert opacity_iou(jnp.zeros((2, 2)), jnp.zeros((2, 2))) == 1
 
 
 class TestHighFrequencyRatio:
-    def test_is_one_for_equal_images_less_for_a_blurred_one_and_more_with_noise(self):
-        close(high_frequency_ratio(IMAGE, IMAGE), np.ones((2, 3)))
-        blurred = sum(jnp.roll(IMAGE, shift, axis=-2) for shift in (-1, 0, 1)) / 3
-        assert (high_frequency_ratio(blurred, IMAGE) < 0.7).all()
-        smooth = jnp.broadcast_to(jnp.linspace(0.0, 1.0, 13).reshape(1, 1, 1, 13, 1), IMAGE.shape) ** 2
-        assert (high_frequency_ratio(smooth + 0.1 * numbers(3, *IMAGE.shape), smooth) > 1.5).all()
-
-    def test_brightness_does_not_count_and_contrast_does_by_its_square(self):
-        ratio = high_frequency_ratio(IMAGE, REFERENCE)
-        close(high_frequency_ratio(IMAGE + 0.3, REFERENCE - 0.2), ratio, rtol=1e-4)
-        close(high_frequency_ratio(0.5 * IMAGE, REFERENCE), 0.25 * ratio, rtol=1e-4)
-
     def test_a_smaller_share_of_nyquist_lets_slower_waves_count(self):
         wave = jnp.broadcast_to(jnp.cos(2 * jnp.pi * 5 * jnp.arange(32) / 32).reshape(32, 1, 1), (32, 32, 3))
         sharp = numbers(4, 32, 32, 3)

@@ -7,7 +7,6 @@ from support.laws import close
 
 from spnr_jax.kernels.numerics import (
     clamp,
-    per_feature,
     softplus,
 )
 
@@ -19,10 +18,6 @@ class TestClamp:
         close(value, jnp.clip(x, -1, 1), rtol=0, atol=0)
         expected = [[0, 1, 0, 1, 1], [1, 0, 0, 0, 0], [0, 0, 1, 0, 0]]
         close(pull_back(jnp.ones(5)), tuple(jnp.array(row, jnp.float32) for row in expected))
-
-
-def test_per_feature_broadcasts_over_the_last_axis_alone():
-    close(jnp.zeros((4, 2, 3)) + per_feature(jnp.arange(3.0), jnp.zeros((4, 2, 3))), np.tile(np.arange(3.0), (4, 2, 1)))
 
 
 class TestSoftplus:

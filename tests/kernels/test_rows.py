@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from support.laws import close, numbers
 
-from spnr_jax.kernels.rows import gather_rows, scatter_rows
+from spnr_jax.kernels.voxels import gather_rows, scatter_rows
 
 INDEX = jnp.asarray(np.random.default_rng(7).integers(0, 5, (2, 3, 4)), jnp.int32)
 

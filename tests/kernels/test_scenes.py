@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from support.surfel_clouds import cloud, even_square
+from support.surfel_clouds import even_square
 
 from spnr_jax.kernels import scenes
 from spnr_jax.surfels.sides import spiral
@@ -64,42 +64,34 @@ def test_clusters_are_those_of_a_plain_loop_over_voxels():
 @pytest.mark.parametrize("nth", [1, 2, 3])
 def test_what_stands_on_the_table_is_cut_out_ball_by_ball(nth):
     positions, part = table_scene(0.2)
-    scene = cloud(positions, metallic=part)
-    ball, said = scenes.cut_out(scene, remove_plane=True, nth=nth)
-    assert same(ball.metallic, np.full(BALLS[nth - 1][1], nth - 1))
+    rows, said = object_of(positions, nth=nth)
+    assert same(part[rows], np.full(BALLS[nth - 1][1], nth - 1))
     assert [line.split(":")[0] for line in said] == ["--remove-plane", "--object"]
-    assert scenes.cut_out(scene, remove_plane=True, nth=nth)[1] == said
 
 
-def test_a_box_comes_first_with_its_borders_and_without_masked_points():
-    positions = np.array([[0, 0, 0], [1, 1, 1], [2, 0, 0], [0.5, 0.5, 0.5]])
-    scene = cloud(positions).replace(mask=np.array([True, True, True, False]))
-    cut, said = scenes.cut_out(scene, crop=(0, 0, 0, 1, 1, 1))
-    np.testing.assert_array_equal(cut.positions, positions[:2])
-    assert said == ["--crop: 2 of 3 points lie inside"]
+def object_of(positions, nth=None):
+    """Rows of what is left without the dominant plane, or of one cluster of it."""
+    return scenes.object_of(positions, np.zeros(3), remove_plane=True, nth=nth, seed=0)
 
 
-def test_nothing_asked_changes_nothing():
-    scene = cloud(table_scene()[0])
-    assert scenes.cut_out(scene) == (scene, [])
+def test_a_box_holds_what_lies_on_its_borders_and_one_without_points_is_named():
+    positions = np.array([[0.0, 0, 0], [1, 1, 1], [2, 0, 0]])
+    inside = scenes.in_box(positions, (0, 0, 0, 1, 1, 1))
+    assert same(inside, np.array([True, True, False]))
+    assert scenes.crop_box(2, 3, (0, 0, 0, 1, 1, 1), *positions[[0, 1]]) == "--crop: 2 of 3 points lie inside"
+    with pytest.raises(ValueError, match=r"--crop 5 5 5 6 6 6: none of the 29,000 points, they lie in the box 0"):
+        scenes.crop_box(0, 29_000, (5, 5, 5, 6, 6, 6), *positions[[0, 2]])
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"crop": (5, 5, 5, 6, 6, 6)}, r"--crop 5 5 5 6 6 6: none of the 29,000 points, they lie in the box -3"),
-        ({"remove_plane": True, "nth": 4}, r"--object 4: there are 3 clusters"),
-        ({"crop": (-3, -0.1, -3, 3, 0.1, 3), "remove_plane": True}, r"--remove-plane: all of the 20,000 points"),
-    ],
-)
-def test_a_step_that_leaves_nothing_is_named(options, message):
-    with pytest.raises(ValueError, match=message):
-        scenes.cut_out(cloud(table_scene()[0]), **options)
-
-
-def test_a_ball_has_no_dominant_plane():
-    with pytest.raises(ValueError, match=r"--remove-plane: no plane holds 10% of the surface"):
-        scenes.cut_out(cloud(spiral(20000)), remove_plane=True)
+def test_a_step_that_leaves_nothing_is_named():
+    positions, part = table_scene()
+    for given, nth, message in (
+        (positions, 4, r"--object 4: there are 3 clusters"),
+        (positions[part == 3], None, r"--remove-plane: all of the 20,000 points"),
+        (spiral(20000), None, r"--remove-plane: no plane holds 10% of the surface"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            object_of(given, nth)
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 50])
@@ -115,9 +107,3 @@ def test_few_points_of_any_size_have_clusters_and_perhaps_a_plane(count, size):
 def test_a_point_at_the_end_of_the_world_is_a_cluster_of_its_own():
     labels = scenes.clusters(np.concatenate([[[1e35, 0, 0]], spiral(5000)]))
     assert same(labels, np.arange(5001) == 0)
-
-
-def test_a_batch_of_clouds_is_refused():
-    plain = cloud(spiral(10))
-    with pytest.raises(ValueError, match=r"takes one cloud, .* got shape \(1, 10, 3\)"):
-        scenes.cut_out(plain.replace(**{name: x[None] for name, x in vars(plain).items() if x is not None}), nth=1)

@@ -26,14 +26,6 @@ def test_thinned_points_cover_the_shape_evenly_where_a_random_choice_leaves_gaps
     assert np.quantile(gap, 0.99) < 0.6 * np.quantile(random_gap, 0.99)
 
 
-def test_farthest_points_are_those_of_the_plain_loop():
-    positions = sphere_points(3, 60)
-    kept = [int(np.random.default_rng(7).integers(60))]
-    while len(kept) < 20:
-        kept.append(int(np.argmax([min(np.linalg.norm(p - positions[k]) for k in kept) for p in positions])))
-    np.testing.assert_array_equal(farthest_points(positions, 20, seed=7), kept)
-
-
 def in_a_grid(positions: np.ndarray) -> np.ndarray:
     return np.round(positions, 1)
 

@@ -8,7 +8,8 @@ from jax import lax
 from support import reference
 from support.laws import adjoint_law, close, numbers, same_bits
 
-from spnr_jax.kernels.voxels import locate, row_of, scatter_conv, scatter_mean, share_voxels, trilinear
+from spnr_jax.kernels import voxels
+from spnr_jax.kernels.voxels import row_of, scatter_conv, scatter_mean, spread, trilinear
 
 D = 4
 POSITIONS = 1.2 * numbers(0, 2, 3, 12, 3)  # some lie outside the box, and several share a voxel
@@ -16,7 +17,7 @@ FEATURES = numbers(1, 2, 3, 12, 2)
 MASK = np.random.default_rng(2).uniform(size=(2, 3, 12)) > 0.3
 VOLUME = numbers(3, D, D, D, 2)
 scatter = jax.jit(scatter_mean, static_argnums=3)
-lookup = jax.jit(trilinear)
+lookup, locate = jax.jit(trilinear), jax.jit(voxels.locate, static_argnums=1)
 
 
 class TestLocate:
@@ -62,19 +63,12 @@ class TestScatterMean:
         assert volume.sum() == 2 * kept
         assert occupancy.sum() == kept
 
-    @pytest.mark.parametrize("count", [1, 1000])
-    def test_identical_points_are_one_point(self, count):
-        positions = jnp.broadcast_to(jnp.array([0.3, -0.2, 0.9]), (count, 3))
-        volume, occupancy = scatter(positions, jnp.full((count, 2), 0.7), jnp.ones(count, bool), D)
-        assert (occupancy > 0).sum() == 1
-        close((volume[3, 1, 2], occupancy[3, 1, 2]), (jnp.full(2, 0.7), 1.0), rtol=3e-5)
-
     @pytest.mark.parametrize("fill", [0.0, 1e30, np.nan])
     def test_padding_does_not_matter_whatever_it_holds(self, fill):
         extra = jnp.full((5, 3), fill, jnp.float32)
         fills = extra, extra[:, :2], jnp.zeros(5, bool)
         padded = (jnp.concatenate(pair) for pair in zip(self.cloud, fills, strict=True))
-        same_bits(scatter_mean(*padded, D), scatter_mean(*self.cloud, D))
+        same_bits(scatter(*padded, D), scatter(*self.cloud, D))
 
     def test_no_point_gives_zeros_and_zero_gradients(self):
         positions, features, mask = self.cloud
@@ -102,9 +96,7 @@ class TestScatterConv:
 
     @staticmethod
     def sparse(positions, features, mask, kernel):
-        rows, share = share_voxels(positions, mask, D)
-        values = jnp.concatenate([features, jnp.ones_like(features[:, :1])], axis=-1) * share[:, None]
-        return scatter_conv(rows, values, kernel, D)
+        return scatter_conv(*spread(positions, features, mask, D), kernel, D)
 
     def test_is_the_convolution_of_the_scattered_volume_in_value_and_gradient(self):
         weights = numbers(6, D, D, D, 4)
@@ -129,8 +121,7 @@ class TestScatterConv:
         close(sparse[0][1], reference.convolution(volume, self.kernel), atol=1e-5)
 
     def test_is_adjoint_to_its_gradient_in_points_and_kernel(self):
-        rows, share = share_voxels(POSITIONS[0, 0], jnp.asarray(MASK[0, 0]), D)
-        values = numbers(9, 12, 3) * share[:, None]
+        rows, values = spread(POSITIONS[0, 0], numbers(9, 12, 2), jnp.asarray(MASK[0, 0]), D)
         adjoint_law(lambda v: scatter_conv(rows, v, self.kernel, D), values)
         adjoint_law(lambda k: scatter_conv(rows, values, k, D), self.kernel)
 

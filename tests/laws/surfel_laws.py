@@ -181,7 +181,7 @@ def borders(place, colors):
     place = jnp.concatenate([0 * place[:1], place[1:]])
     one, up = jnp.ones_like(place[0, 0]), jnp.zeros_like(place[0, 0])
     axes = jnp.stack([jnp.stack([one, up, up]), jnp.stack([up, one, up]), jnp.stack([up, up, one])])
-    return tuple(discs.find_border(place, jnp.ones_like(place[:, 0]), one, axes, colors, RULES))
+    return tuple(discs.find_border(place, jnp.ones_like(place[:, 0]), one, axes, colors, RULES).values())
 
 
 def parted(rng, size):

@@ -17,7 +17,6 @@ from spnr_jax.kernels import losses
 from spnr_jax.kernels.cameras import camera_rays, intersect_box, look_at, pinhole, resize
 from spnr_jax.kernels.records import PointCloud
 from spnr_jax.method import inference
-from spnr_jax.method.model import Model
 
 MODEL, SIZE, NUM_POINTS = tiny_model.MODEL, tiny_model.SIZE, 32
 RANDOM = 0.6 * np.asarray(numbers(0, NUM_POINTS, 3))
@@ -161,37 +160,3 @@ def test_looking_away_is_exactly_white_and_pulls_at_nothing_in_the_scene(variabl
     assert (rendering.acc == 0).all()
     assert all((x == 0).all() for x in jax.tree.leaves(by_inputs))
     assert all((x == 0).all() for part in ("encoder", "field") for x in jax.tree.leaves(by_weights[part]))
-
-
-class TestUnits:
-    """Through the model handle, which normalises: in evaluation mode, each cloud in its own units."""
-
-    @staticmethod
-    def picture(variables, positions, count=NUM_POINTS):
-        handle = Model(config=MODEL, variables=variables)
-        one = jax.tree.map(lambda x: np.asarray(x)[0], cloud(base_color=np.asarray(numbers(5, NUM_POINTS, 3, low=0.0))))
-        one = jax.tree.map(lambda x: np.resize(x, (count, *x.shape[1:])), one)
-        volume = handle.encode(dataclasses.replace(one, positions=np.float32(positions)))
-        rendering = handle.render(volume, handle.camera(volume, 30.0, 20.0))
-        assert all(np.isfinite(x).all() for x in jax.tree.leaves(rendering))
-        return volume, rendering
-
-    @pytest.mark.parametrize("size", [1e-30, 1e-6, 1e6, 1e30])
-    def test_size_changes_nothing_but_the_unit_of_depth(self, variables, size):
-        _, expected = self.picture(variables, RANDOM)
-        _, rendering = self.picture(variables, size * np.float64(RANDOM))
-        close(rendering.image, expected.image, atol=1e-4)
-        close(rendering.acc, expected.acc, atol=1e-4)
-        close(rendering.depth / np.float32(size), expected.depth, rtol=1e-4)
-
-    @pytest.mark.parametrize("seed", range(2))
-    def test_the_ends_of_a_stick_along_an_axis_stay_in_the_box(self, variables, seed):
-        """They lie on two faces, and rounding must not drop them: a stick of two points has no others."""
-        rng = np.random.default_rng(seed)
-        ends = np.zeros((2, 3))
-        ends[:, seed % 3] = rng.normal(size=2) * 10.0 ** rng.uniform(-3, 3)
-        positions = np.repeat(ends, NUM_POINTS // 2, axis=0)
-        stick, _ = self.picture(variables, positions)
-        ends[:, seed % 3] = [-1, 1] if np.diff(ends[:, seed % 3]) > 0 else [1, -1]
-        exact, _ = self.picture(variables, np.repeat(ends, NUM_POINTS // 2, axis=0))
-        close(stick.scene, exact.scene, atol=1e-4)

@@ -17,9 +17,8 @@ from spnr_jax.method import densifier, surfel_method
 from spnr_jax.method.densifier import CHILDREN, Nodes, place
 from spnr_jax.training import weights
 
-COUNT, SIZE = 150, 1000  # real points, and with padding; whole clouds have as many, so that they share programs
+COUNT, SIZE = 150, 512  # real points, and with padding; whole clouds have as many, so that they share programs
 run = jax.jit(densifier.densify)
-see = jax.jit(densifier.see)
 
 
 @pytest.fixture(scope="module")
@@ -59,20 +58,23 @@ def test_measured_points_are_kept_as_they_are_and_children_are_told(params):
 
 
 def test_children_lie_on_a_ball_nearer_than_the_middles_of_pairs(params):
-    points = cloud(shape("sphere", 1000)[0])
+    points, spacing = cloud(shape("sphere", SIZE)[0]), np.sqrt(4 * np.pi / SIZE)
     dense = run(params, points, spnr_jax.neighbors(points))
-    children = np.asarray(dense.positions)[1000:][np.asarray(dense.mask)[1000:]]
+    children = np.asarray(dense.positions)[SIZE:][np.asarray(dense.mask)[SIZE:]]
     off = np.abs(np.linalg.norm(children, axis=1) - 0.6)
-    chord = 0.6 * (1 - np.cos(np.sqrt(4 * np.pi / 1000) / 2))
-    assert len(children) > 2000
-    assert np.sqrt(np.mean(off**2)) < chord / 2
-    assert cKDTree(children).query(shape("sphere", 20_000)[0])[0].max() < 1.1 * 0.6 * np.sqrt(4 * np.pi / 1000)
+    assert len(children) > 2 * SIZE
+    assert np.sqrt(np.mean(off**2)) < 0.6 * (1 - np.cos(spacing / 2)) / 2
+    assert cKDTree(children).query(shape("sphere", 20_000)[0])[0].max() < 1.1 * 0.6 * spacing
+
+
+def nodes_of(positions, normals, spacing):
+    """What is known of points of one colour."""
+    return Nodes(*map(jnp.asarray, (positions, normals)), jnp.full(len(positions), spacing), 0 * normals, None)
 
 
 def test_places_of_pairs_lie_on_circles_that_their_ends_do():
-    normals = jnp.asarray(shape("sphere", 1000)[1])
-    nodes = Nodes(0.6 * normals, normals, jnp.full(1000, 0.067), jnp.zeros((1000, 3)), None)
-    found = jax.jit(place)(nodes, spnr_jax.neighbors(cloud(0.6 * normals)))
+    normals = shape("sphere", 1000)[1]
+    found = jax.jit(place)(nodes_of(0.6 * normals, normals, 0.067), spnr_jax.neighbors(cloud(0.6 * normals)))
     pairs = np.asarray(found.exists & (found.first != found.second))
     assert pairs.sum() > 2500
     close(np.linalg.norm(np.asarray(found.middle)[pairs], axis=1), 0.6, atol=1e-4)  # a cubic, to fourth order
@@ -84,10 +86,11 @@ def test_places_of_pairs_lie_on_circles_that_their_ends_do():
 
 
 def test_no_two_children_are_nearer_than_the_closest(params):
-    points = cloud(shape("sphere", 1000, "random")[0])
+    points = cloud(shape("sphere", SIZE, "random")[0])
     near = spnr_jax.neighbors(points)
     dense = jax.tree.map(lambda x: np.asarray(x)[SIZE:], run(params, points, near))
-    scale = np.asarray(see(points, near)[1].scale)[dense.mask]
+    distance = np.linalg.norm(points.positions[near] - points.positions[:, None], axis=2)
+    scale = 0.8 * np.sqrt(np.pi / 6) * np.repeat(distance[near[:, :9], 6].mean(axis=1), CHILDREN)[dense.mask]
     positions, normals = dense.positions[dense.mask], dense.normals[dense.mask]
     distance, other = cKDTree(positions).query(positions, 2)
     facing = np.sum(normals * normals[other[:, 1]], axis=1)
@@ -108,7 +111,7 @@ def test_vmap_is_a_loop_and_a_program_is_the_plain_function(params):
 def test_blocks_are_the_whole_at_once(params, monkeypatch):
     points = ball()
     near = jnp.asarray(spnr_jax.neighbors(points))
-    nodes, places = see(points, near)
+    nodes, places = jax.jit(densifier.see)(points, near)
     found = []
     for block in (SIZE * CHILDREN, 37):
         monkeypatch.setattr(densifier, "BLOCK", block)
@@ -119,9 +122,9 @@ def test_blocks_are_the_whole_at_once(params, monkeypatch):
 def test_a_dense_cloud_gets_children_where_it_ends_or_bends_alone(monkeypatch):
     grid = np.stack(np.meshgrid(np.arange(20), np.arange(31)), axis=-1).reshape(-1, 2)
     edge = np.concatenate([np.insert(grid[:400], 2, 0, axis=1), np.insert(grid[20:], 0, 0, axis=1)])
-    points = cloud(edge * 0.05)
-    near = spnr_jax.neighbors(points)
-    nodes, everywhere = see(points, near)
+    near = spnr_jax.neighbors(cloud(edge * 0.05))
+    nodes = nodes_of(edge * 0.05, np.repeat(np.eye(3)[[2, 0]], [400, 600], axis=0), 0.05)
+    everywhere = jax.jit(place)(nodes, near)
     monkeypatch.setattr(densifier, "SPARSE", len(edge) - 1)
     some = jax.jit(lambda *x: place(*x))(nodes, near)
     pairs = [np.asarray(x.exists & (x.first != x.second)) for x in (everywhere, some)]
@@ -149,8 +152,8 @@ def test_padding_and_the_order_of_points_do_not_matter(params):
 def test_a_turned_cloud_has_turned_children(params):
     normals = shape("sphere", SIZE, "random")[1]
     turn = np.float32([[0.36, 0.48, -0.8], [-0.8, 0.6, 0], [0.48, 0.64, 0.6]])
-    points = cloud(0.6 * normals, normals=normals)
-    other = dataclasses.replace(points, positions=points.positions @ turn.T, normals=points.normals @ turn.T)
+    points = cloud(0.6 * normals)
+    other = dataclasses.replace(points, positions=points.positions @ turn.T)
     one, two = (run(params, x, spnr_jax.neighbors(x)) for x in (points, other))
     there = cKDTree(np.asarray(two.positions)[np.asarray(two.mask)])
     distance = there.query(np.asarray(one.positions)[np.asarray(one.mask)] @ turn.T)[0]
@@ -182,7 +185,8 @@ def test_few_points_and_equal_ones_stay_finite(params, positions):
     np.testing.assert_array_equal(dense.mask[: len(positions)], True)
 
 
-def test_the_handle_densifies_sparse_clouds_alone(params):
+def test_the_handle_densifies_sparse_clouds_alone(params, monkeypatch):
+    monkeypatch.setattr(surfel_method, "_densify", lambda weights, *given: run({"densifier": weights}, *given))
     sparse = cloud(shape("sphere", 300)[0])
     dense = surfel_method.densify_sparse(params, sparse)
     assert 2 * 300 < len(dense.mask) < 5 * 300

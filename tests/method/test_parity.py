@@ -40,16 +40,14 @@ def pictures(key):
 
 @pytest.fixture(scope="module")
 def stages():
-    """Every intermediate result of the generator in evaluation, from one compiled call."""
+    """Every intermediate result of the generator in evaluation under its name in the fixture, from one program."""
 
     @jax.jit
     def run(variables, cloud, camera):
-        renderer = inference.network(CONFIG.model)
-        module = renderer.bind(variables)
+        module = inference.network(CONFIG.model).bind(variables)
         resolution, counts = CONFIG.model.encoder.volume_resolution, CONFIG.model.sampling
         point_features = module.encoder.point_features(cloud)
         scene = module.encode(cloud)
-        volume = scene.volume
         rays = module.rays(camera)
         near, far, _ = cameras.intersect_box(rays.origins, rays.directions)
         objects = jnp.zeros(rays.origins.shape[:-1], jnp.int32)
@@ -58,82 +56,62 @@ def stages():
         density, (rgb, _) = module.along(scene, rays, objects)[0](coarse)
         weights, _ = compositing.volume_weights(density, compositing.interval_lengths(coarse, far))
         features, depth, acc = trace(module, scene, rays, counts, AS_TRAINED, None)
+        cell, offset = voxels.locate(cloud.positions, resolution)
+        grid, occupancy = voxels.scatter_mean(cloud.positions, point_features, cloud.mask, resolution)
+        rendering = module.render(scene, camera)
+        encoding = encode_direction(rays.directions, CONFIG.model.direction_frequencies)
+
+        def as_picture(x):  # (1, c, h, w), as the twin has it
+            return jnp.moveaxis(x.reshape(1, 32, 32, -1), -1, 1)
+
         return {
-            "voxel": voxels.locate(cloud.positions, resolution),
+            "voxel_index": (cell[0, :, 2] * resolution + cell[0, :, 1]) * resolution + cell[0, :, 0],
+            "voxel_offset": offset,
             "point_features": point_features[0],
-            "grid": voxels.scatter_mean(cloud.positions, point_features, cloud.mask, resolution),
-            "volume": volume,
+            "grid": jnp.moveaxis(jnp.concatenate([grid, occupancy[..., None]], axis=-1), -1, 1),
+            "volume": jnp.moveaxis(scene.volume, -1, 1),
             "ray_direction": rays.directions,
             "near": near[..., None],
             "far": far[..., None],
-            "direction_encoding": encode_direction(rays.directions, CONFIG.model.direction_frequencies),
+            "direction_encoding": encoding.reshape(1, 32, 32, -1)[:, :, 0],
             "coarse_t": coarse,
-            "coarse_lookup": voxels.trilinear(volume, jnp.clip(positions, -1, 1)),  # rays that miss: the twin clamps
+            "coarse_lookup_row0": voxels.trilinear(scene.volume, jnp.clip(positions, -1, 1))[:, :32],  # the twin clamps
             "coarse_density": density,
-            "coarse_rgb": rgb,
+            "coarse_rgb_row0": rgb[:, :32],
             "coarse_weights": weights,
             "fine_t": sampling.importance(None, edges, weights, counts.num_fine, counts.padding),
-            "features": features,
-            "depth": depth,
-            "acc": acc,
-            "rendering": module.render(scene, camera),
+            "features": as_picture(features),
+            "rgb": as_picture(rendering.image_lr),
+            "acc": as_picture(acc),
+            "depth": as_picture(depth - (1 - acc) * far),  # ours adds the light that nothing stops, at `far`
+            "image": jnp.moveaxis(rendering.image[:, 0], -1, 1),
         }
 
     return run(VARIABLES, BATCH.cloud, BATCH.camera)
 
 
-class TestGeneratorStages:
-    def test_points_lie_in_the_same_voxels_at_the_same_offsets(self, stages):
-        cell, offset = (np.asarray(x[0]) for x in stages["voxel"])
-        d = CONFIG.model.encoder.volume_resolution
-        np.testing.assert_array_equal((cell[:, 2] * d + cell[:, 1]) * d + cell[:, 0], ARRAYS["eval/voxel_index"])
-        agree(offset, ARRAYS["eval/voxel_offset"][0])
+STAGES = (
+    *("voxel_offset", "point_features", "grid", "volume", "ray_direction", "near", "far", "direction_encoding"),
+    *("coarse_t", "coarse_lookup_row0", "coarse_density", "coarse_rgb_row0", "coarse_weights", "fine_t"),
+    *("features", "rgb", "acc", "depth", "image"),
+)
 
-    def test_point_features(self, stages):
-        agree(stages["point_features"], ARRAYS["eval/point_features"])
 
-    def test_scattered_grid(self, stages):
-        volume, occupancy = stages["grid"]
-        agree(np.concatenate([volume, occupancy[..., None]], axis=-1), np.moveaxis(ARRAYS["eval/grid"], 1, -1))
+@pytest.mark.parametrize("name", STAGES)
+def test_every_stage_of_the_generator_is_the_twins(stages, name):
+    agree(stages[name], ARRAYS[f"eval/{name}"].reshape(stages[name].shape))
 
-    def test_feature_volume(self, stages):
-        agree(stages["volume"], np.moveaxis(ARRAYS["eval/volume"], 1, -1))
 
-    @pytest.mark.parametrize(
-        "name", ["ray_direction", "near", "far", "coarse_t", "coarse_density", "coarse_weights", "fine_t"]
+def test_points_lie_in_the_same_voxels(stages):
+    np.testing.assert_array_equal(stages["voxel_index"], ARRAYS["eval/voxel_index"])
+
+
+@pytest.mark.parametrize(("name", "source"), [("fake", "eval/image"), ("real", "in/target")])
+def test_logits(name, source):
+    logits = optimisation.discriminator_of(CONFIG).apply(
+        {"params": DISCRIMINATOR}, jnp.asarray(pictures(source)), BATCH.condition[0], BATCH.condition_mask[0]
     )
-    def test_along_the_rays(self, stages, name):
-        agree(stages[name], ARRAYS[f"eval/{name}"])
-
-    def test_direction_encoding_of_the_first_pixel_of_every_row(self, stages):
-        encoding = np.asarray(stages["direction_encoding"]).reshape(1, 32, 32, -1)
-        agree(encoding[:, :, 0], ARRAYS["eval/direction_encoding"])
-
-    def test_lookups_and_colours_of_the_first_row(self, stages):
-        agree(stages["coarse_lookup"][:, :32], ARRAYS["eval/coarse_lookup_row0"])
-        agree(stages["coarse_rgb"][:, :32], ARRAYS["eval/coarse_rgb_row0"])
-
-    def test_rendered_features(self, stages):
-        features = np.asarray(stages["features"]).reshape(1, 32, 32, -1)
-        agree(features, pictures("eval/features"))
-        agree(features[..., :3], pictures("eval/rgb"))
-        agree(stages["rendering"].image_lr[:, 0], pictures("eval/rgb"))
-
-    def test_opacity_and_depth(self, stages):
-        acc, depth, far = (np.asarray(stages[name]).reshape(1, 32, 32, 1) for name in ("acc", "depth", "far"))
-        agree(acc, pictures("eval/acc"))
-        agree(depth - (1 - acc) * far, pictures("eval/depth"))  # ours adds the light that nothing stops, at `far`
-
-    def test_image(self, stages):
-        agree(stages["rendering"].image[:, 0], pictures("eval/image"))
-
-    @pytest.mark.parametrize(("name", "source"), [("fake", "eval/image"), ("real", "in/target")])
-    def test_logits(self, name, source):
-        image = jnp.asarray(pictures(source))
-        logits = optimisation.discriminator_of(CONFIG).apply(
-            {"params": DISCRIMINATOR}, image, BATCH.condition[0], BATCH.condition_mask[0]
-        )
-        agree(logits, pictures(f"eval/logits_{name}"))
+    agree(logits, pictures(f"eval/logits_{name}"))
 
 
 def judge(params, image):
@@ -165,38 +143,34 @@ def trained():
     return rendering, statistics, parts, gradients
 
 
-class TestGeneratorTraining:
-    def test_images_with_batch_statistics(self, trained):
-        rendering = trained[0]
-        agree(rendering.image[:, 0], pictures("train/image"))
-        agree(rendering.image_lr[:, 0], pictures("train/rgb"))
-        agree(rendering.acc[:, 0, ..., None], pictures("train/acc"))
-        far = ARRAYS["eval/far"].reshape(1, 32, 32, 1)
-        acc, depth = (np.asarray(x)[:, 0, ..., None] for x in (rendering.acc, rendering.depth))
-        agree(depth - (1 - acc) * far, pictures("train/depth"))
-
-    @pytest.mark.parametrize("name", ["l1", "adv", "loss_g"])
-    def test_losses(self, trained, name):
-        agree(trained[2][name], ARRAYS[f"train/{name}"])
-
-    @pytest.mark.parametrize("layer", range(3))
-    def test_running_statistics_after_one_forward(self, trained, layer):
-        ours = trained[1]["encoder"]["pointnet"][f"norm_{layer}"]
+def test_images_losses_and_statistics_of_the_training(trained):
+    rendering, statistics, losses_of, _ = trained
+    agree(rendering.image[:, 0], pictures("train/image"))
+    agree(rendering.image_lr[:, 0], pictures("train/rgb"))
+    far = ARRAYS["eval/far"].reshape(1, 32, 32, 1)
+    acc, depth = (np.asarray(x)[:, 0, ..., None] for x in (rendering.acc, rendering.depth))
+    agree(acc, pictures("train/acc"))
+    agree(depth - (1 - acc) * far, pictures("train/depth"))
+    for name in ("l1", "adv", "loss_g"):
+        agree(losses_of[name], ARRAYS[f"train/{name}"])
+    for layer in range(3):
+        ours = statistics["encoder"]["pointnet"][f"norm_{layer}"]
         agree(ours["mean"], ARRAYS[f"train/after/points.norms.{layer}.running_mean"])
         agree(ours["variance"], ARRAYS[f"train/after/points.norms.{layer}.running_var"])
 
-    def test_gradient_norm_of_every_parameter(self, trained):
-        norms = {k.removeprefix("train/grad_norm/gen."): v for k, v in ARRAYS.items() if "grad_norm/gen." in k}
-        ours = twin_named(trained[3])
-        assert set(ours) == set(norms)
-        for name, norm in norms.items():
-            agree(np.linalg.norm(ours[name]), norm)
 
-    def test_gradients_where_they_are_stored_in_full(self, trained):
-        stored = {k.removeprefix("train/grad/gen."): v for k, v in ARRAYS.items() if k.startswith("train/grad/gen.")}
-        ours = twin_named(trained[3])
-        for name, gradient in stored.items():
-            agree(ours[name], gradient)
+def test_gradients_of_every_parameter(trained):
+    """The norms of all, and those that are stored in full."""
+    norms, stored = (
+        {name.removeprefix(begin): x for name, x in ARRAYS.items() if name.startswith(begin)}
+        for begin in ("train/grad_norm/gen.", "train/grad/gen.")
+    )
+    ours = twin_named(trained[3])
+    assert set(ours) == set(norms)
+    for name, norm in norms.items():
+        agree(np.linalg.norm(ours[name]), norm)
+    for name, gradient in stored.items():
+        agree(ours[name], gradient)
 
 
 def twin_named(tree):
@@ -256,17 +230,13 @@ def discriminated():
     return {name: jax.jit(jax.value_and_grad(f))(DISCRIMINATOR) for name, f in (("loss_d", loss), ("r1", penalty))}
 
 
-class TestDiscriminatorTraining:
-    @pytest.mark.parametrize("name", ["loss_d", "r1"])
-    def test_losses(self, discriminated, name):
-        agree(discriminated[name][0], ARRAYS[f"train/{name}"])
-
-    @pytest.mark.parametrize(("name", "key"), [("loss_d", "grad_norm"), ("r1", "grad_norm_r1")])
-    def test_gradient_norm_of_every_parameter(self, discriminated, name, key):
-        stored = {k.split("disc.")[1]: v for k, v in ARRAYS.items() if k.startswith(f"train/{key}/disc.")}
-        assert len(stored) == 13
-        for parameter, norm in stored.items():
-            agree(np.linalg.norm(parameter_of(discriminated[name][1], parameter)), norm)
+@pytest.mark.parametrize(("name", "key"), [("loss_d", "grad_norm"), ("r1", "grad_norm_r1")])
+def test_losses_and_gradient_norms_of_the_discriminator(discriminated, name, key):
+    agree(discriminated[name][0], ARRAYS[f"train/{name}"])
+    stored = {k.split("disc.")[1]: v for k, v in ARRAYS.items() if k.startswith(f"train/{key}/disc.")}
+    assert len(stored) == 13
+    for parameter, norm in stored.items():
+        agree(np.linalg.norm(parameter_of(discriminated[name][1], parameter)), norm)
 
 
 def parameter_of(tree, name):

@@ -6,11 +6,10 @@ import re
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import pytest
 from support.laws import numbers
 from support.tiny_model import MODEL, camera, cloud
-from support.tiny_training import BATCH, CONFIG, L1_ONLY, create, step
+from support.tiny_training import BATCH, CONFIG
 
 from spnr_jax.config import AS_TRAINED
 from spnr_jax.kernels.records import Rays, Scene
@@ -68,23 +67,3 @@ def test_points_field_sampling_and_compositing_stay_float32():
 
     assert "bf16" not in str(jax.make_jaxpr(samples)(variables, jax.random.key(0)))
     assert "bf16" not in str(jax.make_jaxpr(points)(variables))
-
-
-@pytest.mark.parametrize("start", [L1_ONLY, pytest.param(CONFIG, marks=pytest.mark.slow)], ids=["L1", "both networks"])
-def test_thirty_steps_lose_as_much_as_in_float32(start):
-    """The curves differ by a hundredth of the first loss at first, and on average by a fiftieth."""
-    single, half = (loss_curve(dataclasses.replace(start, model=model)) for model in (MODEL, BF16_MODEL))
-    apart = np.abs(half - single) / single[0]
-    assert apart.max() > 0
-    assert apart[:15].max() < 0.01
-    assert apart.mean() < 0.02
-    assert half[-1] < 0.5 * half[0]
-
-
-def loss_curve(config):
-    """Loss of each of thirty steps on one batch."""
-    state, losses = create(config), []
-    for _ in range(30):
-        state, metrics = step(state, config)
-        losses.append(float(metrics["loss"]))
-    return np.array(losses)

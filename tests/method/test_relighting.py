@@ -1,4 +1,4 @@
-"""Laws of light in pictures of the package's network: black, sums, multiples, turns, a white body, extremes."""
+"""Laws of light in pictures of the package's network: sums, multiples, turns, a matt body, where light comes from."""
 
 import dataclasses
 
@@ -12,6 +12,7 @@ from spnr_jax.formats.images import read_light
 from spnr_jax.kernels.imaging import srgb_to_linear
 from spnr_jax.surfels.lighting import directions
 
+COUNT = 1400  # points of every body: few programs
 SIZE = 132  # more than those of pictures that are drawn at twice the size: means of sRGB are not linear in the light
 
 
@@ -27,12 +28,12 @@ def body():
     positions = np.concatenate([ball, rod + [0, 0.35, 0]])
     rng = np.random.default_rng(3)
     color = np.where(positions[:, :1] > 0, [0.7, 0.3, 0.2], [0.2, 0.4, 0.6])
-    return cloud(positions, base_color=color, roughness=rng.uniform(0.2, 0.9, 1400), metallic=positions[:, 1] > 0.3)
+    return cloud(positions, base_color=color, roughness=rng.uniform(0.2, 0.9, COUNT), metallic=positions[:, 1] > 0.3)
 
 
 @pytest.fixture(scope="module")
 def volume(model, body):
-    return model.encode(body)
+    return model.encode(body, densify=False)
 
 
 def linear(model, volume, light, azimuth=30.0, quality="best"):
@@ -42,12 +43,6 @@ def linear(model, volume, light, azimuth=30.0, quality="best"):
     straight = (np.asarray(found.image) - 1 + np.asarray(found.acc)[..., None]) / np.maximum(found.acc, 1e-3)[..., None]
     assert solid.sum() > 500
     return np.asarray(srgb_to_linear(jnp.clip(jnp.asarray(straight), 0, 1))), solid
-
-
-@pytest.mark.ci
-def test_black_light_gives_black(model, volume):
-    image, solid = linear(model, volume, spnr_jax.ambient((0.0, 0.0, 0.0)))
-    assert image[solid].max() < 2e-3  # what an opacity of .999 leaves of the white behind
 
 
 def test_light_a_plus_light_b_is_their_sum_and_a_multiple_a_multiple(model, volume):
@@ -60,39 +55,24 @@ def test_light_a_plus_light_b_is_their_sum_and_a_multiple_a_multiple(model, volu
     np.testing.assert_allclose(twice[clear], 2 * a[clear], atol=2e-3)
 
 
-def turned_together(model, body, volume, light, quality="best", seen_from_everywhere=False):
-    """Differences in linear light between a picture and that of object, camera and light turned; share not solid."""
-    turn = 16 * 5.625
+@pytest.mark.parametrize(("shadowed", "most"), [(True, 0.01), (False, 5e-3)])
+def test_object_camera_and_light_turned_together_give_nearly_the_same_picture(model, body, volume, shadowed, most):
+    """Not exactly where there are shadows: the 64 directions that see the points stand still."""
+    turn, light = 16 * 5.625, read_light("studio")
     angle = np.deg2rad(turn)
     rotation = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
     turned = dataclasses.replace(body, positions=np.float32(body.positions @ rotation.T))
-    volumes = [volume, model.encode(turned)]
-    if seen_from_everywhere:
-        volumes = [unshadowed(volume) for volume in volumes]
-    before, solid = linear(model, volumes[0], light, 30.0, quality)
-    after, also = linear(model, volumes[1], light.turned(turn), 30.0 + turn, quality)
-    return np.abs(after - before)[solid & also], np.mean(solid != also)
 
+    def drawn(volume, light, azimuth):
+        if not shadowed:
+            surfels = volume.scene.surfels.replace(visible=jnp.ones_like(volume.scene.surfels.visible))
+            volume = volume.replace(scene=volume.scene.replace(surfels=surfels))
+        return linear(model, volume, light, azimuth)
 
-def unshadowed(volume):
-    """The volume as if every direction saw every point."""
-    surfels = volume.scene.surfels
-    surfels = dataclasses.replace(surfels, visible=jnp.ones_like(surfels.visible))
-    return dataclasses.replace(volume, scene=dataclasses.replace(volume.scene, surfels=surfels))
-
-
-def test_object_camera_and_light_turned_together_give_nearly_the_same_picture(model, body, volume):
-    """Not exactly: the 64 directions that see the points stand still."""
-    off, unlike = turned_together(model, body, volume, read_light("studio"))
-    assert np.mean(off) < 0.01
-    assert unlike < 0.01
-
-
-def test_what_is_not_shadowed_turns_with_object_camera_and_light(model, body, volume):
-    off, unlike = turned_together(model, body, volume, read_light("studio"), "draft", seen_from_everywhere=True)
-    assert np.median(off) < 1e-3
-    assert np.mean(off) < 5e-3
-    assert unlike < 0.01
+    before, solid = drawn(volume, light, 30.0)
+    after, also = drawn(model.encode(turned, densify=False), light.turned(turn), 30.0 + turn)
+    assert np.mean(np.abs(after - before)[solid & also]) < most
+    assert np.mean(solid != also) < 0.01
 
 
 @pytest.mark.parametrize(("quality", "within"), [("best", 0.1), ("draft", 0.03)])
@@ -100,8 +80,8 @@ def test_uniform_light_shows_the_albedo_of_a_matt_convex_body(model, quality, wi
     """What it mirrors is that of a black body, and is taken away.  The network adds 7 to 9 % to the darkest channel."""
 
     def shown(albedo):
-        columns = {"base_color": np.tile(albedo, (3000, 1)), "roughness": np.ones(3000)}
-        volume = model.encode(cloud(shape("sphere", 3000)[0], **columns))
+        columns = {"base_color": np.tile(albedo, (COUNT, 1)), "roughness": np.ones(COUNT)}
+        volume = model.encode(cloud(shape("sphere", COUNT)[0], **columns), densify=False)
         return linear(model, volume, 0.9 * spnr_jax.ambient(), quality=quality)
 
     color = 0.8, 0.5, 0.2
@@ -109,22 +89,11 @@ def test_uniform_light_shows_the_albedo_of_a_matt_convex_body(model, quality, wi
     np.testing.assert_allclose((body - black)[solid].mean(axis=0), 0.9 * np.array(color), rtol=within)
 
 
-@pytest.mark.parametrize("radiance", [1e-6, 1e6])
-def test_no_light_gives_nan(model, volume, radiance):
-    lamp = np.zeros((32, 64, 3), np.float32)
-    lamp[8, 20] = 1e5
-    for light in (spnr_jax.ambient(), spnr_jax.light_of(lamp)):
-        found = model.render(volume, model.camera(volume, resolution=SIZE), light=radiance * light)
-        assert np.isfinite(np.asarray(found.image)).all()
-        assert np.asarray(found.image).min() >= 0
-        assert np.asarray(found.image).max() <= 1 + 1e-6
-
-
 def test_light_comes_from_where_it_stands(model):
     """A ball lit from the right is brighter there, and so is its picture from behind, on the other side."""
-    volume = model.encode(cloud(shape("sphere", 1400)[0], roughness=np.ones(1400)))
+    volume = model.encode(cloud(shape("sphere", COUNT)[0], roughness=np.ones(COUNT)), densify=False)
     right = spnr_jax.light_of(np.maximum(directions(32) @ [1, 0, 0], 0)[..., None] ** 4 * np.ones(3, np.float32))
-    for azimuth, side in ((0.0, 1), (180.0, -1)):
+    for azimuth, side in ((30.0, 1), (210.0, -1)):
         image, solid = linear(model, volume, right, azimuth)
         columns = np.arange(SIZE)[None] - SIZE / 2
         assert side * np.sum(image.mean(axis=-1) * columns * solid) > 0

@@ -11,7 +11,7 @@ from jax import lax
 from support import reference
 from support.laws import close, numbers, same_bits
 
-from spnr_jax.nn.convolution import Conv, conv, upsample_conv
+from spnr_jax.nn.convolution import Conv, conv, run_by_run, upsample_conv
 
 
 def native(x, kernel, stride=1, padding=1):
@@ -85,51 +85,43 @@ def test_second_order_gradients_are_those_of_the_native_form(window):
     close(penalty(conv), penalty(native), rtol=1e-4, atol=1e-5)
 
 
-RUNS = {  # mapped axes of input and kernel
-    "2D, both": (0, 0, (5, 6), 8),
-    "2D, few features": (0, 0, (5, 6), 3),
-    "2D, kernel alone": (None, 0, (5, 6), 8),
-    "2D, input alone": (0, None, (5, 6), 8),
-    "3D, both": (0, 0, (5, 6, 7), 5),
-    "3D, one matrix product": (0, 0, (4, 3, 3), 5),
-}
-
-
-@pytest.mark.parametrize(("x_axis", "kernel_axis", "shape", "features"), RUNS.values(), ids=RUNS)
-def test_runs_under_vmap_are_the_loop_over_runs_in_value_and_gradients(x_axis, kernel_axis, shape, features):
-    x, kernel = numbers(10, 3, 2, *shape, 2), numbers(11, 3, *[3] * len(shape), 2, features)
-    x, kernel = (a if axis == 0 else a[0] for a, axis in ((x, x_axis), (kernel, kernel_axis)))
-
-    def both(form):
-        return lambda x, kernel: value_and_gradients(form, x, kernel)
-
-    mapped = jax.jit(jax.vmap(both(conv), in_axes=(x_axis, kernel_axis)))(x, kernel)
-    one = jax.jit(both(native))
-    for i in range(3):
-        alone = one(x if x_axis is None else x[i], kernel if kernel_axis is None else kernel[i])
-        close(jax.tree.map(lambda a, i=i: a[i], mapped), alone, rtol=1e-5, atol=1e-5)
-
-
-def test_runs_of_runs_and_their_second_order_gradients_are_those_of_the_native_form():
-    x, kernel = numbers(12, 2, 2, 1, 5, 5, 2), numbers(13, 2, 2, 3, 3, 2, 5)
+def test_forward_mode_and_vmap_over_inputs_and_kernels_are_those_of_the_native_form():
+    x, kernel = numbers(10, 3, 2, 5, 6, 2), numbers(11, 3, 3, 3, 2, 5)
 
     def mapped(form):
-        def squared(x, kernel):
-            return jnp.sum(jax.grad(lambda x: jnp.sum(jnp.tanh(form(x, kernel))))(x) ** 2)
+        def both(x, kernel):
+            return jax.jvp(form, (x, kernel), (0.5 * x, 2 * kernel)), value_and_gradients(form, x, kernel)
 
-        return jax.jit(jax.vmap(jax.vmap(jax.grad(squared, (0, 1)))))(x, kernel)
+        return jax.jit(jax.vmap(both))(x, kernel)
 
     close(mapped(conv), mapped(native), rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.parametrize(("window", "stride"), [(3, 1), (3, 2), (4, 2)])
-def test_no_program_of_many_runs_has_what_the_cpu_is_slow_at(window, stride):
-    """Grouped convolutions, and axes in an order that XLA's CPU compiler puts right outside of loops alone."""
-    x, kernel = numbers(14, 3, 2, 6, 6, 2), numbers(15, 3, window, window, 2, 5)
-    gradient = jax.grad(lambda x, k: jnp.sum(jnp.sin(conv(x, k, stride))), (0, 1))
-    program = jax.jit(jax.vmap(gradient)).lower(x, kernel).as_text()
-    assert set(re.findall(r"feature_group_count = (\d+)", program)) == {"1"}
-    assert set(re.findall(r"dim_numbers = (.*?),\s*window", program)) == {"[b, 0, 1, f]x[0, 1, i, o]->[b, 0, 1, f]"}
+@pytest.mark.parametrize("shape", [(6, 6), (6, 5, 6)], ids=["2D", "3D"])
+@pytest.mark.parametrize("window", [3, 4])
+def test_no_gradient_has_axes_in_an_order_that_xla_puts_right_outside_of_loops_alone(shape, window):
+    x, kernel = numbers(14, 2, *shape, 2), numbers(15, *[window] * len(shape), 2, 5)
+    for stride in (1, 2):
+        gradient = jax.grad(lambda x, k, stride=stride: jnp.sum(jnp.sin(conv(x, k, stride))), (0, 1))
+        program = jax.jit(gradient).lower(x, kernel).as_text()
+        found = set(re.findall(r"dim_numbers = (.*?),\s*window", program))
+        assert found == {"[b, 0, 1, f]x[0, 1, i, o]->[b, 0, 1, f]"}
+
+
+@pytest.mark.parametrize("kernels", [0, None], ids=["a kernel each", "one kernel"])
+def test_runs_are_the_loop_over_them_one_after_the_other(kernels):
+    x, kernel = numbers(12, 3, 2, 5, 5, 2), numbers(13, 3, 3, 3, 2, 5)
+
+    def run(x, kernel):
+        return value_and_gradients(conv, x, kernel)
+
+    program = jax.jit(jax.vmap(run_by_run(run), (0, kernels)))
+    given = kernel if kernels == 0 else kernel[0]
+    together = program(x, given)
+    for i in range(3):
+        close(jax.tree.map(lambda a, i=i: a[i], together), jax.jit(run)(x[i], kernel[i if kernels == 0 else 0]))
+    groups = re.findall(r"feature_group_count = (\d+)", program.lower(x, given).as_text())
+    assert set(groups) == {"1"}
 
 
 def test_the_layer_is_that_of_flax():

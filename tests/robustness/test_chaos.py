@@ -2,10 +2,10 @@
 
     make chaos        100 kills and all faults, with a table
 
-One training is killed at random moments of a phase, again and again, and has to end with the bits, the batches and the
-rows of one that was left alone.  Each of FAULTS happens to a copy of a run that lacks its last steps; it says with
-which code and line the command has to end.  The same command, called again once the fault is mended, has to make up for
-it.  Full and read-only disks are real ones, in a mount namespace of their own (`unshare`).
+One training is killed at random moments of random phases, again and again, and has to end with the bits, the batches
+and the rows of one that was left alone.  Each of FAULTS happens to a copy of a run that lacks its last steps; it says
+with which code and line the command has to end.  The same command, called again once the fault is mended, has to make
+up for it.  A full disk is a real one, in a mount namespace of its own (`unshare`).
 """
 
 import errno
@@ -62,14 +62,13 @@ def seconds_of(events, phase):
 
 
 @pytest.mark.ci
-@pytest.mark.parametrize("phase", PHASES)
-def test_a_training_that_was_killed_ends_with_the_same_bits_data_and_rows(phase, alone, tmp_path):
+def test_a_training_that_was_killed_ends_with_the_same_bits_data_and_rows(alone, tmp_path):
     training, whole, reference = alone
-    rng, run, trials = np.random.default_rng(len(phase)), tmp_path / "killed", []
-    usual, unfinished, again = seconds_of(reference.events, phase), 0, 0
-    for moment in np.sort(rng.uniform(0, STEPS - CHECKPOINT_EVERY, KILLS)):
-        delay = rng.uniform(0, usual)
-        due = lambda event, delay=delay, moment=moment: (  # noqa: E731
+    rng, run, trials = np.random.default_rng(0), tmp_path / "killed", []
+    phases, unfinished, again = rng.permutation(PHASES * KILLS), 0, 0
+    for phase, moment in zip(phases, np.sort(rng.uniform(0, STEPS - CHECKPOINT_EVERY, len(phases))), strict=True):
+        delay = rng.uniform(0, seconds_of(reference.events, phase))
+        due = lambda event, phase=phase, delay=delay, moment=moment: (  # noqa: E731
             delay if event.phase == phase and (phase == "start" or event.step >= moment) else None
         )
         trials.append(training.run(run, aim=due))
@@ -82,18 +81,16 @@ def test_a_training_that_was_killed_ends_with_the_same_bits_data_and_rows(phase,
     assert not different(run, whole)
     assert batches(*trials) == batches(reference)
     assert rows(run) == rows(whole)
-    print(f"\n{phase}: {KILLS} kills, {unfinished} with half a checkpoint, {again} steps trained again", end="")
+    print(f"\n{len(phases)} kills, {unfinished} with half a checkpoint, {again} steps trained again", end="")
 
 
 GRACE = 30.0  # seconds that schedulers give after SIGTERM: Slurm's KillWait, Kubernetes' grace period
 SKIPPED = 99
 UNSHARED = ["unshare", "--user", "--map-root-user", "--mount", "sh", "-c"]
-# $1 the run to copy, $2 the folder to mount on, $3 where to copy what is left, $4 kB of room; then the command
+# $1 the run, of which a copy is trained, $2 the folder to mount on; then the command
 FULL = """mount -t tmpfs -o size=64m none "$2" && cp -a "$1/." "$2" || exit 99
-used=$(du -sk "$2" | cut -f1) && mount -o remount,size=$((used + $4))k "$2" || exit 99
-before="$3" mounted="$2"; shift 4; "$@"; code=$?; cp -a "$mounted/." "$before"; exit $code"""
-READ_ONLY = """mount --bind "$2" "$2" && mount -o remount,bind,ro "$2" || exit 99
-shift 4; exec "$@" """
+used=$(du -sk "$2" | cut -f1) && mount -o remount,size=$((used + 200))k "$2" || exit 99
+before="$1" mounted="$2"; shift 2; "$@"; code=$?; cp -a "$mounted/." "$before"; exit $code"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,26 +127,18 @@ def stopped_by(number: signal.Signals, phase: str) -> Inject:
     return inject
 
 
-def on_disk(script: str, room: int) -> Inject:
-    """A disk with so many kB of room, or one that cannot be written."""
-
-    def inject(training: Training, run: Path) -> Seen:
-        if shutil.which("unshare") is None:
-            return Seen(code=SKIPPED, output="")
-        mounted = run.with_name(f"{run.name}-mounted") if script is FULL else run
-        mounted.mkdir(exist_ok=True)
-        command = [sys.executable, "-m", "spnr_jax.cli", *training.arguments(mounted)]
-        environment = {"XLA_FLAGS": QUICK_COMPILATION} | os.environ | {"JAX_COMPILATION_CACHE_DIR": str(training.cache)}
-        done = subprocess.run(
-            [*UNSHARED, script, "sh", str(run), str(mounted), str(run), str(room), *command],
-            capture_output=True,
-            text=True,
-            env=environment,
-        )
-        refused = done.returncode == 1 and "unshare" in done.stderr
-        return Seen(code=SKIPPED if refused else done.returncode, output=done.stdout + done.stderr)
-
-    return inject
+def full_disk(training: Training, run: Path) -> Seen:
+    """A disk with 200 kB of room."""
+    if shutil.which("unshare") is None:
+        return Seen(code=SKIPPED, output="")
+    mounted = run.with_name(f"{run.name}-mounted")
+    mounted.mkdir()
+    command = [sys.executable, "-m", "spnr_jax.cli", *training.arguments(mounted)]
+    environment = {"XLA_FLAGS": QUICK_COMPILATION} | os.environ | {"JAX_COMPILATION_CACHE_DIR": str(training.cache)}
+    shell = [*UNSHARED, FULL, "sh", str(run), str(mounted), *command]
+    done = subprocess.run(shell, capture_output=True, text=True, env=environment)
+    refused = done.returncode == 1 and "unshare" in done.stderr
+    return Seen(code=SKIPPED if refused else done.returncode, output=done.stdout + done.stderr)
 
 
 def cut_log(training: Training, run: Path) -> Seen:
@@ -173,11 +162,8 @@ def other_version(training: Training, run: Path) -> Seen:
 STOPPED = r"spnr: stopped at step \d+ of \d+; the same command goes on"
 FAULTS: dict[str, tuple[Inject, int, str]] = {  # exit code and line to be seen
     "SIGTERM in a step": (stopped_by(signal.SIGTERM, "step"), 130, STOPPED),
-    "Ctrl-C in a step": (stopped_by(signal.SIGINT, "step"), 130, STOPPED),
-    "SIGTERM while a checkpoint is written": (stopped_by(signal.SIGTERM, "checkpoint"), 130, STOPPED),
-    "disk full from the start": (on_disk(FULL, 0), 2, "spnr: .*No space left on device"),
-    "disk full at a checkpoint": (on_disk(FULL, 200), 2, "spnr: checkpoint .* cannot be written .No space left"),
-    "read-only folder": (on_disk(READ_ONLY, 0), 2, "spnr: .*Read-only file system"),
+    "Ctrl-C while a checkpoint is written": (stopped_by(signal.SIGINT, "checkpoint"), 130, STOPPED),
+    "disk full at a checkpoint": (full_disk, 2, "spnr: checkpoint .* cannot be written .No space left"),
     "metrics file cut off in a row": (cut_log, 0, "trained"),
     "checkpoint of another version": (other_version, 2, "spnr: checkpoint .* is of another version"),
 }
@@ -198,7 +184,7 @@ def test_a_fault_is_one_line_and_its_exit_code_and_the_next_call_makes_up_for_it
     assert "Traceback" not in seen.output
     assert training.run(run).code == 0
     assert not different(run, whole)
-    steps, wanted = [row["step"] for row in rows(run)], [row["step"] for row in rows(whole)]
+    steps, wanted = ([row["step"] for row in rows(x) if "loss" in row] for x in (run, whole))
     if seen.more_rows:  # a stop writes a row of its own
         assert steps == sorted(set(steps))
         assert set(wanted) <= set(steps)

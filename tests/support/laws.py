@@ -38,11 +38,6 @@ def same_bits(actual, expected):
         np.testing.assert_array_equal(bits(a), bits(e))
 
 
-def is_finite(tree) -> bool:
-    """No number of the tree is NaN or infinite (those of integer arguments have no gradient)."""
-    return all(np.isfinite(x).all() for x in jax.tree.leaves(tree) if x.dtype != jax.dtypes.float0)
-
-
 @dataclass(frozen=True)
 class Axis:
     """One way through a function's domain: where it begins and ends, and arguments (float64) at a value."""
@@ -147,12 +142,15 @@ def points_law(function, *arguments, shared=0, rtol=1e-5, atol=1e-6):
     fixed, columns = arguments[:shared], arguments[shared:]
     order = np.random.default_rng(1).permutation(columns[0].shape[-1])
     turned = [x[..., order] for x in columns]
-    whole = jax.jit(function)(*arguments)
-    mapped = jax.jit(jax.vmap(function, (None,) * shared + (0,) * len(columns)))
-    both = mapped(*fixed, *(jnp.stack(pair) for pair in zip(columns, turned, strict=True)))
+    mapped = jax.vmap(function, (None,) * shared + (0,) * len(columns))
+
+    @jax.jit
+    def every_way(fixed, columns, pairs):
+        return function(*fixed, *columns), mapped(*fixed, *pairs), function(*fixed, *(x[..., :5] for x in columns))
+
+    whole, both, few = every_way(fixed, columns, [jnp.stack(pair) for pair in zip(columns, turned, strict=True)])
     close(jax.tree.map(lambda x: x[0], both), whole, rtol, atol)
     close(jax.tree.map(lambda x: x[1], both), jax.tree.map(lambda x: x[..., order], whole), rtol, atol)
-    few = jax.jit(function)(*fixed, *(x[..., :5] for x in columns))
     close(few, jax.tree.map(lambda x: x[..., :5], whole), rtol, atol)
 
 
@@ -165,7 +163,7 @@ def gradient_law(function, *arguments, rtol=1e-3):
 
 def adjoint_law(linear, x):
     """<A x, y> = <x, A^T y> to 1e-6 for a random y, summed in float64: a linear function and its gradient."""
-    out, transpose = jax.vjp(linear, x)
+    out, transpose = jax.vjp(jax.jit(linear), x)
     y = numbers(1, *out.shape)
     (back,) = transpose(y)
     out, x, y, back = map(np.float64, (out, x, y, back))

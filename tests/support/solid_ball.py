@@ -4,7 +4,7 @@ import numpy as np
 
 from spnr_jax.formats.clouds import PlacedCloud
 from spnr_jax.formats.orientation import ROTATIONS
-from spnr_jax.tools.mesh_export import Grid
+from spnr_jax.tools.surfaces import Grid
 from support.surfel_clouds import cloud
 
 RADIUS, CENTRE = 2.0, np.array([5.0, -3.0, 1.0])

@@ -23,24 +23,16 @@ def fresh(preset: str) -> Path:
     return folder
 
 
-class StandIn(contenders.Network):
-    """A grey disc with the depth of the ball behind OFFSET, darker the more points there are."""
+def stand_in() -> contenders.Method:
+    """A grey disc with the depth of the ball behind OFFSET."""
 
-    def as_method(self):
-        """The disc."""
+    def draw(_, item):
+        depth, acc = disc(item.camera.height)
+        image = np.repeat(np.where(acc > 0, 0.5, 1)[..., None], 3, axis=-1)
+        views = {"image": image, "acc": acc, "depth": depth}
+        return evaluation.Pictures(**{name: np.stack([x] * len(item.images)) for name, x in views.items()})
 
-        def draw(_, item):
-            views, size = len(item.images), item.camera.height
-            depth, acc = disc(size)
-            grey = np.where(acc > 0, 1 / (1 + np.log2(len(item.cloud.mask)) / 10), 1)
-            image = np.repeat(grey[..., None], 3, axis=-1).astype(np.float32)
-            return evaluation.Pictures(
-                image=np.tile(image, (views, 1, 1, 1)),
-                acc=np.tile(acc, (views, 1, 1)),
-                depth=np.tile(depth, (views, 1, 1)),
-            )
-
-        return contenders.Method(draw=draw, identity={"steps": self.steps}, has_opacity=self.has_depth)
+    return contenders.Method(draw=draw)
 
 
 def disc(size: int) -> tuple[np.ndarray, np.ndarray]:
@@ -51,17 +43,3 @@ def disc(size: int) -> tuple[np.ndarray, np.ndarray]:
     inner = tiny_dataset.RADIUS**2 - (tiny_dataset.DISTANCE**2 - along**2)
     depth = along - np.sqrt(np.maximum(inner, 0)) + OFFSET
     return np.where(inner > 0, depth, 4).astype(np.float32), (inner > 0).astype(np.float32)
-
-
-def stand_ins(*labels: str) -> dict[str, contenders.Network]:
-    """Stand-ins by label; the first word of each names its method."""
-    return {
-        label: StandIn(
-            method="npbg" if label.startswith("NPBG") else "paper",
-            config=tiny_dataset.CONFIG,
-            variables={},
-            steps=6,
-            checksum="0",
-        )
-        for label in labels
-    }

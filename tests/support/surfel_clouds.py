@@ -8,10 +8,10 @@ from spnr_jax.kernels import cameras
 from spnr_jax.kernels.cloud_arrays import pad
 from spnr_jax.kernels.records import Camera, PointCloud, Surfels
 from spnr_jax.surfels.geometry import estimate_surfels, neighbors
-from spnr_jax.surfels.layers import RULES, Rules
+from spnr_jax.surfels.layers import RULES
 from spnr_jax.surfels.sides import NUM_DIRECTIONS, spiral, tangents
 
-PADDED = (1024, 4096, 32768)  # sizes that clouds are padded to: each is compiled once
+PADDED = (4096, 32768)  # sizes that clouds are padded to: each is compiled once, and blocks of padding cost nothing
 
 
 def even_square(count: int) -> np.ndarray:
@@ -49,21 +49,25 @@ def cloud(positions, **columns) -> PointCloud:
     return PointCloud(positions=np.asarray(positions, np.float32), mask=np.ones(count, bool), **columns)
 
 
-_estimate = jax.jit(estimate_surfels, static_argnames="rules")
+_estimate = jax.jit(estimate_surfels)
 
 
-def estimate(
-    positions, base_color=None, roughness=None, metallic=None, normals=None, materials_known=None, rules: Rules = RULES
-) -> Surfels:
-    """Surfels of points in the box, in their order, as NumPy arrays; computed padded, by few programs."""
+def estimate(positions, base_color=None, roughness=None, metallic=None, normals=None, order=None) -> Surfels:
+    """Surfels of points in the box, in their order, as NumPy arrays; computed padded, by few programs.
+
+    `order` are the places of the points among the padding.
+    """
     given = {"base_color": base_color, "roughness": roughness, "metallic": metallic, "normals": normals}
-    given |= {"materials_known": materials_known}
     points = cloud(positions, **{name: values for name, values in given.items() if values is not None})
     points = pad(points, next(size for size in PADDED if size >= len(positions)))
-    found = jax.tree.map(np.asarray, _estimate(points, neighbors(points), rules=rules))
-    assert not found.mask[len(positions) :].any()
+    places = np.arange(len(positions)) if order is None else np.asarray(order)
+    rows = np.full(len(points.mask), len(positions))
+    rows[places] = np.arange(len(positions))
+    points = jax.tree.map(lambda x: np.concatenate([x[: len(positions)], np.zeros_like(x[:1])])[rows], points)
+    found = jax.tree.map(np.asarray, _estimate(points, neighbors(points)))
+    assert found.mask.sum() == found.mask[places].sum() == len(positions)
     assert all(np.isfinite(values).all() for values in vars(found).values())
-    return jax.tree.map(lambda values: values[: len(positions)], found)
+    return jax.tree.map(lambda values: values[places], found)
 
 
 def surfels(position, normal, spacing, **columns) -> Surfels:

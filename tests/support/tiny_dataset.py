@@ -1,6 +1,7 @@
 """A data set and a run of milliseconds and seconds: coloured balls painted with NumPy, a network of few weights."""
 
 import atexit
+import dataclasses
 import functools
 import shutil
 import tempfile
@@ -11,6 +12,7 @@ import numpy as np
 from data_gen.store import layout
 from spnr_jax.config import LossConfig, OptimizerConfig, TrainConfig
 from spnr_jax.formats import data_sets
+from spnr_jax.formats.images import write_whole
 from spnr_jax.training import trainer
 from support import tiny_model
 
@@ -35,7 +37,7 @@ CONFIG = TrainConfig(
     max_points=32,
     test_points=24,
 )
-
+PLAIN = dataclasses.replace(CONFIG, loss=dataclasses.replace(CONFIG.loss, adversarial_weight=0.0))
 SCHEDULE = trainer.Schedule(log_every=1, preview_every=3, checkpoint_every=2)
 
 
@@ -44,8 +46,8 @@ def write_dataset(folder: Path, splits: dict[str, tuple[str, ...]] = SPLITS, siz
     for seed, name in enumerate(name for names in splits.values() for name in names):
         layout.write_object(folder, name, ball(seed, size))
     for split, names in splits.items():
-        layout.write_text(folder / "splits" / f"{split}.txt", "".join(f"{name}\n" for name in names))
-    layout.write_text(folder / "dataset.json", layout.json_text({"schema": layout.SCHEMA_VERSION, "seed": 0}))
+        write_whole(folder / "splits" / f"{split}.txt", "".join(f"{name}\n" for name in names).encode())
+    write_whole(folder / "dataset.json", layout.json_text({"schema": layout.SCHEMA_VERSION, "seed": 0}).encode())
     return folder
 
 
@@ -102,6 +104,6 @@ def one_object(name: str = NAMES[0]) -> data_sets.ObjectData:
 
 @functools.cache
 def run() -> Path:
-    """A finished run of CONFIG with checkpoints at steps 2, 4 and 6; copy it to change it."""
-    trainer.train(CONFIG, dataset(), folder() / "run", SCHEDULE)
+    """A finished run of PLAIN with checkpoints at steps 2, 4 and 6; copy it to change it."""
+    trainer.train(PLAIN, dataset(), folder() / "run", SCHEDULE)
     return folder() / "run"

@@ -10,8 +10,9 @@ from spnr_jax.config import LossConfig, OptimizerConfig, SurfelConfig, TrainConf
 from spnr_jax.formats import data_sets
 from spnr_jax.method import surfel_method
 from spnr_jax.surfels import lighting
-from spnr_jax.training import gbuffers, trainer, weights
+from spnr_jax.training import checkpoint, gbuffers, optimisation, trainer, weights
 from support import tiny_dataset
+from support.stopped_runs import PICTURE
 
 SIZE = 48
 CONFIG = TrainConfig(
@@ -49,11 +50,21 @@ def views() -> list[gbuffers.View]:
 
 @functools.cache
 def run() -> Path:
-    """A finished run of CONFIG, whose clouds are learnt from as they are: the densifier takes long to trace."""
+    """A finished run of CONFIG, whose clouds are learnt from as they are: densifier and preview take long to trace."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(surfel_method, "densify_sparse", lambda variables, cloud: cloud)
+        patch.setattr(trainer, "preview", lambda *_: ({"val_psnr": 20.0}, PICTURE))
         trainer.train(CONFIG, dataset(), tiny_dataset.folder() / "shaded", SCHEDULE, light=LIGHT)
     return tiny_dataset.folder() / "shaded"
+
+
+@functools.cache
+def untrained() -> Path:
+    """A run folder with fresh weights: for what asks whether it runs, not how good it is."""
+    folder = tiny_dataset.folder() / "fresh_surfels"
+    checkpoint.write_config(folder, CONFIG)
+    checkpoint.save(folder, optimisation.jitted_create_state(CONFIG))
+    return folder
 
 
 def shipped(name: str = weights.SHIPPED) -> Path:

@@ -23,7 +23,7 @@ CONFIG = TrainConfig(
     min_points=NUM_POINTS,
 )
 L1_ONLY = dataclasses.replace(CONFIG, loss=dataclasses.replace(CONFIG.loss, adversarial_weight=0.0), seed=1)
-create = jax.jit(optimisation.create_state, static_argnums=0)
+create = optimisation.jitted_create_state
 copied = jax.jit(lambda tree: jax.tree.map(jnp.copy, tree))
 
 

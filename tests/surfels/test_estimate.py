@@ -1,7 +1,5 @@
 """Surfels of bodies whose normals, spacing and colours are known."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 from support.laws import close
@@ -55,14 +53,13 @@ def test_the_shape_is_0_in_a_plane_and_on_a_line():
     assert estimate(line)["shape"][:, 1].max() < 0.01
 
 
-def test_blocks_of_points_and_their_order_change_nothing():
+def test_the_block_of_a_point_and_its_order_among_others_change_nothing():
     positions, _, _ = shape("sphere", 700, "random")
     color = 0.5 + 0.5 * positions
     whole = estimate(positions, color)
-    order = np.random.default_rng(3).permutation(len(positions))
-    shuffled = vars(surfels_of(positions[order], color[order], rules=dataclasses.replace(RULES, block=97)))
+    shuffled = vars(surfels_of(positions, color, order=np.random.default_rng(3).permutation(4096)[:700]))
     for name in FIELDS:
-        off = np.abs(shuffled[name] - whole[name][order]).reshape(len(positions), -1).max(axis=1)
+        off = np.abs(shuffled[name] - whole[name]).reshape(len(positions), -1).max(axis=1)
         # a visible cell's border is a border: rounding of a normal may move a lifted point over it
         assert np.mean(off > 1e-3 * max(np.abs(whole[name]).max(), 1)) < 0.01, name
 
@@ -74,7 +71,7 @@ def test_normals_that_are_given_are_kept_and_those_of_the_wrong_sign_turned():
     wrong = np.random.default_rng(1).uniform(size=(800, 1)) < 0.3
     found = estimate(positions, normals=np.where(wrong, -3 * tilted, 3 * tilted))
     close(found["normal"], tilted, atol=1e-5)
-    assert found["sided"].min() >= 1 - RULES.leak
+    close(found["sided"], 1 - RULES.leak, atol=1e-6)  # a little weight from behind
 
 
 def test_a_normal_given_on_a_sheet_keeps_its_sign():
@@ -149,29 +146,3 @@ def test_the_sides_of_a_thin_wall_face_away_from_each_other_and_keep_their_colou
     inner = np.hypot(u, v) < 0.5
     assert np.mean(found["normal"][inner, 1] * sign[inner] > 0.9) > 0.97
     assert np.mean(np.abs(found["jump"][inner]).max(axis=1) < 0.1) > 0.97
-
-
-def box_with_a_back(count):
-    """Points, normals and spacing of an open box, deep and dark within, whose walls are a quarter spacing thick."""
-    rng = np.random.default_rng(3)
-    u, v = 0.5 * even_square(count).T
-    spacing, positions, normals = count**-0.5, [], []
-    for axis, sign in ((0, -1), (0, 1), (1, -1), (1, 1), (2, -1)):
-        for side in (-1, 1):  # the inner face, the outer one
-            moved = rng.uniform(-0.2, 0.2, (2, count)) * spacing
-            across = sign * (0.5 + 0.125 * side * spacing)
-            positions.append(np.insert(np.stack([u + moved[0], v + moved[1]], axis=1), axis, across, axis=1))
-            normals.append(np.broadcast_to(side * sign * np.eye(3)[axis], (count, 3)))
-    return np.float32(np.concatenate(positions)), np.float32(np.concatenate(normals)), spacing
-
-
-def test_normals_given_within_a_box_that_is_dark_inside_are_kept_and_its_back_drawn():
-    positions, normals, _ = box_with_a_back(300)
-    found = estimate(positions, normals=normals)
-    assert np.mean(np.sum(found["normal"] * normals, axis=1) > 0.9) > 0.99
-    assert np.mean(found["sided"] > 0.9) > 0.95
-
-
-def test_a_disc_of_one_side_keeps_a_little_weight_from_behind():
-    positions, normals, _ = shape("sphere", 800)
-    close(estimate(positions, normals=normals)["sided"], 1 - RULES.leak, atol=1e-6)

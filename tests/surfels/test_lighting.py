@@ -13,6 +13,9 @@ from spnr_jax.surfels.lighting import HEIGHT, LEVELS, WIDTH, directions, light_o
 from spnr_jax.surfels.sides import DIRECTIONS
 
 COLOR = np.array([0.3, 1.0, 2.0])
+irradiance, reflect, look_up = map(jax.jit, (lighting.irradiance, lighting.reflect, lighting.look_up))
+arriving, project_harmonics = jax.jit(lighting.arriving), jax.jit(lighting.project_harmonics)
+harmonics = jax.jit(lighting.harmonics)
 
 
 def envmap(seed=0, height=HEIGHT):
@@ -37,7 +40,7 @@ def test_all_tables_of_constant_light_are_that_light():
     light = light_of(np.broadcast_to(COLOR, (20, 40, 3)))
     close(light.tables, np.broadcast_to(COLOR, light.tables.shape), rtol=1e-4)
     towards = columns(numbers(0, 50, 3))
-    for found in (lighting.irradiance(light, towards), lighting.reflect(light, towards, numbers(1, 50, low=0.0))):
+    for found in (irradiance(light, towards), reflect(light, towards, numbers(1, 50, low=0.0))):
         close(jnp.stack(found, axis=-1), np.broadcast_to(COLOR, (50, 3)), rtol=1e-4)
 
 
@@ -47,7 +50,7 @@ def test_roughness_passes_through_the_levels_without_jumps():
     for level, roughness in enumerate(LEVELS):
         expected = light.tables[1 + level, 5, 7]
         for off in (-1e-6, 0, 1e-6):
-            found = lighting.reflect(light, columns(towards), jnp.full(1, roughness + off))
+            found = reflect(light, columns(towards), jnp.full(1, roughness + off))
             close(jnp.stack(found, axis=-1)[0], expected, rtol=1e-4)
 
 
@@ -59,8 +62,8 @@ def test_everything_is_linear_in_the_map():
 
     def told(radiance):
         light = light_of(radiance)
-        seen = lighting.irradiance(light, towards) + lighting.reflect(light, towards, roughness)
-        return light.tables, seen, lighting.arriving(found, light), lighting.project_harmonics(light, turn)
+        seen = irradiance(light, towards) + reflect(light, towards, roughness)
+        return light.tables, seen, arriving(found, light), project_harmonics(light, turn)
 
     sums = jax.tree.map(lambda a, b: 2 * a + 3 * b, told(one), told(other))
     close(told(2 * one + 3 * other), sums, rtol=1e-4, atol=1e-4)
@@ -83,26 +86,15 @@ def test_another_size_keeps_the_energy_and_loses_no_lamp(size, height):
     assert small.min() >= 0
 
 
-def test_another_size_is_the_mean_over_whole_texels_and_the_same_size_the_map_itself():
-    radiance = envmap(3, 8)
-    close(resample(radiance, 8), radiance, rtol=1e-5)
-    close(
-        resample(np.repeat(np.repeat(radiance, 3, axis=0), 3, axis=1), 24), np.repeat(np.repeat(radiance, 3, 0), 3, 1)
-    )
-    area = solid_angles(8)[..., None].reshape(4, 2, 8, 2, 1)
-    means = (radiance.reshape(4, 2, 8, 2, 3) * area).sum(axis=(1, 3)) / area.sum(axis=(1, 3))
-    close(resample(radiance, 4), means, rtol=1e-5)
-
-
 class TestLookUp:
     def table(self):
         return jnp.asarray(envmap(4).reshape(-1, 3))
 
     def test_the_middle_of_a_texel_has_its_value_and_half_way_the_mean_of_its_neighbours(self):
-        found = lighting.look_up(self.table(), columns(directions(HEIGHT)))
+        found = look_up(self.table(), columns(directions(HEIGHT)))
         close(jnp.stack(found, axis=-1), self.table(), rtol=1e-3, atol=1e-3)
         corners = directions(2 * HEIGHT)[2::2, 2::2][: HEIGHT - 1, : WIDTH - 1]
-        turned = np.stack(lighting.look_up(self.table(), columns(corners)), axis=-1).reshape(*corners.shape)
+        turned = np.stack(look_up(self.table(), columns(corners)), axis=-1).reshape(*corners.shape)
         texels = np.asarray(self.table()).reshape(HEIGHT, WIDTH, 3)
         mixed = sum(
             (0.75, 0.25)[i] * (0.75, 0.25)[j] * texels[1 + -i :, 1 - j :][: HEIGHT - 1, : WIDTH - 1]
@@ -114,42 +106,31 @@ class TestLookUp:
     def test_it_is_periodic_in_the_azimuth_and_finite_at_the_poles(self):
         azimuth = jnp.asarray([0.0, 1e-7, -1e-7, 2 * np.pi, np.pi, -np.pi], jnp.float32)
         towards = [jnp.sin(azimuth), 0 * azimuth, -jnp.cos(azimuth)]
-        found = np.stack(lighting.look_up(self.table(), towards), axis=-1)
+        found = np.stack(look_up(self.table(), towards), axis=-1)
         close(found[:4], np.broadcast_to(found[0], (4, 3)), rtol=1e-4)
         close(found[4], found[5], rtol=1e-4)
         texels = np.asarray(self.table()).reshape(HEIGHT, WIDTH, 3)
         close(found[0], texels[15:17, [0, -1]].mean(axis=(0, 1)), rtol=1e-4)
         poles = [jnp.zeros(4), jnp.asarray([1.0, -1.0, 1.0000001, -1.0000001]), jnp.asarray([0.0, 0.0, -0.0, 1e-30])]
-        assert np.isfinite(np.stack(lighting.look_up(self.table(), poles))).all()
-
-
-@pytest.mark.parametrize("scale", [1e-6, 1e6])
-def test_faint_and_glaring_light_is_a_multiple_of_light(scale):
-    radiance = envmap(5) ** 8
-    light = light_of(np.float32(scale) * radiance)
-    assert np.isfinite(light.tables).all()
-    assert light.tables.min() >= 0
-    close(light.tables / scale, light_of(radiance).tables, rtol=1e-4)
+        assert np.isfinite(np.stack(look_up(self.table(), poles))).all()
 
 
 def test_what_arrives_at_a_surfel_that_all_directions_see_is_nearly_its_irradiance():
     light = light_of(smooth(directions(HEIGHT)).astype(np.float32))
     found = surfels(np.zeros((64, 3)), DIRECTIONS, 0.1)
-    open_light = np.stack(lighting.irradiance(light, columns(DIRECTIONS)), axis=-1)
-    close(lighting.arriving(found, light), open_light, rtol=0.08, atol=0.05)
+    open_light = np.stack(irradiance(light, columns(DIRECTIONS)), axis=-1)
+    close(arriving(found, light), open_light, rtol=0.08, atol=0.05)
     blind = surfels(np.zeros((64, 3)), DIRECTIONS, 0.1, visible=np.zeros((64, 64)))
-    assert np.all(np.asarray(lighting.arriving(blind, light)) == 0)
+    assert np.all(np.asarray(arriving(blind, light)) == 0)
 
 
 def test_the_harmonics_are_orthonormal_and_project_light_in_the_axes_of_the_camera():
-    basis = np.stack(lighting.harmonics(*columns(directions(HEIGHT))))
+    basis = np.stack(harmonics(*columns(directions(HEIGHT))))
     close(basis * solid_angles(HEIGHT).reshape(-1) @ basis.T, np.eye(9), atol=5e-3)
-    constant = lighting.project_harmonics(light_of(np.ones((32, 64, 3), np.float32)), np.eye(3, dtype=np.float32))
+    constant = project_harmonics(light_of(np.ones((32, 64, 3), np.float32)), np.eye(3, dtype=np.float32))
     close(constant, np.eye(9)[:, :1] * 4 * 0.282095 * np.ones(3), atol=5e-3)
     ahead = np.float32([[0, 0, 1], [0, 1, 0], [-1, 0, 0]])  # a camera that looks along -x, where z is x
-    tilted = lighting.project_harmonics(
-        Light(tables=light_of(smooth(directions(HEIGHT)).astype(np.float32)).tables), ahead
-    )
+    tilted = project_harmonics(Light(tables=light_of(smooth(directions(HEIGHT)).astype(np.float32)).tables), ahead)
     close(tilted[2, 0], 4 / 3 * 0.488603, rtol=1e-2)  # red is 1 + x, and behind the camera is +x
     close(tilted[np.array([1, 3]), 0], np.zeros(2), atol=1e-2)
 
@@ -179,12 +160,9 @@ def test_a_lamp_throws_what_it_is_said_to_and_shines_from_where_it_is_said_to(az
     facing = np.maximum(directions(skies.HEIGHT) @ skies.towards(azimuth, elevation), 0)[..., None]
     close((envmap * facing * area).sum(axis=(0, 1)), np.array([1.0, 0.5, 2.0]), rtol=1e-4)
     middle = (envmap[..., :1] * directions(skies.HEIGHT) * area).sum(axis=(0, 1))
-    close(middle / np.linalg.norm(middle), skies.towards(azimuth, elevation), atol=0.02)
-
-
-def test_azimuth_0_is_in_front_90_to_the_right_and_elevation_90_above():
-    found = [skies.towards(*angles) for angles in ((0, 0), (90, 0), (0, 90))]
-    close(np.stack(found), np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0]]), atol=1e-6)
+    turn, rise = np.deg2rad([azimuth, elevation])  # from +z towards +x, and up
+    place = np.array([np.cos(rise) * np.sin(turn), np.sin(rise), np.cos(rise) * np.cos(turn)])
+    close(middle / np.linalg.norm(middle), place, atol=0.02)
 
 
 @pytest.mark.parametrize("name", skies.NAMED)
@@ -203,7 +181,3 @@ def test_random_maps_follow_from_their_generator_and_differ():
     np.testing.assert_array_equal(maps[0], maps[1])
     assert all(np.isfinite(x).all() and x.min() >= 0 and x.max() > 0 for x in maps)
     assert len({x.tobytes() for x in maps}) == 4
-
-
-def test_black_stays_black_when_it_is_normalised():
-    np.testing.assert_array_equal(skies.normalise(np.zeros((4, 8, 3), np.float32)), 0)

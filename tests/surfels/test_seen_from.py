@@ -3,7 +3,6 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-from support.laws import close
 from support.surfel_clouds import shape
 
 from spnr_jax.surfels import sides
@@ -89,13 +88,6 @@ def test_a_plane_of_random_points_never_hides_itself_at_whatever_angle():
     cosine = turn[2] @ DIRECTIONS.T
     found = seen(positions, turn[2], 0.05)
     assert found[:, np.abs(cosine) > 0.13].min() > 0.99
-
-
-def test_tangents_and_normal_are_three_unit_vectors_at_right_angles_also_at_the_poles():
-    normals = np.concatenate([DIRECTIONS, np.eye(3), -np.eye(3), [[0, 0.6, -0.8], [1e-4, 0, -1]]]).astype(np.float32)
-    frames = np.stack([*tangents(normals), normals], axis=1)
-    close(frames @ frames.swapaxes(1, 2), np.broadcast_to(np.eye(3), (len(normals), 3, 3)), atol=1e-6)
-    close(np.linalg.det(frames), np.ones(len(normals)), atol=1e-6)
 
 
 def test_the_grid_covers_the_box_with_few_sizes_and_never_more_than_1024_cells():

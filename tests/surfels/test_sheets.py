@@ -1,11 +1,9 @@
 """Two skins nearer to each other than a layer is thick: colours tell them apart, and nothing else looks like them."""
 
-import functools
-
 import jax
 import numpy as np
 import pytest
-from support.surfel_clouds import PADDED, cloud, estimate
+from support.surfel_clouds import cloud, estimate
 
 from spnr_jax.kernels.cloud_arrays import pad
 from spnr_jax.surfels import geometry, normals
@@ -26,20 +24,19 @@ def lined_ball(gap):
     return positions, colors, np.concatenate([skin, -lining]).astype(np.float32)
 
 
-@functools.partial(jax.jit, static_argnames="sheets")
-def _normals(points, sheets):
-    return geometry.find_layers(points, None, sided=True, sheets=sheets)[1]
+@jax.jit
+def _both_layers(points):
+    return [geometry.find_layers(points, None, sided=True, sheets=sheets)[1] for sheets in (False, True)]
 
 
 def layers_of(positions, colors):
     """The layers before and after colours part them."""
     count = len(positions)
-    size = next(size for size in PADDED if size >= count)
-    padded = pad(cloud(positions, base_color=colors), size)
+    padded = pad(cloud(positions, base_color=colors), 2 * COUNT)
     number = np.ascontiguousarray(neighbors(padded).T)
     columns = (np.float32(x).T for x in (padded.positions, padded.base_color))
-    points = geometry.Points(number, padded.mask, np.zeros(size, bool), *columns)
-    return [jax.tree.map(lambda x: np.asarray(x)[..., :count], _normals(points, sheets)) for sheets in (False, True)]
+    points = geometry.Points(number, padded.mask, np.zeros(2 * COUNT, bool), *columns)
+    return jax.tree.map(lambda x: np.asarray(x)[..., :count], _both_layers(points))
 
 
 def changed(positions, colors):

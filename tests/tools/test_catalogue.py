@@ -10,7 +10,6 @@ from urllib.parse import unquote, unquote_to_bytes
 import numpy as np
 import pytest
 from support import tiny_untrained
-from support.schedulers import in_this_process
 
 from spnr_jax.tools import catalogue, pictures
 from spnr_jax.tools.commands import Render, is_catalogue
@@ -174,22 +173,16 @@ def test_a_name_that_is_no_text_is_drawn_and_shown(tmp_path):
     assert os.path.isfile(os.path.join(os.fsencode(tmp_path / "out"), unquote_to_bytes(shown)))
 
 
+@pytest.mark.ci  # each process imports JAX
 def test_workers_draw_the_same_and_list_the_same(clouds, tmp_path):
     (clouds / "b" / "bad.ply").write_bytes(b"no ply")
-    lines = {}
-    with in_this_process() as address:
-        for name, options in (("here", {}), ("there", {"cluster": address})):
-            lines[name] = render(clouds, tmp_path / name, **options)[0]
-        assert render(clouds, tmp_path / "there", cluster=address)[0].startswith("drew 0 of 5 files")
-    assert ["drew 4 of 5" in line and "1 left out" in line for line in lines.values()] == [True, True]
+    options = {"here": {}, "there": {"workers": 2}}
+    lines = [render(clouds, tmp_path / name, **chosen)[0] for name, chosen in options.items()]
+    assert ["drew 4 of 5" in line and "1 left out" in line for line in lines] == [True, True]
     for name in all_of(NAMES):
         assert (tmp_path / "here" / name).read_bytes() == (tmp_path / "there" / name).read_bytes()
-    pages = [(tmp_path / name / "index.html").read_text() for name in lines]
+    pages = [(tmp_path / name / "index.html").read_text() for name in options]
     assert pages[0] == pages[1]
-    options = command(tmp_path, tmp_path / "out", cluster="tcp://a:1")
-    unseen = catalogue.Item(name="y.xyz", cloud=tmp_path / "y.xyz")
-    with pytest.raises(ValueError, match=r"y\.xyz: worker .* does not see this file"):
-        catalogue.draw_item(catalogue.Batch(options=options, digest=""), unseen)
 
 
 def test_the_digest_follows_options_and_networks_and_not_where_they_work(tmp_path):
@@ -197,7 +190,7 @@ def test_the_digest_follows_options_and_networks_and_not_where_they_work(tmp_pat
     network.write_bytes(b"one")
     options = command(tmp_path, tmp_path / "out", run=network)
     first = catalogue.digest(options)
-    assert catalogue.digest(dataclasses.replace(options, cluster="tcp://a:1", out=tmp_path)) == first
+    assert catalogue.digest(dataclasses.replace(options, workers=3, out=tmp_path)) == first
     assert catalogue.digest(dataclasses.replace(options, views=3)) != first
     network.write_bytes(b"two")
     assert catalogue.digest(options) != first

@@ -1,4 +1,4 @@
-"""Exported networks, the paper's and the default one, draw the same pictures where there is nothing but JAX."""
+"""The exported network draws the pictures of the pure functions where there is nothing but JAX."""
 
 import json
 import subprocess
@@ -7,7 +7,7 @@ import sys
 import jax
 import numpy as np
 import pytest
-from support import tiny_surfels, tiny_untrained, tiny_viewer
+from support import tiny_surfels, tiny_viewer
 from support.laws import close
 from support.surfel_clouds import cloud, shape
 
@@ -16,9 +16,9 @@ from spnr_jax import cli
 from spnr_jax.kernels import cloud_arrays
 from spnr_jax.surfels.lighting import room_light
 from spnr_jax.surfels.skies import sun
-from spnr_jax.tools import export, surfel_export
+from spnr_jax.tools import export
 
-POINTS, SIZE, SURFELS = 256, 32, 128
+POINTS, SIZE = 128, 32
 # what a stranger does with the files: imports of ours and of Flax fail
 STRANGER = """
 import sys
@@ -32,8 +32,7 @@ encode, render = (
     jax.jit(jax.export.deserialize(bytearray(open(f"{name}.jax", "rb").read())).call) for name in ("encode", "render"))
 volume, camera = encode(dict(np.load("cloud.npz"))), dict(np.load("camera.npz"))
 for light in sys.argv[1:]:
-    given = [] if light == "none" else [dict(np.load(f"{light}.npz"))]
-    np.savez(f"{light}_picture.npz", **render(volume, camera, *given))
+    np.savez(f"{light}_picture.npz", **render(volume, camera, dict(np.load(f"{light}.npz"))))
 """
 
 
@@ -50,101 +49,42 @@ def pictures_of_a_stranger(folder, points, camera, *lights):
     return [dict(np.load(folder / f"{light}_picture.npz")) for light in lights]
 
 
-def given():
-    """A cloud of 200 points padded to the bucket, as the exported functions take it."""
-    return arrays(cloud_arrays.pad(tiny_viewer.cloud(), POINTS))
-
-
-@pytest.fixture(scope="module")
-def exported(tmp_path_factory):
-    """The folder that the command writes, the handle, and its volume of the cloud."""
-    folder, handle = tmp_path_factory.mktemp("exported"), spnr_jax.load(tiny_untrained.run())
-    volume = handle.encode(tiny_viewer.cloud())
-    options = {"num_points": POINTS, "resolution": SIZE, "reach": volume.reach}
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(cli, "set_up_jax", lambda **_: None)  # it would write to the home folder
-        cli.run(cli.Export(run=tiny_untrained.run(), out=folder, **options))
-    return folder, handle, volume
-
-
-def test_the_exported_encode_finds_box_and_features_of_the_handle_and_leaves_the_padding_out(exported):
-    folder, _, volume = exported
-    encode = export.load_exported((folder / "encode.jax").read_bytes())
-    made = encode(given())
-    close(made["centre"], volume.centre)
-    close(made["scale"], volume.scale)
-    close(made["scene"]["volume"], volume.scene.volume, atol=1e-5 * float(np.abs(volume.scene.volume).max()))
-    np.testing.assert_array_equal(made["scene"]["occupied"], volume.scene.occupied)
-    nonsense = given()
-    nonsense["positions"][200:] = np.inf
-    nonsense["base_color"][200:] = 7
-    close(encode(nonsense), made)
-    one = given()
-    one["positions"][:] = [3, 4, 5]
-    made = encode(one)
-    np.testing.assert_array_equal(made["centre"], [3, 4, 5])
-    assert made["scale"] == 1, "the box of points without extent"
-    assert np.isfinite(made["scene"]["volume"]).all()
-    with pytest.raises(ValueError, match="64"):
-        encode({name: value[:64] for name, value in given().items()})
-
-
-def test_what_the_command_writes_draws_the_handles_picture_where_there_is_jax_alone(exported):
-    folder, handle, volume = exported
-    names = {"weights.npz", "encode.jax", "encode.stablehlo", "render.jax", "render.stablehlo", "export.json"}
-    assert {path.name for path in folder.iterdir()} == names
-    assert (folder / "encode.stablehlo").read_bytes().startswith(b"ML\xefR"), "MLIR's bytecode"
-    said = json.loads((folder / "export.json").read_text())
-    scalars, vectors = ({"shape": shape, "dtype": "float32"} for shape in ([POINTS], [POINTS, 3]))
-    columns = {"positions": vectors, "base_color": vectors, "roughness": scalars, "metallic": scalars}
-    assert said["encode"]["inputs"] == [columns | {"mask": {"shape": [POINTS], "dtype": "bool"}}]
-    assert said["encode"]["outputs"] == said["render"]["inputs"][0], "the volume goes from one to the other"
-    assert said["render"]["outputs"]["image"]["shape"] == [SIZE, SIZE, 3]
-    assert said["render"] == export.signature((folder / "render.jax").read_bytes())
-    camera = handle.camera(volume, azimuth=50.0, resolution=SIZE)
-    picture = handle.render(volume, camera)
-    (drawn,) = pictures_of_a_stranger(folder, cloud_arrays.pad(tiny_viewer.cloud(), POINTS), camera, "none")
-    assert np.asarray(picture.image).std() > 0.01, "a picture of nothing would agree with anything"
-    close(drawn, arrays(picture, " ".join(drawn)), rtol=1e-5, atol=1e-5)
-
-
 @pytest.mark.parametrize(
     ("make", "message"),
     [
         (lambda model: export.export_encode(model, num_points=0), "num_points must be at least 1, got 0"),
         (lambda model: export.export_render(model, resolution=18), "multiple of 4 of at least 16, got 18"),
-        (lambda model: export.export_render(model, reach=0), "reach must be 1 to 4 voxels, got 0"),
         (lambda model: export.load_exported(b"PK\x03\x04 a zip"), "not a function that JAX exported"),
-        (lambda model: export.export_render(tiny_viewer.surfels(), quality="balanced"), "export a smaller resolution"),
+        (lambda model: export.export_render(model, quality="balanced"), "export a smaller resolution"),
     ],
 )
 def test_what_cannot_be_exported_or_loaded_is_refused_in_one_line(make, message):
     with pytest.raises(ValueError, match=message) as refused:
-        make(tiny_viewer.model())
+        make(tiny_viewer.surfels())
     assert "\n" not in str(refused.value)
-
-
-# the default network
 
 
 @pytest.mark.ci
 def test_a_process_that_knows_jax_alone_draws_the_pictures_of_the_pure_functions(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(cli, "set_up_jax", lambda **_: None)
-    options = {"num_points": SURFELS, "resolution": SIZE, "platforms": ("cpu", "cuda")}
+    options = {"num_points": POINTS, "resolution": SIZE, "platforms": ("cpu", "cuda")}
     cli.run(cli.Export(run=tiny_surfels.run(), out=tmp_path, **options))
     capsys.readouterr()
+    functions = {f"{name}.{kind}" for name in ("encode", "render") for kind in ("jax", "stablehlo")}
+    assert {path.name for path in tmp_path.iterdir()} == functions | {"weights.npz", "light.npz", "export.json"}
+    assert (tmp_path / "encode.stablehlo").read_bytes().startswith(b"ML\xefR"), "MLIR's bytecode"
     said = json.loads((tmp_path / "export.json").read_text())
     assert said["render"]["platforms"] == ["cpu", "cuda"]
     assert said["encode"]["outputs"] == said["render"]["inputs"][0], "the volume goes from one to the other"
     model = spnr_jax.load(tiny_surfels.run())
     positions, normals, _ = shape("sphere", 110)
     red = np.where(normals[:, :1] > 0, [0.8, 0.1, 0.1], [0.2, 0.4, 0.7])
-    points = cloud_arrays.pad(cloud(7 * positions + 3, base_color=red), SURFELS)  # far from the box's units
+    points = cloud_arrays.pad(cloud(7 * positions + 3, base_color=red), POINTS)  # far from the box's units
     scene = jax.jit(spnr_jax.encode)(model.params, points, spnr_jax.neighbors(points))
     camera = model.camera(scene, azimuth=50.0, resolution=SIZE)
     np.savez(tmp_path / "sun.npz", tables=sun(40, 30).tables)
     found = pictures_of_a_stranger(tmp_path, points, camera, "light", "sun")
-    plan = surfel_export.make_plan(model, SURFELS, SIZE)
+    plan = export.make_plan(model, POINTS, SIZE)
     draw = jax.jit(spnr_jax.render, static_argnames="plan")
     for drawn, light in zip(found, (room_light(), sun(40, 30)), strict=True):
         whole = draw(model.params, scene, camera, light, plan=plan)
@@ -156,6 +96,10 @@ def test_a_process_that_knows_jax_alone_draws_the_pictures_of_the_pure_functions
 
 @pytest.mark.parametrize("count", [1, 110])
 def test_neighbors_found_in_jax_are_those_of_the_tree(count):
-    points = cloud_arrays.pad(cloud(np.random.default_rng(count).normal(size=(count, 3))), SURFELS)
-    found = np.asarray(surfel_export.nearest(points.positions, points.mask))
+    points = cloud_arrays.pad(cloud(np.random.default_rng(count).normal(size=(count, 3))), POINTS)
+    found = np.asarray(export.nearest(points.positions, points.mask))
     np.testing.assert_array_equal(found, spnr_jax.neighbors(points))
+    repeated = np.asarray(points.positions).copy()
+    repeated[1:count] = repeated[0]
+    own = np.asarray(export.nearest(repeated, points.mask))[:count, 0]
+    np.testing.assert_array_equal(own, np.arange(count), err_msg="each point is its own first neighbor")

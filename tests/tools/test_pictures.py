@@ -6,12 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from support import tiny_surfels, tiny_untrained
+from support import tiny_untrained
 
 from spnr_jax.formats.orientation import ROTATIONS
 from spnr_jax.tools import pictures
 from spnr_jax.tools.commands import Lighting, Render
-from spnr_jax.training.weights import load
 
 OPTIONS = {"views": 2, "resolution": 24, "num_points": 30, "up": "y", "frames": 5}
 KINDS = (".png", "_depth.png", "_depth.npy", "_depth_16bit.png", "_opacity.png")
@@ -140,14 +139,3 @@ def test_a_turntable_of_the_light_differs_from_frame_to_frame_and_keeps_the_outl
     assert all(np.abs(frames[0] - other).max() > 8 for other in frames[1:])
     outlines = [(frame > 250).all(axis=-1) for frame in frames]
     assert all((outline == outlines[0]).mean() > 0.95 for outline in outlines)
-
-
-@pytest.mark.ci
-def test_learned_points_are_added_to_a_sparse_cloud_over_surfels(tmp_path):
-    rng = np.random.default_rng(1).normal(size=(40, 3))
-    np.savetxt(tmp_path / "ball.xyz", rng / np.linalg.norm(rng, axis=1, keepdims=True))
-    asked = Render(cloud=tmp_path / "ball.xyz", run=tiny_surfels.run(), up="y")
-    surfels = pictures.prepare_cloud(asked, lambda line: None, load).volume.scene.surfels
-    mask, invented = np.asarray(surfels.mask), np.asarray(surfels.invented)
-    assert 30 < np.sum(mask & (invented == 0)) <= 40
-    assert np.sum(mask & (invented > 0)) > 20

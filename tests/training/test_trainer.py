@@ -14,55 +14,49 @@ import jax
 import numpy as np
 import pytest
 from PIL import Image
-from support import tiny_dataset, tiny_model, tiny_untrained
+from support import tiny_dataset, tiny_model
 from support.laws import close, same_bits
 from support.stopped_runs import PICTURE, interrupted, rows_without_time, without_network
-from support.tiny_baselines import SHRUNKEN
-from support.tiny_dataset import CONFIG, SCHEDULE
+from support.tiny_dataset import CONFIG, PLAIN, SCHEDULE
 from tensorboardX.proto.event_pb2 import Event
 
-import spnr_jax
 from spnr_jax import cli
-from spnr_jax.formats import data_sets
 from spnr_jax.formats.images import png
-from spnr_jax.scoring import evaluation
 from spnr_jax.training import batching, checkpoint, optimisation, trainer, weights
-
-KEPT_STEPS = {"2", "4", "6"}
 
 
 def restored(run):
-    return checkpoint.restore(run, CONFIG)
+    return checkpoint.restore(run, PLAIN)
 
 
 @pytest.mark.ci
-def test_a_stopped_run_goes_on_to_the_same_bits_and_rows(monkeypatch, tmp_path):
+def test_a_stopped_run_whose_discriminator_joins_goes_on_to_the_same_bits_and_rows(monkeypatch, tmp_path):
+    stopped, whole = tmp_path / "stopped", tmp_path / "whole"
     with monkeypatch.context() as patch:
         interrupted(patch, batching, 3)
         with pytest.raises(KeyboardInterrupt, match="stopped at step 3 of 6"):
-            trainer.train(CONFIG, tiny_dataset.dataset(), tmp_path, SCHEDULE)
-    assert int(restored(tmp_path).step) == 3
-    trainer.train(CONFIG, tiny_dataset.dataset(), tmp_path, SCHEDULE)
-    same_bits(restored(tmp_path), restored(tiny_dataset.run()))
-    assert rows_without_time(tmp_path) == rows_without_time(tiny_dataset.run())
+            trainer.train(CONFIG, tiny_dataset.dataset(), stopped, SCHEDULE)
+    for run in (stopped, whole):
+        trainer.train(CONFIG, tiny_dataset.dataset(), run, SCHEDULE)
+    same_bits(*(checkpoint.restore(run, CONFIG) for run in (stopped, whole)))
+    assert rows_without_time(stopped) == rows_without_time(whole)
 
 
 @pytest.mark.ci
 class TestBeginningWithOtherWeights:
     def test_the_first_step_starts_from_them_and_the_record_names_them(self, tmp_path):
-        plain = tiny_untrained.CONFIG  # without a discriminator, which is not begun with
-        slow = dataclasses.replace(plain.optimizer, lr_generator=1e-12, warmup_steps=0)
-        config = dataclasses.replace(plain, optimizer=slow, seed=plain.seed + 1)
+        slow = dataclasses.replace(PLAIN.optimizer, lr_generator=1e-12, warmup_steps=0)
+        config = dataclasses.replace(PLAIN, optimizer=slow, seed=PLAIN.seed + 1)
         init = weights.read_trained(tiny_dataset.run())
         state = trainer.train(config, tiny_dataset.dataset(), tmp_path, SCHEDULE, init=init)
         close(state.generator, init.variables["params"], atol=1e-9)
         close(state.averaged, init.variables["params"], atol=1e-9)
         (start,) = trainer.read_starts(tmp_path)
-        assert start["init"] == f"{CONFIG.preset}, {CONFIG.num_steps} steps"
+        assert start["init"] == f"{PLAIN.preset}, {PLAIN.num_steps} steps"
 
     def test_weights_of_another_network_are_refused_in_one_line(self, tmp_path, capsys):
-        small = tiny_model.with_encoder(CONFIG.model, base_width=2 * CONFIG.model.encoder.base_width)
-        config, init = dataclasses.replace(CONFIG, model=small), weights.read_trained(tiny_dataset.run())
+        small = tiny_model.with_encoder(PLAIN.model, base_width=2 * PLAIN.model.encoder.base_width)
+        config, init = dataclasses.replace(PLAIN, model=small), weights.read_trained(tiny_dataset.run())
         work = partial(trainer.train, config, tiny_dataset.dataset(), tmp_path, SCHEDULE, init=init)
         assert cli.guard(work, "spnr") == 2
         assert "are of another network: shape of" in capsys.readouterr().err.splitlines()[-1]
@@ -81,42 +75,30 @@ def test_what_lies_after_the_newest_good_checkpoint_is_made_again(end, tmp_path,
             file.write(end)
     init = weights.read_trained(tiny_dataset.run())
     zero = dataclasses.replace(init, variables=jax.tree.map(np.zeros_like, init.variables))
-    trainer.train(CONFIG, tiny_dataset.dataset(), run, SCHEDULE, init=zero)
+    trainer.train(PLAIN, tiny_dataset.dataset(), run, SCHEDULE, init=zero)
     assert ("checkpoints/6" in capsys.readouterr().out) == (end is None)
     same_bits(restored(run), restored(tiny_dataset.run()))
     assert capsys.readouterr().out == "", "the checkpoint at step 6 is good again"
     assert rows_without_time(run) == rows_without_time(tiny_dataset.run())
 
 
-def test_a_finished_run_is_left_alone():
-    before = {path: path.stat().st_mtime_ns for path in tiny_dataset.run().rglob("*") if path.is_file()}
-    state = trainer.train(CONFIG, tiny_dataset.dataset(), tiny_dataset.run(), SCHEDULE)
-    assert int(state.step) == 6
-    assert before == {path: path.stat().st_mtime_ns for path in tiny_dataset.run().rglob("*") if path.is_file()}
-
-
-def test_previews_and_rows_come_when_the_schedule_says():
+def test_previews_and_rows_come_when_the_schedule_says_and_a_finished_run_is_left_alone():
     run, rows = tiny_dataset.run(), trainer.read_rows(tiny_dataset.run())
     assert [row["step"] for row in rows if "loss" in row] == [1, 2, 3, 4, 5, 6]
     assert [row["step"] for row in rows if "val_psnr" in row] == [3, 6]
     assert all(np.isfinite(value) for row in rows for value in row.values())
     assert {path.name for path in (run / "previews").iterdir()} == {"0000003.png", "0000006.png"}
-    assert {path.name for path in (run / "checkpoints").iterdir() if path.is_dir()} == KEPT_STEPS
-
-
-def test_handlers_of_signals_come_back_after_training():
-    before = signal.getsignal(signal.SIGINT)
-    with trainer.stop_requests() as requests:
-        signal.raise_signal(signal.SIGINT)
-        assert requests == [signal.SIGINT]
-    assert signal.getsignal(signal.SIGINT) is before
+    assert {path.name for path in (run / "checkpoints").iterdir() if path.is_dir()} == {"2", "4", "6"}
+    before = {path: path.stat().st_mtime_ns for path in run.rglob("*") if path.is_file()}
+    trainer.train(PLAIN, tiny_dataset.dataset(), run, SCHEDULE)
+    assert before == {path: path.stat().st_mtime_ns for path in run.rglob("*") if path.is_file()}
 
 
 def poisoned(monkeypatch, step):
     real = batching.make_batch
 
-    def make_batch(objects, config, at, first):
-        batch = real(objects, config, at, first)
+    def make_batch(objects, config, at):
+        batch = real(objects, config, at)
         return jax.tree.map(lambda x: x * np.nan if x.dtype == np.float32 else x, batch) if at + 1 == step else batch
 
     monkeypatch.setattr(batching, "make_batch", make_batch)
@@ -125,7 +107,7 @@ def poisoned(monkeypatch, step):
 def test_nan_stops_with_step_and_quantity_and_the_last_checkpoint_is_usable(monkeypatch, tmp_path, capsys):
     poisoned(monkeypatch, 4)
     sparse = trainer.Schedule(log_every=100, preview_every=100, checkpoint_every=2)  # step 4 is never due to be logged
-    code = cli.guard(lambda: trainer.train(CONFIG, tiny_dataset.dataset(), tmp_path, sparse), "spnr")
+    code = cli.guard(lambda: trainer.train(PLAIN, tiny_dataset.dataset(), tmp_path, sparse), "spnr")
     line = capsys.readouterr().err.splitlines()[-1]
     assert code == 2
     assert re.match(r"spnr: \w+ is nan at step 4; the last checkpoint is kept", line)
@@ -147,7 +129,7 @@ def test_a_full_disk_is_one_line_and_exit_code_2(monkeypatch, tmp_path, capsys):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(tmp_path / "metrics.jsonl"))
 
     monkeypatch.setattr(trainer.MetricsLog, "write", full)
-    code = cli.guard(lambda: trainer.train(CONFIG, tiny_dataset.dataset(), tmp_path, SCHEDULE), "spnr")
+    code = cli.guard(lambda: trainer.train(PLAIN, tiny_dataset.dataset(), tmp_path, SCHEDULE), "spnr")
     assert code == 2
     line = capsys.readouterr().err.splitlines()[-1]
     assert line == f"spnr: {tmp_path / 'metrics.jsonl'}: No space left on device"
@@ -155,7 +137,7 @@ def test_a_full_disk_is_one_line_and_exit_code_2(monkeypatch, tmp_path, capsys):
 
 def test_ctrl_c_is_exit_code_130_and_says_how_to_go_on(monkeypatch, tmp_path, capsys):
     interrupted(monkeypatch, batching, 1, signal.SIGINT)
-    code = cli.guard(lambda: trainer.train(CONFIG, tiny_dataset.dataset(), tmp_path, SCHEDULE), "spnr")
+    code = cli.guard(lambda: trainer.train(PLAIN, tiny_dataset.dataset(), tmp_path, SCHEDULE), "spnr")
     assert code == 130
     expected = "spnr: stopped at step 1 of 6; the same command goes on from there"
     assert capsys.readouterr().err.splitlines()[-1] == expected
@@ -164,27 +146,12 @@ def test_ctrl_c_is_exit_code_130_and_says_how_to_go_on(monkeypatch, tmp_path, ca
 
 def test_a_state_that_is_not_finite_is_named_though_every_loss_is(monkeypatch, tmp_path):
     """Training normalises batches with their own statistics: an overflown running variance shows in no loss."""
-    fresh = optimisation.jitted_create_state(CONFIG)
+    fresh = optimisation.jitted_create_state(PLAIN)
     fresh.batch_stats["encoder"]["pointnet"]["norm_0"]["variance"] *= np.inf
     monkeypatch.setattr(optimisation, "jitted_create_state", lambda config: fresh)
     with pytest.raises(trainer.NotFinite, match="batch_stats_encoder_pointnet_norm_0_variance is inf at step 2"):
-        trainer.train(CONFIG, tiny_dataset.dataset(), tmp_path, SCHEDULE)
+        trainer.train(PLAIN, tiny_dataset.dataset(), tmp_path, SCHEDULE)
     assert not (tmp_path / "checkpoints").exists()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["npbg_tiny", "point_nerf_tiny"])
-def test_a_baseline_is_trained_previewed_evaluated_and_loaded_like_ours(name, tmp_path):
-    config, dataset = dataclasses.replace(SHRUNKEN[name], num_steps=CONFIG.num_steps), tiny_dataset.dataset()
-    trainer.train(config, dataset, tmp_path, SCHEDULE)
-    assert (tmp_path / "previews" / "0000006.png").is_file()
-    outcome = evaluation.evaluate(tmp_path, dataset, say=lambda line: None)
-    assert np.isfinite(next(iter(outcome.summary["methods"].values()))["psnr"])
-    handle = spnr_jax.load(tmp_path)
-    volume = handle.encode(data_sets.read_object(dataset, "ball_000004").cloud)
-    rendering = handle.render(volume, handle.camera(volume))
-    assert rendering.image.shape == (tiny_dataset.SIZE, tiny_dataset.SIZE, 3)
-    assert np.isfinite(np.asarray(rendering.image)).all()
 
 
 def events(run):
@@ -204,27 +171,21 @@ def decoded(content):
     return np.asarray(Image.open(io.BytesIO(content)))
 
 
-def test_a_row_with_a_picture_is_scalars_and_an_image_of_the_same_pixels_as_the_file(tmp_path):
-    log = trainer.MetricsLog(tmp_path, 0)
-    log.write({"step": 2, "loss": 3.0})
-    log.write({"step": 3, "val_psnr": 20.5}, PICTURE)
-    log.close()
-    (_, loss), (at, score), (shown, picture) = events(tmp_path)
-    assert (loss.tag, loss.simple_value) == ("loss", 3.0)
-    assert (at, score.tag, score.simple_value) == (3, "val_psnr", 20.5)
-    assert (shown, picture.tag) == (3, "preview")
-    np.testing.assert_array_equal(decoded(picture.image.encoded_image_string), decoded(png(PICTURE)))
-    assert trainer.read_rows(tmp_path) == [{"step": 2, "loss": 3.0}, {"step": 3, "val_psnr": 20.5}]
-
-
-def test_previews_are_images_at_their_steps_and_a_second_compilation_is_announced(monkeypatch, tmp_path, capsys):
+def test_tensorboard_has_the_rows_and_previews_of_the_log_and_a_second_compilation_is_announced(
+    monkeypatch, tmp_path, capsys
+):
     without_network(monkeypatch)
     seen = []
     trainer.train(
         CONFIG, tiny_dataset.dataset(), tmp_path, SCHEDULE,
         on_event=lambda phase, step, _: seen.append((phase, step, "discriminator joins" in capsys.readouterr().out)),
     )  # fmt: skip
-    assert [step for step, value in events(tmp_path) if value.HasField("image")] == [3, 6]
+    kept = events(tmp_path)
+    losses = {step: value.simple_value for step, value in kept if value.tag == "loss"}
+    assert losses == {row["step"]: row["loss"] for row in trainer.read_rows(tmp_path) if "loss" in row}
+    shown = [(step, value.image.encoded_image_string) for step, value in kept if value.HasField("image")]
+    assert [step for step, _ in shown] == [3, 6]
+    np.testing.assert_array_equal(decoded(shown[0][1]), decoded(png(PICTURE)))
     assert [step for phase, step, said in seen if said] == [3]
     assert ("step", 3, True) in seen
 
@@ -236,13 +197,13 @@ def recorded(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         without_network(patch)
         patch.setattr(trainer, "preview", lambda *_: ({"val_psnr": 11.0}, np.ones((2, 2, 3))))
-        trainer.train(tiny_untrained.CONFIG, tiny_dataset.dataset(), folder, SCHEDULE)
+        trainer.train(PLAIN, tiny_dataset.dataset(), folder, SCHEDULE)
     return folder
 
 
 def test_a_start_says_where_and_with_what_it_trained_and_tells_its_objects_from_others(recorded):
     (entry,), dataset = trainer.read_starts(recorded), tiny_dataset.dataset()
-    assert (entry["first_step"], entry["last_step"]) == (0, tiny_untrained.CONFIG.num_steps)
+    assert (entry["first_step"], entry["last_step"]) == (0, PLAIN.num_steps)
     assert set(entry["seconds"]) == {"restore", "compilation", "steps", "previews", "checkpoints", "listeners"}
     assert all(seconds >= 0 for seconds in entry["seconds"].values())
     assert entry["data_checksum"] == trainer.checksum(dataset)
@@ -265,14 +226,6 @@ def test_a_run_that_goes_on_keeps_what_earlier_starts_said(tmp_path):
 def test_a_damaged_record_stops_nothing(content, tmp_path):
     (tmp_path / "run.json").write_text(content)
     assert trainer.read_starts(tmp_path) == []
-
-
-def test_laps_of_one_phase_add_up_and_leave_nothing_out(monkeypatch):
-    times = iter([10.0, 11.0, 13.0, 17.0])
-    monkeypatch.setattr(trainer.time, "monotonic", lambda: next(times))
-    clock = trainer.Clock()
-    assert [clock.lap(phase) for phase in ("steps", "previews", "steps")] == [1.0, 2.0, 4.0]
-    assert clock.seconds == {"steps": 5.0, "previews": 2.0}
 
 
 def test_the_checksum_knows_settings_and_splits():

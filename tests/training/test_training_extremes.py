@@ -9,12 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support import tiny_dataset, tiny_training
+from support import tiny_dataset
 from support.tiny_baselines import SHRUNKEN
 
 from spnr_jax.config import LossConfig, OptimizerConfig, TrainConfig
-from spnr_jax.kernels import losses
-from spnr_jax.method import inference
 from spnr_jax.training import batching, optimisation, trainer
 
 pytestmark = pytest.mark.ci  # it trains several networks
@@ -123,33 +121,3 @@ def test_no_step_of_a_training_makes_a_nan(config):
             batch = jax.device_put(batch)
             state, _ = optimisation.jitted_train_step(state, batch, config=config, adversarial=adversarial)
     assert_finite(state)
-
-
-@pytest.mark.slow
-def test_no_seed_of_twenty_has_a_dead_density():
-    """Fifty steps leave the balls opaque, from whatever weights and jitter they began."""
-    config, batch, seeds = tiny_training.L1_ONLY, tiny_training.BATCH, jax.random.key(5)
-
-    def begin(key):
-        init_key, step_key = jax.random.split(key)
-        variables = inference.network(config.model).init(init_key, *inference.example_inputs(config.model))
-        fresh = tiny_training.create(config)
-        return replace(fresh, key=step_key, generator=variables["params"])
-
-    @jax.jit
-    @jax.vmap
-    def step(state):
-        return optimisation.train_step(state, batch, config=config, adversarial=False)[0]
-
-    @jax.jit
-    @jax.vmap
-    def opacity(state):
-        variables = {"params": state.generator, "batch_stats": state.batch_stats}
-        acc = inference.network(config.model).apply(variables, batch.cloud, batch.camera).acc
-        white = losses.area_downsample(batch.image, config.model.render_resolution)
-        return jnp.mean(acc, where=(white < 0.99).any(axis=-1))
-
-    states = jax.jit(jax.vmap(begin))(jax.random.split(seeds, 20))
-    for _ in range(50):
-        states = step(states)
-    assert (opacity(states) > 0.1).all(), opacity(states)

@@ -10,7 +10,7 @@ from support.tiny_viewer import canvas, opened, state, surfels, view
 
 from spnr_jax.formats import clouds
 from spnr_jax.formats.images import NAMES, read_light
-from spnr_jax.kernels.records import Light
+from spnr_jax.kernels.records import Light, Rendering
 from spnr_jax.method.model import Model
 from spnr_jax.tools.commands import Lighting
 from spnr_jax.viewer import frame
@@ -88,10 +88,9 @@ def test_the_square_holds_the_object_and_covers_the_canvas_where_that_is_asked_f
 
 
 def test_while_things_move_the_draft_is_drawn_and_at_rest_what_was_chosen(monkeypatch):
-    asked, render = [], Model.render
-    monkeypatch.setattr(
-        Model, "render", lambda *of: asked.append((of[3], of[2].height)) or render(*of[:3], "draft", *of[4:])
-    )
+    asked, blank = [], np.ones((24, 24, 3), np.float32)
+    drawn = Rendering(image=blank, image_lr=None, depth=blank[..., 0], acc=blank[..., 0])
+    monkeypatch.setattr(Model, "render", lambda *of: asked.append((of[3], of[2].height)) or drawn)
     for name in frame.qualities(surfels()):
         canvas(moving=True, quality=name)
         canvas(quality=name)

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +13,8 @@ from support.handmade import ball, box
 
 from data_gen.make import objects
 from data_gen.plan import tasks
-from data_gen.render import views
 from data_gen.render.light import Lights
-from data_gen.store import check, layout, show, storage
+from data_gen.store import check, layout, show
 from spnr_jax.formats import data_sets
 from spnr_jax.surfels.lighting import directions
 
@@ -50,8 +50,8 @@ def test_a_bad_mesh_is_left_out_with_its_reason_and_the_others_are_made(finished
     rows = [json.loads(line) for line in (finished / "rejected.jsonl").read_text().splitlines()]
     assert [(row["id"], row["path"]) for row in rows] == [("empty", "empty.ply")]
     assert rows[0]["reason"]
-    assert storage.list_completed(finished) == {f"thing_{number}" for number in range(4)}
-    assert len(layout.read_split(finished, "test")) == 1
+    assert layout.list_completed(finished) == {f"thing_{number}" for number in range(4)}
+    assert len((finished / "splits" / "test.txt").read_text().split()) == 1
     assert spnr_data("check", finished) == 0
 
 
@@ -100,8 +100,8 @@ def test_an_object_does_not_depend_on_which_others_are_made():
 
 def test_an_unexpected_error_leaves_out_that_object_only_but_a_full_disk_stops_the_run(tmp_path, monkeypatch):
     task, lights = tasks.Task(object_id="a", category="chair"), Lights(np.ones((4, 8, 3)))
-    given = {"lights": lights, "view": views.ViewConfig(), "num_points": 4, "seed": 0, "variant": "scalar_rgb"}
-    bench = objects.Workbench(out=str(tmp_path), **given)
+    config = tasks.GenerateConfig(out=tmp_path)
+    bench = objects.Workbench(config=config, lights=lights, variant="scalar_rgb")
 
     def fail(error):
         def failing(*_):
@@ -157,8 +157,8 @@ def turn_camera(whole):
 @pytest.mark.parametrize(
     ("name", "damage", "expected"),
     [
-        ("objects/thing_0/images/000.png", lambda _: b"not a picture", "000.png: not a readable PNG"),
-        ("objects/thing_1/points.ply", damage_points, "not finite"),
+        ("objects/thing_0/images/000.png", lambda _: b"not a picture", "000.png: cannot be read (is not an image)"),
+        ("objects/thing_1/points.ply", damage_points, "thing_1/points.ply: cannot be read (holds 1 points"),
         ("objects/thing_2/transforms.json", turn_camera, "orthonormal"),
         ("splits/val.txt", lambda _: b"thing_0\nthing_1\nthing_2\nthing_3\n", "listed more than once"),
     ],
@@ -171,10 +171,9 @@ def test_check_names_what_is_damaged_and_exits_with_1(name, damage, expected, fi
 
 
 def test_check_notices_points_that_miss_the_object(finished):
-    record = layout.read_object(finished / "objects" / "thing_0")
-    assert check.points_on_object(record) > 0.9
-    blank = layout.ObjectRecord(**{**vars(record), "images": np.zeros_like(record.images)})
-    assert check.points_on_object(blank) == 0
+    item = data_sets.read_object(data_sets.open_dataset(finished), "thing_0")
+    assert check.points_on_object(item) > 0.9
+    assert check.points_on_object(replace(item, images=np.zeros_like(item.images))) == 0
 
 
 def test_the_contact_sheet_is_one_file_that_shows_every_picture(finished, tmp_path):

@@ -7,15 +7,9 @@ import time
 from pathlib import Path
 
 import pytest
-from fsspec.implementations.memory import MemoryFileSystem
 from support.command_line import spnr_data
-from support.schedulers import in_this_process
 
-from data_gen.make import objects
-from data_gen.plan import tasks
-from data_gen.render import views
-from data_gen.store import check, storage
-from spnr_jax.devices import cluster
+from data_gen.store import check, layout
 
 pytestmark = pytest.mark.ci  # it renders several data sets
 
@@ -38,34 +32,20 @@ def start(out, *more):
     return subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE)
 
 
-def files(place):
-    """Every file below a place, with its bytes."""
-    filesystem, root = storage.open_place(place)
-    return {name.removeprefix(root): filesystem.cat_file(name) for name in filesystem.find(root)}
+def files(folder):
+    """Every file below a folder, with its bytes."""
+    return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 def wait_for(out, number, process):
     """The names of the objects that are done, once they are so many."""
-    while len(done := storage.list_completed(out)) < number:
+    while len(done := layout.list_completed(out)) < number:
         assert process.poll() is None
         time.sleep(0.01)
     return done
 
 
-def in_a_cluster_and_an_object_store(folder, address):
-    place = "memory://cluster/set"
-    try:
-        made = make(place, "--cluster", address)
-        last = sorted(name for name in made if name.endswith("object.json"))[-1]
-        MemoryFileSystem.store.pop(f"/cluster/set{last}")
-        assert make(place, "--cluster", address) == made, "an object without object.json is made again"
-        return made
-    finally:
-        MemoryFileSystem.store.clear()
-        MemoryFileSystem.pseudo_dirs[:] = [""]
-
-
-def with_two_workers_that_are_stopped_and_go_on(folder, _):
+def with_two_workers_that_are_stopped_and_go_on(folder):
     out = folder / "set"
     process = start(out, "--workers", "2")
     wait_for(out, 1, process)
@@ -74,8 +54,8 @@ def with_two_workers_that_are_stopped_and_go_on(folder, _):
     assert process.returncode == 130, message
     assert "Traceback" not in message
     assert "stopped" in message.splitlines()[-1]
-    assert storage.list_completed(out)
-    assert not list((out / "objects").glob(storage.UNFINISHED + "*"))
+    assert layout.list_completed(out)
+    assert not list((out / "objects").glob(layout.UNFINISHED + "*"))
     assert not (out / "splits").exists()
     make(out, "--workers", 2)
     times = {path: path.stat().st_mtime_ns for path in (out / "objects").rglob("*")}
@@ -84,18 +64,12 @@ def with_two_workers_that_are_stopped_and_go_on(folder, _):
     return made
 
 
-def by_two_runs_at_once(folder, _):
+def by_two_runs_at_once(folder):
     both = [start(folder / "set", "--workers", "2") for _ in range(2)]
     messages = [process.communicate(timeout=120)[1].decode() for process in both]
     assert [process.returncode for process in both] == [0, 0], messages
     assert check.check(folder / "set")
     return files(folder / "set")
-
-
-@pytest.fixture(scope="module")
-def address():
-    with in_this_process() as found:
-        yield found
 
 
 @pytest.fixture(scope="module")
@@ -108,23 +82,7 @@ def expected(tmp_path_factory, generate_here):
 
 @pytest.mark.parametrize(
     "way",
-    [
-        in_a_cluster_and_an_object_store,
-        with_two_workers_that_are_stopped_and_go_on,
-        pytest.param(by_two_runs_at_once, marks=pytest.mark.slow),
-    ],
+    [with_two_workers_that_are_stopped_and_go_on, pytest.param(by_two_runs_at_once, marks=pytest.mark.slow)],
 )
-def test_the_bytes_are_the_same(way, expected, address, tmp_path):
-    assert way(tmp_path, address) == expected
-
-
-def test_a_worker_that_does_not_see_a_mesh_file_ends_the_run_with_its_name(address, tmp_path):
-    unseen = tasks.Task(object_id="thing", path=tmp_path / "other.ply")
-    bench = objects.Workbench(
-        out=str(tmp_path / "set"), lights=None, view=views.ViewConfig(), num_points=4, seed=0, variant="scalar_rgb"
-    )
-    with (
-        cluster.connect(address, 1) as client,
-        pytest.raises(ValueError, match=r"other\.ply: worker .* does not see this file"),
-    ):
-        list(cluster.run_tasks(client, objects.make_and_write, bench, [unseen]))
+def test_the_bytes_are_the_same(way, expected, tmp_path):
+    assert way(tmp_path) == expected

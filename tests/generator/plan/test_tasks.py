@@ -7,7 +7,7 @@ import pytest
 
 from data_gen.__main__ import parse
 from data_gen.make.generate import describe
-from data_gen.plan import data_presets, splits, tasks
+from data_gen.plan import splits, tasks
 
 OUT = ["generate", "out"]
 
@@ -143,14 +143,9 @@ HERE = Path(__file__).parent
 @pytest.mark.parametrize(
     ("options", "expected"),
     [
-        ({"root": HERE}, "give --source meshes, abo or shapenet"),
-        ({"root": HERE, "source": "procedural"}, "give --source meshes, abo or shapenet"),
-        ({"source": "abo"}, "--source abo: give --root"),
-        ({"source": "shapenet", "root": HERE}, "give --category, one of car, plane, chair"),
-        ({"category": "car"}, "only with --source shapenet"),
-        ({"source": "abo", "root": HERE, "category": "car"}, "only with --source shapenet"),
-        ({"source": "abo", "meshes": HERE}, "not together"),
-        ({"meshes": HERE, "root": HERE}, "not together"),
+        ({"root": HERE}, "only with --preset"),
+        ({"preset": "abo"}, "--preset abo: give --root"),
+        ({"preset": "abo", "meshes": HERE}, "not together"),
         ({"objects": 1, "test_list": HERE, "split_file": HERE}, "not together"),
         ({"objects": 8, "test_objects": 8}, "--test-objects 8: leaves none of the 8"),
         ({"colour_variants": -1}, "--colour-variants: expected 0 or more"),
@@ -162,7 +157,7 @@ def test_options_that_do_not_go_together_are_one_line(options, expected):
 
 
 def test_a_preset_is_the_default_of_the_options_and_they_override_it():
-    for name, preset in data_presets.PRESETS.items():
+    for name, preset in tasks.PRESETS.items():
         made = parse([*OUT, "--preset", name, "--root", "data", "--spp", "16"])
         assert vars(made) == {**vars(preset("out")), "root": Path("data"), "spp": 16, "out": made.out}
         assert made.preset == name
@@ -171,23 +166,21 @@ def test_a_preset_is_the_default_of_the_options_and_they_override_it():
     assert parse(OUT) == tasks.GenerateConfig(out=parse(OUT).out)
 
 
-def test_the_presets_hold_the_papers_numbers():
-    numbers = ("resolution", "views", "colour_variants", "train_objects", "test_objects", "category")
-    found = {name: preset(Path("x")) for name, preset in data_presets.PRESETS.items()}
-    assert {name: tuple(getattr(one, number) for number in numbers) for name, one in found.items()} == {
-        "abo": (128, 10, 5, 16161, 200, None),
-        "shapenet_car": (200, 10, 0, None, 128, "car"),
-        "shapenet_plane": (200, 10, 0, None, 406, "plane"),
-        "shapenet_chair": (200, 10, 0, None, 105, "chair"),
-    }
-
-
-def test_meshes_are_the_same_source_by_either_name_and_go_with_procedural_objects(tmp_path):
+def test_meshes_are_named_after_their_files_and_go_with_procedural_objects(tmp_path):
     for name in ("b.ply", "a.glb"):
         (tmp_path / name).write_bytes(b"")
-    short, long = config(meshes=tmp_path), config(source="meshes", root=tmp_path)
-    assert tasks.plan_objects(short) == tasks.plan_objects(long)
-    assert ids(tasks.plan_objects(short)) == ["a", "b"]
+    assert ids(tasks.plan_objects(config(meshes=tmp_path))) == ["a", "b"]
     mixed = tasks.plan_objects(config(meshes=tmp_path, objects=1))
     assert [task.shown_path for task in mixed] == ["a.glb", "b.ply", ""]
     assert len(tasks.plan_objects(config())) == 200
+
+
+def test_the_presets_hold_the_papers_numbers():
+    numbers = ("resolution", "views", "colour_variants", "train_objects", "test_objects")
+    found = {name: preset(Path("x")) for name, preset in tasks.PRESETS.items()}
+    assert {name: tuple(getattr(one, number) for number in numbers) for name, one in found.items()} == {
+        "abo": (128, 10, 5, 16161, 200),
+        "shapenet_car": (200, 10, 0, None, 128),
+        "shapenet_plane": (200, 10, 0, None, 406),
+        "shapenet_chair": (200, 10, 0, None, 105),
+    }

@@ -94,11 +94,6 @@ def test_an_object_is_made_again_from_its_record(task_in, tmp_path):
         np.testing.assert_array_equal(part.material.base_color, expected.material.base_color)
 
 
-def test_a_record_from_before_there_were_variants_is_understood():
-    _, details, stored = made(LAMP)
-    assert objects.original({k: v for k, v in details.items() if k not in ("product", "variant")}, SEED, stored)
-
-
 def test_another_shape_under_the_same_name_and_a_mesh_that_is_not_there_are_refused(tmp_path):
     _, details, stored = made(LAMP)
     with pytest.raises(ValueError, match=r"^object lamp_000004: its points do not lie on the mesh[^\n]*generate"):

@@ -38,8 +38,3 @@ def test_a_library_that_kills_the_probing_process_leads_to_scalar_code_and_a_not
     assert "\n" not in notice
     with pytest.raises(ValueError, match="does not run here"):
         variant.choose_variant("llvm_ad_rgb")
-
-
-def test_asking_for_scalar_code_probes_nothing(libraries, monkeypatch):
-    monkeypatch.setattr(variant, "probe", lambda library: pytest.fail("probed"))
-    assert variant.choose_variant("scalar_rgb") == ("scalar_rgb", None)

@@ -1,13 +1,13 @@
 """What `spnr-data check` says of leaking splits and of lights; damaged files: test_generate.py."""
 
-import io
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from support import tiny_dataset
 
-from data_gen.store.check import light_faults, object_faults, variant_faults
-from data_gen.store.layout import ObjectRecord
+from data_gen.store.check import object_faults, variant_faults
 
 DETAILS = {
     "lamp": {"product": "lamp", "variant": 0},
@@ -34,48 +34,34 @@ def test_the_colour_variants_of_a_product_may_only_train_and_only_together(split
     assert variant_faults(splits, DETAILS) == faults
 
 
-def lights(height=32, value=1.0, dtype=np.float16):
-    return np.full((2, height, 64, 3), value, dtype)
+ITEM = tiny_dataset.one_object()
+SETTINGS = {"views": tiny_dataset.VIEWS, "resolution": tiny_dataset.SIZE, "points": tiny_dataset.POINTS}
+WHOLE = {"files": {}, "product": "lamp", "variant": 0}
+LIGHTS = np.ones((tiny_dataset.VIEWS, 32, 64, 3), np.float32)
+DARK = LIGHTS * np.array([1, 0, 1], np.float32)[:, None, None, None]
 
 
-def npz(**arrays):
-    buffer = io.BytesIO()
-    np.savez_compressed(buffer, **arrays)
-    return buffer.getvalue()
+def moved(**changes):
+    """The object with other columns of its points."""
+    return replace(ITEM, cloud=replace(ITEM.cloud, **changes))
 
 
 @pytest.mark.parametrize(
-    ("content", "fault"),
+    ("item", "details", "expected"),
     [
-        (npz(lights=lights()), None),
-        (npz(lights=lights(16)), r"expected floats \(2, 32, 64, 3\), got float16 \(2, 16, 64, 3\)"),
-        (npz(lights=lights()[:1]), r"got float16 \(1, 32, 64, 3\)"),
-        (npz(lights=lights(dtype=np.uint8)), "got uint8"),
-        (npz(lights=lights(value=-1)), "negative or not finite"),
-        (npz(lights=lights(value=np.nan)), "negative or not finite"),
-        (npz(lights=lights() * np.arange(2, dtype=np.float16)[:, None, None, None]), "view 0 is lit by a black map"),
-        (npz(maps=lights()), "none of the arrays lights"),
-        (npz(lights=lights())[:-40], "broken or truncated"),
+        (ITEM, WHOLE, None),
+        (ITEM, WHOLE | {"files": None}, "object.json: expected files, product and variant"),
+        (ITEM, WHOLE | {"files": {"points.ply": "0"}}, "points.ply has another checksum"),
+        (replace(ITEM, images=ITEM.images[:2]), WHOLE, r"expected \(views, resolution\) \(3, 24\), got \(2, 24\)"),
+        (ITEM, WHOLE | {"files": {"lights.npz": None}}, "lights.npz is there"),
+        (replace(ITEM, lights=LIGHTS), WHOLE | {"files": {"lights.npz": None}}, None),
+        (replace(ITEM, lights=DARK), WHOLE | {"files": {"lights.npz": None}}, "view 1 is lit by a black map"),
+        (moved(positions=2 * ITEM.cloud.positions), WHOLE, "outside the unit sphere"),
+        (moved(normals=None), WHOLE, "normals are not of length 1"),
+        (moved(roughness=ITEM.cloud.roughness - 1), WHOLE, r"outside \[0, 1\]"),
     ],
 )
-def test_the_lights_of_an_object_are_maps_of_radiance_one_for_each_view(tmp_path, content, fault):
-    (tmp_path / "lights.npz").write_bytes(content)
-    found = light_faults(tmp_path, True, views=2, own_lights=True)
-    if fault is None:
-        assert found == []
-    else:
-        (line,) = found
-        assert re.search(fault, line), line
-
-
-def test_an_object_whose_files_are_no_table_is_a_fault_of_its_own(tmp_path):
-    nothing, details = np.zeros(0), {"files": None, "product": "lamp", "variant": 0}
-    record = ObjectRecord(points=nothing, transforms={}, images=nothing, conditions=nothing, details=details)
-    faults = object_faults(tmp_path, record, {}, own_lights=True)
-    assert faults == ["object.json: expected files, product and variant"]
-
-
-def test_lights_are_there_if_and_only_if_the_data_set_says_so(tmp_path):
-    assert light_faults(tmp_path, False, views=2, own_lights=False) == []
-    assert "is missing" in light_faults(tmp_path, False, views=2, own_lights=True)[0]
-    assert "is there" in light_faults(tmp_path, True, views=2, own_lights=False)[0]
+def test_what_is_wrong_with_an_object_is_named(item, details, expected):
+    faults = object_faults(replace(tiny_dataset.dataset(), settings={"settings": SETTINGS}), item, details)
+    assert bool(faults) == (expected is not None), faults
+    assert expected is None or re.search(expected, faults[0])

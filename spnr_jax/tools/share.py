@@ -10,7 +10,6 @@ import json
 from collections.abc import Callable
 from importlib import resources
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -20,18 +19,38 @@ from spnr_jax.formats import images
 from spnr_jax.formats.gaussian_files import check_suffix, spz_of, write_splats
 from spnr_jax.kernels.records import Camera, Gaussians
 from spnr_jax.method.model import FIELD_OF_VIEW
-from spnr_jax.tools import mesh_export
-from spnr_jax.tools.commands import Render, Share
-from spnr_jax.tools.pictures import Ready, prepare_cloud
-from spnr_jax.tools.splat_making import RESOLUTION, note_of, splats_of
-from spnr_jax.training.weights import load
+from spnr_jax.tools import surfaces
+from spnr_jax.tools.commands import Export, Render, Share
+from spnr_jax.tools.pictures import Ready, load_network, make_note, prepare_cloud
 
 MOST_BYTES = 6_000_000  # of a page
 POSTER_QUALITY = 88  # of its JPEG
 
+Say = Callable[[str], None]
 
-def splat_options(options: Any, cloud: Path, run: Path | None) -> Render:
-    """What the options of `spnr export` and `spnr share` ask of a cloud, as those of `spnr render`."""
+
+def export_object(options: Export, note: Say, report: Say) -> None:
+    """Writes a cloud's mesh or splats; `note` gets the assumptions about the cloud, `report` a line after each step."""
+    asked = as_rendered(options, options.run, options.network)
+    if options.mesh is None:
+        assert options.splats is not None
+        check_suffix(options.splats)
+        ready = prepare_cloud(asked, note, load_network(asked))
+        made = _splats(ready, asked, note, report)
+        size = write_splats(options.splats, made, make_note(asked))
+        report(f"wrote {options.splats} ({len(made.opacity):,} splats, {size / 1e6:.1f} MB)")
+        return
+    if options.mesh.suffix.lower() != ".glb":
+        raise UserError(f"{options.mesh}: a mesh is written as .glb, not {options.mesh.suffix or 'a folder'}")
+    images.check_place(options.mesh)
+    ready = prepare_cloud(asked, note, load_network(asked))
+    solid = surfaces.mesh_of_volume(ready.model, ready.volume, ready.placed)
+    images.write_whole(options.mesh, solid.content)
+    report(f"wrote {options.mesh} ({surfaces.describe(solid)}, {len(solid.content) / 1e6:.1f} MB)")
+
+
+def as_rendered(options: Export | Share, cloud: Path, run: Path | None) -> Render:
+    """What the options ask of a cloud, as those of `spnr render`."""
     return Render(
         cloud=cloud,
         run=run,
@@ -43,44 +62,24 @@ def splat_options(options: Any, cloud: Path, run: Path | None) -> Render:
     )
 
 
-def export_mesh(asked: Render, out: Path, note: Callable[[str], None], report: Callable[[str], None]) -> None:
-    """Writes a cloud's mesh; `note` gets the assumptions about the cloud, `report` a line about the file."""
-    if out.suffix.lower() != ".glb":
-        raise UserError(f"{out}: a mesh is written as .glb, not {out.suffix or 'a folder'}")
-    images.check_place(out)
-    ready = prepare_cloud(asked, note, load)
-    solid = mesh_export.mesh_of_volume(ready.model, ready.volume, ready.placed)
-    images.write_whole(out, solid.content)
-    report(f"wrote {out} ({mesh_export.describe(solid)}, {len(solid.content) / 1e6:.1f} MB)")
-
-
-def export_splats(asked: Render, out: Path, note: Callable[[str], None], report: Callable[[str], None]) -> None:
-    """Writes a cloud's splats; `note` gets the assumptions about the cloud, `report` a line after each step."""
-    check_suffix(out)
-    ready = prepare_cloud(asked, note, load)
-    gaussians = _splats(ready, asked, note, report)
-    size = write_splats(out, gaussians, note_of(asked))
-    report(f"wrote {out} ({len(gaussians.opacity):,} splats, {size / 1e6:.1f} MB)")
-
-
-def share(options: Share, note: Callable[[str], None], report: Callable[[str], None]) -> None:
+def share(options: Share, note: Say, report: Say) -> None:
     """Writes the page of a cloud; `note` gets the assumptions about the cloud, `report` a line after each step."""
     images.check_place(options.out)
-    asked = splat_options(options, options.cloud, options.run)
-    ready = prepare_cloud(asked, note, load)
+    asked = as_rendered(options, options.cloud, options.run)
+    ready = prepare_cloud(asked, note, load_network(asked))
     gaussians = _splats(ready, asked, note, report)
-    camera = ready.model.camera(ready.volume, options.azimuth, options.elevation, RESOLUTION)
+    camera = ready.model.camera(ready.volume, options.azimuth, options.elevation, surfaces.RESOLUTION)
     poster = np.asarray(ready.model.render(ready.volume, camera, light=ready.light).image)
-    said = " · ".join(filter(None, [note_of(asked), options.credit]))
+    said = " · ".join(filter(None, [make_note(asked), options.credit]))
     view = (options.azimuth, options.elevation)
     content = page(gaussians, poster, camera, view, options.title or options.cloud.stem, said)
     images.write_whole(options.out, content)
     report(f"wrote {options.out} ({len(gaussians.opacity):,} splats, {len(content) / 1e6:.1f} MB)")
 
 
-def _splats(ready: Ready, asked: Render, note: Callable[[str], None], report: Callable[[str], None]) -> Gaussians:
+def _splats(ready: Ready, asked: Render, note: Say, report: Say) -> Gaussians:
     given = ready.model, ready.volume, ready.placed.cloud, ready.light
-    gaussians = splats_of(*given, report, **asked.making.is_given)
+    gaussians = surfaces.splats_of(*given, report, **asked.making.asked, resolution=surfaces.RESOLUTION)
     if (origin := ready.placed.origin).any():
         note(f"splats lie around the origin; it is at {' '.join(f'{x:.0f}' for x in origin)} in the file")
     return gaussians

@@ -8,9 +8,10 @@ from spnr_jax.formats import images
 from spnr_jax.formats.clouds import read_cloud
 from spnr_jax.formats.meshes import load_mesh
 from spnr_jax.formats.point_files import parse_ply
+from spnr_jax.method import surfel_method
 from spnr_jax.surfels.gaussians import View
 from spnr_jax.surfels.sides import spiral
-from spnr_jax.tools import mesh_export, splat_export, splat_making
+from spnr_jax.tools import pictures, share, surfaces
 from spnr_jax.tools.commands import Lighting
 
 pytestmark = pytest.mark.ci  # it makes splats with the network of the package
@@ -30,7 +31,8 @@ def cloud(tmp_path):
 def small_pictures(monkeypatch):
     """Quick ones, and nothing is written to the home folder."""
     monkeypatch.setattr(cli, "set_up_jax", lambda **_: None)
-    monkeypatch.setattr(splat_export, "RESOLUTION", tiny_surfels.SIZE)
+    monkeypatch.setattr(surfaces, "RESOLUTION", tiny_surfels.SIZE)
+    monkeypatch.setattr(surfel_method, "densify_sparse", lambda variables, cloud: cloud)  # it takes long to trace
 
 
 def made_by(*arguments):
@@ -56,11 +58,11 @@ def test_splats_of_a_file_lie_around_its_points_in_its_units(cloud, tmp_path, ca
 
 
 def test_the_mesh_of_a_file_lies_around_its_points_in_its_units(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(splat_making.fitting_cameras, "__defaults__", (16, 64))
-    monkeypatch.setattr(mesh_export.mesh_of_volume, "__defaults__", (40,))
+    monkeypatch.setattr(surfaces.draw_around, "__defaults__", (None, 16, 64))
+    monkeypatch.setattr(surfaces.mesh_of_volume, "__defaults__", (40,))
     cloud, out = tmp_path / "ball.xyz", tmp_path / "new" / "ball.glb"
     np.savetxt(cloud, 3 * spiral(1000) + [5, 0, 0])
-    code = command_line.exit_code(cli, "export", cloud, "--mesh", out, "--up", "y")
+    code = command_line.exit_code(cli, "export", cloud, "--mesh", out, "--up", "y", "--network", tiny_surfels.run())
     said = capsys.readouterr()
     assert code == 0, said.err
     assert f"wrote {out} (" in said.out
@@ -75,12 +77,12 @@ def test_the_mesh_of_a_file_lies_around_its_points_in_its_units(tmp_path, monkey
 
 @pytest.mark.parametrize(("command", "option", "name"), [("export", "--splats", "a.ply"), ("share", "--out", "a.html")])
 def test_pictures_without_a_surface_are_one_line(cloud, tmp_path, monkeypatch, capsys, command, option, name):
-    def empty(model, volume, cameras, light):
-        size = (cameras[0].height, cameras[0].width)
+    def empty(*_):
+        size, camera = (8, 8), splat_balls.camera(size=8)
         nothing = np.ones((*size, 3), np.float32), np.zeros(size, np.float32), np.full(size, np.nan, np.float32)
-        return [View(splat_making.in_box(camera, volume), *nothing) for camera in cameras]
+        return [View(camera, *nothing)]
 
-    monkeypatch.setattr(splat_making, "draw_views", empty)
+    monkeypatch.setattr(surfaces, "draw_around", empty)
     assert made_by(command, cloud, option, tmp_path / name) == 2
     said = capsys.readouterr().err
     assert "no surface" in said.splitlines()[-1]
@@ -103,9 +105,9 @@ def test_ctrl_c_while_a_file_is_written_leaves_what_was_there(cloud, tmp_path, m
 
 
 def test_a_page_that_is_too_large_is_refused(monkeypatch):
-    monkeypatch.setattr(splat_export, "MOST_BYTES", 1000)
+    monkeypatch.setattr(share, "MOST_BYTES", 1000)
     poster = np.ones((8, 8, 3), np.float32)
     with pytest.raises(ValueError, match="--most-splats"):
-        splat_export.page(splat_balls.ball(50), poster, splat_balls.camera(size=8), (30.0, 20.0), "t", "n")
+        share.page(splat_balls.ball(50), poster, splat_balls.camera(size=8), (30.0, 20.0), "t", "n")
     lighting = Lighting(light="/home/me/sky.hdr", sun=(40.0, 30.0), exposure=-1.0)
-    assert splat_making.light_name(lighting) == "sky.hdr + sun 40 30, exposure -1", "without its folder"
+    assert pictures.light_name(lighting) == "sky.hdr + sun 40 30, exposure -1", "without its folder"

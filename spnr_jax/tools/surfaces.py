@@ -1,22 +1,29 @@
-"""The surface of an object as a .glb file, with the materials of the nearest points: made of a network's pictures.
+"""The surface that a network's pictures from all around show: depth, Gaussian splats, a mesh with materials.
 
-A grid lies over the box of an object, along the axes of its file.  A place's solidity is what the pictures show (as
-Curless and Levoy 1996).  A picture votes for a place being outside by how far it lies before the picture's depth,
-between -1 and 1 in units of BAND steps of the grid, and by 1 where the picture is empty there.  The depth is the least
-around a pixel, else outlines would be cut off by the pixels that they cross.  The AGREE-th largest of the votes counts:
-the mean, as for depth cameras, would let the far side of a thin wall fill what lies before it.  What no picture sees is
-solid, so the surface is closed.
+A rendering's depth is the mean distance of all the light of a ray, and what passes by counts with the far side of the
+box.  At silhouettes this lies behind the object.  Here what passes is taken out again, and pixels that let most of the
+light pass have no depth.
 
-Marching cubes finds where the solidity crosses one half.  glTF has colours for each vertex but roughness and metallic
-only as textures or for whole primitives: each vertex points into one small texture that holds every pair of the two, a
-ramp, so the surface stays one mesh whose faces share their vertices, with one material.
-Coordinates are those of the file that the points came from, whatever its upward axis.
+Splats (surfels/gaussians.py) are placed on this surface and coloured from the pictures.
+
+For the mesh a grid lies over the box of an object, along the axes of its file.  A place's solidity is what the pictures
+show (as Curless and Levoy 1996).  A picture votes for a place being outside by how far it lies before the picture's
+depth, between -1 and 1 in units of BAND steps of the grid, and by 1 where the picture is empty there.  The depth is the
+least around a pixel, else outlines would be cut off by the pixels that they cross.  The AGREE-th largest of the votes
+counts: the mean, as for depth cameras, would let the far side of a thin wall fill what lies before it.  What no picture
+sees is solid, so the surface is closed.  Marching cubes finds where the solidity crosses one half.
+
+glTF has colours for each vertex but roughness and metallic only as textures or for whole primitives: each vertex points
+into one small texture that holds every pair of the two, a ramp, so the surface stays one mesh whose faces share their
+vertices, with one material.  Coordinates are those of the file that the points came from, whatever its upward axis.
 """
 
+import dataclasses
 import json
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -28,14 +35,110 @@ from scipy.spatial import cKDTree
 from spnr_jax.errors import UserError
 from spnr_jax.formats import images
 from spnr_jax.formats.clouds import PlacedCloud
-from spnr_jax.kernels.records import Camera, Volume
-from spnr_jax.method.model import Model
+from spnr_jax.kernels import cameras
+from spnr_jax.kernels.records import Camera, Gaussians, Light, PointCloud, Rendering, SurfelScene, Volume
+from spnr_jax.method.model import DISTANCE, Model
+from spnr_jax.method.surfel_method import encode_in_box
+from spnr_jax.surfels import gaussians
 from spnr_jax.surfels.gaussians import View, nearest_around
-from spnr_jax.tools import splat_making
 
+HIT = 0.5  # opacity from which a pixel has a depth
+VIEWS, RESOLUTION = 32, 512  # pictures, and their pixels along each side
+GOLDEN_ANGLE = 180 * (3 - np.sqrt(5))  # degrees between the azimuths of one direction and the next
 GRID = 192  # places along each side of the box
 AGREE = 4  # pictures; with 3 solid objects are a little sharper, and thin parts are missing
 BAND = 3.5  # steps of the grid before and behind the surface
+
+
+def surface_depth(rendering: Rendering, camera: Camera, volume: Volume) -> np.ndarray:
+    """Distance (h, w) float32 along the ray to what is hit, in the cloud's units; NaN where nothing is."""
+    depth, acc = np.asarray(rendering.depth, np.float64), np.asarray(rendering.acc, np.float64)
+    far = np.asarray(_far(camera, volume.centre, volume.scale, size=depth.shape), np.float64)
+    hit = (depth - (1 - acc) * far) / np.maximum(acc, HIT)
+    return np.where(acc >= HIT, hit, np.nan).astype(np.float32)
+
+
+@partial(jax.jit, static_argnames="size")
+def _far(
+    camera: Camera, centre: Float[Array, "3"], scale: Float[Array, ""], *, size: tuple[int, int]
+) -> Float[Array, "h w"]:
+    """Distance at which each ray leaves the box."""
+    rays = cameras.camera_rays(cameras.resize(camera, *size))
+    return cameras.intersect_box((rays.origins - centre[None, None]) * scale, rays.directions)[1] / scale
+
+
+def draw_around(
+    model: Model, volume: Volume, light: Light | None = None, count: int = VIEWS, resolution: int = RESOLUTION
+) -> list[View]:
+    """The network's pictures from even directions, from the top down along a spiral; the cameras are in the box."""
+    heights = 1 - (2 * np.arange(count) + 1) / count
+    angles = zip(np.arange(count) * GOLDEN_ANGLE % 360, np.degrees(np.arcsin(heights)), strict=True)
+    places = [model.camera(volume, float(azimuth), float(height), resolution) for azimuth, height in angles]
+    found, centre, scale = [], np.asarray(volume.centre), np.asarray(volume.scale)
+    for camera, drawn in zip(places, model.render_each(volume, places, lights=[light] * count), strict=True):
+        image, opacity = np.asarray(drawn.image), np.asarray(drawn.acc)
+        depth = surface_depth(drawn, camera, volume) * scale
+        times = len(image) // len(opacity)  # of a network that enlarges its pictures
+        opacity, depth = (x.repeat(times, axis=0).repeat(times, axis=1) for x in (opacity, depth))
+        pose = np.array(camera.cam_to_world)
+        pose[:, 3] = (pose[:, 3] - centre) * scale
+        inside = dataclasses.replace(camera, cam_to_world=pose, intrinsics=np.asarray(camera.intrinsics))
+        found.append(View(inside, image, opacity, depth))
+    return found
+
+
+# --- splats -----------------------------------------------------------------------------------------------------------
+
+
+def splats(
+    model: Model,
+    cloud: PointCloud,
+    *,
+    light: Light | None = None,
+    degree: int = 1,
+    most: int = 150_000,
+    views: int = VIEWS,
+    resolution: int = RESOLUTION,
+    report: Callable[[str], None] = lambda line: None,
+) -> Gaussians:
+    """Gaussian splats of a cloud as the network draws it, in the cloud's units, y up: what splat viewers show.
+
+    The network draws `views` pictures of `resolution` pixels in the light; splats, at most `most`, lie on the surface
+    that these show, with colours as spherical harmonics of a `degree` 0 to 3.  ValueError if the pictures show no
+    surface.  `spnr_jax.write_splats` writes them.
+    """
+    volume = model.encode(cloud)
+    return splats_of(model, volume, cloud, light, report, degree=degree, most=most, views=views, resolution=resolution)
+
+
+def splats_of(
+    model: Model,
+    volume: Volume,
+    cloud: PointCloud,
+    light: Light | None,
+    report: Callable[[str], None],
+    *,
+    degree: int,
+    most: int,
+    views: int,
+    resolution: int,
+) -> Gaussians:
+    """`splats` of a cloud that is encoded already."""
+    pictures = draw_around(model, volume, light, views, resolution)
+    report(f"the network drew {views} pictures of {resolution} x {resolution}")
+    centre, scale = np.asarray(volume.centre), np.asarray(volume.scale)
+    scene = volume.scene
+    if not isinstance(scene, SurfelScene):
+        inside = np.clip((np.asarray(cloud.positions) - centre) * scale, -1, 1).astype(np.float32)
+        scene = encode_in_box(dataclasses.replace(cloud, positions=inside))
+    focal = float(np.asarray(pictures[0].camera.intrinsics)[0, 0])
+    seen = gaussians.collect_surface(pictures, scene.surfels)
+    grey, side = gaussians.place(seen, most=most, pixel=DISTANCE / focal)
+    made = jax.tree.map(np.asarray, gaussians.color(grey, pictures, side=side, degree=degree))
+    return made.replace(position=made.position / scale + centre, scale=made.scale / scale)
+
+
+# --- a mesh -----------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,7 +156,7 @@ class Grid:
 
 def solidity(views: Sequence[View], volume: Volume, placed: PlacedCloud, resolution: int = GRID) -> Grid:
     """0 outside, 1 inside, 1/2 on the surface, with `resolution` places along each side of the box."""
-    cameras = jax.tree.map(lambda *x: jnp.stack(x), *(view.camera for view in views))
+    seen_from = jax.tree.map(lambda *x: jnp.stack(x), *(view.camera for view in views))
     depth = jnp.stack([nearest_around(view.depth).astype(np.float32) for view in views])
     band = jnp.float32(BAND * 2 / (resolution - 1))
     steps = np.linspace(-1, 1, resolution, dtype=np.float32)
@@ -62,7 +165,7 @@ def solidity(views: Sequence[View], volume: Volume, placed: PlacedCloud, resolut
     values = np.empty((resolution,) * 3, np.float32)
     for i, x in enumerate(steps):  # a plane at a time
         places = np.concatenate([np.full_like(plane[:, :1], x), plane], axis=-1) @ rotation.T
-        values[i] = np.asarray(_solid(cameras, depth, band, places)).reshape(resolution, resolution)
+        values[i] = np.asarray(_solid(seen_from, depth, band, places)).reshape(resolution, resolution)
     return Grid(
         values=values,
         lowest=placed.rotation.T @ np.asarray(volume.centre, np.float64) - 1 / scale,
@@ -73,7 +176,7 @@ def solidity(views: Sequence[View], volume: Volume, placed: PlacedCloud, resolut
 
 @jax.jit
 def _solid(
-    cameras: Camera, depth: Float[Array, "views h w"], band: Float[Array, ""], places: Float[Array, "places 3"]
+    seen_from: Camera, depth: Float[Array, "views h w"], band: Float[Array, ""], places: Float[Array, "places 3"]
 ) -> Float[Array, " places"]:
     """Of places in the box, as cameras (views) with depth see them, infinite where they see nothing."""
     height, width = depth.shape[1:]
@@ -91,7 +194,7 @@ def _solid(
         return jnp.maximum(largest, jnp.minimum(vote[None], next_larger)), None
 
     most = jnp.full((AGREE, len(places)), -1, jnp.float32)
-    most, _ = jax.lax.scan(outvoted, most, (cameras.cam_to_world, cameras.intrinsics, depth))
+    most, _ = jax.lax.scan(outvoted, most, (seen_from.cam_to_world, seen_from.intrinsics, depth))
     return (1 - most[0]) / 2
 
 
@@ -112,7 +215,7 @@ class Solid(NamedTuple):
 
 def mesh_of_volume(model: Model, volume: Volume, placed: PlacedCloud, resolution: int = GRID) -> Solid:
     """The mesh of a cloud that is encoded, from a grid of so many places along each side of the box."""
-    views = splat_making.draw_views(model, volume, splat_making.fitting_cameras(model, volume))
+    views = draw_around(model, volume)
     return mesh_of(solidity(views, volume, placed, resolution), placed)
 
 

@@ -1,0 +1,36 @@
+"""Devices divide the work and change nothing: what one device computes is what all of them compute."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from spnr_jax.devices import placement
+
+QUICK_COMPILATION = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
+
+
+@pytest.mark.ci
+def test_eight_devices_train_as_one_in_float64_and_go_on_from_its_checkpoint(tmp_path):
+    here = Path(__file__).parent
+    environment = os.environ | {
+        "XLA_FLAGS": f"{QUICK_COMPILATION} --xla_force_host_platform_device_count=8",
+        "PYTHONPATH": str(here.parents[1]),
+    }
+    command = [sys.executable, here / "many_devices.py", tmp_path]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    found = json.loads(done.stdout.splitlines()[-1])
+    assert max(found["gradients"].values()) < 1e-9, found
+    assert found["trained"] < 1e-5, found
+
+
+def test_a_batch_that_the_devices_do_not_divide_is_refused_in_one_line():
+    assert placement.device_mesh() is None, "of one device"
+    mesh = jax.sharding.Mesh(np.full(4, jax.devices()[0]), (placement.OBJECTS,))
+    with pytest.raises(ValueError, match="batch_objects 6 cannot be divided among 4 devices; use a multiple"):
+        placement.check_divides(mesh, 6)
