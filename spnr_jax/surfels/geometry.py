@@ -354,7 +354,8 @@ def find_spacings(
         return spacing, weight, discs.measure_evenness(*jax.lax.stop_gradient((hood, weight, spacing)))
 
     rough, weight, evenness = map_blocks(weigh, points, normal, rules, raw, layer, normal, sided)
-    return rough, weight, median(evenness, points.mask) < rules.even
+    random = median(evenness, points.mask) < rules.even
+    return jnp.where(random, rough, jnp.minimum(rough, rules.most_even * raw)), weight, random
 
 
 # --- scenes -----------------------------------------------------------------------------------------------------------

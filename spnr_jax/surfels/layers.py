@@ -48,10 +48,11 @@ class Rules:
     first_disc: int = 6  # neighbors in the disc whose area gives the first spacing
     least_spacing: float = 1e-5  # of the box, for points that coincide
     alone: float = 0.1  # of the box, the spacing of a single point
-    own_disc: float = 3.0  # weight of the neighbors in the disc whose area gives the spacing
+    own_disc: float = 5.5  # weight of the neighbors in the disc whose area gives the spacing
     own_share: float = 0.6  # of the weight of the layer's neighbors, that disc's at most
-    bounds: Pair = (0.5, 1.2)  # of the spacing over the first one
-    smoothed: int = 9  # neighbors over which spacing and visibility are averaged
+    bounds: Pair = (0.5, 1.6)  # of the spacing over the first one
+    most_even: float = 1.2  # of the same, where points are spread evenly: legs are not drawn fat
+    smoothed: int = 12  # neighbors over which spacing and visibility are averaged
     near: float = 1.2  # standard deviation of the weight of a neighbor's distance
 
     # layers: a plane that two neighbors span, then a quadric
