@@ -52,7 +52,7 @@ class Rules:
     own_share: float = 0.6  # of the weight of the layer's neighbors, that disc's at most
     bounds: Pair = (0.5, 1.6)  # of the spacing over the first one
     most_even: float = 1.2  # of the same, where points are spread evenly: legs are not drawn fat
-    smoothed: int = 12  # neighbors over which spacing and visibility are averaged
+    smoothed: int = 9  # neighbors over which spacing and visibility are averaged
     near: float = 1.2  # standard deviation of the weight of a neighbor's distance
 
     # layers: a plane that two neighbors span, then a quadric
