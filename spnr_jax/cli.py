@@ -118,13 +118,13 @@ def check_installed(command: str, package: str, extra: str) -> None:
 def run_train(command: Train) -> None:
     """`spnr train`."""
     check_installed("train", "tensorboardX", "train")
-    from spnr_jax.devices import placement
+    from spnr_jax.devices import programs
     from spnr_jax.formats import data_sets
     from spnr_jax.training import trainer, weights
 
     dataset = data_sets.open_dataset(command.data)
     init = None if command.init is None else weights.read_trained(command.init)
-    trainer.train(command.config, dataset, command.run, command.schedule, placement.device_mesh(), init)
+    trainer.train(command.config, dataset, command.run, command.schedule, programs.device_mesh(), init)
     print(f"trained: {command.run} (score it with `spnr evaluate {command.data} {command.run}`)")
 
 

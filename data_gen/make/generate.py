@@ -24,7 +24,7 @@ from data_gen.render import light
 from data_gen.render.variant import choose_variant, mitsuba_module
 from data_gen.store import layout
 from data_gen.store.check import checksum_of
-from spnr_jax.devices.workers import run_tasks
+from spnr_jax.devices.runtime import run_tasks
 from spnr_jax.errors import UserError
 from spnr_jax.formats.images import read_envmap, write_whole
 from spnr_jax.surfels.skies import indoor_envmap

@@ -9,9 +9,9 @@ from scipy.spatial import cKDTree
 from support.point_clouds import read, sphere_points, write, write_rows
 
 from data_gen.store.layout import POINT_TYPE, encode_points
+from spnr_jax.config import Cut
 from spnr_jax.formats import clouds
 from spnr_jax.formats.clouds import place_cloud, read_cloud
-from spnr_jax.formats.cut import Cut
 from spnr_jax.formats.orientation import ROTATIONS
 from spnr_jax.kernels.cloud_arrays import pad
 from spnr_jax.surfels.sides import spiral
