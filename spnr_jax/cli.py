@@ -163,7 +163,7 @@ def run_render(command: Render) -> None:
 def run_view(command: View) -> None:
     """`spnr view`."""
     check_installed("view", "viser", "viewer")
-    from spnr_jax.viewer.server import open_viewer
+    from spnr_jax.tools.server import open_viewer
 
     viewer, notes = open_viewer(command)
     for line in (*notes, *viewer.lines):
@@ -178,14 +178,14 @@ def run_export(command: Export) -> None:
 
         print(export_network(command))
     else:
-        from spnr_jax.tools.share import export_object
+        from spnr_jax.tools.export import export_object
 
         export_object(command, _make_note(command.run), partial(print, flush=True))
 
 
 def run_share(command: Share) -> None:
     """`spnr share`."""
-    from spnr_jax.tools.share import share
+    from spnr_jax.tools.export import share
 
     share(command, _make_note(command.cloud), partial(print, flush=True))
 
