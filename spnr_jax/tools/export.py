@@ -43,7 +43,7 @@ from spnr_jax.config import Quality, SurfelConfig
 from spnr_jax.errors import UserError, require
 from spnr_jax.formats import images
 from spnr_jax.formats.gaussian_files import check_suffix, spz_of, write_splats
-from spnr_jax.formats.npz import pack_arrays
+from spnr_jax.formats.point_tables import pack_arrays
 from spnr_jax.kernels.cloud_arrays import plain_cloud
 from spnr_jax.kernels.records import AnyArray, Camera, Gaussians, Light, PointCloud, Surfels, SurfelScene
 from spnr_jax.method import surfel_method, surfel_renderer
