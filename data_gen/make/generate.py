@@ -1,4 +1,4 @@
-"""A data set from its plan: what is missing is made by workers (devices/workers.py), then the lists are written.
+"""A data set from its plan: what is missing is made by workers (devices/runtime.py), then the lists are written.
 
 Products are made first, split, and then the colour variants of those that train (plan/splits.py). A run may stop
 anywhere: finished objects stay, and the same command makes the others, to the same bytes. dataset.json
