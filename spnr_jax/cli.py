@@ -118,13 +118,13 @@ def check_installed(command: str, package: str, extra: str) -> None:
 def run_train(command: Train) -> None:
     """`spnr train`."""
     check_installed("train", "tensorboardX", "train")
-    from spnr_jax.devices import placement
+    from spnr_jax.devices import programs
     from spnr_jax.formats import data_sets
     from spnr_jax.training import trainer, weights
 
     dataset = data_sets.open_dataset(command.data)
     init = None if command.init is None else weights.read_trained(command.init)
-    trainer.train(command.config, dataset, command.run, command.schedule, placement.device_mesh(), init)
+    trainer.train(command.config, dataset, command.run, command.schedule, programs.device_mesh(), init)
     print(f"trained: {command.run} (score it with `spnr evaluate {command.data} {command.run}`)")
 
 
@@ -163,7 +163,7 @@ def run_render(command: Render) -> None:
 def run_view(command: View) -> None:
     """`spnr view`."""
     check_installed("view", "viser", "viewer")
-    from spnr_jax.viewer.server import open_viewer
+    from spnr_jax.tools.server import open_viewer
 
     viewer, notes = open_viewer(command)
     for line in (*notes, *viewer.lines):
@@ -178,14 +178,14 @@ def run_export(command: Export) -> None:
 
         print(export_network(command))
     else:
-        from spnr_jax.tools.share import export_object
+        from spnr_jax.tools.export import export_object
 
         export_object(command, _make_note(command.run), partial(print, flush=True))
 
 
 def run_share(command: Share) -> None:
     """`spnr share`."""
-    from spnr_jax.tools.share import share
+    from spnr_jax.tools.export import share
 
     share(command, _make_note(command.cloud), partial(print, flush=True))
 

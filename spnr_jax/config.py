@@ -1,4 +1,4 @@
-"""Every number of a network and of its training, as frozen dataclasses; `presets.py` fills them in.
+"""Every number of a network, its training and its pictures as frozen dataclasses; `presets.py` has those of trainings.
 
     EncoderConfig   points to a volume, with which the paper's network begins
     PaperConfig     the paper's network             method/paper_method.py
@@ -6,6 +6,7 @@
     TrainConfig     a training: one of these, losses, optimiser, batches
     Schedule        what the training loop does beside training
     RenderOptions   how a render is asked for
+    Cut             what is cut out of a scene before it is drawn
 
 Configs are hashable, so they are static arguments of jit.  All numbers are finite and at least 0; a wrong value raises
 ValueError when the config is made, with the field and what came.  Marks: [paper] stands in the supplement, the rest is
@@ -13,12 +14,13 @@ our choice.
 """
 
 import dataclasses
+import math
 from collections.abc import Collection
 from dataclasses import dataclass, field
 from functools import cache
 from typing import Any, ClassVar, Literal, get_args, get_origin, get_type_hints
 
-from spnr_jax.errors import require
+from spnr_jax.errors import UserError, require
 
 Quality = Literal["draft", "balanced", "best", "trained"]
 Material = Literal["base_color", "roughness", "metallic"]
@@ -385,3 +387,38 @@ class Schedule:
 
     def __post_init__(self) -> None:
         check(self, positive=("log_every", "preview_every", "checkpoint_every"))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cut:
+    """One object of a scene: inside a box, without the dominant plane, one cluster of points, in this order."""
+
+    crop: tuple[float, float, float, float, float, float] | None = None
+    """Only what lies in this box: xmin ymin zmin xmax ymax zmax, in the file's own units and axes."""
+    remove_plane: bool = False
+    """Without the plane that holds most of the surface: floor, table or wall."""
+    object: str | None = None
+    """Only one cluster of points: `largest`, or 2 for the second largest, and so on, after the plane is removed."""
+
+    keep_noise: bool = False
+    """Also points that a scan's classification calls noise (7, 18), withheld ones, and those of next to no opacity."""
+
+    @property
+    def is_given(self) -> bool:
+        """Whether anything is cut."""
+        return bool(self.crop or self.remove_plane or self.object)
+
+    @property
+    def nth(self) -> int | None:
+        """Which cluster, the largest is 1; None for all."""
+        return None if self.object is None else 1 if self.object == "largest" else int(self.object)
+
+    def __post_init__(self) -> None:
+        """ValueError names the option that makes no sense."""
+        if self.object not in (None, "largest") and not (self.object.isdecimal() and int(self.object) > 0):
+            raise UserError(f"--object must be largest or a number from 1, got {self.object!r}")
+        if self.crop is None:
+            return
+        box = tuple(self.crop)
+        if len(box) != 6 or not all(map(math.isfinite, box)) or any(a > b for a, b in zip(box, box[3:], strict=False)):
+            raise UserError(f"--crop takes xmin ymin zmin xmax ymax zmax, each min up to its max, got {box}")

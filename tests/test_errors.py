@@ -22,11 +22,11 @@ def raised_in(module, code):
 @pytest.mark.parametrize(
     ("module", "code", "bug"),
     [
-        ("spnr_jax.formats.ply", "absent", True),
+        ("spnr_jax.formats.row_files", "absent", True),
         ("data_gen.store.check", "def f():\n    print(x)\n    x = 1\nf()", True),
-        ("spnr_jax.formats.ply", "json.absent", True),
-        ("spnr_jax.formats.ply", "json.loads('[]').items()", False),  # the file holds a list
-        ("spnr_jax.formats.ply", "json.loads('{')", False),
+        ("spnr_jax.formats.row_files", "json.absent", True),
+        ("spnr_jax.formats.row_files", "json.loads('[]').items()", False),  # the file holds a list
+        ("spnr_jax.formats.row_files", "json.loads('{')", False),
         ("trimesh.exchange.ply", "absent", False),  # a library's way to say that a file is broken
         ("trimesh.exchange.ply", "json.absent", False),
     ],

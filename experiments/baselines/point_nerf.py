@@ -33,7 +33,7 @@ from spnr_jax.config import (
     TrainConfig,
     check,
 )
-from spnr_jax.devices.placement import split_objects
+from spnr_jax.devices.programs import split_objects
 from spnr_jax.errors import require
 from spnr_jax.kernels import cameras, compositing, sampling
 from spnr_jax.kernels.imaging import WHITE

@@ -17,7 +17,7 @@ from PIL import Image
 
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets, images
-from spnr_jax.formats.npz import pack_arrays
+from spnr_jax.formats.point_tables import pack_arrays
 from spnr_jax.scoring.report import Cell, Table
 from spnr_jax.training import trainer
 

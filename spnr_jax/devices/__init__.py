@@ -1,1 +1,1 @@
-"""Where a program runs: the devices and what lies where on them, workers, memory, kept programs."""
+"""Where a program runs: the process on its machine, and the devices of JAX."""

@@ -1,24 +1,35 @@
-"""What a process asks of its machine: threads, memory that stays, compiled programs on the disk; what the machine is.
+"""What a process asks of its machine: threads, workers, memory that stays, kept programs; what the machine is.
 
 glibc's allocator is asked for speed and so that memory does not grow; other C libraries are left alone.  Nothing here
 imports JAX before it is called: `keep_programs` comes before that.
+
+A worker is a fresh process with one thread (the noise of Mitsuba depends on its thread count), which has one task at a
+time.  It is killed with its parent, however that ends.  A worker may be killed at any time, by LLVM or for want of
+memory: this costs its own task alone, which is tried again when the others are done, with no other beside it.
 """
 
-import contextlib
 import ctypes
+import multiprocessing
 import os
 import platform
+import signal
+import threading
 import time
+import traceback
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager, suppress
 from functools import partial
 from itertools import islice
+from multiprocessing import connection, resource_tracker
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
+
+# --- threads ----------------------------------------------------------------------------------------------------------
 
 
 def run_ahead(jobs: Iterable[Callable[[], Result]], threads: int = 1, most: int = 1) -> Iterator[Result]:
@@ -43,6 +54,114 @@ def two_at_a_time(work: Callable[[Item], Result], items: Iterable[Item]) -> Iter
     jobs = (partial(work, item) for item in items)
     yield from (job() for job in islice(jobs, 1))
     yield from run_ahead(jobs, threads=2)
+
+
+# --- worker processes -------------------------------------------------------------------------------------------------
+
+
+DIED = "the process that worked on it died twice; out of memory?"
+PROCESSES = multiprocessing.get_context("spawn")
+
+
+def run_tasks(
+    function: Callable[[Any, Any], Any], state: Any, tasks: Iterable, num_workers: int
+) -> Generator[tuple[Any, Any], None, None]:
+    """Yields (task, result) as they finish, where result = function(state, task) in a worker, or DIED.
+
+    An exception in a worker ends the run and is raised here.  Tasks are taken from the iterable as workers need them.
+    Workers are gone when the generator is closed, with what they had in hand.
+    """
+    suspects = []
+    for task, result in _run_once(function, state, tasks, num_workers):
+        if result is DIED:
+            suspects.append(task)
+        else:
+            yield task, result
+    yield from _run_once(function, state, suspects, 1)
+
+
+def _run_once(function: Callable, state: Any, tasks: Iterable, num_workers: int) -> Iterator[tuple[Any, Any]]:
+    """`run_tasks`, in which one death of its worker is enough for DIED."""
+    waiting, busy, processes = iter(tasks), dict[Any, Any](), list[Any]()
+    try:
+        for task in islice(waiting, num_workers):
+            busy[_start(function, state, task, processes)] = task
+        while busy:
+            ready: list[Any] = connection.wait(list(busy))
+            for pipe in ready:
+                task = busy.pop(pipe)
+                try:
+                    result, error = pipe.recv()
+                except (EOFError, OSError):
+                    result, error = DIED, None
+                if error is not None:
+                    raise error
+                for following in islice(waiting, 1):
+                    if result is DIED:
+                        pipe = _start(function, state, following, processes)
+                    else:
+                        _send(pipe, following)
+                    busy[pipe] = following
+                yield task, result
+    finally:
+        for process in processes:
+            process.kill()
+        for process in processes:
+            process.join()
+
+
+def _start(function: Callable, state: Any, task: Any, processes: list) -> connection.Connection:
+    """The pipe to a new worker, which has begun with a task."""
+    ours, theirs = PROCESSES.Pipe()
+    processes.append(PROCESSES.Process(target=_work, args=(theirs, function, state), daemon=True))
+    with _ready_for_children():
+        processes[-1].start()
+    theirs.close()  # so that the pipe ends with the worker
+    _send(ours, task)
+    return ours
+
+
+def _send(pipe: connection.Connection, task: Any) -> None:
+    """Gives a worker its next task; of one that died meanwhile the pipe says so when it is read."""
+    with suppress(BrokenPipeError):
+        pipe.send(task)
+
+
+@contextmanager
+def _ready_for_children() -> Iterator[None]:
+    """What is started meanwhile has one thread, and never sees Ctrl-C, which reaches every process of a terminal."""
+    for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
+    resource_tracker.ensure_running()  # else it starts with the first worker, and unblocks the signal at that
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)  # a Ctrl-C that has waited is raised here
+
+
+def _work(tasks: connection.Connection, function: Callable, state: Any) -> None:
+    """The worker."""
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    with suppress(EOFError):
+        while True:
+            task = tasks.recv()
+            try:
+                tasks.send((function(state, task), None))
+            except Exception as error:  # noqa: BLE001 - raised in the parent
+                error.add_note(traceback.format_exc())
+                tasks.send((None, error))
+
+
+def _end_with_parent() -> None:
+    """Ends this process when its parent is gone."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
+
+
+# --- memory -----------------------------------------------------------------------------------------------------------
 
 
 TRIM_THRESHOLD, MMAP_MAX, ARENA_MAX = -1, -4, -8  # M_... of malloc.h
@@ -87,6 +206,9 @@ def _ask(what: Callable[[ctypes.CDLL], int]) -> None:
         return  # another C library
 
 
+# --- programs on the disk ---------------------------------------------------------------------------------------------
+
+
 SHORTEST = 0.1  # seconds of compilation from which on a program is kept
 # options of XLA for an outermost jit: a third to two thirds off the compilation of long programs, which run as long
 QUICK = {"xla_cpu_use_fusion_emitters": False}
@@ -112,7 +234,7 @@ def keep_programs() -> None:
     if jax.config.values["jax_compilation_cache_dir"] is None:
         jax.config.update("jax_compilation_cache_dir", str(folder()))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", SHORTEST)
-    with contextlib.suppress(OSError):  # there is none yet, or it is not ours to mend
+    with suppress(OSError):  # there is none yet, or it is not ours to mend
         remove_broken(Path(jax.config.values["jax_compilation_cache_dir"]))
 
 
@@ -136,6 +258,9 @@ def remove_broken(cache: Path) -> None:
                 Path(entry.path).unlink(missing_ok=True)
     mark.touch()
     os.utime(mark, ns=(begin, begin))
+
+
+# --- the machine ------------------------------------------------------------------------------------------------------
 
 
 CPUINFO = Path("/proc/cpuinfo")

@@ -20,10 +20,10 @@ from typing import Any, NamedTuple, get_args
 import numpy as np
 from scipy.spatial import cKDTree
 
+from spnr_jax.config import Cut
 from spnr_jax.errors import UserError
 from spnr_jax.formats.assets import ShownParts
 from spnr_jax.formats.columns import DEFAULTS, Columns, Report, keep_visible, materials, normals, sound, useful
-from spnr_jax.formats.cut import Cut
 from spnr_jax.formats.orientation import ROTATIONS, find_up, sensor_of
 from spnr_jax.formats.point_files import MESHES, column_pieces, kind_of, parse_ply
 from spnr_jax.kernels import scenes

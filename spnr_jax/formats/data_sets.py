@@ -16,7 +16,7 @@ from spnr_jax.config import TrainConfig
 from spnr_jax.errors import UserError
 from spnr_jax.formats import clouds
 from spnr_jax.formats.assets import decode_image
-from spnr_jax.formats.npz import read_arrays
+from spnr_jax.formats.point_tables import read_arrays
 from spnr_jax.kernels.records import Camera, Light, PointCloud
 from spnr_jax.surfels.lighting import HEIGHT, WIDTH, light_of
 

@@ -18,8 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
-from spnr_jax.formats.pcd import read_pcd_header
-from spnr_jax.formats.ply import camera_row
+from spnr_jax.formats.row_files import camera_row, read_pcd_header
 from spnr_jax.surfels.normals import find_visible, spacing_of
 
 ROTATIONS = {  # axis of the file that points up -> rotation (rows) that makes it y

@@ -1,9 +1,9 @@
 """Files opened: which kind a file is, by its first bytes where they tell, and its points as named columns.
 
-    .ply                        spnr_jax/formats/ply.py, also 3D Gaussian splats
-    .xyz .txt .csv .asc .pts    spnr_jax/formats/text.py
-    .pcd                        spnr_jax/formats/pcd.py
-    .npz .npy                   spnr_jax/formats/npz.py
+    .ply                        spnr_jax/formats/row_files.py, also 3D Gaussian splats
+    .xyz .txt .csv .asc .pts    spnr_jax/formats/point_tables.py
+    .pcd                        spnr_jax/formats/row_files.py
+    .npz .npy                   spnr_jax/formats/point_tables.py
     .las .laz                   spnr_jax/formats/las.py
     .spz                        spnr_jax/formats/gaussian_files.py
     .glb .gltf .obj .off        meshes (spnr_jax/formats/meshes.py), as points where they have no faces
@@ -24,10 +24,8 @@ from spnr_jax.errors import UserError
 from spnr_jax.formats.columns import Columns
 from spnr_jax.formats.gaussian_files import decompress_columns, spz_columns
 from spnr_jax.formats.las import las_pieces
-from spnr_jax.formats.npz import numpy_pieces
-from spnr_jax.formats.pcd import pcd_pieces
-from spnr_jax.formats.ply import element_pieces, read_ply_header
-from spnr_jax.formats.text import text_pieces
+from spnr_jax.formats.point_tables import numpy_pieces, text_pieces
+from spnr_jax.formats.row_files import element_pieces, pcd_pieces, read_ply_header
 
 READERS = {
     ".ply": lambda path: _ply(path),

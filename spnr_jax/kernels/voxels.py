@@ -25,7 +25,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from spnr_jax.devices.placement import object_groups
+from spnr_jax.devices.programs import object_groups
 from spnr_jax.kernels import sampling
 from spnr_jax.kernels.numerics import clamp, compute_once
 from spnr_jax.kernels.records import Rays

@@ -24,7 +24,7 @@ from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial import cKDTree
 
 from spnr_jax.config import AS_TRAINED, PaperConfig, RenderOptions, SamplingConfig, TrainConfig
-from spnr_jax.devices.placement import split_objects
+from spnr_jax.devices.programs import split_objects
 from spnr_jax.kernels import cameras, compositing, sampling, voxels
 from spnr_jax.kernels.imaging import WHITE, bilinear
 from spnr_jax.kernels.numerics import clamp

@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Array, Int
 
 from spnr_jax.config import SurfelConfig
+from spnr_jax.devices.programs import Kept
 from spnr_jax.devices.runtime import QUICK, QUICKEST, two_at_a_time
-from spnr_jax.devices.traces import Kept
 from spnr_jax.kernels import cameras, cloud_arrays
 from spnr_jax.kernels.imaging import enlarge
 from spnr_jax.kernels.records import Camera, GBuffer, Key, Light, PointCloud, Rendering, Surfels, SurfelScene, Volume

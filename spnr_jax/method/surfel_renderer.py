@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from spnr_jax.devices.traces import Kept
+from spnr_jax.devices.programs import Kept
 from spnr_jax.errors import UserError
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.imaging import WHITE, double_size, mean_of_squares

@@ -22,8 +22,7 @@ from urllib.parse import quote
 from tqdm import tqdm
 
 from spnr_jax.devices import runtime
-from spnr_jax.devices.runtime import run_ahead
-from spnr_jax.devices.workers import run_tasks
+from spnr_jax.devices.runtime import run_ahead, run_tasks
 from spnr_jax.errors import UserError, one_line
 from spnr_jax.formats.images import check_place, template, write_whole
 from spnr_jax.formats.point_files import MESHES, READERS

@@ -10,9 +10,8 @@ from typing import Any, Literal
 import tyro
 
 from spnr_jax import presets
-from spnr_jax.config import Schedule, TrainConfig
+from spnr_jax.config import Cut, Schedule, TrainConfig
 from spnr_jax.errors import UserError, at_least, require, within
-from spnr_jax.formats.cut import Cut
 
 MOST_STOPS = 20
 

@@ -27,7 +27,7 @@ from spnr_jax.errors import UserError
 from spnr_jax.formats.clouds import MOST_EVEN
 from spnr_jax.formats.data_sets import Dataset, ObjectData, read_object
 from spnr_jax.formats.images import to_uint8, write_whole
-from spnr_jax.formats.npz import pack_arrays, read_arrays
+from spnr_jax.formats.point_tables import pack_arrays, read_arrays
 from spnr_jax.kernels import cameras, losses
 from spnr_jax.kernels.cleaning import Cleaned, clean_columns
 from spnr_jax.kernels.cloud_arrays import farthest_points
@@ -40,8 +40,7 @@ from spnr_jax.methods import Outcome
 from spnr_jax.nn import shader
 from spnr_jax.nn.shader import Shader, picture
 from spnr_jax.surfels import lighting, normals
-from spnr_jax.training.batching import read_ahead
-from spnr_jax.training.scan_faults import colours_alone, random_scan
+from spnr_jax.training.batching import colours_alone, random_scan, read_ahead
 from spnr_jax.training.weights import add_companions
 
 CLOUDS = 2  # of each object

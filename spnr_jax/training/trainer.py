@@ -33,7 +33,7 @@ from jax.sharding import Mesh
 from tqdm import tqdm
 
 from spnr_jax.config import Schedule, TrainConfig
-from spnr_jax.devices import placement, runtime
+from spnr_jax.devices import programs, runtime
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.images import png, to_uint8, write_whole
@@ -68,7 +68,7 @@ def train(
     told what the loop is about to do.  `light` is that of the data set's pictures, where it is not the room.
     """
     runtime.few_arenas()
-    placement.check_divides(mesh, config.batch_objects)
+    programs.check_divides(mesh, config.batch_objects)
     with claim(run, config), ExitStack() as stack:
         clock = Clock()
         state = restore_or_init(config, run, mesh, init)
@@ -108,8 +108,8 @@ def take_step(
     state: optimisation.TrainState, batch: Any, config: TrainConfig, mesh: Mesh | None, *, adversarial: bool
 ) -> tuple[optimisation.TrainState, dict]:
     """The state after a batch whose objects the devices share, and metrics."""
-    with placement.using(mesh):
-        batch = placement.place_batch(batch, mesh)
+    with programs.using(mesh):
+        batch = programs.place_batch(batch, mesh)
         return optimisation.jitted_train_step(state, batch, config=config, adversarial=adversarial)
 
 
@@ -127,8 +127,8 @@ def claim(run: Path, config: TrainConfig) -> Iterator[None]:
 
 def restore_or_init(config: TrainConfig, run: Path, mesh: Mesh | None, init: Trained | None) -> optimisation.TrainState:
     """The state to go on with, and a line about it: of the newest checkpoint, or before the first step."""
-    with placement.using(mesh):
-        sharding = None if mesh is None else placement.sharding_of_all(mesh)
+    with programs.using(mesh):
+        sharding = None if mesh is None else programs.sharding_of_all(mesh)
         state = checkpoint.restore(run, config, tqdm.write, sharding) or new_state(config, init)
     if (step := int(state.step)) >= config.num_steps:
         tqdm.write(f"{run} is finished: {step} steps")
@@ -217,7 +217,7 @@ def new_state(config: TrainConfig, init: Trained | None) -> optimisation.TrainSt
 
 def write_network(run: Path, config: TrainConfig, state: optimisation.TrainState) -> None:
     """The averaged weights as RUN/weights.npz; a line where float16 does not hold them."""
-    variables = placement.on_first_device(optimisation.averaged_variables(state))
+    variables = programs.on_first_device(optimisation.averaged_variables(state))
     try:
         write_weights(run / "weights.npz", Trained(config=config, variables=variables, steps=int(state.step)))
     except UserError as error:
@@ -274,7 +274,7 @@ def preview(
 ) -> tuple[dict[str, float], np.ndarray]:
     """Validation PSNR of the averaged network on a few objects, and references over renderings, kept in previews/."""
     names = (dataset.splits["val"] or dataset.splits["train"])[:num_objects]
-    variables = placement.on_first_device(optimisation.averaged_variables(state))
+    variables = programs.on_first_device(optimisation.averaged_variables(state))
     variables = add_companions(config.model, variables, run)
     columns, scores = [], []
     for name in names:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from support.laws import close
 
-from spnr_jax.devices import traces
+from spnr_jax.devices import programs
 from spnr_jax.kernels.records import Rays
 
 CALLS = []
@@ -32,7 +32,7 @@ def folder(tmp_path):
 
 def kept():
     """As a new process has it."""
-    return traces.Kept(bend, returns=(Rays,), static="times")
+    return programs.Kept(bend, returns=(Rays,), static="times")
 
 
 RAYS = Rays(np.arange(6, dtype=np.float32).reshape(2, 3), np.ones((2, 3), np.float32))

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from spnr_jax.devices.workers import DIED, run_tasks
+from spnr_jax.devices.runtime import DIED, run_tasks
 
 ROOT = Path(__file__).parents[2]
 
@@ -46,7 +46,7 @@ def test_tasks_without_end_are_taken_as_they_are_needed(tmp_path):
 
 SLEEPER = """
 import os, time
-from spnr_jax.devices.workers import run_tasks
+from spnr_jax.devices.runtime import run_tasks
 
 def sleep(state, task):
     os.write(1, b"begun\\n")  # at once: both tasks write to the same pipe

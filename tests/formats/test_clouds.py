@@ -9,9 +9,9 @@ from scipy.spatial import cKDTree
 from support.point_clouds import read, sphere_points, write, write_rows
 
 from data_gen.store.layout import POINT_TYPE, encode_points
+from spnr_jax.config import Cut
 from spnr_jax.formats import clouds
 from spnr_jax.formats.clouds import place_cloud, read_cloud
-from spnr_jax.formats.cut import Cut
 from spnr_jax.formats.orientation import ROTATIONS
 from spnr_jax.kernels.cloud_arrays import pad
 from spnr_jax.surfels.sides import spiral
@@ -202,7 +202,7 @@ def test_of_a_cloud_beyond_the_capacity_a_sample_is_kept_while_reading_which_is_
 
 def test_rows_without_finite_numbers_are_left_out_while_a_big_file_is_thinned(tmp_path, monkeypatch):
     monkeypatch.setattr(clouds, "CAPACITY", 16)
-    monkeypatch.setattr("spnr_jax.formats.text.PIECE_LINES", 7)
+    monkeypatch.setattr("spnr_jax.formats.point_tables.PIECE_LINES", 7)
     positions = np.concatenate([np.full((20, 3), np.nan), sphere_points(3, 300), np.full((9, 3), np.inf)])
     np.savetxt(tmp_path / "a.xyz", np.tile(positions, 2), header="x y z nx ny nz")
     cloud, lines = read(tmp_path / "a.xyz", num_points=1)

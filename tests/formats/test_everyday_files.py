@@ -16,9 +16,9 @@ from support import splat_balls
 from support.gltf_files import GltfBuilder
 from support.point_clouds import packed_splats, ply_bytes, read, write, write_rows
 
+from spnr_jax.config import Cut
 from spnr_jax.formats import gaussian_files
 from spnr_jax.formats.clouds import place_cloud, read_cloud
-from spnr_jax.formats.cut import Cut
 from spnr_jax.formats.polygons import ears
 from spnr_jax.surfels.sides import spiral
 

@@ -14,11 +14,11 @@ from hypothesis import strategies as st
 from support.point_clouds import SRGB, XYZRGB, ply_bytes, read, read_columns, write
 from support.point_tables import BROKEN, SOUND, WHOLE, WRITERS, as_scan, compress_lzf, written
 
-from spnr_jax.formats import clouds, las, npz, ply, text
+from spnr_jax.formats import clouds, las, point_tables, row_files
 from spnr_jax.formats.clouds import place_cloud, read_cloud
-from spnr_jax.formats.npz import pack_arrays
-from spnr_jax.formats.pcd import decompress
 from spnr_jax.formats.point_files import column_pieces
+from spnr_jax.formats.point_tables import pack_arrays
+from spnr_jax.formats.row_files import decompress
 
 PIECED = ("ascii.ply", "little.ply", "big.ply", "ascii.pcd", "binary.pcd", "a.xyz", "a.csv", "a.npy", "a.las")
 ANNOUNCED = [name for name in WRITERS if name.rpartition(".")[2] in "ply pcd npy npz las laz off glb"]
@@ -43,9 +43,10 @@ def test_a_table_comes_back_with_its_colours_linear_without_broken_rows_and_not_
 @pytest.mark.parametrize("name", PIECED)
 def test_pieces_are_small_and_together_the_whole_file(tmp_path, name, monkeypatch):
     path = written(tmp_path, name, WHOLE)
-    for module, limit, size in ((ply, "PIECE_LINES", 5), (text, "PIECE_LINES", 5), (npz, "PIECE_BYTES", 5 * 35)):
+    limits = (row_files, "PIECE_LINES", 5), (point_tables, "PIECE_LINES", 5), (point_tables, "PIECE_BYTES", 5 * 35)
+    for module, limit, size in limits:
         monkeypatch.setattr(module, limit, size)
-    monkeypatch.setattr(ply, "PIECE_BYTES", 5 * 31)
+    monkeypatch.setattr(row_files, "PIECE_BYTES", 5 * 31)
     monkeypatch.setattr(las, "PIECE_BYTES", 5 * 36)
     sizes = [len(next(iter(piece.values()))) for piece in column_pieces(path)]
     assert len(sizes) > 2

@@ -130,7 +130,7 @@ def read_network(folder: Path, main: str) -> None:
 def read_upload(folder: Path, main: str) -> None:
     """What a browser's file becomes; nothing of it stays on the disk."""
     from spnr_jax.formats import clouds
-    from spnr_jax.viewer import frame
+    from spnr_jax.tools import frame
 
     before, read = set(folder.iterdir()), functools.partial(clouds.read_cloud, num_points=MOST_POINTS, up="auto")
     try:

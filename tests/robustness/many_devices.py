@@ -18,7 +18,7 @@ from support import tiny_dataset, tiny_model
 from support.tiny_baselines import SHRUNKEN
 
 from spnr_jax.config import LossConfig, SamplingConfig
-from spnr_jax.devices import placement
+from spnr_jax.devices import programs
 from spnr_jax.training import batching, optimisation, trainer
 
 NEAR = SamplingConfig(num_coarse=4, num_fine=4, reach=1)
@@ -38,10 +38,10 @@ def gradients_apart(model) -> float:
     def precise(tree):
         return jax.tree.map(lambda x: x.astype("float64") if x.dtype == np.float32 else x, tree)
 
-    for mesh in (None, placement.device_mesh()):
-        with placement.using(mesh):
+    for mesh in (None, programs.device_mesh()):
+        with programs.using(mesh):
             state = precise(optimisation.jitted_create_state(config))
-            placed = placement.place_batch(precise(batch), mesh)
+            placed = programs.place_batch(precise(batch), mesh)
             state, _ = optimisation.jitted_train_step(state, placed, config=config, adversarial=False)
         gradients.append(jax.device_get(state.generator_optimizer[0].mu))  # of one step their mean is a multiple
     pairs = zip(*map(jax.tree.leaves, gradients), strict=True)
@@ -55,7 +55,7 @@ def weights_apart(folder: Path) -> float:
     whole = trainer.train(config, tiny_dataset.dataset(), folder / "one", schedule)
     ignored = shutil.ignore_patterns("2", "weights.npz")
     shutil.copytree(folder / "one", folder / "all", ignore=ignored)
-    mesh = placement.device_mesh()
+    mesh = programs.device_mesh()
     state = trainer.train(config, tiny_dataset.dataset(), folder / "all", schedule, mesh)
     pairs = list(zip(*(jax.tree.leaves(jax.device_get(x.generator)) for x in (state, whole)), strict=True))
     return float((sum(np.sum((a - b) ** 2) for a, b in pairs) / sum(np.sum(b**2) for _, b in pairs)) ** 0.5)

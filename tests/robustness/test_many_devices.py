@@ -10,7 +10,7 @@ import jax
 import numpy as np
 import pytest
 
-from spnr_jax.devices import placement
+from spnr_jax.devices import programs
 
 QUICK_COMPILATION = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
 
@@ -30,7 +30,7 @@ def test_eight_devices_train_as_one_in_float64_and_go_on_from_its_checkpoint(tmp
 
 
 def test_a_batch_that_the_devices_do_not_divide_is_refused_in_one_line():
-    assert placement.device_mesh() is None, "of one device"
-    mesh = jax.sharding.Mesh(np.full(4, jax.devices()[0]), (placement.OBJECTS,))
+    assert programs.device_mesh() is None, "of one device"
+    mesh = jax.sharding.Mesh(np.full(4, jax.devices()[0]), (programs.OBJECTS,))
     with pytest.raises(ValueError, match="batch_objects 6 cannot be divided among 4 devices; use a multiple"):
-        placement.check_divides(mesh, 6)
+        programs.check_divides(mesh, 6)

@@ -11,9 +11,9 @@ from spnr_jax.config import SurfelConfig
 from spnr_jax.kernels.records import PointCloud
 from spnr_jax.method import inference, surfel_method
 from spnr_jax.method.model import Model
+from spnr_jax.tools import frame
 from spnr_jax.tools.commands import Lighting
-from spnr_jax.viewer import frame
-from spnr_jax.viewer.frame import OPENCV, State, View
+from spnr_jax.tools.frame import OPENCV, State, View
 from support import surfel_clouds, tiny_model
 
 RED, BLUE = (0.8, 0.05, 0.05), (0.05, 0.05, 0.8)
@@ -80,7 +80,7 @@ def canvas(moving=False, **changes) -> np.ndarray:
 
 def viewer(host="127.0.0.1", port=0, reached_at=None):
     """A viewer that waits for browsers; whoever opens it stops it."""
-    from spnr_jax.viewer.server import Viewer
+    from spnr_jax.tools.server import Viewer
 
     reading = {"num_points": 100, "up": "y", "clean": "auto"}
     return Viewer(surfels(), opened(), reading, host, port, reached_at)

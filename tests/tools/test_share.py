@@ -11,7 +11,7 @@ from spnr_jax.formats.point_files import parse_ply
 from spnr_jax.method import surfel_method
 from spnr_jax.surfels.gaussians import View
 from spnr_jax.surfels.sides import spiral
-from spnr_jax.tools import pictures, share, surfaces
+from spnr_jax.tools import export, pictures, surfaces
 from spnr_jax.tools.commands import Lighting
 
 pytestmark = pytest.mark.ci  # it makes splats with the network of the package
@@ -105,9 +105,9 @@ def test_ctrl_c_while_a_file_is_written_leaves_what_was_there(cloud, tmp_path, m
 
 
 def test_a_page_that_is_too_large_is_refused(monkeypatch):
-    monkeypatch.setattr(share, "MOST_BYTES", 1000)
+    monkeypatch.setattr(export, "MOST_BYTES", 1000)
     poster = np.ones((8, 8, 3), np.float32)
     with pytest.raises(ValueError, match="--most-splats"):
-        share.page(splat_balls.ball(50), poster, splat_balls.camera(size=8), (30.0, 20.0), "t", "n")
+        export.page(splat_balls.ball(50), poster, splat_balls.camera(size=8), (30.0, 20.0), "t", "n")
     lighting = Lighting(light="/home/me/sky.hdr", sun=(40.0, 30.0), exposure=-1.0)
     assert pictures.light_name(lighting) == "sky.hdr + sun 40 30, exposure -1", "without its folder"

@@ -14,7 +14,7 @@ from PIL import Image
 from support import chromium as chromium_of
 from support import splat_balls, splat_twin
 
-from spnr_jax.tools import share, surfaces
+from spnr_jax.tools import export, surfaces
 from spnr_jax.tools.commands import Share, SplatMaking
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install playwright")
@@ -70,7 +70,7 @@ def page(tmp_path, degree, title="A ball"):
     splats = splat_balls.ball(degree=degree)
     poster, _ = splat_twin.draw(splats, camera)
     path = tmp_path / "page.html"
-    path.write_bytes(share.page(splats, poster, camera, (30.0, 20.0), title, "a note"))
+    path.write_bytes(export.page(splats, poster, camera, (30.0, 20.0), title, "a note"))
     return path, poster
 
 
@@ -93,7 +93,7 @@ def test_the_page_of_a_cloud_shows_what_the_network_draws(chromium, tmp_path, mo
     making = SplatMaking(fitting_views=12, most_splats=8000)
     options = Share(cloud=tmp_path / "ball.txt", out=tmp_path / "page.html", up="y", making=making)
     lines: list[str] = []
-    share.share(options, lambda line: None, lines.append)
+    export.share(options, lambda line: None, lines.append)
     assert lines[-1].startswith(f"wrote {options.out} (")
     poster = re.search(r'src="data:image/jpeg;base64,([^"]+)"', options.out.read_text())
     network = np.asarray(Image.open(io.BytesIO(base64.b64decode(poster[1])))) / np.float32(255)

@@ -12,8 +12,8 @@ from spnr_jax.formats import clouds
 from spnr_jax.formats.images import NAMES, read_light
 from spnr_jax.kernels.records import Light, Rendering
 from spnr_jax.method.model import Model
+from spnr_jax.tools import frame
 from spnr_jax.tools.commands import Lighting
-from spnr_jax.viewer import frame
 
 QUIET = {"choice": "room", "yaw": 0, "exposure": 0}
 

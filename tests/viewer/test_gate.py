@@ -14,8 +14,7 @@ import websockets.asyncio.server  # noqa: E402
 from websockets.exceptions import InvalidStatus  # noqa: E402
 from websockets.sync.client import connect  # noqa: E402
 
-from spnr_jax.tools import commands  # noqa: E402
-from spnr_jax.viewer import server  # noqa: E402
+from spnr_jax.tools import commands, server  # noqa: E402
 
 PROTOCOL = f"viser-v{viser.__version__}"
 

@@ -6,7 +6,7 @@ import pytest
 
 pytest.importorskip("viser", reason="the viewer's extra is not installed: pip install 'spnr-jax[viewer]'")
 
-from spnr_jax.viewer.server import Loop  # noqa: E402
+from spnr_jax.tools.server import Loop  # noqa: E402
 
 
 def test_changes_are_applied_in_order_drawn_at_once_and_once_more_at_rest():

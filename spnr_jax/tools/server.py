@@ -35,11 +35,11 @@ from spnr_jax.errors import UserError
 from spnr_jax.formats import clouds, images
 from spnr_jax.method.model import FIELD_OF_VIEW, Model
 from spnr_jax.methods import method_of
+from spnr_jax.tools import frame
 from spnr_jax.tools.commands import View
+from spnr_jax.tools.frame import State
 from spnr_jax.tools.pictures import check_takes_light
 from spnr_jax.training.weights import load
-from spnr_jax.viewer import frame
-from spnr_jax.viewer.frame import State
 
 LENGTH = 16  # bytes of a token
 CLOSED = "Open the address that `spnr view` printed, whole: it holds a token.\n"

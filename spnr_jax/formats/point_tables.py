@@ -1,0 +1,282 @@
+"""Tables of points as named columns, piece by piece: text (.xyz .txt .csv .asc .pts) and NumPy files (.npz .npy).
+
+Numbers of text are separated by commas, semicolons or blanks, also behind the last one; a decimal comma is told by that
+nothing else separates there.  Lines of one whole number count the points.  A header line names the columns, also behind
+# or //, with units in brackets; a column without a name is a table's index.  Without a header the number of columns
+tells, and for normals their values:
+
+    3 x y z | 4 + intensity | 6 + r g b, or + nx ny nz if these have length 1 | 7 + r g b alpha or intensity r g b
+    8 + r g b roughness metallic | 9 + r g b and nx ny nz in either order
+
+    .npz    arrays (points, 3) or (points,) under the names of ARRAY_COLUMNS; they come whole where they are compressed
+    .npy    a structured array of named fields, or an array (points, columns) or (height, width, columns) as in text
+
+Pickled objects, which could run code, are refused.  Every fault is a ValueError that says what is wrong with the file,
+of text also in which line; its name is added by the caller.
+"""
+
+import contextlib
+import io
+import math
+import re
+import threading
+import tokenize
+import warnings
+import zipfile
+import zlib
+from collections.abc import Collection, Iterator, Sequence
+from itertools import chain, islice
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from spnr_jax.errors import UserError
+from spnr_jax.formats.columns import Columns
+
+# --- text -------------------------------------------------------------------------------------------------------------
+
+
+Line = tuple[int, str]  # its number in the file, from 1, and its text
+
+POSITION, COLOR, NORMAL = ("x", "y", "z"), ("r", "g", "b"), ("nx", "ny", "nz")
+PLAIN_COLUMNS = {3: POSITION, 4: (*POSITION, "intensity"), 8: (*POSITION, *COLOR, "roughness", "metallic")}
+OPAQUE = (1, 255, 65535)  # what an alpha is where nobody thought of it
+NUMBERS = "fiu"  # kinds of types that hold real numbers
+UNIT_LENGTH = 0.02  # how far from 1 the length of a normal may be
+COMMENTS = ("#", "//")
+PIECE_LINES = 2**17  # in memory at a time
+SHOWN = 60  # characters of a line that an error shows
+LONGEST_HEADER = 4096  # characters in which names are looked for
+NUMBER = r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?|[+-]?(nan|inf(inity)?)"
+WITH_COMMA = r"[+-]?\d+(,\d+)?([eE][+-]?\d+)?"
+INDEX = "index"  # the name of a column that only counts
+
+
+class Layout(NamedTuple):
+    """How a file writes its rows: what separates numbers (None: blanks), and whether commas are decimal points."""
+
+    delimiter: str | None
+    decimal_comma: bool
+
+    def plain(self, text: str) -> str:
+        """A row with decimal points, without separators behind the last number."""
+        text = text.rstrip(" \t" + (self.delimiter or ""))
+        return text.replace(",", ".") if self.decimal_comma else text
+
+
+def text_pieces(path: Path) -> Iterator[Columns]:
+    """The columns of a text file, some points at a time; the last line before the numbers may name them."""
+    with path.open(encoding="utf-8-sig", errors="replace") as file:
+        numbered = ((number, line.strip()) for number, line in enumerate(file, 1))
+        header, is_comment, first = _header(numbered)
+        layout = _layout(first[1])
+        lines = (
+            (number, plain)
+            for number, text in chain([first], numbered)
+            if not text.startswith(COMMENTS) and not text.isdecimal() and (plain := layout.plain(text))
+        )
+        names: tuple[str, ...] = ()
+        while rows := list(islice(lines, PIECE_LINES)):
+            table = _table(rows, layout)
+            names = names or _names(header, is_comment, table, layout)
+            if len(names) != table.shape[1]:
+                number, text = rows[0]
+                raise UserError(f"line {number}: expected {len(names)} numbers as before, found {text[:SHOWN]!r}")
+            yield {name: column for name, column in zip(names, table.T, strict=True) if name != INDEX}
+
+
+def _header(lines: Iterator[Line]) -> tuple[str, bool, Line]:
+    """What stands before the numbers last, whether as a comment, and the first row of numbers (0, "" if none)."""
+    header, is_comment = "", True
+    for number, line in lines:
+        text = re.sub(r"^(#|//)\s*", "", line)
+        first = re.split(r"[\s;]+", text)[0]
+        if text and not re.fullmatch(NUMBER, first.split(",")[0], re.IGNORECASE):
+            header, is_comment = text[:LONGEST_HEADER], text != line
+        elif text and text == line and not text.isdecimal():
+            return header, is_comment, (number, line)
+    return header, is_comment, (0, "")
+
+
+def _layout(row: str) -> Layout:
+    """How a row of numbers is written."""
+    delimiter = next((mark for mark in ";," if mark in row), None)
+    parts = row.strip("; \t").split(";") if delimiter == ";" else row.split()
+    comma = len(parts) > 2 and "," in row and all(re.fullmatch(WITH_COMMA, part.strip()) for part in parts if part)
+    return Layout(delimiter if delimiter == ";" or not comma else None, comma)
+
+
+def _table(rows: Sequence[Line], layout: Layout) -> np.ndarray:
+    """Numbers (rows, columns); ValueError names the first line that is not like the first one."""
+    try:
+        return np.loadtxt([text for _, text in rows], delimiter=layout.delimiter, comments=None, ndmin=2)
+    except ValueError:
+        count = len(rows[0][1].split(layout.delimiter))
+        for number, text in rows:
+            values = [value.strip() for value in text.split(layout.delimiter)]
+            if len(values) != count or not all(re.fullmatch(NUMBER, value, re.IGNORECASE) for value in values):
+                raise UserError(f"line {number}: expected {count} numbers, found {text[:SHOWN]!r}") from None
+        raise
+
+
+def _names(header: str, is_comment: bool, table: np.ndarray, layout: Layout) -> tuple[str, ...]:
+    """Names of the columns of a table from its header, or if that is a remark, from the numbers."""
+    count = table.shape[1]
+    plain = re.sub(r"[(\[][^)\]]*[)\]]", "", header)  # units
+    marks = [rf"\s*{mark}\s*" for mark in ";," if mark in plain]
+    found = [[name.strip("\"' \t").lower() for name in re.split(mark, plain)] for mark in (*marks, r"[\s,;]+")]
+    for names in found:
+        while len(names) > count and not names[-1]:
+            names.pop()
+        if len(names) == count - 1 and "x" in names and len(table) > 1 and np.all(np.diff(table[:, 0]) == 1):
+            names.insert(0, "")  # as R writes a table
+    names = next((names for names in found if len(names) == count), found[-1])
+    if is_comment and ("x" not in names or len(names) != count):
+        return plain_names(table)
+    if len(names) != count:
+        raise UserError(f"names {len(names)} columns ({' '.join(names)}) above {count} columns of numbers")
+    return tuple(name or INDEX for name in names)
+
+
+def plain_names(table: np.ndarray) -> tuple[str, ...]:
+    """Names of the columns of a table (points, columns) that has none."""
+    if table.ndim == 2 and table.dtype.kind in NUMBERS:
+        count = table.shape[1]
+        if count in PLAIN_COLUMNS:
+            return PLAIN_COLUMNS[count]
+        if count == 6:
+            return (*POSITION, *(NORMAL if _are_normals(table[:, 3:]) else COLOR))
+        if count == 7:
+            alpha_last = np.isin(table[:, 6], OPAQUE).all() or (table[:, 3:].min() >= 0 and table[:, 3:].max() <= 1)
+            return (*POSITION, *((*COLOR, "alpha") if alpha_last else ("intensity", *COLOR)))
+        if count == 9:
+            rest = (*NORMAL, *COLOR) if _are_normals(table[:, 3:6]) else (*COLOR, *NORMAL)
+            return (*POSITION, *rest)
+    raise UserError(
+        f"has numbers of shape {table.shape} and type {table.dtype} without column names; expected rows of 3, 4, 6, 7, "
+        "8 or 9 numbers (x y z; + intensity; + r g b; + r g b alpha; + r g b roughness metallic; + r g b nx ny nz), or "
+        "a header line that names the columns"
+    )
+
+
+def _are_normals(vectors: np.ndarray) -> bool:
+    """Whether vectors (n, 3) have length 1, up to rounding, and are not all in the octant of colours."""
+    lengths = np.linalg.norm(np.asarray(vectors, np.float64), axis=-1)
+    return bool((vectors < 0).any() and np.median(np.abs(lengths - 1)) < UNIT_LENGTH)
+
+
+# --- NumPy ------------------------------------------------------------------------------------------------------------
+
+
+HEADERS = threading.Lock()  # Python's parser, which NumPy reads headers with, fails in two threads at once (gh-106905)
+PIECE_BYTES = 2**25  # of an array in memory at a time
+MOST_BYTES = 2**31  # of an archive's arrays when unpacked: a small file can announce any number
+# what NumPy and zipfile raise on files that break their rules
+UNREADABLE: tuple[type[Exception], ...]
+UNREADABLE = (ValueError, LookupError, TypeError, ArithmeticError, EOFError, OSError, RuntimeError, SyntaxError)
+UNREADABLE += (tokenize.TokenError, zipfile.BadZipFile, zlib.error)
+ARRAY_COLUMNS = {
+    **dict.fromkeys(("positions", "points", "xyz", "vertices"), ("x", "y", "z")),
+    **dict.fromkeys(("base_color", "albedo"), ("base_color_r", "base_color_g", "base_color_b")),
+    **dict.fromkeys(("colors", "rgb", "color"), ("r", "g", "b")),
+    "roughness": ("roughness",),
+    **dict.fromkeys(("metallic", "metalness"), ("metallic",)),
+    "normals": ("nx", "ny", "nz"),
+}
+
+
+def numpy_pieces(path: Path) -> Iterator[Columns]:
+    """The columns of an array, some points at a time, or of an archive."""
+    with path.open("rb") as file:
+        magic = file.read(6)
+        file.seek(0)
+        if magic.startswith(b"PK"):
+            yield _name_columns(read_arrays(file, ARRAY_COLUMNS))
+            return
+    if not magic.startswith(b"\x93NUMPY"):
+        raise UserError("is not a NumPy file")
+    try:
+        with _parsing():
+            loaded = np.lib.format.open_memmap(path, mode="r")
+    except UNREADABLE as error:
+        raise UserError(f"is a broken, truncated or pickled NumPy file ({error})") from None
+    rows = np.atleast_1d(loaded)
+    if rows.ndim == 3:  # the pixels of a picture
+        rows = rows.reshape(-1, rows.shape[2])
+    names = rows.dtype.names or plain_names(rows)
+    step = max(1, PIECE_BYTES // max(1, rows[:1].nbytes))
+    for start in range(0, max(1, len(rows)), step):
+        piece = np.array(rows[start : start + step])
+        values = [piece[name] for name in names] if rows.dtype.names else piece.T
+        yield {name.lower(): column for name, column in zip(names, values, strict=True)}
+
+
+def pack_arrays(arrays: dict[str, np.ndarray], *, compressed: bool = False) -> bytes:
+    """An .npz archive of arrays by their names."""
+    stream = io.BytesIO()
+    save = np.savez_compressed if compressed else np.savez
+    save(stream, allow_pickle=False, **arrays)
+    return stream.getvalue()
+
+
+def read_arrays(file: io.BufferedIOBase, wanted: Collection[str] | None = None) -> dict[str, np.ndarray]:
+    """The arrays of an .npz archive, those whose names are wanted; ValueError if it is broken or unpacks to too much.
+
+    An array's size is checked before memory is taken for it: its header must not announce more than its bytes.
+    """
+    arrays = {}
+    try:
+        with zipfile.ZipFile(file) as archive:
+            members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
+            names = [name for name in members if wanted is None or name in wanted]
+            unpacked = sum(members[name].file_size for name in names)
+            if unpacked > MOST_BYTES:
+                raise UserError(
+                    f"unpacks to {unpacked} bytes, more than {MOST_BYTES}; use .npy, which is read in pieces"
+                )
+            for name in names:
+                arrays[name] = _member(archive, members[name])
+    except UNREADABLE as error:
+        raise UserError(f"is a broken or truncated NumPy file ({error})") from None
+    if not arrays:
+        raise UserError(f"has none of the arrays {', '.join(wanted or ())}; found {', '.join(members) or 'none'}")
+    return arrays
+
+
+@contextlib.contextmanager
+def _parsing() -> Iterator[None]:
+    """Headers are read by one thread at a time; NumPy warns of those of Python 2, which it reads well."""
+    with HEADERS, warnings.catch_warnings():
+        warnings.filterwarnings("ignore", ".*required additional header parsing", UserWarning)
+        yield
+
+
+def _member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
+    """One array of an archive."""
+    with _parsing(), archive.open(info) as stream:
+        version = np.lib.format.read_magic(stream)
+        read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, _, dtype = read_header(stream)
+        if dtype.hasobject or any(size < 0 for size in shape):
+            raise UserError(f"{info.filename} holds objects or a negative size, shape {shape} and type {dtype}")
+        if math.prod(shape) * dtype.itemsize > info.file_size:
+            raise UserError(f"{info.filename} is cut off: shape {shape} of {dtype} in {info.file_size} bytes")
+    with _parsing(), archive.open(info) as stream:
+        return np.lib.format.read_array(stream, allow_pickle=False)
+
+
+def _name_columns(archive: dict[str, np.ndarray]) -> Columns:
+    """The columns of arrays (points, c), or (points,) for scalars, under the names of ARRAY_COLUMNS."""
+    columns: Columns = {}
+    for name, array in archive.items():
+        targets = ARRAY_COLUMNS[name]
+        table = array[:, None] if array.ndim == 1 else array
+        if table.ndim != 2 or table.shape[1] != len(targets) or table.dtype.kind not in NUMBERS:
+            raise UserError(f"has {name!r} of shape {array.shape} and type {array.dtype}, not (points, {len(targets)})")
+        columns |= dict(zip(targets, table.T, strict=True))
+    if "x" not in columns:
+        raise UserError(f"has no array named positions, points or xyz; found {', '.join(archive) or 'none'}")
+    if len({len(column) for column in columns.values()}) > 1:
+        raise UserError(f"has arrays of different lengths: { {name: len(array) for name, array in columns.items()} }")
+    return columns
