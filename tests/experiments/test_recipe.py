@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from support import tiny_surfels
 
-from experiments.packaged import weights
+from experiments.packaged import recipe
 from spnr_jax import cli, presets
 from spnr_jax.training.weights import load, packaged_file, read_trained, read_variables
 
@@ -18,31 +18,31 @@ pytestmark = pytest.mark.slow
 def _tiny(monkeypatch):
     monkeypatch.setattr(cli, "set_up_jax", lambda **_: None)
     monkeypatch.setattr(presets, "surfels", lambda: tiny_surfels.CONFIG)
-    monkeypatch.setattr(weights, "STEPS", 2)
-    monkeypatch.setattr(weights, "DENSIFIER_STEPS", 2)
-    monkeypatch.setattr(weights, "COUNTS", (256,))
-    large = weights.generation_of
+    monkeypatch.setattr(recipe, "STEPS", 2)
+    monkeypatch.setattr(recipe, "DENSIFIER_STEPS", 2)
+    monkeypatch.setattr(recipe, "COUNTS", (256,))
+    large = recipe.generation_of
     monkeypatch.setattr(
-        weights,
+        recipe,
         "generation_of",
-        lambda recipe: dataclasses.replace(
-            large(recipe), resolution=48, views=2, points=1024, spp=1, objects=3, test_objects=1, variant="scalar_rgb"
+        lambda options: dataclasses.replace(
+            large(options), resolution=48, views=2, points=1024, spp=1, objects=3, test_objects=1, variant="scalar_rgb"
         ),
     )
 
 
 def test_one_command_makes_data_both_networks_and_scores_and_then_has_nothing_left_to_do(tmp_path, capsys):
-    recipe = weights.Recipe(out=tmp_path / "w", share=0.004, workers=1)
-    weights.main(recipe)
-    run = recipe.out / "run"
+    options = recipe.Recipe(out=tmp_path / "w", share=0.004, workers=1)
+    recipe.main(options)
+    run = options.out / "run"
     own, packaged = read_trained(run).variables["densifier"], read_variables(packaged_file("densifier"))
     assert not np.array_equal(own["point"]["kernel"], packaged["point"]["kernel"])
-    rows = json.loads((recipe.out / "scores.json").read_text())
-    assert len(rows) == len(weights.PARTS)
+    rows = json.loads((options.out / "scores.json").read_text())
+    assert len(rows) == len(recipe.PARTS)
     assert all(np.isfinite(row["psnr"]) and row["psnr"] > 3 for row in rows.values())
     assert load(run).config == tiny_surfels.CONFIG.model
-    made = {path: path.stat().st_mtime_ns for path in (recipe.out / "densifier" / "records").iterdir()}
+    made = {path: path.stat().st_mtime_ns for path in (options.out / "densifier" / "records").iterdir()}
     capsys.readouterr()
-    weights.main(recipe)
+    recipe.main(options)
     assert made == {path: path.stat().st_mtime_ns for path in made}
     assert "is finished: 2 steps" in capsys.readouterr().out

@@ -1,6 +1,6 @@
 """The networks of the package from scratch: pictures of objects, the densifier, then the shader on what it densifies.
 
-    python -m experiments.packaged.weights --meshes MESHES --test-list TEST --out runs/weights [--share 0.1]
+    python -m experiments.packaged.recipe --meshes MESHES --test-list TEST --out runs/weights [--share 0.1]
 
     OUT/data/         pictures of meshes, of stretched ones and of procedural objects (`spnr-data generate`)
     OUT/densifier/    records of points, checkpoint and weights of the densifier
@@ -161,4 +161,4 @@ def score_object(
 
 
 if __name__ == "__main__":
-    entry_point.run(main, Recipe, "packaged.weights")
+    entry_point.run(main, Recipe, "packaged.recipe")
