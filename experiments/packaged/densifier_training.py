@@ -381,7 +381,7 @@ def measure_cover(batch: Batch, children: Any, likely: Array) -> Array:
 def optimizer(options: Options) -> optax.GradientTransformation:
     """Adam with a cosine schedule."""
     rate = optax.warmup_cosine_decay_schedule(
-        0.0, options.learning_rate, 100, options.steps, options.learning_rate / 100
+        0.0, options.learning_rate, min(100, options.steps // 10), options.steps, options.learning_rate / 100
     )
     return optax.chain(optax.clip_by_global_norm(1.0), optax.adam(rate, b2=0.99))
 
