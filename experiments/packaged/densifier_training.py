@@ -393,7 +393,7 @@ def train(options: Options) -> None:
     print(f"{len(records)} objects", flush=True)
     rule = optimizer(options)
     first = make_batch(records, np.random.default_rng(0))
-    params = init(jax.random.key(0), first.nodes, first.places)
+    params = init(jax.random.key(0), *jax.device_put((first.nodes, first.places)))
     print(f"{sum(x.size for x in jax.tree.leaves(params))} weights", flush=True)
     if options.start:
         params = read_variables(options.start)

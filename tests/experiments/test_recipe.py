@@ -45,4 +45,4 @@ def test_one_command_makes_data_both_networks_and_scores_and_then_has_nothing_le
     capsys.readouterr()
     recipe.main(options)
     assert made == {path: path.stat().st_mtime_ns for path in made}
-    assert "is finished: 2 steps" in capsys.readouterr().out
+    assert "is finished: 1 steps" in capsys.readouterr().out
