@@ -77,10 +77,6 @@ def see_directions(
     matter.
     """
     positions, normals, spacing, cell = jax.lax.stop_gradient((positions, normals, spacing, cell))
-    x, y, z = positions
-
-    def along(axis, vectors):
-        return vectors[0] * axis[0] + vectors[1] * axis[1] + vectors[2] * axis[2]
 
     def number_of(column, row):
         return jnp.clip(row, 0, grid - 1) * grid + jnp.clip(column, 0, grid - 1)
@@ -91,13 +87,13 @@ def see_directions(
 
     def look(axes):
         towards, right, up = axes
-        facing = along(towards, normals)
-        steep = [-along(axis, normals) * jnp.sign(facing) / jnp.maximum(jnp.abs(facing), 1e-3) for axis in (right, up)]
+        facing = dot(towards, normals)
+        steep = [-dot(axis, normals) * jnp.sign(facing) / jnp.maximum(jnp.abs(facing), 1e-3) for axis in (right, up)]
         slope = jnp.sqrt(steep[0] ** 2 + steep[1] ** 2)
         steep = [x * jnp.minimum(1, STEEPEST / jnp.maximum(slope, 1e-3)) for x in steep]
-        across, high = (along(axis, (x, y, z)) / cell + grid / 2 for axis in (right, up))
+        across, high = (dot(axis, positions) / cell + grid / 2 for axis in (right, up))
         column, row = (jnp.floor(v - 0.5).astype(jnp.int32) for v in (across, high))
-        depth = along(towards, (x, y, z))
+        depth = dot(towards, positions)
         most = REACH * spacing * jnp.sqrt(jnp.clip(1 - facing**2, 0, 1))
         nearest = jnp.full(grid * grid, -2 * BOX, depth.dtype)
         for j, i in ((0, 0), (0, 1), (1, 0), (1, 1)):
@@ -105,11 +101,10 @@ def see_directions(
             there = depth + jnp.where(nearer < most, nearer, 0)
             index = jnp.where(mask, number_of(column + i, row + j), grid * grid)
             nearest = nearest.at[index].max(there, mode="drop")
-        lift = jnp.sign(facing) * spacing
-        lifted = [p + lift * n for p, n in zip((x, y, z), normals, strict=True)]
-        across, high = (along(axis, lifted) / cell + grid / 2 for axis in (right, up))
+        lifted = positions + (jnp.sign(facing) * spacing)[None] * normals
+        across, high = (dot(axis, lifted) / cell + grid / 2 for axis in (right, up))
         column, row = (jnp.floor(v).astype(jnp.int32) for v in (across, high))
-        there = along(towards, lifted) + beside(column, row, across, high, steep)
+        there = dot(towards, lifted) + beside(column, row, across, high, steep)
         behind = (nearest[number_of(column, row)] - there) / jnp.maximum(spacing, cell / CELL)
         return jnp.clip(1 - behind / SOFT, 0, 1)
 
