@@ -172,8 +172,10 @@ RUNS = {  # name -> its options, the pictures that it writes, and what is known 
 
 @pytest.mark.ci
 @pytest.mark.parametrize("name", RUNS)
-def test_a_command_ends_with_finite_numbers_and_pictures_and_goes_on_where_it_was(name, data, tmp_path):
+def test_a_command_ends_with_finite_numbers_and_pictures_and_goes_on_where_it_was(name, data, tmp_path, monkeypatch):
     options, pictures, check = RUNS[name]
+    if name == "studies.inverse":  # a network of zeros stands on kinks, where gradients are not differences
+        monkeypatch.setattr(weights, "packaged_file", tiny_surfels.shipped)
     found, out = run_twice(name, tmp_path / "out", **options(data))
     for picture in pictures:
         assert (out / picture).read_bytes().startswith(b"\x89PNG")
