@@ -2,10 +2,12 @@
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 from support.laws import close
 from support.surfel_clouds import estimate as surfels_of
 from support.surfel_clouds import even_square, shape
 
+from spnr_jax.kernels.cloud_arrays import farthest_points
 from spnr_jax.surfels.layers import RULES
 from spnr_jax.surfels.sides import tangents
 from spnr_jax.surfels.splatting import RADIUS
@@ -43,6 +45,19 @@ def test_normals_point_outward_within_degrees_and_the_spacing_is_the_root_of_the
     ratio = found["spacing"] / spacing
     assert 0.75 < np.median(ratio) < 1.25
     assert np.mean((ratio > 0.75) & (ratio < 1.25)) > (0.98 if spread == "even" else 0.75)  # wider beside gaps
+
+
+def test_the_spacing_on_a_thin_leg_is_at_most_a_fifth_above_that_by_all_neighbors_where_points_are_even():
+    rng = np.random.default_rng(0)
+    angle, height = rng.uniform(0, 2 * np.pi, 8000), rng.uniform(-0.9, 0.9, 8000)
+    dense = np.stack([0.03 * np.cos(angle), height, 0.03 * np.sin(angle)], axis=1)
+    quantiles = []
+    for positions in (dense[farthest_points(dense, 200, 0)], dense[:200]):
+        by_all = np.sqrt(np.pi / 6) * cKDTree(positions).query(positions, 7)[0][:, 6]
+        quantiles.append(np.quantile(estimate(positions)["spacing"] / by_all, [0.5, 0.9]))
+    (even, _), (_, largest) = quantiles
+    assert 1.1 < even < 1.2  # 1.43 by the neighbors of a layer alone
+    assert largest > 1.5  # of random points, which are not held
 
 
 def test_the_shape_is_0_in_a_plane_and_on_a_line():
