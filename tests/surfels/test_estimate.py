@@ -51,13 +51,12 @@ def test_the_spacing_on_a_thin_leg_is_at_most_a_fifth_above_that_by_all_neighbor
     rng = np.random.default_rng(0)
     angle, height = rng.uniform(0, 2 * np.pi, 8000), rng.uniform(-0.9, 0.9, 8000)
     dense = np.stack([0.03 * np.cos(angle), height, 0.03 * np.sin(angle)], axis=1)
-    quantiles = []
+    medians = []
     for positions in (dense[farthest_points(dense, 200, 0)], dense[:200]):
         by_all = np.sqrt(np.pi / 6) * cKDTree(positions).query(positions, 7)[0][:, 6]
-        quantiles.append(np.quantile(estimate(positions)["spacing"] / by_all, [0.5, 0.9]))
-    (even, _), (_, largest) = quantiles
-    assert 1.1 < even < 1.2  # 1.43 by the neighbors of a layer alone
-    assert largest > 1.5  # of random points, which are not held
+        medians.append(np.median(estimate(positions)["spacing"] / by_all))
+    assert 1.1 < medians[0] < 1.2  # 1.43 by the neighbors of a layer alone
+    assert medians[1] > 1.17  # random points are not held: 1.23, and 1.12 if they were
 
 
 def test_the_shape_is_0_in_a_plane_and_on_a_line():
