@@ -214,7 +214,7 @@ def splats() -> list[Files]:
     from spnr_jax.formats import gaussian_files
 
     content = gzip.decompress(gaussian_files.spz_of(splat_balls.ball(12)))
-    spz = [{"cloud.spz": gzip.compress(content[:4] + bytes([version]) + content[5:])} for version in (2, 3)]
+    spz = [{"cloud.spz": gzip.compress(content[:4] + bytes([version]) + content[5:], mtime=0)} for version in (2, 3)]
     return [*spz, {"cloud.ply": packed_splats(WHOLE.positions / 8, 255)}]
 
 
