@@ -58,7 +58,7 @@ class Options:
     meshes: Path | None = None
     """Folder of .glb, .gltf, .obj and .ply files that train beside the procedural objects (default: none)."""
     left_out: tuple[Path, ...] = ()
-    """Text files with the ids of meshes and procedural objects that do not train."""
+    """Text files with the ids of meshes that do not train."""
     out: Path = Path("runs/densifier")
     """Folder of records, checkpoint and weights."""
     objects: int = 200

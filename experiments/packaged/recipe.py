@@ -22,7 +22,7 @@ import numpy as np
 from data_gen.make.generate import generate
 from data_gen.plan.tasks import GenerateConfig
 from experiments import entry_point
-from experiments.comparison.study_objects import each_view
+from experiments.comparison.contenders import draw_volume
 from experiments.packaged import densifier_training
 from experiments.packaged.demo import Seconds
 from spnr_jax import cli, presets
@@ -56,7 +56,7 @@ class Recipe:
     test_list: Path | None = None
     """Text file with the ids of meshes that neither network sees: the last part scores them."""
     maps: Path | None = None
-    """Folder of environment maps that light a quarter of the views (default: the room, skies and lamps alone)."""
+    """Folder of environment maps that light a fifth of the views (default: the room, skies and lamps alone)."""
     out: Path = Path("runs/weights")
     """Folder of all that is made."""
     share: float = 1.0
@@ -151,12 +151,9 @@ def score_object(
     model: Model, item: data_sets.ObjectData, cloud: PointCloud, densify: bool, quality: Quality
 ) -> list[float]:
     """COLUMNS of an object, means over its views, each in its own light."""
-    volume = model.encode(cloud, densify=densify)
-    found = []
-    for view, rendering in enumerate(model.render_each(volume, each_view(item), quality, item.own_lights)):
-        reference = item.images[view].astype(np.float32) / 255
-        one = sharpness(np.clip(rendering.image, 0, 1), np.asarray(rendering.acc), reference)
-        found.append([getattr(one, name) for name in COLUMNS])
+    pictures = draw_volume(model, model.encode(cloud, densify=densify), item, quality)
+    drawn = zip(np.clip(pictures.image, 0, 1), pictures.acc, item.images.astype(np.float32) / 255, strict=True)
+    found = [[getattr(one, name) for name in COLUMNS] for one in (sharpness(*view) for view in drawn)]
     return np.nanmean(found, axis=0).tolist()
 
 

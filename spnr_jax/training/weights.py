@@ -46,15 +46,14 @@ def packaged_file(name: str = SHIPPED) -> Path:
     return Path(str(resources.files("spnr_jax") / "pretrained" / f"{name}.npz"))
 
 
-def companion_files(config: NetworkConfig, folder: Path) -> dict[str, Path]:
-    """The files of weights that a method asks for beside its own (its densifier): a folder's own, or the package's."""
-    own = {name: folder / f"{name}.npz" for name in method_of(config).companions}
-    return {name: path if path.is_file() else packaged_file(name) for name, path in own.items()}
-
-
 def add_companions(config: NetworkConfig, variables: dict, folder: Path) -> dict:
-    """The variables, and those of its companions: of the folder that the weights lie in, or of the package."""
-    return variables | {name: read_variables(path) for name, path in companion_files(config, folder).items()}
+    """The variables, and those that the method asks for beside them (its densifier): a folder's own, or the package's.
+
+    The folder is that of the run, or the one that the file of weights lies in.
+    """
+    own = {name: folder / f"{name}.npz" for name in method_of(config).companions}
+    files = {name: path if path.is_file() else packaged_file(name) for name, path in own.items()}
+    return variables | {name: read_variables(path) for name, path in files.items()}
 
 
 def place(source: Path | str | None) -> Path:
