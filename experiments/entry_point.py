@@ -13,7 +13,7 @@ from spnr_jax import errors
 
 def run(main: Callable[[Any], object], options: type, name: str) -> NoReturn:
     """Calls `main` with the options of the command line `python -m experiments.NAME`, and ends the process."""
-    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # as in spnr_jax/devices/compilation.py
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # as in spnr_jax/devices/runtime.py
 
     arguments, debug = errors.split_debug(sys.argv[1:])
 

@@ -2,7 +2,7 @@
 
 Many devices are a mesh, over which the objects of a batch are divided.  The program is the one of a single device:
 placed inputs and the mesh in use are all that differs, and XLA adds the communication.  Parameters and optimisers are
-on every device whole.  Where a program packs rays by what they meet (`occupancy.map_existing`), each device packs those
+on every device whole.  Where a program packs rays by what they meet (`voxels.map_existing`), each device packs those
 of its own objects (`split_objects`): XLA would let all of them compute all.
 
 With kept traces (`Kept`) a new process neither traces nor compiles; both take Python as long as the rest of a second
